@@ -1,0 +1,1 @@
+"""Two-view projective geometry as pure, batched, differentiable functions."""

@@ -1,0 +1,1 @@
+"""Figures of merit for fundamental matrices and matches, as plain batched functions."""

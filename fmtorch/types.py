@@ -1,0 +1,262 @@
+"""What travels between the stages: `Features`, `Correspondences`, `Estimate`.
+
+Conventions (the whole project's):
+points are (x, y) in pixels with (0, 0) at the centre of the first pixel; sizes are (h, w); image 0 comes first and
+``x1^T F x0 = 0``; ``mask`` is True for a real, surviving match, and what stands in a masked slot means nothing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Sequence
+from typing import Any, Self, TypeVar, cast
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+Index = int | slice | Sequence[int] | Tensor
+
+
+def pair_key(identity: str) -> int:
+    """The stable signed 64-bit key of a pair's identity (blake2b), which selects its random streams."""
+    return int.from_bytes(hashlib.blake2b(identity.encode(), digest_size=8).digest(), "big", signed=True)
+
+
+class _Record:
+    """Tensors with a common leading batch dimension, moved, indexed and replaced together."""
+
+    def to(self, device: torch.device | str) -> Self:
+        """The same record with every tensor on `device`."""
+        return self._map(lambda value: value.to(device))
+
+    def detach(self) -> Self:
+        """The same record cut off from the graph."""
+        return self._map(lambda value: value.detach())
+
+    def replace(self, **changes: Any) -> Self:
+        """A copy with some fields changed (shapes are checked again)."""
+        return cast(Self, dataclasses.replace(cast(Any, self), **changes))
+
+    def _map(self, function: Any) -> Self:
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(cast(Any, self))}
+        return self.replace(**{name: function(v) for name, v in values.items() if isinstance(v, Tensor)})
+
+
+def _as_index(index: Index) -> slice | Tensor:
+    """An index that keeps the batch dimension: the integer i selects the batch of one that holds element i."""
+    if isinstance(index, int):
+        return slice(index, index + 1 or None)
+    if isinstance(index, slice | Tensor):
+        return index
+    return torch.as_tensor(list(index), dtype=torch.int64)
+
+
+def _expect(name: str, value: Tensor | None, shape: tuple[int, ...]) -> None:
+    if value is not None and tuple(value.shape) != shape:
+        raise ValueError(f"{name} has shape {tuple(value.shape)}; it must be {shape}")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Features(_Record):
+    """The local features of one image, or of a padded batch of images (a leading dimension on every field).
+
+    lafs: local affine frames (N, 2, 3) in kornia's convention, the last column being the centre in pixels.
+    scores: detector response (N,). descriptors: (N, D). image_size: (h, w).
+    mask: (N,), True for a real feature; all True when not given.
+    """
+
+    lafs: Float[Tensor, "*batch n 2 3"]
+    scores: Float[Tensor, "*batch n"]
+    descriptors: Float[Tensor, "*batch n d"]
+    image_size: Int[Tensor, "*batch 2"]
+    mask: Bool[Tensor, "*batch n"] | None = None
+
+    def __post_init__(self) -> None:
+        batch_n = tuple(self.lafs.shape[:-2])
+        _expect("lafs", self.lafs, (*batch_n, 2, 3))
+        _expect("scores", self.scores, batch_n)
+        _expect("descriptors", self.descriptors, (*batch_n, self.descriptors.shape[-1]))
+        _expect("image_size", self.image_size, (*batch_n[:-1], 2))
+        if self.mask is None:
+            object.__setattr__(self, "mask", torch.ones(batch_n, dtype=torch.bool, device=self.lafs.device))
+        _expect("mask", self.mask, batch_n)
+
+    @property
+    def keypoints(self) -> Float[Tensor, "*batch n 2"]:
+        """The centres of the frames, (x, y) in pixels."""
+        return self.lafs[..., 2]
+
+    @property
+    def valid(self) -> Bool[Tensor, "*batch n"]:
+        """The mask, never None."""
+        return cast(Tensor, self.mask)
+
+    def __len__(self) -> int:
+        """Number of feature slots, padding included."""
+        return int(self.lafs.shape[-3])
+
+    def __getitem__(self, index: Index) -> Features:
+        """Of a batch, the selected images (still a batch); of one image, the selected features."""
+        i = _as_index(index)
+        size = self.image_size[i] if self.image_size.dim() > 1 else self.image_size
+        return Features(self.lafs[i], self.scores[i], self.descriptors[i], size, self.valid[i])
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Correspondences(_Record):
+    """A batch of B image pairs with their putative matches, padded to N slots.
+
+    x0, x1: matched points (B, N, 2) in pixels. mask: (B, N).
+    quality: the matcher's own figure (B, N), for nearest neighbours the distance ratio; smaller is better.
+    prior: P(inlier) in [0, 1], (B, N), where something supplies it.
+    lafs0, lafs1: local affine frames (B, N, 2, 3) where known. size0, size1: image sizes (B, 2) as (h, w).
+    K0, K1: calibration matrices (B, 3, 3) where known. key: (B,) int64, see `pair_key`; 0 when not given.
+    """
+
+    x0: Float[Tensor, "b n 2"]
+    x1: Float[Tensor, "b n 2"]
+    mask: Bool[Tensor, "b n"]
+    quality: Float[Tensor, "b n"] | None = None
+    prior: Float[Tensor, "b n"] | None = None
+    lafs0: Float[Tensor, "b n 2 3"] | None = None
+    lafs1: Float[Tensor, "b n 2 3"] | None = None
+    size0: Int[Tensor, "b 2"] | None = None
+    size1: Int[Tensor, "b 2"] | None = None
+    K0: Float[Tensor, "b 3 3"] | None = None
+    K1: Float[Tensor, "b 3 3"] | None = None
+    key: Int[Tensor, " b"] | None = None
+
+    def __post_init__(self) -> None:
+        if self.x0.dim() != 3 or self.x0.shape[-1] != 2:
+            raise ValueError(f"x0 has shape {tuple(self.x0.shape)}; it must be (B, N, 2)")
+        b, n = self.x0.shape[:2]
+        if self.key is None:
+            object.__setattr__(self, "key", torch.zeros(b, dtype=torch.int64, device=self.x0.device))
+        shapes = {
+            "x1": (b, n, 2), "mask": (b, n), "quality": (b, n), "prior": (b, n),
+            "lafs0": (b, n, 2, 3), "lafs1": (b, n, 2, 3), "size0": (b, 2), "size1": (b, 2),
+            "K0": (b, 3, 3), "K1": (b, 3, 3), "key": (b,),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            _expect(name, getattr(self, name), shape)
+
+    @property
+    def keys(self) -> Int[Tensor, " b"]:
+        """The pairs' keys, never None."""
+        return cast(Tensor, self.key)
+
+    def __len__(self) -> int:
+        """Number of pairs."""
+        return int(self.x0.shape[0])
+
+    def __getitem__(self, index: Index) -> Correspondences:
+        """The selected pairs, always as a batch."""
+        i = _as_index(index)
+        return self._map(lambda value: value[i])
+
+    def count(self) -> Int[Tensor, " b"]:
+        """Number of surviving matches of each pair."""
+        return self.mask.sum(-1)
+
+    def keep(self, mask: Bool[Tensor, "b n"]) -> Correspondences:
+        """The same matches, of which only those also in `mask` survive."""
+        return self.replace(mask=self.mask & mask)
+
+    def compact(self, multiple: int = 1) -> Correspondences:
+        """Survivors moved to the front in their order, padding cut to the longest pair (rounded up to `multiple`)."""
+        longest = int(self.count().max()) if self.mask.numel() else 0
+        n = -(-longest // multiple) * multiple
+        order = torch.argsort(self.mask.logical_not().to(torch.uint8), dim=-1, stable=True)[:, :n]
+        short = n - order.shape[1]
+
+        def take(value: Tensor) -> Tensor:
+            index = order.reshape(*order.shape, *[1] * (value.dim() - 2)).expand(-1, -1, *value.shape[2:])
+            return _pad(torch.gather(value, 1, index), 1, order.shape[1] + short)
+
+        per_match = ("x0", "x1", "mask", "quality", "prior", "lafs0", "lafs1")
+        return self.replace(**{f: take(getattr(self, f)) for f in per_match if getattr(self, f) is not None})
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Estimate(_Record):
+    """Fundamental matrices of B pairs.
+
+    F: (B, 3, 3) with unit Frobenius norm, zero where `ok` is False. inliers: (B, N), within the mask.
+    ok: (B,). reason: why a pair failed, empty where it did not. draws: minimal samples drawn, (B,).
+    """
+
+    F: Float[Tensor, "b 3 3"]
+    inliers: Bool[Tensor, "b n"]
+    ok: Bool[Tensor, " b"]
+    reason: tuple[str, ...]
+    draws: Int[Tensor, " b"]
+
+    def __post_init__(self) -> None:
+        b = self.F.shape[0]
+        _expect("F", self.F, (b, 3, 3))
+        _expect("inliers", self.inliers, (b, self.inliers.shape[-1]))
+        _expect("ok", self.ok, (b,))
+        _expect("draws", self.draws, (b,))
+        if len(self.reason) != b:
+            raise ValueError(f"reason has {len(self.reason)} entries; it must have one for each of the {b} pairs")
+
+    def __len__(self) -> int:
+        """Number of pairs."""
+        return int(self.F.shape[0])
+
+    def __getitem__(self, index: Index) -> Estimate:
+        """The selected pairs, always as a batch."""
+        i = _as_index(index)
+        picked = torch.arange(len(self), device=self.ok.device)[i].tolist()
+        return self._map(lambda value: value[i]).replace(reason=tuple(self.reason[j] for j in picked))
+
+
+def _pad(value: Tensor, dim: int, length: int) -> Tensor:
+    """`value` filled with zeros (False) along `dim` up to `length`."""
+    missing = length - value.shape[dim]
+    if missing <= 0:
+        return value
+    shape = list(value.shape)
+    shape[dim] = missing
+    return torch.cat([value, value.new_zeros(shape)], dim)
+
+
+Item = TypeVar("Item", Features, Correspondences, Estimate)
+
+
+def collate(items: Sequence[Item]) -> Item:
+    """One padded batch from several items: single-image `Features` are stacked, batches are joined.
+
+    Optional fields survive only where every item has them. Raises ValueError for an empty list.
+    """
+    if not items:
+        raise ValueError("collate needs at least one item")
+    first = items[0]
+    n = max(_slots(item) for item in items)
+    merged: dict[str, Any] = {}
+    for field in dataclasses.fields(first):
+        values = [getattr(item, field.name) for item in items]
+        if field.name == "reason":
+            merged[field.name] = sum(values, ())
+        elif any(value is None for value in values):
+            merged[field.name] = None
+        elif isinstance(first, Features) and first.image_size.dim() == 1:
+            stacked = [_pad(value, 0, n) if field.name != "image_size" else value for value in values]
+            merged[field.name] = torch.stack(stacked)
+        else:
+            padded = field.name in _PER_SLOT
+            merged[field.name] = torch.cat([_pad(value, 1, n) if padded else value for value in values])
+    return type(first)(**merged)
+
+
+_PER_SLOT = frozenset(
+    ("lafs", "scores", "descriptors", "x0", "x1", "mask", "quality", "prior", "lafs0", "lafs1", "inliers")
+)
+
+
+def _slots(item: Features | Correspondences | Estimate) -> int:
+    if isinstance(item, Features):
+        return len(item)
+    return int((item.x0 if isinstance(item, Correspondences) else item.inliers).shape[1])

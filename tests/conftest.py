@@ -1,0 +1,31 @@
+"""Where the tests find shared data: $FMTORCH_TEST_DATA, by default the folder `shared` beside the checkout."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+torch.set_num_threads(1)
+
+SHARED = Path(os.environ.get("FMTORCH_TEST_DATA", Path(__file__).resolve().parents[2] / "shared"))
+
+
+def shared_path(relative: str) -> Path:
+    """A file or folder of the shared data; skips the test where it is absent (fails if FMTORCH_REQUIRE_DATA=1)."""
+    path = SHARED / relative
+    if not path.exists():
+        reason = f"{path} is absent (set FMTORCH_TEST_DATA to the folder that holds {relative})"
+        if os.environ.get("FMTORCH_REQUIRE_DATA") == "1":
+            pytest.fail(reason)
+        pytest.skip(reason)
+    return path
+
+
+def oracle(name: str) -> dict[str, np.ndarray]:
+    """The arrays of one reference file, e.g. oracle("gms.npz")."""
+    with np.load(shared_path(f"oracles/{name}")) as file:
+        return {key: file[key] for key in file.files}
