@@ -1,0 +1,68 @@
+"""The item of every data set: an image pair with its ground truth, images read only when asked for."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fmtorch.types import pair_key
+
+
+@dataclasses.dataclass(frozen=True)
+class ImageSource:
+    """One image on disk. `identity` names it within its data set and is the key of feature caches."""
+
+    identity: str
+    path: Path
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ImagePair:
+    """Two images of one scene and how they are related.
+
+    identity: unique within the data set, e.g. ``Strecha/fountain-P11/3-7``.
+    family: what results are grouped by (a data set, or a family of rendered scenes).
+    scene: the cluster for the bootstrap, e.g. ``fountain-P11``.
+    F: (3, 3) float64 with ``x1^T F x0 = 0`` in pixels.
+    K0, K1: (3, 3), R: (3, 3), t: (3,) with ``X1 = R X0 + t``, where known.
+    problem: why this pair cannot be used (a bad line of a pairs file, say); None for a sound pair.
+    """
+
+    identity: str
+    family: str
+    scene: str
+    image0: ImageSource
+    image1: ImageSource
+    F: NDArray[np.float64]
+    K0: NDArray[np.float64] | None = None
+    K1: NDArray[np.float64] | None = None
+    R: NDArray[np.float64] | None = None
+    t: NDArray[np.float64] | None = None
+    problem: str | None = None
+
+    @property
+    def key(self) -> int:
+        """The pair's stable 64-bit key."""
+        return pair_key(self.identity)
+
+
+class PairDataset(Protocol):
+    """A sequence of image pairs.
+
+    name: e.g. ``fmbench``. digest: hex digest of what defines the pairs (contents of pairs files, or the generator's
+    version and parameters; never an absolute path), part of a run's identity.
+    """
+
+    name: str
+    digest: str
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> ImagePair: ...
+
+    def __iter__(self) -> Iterator[ImagePair]: ...
