@@ -40,9 +40,10 @@ class _Record:
         """A copy with some fields changed (shapes are checked again)."""
         return cast(Record, dataclasses.replace(cast(Any, self), **changes))
 
-    def _map(self: Record, function: Any) -> Record:
+    def _map(self: Record, function: Any, **changes: Any) -> Record:
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(cast(Any, self))}
-        return self.replace(**{name: function(v) for name, v in values.items() if isinstance(v, Tensor)})
+        mapped = {name: function(v) for name, v in values.items() if isinstance(v, Tensor)}
+        return self.replace(**mapped, **changes)
 
 
 def _as_index(index: Index, length: int) -> slice | Tensor:
@@ -221,7 +222,7 @@ class Estimate(_Record):
         """The selected pairs, always as a batch."""
         i = _as_index(index, len(self))
         picked = torch.arange(len(self), device=self.ok.device)[i].tolist()
-        return self._map(lambda value: value[i]).replace(reason=tuple(self.reason[j] for j in picked))
+        return self._map(lambda value: value[i], reason=tuple(self.reason[j] for j in picked))
 
 
 def _pad(value: Tensor, dim: int, length: int) -> Tensor:
@@ -240,11 +241,14 @@ Item = TypeVar("Item", Features, Correspondences, Estimate)
 def collate(items: Sequence[Item]) -> Item:
     """One padded batch from several items: single-image `Features` are stacked, batches are joined.
 
-    Optional fields survive only where every item has them. Raises ValueError for an empty list.
+    Optional fields survive only where every item has them. Raises ValueError for an empty list, TypeError for items of
+    several kinds (single images and batches of images are two kinds).
     """
     if not items:
         raise ValueError("collate needs at least one item")
     first = items[0]
+    if len({(type(item), item.lafs.dim() if isinstance(item, Features) else 0) for item in items}) > 1:
+        raise TypeError(f"collate needs items of one kind, not {', '.join(type(item).__name__ for item in items[:5])}")
     n = max(_slots(item) for item in items)
     merged: dict[str, Any] = {}
     for field in dataclasses.fields(first):
