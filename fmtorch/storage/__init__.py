@@ -2,6 +2,6 @@
 
 from fmtorch.storage.files import replacing
 from fmtorch.storage.rows import PAIR_SCHEMA, PairRow, to_table
-from fmtorch.storage.runs import RunFolder, RunFolderError, identity
+from fmtorch.storage.runs import RunFolder, RunFolderError, identity_digest
 
-__all__ = ["PAIR_SCHEMA", "PairRow", "RunFolder", "RunFolderError", "identity", "replacing", "to_table"]
+__all__ = ["PAIR_SCHEMA", "PairRow", "RunFolder", "RunFolderError", "identity_digest", "replacing", "to_table"]

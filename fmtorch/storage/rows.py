@@ -8,8 +8,6 @@ from collections.abc import Sequence
 
 import pyarrow as pa
 
-from fmtorch.types import pair_key
-
 PAIR_SCHEMA = pa.schema(
     [
         pa.field("pair", pa.string(), nullable=False),
@@ -39,17 +37,18 @@ PAIR_SCHEMA = pa.schema(
 
 @dataclasses.dataclass(frozen=True)
 class PairRow:
-    """The result of one image pair. What could not be computed is None.
+    """The result of one image pair. What could not be computed is None or NaN, and null in the table.
 
     Raises ValueError for a row that contradicts itself: a failed pair has a reason, NSGD 1 and no F; a sound one has no
     reason and nine finite elements of F; NSGD is in [0, 1].
     """
 
     pair: str  # the pair's identity within its data set
+    key: int  # the pair's stable 64-bit key, `pair_key(pair)`
     family: str  # what results are grouped by
     scene: str  # the cluster for the bootstrap
     ok: bool  # whether there is an estimate
-    reason: str = ""  # why not; the text before the first colon is the kind of failure
+    reason: str = ""  # why not
     nsgd: float = 1.0  # share of the image diagonal, in [0, 1]; 1 where the pair failed
     nsgd_released: float | None = None  # the same as the published evaluator computes it
     inlier_rate: float | None = None  # share of the estimator's inliers that obey the true F, in [0, 1]
@@ -64,7 +63,7 @@ class PairRow:
     seconds_pruning: float | None = None
     seconds_estimation: float | None = None
     seconds_metrics: float | None = None
-    F: tuple[float, ...] | None = None  # row by row, x1^T F x0 = 0 in pixels, unit Frobenius norm
+    F: Sequence[float] | None = None  # row by row, x1^T F x0 = 0 in pixels, unit Frobenius norm
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.nsgd <= 1.0:
@@ -79,11 +78,6 @@ class PairRow:
                 f"pair {self.pair!r} failed: it needs a reason, nsgd 1 and no F, "
                 f"but has reason={self.reason!r}, nsgd={self.nsgd}, F={self.F}"
             )
-
-    @property
-    def key(self) -> int:
-        """The pair's stable 64-bit key."""
-        return pair_key(self.pair)
 
 
 def to_table(rows: Sequence[PairRow]) -> pa.Table:

@@ -15,7 +15,7 @@ import json
 import os
 import time
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ FORMAT = 1  # of the folder; to be raised when the schema changes
 _SHOWN = 5  # differing fields shown in an error
 
 
-class RunFolderError(RuntimeError):
+class RunFolderError(ValueError):
     """A run folder that cannot be used as asked; the message says what to do."""
 
 
@@ -39,7 +39,7 @@ def canonical(config: Mapping[str, Any]) -> str:
     return json.dumps(config, sort_keys=True, separators=(",", ":"))
 
 
-def identity(config: Mapping[str, Any]) -> str:
+def identity_digest(config: Mapping[str, Any]) -> str:
     """The hex digest (blake2b, 128 bits) of what defines a run's results.
 
     config: plain dicts, lists, strings, numbers, booleans and None: the pipeline's configuration, the data set's name
@@ -53,7 +53,7 @@ class RunFolder:
     """An evaluation on disk; made by `open` (to write) or `load` (to read)."""
 
     path: Path
-    config: dict[str, Any]  # what defines the results, see `identity`
+    config: dict[str, Any]  # what defines the results, see `identity_digest`
 
     @classmethod
     def open(cls, path: Path | str, config: Mapping[str, Any]) -> RunFolder:
@@ -76,7 +76,7 @@ class RunFolder:
                 )
             _claim(path / "run.json", wanted)
         folder = cls.load(path)
-        if folder.identity != identity(wanted):
+        if folder.identity != identity_digest(wanted):
             raise RunFolderError(
                 f"{path} holds another run; what differs (there -> now): {_some(_differences(folder.config, wanted))}. "
                 "Choose another run_dir, or delete the folder"
@@ -105,7 +105,7 @@ class RunFolder:
     @property
     def identity(self) -> str:
         """The digest of what defines the results."""
-        return identity(self.config)
+        return identity_digest(self.config)
 
     def append(self, rows: Sequence[PairRow]) -> None:
         """Add results, as a new part that is either whole or absent. Safe with several processes."""
@@ -120,13 +120,17 @@ class RunFolder:
         """The keys of the pairs that have a result."""
         return {int(key) for part in self._parts(["key"]) for key in part["key"].to_numpy()}
 
-    def read(self) -> pa.Table:
-        """All results, a row of `PAIR_SCHEMA` per pair; of several rows of one pair the first written counts.
+    def read(self, keys: Collection[int] | None = None) -> pa.Table:
+        """The results, a row of `PAIR_SCHEMA` per pair: all of them, or those of the pairs with the given keys.
 
+        Of several rows of one pair the first written counts.
         Raises RunFolderError naming a part that cannot be read.
         """
         table = pa.concat_tables([PAIR_SCHEMA.empty_table(), *self._parts(PAIR_SCHEMA.names)])
-        _, first = np.unique(table["key"].to_numpy(), return_index=True)
+        found = table["key"].to_numpy()
+        _, first = np.unique(found, return_index=True)
+        if keys is not None:
+            first = first[np.isin(found[first], np.fromiter(keys, np.int64, len(keys)))]
         return table.take(np.sort(first))
 
     def write_summary(self, summary: Mapping[str, Any], markdown: str) -> None:
@@ -156,7 +160,7 @@ def _claim(file: Path, config: dict[str, Any]) -> None:
     Where the file system has no hard links the last one wins, which is the same unless their identities differ.
     """
     temporary = temporary_name(file)
-    stored = {"format": FORMAT, "identity": identity(config), "config": config}
+    stored = {"format": FORMAT, "identity": identity_digest(config), "config": config}
     try:
         temporary.write_text(json.dumps(stored, indent=2) + "\n", encoding="utf-8")
         sync(temporary)

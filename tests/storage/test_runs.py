@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from fmtorch.storage import PAIR_SCHEMA, PairRow, RunFolder, RunFolderError, identity, replacing, to_table
+from fmtorch.storage import PAIR_SCHEMA, PairRow, RunFolder, RunFolderError, identity_digest, replacing, to_table
 from fmtorch.types import pair_key
 
 CONFIG = {
@@ -24,11 +24,15 @@ F = (0.0, -0.5, 0.1, 0.5, 0.0, -0.1, 0.2, 0.3, 0.59)
 
 
 def row(name: str, **changes: object) -> PairRow:
-    return dataclasses.replace(PairRow(pair=name, family="indoor", scene="s", ok=True, nsgd=0.01, F=F), **changes)
+    return dataclasses.replace(
+        PairRow(pair=name, key=pair_key(name), family="indoor", scene="s", ok=True, nsgd=0.01, F=F), **changes
+    )
 
 
 def failed(name: str) -> PairRow:
-    return PairRow(pair=name, family="indoor", scene="s", ok=False, reason="too few matches: 5, needs 8")
+    return PairRow(
+        pair=name, key=pair_key(name), family="indoor", scene="s", ok=False, reason="too few matches: 5, needs 8"
+    )
 
 
 # identity
@@ -37,12 +41,12 @@ def failed(name: str) -> PairRow:
 def test_identity_ignores_order_and_container_types() -> None:
     swapped = {key: CONFIG[key] for key in reversed(CONFIG)}
     swapped["pipeline"] = {**CONFIG["pipeline"], "stages": ("a", "b")}
-    assert identity(swapped) == identity(CONFIG)
+    assert identity_digest(swapped) == identity_digest(CONFIG)
 
 
 def test_identity_is_the_same_in_every_version() -> None:
     # blake2b of the canonical text, computed apart; run folders of old must stay valid.
-    assert identity({"b": 0.1, "a": [1, None, True, "ü"]}) == "2087b63ed2736b65dc1c72eed6e2b183"
+    assert identity_digest({"b": 0.1, "a": [1, None, True, "ü"]}) == "2087b63ed2736b65dc1c72eed6e2b183"
 
 
 @pytest.mark.parametrize(
@@ -55,12 +59,12 @@ def test_identity_is_the_same_in_every_version() -> None:
     ],
 )
 def test_identity_changes_with_any_field(change: dict[str, object]) -> None:
-    assert identity({**CONFIG, **change}) != identity(CONFIG)
+    assert identity_digest({**CONFIG, **change}) != identity_digest(CONFIG)
 
 
 def test_identity_refuses_what_json_cannot_say() -> None:
     with pytest.raises(TypeError):
-        identity({"path": Path("x")})
+        identity_digest({"path": Path("x")})
 
 
 # opening
@@ -71,7 +75,7 @@ def test_open_writes_the_identity_and_continues(tmp_path: Path) -> None:
     run = RunFolder.open(path, CONFIG)
     stored = json.loads((path / "run.json").read_text())
     assert stored["config"] == CONFIG
-    assert stored["identity"] == identity(CONFIG) == run.identity
+    assert stored["identity"] == identity_digest(CONFIG) == run.identity
     before = (path / "run.json").read_bytes(), (path / "run.json").stat().st_mtime_ns
     run.append([row("a")])
     assert RunFolder.open(path, CONFIG).done() == {pair_key("a")}
@@ -164,7 +168,7 @@ def test_rows_come_back_as_they_went(tmp_path: Path) -> None:
     table = run.read()
     assert table.schema == PAIR_SCHEMA
     first, second, third = table.to_pylist()
-    assert first.pop("key") == pair_key("a/b c/ü") == full.key
+    assert first["key"] == pair_key("a/b c/ü")
     assert first == {**dataclasses.asdict(full), "F": list(F)}
     assert (second["ok"], second["nsgd"], second["F"]) == (False, 1.0, None)
     assert second["reason"].startswith("too few")
@@ -173,7 +177,7 @@ def test_rows_come_back_as_they_went(tmp_path: Path) -> None:
 
 
 def test_every_column_has_a_field() -> None:
-    fields = {field.name for field in dataclasses.fields(PairRow)} | {"key"}
+    fields = {field.name for field in dataclasses.fields(PairRow)}
     assert fields == set(PAIR_SCHEMA.names)
     assert to_table([]).schema == PAIR_SCHEMA
 
@@ -212,6 +216,8 @@ def test_of_duplicates_the_first_written_counts_and_order_is_kept(tmp_path: Path
     run.append([row("y", corrs=4), row("a", corrs=5)])
     assert run.read()["corrs"].to_pylist() == [1, 2, 5]
     assert run.done() == {pair_key(name) for name in "zya"}
+    assert run.read({pair_key("a"), pair_key("z"), 5})["corrs"].to_pylist() == [1, 5]
+    assert run.read(set()).num_rows == 0
 
 
 def test_temporary_leftovers_are_ignored(tmp_path: Path) -> None:
