@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import threading
 import time
 from collections import OrderedDict
@@ -26,26 +27,15 @@ STAGES = ("features", "matching", "pruning", "estimation")
 class Outcome:
     """What a pipeline made of one pair.
 
-    correspondences, estimate: batches of one, on the CPU; None where the pair failed before that stage.
+    correspondences, estimate: batches of one; None where the pair failed before that stage.
     features: how many each image has. seconds: per stage; a batched stage is shared out evenly, and features count in
     full for each pair that uses them. reason: why the pair failed, empty where it did not.
     """
 
     pair: ImagePair
-    features: tuple[int, int]
-    correspondences: Correspondences | None
-    estimate: Estimate | None
-    seconds: dict[str, float]
-    reason: str
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Matched:
-    """A pair on its way through the stages."""
-
-    pair: ImagePair
     features: tuple[int, int] = (0, 0)
     correspondences: Correspondences | None = None
+    estimate: Estimate | None = None
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     reason: str = ""
 
@@ -74,68 +64,86 @@ class Pipeline:
         """The features of an image and the seconds they took, kept for the next pair that shows the image."""
         return self._memo.get(f"{image.path}", lambda: self._extract(image))
 
+    def match(self, pairs: Sequence[ImagePair]) -> list[Outcome]:
+        """Take a batch of pairs through the stages before estimation; a pair that fails has a reason and harms no other."""
+        return self._batched("pruning", self._prune, [self._match(pair) for pair in pairs])
+
+    def estimate(self, outcomes: Sequence[Outcome], seed: int = 0) -> list[Outcome]:
+        """The last stage, for outcomes of `match`."""
+        return self._batched("estimation", functools.partial(self._estimate, seed=seed), outcomes)
+
     def run(self, pairs: Sequence[ImagePair], seed: int = 0) -> list[Outcome]:
-        """Take a batch of pairs through all stages; a pair that fails has a reason and harms no other."""
-        matched = [self._match(pair) for pair in pairs]
-        alive = [m for m in matched if m.correspondences is not None]
-        outcomes: dict[int, Outcome] = {}
-        if alive:
-            for m, outcome in zip(alive, self._prune_and_estimate(alive, seed), strict=True):
-                outcomes[id(m)] = outcome
-        return [outcomes[id(m)] if id(m) in outcomes else _failed(m) for m in matched]
+        """Take a batch of pairs through all four stages."""
+        return self.estimate(self.match(pairs), seed)
+
+    def _batched(
+        self, stage: str, function: Callable[[list[Outcome]], list[Outcome]], outcomes: Sequence[Outcome]
+    ) -> list[Outcome]:
+        """A batched stage over the pairs that live; where it raises, once more pair by pair: only the culprit fails."""
+        alive = [i for i, outcome in enumerate(outcomes) if outcome.correspondences is not None]
+        start = time.perf_counter()
+        try:
+            made = function([outcomes[i] for i in alive]) if alive else []
+        except Exception:  # whose fault it is shows pair by pair
+            made = [_alone(stage, function, outcomes[i]) for i in alive]
+        _synchronise(self.device)
+        share = (time.perf_counter() - start) / max(len(alive), 1)
+        result = list(outcomes)
+        for i, outcome in zip(alive, made, strict=True):
+            result[i] = dataclasses.replace(outcome, seconds={**outcome.seconds, stage: share})
+        return result
 
     def _extract(self, image: ImageSource) -> tuple[Features, float]:
         start = time.perf_counter()
         features = self.extractor(read_image(image)).to(self.device)
         return features, time.perf_counter() - start
 
-    def _match(self, pair: ImagePair) -> _Matched:
+    def _match(self, pair: ImagePair) -> Outcome:
         if pair.problem is not None:
-            return _Matched(pair, reason=pair.problem)
+            return Outcome(pair, reason=pair.problem)
         try:
             (features0, seconds0), (features1, seconds1) = self.features(pair.image0), self.features(pair.image1)
         except Exception as error:  # a pair that fails becomes a row with this reason
-            return _Matched(pair, reason=_describe("features", error))
+            return Outcome(pair, reason=_describe("features", error))
         seconds = {"features": seconds0 + seconds1}
         counts = (len(features0), len(features1))
         if min(counts) == 0:
             which = " and ".join(f"image {i}" for i in (0, 1) if counts[i] == 0)
-            return _Matched(pair, counts, seconds=seconds, reason=f"no keypoints in {which}")
+            return Outcome(pair, counts, seconds=seconds, reason=f"no keypoints in {which}")
         start = time.perf_counter()
         try:
             c = self.matcher(features0, features1)
         except Exception as error:
-            return _Matched(pair, counts, seconds=seconds, reason=_describe("matching", error))
+            return Outcome(pair, counts, seconds=seconds, reason=_describe("matching", error))
         seconds["matching"] = time.perf_counter() - start
         K0, K1 = (_calibration(K, self.device) for K in (pair.K0, pair.K1))
         c = c.replace(key=torch.tensor([pair.key], device=self.device), K0=K0, K1=K1)
-        return _Matched(pair, counts, c, seconds)
+        return Outcome(pair, counts, c, None, seconds)
 
-    def _prune_and_estimate(self, matched: list[_Matched], seed: int) -> list[Outcome]:
-        """The batched stages; where they raise, once more pair by pair, so that only the culprit fails."""
-        stage, start = "pruning", time.perf_counter()
-        try:
-            c = collate([m.correspondences for m in matched if m.correspondences is not None])
-            for pruner in self.pruners.values():
-                c = pruner(c).compact()
-            pruned, stage = time.perf_counter(), "estimation"
-            estimate = self.estimator(c, seed).detach()
-            _synchronise(self.device)
-            done = time.perf_counter()
-        except Exception as error:
-            if len(matched) > 1:
-                return [outcome for m in matched for outcome in self._prune_and_estimate([m], seed)]
-            return [_failed(dataclasses.replace(matched[0], reason=_describe(stage, error)))]
-        share = {"pruning": (pruned - start) / len(matched), "estimation": (done - pruned) / len(matched)}
-        c, estimate = c.detach().to("cpu"), estimate.to("cpu")
+    def _prune(self, outcomes: list[Outcome]) -> list[Outcome]:
+        c = _collated(outcomes)
+        for pruner in self.pruners.values():
+            c = pruner(c).compact()
+        return [dataclasses.replace(outcome, correspondences=c[i]) for i, outcome in enumerate(outcomes)]
+
+    def _estimate(self, outcomes: list[Outcome], seed: int) -> list[Outcome]:
+        estimate = self.estimator(_collated(outcomes), seed).detach()
         return [
-            Outcome(m.pair, m.features, c[i], estimate[i], {**m.seconds, **share}, estimate.reason[i])
-            for i, m in enumerate(matched)
+            dataclasses.replace(outcome, estimate=estimate[i], reason=estimate.reason[i])
+            for i, outcome in enumerate(outcomes)
         ]
 
 
-def _failed(m: _Matched) -> Outcome:
-    return Outcome(m.pair, m.features, None, None, m.seconds, m.reason)
+def _collated(outcomes: list[Outcome]) -> Correspondences:
+    return collate([outcome.correspondences for outcome in outcomes if outcome.correspondences is not None])
+
+
+def _alone(stage: str, function: Callable[[list[Outcome]], list[Outcome]], outcome: Outcome) -> Outcome:
+    """A stage on a single pair; what it raises becomes the reason for that pair's failure."""
+    try:
+        return function([outcome])[0]
+    except Exception as error:
+        return dataclasses.replace(outcome, correspondences=None, reason=_describe(stage, error))
 
 
 def _describe(stage: str, error: Exception) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -25,6 +25,7 @@ def part(role: str, name: str, choices: Mapping[str, T]) -> T:
     return choices[name]
 
 
+@runtime_checkable
 class Solver(Protocol):
     """A minimal solver: `size` matches in, up to a few models out."""
 
@@ -107,6 +108,7 @@ class RobustDeviations:
         return (r2 <= (2.5 * sigma).square()) & problem.live
 
 
+@runtime_checkable
 class FinalFit(Protocol):
     """Turns the best hypothesis and its inliers into the estimate; attached to the graph of the points."""
 

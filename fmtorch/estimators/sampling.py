@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Int
@@ -16,6 +16,7 @@ _RANDOM_BITS = 32
 _TOTAL_BITS = 30  # cumulative weights stay below 2^30, so that 32 random bits times a total fit an int64
 
 
+@runtime_checkable
 class Sampler(Protocol):
     """Draws minimal samples without replacement."""
 

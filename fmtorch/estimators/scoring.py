@@ -6,7 +6,7 @@ tile size, padding or batch can change a score. Larger is better.
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -35,6 +35,7 @@ def sampson_squared(F: Float[Tensor, "9 p m"], points: Float[Tensor, "4 p n"]) -
     return error.square_().div_(slope.clamp_min_(torch.finfo(slope.dtype).tiny))
 
 
+@runtime_checkable
 class Score(Protocol):
     """Turns squared residuals into scores."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from collections.abc import Sequence
@@ -16,9 +17,20 @@ from fmtorch.storage import PairRow
 def evaluate(outcomes: Sequence[Outcome], seed: int = 0) -> list[PairRow]:
     """One row a pair. NSGD is 1 where the pipeline failed; an inlier rate is NaN where it is not defined."""
     start = time.perf_counter()
+    outcomes = [_on_cpu(outcome) for outcome in outcomes]
     figures = [_figures(outcome, seed) for outcome in outcomes]
     seconds = (time.perf_counter() - start) / max(len(outcomes), 1)
     return [_row(outcome, values, seconds) for outcome, values in zip(outcomes, figures, strict=True)]
+
+
+def _on_cpu(outcome: Outcome) -> Outcome:
+    """The outcome with its tensors on the CPU: metrics are float64, and a row's worth of work needs no GPU."""
+    c, estimate = outcome.correspondences, outcome.estimate
+    return dataclasses.replace(
+        outcome,
+        correspondences=None if c is None else c.to("cpu"),
+        estimate=None if estimate is None else estimate.to("cpu"),
+    )
 
 
 def _figures(outcome: Outcome, seed: int) -> dict[str, float]:

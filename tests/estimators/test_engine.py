@@ -53,7 +53,7 @@ def test_chunks_of_pairs_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None
 def test_gradients_reach_the_points() -> None:
     c = scenes()
     x0, x1 = (x.double().requires_grad_() for x in (c.x0, c.x1))
-    estimate = HypothesizeAndVerify(hypotheses=200)(c.replace(x0=x0, x1=x1))
+    estimate = HypothesizeAndVerify(hypotheses=200, refit_inliers=False)(c.replace(x0=x0, x1=x1))
     estimate.F.square()[:, 0, 1].sum().backward()
     for x in (x0, x1):
         assert x.grad is not None
