@@ -36,21 +36,20 @@ _CLASSES = {
     "stereo": ("fmtorch.data.rendered", "StereoPair"),
 }
 _WITHOUT_SPLIT = frozenset(("stereo",))
-_DRAWN_ON_FIRST_USE = frozenset(("rendered",))
+_GENERATED = frozenset(("rendered",))
 
 
 def load(
     name: str,
     split: str = "test",
     root: str | Path | None = None,
-    *,
     progress: Callable[[int, int], None] | None = None,
     **options: Any,
 ) -> PairDataset:
     """The data set `name` (fmbench, rendered, stereo): an indexable of `ImagePair`, as torch's DataLoader takes it.
 
-    root: where it lies, or for generated sets where they are kept. options: the data set's own.
-    progress: called with (done, total) while a set is drawn on its first use; others are there at once.
+    root: where it lies, or for generated sets where they are kept. progress: called with (done, total) while a
+    generated set is drawn for the first time. options: the data set's own.
     Raises DataError (a ValueError) for an unknown name or for data that cannot be used.
     """
     if name not in _CLASSES:
@@ -61,7 +60,7 @@ def load(
         raise DataError("fmbench needs root: a set's folder with pairs_with_gt.txt, or a folder of such sets")
     if name not in _WITHOUT_SPLIT:
         options["split"] = split
-    if name in _DRAWN_ON_FIRST_USE:
+    if name in _GENERATED and progress is not None:
         options["progress"] = progress
     module, cls = _CLASSES[name]
     return cast(PairDataset, getattr(importlib.import_module(module), cls)(**options))

@@ -89,8 +89,8 @@ class HypothesizeAndVerify:
         made, reasons = problems(c, seed, self.solver.size)
         limit = max(1, (GPU_SAMPLES if device.type == "cuda" else CPU_SAMPLES) // self.round)
         for whole in made:
-            for some in torch.arange(len(whole.pair), device=device).split(limit):
-                problem = whole[some]
+            for first in range(0, len(whole.pair), limit):
+                problem = whole[torch.arange(first, min(first + limit, len(whole.pair)), device=device)]
                 estimate, support, found, drawn = self._solve(problem)
                 F = F.index_copy(0, problem.pair, torch.where(found[:, None, None], problem.to_pixels(estimate), 0))
                 inliers[problem.pair[:, None], problem.slot] |= support & problem.live & found[:, None]

@@ -31,8 +31,9 @@ def sampson_squared(F: Float[Tensor, "9 p m"], points: Float[Tensor, "4 p n"]) -
     error = (f[6] * x0).addcmul_(f[7], y0).add_(f[8]).addcmul_(a0, x1).addcmul_(b0, y1)
     a1 = (f[0] * x1).addcmul_(f[3], y1).add_(f[6])  # F^T x1: the epipolar line in image 0
     b1 = (f[1] * x1).addcmul_(f[4], y1).add_(f[7])
-    slope = a0.square_().addcmul_(b0, b0).addcmul_(a1, a1).addcmul_(b1, b1)
-    return error.square_().div_(slope.clamp_min_(torch.finfo(slope.dtype).tiny))
+    slope: Tensor = a0.square_().addcmul_(b0, b0).addcmul_(a1, a1).addcmul_(b1, b1)
+    distance: Tensor = error.square_().div_(slope.clamp_min_(torch.finfo(slope.dtype).tiny))
+    return distance
 
 
 @runtime_checkable
