@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-
 import numpy as np
 
 from fmtorch.data.rendered.cameras import calibration, look_at
@@ -87,7 +85,7 @@ def scene(rng: Rng, split: str, shots: int, scale: float) -> Scene:
     for side in (-1, 1):
         right = vec(1, 0, 0) if side < 0 else vec(1, 0, 0)
         foot = vec(side * (width / 2 + 3) - (12 if side < 0 else 0), 4, 0)
-        house(fixed, rng, split, foot, right, (12, 8, rng.uniform(7, 11)), Style(density=30, same_windows=0.8))
+        house(fixed, rng, split, foot, right, (12, 8, rng.uniform(7, 11)), Style(density=30, same_windows=0.8), sides="plain")
         for _ in range(3):
             at = vec(side * rng.uniform(width / 2 - 3, width / 2 + 8), -rng.uniform(2, 10), 0)
             tree(fixed, rng, at, rng.uniform(4, 7), leaf, bark)
@@ -104,9 +102,7 @@ def scene(rng: Rng, split: str, shots: int, scale: float) -> Scene:
             sun(turn, rng.uniform(22, 60)), sun=(direct, direct * (0.97 - 0.3 * warm), direct * (0.9 - warm)),
             sky=(0.42, 0.44, 0.5), clouds=k,
         ))  # fmt: skip
-        crowd = copy.copy(fixed)
-        crowd.textures, crowd._rows = list(fixed.textures), list(fixed._rows)
-        crowd._texture, crowd._flags = list(fixed._texture), list(fixed._flags)
+        crowd = fixed.copy()
         for _ in range(14):
             at = vec(rng.normal(0, width / 3), -rng.uniform(3, 22), 0)
             walker(crowd, rng, at, rng.uniform(225, 315))

@@ -78,7 +78,7 @@ def _street(surfaces: Surfaces, rng: Rng, split: str, length: float) -> None:
         x = rng.uniform(0, 8)
         while x < length + 30:
             kind = rng.random()
-            if kind < 0.55:
+            if kind < 0.45:
                 car(surfaces, rng, vec(x, side * (half - 1.0), 0), vec(side * -1.0, 0, 0))
             elif kind < 0.75:
                 tree(surfaces, rng, vec(x, side * (half + 0.7), 0.1), rng.uniform(3.5, 6), leaf, bark)
@@ -97,18 +97,27 @@ def scene(rng: Rng, split: str, shots: int, scale: float) -> Scene:
     _street(surfaces, rng, split, length)
     size = (round(SIZE[0] * scale), round(SIZE[1] * scale))
     K = calibration(FOCAL * scale, size, (CENTRE[0] * scale, CENTRE[1] * scale))
-    speed, bend = rng.uniform(0.6, 1.3) * SPACING, rng.normal(0, 0.6)
+    speed, bend = float(np.exp(rng.uniform(np.log(0.06), np.log(1.4)))) * SPACING, rng.normal(0, 0.6)
     drift = rng.uniform(-1.2, 0.2)
-    taken = []
-    for i in frames.tolist():
+    light = Light(sun(rng.uniform(0, 360), rng.uniform(25, 60)))
+    lens = Lens(grey=True, noise=rng.uniform(2.5, 5.0), blur=rng.uniform(0.6, 0.9), exposure=rng.uniform(0.7, 1.4))
+    traffic = [(rng.uniform(7, 16), -1.7, rng.uniform(0.85, 1.15) * speed)] if rng.random() < 0.7 else []
+    traffic += [(rng.uniform(8, 60), 1.7, -rng.uniform(0.5, 1.2)) for _ in range(int(rng.integers(0, 3)))]
+    models = [int(rng.integers(2**31)) for _ in traffic]
+    taken, views = [], []
+    for k, i in enumerate(frames.tolist()):
         x = 2.0 + i * speed
         y = drift + bend * np.sin(i * speed / 14) + rng.normal(0, 0.01)
         slope = np.degrees(bend / 14 * np.cos(i * speed / 14)) + rng.normal(0, 0.4)
         eye = vec(x, y, HEIGHT + rng.normal(0, 0.015))
         at = eye + direction(slope) + vec(0, 0, -0.02 + rng.normal(0, 0.006))
         camera = look_at(K, size, eye.tolist(), at.tolist(), roll=float(rng.normal(0, 0.006)))
-        taken.append(Shot(camera, Lens(grey=True, noise=3.0, blur=0.6, exposure=1.1)))
-    light = Light(sun(rng.uniform(0, 360), rng.uniform(25, 60)), clouds=0)
+        taken.append(Shot(camera, lens, light=k, jpeg=97))
+        view = surfaces.copy()
+        for (start, lane, pace), model in zip(traffic, models, strict=True):
+            foot = vec(2.0 + start + i * pace, lane, 0)
+            car(view, np.random.default_rng(model), foot, vec(1.0 if lane < 0 else -1.0, 0, 0))
+        views.append(view)
     sky = heaven(rng, rng.uniform(-0.3, 0.8))
     pairs = [(i, j) for i in range(shots) for j in range(i + 1, shots) if frames[j] - frames[i] <= WINDOW]
-    return Scene([surfaces], [light], sky, taken, [pairs[k] for k in rng.permutation(len(pairs))])
+    return Scene(views, [light] * shots, sky, taken, [pairs[k] for k in rng.permutation(len(pairs))])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -143,13 +144,26 @@ def front(
 
 
 def house(
-    surfaces: Surfaces, rng: Rng, split: str, foot: Vector, right: Vector, size: tuple[float, float, float], style: Style
-) -> None:
-    """A house with a front on each side: `foot` its front left corner, `size` its width, depth and height."""
+    surfaces: Surfaces, rng: Rng, split: str, foot: Vector, right: Vector, size: tuple[float, float, float],
+    style: Style, sides: Literal["own", "twin", "plain"] = "own",
+) -> None:  # fmt: skip
+    """A house: `foot` its front left corner, `size` its width, depth and height.
+
+    sides: each with a front of its `own`; opposite sides as `twin`s, so that they are easily confused; or the last
+    three flat and `plain`, for a house far away.
+    """
     width, depth, height = size
     back = -np.cross(right, vec(0, 0, 1))
     corners = [foot, foot + right * width, foot + right * width + back * depth, foot + back * depth]
-    for corner, along, length in zip(corners, (right, back, -right, -back), (width, depth, width, depth), strict=True):
-        number = front(surfaces, rng, split, corner, along, length, height, style)
     top = vec(0, 0, height)
+    twins = np.random.SeedSequence(int(rng.integers(2**31))).spawn(2)
+    number = -1
+    for i, (corner, along, length) in enumerate(
+        zip(corners, (right, back, -right, -back), (width, depth, width, depth), strict=True)
+    ):
+        if sides == "plain" and i > 0:
+            surfaces.quad(corner + top, along * length, -top, number, (0, 0, length / width, 1))
+        else:
+            own = rng if sides != "twin" else np.random.default_rng(twins[i % 2])
+            number = front(surfaces, own, split, corner, along, length, height, style)
     surfaces.quad(corners[3] + top, right * width, -back * depth, number, (0, 0, 1, 0.1))

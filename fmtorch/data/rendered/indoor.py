@@ -72,9 +72,9 @@ def _desk(surfaces: Surfaces, rng: Rng, split: str, centre: Vector) -> None:
             surfaces.box(corner + right * x + back * y, right * 0.06, back * 0.06, tall - 0.05, [top] * 5, strip)
     taken: list[tuple[float, float]] = []
     photos = pictures(split, rng, 3)
-    for k in range(9):
+    for k in range(14):
         x, y = rng.uniform(0.15, wide - 0.35), rng.uniform(0.12, deep - 0.3)
-        if any(np.hypot(x - a, y - b) < 0.22 for a, b in taken):
+        if any(np.hypot(x - a, y - b) < 0.19 for a, b in taken):
             continue
         taken.append((x, y))
         base = corner + right * x + back * y + vec(0, 0, tall)
@@ -123,13 +123,20 @@ def scene(rng: Rng, split: str, shots: int, scale: float) -> Scene:
     desk = vec(rng.uniform(-0.4, 0.4), half - rng.uniform(0.6, 1.0), 0)
     _desk(surfaces, rng, split, desk)
     photos = pictures(split, rng, 2) + [to_pixels(poster(rng, 360, 270)) for _ in range(3)]
-    _on_wall(surfaces, photos[0], 1, half, rng.uniform(-1.3, -0.4), 1.6, 0.6)
-    if rng.random() < 0.6:
-        _on_wall(surfaces, photos[2], 1, half, rng.uniform(0.5, 1.3), 1.55, 0.45)
+    _on_wall(surfaces, photos[0], 1, half, rng.uniform(0.9, 1.4), 1.55, 0.6)
+    if rng.random() < 0.8:
+        _on_wall(surfaces, photos[2], 1, half, rng.uniform(-1.4, -0.9), 1.5, 0.5)
     _on_wall(surfaces, photos[1], 0, half, rng.uniform(-1, 0.5), 1.5, 0.7)
     _on_wall(surfaces, photos[3], 2, half, rng.uniform(-0.5, 1), 1.5, 0.6)
     style = np.random.SeedSequence(int(rng.integers(2**31)))
     _on_wall(surfaces, to_pixels(window(rng, 512, 420, style) * 2.2 + 0.1), 2 * int(rng.integers(2)), half, -1.2, 1.6, 1.1)
+    shelf = surfaces.texture(to_pixels(books(rng, 192, 768)))
+    board = _flat(surfaces, rng)
+    x = rng.uniform(-0.6, 0.4)
+    for z in (1.25, 1.62)[: int(rng.integers(1, 3))]:
+        surfaces.box(vec(x, half - 0.25, z), vec(1.1, 0, 0), vec(0, 0.25, 0), 0.03, [board] * 5)
+        surfaces.box(vec(x + 0.05, half - 0.2, z + 0.03), vec(0.9, 0, 0), vec(0, 0.2, 0), 0.22,
+                     [shelf, board, board, board, board])  # fmt: skip
     _cabinet(surfaces, rng, vec(half - 1.2, half - 0.55, 0), rng.uniform(-6, 6))
     rug = surfaces.texture(to_pixels(cloth(rng, 384, 512)))
     surfaces.quad(vec(-1.1, half - 1.3, 0.01), vec(2.2, 0, 0), vec(0, -1.6, 0), rug)
@@ -151,9 +158,13 @@ def scene(rng: Rng, split: str, shots: int, scale: float) -> Scene:
     taken = []
     for t in times:
         moments = [camera(float(t + EXPOSURE * (k / (SUBFRAMES - 1) - 0.5))) for k in range(SUBFRAMES)]
-        taken.append(Shot(camera(float(t)), Lens(blur=0.7, noise=4.5, exposure=1.0), moments=moments, jpeg=95))
+        taken.append(Shot(camera(float(t)), Lens(blur=0.6, noise=4.0, exposure=1.15), moments=moments, jpeg=95))
     up = rng.uniform(0.7, 1.0)
-    light = Light((0.2, -0.35, 1.0), sun=(0.0, 0.0, 0.0), sky=(up, 0.97 * up, 0.9 * up), ground_shade=0.2)
+    direct = rng.uniform(0.25, 0.5)
+    light = Light(
+        (rng.uniform(-0.5, 0.5), rng.uniform(-0.8, -0.3), 1.0), sun=(direct, 0.95 * direct, 0.85 * direct),
+        sky=(up, 0.97 * up, 0.92 * up), ground_shade=0.2, through_walls=True,
+    )  # fmt: skip
     sky = np.full((8, 16, 3), 128, dtype=np.uint8)
     pairs = [(i, j) for i in range(shots) for j in range(i + 1, shots) if 0 < times[j] - times[i] <= WINDOW]
     return Scene([surfaces], [light], sky, taken, [pairs[k] for k in rng.permutation(len(pairs))])

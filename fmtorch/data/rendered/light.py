@@ -27,6 +27,7 @@ class Light:
     sun: tuple[float, float, float] = (1.0, 0.95, 0.85)
     sky: tuple[float, float, float] = (0.38, 0.42, 0.5)
     ground_shade: float = 0.35  # how much darker the foot of a wall is: mild ambient occlusion
+    through_walls: bool = False  # whether pieces lit from behind let the light in: a room seen without its ceiling
     clouds: int = 0  # turns the sky picture, so that photographs of different days differ
 
 
@@ -64,7 +65,9 @@ class Stage:
         P[:2, 3] = -low[:2] * scale
         P[2, 3] = 1.0
         depth = np.append(axes[2], -low[2])
-        hits = geometry.cast(P, depth, (_SHADOW_MAP, _SHADOW_MAP), None)
+        lit_from_behind = geometry.normal @ toward <= 0
+        skip = lit_from_behind & ~geometry.both_sides if light.through_walls else None
+        hits = geometry.cast(P, depth, (_SHADOW_MAP, _SHADOW_MAP), None, skip)
         # Per piece: texture u v, shadow map x y and depth, height, cosine to the sun, upwardness; affine in (s, t).
         self.table = np.zeros((len(geometry.O), 3, 8), dtype=np.float32)
         self.table[..., :2] = geometry.uv
@@ -83,7 +86,10 @@ class Stage:
     def radiance(self, camera: Camera, offset: tuple[float, float]) -> Floats:
         """Linear colour (h, w, 3) along the rays `offset` away from the pixel centres."""
         hits = self.geometry.look(camera, offset)
-        out = self._background(camera, offset)
+        if (hits.piece >= 0).all():
+            out = np.empty((*camera.size, 3), dtype=np.float32)
+        else:
+            out = self._background(camera, offset)
         index = np.flatnonzero(hits.piece.ravel() >= 0)
         piece = hits.piece.ravel()[index]
         order = np.argsort(self.geometry.texture[piece], kind="stable")

@@ -59,7 +59,7 @@ def _structure(surfaces: Surfaces, rng: Rng, split: str) -> float:
         inner = 0.62
         house(
             surfaces, rng, split, vec(-width * inner / 2, -depth * inner / 2, base), vec(1, 0, 0),
-            (width * inner, depth * inner, height), Style(density=110, storey=2.4, bay=1.7, depth=0.2),
+            (width * inner, depth * inner, height), Style(density=110, storey=2.4, bay=1.7, depth=0.2), sides="twin",
         )  # fmt: skip
         for x in np.linspace(-width / 2 + 0.3, width / 2 - 0.3, 4):
             for y in np.linspace(-depth / 2 + 0.3, depth / 2 - 0.3, 4):
@@ -68,7 +68,7 @@ def _structure(surfaces: Surfaces, rng: Rng, split: str) -> float:
     else:
         house(
             surfaces, rng, split, vec(-width / 2, -depth / 2, base), vec(1, 0, 0), (width, depth, height),
-            Style(density=110, storey=2.3, bay=1.6, depth=0.28, pilasters=kind < 0.75, same_windows=0.6),
+            Style(density=110, storey=1.5, bay=1.1, depth=0.22, pilasters=kind < 0.75, same_windows=0.8), sides="twin",
         )  # fmt: skip
     base += height
     frieze = surfaces.texture(to_pixels(wall_picture(rng, split, 256, 1024, 60)))
@@ -85,9 +85,9 @@ def _structure(surfaces: Surfaces, rng: Rng, split: str) -> float:
         surfaces.lathe(vec(0, 0, base), profile, block, sides=16, repeat=(2, 1))
     else:
         statue(surfaces, rng, vec(0, 0, base), 2.2, stone)
-    paintings = pictures(split, rng, 3) + [to_pixels(poster(rng, 384, 288)) for _ in range(3)]
+    paintings = [*pictures(split, rng, 2), to_pixels(poster(rng, 384, 288))]
     for k, picture in enumerate(paintings):  # boards that stand round it
-        angle = 60 * k + rng.uniform(-20, 20)
+        angle = 120 * k + rng.uniform(-30, 30)
         foot = direction(angle) * (0.5 * np.hypot(width, depth) + rng.uniform(0.8, 2.2))
         right = direction(angle + 90 + rng.uniform(-30, 30))
         tall = 1.3
@@ -125,7 +125,7 @@ def surroundings(surfaces: Surfaces, rng: Rng, split: str, near: float, far: flo
         right = np.cross(vec(0, 0, 1), -outward)
         foot = outward * rng.uniform(0.7 * far, far) - right * width / 2
         style = Style(density=30, storey=3.0, bay=2.8, depth=0.25, same_windows=0.8)
-        house(surfaces, rng, split, foot, right, (width, 7.0, rng.uniform(6, 11)), style)
+        house(surfaces, rng, split, foot, right, (width, 7.0, rng.uniform(6, 11)), style, sides="plain")
     for _ in range(9):
         at = direction(rng.uniform(0, 360)) * rng.uniform(near, far * 0.8)
         tree(surfaces, rng, at, rng.uniform(4, 8), leaf, bark)
@@ -162,4 +162,13 @@ def scene(rng: Rng, split: str, shots: int, scale: float) -> Scene:
     light = Light(sun(rng.uniform(0, 360), rng.uniform(30, 65)))
     apart = np.abs((azimuth[:, None] - azimuth[None] + 180) % 360 - 180)
     pairs = [(i, j) for i in range(shots) for j in range(i + 1, shots) if ANGLES[0] <= apart[i, j] <= ANGLES[1]]
-    return Scene([surfaces], [light], heaven(rng, rng.uniform(-0.4, 0.6)), taken, [pairs[k] for k in rng.permutation(len(pairs))])
+    # Wide before narrow within each round, so that the pairs kept spread evenly over the angles.
+    width = (ANGLES[1] - ANGLES[0]) / 4
+    rounds: dict[int, int] = {}
+    order = []
+    for k in rng.permutation(len(pairs)):
+        step = int((apart[pairs[k]] - ANGLES[0]) / width)
+        rounds[step] = rounds.get(step, 0) + 1
+        order.append((rounds[step], -step, pairs[k]))
+    sky = heaven(rng, rng.uniform(-0.4, 0.6))
+    return Scene([surfaces], [light], sky, taken, [pair for _, _, pair in sorted(order)])

@@ -45,17 +45,22 @@ class Geometry:
         self.normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
         self.corners = np.stack([self.O, self.O + self.U, self.O + self.U + self.V, self.O + self.V], axis=1)
 
-    def cast(self, P: Matrix, depth: Matrix, size: tuple[int, int], centre: Matrix | None) -> Hits:
+    def cast(
+        self, P: Matrix, depth: Matrix, size: tuple[int, int], centre: Matrix | None, skip: NDArray[np.bool_] | None = None
+    ) -> Hits:
         """Rays of all pixels of a projection P (3, 4), perspective or (last row 0 0 0 1) orthographic.
 
         depth: (4,), the affine function of the world by which the nearer of two pieces is known.
         centre: where a perspective camera stands, for leaving out the backs of pieces; None keeps them.
+        skip: pieces (n,) to look through.
         """
         h, w = size
         G = np.stack([self.U @ P[:, :3].T, self.V @ P[:, :3].T, self.O @ P[:, :3].T + P[:, 3]], axis=2)
         usable = np.abs(np.linalg.det(G)) > 1e-14
         if centre is not None:
             usable &= self.both_sides | (((centre - self.O) * self.normal).sum(1) > 0)
+        if skip is not None:
+            usable &= ~skip
         inverse = np.zeros_like(G)
         inverse[usable] = np.linalg.inv(G[usable])
         zO, zU, zV = self.O @ depth[:3] + depth[3], self.U @ depth[:3], self.V @ depth[:3]
@@ -64,10 +69,9 @@ class Geometry:
         piece = np.full((h, w), -1, dtype=np.int32)
         s_out, t_out = np.zeros((h, w), np.float32), np.zeros((h, w), np.float32)
         nearest_first = np.argsort((self.corners @ depth[:3]).min(1), kind="stable")
-        for i in nearest_first:
-            x0, y0, x1, y1 = boxes[i]
-            if not usable[i] or x0 >= x1 or y0 >= y1:
-                continue
+        on_screen = (boxes[:, 0] < boxes[:, 2]) & (boxes[:, 1] < boxes[:, 3])
+        for i in nearest_first[on_screen[nearest_first]]:
+            x0, y0, x1, y1 = boxes[i].tolist()
             # The linear forms, re-centred on the box in float64 so that float32 is accurate inside it.
             A = inverse[i].copy()
             A[:, 2] += A[:, 0] * x0 + A[:, 1] * y0

@@ -18,6 +18,9 @@ def vec(*v: float) -> Vector:
     return np.array(v, dtype=np.float64)
 
 
+_FLAT = np.full(9, np.nan)  # stands for the normals of a flat piece until they are computed for all at once
+
+
 class Surfaces:
     """A growing list of flat pieces: points ``O + s U + t V`` with s, t in [0, 1] (and s + t <= 1 in a triangle).
 
@@ -44,10 +47,8 @@ class Surfaces:
         *, triangle: bool = False, normals: NDArray[np.float64] | None = None, both_sides: bool = False,
     ) -> None:  # fmt: skip
         """One piece; `uv` (3, 2) and `normals` (3, 3) are the values at O and their change along U and along V."""
-        if normals is None:
-            n = np.cross(V, U)
-            normals = np.stack([n / np.linalg.norm(n), np.zeros(3), np.zeros(3)])
-        self._rows.append(np.concatenate([O, U, V, uv.ravel(), normals.ravel()]))
+        flat = _FLAT if normals is None else normals.ravel()
+        self._rows.append(np.concatenate([O, U, V, uv.ravel(), flat]))
         self._texture.append(texture)
         self._flags.append((triangle, both_sides))
 
@@ -109,9 +110,20 @@ class Surfaces:
         points[..., 2] = steps[:, :1]
         self.grid(points + base, texture, repeat)
 
+    def copy(self) -> Surfaces:
+        """A list of its own with the same pieces and textures, to which more can be added."""
+        other = Surfaces()
+        other.textures, other._rows = list(self.textures), list(self._rows)
+        other._texture, other._flags = list(self._texture), list(self._flags)
+        return other
+
     def arrays(self) -> dict[str, NDArray[np.float64]]:
         """All pieces as arrays: O, U, V (n, 3), uv (n, 3, 2), normals (n, 3, 3)."""
         rows = np.array(self._rows).reshape(-1, 24)
+        flat = np.isnan(rows[:, 15])
+        normal = np.cross(rows[flat, 6:9], rows[flat, 3:6])
+        rows[flat, 15:] = 0
+        rows[flat, 15:18] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
         return {
             "O": rows[:, 0:3], "U": rows[:, 3:6], "V": rows[:, 6:9],
             "uv": rows[:, 9:15].reshape(-1, 3, 2), "normals": rows[:, 15:24].reshape(-1, 3, 3),

@@ -1,6 +1,6 @@
 """Several scenes at a time, each worker a process of its own that draws one scene after another.
 
-The workers are started as ``python -m fmtorch.data.rendered.workers FOLDER``: unlike multiprocessing this asks nothing
+The workers are started as ``python -m fmtorch.data.rendered``: unlike multiprocessing this asks nothing
 of the caller's main module, and forks no process that has threads. A worker ends when its input is closed.
 """
 
@@ -76,7 +76,7 @@ def _start() -> subprocess.Popen[str]:
     home = str(Path(fmtorch.__file__).resolve().parents[1])
     path = os.pathsep.join([home, *filter(None, [os.environ.get("PYTHONPATH")])])
     return subprocess.Popen(
-        [sys.executable, "-m", "fmtorch.data.rendered.workers"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        [sys.executable, "-m", "fmtorch.data.rendered"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
         text=True, env={**os.environ, **_ONE_THREAD, "PYTHONPATH": path},
     )  # fmt: skip
 
@@ -102,16 +102,3 @@ def _feed(
         finished.put(problem)
         if problem is not None:
             return
-
-
-def main() -> None:
-    """Draws the scenes named on standard input, one JSON object a line, and answers each with its name."""
-    for line in sys.stdin:
-        job = json.loads(line)
-        task = Task.from_json(json.dumps(job["task"]))
-        generate(task, Path(job["folder"]))
-        print(task.name, flush=True)
-
-
-if __name__ == "__main__":
-    main()
