@@ -1,3 +1,8 @@
 """fmtorch: batched, differentiable two-view geometry in PyTorch."""
 
 __version__ = "0.1.0"
+
+from fmtorch.fundamental import find_fundamental
+from fmtorch.types import Correspondences, Estimate, Features
+
+__all__ = ["Correspondences", "Estimate", "Features", "__version__", "find_fundamental"]

@@ -10,13 +10,14 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from collections.abc import Sequence
-from typing import Any, Self, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-Index = int | slice | Sequence[int] | Tensor
+Index = int | slice | Sequence[int] | Sequence[bool] | Tensor
+Record = TypeVar("Record", bound="_Record")
 
 
 def pair_key(identity: str) -> int:
@@ -27,30 +28,41 @@ def pair_key(identity: str) -> int:
 class _Record:
     """Tensors with a common leading batch dimension, moved, indexed and replaced together."""
 
-    def to(self, device: torch.device | str) -> Self:
+    def to(self: Record, device: torch.device | str) -> Record:
         """The same record with every tensor on `device`."""
         return self._map(lambda value: value.to(device))
 
-    def detach(self) -> Self:
+    def detach(self: Record) -> Record:
         """The same record cut off from the graph."""
         return self._map(lambda value: value.detach())
 
-    def replace(self, **changes: Any) -> Self:
+    def replace(self: Record, **changes: Any) -> Record:
         """A copy with some fields changed (shapes are checked again)."""
-        return cast(Self, dataclasses.replace(cast(Any, self), **changes))
+        return cast(Record, dataclasses.replace(cast(Any, self), **changes))
 
-    def _map(self, function: Any) -> Self:
+    def _map(self: Record, function: Any, **changes: Any) -> Record:
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(cast(Any, self))}
-        return self.replace(**{name: function(v) for name, v in values.items() if isinstance(v, Tensor)})
+        mapped = {name: function(v) for name, v in values.items() if isinstance(v, Tensor)}
+        return self.replace(**mapped, **changes)
 
 
-def _as_index(index: Index) -> slice | Tensor:
-    """An index that keeps the batch dimension: the integer i selects the batch of one that holds element i."""
-    if isinstance(index, int):
-        return slice(index, index + 1 or None)
-    if isinstance(index, slice | Tensor):
+def _as_index(index: Index, length: int) -> slice | Tensor:
+    """An index that keeps the batch dimension: the integer i selects the batch of one that holds element i.
+
+    A list of booleans is a mask. Raises IndexError for an integer that is out of range, which also ends iteration.
+    """
+    if isinstance(index, slice):
         return index
-    return torch.as_tensor(list(index), dtype=torch.int64)
+    if isinstance(index, Tensor) and index.dim() > 0:
+        return index
+    if isinstance(index, int | Tensor):
+        i = int(index)
+        if not -length <= i < length:
+            raise IndexError(f"index {i} is out of range for {length} elements")
+        return slice(i, i + 1 or None)
+    chosen = list(index)
+    is_mask = bool(chosen) and all(isinstance(i, bool) for i in chosen)
+    return torch.as_tensor(chosen, dtype=torch.bool if is_mask else torch.int64)
 
 
 def _expect(name: str, value: Tensor | None, shape: tuple[int, ...]) -> None:
@@ -99,7 +111,7 @@ class Features(_Record):
 
     def __getitem__(self, index: Index) -> Features:
         """Of a batch, the selected images (still a batch); of one image, the selected features."""
-        i = _as_index(index)
+        i = _as_index(index, self.lafs.shape[0])
         size = self.image_size[i] if self.image_size.dim() > 1 else self.image_size
         return Features(self.lafs[i], self.scores[i], self.descriptors[i], size, self.valid[i])
 
@@ -153,7 +165,7 @@ class Correspondences(_Record):
 
     def __getitem__(self, index: Index) -> Correspondences:
         """The selected pairs, always as a batch."""
-        i = _as_index(index)
+        i = _as_index(index, len(self))
         return self._map(lambda value: value[i])
 
     def count(self) -> Int[Tensor, " b"]:
@@ -208,9 +220,9 @@ class Estimate(_Record):
 
     def __getitem__(self, index: Index) -> Estimate:
         """The selected pairs, always as a batch."""
-        i = _as_index(index)
+        i = _as_index(index, len(self))
         picked = torch.arange(len(self), device=self.ok.device)[i].tolist()
-        return self._map(lambda value: value[i]).replace(reason=tuple(self.reason[j] for j in picked))
+        return self._map(lambda value: value[i], reason=tuple(self.reason[j] for j in picked))
 
 
 def _pad(value: Tensor, dim: int, length: int) -> Tensor:
@@ -229,11 +241,14 @@ Item = TypeVar("Item", Features, Correspondences, Estimate)
 def collate(items: Sequence[Item]) -> Item:
     """One padded batch from several items: single-image `Features` are stacked, batches are joined.
 
-    Optional fields survive only where every item has them. Raises ValueError for an empty list.
+    Optional fields survive only where every item has them. Raises ValueError for an empty list, TypeError for items of
+    several kinds (single images and batches of images are two kinds).
     """
     if not items:
         raise ValueError("collate needs at least one item")
     first = items[0]
+    if len({(type(item), item.lafs.dim() if isinstance(item, Features) else 0) for item in items}) > 1:
+        raise TypeError(f"collate needs items of one kind, not {', '.join(type(item).__name__ for item in items[:5])}")
     n = max(_slots(item) for item in items)
     merged: dict[str, Any] = {}
     for field in dataclasses.fields(first):

@@ -1,1 +1,84 @@
 """Data sets of image pairs."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from fmtorch.data.fmbench import DataError, FMBenchPairs
+from fmtorch.data.images import ImageError, read_image, to_grey
+from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset
+
+__all__ = [
+    "DataError",
+    "FMBenchPairs",
+    "ImageError",
+    "ImagePair",
+    "ImageSource",
+    "PairBatch",
+    "PairDataset",
+    "collate",
+    "load",
+    "read_image",
+    "to_grey",
+]
+
+_CLASSES = {
+    "fmbench": ("fmtorch.data.fmbench", "FMBenchPairs"),
+    "rendered": ("fmtorch.data.rendered", "RenderedPairs"),
+    "stereo": ("fmtorch.data.rendered", "StereoPair"),
+}
+_WITHOUT_SPLIT = frozenset(("stereo",))
+_GENERATED = frozenset(("rendered",))
+
+
+def load(
+    name: str,
+    split: str = "test",
+    root: str | Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    **options: Any,
+) -> PairDataset:
+    """The data set `name` (fmbench, rendered, stereo): an indexable of `ImagePair`, as torch's DataLoader takes it.
+
+    root: where it lies, or for generated sets where they are kept. progress: called with (done, total) while a
+    generated set is drawn for the first time. options: the data set's own.
+    Raises DataError (a ValueError) for an unknown name or for data that cannot be used.
+    """
+    if name not in _CLASSES:
+        raise DataError(f"no data set {name!r}; there are {', '.join(_CLASSES)}")
+    if root is not None:
+        options["root"] = root
+    elif name == "fmbench":
+        raise DataError("fmbench needs root: a set's folder with pairs_with_gt.txt, or a folder of such sets")
+    if name not in _WITHOUT_SPLIT:
+        options["split"] = split
+    if name in _GENERATED and progress is not None:
+        options["progress"] = progress
+    module, cls = _CLASSES[name]
+    return cast(PairDataset, getattr(importlib.import_module(module), cls)(**options))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PairBatch:
+    """Several pairs and, stacked, their fundamental matrices (B, 3, 3) float64 and keys (B,)."""
+
+    pairs: tuple[ImagePair, ...]
+    F: Float[Tensor, "b 3 3"]
+    key: Int[Tensor, " b"]
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+
+def collate(pairs: Sequence[ImagePair]) -> PairBatch:
+    """A batch of pairs, for torch's DataLoader; images stay on disk."""
+    F = torch.stack([torch.from_numpy(pair.F) for pair in pairs]) if pairs else torch.zeros(0, 3, 3).double()
+    return PairBatch(tuple(pairs), F, torch.tensor([pair.key for pair in pairs], dtype=torch.int64))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +51,7 @@ class ImagePair:
         return pair_key(self.identity)
 
 
+@runtime_checkable
 class PairDataset(Protocol):
     """A sequence of image pairs.
 

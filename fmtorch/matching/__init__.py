@@ -1,1 +1,6 @@
 """Features x Features -> Correspondences."""
+
+from fmtorch.matching.matcher import NearestNeighborMatcher
+from fmtorch.matching.nearest import Neighbors, nearest_neighbors
+
+__all__ = ["NearestNeighborMatcher", "Neighbors", "nearest_neighbors"]

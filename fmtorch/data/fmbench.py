@@ -1,0 +1,223 @@
+"""Image pairs in the layout of the FM-Bench distribution (Bian et al., BMVC 2019)."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fmtorch.data.pairs import ImagePair, ImageSource
+
+_PAIRS, _SUBSETS, _CAMERAS = "pairs_with_gt.txt", "pairs_which_dataset.txt", "Camera.txt"
+_SUFFIXES = (".jpg", ".png")
+_PAIR_COLUMNS = "l r F11 F12 F13 F21 F22 F23 F31 F32 F33"
+_CAMERA_COLUMNS = "K (9 numbers, row by row), R (9), t (3)"
+
+
+class DataError(ValueError):
+    """A data set that cannot be used as a whole; the message names file, line and what would be right."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Camera:
+    K: NDArray[np.float64]
+    R: NDArray[np.float64]
+    t: NDArray[np.float64]
+
+
+class FMBenchPairs:
+    """The pairs of one or several sets in the authors' distribution layout.
+
+    root: one set's folder, which holds ``pairs_with_gt.txt``, or a folder of such sets.
+    split: the distribution holds test pairs only; a set for tuning has a root of its own.
+    sets: names of the sets to take from a folder of several, in this order; all, by name, when not given.
+    subset: names of the subsets (scenes) to take; all when not given.
+    cameras: read ``<subset>/Camera.txt`` where it stands, for K, R and t.
+
+    A pair's family is its set, its scene the subset, its identity ``<set>/<subset>/<l>-<r>``; image 0 is l.
+    A line with a NaN, infinite or zero F or a missing image becomes a pair with a `problem`; whatever makes the files
+    themselves unreliable raises DataError: a missing file, a wrong number of columns, files of different lengths,
+    an entry that is no number.
+    """
+
+    name = "fmbench"
+
+    def __init__(
+        self,
+        root: str | Path,
+        split: str = "test",
+        subset: str | Sequence[str] | None = None,
+        sets: Sequence[str] | None = None,
+        cameras: bool = True,
+    ) -> None:
+        if split != "test":
+            raise DataError(f"split {split!r}: the FM-Bench distribution has only 'test'; choose pairs by root or sets")
+        self._subsets = None if subset is None else {subset} if isinstance(subset, str) else set(subset)
+        self._cameras = cameras
+        self._hash = hashlib.blake2b(digest_size=16)
+        self._pairs: list[ImagePair] = []
+        self._seen: Counter[str] = Counter()
+        for folder in _set_folders(Path(root).expanduser(), sets):
+            self._read_set(folder)
+        present = {pair.scene for pair in self._pairs}
+        for missing in sorted((self._subsets or set()) - present):
+            raise DataError(f"{root}: no pairs of subset {missing!r}; it has {_listed(present) or 'no pairs'}")
+        self.digest = self._hash.hexdigest()
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def __getitem__(self, index: int) -> ImagePair:
+        return self._pairs[index]
+
+    def __iter__(self) -> Iterator[ImagePair]:
+        return iter(self._pairs)
+
+    def _read_set(self, folder: Path) -> None:
+        table = _read_numbers(folder / _PAIRS, _PAIR_COLUMNS, 11)
+        scenes = [line.strip().replace("\\", "/").strip("/") for line in _read_lines(folder / _SUBSETS)]
+        if len(table) != len(scenes):
+            raise DataError(
+                f"{folder / _SUBSETS} has {len(scenes)} lines and {folder / _PAIRS} has {len(table)}; "
+                "each must have one line a pair, in the same order"
+            )
+        self._add_to_digest(folder.name, folder / _PAIRS, folder / _SUBSETS)
+        chosen = sorted(set(scenes) if self._subsets is None else set(scenes) & self._subsets)
+        self._hash.update(repr(chosen).encode())
+        images = {scene: _images(folder, scene) for scene in chosen}
+        cameras = {scene: self._read_cameras(folder, scene) for scene in chosen}
+        for row, (numbers, scene) in enumerate(zip(table, scenes, strict=True)):
+            if scene in images:
+                line = f"{folder / _PAIRS}, line {row + 1}"
+                self._pairs.append(self._pair(line, folder, scene, numbers, images[scene], cameras[scene]))
+
+    def _read_cameras(self, folder: Path, scene: str) -> list[_Camera] | None:
+        path = folder / scene / _CAMERAS
+        if not self._cameras or not path.is_file():
+            return None
+        self._add_to_digest(f"{folder.name}/{scene}", path)
+        rows = _read_numbers(path, f"{_CAMERA_COLUMNS}; or give cameras=false to do without", 21)
+        return [_Camera(r[:9].reshape(3, 3), r[9:18].reshape(3, 3), r[18:]) for r in rows]
+
+    def _add_to_digest(self, name: str, *paths: Path) -> None:
+        for path in paths:
+            content = path.read_bytes()
+            self._hash.update(f"{name}/{path.name}:{len(content)}:".encode() + content)
+
+    def _pair(
+        self,
+        line: str,
+        folder: Path,
+        scene: str,
+        numbers: NDArray[np.float64],
+        images: dict[str, Path],
+        cameras: list[_Camera] | None,
+    ) -> ImagePair:
+        left, right = (_image_number(line, value) for value in numbers[:2])
+        F, problems = _normalized(numbers[2:].reshape(3, 3))
+        sources = []
+        for stem in (f"{left:08d}", f"{right:08d}"):
+            path = images.get(stem, folder / scene / "Images" / f"{stem}{_SUFFIXES[0]}")
+            sources.append(ImageSource(f"{folder.name}/{scene}/{stem}", path))
+            if stem not in images:
+                problems.append(f"no image {path} (or {_SUFFIXES[1]})")
+        identity = f"{folder.name}/{scene}/{left}-{right}"
+        self._seen[identity] += 1
+        if self._seen[identity] > 1:  # the same pair on a second line is a second pair
+            identity += f"#{self._seen[identity]}"
+        pair = ImagePair(
+            identity=identity,
+            family=folder.name,
+            scene=scene,
+            image0=sources[0],
+            image1=sources[1],
+            F=F,
+            problem=f"{line}: {'; '.join(problems)}" if problems else None,
+        )
+        if cameras is None:
+            return pair
+        if max(left, right) >= len(cameras):
+            raise DataError(
+                f"{folder / scene / _CAMERAS} has {len(cameras)} lines, but {line} names image {max(left, right)}; "
+                "line i + 1 must be the camera of image i"
+            )
+        c0, c1 = cameras[left], cameras[right]
+        R = c1.R @ c0.R.T
+        return dataclasses.replace(pair, K0=c0.K, K1=c1.K, R=R, t=c1.t - R @ c0.t)
+
+
+def _normalized(F: NDArray[np.float64]) -> tuple[NDArray[np.float64], list[str]]:
+    """F with unit Frobenius norm, or zero and what is wrong with it."""
+    largest = float(np.abs(F).max())
+    if not np.isfinite(largest):
+        return np.zeros((3, 3)), ["F has an entry that is not finite"]
+    if largest == 0:
+        return np.zeros((3, 3)), ["F is zero"]
+    F = F / largest
+    return F / np.linalg.norm(F), []
+
+
+def _set_folders(root: Path, sets: Sequence[str] | None) -> list[Path]:
+    if not root.is_dir():
+        raise DataError(f"{root}: no such folder; it must be a set's folder with {_PAIRS}, or a folder of such sets")
+    root = Path(os.path.abspath(root))  # a link keeps its name
+    if (root / _PAIRS).is_file():
+        found = {root.name: root}
+    else:
+        found = {folder.name: folder for folder in sorted(root.iterdir()) if (folder / _PAIRS).is_file()}
+    if not found:
+        raise DataError(f"{root}: neither {_PAIRS} nor a sub-folder that holds one")
+    for name in sets or ():
+        if name not in found:
+            raise DataError(f"{root}: no set {name!r}; it has {_listed(found)}")
+    return [found[name] for name in (sets or found)]
+
+
+def _listed(names: Sequence[str] | set[str] | dict[str, Path]) -> str:
+    return ", ".join(sorted(names))
+
+
+def _images(folder: Path, scene: str) -> dict[str, Path]:
+    """The image files of a subset by their stem."""
+    images = folder / scene / "Images"
+    if not images.is_dir():
+        raise DataError(f"{folder / _SUBSETS} names {scene}/, but there is no folder {images}")
+    files = sorted(images.iterdir(), reverse=True)  # .jpg comes last and wins over .png
+    return {file.stem: file for file in files if file.suffix in _SUFFIXES}
+
+
+def _read_lines(path: Path) -> list[str]:
+    """The lines of a text file without the empty ones at its end."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise DataError(f"{path}: no such file; the layout is <set>/{_PAIRS} and <set>/{_SUBSETS}") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: cannot be read as text ({error})") from error
+    return text.rstrip().splitlines()
+
+
+def _read_numbers(path: Path, columns: str, count: int) -> list[NDArray[np.float64]]:
+    """A table of numbers, one array a line."""
+    rows = []
+    for number, line in enumerate(_read_lines(path), start=1):
+        words = line.split()
+        if len(words) != count:
+            raise DataError(f"{path}, line {number}: {len(words)} columns; it must have {count}: {columns}")
+        try:
+            rows.append(np.array([float(word) for word in words]))
+        except ValueError as error:
+            raise DataError(f"{path}, line {number}: {error}; it must hold {count} numbers: {columns}") from error
+    return rows
+
+
+def _image_number(line: str, value: float) -> int:
+    if not (value >= 0 and value == int(value)):
+        raise DataError(f"{line}: image number {value:g}; it must be a whole number from 0")
+    return int(value)

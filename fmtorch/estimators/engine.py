@@ -1,0 +1,197 @@
+"""Hypothesise and verify: one loop whose parts make RANSAC, MSAC, LMedS and their descendants.
+
+sampler x minimal solver x score x local optimisation x stopping rule x final fit; a config names the parts.
+The search runs without gradients in float32; the final fit is attached to the caller's graph and runs in float64.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from fmtorch import random
+from fmtorch.estimators.parts import FINAL_FITS, INLIER_RULES, SAMPLERS, SCORES, SOLVERS, part
+from fmtorch.estimators.problem import Problem, problems
+from fmtorch.estimators.scoring import InlierCount, score_models
+from fmtorch.random import Stream
+from fmtorch.types import Correspondences, Estimate
+
+CPU_SAMPLES = 1 << 14  # minimal samples that are solved together: bounds memory, changes no result
+GPU_SAMPLES = 1 << 21
+
+
+@dataclasses.dataclass
+class _Search:
+    """What is known of P pairs: the best models so far, their scores (descending), and the draws made."""
+
+    F: Float[Tensor, "9 p k"]
+    score: Float[Tensor, "p k"]
+    draws: Int[Tensor, " p"]
+
+
+class HypothesizeAndVerify:
+    """A robust estimator of fundamental matrices, batched over pairs.
+
+    solver: minimal solver, `seven_point` or `eight_point`.
+    sampler: `uniform` or `prior`. score: `inlier_count`, `msac`, `prior_msac` or `median`.
+    threshold: Sampson distance in pixels up to which a match supports a model (unused by `median`).
+    hypotheses: minimal samples drawn at most. round: samples between two looks at the stopping rule.
+    confidence: stop once an all-inlier sample was drawn with this probability; None: never before `hypotheses`.
+    preselect: models are first scored on this many matches, chosen by the pair's key; 0: always on all.
+    survivors: models of a round that pass the preselection.
+    inliers: `threshold`, `lmeds` (2.5 robust standard deviations) or `median` (the better half).
+    final: `least_squares` (8-point on the inliers) or `none`. refit_inliers: recompute inliers after the final fit.
+
+    Memory: for a batch of pairs of N matches, the points (48 N bytes a pair), the samples of 2^14 draws (about 40 MB)
+    and eight buffers of one scoring tile (1 MB each); on a GPU 2^21 draws and 256 MB a buffer.
+    """
+
+    def __init__(
+        self,
+        *,
+        solver: str = "seven_point",
+        sampler: str = "uniform",
+        score: str = "msac",
+        threshold: float = 1.0,
+        hypotheses: int = 2000,
+        round: int = 500,
+        confidence: float | None = 0.9999,
+        preselect: int = 128,
+        survivors: int = 256,
+        inliers: str = "threshold",
+        final: str = "least_squares",
+        refit_inliers: bool = True,
+    ) -> None:
+        if hypotheses < 1 or round < 1:
+            raise ValueError(f"hypotheses={hypotheses}, round={round}: both must be at least 1")
+        if confidence is not None and not 0 < confidence < 1:
+            raise ValueError(f"confidence is {confidence}; it is a probability between 0 and 1, or null")
+        self.solver = part("solver", solver, SOLVERS)()
+        self.sampler = part("sampler", sampler, SAMPLERS)()
+        self.score = part("score", score, SCORES)(threshold)
+        self.count_inliers = InlierCount(threshold)
+        self.hypotheses, self.round, self.confidence = hypotheses, round, confidence
+        self.preselect, self.survivors = preselect, survivors
+        self.inlier_rule = part("inliers", inliers, INLIER_RULES)(threshold)
+        self.final = part("final", final, FINAL_FITS)()
+        self.refit_inliers = refit_inliers
+
+    def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
+        """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
+        b, n = c.mask.shape
+        device = c.mask.device
+        F = torch.zeros(b, 3, 3, dtype=torch.float64, device=device)
+        inliers = torch.zeros(b, n, dtype=torch.bool, device=device)
+        draws = torch.zeros(b, dtype=torch.int64, device=device)
+        made, reasons = problems(c, seed, self.solver.size)
+        limit = max(1, (GPU_SAMPLES if device.type == "cuda" else CPU_SAMPLES) // self.round)
+        for whole in made:
+            for first in range(0, len(whole.pair), limit):
+                problem = whole[torch.arange(first, min(first + limit, len(whole.pair)), device=device)]
+                estimate, support, found, drawn = self._solve(problem)
+                F = F.index_copy(0, problem.pair, torch.where(found[:, None, None], problem.to_pixels(estimate), 0))
+                inliers[problem.pair[:, None], problem.slot] |= support & problem.live & found[:, None]
+                draws[problem.pair] = drawn
+                for i in problem.pair[~found].tolist():
+                    reasons[i] = "every minimal sample was degenerate"
+        sound = torch.isfinite(F).flatten(1).all(1)
+        F = torch.where(sound[:, None, None], F, 0)
+        for i in (~sound).nonzero()[:, 0].tolist():
+            reasons.setdefault(i, "the final fit is not finite")
+        ok = torch.tensor([i not in reasons for i in range(b)], dtype=torch.bool, device=device)
+        return Estimate(F, inliers, ok, tuple(reasons.get(i, "") for i in range(b)), draws)
+
+    def _solve(self, problem: Problem) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Search, then fit: F (p, 3, 3) in normalised units, inliers (p, n), found (p,), draws (p,)."""
+        with torch.no_grad():
+            search = self._search(problem)
+            best = search.F[:, :, 0].T.reshape(-1, 3, 3).to(torch.float64)
+            inliers = self.inlier_rule(best, problem)
+        found = torch.isfinite(search.score[:, 0])
+        F = self.final(best, problem, inliers)
+        if self.refit_inliers:
+            with torch.no_grad():
+                inliers = self.inlier_rule(F, problem)
+        return F, inliers, found, search.draws
+
+    def _search(self, problem: Problem) -> _Search:
+        p, device = len(problem.pair), problem.points.device
+        points = problem.points.to(torch.float32)
+        table = self.sampler.table(problem)
+        subset = self._subset(problem)
+        state = _Search(
+            torch.zeros(9, p, 1, device=device),
+            torch.full((p, 1), -torch.inf, device=device),
+            torch.zeros(p, dtype=torch.int64, device=device),
+        )
+        active = torch.arange(p, device=device)
+        start = 0
+        while start < self.hypotheses and len(active):
+            count = min(self.round, self.hypotheses - start)
+            some, some_points = problem[active], points[:, active]
+            F, valid = self._hypotheses(some, some_points, table[active], start, count)
+            F, score = self._verify(some, some_points, F, valid, None if subset is None else subset[active])
+            self._remember(state, active, F, score)
+            start += count
+            state.draws[active] = start
+            if self.confidence is not None and start < self.hypotheses:
+                done = self._done(state, active, some, some_points)
+                active = active[~done]
+        return state
+
+    def _hypotheses(
+        self, problem: Problem, points: Float[Tensor, "4 p n"], table: Tensor, start: int, count: int
+    ) -> tuple[Float[Tensor, "9 p m"], Bool[Tensor, "p m"]]:
+        """The models of `count` minimal samples, in the order of their draws."""
+        size = self.solver.size
+        index = self.sampler.draw(problem, table, start, count, size)
+        sample = torch.stack([points.gather(2, i.expand(4, -1, -1)) for i in index], 1)
+        return self.solver(sample)
+
+    def _verify(
+        self, problem: Problem, points: Tensor, F: Tensor, valid: Tensor, subset: Tensor | None
+    ) -> tuple[Float[Tensor, "9 p k"], Float[Tensor, "p k"]]:
+        """The valid models and their scores, the weaker ones dropped after a look at the `subset` of matches."""
+        F, valid = _front(F, valid)
+        if subset is not None and F.shape[2] > self.survivors:
+            coarse = score_models(self.score, F, problem, points, subset).masked_fill_(~valid, -torch.inf)
+            order = torch.sort(coarse, dim=1, descending=True, stable=True).indices[:, : self.survivors]
+            order = torch.sort(order, dim=1).values  # back in the order of the draws, which breaks ties
+            F, valid = F.gather(2, order.expand(9, -1, -1)), valid.gather(1, order)
+        return F, score_models(self.score, F, problem, points).masked_fill_(~valid, -torch.inf)
+
+    def _remember(self, state: _Search, active: Tensor, F: Tensor, score: Tensor) -> None:
+        """Keep the best models of each pair; the earlier draw wins a tie."""
+        all_F = torch.cat([state.F[:, active], F], 2)
+        all_scores = torch.cat([state.score[active], score], 1)
+        k = state.score.shape[1]
+        top, order = torch.sort(all_scores, dim=1, descending=True, stable=True)
+        state.score[active] = top[:, :k]
+        state.F[:, active] = all_F.gather(2, order[:, :k].expand(9, -1, -1))
+
+    def _done(self, state: _Search, active: Tensor, problem: Problem, points: Tensor) -> Bool[Tensor, " p"]:
+        """Whether an all-inlier sample was drawn with probability `confidence` (Fischler & Bolles 1981)."""
+        assert self.confidence is not None
+        support = score_models(self.count_inliers, state.F[:, active, :1].contiguous(), problem, points)[:, 0]
+        all_inliers = (support.to(torch.float64) / problem.count) ** self.solver.size
+        missed = torch.log1p(-all_inliers.clamp(max=1 - 1e-12)) * state.draws[active]
+        return missed <= torch.log1p(torch.tensor(-self.confidence, dtype=torch.float64, device=missed.device))
+
+    def _subset(self, problem: Problem) -> Int[Tensor, "p k"] | None:
+        """The live matches on which models are preselected: those with the smallest hash."""
+        n = problem.live.shape[1]
+        if not self.preselect or n < 2 * self.preselect:
+            return None
+        order = random.bits(problem.seed, problem.key, Stream.PRESELECTION, 0, n, 1)[..., 0]
+        order = torch.where(problem.live, order, torch.iinfo(torch.int64).max)
+        return torch.sort(order, dim=1, stable=True).indices[:, : self.preselect].contiguous()
+
+
+def _front(F: Float[Tensor, "9 p m"], valid: Bool[Tensor, "p m"]) -> tuple[Tensor, Tensor]:
+    """Valid models moved to the front in their order; what is invalid for every pair is cut off."""
+    longest = int(valid.sum(1).max())
+    order = torch.sort((~valid).to(torch.uint8), dim=1, stable=True).indices[:, :longest]
+    return F.gather(2, order.expand(9, -1, -1)), valid.gather(1, order)

@@ -1,0 +1,124 @@
+"""The door of the engine: pairs cleaned, normalised, and grouped by size, so that nothing behind it sees padding.
+
+Everything here depends on a pair's own live matches only: a pair gets the same numbers in any batch.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from fmtorch.types import Correspondences
+
+SMALLEST_BUCKET = 128
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Problem:
+    """P pairs whose live matches come first, padded with zeros to a common bucket of N slots.
+
+    points: (4, P, N) float64, rows x0, y0, x1, y1 in normalised units: ``x = centre + unit * point``.
+    count: live matches (P,). unit: pixels in one normalised unit (P,), a power of two. centre: (P, 4).
+    slot: where each match stood in the caller's tensors (P, N). pair: index of each pair in the caller's batch.
+    quality, prior: (P, N), zero in padded slots, None where the caller has none. seed: of every random choice.
+    Points, quality and prior stay attached to the caller's graph; centre and unit are constants.
+    """
+
+    points: Float[Tensor, "4 p n"]
+    live: Bool[Tensor, "p n"]
+    count: Int[Tensor, " p"]
+    unit: Float[Tensor, " p"]
+    centre: Float[Tensor, "p 4"]
+    slot: Int[Tensor, "p n"]
+    pair: Int[Tensor, " p"]
+    key: Int[Tensor, " p"]
+    quality: Float[Tensor, "p n"] | None
+    prior: Float[Tensor, "p n"] | None
+    seed: int
+
+    def __getitem__(self, index: Tensor) -> Problem:
+        """The selected pairs."""
+        changes = {
+            field.name: getattr(self, field.name)[index]
+            for field in dataclasses.fields(self)
+            if isinstance(getattr(self, field.name), Tensor) and field.name != "points"
+        }
+        return dataclasses.replace(self, points=self.points[:, index], **changes)
+
+    def to_pixels(self, F: Float[Tensor, "p 3 3"]) -> Float[Tensor, "p 3 3"]:
+        """Fundamental matrices of normalised coordinates, in pixels and with unit Frobenius norm."""
+        T0, T1 = self._similarity(self.centre[:, :2]), self._similarity(self.centre[:, 2:])
+        pixel: Tensor = T1.mT @ F @ T0
+        norm: Tensor = torch.linalg.matrix_norm(pixel, keepdim=True)
+        return pixel / norm.clamp_min(torch.finfo(F.dtype).tiny)
+
+    def _similarity(self, centre: Tensor) -> Tensor:
+        T = torch.zeros(len(centre), 3, 3, dtype=torch.float64, device=centre.device)
+        T[:, 0, 0] = T[:, 1, 1] = 1 / self.unit
+        T[:, :2, 2] = -centre / self.unit[:, None]
+        T[:, 2, 2] = 1
+        return T
+
+
+def bucket(count: int) -> int:
+    """The smallest of 128, 192, 256, 384, 512, ... that holds `count` matches."""
+    power = max(SMALLEST_BUCKET, 1 << max(count - 1, 0).bit_length())
+    return power * 3 // 4 if count <= power * 3 // 4 and power > SMALLEST_BUCKET else power
+
+
+def usable(c: Correspondences) -> Bool[Tensor, "b n"]:
+    """Live matches with finite coordinates."""
+    return c.mask & torch.isfinite(c.x0).all(-1) & torch.isfinite(c.x1).all(-1)
+
+
+def problems(c: Correspondences, seed: int, least: int) -> tuple[list[Problem], dict[int, str]]:
+    """Problems of equal bucket, and the reason for each pair that cannot be one (fewer than `least` matches, say)."""
+    live = usable(c)
+    counts = live.sum(-1).tolist()
+    reasons: dict[int, str] = {}
+    groups: dict[int, list[int]] = {}
+    for i, n in enumerate(counts):
+        if n < least:
+            reasons[i] = f"{n} matches; at least {least} are needed"
+        else:
+            groups.setdefault(bucket(n), []).append(i)
+    made: list[Problem] = []
+    for n, members in groups.items():
+        problem = _problem(c, live, torch.tensor(members, device=live.device), n, seed)
+        spread = problem.unit > 0
+        for i in problem.pair[~spread].tolist():
+            reasons[i] = "all matches coincide"
+        if bool(spread.any()):
+            made.append(problem if bool(spread.all()) else problem[spread.nonzero()[:, 0]])
+    return made, reasons
+
+
+def _problem(c: Correspondences, live: Tensor, pair: Tensor, n: int, seed: int) -> Problem:
+    live = live[pair]
+    order = torch.argsort((~live).to(torch.uint8), dim=-1, stable=True)[:, :n]
+    order = torch.nn.functional.pad(order, (0, n - order.shape[1]))
+    count = live.sum(-1)
+    live = torch.arange(n, device=live.device) < count[:, None]
+
+    def take(value: Tensor | None) -> Tensor | None:
+        return None if value is None else torch.where(live, value[pair].gather(1, order), 0).to(torch.float64)
+
+    coordinates = torch.cat([c.x0, c.x1], -1)[pair].to(torch.float64)
+    pixels = coordinates.gather(1, order[..., None].expand(-1, -1, 4))
+    inside = live[..., None]
+    low = torch.where(inside, pixels.detach(), torch.inf).amin(1)
+    high = torch.where(inside, pixels.detach(), -torch.inf).amax(1)
+    centre = (low + high) / 2
+    half = ((high - low) / 2).amax(-1)
+    # A power of two, so that scaling rounds nothing. Zero when all points coincide in both images.
+    unit = torch.where(half > 0, torch.exp2(torch.ceil(torch.log2(half.clamp_min(1e-300)))), 0)
+    points = torch.where(inside, (pixels - centre[:, None]) / unit.clamp_min(1e-300)[:, None, None], 0)
+    prior = take(None if c.prior is None else c.prior)
+    return Problem(
+        points.permute(2, 0, 1).contiguous(), live, count, unit, centre, order, pair, c.keys[pair],
+        take(None if c.quality is None else c.quality),
+        None if prior is None else prior.nan_to_num(0).clamp(0, 1), seed,
+    )  # fmt: skip

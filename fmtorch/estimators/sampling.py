@@ -1,0 +1,106 @@
+"""Which matches a minimal sample holds: a stateless function of (seed, pair key, draw)."""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from fmtorch import random
+from fmtorch.estimators.problem import Problem
+from fmtorch.random import Stream
+
+_RANDOM_BITS = 32
+_TOTAL_BITS = 30  # cumulative weights stay below 2^30, so that 32 random bits times a total fit an int64
+
+
+@runtime_checkable
+class Sampler(Protocol):
+    """Draws minimal samples without replacement."""
+
+    def table(self, problem: Problem) -> Int[Tensor, "p n"]:
+        """Cumulative integer weights of the matches."""
+        ...
+
+    def draw(
+        self, problem: Problem, table: Int[Tensor, "p n"], start: int, count: int, size: int
+    ) -> Int[Tensor, "size p count"]:
+        """Indices of the `size` matches in each of the draws start .. start + count - 1."""
+        ...
+
+
+class Uniform:
+    """Every set of live matches is equally likely."""
+
+    def table(self, problem: Problem) -> Int[Tensor, "p n"]:
+        """1, 2, ..., n, n, n: every live match weighs one."""
+        return problem.live.to(torch.int64).cumsum(-1)
+
+    def draw(
+        self, problem: Problem, table: Int[Tensor, "p n"], start: int, count: int, size: int
+    ) -> Int[Tensor, "size p count"]:
+        """As `Sampler.draw`; with unit weights a position in the table is an index."""
+        return _draw(problem, problem.count, None, start, count, size)
+
+
+class PriorWeighted:
+    """Matches drawn in proportion to their prior P(inlier); uniform where there is none."""
+
+    def table(self, problem: Problem) -> Int[Tensor, "p n"]:
+        """Cumulative sum of the priors, quantised so that it is exact, the same on any device and under any padding."""
+        if problem.prior is None:
+            return Uniform().table(problem)
+        largest = 1 << (_TOTAL_BITS - (problem.live.shape[1] - 1).bit_length())
+        weight = (problem.prior * largest).round().to(torch.int64).clamp_min(1)
+        return torch.where(problem.live, weight, 0).cumsum(-1)
+
+    def draw(
+        self, problem: Problem, table: Int[Tensor, "p n"], start: int, count: int, size: int
+    ) -> Int[Tensor, "size p count"]:
+        """As `Sampler.draw`."""
+        return _draw(problem, table[:, -1], table, start, count, size)
+
+
+def _draw(
+    problem: Problem, total: Tensor, table: Tensor | None, start: int, count: int, size: int
+) -> Int[Tensor, "size p count"]:
+    """Weighted sampling without replacement: intervals already chosen are cut out of [0, total).
+
+    A position is drawn in what is left and pushed past every chosen interval in ascending order; the table tells whose
+    interval it falls in. Without a table every interval has length one.
+    """
+    random_bits = random.bits(problem.seed, problem.key, Stream.SAMPLING, start, count, size) >> (63 - _RANDOM_BITS)
+    left = total[:, None].expand(-1, count)
+    starts: list[Tensor] = []
+    lengths: list[Tensor] = []
+    chosen: list[Tensor] = []
+    for j in range(size):
+        position = (random_bits[..., j] * left) >> _RANDOM_BITS
+        for k, begin in enumerate(starts):
+            past = position >= begin
+            position = position + (past if table is None else past * lengths[k])
+        if table is None:
+            index, begin, length = position, position, None
+        else:
+            index = torch.searchsorted(table, position, right=True)
+            upper = table.gather(1, index)
+            begin = torch.where(index > 0, table.gather(1, (index - 1).clamp_min(0)), 0)
+            length = upper - begin
+        chosen.append(index)
+        left = left - (1 if length is None else length)
+        _insert(starts, lengths, begin, length)
+    return torch.stack(chosen)
+
+
+def _insert(starts: list[Tensor], lengths: list[Tensor], begin: Tensor, length: Tensor | None) -> None:
+    """Insert an interval into elementwise ascending lists of starts and lengths."""
+    for k, other in enumerate(starts):
+        if length is not None:
+            smaller = begin < other
+            lengths[k], length = torch.where(smaller, length, lengths[k]), torch.where(smaller, lengths[k], length)
+        starts[k], begin = torch.minimum(begin, other), torch.maximum(begin, other)
+    starts.append(begin)
+    if length is not None:
+        lengths.append(length)

@@ -1,0 +1,103 @@
+"""Pictures of results."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import torch
+from numpy.typing import NDArray
+
+from fmtorch import metrics
+from fmtorch.evaluation.summary import ALL, THRESHOLD, recall
+from fmtorch.storage import replacing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+MAXIMUM = 0.2  # the last NSGD threshold, the paper's
+TICKS = (0, 0.05, 0.1, 0.15, 0.2)
+# Okabe and Ito's palette, which people with any colour vision can tell apart; dashes repeat it.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+DASHES = ("-", "--", ":", "-.")
+_INK, _PALE = "#333333", "#D9D9D9"
+
+
+def plot_recall_curves(runs: Mapping[str, pa.Table], path: Path) -> None:
+    """Draw recall against the NSGD threshold, from 0 to 0.2, as a PNG; legends give the recall at 0.05.
+
+    runs: tables of `PAIR_SCHEMA` by name. One run gives one panel with a curve for each family and for all; several
+    runs give a panel for each family with a curve for each run.
+    """
+    from matplotlib.figure import Figure  # no pyplot: no global state and no window
+
+    panels = _panels(runs)
+    rows = max(1, math.ceil(len(panels) / 3))
+    columns = max(1, math.ceil(len(panels) / rows))
+    width, height = (6.4, 4.4) if len(panels) <= 1 else (4.6 * columns, 3.7 * rows)
+    figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
+    grid: Any = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    titles = list(panels)
+    for i, ax in enumerate(grid.flat):
+        if i >= len(titles):
+            ax.set_visible(False)
+            continue
+        _draw(ax, titles[i], panels[titles[i]])
+        if i % columns == 0:
+            ax.set_ylabel("recall [%]", color=_INK)
+        if i + columns >= len(titles):  # nothing below
+            ax.set_xlabel("NSGD threshold", color=_INK)
+            ax.tick_params(labelbottom=True)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png")
+
+
+def _panels(runs: Mapping[str, pa.Table]) -> dict[str, dict[str, NDArray[np.float64]]]:
+    """Panel title -> curve name -> NSGD of its pairs."""
+    by_run = {run: _families(table) for run, table in runs.items()}
+    if len(runs) == 1:
+        ((name, families),) = by_run.items()
+        if len(families) > 1:
+            families = {**families, ALL: np.concatenate(list(families.values()))}
+        return {name: families}
+    names = dict.fromkeys(itertools.chain.from_iterable(by_run.values()))
+    return {family: {run: parts[family] for run, parts in by_run.items() if family in parts} for family in names}
+
+
+def _families(table: pa.Table) -> dict[str, NDArray[np.float64]]:
+    family = np.asarray(table["family"].to_pylist(), dtype=object)
+    nsgd = table["nsgd"].to_numpy().astype(np.float64)
+    return {str(name): nsgd[family == name] for name in dict.fromkeys(family)}
+
+
+def _draw(ax: Axes, title: str, curves: Mapping[str, NDArray[np.float64]]) -> None:
+    thresholds = torch.linspace(0, MAXIMUM, 401, dtype=torch.float64)
+    ax.axvline(THRESHOLD, color="#999999", linewidth=0.9, linestyle=(0, (4, 3)), zorder=1)
+    styles = itertools.cycle(itertools.product(DASHES, COLOURS))
+    for (name, nsgd), (dash, colour) in zip(curves.items(), styles, strict=False):
+        share = metrics.recall_curve(torch.from_numpy(nsgd), thresholds).numpy()
+        whole = name == ALL
+        ax.plot(
+            thresholds.numpy(), 100 * share, label=f"{100 * recall(nsgd):.1f}  {name}",
+            color="#000000" if whole else colour, linestyle=dash, linewidth=2.4 if whole else 1.7, zorder=3,
+        )  # fmt: skip
+    ax.set(xlim=(0, MAXIMUM), ylim=(0, 101), yticks=range(0, 101, 20))
+    ax.set_xticks(TICKS, [f"{tick:g}" for tick in TICKS])
+    ax.set_title(title, loc="left", fontsize=11, fontweight="bold", color=_INK)
+    ax.grid(color=_PALE, linewidth=0.6)
+    ax.set_axisbelow(True)
+    ax.tick_params(colors=_INK, length=0, labelsize=9)
+    for side in ("top", "right", "left"):
+        ax.spines[side].set_visible(False)
+    ax.spines["bottom"].set_color("#999999")
+    if curves:
+        legend = ax.legend(
+            title=f"recall [%] at {THRESHOLD}", fontsize=8, title_fontsize=8, loc="best", alignment="left",
+            labelcolor=_INK, framealpha=0.9, edgecolor="none", handlelength=2.0,
+        )  # fmt: skip
+        legend.get_title().set_color(_INK)

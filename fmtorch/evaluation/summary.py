@@ -1,0 +1,221 @@
+"""The table of a run: recall with its interval, inlier rates, counts, failures and seconds, by family and over all."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import torch
+from numpy.typing import NDArray
+from rich import box
+from rich.table import Table
+
+from fmtorch import metrics
+from fmtorch.evaluation.bootstrap import LEVEL, RESAMPLES, bootstrap_mean
+from fmtorch.storage import PAIR_SCHEMA
+
+ALL = "all"
+THRESHOLD = 0.05  # NSGD, the paper's
+FINE_THRESHOLD = 0.01  # NSGD
+STAGES = tuple(name.removeprefix("seconds_") for name in PAIR_SCHEMA.names if name.startswith("seconds_"))
+_REASONS = 3  # commonest reasons kept
+_DASH = "–"
+
+Group = dict[str, Any]
+
+
+def summarize(table: pa.Table) -> dict[str, Group]:
+    """Figures of merit of a table of `PAIR_SCHEMA`: for each family, and for ``all`` pairs.
+
+    All shares are in [0, 1]; a figure that is not defined is None. Of each group:
+
+    - pairs, scenes: how many.
+    - recall: share of all pairs with NSGD < 0.05, a failed pair being a miss; recall_interval: its 95 % bootstrap
+      interval, and interval_over: what was resampled (see `bootstrap_mean`). recall_fine: at NSGD < 0.01.
+      mean_recall: mean over the thresholds from 0 to 0.05. recall_released: by the published evaluator's NSGD, where
+      that was computed for each pair that did not fail.
+    - inlier_rate: share of the estimator's inliers that obey the true F, and inlier_rate_before: share of the matches
+      given to it; means over the pairs that did not fail, as the paper; ``*_failures_0``: means over all pairs with 0
+      for failures and where there is no figure.
+    - corrs, corrs_before: number of inliers and of matches given to the estimator; means over pairs that did not fail.
+    - failures, failure_share, reasons: the commonest reasons (numbers in them replaced by N) and how often.
+    - seconds: median per pair for each stage, and ``total``.
+    """
+    families = table["family"].to_pylist()
+    groups = {name: table.filter(pa.array([f == name for f in families])) for name in dict.fromkeys(families)}
+    return {name: _group(part) for name, part in {**groups, ALL: table}.items()}
+
+
+def _group(table: pa.Table) -> Group:
+    ok = table["ok"].to_numpy().astype(bool)
+    nsgd = _column(table, "nsgd")
+    places = zip(table["family"].to_pylist(), table["scene"].to_pylist(), strict=True)
+    scenes = [f"{family}/{scene}" for family, scene in places]
+    group: Group = {"pairs": len(ok), "scenes": len(set(scenes))}
+
+    group |= {"recall": None, "recall_interval": None, "interval_over": None, "recall_fine": None, "mean_recall": None}
+    if len(ok):
+        interval = bootstrap_mean((nsgd < THRESHOLD).astype(np.float64), scenes)
+        group |= {
+            "recall": recall(nsgd), "recall_interval": [interval.low, interval.high], "interval_over": interval.over,
+            "recall_fine": recall(nsgd, FINE_THRESHOLD),
+            "mean_recall": float(metrics.mean_recall(torch.from_numpy(nsgd), THRESHOLD)),
+        }  # fmt: skip
+    released = np.where(ok, _column(table, "nsgd_released"), 1.0)
+    group["recall_released"] = recall(released) if len(ok) and not np.isnan(released).any() else None
+
+    for name in ("inlier_rate", "inlier_rate_before"):
+        rate = _column(table, name)
+        group[name] = _mean(rate[ok])
+        group[f"{name}_failures_0"] = _mean(np.where(ok, np.nan_to_num(rate), 0.0))
+    for name in ("corrs", "corrs_before"):
+        group[name] = _mean(_column(table, name)[ok])
+
+    reasons = Counter(re.sub(r"\d+", "N", reason) for reason in table["reason"].to_pylist() if reason)
+    failures = int((~ok).sum())
+    group |= {
+        "failures": failures, "failure_share": failures / len(ok) if len(ok) else None,
+        "reasons": dict(reasons.most_common(_REASONS)),
+    }  # fmt: skip
+    seconds = np.stack([_column(table, f"seconds_{stage}") for stage in STAGES])
+    group["seconds"] = {stage: _median(row) for stage, row in zip(STAGES, seconds, strict=True)}
+    group["seconds"]["total"] = _median(np.nansum(seconds, axis=0))
+    return group
+
+
+def recall(nsgd: NDArray[np.float64], threshold: float = THRESHOLD) -> float:
+    """Share of the pairs whose NSGD is below the threshold."""
+    return float(metrics.recall(torch.from_numpy(nsgd), threshold))
+
+
+def summary_table(summary: Mapping[str, Group], title: str) -> Table:
+    """The main figures, for a terminal of 80 columns."""
+    shown = Table(
+        title=title, title_style="bold", caption=_caption(summary), caption_justify="left", caption_style="dim",
+        box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True,
+    )  # fmt: skip
+    for i, heading in enumerate(_TERMINAL):
+        shown.add_column(heading, justify="right" if i else "left", no_wrap=i > 0, overflow="fold")
+    for name, group in _rows(summary):
+        shown.add_row(*_cells(_TERMINAL, name, group), style="bold" if name == ALL else "")
+    return shown
+
+
+def summary_markdown(summary: Mapping[str, Group], title: str) -> str:
+    """All figures as a Markdown page."""
+    rows = [list(_MARKDOWN), ["---", *["---:"] * (len(_MARKDOWN) - 1)]]
+    rows += [_cells(_MARKDOWN, name, group) for name, group in _rows(summary)]
+    stages = [["seconds (median per pair)", *STAGES, "total"], ["---", *["---:"] * (len(STAGES) + 1)]]
+    for name, group in _rows(summary):
+        stages.append([name, *(_number(group["seconds"][stage], "{:.3f}") for stage in (*STAGES, "total"))])
+    failures = [
+        f"- {name}: {count} x {_escape(reason)}"
+        for name, group in _rows(summary)
+        if name != ALL or len(summary) == 1
+        for reason, count in group["reasons"].items()
+    ]
+    parts = [f"# {title}", _lines(rows), _caption(summary), _lines(stages)]
+    if failures:
+        parts += ["Commonest reasons of failure (numbers replaced by N):", "\n".join(failures)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _rows(summary: Mapping[str, Group]) -> list[tuple[str, Group]]:
+    """The groups to show: ``all`` last, and not where it repeats the only family."""
+    return [(name, group) for name, group in summary.items() if name != ALL or len(summary) != 2]
+
+
+def _cells(columns: Mapping[str, Callable[[Group], str]], name: str, group: Group) -> list[str]:
+    return [name, *(column(group) for heading, column in columns.items() if heading)]
+
+
+def _caption(summary: Mapping[str, Group]) -> str:
+    overs = dict.fromkeys(group["interval_over"] for _, group in _rows(summary) if group["interval_over"])
+    where = {over: [name for name, g in _rows(summary) if g["interval_over"] == over] for over in overs}
+    over = "; ".join(f"{o}s" + (f" ({', '.join(names)})" if len(where) > 1 else "") for o, names in where.items())
+    return (
+        f"%Recall: NSGD < {THRESHOLD}, failures are misses; [{LEVEL:.0%} bootstrap interval, {RESAMPLES:,} resamples "
+        f"of {over or 'pairs'}]. mAA: mean recall over NSGD 0 to {THRESHOLD}. %Inlier, #Corrs: after estimation, -m: "
+        "before; means over the pairs that did not fail."
+    )
+
+
+def _lines(rows: list[list[str]]) -> str:
+    return "\n".join("| " + " | ".join(_escape(cell) for cell in row) + " |" for row in rows)
+
+
+def _escape(text: str) -> str:
+    return " ".join(text.replace("|", "\\|").split())
+
+
+def _number(value: float | int | None, form: str) -> str:
+    return _DASH if value is None else form.format(value)
+
+
+def _percent(field: str) -> Callable[[Group], str]:
+    return lambda group: _number(None if group[field] is None else 100 * group[field], "{:.1f}")
+
+
+def _recall(group: Group) -> str:
+    if group["recall"] is None:
+        return _DASH
+    low, high = group["recall_interval"]
+    return f"{100 * group['recall']:.1f} [{100 * low:.0f}, {100 * high:.0f}]"
+
+
+def _inliers(group: Group) -> str:
+    return f"{_percent('inlier_rate')(group)} ({_percent('inlier_rate_before')(group)})"
+
+
+def _corrs(group: Group) -> str:
+    return f"{_number(group['corrs'], '{:.0f}')} ({_number(group['corrs_before'], '{:.0f}')})"
+
+
+def _failures(group: Group) -> str:
+    return f"{group['failures']} ({_number(group['failure_share'], '{:.1%}')})" if group["failures"] else "0"
+
+
+_TERMINAL: dict[str, Callable[[Group], str]] = {
+    "": lambda group: "",
+    "Pairs": lambda group: str(group["pairs"]),
+    "%Recall": _recall,
+    "mAA": _percent("mean_recall"),
+    "%Inlier (-m)": _inliers,
+    "#Corrs (-m)": _corrs,
+    "Failed": lambda group: str(group["failures"]),
+}
+_MARKDOWN: dict[str, Callable[[Group], str]] = {
+    "": lambda group: "",
+    "Pairs": lambda group: str(group["pairs"]),
+    "Scenes": lambda group: str(group["scenes"]),
+    "%Recall [interval]": _recall,
+    f"at {FINE_THRESHOLD}": _percent("recall_fine"),
+    "mAA": _percent("mean_recall"),
+    "%Recall (released NSGD)": _percent("recall_released"),
+    "%Inlier": _percent("inlier_rate"),
+    "with failures 0": _percent("inlier_rate_failures_0"),
+    "%Inlier-m": _percent("inlier_rate_before"),
+    "#Corrs (-m)": _corrs,
+    "Failures": _failures,
+}
+
+
+def _column(table: pa.Table, name: str) -> NDArray[np.float64]:
+    """A column as float64, null as NaN."""
+    values: NDArray[np.float64] = table[name].cast(pa.float64()).to_numpy().astype(np.float64)
+    return values
+
+
+def _mean(values: NDArray[np.float64]) -> float | None:
+    """The mean of what is not NaN."""
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if len(known) else None
+
+
+def _median(values: NDArray[np.float64]) -> float | None:
+    known = values[~np.isnan(values)]
+    return float(np.median(known)) if len(known) else None

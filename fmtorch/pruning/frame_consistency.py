@@ -1,0 +1,133 @@
+"""P(inlier) from local affine frames: does each match predict where its neighbours' partners lie?
+
+A match carries a scale and a rotation (or a full affine shape) in both images, so it maps the small vector to a
+neighbour in image 0 to one in image 1. Where matches are right, neighbours agree with each other's maps.
+Neighbours are taken along space-filling curves instead of by an exact nearest-neighbour query: linear memory, an
+eighth of the time, and the same area under the ROC curve (measured on castle-P19 and fox: 0.955 and 0.930 against
+0.954 and 0.924 for the 24 nearest).
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from fmtorch.types import Correspondences
+
+WINDOW = 8  # neighbours before and after each match along each curve
+CURVES = ((0.0, 0.0), (0.5, math.pi / 4))  # shift of the grid (in thirds of the extent) and rotation of each curve
+TOLERANCE = 0.25  # relative prediction error at which agreement falls to 1/e
+NOISE = 4.0  # px, keeps close neighbours from being judged by their localisation noise
+WORST_RATIO, LEAST_VOTE = 0.85, 0.02  # a neighbour votes with WORST_RATIO - ratio, at least LEAST_VOTE
+_CURVE_BITS = 15
+
+
+def frame_agreement(
+    x0: Float[Tensor, "b n 2"],
+    x1: Float[Tensor, "b n 2"],
+    lafs0: Float[Tensor, "b n 2 3"],
+    lafs1: Float[Tensor, "b n 2 3"],
+    quality: Float[Tensor, "b n"] | None,
+    mask: Bool[Tensor, "b n"],
+) -> Float[Tensor, "b n"]:
+    """The share of its neighbours' votes that agree with each match, in [0, 1]; zero where masked.
+
+    For neighbours i, j with frame maps S: ``e = max(|S_i dx0 - dx1|, |S_j dx0 - dx1|) / (s_i |dx0| + |dx1| + NOISE)``
+    with s the scale change of S; the agreement is the mean of ``exp(-(e / TOLERANCE)^2)`` over the neighbours in both
+    images, weighted by votes.
+    """
+    S = _frame_map(lafs0, lafs1)
+    vote = torch.ones_like(x0[..., 0]) if quality is None else (WORST_RATIO - quality).clamp_min(LEAST_VOTE)
+    scale = torch.linalg.det(S.to(torch.float64)).abs().sqrt().to(S.dtype)
+    rows = torch.stack([*x0.unbind(-1), *x1.unbind(-1), *S.flatten(2).unbind(-1), scale, vote])
+    sound = mask & torch.isfinite(rows).all(0)
+    rows = torch.where(sound, rows, 0)
+    agreement, votes = torch.zeros_like(rows[0]), torch.zeros_like(rows[0])
+    for points in (rows[0:2], rows[2:4]):
+        for shift, angle in CURVES:
+            order = _curve_order(points, sound, shift, angle)
+            along = rows.gather(2, order.expand(len(rows), -1, -1))
+            agreeing, voting = _along_curve(along)
+            agreement = agreement.scatter_add(1, order, agreeing)
+            votes = votes.scatter_add(1, order, voting)
+    return torch.where(sound, agreement / votes.clamp_min(torch.finfo(votes.dtype).tiny), 0)
+
+
+def _frame_map(lafs0: Float[Tensor, "b n 2 3"], lafs1: Float[Tensor, "b n 2 3"]) -> Float[Tensor, "b n 2 2"]:
+    """The linear map from frame 0 to frame 1, ``A1 A0^-1``."""
+    (a, b), (c, d) = (row.unbind(-1) for row in lafs0[..., :2].unbind(-2))
+    determinant = a * d - b * c
+    inverse = torch.stack([torch.stack([d, -b], -1), torch.stack([-c, a], -1)], -2)
+    A1 = lafs1[..., :2]
+    product = (A1[..., :, :, None] * inverse[..., None, :, :]).sum(-2)
+    return product / determinant[..., None, None]
+
+
+def _curve_order(
+    points: Float[Tensor, "2 b n"], mask: Bool[Tensor, "b n"], shift: float, angle: float
+) -> Int[Tensor, "b n"]:
+    """The order of the live points along a Morton curve over a shifted, rotated grid; the others last."""
+    x, y = points.detach()
+    turned = torch.stack([math.cos(angle) * x - math.sin(angle) * y, math.sin(angle) * x + math.cos(angle) * y])
+    low = torch.where(mask, turned, torch.inf).amin(-1, keepdim=True)
+    extent = (torch.where(mask, turned, -torch.inf).amax(-1, keepdim=True) - low).amax(0).clamp_min(1e-6)
+    cell = (torch.where(mask, (turned - low) / extent, 0) * 2 + shift) / 3 * ((1 << _CURVE_BITS) - 1)
+    code = _spread(cell[0].to(torch.int64)) | (_spread(cell[1].to(torch.int64)) << 1)
+    code = torch.where(mask, code, 1 << (2 * _CURVE_BITS + 1))
+    return torch.argsort(code, dim=-1, stable=True)
+
+
+def _spread(v: Int[Tensor, "b n"]) -> Int[Tensor, "b n"]:
+    """The bits of a 16-bit number moved to the even positions."""
+    for step, pattern in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
+        v = (v | (v << step)) & pattern
+    return v
+
+
+def _along_curve(rows: Float[Tensor, "10 b n"]) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n"]]:
+    """Sums of agreeing votes and of all votes over the neighbours of each match along the curve."""
+    n = rows.shape[2]
+    padded = torch.nn.functional.pad(rows, (WINDOW, WINDOW))
+    offsets = [k for k in range(2 * WINDOW + 1) if k != WINDOW]
+    near = torch.stack([padded[..., k : k + n] for k in offsets], 1)  # (10, 16, b, n)
+    dx, dy, ux, uy = near[:4] - rows[:4, None]
+    error = torch.maximum(
+        _prediction_error(rows[4:8, None], dx, dy, ux, uy), _prediction_error(near[4:8], dx, dy, ux, uy)
+    )
+    length = (dx.square() + dy.square() + 1e-12).sqrt() * rows[8] + (ux.square() + uy.square() + 1e-12).sqrt() + NOISE
+    agree = torch.exp(error / length.square() * -(TOLERANCE**-2))
+    vote = near[9]
+    agreeing = agree * vote
+    # Added one by one: the order of a sum must not depend on the batch.
+    total, votes = agreeing[0], vote[0]
+    for k in range(1, len(offsets)):
+        total, votes = total + agreeing[k], votes + vote[k]
+    return total, votes
+
+
+def _prediction_error(S: Tensor, dx: Tensor, dy: Tensor, ux: Tensor, uy: Tensor) -> Tensor:
+    """``|S dx0 - dx1|^2``."""
+    return (S[0] * dx + S[1] * dy - ux).square() + (S[2] * dx + S[3] * dy - uy).square()
+
+
+class FrameConsistency:
+    """Supplies ``prior``: P(inlier) by a logistic model of the agreement of local affine frames and the ratio.
+
+    ``P = sigmoid(a ln(w + 0.02) + b ratio + c)`` with the agreement w. Where matches have no frames or no quality the
+    prior is left as it is. Linear memory: about 700 bytes a match.
+    """
+
+    def __init__(self, *, agreement: float, ratio: float, offset: float) -> None:
+        self.agreement, self.ratio, self.offset = agreement, ratio, offset
+
+    def __call__(self, c: Correspondences) -> Correspondences:
+        """The same matches with a prior."""
+        if c.lafs0 is None or c.lafs1 is None or c.quality is None:
+            return c
+        w = frame_agreement(c.x0, c.x1, c.lafs0, c.lafs1, c.quality, c.mask)
+        quality = torch.where(c.mask, c.quality, 1)
+        logit = self.agreement * torch.log(w + 0.02) + self.ratio * quality + self.offset
+        return c.replace(prior=torch.where(c.mask, torch.sigmoid(logit), 0))

@@ -1,0 +1,90 @@
+"""The result of one image pair, as one row of a table."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import pyarrow as pa
+
+PAIR_SCHEMA = pa.schema(
+    [
+        pa.field("pair", pa.string(), nullable=False),
+        pa.field("key", pa.int64(), nullable=False),
+        pa.field("family", pa.string(), nullable=False),
+        pa.field("scene", pa.string(), nullable=False),
+        pa.field("ok", pa.bool_(), nullable=False),
+        pa.field("reason", pa.string(), nullable=False),
+        pa.field("nsgd", pa.float64(), nullable=False),
+        pa.field("nsgd_released", pa.float64()),
+        pa.field("inlier_rate", pa.float64()),
+        pa.field("inlier_rate_before", pa.float64()),
+        pa.field("corrs", pa.int64(), nullable=False),
+        pa.field("corrs_before", pa.int64(), nullable=False),
+        pa.field("features0", pa.int64(), nullable=False),
+        pa.field("features1", pa.int64(), nullable=False),
+        pa.field("draws", pa.int64(), nullable=False),
+        pa.field("seconds_features", pa.float64()),
+        pa.field("seconds_matching", pa.float64()),
+        pa.field("seconds_pruning", pa.float64()),
+        pa.field("seconds_estimation", pa.float64()),
+        pa.field("seconds_metrics", pa.float64()),
+        pa.field("F", pa.list_(pa.float64(), 9)),
+    ]
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class PairRow:
+    """The result of one image pair. What could not be computed is None or NaN, and null in the table.
+
+    Raises ValueError for a row that contradicts itself: a failed pair has a reason, NSGD 1 and no F; a sound one has no
+    reason and nine finite elements of F; NSGD is in [0, 1].
+    """
+
+    pair: str  # the pair's identity within its data set
+    key: int  # the pair's stable 64-bit key, `pair_key(pair)`
+    family: str  # what results are grouped by
+    scene: str  # the cluster for the bootstrap
+    ok: bool  # whether there is an estimate
+    reason: str = ""  # why not
+    nsgd: float = 1.0  # share of the image diagonal, in [0, 1]; 1 where the pair failed
+    nsgd_released: float | None = None  # the same as the published evaluator computes it
+    inlier_rate: float | None = None  # share of the estimator's inliers that obey the true F, in [0, 1]
+    inlier_rate_before: float | None = None  # share of the matches given to the estimator that do
+    corrs: int = 0  # the estimator's inliers
+    corrs_before: int = 0  # the matches given to the estimator
+    features0: int = 0  # features of image 0
+    features1: int = 0  # features of image 1
+    draws: int = 0  # minimal samples drawn
+    seconds_features: float | None = None  # seconds of wall-clock time spent on this pair, stage by stage;
+    seconds_matching: float | None = None  # a batch's time is shared equally among its pairs
+    seconds_pruning: float | None = None
+    seconds_estimation: float | None = None
+    seconds_metrics: float | None = None
+    F: Sequence[float] | None = None  # row by row, x1^T F x0 = 0 in pixels, unit Frobenius norm
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.nsgd <= 1.0:
+            raise ValueError(f"pair {self.pair!r}: nsgd is {self.nsgd}; it must be in [0, 1]")
+        if self.ok:
+            if self.reason:
+                raise ValueError(f"pair {self.pair!r} is ok but has a reason of failure: {self.reason!r}")
+            if self.F is None or len(self.F) != 9 or not all(map(math.isfinite, self.F)):
+                raise ValueError(f"pair {self.pair!r} is ok: F must be nine finite numbers, but is {self.F}")
+        elif not self.reason or self.nsgd != 1.0 or self.F is not None:
+            raise ValueError(
+                f"pair {self.pair!r} failed: it needs a reason, nsgd 1 and no F, "
+                f"but has reason={self.reason!r}, nsgd={self.nsgd}, F={self.F}"
+            )
+
+
+def to_table(rows: Sequence[PairRow]) -> pa.Table:
+    """The rows as a table of `PAIR_SCHEMA`; NaN becomes null."""
+    columns = {name: [_plain(getattr(row, name)) for row in rows] for name in PAIR_SCHEMA.names}
+    return pa.table(columns, schema=PAIR_SCHEMA)
+
+
+def _plain(value: object) -> object:
+    return None if isinstance(value, float) and math.isnan(value) else value

@@ -1,0 +1,198 @@
+"""The run folder: one evaluation's identity, its pairs' results as they come, its summary.
+
+::
+
+    run.json               the identity; written first, never changed
+    pairs/part-*.parquet   rows of `PAIR_SCHEMA`; any number of processes may add parts
+    summary.json, summary.md
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import time
+import uuid
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from fmtorch.storage.files import replacing, sync, temporary_name
+from fmtorch.storage.rows import PAIR_SCHEMA, PairRow, to_table
+
+FORMAT = 1  # of the folder; to be raised when the schema changes
+_SHOWN = 5  # differing fields shown in an error
+
+
+class RunFolderError(ValueError):
+    """A run folder that cannot be used as asked; the message says what to do."""
+
+
+def canonical(config: Mapping[str, Any]) -> str:
+    """The one JSON text of a configuration: sorted keys, no spaces, floats by `repr`."""
+    return json.dumps(config, sort_keys=True, separators=(",", ":"))
+
+
+def identity_digest(config: Mapping[str, Any]) -> str:
+    """The hex digest (blake2b, 128 bits) of what defines a run's results.
+
+    config: plain dicts, lists, strings, numbers, booleans and None: the pipeline's configuration, the data set's name
+    and digest, the seed, the digests of learned files, the version. Raises TypeError for anything else.
+    """
+    return hashlib.blake2b(canonical(config).encode(), digest_size=16).hexdigest()
+
+
+@dataclasses.dataclass(frozen=True)
+class RunFolder:
+    """An evaluation on disk; made by `open` (to write) or `load` (to read)."""
+
+    path: Path
+    config: dict[str, Any]  # what defines the results, see `identity_digest`
+
+    @classmethod
+    def open(cls, path: Path | str, config: Mapping[str, Any]) -> RunFolder:
+        """Start a run in `path`, or continue it there when the folder holds a run of the same identity.
+
+        Several processes may open the same folder at once. Raises RunFolderError, touching nothing, where the folder
+        holds a run of another identity or files that are no run.
+        """
+        path = Path(path)
+        wanted: dict[str, Any] = json.loads(canonical(config))
+        if path.exists() and not path.is_dir():
+            raise RunFolderError(f"{path} is a file; run_dir must name a folder")
+        path.mkdir(parents=True, exist_ok=True)
+        foreign = sorted(entry.name for entry in path.iterdir() if entry.suffix != ".tmp")
+        if not (path / "run.json").exists():
+            if foreign:
+                raise RunFolderError(
+                    f"{path} is not empty and has no run.json, so it is no run folder (it holds {_some(foreign)}); "
+                    "choose another run_dir"
+                )
+            _claim(path / "run.json", wanted)
+        folder = cls.load(path)
+        if folder.identity != identity_digest(wanted):
+            raise RunFolderError(
+                f"{path} holds another run; what differs (there -> now): {_some(_differences(folder.config, wanted))}. "
+                "Choose another run_dir, or delete the folder"
+            )
+        (path / "pairs").mkdir(exist_ok=True)
+        return folder
+
+    @classmethod
+    def load(cls, path: Path | str) -> RunFolder:
+        """The existing run in `path`, whatever its identity. Raises RunFolderError where there is none."""
+        file = Path(path) / "run.json"
+        try:
+            stored = json.loads(file.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise RunFolderError(f"{path} is no run folder: it has no run.json") from None
+        except ValueError as error:
+            raise RunFolderError(f"{file} is not valid JSON ({error}); delete the folder and run again") from error
+        if not isinstance(stored, dict) or not isinstance(stored.get("config"), dict):
+            raise RunFolderError(f"{file} was not written by this program: it has no 'config'")
+        if stored.get("format") != FORMAT:
+            raise RunFolderError(
+                f"{file} has format {stored.get('format')}, this version reads format {FORMAT}; choose another run_dir"
+            )
+        return cls(Path(path), stored["config"])
+
+    @property
+    def identity(self) -> str:
+        """The digest of what defines the results."""
+        return identity_digest(self.config)
+
+    def append(self, rows: Sequence[PairRow]) -> None:
+        """Add results, as a new part that is either whole or absent. Safe with several processes."""
+        if not rows:
+            return
+        # Parts sort by the time they were written; the second half keeps simultaneous writers apart.
+        name = f"part-{time.time_ns():020d}-{uuid.uuid4().hex[:8]}.parquet"
+        with replacing(self.path / "pairs" / name) as temporary:
+            pq.write_table(to_table(rows), temporary)
+
+    def done(self) -> set[int]:
+        """The keys of the pairs that have a result."""
+        return {int(key) for part in self._parts(["key"]) for key in part["key"].to_numpy()}
+
+    def read(self, keys: Collection[int] | None = None) -> pa.Table:
+        """The results, a row of `PAIR_SCHEMA` per pair: all of them, or those of the pairs with the given keys.
+
+        Of several rows of one pair the first written counts.
+        Raises RunFolderError naming a part that cannot be read.
+        """
+        table = pa.concat_tables([PAIR_SCHEMA.empty_table(), *self._parts(PAIR_SCHEMA.names)])
+        found = table["key"].to_numpy()
+        _, first = np.unique(found, return_index=True)
+        if keys is not None:
+            first = first[np.isin(found[first], np.fromiter(keys, np.int64, len(keys)))]
+        return table.take(np.sort(first))
+
+    def write_summary(self, summary: Mapping[str, Any], markdown: str) -> None:
+        """Write ``summary.json`` and ``summary.md``. Raises ValueError for NaN, which JSON does not have."""
+        text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
+        for name, content in (("summary.json", text), ("summary.md", markdown)):
+            with replacing(self.path / name) as temporary:
+                temporary.write_text(content, encoding="utf-8")
+
+    def _parts(self, columns: list[str]) -> Iterator[pa.Table]:
+        """The parts in the order they were written; of a part's columns only those asked for."""
+        for file in sorted((self.path / "pairs").glob("part-*.parquet")):
+            try:
+                with pq.ParquetFile(file) as parquet:
+                    if not parquet.schema_arrow.equals(PAIR_SCHEMA):
+                        raise pa.ArrowInvalid("its columns are not those of this version")
+                    yield parquet.read(columns=columns)
+            except (pa.ArrowException, OSError) as error:
+                raise RunFolderError(
+                    f"{file} cannot be read ({error}); delete it and start the run again, which computes its pairs anew"
+                ) from error
+
+
+def _claim(file: Path, config: dict[str, Any]) -> None:
+    """Write run.json unless another process has just done so: of several, the first one wins.
+
+    Where the file system has no hard links the last one wins, which is the same unless their identities differ.
+    """
+    temporary = temporary_name(file)
+    stored = {"format": FORMAT, "identity": identity_digest(config), "config": config}
+    try:
+        temporary.write_text(json.dumps(stored, indent=2) + "\n", encoding="utf-8")
+        sync(temporary)
+        try:
+            os.link(temporary, file)  # unlike a rename it fails where the name is taken
+        except FileExistsError:
+            return
+        except OSError:
+            os.replace(temporary, file)
+        sync(file.parent)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
+    """``a.b: 1 -> 2`` for each field that differs."""
+    before, after = dict(_leaves(old)), dict(_leaves(new))
+    names = [*before, *(name for name in after if name not in before)]
+    pairs = [(name, before.get(name, "(absent)"), after.get(name, "(absent)")) for name in names]
+    return [f"{name}: {was} -> {now}" for name, was, now in pairs if was != now]
+
+
+def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
+    """Dotted names and JSON texts of all that a nested configuration holds."""
+    if isinstance(value, dict) and value:
+        for key, entry in value.items():
+            yield from _leaves(entry, f"{name}.{key}" if name else key)
+    else:
+        yield name, json.dumps(value, sort_keys=True)
+
+
+def _some(items: Sequence[str]) -> str:
+    """The first few items, and how many more there are."""
+    more = len(items) - _SHOWN
+    return "; ".join(items[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")

@@ -1,0 +1,67 @@
+"""Scores equal their definitions and do not depend on tiles."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from fmtorch.estimators import scoring
+from fmtorch.estimators.problem import problems
+from fmtorch.estimators.scoring import InlierCount, Median, TruncatedSquares, score_models
+from tests.laws import scene
+from tests.reference import ransac as reference
+
+SCORES = [InlierCount(2.0), TruncatedSquares(2.0), TruncatedSquares(2.0, prior_weighted=True), Median()]
+
+
+def _models(problem: object, count: int = 40) -> torch.Tensor:
+    return (
+        torch.randn(9, 1, count, generator=torch.Generator().manual_seed(0)) * torch.logspace(-2, 0, 9)[:, None, None]
+    )
+
+
+@pytest.mark.parametrize("score", SCORES, ids=["count", "msac", "prior_msac", "median"])
+def test_scores_equal_their_definitions(score: scoring.Score) -> None:
+    problem = problems(scene(0, 60), 0, 8)[0][0]
+    F = _models(problem)
+    batched = score_models(score, F, problem, problem.points.float())[0].numpy()
+    points = problem.points[:, 0, :60].float().double().numpy()
+    prior = problem.prior[0, :60].numpy() if problem.prior is not None else None
+    for m in range(F.shape[2]):
+        model = F[:, 0, m].double().numpy().reshape(3, 3)
+        residual = np.array([reference.sampson(model, points[:2, n], points[2:, n]) for n in range(60)])
+        pixels = residual * float(problem.unit[0])
+        if isinstance(score, InlierCount):
+            border = np.abs(pixels - 2.0) < 1e-3  # float32 residuals this close to the threshold may fall either way
+            assert abs(batched[m] - (pixels <= 2.0).sum()) <= border.sum()
+        elif isinstance(score, Median):
+            # float32: relative error of a residual about 1e-7 times the cancellation in x1^T F x0
+            np.testing.assert_allclose(-batched[m], reference.lower_median(residual**2), rtol=1e-3, atol=1e-12)
+        else:
+            expected = reference.msac(pixels, 2.0, prior if score.prior_weighted else None)
+            # each of up to 60 gains is rounded to a multiple of 2^-10
+            assert abs(batched[m] - expected) <= 60 * 2.0**-11 + 1e-3
+
+
+@pytest.mark.parametrize("score", SCORES, ids=["count", "msac", "prior_msac", "median"])
+@pytest.mark.parametrize("tile", [1, 200, 5000, 1 << 20])
+def test_tiles_change_no_score(score: scoring.Score, tile: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = problems(scene(0, 300), 0, 8)[0][0]
+    F = _models(problem)
+    whole = score_models(score, F, problem, problem.points.float())
+    monkeypatch.setattr(scoring, "CPU_TILE", tile)
+    assert torch.equal(score_models(score, F, problem, problem.points.float()), whole)
+
+
+def test_exact_sum_does_not_depend_on_the_order() -> None:
+    gain = torch.rand(1, 3, 20000, generator=torch.Generator().manual_seed(0))
+    shuffled = gain[..., torch.randperm(20000, generator=torch.Generator().manual_seed(1))]
+    assert torch.equal(scoring._exact_sum(gain.clone()), scoring._exact_sum(shuffled.clone()))
+    np.testing.assert_allclose(scoring._exact_sum(gain.clone()).numpy(), gain.double().sum(-1).numpy(), rtol=1e-3)
+
+
+@pytest.mark.parametrize("threshold", [0.0, -1.0, float("nan")])
+def test_threshold_must_be_positive(threshold: float) -> None:
+    with pytest.raises(ValueError, match="must be positive"):
+        InlierCount(threshold)

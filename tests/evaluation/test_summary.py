@@ -1,0 +1,135 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from rich.console import Console
+
+from fmtorch.evaluation.summary import summarize, summary_markdown, summary_table
+from fmtorch.storage import PairRow, to_table
+from fmtorch.types import pair_key
+
+F = (0.0, -0.5, 0.1, 0.5, 0.0, -0.1, 0.2, 0.3, 0.59)
+
+
+def good(name: str, nsgd: float, **changes: Any) -> PairRow:
+    row = PairRow(
+        pair=name, key=pair_key(name), family="indoor", scene="s0", ok=True, nsgd=nsgd, nsgd_released=nsgd,
+        inlier_rate=0.75, inlier_rate_before=0.5, corrs=100, corrs_before=400, F=F, seconds_features=1.0,
+        seconds_matching=0.5, seconds_pruning=0.0, seconds_estimation=0.25, seconds_metrics=0.125,
+    )  # fmt: skip
+    return dataclasses.replace(row, **changes)
+
+
+def bad(name: str, reason: str = "5 matches; at least 8 are needed", **changes: Any) -> PairRow:
+    row = PairRow(pair=name, key=pair_key(name), family="indoor", scene="s0", ok=False, reason=reason)
+    return dataclasses.replace(row, **changes)
+
+
+def known() -> pa.Table:
+    return to_table(
+        [
+            good("a", 0.0, scene="s0"),
+            good("b", 0.005, scene="s1", inlier_rate=None, corrs=0),
+            good("c", 0.025, scene="s2", seconds_features=3.0),
+            good("d", 0.05, scene="s3"),
+            bad("e", scene="s4", inlier_rate_before=0.9, corrs_before=7, seconds_features=2.0),
+            bad("f", "7 matches; at least 8 are needed", scene="s5", family="orbit"),
+            bad("g", "no keypoints in a|b.png", scene="s5", family="orbit"),
+            good("h", 0.049, scene="s5", family="orbit", inlier_rate=1.0, nsgd_released=None),
+        ]
+    )
+
+
+def test_known_answer() -> None:
+    summary = summarize(known())
+    assert list(summary) == ["indoor", "orbit", "all"]
+    indoor, orbit, everything = summary.values()
+    assert (indoor["pairs"], indoor["scenes"], indoor["failures"], indoor["failure_share"]) == (5, 5, 1, 0.2)
+    assert indoor["recall"] == pytest.approx(3 / 5)  # strictly below 0.05
+    assert indoor["recall_fine"] == pytest.approx(2 / 5)
+    assert indoor["mean_recall"] == pytest.approx((1 + 0.9 + 0.5 + 0 + 0) / 5)
+    assert indoor["recall_released"] == pytest.approx(3 / 5)
+    assert indoor["interval_over"] == "scene"
+    assert indoor["inlier_rate"] == pytest.approx(0.75)  # of the pairs that did not fail and have a rate
+    assert indoor["inlier_rate_failures_0"] == pytest.approx(3 * 0.75 / 5)
+    assert indoor["inlier_rate_before"] == pytest.approx(0.5)
+    assert indoor["inlier_rate_before_failures_0"] == pytest.approx(4 * 0.5 / 5)
+    assert indoor["corrs"] == pytest.approx(75)
+    assert indoor["corrs_before"] == pytest.approx(400)
+    assert indoor["seconds"]["features"] == 1.0
+    assert indoor["seconds"]["total"] == 1.875
+    assert orbit["interval_over"] == "pair"
+    assert orbit["recall_released"] is None
+    assert orbit["recall"] == pytest.approx(1 / 3)
+    assert everything["recall"] == pytest.approx(4 / 8)
+    assert everything["scenes"] == 6
+    assert everything["reasons"] == {"N matches; at least N are needed": 2, "no keypoints in a|b.png": 1}
+    low, high = everything["recall_interval"]
+    assert 0 <= low < everything["recall"] < high <= 1
+
+
+def test_failing_never_pays() -> None:
+    """Turning a poor result into a failure raises none of the figures that count failures."""
+    rows = [good(str(i), 0.01 * i, inlier_rate=0.1 * i) for i in range(8)]
+    failed = [*rows[:7], bad("7")]
+    before, after = (summarize(to_table(r))["all"] for r in (rows, failed))
+    for figure in ("recall", "recall_fine", "mean_recall", "inlier_rate_failures_0", "inlier_rate_before_failures_0"):
+        assert after[figure] <= before[figure]
+
+
+def test_summary_does_not_depend_on_the_order_of_pairs() -> None:
+    table = known()
+    turned = table.take(np.arange(len(table))[::-1])
+    a, b = summarize(table), summarize(turned)
+    for name in a:
+        for figure in ("recall", "mean_recall", "inlier_rate", "corrs", "failures"):
+            assert a[name][figure] == pytest.approx(b[name][figure], abs=1e-15)
+
+
+@pytest.mark.parametrize("rows", [[], [bad("a")], [good("a", 0.2)], [bad("a"), bad("b", family="x")]], ids=len)
+def test_nothing_breaks_on_few_or_failed_pairs(rows: list[PairRow]) -> None:
+    summary = summarize(to_table(rows))
+    assert summary["all"]["pairs"] == len(rows)
+    json.dumps(summary, allow_nan=False)
+    assert summary_markdown(summary, title="t").startswith("# t\n")
+    _render(summary, 80)
+
+
+def _render(summary: dict[str, dict[str, Any]], width: int) -> str:
+    console = Console(width=width, record=True, file=None, color_system=None)
+    with console.capture() as capture:
+        console.print(summary_table(summary, title="sift_ratio on rendered"))
+    return capture.get()
+
+
+def test_terminal_table_fits_80_columns() -> None:
+    text = _render(summarize(known()), 80)
+    lines = text.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert "…" not in text
+    indoor = next(line.split() for line in lines if line.strip().startswith("indoor"))
+    assert indoor[1:3] == ["5", "60.0"]
+    assert {"75.0", "(50.0)", "75", "(400)"} <= set(indoor)
+    assert "scenes (indoor, all); pairs (orbit)" in " ".join(text.split())
+
+
+def test_markdown() -> None:
+    text = summary_markdown(summarize(known()), title="sift_ratio on rendered")
+    lines = text.splitlines()
+    tables = [line.replace("\\|", "").count("|") for line in lines if line.startswith("|")]
+    assert set(tables[:5]) == {13}
+    assert set(tables[5:]) == {8}
+    assert "| indoor | 5 | 5 | 60.0 [" in text
+    assert "a\\|b.png" in text
+    assert "1 (20.0%)" in text
+
+
+def test_a_single_family_is_not_repeated_as_all() -> None:
+    summary = summarize(to_table([good("a", 0.0), good("b", 0.2)]))
+    assert list(summary) == ["indoor", "all"]
+    assert "| all |" not in summary_markdown(summary, title="t")

@@ -1,0 +1,120 @@
+"""The three laws as checks over anything that maps correspondences to a result. A new part joins by being registered.
+
+1. Padding is invisible: garbage or NaN in masked slots changes nothing.
+2. Neighbours are invisible: a pair's result does not depend on the batch it is in (bit-equal).
+3. No pair can take its batch down: degenerate pairs are told apart and leave the others alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fmtorch.types import Correspondences, collate
+
+Result = dict[str, Tensor]  # every value has the batch as its first dimension; masks (B, N) may be padded on the right
+
+
+@dataclasses.dataclass(frozen=True)
+class Subject:
+    """Something that keeps the laws: a function of correspondences with a result per pair."""
+
+    name: str
+    run: Callable[[Correspondences], Result]
+
+
+def scene(index: int, count: int = 150, outliers: float = 0.4, noise: float = 0.3) -> Correspondences:
+    """One synthetic pair: a cloud of points before two cameras, with noise, outliers, ratios, frames and a key."""
+    rng = np.random.default_rng(index)
+    X = np.concatenate([rng.uniform(-2, 2, (count, 2)), rng.uniform(4, 9, (count, 1))], 1)
+    angle = rng.uniform(-0.3, 0.3)
+    R = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    K = np.array([[800, 0, 480], [0, 800, 320], [0, 0, 1.0]])
+
+    def project(points: np.ndarray) -> np.ndarray:
+        pixel = points @ K.T
+        return pixel[:, :2] / pixel[:, 2:]
+
+    x0 = project(X) + rng.normal(0, noise, (count, 2))
+    x1 = project(X @ R.T + rng.uniform(-1, 1, 3)) + rng.normal(0, noise, (count, 2))
+    wrong = rng.random(count) < outliers
+    x1[wrong] = rng.uniform([0, 0], [960, 640], (int(wrong.sum()), 2))
+    ratio = np.where(wrong, rng.uniform(0.5, 0.95, count), rng.uniform(0.2, 0.8, count))
+    frames = rng.normal(size=(2, count, 2, 3))
+    frames[0, :, :, 2], frames[1, :, :, 2] = x0, x1
+
+    def tensor(value: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.asarray(value, dtype=np.float32))[None]
+
+    size = torch.tensor([[640, 960]])
+    return Correspondences(
+        tensor(x0), tensor(x1), torch.ones(1, count, dtype=torch.bool), quality=tensor(ratio),
+        prior=tensor(np.clip(1.2 - ratio, 0, 1)), lafs0=tensor(frames[0]), lafs1=tensor(frames[1]),
+        size0=size, size1=size, key=torch.tensor([index + 1]),
+    )  # fmt: skip
+
+
+def scenes() -> Correspondences:
+    """A batch of pairs of different sizes."""
+    return collate([scene(i, count) for i, count in enumerate((150, 40, 333, 90, 150))])
+
+
+def with_padding(c: Correspondences, rng: np.random.Generator, garbage: float) -> Correspondences:
+    """The same matches in the same order, with garbage slots strewn in between."""
+    b, n = c.mask.shape
+    total = n + 61
+    where = torch.stack([torch.from_numpy(np.sort(rng.choice(total, n, replace=False))) for _ in range(b)])
+
+    def spread(value: Tensor) -> Tensor:
+        filler = False if value.dtype == torch.bool else garbage
+        out = torch.full((b, total, *value.shape[2:]), filler, dtype=value.dtype)
+        index = where.reshape(b, n, *[1] * (value.dim() - 2)).expand(b, n, *value.shape[2:])
+        return out.scatter(1, index, value)
+
+    fields = ("x0", "x1", "mask", "quality", "prior", "lafs0", "lafs1")
+    return c.replace(**{f: spread(getattr(c, f)) for f in fields if getattr(c, f) is not None})
+
+
+def live_values(result: Result, c: Correspondences) -> Result:
+    """Per-match values reduced to the live matches, in order, so that results under different paddings compare."""
+    n = c.mask.shape[1]
+    per_match = {k: v for k, v in result.items() if v.dim() >= 2 and v.shape[1] == n and k != "F"}
+    rest = {k: v for k, v in result.items() if k not in per_match}
+    return {**rest, **{k: v[c.mask] for k, v in per_match.items()}}
+
+
+def degenerate() -> dict[str, Correspondences]:
+    """Pairs that no estimator can solve, or only by luck."""
+    good = scene(3)
+    n = good.x0.shape[1]
+    line = torch.linspace(0, 600, n)
+    collinear = torch.stack([line, 0.5 * line + 20], -1)[None]
+    return {
+        "empty": good.replace(mask=torch.zeros_like(good.mask)),
+        "one match": good.replace(mask=torch.arange(n)[None] < 1),
+        "seven matches": good.replace(mask=torch.arange(n)[None] < 7),
+        "all points equal": good.replace(x0=torch.full_like(good.x0, 100), x1=torch.full_like(good.x1, 50)),
+        "equal in one image": good.replace(x0=torch.full_like(good.x0, 100)),
+        "collinear": good.replace(x0=collinear, x1=collinear + 5),
+        "one plane": good.replace(x1=good.x0 * 1.1 + 3),
+        "identity": good.replace(x1=good.x0),
+        "all outliers": scene(4, outliers=1.0),
+        "NaN": good.replace(x0=torch.full_like(good.x0, torch.nan)),
+        "some NaN": good.replace(x1=torch.where(torch.arange(n)[None, :, None] % 3 == 0, torch.nan, good.x1)),
+        "infinite": good.replace(x1=torch.full_like(good.x1, torch.inf)),
+        "huge": good.replace(x0=good.x0 * 1e6, x1=good.x1 * 1e6),
+        "tiny": good.replace(x0=good.x0 * 1e-6, x1=good.x1 * 1e-6),
+    }
+
+
+def assert_same(a: Result, b: Result, what: str) -> None:
+    """Bit-equal, NaN equal to NaN."""
+    assert a.keys() == b.keys()
+    for name in a:
+        assert a[name].shape == b[name].shape, f"{what}: {name} has shapes {a[name].shape} and {b[name].shape}"
+        same = (a[name] == b[name]) | ((a[name] != a[name]) & (b[name] != b[name]))
+        assert bool(same.all()), f"{what}: {name} differs"

@@ -1,0 +1,30 @@
+"""Scores of one hypothesis, match by match, from the definitions."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+
+def sampson(F: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> float:
+    """The Sampson distance of one match (Hartley & Zisserman 2004, equation 11.9)."""
+    h0, h1 = np.append(x0, 1.0), np.append(x1, 1.0)
+    line1, line0 = F @ h0, F.T @ h1
+    return abs(h1 @ line1) / math.sqrt(line1[0] ** 2 + line1[1] ** 2 + line0[0] ** 2 + line0[1] ** 2)
+
+
+def msac(residuals: np.ndarray, threshold: float, prior: np.ndarray | None = None) -> float:
+    """Sum of 1 - r^2 / t^2 over the matches within t, times the prior."""
+    weights = np.ones(len(residuals)) if prior is None else prior
+    return sum(w * (1 - (r / threshold) ** 2) for r, w in zip(residuals, weights, strict=True) if r < threshold)
+
+
+def lower_median(values: np.ndarray) -> float:
+    """The lower of the middle values."""
+    return sorted(values)[(len(values) + 1) // 2 - 1]
+
+
+def draws_for_confidence(inlier_ratio: float, size: int, confidence: float) -> float:
+    """How many samples until one is all inliers with this probability."""
+    return math.log(1 - confidence) / math.log(1 - inlier_ratio**size)

@@ -1,0 +1,89 @@
+"""The three laws over every registered pruner, prior and estimator."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from fmtorch import presets
+from fmtorch.types import Correspondences, collate
+from tests.laws import Result, Subject, assert_same, degenerate, live_values, scene, scenes, with_padding
+
+OTHER_LIBRARIES = ("opencv_", "poselib")
+
+
+def _estimator(name: str) -> Subject:
+    # Few hypotheses: the laws do not depend on their number, and the tests stay quick.
+    options = {"hypotheses": 200, "round": 100} if not name.startswith(OTHER_LIBRARIES) else {}
+    estimator = presets.build("estimator", name, **options)
+
+    def run(c: Correspondences) -> Result:
+        e = estimator(c, seed=5)
+        return {"F": e.F, "inliers": e.inliers, "ok": e.ok, "draws": e.draws}
+
+    return Subject(f"estimator={name}", run)
+
+
+def _pruner(name: str) -> Subject:
+    pruner = presets.build("pruner", name)
+
+    def run(c: Correspondences) -> Result:
+        pruned = pruner(c)
+        prior = {} if pruned.prior is None else {"prior": pruned.prior}
+        return {"kept": pruned.mask, **prior}
+
+    return Subject(f"pruner={name}", run)
+
+
+def _subjects() -> list[Subject]:
+    """Every preset of these groups: a new file in conf/ joins by being there."""
+    estimators = [_estimator(n) for n in presets.available("estimator") if n != "poselib"]
+    return [*estimators, *(_pruner(n) for n in presets.available("pruner"))]
+
+
+SUBJECTS = _subjects()
+everything = pytest.mark.parametrize("subject", SUBJECTS, ids=[s.name for s in SUBJECTS])
+
+
+@everything
+@pytest.mark.parametrize("garbage", [float("nan"), 1e30, -7.0])
+def test_padding_is_invisible(subject: Subject, garbage: float) -> None:
+    c = scenes()
+    padded = with_padding(c, np.random.default_rng(0), garbage)
+    assert_same(live_values(subject.run(c), c), live_values(subject.run(padded), padded), subject.name)
+
+
+@everything
+def test_neighbours_are_invisible(subject: Subject) -> None:
+    pairs = [scene(i, count) for i, count in enumerate((150, 40, 333, 90, 150, 140, 700))]
+    together = subject.run(collate(pairs))
+    for i, pair in enumerate(pairs):
+        alone = subject.run(pair)
+        n = pair.mask.shape[1]
+        shared = {
+            k: v[i : i + 1, :n] if k in ("inliers", "kept", "prior") else v[i : i + 1] for k, v in together.items()
+        }
+        assert_same(alone, shared, f"{subject.name}, pair {i}")
+
+
+@everything
+@pytest.mark.parametrize("kind", degenerate())
+def test_no_pair_takes_its_batch_down(subject: Subject, kind: str) -> None:
+    good = [scene(1), scene(2, 60)]
+    alone = subject.run(collate(good))
+    mixed = subject.run(collate([good[0], degenerate()[kind], good[1]]))
+    n = max(pair.mask.shape[1] for pair in good)
+    kept = {k: v[[0, 2], :n] if k in ("inliers", "kept", "prior") else v[[0, 2]] for k, v in mixed.items()}
+    assert_same(alone, kept, f"{subject.name} beside {kind}")
+    for value in mixed.values():
+        assert not bool(torch.isnan(value.to(torch.float64)).any()), f"{subject.name}: NaN for {kind}"
+
+
+@pytest.mark.parametrize("name", [n for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES)])
+@pytest.mark.parametrize("kind", ["empty", "one match", "all points equal", "NaN", "infinite"])
+def test_hopeless_pairs_have_a_reason(name: str, kind: str) -> None:
+    estimate = presets.build("estimator", name, hypotheses=100)(degenerate()[kind])
+    assert not bool(estimate.ok[0])
+    assert estimate.reason[0]
+    assert not bool(estimate.inliers.any())

@@ -1,0 +1,126 @@
+"""What is built and installed: the wheel's contents, where it finds its folders, the pinned versions."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tarfile
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+CHECKOUT = Path(__file__).resolve().parents[1]
+
+
+def _project() -> dict[str, object]:
+    with open(CHECKOUT / "pyproject.toml", "rb") as file:
+        project: dict[str, object] = tomllib.load(file)["project"]
+    return project
+
+
+def _build(source: Path, target: str, folder: Path) -> Path:
+    """Build offline with the backend itself."""
+    pytest.importorskip("hatchling")
+    command = [sys.executable, "-m", "hatchling", "build", "-t", target, "-d", str(folder)]
+    done = subprocess.run(command, cwd=source, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (built,) = folder.iterdir()
+    return built
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _build(CHECKOUT, "wheel", tmp_path_factory.mktemp("wheel"))
+
+
+def _names(wheel: Path) -> set[str]:
+    with zipfile.ZipFile(wheel) as archive:
+        return {name for name in archive.namelist() if ".dist-info/" not in name}
+
+
+def _tree(folder: Path, prefix: str) -> set[str]:
+    """The files below a folder of the checkout, as they are named in the wheel."""
+    files = (file.relative_to(folder) for file in folder.rglob("*") if file.is_file() and file.suffix != ".tmp")
+    return {f"{prefix}/{file.as_posix()}" for file in files if "__pycache__" not in file.parts}
+
+
+def test_wheel_carries_the_package_with_its_folders(wheel: Path) -> None:
+    names = _names(wheel)
+    assert {name.split("/")[0] for name in names} == {"fmtorch"}  # no conf, models or tests at top level
+    assert "fmtorch/py.typed" in names
+    assert "fmtorch/models/README.md" in names
+    assert any(name.startswith("fmtorch/conf/") for name in names)
+    folders = {prefix: CHECKOUT / path for prefix, path in {"fmtorch/conf": "conf", "fmtorch/models": "models"}.items()}
+    for prefix, folder in folders.items():
+        assert _tree(folder, prefix) <= names
+    assert _tree(CHECKOUT / "fmtorch", "fmtorch") <= names
+
+
+def test_wheel_carries_the_licence(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        metadata = next(name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+        text = archive.read(metadata).decode()
+        assert any(name.endswith("/LICENSE") for name in archive.namelist())
+    assert "License-Expression: Apache-2.0" in text
+    assert f"Version: {_project()['version']}" in text
+
+
+def test_version_is_stated_once_more_and_the_same() -> None:
+    import fmtorch
+
+    assert fmtorch.__version__ == _project()["version"]
+
+
+def test_source_distribution_builds_the_same_wheel(wheel: Path, tmp_path: Path) -> None:
+    archive = _build(CHECKOUT, "sdist", tmp_path / "sdist")
+    with tarfile.open(archive) as file:
+        file.extractall(tmp_path / "source", filter="data")
+    (source,) = (tmp_path / "source").iterdir()
+    assert (source / "constraints.txt").is_file()
+    assert (source / "tests" / "conftest.py").is_file()
+    assert _names(_build(source, "wheel", tmp_path / "wheel")) == _names(wheel)
+
+
+def test_unpacked_wheel_finds_its_folders_from_any_directory(wheel: Path, tmp_path: Path) -> None:
+    root = tmp_path / "site-packages"
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(root)
+    elsewhere = tmp_path / "elsewhere"
+    (elsewhere / "conf").mkdir(parents=True)  # a user's own folder of that name must not be taken
+    code = "import fmtorch, fmtorch.resources as r; print(fmtorch.__file__, r.conf_dir(), r.models_dir(), sep='\\n')"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=elsewhere, env={**os.environ, "PYTHONPATH": str(root)},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    package = (root / "fmtorch").resolve()
+    expected = [package / "__init__.py", package / "conf", package / "models"]
+    assert [Path(line) for line in done.stdout.split()] == expected
+
+
+def _pins() -> dict[str, str]:
+    lines = (CHECKOUT / "constraints.txt").read_text().splitlines()
+    pins = [line.split("==") for line in lines if line and not line.startswith("#")]
+    return {canonicalize_name(name): version for name, version in pins}
+
+
+def test_constraints_are_exact_and_portable() -> None:
+    for line in (CHECKOUT / "constraints.txt").read_text().splitlines():
+        # no local versions (2.13.0+cpu), which only some package indexes have
+        assert line.startswith("#") or re.fullmatch(r"[a-z0-9-]+==[0-9][0-9a-z.]*", line), line
+
+
+def test_constraints_pin_every_declared_dependency_within_its_range() -> None:
+    project = _project()
+    extras = project["optional-dependencies"]
+    declared = [*project["dependencies"], *extras["test"], *extras["dev"]]  # type: ignore[index,misc]
+    pins = _pins()
+    for text in declared:
+        requirement = Requirement(text)
+        if requirement.name != "fmtorch":
+            assert pins[canonicalize_name(requirement.name)] in requirement.specifier, text
