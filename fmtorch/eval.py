@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from fmtorch import __version__, presets
+from fmtorch import __version__, data, presets
 from fmtorch.data import PairDataset
 from fmtorch.evaluation.plots import plot_recall_curves
 from fmtorch.evaluation.run import evaluate_pairs, select
@@ -87,12 +87,14 @@ def _load(config: DictConfig, progress: Progress) -> PairDataset:
 
     def drawn(done: int, total: int) -> None:
         if not bar:
-            bar.append(progress.add_task(f"drawing {config.name}", total=total))
+            bar.append(progress.add_task("drawing scenes", total=total))
         progress.update(bar[0], completed=done, total=total)
 
-    extra = {"progress": drawn} if config._target_ == "fmtorch.data.load" else {}
-    dataset: PairDataset = presets.instantiate(config, "dataset", **extra)
-    return dataset
+    options = _plain(config)
+    if "_target_" in options:  # somebody's own data set
+        dataset: PairDataset = presets.instantiate(options, "dataset")
+        return dataset
+    return data.load(**options, progress=drawn)
 
 
 def _plain(config: Any) -> dict[str, Any]:

@@ -16,7 +16,9 @@ from fmtorch.data.rendered.surfaces import Surfaces, vec
 SIZE = (120, 160)
 
 
-def camera(x: float, y: float, z: float, target: tuple[float, float, float] = (0, 0, 1), focal: float = 150.0) -> Camera:
+def camera(
+    x: float, y: float, z: float, target: tuple[float, float, float] = (0, 0, 1), focal: float = 150.0
+) -> Camera:
     return look_at(calibration(focal, SIZE), SIZE, (x, y, z), target, roll=0.1 * x)
 
 
@@ -131,7 +133,9 @@ def test_a_mark_is_drawn_where_it_projects() -> None:
     disc = 255 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * 12.0**2))
     number = surfaces.texture(np.repeat((disc + 0.5).astype(np.uint8)[..., None], 3, axis=2))
     surfaces.quad(vec(-2, 0, 3), vec(4, 0, 0), vec(0, 0, -4), number)
-    stage = Stage(Geometry(surfaces), Light((0, -1, 0.1), sun=(0.0, 0.0, 0.0), ground_shade=0), np.zeros((8, 16, 3), np.uint8))
+    stage = Stage(
+        Geometry(surfaces), Light((0, -1, 0.1), sun=(0.0, 0.0, 0.0), ground_shade=0), np.zeros((8, 16, 3), np.uint8)
+    )
     c = camera(0.0, -5.0, 1.0, (0.0, 0.0, 1.0))  # frontal: no perspective shift of the centroid
     image = stage.radiance(c, (0.0, 0.0))[..., 0].astype(np.float64)
     yy, xx = np.mgrid[: SIZE[0], : SIZE[1]]
