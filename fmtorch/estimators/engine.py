@@ -120,7 +120,7 @@ class HypothesizeAndVerify:
     def _search(self, problem: Problem) -> _Search:
         p, device = len(problem.pair), problem.points.device
         points = problem.points.to(torch.float32)
-        table = self.sampler.table(problem)
+        table = self.sampler.table(problem, self.solver.size)
         subset = self._subset(problem)
         state = _Search(
             torch.zeros(9, p, 1, device=device),

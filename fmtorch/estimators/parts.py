@@ -10,8 +10,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.estimators.problem import Problem
-from fmtorch.estimators.sampling import PriorWeighted, Sampler, Uniform
-from fmtorch.estimators.scoring import InlierCount, Median, Score, TruncatedSquares, median_rank, sampson_squared
+from fmtorch.estimators.sampling import PriorWeighted, Prosac, Sampler, Uniform
+from fmtorch.estimators.scoring import (
+    InlierCount,
+    Median,
+    Score,
+    SigmaConsensus,
+    TruncatedSquares,
+    median_rank,
+    sampson_squared,
+)
 from fmtorch.geometry import eight_point
 from fmtorch.geometry.minimal import eight_point_components, seven_point_components
 
@@ -141,12 +149,13 @@ class LeastSquares:
         return torch.where(valid[:, None, None], fitted, F)
 
 
-SAMPLERS: dict[str, Callable[[], Sampler]] = {"uniform": Uniform, "prior": PriorWeighted}
+SAMPLERS: dict[str, Callable[[], Sampler]] = {"uniform": Uniform, "prosac": Prosac, "prior": PriorWeighted}
 SOLVERS: dict[str, Callable[[], Solver]] = {"seven_point": SevenPoint, "eight_point": EightPoint}
 SCORES: dict[str, Callable[[float], Score]] = {
     "inlier_count": InlierCount,
     "msac": TruncatedSquares,
     "prior_msac": lambda threshold: TruncatedSquares(threshold, prior_weighted=True),
+    "magsac": SigmaConsensus,
     "median": lambda threshold: Median(),
 }
 INLIER_RULES: dict[str, Callable[[float], Callable[[Tensor, Problem], Tensor]]] = {

@@ -184,5 +184,7 @@ def person(rng: Rng) -> Pixels:
     for y in range(60, 148, int(rng.integers(6, 16))):
         cv2.line(out, (28, y), (68, y), (*(coat * rng.uniform(0.5, 1.3)).tolist(), 1.0), 2)
     cv2.circle(out, (48, 30), 17, (*skin.tolist(), 1.0), -1)
-    cv2.ellipse(out, (48, 23), (18, 13), 0, 180, 360, (*colour(rng, (0, 0.15), (0, 0.7), (0.05, 0.6)).tolist(), 1.0), -1)
+    cv2.ellipse(
+        out, (48, 23), (18, 13), 0, 180, 360, (*colour(rng, (0, 0.15), (0, 0.7), (0.05, 0.6)).tolist(), 1.0), -1
+    )
     return to_pixels(out)

@@ -44,8 +44,12 @@ def _street(surfaces: Surfaces, rng: Rng, split: str, length: float) -> None:
             for k in range(3):
                 at = vec(i * tiles + k * tiles / 3, y, 0.12)
                 surfaces.quad(at, vec(tiles / 3, 0, 0), vec(0, back, 0), stones)
-        surfaces.quad(vec(i * tiles, half, 0.12), vec(tiles, 0, 0), vec(0, 0, -0.12), stones, (0, 0, 1, 0.1), both_sides=True)
-        surfaces.quad(vec(i * tiles, -half, 0.12), vec(tiles, 0, 0), vec(0, 0, -0.12), stones, (0, 0, 1, 0.1), both_sides=True)
+        surfaces.quad(
+            vec(i * tiles, half, 0.12), vec(tiles, 0, 0), vec(0, 0, -0.12), stones, (0, 0, 1, 0.1), both_sides=True
+        )
+        surfaces.quad(
+            vec(i * tiles, -half, 0.12), vec(tiles, 0, 0), vec(0, 0, -0.12), stones, (0, 0, 1, 0.1), both_sides=True
+        )
     surfaces.quad(vec(-60, 90, -0.05), vec(length + 240, 0, 0), vec(0, -180, 0), green, (0, 0, 40, 25))
     leaf, bark = foliage(surfaces, rng)
     metal = surfaces.texture(to_pixels(np.full((32, 32, 3), 0.35, dtype=np.float32)))

@@ -103,7 +103,9 @@ def front(
 
     def panel(x0: float, z0: float, x1: float, z1: float, depth: float) -> None:
         O = foot + right * x0 + up * z1 + out * depth
-        surfaces.quad(O, right * (x1 - x0), up * (z0 - z1), number, (x0 / width, 1 - z1 / height, x1 / width, 1 - z0 / height))
+        surfaces.quad(
+            O, right * (x1 - x0), up * (z0 - z1), number, (x0 / width, 1 - z1 / height, x1 / width, 1 - z0 / height)
+        )
 
     def block(x0: float, z0: float, x1: float, z1: float, depth: float) -> None:
         """A box set off from the wall (depth > 0) or a niche set back into it (depth < 0), with four sides."""

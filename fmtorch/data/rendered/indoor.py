@@ -85,7 +85,10 @@ def _desk(surfaces: Surfaces, rng: Rng, split: str, centre: Vector) -> None:
             surfaces.box(base + vec(0, 0, 0.08), r * 0.46, b * 0.04, 0.29, [screen, case, case, case, case])
             surfaces.box(base + r * 0.18, r * 0.1, b * 0.04, 0.08, [case] * 5)
         elif k == 1:
-            fur = colour(rng, (0.04, 0.1), (0.4, 0.7), (0.4, 0.7)) * (1 + 0.3 * fractal(rng, 256, 256, 16, 1, 0.8))[..., None]
+            fur = (
+                colour(rng, (0.04, 0.1), (0.4, 0.7), (0.4, 0.7))
+                * (1 + 0.3 * fractal(rng, 256, 256, 16, 1, 0.8))[..., None]
+            )
             statue(surfaces, rng, base, 0.42, surfaces.texture(to_pixels(fur.astype(np.float32))), detail=12)
         elif k < 5:
             number = surfaces.texture(to_pixels(books(rng, 160, 256)))
@@ -104,7 +107,9 @@ def _cabinet(surfaces: Surfaces, rng: Rng, base: Vector, degrees: float) -> None
     sides = surfaces.texture(to_pixels(front * 0 + plaster(rng, 512, 300, front[4, 4], 0.7)))
     surfaces.box(base, right * 0.9, back * 0.45, 1.3, [surfaces.texture(to_pixels(front)), sides, sides, sides, sides])
     shelf = surfaces.texture(to_pixels(books(rng, 192, 512)))
-    surfaces.box(base + right * 0.05 + vec(0, 0, 1.3), right * 0.8, back * 0.2, 0.26, [shelf, sides, sides, sides, sides])
+    surfaces.box(
+        base + right * 0.05 + vec(0, 0, 1.3), right * 0.8, back * 0.2, 0.26, [shelf, sides, sides, sides, sides]
+    )
 
 
 def _path(rng: Rng, target: Vector) -> tuple[np.ndarray, np.ndarray]:
@@ -129,7 +134,9 @@ def scene(rng: Rng, split: str, shots: int, scale: float) -> Scene:
     _on_wall(surfaces, photos[1], 0, half, rng.uniform(-1, 0.5), 1.5, 0.7)
     _on_wall(surfaces, photos[3], 2, half, rng.uniform(-0.5, 1), 1.5, 0.6)
     style = np.random.SeedSequence(int(rng.integers(2**31)))
-    _on_wall(surfaces, to_pixels(window(rng, 512, 420, style) * 2.2 + 0.1), 2 * int(rng.integers(2)), half, -1.2, 1.6, 1.1)
+    _on_wall(
+        surfaces, to_pixels(window(rng, 512, 420, style) * 2.2 + 0.1), 2 * int(rng.integers(2)), half, -1.2, 1.6, 1.1
+    )
     shelf = surfaces.texture(to_pixels(books(rng, 192, 768)))
     board = _flat(surfaces, rng)
     x = rng.uniform(-0.6, 0.4)

@@ -46,7 +46,12 @@ class Geometry:
         self.corners = np.stack([self.O, self.O + self.U, self.O + self.U + self.V, self.O + self.V], axis=1)
 
     def cast(
-        self, P: Matrix, depth: Matrix, size: tuple[int, int], centre: Matrix | None, skip: NDArray[np.bool_] | None = None
+        self,
+        P: Matrix,
+        depth: Matrix,
+        size: tuple[int, int],
+        centre: Matrix | None,
+        skip: NDArray[np.bool_] | None = None,
     ) -> Hits:
         """Rays of all pixels of a projection P (3, 4), perspective or (last row 0 0 0 1) orthographic.
 
