@@ -22,6 +22,7 @@ from fmtorch.estimators.scoring import (
 )
 from fmtorch.geometry import eight_point
 from fmtorch.geometry.minimal import eight_point_components, seven_point_components
+from fmtorch.geometry.refine import refine_components
 
 T = TypeVar("T")
 
@@ -114,6 +115,19 @@ class RobustDeviations:
         spare = (problem.count - self.PARAMETERS).clamp_min(1)[:, None]
         sigma = 1.4826 * (1 + 5 / spare) * _median(r2, problem).sqrt()
         return (r2 <= (2.5 * sigma).square()) & problem.live
+
+
+class Refinement:
+    """Levenberg-Marquardt of the robust Sampson error, weighted by the prior where there is one."""
+
+    def __init__(self, kernel: str, threshold: float, iterations: int) -> None:
+        self.kernel, self.threshold, self.iterations = kernel, threshold, iterations
+
+    def __call__(self, F: Float[Tensor, "9 p k"], problem: Problem) -> Float[Tensor, "9 p k"]:
+        """The refined models."""
+        weight = problem.live.to(torch.float64) if problem.prior is None else problem.prior
+        scale = self.threshold / problem.unit
+        return refine_components(F, problem.points, weight, self.kernel, scale, self.iterations)[0]
 
 
 @runtime_checkable
