@@ -15,7 +15,7 @@ from fmtorch import data, presets
 from fmtorch.evaluation.pictures import draw_matches
 from fmtorch.pipeline import Pipeline
 
-HEIGHT, GAP = 300, 8
+HEIGHT, GAP, WIDTH = 400, 8, 1600
 
 
 def main() -> None:
@@ -45,14 +45,16 @@ def main() -> None:
         count = int(c.count())
         points = (c.x0[0, :count].numpy(), c.x1[0, :count].numpy())
         inliers = outcome.estimate.inliers[0, :count].numpy()
-        strips.append(draw_matches(*images, *points, inliers, height=HEIGHT, most=80))
+        strips.append(draw_matches(*images, *points, inliers, height=HEIGHT, most=40))
     rows = [np.hstack([a, np.full((HEIGHT, GAP, 3), 255, np.uint8), b]) for a, b in _balanced(strips)]
-    width = max(row.shape[1] for row in rows)
     rows = [
-        cv2.copyMakeBorder(row, 0, GAP, 0, width - row.shape[1], cv2.BORDER_CONSTANT, value=(255,) * 3) for row in rows
+        cv2.resize(row, (WIDTH, round(row.shape[0] * WIDTH / row.shape[1])), interpolation=cv2.INTER_AREA)
+        for row in rows
     ]
+    between = np.full((GAP, WIDTH, 3), 255, np.uint8)
+    picture = np.vstack([part for row in rows for part in (row, between)][:-1])
     arguments.output.parent.mkdir(exist_ok=True)
-    cv2.imwrite(str(arguments.output), np.vstack(rows)[:-GAP, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
+    cv2.imwrite(str(arguments.output), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
 
 
 def _balanced(strips: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
