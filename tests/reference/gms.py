@@ -18,7 +18,9 @@ def normalised(x: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def cell(point: np.ndarray, grid: int, shift: tuple[float, float], drop_half_cells: bool) -> tuple[int, int] | None:
-    """Column and row of a point, or None where it is in no cell."""
+    """Column and row of a point, or None where it is in no cell, as points outside the image are."""
+    if not (point >= 0).all() or not (point < 1).all():
+        return None
     place = []
     for value, offset in zip(point, shift, strict=True):
         index = math.floor(float(np.float32(value) * np.float32(grid)) + offset)
@@ -45,7 +47,7 @@ def run(p0: np.ndarray, p1: np.ndarray, scale: float, turn: int, factor: float, 
             for j, (dx, dy) in enumerate((*RING, (0, 0))):
                 ex, ey = RING[(j - turn) % 8] if j < 8 else (0, 0)
                 na, nb = (a[0] + dx, a[1] + dy), (b[0] + ex, b[1] + ey)
-                if not (0 <= min(na) and max(na) < GRID and 0 <= min(nb) and max(nb) < grid1):
+                if min(*na, *nb) < 0 or max(na) >= GRID or max(nb) >= grid1:
                     continue
                 score, total, pairs = score + moves[na, nb], total + filled[na], pairs + 1
             if score >= factor * math.sqrt(total / pairs):
