@@ -8,6 +8,7 @@ from fmtorch.data.rendered.cameras import calibration, look_at
 from fmtorch.data.rendered.drawings import sign
 from fmtorch.data.rendered.facade import Style, front, house
 from fmtorch.data.rendered.light import Lens, Light, sun
+from fmtorch.data.rendered.mipmap import Real
 from fmtorch.data.rendered.orbit import ground
 from fmtorch.data.rendered.patterns import Rng, heaven, to_pixels
 from fmtorch.data.rendered.photographs import pictures
@@ -19,7 +20,7 @@ SIZES = ((600, 800), (533, 800), (450, 800), (576, 768), (683, 1024), (480, 640)
 LIGHTS = 3  # times of day
 
 
-def _gable(surfaces: Surfaces, x: float, y: float, z: float, width: float, height: float, deep: float, stone: int) -> None:
+def _gable(surfaces: Surfaces, x: Real, y: Real, z: Real, width: Real, height: Real, deep: Real, stone: int) -> None:
     """A pediment: a triangular front and two roof planes."""
     left, right, top = vec(x, y, z), vec(x + width, y, z), vec(x + width / 2, y, z + height)
     uv = np.array([[0.0, 1.0], [1.0, 0.0], [0.5, -1.0]]) * np.array([3.0, 1.0])
@@ -65,7 +66,9 @@ def _landmark(surfaces: Surfaces, rng: Rng, split: str) -> float:
                   Style(density=52, storey=4.0, bay=2.5, depth=0.35))  # fmt: skip
     for x in np.linspace(-width / 2 + 2, width / 2 - 2, 6):
         if abs(x) > portico / 2 + 1.5:
-            surfaces.box(vec(x - 0.7, -3.6, 0), vec(1.4, 0, 0), vec(0, 1.4, 0), 1.6, [block] * 5, ((0, 0, 0.25, 0.4),) * 5)
+            surfaces.box(
+                vec(x - 0.7, -3.6, 0), vec(1.4, 0, 0), vec(0, 1.4, 0), 1.6, [block] * 5, ((0, 0, 0.25, 0.4),) * 5
+            )
             statue(surfaces, rng, vec(x, -2.9, 1.6), 2.6, stone, detail=12)
     for picture in pictures(split, rng, 2):
         x = rng.uniform(-width / 2 + 1, width / 2 - 4)
@@ -76,16 +79,25 @@ def _landmark(surfaces: Surfaces, rng: Rng, split: str) -> float:
     return width
 
 
-def scene(rng: Rng, split: str, shots: int, scale: float) -> Scene:
+def scene(rng: Rng, split: str, shots: int, scale: Real) -> Scene:
     """A landmark with `shots` photographs by as many people; images are scaled by `scale`."""
     fixed = Surfaces()
     width = _landmark(fixed, rng, split)
     ground(fixed, rng, split, 36)
     leaf, bark = foliage(fixed, rng)
     for side in (-1, 1):
-        right = vec(1, 0, 0) if side < 0 else vec(1, 0, 0)
+        right = vec(1, 0, 0)
         foot = vec(side * (width / 2 + 3) - (12 if side < 0 else 0), 4, 0)
-        house(fixed, rng, split, foot, right, (12, 8, rng.uniform(7, 11)), Style(density=30, same_windows=0.8), sides="plain")
+        house(
+            fixed,
+            rng,
+            split,
+            foot,
+            right,
+            (12, 8, rng.uniform(7, 11)),
+            Style(density=30, same_windows=0.8),
+            sides="plain",
+        )
         for _ in range(3):
             at = vec(side * rng.uniform(width / 2 - 3, width / 2 + 8), -rng.uniform(2, 10), 0)
             tree(fixed, rng, at, rng.uniform(4, 7), leaf, bark)
@@ -130,4 +142,6 @@ def scene(rng: Rng, split: str, shots: int, scale: float) -> Scene:
         taken.append(Shot(camera, lens, light=i % LIGHTS, jpeg=int(rng.integers(60, 96))))
         eyes.append(eye)
     pairs = [(i, j) for i in range(shots) for j in range(i + 1, shots)]
-    return Scene(surfaces, lights, heaven(rng, rng.uniform(-0.3, 0.7)), taken, [pairs[k] for k in rng.permutation(len(pairs))])
+    return Scene(
+        surfaces, lights, heaven(rng, rng.uniform(-0.3, 0.7)), taken, [pairs[k] for k in rng.permutation(len(pairs))]
+    )

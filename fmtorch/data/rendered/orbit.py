@@ -8,6 +8,7 @@ from fmtorch.data.rendered.cameras import calibration, look_at
 from fmtorch.data.rendered.drawings import poster
 from fmtorch.data.rendered.facade import Style, house, wall_picture
 from fmtorch.data.rendered.light import Lens, Light, sun
+from fmtorch.data.rendered.mipmap import Real
 from fmtorch.data.rendered.patterns import Rng, cells, colour, heaven, heights, masonry, meadow, to_pixels
 from fmtorch.data.rendered.photographs import material, pictures
 from fmtorch.data.rendered.props import ashlar, column, direction, foliage, marble, post, rock, statue, tree, walker
@@ -19,7 +20,7 @@ FOCAL = 760.0  # pixels: a phone's wide lens
 ANGLES = (4.0, 62.0)  # degrees between the two views of a pair
 
 
-def ground(surfaces: Surfaces, rng: Rng, split: str, reach: float) -> None:
+def ground(surfaces: Surfaces, rng: Rng, split: str, reach: Real) -> None:
     """A paved or grown square round the origin; its pictures repeat, with a lawn beyond."""
     lawn = material(split, "ground")
     if lawn is None or rng.random() < 0.5:
@@ -104,7 +105,7 @@ def _structure(surfaces: Surfaces, rng: Rng, split: str) -> float:
     return base
 
 
-def _mound(surfaces: Surfaces, rng: Rng, texture: int, at: tuple[float, float], side: float, tall: float) -> None:
+def _mound(surfaces: Surfaces, rng: Rng, texture: int, at: tuple[Real, Real], side: Real, tall: Real) -> None:
     """A flower bed or heap: a height field over a square."""
     n = 12
     rim = np.sin(np.linspace(0, np.pi, n))
@@ -115,7 +116,7 @@ def _mound(surfaces: Surfaces, rng: Rng, texture: int, at: tuple[float, float], 
     surfaces.grid(points, texture, (1, 1))
 
 
-def surroundings(surfaces: Surfaces, rng: Rng, split: str, near: float, far: float, houses: int) -> None:
+def surroundings(surfaces: Surfaces, rng: Rng, split: str, near: Real, far: Real, houses: int) -> None:
     """Houses, trees and lamp posts in a ring."""
     leaf, bark = foliage(surfaces, rng)
     for k in range(houses):
@@ -134,7 +135,7 @@ def surroundings(surfaces: Surfaces, rng: Rng, split: str, near: float, far: flo
         post(surfaces, direction(rng.uniform(0, 360)) * near, 4.2, metal)
 
 
-def scene(rng: Rng, split: str, shots: int, scale: float) -> Scene:
+def scene(rng: Rng, split: str, shots: int, scale: Real) -> Scene:
     """A structure with `shots` views round it; images are scaled by `scale`."""
     surfaces = Surfaces()
     height = _structure(surfaces, rng, split)

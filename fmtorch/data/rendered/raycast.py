@@ -46,7 +46,12 @@ class Geometry:
         self.corners = np.stack([self.O, self.O + self.U, self.O + self.U + self.V, self.O + self.V], axis=1)
 
     def cast(
-        self, P: Matrix, depth: Matrix, size: tuple[int, int], centre: Matrix | None, skip: NDArray[np.bool_] | None = None
+        self,
+        P: Matrix,
+        depth: Matrix,
+        size: tuple[int, int],
+        centre: Matrix | None,
+        skip: NDArray[np.bool_] | None = None,
     ) -> Hits:
         """Rays of all pixels of a projection P (3, 4), perspective or (last row 0 0 0 1) orthographic.
 
@@ -113,7 +118,8 @@ class Geometry:
         row = hits.inverse[hits.piece, 2]
         inverse_depth = np.where(hits.piece >= 0, row[..., 0] * x + row[..., 1] * y + row[..., 2], 0.0)
         with np.errstate(divide="ignore"):
-            return np.asarray(1.0 / inverse_depth)
+            depth: Matrix = 1.0 / inverse_depth
+        return depth
 
     def _solid(self, i: int, s: Floats, t: Floats, box: tuple[int, int]) -> NDArray[np.bool_]:
         texture = self.textures[self.texture[i]]
@@ -149,5 +155,5 @@ def _clip(X: Matrix) -> Matrix:
             kept.append(a)
         if (a[2] >= NEAR) != (b[2] >= NEAR):
             kept.append(a + (NEAR - a[2]) / (b[2] - a[2]) * (b - a))
-    points = np.array(kept)
+    points: Matrix = np.array(kept)
     return points[:, :2] / points[:, 2:]

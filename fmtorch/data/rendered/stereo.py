@@ -37,9 +37,7 @@ class StereoPair(Dataset[ImagePair]):
         self.digest = hashlib.sha256(b"".join(path.read_bytes() for path in self._paths)).hexdigest()
         x, y = _CENTRE
         left = Camera(calibration(_FOCAL, _SIZE, (x, y)), np.eye(3), np.zeros(3), _SIZE)
-        right = Camera(
-            calibration(_FOCAL, _SIZE, (x + _SHIFT, y)), np.eye(3), np.array([-_BASELINE, 0.0, 0.0]), _SIZE
-        )
+        right = Camera(calibration(_FOCAL, _SIZE, (x + _SHIFT, y)), np.eye(3), np.array([-_BASELINE, 0.0, 0.0]), _SIZE)
         R, t = relative_pose(left, right)
         self._pair = ImagePair(
             identity=f"{self.name}/motorcycle/left-right",
