@@ -106,7 +106,7 @@ def scene(rng: Rng, split: str, shots: int, scale: Real) -> Scene:
     _street(surfaces, rng, split, length)
     size = (round(SIZE[0] * scale), round(SIZE[1] * scale))
     K = calibration(FOCAL * scale, size, (CENTRE[0] * scale, CENTRE[1] * scale))
-    speed, bend = float(np.exp(rng.uniform(np.log(0.06), np.log(1.4)))) * SPACING, rng.normal(0, 0.6)
+    speed, bend = float(np.exp(rng.uniform(np.log(0.03), np.log(1.2)))) * SPACING, rng.normal(0, 0.6)
     drift = rng.uniform(-1.2, 0.2)
     light = Light(sun(rng.uniform(0, 360), rng.uniform(25, 60)))
     lens = Lens(grey=True, noise=rng.uniform(2.5, 5.0), blur=rng.uniform(0.6, 0.9), exposure=rng.uniform(0.7, 1.4))

@@ -151,12 +151,12 @@ def front(
 
 def house(
     surfaces: Surfaces, rng: Rng, split: str, foot: Vector, right: Vector, size: tuple[Real, Real, Real],
-    style: Style, sides: Literal["own", "twin", "plain"] = "own",
+    style: Style, sides: Literal["own", "twin", "same", "plain"] = "own",
 ) -> None:  # fmt: skip
     """A house: `foot` its front left corner, `size` its width, depth and height.
 
-    sides: each with a front of its `own`; opposite sides as `twin`s, so that they are easily confused; or the last
-    three flat and `plain`, for a house far away.
+    sides: each with a front of its `own`; opposite ones as `twin`s, or all four the `same`, so that they are easily
+    confused; or the last three flat and `plain`, for a house far away.
     """
     width, depth, height = size
     back = -np.cross(right, vec(0, 0, 1))
@@ -170,6 +170,6 @@ def house(
         if sides == "plain" and i > 0:
             surfaces.quad(corner + top, along * length, -top, number, (0, 0, length / width, 1))
         else:
-            own = rng if sides != "twin" else np.random.default_rng(twins[i % 2])
+            own = rng if sides == "own" else np.random.default_rng(twins[i % 2 if sides == "twin" else 0])
             number = front(surfaces, own, split, corner, along, length, height, style)
     surfaces.quad(corners[3] + top, right * width, -back * depth, number, (0, 0, 1, 0.1))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 
 from fmtorch.data.rendered.cameras import calibration, look_at
@@ -17,7 +19,8 @@ from fmtorch.data.rendered.surfaces import Surfaces, vec
 
 SIZE = (540, 960)
 FOCAL = 760.0  # pixels: a phone's wide lens
-ANGLES = (4.0, 62.0)  # degrees between the two views of a pair
+ANGLES = (5.0, 70.0)  # degrees between the two views of a pair
+SYMMETRIC = 0.6  # chance that the four sides look the same, as in many monuments
 
 
 def ground(surfaces: Surfaces, rng: Rng, split: str, reach: Real) -> None:
@@ -44,7 +47,10 @@ def ground(surfaces: Surfaces, rng: Rng, split: str, reach: Real) -> None:
 def _structure(surfaces: Surfaces, rng: Rng, split: str) -> float:
     """The thing in the middle; returns its height."""
     stone, block = marble(surfaces, rng), ashlar(surfaces, rng)
-    width, depth = rng.uniform(4.0, 6.5), rng.uniform(3.5, 6.0)
+    width, depth = rng.uniform(4.0, 6.0), rng.uniform(3.5, 6.0)
+    sides: Literal["same", "twin"] = "twin"
+    if rng.random() < SYMMETRIC:
+        depth, sides = width, "same"
     base = 0.0
     for i in range(int(rng.integers(2, 4))):
         grow = 1.5 - 0.5 * i
@@ -60,7 +66,7 @@ def _structure(surfaces: Surfaces, rng: Rng, split: str) -> float:
         inner = 0.62
         house(
             surfaces, rng, split, vec(-width * inner / 2, -depth * inner / 2, base), vec(1, 0, 0),
-            (width * inner, depth * inner, height), Style(density=110, storey=2.4, bay=1.7, depth=0.2), sides="twin",
+            (width * inner, depth * inner, height), Style(density=110, storey=2.4, bay=1.7, depth=0.2), sides=sides,
         )  # fmt: skip
         for x in np.linspace(-width / 2 + 0.3, width / 2 - 0.3, 4):
             for y in np.linspace(-depth / 2 + 0.3, depth / 2 - 0.3, 4):
@@ -69,7 +75,7 @@ def _structure(surfaces: Surfaces, rng: Rng, split: str) -> float:
     else:
         house(
             surfaces, rng, split, vec(-width / 2, -depth / 2, base), vec(1, 0, 0), (width, depth, height),
-            Style(density=110, storey=1.5, bay=1.1, depth=0.22, pilasters=kind < 0.75, same_windows=0.8), sides="twin",
+            Style(density=110, storey=1.5, bay=1.1, depth=0.22, pilasters=kind < 0.75, same_windows=0.8), sides=sides,
         )  # fmt: skip
     base += height
     frieze = surfaces.texture(to_pixels(wall_picture(rng, split, 256, 1024, 60)))
@@ -145,11 +151,14 @@ def scene(rng: Rng, split: str, shots: int, scale: Real) -> Scene:
     for _ in range(3):
         a = np.radians(rng.uniform(0, 360))
         _mound(surfaces, rng, leaf_bed, (float(6.5 * np.cos(a)), float(6.5 * np.sin(a))), 2.4, 0.7)
-    for _ in range(3):
+    leaf, bark = foliage(surfaces, rng)
+    for _ in range(5):
+        tree(surfaces, rng, direction(rng.uniform(0, 360)) * rng.uniform(6.0, 8.5), rng.uniform(2.2, 3.6), leaf, bark)
+    for _ in range(6):
         walker(surfaces, rng, direction(rng.uniform(0, 360)) * rng.uniform(5, 8), rng.uniform(0, 360))
     size = (round(SIZE[0] * scale), round(SIZE[1] * scale))
     K = calibration(FOCAL * scale, size)
-    arc = min(360.0, 16.0 * shots)
+    arc = min(360.0, 20.0 * shots)
     start = rng.uniform(0, 360)
     azimuth = start + arc * (np.arange(shots) + rng.uniform(-0.3, 0.3, shots)) / shots
     taken = []
@@ -158,8 +167,8 @@ def scene(rng: Rng, split: str, shots: int, scale: Real) -> Scene:
         eye = direction(a) * radius + vec(0, 0, rng.uniform(1.3, 2.6))
         at = vec(*rng.normal(0, 0.7, 2), 0.42 * height + rng.normal(0, 0.3))
         camera = look_at(K, size, eye.tolist(), at.tolist(), roll=float(rng.normal(0, 0.03)))
-        lens = Lens(exposure=float(rng.uniform(0.9, 1.1)), noise=2.0, blur=0.55)
-        taken.append(Shot(camera, lens, jpeg=92))
+        lens = Lens(exposure=float(rng.uniform(0.8, 1.2)), noise=3.0, blur=0.7)
+        taken.append(Shot(camera, lens, jpeg=88))
     light = Light(sun(rng.uniform(0, 360), rng.uniform(30, 65)))
     apart = np.abs((azimuth[:, None] - azimuth[None] + 180) % 360 - 180)
     pairs = [(i, j) for i in range(shots) for j in range(i + 1, shots) if ANGLES[0] <= apart[i, j] <= ANGLES[1]]
