@@ -47,10 +47,11 @@ def test_pairs_are_complete_and_consistent(tiny: RenderedPairs, root: Path) -> N
         assert pair.image0.identity == f"{pair.scene}/{i}"
         assert root in pair.image0.path.parents
         assert pair.problem is None
-        assert pair.K0 is not None and pair.K1 is not None and pair.R is not None and pair.t is not None
-        assert pair.F.dtype == np.float64 and np.linalg.norm(pair.F) == pytest.approx(1.0)
-        cross = np.cross(np.eye(3), pair.t)
-        F = np.linalg.inv(pair.K1).T @ cross.T @ pair.R @ np.linalg.inv(pair.K0)
+        assert all(value is not None for value in (pair.K0, pair.K1, pair.R, pair.t))
+        assert pair.F.dtype == np.float64
+        assert np.linalg.norm(pair.F) == pytest.approx(1.0)
+        cross = np.cross(np.eye(3), pair.t)  # rows e_i x t: the matrix [t]x
+        F = np.linalg.inv(pair.K1).T @ cross @ pair.R @ np.linalg.inv(pair.K0)
         np.testing.assert_allclose(F / np.linalg.norm(F), pair.F, atol=1e-12)
         np.testing.assert_allclose(np.linalg.svd(pair.F)[1][2], 0, atol=1e-12)
 
@@ -166,7 +167,8 @@ def test_splits_share_no_texture(family: str) -> None:
         return {t.tobytes() for t in textures if len(np.unique(t[2:-2, 2:4].reshape(-1, t.shape[2]), axis=0)) > 4}
 
     test, train = pictures("test", 0), pictures("train", 0)
-    assert test and train
+    assert test
+    assert train
     assert not test & train
 
 
@@ -184,7 +186,7 @@ def test_unknown_names_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="unknown families"):
         RenderedPairs(families=["underwater"], root=tmp_path)
     with pytest.raises(ValueError, match="no split"):
-        RenderedPairs("validation", root=tmp_path)  # type: ignore[arg-type]
+        RenderedPairs("validation", root=tmp_path)
 
 
 def test_scene_file_holds_the_cameras_exactly(tiny: RenderedPairs) -> None:
@@ -193,4 +195,5 @@ def test_scene_file_holds_the_cameras_exactly(tiny: RenderedPairs) -> None:
     number = int(folder.name[-3:])
     cameras = [shot.camera for shot in build(Task(tiny[0].family, "test", number, 0, TINY)).shots]
     for entry, camera in zip(record["cameras"], cameras, strict=True):
-        assert np.array_equal(entry["R"], camera.R) and np.array_equal(entry["t"], camera.t)
+        np.testing.assert_array_equal(entry["R"], camera.R)
+        np.testing.assert_array_equal(entry["t"], camera.t)

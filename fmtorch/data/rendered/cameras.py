@@ -8,6 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.data.rendered.mipmap import Real
+
 Matrix = NDArray[np.float64]
 
 
@@ -39,7 +41,7 @@ class Camera:
         return x[:, :2] / x[:, 2:], x[:, 2]
 
 
-def calibration(focal: float, size: tuple[int, int], centre: tuple[float, float] | None = None) -> Matrix:
+def calibration(focal: Real, size: tuple[int, int], centre: tuple[float, float] | None = None) -> Matrix:
     """K of square pixels: focal length in pixels, principal point (x, y), by default the middle of the image."""
     h, w = size
     cx, cy = centre if centre is not None else ((w - 1) / 2, (h - 1) / 2)
@@ -47,7 +49,7 @@ def calibration(focal: float, size: tuple[int, int], centre: tuple[float, float]
 
 
 def look_at(
-    K: Matrix, size: tuple[int, int], centre: Sequence[float], target: Sequence[float], roll: float = 0.0
+    K: Matrix, size: tuple[int, int], centre: Sequence[Real], target: Sequence[Real], roll: Real = 0.0
 ) -> Camera:
     """A camera at `centre` that looks at `target`, upright but for a roll about its axis in radians."""
     c = np.asarray(centre, dtype=np.float64)

@@ -8,6 +8,7 @@ from fmtorch.data.rendered.cameras import calibration, look_at
 from fmtorch.data.rendered.drawings import sign
 from fmtorch.data.rendered.facade import Style, front, house
 from fmtorch.data.rendered.light import Lens, Light, sun
+from fmtorch.data.rendered.mipmap import Real
 from fmtorch.data.rendered.orbit import ground
 from fmtorch.data.rendered.patterns import Rng, heaven, to_pixels
 from fmtorch.data.rendered.photographs import pictures
@@ -19,9 +20,7 @@ SIZES = ((600, 800), (533, 800), (450, 800), (576, 768), (683, 1024), (480, 640)
 LIGHTS = 3  # times of day
 
 
-def _gable(
-    surfaces: Surfaces, x: float, y: float, z: float, width: float, height: float, deep: float, stone: int
-) -> None:
+def _gable(surfaces: Surfaces, x: Real, y: Real, z: Real, width: Real, height: Real, deep: Real, stone: int) -> None:
     """A pediment: a triangular front and two roof planes."""
     left, right, top = vec(x, y, z), vec(x + width, y, z), vec(x + width / 2, y, z + height)
     uv = np.array([[0.0, 1.0], [1.0, 0.0], [0.5, -1.0]]) * np.array([3.0, 1.0])
@@ -80,14 +79,14 @@ def _landmark(surfaces: Surfaces, rng: Rng, split: str) -> float:
     return width
 
 
-def scene(rng: Rng, split: str, shots: int, scale: float) -> Scene:
+def scene(rng: Rng, split: str, shots: int, scale: Real) -> Scene:
     """A landmark with `shots` photographs by as many people; images are scaled by `scale`."""
     fixed = Surfaces()
     width = _landmark(fixed, rng, split)
     ground(fixed, rng, split, 36)
     leaf, bark = foliage(fixed, rng)
     for side in (-1, 1):
-        right = vec(1, 0, 0) if side < 0 else vec(1, 0, 0)
+        right = vec(1, 0, 0)
         foot = vec(side * (width / 2 + 3) - (12 if side < 0 else 0), 4, 0)
         house(
             fixed,

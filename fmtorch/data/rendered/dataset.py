@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Literal
 
 from torch.utils.data import Dataset
 
@@ -33,8 +32,8 @@ class RenderedPairs(Dataset[ImagePair]):
 
     def __init__(
         self,
-        split: Literal["test", "train"] = "test",
-        size: Literal["small", "full"] = "small",
+        split: str = "test",
+        size: str = "small",
         families: Sequence[str] | None = None,
         seed: int = 0,
         root: str | Path | None = None,

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from fmtorch.data.rendered.mipmap import Floats, Pixels
-from fmtorch.data.rendered.patterns import Rng, colour, fractal, to_pixels
+from fmtorch.data.rendered.patterns import Rng, colour, fractal, rgb, to_pixels
 
 _FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_COMPLEX, cv2.FONT_HERSHEY_TRIPLEX)
 
@@ -43,7 +43,7 @@ def window(rng: Rng, h: int, w: int, style: np.random.SeedSequence) -> Floats:
     bars_x, bars_y = int(same.integers(1, 4)), int(same.integers(1, 5))
     shade = np.linspace(0.32, 0.12, h, dtype=np.float32)[:, None]
     tilt = np.linspace(-0.06, 0.06, w, dtype=np.float32)
-    glass = (shade + tilt + 0.035 * fractal(rng, h, w, 64, 4))[..., None] * np.float32([0.85, 1.0, 1.15])
+    glass = (shade + tilt + 0.035 * fractal(rng, h, w, 64, 4))[..., None] * rgb(0.85, 1.0, 1.15)
     glass = np.ascontiguousarray(glass, dtype=np.float32)
     drape = rng.random()
     if drape < 0.55:  # curtains, or a blind
@@ -83,7 +83,7 @@ def door(rng: Rng, h: int, w: int) -> Floats:
 def sign(rng: Rng, h: int, w: int) -> Floats:
     """A shop sign: letters on a coloured board."""
     ground = colour(rng, (0, 1), (0.2, 0.95), (0.15, 0.9))
-    ink = np.float32([0.95, 0.95, 0.9]) if ground.mean() < 0.5 else np.float32([0.08, 0.06, 0.1])
+    ink = rgb(0.95, 0.95, 0.9) if ground.mean() < 0.5 else rgb(0.08, 0.06, 0.1)
     out = blank(h, w, ground)
     cv2.rectangle(out, (2, 2), (w - 3, h - 3), (ink * 0.8 + ground * 0.2).tolist(), max(1, h // 30))
     write(rng, out, word(rng), (int(w * 0.07), int(h * 0.12), int(w * 0.86), int(h * 0.76)), ink)
@@ -109,20 +109,20 @@ def poster(rng: Rng, h: int, w: int) -> Floats:
             corners = (p + rng.normal(0, r, (int(rng.integers(3, 6)), 2))).astype(np.int32)
             cv2.fillPoly(out, [corners], tone, cv2.LINE_AA)
         else:
-            write(rng, out, word(rng), (int(p[0] - r), int(p[1]), int(3 * r) + 8, int(r) + 6), np.float32(tone))
+            write(rng, out, word(rng), (int(p[0] - r), int(p[1]), int(3 * r) + 8, int(r) + 6), rgb(*tone))
     return (out * (1 + 0.05 * fractal(rng, h, w, 128, 1))[..., None]).astype(np.float32)
 
 
 def books(rng: Rng, h: int, w: int) -> Floats:
     """A row of book spines."""
-    out = blank(h, w, np.float32([0.08, 0.06, 0.05]))
+    out = blank(h, w, rgb(0.08, 0.06, 0.05))
     x = 0
     while x < w:
         width = int(rng.uniform(0.02, 0.06) * w) + 6
         tall = int(h * rng.uniform(0.72, 0.98))
         tone = colour(rng, (0, 1), (0.1, 0.8), (0.2, 0.9))
         out[h - tall :, x : x + width - 1] = tone
-        ink = np.float32([0.95, 0.93, 0.85]) if tone.mean() < 0.5 else np.float32([0.1, 0.08, 0.08])
+        ink = rgb(0.95, 0.93, 0.85) if tone.mean() < 0.5 else rgb(0.1, 0.08, 0.08)
         title = blank(width, int(tall * 0.8), tone)
         write(rng, title, word(rng, 4, 14), (2, 1, title.shape[1] - 4, width - 2), ink)
         part = np.rot90(title)[:, : max(0, min(width - 1, w - x))]
@@ -166,7 +166,7 @@ def car_end(rng: Rng, tone: Floats) -> Floats:
     cv2.rectangle(out, (208, 92), (248, 122), (0.85, 0.15, 0.1), -1)
     cv2.rectangle(out, (0, 164), (w, h), (0.08, 0.08, 0.08), -1)
     cv2.rectangle(out, (88, 102), (168, 124), (0.95, 0.95, 0.8), -1)
-    write(rng, out, word(rng, 6, 8), (92, 103, 72, 20), np.float32([0.05, 0.05, 0.1]))
+    write(rng, out, word(rng, 6, 8), (92, 103, 72, 20), rgb(0.05, 0.05, 0.1))
     return out.astype(np.float32)
 
 

@@ -1,4 +1,4 @@
-"""House fronts in relief: one painted picture for each, windows set back, sills, cornices, pilasters and signs set off."""
+"""House fronts in relief: one painted picture for each, windows set back, sills, cornices and signs set off."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from fmtorch.data.rendered.drawings import door, sign, window
-from fmtorch.data.rendered.mipmap import Floats
+from fmtorch.data.rendered.mipmap import Floats, Real
 from fmtorch.data.rendered.patterns import Rng, colour, fractal, masonry, plaster, to_pixels
 from fmtorch.data.rendered.photographs import material
 from fmtorch.data.rendered.surfaces import Surfaces, Vector, vec
@@ -19,16 +19,16 @@ from fmtorch.data.rendered.surfaces import Surfaces, Vector, vec
 class Style:
     """Of a front: texels per metre, storey height and bay width in metres, relief depth, repetition of windows."""
 
-    density: float = 64.0
-    storey: float = 3.2
-    bay: float = 2.6
-    depth: float = 0.3
+    density: Real = 64.0
+    storey: Real = 3.2
+    bay: Real = 2.6
+    depth: Real = 0.3
     shop: bool = False
     pilasters: bool = False
-    same_windows: float = 0.5  # chance that a window is a copy of its neighbour
+    same_windows: Real = 0.5  # chance that a window is a copy of its neighbour
 
 
-def wall_picture(rng: Rng, split: str, h: int, w: int, density: float) -> Floats:
+def wall_picture(rng: Rng, split: str, h: int, w: int, density: Real) -> Floats:
     """A bare wall (h, w, 3) of plaster, brick, ashlar, or the split's photograph of stone, with stains of its own."""
     kind = rng.random()
     tint = colour(rng, (0.02, 0.14), (0.1, 0.5), (0.45, 0.9))
@@ -51,7 +51,7 @@ def wall_picture(rng: Rng, split: str, h: int, w: int, density: float) -> Floats
 
 
 def front(
-    surfaces: Surfaces, rng: Rng, split: str, foot: Vector, right: Vector, width: float, height: float, style: Style
+    surfaces: Surfaces, rng: Rng, split: str, foot: Vector, right: Vector, width: Real, height: Real, style: Style
 ) -> int:
     """Builds a front that stands on `foot` (its lower left corner) and returns its texture's number.
 
@@ -68,7 +68,7 @@ def front(
     glass = window(rng, int(win_h * d), int(win_w * d), np.random.SeedSequence(seed))
     entrance = int(rng.integers(bays))
 
-    def paint(picture_of: Floats, x: float, z: float) -> None:
+    def paint(picture_of: Floats, x: Real, z: Real) -> None:
         """Pastes with its lower left corner at (x, z) metres."""
         ph, pw = picture_of.shape[:2]
         y0, x0 = h - int(z * d) - ph, int(x * d)
@@ -101,13 +101,17 @@ def front(
         holes.append(line)
     number = surfaces.texture(to_pixels(picture))
 
-    def panel(x0: float, z0: float, x1: float, z1: float, depth: float) -> None:
-        O = foot + right * x0 + up * z1 + out * depth
+    def panel(x0: Real, z0: Real, x1: Real, z1: Real, depth: Real) -> None:
+        corner = foot + right * x0 + up * z1 + out * depth
         surfaces.quad(
-            O, right * (x1 - x0), up * (z0 - z1), number, (x0 / width, 1 - z1 / height, x1 / width, 1 - z0 / height)
+            corner,
+            right * (x1 - x0),
+            up * (z0 - z1),
+            number,
+            (x0 / width, 1 - z1 / height, x1 / width, 1 - z0 / height),
         )
 
-    def block(x0: float, z0: float, x1: float, z1: float, depth: float) -> None:
+    def block(x0: Real, z0: Real, x1: Real, z1: Real, depth: Real) -> None:
         """A box set off from the wall (depth > 0) or a niche set back into it (depth < 0), with four sides."""
         panel(x0, z0, x1, z1, depth)
         near, reach = foot + out * depth, -out * depth
@@ -146,13 +150,13 @@ def front(
 
 
 def house(
-    surfaces: Surfaces, rng: Rng, split: str, foot: Vector, right: Vector, size: tuple[float, float, float],
-    style: Style, sides: Literal["own", "twin", "plain"] = "own",
+    surfaces: Surfaces, rng: Rng, split: str, foot: Vector, right: Vector, size: tuple[Real, Real, Real],
+    style: Style, sides: Literal["own", "twin", "same", "plain"] = "own",
 ) -> None:  # fmt: skip
     """A house: `foot` its front left corner, `size` its width, depth and height.
 
-    sides: each with a front of its `own`; opposite sides as `twin`s, so that they are easily confused; or the last
-    three flat and `plain`, for a house far away.
+    sides: each with a front of its `own`; opposite ones as `twin`s, or all four the `same`, so that they are easily
+    confused; or the last three flat and `plain`, for a house far away.
     """
     width, depth, height = size
     back = -np.cross(right, vec(0, 0, 1))
@@ -166,6 +170,6 @@ def house(
         if sides == "plain" and i > 0:
             surfaces.quad(corner + top, along * length, -top, number, (0, 0, length / width, 1))
         else:
-            own = rng if sides != "twin" else np.random.default_rng(twins[i % 2])
+            own = rng if sides == "own" else np.random.default_rng(twins[i % 2 if sides == "twin" else 0])
             number = front(surfaces, own, split, corner, along, length, height, style)
     surfaces.quad(corners[3] + top, right * width, -back * depth, number, (0, 0, 1, 0.1))

@@ -179,7 +179,7 @@ Keypoints = tuple[NDArray[np.float64], NDArray[np.float32]]
 
 def keypoints(grey: Pixels) -> Keypoints:
     """OpenCV's SIFT: points (n, 2) and descriptors (n, 128)."""
-    found, descriptors = cv2.SIFT_create(nfeatures=SIFT_FEATURES).detectAndCompute(grey, np.ones_like(grey))
+    found, descriptors = cv2.SIFT.create(nfeatures=SIFT_FEATURES).detectAndCompute(grey, np.ones_like(grey))
     if not found:
         return np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32)
     return np.array([k.pt for k in found], dtype=np.float64), descriptors.astype(np.float32)

@@ -7,7 +7,8 @@ import numpy as np
 from fmtorch.data.rendered.cameras import Camera, calibration, look_at
 from fmtorch.data.rendered.drawings import books, door, poster, window
 from fmtorch.data.rendered.light import Lens, Light
-from fmtorch.data.rendered.patterns import Rng, cloth, colour, fractal, masonry, plaster, to_pixels, wood
+from fmtorch.data.rendered.mipmap import Real
+from fmtorch.data.rendered.patterns import Rng, cloth, colour, fractal, masonry, plaster, rgb, to_pixels, wood
 from fmtorch.data.rendered.photographs import pictures
 from fmtorch.data.rendered.props import direction, statue
 from fmtorch.data.rendered.scene import Scene, Shot
@@ -21,19 +22,19 @@ WINDOW = 1.0  # a frame is paired with the frames of the following second
 SUBFRAMES = 6
 
 
-def _flat(surfaces: Surfaces, rng: Rng, tint: tuple[float, float] = (0.05, 0.15)) -> int:
+def _flat(surfaces: Surfaces, rng: Rng, tint: tuple[Real, Real] = (0.05, 0.15)) -> int:
     return surfaces.texture(to_pixels(plaster(rng, 256, 256, colour(rng, tint, (0.05, 0.4), (0.3, 0.85)), 0.6)))
 
 
-def _room(surfaces: Surfaces, rng: Rng, half: float, height: float) -> None:
+def _room(surfaces: Surfaces, rng: Rng, half: Real, height: Real) -> None:
     tint = colour(rng, (0.08, 0.65), (0.02, 0.15), (0.7, 0.9))
     floor = to_pixels(
         wood(rng, 1024, 1024, 22, colour(rng, (0.05, 0.1), (0.35, 0.6), (0.4, 0.65))) if rng.random() < 0.6
-        else masonry(rng, 1024, 1024, 14, 14, colour(rng, (0.05, 0.6), (0.03, 0.2), (0.5, 0.8)), bond=0, vary=0.04)
+        else masonry(rng, 1024, 1024, 14, 14, colour(rng, (0.05, 0.6), (0.03, 0.2), (0.5, 0.8)), bond=0.0, vary=0.04)
     )  # fmt: skip
     number = surfaces.texture(floor)
     surfaces.quad(vec(-half, half, 0), vec(2 * half, 0, 0), vec(0, -2 * half, 0), number)
-    ceiling = surfaces.texture(to_pixels(plaster(rng, 256, 256, np.float32([0.85, 0.85, 0.83]), 0.3)))
+    ceiling = surfaces.texture(to_pixels(plaster(rng, 256, 256, rgb(0.85, 0.85, 0.83), 0.3)))
     surfaces.quad(vec(-half, -half, height), vec(2 * half, 0, 0), vec(0, 2 * half, 0), ceiling)
     for k in range(4):
         inward, right = -direction(90 * k), direction(90 * k - 90)
@@ -43,7 +44,7 @@ def _room(surfaces: Surfaces, rng: Rng, half: float, height: float) -> None:
         surfaces.quad(-inward * half - right * half + vec(0, 0, height), right * 2 * half, vec(0, 0, -height), number)
 
 
-def _on_wall(surfaces: Surfaces, picture: np.ndarray, k: int, half: float, x: float, z: float, wide: float) -> None:
+def _on_wall(surfaces: Surfaces, picture: np.ndarray, k: int, half: Real, x: Real, z: Real, wide: Real) -> None:
     """A framed picture on wall k, its middle at (x, z), a little off the wall."""
     inward, right = -direction(90 * k), direction(90 * k - 90)
     tall = wide * picture.shape[0] / picture.shape[1]
@@ -54,7 +55,7 @@ def _on_wall(surfaces: Surfaces, picture: np.ndarray, k: int, half: float, x: fl
     surfaces.quad(top, -inward * 0.03, vec(0, 0, -tall), frame, both_sides=True)
 
 
-def _turn(base: Vector, degrees: float) -> tuple[Vector, Vector, Vector]:
+def _turn(base: Vector, degrees: Real) -> tuple[Vector, Vector, Vector]:
     return base, direction(degrees), direction(degrees + 90)
 
 
@@ -70,7 +71,7 @@ def _desk(surfaces: Surfaces, rng: Rng, split: str, centre: Vector) -> None:
     for x in (0.05, wide - 0.11):
         for y in (0.05, deep - 0.11):
             surfaces.box(corner + right * x + back * y, right * 0.06, back * 0.06, tall - 0.05, [top] * 5, strip)
-    taken: list[tuple[float, float]] = []
+    taken: list[tuple[Real, Real]] = []
     photos = pictures(split, rng, 3)
     for k in range(14):
         x, y = rng.uniform(0.15, wide - 0.35), rng.uniform(0.12, deep - 0.3)
@@ -101,7 +102,7 @@ def _desk(surfaces: Surfaces, rng: Rng, split: str, centre: Vector) -> None:
                          [label, plain, label, plain, plain])  # fmt: skip
 
 
-def _cabinet(surfaces: Surfaces, rng: Rng, base: Vector, degrees: float) -> None:
+def _cabinet(surfaces: Surfaces, rng: Rng, base: Vector, degrees: Real) -> None:
     _, right, back = _turn(base, degrees)
     front = door(rng, 512, 300)
     sides = surfaces.texture(to_pixels(front * 0 + plaster(rng, 512, 300, front[4, 4], 0.7)))
@@ -120,7 +121,7 @@ def _path(rng: Rng, target: Vector) -> tuple[np.ndarray, np.ndarray]:
     return size * rng.uniform(0.6, 1.2, (3, 6)), np.stack([frequency, rng.uniform(0, 2 * np.pi, (3, 6))])
 
 
-def scene(rng: Rng, split: str, shots: int, scale: float) -> Scene:
+def scene(rng: Rng, split: str, shots: int, scale: Real) -> Scene:
     """A room and a video of it; `shots` frames in groups that lie within a second; images are scaled by `scale`."""
     surfaces = Surfaces()
     half, height = rng.uniform(2.3, 3.0), 2.7
@@ -153,7 +154,7 @@ def scene(rng: Rng, split: str, shots: int, scale: float) -> Scene:
     stand = desk + vec(rng.uniform(-0.6, 0.6), -rng.uniform(1.2, 1.9), rng.uniform(1.2, 1.5))
     aim = desk + vec(0, 0.2, rng.uniform(0.85, 1.1))
 
-    def camera(time: float) -> Camera:
+    def camera(time: Real) -> Camera:
         move = (amplitude * np.sin(2 * np.pi * frequency * time + phase)).sum(0)
         return look_at(K, size, (stand + move[:3]).tolist(), (aim + move[3:]).tolist(), roll=float(0.15 * move[0]))
 

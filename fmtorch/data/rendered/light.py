@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.data.rendered.cameras import Camera, Matrix
-from fmtorch.data.rendered.mipmap import TO_LINEAR, Floats, Pixels, to_srgb
+from fmtorch.data.rendered.mipmap import TO_LINEAR, Floats, Pixels, Real, to_srgb
 from fmtorch.data.rendered.raycast import Geometry, Hits
 
 # Four rays a pixel, one on each row and column of a 4 x 4 grid (rotated grid); their mean is the pixel centre.
@@ -23,10 +23,10 @@ _ANISOTROPY = 4.0  # the four rays share a footprint's long side, so each filter
 class Light:
     """A sun (unit direction towards it), its strength, and the strength of the sky, in linear colour."""
 
-    direction: tuple[float, float, float]
-    sun: tuple[float, float, float] = (1.0, 0.95, 0.85)
-    sky: tuple[float, float, float] = (0.38, 0.42, 0.5)
-    ground_shade: float = 0.35  # how much darker the foot of a wall is: mild ambient occlusion
+    direction: tuple[Real, Real, Real]
+    sun: tuple[Real, Real, Real] = (1.0, 0.95, 0.85)
+    sky: tuple[Real, Real, Real] = (0.38, 0.42, 0.5)
+    ground_shade: Real = 0.35  # how much darker the foot of a wall is: mild ambient occlusion
     through_walls: bool = False  # whether pieces lit from behind let the light in: a room seen without its ceiling
     clouds: int = 0  # turns the sky picture, so that photographs of different days differ
 
@@ -35,13 +35,13 @@ class Light:
 class Lens:
     """Blur (standard deviation in pixels), exposure, contrast, gamma, white balance, noise, grey or colour."""
 
-    blur: float = 0.5
-    exposure: float = 1.0
-    contrast: float = 1.0
-    gamma: float = 1.0
-    balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    noise: float = 1.5
-    vignette: float = 0.1
+    blur: Real = 0.5
+    exposure: Real = 1.0
+    contrast: Real = 1.0
+    gamma: Real = 1.0
+    balance: tuple[Real, Real, Real] = (1.0, 1.0, 1.0)
+    noise: Real = 1.5
+    vignette: Real = 0.1
     grey: bool = False
 
 
@@ -83,7 +83,7 @@ class Stage:
         distance = met[..., 0] + hits.s * met[..., 1] + hits.t * met[..., 2]
         self.shadow: Floats = np.where(hits.piece >= 0, distance, np.inf).astype(np.float32)
 
-    def radiance(self, camera: Camera, offset: tuple[float, float]) -> Floats:
+    def radiance(self, camera: Camera, offset: tuple[Real, Real]) -> Floats:
         """Linear colour (h, w, 3) along the rays `offset` away from the pixel centres."""
         hits = self.geometry.look(camera, offset)
         if (hits.piece >= 0).all():
@@ -133,7 +133,7 @@ class Stage:
                 colour[part] = texture(value[part, 0], value[part, 1], lod[part])
         return colour
 
-    def _irradiance(self, value: Floats, offset: tuple[float, float]) -> Floats:
+    def _irradiance(self, value: Floats, offset: tuple[Real, Real]) -> Floats:
         """Light (n, 3): the sun where it is not shadowed, and the sky, less towards the ground and near it."""
         last = _SHADOW_MAP - 1
         x = np.clip(value[:, 2] + 2 * np.float32(offset[0]) + 0.5, 0, last).astype(np.int32)
@@ -142,11 +142,11 @@ class Stage:
         sun = np.maximum(value[:, 6], 0) * lit
         foot = 1 - np.float32(self.light.ground_shade) * np.exp(-np.maximum(value[:, 5], 0) / 0.5)
         sky = (0.7 + 0.3 * value[:, 7]) * np.where(value[:, 7] > 0.9, 1, foot)
-        light = sun[:, None] * np.array(self.light.sun, dtype=np.float32)
+        light: Floats = sun[:, None] * np.array(self.light.sun, dtype=np.float32)
         light += sky[:, None] * np.array(self.light.sky, dtype=np.float32)
         return light
 
-    def _background(self, camera: Camera, offset: tuple[float, float]) -> Floats:
+    def _background(self, camera: Camera, offset: tuple[Real, Real]) -> Floats:
         """The sky (h, w, 3), at infinity: looked up by azimuth (once round) and elevation (horizon to zenith)."""
         h, w = camera.size
         toward = camera.R.T @ np.linalg.inv(camera.K)
@@ -181,9 +181,11 @@ def develop(linear: Floats, lens: Lens, rng: np.random.Generator) -> Pixels:
     if lens.blur > 0:
         linear = cv2.GaussianBlur(linear, (0, 0), lens.blur).astype(np.float32)
     y, x = np.linspace(-1, 1, h, dtype=np.float32)[:, None], np.linspace(-1, 1, w, dtype=np.float32)
-    linear = linear * (1 - np.float32(lens.vignette) * (x * x + y * y))[..., None] * np.float32(lens.balance)
+    linear = (
+        linear * (1 - np.float32(lens.vignette) * (x * x + y * y))[..., None] * np.array(lens.balance, dtype=np.float32)
+    )
     if lens.grey:
-        linear = (linear @ np.float32([0.2126, 0.7152, 0.0722]))[..., None]
+        linear = (linear @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32))[..., None]
     # A shoulder instead of clipping, as film and cameras have it.
     tone = to_srgb(linear * (1 + 0.15 * linear) / (1 + linear * 0.45))
     tone = np.power(tone, np.float32(lens.gamma))
@@ -194,7 +196,7 @@ def develop(linear: Floats, lens: Lens, rng: np.random.Generator) -> Pixels:
     return pixels[..., 0] if lens.grey else pixels
 
 
-def sun(azimuth: float, elevation: float) -> tuple[float, float, float]:
+def sun(azimuth: Real, elevation: Real) -> tuple[float, float, float]:
     """The unit direction at an azimuth and elevation in degrees."""
     a, e = np.radians(azimuth), np.radians(elevation)
     return float(np.cos(a) * np.cos(e)), float(np.sin(a) * np.cos(e)), float(np.sin(e))

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
 Pixels = NDArray[np.uint8]
+Real = float | int
 
 _BORDER = 2
 _ROW = 1024  # look-ups are arranged in rows of this length: cv2.remap limits the sides of its maps to 32,767
@@ -33,21 +34,21 @@ class Texture:
         h, w = picture.shape[:2]
         self.opaque = picture.shape[2] == 3
         level = cv2.LUT(picture[..., :3], TO_LINEAR)
-        alpha = None if self.opaque else picture[..., 3].astype(np.float32) / 255
+        alpha: Floats | None = None if self.opaque else np.float32(1 / 255) * picture[..., 3]
         levels = [picture]
         while min(h, w) > 4:
             h, w = h // 2, w // 2
             level = cv2.resize(level, (w, h), interpolation=cv2.INTER_AREA)
-            coded = to_srgb(level)
+            coded = to_srgb(level.astype(np.float32, copy=False))
             if alpha is not None:
-                alpha = cv2.resize(alpha, (w, h), interpolation=cv2.INTER_AREA)
+                alpha = cv2.resize(alpha, (w, h), interpolation=cv2.INTER_AREA).astype(np.float32)
                 coded = np.dstack([coded, alpha])
             levels.append((coded * 255 + 0.5).astype(np.uint8))
         self.size = np.array(picture.shape[1::-1], dtype=np.float32)
         self.levels = len(levels)
         self.scale = np.array([level.shape[1::-1] for level in levels], dtype=np.float32)
         self.origin = np.zeros((len(levels), 2), dtype=np.float32)
-        padded = [cv2.copyMakeBorder(level, *[_BORDER] * 4, cv2.BORDER_WRAP) for level in levels]
+        padded = [np.pad(level, ((_BORDER, _BORDER), (_BORDER, _BORDER), (0, 0)), mode="wrap") for level in levels]
         rest = sum(level.shape[0] for level in padded[1:])
         width = padded[0].shape[1] + max((level.shape[1] for level in padded[1:]), default=0)
         self.atlas = np.zeros((max(padded[0].shape[0], rest), width, picture.shape[2]), dtype=np.uint8)
@@ -65,12 +66,15 @@ class Texture:
         low = lod.astype(np.int32)
         u, v = u - np.floor(u), v - np.floor(v)
         fine, coarse = self._at(u, v, low), self._at(u, v, low + 1)
-        return fine + (coarse - fine) * (lod - low)[:, None]
+        coarse -= fine
+        coarse *= (lod - low.astype(np.float32))[:, None]
+        fine += coarse
+        return fine
 
     def opacity(self, u: Floats, v: Floats, lod: float) -> Floats:
         """Opacity (n,) in [0, 1], at one pyramid level for all."""
         level = np.full(u.shape, min(max(int(lod), 0), self.levels - 1), dtype=np.int32)
-        return self._lookup(u - np.floor(u), v - np.floor(v), level)[:, 3].astype(np.float32) / 255
+        return self._lookup(u - np.floor(u), v - np.floor(v), level)[:, 3] * np.float32(1 / 255)
 
     def _at(self, u: Floats, v: Floats, level: NDArray[np.int32]) -> Floats:
         coded = self._lookup(u, v, level)[:, :3]
@@ -84,6 +88,6 @@ class Texture:
         rows = max(1, -(-n // _ROW))
         maps = np.zeros((2, rows * _ROW), dtype=np.float32)
         maps[0, :n], maps[1, :n] = x, y
-        maps = maps.reshape(2, rows, _ROW)
-        out = cv2.remap(self.atlas, maps[0], maps[1], cv2.INTER_LINEAR)
+        table = maps.reshape(2, rows, _ROW)
+        out = cv2.remap(self.atlas, table[0], table[1], cv2.INTER_LINEAR)
         return out.reshape(rows * _ROW, -1)[:n].astype(np.uint8, copy=False)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 
 from fmtorch.data.rendered.cameras import calibration, look_at
 from fmtorch.data.rendered.drawings import poster
 from fmtorch.data.rendered.facade import Style, house, wall_picture
 from fmtorch.data.rendered.light import Lens, Light, sun
+from fmtorch.data.rendered.mipmap import Real
 from fmtorch.data.rendered.patterns import Rng, cells, colour, heaven, heights, masonry, meadow, to_pixels
 from fmtorch.data.rendered.photographs import material, pictures
 from fmtorch.data.rendered.props import ashlar, column, direction, foliage, marble, post, rock, statue, tree, walker
@@ -16,10 +19,11 @@ from fmtorch.data.rendered.surfaces import Surfaces, vec
 
 SIZE = (540, 960)
 FOCAL = 760.0  # pixels: a phone's wide lens
-ANGLES = (4.0, 62.0)  # degrees between the two views of a pair
+ANGLES = (5.0, 70.0)  # degrees between the two views of a pair
+SYMMETRIC = 0.6  # chance that the four sides look the same, as in many monuments
 
 
-def ground(surfaces: Surfaces, rng: Rng, split: str, reach: float) -> None:
+def ground(surfaces: Surfaces, rng: Rng, split: str, reach: Real) -> None:
     """A paved or grown square round the origin; its pictures repeat, with a lawn beyond."""
     lawn = material(split, "ground")
     if lawn is None or rng.random() < 0.5:
@@ -43,7 +47,10 @@ def ground(surfaces: Surfaces, rng: Rng, split: str, reach: float) -> None:
 def _structure(surfaces: Surfaces, rng: Rng, split: str) -> float:
     """The thing in the middle; returns its height."""
     stone, block = marble(surfaces, rng), ashlar(surfaces, rng)
-    width, depth = rng.uniform(4.0, 6.5), rng.uniform(3.5, 6.0)
+    width, depth = rng.uniform(4.0, 6.0), rng.uniform(3.5, 6.0)
+    sides: Literal["same", "twin"] = "twin"
+    if rng.random() < SYMMETRIC:
+        depth, sides = width, "same"
     base = 0.0
     for i in range(int(rng.integers(2, 4))):
         grow = 1.5 - 0.5 * i
@@ -59,7 +66,7 @@ def _structure(surfaces: Surfaces, rng: Rng, split: str) -> float:
         inner = 0.62
         house(
             surfaces, rng, split, vec(-width * inner / 2, -depth * inner / 2, base), vec(1, 0, 0),
-            (width * inner, depth * inner, height), Style(density=110, storey=2.4, bay=1.7, depth=0.2), sides="twin",
+            (width * inner, depth * inner, height), Style(density=110, storey=2.4, bay=1.7, depth=0.2), sides=sides,
         )  # fmt: skip
         for x in np.linspace(-width / 2 + 0.3, width / 2 - 0.3, 4):
             for y in np.linspace(-depth / 2 + 0.3, depth / 2 - 0.3, 4):
@@ -68,7 +75,7 @@ def _structure(surfaces: Surfaces, rng: Rng, split: str) -> float:
     else:
         house(
             surfaces, rng, split, vec(-width / 2, -depth / 2, base), vec(1, 0, 0), (width, depth, height),
-            Style(density=110, storey=1.5, bay=1.1, depth=0.22, pilasters=kind < 0.75, same_windows=0.8), sides="twin",
+            Style(density=110, storey=1.5, bay=1.1, depth=0.22, pilasters=kind < 0.75, same_windows=0.8), sides=sides,
         )  # fmt: skip
     base += height
     frieze = surfaces.texture(to_pixels(wall_picture(rng, split, 256, 1024, 60)))
@@ -104,7 +111,7 @@ def _structure(surfaces: Surfaces, rng: Rng, split: str) -> float:
     return base
 
 
-def _mound(surfaces: Surfaces, rng: Rng, texture: int, at: tuple[float, float], side: float, tall: float) -> None:
+def _mound(surfaces: Surfaces, rng: Rng, texture: int, at: tuple[Real, Real], side: Real, tall: Real) -> None:
     """A flower bed or heap: a height field over a square."""
     n = 12
     rim = np.sin(np.linspace(0, np.pi, n))
@@ -115,7 +122,7 @@ def _mound(surfaces: Surfaces, rng: Rng, texture: int, at: tuple[float, float], 
     surfaces.grid(points, texture, (1, 1))
 
 
-def surroundings(surfaces: Surfaces, rng: Rng, split: str, near: float, far: float, houses: int) -> None:
+def surroundings(surfaces: Surfaces, rng: Rng, split: str, near: Real, far: Real, houses: int) -> None:
     """Houses, trees and lamp posts in a ring."""
     leaf, bark = foliage(surfaces, rng)
     for k in range(houses):
@@ -134,7 +141,7 @@ def surroundings(surfaces: Surfaces, rng: Rng, split: str, near: float, far: flo
         post(surfaces, direction(rng.uniform(0, 360)) * near, 4.2, metal)
 
 
-def scene(rng: Rng, split: str, shots: int, scale: float) -> Scene:
+def scene(rng: Rng, split: str, shots: int, scale: Real) -> Scene:
     """A structure with `shots` views round it; images are scaled by `scale`."""
     surfaces = Surfaces()
     height = _structure(surfaces, rng, split)
@@ -144,11 +151,14 @@ def scene(rng: Rng, split: str, shots: int, scale: float) -> Scene:
     for _ in range(3):
         a = np.radians(rng.uniform(0, 360))
         _mound(surfaces, rng, leaf_bed, (float(6.5 * np.cos(a)), float(6.5 * np.sin(a))), 2.4, 0.7)
-    for _ in range(3):
+    leaf, bark = foliage(surfaces, rng)
+    for _ in range(5):
+        tree(surfaces, rng, direction(rng.uniform(0, 360)) * rng.uniform(6.0, 8.5), rng.uniform(2.2, 3.6), leaf, bark)
+    for _ in range(6):
         walker(surfaces, rng, direction(rng.uniform(0, 360)) * rng.uniform(5, 8), rng.uniform(0, 360))
     size = (round(SIZE[0] * scale), round(SIZE[1] * scale))
     K = calibration(FOCAL * scale, size)
-    arc = min(360.0, 16.0 * shots)
+    arc = min(360.0, 20.0 * shots)
     start = rng.uniform(0, 360)
     azimuth = start + arc * (np.arange(shots) + rng.uniform(-0.3, 0.3, shots)) / shots
     taken = []
@@ -157,8 +167,8 @@ def scene(rng: Rng, split: str, shots: int, scale: float) -> Scene:
         eye = direction(a) * radius + vec(0, 0, rng.uniform(1.3, 2.6))
         at = vec(*rng.normal(0, 0.7, 2), 0.42 * height + rng.normal(0, 0.3))
         camera = look_at(K, size, eye.tolist(), at.tolist(), roll=float(rng.normal(0, 0.03)))
-        lens = Lens(exposure=float(rng.uniform(0.9, 1.1)), noise=2.0, blur=0.55)
-        taken.append(Shot(camera, lens, jpeg=92))
+        lens = Lens(exposure=float(rng.uniform(0.8, 1.2)), noise=3.0, blur=0.7)
+        taken.append(Shot(camera, lens, jpeg=88))
     light = Light(sun(rng.uniform(0, 360), rng.uniform(30, 65)))
     apart = np.abs((azimuth[:, None] - azimuth[None] + 180) % 360 - 180)
     pairs = [(i, j) for i in range(shots) for j in range(i + 1, shots) if ANGLES[0] <= apart[i, j] <= ANGLES[1]]

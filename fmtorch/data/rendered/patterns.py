@@ -1,4 +1,4 @@
-"""Procedural materials: masonry, plaster, wood, ground, cloth, leaves, sky. Pictures are float32 RGB in [0, 1], sRGB."""
+"""Procedural materials: masonry, plaster, wood, ground, cloth, leaves, sky; float32 RGB in [0, 1], sRGB."""
 
 from __future__ import annotations
 
@@ -8,9 +8,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.data.rendered.mipmap import Floats, Pixels
+from fmtorch.data.rendered.mipmap import Floats, Pixels, Real
 
 Rng = np.random.Generator
+
+
+def rgb(red: Real, green: Real, blue: Real) -> Floats:
+    """A colour (3,)."""
+    return np.array([red, green, blue], dtype=np.float32)
 
 
 def to_pixels(picture: Floats) -> Pixels:
@@ -18,13 +23,12 @@ def to_pixels(picture: Floats) -> Pixels:
     return (np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
-def colour(rng: Rng, hue: tuple[float, float], saturation: tuple[float, float], value: tuple[float, float]) -> Floats:
+def colour(rng: Rng, hue: tuple[Real, Real], saturation: tuple[Real, Real], value: tuple[Real, Real]) -> Floats:
     """A random colour (3,) within ranges of hue, saturation and value."""
-    rgb = colorsys.hsv_to_rgb(rng.uniform(*hue) % 1.0, rng.uniform(*saturation), rng.uniform(*value))
-    return np.array(rgb, dtype=np.float32)
+    return rgb(*colorsys.hsv_to_rgb(rng.uniform(*hue) % 1.0, rng.uniform(*saturation), rng.uniform(*value)))
 
 
-def fractal(rng: Rng, h: int, w: int, coarsest: int = 256, finest: int = 1, roughness: float = 0.6) -> Floats:
+def fractal(rng: Rng, h: int, w: int, coarsest: int = 256, finest: int = 1, roughness: Real = 0.6) -> Floats:
     """Noise (h, w) summed over octaves of `coarsest` to `finest` pixels, zero mean, unit deviation, repeating."""
     total = np.zeros((h, w), dtype=np.float32)
     weight, step = 1.0, min(coarsest, h, w)
@@ -46,7 +50,7 @@ def fractal(rng: Rng, h: int, w: int, coarsest: int = 256, finest: int = 1, roug
     return total / max(float(total.std()), 1e-6)
 
 
-def plaster(rng: Rng, h: int, w: int, tint: Floats, strength: float = 1.0) -> Floats:
+def plaster(rng: Rng, h: int, w: int, tint: Floats, strength: Real = 1.0) -> Floats:
     """A painted wall: fine grain, soft stains, a few cracks."""
     shade = 1 + strength * (0.03 * fractal(rng, h, w, 512, 16) + 0.03 * fractal(rng, h, w, 8, 1, 0.8))
     out = tint * shade[..., None]
@@ -58,8 +62,8 @@ def plaster(rng: Rng, h: int, w: int, tint: Floats, strength: float = 1.0) -> Fl
 
 
 def masonry(
-    rng: Rng, h: int, w: int, rows: int, cols: int, tint: Floats, *, joint: float = 0.06, vary: float = 0.1,
-    bond: float = 0.5,
+    rng: Rng, h: int, w: int, rows: int, cols: int, tint: Floats, *, joint: Real = 0.06, vary: Real = 0.1,
+    bond: Real = 0.5,
 ) -> Floats:  # fmt: skip
     """Courses of stones or bricks, each of its own colour, with mortar; `bond` shifts every second course."""
     y, x = np.mgrid[:h, :w].astype(np.float32)
@@ -77,17 +81,19 @@ def masonry(
     edge_x = np.minimum(c - np.floor(c), 1 - (c - np.floor(c))) * np.float32(aspect)
     wobble = np.float32(joint) * (1 + 0.35 * fractal(rng, h, w, 16, 2))
     gap = np.clip((wobble - np.minimum(edge_x, edge_y)) / np.float32(joint * 0.4) + 0.5, 0, 1)[..., None]
-    mortar = (0.55 * tint + 0.15) * (1 + 0.1 * fractal(rng, h, w, 8, 1))[..., None]
-    return (out * (1 - gap) + mortar * gap).astype(np.float32)
+    mortar: Floats = (0.55 * tint + 0.15) * (1 + 0.1 * fractal(rng, h, w, 8, 1))[..., None]
+    wall: Floats = (out * (1 - gap) + mortar * gap).astype(np.float32)
+    return wall
 
 
-def cells(rng: Rng, h: int, w: int, size: int, tint: Floats, *, vary: float = 0.12, joint: float = 2.0) -> Floats:
+def cells(rng: Rng, h: int, w: int, size: int, tint: Floats, *, vary: Real = 0.12, joint: Real = 2.0) -> Floats:
     """Irregular stones (Voronoi cells of a jittered grid): cobbles, rubble."""
     seeds = np.full((h, w), 255, dtype=np.uint8)
     gy, gx = np.mgrid[size // 2 : h : size, size // 2 : w : size]
     jitter = rng.integers(-size // 3, size // 3 + 1, (2, *gy.shape))
     seeds[np.clip(gy + jitter[0], 0, h - 1), np.clip(gx + jitter[1], 0, w - 1)] = 0
-    distance, label = cv2.distanceTransformWithLabels(seeds, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    distance, found = cv2.distanceTransformWithLabels(seeds, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    label = found.astype(np.int32)
     tones = 1 + vary * rng.standard_normal((int(label.max()) + 1, 1)).astype(np.float32)
     tones = tones * (1 + 0.3 * vary * rng.standard_normal((len(tones), 3)).astype(np.float32))
     border = cv2.morphologyEx(label.astype(np.float32), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0
@@ -167,7 +173,7 @@ def leaves(rng: Rng, size: int, tint: Floats, count: int = 320) -> Pixels:
     return to_pixels(out)
 
 
-def heaven(rng: Rng, cover: float) -> Pixels:
+def heaven(rng: Rng, cover: Real) -> Pixels:
     """A sky (256, 1024, 3): azimuth across, zenith on top, clouds over a gradient."""
     h, w = 256, 1024
     height = np.linspace(1, 0, h, dtype=np.float32)[:, None]
@@ -181,4 +187,5 @@ def heaven(rng: Rng, cover: float) -> Pixels:
 def heights(rng: Rng, m: int, n: int, coarsest: int = 8) -> NDArray[np.float64]:
     """A smooth random field (m, n) in [0, 1] for relief."""
     field = fractal(rng, m, n, coarsest, 1, 0.45).astype(np.float64)
-    return (field - field.min()) / max(float(np.ptp(field)), 1e-9)
+    field -= field.min()
+    return field / max(float(field.max()), 1e-9)

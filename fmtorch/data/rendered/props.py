@@ -5,24 +5,25 @@ from __future__ import annotations
 import numpy as np
 
 from fmtorch.data.rendered.drawings import car_end, car_side, person
+from fmtorch.data.rendered.mipmap import Real
 from fmtorch.data.rendered.patterns import Rng, colour, fractal, heights, leaves, masonry, plaster, to_pixels, wood
 from fmtorch.data.rendered.surfaces import Surfaces, Vector, vec
 
 
-def direction(degrees: float) -> Vector:
+def direction(degrees: Real) -> Vector:
     """The horizontal unit vector at an azimuth."""
     a = np.radians(degrees)
     return vec(np.cos(a), np.sin(a), 0)
 
 
-def card(surfaces: Surfaces, foot: Vector, facing: float, width: float, height: float, texture: int) -> None:
+def card(surfaces: Surfaces, foot: Vector, facing: Real, width: Real, height: Real, texture: int) -> None:
     """An upright picture that faces an azimuth, seen from both sides, centred on `foot`."""
     right = direction(facing + 90)
     top = foot - right * (width / 2) + vec(0, 0, height)
     surfaces.quad(top, right * width, vec(0, 0, -height), texture, both_sides=True)
 
 
-def tree(surfaces: Surfaces, rng: Rng, foot: Vector, height: float, leaf: int, bark: int) -> None:
+def tree(surfaces: Surfaces, rng: Rng, foot: Vector, height: Real, leaf: int, bark: int) -> None:
     """A trunk and a crown of leafy cards."""
     radius = 0.03 * height
     profile = [(0.0, radius * 1.3), (0.3 * height, radius), (0.75 * height, radius * 0.5)]
@@ -41,7 +42,7 @@ def foliage(surfaces: Surfaces, rng: Rng, size: int = 256) -> tuple[int, int]:
     return leaf, surfaces.texture(to_pixels(np.ascontiguousarray(bark.transpose(1, 0, 2))))
 
 
-def post(surfaces: Surfaces, foot: Vector, height: float, texture: int) -> None:
+def post(surfaces: Surfaces, foot: Vector, height: Real, texture: int) -> None:
     """A lamp post."""
     surfaces.lathe(foot, [(0, 0.12), (0.5, 0.09), (height, 0.06)], texture, sides=6, repeat=(1, 4))
     surfaces.lathe(foot + vec(0, 0, height), [(0, 0.06), (0.15, 0.25), (0.5, 0.22), (0.6, 0.05)], texture, sides=8)
@@ -61,16 +62,16 @@ def car(surfaces: Surfaces, rng: Rng, foot: Vector, ahead: Vector) -> None:
     cabin = rear + ahead * (0.18 * length) - left * 0.08 + vec(0, 0, 0.82)
     surfaces.box(cabin, -left * (width - 0.16), ahead * (0.55 * length), 0.6, paint, ((0, 0, 1, 0.5),) * 5)
     for shift, along in ((0.01, -ahead), (-width - 0.01, ahead)):
-        O = foot + left * (width / 2 + shift) - along * (length / 2) + vec(0, 0, 1.5)
-        surfaces.quad(O, along * length, vec(0, 0, -1.52), side)
+        top = foot + left * (width / 2 + shift) - along * (length / 2) + vec(0, 0, 1.5)
+        surfaces.quad(top, along * length, vec(0, 0, -1.52), side)
 
 
-def walker(surfaces: Surfaces, rng: Rng, foot: Vector, facing: float) -> None:
+def walker(surfaces: Surfaces, rng: Rng, foot: Vector, facing: Real) -> None:
     """Somebody, as a picture that faces the camera's side."""
     card(surfaces, foot, facing, 0.66, rng.uniform(1.55, 1.9), surfaces.texture(person(rng)))
 
 
-def rock(surfaces: Surfaces, rng: Rng, foot: Vector, radius: float, texture: int, detail: int = 12) -> None:
+def rock(surfaces: Surfaces, rng: Rng, foot: Vector, radius: Real, texture: int, detail: int = 12) -> None:
     """A boulder: a sphere with relief."""
     angle = np.linspace(-0.35 * np.pi, 0.5 * np.pi, detail)
     profile = [(float(radius * np.sin(a)), float(radius * np.cos(a)) + 1e-4) for a in angle]
@@ -78,7 +79,7 @@ def rock(surfaces: Surfaces, rng: Rng, foot: Vector, radius: float, texture: int
     surfaces.lathe(foot, profile, texture, sides=detail + 4, repeat=(2, 1), bumps=bumps)
 
 
-def statue(surfaces: Surfaces, rng: Rng, foot: Vector, height: float, texture: int, detail: int = 16) -> None:
+def statue(surfaces: Surfaces, rng: Rng, foot: Vector, height: Real, texture: int, detail: int = 16) -> None:
     """A figure-like turned shape with relief, on a base."""
     steps = np.linspace(0, 1, detail)
     body = 0.19 + 0.07 * np.sin(steps * 7 + rng.uniform(0, 6)) - 0.05 * steps
@@ -90,7 +91,7 @@ def statue(surfaces: Surfaces, rng: Rng, foot: Vector, height: float, texture: i
     surfaces.lathe(foot, profile, texture, sides=14, repeat=(1, 1), bumps=bumps)
 
 
-def column(surfaces: Surfaces, foot: Vector, height: float, radius: float, texture: int, sides: int = 10) -> None:
+def column(surfaces: Surfaces, foot: Vector, height: Real, radius: Real, texture: int, sides: int = 10) -> None:
     """A column with a base and a capital."""
     profile = [
         (0.0, 1.35 * radius), (0.04 * height, 1.35 * radius), (0.06 * height, radius), (0.5 * height, 0.97 * radius),

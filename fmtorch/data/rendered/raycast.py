@@ -68,41 +68,49 @@ class Geometry:
             usable &= ~skip
         inverse = np.zeros_like(G)
         inverse[usable] = np.linalg.inv(G[usable])
-        zO, zU, zV = self.O @ depth[:3] + depth[3], self.U @ depth[:3], self.V @ depth[:3]
         boxes = self._boxes(P, size, usable)
+        nearest = self.corners @ depth[:3] + depth[3]
+        order = np.argsort(nearest.min(1), kind="stable")
+        order = order[((boxes[:, 0] < boxes[:, 2]) & (boxes[:, 1] < boxes[:, 3]))[order]]
+        # The linear forms, re-centred on each box in float64 so that float32 is accurate inside it.
+        forms = inverse.copy()
+        forms[:, :, 2] += (inverse[:, :, :2] * boxes[:, None, :2]).sum(-1)
+        forms = forms.astype(np.float32)
+        z_of = np.stack([self.U @ depth[:3], self.V @ depth[:3], self.O @ depth[:3] + depth[3]], 1).astype(np.float32)
+        closest = np.where(nearest.min(1) > NEAR, 0.999 * nearest.min(1), -np.inf).astype(np.float32)
+        x_axis, y_axis = np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32)
         buffer = np.full((h, w), np.inf, dtype=np.float32)
         piece = np.full((h, w), -1, dtype=np.int32)
-        s_out, t_out = np.zeros((h, w), np.float32), np.zeros((h, w), np.float32)
-        nearest_first = np.argsort((self.corners @ depth[:3]).min(1), kind="stable")
-        on_screen = (boxes[:, 0] < boxes[:, 2]) & (boxes[:, 1] < boxes[:, 3])
-        for i in nearest_first[on_screen[nearest_first]]:
-            x0, y0, x1, y1 = boxes[i].tolist()
-            # The linear forms, re-centred on the box in float64 so that float32 is accurate inside it.
-            A = inverse[i].copy()
-            A[:, 2] += A[:, 0] * x0 + A[:, 1] * y0
-            x = np.arange(x1 - x0, dtype=np.float64)
-            y = np.arange(y1 - y0, dtype=np.float64)[:, None]
-            s, t, q = ((A[k, 0] * x).astype(np.float32) + (A[k, 1] * y + A[k, 2]).astype(np.float32) for k in range(3))
-            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-                inv = np.float32(1) / q
-                s *= inv
-                t *= inv
-                z = np.float32(zU[i]) * s + (np.float32(zV[i]) * t + np.float32(zO[i]))
+        where = np.zeros((2, h, w), dtype=np.float32)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            for i in order.tolist():
+                x0, y0, x1, y1 = boxes[i].tolist()
                 view = np.s_[y0:y1, x0:x1]
-                hit = (s > -_SEAM) & (t > -_SEAM) & (z < buffer[view])
+                before = buffer[view]
+                if before.max() < closest[i]:
+                    continue
+                A = forms[i]
+                rows = A[:, 1:2] * y_axis[: y1 - y0] + A[:, 2:]
+                stq = A[:, 0, None, None] * x_axis[: x1 - x0] + rows[:, :, None]
+                st = stq[:2]
+                st /= stq[2]
+                s, t = st
+                z = z_of[i, 0] * s + (z_of[i, 1] * t + z_of[i, 2])
+                hit = (s > -_SEAM) & (t > -_SEAM) & (z < before)
                 if self.triangle[i]:
                     hit &= s + t < 1 + _SEAM
                 else:
                     hit &= (s < 1 + _SEAM) & (t < 1 + _SEAM)
                 if centre is not None:
                     hit &= z > NEAR
-            if not self.textures[self.texture[i]].opaque and hit.any():
-                hit[hit] = self._solid(int(i), s[hit], t[hit], (x1 - x0, y1 - y0))
-            np.copyto(buffer[view], z, where=hit)
-            np.copyto(piece[view], np.int32(i), where=hit)
-            np.copyto(s_out[view], s, where=hit)
-            np.copyto(t_out[view], t, where=hit)
-        return Hits(piece, s_out, t_out, inverse)
+                if not hit.any():
+                    continue
+                if not self.textures[self.texture[i]].opaque:
+                    hit[hit] = self._solid(i, s[hit], t[hit], (x1 - x0, y1 - y0))
+                np.copyto(before, z, where=hit)
+                np.copyto(piece[view], np.int32(i), where=hit)
+                np.copyto(where[:, y0:y1, x0:x1], st, where=hit)
+        return Hits(piece, where[0], where[1], inverse)
 
     def look(self, camera: Camera, offset: tuple[float, float] = (0.0, 0.0)) -> Hits:
         """The rays through the points `offset` (x, y) away from the pixel centres of a camera."""
@@ -118,7 +126,8 @@ class Geometry:
         row = hits.inverse[hits.piece, 2]
         inverse_depth = np.where(hits.piece >= 0, row[..., 0] * x + row[..., 1] * y + row[..., 2], 0.0)
         with np.errstate(divide="ignore"):
-            return np.asarray(1.0 / inverse_depth)
+            depth: Matrix = 1.0 / inverse_depth
+        return depth
 
     def _solid(self, i: int, s: Floats, t: Floats, box: tuple[int, int]) -> NDArray[np.bool_]:
         texture = self.textures[self.texture[i]]
@@ -154,5 +163,5 @@ def _clip(X: Matrix) -> Matrix:
             kept.append(a)
         if (a[2] >= NEAR) != (b[2] >= NEAR):
             kept.append(a + (NEAR - a[2]) / (b[2] - a[2]) * (b - a))
-    points = np.array(kept)
+    points: Matrix = np.array(kept)
     return points[:, :2] / points[:, 2:]

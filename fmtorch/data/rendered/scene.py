@@ -16,7 +16,7 @@ class Shot:
     """One photograph to take. `camera` is the ground truth; `moments` the cameras during a long exposure."""
 
     camera: Camera
-    lens: Lens = Lens()
+    lens: Lens
     light: int = 0
     moments: Sequence[Camera] = ()
     jpeg: int = 95  # quality

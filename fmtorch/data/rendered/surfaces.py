@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.data.rendered.mipmap import Pixels, Texture
+from fmtorch.data.rendered.mipmap import Pixels, Real, Texture
 
 Vector = NDArray[np.float64]
-VectorLike = Vector | Sequence[float]
+VectorLike = Vector | Sequence[Real]
 
 
-def vec(*v: float) -> Vector:
+def vec(*v: Real) -> Vector:
     """A float64 vector."""
     return np.array(v, dtype=np.float64)
 
@@ -22,8 +22,9 @@ _FLAT = np.full(9, np.nan)  # stands for the normals of a flat piece until they 
 
 
 class Surfaces:
-    """A growing list of flat pieces: points ``O + s U + t V`` with s, t in [0, 1] (and s + t <= 1 in a triangle).
+    """A growing list of flat pieces: a corner O and edges U, V; their points are ``O + s U + t V``.
 
+    s and t are in [0, 1]; in a triangle also s + t <= 1.
     Texture coordinates and normals are affine in (s, t), so that curved shapes can be shaded smoothly. The outside of a
     piece is where ``V x U`` points: seen from there, U goes right and V down, as in the picture on it.
     """
@@ -43,26 +44,26 @@ class Surfaces:
         return len(self._rows)
 
     def piece(
-        self, O: Vector, U: Vector, V: Vector, texture: int, uv: NDArray[np.float64],
+        self, corner: Vector, U: Vector, V: Vector, texture: int, uv: NDArray[np.float64],
         *, triangle: bool = False, normals: NDArray[np.float64] | None = None, both_sides: bool = False,
     ) -> None:  # fmt: skip
-        """One piece; `uv` (3, 2) and `normals` (3, 3) are the values at O and their change along U and along V."""
+        """One piece; `uv` (3, 2) and `normals` (3, 3): values at the corner and their change along U and along V."""
         flat = _FLAT if normals is None else normals.ravel()
-        self._rows.append(np.concatenate([O, U, V, uv.ravel(), flat]))
+        self._rows.append(np.concatenate([corner, U, V, uv.ravel(), flat]))
         self._texture.append(texture)
         self._flags.append((triangle, both_sides))
 
     def quad(
-        self, O: Vector, U: Vector, V: Vector, texture: int, window: Sequence[float] = (0.0, 0.0, 1.0, 1.0),
+        self, corner: Vector, U: Vector, V: Vector, texture: int, window: Sequence[Real] = (0.0, 0.0, 1.0, 1.0),
         *, both_sides: bool = False,
     ) -> None:  # fmt: skip
         """A parallelogram that shows the part (u0, v0, u1, v1) of a texture."""
         u0, v0, u1, v1 = window
-        self.piece(O, U, V, texture, np.array([[u0, v0], [u1 - u0, 0.0], [0.0, v1 - v0]]), both_sides=both_sides)
+        self.piece(corner, U, V, texture, np.array([[u0, v0], [u1 - u0, 0.0], [0.0, v1 - v0]]), both_sides=both_sides)
 
     def box(
-        self, base: Vector, right: Vector, back: Vector, height: float, textures: Sequence[int],
-        windows: Sequence[Sequence[float]] = ((0.0, 0.0, 1.0, 1.0),) * 5,
+        self, base: Vector, right: Vector, back: Vector, height: Real, textures: Sequence[int],
+        windows: Sequence[Sequence[Real]] = ((0.0, 0.0, 1.0, 1.0),) * 5,
     ) -> None:  # fmt: skip
         """An upright box on its lower front left corner; textures of front, right, back, left side and top."""
         up = vec(0.0, 0.0, height)
@@ -72,7 +73,7 @@ class Surfaces:
             self.quad(a + up, b - a, -up, textures[i], windows[i])
         self.quad(base + back + up, right, -back, textures[4], windows[4])
 
-    def grid(self, points: NDArray[np.float64], texture: int, repeat: tuple[float, float] = (1.0, 1.0)) -> None:
+    def grid(self, points: NDArray[np.float64], texture: int, repeat: tuple[Real, Real] = (1.0, 1.0)) -> None:
         """A smooth surface through a grid of points (m, n, 3), rows from top to bottom seen from outside."""
         m, n = points.shape[:2]
         du = np.gradient(points, axis=1)
@@ -94,8 +95,8 @@ class Surfaces:
                     self.piece(points[corner], U, V, texture, tex, triangle=True, normals=nor)
 
     def lathe(
-        self, base: Vector, profile: Sequence[tuple[float, float]], texture: int, sides: int = 12,
-        repeat: tuple[float, float] = (1.0, 1.0), bumps: NDArray[np.float64] | None = None,
+        self, base: Vector, profile: Sequence[tuple[Real, Real]], texture: int, sides: int = 12,
+        repeat: tuple[Real, Real] = (1.0, 1.0), bumps: NDArray[np.float64] | None = None,
     ) -> None:  # fmt: skip
         """A turned shape: (height, radius) from bottom to top round the upright axis; `bumps` scale the radius."""
         steps = np.array(profile[::-1], dtype=np.float64)

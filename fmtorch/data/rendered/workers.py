@@ -86,7 +86,8 @@ def _feed(
     waiting: queue.SimpleQueue[tuple[Task, Path]],
     finished: queue.SimpleQueue[str | None],
 ) -> None:
-    assert process.stdin is not None and process.stdout is not None
+    assert process.stdin is not None
+    assert process.stdout is not None
     while True:
         try:
             task, folder = waiting.get_nowait()
