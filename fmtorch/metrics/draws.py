@@ -75,10 +75,8 @@ def mean_terms(pairs: Pairs, draw: Draw, *, samples: int, seed: int) -> tuple[Fl
     if samples < 1:
         raise ValueError(f"samples is {samples}; it must be at least 1")
     step = max(1, TILE // BLOCK)
-    tiles = [pairs.take(slice(i, i + step)) for i in range(0, len(pairs.key), step)]
-    parts = [_tile_terms(tile, draw, samples, seed) for tile in tiles]
-    if not parts:
-        return pairs.F_est.sum((-2, -1)), pairs.key
+    starts = range(0, max(1, len(pairs.key)), step)  # one empty tile for an empty batch
+    parts = [_tile_terms(pairs.take(slice(i, i + step)), draw, samples, seed) for i in starts]
     return torch.cat([total for total, _ in parts]), torch.cat([count for _, count in parts])
 
 
