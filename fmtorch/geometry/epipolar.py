@@ -22,11 +22,11 @@ def cross_matrix(t: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
 
 def unit_frobenius(F: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
     """F divided by its Frobenius norm; the zero matrix stays zero, with finite gradients."""
-    F = _unit_largest(F)
+    F = unit_largest(F)
     squared = torch.zeros_like(F[..., 0, 0])
     for element in F.flatten(-2).unbind(-1):
         squared = squared + element * element
-    return F * _inverse_root(squared)[..., None, None]
+    return F * inverse_root(squared)[..., None, None]
 
 
 def fundamental_from_projections(
@@ -38,7 +38,7 @@ def fundamental_from_projections(
     2nd ed., eq. 17.3), so it holds for finite and infinite cameras and is smooth in both. Cameras with one centre
     have no fundamental matrix: the zero matrix is returned.
     """
-    lines0, lines1 = _pluecker_of_row_pairs(_unit_largest(P0)), _pluecker_of_row_pairs(_unit_largest(P1))
+    lines0, lines1 = _pluecker_of_row_pairs(unit_largest(P0)), _pluecker_of_row_pairs(unit_largest(P1))
     # The sign is that of [t]_x for P0 = [I | 0], P1 = [I | t].
     return unit_frobenius(_matrix([-_determinant(lines0[i], lines1[j]) for j in range(3) for i in range(3)]))
 
@@ -51,9 +51,9 @@ def fundamental_from_calibration(
 ) -> Float[Tensor, "*#batch 3 3"]:
     """F = K1^-T [t]_x R K0^-1 of unit Frobenius norm, for ``X1 = R X0 + t`` (Hartley & Zisserman, eq. 9.12)."""
     E = _matmul(cross_matrix(t), R)
-    inverse0 = _cofactors(_unit_largest(K0)).mT  # K^-1 up to the scale det K
-    inverse1_t = _cofactors(_unit_largest(K1))
-    return unit_frobenius(_matmul(_matmul(inverse1_t, _unit_largest(E)), inverse0))
+    inverse0 = _cofactors(unit_largest(K0)).mT  # K^-1 up to the scale det K
+    inverse1_t = _cofactors(unit_largest(K1))
+    return unit_frobenius(_matmul(_matmul(inverse1_t, unit_largest(E)), inverse0))
 
 
 def epipolar_lines(F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"]) -> Float[Tensor, "*#batch n 3"]:
@@ -61,23 +61,23 @@ def epipolar_lines(F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n
 
     Where a = b = 0 (the epipole, or the line at infinity) the line is returned unscaled, as OpenCV does.
     """
-    a, b, c = _lines(_unit_largest(F), x0)
+    a, b, c = lines_through(unit_largest(F), x0)
     squared = a * a + b * b
-    scale = torch.where(squared > 0, _inverse_root(squared), 1.0)
+    scale = torch.where(squared > 0, inverse_root(squared), 1.0)
     return torch.stack([a, b, c], -1) * scale[..., None]
 
 
 def point_to_line(x: Float[Tensor, "*#batch n 2"], line: Float[Tensor, "*#batch n 3"]) -> Float[Tensor, "*#batch n"]:
     """Distance in pixels of each point to its line (a, b, c) of any scale; 0 where a = b = 0."""
     a, b, c = line.unbind(-1)
-    return (a * x[..., 0] + b * x[..., 1] + c).abs() * _inverse_root(a * a + b * b)
+    return (a * x[..., 0] + b * x[..., 1] + c).abs() * inverse_root(a * a + b * b)
 
 
 def algebraic(
     F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
 ) -> Float[Tensor, "*#batch n"]:
     """The signed algebraic residual ``x1^T F x0``, in units of F."""
-    a, b, c = _lines(F, x0)
+    a, b, c = lines_through(F, x0)
     return a * x1[..., 0] + b * x1[..., 1] + c
 
 
@@ -85,8 +85,8 @@ def epipolar_distances(
     F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
 ) -> tuple[Float[Tensor, "*#batch n"], Float[Tensor, "*#batch n"]]:
     """Point-to-line distances in pixels: of x0 to the line ``F^T x1`` in image 0, of x1 to ``F x0`` in image 1."""
-    e, squared0, squared1 = _residual_and_normals(F, x0, x1)
-    return e.abs() * _inverse_root(squared0), e.abs() * _inverse_root(squared1)
+    e, squared0, squared1 = residual_and_normals(F, x0, x1)
+    return e.abs() * inverse_root(squared0), e.abs() * inverse_root(squared1)
 
 
 def symmetric_mean(
@@ -117,8 +117,8 @@ def sampson(
     F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
 ) -> Float[Tensor, "*#batch n"]:
     """Sampson distance in pixels: |x1^T F x0| over the norm of its gradient (Hartley & Zisserman, eq. 11.9)."""
-    e, squared0, squared1 = _residual_and_normals(F, x0, x1)
-    return e.abs() * _inverse_root(squared0 + squared1)
+    e, squared0, squared1 = residual_and_normals(F, x0, x1)
+    return e.abs() * inverse_root(squared0 + squared1)
 
 
 def sampson_squared(
@@ -129,28 +129,28 @@ def sampson_squared(
     return distance * distance
 
 
-def _residual_and_normals(F: Tensor, x0: Tensor, x1: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def residual_and_normals(F: Tensor, x0: Tensor, x1: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """x1^T F x0 and the squared norms of the normals of ``F^T x1`` and ``F x0``, all for one scaled F."""
-    F = _unit_largest(F)
-    a1, b1, c1 = _lines(F, x0)
-    a0, b0, _ = _lines(F.mT, x1)
+    F = unit_largest(F)
+    a1, b1, c1 = lines_through(F, x0)
+    a0, b0, _ = lines_through(F.mT, x1)
     e = a1 * x1[..., 0] + b1 * x1[..., 1] + c1
     return e, a0 * a0 + b0 * b0, a1 * a1 + b1 * b1
 
 
-def _lines(F: Tensor, x: Tensor) -> list[Tensor]:
+def lines_through(F: Tensor, x: Tensor) -> list[Tensor]:
     """The three components of F (x, y, 1)."""
     u, v = x.unbind(-1)
     return [F[..., i, 0, None] * u + F[..., i, 1, None] * v + F[..., i, 2, None] for i in range(3)]
 
 
-def _inverse_root(squared: Tensor) -> Tensor:
+def inverse_root(squared: Tensor) -> Tensor:
     """1 / sqrt(squared), and 0 with zero gradient where squared = 0."""
     positive = squared != 0  # NaN stays NaN
     return torch.where(positive, 1 / torch.where(positive, squared, 1.0).sqrt(), 0.0)
 
 
-def _unit_largest(matrix: Tensor) -> Tensor:
+def unit_largest(matrix: Tensor) -> Tensor:
     """A homogeneous matrix scaled so that squares neither under- nor overflow.
 
     The scale is a constant to autograd: what is computed from the matrix does not depend on it.

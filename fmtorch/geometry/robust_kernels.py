@@ -1,0 +1,77 @@
+"""Robust kernels: losses of a squared residual that grow more slowly than the residual itself.
+
+Each is scaled so that ``loss ~ r^2`` for small residuals; ``weight = d loss / d r^2`` is then 1 at zero, and minimising
+``sum weight * r^2`` with the weights held fixed, again and again, minimises the sum of losses (IRLS).
+`r2` is the squared residual, `s2` the squared scale in the same unit; both broadcast.
+Zhang (1997), "Parameter estimation techniques", table 1; Torr & Zisserman (2000) for the truncated one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Kernel(NamedTuple):
+    """A robust loss and its derivative with respect to the squared residual, both functions of (r2, s2)."""
+
+    loss: Callable[[Tensor, Tensor], Tensor]
+    weight: Callable[[Tensor, Tensor], Tensor]
+
+
+def huber_loss(r2: Tensor, s2: Tensor) -> Tensor:
+    """``r^2`` up to the scale s, ``2 s |r| - s^2`` beyond (Huber 1964)."""
+    return torch.where(r2 <= s2, r2, 2 * (s2 * torch.maximum(r2, s2)).sqrt() - s2)
+
+
+def huber_weight(r2: Tensor, s2: Tensor) -> Tensor:
+    """1 up to the scale s, ``s / |r|`` beyond."""
+    return (s2 / torch.maximum(r2, s2)).sqrt()
+
+
+def cauchy_loss(r2: Tensor, s2: Tensor) -> Tensor:
+    """``s^2 log(1 + r^2 / s^2)``."""
+    return s2 * torch.log1p(r2 / s2)
+
+
+def cauchy_weight(r2: Tensor, s2: Tensor) -> Tensor:
+    """``s^2 / (s^2 + r^2)``."""
+    return s2 / (s2 + r2)
+
+
+def geman_mcclure_loss(r2: Tensor, s2: Tensor) -> Tensor:
+    """``r^2 s^2 / (s^2 + r^2)``."""
+    return r2 * (s2 / (s2 + r2))
+
+
+def geman_mcclure_weight(r2: Tensor, s2: Tensor) -> Tensor:
+    """``s^4 / (s^2 + r^2)^2``."""
+    return (s2 / (s2 + r2)).square()
+
+
+def truncated_loss(r2: Tensor, s2: Tensor) -> Tensor:
+    """``min(r^2, s^2)``: MSAC. An infinite scale gives plain least squares."""
+    return torch.minimum(r2, s2)
+
+
+def truncated_weight(r2: Tensor, s2: Tensor) -> Tensor:
+    """1 up to the scale, 0 beyond."""
+    return (r2 <= s2).to(r2.dtype)
+
+
+KERNELS: dict[str, Kernel] = {
+    "huber": Kernel(huber_loss, huber_weight),
+    "cauchy": Kernel(cauchy_loss, cauchy_weight),
+    "geman_mcclure": Kernel(geman_mcclure_loss, geman_mcclure_weight),
+    "truncated": Kernel(truncated_loss, truncated_weight),
+}
+
+
+def kernel(name: str) -> Kernel:
+    """The kernel of that name; a ValueError that lists the names where there is none."""
+    if name not in KERNELS:
+        raise ValueError(f"kernel is {name!r}; it must be one of: {', '.join(KERNELS)}")
+    return KERNELS[name]
