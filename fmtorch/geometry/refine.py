@@ -292,7 +292,10 @@ class Objective:
         cost = lanes[0]
         for lane in lanes[1:]:
             cost = cost + lane
-        return stable_sum(products) if derivatives else F.new_empty(0, 0, p, k), stable_sum(cost)
+        if not derivatives:
+            return F.new_empty(0, 0, p, k), stable_sum(cost)
+        half = LANES // 2  # the first level of the tree in place: memory newly mapped costs more than the sum
+        return stable_sum(products[..., :half].add_(products[..., half:])), stable_sum(cost)
 
     def _buffer(self, *shape: int) -> Tensor:
         if shape not in self.buffers:
@@ -386,7 +389,7 @@ def start(F: Float[Tensor, "9 p k"]) -> tuple[Tensor, Tensor, Tensor]:
     C = square(cofactors(F))
     K = component_sum(C[:, :, None] * C[:, None])  # C^T C
     for _ in range(5):
-        K = square(unit((K / K.abs().amax((0, 1))).flatten(0, 1)))
+        K = K / K.abs().amax((0, 1))
         K = component_sum(K[:, :, None] * K[:, None])
     size = component_sum(K * K, 1)
     column = size.argmax(0)
@@ -409,5 +412,5 @@ def square(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "3 3 p k"]:
 
 def unit(x: Float[Tensor, "c p k"]) -> Float[Tensor, "c p k"]:
     """Scaled to unit norm over the components; NaN where that is not possible."""
-    scaled: Tensor = x / component_sum(x * x).sqrt()
-    return scaled
+    norm: Tensor = component_sum(x * x).sqrt()
+    return x / norm
