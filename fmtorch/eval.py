@@ -12,7 +12,15 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from fmtorch import __version__, data, presets
 from fmtorch.data import PairDataset
@@ -24,7 +32,7 @@ from fmtorch.resources import conf_dir
 from fmtorch.storage import RunFolder, identity_digest
 
 STAGE_GROUPS = ("features", "matcher", "pruner", "estimator")
-console = Console(stderr=False)
+console = Console()
 
 
 def resolve_device(name: str) -> torch.device:
@@ -52,13 +60,12 @@ def build_pipeline(config: DictConfig, device: torch.device) -> Pipeline:
 def run(config: DictConfig, pipeline_name: str) -> Path:
     """Evaluate one composed config and return the run folder."""
     device = resolve_device(config.device)
-    options: dict[str, Any] = {str(k): v for k, v in _plain(config.dataset).items()}
     with _progress() as progress:
-        dataset = _load(options, progress)
+        dataset = _load(config.dataset, progress)
         stages = {group: _plain(config[group]) for group in STAGE_GROUPS}
         identity = {
             "pipeline": pipeline_name, **stages, "seed": config.seed, "version": __version__,
-            "dataset": {**{k: v for k, v in options.items() if k != "root"}, "digest": dataset.digest},
+            "dataset": {**{k: v for k, v in _plain(config.dataset).items() if k != "root"}, "digest": dataset.digest},
         }  # fmt: skip
         name = f"{pipeline_name}-{identity_digest(identity)[:8]}"
         folder = RunFolder.open(Path(config.run_dir or f"runs/{dataset.name}/{name}"), identity)
@@ -82,15 +89,19 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
     return folder.path
 
 
-def _load(options: dict[str, Any], progress: Progress) -> PairDataset:
+def _load(config: DictConfig, progress: Progress) -> PairDataset:
     """The data set of a config; the embedded one is drawn on first use, which the progress bar shows."""
-    bar: list[Any] = []
+    bar: list[TaskID] = []
 
     def drawn(done: int, total: int) -> None:
         if not bar:
-            bar.append(progress.add_task(f"drawing {options['name']}", total=total))
+            bar.append(progress.add_task("drawing scenes", total=total))
         progress.update(bar[0], completed=done, total=total)
 
+    options = _plain(config)
+    if "_target_" in options:  # somebody's own data set
+        dataset: PairDataset = presets.instantiate(options, "dataset")
+        return dataset
     return data.load(**options, progress=drawn)
 
 
@@ -116,7 +127,9 @@ def main(config: DictConfig) -> None:
     """The command."""
     try:
         run(config, str(HydraConfig.get().runtime.choices["pipeline"]))
-    except (ValueError, OSError) as error:
+    except KeyboardInterrupt:
+        sys.exit("interrupted; the same command continues the run")
+    except (ValueError, OSError, ImportError) as error:
         sys.exit(f"error: {error}")
 
 

@@ -61,14 +61,13 @@ def find_fundamental(
         tensor = _tensor(value).to(points0.device)
         return tensor[None] if single and tensor.dim() == dims - 1 else tensor
 
+    x0_batch, x1_batch = (points[None] if single else points for points in (points0, points1))
     live = batch(mask, 2)
+    if live is None:
+        live = torch.ones(x0_batch.shape[:2], dtype=torch.bool, device=x0_batch.device)
     c = Correspondences(
-        *(points[None] if single else points for points in (points0, points1)),
-        mask=torch.ones(points0.shape[:-1], dtype=torch.bool, device=points0.device).reshape(-1, points0.shape[-2])
-        if live is None
-        else live.to(torch.bool),
-        quality=batch(quality, 2), prior=batch(prior, 2), lafs0=batch(lafs0, 4), lafs1=batch(lafs1, 4),
-        size0=batch(size0, 2), size1=batch(size1, 2), key=batch(key, 1),
+        x0_batch, x1_batch, live.to(torch.bool), quality=batch(quality, 2), prior=batch(prior, 2),
+        lafs0=batch(lafs0, 4), lafs1=batch(lafs1, 4), size0=batch(size0, 2), size1=batch(size1, 2), key=batch(key, 1),
     )  # fmt: skip
     return _estimator(estimator, json.dumps(options, sort_keys=True))(c, seed)
 

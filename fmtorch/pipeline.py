@@ -65,7 +65,7 @@ class Pipeline:
         return self._memo.get(f"{image.path}", lambda: self._extract(image))
 
     def match(self, pairs: Sequence[ImagePair]) -> list[Outcome]:
-        """Take a batch of pairs through the stages before estimation; a pair that fails has a reason and harms no other."""
+        """Take pairs through the stages before estimation; a pair that fails has a reason and harms no other."""
         return self._batched("pruning", self._prune, [self._match(pair) for pair in pairs])
 
     def estimate(self, outcomes: Sequence[Outcome], seed: int = 0) -> list[Outcome]:

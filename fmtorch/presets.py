@@ -32,7 +32,7 @@ def load(group: str, name: str, config_dir: Path | str | None = None) -> dict[st
         path = folder / group / f"{name}.yaml"
         if path.is_file():
             values = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
-            if not isinstance(values, dict) or "_target_" not in values:
+            if not isinstance(values, dict):
                 raise ValueError(f"{path}: a preset is a mapping with a `_target_`, the dotted name of what it builds")
             return {str(key): value for key, value in values.items()}
     raise ValueError(f"no preset {name!r} in conf/{group}; there are: {', '.join(available(group, config_dir))}")
@@ -46,12 +46,18 @@ def build(group: str, name: str, config_dir: Path | str | None = None, **options
     return instantiate({**load(group, name, config_dir), **options}, where=f"{group}={name}")
 
 
-def instantiate(config: Mapping[str, Any] | DictConfig, where: str) -> Any:
-    """The object of a config with a `_target_`; `where` names the config in errors."""
-    target = hydra.utils.get_object(str(config["_target_"]))
+def instantiate(config: Mapping[str, Any] | DictConfig, where: str, **extra: Any) -> Any:
+    """The object of a flat config with a `_target_`; `where` names the config in errors, `extra` arguments are added.
+
+    Raises ValueError for an unknown option, naming those that exist; what the target itself raises passes through.
+    """
+    values = OmegaConf.to_container(config, resolve=True) if isinstance(config, DictConfig) else dict(config)
+    if not isinstance(values, dict) or "_target_" not in values:
+        raise ValueError(f"{where}: a preset is a mapping with a `_target_`, the dotted name of what it builds")
+    target = hydra.utils.get_object(str(values.pop("_target_")))
     known = inspect.signature(target).parameters
     takes_any = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in known.values())
-    unknown = [str(key) for key in config if key != "_target_" and key not in known]
+    unknown = [str(key) for key in values if key not in known]
     if unknown and not takes_any:
         raise ValueError(f"{where}: no option {', '.join(unknown)}; there are: {', '.join(known)}")
-    return hydra.utils.instantiate(config, _convert_="all")
+    return target(**{str(key): value for key, value in values.items()}, **extra)

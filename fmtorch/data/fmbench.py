@@ -63,11 +63,11 @@ class FMBenchPairs:
         self._hash = hashlib.blake2b(digest_size=16)
         self._pairs: list[ImagePair] = []
         self._seen: Counter[str] = Counter()
+        self._present: set[str] = set()
         for folder in _set_folders(Path(root).expanduser(), sets):
             self._read_set(folder)
-        present = {pair.scene for pair in self._pairs}
-        for missing in sorted((self._subsets or set()) - present):
-            raise DataError(f"{root}: no pairs of subset {missing!r}; it has {_listed(present) or 'no pairs'}")
+        for missing in sorted((self._subsets or set()) - self._present):
+            raise DataError(f"{root}: no pairs of subset {missing!r}; it has {_listed(self._present) or 'no pairs'}")
         self.digest = self._hash.hexdigest()
 
     def __len__(self) -> int:
@@ -87,6 +87,7 @@ class FMBenchPairs:
                 f"{folder / _SUBSETS} has {len(scenes)} lines and {folder / _PAIRS} has {len(table)}; "
                 "each must have one line a pair, in the same order"
             )
+        self._present.update(scenes)
         self._add_to_digest(folder.name, folder / _PAIRS, folder / _SUBSETS)
         chosen = sorted(set(scenes) if self._subsets is None else set(scenes) & self._subsets)
         self._hash.update(repr(chosen).encode())
@@ -218,6 +219,6 @@ def _read_numbers(path: Path, columns: str, count: int) -> list[NDArray[np.float
 
 
 def _image_number(line: str, value: float) -> int:
-    if not (value >= 0 and value == int(value)):
+    if not (np.isfinite(value) and value >= 0 and value == int(value)):
         raise DataError(f"{line}: image number {value:g}; it must be a whole number from 0")
     return int(value)

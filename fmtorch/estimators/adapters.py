@@ -1,4 +1,4 @@
-"""Other libraries' robust estimators behind the same call: OpenCV's, and PoseLib (extra `peers`). One pair at a time."""
+"""Other libraries' robust estimators behind the same call, one pair at a time: OpenCV, PoseLib (extra `peers`)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LEAST_MATCHES = 8
 
 
 class PairwiseEstimator:
-    """Runs a function (x0, x1, seed) -> (F or None, inliers) on each pair's live matches, best quality first if asked."""
+    """Runs a function (x0, x1, seed) -> (F or None, inliers) on each pair's live matches, best first if asked."""
 
     def __init__(self, name: str, solve: Callable[[Points, Points, int], Solution], sort_by_quality: bool) -> None:
         self.name, self._solve, self._sort = name, solve, sort_by_quality

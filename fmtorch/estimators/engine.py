@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch import random
-from fmtorch.estimators.parts import FINAL_FITS, INLIER_RULES, SAMPLERS, SCORES, SOLVERS, part
+from fmtorch.estimators.choice import CHOICES
+from fmtorch.estimators.parts import FINAL_FITS, INLIER_RULES, SAMPLERS, SCORES, SOLVERS, Refinement, part
 from fmtorch.estimators.problem import Problem, problems
 from fmtorch.estimators.scoring import InlierCount, score_models
 from fmtorch.random import Stream
@@ -42,6 +43,10 @@ class HypothesizeAndVerify:
     confidence: stop once an all-inlier sample was drawn with this probability; None: never before `hypotheses`.
     preselect: models are first scored on this many matches, chosen by the pair's key; 0: always on all.
     survivors: models of a round that pass the preselection.
+    pool: the best models that are kept to the end. refine: robust kernel of the Levenberg-Marquardt refinement of the
+    pool (`truncated`, `cauchy`, ...), null: none; refine_threshold: its scale, Sampson distance in pixels;
+    refine_iterations: its steps. choice: by which score the estimate is chosen from the refined pool, `score` (the
+    search's own) or `saturated` (gains saturate in each cell of a grid).
     inliers: `threshold`, `lmeds` (2.5 robust standard deviations) or `median` (the better half).
     final: `least_squares` (8-point on the inliers) or `none`. refit_inliers: recompute inliers after the final fit.
 
@@ -61,6 +66,11 @@ class HypothesizeAndVerify:
         confidence: float | None = 0.9999,
         preselect: int = 128,
         survivors: int = 256,
+        pool: int = 1,
+        refine: str | None = None,
+        refine_threshold: float = 1.0,
+        refine_iterations: int = 5,
+        choice: str = "score",
         inliers: str = "threshold",
         final: str = "least_squares",
         refit_inliers: bool = True,
@@ -75,6 +85,9 @@ class HypothesizeAndVerify:
         self.count_inliers = InlierCount(threshold)
         self.hypotheses, self.round, self.confidence = hypotheses, round, confidence
         self.preselect, self.survivors = preselect, survivors
+        self.pool = pool
+        self.refinement = None if refine is None else Refinement(refine, refine_threshold, refine_iterations)
+        self.choice = None if choice == "score" else part("choice", choice, CHOICES)(threshold)
         self.inlier_rule = part("inliers", inliers, INLIER_RULES)(threshold)
         self.final = part("final", final, FINAL_FITS)()
         self.refit_inliers = refit_inliers
@@ -89,8 +102,8 @@ class HypothesizeAndVerify:
         made, reasons = problems(c, seed, self.solver.size)
         limit = max(1, (GPU_SAMPLES if device.type == "cuda" else CPU_SAMPLES) // self.round)
         for whole in made:
-            for some in torch.arange(len(whole.pair), device=device).split(limit):
-                problem = whole[some]
+            for first in range(0, len(whole.pair), limit):
+                problem = whole[torch.arange(first, min(first + limit, len(whole.pair)), device=device)]
                 estimate, support, found, drawn = self._solve(problem)
                 F = F.index_copy(0, problem.pair, torch.where(found[:, None, None], problem.to_pixels(estimate), 0))
                 inliers[problem.pair[:, None], problem.slot] |= support & problem.live & found[:, None]
@@ -108,23 +121,38 @@ class HypothesizeAndVerify:
         """Search, then fit: F (p, 3, 3) in normalised units, inliers (p, n), found (p,), draws (p,)."""
         with torch.no_grad():
             search = self._search(problem)
-            best = search.F[:, :, 0].T.reshape(-1, 3, 3).to(torch.float64)
+            found = torch.isfinite(search.score[:, 0])
+            best = self._choose(search, problem).T.reshape(-1, 3, 3)
             inliers = self.inlier_rule(best, problem)
-        found = torch.isfinite(search.score[:, 0])
         F = self.final(best, problem, inliers)
         if self.refit_inliers:
             with torch.no_grad():
                 inliers = self.inlier_rule(F, problem)
         return F, inliers, found, search.draws
 
+    def _choose(self, search: _Search, problem: Problem) -> Float[Tensor, "9 p"]:
+        """The best of the pool, once refined, by the score of the choice; float64."""
+        F = search.F.to(torch.float64)
+        if self.refinement is None and self.choice is None:
+            return F[:, :, 0]
+        if self.refinement is not None:
+            F = self.refinement(F, problem)
+        if self.choice is None:
+            score = score_models(self.score, F.to(torch.float32), problem, problem.points.to(torch.float32))
+        else:
+            score = self.choice(F, problem)
+        score = torch.where(torch.isfinite(search.score), score, -torch.inf)
+        best = torch.sort(score, dim=1, descending=True, stable=True).indices[:, :1]
+        return F.gather(2, best.expand(9, -1, -1))[..., 0]
+
     def _search(self, problem: Problem) -> _Search:
         p, device = len(problem.pair), problem.points.device
         points = problem.points.to(torch.float32)
-        table = self.sampler.table(problem)
+        table = self.sampler.table(problem, self.solver.size)
         subset = self._subset(problem)
         state = _Search(
-            torch.zeros(9, p, 1, device=device),
-            torch.full((p, 1), -torch.inf, device=device),
+            torch.zeros(9, p, self.pool, device=device),
+            torch.full((p, self.pool), -torch.inf, device=device),
             torch.zeros(p, dtype=torch.int64, device=device),
         )
         active = torch.arange(p, device=device)

@@ -10,10 +10,19 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.estimators.problem import Problem
-from fmtorch.estimators.sampling import PriorWeighted, Sampler, Uniform
-from fmtorch.estimators.scoring import InlierCount, Median, Score, TruncatedSquares, median_rank, sampson_squared
+from fmtorch.estimators.sampling import PriorWeighted, Prosac, Sampler, Uniform
+from fmtorch.estimators.scoring import (
+    InlierCount,
+    Median,
+    Score,
+    SigmaConsensus,
+    TruncatedSquares,
+    median_rank,
+    sampson_squared,
+)
 from fmtorch.geometry import eight_point
 from fmtorch.geometry.minimal import eight_point_components, seven_point_components
+from fmtorch.geometry.refine import refine_components
 
 T = TypeVar("T")
 
@@ -108,6 +117,19 @@ class RobustDeviations:
         return (r2 <= (2.5 * sigma).square()) & problem.live
 
 
+class Refinement:
+    """Levenberg-Marquardt of the robust Sampson error, weighted by the prior where there is one."""
+
+    def __init__(self, kernel: str, threshold: float, iterations: int) -> None:
+        self.kernel, self.threshold, self.iterations = kernel, threshold, iterations
+
+    def __call__(self, F: Float[Tensor, "9 p k"], problem: Problem) -> Float[Tensor, "9 p k"]:
+        """The refined models."""
+        weight = problem.live.to(torch.float64) if problem.prior is None else problem.prior
+        scale = self.threshold / problem.unit
+        return refine_components(F, problem.points, weight, self.kernel, scale, self.iterations)[0]
+
+
 @runtime_checkable
 class FinalFit(Protocol):
     """Turns the best hypothesis and its inliers into the estimate; attached to the graph of the points."""
@@ -141,12 +163,13 @@ class LeastSquares:
         return torch.where(valid[:, None, None], fitted, F)
 
 
-SAMPLERS: dict[str, Callable[[], Sampler]] = {"uniform": Uniform, "prior": PriorWeighted}
+SAMPLERS: dict[str, Callable[[], Sampler]] = {"uniform": Uniform, "prosac": Prosac, "prior": PriorWeighted}
 SOLVERS: dict[str, Callable[[], Solver]] = {"seven_point": SevenPoint, "eight_point": EightPoint}
 SCORES: dict[str, Callable[[float], Score]] = {
     "inlier_count": InlierCount,
     "msac": TruncatedSquares,
     "prior_msac": lambda threshold: TruncatedSquares(threshold, prior_weighted=True),
+    "magsac": SigmaConsensus,
     "median": lambda threshold: Median(),
 }
 INLIER_RULES: dict[str, Callable[[float], Callable[[Tensor, Problem], Tensor]]] = {

@@ -51,8 +51,9 @@ class Problem:
     def to_pixels(self, F: Float[Tensor, "p 3 3"]) -> Float[Tensor, "p 3 3"]:
         """Fundamental matrices of normalised coordinates, in pixels and with unit Frobenius norm."""
         T0, T1 = self._similarity(self.centre[:, :2]), self._similarity(self.centre[:, 2:])
-        pixel = T1.mT @ F @ T0
-        return pixel / torch.linalg.matrix_norm(pixel, keepdim=True).clamp_min(torch.finfo(F.dtype).tiny)
+        pixel: Tensor = T1.mT @ F @ T0
+        norm: Tensor = torch.linalg.matrix_norm(pixel, keepdim=True)
+        return pixel / norm.clamp_min(torch.finfo(F.dtype).tiny)
 
     def _similarity(self, centre: Tensor) -> Tensor:
         T = torch.zeros(len(centre), 3, 3, dtype=torch.float64, device=centre.device)

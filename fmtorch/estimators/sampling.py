@@ -20,8 +20,8 @@ _TOTAL_BITS = 30  # cumulative weights stay below 2^30, so that 32 random bits t
 class Sampler(Protocol):
     """Draws minimal samples without replacement."""
 
-    def table(self, problem: Problem) -> Int[Tensor, "p n"]:
-        """Cumulative integer weights of the matches."""
+    def table(self, problem: Problem, size: int) -> Int[Tensor, "p n"]:
+        """What the draws of samples of `size` matches look up, of each pair."""
         ...
 
     def draw(
@@ -34,7 +34,7 @@ class Sampler(Protocol):
 class Uniform:
     """Every set of live matches is equally likely."""
 
-    def table(self, problem: Problem) -> Int[Tensor, "p n"]:
+    def table(self, problem: Problem, size: int) -> Int[Tensor, "p n"]:
         """1, 2, ..., n, n, n: every live match weighs one."""
         return problem.live.to(torch.int64).cumsum(-1)
 
@@ -42,16 +42,52 @@ class Uniform:
         self, problem: Problem, table: Int[Tensor, "p n"], start: int, count: int, size: int
     ) -> Int[Tensor, "size p count"]:
         """As `Sampler.draw`; with unit weights a position in the table is an index."""
-        return _draw(problem, problem.count, None, start, count, size)
+        return torch.stack(_draw(problem, problem.count[:, None].expand(-1, count), None, start, count, size))
+
+
+class Prosac:
+    """PROSAC (Chum & Matas, CVPR 2005): samples from the best matches first, from all of them in the end.
+
+    Matches are ranked by quality, smaller first, or by prior where there is no quality. Draw t takes the n(t)-th match
+    and the others from those before it, n(t) growing as the paper's equation 3 says for T_N draws.
+    """
+
+    GROWTH = 200_000  # T_N: after so many draws PROSAC is RANSAC; the paper's value
+
+    def table(self, problem: Problem, size: int) -> Int[Tensor, "p n"]:
+        """T'_n for n = 1 .. N: the last draw whose sample comes from the first n matches (equation 4)."""
+        n = torch.arange(1, problem.live.shape[1] + 1, device=problem.live.device, dtype=torch.float64)
+        total = problem.count[:, None].to(torch.float64)
+        draws = torch.full_like(total, self.GROWTH) * torch.ones_like(n)
+        for i in range(size):
+            draws = draws * ((n - i).clamp_min(0) / (total - i).clamp_min(1))
+        steps = torch.ceil(draws.diff(dim=1)).to(torch.int64)
+        steps = torch.nn.functional.pad(steps, (1, 0))
+        return torch.where(n < size, 0, torch.where(n == size, 1, steps)).cumsum(1)
+
+    def draw(
+        self, problem: Problem, table: Int[Tensor, "p n"], start: int, count: int, size: int
+    ) -> Int[Tensor, "size p count"]:
+        """As `Sampler.draw`."""
+        t = torch.arange(start + 1, start + count + 1, device=table.device).expand(len(table), -1)
+        newest = torch.minimum(torch.searchsorted(table, t.contiguous()), problem.count[:, None] - 1)
+        others = _draw(problem, newest, None, start, count, size - 1)
+        sample = torch.stack([*others, newest])
+        rank = problem.quality if problem.quality is not None else problem.prior
+        if rank is None:
+            return sample
+        worst = torch.where(problem.live, rank if problem.quality is not None else -rank, torch.inf)
+        order = torch.sort(worst, dim=1, stable=True).indices
+        return order.expand(size, -1, -1).gather(2, sample)
 
 
 class PriorWeighted:
     """Matches drawn in proportion to their prior P(inlier); uniform where there is none."""
 
-    def table(self, problem: Problem) -> Int[Tensor, "p n"]:
+    def table(self, problem: Problem, size: int) -> Int[Tensor, "p n"]:
         """Cumulative sum of the priors, quantised so that it is exact, the same on any device and under any padding."""
         if problem.prior is None:
-            return Uniform().table(problem)
+            return Uniform().table(problem, size)
         largest = 1 << (_TOTAL_BITS - (problem.live.shape[1] - 1).bit_length())
         weight = (problem.prior * largest).round().to(torch.int64).clamp_min(1)
         return torch.where(problem.live, weight, 0).cumsum(-1)
@@ -60,19 +96,19 @@ class PriorWeighted:
         self, problem: Problem, table: Int[Tensor, "p n"], start: int, count: int, size: int
     ) -> Int[Tensor, "size p count"]:
         """As `Sampler.draw`."""
-        return _draw(problem, table[:, -1], table, start, count, size)
+        return torch.stack(_draw(problem, table[:, -1:].expand(-1, count), table, start, count, size))
 
 
 def _draw(
-    problem: Problem, total: Tensor, table: Tensor | None, start: int, count: int, size: int
-) -> Int[Tensor, "size p count"]:
+    problem: Problem, total: Int[Tensor, "p count"], table: Tensor | None, start: int, count: int, size: int
+) -> list[Tensor]:
     """Weighted sampling without replacement: intervals already chosen are cut out of [0, total).
 
     A position is drawn in what is left and pushed past every chosen interval in ascending order; the table tells whose
     interval it falls in. Without a table every interval has length one.
     """
     random_bits = random.bits(problem.seed, problem.key, Stream.SAMPLING, start, count, size) >> (63 - _RANDOM_BITS)
-    left = total[:, None].expand(-1, count)
+    left = total
     starts: list[Tensor] = []
     lengths: list[Tensor] = []
     chosen: list[Tensor] = []
@@ -91,7 +127,7 @@ def _draw(
         chosen.append(index)
         left = left - (1 if length is None else length)
         _insert(starts, lengths, begin, length)
-    return torch.stack(chosen)
+    return chosen
 
 
 def _insert(starts: list[Tensor], lengths: list[Tensor], begin: Tensor, length: Tensor | None) -> None:

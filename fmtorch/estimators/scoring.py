@@ -6,6 +6,7 @@ tile size, padding or batch can change a score. Larger is better.
 
 from __future__ import annotations
 
+import math
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -31,8 +32,9 @@ def sampson_squared(F: Float[Tensor, "9 p m"], points: Float[Tensor, "4 p n"]) -
     error = (f[6] * x0).addcmul_(f[7], y0).add_(f[8]).addcmul_(a0, x1).addcmul_(b0, y1)
     a1 = (f[0] * x1).addcmul_(f[3], y1).add_(f[6])  # F^T x1: the epipolar line in image 0
     b1 = (f[1] * x1).addcmul_(f[4], y1).add_(f[7])
-    slope = a0.square_().addcmul_(b0, b0).addcmul_(a1, a1).addcmul_(b1, b1)
-    return error.square_().div_(slope.clamp_min_(torch.finfo(slope.dtype).tiny))
+    slope: Tensor = a0.square_().addcmul_(b0, b0).addcmul_(a1, a1).addcmul_(b1, b1)
+    distance: Tensor = error.square_().div_(slope.clamp_min_(torch.finfo(slope.dtype).tiny))
+    return distance
 
 
 @runtime_checkable
@@ -90,6 +92,57 @@ class TruncatedSquares:
         gain = r2.mul_(scale).neg_().add_(1).clamp_min_(0)
         weight = live.to(r2.dtype) if prior is None or not self.prior_weighted else prior.to(r2.dtype)
         return _exact_sum(gain.mul_(weight[:, None]))
+
+
+class SigmaConsensus:
+    """MAGSAC++: the likelihood marginalised over the noise scale (Barath et al., CVPR 2020, section 3.2).
+
+    For residuals of n = 4 degrees of freedom and a uniform noise scale in (0, sigma_max], the loss of a match is
+    ``rho(r) = sigma^2/2 lower(5/2, x) + r^2/4 (upper(3/2, x) - upper(3/2, k^2/2))`` with ``x = r^2 / (2 sigma^2)`` and
+    the incomplete gamma functions, constant from ``r = k sigma_max`` on, k = 3.64 being the 0.99 quantile; the gain is
+    ``1 - rho(r) / rho(k sigma_max)``, tabulated over r^2 as the authors do.
+    threshold: k sigma_max, Sampson distance, px.
+    """
+
+    QUANTILE = 3.64
+    ENTRIES = 2048
+
+    def __init__(self, threshold: float) -> None:
+        self.threshold = _positive(threshold)
+        # Middle of each interval of (r / threshold)^2, and 0 from the threshold on.
+        middle = (torch.arange(self.ENTRIES, dtype=torch.float64) + 0.5) / self.ENTRIES
+        self._table = torch.cat([self.gain(middle), torch.zeros(1, dtype=torch.float64)]).to(torch.float32)
+
+    @classmethod
+    def gain(cls, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+        """1 - rho / rho_max of residuals below the threshold, as a function of (r / threshold)^2."""
+        end = torch.tensor(cls.QUANTILE**2 / 2, dtype=torch.float64)
+        x = squared * end
+        loss = _lower_gamma_5_2(x) / 2 + x / 2 * (_upper_gamma_3_2(x) - _upper_gamma_3_2(end))
+        gain: Tensor = 1 - loss / (_lower_gamma_5_2(end) / 2)
+        return gain
+
+    def __call__(
+        self,
+        r2: Float[Tensor, "p m n"],
+        live: Bool[Tensor, "p n"],
+        prior: Float[Tensor, "p n"] | None,
+        unit: Float[Tensor, " p"],
+    ) -> Float[Tensor, "p m"]:
+        """As `Score`."""
+        scale = (unit / self.threshold).square().mul(self.ENTRIES).to(r2.dtype)[:, None, None]
+        entry = r2.mul_(scale).clamp_max_(self.ENTRIES).to(torch.int64)
+        return _exact_sum(torch.take(self._table.to(r2.device), entry).mul_(live[:, None]))
+
+
+def _upper_gamma_3_2(x: Tensor) -> Tensor:
+    """The upper incomplete gamma function of 3/2."""
+    return x.sqrt() * torch.exp(-x) + math.sqrt(math.pi) / 2 * torch.special.erfc(x.sqrt())
+
+
+def _lower_gamma_5_2(x: Tensor) -> Tensor:
+    """The lower incomplete gamma function of 5/2."""
+    return 0.75 * math.sqrt(math.pi) - 1.5 * _upper_gamma_3_2(x) - x * x.sqrt() * torch.exp(-x)
 
 
 class Median:

@@ -1,1 +1,25 @@
-"""Figures of merit for fundamental matrices and matches, as plain batched functions."""
+"""Figures of merit for fundamental matrices and matches, as plain batched functions.
+
+`fmtorch.metrics.torchmetrics` has thin classes over them that accumulate over batches and processes.
+"""
+
+from fmtorch.metrics.inlier_rate import InlierRate, ground_truth_inliers, inlier_rate
+from fmtorch.metrics.nsgd import nsgd, sgd
+from fmtorch.metrics.nsgd_released import nsgd_released
+from fmtorch.metrics.pose import PoseError, pose_auc, pose_error
+from fmtorch.metrics.recall import mean_recall, recall, recall_curve
+
+__all__ = [
+    "InlierRate",
+    "PoseError",
+    "ground_truth_inliers",
+    "inlier_rate",
+    "mean_recall",
+    "nsgd",
+    "nsgd_released",
+    "pose_auc",
+    "pose_error",
+    "recall",
+    "recall_curve",
+    "sgd",
+]

@@ -1,8 +1,19 @@
 """Correspondences -> Correspondences: which matches survive."""
 
 from fmtorch.pruning.frame_consistency import FrameConsistency, frame_agreement
+from fmtorch.pruning.gms import GMS, gms
 from fmtorch.pruning.mutual import mutual
 from fmtorch.pruning.one_to_one import OneToOne, one_to_one
 from fmtorch.pruning.ratio import RatioTest, ratio_test
 
-__all__ = ["FrameConsistency", "OneToOne", "RatioTest", "frame_agreement", "mutual", "one_to_one", "ratio_test"]
+__all__ = [
+    "GMS",
+    "FrameConsistency",
+    "OneToOne",
+    "RatioTest",
+    "frame_agreement",
+    "gms",
+    "mutual",
+    "one_to_one",
+    "ratio_test",
+]

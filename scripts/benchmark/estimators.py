@@ -59,9 +59,8 @@ def run(arguments: argparse.Namespace) -> None:
     pairs.sort(key=lambda pair: pair.identity)
     matched = [front.match([pair])[0] for pair in track(pairs, "matching", console=console)]
     usable = [m for m in matched if m.correspondences is not None]
-    console.print(
-        f"{len(usable)} of {len(pairs)} pairs, median {np.median([int(m.correspondences.count()) for m in usable]):.0f} matches"
-    )
+    typical = np.median([int(m.correspondences.count()) for m in usable])
+    console.print(f"{len(usable)} of {len(pairs)} pairs, median {typical:.0f} matches")
     results = {}
     for spec in arguments.estimators:
         results[spec] = measure(spec, [(m.pair, m.correspondences) for m in usable], arguments.seeds)

@@ -39,6 +39,5 @@ def run(arguments: argparse.Namespace) -> None:
             own.append(1e3 * (middle - start))
             peer.append(1e3 * (time.perf_counter() - middle))
         ratio = np.median(np.array(own) / np.array(peer))
-        Console().print(
-            f"{n} x {n} x 128: {np.median(own):.0f} ms, OpenCV {np.median(peer):.0f} ms, ratio {ratio:.2f} (median of {arguments.repeats})"
-        )
+        times = f"{np.median(own):.0f} ms, OpenCV {np.median(peer):.0f} ms, ratio {ratio:.2f}"
+        Console().print(f"{n} x {n} x 128: {times} (medians of {arguments.repeats})")

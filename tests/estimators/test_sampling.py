@@ -8,11 +8,12 @@ import torch
 from scipy import stats
 
 from fmtorch.estimators.problem import Problem, bucket, problems
-from fmtorch.estimators.sampling import PriorWeighted, Sampler, Uniform
+from fmtorch.estimators.sampling import PriorWeighted, Prosac, Sampler, Uniform
 from fmtorch.types import collate
 from tests.laws import scene, with_padding
 
-SAMPLERS = [Uniform(), PriorWeighted()]
+SAMPLERS = [Uniform(), PriorWeighted(), Prosac()]
+NAMES = ["uniform", "prior", "prosac"]
 
 
 def _problem(count: int, seed: int = 0) -> Problem:
@@ -20,10 +21,10 @@ def _problem(count: int, seed: int = 0) -> Problem:
 
 
 def _draw(sampler: Sampler, problem: Problem, start: int, count: int, size: int) -> torch.Tensor:
-    return sampler.draw(problem, sampler.table(problem), start, count, size)
+    return sampler.draw(problem, sampler.table(problem, size), start, count, size)
 
 
-@pytest.mark.parametrize("sampler", SAMPLERS, ids=["uniform", "prior"])
+@pytest.mark.parametrize("sampler", SAMPLERS, ids=NAMES)
 @pytest.mark.parametrize("count", [8, 9, 40, 700])
 def test_samples_hold_distinct_live_matches(sampler: Sampler, count: int) -> None:
     sample = _draw(sampler, _problem(count), 0, 3000, 8)
@@ -54,7 +55,7 @@ def test_prior_samples_follow_the_prior() -> None:
     assert stats.chisquare(observed, 50000 * second).pvalue > 1e-4
 
 
-@pytest.mark.parametrize("sampler", SAMPLERS, ids=["uniform", "prior"])
+@pytest.mark.parametrize("sampler", SAMPLERS, ids=NAMES)
 def test_samples_are_a_function_of_seed_key_and_draw(sampler: Sampler) -> None:
     alone = _draw(sampler, _problem(150), 0, 400, 7)
     later = _draw(sampler, _problem(150), 100, 300, 7)
@@ -69,3 +70,25 @@ def test_samples_are_a_function_of_seed_key_and_draw(sampler: Sampler) -> None:
 )
 def test_buckets(count: int, size: int) -> None:
     assert bucket(count) == size
+
+
+def test_prosac_grows_as_published() -> None:
+    problem = _problem(60)
+    table = Prosac().table(problem, 7)[0].tolist()
+    # Chum & Matas 2005, equations 3 and 4, term by term.
+    expected, T = 1, Prosac.GROWTH * np.prod([(7 - i) / (60 - i) for i in range(7)])
+    assert table[6] == 1
+    for n in range(8, 61):
+        T_next = T * n / (n - 7)
+        expected += int(np.ceil(round(T_next - T, 9)))
+        assert table[n - 1] == expected
+        T = T_next
+
+
+def test_prosac_draws_the_best_first() -> None:
+    problem = _problem(100)
+    assert problem.quality is not None
+    rank = problem.quality[0, :100].argsort(stable=True).argsort()
+    sample = rank[_draw(Prosac(), problem, 0, 300, 7)[:, 0]]
+    assert sorted(sample[:, 0].tolist()) == list(range(7))
+    assert bool((sample.amax(0).diff() >= 0).all())

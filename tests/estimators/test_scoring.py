@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from scipy import integrate
 
 from fmtorch.estimators import scoring
 from fmtorch.estimators.problem import problems
-from fmtorch.estimators.scoring import InlierCount, Median, TruncatedSquares, score_models
+from fmtorch.estimators.scoring import InlierCount, Median, SigmaConsensus, TruncatedSquares, score_models
 from tests.laws import scene
 from tests.reference import ransac as reference
 
@@ -65,3 +66,21 @@ def test_exact_sum_does_not_depend_on_the_order() -> None:
 def test_threshold_must_be_positive(threshold: float) -> None:
     with pytest.raises(ValueError, match="must be positive"):
         InlierCount(threshold)
+
+
+def test_sigma_consensus_is_the_integral_over_sigma() -> None:
+    # Barath et al. 2020: w(r) = integral over sigma of the chi density of r / sigma, which vanishes beyond k sigma;
+    # rho is the integral of w(r) r. Everything up to a factor, which the normalisation of the gain removes.
+    k, sigma_max = SigmaConsensus.QUANTILE, 1.0
+
+    def weight(r: float) -> float:
+        # g(r | sigma) = 2 C(4) sigma^-4 exp(-r^2 / (2 sigma^2)) r^3: over r^3 this leaves sigma^-4 exp(...)
+        density = lambda sigma: r**3 / sigma**4 * np.exp(-(r**2) / (2 * sigma**2))  # noqa: E731
+        return float(integrate.quad(density, r / k, sigma_max, epsabs=1e-12)[0])
+
+    whole = integrate.quad(lambda r: weight(r) * r, 0, k * sigma_max, epsabs=1e-9)[0]
+    for share in (0.05, 0.3, 0.6, 0.9):
+        r = share * k * sigma_max
+        loss = integrate.quad(lambda r: weight(r) * r, 0, r, epsabs=1e-9)[0]
+        gain = float(SigmaConsensus.gain(torch.tensor(share**2, dtype=torch.float64)))
+        assert abs(gain - (1 - loss / whole)) < 1e-6

@@ -1,0 +1,175 @@
+"""House fronts in relief: one painted picture for each, windows set back, sills, cornices and signs set off."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from fmtorch.data.rendered.drawings import door, sign, window
+from fmtorch.data.rendered.mipmap import Floats, Real
+from fmtorch.data.rendered.patterns import Rng, colour, fractal, masonry, plaster, to_pixels
+from fmtorch.data.rendered.photographs import material
+from fmtorch.data.rendered.surfaces import Surfaces, Vector, vec
+
+
+@dataclasses.dataclass(frozen=True)
+class Style:
+    """Of a front: texels per metre, storey height and bay width in metres, relief depth, repetition of windows."""
+
+    density: Real = 64.0
+    storey: Real = 3.2
+    bay: Real = 2.6
+    depth: Real = 0.3
+    shop: bool = False
+    pilasters: bool = False
+    same_windows: Real = 0.5  # chance that a window is a copy of its neighbour
+
+
+def wall_picture(rng: Rng, split: str, h: int, w: int, density: Real) -> Floats:
+    """A bare wall (h, w, 3) of plaster, brick, ashlar, or the split's photograph of stone, with stains of its own."""
+    kind = rng.random()
+    tint = colour(rng, (0.02, 0.14), (0.1, 0.5), (0.45, 0.9))
+    metres_h, metres_w = h / density, w / density
+    if kind < 0.3:
+        out = plaster(rng, h, w, tint, 1.6)
+    elif kind < 0.55:
+        tint = colour(rng, (0.0, 0.06), (0.35, 0.65), (0.4, 0.7))
+        out = masonry(rng, h, w, max(4, round(metres_h / 0.14)), max(4, round(metres_w / 0.32)), tint, vary=0.16)
+    elif kind < 0.8:
+        out = masonry(rng, h, w, max(3, round(metres_h / 0.45)), max(3, round(metres_w / 0.9)), tint, joint=0.04)
+    else:
+        stone = material(split, "stone")
+        assert stone is not None
+        side = int(density * 3.0)
+        tile = cv2.resize(stone, (side, side), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+        out = np.tile(tile, (h // side + 1, w // side + 1, 1))[:h, :w] * (0.5 + tint)
+    stains = 1 + 0.08 * fractal(rng, h, w, 512, 8) + 0.04 * fractal(rng, h, w, 16, 1, 0.8)
+    return np.ascontiguousarray(out * stains[..., None], dtype=np.float32)
+
+
+def front(
+    surfaces: Surfaces, rng: Rng, split: str, foot: Vector, right: Vector, width: Real, height: Real, style: Style
+) -> int:
+    """Builds a front that stands on `foot` (its lower left corner) and returns its texture's number.
+
+    right: horizontal unit vector towards the viewer's right; the front faces right x up, away from the wall.
+    """
+    d = style.density
+    h, w = int(height * d), int(width * d)
+    picture = wall_picture(rng, split, h, w, d)
+    out, up = np.cross(right, vec(0, 0, 1)), vec(0, 0, 1)
+    bays, storeys = max(1, int(width / style.bay)), max(1, int(height / style.storey))
+    step_x, step_z = width / bays, height / storeys
+    seed = int(rng.integers(2**31))
+    win_w, win_h = step_x * rng.uniform(0.36, 0.55), step_z * rng.uniform(0.45, 0.62)
+    glass = window(rng, int(win_h * d), int(win_w * d), np.random.SeedSequence(seed))
+    entrance = int(rng.integers(bays))
+
+    def paint(picture_of: Floats, x: Real, z: Real) -> None:
+        """Pastes with its lower left corner at (x, z) metres."""
+        ph, pw = picture_of.shape[:2]
+        y0, x0 = h - int(z * d) - ph, int(x * d)
+        y1 = max(y0, 0)
+        part = picture[y1 : y0 + ph, x0 : x0 + pw]
+        part[:] = picture_of[y1 - y0 :][: part.shape[0], : part.shape[1]]
+
+    holes: list[list[tuple[float, float, float, float]]] = []
+    boards: list[tuple[float, float, float, float]] = []
+    for row in range(storeys):
+        low = row * step_z + (0.25 * step_z if row else 0.05)
+        high = low + win_h if row else low + 0.72 * step_z
+        line = []
+        for bay in range(bays):
+            x0 = bay * step_x + (step_x - win_w) / 2
+            size = (max(8, int((high - low) * d)), max(8, int(win_w * d)))
+            if row == 0 and (bay == entrance or style.shop):
+                paint(door(rng, *size) if bay == entrance else window(rng, *size, np.random.SeedSequence(seed + bay)),
+                      x0, low)  # fmt: skip
+            elif rng.random() < style.same_windows:
+                paint(cv2.resize(glass, size[::-1]).astype(np.float32), x0, low)
+            else:
+                glass = window(rng, *size, np.random.SeedSequence(seed))
+                paint(glass, x0, low)
+            line.append((x0, low, x0 + win_w, high))
+            if row == 0 and style.shop and rng.random() < 0.6:
+                board = (bay * step_x + 0.1 * step_x, high + 0.05, bay * step_x + 0.9 * step_x, high + 0.22 * step_z)
+                paint(sign(rng, int((board[3] - board[1]) * d), int((board[2] - board[0]) * d)), board[0], board[1])
+                boards.append(board)
+        holes.append(line)
+    number = surfaces.texture(to_pixels(picture))
+
+    def panel(x0: Real, z0: Real, x1: Real, z1: Real, depth: Real) -> None:
+        corner = foot + right * x0 + up * z1 + out * depth
+        surfaces.quad(
+            corner,
+            right * (x1 - x0),
+            up * (z0 - z1),
+            number,
+            (x0 / width, 1 - z1 / height, x1 / width, 1 - z0 / height),
+        )
+
+    def block(x0: Real, z0: Real, x1: Real, z1: Real, depth: Real) -> None:
+        """A box set off from the wall (depth > 0) or a niche set back into it (depth < 0), with four sides."""
+        panel(x0, z0, x1, z1, depth)
+        near, reach = foot + out * depth, -out * depth
+        u0, u1, v0, v1 = x0 / width, x1 / width, 1 - z1 / height, 1 - z0 / height
+        thin = abs(depth) / width
+        a, b, c, e = (near + right * x + up * z for x, z in ((x0, z1), (x1, z1), (x0, z0), (x1, z0)))
+        surfaces.quad(b, reach, up * (z0 - z1), number, (u1, v0, u1 + thin, v1))
+        surfaces.quad(a + reach, -reach, up * (z0 - z1), number, (u0 - thin, v0, u0, v1))
+        surfaces.quad(a + reach, right * (x1 - x0), -reach, number, (u0, v0 - thin, u1, v0))
+        surfaces.quad(c, right * (x1 - x0), reach, number, (u0, v1, u1, v1 + thin))
+        del e
+
+    floor = 0.0
+    for line in holes:
+        low, high = line[0][1], line[0][3]
+        panel(0, floor, width, low, 0)
+        edges = [0.0, *[x for hole in line for x in (hole[0], hole[2])], width]
+        for x0, x1 in zip(edges[::2], edges[1::2], strict=True):
+            panel(x0, low, x1, high, 0)
+        for x0, z0, x1, z1 in line:
+            block(x0, z0, x1, z1, -style.depth)
+            if floor > 0:
+                block(x0 - 0.1, z0 - 0.14, x1 + 0.1, z0, 0.45 * style.depth)
+        floor = high
+    panel(0, floor, width, height, 0)
+    for board in boards:
+        block(*board, 0.12)
+    for row in range(1, storeys):
+        block(0, row * step_z - 0.1, width, row * step_z + 0.1, 0.5 * style.depth)
+    block(0, height - 0.45, width, height, 1.2 * style.depth)
+    if style.pilasters:
+        for bay in range(bays + 1):
+            x = min(max(bay * step_x, 0.2), width - 0.2)
+            block(x - 0.2, 0, x + 0.2, height - 0.45, 0.8 * style.depth)
+    return number
+
+
+def house(
+    surfaces: Surfaces, rng: Rng, split: str, foot: Vector, right: Vector, size: tuple[Real, Real, Real],
+    style: Style, sides: Literal["own", "twin", "same", "plain"] = "own",
+) -> None:  # fmt: skip
+    """A house: `foot` its front left corner, `size` its width, depth and height.
+
+    sides: each with a front of its `own`; opposite ones as `twin`s, or all four the `same`, so that they are easily
+    confused; or the last three flat and `plain`, for a house far away.
+    """
+    width, depth, height = size
+    back = -np.cross(right, vec(0, 0, 1))
+    corners = [foot, foot + right * width, foot + right * width + back * depth, foot + back * depth]
+    top = vec(0, 0, height)
+    twins = np.random.SeedSequence(int(rng.integers(2**31))).spawn(2)
+    number = -1
+    for i, (corner, along, length) in enumerate(
+        zip(corners, (right, back, -right, -back), (width, depth, width, depth), strict=True)
+    ):
+        if sides == "plain" and i > 0:
+            surfaces.quad(corner + top, along * length, -top, number, (0, 0, length / width, 1))
+        else:
+            own = rng if sides == "own" else np.random.default_rng(twins[i % 2 if sides == "twin" else 0])
+            number = front(surfaces, own, split, corner, along, length, height, style)
+    surfaces.quad(corners[3] + top, right * width, -back * depth, number, (0, 0, 1, 0.1))

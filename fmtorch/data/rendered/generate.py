@@ -1,0 +1,209 @@
+"""Draws scenes to disk: photographs, exact cameras, and the pairs that can be matched at all.
+
+Every scene is a function of (version, seed, split, family, number) alone and is written to a temporary folder that is
+renamed when complete, so that an interrupted generation goes on where it stopped and two processes never clash.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import shutil
+import uuid
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fmtorch.data.rendered import collection, driving, indoor, orbit
+from fmtorch.data.rendered.cameras import Camera, fundamental
+from fmtorch.data.rendered.light import Stage, expose
+from fmtorch.data.rendered.mipmap import Pixels
+from fmtorch.data.rendered.raycast import Geometry
+from fmtorch.data.rendered.scene import Scene, Shot
+
+VERSION = 1  # of the generator: raised by every change that changes a picture or a pair
+FAMILIES = {"indoor": indoor.scene, "driving": driving.scene, "orbit": orbit.scene, "collection": collection.scene}
+SPLITS = ("test", "train")
+
+# The paper's rule for a pair: more than 20 SIFT matches within 1 px of the true epipolar lines in both images.
+SIFT_FEATURES, RATIO, NEAR_LINE, ENOUGH = 8000, 0.8, 1.0, 20
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """How much of a family is drawn: scenes, photographs a scene, pairs a scene, and the images' scale."""
+
+    scenes: int
+    shots: int
+    pairs: int
+    scale: float = 1.0
+
+
+PLANS = {
+    ("small", "test"): Plan(4, 5, 5),
+    ("small", "train"): Plan(4, 5, 5),
+    ("full", "test"): Plan(8, 14, 25),
+    ("full", "train"): Plan(32, 14, 25),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """One scene to draw."""
+
+    family: str
+    split: str
+    number: int
+    seed: int
+    plan: Plan
+
+    @property
+    def name(self) -> str:
+        """The scene's name and its folder's."""
+        return f"{self.family}-{self.split}-{self.number:03d}"
+
+    @classmethod
+    def from_json(cls, text: str) -> Task:
+        """The inverse of ``json.dumps(dataclasses.asdict(task))``."""
+        fields: dict[str, Any] = json.loads(text)
+        return cls(**{**fields, "plan": Plan(**fields["plan"])})
+
+
+def digest(family: str, split: str, seed: int, plan: Plan) -> str:
+    """What defines a family's pictures and pairs, as 64 hex digits.
+
+    OpenCV's release is part of it, since it draws the letters on signs and finds the keypoints that choose the pairs.
+    """
+    release = ".".join(cv2.__version__.split(".")[:2])
+    parts = [VERSION, release, family, split, seed, dataclasses.asdict(plan)]
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+def seeds(task: Task) -> np.random.SeedSequence:
+    """The random stream of one scene; no two scenes, families or splits share one."""
+    place = [VERSION, task.seed, SPLITS.index(task.split), list(FAMILIES).index(task.family), task.number]
+    return np.random.SeedSequence(place)
+
+
+def build(task: Task) -> Scene:
+    """A scene's surfaces, lights and shots, before anything is drawn."""
+    rng = np.random.default_rng(seeds(task))
+    return FAMILIES[task.family](rng, task.split, task.plan.shots, task.plan.scale)
+
+
+def draw(scene: Scene, seed: np.random.SeedSequence) -> list[Pixels]:
+    """The photographs of a scene, RGB or grey."""
+    stages: dict[int, Stage] = {}
+    out = []
+    for shot, noise in zip(scene.shots, seed.spawn(len(scene.shots)), strict=True):
+        if shot.light not in stages:
+            surfaces = scene.surfaces[shot.light]
+            stages[shot.light] = Stage(Geometry(surfaces), scene.lights[shot.light], scene.sky)
+        cameras = shot.moments or [shot.camera]
+        out.append(expose(stages[shot.light], cameras, shot.lens, np.random.default_rng(noise)))
+    return out
+
+
+def generate(task: Task, folder: Path) -> Path:
+    """Draws one scene into ``folder/<name>`` unless it stands there complete, and returns that path."""
+    final = folder / task.name
+    if final.is_dir():
+        return final
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        scene = build(task)
+        images = draw(scene, seeds(task))
+        temporary = folder / f".{task.name}-{os.getpid()}-{uuid.uuid4().hex[:8]}.tmp"
+        temporary.mkdir(parents=True)
+        try:
+            _write(temporary, scene, images, task.plan.pairs)
+            os.replace(temporary, final)
+        except OSError:
+            if not final.is_dir():  # otherwise another process was faster, with the same bytes
+                raise
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+    finally:
+        cv2.setNumThreads(threads)
+    return final
+
+
+def _write(folder: Path, scene: Scene, images: list[Pixels], wanted: int) -> None:
+    features = []
+    cameras = []
+    for i, (shot, image) in enumerate(zip(scene.shots, images, strict=True)):
+        path = folder / f"{i:02d}.jpg"
+        picture = image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1])
+        if not cv2.imwrite(str(path), picture, [cv2.IMWRITE_JPEG_QUALITY, shot.jpeg]):
+            raise OSError(f"{path} could not be written")
+        grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert grey is not None
+        features.append(keypoints(grey.astype(np.uint8, copy=False)))
+        cameras.append(_as_json(path.name, shot))
+    kept: list[tuple[int, int]] = []
+    for i, j in scene.pairs:
+        if len(kept) == wanted:
+            break
+        if matchable(features[i], features[j], fundamental(scene.shots[i].camera, scene.shots[j].camera)):
+            kept.append((i, j))
+    record = {"cameras": cameras, "pairs": sorted(kept)}
+    (folder / "scene.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
+
+
+def _as_json(name: str, shot: Shot) -> dict[str, Any]:
+    camera = shot.camera
+    return {
+        "image": name, "size": list(camera.size),
+        "K": camera.K.tolist(), "R": camera.R.tolist(), "t": camera.t.tolist(),
+    }  # fmt: skip
+
+
+def read(folder: Path) -> tuple[list[tuple[Path, Camera]], list[tuple[int, int]]]:
+    """Image paths with their cameras, and the pairs, of a scene drawn before."""
+    record = json.loads((folder / "scene.json").read_text(encoding="utf-8"))
+    views = []
+    for c in record["cameras"]:
+        K, R, t = (np.array(c[k], dtype=np.float64) for k in ("K", "R", "t"))
+        views.append((folder / c["image"], Camera(K, R, t, (c["size"][0], c["size"][1]))))
+    return views, [(i, j) for i, j in record["pairs"]]
+
+
+Keypoints = tuple[NDArray[np.float64], NDArray[np.float32]]
+
+
+def keypoints(grey: Pixels) -> Keypoints:
+    """OpenCV's SIFT: points (n, 2) and descriptors (n, 128)."""
+    found, descriptors = cv2.SIFT.create(nfeatures=SIFT_FEATURES).detectAndCompute(grey, np.ones_like(grey))
+    if not found:
+        return np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32)
+    return np.array([k.pt for k in found], dtype=np.float64), descriptors.astype(np.float32)
+
+
+def ratio_matches(a: Keypoints, b: Keypoints) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Nearest neighbours from the first image to the second that pass the ratio test: points (n, 2) and (n, 2)."""
+    if len(a[0]) == 0 or len(b[0]) < 2:
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    distance = (a[1] ** 2).sum(1)[:, None] + (b[1] ** 2).sum(1) - 2 * a[1] @ b[1].T
+    rows = np.arange(len(distance))
+    best = distance.argmin(1)
+    first = distance[rows, best].copy()
+    distance[rows, best] = np.inf
+    good = np.maximum(first, 0) < RATIO**2 * distance.min(1)
+    return a[0][good], b[0][best[good]]
+
+
+def matchable(a: Keypoints, b: Keypoints, F: NDArray[np.float64]) -> bool:
+    """Whether more than `ENOUGH` ratio matches lie within `NEAR_LINE` pixels of the true lines in both images."""
+    x0, x1 = ratio_matches(a, b)
+    h0, h1 = np.column_stack([x0, np.ones(len(x0))]), np.column_stack([x1, np.ones(len(x1))])
+    l1, l0 = h0 @ F.T, h1 @ F
+    error = np.abs((h1 * l1).sum(1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        worst = error / np.minimum(np.hypot(l0[:, 0], l0[:, 1]), np.hypot(l1[:, 0], l1[:, 1]))
+    return int((worst < NEAR_LINE).sum()) > ENOUGH

@@ -1,0 +1,93 @@
+"""Textures prefiltered for minification: all levels of the pyramid in one picture, looked up trilinearly."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float32]
+Pixels = NDArray[np.uint8]
+Real = float | int
+
+_BORDER = 2
+_ROW = 1024  # look-ups are arranged in rows of this length: cv2.remap limits the sides of its maps to 32,767
+
+# sRGB's transfer curve (IEC 61966-2-1), from 8 bits to linear light.
+_CODE = np.arange(256) / 255.0
+TO_LINEAR: Floats = np.where(_CODE <= 0.04045, _CODE / 12.92, ((_CODE + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def to_srgb(linear: Floats) -> Floats:
+    """Linear light in [0, 1] to sRGB in [0, 1]."""
+    x = np.clip(linear, 0.0, 1.0)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, np.float32(1 / 2.4)) - 0.055).astype(np.float32)
+
+
+class Texture:
+    """A picture (h, w, 3) or, with opacity, (h, w, 4), sRGB in 8 bits; it repeats in both directions.
+
+    Levels are halved in linear light, so that a surface keeps its brightness with distance; opacity is carried along.
+    """
+
+    def __init__(self, picture: Pixels) -> None:
+        h, w = picture.shape[:2]
+        self.opaque = picture.shape[2] == 3
+        level = cv2.LUT(picture[..., :3], TO_LINEAR)
+        alpha: Floats | None = None if self.opaque else np.float32(1 / 255) * picture[..., 3]
+        levels = [picture]
+        while min(h, w) > 4:
+            h, w = h // 2, w // 2
+            level = cv2.resize(level, (w, h), interpolation=cv2.INTER_AREA)
+            coded = to_srgb(level.astype(np.float32, copy=False))
+            if alpha is not None:
+                alpha = cv2.resize(alpha, (w, h), interpolation=cv2.INTER_AREA).astype(np.float32)
+                coded = np.dstack([coded, alpha])
+            levels.append((coded * 255 + 0.5).astype(np.uint8))
+        self.size = np.array(picture.shape[1::-1], dtype=np.float32)
+        self.levels = len(levels)
+        self.scale = np.array([level.shape[1::-1] for level in levels], dtype=np.float32)
+        self.origin = np.zeros((len(levels), 2), dtype=np.float32)
+        padded = [np.pad(level, ((_BORDER, _BORDER), (_BORDER, _BORDER), (0, 0)), mode="wrap") for level in levels]
+        rest = sum(level.shape[0] for level in padded[1:])
+        width = padded[0].shape[1] + max((level.shape[1] for level in padded[1:]), default=0)
+        self.atlas = np.zeros((max(padded[0].shape[0], rest), width, picture.shape[2]), dtype=np.uint8)
+        y = 0
+        for i, level8 in enumerate(padded):
+            x = 0 if i == 0 else padded[0].shape[1]
+            y = 0 if i == 1 else y
+            self.atlas[y : y + level8.shape[0], x : x + level8.shape[1]] = level8
+            self.origin[i] = x + _BORDER - 0.5, y + _BORDER - 0.5
+            y += level8.shape[0]
+
+    def __call__(self, u: Floats, v: Floats, lod: Floats) -> Floats:
+        """Linear colour (n, 3) at u, v (1 = the whole picture, any real number) and pyramid level `lod` (n,)."""
+        lod = np.clip(lod, 0.0, self.levels - 1.001)
+        low = lod.astype(np.int32)
+        u, v = u - np.floor(u), v - np.floor(v)
+        fine, coarse = self._at(u, v, low), self._at(u, v, low + 1)
+        coarse -= fine
+        coarse *= (lod - low.astype(np.float32))[:, None]
+        fine += coarse
+        return fine
+
+    def opacity(self, u: Floats, v: Floats, lod: float) -> Floats:
+        """Opacity (n,) in [0, 1], at one pyramid level for all."""
+        level = np.full(u.shape, min(max(int(lod), 0), self.levels - 1), dtype=np.int32)
+        return self._lookup(u - np.floor(u), v - np.floor(v), level)[:, 3] * np.float32(1 / 255)
+
+    def _at(self, u: Floats, v: Floats, level: NDArray[np.int32]) -> Floats:
+        coded = self._lookup(u, v, level)[:, :3]
+        linear: Floats = np.take(TO_LINEAR, coded)
+        return linear
+
+    def _lookup(self, u: Floats, v: Floats, level: NDArray[np.int32]) -> Pixels:
+        x = np.take(self.origin[:, 0], level) + u * np.take(self.scale[:, 0], level)
+        y = np.take(self.origin[:, 1], level) + v * np.take(self.scale[:, 1], level)
+        n = len(x)
+        rows = max(1, -(-n // _ROW))
+        maps = np.zeros((2, rows * _ROW), dtype=np.float32)
+        maps[0, :n], maps[1, :n] = x, y
+        table = maps.reshape(2, rows, _ROW)
+        out = cv2.remap(self.atlas, table[0], table[1], cv2.INTER_LINEAR)
+        return out.reshape(rows * _ROW, -1)[:n].astype(np.uint8, copy=False)

@@ -1,0 +1,191 @@
+"""Procedural materials: masonry, plaster, wood, ground, cloth, leaves, sky; float32 RGB in [0, 1], sRGB."""
+
+from __future__ import annotations
+
+import colorsys
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fmtorch.data.rendered.mipmap import Floats, Pixels, Real
+
+Rng = np.random.Generator
+
+
+def rgb(red: Real, green: Real, blue: Real) -> Floats:
+    """A colour (3,)."""
+    return np.array([red, green, blue], dtype=np.float32)
+
+
+def to_pixels(picture: Floats) -> Pixels:
+    """[0, 1] to 8 bits."""
+    return (np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def colour(rng: Rng, hue: tuple[Real, Real], saturation: tuple[Real, Real], value: tuple[Real, Real]) -> Floats:
+    """A random colour (3,) within ranges of hue, saturation and value."""
+    return rgb(*colorsys.hsv_to_rgb(rng.uniform(*hue) % 1.0, rng.uniform(*saturation), rng.uniform(*value)))
+
+
+def fractal(rng: Rng, h: int, w: int, coarsest: int = 256, finest: int = 1, roughness: Real = 0.6) -> Floats:
+    """Noise (h, w) summed over octaves of `coarsest` to `finest` pixels, zero mean, unit deviation, repeating."""
+    total = np.zeros((h, w), dtype=np.float32)
+    weight, step = 1.0, min(coarsest, h, w)
+    while step >= finest:
+        rows, cols = max(1, round(h / step)), max(1, round(w / step))
+        grid = rng.standard_normal((rows, cols), dtype=np.float32)
+        if step > 1:
+            grid = np.pad(grid, 2, mode="wrap") if min(rows, cols) > 1 else np.pad(grid, 2, mode="edge")
+            big = cv2.resize(
+                grid, (round(w / cols * (cols + 4)), round(h / rows * (rows + 4))), interpolation=cv2.INTER_CUBIC
+            )
+            y, x = round(2 * h / rows), round(2 * w / cols)
+            grid = big[y : y + h, x : x + w].astype(np.float32)
+            grid = cv2.resize(grid, (w, h)).astype(np.float32) if grid.shape != (h, w) else grid
+        total += np.float32(weight) * grid
+        weight *= roughness
+        step //= 2
+    total -= total.mean()
+    return total / max(float(total.std()), 1e-6)
+
+
+def plaster(rng: Rng, h: int, w: int, tint: Floats, strength: Real = 1.0) -> Floats:
+    """A painted wall: fine grain, soft stains, a few cracks."""
+    shade = 1 + strength * (0.03 * fractal(rng, h, w, 512, 16) + 0.03 * fractal(rng, h, w, 8, 1, 0.8))
+    out = tint * shade[..., None]
+    for _ in range(int(6 * strength)):
+        steps = np.cumsum(rng.normal(0, 6, (14, 2)) + rng.normal(0, 6, 2), axis=0)
+        line = (rng.uniform(0, [w, h]) + steps).astype(np.int32)
+        cv2.polylines(out, [line], False, (tint * 0.6).tolist(), 1, cv2.LINE_AA)
+    return out.astype(np.float32)
+
+
+def masonry(
+    rng: Rng, h: int, w: int, rows: int, cols: int, tint: Floats, *, joint: Real = 0.06, vary: Real = 0.1,
+    bond: Real = 0.5,
+) -> Floats:  # fmt: skip
+    """Courses of stones or bricks, each of its own colour, with mortar; `bond` shifts every second course."""
+    y, x = np.mgrid[:h, :w].astype(np.float32)
+    r = y * (rows / h)
+    row = np.floor(r).astype(np.int32)
+    c = x * (cols / w) + np.where(row % 2 == 1, np.float32(bond), np.float32(0))
+    col = np.floor(c).astype(np.int32) % cols
+    tones = 1 + vary * rng.standard_normal((rows, cols)).astype(np.float32)
+    hues = 1 + 0.25 * vary * rng.standard_normal((rows, cols, 3)).astype(np.float32)
+    flat = row % rows * cols + col
+    out = tint * np.take(tones.ravel(), flat)[..., None] * np.take(hues.reshape(-1, 3), flat, axis=0)
+    out *= (1 + 0.07 * fractal(rng, h, w, 32, 1, 0.8))[..., None]
+    aspect = (w / cols) / (h / rows)
+    edge_y = np.minimum(r - np.floor(r), 1 - (r - np.floor(r)))
+    edge_x = np.minimum(c - np.floor(c), 1 - (c - np.floor(c))) * np.float32(aspect)
+    wobble = np.float32(joint) * (1 + 0.35 * fractal(rng, h, w, 16, 2))
+    gap = np.clip((wobble - np.minimum(edge_x, edge_y)) / np.float32(joint * 0.4) + 0.5, 0, 1)[..., None]
+    mortar: Floats = (0.55 * tint + 0.15) * (1 + 0.1 * fractal(rng, h, w, 8, 1))[..., None]
+    wall: Floats = (out * (1 - gap) + mortar * gap).astype(np.float32)
+    return wall
+
+
+def cells(rng: Rng, h: int, w: int, size: int, tint: Floats, *, vary: Real = 0.12, joint: Real = 2.0) -> Floats:
+    """Irregular stones (Voronoi cells of a jittered grid): cobbles, rubble."""
+    seeds = np.full((h, w), 255, dtype=np.uint8)
+    gy, gx = np.mgrid[size // 2 : h : size, size // 2 : w : size]
+    jitter = rng.integers(-size // 3, size // 3 + 1, (2, *gy.shape))
+    seeds[np.clip(gy + jitter[0], 0, h - 1), np.clip(gx + jitter[1], 0, w - 1)] = 0
+    distance, found = cv2.distanceTransformWithLabels(seeds, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    label = found.astype(np.int32)
+    tones = 1 + vary * rng.standard_normal((int(label.max()) + 1, 1)).astype(np.float32)
+    tones = tones * (1 + 0.3 * vary * rng.standard_normal((len(tones), 3)).astype(np.float32))
+    border = cv2.morphologyEx(label.astype(np.float32), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0
+    gap = cv2.GaussianBlur(border.astype(np.float32), (0, 0), joint / 2)
+    out = tint * np.take(tones, label, axis=0) * (1.08 - 0.2 * distance / size)[..., None]
+    out *= (1 + 0.06 * fractal(rng, h, w, 16, 1, 0.8))[..., None] * (1 - 0.75 * np.clip(gap, 0, 1))[..., None]
+    return out.astype(np.float32)
+
+
+def wood(rng: Rng, h: int, w: int, planks: int, tint: Floats) -> Floats:
+    """Planks that run from left to right."""
+    grain = cv2.resize(fractal(rng, h, max(8, w // 16), 64, 1, 0.8), (w, h), interpolation=cv2.INTER_CUBIC)
+    plank = (np.arange(h) * planks // h)[:, None]
+    out = tint * (1 + 0.1 * rng.standard_normal(planks))[plank][..., None] * (1 + 0.08 * grain)[..., None]
+    out[np.abs(np.diff(plank[:, 0], prepend=0)) > 0] *= 0.45
+    return out.astype(np.float32)
+
+
+def asphalt(rng: Rng, h: int, w: int) -> Floats:
+    """A road's surface: fine gravel, patches, cracks."""
+    shade = 0.33 * (1 + 0.10 * fractal(rng, h, w, 256, 8) + 0.14 * fractal(rng, h, w, 4, 1, 0.9))
+    out = np.repeat(shade[..., None], 3, axis=2).astype(np.float32)
+    for _ in range(5):
+        x, y, a, b = (*rng.uniform(0, [w, h]), *rng.uniform(20, 120, 2))
+        out[int(y) : int(y + b), int(x) : int(x + a)] *= rng.uniform(0.72, 0.92)
+    for _ in range(14):
+        steps = np.cumsum(rng.normal(0, 9, (20, 2)) + rng.normal(0, 9, 2), axis=0)
+        line = (rng.uniform(0, [w, h]) + steps).astype(np.int32)
+        cv2.polylines(out, [line], False, [0.12] * 3, int(rng.integers(1, 3)), cv2.LINE_AA)
+    return out
+
+
+def meadow(rng: Rng, h: int, w: int, tint: Floats) -> Floats:
+    """Grass from above: short strokes of many greens over soft patches."""
+    out = tint * (0.8 + 0.12 * fractal(rng, h, w, 256, 4))[..., None]
+    out = np.ascontiguousarray(out, dtype=np.float32)
+    count = h * w // 120
+    root = rng.uniform(0, [w, h], (count, 2))
+    tip = root + rng.normal(0, 5, (count, 2))
+    shade = rng.normal(1, 0.28, count)
+    for a, b, s in zip(root.astype(int).tolist(), tip.astype(int).tolist(), shade, strict=True):
+        cv2.line(out, a, b, (tint * s).tolist(), 1, cv2.LINE_AA)
+    return out
+
+
+def cloth(rng: Rng, h: int, w: int) -> Floats:
+    """A carpet: a border and mirrored ornaments in a few colours."""
+    palette = [colour(rng, (0, 1), (0.3, 0.8), (0.25, 0.85)) for _ in range(5)]
+    quarter = np.empty((h // 2, w // 2, 3), dtype=np.float32)
+    quarter[:] = palette[0]
+    for _ in range(45):
+        p = rng.uniform(0, [w // 2, h // 2], (3, 2))
+        tone = palette[int(rng.integers(1, 5))].tolist()
+        if rng.random() < 0.5:
+            cv2.fillPoly(quarter, [p.mean(0).astype(np.int32) + rng.normal(0, w / 24, (4, 2)).astype(np.int32)], tone)
+        else:
+            cv2.circle(quarter, p[0].astype(int).tolist(), int(rng.uniform(3, w / 20)), tone, int(rng.choice([-1, 2])))
+    for i, inset in enumerate((0, 10, 16)):
+        cv2.rectangle(quarter, (inset, inset), (w, h), palette[i + 1].tolist(), 5)
+    half = np.concatenate([quarter, quarter[:, ::-1]], axis=1)
+    out = np.concatenate([half, half[::-1]], axis=0)
+    out = cv2.resize(out, (w, h))
+    return (out * (1 + 0.10 * fractal(rng, h, w, 4, 1, 0.9))[..., None]).astype(np.float32)
+
+
+def leaves(rng: Rng, size: int, tint: Floats, count: int = 320) -> Pixels:
+    """A cloud of leaves with opacity (size, size, 4)."""
+    out = np.zeros((size, size, 4), dtype=np.float32)
+    out[..., :3] = tint * 0.5
+    radius = size * 0.42 * np.sqrt(rng.random(count))
+    angle = rng.uniform(0, 2 * np.pi, count)
+    for r, a in zip(radius, angle, strict=True):
+        at = (int(size / 2 + r * np.cos(a)), int(size / 2 + r * np.sin(a)))
+        tone = tint * rng.normal(1, 0.3) * (1.15 - 0.3 * np.sin(a) * r / size)
+        axes = (int(rng.uniform(0.025, 0.055) * size), int(rng.uniform(0.012, 0.028) * size))
+        cv2.ellipse(out, at, axes, rng.uniform(0, 180), 0, 360, (*np.clip(tone, 0, 1).tolist(), 1.0), -1, cv2.LINE_AA)
+    return to_pixels(out)
+
+
+def heaven(rng: Rng, cover: Real) -> Pixels:
+    """A sky (256, 1024, 3): azimuth across, zenith on top, clouds over a gradient."""
+    h, w = 256, 1024
+    height = np.linspace(1, 0, h, dtype=np.float32)[:, None]
+    blue, pale = colour(rng, (0.57, 0.62), (0.4, 0.65), (0.6, 0.9)), colour(rng, (0.55, 0.62), (0.05, 0.2), (0.8, 0.95))
+    out = pale + (blue - pale) * (height**0.6)[..., None]
+    veil = np.clip((fractal(rng, h, w, 128, 1, 0.58) + cover) * 0.7, 0, 1)[..., None]
+    shade = np.clip(0.93 + 0.06 * fractal(rng, h, w, 64, 2), 0, 1)[..., None]
+    return to_pixels((out * (1 - veil) + shade * veil).astype(np.float32))
+
+
+def heights(rng: Rng, m: int, n: int, coarsest: int = 8) -> NDArray[np.float64]:
+    """A smooth random field (m, n) in [0, 1] for relief."""
+    field = fractal(rng, m, n, coarsest, 1, 0.45).astype(np.float64)
+    field -= field.min()
+    return field / max(float(field.max()), 1e-9)

@@ -1,0 +1,167 @@
+"""Which surface each pixel's ray meets first: exact ray-plane intersection, batched over pixels, with a depth buffer.
+
+A piece ``X = O + s U + t V`` is seen by a camera P through the homography ``G = P [U V O; 0 0 1]``. Hence the ray of
+pixel x meets its plane at ``(s, t, 1) = z G^-1 (x, y, 1)``: three linear forms and one division for each pixel, and the
+depth z is the reciprocal of the third form. Each piece is intersected with the rays of its bounding box only.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fmtorch.data.rendered.cameras import Camera
+from fmtorch.data.rendered.mipmap import Floats
+from fmtorch.data.rendered.surfaces import Surfaces
+
+Matrix = NDArray[np.float64]
+
+NEAR = 0.05  # metres
+_SEAM = 1e-4  # pieces reach this much (of their own extent) beyond their edges, so that neighbours leave no gap
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Hits:
+    """Per pixel (h, w): the piece met (-1: none), its s and t; `inverse` (n, 3, 3) is G^-1 of every piece."""
+
+    piece: NDArray[np.int32]
+    s: Floats
+    t: Floats
+    inverse: Matrix
+
+
+class Geometry:
+    """The pieces of a scene as arrays, ready to be cast against any number of cameras."""
+
+    def __init__(self, surfaces: Surfaces) -> None:
+        arrays = surfaces.arrays()
+        self.O, self.U, self.V = arrays["O"], arrays["U"], arrays["V"]
+        self.uv, self.normals = arrays["uv"], arrays["normals"]
+        self.texture, self.triangle, self.both_sides = surfaces.labels()
+        self.textures = surfaces.textures
+        normal = np.cross(self.V, self.U)
+        self.normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        self.corners = np.stack([self.O, self.O + self.U, self.O + self.U + self.V, self.O + self.V], axis=1)
+
+    def cast(
+        self,
+        P: Matrix,
+        depth: Matrix,
+        size: tuple[int, int],
+        centre: Matrix | None,
+        skip: NDArray[np.bool_] | None = None,
+    ) -> Hits:
+        """Rays of all pixels of a projection P (3, 4), perspective or (last row 0 0 0 1) orthographic.
+
+        depth: (4,), the affine function of the world by which the nearer of two pieces is known.
+        centre: where a perspective camera stands, for leaving out the backs of pieces; None keeps them.
+        skip: pieces (n,) to look through.
+        """
+        h, w = size
+        G = np.stack([self.U @ P[:, :3].T, self.V @ P[:, :3].T, self.O @ P[:, :3].T + P[:, 3]], axis=2)
+        usable = np.abs(np.linalg.det(G)) > 1e-14
+        if centre is not None:
+            usable &= self.both_sides | (((centre - self.O) * self.normal).sum(1) > 0)
+        if skip is not None:
+            usable &= ~skip
+        inverse = np.zeros_like(G)
+        inverse[usable] = np.linalg.inv(G[usable])
+        boxes = self._boxes(P, size, usable)
+        nearest = self.corners @ depth[:3] + depth[3]
+        order = np.argsort(nearest.min(1), kind="stable")
+        order = order[((boxes[:, 0] < boxes[:, 2]) & (boxes[:, 1] < boxes[:, 3]))[order]]
+        # The linear forms, re-centred on each box in float64 so that float32 is accurate inside it.
+        forms = inverse.copy()
+        forms[:, :, 2] += (inverse[:, :, :2] * boxes[:, None, :2]).sum(-1)
+        forms = forms.astype(np.float32)
+        z_of = np.stack([self.U @ depth[:3], self.V @ depth[:3], self.O @ depth[:3] + depth[3]], 1).astype(np.float32)
+        closest = np.where(nearest.min(1) > NEAR, 0.999 * nearest.min(1), -np.inf).astype(np.float32)
+        x_axis, y_axis = np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32)
+        buffer = np.full((h, w), np.inf, dtype=np.float32)
+        piece = np.full((h, w), -1, dtype=np.int32)
+        where = np.zeros((2, h, w), dtype=np.float32)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            for i in order.tolist():
+                x0, y0, x1, y1 = boxes[i].tolist()
+                view = np.s_[y0:y1, x0:x1]
+                before = buffer[view]
+                if before.max() < closest[i]:
+                    continue
+                A = forms[i]
+                rows = A[:, 1:2] * y_axis[: y1 - y0] + A[:, 2:]
+                stq = A[:, 0, None, None] * x_axis[: x1 - x0] + rows[:, :, None]
+                st = stq[:2]
+                st /= stq[2]
+                s, t = st
+                z = z_of[i, 0] * s + (z_of[i, 1] * t + z_of[i, 2])
+                hit = (s > -_SEAM) & (t > -_SEAM) & (z < before)
+                if self.triangle[i]:
+                    hit &= s + t < 1 + _SEAM
+                else:
+                    hit &= (s < 1 + _SEAM) & (t < 1 + _SEAM)
+                if centre is not None:
+                    hit &= z > NEAR
+                if not hit.any():
+                    continue
+                if not self.textures[self.texture[i]].opaque:
+                    hit[hit] = self._solid(i, s[hit], t[hit], (x1 - x0, y1 - y0))
+                np.copyto(before, z, where=hit)
+                np.copyto(piece[view], np.int32(i), where=hit)
+                np.copyto(where[:, y0:y1, x0:x1], st, where=hit)
+        return Hits(piece, where[0], where[1], inverse)
+
+    def look(self, camera: Camera, offset: tuple[float, float] = (0.0, 0.0)) -> Hits:
+        """The rays through the points `offset` (x, y) away from the pixel centres of a camera."""
+        shift = np.array([[1.0, 0.0, -offset[0]], [0.0, 1.0, -offset[1]], [0.0, 0.0, 1.0]])
+        depth = np.append(camera.R[2], camera.t[2])
+        return self.cast(shift @ camera.P, depth, camera.size, camera.centre)
+
+    def depth_map(self, camera: Camera) -> Matrix:
+        """Depth (h, w) along the camera's axis at the pixel centres, in float64, infinite where nothing is hit."""
+        hits = self.look(camera)
+        h, w = camera.size
+        y, x = np.mgrid[:h, :w].astype(np.float64)
+        row = hits.inverse[hits.piece, 2]
+        inverse_depth = np.where(hits.piece >= 0, row[..., 0] * x + row[..., 1] * y + row[..., 2], 0.0)
+        with np.errstate(divide="ignore"):
+            depth: Matrix = 1.0 / inverse_depth
+        return depth
+
+    def _solid(self, i: int, s: Floats, t: Floats, box: tuple[int, int]) -> NDArray[np.bool_]:
+        texture = self.textures[self.texture[i]]
+        u, v = (self.uv[i, :, :].astype(np.float32).T[k] @ np.stack([np.ones_like(s), s, t]) for k in range(2))
+        texels = np.abs(self.uv[i, 1:]).max(0) * texture.size
+        lod = float(np.log2(max(1.0, (texels / np.array(box)).max())))
+        solid: NDArray[np.bool_] = texture.opacity(u, v, lod) > 0.5
+        return solid
+
+    def _boxes(self, P: Matrix, size: tuple[int, int], usable: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Pixel bounding boxes (n, 4) as x0, y0, x1, y1 (end excluded) of what lies before the near plane."""
+        h, w = size
+        X = self.corners @ P[:, :3].T + P[:, 3]
+        ahead = X[..., 2] >= NEAR
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x = X[..., :2] / X[..., 2:]
+        boxes = np.zeros((len(X), 4))
+        boxes[:, :2], boxes[:, 2:] = x.min(1), x.max(1)
+        for i in np.flatnonzero(usable & ahead.any(1) & ~ahead.all(1)):
+            points = _clip(X[i])
+            boxes[i, :2], boxes[i, 2:] = points.min(0), points.max(0)
+        boxes[~ahead.any(1) | ~usable] = 0
+        boxes[:, :2] = np.floor(boxes[:, :2])
+        boxes[:, 2:] = np.ceil(boxes[:, 2:]) + 1
+        return np.clip(np.nan_to_num(boxes), 0, [w, h, w, h]).astype(np.int64)
+
+
+def _clip(X: Matrix) -> Matrix:
+    """The image points (m, 2) of a polygon of homogeneous points (k, 3), cut off at the near plane."""
+    kept = []
+    for a, b in zip(X, np.roll(X, -1, axis=0), strict=True):
+        if a[2] >= NEAR:
+            kept.append(a)
+        if (a[2] >= NEAR) != (b[2] >= NEAR):
+            kept.append(a + (NEAR - a[2]) / (b[2] - a[2]) * (b - a))
+    points: Matrix = np.array(kept)
+    return points[:, :2] / points[:, 2:]

@@ -1,0 +1,190 @@
+"""Fundamental matrices from cameras, epipolar lines, and the distances between points and them.
+
+Image 0 comes first: ``x1^T F x0 = 0``. Points are (..., N, 2) in pixels, matrices (..., 3, 3) of any scale and sign;
+leading dimensions broadcast. Only additions, multiplications, divisions and square roots of single elements are used,
+all correctly rounded, so a result is bit-equal whatever stands beside it in the batch. Where an image point falls on
+the epipole its line is undefined: its normal is then zero, and distances and gradients to it are 0, never NaN.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def cross_matrix(t: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """The skew-symmetric matrix [t]_x with ``[t]_x v = t x v``."""
+    x, y, z = t.unbind(-1)
+    zero = torch.zeros_like(x)
+    return _matrix([zero, -z, y, z, zero, -x, -y, x, zero])
+
+
+def unit_frobenius(F: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """F divided by its Frobenius norm; the zero matrix stays zero, with finite gradients."""
+    F = unit_largest(F)
+    squared = torch.zeros_like(F[..., 0, 0])
+    for element in F.flatten(-2).unbind(-1):
+        squared = squared + element * element
+    return F * inverse_root(squared)[..., None, None]
+
+
+def fundamental_from_projections(
+    P0: Float[Tensor, "*#batch 3 4"], P1: Float[Tensor, "*#batch 3 4"]
+) -> Float[Tensor, "*#batch 3 3"]:
+    """F of unit Frobenius norm between two cameras: ``F = [P1 C]_x P1 P0^+`` with ``P0 C = 0``, without a null space.
+
+    Each element is a 4 x 4 determinant of two rows of P0 and two of P1 (Hartley & Zisserman, Multiple View Geometry,
+    2nd ed., eq. 17.3), so it holds for finite and infinite cameras and is smooth in both. Cameras with one centre
+    have no fundamental matrix: the zero matrix is returned.
+    """
+    lines0, lines1 = _pluecker_of_row_pairs(unit_largest(P0)), _pluecker_of_row_pairs(unit_largest(P1))
+    # The sign is that of [t]_x for P0 = [I | 0], P1 = [I | t].
+    return unit_frobenius(_matrix([-_determinant(lines0[i], lines1[j]) for j in range(3) for i in range(3)]))
+
+
+def fundamental_from_calibration(
+    K0: Float[Tensor, "*#batch 3 3"],
+    K1: Float[Tensor, "*#batch 3 3"],
+    R: Float[Tensor, "*#batch 3 3"],
+    t: Float[Tensor, "*#batch 3"],
+) -> Float[Tensor, "*#batch 3 3"]:
+    """F = K1^-T [t]_x R K0^-1 of unit Frobenius norm, for ``X1 = R X0 + t`` (Hartley & Zisserman, eq. 9.12)."""
+    E = _matmul(cross_matrix(t), R)
+    inverse0 = _cofactors(unit_largest(K0)).mT  # K^-1 up to the scale det K
+    inverse1_t = _cofactors(unit_largest(K1))
+    return unit_frobenius(_matmul(_matmul(inverse1_t, unit_largest(E)), inverse0))
+
+
+def epipolar_lines(F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"]) -> Float[Tensor, "*#batch n 3"]:
+    """The lines (a, b, c) of x0 in image 1, ``a x + b y + c = 0`` with a^2 + b^2 = 1; pass ``F.mT`` for image 0.
+
+    Where a = b = 0 (the epipole, or the line at infinity) the line is returned unscaled, as OpenCV does.
+    """
+    a, b, c = lines_through(unit_largest(F), x0)
+    squared = a * a + b * b
+    scale = torch.where(squared > 0, inverse_root(squared), 1.0)
+    return torch.stack([a, b, c], -1) * scale[..., None]
+
+
+def point_to_line(x: Float[Tensor, "*#batch n 2"], line: Float[Tensor, "*#batch n 3"]) -> Float[Tensor, "*#batch n"]:
+    """Distance in pixels of each point to its line (a, b, c) of any scale; 0 where a = b = 0."""
+    a, b, c = line.unbind(-1)
+    return (a * x[..., 0] + b * x[..., 1] + c).abs() * inverse_root(a * a + b * b)
+
+
+def algebraic(
+    F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
+) -> Float[Tensor, "*#batch n"]:
+    """The signed algebraic residual ``x1^T F x0``, in units of F."""
+    a, b, c = lines_through(F, x0)
+    return a * x1[..., 0] + b * x1[..., 1] + c
+
+
+def epipolar_distances(
+    F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
+) -> tuple[Float[Tensor, "*#batch n"], Float[Tensor, "*#batch n"]]:
+    """Point-to-line distances in pixels: of x0 to the line ``F^T x1`` in image 0, of x1 to ``F x0`` in image 1."""
+    e, squared0, squared1 = residual_and_normals(F, x0, x1)
+    return e.abs() * inverse_root(squared0), e.abs() * inverse_root(squared1)
+
+
+def symmetric_mean(
+    F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
+) -> Float[Tensor, "*#batch n"]:
+    """Mean of the two point-to-line distances, in pixels."""
+    d0, d1 = epipolar_distances(F, x0, x1)
+    return (d0 + d1) / 2
+
+
+def symmetric_max(
+    F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
+) -> Float[Tensor, "*#batch n"]:
+    """Larger of the two point-to-line distances, in pixels."""
+    d0, d1 = epipolar_distances(F, x0, x1)
+    return torch.maximum(d0, d1)
+
+
+def symmetric_squared(
+    F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
+) -> Float[Tensor, "*#batch n"]:
+    """Sum of the two squared point-to-line distances, in squared pixels (Hartley & Zisserman, eq. 11.10)."""
+    d0, d1 = epipolar_distances(F, x0, x1)
+    return d0 * d0 + d1 * d1
+
+
+def sampson(
+    F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
+) -> Float[Tensor, "*#batch n"]:
+    """Sampson distance in pixels: |x1^T F x0| over the norm of its gradient (Hartley & Zisserman, eq. 11.9)."""
+    e, squared0, squared1 = residual_and_normals(F, x0, x1)
+    return e.abs() * inverse_root(squared0 + squared1)
+
+
+def sampson_squared(
+    F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
+) -> Float[Tensor, "*#batch n"]:
+    """Squared Sampson distance, in squared pixels."""
+    distance = sampson(F, x0, x1)
+    return distance * distance
+
+
+def residual_and_normals(F: Tensor, x0: Tensor, x1: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """x1^T F x0 and the squared norms of the normals of ``F^T x1`` and ``F x0``, all for one scaled F."""
+    F = unit_largest(F)
+    a1, b1, c1 = lines_through(F, x0)
+    a0, b0, _ = lines_through(F.mT, x1)
+    e = a1 * x1[..., 0] + b1 * x1[..., 1] + c1
+    return e, a0 * a0 + b0 * b0, a1 * a1 + b1 * b1
+
+
+def lines_through(F: Tensor, x: Tensor) -> list[Tensor]:
+    """The three components of F (x, y, 1)."""
+    u, v = x.unbind(-1)
+    return [F[..., i, 0, None] * u + F[..., i, 1, None] * v + F[..., i, 2, None] for i in range(3)]
+
+
+def inverse_root(squared: Tensor) -> Tensor:
+    """1 / sqrt(squared), and 0 with zero gradient where squared = 0."""
+    positive = squared != 0  # NaN stays NaN
+    return torch.where(positive, 1 / torch.where(positive, squared, 1.0).sqrt(), 0.0)
+
+
+def unit_largest(matrix: Tensor) -> Tensor:
+    """A homogeneous matrix scaled so that squares neither under- nor overflow.
+
+    The scale is a constant to autograd: what is computed from the matrix does not depend on it.
+    """
+    largest = matrix.detach().abs().amax((-2, -1), keepdim=True)
+    return matrix / torch.where(largest == 0, 1.0, largest)
+
+
+def _matrix(elements: list[Tensor]) -> Tensor:
+    """A 3 x 3 matrix from its nine elements, row by row."""
+    stacked = torch.stack(elements, -1)
+    return stacked.reshape(*stacked.shape[:-1], 3, 3)
+
+
+def _matmul(a: Tensor, b: Tensor) -> Tensor:
+    """Product of 3 x 3 matrices in a fixed order of summation."""
+    x, y, z = (a[..., :, k, None] * b[..., None, k, :] for k in range(3))
+    return x + y + z
+
+
+def _cofactors(matrix: Tensor) -> Tensor:
+    """det(M) M^-T: each element is the minor of the rows and columns that follow it cyclically."""
+    roll = matrix.roll
+    return roll((-1, -1), (-2, -1)) * roll((-2, -2), (-2, -1)) - roll((-1, -2), (-2, -1)) * roll((-2, -1), (-2, -1))
+
+
+def _pluecker_of_row_pairs(P: Tensor) -> list[list[Tensor]]:
+    """For i = 0, 1, 2 the minors of the two rows of P other than i, in cyclic order: columns 01, 02, 03, 12, 13, 23."""
+    columns = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+    rows = [(1, 2), (2, 0), (0, 1)]
+    return [[P[..., r, a] * P[..., s, b] - P[..., r, b] * P[..., s, a] for a, b in columns] for r, s in rows]
+
+
+def _determinant(line0: list[Tensor], line1: list[Tensor]) -> Tensor:
+    """The 4 x 4 determinant of two rows above two others, by Laplace expansion in 2 x 2 minors."""
+    (a01, a02, a03, a12, a13, a23), (b01, b02, b03, b12, b13, b23) = line0, line1
+    return a01 * b23 - a02 * b13 + a03 * b12 + a12 * b03 - a13 * b02 + a23 * b01

@@ -1,0 +1,36 @@
+"""Recall over a set of pairs at a limit on their NSGD, its curve, and its mean up to a limit."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+THRESHOLD = 0.05  # NSGD below which an estimate counts as recalled (Bian et al., BMVC 2019)
+CURVE = (0.0, 0.2, 20)  # first and last threshold and their number, as in the paper's curves
+
+
+def recall(nsgd: Float[Tensor, "*batch pairs"], threshold: float = THRESHOLD) -> Float[Tensor, "*batch"]:
+    """Share of all pairs with NSGD strictly below the threshold; NaN, a failure, counts as a miss."""
+    return (nsgd < threshold).to(nsgd.dtype).mean(-1)
+
+
+def recall_curve(
+    nsgd: Float[Tensor, "*batch pairs"], thresholds: Float[Tensor, " t"] | None = None
+) -> Float[Tensor, "*batch t"]:
+    """`recall` at each threshold, by default at 20 from 0 to 0.2."""
+    if thresholds is None:
+        first, last, count = CURVE
+        thresholds = torch.linspace(first, last, count, dtype=nsgd.dtype, device=nsgd.device)
+    return (nsgd[..., None, :] < thresholds[:, None]).to(nsgd.dtype).mean(-1)
+
+
+def mean_recall(nsgd: Float[Tensor, "*batch pairs"], maximum: float = THRESHOLD) -> Float[Tensor, "*batch"]:
+    """Mean of `recall` over thresholds from 0 to `maximum`: the exact area under its step curve over `maximum`.
+
+    A pair with NSGD e is recalled on the share max(0, 1 - e / maximum) of the thresholds, so the figure is the mean of
+    that over pairs, and differentiable in e. NaN counts as a miss.
+    """
+    missed = nsgd.isnan()
+    share = (1 - torch.where(missed, maximum, nsgd) / maximum).clamp(min=0.0)
+    return share.mean(-1)

@@ -1,0 +1,164 @@
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from torch.utils.data import DataLoader
+
+from fmtorch.data import DataError, FMBenchPairs, collate, load, read_image
+from tests.conftest import shared_path
+
+LINE = "0 1 0 0 0 0 0 -2 0 2 0"
+
+
+def write_set(folder: Path, lines: list[str], subsets: list[str], images: dict[str, list[str]]) -> Path:
+    folder.mkdir(parents=True)
+    (folder / "pairs_with_gt.txt").write_text("\n".join(lines) + "\n")
+    (folder / "pairs_which_dataset.txt").write_text("\n".join(subsets) + "\n")
+    for subset, names in images.items():
+        (folder / subset / "Images").mkdir(parents=True)
+        for name in names:
+            (folder / subset / "Images" / name).write_bytes(b"")
+    return folder
+
+
+def small_set(folder: Path) -> Path:
+    return write_set(folder, [LINE, "1 2" + LINE[3:]], ["a/", "b/"], {
+        "a": ["00000000.jpg", "00000001.png"], "b": ["00000001.jpg", "00000002.jpg"],
+    })  # fmt: skip
+
+
+def test_a_pair(tmp_path: Path) -> None:
+    pair = FMBenchPairs(small_set(tmp_path / "Set"))[0]
+    assert (pair.identity, pair.family, pair.scene, pair.problem) == ("Set/a/0-1", "Set", "a", None)
+    assert pair.image0.identity == "Set/a/00000000"
+    assert pair.image1.path.name == "00000001.png"
+    np.testing.assert_allclose(pair.F, np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0]]) / np.sqrt(2), rtol=1e-15)
+    assert pair.K0 is None
+
+
+def test_a_folder_of_sets(tmp_path: Path) -> None:
+    small_set(tmp_path / "B")
+    small_set(tmp_path / "A")
+    (tmp_path / "other").mkdir()
+    assert [p.family for p in load("fmbench", root=tmp_path)] == ["A", "A", "B", "B"]
+    assert [p.identity for p in load("fmbench", root=tmp_path, sets=["B", "A"], subset="b")] == ["B/b/1-2", "A/b/1-2"]
+    with pytest.raises(DataError, match="no set 'C'; it has A, B"):
+        load("fmbench", root=tmp_path, sets=["C"])
+    with pytest.raises(DataError, match="no pairs of subset 'c'; it has a, b"):
+        load("fmbench", root=tmp_path, subset=["a", "c"])
+
+
+def test_a_repeated_pair_has_an_identity_of_its_own(tmp_path: Path) -> None:
+    root = write_set(tmp_path / "S", [LINE] * 3, ["a/"] * 3, {"a": ["00000000.jpg", "00000001.jpg"]})
+    pairs = list(FMBenchPairs(root))
+    assert [p.identity for p in pairs] == ["S/a/0-1", "S/a/0-1#2", "S/a/0-1#3"]
+    assert len({p.key for p in pairs}) == 3
+
+
+def test_digest_is_of_the_contents_not_of_the_place(tmp_path: Path) -> None:
+    first, second = FMBenchPairs(small_set(tmp_path / "x/S")), FMBenchPairs(small_set(tmp_path / "y/S"))
+    assert first.digest == second.digest
+    assert FMBenchPairs(tmp_path / "x/S", subset="a").digest != first.digest
+    (tmp_path / "y/S/a/Camera.txt").write_text(" ".join("1" * 21) + "\n" + " ".join("1" * 21))
+    assert FMBenchPairs(tmp_path / "y/S").digest != first.digest
+    assert FMBenchPairs(tmp_path / "y/S", cameras=False).digest == first.digest
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        ("0 1 nan 0 0 0 0 -2 0 2 0", "not finite"),
+        ("0 1 inf 0 0 0 0 -2 0 2 0", "not finite"),
+        ("0 1 0 0 0 0 0 0 0 0 0", "F is zero"),
+        ("0 7 0 0 0 0 0 -2 0 2 0", r"no image .*a/Images/00000007\.jpg \(or \.png\)"),
+    ],
+)
+def test_one_bad_line_is_one_bad_pair(tmp_path: Path, line: str, reason: str) -> None:
+    root = write_set(tmp_path / "S", [LINE, line, LINE], ["a/"] * 3, {"a": ["00000000.jpg", "00000001.jpg"]})
+    pairs = list(FMBenchPairs(root))
+    assert pairs[0].problem is None
+    assert pairs[2].problem is None
+    assert pairs[1].problem is not None
+    assert "pairs_with_gt.txt, line 2: " in pairs[1].problem
+    assert re.search(reason, pairs[1].problem)
+    assert np.isfinite(pairs[1].F).all()
+
+
+@pytest.mark.parametrize(
+    ("lines", "subsets", "message"),
+    [
+        ([LINE, LINE + " 3"], ["a/", "a/"], r"pairs_with_gt\.txt, line 2: 12 columns; it must have 11: l r F11"),
+        ([LINE, "", LINE], ["a/"] * 3, "line 2: 0 columns"),
+        ([LINE, LINE.replace("-2", "two")], ["a/", "a/"], "line 2: .*'two'; it must hold 11 numbers"),
+        ([LINE], ["a/", "a/"], r"pairs_which_dataset\.txt has 2 lines and .*pairs_with_gt\.txt has 1"),
+        (["0.5" + LINE[1:]], ["a/"], "line 1: image number 0.5; it must be a whole number"),
+        (["nan" + LINE[1:]], ["a/"], "image number nan"),
+        (["inf" + LINE[1:]], ["a/"], "image number inf"),
+        ([LINE], ["z/"], r"names z/, but there is no folder .*z/Images"),
+    ],
+)
+def test_unreliable_files_are_refused(tmp_path: Path, lines: list[str], subsets: list[str], message: str) -> None:
+    root = write_set(tmp_path / "S", lines, subsets, {"a": ["00000000.jpg", "00000001.jpg"]})
+    with pytest.raises(DataError, match=message):
+        FMBenchPairs(root)
+
+
+def test_missing_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no such folder"):
+        FMBenchPairs(tmp_path / "nowhere")
+    with pytest.raises(DataError, match=r"neither pairs_with_gt\.txt nor a sub-folder"):
+        FMBenchPairs(tmp_path)
+    root = small_set(tmp_path / "S")
+    (root / "pairs_which_dataset.txt").unlink()
+    with pytest.raises(DataError, match=r"pairs_which_dataset\.txt: no such file"):
+        FMBenchPairs(root)
+    with pytest.raises(DataError, match="split 'train'"):
+        FMBenchPairs(root, split="train")
+
+
+def test_cameras_must_fit(tmp_path: Path) -> None:
+    root = small_set(tmp_path / "S")
+    (root / "a/Camera.txt").write_text(" ".join("1" * 21))
+    with pytest.raises(DataError, match=r"Camera\.txt has 1 lines, but .*line 1 names image 1"):
+        FMBenchPairs(root)
+    (root / "a/Camera.txt").write_text("1 2 3")
+    with pytest.raises(DataError, match=r"3 columns; it must have 21: K .*cameras=false"):
+        FMBenchPairs(root)
+    assert len(FMBenchPairs(root, cameras=False)) == 2
+
+
+def test_load_names_what_there_is() -> None:
+    with pytest.raises(DataError, match="no data set 'kity'; there are fmbench"):
+        load("kity")
+    with pytest.raises(DataError, match="fmbench needs root"):
+        load("fmbench")
+
+
+def test_real_sets() -> None:
+    dataset = load("fmbench", root=shared_path("data"))
+    counts = {family: sum(p.family == family for p in dataset) for family in {p.family for p in dataset}}
+    assert counts == {"KITTI": 100, "PhotoTourism": 34, "Strecha": 79, "Strecha_train": 73, "TUM": 100, "TanksLike": 99}
+    assert len({p.key for p in dataset}) == len(dataset)
+    assert all(p.problem is None for p in dataset)
+    pair = next(p for p in dataset if p.scene == "sacre_coeur")
+    assert read_image(pair.image0).ndim == 3
+
+    # F = K1^-T [t]x R K0^-1, up to scale and sign; the cameras are given with 17 digits.
+    for pair in list(dataset)[::25]:
+        t = pair.t
+        cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+        F = np.linalg.inv(pair.K1).T @ cross @ pair.R @ np.linalg.inv(pair.K0)
+        F /= np.linalg.norm(F)
+        assert min(np.abs(F - pair.F).max(), np.abs(F + pair.F).max()) < 1e-12
+
+
+def test_pairs_go_through_a_data_loader(tmp_path: Path) -> None:
+    dataset = FMBenchPairs(small_set(tmp_path / "S"))
+    (batch,) = DataLoader(dataset, batch_size=2, collate_fn=collate)  # type: ignore[arg-type]
+    assert batch.F.shape == (2, 3, 3)
+    assert batch.key.tolist() == [p.key for p in dataset]
+    assert batch.pairs == tuple(dataset)
+    assert collate([]).F.shape == (0, 3, 3)

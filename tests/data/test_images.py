@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from fmtorch.data import ImageError, ImageSource, read_image, to_grey
+from tests.conftest import shared_path
+
+COLOUR = np.random.default_rng(0).integers(0, 256, (37, 53, 3), dtype=np.uint8)
+
+
+def written(path: Path, image: np.ndarray, *options: int) -> Path:
+    assert cv2.imwrite(str(path), image, options)
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tiff", "a.webp"])
+def test_colour_comes_as_rgb(tmp_path: Path, name: str) -> None:
+    path = written(tmp_path / name, COLOUR[..., ::-1], *([cv2.IMWRITE_WEBP_QUALITY, 101] if "webp" in name else []))
+    np.testing.assert_array_equal(read_image(path), COLOUR)
+    np.testing.assert_array_equal(read_image(ImageSource("a", path)), COLOUR)
+    np.testing.assert_array_equal(read_image(str(path)), COLOUR)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.jpg"])
+def test_grey_stays_grey(tmp_path: Path, name: str) -> None:
+    assert read_image(written(tmp_path / name, COLOUR[..., 0])).shape == (37, 53)
+
+
+def test_depth_and_transparency_are_reduced(tmp_path: Path) -> None:
+    deep = written(tmp_path / "deep.png", COLOUR[..., 0].astype(np.uint16) * 257)
+    np.testing.assert_array_equal(read_image(deep), COLOUR[..., 0])
+    clear = written(tmp_path / "clear.png", np.dstack([COLOUR[..., ::-1], COLOUR[..., 0]]))
+    np.testing.assert_array_equal(read_image(clear), COLOUR)
+
+
+def test_to_grey_is_opencvs() -> None:
+    np.testing.assert_array_equal(to_grey(COLOUR), cv2.cvtColor(COLOUR[..., ::-1].copy(), cv2.COLOR_BGR2GRAY))
+    exact = COLOUR @ np.array([0.299, 0.587, 0.114])
+    assert np.abs(to_grey(COLOUR) - exact).max() <= 0.5 + 255 * 2.0**-14  # weights rounded to 15 bits
+    assert to_grey(COLOUR[..., 0]) is not None
+    np.testing.assert_array_equal(to_grey(COLOUR[..., 0]), COLOUR[..., 0])
+
+
+def jpeg(*options: int) -> bytes:
+    smooth = cv2.resize(COLOUR, (320, 240), interpolation=cv2.INTER_CUBIC)
+    return bytes(cv2.imencode(".jpg", smooth, options)[1])
+
+
+JPEGS = {
+    "baseline": jpeg(),
+    "progressive": jpeg(cv2.IMWRITE_JPEG_PROGRESSIVE, 1),
+    "restarts": jpeg(cv2.IMWRITE_JPEG_RST_INTERVAL, 2),
+}
+
+
+@pytest.mark.parametrize("kind", JPEGS)
+def test_truncated_jpeg_is_refused(tmp_path: Path, kind: str) -> None:
+    path, data = tmp_path / "a.jpg", JPEGS[kind]
+    path.write_bytes(data + b"\0" * 100)  # what follows the end is not ours
+    assert read_image(path).shape == (240, 320, 3)
+    for length in (len(data) - 1, len(data) - 2, len(data) // 2, 40, 3):
+        path.write_bytes(data[:length])
+        with pytest.raises(ImageError, match=r"a\.jpg: truncated JPEG"):
+            read_image(path)
+
+
+def test_a_thumbnails_end_is_not_the_images(tmp_path: Path) -> None:
+    data = JPEGS["baseline"]
+    thumbnail = b"\xff\xe1" + (len(data) + 2).to_bytes(2, "big") + data  # an application segment that holds a JPEG
+    path = tmp_path / "a.jpg"
+    path.write_bytes(data[:2] + thumbnail + data[2:])
+    assert read_image(path).shape == (240, 320, 3)
+    path.write_bytes(data[:2] + thumbnail + data[2 : len(data) // 2])
+    with pytest.raises(ImageError, match="truncated"):
+        read_image(path)
+
+
+def test_truncated_or_corrupt_png_is_refused(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.png", COLOUR)
+    data = path.read_bytes()
+    for length in (len(data) - 1, len(data) // 2, 8, 20):
+        path.write_bytes(data[:length])
+        with pytest.raises(ImageError, match=r"a\.png: truncated PNG"):
+            read_image(path)
+    broken = bytearray(data)
+    broken[len(data) // 2] ^= 1
+    path.write_bytes(broken)
+    with pytest.raises(ImageError, match=r"a\.png: corrupt PNG.*IDAT"):
+        read_image(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"), [(b"", "empty"), (b"not an image", "no image"), (None, "cannot be read")]
+)
+def test_what_is_no_image_is_named(tmp_path: Path, content: bytes | None, message: str) -> None:
+    path = tmp_path / "x.jpg"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ImageError, match=rf"x\.jpg.*{message}"):
+        read_image(path)
+    with pytest.raises(ImageError, match="cannot be read"):
+        read_image(tmp_path)
+
+
+def test_exif_orientation_only_on_demand(tmp_path: Path) -> None:
+    tiff = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0"  # orientation 6: turn by 90 degrees
+    segment = b"Exif\0\0" + tiff
+    data = JPEGS["baseline"]
+    path = tmp_path / "a.jpg"
+    path.write_bytes(data[:2] + b"\xff\xe1" + (len(segment) + 2).to_bytes(2, "big") + segment + data[2:])
+    stored = read_image(path)
+    assert stored.shape == (240, 320, 3)
+    np.testing.assert_array_equal(read_image(path, orient=True), np.rot90(stored, -1))
+
+
+def test_real_images_are_complete() -> None:
+    for relative in ("KITTI/00/Images/00000000.jpg", "Strecha/fountain-P11/Images/00000003.jpg"):
+        image = read_image(shared_path(f"data/{relative}"))
+        assert (image.ndim == 2) == relative.startswith("KITTI")

@@ -1,0 +1,199 @@
+"""The data set of rendered scenes: reproducible, resumable, its splits apart, its pairs worth matching."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import threading
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from fmtorch.data.rendered import Plan, RenderedPairs
+from fmtorch.data.rendered import generate as generation
+from fmtorch.data.rendered.cameras import fundamental
+from fmtorch.data.rendered.generate import FAMILIES, PLANS, Task, build, generate, keypoints, read, seeds
+from fmtorch.data.rendered.photographs import MATERIALS, PICTURES
+
+TINY = Plan(scenes=1, shots=3, pairs=2, scale=0.25)
+
+
+def contents(folder: Path) -> dict[str, str]:
+    files = sorted(p for p in folder.rglob("*") if p.is_file())
+    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("rendered")
+
+
+@pytest.fixture(scope="module")
+def tiny(root: Path) -> RenderedPairs:
+    return RenderedPairs(root=root, plan=TINY, workers=1)
+
+
+def test_pairs_are_complete_and_consistent(tiny: RenderedPairs, root: Path) -> None:
+    assert tiny.name == "rendered"
+    assert len(tiny) > 0
+    assert len({pair.identity for pair in tiny}) == len(tiny)
+    for pair in tiny:
+        family, split, number = pair.scene.split("-")
+        assert (family, split, number) == (pair.family, "test", "000")
+        i, j = (int(image.identity.rpartition("/")[2]) for image in (pair.image0, pair.image1))
+        assert pair.identity == f"rendered/{pair.scene}/{i}-{j}"
+        assert pair.image0.identity == f"{pair.scene}/{i}"
+        assert root in pair.image0.path.parents
+        assert pair.problem is None
+        assert all(value is not None for value in (pair.K0, pair.K1, pair.R, pair.t))
+        assert pair.F.dtype == np.float64
+        assert np.linalg.norm(pair.F) == pytest.approx(1.0)
+        cross = np.cross(np.eye(3), pair.t)  # rows e_i x t: the matrix [t]x
+        F = np.linalg.inv(pair.K1).T @ cross @ pair.R @ np.linalg.inv(pair.K0)
+        np.testing.assert_allclose(F / np.linalg.norm(F), pair.F, atol=1e-12)
+        np.testing.assert_allclose(np.linalg.svd(pair.F)[1][2], 0, atol=1e-12)
+
+
+def test_image_sizes_are_the_cameras(tiny: RenderedPairs) -> None:
+    for pair in tiny:
+        views, _ = read(pair.image0.path.parent)
+        for path, camera in views:
+            image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            assert image.shape[:2] == camera.size
+            assert (image.ndim == 2) == (pair.family == "driving")
+
+
+def test_full_scale_sizes_are_those_of_the_sets_they_stand_for() -> None:
+    sizes = {f: {s.camera.size for s in build(Task(f, "test", 0, 0, Plan(1, 6, 1))).shots} for f in FAMILIES}
+    assert sizes["indoor"] == {(480, 640)}
+    assert sizes["driving"] == {(376, 1241)}
+    assert sizes["orbit"] == {(540, 960)}
+    assert len(sizes["collection"]) > 1
+
+
+def test_what_was_drawn_is_not_drawn_again(tiny: RenderedPairs, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise AssertionError("drawn again")
+
+    monkeypatch.setattr(generation, "build", refuse)
+    again = RenderedPairs(root=root, plan=TINY, workers=1)
+    assert [pair.identity for pair in again] == [pair.identity for pair in tiny]
+    assert again.digest == tiny.digest
+
+
+def test_the_same_seed_gives_the_same_bytes_also_from_worker_processes(tmp_path: Path) -> None:
+    plan = Plan(2, 3, 2, 0.2)
+    calls: list[tuple[int, int]] = []
+    here = RenderedPairs(families=["indoor"], root=tmp_path / "a", plan=plan, workers=1)
+    there = RenderedPairs(
+        families=["indoor"], root=tmp_path / "b", plan=plan, workers=2, progress=lambda *c: calls.append(c)
+    )
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+    assert here.digest == there.digest
+    assert calls == [(0, 2), (1, 2), (2, 2)]
+
+
+def test_digest_depends_on_what_defines_the_pairs_and_not_on_the_folder(root: Path) -> None:
+    digests = {
+        generation.digest(*arguments)
+        for arguments in [
+            ("indoor", "test", 0, TINY), ("indoor", "train", 0, TINY), ("orbit", "test", 0, TINY),
+            ("indoor", "test", 1, TINY), ("indoor", "test", 0, Plan(1, 3, 2)),
+        ]
+    }  # fmt: skip
+    assert len(digests) == 5
+    assert str(root) not in "".join(digests)
+
+
+def test_an_interrupted_generation_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    task = Task("indoor", "test", 0, 0, Plan(1, 2, 1, 0.1))
+    whole = contents(generate(task, tmp_path / "whole"))
+    original = cv2.imwrite
+    count = 0
+
+    def fail(*arguments: object) -> bool:
+        nonlocal count
+        count += 1
+        return False if count == 2 else original(*arguments)  # type: ignore[call-overload]
+
+    monkeypatch.setattr(cv2, "imwrite", fail)
+    with pytest.raises(OSError, match="could not be written"):
+        generate(task, tmp_path / "broken")
+    assert contents(tmp_path / "broken") == {}  # no half a scene
+    monkeypatch.undo()
+    assert contents(generate(task, tmp_path / "broken")) == whole
+
+
+def test_two_at_once_do_not_clash(tmp_path: Path) -> None:
+    task = Task("indoor", "test", 0, 0, Plan(1, 2, 1, 0.1))
+    problems: list[BaseException] = []
+
+    def go() -> None:
+        try:
+            generate(task, tmp_path)
+        except BaseException as problem:
+            problems.append(problem)
+
+    threads = [threading.Thread(target=go) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not problems
+    assert [p.name for p in tmp_path.iterdir()] == [task.name]
+
+
+def test_splits_share_no_photograph_and_no_random_stream() -> None:
+    assert not set(PICTURES["test"]) & set(PICTURES["train"])
+    files = [set(MATERIALS[split].values()) - {""} for split in ("test", "train")]
+    assert not files[0] & files[1]
+    streams = {
+        tuple(seeds(Task(family, split, number, 0, PLANS["full", split])).generate_state(4).tolist())
+        for family in FAMILIES
+        for split in ("test", "train")
+        for number in range(PLANS["full", split].scenes)
+    }
+    assert len(streams) == len(FAMILIES) * (PLANS["full", "test"].scenes + PLANS["full", "train"].scenes)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_splits_share_no_texture(family: str) -> None:
+    def pictures(split: str, number: int) -> set[bytes]:
+        scene = build(Task(family, split, number, 0, Plan(1, 2, 1, 0.1)))
+        textures = [t.atlas for surfaces in scene.surfaces for t in surfaces.textures]
+        # Plain colours (a black case, grey metal) hold nothing that could be recognised.
+        return {t.tobytes() for t in textures if len(np.unique(t[2:-2, 2:4].reshape(-1, t.shape[2]), axis=0)) > 4}
+
+    test, train = pictures("test", 0), pictures("train", 0)
+    assert test
+    assert train
+    assert not test & train
+
+
+def test_pairs_obey_the_rule_and_images_have_keypoints(tmp_path: Path) -> None:
+    """At full scale: hundreds of keypoints, and more than 20 ratio matches near the true lines."""
+    task = Task("collection", "train", 0, 0, Plan(1, 4, 3))
+    views, pairs = read(generate(task, tmp_path))
+    found = [keypoints(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path, _ in views]
+    assert min(len(points) for points, _ in found) > 200
+    for i, j in pairs:
+        assert generation.matchable(found[i], found[j], fundamental(views[i][1], views[j][1]))
+
+
+def test_unknown_names_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="unknown families"):
+        RenderedPairs(families=["underwater"], root=tmp_path)
+    with pytest.raises(ValueError, match="no split"):
+        RenderedPairs("validation", root=tmp_path)
+
+
+def test_scene_file_holds_the_cameras_exactly(tiny: RenderedPairs) -> None:
+    folder = tiny[0].image0.path.parent
+    record = json.loads((folder / "scene.json").read_text())
+    number = int(folder.name[-3:])
+    cameras = [shot.camera for shot in build(Task(tiny[0].family, "test", number, 0, TINY)).shots]
+    for entry, camera in zip(record["cameras"], cameras, strict=True):
+        np.testing.assert_array_equal(entry["R"], camera.R)
+        np.testing.assert_array_equal(entry["t"], camera.t)

@@ -1,0 +1,292 @@
+"""Fundamental matrices from cameras, epipolar lines and distances: known answers, references, peers, laws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import kornia.geometry.epipolar as kornia_epipolar
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from fmtorch import geometry
+from tests.conftest import oracle
+from tests.reference import epipolar as reference
+
+HERZ_JESUS = (
+    [
+        [-2.217067595e-09, -9.138153805e-07, 0.0005709018672],
+        [9.838851789e-08, -2.396304636e-07, 0.005894618027],
+        [-8.165382296e-05, -0.004892109033, -0.9999704936],
+    ],
+    [[548.8669, 102.6623], [662.9686, 83.9458], [346.7056, 164.9772], [1289.713, 186.3821]],
+    [[1503.5176, 400.4516], [405.3245, 214.6125], [80.7208, 306.5314], [1149.4032, 259.1852]],
+    [  # distances in image 0 and 1, squared Sampson distance, symmetric squared distance
+        [242.1721, 259.2485, 31318.6524, 125857.1405],
+        [1.8207, 1.6234, 1.4682, 5.9503],
+        [0.7361, 0.6283, 0.2284, 0.9365],
+        [1.8030, 1.8074, 1.6293, 6.5174],
+    ],
+)
+DISTANCES = ["symmetric_mean", "symmetric_max", "symmetric_squared", "sampson", "sampson_squared"]
+
+
+def cameras(seed: int, *batch: int) -> tuple[Tensor, ...]:
+    """K0, K1, R, t of plausible photographs."""
+    g = torch.Generator().manual_seed(seed)
+    focal = 500 + 1500 * torch.rand(2, *batch, generator=g, dtype=torch.float64)
+    K = torch.zeros(2, *batch, 3, 3, dtype=torch.float64)
+    K[..., 0, 0], K[..., 1, 1], K[..., 2, 2] = focal, focal * 1.02, 1.0
+    K[..., 0, 1], K[..., 0, 2], K[..., 1, 2] = 2.0, 640.0, 360.0
+    R = torch.linalg.matrix_exp(
+        geometry.cross_matrix(torch.randn(*batch, 3, generator=g, dtype=torch.float64).mul(0.4))
+    )
+    t = torch.randn(*batch, 3, generator=g, dtype=torch.float64)
+    return K[0], K[1], R, t
+
+
+def scene(seed: int, *batch: int, n: int = 7, noise: float = 3.0) -> tuple[Tensor, Tensor, Tensor]:
+    """F and matches of random cameras, with noise in image 0."""
+    K0, K1, R, t = cameras(seed, *batch)
+    t = t + torch.tensor([0.0, 0.0, 6.0])  # keeps the points in front of camera 1
+    g = torch.Generator().manual_seed(seed + 1)
+    X0 = torch.rand(*batch, n, 3, generator=g, dtype=torch.float64) * 4 + torch.tensor([-2.0, -2.0, 4.0])
+    X1 = X0 @ R.mT + t[..., None, :]
+    x0, x1 = (p[..., :2] / p[..., 2:] for p in (X0 @ K0.mT, X1 @ K1.mT))
+    x0 = x0 + noise * torch.randn(x0.shape, generator=g, dtype=torch.float64)
+    return geometry.fundamental_from_calibration(K0, K1, R, t), x0, x1
+
+
+def up_to_sign(F: Tensor, like: Tensor) -> Tensor:
+    return F * (F * like).sum((-2, -1), keepdim=True).sign()
+
+
+def test_known_rectified_pair() -> None:
+    """Identical cameras shifted along x: lines are the rows, distances the difference in y."""
+    P0 = torch.eye(3, 4)
+    P1 = P0.clone()
+    P1[0, 3] = 1.0
+    F = geometry.fundamental_from_projections(P0, P1)
+    root = 0.5**0.5
+    torch.testing.assert_close(F, torch.tensor([[0, 0, 0], [0, 0, -root], [0, root, 0]]))
+    x0, x1 = torch.tensor([[3.0, 5.0]]), torch.tensor([[9.0, 1.0]])
+    torch.testing.assert_close(geometry.epipolar_lines(F, x0), torch.tensor([[0.0, -1.0, 5.0]]))
+    d0, d1 = geometry.epipolar_distances(F, x0, x1)
+    assert (d0.item(), d1.item()) == pytest.approx((4, 4))
+    assert geometry.sampson(F, x0, x1).item() == pytest.approx(8**0.5)
+    assert geometry.symmetric_squared(F, x0, x1).item() == pytest.approx(32)
+    assert geometry.point_to_line(x1, torch.tensor([[3.0, 4.0, -6.0]])).item() == pytest.approx(5)
+
+
+def test_known_figures_of_a_real_pair() -> None:
+    """Herz-Jesus-P8, pair 2-4, perturbed F: distances as OpenCV and kornia give them."""
+    F, x0, x1, expected = (torch.tensor(v, dtype=torch.float64) for v in HERZ_JESUS)
+    d0, d1 = geometry.epipolar_distances(F, x0, x1)
+    figures = torch.stack([d0, d1, geometry.sampson_squared(F, x0, x1), geometry.symmetric_squared(F, x0, x1)], -1)
+    # Points and figures are rounded to 1e-4: a distance of 1 px moves by up to 2e-4, its square by 4e-4.
+    torch.testing.assert_close(figures, expected, rtol=1e-5, atol=1e-3)
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (5,), (2, 3)])
+def test_matches_scalar_reference(batch: tuple[int, ...]) -> None:
+    F, x0, x1 = scene(3, *batch)
+    d0, d1 = geometry.epipolar_distances(F, x0, x1)
+    lines, sampson = geometry.epipolar_lines(F, x0), geometry.sampson(F, x0, x1)
+    mean, largest = geometry.symmetric_mean(F, x0, x1), geometry.symmetric_max(F, x0, x1)
+    for index in np.ndindex(*x0.shape[:-1]):
+        f, p0, p1 = F[index[:-1]].numpy(), x0[index].numpy(), x1[index].numpy()
+        expected = reference.epipolar_distances(f, p0, p1)
+        assert (d0[index].item(), d1[index].item()) == pytest.approx(expected, rel=1e-9)
+        assert mean[index].item() == pytest.approx(np.mean(expected), rel=1e-9)
+        assert largest[index].item() == pytest.approx(max(expected), rel=1e-9)
+        assert sampson[index].item() == pytest.approx(reference.sampson(f, p0, p1), rel=1e-9)
+        np.testing.assert_allclose(lines[index].numpy(), reference.line(f, p0), atol=1e-9)
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_projections_match_scalar_reference(batch: tuple[int, ...], dtype: torch.dtype) -> None:
+    g = torch.Generator().manual_seed(0)
+    P0, P1 = (torch.randn(*batch, 3, 4, generator=g, dtype=torch.float64).to(dtype) for _ in range(2))
+    F = geometry.fundamental_from_projections(P0, P1)
+    assert F.dtype == dtype
+    for index in np.ndindex(*batch):
+        expected = torch.from_numpy(
+            reference.fundamental_from_projections(*(P[index].double().numpy() for P in (P0, P1)))
+        )
+        # 24 products of four numbers of size one, over a norm of size one.
+        torch.testing.assert_close(
+            up_to_sign(F[index].double(), expected), expected, atol=100 * torch.finfo(dtype).eps, rtol=0
+        )
+
+
+def test_projections_of_infinite_cameras() -> None:
+    """Affine cameras have a centre at infinity: the two linear blocks of F vanish and the reference agrees."""
+    g = torch.Generator().manual_seed(1)
+    P0, P1 = (torch.randn(3, 4, generator=g, dtype=torch.float64) for _ in range(2))
+    for P in (P0, P1):
+        P[2] = torch.tensor([0.0, 0.0, 0.0, 1.0])
+    F = geometry.fundamental_from_projections(P0, P1)
+    assert F[:2, :2].abs().max() == 0
+    expected = torch.from_numpy(reference.fundamental_from_projections(P0.numpy(), P1.numpy()))
+    torch.testing.assert_close(up_to_sign(F, expected), expected, atol=1e-13, rtol=0)
+
+
+def test_calibration_and_projections_agree_in_sign_too() -> None:
+    K0, K1, R, t = cameras(5, 20)
+    P0 = torch.cat([K0, torch.zeros(20, 3, 1, dtype=torch.float64)], -1)
+    P1 = K1 @ torch.cat([R, t[..., None]], -1)
+    F = geometry.fundamental_from_calibration(K0, K1, R, t)
+    torch.testing.assert_close(F, geometry.fundamental_from_projections(P0, P1), atol=1e-12, rtol=0)
+    torch.testing.assert_close(torch.linalg.matrix_norm(F), torch.ones(20, dtype=torch.float64))
+    assert torch.linalg.det(F).abs().max() < 1e-15
+
+
+def test_projections_of_one_centre_give_zero_with_finite_gradients() -> None:
+    P0 = torch.eye(3, 4, requires_grad=True)
+    F = geometry.fundamental_from_projections(P0, torch.cat([2 * torch.eye(3), torch.zeros(3, 1)], -1))
+    F.sum().backward()
+    assert F.abs().max() == 0
+    assert P0.grad is not None
+    assert P0.grad.isfinite().all()
+
+
+def test_projections_oracle() -> None:
+    file = oracle("fundamental_from_projections.npz")
+    F = geometry.fundamental_from_projections(torch.from_numpy(file["P1"]), torch.from_numpy(file["P2"]))
+    kornia = geometry.unit_frobenius(torch.from_numpy(file["F_kornia"]))
+    torch.testing.assert_close(up_to_sign(F, kornia), kornia, atol=1e-13, rtol=0)
+    gt = torch.from_numpy(file["F_gt"])  # from R, t of six digits
+    torch.testing.assert_close(up_to_sign(F, gt), gt, atol=2e-5, rtol=0)
+
+
+def test_distances_oracle() -> None:
+    file = oracle("epipolar_distances.npz")
+    for case in range(len(file["names"])):
+        get = {k[4:]: torch.from_numpy(v) for k, v in file.items() if k.startswith(f"{case:03d}.")}
+        F, x0, x1 = get["F"], get["X1"], get["X2"]
+        d0, d1 = geometry.epipolar_distances(F, x0, x1)
+        # The residual cancels from terms of about 1e3 px: absolute errors of 1e3 * 2e-16 * 10 in a distance.
+        tight = {"rtol": 1e-9, "atol": 1e-11}
+        torch.testing.assert_close(d1, get["left_to_right_kornia"], **tight)
+        torch.testing.assert_close(d0, get["right_to_left_kornia"], **tight)
+        torch.testing.assert_close(geometry.sampson_squared(F, x0, x1), get["sampson_sq_opencv"], **tight)
+        torch.testing.assert_close(geometry.sampson_squared(F, x0, x1), get["sampson_sq_kornia"], **tight)
+        torch.testing.assert_close(geometry.symmetric_squared(F, x0, x1), get["symmetric_sq_kornia"], **tight)
+        torch.testing.assert_close(geometry.epipolar_lines(F, x0), get["lines_in_2_opencv"], **tight)
+        torch.testing.assert_close(geometry.epipolar_lines(F.mT, x1), get["lines_in_1_opencv"], **tight)
+
+
+def test_agrees_with_opencv_and_kornia() -> None:
+    F, x0, x1 = scene(11, 4, n=30)
+    for f, p0, p1 in zip(F, x0, x1, strict=True):
+        for which, points, matrix in ((1, p0, f), (2, p1, f.mT)):
+            expected = cv2.computeCorrespondEpilines(points.numpy()[:, None], which, f.numpy())[:, 0]
+            np.testing.assert_allclose(geometry.epipolar_lines(matrix, points).numpy(), expected, atol=1e-9)
+    peers: dict[str, Callable[..., Tensor]] = {
+        "sampson_squared": kornia_epipolar.sampson_epipolar_distance,
+        "symmetric_squared": kornia_epipolar.symmetrical_epipolar_distance,
+    }
+    for name, peer in peers.items():
+        torch.testing.assert_close(getattr(geometry, name)(F, x0, x1), peer(x0, x1, F, eps=0.0), rtol=1e-9, atol=1e-11)
+
+
+def test_algebraic_is_signed_and_scales_with_F() -> None:
+    F, x0, x1 = scene(2)
+    e = geometry.algebraic(F, x0, x1)
+    ones = torch.ones(len(x0), 1, dtype=torch.float64)
+    expected = torch.einsum("ni,ij,nj->n", torch.cat([x1, ones], -1), F, torch.cat([x0, ones], -1))
+    torch.testing.assert_close(e, expected, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(geometry.algebraic(-3 * F, x0, x1), -3 * e)
+
+
+@settings(max_examples=30, deadline=None)
+@given(exponent=st.floats(-30, 30), negative=st.booleans(), seed=st.integers(0, 100))
+def test_distances_ignore_scale_and_sign(exponent: float, negative: bool, seed: int) -> None:
+    F, x0, x1 = scene(seed)
+    scaled = F * 10**exponent * (-1 if negative else 1)
+    for name in DISTANCES:
+        function = getattr(geometry, name)
+        torch.testing.assert_close(function(scaled, x0, x1), function(F, x0, x1), rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("name", DISTANCES)
+def test_transposition_exchanges_the_images(name: str) -> None:
+    F, x0, x1 = scene(4, 3)
+    function = getattr(geometry, name)
+    torch.testing.assert_close(function(F, x0, x1), function(F.mT, x1, x0), rtol=1e-9, atol=1e-11)
+
+
+def random_inputs(*shapes: tuple[int, ...]) -> list[Tensor]:
+    """Numbers of size one, for finite differences."""
+    g = torch.Generator().manual_seed(0)
+    return [torch.randn(*shape, generator=g, dtype=torch.float64).requires_grad_() for shape in shapes]
+
+
+@pytest.mark.parametrize("name", [*DISTANCES, "algebraic"])
+def test_gradcheck(name: str) -> None:
+    assert torch.autograd.gradcheck(getattr(geometry, name), random_inputs((2, 3, 3), (2, 3, 2), (2, 3, 2)))
+
+
+def test_gradcheck_of_lines_and_cameras() -> None:
+    check = torch.autograd.gradcheck
+    assert check(geometry.epipolar_lines, random_inputs((2, 3, 3), (2, 3, 2)))
+    assert check(geometry.point_to_line, random_inputs((2, 3, 2), (2, 3, 3)))
+    assert check(geometry.fundamental_from_calibration, random_inputs((2, 3, 3), (2, 3, 3), (2, 3, 3), (2, 3)))
+    assert check(geometry.fundamental_from_projections, random_inputs((2, 3, 4), (2, 3, 4)))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_epipole_and_exact_matches_have_finite_values_and_gradients(dtype: torch.dtype) -> None:
+    """Point 0 is the epipole in both images, point 1 lies exactly on its line, point 2 is off it."""
+    F = geometry.cross_matrix(torch.tensor([0.0, 0.0, 1.0], dtype=dtype)).requires_grad_()  # x1 ~ x0, epipoles (0, 0)
+    x0 = torch.tensor([[0.0, 0.0], [3.0, 4.0], [3.0, 4.0]], dtype=dtype, requires_grad=True)
+    x1 = torch.tensor([[0.0, 0.0], [6.0, 8.0], [6.0, 9.0]], dtype=dtype, requires_grad=True)
+    for name in DISTANCES:
+        d = getattr(geometry, name)(F, x0, x1)
+        assert d[:2].tolist() == [0, 0]
+        assert d[2] > 0
+        for gradient in torch.autograd.grad(d.sum(), [F, x0, x1]):
+            assert gradient.isfinite().all()
+    assert geometry.epipolar_lines(F, x0)[0].tolist() == [0, 0, 0]
+
+
+def test_a_bad_pair_leaves_its_neighbours_alone() -> None:
+    """Bit-equal alone, in a batch, and beside NaN, infinite and zero matrices; their gradients stay finite."""
+    F, x0, x1 = scene(8, 7, n=13)
+    bad = torch.stack([F[0] * torch.nan, F[0] * torch.inf, F[0] * 0])
+    mixed = torch.cat([bad, F]).requires_grad_()
+    points0, points1 = (torch.cat([x[:3], x]) for x in (x0, x1))
+    for name in [*DISTANCES, "algebraic"]:
+        function = getattr(geometry, name)
+        alone = torch.cat([function(F[i : i + 1], x0[i : i + 1], x1[i : i + 1]) for i in range(7)])
+        assert torch.equal(function(F, x0, x1), alone)
+        together = function(mixed, points0, points1)
+        assert torch.equal(together[3:], alone)
+        assert torch.autograd.grad(together[2:].sum(), mixed)[0][2:].isfinite().all()
+    for cut in (1, 5, 13):
+        assert torch.equal(geometry.sampson(F, x0[:, :cut], x1[:, :cut]), geometry.sampson(F, x0, x1)[:, :cut])
+    K0, K1, R, t = cameras(8, 7)
+    t = t.index_put((torch.tensor([2]),), torch.tensor(torch.nan, dtype=t.dtype))
+    Fs = geometry.fundamental_from_calibration(K0, K1, R, t)
+    for i in (0, 1, 3, 6):
+        assert torch.equal(Fs[i], geometry.fundamental_from_calibration(K0[i], K1[i], R[i], t[i]))
+
+
+def test_float32_distances() -> None:
+    """An error of a few rounding units in every term of the residual and of the normal, and no more."""
+    F, x0, x1 = (v.float() for v in scene(9, 5, n=40))
+    _, single = geometry.epipolar_distances(F, x0, x1)
+    F, x0, x1 = F.double(), x0.double(), x1.double()
+    _, exact = geometry.epipolar_distances(F, x0, x1)
+    ones = torch.ones_like(x0[..., :1])
+    p0, p1 = torch.cat([x0, ones], -1), torch.cat([x1, ones], -1)
+    normal = (p0 @ F.mT)[..., :2].norm(dim=-1)
+    terms = p0.abs() @ F.abs().mT
+    bound = ((p1.abs() * terms).sum(-1) + exact * terms[..., :2].norm(dim=-1)) / normal
+    assert single.dtype == torch.float32
+    assert ((single - exact).abs() <= 8 * torch.finfo(torch.float32).eps * bound).all()

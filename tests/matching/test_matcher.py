@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from fmtorch.matching import NearestNeighborMatcher, nearest_neighbors
+from fmtorch.types import Features, collate
+
+
+def features(seed: int, n: int) -> Features:
+    generator = torch.Generator().manual_seed(seed)
+    return Features(
+        lafs=100 * torch.rand(n, 2, 3, generator=generator),
+        scores=torch.rand(n, generator=generator),
+        descriptors=torch.randint(0, 60, (n, 32), generator=generator).float(),
+        image_size=torch.tensor([100 + seed, 200]),
+    )
+
+
+def test_slots_are_the_features_of_image_0() -> None:
+    f0, f1 = features(1, 9), features(2, 7)
+    found = nearest_neighbors(f0.descriptors, f1.descriptors)
+    matches = NearestNeighborMatcher()(f0, f1)
+    assert torch.equal(matches.x0[0], f0.keypoints)
+    assert torch.equal(matches.x1[0], f1.keypoints[found.nearest])
+    assert torch.equal(matches.lafs1[0], f1.lafs[found.nearest])
+    assert torch.equal(matches.quality[0], found.ratio)
+    assert matches.mask.all()
+    assert matches.size0.tolist() == [[101, 200]]
+    assert matches.size1.tolist() == [[102, 200]]
+
+
+def test_mutual_masks_one_sided_matches() -> None:
+    f0, f1 = features(1, 30), features(2, 20)
+    found = nearest_neighbors(f0.descriptors, f1.descriptors)
+    assert torch.equal(NearestNeighborMatcher(mutual=True)(f0, f1).mask[0], found.mutual)
+
+
+@pytest.mark.parametrize("mutual", [False, True])
+def test_neighbours_and_padding_are_invisible(mutual: bool) -> None:
+    pairs = [(features(1, 9), features(2, 7)), (features(3, 0), features(4, 4)), (features(5, 6), features(6, 0))]
+    matcher = NearestNeighborMatcher(mutual=mutual)
+    together = matcher(collate([f0 for f0, _ in pairs]), collate([f1 for _, f1 in pairs]))
+    for b, (f0, f1) in enumerate(pairs):
+        alone, row = matcher(f0, f1), together[b]
+        n = len(f0)
+        assert torch.equal(row.mask[:, :n], alone.mask)
+        assert not row.mask[:, n:].any()
+        for name in ("x0", "x1", "quality", "lafs0", "lafs1"):
+            assert torch.equal(getattr(row, name)[:, :n], getattr(alone, name))
+    assert together.mask.any(-1).tolist() == [True, False, False]
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    with pytest.raises(ValueError, match="do not fit"):
+        NearestNeighborMatcher()(collate([features(1, 3)]), features(2, 3))

@@ -1,0 +1,147 @@
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from fmtorch.matching import Neighbors, nearest_neighbors
+from tests.conftest import oracle
+from tests.reference.matching import two_nearest
+
+
+def sift_like(seed: int, n: int, d: int = 128, top: int = 60) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randint(0, top, (n, d), generator=generator).float()
+
+
+def unit(seed: int, n: int, d: int = 128) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.nn.functional.normalize(torch.randn(n, d, generator=generator), dim=-1)
+
+
+def assert_same(a: Neighbors, b: Neighbors) -> None:
+    for left, right in zip(a, b, strict=True):
+        assert torch.equal(left, right)
+
+
+def assert_is_reference(found: Neighbors, d0: Tensor, d1: Tensor, tolerance: float) -> None:
+    index, first, second = two_nearest(d0.numpy(), d1.numpy())
+    reverse = two_nearest(d1.numpy(), d0.numpy())[0]
+    np.testing.assert_array_equal(found.nearest.numpy(), index)
+    np.testing.assert_array_equal(found.reverse.numpy(), reverse)
+    np.testing.assert_allclose(found.distance.numpy(), first, rtol=tolerance, atol=tolerance)
+    np.testing.assert_allclose(found.second.numpy(), second, rtol=tolerance, atol=tolerance)
+
+
+# Distances are rounded once to float32 (2^-24); real-valued unit vectors lie on a grid of 2^-25, which moves a
+# distance by at most sqrt(128) 2^-25 = 3.4e-7.
+@pytest.mark.parametrize(("n0", "n1"), [(1, 1), (1, 2), (5, 1), (70, 33), (130, 257), (64, 64)])
+def test_equals_the_definition_on_whole_numbers(n0: int, n1: int) -> None:
+    d0, d1 = sift_like(1, n0), sift_like(2, n1)
+    assert_is_reference(nearest_neighbors(d0, d1), d0, d1, 2.0**-23)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-20, 1e15])
+def test_equals_the_definition_on_real_numbers(scale: float) -> None:
+    d0, d1 = scale * unit(3, 90), scale * unit(4, 75)
+    index, first, second = two_nearest(d0.numpy(), d1.numpy())
+    found = nearest_neighbors(d0, d1)
+    np.testing.assert_array_equal(found.nearest.numpy(), index)
+    np.testing.assert_allclose(found.distance.numpy() / scale, first / scale, atol=5e-7)
+    np.testing.assert_allclose(found.second.numpy() / scale, second / scale, atol=5e-7)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.lists(st.integers(0, 2), min_size=2, max_size=2), max_size=40),
+    st.lists(st.lists(st.integers(0, 2), min_size=2, max_size=2), max_size=40),
+    st.integers(1, 9),
+)
+def test_ties_go_to_the_lowest_index(rows: list[list[int]], columns: list[list[int]], chunk: int) -> None:
+    d0, d1 = torch.tensor(rows).reshape(-1, 2).float(), torch.tensor(columns).reshape(-1, 2).float()
+    assert_is_reference(nearest_neighbors(d0, d1, chunk=chunk), d0, d1, 2.0**-23)
+
+
+@pytest.mark.parametrize("make", [sift_like, unit])
+def test_chunk_batch_and_padding_are_invisible(make: object) -> None:
+    sizes = [(70, 40), (3, 90), (0, 5), (5, 0), (64, 1)]
+    pairs = [(make(2 * i, n0), make(2 * i + 1, n1)) for i, (n0, n1) in enumerate(sizes)]  # type: ignore[operator]
+    alone = [nearest_neighbors(d0, d1) for d0, d1 in pairs]
+    for (d0, d1), expected in zip(pairs, alone, strict=True):
+        for chunk in (1, 7, 1000):
+            assert_same(nearest_neighbors(d0, d1, chunk=chunk), expected)
+
+    garbage = [math.nan, math.inf, 1e30]
+    batch0, batch1 = torch.empty(len(pairs), 100, 128), torch.empty(len(pairs), 100, 128)
+    mask0, mask1 = torch.zeros(len(pairs), 100, dtype=torch.bool), torch.zeros(len(pairs), 100, dtype=torch.bool)
+    for b, (d0, d1) in enumerate(pairs):
+        batch0[b], batch1[b] = garbage[b % 3], garbage[(b + 1) % 3]
+        batch0[b, 4 : 4 + len(d0)], mask0[b, 4 : 4 + len(d0)] = d0, True
+        batch1[b, : len(d1)], mask1[b, : len(d1)] = d1, True
+    together = nearest_neighbors(batch0, batch1, mask0, mask1)
+    for b, (expected, (d0, d1)) in enumerate(zip(alone, pairs, strict=True)):
+        assert torch.equal(together.nearest[b, 4 : 4 + len(d0)], expected.nearest)
+        assert torch.equal(together.distance[b, 4 : 4 + len(d0)], expected.distance)
+        assert torch.equal(together.second[b, 4 : 4 + len(d0)], expected.second)
+        shifted = torch.where(expected.reverse >= 0, expected.reverse + 4, -1)
+        assert torch.equal(together.reverse[b, : len(d1)], shifted)
+        assert (together.nearest[b][~mask0[b]] == -1).all()
+        assert (together.reverse[b][~mask1[b]] == -1).all()
+
+
+def test_leading_dimensions() -> None:
+    d0, d1 = sift_like(1, 6 * 10).reshape(2, 3, 10, 128), sift_like(2, 6 * 11).reshape(2, 3, 11, 128)
+    found = nearest_neighbors(d0, d1)
+    assert found.nearest.shape == (2, 3, 10)
+    assert found.reverse.shape == (2, 3, 11)
+    assert torch.equal(found.nearest[1, 2], nearest_neighbors(d0[1, 2], d1[1, 2]).nearest)
+    assert nearest_neighbors(d0[:0], d1[:0]).nearest.shape == (0, 3, 10)
+
+
+def test_a_descriptor_that_is_not_finite_has_no_neighbour_and_is_none() -> None:
+    d0, d1 = sift_like(1, 5), sift_like(2, 5)
+    d0[2, 7], d1[int(nearest_neighbors(d0, d1).nearest[0])] = math.nan, math.inf
+    found = nearest_neighbors(d0, d1)
+    assert found.nearest[2] == -1
+    assert torch.isfinite(found.distance[[0, 1, 3, 4]]).all()
+    assert not (found.reverse == 2).any()
+
+
+def test_ratio_says_nothing_where_there_is_nothing_to_compare() -> None:
+    d0 = torch.tensor([[0.0, 0.0], [3.0, 4.0]])
+    assert nearest_neighbors(d0, d0[:1]).ratio.tolist() == [1.0, 1.0]  # a single candidate
+    assert nearest_neighbors(d0, d0[[0, 0]]).ratio.tolist() == [1.0, 1.0]  # two identical candidates
+    assert nearest_neighbors(d0, d0[:0]).ratio.tolist() == [1.0, 1.0]  # none
+    assert nearest_neighbors(d0, d0).ratio.tolist() == [0.0, 0.0]
+    assert nearest_neighbors(d0, torch.tensor([[6.0, 8.0], [0.0, 2.0]])).ratio[0] == pytest.approx(0.2)
+
+
+def test_mutual_is_symmetric() -> None:
+    d0, d1 = unit(5, 80), unit(6, 70)
+    forward, backward = nearest_neighbors(d0, d1), nearest_neighbors(d1, d0)
+    pairs = {(i, int(forward.nearest[i])) for i in forward.mutual.nonzero()[:, 0].tolist()}
+    assert pairs == {(int(backward.nearest[j]), j) for j in backward.mutual.nonzero()[:, 0].tolist()}
+    assert len(pairs) > 5
+
+
+def test_equals_opencv_on_real_descriptors() -> None:
+    file = oracle("sift.npz")
+    d0, d1 = file["000.default.desc"].astype(np.float32), file["001.default.desc"].astype(np.float32)
+    expected = cv2.BFMatcher(cv2.NORM_L2).knnMatch(d0, d1, 2)
+    found = nearest_neighbors(torch.from_numpy(d0), torch.from_numpy(d1))
+    assert found.nearest.tolist() == [m[0].trainIdx for m in expected]
+    np.testing.assert_array_equal(found.distance, np.float32([m[0].distance for m in expected]))
+    np.testing.assert_array_equal(found.second, np.float32([m[1].distance for m in expected]))
+    crossed = {(m.queryIdx, m.trainIdx) for m in cv2.BFMatcher(cv2.NORM_L2, crossCheck=True).match(d0, d1)}
+    assert crossed == {(i, int(found.nearest[i])) for i in found.mutual.nonzero()[:, 0].tolist()}
+
+
+def test_chunk_must_be_positive() -> None:
+    with pytest.raises(ValueError, match="chunk"):
+        nearest_neighbors(unit(1, 3), unit(2, 3), chunk=0)

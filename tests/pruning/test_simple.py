@@ -1,0 +1,111 @@
+"""Ratio, mutual, one-to-one."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from torch import Tensor
+
+from fmtorch.matching import nearest_neighbors
+from fmtorch.pruning import OneToOne, RatioTest, mutual, one_to_one, ratio_test
+from fmtorch.types import Correspondences
+from tests.reference.matching import one_to_one as one_to_one_reference
+
+
+def test_ratio_is_strict_and_refuses_nan() -> None:
+    quality = torch.tensor([[0.0, 0.79, 0.8, 1.0, math.nan]])
+    assert ratio_test(quality, 0.8).tolist() == [[True, True, False, False, False]]
+    assert ratio_test(quality, 0.8, torch.tensor([[False, True, True, True, True]])).sum() == 1
+
+
+def test_mutual_agrees_with_the_matcher() -> None:
+    generator = torch.Generator().manual_seed(0)
+    d0, d1 = torch.rand(2, 40, 8, generator=generator), torch.rand(2, 30, 8, generator=generator)
+    mask0, mask1 = torch.rand(2, 40, generator=generator) < 0.8, torch.rand(2, 30, generator=generator) < 0.8
+    found = nearest_neighbors(d0, d1, mask0, mask1)
+    assert torch.equal(mutual(found.nearest, found.reverse), found.mutual)
+    garbage = torch.where(mask0, found.nearest, 10**9)
+    assert torch.equal(mutual(garbage, found.reverse, mask0), found.mutual)
+    assert not mutual(found.nearest, found.reverse[:, :0]).any()
+
+
+def grid_points(n: int) -> st.SearchStrategy[np.ndarray]:
+    return arrays(np.float32, (n, 2), elements=st.sampled_from([0.0, -0.0, 0.1, 1.5]))
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.data(), st.integers(0, 12))
+def test_one_to_one_equals_the_definition(data: st.DataObject, n: int) -> None:
+    x0, x1 = data.draw(grid_points(n)), data.draw(grid_points(n))
+    quality = data.draw(arrays(np.float32, (n,), elements=st.sampled_from([0.25, 0.5, math.inf])))
+    found = one_to_one(*(torch.from_numpy(a)[None] for a in (x0, x1, quality)))
+    np.testing.assert_array_equal(found[0], one_to_one_reference(x0, x1, quality))
+
+
+def duplicated(seed: int, n: int, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor, Tensor]:
+    """Points drawn from few locations, so that most locations repeat; no two qualities are equal."""
+    generator = torch.Generator().manual_seed(seed)
+    places = 100 * torch.rand(2, max(n // 3, 1), 2, generator=generator, dtype=dtype)
+    pick = torch.randint(0, places.shape[1], (2, n), generator=generator)
+    quality = torch.randperm(n, generator=generator).to(dtype) / max(n, 1)
+    return places[0, pick[0]], places[1, pick[1]], quality
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_one_to_one_is_symmetric_and_independent_of_order(dtype: torch.dtype) -> None:
+    x0, x1, quality = (a[None] for a in duplicated(0, 200, dtype))
+    kept = one_to_one(x0, x1, quality)
+    assert 0 < kept.sum() < 200
+    assert torch.equal(kept, one_to_one(x1, x0, quality))
+    order = torch.randperm(200, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(kept[:, order], one_to_one(x0[:, order], x1[:, order], quality[:, order]))
+    for x in (x0, x1):
+        assert len(torch.unique(x[kept], dim=0)) == kept.sum()
+
+
+def test_one_to_one_tells_apart_the_closest_floats() -> None:
+    x0 = torch.tensor([[[1.0, 2.0], [math.nextafter(1.0, 2.0), 2.0]]], dtype=torch.float64)
+    x1 = torch.tensor([[[1.0, 2.0], [5.0, 2.0]]], dtype=torch.float64)
+    assert one_to_one(x0, x1, torch.zeros(1, 2).double()).all()
+
+
+def test_one_to_one_does_not_see_padding_or_neighbours() -> None:
+    sizes = [50, 0, 1, 31]
+    items = [duplicated(i, n) for i, n in enumerate(sizes)]
+    x0, x1 = torch.full((4, 60, 2), math.nan), torch.zeros(4, 60, 2)
+    quality, mask = torch.full((4, 60), -math.inf), torch.zeros(4, 60, dtype=torch.bool)
+    for b, (a0, a1, q) in enumerate(items):
+        slots = torch.arange(len(q)) + 5
+        x1[b] = a1[0] if len(a1) else 0.0  # padding that lies where real matches lie, with the best quality
+        x0[b, slots], x1[b, slots], quality[b, slots], mask[b, slots] = a0, a1, q, True
+    together = one_to_one(x0, x1, quality, mask)
+    assert not together[~mask].any()
+    for b, (a0, a1, q) in enumerate(items):
+        assert torch.equal(together[b, 5 : 5 + len(q)], one_to_one(a0[None], a1[None], q[None])[0])
+
+
+def test_one_to_one_drops_what_has_no_location_and_ranks_nan_quality_last() -> None:
+    x0 = torch.tensor([[[math.nan, 0.0], [math.inf, 0.0], [1.0, 1.0], [1.0, 1.0]]])
+    x1 = torch.arange(8.0).reshape(1, 4, 2)
+    quality = torch.tensor([[0.0, 0.0, math.nan, 0.9]])
+    assert one_to_one(x0, x1, quality).tolist() == [[False, False, False, True]]
+
+
+def test_stages_need_a_quality_and_keep_the_rest() -> None:
+    x0, x1, quality = (a[None] for a in duplicated(0, 20))
+    mask = torch.ones(1, 20, dtype=torch.bool)
+    for stage, expected in (
+        (RatioTest(0.5), ratio_test(quality, 0.5)),
+        (OneToOne(), one_to_one(x0, x1, quality)),
+    ):
+        out = stage(Correspondences(x0, x1, mask, quality))
+        assert torch.equal(out.mask, expected)
+        assert torch.equal(out.x0, x0)
+        with pytest.raises(ValueError, match="quality"):
+            stage(Correspondences(x0, x1, mask))

@@ -1,0 +1,48 @@
+"""Locality preserving matching (Ma et al., IJCV 2019), one match at a time, for one pair."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+
+def nearest(query: np.ndarray, points: np.ndarray, members: list[int], count: int) -> list[int]:
+    """The `count` members nearest to the query, ties by index; fewer where there are fewer."""
+    return sorted(members, key=lambda j: (float(((points[j] - query) ** 2).sum()), j))[:count]
+
+
+def cost(i: int, x: np.ndarray, y: np.ndarray, members: list[int], K: int, tau: float) -> float:
+    """Sum over the three scales of the share of neighbours that are lost or move otherwise."""
+    around_x, around_y = nearest(x[i], x, members, K + 3), nearest(y[i], y, members, K + 3)
+    total = 0.0
+    for scale, size in enumerate((K + 2, K, K - 2)):
+        near_x, near_y = around_x[1 + scale : K + 3 - scale], around_y[1 + scale : K + 3 - scale]
+        common = [j for j in near_x if j in near_y]
+        total += (size - len(common) + sum(differs(y[i] - x[i], y[j] - x[j], tau) for j in common)) / size
+    return total
+
+
+def differs(v: np.ndarray, w: np.ndarray, tau: float) -> bool:
+    """Whether two motions differ in direction and length; motions of length zero never do."""
+    v2, w2 = float((v**2).sum()), float((w**2).sum())
+    if v2 == 0 or w2 == 0:
+        return False
+    cosine = float(v @ w) / math.sqrt(v2 * w2)
+    return cosine * min(v2, w2) / max(v2, w2) < tau
+
+
+def lpm(
+    x: np.ndarray,
+    y: np.ndarray,
+    thresholds: tuple[float, float] = (0.8, 0.5),
+    neighbors: tuple[int, int] = (6, 6),
+    taus: tuple[float, float] = (0.2, 0.2),
+) -> np.ndarray:
+    """Two passes; in the second the neighbours are sought among the matches that the first kept."""
+    members = list(range(len(x)))
+    for passing, (threshold, K, tau) in enumerate(zip(thresholds, neighbors, taus, strict=True)):
+        if passing == 1 and len(members) < K + 4:
+            break
+        members = [i for i in range(len(x)) if cost(i, x, y, members, K, tau) / 3 <= threshold]
+    return np.isin(np.arange(len(x)), members)

@@ -1,0 +1,26 @@
+"""Nearest neighbours and one match per location, one match at a time, from their definitions."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def two_nearest(descriptors0: np.ndarray, descriptors1: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """For every descriptor of image 0: index of the nearest (lowest on ties), distance to it and to the second."""
+    index, first, second = [], [], []
+    for descriptor in descriptors0.astype(np.float64):
+        distances = [float(np.linalg.norm(descriptor - other)) for other in descriptors1.astype(np.float64)]
+        order = sorted(range(len(distances)), key=lambda j: (distances[j], j))
+        index.append(order[0] if order else -1)
+        first.append(distances[order[0]] if order else np.inf)
+        second.append(distances[order[1]] if len(order) > 1 else np.inf)
+    return np.array(index, int), np.array(first), np.array(second)
+
+
+def one_to_one(x0: np.ndarray, x1: np.ndarray, quality: np.ndarray) -> np.ndarray:
+    """A match is kept unless another at its location in either image is better: lower quality, then lower index."""
+    kept = []
+    for i in range(len(x0)):
+        rivals = [j for j in range(len(x0)) if (x0[i] == x0[j]).all() or (x1[i] == x1[j]).all()]
+        kept.append(all((quality[i], i) <= (quality[j], j) for j in rivals))
+    return np.array(kept, bool)

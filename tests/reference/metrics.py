@@ -1,0 +1,155 @@
+"""The metrics for one pair and one draw at a time, written from the definitions; random numbers are arguments."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+from scipy.integrate import trapezoid
+
+
+def homogeneous(x: np.ndarray) -> np.ndarray:
+    return np.array([x[0], x[1], 1.0])
+
+
+def distance(x: np.ndarray, line: np.ndarray, offset: float = 0.0) -> float:
+    """Distance of a point from a line; `offset` is what the released evaluator adds to the length of the normal."""
+    with np.errstate(all="ignore"):
+        return float(abs(line @ homogeneous(x)) / (math.sqrt(line[0] ** 2 + line[1] ** 2) + offset))
+
+
+def border_points(line: np.ndarray, size: np.ndarray, origin: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """Where a line enters and leaves an image, seen along its direction (b, -a); None where it misses."""
+    a, b, c = line
+    low, high = origin, origin + np.array([size[1], size[0]])
+    points = [(x, -(a * x + c) / b) for x in (low, high[0]) if b != 0] + [
+        (-(b * y + c) / a, y) for y in (low, high[1]) if a != 0
+    ]
+    points = [np.array(p) for p in points if low <= p[0] <= high[0] and low <= p[1] <= high[1]]
+    if len(points) < 2:
+        return None
+    points.sort(key=lambda p: float(p @ np.array([b, -a])))
+    return points[0], points[-1]
+
+
+def half_draw(
+    F: np.ndarray, F_other: np.ndarray, size0: np.ndarray, size1: np.ndarray, u: np.ndarray
+) -> tuple[float, float] | None:
+    """A match exact for F and its distances from the lines of F_other in images 0 and 1."""
+    m = np.array([u[0] * size0[1] - 0.5, u[1] * size0[0] - 0.5])
+    ends = border_points(F @ homogeneous(m), size1, -0.5)
+    if ends is None:
+        return None
+    m1 = ends[0] + u[2] * (ends[1] - ends[0])
+    return distance(m, F_other.T @ homogeneous(m1)), distance(m1, F_other @ homogeneous(m))
+
+
+def nsgd(
+    F_gt: np.ndarray, F_est: np.ndarray, size0: np.ndarray, size1: np.ndarray, uniforms: np.ndarray, samples: int
+) -> tuple[float, float, int]:
+    """SGD, NSGD (both uncapped) and the number of draws accepted, from uniform numbers (tries, 6)."""
+    pixels, diagonals = [], []
+    for u in uniforms:
+        first = half_draw(F_gt, F_est, size0, size1, u[:3])
+        second = half_draw(F_est, F_gt, size0, size1, u[3:])
+        if first is None or second is None:
+            continue
+        d0, d1 = first[0] + second[0], first[1] + second[1]
+        pixels.append((d0 + d1) / 4)
+        diagonals.append((d0 / math.hypot(*size0) + d1 / math.hypot(*size1)) / 4)
+        if len(pixels) == samples:
+            break
+    if not pixels:
+        return (math.hypot(*size0) + math.hypot(*size1)) / 2, 1.0, 0
+    return float(np.mean(pixels)), float(np.mean(diagonals)), len(pixels)
+
+
+def half_draw_released(
+    F: np.ndarray, F_other: np.ndarray, size0: np.ndarray, size1: np.ndarray, u: np.ndarray
+) -> float | None:
+    m = np.array([np.round(u[0] * size0[1]), np.round(u[1] * size0[0])])
+    a, b, c = line = np.array([row[0] * m[0] + row[1] * m[1] + row[2] for row in F])
+    ends = border_points(line, size1, 0.5)
+    if ends is None:
+        return None
+    x = ends[0][0] + u[2] * (ends[1][0] - ends[0][0])
+    with np.errstate(all="ignore"):
+        m1 = np.array([x, np.float64(-(a * x + c)) / np.float64(b)])
+        d1 = distance(m1, F_other @ homogeneous(m), 1e-10) / math.hypot(*size1)
+        d0 = distance(m, F_other.T @ homogeneous(m1), 1e-10) / math.hypot(*size0)
+    return (d0 + d1) / 2
+
+
+def nsgd_released(
+    F_gt: np.ndarray, F_est: np.ndarray, size0: np.ndarray, size1: np.ndarray, uniforms: np.ndarray, samples: int
+) -> float:
+    """The released evaluator: sizes exchanged with the matrices, the sum divided by `samples`, NaN capped to 1."""
+    total, accepted = 0.0, 0
+    for u in uniforms:
+        first = half_draw_released(F_gt, F_est, size0, size1, u[:3])
+        second = half_draw_released(F_est, F_gt, size1, size0, u[3:])
+        if first is None or second is None:
+            continue
+        total, accepted = total + (first + second) / 2, accepted + 1
+        if accepted == samples:
+            break
+    return total / samples if total / samples < 1 else 1.0
+
+
+def inlier_rate(
+    F_gt: np.ndarray,
+    x0: np.ndarray,
+    x1: np.ndarray,
+    inliers: np.ndarray,
+    mask: np.ndarray,
+    size0: np.ndarray,
+    size1: np.ndarray,
+    threshold: float = 0.003,
+) -> tuple[float, float]:
+    """Shares of ground-truth inliers among the matches, and among those kept."""
+    before, after = [], []
+    for p0, p1, kept, given in zip(x0, x1, inliers, mask, strict=True):
+        if not given:
+            continue
+        d1 = distance(p1, F_gt @ homogeneous(p0))
+        d0 = distance(p0, F_gt.T @ homogeneous(p1))
+        correct = d0 < threshold * math.hypot(*size0) and d1 < threshold * math.hypot(*size1)
+        before.append(correct)
+        if kept:
+            after.append(correct)
+    return tuple(sum(s) / len(s) if s else math.nan for s in (before, after))  # type: ignore[return-value]
+
+
+def recall(nsgd: np.ndarray, threshold: float) -> float:
+    return sum(1 for e in nsgd if e < threshold) / len(nsgd)
+
+
+def mean_recall(nsgd: np.ndarray, maximum: float) -> float:
+    """Area under the step curve of recall, piece by piece between the sorted errors."""
+    edges = [0.0, *sorted(e for e in nsgd if e < maximum), maximum]
+    return sum(recall(nsgd, high) * (high - low) for low, high in itertools.pairwise(edges)) / maximum
+
+
+def rotation_angle(R0: np.ndarray, R1: np.ndarray) -> float:
+    """Degrees, as SuperGlue and LoFTR compute it."""
+    return float(np.rad2deg(np.abs(np.arccos(np.clip((np.trace(R0.T @ R1) - 1) / 2, -1.0, 1.0)))))
+
+
+def direction_angle(t0: np.ndarray, t1: np.ndarray) -> float:
+    """Degrees up to the sign of t, as SuperGlue and LoFTR compute it."""
+    cosine = np.clip(t0 @ t1 / (np.linalg.norm(t0) * np.linalg.norm(t1)), -1.0, 1.0)
+    angle = float(np.rad2deg(np.arccos(cosine)))
+    return min(angle, 180 - angle)
+
+
+def pose_auc(errors: list[float], thresholds: tuple[float, ...]) -> list[float]:
+    """The recall curve's area as SuperGlue's published evaluation computes it."""
+    ordered = [0.0, *sorted(errors)]
+    curve = [0.0, *((i + 1) / len(errors) for i in range(len(errors)))]
+    areas = []
+    for t in thresholds:
+        last = int(np.searchsorted(ordered, t))
+        r, e = [*curve[:last], curve[last - 1]], [*ordered[:last], t]
+        areas.append(float(trapezoid(r, x=e)) / t)
+    return areas
