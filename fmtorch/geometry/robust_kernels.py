@@ -70,7 +70,7 @@ KERNELS: dict[str, Kernel] = {
 }
 
 
-def kernel(name: str) -> Kernel:
+def named_kernel(name: str) -> Kernel:
     """The kernel of that name; a ValueError that lists the names where there is none."""
     if name not in KERNELS:
         raise ValueError(f"kernel is {name!r}; it must be one of: {', '.join(KERNELS)}")
