@@ -19,7 +19,7 @@ from fmtorch.types import Correspondences
 
 WINDOW = 8  # neighbours before and after each match along each curve
 CURVES = ((0.0, 0.0), (0.5, math.pi / 4))  # shift of the grid (in thirds of the extent) and rotation of each curve
-TOLERANCE = 0.25  # relative prediction error at which agreement falls to 1/e
+TOLERANCE = 0.25  # relative prediction error at which agreement falls to about 1/e
 NOISE = 4.0  # px, keeps close neighbours from being judged by their localisation noise
 WORST_RATIO, LEAST_VOTE = 0.85, 0.02  # a neighbour votes with WORST_RATIO - ratio, at least LEAST_VOTE
 _CURVE_BITS = 15
@@ -36,12 +36,12 @@ def frame_agreement(
     """The share of its neighbours' votes that agree with each match, in [0, 1]; zero where masked.
 
     For neighbours i, j with frame maps S: ``e = max(|S_i dx0 - dx1|, |S_j dx0 - dx1|) / (s_i |dx0| + |dx1| + NOISE)``
-    with s the scale change of S; the agreement is the mean of ``exp(-(e / TOLERANCE)^2)`` over the neighbours in both
+    with s the scale change of S; the agreement is the mean of ``(1 + (e / TOLERANCE)^2 / 8)^-8`` over the neighbours in both
     images, weighted by votes.
     """
     S = _frame_map(lafs0, lafs1)
     vote = torch.ones_like(x0[..., 0]) if quality is None else (WORST_RATIO - quality).clamp_min(LEAST_VOTE)
-    scale = torch.linalg.det(S.to(torch.float64)).abs().sqrt().to(S.dtype)
+    scale = (S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]).abs().sqrt()
     rows = torch.stack([*x0.unbind(-1), *x1.unbind(-1), *S.flatten(2).unbind(-1), scale, vote])
     sound = mask & torch.isfinite(rows).all(0)
     rows = torch.where(sound, rows, 0)
@@ -98,7 +98,8 @@ def _along_curve(rows: Float[Tensor, "10 b n"]) -> tuple[Float[Tensor, "b n"], F
         _prediction_error(rows[4:8, None], dx, dy, ux, uy), _prediction_error(near[4:8], dx, dy, ux, uy)
     )
     length = (dx.square() + dy.square() + 1e-12).sqrt() * rows[8] + (ux.square() + uy.square() + 1e-12).sqrt() + NOISE
-    agree = torch.exp(error / length.square() * -(TOLERANCE**-2))
+    # exp(-z) in arithmetic alone, whose last bits, unlike exp's, do not depend on where in memory a number stands
+    agree = (1 + error / length.square() * (TOLERANCE**-2 / 8)).square().square().square().reciprocal()
     vote = near[9]
     agreeing = agree * vote
     # Added one by one: the order of a sum must not depend on the batch.
