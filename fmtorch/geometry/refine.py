@@ -402,7 +402,8 @@ def start(F: Float[Tensor, "9 p k"]) -> tuple[Tensor, Tensor, Tensor]:
 def cofactors(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "9 p k"]:
     """The matrix of cofactors: ``det(F) F^-T`` where F is regular."""
     rows = square(F)
-    return torch.linalg.cross(rows.roll(-1, 0), rows.roll(-2, 0), dim=1).flatten(0, 1)
+    products: Tensor = torch.linalg.cross(rows.roll(-1, 0), rows.roll(-2, 0), dim=1)
+    return products.flatten(0, 1)
 
 
 def square(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "3 3 p k"]:
