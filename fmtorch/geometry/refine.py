@@ -80,7 +80,7 @@ def refine(
     Raises ValueError for an unknown kernel. Bartoli & Sturm (2004); Hartley & Zisserman (2004), 11.4.3.
     """
     with torch.no_grad():
-        problem = _Normalised(x0, x1, weight, mask, F, scale)
+        problem = Normalised(x0, x1, weight, mask, F, scale)
         models, _ = refine_components(problem.models, problem.points, problem.weight, kernel, problem.scale, iterations)
         return problem.to_pixels(models).reshape(F.shape)
 
@@ -102,7 +102,7 @@ def attached_step(
     gets no gradient. Where the points leave a direction open, the step and its gradients in it are damped; where F or
     the step is not finite, F comes back with gradients of zero.
     """
-    problem = _Normalised(x0, x1, weight, mask, F.detach(), scale)
+    problem = Normalised(x0, x1, weight, mask, F.detach(), scale)
     with torch.no_grad():
         model, e0, e1 = start(problem.models)
         objective = Objective(problem.points, problem.weight, named_kernel(kernel), problem.scale)
@@ -137,8 +137,8 @@ def gradient_of_cost(
     return stable_sum(torch.stack(rows[:9]) * influence)[:, 0]
 
 
-class _Normalised:
-    """Matches as `refine_components` wants them: live ones first, centred, of about unit scale, in float64."""
+class Normalised:
+    """Matches as `refine_components` wants them: live ones first, centred, of about unit scale, in float64; and models."""
 
     def __init__(
         self,
@@ -178,8 +178,8 @@ class _Normalised:
     def to_pixels(self, models: Float[Tensor, "9 p k"]) -> Float[Tensor, "p k 3 3"]:
         """Matrices in pixels, of unit norm."""
         T0, T1 = self._similarity(0), self._similarity(2)
-        F = matmul3(matmul3(T1.mT, _matrices(models)), T0)
-        return _matrices(unit(_flat(F)))
+        F = matmul3(matmul3(T1.mT, matrices(models)), T0)
+        return matrices(unit(_flat(F)))
 
     def _affinity(self, first: int) -> Float[Tensor, "p 1 3 3"]:
         """From normalised to pixel coordinates of one image."""
@@ -198,7 +198,8 @@ def _flat(F: Float[Tensor, "p k 3 3"]) -> Float[Tensor, "9 p k"]:
     return F.flatten(2).permute(2, 0, 1).contiguous()
 
 
-def _matrices(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "p k 3 3"]:
+def matrices(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "p k 3 3"]:
+    """Components as matrices."""
     return F.permute(1, 2, 0).reshape(*F.shape[1:], 3, 3)
 
 
@@ -402,7 +403,8 @@ def start(F: Float[Tensor, "9 p k"]) -> tuple[Tensor, Tensor, Tensor]:
 def cofactors(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "9 p k"]:
     """The matrix of cofactors: ``det(F) F^-T`` where F is regular."""
     rows = square(F)
-    return torch.linalg.cross(rows.roll(-1, 0), rows.roll(-2, 0), dim=1).flatten(0, 1)
+    crossed: Tensor = torch.linalg.cross(rows.roll(-1, 0), rows.roll(-2, 0), dim=1)
+    return crossed.flatten(0, 1)
 
 
 def square(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "3 3 p k"]:
