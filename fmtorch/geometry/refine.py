@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.geometry.reduce import component_sum, matmul3, stable_sum
+from fmtorch.geometry.reduce import matmul3, stable_sum
 from fmtorch.geometry.robust_kernels import Kernel, named_kernel
 
 LANES = 64  # points are summed one by one into so many lanes, and these in a tree: part of the result's last bits
@@ -115,7 +115,7 @@ def attached_step(
         model = torch.where(sound, model, _constant(model, RANK_TWO))
         e0, e1 = (torch.where(sound, e, _constant(e, RANK_TWO_EPIPOLE)) for e in (e0, e1))
     gradient = gradient_of_cost(model, problem.points, problem.weight, objective.robust, problem.scale)
-    step = -component_sum((inverse * gradient).transpose(0, 1))
+    step = -total((inverse * gradient).transpose(0, 1))
     moved, _, _ = retract(model, step, e0, e1)
     return problem.to_pixels(torch.where(sound, moved, problem.models)).reshape(F.shape)
 
@@ -138,7 +138,7 @@ def gradient_of_cost(
 
 
 class Normalised:
-    """Matches as `refine_components` wants them: live ones first, centred, of about unit scale, in float64; and models."""
+    """Matches as `refine_components` wants them: live ones first, centred, of about unit scale; and models."""
 
     def __init__(
         self,
@@ -274,7 +274,8 @@ class Objective:
         f = F[..., None].unbind(0)
         m, count = len(weight), max(1, TILE_ELEMENTS // (p * k * LANES))
         lanes: list[Tensor] = []
-        products = self._buffer(10, 10, p, k, LANES)
+        sums = self._buffer(101, p, k, LANES)  # of the products, then the cost
+        products = sums[:100].view(10, 10, p, k, LANES)
         for first in range(0, m, count):
             some = slice(first, first + count)
             w = weight[some]
@@ -295,8 +296,10 @@ class Objective:
             cost = cost + lane
         if not derivatives:
             return F.new_empty(0, 0, p, k), stable_sum(cost)
+        sums[100] = cost
         half = LANES // 2  # the first level of the tree in place: memory newly mapped costs more than the sum
-        return stable_sum(products[..., :half].add_(products[..., half:])), stable_sum(cost)
+        sums = stable_sum(sums[..., :half].add_(sums[..., half:]))
+        return sums[:100].view(10, 10, p, k), sums[100]
 
     def _buffer(self, *shape: int) -> Tensor:
         if shape not in self.buffers:
@@ -362,9 +365,9 @@ def constrained_solve(
     Q[:9, 9] = Q[9, :9] = normal
     Q[:9, 10:] = right
     for i in range(10):
-        column, rest = Q[:, :1], Q[:, 1:]
+        column, rest = Q.tensor_split((1,), 1)
         row = rest[i] / column[i]
-        Q = rest - column * row
+        Q = torch.addcmul(rest, column, row, value=-1)
         Q[i] = row
     return Q[:9]
 
@@ -373,11 +376,11 @@ def retract(F: Tensor, step: Tensor, e0: Tensor, e1: Tensor) -> tuple[Tensor, Te
     """The rank-2 matrix of unit norm ``F + step + alpha e1 e0^T``, and its epipoles."""
     G = F + step
     C = cofactors(G)
-    determinant = component_sum(C[:3] * G[:3])
+    determinant = total(C[:3] * G[:3])
     normal = (e1[:, None] * e0[None]).flatten(0, 1)
-    G = unit(G - determinant / component_sum(C * normal) * normal)
+    G = unit(G - determinant / total(C * normal) * normal)
     C = square(cofactors(G))  # a multiple of e1 e0^T
-    return G, unit(component_sum(C * e1[:, None])), unit(component_sum(C * e0, 1))
+    return G, unit(total(C * e1[:, None])), unit(total(C * e0, 1))
 
 
 def start(F: Float[Tensor, "9 p k"]) -> tuple[Tensor, Tensor, Tensor]:
@@ -388,16 +391,16 @@ def start(F: Float[Tensor, "9 p k"]) -> tuple[Tensor, Tensor, Tensor]:
     """
     F = unit(F)
     C = square(cofactors(F))
-    K = component_sum(C[:, :, None] * C[:, None])  # C^T C
+    K = total(C[:, :, None] * C[:, None])  # C^T C
     for _ in range(5):
         K = K / K.abs().amax((0, 1))
-        K = component_sum(K[:, :, None] * K[:, None])
-    size = component_sum(K * K, 1)
+        K = total(K[:, :, None] * K[:, None])
+    size = total(K * K, 1)
     column = size.argmax(0)
     e0 = unit(K.gather(0, column.expand(1, 3, *column.shape))[0])
     M = square(F)
-    G = unit((M - component_sum(M * e0, 1)[:, None] * e0).flatten(0, 1))
-    return G, e0, unit(component_sum(square(cofactors(G)) * e0, 1))
+    G = unit((M - total(M * e0, 1)[:, None] * e0).flatten(0, 1))
+    return G, e0, unit(total(square(cofactors(G)) * e0, 1))
 
 
 def cofactors(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "9 p k"]:
@@ -412,7 +415,15 @@ def square(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "3 3 p k"]:
     return F.reshape(3, 3, *F.shape[1:])
 
 
+def total(x: Tensor, dim: int = 0) -> Tensor:
+    """The sum over a short axis, in order: for few numbers this takes half as long as a tree."""
+    first, *rest = x.unbind(dim)
+    for part in rest:
+        first = first + part
+    return first
+
+
 def unit(x: Float[Tensor, "c p k"]) -> Float[Tensor, "c p k"]:
     """Scaled to unit norm over the components; NaN where that is not possible."""
-    norm: Tensor = component_sum(x * x).sqrt()
+    norm: Tensor = total(x * x).sqrt()
     return x / norm
