@@ -98,15 +98,17 @@ def attached_step(
     """One Gauss-Newton step from a refined F, whose gradients are those of the optimum; arguments as of `refine`.
 
     The gradient of the cost is attached to the graph of points and weights, the normal matrix is not: the implicit
-    function theorem, with the Hessian in Gauss and Newton's approximation (exact where residuals vanish). F itself
-    gets no gradient. Where the points leave a direction open, the step and its gradients in it are damped; where F or
-    the step is not finite, F comes back with gradients of zero.
+    function theorem, with the Hessian in Gauss and Newton's approximation: it has the kernel's curvature, but not that
+    of the residuals, so it is exact where the residuals that count vanish. F itself gets no gradient. Where the points
+    leave a direction open, the step and its gradients in it are damped; where F or the step is not finite, F comes
+    back with gradients of zero.
     """
     problem = Normalised(x0, x1, weight, mask, F.detach(), scale)
     with torch.no_grad():
         model, e0, e1 = start(problem.models)
-        objective = Objective(problem.points, problem.weight, named_kernel(kernel), problem.scale)
-        H = objective(model, True)[0][:9, :9]
+        robust = named_kernel(kernel)
+        curved = robust._replace(weight=robust.curvature)  # Newton's weights of J^T J, not those of IRLS
+        H = Objective(problem.points, problem.weight, curved, problem.scale)(model, True)[0][:9, :9]
         identity = torch.eye(9, dtype=H.dtype, device=H.device)[:, :, None, None].expand_as(H)
         inverse = constrained_solve(H, model, e0, e1, torch.full_like(H[0, 0], STEP_DAMPING), identity)
         sound = torch.isfinite(inverse).flatten(0, 1).all(0)
@@ -114,7 +116,7 @@ def attached_step(
         # Something of rank 2 instead of what is not finite: `where` alone would not keep NaN out of the gradients.
         model = torch.where(sound, model, _constant(model, RANK_TWO))
         e0, e1 = (torch.where(sound, e, _constant(e, RANK_TWO_EPIPOLE)) for e in (e0, e1))
-    gradient = gradient_of_cost(model, problem.points, problem.weight, objective.robust, problem.scale)
+    gradient = gradient_of_cost(model, problem.points, problem.weight, robust, problem.scale)
     step = -total((inverse * gradient).transpose(0, 1))
     moved, _, _ = retract(model, step, e0, e1)
     return problem.to_pixels(torch.where(sound, moved, problem.models)).reshape(F.shape)
