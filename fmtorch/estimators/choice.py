@@ -51,6 +51,8 @@ def _cells(points: Float[Tensor, "2 p n"], problem: Problem) -> Int[Tensor, "p n
     low = torch.where(problem.live, points, torch.inf).amin(-1, keepdim=True)
     high = torch.where(problem.live, points, -torch.inf).amax(-1, keepdim=True)
     share = (points - low) / (high - low).clamp_min(torch.finfo(points.dtype).tiny)
+    x: Tensor
+    y: Tensor
     x, y = (share * GRID).nan_to_num(0).clamp(0, GRID - 1).to(torch.int64)
     return y * GRID + x
 

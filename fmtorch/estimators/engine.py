@@ -106,7 +106,8 @@ class HypothesizeAndVerify:
                 problem = whole[torch.arange(first, min(first + limit, len(whole.pair)), device=device)]
                 estimate, support, found, drawn = self._solve(problem)
                 F = F.index_copy(0, problem.pair, torch.where(found[:, None, None], problem.to_pixels(estimate), 0))
-                inliers[problem.pair[:, None], problem.slot] |= support & problem.live & found[:, None]
+                row, match = (support & problem.live & found[:, None]).nonzero(as_tuple=True)
+                inliers[problem.pair[row], problem.slot[row, match]] = True
                 draws[problem.pair] = drawn
                 for i in problem.pair[~found].tolist():
                     reasons[i] = "every minimal sample was degenerate"

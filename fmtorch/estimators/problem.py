@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from fmtorch.geometry import canonical
+from fmtorch.geometry.reduce import matmul3
 from fmtorch.types import Correspondences
 
 SMALLEST_BUCKET = 128
@@ -49,11 +51,9 @@ class Problem:
         return dataclasses.replace(self, points=self.points[:, index], **changes)
 
     def to_pixels(self, F: Float[Tensor, "p 3 3"]) -> Float[Tensor, "p 3 3"]:
-        """Fundamental matrices of normalised coordinates, in pixels and with unit Frobenius norm."""
+        """Fundamental matrices of normalised coordinates, in pixels, canonical in scale and sign."""
         T0, T1 = self._similarity(self.centre[:, :2]), self._similarity(self.centre[:, 2:])
-        pixel: Tensor = T1.mT @ F @ T0
-        norm: Tensor = torch.linalg.matrix_norm(pixel, keepdim=True)
-        return pixel / norm.clamp_min(torch.finfo(F.dtype).tiny)
+        return canonical(matmul3(matmul3(T1.mT, F), T0))
 
     def _similarity(self, centre: Tensor) -> Tensor:
         T = torch.zeros(len(centre), 3, 3, dtype=torch.float64, device=centre.device)

@@ -137,7 +137,8 @@ class SigmaConsensus:
 
 def _upper_gamma_3_2(x: Tensor) -> Tensor:
     """The upper incomplete gamma function of 3/2."""
-    return x.sqrt() * torch.exp(-x) + math.sqrt(math.pi) / 2 * torch.special.erfc(x.sqrt())
+    value: Tensor = x.sqrt() * torch.exp(-x) + math.sqrt(math.pi) / 2 * torch.special.erfc(x.sqrt())
+    return value
 
 
 def _lower_gamma_5_2(x: Tensor) -> Tensor:

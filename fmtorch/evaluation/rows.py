@@ -2,56 +2,83 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import time
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from fmtorch import metrics
 from fmtorch.pipeline import STAGES, Outcome
 from fmtorch.storage import PairRow
+from fmtorch.types import Correspondences, Estimate, collate
 
 
 def evaluate(outcomes: Sequence[Outcome], seed: int = 0) -> list[PairRow]:
     """One row a pair. NSGD is 1 where the pipeline failed; an inlier rate is NaN where it is not defined."""
     start = time.perf_counter()
-    outcomes = [_on_cpu(outcome) for outcome in outcomes]
-    figures = [_figures(outcome, seed) for outcome in outcomes]
+    nsgd, released = _distances(outcomes, seed)
+    before, after = _inlier_rates(outcomes)
     seconds = (time.perf_counter() - start) / max(len(outcomes), 1)
-    return [_row(outcome, values, seconds) for outcome, values in zip(outcomes, figures, strict=True)]
+    return [
+        _row(outcome, {"nsgd": a, "nsgd_released": b, "inlier_rate_before": c, "inlier_rate": d}, seconds)
+        for outcome, a, b, c, d in zip(outcomes, nsgd, released, before, after, strict=True)
+    ]
 
 
-def _on_cpu(outcome: Outcome) -> Outcome:
-    """The outcome with its tensors on the CPU: metrics are float64, and a row's worth of work needs no GPU."""
-    c, estimate = outcome.correspondences, outcome.estimate
-    return dataclasses.replace(
-        outcome,
-        correspondences=None if c is None else c.to("cpu"),
-        estimate=None if estimate is None else estimate.to("cpu"),
-    )
+def _solved(outcome: Outcome) -> bool:
+    return outcome.estimate is not None and bool(outcome.estimate.ok[0])
 
 
-def _figures(outcome: Outcome, seed: int) -> dict[str, float]:
-    c, estimate = outcome.correspondences, outcome.estimate
-    if c is None or c.size0 is None or c.size1 is None:
-        return {"nsgd": 1.0, "nsgd_released": 1.0, "inlier_rate": math.nan, "inlier_rate_before": math.nan}
-    F_true = torch.from_numpy(outcome.pair.F)[None]
-    solved = estimate is not None and bool(estimate.ok[0])
-    inside = estimate.inliers if estimate is not None else torch.zeros_like(c.mask)
-    before, after = metrics.inlier_rate(F_true, c.x0, c.x1, inside, c.size0, c.size1, mask=c.mask)
-    sgd = {"nsgd": 1.0, "nsgd_released": 1.0}
-    if estimate is not None and solved:
-        arguments = (F_true, estimate.F, c.size0, c.size1)
-        sgd["nsgd"] = float(metrics.nsgd(*arguments, seed=seed, key=c.keys))
-        sgd["nsgd_released"] = float(metrics.nsgd_released(*arguments, seed=seed, key=c.keys))
-    return {**sgd, "inlier_rate": float(after) if solved else math.nan, "inlier_rate_before": float(before)}
+def _correspondences(outcomes: Sequence[Outcome]) -> Correspondences:
+    """On the CPU: metrics are float64, and so little work needs no GPU."""
+    return collate([o.correspondences.to("cpu") for o in outcomes if o.correspondences is not None])
+
+
+def _estimates(outcomes: Sequence[Outcome]) -> Estimate:
+    return collate([o.estimate.to("cpu") for o in outcomes if o.estimate is not None])
+
+
+def _true(outcomes: Sequence[Outcome]) -> Tensor:
+    return torch.stack([torch.from_numpy(o.pair.F) for o in outcomes])
+
+
+def _distances(outcomes: Sequence[Outcome], seed: int) -> tuple[list[float], list[float]]:
+    """NSGD in both forms."""
+    nsgd, released = [1.0] * len(outcomes), [1.0] * len(outcomes)
+    solved = [i for i, o in enumerate(outcomes) if _solved(o)]
+    if solved:
+        some = [outcomes[i] for i in solved]
+        c = _correspondences(some)
+        if c.size0 is None or c.size1 is None:
+            raise ValueError("correspondences come without image sizes (size0, size1); the matcher must supply them")
+        arguments = (_true(some), _estimates(some).F, c.size0, c.size1)
+        values = metrics.nsgd(*arguments, seed=seed, key=c.keys).tolist()
+        values_released = metrics.nsgd_released(*arguments, seed=seed, key=c.keys).tolist()
+        for i, a, b in zip(solved, values, values_released, strict=True):
+            nsgd[i], released[i] = a, b
+    return nsgd, released
+
+
+def _inlier_rates(outcomes: Sequence[Outcome]) -> tuple[list[float], list[float]]:
+    """Before and, where the pair was solved, after estimation."""
+    before, after = [math.nan] * len(outcomes), [math.nan] * len(outcomes)
+    matched = [i for i, o in enumerate(outcomes) if o.estimate is not None and o.correspondences is not None]
+    if matched:
+        some = [outcomes[i] for i in matched]
+        c, estimate = _correspondences(some), _estimates(some)
+        if c.size0 is None or c.size1 is None:
+            raise ValueError("correspondences come without image sizes (size0, size1); the matcher must supply them")
+        rates = metrics.inlier_rate(_true(some), c.x0, c.x1, estimate.inliers, c.size0, c.size1, mask=c.mask)
+        for i, a, b in zip(matched, rates.before.tolist(), rates.after.tolist(), strict=True):
+            before[i], after[i] = a, b if _solved(outcomes[i]) else math.nan
+    return before, after
 
 
 def _row(outcome: Outcome, figures: dict[str, float], seconds: float) -> PairRow:
     pair, c, estimate = outcome.pair, outcome.correspondences, outcome.estimate
-    ok = estimate is not None and bool(estimate.ok[0])
+    ok = _solved(outcome)
     return PairRow(
         pair=pair.identity, key=pair.key, family=pair.family, scene=pair.scene, ok=ok, reason=outcome.reason,
         corrs=int(estimate.inliers.sum()) if estimate is not None else 0,

@@ -1,5 +1,6 @@
 """Two-view projective geometry as pure, batched, differentiable functions."""
 
+from fmtorch.geometry.eight_point import eight_point
 from fmtorch.geometry.epipolar import (
     algebraic,
     cross_matrix,
@@ -15,17 +16,32 @@ from fmtorch.geometry.epipolar import (
     symmetric_squared,
     unit_frobenius,
 )
+from fmtorch.geometry.normalize import canonical, denormalize_fundamental, normalize_pair, normalize_points
+from fmtorch.geometry.pose import Pose, pose_from_fundamental
+from fmtorch.geometry.rank2 import nearest_rank2
+from fmtorch.geometry.refine import refine
+from fmtorch.geometry.seven_point import seven_point
 
 __all__ = [
+    "Pose",
     "algebraic",
+    "canonical",
     "cross_matrix",
+    "denormalize_fundamental",
+    "eight_point",
     "epipolar_distances",
     "epipolar_lines",
     "fundamental_from_calibration",
     "fundamental_from_projections",
+    "nearest_rank2",
+    "normalize_pair",
+    "normalize_points",
     "point_to_line",
+    "pose_from_fundamental",
+    "refine",
     "sampson",
     "sampson_squared",
+    "seven_point",
     "symmetric_max",
     "symmetric_mean",
     "symmetric_squared",

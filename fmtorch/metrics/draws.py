@@ -75,10 +75,8 @@ def mean_terms(pairs: Pairs, draw: Draw, *, samples: int, seed: int) -> tuple[Fl
     if samples < 1:
         raise ValueError(f"samples is {samples}; it must be at least 1")
     step = max(1, TILE // BLOCK)
-    tiles = [pairs.take(slice(i, i + step)) for i in range(0, len(pairs.key), step)]
-    parts = [_tile_terms(tile, draw, samples, seed) for tile in tiles]
-    if not parts:
-        return pairs.F_est.sum((-2, -1)), pairs.key
+    starts = range(0, max(1, len(pairs.key)), step)  # one empty tile for an empty batch
+    parts = [_tile_terms(pairs.take(slice(i, i + step)), draw, samples, seed) for i in starts]
     return torch.cat([total for total, _ in parts]), torch.cat([count for _, count in parts])
 
 
@@ -113,13 +111,15 @@ def segment_in_image(
 ) -> tuple[Float[Tensor, "b n 2"], Float[Tensor, "b n 2"], Bool[Tensor, "b n"]]:
     """End points of the part of each line inside the rectangle (origin, origin + size), and whether there is one.
 
-    `line` holds the components a, b, c (b, n) at any scale and direction. End points of lines that miss mean nothing
-    but are finite.
+    `line` holds the components a, b, c (b, n) at any scale, sign and direction. The first end point is the left one,
+    or the upper one of a vertical line. End points of lines that miss mean nothing but are finite.
     """
     half_h, half_w = (size / 2)[:, :, None].unbind(1)
     centre_x, centre_y = half_w + origin, half_h + origin
     a, b, c = line
     scale = inverse_root(a * a + b * b)
+    vertical = (b * scale).abs() < PARALLEL
+    scale = torch.where(torch.where(vertical, a > 0, b < 0), -scale, scale)  # makes t run from left to right
     a, b = a * scale, b * scale
     c = c * scale + a * centre_x + b * centre_y
     # Seen from the centre the line is (-a c, -b c) + t (b, -a); each pair of borders cuts an interval of t out of it.
@@ -127,7 +127,7 @@ def segment_in_image(
     middle_y, reach_y, misses_y = _slab(-b * c, a, half_h)
     low = torch.maximum(middle_x - reach_x, middle_y - reach_y)
     high = torch.minimum(middle_x + reach_x, middle_y + reach_y)
-    hits = (low < high) & ~misses_x & ~misses_y & (scale > 0)
+    hits = (low < high) & ~misses_x & ~misses_y & (scale != 0)
 
     def point(t: Tensor) -> Tensor:
         t = torch.where(hits, t, 0.0)

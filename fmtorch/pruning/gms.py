@@ -40,7 +40,7 @@ def gms(
 
     Each of four shifted 20 x 20 grids in image 0 assigns every cell the cell of image 1 that most of its matches go
     to; the assignment stands when the nine cells around move likewise often enough,
-    ``score >= threshold_factor * sqrt(mean matches of the nine cells)`` (equations 12-14). A match is kept when it
+    ``score >= threshold_factor * sqrt(mean matches of the nine cells)``. A match is kept when it
     follows the assignment of its cell in one of the grids. with_rotation tries eight rotations of the neighbourhood,
     with_scale five sizes of the grid in image 1; the hypothesis that keeps most matches wins, the first of equals.
 

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from fmtorch.pruning.knn import nearest_points
 from fmtorch.types import Correspondences
-
-_DISTANCES = 2**18  # entries of the distance matrix that exist at a time on a CPU; more on a GPU
-_DISTANCES_GPU = 2**26
 
 
 def lpm(
@@ -19,20 +18,20 @@ def lpm(
     x1: Float[Tensor, "b n 2"],
     *,
     mask: Bool[Tensor, "b n"] | None = None,
-    thresholds: tuple[float, float] = (0.8, 0.5),
-    neighbors: tuple[int, int] = (6, 6),
-    taus: tuple[float, float] = (0.2, 0.2),
+    thresholds: Sequence[float] = (0.8, 0.5),
+    neighbors: Sequence[int] = (6, 6),
+    taus: Sequence[float] = (0.2, 0.2),
 ) -> Bool[Tensor, "b n"]:
     """True for matches whose neighbourhoods in the two images hold the same matches, moving alike.
 
     The cost of a match is the mean over three neighbourhood sizes (K + 2, K, K - 2) of the share of its neighbours
-    that are near in one image only or whose motion differs, ``cos(angle) * ratio of squared lengths < tau``
-    (equations 10-15). Two passes (lambda, K, tau each): the second seeks neighbours among the matches whose cost in
-    the first is at most lambda, if those are at least K + 4. Equal to the released code with exact neighbours, ties by
-    index; a neighbour that does not exist, where matches are few, counts as lost.
+    that are near in one image only or whose motion differs, ``cos(angle) * ratio of squared lengths < tau``. Two
+    passes, each with its threshold lambda, K and tau: the second seeks neighbours among the matches that the first
+    kept, if those are at least K + 4, and decides. Equal to the released code with exact neighbours, ties by index; a
+    neighbour that does not exist, where matches are few, counts as lost.
 
-    Points in any common unit. Non-finite points are dropped. Memory is linear in the number of matches, time
-    quadratic. Raises ValueError for K below 4.
+    Points in any common unit. Non-finite points are dropped. Memory is linear in the number of matches. Raises
+    ValueError for K below 4.
     """
     if min(neighbors) < 4:
         raise ValueError(f"neighbors is {neighbors}; each must be at least 4, so that the smallest neighbourhood has 2")
@@ -51,7 +50,7 @@ def lpm(
 
 def _cost(points: Float[Tensor, "2 n 2"], members: Int[Tensor, " m"], K: int, tau: float) -> Float[Tensor, " n"]:
     """Sum over the three neighbourhood sizes, between 0 and 3; the neighbours are among the members."""
-    near0, near1 = (_nearest(x, members, K + 3) for x in points)
+    near0, near1 = (_among(members, nearest_points(x, x[members], K + 3)) for x in points)
     shared = (near0[:, :, None] == near1[:, None, :]) & (near0 >= 0)[:, :, None]  # (N, K + 3, K + 3)
     differs = _differs(points[1] - points[0], near0, tau)
     cost = torch.zeros(points.shape[1], dtype=torch.float64, device=points.device)
@@ -63,6 +62,11 @@ def _cost(points: Float[Tensor, "2 n 2"], members: Int[Tensor, " m"], K: int, ta
     return cost
 
 
+def _among(members: Int[Tensor, " m"], near: Int[Tensor, "n k"]) -> Int[Tensor, "n k"]:
+    """Indices among the members as indices among all; -1 stays."""
+    return torch.where(near >= 0, members[near], -1) if len(members) else near
+
+
 def _differs(motion: Float[Tensor, "n 2"], near: Int[Tensor, "n k"], tau: float) -> Bool[Tensor, "n k"]:
     """Whether each neighbour moves otherwise; never where one of the two does not move (0 / 0 in the cosine)."""
     others = motion[near.clamp(min=0)]
@@ -71,38 +75,15 @@ def _differs(motion: Float[Tensor, "n 2"], near: Int[Tensor, "n k"], tau: float)
     return cosine * torch.minimum(length, lengths) / torch.maximum(length, lengths) < tau
 
 
-def _nearest(x: Float[Tensor, "n 2"], members: Int[Tensor, " m"], count: int) -> Int[Tensor, "n count"]:
-    """For every point the members nearest to it, ties by index; -1 where there are no more members."""
-    found = torch.full((len(x), count), -1, device=x.device)
-    count = min(count, len(members))
-    if count == 0:
-        return found
-    budget = _DISTANCES if x.device.type == "cpu" else _DISTANCES_GPU
-    x_of_members, y_of_members = x[members].T
-    for rows in torch.arange(len(x), device=x.device).split(max(1, budget // len(members))):
-        squared = (x[rows, 0, None] - x_of_members).square_() + (x[rows, 1, None] - y_of_members).square_()
-        distance, index = squared.topk(count, largest=False)
-        tied = ((squared <= distance[:, -1:]).sum(1) > count).nonzero()[:, 0]
-        if len(tied):  # more at the last distance than there is room for: topk takes any, the lowest are wanted
-            index[tied] = squared[tied].sort(stable=True).indices[:, :count]
-            distance[tied] = squared[tied].gather(1, index[tied])
-        order = index.argsort(-1)  # by distance, then index
-        order = order.gather(1, distance.gather(1, order).argsort(dim=-1, stable=True))
-        found[rows, :count] = members[index.gather(1, order)]
-    return found
-
-
 @dataclasses.dataclass(frozen=True)
 class LPM:
     """`lpm` as a stage; `thresholds`, `neighbors`, `taus` hold one value for each of the two passes."""
 
-    thresholds: tuple[float, float] = (0.8, 0.5)
-    neighbors: tuple[int, int] = (6, 6)
-    taus: tuple[float, float] = (0.2, 0.2)
+    thresholds: Sequence[float] = (0.8, 0.5)
+    neighbors: Sequence[int] = (6, 6)
+    taus: Sequence[float] = (0.2, 0.2)
 
     def __call__(self, correspondences: Correspondences) -> Correspondences:
         """The same matches, of which only those survive that keep their neighbourhoods."""
         c = correspondences
-        options = {"thresholds": self.thresholds, "neighbors": self.neighbors, "taus": self.taus}
-        kept = lpm(c.x0, c.x1, mask=c.mask, **{name: tuple(pair) for name, pair in options.items()})
-        return c.keep(kept)
+        return c.keep(lpm(c.x0, c.x1, mask=c.mask, **dataclasses.asdict(self)))

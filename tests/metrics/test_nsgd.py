@@ -22,6 +22,41 @@ VGA = torch.tensor([480, 640])
 HD = torch.tensor([720.0, 1280.0])
 
 
+# fountain-P11, pair 5-8: F_gt and F_est, the sizes, and what the published evaluator gives (mean and standard deviation
+# over seeds of 1,000 samples) and its corrected restatement. In the second case the sizes differ, which is one of the
+# evaluator's faults.
+FOUNTAIN = [
+    (
+        [
+            [2.06032987e-08, -9.37355848e-07, 0.000540997389],
+            [-1.17919919e-06, -5.35674385e-08, -0.00333456947],
+            [0.000571483698, 0.00511075257, -0.999981071],
+        ],
+        [
+            [1.77539992e-08, -8.07729926e-07, 0.000466183359],
+            [-1.01613525e-06, -4.61597799e-08, -0.00287344091],
+            [0.000492080665, 0.00467070238, -0.999984734],
+        ],
+        ((1024, 1536), (1024, 1536)),
+        (0.00977949, 9.65e-5, 0.00976449),
+    ),
+    (
+        [
+            [4.94469062e-08, -2.24960805e-06, 0.00129836719],
+            [-2.51557353e-06, -1.14274866e-07, -0.00711360279],
+            [0.000571472018, 0.00511064811, -0.999960632],
+        ],
+        [
+            [3.59093478e-08, -2.12206434e-06, 0.00125173667],
+            [-2.35191287e-06, -1.35738197e-07, -0.00672588634],
+            [0.000557596025, 0.00482849597, -0.999964785],
+        ],
+        ((1024, 1536), (480, 640)),
+        (0.00636949, 3.45e-5, 0.0051564),
+    ),
+]
+
+
 def rows_shifted(pixels: float) -> Tensor:
     """F of a rectified pair: the line of (x, y) is the row y + pixels."""
     return torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, pixels]], dtype=torch.float64)
@@ -75,6 +110,24 @@ def test_known_answers_of_the_released_evaluator() -> None:
     for failed in (exact * 0, exact * torch.nan):
         assert nsgd_released(exact, failed, HD, HD).item() == 1
     assert nsgd_released(exact * 1e-9, rows_shifted(10.0) * 1e-9, HD, HD).item() < 0.0065
+
+
+@pytest.mark.parametrize(("F_gt", "F_est", "sizes", "figures"), FOUNTAIN)
+def test_known_figures_of_real_pairs(
+    F_gt: list[list[float]],
+    F_est: list[list[float]],
+    sizes: tuple[tuple[int, int], ...],
+    figures: tuple[float, float, float],
+) -> None:
+    """4.5 standard errors of a mean of 20 runs against theirs: 24 runs, and one run with 50 times the samples."""
+    runs = 20
+    tensors = [torch.tensor(F, dtype=torch.float64).expand(runs, 3, 3) for F in (F_gt, F_est)]
+    tensors += [torch.tensor(size).expand(runs, 2) for size in sizes]
+    published, deviation, corrected = figures
+    released = nsgd_released(*tensors, key=torch.arange(runs)).mean().item()
+    assert released == pytest.approx(published, abs=4.5 * deviation * math.sqrt(1 / runs + 1 / 24))
+    sound = nsgd(*tensors, key=torch.arange(runs))
+    assert sound.mean().item() == pytest.approx(corrected, abs=4.5 * sound.std().item() * math.sqrt(1 / runs + 1 / 50))
 
 
 @pytest.mark.parametrize("sizes", [(VGA, VGA), (VGA, torch.tensor([400, 220]))])

@@ -20,7 +20,7 @@ def distance(x: np.ndarray, line: np.ndarray, offset: float = 0.0) -> float:
 
 
 def border_points(line: np.ndarray, size: np.ndarray, origin: float) -> tuple[np.ndarray, np.ndarray] | None:
-    """Where a line enters and leaves an image, seen along its direction (b, -a); None where it misses."""
+    """Where a line enters and leaves an image, from left to right (a vertical one downwards); None where it misses."""
     a, b, c = line
     low, high = origin, origin + np.array([size[1], size[0]])
     points = [(x, -(a * x + c) / b) for x in (low, high[0]) if b != 0] + [
@@ -29,7 +29,7 @@ def border_points(line: np.ndarray, size: np.ndarray, origin: float) -> tuple[np
     points = [np.array(p) for p in points if low <= p[0] <= high[0] and low <= p[1] <= high[1]]
     if len(points) < 2:
         return None
-    points.sort(key=lambda p: float(p @ np.array([b, -a])))
+    points.sort(key=tuple)
     return points[0], points[-1]
 
 

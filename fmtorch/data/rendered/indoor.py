@@ -115,7 +115,7 @@ def _cabinet(surfaces: Surfaces, rng: Rng, base: Vector, degrees: Real) -> None:
 
 def _path(rng: Rng, target: Vector) -> tuple[np.ndarray, np.ndarray]:
     """Amplitudes and phases of a hand's smooth movement: three sinusoids for each of six coordinates."""
-    speed = rng.uniform(0.5, 1.3)
+    speed = rng.uniform(0.6, 1.5)
     frequency = np.array([0.11, 0.37, 1.3])[:, None] * rng.uniform(0.8, 1.2, (3, 6))
     size = speed * np.array([0.50, 0.10, 0.010])[:, None] * np.array([1, 1, 0.35, 0.5, 0.5, 0.35])
     return size * rng.uniform(0.6, 1.2, (3, 6)), np.stack([frequency, rng.uniform(0, 2 * np.pi, (3, 6))])

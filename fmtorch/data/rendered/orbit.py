@@ -19,7 +19,7 @@ from fmtorch.data.rendered.surfaces import Surfaces, vec
 
 SIZE = (540, 960)
 FOCAL = 760.0  # pixels: a phone's wide lens
-ANGLES = (5.0, 70.0)  # degrees between the two views of a pair
+ANGLES = (12.0, 75.0)  # degrees between the two views of a pair
 SYMMETRIC = 0.6  # chance that the four sides look the same, as in many monuments
 
 
@@ -163,7 +163,7 @@ def scene(rng: Rng, split: str, shots: int, scale: Real) -> Scene:
     azimuth = start + arc * (np.arange(shots) + rng.uniform(-0.3, 0.3, shots)) / shots
     taken = []
     for a in azimuth:
-        radius = rng.uniform(10.5, 14.5)
+        radius = rng.uniform(9.5, 16.5)
         eye = direction(a) * radius + vec(0, 0, rng.uniform(1.3, 2.6))
         at = vec(*rng.normal(0, 0.7, 2), 0.42 * height + rng.normal(0, 0.3))
         camera = look_at(K, size, eye.tolist(), at.tolist(), roll=float(rng.normal(0, 0.03)))

@@ -1,0 +1,75 @@
+"""The normalised, weighted eight-point algorithm."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from fmtorch.geometry.eigenvector import smallest_eigenvector
+from fmtorch.geometry.normalize import canonical, denormalize_fundamental, normalize_points
+from fmtorch.geometry.rank2 import nearest_rank2
+from fmtorch.geometry.reduce import stable_sum
+
+
+def eight_point(
+    x0: Float[Tensor, "*batch n 2"],
+    x1: Float[Tensor, "*batch n 2"],
+    weight: Float[Tensor, "*batch n"] | None = None,
+    mask: Bool[Tensor, "*batch n"] | None = None,
+) -> tuple[Float[Tensor, "*batch 3 3"], Bool[Tensor, "*batch"]]:
+    """The fundamental matrix of N >= 8 correspondences by weighted linear least squares, and whether it is valid.
+
+    Points are normalised (Hartley, PAMI 1997; with the weights, so that a point of weight zero is as good as masked),
+    F is the smallest eigenvector of M = sum w a a^T, made rank two, denormalised, of unit Frobenius norm with its
+    largest entry positive. Differentiable in points and weights (not in a root of the weights, so also at zero).
+    Computed in float64, returned in x0's type.
+
+    weight: non-negative, any scale. mask: True for a real match. Invalid (F = 0): fewer than eight independent
+    equations (too few points, coincident or collinear ones, an exact plane), or anything not finite, or a negative
+    weight, among the unmasked points. The result has the same bits in any batch and with any padding.
+    """
+    x0d, x1d, w, sound = _door(x0, x1, weight, mask)
+    x0n, T0 = normalize_points(x0d, weight=w)
+    x1n, T1 = normalize_points(x1d, weight=w)
+    F, determined = linear_fundamental(x0n, x1n, w)
+    F = canonical(denormalize_fundamental(nearest_rank2(F), T0, T1))
+    valid = sound & determined & (F.detach() != 0).any(-1).any(-1)
+    return torch.where(valid[..., None, None], F, 0.0).to(x0.dtype), valid
+
+
+def linear_fundamental(
+    x0: Float[Tensor, "*batch n 2"], x1: Float[Tensor, "*batch n 2"], weight: Float[Tensor, "*batch n"]
+) -> tuple[Float[Tensor, "*batch 3 3"], Bool[Tensor, "*batch"]]:
+    """The F of unit norm, of any rank, that minimises sum w (x1^T F x0)^2; False where it is not determined.
+
+    Expects normalised float64 points, finite, with weight zero for those that do not count.
+    """
+    # a = x1 (x) x0, so M holds the sums of w (x1 x1^T) (x) (x0 x0^T): 6 x 6 different ones.
+    products = (weight[..., None, :] * _products(x1))[..., :, None, :] * _products(x0)[..., None, :, :]
+    sums = stable_sum(products, -1)
+    M = sums[..., _PRODUCT_INDEX[:, None, :, None], _PRODUCT_INDEX[None, :, None, :]]
+    M = M.reshape(*sums.shape[:-2], 9, 9)
+    f, determined = smallest_eigenvector(M)
+    return f.reshape(*f.shape[:-1], 3, 3), determined
+
+
+_PRODUCT_INDEX = torch.tensor([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
+
+
+def _products(x: Tensor) -> Tensor:
+    """The different entries of (x, y, 1) (x, y, 1)^T: (*batch, 6, n)."""
+    x, y = x.unbind(-1)
+    return torch.stack([x * x, x * y, y * y, x, y, torch.ones_like(x)], -2)
+
+
+def _door(x0: Tensor, x1: Tensor, weight: Tensor | None, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Points and weights in float64, zero where they do not count; False for a set with something unusable in it."""
+    w = torch.ones_like(x0[..., 0]) if weight is None else weight
+    good = (x0.isfinite() & x1.isfinite()).all(-1) & w.isfinite() & (w >= 0)
+    keep = good if mask is None else good & mask
+    sound = (good if mask is None else good | ~mask).all(-1)
+    x0d, x1d = (torch.where(keep[..., None], x, 0.0).to(torch.float64) for x in (x0, x1))
+    wd = torch.where(keep, w, 0.0).to(torch.float64)
+    largest = wd.detach().amax(-1, keepdim=True) if wd.shape[-1] else wd.new_ones(*wd.shape[:-1], 1)
+    return x0d, x1d, wd / torch.where(largest > 0, largest, 1.0), sound

@@ -1,0 +1,149 @@
+"""The nearest matrix of rank two: the step that makes a linear estimate a fundamental matrix."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from fmtorch.geometry.reduce import component_sum
+
+GAP = 1e-6
+"""Eigenvalue gaps of F^T F below this share of its largest eigenvalue have their gradient held finite."""
+
+
+def nearest_rank2(F: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """The rank-two matrix nearest to F in Frobenius norm, F - F v v^T, v being the last right singular vector.
+
+    Computed in float64, returned in F's type. Differentiable; where the two smallest singular values meet, v and with
+    it the projection jump, and the gradient is held finite by gap / (gap^2 + eps^2) in place of 1 / gap.
+    F must be finite.
+    """
+    components = F.reshape(*F.shape[:-2], 9).movedim(-1, 0).contiguous()
+    return rank2_components(components).movedim(0, -1).reshape(F.shape)
+
+
+def rank2_components(F: Float[Tensor, " 9 *s"]) -> Float[Tensor, " 9 *s"]:
+    """`nearest_rank2` with the nine entries (row by row) as the first axis."""
+    rows = F.to(torch.float64).reshape(3, 3, *F.shape[1:])
+    v = last_right_singular_vector(rows)
+    projected = rows - component_sum(rows * v, 1)[:, None] * v
+    return projected.reshape(F.shape).to(F.dtype)
+
+
+def last_right_singular_vector(F: Float[Tensor, " 3 3 *s"]) -> Float[Tensor, " 3 *s"]:
+    """The unit right singular vector v of the smallest singular value, float64; F[i, j] is row i, column j.
+
+    The cofactor matrix C of F has v for its *first* right singular vector, and singular values s1 s2, s1 s3, s2 s3: so
+    v belongs to the largest eigenvalue of C^T C (closed form), and power iteration with C^T C sharpens it whenever
+    s3 < s2, without F^T F's loss of digits.
+    """
+    with torch.no_grad():
+        G = _scaled(F.detach())
+        C = cofactors(G)
+        rank_one = C.abs().amax((0, 1)) < 8 * torch.finfo(C.dtype).eps
+        C = _scaled(C)
+        v = _largest_eigenvector(component_sum(C[:, :, None] * C[:, None], 0))
+        v = torch.where(rank_one, _across_longest(G), v)
+        for _ in range(2):
+            u = component_sum(C * v, 1)
+            v = torch.where(rank_one, v, _unit(component_sum(C * u[:, None], 0), v))
+        # C loses digits when s2 << s1; a step down the slope of |F v|^2 takes out what is left along the first vector.
+        norm2 = component_sum(component_sum(G * G, 1))
+        slope = component_sum(G * component_sum(G * v, 1)[:, None], 0)
+        v = _unit(v - slope / torch.where(norm2 > 0, norm2, 1.0), v)
+    return _attach(F, v) if F.requires_grad else v
+
+
+def _attach(F: Tensor, v: Tensor) -> Tensor:
+    """v with the gradient of an eigenvector of M = F^T F: dv = -(M - s3^2)^+ dM v, the pseudo-inverse kept bounded."""
+    with torch.no_grad():
+        M = component_sum(F[:, :, None] * F[:, None], 0)
+        smallest = component_sum(v * component_sum(M * v, 1))
+        p, q = complement(v)
+        Mp, Mq = component_sum(M * p, 1), component_sum(M * q, 1)
+        # B = (M - s3^2) on the plane across v, in the basis p, q; (B^2 + eps^2)^-1 B is gap / (gap^2 + eps^2).
+        b00, b01, b11 = (component_sum(s * t) for s, t in ((p, Mp), (p, Mq), (q, Mq)))
+        b00, b11 = b00 - smallest, b11 - smallest
+        eps2 = (GAP * (M[0, 0] + M[1, 1] + M[2, 2])) ** 2
+        s00, s01, s11 = b00 * b00 + b01 * b01 + eps2, b01 * (b00 + b11), b01 * b01 + b11 * b11 + eps2
+        determinant = s00 * s11 - s01 * s01
+        inverse = torch.where(determinant > 0, 1.0 / torch.where(determinant > 0, determinant, 1.0), 0.0)
+        i00 = (s11 * b00 - s01 * b01) * inverse
+        i01 = (s11 * b01 - s01 * b11) * inverse
+        i11 = (s00 * b11 - s01 * b01) * inverse
+    Fv = component_sum(F * v, 1)
+    Mv = component_sum(F * Fv[:, None], 0)
+    change = Mv - Mv.detach()
+    along_p, along_q = component_sum(p * change), component_sum(q * change)
+    return v - (p * (i00 * along_p + i01 * along_q) + q * (i01 * along_p + i11 * along_q))
+
+
+def cofactors(F: Tensor) -> Tensor:
+    """The cofactor matrix: row i is the cross product of the other two rows of F."""
+    return torch.stack([cross(F[1], F[2]), cross(F[2], F[0]), cross(F[0], F[1])])
+
+
+def cross(a: Float[Tensor, " 3 *s"], b: Float[Tensor, " 3 *s"]) -> Float[Tensor, " 3 *s"]:
+    """The cross product of component-first vectors."""
+    return torch.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def _scaled(A: Tensor) -> Tensor:
+    """A over its largest entry, so that no product over- or underflows."""
+    peak = A.abs().amax((0, 1))
+    return A / torch.where(peak > 0, peak, 1.0)
+
+
+def _unit(x: Tensor, fallback: Tensor) -> Tensor:
+    """x at unit length, or `fallback` where it has none."""
+    norm2 = component_sum(x * x)
+    return torch.where(norm2 > 0, x / torch.where(norm2 > 0, norm2, 1.0).sqrt(), fallback)
+
+
+def _largest_eigenvector(K: Tensor) -> Tensor:
+    """The unit eigenvector of the largest eigenvalue of symmetric 3 x 3 matrices (3, 3, *s); any, where it is multiple.
+
+    K - mean = m X with X's eigenvalues y the roots of y^3 - 3 y = det X: the extreme root by Newton's method from 2,
+    the others from the quadratic that remains. The eigenvector is the longest cross product of two rows of K - lambda.
+    """
+    mean = (K[0, 0] + K[1, 1] + K[2, 2]) / 3
+    D = K.clone()
+    for i in range(3):
+        D[i, i] = K[i, i] - mean
+    m = (component_sum(component_sum(D * D, 1)) / 6).sqrt()
+    X = D / torch.where(m > 0, m, 1.0)
+    determinant = component_sum(X[0] * cross(X[1], X[2])).clamp(-2.0, 2.0)
+    y = torch.full_like(m, 2.0)
+    for _ in range(5):
+        y = (2 * y * y * y + determinant.abs()) / (3 * (y * y - 1))
+    middle = ((3 * (2 - y).clamp_min(0) * (2 + y)).sqrt() + y) / 2
+    largest = torch.where(determinant >= 0, y, middle)
+    for i in range(3):
+        X[i, i] = X[i, i] - largest
+    candidates = cofactors(X)
+    length2 = component_sum(candidates * candidates, 1)
+    best = length2.argmax(0)
+    chosen = torch.gather(candidates, 0, best[None, None].expand(1, 3, *best.shape))[0]
+    # A double eigenvalue leaves X - lambda of rank one (all products vanish): any vector across its rows will do.
+    # With L the length of the longest product, the product is good to eps / L and the other choice to L.
+    across = _across_longest(X)
+    distinct = length2.amax(0) > torch.finfo(K.dtype).eps
+    return torch.where(distinct, _unit(chosen, across), across)
+
+
+def _across_longest(A: Tensor) -> Tensor:
+    """A unit vector perpendicular to the longest row of A."""
+    longest = component_sum(A * A, 1).argmax(0)
+    row = torch.gather(A, 0, longest[None, None].expand(1, 3, *longest.shape))[0]
+    return complement(_unit(row, torch.zeros_like(row)))[0]
+
+
+def complement(v: Tensor) -> tuple[Tensor, Tensor]:
+    """Two unit vectors that complete v to an orthonormal basis (Duff et al., JCGT 2017); for v = 0, two axes."""
+    sign = torch.copysign(torch.ones_like(v[2]), v[2])
+    a = -1.0 / (sign + v[2])
+    b = v[0] * v[1] * a
+    p = torch.stack([1.0 + sign * v[0] * v[0] * a, sign * b, -sign * v[0]])
+    q = torch.stack([b, sign + v[1] * v[1] * a, -v[1]])
+    return p, q

@@ -1,0 +1,95 @@
+"""The figures of a whole evaluation as torchmetrics classes, which accumulate over batches and processes.
+
+Needs the extra `metrics`: ``pip install 'fmtorch[metrics]'``.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int, Real
+from torch import Tensor
+
+from fmtorch.metrics.nsgd import nsgd
+from fmtorch.metrics.recall import THRESHOLD, mean_recall, recall
+
+try:
+    from torchmetrics import Metric  # type: ignore[import-not-found, unused-ignore]
+except ImportError as error:
+    raise ImportError("torchmetrics is not installed; pip install 'fmtorch[metrics]' brings it") from error
+
+
+class _MeanOverPairs(Metric):  # type: ignore[misc, unused-ignore]
+    """Sum and number of a figure per pair."""
+
+    full_state_update = False
+    total: Tensor
+    pairs: Tensor
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+        self.add_state("pairs", torch.zeros((), dtype=torch.int64), dist_reduce_fx="sum")
+
+    def _add(self, mean: Tensor, pairs: int) -> None:
+        if pairs:
+            self.total = self.total + mean * pairs
+            self.pairs = self.pairs + pairs
+
+    def compute(self) -> Tensor:
+        """The mean over all pairs so far, NaN when there are none."""
+        return self.total / self.pairs
+
+
+class NSGD(_MeanOverPairs):
+    """Mean of `fmtorch.metrics.nsgd` over pairs."""
+
+    is_differentiable = True
+    higher_is_better = False
+
+    def __init__(self, *, samples: int = 1000, seed: int = 0, **options: Any) -> None:
+        super().__init__(**options)
+        self.samples, self.seed = samples, seed
+
+    def update(
+        self,
+        F_gt: Float[Tensor, "b 3 3"],
+        F_est: Float[Tensor, "b 3 3"],
+        size0: Real[Tensor, "b 2"],
+        size1: Real[Tensor, "b 2"],
+        key: Int[Tensor, " b"] | None = None,
+    ) -> None:
+        """Adds a batch; arguments as `fmtorch.metrics.nsgd`."""
+        value = nsgd(F_gt, F_est, size0, size1, samples=self.samples, seed=self.seed, key=key)
+        self._add(value.mean(), len(value))
+
+
+class Recall(_MeanOverPairs):
+    """`fmtorch.metrics.recall` over all pairs, from their NSGD."""
+
+    is_differentiable = False
+    higher_is_better = True
+
+    def __init__(self, *, threshold: float = THRESHOLD, **options: Any) -> None:
+        super().__init__(**options)
+        self.threshold = threshold
+
+    def update(self, nsgd: Float[Tensor, " b"]) -> None:
+        """Adds the NSGD of a batch; NaN counts as a miss."""
+        self._add(recall(nsgd, self.threshold), len(nsgd))
+
+
+class MeanRecall(_MeanOverPairs):
+    """`fmtorch.metrics.mean_recall` over all pairs, from their NSGD."""
+
+    is_differentiable = True
+    higher_is_better = True
+
+    def __init__(self, *, maximum: float = THRESHOLD, **options: Any) -> None:
+        super().__init__(**options)
+        self.maximum = maximum
+
+    def update(self, nsgd: Float[Tensor, " b"]) -> None:
+        """Adds the NSGD of a batch; NaN counts as a miss."""
+        self._add(mean_recall(nsgd, self.maximum), len(nsgd))

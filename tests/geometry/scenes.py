@@ -1,0 +1,50 @@
+"""Exact two-view scenes for the solvers' tests."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+
+class Scene(NamedTuple):
+    x0: Tensor
+    x1: Tensor
+    F: Tensor
+    K0: Tensor
+    K1: Tensor
+    R: Tensor
+    t: Tensor
+
+
+def _cross_matrix(t: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+
+
+def scene(n: int, seed: int = 0, noise: float = 0.0, planar: bool = False) -> Scene:
+    """n points in general position (or on a plane) 4 to 8 units ahead, seen by two cameras of some 1000 pixels."""
+    rng = np.random.default_rng(seed)
+    R = Rotation.from_rotvec(rng.normal(size=3) * 0.2).as_matrix()
+    t = rng.normal(size=3)
+    t /= np.linalg.norm(t)
+    X = rng.uniform([-2, -2, 4], [2, 2, 8], size=(n, 3))
+    if planar:
+        X[:, 2] = 6 + 0.3 * X[:, 0] - 0.2 * X[:, 1]
+    K0 = np.array([[900.0, 0, 500], [0, 920, 400], [0, 0, 1]])
+    K1 = np.array([[1100.0, 0, 520], [0, 1080, 380], [0, 0, 1]])
+    y0, y1 = X @ K0.T, (X @ R.T + t) @ K1.T
+    x0, x1 = y0[:, :2] / y0[:, 2:], y1[:, :2] / y1[:, 2:]
+    x0, x1 = x0 + noise * rng.normal(size=x0.shape), x1 + noise * rng.normal(size=x1.shape)
+    F = np.linalg.inv(K1).T @ _cross_matrix(t) @ R @ np.linalg.inv(K0)
+    F = F / np.linalg.norm(F)
+    return Scene(*(torch.from_numpy(a) for a in (x0, x1, F, K0, K1, R, t)))
+
+
+def scenes(batch: tuple[int, ...], n: int, seed: int = 0, noise: float = 0.0) -> tuple[Tensor, Tensor, Tensor]:
+    """x0, x1, F of independent scenes with any leading shape."""
+    many = [scene(n, seed * 1000 + i, noise) for i in range(int(np.prod(batch, dtype=int)))]
+    return tuple(torch.stack(list(a)).reshape(*batch, *a[0].shape) for a in list(zip(*many, strict=True))[:3])

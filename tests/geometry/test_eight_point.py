@@ -1,0 +1,254 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from kornia.geometry.epipolar import find_fundamental
+
+from fmtorch.geometry import canonical, eight_point
+from fmtorch.geometry.eigenvector import smallest_eigenvector
+from fmtorch.geometry.minimal import eight_point_components
+from tests.conftest import oracle
+from tests.geometry.scenes import scene, scenes
+from tests.reference import solvers as reference
+
+# Eight matches of images 0005 and 0008 of Strecha's fountain-P11 and the solution of cv2.findFundamentalMat.
+FOUNTAIN_X0 = np.array(
+    [[467.8582, 619.73486], [216.65224, 214.61296], [138.11928, 554.51605], [1366.7096, 627.56067],
+     [271.1964, 347.6318], [317.3195, 294.90454], [1152.1213, 163.50772], [431.11792, 648.2098]],
+    np.float32)  # fmt: skip
+FOUNTAIN_X1 = np.array(
+    [[612.11676, 616.91595], [203.72824, 80.61976], [97.49278, 543.1511], [1151.0769, 595.4389],
+     [275.8673, 269.5121], [333.8658, 209.40636], [1035.0784, 195.64484], [577.998, 651.55457]],
+    np.float32)  # fmt: skip
+FOUNTAIN_F = np.array(
+    [[6.7017539505873322e-08, 2.2802558436056260e-06, -1.1618511614669813e-03],
+     [-1.5516244084291232e-07, -1.9180029430552904e-07, 3.7333482013139734e-03],
+     [-8.6271565107547618e-05, -5.3523033420740454e-03, 9.9997802856561435e-01]])  # fmt: skip
+
+
+def components(x0, x1):
+    return torch.cat([x0, x1], -1).movedim((-1, -2), (0, 1)).contiguous()
+
+
+def test_opencv_and_kornia_oracle():
+    data = oracle("epipolar_8pt.npz")
+    for i in range(len(data["names"])):
+        case = {k: torch.from_numpy(data[f"{i:03d}.{k}"]) for k in ("X1", "X2", "weights")}
+        theirs = {k: canonical(torch.from_numpy(data[f"{i:03d}.{k}"]))
+                  for k in ("F_opencv", "F_kornia", "F_kornia_weighted")}  # fmt: skip
+        F, valid = eight_point(case["X1"], case["X2"])
+        weighted, _ = eight_point(case["X1"], case["X2"], case["weights"])
+        assert valid
+        # OpenCV and kornia agree to 3.1e-10 among themselves (n9 of the last pair, the least determined).
+        assert (F - theirs["F_opencv"]).norm() < 4e-10
+        assert (F - theirs["F_kornia"]).norm() < 4e-10
+        assert (weighted - theirs["F_kornia_weighted"]).norm() < 4e-10
+        if case["X1"].shape[0] == 8:
+            F, valid = eight_point_components(components(case["X1"], case["X2"]))
+            assert valid
+            assert (canonical(F.reshape(3, 3)) - theirs["F_opencv"]).norm() < 4e-10
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+@pytest.mark.parametrize("n", [8, 9, 50])
+def test_reference_opencv_and_kornia_live(batch, n):
+    x0, x1, _ = (a.float().double() for a in scenes(batch, n, noise=0.5))  # OpenCV rounds points to float32
+    w = torch.rand(*batch, n, dtype=torch.float64) + 0.1
+    F, valid = eight_point(x0, x1)
+    W, _ = eight_point(x0, x1, w)
+    assert valid.all()
+    minimal = eight_point_components(components(x0, x1))[0] if n == 8 else None
+    for i in np.ndindex(batch):
+        a, b = x0[i].numpy(), x1[i].numpy()
+        theirs = torch.from_numpy(cv2.findFundamentalMat(a, b, cv2.FM_8POINT)[0])
+        ones = torch.ones(1, n, dtype=torch.float64)
+        kornia = find_fundamental(x0[i][None], x1[i][None], ones)[0]
+        ours = [(F[i], None), (W[i], w[i].numpy()), (theirs, None), (kornia, None)]
+        if minimal is not None:
+            ours.append((minimal[(..., *i)].reshape(3, 3), None))
+        for solution, weights in ours:
+            # M = A^T A is summed with a relative error of n eps, which moves its eigenvector by that over the gap; then
+            # the undoing of the normalisation only shrinks: compared before it.
+            expected = torch.from_numpy(reference.eight_point(a, b, weights))
+            A, T0, T1 = reference.normalised_equations(a, b, weights)
+            s = np.linalg.svd(A if weights is None else np.sqrt(weights)[:, None] * A)[1]
+            gap = (s[7] ** 2 - (s[8] ** 2 if n > 8 else 0)) / s[0] ** 2
+            U0, U1 = (torch.linalg.inv(torch.from_numpy(T)) for T in (T0, T1))
+            error = canonical(U1.mT @ solution @ U0) - canonical(U1.mT @ expected @ U0)
+            assert error.norm() < n * torch.finfo(torch.float64).eps / gap
+
+
+def test_opencv_figures():
+    F, valid = eight_point(*(torch.from_numpy(x.astype(np.float64)) for x in (FOUNTAIN_X0, FOUNTAIN_X1)))
+    assert valid
+    assert (F - torch.from_numpy(FOUNTAIN_F)).norm() < 4e-10  # as for the oracle files
+
+
+def test_rectified_pair_known_by_heart():
+    x0 = torch.tensor([[0.0, 0], [1, 0], [0, 1], [1, 1], [2, 1], [1, 3], [4, 2], [3, 5], [0, 4]], dtype=torch.float64)
+    disparity = torch.tensor([1.0, 2, 3, 5, 7, 11, 13, 4, 9], dtype=torch.float64)
+    x1 = x0 - torch.stack([disparity, torch.zeros_like(disparity)], 1)
+    F, valid = eight_point(x0, x1)
+    expected = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64) / 2**0.5
+    assert valid
+    assert torch.minimum((F - expected).norm(), (F + expected).norm()) < 1e-12
+
+
+def test_float32():
+    x0, x1, F_true = scenes((50,), 100, seed=2)
+    F, valid = eight_point(x0.float(), x1.float())
+    assert F.dtype == torch.float32
+    assert valid.all()
+    assert torch.equal(F, eight_point(x0.float().double(), x1.float().double())[0].float())
+    # The input's rounding, 2^-15 px near 512 px, is noise of that size; 1e-3 px of noise gives errors in F (entries of
+    # order 1e-3 and 1 together) below 1e-5 relative, so 3e-5 px stays far below 1e-4.
+    assert (F - canonical(F_true).float()).norm(dim=(1, 2)).max() < 1e-4
+    points = components(*(a[:, :8] for a in (x0, x1)))
+    F8, valid = eight_point_components(points.float())
+    G8, _ = eight_point_components(points)
+    F8, G8 = (canonical(a.double().movedim(0, -1).reshape(-1, 3, 3)) for a in (F8, G8))
+    # eps = 1.2e-7 times the condition of eight random matches, of order 1e3 in the median.
+    assert (F8 - G8).norm(dim=(1, 2)).median() < 1e-3
+
+
+def test_weight_zero_is_masked_and_masked_is_absent():
+    x0, x1, _ = scenes((3,), 40, noise=0.5)
+    mask = torch.ones(3, 40, dtype=torch.bool)
+    mask[:, 30:] = False
+    garbage = [torch.where(mask[..., None], x, torch.tensor([torch.nan, 1e30], dtype=x.dtype)) for x in (x0, x1)]
+    F, valid = eight_point(*garbage, mask=mask)
+    assert torch.equal(F, eight_point(x0, x1, weight=mask.double())[0])
+    assert torch.equal(F, eight_point(x0[:, :30], x1[:, :30])[0])
+    padded = [torch.cat([x, x.new_full((3, 700, 2), torch.nan)], 1) for x in garbage]
+    padded_mask = torch.cat([mask, torch.zeros(3, 700, dtype=torch.bool)], 1)
+    assert torch.equal(F, eight_point(*padded, mask=padded_mask)[0])
+    weight = torch.where(padded_mask, 0.5, torch.nan).double()
+    assert torch.equal(F, eight_point(*padded, weight=weight, mask=padded_mask)[0])
+    assert valid.all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_bits_do_not_depend_on_the_neighbours(dtype):
+    x0, x1, _ = (a.to(dtype) for a in scenes((37,), 23, noise=1.0))
+    w = torch.rand(37, 23, dtype=dtype)
+    F, _ = eight_point(x0, x1, w)
+    for start, count in ((0, 1), (1, 2), (5, 17), (3, 30)):
+        part = slice(start, start + count)
+        assert torch.equal(eight_point(x0[part], x1[part], w[part])[0], F[part])
+    for i in range(37):
+        assert torch.equal(eight_point(x0[i], x1[i], w[i])[0], F[i])
+    points = torch.randn(4, 8, 203, dtype=dtype)
+    F, valid = eight_point_components(points)
+    for start, count in ((0, 1), (1, 2), (5, 17), (3, 200)):
+        part = eight_point_components(points[..., start : start + count].contiguous())
+        assert torch.equal(part[0], F[..., start : start + count])
+        assert torch.equal(part[1], valid[..., start : start + count])
+
+
+def degenerate(n, dtype=torch.float64):
+    """Two sound sets, then ten that are not, and their names' verdict."""
+    x0, x1, _ = (a.to(dtype).clone() for a in scenes((12,), n, noise=0.5))
+    line = torch.arange(n, dtype=dtype)[:, None]
+    x0[2], x1[2] = x0[2, :1], x1[2, :1]  # all equal
+    x0[3], x1[3] = x0[3, torch.arange(n) % 7], x1[3, torch.arange(n) % 7]  # seven different matches
+    x0[4], x1[4] = line * torch.tensor([8.0, 16], dtype=dtype), line * torch.tensor([4.0, 4], dtype=dtype)  # collinear
+    x0[5, 3, 0] = torch.nan
+    x1[6, 0, 1] = -torch.inf
+    x0[7], x1[7] = 0, 0
+    plane = scene(n, planar=True)
+    x0[8], x1[8] = plane.x0.to(dtype), plane.x1.to(dtype)
+    x0[9] = x0[9, :1]  # coincident in image 0 only
+    x1[10] = x0[10]  # no motion
+    x0[11] = torch.nan
+    return x0, x1
+
+
+@pytest.mark.parametrize("n", [8, 20])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_degenerate_sets_are_invalid_and_alone(n, dtype):
+    x0, x1 = degenerate(n, dtype)
+    F, valid = eight_point(x0, x1)
+    assert valid.tolist() == [True] * 2 + [False] * 10
+    assert not F[2:].any()
+    assert torch.equal(F[:2], eight_point(x0[:2], x1[:2])[0])
+    if n == 8 and dtype == torch.float64:
+        F, valid = eight_point_components(components(x0, x1))
+        assert valid.tolist() == [True] * 2 + [False] * 10
+        assert not F[:, 2:].any()
+
+
+@pytest.mark.parametrize("n", [0, 1, 7])
+def test_too_few(n):
+    x0, x1, _ = scenes((2,), 8)
+    assert not eight_point(x0[:, :n], x1[:, :n])[1].any()
+    mask = (torch.arange(8) < n).expand(2, 8)
+    assert not eight_point(x0, x1, mask=mask)[1].any()
+
+
+def test_bad_weights():
+    x0, x1, _ = scenes((4,), 20)
+    w = torch.ones(4, 20, dtype=torch.float64)
+    w[0, 3], w[1, 3], w[2] = -1.0, torch.nan, 0.0
+    assert eight_point(x0, x1, w)[1].tolist() == [False, False, False, True]
+
+
+def test_gradient():
+    s = scene(12, noise=0.5)
+    x0, x1 = (s.x0 / 500).requires_grad_(), (s.x1 / 500).requires_grad_()
+    w = torch.rand(12, dtype=torch.float64) + 0.2
+    w[3] = 0.0
+    w[-1] = 1.5  # the largest stays the largest
+
+    def invariant(a, b, w):
+        F, _ = eight_point(a, b, w)
+        return F @ F.mT
+
+    assert torch.autograd.gradcheck(lambda a, b: invariant(a, b, w), (x0, x1))
+    free = torch.arange(12) != 3  # a zero weight may only grow
+    v = w[free].clone().requires_grad_()
+    full = torch.zeros(12, dtype=torch.float64)
+    assert torch.autograd.gradcheck(lambda v: invariant(x0.detach(), x1.detach(), full.masked_scatter(free, v)), (v,))
+    # at zero: against a one-sided difference
+    w0 = w.clone().requires_grad_()
+    loss = invariant(x0.detach(), x1.detach(), w0)[0, 0]
+    (gradient,) = torch.autograd.grad(loss, w0)
+    step = 1e-7
+    moved = w.clone()
+    moved[3] = step
+    difference = (invariant(x0.detach(), x1.detach(), moved)[0, 0] - loss.detach()) / step
+    torch.testing.assert_close(gradient[3], difference, rtol=1e-4, atol=1e-6)
+
+
+def test_gradient_is_finite_on_degenerate_sets():
+    x0, x1 = (a.requires_grad_() for a in degenerate(20))
+    w = torch.ones(12, 20, dtype=torch.float64)
+    w[0, :10] = 0
+    w.requires_grad_()
+    eight_point(x0, x1, w)[0].square().sum().backward()
+    for leaf in (x0, x1, w):
+        assert leaf.grad is not None
+        assert leaf.grad.isfinite().all()
+    x0, x1, _ = scenes((1,), 20, noise=0.5)
+    w = torch.zeros(1, 20, dtype=torch.float64, requires_grad=True)
+    eight_point(x0, x1, w)[0].sum().backward()
+    assert w.grad is not None
+    assert w.grad.isfinite().all()
+
+
+def test_smallest_eigenvector():
+    A = torch.randn(300, 12, 9, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    M = A.mT @ A
+    v, determined = smallest_eigenvector(M)
+    values, vectors = torch.linalg.eigh(M)
+    assert determined.all()
+    dot = (v * vectors[..., 0]).sum(-1).abs()
+    # Angle: eps |M| / gap, and from the squarings (l9 / l8)^(2^14), nothing here.
+    gap = (values[:, 1] - values[:, 0]) / values[:, 8]
+    assert (1 - dot <= 0.5 * (100 * torch.finfo(torch.float64).eps / gap) ** 2 + 1e-15).all()
+    M[:, 3] = M[:, :, 3] = 0
+    M[::2, 4] = M[::2, :, 4] = 0
+    assert smallest_eigenvector(M)[1].tolist() == [False, True] * 150
+    v, _ = smallest_eigenvector(torch.zeros(9, 9, dtype=torch.float64))
+    assert v.isfinite().all()
