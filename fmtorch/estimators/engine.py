@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch import random
-from fmtorch.estimators.choice import CHOICES
-from fmtorch.estimators.parts import FINAL_FITS, INLIER_RULES, SAMPLERS, SCORES, SOLVERS, Refinement, part
+from fmtorch.estimators.choice import best_of
+from fmtorch.estimators.parts import CHOICES, FINAL_FITS, INLIER_RULES, SAMPLERS, SCORES, SOLVERS, Refinement, part
 from fmtorch.estimators.problem import Problem, problems
 from fmtorch.estimators.scoring import InlierCount, score_models
 from fmtorch.random import Stream
@@ -46,7 +46,8 @@ class HypothesizeAndVerify:
     pool: the best models that are kept to the end. refine: robust kernel of the Levenberg-Marquardt refinement of the
     pool (`truncated`, `cauchy`, ...), null: none; refine_threshold: its scale, Sampson distance in pixels;
     refine_iterations: its steps. choice: by which score the estimate is chosen from the refined pool, `score` (the
-    search's own) or `saturated` (gains saturate in each cell of a grid).
+    search's own), `saturated` (gains saturate in each cell of a grid) or `focal` (the same, with a prior on the focal
+    length: for whole photographs, not crops; `saturated` where the image sizes are unknown).
     inliers: `threshold`, `lmeds` (2.5 robust standard deviations) or `median` (the better half).
     final: `least_squares` (8-point on the inliers) or `none`. refit_inliers: recompute inliers after the final fit.
 
@@ -138,13 +139,11 @@ class HypothesizeAndVerify:
             return F[:, :, 0]
         if self.refinement is not None:
             F = self.refinement(F, problem)
-        if self.choice is None:
-            score = score_models(self.score, F.to(torch.float32), problem, problem.points.to(torch.float32))
-        else:
-            score = self.choice(F, problem)
-        score = torch.where(torch.isfinite(search.score), score, -torch.inf)
-        best = torch.sort(score, dim=1, descending=True, stable=True).indices[:, :1]
-        return F.gather(2, best.expand(9, -1, -1))[..., 0]
+        alive = torch.isfinite(search.score)
+        if self.choice is not None:
+            return self.choice(F, problem, alive)
+        score = score_models(self.score, F.to(torch.float32), problem, problem.points.to(torch.float32))
+        return best_of(F, score, alive)
 
     def _search(self, problem: Problem) -> _Search:
         p, device = len(problem.pair), problem.points.device

@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.estimators.choice import Choice, SaturatedGain
+from fmtorch.estimators.focal import FocalPrior
 from fmtorch.estimators.problem import Problem
 from fmtorch.estimators.sampling import PriorWeighted, Prosac, Sampler, Uniform
 from fmtorch.estimators.scoring import (
@@ -178,3 +180,4 @@ INLIER_RULES: dict[str, Callable[[float], Callable[[Tensor, Problem], Tensor]]] 
     "lmeds": RobustDeviations,
 }
 FINAL_FITS: dict[str, Callable[[], FinalFit]] = {"none": NoFit, "least_squares": LeastSquares}
+CHOICES: dict[str, Callable[[float], Choice]] = {"saturated": SaturatedGain, "focal": FocalPrior}
