@@ -47,7 +47,8 @@ class HypothesizeAndVerify:
     pool (`truncated`, `cauchy`, ...), null: none; refine_threshold: its scale, Sampson distance in pixels;
     refine_iterations: its steps. choice: by which score the estimate is chosen from the refined pool, `score` (the
     search's own), `saturated` (gains saturate in each cell of a grid) or `focal` (the same, with a prior on the focal
-    length: for whole photographs, not crops; `saturated` where the image sizes are unknown).
+    length: for whole photographs, not crops; `saturated` where the image sizes are unknown);
+    choice_threshold: of these two, Sampson distance in pixels, null: `threshold`. Minimal samples want a wider one.
     inliers: `threshold`, `lmeds` (2.5 robust standard deviations) or `median` (the better half).
     final: `least_squares` (8-point on the inliers) or `none`. refit_inliers: recompute inliers after the final fit.
 
@@ -72,6 +73,7 @@ class HypothesizeAndVerify:
         refine_threshold: float = 1.0,
         refine_iterations: int = 5,
         choice: str = "score",
+        choice_threshold: float | None = None,
         inliers: str = "threshold",
         final: str = "least_squares",
         refit_inliers: bool = True,
@@ -88,7 +90,7 @@ class HypothesizeAndVerify:
         self.preselect, self.survivors = preselect, survivors
         self.pool = pool
         self.refinement = None if refine is None else Refinement(refine, refine_threshold, refine_iterations)
-        self.choice = None if choice == "score" else part("choice", choice, CHOICES)(threshold)
+        self.choice = None if choice == "score" else part("choice", choice, CHOICES)(choice_threshold or threshold)
         self.inlier_rule = part("inliers", inliers, INLIER_RULES)(threshold)
         self.final = part("final", final, FINAL_FITS)()
         self.refit_inliers = refit_inliers
