@@ -81,7 +81,7 @@ def _path(config: DictConfig, name: str) -> Path:
 def _report(result: MatchResult, image0: Image, image1: Image, truth: NDArray[np.float64] | None) -> dict[str, Any]:
     """What result.json holds of a result; points in pixels of the images."""
     c = result.correspondences
-    report = {
+    report: dict[str, Any] = {
         "size0": image0.shape[:2], "size1": image1.shape[:2],
         "F": result.F.tolist() if result.ok else None, "reason": result.reason, "warning": result.warning,
         "features": [len(result.keypoints0), len(result.keypoints1)],

@@ -105,7 +105,7 @@ def _image(image: Path | str | Image, name: str) -> Image:
     return image
 
 
-def _reduced(image: Image, longest_side: int) -> tuple[Image, Float[Tensor, "2"]]:
+def _reduced(image: Image, longest_side: int) -> tuple[Image, Float[Tensor, " xy"]]:
     """The image with its longest side at most that long, and its scale in x and y (rounding makes them differ)."""
     h, w = image.shape[:2]
     scale = min(1.0, longest_side / max(h, w))
@@ -147,8 +147,9 @@ def _relate(pipeline: Pipeline, features0: Features, features1: Features, seed: 
 
 
 def _still(c: Correspondences, inliers: Tensor) -> str:
-    """A warning where the inliers do not move between the images."""
-    motion = (c.x1 - c.x0)[0, inliers].norm(dim=-1)
+    """A warning where the inliers, or without any all matches, do not move between the images."""
+    motion = (c.x1 - c.x0)[0].norm(dim=-1)
+    motion = motion[inliers] if inliers.any() else motion
     if len(motion) == 0 or motion.median() > STILL:
         return ""
     return "the images show no motion, as if they were one: infinitely many F agree with all matches"

@@ -72,7 +72,7 @@ def draw_epipolar_lines(
         partners = np.column_stack([other[index], np.ones(len(index))])
         drawn = [[place.clip(line) for line in partners @ matrix.T] for matrix in matrices]
         for k, ends in enumerate(drawn[0]):
-            _segment(part, ends, COLOURS[k % len(COLOURS)], 1.5 * unit)
+            _segment(part, ends, COLOURS[k % len(COLOURS)], 1.9 * unit)
         for ends in drawn[1] if truth is not None else []:
             for dash in _dashes(ends, 9 * unit):
                 _segment(part, dash, (255, 255, 255), 1.1 * unit)
@@ -116,7 +116,7 @@ class _Place:
         return canvas[self.origin[1] : self.origin[1] + self.size[1], self.origin[0] : self.origin[0] + self.size[0]]
 
     def clip(self, line: Points) -> NDArray[np.float64]:
-        """The part of a line (a, b, c) of the image within the image: two ends (2, 2) in pixels of `view`, or (0, 2)."""
+        """The part of a line (a, b, c) within the image: its ends (2, 2) in pixels of `view`; (0, 2) if there is none."""
         w, h = self.shape[::-1]
         normal, middle = line[:2], np.array([w - 1, h - 1]) / 2
         squared = float(normal @ normal)
