@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from numpy.typing import NDArray
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 
@@ -73,8 +73,8 @@ def read_matrix(path: Path) -> NDArray[np.float64]:
 
 
 def _path(config: DictConfig, name: str) -> Path:
-    if config[name] is None:
-        raise ValueError(f"{name} is null; give two image files: image0=a.jpg image1=b.jpg")
+    if OmegaConf.is_missing(config, name) or config[name] is None:
+        raise ValueError(f"{name} is missing; give two image files: image0=a.jpg image1=b.jpg")
     return Path(str(config[name]))
 
 

@@ -31,7 +31,7 @@ _COLOUR_LEFT = 0.45  # of the photographs' own, so that lines stand out
 
 def draw_matches(
     image0: Image, image1: Image, x0: Points, x1: Points, good: NDArray[np.bool_],
-    *, height: int | None = None, most: int = 100, most_bad: int = 50,
+    *, height: int | None = None, most: int = 90, most_bad: int = 50,
 ) -> Image:  # fmt: skip
     """Two images side by side with their matches as lines, green where good, thin and red elsewhere; RGB (H, W, 3).
 
@@ -41,7 +41,7 @@ def draw_matches(
     canvas, place0, place1 = _placed(image0, image1, height)
     ends0, ends1 = place0(x0), place1(x1)
     unit = _unit(canvas)
-    styles = ((BAD, ~good, most_bad, 0.7 * unit, 0.6), (GOOD, good, most, 1.4 * unit, 0.9))
+    styles = ((BAD, ~good, most_bad, 0.6 * unit, 0.6), (GOOD, good, most, 1.1 * unit, 0.85))
     for colour, chosen, count, width, opacity in styles:
         index = np.flatnonzero(chosen & np.isfinite(ends0).all(1) & np.isfinite(ends1).all(1))
         index = index[spread(np.hstack([ends0, ends1])[index], count)]
@@ -49,7 +49,7 @@ def draw_matches(
         for a, b in zip(_fixed(ends0[index]), _fixed(ends1[index]), strict=True):
             cv2.line(layer, a, b, colour, _pixels(width), cv2.LINE_AA, _SUBPIXEL)
         for point in _fixed(np.concatenate([ends0[index], ends1[index]])):
-            cv2.circle(layer, point, round(2 * width * (1 << _SUBPIXEL)), colour, -1, cv2.LINE_AA, _SUBPIXEL)
+            cv2.circle(layer, point, round(2.6 * width * (1 << _SUBPIXEL)), colour, -1, cv2.LINE_AA, _SUBPIXEL)
         canvas = np.asarray(cv2.addWeighted(layer, opacity, canvas, 1 - opacity, 0), np.uint8)
     return canvas
 
@@ -74,7 +74,7 @@ def draw_epipolar_lines(
         for k, ends in enumerate(drawn[0]):
             _segment(part, ends, COLOURS[k % len(COLOURS)], 1.9 * unit)
         for ends in drawn[1] if truth is not None else []:
-            for dash in _dashes(ends, 9 * unit):
+            for dash in _dashes(ends, 8 * unit):
                 _segment(part, dash, (255, 255, 255), 1.1 * unit)
         for k, point in enumerate(_fixed(place(own[index]) - place.origin)):
             for colour, radius in (((0, 0, 0), 5.8), ((255, 255, 255), 5.0), (COLOURS[k % len(COLOURS)], 3.6)):
@@ -116,7 +116,7 @@ class _Place:
         return canvas[self.origin[1] : self.origin[1] + self.size[1], self.origin[0] : self.origin[0] + self.size[0]]
 
     def clip(self, line: Points) -> NDArray[np.float64]:
-        """The part of a line (a, b, c) within the image: its ends (2, 2) in pixels of `view`; (0, 2) if there is none."""
+        """The part of a line (a, b, c) within the image: its ends (2, 2) in pixels of `view`; (0, 2) where none is."""
         w, h = self.shape[::-1]
         normal, middle = line[:2], np.array([w - 1, h - 1]) / 2
         squared = float(normal @ normal)
@@ -188,11 +188,11 @@ def _segment(canvas: Image, ends: Points, colour: tuple[int, int, int], width: f
 
 
 def _dashes(ends: Points, length: float) -> Iterator[Points]:
-    """Pieces of a line with gaps of the same length between them."""
+    """Pieces of a line with gaps of twice their length between them."""
     if len(ends):
         pieces = max(1, round(float(np.linalg.norm(ends[1] - ends[0])) / length))
         stops = ends[0] + np.linspace(0, 1, pieces + 1)[:, None] * (ends[1] - ends[0])
-        yield from (stops[i : i + 2] for i in range(0, pieces, 2))
+        yield from (stops[i : i + 2] for i in range(1, pieces, 3))
 
 
 def _fixed(points: Points) -> list[tuple[int, int]]:
