@@ -157,7 +157,7 @@ def _still(c: Correspondences, inliers: Tensor) -> str:
 
 def _restored(found: MatchResult, scales: list[Tensor], sizes: list[Tensor]) -> MatchResult:
     """The result in pixels of the original images of these sizes, whose reduction had these scales."""
-    # (0, 0) is the centre of the first pixel: x_reduced = s x + (s - 1) / 2.
+    # (0, 0) is the centre of the first pixel, so x_reduced + 1/2 = s (x + 1/2).
     to_reduced = [
         torch.tensor([[s[0], 0, (s[0] - 1) / 2], [0, s[1], (s[1] - 1) / 2], [0, 0, 1]], dtype=torch.float64)
         for s in scales
@@ -166,7 +166,7 @@ def _restored(found: MatchResult, scales: list[Tensor], sizes: list[Tensor]) -> 
     s0, s1 = (s.to(found.keypoints0) for s in scales)
 
     def points(x: Tensor, s: Tensor) -> Tensor:
-        return (x + 0.5) / s - 0.5
+        return x / s + (1 - s) / (2 * s)  # exactly x where nothing was reduced
 
     def frames(lafs: Tensor | None, s: Tensor) -> Tensor | None:
         return None if lafs is None else torch.cat([lafs[..., :2] / s[:, None], points(lafs[..., 2:].mT, s).mT], -1)

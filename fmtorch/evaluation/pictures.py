@@ -26,6 +26,7 @@ WIDTH, HEIGHT = 1920, 1000  # px, of a picture at most
 _GAP = 6  # px between the two images
 _STACKED = 5.0  # images whose widths add up to more than so many heights stand one above the other
 _SUBPIXEL = 4  # fractional bits of the coordinates that are drawn
+_PARALLEL = 1e-9  # a line with this slope at most leaves an image only at its two other sides
 _COLOUR_LEFT = 0.45  # of the photographs' own, so that lines stand out
 
 
@@ -75,7 +76,7 @@ def draw_epipolar_lines(
             _segment(part, ends, COLOURS[k % len(COLOURS)], 1.9 * unit)
         for ends in drawn[1] if truth is not None else []:
             for dash in _dashes(ends, 8 * unit):
-                _segment(part, dash, (255, 255, 255), 1.1 * unit)
+                _segment(part, dash, (255, 255, 255), 1.6 * unit)
         for k, point in enumerate(_fixed(place(own[index]) - place.origin)):
             for colour, radius in (((0, 0, 0), 5.8), ((255, 255, 255), 5.0), (COLOURS[k % len(COLOURS)], 3.6)):
                 cv2.circle(part, point, round(radius * unit * (1 << _SUBPIXEL)), colour, -1, cv2.LINE_AA, _SUBPIXEL)
@@ -118,15 +119,15 @@ class _Place:
     def clip(self, line: Points) -> NDArray[np.float64]:
         """The part of a line (a, b, c) within the image: its ends (2, 2) in pixels of `view`; (0, 2) where none is."""
         w, h = self.shape[::-1]
-        normal, middle = line[:2], np.array([w - 1, h - 1]) / 2
-        squared = float(normal @ normal)
-        if not np.isfinite(line).all() or squared == 0:
+        length = float(np.hypot(line[0], line[1]))
+        if not np.isfinite(line).all() or length == 0:
             return np.zeros((0, 2))
-        foot = middle - normal * ((normal @ middle + line[2]) / squared)
-        direction = np.array([-normal[1], normal[0]]) / np.sqrt(squared)
+        normal, middle = line[:2] / length, np.array([w - 1, h - 1]) / 2
+        foot = middle - normal * (normal @ middle + line[2] / length)
+        direction = np.array([-normal[1], normal[0]])
         first, last = -np.inf, np.inf
         for start, step, low, high in zip(foot, direction, (-0.5, -0.5), (w - 0.5, h - 0.5), strict=True):
-            if step == 0:
+            if abs(step) < _PARALLEL:
                 if not low <= start <= high:
                     return np.zeros((0, 2))
                 continue
