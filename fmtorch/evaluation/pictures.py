@@ -27,6 +27,7 @@ _GAP = 6  # px between the two images
 _STACKED = 5.0  # images whose widths add up to more than so many heights stand one above the other
 _SUBPIXEL = 4  # fractional bits of the coordinates that are drawn
 _PARALLEL = 1e-9  # a line with this slope at most leaves an image only at its two other sides
+_FARTHEST = 1e12  # px; a line farther from the first pixel is the line at infinity
 _COLOUR_LEFT = 0.45  # of the photographs' own, so that lines stand out
 
 
@@ -75,8 +76,8 @@ def draw_epipolar_lines(
         for k, ends in enumerate(drawn[0]):
             _segment(part, ends, COLOURS[k % len(COLOURS)], 1.9 * unit)
         for ends in drawn[1] if truth is not None else []:
-            for dash in _dashes(ends, 8 * unit):
-                _segment(part, dash, (255, 255, 255), 1.6 * unit)
+            for dash in _dashes(ends, 15 * unit):
+                _segment(part, dash, (255, 255, 255), 1.3 * unit)
         for k, point in enumerate(_fixed(place(own[index]) - place.origin)):
             for colour, radius in (((0, 0, 0), 5.8), ((255, 255, 255), 5.0), (COLOURS[k % len(COLOURS)], 3.6)):
                 cv2.circle(part, point, round(radius * unit * (1 << _SUBPIXEL)), colour, -1, cv2.LINE_AA, _SUBPIXEL)
@@ -120,7 +121,7 @@ class _Place:
         """The part of a line (a, b, c) within the image: its ends (2, 2) in pixels of `view`; (0, 2) where none is."""
         w, h = self.shape[::-1]
         length = float(np.hypot(line[0], line[1]))
-        if not np.isfinite(line).all() or length == 0:
+        if not np.isfinite(line).all() or length <= abs(line[2]) / _FARTHEST:
             return np.zeros((0, 2))
         normal, middle = line[:2] / length, np.array([w - 1, h - 1]) / 2
         foot = middle - normal * (normal @ middle + line[2] / length)
@@ -189,11 +190,11 @@ def _segment(canvas: Image, ends: Points, colour: tuple[int, int, int], width: f
 
 
 def _dashes(ends: Points, length: float) -> Iterator[Points]:
-    """Pieces of a line with gaps of twice their length between them."""
+    """Pieces of a line with gaps of the same length between them."""
     if len(ends):
         pieces = max(1, round(float(np.linalg.norm(ends[1] - ends[0])) / length))
         stops = ends[0] + np.linspace(0, 1, pieces + 1)[:, None] * (ends[1] - ends[0])
-        yield from (stops[i : i + 2] for i in range(1, pieces, 3))
+        yield from (stops[i : i + 2] for i in range(0, pieces, 2))
 
 
 def _fixed(points: Points) -> list[tuple[int, int]]:

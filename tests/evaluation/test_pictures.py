@@ -105,7 +105,7 @@ def test_epipolar_lines_run_through_the_points_and_the_truth_is_white() -> None:
     row = round((30 + 9 + 0.5) * scale - 0.5)
     white = near(with_truth, (255, 255, 255), 100)[row - 1 : row + 2].any(0)
     half = with_truth.shape[1] // 2 + 10
-    assert 0.2 < white[half:].mean() < 0.6  # dashed
+    assert 0.4 < white[half:].mean() < 0.7  # dashed
     assert not white[: half - 20].any()
 
 
