@@ -11,7 +11,7 @@ from torch import Tensor
 
 from fmtorch import random
 from fmtorch.estimators.problem import Problem
-from fmtorch.estimators.scoring import Score, sampson_squared, score_models
+from fmtorch.estimators.scoring import CPU_TILE, GPU_TILE, Score, sampson_squared, score_models
 from fmtorch.estimators.spatial import gaussian_kernel, neighbor_graph, spatially_coherent_inliers
 from fmtorch.geometry import eight_point
 from fmtorch.random import Stream
@@ -47,31 +47,37 @@ class GraphCut:
         self.threshold, self.score = threshold, score
 
     def __call__(self, F: Float[Tensor, "9 p k"], problem: Problem) -> Float[Tensor, "9 p k"]:
-        """As `LocalOptimization`."""
+        """As `LocalOptimization`; in tiles of pairs that bound the memory."""
+        limit = GPU_TILE if F.is_cuda else CPU_TILE
+        pairs = max(1, limit // (F.shape[2] * problem.live.shape[1]))
         with torch.no_grad():
-            graph = neighbor_graph(problem, self.RADIUS)
-            points = problem.points.to(torch.float32)
-            scale = (problem.unit / self.threshold).square()[:, None, None]
-            score = score_models(self.score, F.to(torch.float32), problem, points)
-            rising = torch.ones_like(score, dtype=torch.bool)
-            for i in range(self.ITERATIONS):
-                kernel = gaussian_kernel(sampson_squared(F, problem.points) * scale)
-                labels = spatially_coherent_inliers(kernel, problem.live, graph, self.COHERENCE)
-                fits, valid = self._fits(labels, problem, i)
-                fit_score = score_models(self.score, fits.flatten(2).to(torch.float32), problem, points)
-                best, which = first_maximum(fit_score.reshape(valid.shape).masked_fill(~valid, -torch.inf))
-                rising = rising & (best > score)
-                if not bool(rising.any()):
-                    break
-                fit = fits.gather(3, which.expand(9, -1, -1, -1))[..., 0]
-                F, score = torch.where(rising, fit, F), torch.where(rising, best, score)
+            tiles = torch.split(torch.arange(F.shape[1], device=F.device), pairs)
+            return torch.cat([self._improved(F[:, tile], problem[tile]) for tile in tiles], 1)
+
+    def _improved(self, F: Float[Tensor, "9 p k"], problem: Problem) -> Float[Tensor, "9 p k"]:
+        graph = neighbor_graph(problem, self.RADIUS)
+        points = problem.points.to(torch.float32)
+        scale = (problem.unit / self.threshold).square()[:, None, None]
+        score = score_models(self.score, F.to(torch.float32), problem, points)
+        rising = torch.ones_like(score, dtype=torch.bool)
+        for i in range(self.ITERATIONS):
+            kernel = gaussian_kernel(sampson_squared(F, problem.points) * scale)
+            labels = spatially_coherent_inliers(kernel, problem.live, graph, self.COHERENCE)
+            fits, valid = self._fits(labels, problem, i)
+            fit_score = score_models(self.score, fits.flatten(2).to(torch.float32), problem, points)
+            best, which = first_maximum(fit_score.reshape(valid.shape).masked_fill(~valid, -torch.inf))
+            rising = rising & (best > score)
+            if not bool(rising.any()):
+                break
+            fit = fits.gather(3, which.expand(9, -1, -1, -1))[..., 0]
+            F, score = torch.where(rising, fit, F), torch.where(rising, best, score)
         return F
 
     def _fits(
         self, labels: Bool[Tensor, "p k n"], problem: Problem, iteration: int
     ) -> tuple[Float[Tensor, "9 p k m"], Bool[Tensor, "p k m"]]:
         """Fits to all inliers of each model and to samples of them, and which are determined."""
-        p, k, n = labels.shape
+        k, n = labels.shape[1:]
         everything = problem.points[:, :, None].expand(-1, -1, k, -1)
         whole, whole_valid = _eight_point(everything, labels.to(torch.float64))
         table = labels.to(torch.int64).cumsum(-1)
@@ -79,8 +85,8 @@ class GraphCut:
         bits = random.bits(problem.seed, problem.key, Stream.SAMPLING, first, self.SAMPLES, self.SAMPLE_SIZE)
         position = ((bits.flatten(1)[:, None] >> 31) * table[..., -1:]) >> 32
         index = torch.searchsorted(table, position, right=True).clamp_max_(n - 1)
-        sample = everything.gather(3, index.expand(4, -1, -1, -1)).unflatten(3, (self.SAMPLES, self.SAMPLE_SIZE))
-        some, some_valid = _eight_point(sample)
+        sample = everything.gather(3, index.expand(4, -1, -1, -1))
+        some, some_valid = _eight_point(sample.reshape(*sample.shape[:3], self.SAMPLES, self.SAMPLE_SIZE))
         return torch.cat([whole[..., None], some], 3), torch.cat([whole_valid[..., None], some_valid], 2)
 
 

@@ -6,8 +6,8 @@ graph, each counted once. With the kernel ``K = exp(-r^2 / (2 epsilon^2))`` of a
 
     B(0) = K_p, B(1) = 1 - K_p;    R(0, 0) = (K_p + K_q) / 2, R(1, 1) = 1 - (K_p + K_q) / 2, R(0, 1) = R(1, 0) = 1.
 
-This is the paper's form, which is followed here. The released code differs: it takes ``K = 1 - r^2 / (1.5 epsilon)^2``,
-in B not cut off below zero and with B(1) = 0, counts each edge from both ends, and has lambda = 0.14 for the paper's 0.1.
+This is the paper's form, which is followed here. The released code differs: ``K = 1 - r^2 / (1.5 epsilon)^2``, in B
+not cut off below zero and with B(1) = 0; each edge counts from both ends; and lambda is 0.14 for the paper's 0.1.
 The paper's neighbours are the matches within a ball of 20 px in the space of (x0, y0, x1, y1); so they are here, as far
 as they are found close to each other along space-filling curves through that space.
 

@@ -27,7 +27,7 @@ def least_by_enumeration(kernel: np.ndarray, edges: list[tuple[int, int]], coher
 
 
 def least_cut(kernel: np.ndarray, edges: list[tuple[int, int]], coherence: float) -> np.ndarray:
-    """The labelling of least energy and fewest inliers, by the maximum flow through a graph whose cuts cost what labellings cost.
+    """The labelling of least energy and fewest inliers: a least cut of a graph whose cuts cost what labellings cost.
 
     Terminals as Kolmogorov & Zabih (PAMI 2004) place them: a pair's cost [[A, B], [C, D]] is A + (C - A) L_p
     + (D - C) L_q + (B + C - A - D) (1 - L_p) L_q. Source: label 0; sink: label 1.
