@@ -50,10 +50,10 @@ class Plan:
 
 
 PLANS = {
-    ("small", "test"): Plan(5, 4, 4, spare=8),
-    ("small", "train"): Plan(5, 4, 4, spare=8),
-    ("full", "test"): Plan(8, 14, 25, spare=8),
-    ("full", "train"): Plan(32, 14, 25, spare=8),
+    ("small", "test"): Plan(5, 4, 4, spare=6),
+    ("small", "train"): Plan(5, 4, 4, spare=6),
+    ("full", "test"): Plan(8, 14, 25, spare=6),
+    ("full", "train"): Plan(32, 14, 25, spare=6),
 }
 
 
