@@ -1,8 +1,8 @@
 """Non-linear refinement of fundamental matrices: Levenberg-Marquardt of the robust Sampson error.
 
 Minimises ``sum_i w_i rho(r_i^2)``, r the Sampson distance, over the 7-dimensional manifold of 3 x 3 matrices of rank 2
-and unit norm (see `rank2_manifold`). Everything is element-wise or summed in a fixed order, so a model is refined to the
-same bits in any batch.
+and unit norm (see `rank2_manifold`). Everything is element-wise or summed in a fixed order, so a model is refined to
+the same bits in any batch.
 """
 
 from __future__ import annotations
