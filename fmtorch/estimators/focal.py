@@ -20,17 +20,17 @@ from torch import Tensor
 from fmtorch.estimators.choice import SaturatedGain, best_of
 from fmtorch.estimators.problem import Problem
 from fmtorch.geometry.rank2 import complement
+from fmtorch.geometry.rank2_manifold import start, total, unit
 from fmtorch.geometry.reduce import component_sum
-from fmtorch.geometry.refine import Objective, start, total, unit
 from fmtorch.geometry.robust_kernels import KERNELS
+from fmtorch.geometry.sampson_objective import Objective
 
 USUAL_FOCAL = 1.2  # median focal length in units of the longer image side
 FOCAL_DEVIATION = 0.4  # of its logarithm, averaged over the two images
 RATIO_DEVIATION = 0.3  # of the logarithm of the two focal lengths' ratio
 SIGMA = 0.3  # px, standard deviation of an inlier's Sampson distance
-GATE = (
-    0.94  # share of the best gain without prior that gain minus prior cost must reach; castle-P19, fox, crops of both
-)
+# Share of the best gain without prior that gain minus prior cost must reach; chosen on castle-P19, fox, crops of them.
+GATE = 0.94
 ITERATIONS = 12  # Levenberg-Marquardt steps
 SHORTEST, LONGEST = 0.25, 5.0  # focal lengths outside are not believed at the start
 DAMPING, SMALLEST_DAMPING, LARGEST_DAMPING = 1e-3, 1e-9, 1e6

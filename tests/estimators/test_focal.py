@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from fmtorch.estimators import HypothesizeAndVerify
 from fmtorch.estimators.focal import FocalPrior, bougnoux, exponential, logarithm, refine_focal
 from fmtorch.estimators.problem import Problem, problems
-from fmtorch.geometry.refine import refine_components, start
+from fmtorch.geometry.rank2_manifold import start
+from fmtorch.geometry.refine import refine_components
 from fmtorch.types import Correspondences, collate
 from tests.conftest import oracle
 from tests.laws import scenes
