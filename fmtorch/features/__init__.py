@@ -3,4 +3,4 @@
 from fmtorch.features.asift import ASIFT, simulate_view, simulated_views
 from fmtorch.features.sift import FRAME_SIGMAS, SIFT, keypoints_to_lafs, root_sift
 
-__all__ = ["FRAME_SIGMAS", "SIFT", "ASIFT", "keypoints_to_lafs", "root_sift", "simulate_view", "simulated_views"]
+__all__ = ["ASIFT", "FRAME_SIGMAS", "SIFT", "keypoints_to_lafs", "root_sift", "simulate_view", "simulated_views"]

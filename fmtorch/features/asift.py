@@ -8,11 +8,11 @@ import math
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.features.sift import FRAME_SIGMAS, SIFT, _as_grey, _strongest
+from fmtorch.features.sift import SIFT, _as_grey, _strongest
 from fmtorch.types import Features
 
 ROTATION_STEP = 72.0  # degrees, divided by the tilt; section 5.2 of the paper
@@ -20,19 +20,18 @@ ANTIALIAS_SIGMA = 0.8  # times sqrt(t^2 - 1), the blur along the axis that is th
 
 
 @dataclasses.dataclass(frozen=True)
-class ASIFT:
+class ASIFT(SIFT):
     """SIFT on simulated views of an image, the keypoints mapped back; an instance may be used by several threads.
 
     A view is the image rotated by an angle, then reduced t times along x: as a camera would see a distant plane from
     latitude arccos(1 / t). The tilts are ``t = sqrt(2)^k``, k = 0 ... tilts - 1, at the angles 0, 72 / t, ... below
     180 degrees: 43 views for the paper's six tilts, about 14 times the area of the image. No tilt is plain SIFT.
 
-    sift: finds and describes the keypoints of each view. max_features: the strongest kept over all views.
+    max_features: the strongest kept over all views. The other options are those of `SIFT` in each view.
     """
 
-    sift: SIFT = SIFT()
-    tilts: int = 6
     max_features: int = 30000
+    tilts: int = 6
 
     def __call__(self, image: NDArray[np.uint8]) -> Features:
         """The features of a grey (H, W) or RGB (H, W, 3) uint8 image; none, with N = 0, where nothing is found.
@@ -42,10 +41,10 @@ class ASIFT:
         an empty image.
         """
         grey = _as_grey(image)
-        found = [self.sift(grey)]
+        found = [super().__call__(grey)]
         for tilt, angle in simulated_views(self.tilts)[1:]:
             view, to_view = simulate_view(grey, tilt, angle)
-            found.append(_mapped_back(self.sift(view), to_view, grey.shape))
+            found.append(_mapped_back(super().__call__(view), to_view, grey.shape))
         scores = torch.cat([f.scores for f in found])
         kept = torch.from_numpy(_strongest(scores.numpy(), self.max_features))
         return Features(
@@ -100,8 +99,9 @@ def _mapped_back(features: Features, to_view: NDArray[np.float64], shape: tuple[
 
 def _inside(
     centre: Float[Tensor, "n 2"], radius: Float[Tensor, " n"], to_image: Float[Tensor, "2 2"], shape: tuple[int, ...]
-) -> Tensor:
+) -> Bool[Tensor, " n"]:
     """Whether a circle of the view, mapped to the image, stays in it: it reaches |row of the map| times its radius."""
     reach = radius[:, None] * torch.linalg.vector_norm(to_image, dim=1)
     far = torch.tensor([shape[1] - 1, shape[0] - 1], dtype=centre.dtype)
-    return ((centre >= reach) & (centre <= far - reach)).all(-1)
+    inside: Tensor = ((centre >= reach) & (centre <= far - reach)).all(-1)
+    return inside

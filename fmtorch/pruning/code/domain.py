@@ -31,7 +31,7 @@ class MatchDomain(NamedTuple):
 
     def blocks(self) -> list[MatchDomain]:
         """The matches in their order, at most BLOCK at a time."""
-        return [MatchDomain(*part) for part in zip(*(value.split(BLOCK) for value in self), strict=True)]
+        return [MatchDomain(*part) for part in zip(*(torch.split(value, BLOCK) for value in self), strict=True)]
 
 
 def match_domain(

@@ -16,14 +16,15 @@ from fmtorch.pruning.code.regression import huber_regression
 class LikelihoodField:
     """A function of the match domain that is near 1 where distinctive matches are coherent and near 0 elsewhere.
 
-    ``f = sum_m w_m g(., c_m)`` minimises ``sum_j huber(1 - f(z_j)) + ridge |w|^2`` over the distinctive matches j: all
+    ``f = sum_m w_m g(., c_m)`` minimises ``mean_j huber(1 - f(z_j)) + ridge |w|^2`` over the distinctive matches j: all
     are asked to have likelihood 1, but beyond `huber` each pulls with a bounded force, so one alone lifts f by little
-    (to about huber / ridge) while many that agree saturate it at 1.
+    (huber / ridge / their number) while many that agree saturate it at 1.
 
     ratio, least_seeds, most_seeds: matches below the distance ratio are distinctive; where those are fewer than
     least_seeds, so many of the lowest ratio; where they are more than most_seeds, so many of them, evenly.
     candidates, centres: at most so many seeds are looked at for centres, and so many centres are chosen.
-    position, displacement, rotation, scale: widths of the Gaussians, see `predictive_gaussians`.
+    position, displacement, rotation, scale: widths of the Gaussians, see `predictive_gaussians`; unframed_displacement
+    replaces the second where matches have no frames to predict it by.
     """
 
     ratio: float = 0.8
@@ -33,26 +34,29 @@ class LikelihoodField:
     centres: int = 300
     position: float = 0.5
     displacement: float = 0.07
+    unframed_displacement: float = 0.2
     rotation: float = 0.8
     scale: float = 0.5
-    ridge: float = 5.0
+    ridge: float = 0.0075
     huber: float = 0.1
-    iterations: int = 10
+    iterations: int = 6
 
-    def __call__(self, matches: MatchDomain, quality: Float[Tensor, " n"] | None) -> Float[Tensor, " n"]:
-        """The likelihood of every match; without `quality` every match is distinctive."""
+    def __call__(
+        self, matches: MatchDomain, quality: Float[Tensor, " n"] | None, *, framed: bool = True
+    ) -> Float[Tensor, " n"]:
+        """The likelihood of every match; without `quality` every match is distinctive. framed: S is known."""
         seeds = evenly(self.distinctive(matches, quality), self.most_seeds)
         candidates = matches.take(evenly(seeds, self.candidates))
-        centres = candidates.take(spread_centres(self._basis(candidates, candidates), self.centres))
-        basis = self._basis(matches.take(seeds), centres)
+        centres = candidates.take(spread_centres(self._basis(candidates, candidates, framed), self.centres))
+        basis = self._basis(matches.take(seeds), centres, framed)
         weights = huber_regression(
             basis,
             torch.ones_like(basis[:, :1]),
-            self.ridge * torch.eye(basis.shape[1], device=basis.device),
+            self.ridge * len(seeds) * torch.eye(basis.shape[1], device=basis.device),
             scale=self.huber,
             iterations=self.iterations,
         )
-        return torch.cat([self._basis(block, centres) @ weights for block in matches.blocks()])[:, 0]
+        return torch.cat([self._basis(block, centres, framed) @ weights for block in matches.blocks()])[:, 0]
 
     def distinctive(self, matches: MatchDomain, quality: Float[Tensor, " n"] | None) -> Int[Tensor, " s"]:
         """Indices of the distinctive matches, in order; NaN is not distinctive unless nothing is."""
@@ -63,12 +67,12 @@ class LikelihoodField:
             return found
         return quality.argsort(stable=True)[: self.least_seeds].sort().values
 
-    def _basis(self, matches: MatchDomain, centres: MatchDomain) -> Float[Tensor, "n m"]:
+    def _basis(self, matches: MatchDomain, centres: MatchDomain, framed: bool) -> Float[Tensor, "n m"]:
         return predictive_gaussians(
             matches,
             centres,
             position=self.position,
-            displacement=self.displacement,
+            displacement=self.displacement if framed else self.unframed_displacement,
             rotation=self.rotation,
             scale=self.scale,
         )

@@ -35,7 +35,7 @@ class SmoothMotion:
     displacement: float = 0.7
     ridge: float = 0.5
     huber: float = 0.02
-    iterations: int = 8
+    iterations: int = 5
 
     def __call__(self, matches: MatchDomain, likely: Bool[Tensor, " n"]) -> Float[Tensor, " n"]:
         """Distance of every match's partner from where the motion puts it; infinite where too few are likely."""
@@ -64,7 +64,7 @@ class SmoothMotion:
         z = self._domain(matches)[candidates]
         return candidates[spread_centres(gaussians(z, z), self.centres)]
 
-    def _basis(self, matches: MatchDomain, centres: MatchDomain) -> Float[Tensor, "n 3+3*m"]:
+    def _basis(self, matches: MatchDomain, centres: MatchDomain) -> Float[Tensor, "n k"]:
         g = gaussians(self._domain(matches), self._domain(centres))
         dx, dy = ((matches.p0[:, None, i] - centres.p0[None, :, i]) / self.position for i in (0, 1))
         return torch.cat([torch.ones_like(g[:, :1]), matches.p0, g, g * dx, g * dy], 1)

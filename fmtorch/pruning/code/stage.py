@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -79,32 +79,37 @@ def coherence(
     for pair, here in enumerate(alive):
         if not bool(here.any()):
             continue
-        points0, points1, ratios, frames0, frames1 = (
-            None if value is None else value[pair][here] for value in (x0, x1, quality, lafs0, lafs1)
+        ratios, frames0, frames1 = (None if v is None else v[pair][here] for v in (quality, lafs0, lafs1))
+        matches = match_domain(x0[pair][here], x1[pair][here], frames0, frames1)
+        found.likelihood[pair, here] = f = likelihood(
+            matches, ratios, framed=frames0 is not None and frames1 is not None
         )
-        assert points0 is not None and points1 is not None
-        matches = match_domain(points0, points1, frames0, frames1)
-        found.likelihood[pair, here] = f = likelihood(matches, ratios)
         found.residual[pair, here] = motion(matches, f > least_likelihood)
     return found
 
 
-@dataclasses.dataclass(frozen=True)
 class CODE:
     """`code` as a stage, which also supplies ``prior``: P(inlier).
 
-    The odds are ``odds (max(likelihood, 0) + floor)^2 / (1 + (residual / reach)^2)``. prune: False keeps every match
-    and gives the prior only.
+    The odds are ``odds (max(likelihood, 0) + floor)^3 / (1 + (residual / reach)^2)``. prune: False keeps every match
+    and gives the prior only. likelihood, motion: options of `LikelihoodField` and `SmoothMotion`.
     """
 
-    odds: float
-    floor: float
-    reach: float
-    least_likelihood: float = LEAST_LIKELIHOOD
-    largest_residual: float = LARGEST_RESIDUAL
-    prune: bool = True
-    likelihood: LikelihoodField = LikelihoodField()
-    motion: SmoothMotion = SmoothMotion()
+    def __init__(
+        self,
+        *,
+        odds: float,
+        floor: float,
+        reach: float,
+        least_likelihood: float = LEAST_LIKELIHOOD,
+        largest_residual: float = LARGEST_RESIDUAL,
+        prune: bool = True,
+        likelihood: Mapping[str, Any] | None = None,
+        motion: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.odds, self.floor, self.reach, self.prune = odds, floor, reach, prune
+        self.least_likelihood, self.largest_residual = least_likelihood, largest_residual
+        self.likelihood, self.motion = LikelihoodField(**(likelihood or {})), SmoothMotion(**(motion or {}))
 
     def __call__(self, c: Correspondences) -> Correspondences:
         """The same matches, of which only the coherent ones survive, with a prior."""
@@ -113,7 +118,7 @@ class CODE:
             least_likelihood=self.least_likelihood, likelihood=self.likelihood, motion=self.motion,
         )  # fmt: skip
         evidence = found.likelihood.clamp_min(0) + self.floor
-        odds = self.odds * evidence.square() / (1 + (found.residual / self.reach).square())
+        odds = self.odds * evidence * evidence * evidence / (1 + (found.residual / self.reach).square())
         c = c.replace(prior=(odds / (1 + odds)).to(c.x0.dtype))
         if not self.prune:
             return c
