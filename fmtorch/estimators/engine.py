@@ -7,6 +7,7 @@ The search runs without gradients in float32; the final fit is attached to the c
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -16,7 +17,8 @@ from fmtorch import random
 from fmtorch.estimators.choice import CHOICES
 from fmtorch.estimators.parts import FINAL_FITS, INLIER_RULES, SAMPLERS, SCORES, SOLVERS, Refinement, part
 from fmtorch.estimators.problem import Problem, problems
-from fmtorch.estimators.scoring import InlierCount, score_models
+from fmtorch.estimators.sampling import PriorWeighted
+from fmtorch.estimators.scoring import sampson_squared, score_models
 from fmtorch.random import Stream
 from fmtorch.types import Correspondences, Estimate
 
@@ -48,7 +50,9 @@ class HypothesizeAndVerify:
     refine_iterations: its steps. choice: by which score the estimate is chosen from the refined pool, `score` (the
     search's own) or `saturated` (gains saturate in each cell of a grid).
     inliers: `threshold`, `lmeds` (2.5 robust standard deviations) or `median` (the better half).
-    final: `least_squares` (8-point on the inliers) or `none`. refit_inliers: recompute inliers after the final fit.
+    inlier_threshold: of the inliers reported, Sampson distance in pixels; null: the score's threshold.
+    final: `least_squares` (8-point on the inliers), `gauss_newton` (one attached step) or `none`.
+    refit_inliers: recompute the inliers after the final fit.
 
     Memory: for a batch of pairs of N matches, the points (48 N bytes a pair), the samples of 2^14 draws (about 40 MB)
     and eight buffers of one scoring tile (1 MB each); on a GPU 2^21 draws and 256 MB a buffer.
@@ -72,6 +76,7 @@ class HypothesizeAndVerify:
         refine_iterations: int = 5,
         choice: str = "score",
         inliers: str = "threshold",
+        inlier_threshold: float | None = None,
         final: str = "least_squares",
         refit_inliers: bool = True,
     ) -> None:
@@ -82,15 +87,20 @@ class HypothesizeAndVerify:
         self.solver = part("solver", solver, SOLVERS)()
         self.sampler = part("sampler", sampler, SAMPLERS)()
         self.score = part("score", score, SCORES)(threshold)
-        self.count_inliers = InlierCount(threshold)
+        self.inlier_threshold = threshold if inlier_threshold is None else inlier_threshold
         self.hypotheses, self.round, self.confidence = hypotheses, round, confidence
         self.preselect, self.survivors = preselect, survivors
         self.pool = pool
         self.refinement = None if refine is None else Refinement(refine, refine_threshold, refine_iterations)
         self.choice = None if choice == "score" else part("choice", choice, CHOICES)(threshold)
-        self.inlier_rule = part("inliers", inliers, INLIER_RULES)(threshold)
+        self.inlier_rule = part("inliers", inliers, INLIER_RULES)(self.inlier_threshold)
         self.final = part("final", final, FINAL_FITS)()
         self.refit_inliers = refit_inliers
+
+    @property
+    def uses_prior(self) -> bool:
+        """Whether a prior makes a difference to the search."""
+        return isinstance(self.sampler, PriorWeighted) or getattr(self.score, "prior_weighted", False)
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
@@ -204,10 +214,15 @@ class HypothesizeAndVerify:
     def _done(self, state: _Search, active: Tensor, problem: Problem, points: Tensor) -> Bool[Tensor, " p"]:
         """Whether an all-inlier sample was drawn with probability `confidence` (Fischler & Bolles 1981)."""
         assert self.confidence is not None
-        support = score_models(self.count_inliers, state.F[:, active, :1].contiguous(), problem, points)[:, 0]
-        all_inliers = (support.to(torch.float64) / problem.count) ** self.solver.size
+        r2 = sampson_squared(state.F[:, active, :1].contiguous(), points)[:, 0]
+        support = r2 <= (self.inlier_threshold / problem.unit).square().to(r2.dtype)[:, None]
+        weight = self.sampler.weight(problem)
+        share = torch.where(support, weight, 0).sum(1).to(torch.float64) / weight.sum(1)
+        all_inliers = share
+        for _ in range(self.solver.size - 1):  # a power would not have the same last bits everywhere
+            all_inliers = all_inliers * share
         missed = torch.log1p(-all_inliers.clamp(max=1 - 1e-12)) * state.draws[active]
-        return missed <= torch.log1p(torch.tensor(-self.confidence, dtype=torch.float64, device=missed.device))
+        return missed <= math.log1p(-self.confidence)
 
     def _subset(self, problem: Problem) -> Int[Tensor, "p k"] | None:
         """The live matches on which models are preselected: those with the smallest hash."""

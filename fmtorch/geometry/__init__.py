@@ -16,15 +16,19 @@ from fmtorch.geometry.epipolar import (
     symmetric_squared,
     unit_frobenius,
 )
+from fmtorch.geometry.irls import irls
 from fmtorch.geometry.normalize import canonical, denormalize_fundamental, normalize_pair, normalize_points
 from fmtorch.geometry.pose import Pose, pose_from_fundamental
 from fmtorch.geometry.rank2 import nearest_rank2
-from fmtorch.geometry.refine import refine
+from fmtorch.geometry.refine import attached_step, refine
+from fmtorch.geometry.robust_kernels import KERNELS
 from fmtorch.geometry.seven_point import seven_point
 
 __all__ = [
+    "KERNELS",
     "Pose",
     "algebraic",
+    "attached_step",
     "canonical",
     "cross_matrix",
     "denormalize_fundamental",
@@ -33,6 +37,7 @@ __all__ = [
     "epipolar_lines",
     "fundamental_from_calibration",
     "fundamental_from_projections",
+    "irls",
     "nearest_rank2",
     "normalize_pair",
     "normalize_points",

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.geometry.reduce import component_sum, matmul3, stable_sum
+from fmtorch.geometry.reduce import matmul3, stable_sum
 from fmtorch.geometry.robust_kernels import Kernel, named_kernel
 
 LANES = 64  # points are summed one by one into so many lanes, and these in a tree: part of the result's last bits
@@ -80,7 +80,7 @@ def refine(
     Raises ValueError for an unknown kernel. Bartoli & Sturm (2004); Hartley & Zisserman (2004), 11.4.3.
     """
     with torch.no_grad():
-        problem = _Normalised(x0, x1, weight, mask, F, scale)
+        problem = Normalised(x0, x1, weight, mask, F, scale)
         models, _ = refine_components(problem.models, problem.points, problem.weight, kernel, problem.scale, iterations)
         return problem.to_pixels(models).reshape(F.shape)
 
@@ -98,15 +98,17 @@ def attached_step(
     """One Gauss-Newton step from a refined F, whose gradients are those of the optimum; arguments as of `refine`.
 
     The gradient of the cost is attached to the graph of points and weights, the normal matrix is not: the implicit
-    function theorem, with the Hessian in Gauss and Newton's approximation (exact where residuals vanish). F itself
-    gets no gradient. Where the points leave a direction open, the step and its gradients in it are damped; where F or
-    the step is not finite, F comes back with gradients of zero.
+    function theorem, with the Hessian in Gauss and Newton's approximation: it has the kernel's curvature, but not that
+    of the residuals, so it is exact where the residuals that count vanish. F itself gets no gradient. Where the points
+    leave a direction open, the step and its gradients in it are damped; where F or the step is not finite, F comes
+    back with gradients of zero.
     """
-    problem = _Normalised(x0, x1, weight, mask, F.detach(), scale)
+    problem = Normalised(x0, x1, weight, mask, F.detach(), scale)
     with torch.no_grad():
         model, e0, e1 = start(problem.models)
-        objective = Objective(problem.points, problem.weight, named_kernel(kernel), problem.scale)
-        H = objective(model, True)[0][:9, :9]
+        robust = named_kernel(kernel)
+        curved = robust._replace(weight=robust.curvature)  # Newton's weights of J^T J, not those of IRLS
+        H = Objective(problem.points, problem.weight, curved, problem.scale)(model, True)[0][:9, :9]
         identity = torch.eye(9, dtype=H.dtype, device=H.device)[:, :, None, None].expand_as(H)
         inverse = constrained_solve(H, model, e0, e1, torch.full_like(H[0, 0], STEP_DAMPING), identity)
         sound = torch.isfinite(inverse).flatten(0, 1).all(0)
@@ -114,8 +116,8 @@ def attached_step(
         # Something of rank 2 instead of what is not finite: `where` alone would not keep NaN out of the gradients.
         model = torch.where(sound, model, _constant(model, RANK_TWO))
         e0, e1 = (torch.where(sound, e, _constant(e, RANK_TWO_EPIPOLE)) for e in (e0, e1))
-    gradient = gradient_of_cost(model, problem.points, problem.weight, objective.robust, problem.scale)
-    step = -component_sum((inverse * gradient).transpose(0, 1))
+    gradient = gradient_of_cost(model, problem.points, problem.weight, robust, problem.scale)
+    step = -total((inverse * gradient).transpose(0, 1))
     moved, _, _ = retract(model, step, e0, e1)
     return problem.to_pixels(torch.where(sound, moved, problem.models)).reshape(F.shape)
 
@@ -137,8 +139,8 @@ def gradient_of_cost(
     return stable_sum(torch.stack(rows[:9]) * influence)[:, 0]
 
 
-class _Normalised:
-    """Matches as `refine_components` wants them: live ones first, centred, of about unit scale, in float64."""
+class Normalised:
+    """Matches as `refine_components` wants them: live ones first, centred, of about unit scale; and models."""
 
     def __init__(
         self,
@@ -178,8 +180,8 @@ class _Normalised:
     def to_pixels(self, models: Float[Tensor, "9 p k"]) -> Float[Tensor, "p k 3 3"]:
         """Matrices in pixels, of unit norm."""
         T0, T1 = self._similarity(0), self._similarity(2)
-        F = matmul3(matmul3(T1.mT, _matrices(models)), T0)
-        return _matrices(unit(_flat(F)))
+        F = matmul3(matmul3(T1.mT, matrices(models)), T0)
+        return matrices(unit(_flat(F)))
 
     def _affinity(self, first: int) -> Float[Tensor, "p 1 3 3"]:
         """From normalised to pixel coordinates of one image."""
@@ -198,7 +200,8 @@ def _flat(F: Float[Tensor, "p k 3 3"]) -> Float[Tensor, "9 p k"]:
     return F.flatten(2).permute(2, 0, 1).contiguous()
 
 
-def _matrices(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "p k 3 3"]:
+def matrices(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "p k 3 3"]:
+    """Components as matrices."""
     return F.permute(1, 2, 0).reshape(*F.shape[1:], 3, 3)
 
 
@@ -273,7 +276,8 @@ class Objective:
         f = F[..., None].unbind(0)
         m, count = len(weight), max(1, TILE_ELEMENTS // (p * k * LANES))
         lanes: list[Tensor] = []
-        products = self._buffer(10, 10, p, k, LANES)
+        sums = self._buffer(101, p, k, LANES)  # of the products, then the cost
+        products = sums[:100].view(10, 10, p, k, LANES)
         for first in range(0, m, count):
             some = slice(first, first + count)
             w = weight[some]
@@ -294,8 +298,10 @@ class Objective:
             cost = cost + lane
         if not derivatives:
             return F.new_empty(0, 0, p, k), stable_sum(cost)
+        sums[100] = cost
         half = LANES // 2  # the first level of the tree in place: memory newly mapped costs more than the sum
-        return stable_sum(products[..., :half].add_(products[..., half:])), stable_sum(cost)
+        sums = stable_sum(sums[..., :half].add_(sums[..., half:]))
+        return sums[:100].view(10, 10, p, k), sums[100]
 
     def _buffer(self, *shape: int) -> Tensor:
         if shape not in self.buffers:
@@ -361,9 +367,9 @@ def constrained_solve(
     Q[:9, 9] = Q[9, :9] = normal
     Q[:9, 10:] = right
     for i in range(10):
-        column, rest = Q[:, :1], Q[:, 1:]
+        column, rest = Q.tensor_split((1,), 1)
         row = rest[i] / column[i]
-        Q = rest - column * row
+        Q = torch.addcmul(rest, column, row, value=-1)
         Q[i] = row
     return Q[:9]
 
@@ -372,11 +378,11 @@ def retract(F: Tensor, step: Tensor, e0: Tensor, e1: Tensor) -> tuple[Tensor, Te
     """The rank-2 matrix of unit norm ``F + step + alpha e1 e0^T``, and its epipoles."""
     G = F + step
     C = cofactors(G)
-    determinant = component_sum(C[:3] * G[:3])
+    determinant = total(C[:3] * G[:3])
     normal = (e1[:, None] * e0[None]).flatten(0, 1)
-    G = unit(G - determinant / component_sum(C * normal) * normal)
+    G = unit(G - determinant / total(C * normal) * normal)
     C = square(cofactors(G))  # a multiple of e1 e0^T
-    return G, unit(component_sum(C * e1[:, None])), unit(component_sum(C * e0, 1))
+    return G, unit(total(C * e1[:, None])), unit(total(C * e0, 1))
 
 
 def start(F: Float[Tensor, "9 p k"]) -> tuple[Tensor, Tensor, Tensor]:
@@ -387,23 +393,23 @@ def start(F: Float[Tensor, "9 p k"]) -> tuple[Tensor, Tensor, Tensor]:
     """
     F = unit(F)
     C = square(cofactors(F))
-    K = component_sum(C[:, :, None] * C[:, None])  # C^T C
+    K = total(C[:, :, None] * C[:, None])  # C^T C
     for _ in range(5):
         K = K / K.abs().amax((0, 1))
-        K = component_sum(K[:, :, None] * K[:, None])
-    size = component_sum(K * K, 1)
+        K = total(K[:, :, None] * K[:, None])
+    size = total(K * K, 1)
     column = size.argmax(0)
     e0 = unit(K.gather(0, column.expand(1, 3, *column.shape))[0])
     M = square(F)
-    G = unit((M - component_sum(M * e0, 1)[:, None] * e0).flatten(0, 1))
-    return G, e0, unit(component_sum(square(cofactors(G)) * e0, 1))
+    G = unit((M - total(M * e0, 1)[:, None] * e0).flatten(0, 1))
+    return G, e0, unit(total(square(cofactors(G)) * e0, 1))
 
 
 def cofactors(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "9 p k"]:
     """The matrix of cofactors: ``det(F) F^-T`` where F is regular."""
     rows = square(F)
-    products: Tensor = torch.linalg.cross(rows.roll(-1, 0), rows.roll(-2, 0), dim=1)
-    return products.flatten(0, 1)
+    crossed: Tensor = torch.linalg.cross(rows.roll(-1, 0), rows.roll(-2, 0), dim=1)
+    return crossed.flatten(0, 1)
 
 
 def square(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "3 3 p k"]:
@@ -411,7 +417,15 @@ def square(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "3 3 p k"]:
     return F.reshape(3, 3, *F.shape[1:])
 
 
+def total(x: Tensor, dim: int = 0) -> Tensor:
+    """The sum over a short axis, in order: for few numbers this takes half as long as a tree."""
+    first, *rest = x.unbind(dim)
+    for part in rest:
+        first = first + part
+    return first
+
+
 def unit(x: Float[Tensor, "c p k"]) -> Float[Tensor, "c p k"]:
     """Scaled to unit norm over the components; NaN where that is not possible."""
-    norm: Tensor = component_sum(x * x).sqrt()
+    norm: Tensor = total(x * x).sqrt()
     return x / norm

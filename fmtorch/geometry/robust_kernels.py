@@ -16,10 +16,14 @@ from torch import Tensor
 
 
 class Kernel(NamedTuple):
-    """A robust loss and its derivative with respect to the squared residual, both functions of (r2, s2)."""
+    """A robust loss, its derivative with respect to r^2, and its curvature, all functions of (r2, s2).
+
+    curvature: half the second derivative with respect to r, ``rho' + 2 r^2 rho''``, and 0 where that is negative.
+    """
 
     loss: Callable[[Tensor, Tensor], Tensor]
     weight: Callable[[Tensor, Tensor], Tensor]
+    curvature: Callable[[Tensor, Tensor], Tensor]
 
 
 def huber_loss(r2: Tensor, s2: Tensor) -> Tensor:
@@ -32,6 +36,11 @@ def huber_weight(r2: Tensor, s2: Tensor) -> Tensor:
     return (s2 / torch.maximum(r2, s2)).sqrt()
 
 
+def huber_curvature(r2: Tensor, s2: Tensor) -> Tensor:
+    """1 up to the scale, 0 beyond."""
+    return (r2 <= s2).to(r2.dtype)
+
+
 def cauchy_loss(r2: Tensor, s2: Tensor) -> Tensor:
     """``s^2 log(1 + r^2 / s^2)``."""
     return s2 * torch.log1p(r2 / s2)
@@ -42,6 +51,11 @@ def cauchy_weight(r2: Tensor, s2: Tensor) -> Tensor:
     return s2 / (s2 + r2)
 
 
+def cauchy_curvature(r2: Tensor, s2: Tensor) -> Tensor:
+    """``s^2 (s^2 - r^2) / (s^2 + r^2)^2``, or 0."""
+    return s2 / (s2 + r2) * ((s2 - r2) / (s2 + r2)).clamp_min(0)
+
+
 def geman_mcclure_loss(r2: Tensor, s2: Tensor) -> Tensor:
     """``r^2 s^2 / (s^2 + r^2)``."""
     return r2 * (s2 / (s2 + r2))
@@ -50,6 +64,11 @@ def geman_mcclure_loss(r2: Tensor, s2: Tensor) -> Tensor:
 def geman_mcclure_weight(r2: Tensor, s2: Tensor) -> Tensor:
     """``s^4 / (s^2 + r^2)^2``."""
     return (s2 / (s2 + r2)).square()
+
+
+def geman_mcclure_curvature(r2: Tensor, s2: Tensor) -> Tensor:
+    """``s^4 (s^2 - 3 r^2) / (s^2 + r^2)^3``, or 0."""
+    return geman_mcclure_weight(r2, s2) * ((s2 - 3 * r2) / (s2 + r2)).clamp_min(0)
 
 
 def truncated_loss(r2: Tensor, s2: Tensor) -> Tensor:
@@ -63,10 +82,10 @@ def truncated_weight(r2: Tensor, s2: Tensor) -> Tensor:
 
 
 KERNELS: dict[str, Kernel] = {
-    "huber": Kernel(huber_loss, huber_weight),
-    "cauchy": Kernel(cauchy_loss, cauchy_weight),
-    "geman_mcclure": Kernel(geman_mcclure_loss, geman_mcclure_weight),
-    "truncated": Kernel(truncated_loss, truncated_weight),
+    "huber": Kernel(huber_loss, huber_weight, huber_curvature),
+    "cauchy": Kernel(cauchy_loss, cauchy_weight, cauchy_curvature),
+    "geman_mcclure": Kernel(geman_mcclure_loss, geman_mcclure_weight, geman_mcclure_curvature),
+    "truncated": Kernel(truncated_loss, truncated_weight, truncated_weight),
 }
 
 

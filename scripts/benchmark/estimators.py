@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import platform
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from fmtorch.data import ImagePair
 from fmtorch.pipeline import Pipeline
 from fmtorch.types import Correspondences
 
-console = Console()
+console = Console(width=None if sys.stdout.isatty() else 160)
 
 
 def add_arguments(commands: Any) -> None:

@@ -233,9 +233,9 @@ def test_empty_and_unknown() -> None:
         refine(F, none, none, kernel="none")
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_attached_step_has_the_gradient_of_the_optimum(kernel: str) -> None:
-    F, a, b = scene(2, 30, noise=1e-4)
+@pytest.mark.parametrize(("kernel", "outliers"), [*((name, 0) for name in KERNELS), ("truncated", 6)])
+def test_attached_step_has_the_gradient_of_the_optimum(kernel: str, outliers: int) -> None:
+    F, a, b = scene(2, 30, noise=1e-4, outliers=outliers)
     x0, x1 = torch.from_numpy(a), torch.from_numpy(b)
     rng = np.random.default_rng(0)
     weight = torch.from_numpy(rng.uniform(0.2, 1, 30))

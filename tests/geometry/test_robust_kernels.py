@@ -19,6 +19,15 @@ def test_weight_is_the_derivative_of_the_loss(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", KERNELS)
+def test_curvature_is_half_the_second_derivative_or_zero(name: str) -> None:
+    r = torch.tensor([1e-3, 0.5, 1.0, 1.9, 2.1, 5.0, 30.0], dtype=torch.float64)
+    h = 1e-5  # derivatives of the influence r rho', analytic above: errors h^2 by truncation, 1e-16 r / h by rounding
+    influence = [(r + d) * KERNELS[name].weight((r + d).square(), S2) for d in (-h, h)]
+    second = ((influence[1] - influence[0]) / (2 * h)).clamp_min(0)
+    assert torch.allclose(KERNELS[name].curvature(r.square(), S2), second, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", KERNELS)
 def test_quadratic_near_zero_and_never_above(name: str) -> None:
     zero = torch.zeros((), dtype=torch.float64)
     assert KERNELS[name].loss(zero, S2) == 0

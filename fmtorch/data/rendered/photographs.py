@@ -5,8 +5,8 @@ from __future__ import annotations
 import importlib.util
 from pathlib import Path
 
-import cv2
 import numpy as np
+from PIL import Image
 
 from fmtorch.data.rendered.mipmap import Pixels
 
@@ -34,11 +34,8 @@ def skimage_file(name: str) -> Path:
 
 def photograph(name: str) -> Pixels:
     """A photograph as RGB (h, w, 3)."""
-    path = skimage_file(name)
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if picture is None:
-        raise ValueError(f"{path} is not a readable picture")
-    return np.ascontiguousarray(picture[..., ::-1], dtype=np.uint8)
+    with Image.open(skimage_file(name)) as picture:
+        return np.array(picture.convert("RGB"), dtype=np.uint8)
 
 
 def pictures(split: str, rng: np.random.Generator, count: int) -> list[Pixels]:
