@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from fmtorch.pruning.frame_consistency import _frame_map
+
 BLOCK = 4096  # matches whose basis functions exist at a time
 LARGEST_CHANGE = 100.0  # of a frame's size between images of a common scale: what is beyond is no match
 
@@ -46,7 +48,7 @@ def match_domain(
     if lafs0 is None or lafs1 is None:
         S = torch.eye(2, dtype=torch.float64, device=x0.device).expand(len(x0), 2, 2)
     else:
-        S = frame_map(lafs0, lafs1) * (spread0 / spread1)
+        S = _frame_map(lafs0[None].double(), lafs1[None].double())[0] * (spread0 / spread1)
     size = S.square().sum((1, 2)).sqrt().clamp_min(torch.finfo(torch.float32).tiny) / math.sqrt(2)
     entries = S / size[:, None, None]
     bounded = S * (size.clamp(1 / LARGEST_CHANGE, LARGEST_CHANGE) / size)[:, None, None]
@@ -62,13 +64,6 @@ def sound_matches(*values: Tensor | None) -> Bool[Tensor, "b n"]:
         (a, b), (c, d) = (row.unbind(-1) for row in frame[..., :2].double().unbind(-2))
         sound = sound & ((a * d - b * c) != 0)
     return sound
-
-
-def frame_map(lafs0: Float[Tensor, "n 2 3"], lafs1: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 2 2"]:
-    """The linear map from frame 0 to frame 1, ``A1 A0^-1``, in float64."""
-    a, b, c, d = lafs0[..., :2].double().flatten(1).unbind(1)
-    inverse = torch.stack([d, -b, -c, a], 1).reshape(-1, 2, 2) / (a * d - b * c)[:, None, None]
-    return (lafs1[:, :, :2].double()[:, :, :, None] * inverse[:, None]).sum(2)
 
 
 def _normalized(x: Float[Tensor, "n 2"]) -> tuple[Float[Tensor, "n 2"], Float[Tensor, ""]]:
