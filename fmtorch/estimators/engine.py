@@ -15,6 +15,7 @@ from torch import Tensor
 
 from fmtorch import random
 from fmtorch.estimators.choice import CHOICES
+from fmtorch.estimators.local_optimization import LOCAL_OPTIMIZATIONS
 from fmtorch.estimators.parts import FINAL_FITS, INLIER_RULES, SAMPLERS, SCORES, SOLVERS, Refinement, part
 from fmtorch.estimators.problem import Problem, problems
 from fmtorch.estimators.sampling import PriorWeighted
@@ -45,10 +46,11 @@ class HypothesizeAndVerify:
     confidence: stop once an all-inlier sample was drawn with this probability; None: never before `hypotheses`.
     preselect: models are first scored on this many matches, chosen by the pair's key; 0: always on all.
     survivors: models of a round that pass the preselection.
-    pool: the best models that are kept to the end. refine: robust kernel of the Levenberg-Marquardt refinement of the
-    pool (`truncated`, `cauchy`, ...), null: none; refine_threshold: its scale, Sampson distance in pixels;
-    refine_iterations: its steps. choice: by which score the estimate is chosen from the refined pool, `score` (the
-    search's own) or `saturated` (gains saturate in each cell of a grid).
+    pool: the best models that are kept to the end. local_optimization: of the pool, `graph_cut` or null: none.
+    refine: robust kernel of the Levenberg-Marquardt refinement of the pool (`truncated`, `cauchy`, ...), null: none;
+    refine_threshold: its scale, Sampson distance in pixels; refine_iterations: its steps. choice: by which score the
+    estimate is chosen from the refined pool, `score` (the search's own) or `saturated` (gains saturate in each cell of
+    a grid).
     inliers: `threshold`, `lmeds` (2.5 robust standard deviations) or `median` (the better half).
     inlier_threshold: of the inliers reported, Sampson distance in pixels; null: the score's threshold.
     final: `least_squares` (8-point on the inliers), `gauss_newton` (one attached step) or `none`.
@@ -71,6 +73,7 @@ class HypothesizeAndVerify:
         preselect: int = 128,
         survivors: int = 256,
         pool: int = 1,
+        local_optimization: str | None = None,
         refine: str | None = None,
         refine_threshold: float = 1.0,
         refine_iterations: int = 5,
@@ -91,6 +94,10 @@ class HypothesizeAndVerify:
         self.hypotheses, self.round, self.confidence = hypotheses, round, confidence
         self.preselect, self.survivors = preselect, survivors
         self.pool = pool
+        self.local_optimization = None
+        if local_optimization is not None:
+            optimization = part("local_optimization", local_optimization, LOCAL_OPTIMIZATIONS)
+            self.local_optimization = optimization(threshold, self.score)
         self.refinement = None if refine is None else Refinement(refine, refine_threshold, refine_iterations)
         self.choice = None if choice == "score" else part("choice", choice, CHOICES)(threshold)
         self.inlier_rule = part("inliers", inliers, INLIER_RULES)(self.inlier_threshold)
@@ -142,10 +149,12 @@ class HypothesizeAndVerify:
         return F, inliers, found, search.draws
 
     def _choose(self, search: _Search, problem: Problem) -> Float[Tensor, "9 p"]:
-        """The best of the pool, once refined, by the score of the choice; float64."""
+        """The best of the pool, once optimised and refined, by the score of the choice; float64."""
         F = search.F.to(torch.float64)
-        if self.refinement is None and self.choice is None:
+        if self.local_optimization is None and self.refinement is None and self.choice is None:
             return F[:, :, 0]
+        if self.local_optimization is not None:
+            F = self.local_optimization(F, problem)
         if self.refinement is not None:
             F = self.refinement(F, problem)
         if self.choice is None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -14,7 +16,7 @@ import pytest
 from fmtorch.data.rendered import Plan, RenderedPairs
 from fmtorch.data.rendered import generate as generation
 from fmtorch.data.rendered.cameras import fundamental
-from fmtorch.data.rendered.generate import FAMILIES, PLANS, Task, build, generate, keypoints, read, seeds
+from fmtorch.data.rendered.generate import FAMILIES, PLANS, Keypoints, Task, build, generate, keypoints, read, seeds
 from fmtorch.data.rendered.photographs import MATERIALS, PICTURES
 
 TINY = Plan(scenes=1, shots=3, pairs=2, scale=0.25)
@@ -180,6 +182,54 @@ def test_pairs_obey_the_rule_and_images_have_keypoints(tmp_path: Path) -> None:
     assert min(len(points) for points, _ in found) > 200
     for i, j in pairs:
         assert generation.matchable(found[i], found[j], fundamental(views[i][1], views[j][1]))
+
+
+def rule(wanted: set[tuple[int, int]]) -> Callable[[Keypoints, Keypoints, object], bool]:
+    """A stand-in for the pair rule that knows photographs by their number, which `numbered` hides in the keypoints."""
+    return lambda a, b, F: (int(a[0][0, 0]), int(b[0][0, 0])) in wanted
+
+
+@pytest.fixture
+def numbered(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Replaces keypoints by the photograph's number; the list holds the photographs drawn so far."""
+    drawn: list[int] = []
+
+    def count(_: object) -> Keypoints:
+        drawn.append(len(drawn))
+        return np.full((1, 2), float(drawn[-1])), np.zeros((1, 128), dtype=np.float32)
+
+    monkeypatch.setattr(generation, "keypoints", count)
+    return drawn
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_small_plan_yields_the_planned_pairs_and_draws_no_more_than_it_needs(
+    family: str, numbered: list[int], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Where the rule keeps everything, a family proposes enough pairs for the plan among its first photographs."""
+    monkeypatch.setattr(generation, "matchable", lambda *_: True)
+    small = dataclasses.replace(PLANS["small", "test"], scenes=1, scale=0.1)
+    _, pairs = read(generate(Task(family, "test", 0, 0, small), tmp_path))
+    assert len(pairs) == len(set(pairs)) == small.pairs
+    assert len(numbered) == small.shots
+
+
+def test_spare_photographs_are_drawn_until_there_are_pairs_enough(
+    numbered: list[int], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(generation, "matchable", rule({(0, 1), (1, 3), (0, 4), (2, 4), (0, 5)}))
+    views, pairs = read(generate(Task("collection", "test", 0, 0, Plan(1, 3, 3, 0.1, spare=4)), tmp_path))
+    assert len(views) == len(numbered) == 5  # 0-2 give a pair, 3 a second, 4 the third; 5 and 6 are not drawn
+    assert len(pairs) == 3
+    assert {(0, 1), (1, 3)} < set(pairs)
+
+
+def test_a_scene_without_matchable_pairs_ends_with_its_spare_photographs(
+    numbered: list[int], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(generation, "matchable", rule(set()))
+    views, pairs = read(generate(Task("indoor", "test", 0, 0, Plan(1, 2, 2, 0.1, spare=2)), tmp_path))
+    assert (len(views), pairs) == (4, [])
 
 
 def test_unknown_names_are_refused(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from fmtorch.data.rendered.scene import Scene, Shot
 from fmtorch.data.rendered.surfaces import Surfaces, vec
 
 SIZES = ((600, 800), (533, 800), (450, 800), (576, 768), (683, 1024), (480, 640))
-LIGHTS = 3  # times of day
+LIGHTS = 4  # times of day
 
 
 def _gable(surfaces: Surfaces, x: Real, y: Real, z: Real, width: Real, height: Real, deep: Real, stone: int) -> None:
@@ -107,7 +107,7 @@ def scene(rng: Rng, split: str, shots: int, scale: Real) -> Scene:
     lights, surfaces = [], []
     azimuth = rng.uniform(200, 340)
     for k in range(LIGHTS):
-        turn = azimuth + 35 * (k - 1) + rng.uniform(-10, 10)
+        turn = azimuth + 35 * (k - 1.5) + rng.uniform(-10, 10)
         direct = rng.uniform(0.2, 1.0) if k else 1.0
         warm = rng.uniform(0, 0.3)
         lights.append(Light(
@@ -115,7 +115,7 @@ def scene(rng: Rng, split: str, shots: int, scale: Real) -> Scene:
             sky=(0.42, 0.44, 0.5), clouds=k,
         ))  # fmt: skip
         crowd = fixed.copy()
-        for _ in range(14):
+        for _ in range(22):
             at = vec(rng.normal(0, width / 3), -rng.uniform(3, 22), 0)
             walker(crowd, rng, at, rng.uniform(225, 315))
         surfaces.append(crowd)
@@ -126,17 +126,17 @@ def scene(rng: Rng, split: str, shots: int, scale: Real) -> Scene:
         if rng.random() < 0.3:
             h, w = w, h
         size = (round(h * scale), round(w * scale))
-        zoom = float(np.exp(rng.uniform(0, np.log(3))))
+        zoom = float(np.exp(rng.uniform(0, np.log(3.5))))
         K = calibration(0.85 * zoom * max(size), size)
-        angle = -90 + float(np.clip(rng.normal(0, 26), -58, 58))
+        angle = -90 + float(np.clip(rng.normal(0, 36), -65, 65))
         distance = rng.uniform(14, 24) * (1 + 0.55 * (zoom - 1))
         eye = direction(angle) * distance + vec(0, 0, rng.uniform(1.5, 2.2))
         eye[1] = min(eye[1], -9.0)
         at = vec(rng.normal(0, 0.14 * width), 0, rng.uniform(3.0, 5.5))
         camera = look_at(K, size, eye.tolist(), at.tolist(), roll=float(rng.normal(0, 0.025)))
         lens = Lens(
-            blur=rng.uniform(0.4, 0.9), exposure=rng.uniform(0.75, 1.4), contrast=rng.uniform(0.85, 1.25),
-            gamma=rng.uniform(0.8, 1.25), noise=rng.uniform(1, 4), vignette=rng.uniform(0, 0.25),
+            blur=rng.uniform(0.4, 0.9), exposure=rng.uniform(0.75, 1.4), contrast=rng.uniform(0.8, 1.3),
+            gamma=rng.uniform(0.75, 1.3), noise=rng.uniform(1, 4), vignette=rng.uniform(0, 0.25),
             balance=(rng.uniform(0.9, 1.12), 1.0, rng.uniform(0.88, 1.12)),
         )  # fmt: skip
         taken.append(Shot(camera, lens, light=i % LIGHTS, jpeg=int(rng.integers(60, 96))))

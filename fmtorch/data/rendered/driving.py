@@ -91,7 +91,7 @@ def _roadside(surfaces: Surfaces, rng: Rng, length: float, half: float, side: in
 
 
 def _street(surfaces: Surfaces, rng: Rng, split: str, length: float) -> None:
-    half, walk, gap = rng.uniform(3.4, 4.6), rng.uniform(1.8, 3.0), rng.uniform(0.1, 0.45)
+    half, walk, gap = rng.uniform(3.4, 4.6), rng.uniform(1.8, 3.0), rng.uniform(0.2, 0.6)
     _road(surfaces, rng, length, half, walk)
     for side in (1, -1):
         _row_of_houses(surfaces, rng, split, length, half + walk + rng.uniform(0, 3), side, gap)
@@ -110,8 +110,8 @@ def scene(rng: Rng, split: str, shots: int, scale: Real) -> Scene:
     drift = rng.uniform(-1.2, 0.2)
     light = Light(sun(rng.uniform(0, 360), rng.uniform(25, 60)))
     lens = Lens(grey=True, noise=rng.uniform(2.5, 5.0), blur=rng.uniform(0.6, 0.9), exposure=rng.uniform(0.7, 1.4))
-    traffic = [(rng.uniform(7, 16), -1.7, rng.uniform(0.85, 1.15) * speed)] if rng.random() < 0.7 else []
-    traffic += [(rng.uniform(8, 60), 1.7, -rng.uniform(0.5, 1.2)) for _ in range(int(rng.integers(0, 3)))]
+    traffic = [(rng.uniform(7, 16), -1.7, rng.uniform(0.85, 1.15) * speed)] if rng.random() < 0.85 else []
+    traffic += [(rng.uniform(8, 60), 1.7, -rng.uniform(0.5, 1.2)) for _ in range(int(rng.integers(1, 4)))]
     models = [int(rng.integers(2**31)) for _ in traffic]
     taken, views = [], []
     for k, i in enumerate(frames.tolist()):
