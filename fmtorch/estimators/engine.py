@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch import random
-from fmtorch.estimators.choice import CHOICES
+from fmtorch.estimators.choice import best_of
 from fmtorch.estimators.local_optimization import LOCAL_OPTIMIZATIONS
-from fmtorch.estimators.parts import FINAL_FITS, INLIER_RULES, SAMPLERS, SCORES, SOLVERS, Refinement, part
+from fmtorch.estimators.parts import CHOICES, FINAL_FITS, INLIER_RULES, SAMPLERS, SCORES, SOLVERS, Refinement, part
 from fmtorch.estimators.problem import Problem, problems
 from fmtorch.estimators.sampling import PriorWeighted
 from fmtorch.estimators.scoring import sampson_squared, score_models
@@ -49,8 +49,9 @@ class HypothesizeAndVerify:
     pool: the best models that are kept to the end. local_optimization: of the pool, `graph_cut` or null: none.
     refine: robust kernel of the Levenberg-Marquardt refinement of the pool (`truncated`, `cauchy`, ...), null: none;
     refine_threshold: its scale, Sampson distance in pixels; refine_iterations: its steps. choice: by which score the
-    estimate is chosen from the refined pool, `score` (the search's own) or `saturated` (gains saturate in each cell of
-    a grid).
+    estimate is chosen from the refined pool, `score` (the search's own), `saturated` (gains saturate in each cell of
+    a grid) or `focal` (the same, with a prior on the focal length: for whole photographs, not crops; `saturated` where
+    the image sizes are unknown); choice_threshold: of the last two, Sampson distance in pixels, null: the score's.
     inliers: `threshold`, `lmeds` (2.5 robust standard deviations) or `median` (the better half).
     inlier_threshold: of the inliers reported, Sampson distance in pixels; null: the score's threshold.
     final: `least_squares` (8-point on the inliers), `gauss_newton` (one attached step) or `none`.
@@ -78,6 +79,7 @@ class HypothesizeAndVerify:
         refine_threshold: float = 1.0,
         refine_iterations: int = 5,
         choice: str = "score",
+        choice_threshold: float | None = None,
         inliers: str = "threshold",
         inlier_threshold: float | None = None,
         final: str = "least_squares",
@@ -99,7 +101,7 @@ class HypothesizeAndVerify:
             optimization = part("local_optimization", local_optimization, LOCAL_OPTIMIZATIONS)
             self.local_optimization = optimization(threshold, self.score)
         self.refinement = None if refine is None else Refinement(refine, refine_threshold, refine_iterations)
-        self.choice = None if choice == "score" else part("choice", choice, CHOICES)(threshold)
+        self.choice = None if choice == "score" else part("choice", choice, CHOICES)(choice_threshold or threshold)
         self.inlier_rule = part("inliers", inliers, INLIER_RULES)(self.inlier_threshold)
         self.final = part("final", final, FINAL_FITS)()
         self.refit_inliers = refit_inliers
@@ -157,13 +159,11 @@ class HypothesizeAndVerify:
             F = self.local_optimization(F, problem)
         if self.refinement is not None:
             F = self.refinement(F, problem)
-        if self.choice is None:
-            score = score_models(self.score, F.to(torch.float32), problem, problem.points.to(torch.float32))
-        else:
-            score = self.choice(F, problem)
-        score = torch.where(torch.isfinite(search.score), score, -torch.inf)
-        best = torch.sort(score, dim=1, descending=True, stable=True).indices[:, :1]
-        return F.gather(2, best.expand(9, -1, -1))[..., 0]
+        alive = torch.isfinite(search.score)
+        if self.choice is not None:
+            return self.choice(F, problem, alive)
+        score = score_models(self.score, F.to(torch.float32), problem, problem.points.to(torch.float32))
+        return best_of(F, score, alive)
 
     def _search(self, problem: Problem) -> _Search:
         p, device = len(problem.pair), problem.points.device

@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.estimators.choice import Choice, SaturatedGain
+from fmtorch.estimators.focal import FocalPrior
 from fmtorch.estimators.problem import Problem
 from fmtorch.estimators.sampling import PriorWeighted, Prosac, Sampler, Uniform
 from fmtorch.estimators.scoring import (
@@ -200,3 +202,4 @@ FINAL_FITS: dict[str, Callable[[], FinalFit]] = {
     "least_squares": LeastSquares,
     "gauss_newton": GaussNewton,
 }
+CHOICES: dict[str, Callable[[float], Choice]] = {"saturated": SaturatedGain, "focal": FocalPrior}

@@ -21,7 +21,7 @@ def test_saturated_gain_equals_its_definition() -> None:
     F = torch.randn(9, 1, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     F *= torch.logspace(-2, 0, 9, dtype=torch.float64)[:, None, None]
     threshold, unit = 3.0, float(problem.unit[0])
-    batched = SaturatedGain(threshold)(F, problem)[0]
+    batched = SaturatedGain(threshold).score(F, problem)[0]
     assert problem.prior is not None
     points, prior = problem.points[:, 0, :70].numpy(), problem.prior[0, :70].numpy()
     low, extent = points.min(1, keepdims=True), np.ptp(points, axis=1, keepdims=True)
@@ -52,7 +52,7 @@ def test_saturation_prefers_what_explains_the_whole_image() -> None:
     scores = []
     for px in (spread, crowd):
         points = torch.stack([px, px, px, px])
-        scores.append(float(SaturatedGain(1.0)(vertical, dataclasses.replace(problem, points=points))))
+        scores.append(float(SaturatedGain(1.0).score(vertical, dataclasses.replace(problem, points=points))))
     assert scores[0] > 2 * scores[1]
 
 
