@@ -3,6 +3,7 @@
 __version__ = "0.1.0"
 
 from fmtorch.fundamental import find_fundamental
+from fmtorch.photographs import MatchResult, match
 from fmtorch.types import Correspondences, Estimate, Features
 
-__all__ = ["Correspondences", "Estimate", "Features", "__version__", "find_fundamental"]
+__all__ = ["Correspondences", "Estimate", "Features", "MatchResult", "__version__", "find_fundamental", "match"]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.stages import Estimator
+from fmtorch.stages import Estimator, Pruner
 from fmtorch.types import Correspondences, Estimate
 
 Array = Tensor | NDArray[Any]
@@ -40,7 +40,8 @@ def find_fundamental(
     device; gradients reach them through the final fit. mask: (B, N), True for real matches; all when not given.
     quality: (B, N), the matcher's figure, smaller is better (a distance ratio). prior: (B, N), P(inlier) in [0, 1].
     lafs0, lafs1: (B, N, 2, 3) local affine frames. size0, size1: (B, 2) image sizes (h, w). key: (B,) int64, selects
-    each pair's random numbers. One pair's arguments may come without the leading B.
+    each pair's random numbers. Where an estimator uses a prior and none is given, it is derived from the frames and the
+    quality, if these are. One pair's arguments may come without the leading B.
     estimator: a preset of conf/estimator; `options` replace values of it (``threshold=0.5``).
 
     Returns an `Estimate` of B pairs (of one pair for (N, 2) points): F with unit Frobenius norm, inliers, ok, reason.
@@ -69,7 +70,10 @@ def find_fundamental(
         x0_batch, x1_batch, live.to(torch.bool), quality=batch(quality, 2), prior=batch(prior, 2),
         lafs0=batch(lafs0, 4), lafs1=batch(lafs1, 4), size0=batch(size0, 2), size1=batch(size1, 2), key=batch(key, 1),
     )  # fmt: skip
-    return _estimator(estimator, json.dumps(options, sort_keys=True))(c, seed)
+    chosen = _estimator(estimator, json.dumps(options, sort_keys=True))
+    if prior is None and getattr(chosen, "uses_prior", False):
+        c = _frame_consistency()(c)
+    return chosen(c, seed)
 
 
 def _tensor(value: Array) -> Tensor:
@@ -79,4 +83,10 @@ def _tensor(value: Array) -> Tensor:
 @functools.lru_cache(maxsize=64)
 def _estimator(name: str, options: str) -> Estimator:
     built: Estimator = presets.build("estimator", name, **json.loads(options))
+    return built
+
+
+@functools.lru_cache(maxsize=1)
+def _frame_consistency() -> Pruner:
+    built: Pruner = presets.build("pruner", "frame_consistency")
     return built

@@ -5,15 +5,24 @@ With the commands this is the only user of Hydra and OmegaConf.
 
 from __future__ import annotations
 
+import functools
 import inspect
-from collections.abc import Mapping
+import threading
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import hydra
 import hydra.utils
+import torch
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
+from fmtorch.pipeline import Pipeline
 from fmtorch.resources import conf_dir
+
+_composing = threading.Lock()  # Hydra composes through a global
 
 
 def available(group: str, config_dir: Path | str | None = None) -> list[str]:
@@ -61,3 +70,52 @@ def instantiate(config: Mapping[str, Any] | DictConfig, where: str, **extra: Any
     if unknown and not takes_any:
         raise ValueError(f"{where}: no option {', '.join(unknown)}; there are: {', '.join(known)}")
     return target(**{str(key): value for key, value in values.items()}, **extra)
+
+
+def resolve_device(name: str) -> torch.device:
+    """The torch device of a config: `auto` takes a GPU where there is one. Raises ValueError where it is not there."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = torch.device(name)
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise ValueError(f"device={name}: this installation of torch sees no CUDA device; use device=cpu")
+    return device
+
+
+def build_pipeline(config: DictConfig, device: torch.device | str = "cpu") -> Pipeline:
+    """The pipeline that the groups features, matcher, pruner and estimator of a composed config describe."""
+    pruners = {str(k): instantiate(v, f"pruner={k}") for k, v in (config.pruner or {}).items()}
+    return Pipeline(
+        instantiate(config.features, "features"),
+        instantiate(config.matcher, "matcher"),
+        pruners,
+        instantiate(config.estimator, "estimator"),
+        device=device,
+    )
+
+
+def pipeline(name: str, device: torch.device | str = "cpu", overrides: Sequence[str] = ()) -> Pipeline:
+    """The pipeline of ``conf/pipeline/<name>.yaml``, changed by `overrides` as on the command line.
+
+    E.g. ``pipeline("sift_gms", overrides=["estimator=lmeds", "pruner.gms.with_scale=true"])``.
+    Raises ValueError for an unknown pipeline, naming those there are, and for an override that does not apply.
+    """
+    if name not in available("pipeline"):
+        raise ValueError(f"no preset {name!r} in conf/pipeline; there are: {', '.join(available('pipeline'))}")
+    try:
+        config = _compose("match", (f"pipeline={name}", *overrides))
+    except HydraException as error:
+        raise ValueError(f"pipeline={name} with {', '.join(overrides)}: {error}") from error
+    return build_pipeline(config, device)
+
+
+@functools.lru_cache(maxsize=64)
+def _compose(config_name: str, overrides: tuple[str, ...]) -> DictConfig:
+    """The config that a command composes from its arguments; a caller's own Hydra stays as it is."""
+    with _composing:
+        hydra_of_caller, GlobalHydra.instance().hydra = GlobalHydra.instance().hydra, None
+        try:
+            with hydra.initialize_config_dir(str(conf_dir()), version_base=None):
+                return hydra.compose(config_name, list(overrides))
+        finally:
+            GlobalHydra.instance().hydra = hydra_of_caller

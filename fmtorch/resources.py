@@ -9,7 +9,8 @@ _PACKAGE = Path(__file__).resolve().parent
 
 
 def _folder(name: str) -> Path:
-    for folder in (_PACKAGE / name, _PACKAGE.parent / name):
+    checkout = _PACKAGE.parent if (_PACKAGE.parent / "pyproject.toml").is_file() else _PACKAGE
+    for folder in (_PACKAGE / name, checkout / name):
         if folder.is_dir():
             return folder
     raise FileNotFoundError(f"no folder {name!r} in {_PACKAGE} or beside it: the installation is incomplete")

@@ -7,16 +7,19 @@ The search runs without gradients in float32; the final fit is attached to the c
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch import random
-from fmtorch.estimators.choice import CHOICES
-from fmtorch.estimators.parts import FINAL_FITS, INLIER_RULES, SAMPLERS, SCORES, SOLVERS, Refinement, part
+from fmtorch.estimators.choice import best_of
+from fmtorch.estimators.local_optimization import LOCAL_OPTIMIZATIONS
+from fmtorch.estimators.parts import CHOICES, FINAL_FITS, INLIER_RULES, SAMPLERS, SCORES, SOLVERS, Refinement, part
 from fmtorch.estimators.problem import Problem, problems
-from fmtorch.estimators.scoring import InlierCount, score_models
+from fmtorch.estimators.sampling import PriorWeighted
+from fmtorch.estimators.scoring import sampson_squared, score_models
 from fmtorch.random import Stream
 from fmtorch.types import Correspondences, Estimate
 
@@ -43,12 +46,16 @@ class HypothesizeAndVerify:
     confidence: stop once an all-inlier sample was drawn with this probability; None: never before `hypotheses`.
     preselect: models are first scored on this many matches, chosen by the pair's key; 0: always on all.
     survivors: models of a round that pass the preselection.
-    pool: the best models that are kept to the end. refine: robust kernel of the Levenberg-Marquardt refinement of the
-    pool (`truncated`, `cauchy`, ...), null: none; refine_threshold: its scale, Sampson distance in pixels;
-    refine_iterations: its steps. choice: by which score the estimate is chosen from the refined pool, `score` (the
-    search's own) or `saturated` (gains saturate in each cell of a grid).
+    pool: the best models that are kept to the end. local_optimization: of the pool, `graph_cut` or null: none.
+    refine: robust kernel of the Levenberg-Marquardt refinement of the pool (`truncated`, `cauchy`, ...), null: none;
+    refine_threshold: its scale, Sampson distance in pixels; refine_iterations: its steps. choice: by which score the
+    estimate is chosen from the refined pool, `score` (the search's own), `saturated` (gains saturate in each cell of
+    a grid) or `focal` (the same, with a prior on the focal length: for whole photographs, not crops; `saturated` where
+    the image sizes are unknown); choice_threshold: of the last two, Sampson distance in pixels, null: the score's.
     inliers: `threshold`, `lmeds` (2.5 robust standard deviations) or `median` (the better half).
-    final: `least_squares` (8-point on the inliers) or `none`. refit_inliers: recompute inliers after the final fit.
+    inlier_threshold: of the inliers reported, Sampson distance in pixels; null: the score's threshold.
+    final: `least_squares` (8-point on the inliers), `gauss_newton` (one attached step) or `none`.
+    refit_inliers: recompute the inliers after the final fit.
 
     Memory: for a batch of pairs of N matches, the points (48 N bytes a pair), the samples of 2^14 draws (about 40 MB)
     and eight buffers of one scoring tile (1 MB each); on a GPU 2^21 draws and 256 MB a buffer.
@@ -67,11 +74,14 @@ class HypothesizeAndVerify:
         preselect: int = 128,
         survivors: int = 256,
         pool: int = 1,
+        local_optimization: str | None = None,
         refine: str | None = None,
         refine_threshold: float = 1.0,
         refine_iterations: int = 5,
         choice: str = "score",
+        choice_threshold: float | None = None,
         inliers: str = "threshold",
+        inlier_threshold: float | None = None,
         final: str = "least_squares",
         refit_inliers: bool = True,
     ) -> None:
@@ -82,15 +92,24 @@ class HypothesizeAndVerify:
         self.solver = part("solver", solver, SOLVERS)()
         self.sampler = part("sampler", sampler, SAMPLERS)()
         self.score = part("score", score, SCORES)(threshold)
-        self.count_inliers = InlierCount(threshold)
+        self.inlier_threshold = threshold if inlier_threshold is None else inlier_threshold
         self.hypotheses, self.round, self.confidence = hypotheses, round, confidence
         self.preselect, self.survivors = preselect, survivors
         self.pool = pool
+        self.local_optimization = None
+        if local_optimization is not None:
+            optimization = part("local_optimization", local_optimization, LOCAL_OPTIMIZATIONS)
+            self.local_optimization = optimization(threshold, self.score)
         self.refinement = None if refine is None else Refinement(refine, refine_threshold, refine_iterations)
-        self.choice = None if choice == "score" else part("choice", choice, CHOICES)(threshold)
-        self.inlier_rule = part("inliers", inliers, INLIER_RULES)(threshold)
+        self.choice = None if choice == "score" else part("choice", choice, CHOICES)(choice_threshold or threshold)
+        self.inlier_rule = part("inliers", inliers, INLIER_RULES)(self.inlier_threshold)
         self.final = part("final", final, FINAL_FITS)()
         self.refit_inliers = refit_inliers
+
+    @property
+    def uses_prior(self) -> bool:
+        """Whether a prior makes a difference to the search."""
+        return isinstance(self.sampler, PriorWeighted) or getattr(self.score, "prior_weighted", False)
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
@@ -132,19 +151,19 @@ class HypothesizeAndVerify:
         return F, inliers, found, search.draws
 
     def _choose(self, search: _Search, problem: Problem) -> Float[Tensor, "9 p"]:
-        """The best of the pool, once refined, by the score of the choice; float64."""
+        """The best of the pool, once optimised and refined, by the score of the choice; float64."""
         F = search.F.to(torch.float64)
-        if self.refinement is None and self.choice is None:
+        if self.local_optimization is None and self.refinement is None and self.choice is None:
             return F[:, :, 0]
+        if self.local_optimization is not None:
+            F = self.local_optimization(F, problem)
         if self.refinement is not None:
             F = self.refinement(F, problem)
-        if self.choice is None:
-            score = score_models(self.score, F.to(torch.float32), problem, problem.points.to(torch.float32))
-        else:
-            score = self.choice(F, problem)
-        score = torch.where(torch.isfinite(search.score), score, -torch.inf)
-        best = torch.sort(score, dim=1, descending=True, stable=True).indices[:, :1]
-        return F.gather(2, best.expand(9, -1, -1))[..., 0]
+        alive = torch.isfinite(search.score)
+        if self.choice is not None:
+            return self.choice(F, problem, alive)
+        score = score_models(self.score, F.to(torch.float32), problem, problem.points.to(torch.float32))
+        return best_of(F, score, alive)
 
     def _search(self, problem: Problem) -> _Search:
         p, device = len(problem.pair), problem.points.device
@@ -204,10 +223,15 @@ class HypothesizeAndVerify:
     def _done(self, state: _Search, active: Tensor, problem: Problem, points: Tensor) -> Bool[Tensor, " p"]:
         """Whether an all-inlier sample was drawn with probability `confidence` (Fischler & Bolles 1981)."""
         assert self.confidence is not None
-        support = score_models(self.count_inliers, state.F[:, active, :1].contiguous(), problem, points)[:, 0]
-        all_inliers = (support.to(torch.float64) / problem.count) ** self.solver.size
+        r2 = sampson_squared(state.F[:, active, :1].contiguous(), points)[:, 0]
+        support = r2 <= (self.inlier_threshold / problem.unit).square().to(r2.dtype)[:, None]
+        weight = self.sampler.weight(problem)
+        share = torch.where(support, weight, 0).sum(1).to(torch.float64) / weight.sum(1)
+        all_inliers = share
+        for _ in range(self.solver.size - 1):  # a power would not have the same last bits everywhere
+            all_inliers = all_inliers * share
         missed = torch.log1p(-all_inliers.clamp(max=1 - 1e-12)) * state.draws[active]
-        return missed <= torch.log1p(torch.tensor(-self.confidence, dtype=torch.float64, device=missed.device))
+        return missed <= math.log1p(-self.confidence)
 
     def _subset(self, problem: Problem) -> Int[Tensor, "p k"] | None:
         """The live matches on which models are preselected: those with the smallest hash."""

@@ -9,9 +9,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.estimators.choice import Choice, SaturatedGain
+from fmtorch.estimators.focal import FocalPrior
 from fmtorch.estimators.problem import Problem
 from fmtorch.estimators.sampling import PriorWeighted, Prosac, Sampler, Uniform
 from fmtorch.estimators.scoring import (
+    GemanMcClure,
     InlierCount,
     Median,
     Score,
@@ -22,7 +25,7 @@ from fmtorch.estimators.scoring import (
 )
 from fmtorch.geometry import eight_point
 from fmtorch.geometry.minimal import eight_point_components, seven_point_components
-from fmtorch.geometry.refine import refine_components
+from fmtorch.geometry.refine import attached_step, refine_components
 
 T = TypeVar("T")
 
@@ -163,12 +166,29 @@ class LeastSquares:
         return torch.where(valid[:, None, None], fitted, F)
 
 
+class GaussNewton:
+    """One attached Gauss-Newton step of the Sampson error at the refined model, on its inliers, weighted by the prior.
+
+    At an optimum it moves nothing, and its gradient is that of the optimum (implicit function theorem).
+    """
+
+    def __call__(
+        self, F: Float[Tensor, "p 3 3"], problem: Problem, inliers: Bool[Tensor, "p n"]
+    ) -> Float[Tensor, "p 3 3"]:
+        """As `FinalFit`."""
+        x0, x1 = problem.points[:2].permute(1, 2, 0), problem.points[2:].permute(1, 2, 0)
+        weight = inliers.to(torch.float64) if problem.prior is None else torch.where(inliers, problem.prior, 0)
+        return attached_step(F, x0, x1, weight, kernel="truncated", scale=torch.inf)
+
+
 SAMPLERS: dict[str, Callable[[], Sampler]] = {"uniform": Uniform, "prosac": Prosac, "prior": PriorWeighted}
 SOLVERS: dict[str, Callable[[], Solver]] = {"seven_point": SevenPoint, "eight_point": EightPoint}
 SCORES: dict[str, Callable[[float], Score]] = {
     "inlier_count": InlierCount,
     "msac": TruncatedSquares,
     "prior_msac": lambda threshold: TruncatedSquares(threshold, prior_weighted=True),
+    "geman_mcclure": GemanMcClure,
+    "prior_geman_mcclure": lambda threshold: GemanMcClure(threshold, prior_weighted=True),
     "magsac": SigmaConsensus,
     "median": lambda threshold: Median(),
 }
@@ -177,4 +197,9 @@ INLIER_RULES: dict[str, Callable[[float], Callable[[Tensor, Problem], Tensor]]] 
     "median": BetterHalf,
     "lmeds": RobustDeviations,
 }
-FINAL_FITS: dict[str, Callable[[], FinalFit]] = {"none": NoFit, "least_squares": LeastSquares}
+FINAL_FITS: dict[str, Callable[[], FinalFit]] = {
+    "none": NoFit,
+    "least_squares": LeastSquares,
+    "gauss_newton": GaussNewton,
+}
+CHOICES: dict[str, Callable[[float], Choice]] = {"saturated": SaturatedGain, "focal": FocalPrior}

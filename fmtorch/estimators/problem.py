@@ -25,7 +25,8 @@ class Problem:
     points: (4, P, N) float64, rows x0, y0, x1, y1 in normalised units: ``x = centre + unit * point``.
     count: live matches (P,). unit: pixels in one normalised unit (P,), a power of two. centre: (P, 4).
     slot: where each match stood in the caller's tensors (P, N). pair: index of each pair in the caller's batch.
-    quality, prior: (P, N), zero in padded slots, None where the caller has none. seed: of every random choice.
+    quality, prior: (P, N), zero in padded slots, None where the caller has none. size0, size1: (P, 2) as (h, w),
+    pixels, or None. seed: of every random choice.
     Points, quality and prior stay attached to the caller's graph; centre and unit are constants.
     """
 
@@ -40,6 +41,8 @@ class Problem:
     quality: Float[Tensor, "p n"] | None
     prior: Float[Tensor, "p n"] | None
     seed: int
+    size0: Int[Tensor, "p 2"] | None = None
+    size1: Int[Tensor, "p 2"] | None = None
 
     def __getitem__(self, index: Tensor) -> Problem:
         """The selected pairs."""
@@ -121,4 +124,5 @@ def _problem(c: Correspondences, live: Tensor, pair: Tensor, n: int, seed: int) 
         points.permute(2, 0, 1).contiguous(), live, count, unit, centre, order, pair, c.keys[pair],
         take(None if c.quality is None else c.quality),
         None if prior is None else prior.nan_to_num(0).clamp(0, 1), seed,
+        None if c.size0 is None else c.size0[pair], None if c.size1 is None else c.size1[pair],
     )  # fmt: skip

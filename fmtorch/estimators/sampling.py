@@ -30,13 +30,21 @@ class Sampler(Protocol):
         """Indices of the `size` matches in each of the draws start .. start + count - 1."""
         ...
 
+    def weight(self, problem: Problem) -> Int[Tensor, "p n"]:
+        """How likely each match is to be drawn, relative to the others, for the stopping rule."""
+        ...
+
 
 class Uniform:
     """Every set of live matches is equally likely."""
 
+    def weight(self, problem: Problem) -> Int[Tensor, "p n"]:
+        """One for each live match."""
+        return problem.live.to(torch.int64)
+
     def table(self, problem: Problem, size: int) -> Int[Tensor, "p n"]:
         """1, 2, ..., n, n, n: every live match weighs one."""
-        return problem.live.to(torch.int64).cumsum(-1)
+        return self.weight(problem).cumsum(-1)
 
     def draw(
         self, problem: Problem, table: Int[Tensor, "p n"], start: int, count: int, size: int
@@ -53,6 +61,10 @@ class Prosac:
     """
 
     GROWTH = 200_000  # T_N: after so many draws PROSAC is RANSAC; the paper's value
+
+    def weight(self, problem: Problem) -> Int[Tensor, "p n"]:
+        """One for each live match."""
+        return problem.live.to(torch.int64)
 
     def table(self, problem: Problem, size: int) -> Int[Tensor, "p n"]:
         """T'_n for n = 1 .. N: the last draw whose sample comes from the first n matches (equation 4)."""
@@ -84,13 +96,17 @@ class Prosac:
 class PriorWeighted:
     """Matches drawn in proportion to their prior P(inlier); uniform where there is none."""
 
-    def table(self, problem: Problem, size: int) -> Int[Tensor, "p n"]:
-        """Cumulative sum of the priors, quantised so that it is exact, the same on any device and under any padding."""
+    def weight(self, problem: Problem) -> Int[Tensor, "p n"]:
+        """The priors, quantised so that their sums are exact, the same on any device and under any padding."""
         if problem.prior is None:
-            return Uniform().table(problem, size)
+            return problem.live.to(torch.int64)
         largest = 1 << (_TOTAL_BITS - (problem.live.shape[1] - 1).bit_length())
         weight = (problem.prior * largest).round().to(torch.int64).clamp_min(1)
-        return torch.where(problem.live, weight, 0).cumsum(-1)
+        return torch.where(problem.live, weight, 0)
+
+    def table(self, problem: Problem, size: int) -> Int[Tensor, "p n"]:
+        """Cumulative sum of the weights."""
+        return self.weight(problem).cumsum(-1)
 
     def draw(
         self, problem: Problem, table: Int[Tensor, "p n"], start: int, count: int, size: int

@@ -90,8 +90,40 @@ class TruncatedSquares:
         """As `Score`."""
         scale = (unit / self.threshold).square().to(r2.dtype)[:, None, None]
         gain = r2.mul_(scale).neg_().add_(1).clamp_min_(0)
-        weight = live.to(r2.dtype) if prior is None or not self.prior_weighted else prior.to(r2.dtype)
-        return _exact_sum(gain.mul_(weight[:, None]))
+        return _exact_sum(gain.mul_(_weight(live, prior, self.prior_weighted, r2.dtype)))
+
+
+class GemanMcClure:
+    """The sum over matches of ``1 / (1 + r^2 / s^2)``, shifted and scaled to be 1 at r = 0 and 0 from 5 s on.
+
+    Geman & McClure (1987). A narrow peak with a long tail: exact matches decide, and matches with larger noise still
+    count, so that one scale serves scenes of different noise. threshold: s, Sampson distance, px. prior_weighted:
+    multiply each gain by P(inlier), where there is a prior.
+    """
+
+    REACH = 5.0
+
+    def __init__(self, threshold: float, prior_weighted: bool = False) -> None:
+        self.threshold = _positive(threshold)
+        self.prior_weighted = prior_weighted
+
+    def __call__(
+        self,
+        r2: Float[Tensor, "p m n"],
+        live: Bool[Tensor, "p n"],
+        prior: Float[Tensor, "p n"] | None,
+        unit: Float[Tensor, " p"],
+    ) -> Float[Tensor, "p m"]:
+        """As `Score`."""
+        scale = (unit / self.threshold).square().to(r2.dtype)[:, None, None]
+        rest = 1 / (1 + self.REACH**2)
+        gain = r2.mul_(scale).add_(1).reciprocal_().sub_(rest).clamp_min_(0).mul_(1 / (1 - rest))
+        return _exact_sum(gain.mul_(_weight(live, prior, self.prior_weighted, r2.dtype)))
+
+
+def _weight(live: Tensor, prior: Tensor | None, prior_weighted: bool, dtype: torch.dtype) -> Float[Tensor, "p 1 n"]:
+    """What each match counts: its prior, or one; nothing in padded slots."""
+    return (live if prior is None or not prior_weighted else prior).to(dtype)[:, None]
 
 
 class SigmaConsensus:

@@ -1,52 +1,202 @@
-"""Pictures of matched pairs."""
+"""Pictures of matched pairs: their matches, and the epipolar lines of some of them."""
 
 from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 Image = NDArray[np.uint8]
-GOOD, BAD = (60, 190, 90), (225, 70, 60)  # RGB
+Points = NDArray[np.floating]
+# RGB; told apart by all kinds of colour vision, and in grey (Okabe & Ito, "Color Universal Design", 2008), lightened.
+GOOD, BAD = (20, 205, 140), (225, 75, 20)
+COLOURS = (
+    (0, 158, 235),
+    (240, 228, 66),
+    (230, 100, 10),
+    (20, 190, 130),
+    (225, 130, 185),
+    (110, 205, 250),
+    (245, 170, 0),
+)
+WIDTH, HEIGHT = 1920, 1000  # px, of a picture at most
 _GAP = 6  # px between the two images
+_STACKED = 5.0  # images whose widths add up to more than so many heights stand one above the other
 _SUBPIXEL = 4  # fractional bits of the coordinates that are drawn
+_PARALLEL = 1e-9  # a line with this slope at most leaves an image only at its two other sides
+_FARTHEST = 1e12  # px; a line farther from the first pixel is the line at infinity
+_COLOUR_LEFT = 0.45  # of the photographs' own, so that lines stand out
 
 
 def draw_matches(
-    image0: Image, image1: Image, x0: NDArray[np.floating], x1: NDArray[np.floating], good: NDArray[np.bool_],
-    *, height: int = 480, most: int = 150,
+    image0: Image, image1: Image, x0: Points, x1: Points, good: NDArray[np.bool_],
+    *, height: int | None = None, most: int = 90, most_bad: int = 50,
 ) -> Image:  # fmt: skip
-    """Two images side by side, their matches as lines: green where good, red elsewhere; RGB (height, W, 3).
+    """Two images side by side with their matches as lines, green where good, thin and red elsewhere; RGB (H, W, 3).
 
-    x0, x1: (N, 2) pixels. most: lines of each colour at most, spread evenly over the list.
+    Wide images stand one above the other. x0, x1: (N, 2) pixels. height: side by side in this height; None: as fits
+    `WIDTH` x `HEIGHT`. most, most_bad: lines of each kind at most, spread over both images.
     """
-    left, scale0 = _scaled(image0, height)
-    right, scale1 = _scaled(image1, height)
-    offset = left.shape[1] + _GAP
-    canvas = np.full((height, offset + right.shape[1], 3), 255, np.uint8)
-    canvas[:, : left.shape[1]], canvas[:, offset:] = left, right
-    # (0, 0) is the centre of the first pixel, so scaling moves coordinates by half a pixel.
-    ends0 = (x0 + 0.5) * scale0 - 0.5
-    ends1 = (x1 + 0.5) * scale1 - 0.5 + [offset, 0]
-    for colour, chosen in ((BAD, ~good), (GOOD, good)):
-        index = np.flatnonzero(chosen)
-        if len(index) > most:
-            index = index[np.linspace(0, len(index) - 1, most).round().astype(int)]
+    canvas, place0, place1 = _placed(image0, image1, height)
+    ends0, ends1 = place0(x0), place1(x1)
+    unit = _unit(canvas)
+    styles = ((BAD, ~good, most_bad, 0.6 * unit, 0.6), (GOOD, good, most, 1.1 * unit, 0.85))
+    for colour, chosen, count, width, opacity in styles:
+        index = np.flatnonzero(chosen & np.isfinite(ends0).all(1) & np.isfinite(ends1).all(1))
+        index = index[spread(np.hstack([ends0, ends1])[index], count)]
+        layer = canvas.copy()
         for a, b in zip(_fixed(ends0[index]), _fixed(ends1[index]), strict=True):
-            cv2.line(canvas, a, b, colour, 1, cv2.LINE_AA, _SUBPIXEL)
+            cv2.line(layer, a, b, colour, _pixels(width), cv2.LINE_AA, _SUBPIXEL)
         for point in _fixed(np.concatenate([ends0[index], ends1[index]])):
-            cv2.circle(canvas, point, 2 << _SUBPIXEL, colour, -1, cv2.LINE_AA, _SUBPIXEL)
+            cv2.circle(layer, point, round(2.6 * width * (1 << _SUBPIXEL)), colour, -1, cv2.LINE_AA, _SUBPIXEL)
+        canvas = np.asarray(cv2.addWeighted(layer, opacity, canvas, 1 - opacity, 0), np.uint8)
     return canvas
 
 
-def _scaled(image: Image, height: int) -> tuple[Image, float]:
-    scale = height / image.shape[0]
-    size = (max(1, round(image.shape[1] * scale)), height)
-    colour = image if image.ndim == 3 else np.repeat(image[..., None], 3, 2)
-    interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-    return np.asarray(cv2.resize(colour, size, interpolation=interpolation), np.uint8), scale
+def draw_epipolar_lines(
+    image0: Image, image1: Image, x0: Points, x1: Points, F: Points, *, truth: Points | None = None, most: int = 14
+) -> Image:
+    """Two images with some of their matches as points and the matches' epipolar lines, ``x1^T F x0 = 0``; RGB.
+
+    A match has one colour: its point and the line of its partner in each image. truth: the true F, whose lines are
+    dashed and white. x0, x1: (N, 2) pixels, of which `most` are drawn at most, spread over both images.
+    """
+    canvas, place0, place1 = _placed(image0, image1, None)
+    unit = _unit(canvas)
+    finite = np.flatnonzero(np.isfinite(x0).all(1) & np.isfinite(x1).all(1))
+    index = finite[spread(np.hstack([place0(x0), place1(x1)])[finite], most)]
+    for place, own, other, transpose in ((place0, x0, x1, True), (place1, x1, x0, False)):
+        matrices = [(matrix.T if transpose else matrix) for matrix in (F, truth) if matrix is not None]
+        part = place.view(canvas)
+        partners = np.column_stack([other[index], np.ones(len(index))])
+        drawn = [[place.clip(line) for line in partners @ matrix.T] for matrix in matrices]
+        for k, ends in enumerate(drawn[0]):
+            _segment(part, ends, COLOURS[k % len(COLOURS)], 1.9 * unit)
+        for ends in drawn[1] if truth is not None else []:
+            for dash in _dashes(ends, 15 * unit):
+                _segment(part, dash, (255, 255, 255), 1.3 * unit)
+        for k, point in enumerate(_fixed(place(own[index]) - place.origin)):
+            for colour, radius in (((0, 0, 0), 5.8), ((255, 255, 255), 5.0), (COLOURS[k % len(COLOURS)], 3.6)):
+                cv2.circle(part, point, round(radius * unit * (1 << _SUBPIXEL)), colour, -1, cv2.LINE_AA, _SUBPIXEL)
+    return canvas
 
 
-def _fixed(points: NDArray[np.floating]) -> list[tuple[int, int]]:
+def spread(points: Points, count: int) -> NDArray[np.intp]:
+    """Indices, ascending, of at most `count` points (N, D) far from one another: each the farthest from those before.
+
+    The first is the nearest to the mean. O(N count). Ties go to the lowest index.
+    """
+    if len(points) <= count:
+        return np.arange(len(points))
+    distance = -((points - points.mean(0)) ** 2).sum(1)
+    chosen = [int(distance.argmax())]
+    distance = np.full(len(points), np.inf)
+    for _ in range(count - 1):
+        distance = np.minimum(distance, ((points - points[chosen[-1]]) ** 2).sum(1))
+        chosen.append(int(distance.argmax()))
+    return np.sort(np.array(chosen, np.intp))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Place:
+    """Where an image of `shape` (h, w) stands on the canvas: its first corner (x, y) and its size (w, h) there."""
+
+    shape: tuple[int, int]
+    origin: tuple[int, int]
+    size: tuple[int, int]
+
+    def __call__(self, x: Points) -> NDArray[np.float64]:
+        """Pixels of the image as pixels of the canvas; (0, 0) is the centre of the first pixel of either."""
+        scale = np.array(self.size) / self.shape[::-1]
+        return np.asarray((x + 0.5) * scale - 0.5 + self.origin, np.float64)
+
+    def view(self, canvas: Image) -> Image:
+        """The image's part of the canvas."""
+        return canvas[self.origin[1] : self.origin[1] + self.size[1], self.origin[0] : self.origin[0] + self.size[0]]
+
+    def clip(self, line: Points) -> NDArray[np.float64]:
+        """The part of a line (a, b, c) within the image: its ends (2, 2) in pixels of `view`; (0, 2) where none is."""
+        w, h = self.shape[::-1]
+        length = float(np.hypot(line[0], line[1]))
+        if not np.isfinite(line).all() or length <= abs(line[2]) / _FARTHEST:
+            return np.zeros((0, 2))
+        normal, middle = line[:2] / length, np.array([w - 1, h - 1]) / 2
+        foot = middle - normal * (normal @ middle + line[2] / length)
+        direction = np.array([-normal[1], normal[0]])
+        first, last = -np.inf, np.inf
+        for start, step, low, high in zip(foot, direction, (-0.5, -0.5), (w - 0.5, h - 0.5), strict=True):
+            if abs(step) < _PARALLEL:
+                if not low <= start <= high:
+                    return np.zeros((0, 2))
+                continue
+            near, far = sorted(((low - start) / step, (high - start) / step))
+            first, last = max(first, near), min(last, far)
+        if first > last:
+            return np.zeros((0, 2))
+        return self(foot + np.array([[first], [last]]) * direction) - self.origin
+
+
+def _placed(image0: Image, image1: Image, height: int | None) -> tuple[Image, _Place, _Place]:
+    """A canvas with both images, and where they stand on it: in a row of one height, or in a column of one width."""
+    shapes = [image.shape[:2] for image in (image0, image1)]
+    widths = [w / h for h, w in shapes]  # at height 1
+    if height is None and sum(widths) > _STACKED:
+        width = min(WIDTH, (HEIGHT - _GAP) / sum(1 / x for x in widths))
+        sizes = [(max(1, round(width)), max(1, round(width / x))) for x in widths]
+        origins = [(0, 0), (0, sizes[0][1] + _GAP)]
+    else:
+        tall = height or min(HEIGHT, (WIDTH - _GAP) / sum(widths))
+        sizes = [(max(1, round(tall * x)), max(1, round(tall))) for x in widths]
+        origins = [(0, 0), (sizes[0][0] + _GAP, 0)]
+    end = np.array(origins[1]) + np.max(sizes, axis=0) * [origins[1][0] == 0, origins[1][1] == 0]
+    end += np.array(sizes[1]) * [origins[1][0] > 0, origins[1][1] > 0]
+    canvas = np.full((end[1], end[0], 3), 255, np.uint8)
+    places = []
+    for image, shape, origin, size in zip((image0, image1), shapes, origins, sizes, strict=True):
+        place = _Place((shape[0], shape[1]), origin, size)
+        place.view(canvas)[:] = _faded(image, size)
+        places.append(place)
+    return canvas, places[0], places[1]
+
+
+def _faded(image: Image, size: tuple[int, int]) -> Image:
+    """The image in another size (w, h) and paler colours."""
+    shrinks = size[0] < image.shape[1]
+    image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC), np.uint8)
+    if image.ndim == 2:
+        return np.repeat(image[..., None], 3, 2)
+    grey = np.repeat(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))[..., None], 3, 2)
+    return np.asarray(cv2.addWeighted(image, _COLOUR_LEFT, grey, 1 - _COLOUR_LEFT, 0), np.uint8)
+
+
+def _unit(canvas: Image) -> float:
+    """The width of a fine line: 1 px for a picture of WIDTH x 640."""
+    return float(np.sqrt(canvas.shape[0] * canvas.shape[1] / (WIDTH * 640)))
+
+
+def _pixels(width: float) -> int:
+    return max(1, round(width))
+
+
+def _segment(canvas: Image, ends: Points, colour: tuple[int, int, int], width: float) -> None:
+    """A line on a dark rim, which can be seen on any ground."""
+    if len(ends):
+        a, b = _fixed(ends)
+        cv2.line(canvas, a, b, (0, 0, 0), _pixels(width) + 2, cv2.LINE_AA, _SUBPIXEL)
+        cv2.line(canvas, a, b, colour, _pixels(width), cv2.LINE_AA, _SUBPIXEL)
+
+
+def _dashes(ends: Points, length: float) -> Iterator[Points]:
+    """Pieces of a line with gaps of the same length between them."""
+    if len(ends):
+        pieces = max(1, round(float(np.linalg.norm(ends[1] - ends[0])) / length))
+        stops = ends[0] + np.linspace(0, 1, pieces + 1)[:, None] * (ends[1] - ends[0])
+        yield from (stops[i : i + 2] for i in range(0, pieces, 2))
+
+
+def _fixed(points: Points) -> list[tuple[int, int]]:
     whole = np.round(points * (1 << _SUBPIXEL)).astype(int)
     return [(int(x), int(y)) for x, y in whole]

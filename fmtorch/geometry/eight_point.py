@@ -39,15 +39,17 @@ def eight_point(
 
 
 def linear_fundamental(
-    x0: Float[Tensor, "*batch n 2"], x1: Float[Tensor, "*batch n 2"], weight: Float[Tensor, "*batch n"]
+    x0: Float[Tensor, "*points n 2"], x1: Float[Tensor, "*points n 2"], weight: Float[Tensor, "*batch n"]
 ) -> tuple[Float[Tensor, "*batch 3 3"], Bool[Tensor, "*batch"]]:
     """The F of unit norm, of any rank, that minimises sum w (x1^T F x0)^2; False where it is not determined.
 
-    Expects normalised float64 points, finite, with weight zero for those that do not count.
+    Expects normalised float64 points, finite, with weight zero for those that do not count. The points' leading shape
+    broadcasts against that of the weights.
     """
-    # a = x1 (x) x0, so M holds the sums of w (x1 x1^T) (x) (x0 x0^T): 6 x 6 different ones.
-    products = (weight[..., None, :] * _products(x1))[..., :, None, :] * _products(x0)[..., None, :, :]
-    sums = stable_sum(products, -1)
+    # a = x1 (x) x0, so M holds the sums of w (x1 x1^T) (x) (x0 x0^T): 6 x 6 different ones, in parts that fit a cache.
+    p0, p1 = _products(x0), weight[..., None, :] * _products(x1)
+    rows = [stable_sum(part[..., :, None, :] * p0[..., None, :, :], -1) for part in p1.chunk(3, -2)]
+    sums = torch.cat(rows, -2)
     M = sums[..., _PRODUCT_INDEX[:, None, :, None], _PRODUCT_INDEX[None, :, None, :]]
     M = M.reshape(*sums.shape[:-2], 9, 9)
     f, determined = smallest_eigenvector(M)

@@ -9,8 +9,9 @@ from torch import Tensor
 from fmtorch.geometry.eight_point import linear_fundamental
 from fmtorch.geometry.normalize import denormalize_fundamental, normalize_points
 from fmtorch.geometry.rank2 import nearest_rank2
-from fmtorch.geometry.refine import Normalised, linearise
+from fmtorch.geometry.refine import Normalised
 from fmtorch.geometry.robust_kernels import Kernel, named_kernel
+from fmtorch.geometry.sampson_objective import linearise
 
 
 def irls(

@@ -35,8 +35,8 @@ def last_right_singular_vector(F: Float[Tensor, " 3 3 *s"]) -> Float[Tensor, " 3
     """The unit right singular vector v of the smallest singular value, float64; F[i, j] is row i, column j.
 
     The cofactor matrix C of F has v for its *first* right singular vector, and singular values s1 s2, s1 s3, s2 s3: so
-    v belongs to the largest eigenvalue of C^T C (closed form), and power iteration with C^T C sharpens it whenever
-    s3 < s2, without F^T F's loss of digits.
+    v belongs to the largest eigenvalue of C^T C, which is well determined whenever s3 < s2, while the smallest one of
+    F^T F has lost half of its digits.
     """
     with torch.no_grad():
         G = _scaled(F.detach())
@@ -45,9 +45,6 @@ def last_right_singular_vector(F: Float[Tensor, " 3 3 *s"]) -> Float[Tensor, " 3
         C = _scaled(C)
         v = _largest_eigenvector(component_sum(C[:, :, None] * C[:, None], 0))
         v = torch.where(rank_one, _across_longest(G), v)
-        for _ in range(2):
-            u = component_sum(C * v, 1)
-            v = torch.where(rank_one, v, _unit(component_sum(C * u[:, None], 0), v))
         # C loses digits when s2 << s1; a step down the slope of |F v|^2 takes out what is left along the first vector.
         norm2 = component_sum(component_sum(G * G, 1))
         slope = component_sum(G * component_sum(G * v, 1)[:, None], 0)

@@ -1,33 +1,35 @@
 """Non-linear refinement of fundamental matrices: Levenberg-Marquardt of the robust Sampson error.
 
 Minimises ``sum_i w_i rho(r_i^2)``, r the Sampson distance, over the 7-dimensional manifold of 3 x 3 matrices of rank 2
-and unit norm. The tangent space at F is what is orthogonal, in R^9, to F (scale) and to ``e1 e0^T`` (rank), with
-``F e0 = 0`` and ``F^T e1 = 0`` the epipoles; a step is taken in it and brought back along ``e1 e0^T`` to determinant
-zero, which is linear in that direction. This is the orthonormal parametrisation of Bartoli & Sturm (2004) to first
-order, without its rotations, and without its defect where the singular values coincide.
-
-Everything is element-wise or summed in a fixed order, so a model is refined to the same bits in any batch.
+and unit norm (see `rank2_manifold`). Everything is element-wise or summed in a fixed order, so a model is refined to
+the same bits in any batch.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.geometry.rank2_manifold import (
+    RANK_TWO,
+    RANK_TWO_EPIPOLE,
+    constant,
+    constrained_solve,
+    retract,
+    solve,
+    start,
+    total,
+    unit,
+)
 from fmtorch.geometry.reduce import matmul3, stable_sum
 from fmtorch.geometry.robust_kernels import Kernel, named_kernel
+from fmtorch.geometry.sampson_objective import Objective, linearise
 
-LANES = 64  # points are summed one by one into so many lanes, and these in a tree: part of the result's last bits
-TILE_MODELS = 8  # models whose sums stay in the L2 cache together; changes no result
-TILE_ELEMENTS = 1 << 13  # points times models of one step; changes no result
-TINY = 1e-30  # squared slope of the epipolar constraint below which it is taken for this
 DAMPING = 1e-4  # initial, relative to the mean curvature; divided or multiplied by 10 at each step
 SMALLEST_DAMPING, LARGEST_DAMPING = 1e-12, 1e6
-RANK_TWO, RANK_TWO_EPIPOLE = (0.5**0.5, 0.0, 0.0, 0.0, 0.5**0.5, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 STEP_DAMPING = 1e-10  # of the attached step: bounds its gradient where the points leave a direction open
 
 
@@ -114,16 +116,12 @@ def attached_step(
         sound = torch.isfinite(inverse).flatten(0, 1).all(0)
         inverse = torch.where(sound, inverse, 0)
         # Something of rank 2 instead of what is not finite: `where` alone would not keep NaN out of the gradients.
-        model = torch.where(sound, model, _constant(model, RANK_TWO))
-        e0, e1 = (torch.where(sound, e, _constant(e, RANK_TWO_EPIPOLE)) for e in (e0, e1))
+        model = torch.where(sound, model, constant(model, RANK_TWO))
+        e0, e1 = (torch.where(sound, e, constant(e, RANK_TWO_EPIPOLE)) for e in (e0, e1))
     gradient = gradient_of_cost(model, problem.points, problem.weight, robust, problem.scale)
     step = -total((inverse * gradient).transpose(0, 1))
     moved, _, _ = retract(model, step, e0, e1)
     return problem.to_pixels(torch.where(sound, moved, problem.models)).reshape(F.shape)
-
-
-def _constant(like: Tensor, components: tuple[float, ...]) -> Tensor:
-    return like.new_tensor(components)[:, None, None]
 
 
 def gradient_of_cost(
@@ -220,212 +218,3 @@ class _State:
         self.cost = torch.where(condition, other.cost, self.cost)
         if len(other.products):
             self.products = torch.where(condition, other.products, self.products)
-
-
-def blocks(
-    points: Float[Tensor, "4 p n"], weight: Float[Tensor, "p n"]
-) -> tuple[Float[Tensor, "4 m p 1 lanes"], Float[Tensor, "m p 1 lanes"]]:
-    """Points and weights cut into blocks of LANES, the last one padded with zeros of weight zero."""
-    p, n = weight.shape
-    m = max(1, -(-n // LANES))
-    if n < m * LANES:
-        points = torch.nn.functional.pad(points, (0, m * LANES - n))
-        weight = torch.nn.functional.pad(weight, (0, m * LANES - n))
-    points = points.reshape(4, p, m, 1, LANES).transpose(1, 2).contiguous()
-    return points, weight.reshape(p, m, 1, LANES).transpose(0, 1).contiguous()
-
-
-class Objective:
-    """The robust cost of models of some pairs, with its normal equations, in tiles that stay in the cache."""
-
-    def __init__(
-        self,
-        points: Float[Tensor, "4 p n"],
-        weight: Float[Tensor, "p n"],
-        robust: Kernel,
-        scale: Float[Tensor, " p"],
-    ) -> None:
-        self.points, self.weight = blocks(points, weight)
-        self.robust, self.s2 = robust, scale.square()[:, None, None]
-        self.buffers: dict[tuple[int, ...], Tensor] = {}
-
-    def __call__(
-        self, F: Float[Tensor, "9 p k"], derivatives: bool
-    ) -> tuple[Float[Tensor, "rows columns p k"], Float[Tensor, "p k"]]:
-        """The weighted products of Jacobian and residual, [[J^T W J, J^T W r], [.., r^T W r]] (10, 10), and the cost.
-
-        W holds the weights times those of the kernel. Without derivatives the first is empty.
-        Each lane adds its points one after the other, so zeros at the end change nothing.
-        """
-        p, k = F.shape[1:]
-        pairs = max(1, TILE_MODELS // k)
-        if p <= pairs and k <= TILE_MODELS:
-            return self._tile(F, slice(None), derivatives)
-        rows = 10 if derivatives else 0
-        products, cost = F.new_empty(rows, rows, p, k), F.new_empty(p, k)
-        for i in range(0, p, pairs):
-            some = slice(i, i + pairs)
-            for j in range(0, k, TILE_MODELS):
-                models = slice(j, j + TILE_MODELS)
-                products[..., some, models], cost[some, models] = self._tile(F[:, some, models], some, derivatives)
-        return products, cost
-
-    def _tile(self, F: Tensor, pairs: slice, derivatives: bool) -> tuple[Tensor, Tensor]:
-        points, weight, s2 = self.points[:, :, pairs], self.weight[:, pairs], self.s2[pairs]
-        p, k = F.shape[1:]
-        f = F[..., None].unbind(0)
-        m, count = len(weight), max(1, TILE_ELEMENTS // (p * k * LANES))
-        lanes: list[Tensor] = []
-        sums = self._buffer(101, p, k, LANES)  # of the products, then the cost
-        products = sums[:100].view(10, 10, p, k, LANES)
-        for first in range(0, m, count):
-            some = slice(first, first + count)
-            w = weight[some]
-            rows, inverse, r2 = linearise(f, points[:, some], derivatives)
-            lanes += (self.robust.loss(r2, s2) * w).unbind(0)
-            if not derivatives:
-                continue
-            A, B = self._buffer(2, len(w), 10, p, k, LANES).unbind(0)
-            torch.stack(rows, 1, out=A)
-            torch.mul(A, (self.robust.weight(r2, s2) * w * inverse)[:, None], out=B)
-            for j, (a, b) in enumerate(zip(A[:, :, None].unbind(0), B[:, None].unbind(0), strict=True), start=first):
-                if j == 0:
-                    torch.mul(a, b, out=products)
-                else:
-                    products.addcmul_(a, b)
-        cost = lanes[0]
-        for lane in lanes[1:]:
-            cost = cost + lane
-        if not derivatives:
-            return F.new_empty(0, 0, p, k), stable_sum(cost)
-        sums[100] = cost
-        half = LANES // 2  # the first level of the tree in place: memory newly mapped costs more than the sum
-        sums = stable_sum(sums[..., :half].add_(sums[..., half:]))
-        return sums[:100].view(10, 10, p, k), sums[100]
-
-    def _buffer(self, *shape: int) -> Tensor:
-        if shape not in self.buffers:
-            self.buffers[shape] = self.points.new_empty(shape)
-        return self.buffers[shape]
-
-
-def linearise(
-    f: Sequence[Float[Tensor, "p k 1"]], points: Float[Tensor, "4 m p 1 lanes"], derivatives: bool = True
-) -> tuple[list[Tensor], Float[Tensor, "m p k lanes"], Float[Tensor, "m p k lanes"]]:
-    """The Sampson residual ``r = e / g`` and its Jacobian: g J (nine of them, then e), 1 / g^2, and r^2.
-
-    ``e = x1^T F x0``, ``g^2`` the squared norm of the first two entries of ``F x0`` and ``F^T x1`` together (Hartley &
-    Zisserman 2004, equation 11.9), so ``g dr = x1^T dF x0 - (e / g^2) ((F x0)^T D dF x0 + x1^T dF D F^T x1)`` with
-    ``D = diag(1, 1, 0)``: the sum of two products of a column and a row.
-    """
-    x0, y0, x1, y1 = points
-    a1 = torch.addcmul(torch.addcmul(f[2], f[0], x0), f[1], y0)
-    b1 = torch.addcmul(torch.addcmul(f[5], f[3], x0), f[4], y0)
-    c1 = torch.addcmul(torch.addcmul(f[8], f[6], x0), f[7], y0)
-    a0 = torch.addcmul(torch.addcmul(f[6], f[0], x1), f[3], y1)
-    b0 = torch.addcmul(torch.addcmul(f[7], f[1], x1), f[4], y1)
-    e = torch.addcmul(torch.addcmul(c1, a1, x1), b1, y1)
-    slope = torch.addcmul(torch.addcmul(torch.addcmul(a1 * a1, b1, b1), a0, a0), b0, b0)
-    inverse = slope.clamp_min(TINY).reciprocal()
-    c = e * inverse
-    r2 = e * c
-    if not derivatives:
-        return [], inverse, r2
-    u, v = torch.addcmul(x1, c, a1, value=-1), torch.addcmul(y1, c, b1, value=-1)  # x1 - c D F x0
-    s, t = -c * a0, -c * b0  # -c D F^T x1
-    rows = [
-        torch.addcmul(u * x0, s, x1), torch.addcmul(u * y0, t, x1), u,
-        torch.addcmul(v * x0, s, y1), torch.addcmul(v * y0, t, y1), v,
-        s + x0, t + y0, torch.ones_like(e), e,
-    ]  # fmt: skip
-    return rows, inverse, r2
-
-
-def solve(
-    products: Float[Tensor, "10 10 p k"], F: Tensor, e0: Tensor, e1: Tensor, damping: Tensor
-) -> Float[Tensor, "9 p k"]:
-    """The damped Gauss-Newton step in the tangent space: the least ``s^T (H + damping c I) s / 2 + s^T gradient``.
-
-    c is the greatest diagonal entry of H.
-    """
-    return constrained_solve(products[:9, :9], F, e0, e1, damping, -products[:9, 9:])[:, 0]
-
-
-def constrained_solve(
-    H: Float[Tensor, "9 9 p k"], F: Tensor, e0: Tensor, e1: Tensor, damping: Tensor, right: Float[Tensor, "9 r p k"]
-) -> Float[Tensor, "9 r p k"]:
-    """Solve ``(H + damping c I) x = right`` for x orthogonal to ``e1 e0^T`` by Gauss-Jordan elimination.
-
-    The constraint has a row and a column of its own; H is positive semidefinite, so that no pivoting is needed.
-    Along F, to which the residual is blind, H is given the curvature c.
-    """
-    normal = (e1[:, None] * e0).flatten(0, 1)
-    curvature = H.diagonal(dim1=0, dim2=1).amax(-1)
-    Q = H.new_zeros(10, 10 + right.shape[1], *F.shape[1:])
-    torch.add(H, (curvature * F)[:, None] * F, out=Q[:9, :9])
-    Q[:9, :9].diagonal(dim1=0, dim2=1).add_((curvature * damping)[..., None])
-    Q[:9, 9] = Q[9, :9] = normal
-    Q[:9, 10:] = right
-    for i in range(10):
-        column, rest = Q.tensor_split((1,), 1)
-        row = rest[i] / column[i]
-        Q = torch.addcmul(rest, column, row, value=-1)
-        Q[i] = row
-    return Q[:9]
-
-
-def retract(F: Tensor, step: Tensor, e0: Tensor, e1: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The rank-2 matrix of unit norm ``F + step + alpha e1 e0^T``, and its epipoles."""
-    G = F + step
-    C = cofactors(G)
-    determinant = total(C[:3] * G[:3])
-    normal = (e1[:, None] * e0[None]).flatten(0, 1)
-    G = unit(G - determinant / total(C * normal) * normal)
-    C = square(cofactors(G))  # a multiple of e1 e0^T
-    return G, unit(total(C * e1[:, None])), unit(total(C * e0, 1))
-
-
-def start(F: Float[Tensor, "9 p k"]) -> tuple[Tensor, Tensor, Tensor]:
-    """A rank-2 matrix of unit norm close to F and its epipoles: ``F (I - e0 e0^T)``.
-
-    e0 is the right singular vector of the smallest singular value, by five squarings of the matrix whose dominant
-    eigenvector it is; to rounding where the last two singular values differ by half, and F has rank 2 in any case.
-    """
-    F = unit(F)
-    C = square(cofactors(F))
-    K = total(C[:, :, None] * C[:, None])  # C^T C
-    for _ in range(5):
-        K = K / K.abs().amax((0, 1))
-        K = total(K[:, :, None] * K[:, None])
-    size = total(K * K, 1)
-    column = size.argmax(0)
-    e0 = unit(K.gather(0, column.expand(1, 3, *column.shape))[0])
-    M = square(F)
-    G = unit((M - total(M * e0, 1)[:, None] * e0).flatten(0, 1))
-    return G, e0, unit(total(square(cofactors(G)) * e0, 1))
-
-
-def cofactors(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "9 p k"]:
-    """The matrix of cofactors: ``det(F) F^-T`` where F is regular."""
-    rows = square(F)
-    crossed: Tensor = torch.linalg.cross(rows.roll(-1, 0), rows.roll(-2, 0), dim=1)
-    return crossed.flatten(0, 1)
-
-
-def square(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "3 3 p k"]:
-    """The components as rows and columns."""
-    return F.reshape(3, 3, *F.shape[1:])
-
-
-def total(x: Tensor, dim: int = 0) -> Tensor:
-    """The sum over a short axis, in order: for few numbers this takes half as long as a tree."""
-    first, *rest = x.unbind(dim)
-    for part in rest:
-        first = first + part
-    return first
-
-
-def unit(x: Float[Tensor, "c p k"]) -> Float[Tensor, "c p k"]:
-    """Scaled to unit norm over the components; NaN where that is not possible."""
-    norm: Tensor = total(x * x).sqrt()
-    return x / norm

@@ -12,9 +12,10 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.geometry.curves import curve_order, rotated
 from fmtorch.types import Correspondences
 
 WINDOW = 8  # neighbours before and after each match along each curve
@@ -22,7 +23,6 @@ CURVES = ((0.0, 0.0), (0.5, math.pi / 4))  # shift of the grid (in thirds of the
 TOLERANCE = 0.25  # relative prediction error at which agreement falls to about 1/e
 NOISE = 4.0  # px, keeps close neighbours from being judged by their localisation noise
 WORST_RATIO, LEAST_VOTE = 0.85, 0.02  # a neighbour votes with WORST_RATIO - ratio, at least LEAST_VOTE
-_CURVE_BITS = 15
 
 
 def frame_agreement(
@@ -48,7 +48,7 @@ def frame_agreement(
     agreement, votes = torch.zeros_like(rows[0]), torch.zeros_like(rows[0])
     for points in (rows[0:2], rows[2:4]):
         for shift, angle in CURVES:
-            order = _curve_order(points, sound, shift, angle)
+            order = curve_order(rotated(points.detach(), angle), sound, shift)
             along = rows.gather(2, order.expand(len(rows), -1, -1))
             agreeing, voting = _along_curve(along)
             agreement = agreement.scatter_add(1, order, agreeing)
@@ -64,27 +64,6 @@ def _frame_map(lafs0: Float[Tensor, "b n 2 3"], lafs1: Float[Tensor, "b n 2 3"])
     A1 = lafs1[..., :2]
     product = (A1[..., :, :, None] * inverse[..., None, :, :]).sum(-2)
     return product / determinant[..., None, None]
-
-
-def _curve_order(
-    points: Float[Tensor, "2 b n"], mask: Bool[Tensor, "b n"], shift: float, angle: float
-) -> Int[Tensor, "b n"]:
-    """The order of the live points along a Morton curve over a shifted, rotated grid; the others last."""
-    x, y = points.detach()
-    turned = torch.stack([math.cos(angle) * x - math.sin(angle) * y, math.sin(angle) * x + math.cos(angle) * y])
-    low = torch.where(mask, turned, torch.inf).amin(-1, keepdim=True)
-    extent = (torch.where(mask, turned, -torch.inf).amax(-1, keepdim=True) - low).amax(0).clamp_min(1e-6)
-    cell = (torch.where(mask, (turned - low) / extent, 0) * 2 + shift) / 3 * ((1 << _CURVE_BITS) - 1)
-    code = _spread(cell[0].to(torch.int64)) | (_spread(cell[1].to(torch.int64)) << 1)
-    code = torch.where(mask, code, 1 << (2 * _CURVE_BITS + 1))
-    return torch.argsort(code, dim=-1, stable=True)
-
-
-def _spread(v: Int[Tensor, "b n"]) -> Int[Tensor, "b n"]:
-    """The bits of a 16-bit number moved to the even positions."""
-    for step, pattern in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
-        v = (v | (v << step)) & pattern
-    return v
 
 
 def _along_curve(rows: Float[Tensor, "10 b n"]) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n"]]:

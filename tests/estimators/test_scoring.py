@@ -9,11 +9,19 @@ from scipy import integrate
 
 from fmtorch.estimators import scoring
 from fmtorch.estimators.problem import problems
-from fmtorch.estimators.scoring import InlierCount, Median, SigmaConsensus, TruncatedSquares, score_models
+from fmtorch.estimators.scoring import GemanMcClure, InlierCount, Median, SigmaConsensus, TruncatedSquares, score_models
 from tests.laws import scene
 from tests.reference import ransac as reference
 
-SCORES = [InlierCount(2.0), TruncatedSquares(2.0), TruncatedSquares(2.0, prior_weighted=True), Median()]
+SCORES = [
+    InlierCount(2.0),
+    TruncatedSquares(2.0),
+    TruncatedSquares(2.0, prior_weighted=True),
+    GemanMcClure(2.0),
+    GemanMcClure(2.0, prior_weighted=True),
+    Median(),
+]
+NAMES = ["count", "msac", "prior_msac", "geman_mcclure", "prior_geman_mcclure", "median"]
 
 
 def _models(problem: object, count: int = 40) -> torch.Tensor:
@@ -22,7 +30,7 @@ def _models(problem: object, count: int = 40) -> torch.Tensor:
     )
 
 
-@pytest.mark.parametrize("score", SCORES, ids=["count", "msac", "prior_msac", "median"])
+@pytest.mark.parametrize("score", SCORES, ids=NAMES)
 def test_scores_equal_their_definitions(score: scoring.Score) -> None:
     problem = problems(scene(0, 60), 0, 8)[0][0]
     F = _models(problem)
@@ -39,13 +47,17 @@ def test_scores_equal_their_definitions(score: scoring.Score) -> None:
         elif isinstance(score, Median):
             # float32: relative error of a residual about 1e-7 times the cancellation in x1^T F x0
             np.testing.assert_allclose(-batched[m], reference.lower_median(residual**2), rtol=1e-3, atol=1e-12)
+        elif isinstance(score, GemanMcClure):
+            weights = prior if score.prior_weighted else None
+            expected = reference.geman_mcclure(pixels, 2.0, GemanMcClure.REACH, weights)
+            assert abs(batched[m] - expected) <= 60 * 2.0**-11 + 1e-3
         else:
             expected = reference.msac(pixels, 2.0, prior if score.prior_weighted else None)
             # each of up to 60 gains is rounded to a multiple of 2^-10
             assert abs(batched[m] - expected) <= 60 * 2.0**-11 + 1e-3
 
 
-@pytest.mark.parametrize("score", SCORES, ids=["count", "msac", "prior_msac", "median"])
+@pytest.mark.parametrize("score", SCORES, ids=NAMES)
 @pytest.mark.parametrize("tile", [1, 200, 5000, 1 << 20])
 def test_tiles_change_no_score(score: scoring.Score, tile: int, monkeypatch: pytest.MonkeyPatch) -> None:
     problem = problems(scene(0, 300), 0, 8)[0][0]

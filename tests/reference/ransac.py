@@ -20,6 +20,14 @@ def msac(residuals: np.ndarray, threshold: float, prior: np.ndarray | None = Non
     return sum(w * (1 - (r / threshold) ** 2) for r, w in zip(residuals, weights, strict=True) if r < threshold)
 
 
+def geman_mcclure(residuals: np.ndarray, scale: float, reach: float, prior: np.ndarray | None = None) -> float:
+    """Sum of (1 / (1 + r^2 / s^2) - e) / (1 - e) over the matches within `reach` scales, e the value there."""
+    weights = np.ones(len(residuals)) if prior is None else prior
+    end = 1 / (1 + reach**2)
+    inside = [(r, w) for r, w in zip(residuals, weights, strict=True) if r < reach * scale]
+    return sum(w * (1 / (1 + (r / scale) ** 2) - end) / (1 - end) for r, w in inside)
+
+
 def lower_median(values: np.ndarray) -> float:
     """The lower of the middle values."""
     return sorted(values)[(len(values) + 1) // 2 - 1]

@@ -1,0 +1,105 @@
+"""Local optimisation: good models made better from their inliers before one of them is chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from fmtorch import random
+from fmtorch.estimators.problem import Problem
+from fmtorch.estimators.scoring import CPU_TILE, GPU_TILE, Score, sampson_squared, score_models
+from fmtorch.estimators.spatial import gaussian_kernel, neighbor_graph, spatially_coherent_inliers
+from fmtorch.geometry import eight_point
+from fmtorch.random import Stream
+
+FIRST_DRAW = 1 << 32  # of the samples drawn here: beyond those of any search, so that they are others
+
+
+@runtime_checkable
+class LocalOptimization(Protocol):
+    """Improves a small pool of models; none comes back with a lower score than it had."""
+
+    def __call__(self, F: Float[Tensor, "9 p k"], problem: Problem) -> Float[Tensor, "9 p k"]:
+        """The improved models, float64; without gradients."""
+        ...
+
+
+class GraphCut:
+    """The local optimisation of Graph-Cut RANSAC (Barath & Matas, CVPR 2018, algorithm 2).
+
+    Label the matches with spatial coherence, fit the 8-point algorithm to samples of the inliers and to all of them,
+    take the fit of the highest score, and again while the score rises. The samples hold seven times as many matches as
+    a minimal one, as in the paper, here drawn with replacement.
+    threshold: epsilon of the labelling, Sampson distance, px. score: what is improved.
+    """
+
+    COHERENCE = 0.1  # lambda; as the radius and the size of samples in section 4 of the paper
+    RADIUS = 20.0  # px, of the ball of neighbours in (x0, y0, x1, y1)
+    SAMPLE_SIZE = 49
+    SAMPLES = 20  # in each iteration
+    ITERATIONS = 3  # at most
+
+    def __init__(self, threshold: float, score: Score) -> None:
+        self.threshold, self.score = threshold, score
+
+    def __call__(self, F: Float[Tensor, "9 p k"], problem: Problem) -> Float[Tensor, "9 p k"]:
+        """As `LocalOptimization`; in tiles of pairs that bound the memory."""
+        limit = GPU_TILE if F.is_cuda else CPU_TILE
+        pairs = max(1, limit // (F.shape[2] * problem.live.shape[1]))
+        with torch.no_grad():
+            tiles = torch.split(torch.arange(F.shape[1], device=F.device), pairs)
+            return torch.cat([self._improved(F[:, tile], problem[tile]) for tile in tiles], 1)
+
+    def _improved(self, F: Float[Tensor, "9 p k"], problem: Problem) -> Float[Tensor, "9 p k"]:
+        graph = neighbor_graph(problem, self.RADIUS)
+        points = problem.points.to(torch.float32)
+        scale = (problem.unit / self.threshold).square()[:, None, None]
+        score = score_models(self.score, F.to(torch.float32), problem, points)
+        rising = torch.ones_like(score, dtype=torch.bool)
+        for i in range(self.ITERATIONS):
+            kernel = gaussian_kernel(sampson_squared(F, problem.points) * scale)
+            labels = spatially_coherent_inliers(kernel, problem.live, graph, self.COHERENCE)
+            fits, valid = self._fits(labels, problem, i)
+            fit_score = score_models(self.score, fits.flatten(2).to(torch.float32), problem, points)
+            best, which = first_maximum(fit_score.reshape(valid.shape).masked_fill(~valid, -torch.inf))
+            rising = rising & (best > score)
+            if not bool(rising.any()):
+                break
+            fit = fits.gather(3, which.expand(9, -1, -1, -1))[..., 0]
+            F, score = torch.where(rising, fit, F), torch.where(rising, best, score)
+        return F
+
+    def _fits(
+        self, labels: Bool[Tensor, "p k n"], problem: Problem, iteration: int
+    ) -> tuple[Float[Tensor, "9 p k m"], Bool[Tensor, "p k m"]]:
+        """Fits to all inliers of each model and to samples of them, and which are determined."""
+        k, n = labels.shape[1:]
+        everything = problem.points[:, :, None].expand(-1, -1, k, -1)
+        whole, whole_valid = _eight_point(everything, labels.to(torch.float64))
+        table = labels.to(torch.int64).cumsum(-1)
+        first = FIRST_DRAW + iteration * self.SAMPLES
+        bits = random.bits(problem.seed, problem.key, Stream.SAMPLING, first, self.SAMPLES, self.SAMPLE_SIZE)
+        position = ((bits.flatten(1)[:, None] >> 31) * table[..., -1:]) >> 32
+        index = torch.searchsorted(table, position, right=True).clamp_max_(n - 1)
+        sample = everything.gather(3, index.expand(4, -1, -1, -1))
+        some, some_valid = _eight_point(sample.reshape(*sample.shape[:3], self.SAMPLES, self.SAMPLE_SIZE))
+        return torch.cat([whole[..., None], some], 3), torch.cat([whole_valid[..., None], some_valid], 2)
+
+
+def first_maximum(x: Float[Tensor, "p k m"]) -> tuple[Float[Tensor, "p k"], Int[Tensor, "p k 1"]]:
+    """The maximum over the last axis and the first place where it stands, on any device."""
+    top, order = torch.sort(x, dim=-1, descending=True, stable=True)
+    return top[..., 0], order[..., :1]
+
+
+def _eight_point(points: Tensor, weight: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """The normalised 8-point algorithm, from points (4, *sets, n) to F (9, *sets) and whether it is determined."""
+    F, valid = eight_point(points[:2].movedim(0, -1), points[2:].movedim(0, -1), weight)
+    return F.flatten(-2).movedim(-1, 0), valid
+
+
+LOCAL_OPTIMIZATIONS: dict[str, Callable[[float, Score], LocalOptimization]] = {"graph_cut": GraphCut}

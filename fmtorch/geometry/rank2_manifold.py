@@ -1,0 +1,109 @@
+"""The manifold of 3 x 3 matrices of rank 2 and unit norm: a start on it, steps in its tangent space, the way back.
+
+The tangent space at F is what is orthogonal, in R^9, to F (scale) and to ``e1 e0^T`` (rank), with ``F e0 = 0`` and
+``F^T e1 = 0`` the epipoles. This is the orthonormal parametrisation of Bartoli & Sturm (2004) to first order, without
+its rotations, and without its defect where the singular values coincide.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+RANK_TWO, RANK_TWO_EPIPOLE = (0.5**0.5, 0.0, 0.0, 0.0, 0.5**0.5, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+
+
+def solve(
+    products: Float[Tensor, "10 10 p k"], F: Tensor, e0: Tensor, e1: Tensor, damping: Tensor
+) -> Float[Tensor, "9 p k"]:
+    """The damped Gauss-Newton step in the tangent space: the least ``s^T (H + damping c I) s / 2 + s^T gradient``.
+
+    c is the greatest diagonal entry of H.
+    """
+    return constrained_solve(products[:9, :9], F, e0, e1, damping, -products[:9, 9:])[:, 0]
+
+
+def constrained_solve(
+    H: Float[Tensor, "9 9 p k"], F: Tensor, e0: Tensor, e1: Tensor, damping: Tensor, right: Float[Tensor, "9 r p k"]
+) -> Float[Tensor, "9 r p k"]:
+    """Solve ``(H + damping c I) x = right`` for x orthogonal to ``e1 e0^T`` by Gauss-Jordan elimination.
+
+    The constraint has a row and a column of its own; H is positive semidefinite, so that no pivoting is needed.
+    Along F, to which the residual is blind, H is given the curvature c.
+    """
+    normal = (e1[:, None] * e0).flatten(0, 1)
+    curvature = H.diagonal(dim1=0, dim2=1).amax(-1)
+    Q = H.new_zeros(10, 10 + right.shape[1], *F.shape[1:])
+    torch.add(H, (curvature * F)[:, None] * F, out=Q[:9, :9])
+    Q[:9, :9].diagonal(dim1=0, dim2=1).add_((curvature * damping)[..., None])
+    Q[:9, 9] = Q[9, :9] = normal
+    Q[:9, 10:] = right
+    for i in range(10):
+        column, rest = Q.tensor_split((1,), 1)
+        row = rest[i] / column[i]
+        Q = torch.addcmul(rest, column, row, value=-1)
+        Q[i] = row
+    return Q[:9]
+
+
+def retract(F: Tensor, step: Tensor, e0: Tensor, e1: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The rank-2 matrix of unit norm ``F + step + alpha e1 e0^T``, and its epipoles."""
+    G = F + step
+    C = cofactors(G)
+    determinant = total(C[:3] * G[:3])
+    normal = (e1[:, None] * e0[None]).flatten(0, 1)
+    G = unit(G - determinant / total(C * normal) * normal)
+    C = square(cofactors(G))  # a multiple of e1 e0^T
+    return G, unit(total(C * e1[:, None])), unit(total(C * e0, 1))
+
+
+def start(F: Float[Tensor, "9 p k"]) -> tuple[Tensor, Tensor, Tensor]:
+    """A rank-2 matrix of unit norm close to F and its epipoles: ``F (I - e0 e0^T)``.
+
+    e0 is the right singular vector of the smallest singular value, by five squarings of the matrix whose dominant
+    eigenvector it is; to rounding where the last two singular values differ by half, and F has rank 2 in any case.
+    """
+    F = unit(F)
+    C = square(cofactors(F))
+    K = total(C[:, :, None] * C[:, None])  # C^T C
+    for _ in range(5):
+        K = K / K.abs().amax((0, 1))
+        K = total(K[:, :, None] * K[:, None])
+    size = total(K * K, 1)
+    column = size.argmax(0)
+    e0 = unit(K.gather(0, column.expand(1, 3, *column.shape))[0])
+    M = square(F)
+    G = unit((M - total(M * e0, 1)[:, None] * e0).flatten(0, 1))
+    return G, e0, unit(total(square(cofactors(G)) * e0, 1))
+
+
+def cofactors(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "9 p k"]:
+    """The matrix of cofactors: ``det(F) F^-T`` where F is regular."""
+    rows = square(F)
+    crossed: Tensor = torch.linalg.cross(rows.roll(-1, 0), rows.roll(-2, 0), dim=1)
+    return crossed.flatten(0, 1)
+
+
+def square(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "3 3 p k"]:
+    """The components as rows and columns."""
+    return F.reshape(3, 3, *F.shape[1:])
+
+
+def total(x: Tensor, dim: int = 0) -> Tensor:
+    """The sum over a short axis, in order: for few numbers this takes half as long as a tree."""
+    first, *rest = x.unbind(dim)
+    for part in rest:
+        first = first + part
+    return first
+
+
+def unit(x: Float[Tensor, "c p k"]) -> Float[Tensor, "c p k"]:
+    """Scaled to unit norm over the components; NaN where that is not possible."""
+    norm: Tensor = total(x * x).sqrt()
+    return x / norm
+
+
+def constant(like: Tensor, components: tuple[float, ...]) -> Tensor:
+    """Fixed components, to broadcast against models (c, p, k)."""
+    return like.new_tensor(components)[:, None, None]

@@ -1,0 +1,141 @@
+"""`python -m fmtorch.match image0=a.jpg image1=b.jpg`: the fundamental matrix of two photographs, with pictures.
+
+`fmtorch.match` is the function of `fmtorch.photographs`, also for whoever imports this file.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any, cast
+
+import cv2
+import hydra
+import numpy as np
+import torch
+from hydra.core.hydra_config import HydraConfig
+from numpy.typing import NDArray
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+from rich.table import Table
+
+from fmtorch import __version__, presets
+from fmtorch.command import console, exits_with_message
+from fmtorch.data import read_image
+from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_matches
+from fmtorch.metrics import nsgd
+from fmtorch.photographs import Image, MatchResult, match
+from fmtorch.resources import conf_dir
+from fmtorch.storage.files import replacing
+
+
+def run(config: DictConfig, pipeline_name: str) -> Path:
+    """Match the two photographs of a composed config and return the folder with the results."""
+    paths = [_path(config, name) for name in ("image0", "image1")]
+    truth = None if config.truth is None else read_matrix(Path(str(config.truth)))
+    pipeline = presets.build_pipeline(config, presets.resolve_device(config.device))
+    image0, image1 = (read_image(path, orient=config.orient) for path in paths)
+    result = match(image0, image1, pipeline=pipeline, longest_side=config.longest_side, seed=config.seed)
+    report = {
+        "version": __version__, "pipeline": pipeline_name, "seed": config.seed,
+        "image0": str(paths[0]), "image1": str(paths[1]),
+        **_report(result, image0, image1, truth),
+    }  # fmt: skip
+    folder = Path(config.output or f"matches/{paths[0].stem}-{paths[1].stem}")
+    folder.mkdir(parents=True, exist_ok=True)
+    with replacing(folder / "result.json") as path:
+        path.write_text(json.dumps(report) + "\n")
+    written = ["result.json", *_draw(folder, result, image0, image1, truth)]
+    console.print(_table(result, f"{pipeline_name}: {paths[0].name}, {paths[1].name}"))
+    if "nsgd" in report:
+        console.print(f"NSGD to the true F: {report['nsgd']:.4f}", highlight=False)
+    for trouble in filter(None, (f"no F: {result.reason}" if result.reason else "", result.warning)):
+        Console(stderr=True).print(f"[bold]{trouble}[/bold]", highlight=False)
+    console.print(f"[dim]{folder}: {', '.join(written)}[/dim]", highlight=False)
+    return folder
+
+
+def read_matrix(path: Path) -> NDArray[np.float64]:
+    """The 3 x 3 matrix of a text file of nine numbers, row by row, apart by spaces, commas or new lines.
+
+    Raises ValueError for a file of anything else.
+    """
+    words = path.read_text().replace(",", " ").split()
+    try:
+        numbers = np.array([float(word) for word in words])
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}; it must hold nine numbers, F row by row") from error
+    if numbers.shape != (9,) or not np.isfinite(numbers).all() or not numbers.any():
+        raise ValueError(f"{path}: holds {len(words)} numbers; it must hold nine finite ones, F row by row")
+    return numbers.reshape(3, 3)
+
+
+def _path(config: DictConfig, name: str) -> Path:
+    if OmegaConf.is_missing(config, name) or config[name] is None:
+        raise ValueError(f"{name} is missing; give two image files: image0=a.jpg image1=b.jpg")
+    return Path(str(config[name]))
+
+
+def _report(result: MatchResult, image0: Image, image1: Image, truth: NDArray[np.float64] | None) -> dict[str, Any]:
+    """What result.json holds of a result; points in pixels of the images."""
+    c = result.correspondences
+    report: dict[str, Any] = {
+        "size0": image0.shape[:2], "size1": image1.shape[:2],
+        "F": result.F.tolist() if result.ok else None, "reason": result.reason, "warning": result.warning,
+        "features": [len(result.keypoints0), len(result.keypoints1)],
+        "matches": result.counts, "seconds": result.seconds,
+        "x0": c.x0[0].tolist(), "x1": c.x1[0].tolist(), "inliers": result.inliers.tolist(),
+        "ratio": None if c.quality is None else c.quality[0].tolist(),
+    }  # fmt: skip
+    if truth is not None and result.ok:
+        sizes = (torch.tensor([image.shape[:2]]) for image in (image0, image1))
+        report["nsgd"] = float(nsgd(torch.from_numpy(truth)[None], result.F.cpu()[None], *sizes)[0])
+    return report
+
+
+def _draw(
+    folder: Path, result: MatchResult, image0: Image, image1: Image, truth: NDArray[np.float64] | None
+) -> list[str]:
+    """Draw the pictures into the folder; the names of those there are."""
+    x0, x1 = (x[0].cpu().numpy().astype(np.float64) for x in (result.putative.x0, result.putative.x1))
+    good = result.kept.cpu().numpy().copy()
+    if result.ok:
+        good[good] = result.inliers.cpu().numpy()
+    pictures = {"matches.png": draw_matches(image0, image1, x0, x1, good)}
+    F = result.F.cpu().numpy() if result.ok else truth
+    if F is not None:
+        dashed = truth if result.ok else None
+        pictures["epipolar.png"] = draw_epipolar_lines(image0, image1, x0[good], x1[good], F, truth=dashed)
+    for name, picture in pictures.items():
+        with replacing(folder / name) as path:
+            path.write_bytes(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
+    if "epipolar.png" not in pictures:  # of an earlier run
+        (folder / "epipolar.png").unlink(missing_ok=True)
+    return list(pictures)
+
+
+def _table(result: MatchResult, title: str) -> Table:
+    table = Table(title=title, title_justify="left")
+    table.add_column("step")
+    table.add_column("left", justify="right")
+    table.add_column("seconds", justify="right")
+    for step, seconds in result.seconds.items():
+        counts = [len(result.keypoints0), len(result.keypoints1)] if step == "features" else [result.counts[step]]
+        unit = {"features": "keypoints", "estimation": "inliers"}.get(step, "matches")
+        table.add_row(step, f"{' + '.join(f'{count:,}' for count in counts)} {unit}", f"{seconds:.3f}")
+    return table
+
+
+@hydra.main(version_base=None, config_path=str(conf_dir()), config_name="match")
+def main(config: DictConfig) -> None:
+    """The command."""
+    with exits_with_message():
+        run(config, str(HydraConfig.get().runtime.choices["pipeline"]))
+
+
+if __name__ == "__main__":
+    main()
+elif __name__ == "fmtorch.match":  # imported: a module may replace itself
+    sys.modules[__name__] = cast(ModuleType, match)

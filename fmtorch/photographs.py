@@ -1,0 +1,200 @@
+"""Two photographs of any size through a pipeline: their matches and fundamental matrix in their own pixels."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from fmtorch import presets
+from fmtorch.data.images import read_image
+from fmtorch.geometry.epipolar import unit_frobenius
+from fmtorch.pipeline import Pipeline
+from fmtorch.types import Correspondences, Estimate, Features
+
+Image = NDArray[np.uint8]
+STILL = 0.1  # px of the images as matched: a median motion below it is none
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MatchResult:
+    """The matches of two photographs and their fundamental matrix, ``x1^T F x0 = 0``, in pixels of the photographs.
+
+    keypoints0, keypoints1: all that were detected, (N0, 2) and (N1, 2).
+    putative: the matcher's matches, a batch of one. kept: which of them the pruners kept, (M,).
+    correspondences: the kept ones, a batch of one. inliers: which of those agree with F, (K,).
+    F: (3, 3) float64 of unit Frobenius norm; zero where there is none, and `reason` then says why.
+    warning: why F, though found, means little; mostly empty. counts: matches after each step, in order. seconds: of
+    each step.
+    """
+
+    keypoints0: Float[Tensor, "n0 2"]
+    keypoints1: Float[Tensor, "n1 2"]
+    putative: Correspondences
+    kept: Bool[Tensor, " m"]
+    correspondences: Correspondences
+    inliers: Bool[Tensor, " k"]
+    F: Float[Tensor, "3 3"]
+    reason: str = ""
+    warning: str = ""
+    counts: dict[str, int] = dataclasses.field(default_factory=dict)
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    @property
+    def ok(self) -> bool:
+        """Whether a fundamental matrix was found."""
+        return not self.reason
+
+
+def match(
+    image0: Path | str | Image,
+    image1: Path | str | Image,
+    *,
+    pipeline: str | Pipeline = "sift_gms",
+    device: torch.device | str | None = None,
+    longest_side: int = 1600,
+    seed: int = 0,
+) -> MatchResult:
+    """Match two photographs and estimate their fundamental matrix.
+
+    image0, image1: files, turned as their EXIF orientation says, or uint8 arrays, (H, W) or RGB (H, W, 3).
+    pipeline: a preset of conf/pipeline, or a `Pipeline` (``presets.pipeline("sift_gms", overrides=[...])``).
+    device: of a pipeline given by name; None: a GPU where there is one. longest_side: larger images are reduced to it
+    for matching, and thresholds are in pixels of the reduced images; the results are always in pixels of the originals.
+    seed: of sampling.
+
+    Raises ImageError for a file that is no sound image, ValueError for an array of another type or shape, an unknown
+    pipeline, or a device that is not there. Photographs that cannot be related are no error: `ok` is False.
+    """
+    if longest_side < 1:
+        raise ValueError(f"longest_side is {longest_side}; it must be at least 1 px")
+    if isinstance(pipeline, str):
+        pipeline = _pipeline(pipeline, str(presets.resolve_device("auto" if device is None else str(device))))
+    elif device is not None and torch.device(device) != pipeline.device:
+        raise ValueError(f"device={device}, but the pipeline was built for {pipeline.device}; leave one of them out")
+    images = [_image(image, name) for image, name in ((image0, "image0"), (image1, "image1"))]
+    clock = _Clock(pipeline.device)
+    reduced = [_reduced(image, longest_side) for image in images]
+    features = [pipeline.extractor(image).to(pipeline.device) for image, _ in reduced]
+    clock("features")
+    scales = [scale for _, scale in reduced]
+    sizes = [torch.tensor([image.shape[:2]], device=pipeline.device) for image in images]
+    found = _relate(pipeline, features[0], features[1], seed, clock)
+    return _restored(found, scales, sizes)
+
+
+@functools.lru_cache(maxsize=8)
+def _pipeline(name: str, device: str) -> Pipeline:
+    return presets.pipeline(name, device)
+
+
+def _image(image: Path | str | Image, name: str) -> Image:
+    if isinstance(image, Path | str):
+        return read_image(image, orient=True)
+    colour = image.ndim == 3 and image.shape[2] == 3
+    if image.dtype != np.uint8 or image.size == 0 or not (image.ndim == 2 or colour):
+        raise ValueError(f"{name} is {image.dtype} {image.shape}; it must be non-empty uint8, (H, W) or RGB (H, W, 3)")
+    return image
+
+
+def _reduced(image: Image, longest_side: int) -> tuple[Image, Float[Tensor, " xy"]]:
+    """The image with its longest side at most that long, and its scale in x and y (rounding makes them differ)."""
+    h, w = image.shape[:2]
+    scale = min(1.0, longest_side / max(h, w))
+    size = (max(1, round(w * scale)), max(1, round(h * scale)))
+    if size != (w, h):
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return image, torch.tensor([size[0] / w, size[1] / h], dtype=torch.float64)
+
+
+def _relate(pipeline: Pipeline, features0: Features, features1: Features, seed: int, clock: _Clock) -> MatchResult:
+    """Matching, pruning and estimation, in pixels of the images as they were described."""
+    ends = features0.keypoints, features1.keypoints
+    nothing = Correspondences(ends[0][None, :0], ends[1][None, :0], features0.valid[None, :0])
+    found = MatchResult(
+        *ends, nothing, nothing.mask[0], nothing, nothing.mask[0], ends[0].new_zeros(3, 3, dtype=torch.float64)
+    )
+    empty = [f"image{i}" for i in (0, 1) if len(ends[i]) == 0]
+    if empty:
+        reason = f"no keypoints in {' and '.join(empty)}: too small, or without texture"
+        return dataclasses.replace(found, reason=reason, seconds=clock.seconds)
+    putative = c = pipeline.matcher(features0, features1)
+    clock("matching")
+    counts = {"matching": int(c.count())}
+    slots = torch.arange(c.mask.shape[1], device=c.mask.device)
+    for name, pruner in pipeline.pruners.items():
+        c = pruner(c)
+        slots, c = slots[c.mask[0]], c.compact()
+        clock(name)
+        counts[name] = len(slots)
+    kept = torch.zeros_like(putative.mask[0]).index_fill(0, slots, True)
+    estimate: Estimate = pipeline.estimator(c, seed).detach()
+    clock("estimation")
+    inliers = estimate.inliers[0]
+    counts["estimation"] = int(inliers.sum())
+    return MatchResult(
+        *ends, putative, kept, c, inliers, estimate.F[0].to(torch.float64), estimate.reason[0], _still(c, inliers),
+        counts, clock.seconds,
+    )  # fmt: skip
+
+
+def _still(c: Correspondences, inliers: Tensor) -> str:
+    """A warning where the inliers, or without any all matches, do not move between the images."""
+    motion = (c.x1 - c.x0)[0].norm(dim=-1)
+    motion = motion[inliers] if inliers.any() else motion
+    if len(motion) == 0 or motion.median() > STILL:
+        return ""
+    return "the images show no motion, as if they were one: infinitely many F agree with all matches"
+
+
+def _restored(found: MatchResult, scales: list[Tensor], sizes: list[Tensor]) -> MatchResult:
+    """The result in pixels of the original images of these sizes, whose reduction had these scales."""
+    # (0, 0) is the centre of the first pixel, so x_reduced + 1/2 = s (x + 1/2).
+    to_reduced = [
+        torch.tensor([[s[0], 0, (s[0] - 1) / 2], [0, s[1], (s[1] - 1) / 2], [0, 0, 1]], dtype=torch.float64)
+        for s in scales
+    ]
+    A0, A1 = (A.to(found.F) for A in to_reduced)
+    s0, s1 = (s.to(found.keypoints0) for s in scales)
+
+    def points(x: Tensor, s: Tensor) -> Tensor:
+        return x / s + (1 - s) / (2 * s)  # exactly x where nothing was reduced
+
+    def frames(lafs: Tensor | None, s: Tensor) -> Tensor | None:
+        return None if lafs is None else torch.cat([lafs[..., :2] / s[:, None], points(lafs[..., 2:].mT, s).mT], -1)
+
+    def matches(c: Correspondences) -> Correspondences:
+        return c.replace(
+            x0=points(c.x0, s0), x1=points(c.x1, s1), lafs0=frames(c.lafs0, s0), lafs1=frames(c.lafs1, s1),
+            size0=sizes[0], size1=sizes[1],
+        )  # fmt: skip
+
+    return dataclasses.replace(
+        found,
+        keypoints0=points(found.keypoints0, s0), keypoints1=points(found.keypoints1, s1),
+        putative=matches(found.putative), correspondences=matches(found.correspondences),
+        F=unit_frobenius(A1.T @ found.F @ A0),
+    )  # fmt: skip
+
+
+class _Clock:
+    """The seconds between its calls."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._device, self._last = device, time.perf_counter()
+        self.seconds: dict[str, float] = {}
+
+    def __call__(self, step: str) -> None:
+        """The time since the last call was spent on `step`."""
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+        now = time.perf_counter()
+        self.seconds[step], self._last = now - self._last, now

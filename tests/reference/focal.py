@@ -1,0 +1,95 @@
+"""The maximum a posteriori over pose and two focal lengths, one candidate at a time, by SciPy.
+
+Parameters: a rotation vector, the direction of the translation and two log focal lengths; with ``K = [f 0 cx; 0 f cy;
+0 0 1]`` the model is ``F = K1^-T [t]x R K0^-1``. Minimises
+``sum P min(r^2, t^2) / (2 sigma^2) + ((ln f0 - ln f1) / s1)^2 / 2 + ((mean ln f - ln usual) / s2)^2 / 2``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from tests.reference.refine import sampson
+
+
+def cross_matrix(t: np.ndarray) -> np.ndarray:
+    """``[t]x``."""
+    return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+
+
+def calibration(focal: float, size: tuple[int, int]) -> np.ndarray:
+    """K of a camera with square pixels and central principal point; focal in units of the longer side, size (h, w)."""
+    h, w = size
+    f = focal * max(h, w)
+    return np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1]])
+
+
+def fundamental(parameters: np.ndarray, size0: tuple[int, int], size1: tuple[int, int]) -> np.ndarray:
+    """F of rotation vector (3), translation (3), log focal lengths (2)."""
+    R = Rotation.from_rotvec(parameters[:3]).as_matrix()
+    K0, K1 = calibration(np.exp(parameters[6]), size0), calibration(np.exp(parameters[7]), size1)
+    return np.linalg.inv(K1).T @ cross_matrix(parameters[3:6]) @ R @ np.linalg.inv(K0)
+
+
+def parameters_of(F: np.ndarray, size0: tuple[int, int], size1: tuple[int, int]) -> np.ndarray:
+    """Parameters whose model is F: focal lengths by Bougnoux's formula (ICCV 1998), one of E's four poses."""
+    C0, C1 = (calibration(1 / max(size), size) for size in (size0, size1))  # f of one pixel
+    G = C1.T @ F @ C0
+    p, D = np.array([0, 0, 1.0]), np.diag([1.0, 1, 0])
+
+    def squared(G: np.ndarray) -> float:
+        e = cross_matrix(np.linalg.svd(G.T)[2][2])  # of the epipole in the second image
+        return float(-(p @ e @ D @ G @ p) * (p @ G.T @ p) / (p @ e @ D @ G @ D @ G.T @ p))
+
+    f0, f1 = np.sqrt(squared(G)) / max(size0), np.sqrt(squared(G.T)) / max(size1)
+    E = calibration(f1, size1).T @ F @ calibration(f0, size0)
+    U, _, Vt = np.linalg.svd(E)
+    R = U @ np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]) @ Vt
+    R = R * np.sign(np.linalg.det(R))
+    return np.concatenate([Rotation.from_matrix(R).as_rotvec(), U[:, 2], np.log([f0, f1])])
+
+
+def prior_cost(log_f0: float, log_f1: float) -> float:
+    """What the two focal lengths cost."""
+    return ((log_f0 - log_f1) / 0.3) ** 2 / 2 + (((log_f0 + log_f1) / 2 - np.log(1.2)) / 0.4) ** 2 / 2
+
+
+def cost(
+    F: np.ndarray, focal: np.ndarray, x0: np.ndarray, x1: np.ndarray, weight: np.ndarray, threshold: float
+) -> float:
+    """The objective at F with log focal lengths `focal`."""
+    r2 = sampson(F, x0, x1) ** 2
+    return float((weight * np.minimum(r2, threshold**2)).sum() / (2 * 0.3**2)) + prior_cost(*focal)
+
+
+def optimum(
+    start: np.ndarray,
+    x0: np.ndarray,
+    x1: np.ndarray,
+    weight: np.ndarray,
+    threshold: float,
+    size0: tuple[int, int],
+    size1: tuple[int, int],
+) -> tuple[np.ndarray, float]:
+    """The parameters of least cost near `start`, and that cost.
+
+    Truncation by reweighting: least squares on the matches within the threshold, until these stay the same.
+    """
+    parameters = start
+    for _ in range(20):
+        inside = sampson(fundamental(parameters, size0, size1), x0, x1) ** 2 <= threshold**2
+
+        def residuals(p: np.ndarray, inside: np.ndarray = inside) -> np.ndarray:
+            r = sampson(fundamental(p, size0, size1), x0, x1)
+            data = np.sqrt(weight[inside]) * r[inside] / 0.3
+            focal = [(p[6] - p[7]) / 0.3, ((p[6] + p[7]) / 2 - np.log(1.2)) / 0.4]
+            gauge = [np.linalg.norm(p[3:6]) - 1]
+            return np.concatenate([data, focal, gauge])
+
+        parameters = least_squares(residuals, parameters, xtol=1e-15, ftol=1e-15, gtol=1e-12).x
+        F = fundamental(parameters, size0, size1)
+        if np.array_equal(inside, sampson(F, x0, x1) ** 2 <= threshold**2):
+            break
+    return parameters, cost(F, parameters[6:], x0, x1, weight, threshold)
