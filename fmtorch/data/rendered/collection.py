@@ -44,7 +44,7 @@ def _landmark(surfaces: Surfaces, rng: Rng, split: str) -> float:
         foot = vec(x, 0, 0) + (end if along < 0 else 0)
         front(surfaces, rng, split, foot, vec(0, along, 0), 14, height, Style(density=36, depth=0.3))
     portico = rng.uniform(8, 12)
-    tall, out = min(height - 1.5, rng.uniform(6, 8)), rng.uniform(2.2, 3.5)
+    tall, out = min(height - 1.5, rng.uniform(6, 8)), rng.uniform(1.6, 2.8)
     for i in range(4):
         inset = 0.35 * i
         base = vec(-portico / 2 - 1.4 + inset, -out - 1.4 + inset, 0.16 * i)
@@ -135,11 +135,11 @@ def scene(rng: Rng, split: str, shots: int, scale: Real) -> Scene:
         at = vec(rng.normal(0, 0.14 * width), 0, rng.uniform(3.0, 5.5))
         camera = look_at(K, size, eye.tolist(), at.tolist(), roll=float(rng.normal(0, 0.025)))
         lens = Lens(
-            blur=rng.uniform(0.4, 0.9), exposure=rng.uniform(0.75, 1.4), contrast=rng.uniform(0.8, 1.3),
-            gamma=rng.uniform(0.75, 1.3), noise=rng.uniform(1, 4), vignette=rng.uniform(0, 0.25),
+            blur=rng.uniform(0.5, 1.2), exposure=rng.uniform(0.75, 1.4), contrast=rng.uniform(0.8, 1.3),
+            gamma=rng.uniform(0.75, 1.3), noise=rng.uniform(2, 7), vignette=rng.uniform(0, 0.25),
             balance=(rng.uniform(0.9, 1.12), 1.0, rng.uniform(0.88, 1.12)),
         )  # fmt: skip
-        taken.append(Shot(camera, lens, light=i % LIGHTS, jpeg=int(rng.integers(60, 96))))
+        taken.append(Shot(camera, lens, light=i % LIGHTS, jpeg=int(rng.integers(45, 92))))
         eyes.append(eye)
     pairs = [(i, j) for i in range(shots) for j in range(i + 1, shots)]
     return Scene(

@@ -27,7 +27,7 @@ from fmtorch.data.rendered.mipmap import Pixels
 from fmtorch.data.rendered.raycast import Geometry
 from fmtorch.data.rendered.scene import Scene, Shot
 
-VERSION = 2  # of the generator: raised by every change that changes a picture or a pair
+VERSION = 3  # of the generator: raised by every change that changes a picture or a pair
 FAMILIES = {"indoor": indoor.scene, "driving": driving.scene, "orbit": orbit.scene, "collection": collection.scene}
 SPLITS = ("test", "train")
 
