@@ -24,7 +24,7 @@ from fmtorch.command import console, exits_with_message, plain
 from fmtorch.data import PairDataset
 from fmtorch.evaluation.plots import plot_recall_curves
 from fmtorch.evaluation.run import evaluate_pairs, select
-from fmtorch.evaluation.summary import summarize, summary_markdown, summary_table
+from fmtorch.evaluation.summary import ALL, summarize, summary_markdown, summary_table
 from fmtorch.resources import conf_dir
 from fmtorch.storage import RunFolder, identity_digest
 
@@ -60,6 +60,11 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
     plot_recall_curves({pipeline_name: table}, folder.path / "recall.png")
     console.print(summary_table(summary, title=f"{pipeline_name} on {dataset.name}"))
     console.print(f"[dim]{folder.path}: pairs/, summary.json, summary.md, recall.png[/dim]")
+    if chosen and summary[ALL]["failures"] == len(chosen):
+        reason = next(iter(table["reason"].to_pylist()))
+        raise ValueError(
+            f"every pair failed, the first because: {reason}. Once that is mended, delete {folder.path} to run again"
+        )
     return folder.path
 
 

@@ -143,6 +143,15 @@ def test_what_cannot_be_run_is_told(root: Path, tmp_path: Path, damage: str, tol
     assert "Traceback" not in run.stderr
 
 
+def test_a_run_in_which_nothing_succeeds_is_told(root: Path, tmp_path: Path) -> None:
+    for image in (root / "scene" / "Images").iterdir():
+        image.write_bytes(b"no picture")
+    run = evaluate("dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"run_dir={tmp_path / 'run'}", cwd=tmp_path)
+    assert run.returncode == 1
+    assert "every pair failed" in run.stderr
+    assert len(rows(tmp_path / "run")) == 5
+
+
 def test_on_real_pairs(tmp_path: Path) -> None:
     root = shared_path("data/Strecha")
     run = evaluate("dataset=fmbench", f"dataset.root={root}", "limit=4", f"run_dir={tmp_path / 'run'}", cwd=tmp_path)

@@ -13,7 +13,7 @@ import torch
 
 from fmtorch import presets
 from fmtorch.data import ImagePair, ImageSource
-from fmtorch.pipeline import Outcome, Pipeline, _Memo
+from fmtorch.pipeline import Pipeline, _Memo
 from fmtorch.types import Correspondences, Estimate, Features
 
 
@@ -163,9 +163,3 @@ def test_memo_computes_once_among_threads_and_forgets_the_oldest() -> None:
     assert memo.get(1, lambda: 1) == 1
     assert memo.get(2, lambda: 2) == 2
     assert memo.get(0, lambda: 8) == 8  # 0 was forgotten
-
-
-def test_outcome_is_plain_data(pairs: list[ImagePair]) -> None:
-    outcome = Outcome(pairs[0])
-    assert outcome.features == (0, 0)
-    assert outcome.seconds == {}

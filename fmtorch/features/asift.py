@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.features.sift import SIFT, _as_grey, _strongest
+from fmtorch.features.sift import SIFT, as_grey, strongest
 from fmtorch.types import Features
 
 ROTATION_STEP = 72.0  # degrees, divided by the tilt; section 5.2 of the paper
@@ -40,13 +40,13 @@ class ASIFT(SIFT):
         leave the image are dropped, except in the view that is the image. Raises ValueError for another type, shape or
         an empty image.
         """
-        grey = _as_grey(image)
+        grey = as_grey(image)
         found = [super().__call__(grey)]
         for tilt, angle in simulated_views(self.tilts)[1:]:
             view, to_view = simulate_view(grey, tilt, angle)
             found.append(_mapped_back(super().__call__(view), to_view, grey.shape))
         scores = torch.cat([f.scores for f in found])
-        kept = torch.from_numpy(_strongest(scores.numpy(), self.max_features))
+        kept = torch.from_numpy(strongest(scores.numpy(), self.max_features))
         return Features(
             lafs=torch.cat([f.lafs for f in found])[kept],
             scores=scores[kept],

@@ -46,7 +46,7 @@ class SIFT:
         lafs: half side `FRAME_SIGMAS` sigma, kornia's angle (minus OpenCV's). scores: contrast. descriptors: (N, 128)
         float32, whole numbers from 0 to 255 unless `root`. Raises ValueError for another type, shape or an empty image.
         """
-        grey = _as_grey(image)
+        grey = as_grey(image)
         detector = cv2.SIFT.create(
             nfeatures=self.max_features,
             contrastThreshold=self.contrast_threshold,
@@ -57,7 +57,7 @@ class SIFT:
         keypoints, found = detector.detectAndCompute(grey, None)
         descriptors = np.zeros((0, 128), np.float32) if found is None else found
         scores = np.array([k.response for k in keypoints], np.float32)
-        kept = _strongest(scores, self.max_features)
+        kept = strongest(scores, self.max_features)
         features = torch.from_numpy(descriptors[kept])
         return Features(
             lafs=keypoints_to_lafs([keypoints[i] for i in kept]),
@@ -87,12 +87,13 @@ def root_sift(descriptors: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch
     return (descriptors / torch.where(total > 0, total, 1.0)).sqrt()
 
 
-def _strongest(scores: NDArray[np.float32], count: int) -> NDArray[np.int64]:
+def strongest(scores: NDArray[np.float32], count: int) -> NDArray[np.int64]:
     """Indices, in order, of the `count` highest scores: OpenCV keeps more where the last ones tie."""
     return np.sort(np.argsort(-scores, kind="stable")[:count])
 
 
-def _as_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def as_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A grey image of a grey or RGB one. Raises ValueError for another type, shape or an empty image."""
     if image.dtype != np.uint8 or image.size == 0 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
         raise ValueError(f"image is {image.dtype} {image.shape}; it must be a non-empty uint8 (H, W) or RGB (H, W, 3)")
     if image.ndim == 2:

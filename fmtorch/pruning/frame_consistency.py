@@ -39,7 +39,7 @@ def frame_agreement(
     with s the scale change of S; the agreement is the mean of ``(1 + (e / TOLERANCE)^2 / 8)^-8`` over the neighbours in
     both images, weighted by votes.
     """
-    S = _frame_map(lafs0, lafs1)
+    S = frame_map(lafs0, lafs1)
     vote = torch.ones_like(x0[..., 0]) if quality is None else (WORST_RATIO - quality).clamp_min(LEAST_VOTE)
     scale = (S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]).abs().sqrt()
     rows = torch.stack([*x0.unbind(-1), *x1.unbind(-1), *S.flatten(2).unbind(-1), scale, vote])
@@ -56,7 +56,7 @@ def frame_agreement(
     return torch.where(sound, agreement / votes.clamp_min(torch.finfo(votes.dtype).tiny), 0)
 
 
-def _frame_map(lafs0: Float[Tensor, "b n 2 3"], lafs1: Float[Tensor, "b n 2 3"]) -> Float[Tensor, "b n 2 2"]:
+def frame_map(lafs0: Float[Tensor, "b n 2 3"], lafs1: Float[Tensor, "b n 2 3"]) -> Float[Tensor, "b n 2 2"]:
     """The linear map from frame 0 to frame 1, ``A1 A0^-1``."""
     (a, b), (c, d) = (row.unbind(-1) for row in lafs0[..., :2].unbind(-2))
     determinant = a * d - b * c

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fmtorch.pruning.frame_consistency import _frame_map
+from fmtorch.pruning.frame_consistency import frame_map
 
 BLOCK = 4096  # matches whose basis functions exist at a time
 LARGEST_CHANGE = 100.0  # of a frame's size between images of a common scale: what is beyond is no match
@@ -48,7 +48,7 @@ def match_domain(
     if lafs0 is None or lafs1 is None:
         S = torch.eye(2, dtype=torch.float64, device=x0.device).expand(len(x0), 2, 2)
     else:
-        S = _frame_map(lafs0[None].double(), lafs1[None].double())[0] * (spread0 / spread1)
+        S = frame_map(lafs0[None].double(), lafs1[None].double())[0] * (spread0 / spread1)
     size = S.square().sum((1, 2)).sqrt().clamp_min(torch.finfo(torch.float32).tiny) / math.sqrt(2)
     entries = S / size[:, None, None]
     bounded = S * (size.clamp(1 / LARGEST_CHANGE, LARGEST_CHANGE) / size)[:, None, None]
