@@ -29,7 +29,8 @@ class Outcome:
 
     correspondences, estimate: batches of one; None where the pair failed before that stage.
     features: how many each image has. seconds: per stage; a batched stage is shared out evenly, and features count in
-    full for each pair that uses them, cached ones with the seconds they took when they were computed. reason: why the pair failed, empty where it did not.
+    full for each pair that uses them, cached ones with the seconds they took when they were computed.
+    reason: why the pair failed, empty where it did not.
     """
 
     pair: ImagePair

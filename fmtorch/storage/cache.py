@@ -68,7 +68,7 @@ class ArrayCache:
         with self._excused(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             with replacing(path) as temporary, temporary.open("wb") as file:
-                np.savez(file, **arrays)
+                np.savez(file, **arrays)  # type: ignore[arg-type]
             self._grown(sum(array.nbytes for array in arrays.values()))
 
     def files(self) -> Iterator[tuple[Path, os.stat_result]]:

@@ -39,18 +39,24 @@ def configuration(part: object) -> Any:
     if isinstance(part, torch.Tensor):
         values = part.detach().cpu().contiguous()
         return {"tensor": [str(part.dtype), list(part.shape), _digest(values.reshape(-1).view(torch.uint8).numpy())]}
-    kind = type(part)
-    named = {"class": f"{kind.__module__}.{kind.__qualname__}", "code": _code_digest(kind.__module__)}
+    return {**_options(part), **_class(type(part))}
+
+
+def _options(part: object) -> dict[str, Any]:
     if hasattr(part, "identity"):
-        return {**named, "identity": configuration(part.identity)}
+        return {"identity": configuration(part.identity)}
     if dataclasses.is_dataclass(part):
-        return {**named, **{f.name: configuration(getattr(part, f.name)) for f in dataclasses.fields(part) if f.compare}}
+        return {f.name: configuration(getattr(part, f.name)) for f in dataclasses.fields(part) if f.compare}
     if isinstance(part, torch.nn.Module):
-        return {**named, "network": repr(part), "weights": configuration(part.state_dict())}
+        return {"network": repr(part), "weights": configuration(part.state_dict())}
     raise TypeError(
-        f"{kind.__module__}.{kind.__qualname__} does not say what defines its results; "
+        f"{type(part).__module__}.{type(part).__qualname__} does not say what defines its results; "
         "make it a dataclass, or give it an attribute `identity` of plain values"
     )
+
+
+def _class(kind: type) -> dict[str, str]:
+    return {"class": f"{kind.__module__}.{kind.__qualname__}", "code": _code_digest(kind.__module__)}
 
 
 @functools.cache

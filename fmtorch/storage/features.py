@@ -18,7 +18,7 @@ from torch import Tensor
 
 from fmtorch.resources import cache_dir
 from fmtorch.stages import FeatureExtractor, TwoStepExtractor
-from fmtorch.storage.cache import ArrayCache, Arrays
+from fmtorch.storage.cache import ArrayCache
 from fmtorch.storage.configuration import configuration, environment
 from fmtorch.storage.runs import identity_digest
 from fmtorch.types import Features
@@ -31,7 +31,7 @@ class CachedFeatures:
 
     A `TwoStepExtractor` is kept in two files, frames under the digest of its `detection` alone; any other in one.
     Results are on the CPU. `timed` gives the seconds that the computation took when it was done, here or in another
-    run. found, computed: images so far that needed no computation, and that needed some. May be used by several threads.
+    run. found, computed: images so far that needed no computation, and that needed some. For any number of threads.
 
     Raises TypeError where the extractor does not say what defines it (see `configuration`).
     """
@@ -92,11 +92,13 @@ class CachedFeatures:
         tensors = {name: value.detach().cpu() for name, value in compute().items()}
         seconds = time.perf_counter() - start
         arrays = {name: _packed(value) for name, value in tensors.items()}
-        self.cache.write(section, digest, {**arrays, "seconds": np.float64(seconds)})
+        self.cache.write(section, digest, {**arrays, "seconds": np.array(seconds)})
         return _Step(tensors, seconds, computed=True)
 
 
-def cached(extractor: FeatureExtractor, cache: str | Path | bool | None, limit: float | None = None) -> FeatureExtractor:
+def cached(
+    extractor: FeatureExtractor, cache: str | Path | bool | None, limit: int | float | None = None
+) -> FeatureExtractor:
     """The extractor with a cache in the folder `cache`; None: the user's cache folder; "off" or False: as it is.
 
     limit: GB, see `ArrayCache`. An extractor that does not say what defines it stays as it is, with a warning.
