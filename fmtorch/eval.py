@@ -37,7 +37,7 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
     device = presets.resolve_device(config.device)
     with _progress() as progress:
         dataset = _load(config.dataset, progress)
-        stages = {group: plain(config[group]) for group in STAGE_GROUPS}
+        stages = {group: plain(config.get(group)) for group in STAGE_GROUPS}
         identity = {
             "pipeline": pipeline_name, **stages, "seed": config.seed, "version": __version__,
             "dataset": {**{k: v for k, v in plain(config.dataset).items() if k != "root"}, "digest": dataset.digest},

@@ -86,7 +86,7 @@ def resolve_device(name: str) -> torch.device:
 def build_pipeline(config: DictConfig, device: torch.device | str = "cpu") -> Pipeline:
     """The pipeline that features (with cache), matcher, pruner and estimator of a composed config describe."""
     extractor = cached(instantiate(config.features, "features"), config.cache, config.cache_limit)
-    pruners = {str(k): instantiate(v, f"pruner={k}") for k, v in (config.pruner or {}).items()}
+    pruners = {str(k): instantiate(v, f"pruner={k}") for k, v in (config.get("pruner") or {}).items()}
     return Pipeline(
         extractor,
         instantiate(config.matcher, "matcher"),

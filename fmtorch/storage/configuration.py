@@ -69,11 +69,11 @@ def environment() -> dict[str, str]:
 
 @functools.cache
 def _code_digest(module: str) -> str:
-    """The digest of a module's source and, where it belongs to a package, of the files beside it."""
+    """The digest of a module's source and, where it belongs to a package, of the files beside and below it."""
     file = getattr(sys.modules[module], "__file__", None)
     if file is None:
         raise TypeError(f"the code of {module} is in no file, so its changes cannot be noticed")
-    files = sorted(Path(file).parent.glob("*.py")) if "." in module else [Path(file)]
+    files = sorted(Path(file).parent.rglob("*.py")) if "." in module else [Path(file)]
     return _digest(b"".join(_digest(path.read_bytes()).encode() for path in files))
 
 
