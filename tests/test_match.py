@@ -233,7 +233,8 @@ def test_the_name_is_the_function_in_every_order_of_imports(code: str) -> None:
 
 def run_python(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     source = str(Path(__file__).resolve().parents[1])
-    env = {**os.environ, "PYTHONPATH": source, "COLUMNS": "200", "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
+    own = {"COLUMNS": "200", "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1", "FMTORCH_CACHE": f"{cwd}/cache"}
+    env = {**os.environ, "PYTHONPATH": source, **own}
     command = [sys.executable, *arguments]
     return subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, timeout=300, check=False)
 

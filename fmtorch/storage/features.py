@@ -33,7 +33,8 @@ class CachedFeatures:
     Results are on the CPU. `timed` gives the seconds that the computation took when it was done, here or in another
     run. found, computed: images so far that needed no computation, and that needed some. For any number of threads.
 
-    Raises TypeError where the extractor does not say what defines it (see `configuration`).
+    Raises TypeError where the extractor does not say what defines it, OSError where a file of it cannot be read (see
+    `configuration`).
     """
 
     def __init__(self, extractor: FeatureExtractor, cache: ArrayCache) -> None:
@@ -101,14 +102,15 @@ def cached(
 ) -> FeatureExtractor:
     """The extractor with a cache in the folder `cache`; None: the user's cache folder; "off" or False: as it is.
 
-    limit: GB, see `ArrayCache`. An extractor that does not say what defines it stays as it is, with a warning.
+    limit: GB, see `ArrayCache`. An extractor that does not say what defines it, or whose files cannot be read, stays as
+    it is, with a warning.
     """
     if cache is False or str(cache) in OFF:
         return extractor
     folder = cache_dir() / "features" if cache is None else Path(str(cache)).expanduser()
     try:
         return CachedFeatures(extractor, ArrayCache(folder, None if limit is None else int(limit * 1e9)))
-    except TypeError as error:
+    except (TypeError, OSError) as error:  # of a learned file that is not there the extractor speaks better
         warnings.warn(f"features are not cached: {error}", stacklevel=2)
         return extractor
 

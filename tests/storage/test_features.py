@@ -233,6 +233,19 @@ def test_an_extractor_that_does_not_say_what_it_is_stays_uncached(tmp_path: Path
         assert cached(mine, tmp_path) is mine
 
 
+def test_an_extractor_whose_file_is_absent_stays_uncached(tmp_path: Path) -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Network:
+        file: Path
+
+        def __call__(self, image: NDArray[np.uint8]) -> Features:
+            raise FileNotFoundError("a message of its own")
+
+    network = Network(tmp_path / "absent.onnx")
+    with pytest.warns(UserWarning, match=r"not cached: .*absent\.onnx"):
+        assert cached(network, tmp_path / "cache") is network
+
+
 def test_configuration_of_files_tensors_networks_and_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     @dataclasses.dataclass(frozen=True)
     class Part:
