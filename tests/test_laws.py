@@ -8,9 +8,17 @@ import torch
 
 from fmtorch import presets
 from fmtorch.types import Correspondences, collate
-from tests.laws import Result, Subject, assert_same, degenerate, live_values, scene, scenes, with_padding
-
-OTHER_LIBRARIES = ("opencv_", "poselib")
+from tests.laws import (
+    OTHER_LIBRARIES,
+    Result,
+    Subject,
+    assert_same,
+    degenerate,
+    live_values,
+    scene,
+    scenes,
+    with_padding,
+)
 
 
 def _estimator(name: str) -> Subject:
@@ -38,7 +46,7 @@ def _pruner(name: str) -> Subject:
 
 def _subjects() -> list[Subject]:
     """Every preset of these groups: a new file in conf/ joins by being there."""
-    estimators = [_estimator(n) for n in presets.available("estimator") if n != "poselib"]
+    estimators = [_estimator(n) for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES[1:])]
     return [*estimators, *(_pruner(n) for n in presets.available("pruner"))]
 
 
