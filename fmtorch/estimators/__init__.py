@@ -2,5 +2,6 @@
 
 from fmtorch.estimators.adapters import PairwiseEstimator, opencv, poselib
 from fmtorch.estimators.engine import HypothesizeAndVerify
+from fmtorch.estimators.irls import IterativelyReweighted
 
-__all__ = ["HypothesizeAndVerify", "PairwiseEstimator", "opencv", "poselib"]
+__all__ = ["HypothesizeAndVerify", "IterativelyReweighted", "PairwiseEstimator", "opencv", "poselib"]

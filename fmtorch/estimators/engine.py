@@ -14,10 +14,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch import random
+from fmtorch.estimators.batching import solve_all
 from fmtorch.estimators.choice import best_of
 from fmtorch.estimators.local_optimization import LOCAL_OPTIMIZATIONS
 from fmtorch.estimators.parts import CHOICES, FINAL_FITS, INLIER_RULES, SAMPLERS, SCORES, SOLVERS, Refinement, part
-from fmtorch.estimators.problem import Problem, problems
+from fmtorch.estimators.problem import Problem
 from fmtorch.estimators.sampling import PriorWeighted
 from fmtorch.estimators.scoring import sampson_squared, score_models
 from fmtorch.random import Stream
@@ -113,29 +114,8 @@ class HypothesizeAndVerify:
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
-        b, n = c.mask.shape
-        device = c.mask.device
-        F = torch.zeros(b, 3, 3, dtype=torch.float64, device=device)
-        inliers = torch.zeros(b, n, dtype=torch.bool, device=device)
-        draws = torch.zeros(b, dtype=torch.int64, device=device)
-        made, reasons = problems(c, seed, self.solver.size)
-        limit = max(1, (GPU_SAMPLES if device.type == "cuda" else CPU_SAMPLES) // self.round)
-        for whole in made:
-            for first in range(0, len(whole.pair), limit):
-                problem = whole[torch.arange(first, min(first + limit, len(whole.pair)), device=device)]
-                estimate, support, found, drawn = self._solve(problem)
-                F = F.index_copy(0, problem.pair, torch.where(found[:, None, None], problem.to_pixels(estimate), 0))
-                row, match = (support & problem.live & found[:, None]).nonzero(as_tuple=True)
-                inliers[problem.pair[row], problem.slot[row, match]] = True
-                draws[problem.pair] = drawn
-                for i in problem.pair[~found].tolist():
-                    reasons[i] = "every minimal sample was degenerate"
-        sound = torch.isfinite(F).flatten(1).all(1)
-        F = torch.where(sound[:, None, None], F, 0)
-        for i in (~sound).nonzero()[:, 0].tolist():
-            reasons.setdefault(i, "the final fit is not finite")
-        ok = torch.tensor([i not in reasons for i in range(b)], dtype=torch.bool, device=device)
-        return Estimate(F, inliers, ok, tuple(reasons.get(i, "") for i in range(b)), draws)
+        samples = GPU_SAMPLES if c.mask.is_cuda else CPU_SAMPLES
+        return solve_all(c, seed, self.solver.size, self._solve, "every minimal sample was degenerate", samples // self.round)
 
     def _solve(self, problem: Problem) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Search, then fit: F (p, 3, 3) in normalised units, inliers (p, n), found (p,), draws (p,)."""
