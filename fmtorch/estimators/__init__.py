@@ -1,7 +1,8 @@
 """Correspondences -> Estimate: robust estimation of fundamental matrices."""
 
 from fmtorch.estimators.adapters import PairwiseEstimator, opencv, poselib
+from fmtorch.estimators.coarse_to_fine import CoarseToFine
 from fmtorch.estimators.engine import HypothesizeAndVerify
 from fmtorch.estimators.irls import IterativelyReweighted
 
-__all__ = ["HypothesizeAndVerify", "IterativelyReweighted", "PairwiseEstimator", "opencv", "poselib"]
+__all__ = ["CoarseToFine", "HypothesizeAndVerify", "IterativelyReweighted", "PairwiseEstimator", "opencv", "poselib"]
