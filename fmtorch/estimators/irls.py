@@ -50,16 +50,16 @@ class IterativelyReweighted:
         threshold: float,
         starts: Sequence[int] = (0, 1, 2, 4),
         iterations: int = 12,
-        start_scale: float = 1.5,
-        refine_iterations: int = 10,
+        start_scale: float = 0.75,
+        refine_iterations: int = 30,
         inlier_threshold: float | None = None,
     ) -> None:
         if not threshold > 0:
             raise ValueError(f"threshold is {threshold}; it must be positive")
-        if not starts or any(power != int(power) or power < 0 for power in starts):
-            raise ValueError(f"starts is {starts}; it must be a list of integers of at least 0")
+        if not starts or min(starts) < 0:
+            raise ValueError(f"starts is {starts}; it must be a list of integers, each at least 0")
         self.kernel, self.robust, self.threshold = kernel, named_kernel(kernel), threshold
-        self.starts = sorted({int(power) for power in starts})
+        self.starts = sorted(set(starts))
         self.iterations, self.start_scale, self.refine_iterations = iterations, start_scale, refine_iterations
         self.inlier_rule = WithinThreshold(threshold if inlier_threshold is None else inlier_threshold)
 
