@@ -10,7 +10,7 @@ import inspect
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import hydra
 import hydra.utils
@@ -50,14 +50,17 @@ def load(group: str, name: str, config_dir: Path | str | None = None) -> dict[st
 def build(group: str, name: str, config_dir: Path | str | None = None, **options: Any) -> Any:
     """The object that a preset describes, with some of its options replaced.
 
+    Where an option is itself an object, its own are replaced: ``build("estimator", "cf_ransac", fine={"round": 100})``.
     Raises ValueError for an unknown preset or option, naming those that exist.
     """
-    return instantiate({**load(group, name, config_dir), **options}, where=f"{group}={name}")
+    merged = OmegaConf.merge(load(group, name, config_dir), options)
+    return instantiate(cast(DictConfig, merged), where=f"{group}={name}")
 
 
 def instantiate(config: Mapping[str, Any] | DictConfig, where: str, **extra: Any) -> Any:
-    """The object of a flat config with a `_target_`; `where` names the config in errors, `extra` arguments are added.
+    """The object of a config with a `_target_`; `where` names the config in errors, `extra` arguments are added.
 
+    A value that is a mapping with a `_target_` of its own becomes an object first.
     Raises ValueError for an unknown option, naming those that exist; what the target itself raises passes through.
     """
     values = OmegaConf.to_container(config, resolve=True) if isinstance(config, DictConfig) else dict(config)
@@ -69,7 +72,11 @@ def instantiate(config: Mapping[str, Any] | DictConfig, where: str, **extra: Any
     unknown = [str(key) for key in values if key not in known]
     if unknown and not takes_any:
         raise ValueError(f"{where}: no option {', '.join(unknown)}; there are: {', '.join(known)}")
-    return target(**{str(key): value for key, value in values.items()}, **extra)
+    built = {
+        str(key): instantiate(value, f"{where}.{key}") if isinstance(value, dict) and "_target_" in value else value
+        for key, value in values.items()
+    }
+    return target(**built, **extra)
 
 
 def resolve_device(name: str) -> torch.device:

@@ -15,6 +15,8 @@ class Stream(enum.IntEnum):
     SAMPLING = 1
     PRESELECTION = 2
     METRIC = 3
+    PLANE = 4
+    PARALLAX = 5
 
 
 def _wrap(value: int) -> int:

@@ -9,10 +9,14 @@ from fmtorch.estimators.adapters import (
     opencv,
     poselib,
 )
+from fmtorch.estimators.coarse_to_fine import CoarseToFine
 from fmtorch.estimators.engine import HypothesizeAndVerify
+from fmtorch.estimators.irls import IterativelyReweighted
 
 __all__ = [
+    "CoarseToFine",
     "HypothesizeAndVerify",
+    "IterativelyReweighted",
     "PairwiseEstimator",
     "degensac_cpp",
     "gc_ransac_cpp",

@@ -14,10 +14,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch import random
+from fmtorch.estimators.batching import solve_all
 from fmtorch.estimators.choice import best_of
+from fmtorch.estimators.degeneracy import CANDIDATES, DEGENERACIES, Degensac
 from fmtorch.estimators.local_optimization import LOCAL_OPTIMIZATIONS
 from fmtorch.estimators.parts import CHOICES, FINAL_FITS, INLIER_RULES, SAMPLERS, SCORES, SOLVERS, Refinement, part
-from fmtorch.estimators.problem import Problem, problems
+from fmtorch.estimators.problem import Problem
 from fmtorch.estimators.sampling import PriorWeighted
 from fmtorch.estimators.scoring import sampson_squared, score_models
 from fmtorch.random import Stream
@@ -46,6 +48,8 @@ class HypothesizeAndVerify:
     confidence: stop once an all-inlier sample was drawn with this probability; None: never before `hypotheses`.
     preselect: models are first scored on this many matches, chosen by the pair's key; 0: always on all.
     survivors: models of a round that pass the preselection.
+    degeneracy: `degensac` (a best model whose sample lies on a plane is replaced by plane and parallax), null: no check.
+    candidates: `plane_and_parallax` adds models of the scene's planes to the pool, null: none.
     pool: the best models that are kept to the end. local_optimization: of the pool, `graph_cut` or null: none.
     refine: robust kernel of the Levenberg-Marquardt refinement of the pool (`truncated`, `cauchy`, ...), null: none;
     refine_threshold: its scale, Sampson distance in pixels; refine_iterations: its steps. choice: by which score the
@@ -73,6 +77,8 @@ class HypothesizeAndVerify:
         confidence: float | None = 0.9999,
         preselect: int = 128,
         survivors: int = 256,
+        degeneracy: str | None = None,
+        candidates: str | None = None,
         pool: int = 1,
         local_optimization: str | None = None,
         refine: str | None = None,
@@ -95,6 +101,10 @@ class HypothesizeAndVerify:
         self.inlier_threshold = threshold if inlier_threshold is None else inlier_threshold
         self.hypotheses, self.round, self.confidence = hypotheses, round, confidence
         self.preselect, self.survivors = preselect, survivors
+        self.degeneracy = None if degeneracy is None else part("degeneracy", degeneracy, DEGENERACIES)(self.score)
+        if self.degeneracy is not None and self.solver.size != Degensac.SAMPLE:
+            raise ValueError(f"degeneracy={degeneracy} needs solver=seven_point; solver is {solver!r}")
+        self.candidates = None if candidates is None else part("candidates", candidates, CANDIDATES)(self.score)
         self.pool = pool
         self.local_optimization = None
         if local_optimization is not None:
@@ -113,35 +123,17 @@ class HypothesizeAndVerify:
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
-        b, n = c.mask.shape
-        device = c.mask.device
-        F = torch.zeros(b, 3, 3, dtype=torch.float64, device=device)
-        inliers = torch.zeros(b, n, dtype=torch.bool, device=device)
-        draws = torch.zeros(b, dtype=torch.int64, device=device)
-        made, reasons = problems(c, seed, self.solver.size)
-        limit = max(1, (GPU_SAMPLES if device.type == "cuda" else CPU_SAMPLES) // self.round)
-        for whole in made:
-            for first in range(0, len(whole.pair), limit):
-                problem = whole[torch.arange(first, min(first + limit, len(whole.pair)), device=device)]
-                estimate, support, found, drawn = self._solve(problem)
-                F = F.index_copy(0, problem.pair, torch.where(found[:, None, None], problem.to_pixels(estimate), 0))
-                row, match = (support & problem.live & found[:, None]).nonzero(as_tuple=True)
-                inliers[problem.pair[row], problem.slot[row, match]] = True
-                draws[problem.pair] = drawn
-                for i in problem.pair[~found].tolist():
-                    reasons[i] = "every minimal sample was degenerate"
-        sound = torch.isfinite(F).flatten(1).all(1)
-        F = torch.where(sound[:, None, None], F, 0)
-        for i in (~sound).nonzero()[:, 0].tolist():
-            reasons.setdefault(i, "the final fit is not finite")
-        ok = torch.tensor([i not in reasons for i in range(b)], dtype=torch.bool, device=device)
-        return Estimate(F, inliers, ok, tuple(reasons.get(i, "") for i in range(b)), draws)
+        samples = GPU_SAMPLES if c.mask.is_cuda else CPU_SAMPLES
+        return solve_all(c, seed, self.solver.size, self._solve, "every minimal sample was degenerate", samples // self.round)
 
     def _solve(self, problem: Problem) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Search, then fit: F (p, 3, 3) in normalised units, inliers (p, n), found (p,), draws (p,)."""
         with torch.no_grad():
             search = self._search(problem)
-            found = torch.isfinite(search.score[:, 0])
+            if self.candidates is not None:
+                F, score = self.candidates(problem)
+                search.F, search.score = torch.cat([search.F, F], 2), torch.cat([search.score, score], 1)
+            found = torch.isfinite(search.score).any(1)
             best = self._choose(search, problem).T.reshape(-1, 3, 3)
             inliers = self.inlier_rule(best, problem)
         F = self.final(best, problem, inliers)
@@ -180,8 +172,10 @@ class HypothesizeAndVerify:
         while start < self.hypotheses and len(active):
             count = min(self.round, self.hypotheses - start)
             some, some_points = problem[active], points[:, active]
-            F, valid = self._hypotheses(some, some_points, table[active], start, count)
-            F, score = self._verify(some, some_points, F, valid, None if subset is None else subset[active])
+            drawn, valid, index = self._hypotheses(some, some_points, table[active], start, count)
+            F, score = self._verify(some, some_points, drawn, valid, None if subset is None else subset[active])
+            if self.degeneracy is not None:
+                F, score = self.degeneracy(F, score, state.score[active, 0], drawn, index, some, start)
             self._remember(state, active, F, score)
             start += count
             state.draws[active] = start
@@ -192,12 +186,12 @@ class HypothesizeAndVerify:
 
     def _hypotheses(
         self, problem: Problem, points: Float[Tensor, "4 p n"], table: Tensor, start: int, count: int
-    ) -> tuple[Float[Tensor, "9 p m"], Bool[Tensor, "p m"]]:
-        """The models of `count` minimal samples, in the order of their draws."""
+    ) -> tuple[Float[Tensor, "9 p m"], Bool[Tensor, "p m"], Int[Tensor, "size p s"]]:
+        """The models of `count` minimal samples, in the order of their draws, which of them exist, and the samples."""
         size = self.solver.size
         index = self.sampler.draw(problem, table, start, count, size)
         sample = torch.stack([points.gather(2, i.expand(4, -1, -1)) for i in index], 1)
-        return self.solver(sample)
+        return *self.solver(sample), index
 
     def _verify(
         self, problem: Problem, points: Tensor, F: Tensor, valid: Tensor, subset: Tensor | None

@@ -86,8 +86,8 @@ class WithinThreshold:
         return (residuals_squared(F, problem) <= self.threshold**2) & problem.live
 
 
-def _median(r2: Tensor, problem: Problem) -> Tensor:
-    """The median of the live residuals of each pair, (p, 1)."""
+def median_of_live(r2: Float[Tensor, "p n"], problem: Problem) -> Float[Tensor, "p 1"]:
+    """The median of the live residuals of each pair."""
     ordered = torch.where(problem.live, r2, torch.inf).sort(1).values
     return ordered.gather(1, median_rank(problem.count)[:, None] - 1)
 
@@ -101,7 +101,7 @@ class BetterHalf:
     def __call__(self, F: Float[Tensor, "p 3 3"], problem: Problem) -> Bool[Tensor, "p n"]:
         """The inliers of each pair's model."""
         r2 = residuals_squared(F, problem)
-        return (r2 <= _median(r2, problem)) & problem.live
+        return (r2 <= median_of_live(r2, problem)) & problem.live
 
 
 class RobustDeviations:
@@ -116,7 +116,7 @@ class RobustDeviations:
         """The inliers of each pair's model."""
         r2 = residuals_squared(F, problem)
         spare = (problem.count - self.PARAMETERS).clamp_min(1)[:, None]
-        sigma = 1.4826 * (1 + 5 / spare) * _median(r2, problem).sqrt()
+        sigma = 1.4826 * (1 + 5 / spare) * median_of_live(r2, problem).sqrt()
         return (r2 <= (2.5 * sigma).square()) & problem.live
 
 

@@ -6,7 +6,6 @@ tile size, padding or batch can change a score. Larger is better.
 
 from __future__ import annotations
 
-import math
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -14,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.estimators.problem import Problem
+from fmtorch.geometry.sigma_consensus import marginal_loss
 
 CPU_TILE = 1 << 18  # elements of one tile: 1 MB of float32, so that the handful of buffers stay in the L2 cache
 GPU_TILE = 1 << 26
@@ -129,14 +129,10 @@ def _weight(live: Tensor, prior: Tensor | None, prior_weighted: bool, dtype: tor
 class SigmaConsensus:
     """MAGSAC++: the likelihood marginalised over the noise scale (Barath et al., CVPR 2020, section 3.2).
 
-    For residuals of n = 4 degrees of freedom and a uniform noise scale in (0, sigma_max], the loss of a match is
-    ``rho(r) = sigma^2/2 lower(5/2, x) + r^2/4 (upper(3/2, x) - upper(3/2, k^2/2))`` with ``x = r^2 / (2 sigma^2)`` and
-    the incomplete gamma functions, constant from ``r = k sigma_max`` on, k = 3.64 being the 0.99 quantile; the gain is
-    ``1 - rho(r) / rho(k sigma_max)``, tabulated over r^2 as the authors do.
+    The gain is ``1 - rho(r) / rho(k sigma_max)``, rho as in `sigma_consensus`, tabulated over r^2 as the authors do.
     threshold: k sigma_max, Sampson distance, px.
     """
 
-    QUANTILE = 3.64
     ENTRIES = 2048
 
     def __init__(self, threshold: float) -> None:
@@ -145,13 +141,10 @@ class SigmaConsensus:
         middle = (torch.arange(self.ENTRIES, dtype=torch.float64) + 0.5) / self.ENTRIES
         self._table = torch.cat([self.gain(middle), torch.zeros(1, dtype=torch.float64)]).to(torch.float32)
 
-    @classmethod
-    def gain(cls, squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    @staticmethod
+    def gain(squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """1 - rho / rho_max of residuals below the threshold, as a function of (r / threshold)^2."""
-        end = torch.tensor(cls.QUANTILE**2 / 2, dtype=torch.float64)
-        x = squared * end
-        loss = _lower_gamma_5_2(x) / 2 + x / 2 * (_upper_gamma_3_2(x) - _upper_gamma_3_2(end))
-        gain: Tensor = 1 - loss / (_lower_gamma_5_2(end) / 2)
+        gain: Tensor = 1 - marginal_loss(squared) / marginal_loss(torch.ones_like(squared))
         return gain
 
     def __call__(
@@ -165,17 +158,6 @@ class SigmaConsensus:
         scale = (unit / self.threshold).square().mul(self.ENTRIES).to(r2.dtype)[:, None, None]
         entry = r2.mul_(scale).clamp_max_(self.ENTRIES).to(torch.int64)
         return _exact_sum(torch.take(self._table.to(r2.device), entry).mul_(live[:, None]))
-
-
-def _upper_gamma_3_2(x: Tensor) -> Tensor:
-    """The upper incomplete gamma function of 3/2."""
-    value: Tensor = x.sqrt() * torch.exp(-x) + math.sqrt(math.pi) / 2 * torch.special.erfc(x.sqrt())
-    return value
-
-
-def _lower_gamma_5_2(x: Tensor) -> Tensor:
-    """The lower incomplete gamma function of 5/2."""
-    return 0.75 * math.sqrt(math.pi) - 1.5 * _upper_gamma_3_2(x) - x * x.sqrt() * torch.exp(-x)
 
 
 class Median:
