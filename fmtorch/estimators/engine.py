@@ -205,11 +205,11 @@ class HypothesizeAndVerify:
         """The valid models and their scores, the weaker ones dropped after a look at the `subset` of matches."""
         F, valid = _front(F, valid)
         if subset is not None and F.shape[2] > self.survivors:
-            coarse = score_models(self.score, F, problem, points, subset).masked_fill_(~valid, -torch.inf)
+            coarse = score_models(self.score, F, problem, points, subset, valid)
             order = torch.sort(coarse, dim=1, descending=True, stable=True).indices[:, : self.survivors]
             order = torch.sort(order, dim=1).values  # back in the order of the draws, which breaks ties
             F, valid = F.gather(2, order.expand(9, -1, -1)), valid.gather(1, order)
-        return F, score_models(self.score, F, problem, points).masked_fill_(~valid, -torch.inf)
+        return F, score_models(self.score, F, problem, points, valid=valid)
 
     def _remember(self, state: _Search, active: Tensor, F: Tensor, score: Tensor) -> None:
         """Keep the best models of each pair; the earlier draw wins a tie."""

@@ -25,6 +25,7 @@ from fmtorch.estimators.scoring import (
 )
 from fmtorch.geometry import eight_point
 from fmtorch.geometry.minimal import eight_point_components, seven_point_components
+from fmtorch.geometry.orientation import consistently_oriented
 from fmtorch.geometry.refine import attached_step, refine_components
 
 T = TypeVar("T")
@@ -56,6 +57,7 @@ class SevenPoint:
     def __call__(self, sample: Float[Tensor, "4 size p s"]) -> tuple[Float[Tensor, "9 p m"], Bool[Tensor, "p m"]]:
         """As `Solver`: the three roots of one sample stand together."""
         F, valid = seven_point_components(sample)
+        valid = valid & consistently_oriented(F, sample[:, :, None])
         return F.permute(0, 2, 3, 1).flatten(2).contiguous(), valid.permute(1, 2, 0).flatten(1).contiguous()
 
 
@@ -66,7 +68,8 @@ class EightPoint:
 
     def __call__(self, sample: Float[Tensor, "4 size p s"]) -> tuple[Float[Tensor, "9 p m"], Bool[Tensor, "p m"]]:
         """As `Solver`."""
-        return eight_point_components(sample)
+        F, valid = eight_point_components(sample)
+        return F, valid & consistently_oriented(F, sample)
 
 
 def residuals_squared(F: Float[Tensor, "p 3 3"], problem: Problem) -> Float[Tensor, "p n"]:

@@ -30,11 +30,7 @@ console = Console(width=None if sys.stdout.isatty() else 160)
 
 def add_arguments(commands: Any) -> None:
     parser = commands.add_parser("estimators", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--root", action="append", default=[], help="a set in the FM-Bench layout; may be repeated")
-    parser.add_argument("--rendered", choices=["small", "full"], help="also the embedded data set, of this size")
-    parser.add_argument("--split", default="test")
-    parser.add_argument("--limit", type=int, help="pairs of each set at most")
-    parser.add_argument("--pruners", nargs="*", default=["ratio", "one_to_one"])
+    add_matches_arguments(parser)
     parser.add_argument(
         "--estimators", nargs="+", required=True, help="presets, with options as name:key=value,key=value"
     )
@@ -44,8 +40,17 @@ def add_arguments(commands: Any) -> None:
     parser.set_defaults(run=run)
 
 
-def run(arguments: argparse.Namespace) -> None:
-    torch.set_num_threads(1)
+def add_matches_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options that say which image pairs are matched, and how."""
+    parser.add_argument("--root", action="append", default=[], help="a set in the FM-Bench layout; may be repeated")
+    parser.add_argument("--rendered", choices=["small", "full"], help="also the embedded data set, of this size")
+    parser.add_argument("--split", default="test")
+    parser.add_argument("--limit", type=int, help="pairs of each set at most")
+    parser.add_argument("--pruners", nargs="*", default=["ratio", "one_to_one"])
+
+
+def matched_pairs(arguments: argparse.Namespace) -> list[Any]:
+    """The image pairs that the options name, with their matches."""
     pairs: list[ImagePair] = []
     sets = [data.load("fmbench", arguments.split, root) for root in arguments.root]
     if arguments.rendered:
@@ -62,6 +67,12 @@ def run(arguments: argparse.Namespace) -> None:
     usable = [m for m in matched if m.correspondences is not None]
     typical = np.median([int(m.correspondences.count()) for m in usable])
     console.print(f"{len(usable)} of {len(pairs)} pairs, median {typical:.0f} matches")
+    return usable
+
+
+def run(arguments: argparse.Namespace) -> None:
+    torch.set_num_threads(1)
+    usable = matched_pairs(arguments)
     results = {}
     for spec in arguments.estimators:
         results[spec] = measure(spec, [(m.pair, m.correspondences) for m in usable], arguments.seeds)
