@@ -25,6 +25,7 @@ from fmtorch.types import Correspondences, Estimate
 
 CPU_SAMPLES = 1 << 14  # minimal samples that are solved together: bounds memory, changes no result
 GPU_SAMPLES = 1 << 21
+UNSTOPPED_ROUND = 2000  # samples of a round where nobody looks in between: few operations on many numbers are faster
 
 
 @dataclasses.dataclass
@@ -42,7 +43,8 @@ class HypothesizeAndVerify:
     solver: minimal solver, `seven_point` or `eight_point`.
     sampler: `uniform` or `prior`. score: `inlier_count`, `msac`, `prior_msac` or `median`.
     threshold: Sampson distance in pixels up to which a match supports a model (unused by `median`).
-    hypotheses: minimal samples drawn at most. round: samples between two looks at the stopping rule.
+    hypotheses: minimal samples drawn at most. round: samples between two looks at the stopping rule; without one,
+    rounds of `UNSTOPPED_ROUND` at least.
     confidence: stop once an all-inlier sample was drawn with this probability; None: never before `hypotheses`.
     preselect: models are first scored on this many matches, chosen by the pair's key; 0: always on all.
     survivors: models of a round that pass the preselection.
@@ -93,7 +95,8 @@ class HypothesizeAndVerify:
         self.sampler = part("sampler", sampler, SAMPLERS)()
         self.score = part("score", score, SCORES)(threshold)
         self.inlier_threshold = threshold if inlier_threshold is None else inlier_threshold
-        self.hypotheses, self.round, self.confidence = hypotheses, round, confidence
+        self.hypotheses, self.confidence = hypotheses, confidence
+        self.round = round if confidence is not None else max(round, UNSTOPPED_ROUND)
         self.preselect, self.survivors = preselect, survivors
         self.pool = pool
         self.local_optimization = None
