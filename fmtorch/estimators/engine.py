@@ -15,8 +15,19 @@ from torch import Tensor
 
 from fmtorch import random
 from fmtorch.estimators.choice import best_of
+from fmtorch.estimators.compiled import CompiledSolver, compiled_score
 from fmtorch.estimators.local_optimization import LOCAL_OPTIMIZATIONS
-from fmtorch.estimators.parts import CHOICES, FINAL_FITS, INLIER_RULES, SAMPLERS, SCORES, SOLVERS, Refinement, part
+from fmtorch.estimators.parts import (
+    CHOICES,
+    FINAL_FITS,
+    INLIER_RULES,
+    SAMPLERS,
+    SCORES,
+    SOLVERS,
+    Refinement,
+    Solver,
+    part,
+)
 from fmtorch.estimators.problem import Problem, problems
 from fmtorch.estimators.sampling import PriorWeighted
 from fmtorch.estimators.scoring import sampson_squared, score_models
@@ -58,6 +69,8 @@ class HypothesizeAndVerify:
     inlier_threshold: of the inliers reported, Sampson distance in pixels; null: the score's threshold.
     final: `least_squares` (8-point on the inliers), `gauss_newton` (one attached step) or `none`.
     refit_inliers: recompute the inliers after the final fit.
+    compile: build the minimal solver and the score with torch.compile, for long runs: the first calls take some tens of
+    seconds and need a C++ compiler (RuntimeError where there is none).
 
     Memory: for a batch of pairs of N matches, the points (48 N bytes a pair), the samples of 2^14 draws (about 40 MB)
     and eight buffers of one scoring tile (1 MB each); on a GPU 2^21 draws and 256 MB a buffer.
@@ -86,14 +99,17 @@ class HypothesizeAndVerify:
         inlier_threshold: float | None = None,
         final: str = "least_squares",
         refit_inliers: bool = True,
+        compile: bool = False,
     ) -> None:
         if hypotheses < 1 or round < 1:
             raise ValueError(f"hypotheses={hypotheses}, round={round}: both must be at least 1")
         if confidence is not None and not 0 < confidence < 1:
             raise ValueError(f"confidence is {confidence}; it is a probability between 0 and 1, or null")
-        self.solver = part("solver", solver, SOLVERS)()
+        self.solver: Solver = part("solver", solver, SOLVERS)()
         self.sampler = part("sampler", sampler, SAMPLERS)()
         self.score = part("score", score, SCORES)(threshold)
+        if compile:
+            self.solver, self.score = CompiledSolver(self.solver), compiled_score(self.score)
         self.inlier_threshold = threshold if inlier_threshold is None else inlier_threshold
         self.hypotheses, self.confidence = hypotheses, confidence
         self.round = round if confidence is not None else max(round, UNSTOPPED_ROUND)

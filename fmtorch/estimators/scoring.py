@@ -40,14 +40,18 @@ def sampson_squared(F: Float[Tensor, "9 p m"], points: Float[Tensor, "4 p n"]) -
 
 @runtime_checkable
 class Score(Protocol):
-    """Turns squared residuals into scores. prior_weighted: each match counts as much as its prior, where it has one."""
+    """Scores models. prior_weighted: each match counts as much as its prior, where it has one."""
 
     prior_weighted: bool
 
     def __call__(
-        self, r2: Float[Tensor, "p m n"], weight: Float[Tensor, "p n"], unit: Float[Tensor, " p"]
+        self,
+        F: Float[Tensor, "9 p m"],
+        points: Float[Tensor, "4 p n"],
+        weight: Float[Tensor, "p n"],
+        unit: Float[Tensor, " p"],
     ) -> Float[Tensor, "p m"]:
-        """Scores; r2 in squared normalised units (may be overwritten), `unit` the pixels in one of them.
+        """Scores of models of points in normalised units, `unit` the pixels in one of them.
 
         weight: what each match counts, in [0, 1]; zero in padded slots.
         """
@@ -66,12 +70,11 @@ class SummedGains:
         self.threshold = float(threshold)
         self.prior_weighted = prior_weighted
 
-    def __call__(
-        self, r2: Float[Tensor, "p m n"], weight: Float[Tensor, "p n"], unit: Float[Tensor, " p"]
-    ) -> Float[Tensor, "p m"]:
+    def __call__(self, F: Tensor, points: Tensor, weight: Tensor, unit: Tensor) -> Tensor:
         """As `Score`."""
-        scale = (unit / self.threshold).square().to(r2.dtype)[:, None, None]
-        return _exact_sum(self._gain(r2.mul_(scale)).mul_(weight[:, None]))
+        scale = (unit / self.threshold).square().to(F.dtype)[:, None, None]
+        gain = self._gain(sampson_squared(F, points).mul_(scale))
+        return _exact_sum(gain.mul_(weight[:, None]))
 
     def _gain(self, squared: Float[Tensor, "p m n"]) -> Float[Tensor, "p m n"]:
         """The gains at squared residuals in units of the threshold; these may be overwritten."""
@@ -155,12 +158,10 @@ class Median:
 
     prior_weighted = False
 
-    def __call__(
-        self, r2: Float[Tensor, "p m n"], weight: Float[Tensor, "p n"], unit: Float[Tensor, " p"]
-    ) -> Float[Tensor, "p m"]:
+    def __call__(self, F: Tensor, points: Tensor, weight: Tensor, unit: Tensor) -> Tensor:
         """As `Score`."""
         live = weight > 0
-        r2.masked_fill_(~live[:, None], torch.inf)
+        r2 = sampson_squared(F, points).masked_fill_(~live[:, None], torch.inf)
         rank = median_rank(live.sum(-1)).tolist()
         return torch.stack([-pair.kthvalue(k, dim=-1).values for pair, k in zip(r2, rank, strict=True)])
 
@@ -210,6 +211,5 @@ def score_models(
         models = max(1, limit // (n * pairs))
         for j in range(0, max(height[some]), models):
             these = slice(j, min(j + models, max(height[some])))
-            r2 = sampson_squared(F[:, some, these], points[:, some, :n])
-            scores[some, these] = score(r2, weight[some, :n], problem.unit[some])
+            scores[some, these] = score(F[:, some, these], points[:, some, :n], weight[some, :n], problem.unit[some])
     return scores if valid is None else scores.masked_fill_(~valid, -torch.inf)
