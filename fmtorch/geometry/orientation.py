@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -11,7 +10,7 @@ from fmtorch.geometry.rank2 import cross
 _COLUMNS = (0.618, 0.414)  # of a generic combination, so that no usual epipole makes both columns parallel
 
 
-def consistently_oriented(F: Float[Tensor, "9 *s"], points: Float[Tensor, "4 n *t"]) -> Bool[Tensor, "*s"]:
+def consistently_oriented(F: Float[Tensor, " 9 *s"], points: Float[Tensor, " 4 n *t"]) -> Bool[Tensor, "*s"]:
     """Whether ``F x0`` and ``e1 x x1``, the same epipolar line, point the same way for all matches of a sample.
 
     Chum, Werner & Matas, "Epipolar geometry estimation via RANSAC benefits from the oriented epipolar constraint"
