@@ -41,11 +41,11 @@ class FocalPrior:
 
     The estimate is the refined candidate with the largest gain (`SaturatedGain`) minus prior cost if that reaches GATE
     of the largest gain without prior; otherwise, and where there are no image sizes, the model of the latter.
-    threshold: Sampson distance of the gain and of the truncated cost, px.
+    threshold: Sampson distance of the gain and of the truncated cost, px. iterations: Levenberg-Marquardt steps.
     """
 
-    def __init__(self, threshold: float) -> None:
-        self.threshold = threshold
+    def __init__(self, threshold: float, iterations: int = ITERATIONS) -> None:
+        self.threshold, self.iterations = threshold, iterations
         self.gain = SaturatedGain(threshold)
 
     def __call__(self, F: Float[Tensor, "9 p k"], problem: Problem, alive: Bool[Tensor, "p k"]) -> Float[Tensor, "9 p"]:
@@ -54,7 +54,7 @@ class FocalPrior:
         plain = best_of(F, gain, alive)
         if problem.size0 is None or problem.size1 is None:
             return plain
-        focal, prior = refine_focal(F, problem, self.threshold)
+        focal, prior = refine_focal(F, problem, self.threshold, self.iterations)
         posterior = torch.where(alive, self.gain.score(focal, problem) - prior, -torch.inf).nan_to_num(nan=-torch.inf)
         best = torch.where(alive, gain, -torch.inf).amax(1)
         return torch.where(posterior.amax(1) >= GATE * best, best_of(focal, posterior, alive), plain)

@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from fmtorch.geometry.reduce import component_sum as total
+
 RANK_TWO, RANK_TWO_EPIPOLE = (0.5**0.5, 0.0, 0.0, 0.0, 0.5**0.5, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 
 
@@ -88,14 +90,6 @@ def cofactors(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "9 p k"]:
 def square(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "3 3 p k"]:
     """The components as rows and columns."""
     return F.reshape(3, 3, *F.shape[1:])
-
-
-def total(x: Tensor, dim: int = 0) -> Tensor:
-    """The sum over a short axis, in order: for few numbers this takes half as long as a tree."""
-    first, *rest = x.unbind(dim)
-    for part in rest:
-        first = first + part
-    return first
 
 
 def unit(x: Float[Tensor, "c p k"]) -> Float[Tensor, "c p k"]:

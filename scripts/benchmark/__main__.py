@@ -10,13 +10,15 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import estimators
 import matching
+import memory
+import speed
 import thresholds
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="scripts/benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    for module in (estimators, matching, thresholds):
+    for module in (estimators, matching, memory, speed, thresholds):
         module.add_arguments(commands)
     arguments = parser.parse_args()
     arguments.run(arguments)

@@ -79,7 +79,7 @@ def build(spec: str) -> Callable[[Correspondences, int], Estimate]:
     estimator = presets.build("estimator", name, **options)
     pruners = [presets.build("pruner", stage) for stage in stages.split("+") if stage]
 
-    def call(c: Correspondences, seed: int) -> Estimate:
+    def call(c: Correspondences, seed: int = 0) -> Estimate:
         for pruner in pruners:
             c = pruner(c)
         estimate: Estimate = estimator(c, seed)
