@@ -48,7 +48,7 @@ class HypothesizeAndVerify:
     confidence: stop once an all-inlier sample was drawn with this probability; None: never before `hypotheses`.
     preselect: models are first scored on this many matches, chosen by the pair's key; 0: always on all.
     survivors: models of a round that pass the preselection.
-    degeneracy: `degensac` (a best model whose sample lies on a plane is replaced by plane and parallax), null: no check.
+    degeneracy: `degensac` completes a best model whose sample lies on a plane by plane and parallax, null: no check.
     candidates: `plane_and_parallax` adds models of the scene's planes to the pool, null: none.
     pool: the best models that are kept to the end. local_optimization: of the pool, `graph_cut` or null: none.
     refine: robust kernel of the Levenberg-Marquardt refinement of the pool (`truncated`, `cauchy`, ...), null: none;
@@ -124,7 +124,8 @@ class HypothesizeAndVerify:
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
         samples = GPU_SAMPLES if c.mask.is_cuda else CPU_SAMPLES
-        return solve_all(c, seed, self.solver.size, self._solve, "every minimal sample was degenerate", samples // self.round)
+        pairs = samples // self.round
+        return solve_all(c, seed, self.solver.size, self._solve, "every minimal sample was degenerate", pairs)
 
     def _solve(self, problem: Problem) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Search, then fit: F (p, 3, 3) in normalised units, inliers (p, n), found (p,), draws (p,)."""
