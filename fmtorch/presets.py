@@ -10,7 +10,7 @@ import inspect
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import hydra
 import hydra.utils
@@ -54,8 +54,16 @@ def build(group: str, name: str, config_dir: Path | str | None = None, **options
     Where an option is itself an object, its own are replaced: ``build("estimator", "cf_ransac", fine={"round": 100})``.
     Raises ValueError for an unknown preset or option, naming those that exist.
     """
-    merged = OmegaConf.merge(load(group, name, config_dir), options)
-    return instantiate(cast(DictConfig, merged), where=f"{group}={name}")
+    return instantiate(_merged(load(group, name, config_dir), options), where=f"{group}={name}")
+
+
+def _merged(config: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
+    """`config` with the values of `options`, mappings merged level by level."""
+    changes = {
+        key: _merged(config[key], value) if isinstance(value, Mapping) and isinstance(config.get(key), Mapping) else value
+        for key, value in options.items()
+    }
+    return {**config, **changes}
 
 
 def instantiate(config: Mapping[str, Any] | DictConfig, where: str, **extra: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Scenes ruled by a plane: models that fit the plane alone are told apart, and completed by the parallax of the rest."""
+"""Scenes ruled by a plane: models that fit the plane alone, told apart and completed by the parallax of the rest."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ class HypothesizeAndVerify:
     confidence: stop once an all-inlier sample was drawn with this probability; None: never before `hypotheses`.
     preselect: models are first scored on this many matches, chosen by the pair's key; 0: always on all.
     survivors: models of a round that pass the preselection.
-    degeneracy: `degensac` (a best model whose sample lies on a plane is replaced by plane and parallax), null: no check.
+    degeneracy: `degensac` completes a best model whose sample lies on a plane by plane and parallax, null: no check.
     candidates: `plane_and_parallax` adds models of the scene's planes to the pool, null: none.
     pool: the best models that are kept to the end. local_optimization: of the pool, `graph_cut` or null: none.
     refine: robust kernel of the Levenberg-Marquardt refinement of the pool (`truncated`, `cauchy`, ...), null: none;
@@ -72,8 +72,8 @@ class HypothesizeAndVerify:
     choice_iterations: steps of the refinement that `focal` makes.
     inliers: `threshold`, `lmeds` (2.5 robust standard deviations) or `median` (the better half).
     inlier_threshold: of the inliers reported, Sampson distance in pixels; null: the score's threshold.
-    final: `least_squares` (8-point on the inliers), `gauss_newton` (one attached step), `adaptive` (refined at the scale
-    of the pair's own noise, with an attached step) or `none`.
+    final: `least_squares` (8-point on the inliers), `gauss_newton` (one attached step), `adaptive` (refined at the
+    scale of the pair's own noise, with an attached step) or `none`.
     refit_inliers: recompute the inliers after the final fit.
     compile: build the minimal solver and the score with torch.compile, for long runs: the first calls take some tens of
     seconds and need a C++ compiler (RuntimeError where there is none).
@@ -150,9 +150,8 @@ class HypothesizeAndVerify:
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
         samples = GPU_SAMPLES if c.mask.is_cuda else CPU_SAMPLES
-        return solve_all(
-            c, seed, self.solver.size, self._solve, "every minimal sample was degenerate", samples // self.round
-        )
+        pairs = samples // self.round
+        return solve_all(c, seed, self.solver.size, self._solve, "every minimal sample was degenerate", pairs)
 
     def _solve(self, problem: Problem) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Search, then fit: F (p, 3, 3) in normalised units, inliers (p, n), found (p,), draws (p,)."""

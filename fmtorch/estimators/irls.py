@@ -91,8 +91,8 @@ class IterativelyReweighted:
         for _ in range(self.starts[-1]):
             powers.append(powers[-1] * weight)
         weights = torch.stack([powers[i] for i in self.starts], 1)
-        x0, x1 = (x.permute(1, 2, 0)[:, None].expand(-1, len(self.starts), -1, -1) for x in problem.points.split(2))
-        F, valid = eight_point(x0, x1, weights)
+        points = problem.points[:, :, None].expand(-1, -1, len(self.starts), -1)
+        F, valid = eight_point(points[:2].movedim(0, -1), points[2:].movedim(0, -1), weights)
         return F.flatten(2).permute(2, 0, 1), valid
 
     def _first_scale(self, F: Tensor, valid: Tensor, problem: Problem) -> Float[Tensor, " p"]:

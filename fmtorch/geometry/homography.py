@@ -1,7 +1,7 @@
 """Homographies and the planes they stand for, component by component: a result has the same bits in any batch.
 
-``x1 ~ H x0``. Models are (9, *s), entries row by row, in float64 or float32; points (4, n, *s) with the rows x0, y0, x1,
-y1. Hartley & Zisserman (2004), Multiple View Geometry, chapters 4 and 13.
+``x1 ~ H x0``. Models are (9, *s), entries row by row; points (4, n, *s), rows x0, y0, x1, y1.
+Hartley & Zisserman (2004), Multiple View Geometry, chapters 4 and 13.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fmtorch.geometry.rank2 import cross
 from fmtorch.geometry.reduce import component_sum, matmul3, stable_sum
 
 
-def four_point_components(points: Float[Tensor, "4 4 *s"]) -> tuple[Float[Tensor, 9 *s], Bool[Tensor, "*s"]]:
+def four_point_components(points: Float[Tensor, "4 4 *s"]) -> tuple[Float[Tensor, " 9 *s"], Bool[Tensor, "*s"]]:
     """The homography of four matches, of unit norm, and whether they determine one (no three of them on a line).
 
     The null vector of the eight equations of `_equations`. Points should be of about unit scale.
@@ -49,14 +49,14 @@ def least_squares_homography(
 
 
 def transfer_squared(H: Float[Tensor, "9 p m"], points: Float[Tensor, "4 p n"]) -> Float[Tensor, "p m n"]:
-    """The greater of the squared distances from H x0 to x1 and from H^-1 x1 to x0; infinite where a point goes there."""
+    """The greater of the squared distances from H x0 to x1 and from H^-1 x1 to x0; infinite where these are."""
     x0, y0, x1, y1 = points[:, :, None]
     return torch.maximum(_squared(H, x0, y0, x1, y1), _squared(_adjugate(H), x1, y1, x0, y0))
 
 
 def plane_homography(
-    F: Float[Tensor, 9 *s], e1: Float[Tensor, 3 *s], points: Float[Tensor, "4 3 *s"]
-) -> tuple[Float[Tensor, 9 *s], Bool[Tensor, "*s"]]:
+    F: Float[Tensor, " 9 *s"], e1: Float[Tensor, " 3 *s"], points: Float[Tensor, "4 3 *s"]
+) -> tuple[Float[Tensor, " 9 *s"], Bool[Tensor, "*s"]]:
     """The homography of the plane through three matches of a fundamental matrix, and whether it is determined.
 
     ``H = A - e1 (M^-1 b)^T`` with ``A = [e1]_x F``, the rows of M the points in image 0, and
@@ -79,8 +79,8 @@ def plane_homography(
 
 
 def plane_and_parallax(
-    H: Float[Tensor, 9 *s], points: Float[Tensor, "4 2 *s"]
-) -> tuple[Float[Tensor, 9 *s], Bool[Tensor, "*s"]]:
+    H: Float[Tensor, " 9 *s"], points: Float[Tensor, "4 2 *s"]
+) -> tuple[Float[Tensor, " 9 *s"], Bool[Tensor, "*s"]]:
     """The fundamental matrix of a plane's homography and two matches off the plane, of unit norm, and whether there is.
 
     ``F = [e1]_x H``: the lines through x1 and H x0 of both matches meet in the epipole e1 (section 13.2).
@@ -94,7 +94,7 @@ def plane_and_parallax(
     return torch.where(valid, F / torch.where(valid, norm2, 1.0).sqrt(), 0.0), valid
 
 
-def cross_times(e: Float[Tensor, 3 *s], A: Float[Tensor, 9 *s]) -> Float[Tensor, 9 *s]:
+def cross_times(e: Float[Tensor, " 3 *s"], A: Float[Tensor, " 9 *s"]) -> Float[Tensor, " 9 *s"]:
     """``[e]_x A``: the cross product of e with each column of A."""
     rows = A.reshape(3, 3, *A.shape[1:])
     return cross(e[:, None].expand_as(rows), rows).flatten(0, 1)
@@ -121,12 +121,12 @@ def _squared(H: Tensor, x: Tensor, y: Tensor, u: Tensor, v: Tensor) -> Float[Ten
     return (du * du + dv * dv).nan_to_num(nan=torch.inf, posinf=torch.inf)
 
 
-def _adjugate(H: Float[Tensor, 9 *s]) -> Float[Tensor, 9 *s]:
+def _adjugate(H: Float[Tensor, " 9 *s"]) -> Float[Tensor, " 9 *s"]:
     """A multiple of the inverse: the transposed cofactors."""
     rows = H.reshape(3, 3, *H.shape[1:])
     return torch.stack([cross(rows[1], rows[2]), cross(rows[2], rows[0]), cross(rows[0], rows[1])], 1).flatten(0, 1)
 
 
-def _determinant(H: Float[Tensor, 9 *s]) -> Tensor:
+def _determinant(H: Float[Tensor, " 9 *s"]) -> Tensor:
     rows = H.reshape(3, 3, *H.shape[1:])
     return component_sum(rows[0] * cross(rows[1], rows[2]))
