@@ -173,7 +173,7 @@ def score_models(
 ) -> Float[Tensor, "p m"]:
     """Scores of the models on all matches, or on the `subset` (P, K) of them, in tiles of bounded size.
 
-    valid: which models are some, first those; the others score minus infinity.
+    valid: False for slots that hold no model, which must stand last in each pair; they score minus infinity.
     Memory: eight buffers of one tile. Models are float32 in normalised units, as are the points.
     """
     weight = problem.prior if score.prior_weighted and problem.prior is not None else problem.live
