@@ -20,7 +20,7 @@ from torch import Tensor
 from fmtorch.estimators.choice import SaturatedGain, best_of
 from fmtorch.estimators.problem import Problem
 from fmtorch.geometry.rank2 import complement
-from fmtorch.geometry.rank2_manifold import start, total, unit
+from fmtorch.geometry.rank2_manifold import start, unit
 from fmtorch.geometry.reduce import component_sum
 from fmtorch.geometry.robust_kernels import KERNELS
 from fmtorch.geometry.sampson_objective import Objective
@@ -148,9 +148,9 @@ class _Objective:
             ]
         ).flatten(1, 2)  # fmt: skip
         H, g = products[:9, :9], products[:9, 9]
-        along = total((tangents[:, :, None] * H).transpose(0, 1))  # (7, 9)
-        hessian = total((along[:, None] * tangents).movedim(2, 0)) * self.precision
-        gradient = total((tangents * g).transpose(0, 1)) * self.precision
+        along = component_sum((tangents[:, :, None] * H).transpose(0, 1))  # (7, 9)
+        hessian = component_sum((along[:, None] * tangents).movedim(2, 0)) * self.precision
+        gradient = component_sum((tangents * g).transpose(0, 1)) * self.precision
         hessian[5:, 5:] += prior_hessian[..., None, None]
         gradient[5:] += prior_gradient
         return _State(U, V, focal, F.flatten(0, 1), cost, gradient, hessian)
@@ -191,9 +191,9 @@ def _moved(state: _State, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def _rotated(U: Tensor, angle: Float[Tensor, "3 p k"]) -> Tensor:
     """``U R`` with the rotation by twice the angle whose tangent is half of `angle`, about its direction (Cayley)."""
     x, y, z = c = angle / 2
-    n = total(c * c)
+    n = component_sum(c * c)
     crossed = torch.stack([z * U[:, 1] - y * U[:, 2], x * U[:, 2] - z * U[:, 0], y * U[:, 0] - x * U[:, 1]], 1)
-    along = total(U * c, 1)
+    along = component_sum(U * c, 1)
     # U (I + 2 / (1 + n) ([c]x + [c]x^2)), and [c]x^2 = c c^T - n I.
     rotated: Tensor = U + 2 / (1 + n) * (crossed + along[:, None] * c - n * U)
     return rotated
