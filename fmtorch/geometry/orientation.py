@@ -24,5 +24,5 @@ def consistently_oriented(F: Float[Tensor, " 9 *s"], points: Float[Tensor, " 4 n
     x0, y0, x1, y1 = points
     a, b = f[0, 0] * x0 + f[0, 1] * y0 + f[0, 2], f[1, 0] * x0 + f[1, 1] * y0 + f[1, 2]
     agreement = a * (ey - ez * y1) + b * (ez * x1 - ex)
-    same: Tensor = (agreement.amin(0) > 0) | (agreement.amax(0) < 0)
-    return same
+    one_sided: Tensor = (agreement.amin(0) > 0) | (agreement.amax(0) < 0)
+    return one_sided
