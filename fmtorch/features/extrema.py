@@ -85,11 +85,19 @@ def _quadratic(v: Float[Tensor, "27 m"]) -> tuple[Tensor, Tensor, Tensor]:
     c = cube[1, 1, 1]
     gs, gy, gx = (
         0.5 * (high - low)
-        for low, high in ((cube[0, 1, 1], cube[2, 1, 1]), (cube[1, 0, 1], cube[1, 2, 1]), (cube[1, 1, 0], cube[1, 1, 2]))
+        for low, high in (
+            (cube[0, 1, 1], cube[2, 1, 1]),
+            (cube[1, 0, 1], cube[1, 2, 1]),
+            (cube[1, 1, 0], cube[1, 1, 2]),
+        )
     )
     ss, yy, xx = (
         2 * c - low - high
-        for low, high in ((cube[0, 1, 1], cube[2, 1, 1]), (cube[1, 0, 1], cube[1, 2, 1]), (cube[1, 1, 0], cube[1, 1, 2]))
+        for low, high in (
+            (cube[0, 1, 1], cube[2, 1, 1]),
+            (cube[1, 0, 1], cube[1, 2, 1]),
+            (cube[1, 1, 0], cube[1, 1, 2]),
+        )
     )
     sy = -0.25 * (cube[2, 2, 1] - cube[2, 0, 1] - cube[0, 2, 1] + cube[0, 0, 1])
     sx = -0.25 * (cube[2, 1, 2] - cube[2, 1, 0] - cube[0, 1, 2] + cube[0, 1, 0])

@@ -74,7 +74,7 @@ class OpenCVFilters:
             largest = np.maximum(cv2.dilate(values[top:bottom], square)[y - top : y - top + STRIP], threshold)
             strip = values[y : y + STRIP]
             yx = np.argwhere((strip >= largest) & (strip > threshold))
-            found.append(yx + [y, 0])
+            found.append(yx + np.array([y, 0]))
         yx = torch.from_numpy(np.concatenate(found))
         return torch.cat([torch.zeros_like(yx[:, :1]), yx], 1)
 

@@ -21,6 +21,7 @@ WINDOW = CELLS / 2  # cells, sigma of the Gaussian window; Lowe, section 6.1
 CLIP = 0.2  # largest entry of the normalised histogram; Lowe, section 6.1
 SMOOTHING = 1.0  # keypoint sigmas, the blur at which gradients are taken: that of the level of detection
 PATCH_BLUR = 0.75  # pixels, the blur that patches have from the pyramid
+FLAT = 1e-6  # gradients below are the rounding of float32 intensities
 CHUNK = 64  # patches worked on together: their histograms fit a core's cache
 
 
@@ -58,7 +59,8 @@ def sift_of_patches(patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n 128
     for part in patches[:, 0].split(CHUNK):
         gx = across @ part @ along.T
         gy = along @ part @ across.T
-        magnitude = (gx * gx + gy * gy).sqrt().flatten(1)
+        squared = (gx * gx + gy * gy).flatten(1)
+        magnitude = torch.where(squared > FLAT * FLAT, squared, 0.0).sqrt()
         position = (torch.atan2(-gy, gx) * (DIRECTIONS / (2 * math.pi))).flatten(1)
         lower = position.floor()
         upper_weight = (position - lower) * magnitude

@@ -44,7 +44,7 @@ class RootSIFTPCA:
 
 
 def project(
-    descriptors: Float[Tensor, "n 128"], mean: Float[Tensor, "128"], basis: Float[Tensor, "128 d"], power: float
+    descriptors: Float[Tensor, "n 128"], mean: Float[Tensor, 128], basis: Float[Tensor, "128 d"], power: float
 ) -> Float[Tensor, "n d"]:
     """Centred, projected, signed power of each entry, unit length."""
     projected = (descriptors - mean) @ basis
@@ -53,7 +53,7 @@ def project(
 
 def learn_projection(
     descriptors: Float[Tensor, "n 128"], dimensions: int = DIMENSIONS
-) -> tuple[Float[Tensor, "128"], Float[Tensor, "128 d"]]:
+) -> tuple[Float[Tensor, 128], Float[Tensor, "128 d"]]:
     """Mean and the `dimensions` principal axes of descriptors, largest variance first; the largest entry positive."""
     x = descriptors.double()
     mean = x.mean(0)
@@ -64,7 +64,7 @@ def learn_projection(
 
 
 @functools.lru_cache(maxsize=8)
-def load_projection(path: Path) -> tuple[Float[Tensor, "128"], Float[Tensor, "128 d"]]:
+def load_projection(path: Path) -> tuple[Float[Tensor, 128], Float[Tensor, "128 d"]]:
     """Mean and basis of a learned file. Raises FileNotFoundError and ValueError that say how to make it."""
     remedy = "make it with `python scripts/learn_pca.py`"
     if not path.is_file():
@@ -75,5 +75,7 @@ def load_projection(path: Path) -> tuple[Float[Tensor, "128"], Float[Tensor, "12
     except (KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path}: no file with `mean` and `basis` ({error}); {remedy}") from error
     if mean.shape != (128,) or basis.dim() != 2 or len(basis) != 128:
-        raise ValueError(f"{path}: mean {tuple(mean.shape)}, basis {tuple(basis.shape)} must be (128,), (128, D); {remedy}")
+        raise ValueError(
+            f"{path}: mean {tuple(mean.shape)}, basis {tuple(basis.shape)} must be (128,), (128, D); {remedy}"
+        )
     return mean, basis

@@ -17,6 +17,7 @@ from torch import Tensor
 from fmtorch.features.frames import FRAME_SIGMAS
 from fmtorch.types import Features
 
+
 @dataclasses.dataclass(frozen=True)
 class SIFT:
     """Detects DoG keypoints and describes them by SIFT (Lowe, IJCV 2004); an instance may be used by several threads.

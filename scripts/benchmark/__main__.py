@@ -9,13 +9,14 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import estimators
+import features
 import matching
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="scripts/benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    for module in (estimators, matching):
+    for module in (estimators, features, matching):
         module.add_arguments(commands)
     arguments = parser.parse_args()
     arguments.run(arguments)

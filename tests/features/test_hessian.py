@@ -99,9 +99,9 @@ def test_small_and_constant_images(shape: tuple[int, int], constant: bool) -> No
     assert HessianDetector().detect_batch(torch.from_numpy(image)[None, None].float() / 255)[0].shape[1] == len(scores)
 
 
-@pytest.mark.parametrize("image", [np.zeros((0, 5), np.uint8), np.zeros((5, 5, 4), np.uint8), np.zeros((5, 5))])
+@pytest.mark.parametrize("image", [np.zeros((0, 5), np.uint8), np.zeros((5, 5, 4), np.uint8), np.zeros(5, np.uint8)])
 def test_what_is_no_image_is_refused(image: np.ndarray) -> None:
-    with pytest.raises((ValueError, Exception), match="uint8|dtype"):
+    with pytest.raises(ValueError, match="uint8"):
         HessianDetector().detect(image)
 
 
