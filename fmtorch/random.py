@@ -15,6 +15,7 @@ class Stream(enum.IntEnum):
     SAMPLING = 1
     PRESELECTION = 2
     METRIC = 3
+    TRAINING = 4
 
 
 def _wrap(value: int) -> int:
