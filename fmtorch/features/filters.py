@@ -83,12 +83,13 @@ class TorchFilters:
     """`Filters` for a batch on its device."""
 
     def blur(self, image: Float[Tensor, "b h w"], sigma: float) -> Float[Tensor, "b h w"]:
-        kernel = gaussian_kernel(sigma).to(image.device)
-        radius = len(kernel) // 2
-        padded = F.pad(image[:, None], (radius, radius, 0, 0), mode="replicate")
-        rows = F.conv2d(padded, kernel[None, None, None, :])
-        columns = F.conv2d(F.pad(rows, (0, 0, radius, radius), mode="replicate"), kernel[None, None, :, None])
-        return columns[:, 0]
+        # Tap by tap: a convolution's rounding depends on the batch.
+        kernel = gaussian_kernel(sigma).tolist()
+        radius, (_, h, w) = len(kernel) // 2, image.shape
+        padded = F.pad(image[:, None], (radius, radius, 0, 0), mode="replicate")[:, 0]
+        rows = sum((k * padded[:, :, i : i + w] for i, k in enumerate(kernel)), torch.zeros_like(image))
+        padded = F.pad(rows[:, None], (0, 0, radius, radius), mode="replicate")[:, 0]
+        return sum((k * padded[:, i : i + h] for i, k in enumerate(kernel)), torch.zeros_like(image))
 
     def hessian_determinant(self, image: Float[Tensor, "b h w"], out: Float[Tensor, "b h w"]) -> None:
         middle = image[:, 1:-1, 1:-1]

@@ -39,7 +39,7 @@ class PatchSIFT:
     sizes: int = 1
 
     def __call__(self, pyramid: ImagePyramid, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 128"]:
-        """Descriptors of unit length; zeros for a frame without gradient. Entry (4 y + x) 8 + direction, as OpenCV's."""
+        """Descriptors of unit length; zeros for a frame without gradient. In OpenCV's order."""
         total = lafs.new_zeros(len(lafs), CELLS * CELLS * DIRECTIONS)
         for size in torch.linspace(self.smallest, self.largest, self.sizes).tolist():
             scaled = torch.cat([lafs[..., :2] * (EXTENT * size), lafs[..., 2:]], -1)
@@ -51,8 +51,8 @@ class PatchSIFT:
 def sift_of_patches(patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n 128"]:
     """SIFT of patches that cover `EXTENT` frames: gradients of the blurred patch vote, weighted by a Gaussian window.
 
-    Each gradient votes for the two nearest directions, counted counter-clockwise on the screen from the patch's x axis, and the four
-    nearest cells; the histogram is normalised, clipped and normalised again.
+    Each gradient votes for the two nearest directions and the four nearest cells; the histogram is normalised, clipped
+    and normalised again. Entry (4 y + x) 8 + d is cell (x, y), direction 45 d degrees counter-clockwise on the screen.
     """
     pooling, along, across = _matrices(patches.device)
     parts = []

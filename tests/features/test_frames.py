@@ -140,7 +140,7 @@ def test_authors_networks_give_the_stored_frames() -> None:
         turned = torch.from_numpy(file["laf_oriented"][chosen]).float()
         # Through kornia's patches, the stored frames. Entries of up to 100 px in float32 through a network.
         torch.testing.assert_close(NetworkShape(shape)(KorniaPyramid(image), lafs), stored, atol=5e-3, rtol=1e-3)
-        oriented = NetworkOrientation(orientation)(KorniaPyramid(image), lafs)
+        oriented = NetworkOrientation(orientation)(KorniaPyramid(image), stored)
         torch.testing.assert_close(oriented, turned, atol=5e-3, rtol=1e-3)
         # Through ours, which are blurred otherwise, nearly so.
         found = NetworkShape(shape)(ImagePyramid(image), lafs)
