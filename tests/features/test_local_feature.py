@@ -20,6 +20,8 @@ from fmtorch.features import (
     local_feature,
 )
 from fmtorch.matching import NearestNeighborMatcher
+from fmtorch.storage.cache import ArrayCache
+from fmtorch.storage.features import CachedFeatures
 from fmtorch.types import Features
 from tests.features.scenes import texture
 
@@ -158,6 +160,8 @@ def test_networks_are_read_when_first_used(tmp_path: Path) -> None:
     extract = local_feature("hessian", {"name": "hardnet", "network": str(missing)}, shape=None)
     with pytest.raises(ValueError, match=r"mine\.onnx.*export_onnx"):
         extract(texture(4))
+    with pytest.raises(ValueError, match=r"mine\.onnx.*export_onnx"):
+        CachedFeatures(extract, ArrayCache(tmp_path))
 
 
 def test_hesaffnet_runs_through_onnx(tmp_path: Path) -> None:
@@ -181,6 +185,10 @@ def test_hesaffnet_runs_through_onnx(tmp_path: Path) -> None:
     assert torch.isfinite(found.lafs).all()
     same_in_torch = LocalFeature(extract.detector, NetworkDescriptor(random_network(1, 128)))
     described = same_in_torch.describe(texture(5), found.lafs)
+    kept = CachedFeatures(extract, ArrayCache(tmp_path / "cache"))
+    for _ in range(2):  # computed, then found
+        assert same(kept(texture(5)), found)
+    assert (kept.computed, kept.found) == (1, 1)
     torch.testing.assert_close(found.descriptors, described, atol=1e-4, rtol=0)
 
 
