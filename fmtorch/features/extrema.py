@@ -33,7 +33,7 @@ def refined_maxima(volume: Float[Tensor, "b s h w"], seeds: Int[Tensor, "m 4"], 
     it leaves the volume, does not settle, the quadratic has no maximum, or its value is at most `threshold`. Of those
     that end at one sample one remains.
     """
-    chunks = [_refine(volume, part) for part in seeds.split(CHUNK)] or [_refine(volume, seeds)]
+    chunks = [_refine(volume, part) for part in torch.split(seeds, CHUNK)] or [_refine(volume, seeds)]
     at, offset, value = (torch.cat(parts) for parts in zip(*chunks, strict=True))
     kept = value > threshold
     at, offset, value = at[kept], offset[kept], value[kept]

@@ -75,8 +75,8 @@ class OpenCVFilters:
             strip = values[y : y + STRIP]
             yx = np.argwhere((strip >= largest) & (strip > threshold))
             found.append(yx + np.array([y, 0]))
-        yx = torch.from_numpy(np.concatenate(found))
-        return torch.cat([torch.zeros_like(yx[:, :1]), yx], 1)
+        places = torch.from_numpy(np.concatenate(found))
+        return torch.cat([torch.zeros_like(places[:, :1]), places], 1)
 
 
 class TorchFilters:

@@ -59,7 +59,7 @@ def dominant_gradient(patches: Float[Tensor, "n 1 p p"]) -> Float[Tensor, " n"]:
     Sobel gradients, weighted by a Gaussian window, vote for the two nearest of `BINS` directions; the smoothed
     histogram's highest peak is refined by a parabola. A patch without gradient gives pi.
     """
-    histograms = [_histogram(part) for part in patches.split(CHUNK)]
+    histograms = [_histogram(part) for part in torch.split(patches, CHUNK)]
     smooth = _smoothed(torch.cat(histograms) if histograms else patches.new_zeros(0, BINS))
     value, peak = smooth.max(1)
     left, right = (smooth.gather(1, ((peak + step) % BINS)[:, None])[:, 0] for step in (-1, 1))

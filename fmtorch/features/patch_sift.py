@@ -56,7 +56,7 @@ def sift_of_patches(patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n 128
     """
     pooling, along, across = _matrices(patches.device)
     parts = []
-    for part in patches[:, 0].split(CHUNK):
+    for part in torch.split(patches[:, 0], CHUNK):
         gx = across @ part @ along.T
         gy = along @ part @ across.T
         squared = (gx * gx + gy * gy).flatten(1)
