@@ -71,7 +71,7 @@ def objective_of(config: DictConfig, device: torch.device) -> Objective:
 def set_pixel_mean(network: nn.Module, store: PatchStore) -> None:
     """L2-Net's mean patch, from training patches spread evenly over the store."""
     if hasattr(network, "pixel_mean"):
-        some = torch.from_numpy(store.patches[:: max(1, len(store.patches) // 20000)])
+        some = torch.from_numpy(store.patches[:: max(1, len(store.patches) // 20000)].copy())
         network.pixel_mean.copy_(middle(some, PATCH_SIZE).float().mean(0) / 255)
 
 

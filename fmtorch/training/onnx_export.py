@@ -55,7 +55,7 @@ def check(network: nn.Module, path: Path, patches: Float[Tensor, "n 1 32 32"]) -
 
 
 def quantize(source: Path, path: Path, patches: Float[Tensor, "n 1 32 32"]) -> None:
-    """An int8 network (QDQ, weights per channel, convolutions only) calibrated on real patches (n, 1, 32, 32)."""
+    """An int8 network (QDQ, weights per channel, convolutions with their ReLU) calibrated on real patches (n, 1, 32, 32)."""
     from onnxruntime.quantization import (
         CalibrationDataReader,
         CalibrationMethod,
@@ -78,7 +78,7 @@ def quantize(source: Path, path: Path, patches: Float[Tensor, "n 1 32 32"]) -> N
         quant_pre_process(str(source), str(prepared), skip_symbolic_shape=True)
         quantize_static(
             str(prepared), str(unfinished), Reader(), quant_format=QuantFormat.QDQ, per_channel=True,
-            activation_type=QuantType.QUInt8, weight_type=QuantType.QInt8, op_types_to_quantize=["Conv"],
+            activation_type=QuantType.QUInt8, weight_type=QuantType.QInt8, op_types_to_quantize=["Conv", "Relu"],
             calibrate_method=CalibrationMethod.MinMax,
         )  # fmt: skip
     unfinished.replace(path)

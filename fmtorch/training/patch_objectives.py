@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -21,6 +21,7 @@ DRAWS = 6
 """Random numbers in [0, 1) that an objective gets for each point."""
 
 
+@runtime_checkable
 class Objective(Protocol):
     """A loss of a network on pairs of patches with their surroundings, and its figures on validation pairs."""
 

@@ -104,7 +104,8 @@ def test_a_corrupt_file_is_named(hardnet: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("shape", "out"), [
-    (["n", 1, 64, 64], ["n", 4096]), (["n", 3, 32, 32], ["n", 3072]), ([5, 1, 32, 32], [5, 1024]), (["n", 1024], ["n", 1024]),
+    (["n", 1, 64, 64], ["n", 4096]), (["n", 3, 32, 32], ["n", 3072]),
+    ([5, 1, 32, 32], [5, 1024]), (["n", 1024], ["n", 1024]),
 ])  # fmt: skip
 def test_a_network_of_another_shape_is_named(shape: list[object], out: list[object], tmp_path: Path) -> None:
     inputs = helper.make_tensor_value_info("x", TensorProto.FLOAT, shape)

@@ -62,6 +62,7 @@ def test_hessian_finds_blobs_with_their_scale() -> None:
 
 @pytest.mark.parametrize("detect", [dog_keypoints, hessian_keypoints])
 def test_keypoints_turn_with_the_image(grey: np.ndarray, detect: object) -> None:
+    grey = np.ascontiguousarray(grey[:257, :385])  # so that halving keeps the same pixels after the turn
     before, after = detect(grey, 300), detect(np.ascontiguousarray(np.rot90(grey, -1)), 300)  # type: ignore[operator]
     # clockwise: (x, y) -> (h - 1 - y, x), angles (x towards y) grow by 90 degrees
     moved = np.c_[grey.shape[0] - 1 - before[:, 1], before[:, 0]]
@@ -74,8 +75,8 @@ def test_keypoints_turn_with_the_image(grey: np.ndarray, detect: object) -> None
 def test_patches_of_a_turned_image_are_the_same(grey: np.ndarray) -> None:
     points = np.array([[200.0, 150, 3, 0.4], [260, 120, 9, -2]])
     turned = np.c_[grey.shape[0] - 1 - points[:, 1], points[:, 0], points[:, 2], points[:, 3] + math.pi / 2]
-    a = cut(grey, points, 64, 12)
-    b = cut(np.ascontiguousarray(np.rot90(grey, -1)), turned, 64, 12)
+    a = cut(grey, points, 64, 12.0)
+    b = cut(np.ascontiguousarray(np.rot90(grey, -1)), turned, 64, 12.0)
     assert np.abs(a.astype(int) - b).mean() < 2
     assert a.std() > 10
 
@@ -141,7 +142,7 @@ def test_photographs_are_split_by_source(tmp_path: Path) -> None:
     train, validation = split(found, ["a"])
     assert {p.source for p in train} == {"b", "4.jpg"}
     assert {p.path.name for p in validation} == {"1.jpg", "2.png"}
-    with pytest.raises(ValueError, match="held_out names c; the sources are 4.jpg, a, b"):
+    with pytest.raises(ValueError, match=r"held_out names c; the sources are 4\.jpg, a, b"):
         split(found, ["c"])
     with pytest.raises(ValueError, match="both sides"):
         split(found, ["a", "b", "4.jpg"])
