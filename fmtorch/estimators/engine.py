@@ -16,20 +16,11 @@ from torch import Tensor
 from fmtorch import random
 from fmtorch.estimators.batching import solve_all
 from fmtorch.estimators.choice import best_of
-from fmtorch.estimators.compiled import CompiledSolver, compiled_score
+from fmtorch.estimators.compiled import compiled
 from fmtorch.estimators.degeneracy import CANDIDATES, DEGENERACIES, Degensac
 from fmtorch.estimators.final_fits import FINAL_FITS
 from fmtorch.estimators.local_optimization import LOCAL_OPTIMIZATIONS
-from fmtorch.estimators.parts import (
-    CHOICES,
-    INLIER_RULES,
-    SAMPLERS,
-    SCORES,
-    SOLVERS,
-    Refinement,
-    Solver,
-    part,
-)
+from fmtorch.estimators.parts import CHOICES, INLIER_RULES, SAMPLERS, SCORES, SOLVERS, Refinement, part
 from fmtorch.estimators.problem import Problem
 from fmtorch.estimators.sampling import PriorWeighted
 from fmtorch.estimators.scoring import sampson_squared, score_models
@@ -75,8 +66,9 @@ class HypothesizeAndVerify:
     final: `least_squares` (8-point on the inliers), `gauss_newton` (one attached step), `adaptive` (refined at the
     scale of the pair's own noise, with an attached step) or `none`.
     refit_inliers: recompute the inliers after the final fit.
-    compile: build the minimal solver and the score with torch.compile, for long runs: the first calls take some tens of
-    seconds and need a C++ compiler (RuntimeError where there is none).
+    compile: build the score with torch.compile, for long runs: the first calls take some ten seconds each and need a
+    C++ compiler (RuntimeError where there is none). Scores, and so estimates, may differ from those without. That they
+    have the same bits in any batch is by construction, but depends on the compiler: it is tested of the score alone.
 
     Memory: for a batch of pairs of N matches, the points (48 N bytes a pair), the samples of 2^14 draws (about 40 MB)
     and eight buffers of one scoring tile (1 MB each); on a GPU 2^21 draws and 256 MB a buffer.
@@ -114,11 +106,11 @@ class HypothesizeAndVerify:
             raise ValueError(f"hypotheses={hypotheses}, round={round}: both must be at least 1")
         if confidence is not None and not 0 < confidence < 1:
             raise ValueError(f"confidence is {confidence}; it is a probability between 0 and 1, or null")
-        self.solver: Solver = part("solver", solver, SOLVERS)()
+        self.solver = part("solver", solver, SOLVERS)()
         self.sampler = part("sampler", sampler, SAMPLERS)()
         self.score = part("score", score, SCORES)(threshold)
         if compile:
-            self.solver, self.score = CompiledSolver(self.solver), compiled_score(self.score)
+            self.score = compiled(self.score)
         self.inlier_threshold = threshold if inlier_threshold is None else inlier_threshold
         self.hypotheses, self.confidence = hypotheses, confidence
         self.round = round if confidence is not None else max(round, UNSTOPPED_ROUND)
