@@ -3,6 +3,7 @@
 from fmtorch.pruning.code import CODE, Coherence, LikelihoodField, SmoothMotion, code, coherence
 from fmtorch.pruning.frame_consistency import FrameConsistency, frame_agreement
 from fmtorch.pruning.gms import GMS, gms
+from fmtorch.pruning.likely import Likely
 from fmtorch.pruning.lpm import LPM, lpm
 from fmtorch.pruning.mutual import mutual
 from fmtorch.pruning.one_to_one import OneToOne, one_to_one
@@ -15,6 +16,7 @@ __all__ = [
     "Coherence",
     "FrameConsistency",
     "LikelihoodField",
+    "Likely",
     "OneToOne",
     "RatioTest",
     "SmoothMotion",

@@ -10,12 +10,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import estimators
 import matching
+import pruning
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="scripts/benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    for module in (estimators, matching):
+    for module in (estimators, matching, pruning):
         module.add_arguments(commands)
     arguments = parser.parse_args()
     arguments.run(arguments)
