@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
-from typing import Literal, NamedTuple
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from fmtorch.pruning.calibration import calibration_of
 from fmtorch.types import Correspondences
 
 GRID = 20  # cells a side in image 0
@@ -20,6 +21,7 @@ _GRIDS = (20, 10, 14, 28, 40)
 # moves the ring on by one.
 _RING = ((-1, -1), (0, -1), (1, -1), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (0, 0))
 _TABLE_CPU, _TABLE_GPU = 2**22, 2**28  # entries of the table of moves that are in memory at a time
+_HALF_SUPPORT = 1.5  # the score, in square roots of the mean, whose support is one half
 
 Border = Literal["opencv", "authors"]
 
@@ -49,24 +51,62 @@ def gms(
     cells of shifted grids. Time and memory are linear in the number of matches, besides a table of cell pairs whose
     size is bounded.
     """
+    grids, turns = _GRIDS if with_scale else _GRIDS[:1], 8 if with_rotation else 1
     kept = torch.zeros(x0.shape[:2], dtype=torch.bool, device=x0.device)
-    grids = _GRIDS if with_scale else _GRIDS[:1]
-    turns = 8 if with_rotation else 1
+    for moves, place in _blocks(x0, x1, size0, size1, mask, grids, border):
+        table = _tabulated(moves)
+        bits = _standing(table, moves, turns, threshold_factor)
+        kept.view(-1)[place] = _kept(bits, _winner(bits, moves, turns), moves, turns)
+    return kept
+
+
+def gms_support(
+    x0: Float[Tensor, "b n 2"],
+    x1: Float[Tensor, "b n 2"],
+    *,
+    size0: Int[Tensor, "b 2"],
+    size1: Int[Tensor, "b 2"],
+    mask: Bool[Tensor, "b n"] | None = None,
+    with_rotation: bool = False,
+    with_scale: bool = False,
+    threshold_factor: float = 6.0,
+    border: Border = "opencv",
+) -> Float[Tensor, "b n"]:
+    """How many neighbours move with each match, against how many would suffice by the square root; in [0, 1).
+
+    In each of the four grids, ``z = (score - 1) / sqrt(mean matches of the nine cells)``, where the score counts the
+    matches, itself included, of the nine cells around that go where the match's own cells say: the paper's S_i for each
+    match instead of for the assignment of its cell. The support is ``z / (z + 1.5)`` of the mean z over the grids; 0
+    for a match that is alone, outside or masked. Rotation and scale are those of the hypothesis that keeps most matches
+    of the pair in `gms`, whose arguments these are.
+    """
+    grids, turns = _GRIDS if with_scale else _GRIDS[:1], 8 if with_rotation else 1
+    support = torch.zeros(x0.shape[:2], dtype=x0.dtype, device=x0.device)
+    for moves, place in _blocks(x0, x1, size0, size1, mask, grids, border):
+        table = _tabulated(moves)
+        winner = torch.zeros(moves.pairs, dtype=torch.int64, device=x0.device)
+        if len(grids) * turns > 1:
+            winner = _winner(_standing(table, moves, turns, threshold_factor), moves, turns)
+        z = _own_support(table, moves, winner, turns)
+        support.view(-1)[place] = (z / (z + _HALF_SUPPORT)).to(support.dtype)
+    return support
+
+
+def _blocks(
+    x0: Tensor, x1: Tensor, size0: Tensor, size1: Tensor, mask: Tensor | None, grids: tuple[int, ...], border: Border
+) -> Iterator[tuple[_Moves, Int[Tensor, " m"]]]:
+    """The moves of as many pairs at a time as the table may hold, and the places of their matches in (B * N)."""
     p0, p1 = _normalized(x0, size0), _normalized(x1, size1)
     alive = _inside_unit(p0) & _inside_unit(p1)
     alive = alive if mask is None else alive & mask
     entries = 4 * _CELLS * sum(g * g for g in grids)
     pairs = max(1, (_TABLE_CPU if x0.device.type == "cpu" else _TABLE_GPU) // entries)
     for start in range(0, len(x0), pairs):
-        block = slice(start, start + pairs)
-        pair, match = alive[block].nonzero().unbind(-1)
+        block = alive[start : start + pairs]
+        pair, match = block.nonzero().unbind(-1)
         place = (start + pair) * x0.shape[1] + match
         points0, points1 = (p.flatten(1).index_select(1, place) for p in (p0, p1))
-        line = _lines(points0, pair, border)
-        end = _cells(points1, grids)
-        moves = _Moves(line, end, pair, len(alive[block]), grids)
-        kept[start + pair, match] = _consistent(moves, turns, threshold_factor)
-    return kept
+        yield _Moves(_lines(points0, pair, border), _cells(points1, grids), pair, len(block), grids), place
 
 
 def _normalized(x: Tensor, size: Tensor) -> Float[Tensor, "2 b n"]:
@@ -120,34 +160,50 @@ class _Moves(NamedTuple):
         return cells.cumsum(0) * (self.lines + 1)
 
 
-def _consistent(moves: _Moves, turns: int, factor: float) -> Bool[Tensor, " m"]:
-    """Which of the M matches the winning hypothesis of their pair keeps."""
-    s, lines, device = len(moves.grids), moves.lines, moves.line.device
+class _Table(NamedTuple):
+    """How many matches go from each line to each cell; `filled`: from each line, the spare one included.
+
+    slot (S * 4 * M): where each match is counted. The last entry of `moves` stays zero.
+    """
+
+    moves: Int[Tensor, " t"]
+    filled: Int[Tensor, " lines"]
+    line: Int[Tensor, "4 m"]
+    slot: Int[Tensor, " sm"]
+
+
+def _tabulated(moves: _Moves) -> _Table:
+    lines, device = moves.lines, moves.line.device
     line = torch.where(moves.line >= 0, moves.line, lines)
     filled = torch.zeros(lines + 1, dtype=torch.int64, device=device)
     filled.scatter_add_(0, line.flatten(), torch.ones_like(line).flatten())
 
     cells = torch.tensor([g * g for g in moves.grids], device=device)[:, None, None]
-    slot = (line * cells + (moves.origins()[:, None] + moves.end)[:, None]).flatten()  # (S * 4 * M)
+    slot = (line * cells + (moves.origins()[:, None] + moves.end)[:, None]).flatten()
     counted = torch.int16 if len(moves.pair) < 2**15 else torch.int32
-    table = torch.zeros((lines + 1) * int(cells.sum()) + 1, dtype=counted, device=device)  # the last entry stays zero
+    table = torch.zeros((lines + 1) * int(cells.sum()) + 1, dtype=counted, device=device)
     table.scatter_add_(0, slot, torch.ones_like(slot, dtype=counted))
+    return _Table(table, filled, line, slot)
 
+
+def _standing(table: _Table, moves: _Moves, turns: int, factor: float) -> UInt8[Tensor, "s m"]:
+    """The rotations, as bits, under which a match follows an assignment that stands, for each grid of image 1."""
+    s, lines, line, device = len(moves.grids), moves.lines, table.line, moves.line.device
     # The cell of image 1 that most matches of a line go to: largest count, then lowest cell.
     base = max(moves.grids) ** 2
-    merit = table.gather(0, slot).long().reshape(s, -1) * base + (base - 1 - moves.end.repeat(1, 4))
+    merit = table.moves.gather(0, table.slot).long().reshape(s, -1) * base + (base - 1 - moves.end.repeat(1, 4))
     best = torch.zeros(s, lines + 1, dtype=torch.int64, device=device)
     best.scatter_reduce_(1, line.reshape(1, -1).expand(s, -1), merit, "amax")
     best = base - 1 - best.remainder(base)
 
-    grid, occupied = (filled[:-1] > 0).expand(s, -1).nonzero().unbind(-1)
+    grid, occupied = (table.filled[:-1] > 0).expand(s, -1).nonzero().unbind(-1)
     verdict = torch.zeros_like(best)  # best cell and, in the low byte, bit k: the assignment stands under rotation k
     verdict[grid, occupied] = best[grid, occupied] * 256 + _verify(
-        table, filled, moves, grid, occupied, best[grid, occupied], turns, factor
+        table.moves, table.filled, moves, grid, occupied, best[grid, occupied], turns, factor
     )
     found = verdict.gather(1, line.reshape(1, -1).expand(s, -1)).reshape(s, *line.shape)
     bits = torch.where(found >> 8 == moves.end[:, None], found & 255, 0).to(torch.uint8)
-    return _winner(bits[:, 0] | bits[:, 1] | bits[:, 2] | bits[:, 3], moves, turns)
+    return bits[:, 0] | bits[:, 1] | bits[:, 2] | bits[:, 3]
 
 
 def _verify(
@@ -192,29 +248,79 @@ def _around(cell: Tensor, side: Tensor, ring: Tensor) -> tuple[Tensor, Tensor]:
     return inside, ring[1] * side + ring[0]
 
 
-def _winner(bits: UInt8[Tensor, "s m"], moves: _Moves, turns: int) -> Bool[Tensor, " m"]:
-    """What the hypothesis (grid, bit) that keeps most matches of a pair keeps, the first of equals."""
+def _winner(bits: UInt8[Tensor, "s m"], moves: _Moves, turns: int) -> Int[Tensor, " pairs"]:
+    """The hypothesis, grid * turns + turn, that keeps most matches of each pair, the first of equals."""
     hypotheses = torch.stack([(row >> turn) & 1 for row in bits for turn in range(turns)], 1)  # (M, S * turns)
-    if hypotheses.shape[1] == 1:
-        return hypotheses[:, 0].bool()
     counts = torch.zeros(moves.pairs, hypotheses.shape[1], dtype=torch.int32, device=bits.device)
     counts.index_add_(0, moves.pair, hypotheses.int())
-    return hypotheses.gather(1, counts.argmax(1)[moves.pair][:, None])[:, 0].bool()
+    return counts.argmax(1)
 
 
-@dataclasses.dataclass(frozen=True)
+def _kept(bits: UInt8[Tensor, "s m"], winner: Int[Tensor, " pairs"], moves: _Moves, turns: int) -> Bool[Tensor, " m"]:
+    """What the winning hypothesis of its pair says of each match."""
+    chosen = winner[moves.pair]
+    row = bits.gather(0, torch.div(chosen, turns, rounding_mode="floor")[None])[0]
+    return ((row >> chosen.remainder(turns).to(torch.uint8)) & 1).bool()
+
+
+def _own_support(
+    table: _Table, moves: _Moves, winner: Int[Tensor, " pairs"], turns: int
+) -> Float[Tensor, " m"]:
+    """``(score - 1) / sqrt(mean)`` of each match's own cells under its pair's hypothesis, mean over the four grids."""
+    ring, partner = _neighbourhood(turns, str(moves.line.device))
+    chosen = winner[moves.pair]
+    grid, turn = torch.div(chosen, turns, rounding_mode="floor"), chosen.remainder(turns)
+    side = torch.tensor(moves.grids, device=chosen.device)[grid]
+    end = moves.end.gather(0, grid[None])[0]
+    inside1, step1 = (v.gather(0, partner[turn].T) for v in _around(end, side, ring))
+    total = torch.zeros(len(chosen), dtype=torch.float64, device=chosen.device)
+    for line in table.line:
+        inside0, step0 = _around(line.remainder(_CELLS), torch.full_like(line, GRID), ring)  # (9, M)
+        both = inside0 & inside1 & (line < moves.lines)
+        neighbour = torch.where(inside0 & (line < moves.lines), line + step0, line)
+        slot = torch.where(both, moves.origins()[grid] + neighbour * side * side + end + step1, len(table.moves) - 1)
+        score = table.moves.gather(0, slot.flatten()).reshape(slot.shape).sum(0)
+        count = torch.where(both, table.filled.gather(0, neighbour.flatten()).reshape(neighbour.shape), 0).sum(0)
+        mean = count.double() / both.sum(0).clamp_min(1)
+        total = total + (score - 1).clamp_min(0) / mean.clamp_min(1).sqrt()
+    return total / 4
+
+
 class GMS:
-    """`gms` as a stage. Raises ValueError for correspondences without image sizes."""
+    """`gms` as a stage, which may also supply ``prior``: P(inlier) from `gms_support`.
 
-    with_rotation: bool = False
-    with_scale: bool = False
-    threshold_factor: float = 6.0
-    border: Border = "opencv"
+    calibration: of the support, see `Calibration`; None: no prior. prune: False keeps every match and gives the prior
+    only; raises ValueError where there is no calibration then. The other options are those of `gms`. Raises ValueError
+    for correspondences without image sizes.
+    """
 
-    def __call__(self, correspondences: Correspondences) -> Correspondences:
-        """The same matches, of which only those survive that move with their neighbours."""
-        c = correspondences
+    def __init__(
+        self,
+        *,
+        with_rotation: bool = False,
+        with_scale: bool = False,
+        threshold_factor: float = 6.0,
+        border: Border = "opencv",
+        prune: bool = True,
+        calibration: Mapping[str, Mapping[str, float]] | None = None,
+    ) -> None:
+        self._options: dict[str, Any] = {
+            "with_rotation": with_rotation, "with_scale": with_scale,
+            "threshold_factor": threshold_factor, "border": border,
+        }  # fmt: skip
+        self.prune = prune
+        self.calibration = calibration_of("GMS", prune, calibration)
+
+    def __call__(self, c: Correspondences) -> Correspondences:
+        """The same matches, of which only those survive that move with their neighbours, or with a prior."""
+        soft = c if self.calibration is None else self.calibration(c, self.evidence(c))
+        return soft.keep(gms(**self._arguments(c))) if self.prune else soft
+
+    def evidence(self, c: Correspondences) -> Float[Tensor, "b n"]:
+        """What the prior is calibrated from: `gms_support`."""
+        return gms_support(**self._arguments(c))
+
+    def _arguments(self, c: Correspondences) -> dict[str, Any]:
         if c.size0 is None or c.size1 is None:
             raise ValueError("GMS needs `size0` and `size1`: its grids divide the images")
-        options = dataclasses.asdict(self)
-        return c.keep(gms(c.x0, c.x1, size0=c.size0, size1=c.size1, mask=c.mask, **options))
+        return {"x0": c.x0, "x1": c.x1, "size0": c.size0, "size1": c.size1, "mask": c.mask, **self._options}

@@ -74,8 +74,7 @@ def run(arguments: argparse.Namespace) -> None:
         runs.append({"machine": machine(), "rows": [], "speed": speed})
     merged = {
         "machine": [r["machine"] for r in runs],
-        "rows": sum((r["rows"] for r in runs), []),
-        "speed": sum((r["speed"] for r in runs), []),
+        **{part: [line for r in runs for line in r[part]] for part in ("rows", "speed")},
     }
     tables = pruning_table.tables(merged)
     for table in tables:

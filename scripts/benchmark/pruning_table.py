@@ -63,7 +63,7 @@ def tables(figures: dict[str, Any]) -> list[Sheet]:
     if figures["speed"]:
         names = list(figures["speed"][0])
         timings = [[str(line[name]) for name in names] for line in figures["speed"]]
-        sheets.append(Sheet("Milliseconds, one thread", names, timings))
+        sheets.append(Sheet("Milliseconds of processor time a pair, one thread", names, timings))
     return sheets
 
 
@@ -84,7 +84,7 @@ def _family(family: str, rows: list[dict[str, Any]], some: str, paper: dict[tupl
 
 
 def _intervals(rows: list[dict[str, Any]]) -> list[str]:
-    """The five figures with 95 % bootstrap intervals; recall over all pairs, the others over those that did not fail."""
+    """The figures with 95 % bootstrap intervals: recall over all pairs, the others over those that did not fail."""
     solved = [row for row in rows if row["ok"]]
 
     def shown(values: list[float], some: list[dict[str, Any]], form: str) -> str:
