@@ -82,7 +82,7 @@ def gms(
 def support(
     x0: np.ndarray, x1: np.ndarray, size0: tuple[int, int], size1: tuple[int, int], scale: float, turn: int
 ) -> list[float]:
-    """The mean over the shifted grids of (score - 1) / sqrt(mean) at each match's own cells, by one hypothesis."""
+    """The mean over the shifted grids of (score - 1) / sqrt(mean, at least 1) at each match's own cells, by one hypothesis."""
     p0, p1 = normalised(x0, size0), normalised(x1, size1)
     grid1 = int(GRID * scale)
     total = [0.0] * len(x0)
@@ -100,5 +100,5 @@ def support(
                 na, nb = (a[0] + dx, a[1] + dy), (b[0] + ex, b[1] + ey)
                 if min(*na, *nb) >= 0 and max(na) < GRID and max(nb) < grid1:
                     score, count, pairs = score + moves[na, nb], count + filled[na], pairs + 1
-            total[i] += max(score - 1, 0) / math.sqrt(count / pairs) / 4
+            total[i] += (score - 1) / math.sqrt(max(count / pairs, 1)) / 4
     return total
