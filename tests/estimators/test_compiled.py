@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import pytest
 import torch
 
@@ -18,6 +21,13 @@ def test_compiled_score_equals_the_eager_one_in_any_tile() -> None:
         require_compiler()
     except RuntimeError as error:
         pytest.skip(str(error))
+    # In a process of its own: the tests' checks of types cannot be compiled.
+    command = "from tests.estimators.test_compiled import check_compiled_score as check; check()"
+    done = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def check_compiled_score() -> None:
     problem = problems(collate([scene(i, 180) for i in range(3)]), 0, 8)[0][0]
     F = torch.randn(9, 3, 40, generator=torch.Generator().manual_seed(0)) * torch.logspace(-2, 0, 9)[:, None, None]
     points, weight, unit = problem.points.float(), problem.live.float(), problem.unit
