@@ -18,6 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import matched
 import numpy as np
 import torch
@@ -48,6 +49,7 @@ def add_arguments(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> None:
     items = matched.load(arguments)
     torch.set_num_threads(1)
+    cv2.setNumThreads(1)
     specs = [*arguments.estimators, *(read_specs(arguments.specs) if arguments.specs else [])]
     if not specs:
         raise SystemExit("name at least one estimator: --estimators or --specs")
@@ -89,15 +91,15 @@ def build(spec: str) -> Callable[[Correspondences, int], Estimate]:
 
 
 def measure(spec: str, items: list[Item], seeds: int) -> Result:
-    """NSGD (seeds, pairs) and milliseconds (seeds, pairs) of one estimator, one pair a call."""
+    """NSGD (seeds, pairs) and milliseconds of processor time (seeds, pairs) of one estimator, one pair a call."""
     estimator = build(spec)
     estimator(items[0][1], 0)  # not counted: lazy initialisation
     nsgd, milliseconds = np.ones((seeds, len(items))), np.zeros((seeds, len(items)))
     for seed in range(seeds):
         for i, (pair, c) in enumerate(track(items, f"{spec}, seed {seed}", console=console, transient=True)):
-            start = time.perf_counter()
+            start = time.process_time()
             estimate = estimator(c, seed)
-            milliseconds[seed, i] = 1e3 * (time.perf_counter() - start)
+            milliseconds[seed, i] = 1e3 * (time.process_time() - start)
             if bool(estimate.ok[0]):
                 F = torch.from_numpy(pair.F)[None]
                 nsgd[seed, i] = float(metrics.nsgd(F, estimate.F, c.size0, c.size1, key=c.keys))
@@ -160,7 +162,7 @@ def markdown(figures: dict[str, dict[str, dict[str, Any]]], pairs: list[ImagePai
         lines.append(f"| `{spec}` | {' | '.join(recalls)} | {whole['ms_median']:.1f} |")
     note = (
         "Recall at NSGD 0.05 / at 0.01 / mean recall over 0..0.05, in %; pairs in brackets; "
-        f"mean of {seeds} seeds; median milliseconds a pair over all, one thread."
+        f"mean of {seeds} seeds; median milliseconds of processor time a pair over all, one thread."
     )
     return "\n".join([note, "", *lines])
 
