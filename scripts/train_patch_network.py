@@ -28,7 +28,7 @@ from fmtorch.training.correspondences import Tolerance
 from fmtorch.training.patch_loop import PatchTraining, TrainingOptions
 from fmtorch.training.patch_losses import LOSSES
 from fmtorch.training.patch_metrics import middle, validation_pairs
-from fmtorch.training.patch_objectives import DescriptorObjective, Objective, ShapeObjective
+from fmtorch.training.patch_objectives import CovarianceObjective, DescriptorObjective, Objective, ShapeObjective
 from fmtorch.training.patch_store import PatchStore, build_store
 from fmtorch.training.photographs import list_photographs, package_photographs, split
 from fmtorch.training.warps import ViewRange
@@ -63,8 +63,12 @@ def objective_of(config: DictConfig, device: torch.device) -> Objective:
         descriptor = build("hardnet").to(device).eval().requires_grad_(False)
         load_weights(descriptor, loss.pop("descriptor"))
         return ShapeObjective(descriptor, **loss)
+    if name == "affine_covariance":
+        return CovarianceObjective(**loss)
     if name not in LOSSES:
-        raise ValueError(f"training.loss.name={name}; there are: {', '.join(LOSSES)}, hard_negative_constant")
+        raise ValueError(
+            f"training.loss.name={name}; there are: {', '.join(LOSSES)}, hard_negative_constant, affine_covariance"
+        )
     return DescriptorObjective(functools.partial(LOSSES[name], **loss))
 
 

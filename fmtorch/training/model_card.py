@@ -13,7 +13,13 @@ TITLES = {
     "affnet": "AffNet (Mishkin, Radenovic, Matas, ECCV 2018)",
     "orinet": "OriNet (Mishkin, Radenovic, Matas, ECCV 2018)",
 }
-FIGURES = {"fpr95": "FPR at 95 % recall", "map": "mAP", "accuracy": "nearest is right"}
+RATIO = "residual_tilt"
+FIGURES = {
+    "fpr95": "FPR at 95 % recall (%)",
+    "map": "mAP (%)",
+    "accuracy": "nearest is right (%)",
+    RATIO: "ratio of axes left after rectification (median; 1 is best)",
+}
 OWN_LICENCE = "Apache-2.0, as this project"
 
 
@@ -53,7 +59,7 @@ def model_card(
 
 def _training(checkpoint: Mapping[str, Any]) -> list[str]:
     o, data, losses = checkpoint["options"], checkpoint["data"], checkpoint["losses"]
-    licences = checkpoint.get("licences", {}) | {"scikit-image": "the package's photographs, public domain or CC0"}
+    licences = checkpoint.get("licences", {}) | {"scikit-image": "photographs inside the package, BSD-3-Clause"}
     photographs = "; ".join(
         f"{count} of {source}" + (f" ({licences[source]})" if source in licences else "")
         for source, count in data["photographs"].items()
@@ -86,12 +92,9 @@ def _quality(rows: Mapping[str, Mapping[str, float]], checkpoint: Mapping[str, A
         return []
     held_out = ", ".join(checkpoint.get("validation_data", {}).get("photographs", {}))
     title = f"Measured on patches of held-out sources ({held_out}):" if held_out else "Measured on held-out patches:"
-    head = [
-        title,
-        "",
-        "| | " + " | ".join(f"{t} (%)" for t in FIGURES.values()) + " |",
-        "| --- " * (len(FIGURES) + 1) + "|",
-    ]
+    columns = [key for key in FIGURES if all(key in row for row in table.values())]
+    head = [title, "", "| | " + " | ".join(FIGURES[key] for key in columns) + " |", "| --- " * (len(columns) + 1) + "|"]
     return head + [
-        f"| {name} | " + " | ".join(f"{100 * row[key]:.2f}" for key in FIGURES) + " |" for name, row in table.items()
+        f"| {name} | " + " | ".join(f"{row[key] * (1 if key == RATIO else 100):.2f}" for key in columns) + " |"
+        for name, row in table.items()
     ]

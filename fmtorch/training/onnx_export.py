@@ -55,7 +55,7 @@ def check(network: nn.Module, path: Path, patches: Float[Tensor, "n 1 32 32"]) -
 
 
 def quantize(source: Path, path: Path, patches: Float[Tensor, "n 1 32 32"]) -> None:
-    """An int8 network (QDQ, weights per channel, convolutions with their ReLU) calibrated on real patches (n, 1, 32, 32)."""
+    """An int8 network (QDQ, weights per channel, convolutions with their ReLU) calibrated on real patches."""
     from onnxruntime.quantization import (
         CalibrationDataReader,
         CalibrationMethod,
@@ -73,6 +73,7 @@ def quantize(source: Path, path: Path, patches: Float[Tensor, "n 1 32 32"]) -> N
             part = next(self.parts, None)
             return None if part is None else {"patches": part.numpy()}
 
+    path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         prepared, unfinished = Path(folder) / "prepared.onnx", path.with_name(path.name + ".tmp")
         quant_pre_process(str(source), str(prepared), skip_symbolic_shape=True)

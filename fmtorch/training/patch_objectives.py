@@ -99,6 +99,45 @@ class ShapeObjective:
         return a, b
 
 
+@dataclasses.dataclass(frozen=True)
+class CovarianceObjective:
+    """Shapes should follow what is done to a patch (as Lenc and Vedaldi, ECCV Workshops 2016, train detectors).
+
+    A patch is turned and stretched in two ways T1 and T2, up to `tilt` each. With the shapes A1 and A2 found then,
+    T1 A1 and T2 A2 rectify the same patch, so (T1 A1)^-1 T2 A2 should be a rotation. Unlike the loss on descriptors it
+    cannot be met by one shape for all patches, and needs no descriptor.
+    """
+
+    tilt: float = 2.5
+
+    def loss(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"], draws: Float[Tensor, "n k"]) -> Tensor:
+        """Mean of log((s^2 + s^-2) / 2) for singular values s and 1 / s of what should be a rotation: 0 where it is."""
+        _, after = self._relative(network, pairs.flatten(0, 1), torch.cat([draws, draws]))
+        return (after.square().sum((1, 2)) / 2).log().mean()
+
+    @torch.no_grad()
+    def evaluate(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"]) -> dict[str, float]:
+        """Median ratio of axes that is left between the two rectified patches, and without shapes (1: none)."""
+        patches = pairs[0]
+        draws = random.uniform(0, torch.zeros(1, dtype=torch.int64), Stream.TRAINING, 0, len(patches), DRAWS)[0]
+        both = self._relative(network, patches, draws.to(patches))
+        values = [torch.linalg.svdvals(m.cpu()) for m in both]
+        before, after = (float((s[:, 0] / s[:, 1]).median()) for s in values)
+        return {"residual_tilt": after, "circle_residual_tilt": before}
+
+    def _relative(
+        self, network: nn.Module, patches: Float[Tensor, "n 1 h w"], draws: Float[Tensor, "n k"]
+    ) -> tuple[Tensor, Tensor]:
+        """(T1)^-1 T2 and (T1 A1)^-1 T2 A2, matrices of determinant 1."""
+        T1, T2 = (
+            _rotation(2 * math.pi * draws[:, i]) @ _stretch(self.tilt ** draws[:, i + 1], math.pi * draws[:, i + 2])
+            for i in (0, 3)
+        )
+        seen = torch.cat([sample(patches, T1), sample(patches, T2)])
+        A1, A2 = shape_matrix(network(seen)).chunk(2)
+        return _inverse(T1) @ T2, _inverse(T1 @ A1) @ T2 @ A2
+
+
 def shape_matrix(x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 2 2"]:
     """AffNet's output as a lower-triangular matrix of determinant 1."""
     diagonal = 1 + x[:, ::2]
@@ -113,6 +152,12 @@ def sample(patches: Float[Tensor, "n 1 h w"], frame: Float[Tensor, "n 2 2"], siz
     theta = torch.cat([frame * scale[:, None], torch.zeros_like(frame[..., :1])], -1)
     grid = functional.affine_grid(theta, [len(patches), 1, size, size], align_corners=False)
     return functional.grid_sample(patches, grid, padding_mode="reflection", align_corners=False)
+
+
+def _inverse(matrix: Float[Tensor, "n 2 2"]) -> Float[Tensor, "n 2 2"]:
+    """Of matrices of determinant 1."""
+    (a, b), (c, d) = matrix.unbind(-2)[0].unbind(-1), matrix.unbind(-2)[1].unbind(-1)
+    return torch.stack([d, -b, -c, a], -1).reshape(-1, 2, 2)
 
 
 def _rotation(angle: Float[Tensor, " n"]) -> Float[Tensor, "n 2 2"]:

@@ -16,7 +16,14 @@ from fmtorch.training.model_card import model_card, sha256
 from fmtorch.training.patch_loop import PatchTraining, TrainingOptions
 from fmtorch.training.patch_losses import hard_negative_constant, hardest_triplet, relative_distance
 from fmtorch.training.patch_metrics import fpr_at_recall, middle, patch_quality, validation_pairs
-from fmtorch.training.patch_objectives import DRAWS, DescriptorObjective, ShapeObjective, sample, shape_matrix
+from fmtorch.training.patch_objectives import (
+    DRAWS,
+    CovarianceObjective,
+    DescriptorObjective,
+    ShapeObjective,
+    sample,
+    shape_matrix,
+)
 from fmtorch.training.patch_store import PatchStore
 from fmtorch.training.warps import ViewRange
 from tests.reference import patch_losses as reference
@@ -207,9 +214,9 @@ def test_a_shape_that_undoes_the_stretch_lowers_the_loss(store: PatchStore) -> N
     stretch, n = 2**0.5, 40
     known.answer = torch.tensor([[1 / stretch - 1, 0, stretch - 1]]).repeat(n, 1)
     known.answer = torch.cat([known.answer, torch.zeros(n, 3)])
-    undone = objective.loss(known, pairs, draws)
+    undone = objective.loss(known, pairs, draws).detach()
     known.answer = torch.zeros(2 * n, 3)
-    circles = objective.loss(known, pairs, draws)
+    circles = objective.loss(known, pairs, draws).detach()
     with torch.no_grad():
         a, b = objective._described(known, pairs, draws, rectify=False)
     assert float((a - b).norm(dim=1).mean()) > 0.1
@@ -227,3 +234,35 @@ def test_shape_training_moves_the_network_and_not_the_descriptor(store: PatchSto
     assert all(torch.equal(v, before[k]) for k, v in descriptor.state_dict().items())
     assert all(not torch.equal(v, start[k]) for k, v in network.named_parameters())
     assert set(run.objective.evaluate(network.eval(), validation_pairs(store, 30))) >= {"map", "circle_map"}
+
+
+def test_covariant_shapes_have_no_loss_and_constant_ones_do() -> None:
+    class SecondMoment(torch.nn.Module):
+        """Shapes from the second moments of a white disc that was stretched: covariant by construction."""
+
+        def forward(self, patches: Tensor) -> Tensor:
+            u = (torch.arange(32) + 0.5) / 16 - 1
+            grid = torch.stack(torch.meshgrid(u, u, indexing="xy"), -1).flatten(0, 1)
+            weight = patches.flatten(1)
+            moment = torch.einsum("np,pi,pj->nij", weight / weight.sum(1, keepdim=True), grid, grid)
+            A = torch.linalg.cholesky(moment)  # lower triangular, A A^T is the moment
+            A = A / torch.linalg.det(A).sqrt()[:, None, None]
+            return torch.stack([A[:, 0, 0] - 1, A[:, 1, 0], A[:, 1, 1] - 1], -1)
+
+    class Circle(torch.nn.Module):
+        def forward(self, patches: Tensor) -> Tensor:
+            return torch.zeros(len(patches), 3)
+
+    u = (torch.arange(64) + 0.5) / 16 - 2
+    disc = (u[:, None] ** 2 + u[None] ** 2 < 0.35**2).float()
+    pairs = disc.expand(2, 30, 1, 64, 64)
+    draws = torch.rand(30, DRAWS, generator=torch.Generator().manual_seed(0))
+    objective = CovarianceObjective(tilt=1.8)
+    covariant, constant = (float(objective.loss(f, pairs, draws)) for f in (SecondMoment(), Circle()))
+    assert covariant < constant / 5
+    figures = objective.evaluate(SecondMoment(), pairs)
+    assert figures["residual_tilt"] < 1.1 < figures["circle_residual_tilt"]
+    draws = torch.zeros(1, DRAWS)
+    draws[0, 1] = 1.0  # T1 stretches 1.8 times, T2 not at all
+    found = float(objective.loss(Circle(), pairs[:, :1], draws))
+    assert found == pytest.approx(np.log((1.8 + 1 / 1.8) / 2), abs=1e-5)
