@@ -97,10 +97,7 @@ def _intervals(rows: list[dict[str, Any]]) -> list[str]:
 
     return [
         shown([100.0 * (row["nsgd"] < RECALL) for row in rows], rows, ".1f"),
-        *(
-            shown([100 * row[name] for row in solved], solved, ".1f")
-            for name in ("inlier_rate", "inlier_rate_before")
-        ),
+        *(shown([100 * row[name] for row in solved], solved, ".1f") for name in ("inlier_rate", "inlier_rate_before")),
         *(shown([row[name] for row in solved], solved, ".0f") for name in ("corrs", "corrs_before")),
     ]
 
