@@ -78,9 +78,8 @@ def _family(family: str, rows: list[dict[str, Any]], some: str, paper: dict[tupl
         known = paper.get((kin or "", method))
         theirs = " / ".join(known[k] for k in ("recall", "inlier", "inlier_m", "corrs", "corrs_m")) if known else ""
         failed = sum(not row["ok"] for row in own)
-        seconds = float(np.median([row["pruning_seconds"] for row in own]))
-        lines.append([method, *_intervals(own), str(failed), f"{1e3 * seconds:.0f}", theirs])
-    return Sheet(title, ["", *FIGURES, "failed", "ms", heading], lines)
+        lines.append([method, *_intervals(own), str(failed), theirs])
+    return Sheet(title, ["", *FIGURES, "failed", heading], lines)
 
 
 def _intervals(rows: list[dict[str, Any]]) -> list[str]:
