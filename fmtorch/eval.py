@@ -27,6 +27,7 @@ from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import ALL, summarize, summary_markdown, summary_table
 from fmtorch.resources import conf_dir
 from fmtorch.storage import RunFolder, identity_digest
+from fmtorch.storage.features import CachedFeatures
 
 STAGE_GROUPS = ("features", "matcher", "pruner", "estimator")
 
@@ -36,7 +37,7 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
     device = presets.resolve_device(config.device)
     with _progress() as progress:
         dataset = _load(config.dataset, progress)
-        stages = {group: plain(config[group]) for group in STAGE_GROUPS}
+        stages = {group: plain(config.get(group)) for group in STAGE_GROUPS}
         identity = {
             "pipeline": pipeline_name, **stages, "seed": config.seed, "version": __version__,
             "dataset": {**{k: v for k, v in plain(config.dataset).items() if k != "root"}, "digest": dataset.digest},
@@ -60,6 +61,8 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
     plot_recall_curves({pipeline_name: table}, folder.path / "recall.png")
     console.print(summary_table(summary, title=f"{pipeline_name} on {dataset.name}"))
     console.print(f"[dim]{folder.path}: pairs/, summary.json, summary.md, recall.png[/dim]")
+    if isinstance(pipeline.extractor, CachedFeatures):
+        console.print(f"[dim]{pipeline.extractor.report()}[/dim]")
     if chosen and summary[ALL]["failures"] == len(chosen):
         reason = next(iter(table["reason"].to_pylist()))
         raise ValueError(

@@ -28,6 +28,7 @@ from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_matches
 from fmtorch.metrics import nsgd
 from fmtorch.photographs import Image, MatchResult, match
 from fmtorch.resources import conf_dir
+from fmtorch.storage.features import CachedFeatures
 from fmtorch.storage.files import replacing
 
 
@@ -54,6 +55,8 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
     for trouble in filter(None, (f"no F: {result.reason}" if result.reason else "", result.warning)):
         Console(stderr=True).print(f"[bold]{trouble}[/bold]", highlight=False)
     console.print(f"[dim]{folder}: {', '.join(written)}[/dim]", highlight=False)
+    if isinstance(pipeline.extractor, CachedFeatures):
+        console.print(f"[dim]{pipeline.extractor.report()}[/dim]", highlight=False)
     return folder
 
 

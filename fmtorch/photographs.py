@@ -33,7 +33,7 @@ class MatchResult:
     correspondences: the kept ones, a batch of one. inliers: which of those agree with F, (K,).
     F: (3, 3) float64 of unit Frobenius norm; zero where there is none, and `reason` then says why.
     warning: why F, though found, means little; mostly empty. counts: matches after each step, in order. seconds: of
-    each step.
+    each step, cached features with those they took when they were computed.
     """
 
     keypoints0: Float[Tensor, "n0 2"]
@@ -83,11 +83,11 @@ def match(
     images = [_image(image, name) for image, name in ((image0, "image0"), (image1, "image1"))]
     clock = _Clock(pipeline.device)
     reduced = [_reduced(image, longest_side) for image in images]
-    features = [pipeline.extractor(image).to(pipeline.device) for image, _ in reduced]
-    clock("features")
+    (features0, seconds0), (features1, seconds1) = (pipeline.extract(image) for image, _ in reduced)
+    clock("features", seconds0 + seconds1)
     scales = [scale for _, scale in reduced]
     sizes = [torch.tensor([image.shape[:2]], device=pipeline.device) for image in images]
-    found = _relate(pipeline, features[0], features[1], seed, clock)
+    found = _relate(pipeline, features0, features1, seed, clock)
     return _restored(found, scales, sizes)
 
 
@@ -192,9 +192,10 @@ class _Clock:
         self._device, self._last = device, time.perf_counter()
         self.seconds: dict[str, float] = {}
 
-    def __call__(self, step: str) -> None:
-        """The time since the last call was spent on `step`."""
+    def __call__(self, step: str, seconds: float | None = None) -> None:
+        """The time since the last call was spent on `step`, which counts for `seconds` where they are given."""
         if self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
         now = time.perf_counter()
-        self.seconds[step], self._last = now - self._last, now
+        self.seconds[step] = now - self._last if seconds is None else seconds
+        self._last = now

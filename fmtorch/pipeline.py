@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from fmtorch.data.images import read_image
 from fmtorch.data.pairs import ImagePair, ImageSource
-from fmtorch.stages import Estimator, FeatureExtractor, Matcher, Pruner
+from fmtorch.stages import Estimator, FeatureExtractor, Matcher, Pruner, TimedExtractor
 from fmtorch.types import Correspondences, Estimate, Features, collate
 
 STAGES = ("features", "matching", "pruning", "estimation")
@@ -29,7 +29,8 @@ class Outcome:
 
     correspondences, estimate: batches of one; None where the pair failed before that stage.
     features: how many each image has. seconds: per stage; a batched stage is shared out evenly, and features count in
-    full for each pair that uses them. reason: why the pair failed, empty where it did not.
+    full for each pair that uses them, cached ones with the seconds they took when they were computed.
+    reason: why the pair failed, empty where it did not.
     """
 
     pair: ImagePair
@@ -62,7 +63,17 @@ class Pipeline:
 
     def features(self, image: ImageSource) -> tuple[Features, float]:
         """The features of an image and the seconds they took, kept for the next pair that shows the image."""
-        return self._memo.get(f"{image.path}", lambda: self._extract(image))
+        return self._memo.get(f"{image.path}", lambda: self.extract(read_image(image)))
+
+    def extract(self, image: NDArray[np.uint8]) -> tuple[Features, float]:
+        """The features of pixels on the pipeline's device, and the seconds that computing them takes or took."""
+        if isinstance(self.extractor, TimedExtractor):
+            features, seconds = self.extractor.timed(image)
+            return features.to(self.device), seconds
+        start = time.perf_counter()
+        features = self.extractor(image).to(self.device)
+        _synchronise(self.device)
+        return features, time.perf_counter() - start
 
     def match(self, pairs: Sequence[ImagePair]) -> list[Outcome]:
         """Take pairs through the stages before estimation; a pair that fails has a reason and harms no other."""
@@ -92,11 +103,6 @@ class Pipeline:
         for i, outcome in zip(alive, made, strict=True):
             result[i] = dataclasses.replace(outcome, seconds={**outcome.seconds, stage: share})
         return result
-
-    def _extract(self, image: ImageSource) -> tuple[Features, float]:
-        start = time.perf_counter()
-        features = self.extractor(read_image(image)).to(self.device)
-        return features, time.perf_counter() - start
 
     def _match(self, pair: ImagePair) -> Outcome:
         if pair.problem is not None:

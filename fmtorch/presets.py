@@ -21,6 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from fmtorch.pipeline import Pipeline
 from fmtorch.resources import conf_dir
+from fmtorch.storage.features import cached
 
 _composing = threading.Lock()  # Hydra composes through a global
 
@@ -83,10 +84,11 @@ def resolve_device(name: str) -> torch.device:
 
 
 def build_pipeline(config: DictConfig, device: torch.device | str = "cpu") -> Pipeline:
-    """The pipeline that the groups features, matcher, pruner and estimator of a composed config describe."""
-    pruners = {str(k): instantiate(v, f"pruner={k}") for k, v in (config.pruner or {}).items()}
+    """The pipeline that features (with cache), matcher, pruner and estimator of a composed config describe."""
+    extractor = cached(instantiate(config.features, "features"), config.cache, config.cache_limit)
+    pruners = {str(k): instantiate(v, f"pruner={k}") for k, v in (config.get("pruner") or {}).items()}
     return Pipeline(
-        instantiate(config.features, "features"),
+        extractor,
         instantiate(config.matcher, "matcher"),
         pruners,
         instantiate(config.estimator, "estimator"),
@@ -97,13 +99,14 @@ def build_pipeline(config: DictConfig, device: torch.device | str = "cpu") -> Pi
 def pipeline(name: str, device: torch.device | str = "cpu", overrides: Sequence[str] = ()) -> Pipeline:
     """The pipeline of ``conf/pipeline/<name>.yaml``, changed by `overrides` as on the command line.
 
-    E.g. ``pipeline("sift_gms", overrides=["estimator=lmeds", "pruner.gms.with_scale=true"])``.
+    E.g. ``pipeline("sift_gms", overrides=["estimator=lmeds", "pruner.gms.with_scale=true"])``. Unlike the commands it
+    keeps no features on disk unless asked to (``overrides=["cache=null"]``, or a folder).
     Raises ValueError for an unknown pipeline, naming those there are, and for an override that does not apply.
     """
     if name not in available("pipeline"):
         raise ValueError(f"no preset {name!r} in conf/pipeline; there are: {', '.join(available('pipeline'))}")
     try:
-        config = _compose("match", (f"pipeline={name}", *overrides))
+        config = _compose("match", (f"pipeline={name}", "cache=off", *overrides))
     except HydraException as error:
         raise ValueError(f"pipeline={name} with {', '.join(overrides)}: {error}") from error
     return build_pipeline(config, device)

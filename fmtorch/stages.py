@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import NDArray
+from torch import Tensor
 
 from fmtorch.types import Correspondences, Estimate, Features
 
@@ -15,6 +17,36 @@ class FeatureExtractor(Protocol):
     """An image (H, W) or (H, W, 3), uint8, RGB -> its local features."""
 
     def __call__(self, image: NDArray[np.uint8]) -> Features: ...
+
+
+@runtime_checkable
+class TwoStepExtractor(FeatureExtractor, Protocol):
+    """An extractor whose two steps a cache keeps apart: extractors with the same detection share its results.
+
+    Calling it equals ``describe(image, lafs)`` after ``lafs, scores = detect(image)``: a descriptor for each frame.
+    """
+
+    @property
+    def detection(self) -> object:
+        """What defines the frames and scores: parts, options, files, see `storage.configuration.configuration`."""
+        ...
+
+    def detect(self, image: NDArray[np.uint8]) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
+        """Local affine frames and their scores."""
+        ...
+
+    def describe(self, image: NDArray[np.uint8], lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n d"]:
+        """The descriptors of the frames, which may be on the CPU."""
+        ...
+
+
+@runtime_checkable
+class TimedExtractor(FeatureExtractor, Protocol):
+    """An extractor that knows what its result costs, such as one that may have it already."""
+
+    def timed(self, image: NDArray[np.uint8]) -> tuple[Features, float]:
+        """The features, and the seconds that computing them takes or took."""
+        ...
 
 
 @runtime_checkable

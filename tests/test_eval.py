@@ -21,7 +21,8 @@ OPTIONS = ["features.max_features=500", "estimator=lmeds", "estimator.hypotheses
 def evaluate(*arguments: str, cwd: Path, environment: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
     """Run the command as a user does, in another directory."""
     source = str(Path(__file__).resolve().parents[1])
-    env = {**os.environ, "PYTHONPATH": source, "COLUMNS": "200", **(environment or {})}
+    own = {"PYTHONPATH": source, "COLUMNS": "200", "FMTORCH_CACHE": f"{cwd}/cache"}
+    env = {**os.environ, **own, **(environment or {})}
     command = [sys.executable, "-m", "fmtorch.eval", *arguments]
     return subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, timeout=300, check=False)
 

@@ -1,0 +1,86 @@
+"""What defines the results of a feature extractor, as plain values: its options, learned files, code, libraries."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import importlib.metadata
+import platform
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import torch
+
+from fmtorch import __version__
+
+LIBRARIES = ("numpy", "torch", "kornia", "onnxruntime")  # and OpenCV, which has several names as a package
+
+
+def configuration(part: object) -> Any:
+    """A part of a pipeline as plain values that JSON can hold; equal values mean equal results.
+
+    A dataclass is its class, the code of its package, and its fields (not those with ``compare=False``); an object with
+    an attribute `identity` is that attribute in place of the fields; a `Path` is the digest of the file; tensors and
+    networks are the digests of their values. Raises TypeError for anything that does not say what defines it, and
+    OSError for a file that cannot be read.
+    """
+    if part is None or isinstance(part, bool | int | float | str):
+        return part
+    if isinstance(part, Path):
+        return {"file": _file_digest(part, part.stat().st_mtime_ns)}
+    if isinstance(part, Mapping):
+        return {str(key): configuration(value) for key, value in part.items()}
+    if isinstance(part, list | tuple):
+        return [configuration(value) for value in part]
+    if isinstance(part, torch.Tensor):
+        values = part.detach().cpu().contiguous()
+        return {"tensor": [str(part.dtype), list(part.shape), _digest(values.reshape(-1).view(torch.uint8).numpy())]}
+    return {**_options(part), **_class(type(part))}
+
+
+def _options(part: object) -> dict[str, Any]:
+    if hasattr(part, "identity"):
+        return {"identity": configuration(part.identity)}
+    if dataclasses.is_dataclass(part):
+        return {f.name: configuration(getattr(part, f.name)) for f in dataclasses.fields(part) if f.compare}
+    if isinstance(part, torch.nn.Module):
+        return {"network": repr(part), "weights": configuration(part.state_dict())}
+    raise TypeError(
+        f"{type(part).__module__}.{type(part).__qualname__} does not say what defines its results; "
+        "make it a dataclass, or give it an attribute `identity` of plain values"
+    )
+
+
+def _class(kind: type) -> dict[str, str]:
+    return {"class": f"{kind.__module__}.{kind.__qualname__}", "code": _code_digest(kind.__module__)}
+
+
+@functools.cache
+def environment() -> dict[str, str]:
+    """Versions of what computes, and the processor's instruction set, on which the last bits of a result depend."""
+    versions = {name: importlib.metadata.version(name) for name in LIBRARIES}
+    processor = f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}"
+    return {"fmtorch": __version__, "opencv": cv2.__version__, **versions, "processor": processor}
+
+
+@functools.cache
+def _code_digest(module: str) -> str:
+    """The digest of a module's source and, where it belongs to a package, of the files beside and below it."""
+    file = getattr(sys.modules[module], "__file__", None)
+    if file is None:
+        raise TypeError(f"the code of {module} is in no file, so its changes cannot be noticed")
+    files = sorted(Path(file).parent.rglob("*.py")) if "." in module else [Path(file)]
+    return _digest(b"".join(_digest(path.read_bytes()).encode() for path in files))
+
+
+@functools.lru_cache(maxsize=256)
+def _file_digest(path: Path, modified: int) -> str:
+    return _digest(path.read_bytes())
+
+
+def _digest(data: Any) -> str:
+    return hashlib.blake2b(data, digest_size=16).hexdigest()

@@ -1,0 +1,111 @@
+"""LightGlue behind the project's conventions, with an untrained network."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import kornia
+import numpy as np
+import pytest
+import torch
+
+from fmtorch import presets
+from fmtorch.matching.lightglue import LightGlue
+from fmtorch.pipeline import Pipeline
+from fmtorch.types import Features
+from tests.test_pipeline import draw, pair
+
+
+def matcher(threshold: float = -1.0) -> LightGlue:
+    """Untrained; every mutual nearest neighbour is a match at the threshold -1."""
+    torch.manual_seed(0)
+    network = kornia.feature.LightGlue(None, input_dim=128, filter_threshold=threshold)
+    return LightGlue("disk", device="cpu", network=network)
+
+
+def features(seed: int, count: int, size: tuple[int, int] = (100, 400), length: int = 128) -> Features:
+    rng = torch.Generator().manual_seed(seed)
+    lafs = torch.eye(2, 3).repeat(count, 1, 1)
+    lafs[..., 2] = torch.rand(count, 2, generator=rng) * torch.tensor([size[1] - 1.0, size[0] - 1.0])
+    descriptors = torch.nn.functional.normalize(torch.randn(count, length, generator=rng), dim=1)
+    return Features(lafs, torch.ones(count), descriptors, torch.tensor(size))
+
+
+def test_equals_kornias_matcher() -> None:
+    glue, a, b = matcher(), features(0, 60), features(1, 50, (300, 120))
+    c = glue(a, b)  # wide and tall: kornia refuses keypoints outside of an image whose sizes are swapped
+    reference = kornia.feature.LightGlueMatcher.__new__(kornia.feature.LightGlueMatcher)
+    torch.nn.Module.__init__(reference)
+    reference.feature_name, reference.matcher = "disk", glue.network
+    with torch.no_grad():
+        scores, index = reference(a.descriptors, b.descriptors, a.lafs[None], b.lafs[None], (100, 400), (300, 120))
+    assert len(index) > 5
+    assert torch.equal(c.x0[0], a.keypoints[index[:, 0]])
+    assert torch.equal(c.x1[0], b.keypoints[index[:, 1]])
+    assert c.prior is not None
+    assert torch.equal(c.prior[0], scores[:, 0])
+    assert ((c.prior >= 0) & (c.prior <= 1)).all()
+    assert c.quality is not None
+    assert torch.equal(c.quality, 1 - c.prior)
+    assert c.mask.all()
+    assert c.size0 is not None
+    assert c.size0.tolist() == [[100, 400]]
+
+
+def test_frames_without_meaning_are_not_handed_on() -> None:
+    c = matcher()(features(0, 60), features(1, 50))
+    assert c.lafs0 is None
+    assert c.lafs1 is None
+    assert presets.build("pruner", "frame_consistency")(c) is c
+
+
+@pytest.mark.parametrize("counts", [(0, 5), (1, 5), (5, 1), (0, 0)])
+def test_too_few_features_give_no_match(counts: tuple[int, int]) -> None:
+    c = matcher()(features(0, counts[0]), features(1, counts[1]))
+    assert c.x0.shape == (1, 0, 2)
+
+
+def test_descriptors_of_another_length_are_told() -> None:
+    with pytest.raises(ValueError, match=r"descriptors are \(5, 64\).*\(N, 128\)"):
+        matcher()(features(0, 5), features(1, 5, length=64))
+
+
+@pytest.mark.parametrize("threshold", [-1.0, 2.0])
+def test_in_a_pipeline(tmp_path: Path, threshold: float) -> None:
+    def extractor(image: np.ndarray) -> Features:
+        return features(int(image.sum()), 300 if image.any() else 1, image.shape[:2])
+
+    estimator = presets.build("estimator", "fmtorch", hypotheses=200, round=100)
+    pruners = {"one_to_one": presets.build("pruner", "one_to_one")}
+    a, b = draw(tmp_path / "a.png", 0), draw(tmp_path / "b.png", 0, shift=12)
+    small = draw(tmp_path / "small.png", 1)
+    cv2.imwrite(str(small.path), np.zeros((20, 20), np.uint8))
+    outcomes = Pipeline(extractor, matcher(threshold), pruners, estimator).run([pair("a", a, b), pair("b", a, small)])
+    assert outcomes[0].features == (300, 300)
+    counts = [0 if outcome.correspondences is None else int(outcome.correspondences.count()) for outcome in outcomes]
+    assert counts[1] == 0
+    assert "0 matches" in outcomes[1].reason
+    if threshold < 0:
+        assert counts[0] > 8
+        assert outcomes[0].estimate is not None
+        assert outcomes[0].estimate.F.isfinite().all()
+    else:
+        assert counts[0] == 0
+        assert outcomes[0].reason == outcomes[1].reason
+
+
+def test_weights_that_cannot_be_fetched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+
+    def offline(*_: object, **__: object) -> None:
+        raise RuntimeError("Name or service not known")
+
+    monkeypatch.setattr(kornia.feature, "LightGlue", type("L", (kornia.feature.LightGlue,), {"__init__": offline}))
+    with pytest.raises(ConnectionError, match=r"LightGlue \(disk\).*Name or service.*github\.com/cvg/LightGlue"):
+        presets.build("matcher", "lightglue", features="disk")
+
+
+def test_unknown_features_are_told() -> None:
+    with pytest.raises(ValueError, match="aliked, disk"):
+        presets.build("matcher", "lightglue", features="sift")

@@ -1,0 +1,301 @@
+"""The feature cache: bit-equal, by content and configuration, shared detection, honest seconds."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from fmtorch import presets
+from fmtorch.stages import TimedExtractor, TwoStepExtractor
+from fmtorch.storage import configuration as configuration_module
+from fmtorch.storage.cache import ArrayCache
+from fmtorch.storage.configuration import configuration
+from fmtorch.storage.features import CachedFeatures, cached, image_digest
+from fmtorch.types import Features
+from tests.conftest import shared_path
+
+
+def picture(seed: int = 0, shape: tuple[int, ...] = (120, 160)) -> NDArray[np.uint8]:
+    noise = np.random.default_rng(seed).uniform(0, 255, (shape[0] // 8, shape[1] // 8, *shape[2:]))
+    return np.kron(noise, np.ones((8, 8, *(1 for _ in shape[2:])))).astype(np.uint8)
+
+
+def equal(a: Features, b: Features) -> bool:
+    return all(
+        getattr(a, f.name).dtype == getattr(b, f.name).dtype and torch.equal(getattr(a, f.name), getattr(b, f.name))
+        for f in dataclasses.fields(a)
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Detector:
+    step: int = 8
+    threads: int = dataclasses.field(default=1, compare=False)
+
+
+@dataclasses.dataclass(frozen=True)
+class TwoSteps:
+    """Frames on a grid, described by the grey levels at their centres; says what it does."""
+
+    detector: Detector = Detector()
+    gain: float = 0.5
+    log: list[str] = dataclasses.field(default_factory=list, compare=False)
+
+    @property
+    def detection(self) -> object:
+        return self.detector
+
+    def detect(self, image: NDArray[np.uint8]) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
+        self.log.append("detect")
+        y, x = np.mgrid[0 : image.shape[0] : self.detector.step, 0 : image.shape[1] : self.detector.step].reshape(2, -1)
+        lafs = torch.zeros(len(x), 2, 3)
+        lafs[:, 0, 0] = lafs[:, 1, 1] = 4
+        lafs[:, :, 2] = torch.from_numpy(np.stack([x, y], 1)).float()
+        return lafs, torch.from_numpy(image[y, x]).float() / 255
+
+    def describe(self, image: NDArray[np.uint8], lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n d"]:
+        self.log.append("describe")
+        x, y = lafs[..., 2].long().T.numpy()
+        return self.gain * torch.from_numpy(image[y, x]).float()[:, None].repeat(1, 4)
+
+    def __call__(self, image: NDArray[np.uint8]) -> Features:
+        lafs, scores = self.detect(image)
+        return Features(lafs, scores, self.describe(image, lafs), torch.tensor(image.shape[:2]))
+
+
+@pytest.mark.parametrize("root", [False, True])
+@pytest.mark.parametrize("shape", [(240, 320), (240, 320, 3), (8, 8)])
+def test_bit_equal_with_and_without(tmp_path: Path, shape: tuple[int, ...], root: bool) -> None:
+    sift = presets.build("features", "sift", max_features=300, root=root)
+    image = picture(shape=shape)
+    first, second = (CachedFeatures(sift, ArrayCache(tmp_path)) for _ in range(2))
+    truth = sift(image)
+    assert shape == (8, 8) or len(truth) > 50
+    assert equal(first(image), truth)
+    assert equal(second(image), truth)
+    assert (first.computed, first.found) == (1, 0)
+    assert (second.computed, second.found) == (0, 1)
+
+
+def test_bit_equal_on_a_real_photograph(tmp_path: Path) -> None:
+    from fmtorch.data import read_image
+
+    path = next(shared_path("data/Strecha_train").rglob("*.jpg"))
+    sift = presets.build("features", "sift", max_features=2000)
+    image = read_image(path)
+    kept = CachedFeatures(sift, ArrayCache(tmp_path))
+    assert equal(kept(image), sift(image))
+    assert equal(kept(image), sift(image))
+    assert kept.found == 1
+    ((_, status),) = kept.cache.files()
+    assert status.st_size < 2000 * (128 + 24 + 4 + 1) + 4000  # SIFT's descriptors are bytes
+
+
+def test_every_float_survives(tmp_path: Path) -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Odd:
+        descriptors: Tensor
+
+        def __call__(self, image: NDArray[np.uint8]) -> Features:
+            n = len(self.descriptors)
+            return Features(torch.zeros(n, 2, 3), torch.zeros(n), self.descriptors, torch.tensor([1, 1]))
+
+    whole = torch.arange(256.0)[:, None]
+    special = torch.tensor([[-0.0], [256.0], [-1.0], [0.5], [torch.nan], [torch.inf], [1e30], [3.0]])
+    for descriptors in (whole, special, special.double(), special.half(), whole[:0], whole.double()):
+        kept = CachedFeatures(Odd(descriptors), ArrayCache(tmp_path))
+        for _ in range(2):
+            found = kept(picture()).descriptors
+            assert found.dtype == descriptors.dtype
+            assert found.numpy().tobytes() == descriptors.numpy().tobytes()
+        assert kept.found == 1
+
+
+def test_extractors_with_the_same_detection_share_it(tmp_path: Path) -> None:
+    cache, image = ArrayCache(tmp_path), picture()
+    one, other, coarse = TwoSteps(gain=0.5), TwoSteps(gain=2.0), TwoSteps(Detector(step=16))
+    assert isinstance(one, TwoStepExtractor)
+    for extractor, expected in ((one, ["detect", "describe"]), (other, ["describe"]), (coarse, ["detect", "describe"])):
+        truth = dataclasses.replace(extractor, log=[])(image)
+        for _ in range(2):
+            assert equal(CachedFeatures(extractor, cache)(image), truth)
+        assert extractor.log == expected
+    assert len(list(cache.files())) == 5
+
+
+def test_options_that_change_nothing_are_left_out(tmp_path: Path) -> None:
+    cache = ArrayCache(tmp_path)
+    CachedFeatures(TwoSteps(Detector(threads=1)), cache)(picture())
+    again = CachedFeatures(TwoSteps(Detector(threads=2)), cache)
+    again(picture())
+    assert again.found == 1
+
+
+def test_another_option_image_or_shape_is_another_file(tmp_path: Path) -> None:
+    cache = ArrayCache(tmp_path)
+    sift = CachedFeatures(presets.build("features", "sift"), cache)
+    images = [picture(0), picture(1), picture(0).reshape(160, 120), picture(0)[:, ::-1]]
+    assert len({image_digest(image) for image in images}) == len(images)
+    assert image_digest(images[3]) == image_digest(np.ascontiguousarray(images[3]))
+    for image in images:
+        sift(image)
+    assert sift.computed == 4
+    other = CachedFeatures(presets.build("features", "sift", edge_threshold=9.0), cache)
+    other(images[0])
+    assert other.computed == 1
+
+
+def test_seconds_are_those_of_the_computation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sift = presets.build("features", "sift")
+    first, second = (CachedFeatures(sift, ArrayCache(tmp_path)) for _ in range(2))
+    assert isinstance(first, TimedExtractor)
+    seconds = first.timed(picture())[1]
+    assert seconds > 0
+    assert second.timed(picture())[1] == seconds
+    assert "of 1 taken" in second.report()
+    assert "1 files" in second.report()
+
+
+def test_a_failure_is_not_kept(tmp_path: Path) -> None:
+    kept = CachedFeatures(presets.build("features", "sift"), ArrayCache(tmp_path))
+    for _ in range(2):
+        with pytest.raises(ValueError, match="non-empty"):
+            kept(np.zeros((0, 4), np.uint8))
+    assert not list(kept.cache.files())
+
+
+def test_a_damaged_file_is_computed_anew(tmp_path: Path) -> None:
+    sift = presets.build("features", "sift")
+    kept = CachedFeatures(sift, ArrayCache(tmp_path))
+    truth = kept(picture())
+    ((path, status),) = kept.cache.files()
+    path.write_bytes(path.read_bytes()[: status.st_size // 2])
+    with pytest.warns(UserWarning, match="damaged"):
+        assert equal(kept(picture()), truth)
+    assert kept.computed == 2
+    assert equal(kept(picture()), truth)
+    assert kept.found == 1
+
+
+def test_threads(tmp_path: Path) -> None:
+    sift = presets.build("features", "sift")
+    kept = CachedFeatures(sift, ArrayCache(tmp_path))
+    truths = [sift(picture(seed)) for seed in range(3)]
+    wrong: list[int] = []
+
+    def work() -> None:
+        wrong.extend(seed for seed in [0, 1, 2] * 4 if not equal(kept(picture(seed)), truths[seed]))
+
+    threads = [threading.Thread(target=work) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert wrong == []
+    assert kept.found + kept.computed == 48
+    assert kept.found >= 48 - 3 * 4
+
+
+def test_off_and_where(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FMTORCH_CACHE", str(tmp_path / "home"))
+    sift = presets.build("features", "sift")
+    assert cached(sift, "off") is sift
+    assert cached(sift, False) is sift
+    default, own = cached(sift, None, 1.5), cached(sift, str(tmp_path / "own"))
+    assert isinstance(default, CachedFeatures)
+    assert isinstance(own, CachedFeatures)
+    assert (default.cache.folder, default.cache.limit) == (tmp_path / "home" / "features", 1_500_000_000)
+    assert (own.cache.folder, own.cache.limit) == (tmp_path / "own", None)
+    assert presets.pipeline("sift_gms").extractor == sift  # a library call leaves nothing on disk
+    kept = presets.pipeline("sift_gms", overrides=[f"cache={tmp_path}/there", "cache_limit=1"]).extractor
+    assert isinstance(kept, CachedFeatures)
+    assert kept.cache.folder == tmp_path / "there"
+
+
+def test_an_extractor_that_does_not_say_what_it_is_stays_uncached(tmp_path: Path) -> None:
+    class Mine:
+        def __call__(self, image: NDArray[np.uint8]) -> Features:
+            raise NotImplementedError
+
+    mine = Mine()
+    with pytest.warns(UserWarning, match=r"not cached: .*Mine does not say what defines its results"):
+        assert cached(mine, tmp_path) is mine
+
+
+def test_an_extractor_whose_file_is_absent_stays_uncached(tmp_path: Path) -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Network:
+        file: Path
+
+        def __call__(self, image: NDArray[np.uint8]) -> Features:
+            raise FileNotFoundError("a message of its own")
+
+    network = Network(tmp_path / "absent.onnx")
+    with pytest.warns(UserWarning, match=r"not cached: .*absent\.onnx"):
+        assert cached(network, tmp_path / "cache") is network
+
+
+def test_configuration_of_files_tensors_networks_and_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Part:
+        value: object
+
+    class Named:
+        identity = ("hardnet", 3)
+
+    def of(value: object) -> str:
+        return str(configuration(Part(value)))
+
+    file, copy = tmp_path / "a.onnx", tmp_path / "b.onnx"
+    file.write_bytes(b"one")
+    copy.write_bytes(b"one")
+    before = of(file)
+    assert before == of(copy)
+    file.write_bytes(b"two")
+    os.utime(file, (1, 1))
+    assert of(file) != before
+    with pytest.raises(FileNotFoundError):
+        of(tmp_path / "absent")
+    assert of(torch.zeros(3)) == of(torch.zeros(3)) != of(torch.zeros(3, 1))
+    assert of(torch.zeros(3)) != of(torch.ones(3))
+    network = torch.nn.Linear(2, 2)
+    before = of(network)
+    with torch.no_grad():
+        network.weight[0, 0] += 1
+    assert of(network) != before
+    assert "hardnet" in of(Named())
+    assert of({"a": [1, None]}) != of({"a": [1, 0]})
+    with pytest.raises(TypeError, match="function does not say"):
+        of(lambda: None)
+
+    sift = presets.build("features", "sift")
+    code = configuration(sift)["code"]
+    source = tmp_path / "package"
+    source.mkdir()
+    (source / "sift.py").write_text("edited")
+    monkeypatch.setattr(sys.modules["fmtorch.features.sift"], "__file__", str(source / "sift.py"))
+    configuration_module._code_digest.cache_clear()
+    assert configuration(sift)["code"] != code
+    configuration_module._code_digest.cache_clear()
+
+
+def test_the_command_tells_what_is_there(tmp_path: Path) -> None:
+    CachedFeatures(TwoSteps(), ArrayCache(tmp_path / "features"))(picture())
+    source = str(Path(__file__).resolve().parents[2])
+    env = {**os.environ, "PYTHONPATH": source, "FMTORCH_CACHE": str(tmp_path), "COLUMNS": "200"}
+    command = [sys.executable, "-W", "error", "-m", "fmtorch.storage"]
+    told = subprocess.run(command, env=env, capture_output=True, text=True, timeout=120, check=True).stdout
+    assert "2 files" in told
+    assert "detection-" in told
+    assert "TwoSteps-" in told
