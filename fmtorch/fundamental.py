@@ -40,7 +40,7 @@ def find_fundamental(
     device; gradients reach them through the final fit. mask: (B, N), True for real matches; all when not given.
     quality: (B, N), the matcher's figure, smaller is better (a distance ratio). prior: (B, N), P(inlier) in [0, 1].
     lafs0, lafs1: (B, N, 2, 3) local affine frames. size0, size1: (B, 2) image sizes (h, w). key: (B,) int64, selects
-    each pair's random numbers. Where an estimator uses a prior and none is given, it is derived: from the frames and the
+    each pair's random numbers. Where an estimator uses a prior and none is given, it is derived from the frames and the
     quality, if both are given, otherwise from the points and, if given, the quality. One pair's arguments may come
     without the leading B.
     estimator: a preset of conf/estimator; `options` replace values of it (``threshold=0.5``).

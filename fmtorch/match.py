@@ -107,7 +107,9 @@ def _draw(
     good = kept.copy()
     if result.ok:
         good[good] = result.inliers.cpu().numpy()
-    names = ("inliers of F", "others, dropped by pruning or estimation") if result.ok else ("kept", "dropped by pruning")
+    names = (
+        ("inliers of F", "others, dropped by pruning or estimation") if result.ok else ("kept", "dropped by pruning")
+    )
     pictures = {"matches.png": draw_matches(image0, image1, x0, x1, good, names=names)}
     pruners = [step for step in result.counts if step not in ("matching", "estimation")]
     if pruners:

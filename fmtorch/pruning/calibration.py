@@ -20,10 +20,10 @@ def logistic(z: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 
     Made of arithmetic alone, whose last bits, unlike those of exp, do not depend on where in memory a number stands.
     """
-    odds = 1 + z.clamp(-_LARGEST, _LARGEST) / 2**_SQUARINGS
+    odds: Tensor = 1 + z.clamp(-_LARGEST, _LARGEST) / 2**_SQUARINGS
     for _ in range(_SQUARINGS):
         odds = odds.square()
-    return odds / (1 + odds)
+    return odds / (odds + 1)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,7 +14,6 @@ import dataclasses
 import json
 import platform
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -116,12 +115,9 @@ def stage(spec: str) -> Any:
 def rows(front: Pipeline, pair: ImagePair, methods: dict[str, list[Any]]) -> Iterator[dict[str, Any]]:
     matched = front.match([pair])[0]
     for name, pruners in methods.items():
-        start = time.perf_counter()
-        pruned = pruned_by(matched, pruners)
-        seconds = time.perf_counter() - start
-        row = evaluate(front.estimate([pruned]))[0]
+        row = evaluate(front.estimate([pruned_by(matched, pruners)]))[0]
         kept = ("pair", "family", "scene", "ok", "nsgd", "inlier_rate", "inlier_rate_before", "corrs", "corrs_before")
-        yield {"method": name, "pruning_seconds": seconds, **{field: getattr(row, field) for field in kept}}
+        yield {"method": name, **{field: getattr(row, field) for field in kept}}
 
 
 def pruned_by(outcome: Outcome, pruners: list[Any]) -> Outcome:

@@ -5,6 +5,7 @@ Processor time, which other work on the machine disturbs less than the time on t
 
 from __future__ import annotations
 
+import functools
 import subprocess
 import tempfile
 import time
@@ -26,19 +27,21 @@ LPM_COUNTS = (1000, 5000, 20_000, 50_000)
 
 
 def measure(contrib_python: str, repeats: int) -> list[dict[str, Any]]:
-    """Lines of a table: medians over the repeats of our milliseconds of processor time a pair, the peer's, and their ratio."""
+    """Lines of a table: our milliseconds of processor time a pair, the peer's, and their ratio."""
     lines = []
     with (
         tempfile.TemporaryDirectory() as folder,
         subprocess.Popen([contrib_python, str(PEER)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as peer,
     ):
-        for n in COUNTS:
-            for searched in (False, True):
-                for pairs in (1, PAIRS):
-                    lines.append(_against_opencv(peer, Path(folder) / f"{n}-{searched}-{pairs}.npz", n, searched, pairs, repeats))
+        lines += [
+            _against_opencv(peer, Path(folder) / f"{n}-{searched}-{pairs}.npz", n, searched, pairs, repeats)
+            for n in COUNTS
+            for searched in (False, True)
+            for pairs in (1, PAIRS)
+        ]
     for n in LPM_COUNTS:
-        x0, x1 = moving(n, 0)
-        ours = [_milliseconds(lambda: lpm(x0[None], x1[None])) for _ in range(max(3, repeats // 10))]
+        points = [x[None] for x in moving(n, 0)]
+        ours = [_milliseconds(functools.partial(lpm, *points)) for _ in range(max(3, repeats // 10))]
         lines.append(_line("LPM", n, 1, ours, None))
     return lines
 
@@ -65,7 +68,7 @@ def _against_opencv(peer: Any, path: Path, n: int, searched: bool, pairs: int, r
     kept = int(gms(x0, x1, **sizes, **options)[0].sum())
     ours, theirs = [], []
     for _ in range(repeats if pairs == 1 or not searched else max(3, repeats // 10)):
-        ours.append(_milliseconds(lambda: gms(x0, x1, **sizes, **options)) / pairs)
+        ours.append(_milliseconds(functools.partial(gms, x0, x1, **sizes, **options)) / pairs)
         peer.stdin.write(f"{path}\n")
         peer.stdin.flush()
         milliseconds, count = peer.stdout.readline().split()

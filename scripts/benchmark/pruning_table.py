@@ -78,9 +78,8 @@ def _family(family: str, rows: list[dict[str, Any]], some: str, paper: dict[tupl
         known = paper.get((kin or "", method))
         theirs = " / ".join(known[k] for k in ("recall", "inlier", "inlier_m", "corrs", "corrs_m")) if known else ""
         failed = sum(not row["ok"] for row in own)
-        seconds = float(np.median([row["pruning_seconds"] for row in own]))
-        lines.append([method, *_intervals(own), str(failed), f"{1e3 * seconds:.0f}", theirs])
-    return Sheet(title, ["", *FIGURES, "failed", "ms", heading], lines)
+        lines.append([method, *_intervals(own), str(failed), theirs])
+    return Sheet(title, ["", *FIGURES, "failed", heading], lines)
 
 
 def _intervals(rows: list[dict[str, Any]]) -> list[str]:
@@ -97,10 +96,7 @@ def _intervals(rows: list[dict[str, Any]]) -> list[str]:
 
     return [
         shown([100.0 * (row["nsgd"] < RECALL) for row in rows], rows, ".1f"),
-        *(
-            shown([100 * row[name] for row in solved], solved, ".1f")
-            for name in ("inlier_rate", "inlier_rate_before")
-        ),
+        *(shown([100 * row[name] for row in solved], solved, ".1f") for name in ("inlier_rate", "inlier_rate_before")),
         *(shown([row[name] for row in solved], solved, ".0f") for name in ("corrs", "corrs_before")),
     ]
 

@@ -82,7 +82,7 @@ def gms(
 def support(
     x0: np.ndarray, x1: np.ndarray, size0: tuple[int, int], size1: tuple[int, int], scale: float, turn: int
 ) -> list[float]:
-    """The mean over the shifted grids of (score - 1) / sqrt(mean, at least 1) at each match's own cells, by one hypothesis."""
+    """The mean over the shifted grids of (score - 1) / sqrt(mean, at least 1) at each match's own cells."""
     p0, p1 = normalised(x0, size0), normalised(x1, size1)
     grid1 = int(GRID * scale)
     total = [0.0] * len(x0)
