@@ -16,6 +16,8 @@ class Stream(enum.IntEnum):
     PRESELECTION = 2
     METRIC = 3
     TRAINING = 4
+    PLANE = 5
+    PARALLAX = 6
 
 
 def _wrap(value: int) -> int:

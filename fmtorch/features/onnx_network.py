@@ -16,6 +16,7 @@ from fmtorch.resources import models_dir
 
 PRECISIONS = ("fp32", "int8")
 PATCH_SHAPE = (1, 32, 32)
+HINT = "python scripts/export_onnx.py makes it from a checkpoint, scripts/download.py fetches authors' checkpoints"
 
 
 class NetworkFileError(ValueError):
@@ -69,6 +70,13 @@ class PatchNetwork:
         return torch.from_numpy(result).to(patches.device)
 
     @property
+    def identity(self) -> dict[str, object]:
+        """What defines the results, for the feature cache. Raises NetworkFileError for a file that is absent."""
+        if not self.path.is_file():
+            raise NetworkFileError(f"{self.path} does not exist: {HINT}")
+        return {"file": self.path, "batch": self.batch}
+
+    @property
     def outputs(self) -> int:
         """D, the length of an output; opens the file."""
         return _session(str(self.path.absolute()), self.threads)[2]
@@ -86,9 +94,8 @@ def _session(path: str, threads: int) -> tuple[Any, str, int]:
     import onnxruntime
     from onnxruntime.capi import onnxruntime_pybind11_state as errors
 
-    hint = "python scripts/export_onnx.py makes it from a checkpoint, scripts/download.py fetches authors' checkpoints"
     if not Path(path).is_file():
-        raise NetworkFileError(f"{path} does not exist: {hint}")
+        raise NetworkFileError(f"{path} does not exist: {HINT}")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     options.log_severity_level = 3
@@ -96,14 +103,14 @@ def _session(path: str, threads: int) -> tuple[Any, str, int]:
         session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     except (errors.InvalidProtobuf, errors.InvalidGraph, errors.Fail, errors.InvalidArgument, errors.NotImplemented,
             errors.RuntimeException) as error:  # fmt: skip
-        raise NetworkFileError(f"{path} is no ONNX network that can be run ({error}): {hint}") from error
+        raise NetworkFileError(f"{path} is no ONNX network that can be run ({error}): {HINT}") from error
     inputs, outputs = session.get_inputs(), session.get_outputs()
     shape = inputs[0].shape if len(inputs) == 1 else None
     fits = shape is not None and len(shape) == 4 and tuple(shape[1:]) == PATCH_SHAPE and not isinstance(shape[0], int)
     if not fits or inputs[0].type != "tensor(float)":
         found = ", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)
-        raise NetworkFileError(f"{path} takes {found}; a patch network takes float (N, 1, 32, 32), N free: {hint}")
+        raise NetworkFileError(f"{path} takes {found}; a patch network takes float (N, 1, 32, 32), N free: {HINT}")
     size = outputs[0].shape
     if len(outputs) != 1 or len(size) != 2 or not isinstance(size[1], int):
-        raise NetworkFileError(f"{path} gives {[o.shape for o in outputs]}; a patch network gives (N, D): {hint}")
+        raise NetworkFileError(f"{path} gives {[o.shape for o in outputs]}; a patch network gives (N, D): {HINT}")
     return session, inputs[0].name, size[1]

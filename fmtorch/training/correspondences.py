@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.features.sift import FRAME_SIGMAS
+from fmtorch.features.frames import FRAME_SIGMAS
 from fmtorch.training.keypoints import Keypoints, dog_keypoints, hessian_keypoints
 from fmtorch.training.warps import (
     Grey,
