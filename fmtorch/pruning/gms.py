@@ -87,7 +87,7 @@ def gms_support(
 
 def _standing(table: Table, moves: Moves, turns: int, factor: float) -> UInt8[Tensor, "s m"]:
     """The rotations, as bits, under which a match follows an assignment that stands, for each grid of image 1."""
-    line, lines = table.line.flatten(), moves.lines
+    line, lines = moves.line.flatten(), moves.lines
     occupied = (table.filled[:lines] > 0).nonzero()[:, 0]
     rows = []
     for grid, (side, slot, end) in enumerate(zip(moves.grids, table.slot, moves.end, strict=True)):
@@ -131,7 +131,7 @@ def _own_support(table: Table, moves: Moves, winner: Int[Tensor, " pairs"], turn
         grid, turn = divmod(hypothesis, turns)
         members = (chosen == hypothesis).nonzero()[:, 0]
         for line in moves.line:
-            here = members[line[members] >= 0]
+            here = members[line[members] < moves.lines]
             score, mean = Surroundings(table, moves, grid, line[here], moves.end[grid, here]).turned(turn)
             total.index_add_(0, here, (score - 1).clamp_min(0) / mean.clamp_min(1).sqrt() / 4)
     return total
@@ -155,10 +155,8 @@ class GMS:
         prune: bool = True,
         calibration: Mapping[str, Mapping[str, float]] | None = None,
     ) -> None:
-        self._options: dict[str, Any] = {
-            "with_rotation": with_rotation, "with_scale": with_scale,
-            "threshold_factor": threshold_factor, "border": border,
-        }  # fmt: skip
+        self.with_rotation, self.with_scale = with_rotation, with_scale
+        self.threshold_factor, self.border = threshold_factor, border
         self.prune = prune
         self.calibration = calibration_of("GMS", prune, calibration)
 
@@ -174,4 +172,8 @@ class GMS:
     def _arguments(self, c: Correspondences) -> dict[str, Any]:
         if c.size0 is None or c.size1 is None:
             raise ValueError("GMS needs `size0` and `size1`: its grids divide the images")
-        return {"x0": c.x0, "x1": c.x1, "size0": c.size0, "size1": c.size1, "mask": c.mask, **self._options}
+        return {
+            "x0": c.x0, "x1": c.x1, "size0": c.size0, "size1": c.size1, "mask": c.mask,
+            "with_rotation": self.with_rotation, "with_scale": self.with_scale,
+            "threshold_factor": self.threshold_factor, "border": self.border,
+        }  # fmt: skip
