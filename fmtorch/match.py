@@ -122,8 +122,8 @@ def _draw(
     for name, picture in pictures.items():
         with replacing(folder / name) as path:
             path.write_bytes(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
-    if "epipolar.png" not in pictures:  # of an earlier run
-        (folder / "epipolar.png").unlink(missing_ok=True)
+    for name in {"pruning.png", "epipolar.png"} - pictures.keys():  # of an earlier run
+        (folder / name).unlink(missing_ok=True)
     return list(pictures)
 
 

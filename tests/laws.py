@@ -8,13 +8,19 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from fmtorch import presets
+from fmtorch.stages import Estimator
 from fmtorch.types import Correspondences, collate
+
+OTHER_LIBRARIES = ("opencv_", "poselib", "kornia_ransac", "magsac_cpp", "gc_ransac_cpp", "degensac_cpp")
+"""Prefixes of the presets that call other libraries' estimators; of these only OpenCV's keep the laws."""
 
 Result = dict[str, Tensor]  # every value has the batch as its first dimension; masks (B, N) may be padded on the right
 
@@ -25,6 +31,18 @@ class Subject:
 
     name: str
     run: Callable[[Correspondences], Result]
+
+
+def quick(name: str, hypotheses: int = 200, round: int = 100) -> Estimator:
+    """An estimator preset with few hypotheses in each of its stages: the laws do not depend on their number."""
+
+    def fewer(config: Mapping[str, Any]) -> dict[str, Any]:
+        if config["_target_"] == "fmtorch.estimators.HypothesizeAndVerify":
+            return {"hypotheses": hypotheses, "round": round}
+        return {key: fewer(value) for key, value in config.items() if isinstance(value, dict)}
+
+    built: Estimator = presets.build("estimator", name, **fewer(presets.load("estimator", name)))
+    return built
 
 
 def scene(index: int, count: int = 150, outliers: float = 0.4, noise: float = 0.3) -> Correspondences:

@@ -2,21 +2,38 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 import torch
 
 from fmtorch import presets
+from fmtorch.estimators import engine, irls, local_optimization, scoring
+from fmtorch.geometry import sampson_objective
 from fmtorch.types import Correspondences, collate
-from tests.laws import Result, Subject, assert_same, degenerate, live_values, scene, scenes, with_padding
+from tests.laws import (
+    OTHER_LIBRARIES,
+    Result,
+    Subject,
+    assert_same,
+    degenerate,
+    live_values,
+    quick,
+    scene,
+    scenes,
+    with_padding,
+)
 
-OTHER_LIBRARIES = ("opencv_", "poselib")
+OWN = [n for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES)]
+TILES = [  # what bounds memory and fills caches, and must change no result
+    (engine, "CPU_SAMPLES", 150), (scoring, "CPU_TILE", 1000), (local_optimization, "CPU_TILE", 1000),
+    (irls, "TILE", 1000), (sampson_objective, "TILE_ELEMENTS", 1), (sampson_objective, "TILE_MODELS", 3),
+]  # fmt: skip
 
 
 def _estimator(name: str) -> Subject:
-    # Few hypotheses: the laws do not depend on their number, and the tests stay quick.
-    options = {"hypotheses": 200, "round": 100} if not name.startswith(OTHER_LIBRARIES) else {}
-    estimator = presets.build("estimator", name, **options)
+    estimator = quick(name)
 
     def run(c: Correspondences) -> Result:
         e = estimator(c, seed=5)
@@ -38,7 +55,7 @@ def _pruner(name: str) -> Subject:
 
 def _subjects() -> list[Subject]:
     """Every preset of these groups: a new file in conf/ joins by being there."""
-    estimators = [_estimator(n) for n in presets.available("estimator") if n != "poselib"]
+    estimators = [_estimator(n) for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES[1:])]
     return [*estimators, *(_pruner(n) for n in presets.available("pruner"))]
 
 
@@ -80,10 +97,42 @@ def test_no_pair_takes_its_batch_down(subject: Subject, kind: str) -> None:
         assert not bool(torch.isnan(value.to(torch.float64)).any()), f"{subject.name}: NaN for {kind}"
 
 
-@pytest.mark.parametrize("name", [n for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES)])
+@pytest.mark.parametrize("name", OWN)
 @pytest.mark.parametrize("kind", ["empty", "one match", "all points equal", "NaN", "infinite"])
 def test_hopeless_pairs_have_a_reason(name: str, kind: str) -> None:
-    estimate = presets.build("estimator", name, hypotheses=100)(degenerate()[kind])
+    estimate = quick(name, 100)(degenerate()[kind])
     assert not bool(estimate.ok[0])
     assert estimate.reason[0]
     assert not bool(estimate.inliers.any())
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_batch_workers_threads_and_tiles_change_nothing(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    estimator = quick(name, 60, 30)
+    pairs = [scene(i, 40 + 53 * i % 180) for i in range(64)]
+
+    def run(some: list[Correspondences]) -> Result:
+        e = estimator(collate(some), seed=5)
+        return {"F": e.F, "inliers": e.inliers, "ok": e.ok, "draws": e.draws}
+
+    def first(result: Result, pairs: int, matches: int) -> Result:
+        return {k: v[:pairs, :matches] if k == "inliers" else v[:pairs] for k, v in result.items()}
+
+    whole = run(pairs)
+    seven = run(pairs[:7])
+    n = seven["inliers"].shape[1]
+    assert_same(seven, first(whole, 7, n), f"{name}: batches of 7 and 64")
+    with ThreadPoolExecutor(4) as workers:
+        for i, alone in enumerate(workers.map(lambda pair: run([pair]), pairs[:7])):
+            n_alone = pairs[i].mask.shape[1]
+            shared = {k: v[i : i + 1, :n_alone] if k == "inliers" else v[i : i + 1] for k, v in seven.items()}
+            assert_same(alone, shared, f"{name}: pair {i} alone, in one of four workers")
+    threads = torch.get_num_threads()
+    torch.set_num_threads(4)
+    try:
+        assert_same(run(pairs), whole, f"{name}: four threads")
+    finally:
+        torch.set_num_threads(threads)
+    for module, constant, value in TILES:
+        monkeypatch.setattr(module, constant, value)
+    assert_same(run(pairs[:7]), seven, f"{name}: other tiles")

@@ -14,10 +14,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch import random
+from fmtorch.estimators.batching import solve_all
 from fmtorch.estimators.choice import best_of
+from fmtorch.estimators.compiled import compiled
+from fmtorch.estimators.degeneracy import CANDIDATES, DEGENERACIES, Degensac
+from fmtorch.estimators.final_fits import FINAL_FITS
 from fmtorch.estimators.local_optimization import LOCAL_OPTIMIZATIONS
-from fmtorch.estimators.parts import CHOICES, FINAL_FITS, INLIER_RULES, SAMPLERS, SCORES, SOLVERS, Refinement, part
-from fmtorch.estimators.problem import Problem, problems
+from fmtorch.estimators.parts import CHOICES, INLIER_RULES, SAMPLERS, SCORES, SOLVERS, Refinement, part
+from fmtorch.estimators.problem import Problem
 from fmtorch.estimators.sampling import PriorWeighted
 from fmtorch.estimators.scoring import sampson_squared, score_models
 from fmtorch.random import Stream
@@ -25,6 +29,7 @@ from fmtorch.types import Correspondences, Estimate
 
 CPU_SAMPLES = 1 << 14  # minimal samples that are solved together: bounds memory, changes no result
 GPU_SAMPLES = 1 << 21
+UNSTOPPED_ROUND = 2000  # samples of a round where nobody looks in between: few operations on many numbers are faster
 
 
 @dataclasses.dataclass
@@ -42,20 +47,28 @@ class HypothesizeAndVerify:
     solver: minimal solver, `seven_point` or `eight_point`.
     sampler: `uniform` or `prior`. score: `inlier_count`, `msac`, `prior_msac` or `median`.
     threshold: Sampson distance in pixels up to which a match supports a model (unused by `median`).
-    hypotheses: minimal samples drawn at most. round: samples between two looks at the stopping rule.
+    hypotheses: minimal samples drawn at most. round: samples between two looks at the stopping rule; without one,
+    rounds of `UNSTOPPED_ROUND` at least.
     confidence: stop once an all-inlier sample was drawn with this probability; None: never before `hypotheses`.
     preselect: models are first scored on this many matches, chosen by the pair's key; 0: always on all.
     survivors: models of a round that pass the preselection.
+    degeneracy: `degensac` completes a best model whose sample lies on a plane by plane and parallax, null: no check.
+    candidates: `plane_and_parallax` adds models of the scene's planes to the pool, null: none.
     pool: the best models that are kept to the end. local_optimization: of the pool, `graph_cut` or null: none.
     refine: robust kernel of the Levenberg-Marquardt refinement of the pool (`truncated`, `cauchy`, ...), null: none;
     refine_threshold: its scale, Sampson distance in pixels; refine_iterations: its steps. choice: by which score the
     estimate is chosen from the refined pool, `score` (the search's own), `saturated` (gains saturate in each cell of
     a grid) or `focal` (the same, with a prior on the focal length: for whole photographs, not crops; `saturated` where
-    the image sizes are unknown); choice_threshold: of the last two, Sampson distance in pixels, null: the score's.
+    the image sizes are unknown); choice_threshold: of the last two, Sampson distance in pixels, null: the score's;
+    choice_iterations: steps of the refinement that `focal` makes.
     inliers: `threshold`, `lmeds` (2.5 robust standard deviations) or `median` (the better half).
     inlier_threshold: of the inliers reported, Sampson distance in pixels; null: the score's threshold.
-    final: `least_squares` (8-point on the inliers), `gauss_newton` (one attached step) or `none`.
+    final: `least_squares` (8-point on the inliers), `gauss_newton` (one attached step), `adaptive` (refined at the
+    scale of the pair's own noise, with an attached step) or `none`.
     refit_inliers: recompute the inliers after the final fit.
+    compile: build the score with torch.compile, for long runs: the first calls take some ten seconds each and need a
+    C++ compiler (RuntimeError where there is none). Scores, and so estimates, may differ from those without. That they
+    have the same bits in any batch is by construction, but depends on the compiler: it is tested of the score alone.
 
     Memory: for a batch of pairs of N matches, the points (48 N bytes a pair), the samples of 2^14 draws (about 40 MB)
     and eight buffers of one scoring tile (1 MB each); on a GPU 2^21 draws and 256 MB a buffer.
@@ -73,6 +86,8 @@ class HypothesizeAndVerify:
         confidence: float | None = 0.9999,
         preselect: int = 128,
         survivors: int = 256,
+        degeneracy: str | None = None,
+        candidates: str | None = None,
         pool: int = 1,
         local_optimization: str | None = None,
         refine: str | None = None,
@@ -80,10 +95,12 @@ class HypothesizeAndVerify:
         refine_iterations: int = 5,
         choice: str = "score",
         choice_threshold: float | None = None,
+        choice_iterations: int = 12,
         inliers: str = "threshold",
         inlier_threshold: float | None = None,
         final: str = "least_squares",
         refit_inliers: bool = True,
+        compile: bool = False,
     ) -> None:
         if hypotheses < 1 or round < 1:
             raise ValueError(f"hypotheses={hypotheses}, round={round}: both must be at least 1")
@@ -92,16 +109,27 @@ class HypothesizeAndVerify:
         self.solver = part("solver", solver, SOLVERS)()
         self.sampler = part("sampler", sampler, SAMPLERS)()
         self.score = part("score", score, SCORES)(threshold)
+        if compile:
+            self.score = compiled(self.score)
         self.inlier_threshold = threshold if inlier_threshold is None else inlier_threshold
-        self.hypotheses, self.round, self.confidence = hypotheses, round, confidence
+        self.hypotheses, self.confidence = hypotheses, confidence
+        self.round = round if confidence is not None else max(round, UNSTOPPED_ROUND)
         self.preselect, self.survivors = preselect, survivors
+        self.degeneracy = None if degeneracy is None else part("degeneracy", degeneracy, DEGENERACIES)(self.score)
+        if self.degeneracy is not None and self.solver.size != Degensac.SAMPLE:
+            raise ValueError(f"degeneracy={degeneracy} needs solver=seven_point; solver is {solver!r}")
+        self.candidates = None if candidates is None else part("candidates", candidates, CANDIDATES)(self.score)
         self.pool = pool
         self.local_optimization = None
         if local_optimization is not None:
             optimization = part("local_optimization", local_optimization, LOCAL_OPTIMIZATIONS)
             self.local_optimization = optimization(threshold, self.score)
         self.refinement = None if refine is None else Refinement(refine, refine_threshold, refine_iterations)
-        self.choice = None if choice == "score" else part("choice", choice, CHOICES)(choice_threshold or threshold)
+        self.choice = (
+            None
+            if choice == "score"
+            else part("choice", choice, CHOICES)(choice_threshold or threshold, choice_iterations)
+        )
         self.inlier_rule = part("inliers", inliers, INLIER_RULES)(self.inlier_threshold)
         self.final = part("final", final, FINAL_FITS)()
         self.refit_inliers = refit_inliers
@@ -113,35 +141,18 @@ class HypothesizeAndVerify:
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
-        b, n = c.mask.shape
-        device = c.mask.device
-        F = torch.zeros(b, 3, 3, dtype=torch.float64, device=device)
-        inliers = torch.zeros(b, n, dtype=torch.bool, device=device)
-        draws = torch.zeros(b, dtype=torch.int64, device=device)
-        made, reasons = problems(c, seed, self.solver.size)
-        limit = max(1, (GPU_SAMPLES if device.type == "cuda" else CPU_SAMPLES) // self.round)
-        for whole in made:
-            for first in range(0, len(whole.pair), limit):
-                problem = whole[torch.arange(first, min(first + limit, len(whole.pair)), device=device)]
-                estimate, support, found, drawn = self._solve(problem)
-                F = F.index_copy(0, problem.pair, torch.where(found[:, None, None], problem.to_pixels(estimate), 0))
-                row, match = (support & problem.live & found[:, None]).nonzero(as_tuple=True)
-                inliers[problem.pair[row], problem.slot[row, match]] = True
-                draws[problem.pair] = drawn
-                for i in problem.pair[~found].tolist():
-                    reasons[i] = "every minimal sample was degenerate"
-        sound = torch.isfinite(F).flatten(1).all(1)
-        F = torch.where(sound[:, None, None], F, 0)
-        for i in (~sound).nonzero()[:, 0].tolist():
-            reasons.setdefault(i, "the final fit is not finite")
-        ok = torch.tensor([i not in reasons for i in range(b)], dtype=torch.bool, device=device)
-        return Estimate(F, inliers, ok, tuple(reasons.get(i, "") for i in range(b)), draws)
+        samples = GPU_SAMPLES if c.mask.is_cuda else CPU_SAMPLES
+        pairs = samples // self.round
+        return solve_all(c, seed, self.solver.size, self._solve, "every minimal sample was degenerate", pairs)
 
     def _solve(self, problem: Problem) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Search, then fit: F (p, 3, 3) in normalised units, inliers (p, n), found (p,), draws (p,)."""
         with torch.no_grad():
             search = self._search(problem)
-            found = torch.isfinite(search.score[:, 0])
+            if self.candidates is not None:
+                F, score = self.candidates(problem)
+                search.F, search.score = torch.cat([search.F, F], 2), torch.cat([search.score, score], 1)
+            found = torch.isfinite(search.score).any(1)
             best = self._choose(search, problem).T.reshape(-1, 3, 3)
             inliers = self.inlier_rule(best, problem)
         F = self.final(best, problem, inliers)
@@ -180,8 +191,10 @@ class HypothesizeAndVerify:
         while start < self.hypotheses and len(active):
             count = min(self.round, self.hypotheses - start)
             some, some_points = problem[active], points[:, active]
-            F, valid = self._hypotheses(some, some_points, table[active], start, count)
-            F, score = self._verify(some, some_points, F, valid, None if subset is None else subset[active])
+            drawn, valid, index = self._hypotheses(some, some_points, table[active], start, count)
+            F, score = self._verify(some, some_points, drawn, valid, None if subset is None else subset[active])
+            if self.degeneracy is not None:
+                F, score = self.degeneracy(F, score, state.score[active, 0], drawn, index, some, start)
             self._remember(state, active, F, score)
             start += count
             state.draws[active] = start
@@ -192,12 +205,12 @@ class HypothesizeAndVerify:
 
     def _hypotheses(
         self, problem: Problem, points: Float[Tensor, "4 p n"], table: Tensor, start: int, count: int
-    ) -> tuple[Float[Tensor, "9 p m"], Bool[Tensor, "p m"]]:
-        """The models of `count` minimal samples, in the order of their draws."""
+    ) -> tuple[Float[Tensor, "9 p m"], Bool[Tensor, "p m"], Int[Tensor, "size p s"]]:
+        """The models of `count` minimal samples, in the order of their draws, which of them exist, and the samples."""
         size = self.solver.size
         index = self.sampler.draw(problem, table, start, count, size)
         sample = torch.stack([points.gather(2, i.expand(4, -1, -1)) for i in index], 1)
-        return self.solver(sample)
+        return *self.solver(sample), index
 
     def _verify(
         self, problem: Problem, points: Tensor, F: Tensor, valid: Tensor, subset: Tensor | None
@@ -205,11 +218,11 @@ class HypothesizeAndVerify:
         """The valid models and their scores, the weaker ones dropped after a look at the `subset` of matches."""
         F, valid = _front(F, valid)
         if subset is not None and F.shape[2] > self.survivors:
-            coarse = score_models(self.score, F, problem, points, subset).masked_fill_(~valid, -torch.inf)
+            coarse = score_models(self.score, F, problem, points, subset, valid)
             order = torch.sort(coarse, dim=1, descending=True, stable=True).indices[:, : self.survivors]
             order = torch.sort(order, dim=1).values  # back in the order of the draws, which breaks ties
             F, valid = F.gather(2, order.expand(9, -1, -1)), valid.gather(1, order)
-        return F, score_models(self.score, F, problem, points).masked_fill_(~valid, -torch.inf)
+        return F, score_models(self.score, F, problem, points, valid=valid)
 
     def _remember(self, state: _Search, active: Tensor, F: Tensor, score: Tensor) -> None:
         """Keep the best models of each pair; the earlier draw wins a tie."""

@@ -23,9 +23,9 @@ from fmtorch.estimators.scoring import (
     median_rank,
     sampson_squared,
 )
-from fmtorch.geometry import eight_point
 from fmtorch.geometry.minimal import eight_point_components, seven_point_components
-from fmtorch.geometry.refine import attached_step, refine_components
+from fmtorch.geometry.orientation import consistently_oriented
+from fmtorch.geometry.refine import refine_components
 
 T = TypeVar("T")
 
@@ -56,6 +56,7 @@ class SevenPoint:
     def __call__(self, sample: Float[Tensor, "4 size p s"]) -> tuple[Float[Tensor, "9 p m"], Bool[Tensor, "p m"]]:
         """As `Solver`: the three roots of one sample stand together."""
         F, valid = seven_point_components(sample)
+        valid = valid & consistently_oriented(F, sample[:, :, None])
         return F.permute(0, 2, 3, 1).flatten(2).contiguous(), valid.permute(1, 2, 0).flatten(1).contiguous()
 
 
@@ -66,7 +67,8 @@ class EightPoint:
 
     def __call__(self, sample: Float[Tensor, "4 size p s"]) -> tuple[Float[Tensor, "9 p m"], Bool[Tensor, "p m"]]:
         """As `Solver`."""
-        return eight_point_components(sample)
+        F, valid = eight_point_components(sample)
+        return F, valid & consistently_oriented(F, sample)
 
 
 def residuals_squared(F: Float[Tensor, "p 3 3"], problem: Problem) -> Float[Tensor, "p n"]:
@@ -86,8 +88,8 @@ class WithinThreshold:
         return (residuals_squared(F, problem) <= self.threshold**2) & problem.live
 
 
-def _median(r2: Tensor, problem: Problem) -> Tensor:
-    """The median of the live residuals of each pair, (p, 1)."""
+def median_of_live(r2: Float[Tensor, "p n"], problem: Problem) -> Float[Tensor, "p 1"]:
+    """The median of the live residuals of each pair."""
     ordered = torch.where(problem.live, r2, torch.inf).sort(1).values
     return ordered.gather(1, median_rank(problem.count)[:, None] - 1)
 
@@ -101,7 +103,7 @@ class BetterHalf:
     def __call__(self, F: Float[Tensor, "p 3 3"], problem: Problem) -> Bool[Tensor, "p n"]:
         """The inliers of each pair's model."""
         r2 = residuals_squared(F, problem)
-        return (r2 <= _median(r2, problem)) & problem.live
+        return (r2 <= median_of_live(r2, problem)) & problem.live
 
 
 class RobustDeviations:
@@ -116,7 +118,7 @@ class RobustDeviations:
         """The inliers of each pair's model."""
         r2 = residuals_squared(F, problem)
         spare = (problem.count - self.PARAMETERS).clamp_min(1)[:, None]
-        sigma = 1.4826 * (1 + 5 / spare) * _median(r2, problem).sqrt()
+        sigma = 1.4826 * (1 + 5 / spare) * median_of_live(r2, problem).sqrt()
         return (r2 <= (2.5 * sigma).square()) & problem.live
 
 
@@ -131,54 +133,6 @@ class Refinement:
         weight = problem.live.to(torch.float64) if problem.prior is None else problem.prior
         scale = self.threshold / problem.unit
         return refine_components(F, problem.points, weight, self.kernel, scale, self.iterations)[0]
-
-
-@runtime_checkable
-class FinalFit(Protocol):
-    """Turns the best hypothesis and its inliers into the estimate; attached to the graph of the points."""
-
-    def __call__(
-        self, F: Float[Tensor, "p 3 3"], problem: Problem, inliers: Bool[Tensor, "p n"]
-    ) -> Float[Tensor, "p 3 3"]:
-        """The estimate in normalised units."""
-        ...
-
-
-class NoFit:
-    """The best hypothesis as it is."""
-
-    def __call__(
-        self, F: Float[Tensor, "p 3 3"], problem: Problem, inliers: Bool[Tensor, "p n"]
-    ) -> Float[Tensor, "p 3 3"]:
-        """As `FinalFit`."""
-        return F
-
-
-class LeastSquares:
-    """The normalised 8-point algorithm on the inliers; the hypothesis itself where they do not determine one."""
-
-    def __call__(
-        self, F: Float[Tensor, "p 3 3"], problem: Problem, inliers: Bool[Tensor, "p n"]
-    ) -> Float[Tensor, "p 3 3"]:
-        """As `FinalFit`."""
-        x0, x1 = problem.points[:2].permute(1, 2, 0), problem.points[2:].permute(1, 2, 0)
-        fitted, valid = eight_point(x0, x1, inliers.to(torch.float64))
-        return torch.where(valid[:, None, None], fitted, F)
-
-
-class GaussNewton:
-    """One attached Gauss-Newton step of the Sampson error at the refined model, on its inliers, weighted by the prior.
-
-    At an optimum it moves nothing, and its gradient is that of the optimum (implicit function theorem).
-    """
-
-    def __call__(
-        self, F: Float[Tensor, "p 3 3"], problem: Problem, inliers: Bool[Tensor, "p n"]
-    ) -> Float[Tensor, "p 3 3"]:
-        """As `FinalFit`."""
-        x0, x1 = problem.points[:2].permute(1, 2, 0), problem.points[2:].permute(1, 2, 0)
-        weight = inliers.to(torch.float64) if problem.prior is None else torch.where(inliers, problem.prior, 0)
-        return attached_step(F, x0, x1, weight, kernel="truncated", scale=torch.inf)
 
 
 SAMPLERS: dict[str, Callable[[], Sampler]] = {"uniform": Uniform, "prosac": Prosac, "prior": PriorWeighted}
@@ -197,9 +151,7 @@ INLIER_RULES: dict[str, Callable[[float], Callable[[Tensor, Problem], Tensor]]] 
     "median": BetterHalf,
     "lmeds": RobustDeviations,
 }
-FINAL_FITS: dict[str, Callable[[], FinalFit]] = {
-    "none": NoFit,
-    "least_squares": LeastSquares,
-    "gauss_newton": GaussNewton,
+CHOICES: dict[str, Callable[[float, int], Choice]] = {
+    "saturated": lambda threshold, iterations: SaturatedGain(threshold),
+    "focal": FocalPrior,
 }
-CHOICES: dict[str, Callable[[float], Choice]] = {"saturated": SaturatedGain, "focal": FocalPrior}

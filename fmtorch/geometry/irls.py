@@ -43,18 +43,29 @@ def irls(
         problem = Normalised(x0, x1, weight, mask, F0, scale)
         F = problem.models
         for _ in range(iterations):
-            F = _reweighted(F, problem, robust)
+            F = reweighted(F, problem.points, problem.weight, robust, problem.scale)
         return problem.to_pixels(F).reshape(F0.shape)
 
 
-def _reweighted(F: Float[Tensor, "9 p k"], problem: Normalised, robust: Kernel) -> Float[Tensor, "9 p k"]:
-    """The 8-point algorithm with the weights that the residuals under F give."""
+def reweighted(
+    F: Float[Tensor, "9 p k"],
+    points: Float[Tensor, "4 p n"],
+    weight: Float[Tensor, "p n"],
+    robust: Kernel,
+    scale: Float[Tensor, " p"],
+) -> Float[Tensor, "9 p k"]:
+    """One iteration, component by component: the 8-point algorithm with the weights that the residuals under F give.
+
+    F: k models for each of p pairs, entries row by row. points: x0, y0, x1, y1, of about unit scale; finite. weight: 0
+    in padded slots. scale: of the kernel, in the unit of the points. Models of rank 2; one that the weighted matches do
+    not determine is kept as it was.
+    """
     p, k = F.shape[1:]
-    _, inverse, r2 = linearise(F[..., None].unbind(0), problem.points[:, None, :, None], derivatives=False)
-    w = problem.weight[:, None] * (robust.weight(r2, problem.scale.square()[:, None, None]) * inverse)[0]
+    _, inverse, r2 = linearise(F[..., None].unbind(0), points[:, None, :, None], derivatives=False)
+    w = weight[:, None] * (robust.weight(r2, scale.square()[:, None, None]) * inverse)[0]
     usable = torch.isfinite(w).all(-1, keepdim=True) & (w > 0).any(-1, keepdim=True)
     w = torch.where(usable, w / w.amax(-1, keepdim=True), 0)
-    points = problem.points[:, :, None].expand(4, p, k, -1).movedim(0, -1)
+    points = points[:, :, None].expand(4, p, k, -1).movedim(0, -1)
     x0, T0 = normalize_points(points[..., :2], weight=w)
     x1, T1 = normalize_points(points[..., 2:], weight=w)
     linear, determined = linear_fundamental(x0, x1, w)

@@ -3,7 +3,8 @@
 Each is scaled so that ``loss ~ r^2`` for small residuals; ``weight = d loss / d r^2`` is then 1 at zero, and minimising
 ``sum weight * r^2`` with the weights held fixed, again and again, minimises the sum of losses (IRLS).
 `r2` is the squared residual, `s2` the squared scale in the same unit; both broadcast.
-Zhang (1997), "Parameter estimation techniques", table 1; Torr & Zisserman (2000) for the truncated one.
+Zhang (1997), "Parameter estimation techniques", table 1; Torr & Zisserman (2000) for the truncated one;
+Barath et al. (2020) for that of MAGSAC++, whose scale is k sigma_max, the distance from which on nothing counts.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+from fmtorch.geometry.sigma_consensus import tabulated_curvature, tabulated_loss, tabulated_weight
 
 
 class Kernel(NamedTuple):
@@ -86,6 +89,7 @@ KERNELS: dict[str, Kernel] = {
     "cauchy": Kernel(cauchy_loss, cauchy_weight, cauchy_curvature),
     "geman_mcclure": Kernel(geman_mcclure_loss, geman_mcclure_weight, geman_mcclure_curvature),
     "truncated": Kernel(truncated_loss, truncated_weight, truncated_weight),
+    "magsac": Kernel(tabulated_loss, tabulated_weight, tabulated_curvature),
 }
 
 

@@ -10,6 +10,7 @@ from scipy import integrate
 from fmtorch.estimators import scoring
 from fmtorch.estimators.problem import problems
 from fmtorch.estimators.scoring import GemanMcClure, InlierCount, Median, SigmaConsensus, TruncatedSquares, score_models
+from fmtorch.geometry.sigma_consensus import QUANTILE
 from tests.laws import scene
 from tests.reference import ransac as reference
 
@@ -83,7 +84,7 @@ def test_threshold_must_be_positive(threshold: float) -> None:
 def test_sigma_consensus_is_the_integral_over_sigma() -> None:
     # Barath et al. 2020: w(r) = integral over sigma of the chi density of r / sigma, which vanishes beyond k sigma;
     # rho is the integral of w(r) r. Everything up to a factor, which the normalisation of the gain removes.
-    k, sigma_max = SigmaConsensus.QUANTILE, 1.0
+    k, sigma_max = QUANTILE, 1.0
 
     def weight(r: float) -> float:
         # g(r | sigma) = 2 C(4) sigma^-4 exp(-r^2 / (2 sigma^2)) r^3: over r^3 this leaves sigma^-4 exp(...)
@@ -96,3 +97,12 @@ def test_sigma_consensus_is_the_integral_over_sigma() -> None:
         loss = integrate.quad(lambda r: weight(r) * r, 0, r, epsabs=1e-9)[0]
         gain = float(SigmaConsensus.gain(torch.tensor(share**2, dtype=torch.float64)))
         assert abs(gain - (1 - loss / whole)) < 1e-6
+
+
+def test_models_that_are_none_score_minus_infinity_and_change_no_other() -> None:
+    problem = problems(scene(0, 300), 0, 8)[0][0]
+    F = _models(problem)
+    valid = torch.arange(40)[None] < 25
+    scores = score_models(TruncatedSquares(2.0), F, problem, problem.points.float(), valid=valid)
+    whole = score_models(TruncatedSquares(2.0), F, problem, problem.points.float())
+    assert torch.equal(scores, torch.where(valid, whole, -torch.inf))

@@ -112,7 +112,8 @@ def test_robust_optimum_equals_scipy(kernel: str, seed: int) -> None:
     found, cost = refine_components(F0, components(x0, x1), one, kernel, torch.tensor([scale], dtype=torch.float64), 60)
     # From our optimum SciPy, which knows another parametrisation and numerical gradients, cannot get lower.
     _, least = reference.optimum(found[:, 0, 0].reshape(3, 3).numpy(), x0, x1, np.ones(120), kernel, scale)
-    assert cost.item() == pytest.approx(least, rel=1e-8)
+    # The tabulated kernel is linear between its entries, whose integral is off by up to 1e-7.
+    assert cost.item() == pytest.approx(least, rel=1e-6 if kernel == "magsac" else 1e-8)
     if kernel in ("geman_mcclure", "truncated"):  # bounded losses; the others let a quarter of outliers move F far
         assert distance(found[:, 0, 0], torch.from_numpy(F.flatten())) < 0.05
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import least_squares, minimize
 from scipy.spatial.transform import Rotation
+from scipy.special import gamma, gammainc, gammaincc
 
 
 def sampson(F: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:
@@ -23,7 +24,23 @@ def loss(r2: np.ndarray, s2: float, kernel: str) -> np.ndarray:
         return np.array([s2 * np.log(1 + v / s2) for v in r2])
     if kernel == "geman_mcclure":
         return np.array([v * s2 / (v + s2) for v in r2])
+    if kernel == "magsac":
+        return magsac_loss(r2, s2)
     return np.array([min(v, s2) for v in r2])
+
+
+def magsac_loss(r2: np.ndarray, s2: float) -> np.ndarray:
+    """Barath et al. (CVPR 2020), section 3.2, for s = k sigma_max, over its slope at zero."""
+
+    def upper(a: float, x: np.ndarray) -> np.ndarray:
+        return gammaincc(a, x) * gamma(a)
+
+    end = np.array(3.64**2 / 2)
+    variance = s2 / (2 * end)
+    x = np.minimum(r2, s2) / (2 * variance)
+    rho = variance / 2 * gammainc(2.5, x) * gamma(2.5) + np.minimum(r2, s2) / 4 * (upper(1.5, x) - upper(1.5, end))
+    slope = (gamma(1.5) - upper(1.5, end)) / 4
+    return rho / slope
 
 
 def optimum(

@@ -1,0 +1,45 @@
+"""From correspondences to an estimate through problems of equal size: the frame that batched estimators share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from fmtorch.estimators.problem import Problem, problems
+from fmtorch.types import Correspondences, Estimate
+
+Solve = Callable[[Problem], tuple[Tensor, Tensor, Tensor, Tensor]]
+"""A problem -> F (p, 3, 3) in normalised units, inliers (p, n), found (p,), draws (p,)."""
+
+
+def solve_all(c: Correspondences, seed: int, least: int, solve: Solve, not_found: str, limit: int) -> Estimate:
+    """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`.
+
+    least: matches below which a pair is not tried. not_found: the reason for pairs that `solve` does not find a model
+    for. limit: pairs that are solved together; changes no result.
+    """
+    b, n = c.mask.shape
+    device = c.mask.device
+    F = torch.zeros(b, 3, 3, dtype=torch.float64, device=device)
+    inliers = torch.zeros(b, n, dtype=torch.bool, device=device)
+    draws = torch.zeros(b, dtype=torch.int64, device=device)
+    made, reasons = problems(c, seed, least)
+    limit = max(1, limit)
+    for whole in made:
+        for first in range(0, len(whole.pair), limit):
+            problem = whole[torch.arange(first, min(first + limit, len(whole.pair)), device=device)]
+            estimate, support, found, drawn = solve(problem)
+            F = F.index_copy(0, problem.pair, torch.where(found[:, None, None], problem.to_pixels(estimate), 0))
+            row, match = (support & problem.live & found[:, None]).nonzero(as_tuple=True)
+            inliers[problem.pair[row], problem.slot[row, match]] = True
+            draws[problem.pair] = drawn
+            for i in problem.pair[~found].tolist():
+                reasons[i] = not_found
+    sound = torch.isfinite(F).flatten(1).all(1)
+    F = torch.where(sound[:, None, None], F, 0)
+    for i in (~sound).nonzero()[:, 0].tolist():
+        reasons.setdefault(i, "the final fit is not finite")
+    ok = torch.tensor([i not in reasons for i in range(b)], dtype=torch.bool, device=device)
+    return Estimate(F, inliers, ok, tuple(reasons.get(i, "") for i in range(b)), draws)

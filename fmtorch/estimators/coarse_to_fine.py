@@ -1,0 +1,33 @@
+"""Coarse-to-Fine RANSAC: one estimator finds the inliers, another fits them (Bian et al., BMVC 2019, section 5)."""
+
+from __future__ import annotations
+
+from fmtorch.stages import Estimator
+from fmtorch.types import Correspondences, Estimate
+
+
+class CoarseToFine:
+    """Two estimators in a row: the fine one sees the inliers of the coarse one, and its model is the estimate.
+
+    coarse: one that prunes well, GC-RANSAC or USAC in the paper. fine: one that fits well, LMedS in the paper.
+    A pair that one of them cannot solve is ``ok=False`` with that one's reason; `draws` counts those of both.
+    Gradients are the fine estimator's: the coarse one only chooses matches.
+    """
+
+    def __init__(self, *, coarse: Estimator, fine: Estimator) -> None:
+        self.coarse, self.fine = coarse, fine
+
+    @property
+    def uses_prior(self) -> bool:
+        """Whether a prior makes a difference to one of the two."""
+        return any(getattr(stage, "uses_prior", False) for stage in (self.coarse, self.fine))
+
+    def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
+        """Estimate the fundamental matrices of a batch of pairs."""
+        coarse = self.coarse(c.detach(), seed)
+        fine = self.fine(c.keep(coarse.inliers & coarse.ok[:, None]), seed)
+        reasons = tuple(
+            f"coarse: {first}" if first else f"fine: {second}" if second else ""
+            for first, second in zip(coarse.reason, fine.reason, strict=True)
+        )
+        return fine.replace(reason=reasons, draws=coarse.draws + fine.draws)

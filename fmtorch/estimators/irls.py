@@ -1,0 +1,112 @@
+"""M-estimators of fundamental matrices by iteratively reweighted least squares: no samples, no random numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from fmtorch.estimators.batching import solve_all
+from fmtorch.estimators.choice import best_of
+from fmtorch.estimators.parts import WithinThreshold, median_of_live
+from fmtorch.estimators.problem import Problem
+from fmtorch.estimators.scoring import sampson_squared
+from fmtorch.geometry import attached_step, eight_point
+from fmtorch.geometry.irls import reweighted
+from fmtorch.geometry.refine import refine_components
+from fmtorch.geometry.robust_kernels import named_kernel
+from fmtorch.types import Correspondences, Estimate
+
+TILE = 1 << 16  # matches times models of the pairs that are solved together: bounds memory, changes no result
+DECAY = 0.65  # of the kernel's scale, from one iteration to the next, down to the threshold
+
+
+class IterativelyReweighted:
+    """The least ``sum_i w_i rho(r_i^2)``, r the Sampson distance, from the weighted 8-point algorithm on all matches.
+
+    w is the prior P(inlier); where there is none, the rank by quality (1 for the best match, falling to 0); where there
+    is neither, 1. Each power of w in `starts` gives a first model. From there the scale of the kernel shrinks from the
+    residuals' own to the threshold, one reweighted fit at each scale (graduated non-convexity, Blake & Zisserman 1987,
+    with the 8-point weights of Torr & Murray 1997), so that a redescending kernel is not caught in the nearest minimum.
+    Of the refined models the one of least cost is the estimate.
+
+    kernel: a name of `geometry.KERNELS`. threshold: its scale, Sampson distance, px. starts: powers of w, integers, at
+    least 0. iterations: reweighted fits. start_scale: the kernel's first scale, in robust standard deviations of the
+    residuals under a first model, the widest of them. refine_iterations: Levenberg-Marquardt steps of the end.
+    inlier_threshold: of the inliers reported, Sampson distance, px; null: the threshold.
+
+    Gradients reach the points and the prior through one attached Gauss-Newton step: those of the optimum.
+    """
+
+    uses_prior = True
+    LEAST = 8
+
+    def __init__(
+        self,
+        *,
+        kernel: str,
+        threshold: float,
+        starts: Sequence[int] = (0, 1, 2, 4),
+        iterations: int = 12,
+        start_scale: float = 0.75,
+        refine_iterations: int = 30,
+        inlier_threshold: float | None = None,
+    ) -> None:
+        if not threshold > 0:
+            raise ValueError(f"threshold is {threshold}; it must be positive")
+        if not starts or min(starts) < 0:
+            raise ValueError(f"starts is {starts}; it must be a list of integers, each at least 0")
+        self.kernel, self.robust, self.threshold = kernel, named_kernel(kernel), threshold
+        self.starts = sorted(set(starts))
+        self.iterations, self.start_scale, self.refine_iterations = iterations, start_scale, refine_iterations
+        self.inlier_rule = WithinThreshold(threshold if inlier_threshold is None else inlier_threshold)
+
+    def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
+        """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
+        pairs = TILE // (max(1, c.mask.shape[1]) * len(self.starts))
+        return solve_all(c, seed, self.LEAST, self._solve, "the matches do not determine a model", pairs)
+
+    def _solve(self, problem: Problem) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        weight = _weight(problem)
+        scale = self.threshold / problem.unit
+        with torch.no_grad():
+            F, valid = self._first(problem, weight)
+            start = self._first_scale(F, valid, problem)
+            for i in range(self.iterations):
+                F = reweighted(F, problem.points, weight, self.robust, torch.maximum(start * DECAY**i, scale))
+            F, cost = refine_components(F, problem.points, weight, self.kernel, scale, self.refine_iterations)
+            best = best_of(F, -cost, valid & torch.isfinite(cost)).T.reshape(-1, 3, 3)
+            found = (valid & torch.isfinite(cost)).any(1)
+        x0, x1 = problem.points[:2].permute(1, 2, 0), problem.points[2:].permute(1, 2, 0)
+        estimate = attached_step(best, x0, x1, weight, kernel=self.kernel, scale=scale)
+        with torch.no_grad():
+            inliers = self.inlier_rule(estimate, problem)
+        return estimate, inliers, found, torch.zeros_like(problem.count)
+
+    def _first(self, problem: Problem, weight: Tensor) -> tuple[Float[Tensor, "9 p k"], Bool[Tensor, "p k"]]:
+        """The 8-point algorithm on all matches, with each power of the weights, and whether these determine a model."""
+        powers = [problem.live.to(weight.dtype)]
+        for _ in range(self.starts[-1]):
+            powers.append(powers[-1] * weight)
+        weights = torch.stack([powers[i] for i in self.starts], 1)
+        points = problem.points[:, :, None].expand(-1, -1, len(self.starts), -1)
+        F, valid = eight_point(points[:2].movedim(0, -1), points[2:].movedim(0, -1), weights)
+        return F.flatten(2).permute(2, 0, 1), valid
+
+    def _first_scale(self, F: Tensor, valid: Tensor, problem: Problem) -> Float[Tensor, " p"]:
+        r2 = sampson_squared(F, problem.points)
+        medians = torch.stack([median_of_live(r2[:, i], problem)[:, 0] for i in range(r2.shape[1])], 1)
+        return self.start_scale * 1.4826 * torch.where(valid, medians, 0).amax(1).sqrt()
+
+
+def _weight(problem: Problem) -> Float[Tensor, "p n"]:
+    """The prior, or the rank by quality, or 1; 0 in padded slots."""
+    if problem.prior is not None:
+        return problem.prior
+    if problem.quality is None:
+        return problem.live.to(torch.float64)
+    order = torch.sort(torch.where(problem.live, problem.quality, torch.inf), dim=1, stable=True).indices
+    rank = torch.argsort(order, dim=1)
+    return torch.where(problem.live, 1 - rank / problem.count[:, None], 0).to(torch.float64)

@@ -1,0 +1,67 @@
+"""Two estimators in a row: the second sees the first one's inliers, and each is answerable for its own failures."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from fmtorch import presets
+from fmtorch.estimators import CoarseToFine, HypothesizeAndVerify
+from fmtorch.types import Correspondences, Estimate, collate
+from tests.laws import scene
+
+COARSE = HypothesizeAndVerify(hypotheses=200, threshold=2.0)
+FINE = HypothesizeAndVerify(hypotheses=100, solver="eight_point", score="median", confidence=None, inliers="lmeds")
+
+
+def test_equals_the_two_by_hand() -> None:
+    c = collate([scene(i, n) for i, n in enumerate((150, 90, 200))])
+    coarse = COARSE(c, 3)
+    fine = FINE(c.keep(coarse.inliers), 3)
+    both = CoarseToFine(coarse=COARSE, fine=FINE)(c, 3)
+    assert bool(both.ok.all())
+    assert torch.equal(both.F, fine.F)
+    assert torch.equal(both.inliers, fine.inliers)
+    assert bool((both.inliers <= coarse.inliers).all())
+    assert torch.equal(both.draws, coarse.draws + fine.draws)
+
+
+def test_each_stage_names_its_own_failure() -> None:
+    class Few:
+        """Keeps the first five matches."""
+
+        def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
+            estimate = COARSE(c, seed)
+            return estimate.replace(inliers=estimate.inliers & (estimate.inliers.cumsum(1) <= 5))
+
+    pairs = collate([scene(0), scene(1).replace(mask=torch.zeros(1, 150, dtype=torch.bool))])
+    estimate = CoarseToFine(coarse=Few(), fine=FINE)(pairs)
+    assert estimate.reason == ("fine: 5 matches; at least 8 are needed", "coarse: 0 matches; at least 7 are needed")
+    assert not bool(estimate.ok.any())
+    assert not bool(estimate.inliers.any())
+    assert not bool(estimate.F.any())
+
+
+def test_a_stage_s_options_are_replaced_by_name() -> None:
+    estimator = presets.build("estimator", "cf_ransac", fine={"hypotheses": 77}, coarse={"threshold": 3.5})
+    assert estimator.fine.hypotheses == 77
+    assert estimator.fine.round == presets.build("estimator", "lmeds").round
+    assert estimator.coarse.inlier_threshold == 3.5
+    with pytest.raises(ValueError, match=r"estimator=cf_ransac\.fine: no option treshold; there are: "):
+        presets.build("estimator", "cf_ransac", fine={"treshold": 1.0})
+
+
+@pytest.mark.parametrize("sampler", ["uniform", "prior"])
+def test_uses_the_prior_if_a_stage_does(sampler: str) -> None:
+    coarse = HypothesizeAndVerify(sampler=sampler)
+    assert CoarseToFine(coarse=coarse, fine=FINE).uses_prior == (sampler == "prior")
+
+
+def test_gradients_are_the_fine_stage_s() -> None:
+    c = scene(2, 200)
+    x0 = c.x0.double().requires_grad_()
+    estimate = CoarseToFine(coarse=COARSE, fine=FINE)(c.replace(x0=x0, x1=c.x1.double()))
+    estimate.F.square()[:, 0, 1].sum().backward()
+    assert x0.grad is not None
+    assert bool(torch.isfinite(x0.grad).all())
+    assert bool((x0.grad != 0).any())
