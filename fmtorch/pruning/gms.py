@@ -87,7 +87,7 @@ def gms_support(
 
 def _standing(table: Table, moves: Moves, turns: int, factor: float) -> UInt8[Tensor, "s m"]:
     """The rotations, as bits, under which a match follows an assignment that stands, for each grid of image 1."""
-    line, lines = table.line.flatten(), moves.lines
+    line, lines = moves.line.flatten(), moves.lines
     occupied = (table.filled[:lines] > 0).nonzero()[:, 0]
     rows = []
     for grid, (side, slot, end) in enumerate(zip(moves.grids, table.slot, moves.end, strict=True)):
@@ -131,7 +131,7 @@ def _own_support(table: Table, moves: Moves, winner: Int[Tensor, " pairs"], turn
         grid, turn = divmod(hypothesis, turns)
         members = (chosen == hypothesis).nonzero()[:, 0]
         for line in moves.line:
-            here = members[line[members] >= 0]
+            here = members[line[members] < moves.lines]
             score, mean = Surroundings(table, moves, grid, line[here], moves.end[grid, here]).turned(turn)
             total.index_add_(0, here, (score - 1).clamp_min(0) / mean.clamp_min(1).sqrt() / 4)
     return total

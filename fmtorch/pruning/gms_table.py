@@ -18,7 +18,7 @@ GRIDS = (20, 10, 14, 28, 40)
 # The neighbourhood as (dx, dy): eight cells clockwise from the top left, then the centre. A rotation by 45 degrees
 # moves the ring on by one.
 _RING = ((-1, -1), (0, -1), (1, -1), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (0, 0))
-_TABLE_CPU, _TABLE_GPU = 2**22, 2**28  # entries of the table of moves that are in memory at a time
+_TABLE_CPU, _TABLE_GPU = 2**21, 2**28  # entries of the table of moves that are in memory at a time
 
 Border = Literal["opencv", "authors"]
 
@@ -37,7 +37,7 @@ def moves_in_blocks(
         pair, match = block.nonzero().unbind(-1)
         place = (start + pair) * x0.shape[1] + match
         points0, points1 = (p.flatten(1).index_select(1, place) for p in (p0, p1))
-        yield Moves(_lines(points0, pair, border), _cells(points1, grids), pair, len(block), grids), place
+        yield Moves(_lines(points0, pair, len(block), border), _cells(points1, grids), pair, len(block), grids), place
 
 
 def _normalized(x: Tensor, size: Tensor) -> Float[Tensor, "2 b n"]:
@@ -49,8 +49,8 @@ def _inside_unit(p: Tensor) -> Tensor:
     return ((p >= 0) & (p < 1)).all(0)
 
 
-def _lines(p: Float[Tensor, "2 m"], pair: Int[Tensor, " m"], border: Border) -> Int[Tensor, "4 m"]:
-    """Number of each match's cell of image 0 in the four shifted grids, (pair, shift, cell); -1 for no cell."""
+def _lines(p: Float[Tensor, "2 m"], pair: Int[Tensor, " m"], pairs: int, border: Border) -> Int[Tensor, "4 m"]:
+    """Number of each match's cell of image 0 in the four shifted grids, (pair, shift, cell); one more for no cell."""
     half = (p * (2 * GRID)).floor().int()  # doubling is exact: as if half a cell were added in float64, as in C++
     x, y = torch.stack([half, half + 1], 1) >> 1  # (2, M) each: without and with the shift
     inside_x, inside_y = x < GRID, y < GRID
@@ -59,7 +59,8 @@ def _lines(p: Float[Tensor, "2 m"], pair: Int[Tensor, " m"], border: Border) -> 
         inside_y[1] &= y[1] >= 1
     first = (pair * (4 * CELLS)).int()
     rows = [first + (2 * j) * CELLS + y[j] * GRID for j in (0, 1)]
-    cells = [torch.where(inside_y[j] & inside_x[i], rows[j] + (x[i] + i * CELLS), -1) for j in (0, 1) for i in (0, 1)]
+    none = pairs * 4 * CELLS
+    cells = [torch.where(inside_y[j] & inside_x[i], rows[j] + (x[i] + i * CELLS), none) for j in (0, 1) for i in (0, 1)]
     return torch.stack(cells).long()
 
 
@@ -71,7 +72,8 @@ def _cells(p: Float[Tensor, "2 m"], grids: tuple[int, ...]) -> Int[Tensor, "s m"
 
 
 class Moves(NamedTuple):
-    """Where M matches of several pairs go: from `line`, a cell of image 0, to `end`, a cell of image 1.
+    """Where M matches of several pairs go: from `line`, a cell of image 0 in one of its grids, to `end`, a cell
+    of image 1. Matches without a cell in a grid of image 0 have a spare line, the last.
 
     The table of moves has for each grid of image 1 one row a line, and one more for matches without a cell.
     """
@@ -101,14 +103,12 @@ class Table(NamedTuple):
 
     moves: Int[Tensor, " t"]
     filled: Int[Tensor, " lines"]
-    line: Int[Tensor, "4 m"]
     slot: Int[Tensor, "s places"]
 
 
 def tabulated(moves: Moves) -> Table:
     """Count the moves; `give_back` the table after use."""
-    lines, device = moves.lines, moves.line.device
-    line = torch.where(moves.line >= 0, moves.line, lines)
+    line, lines, device = moves.line, moves.lines, moves.line.device
     filled = torch.zeros(lines + 2, dtype=torch.int32, device=device)
     filled.scatter_add_(0, line.flatten(), torch.ones_like(line.flatten(), dtype=torch.int32))
 
@@ -117,7 +117,7 @@ def tabulated(moves: Moves) -> Table:
     counted = torch.int16 if len(moves.pair) < 2**15 else torch.int32
     table = _zeros((lines + 1) * sum(g * g for g in moves.grids) + 1, counted, device)
     table.scatter_add_(0, slot.flatten(), torch.ones_like(slot.flatten(), dtype=counted))
-    return Table(table, filled, line, slot)
+    return Table(table, filled, slot)
 
 
 _scratch = threading.local()  # a table of zeros for each type: to clear its memory is quicker than to have new
