@@ -57,7 +57,7 @@ def _smallest(values: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """
     short = -values.shape[-1] % _LEAF
     values = torch.nn.functional.pad(values, (0, short), value=math.inf) if short else values
-    grouped = values.unflatten(-1, (-1, _LEAF))
+    grouped = values.unflatten(-1, (-1, _LEAF))  # type: ignore[no-untyped-call]
     minima = grouped.amin(-1)
     columns = []
     for _ in range(count):
