@@ -18,6 +18,7 @@ class Stream(enum.IntEnum):
     TRAINING = 4
     PLANE = 5
     PARALLAX = 6
+    REFINEMENT = 7
 
 
 def _wrap(value: int) -> int:

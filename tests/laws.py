@@ -38,7 +38,8 @@ def quick(name: str, hypotheses: int = 200, round: int = 100) -> Estimator:
 
     def fewer(config: Mapping[str, Any]) -> dict[str, Any]:
         if config["_target_"] == "fmtorch.estimators.HypothesizeAndVerify":
-            return {"hypotheses": hypotheses, "round": round}
+            limit = {"refine_matches": 64} if config.get("refine_matches") else {}  # fewer than a scene has
+            return {"hypotheses": hypotheses, "round": round, **limit}
         return {key: fewer(value) for key, value in config.items() if isinstance(value, dict)}
 
     built: Estimator = presets.build("estimator", name, **fewer(presets.load("estimator", name)))

@@ -29,6 +29,7 @@ from fmtorch.types import Correspondences, Estimate
 
 CPU_SAMPLES = 1 << 14  # minimal samples that are solved together: bounds memory, changes no result
 GPU_SAMPLES = 1 << 21
+REACH = 4.0  # refinement thresholds: a match farther from all models of the pool is not looked at again
 UNSTOPPED_ROUND = 2000  # samples of a round where nobody looks in between: few operations on many numbers are faster
 
 
@@ -61,6 +62,8 @@ class HypothesizeAndVerify:
     a grid) or `focal` (the same, with a prior on the focal length: for whole photographs, not crops; `saturated` where
     the image sizes are unknown); choice_threshold: of the last two, Sampson distance in pixels, null: the score's;
     choice_iterations: steps of the refinement that `focal` makes.
+    refine_matches: at most so many matches for refinement and choice, drawn by the pair's key from those within REACH
+    refine_thresholds of a model of the pool; null: all matches.
     inliers: `threshold`, `lmeds` (2.5 robust standard deviations) or `median` (the better half).
     inlier_threshold: of the inliers reported, Sampson distance in pixels; null: the score's threshold.
     final: `least_squares` (8-point on the inliers), `gauss_newton` (one attached step), `adaptive` (refined at the
@@ -93,6 +96,7 @@ class HypothesizeAndVerify:
         refine: str | None = None,
         refine_threshold: float = 1.0,
         refine_iterations: int = 5,
+        refine_matches: int | None = None,
         choice: str = "score",
         choice_threshold: float | None = None,
         choice_iterations: int = 12,
@@ -125,6 +129,7 @@ class HypothesizeAndVerify:
             optimization = part("local_optimization", local_optimization, LOCAL_OPTIMIZATIONS)
             self.local_optimization = optimization(threshold, self.score)
         self.refinement = None if refine is None else Refinement(refine, refine_threshold, refine_iterations)
+        self.reach, self.refine_matches = REACH * refine_threshold, refine_matches
         self.choice = (
             None
             if choice == "score"
@@ -168,6 +173,8 @@ class HypothesizeAndVerify:
             return F[:, :, 0]
         if self.local_optimization is not None:
             F = self.local_optimization(F, problem)
+        if self.refine_matches is not None:
+            problem = self._near(search.F, problem, self.refine_matches)
         if self.refinement is not None:
             F = self.refinement(F, problem)
         alive = torch.isfinite(search.score)
@@ -175,6 +182,15 @@ class HypothesizeAndVerify:
             return self.choice(F, problem, alive)
         score = score_models(self.score, F.to(torch.float32), problem, problem.points.to(torch.float32))
         return best_of(F, score, alive)
+
+    def _near(self, F: Float[Tensor, "9 p k"], problem: Problem, most: int) -> Problem:
+        """The same pairs with at most so many of their matches, of those near one of the models."""
+        r2 = sampson_squared(F, problem.points.to(torch.float32)).nan_to_num_(torch.inf).amin(1)
+        near = problem.live & (r2 * problem.unit.square()[:, None].to(r2.dtype) <= self.reach**2)
+        order = random.bits(problem.seed, problem.key, Stream.REFINEMENT, 0, near.shape[1], 1)[..., 0]
+        order = torch.where(near, order, torch.iinfo(torch.int64).max)
+        longest = min(most, max(int(near.sum(1).max()), 1))
+        return problem.take(torch.sort(order, dim=1, stable=True).indices[:, :longest], near)
 
     def _search(self, problem: Problem) -> _Search:
         p, device = len(problem.pair), problem.points.device

@@ -19,7 +19,8 @@ SMALLEST, LARGEST = 0.3, 2.0  # px, bounds of that distance
 UNKNOWN = 1.5  # px, that distance where too few matches tell the noise
 LEAST = 15  # matches that tell the noise
 LIKELY = 0.3  # matches of a smaller prior do not tell the noise
-ITERATIONS = 5  # Levenberg-Marquardt steps
+ITERATIONS = 5  # Levenberg-Marquardt steps, at most
+TOLERANCE = 1e-3  # share of the cost: a smaller gain is left to the attached step
 
 
 @runtime_checkable
@@ -90,7 +91,7 @@ class AdaptiveGaussNewton:
             truncation = noise(residuals_squared(F, problem), inliers & (prior > LIKELY))
             models = F.flatten(1).T[..., None].contiguous()
             scale = truncation / problem.unit
-            refined, _ = refine_components(models, problem.points, prior, "truncated", scale, ITERATIONS)
+            refined, _ = refine_components(models, problem.points, prior, "truncated", scale, ITERATIONS, TOLERANCE)
             F = refined[..., 0].T.reshape(-1, 3, 3)
             close = residuals_squared(F, problem) <= truncation.square()[:, None]
         x0, x1 = problem.points[:2].permute(1, 2, 0), problem.points[2:].permute(1, 2, 0)

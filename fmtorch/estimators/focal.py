@@ -31,6 +31,9 @@ RATIO_DEVIATION = 0.3  # of the logarithm of the two focal lengths' ratio
 SIGMA = 0.3  # px, standard deviation of an inlier's Sampson distance
 # Share of the best gain without prior that gain minus prior cost must reach; chosen on castle-P19, fox, crops of them.
 GATE = 0.94
+# A pair is open, and the prior is asked, where a candidate of RIVAL of the best gain is further from the best one than
+# SAME: 1 - |cosine| of the two as vectors.
+RIVAL, SAME = 0.85, 1e-3
 ITERATIONS = 12  # Levenberg-Marquardt steps
 SHORTEST, LONGEST = 0.25, 5.0  # focal lengths outside are not believed at the start
 DAMPING, SMALLEST_DAMPING, LARGEST_DAMPING = 1e-3, 1e-9, 1e6
@@ -50,14 +53,24 @@ class FocalPrior:
 
     def __call__(self, F: Float[Tensor, "9 p k"], problem: Problem, alive: Bool[Tensor, "p k"]) -> Float[Tensor, "9 p"]:
         """As `Choice`."""
-        gain = self.gain.score(F, problem)
+        gain = torch.where(alive, self.gain.score(F, problem), -torch.inf)
         plain = best_of(F, gain, alive)
         if problem.size0 is None or problem.size1 is None:
             return plain
+        apart = 1 - component_sum(F * plain[..., None]).abs()
+        rival = (gain >= RIVAL * gain.amax(1, keepdim=True)) & ~(apart <= SAME)
+        (open_,) = rival.any(1).nonzero(as_tuple=True)
+        if not len(open_):
+            return plain
+        return plain.index_copy(1, open_, self._chosen(F[:, open_], problem[open_], alive[open_], gain[open_]))
+
+    def _chosen(
+        self, F: Float[Tensor, "9 p k"], problem: Problem, alive: Bool[Tensor, "p k"], gain: Float[Tensor, "p k"]
+    ) -> Float[Tensor, "9 p"]:
         focal, prior = refine_focal(F, problem, self.threshold, self.iterations)
         posterior = torch.where(alive, self.gain.score(focal, problem) - prior, -torch.inf).nan_to_num(nan=-torch.inf)
-        best = torch.where(alive, gain, -torch.inf).amax(1)
-        return torch.where(posterior.amax(1) >= GATE * best, best_of(focal, posterior, alive), plain)
+        plain = best_of(F, gain, alive)
+        return torch.where(posterior.amax(1) >= GATE * gain.amax(1), best_of(focal, posterior, alive), plain)
 
 
 def refine_focal(
@@ -122,48 +135,44 @@ class _Objective:
         self.data = Objective(points, weight, KERNELS["truncated"], threshold / problem.unit)
         self.precision = (problem.unit / SIGMA).square()[:, None]
         self.longest = longest
+        # Of the derivatives of E by rotations of U about its three axes and of V about the first two.
+        self.signs = points.new_tensor([1.0, -1.0, 1.0, 1.0, -1.0])[:, None, None]
 
     def at(self, U: Tensor, V: Tensor, focal: Tensor, derivatives: bool) -> _State:
         """The state of these parameters."""
         depth = exponential(focal) * self.longest[..., None]
-        F = _fundamental(_outer(U, V, 0, 0) + _outer(U, V, 1, 1), depth)
+        outer = (U[:, None, :, None] * V[None, :, None]).flatten(
+            2, 3
+        )  # columns i of U and j of V: (3, 3, 3i + j, p, k)
+        scales = _scales(depth)
+        F = (outer[:, :, 0] + outer[:, :, 4]) * scales
         products, cost = self.data(F.flatten(0, 1), derivatives)
         prior, prior_gradient, prior_hessian = _prior(focal)
         cost = cost * self.precision / 2 + prior
         if not derivatives:
             return _State(U, V, focal, F.flatten(0, 1), cost, cost[:0], cost[:0])
-        zero = torch.zeros_like(F[0])
-        last = F[2].new_tensor([0, 0, 1])[:, None, None]
-        tangents = torch.stack(
-            [
-                *(
-                    _fundamental(E, depth)
-                    for E in (
-                        _outer(U, V, 2, 1), -_outer(U, V, 2, 0), _outer(U, V, 1, 0) - _outer(U, V, 0, 1),
-                        _outer(U, V, 1, 2), -_outer(U, V, 0, 2),
-                    )
-                ),
-                F * last,
-                torch.stack([zero, zero, F[2]]),
-            ]
-        ).flatten(1, 2)  # fmt: skip
-        H, g = products[:9, :9], products[:9, 9]
-        along = component_sum((tangents[:, :, None] * H).transpose(0, 1))  # (7, 9)
-        hessian = component_sum((along[:, None] * tangents).movedim(2, 0)) * self.precision
-        gradient = component_sum((tangents * g).transpose(0, 1)) * self.precision
-        hessian[5:, 5:] += prior_hessian[..., None, None]
+        tangents = F.new_zeros(3, 3, 7, *focal.shape[1:])
+        torch.mul(outer[:, :, [7, 6, 3, 5, 2]], self.signs, out=tangents[:, :, :5])
+        tangents[:, :, 2] -= outer[:, :, 1]
+        tangents[:, :, :5] *= scales[:, :, None]
+        tangents[:, 2, 5], tangents[2, :, 6] = F[:, 2], F[2]
+        T = tangents.flatten(0, 1)
+        along = component_sum(T[:, :, None] * products[:9, None])  # (7, 10)
+        hessian = component_sum(T[:, None] * along.transpose(0, 1)[:9, :, None]) * self.precision
+        gradient = along[:, 9] * self.precision
+        hessian[5:, 5:] += prior_hessian
         gradient[5:] += prior_gradient
         return _State(U, V, focal, F.flatten(0, 1), cost, gradient, hessian)
 
 
 def _prior(focal: Float[Tensor, "2 p k"]) -> tuple[Tensor, Tensor, Tensor]:
-    """The cost of two log focal lengths, its gradient (2, p, k) and second derivatives (2, 2)."""
+    """The cost of two log focal lengths, its gradient (2, p, k) and second derivatives (2, 2, 1, 1)."""
     ratio = (focal[0] - focal[1]) / RATIO_DEVIATION
     mean = ((focal[0] + focal[1]) / 2 - math.log(USUAL_FOCAL)) / FOCAL_DEVIATION
     a, b = 1 / RATIO_DEVIATION, 0.5 / FOCAL_DEVIATION
     gradient = torch.stack([a * ratio + b * mean, b * mean - a * ratio])
     hessian = focal.new_tensor([[a * a + b * b, b * b - a * a], [b * b - a * a, a * a + b * b]])
-    return (ratio * ratio + mean * mean) / 2, gradient, hessian
+    return (ratio * ratio + mean * mean) / 2, gradient, hessian[..., None, None]
 
 
 def _step(state: _State, damping: Tensor) -> Float[Tensor, "7 p k"]:
@@ -199,15 +208,12 @@ def _rotated(U: Tensor, angle: Float[Tensor, "3 p k"]) -> Tensor:
     return rotated
 
 
-def _outer(U: Tensor, V: Tensor, i: int, j: int) -> Float[Tensor, "3 3 p k"]:
-    """Column i of U times column j of V, transposed."""
-    return U[:, i, None] * V[None, :, j]
-
-
-def _fundamental(E: Float[Tensor, "3 3 p k"], depth: Float[Tensor, "2 p k"]) -> Float[Tensor, "3 3 p k"]:
-    """``diag(1, 1, depth1) E diag(1, 1, depth0)``, the depth being the focal length in the unit of the points."""
-    one = torch.ones_like(depth[0])
-    return E * torch.stack([one, one, depth[0]]) * torch.stack([one, one, depth[1]])[:, None]
+def _scales(depth: Float[Tensor, "2 p k"]) -> Float[Tensor, "3 3 p k"]:
+    """What ``diag(1, 1, depth1) E diag(1, 1, depth0)`` multiplies E by; depth: focal length in the unit of points."""
+    scales = depth.new_ones(3, 3, *depth.shape[1:])
+    scales[:, 2] = depth[0]
+    scales[2] *= depth[1]
+    return scales
 
 
 def _translated(F: Float[Tensor, "9 p k"], offset: Float[Tensor, "4 p"]) -> Float[Tensor, "9 p k"]:
@@ -225,8 +231,7 @@ def _start(F: Float[Tensor, "9 p k"], longest: Float[Tensor, "2 p"]) -> tuple[Te
     plausible = ((square > SHORTEST**2) & (square < LONGEST**2)).all(0)
     focal = torch.where(plausible, logarithm(torch.where(plausible, square, 1)) / 2, math.log(USUAL_FOCAL))
     depth = 1 / (exponential(focal) * longest[..., None])
-    M = _fundamental(G.reshape(3, 3, *G.shape[1:]), depth).flatten(0, 1)
-    M, e0, e1 = start(M)
+    M, e0, e1 = start(G * _scales(depth).flatten(0, 1), 0)
     p, q = complement(e0)
     a, b = complement(e1)
     # In the planes across the epipoles M is 2 x 2; its nearest orthogonal matrix gives both singular values 1.
@@ -258,20 +263,27 @@ def bougnoux(
 
 
 def exponential(x: Tensor) -> Tensor:
-    """exp(x) for |x| up to about 5 by arithmetic alone: library functions differ in the last bit with memory layout."""
-    y = x / 256
-    value = torch.ones_like(y)
-    for k in range(6, 0, -1):
-        value = 1 + value * y / k
-    for _ in range(8):
+    """exp(x) for |x| up to about 5 by arithmetic alone: library functions differ in the last bit with memory layout.
+
+    Pade's approximant of order 4 at x / 32, to rounding there, and five squarings.
+    """
+    y = x / 32
+    y2 = y * y
+    even, odd = 1680 + y2 * (180 + y2), y * (840 + 20 * y2)
+    value = (even + odd) / (even - odd)
+    for _ in range(5):
         value = value * value
     return value
 
 
 def logarithm(x: Tensor) -> Tensor:
-    """ln(x) for x between about 1/50 and 50, by Halley's method on `exponential`."""
-    y = torch.zeros_like(x)
-    for _ in range(5):
-        e = exponential(y)
-        y = y + 2 * (x - e) / (x + e)
-    return y
+    """ln(x) of positive numbers, to rounding, by arithmetic alone: the series of atanh at the mantissa."""
+    mantissa, exponent = torch.frexp(x)
+    m = mantissa * math.sqrt(2)
+    z = (m - 1) / (m + 1)
+    z2 = z * z
+    series = torch.full_like(z, 1 / 19)
+    for k in range(17, 0, -2):
+        series = series * z2 + 1 / k
+    value: Tensor = 2 * z * series + (exponent.to(x.dtype) - 0.5) * math.log(2)
+    return value

@@ -53,6 +53,19 @@ class Problem:
         }
         return dataclasses.replace(self, points=self.points[:, index], **changes)
 
+    def take(self, index: Int[Tensor, "p k"], wanted: Bool[Tensor, "p n"]) -> Problem:
+        """The same pairs with the matches of these indices; slots of unwanted ones, which stand last, are empty."""
+        live = wanted.gather(1, index)
+
+        def some(value: Tensor | None) -> Tensor | None:
+            return None if value is None else torch.where(live, value.gather(1, index), 0)
+
+        points = torch.where(live, self.points.gather(2, index.expand(4, -1, -1)), 0)
+        return dataclasses.replace(
+            self, points=points, live=live, count=live.sum(1), slot=self.slot.gather(1, index),
+            quality=some(self.quality), prior=some(self.prior),
+        )  # fmt: skip
+
     def to_pixels(self, F: Float[Tensor, "p 3 3"]) -> Float[Tensor, "p 3 3"]:
         """Fundamental matrices of normalised coordinates, in pixels, canonical in scale and sign."""
         T0, T1 = self._similarity(self.centre[:, :2]), self._similarity(self.centre[:, 2:])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -19,7 +20,9 @@ _SPREADING = (
 )
 
 
-def curve_order(points: Float[Tensor, "d b n"], mask: Bool[Tensor, "b n"], shift: float) -> Int[Tensor, "b n"]:
+def curve_order(
+    points: Float[Tensor, "d b n"], mask: Bool[Tensor, "b n"], shift: float | Float[Tensor, "b 1"]
+) -> Int[Tensor, "b n"]:
     """The order of the live points along a Morton curve over a shifted grid; the others last.
 
     points: of 2 or 4 coordinates. shift: of the grid, between 0 and 1, in thirds of the curve's extent, which is 1.5
@@ -32,6 +35,19 @@ def curve_order(points: Float[Tensor, "d b n"], mask: Bool[Tensor, "b n"], shift
     cell = (torch.where(mask, (points - low) / extent, 0) * 2 + shift) / 3 * ((1 << _BITS) - 1)
     code = torch.where(mask, _interleaved(cell.to(torch.int64)), _AFTER_ALL)
     return torch.argsort(code, dim=-1, stable=True)
+
+
+def curve_orders(
+    points0: Float[Tensor, "2 b n"],
+    points1: Float[Tensor, "2 b n"],
+    mask: Bool[Tensor, "b n"],
+    curves: Sequence[tuple[float, float]],
+) -> Int[Tensor, "c b n"]:
+    """`curve_order` of the points in image 0, then in image 1, along curves of these (shift, rotation in radians)."""
+    planes = [rotated(points, angle) for points in (points0, points1) for _, angle in curves]
+    b = len(mask)
+    shift = points0.new_tensor([s for s, _ in curves] * 2).repeat_interleave(b)[:, None]
+    return curve_order(torch.cat(planes, 1), mask.repeat(len(planes), 1), shift).reshape(len(planes), *mask.shape)
 
 
 def rotated(points: Float[Tensor, "2 b n"], angle: float) -> Float[Tensor, "2 b n"]:

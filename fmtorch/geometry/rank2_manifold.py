@@ -60,16 +60,17 @@ def retract(F: Tensor, step: Tensor, e0: Tensor, e1: Tensor) -> tuple[Tensor, Te
     return G, unit(component_sum(C * e1[:, None])), unit(component_sum(C * e0, 1))
 
 
-def start(F: Float[Tensor, "9 p k"]) -> tuple[Tensor, Tensor, Tensor]:
+def start(F: Float[Tensor, "9 p k"], squarings: int = 5) -> tuple[Tensor, Tensor, Tensor]:
     """A rank-2 matrix of unit norm close to F and its epipoles: ``F (I - e0 e0^T)``.
 
-    e0 is the right singular vector of the smallest singular value, by five squarings of the matrix whose dominant
-    eigenvector it is; to rounding where the last two singular values differ by half, and F has rank 2 in any case.
+    e0 is the right singular vector of the smallest singular value, by squarings of the matrix whose dominant
+    eigenvector it is: with five to rounding where the last two singular values differ by half, with none where F has
+    rank 2 up to rounding already. The result has rank 2 in any case.
     """
     F = unit(F)
     C = square(cofactors(F))
     K = component_sum(C[:, :, None] * C[:, None])  # C^T C
-    for _ in range(5):
+    for _ in range(squarings):
         K = K / K.abs().amax((0, 1))
         K = component_sum(K[:, :, None] * K[:, None])
     size = component_sum(K * K, 1)

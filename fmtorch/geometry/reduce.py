@@ -31,9 +31,18 @@ def stable_sum(x: Tensor, dim: int = -1) -> Tensor:
     return x.squeeze(dim)
 
 
+SMALL = 1 << 13  # elements up to which a cumulative sum takes less time than one addition after the other
+
+
 def component_sum(x: Tensor, dim: int = 0) -> Tensor:
-    """The sum over a short axis of fixed length, in order: for few numbers this takes less time than a tree."""
+    """The sum over a short axis of fixed length, in order; of float64 numbers of any layout the same bits.
+
+    Small tensors are summed by a cumulative sum, which is sequential by definition: one call instead of many.
+    """
+    if x.numel() <= SMALL and x.dtype == torch.float64 and not x.is_cuda and not x.requires_grad:
+        return x.cumsum(dim).select(dim, -1)
     first, *rest = x.unbind(dim)
+    first = first + 0.0  # -0 becomes 0, as in a cumulative sum
     for part in rest:
         first = first + part
     return first

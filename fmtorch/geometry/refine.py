@@ -39,11 +39,13 @@ def refine_components(
     kernel: str,
     scale: Float[Tensor, " p"],
     iterations: int,
+    tolerance: float = 0.0,
 ) -> tuple[Float[Tensor, "9 p k"], Float[Tensor, "p k"]]:
     """Refined models and their costs ``sum_i w_i rho(r_i^2)``, component by component, without gradients.
 
     F: k models for each of p pairs, entries row by row; made rank 2 first where they are not. points: x0, y0, x1, y1,
     of about unit scale; finite. weight: 0 in padded slots. scale: of the kernel, in the unit of the points.
+    iterations: at most. tolerance: a model is done once a step has lowered its cost by no more than this share of it.
     The cost of a model never rises above that of its (rank-2) start; a model that cannot be improved is kept, one that
     is not finite comes back as it was, with infinite cost.
     """
@@ -51,12 +53,17 @@ def refine_components(
         objective = Objective(points, weight, named_kernel(kernel), scale)
         state = _State(objective, *start(F), iterations > 0)
         damping = torch.full_like(state.cost, DAMPING)
+        done = torch.zeros_like(state.cost, dtype=torch.bool)
         for i in range(iterations):
             step = solve(state.products, state.F, state.e0, state.e1, damping)
             trial = _State(objective, *retract(state.F, step, state.e0, state.e1), i + 1 < iterations)
-            better = trial.cost < state.cost
+            better = (trial.cost < state.cost) & ~done
             damping = torch.where(better, damping / 10, damping * 10).clamp_(SMALLEST_DAMPING, LARGEST_DAMPING)
+            if tolerance:
+                done |= better & (state.cost - trial.cost <= tolerance * state.cost)
             state.adopt(trial, better)
+            if tolerance and bool(done.all()):
+                break
         kept = torch.isfinite(state.cost)
         return torch.where(kept, state.F, F), torch.where(kept, state.cost, torch.inf)
 

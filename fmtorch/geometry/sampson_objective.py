@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.geometry.reduce import stable_sum
+from fmtorch.geometry.reduce import component_sum, stable_sum
 from fmtorch.geometry.robust_kernels import Kernel
 
 LANES = 64  # points are summed one by one into so many lanes, and these in a tree: part of the result's last bits
@@ -73,14 +73,14 @@ class Objective:
         p, k = F.shape[1:]
         f = F[..., None].unbind(0)
         m, count = len(weight), max(1, TILE_ELEMENTS // (p * k * LANES))
-        lanes: list[Tensor] = []
+        losses: list[Tensor] = []
         sums = self._buffer(101, p, k, LANES)  # of the products, then the cost
         products = sums[:100].view(10, 10, p, k, LANES)
         for first in range(0, m, count):
             some = slice(first, first + count)
             w = weight[some]
             rows, inverse, r2 = linearise(f, points[:, some], derivatives)
-            lanes += (self.robust.loss(r2, s2) * w).unbind(0)
+            losses.append(self.robust.loss(r2, s2) * w)
             if not derivatives:
                 continue
             A, B = self._buffer(2, len(w), 10, p, k, LANES).unbind(0)
@@ -91,9 +91,7 @@ class Objective:
                     torch.mul(a, b, out=products)
                 else:
                     products.addcmul_(a, b)
-        cost = lanes[0]
-        for lane in lanes[1:]:
-            cost = cost + lane
+        cost = component_sum(losses[0] if len(losses) == 1 else torch.cat(losses))
         if not derivatives:
             return F.new_empty(0, 0, p, k), stable_sum(cost)
         sums[100] = cost

@@ -10,12 +10,14 @@ eighth of the time, and the same area under the ROC curve (measured on castle-P1
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.geometry.curves import curve_order, rotated
+from fmtorch.geometry.curves import curve_orders
+from fmtorch.geometry.reduce import component_sum
 from fmtorch.types import Correspondences
 
 WINDOW = 8  # neighbours before and after each match along each curve
@@ -23,6 +25,7 @@ CURVES = ((0.0, 0.0), (0.5, math.pi / 4))  # shift of the grid (in thirds of the
 TOLERANCE = 0.25  # relative prediction error at which agreement falls to about 1/e
 NOISE = 4.0  # px, keeps close neighbours from being judged by their localisation noise
 WORST_RATIO, LEAST_VOTE = 0.85, 0.02  # a neighbour votes with WORST_RATIO - ratio, at least LEAST_VOTE
+TILE = 1 << 15  # matches looked at together; bounds memory, changes no result
 
 
 def frame_agreement(
@@ -45,14 +48,25 @@ def frame_agreement(
     rows = torch.stack([*x0.unbind(-1), *x1.unbind(-1), *S.flatten(2).unbind(-1), scale, vote])
     sound = mask & torch.isfinite(rows).all(0)
     rows = torch.where(sound, rows, 0)
-    agreement, votes = torch.zeros_like(rows[0]), torch.zeros_like(rows[0])
-    for points in (rows[0:2], rows[2:4]):
-        for shift, angle in CURVES:
-            order = curve_order(rotated(points.detach(), angle), sound, shift)
-            along = rows.gather(2, order.expand(len(rows), -1, -1))
-            agreeing, voting = _along_curve(along)
-            agreement = agreement.scatter_add(1, order, agreeing)
-            votes = votes.scatter_add(1, order, voting)
+    return tiled(_agreement, rows, sound)
+
+
+def tiled(function: Callable[[Tensor, Tensor], Tensor], rows: Tensor, sound: Bool[Tensor, "b n"]) -> Tensor:
+    """function(rows (d, b, n), sound) over so many pairs at once that TILE matches bound its memory."""
+    pairs = max(1, TILE // max(sound.shape[1], 1))
+    if len(sound) <= pairs:
+        return function(rows, sound)
+    tiles = zip(torch.split(rows, pairs, 1), torch.split(sound, pairs), strict=True)
+    return torch.cat([function(*tile) for tile in tiles])
+
+
+def _agreement(rows: Float[Tensor, "10 b n"], sound: Bool[Tensor, "b n"]) -> Float[Tensor, "b n"]:
+    """The agreement of matches x0, y0, x1, y1, S, scale, vote along all curves in both images at once."""
+    orders = curve_orders(rows[0:2].detach(), rows[2:4].detach(), sound, CURVES)
+    along = rows[:, None].expand(-1, len(orders), -1, -1).gather(3, orders.expand(len(rows), -1, -1, -1))
+    sums = torch.stack(_along_curve(along.flatten(1, 2))).reshape(2, *orders.shape)
+    found = torch.zeros_like(sums).scatter(3, orders.expand(2, -1, -1, -1), sums)
+    agreement, votes = component_sum(found, 1)
     return torch.where(sound, agreement / votes.clamp_min(torch.finfo(votes.dtype).tiny), 0)
 
 
@@ -81,11 +95,7 @@ def _along_curve(rows: Float[Tensor, "10 b n"]) -> tuple[Float[Tensor, "b n"], F
     agree = (1 + error / length.square() * (TOLERANCE**-2 / 8)).square().square().square().reciprocal()
     vote = near[9]
     agreeing = agree * vote
-    # Added one by one: the order of a sum must not depend on the batch.
-    total, votes = agreeing[0], vote[0]
-    for k in range(1, len(offsets)):
-        total, votes = total + agreeing[k], votes + vote[k]
-    return total, votes
+    return component_sum(agreeing), component_sum(vote)
 
 
 def _prediction_error(S: Tensor, dx: Tensor, dy: Tensor, ux: Tensor, uy: Tensor) -> Tensor:

@@ -15,9 +15,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fmtorch.geometry.curves import curve_order, rotated
+from fmtorch.geometry.curves import curve_orders
+from fmtorch.geometry.reduce import component_sum
 from fmtorch.pruning.calibration import Calibration
-from fmtorch.pruning.frame_consistency import CURVES, LEAST_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO
+from fmtorch.pruning.frame_consistency import CURVES, LEAST_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO, tiled
 from fmtorch.types import Correspondences
 
 TURNS = 16  # hypotheses of the common turn
@@ -54,17 +55,18 @@ def position_agreement(
     rows = torch.stack([*x0.unbind(-1), *x1.unbind(-1), vote])
     sound = mask & (rows.abs() < _FARTHEST).all(0)
     rows = torch.where(sound, rows, 0)
-    orders = [
-        curve_order(rotated(points.detach(), angle), sound, shift)
-        for points in (rows[0:2], rows[2:4])
-        for shift, angle in CURVES
-    ]
-    along = [rows.gather(2, order.expand(len(rows), -1, -1)) for order in orders]
-    S = common_similarity(along[0].detach(), along[len(CURVES)].detach(), sound.sum(1))
-    agreement, votes = torch.zeros_like(rows[0]), torch.zeros_like(rows[0])
-    for order, sorted_rows in zip(orders, along, strict=True):
-        agreeing, voting = _along_curve(sorted_rows, S)
-        agreement, votes = agreement.scatter_add(1, order, agreeing), votes.scatter_add(1, order, voting)
+    return tiled(_agreement, rows, sound)
+
+
+def _agreement(rows: Float[Tensor, "5 b n"], sound: Bool[Tensor, "b n"]) -> Float[Tensor, "b n"]:
+    """The agreement of matches x0, y0, x1, y1, vote along all curves in both images at once."""
+    orders = curve_orders(rows[0:2].detach(), rows[2:4].detach(), sound, CURVES)
+    along = rows[:, None].expand(-1, len(orders), -1, -1).gather(3, orders.expand(len(rows), -1, -1, -1))
+    S = common_similarity(along[:, 0].detach(), along[:, len(CURVES)].detach(), sound.sum(1))
+    S = Similarity(*(value.repeat(len(orders), 1) for value in S))
+    sums = torch.stack(_along_curve(along.flatten(1, 2), S)).reshape(2, *orders.shape)
+    found = torch.zeros_like(sums).scatter(3, orders.expand(2, -1, -1, -1), sums)
+    agreement, votes = component_sum(found, 1)
     return torch.where(sound, agreement / votes.clamp_min(torch.finfo(votes.dtype).tiny), 0)
 
 

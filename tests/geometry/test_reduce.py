@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from fmtorch.geometry.reduce import component_sum, matmul3, outer_sum, stable_sum
+from fmtorch.geometry.reduce import SMALL, component_sum, matmul3, outer_sum, stable_sum
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 7, 8, 9, 100, 760, 1000])
@@ -27,6 +27,20 @@ def test_stable_sum_is_a_sum_that_padding_and_neighbours_do_not_change(n, dtype)
 def test_component_sum(n, dim):
     x = torch.arange(n**3, dtype=torch.float64).reshape(n, n, n)
     assert torch.equal(component_sum(x, dim), x.sum(dim))  # integers: exact
+
+
+@pytest.mark.parametrize("n", [3, 7, 9])
+@pytest.mark.parametrize("dim", [0, 1])
+def test_component_sum_has_the_same_bits_in_small_and_in_large_tensors(n, dim):
+    x = torch.randn(n, n, 2000, generator=torch.Generator().manual_seed(n), dtype=torch.float64)
+    x[..., :50] = -0.0  # of which a sum is 0, not -0, on both ways
+    whole = component_sum(x, dim)
+    assert x[..., 30:130].numel() <= SMALL < x.numel()
+    assert torch.equal(component_sum(x[..., 30:130], dim).view(torch.int64), whole[..., 30:130].view(torch.int64))
+    turned = x[..., 30:130].transpose(0, 2).contiguous().transpose(0, 2)
+    assert torch.equal(component_sum(turned, dim).view(torch.int64), whole[..., 30:130].view(torch.int64))
+    attached = x[..., 30:130].clone().requires_grad_()
+    assert torch.equal(component_sum(attached, dim).view(torch.int64), whole[..., 30:130].view(torch.int64))
 
 
 def test_matmul3_broadcasts():
