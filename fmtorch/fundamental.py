@@ -41,7 +41,8 @@ def find_fundamental(
     quality: (B, N), the matcher's figure, smaller is better (a distance ratio). prior: (B, N), P(inlier) in [0, 1].
     lafs0, lafs1: (B, N, 2, 3) local affine frames. size0, size1: (B, 2) image sizes (h, w). key: (B,) int64, selects
     each pair's random numbers. Where an estimator uses a prior and none is given, it is derived from the frames and the
-    quality, if these are. One pair's arguments may come without the leading B.
+    quality, if both are given, otherwise from the points and, if given, the quality. One pair's arguments may come
+    without the leading B.
     estimator: a preset of conf/estimator; `options` replace values of it (``threshold=0.5``).
 
     Returns an `Estimate` of B pairs (of one pair for (N, 2) points): F with unit Frobenius norm, inliers, ok, reason.
@@ -72,7 +73,8 @@ def find_fundamental(
     )  # fmt: skip
     chosen = _estimator(estimator, json.dumps(options, sort_keys=True))
     if prior is None and getattr(chosen, "uses_prior", False):
-        c = _frame_consistency()(c)
+        framed = lafs0 is not None and lafs1 is not None and quality is not None
+        c = _consistency("frame_consistency" if framed else "position_consistency")(c)
     return chosen(c, seed)
 
 
@@ -86,7 +88,7 @@ def _estimator(name: str, options: str) -> Estimator:
     return built
 
 
-@functools.lru_cache(maxsize=1)
-def _frame_consistency() -> Pruner:
-    built: Pruner = presets.build("pruner", "frame_consistency")
+@functools.lru_cache(maxsize=2)
+def _consistency(name: str) -> Pruner:
+    built: Pruner = presets.build("pruner", name)
     return built

@@ -103,10 +103,18 @@ def _draw(
 ) -> list[str]:
     """Draw the pictures into the folder; the names of those there are."""
     x0, x1 = (x[0].cpu().numpy().astype(np.float64) for x in (result.putative.x0, result.putative.x1))
-    good = result.kept.cpu().numpy().copy()
+    kept = result.kept.cpu().numpy()
+    good = kept.copy()
     if result.ok:
         good[good] = result.inliers.cpu().numpy()
-    pictures = {"matches.png": draw_matches(image0, image1, x0, x1, good)}
+    names = (
+        ("inliers of F", "others, dropped by pruning or estimation") if result.ok else ("kept", "dropped by pruning")
+    )
+    pictures = {"matches.png": draw_matches(image0, image1, x0, x1, good, names=names)}
+    pruners = [step for step in result.counts if step not in ("matching", "estimation")]
+    if pruners:
+        names = (f"kept by pruning ({', '.join(pruners)})", "dropped")
+        pictures["pruning.png"] = draw_matches(image0, image1, x0, x1, kept, names=names)
     F = result.F.cpu().numpy() if result.ok else truth
     if F is not None:
         dashed = truth if result.ok else None
@@ -114,8 +122,8 @@ def _draw(
     for name, picture in pictures.items():
         with replacing(folder / name) as path:
             path.write_bytes(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
-    if "epipolar.png" not in pictures:  # of an earlier run
-        (folder / "epipolar.png").unlink(missing_ok=True)
+    for name in {"pruning.png", "epipolar.png"} - pictures.keys():  # of an earlier run
+        (folder / name).unlink(missing_ok=True)
     return list(pictures)
 
 

@@ -59,8 +59,10 @@ def build(group: str, name: str, config_dir: Path | str | None = None, **options
 
 def _merged(config: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
     """`config` with the values of `options`, mappings merged level by level."""
-    both = {key for key, value in options.items() if isinstance(value, Mapping) and isinstance(config.get(key), Mapping)}
-    changes = {key: _merged(config[key], value) if key in both else value for key, value in options.items()}
+    changes = {
+        key: _merged(before, value) if isinstance(value, Mapping) and isinstance(before, Mapping) else value
+        for key, value, before in ((key, value, config.get(key)) for key, value in options.items())
+    }
     return {**config, **changes}
 
 
@@ -80,8 +82,8 @@ def instantiate(config: Mapping[str, Any] | DictConfig, where: str, **extra: Any
     if unknown and not takes_any:
         raise ValueError(f"{where}: no option {', '.join(unknown)}; there are: {', '.join(known)}")
     built = {
-        key: instantiate(value, f"{where}.{key}") if isinstance(value, dict) and "_target_" in value else value
-        for key, value in ((str(key), value) for key, value in values.items())
+        str(key): instantiate(value, f"{where}.{key!s}") if isinstance(value, dict) and "_target_" in value else value
+        for key, value in values.items()
     }
     return target(**built, **extra)
 

@@ -15,8 +15,9 @@ class Stream(enum.IntEnum):
     SAMPLING = 1
     PRESELECTION = 2
     METRIC = 3
-    PLANE = 4
-    PARALLAX = 5
+    TRAINING = 4
+    PLANE = 5
+    PARALLAX = 6
 
 
 def _wrap(value: int) -> int:

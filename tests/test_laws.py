@@ -12,9 +12,19 @@ from fmtorch import presets
 from fmtorch.estimators import engine, irls, local_optimization, scoring
 from fmtorch.geometry import sampson_objective
 from fmtorch.types import Correspondences, collate
-from tests.laws import Result, Subject, assert_same, degenerate, live_values, quick, scene, scenes, with_padding
+from tests.laws import (
+    OTHER_LIBRARIES,
+    Result,
+    Subject,
+    assert_same,
+    degenerate,
+    live_values,
+    quick,
+    scene,
+    scenes,
+    with_padding,
+)
 
-OTHER_LIBRARIES = ("opencv_", "poselib")
 OWN = [n for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES)]
 TILES = [  # what bounds memory and fills caches, and must change no result
     (engine, "CPU_SAMPLES", 150), (scoring, "CPU_TILE", 1000), (local_optimization, "CPU_TILE", 1000),
@@ -45,7 +55,7 @@ def _pruner(name: str) -> Subject:
 
 def _subjects() -> list[Subject]:
     """Every preset of these groups: a new file in conf/ joins by being there."""
-    estimators = [_estimator(n) for n in presets.available("estimator") if n != "poselib"]
+    estimators = [_estimator(n) for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES[1:])]
     return [*estimators, *(_pruner(n) for n in presets.available("pruner"))]
 
 

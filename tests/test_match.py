@@ -253,7 +253,7 @@ def test_the_command(tmp_path: Path) -> None:
     for told in ("sift_gms", "one_to_one", "inliers", "seconds", "NSGD", "matches/a-b"):
         assert told in done.stdout
     folder = tmp_path / "matches" / "a-b"
-    assert {path.name for path in folder.iterdir()} == {"result.json", "matches.png", "epipolar.png"}
+    assert {path.name for path in folder.iterdir()} == {"result.json", "matches.png", "pruning.png", "epipolar.png"}
     assert {path.name for path in tmp_path.iterdir()} == {"a.png", "b.webp", "F.txt", "matches", "cache"}
     report = json.loads((folder / "result.json").read_text())
     assert report["pipeline"] == "sift_gms"
@@ -267,7 +267,7 @@ def test_the_command(tmp_path: Path) -> None:
     assert sum(report["inliers"]) == report["matches"]["estimation"]
     result = fmtorch.match(tmp_path / "a.png", tmp_path / "b.webp")
     assert np.array_equal(np.array(report["F"]), result.F.numpy())
-    for name in ("matches.png", "epipolar.png"):
+    for name in ("matches.png", "pruning.png", "epipolar.png"):
         assert read_image(folder / name).ndim == 3
 
     # Without F, into the same folder: a picture, the reason, status 0, and nothing left of the earlier pair.

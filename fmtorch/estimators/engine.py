@@ -16,9 +16,11 @@ from torch import Tensor
 from fmtorch import random
 from fmtorch.estimators.batching import solve_all
 from fmtorch.estimators.choice import best_of
+from fmtorch.estimators.compiled import compiled
 from fmtorch.estimators.degeneracy import CANDIDATES, DEGENERACIES, Degensac
+from fmtorch.estimators.final_fits import FINAL_FITS
 from fmtorch.estimators.local_optimization import LOCAL_OPTIMIZATIONS
-from fmtorch.estimators.parts import CHOICES, FINAL_FITS, INLIER_RULES, SAMPLERS, SCORES, SOLVERS, Refinement, part
+from fmtorch.estimators.parts import CHOICES, INLIER_RULES, SAMPLERS, SCORES, SOLVERS, Refinement, part
 from fmtorch.estimators.problem import Problem
 from fmtorch.estimators.sampling import PriorWeighted
 from fmtorch.estimators.scoring import sampson_squared, score_models
@@ -27,6 +29,7 @@ from fmtorch.types import Correspondences, Estimate
 
 CPU_SAMPLES = 1 << 14  # minimal samples that are solved together: bounds memory, changes no result
 GPU_SAMPLES = 1 << 21
+UNSTOPPED_ROUND = 2000  # samples of a round where nobody looks in between: few operations on many numbers are faster
 
 
 @dataclasses.dataclass
@@ -44,7 +47,8 @@ class HypothesizeAndVerify:
     solver: minimal solver, `seven_point` or `eight_point`.
     sampler: `uniform` or `prior`. score: `inlier_count`, `msac`, `prior_msac` or `median`.
     threshold: Sampson distance in pixels up to which a match supports a model (unused by `median`).
-    hypotheses: minimal samples drawn at most. round: samples between two looks at the stopping rule.
+    hypotheses: minimal samples drawn at most. round: samples between two looks at the stopping rule; without one,
+    rounds of `UNSTOPPED_ROUND` at least.
     confidence: stop once an all-inlier sample was drawn with this probability; None: never before `hypotheses`.
     preselect: models are first scored on this many matches, chosen by the pair's key; 0: always on all.
     survivors: models of a round that pass the preselection.
@@ -55,11 +59,16 @@ class HypothesizeAndVerify:
     refine_threshold: its scale, Sampson distance in pixels; refine_iterations: its steps. choice: by which score the
     estimate is chosen from the refined pool, `score` (the search's own), `saturated` (gains saturate in each cell of
     a grid) or `focal` (the same, with a prior on the focal length: for whole photographs, not crops; `saturated` where
-    the image sizes are unknown); choice_threshold: of the last two, Sampson distance in pixels, null: the score's.
+    the image sizes are unknown); choice_threshold: of the last two, Sampson distance in pixels, null: the score's;
+    choice_iterations: steps of the refinement that `focal` makes.
     inliers: `threshold`, `lmeds` (2.5 robust standard deviations) or `median` (the better half).
     inlier_threshold: of the inliers reported, Sampson distance in pixels; null: the score's threshold.
-    final: `least_squares` (8-point on the inliers), `gauss_newton` (one attached step) or `none`.
+    final: `least_squares` (8-point on the inliers), `gauss_newton` (one attached step), `adaptive` (refined at the
+    scale of the pair's own noise, with an attached step) or `none`.
     refit_inliers: recompute the inliers after the final fit.
+    compile: build the score with torch.compile, for long runs: the first calls take some ten seconds each and need a
+    C++ compiler (RuntimeError where there is none). Scores, and so estimates, may differ from those without. That they
+    have the same bits in any batch is by construction, but depends on the compiler: it is tested of the score alone.
 
     Memory: for a batch of pairs of N matches, the points (48 N bytes a pair), the samples of 2^14 draws (about 40 MB)
     and eight buffers of one scoring tile (1 MB each); on a GPU 2^21 draws and 256 MB a buffer.
@@ -86,10 +95,12 @@ class HypothesizeAndVerify:
         refine_iterations: int = 5,
         choice: str = "score",
         choice_threshold: float | None = None,
+        choice_iterations: int = 12,
         inliers: str = "threshold",
         inlier_threshold: float | None = None,
         final: str = "least_squares",
         refit_inliers: bool = True,
+        compile: bool = False,
     ) -> None:
         if hypotheses < 1 or round < 1:
             raise ValueError(f"hypotheses={hypotheses}, round={round}: both must be at least 1")
@@ -98,8 +109,11 @@ class HypothesizeAndVerify:
         self.solver = part("solver", solver, SOLVERS)()
         self.sampler = part("sampler", sampler, SAMPLERS)()
         self.score = part("score", score, SCORES)(threshold)
+        if compile:
+            self.score = compiled(self.score)
         self.inlier_threshold = threshold if inlier_threshold is None else inlier_threshold
-        self.hypotheses, self.round, self.confidence = hypotheses, round, confidence
+        self.hypotheses, self.confidence = hypotheses, confidence
+        self.round = round if confidence is not None else max(round, UNSTOPPED_ROUND)
         self.preselect, self.survivors = preselect, survivors
         self.degeneracy = None if degeneracy is None else part("degeneracy", degeneracy, DEGENERACIES)(self.score)
         if self.degeneracy is not None and self.solver.size != Degensac.SAMPLE:
@@ -111,7 +125,11 @@ class HypothesizeAndVerify:
             optimization = part("local_optimization", local_optimization, LOCAL_OPTIMIZATIONS)
             self.local_optimization = optimization(threshold, self.score)
         self.refinement = None if refine is None else Refinement(refine, refine_threshold, refine_iterations)
-        self.choice = None if choice == "score" else part("choice", choice, CHOICES)(choice_threshold or threshold)
+        self.choice = (
+            None
+            if choice == "score"
+            else part("choice", choice, CHOICES)(choice_threshold or threshold, choice_iterations)
+        )
         self.inlier_rule = part("inliers", inliers, INLIER_RULES)(self.inlier_threshold)
         self.final = part("final", final, FINAL_FITS)()
         self.refit_inliers = refit_inliers
@@ -200,11 +218,11 @@ class HypothesizeAndVerify:
         """The valid models and their scores, the weaker ones dropped after a look at the `subset` of matches."""
         F, valid = _front(F, valid)
         if subset is not None and F.shape[2] > self.survivors:
-            coarse = score_models(self.score, F, problem, points, subset).masked_fill_(~valid, -torch.inf)
+            coarse = score_models(self.score, F, problem, points, subset, valid)
             order = torch.sort(coarse, dim=1, descending=True, stable=True).indices[:, : self.survivors]
             order = torch.sort(order, dim=1).values  # back in the order of the draws, which breaks ties
             F, valid = F.gather(2, order.expand(9, -1, -1)), valid.gather(1, order)
-        return F, score_models(self.score, F, problem, points).masked_fill_(~valid, -torch.inf)
+        return F, score_models(self.score, F, problem, points, valid=valid)
 
     def _remember(self, state: _Search, active: Tensor, F: Tensor, score: Tensor) -> None:
         """Keep the best models of each pair; the earlier draw wins a tie."""

@@ -20,7 +20,7 @@ from torch import Tensor
 from fmtorch.estimators.choice import SaturatedGain, best_of
 from fmtorch.estimators.problem import Problem
 from fmtorch.geometry.rank2 import complement
-from fmtorch.geometry.rank2_manifold import start, total, unit
+from fmtorch.geometry.rank2_manifold import start, unit
 from fmtorch.geometry.reduce import component_sum
 from fmtorch.geometry.robust_kernels import KERNELS
 from fmtorch.geometry.sampson_objective import Objective
@@ -41,11 +41,11 @@ class FocalPrior:
 
     The estimate is the refined candidate with the largest gain (`SaturatedGain`) minus prior cost if that reaches GATE
     of the largest gain without prior; otherwise, and where there are no image sizes, the model of the latter.
-    threshold: Sampson distance of the gain and of the truncated cost, px.
+    threshold: Sampson distance of the gain and of the truncated cost, px. iterations: Levenberg-Marquardt steps.
     """
 
-    def __init__(self, threshold: float) -> None:
-        self.threshold = threshold
+    def __init__(self, threshold: float, iterations: int = ITERATIONS) -> None:
+        self.threshold, self.iterations = threshold, iterations
         self.gain = SaturatedGain(threshold)
 
     def __call__(self, F: Float[Tensor, "9 p k"], problem: Problem, alive: Bool[Tensor, "p k"]) -> Float[Tensor, "9 p"]:
@@ -54,7 +54,7 @@ class FocalPrior:
         plain = best_of(F, gain, alive)
         if problem.size0 is None or problem.size1 is None:
             return plain
-        focal, prior = refine_focal(F, problem, self.threshold)
+        focal, prior = refine_focal(F, problem, self.threshold, self.iterations)
         posterior = torch.where(alive, self.gain.score(focal, problem) - prior, -torch.inf).nan_to_num(nan=-torch.inf)
         best = torch.where(alive, gain, -torch.inf).amax(1)
         return torch.where(posterior.amax(1) >= GATE * best, best_of(focal, posterior, alive), plain)
@@ -148,9 +148,9 @@ class _Objective:
             ]
         ).flatten(1, 2)  # fmt: skip
         H, g = products[:9, :9], products[:9, 9]
-        along = total((tangents[:, :, None] * H).transpose(0, 1))  # (7, 9)
-        hessian = total((along[:, None] * tangents).movedim(2, 0)) * self.precision
-        gradient = total((tangents * g).transpose(0, 1)) * self.precision
+        along = component_sum((tangents[:, :, None] * H).transpose(0, 1))  # (7, 9)
+        hessian = component_sum((along[:, None] * tangents).movedim(2, 0)) * self.precision
+        gradient = component_sum((tangents * g).transpose(0, 1)) * self.precision
         hessian[5:, 5:] += prior_hessian[..., None, None]
         gradient[5:] += prior_gradient
         return _State(U, V, focal, F.flatten(0, 1), cost, gradient, hessian)
@@ -191,9 +191,9 @@ def _moved(state: _State, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def _rotated(U: Tensor, angle: Float[Tensor, "3 p k"]) -> Tensor:
     """``U R`` with the rotation by twice the angle whose tangent is half of `angle`, about its direction (Cayley)."""
     x, y, z = c = angle / 2
-    n = total(c * c)
+    n = component_sum(c * c)
     crossed = torch.stack([z * U[:, 1] - y * U[:, 2], x * U[:, 2] - z * U[:, 0], y * U[:, 0] - x * U[:, 1]], 1)
-    along = total(U * c, 1)
+    along = component_sum(U * c, 1)
     # U (I + 2 / (1 + n) ([c]x + [c]x^2)), and [c]x^2 = c c^T - n I.
     rotated: Tensor = U + 2 / (1 + n) * (crossed + along[:, None] * c - n * U)
     return rotated

@@ -13,7 +13,7 @@ from fmtorch import random
 from fmtorch.estimators.problem import Problem
 from fmtorch.estimators.scoring import CPU_TILE, GPU_TILE, Score, sampson_squared, score_models
 from fmtorch.estimators.spatial import gaussian_kernel, neighbor_graph, spatially_coherent_inliers
-from fmtorch.geometry import eight_point
+from fmtorch.geometry.eight_point import NormalEquations, fundamental_of
 from fmtorch.random import Stream
 
 FIRST_DRAW = 1 << 32  # of the samples drawn here: beyond those of any search, so that they are others
@@ -41,7 +41,7 @@ class GraphCut:
     RADIUS = 20.0  # px, of the ball of neighbours in (x0, y0, x1, y1)
     SAMPLE_SIZE = 49
     SAMPLES = 20  # in each iteration
-    ITERATIONS = 3  # at most
+    ITERATIONS = 2  # at most; with 3, 2 of two models: mean recall 41.7, 40.8 on every other tuning pair, two seeds
 
     def __init__(self, threshold: float, score: Score) -> None:
         self.threshold, self.score = threshold, score
@@ -79,15 +79,17 @@ class GraphCut:
         """Fits to all inliers of each model and to samples of them, and which are determined."""
         k, n = labels.shape[1:]
         everything = problem.points[:, :, None].expand(-1, -1, k, -1)
-        whole, whole_valid = _eight_point(everything, labels.to(torch.float64))
+        whole = _normal_equations(everything[:, :, :, None], labels[:, :, None].to(torch.float64))
         table = labels.to(torch.int64).cumsum(-1)
         first = FIRST_DRAW + iteration * self.SAMPLES
         bits = random.bits(problem.seed, problem.key, Stream.SAMPLING, first, self.SAMPLES, self.SAMPLE_SIZE)
         position = ((bits.flatten(1)[:, None] >> 31) * table[..., -1:]) >> 32
         index = torch.searchsorted(table, position, right=True).clamp_max_(n - 1)
         sample = everything.gather(3, index.expand(4, -1, -1, -1))
-        some, some_valid = _eight_point(sample.reshape(*sample.shape[:3], self.SAMPLES, self.SAMPLE_SIZE))
-        return torch.cat([whole[..., None], some], 3), torch.cat([whole_valid[..., None], some_valid], 2)
+        some = _normal_equations(sample.reshape(*sample.shape[:3], self.SAMPLES, self.SAMPLE_SIZE))
+        together = NormalEquations(*(torch.cat(values, 2) for values in zip(whole, some, strict=True)))
+        F, valid = fundamental_of(together)
+        return F.flatten(-2).movedim(-1, 0), valid
 
 
 def first_maximum(x: Float[Tensor, "p k m"]) -> tuple[Float[Tensor, "p k"], Int[Tensor, "p k 1"]]:
@@ -96,10 +98,8 @@ def first_maximum(x: Float[Tensor, "p k m"]) -> tuple[Float[Tensor, "p k"], Int[
     return top[..., 0], order[..., :1]
 
 
-def _eight_point(points: Tensor, weight: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """The normalised 8-point algorithm, from points (4, *sets, n) to F (9, *sets) and whether it is determined."""
-    F, valid = eight_point(points[:2].movedim(0, -1), points[2:].movedim(0, -1), weight)
-    return F.flatten(-2).movedim(-1, 0), valid
+def _normal_equations(points: Float[Tensor, "4 *sets n"], weight: Tensor | None = None) -> NormalEquations:
+    return NormalEquations.of(points[:2].movedim(0, -1), points[2:].movedim(0, -1), weight)
 
 
 LOCAL_OPTIMIZATIONS: dict[str, Callable[[float, Score], LocalOptimization]] = {"graph_cut": GraphCut}

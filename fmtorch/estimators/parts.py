@@ -23,9 +23,9 @@ from fmtorch.estimators.scoring import (
     median_rank,
     sampson_squared,
 )
-from fmtorch.geometry import eight_point
 from fmtorch.geometry.minimal import eight_point_components, seven_point_components
-from fmtorch.geometry.refine import attached_step, refine_components
+from fmtorch.geometry.orientation import consistently_oriented
+from fmtorch.geometry.refine import refine_components
 
 T = TypeVar("T")
 
@@ -56,6 +56,7 @@ class SevenPoint:
     def __call__(self, sample: Float[Tensor, "4 size p s"]) -> tuple[Float[Tensor, "9 p m"], Bool[Tensor, "p m"]]:
         """As `Solver`: the three roots of one sample stand together."""
         F, valid = seven_point_components(sample)
+        valid = valid & consistently_oriented(F, sample[:, :, None])
         return F.permute(0, 2, 3, 1).flatten(2).contiguous(), valid.permute(1, 2, 0).flatten(1).contiguous()
 
 
@@ -66,7 +67,8 @@ class EightPoint:
 
     def __call__(self, sample: Float[Tensor, "4 size p s"]) -> tuple[Float[Tensor, "9 p m"], Bool[Tensor, "p m"]]:
         """As `Solver`."""
-        return eight_point_components(sample)
+        F, valid = eight_point_components(sample)
+        return F, valid & consistently_oriented(F, sample)
 
 
 def residuals_squared(F: Float[Tensor, "p 3 3"], problem: Problem) -> Float[Tensor, "p n"]:
@@ -133,54 +135,6 @@ class Refinement:
         return refine_components(F, problem.points, weight, self.kernel, scale, self.iterations)[0]
 
 
-@runtime_checkable
-class FinalFit(Protocol):
-    """Turns the best hypothesis and its inliers into the estimate; attached to the graph of the points."""
-
-    def __call__(
-        self, F: Float[Tensor, "p 3 3"], problem: Problem, inliers: Bool[Tensor, "p n"]
-    ) -> Float[Tensor, "p 3 3"]:
-        """The estimate in normalised units."""
-        ...
-
-
-class NoFit:
-    """The best hypothesis as it is."""
-
-    def __call__(
-        self, F: Float[Tensor, "p 3 3"], problem: Problem, inliers: Bool[Tensor, "p n"]
-    ) -> Float[Tensor, "p 3 3"]:
-        """As `FinalFit`."""
-        return F
-
-
-class LeastSquares:
-    """The normalised 8-point algorithm on the inliers; the hypothesis itself where they do not determine one."""
-
-    def __call__(
-        self, F: Float[Tensor, "p 3 3"], problem: Problem, inliers: Bool[Tensor, "p n"]
-    ) -> Float[Tensor, "p 3 3"]:
-        """As `FinalFit`."""
-        x0, x1 = problem.points[:2].permute(1, 2, 0), problem.points[2:].permute(1, 2, 0)
-        fitted, valid = eight_point(x0, x1, inliers.to(torch.float64))
-        return torch.where(valid[:, None, None], fitted, F)
-
-
-class GaussNewton:
-    """One attached Gauss-Newton step of the Sampson error at the refined model, on its inliers, weighted by the prior.
-
-    At an optimum it moves nothing, and its gradient is that of the optimum (implicit function theorem).
-    """
-
-    def __call__(
-        self, F: Float[Tensor, "p 3 3"], problem: Problem, inliers: Bool[Tensor, "p n"]
-    ) -> Float[Tensor, "p 3 3"]:
-        """As `FinalFit`."""
-        x0, x1 = problem.points[:2].permute(1, 2, 0), problem.points[2:].permute(1, 2, 0)
-        weight = inliers.to(torch.float64) if problem.prior is None else torch.where(inliers, problem.prior, 0)
-        return attached_step(F, x0, x1, weight, kernel="truncated", scale=torch.inf)
-
-
 SAMPLERS: dict[str, Callable[[], Sampler]] = {"uniform": Uniform, "prosac": Prosac, "prior": PriorWeighted}
 SOLVERS: dict[str, Callable[[], Solver]] = {"seven_point": SevenPoint, "eight_point": EightPoint}
 SCORES: dict[str, Callable[[float], Score]] = {
@@ -197,9 +151,7 @@ INLIER_RULES: dict[str, Callable[[float], Callable[[Tensor, Problem], Tensor]]] 
     "median": BetterHalf,
     "lmeds": RobustDeviations,
 }
-FINAL_FITS: dict[str, Callable[[], FinalFit]] = {
-    "none": NoFit,
-    "least_squares": LeastSquares,
-    "gauss_newton": GaussNewton,
+CHOICES: dict[str, Callable[[float, int], Choice]] = {
+    "saturated": lambda threshold, iterations: SaturatedGain(threshold),
+    "focal": FocalPrior,
 }
-CHOICES: dict[str, Callable[[float], Choice]] = {"saturated": SaturatedGain, "focal": FocalPrior}

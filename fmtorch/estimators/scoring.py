@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch.estimators.problem import Problem
@@ -17,6 +17,7 @@ from fmtorch.geometry.sigma_consensus import marginal_loss
 
 CPU_TILE = 1 << 18  # elements of one tile: 1 MB of float32, so that the handful of buffers stay in the L2 cache
 GPU_TILE = 1 << 26
+LANES = 64  # matches are scored in multiples of it: whole vectors of the processor
 
 
 def sampson_squared(F: Float[Tensor, "9 p m"], points: Float[Tensor, "4 p n"]) -> Float[Tensor, "p m n"]:
@@ -39,94 +40,76 @@ def sampson_squared(F: Float[Tensor, "9 p m"], points: Float[Tensor, "4 p n"]) -
 
 @runtime_checkable
 class Score(Protocol):
-    """Turns squared residuals into scores."""
+    """Scores models. prior_weighted: each match counts as much as its prior, where it has one."""
+
+    prior_weighted: bool
 
     def __call__(
         self,
-        r2: Float[Tensor, "p m n"],
-        live: Bool[Tensor, "p n"],
-        prior: Float[Tensor, "p n"] | None,
+        F: Float[Tensor, "9 p m"],
+        points: Float[Tensor, "4 p n"],
+        weight: Float[Tensor, "p n"],
         unit: Float[Tensor, " p"],
     ) -> Float[Tensor, "p m"]:
-        """Scores; r2 in squared normalised units (may be overwritten), `unit` the pixels in one of them."""
+        """Scores of models of points in normalised units, `unit` the pixels in one of them.
+
+        weight: what each match counts, in [0, 1]; zero in padded slots.
+        """
         ...
 
 
-class InlierCount:
-    """RANSAC: the number of matches within the threshold (Fischler & Bolles 1981). threshold: Sampson distance, px."""
+class SummedGains:
+    """A score that is the sum over matches of a gain, from 1 at no residual to 0, times P(inlier) if so asked.
 
-    def __init__(self, threshold: float) -> None:
-        self.threshold = _positive(threshold)
-
-    def __call__(
-        self,
-        r2: Float[Tensor, "p m n"],
-        live: Bool[Tensor, "p n"],
-        prior: Float[Tensor, "p n"] | None,
-        unit: Float[Tensor, " p"],
-    ) -> Float[Tensor, "p m"]:
-        """As `Score`."""
-        limit = (self.threshold / unit).square().to(r2.dtype)[:, None, None]
-        return ((r2 <= limit) & live[:, None]).sum(-1, dtype=torch.float32)
-
-
-class TruncatedSquares:
-    """MSAC: the sum of ``1 - r^2 / t^2`` over the matches within t (Torr & Zisserman 2000), each times its prior.
-
-    threshold: t, Sampson distance, px. prior_weighted: multiply each gain by P(inlier), where there is a prior.
+    threshold: the scale of the residuals, Sampson distance, px.
     """
 
     def __init__(self, threshold: float, prior_weighted: bool = False) -> None:
-        self.threshold = _positive(threshold)
+        if not threshold > 0:
+            raise ValueError(f"threshold is {threshold}; it is a distance in pixels and must be positive")
+        self.threshold = float(threshold)
         self.prior_weighted = prior_weighted
 
-    def __call__(
-        self,
-        r2: Float[Tensor, "p m n"],
-        live: Bool[Tensor, "p n"],
-        prior: Float[Tensor, "p n"] | None,
-        unit: Float[Tensor, " p"],
-    ) -> Float[Tensor, "p m"]:
+    def __call__(self, F: Tensor, points: Tensor, weight: Tensor, unit: Tensor) -> Tensor:
         """As `Score`."""
-        scale = (unit / self.threshold).square().to(r2.dtype)[:, None, None]
-        gain = r2.mul_(scale).neg_().add_(1).clamp_min_(0)
-        return _exact_sum(gain.mul_(_weight(live, prior, self.prior_weighted, r2.dtype)))
+        scale = (unit / self.threshold).square().to(F.dtype)[:, None, None]
+        gain = self._gain(sampson_squared(F, points).mul_(scale))
+        return _exact_sum(gain.mul_(weight[:, None]))
+
+    def _gain(self, squared: Float[Tensor, "p m n"]) -> Float[Tensor, "p m n"]:
+        """The gains at squared residuals in units of the threshold; these may be overwritten."""
+        raise NotImplementedError
 
 
-class GemanMcClure:
+class InlierCount(SummedGains):
+    """RANSAC: the number of matches within the threshold (Fischler & Bolles 1981)."""
+
+    def _gain(self, squared: Float[Tensor, "p m n"]) -> Float[Tensor, "p m n"]:
+        return squared.le_(1)
+
+
+class TruncatedSquares(SummedGains):
+    """MSAC: the sum of ``1 - r^2 / t^2`` over the matches within the threshold t (Torr & Zisserman 2000)."""
+
+    def _gain(self, squared: Float[Tensor, "p m n"]) -> Float[Tensor, "p m n"]:
+        return squared.neg_().add_(1).clamp_min_(0)
+
+
+class GemanMcClure(SummedGains):
     """The sum over matches of ``1 / (1 + r^2 / s^2)``, shifted and scaled to be 1 at r = 0 and 0 from 5 s on.
 
-    Geman & McClure (1987). A narrow peak with a long tail: exact matches decide, and matches with larger noise still
-    count, so that one scale serves scenes of different noise. threshold: s, Sampson distance, px. prior_weighted:
-    multiply each gain by P(inlier), where there is a prior.
+    Geman & McClure (1987); s is the threshold. A narrow peak with a long tail: exact matches decide, and matches with
+    larger noise still count, so that one scale serves scenes of different noise.
     """
 
     REACH = 5.0
 
-    def __init__(self, threshold: float, prior_weighted: bool = False) -> None:
-        self.threshold = _positive(threshold)
-        self.prior_weighted = prior_weighted
-
-    def __call__(
-        self,
-        r2: Float[Tensor, "p m n"],
-        live: Bool[Tensor, "p n"],
-        prior: Float[Tensor, "p n"] | None,
-        unit: Float[Tensor, " p"],
-    ) -> Float[Tensor, "p m"]:
-        """As `Score`."""
-        scale = (unit / self.threshold).square().to(r2.dtype)[:, None, None]
+    def _gain(self, squared: Float[Tensor, "p m n"]) -> Float[Tensor, "p m n"]:
         rest = 1 / (1 + self.REACH**2)
-        gain = r2.mul_(scale).add_(1).reciprocal_().sub_(rest).clamp_min_(0).mul_(1 / (1 - rest))
-        return _exact_sum(gain.mul_(_weight(live, prior, self.prior_weighted, r2.dtype)))
+        return squared.add_(1).reciprocal_().sub_(rest).clamp_min_(0).mul_(1 / (1 - rest))
 
 
-def _weight(live: Tensor, prior: Tensor | None, prior_weighted: bool, dtype: torch.dtype) -> Float[Tensor, "p 1 n"]:
-    """What each match counts: its prior, or one; nothing in padded slots."""
-    return (live if prior is None or not prior_weighted else prior).to(dtype)[:, None]
-
-
-class SigmaConsensus:
+class SigmaConsensus(SummedGains):
     """MAGSAC++: the likelihood marginalised over the noise scale (Barath et al., CVPR 2020, section 3.2).
 
     The gain is ``1 - rho(r) / rho(k sigma_max)``, rho as in `sigma_consensus`, tabulated over r^2 as the authors do.
@@ -136,7 +119,7 @@ class SigmaConsensus:
     ENTRIES = 2048
 
     def __init__(self, threshold: float) -> None:
-        self.threshold = _positive(threshold)
+        super().__init__(threshold)
         # Middle of each interval of (r / threshold)^2, and 0 from the threshold on.
         middle = (torch.arange(self.ENTRIES, dtype=torch.float64) + 0.5) / self.ENTRIES
         self._table = torch.cat([self.gain(middle), torch.zeros(1, dtype=torch.float64)]).to(torch.float32)
@@ -147,31 +130,20 @@ class SigmaConsensus:
         gain: Tensor = 1 - marginal_loss(squared) / marginal_loss(torch.ones_like(squared))
         return gain
 
-    def __call__(
-        self,
-        r2: Float[Tensor, "p m n"],
-        live: Bool[Tensor, "p n"],
-        prior: Float[Tensor, "p n"] | None,
-        unit: Float[Tensor, " p"],
-    ) -> Float[Tensor, "p m"]:
-        """As `Score`."""
-        scale = (unit / self.threshold).square().mul(self.ENTRIES).to(r2.dtype)[:, None, None]
-        entry = r2.mul_(scale).clamp_max_(self.ENTRIES).to(torch.int64)
-        return _exact_sum(torch.take(self._table.to(r2.device), entry).mul_(live[:, None]))
+    def _gain(self, squared: Float[Tensor, "p m n"]) -> Float[Tensor, "p m n"]:
+        entry = squared.mul_(self.ENTRIES).clamp_max_(self.ENTRIES).to(torch.int32)
+        return torch.index_select(self._table.to(squared.device), 0, entry.flatten()).view_as(squared)
 
 
 class Median:
     """LMedS: minus the median squared residual (Rousseeuw 1984)."""
 
-    def __call__(
-        self,
-        r2: Float[Tensor, "p m n"],
-        live: Bool[Tensor, "p n"],
-        prior: Float[Tensor, "p n"] | None,
-        unit: Float[Tensor, " p"],
-    ) -> Float[Tensor, "p m"]:
+    prior_weighted = False
+
+    def __call__(self, F: Tensor, points: Tensor, weight: Tensor, unit: Tensor) -> Tensor:
         """As `Score`."""
-        r2.masked_fill_(~live[:, None], torch.inf)
+        live = weight > 0
+        r2 = sampson_squared(F, points).masked_fill_(~live[:, None], torch.inf)
         rank = median_rank(live.sum(-1)).tolist()
         return torch.stack([-pair.kthvalue(k, dim=-1).values for pair, k in zip(r2, rank, strict=True)])
 
@@ -179,12 +151,6 @@ class Median:
 def median_rank(count: Tensor) -> Tensor:
     """The rank (from 1) of the median of `count` residuals: the lower middle one."""
     return (count + 1) // 2
-
-
-def _positive(threshold: float) -> float:
-    if not threshold > 0:
-        raise ValueError(f"threshold is {threshold}; it is a distance in pixels and must be positive")
-    return float(threshold)
 
 
 def _exact_sum(gain: Float[Tensor, "p m n"]) -> Float[Tensor, "p m"]:
@@ -202,27 +168,30 @@ def score_models(
     F: Float[Tensor, "9 p m"],
     problem: Problem,
     points: Float[Tensor, "4 p n"],
-    subset: Tensor | None = None,
+    subset: Int[Tensor, "p k"] | None = None,
+    valid: Bool[Tensor, "p m"] | None = None,
 ) -> Float[Tensor, "p m"]:
     """Scores of the models on all matches, or on the `subset` (P, K) of them, in tiles of bounded size.
 
+    valid: False for slots that hold no model, which must stand last in each pair; they score minus infinity.
     Memory: eight buffers of one tile. Models are float32 in normalised units, as are the points.
     """
-    live, prior = problem.live, problem.prior
+    weight = problem.prior if score.prior_weighted and problem.prior is not None else problem.live
+    weight = weight.to(F.dtype)
+    width = problem.count.tolist()
     if subset is not None:
-        points = points.gather(2, subset.expand(4, -1, -1))
-        live = live.gather(1, subset)
-        prior = None if prior is None else prior.gather(1, subset)
+        points, weight = points.gather(2, subset.expand(4, -1, -1)), weight.gather(1, subset)
+        width = [subset.shape[1]] * len(width)
     p, m = F.shape[1:]
-    n = points.shape[2]
+    height = [m] * p if valid is None else valid.sum(1).tolist()
+    scores = F.new_full((p, m), -torch.inf)
     limit = GPU_TILE if F.is_cuda else CPU_TILE
-    models = max(1, min(m, limit // n))
-    pairs = max(1, limit // (n * models))
-    scores = torch.empty(p, m, dtype=torch.float32, device=F.device)
+    pairs = max(1, limit // (points.shape[2] * max(m, 1)))
     for i in range(0, p, pairs):
         some = slice(i, i + pairs)
-        for j in range(0, m, models):
-            r2 = sampson_squared(F[:, some, j : j + models], points[:, some])
-            one_prior = None if prior is None else prior[some]
-            scores[some, j : j + models] = score(r2, live[some], one_prior, problem.unit[some])
-    return scores
+        n = min(-(-max(width[some]) // LANES) * LANES, points.shape[2])
+        models = max(1, limit // (n * pairs))
+        for j in range(0, max(height[some]), models):
+            these = slice(j, min(j + models, max(height[some])))
+            scores[some, these] = score(F[:, some, these], points[:, some, :n], weight[some, :n], problem.unit[some])
+    return scores if valid is None else scores.masked_fill_(~valid, -torch.inf)

@@ -130,7 +130,9 @@ def fixed_points(
     both = torch.cat([field, field], 1)
     labels = torch.cat([torch.zeros_like(field), torch.isfinite(field).to(field.dtype)], 1)
     for _ in range(sweeps):
-        labels = (both < coherence * graph.sum(labels)).to(labels.dtype)
+        before, labels = labels, (both < coherence * graph.sum(labels)).to(labels.dtype)
+        if torch.equal(before, labels):
+            break
     return labels[:, :k] > 0, labels[:, k:] > 0
 
 

@@ -28,17 +28,20 @@ _STACKED = 5.0  # images whose widths add up to more than so many heights stand 
 _SUBPIXEL = 4  # fractional bits of the coordinates that are drawn
 _PARALLEL = 1e-9  # a line with this slope at most leaves an image only at its two other sides
 _FARTHEST = 1e12  # px; a line farther from the first pixel is the line at infinity
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
 _COLOUR_LEFT = 0.45  # of the photographs' own, so that lines stand out
 
 
 def draw_matches(
     image0: Image, image1: Image, x0: Points, x1: Points, good: NDArray[np.bool_],
-    *, height: int | None = None, most: int = 90, most_bad: int = 50,
+    *, height: int | None = None, most: int = 90, most_bad: int = 50, names: tuple[str, str] | None = None,
 ) -> Image:  # fmt: skip
     """Two images side by side with their matches as lines, green where good, thin and red elsewhere; RGB (H, W, 3).
 
     Wide images stand one above the other. x0, x1: (N, 2) pixels. height: side by side in this height; None: as fits
-    `WIDTH` x `HEIGHT`. most, most_bad: lines of each kind at most, spread over both images.
+    `WIDTH` x `HEIGHT`. most, most_bad: lines of each kind at most, spread over both images. names: what good and other
+    matches are called in a line below the images, which also says how many there are and how many are drawn; None: no
+    such line.
     """
     canvas, place0, place1 = _placed(image0, image1, height)
     ends0, ends1 = place0(x0), place1(x1)
@@ -53,7 +56,10 @@ def draw_matches(
         for point in _fixed(np.concatenate([ends0[index], ends1[index]])):
             cv2.circle(layer, point, round(2.6 * width * (1 << _SUBPIXEL)), colour, -1, cv2.LINE_AA, _SUBPIXEL)
         canvas = np.asarray(cv2.addWeighted(layer, opacity, canvas, 1 - opacity, 0), np.uint8)
-    return canvas
+    if names is None:
+        return canvas
+    counts = int(good.sum()), int((~good).sum())
+    return _captioned(canvas, names, counts, (min(counts[0], most), min(counts[1], most_bad)))
 
 
 def draw_epipolar_lines(
@@ -170,6 +176,20 @@ def _faded(image: Image, size: tuple[int, int]) -> Image:
         return np.repeat(image[..., None], 3, 2)
     grey = np.repeat(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))[..., None], 3, 2)
     return np.asarray(cv2.addWeighted(image, _COLOUR_LEFT, grey, 1 - _COLOUR_LEFT, 0), np.uint8)
+
+
+def _captioned(canvas: Image, names: tuple[str, str], counts: tuple[int, int], drawn: tuple[int, int]) -> Image:
+    """The picture with a line below it that says what its two colours are."""
+    size = max(0.45, 0.62 * canvas.shape[1] / WIDTH)  # of letters, in OpenCV's unit
+    height, gap, rise = round(44 * size), round(22 * size), round(30 * size)
+    line = np.full((height, canvas.shape[1], 3), 255, np.uint8)
+    x = gap
+    for colour, name, count, shown in zip((GOOD, BAD), names, counts, drawn, strict=True):
+        text = f"{count} {name}" + (f", {shown} of them drawn" if shown < count else "")
+        cv2.line(line, (x, rise - round(7 * size)), (x + 2 * gap, rise - round(7 * size)), colour, _pixels(5 * size))
+        cv2.putText(line, text, (x + 3 * gap, rise), _FONT, size, (0, 0, 0), _pixels(1.3 * size), cv2.LINE_AA)
+        x += 5 * gap + cv2.getTextSize(text, _FONT, size, _pixels(1.3 * size))[0][0]
+    return np.concatenate([canvas, line])
 
 
 def _unit(canvas: Image) -> float:

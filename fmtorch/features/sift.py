@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import cv2
@@ -13,14 +14,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.features.frames import FRAME_SIGMAS
 from fmtorch.types import Features
-
-FRAME_SIGMAS = 6.0
-"""Half the side of a local affine frame in units of the keypoint's sigma, which is half of OpenCV's `size`.
-
-The frame is the region from which a 32 x 32 patch is cut for shape, orientation and description (Mishkin et al.,
-ECCV 2018); a ratio of two frames' scales is the ratio of the keypoints' sizes.
-"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +25,8 @@ class SIFT:
     max_features: the strongest that are kept; a location with several orientations counts once for each.
     contrast_threshold, edge_threshold, sigma: as OpenCV's, see ``conf/features/sift.yaml``.
     precise_upscale: double the image so that pixel x lands on 2x, without the quarter-pixel shift of plain resizing.
+    max_pixels: a larger image is reduced to so many pixels first, which bounds memory: OpenCV needs about 240 bytes a
+    pixel of the image that it sees.
     root: RootSIFT, the square root of the L1-normalised descriptor (Arandjelovic and Zisserman, CVPR 2012).
     """
 
@@ -38,6 +35,7 @@ class SIFT:
     edge_threshold: float = 10.0
     sigma: float = 1.6
     precise_upscale: bool = True
+    max_pixels: int = 16_000_000
     root: bool = False
 
     def __call__(self, image: NDArray[np.uint8]) -> Features:
@@ -47,24 +45,54 @@ class SIFT:
         float32, whole numbers from 0 to 255 unless `root`. Raises ValueError for another type, shape or an empty image.
         """
         grey = as_grey(image)
-        detector = cv2.SIFT.create(
+        seen = self._reduced(grey)
+        keypoints, found = self._opencv().detectAndCompute(seen, None)
+        descriptors = np.zeros((0, 128), np.float32) if found is None else found
+        lafs, scores, kept = self._kept(keypoints, seen.shape, grey.shape)
+        features = torch.from_numpy(descriptors[kept])
+        return Features(
+            lafs=lafs,
+            scores=scores,
+            descriptors=root_sift(features) if self.root else features,
+            image_size=torch.tensor(grey.shape, dtype=torch.int64),
+        )
+
+    def detect(self, image: NDArray[np.uint8]) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
+        """The frames and scores of the features that a call finds, without their descriptors."""
+        grey = as_grey(image)
+        seen = self._reduced(grey)
+        lafs, scores, _ = self._kept(self._opencv().detect(seen), seen.shape, grey.shape)
+        return lafs, scores
+
+    def _opencv(self) -> cv2.SIFT:
+        return cv2.SIFT.create(
             nfeatures=self.max_features,
             contrastThreshold=self.contrast_threshold,
             edgeThreshold=self.edge_threshold,
             sigma=self.sigma,
             enable_precise_upscale=self.precise_upscale,
         )
-        keypoints, found = detector.detectAndCompute(grey, None)
-        descriptors = np.zeros((0, 128), np.float32) if found is None else found
+
+    def _reduced(self, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The image, or a smaller one of at most `max_pixels`."""
+        factor = math.sqrt(self.max_pixels / grey.size)
+        if factor >= 1:
+            return grey
+        h, w = (max(int(side * factor), 1) for side in grey.shape)
+        return cv2.resize(grey, (w, h), interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
+
+    def _kept(
+        self, keypoints: Sequence[cv2.KeyPoint], seen: tuple[int, ...], shape: tuple[int, ...]
+    ) -> tuple[Tensor, Tensor, NDArray[np.int64]]:
+        """The frames and scores of the strongest keypoints, and which these are; from the image seen to the image."""
         scores = np.array([k.response for k in keypoints], np.float32)
         kept = strongest(scores, self.max_features)
-        features = torch.from_numpy(descriptors[kept])
-        return Features(
-            lafs=keypoints_to_lafs([keypoints[i] for i in kept]),
-            scores=torch.from_numpy(scores[kept]),
-            descriptors=root_sift(features) if self.root else features,
-            image_size=torch.tensor(grey.shape, dtype=torch.int64),
-        )
+        lafs = keypoints_to_lafs([keypoints[i] for i in kept])
+        if seen != shape:
+            factor = torch.tensor([shape[1] / seen[1], shape[0] / seen[0]])
+            half = torch.tensor([0.0, 0.0, 0.5])  # a pixel's centre is half a pixel from the image's corner
+            lafs = (lafs + half) * factor[:, None] - half
+        return lafs, torch.from_numpy(scores[kept]), kept
 
 
 def keypoints_to_lafs(keypoints: Sequence[cv2.KeyPoint]) -> Float[Tensor, "n 2 3"]:

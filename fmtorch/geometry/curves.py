@@ -25,6 +25,8 @@ def curve_order(points: Float[Tensor, "d b n"], mask: Bool[Tensor, "b n"], shift
     points: of 2 or 4 coordinates. shift: of the grid, between 0 and 1, in thirds of the curve's extent, which is 1.5
     times that of the points along the axis on which they extend furthest.
     """
+    if mask.shape[-1] == 0:
+        return torch.zeros_like(mask, dtype=torch.int64)
     low = torch.where(mask, points, torch.inf).amin(-1, keepdim=True)
     extent = (torch.where(mask, points, -torch.inf).amax(-1, keepdim=True) - low).amax(0).clamp_min(1e-6)
     cell = (torch.where(mask, (points - low) / extent, 0) * 2 + shift) / 3 * ((1 << _BITS) - 1)

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.geometry.reduce import component_sum
+from fmtorch.geometry.reduce import component_sum, outer_sum
 
 SHIFT = 1e-14  # relative to the trace: above the rounding error of the factorisation, below any eigenvalue that counts
 RANK_TOLERANCE = 1e-12  # relative to the trace: relative errors of 1e-6 in the rows that M was summed from
@@ -74,12 +74,12 @@ def _inverse_power(M: Tensor) -> tuple[Tensor, Tensor]:
         A = A[1:, 1:] - column[:, None] * A[0, 1:]
         pivots.append(pivot)
     D = torch.stack(pivots)
-    inverse = component_sum((inverse_of_L / D[:, None])[:, :, None] * inverse_of_L[:, None], 0)
+    inverse = outer_sum((inverse_of_L / D[:, None])[:, :, None], inverse_of_L[:, None])
     size = _trace(inverse)
     X = inverse = inverse / size
     done = torch.zeros_like(usable)
     for _ in range(_SQUARINGS):
-        squared = component_sum(X[:, :, None] * X[:, None], 0)
+        squared = outer_sum(X[:, :, None], X[:, None])
         trace = _trace(squared)
         X = torch.where(done, X, squared / trace)
         done = done | (trace > 1 - 1e-14)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -29,19 +31,55 @@ def eight_point(
     equations (too few points, coincident or collinear ones, an exact plane), or anything not finite, or a negative
     weight, among the unmasked points. The result has the same bits in any batch and with any padding.
     """
-    x0d, x1d, w, sound = _door(x0, x1, weight, mask)
-    x0n, T0 = normalize_points(x0d, weight=w)
-    x1n, T1 = normalize_points(x1d, weight=w)
-    F, determined = linear_fundamental(x0n, x1n, w)
-    F = canonical(denormalize_fundamental(nearest_rank2(F), T0, T1))
-    valid = sound & determined & (F.detach() != 0).any(-1).any(-1)
-    return torch.where(valid[..., None, None], F, 0.0).to(x0.dtype), valid
+    F, valid = fundamental_of(NormalEquations.of(x0, x1, weight, mask))
+    return F.to(x0.dtype), valid
+
+
+class NormalEquations(NamedTuple):
+    """What the eight-point algorithm needs to know of a set of matches, however many these are.
+
+    M: the sum of w a a^T over normalised matches. T0, T1: the similarities that normalise the points. sound: whether
+    everything was finite.
+    """
+
+    M: Float[Tensor, "*batch 9 9"]
+    T0: Float[Tensor, "*batch 3 3"]
+    T1: Float[Tensor, "*batch 3 3"]
+    sound: Bool[Tensor, "*batch"]
+
+    @classmethod
+    def of(cls, x0: Tensor, x1: Tensor, weight: Tensor | None = None, mask: Tensor | None = None) -> NormalEquations:
+        """Arguments as of `eight_point`."""
+        x0d, x1d, w, sound = _door(x0, x1, weight, mask)
+        x0n, T0 = normalize_points(x0d, weight=w)
+        x1n, T1 = normalize_points(x1d, weight=w)
+        return cls(normal_matrix(x0n, x1n, w), T0, T1, sound)
+
+
+def fundamental_of(equations: NormalEquations) -> tuple[Float[Tensor, "*batch 3 3"], Bool[Tensor, "*batch"]]:
+    """The fundamental matrices, float64, and which are valid, as of `eight_point`."""
+    f, determined = smallest_eigenvector(equations.M)
+    linear = f.reshape(*f.shape[:-1], 3, 3)
+    F = canonical(denormalize_fundamental(nearest_rank2(linear), equations.T0, equations.T1))
+    valid = equations.sound & determined & (F.detach() != 0).any(-1).any(-1)
+    return torch.where(valid[..., None, None], F, 0.0), valid
 
 
 def linear_fundamental(
     x0: Float[Tensor, "*points n 2"], x1: Float[Tensor, "*points n 2"], weight: Float[Tensor, "*batch n"]
 ) -> tuple[Float[Tensor, "*batch 3 3"], Bool[Tensor, "*batch"]]:
     """The F of unit norm, of any rank, that minimises sum w (x1^T F x0)^2; False where it is not determined.
+
+    Arguments as of `normal_matrix`.
+    """
+    f, determined = smallest_eigenvector(normal_matrix(x0, x1, weight))
+    return f.reshape(*f.shape[:-1], 3, 3), determined
+
+
+def normal_matrix(
+    x0: Float[Tensor, "*points n 2"], x1: Float[Tensor, "*points n 2"], weight: Float[Tensor, "*batch n"]
+) -> Float[Tensor, "*batch 9 9"]:
+    """The sum of w a a^T, with a . vec(F) = x1^T F x0.
 
     Expects normalised float64 points, finite, with weight zero for those that do not count. The points' leading shape
     broadcasts against that of the weights.
@@ -50,10 +88,8 @@ def linear_fundamental(
     p0, p1 = _products(x0), weight[..., None, :] * _products(x1)
     rows = [stable_sum(part[..., :, None, :] * p0[..., None, :, :], -1) for part in p1.chunk(3, -2)]
     sums = torch.cat(rows, -2)
-    M = sums[..., _PRODUCT_INDEX[:, None, :, None], _PRODUCT_INDEX[None, :, None, :]]
-    M = M.reshape(*sums.shape[:-2], 9, 9)
-    f, determined = smallest_eigenvector(M)
-    return f.reshape(*f.shape[:-1], 3, 3), determined
+    M: Tensor = sums[..., _PRODUCT_INDEX[:, None, :, None], _PRODUCT_INDEX[None, :, None, :]]
+    return M.reshape(*sums.shape[:-2], 9, 9)
 
 
 _PRODUCT_INDEX = torch.tensor([[0, 1, 3], [1, 2, 4], [3, 4, 5]])

@@ -90,7 +90,9 @@ def plane_and_parallax(
     lines = cross(h1, moved)
     F = cross_times(cross(lines[:, 0], lines[:, 1]), H)
     norm2 = component_sum(F * F)
-    valid = (norm2 > 0) & norm2.isfinite()
+    size2 = component_sum(lines[:, 0].square()) * component_sum(lines[:, 1].square()) * component_sum(H * H)
+    rounding = 16 * torch.finfo(F.dtype).eps  # of cross products that should vanish, as of a match taken twice
+    valid = (norm2 > rounding**2 * size2) & norm2.isfinite()
     return torch.where(valid, F / torch.where(valid, norm2, 1.0).sqrt(), 0.0), valid
 
 

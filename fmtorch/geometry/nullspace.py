@@ -23,24 +23,29 @@ def null_space(A: Float[Tensor, "m n *s"]) -> tuple[Float[Tensor, "k n *s"], Boo
     m, n = A.shape[:2]
     tolerance = (RANK_TOLERANCE * torch.finfo(A.dtype).eps) ** 2
     length2 = component_sum(A.detach() * A.detach(), 1)
-    full_rank = torch.ones(A.shape[2:], dtype=torch.bool, device=A.device)
-    reflectors: list[tuple[Tensor, Tensor]] = []
+    remainders: list[Tensor] = []
+    reflectors: list[tuple[Tensor, Tensor, Tensor]] = []
     rows = A
-    for i in range(m):
-        row, below = rows[0], rows[1:]
-        remainder2 = component_sum(row * row)
-        full_rank = full_rank & (remainder2 > tolerance * length2[i])
+    for _ in range(m):
+        # v = (head, tail) with head = row[0] + shift: its products with the rows follow from those with the row itself.
+        row = rows[0]
+        head, tail = row[0], row[1:]
+        products = component_sum(rows * row, 1)
+        remainder2 = products[0]
         norm = torch.where(remainder2 > 0, remainder2, 1.0).sqrt()
-        head = row[0] + torch.copysign(norm, row[0])
-        scale = 1.0 / (norm * head.abs())
-        v = torch.cat([head[None], row[1:]])
-        reflectors.append((v, scale))
-        if i + 1 < m:
-            projection = component_sum(below * v, 1) * scale
-            rows = below[:, 1:] - projection[:, None] * v[1:]
+        shift = torch.copysign(norm, head)
+        head = head + shift
+        scale = 1.0 / (shift * head)
+        reflectors.append((head, tail, scale))
+        remainders.append(remainder2)
+        below = rows[1:]
+        projection = torch.addcmul(products[1:], below[:, 0], shift) * scale
+        rows = torch.addcmul(below[:, 1:], projection[:, None], tail, value=-1)
+    full_rank = (torch.stack(remainders) > tolerance * length2).all(0)
     basis = torch.eye(n - m, dtype=A.dtype, device=A.device)
     basis = basis.reshape(n - m, n - m, *[1] * (A.dim() - 2)).expand(n - m, n - m, *A.shape[2:])
-    for v, scale in reversed(reflectors):
-        projection = component_sum(basis * v[1:], 1) * scale
-        basis = torch.cat([-(projection * v[0])[:, None], basis - projection[:, None] * v[1:]], 1)
+    for head, tail, scale in reversed(reflectors):
+        projection = component_sum(basis * tail, 1) * scale
+        rest = torch.addcmul(basis, projection[:, None], tail, value=-1)
+        basis = torch.cat([-(projection * head)[:, None], rest], 1)
     return basis, full_rank

@@ -78,12 +78,14 @@ def _attach(F: Tensor, v: Tensor) -> Tensor:
 
 def cofactors(F: Tensor) -> Tensor:
     """The cofactor matrix: row i is the cross product of the other two rows of F."""
-    return torch.stack([cross(F[1], F[2]), cross(F[2], F[0]), cross(F[0], F[1])])
+    product: Tensor = torch.linalg.cross(F.roll(-1, 0), F.roll(-2, 0), dim=1)
+    return product
 
 
 def cross(a: Float[Tensor, " 3 *s"], b: Float[Tensor, " 3 *s"]) -> Float[Tensor, " 3 *s"]:
     """The cross product of component-first vectors."""
-    return torch.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    product: Tensor = torch.linalg.cross(a, b, dim=0)
+    return product
 
 
 def _scaled(A: Tensor) -> Tensor:

@@ -32,18 +32,19 @@ def stable_sum(x: Tensor, dim: int = -1) -> Tensor:
 
 
 def component_sum(x: Tensor, dim: int = 0) -> Tensor:
-    """The sum over a small axis of fixed length, largest power of two first; no copies, unlike `stable_sum`."""
-    n = x.shape[dim]
-    if n == 1:
-        return x.select(dim, 0)
-    power = 1 << (n.bit_length() - 1)
-    rest = x.narrow(dim, power, n - power)
-    x = x.narrow(dim, 0, power)
-    while power > 2:
-        power //= 2
-        x = x.narrow(dim, 0, power) + x.narrow(dim, power, power)
-    total = x.select(dim, 0) + x.select(dim, 1)
-    return total + component_sum(rest, dim) if n > x.shape[dim] and rest.shape[dim] else total
+    """The sum over a short axis of fixed length, in order: for few numbers this takes less time than a tree."""
+    first, *rest = x.unbind(dim)
+    for part in rest:
+        first = first + part
+    return first
+
+
+def outer_sum(a: Float[Tensor, " k *s"], b: Float[Tensor, " k *t"]) -> Tensor:
+    """The sum over k, in order, of the products of a[k] and b[k], which broadcast; without the temporaries of a sum."""
+    total: Tensor = a[0] * b[0]
+    for one, other in zip(a[1:].unbind(0), b[1:].unbind(0), strict=True):
+        total = torch.addcmul(total, one, other)
+    return total
 
 
 def matmul3(a: Float[Tensor, "*batch 3 3"], b: Float[Tensor, "*batch2 3 3"]) -> Float[Tensor, "*batch3 3 3"]:

@@ -21,10 +21,9 @@ from fmtorch.geometry.rank2_manifold import (
     retract,
     solve,
     start,
-    total,
     unit,
 )
-from fmtorch.geometry.reduce import matmul3, stable_sum
+from fmtorch.geometry.reduce import component_sum, matmul3, stable_sum
 from fmtorch.geometry.robust_kernels import Kernel, named_kernel
 from fmtorch.geometry.sampson_objective import Objective, linearise
 
@@ -119,7 +118,7 @@ def attached_step(
         model = torch.where(sound, model, constant(model, RANK_TWO))
         e0, e1 = (torch.where(sound, e, constant(e, RANK_TWO_EPIPOLE)) for e in (e0, e1))
     gradient = gradient_of_cost(model, problem.points, problem.weight, robust, problem.scale)
-    step = -total((inverse * gradient).transpose(0, 1))
+    step = -component_sum((inverse * gradient).transpose(0, 1))
     moved, _, _ = retract(model, step, e0, e1)
     return problem.to_pixels(torch.where(sound, moved, problem.models)).reshape(F.shape)
 

@@ -1,29 +1,39 @@
 """Correspondences -> Correspondences: which matches survive."""
 
+from fmtorch.pruning.calibration import Calibration, RatioPrior
 from fmtorch.pruning.code import CODE, Coherence, LikelihoodField, SmoothMotion, code, coherence
 from fmtorch.pruning.frame_consistency import FrameConsistency, frame_agreement
-from fmtorch.pruning.gms import GMS, gms
-from fmtorch.pruning.lpm import LPM, lpm
+from fmtorch.pruning.gms import GMS, gms, gms_support
+from fmtorch.pruning.likely import Likely
+from fmtorch.pruning.lpm import LPM, lpm, lpm_cost
 from fmtorch.pruning.mutual import mutual
 from fmtorch.pruning.one_to_one import OneToOne, one_to_one
+from fmtorch.pruning.position_consistency import PositionConsistency, position_agreement
 from fmtorch.pruning.ratio import RatioTest, ratio_test
 
 __all__ = [
     "CODE",
     "GMS",
     "LPM",
+    "Calibration",
     "Coherence",
     "FrameConsistency",
     "LikelihoodField",
+    "Likely",
     "OneToOne",
+    "PositionConsistency",
+    "RatioPrior",
     "RatioTest",
     "SmoothMotion",
     "code",
     "coherence",
     "frame_agreement",
     "gms",
+    "gms_support",
     "lpm",
+    "lpm_cost",
     "mutual",
     "one_to_one",
+    "position_agreement",
     "ratio_test",
 ]

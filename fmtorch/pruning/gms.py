@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
-import functools
-from typing import Literal, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from fmtorch.pruning.calibration import calibration_of
+from fmtorch.pruning.gms_table import GRIDS, Border, Moves, Surroundings, Table, give_back, moves_in_blocks, tabulated
 from fmtorch.types import Correspondences
 
-GRID = 20  # cells a side in image 0
-_CELLS = GRID * GRID
-# Cells a side in image 1 at the scale ratios 1, 1/2, 1/sqrt(2), sqrt(2), 2, rounded down as the released code does.
-_GRIDS = (20, 10, 14, 28, 40)
-# The neighbourhood as (dx, dy): eight cells clockwise from the top left, then the centre. A rotation by 45 degrees
-# moves the ring on by one.
-_RING = ((-1, -1), (0, -1), (1, -1), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (0, 0))
-_TABLE_CPU, _TABLE_GPU = 2**22, 2**28  # entries of the table of moves that are in memory at a time
-
-Border = Literal["opencv", "authors"]
+_HALF_SUPPORT = 1.5  # the score, in square roots of the mean, whose support is one half
 
 
 def gms(
@@ -49,172 +41,139 @@ def gms(
     cells of shifted grids. Time and memory are linear in the number of matches, besides a table of cell pairs whose
     size is bounded.
     """
+    grids, turns = GRIDS if with_scale else GRIDS[:1], 8 if with_rotation else 1
     kept = torch.zeros(x0.shape[:2], dtype=torch.bool, device=x0.device)
-    grids = _GRIDS if with_scale else _GRIDS[:1]
-    turns = 8 if with_rotation else 1
-    p0, p1 = _normalized(x0, size0), _normalized(x1, size1)
-    alive = _inside_unit(p0) & _inside_unit(p1)
-    alive = alive if mask is None else alive & mask
-    entries = 4 * _CELLS * sum(g * g for g in grids)
-    pairs = max(1, (_TABLE_CPU if x0.device.type == "cpu" else _TABLE_GPU) // entries)
-    for start in range(0, len(x0), pairs):
-        block = slice(start, start + pairs)
-        pair, match = alive[block].nonzero().unbind(-1)
-        place = (start + pair) * x0.shape[1] + match
-        points0, points1 = (p.flatten(1).index_select(1, place) for p in (p0, p1))
-        line = _lines(points0, pair, border)
-        end = _cells(points1, grids)
-        moves = _Moves(line, end, pair, len(alive[block]), grids)
-        kept[start + pair, match] = _consistent(moves, turns, threshold_factor)
+    for moves, place in moves_in_blocks(x0, x1, size0, size1, mask, grids, border):
+        table = tabulated(moves)
+        bits = _standing(table, moves, turns, threshold_factor)
+        searched = len(grids) * turns > 1
+        kept.view(-1)[place] = _kept(bits, _winner(bits, moves, turns), moves, turns) if searched else bits[0] > 0
+        give_back(table)
     return kept
 
 
-def _normalized(x: Tensor, size: Tensor) -> Float[Tensor, "2 b n"]:
-    """Points in units of the image, component first, in float32 as the released code has them."""
-    return (x.float() / size.flip(-1)[:, None].float()).movedim(-1, 0).contiguous()
+def gms_support(
+    x0: Float[Tensor, "b n 2"],
+    x1: Float[Tensor, "b n 2"],
+    *,
+    size0: Int[Tensor, "b 2"],
+    size1: Int[Tensor, "b 2"],
+    mask: Bool[Tensor, "b n"] | None = None,
+    with_rotation: bool = False,
+    with_scale: bool = False,
+    threshold_factor: float = 6.0,
+    border: Border = "opencv",
+) -> Float[Tensor, "b n"]:
+    """How many neighbours move with each match, against how many would suffice by the square root; in [0, 1).
 
-
-def _inside_unit(p: Tensor) -> Tensor:
-    return ((p >= 0) & (p < 1)).all(0)
-
-
-def _lines(p: Float[Tensor, "2 m"], pair: Int[Tensor, " m"], border: Border) -> Int[Tensor, "4 m"]:
-    """Number of each match's cell of image 0 in the four shifted grids, (pair, shift, cell); -1 for no cell."""
-    shift = torch.tensor([0.0, 0.5], dtype=torch.float64, device=p.device)[:, None]
-    place = ((p * GRID)[:, None] + shift).floor().long()  # (2, 2, M); the shift is added in float64, as in C++
-    inside = place < GRID
-    if border == "authors":
-        inside[:, 1] &= place[:, 1] >= 1
-    cell = (place[1, :, None] * GRID + place[0]).flatten(0, 1)
-    shifts = torch.arange(4, device=p.device)[:, None]
-    return torch.where((inside[1, :, None] & inside[0]).flatten(0, 1), (pair * 4 + shifts) * _CELLS + cell, -1)
-
-
-def _cells(p: Float[Tensor, "2 m"], grids: tuple[int, ...]) -> Int[Tensor, "s m"]:
-    """Each match's cell of image 1, in each of the grids."""
-    side = torch.tensor(grids, device=p.device)[:, None]
-    x, y = (torch.minimum((q * side.float()).floor().long(), side - 1) for q in p)
-    return y * side + x
-
-
-class _Moves(NamedTuple):
-    """Where M matches of several pairs go: from `line`, a cell of image 0, to `end`, a cell of image 1.
-
-    The table of moves has for each grid of image 1 one row a line, and one more for matches without a cell.
+    In each of the four grids, ``z = (score - 1) / sqrt(mean matches of the nine cells, at least 1)``, where the score
+    counts the matches, itself included, of the nine cells around that go where the match's own cells say: the paper's
+    S_i for each match instead of for the assignment of its cell. The support is ``z / (z + 1.5)`` of the mean z over
+    the grids; 0 for a match that is alone, outside or masked. Rotation and scale are those of the hypothesis that keeps
+    most matches of the pair in `gms`, whose arguments these are.
     """
-
-    line: Int[Tensor, "4 m"]
-    end: Int[Tensor, "s m"]
-    pair: Int[Tensor, " m"]
-    pairs: int
-    grids: tuple[int, ...]
-
-    @property
-    def lines(self) -> int:
-        """Lines of one grid, without the spare one, which is last."""
-        return self.pairs * 4 * _CELLS
-
-    def origins(self) -> Int[Tensor, " s"]:
-        """Where the rows of each grid begin in the table."""
-        cells = torch.tensor([0, *(g * g for g in self.grids[:-1])], device=self.line.device)
-        return cells.cumsum(0) * (self.lines + 1)
+    grids, turns = GRIDS if with_scale else GRIDS[:1], 8 if with_rotation else 1
+    support = torch.zeros(x0.shape[:2], dtype=x0.dtype, device=x0.device)
+    for moves, place in moves_in_blocks(x0, x1, size0, size1, mask, grids, border):
+        table = tabulated(moves)
+        winner = torch.zeros(moves.pairs, dtype=torch.int64, device=x0.device)
+        if len(grids) * turns > 1:
+            winner = _winner(_standing(table, moves, turns, threshold_factor), moves, turns)
+        z = _own_support(table, moves, winner, turns)
+        give_back(table)
+        support.view(-1)[place] = (z / (z + _HALF_SUPPORT)).to(support.dtype)
+    return support
 
 
-def _consistent(moves: _Moves, turns: int, factor: float) -> Bool[Tensor, " m"]:
-    """Which of the M matches the winning hypothesis of their pair keeps."""
-    s, lines, device = len(moves.grids), moves.lines, moves.line.device
-    line = torch.where(moves.line >= 0, moves.line, lines)
-    filled = torch.zeros(lines + 1, dtype=torch.int64, device=device)
-    filled.scatter_add_(0, line.flatten(), torch.ones_like(line).flatten())
-
-    cells = torch.tensor([g * g for g in moves.grids], device=device)[:, None, None]
-    slot = (line * cells + (moves.origins()[:, None] + moves.end)[:, None]).flatten()  # (S * 4 * M)
-    counted = torch.int16 if len(moves.pair) < 2**15 else torch.int32
-    table = torch.zeros((lines + 1) * int(cells.sum()) + 1, dtype=counted, device=device)  # the last entry stays zero
-    table.scatter_add_(0, slot, torch.ones_like(slot, dtype=counted))
-
-    # The cell of image 1 that most matches of a line go to: largest count, then lowest cell.
-    base = max(moves.grids) ** 2
-    merit = table.gather(0, slot).long().reshape(s, -1) * base + (base - 1 - moves.end.repeat(1, 4))
-    best = torch.zeros(s, lines + 1, dtype=torch.int64, device=device)
-    best.scatter_reduce_(1, line.reshape(1, -1).expand(s, -1), merit, "amax")
-    best = base - 1 - best.remainder(base)
-
-    grid, occupied = (filled[:-1] > 0).expand(s, -1).nonzero().unbind(-1)
-    verdict = torch.zeros_like(best)  # best cell and, in the low byte, bit k: the assignment stands under rotation k
-    verdict[grid, occupied] = best[grid, occupied] * 256 + _verify(
-        table, filled, moves, grid, occupied, best[grid, occupied], turns, factor
-    )
-    found = verdict.gather(1, line.reshape(1, -1).expand(s, -1)).reshape(s, *line.shape)
-    bits = torch.where(found >> 8 == moves.end[:, None], found & 255, 0).to(torch.uint8)
-    return _winner(bits[:, 0] | bits[:, 1] | bits[:, 2] | bits[:, 3], moves, turns)
+def _standing(table: Table, moves: Moves, turns: int, factor: float) -> UInt8[Tensor, "s m"]:
+    """The rotations, as bits, under which a match follows an assignment that stands, for each grid of image 1."""
+    line, lines = table.line.flatten(), moves.lines
+    occupied = (table.filled[:lines] > 0).nonzero()[:, 0]
+    rows = []
+    for grid, (side, slot, end) in enumerate(zip(moves.grids, table.slot, moves.end, strict=True)):
+        # The cell of image 1 that most matches of a line go to: largest count, then lowest cell.
+        merit = table.moves.index_select(0, slot).long() * side**2 + (side**2 - 1 - end).repeat(4)
+        best = torch.zeros(lines + 1, dtype=torch.int64, device=line.device).scatter_reduce_(0, line, merit, "amax")
+        assigned = side**2 - 1 - best.index_select(0, occupied).remainder(side**2)
+        around = Surroundings(table, moves, grid, occupied, assigned)
+        stands = torch.zeros_like(assigned)
+        for turn in range(turns):
+            score, mean = around.turned(turn)
+            stands |= (score >= factor * mean.sqrt()).long() << turn
+        verdict = torch.zeros_like(best)  # best cell and, in the low byte, bit k: it stands under rotation k
+        verdict.index_copy_(0, occupied, assigned * 256 + stands)
+        found = verdict.index_select(0, line).reshape(4, -1)
+        bits = torch.where(found >> 8 == end, found, 0).to(torch.uint8)
+        rows.append(bits[0] | bits[1] | bits[2] | bits[3])
+    return torch.stack(rows)
 
 
-def _verify(
-    table: Tensor,
-    filled: Int[Tensor, " lines"],
-    moves: _Moves,
-    grid: Int[Tensor, " c"],
-    line: Int[Tensor, " c"],
-    best: Int[Tensor, " c"],
-    turns: int,
-    factor: float,
-) -> Int[Tensor, " c"]:
-    """The rotations under which the neighbours of each occupied line agree with its best cell, as bits."""
-    ring, partner = _neighbourhood(turns, str(line.device))
-    side = torch.tensor(moves.grids, device=line.device)[grid]
-    inside0, step0 = _around(line.remainder(_CELLS), torch.full_like(line, GRID), ring)  # (9, C)
-    inside1, step1 = _around(best, side, ring)
-    neighbour = torch.where(inside0, line + step0, line)
-    start = moves.origins()[grid] + best + neighbour * side * side
-    count = filled.gather(0, neighbour.flatten()).reshape(neighbour.shape)
-    stands = torch.zeros_like(line)
-    for turn in range(turns):  # nine rows each, which all rotations share
-        both = inside0 & inside1[partner[turn]]
-        slot = torch.where(both, start + step1[partner[turn]], len(table) - 1)
-        score = table.gather(0, slot.flatten()).reshape(slot.shape).sum(0)
-        mean = torch.where(both, count, 0).sum(0).double() / both.sum(0)
-        stands |= (score >= factor * mean.sqrt()).long() << turn
-    return stands
-
-
-@functools.cache
-def _neighbourhood(turns: int, device: str) -> tuple[Tensor, Tensor]:
-    """The ring (2, 9, 1), and for each rotation the cells of image 1's ring that belong to image 0's (turns, 9)."""
-    partner = [[*((j - turn) % 8 for j in range(8)), 8] for turn in range(turns)]
-    return torch.tensor(_RING, device=device).T[..., None].contiguous(), torch.tensor(partner, device=device)
-
-
-def _around(cell: Tensor, side: Tensor, ring: Tensor) -> tuple[Tensor, Tensor]:
-    """Which of the nine cells around each cell are in its grid, and how far on they are in the cells' numbering."""
-    x, y = cell.remainder(side) + ring[0], torch.div(cell, side, rounding_mode="floor") + ring[1]
-    inside = (x >= 0) & (x < side) & (y >= 0) & (y < side)
-    return inside, ring[1] * side + ring[0]
-
-
-def _winner(bits: UInt8[Tensor, "s m"], moves: _Moves, turns: int) -> Bool[Tensor, " m"]:
-    """What the hypothesis (grid, bit) that keeps most matches of a pair keeps, the first of equals."""
+def _winner(bits: UInt8[Tensor, "s m"], moves: Moves, turns: int) -> Int[Tensor, " pairs"]:
+    """The hypothesis, grid * turns + turn, that keeps most matches of each pair, the first of equals."""
     hypotheses = torch.stack([(row >> turn) & 1 for row in bits for turn in range(turns)], 1)  # (M, S * turns)
-    if hypotheses.shape[1] == 1:
-        return hypotheses[:, 0].bool()
     counts = torch.zeros(moves.pairs, hypotheses.shape[1], dtype=torch.int32, device=bits.device)
     counts.index_add_(0, moves.pair, hypotheses.int())
-    return hypotheses.gather(1, counts.argmax(1)[moves.pair][:, None])[:, 0].bool()
+    return counts.argmax(1)
 
 
-@dataclasses.dataclass(frozen=True)
+def _kept(bits: UInt8[Tensor, "s m"], winner: Int[Tensor, " pairs"], moves: Moves, turns: int) -> Bool[Tensor, " m"]:
+    """What the winning hypothesis of its pair says of each match."""
+    chosen = winner[moves.pair]
+    row = bits.gather(0, torch.div(chosen, turns, rounding_mode="floor")[None])[0]
+    return ((row >> chosen.remainder(turns).to(torch.uint8)) & 1).bool()
+
+
+def _own_support(table: Table, moves: Moves, winner: Int[Tensor, " pairs"], turns: int) -> Float[Tensor, " m"]:
+    """``(score - 1) / sqrt(mean)`` of each match's own cells under its pair's hypothesis, mean over the four grids."""
+    chosen = winner[moves.pair]
+    total = torch.zeros(len(chosen), dtype=torch.float64, device=chosen.device)
+    for hypothesis in sorted(set(winner.tolist())):
+        grid, turn = divmod(hypothesis, turns)
+        members = (chosen == hypothesis).nonzero()[:, 0]
+        for line in moves.line:
+            here = members[line[members] >= 0]
+            score, mean = Surroundings(table, moves, grid, line[here], moves.end[grid, here]).turned(turn)
+            total.index_add_(0, here, (score - 1).clamp_min(0) / mean.clamp_min(1).sqrt() / 4)
+    return total
+
+
 class GMS:
-    """`gms` as a stage. Raises ValueError for correspondences without image sizes."""
+    """`gms` as a stage, which may also supply ``prior``: P(inlier) from `gms_support`.
 
-    with_rotation: bool = False
-    with_scale: bool = False
-    threshold_factor: float = 6.0
-    border: Border = "opencv"
+    calibration: of the support, see `Calibration`; None: no prior. prune: False keeps every match and gives the prior
+    only; raises ValueError where there is no calibration then. The other options are those of `gms`. Raises ValueError
+    for correspondences without image sizes.
+    """
 
-    def __call__(self, correspondences: Correspondences) -> Correspondences:
-        """The same matches, of which only those survive that move with their neighbours."""
-        c = correspondences
+    def __init__(
+        self,
+        *,
+        with_rotation: bool = False,
+        with_scale: bool = False,
+        threshold_factor: float = 6.0,
+        border: Border = "opencv",
+        prune: bool = True,
+        calibration: Mapping[str, Mapping[str, float]] | None = None,
+    ) -> None:
+        self.with_rotation, self.with_scale = with_rotation, with_scale
+        self.threshold_factor, self.border = threshold_factor, border
+        self.prune = prune
+        self.calibration = calibration_of("GMS", prune, calibration)
+
+    def __call__(self, c: Correspondences) -> Correspondences:
+        """The same matches, of which only those survive that move with their neighbours, or with a prior."""
+        soft = c if self.calibration is None else self.calibration(c, self.evidence(c))
+        return soft.keep(gms(**self._arguments(c))) if self.prune else soft
+
+    def evidence(self, c: Correspondences) -> Float[Tensor, "b n"]:
+        """What the prior is calibrated from: `gms_support`."""
+        return gms_support(**self._arguments(c))
+
+    def _arguments(self, c: Correspondences) -> dict[str, Any]:
         if c.size0 is None or c.size1 is None:
             raise ValueError("GMS needs `size0` and `size1`: its grids divide the images")
-        options = dataclasses.asdict(self)
-        return c.keep(gms(c.x0, c.x1, size0=c.size0, size1=c.size1, mask=c.mask, **options))
+        return {
+            "x0": c.x0, "x1": c.x1, "size0": c.size0, "size1": c.size1, "mask": c.mask,
+            "with_rotation": self.with_rotation, "with_scale": self.with_scale,
+            "threshold_factor": self.threshold_factor, "border": self.border,
+        }  # fmt: skip

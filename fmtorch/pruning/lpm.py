@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from fmtorch.pruning.calibration import calibration_of
 from fmtorch.pruning.knn import nearest_points
 from fmtorch.types import Correspondences
 
@@ -33,19 +34,54 @@ def lpm(
     Points in any common unit. Non-finite points are dropped. Memory is linear in the number of matches. Raises
     ValueError for K below 4.
     """
+    kept = torch.zeros(x0.shape[:2], dtype=torch.bool, device=x0.device)
+    for pair, match, passes in _passes(x0, x1, mask, thresholds, neighbors, taus):
+        kept[pair, match] = passes[-1] <= thresholds[len(passes) - 1]
+    return kept
+
+
+def lpm_cost(
+    x0: Float[Tensor, "b n 2"],
+    x1: Float[Tensor, "b n 2"],
+    *,
+    mask: Bool[Tensor, "b n"] | None = None,
+    thresholds: Sequence[float] = (0.8, 0.5),
+    neighbors: Sequence[int] = (6, 6),
+    taus: Sequence[float] = (0.2, 0.2),
+) -> Float[Tensor, "b n"]:
+    """The mean of the costs of the passes of `lpm`, in [0, 1]; 1 for masked matches and non-finite points.
+
+    The first pass sees all matches, the second those that the first kept: together they tell right matches from wrong
+    ones better than either does. Arguments as `lpm`.
+    """
+    cost = torch.ones(x0.shape[:2], dtype=torch.float64, device=x0.device)
+    for pair, match, passes in _passes(x0, x1, mask, thresholds, neighbors, taus):
+        cost[pair, match] = sum(passes[1:], passes[0]) / len(passes)
+    return cost.to(x0.dtype)
+
+
+def _passes(
+    x0: Tensor,
+    x1: Tensor,
+    mask: Tensor | None,
+    thresholds: Sequence[float],
+    neighbors: Sequence[int],
+    taus: Sequence[float],
+) -> Iterator[tuple[int, Int[Tensor, " n"], list[Float[Tensor, " n"]]]]:
+    """Of each pair its live matches and, for every pass that there was, the mean cost of each of them."""
     if min(neighbors) < 4:
         raise ValueError(f"neighbors is {neighbors}; each must be at least 4, so that the smallest neighbourhood has 2")
     alive = torch.isfinite(x0).all(-1) & torch.isfinite(x1).all(-1)
     alive = alive if mask is None else alive & mask
-    kept = torch.zeros_like(alive)
     for pair, here in enumerate(alive):
         points = torch.stack([x0[pair][here], x1[pair][here]]).double()
         members = torch.arange(points.shape[1], device=points.device)
-        for passing, (threshold, K, tau) in enumerate(zip(thresholds, neighbors, taus, strict=True)):
-            if passing == 0 or len(members) >= K + 4:
-                members = (_cost(points, members, K, tau) / 3 <= threshold).nonzero()[:, 0]
-        kept[pair, here.nonzero()[members, 0]] = True
-    return kept
+        passes: list[Tensor] = []
+        for threshold, K, tau in zip(thresholds, neighbors, taus, strict=True):
+            if not passes or len(members) >= K + 4:
+                passes.append(_cost(points, members, K, tau) / 3)
+                members = (passes[-1] <= threshold).nonzero()[:, 0]
+        yield pair, here.nonzero()[:, 0], passes
 
 
 def _cost(points: Float[Tensor, "2 n 2"], members: Int[Tensor, " m"], K: int, tau: float) -> Float[Tensor, " n"]:
@@ -75,15 +111,32 @@ def _differs(motion: Float[Tensor, "n 2"], near: Int[Tensor, "n k"], tau: float)
     return cosine * torch.minimum(length, lengths) / torch.maximum(length, lengths) < tau
 
 
-@dataclasses.dataclass(frozen=True)
 class LPM:
-    """`lpm` as a stage; `thresholds`, `neighbors`, `taus` hold one value for each of the two passes."""
+    """`lpm` as a stage, which may also supply ``prior``: P(inlier) from `lpm_cost`.
 
-    thresholds: Sequence[float] = (0.8, 0.5)
-    neighbors: Sequence[int] = (6, 6)
-    taus: Sequence[float] = (0.2, 0.2)
+    `thresholds`, `neighbors`, `taus` hold one value for each of the two passes. calibration: of one minus the cost, see
+    `Calibration`; None: no prior. prune: False keeps every match and gives the prior only; raises ValueError where
+    there is no calibration then.
+    """
 
-    def __call__(self, correspondences: Correspondences) -> Correspondences:
-        """The same matches, of which only those survive that keep their neighbourhoods."""
-        c = correspondences
-        return c.keep(lpm(c.x0, c.x1, mask=c.mask, **dataclasses.asdict(self)))
+    def __init__(
+        self,
+        *,
+        thresholds: Sequence[float] = (0.8, 0.5),
+        neighbors: Sequence[int] = (6, 6),
+        taus: Sequence[float] = (0.2, 0.2),
+        prune: bool = True,
+        calibration: Mapping[str, Mapping[str, float]] | None = None,
+    ) -> None:
+        self._options: dict[str, Any] = {"thresholds": thresholds, "neighbors": neighbors, "taus": taus}
+        self.prune = prune
+        self.calibration = calibration_of("LPM", prune, calibration)
+
+    def __call__(self, c: Correspondences) -> Correspondences:
+        """The same matches, of which only those survive that keep their neighbourhoods, or with a prior."""
+        soft = c if self.calibration is None else self.calibration(c, self.evidence(c))
+        return soft.keep(lpm(c.x0, c.x1, mask=c.mask, **self._options)) if self.prune else soft
+
+    def evidence(self, c: Correspondences) -> Float[Tensor, "b n"]:
+        """What the prior is calibrated from: one minus the cost."""
+        return 1 - lpm_cost(c.x0, c.x1, mask=c.mask, **self._options)

@@ -9,13 +9,18 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import estimators
+import features
 import matching
+import memory
+import pruning
+import speed
+import thresholds
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="scripts/benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    for module in (estimators, matching):
+    for module in (estimators, features, matching, memory, pruning, speed, thresholds):
         module.add_arguments(commands)
     arguments = parser.parse_args()
     arguments.run(arguments)

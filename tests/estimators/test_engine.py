@@ -10,9 +10,9 @@ import fmtorch
 from fmtorch import presets
 from fmtorch.estimators import HypothesizeAndVerify, engine
 from fmtorch.types import collate
-from tests.laws import scene, scenes
+from tests.laws import OTHER_LIBRARIES, scene, scenes
 
-OWN = [n for n in presets.available("estimator") if not n.startswith(("opencv_", "poselib"))]
+OWN = [n for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES)]
 
 
 def _true_inlier_error(F: torch.Tensor, index: int, count: int) -> float:

@@ -97,3 +97,12 @@ def test_sigma_consensus_is_the_integral_over_sigma() -> None:
         loss = integrate.quad(lambda r: weight(r) * r, 0, r, epsabs=1e-9)[0]
         gain = float(SigmaConsensus.gain(torch.tensor(share**2, dtype=torch.float64)))
         assert abs(gain - (1 - loss / whole)) < 1e-6
+
+
+def test_models_that_are_none_score_minus_infinity_and_change_no_other() -> None:
+    problem = problems(scene(0, 300), 0, 8)[0][0]
+    F = _models(problem)
+    valid = torch.arange(40)[None] < 25
+    scores = score_models(TruncatedSquares(2.0), F, problem, problem.points.float(), valid=valid)
+    whole = score_models(TruncatedSquares(2.0), F, problem, problem.points.float())
+    assert torch.equal(scores, torch.where(valid, whole, -torch.inf))

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from fmtorch.geometry.reduce import component_sum, matmul3, stable_sum
+from fmtorch.geometry.reduce import component_sum, matmul3, outer_sum, stable_sum
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 7, 8, 9, 100, 760, 1000])
@@ -32,3 +32,10 @@ def test_component_sum(n, dim):
 def test_matmul3_broadcasts():
     a, b = torch.randn(4, 1, 3, 3, dtype=torch.float64), torch.randn(5, 3, 3, dtype=torch.float64)
     torch.testing.assert_close(matmul3(a, b), a @ b)
+
+
+def test_outer_sum():
+    generator = torch.Generator().manual_seed(0)
+    a, b = (torch.randint(-9, 9, (5, n, 20), generator=generator).double() for n in (3, 4))
+    expected = torch.einsum("kis,kjs->ijs", a, b)
+    assert torch.equal(outer_sum(a[:, :, None], b[:, None]), expected)  # integers: exact

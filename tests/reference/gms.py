@@ -77,3 +77,28 @@ def gms(
             if kept.sum() > best.sum():
                 best = kept
     return best
+
+
+def support(
+    x0: np.ndarray, x1: np.ndarray, size0: tuple[int, int], size1: tuple[int, int], scale: float, turn: int
+) -> list[float]:
+    """The mean over the shifted grids of (score - 1) / sqrt(mean, at least 1) at each match's own cells."""
+    p0, p1 = normalised(x0, size0), normalised(x1, size1)
+    grid1 = int(GRID * scale)
+    total = [0.0] * len(x0)
+    for shift in SHIFTS:
+        left = [cell(p, GRID, shift, False) for p in p0]
+        right = [cell(p, grid1, (0.0, 0.0), False) for p in p1]
+        both = [(a, b) for a, b in zip(left, right, strict=True) if a is not None and b is not None]
+        moves, filled = Counter(both), Counter(a for a, _ in both)
+        for i, (a, b) in enumerate(zip(left, right, strict=True)):
+            if a is None or b is None:
+                continue
+            score, count, pairs = 0, 0, 0
+            for j, (dx, dy) in enumerate((*RING, (0, 0))):
+                ex, ey = RING[(j - turn) % 8] if j < 8 else (0, 0)
+                na, nb = (a[0] + dx, a[1] + dy), (b[0] + ex, b[1] + ey)
+                if min(*na, *nb) >= 0 and max(na) < GRID and max(nb) < grid1:
+                    score, count, pairs = score + moves[na, nb], count + filled[na], pairs + 1
+            total[i] += (score - 1) / math.sqrt(max(count / pairs, 1)) / 4
+    return total

@@ -32,17 +32,23 @@ def differs(v: np.ndarray, w: np.ndarray, tau: float) -> bool:
     return cosine * min(v2, w2) / max(v2, w2) < tau
 
 
-def lpm(
+def passes(
     x: np.ndarray,
     y: np.ndarray,
     thresholds: tuple[float, float] = (0.8, 0.5),
     neighbors: tuple[int, int] = (6, 6),
     taus: tuple[float, float] = (0.2, 0.2),
-) -> np.ndarray:
-    """Two passes; in the second the neighbours are sought among the matches that the first kept."""
-    members = list(range(len(x)))
+) -> tuple[list[int], list[list[float]]]:
+    """The survivors of two passes, and the costs in each; in the second neighbours are sought among the survivors."""
+    members, costs = list(range(len(x))), []
     for passing, (threshold, K, tau) in enumerate(zip(thresholds, neighbors, taus, strict=True)):
         if passing == 1 and len(members) < K + 4:
             break
-        members = [i for i in range(len(x)) if cost(i, x, y, members, K, tau) / 3 <= threshold]
-    return np.isin(np.arange(len(x)), members)
+        costs.append([cost(i, x, y, members, K, tau) / 3 for i in range(len(x))])
+        members = [i for i in range(len(x)) if costs[-1][i] <= threshold]
+    return members, costs
+
+
+def lpm(x: np.ndarray, y: np.ndarray, *options: tuple[float, float]) -> np.ndarray:
+    """Which matches survive the two passes."""
+    return np.isin(np.arange(len(x)), passes(x, y, *options)[0])

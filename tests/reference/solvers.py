@@ -87,3 +87,10 @@ def pose(F: Array, K0: Array, K1: Array, x0: Array, x1: Array) -> tuple[Array, A
             best = (R, t, count)
     assert best is not None
     return best
+
+
+def consistently_oriented(F: Array, x0: Array, x1: Array) -> bool:
+    """Whether F x0 is a multiple of e1 x x1 by factors of one sign (Chum, Werner & Matas 2004, equation 2)."""
+    e1 = np.linalg.svd(F)[0][:, 2]
+    signs = [np.sign(np.dot(F @ a, np.cross(e1, b))) for a, b in zip(homogeneous(x0), homogeneous(x1), strict=True)]
+    return abs(sum(signs)) == len(signs)

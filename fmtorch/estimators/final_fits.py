@@ -1,0 +1,115 @@
+"""Final fits: from the best hypothesis and its inliers to the estimate, attached to the graph of the points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from fmtorch.estimators.parts import residuals_squared
+from fmtorch.estimators.problem import Problem
+from fmtorch.geometry import eight_point
+from fmtorch.geometry.refine import attached_step, refine_components
+
+MULTIPLE = 2.0  # of the robust standard deviation: beyond it a match does not count
+SMALLEST, LARGEST = 0.3, 2.0  # px, bounds of that distance
+UNKNOWN = 1.5  # px, that distance where too few matches tell the noise
+LEAST = 15  # matches that tell the noise
+LIKELY = 0.3  # matches of a smaller prior do not tell the noise
+ITERATIONS = 5  # Levenberg-Marquardt steps
+
+
+@runtime_checkable
+class FinalFit(Protocol):
+    """Turns the best hypothesis and its inliers into the estimate; attached to the graph of the points."""
+
+    def __call__(
+        self, F: Float[Tensor, "p 3 3"], problem: Problem, inliers: Bool[Tensor, "p n"]
+    ) -> Float[Tensor, "p 3 3"]:
+        """The estimate in normalised units."""
+        ...
+
+
+class NoFit:
+    """The best hypothesis as it is."""
+
+    def __call__(
+        self, F: Float[Tensor, "p 3 3"], problem: Problem, inliers: Bool[Tensor, "p n"]
+    ) -> Float[Tensor, "p 3 3"]:
+        """As `FinalFit`."""
+        return F
+
+
+class LeastSquares:
+    """The normalised 8-point algorithm on the inliers; the hypothesis itself where they do not determine one."""
+
+    def __call__(
+        self, F: Float[Tensor, "p 3 3"], problem: Problem, inliers: Bool[Tensor, "p n"]
+    ) -> Float[Tensor, "p 3 3"]:
+        """As `FinalFit`."""
+        x0, x1 = problem.points[:2].permute(1, 2, 0), problem.points[2:].permute(1, 2, 0)
+        fitted, valid = eight_point(x0, x1, inliers.to(torch.float64))
+        return torch.where(valid[:, None, None], fitted, F)
+
+
+class GaussNewton:
+    """One attached Gauss-Newton step of the Sampson error at the refined model, on its inliers, weighted by the prior.
+
+    At an optimum it moves nothing, and its gradient is that of the optimum (implicit function theorem).
+    """
+
+    def __call__(
+        self, F: Float[Tensor, "p 3 3"], problem: Problem, inliers: Bool[Tensor, "p n"]
+    ) -> Float[Tensor, "p 3 3"]:
+        """As `FinalFit`."""
+        x0, x1 = problem.points[:2].permute(1, 2, 0), problem.points[2:].permute(1, 2, 0)
+        weight = inliers.to(torch.float64) if problem.prior is None else torch.where(inliers, problem.prior, 0)
+        return attached_step(F, x0, x1, weight, kernel="truncated", scale=torch.inf)
+
+
+class AdaptiveGaussNewton:
+    """Levenberg-Marquardt of the truncated Sampson error at the noise of the inliers, then one attached step.
+
+    One threshold does not suit all pairs: keypoints of a sharp video lie within a fifth of a pixel of their epipolar
+    lines, those of a hand-held telephone within one. A threshold for the worst lets wrong matches into the fit of the
+    best: on rendered training scenes this fit raises mean recall from 66.8 to 74.2 (indoor) and from 78.2 to 85.3
+    (driving) and changes nothing on castle-P19 and fox.
+    The noise is 1.4826 times the median Sampson distance of the inliers (Rousseeuw & Leroy 1987), the truncation
+    MULTIPLE times that. The attached step moves nothing at an optimum and has the gradients of the optimum.
+    """
+
+    def __call__(
+        self, F: Float[Tensor, "p 3 3"], problem: Problem, inliers: Bool[Tensor, "p n"]
+    ) -> Float[Tensor, "p 3 3"]:
+        """As `FinalFit`."""
+        prior = problem.live.to(torch.float64) if problem.prior is None else problem.prior
+        with torch.no_grad():
+            truncation = noise(residuals_squared(F, problem), inliers & (prior > LIKELY))
+            models = F.flatten(1).T[..., None].contiguous()
+            scale = truncation / problem.unit
+            refined, _ = refine_components(models, problem.points, prior, "truncated", scale, ITERATIONS)
+            F = refined[..., 0].T.reshape(-1, 3, 3)
+            close = residuals_squared(F, problem) <= truncation.square()[:, None]
+        x0, x1 = problem.points[:2].permute(1, 2, 0), problem.points[2:].permute(1, 2, 0)
+        weight = torch.where(close & problem.live, prior, 0)
+        return attached_step(F, x0, x1, weight, kernel="truncated", scale=torch.inf)
+
+
+def noise(r2: Float[Tensor, "p n"], inliers: Bool[Tensor, "p n"]) -> Float[Tensor, " p"]:
+    """The distance in pixels up to which a match counts, from the squared distances of the inliers."""
+    count = inliers.sum(1)
+    ordered = torch.where(inliers, r2, torch.inf).sort(1).values
+    median = ordered.gather(1, ((count + 1) // 2 - 1).clamp_min(0)[:, None])[:, 0]
+    truncation = (MULTIPLE * 1.4826 * median.sqrt()).clamp(SMALLEST, LARGEST)
+    return torch.where(count >= LEAST, truncation, UNKNOWN)
+
+
+FINAL_FITS: dict[str, Callable[[], FinalFit]] = {
+    "none": NoFit,
+    "least_squares": LeastSquares,
+    "gauss_newton": GaussNewton,
+    "adaptive": AdaptiveGaussNewton,
+}

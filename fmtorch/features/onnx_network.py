@@ -1,0 +1,116 @@
+"""Patch networks run by ONNX Runtime on CPU."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from fmtorch.resources import models_dir
+
+PRECISIONS = ("fp32", "int8")
+PATCH_SHAPE = (1, 32, 32)
+HINT = "python scripts/export_onnx.py makes it from a checkpoint, scripts/download.py fetches authors' checkpoints"
+
+
+class NetworkFileError(ValueError):
+    """A network file that is absent, unreadable or of another shape; the message names it and what makes it."""
+
+
+def network_file(name: str, precision: str = "fp32") -> Path:
+    """Where the ONNX file of a network is among the shipped models: name.onnx, or name.int8.onnx.
+
+    A name that ends in .onnx is a path of the user's own and stays as it is. Raises ValueError for another precision.
+    """
+    if precision not in PRECISIONS:
+        raise ValueError(f"precision={precision}; there are: {', '.join(PRECISIONS)}")
+    if name.endswith(".onnx"):
+        return Path(name)
+    return models_dir() / (f"{name}.onnx" if precision == "fp32" else f"{name}.{precision}.onnx")
+
+
+class PatchNetwork:
+    """A patch network from an ONNX file: float32 patches (N, 1, 32, 32) to (N, D).
+
+    threads: of ONNX Runtime; one session a file and thread count serves all instances and threads of a process, is made
+    at the first call and is not pickled. batch: patches are processed in portions of exactly this many, the last one
+    filled up with zeros, so that a patch's result does not depend on how many or which patches came with it.
+
+    Patches on a GPU are brought to the CPU and the result back; there is no other path.
+    """
+
+    def __init__(self, path: Path | str, *, threads: int = 1, batch: int = 256) -> None:
+        if threads < 1 or batch < 1:
+            raise ValueError(f"threads={threads}, batch={batch}: both must be at least 1")
+        self.path, self.threads, self.batch = Path(path), threads, batch
+
+    def __repr__(self) -> str:
+        return f"PatchNetwork({str(self.path)!r}, threads={self.threads}, batch={self.batch})"
+
+    def __call__(self, patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n d"]:
+        """The network's output for each patch, float32, on the patches' device.
+
+        Raises NetworkFileError for a file that is absent, corrupt or takes another shape, ValueError for patches of
+        another shape.
+        """
+        if patches.ndim != 4 or tuple(patches.shape[1:]) != PATCH_SHAPE:
+            raise ValueError(f"patches are {tuple(patches.shape)}; a patch network takes (N, 1, 32, 32)")
+        session, name, outputs = _session(str(self.path.absolute()), self.threads)
+        array = np.ascontiguousarray(patches.detach().to("cpu", torch.float32).numpy())
+        result = np.zeros((len(array), outputs), np.float32)
+        for start in range(0, len(array), self.batch):
+            part = array[start : start + self.batch]
+            result[start : start + len(part)] = session.run(None, {name: _filled(part, self.batch)})[0][: len(part)]
+        return torch.from_numpy(result).to(patches.device)
+
+    @property
+    def identity(self) -> dict[str, object]:
+        """What defines the results, for the feature cache. Raises NetworkFileError for a file that is absent."""
+        if not self.path.is_file():
+            raise NetworkFileError(f"{self.path} does not exist: {HINT}")
+        return {"file": self.path, "batch": self.batch}
+
+    @property
+    def outputs(self) -> int:
+        """D, the length of an output; opens the file."""
+        return _session(str(self.path.absolute()), self.threads)[2]
+
+
+def _filled(part: NDArray[np.float32], count: int) -> NDArray[np.float32]:
+    if len(part) == count:
+        return part
+    return np.concatenate([part, np.zeros((count - len(part), *PATCH_SHAPE), np.float32)])
+
+
+@functools.lru_cache(maxsize=16)
+def _session(path: str, threads: int) -> tuple[Any, str, int]:
+    """An inference session, its input's name and the length of an output."""
+    import onnxruntime
+    from onnxruntime.capi import onnxruntime_pybind11_state as errors
+
+    if not Path(path).is_file():
+        raise NetworkFileError(f"{path} does not exist: {HINT}")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    options.log_severity_level = 3
+    try:
+        session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    except (errors.InvalidProtobuf, errors.InvalidGraph, errors.Fail, errors.InvalidArgument, errors.NotImplemented,
+            errors.RuntimeException) as error:  # fmt: skip
+        raise NetworkFileError(f"{path} is no ONNX network that can be run ({error}): {HINT}") from error
+    inputs, outputs = session.get_inputs(), session.get_outputs()
+    shape = inputs[0].shape if len(inputs) == 1 else None
+    fits = shape is not None and len(shape) == 4 and tuple(shape[1:]) == PATCH_SHAPE and not isinstance(shape[0], int)
+    if not fits or inputs[0].type != "tensor(float)":
+        found = ", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)
+        raise NetworkFileError(f"{path} takes {found}; a patch network takes float (N, 1, 32, 32), N free: {HINT}")
+    size = outputs[0].shape
+    if len(outputs) != 1 or len(size) != 2 or not isinstance(size[1], int):
+        raise NetworkFileError(f"{path} gives {[o.shape for o in outputs]}; a patch network gives (N, D): {HINT}")
+    return session, inputs[0].name, size[1]

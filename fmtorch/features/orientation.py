@@ -1,0 +1,108 @@
+"""Orientation of local affine frames from their patches: the angle by which the frame's axes turn."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from fmtorch.features.frames import rotate_frames
+from fmtorch.features.patches import PATCH, ImagePyramid
+
+PatchFunction = Callable[[Tensor], Tensor]
+"""Patches (N, 1, 32, 32) float32, grey in [0, 1] -> (N, D); see `PatchNetwork`."""
+
+BINS = 36  # of the orientation histogram, 10 degrees each; Lowe, IJCV 2004, section 5
+WINDOW = PATCH / 6  # pixels, sigma of the Gaussian window: 2 keypoint sigmas
+CHUNK = 128  # patches worked on together: their gradients fit a core's cache
+SMOOTHING = 1.6  # bins, sigma of the histogram's blur; kornia's
+
+
+@dataclasses.dataclass(frozen=True)
+class DominantGradient:
+    """Turns the first axis to the highest peak of the histogram of gradient directions (Lowe, IJCV 2004, section 5).
+
+    One orientation a frame, as kornia's PatchDominantGradientOrientation.
+    """
+
+    def __call__(self, pyramid: ImagePyramid, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 2 3"]:
+        """The turned frames."""
+        return rotate_frames(lafs, dominant_gradient(pyramid.extract(lafs)))
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkOrientation:
+    """Turns the first axis to the direction that OriNet sees (Mishkin et al., ECCV 2018).
+
+    network: patches (N, 1, 32, 32) -> (N, 2), a vector (y, x).
+    """
+
+    network: PatchFunction
+
+    def __call__(self, pyramid: ImagePyramid, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 2 3"]:
+        """The turned frames."""
+        if len(lafs) == 0:
+            return lafs
+        y, x = self.network(pyramid.extract(lafs)).to(lafs).unbind(1)
+        return rotate_frames(lafs, torch.atan2(y, x))
+
+
+def dominant_gradient(patches: Float[Tensor, "n 1 p p"]) -> Float[Tensor, " n"]:
+    """The direction of the dominant gradient, towards bright, in radians counter-clockwise on the screen.
+
+    Sobel gradients, weighted by a Gaussian window, vote for the two nearest of `BINS` directions; the smoothed
+    histogram's highest peak is refined by a parabola. A patch without gradient gives pi.
+    """
+    histograms = [_histogram(part) for part in torch.split(patches, CHUNK)]
+    smooth = _smoothed(torch.cat(histograms) if histograms else patches.new_zeros(0, BINS))
+    value, peak = smooth.max(1)
+    left, right = (smooth.gather(1, ((peak + step) % BINS)[:, None])[:, 0] for step in (-1, 1))
+    curvature = left + right - 2 * value
+    offset = torch.where(curvature < 0, 0.5 * (left - right) / torch.where(curvature < 0, curvature, -1.0), 0.0)
+    return math.pi - (peak + offset) * (2 * math.pi / BINS)
+
+
+def _histogram(patches: Float[Tensor, "n 1 p p"]) -> Float[Tensor, "n k"]:
+    """Votes for the directions -pi, -pi + 2 pi / BINS, ..., clockwise on the screen."""
+    n, size = patches.shape[0], patches.shape[-1]
+    gy, gx = _sobel(patches)
+    magnitude = (gx * gx + gy * gy).sqrt() * _window(size, patches.device)
+    position = (torch.atan2(gy, gx) + math.pi) * (BINS / (2 * math.pi))
+    lower = position.floor()
+    upper_weight = (position - lower) * magnitude
+    # BINS + 2 places: pi, where a direction ends up that is -pi, and the place above it.
+    place = lower.long() + (BINS + 2) * torch.arange(n, device=patches.device)[:, None, None]
+    votes = patches.new_zeros(n * (BINS + 2))
+    votes.scatter_add_(0, place.flatten(), (magnitude - upper_weight).flatten())
+    votes.scatter_add_(0, place.flatten() + 1, upper_weight.flatten())
+    histogram = votes.reshape(n, BINS + 2)
+    histogram[:, :2] += histogram[:, BINS:]
+    return histogram[:, :BINS]
+
+
+def _sobel(patches: Tensor) -> tuple[Tensor, Tensor]:
+    """Derivatives along y and x (N, P, P); the border is continued."""
+    padded = F.pad(patches, (1, 1, 1, 1), mode="replicate")[:, 0]
+    rows = padded[:, :-2] + 2 * padded[:, 1:-1] + padded[:, 2:]
+    columns = padded[:, :, :-2] + 2 * padded[:, :, 1:-1] + padded[:, :, 2:]
+    return (columns[:, 2:] - columns[:, :-2]) / 8, (rows[:, :, 2:] - rows[:, :, :-2]) / 8
+
+
+def _smoothed(histogram: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+    """The circular histogram blurred by a Gaussian of five taps."""
+    taps = [math.exp(-0.5 * (step / SMOOTHING) ** 2) for step in range(-2, 3)]
+    shifted = (weight / sum(taps) * histogram.roll(step, 1) for step, weight in zip(range(-2, 3), taps, strict=True))
+    return functools.reduce(torch.add, shifted)
+
+
+@functools.cache
+def _window(size: int, device: torch.device) -> Float[Tensor, "p p"]:
+    x = torch.arange(size, device=device) - (size - 1) / 2
+    weight = torch.exp(-0.5 * (x / (WINDOW * size / PATCH)) ** 2)
+    return weight[:, None] * weight

@@ -1,0 +1,74 @@
+"""From a pruner's evidence to P(inlier)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from fmtorch.types import Correspondences
+
+_SQUARINGS = 10
+_LARGEST = 12.0  # log-odds beyond which P(inlier) is as good as 0 or 1; the logistic function here is 6e-6 off 1 there
+
+
+def logistic(z: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """``o / (1 + o)`` with ``o = (1 + z / 1024)^1024``, the logistic function but for 0.001 at most.
+
+    Made of arithmetic alone, whose last bits, unlike those of exp, do not depend on where in memory a number stands.
+    """
+    odds: Tensor = 1 + z.clamp(-_LARGEST, _LARGEST) / 2**_SQUARINGS
+    for _ in range(_SQUARINGS):
+        odds = odds.square()
+    return odds / (odds + 1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Calibration:
+    """``P(inlier) = logistic(constant + evidence e + ratio q)`` of the evidence e and the distance ratio q.
+
+    with_ratio: {constant, evidence, ratio}, where matches have a `quality`. alone: {constant, evidence}, where they
+    have none; without it their prior stays as it is. `scripts/calibrate_priors.py` fits these numbers.
+    """
+
+    with_ratio: Mapping[str, float]
+    alone: Mapping[str, float] | None = None
+
+    def __call__(self, c: Correspondences, evidence: Float[Tensor, "b n"]) -> Correspondences:
+        """The same matches with ``prior``, zero where masked. A ratio that is NaN counts as 1."""
+        fitted = self.alone if c.quality is None else self.with_ratio
+        if fitted is None:
+            return c
+        log_odds = fitted["constant"] + fitted["evidence"] * torch.where(c.mask, evidence.to(c.x0.dtype), 0)
+        if c.quality is not None:
+            log_odds = log_odds + fitted["ratio"] * torch.where(c.mask, c.quality, 0).nan_to_num(nan=1.0)
+        return c.replace(prior=torch.where(c.mask, logistic(log_odds), 0))
+
+
+def calibration_of(
+    pruner: str, prune: bool, calibration: Mapping[str, Mapping[str, float]] | None
+) -> Calibration | None:
+    """The calibration that a stage's options describe. Raises ValueError for a stage that would do nothing."""
+    if calibration is not None:
+        return Calibration(**calibration)
+    if not prune:
+        raise ValueError(f"{pruner} with prune=False needs `calibration`, to supply a prior; it would do nothing")
+    return None
+
+
+class RatioPrior:
+    """Supplies ``prior``: P(inlier) from the distance ratio alone. Without `quality` the prior stays as it is."""
+
+    def __init__(self, *, calibration: Mapping[str, Mapping[str, float]]) -> None:
+        self.calibration = Calibration(**calibration)
+
+    def __call__(self, c: Correspondences) -> Correspondences:
+        """The same matches with a prior."""
+        return self.calibration(c, self.evidence(c))
+
+    def evidence(self, c: Correspondences) -> Float[Tensor, "b n"]:
+        """None but the ratio."""
+        return torch.zeros_like(c.x0[..., 0])

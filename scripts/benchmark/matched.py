@@ -1,0 +1,86 @@
+"""The matched pairs that benchmarks of pruners and estimators start from."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import track
+
+from fmtorch import data, presets
+from fmtorch.data import ImagePair
+from fmtorch.pipeline import Pipeline
+from fmtorch.types import Correspondences
+
+console = Console(width=None if sys.stdout.isatty() else 170)
+
+WIDE = ("Strecha", "PhotoTourism", "CPC", "Tanks_and_Temples", "Strecha_train", "TanksLike", "orbit", "collection")
+"""Families of wide baselines; the others are videos, whose baselines are short."""
+
+Item = tuple[ImagePair, Correspondences]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--root", action="append", default=[], help="a set in the FM-Bench layout; may be repeated")
+    parser.add_argument("--rendered", choices=["small", "full"], help="also the embedded data set, of this size")
+    parser.add_argument("--split", default="test")
+    parser.add_argument("--limit", type=int, help="pairs of each set at most")
+    parser.add_argument("--features", default="sift")
+    parser.add_argument("--pruners", nargs="*", default=["ratio", "one_to_one"])
+
+
+def load(arguments: argparse.Namespace) -> list[Item]:
+    """Every usable pair of the sets that are asked for, with its matches as a batch of one."""
+    sets = [data.load("fmbench", arguments.split, root) for root in arguments.root]
+    if arguments.rendered:
+        sets.append(data.load("rendered", arguments.split, size=arguments.rendered))
+    pairs: list[ImagePair] = []
+    for dataset in sets:
+        whole = sorted((dataset[i] for i in range(len(dataset))), key=lambda pair: pair.key)
+        pairs += whole[: arguments.limit]
+    pairs.sort(key=lambda pair: pair.identity)
+    pruners: dict[str, Any] = {name: presets.build("pruner", name) for name in arguments.pruners}
+    front = Pipeline(
+        presets.build("features", arguments.features), presets.build("matcher", "nearest"), pruners,
+        lambda c, seed=0: None,
+    )  # fmt: skip
+    with ThreadPoolExecutor(torch.get_num_threads()) as workers:
+        matched = workers.map(lambda pair: front.match([pair])[0], pairs)
+        outcomes = list(track(matched, "matching", total=len(pairs), console=console))
+    items = [(o.pair, o.correspondences) for o in outcomes if o.correspondences is not None]
+    typical = np.median([int(c.count()) for _, c in items])
+    console.print(f"{len(items)} of {len(pairs)} pairs, median {typical:.0f} matches")
+    return items
+
+
+def groups(pairs: list[ImagePair]) -> dict[str, np.ndarray]:
+    """Which pairs belong to each family, to the wide and to the short baselines, and to all."""
+    found = {family: np.array([p.family == family for p in pairs]) for family in sorted({p.family for p in pairs})}
+    wide = np.array([p.family in WIDE for p in pairs])
+    if len(found) > 1:
+        if wide.any() and not wide.all():
+            found |= {"wide baselines": wide, "short baselines": ~wide}
+        found["all"] = np.ones(len(pairs), bool)
+    return found
+
+
+def paired_interval(difference: np.ndarray, clusters: np.ndarray, resamples: int = 2000) -> tuple[float, float, float]:
+    """Mean of (seeds, pairs) differences in percent and its 95 % bootstrap interval.
+
+    Scenes are resampled, and pairs within each; with a single scene only pairs.
+    """
+    rng = np.random.default_rng(0)
+    per_pair = difference.mean(0)
+    members = [np.flatnonzero(clusters == cluster) for cluster in np.unique(clusters)]
+    means = np.empty(resamples)
+    for b in range(resamples):
+        scenes = rng.integers(len(members), size=len(members)) if len(members) > 1 else [0]
+        index = np.concatenate([rng.choice(members[s], len(members[s])) for s in scenes])
+        means[b] = per_pair[index].mean()
+    low, high = np.percentile(means, [2.5, 97.5])
+    return 100 * float(per_pair.mean()), 100 * float(low), 100 * float(high)

@@ -1,0 +1,127 @@
+"""Pruners on the same matches with RANSAC: recall, inlier rates and counts before and after estimation.
+
+python scripts/benchmark pruning --root DATA/Strecha --root DATA/KITTI --rendered small --json FILE
+python scripts/benchmark pruning --from FILE FILE --markdown docs/pruning.md
+python scripts/benchmark pruning --contrib-python ENVIRONMENT/bin/python      # also times GMS against OpenCV's
+
+ASIFT features take a minute a pair: --asift-limit pairs of each family have them, by default 10.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import platform
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pruning_speed
+import pruning_table
+import torch
+from rich.console import Console
+from rich.progress import track
+
+from fmtorch import data, presets
+from fmtorch.data import ImagePair
+from fmtorch.evaluation.rows import evaluate
+from fmtorch.evaluation.run import select
+from fmtorch.pipeline import Outcome, Pipeline
+
+console = Console(width=None if sys.stdout.isatty() else 160)
+# Method: features, then pruners in order, with options as name:key=value. One match per location everywhere but in the
+# paper's own baseline; CODE takes all nearest neighbours, so that its survivors are thinned out afterwards.
+METHODS = {
+    "none": ("sift", "one_to_one"),
+    "RATIO, many a location": ("sift", "ratio"),
+    "RATIO": ("sift", "ratio one_to_one"),
+    "GMS": ("sift", "ratio one_to_one gms"),
+    "GMS, scale": ("sift", "ratio one_to_one gms:with_scale=true"),
+    "LPM": ("sift", "ratio one_to_one lpm"),
+    "frame consistency": ("sift", "ratio one_to_one frame_consistency likely"),
+    "CODE on SIFT": ("sift", "code one_to_one"),
+    "CODE": ("asift", "code one_to_one"),
+}
+
+
+def add_arguments(commands: Any) -> None:
+    parser = commands.add_parser("pruning", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--root", action="append", default=[], help="a set in the FM-Bench layout; may be repeated")
+    parser.add_argument("--rendered", choices=["small", "full"], help="also the embedded data set, of this size")
+    parser.add_argument("--split", default="test")
+    parser.add_argument("--limit", type=int, help="pairs of each family at most")
+    parser.add_argument("--asift-limit", type=int, default=10, help="pairs of each family with ASIFT features at most")
+    parser.add_argument("--methods", nargs="*", default=list(METHODS), choices=list(METHODS))
+    parser.add_argument("--estimator", default="ransac")
+    parser.add_argument("--json", type=Path, help="write the figures of every pair here")
+    parser.add_argument("--from", nargs="*", type=Path, default=[], dest="earlier", help="add earlier runs' --json")
+    parser.add_argument("--markdown", type=Path, help="put the tables between the marks of this file")
+    parser.add_argument("--contrib-python", help="a Python with opencv-contrib: times GMS against its matchGMS")
+    parser.add_argument("--repeats", type=int, default=31, help="of each timing")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    torch.set_num_threads(1)
+    runs = [json.loads(path.read_text()) for path in arguments.earlier]
+    if arguments.root or arguments.rendered:
+        runs.append({"machine": machine(), "rows": list(measure(arguments)), "speed": []})
+    if arguments.contrib_python:
+        speed = pruning_speed.measure(arguments.contrib_python, arguments.repeats)
+        runs.append({"machine": machine(), "rows": [], "speed": speed})
+    merged = {
+        "machine": [r["machine"] for r in runs],
+        **{part: [line for r in runs for line in r[part]] for part in ("rows", "speed")},
+    }
+    tables = pruning_table.tables(merged)
+    for table in tables:
+        console.print(table.terminal())
+    if arguments.json:
+        arguments.json.write_text(json.dumps(merged, indent=0) + "\n")
+    if arguments.markdown:
+        pruning_table.put(arguments.markdown, tables)
+
+
+def machine() -> dict[str, str]:
+    return {"processor": platform.processor() or platform.machine(), "torch": torch.__version__}
+
+
+def measure(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """A row for each method and pair."""
+    sets = [data.load("fmbench", arguments.split, root) for root in arguments.root]
+    if arguments.rendered:
+        sets.append(data.load("rendered", arguments.split, size=arguments.rendered))
+    pairs = [dataset[i] for dataset in sets for i in range(len(dataset))]
+    estimator = presets.build("estimator", arguments.estimator)
+    for extractor, limit in (("sift", arguments.limit), ("asift", arguments.asift_limit)):
+        chosen = {name: METHODS[name][1] for name in arguments.methods if METHODS[name][0] == extractor}
+        if not chosen:
+            continue
+        front = Pipeline(presets.build("features", extractor), presets.build("matcher", "nearest"), {}, estimator)
+        pruners = {name: [stage(spec) for spec in chain.split()] for name, chain in chosen.items()}
+        for pair in track(select(select(pairs, arguments.limit), limit), extractor, console=console):
+            yield from rows(front, pair, pruners)
+
+
+def stage(spec: str) -> Any:
+    """A pruner from `name` or `name:key=value,key=value`."""
+    name, _, rest = spec.partition(":")
+    options = {key: json.loads(value) for key, value in (item.split("=") for item in rest.split(",") if item)}
+    return presets.build("pruner", name, **options)
+
+
+def rows(front: Pipeline, pair: ImagePair, methods: dict[str, list[Any]]) -> Iterator[dict[str, Any]]:
+    matched = front.match([pair])[0]
+    for name, pruners in methods.items():
+        row = evaluate(front.estimate([pruned_by(matched, pruners)]))[0]
+        kept = ("pair", "family", "scene", "ok", "nsgd", "inlier_rate", "inlier_rate_before", "corrs", "corrs_before")
+        yield {"method": name, **{field: getattr(row, field) for field in kept}}
+
+
+def pruned_by(outcome: Outcome, pruners: list[Any]) -> Outcome:
+    c = outcome.correspondences
+    for pruner in pruners if c is not None else []:
+        c = pruner(c).compact()
+    return dataclasses.replace(outcome, correspondences=c)

@@ -1,0 +1,63 @@
+"""Other libraries behind our call: their results in our conventions, failures as data, a prior that orders matches."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+import torch
+
+from fmtorch import geometry, presets
+from fmtorch.estimators import PairwiseEstimator
+from fmtorch.estimators.adapters import Pair, Solution
+from fmtorch.types import collate
+from tests.laws import OTHER_LIBRARIES, scene
+
+NAMES = [n for n in presets.available("estimator") if n.startswith(OTHER_LIBRARIES)]
+MODULES = {
+    "poselib": "poselib", "magsac_cpp": "pymagsac", "gc_ransac_cpp": "pygcransac", "degensac_cpp": "pydegensac"
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_recovers_the_geometry_in_a_batch(name: str) -> None:
+    if name in MODULES:
+        pytest.importorskip(MODULES[name])
+    pairs = [scene(0, 300, outliers=0.3, noise=0.1), scene(1, 5), scene(2, 200, outliers=0.2, noise=0.1)]
+    batch = collate(pairs)
+    options = {"rounds": 2} if name == "kornia_ransac" else {}
+    estimate = presets.build("estimator", name, **options)(batch)
+    assert estimate.ok.tolist() == [True, False, True]
+    assert "5 matches" in estimate.reason[1]
+    for i in (0, 2):
+        clean = scene(i, pairs[i].mask.shape[1], outliers=0.0, noise=0.0)
+        distance = geometry.sampson(estimate.F[i : i + 1], clean.x0.double(), clean.x1.double())
+        assert float(distance.median()) < 0.5
+        assert int(estimate.inliers[i].sum()) >= 0.5 * len(distance[0])
+        assert not bool((estimate.inliers[i] & ~batch.mask[i]).any())
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_a_missing_library_is_named(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, MODULES[name], None)
+    with pytest.raises(ImportError, match=rf"{MODULES[name]}.*fmtorch\[peers\]"):
+        presets.build("estimator", name)
+
+
+def test_the_prior_orders_matches_before_the_quality() -> None:
+    seen: list[Pair] = []
+
+    def solve(pair: Pair) -> Solution:
+        seen.append(pair)
+        return None, torch.zeros(len(pair.x0), dtype=torch.bool).numpy()
+
+    c = scene(0, 40)
+    assert c.prior is not None
+    estimator = PairwiseEstimator("probe", solve, best_first=True)
+    estimate = estimator(c)
+    estimator(c.replace(prior=None))
+    assert estimate.reason == ("probe found no fundamental matrix",)
+    for pair in seen:
+        assert (pair.likelihood[:-1] >= pair.likelihood[1:]).all()
+    assert torch.equal(torch.from_numpy(seen[0].likelihood), c.prior[0].double().sort(descending=True).values)
+    assert seen[0].size0 == (640, 960)

@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+import cv2
+import kornia
+import numpy as np
+import pytest
+import torch
+
+from fmtorch.features import FRAME_SIGMAS, SIFT, HessianDetector
+from tests.conftest import shared_path
+from tests.features.scenes import texture
+from tests.reference.local_features import hessian_keypoints
+
+
+def keypoints(detector: HessianDetector, image: np.ndarray) -> np.ndarray:
+    """Rows (x, y, sigma, response)."""
+    lafs, scores = detector.detect(image)
+    return torch.cat([lafs[:, :, 2], lafs[:, :1, 0] / FRAME_SIGMAS, scores[:, None]], 1).double().numpy()
+
+
+@pytest.mark.parametrize("levels", [2, 3])
+def test_equals_the_definition(levels: int) -> None:
+    image = texture(0, 50, 61)
+    expected = hessian_keypoints(image / 255, 1e-4, levels)
+    found = keypoints(HessianDetector(levels=levels, border=0.0), image)
+    assert len(found) == len(expected) > 15
+    expected = expected[np.argsort(-expected[:, 3])]
+    # float32 filters: rounding of 2^-24 of intensities against differences of about 0.01.
+    np.testing.assert_allclose(found[:, :3], expected[:, :3], atol=2e-3)
+    np.testing.assert_allclose(found[:, 3], expected[:, 3], rtol=1e-3)
+
+
+@pytest.mark.parametrize("sigma", [2.2, 3.5, 6.0, 11.0])
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_gaussian_blob_has_its_place_and_size(sigma: float, sign: int) -> None:
+    # sigma^4 det H of a Gaussian of s, blurred to s^2 + sigma^2, is largest at sigma = s; the detector takes the image
+    # to have a blur of 0.5 already.
+    y, x = np.mgrid[0:150, 0:170]
+    centre = np.array([81.3, 70.6])
+    blob = np.exp(-((x - centre[0]) ** 2 + (y - centre[1]) ** 2) / (2 * sigma**2))
+    found = keypoints(HessianDetector(max_features=1), (128 + sign * 100 * blob).round().astype(np.uint8))
+    assert len(found) == 1
+    np.testing.assert_allclose(found[0, :2], centre, atol=0.05 * sigma)
+    # A quadratic over steps of 2^(1/3), kernels cut at 3 sigma, and rounding to 8 bits.
+    assert found[0, 2] == pytest.approx(np.hypot(sigma, 0.5), rel=0.06)
+
+
+def test_the_batch_in_torch_equals_each_image_through_opencv() -> None:
+    images = [texture(i) for i in range(3)]
+    batch = torch.from_numpy(np.stack(images))[:, None].float() / 255
+    detector = HessianDetector()
+    lafs, scores, mask = detector.detect_batch(batch)
+    for i, image in enumerate(images):
+        expected_lafs, expected_scores = detector.detect(image)
+        assert int(mask[i].sum()) == len(expected_lafs) > 100
+        # Equal scores, up to rounding, may change places: each keypoint is compared with the nearest one.
+        apart = (lafs[i, mask[i]].flatten(1)[:, None] - expected_lafs.flatten(1)).abs().amax(2)
+        gap, other = apart.min(1)
+        assert gap.max() < 2e-2
+        assert len(other.unique()) == len(expected_lafs)
+        torch.testing.assert_close(scores[i, mask[i]], expected_scores[other], rtol=1e-3, atol=0)
+        assert not lafs[i, ~mask[i]].any()
+        alone = detector.detect_batch(batch[i : i + 1])
+        assert torch.equal(alone[0][0], lafs[i, mask[i]])
+
+
+def test_at_most_max_features_the_strongest() -> None:
+    image = np.tile(texture(1, 60, 60), (2, 3))  # equal blobs: equal scores
+    everything, few = HessianDetector().detect(image)[1], HessianDetector(max_features=20).detect(image)[1]
+    assert torch.equal(everything, everything.sort(descending=True).values)
+    assert torch.equal(few, everything[:20])
+
+
+def test_of_equal_neighbours_one_remains() -> None:
+    # A blob centred between two pixels: their responses are equal in exact arithmetic.
+    y, x = np.mgrid[0:60, 0:61]
+    blob = np.exp(-((x - 29.5) ** 2 + (y - 30) ** 2) / (2 * 3.0**2))
+    found = keypoints(HessianDetector(), (100 + 100 * blob).round().astype(np.uint8))
+    assert (np.abs(found[:, :2] - [29.5, 30]) < 0.1).all(1).sum() == 1
+
+
+def test_border() -> None:
+    h, w = 100, 120
+    for border in (0.0, 3.0, 6.0):
+        x, y, sigma = keypoints(HessianDetector(border=border), texture(2, h, w))[:, :3].T
+        room = np.min([x, y, w - 1 - x, h - 1 - y], 0)
+        assert (room >= border * sigma - 1e-3).all()
+        assert len(room) > 10
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 300), (300, 1), (2, 2), (15, 400), (16, 16), (31, 33)])
+@pytest.mark.parametrize("constant", [True, False])
+def test_small_and_constant_images(shape: tuple[int, int], constant: bool) -> None:
+    image = np.full(shape, 90, np.uint8) if constant else texture(0, 400, 400)[: shape[0], : shape[1]]
+    lafs, scores = HessianDetector().detect(image)
+    assert lafs.shape == (len(scores), 2, 3)
+    if constant or min(shape) < 16:
+        assert len(scores) == 0
+    assert HessianDetector().detect_batch(torch.from_numpy(image)[None, None].float() / 255)[0].shape[1] == len(scores)
+
+
+@pytest.mark.parametrize("image", [np.zeros((0, 5), np.uint8), np.zeros((5, 5, 4), np.uint8), np.zeros(5, np.uint8)])
+def test_what_is_no_image_is_refused(image: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="uint8"):
+        HessianDetector().detect(image)
+
+
+def repeatability(first: np.ndarray, second: np.ndarray, matrix: np.ndarray, shape: tuple[int, int]) -> float:
+    """Share of the keypoints (x, y, sigma) seen in both images that are found again: within half a sigma of their
+    place, and within 2^(1/3) of their size."""
+    h, w = shape
+    mapped = np.c_[first[:, :2] @ matrix[:, :2].T + matrix[:, 2], first[:, 2] * np.sqrt(np.linalg.det(matrix[:, :2]))]
+    seen = ((mapped[:, :2] > 20) & (mapped[:, :2] < [w - 21, h - 21])).all(1)
+    mapped = mapped[seen]
+    near = np.linalg.norm(mapped[:, None, :2] - second[None, :, :2], axis=2) < 0.5 * mapped[:, None, 2]
+    alike = np.abs(np.log2(mapped[:, None, 2] / second[None, :, 2])) < 1 / 3
+    return float((near & alike).any(1).mean())
+
+
+def test_repeats_as_well_as_kornias_and_better_than_dog() -> None:
+    image = cv2.imread(str(shared_path("data/Strecha_train/castle-P19/Images/00000004.jpg")), cv2.IMREAD_GRAYSCALE)
+    image = cv2.resize(image, (640, 427), interpolation=cv2.INTER_AREA)
+    h, w = image.shape
+    peer = kornia.feature.ScaleSpaceDetector(500, resp_module=kornia.feature.BlobHessian("diff"))
+
+    def detect(name: str, pixels: np.ndarray) -> np.ndarray:
+        if name == "kornia":
+            lafs = peer(torch.from_numpy(pixels)[None, None].float() / 255)[0][0].detach()
+            lafs = lafs[lafs.abs().sum((1, 2)) > 0]
+        else:
+            lafs = {"hessian": HessianDetector(500), "dog": SIFT(500)}[name].detect(pixels)[0]
+        scale = torch.linalg.det(lafs[..., :2]).sqrt() / 6
+        return torch.cat([lafs[..., 2], scale[:, None]], 1).numpy()
+
+    shares: dict[str, list[float]] = {"hessian": [], "kornia": [], "dog": []}
+    for angle, zoom in ((0, 0.8), (25, 1.0), (60, 0.7), (-40, 1.25), (10, 0.55)):
+        matrix = cv2.getRotationMatrix2D((w / 2, h / 2), angle, zoom)
+        blurred = cv2.GaussianBlur(image, (0, 0), 0.6 / zoom) if zoom < 1 else image
+        warped = cv2.warpAffine(blurred, matrix, (w, h), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101)
+        for name, values in shares.items():
+            values.append(repeatability(detect(name, image), detect(name, warped), matrix, (h, w)))
+    mean = {name: np.mean(values) for name, values in shares.items()}
+    print(mean)
+    assert mean["hessian"] > 0.5
+    assert mean["hessian"] > mean["kornia"] - 0.02
+    assert mean["hessian"] > mean["dog"] - 0.02

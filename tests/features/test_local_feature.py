@@ -1,0 +1,212 @@
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import kornia
+import numpy as np
+import pytest
+import torch
+
+from fmtorch import presets
+from fmtorch.features import (
+    SIFT,
+    DominantGradient,
+    HessianDetector,
+    LocalFeature,
+    NetworkDescriptor,
+    NetworkShape,
+    PatchSIFT,
+    local_feature,
+)
+from fmtorch.matching import NearestNeighborMatcher
+from fmtorch.storage.cache import ArrayCache
+from fmtorch.storage.features import CachedFeatures
+from fmtorch.types import Features
+from tests.features.scenes import texture
+
+WITHOUT_NETWORK = ("rootsift", "dspsift", "rootsiftpca")
+PIPELINES = ("dspsift", "rootsiftpca", "l2net", "hardnet", "hesaffnet")
+
+
+def random_network(seed: int, outputs: int) -> torch.nn.Module:
+    torch.manual_seed(seed)
+    return torch.nn.Sequential(
+        torch.nn.Conv2d(1, 8, 5, stride=3), torch.nn.Tanh(), torch.nn.Flatten(), torch.nn.Linear(800, outputs)
+    ).requires_grad_(False)
+
+
+def composed() -> LocalFeature:
+    shape = random_network(0, 3)
+    return LocalFeature(
+        HessianDetector(300),
+        NetworkDescriptor(random_network(1, 128)),
+        NetworkShape(lambda patches: 0.2 * torch.tanh(shape(patches))),
+        DominantGradient(),
+    )
+
+
+def same(a: Features, b: Features) -> bool:
+    return torch.equal(a.lafs, b.lafs) and torch.equal(a.scores, b.scores) and torch.equal(a.descriptors, b.descriptors)
+
+
+@pytest.mark.parametrize("name", WITHOUT_NETWORK)
+def test_presets_describe_the_keypoints_of_sift(name: str) -> None:
+    image = texture(0)
+    found = presets.build("features", name)(image)
+    plain = SIFT()(image)
+    assert torch.equal(found.lafs, plain.lafs)
+    assert torch.equal(found.scores, plain.scores)
+    torch.testing.assert_close(found.descriptors.norm(dim=1), torch.ones(len(found)))
+
+
+def test_a_call_is_detection_and_description() -> None:
+    extract, image = composed(), texture(1)
+    lafs, scores = extract.detect(image)
+    found = extract(image)
+    assert len(found) > 100
+    assert torch.equal(found.lafs, lafs)
+    assert torch.equal(found.scores, scores)
+    assert torch.equal(found.descriptors, extract.describe(image, lafs))
+    # A descriptor does not depend on its neighbours; the image is described as its grey levels.
+    alone = extract.describe(image, lafs[5:6])
+    torch.testing.assert_close(alone, found.descriptors[5:6], atol=1e-5, rtol=0)
+    assert same(extract(np.stack([image] * 3, -1)), found)
+
+
+def test_equal_parts_define_equal_detection() -> None:
+    first = local_feature("dog", "rootsift")
+    assert first.detection == local_feature("dog", {"name": "dspsift", "sizes": 3}).detection
+    assert first.detection != local_feature("dog", "rootsift", max_features=100).detection
+    assert first.detection != local_feature("hessian", "rootsift").detection
+    hessian = local_feature({"name": "hessian", "levels": 2}, "sift", orientation="dominant_gradient")
+    assert hessian == local_feature({"name": "hessian", "levels": 2}, "sift", orientation="dominant_gradient")
+    assert isinstance(hessian.detector, HessianDetector)
+    assert hessian.detector.max_features == 8000
+
+
+def test_one_instance_serves_several_threads() -> None:
+    extract, images = composed(), [texture(i) for i in range(4)]
+    alone = [extract(image) for image in images]
+    with ThreadPoolExecutor(4) as pool:
+        assert all(map(same, alone, pool.map(extract, images)))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 300), (300, 1), (9, 9), (20, 31), (60, 80, 3)])
+@pytest.mark.parametrize("constant", [True, False])
+def test_images_smaller_than_a_patch_or_constant(shape: tuple[int, ...], constant: bool) -> None:
+    if constant:
+        image = np.full(shape, 77, np.uint8)
+    else:
+        image = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
+    for extract in (composed(), local_feature("dog", "rootsift"), presets.build("features", "rootsiftpca")):
+        found = extract(image)
+        assert found.image_size.tolist() == list(shape[:2])
+        assert torch.isfinite(found.descriptors).all()
+        assert torch.isfinite(found.lafs).all()
+        if constant:
+            assert len(found) == 0
+
+
+def test_quarter_turns() -> None:
+    # The frames of a turned image are the turned frames, and their descriptors stay.
+    image = texture(3, 240, 260)
+    extract = LocalFeature(HessianDetector(150), PatchSIFT(root=True), None, DominantGradient())
+    first, second = extract(image), extract(np.rot90(image))
+    c = NearestNeighborMatcher()(first, second)
+    expected = torch.stack([c.x0[0, :, 1], image.shape[1] - 1 - c.x0[0, :, 0]], 1)
+    assert ((c.x1[0] - expected).norm(dim=1) < 1).float().mean() > 0.8
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"detector": "harris", "descriptor": "sift"}, "detector=harris.*dog, hessian"),
+        ({"detector": "dog", "descriptor": "surf"}, "descriptor=surf.*hardnet"),
+        ({"detector": "dog", "descriptor": "sift", "shape": "baumberg"}, "shape=baumberg.*affnet"),
+        ({"detector": "dog", "descriptor": "sift", "orientation": "up"}, "orientation=up.*dominant_gradient"),
+        ({"detector": {"name": "hessian", "octaves": 3}, "descriptor": "sift"}, "hessian.*octaves"),
+        ({"detector": {"threshold": 3}, "descriptor": "sift"}, "detector=None"),
+        ({"detector": "dog", "descriptor": "sift", "precision": "fp16"}, "precision=fp16.*fp32"),
+    ],
+)
+def test_unknown_parts_and_options(options: dict[str, object], told: str) -> None:
+    with pytest.raises(ValueError, match=told):
+        local_feature(**options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", [f"{p}_{s}" for p in PIPELINES for s in ("ratio", "ratio_paper")])
+def test_pipelines_of_the_features_table(name: str) -> None:
+    pipeline = presets.pipeline(name)
+    paper = name.endswith("_paper")
+    assert list(pipeline.pruners) == (["ratio"] if paper else ["ratio", "one_to_one"])
+    assert pipeline.pruners["ratio"].threshold == 0.8  # type: ignore[attr-defined]
+    detector = HessianDetector if "hesaff" in name else SIFT
+    assert isinstance(pipeline.extractor.detector, detector)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    "name", [f"{p}_{s}" for p in ("rootsiftpca", "hardnet", "hesaffnet") for s in ("gms", "gms_paper")]
+)
+def test_pipelines_of_the_systems_table(name: str) -> None:
+    pipeline = presets.pipeline(name)
+    assert next(iter(pipeline.pruners)) == "ratio"
+    assert list(pipeline.pruners)[-1] == "gms"
+    assert type(pipeline.estimator.score).__name__ == "Median"  # type: ignore[attr-defined]
+
+
+def test_networks_are_read_when_first_used(tmp_path: Path) -> None:
+    missing = tmp_path / "mine.onnx"
+    extract = local_feature("hessian", {"name": "hardnet", "network": str(missing)}, shape=None)
+    with pytest.raises(ValueError, match=r"mine\.onnx.*export_onnx"):
+        extract(texture(4))
+    with pytest.raises(ValueError, match=r"mine\.onnx.*export_onnx"):
+        CachedFeatures(extract, ArrayCache(tmp_path))
+
+
+def test_hesaffnet_runs_through_onnx(tmp_path: Path) -> None:
+    pytest.importorskip("onnx")
+    files = {}
+    for i, (name, outputs) in enumerate({"affnet": 3, "hardnet": 128, "orinet": 2}.items()):
+        files[name] = str(tmp_path / f"{name}.onnx")
+        torch.onnx.export(
+            random_network(i, outputs), (torch.zeros(4, 1, 32, 32),), files[name], input_names=["patches"],
+            output_names=["values"], dynamo=False, dynamic_axes={"patches": {0: "n"}, "values": {0: "n"}},
+        )  # fmt: skip
+    extract = local_feature(
+        "hessian",
+        {"name": "hardnet", "network": files["hardnet"]},
+        shape={"name": "affnet", "network": files["affnet"]},
+        orientation={"name": "orinet", "network": files["orinet"]},
+        max_features=50,
+    )
+    found = extract(texture(5))
+    assert found.descriptors.shape == (50, 128)
+    assert torch.isfinite(found.lafs).all()
+    same_in_torch = LocalFeature(extract.detector, NetworkDescriptor(random_network(1, 128)))
+    described = same_in_torch.describe(texture(5), found.lafs)
+    kept = CachedFeatures(extract, ArrayCache(tmp_path / "cache"))
+    for _ in range(2):  # computed, then found
+        assert same(kept(texture(5)), found)
+    assert (kept.computed, kept.found) == (1, 1)
+    torch.testing.assert_close(found.descriptors, described, atol=1e-4, rtol=0)
+
+
+def test_kornias_hardnet_serves_as_a_part() -> None:
+    module = kornia.feature.HardNet(False).eval().requires_grad_(False)
+    extract = LocalFeature(SIFT(40), NetworkDescriptor(module))
+    found = extract(texture(6))
+    assert found.descriptors.shape == (40, 128)
+
+
+def test_large_images_are_reduced_for_opencv() -> None:
+    image = texture(7, 300, 401)
+    full, reduced = SIFT(), SIFT(max_pixels=300 * 401 // 2)
+    a, b = full(image), reduced(image)
+    assert reduced.detect(image)[0].shape == b.lafs.shape
+    gap, nearest = (b.lafs[..., 2][:, None] - a.lafs[..., 2]).norm(dim=2).min(1)
+    close = gap < 1
+    assert close.float().mean() > 0.5
+    shift = (b.lafs[close][..., 2] - a.lafs[nearest[close]][..., 2]).median(0).values
+    assert shift.abs().max() < 0.15  # half a pixel missed would show as 0.2
+    assert torch.equal(SIFT(max_pixels=300 * 401)(image).lafs, a.lafs)

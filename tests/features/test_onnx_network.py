@@ -1,0 +1,134 @@
+"""Patch networks through ONNX Runtime: they agree with torch, neighbours are invisible, bad files are named."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import onnx
+import pytest
+import torch
+from onnx import TensorProto, helper
+from torch import Tensor
+
+from fmtorch.features.networks import ARCHITECTURES, build, load_weights
+from fmtorch.features.onnx_network import NetworkFileError, PatchNetwork, network_file
+from fmtorch.resources import models_dir
+from fmtorch.training.onnx_export import export, quantize
+from tests.conftest import oracle, shared_path
+from tests.features.test_networks import randomized
+
+NEIGHBOURS = 1e-5  # what design allows a descriptor to change with its batch
+
+
+@pytest.fixture(scope="module")
+def patches() -> Tensor:
+    return torch.from_numpy(oracle("affnet_orinet.npz")["patches"])[:, None].float() / 255
+
+
+@pytest.fixture(scope="module")
+def hardnet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("onnx") / "hardnet.onnx"
+    export(randomized(build("hardnet")), path)
+    return path
+
+
+@pytest.mark.parametrize("name", ARCHITECTURES)
+def test_onnx_agrees_with_torch_on_real_patches(name: str, tmp_path: Path, patches: Tensor) -> None:
+    network = randomized(build(name))
+    if name == "l2net":
+        network.pixel_mean.copy_(patches.mean(0, keepdim=True))
+    export(network, tmp_path / "network.onnx")
+    found = PatchNetwork(tmp_path / "network.onnx", batch=40)(patches)
+    assert found.shape == (64, network.outputs)
+    torch.testing.assert_close(found, network(patches).detach(), atol=1e-4, rtol=0)
+    assert [f.name for f in tmp_path.iterdir()] == ["network.onnx"]  # one file, weights inside
+
+
+@pytest.mark.parametrize(("name", "file", "field"), [
+    ("affnet", "AffNet.pth", "affnet_features"), ("orinet", "OriNet.pth", "orinet_features"),
+])  # fmt: skip
+def test_the_authors_weights_as_onnx(name: str, file: str, field: str, tmp_path: Path, patches: Tensor) -> None:
+    network = build(name)
+    load_weights(network, shared_path(f"weights/{file}"))
+    export(network, tmp_path / "network.onnx")
+    expected = torch.from_numpy(oracle("affnet_orinet.npz")[field])
+    torch.testing.assert_close(PatchNetwork(tmp_path / "network.onnx")(patches), expected, atol=1e-4, rtol=0)
+
+
+def test_neighbours_and_batch_size_are_invisible(hardnet: Path, patches: Tensor) -> None:
+    expected = PatchNetwork(hardnet)(patches)
+    for batch in (1, 7, 64, 300):
+        found = PatchNetwork(hardnet, batch=batch)(patches)
+        torch.testing.assert_close(found, expected, atol=NEIGHBOURS, rtol=0)
+    one = PatchNetwork(hardnet)(patches[5:6])
+    torch.testing.assert_close(one, expected[5:6], atol=0, rtol=0)  # the same portion size: the same bits
+    garbage = patches.clone()
+    garbage[6:] = torch.nan
+    torch.testing.assert_close(PatchNetwork(hardnet)(garbage)[:6], expected[:6], atol=0, rtol=0)
+
+
+def test_no_patches(hardnet: Path) -> None:
+    assert PatchNetwork(hardnet)(torch.zeros(0, 1, 32, 32)).shape == (0, 128)
+    assert PatchNetwork(hardnet).outputs == 128
+
+
+def test_a_network_can_be_pickled_after_use(hardnet: Path, patches: Tensor) -> None:
+    network = PatchNetwork(hardnet, threads=1, batch=32)
+    expected = network(patches)
+    again = pickle.loads(pickle.dumps(network))
+    assert (again.path, again.threads, again.batch) == (hardnet, 1, 32)
+    torch.testing.assert_close(again(patches), expected, atol=0, rtol=0)
+
+
+def test_other_shapes_of_patches_are_refused(hardnet: Path) -> None:
+    for shape in ((2, 1, 64, 64), (2, 3, 32, 32)):
+        with pytest.raises(Exception, match=r"\(N, 1, 32, 32\)|jaxtyping|Type-check"):
+            PatchNetwork(hardnet)(torch.zeros(shape))
+    with pytest.raises(ValueError, match="batch=0"):
+        PatchNetwork(hardnet, batch=0)
+
+
+def test_an_absent_file_is_named_with_what_makes_it(tmp_path: Path) -> None:
+    with pytest.raises(NetworkFileError, match=r"absent\.onnx does not exist: python scripts/export_onnx\.py"):
+        PatchNetwork(tmp_path / "absent.onnx")(torch.zeros(1, 1, 32, 32))
+
+
+def test_a_corrupt_file_is_named(hardnet: Path, tmp_path: Path) -> None:
+    (tmp_path / "cut.onnx").write_bytes(hardnet.read_bytes()[:100_000])
+    (tmp_path / "text.onnx").write_text("404: Not Found")
+    (tmp_path / "empty.onnx").write_bytes(b"")
+    for name in ("cut", "text", "empty"):
+        with pytest.raises(NetworkFileError, match=rf"{name}\.onnx"):
+            PatchNetwork(tmp_path / f"{name}.onnx")(torch.zeros(1, 1, 32, 32))
+
+
+@pytest.mark.parametrize(("shape", "out"), [
+    (["n", 1, 64, 64], ["n", 4096]), (["n", 3, 32, 32], ["n", 3072]),
+    ([5, 1, 32, 32], [5, 1024]), (["n", 1024], ["n", 1024]),
+])  # fmt: skip
+def test_a_network_of_another_shape_is_named(shape: list[object], out: list[object], tmp_path: Path) -> None:
+    inputs = helper.make_tensor_value_info("x", TensorProto.FLOAT, shape)
+    outputs = helper.make_tensor_value_info("y", TensorProto.FLOAT, out)
+    graph = helper.make_graph([helper.make_node("Flatten", ["x"], ["y"])], "g", [inputs], [outputs])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10), tmp_path / "w.onnx")
+    with pytest.raises(NetworkFileError, match=r"w\.onnx takes .*a patch network takes float \(N, 1, 32, 32\)"):
+        PatchNetwork(tmp_path / "w.onnx")(torch.zeros(1, 1, 32, 32))
+
+
+def test_int8_keeps_descriptors_close_and_the_file_small(hardnet: Path, tmp_path: Path, patches: Tensor) -> None:
+    quantize(hardnet, tmp_path / "hardnet.int8.onnx", patches)
+    expected, found = (PatchNetwork(p)(patches) for p in (hardnet, tmp_path / "hardnet.int8.onnx"))
+    cosine = (expected * found).sum(1)
+    assert float(cosine.min()) > 0.9
+    assert (tmp_path / "hardnet.int8.onnx").stat().st_size < 0.3 * hardnet.stat().st_size
+    nodes = {node.op_type for node in onnx.load(tmp_path / "hardnet.int8.onnx").graph.node}
+    assert {"QuantizeLinear", "DequantizeLinear"} <= nodes
+
+
+def test_names_of_files() -> None:
+    assert network_file("hardnet") == models_dir() / "hardnet.onnx"
+    assert network_file("hardnet", "int8") == models_dir() / "hardnet.int8.onnx"
+    assert network_file("/data/mine.onnx", "int8") == Path("/data/mine.onnx")
+    with pytest.raises(ValueError, match="precision=fp16; there are: fp32, int8"):
+        network_file("hardnet", "fp16")

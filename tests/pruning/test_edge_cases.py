@@ -1,0 +1,90 @@
+"""Every pruner preset on input from the edges: sound results, no exception, bounded memory."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from fmtorch import presets
+from fmtorch.types import Correspondences
+from tests.laws import scene
+
+PRUNERS = presets.available("pruner")
+PER_MATCH = ("x0", "x1", "quality", "prior", "lafs0", "lafs1")
+H, W = 640, 960
+
+
+def edge_cases() -> dict[str, Correspondences]:
+    c, one = scene(0, 300), scene(0, 1)
+    right, bottom = float(W - 1), float(H - 1)
+    inside = [[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]]
+    border = torch.tensor([*inside, [right + 1, bottom + 1], [-0.5, -0.5], [right + 50, 7.0], [3.0, -90.0]])
+    on_border = border.repeat(40, 1)[:300][None]
+    slot = torch.arange(300)
+    masked = (slot % 3 == 0)[None]
+    nan = {
+        name: torch.where(masked.reshape(1, 300, *[1] * (value.dim() - 2)), torch.nan, value)
+        for name in PER_MATCH
+        if (value := getattr(c, name)) is not None
+    }
+    one_cell = c.x0 / 100 + 200
+    return {
+        "no slots": one.replace(**{f: getattr(one, f)[:, :0] for f in ("mask", *PER_MATCH)}),
+        "no matches": c.replace(mask=torch.zeros_like(c.mask)),
+        "one match": one,
+        "one cell": c.replace(x0=one_cell, x1=one_cell + 5),
+        "all points equal": c.replace(x0=torch.full_like(c.x0, 7), x1=torch.full_like(c.x1, 9)),
+        "on and outside the border": c.replace(x0=on_border, x1=on_border.flip(1)),
+        "NaN in masked slots": c.replace(mask=~masked, **nan),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PRUNERS)
+@pytest.mark.parametrize("case", edge_cases())
+def test_edge_case(name: str, case: str) -> None:
+    c = edge_cases()[case]
+    pruned = presets.build("pruner", name)(c)
+    assert pruned.mask.shape == c.mask.shape
+    assert not (pruned.mask & ~c.mask).any()
+    if pruned.prior is not None and pruned.prior is not c.prior:
+        assert ((pruned.prior >= 0) & (pruned.prior <= 1)).all()
+        assert not pruned.prior[~c.mask].any()
+
+
+@pytest.mark.parametrize("name", ["gms", "lpm", "gms_soft", "lpm_soft", "position_consistency"])
+def test_matches_that_all_move_alike_in_one_cell_are_kept(name: str) -> None:
+    c = edge_cases()["one cell"].replace(quality=None, lafs0=None, lafs1=None, prior=None)
+    pruned = presets.build("pruner", name)(c)
+    assert pruned.mask.all()
+    if name not in ("gms", "lpm"):
+        assert pruned.prior.min() > 0.5
+
+
+MOST = [name for name in PRUNERS if name != "code"]  # code_soft does the same work, tests/pruning/test_code.py the rest
+MANY = """
+import resource, sys, torch
+from fmtorch import presets
+from tests.laws import scene
+torch.set_num_threads(1)
+many = scene(1, 50_000)
+for name in sys.argv[1:]:
+    stage = presets.build("pruner", name)
+    framed = {} if name == "frame_consistency" else {"lafs0": None, "lafs1": None}  # the scene's frames are random
+    pruned = stage(many.replace(**framed))
+    assert 0 < int(pruned.mask.sum()) <= 50_000, name
+    assert pruned.prior is None or bool(torch.isfinite(pruned.prior).all()), name
+    print(name, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+UNIT = 1024 if sys.platform != "darwin" else 1  # of ru_maxrss, in bytes
+
+
+def test_many_matches_in_bounded_memory() -> None:
+    """50,000 matches: a table of pairs of matches would take 2.5 GB even at a byte each."""
+    result = subprocess.run([sys.executable, "-c", MANY, *MOST], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    peaks = {line.split()[0]: int(line.split()[1]) * UNIT for line in result.stdout.splitlines()}
+    assert list(peaks) == MOST
+    assert max(peaks.values()) < 1.5e9, peaks

@@ -1,0 +1,164 @@
+"""Detectors, patches, orientations and descriptors pixel by pixel, from their definitions."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+
+
+def blur(image: np.ndarray, sigma: float) -> np.ndarray:
+    """Gaussian of 3 sigma half length, borders continued."""
+    radius = math.ceil(3 * sigma)
+    kernel = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma) ** 2)
+    kernel /= kernel.sum()
+    for axis in (0, 1):
+        padded = np.pad(image, [(radius, radius) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
+        image = np.apply_along_axis(lambda line: np.convolve(line, kernel, mode="valid"), axis, padded)
+    return image
+
+
+def hessian_determinant(image: np.ndarray) -> np.ndarray:
+    out = np.zeros_like(image)
+    for y in range(1, image.shape[0] - 1):
+        for x in range(1, image.shape[1] - 1):
+            p = image[y - 1 : y + 2, x - 1 : x + 2]
+            xy = (p[2, 2] - p[2, 0] - p[0, 2] + p[0, 0]) / 4
+            out[y, x] = (p[1, 2] - 2 * p[1, 1] + p[1, 0]) * (p[2, 1] - 2 * p[1, 1] + p[0, 1]) - xy**2
+    return out
+
+
+def hessian_keypoints(image: np.ndarray, threshold: float, levels: int = 3, sigma: float = 1.6) -> np.ndarray:
+    """Rows (x, y, sigma, response) of an image in [0, 1], in no order, without the border's rule."""
+    found = []
+    level = blur(image, math.sqrt(sigma**2 - 0.25))
+    spacing = 1
+    while min(level.shape) >= 16:
+        blurs = [sigma * 2 ** (s / levels) for s in range(levels + 2)]
+        stack = [level]
+        for before, after in itertools.pairwise(blurs):
+            stack.append(blur(stack[-1], math.sqrt(after**2 - before**2)))
+        volume = np.stack([b**4 * hessian_determinant(layer) for b, layer in zip(blurs, stack, strict=True)])
+        ended = {}
+        for at in itertools.product(*(range(1, n - 1) for n in volume.shape)):
+            if volume[at] > threshold and _is_maximum(volume, at):
+                refined = _refine(volume, at)
+                if refined is not None and refined[2] > threshold:
+                    ended[refined[0]] = refined[1:]
+        for where, (offset, value) in ended.items():
+            s, y, x = np.array(where) + offset
+            found.append((spacing * x, spacing * y, spacing * sigma * 2 ** (s / levels), value))
+        level = stack[levels][::2, ::2]
+        spacing *= 2
+    return np.array(found).reshape(-1, 4)
+
+
+def _is_maximum(volume: np.ndarray, at: tuple[int, ...]) -> bool:
+    before = True
+    for step in itertools.product((-1, 0, 1), repeat=3):
+        if step == (0, 0, 0):
+            before = False
+            continue
+        other = volume[tuple(a + d for a, d in zip(at, step, strict=True))]
+        if other > volume[at] or (before and other == volume[at]):
+            return False
+    return True
+
+
+def _refine(volume: np.ndarray, at: tuple[int, ...]) -> tuple[tuple[int, ...], np.ndarray, float] | None:
+    for moves_left in range(4, -1, -1):
+        gradient, hessian = np.zeros(3), np.zeros((3, 3))
+        unit = np.eye(3, dtype=int)
+
+        def value(step: np.ndarray, at: tuple[int, ...] = at) -> float:
+            return float(volume[tuple(np.array(at) + step)])
+
+        for i in range(3):
+            gradient[i] = (value(unit[i]) - value(-unit[i])) / 2
+            hessian[i, i] = value(unit[i]) - 2 * value(0 * unit[i]) + value(-unit[i])
+            for j in range(i):
+                plus, minus = unit[i] + unit[j], unit[i] - unit[j]
+                hessian[i, j] = hessian[j, i] = (value(plus) - value(minus) - value(-minus) + value(-plus)) / 4
+        if not (np.linalg.eigvalsh(hessian) < 0).all():
+            return None
+        offset = -np.linalg.solve(hessian, gradient)
+        if (np.abs(offset) <= 0.6).all():
+            return at, offset, value(np.zeros(3, int)) + gradient @ offset / 2
+        moved = tuple(int(v) for v in np.array(at) + np.clip(np.round(offset), -1, 1))
+        if moves_left == 0 or any(not 1 <= m <= n - 2 for m, n in zip(moved, volume.shape, strict=True)):
+            return None
+        at = moved
+    return None
+
+
+def patch(image: np.ndarray, laf: np.ndarray, size: int = 32, blur_pixels: float = 0.6, dense: int = 6) -> np.ndarray:
+    """What a camera whose pixels tile the frame sees: each pixel a Gaussian mean of dense samples of the image.
+
+    The Gaussian has sigma `blur_pixels` of the patch's pixels; the image is interpolated linearly, borders continued.
+    """
+    reach = 3 * blur_pixels
+    steps = np.arange(-reach, reach + 1e-9, 1 / dense)
+    weight = np.exp(-0.5 * (steps / blur_pixels) ** 2)
+    weight /= weight.sum()
+    out = np.zeros((size, size))
+    for i, j in itertools.product(range(size), repeat=2):
+        u, v = np.meshgrid((2 * (j + steps) + 1) / size - 1, (2 * (i + steps) + 1) / size - 1)
+        points = np.stack([u, v], -1) @ laf[:, :2].T + laf[:, 2]
+        out[i, j] = weight @ bilinear(image, points[..., 0], points[..., 1]) @ weight
+    return out
+
+
+def bilinear(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    h, w = image.shape
+    x, y = np.clip(x, 0, w - 1), np.clip(y, 0, h - 1)
+    x0, y0 = np.minimum(x.astype(int), max(w - 2, 0)), np.minimum(y.astype(int), max(h - 2, 0))
+    x1, y1 = np.minimum(x0 + 1, w - 1), np.minimum(y0 + 1, h - 1)
+    fx, fy = x - x0, y - y0
+    top = image[y0, x0] * (1 - fx) + image[y0, x1] * fx
+    return top * (1 - fy) + (image[y1, x0] * (1 - fx) + image[y1, x1] * fx) * fy
+
+
+def dominant_gradient(pixels: np.ndarray, bins: int = 36) -> float:
+    """Direction of the dominant gradient, counter-clockwise on the screen."""
+    size = len(pixels)
+    padded = np.pad(pixels, 1, mode="edge")
+    histogram = np.zeros(bins)
+    for i, j in itertools.product(range(size), repeat=2):
+        p = padded[i : i + 3, j : j + 3]
+        gx = (p[0, 2] + 2 * p[1, 2] + p[2, 2] - p[0, 0] - 2 * p[1, 0] - p[2, 0]) / 8
+        gy = (p[2, 0] + 2 * p[2, 1] + p[2, 2] - p[0, 0] - 2 * p[0, 1] - p[0, 2]) / 8
+        window = math.exp(-((i - (size - 1) / 2) ** 2 + (j - (size - 1) / 2) ** 2) / (2 * (size / 6) ** 2))
+        place = (math.atan2(-gy, gx) % (2 * math.pi)) * bins / (2 * math.pi)
+        low = math.floor(place)
+        histogram[low % bins] += window * math.hypot(gx, gy) * (1 - place + low)
+        histogram[(low + 1) % bins] += window * math.hypot(gx, gy) * (place - low)
+    taps = np.exp(-0.5 * (np.arange(-2, 3) / 1.6) ** 2)
+    smooth = sum(t * np.roll(histogram, k) for k, t in zip(range(-2, 3), taps / taps.sum(), strict=True))
+    k = int(np.argmax(smooth))
+    left, middle, right = smooth[k - 1], smooth[k], smooth[(k + 1) % bins]
+    return (k + 0.5 * (left - right) / (left + right - 2 * middle)) * 2 * math.pi / bins
+
+
+def sift(pixels: np.ndarray, extent: float = 1.25, patch_blur: float = 0.75) -> np.ndarray:
+    """SIFT of a 32 x 32 patch that covers `extent` frames of half side 6 keypoint sigmas."""
+    size = len(pixels)
+    keypoint = size / (2 * extent * 6)
+    sigma = math.sqrt(keypoint**2 - patch_blur**2)
+    x = np.arange(size)
+    kernel = np.exp(-0.5 * ((x[:, None] - x) / sigma) ** 2)
+    smooth = (kernel / kernel.sum(1, keepdims=True)) @ pixels @ (kernel / kernel.sum(1, keepdims=True)).T
+    histogram = np.zeros((4, 4, 8))
+    for i, j in itertools.product(range(size), repeat=2):
+        gx = (smooth[i, j + 1] - smooth[i, j - 1]) / 2 if 0 < j < size - 1 else 0.0
+        gy = (smooth[i + 1, j] - smooth[i - 1, j]) / 2 if 0 < i < size - 1 else 0.0
+        u, v = ((k - (size - 1) / 2) / (3 * keypoint) for k in (j, i))
+        vote = math.hypot(gx, gy) * math.exp(-(u * u + v * v) / 8)
+        place = (math.atan2(-gy, gx) % (2 * math.pi)) * 8 / (2 * math.pi)
+        for cy, cx, step in itertools.product(range(4), range(4), (0, 1)):
+            direction = math.floor(place) + step
+            share = max(1 - abs(v - cy + 1.5), 0) * max(1 - abs(u - cx + 1.5), 0) * (1 - abs(place - direction))
+            histogram[cy, cx, direction % 8] += vote * share
+    d = histogram.ravel()
+    d = np.minimum(d / np.linalg.norm(d), 0.2)
+    return d / np.linalg.norm(d)

@@ -1,0 +1,52 @@
+"""Position consistency, match by match, from its definition."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from tests.reference.frame_consistency import morton_order
+
+
+def similarity(p0: np.ndarray, p1: np.ndarray, curves: tuple, turns: int, scales: tuple) -> complex:
+    """The common turn and scale, a complex number: the best bin of the product of both images' smoothed histograms."""
+    product = np.ones((len(scales), turns))
+    for points in (p0, p1):
+        order = morton_order(points, *curves[0])
+        votes = np.zeros((len(scales), turns))
+        for i, j in itertools.pairwise(order):
+            d, u = complex(*(p0[j] - p0[i])), complex(*(p1[j] - p1[i]))
+            if d == 0 or u == 0:
+                continue
+            level = round(2 * np.log2(abs(u / d))) + len(scales) // 2
+            if 0 <= level < len(scales):
+                votes[level, round(np.angle(u / d) / (2 * np.pi) * turns) % turns] += 1
+        votes = 2 * votes + np.roll(votes, 1, 1) + np.roll(votes, -1, 1)
+        smooth = 2 * votes
+        smooth[1:] += votes[:-1]
+        smooth[:-1] += votes[1:]
+        product *= smooth
+    level, turn = np.unravel_index(product.argmax(), product.shape)
+    return scales[level] * np.exp(2j * np.pi * turn / turns) if product.any() else 1 + 0j
+
+
+def agreement(
+    x0: np.ndarray, x1: np.ndarray, S: complex, vote: np.ndarray, curves: tuple,
+    window: int, tolerance: float, noise: float,
+) -> np.ndarray:  # fmt: skip
+    """The weighted share of neighbours along the curves whose displacement the similarity S predicts."""
+    z0, z1 = x0[:, 0] + 1j * x0[:, 1], x1[:, 0] + 1j * x1[:, 1]
+    agreeing, votes = np.zeros(len(x0)), np.zeros(len(x0))
+    for points in (x0, x1):
+        for shift, angle in curves:
+            order = morton_order(points, shift, angle)
+            for place, i in enumerate(order):
+                for j in order[max(0, place - window) : place + window + 1]:
+                    if j == i:
+                        continue
+                    d, u = z0[j] - z0[i], z1[j] - z1[i]
+                    e = abs(S * d - u) / (abs(S) * abs(d) + abs(u) + noise)
+                    agreeing[i] += vote[j] * (1 + (e / tolerance) ** 2 / 8) ** -8
+                    votes[i] += vote[j]
+    return agreeing / np.maximum(votes, np.finfo(float).tiny)
