@@ -48,7 +48,7 @@ class IterativelyReweighted:
         *,
         kernel: str,
         threshold: float,
-        starts: Sequence[int] = (0, 1, 2, 4),
+        starts: Sequence[int] = (0, 1, 2, 4, 8, 16),
         iterations: int = 12,
         start_scale: float = 0.75,
         refine_iterations: int = 30,
