@@ -43,6 +43,7 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument("--json", type=Path, help="write the figures here")
     parser.add_argument("--baseline", type=Path, help="a file written by --json, to compare recall and time with")
     parser.add_argument("--update", type=Path, help="write the tables into this Markdown file, between its markers")
+    parser.add_argument("--marker", default="estimators", help="<!-- NAME --> and <!-- end NAME --> are the markers")
     parser.set_defaults(run=run)
 
 
@@ -65,7 +66,7 @@ def run(arguments: argparse.Namespace) -> None:
         content = {"machine": machine, "pairs": len(pairs), "seeds": arguments.seeds, "figures": figures}
         arguments.json.write_text(json.dumps(content, indent=1) + "\n")
     if arguments.update:
-        update(arguments.update, "estimators", markdown(figures, pairs, arguments.seeds))
+        update(arguments.update, arguments.marker, markdown(figures, pairs, arguments.seeds))
 
 
 def read_specs(path: Path) -> list[str]:
@@ -77,7 +78,7 @@ def build(spec: str) -> Callable[[Correspondences, int], Estimate]:
     """The function of `PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]`: pruners in order, then the estimator."""
     front, _, stages = spec.partition("@")
     name, _, rest = front.partition(":")
-    options = {key: json.loads(value) for key, value in (item.split("=") for item in rest.split(",") if item)}
+    options = {key: parsed(value) for key, value in (item.split("=") for item in rest.split(",") if item)}
     estimator = presets.build("estimator", name, **options)
     pruners = [presets.build("pruner", stage) for stage in stages.split("+") if stage]
 
@@ -88,6 +89,14 @@ def build(spec: str) -> Callable[[Correspondences, int], Estimate]:
         return estimate
 
     return call
+
+
+def parsed(value: str) -> Any:
+    """A number, true, false or null; anything else is text."""
+    try:
+        return json.loads(value)
+    except json.JSONDecodeError:
+        return value
 
 
 def measure(spec: str, items: list[Item], seeds: int) -> Result:
