@@ -12,26 +12,24 @@ from __future__ import annotations
 import argparse
 import json
 import platform
-import re
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cv2
+import estimators_table as table
 import matched
 import numpy as np
 import torch
 from matched import Item, console, groups, paired_interval
 from rich.progress import track
-from rich.table import Table
 
 from fmtorch import metrics, presets
 from fmtorch.data import ImagePair
 from fmtorch.types import Correspondences, Estimate
 
 Result = dict[str, np.ndarray]  # nsgd, ms: (seeds, pairs)
-COLUMNS = ("R.05", "R.01", "mAA", "first minus this: R.01", "mAA", "ms median", "ms mean", "ratio")
 
 
 def add_arguments(commands: Any) -> None:
@@ -43,7 +41,10 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument("--json", type=Path, help="write the figures here")
     parser.add_argument("--baseline", type=Path, help="a file written by --json, to compare recall and time with")
     parser.add_argument("--update", type=Path, help="write the tables into this Markdown file, between its markers")
-    parser.add_argument("--marker", default="estimators", help="<!-- NAME --> and <!-- end NAME --> are the markers")
+    parser.add_argument(
+        "--marker", default="estimators",
+        help="recall goes between <!-- NAME --> and <!-- end NAME -->, differences between those of NAME differences",
+    )  # fmt: skip
     parser.set_defaults(run=run)
 
 
@@ -58,15 +59,15 @@ def run(arguments: argparse.Namespace) -> None:
     pairs = [pair for pair, _ in items]
     figures = {group: summaries(results, pairs, inside) for group, inside in groups(pairs).items()}
     for group, inside in groups(pairs).items():
-        report(f"{group}: {int(inside.sum())} pairs, {arguments.seeds} seeds", figures[group])
+        table.report(f"{group}: {int(inside.sum())} pairs, {arguments.seeds} seeds", figures[group])
     if arguments.baseline:
-        compare(figures, json.loads(arguments.baseline.read_text())["figures"])
+        table.compare(figures, json.loads(arguments.baseline.read_text())["figures"])
     if arguments.json:
         machine = {"processor": platform.processor() or platform.machine(), "torch": torch.__version__}
         content = {"machine": machine, "pairs": len(pairs), "seeds": arguments.seeds, "figures": figures}
         arguments.json.write_text(json.dumps(content, indent=1) + "\n")
     if arguments.update:
-        update(arguments.update, arguments.marker, markdown(figures, pairs, arguments.seeds))
+        table.write(arguments.update, arguments.marker, figures, pairs, arguments.seeds)
 
 
 def read_specs(path: Path) -> list[str]:
@@ -135,61 +136,3 @@ def summaries(results: dict[str, Result], pairs: list[ImagePair], inside: np.nda
             "ms_ratio": float(np.median(ms.mean(0) / first["ms"].mean(0))),
         }
     return found
-
-
-def cells(figures: dict[str, Any]) -> list[str]:
-    ahead = [
-        "" if figures[key] == (0.0, 0.0, 0.0) else "{:+.1f} [{:+.1f}, {:+.1f}]".format(*figures[key])
-        for key in ("ahead_recall_01", "ahead_mean_recall")
-    ]
-    recalls = [f"{figures[key]:.1f}" for key in ("recall_05", "recall_01", "mean_recall")]
-    return [*recalls, *ahead, *(f"{figures[key]:.2f}" for key in ("ms_median", "ms_mean", "ms_ratio"))]
-
-
-def report(title: str, figures: dict[str, dict[str, Any]]) -> None:
-    """One group's table in the terminal."""
-    table = Table(title=title)
-    table.add_column("estimator", overflow="fold")
-    for column in COLUMNS:
-        table.add_column(column, justify="right")
-    for spec, own in figures.items():
-        table.add_row(spec, *cells(own))
-    console.print(table)
-
-
-def markdown(figures: dict[str, dict[str, dict[str, Any]]], pairs: list[ImagePair], seeds: int) -> str:
-    """Recall at 0.05 / at 0.01 / mean recall of each group, and the median time over all: a row an estimator."""
-    counts = {group: int(inside.sum()) for group, inside in groups(pairs).items()}
-    head = ["estimator", *(f"{group} ({counts[group]})" for group in figures if group != "all" or len(figures) == 1)]
-    shown = [group for group in figures if group != "all" or len(figures) == 1]
-    last = figures[list(figures)[-1]]
-    lines = [f"| {' | '.join([*head, 'ms'])} |", f"| --- {'| ---: ' * (len(head))}|"]
-    for spec, whole in last.items():
-        recalls = [
-            "{recall_05:.1f} / {recall_01:.1f} / {mean_recall:.1f}".format(**figures[group][spec]) for group in shown
-        ]
-        lines.append(f"| `{spec}` | {' | '.join(recalls)} | {whole['ms_median']:.1f} |")
-    note = (
-        "Recall at NSGD 0.05 / at 0.01 / mean recall over 0..0.05, in %; pairs in brackets; "
-        f"mean of {seeds} seeds; median milliseconds of processor time a pair over all, one thread."
-    )
-    return "\n".join([note, "", *lines])
-
-
-def update(path: Path, name: str, text: str) -> None:
-    """Replace what stands between ``<!-- name -->`` and ``<!-- end name -->``. Raises SystemExit without them."""
-    pattern = re.compile(rf"(<!-- {name} -->\n).*?(<!-- end {name} -->)", re.DOTALL)
-    content = path.read_text()
-    if not pattern.search(content):
-        raise SystemExit(f"{path} has no lines <!-- {name} --> and <!-- end {name} -->")
-    path.write_text(pattern.sub(lambda found: f"{found[1]}{text}\n{found[2]}", content))
-
-
-def compare(figures: dict[str, dict[str, dict[str, Any]]], before: dict[str, dict[str, dict[str, Any]]]) -> None:
-    """How recall and time differ from an earlier run's, group by group."""
-    keys = ("recall_05", "recall_01", "mean_recall", "ms_median")
-    for group in figures.keys() & before.keys():
-        for spec in figures[group].keys() & before[group].keys():
-            now, then = figures[group][spec], before[group][spec]
-            changes = ", ".join(f"{key} {now[key] - then[key]:+.2f}" for key in keys)
-            console.print(f"{group}, {spec} against the baseline: {changes}")
