@@ -69,13 +69,13 @@ def run(arguments: argparse.Namespace) -> None:
     torch.set_num_threads(1)
     runs = [json.loads(path.read_text()) for path in arguments.earlier]
     if arguments.root or arguments.rendered:
-        runs.append({"machine": machine(), "rows": list(measure(arguments)), "speed": []})
+        runs.append({"machine": machine(), "rows": list(measure(arguments))})
     if arguments.contrib_python:
         speed = pruning_speed.measure(arguments.contrib_python, arguments.repeats)
-        runs.append({"machine": machine(), "rows": [], "speed": speed})
+        runs.append({"machine": machine(), "speed": speed, "memory": pruning_speed.memory()})
     merged = {
         "machine": [r["machine"] for r in runs],
-        **{part: [line for r in runs for line in r[part]] for part in ("rows", "speed")},
+        **{part: [line for r in runs for line in r.get(part, [])] for part in ("rows", "speed", "memory")},
     }
     tables = pruning_table.tables(merged)
     for table in tables:

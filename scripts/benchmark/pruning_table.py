@@ -60,10 +60,11 @@ def tables(figures: dict[str, Any]) -> list[Sheet]:
         if simulated:
             some = "" if simulated == everywhere else " with ASIFT features too"
             sheets.append(_family(family, [row for row in own if row["pair"] in simulated], some, paper))
-    if figures["speed"]:
-        names = list(figures["speed"][0])
-        timings = [[str(line[name]) for name in names] for line in figures["speed"]]
-        sheets.append(Sheet("Milliseconds of processor time a pair, one thread", names, timings))
+    titles = {"speed": "Milliseconds of processor time a pair, one thread", "memory": "Peak memory of a call, MiB"}
+    for part, title in titles.items():
+        if figures[part]:
+            names = list(figures[part][0])
+            sheets.append(Sheet(title, names, [[str(line[name]) for name in names] for line in figures[part]]))
     return sheets
 
 
