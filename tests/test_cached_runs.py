@@ -23,7 +23,7 @@ from tests.test_eval import OPTIONS, evaluate, rows
 from tests.test_match import run_python
 from tests.test_pipeline import draw
 
-IMAGES = 14
+IMAGES = 24
 Rows = list[dict[str, object]]
 
 
