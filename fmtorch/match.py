@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any, cast
@@ -31,16 +32,21 @@ from fmtorch.resources import conf_dir
 from fmtorch.storage.features import CachedFeatures
 from fmtorch.storage.files import replacing
 
+STAGES = ("features", "matcher", "pruner", "estimator")  # groups of the configuration that a pipeline chooses from
 
-def run(config: DictConfig, pipeline_name: str) -> Path:
-    """Match the two photographs of a composed config and return the folder with the results."""
+
+def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -> Path:
+    """Match the two photographs of a composed config and return the folder with the results.
+
+    overrides: what the command line changed of the pipeline of that name; said beside it.
+    """
     paths = [_path(config, name) for name in ("image0", "image1")]
     truth = None if config.truth is None else read_matrix(Path(str(config.truth)))
     pipeline = presets.build_pipeline(config, presets.resolve_device(config.device))
     image0, image1 = (read_image(path, orient=config.orient) for path in paths)
     result = match(image0, image1, pipeline=pipeline, longest_side=config.longest_side, seed=config.seed)
     report = {
-        "version": __version__, "pipeline": pipeline_name, "seed": config.seed,
+        "version": __version__, "pipeline": pipeline_name, "overrides": list(overrides), "seed": config.seed,
         "image0": str(paths[0]), "image1": str(paths[1]),
         **_report(result, image0, image1, truth),
     }  # fmt: skip
@@ -49,7 +55,9 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
     with replacing(folder / "result.json") as path:
         path.write_text(json.dumps(report) + "\n")
     written = ["result.json", *_draw(folder, result, image0, image1, truth)]
-    console.print(_table(result, f"{pipeline_name}: {paths[0].name}, {paths[1].name}"))
+    heading = f"{' '.join([pipeline_name, *overrides])}: {paths[0].name}, {paths[1].name}"
+    console.print(heading, style="italic", markup=False, highlight=False)
+    console.print(_table(result))
     if "nsgd" in report:
         console.print(f"NSGD to the true F: {report['nsgd']:.4f}", highlight=False)
     for trouble in filter(None, (f"no F: {result.reason}" if result.reason else "", result.warning)):
@@ -127,8 +135,8 @@ def _draw(
     return list(pictures)
 
 
-def _table(result: MatchResult, title: str) -> Table:
-    table = Table(title=title, title_justify="left")
+def _table(result: MatchResult) -> Table:
+    table = Table()
     table.add_column("step")
     table.add_column("left", justify="right")
     table.add_column("seconds", justify="right")
@@ -143,7 +151,9 @@ def _table(result: MatchResult, title: str) -> Table:
 def main(config: DictConfig) -> None:
     """The command."""
     with exits_with_message():
-        run(config, str(HydraConfig.get().runtime.choices["pipeline"]))
+        hydra_config = HydraConfig.get()
+        changed = [o for o in hydra_config.overrides.task if o.lstrip("+~").startswith(STAGES)]
+        run(config, str(hydra_config.runtime.choices["pipeline"]), changed)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -59,6 +60,17 @@ def _subjects() -> list[Subject]:
     return [*estimators, *(_pruner(n) for n in presets.available("pruner"))]
 
 
+@functools.cache
+def _unpadded(subject: Subject) -> Result:
+    return live_values(subject.run(scenes()), scenes())
+
+
+@functools.cache
+def _good_alone(subject: Subject) -> Result:
+    return subject.run(collate(GOOD))
+
+
+GOOD = [scene(1), scene(2, 60)]
 SUBJECTS = _subjects()
 everything = pytest.mark.parametrize("subject", SUBJECTS, ids=[s.name for s in SUBJECTS])
 
@@ -66,9 +78,8 @@ everything = pytest.mark.parametrize("subject", SUBJECTS, ids=[s.name for s in S
 @everything
 @pytest.mark.parametrize("garbage", [float("nan"), 1e30, -7.0])
 def test_padding_is_invisible(subject: Subject, garbage: float) -> None:
-    c = scenes()
-    padded = with_padding(c, np.random.default_rng(0), garbage)
-    assert_same(live_values(subject.run(c), c), live_values(subject.run(padded), padded), subject.name)
+    padded = with_padding(scenes(), np.random.default_rng(0), garbage)
+    assert_same(_unpadded(subject), live_values(subject.run(padded), padded), subject.name)
 
 
 @everything
@@ -87,12 +98,10 @@ def test_neighbours_are_invisible(subject: Subject) -> None:
 @everything
 @pytest.mark.parametrize("kind", degenerate())
 def test_no_pair_takes_its_batch_down(subject: Subject, kind: str) -> None:
-    good = [scene(1), scene(2, 60)]
-    alone = subject.run(collate(good))
-    mixed = subject.run(collate([good[0], degenerate()[kind], good[1]]))
-    n = max(pair.mask.shape[1] for pair in good)
+    mixed = subject.run(collate([GOOD[0], degenerate()[kind], GOOD[1]]))
+    n = max(pair.mask.shape[1] for pair in GOOD)
     kept = {k: v[[0, 2], :n] if k in ("inliers", "kept", "prior") else v[[0, 2]] for k, v in mixed.items()}
-    assert_same(alone, kept, f"{subject.name} beside {kind}")
+    assert_same(_good_alone(subject), kept, f"{subject.name} beside {kind}")
     for value in mixed.values():
         assert not bool(torch.isnan(value.to(torch.float64)).any()), f"{subject.name}: NaN for {kind}"
 

@@ -257,6 +257,7 @@ def test_the_command(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {"a.png", "b.webp", "F.txt", "matches", "cache"}
     report = json.loads((folder / "result.json").read_text())
     assert report["pipeline"] == "sift_gms"
+    assert report["overrides"] == []
     assert report["size0"] == report["size1"] == [480, 640]
     assert report["reason"] == ""
     assert report["nsgd"] < 0.01
@@ -272,11 +273,14 @@ def test_the_command(tmp_path: Path) -> None:
 
     # Without F, into the same folder: a picture, the reason, status 0, and nothing left of the earlier pair.
     cv2.imwrite(str(tmp_path / "flat.png"), np.full((300, 20), 90, np.uint8))
-    done = run_python("-m", "fmtorch.match", "image0=a.png", "image1=flat.png", f"output={folder}", cwd=tmp_path)
+    other = ("image1=flat.png", f"output={folder}", "pruner=[ratio]")
+    done = run_python("-m", "fmtorch.match", "image0=a.png", *other, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
+    assert "sift_gms pruner=[ratio]: a.png, flat.png" in done.stdout
     assert "no keypoints in image1" in done.stderr
     assert {path.name for path in folder.iterdir()} == {"result.json", "matches.png"}
     report = json.loads((folder / "result.json").read_text())
+    assert report["overrides"] == ["pruner=[ratio]"]
     assert report["F"] is None
     assert "no keypoints" in report["reason"]
 

@@ -87,23 +87,25 @@ def gms_support(
 
 def _standing(table: Table, moves: Moves, turns: int, factor: float) -> UInt8[Tensor, "s m"]:
     """The rotations, as bits, under which a match follows an assignment that stands, for each grid of image 1."""
-    line, lines = moves.line.flatten(), moves.lines
-    occupied = (table.filled[:lines] > 0).nonzero()[:, 0]
+    line, lines = moves.line.flatten().long(), moves.lines
+    occupied = table.filled.nonzero()[:, 0].int()
     rows = []
     for grid, (side, slot, end) in enumerate(zip(moves.grids, table.slot, moves.end, strict=True)):
         # The cell of image 1 that most matches of a line go to: largest count, then lowest cell.
-        merit = table.moves.index_select(0, slot).long() * side**2 + (side**2 - 1 - end).repeat(4)
-        best = torch.zeros(lines + 1, dtype=torch.int64, device=line.device).scatter_reduce_(0, line, merit, "amax")
-        assigned = side**2 - 1 - best.index_select(0, occupied).remainder(side**2)
+        cells = side * side
+        counted = torch.int32 if len(end) * cells < 2**31 else torch.int64
+        merit = (cells - 1 - end).to(counted) + table.moves.index_select(0, slot).to(counted).mul_(cells).view(4, -1)
+        best = merit.new_zeros(lines + 1).scatter_reduce_(0, line, merit.flatten(), "amax")
+        assigned = (cells - 1 - best.index_select(0, occupied).remainder(cells)).int()
         around = Surroundings(table, moves, grid, occupied, assigned)
         stands = torch.zeros_like(assigned)
         for turn in range(turns):
             score, mean = around.turned(turn)
-            stands |= (score >= factor * mean.sqrt()).long() << turn
-        verdict = torch.zeros_like(best)  # best cell and, in the low byte, bit k: it stands under rotation k
-        verdict.index_copy_(0, occupied, assigned * 256 + stands)
-        found = verdict.index_select(0, line).reshape(4, -1)
-        bits = torch.where(found >> 8 == end, found, 0).to(torch.uint8)
+            stands |= (score >= factor * mean.sqrt()).int() << turn
+        verdict = stands.new_zeros(lines + 1)  # best cell and, in the low byte, bit k: it stands under rotation k
+        verdict.index_copy_(0, occupied.long(), (assigned << 8) + stands)
+        differs = verdict.index_select(0, line).view(4, -1) ^ (end << 8)  # bits beyond the low byte: another cell
+        bits = differs.clamp_(max=256).to(torch.uint8)
         rows.append(bits[0] | bits[1] | bits[2] | bits[3])
     return torch.stack(rows)
 

@@ -8,17 +8,18 @@ from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 GRID = 20  # cells a side in image 0
 CELLS = GRID * GRID
 # Cells a side in image 1 at the scale ratios 1, 1/2, 1/sqrt(2), sqrt(2), 2, rounded down as the released code does.
 GRIDS = (20, 10, 14, 28, 40)
-# The neighbourhood as (dx, dy): eight cells clockwise from the top left, then the centre. A rotation by 45 degrees
-# moves the ring on by one.
-_RING = ((-1, -1), (0, -1), (1, -1), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (0, 0))
-_TABLE_CPU, _TABLE_GPU = 2**21, 2**28  # entries of the table of moves that are in memory at a time
+# The cells around a cell as (dx, dy), clockwise from the top left. A rotation by 45 degrees moves the ring on by one.
+_RING = ((-1, -1), (0, -1), (1, -1), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0))
+_NOWHERE = 2**24  # a cell that is beyond all of a block's, also as a row of them
+# Entries of the table of moves, and matches, that are in memory at a time. What a processor counts fits its cache.
+_BLOCK_CPU, _BLOCK_GPU = (2**22, 2**14), (2**28, 2**24)
 
 Border = Literal["opencv", "authors"]
 
@@ -27,55 +28,58 @@ def moves_in_blocks(
     x0: Tensor, x1: Tensor, size0: Tensor, size1: Tensor, mask: Tensor | None, grids: tuple[int, ...], border: Border
 ) -> Iterator[tuple[Moves, Int[Tensor, " m"]]]:
     """The moves of as many pairs at a time as the table may hold, and the places of their matches in (B * N)."""
-    p0, p1 = _normalized(x0, size0), _normalized(x1, size1)
-    alive = _inside_unit(p0) & _inside_unit(p1)
-    alive = alive if mask is None else alive & mask
+    b, n = x0.shape[:2]
+    mask = torch.ones(b, n, dtype=torch.bool, device=x0.device) if mask is None else mask
+    table, matches = _BLOCK_CPU if x0.device.type == "cpu" else _BLOCK_GPU
     entries = 4 * CELLS * sum(g * g for g in grids)
-    pairs = max(1, (_TABLE_CPU if x0.device.type == "cpu" else _TABLE_GPU) // entries)
-    for start in range(0, len(x0), pairs):
-        block = alive[start : start + pairs]
-        pair, match = block.nonzero().unbind(-1)
-        place = (start + pair) * x0.shape[1] + match
-        points0, points1 = (p.flatten(1).index_select(1, place) for p in (p0, p1))
-        yield Moves(_lines(points0, pair, len(block), border), _cells(points1, grids), pair, len(block), grids), place
+    pairs = max(1, min(table // entries, matches // max(1, n)))
+    blocks = zip(*(torch.split(a, pairs) for a in (x0, x1, size0, size1, mask)), strict=True)
+    for i, (points0, points1, extent0, extent1, alive) in enumerate(blocks if b else ()):
+        p = torch.cat([_normalized(points0, extent0), _normalized(points1, extent1)])
+        alive = alive & (p.amin(0) >= 0) & (p.amax(0) < 1)
+        place = alive.flatten().nonzero()[:, 0]
+        pair = torch.arange(len(alive), device=p.device).repeat_interleave(alive.sum(1))
+        p = p.flatten(1).index_select(1, place)
+        line, end = _lines(p[:2], pair, len(alive), border), _cells(p[2:], grids)
+        yield Moves(line, end, pair, len(alive), grids), i * pairs * n + place
 
 
 def _normalized(x: Tensor, size: Tensor) -> Float[Tensor, "2 b n"]:
     """Points in units of the image, component first, in float32 as the released code has them."""
-    return (x.float() / size.flip(-1)[:, None].float()).movedim(-1, 0).contiguous()
-
-
-def _inside_unit(p: Tensor) -> Tensor:
-    return ((p >= 0) & (p < 1)).all(0)
+    return torch.stack([x[..., i].float() / size[:, 1 - i, None].float() for i in (0, 1)])
 
 
 def _lines(p: Float[Tensor, "2 m"], pair: Int[Tensor, " m"], pairs: int, border: Border) -> Int[Tensor, "4 m"]:
     """Number of each match's cell of image 0 in the four shifted grids, (pair, shift, cell); one more for no cell."""
-    half = (p * (2 * GRID)).floor().int()  # doubling is exact: as if half a cell were added in float64, as in C++
-    x, y = torch.stack([half, half + 1], 1) >> 1  # (2, M) each: without and with the shift
-    inside_x, inside_y = x < GRID, y < GRID
-    if border == "authors":
-        inside_x[1] &= x[1] >= 1
-        inside_y[1] &= y[1] >= 1
-    first = (pair * (4 * CELLS)).int()
-    rows = [first + (2 * j) * CELLS + y[j] * GRID for j in (0, 1)]
-    none = pairs * 4 * CELLS
-    cells = [torch.where(inside_y[j] & inside_x[i], rows[j] + (x[i] + i * CELLS), none) for j in (0, 1) for i in (0, 1)]
-    return torch.stack(cells).long()
+    x, y = (p * (2 * GRID)).int().unbind()  # doubling is exact: as if half a cell were added in float64, as in C++
+    cell = _shifted(border, str(p.device)).index_select(1, y * (2 * GRID) + x)
+    return cell.add_((pair * (4 * CELLS)).int()).clamp_(max=pairs * 4 * CELLS)
+
+
+@functools.cache
+def _shifted(border: Border, device: str) -> Int[Tensor, "4 halves"]:
+    """The (shift, cell) that each half cell belongs to in the four grids, shifted along neither axis, x, y, both."""
+    half = torch.arange(2 * GRID, device=device)
+    shifted = half + 1 >> 1
+    outside = shifted >= GRID if border == "opencv" else (shifted >= GRID) | (shifted < 1)
+    along = torch.stack([half >> 1, shifted.masked_fill(outside, _NOWHERE)])  # (2, 40)
+    cells = torch.arange(4, device=device).view(2, 2, 1, 1) * CELLS + along[:, None, :, None] * GRID + along[:, None]
+    return cells.flatten(0, 1).flatten(1).int()
 
 
 def _cells(p: Float[Tensor, "2 m"], grids: tuple[int, ...]) -> Int[Tensor, "s m"]:
-    """Each match's cell of image 1, in each of the grids."""
-    side = torch.tensor(grids, device=p.device)[:, None]
-    x, y = (torch.minimum((q * side.float()).floor().long(), side - 1) for q in p)
-    return y * side + x
+    """Each match's cell of image 1, in each of the grids. (The product of a number below 1 and a side is below it.)"""
+    side = torch.tensor(grids, dtype=torch.int32, device=p.device)[:, None]
+    x, y = ((q * side).int() for q in p.unbind())
+    return y.mul_(side).add_(x)
 
 
 class Moves(NamedTuple):
     """Where M matches of several pairs go: from `line`, a cell of image 0 in one of its grids, to `end`, a cell
     of image 1. Matches without a cell in a grid of image 0 have a spare line, the last.
 
-    The table of moves has for each grid of image 1 one row a line, and one more for matches without a cell.
+    The table of moves begins with an entry that stays zero, and has for each grid of image 1 one row a line, and one
+    more for matches without a cell.
     """
 
     line: Int[Tensor, "4 m"]
@@ -89,34 +93,36 @@ class Moves(NamedTuple):
         """Lines of one grid, without the spare one, which is last."""
         return self.pairs * 4 * CELLS
 
-    def origins(self) -> Int[Tensor, " s"]:
-        """Where the rows of each grid begin in the table."""
-        cells = torch.tensor([0, *(g * g for g in self.grids[:-1])], device=self.line.device)
-        return cells.cumsum(0) * (self.lines + 1)
+    def origin(self, grid: int) -> int:
+        """Where the rows of a grid begin in the table; beyond the last grid, the size of the table."""
+        return 1 + sum(g * g for g in self.grids[:grid]) * (self.lines + 1)
 
 
 class Table(NamedTuple):
-    """How many matches go from each line to each cell; `filled`: from each line, the spare one and an empty one last.
+    """How many matches go from each line to each cell; `filled`: from each line, 0 for the spare one.
 
-    slot: where each match is counted. The last entry of `moves` stays zero.
+    slot: where each match is counted, for each grid of image 1.
     """
 
     moves: Int[Tensor, " t"]
     filled: Int[Tensor, " lines"]
-    slot: Int[Tensor, "s places"]
+    slot: list[Int[Tensor, " places"]]
 
 
 def tabulated(moves: Moves) -> Table:
     """Count the moves; `give_back` the table after use."""
     line, lines, device = moves.line, moves.lines, moves.line.device
-    filled = torch.zeros(lines + 2, dtype=torch.int32, device=device)
-    filled.scatter_add_(0, line.flatten(), torch.ones_like(line.flatten(), dtype=torch.int32))
-
-    cells = torch.tensor([g * g for g in moves.grids], device=device)[:, None, None]
-    slot = (line * cells + (moves.origins()[:, None] + moves.end)[:, None]).flatten(1)
+    filled = torch.bincount(line.flatten(), minlength=lines + 1).int()
+    filled[lines] = 0
+    slot = [
+        (line * (side * side)).add_(end + moves.origin(grid)).flatten().long()
+        for grid, (side, end) in enumerate(zip(moves.grids, moves.end, strict=True))
+    ]
     counted = torch.int16 if len(moves.pair) < 2**15 else torch.int32
-    table = _zeros((lines + 1) * sum(g * g for g in moves.grids) + 1, counted, device)
-    table.scatter_add_(0, slot.flatten(), torch.ones_like(slot.flatten(), dtype=counted))
+    table = _zeros(moves.origin(len(moves.grids)), counted, device)
+    one = torch.ones(line.numel(), dtype=counted, device=device)
+    for some in slot:
+        table.scatter_add_(0, some, one)
     return Table(table, filled, slot)
 
 
@@ -134,8 +140,9 @@ def give_back(table: Table) -> None:
     """Clear the table for the thread's next one. That of a GPU is too large to keep, and new ones cost little there."""
     if table.moves.device.type != "cpu":
         return
-    if table.slot.numel() * _CLEARING < len(table.moves):
-        table.moves.index_fill_(0, table.slot.flatten(), 0)
+    if sum(map(len, table.slot)) * _CLEARING < len(table.moves):
+        for slot in table.slot:
+            table.moves.index_fill_(0, slot, 0)
     else:
         table.moves.zero_()
     _scratch.__dict__[f"{table.moves.dtype} cpu"] = table.moves
@@ -146,25 +153,29 @@ class Surroundings:
 
     def __init__(self, table: Table, moves: Moves, grid: int, line: Int[Tensor, " c"], end: Int[Tensor, " c"]) -> None:
         device, side = str(line.device), moves.grids[grid]
-        self.table = table
+        self.moves = table.moves
         inside0, step0 = _ring(GRID, device)
-        inside1, self.step1 = _ring(side, device)
-        self.inside0 = inside0.index_select(1, line.remainder(CELLS))  # (9, C)
-        self.inside1 = inside1.index_select(1, end)
-        neighbour = torch.where(self.inside0, line + step0, moves.lines + 1)
-        self.start = neighbour * (side * side) + (moves.origins()[grid] + end)
-        self.count = table.filled.index_select(0, neighbour.flatten()).reshape(neighbour.shape)
+        inside1, step1 = _ring(side, device)
+        self.inside0 = inside0.index_select(1, line.remainder(CELLS))  # (8, C)
+        self.inside1 = inside1.index_select(1, end).repeat(2, 1)  # (16, C), so that every turn of the ring is a slice
+        self.step1 = step1.repeat(2, 1)
+        row = side * side
+        self.centre = torch.add(end, line, alpha=row).add_(moves.origin(grid))
+        self.start = self.centre + step0 * row
+        self.filled = table.filled.index_select(0, line)
+        around = (line + step0).clamp_(0, moves.lines)  # where this is another line, it is not inside
+        self.around = table.filled.index_select(0, around.flatten()).view_as(around)
+        self.score = self.moves.index_select(0, self.centre)
 
     def turned(self, turn: int) -> tuple[Int[Tensor, " c"], Float[Tensor, " c"]]:
         """The matches that go from each cell around the line to the cell around the end that a rotation pairs it with;
         and the matches of those cells of image 0 whose partner is in its grid, on average over them; 0 for none."""
-        partner = [*((j - turn) % 8 for j in range(8)), 8]  # a rotation by 45 degrees moves the ring on by one
-        both = self.inside0 & (self.inside1[partner] if turn else self.inside1)
-        step1 = self.step1[partner] if turn else self.step1
-        slot = torch.where(both, self.start + step1, len(self.table.moves) - 1)
-        score = _added(self.table.moves.index_select(0, slot.flatten()).reshape(slot.shape))
-        cells = _added(both.view(torch.uint8)).clamp_min(1)
-        return score, _added(torch.where(both, self.count, 0)).double() / cells
+        partner = slice(8 - turn, 16 - turn)  # a rotation by 45 degrees moves the ring on by one
+        both = self.inside0 & self.inside1[partner]
+        slot = (self.start + self.step1[partner]).bitwise_and_(both)  # 0, the entry that stays zero, for no cell
+        score = _added(self.moves.index_select(0, slot.flatten()).view_as(slot)).add_(self.score)
+        cells = 1 - _added(both)
+        return score, _added(both.bitwise_and_(self.around)).add_(self.filled).double() / cells
 
 
 def _added(rows: Tensor) -> Tensor:
@@ -173,9 +184,10 @@ def _added(rows: Tensor) -> Tensor:
 
 
 @functools.cache
-def _ring(side: int, device: str) -> tuple[Bool[Tensor, "9 cells"], Int[Tensor, "9 1"]]:
-    """Which of the nine cells around each cell of a grid are in the grid, and how far on they are in its numbering."""
-    ring = torch.tensor(_RING, device=device).T[..., None]
+def _ring(side: int, device: str) -> tuple[Int[Tensor, "8 cells"], Int[Tensor, "8 1"]]:
+    """Which of the eight cells around each cell of a grid are in the grid, as masks of all bits (-1) or none (0), and
+    how far on they are in its numbering."""
+    dx, dy = torch.tensor(_RING, dtype=torch.int32, device=device).T[..., None]
     cell = torch.arange(side * side, device=device)
-    x, y = cell.remainder(side) + ring[0], torch.div(cell, side, rounding_mode="floor") + ring[1]
-    return (x >= 0) & (x < side) & (y >= 0) & (y < side), ring[1] * side + ring[0]
+    x, y = cell.remainder(side) + dx, torch.div(cell, side, rounding_mode="floor") + dy
+    return -((x >= 0) & (x < side) & (y >= 0) & (y < side)).int(), dy * side + dx

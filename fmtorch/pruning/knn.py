@@ -93,7 +93,11 @@ def _boxes(x: Tensor, leaves: Tensor) -> tuple[Tensor, Tensor]:
 def _nearest_leaves(homes: tuple[Tensor, Tensor], leaves: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """For every home its nearest leaves, and the least squared distance to any other; no distance rounds below it."""
     (low0, high0), (low1, high1) = homes, leaves
-    apart = torch.maximum(low1 - high0[:, None], low0[:, None] - high1).clamp(min=0).square().sum(-1)
+    dx, dy = (
+        torch.maximum(low1[:, i] - high0[:, None, i], low0[:, None, i] - high1[:, i]).clamp_(min=0).square_()
+        for i in (0, 1)
+    )
+    apart = dx.add_(dy)
     if len(low1) <= _LEAVES:
         return torch.arange(len(low1), device=low1.device).expand(len(low0), -1), apart.new_full((len(low0),), math.inf)
     bound, index = apart.topk(_LEAVES + 1, largest=False)

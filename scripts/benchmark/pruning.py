@@ -29,6 +29,7 @@ from fmtorch.data import ImagePair
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.run import select
 from fmtorch.pipeline import Outcome, Pipeline
+from fmtorch.storage.features import cached
 
 console = Console(width=None if sys.stdout.isatty() else 160)
 # Method: features, then pruners in order, with options as name:key=value. One match per location everywhere but in the
@@ -55,6 +56,7 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument("--asift-limit", type=int, default=10, help="pairs of each family with ASIFT features at most")
     parser.add_argument("--methods", nargs="*", default=list(METHODS), choices=list(METHODS))
     parser.add_argument("--estimator", default="ransac")
+    parser.add_argument("--cache", default="off", help="a folder that keeps features from run to run; off: nowhere")
     parser.add_argument("--json", type=Path, help="write the figures of every pair here")
     parser.add_argument("--from", nargs="*", type=Path, default=[], dest="earlier", help="add earlier runs' --json")
     parser.add_argument("--markdown", type=Path, help="put the tables between the marks of this file")
@@ -67,13 +69,13 @@ def run(arguments: argparse.Namespace) -> None:
     torch.set_num_threads(1)
     runs = [json.loads(path.read_text()) for path in arguments.earlier]
     if arguments.root or arguments.rendered:
-        runs.append({"machine": machine(), "rows": list(measure(arguments)), "speed": []})
+        runs.append({"machine": machine(), "rows": list(measure(arguments))})
     if arguments.contrib_python:
         speed = pruning_speed.measure(arguments.contrib_python, arguments.repeats)
-        runs.append({"machine": machine(), "rows": [], "speed": speed})
+        runs.append({"machine": machine(), "speed": speed, "memory": pruning_speed.memory()})
     merged = {
         "machine": [r["machine"] for r in runs],
-        **{part: [line for r in runs for line in r[part]] for part in ("rows", "speed")},
+        **{part: [line for r in runs for line in r.get(part, [])] for part in ("rows", "speed", "memory")},
     }
     tables = pruning_table.tables(merged)
     for table in tables:
@@ -99,7 +101,8 @@ def measure(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
         chosen = {name: METHODS[name][1] for name in arguments.methods if METHODS[name][0] == extractor}
         if not chosen:
             continue
-        front = Pipeline(presets.build("features", extractor), presets.build("matcher", "nearest"), {}, estimator)
+        features = cached(presets.build("features", extractor), arguments.cache)
+        front = Pipeline(features, presets.build("matcher", "nearest"), {}, estimator)
         pruners = {name: [stage(spec) for spec in chain.split()] for name, chain in chosen.items()}
         for pair in track(select(select(pairs, arguments.limit), limit), extractor, console=console):
             yield from rows(front, pair, pruners)

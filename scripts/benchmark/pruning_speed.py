@@ -1,11 +1,13 @@
-"""GMS against OpenCV's, one thread each, interleaved in one run; and how LPM's time grows with the matches.
+"""Pruners against others' in one run, one thread each, interleaved; and what memory they take.
 
-Processor time, which other work on the machine disturbs less than the time on the wall.
+GMS against OpenCV's matchGMS, LPM against NumPy with SciPy's KD-tree, which is how the authors' Python works. CODE has
+no peer. Processor time, which other work on the machine disturbs less than the time on the wall.
 """
 
 from __future__ import annotations
 
 import functools
+import multiprocessing
 import subprocess
 import tempfile
 import time
@@ -15,15 +17,21 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
 from torch import Tensor
 
+from fmtorch import presets
 from fmtorch.pruning import gms, lpm
+from fmtorch.types import Correspondences
 
 PEER = Path(__file__).resolve().parent / "opencv_gms.py"
 SIZE = (960, 1280)
 FACTOR = 4.0
 COUNTS, PAIRS = (500, 2000, 10_000), 64
-LPM_COUNTS = (1000, 5000, 20_000, 50_000)
+LPM_COUNTS = (500, 5000, 20_000, 50_000)
+CODE_COUNTS = (2000, 20_000)
+MEMORY_COUNTS = (5000, 20_000, 50_000)
 
 
 def measure(contrib_python: str, repeats: int) -> list[dict[str, Any]]:
@@ -39,11 +47,55 @@ def measure(contrib_python: str, repeats: int) -> list[dict[str, Any]]:
             for searched in (False, True)
             for pairs in (1, PAIRS)
         ]
-    for n in LPM_COUNTS:
-        points = [x[None] for x in moving(n, 0)]
-        ours = [_milliseconds(functools.partial(lpm, *points)) for _ in range(max(3, repeats // 10))]
-        lines.append(_line("LPM", n, 1, ours, None))
+    lines += [_lpm(n, max(3, repeats // 3)) for n in LPM_COUNTS]
+    for n in CODE_COUNTS:
+        stage, c = presets.build("pruner", "code"), correspondences(n)
+        ours = [_milliseconds(functools.partial(stage, c)) for _ in range(max(3, repeats // 3))]
+        lines.append(_line("CODE", n, 1, ours, "", []))
     return lines
+
+
+def memory() -> list[dict[str, Any]]:
+    """Lines of a table: MiB by which the peak of a process grows in one call, each in a process of its own."""
+    context = multiprocessing.get_context("spawn")
+    lines = []
+    for name, options in (("gms", {"with_rotation": True, "with_scale": True}), ("lpm", {}), ("code", {})):
+        grown = []
+        for n in MEMORY_COUNTS:
+            with context.Pool(1) as pool:  # memory once claimed stays claimed, so each has a fresh process
+                grown.append(f"{pool.apply(_peak_growth, (name, options, n)):.0f}")
+        shown = "GMS, rotation and scale" if options else name.upper()
+        lines.append({"": shown} | {f"{n} matches": g for n, g in zip(MEMORY_COUNTS, grown, strict=True)})
+    return lines
+
+
+def _peak_growth(name: str, options: dict[str, Any], n: int) -> float:
+    torch.set_num_threads(1)
+    stage = presets.build("pruner", name, **options)
+    stage(correspondences(200))  # lazy initialisation is not counted
+    c = correspondences(n)
+    before = _status("VmRSS")
+    stage(c)
+    return (_status("VmHWM") - before) / 1024
+
+
+def _status(field: str) -> int:
+    """kB; of the process itself, whereas ru_maxrss is inherited."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(field))
+
+
+def correspondences(n: int) -> Correspondences:
+    """A pair of `moving` matches with ratios, lower on average for right ones."""
+    x0, x1 = (x[None] for x in moving(n, 0))
+    ratio = torch.from_numpy(np.random.default_rng(1).uniform(0.2, 1.0, (1, n))).float()
+    motion = x1 - (x0 @ torch.tensor([[0.95, 0.1], [-0.1, 0.95]]))
+    right = (motion - motion.median(1, keepdim=True).values).norm(dim=-1) < 15
+    size = torch.tensor([SIZE])
+    return Correspondences(
+        x0, x1, torch.ones(1, n, dtype=torch.bool), quality=torch.where(right, ratio, 1 - 0.4 * (1 - ratio)),
+        size0=size, size1=size,
+    )  # fmt: skip
 
 
 def moving(n: int, seed: int) -> tuple[Tensor, Tensor]:
@@ -75,7 +127,42 @@ def _against_opencv(peer: Any, path: Path, n: int, searched: bool, pairs: int, r
         if int(count) != kept:
             raise RuntimeError(f"GMS keeps {kept} of {n} matches, OpenCV's {count}: the timings would mean nothing")
         theirs.append(float(milliseconds))
-    return _line("GMS, rotation and scale" if searched else "GMS", n, pairs, ours, theirs)
+    return _line("GMS, rotation and scale" if searched else "GMS", n, pairs, ours, "OpenCV", theirs)
+
+
+def _lpm(n: int, repeats: int) -> dict[str, Any]:
+    x0, x1 = moving(n, 0)
+    ours, theirs = [], []
+    if not np.array_equal(lpm(x0[None], x1[None])[0].numpy(), lpm_by_trees(x0.numpy(), x1.numpy())):
+        raise RuntimeError(f"LPM and its peer keep others of {n} matches: the timings would mean nothing")
+    for _ in range(repeats):
+        ours.append(_milliseconds(lambda: lpm(x0[None], x1[None])))
+        theirs.append(_milliseconds(lambda: lpm_by_trees(x0.numpy(), x1.numpy())))
+    return _line("LPM", n, 1, ours, "NumPy, SciPy", theirs)
+
+
+def lpm_by_trees(
+    x0: NDArray[np.floating], x1: NDArray[np.floating], K: int = 6, tau: float = 0.2, thresholds: Any = (0.8, 0.5)
+) -> NDArray[np.bool_]:
+    """Which matches (N, 2) LPM keeps, of more than a few."""
+    points = x0.astype(np.float64), x1.astype(np.float64)
+    motion = points[1] - points[0]
+    length = (motion**2).sum(1)
+    kept = np.ones(len(x0), bool)
+    for threshold in thresholds:
+        members = np.flatnonzero(kept)
+        near0, near1 = (members[KDTree(x[members]).query(x, K + 3)[1]] for x in points)
+        dot = (motion[:, None] * motion[near0]).sum(-1)
+        a, b = length[:, None], length[near0]
+        differs = dot / np.sqrt(a * b) * np.minimum(a, b) / np.maximum(a, b) < tau
+        shared = near0[:, :, None] == near1[:, None, :]
+        cost = np.zeros(len(x0))
+        for scale, size in enumerate((K + 2, K, K - 2)):
+            ring = slice(1 + scale, K + 3 - scale)
+            common = shared[:, ring, ring].any(-1)
+            cost += (size - common.sum(-1) + (common & differs[:, ring]).sum(-1)) / size
+        kept = cost / 3 <= threshold
+    return kept
 
 
 def _milliseconds(function: Callable[[], Any]) -> float:
@@ -84,11 +171,16 @@ def _milliseconds(function: Callable[[], Any]) -> float:
     return 1e3 * (time.process_time() - start)
 
 
-def _line(what: str, n: int, pairs: int, ours: list[float], theirs: list[float] | None) -> dict[str, Any]:
+def _line(what: str, n: int, pairs: int, ours: list[float], peer: str, theirs: list[float]) -> dict[str, Any]:
     line = {"": what, "matches": n, "pairs a call": pairs, "fmtorch, least": f"{min(ours):.2f}"}
-    line |= {"fmtorch, median": f"{np.median(ours):.2f}", "OpenCV, least": "", "OpenCV, median": "", "ratio": ""}
-    if theirs is not None:
-        ratio = np.median(np.array(ours) / np.array(theirs))
-        line |= {"OpenCV, least": f"{min(theirs):.2f}", "OpenCV, median": f"{np.median(theirs):.2f}"}
-        line["ratio"] = f"{ratio:.2f}"
+    line |= {
+        "fmtorch, median": f"{np.median(ours):.2f}",
+        "peer": peer,
+        "peer, least": "",
+        "peer, median": "",
+        "ratio": "",
+    }
+    if theirs:
+        line |= {"peer, least": f"{min(theirs):.2f}", "peer, median": f"{np.median(theirs):.2f}"}
+        line["ratio"] = f"{np.median(np.array(ours) / np.array(theirs)):.2f}"
     return line

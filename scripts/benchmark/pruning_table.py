@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from fmtorch.evaluation.bootstrap import bootstrap_mean
+from fmtorch.evaluation.bootstrap import bootstrap_mean, paired_bootstrap
 
 # Bian et al., "An Evaluation of Feature Matchers for Fundamental Matrix Estimation", BMVC 2019, tables of pruning.
 PAPER = Path(__file__).resolve().parent / "paper_pruning.csv"
@@ -21,7 +21,8 @@ KIN = {
     "PhotoTourism": "CPC", "collection": "CPC",
 }  # fmt: skip
 RECALL = 0.05  # NSGD
-FIGURES = ("%Recall", "%Inlier", "%Inlier-m", "#Corrs", "#Corrs-m")
+BASELINE = "RATIO"
+FIGURES = ("%Recall", f"less {BASELINE}'s", "%Inlier", "%Inlier-m", "#Corrs", "#Corrs-m")
 BEGIN, END = "<!-- figures -->", "<!-- end of figures -->"
 
 
@@ -60,10 +61,11 @@ def tables(figures: dict[str, Any]) -> list[Sheet]:
         if simulated:
             some = "" if simulated == everywhere else " with ASIFT features too"
             sheets.append(_family(family, [row for row in own if row["pair"] in simulated], some, paper))
-    if figures["speed"]:
-        names = list(figures["speed"][0])
-        timings = [[str(line[name]) for name in names] for line in figures["speed"]]
-        sheets.append(Sheet("Milliseconds of processor time a pair, one thread", names, timings))
+    titles = {"speed": "Milliseconds of processor time a pair, one thread", "memory": "Peak memory of a call, MiB"}
+    for part, title in titles.items():
+        if figures[part]:
+            names = list(figures[part][0])
+            sheets.append(Sheet(title, names, [[str(line[name]) for name in names] for line in figures[part]]))
     return sheets
 
 
@@ -73,12 +75,14 @@ def _family(family: str, rows: list[dict[str, Any]], some: str, paper: dict[tupl
     kin = KIN.get(family)
     heading = f"paper, {kin}: recall, inlier, -m, #, -m" if kin else "paper"
     lines = []
+    baseline = {row["pair"]: row for row in rows if row["method"] == BASELINE}
     for method in dict.fromkeys(row["method"] for row in rows):
         own = [row for row in rows if row["method"] == method]
         known = paper.get((kin or "", method))
         theirs = " / ".join(known[k] for k in ("recall", "inlier", "inlier_m", "corrs", "corrs_m")) if known else ""
         failed = sum(not row["ok"] for row in own)
-        lines.append([method, *_intervals(own), str(failed), theirs])
+        recall, *others = _intervals(own)
+        lines.append([method, recall, _against(own, baseline), *others, str(failed), theirs])
     return Sheet(title, ["", *FIGURES, "failed", heading], lines)
 
 
@@ -99,6 +103,16 @@ def _intervals(rows: list[dict[str, Any]]) -> list[str]:
         *(shown([100 * row[name] for row in solved], solved, ".1f") for name in ("inlier_rate", "inlier_rate_before")),
         *(shown([row[name] for row in solved], solved, ".0f") for name in ("corrs", "corrs_before")),
     ]
+
+
+def _against(rows: list[dict[str, Any]], baseline: dict[str, dict[str, Any]]) -> str:
+    """The recall, less that of the baseline on the same pairs, with its interval, which is narrower than theirs."""
+    if any(row["pair"] not in baseline or row["method"] == BASELINE for row in rows):
+        return ""
+    paired = [[100.0 * (r["nsgd"] < RECALL) for r in (row, baseline[row["pair"]])] for row in rows]
+    own, other = np.array(paired).T
+    i = paired_bootstrap(own, other, [row["scene"] for row in rows])
+    return f"{i.value:+.1f} [{i.low:+.1f}, {i.high:+.1f}]"
 
 
 def put(path: Path, sheets: Sequence[Sheet]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import threading
@@ -18,6 +19,7 @@ from fmtorch.data.rendered import generate as generation
 from fmtorch.data.rendered.cameras import fundamental
 from fmtorch.data.rendered.generate import FAMILIES, PLANS, Keypoints, Task, build, generate, keypoints, read, seeds
 from fmtorch.data.rendered.photographs import MATERIALS, PICTURES
+from fmtorch.data.rendered.scene import Scene
 
 TINY = Plan(scenes=1, shots=3, pairs=2, scale=0.25)
 
@@ -35,6 +37,12 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def tiny(root: Path) -> RenderedPairs:
     return RenderedPairs(root=root, plan=TINY, workers=1)
+
+
+@functools.cache
+def built(family: str, split: str) -> Scene:
+    """A scene at full scale, not drawn."""
+    return build(Task(family, split, 0, 0, Plan(1, 6, 1)))
 
 
 def test_pairs_are_complete_and_consistent(tiny: RenderedPairs, root: Path) -> None:
@@ -68,7 +76,7 @@ def test_image_sizes_are_the_cameras(tiny: RenderedPairs) -> None:
 
 
 def test_full_scale_sizes_are_those_of_the_sets_they_stand_for() -> None:
-    sizes = {f: {s.camera.size for s in build(Task(f, "test", 0, 0, Plan(1, 6, 1))).shots} for f in FAMILIES}
+    sizes = {f: {s.camera.size for s in built(f, "test").shots} for f in FAMILIES}
     assert sizes["indoor"] == {(480, 640)}
     assert sizes["driving"] == {(376, 1241)}
     assert sizes["orbit"] == {(540, 960)}
@@ -162,13 +170,12 @@ def test_splits_share_no_photograph_and_no_random_stream() -> None:
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_splits_share_no_texture(family: str) -> None:
-    def pictures(split: str, number: int) -> set[bytes]:
-        scene = build(Task(family, split, number, 0, Plan(1, 2, 1, 0.1)))
-        textures = [t.atlas for surfaces in scene.surfaces for t in surfaces.textures]
+    def pictures(split: str) -> set[bytes]:
+        textures = [t.atlas for surfaces in built(family, split).surfaces for t in surfaces.textures]
         # Plain colours (a black case, grey metal) hold nothing that could be recognised.
         return {t.tobytes() for t in textures if len(np.unique(t[2:-2, 2:4].reshape(-1, t.shape[2]), axis=0)) > 4}
 
-    test, train = pictures("test", 0), pictures("train", 0)
+    test, train = pictures("test"), pictures("train")
     assert test
     assert train
     assert not test & train

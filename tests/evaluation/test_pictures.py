@@ -17,6 +17,7 @@ from fmtorch.evaluation.pictures import (
     draw_epipolar_lines,
     draw_matches,
     spread,
+    thinned,
 )
 
 ROWS = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # a sideways camera: epipolar lines are rows
@@ -146,3 +147,17 @@ def test_spread_takes_points_far_apart() -> None:
     assert np.array_equal(spread(points[:3], 4), np.arange(3))
     assert len(spread(np.zeros((5, 2)), 3)) == 3
     assert len(spread(np.zeros((0, 4)), 3)) == 0
+
+
+def test_thinned_points_keep_the_shares_of_regions() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0, 100, (1000, 2))
+    points[900:, 0] += 100
+    for turned in (points, points[:, ::-1]):
+        chosen = thinned(turned, 50)
+        assert len(chosen) == 50
+        assert (np.diff(chosen) > 0).all()
+        assert 4 <= (chosen >= 900).sum() <= 6  # a tenth of them, to one
+    assert np.array_equal(thinned(points[:3], 4), np.arange(3))
+    assert len(set(thinned(np.zeros((5, 2)), 3).tolist())) == 3
+    assert len(thinned(np.zeros((0, 2)), 3)) == 0

@@ -88,9 +88,10 @@ def test_known_answers() -> None:
         assert nsgd(exact, off, HD, HD).item() == pytest.approx(10 / math.hypot(720, 1280), rel=1e-12)
         assert sgd(exact, off, HD, HD).item() == pytest.approx(10, rel=1e-12)
         never = shifted(5000.0)
-        for pair in ((exact, never), (never, exact), (exact, exact * 0), (exact, exact * torch.nan)):
-            assert nsgd(*pair, HD, HD).item() == 1
-            assert sgd(*pair, HD, HD).item() == pytest.approx(math.hypot(720, 1280))
+        pairs = ((exact, never), (never, exact), (exact, exact * 0), (exact, exact * torch.nan))
+        F_gt, F_est = (torch.stack(matrices) for matrices in zip(*pairs, strict=True))
+        assert (nsgd(F_gt, F_est, HD, HD) == 1).all()
+        assert sgd(F_gt, F_est, HD, HD).tolist() == pytest.approx([math.hypot(720, 1280)] * 4)
     rarely = nsgd(rows_shifted(0.0), rows_shifted(700.0), HD, HD)
     assert rarely.item() == pytest.approx(700 / math.hypot(720, 1280), rel=1e-12)
     # Distances are 6 px in both images, whose diagonals are 800 and 500 px.

@@ -9,14 +9,11 @@ import pytest
 import torch
 
 import fmtorch
-from fmtorch import data, presets
-from fmtorch.geometry import sampson
-from fmtorch.pipeline import Pipeline
+from fmtorch import presets
 from fmtorch.pruning import position_agreement
 from fmtorch.pruning.frame_consistency import CURVES, LEAST_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO
 from fmtorch.pruning.position_consistency import SCALES, TURNS
 from fmtorch.types import Correspondences, collate
-from tests.conftest import shared_path
 from tests.laws import scene
 from tests.reference import position_consistency as reference
 
@@ -83,23 +80,12 @@ def test_find_fundamental_derives_the_prior_without_frames(ratios: bool) -> None
     assert torch.equal(own.F, told.F)
 
 
-def test_tells_inliers_on_real_pairs() -> None:
-    dataset = data.load("fmbench", root=shared_path("data/Strecha_train"))
-    front = Pipeline(
-        presets.build("features", "sift", max_features=2000),
-        presets.build("matcher", "nearest"),
-        {name: presets.build("pruner", name) for name in ("ratio", "one_to_one", "position_consistency")},
-        presets.build("estimator", "ransac"),
-    )
+def test_tells_inliers_on_real_pairs(real_matches: list[tuple[Correspondences, Tensor]]) -> None:
     areas = []
-    for i in range(0, 60, 12):
-        pair = dataset[i]
-        c = front.match([pair])[0].correspondences
-        assert c is not None
-        assert c.prior is not None
-        live = c.mask[0]
-        right = (sampson(torch.from_numpy(pair.F)[None], c.x0.double(), c.x1.double())[0][live] < 2).numpy()
-        prior = c.prior[0][live].numpy()
-        areas.append((prior[right][:, None] > prior[~right][None]).mean())
+    for c, right in real_matches:
+        prior = presets.build("pruner", "position_consistency")(c).prior
+        assert prior is not None
+        good, bad = prior[c.mask & right].numpy(), prior[c.mask & ~right].numpy()
+        areas.append((good[:, None] > bad[None]).mean())
     # Area under the ROC curve; 0.95 over all pairs of this scene, where the ratio alone reaches 0.78.
     assert np.mean(areas) > 0.88
