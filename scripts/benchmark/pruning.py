@@ -55,7 +55,7 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument("--limit", type=int, help="pairs of each family at most")
     parser.add_argument("--asift-limit", type=int, default=10, help="pairs of each family with ASIFT features at most")
     parser.add_argument("--methods", nargs="*", default=list(METHODS), choices=list(METHODS))
-    parser.add_argument("--estimator", default="ransac")
+    parser.add_argument("--estimator", default="ransac_eight_point")
     parser.add_argument("--cache", default="off", help="a folder that keeps features from run to run; off: nowhere")
     parser.add_argument("--json", type=Path, help="write the figures of every pair here")
     parser.add_argument("--from", nargs="*", type=Path, default=[], dest="earlier", help="add earlier runs' --json")
