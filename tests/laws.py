@@ -34,12 +34,14 @@ class Subject:
 
 
 def quick(name: str, hypotheses: int = 200, round: int = 100) -> Estimator:
-    """An estimator preset with few hypotheses in each of its stages: the laws do not depend on their number."""
+    """An estimator preset that does little in each of its stages: the laws do not depend on how much."""
 
     def fewer(config: Mapping[str, Any]) -> dict[str, Any]:
         if config["_target_"] == "fmtorch.estimators.HypothesizeAndVerify":
-            limit = {"refine_matches": 64} if config.get("refine_matches") else {}  # fewer than a scene has
-            return {"hypotheses": hypotheses, "round": round, **limit}
+            few = {"hypotheses": hypotheses, "round": round, "pool": min(config.get("pool", 1), 8)}
+            return few | ({"refine_matches": 64} if config.get("refine_matches") else {})  # fewer than a scene has
+        if config["_target_"] == "fmtorch.estimators.IterativelyReweighted":
+            return {"starts": [0, 2], "iterations": 5, "refine_iterations": 5}
         return {key: fewer(value) for key, value in config.items() if isinstance(value, dict)}
 
     built: Estimator = presets.build("estimator", name, **fewer(presets.load("estimator", name)))
