@@ -55,7 +55,7 @@ def run(arguments: argparse.Namespace) -> None:
     specs = [*arguments.estimators, *(read_specs(arguments.specs) if arguments.specs else [])]
     if not specs:
         raise SystemExit("name at least one estimator: --estimators or --specs")
-    results = {spec: measure(spec, items, arguments.seeds) for spec in specs}
+    results = measure(specs, items, arguments.seeds)
     pairs = [pair for pair, _ in items]
     figures = {group: summaries(results, pairs, inside) for group, inside in groups(pairs).items()}
     for group, inside in groups(pairs).items():
@@ -100,20 +100,26 @@ def parsed(value: str) -> Any:
         return value
 
 
-def measure(spec: str, items: list[Item], seeds: int) -> Result:
-    """NSGD (seeds, pairs) and milliseconds of processor time (seeds, pairs) of one estimator, one pair a call."""
-    estimator = build(spec)
-    estimator(items[0][1], 0)  # not counted: lazy initialisation
-    nsgd, milliseconds = np.ones((seeds, len(items))), np.zeros((seeds, len(items)))
-    for seed in range(seeds):
-        for i, (pair, c) in enumerate(track(items, f"{spec}, seed {seed}", console=console, transient=True)):
+def measure(specs: list[str], items: list[Item], seeds: int) -> dict[str, Result]:
+    """NSGD (seeds, pairs) and milliseconds of processor time (seeds, pairs) of each estimator, one pair a call.
+
+    The estimators take turns at each pair, so that what else the machine does slows them down alike.
+    """
+    methods = {spec: build(spec) for spec in specs}
+    results = {spec: {"nsgd": np.ones((seeds, len(items))), "ms": np.zeros((seeds, len(items)))} for spec in specs}
+    for method in methods.values():
+        method(items[0][1], 0)  # not counted: lazy initialisation
+    calls = [(seed, i) for seed in range(seeds) for i in range(len(items))]
+    for seed, i in track(calls, "estimating", console=console, transient=True):
+        pair, c = items[i]
+        for spec, method in methods.items():
             start = time.process_time()
-            estimate = estimator(c, seed)
-            milliseconds[seed, i] = 1e3 * (time.process_time() - start)
+            estimate = method(c, seed)
+            results[spec]["ms"][seed, i] = 1e3 * (time.process_time() - start)
             if bool(estimate.ok[0]):
                 F = torch.from_numpy(pair.F)[None]
-                nsgd[seed, i] = float(metrics.nsgd(F, estimate.F, c.size0, c.size1, key=c.keys))
-    return {"nsgd": nsgd, "ms": milliseconds}
+                results[spec]["nsgd"][seed, i] = float(metrics.nsgd(F, estimate.F, c.size0, c.size1, key=c.keys))
+    return results
 
 
 def summaries(results: dict[str, Result], pairs: list[ImagePair], inside: np.ndarray) -> dict[str, dict[str, Any]]:

@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> None:
         for value in arguments.values:
             option = f"{arguments.option}={value}"
             varied = f"{front}{',' if ':' in front else ':'}{option}{at}{stages}"
-            nsgd = estimators.measure(varied, items, arguments.seeds)["nsgd"]
+            nsgd = estimators.measure([varied], items, arguments.seeds)[varied]["nsgd"]
             gain = 100 * np.clip(1 - nsgd / 0.05, 0, 1).mean(0)
             per_family = [float(gain[inside].mean()) for inside in families.values()]
             rows.append((value, per_family, float(np.mean(per_family))))
