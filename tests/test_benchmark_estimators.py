@@ -1,0 +1,60 @@
+"""The benchmark of estimators: specs, turns, tables between their markers."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fmtorch.data import ImagePair, ImageSource
+from tests.laws import scene
+
+SCRIPTS = Path(__file__).resolve().parent.parent / "scripts" / "benchmark"
+
+
+@pytest.fixture(autouse=True)
+def _importable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", [str(SCRIPTS), *sys.path])
+
+
+def test_options_are_numbers_switches_or_words() -> None:
+    import estimators
+
+    assert [estimators.parsed(v) for v in ("0.5", "true", "null", "focal")] == [0.5, True, None, "focal"]
+
+
+def test_tables_stand_between_their_markers(tmp_path: Path) -> None:
+    import estimators
+    import estimators_table
+    import matched
+
+    rng = np.random.default_rng(0)
+    image = ImageSource("none", tmp_path / "none.png")  # not looked at
+    families = ["orbit", "orbit", "driving", "driving"]
+    pairs = [
+        ImagePair(f"{family}/{i}", family, f"{family}{i}", image, image, rng.normal(size=(3, 3)))
+        for i, family in enumerate(families)
+    ]
+    items = [(pair, scene(i, 60, outliers=0.1)) for i, pair in enumerate(pairs)]
+    specs = ["ransac:hypotheses=50", "opencv_ransac", "fmtorch@position_consistency"]
+    results = estimators.measure(specs, items, 2)
+    assert all((r["ms"] > 0).all() and r["nsgd"].shape == (2, 4) for r in results.values())
+    assert (results[specs[0]]["nsgd"] > 0.01).all()  # the "true" matrices have nothing to do with the matches
+    figures = {g: estimators.summaries(results, pairs, inside) for g, inside in matched.groups(pairs).items()}
+    page = tmp_path / "page.md"
+    page.write_text(
+        "before\n<!-- a -->\nold\n<!-- end a -->\n<!-- a differences -->\n<!-- end a differences -->\nafter\n"
+    )
+    estimators_table.write(page, "a", figures, pairs, 2)
+    text = page.read_text()
+    assert text.startswith("before\n<!-- a -->\nRecall at")
+    assert text.endswith("<!-- end a differences -->\nafter\n")
+    assert "old" not in text
+    rows = [line for line in text.splitlines() if line.startswith("| `")]
+    assert [row.split("`")[1] for row in rows] == specs * 2
+    for group in ("driving (2)", "wide baselines (2)", "short baselines (2)"):
+        assert group in text
+    with pytest.raises(SystemExit, match="no lines <!-- b -->"):
+        estimators_table.write(page, "b", figures, pairs, 2)
