@@ -25,8 +25,8 @@ OTHER_LOSS = {
     "known ways should be rectified alike (fmtorch.training.patch_objectives.CovarianceObjective). The published hard "
     "negative-constant loss, with a HardNet that is itself robust to tilt, ended after 20 minutes in one shape for all "
     "patches; it is the option training.loss.name=hard_negative_constant.",
-    ("l2net", "hardest_triplet"): "The loss is HardNet's: L2-Net's own, the option training.loss.name=relative_distance,"
-    " learns far more slowly in so short a run.",
+    ("l2net", "hardest_triplet"): "The loss is HardNet's: L2-Net's own, the option "
+    "training.loss.name=relative_distance, learns far more slowly in so short a run.",
 }
 """Said of an architecture that was trained with another loss than that of its paper."""
 OWN_LICENCE = "Apache-2.0, as this project"

@@ -68,15 +68,23 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def read(path: Path) -> list[dict[str, Any]]:
-    """The rows of a file; a last line that was cut off by an interruption does not count."""
-    text = path.read_text() if path.exists() else ""
-    return [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
+    """The rows of a file."""
+    return [json.loads(line) for line in whole_lines(path).splitlines()]
+
+
+def whole_lines(path: Path) -> str:
+    """What a file holds, without a last line that was cut off by an interruption."""
+    text = path.read_text(encoding="utf-8") if path.exists() else ""
+    return text[: text.rfind("\n") + 1]
 
 
 def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """A row for each pipeline and pair, those of an earlier run included."""
     pairs = pairs_of(arguments)
-    known = read(arguments.json) if arguments.json else []
+    known = []
+    if arguments.json:
+        arguments.json.write_text(whole_lines(arguments.json), encoding="utf-8")
+        known = read(arguments.json)
     rows = []
     for wide in (True, False):
         some = [pair for pair in pairs if (pair.family in WIDE) == wide]
