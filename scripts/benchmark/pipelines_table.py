@@ -23,6 +23,8 @@ ORDER = (
     ("hesaffnet_gms", "sift_ratio"),
 )  # fmt: skip
 """Pairs of pipelines of which the paper has the first above the second on wide baselines."""
+REAL = ("Strecha", "PhotoTourism", "CPC", "Tanks_and_Temples", "KITTI", "TUM")
+METHODS = [line["method"] for line in csv.DictReader(PAPER.open()) if line["dataset"] == "CPC"]
 
 Row = dict[str, Any]
 # A figure of one pair, the mean over seeds; NaN where it is not defined.
@@ -37,12 +39,18 @@ FIGURES: dict[str, tuple[Callable[[Row], float], str]] = {
 
 
 def tables(rows: list[Row]) -> list[Sheet]:
-    """A table for each family and one of paired differences."""
-    newest = list({(row["method"], row["pair"]): row for row in rows}.values())
+    """A table for each family and one of paired differences; of several rows of a pair the last counts."""
+    newest = sorted({(r["method"], r["pair"]): r for r in rows}.values(), key=lambda r: (_place(r), r["method"]))
     paper = {(line["dataset"], line["method"]): line for line in csv.DictReader(PAPER.open())}
-    families = list(dict.fromkeys(row["family"] for row in newest))
+    families = sorted({row["family"] for row in newest}, key=lambda f: (f not in REAL, f not in WIDE, f))
     sheets = [_family(family, [r for r in newest if r["family"] == family], paper) for family in families]
     return [*sheets, _order(newest, families)]
+
+
+def _place(row: Row) -> int:
+    """Where a method stands in the tables: as in the paper, those with a label after their like."""
+    name = row["method"].split()[0]
+    return METHODS.index(name) if name in METHODS else len(METHODS)
 
 
 def _solved_mean(row: Row, field: str) -> float:
