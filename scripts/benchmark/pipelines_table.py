@@ -66,7 +66,8 @@ def _family(family: str, rows: list[Row], paper: dict[tuple[str, str], Any]) -> 
         own = [row for row in rows if row["method"] == method]
         known = paper.get((kin, method))
         theirs = " / ".join(known[k] for k in ("recall", "inlier", "inlier_m", "corrs", "corrs_m")) if known else ""
-        lines.append([f"`{method}`", *(_shown(own, name) for name in FIGURES), _failed(own), theirs])
+        some = "" if len(own) == len(pairs) else f", {len(own)} pairs"
+        lines.append([f"`{method}`{some}", *(_shown(own, name) for name in FIGURES), _failed(own), theirs])
     title = f"{family}: {len(pairs)} pairs of {len(scenes)} scene{'s' * (len(scenes) > 1)}"
     return Sheet(title, ["", *FIGURES, "failed", f"paper, {kin}: recall, inlier, -m, #, -m"], lines)
 
@@ -91,14 +92,18 @@ def _interval(i: Interval, form: str) -> str:
 
 
 def _order(rows: list[Row], families: list[str]) -> Sheet:
-    """What one pipeline has more than another on the same pairs: %Recall, mAA and %Inlier-m."""
+    """What one pipeline has more than another on the same pairs: %Recall, mAA and %Inlier-m.
+
+    Those with a label are compared with their like without one.
+    """
     by_method = {m: {r["pair"]: r for r in rows if r["method"] == m} for m in {row["method"] for row in rows}}
     groups = {family: [family] for family in families}
     wide = [family for family in families if family in WIDE]
     groups |= {"wide baselines": wide, "short baselines": [family for family in families if family not in WIDE]}
+    labelled = sorted((name, name.split()[0]) for name in by_method if " " in name)
     lines = []
     for group, members in groups.items():
-        for better, worse in ORDER:
+        for better, worse in [*ORDER, *labelled]:
             first, second = by_method.get(better, {}), by_method.get(worse, {})
             common = [pair for pair in first if pair in second and first[pair]["family"] in members]
             if not common or (len(members) < 2 and group not in families):
