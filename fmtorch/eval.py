@@ -25,8 +25,10 @@ from fmtorch.data import PairDataset
 from fmtorch.evaluation.plots import plot_recall_curves
 from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import ALL, summarize, summary_markdown, summary_table
+from fmtorch.pipeline import Pipeline
 from fmtorch.resources import conf_dir
 from fmtorch.storage import RunFolder, identity_digest
+from fmtorch.storage.configuration import learned
 from fmtorch.storage.features import CachedFeatures
 
 STAGE_GROUPS = ("features", "matcher", "pruner", "estimator")
@@ -37,14 +39,15 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
     device = presets.resolve_device(config.device)
     with _progress() as progress:
         dataset = _load(config.dataset, progress)
+        pipeline = presets.build_pipeline(config, device)
         stages = {group: plain(config.get(group)) for group in STAGE_GROUPS}
         identity = {
             "pipeline": pipeline_name, **stages, "seed": config.seed, "version": __version__,
+            "learned": _learned(pipeline),
             "dataset": {**{k: v for k, v in plain(config.dataset).items() if k != "root"}, "digest": dataset.digest},
         }  # fmt: skip
         name = f"{pipeline_name}-{identity_digest(identity)[:8]}"
         folder = RunFolder.open(Path(config.run_dir or f"runs/{dataset.name}/{name}"), identity)
-        pipeline = presets.build_pipeline(config, device)
         chosen = select([dataset[i] for i in range(len(dataset))], config.limit)
         done = folder.done()
         todo = [pair for pair in chosen if pair.key not in done]
@@ -69,6 +72,13 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
             f"every pair failed, the first because: {reason}. Once that is mended, delete {folder.path} to run again"
         )
     return folder.path
+
+
+def _learned(pipeline: Pipeline) -> list[str]:
+    """Digests of the learned files of features and matcher."""
+    extractor = pipeline.extractor
+    parts = [extractor.extractor if isinstance(extractor, CachedFeatures) else extractor, pipeline.matcher]
+    return sorted(digest for part in parts for digest in learned(part))
 
 
 def _load(config: DictConfig, progress: Progress) -> PairDataset:

@@ -1,9 +1,10 @@
-"""How well descriptors tell held-out patches apart: SIFT, RootSIFT, untrained and trained networks in one table.
+"""How well descriptors tell held-out patches apart: SIFT, RootSIFT-PCA, untrained and trained networks in one table.
 
 python scripts/evaluate_patches.py patches=runs/patch_networks/patches/validation networks=[models/hardnet.onnx]
 
-Networks are ONNX files, or checkpoints of scripts/train_patch_network.py. Figures: see
-fmtorch.training.patch_metrics.patch_quality; standard errors of about sqrt(p (1 - p) / pairs).
+Networks are ONNX files, or checkpoints of scripts/train_patch_network.py. SIFT sees as much of the surroundings as in
+the pipelines, a quarter more than the networks. Figures: see fmtorch.training.patch_metrics.patch_quality; standard
+errors of about sqrt(p (1 - p) / pairs).
 """
 
 from __future__ import annotations
@@ -11,8 +12,8 @@ from __future__ import annotations
 import functools
 from pathlib import Path
 
-import kornia
 import torch
+from jaxtyping import Float
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 from torch import Tensor
@@ -21,15 +22,23 @@ from fmtorch.command import console, exits_with_message
 from fmtorch.features.networks import build, load_weights
 from fmtorch.features.networks.checkpoints import read_checkpoint
 from fmtorch.features.onnx_network import PatchNetwork
-from fmtorch.training.patch_metrics import Describe, evaluate_descriptor, validation_pairs
+from fmtorch.features.patch_sift import EXTENT, sift_of_patches
+from fmtorch.features.rootsift_pca import load_projection, project
+from fmtorch.features.sift import root_sift
+from fmtorch.resources import models_dir
+from fmtorch.training.patch_metrics import Describe, evaluate_descriptor, patch_quality, validation_pairs
+from fmtorch.training.patch_objectives import sample
 from fmtorch.training.patch_store import PatchStore
 
 DEFAULTS = {"patches": "???", "networks": [], "pairs": 5000, "seed": 0, "threads": 1}
 
 
-def sift(*, root: bool) -> Describe:
-    """SIFT of a patch of its frame, of unit length (kornia's, 4 x 4 cells of 8 directions)."""
-    return kornia.feature.SIFTDescriptor(32, rootsift=root).eval()  # type: ignore[no-any-return]
+def sift(pairs: Float[Tensor, "2 n 1 h w"], *, root: bool) -> Float[Tensor, "2 n 128"]:
+    """SIFT of patches with their surroundings, of the part of them that `PatchSIFT` sees."""
+    whole = pairs.flatten(0, 1)
+    seen = sample(whole, EXTENT * torch.eye(2).expand(len(whole), 2, 2))
+    described = sift_of_patches(seen)
+    return (root_sift(described) if root else described).unflatten(0, pairs.shape[:2])
 
 
 def descriptor_of(path: Path) -> Describe:
@@ -48,12 +57,17 @@ def described(describe: Describe, patches: Tensor) -> Tensor:
 def evaluate(config: DictConfig) -> dict[str, dict[str, float]]:
     """The figures of each descriptor, by name."""
     pairs = validation_pairs(PatchStore.open(config.patches), config.pairs, config.seed)
-    describers: dict[str, Describe] = {"SIFT": sift(root=False), "RootSIFT": sift(root=True)}
+    rooted = sift(pairs, root=True)
+    projected = project(rooted.flatten(0, 1), *load_projection(models_dir() / "rootsift_pca.npz"), power=0.5)
+    classic = {"SIFT": sift(pairs, root=False), "RootSIFT": rooted, "RootSIFT-PCA": projected.unflatten(0, (2, -1))}
+    describers: dict[str, Describe] = {}
     for name in ("hardnet", "l2net"):
         torch.manual_seed(config.seed)
         describers[f"{name}, untrained"] = build(name).eval()
     describers |= {Path(path).name: descriptor_of(Path(path)) for path in config.networks}
-    return {name: evaluate_descriptor(functools.partial(described, f), pairs) for name, f in describers.items()}
+    return {name: patch_quality(a, b) for name, (a, b) in classic.items()} | {
+        name: evaluate_descriptor(functools.partial(described, f), pairs) for name, f in describers.items()
+    }
 
 
 def main() -> None:

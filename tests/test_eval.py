@@ -144,6 +144,22 @@ def test_what_cannot_be_run_is_told(root: Path, tmp_path: Path, damage: str, tol
     assert "Traceback" not in run.stderr
 
 
+def test_a_learned_file_is_part_of_the_run(root: Path, tmp_path: Path) -> None:
+    model = tmp_path / "model.npz"
+    basis = np.eye(128, 80, dtype=np.float32)
+    np.savez(model, mean=np.zeros(128, np.float32), basis=basis)
+    pipeline = ["pipeline=rootsiftpca_ratio", f"features.descriptor.model={model}"]
+    data = ["dataset=fmbench", f"dataset.root={root}", "limit=2"]
+    arguments = [*pipeline, *data, *OPTIONS, f"run_dir={tmp_path / 'run'}"]
+    first = evaluate(*arguments, cwd=tmp_path)
+    assert first.returncode == 0, first.stderr
+    np.savez(model, mean=np.zeros(128, np.float32), basis=-basis)
+    second = evaluate(*arguments, cwd=tmp_path)
+    assert second.returncode == 1
+    assert "holds another run" in second.stderr
+    assert "learned: " in second.stderr
+
+
 def test_a_run_in_which_nothing_succeeds_is_told(root: Path, tmp_path: Path) -> None:
     for image in (root / "scene" / "Images").iterdir():
         image.write_bytes(b"no picture")

@@ -17,6 +17,10 @@ from fmtorch.resources import models_dir
 PRECISIONS = ("fp32", "int8")
 PATCH_SHAPE = (1, 32, 32)
 HINT = "python scripts/export_onnx.py makes it from a checkpoint, scripts/download.py fetches authors' checkpoints"
+HINT_INT8 = (
+    "python scripts/export_onnx.py precision=int8 makes it from a checkpoint, checkpoint=FILE, and patches that "
+    "calibrate it, calibration=FOLDER (scripts/train_patch_network.py leaves both)"
+)
 
 
 class NetworkFileError(ValueError):
@@ -33,6 +37,10 @@ def network_file(name: str, precision: str = "fp32") -> Path:
     if name.endswith(".onnx"):
         return Path(name)
     return models_dir() / (f"{name}.onnx" if precision == "fp32" else f"{name}.{precision}.onnx")
+
+
+def _hint(path: Path | str) -> str:
+    return HINT_INT8 if str(path).endswith(".int8.onnx") else HINT
 
 
 class PatchNetwork:
@@ -73,7 +81,7 @@ class PatchNetwork:
     def identity(self) -> dict[str, object]:
         """What defines the results, for the feature cache. Raises NetworkFileError for a file that is absent."""
         if not self.path.is_file():
-            raise NetworkFileError(f"{self.path} does not exist: {HINT}")
+            raise NetworkFileError(f"{self.path} does not exist: {_hint(self.path)}")
         return {"file": self.path, "batch": self.batch}
 
     @property
@@ -95,7 +103,7 @@ def _session(path: str, threads: int) -> tuple[Any, str, int]:
     from onnxruntime.capi import onnxruntime_pybind11_state as errors
 
     if not Path(path).is_file():
-        raise NetworkFileError(f"{path} does not exist: {HINT}")
+        raise NetworkFileError(f"{path} does not exist: {_hint(path)}")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     options.log_severity_level = 3
@@ -103,14 +111,16 @@ def _session(path: str, threads: int) -> tuple[Any, str, int]:
         session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     except (errors.InvalidProtobuf, errors.InvalidGraph, errors.Fail, errors.InvalidArgument, errors.NotImplemented,
             errors.RuntimeException) as error:  # fmt: skip
-        raise NetworkFileError(f"{path} is no ONNX network that can be run ({error}): {HINT}") from error
+        raise NetworkFileError(f"{path} is no ONNX network that can be run ({error}): {_hint(path)}") from error
     inputs, outputs = session.get_inputs(), session.get_outputs()
     shape = inputs[0].shape if len(inputs) == 1 else None
     fits = shape is not None and len(shape) == 4 and tuple(shape[1:]) == PATCH_SHAPE and not isinstance(shape[0], int)
     if not fits or inputs[0].type != "tensor(float)":
         found = ", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)
-        raise NetworkFileError(f"{path} takes {found}; a patch network takes float (N, 1, 32, 32), N free: {HINT}")
+        wanted = f"a patch network takes float (N, 1, 32, 32), N free: {_hint(path)}"
+        raise NetworkFileError(f"{path} takes {found}; {wanted}")
     size = outputs[0].shape
     if len(outputs) != 1 or len(size) != 2 or not isinstance(size[1], int):
-        raise NetworkFileError(f"{path} gives {[o.shape for o in outputs]}; a patch network gives (N, D): {HINT}")
+        wanted = f"a patch network gives (N, D): {_hint(path)}"
+        raise NetworkFileError(f"{path} gives {[o.shape for o in outputs]}; {wanted}")
     return session, inputs[0].name, size[1]

@@ -27,7 +27,7 @@ class RootSIFTPCA:
     power: exponent of the entries' absolute values, which keep their signs; the authors' released code has 0.5.
     """
 
-    model: Path | None = None
+    model: Path | str | None = None
     power: float = 0.5
 
     def __post_init__(self) -> None:
@@ -38,8 +38,7 @@ class RootSIFTPCA:
 
         Raises FileNotFoundError where the learned file is absent, ValueError where it is not what it should be.
         """
-        assert self.model is not None
-        mean, basis = load_projection(self.model)
+        mean, basis = load_projection(Path(str(self.model)))
         return project(PatchSIFT(root=True)(pyramid, lafs), mean.to(lafs.device), basis.to(lafs.device), self.power)
 
 

@@ -8,7 +8,7 @@ import hashlib
 import importlib.metadata
 import platform
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,32 @@ def configuration(part: object) -> Any:
         values = part.detach().cpu().contiguous()
         return {"tensor": [str(part.dtype), list(part.shape), _digest(values.reshape(-1).view(torch.uint8).numpy())]}
     return {**_options(part), **_class(type(part))}
+
+
+def learned(part: object) -> list[str]:
+    """Digests of the learned files and networks that a part of a pipeline uses, sorted; of a network's weights one.
+
+    None for a part that does not say what defines it, or whose file cannot be read: it tells so itself when used.
+    """
+    try:
+        whole = configuration(part)
+    except (TypeError, OSError):
+        return []
+    return sorted(set(_learned(whole)))
+
+
+def _learned(value: Any) -> Iterator[str]:
+    if isinstance(value, list):
+        for entry in value:
+            yield from _learned(entry)
+    elif isinstance(value, dict):
+        for key, entry in value.items():
+            if key == "file" and isinstance(entry, str):
+                yield entry
+            elif key == "weights":
+                yield _digest(repr(entry).encode())
+            else:
+                yield from _learned(entry)
 
 
 def _options(part: object) -> dict[str, Any]:

@@ -20,6 +20,15 @@ FIGURES = {
     "accuracy": "nearest is right (%)",
     RATIO: "ratio of axes left after rectification (median; 1 is best)",
 }
+OTHER_LOSS = {
+    ("affnet", "affine_covariance"): "The loss is this project's own, not AffNet's: a patch that was stretched in two "
+    "known ways should be rectified alike (fmtorch.training.patch_objectives.CovarianceObjective). The published hard "
+    "negative-constant loss, with a HardNet that is itself robust to tilt, ended after 20 minutes in one shape for all "
+    "patches; it is the option training.loss.name=hard_negative_constant.",
+    ("l2net", "hardest_triplet"): "The loss is HardNet's: L2-Net's own, the option "
+    "training.loss.name=relative_distance, learns far more slowly in so short a run.",
+}
+"""Said of an architecture that was trained with another loss than that of its paper."""
 OWN_LICENCE = "Apache-2.0, as this project"
 
 
@@ -51,6 +60,9 @@ def model_card(
         lines += [f"| licence | {licence or OWN_LICENCE} |", *_training(checkpoint)]
     else:
         lines += [f"| licence | {licence or 'as the checkpoint it was converted from'} |", "| origin | converted |"]
+    loss = checkpoint.get("loss", {}).get("name")
+    if (architecture, loss) in OTHER_LOSS:
+        lines += ["", OTHER_LOSS[architecture, loss]]
     rows = dict(checkpoint.get("validation", {}))
     if figures is not None:
         rows["this file"] = figures

@@ -12,6 +12,7 @@ import estimators
 import features
 import matching
 import memory
+import pipelines
 import pruning
 import speed
 import thresholds
@@ -20,7 +21,7 @@ import thresholds
 def main() -> None:
     parser = argparse.ArgumentParser(prog="scripts/benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    for module in (estimators, features, matching, memory, pruning, speed, thresholds):
+    for module in (estimators, features, matching, memory, pipelines, pruning, speed, thresholds):
         module.add_arguments(commands)
     arguments = parser.parse_args()
     arguments.run(arguments)

@@ -210,3 +210,15 @@ def test_large_images_are_reduced_for_opencv() -> None:
     shift = (b.lafs[close][..., 2] - a.lafs[nearest[close]][..., 2]).median(0).values
     assert shift.abs().max() < 0.15  # half a pixel missed would show as 0.2
     assert torch.equal(SIFT(max_pixels=300 * 401)(image).lafs, a.lafs)
+
+
+@pytest.mark.parametrize("name", ["l2net", "hardnet", "hesaffnet"])
+@pytest.mark.parametrize("shape", [(1, 300), (20, 31), (40, 45)])
+def test_shipped_networks_on_small_images(name: str, shape: tuple[int, int]) -> None:
+    image = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
+    extract = presets.build("features", name)
+    found = extract(image)
+    assert found.image_size.tolist() == list(shape)
+    assert torch.isfinite(found.descriptors).all()
+    assert torch.isfinite(found.lafs).all()
+    assert len(extract(np.full(shape, 77, np.uint8))) == 0

@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch import presets
+from fmtorch.features import RootSIFTPCA
 from fmtorch.stages import TimedExtractor, TwoStepExtractor
 from fmtorch.storage import configuration as configuration_module
 from fmtorch.storage.cache import ArrayCache
-from fmtorch.storage.configuration import configuration
+from fmtorch.storage.configuration import configuration, learned
 from fmtorch.storage.features import CachedFeatures, cached, image_digest
 from fmtorch.types import Features
 from tests.conftest import shared_path
@@ -288,6 +289,26 @@ def test_configuration_of_files_tensors_networks_and_code(tmp_path: Path, monkey
     configuration_module._code_digest.cache_clear()
     assert configuration(sift)["code"] != code
     configuration_module._code_digest.cache_clear()
+
+
+def test_learned_files_are_digests(tmp_path: Path) -> None:
+    file = tmp_path / "a.npz"
+    file.write_bytes(b"one")
+    before = learned(presets.build("features", "rootsiftpca", descriptor={"name": "rootsiftpca", "model": str(file)}))
+    assert len(before) == 1
+    file.write_bytes(b"two")
+    os.utime(file, (1, 1))
+    after = learned({"a": [RootSIFTPCA(file), RootSIFTPCA(file)]})
+    assert len(after) == 1
+    assert after != before
+    network = torch.nn.Linear(2, 2)
+    (before,) = learned(network)
+    with torch.no_grad():
+        network.weight[0, 0] += 1
+    assert learned(network) != [before]
+    assert learned(presets.build("features", "sift")) == []
+    assert learned(lambda: None) == []
+    assert learned(RootSIFTPCA(tmp_path / "absent.npz")) == []
 
 
 def test_the_command_tells_what_is_there(tmp_path: Path) -> None:

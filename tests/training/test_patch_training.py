@@ -178,6 +178,9 @@ def test_a_checkpoint_gives_the_network_and_its_card(store: PatchStore, tmp_path
         "| trained | 1.23 | 91.00",
     ):
         assert part in card
+    other = model_card(tmp_path / "hardnet.onnx", "affnet", "int8", {**content, "loss": {"name": "affine_covariance"}})
+    assert "own, not AffNet's" in other
+    assert "own, not" not in card
 
 
 def stretched(store: PatchStore, matrix: Tensor) -> tuple[Tensor, Tensor]:

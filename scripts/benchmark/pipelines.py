@@ -1,0 +1,154 @@
+"""Pipelines of different features: recall, inlier rates and counts, beside the paper's figures.
+
+python scripts/benchmark pipelines --root DATA/Strecha --root DATA/PhotoTourism --json features.jsonl
+python scripts/benchmark pipelines --rendered full --limit 40 --json features.jsonl
+python scripts/benchmark pipelines --from features.jsonl --markdown docs/features.md
+
+--json is appended to batch by batch: started again, the command goes on where it was interrupted. A row counts only
+for the learned files and options that it was made with. GMS runs with scale on wide baselines, as in the paper.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pipelines_table
+import torch
+from matched import WIDE, console
+from pruning import pruned_by
+from rich.progress import track
+
+from fmtorch import data, presets
+from fmtorch.data import ImagePair
+from fmtorch.evaluation.rows import evaluate
+from fmtorch.evaluation.run import select
+from fmtorch.pipeline import Outcome, Pipeline
+from fmtorch.storage import identity_digest
+from fmtorch.storage.configuration import configuration
+from fmtorch.storage.features import CachedFeatures
+
+FEATURES = ("sift", "dspsift", "rootsiftpca", "l2net", "hardnet", "hesaffnet")
+SYSTEMS = ("rootsiftpca", "hardnet", "hesaffnet")
+PIPELINES = [*(f"{name}_ratio" for name in FEATURES), *(f"{name}_gms" for name in SYSTEMS)]
+BATCH = 8  # pairs that are kept together
+FIGURES = ("nsgd", "inlier_rate", "inlier_rate_before", "corrs", "corrs_before", "ok")
+
+
+def add_arguments(commands: Any) -> None:
+    parser = commands.add_parser("pipelines", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--root", action="append", default=[], help="a set in the FM-Bench layout; may be repeated")
+    parser.add_argument("--rendered", choices=["small", "full"], help="also the embedded data set, of this size")
+    parser.add_argument("--split", default="test")
+    parser.add_argument("--limit", type=int, help="pairs of each family at most, chosen by hash")
+    parser.add_argument("--pipelines", nargs="*", default=PIPELINES, help="names of presets in conf/pipeline")
+    parser.add_argument("--overrides", nargs="*", default=[], help="of each pipeline, e.g. features.precision=int8")
+    parser.add_argument("--label", default="", help="appended to the pipelines' names in the tables")
+    parser.add_argument("--seeds", type=int, default=5, help="of the estimators; recall is their mean")
+    parser.add_argument("--cache", default="null", help="folder of features; null: the user's")
+    parser.add_argument("--json", type=Path, help="keep the figures of every pair here, one line each")
+    parser.add_argument("--from", nargs="*", type=Path, default=[], dest="earlier", help="only show earlier --json")
+    parser.add_argument("--markdown", type=Path, help="put the tables between the marks of this file")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    torch.set_num_threads(1)
+    rows = [row for path in arguments.earlier for row in read(path)]
+    if arguments.root or arguments.rendered:
+        rows += measure(arguments)
+    tables = pipelines_table.tables(rows)
+    for table in tables:
+        console.print(table.terminal())
+    if arguments.markdown:
+        pipelines_table.put(arguments.markdown, tables)
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    """The rows of a file."""
+    return [json.loads(line) for line in whole_lines(path).splitlines()]
+
+
+def whole_lines(path: Path) -> str:
+    """What a file holds, without a last line that was cut off by an interruption."""
+    text = path.read_text(encoding="utf-8") if path.exists() else ""
+    return text[: text.rfind("\n") + 1]
+
+
+def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """A row for each pipeline and pair, those of an earlier run included."""
+    pairs = pairs_of(arguments)
+    known = []
+    if arguments.json:
+        arguments.json.write_text(whole_lines(arguments.json), encoding="utf-8")
+        known = read(arguments.json)
+    rows = []
+    for wide in (True, False):
+        some = [pair for pair in pairs if (pair.family in WIDE) == wide]
+        for group in by_features(arguments, wide) if some else []:
+            pipelines = {name: pipeline for name, (pipeline, _) in group.items()}
+            identity = {name: digest for name, (_, digest) in group.items()}
+            own = [row for row in known if identity.get(row["method"]) == row["identity"]]
+            rows += own
+            done = {row["pair"] for row in own}
+            todo = [pair for pair in some if pair.identity not in done]
+            batches = [todo[i : i + BATCH] for i in range(0, len(todo), BATCH)]
+            for batch in track(batches, next(iter(pipelines)), console=console):
+                new = list(rows_of(pipelines, batch, arguments.seeds, identity))
+                rows += new
+                keep(arguments.json, new)
+    return rows
+
+
+def pairs_of(arguments: argparse.Namespace) -> list[ImagePair]:
+    sets = [data.load("fmbench", arguments.split, root) for root in arguments.root]
+    if arguments.rendered:
+        sets.append(data.load("rendered", arguments.split, size=arguments.rendered))
+    return select([dataset[i] for dataset in sets for i in range(len(dataset))], arguments.limit)
+
+
+def by_features(arguments: argparse.Namespace, wide: bool) -> Iterator[dict[str, tuple[Pipeline, str]]]:
+    """The pipelines in groups that share features and matches, by the names that the tables show.
+
+    With each the digest of its options and learned files.
+    """
+    groups: dict[str, dict[str, tuple[Pipeline, str]]] = {}
+    for name in arguments.pipelines:
+        scale = [f"pruner.gms.with_scale={str(wide).lower()}"] if name.endswith("_gms") else []
+        overrides = [*scale, *arguments.overrides]
+        pipeline = presets.pipeline(name, overrides=[f"cache={arguments.cache}", *overrides])
+        extractor = pipeline.extractor
+        features = extractor.extractor if isinstance(extractor, CachedFeatures) else extractor
+        made_with = {"features": configuration(features), "preset": presets.load("pipeline", name),
+                     "overrides": overrides, "seeds": arguments.seeds}  # fmt: skip
+        label = name + arguments.label
+        groups.setdefault(name.split("_")[0], {})[label] = pipeline, identity_digest(made_with)[:16]
+    yield from groups.values()
+
+
+def rows_of(
+    pipelines: dict[str, Pipeline], batch: Sequence[ImagePair], seeds: int, identity: dict[str, str]
+) -> Iterator[dict[str, Any]]:
+    """A row for each pipeline and pair, with a list over seeds for each figure.
+
+    All have the pruners of the shortest of them, whose matches are shared.
+    """
+    front = min(pipelines.values(), key=lambda p: len(p.pruners))
+    matched = front.match(batch)
+    for name, pipeline in pipelines.items():
+        further = [stage for key, stage in pipeline.pruners.items() if key not in front.pruners]
+        outcomes: list[Outcome] = [pruned_by(outcome, further) for outcome in matched]
+        runs = [evaluate(pipeline.estimate(outcomes, seed), seed) for seed in range(seeds)]
+        for same in zip(*runs, strict=True):
+            row = {field: getattr(same[0], field) for field in ("pair", "family", "scene", "features0", "features1")}
+            figures = {field: [getattr(r, field) for r in same] for field in FIGURES}
+            yield {"method": name, "identity": identity[name], **row, **figures}
+
+
+def keep(path: Path | None, rows: Sequence[dict[str, Any]]) -> None:
+    if path is not None:
+        with open(path, "a", encoding="utf-8") as file:
+            file.write("".join(json.dumps(row) + "\n" for row in rows))
