@@ -24,6 +24,7 @@ Solution = tuple[Points | None, NDArray[np.bool_]]
 
 LEAST_MATCHES = 8
 
+FAILURES = (cv2.error, RuntimeError, ValueError)  # how these libraries say that they cannot solve a pair
 # The numbers of the samplers in the authors' bindings of MAGSAC++ and GC-RANSAC.
 SAMPLERS = {"uniform": 0, "prosac": 1, "progressive_napsac": 2, "importance": 3, "adaptive": 4}
 
@@ -72,7 +73,11 @@ class PairwiseEstimator:
                 continue
             x0, x1 = (x[i].detach().cpu()[index].to(torch.float64).numpy() for x in (c.x0, c.x1))
             size0, size1 = _size(c.size0, x0, i), _size(c.size1, x1, i)
-            estimate, inside = self._solve(Pair(x0, x1, likelihood.numpy(), size0, size1, seed))
+            try:
+                estimate, inside = self._solve(Pair(x0, x1, likelihood.numpy(), size0, size1, seed))
+            except FAILURES as failure:  # OpenCV's USAC asserts what some matches do not fulfil
+                reasons[i] = f"{self.name} failed: {' '.join(str(failure).split())}"
+                continue
             if estimate is None or estimate.shape != (3, 3) or not np.isfinite(estimate).all() or not np.any(estimate):
                 reasons[i] = f"{self.name} found no fundamental matrix"
                 continue

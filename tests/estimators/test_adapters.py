@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
@@ -61,3 +63,16 @@ def test_the_prior_orders_matches_before_the_quality() -> None:
         assert (pair.likelihood[:-1] >= pair.likelihood[1:]).all()
     assert torch.equal(torch.from_numpy(seen[0].likelihood), c.prior[0].double().sort(descending=True).values)
     assert seen[0].size0 == (640, 960)
+
+
+def test_what_another_library_raises_becomes_the_pairs_reason() -> None:
+    def solve(pair: Pair) -> Solution:
+        if len(pair.x0) == 20:
+            raise cv2.error("(-215:Assertion failed)\n!model.empty()")
+        return np.eye(3), np.ones(len(pair.x0), bool)
+
+    estimate = PairwiseEstimator("It", solve)(collate([scene(0, 20), scene(1, 30)]))
+    assert estimate.ok.tolist() == [False, True]
+    assert estimate.reason == ("It failed: (-215:Assertion failed) !model.empty()", "")
+    assert not estimate.F[0].any()
+    assert not estimate.inliers[0].any()
