@@ -75,7 +75,7 @@ def scene(index: int, count: int = 150, outliers: float = 0.4, noise: float = 0.
     return Correspondences(
         tensor(x0), tensor(x1), torch.ones(1, count, dtype=torch.bool), quality=tensor(ratio),
         prior=tensor(np.clip(1.2 - ratio, 0, 1)), lafs0=tensor(frames[0]), lafs1=tensor(frames[1]),
-        size0=size, size1=size, key=torch.tensor([index + 1]),
+        size0=size, size1=size, key=torch.tensor([index + 1]), mutual=tensor(ratio) < 0.7,
     )  # fmt: skip
 
 
@@ -96,7 +96,7 @@ def with_padding(c: Correspondences, rng: np.random.Generator, garbage: float) -
         index = where.reshape(b, n, *[1] * (value.dim() - 2)).expand(b, n, *value.shape[2:])
         return out.scatter(1, index, value)
 
-    fields = ("x0", "x1", "mask", "quality", "prior", "lafs0", "lafs1")
+    fields = ("x0", "x1", "mask", "quality", "prior", "lafs0", "lafs1", "mutual")
     return c.replace(**{f: spread(getattr(c, f)) for f in fields if getattr(c, f) is not None})
 
 

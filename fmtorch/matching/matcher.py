@@ -20,9 +20,8 @@ class NearestNeighborMatcher:
     partner. `quality` is the ratio of the distances to the nearest and the second nearest descriptor, in [0, 1], and
     1 where it means nothing (a single candidate, two identical candidates).
 
-    mutual: keep only matches whose partner's own nearest neighbour is the feature itself. The check belongs here
-    because `Correspondences` hold the matches of one direction only; it costs nothing, both directions being found
-    in one pass.
+    mutual: keep only matches whose partner's own nearest neighbour is the feature itself. It costs nothing, both
+    directions being found in one pass; without it the result says which matches these are (`Correspondences.mutual`).
     chunk: rows of the distance matrix that exist at a time; changes speed and memory only.
     """
 
@@ -55,6 +54,7 @@ class NearestNeighborMatcher:
             lafs1=lafs1,
             size0=features0.image_size,
             size1=features1.image_size,
+            mutual=found.mutual & mask,
         )
 
 

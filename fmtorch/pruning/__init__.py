@@ -6,7 +6,7 @@ from fmtorch.pruning.frame_consistency import FrameConsistency, frame_agreement
 from fmtorch.pruning.gms import GMS, gms, gms_support
 from fmtorch.pruning.likely import Likely
 from fmtorch.pruning.lpm import LPM, lpm, lpm_cost
-from fmtorch.pruning.mutual import mutual
+from fmtorch.pruning.mutual import MutualCheck, mutual
 from fmtorch.pruning.one_to_one import OneToOne, one_to_one
 from fmtorch.pruning.position_consistency import PositionConsistency, position_agreement
 from fmtorch.pruning.ratio import RatioTest, ratio_test
@@ -20,6 +20,7 @@ __all__ = [
     "FrameConsistency",
     "LikelihoodField",
     "Likely",
+    "MutualCheck",
     "OneToOne",
     "PositionConsistency",
     "RatioPrior",

@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from torch import Tensor
 
-from fmtorch.matching import nearest_neighbors
-from fmtorch.pruning import OneToOne, RatioTest, mutual, one_to_one, ratio_test
-from fmtorch.types import Correspondences
+from fmtorch.matching import NearestNeighborMatcher, nearest_neighbors
+from fmtorch.pruning import MutualCheck, OneToOne, RatioTest, mutual, one_to_one, ratio_test
+from fmtorch.types import Correspondences, Features
+from tests.reference import matching as matching_reference
 from tests.reference.matching import one_to_one as one_to_one_reference
 
 
@@ -33,6 +34,30 @@ def test_mutual_agrees_with_the_matcher() -> None:
     garbage = torch.where(mask0, found.nearest, 10**9)
     assert torch.equal(mutual(garbage, found.reverse, mask0), found.mutual)
     assert not mutual(found.nearest, found.reverse[:, :0]).any()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_ratio_and_mutual_stages_equal_their_definitions(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    d0, d1 = rng.random((30, 8), np.float32), rng.random((24 + seed, 8), np.float32)
+    d1[:10] = d0[:10] + rng.normal(0, 0.05, (10, 8))
+
+    def features(descriptors: np.ndarray) -> Features:
+        n = len(descriptors)
+        lafs = torch.zeros(n, 2, 3)
+        lafs[:, :, 2] = torch.from_numpy(rng.random((n, 2)))
+        return Features(lafs, torch.ones(n), torch.from_numpy(descriptors), torch.tensor([9, 9]))
+
+    matches = NearestNeighborMatcher()(features(d0), features(d1))
+    ratio, both = RatioTest(0.8)(matches).mask[0], MutualCheck()(matches).mask[0]
+    np.testing.assert_array_equal(ratio, matching_reference.ratio_test(d0, d1, 0.8))
+    np.testing.assert_array_equal(both, matching_reference.mutual(d0, d1))
+    assert 0 < int(ratio.sum()) < 30
+    assert 0 < int(both.sum()) < 30
+    order = matches.compact()
+    assert torch.equal(MutualCheck()(order).count(), both.sum()[None])
+    with pytest.raises(ValueError, match="needs `mutual`"):
+        MutualCheck()(matches.replace(mutual=None))
 
 
 def grid_points(n: int) -> st.SearchStrategy[np.ndarray]:

@@ -17,6 +17,19 @@ def two_nearest(descriptors0: np.ndarray, descriptors1: np.ndarray) -> tuple[np.
     return np.array(index, int), np.array(first), np.array(second)
 
 
+def ratio_test(descriptors0: np.ndarray, descriptors1: np.ndarray, threshold: float) -> np.ndarray:
+    """Which descriptors of image 0 are clearly nearer to their nearest one than to any other."""
+    _, first, second = two_nearest(descriptors0, descriptors1)
+    return np.array([a < threshold * b for a, b in zip(first, second, strict=True)], bool)
+
+
+def mutual(descriptors0: np.ndarray, descriptors1: np.ndarray) -> np.ndarray:
+    """Which descriptors of image 0 are the nearest ones of their nearest ones."""
+    forward, _, _ = two_nearest(descriptors0, descriptors1)
+    backward, _, _ = two_nearest(descriptors1, descriptors0)
+    return np.array([backward[j] == i for i, j in enumerate(forward)], bool)
+
+
 def one_to_one(x0: np.ndarray, x1: np.ndarray, quality: np.ndarray) -> np.ndarray:
     """A match is kept unless another at its location in either image is better: lower quality, then lower index."""
     kept = []
