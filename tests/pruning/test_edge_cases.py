@@ -14,7 +14,7 @@ from fmtorch.types import Correspondences
 from tests.laws import scene
 
 PRUNERS = presets.available("pruner")
-PER_MATCH = ("x0", "x1", "quality", "prior", "lafs0", "lafs1")
+PER_MATCH = ("x0", "x1", "quality", "prior", "lafs0", "lafs1", "mutual")
 H, W = 640, 960
 
 
@@ -29,7 +29,7 @@ def edge_cases() -> dict[str, Correspondences]:
     nan = {
         name: torch.where(masked.reshape(1, 300, *[1] * (value.dim() - 2)), torch.nan, value)
         for name in PER_MATCH
-        if (value := getattr(c, name)) is not None
+        if (value := getattr(c, name)) is not None and value.is_floating_point()
     }
     one_cell = c.x0 / 100 + 200
     return {
