@@ -20,9 +20,10 @@ def _importable(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_options_are_numbers_switches_or_words() -> None:
-    import estimators
+    import matched
 
-    assert [estimators.parsed(v) for v in ("0.5", "true", "null", "focal")] == [0.5, True, None, "focal"]
+    assert matched.options("a=0.5,b=true,c=null,d=focal") == {"a": 0.5, "b": True, "c": None, "d": "focal"}
+    assert matched.options("") == {}
 
 
 def test_tables_stand_between_their_markers(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ class Choice(Protocol):
     """Chooses one model for each pair from a small pool of them; may improve it."""
 
     def __call__(self, F: Float[Tensor, "9 p k"], problem: Problem, alive: Bool[Tensor, "p k"]) -> Float[Tensor, "9 p"]:
-        """The estimates; alive: False for slots of the pool that hold no model."""
+        """The estimates, of models of unit norm; alive: False for slots of the pool that hold no model."""
         ...
 
 

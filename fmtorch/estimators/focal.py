@@ -42,6 +42,7 @@ DAMPING, SMALLEST_DAMPING, LARGEST_DAMPING = 1e-3, 1e-9, 1e6
 class FocalPrior:
     """Refines each candidate as a maximum a posteriori over E and two focal lengths and chooses among these.
 
+    Asked only of pairs that are open: where all good candidates are one and the same model, that is the estimate.
     The estimate is the refined candidate with the largest gain (`SaturatedGain`) minus prior cost if that reaches GATE
     of the largest gain without prior; otherwise, and where there are no image sizes, the model of the latter.
     threshold: Sampson distance of the gain and of the truncated cost, px. iterations: Levenberg-Marquardt steps.

@@ -22,7 +22,7 @@ import estimators_table as table
 import matched
 import numpy as np
 import torch
-from matched import Item, console, groups, paired_interval
+from matched import Item, console, groups, options, paired_interval
 from rich.progress import track
 
 from fmtorch import metrics, presets
@@ -79,8 +79,7 @@ def build(spec: str) -> Callable[[Correspondences, int], Estimate]:
     """The function of `PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]`: pruners in order, then the estimator."""
     front, _, stages = spec.partition("@")
     name, _, rest = front.partition(":")
-    options = {key: parsed(value) for key, value in (item.split("=") for item in rest.split(",") if item)}
-    estimator = presets.build("estimator", name, **options)
+    estimator = presets.build("estimator", name, **options(rest))
     pruners = [presets.build("pruner", stage) for stage in stages.split("+") if stage]
 
     def call(c: Correspondences, seed: int = 0) -> Estimate:
@@ -90,14 +89,6 @@ def build(spec: str) -> Callable[[Correspondences, int], Estimate]:
         return estimate
 
     return call
-
-
-def parsed(value: str) -> Any:
-    """A number, true, false or null; anything else is text."""
-    try:
-        return json.loads(value)
-    except json.JSONDecodeError:
-        return value
 
 
 def measure(specs: list[str], items: list[Item], seeds: int) -> dict[str, Result]:

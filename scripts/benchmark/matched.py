@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -13,7 +14,7 @@ from rich.console import Console
 from rich.progress import track
 
 from fmtorch import data, presets
-from fmtorch.data import ImagePair
+from fmtorch.data import ImagePair, PairDataset
 from fmtorch.pipeline import Pipeline
 from fmtorch.types import Correspondences
 
@@ -25,22 +26,46 @@ WIDE = ("Strecha", "PhotoTourism", "CPC", "Tanks_and_Temples", "Strecha_train", 
 Item = tuple[ImagePair, Correspondences]
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_set_arguments(parser: argparse.ArgumentParser, limit: str = "pairs of each family at most") -> None:
+    """The options that say which pairs; `limit` is the help of the last one."""
     parser.add_argument("--root", action="append", default=[], help="a set in the FM-Bench layout; may be repeated")
     parser.add_argument("--rendered", choices=["small", "full"], help="also the embedded data set, of this size")
     parser.add_argument("--split", default="test")
-    parser.add_argument("--limit", type=int, help="pairs of each set at most")
+    parser.add_argument("--limit", type=int, help=limit)
+
+
+def sets_of(arguments: argparse.Namespace) -> list[PairDataset]:
+    """The data sets that these options name, before any limit."""
+    sets = [data.load("fmbench", arguments.split, root) for root in arguments.root]
+    if arguments.rendered:
+        sets.append(data.load("rendered", arguments.split, size=arguments.rendered))
+    return sets
+
+
+def options(text: str) -> dict[str, Any]:
+    """``KEY=VALUE,...``: numbers, true, false or null as in JSON; anything else is text."""
+    return {key: parsed(value) for key, value in (item.split("=") for item in text.split(",") if item)}
+
+
+def parsed(value: str) -> Any:
+    """A number, true, false or null; anything else is text."""
+    try:
+        return json.loads(value)
+    except json.JSONDecodeError:
+        return value
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of `load`."""
+    add_set_arguments(parser, "pairs of each set at most")
     parser.add_argument("--features", default="sift")
     parser.add_argument("--pruners", nargs="*", default=["ratio", "one_to_one"])
 
 
 def load(arguments: argparse.Namespace) -> list[Item]:
     """Every usable pair of the sets that are asked for, with its matches as a batch of one."""
-    sets = [data.load("fmbench", arguments.split, root) for root in arguments.root]
-    if arguments.rendered:
-        sets.append(data.load("rendered", arguments.split, size=arguments.rendered))
     pairs: list[ImagePair] = []
-    for dataset in sets:
+    for dataset in sets_of(arguments):
         whole = sorted((dataset[i] for i in range(len(dataset))), key=lambda pair: pair.key)
         pairs += whole[: arguments.limit]
     pairs.sort(key=lambda pair: pair.identity)

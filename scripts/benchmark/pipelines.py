@@ -18,11 +18,11 @@ from typing import Any
 
 import pipelines_table
 import torch
-from matched import WIDE, console
+from matched import WIDE, add_set_arguments, console, sets_of
 from pruning import pruned_by
 from rich.progress import track
 
-from fmtorch import data, presets
+from fmtorch import presets
 from fmtorch.data import ImagePair
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.run import select
@@ -40,10 +40,7 @@ FIGURES = ("nsgd", "inlier_rate", "inlier_rate_before", "corrs", "corrs_before",
 
 def add_arguments(commands: Any) -> None:
     parser = commands.add_parser("pipelines", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--root", action="append", default=[], help="a set in the FM-Bench layout; may be repeated")
-    parser.add_argument("--rendered", choices=["small", "full"], help="also the embedded data set, of this size")
-    parser.add_argument("--split", default="test")
-    parser.add_argument("--limit", type=int, help="pairs of each family at most, chosen by hash")
+    add_set_arguments(parser, "pairs of each family at most, chosen by hash")
     parser.add_argument("--pipelines", nargs="*", default=PIPELINES, help="names of presets in conf/pipeline")
     parser.add_argument("--overrides", nargs="*", default=[], help="of each pipeline, e.g. features.precision=int8")
     parser.add_argument("--label", default="", help="appended to the pipelines' names in the tables")
@@ -80,7 +77,8 @@ def whole_lines(path: Path) -> str:
 
 def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """A row for each pipeline and pair, those of an earlier run included."""
-    pairs = pairs_of(arguments)
+    every = [dataset[i] for dataset in sets_of(arguments) for i in range(len(dataset))]
+    pairs = select(every, arguments.limit)
     known = []
     if arguments.json:
         arguments.json.write_text(whole_lines(arguments.json), encoding="utf-8")
@@ -101,13 +99,6 @@ def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
                 rows += new
                 keep(arguments.json, new)
     return rows
-
-
-def pairs_of(arguments: argparse.Namespace) -> list[ImagePair]:
-    sets = [data.load("fmbench", arguments.split, root) for root in arguments.root]
-    if arguments.rendered:
-        sets.append(data.load("rendered", arguments.split, size=arguments.rendered))
-    return select([dataset[i] for dataset in sets for i in range(len(dataset))], arguments.limit)
 
 
 def by_features(arguments: argparse.Namespace, wide: bool) -> Iterator[dict[str, tuple[Pipeline, str]]]:

@@ -21,10 +21,11 @@ from typing import Any
 import pruning_speed
 import pruning_table
 import torch
+from matched import add_set_arguments, options, sets_of
 from rich.console import Console
 from rich.progress import track
 
-from fmtorch import data, presets
+from fmtorch import presets
 from fmtorch.data import ImagePair
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.run import select
@@ -49,10 +50,7 @@ METHODS = {
 
 def add_arguments(commands: Any) -> None:
     parser = commands.add_parser("pruning", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--root", action="append", default=[], help="a set in the FM-Bench layout; may be repeated")
-    parser.add_argument("--rendered", choices=["small", "full"], help="also the embedded data set, of this size")
-    parser.add_argument("--split", default="test")
-    parser.add_argument("--limit", type=int, help="pairs of each family at most")
+    add_set_arguments(parser)
     parser.add_argument("--asift-limit", type=int, default=10, help="pairs of each family with ASIFT features at most")
     parser.add_argument("--methods", nargs="*", default=list(METHODS), choices=list(METHODS))
     parser.add_argument("--estimator", default="ransac_eight_point")
@@ -92,10 +90,7 @@ def machine() -> dict[str, str]:
 
 def measure(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """A row for each method and pair."""
-    sets = [data.load("fmbench", arguments.split, root) for root in arguments.root]
-    if arguments.rendered:
-        sets.append(data.load("rendered", arguments.split, size=arguments.rendered))
-    pairs = [dataset[i] for dataset in sets for i in range(len(dataset))]
+    pairs = [dataset[i] for dataset in sets_of(arguments) for i in range(len(dataset))]
     estimator = presets.build("estimator", arguments.estimator)
     for extractor, limit in (("sift", arguments.limit), ("asift", arguments.asift_limit)):
         chosen = {name: METHODS[name][1] for name in arguments.methods if METHODS[name][0] == extractor}
@@ -111,8 +106,7 @@ def measure(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
 def stage(spec: str) -> Any:
     """A pruner from `name` or `name:key=value,key=value`."""
     name, _, rest = spec.partition(":")
-    options = {key: json.loads(value) for key, value in (item.split("=") for item in rest.split(",") if item)}
-    return presets.build("pruner", name, **options)
+    return presets.build("pruner", name, **options(rest))
 
 
 def rows(front: Pipeline, pair: ImagePair, methods: dict[str, list[Any]]) -> Iterator[dict[str, Any]]:

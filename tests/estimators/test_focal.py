@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from fmtorch.estimators import HypothesizeAndVerify
 from fmtorch.estimators.focal import FocalPrior, bougnoux, exponential, logarithm, refine_focal
 from fmtorch.estimators.problem import Problem, problems
-from fmtorch.geometry.rank2_manifold import start
+from fmtorch.geometry.rank2_manifold import start, unit
 from fmtorch.geometry.refine import refine_components
 from fmtorch.types import Correspondences, collate
 from tests.conftest import oracle
@@ -159,6 +159,22 @@ def test_unknown_sizes_give_the_saturated_choice() -> None:
     focal = HypothesizeAndVerify(choice="focal", **options)(c)  # type: ignore[arg-type]
     saturated = HypothesizeAndVerify(choice="saturated", **options)(c)  # type: ignore[arg-type]
     assert torch.equal(focal.F, saturated.F)
+
+
+def test_the_prior_is_asked_only_where_good_candidates_differ(monkeypatch: pytest.MonkeyPatch) -> None:
+    c, truth = _pair(4, outliers=0.1)
+    problem, alive = _problem(c), torch.ones(1, 2, dtype=torch.bool)
+    turned = truth + np.array([0.05, 0, 0, 0, 0, 0, 0, 0])
+    right, other = (unit(_normalised(reference.fundamental(p, SIZE0, SIZE1), problem)) for p in (truth, turned))
+    same, different = torch.cat([right, right], 2), torch.cat([right, other], 2)
+    monkeypatch.setattr("fmtorch.estimators.focal.RIVAL", 0.0)  # every candidate is a good one
+    assert torch.equal(FocalPrior(THRESHOLD)(same, problem, alive), right[..., 0])
+    refined, _ = refine_focal(different, problem, THRESHOLD)
+    chosen = FocalPrior(THRESHOLD)(different, problem, alive)
+    assert any(torch.equal(chosen, refined[..., k]) for k in (0, 1))
+    assert not torch.equal(chosen, right[..., 0])
+    monkeypatch.setattr("fmtorch.estimators.focal.RIVAL", 2.0)  # none is
+    assert torch.equal(FocalPrior(THRESHOLD)(different, problem, alive), right[..., 0])
 
 
 def test_models_that_are_not_finite_harm_no_other() -> None:
