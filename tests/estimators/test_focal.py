@@ -164,7 +164,7 @@ def test_unknown_sizes_give_the_saturated_choice() -> None:
 def test_the_prior_is_asked_only_where_good_candidates_differ(monkeypatch: pytest.MonkeyPatch) -> None:
     c, truth = _pair(4, outliers=0.1)
     problem, alive = _problem(c), torch.ones(1, 2, dtype=torch.bool)
-    turned = truth + np.array([0.05, 0, 0, 0, 0, 0, 0, 0])
+    turned = truth + np.array([0.3, 0, 0, 0, 0, 0, 0, 0])
     right, other = (unit(_normalised(reference.fundamental(p, SIZE0, SIZE1), problem)) for p in (truth, turned))
     same, different = torch.cat([right, right], 2), torch.cat([right, other], 2)
     monkeypatch.setattr("fmtorch.estimators.focal.RIVAL", 0.0)  # every candidate is a good one
