@@ -4,26 +4,71 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.spatial import KDTree
 from torch import Tensor
 
 _LEAF = 16  # points a leaf
 _LEAVES = 12  # leaves that are searched for the points of a leaf; what they do not settle is searched exhaustively
 _DISTANCES_CPU, _DISTANCES_GPU = 2**18, 2**26  # distances that exist at a time
+_ATTEMPT = 8  # times as many neighbours as are wanted are asked of the tree where ties are not settled
+_ROUNDING = 1 + 1e-14  # of squared distances, in the tree's arithmetic and in ours
 
 
 def nearest_points(queries: Float[Tensor, "n 2"], points: Float[Tensor, "m 2"], count: int) -> Int[Tensor, "n count"]:
     """Indices of the `count` points nearest to each query, nearest first, ties by lowest index; -1 for no more points.
 
-    Queries and points are packed into rectangular leaves (sort-tile-recursive: Leutenegger et al., ICDE 1997). The
-    points of the nearest leaves are candidates, and settle a query when the last neighbour found is nearer than any
-    other leaf can be. Exact in the type of the coordinates; memory linear in n + m.
+    Exact in float64, except for ties within a few roundings. Memory linear in n + m. On a CPU by SciPy's k-d tree, with
+    as many threads as torch has; elsewhere by packed leaves.
     """
     found = torch.full((len(queries), count), -1, device=queries.device)
     wanted = min(count, len(points))
-    if wanted == 0 or len(queries) == 0:
-        return found
+    if wanted and len(queries):
+        search = by_tree if queries.device.type == "cpu" else by_leaves
+        found[:, :wanted] = search(queries.double(), points.double(), wanted)
+    return found
+
+
+def by_tree(queries: Float[Tensor, "n 2"], points: Float[Tensor, "m 2"], count: int) -> Int[Tensor, "n count"]:
+    """`nearest_points` by a k-d tree, for 1 <= count <= m.
+
+    The tree breaks ties in no fixed order: so more neighbours are asked for, until the last is farther than the ones
+    that are wanted, and what one attempt with many does not settle is searched exhaustively.
+    """
+    at, places = queries.numpy(), points.numpy()
+    tree = KDTree(places)
+    found = np.empty((len(at), count), np.int64)
+    todo = np.arange(len(at))
+    for asked in (min(count + 1, len(places)), min(_ATTEMPT * count, len(places))):
+        unsettled = []
+        for some in np.array_split(todo, -(-len(todo) * asked // _DISTANCES_CPU)) if len(todo) else ():
+            index = tree.query(at[some], np.arange(1, asked + 1), workers=torch.get_num_threads())[1]
+            (dx, dy) = (places[index, i] - at[some, None, i] for i in (0, 1))
+            squared = dx * dx + dy * dy
+            equal = np.flatnonzero((squared[:, 1:] <= squared[:, :-1]).any(1))
+            order = np.lexsort((index[equal], squared[equal]))
+            index[equal], squared[equal] = (np.take_along_axis(v[equal], order, 1) for v in (index, squared))
+            found[some] = index[:, :count]
+            if asked < len(places):
+                unsettled.append(some[squared[:, -1] <= squared[:, count - 1] * _ROUNDING])
+        todo = np.concatenate([np.empty(0, np.int64), *unsettled])
+    rest = torch.from_numpy(todo)
+    result = torch.from_numpy(found)
+    for part in torch.split(rest, max(1, _DISTANCES_CPU // len(places))):
+        result[part] = _smallest(_squared(queries[part], points), count)[0]
+    return result
+
+
+def by_leaves(queries: Float[Tensor, "n 2"], points: Float[Tensor, "m 2"], count: int) -> Int[Tensor, "n count"]:
+    """`nearest_points` for 1 <= count <= m in operations on tensors alone.
+
+    Queries and points are packed into rectangular leaves (sort-tile-recursive: Leutenegger et al., ICDE 1997). The
+    points of the nearest leaves are candidates, and settle a query when the last neighbour found is nearer than any
+    other leaf can be; what is left is searched exhaustively.
+    """
+    found = torch.full((len(queries), count), -1, device=queries.device)
     homes, leaves = _pack(queries), _pack(points)  # (H, 16), (L, 16), -1 for empty places
     boxes = _boxes(points, leaves)
     budget = _DISTANCES_CPU if queries.device.type == "cpu" else _DISTANCES_GPU
@@ -33,13 +78,13 @@ def nearest_points(queries: Float[Tensor, "n 2"], points: Float[Tensor, "m 2"], 
         candidates = leaves[nearest].flatten(1).sort(1).values  # (H, C), by index: ties go to the lowest
         squared = _squared(queries[home], points[candidates])  # (H, 16, C)
         squared.masked_fill_((candidates < 0)[:, None], math.inf)
-        columns, last = _smallest(squared, min(wanted, squared.shape[-1]))
+        columns, last = _smallest(squared, min(count, squared.shape[-1]))
         real = home >= 0
         index = candidates[:, None].expand(-1, _LEAF, -1).gather(2, columns)[real]
         found[home[real], : index.shape[1]] = index
-        unsettled.append(home[real & ((last >= gap[:, None]) | (index.shape[1] < wanted))])
+        unsettled.append(home[real & ((last >= gap[:, None]) | (index.shape[1] < count))])
     for some in torch.split(torch.cat(unsettled), max(1, budget // len(points))):
-        found[some, :wanted] = _smallest(_squared(queries[some], points), wanted)[0]
+        found[some] = _smallest(_squared(queries[some], points), count)[0]
     return found
 
 

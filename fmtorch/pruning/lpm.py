@@ -87,14 +87,16 @@ def _passes(
 def _cost(points: Float[Tensor, "2 n 2"], members: Int[Tensor, " m"], K: int, tau: float) -> Float[Tensor, " n"]:
     """Sum over the three neighbourhood sizes, between 0 and 3; the neighbours are among the members."""
     near0, near1 = (_among(members, nearest_points(x, x[members], K + 3)) for x in points)
-    shared = (near0[:, :, None] == near1[:, None, :]) & (near0 >= 0)[:, :, None]  # (N, K + 3, K + 3)
+    rank = torch.arange(K + 3, dtype=torch.uint8, device=points.device)
+    place = ((near0[:, :, None] == near1[:, None, :]) * rank).amax(-1)  # of a neighbour in near1; 0: nowhere
+    place.masked_fill_(near0 < 0, 0)
     differs = _differs(points[1] - points[0], near0, tau)
     cost = torch.zeros(points.shape[1], dtype=torch.float64, device=points.device)
     for scale, size in enumerate((K + 2, K, K - 2)):  # as released: neighbours 1..K+2, 2..K+1, 3..K; 0 is the match
         ring = slice(1 + scale, K + 3 - scale)
-        common = shared[:, ring, ring].any(-1)
-        lost = size - common.sum(-1) + (common & differs[:, ring]).sum(-1)
-        cost = cost + lost.double() / size
+        common = (place[:, ring] > scale) & (place[:, ring] < K + 3 - scale)
+        kept = (common & ~differs[:, ring]).sum(-1)
+        cost = cost + (size - kept).double() / size
     return cost
 
 

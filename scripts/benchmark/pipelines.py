@@ -57,6 +57,7 @@ def run(arguments: argparse.Namespace) -> None:
     rows = [row for path in arguments.earlier for row in read(path)]
     if arguments.root or arguments.rendered:
         rows += measure(arguments)
+    rows = list({(row["pair"], row["method"]): row for row in rows}.values())  # the last of equals
     tables = pipelines_table.tables(rows)
     for table in tables:
         console.print(table.terminal())

@@ -75,6 +75,7 @@ def run(arguments: argparse.Namespace) -> None:
         "machine": [r["machine"] for r in runs],
         **{part: [line for r in runs for line in r.get(part, [])] for part in ("rows", "speed", "memory")},
     }
+    merged["rows"] = list({(row["pair"], row["method"]): row for row in merged["rows"]}.values())  # the last of equals
     tables = pruning_table.tables(merged)
     for table in tables:
         console.print(table.terminal())

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
@@ -9,11 +11,13 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from fmtorch.pruning import LPM, lpm
-from fmtorch.pruning.knn import nearest_points
+from fmtorch.pruning.knn import by_leaves, by_tree, nearest_points
 from fmtorch.types import Correspondences
 from tests.conftest import oracle
 from tests.reference.lpm import lpm as reference
 from tests.reference.lpm import nearest
+
+Search = Callable[[Tensor, Tensor, int], Tensor]
 
 
 def moving(seed: int, n: int, outliers: float = 0.4) -> tuple[Tensor, Tensor]:
@@ -36,14 +40,18 @@ def test_nearest_points_equal_the_definition(seed: int, n: int, m: int, count: i
     queries, points = rng.uniform(0, 6, (n, 2)), rng.uniform(0, 6, (m, 2))
     if coarse:  # ties everywhere
         queries, points = queries.round(), points.round()
-    found = nearest_points(torch.from_numpy(queries), torch.from_numpy(points), count)
+    queries_, points_ = torch.from_numpy(queries), torch.from_numpy(points)
+    found = nearest_points(queries_, points_, count)
     for query, row in zip(queries, found.tolist(), strict=True):
         expected = nearest(query, points, list(range(m)), count)
         assert row == expected + [-1] * (count - len(expected))
+    if n and m:
+        torch.testing.assert_close(by_leaves(queries_, points_, min(count, m)), found[:, :m], rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("search", [by_tree, by_leaves])
 @pytest.mark.parametrize("kind", ["uniform", "clusters", "line", "grid", "one place"])
-def test_nearest_points_of_many(kind: str) -> None:
+def test_nearest_points_of_many(kind: str, search: Search) -> None:
     rng = np.random.default_rng(1)
     n = 1500
     points = {
@@ -54,7 +62,7 @@ def test_nearest_points_of_many(kind: str) -> None:
         "one place": np.full((n, 2), 7.0),
     }[kind]
     queries = np.concatenate([points[:400], rng.uniform(-200, 1200, (100, 2))])
-    found = nearest_points(torch.from_numpy(queries), torch.from_numpy(points), 9).numpy()
+    found = search(torch.from_numpy(queries), torch.from_numpy(points), 9).numpy()
     expected = cKDTree(points).query(queries, 9)[0]
     distances = np.linalg.norm(points[found] - queries[:, None], axis=-1)
     np.testing.assert_allclose(distances, expected, rtol=1e-14, atol=1e-14)  # a few roundings of float64
