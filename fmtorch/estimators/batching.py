@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from fmtorch.estimators.problem import Problem, problems
-from fmtorch.types import Correspondences, Estimate
+from fmtorch.types import Correspondences, Estimate, ungraphed
 
 Solve = Callable[[Problem], tuple[Tensor, Tensor, Tensor, Tensor]]
 """A problem -> F (p, 3, 3) in normalised units, inliers (p, n), found (p,), draws (p,)."""
@@ -20,6 +20,10 @@ def solve_all(c: Correspondences, seed: int, least: int, solve: Solve, not_found
     least: matches below which a pair is not tried. not_found: the reason for pairs that `solve` does not find a model
     for. limit: pairs that are solved together; changes no result.
     """
+    return ungraphed(c, lambda: _solve_all(c, seed, least, solve, not_found, limit))
+
+
+def _solve_all(c: Correspondences, seed: int, least: int, solve: Solve, not_found: str, limit: int) -> Estimate:
     b, n = c.mask.shape
     device = c.mask.device
     F = torch.zeros(b, 3, 3, dtype=torch.float64, device=device)
@@ -29,7 +33,7 @@ def solve_all(c: Correspondences, seed: int, least: int, solve: Solve, not_found
     limit = max(1, limit)
     for whole in made:
         for first in range(0, len(whole.pair), limit):
-            problem = whole[torch.arange(first, min(first + limit, len(whole.pair)), device=device)]
+            problem = whole.only(torch.arange(first, min(first + limit, len(whole.pair)), device=device))
             estimate, support, found, drawn = solve(problem)
             F = F.index_copy(0, problem.pair, torch.where(found[:, None, None], problem.to_pixels(estimate), 0))
             row, match = (support & problem.live & found[:, None]).nonzero(as_tuple=True)

@@ -67,7 +67,7 @@ class HypothesizeAndVerify:
     inliers: `threshold`, `lmeds` (2.5 robust standard deviations) or `median` (the better half).
     inlier_threshold: of the inliers reported, Sampson distance in pixels; null: the score's threshold.
     final: `least_squares` (8-point on the inliers), `gauss_newton` (one attached step), `adaptive` (refined at the
-    scale of the pair's own noise, with an attached step) or `none`.
+    scale of the pair's own noise, with the gradients of the optimum) or `none`.
     refit_inliers: recompute the inliers after the final fit.
     compile: build the score with torch.compile, for long runs: the first calls take some ten seconds each and need a
     C++ compiler (RuntimeError where there is none). Scores, and so estimates, may differ from those without. That they
@@ -206,7 +206,8 @@ class HypothesizeAndVerify:
         start = 0
         while start < self.hypotheses and len(active):
             count = min(self.round, self.hypotheses - start)
-            some, some_points = problem[active], points[:, active]
+            every = len(active) == p
+            some, some_points = problem.only(active), points if every else points[:, active]
             drawn, valid, index = self._hypotheses(some, some_points, table[active], start, count)
             F, score = self._verify(some, some_points, drawn, valid, None if subset is None else subset[active])
             if self.degeneracy is not None:

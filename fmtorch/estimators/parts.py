@@ -25,7 +25,7 @@ from fmtorch.estimators.scoring import (
 )
 from fmtorch.geometry.minimal import eight_point_components, seven_point_components
 from fmtorch.geometry.orientation import consistently_oriented
-from fmtorch.geometry.refine import refine_components
+from fmtorch.geometry.refine import RANK_TWO_ALREADY, refine_components
 
 T = TypeVar("T")
 
@@ -132,7 +132,9 @@ class Refinement:
         """The refined models."""
         weight = problem.live.to(torch.float64) if problem.prior is None else problem.prior
         scale = self.threshold / problem.unit
-        return refine_components(F, problem.points, weight, self.kernel, scale, self.iterations)[0]
+        return refine_components(
+            F, problem.points, weight, self.kernel, scale, self.iterations, squarings=RANK_TWO_ALREADY
+        )[0]
 
 
 SAMPLERS: dict[str, Callable[[], Sampler]] = {"uniform": Uniform, "prosac": Prosac, "prior": PriorWeighted}

@@ -53,6 +53,10 @@ class Problem:
         }
         return dataclasses.replace(self, points=self.points[:, index], **changes)
 
+    def only(self, index: Int[Tensor, " q"]) -> Problem:
+        """The pairs of a sorted index without repetition; itself if these are all."""
+        return self if len(index) == len(self.pair) else self[index]
+
     def take(self, index: Int[Tensor, "p k"], wanted: Bool[Tensor, "p n"]) -> Problem:
         """The same pairs with the matches of these indices; slots of unwanted ones, which stand last, are empty."""
         live = wanted.gather(1, index)

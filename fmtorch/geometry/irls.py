@@ -11,7 +11,7 @@ from fmtorch.geometry.normalize import denormalize_fundamental, normalize_points
 from fmtorch.geometry.rank2 import nearest_rank2
 from fmtorch.geometry.refine import Normalised
 from fmtorch.geometry.robust_kernels import Kernel, named_kernel
-from fmtorch.geometry.sampson_objective import linearise
+from fmtorch.geometry.sampson_objective import homogeneous, linearise
 
 
 def irls(
@@ -61,7 +61,7 @@ def reweighted(
     not determine is kept as it was.
     """
     p, k = F.shape[1:]
-    _, inverse, r2 = linearise(F[..., None].unbind(0), points[:, None, :, None], derivatives=False)
+    _, _, inverse, r2 = linearise(F, homogeneous(points[:, None, :, None]), derivatives=False)
     w = weight[:, None] * (robust.weight(r2, scale.square()[:, None, None]) * inverse)[0]
     usable = torch.isfinite(w).all(-1, keepdim=True) & (w > 0).any(-1, keepdim=True)
     w = torch.where(usable, w / w.amax(-1, keepdim=True), 0)

@@ -16,6 +16,9 @@ from fmtorch.geometry.reduce import component_sum
 RANK_TWO, RANK_TWO_EPIPOLE = (0.5**0.5, 0.0, 0.0, 0.0, 0.5**0.5, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 
 
+SQUARINGS = 5  # enough for any matrix whose last two singular values differ by half
+
+
 def solve(
     products: Float[Tensor, "10 10 p k"], F: Tensor, e0: Tensor, e1: Tensor, damping: Tensor
 ) -> Float[Tensor, "9 p k"]:
@@ -60,7 +63,7 @@ def retract(F: Tensor, step: Tensor, e0: Tensor, e1: Tensor) -> tuple[Tensor, Te
     return G, unit(component_sum(C * e1[:, None])), unit(component_sum(C * e0, 1))
 
 
-def start(F: Float[Tensor, "9 p k"], squarings: int = 5) -> tuple[Tensor, Tensor, Tensor]:
+def start(F: Float[Tensor, "9 p k"], squarings: int = SQUARINGS) -> tuple[Tensor, Tensor, Tensor]:
     """A rank-2 matrix of unit norm close to F and its epipoles: ``F (I - e0 e0^T)``.
 
     e0 is the right singular vector of the smallest singular value, by squarings of the matrix whose dominant

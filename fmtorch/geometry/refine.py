@@ -16,6 +16,7 @@ from torch import Tensor
 from fmtorch.geometry.rank2_manifold import (
     RANK_TWO,
     RANK_TWO_EPIPOLE,
+    SQUARINGS,
     constant,
     constrained_solve,
     retract,
@@ -25,10 +26,11 @@ from fmtorch.geometry.rank2_manifold import (
 )
 from fmtorch.geometry.reduce import component_sum, matmul3, stable_sum
 from fmtorch.geometry.robust_kernels import Kernel, named_kernel
-from fmtorch.geometry.sampson_objective import Objective, linearise
+from fmtorch.geometry.sampson_objective import Objective, homogeneous, linearise
 
 DAMPING = 1e-4  # initial, relative to the mean curvature; divided or multiplied by 10 at each step
 SMALLEST_DAMPING, LARGEST_DAMPING = 1e-12, 1e6
+RANK_TWO_ALREADY = 1  # squarings that suffice where the last singular value is but rounding of float32
 STEP_DAMPING = 1e-10  # of the attached step: bounds its gradient where the points leave a direction open
 
 
@@ -40,18 +42,20 @@ def refine_components(
     scale: Float[Tensor, " p"],
     iterations: int,
     tolerance: float = 0.0,
+    squarings: int = SQUARINGS,
 ) -> tuple[Float[Tensor, "9 p k"], Float[Tensor, "p k"]]:
     """Refined models and their costs ``sum_i w_i rho(r_i^2)``, component by component, without gradients.
 
     F: k models for each of p pairs, entries row by row; made rank 2 first where they are not. points: x0, y0, x1, y1,
     of about unit scale; finite. weight: 0 in padded slots. scale: of the kernel, in the unit of the points.
     iterations: at most. tolerance: a model is done once a step has lowered its cost by no more than this share of it.
+    squarings: of `start`.
     The cost of a model never rises above that of its (rank-2) start; a model that cannot be improved is kept, one that
     is not finite comes back as it was, with infinite cost.
     """
     with torch.no_grad():
         objective = Objective(points, weight, named_kernel(kernel), scale)
-        state = _State(objective, *start(F), iterations > 0)
+        state = _State(objective, *start(F, squarings), iterations > 0)
         damping = torch.full_like(state.cost, DAMPING)
         done = torch.zeros_like(state.cost, dtype=torch.bool)
         for i in range(iterations):
@@ -138,9 +142,9 @@ def gradient_of_cost(
     scale: Float[Tensor, " p"],
 ) -> Float[Tensor, "9 p k"]:
     """Half the gradient of the cost with respect to F, ``sum_i w_i rho'(r_i^2) r_i dr_i``; attached to all inputs."""
-    rows, inverse, r2 = linearise(F[..., None].unbind(0), points[:, None, :, None])
-    influence = weight[:, None] * robust.weight(r2, scale.square()[:, None, None]) * inverse * rows[9]
-    return stable_sum(torch.stack(rows[:9]) * influence)[:, 0]
+    J, e, inverse, r2 = linearise(F, homogeneous(points[:, None, :, None]))
+    influence = weight[:, None] * robust.weight(r2, scale.square()[:, None, None]) * inverse * e
+    return stable_sum(J.flatten(0, 1) * influence)[:, 0]
 
 
 class Normalised:

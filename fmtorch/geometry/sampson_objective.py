@@ -5,8 +5,6 @@ Everything is element-wise or summed in a fixed order, so a model has the same b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -18,6 +16,11 @@ LANES = 64  # points are summed one by one into so many lanes, and these in a tr
 TILE_MODELS = 8  # models whose sums stay in the L2 cache together; changes no result
 TILE_ELEMENTS = 1 << 13  # points times models of one step; changes no result
 TINY = 1e-30  # squared slope of the epipolar constraint below which it is taken for this
+
+
+def homogeneous(points: Float[Tensor, " 4 *s"]) -> Float[Tensor, " 2 3 *s"]:
+    """x0, y0, x1, y1 as homogeneous points of the two images."""
+    return torch.cat([points.reshape(2, 2, *points.shape[1:]), torch.ones_like(points[:2])[:, None]], 1)
 
 
 def blocks(
@@ -43,7 +46,8 @@ class Objective:
         robust: Kernel,
         scale: Float[Tensor, " p"],
     ) -> None:
-        self.points, self.weight = blocks(points, weight)
+        points, self.weight = blocks(points, weight)
+        self.points = homogeneous(points)
         self.robust, self.s2 = robust, scale.square()[:, None, None]
         self.buffers: dict[tuple[int, ...], Tensor] = {}
 
@@ -69,9 +73,8 @@ class Objective:
         return products, cost
 
     def _tile(self, F: Tensor, pairs: slice, derivatives: bool) -> tuple[Tensor, Tensor]:
-        points, weight, s2 = self.points[:, :, pairs], self.weight[:, pairs], self.s2[pairs]
+        points, weight, s2 = self.points[:, :, :, pairs], self.weight[:, pairs], self.s2[pairs]
         p, k = F.shape[1:]
-        f = F[..., None].unbind(0)
         m, count = len(weight), max(1, TILE_ELEMENTS // (p * k * LANES))
         losses: list[Tensor] = []
         sums = self._buffer(101, p, k, LANES)  # of the products, then the cost
@@ -79,14 +82,13 @@ class Objective:
         for first in range(0, m, count):
             some = slice(first, first + count)
             w = weight[some]
-            rows, inverse, r2 = linearise(f, points[:, some], derivatives)
+            J, e, inverse, r2 = linearise(F, points[:, :, some], derivatives)
             losses.append(self.robust.loss(r2, s2) * w)
             if not derivatives:
                 continue
-            A, B = self._buffer(2, len(w), 10, p, k, LANES).unbind(0)
-            torch.stack(rows, 1, out=A)
-            torch.mul(A, (self.robust.weight(r2, s2) * w * inverse)[:, None], out=B)
-            for j, (a, b) in enumerate(zip(A[:, :, None].unbind(0), B[:, None].unbind(0), strict=True), start=first):
+            A = torch.cat([J.flatten(0, 1), e[None]])
+            B = A * (self.robust.weight(r2, s2) * w * inverse)
+            for j, (a, b) in enumerate(zip(A[:, None].unbind(2), B.unbind(1), strict=True), start=first):
                 if j == 0:
                     torch.mul(a, b, out=products)
                 else:
@@ -106,32 +108,27 @@ class Objective:
 
 
 def linearise(
-    f: Sequence[Float[Tensor, "p k 1"]], points: Float[Tensor, "4 m p 1 lanes"], derivatives: bool = True
-) -> tuple[list[Tensor], Float[Tensor, "m p k lanes"], Float[Tensor, "m p k lanes"]]:
-    """The Sampson residual ``r = e / g`` and its Jacobian: g J (nine of them, then e), 1 / g^2, and r^2.
+    F: Float[Tensor, "9 p k"], points: Float[Tensor, "2 3 m p 1 lanes"], derivatives: bool = True
+) -> tuple[Tensor, Float[Tensor, "m p k lanes"], Float[Tensor, "m p k lanes"], Float[Tensor, "m p k lanes"]]:
+    """The Sampson residual ``r = e / g`` and its Jacobian: g J (3, 3, m, p, k, lanes), then e, 1 / g^2, and r^2.
 
     ``e = x1^T F x0``, ``g^2`` the squared norm of the first two entries of ``F x0`` and ``F^T x1`` together (Hartley &
     Zisserman 2004, equation 11.9), so ``g dr = x1^T dF x0 - (e / g^2) ((F x0)^T D dF x0 + x1^T dF D F^T x1)`` with
-    ``D = diag(1, 1, 0)``: the sum of two products of a column and a row.
+    ``D = diag(1, 1, 0)``: the sum of two products of a column and a row. points: homogeneous. Without derivatives the
+    first is empty.
     """
-    x0, y0, x1, y1 = points
-    a1 = torch.addcmul(torch.addcmul(f[2], f[0], x0), f[1], y0)
-    b1 = torch.addcmul(torch.addcmul(f[5], f[3], x0), f[4], y0)
-    c1 = torch.addcmul(torch.addcmul(f[8], f[6], x0), f[7], y0)
-    a0 = torch.addcmul(torch.addcmul(f[6], f[0], x1), f[3], y1)
-    b0 = torch.addcmul(torch.addcmul(f[7], f[1], x1), f[4], y1)
-    e = torch.addcmul(torch.addcmul(c1, a1, x1), b1, y1)
-    slope = torch.addcmul(torch.addcmul(torch.addcmul(a1 * a1, b1, b1), a0, a0), b0, b0)
-    inverse = slope.clamp_min(TINY).reciprocal()
+    x0, x1 = points
+    rows = F.reshape(3, 3, 1, *F.shape[1:], 1)
+    line1 = torch.addcmul(torch.addcmul(rows[:, 2], rows[:, 0], x0[0]), rows[:, 1], x0[1])  # F x0
+    line0 = torch.addcmul(torch.addcmul(rows[2, :2], rows[0, :2], x1[0]), rows[1, :2], x1[1])  # F^T x1
+    slope1 = line1[:2]
+    e = torch.addcmul(torch.addcmul(line1[2], slope1[0], x1[0]), slope1[1], x1[1])
+    a, b = torch.addcmul(slope1 * slope1, line0, line0)
+    inverse = (a + b).clamp_min(TINY).reciprocal()
     c = e * inverse
     r2 = e * c
     if not derivatives:
-        return [], inverse, r2
-    u, v = torch.addcmul(x1, c, a1, value=-1), torch.addcmul(y1, c, b1, value=-1)  # x1 - c D F x0
-    s, t = -c * a0, -c * b0  # -c D F^T x1
-    rows = [
-        torch.addcmul(u * x0, s, x1), torch.addcmul(u * y0, t, x1), u,
-        torch.addcmul(v * x0, s, y1), torch.addcmul(v * y0, t, y1), v,
-        s + x0, t + y0, torch.ones_like(e), e,
-    ]  # fmt: skip
-    return rows, inverse, r2
+        return e.new_empty(0), e, inverse, r2
+    across1 = torch.cat([torch.addcmul(x1[:2], c, slope1, value=-1), torch.ones_like(e)[None]])  # x1 - c D F x0
+    across0 = torch.cat([-c * line0, torch.zeros_like(e)[None]])  # -c D F^T x1
+    return torch.addcmul(across1[:, None] * x0, x1[:, None], across0), e, inverse, r2

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from fmtorch.geometry.curves import curve_orders
 from fmtorch.geometry.reduce import component_sum
-from fmtorch.types import Correspondences
+from fmtorch.types import Correspondences, ungraphed
 
 WINDOW = 8  # neighbours before and after each match along each curve
 CURVES = ((0.0, 0.0), (0.5, math.pi / 4))  # shift of the grid (in thirds of the extent) and rotation of each curve
@@ -64,7 +64,7 @@ def _agreement(rows: Float[Tensor, "10 b n"], sound: Bool[Tensor, "b n"]) -> Flo
     """The agreement of matches x0, y0, x1, y1, S, scale, vote along all curves in both images at once."""
     orders = curve_orders(rows[0:2].detach(), rows[2:4].detach(), sound, CURVES)
     along = rows[:, None].expand(-1, len(orders), -1, -1).gather(3, orders.expand(len(rows), -1, -1, -1))
-    sums = torch.stack(_along_curve(along.flatten(1, 2))).reshape(2, *orders.shape)
+    sums = _along_curve(along.flatten(1, 2)).reshape(2, *orders.shape)
     found = torch.zeros_like(sums).scatter(3, orders.expand(2, -1, -1, -1), sums)
     agreement, votes = component_sum(found, 1)
     return torch.where(sound, agreement / votes.clamp_min(torch.finfo(votes.dtype).tiny), 0)
@@ -80,22 +80,19 @@ def frame_map(lafs0: Float[Tensor, "b n 2 3"], lafs1: Float[Tensor, "b n 2 3"]) 
     return product / determinant[..., None, None]
 
 
-def _along_curve(rows: Float[Tensor, "10 b n"]) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n"]]:
+def _along_curve(rows: Float[Tensor, "10 b n"]) -> Float[Tensor, "2 b n"]:
     """Sums of agreeing votes and of all votes over the neighbours of each match along the curve."""
-    n = rows.shape[2]
     padded = torch.nn.functional.pad(rows, (WINDOW, WINDOW))
-    offsets = [k for k in range(2 * WINDOW + 1) if k != WINDOW]
-    near = torch.stack([padded[..., k : k + n] for k in offsets], 1)  # (10, 16, b, n)
-    dx, dy, ux, uy = near[:4] - rows[:4, None]
-    error = torch.maximum(
-        _prediction_error(rows[4:8, None], dx, dy, ux, uy), _prediction_error(near[4:8], dx, dy, ux, uy)
-    )
+    near = padded.unfold(2, rows.shape[2], 1)  # (10, b, 17, n), no copy: each match itself is in the middle
+    rows = rows[:, :, None]
+    dx, dy, ux, uy = near[:4] - rows[:4]
+    error = torch.maximum(_prediction_error(rows[4:8], dx, dy, ux, uy), _prediction_error(near[4:8], dx, dy, ux, uy))
     length = (dx.square() + dy.square() + 1e-12).sqrt() * rows[8] + (ux.square() + uy.square() + 1e-12).sqrt() + NOISE
     # exp(-z) in arithmetic alone, whose last bits, unlike exp's, do not depend on where in memory a number stands
     agree = (1 + error / length.square() * (TOLERANCE**-2 / 8)).square().square().square().reciprocal()
-    vote = near[9]
-    agreeing = agree * vote
-    return component_sum(agreeing), component_sum(vote)
+    votes = torch.stack([agree * near[9], near[9]])
+    votes[:, :, WINDOW] = 0
+    return component_sum(votes, 2)
 
 
 def _prediction_error(S: Tensor, dx: Tensor, dy: Tensor, ux: Tensor, uy: Tensor) -> Tensor:
@@ -116,6 +113,9 @@ class FrameConsistency:
 
     def __call__(self, c: Correspondences) -> Correspondences:
         """The same matches with a prior."""
+        return ungraphed(c, lambda: self._with_prior(c))
+
+    def _with_prior(self, c: Correspondences) -> Correspondences:
         if c.lafs0 is None or c.lafs1 is None or c.quality is None:
             return c
         w = frame_agreement(c.x0, c.x1, c.lafs0, c.lafs1, c.quality, c.mask) + self.floor

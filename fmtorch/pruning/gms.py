@@ -11,7 +11,7 @@ from torch import Tensor
 
 from fmtorch.pruning.calibration import calibration_of
 from fmtorch.pruning.gms_table import GRIDS, Border, Moves, Surroundings, Table, give_back, moves_in_blocks, tabulated
-from fmtorch.types import Correspondences
+from fmtorch.types import Correspondences, ungraphed
 
 _HALF_SUPPORT = 1.5  # the score, in square roots of the mean, whose support is one half
 
@@ -164,6 +164,9 @@ class GMS:
 
     def __call__(self, c: Correspondences) -> Correspondences:
         """The same matches, of which only those survive that move with their neighbours, or with a prior."""
+        return ungraphed(c, lambda: self._pruned(c))
+
+    def _pruned(self, c: Correspondences) -> Correspondences:
         soft = c if self.calibration is None else self.calibration(c, self.evidence(c))
         return soft.keep(gms(**self._arguments(c))) if self.prune else soft
 

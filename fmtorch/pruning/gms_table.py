@@ -133,7 +133,10 @@ _CLEARING = 64  # entries that are cleared one after another in the time of one 
 def _zeros(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """A table of zeros, to be given back by `give_back`."""
     kept: Tensor | None = _scratch.__dict__.pop(f"{dtype} {device}", None)
-    return torch.zeros(size, dtype=dtype, device=device) if kept is None or len(kept) < size else kept
+    if kept is not None and len(kept) >= size:
+        return kept
+    with torch.inference_mode(False):  # what is kept is changed in either mode
+        return torch.zeros(size, dtype=dtype, device=device)
 
 
 def give_back(table: Table) -> None:

@@ -19,7 +19,7 @@ from fmtorch.geometry.curves import curve_orders
 from fmtorch.geometry.reduce import component_sum
 from fmtorch.pruning.calibration import Calibration
 from fmtorch.pruning.frame_consistency import CURVES, LEAST_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO, tiled
-from fmtorch.types import Correspondences
+from fmtorch.types import Correspondences, ungraphed
 
 TURNS = 16  # hypotheses of the common turn
 SCALES = tuple(2.0 ** (k / 2) for k in range(-4, 5))  # hypotheses of the common change of scale
@@ -155,7 +155,7 @@ class PositionConsistency:
 
     def __call__(self, c: Correspondences) -> Correspondences:
         """The same matches with a prior."""
-        return self.calibration(c, self.evidence(c))
+        return ungraphed(c, lambda: self.calibration(c, self.evidence(c)))
 
     def evidence(self, c: Correspondences) -> Float[Tensor, "b n"]:
         """What the prior is calibrated from."""

@@ -12,7 +12,7 @@ from fmtorch.estimators import HypothesizeAndVerify, engine
 from fmtorch.estimators.parts import residuals_squared
 from fmtorch.estimators.problem import problems
 from fmtorch.types import collate
-from tests.laws import OTHER_LIBRARIES, scene, scenes
+from tests.laws import OTHER_LIBRARIES, quick, scene, scenes
 
 OWN = [n for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES)]
 
@@ -64,6 +64,31 @@ def test_gradients_reach_the_points() -> None:
         assert bool(torch.isfinite(x.grad).all())
         assert bool((x.grad[~estimate.inliers] == 0).all())
         assert bool((x.grad != 0).any())
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_who_asks_for_gradients_gets_the_same_estimate(name: str) -> None:
+    c = scenes()
+    attached = c.replace(x0=c.x0.double().requires_grad_(), x1=c.x1.double())
+    estimator = quick(name)
+    without, with_graph = estimator(c), estimator(attached)
+    assert not without.F.requires_grad
+    assert torch.equal(without.F, with_graph.F.detach())
+    assert torch.equal(without.inliers, with_graph.inliers)
+
+
+@pytest.mark.parametrize("stage", ["frame_consistency", "position_consistency", "gms", "estimator"])
+def test_results_are_free_to_use_in_a_graph(stage: str) -> None:
+    c = scenes()
+    if stage == "estimator":
+        value = HypothesizeAndVerify(hypotheses=100)(c).F
+    else:
+        pruned = presets.build("pruner", stage)(c)
+        value = pruned.mask.float() if stage == "gms" else pruned.prior
+    factor = torch.ones(1, requires_grad=True)
+    (value * factor).square().sum().backward()
+    assert factor.grad is not None
+    value += 1  # nor are they frozen
 
 
 def test_too_few_matches_have_a_reason() -> None:

@@ -11,7 +11,7 @@ from fmtorch.geometry import sampson_objective
 from fmtorch.geometry.rank2_manifold import start
 from fmtorch.geometry.refine import attached_step, refine, refine_components
 from fmtorch.geometry.robust_kernels import KERNELS
-from fmtorch.geometry.sampson_objective import linearise
+from fmtorch.geometry.sampson_objective import homogeneous, linearise
 from tests.conftest import oracle
 from tests.reference import refine as reference
 
@@ -58,8 +58,9 @@ def test_jacobian_equals_autograd(seed: int) -> None:
         line1, line0 = h0 @ f.reshape(3, 3).T, h1 @ f.reshape(3, 3)
         return (h1 * line1).sum(1) / (line1[:, :2].square().sum(1) + line0[:, :2].square().sum(1)).sqrt()
 
-    rows, inverse, r2 = linearise(f[..., None].unbind(0), components(x0, x1)[:, None, :, None])
-    jacobian = (torch.stack(rows[:9], -1) * inverse.sqrt()[..., None])[0, 0, 0]
+    J, e, inverse, r2 = linearise(f, homogeneous(components(x0, x1)[:, None, :, None]))
+    jacobian = (J.flatten(0, 1) * inverse.sqrt())[:, 0, 0, 0].T
+    assert torch.allclose(e * e * inverse, r2)
     expected = torch.autograd.functional.jacobian(residual, f.flatten())
     assert torch.allclose(jacobian, expected, rtol=0, atol=1e-9 * float(expected.abs().max()))
     # r^2 of outliers is of order 1, of relative precision 1e-15
