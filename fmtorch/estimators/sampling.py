@@ -125,34 +125,22 @@ def _draw(
     """
     random_bits = random.bits(problem.seed, problem.key, Stream.SAMPLING, start, count, size) >> (63 - _RANDOM_BITS)
     left = total
-    starts: list[Tensor] = []
-    lengths: list[Tensor] = []
+    begins, shortened, lengths = random_bits.new_empty(3, size, *random_bits.shape[:2]).unbind(0)
     chosen: list[Tensor] = []
     for j in range(size):
+        # shortened: where the intervals chosen so far begin when those before them are cut out.
         position = (random_bits[..., j] * left) >> _RANDOM_BITS
-        for k, begin in enumerate(starts):
-            past = position >= begin
-            position = position + (past if table is None else past * lengths[k])
+        position = position + (lengths[:j] * (position >= shortened[:j])).sum(0)
         if table is None:
-            index, begin, length = position, position, None
+            index, begin, length = position, position, torch.ones_like(position)
         else:
             index = torch.searchsorted(table, position, right=True)
             upper = table.gather(1, index)
             begin = torch.where(index > 0, table.gather(1, (index - 1).clamp_min(0)), 0)
             length = upper - begin
         chosen.append(index)
-        left = left - (1 if length is None else length)
-        _insert(starts, lengths, begin, length)
+        left = left - length
+        before = begins[:j] < begin
+        shortened[:j] -= length * ~before
+        begins[j], lengths[j], shortened[j] = begin, length, begin - (lengths[:j] * before).sum(0)
     return chosen
-
-
-def _insert(starts: list[Tensor], lengths: list[Tensor], begin: Tensor, length: Tensor | None) -> None:
-    """Insert an interval into elementwise ascending lists of starts and lengths."""
-    for k, other in enumerate(starts):
-        if length is not None:
-            smaller = begin < other
-            lengths[k], length = torch.where(smaller, length, lengths[k]), torch.where(smaller, lengths[k], length)
-        starts[k], begin = torch.minimum(begin, other), torch.maximum(begin, other)
-    starts.append(begin)
-    if length is not None:
-        lengths.append(length)
