@@ -31,6 +31,7 @@ from fmtorch.training.patch_metrics import middle, validation_pairs
 from fmtorch.training.patch_objectives import CovarianceObjective, DescriptorObjective, Objective, ShapeObjective
 from fmtorch.training.patch_store import PatchStore, build_store
 from fmtorch.training.photographs import list_photographs, package_photographs, split
+from fmtorch.training.scenes import training_scenes
 from fmtorch.training.warps import ViewRange
 
 
@@ -50,6 +51,8 @@ def stores(config: DictConfig) -> tuple[PatchStore, PatchStore]:
             limits, tolerance = options.pop("limits"), Tolerance(**options.pop("tolerance"))
             limits = ViewRange(**{**limits, "scale": tuple(limits["scale"])})
             options["seed"] += i
+            count = options.pop("scenes")
+            options["scenes"] = training_scenes(count, options["views"], options["seed"]) if name == "train" else []
             build_store(folder, chosen, limits=limits, tolerance=tolerance, **options)
         found.append(PatchStore.open(folder))
     return found[0], found[1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -39,6 +40,10 @@ class Tolerance:
     angle: float = 25.0
 
 
+SAME_PLACE = Tolerance(distance=1.0, scale=1.6, angle=45.0)
+"""Keypoints within it show nearly the same: they are never two points, or one would be the other's false negative."""
+
+
 def corresponding_patches(
     image: NDArray[np.uint8],
     rng: np.random.Generator,
@@ -57,22 +62,34 @@ def corresponding_patches(
     anchors: Keypoints = np.zeros((0, 4))
     for view in range(views):
         picture, H = _view(image, rng, limits, first=view == 0)
-        found = _detect(picture, points if view == 0 else 4 * points)
+        found = detect(picture, points if view == 0 else 4 * points)
         in_reference = _transfer(found, np.asarray(np.linalg.inv(H), np.float64))
         if view == 0:
-            kept = _distinct(in_reference)
+            kept = distinct(in_reference)
             anchors, found = in_reference[kept], found[kept]
             owner = np.arange(len(anchors))
         else:
-            owner = _same_point(anchors, in_reference, tolerance)
+            owner = same_point(anchors, in_reference, tolerance)
         mine = np.flatnonzero(owner >= 0)
-        patches.append(cut(picture, found[mine], CONTEXT_SIZE, FRAME_SIGMAS * CONTEXT_SIZE / 32))
+        patches.append(cut_context(picture, found[mine]))
         owners.append(owner[mine])
-    point, patch = np.concatenate(owners), np.concatenate(patches)
-    several = np.bincount(point, minlength=len(anchors)) >= 2
+    return sorted_by_point(patches, owners)
+
+
+def sorted_by_point(
+    patches: Sequence[NDArray[np.uint8]], points: Sequence[NDArray[np.int64]]
+) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """The patches of points that have two or more, point after point, and the point of each, numbered anew."""
+    point, patch = np.concatenate(points), np.concatenate(patches)
+    several = np.bincount(point) >= 2
     chosen = np.flatnonzero(several[point])
     order = chosen[np.argsort(point[chosen], kind="stable")]
     return patch[order], (np.cumsum(several) - 1)[point[order]]
+
+
+def cut_context(image: Grey, keypoints: Keypoints) -> NDArray[np.uint8]:
+    """The patches (n, CONTEXT_SIZE, CONTEXT_SIZE) that are stored of keypoints."""
+    return cut(image, keypoints, CONTEXT_SIZE, FRAME_SIGMAS * CONTEXT_SIZE / 32)
 
 
 def cut(image: Grey, keypoints: Keypoints, size: int, sigmas: float) -> NDArray[np.uint8]:
@@ -103,7 +120,8 @@ def _view(image: NDArray[np.uint8], rng: np.random.Generator, limits: ViewRange,
     return change_camera(rng, warp(change_light(rng, grey), H, size)), H
 
 
-def _detect(image: Grey, count: int) -> Keypoints:
+def detect(image: Grey, count: int) -> Keypoints:
+    """The strongest DoG and Hessian keypoints, `count` of each."""
     return np.concatenate([dog_keypoints(image, count), hessian_keypoints(image, count)])
 
 
@@ -116,7 +134,7 @@ def _transfer(keypoints: Keypoints, H: Matrix) -> Keypoints:
     return np.asarray(np.c_[apply(H, keypoints[:, :2]), sigma, angle], np.float64)
 
 
-def _near(a: Keypoints, b: Keypoints, tolerance: Tolerance) -> tuple[NDArray[np.int64], NDArray[np.int64], Matrix]:
+def near(a: Keypoints, b: Keypoints, tolerance: Tolerance) -> tuple[NDArray[np.int64], NDArray[np.int64], Matrix]:
     """Pairs (indices of a and of b) within the tolerance, and each one's cost, 0 to 2; sigmas are those of `a`."""
     x, y = (np.asarray(a[:, None, k] - b[None, :, k], np.float32) for k in (0, 1))
     i, j = np.nonzero(x * x + y * y <= (tolerance.distance * a[:, 2, None]).astype(np.float32) ** 2)
@@ -128,9 +146,9 @@ def _near(a: Keypoints, b: Keypoints, tolerance: Tolerance) -> tuple[NDArray[np.
     return i[fits], j[fits], cost[fits]
 
 
-def _distinct(keypoints: Keypoints) -> NDArray[np.int64]:
+def distinct(keypoints: Keypoints) -> NDArray[np.int64]:
     """Indices of keypoints without those that nearly repeat an earlier one: they would be false negatives."""
-    i, j, _ = _near(keypoints, keypoints, Tolerance(distance=1.0, scale=1.6, angle=45.0))
+    i, j, _ = near(keypoints, keypoints, SAME_PLACE)
     kept = np.ones(len(keypoints), bool)
     for earlier, later in zip(i, j, strict=True):
         if earlier < later and kept[earlier]:
@@ -138,11 +156,11 @@ def _distinct(keypoints: Keypoints) -> NDArray[np.int64]:
     return np.flatnonzero(kept)
 
 
-def _same_point(anchors: Keypoints, found: Keypoints, tolerance: Tolerance) -> NDArray[np.int64]:
+def same_point(anchors: Keypoints, found: Keypoints, tolerance: Tolerance) -> NDArray[np.int64]:
     """For each found keypoint its anchor or -1; pairs are taken in the order of their cost, each keypoint once."""
     owner = np.full(len(found), -1)
     taken = np.zeros(len(anchors), bool)
-    i, j, cost = _near(anchors, found, tolerance)
+    i, j, cost = near(anchors, found, tolerance)
     for k in np.argsort(cost, kind="stable"):
         if not taken[i[k]] and owner[j[k]] < 0:
             owner[j[k]], taken[i[k]] = i[k], True

@@ -79,11 +79,13 @@ def _training(checkpoint: Mapping[str, Any]) -> list[str]:
     loss = ", ".join(f"{k} {Path(v).name if k == 'descriptor' else v}" for k, v in checkpoint["loss"].items())
     last = losses[-100:]
     limits = ", ".join(f"{k} {v}" for k, v in data["limits"].items())
+    scenes = ", ".join(f"{count} of {family}" for family, count in data.get("scenes", {}).items())
     return [
         "| origin | trained by this project from random weights, scripts/train_patch_network.py |",
         f"| photographs | {photographs} |",
         f"| patches | {data['patches']} of {data['points']} points, found independently by DoG and Hessian in"
-        f" {data['views']} random views of each photograph ({limits}) with changes of light, blur, noise and JPEG |",
+        f" {data['views']} random views of each photograph ({limits}) with changes of light, blur, noise and JPEG"
+        f"{f', and in as many photographs of each rendered scene ({scenes})' if scenes else ''} |",
         f"| loss | {loss} |",
         f"| run | {checkpoint['step']} steps of {o['batch']} points, {checkpoint['seconds'] / 60:.0f} minutes, "
         f"{o['optimizer']}, learning rate {o['learning_rate']} falling linearly to zero, seed {o['seed']}, "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import multiprocessing
 import os
@@ -19,8 +20,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.data.images import read_image
+from fmtorch.data.rendered.generate import Task
 from fmtorch.training.correspondences import CONTEXT_SIZE, Tolerance, corresponding_patches
 from fmtorch.training.photographs import Photograph
+from fmtorch.training.scenes import draw_patches
 from fmtorch.training.warps import ViewRange
 
 
@@ -72,24 +75,28 @@ def build_store(
     limits: ViewRange | None = None,
     tolerance: Tolerance | None = None,
     longest_side: int = 1024,
+    scenes: Sequence[Task] = (),
     workers: int = 1,
 ) -> PatchStore:
-    """Cut corresponding patches from photographs into `folder`, which appears only when it is complete.
+    """Cut corresponding patches from photographs and rendered scenes into `folder`, which appears once it is complete.
 
-    A photograph's patches depend on the seed and its place in the list alone. Raises FileExistsError if it exists.
+    A photograph's patches depend on the seed and its place in the list alone, a scene's on the seed and the scene.
+    Raises FileExistsError if the folder exists.
     """
     folder = Path(folder)
     if folder.exists():
         raise FileExistsError(f"{folder} exists; delete it to cut the patches again")
     limits, tolerance = limits or ViewRange(), tolerance or Tolerance()
     options = {"views": views, "points": points, "limits": limits, "tolerance": tolerance}
-    jobs = [(photograph.path, (seed, i), longest_side, options) for i, photograph in enumerate(photographs)]
+    photograph_jobs = [(photograph.path, (seed, i), longest_side, options) for i, photograph in enumerate(photographs)]
+    scene_jobs = [(task, (seed, len(photographs) + i), points, tolerance) for i, task in enumerate(scenes)]
     unfinished = folder.with_name(f"{folder.name}.{os.getpid()}.tmp")
     unfinished.mkdir(parents=True)
     try:
         first, total = [np.zeros(1, np.int64)], 0
         with open(unfinished / "patches.raw", "wb") as raw, multiprocessing.get_context("spawn").Pool(workers) as pool:
-            for patches, point in pool.imap(_patches_of, jobs):
+            cutting = pool.imap(_patches_of, photograph_jobs), pool.imap(draw_patches, scene_jobs)
+            for patches, point in itertools.chain(*cutting):
                 raw.write(patches.tobytes())
                 first.append(total + np.cumsum(np.bincount(point)) if len(point) else np.zeros(0, np.int64))
                 total += len(patches)
@@ -100,9 +107,13 @@ def build_store(
         sources: dict[str, int] = {}
         for photograph in photographs:
             sources[photograph.source] = sources.get(photograph.source, 0) + 1
+        families: dict[str, int] = {}
+        for task in scenes:
+            families[task.family] = families.get(task.family, 0) + 1
         description = {
-            "points": sum(len(f) for f in first) - 1, "patches": total, "photographs": sources, "seed": seed,
-            "views": views, "limits": dataclasses.asdict(limits), "tolerance": dataclasses.asdict(tolerance),
+            "points": sum(len(f) for f in first) - 1, "patches": total, "photographs": sources, "scenes": families,
+            "seed": seed, "views": views,
+            "limits": dataclasses.asdict(limits), "tolerance": dataclasses.asdict(tolerance),
         }  # fmt: skip
         (unfinished / "store.json").write_text(json.dumps(description, indent=1))
         unfinished.rename(folder)
