@@ -61,11 +61,12 @@ def position_agreement(
 def _agreement(rows: Float[Tensor, "5 b n"], sound: Bool[Tensor, "b n"]) -> Float[Tensor, "b n"]:
     """The agreement of matches x0, y0, x1, y1, vote along all curves in both images at once."""
     orders = curve_orders(rows[0:2].detach(), rows[2:4].detach(), sound, CURVES)
+    orders = orders[..., : max(int(sound.sum(1).max()), 1)]  # what is not sound stands last
     along = rows[:, None].expand(-1, len(orders), -1, -1).gather(3, orders.expand(len(rows), -1, -1, -1))
     S = common_similarity(along[:, 0].detach(), along[:, len(CURVES)].detach(), sound.sum(1))
     S = Similarity(*(value.repeat(len(orders), 1) for value in S))
     sums = torch.stack(_along_curve(along.flatten(1, 2), S)).reshape(2, *orders.shape)
-    found = torch.zeros_like(sums).scatter(3, orders.expand(2, -1, -1, -1), sums)
+    found = sums.new_zeros(*sums.shape[:3], sound.shape[1]).scatter(3, orders.expand(2, -1, -1, -1), sums)
     agreement, votes = component_sum(found, 1)
     return torch.where(sound, agreement / votes.clamp_min(torch.finfo(votes.dtype).tiny), 0)
 

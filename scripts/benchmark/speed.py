@@ -12,6 +12,7 @@ import json
 import platform
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument("--peers", nargs="*", default=["poselib", "opencv_usac_magsac"], help="the ratios' reference")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--workers", type=int, help="also pairs a second of so many threads over batches, by the clock")
     parser.add_argument("--compile", action="store_true", help="add each engine preset again, with torch.compile")
     parser.add_argument("--json", type=Path, help="write the figures here")
     parser.set_defaults(run=run)
@@ -87,6 +89,12 @@ def run(arguments: argparse.Namespace) -> None:
         }
         for spec in specs
     }
+    if arguments.workers:
+        for spec, run_one in methods.items():
+            for name, workers in (("alone_pairs_s", 1), ("workers_pairs_s", arguments.workers)):
+                figures[spec][name] = len(pairs) / min(
+                    shared_seconds(run_one, batches, workers) for _ in range(arguments.repeats)
+                )
     report(figures, arguments.peers)
     if arguments.json:
         machine = {"processor": platform.processor() or platform.machine(), "torch": torch.__version__}
@@ -102,6 +110,15 @@ def seconds(call: Callable[[Correspondences], Any], c: Correspondences) -> float
     return clock() - start
 
 
+def shared_seconds(call: Callable[[Correspondences], Any], batches: list[Correspondences], workers: int) -> float:
+    """The time by the clock until so many threads have done all batches."""
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(lambda batch: None, range(workers)))  # the threads are there
+        start = time.perf_counter()
+        list(pool.map(call, batches))
+        return time.perf_counter() - start
+
+
 def report(figures: dict[str, dict[str, float]], peers: list[str]) -> None:
     table = Table(title="milliseconds a pair")
     table.add_column("estimator")
@@ -112,3 +129,9 @@ def report(figures: dict[str, dict[str, float]], peers: list[str]) -> None:
         first = f"{f['first_call_s']:.1f} s"
         table.add_row(spec, f"{f['ms_median']:.2f}", f"{f['ms_mean']:.2f}", f"{f['ms_batch']:.2f}", first, *ratios)
     console.print(table)
+    if "workers_pairs_s" in next(iter(figures.values())):
+        table = Table("estimator", "pairs a second, one worker", "all workers", "gain", title="threads over batches")
+        for spec, f in figures.items():
+            alone, together = f["alone_pairs_s"], f["workers_pairs_s"]
+            table.add_row(spec, f"{alone:.1f}", f"{together:.1f}", f"{together / alone:.2f}")
+        console.print(table)
