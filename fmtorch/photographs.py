@@ -58,7 +58,7 @@ def match(
     image0: Path | str | Image,
     image1: Path | str | Image,
     *,
-    pipeline: str | Pipeline = "sift_gms",
+    pipeline: str | Pipeline = "hesaffnet_fmtorch",
     device: torch.device | str | None = None,
     longest_side: int = 1600,
     seed: int = 0,

@@ -250,18 +250,18 @@ def test_the_command(tmp_path: Path) -> None:
     done = run_python("-m", "fmtorch.match", "image0=a.png", "image1=b.webp", "truth=F.txt", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "RuntimeWarning" not in done.stderr
-    for told in ("sift_gms", "one_to_one", "inliers", "seconds", "NSGD", "matches/a-b"):
+    for told in ("hesaffnet_fmtorch", "one_to_one", "inliers", "seconds", "NSGD", "matches/a-b"):
         assert told in done.stdout
     folder = tmp_path / "matches" / "a-b"
     assert {path.name for path in folder.iterdir()} == {"result.json", "matches.png", "pruning.png", "epipolar.png"}
     assert {path.name for path in tmp_path.iterdir()} == {"a.png", "b.webp", "F.txt", "matches", "cache"}
     report = json.loads((folder / "result.json").read_text())
-    assert report["pipeline"] == "sift_gms"
+    assert report["pipeline"] == "hesaffnet_fmtorch"
     assert report["overrides"] == []
     assert report["size0"] == report["size1"] == [480, 640]
     assert report["reason"] == ""
     assert report["nsgd"] < 0.01
-    kept = report["matches"]["gms"]
+    kept = report["matches"]["frame_consistency"]
     assert np.shape(report["x0"]) == np.shape(report["x1"]) == (kept, 2)
     assert len(report["ratio"]) == len(report["inliers"]) == kept
     assert max(report["ratio"]) < 0.8
@@ -273,7 +273,7 @@ def test_the_command(tmp_path: Path) -> None:
 
     # Without F, into the same folder: a picture, the reason, status 0, and nothing left of the earlier pair.
     cv2.imwrite(str(tmp_path / "flat.png"), np.full((300, 20), 90, np.uint8))
-    other = ("image1=flat.png", f"output={folder}", "pruner=[ratio]")
+    other = ("image1=flat.png", f"output={folder}", "pipeline=sift_gms", "pruner=[ratio]")
     done = run_python("-m", "fmtorch.match", "image0=a.png", *other, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "sift_gms pruner=[ratio]: a.png, flat.png" in done.stdout
