@@ -115,12 +115,13 @@ class FrameConsistency:
 
     def __call__(self, c: Correspondences) -> Correspondences:
         """The same matches with a prior."""
-        return ungraphed(c, lambda: self._with_prior(c))
-
-    def _with_prior(self, c: Correspondences) -> Correspondences:
         if c.lafs0 is None or c.lafs1 is None or c.quality is None:
             return c
-        w = frame_agreement(c.x0, c.x1, c.lafs0, c.lafs1, c.quality, c.mask) + self.floor
-        quality = torch.where(c.mask, c.quality, 1)
+        frames0, frames1, ratio = c.lafs0, c.lafs1, c.quality
+        return ungraphed(c, lambda: self._with_prior(c, frames0, frames1, ratio))
+
+    def _with_prior(self, c: Correspondences, lafs0: Tensor, lafs1: Tensor, ratio: Tensor) -> Correspondences:
+        w = frame_agreement(c.x0, c.x1, lafs0, lafs1, ratio, c.mask) + self.floor
+        quality = torch.where(c.mask, ratio, 1)
         odds = self.odds * w * w * w / (1 + self.slope * quality).square()
         return c.replace(prior=torch.where(c.mask, odds / (1 + odds), 0))
