@@ -87,7 +87,7 @@ def _passes(
 def _cost(points: Float[Tensor, "2 n 2"], members: Int[Tensor, " m"], K: int, tau: float) -> Float[Tensor, " n"]:
     """Sum over the three neighbourhood sizes, between 0 and 3; the neighbours are among the members."""
     near0, near1 = (_among(members, nearest_points(x, x[members], K + 3)) for x in points)
-    rank = torch.arange(K + 3, dtype=torch.uint8, device=points.device)
+    rank = torch.arange(K + 3, dtype=torch.int16, device=points.device)
     place = ((near0[:, :, None] == near1[:, None, :]) * rank).amax(-1)  # of a neighbour in near1; 0: nowhere
     place.masked_fill_(near0 < 0, 0)
     differs = _differs(points[1] - points[0], near0, tau)

@@ -93,6 +93,14 @@ def test_equals_the_definition(n: int, neighbors: tuple[int, int]) -> None:
     np.testing.assert_array_equal(found[0], expected)
 
 
+def test_neighbourhoods_may_be_large() -> None:
+    x0, x1 = moving(3, 300)
+    expected = reference(x0.numpy(), x1.numpy(), (0.8, 0.8), (260, 6), (0.2, 0.2))
+    found = lpm(x0[None], x1[None], neighbors=(260, 6), thresholds=(0.8, 0.8))
+    assert 0 < expected.sum() < 300
+    np.testing.assert_array_equal(found[0], expected)
+
+
 def test_keeps_a_common_motion_and_drops_scattered_matches() -> None:
     x0, x1 = moving(0, 1000, outliers=0.5)
     turn = torch.tensor([[0.95, 0.2], [-0.2, 0.95]], dtype=torch.float64)

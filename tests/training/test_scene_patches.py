@@ -9,7 +9,7 @@ import numpy as np
 
 from fmtorch.data.rendered.cameras import Camera, calibration, fundamental, look_at
 from fmtorch.data.rendered.generate import Plan, Task
-from fmtorch.training.correspondences import SAME_PLACE, Tolerance, near
+from fmtorch.training.correspondences import Tolerance, near
 from fmtorch.training.patch_store import PatchStore, build_store
 from fmtorch.training.scenes import View, linked, patches_of_scene, training_scenes, transferred
 
@@ -106,7 +106,6 @@ def test_points_are_linked_once_and_are_not_near_each_other() -> None:
             one, other = mine[seen][i], theirs[j]
             # What is as near as one point can be is one point, but for what chance put between two of them.
             assert (one == other)[(one >= 0) & (other >= 0)].mean() > 0.97
-    assert SAME_PLACE.distance > Tolerance().distance
 
 
 def test_patches_of_a_scene(tmp_path: Path) -> None:
