@@ -46,7 +46,7 @@ class HypothesizeAndVerify:
     """A robust estimator of fundamental matrices, batched over pairs.
 
     solver: minimal solver, `seven_point` or `eight_point`.
-    sampler: `uniform` or `prior`. score: `inlier_count`, `msac`, `prior_msac` or `median`.
+    sampler: `uniform` or `prior`. score: a name of `parts.SCORES`.
     threshold: Sampson distance in pixels up to which a match supports a model (unused by `median`).
     hypotheses: minimal samples drawn at most. round: samples between two looks at the stopping rule; without one,
     rounds of `UNSTOPPED_ROUND` at least.
@@ -58,12 +58,12 @@ class HypothesizeAndVerify:
     pool: the best models that are kept to the end. local_optimization: of the pool, `graph_cut` or null: none.
     refine: robust kernel of the Levenberg-Marquardt refinement of the pool (`truncated`, `cauchy`, ...), null: none;
     refine_threshold: its scale, Sampson distance in pixels; refine_iterations: its steps. choice: by which score the
-    estimate is chosen from the refined pool, `score` (the search's own), `saturated` (gains saturate in each cell of
-    a grid) or `focal` (the same, with a prior on the focal length: for whole photographs, not crops; `saturated` where
+    estimate is chosen from the refined pool, `score` (the search's own), `saturated` (gains saturate in each cell of a
+    grid) or `focal` (the same, with a prior on the focal length: for whole photographs, not crops; `saturated` where
     the image sizes are unknown); choice_threshold: of the last two, Sampson distance in pixels, null: the score's;
-    choice_iterations: steps of the refinement that `focal` makes.
-    refine_matches: at most so many matches for refinement and choice, drawn by the pair's key from those within REACH
-    refine_thresholds of a model of the pool; null: all matches.
+    choice_pool, choice_iterations: candidates and steps of the refinement that `focal` makes.
+    refine_matches: refinements look at so many matches at most, drawn by the pair's key from those within REACH
+    refine_thresholds of a model of the pool; null: at all.
     inliers: `threshold`, `lmeds` (2.5 robust standard deviations) or `median` (the better half).
     inlier_threshold: of the inliers reported, Sampson distance in pixels; null: the score's threshold.
     final: `least_squares` (8-point on the inliers), `gauss_newton` (one attached step), `adaptive` (refined at the
@@ -99,6 +99,7 @@ class HypothesizeAndVerify:
         refine_matches: int | None = None,
         choice: str = "score",
         choice_threshold: float | None = None,
+        choice_pool: int = 12,
         choice_iterations: int = 12,
         inliers: str = "threshold",
         inlier_threshold: float | None = None,
@@ -113,8 +114,10 @@ class HypothesizeAndVerify:
         self.solver = part("solver", solver, SOLVERS)()
         self.sampler = part("sampler", sampler, SAMPLERS)()
         self.score = part("score", score, SCORES)(threshold)
+        self.coarse = getattr(self.score, "unsaturated", self.score)
         if compile:
-            self.score = compiled(self.score)
+            self.coarse = compiled(self.coarse)
+            self.score = self.coarse if self.coarse is self.score else compiled(self.score)
         self.inlier_threshold = threshold if inlier_threshold is None else inlier_threshold
         self.hypotheses, self.confidence = hypotheses, confidence
         self.round = round if confidence is not None else max(round, UNSTOPPED_ROUND)
@@ -133,7 +136,7 @@ class HypothesizeAndVerify:
         self.choice = (
             None
             if choice == "score"
-            else part("choice", choice, CHOICES)(choice_threshold or threshold, choice_iterations)
+            else part("choice", choice, CHOICES)(choice_threshold or threshold, choice_iterations, choice_pool)
         )
         self.inlier_rule = part("inliers", inliers, INLIER_RULES)(self.inlier_threshold)
         self.final = part("final", final, FINAL_FITS)()
@@ -168,18 +171,16 @@ class HypothesizeAndVerify:
 
     def _choose(self, search: _Search, problem: Problem) -> Float[Tensor, "9 p"]:
         """The best of the pool, once optimised and refined, by the score of the choice; float64."""
-        F = search.F.to(torch.float64)
         if self.local_optimization is None and self.refinement is None and self.choice is None:
-            return F[:, :, 0]
+            return search.F[:, :, 0].to(torch.float64)
+        F, alive = search.F.to(torch.float64), torch.isfinite(search.score)
         if self.local_optimization is not None:
             F = self.local_optimization(F, problem)
-        if self.refine_matches is not None:
-            problem = self._near(search.F, problem, self.refine_matches)
+        near = problem if self.refine_matches is None else self._near(search.F, problem, self.refine_matches)
         if self.refinement is not None:
-            F = self.refinement(F, problem)
-        alive = torch.isfinite(search.score)
+            F = self.refinement(F, near)
         if self.choice is not None:
-            return self.choice(F, problem, alive)
+            return self.choice(F, problem, near, alive)
         score = score_models(self.score, F.to(torch.float32), problem, problem.points.to(torch.float32))
         return best_of(F, score, alive)
 
@@ -235,7 +236,7 @@ class HypothesizeAndVerify:
         """The valid models and their scores, the weaker ones dropped after a look at the `subset` of matches."""
         F, valid = _front(F, valid)
         if subset is not None and F.shape[2] > self.survivors:
-            coarse = score_models(self.score, F, problem, points, subset, valid)
+            coarse = score_models(self.coarse, F, problem, points, subset, valid)
             order = torch.sort(coarse, dim=1, descending=True, stable=True).indices[:, : self.survivors]
             order = torch.sort(order, dim=1).values  # back in the order of the draws, which breaks ties
             F, valid = F.gather(2, order.expand(9, -1, -1)), valid.gather(1, order)

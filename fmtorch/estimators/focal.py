@@ -17,8 +17,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.estimators.choice import SaturatedGain, best_of
+from fmtorch.estimators.choice import best_of, ranked
 from fmtorch.estimators.problem import Problem
+from fmtorch.estimators.scoring import SaturatedGains, score_models
 from fmtorch.geometry.rank2 import complement
 from fmtorch.geometry.rank2_manifold import start, unit
 from fmtorch.geometry.reduce import component_sum
@@ -29,12 +30,14 @@ USUAL_FOCAL = 1.2  # median focal length in units of the longer image side
 FOCAL_DEVIATION = 0.4  # of its logarithm, averaged over the two images
 RATIO_DEVIATION = 0.3  # of the logarithm of the two focal lengths' ratio
 SIGMA = 0.3  # px, standard deviation of an inlier's Sampson distance
+SCALE = 0.7  # px, Sampson distance at which an inlier's cost is half of what a squared one would be
 # Share of the best gain without prior that gain minus prior cost must reach; chosen on castle-P19, fox, crops of them.
 GATE = 0.94
 # A pair is open, and the prior is asked, where a candidate of RIVAL of the best gain is further from the best one than
 # SAME: 1 - |cosine| of the two as vectors.
 RIVAL, SAME = 0.85, 1e-3
 ITERATIONS = 12  # Levenberg-Marquardt steps
+MOST = 12  # candidates that are refined
 SHORTEST, LONGEST = 0.25, 5.0  # focal lengths outside are not believed at the start
 DAMPING, SMALLEST_DAMPING, LARGEST_DAMPING = 1e-3, 1e-9, 1e6
 
@@ -43,18 +46,20 @@ class FocalPrior:
     """Refines each candidate as a maximum a posteriori over E and two focal lengths and chooses among these.
 
     Asked only of pairs that are open: where all good candidates are one and the same model, that is the estimate.
-    The estimate is the refined candidate with the largest gain (`SaturatedGain`) minus prior cost if that reaches GATE
+    The estimate is the refined candidate with the largest gain (`SaturatedGains`) minus prior cost if that reaches GATE
     of the largest gain without prior; otherwise, and where there are no image sizes, the model of the latter.
-    threshold: Sampson distance of the gain and of the truncated cost, px. iterations: Levenberg-Marquardt steps.
+    scale: of the gain, px. iterations: Levenberg-Marquardt steps. most: candidates refined, those of the largest gain.
     """
 
-    def __init__(self, threshold: float, iterations: int = ITERATIONS) -> None:
-        self.threshold, self.iterations = threshold, iterations
-        self.gain = SaturatedGain(threshold)
+    def __init__(self, scale: float, iterations: int = ITERATIONS, most: int = MOST) -> None:
+        self.iterations, self.most = iterations, most
+        self.gain = SaturatedGains(scale)
 
-    def __call__(self, F: Float[Tensor, "9 p k"], problem: Problem, alive: Bool[Tensor, "p k"]) -> Float[Tensor, "9 p"]:
+    def __call__(
+        self, F: Float[Tensor, "9 p k"], problem: Problem, near: Problem, alive: Bool[Tensor, "p k"]
+    ) -> Float[Tensor, "9 p"]:
         """As `Choice`."""
-        gain = torch.where(alive, self.gain.score(F, problem), -torch.inf)
+        gain = torch.where(alive, score_models(self.gain, F, problem, problem.points), -torch.inf)
         plain = best_of(F, gain, alive)
         if problem.size0 is None or problem.size1 is None:
             return plain
@@ -63,24 +68,27 @@ class FocalPrior:
         (open_,) = rival.any(1).nonzero(as_tuple=True)
         if not len(open_):
             return plain
-        return plain.index_copy(1, open_, self._chosen(F[:, open_], problem[open_], alive[open_], gain[open_]))
+        F, gain = ranked(F[:, open_], gain[open_], self.most)
+        return plain.index_copy(1, open_, self._chosen(F, gain, problem.only(open_), near.only(open_)))
 
     def _chosen(
-        self, F: Float[Tensor, "9 p k"], problem: Problem, alive: Bool[Tensor, "p k"], gain: Float[Tensor, "p k"]
+        self, F: Float[Tensor, "9 p k"], gain: Float[Tensor, "p k"], problem: Problem, near: Problem
     ) -> Float[Tensor, "9 p"]:
-        focal, prior = refine_focal(F, problem, self.threshold, self.iterations)
-        posterior = torch.where(alive, self.gain.score(focal, problem) - prior, -torch.inf).nan_to_num(nan=-torch.inf)
-        plain = best_of(F, gain, alive)
-        return torch.where(posterior.amax(1) >= GATE * gain.amax(1), best_of(focal, posterior, alive), plain)
+        """The estimates, of models by descending gain, minus infinity where there is none."""
+        focal, prior = refine_focal(F, near, self.iterations)
+        posterior = (score_models(self.gain, focal, problem, problem.points) - prior).nan_to_num(nan=-torch.inf)
+        posterior = torch.where(torch.isfinite(gain), posterior, -torch.inf)
+        chosen = ranked(focal, posterior, 1)[0][..., 0]
+        return torch.where(posterior.amax(1) >= GATE * gain[:, 0], chosen, F[..., 0])
 
 
 def refine_focal(
-    F: Float[Tensor, "9 p k"], problem: Problem, threshold: float, iterations: int = ITERATIONS
+    F: Float[Tensor, "9 p k"], problem: Problem, iterations: int = ITERATIONS
 ) -> tuple[Float[Tensor, "9 p k"], Float[Tensor, "p k"]]:
-    """Models of least ``sum P min(r^2, threshold^2) / (2 SIGMA^2) + prior(f0, f1)``, and their prior costs.
+    """Models of least ``sum P rho(r) / (2 SIGMA^2) + prior(f0, f1)``, and their prior costs.
 
-    r is the Sampson distance in pixels. The sizes of the problem must be known. A model that is not finite comes back
-    as something that is not, with a prior cost of infinity.
+    r is the Sampson distance in pixels, rho the loss of Geman & McClure at SCALE. The sizes of the problem must be
+    known. A model that is not finite comes back as something that is not, with a prior cost of infinity.
     """
     assert problem.size0 is not None
     assert problem.size1 is not None
@@ -90,7 +98,7 @@ def refine_focal(
         offset = ((problem.centre - (middle - 1) / 2) / problem.unit[:, None]).T
         points = problem.points + offset[..., None]
         longest = torch.stack([problem.size0.amax(-1), problem.size1.amax(-1)]).to(torch.float64) / problem.unit
-        objective = _Objective(problem, points, longest, threshold)
+        objective = _Objective(problem, points, longest)
         shifted = _translated(F, -offset)
         state = objective.at(*_start(shifted, longest), True)
         damping = torch.full_like(state.cost, DAMPING)
@@ -131,9 +139,9 @@ class _State:
 class _Objective:
     """The negative logarithm of the posterior, with its derivatives by five rotations and two log focal lengths."""
 
-    def __init__(self, problem: Problem, points: Tensor, longest: Tensor, threshold: float) -> None:
+    def __init__(self, problem: Problem, points: Tensor, longest: Tensor) -> None:
         weight = problem.live.to(torch.float64) if problem.prior is None else problem.prior
-        self.data = Objective(points, weight, KERNELS["truncated"], threshold / problem.unit)
+        self.data = Objective(points, weight, KERNELS["geman_mcclure"], SCALE / problem.unit)
         self.precision = (problem.unit / SIGMA).square()[:, None]
         self.longest = longest
         # Of the derivatives of E by rotations of U about its three axes and of V about the first two.

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.estimators.choice import Choice, SaturatedGain
+from fmtorch.estimators.choice import Choice, SaturatedChoice
 from fmtorch.estimators.focal import FocalPrior
 from fmtorch.estimators.problem import Problem
 from fmtorch.estimators.sampling import PriorWeighted, Prosac, Sampler, Uniform
@@ -17,6 +17,7 @@ from fmtorch.estimators.scoring import (
     GemanMcClure,
     InlierCount,
     Median,
+    SaturatedGains,
     Score,
     SigmaConsensus,
     TruncatedSquares,
@@ -145,6 +146,8 @@ SCORES: dict[str, Callable[[float], Score]] = {
     "prior_msac": lambda threshold: TruncatedSquares(threshold, prior_weighted=True),
     "geman_mcclure": GemanMcClure,
     "prior_geman_mcclure": lambda threshold: GemanMcClure(threshold, prior_weighted=True),
+    "saturated": lambda threshold: SaturatedGains(threshold, prior_weighted=False),
+    "prior_saturated": SaturatedGains,
     "magsac": SigmaConsensus,
     "median": lambda threshold: Median(),
 }
@@ -153,7 +156,7 @@ INLIER_RULES: dict[str, Callable[[float], Callable[[Tensor, Problem], Tensor]]] 
     "median": BetterHalf,
     "lmeds": RobustDeviations,
 }
-CHOICES: dict[str, Callable[[float, int], Choice]] = {
-    "saturated": lambda threshold, iterations: SaturatedGain(threshold),
+CHOICES: dict[str, Callable[[float, int, int], Choice]] = {
+    "saturated": lambda scale, iterations, most: SaturatedChoice(scale),
     "focal": FocalPrior,
 }

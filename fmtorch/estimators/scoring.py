@@ -1,7 +1,7 @@
 """How good a hypothesis is: the residual of every match under every model, turned into one number a model.
 
-Per-match gains are multiples of 2^-10, so their float32 sums are exact (up to 16,384 matches; coarser beyond) and no
-tile size, padding or batch can change a score. Larger is better.
+Per-match gains are rounded to few fractional bits, so that their sums are exact and no tile size, padding or batch can
+change a score. Larger is better.
 """
 
 from __future__ import annotations
@@ -17,6 +17,9 @@ from fmtorch.geometry.sigma_consensus import marginal_loss
 
 CPU_TILE = 1 << 18  # elements of one tile: 1 MB of float32, so that the handful of buffers stay in the L2 cache
 GPU_TILE = 1 << 26
+GEMAN_MCCLURE_REACH = 5.0  # scales from which on that gain is zero
+GRID = 12  # cells along each side of each image, of saturated gains
+VECTORS = 128  # bytes that a processor computes on together, at most: two vectors
 LANES = 64  # matches are scored in multiples of it: whole vectors of the processor
 
 
@@ -26,8 +29,12 @@ def sampson_squared(F: Float[Tensor, "9 p m"], points: Float[Tensor, "4 p n"]) -
     Written with in-place products of a column and a row, which torch vectorises, instead of matrix products, whose
     last bits depend on the shape of the batch. Hartley & Zisserman (2004), equation 11.9.
     """
-    f = F[..., None]
-    x0, y0, x1, y1 = points[:, :, None]
+    return _sampson(F[..., None], points[:, :, None])
+
+
+def _sampson(f: Tensor, points: Tensor) -> Tensor:
+    """As `sampson_squared`, of the nine entries of models and the four of points, which broadcast."""
+    x0, y0, x1, y1 = points
     a0 = (f[0] * x0).addcmul_(f[1], y0).add_(f[2])  # F x0: the epipolar line in image 1
     b0 = (f[3] * x0).addcmul_(f[4], y0).add_(f[5])
     error = (f[6] * x0).addcmul_(f[7], y0).add_(f[8]).addcmul_(a0, x1).addcmul_(b0, y1)
@@ -36,6 +43,12 @@ def sampson_squared(F: Float[Tensor, "9 p m"], points: Float[Tensor, "4 p n"]) -
     slope: Tensor = a0.square_().addcmul_(b0, b0).addcmul_(a1, a1).addcmul_(b1, b1)
     distance: Tensor = error.square_().div_(slope.clamp_min_(torch.finfo(slope.dtype).tiny))
     return distance
+
+
+def geman_mcclure_gain(squared: Tensor) -> Tensor:
+    """``1 / (1 + r^2)`` of squared residuals, shifted and scaled to be 0 from r = GEMAN_MCCLURE_REACH on, in place."""
+    rest = 1 / (1 + GEMAN_MCCLURE_REACH**2)
+    return squared.add_(1).reciprocal_().sub_(rest).clamp_min_(0).mul_(1 / (1 - rest))
 
 
 @runtime_checkable
@@ -58,6 +71,11 @@ class Score(Protocol):
         ...
 
 
+def _check_threshold(threshold: float) -> None:
+    if not threshold > 0:
+        raise ValueError(f"threshold is {threshold}; it is a distance in pixels and must be positive")
+
+
 class SummedGains:
     """A score that is the sum over matches of a gain, from 1 at no residual to 0, times P(inlier) if so asked.
 
@@ -65,8 +83,7 @@ class SummedGains:
     """
 
     def __init__(self, threshold: float, prior_weighted: bool = False) -> None:
-        if not threshold > 0:
-            raise ValueError(f"threshold is {threshold}; it is a distance in pixels and must be positive")
+        _check_threshold(threshold)
         self.threshold = float(threshold)
         self.prior_weighted = prior_weighted
 
@@ -102,11 +119,53 @@ class GemanMcClure(SummedGains):
     larger noise still count, so that one scale serves scenes of different noise.
     """
 
-    REACH = 5.0
-
     def _gain(self, squared: Float[Tensor, "p m n"]) -> Float[Tensor, "p m n"]:
-        rest = 1 / (1 + self.REACH**2)
-        return squared.add_(1).reciprocal_().sub_(rest).clamp_min_(0).mul_(1 / (1 - rest))
+        return geman_mcclure_gain(squared)
+
+
+class SaturatedGains:
+    """The sum over grid cells of ``sqrt(sum of P g(r))``, over both images; g is the gain of Geman & McClure.
+
+    Saturates where matches crowd, so that a model which explains the whole image beats one that explains a single
+    textured plane. The narrow peak of g tells exact models from those nearby, and its tail lets one scale serve scenes
+    of different noise. The grid is that of the box around the matches of weight.
+    threshold: the scale, at which a match counts half, Sampson distance, px. unsaturated: the plain sum of g, for a
+    first look at few matches.
+    """
+
+    def __init__(self, threshold: float, prior_weighted: bool = True) -> None:
+        _check_threshold(threshold)
+        self.threshold = float(threshold)
+        self.prior_weighted = prior_weighted
+        self.unsaturated = GemanMcClure(threshold, prior_weighted)
+
+    def __call__(self, F: Tensor, points: Tensor, weight: Tensor, unit: Tensor) -> Tensor:
+        """As `Score`."""
+        (p, n), m = weight.shape, F.shape[2]
+        whole = VECTORS // F.element_size()  # so many models at a time: the rest would be rounded differently
+        F = torch.nn.functional.pad(F, (0, -m % whole))
+        bits = _fractional_bits(n, F.dtype)
+        scale = (unit / self.threshold).square().to(F.dtype)[:, None, None]
+        r2 = _sampson(F[:, :, None], points[..., None]).mul_(scale)  # (p, n, m): rows of models are added to a cell
+        gain = _rounded(geman_mcclure_gain(r2).mul_(weight[..., None]), bits).flatten(0, 1)
+        first = GRID * GRID * torch.arange(p, device=F.device)[:, None]
+        total = torch.zeros_like(F[0])
+        for image in (points[:2], points[2:]):
+            cell = (_cells(image, weight > 0) + first).flatten()
+            sums = gain.new_zeros(p * GRID * GRID, F.shape[2]).index_add_(0, cell, gain)
+            total += _rounded(sums.sqrt_(), bits).view(p, GRID * GRID, -1).sum(1)
+        return total[:, :m].nan_to_num_(0)
+
+
+def _cells(points: Float[Tensor, "2 p n"], live: Bool[Tensor, "p n"]) -> Int[Tensor, "p n"]:
+    """The cell of each point in a grid over the live points' bounding box."""
+    low = torch.where(live, points, torch.inf).amin(-1, keepdim=True)
+    high = torch.where(live, points, -torch.inf).amax(-1, keepdim=True)
+    share = (points - low) / (high - low).clamp_min(torch.finfo(points.dtype).tiny)
+    x: Tensor
+    y: Tensor
+    x, y = (share * GRID).nan_to_num(0).clamp(0, GRID - 1).to(torch.int64)
+    return y * GRID + x
 
 
 class SigmaConsensus(SummedGains):
@@ -154,13 +213,19 @@ def median_rank(count: Tensor) -> Tensor:
 
 
 def _exact_sum(gain: Float[Tensor, "p m n"]) -> Float[Tensor, "p m"]:
-    """Sum over matches of gains in [0, 1], each first rounded to a multiple of 2^-10 (coarser beyond 2^14 matches).
+    """Sum over matches of gains in [0, 1], each first rounded so that the sum is exact."""
+    return _rounded(gain, _fractional_bits(gain.shape[-1], gain.dtype)).sum(-1)
 
-    Adding and subtracting 1.5 * 2^(23 - b) rounds a float32 to b fractional bits.
-    """
-    fractional_bits = min(10, 24 - (gain.shape[-1] - 1).bit_length())
-    magic = 1.5 * 2.0 ** (23 - fractional_bits)
-    return gain.add_(magic).sub_(magic).sum(-1)
+
+def _fractional_bits(count: int, dtype: torch.dtype) -> int:
+    """Of so many numbers in [0, 1], for their sums to be exact: 10 (fewer beyond 2^14 numbers), 20 in float64."""
+    return 20 if dtype == torch.float64 else min(10, 24 - (count - 1).bit_length())
+
+
+def _rounded(value: Tensor, fractional_bits: int) -> Tensor:
+    """Rounded to so many fractional bits, in place: 1.5 * 2^(23 - b) is added to a float32 and subtracted again."""
+    magic = 1.5 * 2.0 ** ((52 if value.dtype == torch.float64 else 23) - fractional_bits)
+    return value.add_(magic).sub_(magic)
 
 
 def score_models(

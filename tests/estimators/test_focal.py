@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from fmtorch.estimators import HypothesizeAndVerify
-from fmtorch.estimators.focal import FocalPrior, bougnoux, exponential, logarithm, refine_focal
+from fmtorch.estimators.focal import SCALE, FocalPrior, bougnoux, exponential, logarithm, refine_focal
 from fmtorch.estimators.problem import Problem, problems
 from fmtorch.geometry.rank2_manifold import start, unit
 from fmtorch.geometry.refine import refine_components
@@ -18,7 +18,6 @@ from tests.laws import scenes
 from tests.reference import focal as reference
 
 SIZE0, SIZE1 = (640, 960), (1000, 700)  # (h, w)
-THRESHOLD = 0.7
 
 
 def _pair(
@@ -89,17 +88,17 @@ def test_same_cost_as_scipy(seed: int) -> None:
     c, truth = _pair(seed)
     problem = _problem(c)
     x0, x1, weight = c.x0[0].numpy(), c.x1[0].numpy(), c.prior[0].numpy()  # type: ignore[index]
-    _, expected = reference.optimum(truth, x0, x1, weight, THRESHOLD, SIZE0, SIZE1)
+    _, expected = reference.optimum(truth, x0, x1, weight, SCALE, SIZE0, SIZE1)
     F = _normalised(reference.fundamental(truth, SIZE0, SIZE1), problem)
     # From the unconstrained optimum, as in the engine: focal lengths there are off, often implausible.
-    F, _ = refine_components(F, problem.points, problem.prior, "truncated", THRESHOLD / problem.unit, 10)  # type: ignore[arg-type]
-    models, prior = refine_focal(F, problem, THRESHOLD, iterations=50)
+    F, _ = refine_components(F, problem.points, problem.prior, "truncated", SCALE / problem.unit, 10)  # type: ignore[arg-type]
+    models, prior = refine_focal(F, problem, iterations=50)
     found = _pixels(models, problem)
-    r2 = reference.sampson(found, x0, x1) ** 2
-    data = (weight * np.minimum(r2, THRESHOLD**2)).sum() / (2 * 0.3**2)
-    # Truncation has local minima, but on these pairs both end in the same one, where the cost is flat: an error of the
-    # parameters enters squared, and SciPy stops within 1e-8 of the optimum.
-    assert data + float(prior) == pytest.approx(expected, rel=1e-9)
+    r = reference.sampson(found, x0, x1)
+    data = (weight * reference.loss(r, SCALE)).sum() / (2 * 0.3**2)
+    # The loss has local minima, but on these pairs both end in the same one, where the cost is flat: an error of the
+    # parameters enters squared, and SciPy stops within 1e-7 of the least cost.
+    assert data + float(prior) == pytest.approx(expected, rel=1e-7)
 
 
 @pytest.mark.parametrize("name", ["000", "010", "020"])
@@ -112,12 +111,12 @@ def test_scipy_finds_nothing_better_nearby_on_real_pairs(name: str) -> None:
         size0=torch.tensor(sizes[:1]), size1=torch.tensor(sizes[1:]),
     )  # fmt: skip
     problem, weight = _problem(c), np.ones(len(x0))
-    models, prior = refine_focal(_normalised(data[f"{name}.F_gt"], problem), problem, THRESHOLD, iterations=50)
+    models, prior = refine_focal(_normalised(data[f"{name}.F_gt"], problem), problem, iterations=50)
     found = _pixels(models, problem)
     parameters = reference.parameters_of(found, *sizes)
     assert float(prior) == pytest.approx(reference.prior_cost(*parameters[6:]), rel=1e-4)  # by way of F and Bougnoux
-    cost = reference.cost(found, parameters[6:], x0, x1, weight, THRESHOLD)
-    _, least = reference.optimum(parameters, x0, x1, weight, THRESHOLD, *sizes)
+    cost = reference.cost(found, parameters[6:], x0, x1, weight, SCALE)
+    _, least = reference.optimum(parameters, x0, x1, weight, SCALE, *sizes)
     assert cost <= least * (1 + 1e-6)
 
 
@@ -125,7 +124,7 @@ def test_no_noise_no_change() -> None:
     c, truth = _pair(1, focal=(1.2, 1.2), noise=0.0, outliers=0.0)
     problem = _problem(c)
     F = _normalised(reference.fundamental(truth, SIZE0, SIZE1), problem)
-    models, prior = refine_focal(F, problem, THRESHOLD)
+    models, prior = refine_focal(F, problem)
     # Residuals are below 1e-9 px here, so the prior's pull of a focal length of 1.2 is of the same order.
     assert float((models * F).sum().abs()) == pytest.approx(1, abs=1e-12)
     assert float(prior) < 1e-12
@@ -136,7 +135,7 @@ def test_prior_decides_between_models_that_explain_the_matches_alike() -> None:
     problem = _problem(c)
     strange = truth + np.array([0, 0, 0, 0, 0, 0, np.log(3), -np.log(3)])
     pool = torch.cat([_normalised(reference.fundamental(p, SIZE0, SIZE1), problem) for p in (strange, truth)], 2)
-    _, prior = refine_focal(pool, problem, THRESHOLD, iterations=0)
+    _, prior = refine_focal(pool, problem, iterations=0)
     assert float(prior[0, 0]) == pytest.approx(reference.prior_cost(*strange[6:]), rel=1e-9)
     assert float(prior[0, 1]) == pytest.approx(0, abs=1e-9)
 
@@ -149,7 +148,7 @@ def test_a_crop_keeps_the_model_without_prior() -> None:
     K0[:2, 2] += 4000
     R = Rotation.from_rotvec(truth[:3]).as_matrix()
     F = _normalised(np.linalg.inv(K1).T @ reference.cross_matrix(truth[3:6]) @ R @ np.linalg.inv(K0), problem)
-    chosen = FocalPrior(THRESHOLD)(F, problem, torch.ones(1, 1, dtype=torch.bool))
+    chosen = FocalPrior(0.3)(F, problem, problem, torch.ones(1, 1, dtype=torch.bool))
     assert torch.equal(chosen, F[..., 0])
 
 
@@ -168,13 +167,13 @@ def test_the_prior_is_asked_only_where_good_candidates_differ(monkeypatch: pytes
     right, other = (unit(_normalised(reference.fundamental(p, SIZE0, SIZE1), problem)) for p in (truth, turned))
     same, different = torch.cat([right, right], 2), torch.cat([right, other], 2)
     monkeypatch.setattr("fmtorch.estimators.focal.RIVAL", 0.0)  # every candidate is a good one
-    assert torch.equal(FocalPrior(THRESHOLD)(same, problem, alive), right[..., 0])
-    refined, _ = refine_focal(different, problem, THRESHOLD)
-    chosen = FocalPrior(THRESHOLD)(different, problem, alive)
+    assert torch.equal(FocalPrior(0.3)(same, problem, problem, alive), right[..., 0])
+    refined, _ = refine_focal(different, problem)
+    chosen = FocalPrior(0.3)(different, problem, problem, alive)
     assert any(torch.equal(chosen, refined[..., k]) for k in (0, 1))
     assert not torch.equal(chosen, right[..., 0])
     monkeypatch.setattr("fmtorch.estimators.focal.RIVAL", 2.0)  # none is
-    assert torch.equal(FocalPrior(THRESHOLD)(different, problem, alive), right[..., 0])
+    assert torch.equal(FocalPrior(0.3)(different, problem, problem, alive), right[..., 0])
 
 
 def test_models_that_are_not_finite_harm_no_other() -> None:
@@ -182,9 +181,9 @@ def test_models_that_are_not_finite_harm_no_other() -> None:
     problem = _problem(pair)
     good = torch.cat([_normalised(reference.fundamental(_pair(s)[1], SIZE0, SIZE1), problem) for s in (4, 5)], 1)
     bad = torch.cat([torch.full_like(good, torch.nan), torch.zeros_like(good), good], 2)
-    alone, _ = refine_focal(good, problem, THRESHOLD)
-    models, prior = refine_focal(bad, problem, THRESHOLD)
+    alone, _ = refine_focal(good, problem)
+    models, prior = refine_focal(bad, problem)
     assert torch.equal(models[:, :, 2:], alone)
     assert bool(torch.isinf(prior[:, :2]).all())
-    chosen = FocalPrior(THRESHOLD)(bad, problem, torch.tensor([[False, False, True]] * 2))
+    chosen = FocalPrior(0.3)(bad, problem, problem, torch.tensor([[False, False, True]] * 2))
     assert bool(torch.isfinite(chosen).all())

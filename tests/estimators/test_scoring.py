@@ -9,7 +9,17 @@ from scipy import integrate
 
 from fmtorch.estimators import scoring
 from fmtorch.estimators.problem import problems
-from fmtorch.estimators.scoring import GemanMcClure, InlierCount, Median, SigmaConsensus, TruncatedSquares, score_models
+from fmtorch.estimators.scoring import (
+    GEMAN_MCCLURE_REACH,
+    GRID,
+    GemanMcClure,
+    InlierCount,
+    Median,
+    SaturatedGains,
+    SigmaConsensus,
+    TruncatedSquares,
+    score_models,
+)
 from fmtorch.geometry.sigma_consensus import QUANTILE
 from tests.laws import scene
 from tests.reference import ransac as reference
@@ -20,9 +30,20 @@ SCORES = [
     TruncatedSquares(2.0, prior_weighted=True),
     GemanMcClure(2.0),
     GemanMcClure(2.0, prior_weighted=True),
+    SaturatedGains(2.0, prior_weighted=False),
+    SaturatedGains(2.0),
     Median(),
 ]
-NAMES = ["count", "msac", "prior_msac", "geman_mcclure", "prior_geman_mcclure", "median"]
+NAMES = [
+    "count",
+    "msac",
+    "prior_msac",
+    "geman_mcclure",
+    "prior_geman_mcclure",
+    "saturated",
+    "prior_saturated",
+    "median",
+]
 
 
 def _models(problem: object, count: int = 40) -> torch.Tensor:
@@ -48,9 +69,14 @@ def test_scores_equal_their_definitions(score: scoring.Score) -> None:
         elif isinstance(score, Median):
             # float32: relative error of a residual about 1e-7 times the cancellation in x1^T F x0
             np.testing.assert_allclose(-batched[m], reference.lower_median(residual**2), rtol=1e-3, atol=1e-12)
+        elif isinstance(score, SaturatedGains):
+            weights = prior if score.prior_weighted and prior is not None else np.ones(60)
+            expected = reference.saturated(pixels, points, 2.0, GEMAN_MCCLURE_REACH, GRID, weights)
+            # a root magnifies the rounding of a small sum of gains: of one that is rounded to 0 to 2^-5.5
+            assert abs(batched[m] - expected) <= 0.02 * expected + 2.0**-4
         elif isinstance(score, GemanMcClure):
             weights = prior if score.prior_weighted else None
-            expected = reference.geman_mcclure(pixels, 2.0, GemanMcClure.REACH, weights)
+            expected = reference.geman_mcclure(pixels, 2.0, GEMAN_MCCLURE_REACH, weights)
             assert abs(batched[m] - expected) <= 60 * 2.0**-11 + 1e-3
         else:
             expected = reference.msac(pixels, 2.0, prior if score.prior_weighted else None)

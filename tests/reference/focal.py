@@ -2,7 +2,7 @@
 
 Parameters: a rotation vector, the direction of the translation and two log focal lengths; with ``K = [f 0 cx; 0 f cy;
 0 0 1]`` the model is ``F = K1^-T [t]x R K0^-1``. Minimises
-``sum P min(r^2, t^2) / (2 sigma^2) + ((ln f0 - ln f1) / s1)^2 / 2 + ((mean ln f - ln usual) / s2)^2 / 2``.
+``sum P rho(r) / (2 sigma^2) + ((ln f0 - ln f1) / s1)^2 / 2 + ((mean ln f - ln usual) / s2)^2 / 2``.
 """
 
 from __future__ import annotations
@@ -56,12 +56,14 @@ def prior_cost(log_f0: float, log_f1: float) -> float:
     return ((log_f0 - log_f1) / 0.3) ** 2 / 2 + (((log_f0 + log_f1) / 2 - np.log(1.2)) / 0.4) ** 2 / 2
 
 
-def cost(
-    F: np.ndarray, focal: np.ndarray, x0: np.ndarray, x1: np.ndarray, weight: np.ndarray, threshold: float
-) -> float:
+def loss(r: np.ndarray, scale: float) -> np.ndarray:
+    """Geman & McClure's: ``r^2 s^2 / (s^2 + r^2)``."""
+    return (r * scale) ** 2 / (scale**2 + r**2)
+
+
+def cost(F: np.ndarray, focal: np.ndarray, x0: np.ndarray, x1: np.ndarray, weight: np.ndarray, scale: float) -> float:
     """The objective at F with log focal lengths `focal`."""
-    r2 = sampson(F, x0, x1) ** 2
-    return float((weight * np.minimum(r2, threshold**2)).sum() / (2 * 0.3**2)) + prior_cost(*focal)
+    return float((weight * loss(sampson(F, x0, x1), scale)).sum() / (2 * 0.3**2)) + prior_cost(*focal)
 
 
 def optimum(
@@ -69,27 +71,18 @@ def optimum(
     x0: np.ndarray,
     x1: np.ndarray,
     weight: np.ndarray,
-    threshold: float,
+    scale: float,
     size0: tuple[int, int],
     size1: tuple[int, int],
 ) -> tuple[np.ndarray, float]:
-    """The parameters of least cost near `start`, and that cost.
+    """The parameters of least cost near `start`, and that cost."""
 
-    Truncation by reweighting: least squares on the matches within the threshold, until these stay the same.
-    """
-    parameters = start
-    for _ in range(20):
-        inside = sampson(fundamental(parameters, size0, size1), x0, x1) ** 2 <= threshold**2
+    def residuals(p: np.ndarray) -> np.ndarray:
+        r = sampson(fundamental(p, size0, size1), x0, x1)
+        data = np.sqrt(weight) * scale * r / np.sqrt(scale**2 + r**2) / 0.3  # its square is the loss
+        focal = [(p[6] - p[7]) / 0.3, ((p[6] + p[7]) / 2 - np.log(1.2)) / 0.4]
+        gauge = [np.linalg.norm(p[3:6]) - 1]
+        return np.concatenate([data, focal, gauge])
 
-        def residuals(p: np.ndarray, inside: np.ndarray = inside) -> np.ndarray:
-            r = sampson(fundamental(p, size0, size1), x0, x1)
-            data = np.sqrt(weight[inside]) * r[inside] / 0.3
-            focal = [(p[6] - p[7]) / 0.3, ((p[6] + p[7]) / 2 - np.log(1.2)) / 0.4]
-            gauge = [np.linalg.norm(p[3:6]) - 1]
-            return np.concatenate([data, focal, gauge])
-
-        parameters = least_squares(residuals, parameters, xtol=1e-15, ftol=1e-15, gtol=1e-12).x
-        F = fundamental(parameters, size0, size1)
-        if np.array_equal(inside, sampson(F, x0, x1) ** 2 <= threshold**2):
-            break
-    return parameters, cost(F, parameters[6:], x0, x1, weight, threshold)
+    parameters = least_squares(residuals, start, jac="3-point", max_nfev=1000, xtol=1e-15, ftol=1e-15, gtol=1e-12).x
+    return parameters, cost(fundamental(parameters, size0, size1), parameters[6:], x0, x1, weight, scale)

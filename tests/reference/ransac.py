@@ -28,6 +28,23 @@ def geman_mcclure(residuals: np.ndarray, scale: float, reach: float, prior: np.n
     return sum(w * (1 / (1 + (r / scale) ** 2) - end) / (1 - end) for r, w in inside)
 
 
+def saturated(
+    residuals: np.ndarray, points: np.ndarray, scale: float, reach: float, cells: int, prior: np.ndarray
+) -> float:
+    """Over both images, the sum over the cells of a grid of the root of `geman_mcclure` of the matches in it.
+
+    points: (4, n), x0, y0, x1, y1. The grid is that of the matches' bounding box.
+    """
+    low, extent = points.min(1, keepdims=True), np.ptp(points, axis=1, keepdims=True)
+    cell = np.clip((points - low) / extent * cells, 0, cells - 1).astype(int)
+    total = 0.0
+    for rows in ((0, 1), (2, 3)):
+        for where in {tuple(column) for column in cell[rows, :].T}:
+            inside = (where == cell[rows, :].T).all(1)
+            total += math.sqrt(geman_mcclure(residuals[inside], scale, reach, prior[inside]))
+    return total
+
+
 def lower_median(values: np.ndarray) -> float:
     """The lower of the middle values."""
     return sorted(values)[(len(values) + 1) // 2 - 1]
