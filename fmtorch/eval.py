@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from pathlib import Path
 
@@ -31,6 +32,7 @@ from fmtorch.storage import RunFolder, identity_digest
 from fmtorch.storage.configuration import learned
 from fmtorch.storage.features import CachedFeatures
 
+MANY = 250  # pairs from which on processes are worth their start
 STAGE_GROUPS = ("features", "matcher", "pruner", "estimator")
 
 
@@ -53,8 +55,12 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
         todo = [pair for pair in chosen if pair.key not in done]
         workers = config.workers or (1 if device.type != "cpu" else os.cpu_count() or 1)
         bar = progress.add_task(pipeline_name, total=len(chosen), completed=len(chosen) - len(todo))
+        processes = len(todo) >= MANY if config.processes is None else bool(config.processes)
+        build = None
+        if processes and workers > 1 and device.type == "cpu":
+            build = functools.partial(presets.build_pipeline, config, device)
         for count in evaluate_pairs(
-            pipeline, todo, seed=config.seed, batch=config.batch, workers=workers, store=folder.append
+            pipeline, todo, seed=config.seed, batch=config.batch, workers=workers, store=folder.append, build=build
         ):
             progress.advance(bar, count)
     keys = {pair.key for pair in chosen}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -82,14 +83,23 @@ def test_a_run_from_start_to_end(root: Path, tmp_path: Path) -> None:
 
 def test_batch_and_workers_change_no_row(root: Path, tmp_path: Path) -> None:
     results = []
-    for name, extra in (("a", ["batch=1", "workers=1"]), ("b", ["batch=5", "workers=3"])):
+    variants = {
+        "a": ["batch=1", "workers=1"],
+        "b": ["batch=5", "workers=3"],
+        "c": ["batch=2", "workers=2", "processes=true", f"cache={tmp_path / 'own'}"],
+    }
+    for name, extra in variants.items():
         run = evaluate(
             "dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"run_dir={tmp_path / name}", *extra, cwd=tmp_path
         )
         assert run.returncode == 0, run.stderr
         plain = [{k: v for k, v in row.items() if not k.startswith("seconds")} for row in rows(tmp_path / name)]
         results.append(sorted(plain, key=lambda row: str(row["pair"])))
-    assert results[0] == results[1]
+        told = run.stdout
+    assert results[0] == results[1] == results[2]
+    computed = re.search(r"features of (\d+) images computed", told)
+    assert computed is not None
+    assert 4 <= int(computed[1]) <= 6  # two processes may come upon the same image at the same time
 
 
 def test_sweep_gives_each_job_a_folder(root: Path, tmp_path: Path) -> None:

@@ -1,16 +1,18 @@
-"""The loop that makes a run: batches of pairs through a pipeline on worker threads, rows stored as they come."""
+"""The loop that makes a run: batches of pairs through a pipeline by several workers, rows stored as they come."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures.process import BrokenProcessPool
 
 import torch
 
 from fmtorch.data.pairs import ImagePair
-from fmtorch.evaluation.rows import evaluate
+from fmtorch.evaluation.workers import Build, Work, Workers
 from fmtorch.pipeline import Pipeline
 from fmtorch.storage import PairRow
+from fmtorch.storage.features import CachedFeatures
 
 
 def select(pairs: Sequence[ImagePair], limit: int | None) -> list[ImagePair]:
@@ -35,38 +37,46 @@ def evaluate_pairs(
     batch: int,
     workers: int,
     store: Callable[[list[PairRow]], None],
+    build: Build | None = None,
 ) -> Iterator[int]:
     """Run and evaluate the pairs, hand each batch's rows to `store`, and yield how many pairs it held.
 
-    One thread of torch's own per worker: small operations on several contended threads collapse. Results do not
-    depend on `batch` or `workers`.
+    build: makes the same pipeline in another process: workers are then processes, otherwise threads (see `Workers`).
+    Results do not depend on `batch`, `workers` or `build`. Raises RuntimeError where a process dies.
     """
-    batches = [list(pairs[i : i + batch]) for i in range(0, len(pairs), batch)]
-
-    def work(some: list[ImagePair]) -> list[PairRow]:
-        return evaluate(pipeline.run(some, seed), seed)
-
     before = torch.get_num_threads()
     torch.set_num_threads(1)
-    executor = ThreadPoolExecutor(workers)
-    waiting: set[Future[list[PairRow]]] = set()
+    team = Workers(pipeline, workers, build)
+    waiting: set[Future[Work]] = set()
+
+    def kept(future: Future[Work]) -> int:
+        work = future.result()
+        store(work.rows)
+        if isinstance(pipeline.extractor, CachedFeatures):
+            pipeline.extractor.computed += work.computed
+            pipeline.extractor.found += work.found
+        return len(work.rows)
+
     try:
-        todo = iter(batches)
+        todo = (list(pairs[i : i + batch]) for i in range(0, len(pairs), batch))
         while True:
             for some in todo:
-                waiting.add(executor.submit(work, some))
+                waiting.add(team.submit(some, seed))
                 if len(waiting) > workers:
                     break
             if not waiting:
                 return
             finished, waiting = wait(waiting, return_when=FIRST_COMPLETED)
             for future in finished:
-                rows = future.result()
-                store(rows)
-                yield len(rows)
+                yield kept(future)
+    except BrokenProcessPool as error:
+        raise RuntimeError(
+            "a worker process ended before its time, perhaps for want of memory: the same command goes on from here; "
+            "workers=1 or processes=false need less of it"
+        ) from error
     finally:  # interrupted: what is under way is finished and kept
-        executor.shutdown(wait=True, cancel_futures=True)
+        team.close()
         for future in waiting:
             if not future.cancelled() and future.exception() is None:
-                store(future.result())
+                kept(future)
         torch.set_num_threads(before)

@@ -1,0 +1,87 @@
+"""What works on batches of pairs: threads of this process, or processes of their own.
+
+Threads share features and networks and start at once, but only one of them issues torch operations at a time: enough
+where detectors, networks and OpenCV do the work. Processes use all cores for estimators too, at some seconds and some
+hundred megabytes each.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections.abc import Callable
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import torch
+
+from fmtorch.data.pairs import ImagePair
+from fmtorch.evaluation.rows import evaluate
+from fmtorch.pipeline import Pipeline
+from fmtorch.storage import PairRow
+from fmtorch.storage.features import CachedFeatures
+
+Build = Callable[[], Pipeline]
+
+
+@dataclass(frozen=True)
+class Work:
+    """The rows of a batch; computed, found: images whose features a process computed or took from the cache for it."""
+
+    rows: list[PairRow]
+    computed: int = 0
+    found: int = 0
+
+
+class Workers:
+    """Evaluate batches of pairs, several at a time. One thread of torch's own each: contended ones collapse.
+
+    build: makes the pipeline anew in each process; it is pickled. None: threads, which share `pipeline`.
+    """
+
+    def __init__(self, pipeline: Pipeline, workers: int, build: Build | None = None) -> None:
+        self.pipeline = None if build else pipeline
+        self.executor: Executor
+        if build is None:
+            self.executor = ThreadPoolExecutor(workers)
+        else:
+            self.executor = ProcessPoolExecutor(
+                workers, multiprocessing.get_context("spawn"), initializer=_begin, initargs=(build,)
+            )
+
+    def submit(self, pairs: list[ImagePair], seed: int) -> Future[Work]:
+        """The rows of these pairs, some time."""
+        if self.pipeline is None:
+            return self.executor.submit(_in_process, pairs, seed)
+        return self.executor.submit(_work, self.pipeline, pairs, seed)
+
+    def close(self) -> None:
+        """Wait for what is under way; what has not begun is dropped."""
+        self.executor.shutdown(wait=True, cancel_futures=True)
+
+
+def _work(pipeline: Pipeline, pairs: list[ImagePair], seed: int) -> Work:
+    return Work(evaluate(pipeline.run(pairs, seed), seed))
+
+
+_mine: Pipeline | None = None  # of a process that works for another
+
+
+def _begin(build: Build) -> None:
+    """The start of a process: an interrupt is for the one that asked, which waits for what is under way."""
+    global _mine
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    _mine = build()
+
+
+def _in_process(pairs: list[ImagePair], seed: int) -> Work:
+    assert _mine is not None
+    extractor = _mine.extractor
+    if not isinstance(extractor, CachedFeatures):
+        return _work(_mine, pairs, seed)
+    computed, found = extractor.computed, extractor.found
+    rows = _work(_mine, pairs, seed).rows
+    return Work(rows, extractor.computed - computed, extractor.found - found)
