@@ -69,9 +69,10 @@ class HypothesizeAndVerify:
     final: `least_squares` (8-point on the inliers), `gauss_newton` (one attached step), `adaptive` (refined at the
     scale of the pair's own noise, with the gradients of the optimum) or `none`.
     refit_inliers: recompute the inliers after the final fit.
-    compile: build the score with torch.compile, for long runs: the first calls take some ten seconds each and need a
-    C++ compiler (RuntimeError where there is none). Scores, and so estimates, may differ from those without. That they
-    have the same bits in any batch is by construction, but depends on the compiler: it is tested of the score alone.
+    compile: build the score with torch.compile (of a saturated one the first look, at a subset), for long runs: the
+    first calls take some ten seconds each and need a C++ compiler (RuntimeError where there is none). Scores, and so
+    estimates, may differ from those without. That they have the same bits in any batch is by construction, but depends
+    on the compiler: it is tested of the score alone.
 
     Memory: for a batch of pairs of N matches, the points (48 N bytes a pair), the samples of 2^14 draws (about 40 MB)
     and eight buffers of one scoring tile (1 MB each); on a GPU 2^21 draws and 256 MB a buffer.
