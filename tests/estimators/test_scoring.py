@@ -101,6 +101,23 @@ def test_exact_sum_does_not_depend_on_the_order() -> None:
     np.testing.assert_allclose(scoring._exact_sum(gain.clone()).numpy(), gain.double().sum(-1).numpy(), rtol=1e-3)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_saturated_gains_depend_on_no_order(dtype: torch.dtype) -> None:
+    """Of matches, in which sums in a cell are formed, and of models, which stand side by side in vectors."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(4, 1, 20000, generator=generator, dtype=dtype) * 2 - 1
+    weight = torch.rand(1, 20000, generator=generator, dtype=dtype)
+    F = torch.randn(9, 1, 37, generator=generator, dtype=dtype)
+    score, unit = SaturatedGains(20.0), torch.tensor([512.0], dtype=torch.float64)
+    scores = score(F, points, weight, unit)
+    assert (scores > 0).all()
+    order = torch.randperm(20000, generator=generator)
+    assert torch.equal(score(F, points[..., order], weight[:, order], unit), scores)
+    models = torch.randperm(37, generator=generator)
+    assert torch.equal(score(F[..., models], points, weight, unit), scores[:, models])
+    assert torch.equal(score(F[..., 5:6].contiguous(), points, weight, unit), scores[:, 5:6])
+
+
 @pytest.mark.parametrize("threshold", [0.0, -1.0, float("nan")])
 def test_threshold_must_be_positive(threshold: float) -> None:
     with pytest.raises(ValueError, match="must be positive"):
