@@ -32,7 +32,8 @@ from fmtorch.storage import RunFolder, identity_digest
 from fmtorch.storage.configuration import learned
 from fmtorch.storage.features import CachedFeatures
 
-MANY = 250  # pairs from which on processes are worth their start
+MANY = 500  # pairs from which on processes are worth their start
+MOST_PROCESSES = 8  # unless more are asked for: each holds the networks of the pipeline and some 0.5 GB
 STAGE_GROUPS = ("features", "matcher", "pruner", "estimator")
 
 
@@ -53,12 +54,12 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
         chosen = select([dataset[i] for i in range(len(dataset))], config.limit)
         done = folder.done()
         todo = [pair for pair in chosen if pair.key not in done]
-        workers = config.workers or (1 if device.type != "cpu" else os.cpu_count() or 1)
-        bar = progress.add_task(pipeline_name, total=len(chosen), completed=len(chosen) - len(todo))
         processes = len(todo) >= MANY if config.processes is None else bool(config.processes)
-        build = None
-        if processes and workers > 1 and device.type == "cpu":
-            build = functools.partial(presets.build_pipeline, config, device)
+        processes = processes and device.type == "cpu"
+        cores = os.cpu_count() or 1
+        workers = config.workers or (1 if device.type != "cpu" else min(cores, MOST_PROCESSES) if processes else cores)
+        bar = progress.add_task(pipeline_name, total=len(chosen), completed=len(chosen) - len(todo))
+        build = functools.partial(presets.build_pipeline, config, device) if processes and workers > 1 else None
         for count in evaluate_pairs(
             pipeline, todo, seed=config.seed, batch=config.batch, workers=workers, store=folder.append, build=build
         ):

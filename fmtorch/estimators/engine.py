@@ -23,7 +23,7 @@ from fmtorch.estimators.local_optimization import LOCAL_OPTIMIZATIONS
 from fmtorch.estimators.parts import CHOICES, INLIER_RULES, SAMPLERS, SCORES, SOLVERS, Refinement, part
 from fmtorch.estimators.problem import Problem
 from fmtorch.estimators.sampling import PriorWeighted
-from fmtorch.estimators.scoring import sampson_squared, score_models
+from fmtorch.estimators.scoring import SaturatedGains, sampson_squared, score_models
 from fmtorch.random import Stream
 from fmtorch.types import Correspondences, Estimate
 
@@ -115,7 +115,7 @@ class HypothesizeAndVerify:
         self.solver = part("solver", solver, SOLVERS)()
         self.sampler = part("sampler", sampler, SAMPLERS)()
         self.score = part("score", score, SCORES)(threshold)
-        self.coarse = getattr(self.score, "unsaturated", self.score)
+        self.coarse = self.score.unsaturated if isinstance(self.score, SaturatedGains) else self.score
         if compile:
             self.coarse = compiled(self.coarse)
             self.score = self.coarse if self.coarse is self.score else compiled(self.score)

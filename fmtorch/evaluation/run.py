@@ -46,7 +46,7 @@ def evaluate_pairs(
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
-    team = Workers(pipeline, workers, build)
+    team = Workers(pipeline, max(1, min(workers, -(-len(pairs) // batch))), build)
     waiting: set[Future[Work]] = set()
 
     def kept(future: Future[Work]) -> int:
