@@ -75,7 +75,7 @@ class HypothesizeAndVerify:
     on the compiler: it is tested of the score alone.
 
     Memory: for a batch of pairs of N matches, the points (48 N bytes a pair), the samples of 2^14 draws (about 40 MB)
-    and eight buffers of one scoring tile (1 MB each); on a GPU 2^21 draws and 256 MB a buffer.
+    and eight buffers of one scoring tile (256 KB each); on a GPU 2^21 draws and 256 MB a buffer.
     """
 
     def __init__(

@@ -20,6 +20,7 @@ UNKNOWN = 1.5  # px, that distance where too few matches tell the noise
 LEAST = 15  # matches that tell the noise
 LIKELY = 0.3  # matches of a smaller prior do not tell the noise
 ITERATIONS = 8  # Levenberg-Marquardt steps, at most
+DAMPING = 1e-6  # at first: the start is near the optimum, and its weakest directions take long steps
 TOLERANCE = 1e-4  # share of the cost: a smaller gain ends the fit
 
 
@@ -93,7 +94,7 @@ class AdaptiveGaussNewton:
             models = F.flatten(1).T[..., None].contiguous()
             scale = truncation / problem.unit
             refined, _ = refine_components(
-                models, problem.points, prior, "truncated", scale, ITERATIONS, TOLERANCE, RANK_TWO_ALREADY
+                models, problem.points, prior, "truncated", scale, ITERATIONS, TOLERANCE, RANK_TWO_ALREADY, DAMPING
             )
             F = refined[..., 0].T.reshape(-1, 3, 3)
             if not (problem.points.requires_grad or prior.requires_grad):

@@ -5,7 +5,7 @@ freedom as an essential matrix and two focal lengths. Refined in these, each can
 lengths: maximum a posteriori instead of maximum likelihood. Cropped photographs violate the assumption, so the result
 stands only where it explains the matches about as well as the best model without it.
 
-Everything is element-wise or summed in a fixed order, so that a pair gets the same bits in any batch.
+A pair gets the same bits in any batch (see `sampson_objective`).
 """
 
 from __future__ import annotations

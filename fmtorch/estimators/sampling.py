@@ -125,6 +125,9 @@ def _draw(
     """
     random_bits = random.bits(problem.seed, problem.key, Stream.SAMPLING, start, count, size) >> (63 - _RANDOM_BITS)
     left = total
+    if table is not None:
+        starts = torch.nn.functional.pad(table, (1, -1))
+        weight = table - starts
     begins, shortened, lengths = random_bits.new_empty(3, size, *random_bits.shape[:2]).unbind(0)
     chosen: list[Tensor] = []
     for j in range(size):
@@ -135,9 +138,7 @@ def _draw(
             index, begin, length = position, position, torch.ones_like(position)
         else:
             index = torch.searchsorted(table, position, right=True)
-            upper = table.gather(1, index)
-            begin = torch.where(index > 0, table.gather(1, (index - 1).clamp_min(0)), 0)
-            length = upper - begin
+            begin, length = starts.gather(1, index), weight.gather(1, index)
         chosen.append(index)
         left = left - length
         before = begins[:j] < begin

@@ -15,7 +15,7 @@ from torch import Tensor
 from fmtorch.estimators.problem import Problem
 from fmtorch.geometry.sigma_consensus import marginal_loss
 
-CPU_TILE = 1 << 18  # elements of one tile: 1 MB of float32, so that the handful of buffers stay in the L2 cache
+CPU_TILE = 1 << 16  # elements of one tile: 256 KB of float32, so that the handful of buffers stay in the L2 cache
 GPU_TILE = 1 << 26
 GEMAN_MCCLURE_REACH = 5.0  # scales from which on that gain is zero
 GRID = 12  # cells along each side of each image, of saturated gains

@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 _NEGLIGIBLE = 1e-60  # relative to the largest coefficient: counts as zero, so that no power over- or underflows
-_SEPARATION = 1e-6  # relative to the outermost root: the others are found as those of the quadratic that remains
-_POLISHING_STEPS = 2  # the closed form is good to 1e-10, and Newton's method squares that
+_SEPARATION = 1e-4  # relative to the outermost root: the others are found as those of the quadratic that remains
+_POLISHING_STEPS = 2  # the closed form is good to 1e-8, the quadratic to 1e-4, and Newton's method squares that
 _GRADIENT_FLOOR = 1e-7  # relative slope below which the gradient of a (double) root is held finite
 
 

@@ -55,8 +55,7 @@ def eight_point_components(points: Float[Tensor, " 4 8 *s"]) -> tuple[Float[Tens
 
 def _finite(points: Tensor) -> tuple[Tensor, Tensor]:
     """Points with zeros for what is not finite, and which samples are wholly finite."""
-    finite = points.isfinite()
-    return torch.where(finite, points, 0.0), finite.all(0).all(0)
+    return points.nan_to_num(0.0, 0.0, 0.0), points.detach().abs().amax((0, 1)).isfinite()
 
 
 def _equations(points: Tensor) -> Tensor:

@@ -1,8 +1,7 @@
 """Non-linear refinement of fundamental matrices: Levenberg-Marquardt of the robust Sampson error.
 
 Minimises ``sum_i w_i rho(r_i^2)``, r the Sampson distance, over the 7-dimensional manifold of 3 x 3 matrices of rank 2
-and unit norm (see `rank2_manifold`). Everything is element-wise or summed in a fixed order, so a model is refined to
-the same bits in any batch.
+and unit norm (see `rank2_manifold`). A model is refined to the same bits in any batch (see `sampson_objective`).
 """
 
 from __future__ import annotations
@@ -43,26 +42,27 @@ def refine_components(
     iterations: int,
     tolerance: float = 0.0,
     squarings: int = SQUARINGS,
+    damping: float = DAMPING,
 ) -> tuple[Float[Tensor, "9 p k"], Float[Tensor, "p k"]]:
     """Refined models and their costs ``sum_i w_i rho(r_i^2)``, component by component, without gradients.
 
     F: k models for each of p pairs, entries row by row; made rank 2 first where they are not. points: x0, y0, x1, y1,
     of about unit scale; finite. weight: 0 in padded slots. scale: of the kernel, in the unit of the points.
     iterations: at most. tolerance: a model is done once a step has lowered its cost by no more than this share of it.
-    squarings: of `start`.
+    squarings: of `start`. damping: of the first step.
     The cost of a model never rises above that of its (rank-2) start; a model that cannot be improved is kept, one that
     is not finite comes back as it was, with infinite cost.
     """
     with torch.no_grad():
         objective = Objective(points, weight, named_kernel(kernel), scale)
         state = _State(objective, *start(F, squarings), iterations > 0)
-        damping = torch.full_like(state.cost, DAMPING)
+        damped = torch.full_like(state.cost, damping)
         done = torch.zeros_like(state.cost, dtype=torch.bool)
         for i in range(iterations):
-            step = solve(state.products, state.F, state.e0, state.e1, damping)
+            step = solve(state.products, state.F, state.e0, state.e1, damped)
             trial = _State(objective, *retract(state.F, step, state.e0, state.e1), i + 1 < iterations)
             better = (trial.cost < state.cost) & ~done
-            damping = torch.where(better, damping / 10, damping * 10).clamp_(SMALLEST_DAMPING, LARGEST_DAMPING)
+            damped = torch.where(better, damped / 10, damped * 10).clamp_(SMALLEST_DAMPING, LARGEST_DAMPING)
             if tolerance:
                 done |= better & (state.cost - trial.cost <= tolerance * state.cost)
             state.adopt(trial, better)

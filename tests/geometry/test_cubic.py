@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from fmtorch.geometry.cubic import cube_root, cubic_roots
@@ -62,6 +62,7 @@ def test_random_cubics_against_numpy():
 
 
 @settings(max_examples=300, deadline=None)
+@example([1.0, 2149678235974625.0, 1.770644304821928e26, 0.0])  # -2e15, -8e10, 0
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=4, max_size=4))
 def test_never_nan_and_every_root_is_one(coefficients):
     c = torch.tensor(coefficients, dtype=torch.float64)
