@@ -17,9 +17,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.estimators.cheirality import share_in_front
 from fmtorch.estimators.choice import best_of, ranked
 from fmtorch.estimators.problem import Problem
-from fmtorch.estimators.scoring import SaturatedGains, score_models
+from fmtorch.estimators.scoring import SaturatedGains, geman_mcclure_gain, sampson_squared, score_models
 from fmtorch.geometry.rank2 import complement
 from fmtorch.geometry.rank2_manifold import start, unit
 from fmtorch.geometry.reduce import component_sum
@@ -36,6 +37,7 @@ GATE = 0.94
 # A pair is open, and the prior is asked, where a candidate of RIVAL of the best gain is further from the best one than
 # SAME: 1 - |cosine| of the two as vectors.
 RIVAL, SAME = 0.85, 1e-3
+PARALLEL = 4.0  # px in image 1: rays that differ less do not tell on which side of the cameras they meet
 ITERATIONS = 12  # Levenberg-Marquardt steps
 MOST = 12  # candidates that are refined
 SHORTEST, LONGEST = 0.25, 5.0  # focal lengths outside are not believed at the start
@@ -46,8 +48,9 @@ class FocalPrior:
     """Refines each candidate as a maximum a posteriori over E and two focal lengths and chooses among these.
 
     Asked only of pairs that are open: where all good candidates are one and the same model, that is the estimate.
-    The estimate is the refined candidate with the largest gain (`SaturatedGains`) minus prior cost if that reaches GATE
-    of the largest gain without prior; otherwise, and where there are no image sizes, the model of the latter.
+    The estimate is the refined candidate with the largest gain (`SaturatedGains`), times the share of its support in
+    front of both cameras, minus prior cost, if that reaches GATE of the largest gain without prior; otherwise, and
+    where there are no image sizes, the model of the latter.
     scale: of the gain, px. iterations: Levenberg-Marquardt steps. most: candidates refined, those of the largest gain.
     """
 
@@ -75,8 +78,8 @@ class FocalPrior:
         self, F: Float[Tensor, "9 p k"], gain: Float[Tensor, "p k"], problem: Problem, near: Problem
     ) -> Float[Tensor, "9 p"]:
         """The estimates, of models by descending gain, minus infinity where there is none."""
-        focal, prior = refine_focal(F, near, self.iterations)
-        posterior = (score_models(self.gain, focal, problem, problem.points) - prior).nan_to_num(nan=-torch.inf)
+        focal, prior, front = refine_focal(F, near, self.iterations)
+        posterior = (score_models(self.gain, focal, problem, problem.points) * front - prior).nan_to_num(nan=-torch.inf)
         posterior = torch.where(torch.isfinite(gain), posterior, -torch.inf)
         chosen = ranked(focal, posterior, 1)[0][..., 0]
         return torch.where(posterior.amax(1) >= GATE * gain[:, 0], chosen, F[..., 0])
@@ -84,11 +87,12 @@ class FocalPrior:
 
 def refine_focal(
     F: Float[Tensor, "9 p k"], problem: Problem, iterations: int = ITERATIONS
-) -> tuple[Float[Tensor, "9 p k"], Float[Tensor, "p k"]]:
-    """Models of least ``sum P rho(r) / (2 SIGMA^2) + prior(f0, f1)``, and their prior costs.
+) -> tuple[Float[Tensor, "9 p k"], Float[Tensor, "p k"], Float[Tensor, "p k"]]:
+    """Models of least ``sum P rho(r) / (2 SIGMA^2) + prior(f0, f1)``, prior costs, shares of support in front.
 
     r is the Sampson distance in pixels, rho the loss of Geman & McClure at SCALE. The sizes of the problem must be
-    known. A model that is not finite comes back as something that is not, with a prior cost of infinity.
+    known. Support is P times the gain of Geman & McClure at SCALE (see `share_in_front`). A model that is not finite
+    comes back as something that is not, with a prior cost of infinity.
     """
     assert problem.size0 is not None
     assert problem.size1 is not None
@@ -109,7 +113,11 @@ def refine_focal(
             state = state.replaced(trial, better)
         models = unit(_translated(state.F, offset))
         sound = torch.isfinite(models).all(0) & torch.isfinite(state.cost)
-        return models, torch.where(sound, _prior(state.focal)[0], torch.inf)
+        depth = exponential(state.focal) * longest[..., None]
+        r2 = sampson_squared(state.F, points) * (problem.unit / SCALE).square()[:, None, None]
+        support = geman_mcclure_gain(r2) * objective.weight[:, None]
+        front = share_in_front(state.U, state.V, depth, points, support, PARALLEL / problem.unit)
+        return models, torch.where(sound, _prior(state.focal)[0], torch.inf), front
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -140,8 +148,8 @@ class _Objective:
     """The negative logarithm of the posterior, with its derivatives by five rotations and two log focal lengths."""
 
     def __init__(self, problem: Problem, points: Tensor, longest: Tensor) -> None:
-        weight = problem.live.to(torch.float64) if problem.prior is None else problem.prior
-        self.data = Objective(points, weight, KERNELS["geman_mcclure"], SCALE / problem.unit)
+        self.weight = problem.live.to(torch.float64) if problem.prior is None else problem.prior
+        self.data = Objective(points, self.weight, KERNELS["geman_mcclure"], SCALE / problem.unit)
         self.precision = (problem.unit / SIGMA).square()[:, None]
         self.longest = longest
         # Of the derivatives of E by rotations of U about its three axes and of V about the first two.

@@ -91,7 +91,7 @@ class SummedGains:
         """As `Score`."""
         scale = (unit / self.threshold).square().to(F.dtype)[:, None, None]
         gain = self._gain(sampson_squared(F, points).mul_(scale))
-        return _exact_sum(gain.mul_(weight[:, None]))
+        return exact_sum(gain.mul_(weight[:, None]))
 
     def _gain(self, squared: Float[Tensor, "p m n"]) -> Float[Tensor, "p m n"]:
         """The gains at squared residuals in units of the threshold; these may be overwritten."""
@@ -212,7 +212,7 @@ def median_rank(count: Tensor) -> Tensor:
     return (count + 1) // 2
 
 
-def _exact_sum(gain: Float[Tensor, "p m n"]) -> Float[Tensor, "p m"]:
+def exact_sum(gain: Float[Tensor, "p m n"]) -> Float[Tensor, "p m"]:
     """Sum over matches of gains in [0, 1], each first rounded so that the sum is exact."""
     return _rounded(gain, _fractional_bits(gain.shape[-1], gain.dtype)).sum(-1)
 

@@ -92,7 +92,7 @@ def test_same_cost_as_scipy(seed: int) -> None:
     F = _normalised(reference.fundamental(truth, SIZE0, SIZE1), problem)
     # From the unconstrained optimum, as in the engine: focal lengths there are off, often implausible.
     F, _ = refine_components(F, problem.points, problem.prior, "truncated", SCALE / problem.unit, 10)  # type: ignore[arg-type]
-    models, prior = refine_focal(F, problem, iterations=50)
+    models, prior, _ = refine_focal(F, problem, iterations=50)
     found = _pixels(models, problem)
     r = reference.sampson(found, x0, x1)
     data = (weight * reference.loss(r, SCALE)).sum() / (2 * 0.3**2)
@@ -112,7 +112,7 @@ def test_scipy_finds_nothing_better_nearby_on_real_pairs(name: str) -> None:
         size0=torch.tensor(sizes[:1]), size1=torch.tensor(sizes[1:]),
     )  # fmt: skip
     problem, weight = _problem(c), np.ones(len(x0))
-    models, prior = refine_focal(_normalised(data[f"{name}.F_gt"], problem), problem, iterations=50)
+    models, prior, _ = refine_focal(_normalised(data[f"{name}.F_gt"], problem), problem, iterations=50)
     found = _pixels(models, problem)
     parameters = reference.parameters_of(found, *sizes)
     assert float(prior) == pytest.approx(reference.prior_cost(*parameters[6:]), rel=1e-4)  # by way of F and Bougnoux
@@ -125,7 +125,7 @@ def test_no_noise_no_change() -> None:
     c, truth = _pair(1, focal=(1.2, 1.2), noise=0.0, outliers=0.0)
     problem = _problem(c)
     F = _normalised(reference.fundamental(truth, SIZE0, SIZE1), problem)
-    models, prior = refine_focal(F, problem)
+    models, prior, _ = refine_focal(F, problem)
     # Residuals are below 1e-9 px here, so the prior's pull of a focal length of 1.2 is of the same order.
     assert float((models * F).sum().abs()) == pytest.approx(1, abs=1e-12)
     assert float(prior) < 1e-12
@@ -136,7 +136,7 @@ def test_prior_decides_between_models_that_explain_the_matches_alike() -> None:
     problem = _problem(c)
     strange = truth + np.array([0, 0, 0, 0, 0, 0, np.log(3), -np.log(3)])
     pool = torch.cat([_normalised(reference.fundamental(p, SIZE0, SIZE1), problem) for p in (strange, truth)], 2)
-    _, prior = refine_focal(pool, problem, iterations=0)
+    _, prior, _ = refine_focal(pool, problem, iterations=0)
     assert float(prior[0, 0]) == pytest.approx(reference.prior_cost(*strange[6:]), rel=1e-9)
     assert float(prior[0, 1]) == pytest.approx(0, abs=1e-9)
 
@@ -169,7 +169,7 @@ def test_the_prior_is_asked_only_where_good_candidates_differ(monkeypatch: pytes
     same, different = torch.cat([right, right], 2), torch.cat([right, other], 2)
     monkeypatch.setattr("fmtorch.estimators.focal.RIVAL", 0.0)  # every candidate is a good one
     assert torch.equal(FocalPrior(0.3)(same, problem, problem, alive), right[..., 0])
-    refined, _ = refine_focal(different, problem)
+    refined, _, _ = refine_focal(different, problem)
     chosen = FocalPrior(0.3)(different, problem, problem, alive)
     assert any(torch.equal(chosen, refined[..., k]) for k in (0, 1))
     assert not torch.equal(chosen, right[..., 0])
@@ -182,8 +182,8 @@ def test_models_that_are_not_finite_harm_no_other() -> None:
     problem = _problem(pair)
     good = torch.cat([_normalised(reference.fundamental(_pair(s)[1], SIZE0, SIZE1), problem) for s in (4, 5)], 1)
     bad = torch.cat([torch.full_like(good, torch.nan), torch.zeros_like(good), good], 2)
-    alone, _ = refine_focal(good, problem)
-    models, prior = refine_focal(bad, problem)
+    alone, _, _ = refine_focal(good, problem)
+    models, prior, _ = refine_focal(bad, problem)
     assert torch.equal(models[:, :, 2:], alone)
     assert bool(torch.isinf(prior[:, :2]).all())
     chosen = FocalPrior(0.3)(bad, problem, problem, torch.tensor([[False, False, True]] * 2))
