@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from fmtorch.data import ImagePair, ImageSource
+from fmtorch.geometry import eight_point
 from tests.laws import scene
 
 SCRIPTS = Path(__file__).resolve().parent.parent / "scripts" / "benchmark"
@@ -59,3 +60,19 @@ def test_tables_stand_between_their_markers(tmp_path: Path) -> None:
         assert group in text
     with pytest.raises(SystemExit, match="no lines <!-- b -->"):
         estimators_table.write(page, "b", figures, pairs, 2)
+
+
+def test_truth_is_the_fit_that_starts_from_the_true_matrix(tmp_path: Path) -> None:
+    import estimators
+
+    exact = scene(0, 200, outliers=0, noise=0)
+    (F,), _ = eight_point(exact.x0.double(), exact.x1.double())
+    image = ImageSource("none", tmp_path / "none.png")  # not looked at
+    items = [
+        (ImagePair("orbit/0", "orbit", "0", image, image, F.numpy()), scene(0, 200, outliers=0.5, noise=0.3)),
+        (ImagePair("orbit/1", "orbit", "0", image, image, F.flip(0).numpy()), scene(0, 200, outliers=0.5, noise=0.3)),
+    ]
+    for spec, result in estimators.measure(["truth", "truth@position_consistency"], items, 1).items():
+        near, far = result["nsgd"][0]
+        assert 1e-6 < near < 0.01, spec  # the matches' noise moves it
+        assert far > 0.05, spec  # and does not bring it home from elsewhere

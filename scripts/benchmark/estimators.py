@@ -1,6 +1,7 @@
 """Robust estimators on the same matches, one thread each: recall, mean recall, milliseconds, paired intervals.
 
-An estimator is named as PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]; the pruners after @ count into its time.
+An estimator is named as PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]; the pruners after @ count into its time. The preset
+`truth` is none: it is the fit that starts from the true matrix, and so what the matches allow.
 
 python scripts/benchmark estimators --root DATA/Strecha --root DATA/PhotoTourism --seeds 5 \\
     --estimators fmtorch@frame_consistency opencv_usac_magsac:threshold=1.0 poselib:threshold=0.5,prosac=true
@@ -27,6 +28,7 @@ from rich.progress import track
 
 from fmtorch import metrics, presets
 from fmtorch.data import ImagePair
+from fmtorch.geometry import refine
 from fmtorch.types import Correspondences, Estimate
 
 Result = dict[str, np.ndarray]  # nsgd, ms: (seeds, pairs)
@@ -75,20 +77,29 @@ def read_specs(path: Path) -> list[str]:
     return [text for line in path.read_text().splitlines() if (text := line.partition("#")[0].strip())]
 
 
-def build(spec: str) -> Callable[[Correspondences, int], Estimate]:
+def build(spec: str) -> Callable[[ImagePair, Correspondences, int], Estimate]:
     """The function of `PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]`: pruners in order, then the estimator."""
     front, _, stages = spec.partition("@")
     name, _, rest = front.partition(":")
-    estimator = presets.build("estimator", name, **options(rest))
+    estimator = None if name == "truth" else presets.build("estimator", name, **options(rest))
     pruners = [presets.build("pruner", stage) for stage in stages.split("+") if stage]
 
-    def call(c: Correspondences, seed: int = 0) -> Estimate:
+    def call(pair: ImagePair, c: Correspondences, seed: int = 0) -> Estimate:
         for pruner in pruners:
             c = pruner(c)
-        estimate: Estimate = estimator(c, seed)
+        estimate: Estimate = from_truth(pair, c) if estimator is None else estimator(c, seed)
         return estimate
 
     return call
+
+
+def from_truth(pair: ImagePair, c: Correspondences) -> Estimate:
+    """The robust fit to the matches, weighted by their prior, that starts from the true matrix."""
+    F = torch.from_numpy(pair.F)[None]
+    for scale in (1.5, 0.7):  # px
+        F = refine(F, c.x0, c.x1, c.prior, c.mask, kernel="geman_mcclure", scale=scale, iterations=20)
+    ok = torch.isfinite(F).all(-1).all(-1)
+    return Estimate(F, c.mask, ok, ("",), torch.zeros(1, dtype=torch.int64))
 
 
 def measure(specs: list[str], items: list[Item], seeds: int) -> dict[str, Result]:
@@ -99,13 +110,13 @@ def measure(specs: list[str], items: list[Item], seeds: int) -> dict[str, Result
     methods = {spec: build(spec) for spec in specs}
     results = {spec: {"nsgd": np.ones((seeds, len(items))), "ms": np.zeros((seeds, len(items)))} for spec in specs}
     for method in methods.values():
-        method(items[0][1], 0)  # not counted: lazy initialisation
+        method(*items[0], 0)  # not counted: lazy initialisation
     calls = [(seed, i) for seed in range(seeds) for i in range(len(items))]
     for seed, i in track(calls, "estimating", console=console, transient=True):
         pair, c = items[i]
         for spec, method in methods.items():
             start = time.process_time()
-            estimate = method(c, seed)
+            estimate = method(pair, c, seed)
             results[spec]["ms"][seed, i] = 1e3 * (time.process_time() - start)
             if bool(estimate.ok[0]):
                 F = torch.from_numpy(pair.F)[None]
