@@ -11,6 +11,7 @@ python scripts/benchmark estimators --rendered full --specs scripts/benchmark/es
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import platform
 import time
@@ -77,20 +78,33 @@ def read_specs(path: Path) -> list[str]:
     return [text for line in path.read_text().splitlines() if (text := line.partition("#")[0].strip())]
 
 
-def build(spec: str) -> Callable[[ImagePair, Correspondences, int], Estimate]:
+def build(spec: str) -> Callable[[Correspondences, int], Estimate]:
     """The function of `PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]`: pruners in order, then the estimator."""
     front, _, stages = spec.partition("@")
     name, _, rest = front.partition(":")
-    estimator = None if name == "truth" else presets.build("estimator", name, **options(rest))
-    pruners = [presets.build("pruner", stage) for stage in stages.split("+") if stage]
+    estimator, prune = presets.build("estimator", name, **options(rest)), pruning(stages)
 
-    def call(pair: ImagePair, c: Correspondences, seed: int = 0) -> Estimate:
-        for pruner in pruners:
-            c = pruner(c)
-        estimate: Estimate = from_truth(pair, c) if estimator is None else estimator(c, seed)
+    def call(c: Correspondences, seed: int = 0) -> Estimate:
+        estimate: Estimate = estimator(prune(c), seed)
         return estimate
 
     return call
+
+
+def pruning(stages: str) -> Callable[[Correspondences], Correspondences]:
+    """The pruners `PRUNER+PRUNER...`, in order; of nothing, the matches as they are."""
+    pruners = [presets.build("pruner", stage) for stage in stages.split("+") if stage]
+    return lambda c: functools.reduce(lambda kept, pruner: pruner(kept), pruners, c)
+
+
+def informed(spec: str) -> Callable[[ImagePair, Correspondences, int], Estimate]:
+    """As `build`, of methods that are told the pair: only `truth` looks at it."""
+    name, _, stages = spec.partition("@")
+    if name == "truth":
+        prune = pruning(stages)
+        return lambda pair, c, seed: from_truth(pair, prune(c))
+    method = build(spec)
+    return lambda pair, c, seed: method(c, seed)
 
 
 def from_truth(pair: ImagePair, c: Correspondences) -> Estimate:
@@ -107,7 +121,7 @@ def measure(specs: list[str], items: list[Item], seeds: int) -> dict[str, Result
 
     The estimators take turns at each pair, so that what else the machine does slows them down alike.
     """
-    methods = {spec: build(spec) for spec in specs}
+    methods = {spec: informed(spec) for spec in specs}
     results = {spec: {"nsgd": np.ones((seeds, len(items))), "ms": np.zeros((seeds, len(items)))} for spec in specs}
     for method in methods.values():
         method(*items[0], 0)  # not counted: lazy initialisation

@@ -9,10 +9,11 @@ from __future__ import annotations
 import argparse
 import functools
 import json
+import multiprocessing
 import platform
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from rich.table import Table
 from synthetic import synthetic_pair
 
 from fmtorch import presets
-from fmtorch.types import Correspondences, collate
+from fmtorch.types import Correspondences, Estimate, collate
 
 
 def add_arguments(commands: Any) -> None:
@@ -42,7 +43,11 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument("--peers", nargs="*", default=["poselib", "opencv_usac_magsac"], help="the ratios' reference")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--workers", type=int, help="also pairs a second of so many threads over batches, by the clock")
+    parser.add_argument(
+        "--workers",
+        type=int,
+        help="also pairs a second, by the clock, of so many threads and processes over batches",
+    )
     parser.add_argument("--compile", action="store_true", help="add each engine preset again, with torch.compile")
     parser.add_argument("--json", type=Path, help="write the figures here")
     parser.set_defaults(run=run)
@@ -91,10 +96,14 @@ def run(arguments: argparse.Namespace) -> None:
     }
     if arguments.workers:
         for spec, run_one in methods.items():
-            for name, workers in (("alone_pairs_s", 1), ("workers_pairs_s", arguments.workers)):
-                figures[spec][name] = len(pairs) / min(
-                    shared_seconds(run_one, batches, workers) for _ in range(arguments.repeats)
-                )
+            for name, workers in (("alone", 1), ("threads", arguments.workers)):
+                with ThreadPoolExecutor(workers) as pool:
+                    fastest = shared_seconds(pool, run_one, batches, workers, arguments.repeats)
+                figures[spec][f"{name}_pairs_s"] = len(pairs) / fastest
+            context = multiprocessing.get_context("spawn")
+            with ProcessPoolExecutor(arguments.workers, context, begin, (spec, arguments.threads)) as pool:
+                fastest = shared_seconds(pool, in_process, batches, arguments.workers, arguments.repeats)
+            figures[spec]["processes_pairs_s"] = len(pairs) / fastest
     report(figures, arguments.peers)
     if arguments.json:
         machine = {"processor": platform.processor() or platform.machine(), "torch": torch.__version__}
@@ -110,13 +119,33 @@ def seconds(call: Callable[[Correspondences], Any], c: Correspondences) -> float
     return clock() - start
 
 
-def shared_seconds(call: Callable[[Correspondences], Any], batches: list[Correspondences], workers: int) -> float:
-    """The time by the clock until so many threads have done all batches."""
-    with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(lambda batch: None, range(workers)))  # the threads are there
+def shared_seconds(
+    pool: Executor, call: Callable[[Correspondences], Any], batches: list[Correspondences], workers: int, repeats: int
+) -> float:
+    """The time by the clock until all workers together have done all batches, at best."""
+    list(pool.map(call, batches[:1] * workers))  # the workers are there
+    times = []
+    for _ in range(repeats):
         start = time.perf_counter()
         list(pool.map(call, batches))
-        return time.perf_counter() - start
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+mine: Callable[[Correspondences], Estimate] | None = None  # of a process that works for another
+
+
+def begin(spec: str, threads: int) -> None:
+    """The start of a process."""
+    global mine
+    torch.set_num_threads(threads)
+    cv2.setNumThreads(threads)
+    mine = functools.partial(build(spec), seed=0)
+
+
+def in_process(c: Correspondences) -> Estimate:
+    assert mine is not None
+    return mine(c)
 
 
 def report(figures: dict[str, dict[str, float]], peers: list[str]) -> None:
@@ -129,9 +158,9 @@ def report(figures: dict[str, dict[str, float]], peers: list[str]) -> None:
         first = f"{f['first_call_s']:.1f} s"
         table.add_row(spec, f"{f['ms_median']:.2f}", f"{f['ms_mean']:.2f}", f"{f['ms_batch']:.2f}", first, *ratios)
     console.print(table)
-    if "workers_pairs_s" in next(iter(figures.values())):
-        table = Table("estimator", "pairs a second, one worker", "all workers", "gain", title="threads over batches")
+    if "processes_pairs_s" in next(iter(figures.values())):
+        table = Table("estimator", "one worker", "threads", "processes", "gain", title="pairs a second, over batches")
         for spec, f in figures.items():
-            alone, together = f["alone_pairs_s"], f["workers_pairs_s"]
-            table.add_row(spec, f"{alone:.1f}", f"{together:.1f}", f"{together / alone:.2f}")
+            kinds = [f[f"{kind}_pairs_s"] for kind in ("alone", "threads", "processes")]
+            table.add_row(spec, *(f"{rate:.1f}" for rate in kinds), f"{kinds[2] / kinds[0]:.2f}")
         console.print(table)
