@@ -48,6 +48,23 @@ def load(group: str, name: str, config_dir: Path | str | None = None) -> dict[st
     raise ValueError(f"no preset {name!r} in conf/{group}; there are: {', '.join(available(group, config_dir))}")
 
 
+@functools.cache
+def known_targets() -> frozenset[str]:
+    """What the project's own presets build: dotted names that are safe to take from a file."""
+    files = conf_dir().glob("*/*.yaml")
+    return frozenset().union(*(targets_of(OmegaConf.to_container(OmegaConf.load(path))) for path in files))
+
+
+def targets_of(config: object) -> frozenset[str]:
+    """The `_target_`s anywhere within a config."""
+    if isinstance(config, Mapping):
+        own = [str(config["_target_"])] if "_target_" in config else []
+        return frozenset(own).union(*(targets_of(value) for value in config.values()))
+    if isinstance(config, list):
+        return frozenset().union(*(targets_of(value) for value in config))
+    return frozenset()
+
+
 def build(group: str, name: str, config_dir: Path | str | None = None, **options: Any) -> Any:
     """The object that a preset describes, with some of its options replaced.
 

@@ -56,6 +56,7 @@ def test_wheel_carries_the_package_with_its_folders(wheel: Path) -> None:
     assert "fmtorch/py.typed" in names
     assert "fmtorch/models/README.md" in names
     assert any(name.startswith("fmtorch/conf/") for name in names)
+    assert "fmtorch/evaluation/report.html.j2" in names
     folders = {prefix: CHECKOUT / path for prefix, path in {"fmtorch/conf": "conf", "fmtorch/models": "models"}.items()}
     for prefix, folder in folders.items():
         assert _tree(folder, prefix) <= names

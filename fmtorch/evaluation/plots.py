@@ -29,7 +29,7 @@ _INK, _PALE = "#333333", "#D9D9D9"
 
 
 def plot_recall_curves(runs: Mapping[str, pa.Table], path: Path) -> None:
-    """Draw recall against the NSGD threshold, from 0 to 0.2, as a PNG; legends give the recall at 0.05.
+    """Draw recall against the NSGD threshold, from 0 to 0.2, as PNG or SVG; legends give the recall at 0.05.
 
     runs: tables of `PAIR_SCHEMA` by name. One run gives one panel with a curve for each family and for all; several
     runs give a panel for each family with a curve for each run.
@@ -54,7 +54,7 @@ def plot_recall_curves(runs: Mapping[str, pa.Table], path: Path) -> None:
             ax.set_xlabel("NSGD threshold", color=_INK)
             ax.tick_params(labelbottom=True)
     with replacing(path) as temporary:
-        figure.savefig(temporary, format="png")
+        figure.savefig(temporary, format=path.suffix[1:])
 
 
 def _panels(runs: Mapping[str, pa.Table]) -> dict[str, dict[str, NDArray[np.float64]]]:

@@ -95,7 +95,7 @@ def recall(nsgd: NDArray[np.float64], threshold: float = THRESHOLD) -> float:
 def summary_table(summary: Mapping[str, Group], title: str) -> Table:
     """The main figures, for a terminal of 80 columns."""
     shown = Table(
-        title=title, title_style="bold", caption=_caption(summary), caption_justify="left", caption_style="dim",
+        title=title, title_style="bold", caption=caption(summary), caption_justify="left", caption_style="dim",
         box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True,
     )  # fmt: skip
     for i, heading in enumerate(_TERMINAL):
@@ -107,8 +107,8 @@ def summary_table(summary: Mapping[str, Group], title: str) -> Table:
 
 def summary_markdown(summary: Mapping[str, Group], title: str) -> str:
     """All figures as a Markdown page."""
-    rows = [list(_MARKDOWN), ["---", *["---:"] * (len(_MARKDOWN) - 1)]]
-    rows += [_cells(_MARKDOWN, name, group) for name, group in _rows(summary)]
+    rows = [list(MARKDOWN_COLUMNS), ["---", *["---:"] * (len(MARKDOWN_COLUMNS) - 1)]]
+    rows += [_cells(MARKDOWN_COLUMNS, name, group) for name, group in _rows(summary)]
     stages = [["seconds (median per pair)", *STAGES, "total"], ["---", *["---:"] * (len(STAGES) + 1)]]
     for name, group in _rows(summary):
         stages.append([name, *(_number(group["seconds"][stage], "{:.3f}") for stage in (*STAGES, "total"))])
@@ -118,7 +118,7 @@ def summary_markdown(summary: Mapping[str, Group], title: str) -> str:
         if name != ALL or len(summary) == 1
         for reason, count in group["reasons"].items()
     ]
-    parts = [f"# {title}", _lines(rows), _caption(summary), _lines(stages)]
+    parts = [f"# {title}", _lines(rows), caption(summary), _lines(stages)]
     if failures:
         parts += ["Commonest reasons of failure (numbers replaced by N):", "\n".join(failures)]
     return "\n\n".join(parts) + "\n"
@@ -133,7 +133,8 @@ def _cells(columns: Mapping[str, Callable[[Group], str]], name: str, group: Grou
     return [name, *(column(group) for heading, column in columns.items() if heading)]
 
 
-def _caption(summary: Mapping[str, Group]) -> str:
+def caption(summary: Mapping[str, Group]) -> str:
+    """What the columns mean, and what the intervals were resampled over."""
     overs = dict.fromkeys(group["interval_over"] for _, group in _rows(summary) if group["interval_over"])
     where = {over: [name for name, g in _rows(summary) if g["interval_over"] == over] for over in overs}
     over = "; ".join(f"{o}s" + (f" ({', '.join(names)})" if len(where) > 1 else "") for o, names in where.items())
@@ -188,7 +189,7 @@ _TERMINAL: dict[str, Callable[[Group], str]] = {
     "#Corrs (-m)": _corrs,
     "Failed": lambda group: str(group["failures"]),
 }
-_MARKDOWN: dict[str, Callable[[Group], str]] = {
+MARKDOWN_COLUMNS: dict[str, Callable[[Group], str]] = {
     "": lambda group: "",
     "Pairs": lambda group: str(group["pairs"]),
     "Scenes": lambda group: str(group["scenes"]),
