@@ -59,8 +59,9 @@ class HypothesizeAndVerify:
     refine: robust kernel of the Levenberg-Marquardt refinement of the pool (`truncated`, `cauchy`, ...), null: none;
     refine_threshold: its scale, Sampson distance in pixels; refine_iterations: its steps. choice: by which score the
     estimate is chosen from the refined pool, `score` (the search's own), `saturated` (gains saturate in each cell of a
-    grid) or `focal` (the same, with a prior on the focal length: for whole photographs, not crops; `saturated` where
-    the image sizes are unknown); choice_threshold: of the last two, Sampson distance in pixels, null: the score's;
+    grid) or `focal` (the same, with a prior on the focal length and without matches behind a camera: for whole
+    photographs, not crops; `saturated` where the image sizes are unknown; `focal_any_side`: matches behind a camera
+    count); choice_threshold: of the last two, Sampson distance in pixels, null: the score's;
     choice_pool, choice_iterations: candidates and steps of the refinement that `focal` makes.
     refine_matches: refinements look at so many matches at most, drawn by the pair's key from those within REACH
     refine_thresholds of a model of the pool; null: at all.

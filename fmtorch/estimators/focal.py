@@ -52,10 +52,13 @@ class FocalPrior:
     front of both cameras, minus prior cost, if that reaches GATE of the largest gain without prior; otherwise, and
     where there are no image sizes, the model of the latter.
     scale: of the gain, px. iterations: Levenberg-Marquardt steps. most: candidates refined, those of the largest gain.
+    cheirality: whether support behind a camera does not count.
     """
 
-    def __init__(self, scale: float, iterations: int = ITERATIONS, most: int = MOST) -> None:
-        self.iterations, self.most = iterations, most
+    def __init__(
+        self, scale: float, iterations: int = ITERATIONS, most: int = MOST, *, cheirality: bool = True
+    ) -> None:
+        self.iterations, self.most, self.cheirality = iterations, most, cheirality
         self.gain = SaturatedGains(scale)
 
     def __call__(
@@ -79,7 +82,8 @@ class FocalPrior:
     ) -> Float[Tensor, "9 p"]:
         """The estimates, of models by descending gain, minus infinity where there is none."""
         focal, prior, front = refine_focal(F, near, self.iterations)
-        posterior = (score_models(self.gain, focal, problem, problem.points) * front - prior).nan_to_num(nan=-torch.inf)
+        support = score_models(self.gain, focal, problem, problem.points)
+        posterior = ((support * front if self.cheirality else support) - prior).nan_to_num(nan=-torch.inf)
         posterior = torch.where(torch.isfinite(gain), posterior, -torch.inf)
         chosen = ranked(focal, posterior, 1)[0][..., 0]
         return torch.where(posterior.amax(1) >= GATE * gain[:, 0], chosen, F[..., 0])

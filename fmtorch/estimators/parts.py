@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Protocol, TypeVar, runtime_checkable
 
@@ -159,4 +160,5 @@ INLIER_RULES: dict[str, Callable[[float], Callable[[Tensor, Problem], Tensor]]] 
 CHOICES: dict[str, Callable[[float, int, int], Choice]] = {
     "saturated": lambda scale, iterations, most: SaturatedChoice(scale),
     "focal": FocalPrior,
+    "focal_any_side": functools.partial(FocalPrior, cheirality=False),
 }

@@ -177,6 +177,24 @@ def test_the_prior_is_asked_only_where_good_candidates_differ(monkeypatch: pytes
     assert torch.equal(FocalPrior(0.3)(different, problem, problem, alive), right[..., 0])
 
 
+def test_support_behind_a_camera_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    c, truth = _pair(4, outliers=0.1)
+    problem, alive = _problem(c), torch.ones(1, 2, dtype=torch.bool)
+    turned = truth + np.array([0.01, 0, 0, 0, 0, 0, 0, 0])
+    right, other = (unit(_normalised(reference.fundamental(p, SIZE0, SIZE1), problem)) for p in (truth, turned))
+    both = torch.cat([right, other], 2)
+    refined, _, front = refine_focal(both, problem, iterations=0)
+    assert float(front[0, 0]) > 0.9  # the scene is before both cameras; some wrong matches agree by chance
+    monkeypatch.setattr("fmtorch.estimators.focal.RIVAL", 0.0)  # every candidate is a good one
+    monkeypatch.setattr("fmtorch.estimators.focal.SAME", 0.0)  # and another model
+    monkeypatch.setattr("fmtorch.estimators.focal.GATE", 0.0)
+    for share, cheirality, best in ((1.0, True, 0), (0.01, True, 1), (0.01, False, 0)):
+        shares = torch.tensor([[share, 1.0]], dtype=torch.float64)
+        monkeypatch.setattr("fmtorch.estimators.focal.share_in_front", lambda *_, shares=shares: shares)
+        chosen = FocalPrior(0.3, iterations=0, cheirality=cheirality)(both, problem, problem, alive)
+        assert torch.equal(chosen, refined[..., best])
+
+
 def test_models_that_are_not_finite_harm_no_other() -> None:
     pair = collate([_pair(seed)[0] for seed in (4, 5)])
     problem = _problem(pair)
