@@ -180,7 +180,7 @@ def test_the_prior_is_asked_only_where_good_candidates_differ(monkeypatch: pytes
 def test_support_behind_a_camera_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
     c, truth = _pair(4, outliers=0.1)
     problem, alive = _problem(c), torch.ones(1, 2, dtype=torch.bool)
-    turned = truth + np.array([0.01, 0, 0, 0, 0, 0, 0, 0])
+    turned = truth + np.array([5e-4, 0, 0, 0, 0, 0, 0, 0])  # half a pixel
     right, other = (unit(_normalised(reference.fundamental(p, SIZE0, SIZE1), problem)) for p in (truth, turned))
     both = torch.cat([right, other], 2)
     refined, _, front = refine_focal(both, problem, iterations=0)
