@@ -55,6 +55,19 @@ def known_targets() -> frozenset[str]:
     return frozenset().union(*(targets_of(OmegaConf.to_container(OmegaConf.load(path))) for path in files))
 
 
+def closest(group: str, config: Mapping[str, Any]) -> tuple[str, dict[str, Any]] | None:
+    """The project's preset of a group from which a config differs least, and the options in which it does.
+
+    None where no preset builds what the config does, or the options are not those of the preset.
+    """
+    found = []
+    for name in available(group):
+        preset = load(group, name)
+        if preset.get("_target_") == config.get("_target_") and preset.keys() >= config.keys():
+            found.append((name, {key: value for key, value in config.items() if preset[key] != value}))
+    return min(found, key=lambda pair: len(pair[1]), default=None)
+
+
 def targets_of(config: object) -> frozenset[str]:
     """The `_target_`s anywhere within a config."""
     if isinstance(config, Mapping):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import hydra
 import numpy as np
@@ -25,6 +26,7 @@ from fmtorch.storage import RunFolder, RunFolderError
 from fmtorch.storage.files import replacing
 
 STAGES = ("features", "matcher", "pruner", "estimator")
+MOST_OPTIONS = 3  # that a run's name tells; of more its identity does
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,17 +77,51 @@ def run_folders(paths: Iterable[Path]) -> list[Path]:
 
 
 def _named(folders: Sequence[RunFolder]) -> list[_Run]:
-    """The runs that hold results; pipelines' names, with the identity where several share one."""
-    tables = [folder.read() for folder in folders]
-    names = [str(folder.config.get("pipeline", folder.path.name)) for folder in folders]
-    runs = [
-        _Run(name if names.count(name) == 1 else f"{name} {folder.identity[:6]}", folder, table)
-        for name, folder, table in zip(names, folders, tables, strict=True)
-        if table.num_rows
-    ]
-    if not runs:
+    """The runs that hold results: pipelines' names, with what differs where several share one."""
+    held = [(folder, table) for folder in folders if (table := folder.read()).num_rows]
+    if not held:
         raise RunFolderError("no run holds results yet; the command that began one continues it")
-    return runs
+    names = []
+    for folder, _ in held:
+        same = [other.config for other, _ in held if _pipeline_name(other) == _pipeline_name(folder)]
+        names.append(" ".join([_pipeline_name(folder), *_distinction(folder.config, same)]))
+    unique = [
+        name if names.count(name) == 1 else f"{name} {f.identity[:6]}" for name, (f, _) in zip(names, held, strict=True)
+    ]
+    return [_Run(name, folder, table) for name, (folder, table) in zip(unique, held, strict=True)]
+
+
+def _pipeline_name(folder: RunFolder) -> str:
+    return str(folder.config.get("pipeline", folder.path.name))
+
+
+def _distinction(config: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What tells a run from others of the same pipeline: presets' names, or a few options."""
+    words = []
+    for group in (*STAGES, "seed", "version"):
+        values = [run.get(group) for run in runs]
+        if all(value == values[0] for value in values):
+            continue
+        mine = config.get(group)
+        close = presets.closest(group, mine) if isinstance(mine, Mapping) else None
+        if close is not None and len({str(presets.closest(group, value)) for value in values if value}) > 1:
+            words += [close[0], *(f"{key}={value}" for key, value in close[1].items())]
+            continue
+        leaves = [dict(_leaves(value, group)) for value in values]
+        different = {key for one in leaves for key in one if any(one[key] != other.get(key) for other in leaves)}
+        own = {key: value for key, value in _leaves(mine, group) if key in different}
+        if len(own) <= MOST_OPTIONS:
+            words += [f"{key}={value}" for key, value in own.items()]
+    return words
+
+
+def _leaves(value: object, name: str) -> Iterator[tuple[str, object]]:
+    """Dotted names and values of all that a nested configuration holds."""
+    if isinstance(value, Mapping):
+        for key, entry in value.items():
+            yield from _leaves(entry, f"{name}.{key}")
+    else:
+        yield name, value
 
 
 def _by_dataset(runs: Sequence[_Run]) -> dict[str, list[_Run]]:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from fmtorch import report
+from fmtorch import presets, report
 from fmtorch.evaluation.page import Section, differing_pairs, render
 from fmtorch.storage import PairRow, RunFolder, RunFolderError, to_table
 from tests.test_pipeline import draw
@@ -76,6 +76,29 @@ def test_folders_of_runs_are_found_and_missed(tmp_path: Path) -> None:
         report.run(OmegaConf.create({**OPTIONS, "runs": [str(tmp_path)]}))
 
 
+def test_runs_are_told_apart_by_what_differs(tmp_path: Path) -> None:
+    base = {
+        "pipeline": "sift_ratio", "seed": 0, "features": {"_target_": "a"}, "pruner": {"r": {"threshold": 0.8}},
+        "estimator": {"_target_": "b"}, "dataset": {"name": "stereo"},
+    }  # fmt: skip
+    changes: dict[str, dict[str, object]] = {
+        "sift_ratio seed=0 estimator._target_=b": {},
+        "sift_ratio lmeds seed=1": {"seed": 1, "estimator": presets.load("estimator", "lmeds")},
+        "sift_gms": {"pipeline": "sift_gms"},
+    }
+    folders = []
+    for i, change in enumerate(changes.values()):
+        folders.append(RunFolder.open(tmp_path / str(i), {**base, **change}))
+        folders[-1].append(results([0.1]))
+    names = [" ".join(sorted(r.name.split())) for r in report._named(folders)]
+    assert names == [" ".join(sorted(name.split())) for name in changes]
+    twice = [*folders, RunFolder.open(tmp_path / "twice", {**base, "learned": ["x"]})]
+    twice[-1].append(results([0.1]))
+    names = [r.name for r in report._named(twice)]
+    assert len(set(names)) == 4
+    assert names[0].split()[-1] == folders[0].identity[:6]  # nothing that a name tells differs
+
+
 def test_a_run_folder_runs_no_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     called = tmp_path / "called"
@@ -118,7 +141,8 @@ def test_the_command_on_two_runs(tmp_path: Path) -> None:
     page = (tmp_path / "report.html").read_text()
     assert page.count("data:image/jpeg") == 2 * 2 * 2  # pairs, runs, pictures
     assert "fmbench, test: Set" in page or "fmbench: Set" in page
-    assert len(set(re.findall(r"sift_ratio [0-9a-f]{6}", page))) == 2  # told apart by their identities
+    assert page.count("<td>sift_ratio lmeds hypotheses=100</td>") >= 3
+    assert page.count("<td>sift_ratio msac hypotheses=100</td>") >= 3
     # Without the images there are figures, and why there are no pictures.
     done = command("fmtorch.report", "output=bare.html")
     assert done.returncode == 0, done.stderr
