@@ -95,6 +95,8 @@ def run(arguments: argparse.Namespace) -> None:
         for spec in specs
     }
     if arguments.workers:
+        size = min(arguments.batch or 1, -(-len(pairs) // (4 * arguments.workers)))  # some batches for each worker
+        batches = [collate(pairs[i : i + size]) for i in range(0, len(pairs), size)]
         for spec, run_one in methods.items():
             for name, workers in (("alone", 1), ("threads", arguments.workers)):
                 with ThreadPoolExecutor(workers) as pool:
