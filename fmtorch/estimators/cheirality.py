@@ -43,7 +43,7 @@ def share_in_front(
     parallel = (b * (b + b3 * b3) * (a + a3 * a3)).sqrt() * (tolerance[:, None] / depth[1])[..., None]
     ahead, behind = (torch.where(d > -parallel, support, 0) for d in (distance, -distance))
     fronts = torch.stack([exact_sum(torch.where(s > 0, x, 0)) for s in (side, -side) for x in (ahead, behind)])
-    share: Tensor = fronts.amax(0) / exact_sum(support)
+    share: Tensor = fronts.amax(0) / exact_sum(support.clone())  # which is rounded in place
     return share
 
 

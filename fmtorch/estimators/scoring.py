@@ -213,7 +213,7 @@ def median_rank(count: Tensor) -> Tensor:
 
 
 def exact_sum(gain: Float[Tensor, "p m n"]) -> Float[Tensor, "p m"]:
-    """Sum over matches of gains in [0, 1], each first rounded so that the sum is exact."""
+    """Sum over matches of gains in [0, 1], each first rounded, in place, so that the sum is exact."""
     return _rounded(gain, _fractional_bits(gain.shape[-1], gain.dtype)).sum(-1)
 
 
