@@ -99,8 +99,8 @@ def test_tiles_change_no_score(score: scoring.Score, tile: int, monkeypatch: pyt
 def test_exact_sum_does_not_depend_on_the_order() -> None:
     gain = torch.rand(1, 3, 20000, generator=torch.Generator().manual_seed(0))
     shuffled = gain[..., torch.randperm(20000, generator=torch.Generator().manual_seed(1))]
-    assert torch.equal(scoring._exact_sum(gain.clone()), scoring._exact_sum(shuffled.clone()))
-    np.testing.assert_allclose(scoring._exact_sum(gain.clone()).numpy(), gain.double().sum(-1).numpy(), rtol=1e-3)
+    assert torch.equal(scoring.exact_sum(gain.clone()), scoring.exact_sum(shuffled.clone()))
+    np.testing.assert_allclose(scoring.exact_sum(gain.clone()).numpy(), gain.double().sum(-1).numpy(), rtol=1e-3)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
