@@ -34,7 +34,6 @@ from fmtorch.storage.features import CachedFeatures
 
 MANY = 500  # pairs from which on processes are worth their start
 MOST_PROCESSES = 8  # unless more are asked for: each holds the networks of the pipeline and some 0.5 GB
-STAGE_GROUPS = ("features", "matcher", "pruner", "estimator")
 
 
 def run(config: DictConfig, pipeline_name: str) -> Path:
@@ -43,7 +42,7 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
     with _progress() as progress:
         dataset = _load(config.dataset, progress)
         pipeline = presets.build_pipeline(config, device)
-        stages = {group: plain(config.get(group)) for group in STAGE_GROUPS}
+        stages = {group: plain(config.get(group)) for group in presets.STAGES}
         identity = {
             "pipeline": pipeline_name, **stages, "seed": config.seed, "version": __version__,
             "learned": _learned(pipeline),

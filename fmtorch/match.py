@@ -32,8 +32,6 @@ from fmtorch.resources import conf_dir
 from fmtorch.storage.features import CachedFeatures
 from fmtorch.storage.files import replacing
 
-STAGES = ("features", "matcher", "pruner", "estimator")  # groups of the configuration that a pipeline chooses from
-
 
 def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -> Path:
     """Match the two photographs of a composed config and return the folder with the results.
@@ -152,7 +150,7 @@ def main(config: DictConfig) -> None:
     """The command."""
     with exits_with_message():
         hydra_config = HydraConfig.get()
-        changed = [o for o in hydra_config.overrides.task if o.lstrip("+~").startswith(STAGES)]
+        changed = [o for o in hydra_config.overrides.task if o.lstrip("+~").startswith(presets.STAGES)]
         run(config, str(hydra_config.runtime.choices["pipeline"]), changed)
 
 

@@ -23,6 +23,7 @@ from fmtorch.pipeline import Pipeline
 from fmtorch.resources import conf_dir
 from fmtorch.storage.features import cached
 
+STAGES = ("features", "matcher", "pruner", "estimator")  # groups that a pipeline chooses from
 _composing = threading.Lock()  # Hydra composes through a global
 
 
@@ -61,11 +62,16 @@ def closest(group: str, config: Mapping[str, Any]) -> tuple[str, dict[str, Any]]
     None where no preset builds what the config does, or the options are not those of the preset.
     """
     found = []
-    for name in available(group):
-        preset = load(group, name)
+    for name, preset in _shipped(group).items():
         if preset.get("_target_") == config.get("_target_") and preset.keys() >= config.keys():
             found.append((name, {key: value for key, value in config.items() if preset[key] != value}))
     return min(found, key=lambda pair: len(pair[1]), default=None)
+
+
+@functools.cache
+def _shipped(group: str) -> dict[str, dict[str, Any]]:
+    """The project's own presets of a group, by name."""
+    return {name: load(group, name) for name in available(group)}
 
 
 def targets_of(config: object) -> frozenset[str]:

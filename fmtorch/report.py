@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,8 @@ from fmtorch.pipeline import Outcome, Pipeline
 from fmtorch.resources import conf_dir
 from fmtorch.storage import RunFolder, RunFolderError
 from fmtorch.storage.files import replacing
+from fmtorch.storage.runs import leaves
 
-STAGES = ("features", "matcher", "pruner", "estimator")
 MOST_OPTIONS = 3  # that a run's name tells; of more its identity does
 
 
@@ -56,6 +56,7 @@ def run(config: DictConfig) -> Path:
         for r in runs
     ]
     output = Path(str(config.output))
+    output.parent.mkdir(parents=True, exist_ok=True)
     with replacing(output) as temporary:
         temporary.write_text(render(str(config.title), sections, rows), encoding="utf-8")
     for section in sections:
@@ -98,7 +99,7 @@ def _pipeline_name(folder: RunFolder) -> str:
 def _distinction(config: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> list[str]:
     """What tells a run from others of the same pipeline: presets' names, or a few options."""
     words = []
-    for group in (*STAGES, "seed", "version"):
+    for group in (*presets.STAGES, "seed", "version"):
         values = [run.get(group) for run in runs]
         if all(value == values[0] for value in values):
             continue
@@ -107,21 +108,12 @@ def _distinction(config: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -
         if close is not None and len({str(presets.closest(group, value)) for value in values if value}) > 1:
             words += [close[0], *(f"{key}={value}" for key, value in close[1].items())]
             continue
-        leaves = [dict(_leaves(value, group)) for value in values]
-        different = {key for one in leaves for key in one if any(one[key] != other.get(key) for other in leaves)}
-        own = {key: value for key, value in _leaves(mine, group) if key in different}
+        known = [dict(leaves(value, group)) for value in values]
+        different = {key for one in known for key in one if any(one[key] != other.get(key) for other in known)}
+        own = {key: text for key, text in leaves(mine, group) if key in different}
         if len(own) <= MOST_OPTIONS:
-            words += [f"{key}={value}" for key, value in own.items()]
+            words += [f"{key}={text.strip(chr(34))}" for key, text in own.items()]
     return words
-
-
-def _leaves(value: object, name: str) -> Iterator[tuple[str, object]]:
-    """Dotted names and values of all that a nested configuration holds."""
-    if isinstance(value, Mapping):
-        for key, entry in value.items():
-            yield from _leaves(entry, f"{name}.{key}")
-    else:
-        yield name, value
 
 
 def _by_dataset(runs: Sequence[_Run]) -> dict[str, list[_Run]]:
@@ -176,7 +168,7 @@ def _images(r: _Run, config: DictConfig) -> Mapping[str, ImagePair]:
 
 def _pipeline(r: _Run, config: DictConfig) -> Pipeline:
     """The pipeline of a run. Raises ValueError for parts that are not the project's own: a file never runs code."""
-    stages = {group: r.folder.config.get(group) for group in STAGES}
+    stages = {group: r.folder.config.get(group) for group in presets.STAGES}
     foreign = presets.targets_of(stages) - presets.known_targets()
     if foreign:
         raise ValueError(f"{r.name} has parts of your own ({', '.join(sorted(foreign))}), which a report does not load")

@@ -177,17 +177,17 @@ def _claim(file: Path, config: dict[str, Any]) -> None:
 
 def _differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     """``a.b: 1 -> 2`` for each field that differs."""
-    before, after = dict(_leaves(old)), dict(_leaves(new))
+    before, after = dict(leaves(old)), dict(leaves(new))
     names = [*before, *(name for name in after if name not in before)]
     pairs = [(name, before.get(name, "(absent)"), after.get(name, "(absent)")) for name in names]
     return [f"{name}: {was} -> {now}" for name, was, now in pairs if was != now]
 
 
-def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
+def leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
     """Dotted names and JSON texts of all that a nested configuration holds."""
     if isinstance(value, dict) and value:
         for key, entry in value.items():
-            yield from _leaves(entry, f"{name}.{key}" if name else key)
+            yield from leaves(entry, f"{name}.{key}" if name else key)
     else:
         yield name, json.dumps(value, sort_keys=True)
 
