@@ -28,6 +28,7 @@ def find_fundamental(
     prior: Array | None = None,
     lafs0: Array | None = None,
     lafs1: Array | None = None,
+    noise: Array | None = None,
     size0: Array | None = None,
     size1: Array | None = None,
     key: Array | None = None,
@@ -39,6 +40,8 @@ def find_fundamental(
     x0, x1: matched points in pixels, (N, 2) for one pair or (B, N, 2) for a padded batch, NumPy or torch, on any
     device; gradients reach them through the final fit. mask: (B, N), True for real matches; all when not given.
     quality: (B, N), the matcher's figure, smaller is better (a distance ratio). prior: (B, N), P(inlier) in [0, 1].
+    noise: (B, N), each match's standard deviation relative to a usual one's (`fmtorch.pruning.MatchNoise` derives it
+    from frames).
     lafs0, lafs1: (B, N, 2, 3) local affine frames. size0, size1: (B, 2) image sizes (h, w). key: (B,) int64, selects
     each pair's random numbers. Where an estimator uses a prior and none is given, it is derived from the frames and the
     quality, if both are given, otherwise from the points and, if given, the quality. One pair's arguments may come
@@ -70,6 +73,7 @@ def find_fundamental(
     c = Correspondences(
         x0_batch, x1_batch, live.to(torch.bool), quality=batch(quality, 2), prior=batch(prior, 2),
         lafs0=batch(lafs0, 4), lafs1=batch(lafs1, 4), size0=batch(size0, 2), size1=batch(size1, 2), key=batch(key, 1),
+        noise=batch(noise, 2),
     )  # fmt: skip
     chosen = _estimator(estimator, json.dumps(options, sort_keys=True))
     if prior is None and getattr(chosen, "uses_prior", False):

@@ -141,6 +141,8 @@ class Correspondences(_Record):
     x0, x1: matched points (B, N, 2) in pixels. mask: (B, N).
     quality: the matcher's own figure (B, N), for nearest neighbours the distance ratio; smaller is better.
     prior: P(inlier) in [0, 1], (B, N), where something supplies it.
+    noise: standard deviation of each match's distance to its epipolar line, relative to that of a usual match, (B, N),
+    where something supplies it.
     lafs0, lafs1: local affine frames (B, N, 2, 3) where known. size0, size1: image sizes (B, 2) as (h, w).
     K0, K1: calibration matrices (B, 3, 3) where known. key: (B,) int64, see `pair_key`; 0 when not given.
     mutual: (B, N), True where the match is also the best one of its partner, where the matcher knows.
@@ -159,6 +161,7 @@ class Correspondences(_Record):
     K1: Float[Tensor, "b 3 3"] | None = None
     key: Int[Tensor, " b"] | None = None
     mutual: Bool[Tensor, "b n"] | None = None
+    noise: Float[Tensor, "b n"] | None = None
 
     def __post_init__(self) -> None:
         if self.x0.dim() != 3 or self.x0.shape[-1] != 2:
@@ -170,6 +173,7 @@ class Correspondences(_Record):
             "x1": (b, n, 2), "mask": (b, n), "quality": (b, n), "prior": (b, n),
             "lafs0": (b, n, 2, 3), "lafs1": (b, n, 2, 3), "size0": (b, 2), "size1": (b, 2),
             "K0": (b, 3, 3), "K1": (b, 3, 3), "key": (b,), "mutual": (b, n),
+            "noise": (b, n),
         }  # fmt: skip
         for name, shape in shapes.items():
             _expect(name, getattr(self, name), shape)
@@ -207,7 +211,7 @@ class Correspondences(_Record):
             index = order.reshape(*order.shape, *[1] * (value.dim() - 2)).expand(-1, -1, *value.shape[2:])
             return _pad(torch.gather(value, 1, index), 1, order.shape[1] + short)
 
-        per_match = ("x0", "x1", "mask", "quality", "prior", "lafs0", "lafs1", "mutual")
+        per_match = ("x0", "x1", "mask", "quality", "prior", "lafs0", "lafs1", "mutual", "noise")
         return self.replace(**{f: take(getattr(self, f)) for f in per_match if getattr(self, f) is not None})
 
 
@@ -287,7 +291,10 @@ def collate(items: Sequence[Item]) -> Item:
 
 
 _PER_SLOT = frozenset(
-    ("lafs", "scores", "descriptors", "x0", "x1", "mask", "quality", "prior", "lafs0", "lafs1", "mutual", "inliers")
+    (
+        *("lafs", "scores", "descriptors", "inliers"),
+        *("x0", "x1", "mask", "quality", "prior", "lafs0", "lafs1", "mutual", "noise"),
+    )
 )
 
 

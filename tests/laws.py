@@ -96,7 +96,7 @@ def with_padding(c: Correspondences, rng: np.random.Generator, garbage: float) -
         index = where.reshape(b, n, *[1] * (value.dim() - 2)).expand(b, n, *value.shape[2:])
         return out.scatter(1, index, value)
 
-    fields = ("x0", "x1", "mask", "quality", "prior", "lafs0", "lafs1", "mutual")
+    fields = ("x0", "x1", "mask", "quality", "prior", "lafs0", "lafs1", "mutual", "noise")
     return c.replace(**{f: spread(getattr(c, f)) for f in fields if getattr(c, f) is not None})
 
 

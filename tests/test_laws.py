@@ -27,6 +27,8 @@ from tests.laws import (
 )
 
 OWN = [n for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES)]
+PER_MATCH = ("inliers", "kept", "prior", "noise")
+NOISY = ("fmtorch", "fmtorch_max", "gc_ransac", "msac")  # are also told the noise of matches
 TILES = [  # what bounds memory and fills caches, and must change no result
     (engine, "CPU_SAMPLES", 150), (scoring, "CPU_TILE", 1000), (local_optimization, "CPU_TILE", 1000),
     (irls, "TILE", 1000), (sampson_objective, "TILE_ELEMENTS", 1), (sampson_objective, "TILE_MODELS", 3),
@@ -48,16 +50,26 @@ def _pruner(name: str) -> Subject:
 
     def run(c: Correspondences) -> Result:
         pruned = pruner(c)
-        prior = {} if pruned.prior is None else {"prior": pruned.prior}
-        return {"kept": pruned.mask, **prior}
+        told = {name: getattr(pruned, name) for name in ("prior", "noise")}
+        return {"kept": pruned.mask, **{name: value for name, value in told.items() if value is not None}}
 
     return Subject(f"pruner={name}", run)
+
+
+def _noisy(name: str) -> Subject:
+    estimator, noise = quick(name), presets.build("pruner", "match_noise")
+
+    def run(c: Correspondences) -> Result:
+        e = estimator(noise(c), seed=5)
+        return {"F": e.F, "inliers": e.inliers, "ok": e.ok, "draws": e.draws}
+
+    return Subject(f"estimator={name} with noise", run)
 
 
 def _subjects() -> list[Subject]:
     """Every preset of these groups: a new file in conf/ joins by being there."""
     estimators = [_estimator(n) for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES[1:])]
-    return [*estimators, *(_pruner(n) for n in presets.available("pruner"))]
+    return [*estimators, *(_pruner(n) for n in presets.available("pruner")), *(_noisy(n) for n in NOISY)]
 
 
 @functools.cache
@@ -89,9 +101,7 @@ def test_neighbours_are_invisible(subject: Subject) -> None:
     for i, pair in enumerate(pairs):
         alone = subject.run(pair)
         n = pair.mask.shape[1]
-        shared = {
-            k: v[i : i + 1, :n] if k in ("inliers", "kept", "prior") else v[i : i + 1] for k, v in together.items()
-        }
+        shared = {k: v[i : i + 1, :n] if k in PER_MATCH else v[i : i + 1] for k, v in together.items()}
         assert_same(alone, shared, f"{subject.name}, pair {i}")
 
 
@@ -100,7 +110,7 @@ def test_neighbours_are_invisible(subject: Subject) -> None:
 def test_no_pair_takes_its_batch_down(subject: Subject, kind: str) -> None:
     mixed = subject.run(collate([GOOD[0], degenerate()[kind], GOOD[1]]))
     n = max(pair.mask.shape[1] for pair in GOOD)
-    kept = {k: v[[0, 2], :n] if k in ("inliers", "kept", "prior") else v[[0, 2]] for k, v in mixed.items()}
+    kept = {k: v[[0, 2], :n] if k in PER_MATCH else v[[0, 2]] for k, v in mixed.items()}
     assert_same(_good_alone(subject), kept, f"{subject.name} beside {kind}")
     for value in mixed.values():
         assert not bool(torch.isnan(value.to(torch.float64)).any()), f"{subject.name}: NaN for {kind}"

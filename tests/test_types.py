@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from fmtorch.types import Correspondences, Estimate, Features, collate, pair_key
 
 NAN = float("nan")
-PER_MATCH = ("x0", "x1", "mask", "quality", "prior", "lafs0", "lafs1", "mutual")
+PER_MATCH = ("x0", "x1", "mask", "quality", "prior", "lafs0", "lafs1", "mutual", "noise")
 
 
 def features(n: int = 5, d: int = 3, seed: int = 0) -> Features:
@@ -42,6 +42,7 @@ def matches(b: int = 4, n: int = 6, seed: int = 0) -> Correspondences:
         K1=torch.rand(b, 3, 3, generator=g),
         key=torch.arange(b) + 100 * seed,
         mutual=torch.rand(b, n, generator=g) < 0.5,
+        noise=torch.rand(b, n, generator=g),
     )
 
 

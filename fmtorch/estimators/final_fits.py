@@ -58,7 +58,7 @@ class LeastSquares:
 
 
 class GaussNewton:
-    """One attached Gauss-Newton step of the Sampson error at the refined model, on its inliers, weighted by the prior.
+    """One attached Gauss-Newton step of the Sampson error at the refined model, on its inliers, by prior and noise.
 
     At an optimum it moves nothing, and its gradient is that of the optimum (implicit function theorem).
     """
@@ -68,7 +68,7 @@ class GaussNewton:
     ) -> Float[Tensor, "p 3 3"]:
         """As `FinalFit`."""
         x0, x1 = problem.points[:2].permute(1, 2, 0), problem.points[2:].permute(1, 2, 0)
-        weight = inliers.to(torch.float64) if problem.prior is None else torch.where(inliers, problem.prior, 0)
+        weight = torch.where(inliers, problem.weight(), 0)
         return attached_step(F, x0, x1, weight, kernel="truncated", scale=torch.inf)
 
 
@@ -88,22 +88,29 @@ class AdaptiveGaussNewton:
         self, F: Float[Tensor, "p 3 3"], problem: Problem, inliers: Bool[Tensor, "p n"]
     ) -> Float[Tensor, "p 3 3"]:
         """As `FinalFit`."""
-        prior = problem.live.to(torch.float64) if problem.prior is None else problem.prior
+        weight = problem.weight()
+        likely = inliers if problem.prior is None else inliers & (problem.prior > LIKELY)
         with torch.no_grad():
-            truncation = noise(residuals_squared(F, problem), inliers & (prior > LIKELY))
+            truncation = noise(_in_noises(F, problem), likely)
             models = F.flatten(1).T[..., None].contiguous()
-            scale = truncation / problem.unit
+            scale = truncation[:, None] / problem.units
             refined, _ = refine_components(
-                models, problem.points, prior, "truncated", scale, ITERATIONS, TOLERANCE, RANK_TWO_ALREADY, DAMPING
+                models, problem.points, weight, "truncated", scale, ITERATIONS, TOLERANCE, RANK_TWO_ALREADY, DAMPING
             )
             F = refined[..., 0].T.reshape(-1, 3, 3)
-            if not (problem.points.requires_grad or prior.requires_grad):
+            if not (problem.points.requires_grad or weight.requires_grad):
                 return F
-            close = residuals_squared(F, problem) <= truncation.square()[:, None]
+            close = _in_noises(F, problem) <= truncation.square()[:, None]
         x0, x1 = problem.points[:2].permute(1, 2, 0), problem.points[2:].permute(1, 2, 0)
-        weight = torch.where(close & problem.live, prior, 0)
+        weight = torch.where(close & problem.live, weight, 0)
         step = attached_step(F, x0, x1, weight, kernel="truncated", scale=torch.inf)
         return F + (step - step.detach())
+
+
+def _in_noises(F: Float[Tensor, "p 3 3"], problem: Problem) -> Float[Tensor, "p n"]:
+    """Squared Sampson distances in squared pixels, of matches of usual noise."""
+    r2 = residuals_squared(F, problem)
+    return r2 if problem.noise is None else r2 / problem.noise.square()
 
 
 def noise(r2: Float[Tensor, "p n"], inliers: Bool[Tensor, "p n"]) -> Float[Tensor, " p"]:

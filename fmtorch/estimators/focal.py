@@ -118,8 +118,8 @@ def refine_focal(
         models = unit(_translated(state.F, offset))
         sound = torch.isfinite(models).all(0) & torch.isfinite(state.cost)
         depth = exponential(state.focal) * longest[..., None]
-        r2 = sampson_squared(state.F, points) * (problem.unit / SCALE).square()[:, None, None]
-        support = geman_mcclure_gain(r2) * objective.weight[:, None]
+        r2 = sampson_squared(state.F, points) * (problem.units / SCALE).square()[:, None]
+        support = geman_mcclure_gain(r2) * (problem.live if problem.prior is None else problem.prior)[:, None]
         front = share_in_front(state.U, state.V, depth, points, support, PARALLEL / problem.unit)
         return models, torch.where(sound, _prior(state.focal)[0], torch.inf), front
 
@@ -152,8 +152,7 @@ class _Objective:
     """The negative logarithm of the posterior, with its derivatives by five rotations and two log focal lengths."""
 
     def __init__(self, problem: Problem, points: Tensor, longest: Tensor) -> None:
-        self.weight = problem.live.to(torch.float64) if problem.prior is None else problem.prior
-        self.data = Objective(points, self.weight, KERNELS["geman_mcclure"], SCALE / problem.unit)
+        self.data = Objective(points, problem.weight(), KERNELS["geman_mcclure"], SCALE / problem.units)
         self.precision = (problem.unit / SIGMA).square()[:, None]
         self.longest = longest
         # Of the derivatives of E by rotations of U about its three axes and of V about the first two.

@@ -125,17 +125,16 @@ class RobustDeviations:
 
 
 class Refinement:
-    """Levenberg-Marquardt of the robust Sampson error, weighted by the prior where there is one."""
+    """Levenberg-Marquardt of the robust Sampson error, weighted by prior and noise where there are any."""
 
     def __init__(self, kernel: str, threshold: float, iterations: int) -> None:
         self.kernel, self.threshold, self.iterations = kernel, threshold, iterations
 
     def __call__(self, F: Float[Tensor, "9 p k"], problem: Problem) -> Float[Tensor, "9 p k"]:
         """The refined models."""
-        weight = problem.live.to(torch.float64) if problem.prior is None else problem.prior
-        scale = self.threshold / problem.unit
+        scale = self.threshold / problem.units
         return refine_components(
-            F, problem.points, weight, self.kernel, scale, self.iterations, squarings=RANK_TWO_ALREADY
+            F, problem.points, problem.weight(), self.kernel, scale, self.iterations, squarings=RANK_TWO_ALREADY
         )[0]
 
 

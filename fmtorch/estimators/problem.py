@@ -16,6 +16,7 @@ from fmtorch.geometry.reduce import matmul3
 from fmtorch.types import Correspondences
 
 SMALLEST_BUCKET = 128
+LEAST_NOISE, MOST_NOISE = 0.1, 10.0  # of a match, relative to a usual one; what is beyond is taken for these
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -25,9 +26,10 @@ class Problem:
     points: (4, P, N) float64, rows x0, y0, x1, y1 in normalised units: ``x = centre + unit * point``.
     count: live matches (P,). unit: pixels in one normalised unit (P,), a power of two. centre: (P, 4).
     slot: where each match stood in the caller's tensors (P, N). pair: index of each pair in the caller's batch.
-    quality, prior: (P, N), zero in padded slots, None where the caller has none. size0, size1: (P, 2) as (h, w),
+    quality, prior: (P, N), zero in padded slots, None where the caller has none. noise: likewise, between LEAST_NOISE
+    and MOST_NOISE, one in padded slots. size0, size1: (P, 2) as (h, w),
     pixels, or None. seed: of every random choice.
-    Points, quality and prior stay attached to the caller's graph; centre and unit are constants.
+    Points, quality, prior and noise stay attached to the caller's graph; centre and unit are constants.
     """
 
     points: Float[Tensor, "4 p n"]
@@ -43,6 +45,18 @@ class Problem:
     seed: int
     size0: Int[Tensor, "p 2"] | None = None
     size1: Int[Tensor, "p 2"] | None = None
+    noise: Float[Tensor, "p n"] | None = None
+
+    @property
+    def units(self) -> Float[Tensor, "p slots"]:
+        """Pixels in one normalised unit, divided by each match's noise: a column for all (P, 1) where there is none."""
+        unit = self.unit[:, None]
+        return unit if self.noise is None else unit / self.noise
+
+    def weight(self) -> Float[Tensor, "p n"]:
+        """What each match counts in a fit: its prior divided by the square of its noise; float64, zero if padded."""
+        prior = self.live.to(torch.float64) if self.prior is None else self.prior
+        return prior if self.noise is None else prior / self.noise.square()
 
     def __getitem__(self, index: Tensor) -> Problem:
         """The selected pairs."""
@@ -68,6 +82,7 @@ class Problem:
         return dataclasses.replace(
             self, points=points, live=live, count=live.sum(1), slot=self.slot.gather(1, index),
             quality=some(self.quality), prior=some(self.prior),
+            noise=None if self.noise is None else torch.where(live, self.noise.gather(1, index), 1),
         )  # fmt: skip
 
     def to_pixels(self, F: Float[Tensor, "p 3 3"]) -> Float[Tensor, "p 3 3"]:
@@ -136,10 +151,13 @@ def _problem(c: Correspondences, live: Tensor, pair: Tensor, n: int, seed: int) 
     # A power of two, so that scaling rounds nothing. Zero when all points coincide in both images.
     unit = torch.where(half > 0, torch.exp2(torch.ceil(torch.log2(half.clamp_min(1e-300)))), 0)
     points = torch.where(inside, (pixels - centre[:, None]) / unit.clamp_min(1e-300)[:, None, None], 0)
-    prior = take(None if c.prior is None else c.prior)
+    prior, noise = take(c.prior), take(c.noise)
+    if noise is not None:
+        noise = torch.where(live, noise.nan_to_num(1).clamp(LEAST_NOISE, MOST_NOISE), 1)
     return Problem(
         points.permute(2, 0, 1).contiguous(), live, count, unit, centre, order, pair, c.keys[pair],
         take(None if c.quality is None else c.quality),
         None if prior is None else prior.nan_to_num(0).clamp(0, 1), seed,
         None if c.size0 is None else c.size0[pair], None if c.size1 is None else c.size1[pair],
+        noise,
     )  # fmt: skip

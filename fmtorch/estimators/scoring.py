@@ -62,9 +62,10 @@ class Score(Protocol):
         F: Float[Tensor, "9 p m"],
         points: Float[Tensor, "4 p n"],
         weight: Float[Tensor, "p n"],
-        unit: Float[Tensor, " p"],
+        unit: Float[Tensor, "p slots"],
     ) -> Float[Tensor, "p m"]:
-        """Scores of models of points in normalised units, `unit` the pixels in one of them.
+        """Scores of models of points in normalised units, `unit` the pixels in one of them: (p, 1), or (p, n) where
+        each match has its own noise, by which its pixels are divided.
 
         weight: what each match counts, in [0, 1]; zero in padded slots.
         """
@@ -89,7 +90,7 @@ class SummedGains:
 
     def __call__(self, F: Tensor, points: Tensor, weight: Tensor, unit: Tensor) -> Tensor:
         """As `Score`."""
-        scale = (unit / self.threshold).square().to(F.dtype)[:, None, None]
+        scale = (unit / self.threshold).square().to(F.dtype)[:, None]
         gain = self._gain(sampson_squared(F, points).mul_(scale))
         return exact_sum(gain.mul_(weight[:, None]))
 
@@ -145,7 +146,7 @@ class SaturatedGains:
         whole = VECTORS // F.element_size()  # so many models at a time: the rest would be rounded differently
         F = torch.nn.functional.pad(F, (0, -m % whole))
         bits = _fractional_bits(n, F.dtype)
-        scale = (unit / self.threshold).square().to(F.dtype)[:, None, None]
+        scale = (unit / self.threshold).square().to(F.dtype)[..., None]
         r2 = _sampson(F[:, :, None], points[..., None]).mul_(scale)  # (p, n, m): rows of models are added to a cell
         gain = _rounded(geman_mcclure_gain(r2).mul_(weight[..., None]), bits).flatten(0, 1)
         first = GRID * GRID * torch.arange(p, device=F.device)[:, None]
@@ -242,10 +243,11 @@ def score_models(
     Memory: eight buffers of one tile. Models are float32 in normalised units, as are the points.
     """
     weight = problem.prior if score.prior_weighted and problem.prior is not None else problem.live
-    weight = weight.to(F.dtype)
+    weight, units = weight.to(F.dtype), problem.units
     width = problem.count.tolist()
     if subset is not None:
         points, weight = points.gather(2, subset.expand(4, -1, -1)), weight.gather(1, subset)
+        units = units.gather(1, subset) if problem.noise is not None else units
         width = [subset.shape[1]] * len(width)
     p, m = F.shape[1:]
     height = [m] * p if valid is None else valid.sum(1).tolist()
@@ -258,5 +260,5 @@ def score_models(
         models = max(1, limit // (n * pairs))
         for j in range(0, max(height[some]), models):
             these = slice(j, min(j + models, max(height[some])))
-            scores[some, these] = score(F[:, some, these], points[:, some, :n], weight[some, :n], problem.unit[some])
+            scores[some, these] = score(F[:, some, these], points[:, some, :n], weight[some, :n], units[some, :n])
     return scores if valid is None else scores.masked_fill_(~valid, -torch.inf)

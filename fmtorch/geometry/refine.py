@@ -38,7 +38,7 @@ def refine_components(
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
     kernel: str,
-    scale: Float[Tensor, " p"],
+    scale: Float[Tensor, " p"] | Float[Tensor, "p slots"],
     iterations: int,
     tolerance: float = 0.0,
     squarings: int = SQUARINGS,
@@ -47,7 +47,8 @@ def refine_components(
     """Refined models and their costs ``sum_i w_i rho(r_i^2)``, component by component, without gradients.
 
     F: k models for each of p pairs, entries row by row; made rank 2 first where they are not. points: x0, y0, x1, y1,
-    of about unit scale; finite. weight: 0 in padded slots. scale: of the kernel, in the unit of the points.
+    of about unit scale; finite. weight: 0 in padded slots. scale: of the kernel, in the unit of the points,
+    one for all matches of a pair, (p,) or (p, 1), or one for each (p, n).
     iterations: at most. tolerance: a model is done once a step has lowered its cost by no more than this share of it.
     squarings: of `start`. damping: of the first step.
     The cost of a model never rises above that of its (rank-2) start; a model that cannot be improved is kept, one that

@@ -38,18 +38,26 @@ def blocks(
 
 
 class Objective:
-    """The robust cost of models of some pairs, with its normal equations, in tiles that stay in the cache."""
+    """The robust cost of models of some pairs, with its normal equations, in tiles that stay in the cache.
+
+    scale: of the kernel, one for all matches of a pair, (p,) or (p, 1), or one for each (p, n).
+    """
 
     def __init__(
         self,
         points: Float[Tensor, "4 p n"],
         weight: Float[Tensor, "p n"],
         robust: Kernel,
-        scale: Float[Tensor, " p"],
+        scale: Float[Tensor, " p"] | Float[Tensor, "p slots"],
     ) -> None:
+        s2 = scale.square().reshape(len(scale), -1)
+        if s2.shape[1] > 1:
+            s2 = torch.nn.functional.pad(s2, (0, -s2.shape[1] % LANES), value=1)
+            self.s2 = s2.reshape(len(s2), -1, 1, LANES).transpose(0, 1).contiguous()
+        else:
+            self.s2 = s2[None, :, :, None]
         points, self.weight = blocks(points, weight)
-        self.points = homogeneous(points)
-        self.robust, self.s2 = robust, scale.square()[:, None, None]
+        self.points, self.robust = homogeneous(points), robust
 
     def __call__(
         self, F: Float[Tensor, "9 p k"], derivatives: bool
@@ -73,18 +81,18 @@ class Objective:
         return products, cost
 
     def _tile(self, F: Tensor, pairs: slice, derivatives: bool) -> tuple[Tensor, Tensor]:
-        points, weight, s2 = self.points[:, :, :, pairs], self.weight[:, pairs], self.s2[pairs]
+        points, weight, s2 = self.points[:, :, :, pairs], self.weight[:, pairs], self.s2[:, pairs]
         count = max(1, TILE_ELEMENTS // (F[0].numel() * LANES))
         products, costs = [], []
         for first in range(0, len(weight), count):
             some = slice(first, first + count)
-            w = weight[some]
+            w, scale = weight[some], s2[some] if len(s2) > 1 else s2
             J, e, inverse, r2 = linearise(F, points[:, :, some], derivatives)
-            loss = self.robust.loss(r2, s2)
+            loss = self.robust.loss(r2, scale)
             costs.append(block_products(loss[None], w.expand_as(loss)[None]))
             if derivatives:
                 A = torch.cat([J.flatten(0, 1), e[None]])
-                products.append(block_products(A, A * (self.robust.weight(r2, s2) * w * inverse)))
+                products.append(block_products(A, A * (self.robust.weight(r2, scale) * w * inverse)))
         cost = _in_order(costs)[0, 0]
         return _in_order(products) if derivatives else F.new_empty(0, 0, *cost.shape), cost
 

@@ -6,6 +6,7 @@ from fmtorch.pruning.frame_consistency import FrameConsistency, frame_agreement
 from fmtorch.pruning.gms import GMS, gms, gms_support
 from fmtorch.pruning.likely import Likely
 from fmtorch.pruning.lpm import LPM, lpm, lpm_cost
+from fmtorch.pruning.match_noise import MatchNoise, match_noise
 from fmtorch.pruning.mutual import MutualCheck, mutual
 from fmtorch.pruning.one_to_one import OneToOne, one_to_one
 from fmtorch.pruning.position_consistency import PositionConsistency, position_agreement
@@ -20,6 +21,7 @@ __all__ = [
     "FrameConsistency",
     "LikelihoodField",
     "Likely",
+    "MatchNoise",
     "MutualCheck",
     "OneToOne",
     "PositionConsistency",
@@ -33,6 +35,7 @@ __all__ = [
     "gms_support",
     "lpm",
     "lpm_cost",
+    "match_noise",
     "mutual",
     "one_to_one",
     "position_agreement",

@@ -30,7 +30,7 @@ def test_compiled_score_equals_the_eager_one_in_any_tile() -> None:
 def check_compiled_score() -> None:
     problem = problems(collate([scene(i, 180) for i in range(3)]), 0, 8)[0][0]
     F = torch.randn(9, 3, 40, generator=torch.Generator().manual_seed(0)) * torch.logspace(-2, 0, 9)[:, None, None]
-    points, weight, unit = problem.points.float(), problem.live.float(), problem.unit
+    points, weight, unit = problem.points.float(), problem.live.float(), problem.units
     score = TruncatedSquares(2.0)
     compiled = CompiledScore(score)
     whole = compiled(F, points, weight, unit)

@@ -110,7 +110,7 @@ def test_saturated_gains_depend_on_no_order(dtype: torch.dtype) -> None:
     points = torch.rand(4, 1, 20000, generator=generator, dtype=dtype) * 2 - 1
     weight = torch.rand(1, 20000, generator=generator, dtype=dtype)
     F = torch.randn(9, 1, 37, generator=generator, dtype=dtype)
-    score, unit = SaturatedGains(20.0), torch.tensor([512.0], dtype=torch.float64)
+    score, unit = SaturatedGains(20.0), torch.tensor([[512.0]], dtype=torch.float64)
     scores = score(F, points, weight, unit)
     assert (scores > 0).all()
     order = torch.randperm(20000, generator=generator)

@@ -1,0 +1,73 @@
+"""How exact is each match? Noise from the keypoint's size, the distance ratio and the prior."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from fmtorch.types import Correspondences, ungraphed
+
+LEAST_PRIOR = 0.02  # matches less likely than that are not taken for noisier
+
+
+def match_noise(
+    lafs0: Float[Tensor, "b n 2 3"],
+    lafs1: Float[Tensor, "b n 2 3"],
+    quality: Float[Tensor, "b n"] | None = None,
+    prior: Float[Tensor, "b n"] | None = None,
+    *,
+    usual: float,
+    radius: float,
+    slope: float,
+) -> Float[Tensor, "b n"]:
+    """Standard deviation of each match's distance to its epipolar line, in units of a usual match's.
+
+    ``(1 + s / radius) (1 + slope ratio)^2 P^(-1/4) / usual`` with s the larger of the two frames' scales in pixels: a
+    keypoint is located to a share of its size, and matches that are hard to tell apart, or that their neighbours
+    contradict somewhat, are less exact. Arithmetic and roots alone, which are rounded in the same way everywhere.
+    """
+    size = torch.maximum(_scale(lafs0), _scale(lafs1))
+    noise = (1 + size / radius) / usual
+    if quality is not None:
+        noise = noise * (1 + slope * quality).square()
+    if prior is not None:
+        noise = noise / prior.clamp_min(LEAST_PRIOR).sqrt().sqrt()
+    return noise
+
+
+def _scale(lafs: Float[Tensor, "b n 2 3"]) -> Float[Tensor, "b n"]:
+    """The square root of the area that a frame maps the unit square to, pixels."""
+    (a, b), (c, d) = (row.unbind(-1) for row in lafs[..., :2].unbind(-2))
+    return (a * d - b * c).abs().sqrt()
+
+
+@dataclasses.dataclass(frozen=True)
+class MatchNoise:
+    """Supplies ``noise`` by `match_noise`; matches without frames are left as they are.
+
+    Estimators divide each match's residual by it, in their scores and in their fits; inliers are reported by their
+    distance in pixels all the same. usual, radius, slope: see `match_noise`.
+    """
+
+    usual: float
+    radius: float
+    slope: float
+
+    def __call__(self, c: Correspondences) -> Correspondences:
+        """The same matches with their noise; one where masked or where it cannot be told."""
+        lafs0, lafs1 = c.lafs0, c.lafs1
+        if lafs0 is None or lafs1 is None:
+            return c
+        return ungraphed(c, lambda: self._with_noise(c, lafs0, lafs1))
+
+    def _with_noise(self, c: Correspondences, lafs0: Tensor, lafs1: Tensor) -> Correspondences:
+        inside = c.mask[..., None, None]
+        quality, prior = (None if v is None else torch.where(c.mask, v, 1) for v in (c.quality, c.prior))
+        noise = match_noise(
+            torch.where(inside, lafs0, 0), torch.where(inside, lafs1, 0), quality, prior,
+            usual=self.usual, radius=self.radius, slope=self.slope,
+        )  # fmt: skip
+        return c.replace(noise=torch.where(c.mask & torch.isfinite(noise), noise, 1))
