@@ -10,6 +10,7 @@ from torch import Tensor
 
 from fmtorch.types import Correspondences, ungraphed
 
+LEAST_AREA = 1e-12  # square pixels: keeps the gradient of the scale finite
 LEAST_PRIOR = 0.02  # matches less likely than that are not taken for noisier
 
 
@@ -41,7 +42,7 @@ def match_noise(
 def _scale(lafs: Float[Tensor, "b n 2 3"]) -> Float[Tensor, "b n"]:
     """The square root of the area that a frame maps the unit square to, pixels."""
     (a, b), (c, d) = (row.unbind(-1) for row in lafs[..., :2].unbind(-2))
-    return (a * d - b * c).abs().sqrt()
+    return (a * d - b * c).abs().clamp_min(LEAST_AREA).sqrt()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,10 +65,13 @@ class MatchNoise:
         return ungraphed(c, lambda: self._with_noise(c, lafs0, lafs1))
 
     def _with_noise(self, c: Correspondences, lafs0: Tensor, lafs1: Tensor) -> Correspondences:
-        inside = c.mask[..., None, None]
-        quality, prior = (None if v is None else torch.where(c.mask, v, 1) for v in (c.quality, c.prior))
+        sound = c.mask & torch.isfinite(lafs0).flatten(2).all(2) & torch.isfinite(lafs1).flatten(2).all(2)
+        for known in (c.quality, c.prior):
+            sound = sound if known is None else sound & torch.isfinite(known)
+        inside = sound[..., None, None]
+        quality, prior = (None if known is None else torch.where(sound, known, 1) for known in (c.quality, c.prior))
         noise = match_noise(
             torch.where(inside, lafs0, 0), torch.where(inside, lafs1, 0), quality, prior,
             usual=self.usual, radius=self.radius, slope=self.slope,
         )  # fmt: skip
-        return c.replace(noise=torch.where(c.mask & torch.isfinite(noise), noise, 1))
+        return c.replace(noise=torch.where(sound, noise, 1))

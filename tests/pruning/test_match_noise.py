@@ -44,6 +44,21 @@ def test_matches_without_frames_are_left_as_they_are_and_what_cannot_be_told_is_
     assert bool((alone[c.mask] > 0).all())
 
 
+def test_gradients_are_finite_beside_padding_and_what_is_no_frame() -> None:
+    c = scene(0, 50)
+    lafs = c.lafs0.clone()
+    lafs[:, 3], lafs[:, 4] = float("nan"), 0.0
+    lafs.requires_grad_()
+    prior = torch.rand(c.mask.shape, requires_grad=True)
+    mask = c.mask.clone()
+    mask[:, 5:9] = False
+    noise = presets.build("pruner", "match_noise")(c.replace(lafs0=lafs, mask=mask, prior=prior)).noise
+    noise.sum().backward()
+    assert bool(torch.isfinite(lafs.grad).all())
+    assert bool(torch.isfinite(prior.grad).all())
+    assert bool((prior.grad[mask] != 0).any())
+
+
 def test_noise_travels_with_its_matches() -> None:
     c = presets.build("pruner", "match_noise")(scene(0, 50))
     kept = torch.zeros_like(c.mask)
