@@ -27,8 +27,7 @@ class Problem:
     count: live matches (P,). unit: pixels in one normalised unit (P,), a power of two. centre: (P, 4).
     slot: where each match stood in the caller's tensors (P, N). pair: index of each pair in the caller's batch.
     quality, prior: (P, N), zero in padded slots, None where the caller has none. noise: likewise, between LEAST_NOISE
-    and MOST_NOISE, one in padded slots. size0, size1: (P, 2) as (h, w),
-    pixels, or None. seed: of every random choice.
+    and MOST_NOISE, one in padded slots. size0, size1: (P, 2) as (h, w), pixels, or None. seed: of every random choice.
     Points, quality, prior and noise stay attached to the caller's graph; centre and unit are constants.
     """
 

@@ -9,11 +9,12 @@ import pytest
 import torch
 
 from fmtorch import find_fundamental, metrics, presets
-from fmtorch.geometry import sampson
+from fmtorch.estimators import scoring
+from fmtorch.geometry import sampson, sampson_objective
 from fmtorch.geometry.refine import refine_components
 from fmtorch.pruning import match_noise
 from fmtorch.types import collate
-from tests.laws import scene
+from tests.laws import quick, scene
 
 NUMBERS = {"usual": 4.06, "radius": 15.0, "slope": 0.65}
 
@@ -102,6 +103,19 @@ def _fit() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     U, s, V = np.linalg.svd(rng.normal(size=(3, 3)))
     F = (U * [s[0], s[1], 0]) @ V
     return torch.from_numpy(F / np.linalg.norm(F)).reshape(9, 1, 1), points, weight
+
+
+@pytest.mark.parametrize("name", ["fmtorch", "fmtorch_max", "gc_ransac"])
+def test_tiles_change_nothing(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    estimator, stage = quick(name, 60, 30), presets.build("pruner", "match_noise")
+    c = stage(collate([scene(i, 150 + 40 * i) for i in range(4)]))
+    whole = estimator(c, 5)
+    assert not torch.equal(whole.F, estimator(c.replace(noise=None), 5).F)
+    for module, constant, value in (
+        (scoring, "CPU_TILE", 1000), (sampson_objective, "TILE_ELEMENTS", 1), (sampson_objective, "TILE_MODELS", 3),
+    ):  # fmt: skip
+        monkeypatch.setattr(module, constant, value)
+    assert torch.equal(whole.F, estimator(c, 5).F)
 
 
 def _noisy_pair(seed: int) -> tuple[torch.Tensor, ...]:
