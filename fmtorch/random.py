@@ -19,6 +19,7 @@ class Stream(enum.IntEnum):
     PLANE = 5
     PARALLAX = 6
     REFINEMENT = 7
+    FOCAL = 8
 
 
 def _wrap(value: int) -> int:

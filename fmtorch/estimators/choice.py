@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,17 +14,60 @@ from fmtorch.estimators.problem import Problem
 from fmtorch.estimators.scoring import SaturatedGains, score_models
 
 
+class Candidates(NamedTuple):
+    """Models of a pool, and which slots hold one."""
+
+    F: Float[Tensor, "9 p k"]
+    alive: Bool[Tensor, "p k"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class TwoCameras:
+    """Cameras of square pixels and central principal points, ``E = U diag(1, 1, 0) V^T``; NaN where none are assumed.
+
+    axes: U and V, (3, 3, 2, P), rows first. focal: the logarithms of the focal lengths in units of the longer sides.
+    """
+
+    axes: Float[Tensor, "3 3 2 p"]
+    focal: Float[Tensor, "2 p"]
+
+    @property
+    def known(self) -> Bool[Tensor, " p"]:
+        """Where cameras are assumed."""
+        return torch.isfinite(self.focal[0])
+
+    def __getitem__(self, index: Tensor) -> TwoCameras:
+        """Those of the selected pairs."""
+        return TwoCameras(self.axes[..., index], self.focal[..., index])
+
+
+class Chosen(NamedTuple):
+    """The estimates, of unit norm, and the cameras that were assumed, None where of no pair."""
+
+    F: Float[Tensor, "9 p"]
+    cameras: TwoCameras | None
+
+
+More = Callable[[Tensor], tuple[Candidates, Problem]]
+"""Indices of pairs -> more candidates for them, and these pairs with the matches near any candidate."""
+
+
 @runtime_checkable
 class Choice(Protocol):
     """Chooses one model for each pair from a small pool of them; may improve it."""
 
     def __call__(
-        self, F: Float[Tensor, "9 p k"], problem: Problem, near: Problem, alive: Bool[Tensor, "p k"]
-    ) -> Float[Tensor, "9 p"]:
+        self,
+        F: Float[Tensor, "9 p k"],
+        alive: Bool[Tensor, "p k"],
+        problem: Problem,
+        near: Problem,
+        calibrated: More | None = None,
+    ) -> Chosen:
         """The estimates, of models of unit norm.
 
-        problem: the pairs with all matches, near: with those on which models are refined. alive: False for slots of
-        the pool that hold no model.
+        alive: False for slots of the pool that hold no model. problem: the pairs with all matches, near: with those on
+        which models are refined. calibrated: makes models of cameras with plausible focal lengths where asked.
         """
         ...
 
@@ -47,7 +92,12 @@ class SaturatedChoice:
         self.gain = SaturatedGains(scale)
 
     def __call__(
-        self, F: Float[Tensor, "9 p k"], problem: Problem, near: Problem, alive: Bool[Tensor, "p k"]
-    ) -> Float[Tensor, "9 p"]:
+        self,
+        F: Float[Tensor, "9 p k"],
+        alive: Bool[Tensor, "p k"],
+        problem: Problem,
+        near: Problem,
+        calibrated: More | None = None,
+    ) -> Chosen:
         """As `Choice`."""
-        return best_of(F, score_models(self.gain, F, problem, problem.points), alive)
+        return Chosen(best_of(F, score_models(self.gain, F, problem, problem.points), alive), None)

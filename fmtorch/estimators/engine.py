@@ -15,7 +15,9 @@ from torch import Tensor
 
 from fmtorch import random
 from fmtorch.estimators.batching import solve_all
-from fmtorch.estimators.choice import best_of
+from fmtorch.estimators.calibrated import SAMPLE as FIVE
+from fmtorch.estimators.calibrated import calibrated_hypotheses
+from fmtorch.estimators.choice import Candidates, Chosen, best_of
 from fmtorch.estimators.compiled import compiled
 from fmtorch.estimators.degeneracy import CANDIDATES, DEGENERACIES, Degensac
 from fmtorch.estimators.final_fits import FINAL_FITS
@@ -30,6 +32,7 @@ from fmtorch.types import Correspondences, Estimate
 CPU_SAMPLES = 1 << 14  # minimal samples that are solved together: bounds memory, changes no result
 GPU_SAMPLES = 1 << 21
 REACH = 4.0  # refinement thresholds: a match farther from all models of the pool is not looked at again
+CALIBRATED_ROUND = 500  # samples of five matches at a time
 UNSTOPPED_ROUND = 2000  # samples of a round where nobody looks in between: few operations on many numbers are faster
 
 
@@ -40,6 +43,15 @@ class _Search:
     F: Float[Tensor, "9 p k"]
     score: Float[Tensor, "p k"]
     draws: Int[Tensor, " p"]
+
+    @staticmethod
+    def empty(p: int, k: int, device: torch.device) -> _Search:
+        """Nothing found yet."""
+        return _Search(
+            torch.zeros(9, p, k, device=device),
+            torch.full((p, k), -torch.inf, device=device),
+            torch.zeros(p, dtype=torch.int64, device=device),
+        )
 
 
 class HypothesizeAndVerify:
@@ -94,6 +106,8 @@ class HypothesizeAndVerify:
         degeneracy: str | None = None,
         candidates: str | None = None,
         pool: int = 1,
+        calibrated: int = 0,
+        calibrated_pool: int = 12,
         local_optimization: str | None = None,
         refine: str | None = None,
         refine_threshold: float = 1.0,
@@ -129,6 +143,7 @@ class HypothesizeAndVerify:
             raise ValueError(f"degeneracy={degeneracy} needs solver=seven_point; solver is {solver!r}")
         self.candidates = None if candidates is None else part("candidates", candidates, CANDIDATES)(self.score)
         self.pool = pool
+        self.calibrated, self.calibrated_pool = calibrated, calibrated_pool
         self.local_optimization = None
         if local_optimization is not None:
             optimization = part("local_optimization", local_optimization, LOCAL_OPTIMIZATIONS)
@@ -163,31 +178,55 @@ class HypothesizeAndVerify:
                 F, score = self.candidates(problem)
                 search.F, search.score = torch.cat([search.F, F], 2), torch.cat([search.score, score], 1)
             found = torch.isfinite(search.score).any(1)
-            best = self._choose(search, problem).T.reshape(-1, 3, 3)
+            best, cameras = self._choose(search, problem)
+            best = best.T.reshape(-1, 3, 3)
             inliers = self.inlier_rule(best, problem)
-        F = self.final(best, problem, inliers)
+        F = self.final(best, problem, inliers, cameras)
         if self.refit_inliers:
             with torch.no_grad():
                 inliers = self.inlier_rule(F, problem)
         return F, inliers, found, search.draws
 
-    def _choose(self, search: _Search, problem: Problem) -> Float[Tensor, "9 p"]:
+    def _choose(self, search: _Search, problem: Problem) -> Chosen:
         """The best of the pool, once optimised and refined, by the score of the choice; float64."""
         if self.local_optimization is None and self.refinement is None and self.choice is None:
-            return search.F[:, :, 0].to(torch.float64)
+            return Chosen(search.F[:, :, 0].to(torch.float64), None)
         F, alive = search.F.to(torch.float64), torch.isfinite(search.score)
         if self.local_optimization is not None:
             F = self.local_optimization(F, problem)
-        near = problem if self.refine_matches is None else self._near(search.F, problem, self.refine_matches)
+        near = self._near(search.F, problem)
         if self.refinement is not None:
             F = self.refinement(F, near)
         if self.choice is not None:
-            return self.choice(F, problem, near, alive)
-        score = score_models(self.score, F.to(torch.float32), problem, problem.points.to(torch.float32))
-        return best_of(F, score, alive)
 
-    def _near(self, F: Float[Tensor, "9 p k"], problem: Problem, most: int) -> Problem:
-        """The same pairs with at most so many of their matches, of those near one of the models."""
+            def calibrated(index: Tensor) -> tuple[Candidates, Problem]:
+                some = problem.only(index)
+                more = self._calibrated(some)
+                return more, self._near(torch.cat([search.F[:, index], more.F], 2), some)
+
+            return self.choice(F, alive, problem, near, calibrated if self.calibrated else None)
+        score = score_models(self.score, F.to(torch.float32), problem, problem.points.to(torch.float32))
+        return Chosen(best_of(F, score, alive), None)
+
+    def _calibrated(self, problem: Problem) -> Candidates:
+        """The best models of cameras with plausible focal lengths."""
+        points = problem.points.to(torch.float32)
+        state = _Search.empty(len(problem.pair), self.calibrated_pool, points.device)
+        table = self.sampler.table(problem, FIVE)
+        subset = self._subset(problem)
+        everything = torch.arange(len(problem.pair), device=points.device)
+        for start in range(0, self.calibrated, CALIBRATED_ROUND):
+            count = min(CALIBRATED_ROUND, self.calibrated - start)
+            index = self.sampler.draw(problem, table, start, count, FIVE)
+            F, score = self._verify(problem, points, *calibrated_hypotheses(problem, index, start), subset)
+            self._remember(state, everything, F, score)
+        return Candidates(state.F, torch.isfinite(state.score))
+
+    def _near(self, F: Float[Tensor, "9 p k"], problem: Problem) -> Problem:
+        """The same pairs with at most `refine_matches` of their matches, of those near one of the models."""
+        most = self.refine_matches
+        if most is None:
+            return problem
         r2 = sampson_squared(F, problem.points.to(torch.float32)).nan_to_num_(torch.inf).amin(1)
         near = problem.live & (r2 * problem.unit.square()[:, None].to(r2.dtype) <= self.reach**2)
         order = random.bits(problem.seed, problem.key, Stream.REFINEMENT, 0, near.shape[1], 1)[..., 0]
@@ -200,11 +239,7 @@ class HypothesizeAndVerify:
         points = problem.points.to(torch.float32)
         table = self.sampler.table(problem, self.solver.size)
         subset = self._subset(problem)
-        state = _Search(
-            torch.zeros(9, p, self.pool, device=device),
-            torch.full((p, self.pool), -torch.inf, device=device),
-            torch.zeros(p, dtype=torch.int64, device=device),
-        )
+        state = _Search.empty(p, self.pool, device)
         active = torch.arange(p, device=device)
         start = 0
         while start < self.hypotheses and len(active):

@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.estimators.choice import TwoCameras
+from fmtorch.estimators.focal import fit_focal
 from fmtorch.estimators.parts import residuals_squared
 from fmtorch.estimators.problem import Problem
 from fmtorch.geometry import eight_point
@@ -21,6 +23,9 @@ LEAST = 15  # matches that tell the noise
 LIKELY = 0.3  # matches of a smaller prior do not tell the noise
 ITERATIONS = 8  # Levenberg-Marquardt steps, at most
 DAMPING = 1e-6  # at first: the start is near the optimum, and its weakest directions take long steps
+DOUBT = 4.0  # what an optimum without prior may gain, in logarithms of the likelihood, before it is taken instead
+FOCAL_ITERATIONS = 8
+LIKELIHOOD_TOLERANCE = 0.05  # of its logarithm: a fifth of a standard deviation more or less
 TOLERANCE = 1e-4  # share of the cost: a smaller gain ends the fit
 
 
@@ -29,7 +34,11 @@ class FinalFit(Protocol):
     """Turns the best hypothesis and its inliers into the estimate; attached to the graph of the points."""
 
     def __call__(
-        self, F: Float[Tensor, "p 3 3"], problem: Problem, inliers: Bool[Tensor, "p n"]
+        self,
+        F: Float[Tensor, "p 3 3"],
+        problem: Problem,
+        inliers: Bool[Tensor, "p n"],
+        cameras: TwoCameras | None = None,
     ) -> Float[Tensor, "p 3 3"]:
         """The estimate in normalised units."""
         ...
@@ -39,7 +48,11 @@ class NoFit:
     """The best hypothesis as it is."""
 
     def __call__(
-        self, F: Float[Tensor, "p 3 3"], problem: Problem, inliers: Bool[Tensor, "p n"]
+        self,
+        F: Float[Tensor, "p 3 3"],
+        problem: Problem,
+        inliers: Bool[Tensor, "p n"],
+        cameras: TwoCameras | None = None,
     ) -> Float[Tensor, "p 3 3"]:
         """As `FinalFit`."""
         return F
@@ -49,7 +62,11 @@ class LeastSquares:
     """The normalised 8-point algorithm on the inliers; the hypothesis itself where they do not determine one."""
 
     def __call__(
-        self, F: Float[Tensor, "p 3 3"], problem: Problem, inliers: Bool[Tensor, "p n"]
+        self,
+        F: Float[Tensor, "p 3 3"],
+        problem: Problem,
+        inliers: Bool[Tensor, "p n"],
+        cameras: TwoCameras | None = None,
     ) -> Float[Tensor, "p 3 3"]:
         """As `FinalFit`."""
         x0, x1 = problem.points[:2].permute(1, 2, 0), problem.points[2:].permute(1, 2, 0)
@@ -64,7 +81,11 @@ class GaussNewton:
     """
 
     def __call__(
-        self, F: Float[Tensor, "p 3 3"], problem: Problem, inliers: Bool[Tensor, "p n"]
+        self,
+        F: Float[Tensor, "p 3 3"],
+        problem: Problem,
+        inliers: Bool[Tensor, "p n"],
+        cameras: TwoCameras | None = None,
     ) -> Float[Tensor, "p 3 3"]:
         """As `FinalFit`."""
         x0, x1 = problem.points[:2].permute(1, 2, 0), problem.points[2:].permute(1, 2, 0)
@@ -85,26 +106,61 @@ class AdaptiveGaussNewton:
     """
 
     def __call__(
-        self, F: Float[Tensor, "p 3 3"], problem: Problem, inliers: Bool[Tensor, "p n"]
+        self,
+        F: Float[Tensor, "p 3 3"],
+        problem: Problem,
+        inliers: Bool[Tensor, "p n"],
+        cameras: TwoCameras | None = None,
     ) -> Float[Tensor, "p 3 3"]:
         """As `FinalFit`."""
         weight = problem.weight()
         likely = inliers if problem.prior is None else inliers & (problem.prior > LIKELY)
+        attached = problem.points.requires_grad or weight.requires_grad
         with torch.no_grad():
             truncation = noise(_in_noises(F, problem), likely)
-            models = F.flatten(1).T[..., None].contiguous()
-            scale = truncation[:, None] / problem.units
-            refined, _ = refine_components(
-                models, problem.points, weight, "truncated", scale, ITERATIONS, TOLERANCE, RANK_TWO_ALREADY, DAMPING
-            )
-            F = refined[..., 0].T.reshape(-1, 3, 3)
-            if not (problem.points.requires_grad or weight.requires_grad):
+            free, calibrated = torch.ones_like(problem.live[:, 0]), None
+            if cameras is not None and bool(cameras.known.any()):
+                (k,) = cameras.known.nonzero(as_tuple=True)
+                t = truncation[k]
+                calibrated = fit_focal(
+                    cameras[k], problem.only(k), t, t / MULTIPLE, FOCAL_ITERATIONS, LIKELIHOOD_TOLERANCE
+                )
+                trusted = (calibrated.gain <= DOUBT) & torch.isfinite(calibrated.F).flatten(1).all(1)
+                free = free.index_copy(0, k, ~trusted)
+                F = F.index_copy(0, k, torch.where(trusted[:, None, None], calibrated.F, F[k]))
+            (f,) = free.nonzero(as_tuple=True)
+            if len(f):
+                F = F.index_copy(0, f, self._free(F[f], problem.only(f), truncation[f]))
+            if not attached:
                 return F
             close = _in_noises(F, problem) <= truncation.square()[:, None]
         x0, x1 = problem.points[:2].permute(1, 2, 0), problem.points[2:].permute(1, 2, 0)
-        weight = torch.where(close & problem.live, weight, 0)
-        step = attached_step(F, x0, x1, weight, kernel="truncated", scale=torch.inf)
-        return F + (step - step.detach())
+        counted = torch.where(close & problem.live, weight, 0)
+        step = attached_step(F, x0, x1, counted, kernel="truncated", scale=torch.inf)
+        step = step - step.detach()
+        if calibrated is not None:
+            own = calibrated.attached_step(problem.only(k), close[k])
+            step = step.index_copy(0, k, torch.where(trusted[:, None, None], own, step[k]))
+        return F + step
+
+    def _free(
+        self, F: Float[Tensor, "p 3 3"], problem: Problem, truncation: Float[Tensor, " p"]
+    ) -> Float[Tensor, "p 3 3"]:
+        """The optimum without prior."""
+        models = F.flatten(1).T[..., None].contiguous()
+        scale = truncation[:, None] / problem.units
+        refined, _ = refine_components(
+            models,
+            problem.points,
+            problem.weight(),
+            "truncated",
+            scale,
+            ITERATIONS,
+            TOLERANCE,
+            RANK_TWO_ALREADY,
+            DAMPING,
+        )
+        return refined[..., 0].T.reshape(-1, 3, 3)
 
 
 def _in_noises(F: Float[Tensor, "p 3 3"], problem: Problem) -> Float[Tensor, "p n"]:

@@ -12,24 +12,28 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.estimators.cheirality import share_in_front
-from fmtorch.estimators.choice import best_of, ranked
+from fmtorch.estimators.choice import Chosen, More, TwoCameras, ranked
 from fmtorch.estimators.problem import Problem
 from fmtorch.estimators.scoring import SaturatedGains, geman_mcclure_gain, sampson_squared, score_models
 from fmtorch.geometry.rank2 import complement
 from fmtorch.geometry.rank2_manifold import start, unit
 from fmtorch.geometry.reduce import component_sum
+from fmtorch.geometry.refine import STEP_DAMPING, gradient_of_cost
 from fmtorch.geometry.robust_kernels import KERNELS
 from fmtorch.geometry.sampson_objective import Objective
 
 USUAL_FOCAL = 1.2  # median focal length in units of the longer image side
 FOCAL_DEVIATION = 0.4  # of its logarithm, averaged over the two images
-RATIO_DEVIATION = 0.3  # of the logarithm of the two focal lengths' ratio
+RATIO_DEVIATION = 0.5  # of the logarithm of the two focal lengths' ratio, for images of different sizes
+SAME_CAMERA = 0.01  # images of equal size mostly come from one camera: scale of a well in the cost of that logarithm
+ODDS = 5.0  # its depth
 SIGMA = 0.3  # px, standard deviation of an inlier's Sampson distance
 SCALE = 0.7  # px, Sampson distance at which an inlier's cost is half of what a squared one would be
 # Share of the best gain without prior that gain minus prior cost must reach; chosen on castle-P19, fox, crops of them.
@@ -47,12 +51,11 @@ DAMPING, SMALLEST_DAMPING, LARGEST_DAMPING = 1e-3, 1e-9, 1e6
 class FocalPrior:
     """Refines each candidate as a maximum a posteriori over E and two focal lengths and chooses among these.
 
-    Asked only of pairs that are open: where all good candidates are one and the same model, that is the estimate.
     The estimate is the refined candidate with the largest gain (`SaturatedGains`), times the share of its support in
     front of both cameras, minus prior cost, if that reaches GATE of the largest gain without prior; otherwise, and
     where there are no image sizes, the model of the latter.
-    scale: of the gain, px. iterations: Levenberg-Marquardt steps. most: candidates refined, those of the largest gain.
-    cheirality: whether support behind a camera does not count.
+    scale: of the gain, px. iterations: Levenberg-Marquardt steps. most: candidates refined, those of the largest gain,
+    besides those that were made with focal lengths. cheirality: whether support behind a camera does not count.
     """
 
     def __init__(
@@ -62,82 +65,188 @@ class FocalPrior:
         self.gain = SaturatedGains(scale)
 
     def __call__(
-        self, F: Float[Tensor, "9 p k"], problem: Problem, near: Problem, alive: Bool[Tensor, "p k"]
-    ) -> Float[Tensor, "9 p"]:
+        self,
+        F: Float[Tensor, "9 p k"],
+        alive: Bool[Tensor, "p k"],
+        problem: Problem,
+        near: Problem,
+        calibrated: More | None = None,
+    ) -> Chosen:
         """As `Choice`."""
         gain = torch.where(alive, score_models(self.gain, F, problem, problem.points), -torch.inf)
-        plain = best_of(F, gain, alive)
+        F, gain = ranked(F, gain, F.shape[2])
+        plain = F[..., 0]
         if problem.size0 is None or problem.size1 is None:
-            return plain
+            return Chosen(plain, None)
         apart = 1 - component_sum(F * plain[..., None]).abs()
-        rival = (gain >= RIVAL * gain.amax(1, keepdim=True)) & ~(apart <= SAME)
+        rival = (gain >= RIVAL * gain[:, :1]) & ~(apart <= SAME)
         (open_,) = rival.any(1).nonzero(as_tuple=True)
+        cameras = TwoCameras(
+            plain.new_full((3, 3, 2, plain.shape[1]), torch.nan), torch.full_like(plain[:2], torch.nan)
+        )
         if not len(open_):
-            return plain
-        F, gain = ranked(F[:, open_], gain[open_], self.most)
-        return plain.index_copy(1, open_, self._chosen(F, gain, problem.only(open_), near.only(open_)))
+            return Chosen(plain, cameras)
+        F, alive = F[:, open_, : self.most], torch.isfinite(gain[open_, : self.most])
+        some, near = problem.only(open_), near.only(open_)
+        if calibrated is not None:
+            more, near = calibrated(open_)
+            F, alive = torch.cat([F, more.F.to(F.dtype)], 2), torch.cat([alive, more.alive], 1)
+        refined = refine_focal(F, near, self.iterations)
+        support = score_models(self.gain, refined.F, some, some.points)
+        posterior = (support * refined.front if self.cheirality else support) - refined.prior
+        posterior = torch.where(alive, posterior.nan_to_num(nan=-torch.inf), -torch.inf)
+        best = torch.sort(posterior, dim=1, descending=True, stable=True).indices[:, :1]
+        (plausible,) = (posterior.gather(1, best)[:, 0] >= GATE * gain[open_, 0]).nonzero(as_tuple=True)
+        best, places = best[plausible], open_[plausible]
 
-    def _chosen(
-        self, F: Float[Tensor, "9 p k"], gain: Float[Tensor, "p k"], problem: Problem, near: Problem
-    ) -> Float[Tensor, "9 p"]:
-        """The estimates, of models by descending gain, minus infinity where there is none."""
-        focal, prior, front = refine_focal(F, near, self.iterations)
-        support = score_models(self.gain, focal, problem, problem.points)
-        posterior = ((support * front if self.cheirality else support) - prior).nan_to_num(nan=-torch.inf)
-        posterior = torch.where(torch.isfinite(gain), posterior, -torch.inf)
-        chosen = ranked(focal, posterior, 1)[0][..., 0]
-        return torch.where(posterior.amax(1) >= GATE * gain[:, 0], chosen, F[..., 0])
+        def replaced(everywhere: Tensor, x: Tensor) -> Tensor:
+            """The best of the candidates where it is plausible."""
+            x = x[..., plausible, :].gather(-1, best.expand(*x.shape[:-2], -1, -1))[..., 0]
+            return everywhere.index_copy(everywhere.dim() - 1, places, x)
+
+        cameras = TwoCameras(replaced(cameras.axes, refined.axes), replaced(cameras.focal, refined.focal))
+        return Chosen(replaced(plain, refined.F), cameras)
 
 
-def refine_focal(
-    F: Float[Tensor, "9 p k"], problem: Problem, iterations: int = ITERATIONS
-) -> tuple[Float[Tensor, "9 p k"], Float[Tensor, "p k"], Float[Tensor, "p k"]]:
-    """Models of least ``sum P rho(r) / (2 SIGMA^2) + prior(f0, f1)``, prior costs, shares of support in front.
+class Cameras:
+    """What is known of the cameras of some pairs.
+
+    offset: (4, P) from the centre of the points to the principal points. points: (4, P, N) from the principal points.
+    longest: (2, P) the longer sides of the images. All in normalised units. same_size: (P,).
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        assert problem.size0 is not None
+        assert problem.size1 is not None
+        middle = torch.cat([problem.size0.flip(-1), problem.size1.flip(-1)], -1).to(torch.float64)
+        self.offset = ((problem.centre - (middle - 1) / 2) / problem.unit[:, None]).T
+        self.points = problem.points + self.offset[..., None]
+        self.longest = torch.stack([problem.size0.amax(-1), problem.size1.amax(-1)]).to(torch.float64) / problem.unit
+        self.same_size = (problem.size0 == problem.size1).all(-1)
+
+
+class Refined(NamedTuple):
+    """Models of least cost, their prior costs, shares of support in front, log focal lengths."""
+
+    F: Float[Tensor, "9 p k"]
+    prior: Float[Tensor, "p k"]
+    front: Float[Tensor, "p k"]
+    axes: Float[Tensor, "3 3 2 p k"]
+    focal: Float[Tensor, "2 p k"]
+
+
+def refine_focal(F: Float[Tensor, "9 p k"], problem: Problem, iterations: int = ITERATIONS) -> Refined:
+    """Models of least ``sum P rho(r) / (2 SIGMA^2) + prior(f0, f1)``.
 
     r is the Sampson distance in pixels, rho the loss of Geman & McClure at SCALE. The sizes of the problem must be
     known. Support is P times the gain of Geman & McClure at SCALE (see `share_in_front`). A model that is not finite
     comes back as something that is not, with a prior cost of infinity.
     """
-    assert problem.size0 is not None
-    assert problem.size1 is not None
     with torch.no_grad():
-        # Coordinates from the principal points, still in normalised units.
-        middle = torch.cat([problem.size0.flip(-1), problem.size1.flip(-1)], -1).to(torch.float64)
-        offset = ((problem.centre - (middle - 1) / 2) / problem.unit[:, None]).T
-        points = problem.points + offset[..., None]
-        longest = torch.stack([problem.size0.amax(-1), problem.size1.amax(-1)]).to(torch.float64) / problem.unit
-        objective = _Objective(problem, points, longest)
-        shifted = _translated(F, -offset)
-        state = objective.at(*_start(shifted, longest), True)
-        damping = torch.full_like(state.cost, DAMPING)
-        for i in range(iterations):
-            trial = objective.at(*_moved(state, _step(state, damping)), i + 1 < iterations)
-            better = trial.cost < state.cost
-            damping = torch.where(better, damping / 10, damping * 10).clamp_(SMALLEST_DAMPING, LARGEST_DAMPING)
-            state = state.replaced(trial, better)
-        models = unit(_translated(state.F, offset))
+        cameras = Cameras(problem)
+        objective = _Objective(problem, cameras, "geman_mcclure", SCALE / problem.units, SIGMA / problem.unit)
+        shifted = translated(F, -cameras.offset)
+        state = _minimised(objective, _start(shifted, cameras.longest), iterations)
+        models = unit(translated(state.F, cameras.offset))
         sound = torch.isfinite(models).all(0) & torch.isfinite(state.cost)
-        depth = exponential(state.focal) * longest[..., None]
-        r2 = sampson_squared(state.F, points) * (problem.units / SCALE).square()[:, None]
+        depth = exponential(state.focal) * cameras.longest[..., None]
+        r2 = sampson_squared(state.F, cameras.points) * (problem.units / SCALE).square()[:, None]
         support = geman_mcclure_gain(r2) * (problem.live if problem.prior is None else problem.prior)[:, None]
-        front = share_in_front(state.U, state.V, depth, points, support, PARALLEL / problem.unit)
-        return models, torch.where(sound, _prior(state.focal)[0], torch.inf), front
+        front = share_in_front(*state.axes.unbind(2), depth, cameras.points, support, PARALLEL / problem.unit)
+        prior = torch.where(sound, _prior(state.focal, cameras.same_size)[0], torch.inf)
+        return Refined(models, prior, front, state.axes, state.focal)
+
+
+class FocalFit(NamedTuple):
+    """The maximum a posteriori at the noise of each pair, and how much an optimum without prior would gain.
+
+    F: (P, 3, 3) in normalised units. gain: what the logarithm of the likelihood would rise by.
+    """
+
+    F: Float[Tensor, "p 3 3"]
+    gain: Float[Tensor, " p"]
+    state: _State
+    objective: _Objective
+
+    def attached_step(self, problem: Problem, close: Bool[Tensor, "p n"]) -> Float[Tensor, "p 3 3"]:
+        """A zero with the gradients of the optimum, by the implicit function theorem (see `geometry.attached_step`).
+
+        close: matches that the fit counts.
+        """
+        state, precision = self.state, self.objective.precision
+        cameras = Cameras(problem)
+        weight = torch.where(close & problem.live, problem.weight(), 0)
+        unbounded = torch.full_like(precision[:, 0], torch.inf)
+        gradient = gradient_of_cost(state.F, cameras.points, weight, KERNELS["truncated"], unbounded)
+        along = component_sum(state.tangents * gradient[:, None]) * precision
+        damping = torch.full_like(state.cost, STEP_DAMPING)
+        step = _solved(state.hessian, along.detach() - along, damping)
+        moved = translated(component_sum(state.tangents.transpose(0, 1) * step[:, None]), cameras.offset)
+        return moved[..., 0].T.reshape(-1, 3, 3)
+
+
+def fit_focal(
+    start: TwoCameras,
+    problem: Problem,
+    truncation: Float[Tensor, " p"],
+    sigma: Float[Tensor, " p"],
+    iterations: int,
+    tolerance: float,
+) -> FocalFit:
+    """The maximum a posteriori of the truncated Sampson error.
+
+    truncation, sigma: of the Sampson distance, px. tolerance: a fit is done once a step changes its cost, a logarithm of
+    the posterior, by no more than this.
+    """
+    with torch.no_grad():
+        cameras = Cameras(problem)
+        objective = _Objective(problem, cameras, "truncated", truncation[:, None] / problem.units, sigma / problem.unit)
+        state = _minimised(objective, (start.axes[..., None], start.focal[..., None]), iterations, tolerance)
+        fitted = translated(state.F, cameras.offset)[..., 0].T.reshape(-1, 3, 3)
+        _, gradient, hessian = _prior(state.focal, cameras.same_size)
+        data = state.hessian.clone()
+        data[5:, 5:] -= hessian
+        slope = state.gradient.clone()
+        slope[5:] -= gradient
+        step = _solved(data, -slope, torch.full_like(state.cost, STEP_DAMPING))
+        return FocalFit(fitted, -component_sum(slope * step)[:, 0] / 2, state, objective)
+
+
+def _minimised(
+    objective: _Objective, start: tuple[Tensor, Tensor], iterations: int, tolerance: float | None = None
+) -> _State:
+    """The state of least cost that so many Levenberg-Marquardt steps reach; with its derivatives given a tolerance."""
+    state = objective.at(*start, True)
+    damping = torch.full_like(state.cost, DAMPING)
+    done = torch.zeros_like(state.cost, dtype=torch.bool)
+    for i in range(iterations):
+        step = _solved(state.hessian, -state.gradient, damping)
+        trial = objective.at(*_moved(state, step), i + 1 < iterations or tolerance is not None)
+        better = (trial.cost < state.cost) & ~done
+        damping = torch.where(better, damping / 10, damping * 10).clamp_(SMALLEST_DAMPING, LARGEST_DAMPING)
+        if tolerance is not None:
+            done |= state.cost - trial.cost <= tolerance
+        state = state.replaced(trial, better)
+        if tolerance is not None and bool(done.all()):
+            break
+    return state
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _State:
-    """``E = U diag(1, 1, 0) V^T`` and log focal lengths; with F, the cost, its gradient and Gauss-Newton matrix there.
+    """``E = U diag(1, 1, 0) V^T`` and log focal lengths; with F, the cost, its derivatives there.
 
-    U, V: (3, 3, p, k), rows first. focal: (2, p, k), logarithms, f in units of the longer side.
+    axes: U and V, (3, 3, 2, p, k), rows first. focal: (2, p, k), logarithms, f in units of the longer side.
+    tangents: (9, 7, p, k), the derivatives of F by five rotations and the two logarithms.
     """
 
-    U: Tensor
-    V: Tensor
+    axes: Tensor
     focal: Tensor
     F: Tensor
     cost: Tensor
     gradient: Tensor
     hessian: Tensor
+    tangents: Tensor
 
     def replaced(self, other: _State, condition: Tensor) -> _State:
         """The other state where the condition holds; without derivatives if the other has none."""
@@ -151,30 +260,31 @@ class _State:
 class _Objective:
     """The negative logarithm of the posterior, with its derivatives by five rotations and two log focal lengths."""
 
-    def __init__(self, problem: Problem, points: Tensor, longest: Tensor) -> None:
-        self.data = Objective(points, problem.weight(), KERNELS["geman_mcclure"], SCALE / problem.units)
-        self.precision = (problem.unit / SIGMA).square()[:, None]
-        self.longest = longest
-        # Of the derivatives of E by rotations of U about its three axes and of V about the first two.
-        self.signs = points.new_tensor([1.0, -1.0, 1.0, 1.0, -1.0])[:, None, None]
+    def __init__(self, problem: Problem, cameras: Cameras, kernel: str, scale: Tensor, sigma: Tensor) -> None:
+        self.data = Objective(cameras.points, problem.weight(), KERNELS[kernel], scale)
+        self.precision = (1 / sigma).square()[:, None]
+        self.longest, self.same_size = cameras.longest, cameras.same_size
+        # The derivatives of E by rotations of U about its three axes and of V about the first two, in products of a
+        # column i of U and j of V (3i + j); that by U's third has a second term.
+        self.columns = torch.tensor([7, 6, 3, 5, 2], device=self.longest.device)
+        self.signs = self.longest.new_tensor([1.0, -1.0, 1.0, 1.0, -1.0])[:, None, None]
 
-    def at(self, U: Tensor, V: Tensor, focal: Tensor, derivatives: bool) -> _State:
+    def at(self, axes: Tensor, focal: Tensor, derivatives: bool) -> _State:
         """The state of these parameters."""
         depth = exponential(focal) * self.longest[..., None]
-        outer = (U[:, None, :, None] * V[None, :, None]).flatten(
-            2, 3
-        )  # columns i of U and j of V: (3, 3, 3i + j, p, k)
-        scales = _scales(depth)
-        F = (outer[:, :, 0] + outer[:, :, 4]) * scales
+        U, V = axes.unbind(2)
+        outer = (U[:, None, :, None] * V[None, :, None]).flatten(2, 3)  # (3, 3, 3i + j, p, k)
+        by_depth = scales(depth)
+        F = (outer[:, :, 0] + outer[:, :, 4]) * by_depth
         products, cost = self.data(F.flatten(0, 1), derivatives)
-        prior, prior_gradient, prior_hessian = _prior(focal)
+        prior, prior_gradient, prior_hessian = _prior(focal, self.same_size)
         cost = cost * self.precision / 2 + prior
         if not derivatives:
-            return _State(U, V, focal, F.flatten(0, 1), cost, cost[:0], cost[:0])
+            return _State(axes, focal, F.flatten(0, 1), cost, cost[:0], cost[:0], cost[:0])
         tangents = F.new_zeros(3, 3, 7, *focal.shape[1:])
-        torch.mul(outer[:, :, [7, 6, 3, 5, 2]], self.signs, out=tangents[:, :, :5])
-        tangents[:, :, 2] -= outer[:, :, 1]
-        tangents[:, :, :5] *= scales[:, :, None]
+        rotations = outer.index_select(2, self.columns).mul_(self.signs)
+        rotations[:, :, 2] -= outer[:, :, 1]
+        torch.mul(rotations, by_depth[:, :, None], out=tangents[:, :, :5])
         tangents[:, 2, 5], tangents[2, :, 6] = F[:, 2], F[2]
         T = tangents.flatten(0, 1)
         along = component_sum(T[:, :, None] * products[:9, None])  # (7, 10)
@@ -182,25 +292,32 @@ class _Objective:
         gradient = along[:, 9] * self.precision
         hessian[5:, 5:] += prior_hessian
         gradient[5:] += prior_gradient
-        return _State(U, V, focal, F.flatten(0, 1), cost, gradient, hessian)
+        return _State(axes, focal, F.flatten(0, 1), cost, gradient, hessian, T)
 
 
-def _prior(focal: Float[Tensor, "2 p k"]) -> tuple[Tensor, Tensor, Tensor]:
-    """The cost of two log focal lengths, its gradient (2, p, k) and second derivatives (2, 2, 1, 1)."""
-    ratio = (focal[0] - focal[1]) / RATIO_DEVIATION
-    mean = ((focal[0] + focal[1]) / 2 - math.log(USUAL_FOCAL)) / FOCAL_DEVIATION
-    a, b = 1 / RATIO_DEVIATION, 0.5 / FOCAL_DEVIATION
-    gradient = torch.stack([a * ratio + b * mean, b * mean - a * ratio])
-    hessian = focal.new_tensor([[a * a + b * b, b * b - a * a], [b * b - a * a, a * a + b * b]])
-    return (ratio * ratio + mean * mean) / 2, gradient, hessian[..., None, None]
+def _prior(focal: Float[Tensor, "2 p k"], same_size: Bool[Tensor, " p"]) -> tuple[Tensor, Tensor, Tensor]:
+    """The cost of two log focal lengths, its gradient (2, p, k) and a Gauss-Newton matrix (2, 2, p, k)."""
+    difference = focal[0] - focal[1]
+    squared = difference * difference
+    mean = (focal[0] + focal[1]) * (0.5 / FOCAL_DEVIATION) - math.log(USUAL_FOCAL) / FOCAL_DEVIATION
+    well = torch.where(same_size, SAME_CAMERA**2, 0.0)[:, None] / (squared + SAME_CAMERA**2)
+    precision = 1 / RATIO_DEVIATION**2 + 2 * ODDS / SAME_CAMERA**2 * well * well
+    cost = mean * mean / 2 + squared / (2 * RATIO_DEVIATION**2) - ODDS * well
+    b = 0.5 / FOCAL_DEVIATION
+    pull = precision * difference
+    gradient = torch.stack([b * mean + pull, b * mean - pull])
+    own, other = b * b + precision, b * b - precision
+    return cost, gradient, torch.stack([torch.stack([own, other]), torch.stack([other, own])])
 
 
-def _step(state: _State, damping: Tensor) -> Float[Tensor, "7 p k"]:
+def _solved(
+    hessian: Float[Tensor, "7 7 p k"], right: Float[Tensor, "7 p k"], damping: Tensor
+) -> Float[Tensor, "7 p k"]:
     """The damped Gauss-Newton step, by Gauss-Jordan elimination; the matrix is positive definite, so without pivots."""
-    A = state.hessian.clone()
+    A = hessian.clone()
     diagonal = A.diagonal(dim1=0, dim2=1)
     diagonal += diagonal * damping[..., None]
-    Q = torch.cat([A, -state.gradient[:, None]], 1)
+    Q = torch.cat([A, right[:, None]], 1)
     for i in range(7):
         column, rest = Q.tensor_split((1,), 1)
         row = rest[i] / column[i]
@@ -209,26 +326,27 @@ def _step(state: _State, damping: Tensor) -> Float[Tensor, "7 p k"]:
     return Q[:, 0]
 
 
-def _moved(state: _State, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _moved(state: _State, step: Tensor) -> tuple[Tensor, Tensor]:
     """The parameters after a step: Cayley rotations of U and V, log focal lengths moved by at most 1."""
-    zero = torch.zeros_like(step[0])
-    U = _rotated(state.U, step[:3])
-    V = _rotated(state.V, torch.stack([step[3], step[4], zero]))
-    return U, V, (state.focal + step[5:].clamp(-1, 1)).clamp(-3, 3)
+    about_third = torch.stack([step[2], torch.zeros_like(step[2])])
+    angle = torch.stack([step[[0, 3]], step[[1, 4]], about_third])
+    return _rotated(state.axes, angle), (state.focal + step[5:].clamp(-1, 1)).clamp(-3, 3)
 
 
-def _rotated(U: Tensor, angle: Float[Tensor, "3 p k"]) -> Tensor:
+def _rotated(axes: Float[Tensor, "3 3 *s"], angle: Float[Tensor, "3 *s"]) -> Float[Tensor, "3 3 *s"]:
     """``U R`` with the rotation by twice the angle whose tangent is half of `angle`, about its direction (Cayley)."""
     x, y, z = c = angle / 2
     n = component_sum(c * c)
-    crossed = torch.stack([z * U[:, 1] - y * U[:, 2], x * U[:, 2] - z * U[:, 0], y * U[:, 0] - x * U[:, 1]], 1)
-    along = component_sum(U * c, 1)
+    crossed = torch.stack(
+        [z * axes[:, 1] - y * axes[:, 2], x * axes[:, 2] - z * axes[:, 0], y * axes[:, 0] - x * axes[:, 1]], 1
+    )
+    along = component_sum(axes * c, 1)
     # U (I + 2 / (1 + n) ([c]x + [c]x^2)), and [c]x^2 = c c^T - n I.
-    rotated: Tensor = U + 2 / (1 + n) * (crossed + along[:, None] * c - n * U)
+    rotated: Tensor = axes + 2 / (1 + n) * (crossed + along[:, None] * c - n * axes)
     return rotated
 
 
-def _scales(depth: Float[Tensor, "2 p k"]) -> Float[Tensor, "3 3 p k"]:
+def scales(depth: Float[Tensor, "2 p k"]) -> Float[Tensor, "3 3 p k"]:
     """What ``diag(1, 1, depth1) E diag(1, 1, depth0)`` multiplies E by; depth: focal length in the unit of points."""
     scales = depth.new_ones(3, 3, *depth.shape[1:])
     scales[:, 2] = depth[0]
@@ -236,7 +354,7 @@ def _scales(depth: Float[Tensor, "2 p k"]) -> Float[Tensor, "3 3 p k"]:
     return scales
 
 
-def _translated(F: Float[Tensor, "9 p k"], offset: Float[Tensor, "4 p"]) -> Float[Tensor, "9 p k"]:
+def translated(F: Float[Tensor, "9 p k"], offset: Float[Tensor, "4 p"]) -> Float[Tensor, "9 p k"]:
     """F for points from which the offset is taken: ``T(offset1)^T F T(offset0)``."""
     x0, y0, x1, y1 = offset[..., None]
     a, b, c = F.reshape(3, 3, *F.shape[1:]).unbind(1)
@@ -244,14 +362,14 @@ def _translated(F: Float[Tensor, "9 p k"], offset: Float[Tensor, "4 p"]) -> Floa
     return torch.stack([G[0], G[1], G[2] + x1 * G[0] + y1 * G[1]]).flatten(0, 1)
 
 
-def _start(F: Float[Tensor, "9 p k"], longest: Float[Tensor, "2 p"]) -> tuple[Tensor, Tensor, Tensor]:
-    """U, V and log focal lengths near F: the focal lengths that F has, the usual ones where these are implausible."""
+def _start(F: Float[Tensor, "9 p k"], longest: Float[Tensor, "2 p"]) -> tuple[Tensor, Tensor]:
+    """U and V, and log focal lengths near F: the focal lengths that F has, the usual ones where these are implausible."""
     G, e0, e1 = start(F)
     square = bougnoux(G, e0, e1) / longest[..., None].square()
     plausible = ((square > SHORTEST**2) & (square < LONGEST**2)).all(0)
     focal = torch.where(plausible, logarithm(torch.where(plausible, square, 1)) / 2, math.log(USUAL_FOCAL))
     depth = 1 / (exponential(focal) * longest[..., None])
-    M, e0, e1 = start(G * _scales(depth).flatten(0, 1), 0)
+    M, e0, e1 = start(G * scales(depth).flatten(0, 1), 0)
     p, q = complement(e0)
     a, b = complement(e1)
     # In the planes across the epipoles M is 2 x 2; its nearest orthogonal matrix gives both singular values 1.
@@ -262,7 +380,7 @@ def _start(F: Float[Tensor, "9 p k"], longest: Float[Tensor, "2 p"]) -> tuple[Te
     norm = (c * c + s * s).sqrt()
     c, s = c / norm, s / norm
     U = torch.stack([a * c + b * s, sign * (b * c - a * s), e1], 1)
-    return U, torch.stack([p, q, e0], 1), focal
+    return torch.stack([U, torch.stack([p, q, e0], 1)], 2), focal
 
 
 def bougnoux(
