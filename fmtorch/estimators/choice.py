@@ -3,33 +3,32 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch.estimators.problem import Problem
 from fmtorch.estimators.scoring import SaturatedGains, score_models
 
 
-class Candidates(NamedTuple):
-    """Models of a pool, and which slots hold one."""
-
-    F: Float[Tensor, "9 p k"]
-    alive: Bool[Tensor, "p k"]
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class TwoCameras:
     """Cameras of square pixels and central principal points, ``E = U diag(1, 1, 0) V^T``; NaN where none are assumed.
 
-    axes: U and V, (3, 3, 2, P), rows first. focal: the logarithms of the focal lengths in units of the longer sides.
+    axes: U and V, (3, 3, 2, P), rows first. focal: the logarithms of the focal lengths in units of the longer sides,
+    (2, P). Of several candidates a pair, (3, 3, 2, P, K) and (2, P, K).
     """
 
-    axes: Float[Tensor, "3 3 2 p"]
-    focal: Float[Tensor, "2 p"]
+    axes: Tensor
+    focal: Tensor
+
+    @staticmethod
+    def none(problem: Problem) -> TwoCameras:
+        """No assumption about any pair."""
+        p, points = len(problem.pair), problem.points
+        return TwoCameras(points.new_full((3, 3, 2, p), torch.nan), points.new_full((2, p), torch.nan))
 
     @property
     def known(self) -> Bool[Tensor, " p"]:
@@ -38,18 +37,26 @@ class TwoCameras:
 
     def __getitem__(self, index: Tensor) -> TwoCameras:
         """Those of the selected pairs."""
-        return TwoCameras(self.axes[..., index], self.focal[..., index])
+        return TwoCameras(self.axes[:, :, :, index], self.focal[:, index])
+
+    def joined(self, other: TwoCameras) -> TwoCameras:
+        """The candidates of both."""
+        return TwoCameras(torch.cat([self.axes, other.axes], -1), torch.cat([self.focal, other.focal], -1))
 
 
 class Chosen(NamedTuple):
-    """The estimates, of unit norm, and the cameras that were assumed, None where of no pair."""
+    """The estimates, of unit norm, and the cameras that were assumed."""
 
     F: Float[Tensor, "9 p"]
-    cameras: TwoCameras | None
+    cameras: TwoCameras
 
-
-More = Callable[[Tensor], tuple[Candidates, Problem]]
-"""Indices of pairs -> more candidates for them, and these pairs with the matches near any candidate."""
+    def replaced(self, index: Int[Tensor, " q"], other: Chosen) -> Chosen:
+        """With other estimates for the pairs of these indices."""
+        cameras = TwoCameras(
+            self.cameras.axes.index_copy(3, index, other.cameras.axes),
+            self.cameras.focal.index_copy(1, index, other.cameras.focal),
+        )
+        return Chosen(self.F.index_copy(1, index, other.F), cameras)
 
 
 @runtime_checkable
@@ -62,12 +69,11 @@ class Choice(Protocol):
         alive: Bool[Tensor, "p k"],
         problem: Problem,
         near: Problem,
-        calibrated: More | None = None,
     ) -> Chosen:
         """The estimates, of models of unit norm.
 
         alive: False for slots of the pool that hold no model. problem: the pairs with all matches, near: with those on
-        which models are refined. calibrated: makes models of cameras with plausible focal lengths where asked.
+        which models are refined.
         """
         ...
 
@@ -97,7 +103,6 @@ class SaturatedChoice:
         alive: Bool[Tensor, "p k"],
         problem: Problem,
         near: Problem,
-        calibrated: More | None = None,
     ) -> Chosen:
         """As `Choice`."""
-        return Chosen(best_of(F, score_models(self.gain, F, problem, problem.points), alive), None)
+        return Chosen(best_of(F, score_models(self.gain, F, problem, problem.points), alive), TwoCameras.none(problem))

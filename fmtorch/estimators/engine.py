@@ -17,10 +17,11 @@ from fmtorch import random
 from fmtorch.estimators.batching import solve_all
 from fmtorch.estimators.calibrated import SAMPLE as FIVE
 from fmtorch.estimators.calibrated import calibrated_hypotheses
-from fmtorch.estimators.choice import Candidates, Chosen, best_of
+from fmtorch.estimators.choice import Chosen, TwoCameras, best_of
 from fmtorch.estimators.compiled import compiled
 from fmtorch.estimators.degeneracy import CANDIDATES, DEGENERACIES, Degensac
 from fmtorch.estimators.final_fits import FINAL_FITS
+from fmtorch.estimators.focal import FocalPrior, Refined
 from fmtorch.estimators.local_optimization import LOCAL_OPTIMIZATIONS
 from fmtorch.estimators.parts import CHOICES, INLIER_RULES, SAMPLERS, SCORES, SOLVERS, Refinement, part
 from fmtorch.estimators.problem import Problem
@@ -173,43 +174,66 @@ class HypothesizeAndVerify:
     def _solve(self, problem: Problem) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Search, then fit: F (p, 3, 3) in normalised units, inliers (p, n), found (p,), draws (p,)."""
         with torch.no_grad():
-            search = self._search(problem)
-            if self.candidates is not None:
-                F, score = self.candidates(problem)
-                search.F, search.score = torch.cat([search.F, F], 2), torch.cat([search.score, score], 1)
-            found = torch.isfinite(search.score).any(1)
-            best, cameras = self._choose(search, problem)
-            best = best.T.reshape(-1, 3, 3)
+            chosen, found, draws = self._found(problem)
+            best = chosen.F.T.reshape(-1, 3, 3)
             inliers = self.inlier_rule(best, problem)
-        F = self.final(best, problem, inliers, cameras)
+        F = self.final(best, problem, inliers, chosen.cameras)
         if self.refit_inliers:
             with torch.no_grad():
                 inliers = self.inlier_rule(F, problem)
-        return F, inliers, found, search.draws
+        return F, inliers, found, draws
 
-    def _choose(self, search: _Search, problem: Problem) -> Chosen:
+    def _found(self, problem: Problem) -> tuple[Chosen, Tensor, Tensor]:
+        """The estimates before the final fit, whether there are any, and the draws made."""
+        if (
+            not (self.calibrated and isinstance(self.choice, FocalPrior))
+            or problem.size0 is None
+            or problem.size1 is None
+        ):
+            return self._searched(problem, None)
+        F, alive = self._calibrated(problem)
+        refined = self.choice.refined(F.to(torch.float64), alive, problem, self._near(F, problem))
+        chosen, posterior = refined.best()
+        found = torch.isfinite(posterior)
+        draws = torch.full_like(problem.count, self.calibrated)
+        one_camera = (problem.size0 == problem.size1).all(-1)
+        settled = (one_camera | self.choice.settled(refined)) & self._enough(chosen.F, draws, problem, FIVE)
+        (rest,) = (~settled).nonzero(as_tuple=True)
+        if len(rest):
+            other, other_found, other_draws = self._searched(problem.only(rest), refined[rest])
+            chosen, found = chosen.replaced(rest, other), found.index_copy(0, rest, other_found)
+            draws = draws.index_add(0, rest, other_draws)
+        return chosen, found, draws
+
+    def _searched(self, problem: Problem, refined: Refined | None) -> tuple[Chosen, Tensor, Tensor]:
+        """The same by search without assumptions; refined: candidates of plausible cameras."""
+        search = self._search(problem)
+        if self.candidates is not None:
+            F, score = self.candidates(problem)
+            search.F, search.score = torch.cat([search.F, F], 2), torch.cat([search.score, score], 1)
+        found = torch.isfinite(search.score).any(1)
+        return self._chosen(search, problem, refined), found, search.draws
+
+    def _chosen(self, search: _Search, problem: Problem, refined: Refined | None) -> Chosen:
         """The best of the pool, once optimised and refined, by the score of the choice; float64."""
+        nothing = TwoCameras.none(problem)
         if self.local_optimization is None and self.refinement is None and self.choice is None:
-            return Chosen(search.F[:, :, 0].to(torch.float64), None)
+            return Chosen(search.F[:, :, 0].to(torch.float64), nothing)
         F, alive = search.F.to(torch.float64), torch.isfinite(search.score)
         if self.local_optimization is not None:
             F = self.local_optimization(F, problem)
         near = self._near(search.F, problem)
         if self.refinement is not None:
             F = self.refinement(F, near)
+        if isinstance(self.choice, FocalPrior):
+            return self.choice(F, alive, problem, near, refined)
         if self.choice is not None:
-
-            def calibrated(index: Tensor) -> tuple[Candidates, Problem]:
-                some = problem.only(index)
-                more = self._calibrated(some)
-                return more, self._near(torch.cat([search.F[:, index], more.F], 2), some)
-
-            return self.choice(F, alive, problem, near, calibrated if self.calibrated else None)
+            return self.choice(F, alive, problem, near)
         score = score_models(self.score, F.to(torch.float32), problem, problem.points.to(torch.float32))
-        return Chosen(best_of(F, score, alive), None)
+        return Chosen(best_of(F, score, alive), nothing)
 
-    def _calibrated(self, problem: Problem) -> Candidates:
-        """The best models of cameras with plausible focal lengths."""
+    def _calibrated(self, problem: Problem) -> tuple[Float[Tensor, "9 p k"], Bool[Tensor, "p k"]]:
+        """The best models of cameras with plausible focal lengths, and which slots hold one."""
         points = problem.points.to(torch.float32)
         state = _Search.empty(len(problem.pair), self.calibrated_pool, points.device)
         table = self.sampler.table(problem, FIVE)
@@ -220,7 +244,7 @@ class HypothesizeAndVerify:
             index = self.sampler.draw(problem, table, start, count, FIVE)
             F, score = self._verify(problem, points, *calibrated_hypotheses(problem, index, start), subset)
             self._remember(state, everything, F, score)
-        return Candidates(state.F, torch.isfinite(state.score))
+        return state.F, torch.isfinite(state.score)
 
     def _near(self, F: Float[Tensor, "9 p k"], problem: Problem) -> Problem:
         """The same pairs with at most `refine_matches` of their matches, of those near one of the models."""
@@ -289,16 +313,24 @@ class HypothesizeAndVerify:
         state.F[:, active] = all_F.gather(2, order[:, :k].expand(9, -1, -1))
 
     def _done(self, state: _Search, active: Tensor, problem: Problem, points: Tensor) -> Bool[Tensor, " p"]:
+        """Whether the best models may be taken for the best there are."""
+        best = state.F[:, active, 0].to(points.dtype)
+        return self._enough(best, state.draws[active], problem, self.solver.size)
+
+    def _enough(
+        self, F: Float[Tensor, "9 p"], draws: Int[Tensor, " p"], problem: Problem, size: int
+    ) -> Bool[Tensor, " p"]:
         """Whether an all-inlier sample was drawn with probability `confidence` (Fischler & Bolles 1981)."""
-        assert self.confidence is not None
-        r2 = sampson_squared(state.F[:, active, :1].contiguous(), points)[:, 0]
+        if self.confidence is None:
+            return torch.zeros_like(draws, dtype=torch.bool)
+        r2 = sampson_squared(F[..., None].contiguous(), problem.points.to(F.dtype))[:, 0]
         support = r2 <= (self.inlier_threshold / problem.unit).square().to(r2.dtype)[:, None]
         weight = self.sampler.weight(problem)
         share = torch.where(support, weight, 0).sum(1).to(torch.float64) / weight.sum(1)
         all_inliers = share
-        for _ in range(self.solver.size - 1):  # a power would not have the same last bits everywhere
+        for _ in range(size - 1):  # a power would not have the same last bits everywhere
             all_inliers = all_inliers * share
-        missed = torch.log1p(-all_inliers.clamp(max=1 - 1e-12)) * state.draws[active]
+        missed = torch.log1p(-all_inliers.clamp(max=1 - 1e-12)) * draws
         return missed <= math.log1p(-self.confidence)
 
     def _subset(self, problem: Problem) -> Int[Tensor, "p k"] | None:

@@ -24,7 +24,7 @@ LIKELY = 0.3  # matches of a smaller prior do not tell the noise
 ITERATIONS = 8  # Levenberg-Marquardt steps, at most
 DAMPING = 1e-6  # at first: the start is near the optimum, and its weakest directions take long steps
 DOUBT = 4.0  # what an optimum without prior may gain, in logarithms of the likelihood, before it is taken instead
-FOCAL_ITERATIONS = 8
+FOCAL_ITERATIONS = 5  # the same, where cameras are assumed: these start nearer
 LIKELIHOOD_TOLERANCE = 0.05  # of its logarithm: a fifth of a standard deviation more or less
 TOLERANCE = 1e-4  # share of the cost: a smaller gain ends the fit
 

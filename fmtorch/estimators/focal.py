@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.estimators.cheirality import share_in_front
-from fmtorch.estimators.choice import Chosen, More, TwoCameras, ranked
+from fmtorch.estimators.choice import Chosen, TwoCameras, ranked
 from fmtorch.estimators.problem import Problem
 from fmtorch.estimators.scoring import SaturatedGains, geman_mcclure_gain, sampson_squared, score_models
 from fmtorch.geometry.rank2 import complement
@@ -37,10 +37,11 @@ ODDS = 5.0  # its depth
 SIGMA = 0.3  # px, standard deviation of an inlier's Sampson distance
 SCALE = 0.7  # px, Sampson distance at which an inlier's cost is half of what a squared one would be
 # Share of the best gain without prior that gain minus prior cost must reach; chosen on castle-P19, fox, crops of them.
-GATE = 0.94
+GATE = 0.85
 # A pair is open, and the prior is asked, where a candidate of RIVAL of the best gain is further from the best one than
 # SAME: 1 - |cosine| of the two as vectors.
 RIVAL, SAME = 0.85, 1e-3
+ALIKE = 1e-2  # the same for candidates of plausible cameras: if these agree so well, nobody else is asked
 PARALLEL = 4.0  # px in image 1: rays that differ less do not tell on which side of the cameras they meet
 ITERATIONS = 12  # Levenberg-Marquardt steps
 MOST = 12  # candidates that are refined
@@ -70,42 +71,76 @@ class FocalPrior:
         alive: Bool[Tensor, "p k"],
         problem: Problem,
         near: Problem,
-        calibrated: More | None = None,
+        refined: Refined | None = None,
     ) -> Chosen:
-        """As `Choice`."""
+        """As `Choice`; of pairs with refined candidates already, all are open."""
         gain = torch.where(alive, score_models(self.gain, F, problem, problem.points), -torch.inf)
         F, gain = ranked(F, gain, F.shape[2])
-        plain = F[..., 0]
+        plain = Chosen(F[..., 0], TwoCameras.none(problem))
         if problem.size0 is None or problem.size1 is None:
-            return Chosen(plain, None)
-        apart = 1 - component_sum(F * plain[..., None]).abs()
-        rival = (gain >= RIVAL * gain[:, :1]) & ~(apart <= SAME)
-        (open_,) = rival.any(1).nonzero(as_tuple=True)
-        cameras = TwoCameras(
-            plain.new_full((3, 3, 2, plain.shape[1]), torch.nan), torch.full_like(plain[:2], torch.nan)
-        )
+            return plain
+        if refined is None:
+            (open_,) = self._differ(F, gain, SAME).nonzero(as_tuple=True)
+        else:
+            open_ = torch.arange(F.shape[1], device=F.device)
         if not len(open_):
-            return Chosen(plain, cameras)
-        F, alive = F[:, open_, : self.most], torch.isfinite(gain[open_, : self.most])
-        some, near = problem.only(open_), near.only(open_)
-        if calibrated is not None:
-            more, near = calibrated(open_)
-            F, alive = torch.cat([F, more.F.to(F.dtype)], 2), torch.cat([alive, more.alive], 1)
-        refined = refine_focal(F, near, self.iterations)
-        support = score_models(self.gain, refined.F, some, some.points)
-        posterior = (support * refined.front if self.cheirality else support) - refined.prior
-        posterior = torch.where(alive, posterior.nan_to_num(nan=-torch.inf), -torch.inf)
-        best = torch.sort(posterior, dim=1, descending=True, stable=True).indices[:, :1]
-        (plausible,) = (posterior.gather(1, best)[:, 0] >= GATE * gain[open_, 0]).nonzero(as_tuple=True)
-        best, places = best[plausible], open_[plausible]
+            return plain
+        own = self.refined(
+            F[:, open_, : self.most], torch.isfinite(gain[open_, : self.most]), problem.only(open_), near.only(open_)
+        )
+        best, posterior = (own if refined is None else own.joined(refined)).best()
+        (plausible,) = (posterior >= GATE * gain[open_, 0]).nonzero(as_tuple=True)
+        return plain.replaced(open_[plausible], Chosen(best.F[:, plausible], best.cameras[plausible]))
 
-        def replaced(everywhere: Tensor, x: Tensor) -> Tensor:
-            """The best of the candidates where it is plausible."""
-            x = x[..., plausible, :].gather(-1, best.expand(*x.shape[:-2], -1, -1))[..., 0]
-            return everywhere.index_copy(everywhere.dim() - 1, places, x)
+    def refined(
+        self, F: Float[Tensor, "9 p k"], alive: Bool[Tensor, "p k"], problem: Problem, near: Problem
+    ) -> Refined:
+        """The candidates refined on the matches `near` them, with their posteriors."""
+        models, prior, front, cameras = refine_focal(F, near, self.iterations)
+        support = score_models(self.gain, models, problem, problem.points)
+        posterior = (support * front if self.cheirality else support) - prior
+        return Refined(models, torch.where(alive, posterior.nan_to_num(nan=-torch.inf), -torch.inf), cameras)
 
-        cameras = TwoCameras(replaced(cameras.axes, refined.axes), replaced(cameras.focal, refined.focal))
-        return Chosen(replaced(plain, refined.F), cameras)
+    def settled(self, refined: Refined) -> Bool[Tensor, " p"]:
+        """Whether all good candidates are one and the same model."""
+        F, posterior = ranked(refined.F, refined.posterior, refined.F.shape[2])
+        return torch.isfinite(posterior[:, 0]) & ~self._differ(F, posterior, ALIKE)
+
+    def _differ(self, F: Float[Tensor, "9 p k"], gain: Float[Tensor, "p k"], same: float) -> Bool[Tensor, " p"]:
+        """Whether a good candidate is another model than the best, which comes first."""
+        apart = 1 - component_sum(F * F[..., :1]).abs()
+        return ((gain >= RIVAL * gain[:, :1]) & ~(apart <= same)).any(1)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Refined:
+    """Candidates of greatest posterior nearby, what that is, and their cameras."""
+
+    F: Float[Tensor, "9 p k"]
+    posterior: Float[Tensor, "p k"]
+    cameras: TwoCameras
+
+    def __getitem__(self, index: Tensor) -> Refined:
+        """Those of the selected pairs."""
+        return Refined(self.F[:, index], self.posterior[index], self.cameras[index])
+
+    def joined(self, other: Refined) -> Refined:
+        """The candidates of both."""
+        return Refined(
+            torch.cat([self.F, other.F], -1),
+            torch.cat([self.posterior, other.posterior], -1),
+            self.cameras.joined(other.cameras),
+        )
+
+    def best(self) -> tuple[Chosen, Float[Tensor, " p"]]:
+        """The candidate of the greatest posterior, the first of several, and that."""
+        top, order = torch.sort(self.posterior, dim=1, descending=True, stable=True)
+        first = order[:, :1]
+
+        def taken(x: Tensor) -> Tensor:
+            return x.gather(-1, first.expand(*x.shape[:-2], -1, -1))[..., 0]
+
+        return Chosen(taken(self.F), TwoCameras(taken(self.cameras.axes), taken(self.cameras.focal))), top[:, 0]
 
 
 class Cameras:
@@ -125,18 +160,10 @@ class Cameras:
         self.same_size = (problem.size0 == problem.size1).all(-1)
 
 
-class Refined(NamedTuple):
-    """Models of least cost, their prior costs, shares of support in front, log focal lengths."""
-
-    F: Float[Tensor, "9 p k"]
-    prior: Float[Tensor, "p k"]
-    front: Float[Tensor, "p k"]
-    axes: Float[Tensor, "3 3 2 p k"]
-    focal: Float[Tensor, "2 p k"]
-
-
-def refine_focal(F: Float[Tensor, "9 p k"], problem: Problem, iterations: int = ITERATIONS) -> Refined:
-    """Models of least ``sum P rho(r) / (2 SIGMA^2) + prior(f0, f1)``.
+def refine_focal(
+    F: Float[Tensor, "9 p k"], problem: Problem, iterations: int = ITERATIONS
+) -> tuple[Float[Tensor, "9 p k"], Float[Tensor, "p k"], Float[Tensor, "p k"], TwoCameras]:
+    """Models of least ``sum P rho(r) / (2 SIGMA^2) + prior(f0, f1)``, prior costs, shares of support in front, cameras.
 
     r is the Sampson distance in pixels, rho the loss of Geman & McClure at SCALE. The sizes of the problem must be
     known. Support is P times the gain of Geman & McClure at SCALE (see `share_in_front`). A model that is not finite
@@ -152,9 +179,11 @@ def refine_focal(F: Float[Tensor, "9 p k"], problem: Problem, iterations: int = 
         depth = exponential(state.focal) * cameras.longest[..., None]
         r2 = sampson_squared(state.F, cameras.points) * (problem.units / SCALE).square()[:, None]
         support = geman_mcclure_gain(r2) * (problem.live if problem.prior is None else problem.prior)[:, None]
-        front = share_in_front(*state.axes.unbind(2), depth, cameras.points, support, PARALLEL / problem.unit)
+        front = share_in_front(
+            state.axes[:, :, 0], state.axes[:, :, 1], depth, cameras.points, support, PARALLEL / problem.unit
+        )
         prior = torch.where(sound, _prior(state.focal, cameras.same_size)[0], torch.inf)
-        return Refined(models, prior, front, state.axes, state.focal)
+        return models, prior, front, TwoCameras(state.axes, state.focal)
 
 
 class FocalFit(NamedTuple):
@@ -195,7 +224,7 @@ def fit_focal(
 ) -> FocalFit:
     """The maximum a posteriori of the truncated Sampson error.
 
-    truncation, sigma: of the Sampson distance, px. tolerance: a fit is done once a step changes its cost, a logarithm of
+    truncation, sigma: of the Sampson distance, px. tolerance: a fit is done once a step lowers its cost, a logarithm of
     the posterior, by no more than this.
     """
     with torch.no_grad():
@@ -333,7 +362,7 @@ def _moved(state: _State, step: Tensor) -> tuple[Tensor, Tensor]:
     return _rotated(state.axes, angle), (state.focal + step[5:].clamp(-1, 1)).clamp(-3, 3)
 
 
-def _rotated(axes: Float[Tensor, "3 3 *s"], angle: Float[Tensor, "3 *s"]) -> Float[Tensor, "3 3 *s"]:
+def _rotated(axes: Float[Tensor, "3 3 *s"], angle: Float[Tensor, 3 * s]) -> Float[Tensor, "3 3 *s"]:
     """``U R`` with the rotation by twice the angle whose tangent is half of `angle`, about its direction (Cayley)."""
     x, y, z = c = angle / 2
     n = component_sum(c * c)
@@ -346,7 +375,7 @@ def _rotated(axes: Float[Tensor, "3 3 *s"], angle: Float[Tensor, "3 *s"]) -> Flo
     return rotated
 
 
-def scales(depth: Float[Tensor, "2 p k"]) -> Float[Tensor, "3 3 p k"]:
+def scales(depth: Float[Tensor, " 2 *s"]) -> Float[Tensor, " 3 3 *s"]:
     """What ``diag(1, 1, depth1) E diag(1, 1, depth0)`` multiplies E by; depth: focal length in the unit of points."""
     scales = depth.new_ones(3, 3, *depth.shape[1:])
     scales[:, 2] = depth[0]
@@ -363,7 +392,7 @@ def translated(F: Float[Tensor, "9 p k"], offset: Float[Tensor, "4 p"]) -> Float
 
 
 def _start(F: Float[Tensor, "9 p k"], longest: Float[Tensor, "2 p"]) -> tuple[Tensor, Tensor]:
-    """U and V, and log focal lengths near F: the focal lengths that F has, the usual ones where these are implausible."""
+    """U and V, and log focal lengths, near F: those that F has, the usual ones where these are implausible."""
     G, e0, e1 = start(F)
     square = bougnoux(G, e0, e1) / longest[..., None].square()
     plausible = ((square > SHORTEST**2) & (square < LONGEST**2)).all(0)

@@ -84,8 +84,7 @@ def _constraints(e: Float[Tensor, "4 3 3 s"]) -> Float[Tensor, "10 20 s"]:
         [r1[:, None, i] * r2[None, :, j] - r1[:, None, j] * r2[None, :, i] for i, j in ((1, 2), (2, 0), (0, 1))], 2
     )
     minors = quadratic(minors.view(16, 3, s))
-    # Rows 0 to 2 of a 4 x 3 matrix Q of quadratic forms, times E, are the nine equations; row 3 times the first of E's
-    # columns, so to speak, the determinant.
+    # Terms of quadratic forms times entries of E: first those of the determinant, then of the nine other equations.
     Q = quadrics.view(10, 1, 3, 3, s)
     terms = e.new_zeros(41, 10, s)
     nine = terms[:40, 1:].view(10, 4, 9, s).view(10, 4, 3, 3, s)
@@ -101,8 +100,9 @@ def _constraints(e: Float[Tensor, "4 3 3 s"]) -> Float[Tensor, "10 20 s"]:
 def _eliminated(A: Float[Tensor, "10 20 s"]) -> tuple[Float[Tensor, "3 3 5 s"], Bool[Tensor, " s"]]:
     """The 3 x 3 matrix of polynomials in z that (x, y, 1) is the null vector of, and whether elimination went well.
 
-    Gauss elimination with partial pivoting, carried out for the last six of the ten leading monomials; then the
-    equations of x^2 z and z times x^2 are subtracted, and so on. Polynomials have the highest power first.
+    Gauss elimination, carried out for the last six of the ten leading monomials; then z times the equation of x^2 is
+    subtracted from that of x^2 z, and so on. Without pivoting: the coefficients are generic. Polynomials have the
+    highest power first.
     """
     rows: list[Tensor] = []
     for _ in range(10):
@@ -115,13 +115,12 @@ def _eliminated(A: Float[Tensor, "10 20 s"]) -> tuple[Float[Tensor, "3 3 5 s"], 
         for i, done in enumerate(reduced):
             row = torch.addcmul(row, between[8 - k - i], done, value=-1)
         reduced.append(row)
-    j, i, h, g, f, e = reduced
-    a, b = torch.stack([e, g, i]), torch.stack([f, h, j])
+    xy, xyz, y2, y2z, x2, x2z = reduced
+    a, b = torch.stack([x2z, y2z, xyz]), torch.stack([x2, y2, xy])
     B = a.new_zeros(3, 3, 5, *a.shape[2:])
-    for column, some in enumerate((slice(0, 3), slice(3, 6), slice(6, 10))):
-        degree = some.stop - some.start
-        B[:, column, 5 - degree :] += a[:, some]
-        B[:, column, 4 - degree : 4] -= b[:, some]
+    for column, (first, count) in enumerate(((0, 3), (3, 3), (6, 4))):
+        B[:, column, 5 - count :] += a[:, first : first + count]
+        B[:, column, 4 - count : 4] -= b[:, first : first + count]
     return B, B.isfinite().flatten(0, 2).all(0)
 
 
@@ -135,7 +134,7 @@ def _times(a: Float[Tensor, "m s"], b: Float[Tensor, "n s"]) -> Float[Tensor, "m
 
 def _determinant(B: Float[Tensor, "3 3 5 s"]) -> Float[Tensor, "11 s"]:
     """Of polynomials of degrees 3, 3 and 4 in each row."""
-    (a, b, c), (d, e, f), (g, h, i) = (([row[0, 1:], row[1, 1:], row[2]]) for row in B)
+    (a, b, c), (d, e, f), (g, h, i) = ((row[0, 1:], row[1, 1:], row[2]) for row in B.unbind(0))
     return (
         _times(_times(b, f) - _times(c, e), g)
         + _times(_times(c, d) - _times(a, f), h)
@@ -163,16 +162,22 @@ def _solutions(
     M = B.flatten(0, 1).transpose(0, 1).index_select(2, sample)
     m = _horner(torch.where(far, M.flip(0), M), z).view(3, 3, -1)
     x, y, one = _null_vector(m)
-    weights = torch.stack([torch.where(far, x * z, x), torch.where(far, y * z, y), one, one])
-    weights[2] = torch.where(far, one, one * z)
-    weights[3] = torch.where(far, one * z, one)
+    # x : y : z : 1 of the root; with u = 1 / z for z the polynomials were divided by z^4, and x : y : 1 is (x, y, one).
+    weights = torch.stack(
+        [
+            torch.where(far, x * z, x),
+            torch.where(far, y * z, y),
+            torch.where(far, one, one * z),
+            torch.where(far, one * z, one),
+        ]
+    )
     E = component_sum(basis.index_select(2, sample) * weights[:, None])
     norm = component_sum(E * E).sqrt()
     sound = norm.isfinite() & (norm > 0)
     return (E / norm)[:, sound], sample[sound]
 
 
-def _horner(p: Float[Tensor, "c *s"], z: Tensor) -> Tensor:
+def _horner(p: Float[Tensor, c * s], z: Tensor) -> Tensor:
     """The polynomial at z."""
     value = torch.addcmul(p[1], p[0], z)
     for c in p[2:]:

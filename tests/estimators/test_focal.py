@@ -92,7 +92,7 @@ def test_same_cost_as_scipy(seed: int) -> None:
     F = _normalised(reference.fundamental(truth, SIZE0, SIZE1), problem)
     # From the unconstrained optimum, as in the engine: focal lengths there are off, often implausible.
     F, _ = refine_components(F, problem.points, problem.prior, "truncated", SCALE / problem.unit, 10)  # type: ignore[arg-type]
-    models, prior, _ = refine_focal(F, problem, iterations=50)
+    models, prior, *_ = refine_focal(F, problem, iterations=50)
     found = _pixels(models, problem)
     r = reference.sampson(found, x0, x1)
     data = (weight * reference.loss(r, SCALE)).sum() / (2 * 0.3**2)
@@ -112,11 +112,13 @@ def test_scipy_finds_nothing_better_nearby_on_real_pairs(name: str) -> None:
         size0=torch.tensor(sizes[:1]), size1=torch.tensor(sizes[1:]),
     )  # fmt: skip
     problem, weight = _problem(c), np.ones(len(x0))
-    models, prior, _ = refine_focal(_normalised(data[f"{name}.F_gt"], problem), problem, iterations=50)
+    models, prior, *_ = refine_focal(_normalised(data[f"{name}.F_gt"], problem), problem, iterations=50)
     found = _pixels(models, problem)
     parameters = reference.parameters_of(found, *sizes)
-    assert float(prior) == pytest.approx(reference.prior_cost(*parameters[6:]), rel=1e-4)  # by way of F and Bougnoux
-    cost = reference.cost(found, parameters[6:], x0, x1, weight, SCALE)
+    same = sizes[0] == sizes[1]
+    expected = reference.prior_cost(parameters[6], parameters[7], same)  # by way of F and Bougnoux
+    assert float(prior) == pytest.approx(expected, rel=1e-4)
+    cost = reference.cost(found, parameters[6:], x0, x1, weight, SCALE, same)
     _, least = reference.optimum(parameters, x0, x1, weight, SCALE, *sizes)
     assert cost <= least * (1 + 1e-6)
 
@@ -125,7 +127,7 @@ def test_no_noise_no_change() -> None:
     c, truth = _pair(1, focal=(1.2, 1.2), noise=0.0, outliers=0.0)
     problem = _problem(c)
     F = _normalised(reference.fundamental(truth, SIZE0, SIZE1), problem)
-    models, prior, _ = refine_focal(F, problem)
+    models, prior, *_ = refine_focal(F, problem)
     # Residuals are below 1e-9 px here, so the prior's pull of a focal length of 1.2 is of the same order.
     assert float((models * F).sum().abs()) == pytest.approx(1, abs=1e-12)
     assert float(prior) < 1e-12
@@ -136,7 +138,7 @@ def test_prior_decides_between_models_that_explain_the_matches_alike() -> None:
     problem = _problem(c)
     strange = truth + np.array([0, 0, 0, 0, 0, 0, np.log(3), -np.log(3)])
     pool = torch.cat([_normalised(reference.fundamental(p, SIZE0, SIZE1), problem) for p in (strange, truth)], 2)
-    _, prior, _ = refine_focal(pool, problem, iterations=0)
+    _, prior, *_ = refine_focal(pool, problem, iterations=0)
     assert float(prior[0, 0]) == pytest.approx(reference.prior_cost(*strange[6:]), rel=1e-9)
     assert float(prior[0, 1]) == pytest.approx(0, abs=1e-9)
 
@@ -149,7 +151,7 @@ def test_a_crop_keeps_the_model_without_prior() -> None:
     K0[:2, 2] += 4000
     R = Rotation.from_rotvec(truth[:3]).as_matrix()
     F = _normalised(np.linalg.inv(K1).T @ reference.cross_matrix(truth[3:6]) @ R @ np.linalg.inv(K0), problem)
-    chosen = FocalPrior(0.3)(F, problem, problem, torch.ones(1, 1, dtype=torch.bool))
+    chosen = FocalPrior(0.3)(F, torch.ones(1, 1, dtype=torch.bool), problem, problem).F
     assert torch.equal(chosen, F[..., 0])
 
 
@@ -168,13 +170,13 @@ def test_the_prior_is_asked_only_where_good_candidates_differ(monkeypatch: pytes
     right, other = (unit(_normalised(reference.fundamental(p, SIZE0, SIZE1), problem)) for p in (truth, turned))
     same, different = torch.cat([right, right], 2), torch.cat([right, other], 2)
     monkeypatch.setattr("fmtorch.estimators.focal.RIVAL", 0.0)  # every candidate is a good one
-    assert torch.equal(FocalPrior(0.3)(same, problem, problem, alive), right[..., 0])
-    refined, _, _ = refine_focal(different, problem)
-    chosen = FocalPrior(0.3)(different, problem, problem, alive)
+    assert torch.equal(FocalPrior(0.3)(same, alive, problem, problem).F, right[..., 0])
+    refined, *_ = refine_focal(different, problem)
+    chosen = FocalPrior(0.3)(different, alive, problem, problem).F
     assert any(torch.equal(chosen, refined[..., k]) for k in (0, 1))
     assert not torch.equal(chosen, right[..., 0])
     monkeypatch.setattr("fmtorch.estimators.focal.RIVAL", 2.0)  # none is
-    assert torch.equal(FocalPrior(0.3)(different, problem, problem, alive), right[..., 0])
+    assert torch.equal(FocalPrior(0.3)(different, alive, problem, problem).F, right[..., 0])
 
 
 def test_support_behind_a_camera_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -183,7 +185,7 @@ def test_support_behind_a_camera_does_not_count(monkeypatch: pytest.MonkeyPatch)
     turned = truth + np.array([5e-4, 0, 0, 0, 0, 0, 0, 0])  # half a pixel
     right, other = (unit(_normalised(reference.fundamental(p, SIZE0, SIZE1), problem)) for p in (truth, turned))
     both = torch.cat([right, other], 2)
-    refined, _, front = refine_focal(both, problem, iterations=0)
+    refined, _, front, _ = refine_focal(both, problem, iterations=0)
     assert float(front[0, 0]) > 0.9  # the scene is before both cameras; some wrong matches agree by chance
     monkeypatch.setattr("fmtorch.estimators.focal.RIVAL", 0.0)  # every candidate is a good one
     monkeypatch.setattr("fmtorch.estimators.focal.SAME", 0.0)  # and another model
@@ -191,7 +193,7 @@ def test_support_behind_a_camera_does_not_count(monkeypatch: pytest.MonkeyPatch)
     for share, cheirality, best in ((1.0, True, 0), (0.01, True, 1), (0.01, False, 0)):
         shares = torch.tensor([[share, 1.0]], dtype=torch.float64)
         monkeypatch.setattr("fmtorch.estimators.focal.share_in_front", lambda *_, shares=shares: shares)
-        chosen = FocalPrior(0.3, iterations=0, cheirality=cheirality)(both, problem, problem, alive)
+        chosen = FocalPrior(0.3, iterations=0, cheirality=cheirality)(both, alive, problem, problem).F
         assert torch.equal(chosen, refined[..., best])
 
 
@@ -200,9 +202,9 @@ def test_models_that_are_not_finite_harm_no_other() -> None:
     problem = _problem(pair)
     good = torch.cat([_normalised(reference.fundamental(_pair(s)[1], SIZE0, SIZE1), problem) for s in (4, 5)], 1)
     bad = torch.cat([torch.full_like(good, torch.nan), torch.zeros_like(good), good], 2)
-    alone, _, _ = refine_focal(good, problem)
-    models, prior, _ = refine_focal(bad, problem)
+    alone, *_ = refine_focal(good, problem)
+    models, prior, *_ = refine_focal(bad, problem)
     assert torch.equal(models[:, :, 2:], alone)
     assert bool(torch.isinf(prior[:, :2]).all())
-    chosen = FocalPrior(0.3)(bad, problem, problem, torch.tensor([[False, False, True]] * 2))
+    chosen = FocalPrior(0.3)(bad, torch.tensor([[False, False, True]] * 2), problem, problem).F
     assert bool(torch.isfinite(chosen).all())

@@ -2,7 +2,8 @@
 
 Parameters: a rotation vector, the direction of the translation and two log focal lengths; with ``K = [f 0 cx; 0 f cy;
 0 0 1]`` the model is ``F = K1^-T [t]x R K0^-1``. Minimises
-``sum P rho(r) / (2 sigma^2) + ((ln f0 - ln f1) / s1)^2 / 2 + ((mean ln f - ln usual) / s2)^2 / 2``.
+``sum P rho(r) / (2 sigma^2) + ((ln f0 - ln f1) / s1)^2 / 2 + ((mean ln f - ln usual) / s2)^2 / 2``, for images of one
+size less ``A / (1 + (ln f0 - ln f1)^2 / s3^2)``.
 """
 
 from __future__ import annotations
@@ -51,9 +52,11 @@ def parameters_of(F: np.ndarray, size0: tuple[int, int], size1: tuple[int, int])
     return np.concatenate([Rotation.from_matrix(R).as_rotvec(), U[:, 2], np.log([f0, f1])])
 
 
-def prior_cost(log_f0: float, log_f1: float) -> float:
-    """What the two focal lengths cost."""
-    return ((log_f0 - log_f1) / 0.3) ** 2 / 2 + (((log_f0 + log_f1) / 2 - np.log(1.2)) / 0.4) ** 2 / 2
+def prior_cost(log_f0: float, log_f1: float, same_size: bool = False) -> float:
+    """What the two focal lengths cost; less where images of equal size may be of one camera."""
+    difference = log_f0 - log_f1
+    well = 5 * 0.01**2 / (0.01**2 + difference**2) if same_size else 0.0
+    return (difference / 0.5) ** 2 / 2 + (((log_f0 + log_f1) / 2 - np.log(1.2)) / 0.4) ** 2 / 2 - well
 
 
 def loss(r: np.ndarray, scale: float) -> np.ndarray:
@@ -61,9 +64,18 @@ def loss(r: np.ndarray, scale: float) -> np.ndarray:
     return (r * scale) ** 2 / (scale**2 + r**2)
 
 
-def cost(F: np.ndarray, focal: np.ndarray, x0: np.ndarray, x1: np.ndarray, weight: np.ndarray, scale: float) -> float:
+def cost(
+    F: np.ndarray,
+    focal: np.ndarray,
+    x0: np.ndarray,
+    x1: np.ndarray,
+    weight: np.ndarray,
+    scale: float,
+    same_size: bool = False,
+) -> float:
     """The objective at F with log focal lengths `focal`."""
-    return float((weight * loss(sampson(F, x0, x1), scale)).sum() / (2 * 0.3**2)) + prior_cost(*focal)
+    data = (weight * loss(sampson(F, x0, x1), scale)).sum() / (2 * 0.3**2)
+    return float(data) + prior_cost(focal[0], focal[1], same_size)
 
 
 def optimum(
@@ -77,12 +89,16 @@ def optimum(
 ) -> tuple[np.ndarray, float]:
     """The parameters of least cost near `start`, and that cost."""
 
+    same = size0 == size1
+
     def residuals(p: np.ndarray) -> np.ndarray:
         r = sampson(fundamental(p, size0, size1), x0, x1)
         data = np.sqrt(weight) * scale * r / np.sqrt(scale**2 + r**2) / 0.3  # its square is the loss
-        focal = [(p[6] - p[7]) / 0.3, ((p[6] + p[7]) / 2 - np.log(1.2)) / 0.4]
+        focal = [(p[6] - p[7]) / 0.5, ((p[6] + p[7]) / 2 - np.log(1.2)) / 0.4]
+        if same:  # its square is twice what is missing to the depth of the well
+            focal.append(np.sqrt(10 / (0.01**2 + (p[6] - p[7]) ** 2)) * (p[6] - p[7]))
         gauge = [np.linalg.norm(p[3:6]) - 1]
         return np.concatenate([data, focal, gauge])
 
     parameters = least_squares(residuals, start, jac="3-point", max_nfev=1000, xtol=1e-15, ftol=1e-15, gtol=1e-12).x
-    return parameters, cost(fundamental(parameters, size0, size1), parameters[6:], x0, x1, weight, scale)
+    return parameters, cost(fundamental(parameters, size0, size1), parameters[6:], x0, x1, weight, scale, same)
