@@ -8,6 +8,7 @@ from fmtorch.estimators.adapters import (
     magsac_cpp,
     opencv,
     poselib,
+    poselib_shared_focal,
 )
 from fmtorch.estimators.coarse_to_fine import CoarseToFine
 from fmtorch.estimators.engine import HypothesizeAndVerify
@@ -24,4 +25,5 @@ __all__ = [
     "magsac_cpp",
     "opencv",
     "poselib",
+    "poselib_shared_focal",
 ]

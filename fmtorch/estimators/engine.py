@@ -68,6 +68,10 @@ class HypothesizeAndVerify:
     survivors: models of a round that pass the preselection.
     degeneracy: `degensac` completes a best model whose sample lies on a plane by plane and parallax, null: no check.
     candidates: `plane_and_parallax` adds models of the scene's planes to the pool, null: none.
+    calibrated: samples of five matches with focal lengths drawn from their prior, 0: none; where the image sizes are
+    known and the choice is a `focal` one. The best calibrated_pool of their models are refined with the prior. They are
+    all that is asked of a pair whose images have one size, or whose good candidates agree, if the stopping rule is
+    content with them; other pairs are searched without assumptions, too, and both kinds of candidates compared.
     pool: the best models that are kept to the end. local_optimization: of the pool, `graph_cut` or null: none.
     refine: robust kernel of the Levenberg-Marquardt refinement of the pool (`truncated`, `cauchy`, ...), null: none;
     refine_threshold: its scale, Sampson distance in pixels; refine_iterations: its steps. choice: by which score the
@@ -81,7 +85,8 @@ class HypothesizeAndVerify:
     inliers: `threshold`, `lmeds` (2.5 robust standard deviations) or `median` (the better half).
     inlier_threshold: of the inliers reported, Sampson distance in pixels; null: the score's threshold.
     final: `least_squares` (8-point on the inliers), `gauss_newton` (one attached step), `adaptive` (refined at the
-    scale of the pair's own noise, with the gradients of the optimum) or `none`.
+    scale of the pair's own noise, with the prior on the focal lengths where the choice assumed one and the matches do
+    not contradict it; with the gradients of the optimum) or `none`.
     refit_inliers: recompute the inliers after the final fit.
     compile: build the score with torch.compile (of a saturated one the first look, at a subset), for long runs: the
     first calls take some ten seconds each and need a C++ compiler (RuntimeError where there is none). Scores, and so

@@ -17,7 +17,8 @@ from tests.laws import OTHER_LIBRARIES, scene
 
 NAMES = [n for n in presets.available("estimator") if n.startswith(OTHER_LIBRARIES)]
 MODULES = {
-    "poselib": "poselib", "magsac_cpp": "pymagsac", "gc_ransac_cpp": "pygcransac", "degensac_cpp": "pydegensac"
+    "poselib": "poselib", "poselib_shared_focal": "poselib", "magsac_cpp": "pymagsac", "gc_ransac_cpp": "pygcransac",
+    "degensac_cpp": "pydegensac",
 }  # fmt: skip
 
 
