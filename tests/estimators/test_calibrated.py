@@ -17,6 +17,7 @@ from fmtorch.estimators.final_fits import DOUBT
 from fmtorch.estimators.focal import Cameras, fit_focal, refine_focal
 from fmtorch.estimators.problem import Problem, problems
 from fmtorch.geometry import sampson
+from fmtorch.geometry.refine import refine_components
 from fmtorch.metrics import nsgd
 from fmtorch.types import Correspondences, collate
 from tests.reference import focal as reference
@@ -111,22 +112,27 @@ def test_other_cameras_fall_back_to_the_fit_without_prior() -> None:
     assert _error(estimate.F[0], c, truth) < 0.01
 
 
-def test_fit_reaches_the_optimum_and_tells_what_the_prior_costs() -> None:
-    c, truth = _pair(5, outliers=0.0, noise=0.1, focal=(1.1, 1.1), count=600)
+@pytest.mark.parametrize("focal", [(1.1, 1.1), (1.1, 0.8), (0.45, 0.45)])
+def test_fit_reaches_the_optimum_and_tells_what_the_prior_costs(focal: tuple[float, float]) -> None:
+    noise = 0.5
+    c, truth = _pair(5, outliers=0.0, noise=noise, focal=focal)
     problem = _problem(c)
-    A = [np.array([[float(problem.unit[0]), 0, x], [0, float(problem.unit[0]), y], [0, 0, 1]])
-         for x, y in problem.centre[0].reshape(2, 2).tolist()]  # fmt: skip
+    unit = float(problem.unit[0])
+    A = [np.array([[unit, 0, x], [0, unit, y], [0, 0, 1]]) for x, y in problem.centre[0].reshape(2, 2).tolist()]
     start = torch.from_numpy(A[1].T @ truth.numpy() @ A[0]).reshape(9, 1, 1)
-    _, _, _, cameras = refine_focal(start / start.norm(), problem)
-    cameras = TwoCameras(cameras.axes[..., 0], cameras.focal[..., 0])
-    wide = torch.tensor([10.0], dtype=torch.float64)  # nothing is truncated
-    sigma = torch.tensor([0.1], dtype=torch.float64)
-    fit = fit_focal(cameras, problem, wide, sigma, 50, 0.0)
+    *_, cameras = refine_focal(start / start.norm(), problem)
+    wide, sigma = torch.tensor([50.0], dtype=torch.float64), torch.tensor([noise], dtype=torch.float64)
+    fit = fit_focal(TwoCameras(cameras.axes[..., 0], cameras.focal[..., 0]), problem, wide, sigma, 50, 0.0)
     assert float(fit.state.gradient.abs().max()) < 1e-6 * float(fit.state.hessian.abs().max())
-    assert 0 <= float(fit.gain) < DOUBT  # these cameras are what the prior expects
-    other = _pair(5, outliers=0.0, noise=0.1, focal=(1.1, 1.1), count=600, shift=200.0)[0]
-    moved = fit_focal(cameras, _problem(other), wide, sigma, 50, 0.0)
-    assert float(moved.gain) > DOUBT
+    # What a fit without prior gains, in logarithms of the likelihood.
+    F = fit.F.flatten(1).T[..., None].contiguous()
+    costs = [
+        float(refine_components(F, problem.points, problem.weight(), "truncated", wide / problem.unit, steps)[1])
+        for steps in (0, 50)
+    ]
+    gained = (costs[0] - costs[1]) * (unit / noise) ** 2 / 2
+    assert 0 < gained < DOUBT
+    assert float(fit.gain) == pytest.approx(gained, rel=0.05)
 
 
 @pytest.mark.parametrize("same", [True, False])

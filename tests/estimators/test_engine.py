@@ -138,12 +138,14 @@ def test_the_pool_is_refined_on_matches_near_one_of_its_models() -> None:
     F = HypothesizeAndVerify(pool=4)._search(problem).F
     r = torch.stack([residuals_squared(f.T.reshape(1, 3, 3).double(), problem) for f in F.unbind(2)]).amin(0).sqrt()
     refining = HypothesizeAndVerify(pool=4, refine="truncated", refine_threshold=1.5, refine_matches=150)
-    few = refining._near(F, problem, 150)
+    few = refining._near(F, problem)
     assert few.count.tolist() == [150] == few.live.sum(1).tolist()
     assert len(set(few.slot[0].tolist())) == 150
     assert (r[0, few.slot[0]] <= 6.0 + 1e-3).all()  # REACH times the threshold
     places = few.slot.expand(4, -1, -1)
     assert torch.equal(few.points, problem.points.gather(2, places))
-    every = refining._near(F, problem, 1000)
+    every = HypothesizeAndVerify(pool=4, refine="truncated", refine_threshold=1.5, refine_matches=1000)._near(
+        F, problem
+    )
     assert every.count.tolist() == [int((r <= 6.0).sum())]
     assert not every.points[:, ~every.live].any()
