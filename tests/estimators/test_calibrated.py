@@ -122,7 +122,7 @@ def test_fit_reaches_the_optimum_and_tells_what_the_prior_costs(focal: tuple[flo
     start = torch.from_numpy(A[1].T @ truth.numpy() @ A[0]).reshape(9, 1, 1)
     *_, cameras = refine_focal(start / start.norm(), problem)
     wide, sigma = torch.tensor([50.0], dtype=torch.float64), torch.tensor([noise], dtype=torch.float64)
-    fit = fit_focal(TwoCameras(cameras.axes[..., 0], cameras.focal[..., 0]), problem, wide, sigma, 50, 0.0)
+    fit = fit_focal(TwoCameras(cameras.axes[..., 0], cameras.focal[..., 0]), problem, wide, sigma, 50, -math.inf)
     assert float(fit.state.gradient.abs().max()) < 1e-6 * float(fit.state.hessian.abs().max())
     # What a fit without prior gains, in logarithms of the likelihood.
     F = fit.F.flatten(1).T[..., None].contiguous()
