@@ -33,7 +33,8 @@ from fmtorch.types import Correspondences, Estimate
 CPU_SAMPLES = 1 << 14  # minimal samples that are solved together: bounds memory, changes no result
 GPU_SAMPLES = 1 << 21
 REACH = 4.0  # refinement thresholds: a match farther from all models of the pool is not looked at again
-CALIBRATED_ROUND = 500  # samples of five matches at a time
+CALIBRATED_ROUND = 500  # samples of five matches of a pair at a time
+CPU_CALIBRATED, GPU_CALIBRATED = 1 << 10, 1 << 19  # of all pairs: stays in the L2 cache; bounds memory
 UNSTOPPED_ROUND = 2000  # samples of a round where nobody looks in between: few operations on many numbers are faster
 
 
@@ -93,8 +94,9 @@ class HypothesizeAndVerify:
     estimates, may differ from those without. That they have the same bits in any batch is by construction, but depends
     on the compiler: it is tested of the score alone.
 
-    Memory: for a batch of pairs of N matches, the points (48 N bytes a pair), the samples of 2^14 draws (about 40 MB)
-    and eight buffers of one scoring tile (256 KB each); on a GPU 2^21 draws and 256 MB a buffer.
+    Memory: for a batch of pairs of N matches, the points (48 N bytes a pair), the samples of 2^14 draws (about 40 MB),
+    2^10 samples of five (about 20 MB) and eight buffers of one scoring tile (256 KB each); on a GPU 2^21 draws, 2^19
+    samples of five and 256 MB a buffer.
     """
 
     def __init__(
@@ -206,7 +208,7 @@ class HypothesizeAndVerify:
         (rest,) = (~settled).nonzero(as_tuple=True)
         if len(rest):
             other, other_found, other_draws = self._searched(problem.only(rest), refined[rest])
-            chosen, found = chosen.replaced(rest, other), found.index_copy(0, rest, other_found)
+            chosen, found = chosen.replaced(rest, other), found.index_copy(0, rest, other_found | found[rest])
             draws = draws.index_add(0, rest, other_draws)
         return chosen, found, draws
 
@@ -238,18 +240,26 @@ class HypothesizeAndVerify:
         return Chosen(best_of(F, score, alive), nothing)
 
     def _calibrated(self, problem: Problem) -> tuple[Float[Tensor, "9 p k"], Bool[Tensor, "p k"]]:
-        """The best models of cameras with plausible focal lengths, and which slots hold one."""
+        """The best models of cameras with plausible focal lengths, and which slots hold one; in tiles of pairs."""
+        limit = GPU_CALIBRATED if problem.points.is_cuda else CPU_CALIBRATED
+        everything = torch.arange(len(problem.pair), device=problem.points.device)
+        tiles = torch.split(everything, max(1, limit // min(self.calibrated, CALIBRATED_ROUND)))
+        states = [self._calibrated_search(problem.only(tile)) for tile in tiles]
+        F, score = torch.cat([s.F for s in states], 1), torch.cat([s.score for s in states])
+        return F, torch.isfinite(score)
+
+    def _calibrated_search(self, problem: Problem) -> _Search:
         points = problem.points.to(torch.float32)
+        everything = torch.arange(len(problem.pair), device=points.device)
         state = _Search.empty(len(problem.pair), self.calibrated_pool, points.device)
         table = self.sampler.table(problem, FIVE)
         subset = self._subset(problem)
-        everything = torch.arange(len(problem.pair), device=points.device)
         for start in range(0, self.calibrated, CALIBRATED_ROUND):
             count = min(CALIBRATED_ROUND, self.calibrated - start)
             index = self.sampler.draw(problem, table, start, count, FIVE)
             F, score = self._verify(problem, points, *calibrated_hypotheses(problem, index, start), subset)
             self._remember(state, everything, F, score)
-        return state.F, torch.isfinite(state.score)
+        return state
 
     def _near(self, F: Float[Tensor, "9 p k"], problem: Problem) -> Problem:
         """The same pairs with at most `refine_matches` of their matches, of those near one of the models."""

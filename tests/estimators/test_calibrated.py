@@ -180,3 +180,13 @@ def test_unknown_sizes_are_searched_without_assumptions() -> None:
     assert bool(estimate.ok[0])
     assert torch.equal(estimate.F, presets.build("estimator", "fmtorch", calibrated=0)(bare, 0).F)
     assert _error(estimate.F[0], c, truth) < 0.05
+
+
+def test_an_exact_plane_has_a_solution_where_cameras_are_plausible() -> None:
+    """Any seven of its matches leave F open, so that there is no sample of seven; five and a focal length suffice."""
+    c, truth = _pair(4, relief=0.0, noise=0.0, outliers=0.0)
+    estimate = presets.build("estimator", "fmtorch")(c, 0)
+    assert bool(estimate.ok[0])
+    assert float(sampson(estimate.F, c.x0, c.x1).max()) < 1e-3
+    assert int(estimate.inliers.sum()) == 150
+    assert _error(estimate.F[0], c, truth) < 0.05
