@@ -1,0 +1,138 @@
+"""A training from start to end: what is already done is taken up again, whatever ended the last attempt."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import re
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import lightning
+import torch
+from lightning.pytorch.callbacks import Callback, EarlyStopping, ModelCheckpoint
+from lightning.pytorch.loggers import TensorBoardLogger
+from torch.utils.data import DataLoader
+
+from fmtorch.storage.files import replacing
+from fmtorch.storage.runs import identity_digest
+from fmtorch.training.pruners.module import PrunerTraining
+
+CHECKPOINTS, BEST, LOGS = "checkpoints", "best.ckpt", "logs"
+
+
+class TrainingFolderError(ValueError):
+    """A folder that holds another training; the message says what to do."""
+
+
+def claim(folder: Path, identity: Mapping[str, Any]) -> None:
+    """Make `folder` that of the training with this identity, or check that it already is.
+
+    Raises TrainingFolderError where it holds another training, or files that are none.
+    """
+    file = folder / "training.json"
+    wanted = json.loads(json.dumps(identity, sort_keys=True))
+    if file.is_file():
+        try:
+            stored = json.loads(file.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise TrainingFolderError(f"{file} is not valid JSON ({error}); delete {folder} to train anew") from error
+        if identity_digest(stored) != identity_digest(wanted):
+            changed = sorted(k for k in {*stored, *wanted} if stored.get(k) != wanted.get(k))
+            raise TrainingFolderError(
+                f"{folder} holds another training (it differs in {', '.join(changed)}); choose another output"
+            )
+        return
+    if folder.is_dir() and any(folder.iterdir()):
+        raise TrainingFolderError(f"{folder} is not empty and holds no training; choose another output")
+    folder.mkdir(parents=True, exist_ok=True)
+    with replacing(file) as temporary:
+        temporary.write_text(json.dumps(wanted, indent=2) + "\n", encoding="utf-8")
+
+
+def latest_checkpoint(folder: Path) -> tuple[Path | None, int]:
+    """The checkpoint of most steps that can be read, and its steps; (None, 0) where there is none."""
+    found = []
+    for path in (folder / CHECKPOINTS).glob("step=*.ckpt"):
+        match = re.fullmatch(r"step=(\d+)", path.stem)
+        if match:
+            found.append((int(match[1]), path))
+    for step, path in sorted(found, reverse=True):
+        try:
+            torch.load(path, map_location="cpu", weights_only=True)
+        except Exception as error:  # whatever a damaged file raises: an older one may do
+            warnings.warn(f"{path} cannot be read and is passed over ({error})", stacklevel=2)
+            continue
+        return path, step
+    return None, 0
+
+
+def train(
+    module: PrunerTraining,
+    batches: Callable[[int], DataLoader[Any]],
+    folder: Path,
+    trainer: Mapping[str, Any],
+    *,
+    every: int,
+    checkpoint_every: int,
+    patience: int | None,
+    monitor: str,
+    callbacks: tuple[Callback, ...] = (),
+) -> int:
+    """Train in `folder`, going on from its last checkpoint, and return the steps made in all.
+
+    Args:
+        module: what is trained; ends with the best weights that validation saw.
+        batches: the training batches from a given step on, always the same for the same step.
+        folder: keeps checkpoints and TensorBoard's logs.
+        trainer: further arguments of lightning.Trainer (accelerator, devices, strategy, precision, gradient clipping).
+        every: steps between two validations. checkpoint_every: steps between two checkpoints.
+        patience: validations without a better figure after which training ends; None: never.
+        monitor: the figure of validation that counts, larger is better.
+        callbacks: further ones.
+    """
+    path, step = latest_checkpoint(folder)
+    total = module.optimisation.steps
+    kept = ModelCheckpoint(
+        folder / CHECKPOINTS, "{step}", save_top_k=1, monitor="step", mode="max", every_n_train_steps=checkpoint_every,
+        enable_version_counter=False, save_on_train_epoch_end=False,
+    )  # fmt: skip
+    best = ModelCheckpoint(
+        folder / CHECKPOINTS, "best", monitor=f"validation/{monitor}", mode="max", enable_version_counter=False,
+        save_weights_only=True,
+    )  # fmt: skip
+    stop = [] if patience is None else [EarlyStopping(f"validation/{monitor}", mode="max", patience=patience, strict=True)]
+    with _quiet():
+        lightning_trainer = lightning.Trainer(
+            max_steps=total, max_epochs=1, val_check_interval=every, check_val_every_n_epoch=None,
+            num_sanity_val_steps=0, log_every_n_steps=min(10, every), default_root_dir=folder,
+            logger=TensorBoardLogger(folder, name=LOGS, version=""), callbacks=[kept, best, *stop, *callbacks],
+            use_distributed_sampler=False, enable_model_summary=False, deterministic=True, **trainer,
+        )  # fmt: skip
+        if step < total:
+            lightning_trainer.fit(
+                module, batches(step), DataLoader([0], batch_size=None), ckpt_path=path, weights_only=True
+            )
+            step = lightning_trainer.global_step
+    return step
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Lightning without the advice that does not apply here."""
+    loggers = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric")]
+    before = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=".*does not have many workers.*")
+            warnings.filterwarnings("ignore", message=".*exists and is not empty.*")
+            warnings.filterwarnings("ignore", category=FutureWarning, module="lightning.*")
+            yield
+    finally:
+        for logger, level in zip(loggers, before, strict=True):
+            logger.setLevel(level)
