@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 console = Console()
 
@@ -18,6 +19,30 @@ def plain(config: Any) -> dict[str, Any]:
     container = OmegaConf.to_container(config, resolve=True) if isinstance(config, DictConfig) else {}
     assert isinstance(container, dict)
     return {str(key): value for key, value in container.items()}
+
+
+def progress_bars() -> Progress:
+    """Progress bars on the terminal's error stream, as all commands show them; a context manager."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    return Progress(*columns, console=Console(stderr=True))
+
+
+def reporter(progress: Progress, description: str) -> Callable[[int, int], None]:
+    """A function of (done, total) that shows a bar from its first call on."""
+    bar: list[TaskID] = []
+
+    def report(done: int, total: int) -> None:
+        if not bar:
+            bar.append(progress.add_task(description, total=total))
+        progress.update(bar[0], completed=done, total=total)
+
+    return report
 
 
 @contextlib.contextmanager

@@ -10,6 +10,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import estimators
 import features
+import learned
 import matching
 import memory
 import pipelines
@@ -21,7 +22,7 @@ import thresholds
 def main() -> None:
     parser = argparse.ArgumentParser(prog="scripts/benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    for module in (estimators, features, matching, memory, pipelines, pruning, speed, thresholds):
+    for module in (estimators, features, learned, matching, memory, pipelines, pruning, speed, thresholds):
         module.add_arguments(commands)
     arguments = parser.parse_args()
     arguments.run(arguments)

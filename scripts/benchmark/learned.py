@@ -1,0 +1,144 @@
+"""Learned pruners beside all others, on the same matches: before the paper's estimators, and as a prior for our own.
+
+python scripts/benchmark learned --root DATA/Strecha --root DATA/KITTI --json FILE
+python scripts/benchmark learned --rendered full --limit 50 --json FILE
+python scripts/benchmark learned --from FILE FILE --markdown docs/learned.md
+python scripts/benchmark learned --ngransac FILE.safetensors ...      # also the weights that NG-RANSAC's authors publish
+
+A pruner's time is that of its stage alone, on one thread. Every pair is estimated once, with seed 0.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import learned_table
+import torch
+from matched import add_set_arguments, sets_of
+from pruning import machine, stage
+from pruning_table import put
+from rich.console import Console
+from rich.progress import track
+
+from fmtorch import presets
+from fmtorch.data import ImagePair
+from fmtorch.evaluation.rows import evaluate
+from fmtorch.evaluation.run import select
+from fmtorch.pipeline import Outcome, Pipeline
+from fmtorch.storage.features import cached
+
+console = Console(width=None if sys.stdout.isatty() else 160)
+# Pruners in order after one match per location; `ratio` stands in every chain but CODE's, which takes all matches.
+HARD = {
+    "ratio": "ratio one_to_one",
+    "GMS": "ratio one_to_one gms",
+    "GMS, scale": "ratio one_to_one gms:with_scale=true",
+    "LPM": "ratio one_to_one lpm",
+    "CODE": "code one_to_one",
+    "frame consistency": "ratio one_to_one frame_consistency likely",
+    "LC, F": "ratio one_to_one lc",
+    "LC, E": "ratio one_to_one lc_e",
+    "LC, F, side information": "ratio one_to_one lc_side",
+    "DFE": "ratio one_to_one dfe",
+}
+PRIOR = {
+    "none": "ratio one_to_one",
+    "ratio": "ratio one_to_one ratio_prior",
+    "GMS": "ratio one_to_one gms_soft",
+    "LPM": "ratio one_to_one lpm_soft",
+    "CODE": "code_soft one_to_one ratio",
+    "frame consistency": "ratio one_to_one frame_consistency",
+    "LC, F": "ratio one_to_one lc_soft",
+    "LC, E": "ratio one_to_one lc_e_soft",
+    "LC, F, side information": "ratio one_to_one lc_side_soft",
+    "DFE": "ratio one_to_one dfe_soft",
+}
+USES = {"hard": (HARD, ("ransac_eight_point", "lmeds_eight_point")), "prior": (PRIOR, ("fmtorch",))}
+GIVEN = frozenset(("ratio", "one_to_one"))  # what every method has, and what is not counted into its time
+KEPT = ("pair", "family", "scene", "ok", "nsgd", "inlier_rate", "inlier_rate_before", "corrs", "corrs_before")
+
+
+Chain = list[tuple[str, Any]]  # names of presets and the stages
+
+
+def add_arguments(commands: Any) -> None:
+    parser = commands.add_parser("learned", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add_set_arguments(parser)
+    parser.add_argument("--features", default="sift", help="features of another kind than the networks saw in training")
+    parser.add_argument("--methods", nargs="*", default=list(HARD | PRIOR), choices=list(HARD | PRIOR))
+    parser.add_argument("--ngransac", type=Path, help="NG-RANSAC's published weights, converted to safetensors")
+    parser.add_argument("--cache", default="off", help="a folder that keeps features from run to run; off: nowhere")
+    parser.add_argument("--json", type=Path, help="write the figures of every pair here")
+    parser.add_argument("--from", nargs="*", type=Path, default=[], dest="earlier", help="add earlier runs' --json")
+    parser.add_argument("--markdown", type=Path, help="put the tables between the marks of this file")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    torch.set_num_threads(1)
+    runs = [json.loads(path.read_text()) for path in arguments.earlier]
+    if arguments.root or arguments.rendered:
+        runs.append({"machine": machine(), "rows": list(measure(arguments))})
+    rows = [row for r in runs for row in r["rows"]]
+    unique = {(row["pair"], row["features"], row["use"], row["method"], row["estimator"]): row for row in rows}
+    merged = {"machine": [r["machine"] for r in runs], "rows": list(unique.values())}  # of equals the last
+    tables = learned_table.tables(merged["rows"])
+    for table in tables:
+        console.print(table.terminal())
+    if arguments.json:
+        arguments.json.write_text(json.dumps(merged, indent=0) + "\n")
+    if arguments.markdown:
+        put(arguments.markdown, tables)
+
+
+def measure(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """A row for each pair, method, use and estimator."""
+    pairs = select([dataset[i] for dataset in sets_of(arguments) for i in range(len(dataset))], arguments.limit)
+    features = cached(presets.build("features", arguments.features), arguments.cache)
+    estimators = {name: presets.build("estimator", name) for _, names in USES.values() for name in names}
+    front = Pipeline(features, presets.build("matcher", "nearest"), {}, next(iter(estimators.values())))
+    built = {
+        use: {name: [(spec, stage(spec)) for spec in chain.split()] for name, chain in methods.items()
+              if name in arguments.methods}
+        for use, (methods, _) in USES.items()
+    }  # fmt: skip
+    if arguments.ngransac:
+        network = {"_target_": "fmtorch.pruning.networks.LC", "side": ["ratio"]}
+        for use, threshold in (("hard", 0.5), ("prior", None)):
+            pruner = presets.build("pruner", "lc", network=network, file=str(arguments.ngransac), threshold=threshold)
+            before = [(name, stage(name)) for name in sorted(GIVEN, reverse=True)]
+            built[use]["NG-RANSAC's network"] = [*before, ("lc", pruner)]
+    for pair in track(pairs, "pairs", console=console):
+        yield from rows(front, pair, built, estimators, arguments.features)
+
+
+def rows(
+    front: Pipeline, pair: ImagePair, built: dict[str, dict[str, Chain]], estimators: dict[str, Any], features: str
+) -> Iterator[dict[str, Any]]:
+    matched = front.match([pair])[0]
+    for use, methods in built.items():
+        for name, pruners in methods.items():
+            outcome, seconds = pruned(matched, pruners)
+            for estimator in USES[use][1]:
+                front.estimator = estimators[estimator]
+                row = evaluate(front.estimate([outcome]))[0]
+                values = {field: getattr(row, field) for field in KEPT}
+                about = {"use": use, "method": name, "estimator": estimator, "features": features}
+                yield {**about, **values, "ms": 1e3 * seconds, "ms_estimator": 1e3 * row.seconds_estimation}
+
+
+def pruned(outcome: Outcome, pruners: Chain) -> tuple[Outcome, float]:
+    """The outcome after the pruners, and the seconds of those that are not in every chain."""
+    c, seconds = outcome.correspondences, 0.0
+    for name, pruner in pruners if c is not None else []:
+        start = time.perf_counter()
+        c = pruner(c).compact()
+        seconds += (time.perf_counter() - start) * (name not in GIVEN)
+    return dataclasses.replace(outcome, correspondences=c), seconds

@@ -1,0 +1,90 @@
+"""The figures of `scripts/benchmark learned` as tables."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from pruning_table import Sheet
+
+from fmtorch.evaluation.bootstrap import bootstrap_mean, paired_bootstrap
+
+AUC_LIMIT = 0.05  # NSGD up to which recall is averaged
+STRICT = 0.01
+WIDE = {"Strecha": "real", "PhotoTourism": "real", "orbit": "rendered", "collection": "rendered"}
+SHORT = {"KITTI": "real", "TUM": "real", "indoor": "rendered", "driving": "rendered"}
+BASELINE = {"hard": "ratio", "prior": "frame consistency"}
+ESTIMATOR = {"ransac_eight_point": "RANSAC", "lmeds_eight_point": "LMedS", "fmtorch": "fmtorch"}
+
+
+def tables(rows: list[dict[str, Any]]) -> list[Sheet]:
+    """Real and rendered sets apart: wide and short baselines, then each family; one table for each use."""
+    sheets = []
+    for features in dict.fromkeys(row["features"] for row in rows):
+        mine = [row for row in rows if row["features"] == features]
+        for title, families in _groups([row["family"] for row in mine]).items():
+            own = [row for row in mine if row["family"] in families]
+            for use in ("hard", "prior"):
+                if any(row["use"] == use for row in own):
+                    sheets.append(_sheet(title, features, use, [row for row in own if row["use"] == use]))
+    return sheets
+
+
+def _groups(present: list[str]) -> dict[str, list[str]]:
+    families = list(dict.fromkeys(present))
+    groups: dict[str, list[str]] = {}
+    for kind in ("real", "rendered"):
+        for name, members in (("wide", WIDE), ("short", SHORT)):
+            some = [f for f in families if members.get(f) == kind]
+            if some:
+                groups[f"{kind.capitalize()}, {name} baselines ({', '.join(some)})"] = some
+    return groups | {family: [family] for family in families}
+
+
+def _sheet(title: str, features: str, use: str, rows: list[dict[str, Any]]) -> Sheet:
+    pairs, scenes = ({row[field] for row in rows} for field in ("pair", "scene"))
+    estimators = list(dict.fromkeys(row["estimator"] for row in rows))
+    columns = [""]
+    for estimator in estimators:
+        name = ESTIMATOR[estimator]
+        columns += [f"{name}: R.05", "R.01", "AUC@0.05", f"AUC - {BASELINE[use]}"]
+    columns += ["%Inlier-m", "#Corrs-m", "ms"] if use == "hard" else ["ms"]
+    lines = []
+    for method in dict.fromkeys(row["method"] for row in rows):
+        own = [row for row in rows if row["method"] == method]
+        line = [method]
+        for estimator in estimators:
+            some = [row for row in own if row["estimator"] == estimator]
+            base = {row["pair"]: row for row in rows
+                    if row["method"] == BASELINE[use] and row["estimator"] == estimator}  # fmt: skip
+            nsgd = np.array([row["nsgd"] for row in some])
+            line += [f"{100 * (nsgd < 0.05).mean():.1f}", f"{100 * (nsgd < STRICT).mean():.1f}", _auc(some)]
+            line.append(_difference(some, base) if method != BASELINE[use] else "")
+        once = [row for row in own if row["estimator"] == estimators[0]]
+        if use == "hard":
+            rate = [row["inlier_rate_before"] for row in once if not np.isnan(row["inlier_rate_before"])]
+            line += [f"{100 * np.mean(rate):.1f}" if rate else "-", f"{np.mean([row['corrs_before'] for row in once]):.0f}"]
+        line.append(f"{np.median([row['ms'] for row in once]):.1f}")
+        lines.append(line)
+    what = "matches dropped before the paper's estimators" if use == "hard" else "P(inlier) as the prior of `fmtorch`"
+    return Sheet(
+        f"{title}: {what}; {features}, {len(pairs)} pairs of {len(scenes)} scene{'s' * (len(scenes) > 1)}", columns, lines
+    )
+
+
+def _share(row: dict[str, Any]) -> float:
+    """What a pair adds to the area under the recall curve, in percent."""
+    return 100 * max(0.0, 1 - row["nsgd"] / AUC_LIMIT)
+
+
+def _auc(rows: list[dict[str, Any]]) -> str:
+    i = bootstrap_mean(np.array([_share(row) for row in rows]), [row["scene"] for row in rows])
+    return f"{i.value:.1f} [{i.low:.0f}, {i.high:.0f}]"
+
+
+def _difference(rows: list[dict[str, Any]], base: dict[str, dict[str, Any]]) -> str:
+    if not rows or any(row["pair"] not in base for row in rows):
+        return ""
+    own, other = (np.array([_share(r) for r in some]) for some in (rows, [base[row["pair"]] for row in rows]))
+    i = paired_bootstrap(own, other, [row["scene"] for row in rows])
+    return f"{i.value:+.1f} [{i.low:+.1f}, {i.high:+.1f}]"
