@@ -14,10 +14,11 @@ from torch import Tensor
 
 from fmtorch.data.fmbench import DataError, FMBenchPairs
 from fmtorch.data.images import ImageError, read_image, to_grey
-from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset
+from fmtorch.data.pairs import DepthDataset, ImagePair, ImageSource, PairDataset
 
 __all__ = [
     "DataError",
+    "DepthDataset",
     "FMBenchPairs",
     "ImageError",
     "ImagePair",

@@ -67,3 +67,12 @@ class PairDataset(Protocol):
     def __getitem__(self, index: int) -> ImagePair: ...
 
     def __iter__(self) -> Iterator[ImagePair]: ...
+
+
+@runtime_checkable
+class DepthDataset(PairDataset, Protocol):
+    """A data set that knows how far away the points of its images are, in the unit of the pairs' t."""
+
+    def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Depth (n,) along the optical axis at points (n, 2) in pixels; NaN where it is unknown."""
+        ...

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import functools
 import hashlib
@@ -23,10 +24,10 @@ LIBRARIES = ("numpy", "torch", "kornia", "onnxruntime")  # and OpenCV, which has
 def configuration(part: object) -> Any:
     """A part of a pipeline as plain values that JSON can hold; equal values mean equal results.
 
-    A dataclass is its class, the code of its package, and its fields (not those with ``compare=False``); an object with
-    an attribute `identity` is that attribute in place of the fields; a `Path` is the digest of the file; tensors and
-    networks are the digests of their values. Raises TypeError for anything that does not say what defines it, and
-    OSError for a file that cannot be read.
+    A dataclass is its class, its code and the code that it imports from its own package, and its fields (not those with
+    ``compare=False``); an object with an attribute `identity` is that attribute in place of the fields; a `Path` is the
+    digest of the file; tensors and networks are the digests of their values. Raises TypeError for anything that does
+    not say what defines it, and OSError for a file that cannot be read.
     """
     if part is None or isinstance(part, bool | int | float | str):
         return part
@@ -95,12 +96,41 @@ def environment() -> dict[str, str]:
 
 @functools.cache
 def _code_digest(module: str) -> str:
-    """The digest of a module's source and, where it belongs to a package, of the files beside and below it."""
+    """The digest of a module's source and of all modules of its own top-level package that it imports, at any depth."""
     file = getattr(sys.modules[module], "__file__", None)
     if file is None:
         raise TypeError(f"the code of {module} is in no file, so its changes cannot be noticed")
-    files = sorted(Path(file).parent.rglob("*.py")) if "." in module else [Path(file)]
-    return _digest(b"".join(_digest(path.read_bytes()).encode() for path in files))
+    package = module.partition(".")[0]
+    home = getattr(sys.modules.get(package), "__file__", None)
+    root = Path(home).parents[1] if home and "." in module else None
+    sources: dict[str, bytes] = {}
+    waiting = [(module, Path(file))]
+    while waiting:
+        name, path = waiting.pop()
+        if name in sources:
+            continue
+        sources[name] = path.read_bytes()
+        if root is not None:
+            named = (n for n in _imported(sources[name]) if n.partition(".")[0] == package)
+            waiting += [(n, found) for n in named if (found := _source_file(root, n))]
+    return _digest("".join(f"{name} {_digest(sources[name])}\n" for name in sorted(sources)).encode())
+
+
+def _imported(source: bytes) -> set[str]:
+    """Dotted names that a source may import: modules, and what is taken from them, which may be modules too."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            names.update((node.module, *(f"{node.module}.{alias.name}" for alias in node.names)))
+    return names
+
+
+def _source_file(root: Path, module: str) -> Path | None:
+    """The file of a module below `root`; None where the name is not a module's."""
+    path = root.joinpath(*module.split("."))
+    return next((file for file in (path.with_suffix(".py"), path / "__init__.py") if file.is_file()), None)
 
 
 @functools.lru_cache(maxsize=256)

@@ -6,10 +6,13 @@ import hashlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.data.rendered.cameras import Camera, fundamental, relative_pose
+from fmtorch.data.rendered.depth import depth_at
 from fmtorch.data.rendered.generate import FAMILIES, PLANS, Plan, Task, digest, read
 from fmtorch.data.rendered.workers import Progress, generate_all
 from fmtorch.resources import cache_dir
@@ -60,6 +63,7 @@ class RenderedPairs(Dataset[ImagePair]):
         generate_all([(task, folders[task.family]) for task in tasks], workers, progress)
         self._pairs: list[tuple[Task, int, int]] = []
         self._views: dict[str, list[tuple[Path, Camera]]] = {}
+        self._tasks = {task.name: task for task in tasks}
         for task in sorted(tasks, key=lambda task: chosen.index(task.family)):
             self._views[task.name], pairs = read(folders[task.family] / task.name)
             self._pairs += [(task, i, j) for i, j in pairs]
@@ -83,6 +87,15 @@ class RenderedPairs(Dataset[ImagePair]):
             R=R,
             t=t,
         )
+
+    def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Depth (n,) in metres along the optical axis at points (n, 2) of an image; NaN for the sky and outside.
+
+        The scene is built anew and its rays are cast, as when it was drawn; the last few images are remembered.
+        Raises KeyError for an image of another data set.
+        """
+        scene, _, number = image.identity.rpartition("/")
+        return depth_at(self._tasks[scene], int(number), points)
 
     def __iter__(self) -> Iterator[ImagePair]:
         return (self[index] for index in range(len(self)))

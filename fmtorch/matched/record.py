@@ -1,0 +1,88 @@
+"""`LabelledMatches`: correspondences of a batch of pairs, which of them are right, and the true geometry."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int8
+from torch import Tensor
+
+from fmtorch import types
+from fmtorch.matched.labels import IGNORED, INLIER
+from fmtorch.types import Correspondences, Index
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LabelledMatches(types._Record):
+    """A batch of B pairs with N matches each (padded), labels and the true fundamental matrices.
+
+    correspondences: the matches. label: (B, N) int8, 1 inlier, 0 outlier, -1 ignored, always -1 in masked slots.
+    F: (B, 3, 3) float64 of unit Frobenius norm, ``x1^T F x0 = 0``.
+    """
+
+    correspondences: Correspondences
+    label: Int8[Tensor, "b n"]
+    F: Float[Tensor, "b 3 3"]
+
+    def __post_init__(self) -> None:
+        b, n = self.correspondences.x0.shape[:2]
+        types._expect("label", self.label, (b, n))
+        types._expect("F", self.F, (b, 3, 3))
+        label = torch.where(self.correspondences.mask, self.label, IGNORED)
+        object.__setattr__(self, "label", label)
+
+    @property
+    def labelled(self) -> Bool[Tensor, "b n"]:
+        """True for the matches that a loss may look at: real ones that are inliers or outliers."""
+        return self.label >= 0
+
+    @property
+    def inlier(self) -> Bool[Tensor, "b n"]:
+        """True for the matches that are right."""
+        return self.label == INLIER
+
+    @property
+    def requires_grad(self) -> bool:
+        """Whether a gradient can reach any of the tensors."""
+        return self.correspondences.requires_grad or (torch.is_grad_enabled() and self.F.requires_grad)
+
+    def __len__(self) -> int:
+        """Number of pairs."""
+        return len(self.correspondences)
+
+    def __getitem__(self, index: Index) -> LabelledMatches:
+        """The selected pairs, always as a batch."""
+        i = types._as_index(index, len(self))
+        return self._map(lambda value: value[i])
+
+    def compact(self, multiple: int = 1) -> LabelledMatches:
+        """Matches moved to the front, padding cut to the longest pair (rounded up to `multiple`)."""
+        order = torch.argsort(self.correspondences.mask.logical_not().to(torch.uint8), dim=-1, stable=True)
+        c = self.correspondences.compact(multiple)
+        label = _padded(torch.gather(self.label, 1, order), c.x0.shape[1])
+        return LabelledMatches(c, label, self.F)
+
+    def _map(self, function: Any, **changes: Any) -> LabelledMatches:
+        parts = {"correspondences": self.correspondences._map(function)}
+        parts |= {"label": function(self.label), "F": function(self.F)}
+        return dataclasses.replace(self, **{**parts, **changes})
+
+
+def collate(items: Sequence[LabelledMatches]) -> LabelledMatches:
+    """One padded batch from several: for torch's DataLoader. Optional fields survive only where every item has them.
+
+    Raises ValueError for an empty list.
+    """
+    c = types.collate([item.correspondences for item in items])
+    n = c.x0.shape[1]
+    label = torch.cat([_padded(item.label, n) for item in items])
+    return LabelledMatches(c, label, torch.cat([item.F for item in items]))
+
+
+def _padded(label: Tensor, n: int) -> Tensor:
+    """Labels of `n` slots, ignored beyond the given ones."""
+    missing = max(n - label.shape[1], 0)
+    return torch.nn.functional.pad(label, (0, missing), value=IGNORED)[:, :n]

@@ -1,0 +1,7 @@
+"""Networks that tell inliers from outliers: Correspondences -> Prediction."""
+
+from fmtorch.pruning.networks.inputs import MatchInputs
+from fmtorch.pruning.networks.lc import LC
+from fmtorch.pruning.networks.prediction import Prediction
+
+__all__ = ["LC", "MatchInputs", "Prediction"]

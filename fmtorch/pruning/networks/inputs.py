@@ -1,0 +1,142 @@
+"""Correspondences as the input of a network: normalised coordinates and side information, one column a match."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from fmtorch.pruning.frame_consistency import frame_agreement, frame_map
+from fmtorch.types import Correspondences
+
+COORDINATES = ("size", "K")
+LEAST_AREA_RATIO = 1e-12  # of two frames; keeps the gradient of the logarithm finite
+
+
+@dataclasses.dataclass(frozen=True)
+class MatchInputs:
+    """Turns correspondences into (B, channels, N) float32, zero in masked slots.
+
+    coordinates, the first four channels (x0, y0, x1, y1):
+      "size": ``(x - w/2) / max(h, w)``, as Brachmann & Rother, "Neural-guided RANSAC", ICCV 2019. Points have (0, 0) at
+      the centre of the first pixel, so this centre is half a pixel off the image's: it is kept as published.
+      "K": rays ``K^-1 (x, y, 1)``, as Yi et al., CVPR 2018, for the essential matrix.
+    side: names from `SIDE`, in this order after the coordinates. What is not known, of a match or of all, is 0, which
+    no channel but "scale" (beside "rotation") and "agreement" otherwise takes:
+      "ratio": `quality` as it is, (0, 1].
+      "mutual": 1 or -1.
+      "scale": half the logarithm of the determinant of the map from frame 0 to frame 1.
+      "rotation": cosine and sine of that map's rotation (of its polar decomposition), so without a jump at any angle.
+      "agreement": ``2 a - 1`` with a of `frame_agreement`, in [-1, 1].
+
+    Raises ValueError for unknown names.
+    """
+
+    coordinates: str = "size"
+    side: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.coordinates not in COORDINATES:
+            raise ValueError(f"coordinates={self.coordinates}; there are: {', '.join(COORDINATES)}")
+        object.__setattr__(self, "side", tuple(self.side))
+        unknown = [name for name in self.side if name not in SIDE]
+        if unknown or len(set(self.side)) < len(self.side):
+            raise ValueError(f"side={list(self.side)}: each at most once of {', '.join(SIDE)}")
+
+    @property
+    def channels(self) -> int:
+        """Numbers for each match."""
+        return 4 + sum(SIDE[name][0] for name in self.side)
+
+    def __call__(self, c: Correspondences) -> tuple[Float[Tensor, "b channels n"], Bool[Tensor, "b n"]]:
+        """The input and the mask of its columns: matches of `c.mask` whose normalised coordinates are finite.
+
+        Raises ValueError where image sizes or calibration matrices are missing.
+        """
+        x0, x1 = (torch.where(c.mask[..., None], x, 0) for x in (c.x0, c.x1))
+        points = [_by_size(x0, c.size0, "size0"), _by_size(x1, c.size1, "size1")] if self.coordinates == "size" else [
+            _by_calibration(x0, c.K0, "K0"), _by_calibration(x1, c.K1, "K1")]  # fmt: skip
+        coordinates = torch.cat(points, -1).float()
+        mask = c.mask & torch.isfinite(coordinates).all(-1)
+        channels = [*torch.where(mask[..., None], coordinates, 0).unbind(-1)]
+        for name in self.side:
+            channels += [torch.where(mask & torch.isfinite(value), value.float(), 0) for value in SIDE[name][1](c)]
+        return torch.stack(channels, 1), mask
+
+
+def _by_size(x: Float[Tensor, "b n 2"], size: Tensor | None, name: str) -> Float[Tensor, "b n 2"]:
+    if size is None:
+        raise ValueError(
+            f"coordinates=size needs `{name}`, the images' (h, w): give image sizes with the matches, or take a "
+            "network trained on calibrated coordinates (coordinates=K)"
+        )
+    size = size.to(x.dtype)
+    longest = size.amax(-1)[:, None, None]
+    return (x - size.flip(-1)[:, None] / 2) / longest
+
+
+def _by_calibration(x: Float[Tensor, "b n 2"], K: Tensor | None, name: str) -> Float[Tensor, "b n 2"]:
+    if K is None:
+        raise ValueError(
+            f"coordinates=K needs `{name}`, the calibration matrices: take a data set that has them, or a network "
+            "trained on coordinates by image size (coordinates=size)"
+        )
+    fx, skew, cx, fy, cy = (K[:, i, j, None].to(x.dtype) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
+    y = (x[..., 1] - cy) / fy
+    return torch.stack([(x[..., 0] - cx - skew * y) / fx, y], -1)
+
+
+def _ratio(c: Correspondences) -> list[Tensor]:
+    return [torch.zeros_like(c.x0[..., 0]) if c.quality is None else torch.where(c.mask, c.quality, 0)]
+
+
+def _mutual(c: Correspondences) -> list[Tensor]:
+    return [torch.zeros_like(c.x0[..., 0]) if c.mutual is None else c.mutual.to(c.x0.dtype) * 2 - 1]
+
+
+def _frame_map(c: Correspondences) -> Float[Tensor, "b n 2 2"] | None:
+    """The linear part of the map from frame 0 to frame 1; the identity's in masked slots and for unusable frames."""
+    if c.lafs0 is None or c.lafs1 is None:
+        return None
+    sound = c.mask
+    for lafs in (c.lafs0, c.lafs1):
+        (a, b), (d, e) = (row.unbind(-1) for row in lafs[..., :2].unbind(-2))
+        sound = sound & torch.isfinite(lafs).flatten(2).all(2) & (a * e - b * d != 0)
+    unit = torch.eye(2, 3, dtype=c.lafs0.dtype, device=c.lafs0.device)
+    return frame_map(*(torch.where(sound[..., None, None], lafs, unit) for lafs in (c.lafs0, c.lafs1)))
+
+
+def _scale(c: Correspondences) -> list[Tensor]:
+    S = _frame_map(c)
+    if S is None:
+        return [torch.zeros_like(c.x0[..., 0])]
+    determinant = S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]
+    return [determinant.abs().clamp_min(LEAST_AREA_RATIO).log() / 2]
+
+
+def _rotation(c: Correspondences) -> list[Tensor]:
+    S = _frame_map(c)
+    if S is None:
+        return [torch.zeros_like(c.x0[..., 0])] * 2
+    cosine, sine = S[..., 0, 0] + S[..., 1, 1], S[..., 1, 0] - S[..., 0, 1]
+    squared = cosine.square() + sine.square()
+    inverse = torch.where(squared > 0, torch.where(squared > 0, squared, 1).rsqrt(), 0)
+    return [cosine * inverse, sine * inverse]
+
+
+def _agreement(c: Correspondences) -> list[Tensor]:
+    if c.lafs0 is None or c.lafs1 is None:
+        return [torch.zeros_like(c.x0[..., 0])]
+    return [2 * frame_agreement(c.x0, c.x1, c.lafs0, c.lafs1, c.quality, c.mask) - 1]
+
+
+SIDE: dict[str, tuple[int, Callable[[Correspondences], list[Tensor]]]] = {
+    "ratio": (1, _ratio),
+    "mutual": (1, _mutual),
+    "scale": (1, _scale),
+    "rotation": (2, _rotation),
+    "agreement": (1, _agreement),
+}  # name: how many channels, and what they hold
