@@ -72,7 +72,7 @@ def latest_checkpoint(folder: Path) -> tuple[Path | None, int]:
 
 def train(
     module: PrunerTraining,
-    batches: Callable[[int], DataLoader[Any]],
+    batches: Callable[[int, int, int], DataLoader[Any]],
     folder: Path,
     trainer: Mapping[str, Any],
     *,
@@ -86,7 +86,7 @@ def train(
 
     Args:
         module: what is trained; ends with the best weights that validation saw.
-        batches: the training batches from a given step on, always the same for the same step.
+        batches: from (step, rank, processes) to the training batches from that step on, which must always be the same.
         folder: keeps checkpoints and TensorBoard's logs.
         trainer: further arguments of lightning.Trainer (accelerator, devices, strategy, precision, gradient clipping).
         every: steps between two validations. checkpoint_every: steps between two checkpoints.
@@ -113,9 +113,8 @@ def train(
             use_distributed_sampler=False, enable_model_summary=False, deterministic=True, **trainer,
         )  # fmt: skip
         if step < total:
-            lightning_trainer.fit(
-                module, batches(step), DataLoader([0], batch_size=None), ckpt_path=path, weights_only=True
-            )
+            own = batches(step, lightning_trainer.global_rank, lightning_trainer.world_size)
+            lightning_trainer.fit(module, own, DataLoader([0], batch_size=None), ckpt_path=path, weights_only=True)
             step = lightning_trainer.global_step
     return step
 

@@ -84,7 +84,7 @@ class PrunerTraining(lightning.LightningModule):
         """Adam and its schedule."""
         o = self.optimisation
         adam = torch.optim.Adam(self.network.parameters(), lr=o.learning_rate, weight_decay=o.weight_decay)
-        schedule = torch.optim.lr_scheduler.LambdaLR(adam, o.factor)
+        schedule = torch.optim.lr_scheduler.LambdaLR(adam, lambda step: o.factor(step))
         return {"optimizer": adam, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
