@@ -81,8 +81,8 @@ def train(
     patience: int | None,
     monitor: str,
     callbacks: tuple[Callback, ...] = (),
-) -> int:
-    """Train in `folder`, going on from its last checkpoint, and return the steps made in all.
+) -> tuple[int, float]:
+    """Train in `folder`, going on from its last checkpoint; returns the steps and seconds made in all.
 
     Args:
         module: what is trained; ends with the best weights that validation saw.
@@ -116,7 +116,7 @@ def train(
             own = batches(step, lightning_trainer.global_rank, lightning_trainer.world_size)
             lightning_trainer.fit(module, own, DataLoader([0], batch_size=None), ckpt_path=path, weights_only=True)
             step = lightning_trainer.global_step
-    return step
+    return step, module.seconds
 
 
 @contextlib.contextmanager

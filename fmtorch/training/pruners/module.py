@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from typing import Any
 
 import lightning
@@ -53,6 +54,20 @@ class PrunerTraining(lightning.LightningModule):
         self.network, self.objective, self.optimisation = network, objective, optimisation
         self.validation = validation
         self.evaluation: Evaluation | None = None
+        self._seconds, self._started = 0.0, time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Spent on the training so far, in this and earlier attempts."""
+        return self._seconds + time.perf_counter() - self._started
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Keeps the seconds."""
+        checkpoint["seconds"] = self.seconds
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Goes on counting seconds."""
+        self._seconds, self._started = float(checkpoint.get("seconds", 0.0)), time.perf_counter()
 
     def training_step(self, batch: LabelledMatches, index: int) -> Tensor:
         """The loss of a batch. Raises FloatingPointError where it is not finite: no step is skipped in silence."""

@@ -4,87 +4,84 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import time
+import platform
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from omegaconf import DictConfig
-from rich.progress import Progress
 
-from fmtorch import __version__, data, presets
-from fmtorch.command import console, plain, progress_bars, reporter
-from fmtorch.data import ImagePair, PairDataset
-from fmtorch.evaluation.run import select
-from fmtorch.matched import Augmentation, LabelledMatches, MatchedPairs
-from fmtorch.pipeline import Pipeline
-from fmtorch.storage.features import cached
+from fmtorch import __version__, presets
+from fmtorch.command import console, plain, progress_bars
 from fmtorch.storage.runs import identity_digest
 from fmtorch.training.pruners.batches import training_batches
+from fmtorch.training.pruners.data import labelled_matches
 from fmtorch.training.pruners.loop import claim, train
 from fmtorch.training.pruners.module import Optimisation, PrunerTraining
 from fmtorch.training.pruners.objective import Objective
 from fmtorch.training.pruners.pictures import ValidationPictures
-from fmtorch.training.pruners.result import write_result
+from fmtorch.training.pruners.result import Result, write_result
 from fmtorch.training.pruners.validation import Use, Validation
 
 PICTURES = 4  # validation pairs that are drawn into the log
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Matches:
-    """What a training sees: labelled matches to train on, and to validate on with their pairs."""
-
-    training: MatchedPairs
-    validation: list[tuple[ImagePair, LabelledMatches]]
-    digest: str
-
-
 def run(config: DictConfig, name: str) -> Path:
     """Train what a composed config describes and return the folder of the result.
 
-    Started again, it goes on from the last checkpoint; a finished training is only reported.
-    name: of the pruner's preset, e.g. ``lc``.
+    Started again, it goes on from the last checkpoint; a finished training only writes its files anew.
+    name: of the pruner's preset, e.g. ``lc``. Raises ValueError for options that cannot be.
     """
     network_config = network_of(config, name)
     optimisation, objective = Optimisation(**plain(config.optimisation)), Objective(**plain(config.objective))
     uses = {key: use_of(key, value) for key, value in plain(config.validation.uses).items()}
-    threads = int(config.threads or os.cpu_count() or 1)
+    expect_positive(config)
     with progress_bars() as progress:
         matches = labelled_matches(config, progress)
     identity = {
         "network": network_config, "objective": dataclasses.asdict(objective), "batch": config.batch,
         "optimisation": dataclasses.asdict(optimisation), "augmentation": plain(config.augmentation),
-        "seed": config.seed, "matches": matches.digest, "version": __version__,
-        "validation": {k: v for k, v in plain(config.validation).items() if k in ("every", "monitor", "patience")},
-        "trainer": plain(config.trainer),
+        "seed": config.seed, "matches": matches.digest, "version": __version__, "trainer": plain(config.trainer),
+        "validation": {k: v for k, v in plain(config.validation).items() if k != "roots"},
     }  # fmt: skip
     folder = Path(config.output or f"runs/train/{name}-{identity_digest(identity)[:8]}")
     claim(folder, identity)
-    torch.set_num_threads(threads)
+    torch.set_num_threads(int(config.threads or os.cpu_count() or 1))
     torch.manual_seed(config.seed)
     network = presets.instantiate(network_config, f"pruner={name}, network")
     validation = Validation([m for _, m in matches.validation], uses, [p.family for p, _ in matches.validation])
     module = PrunerTraining(network, objective, optimisation, validation)
-    augmentation = Augmentation(**plain(config.augmentation))
-    console.print(
-        f"{len(matches.training)} pairs to train on, {len(matches.validation)} to validate on; {folder}", highlight=False
-    )
-    start = time.perf_counter()
-    train(
+    about = f"{len(matches.training)} pairs to train on, {len(matches.validation)} to validate on"
+    console.print(f"{about}; {folder}", highlight=False)
+    shown = matches.validation[:: max(1, len(matches.validation) // PICTURES)][:PICTURES]
+    steps, seconds = train(
         module,
-        lambda step: training_batches(matches.training, augmentation, config.batch, config.seed, step),
+        lambda step, rank, processes: training_batches(
+            matches.training, config.batch, config.seed, step, rank, processes, workers=config.loaders
+        ),
         folder,
         plain(config.trainer),
         every=config.validation.every,
         checkpoint_every=config.checkpoint_every,
         patience=config.validation.patience,
         monitor=config.validation.monitor,
-        callbacks=(ValidationPictures(matches.validation[:: max(1, len(matches.validation) // PICTURES)][:PICTURES]),),
+        callbacks=(ValidationPictures(shown),),
     )
-    write_result(folder, name, module, identity, seconds=time.perf_counter() - start)
+    if int(os.environ.get("LOCAL_RANK", "0")) == 0:
+        processor = f"{os.cpu_count()} cores of {platform.processor() or platform.machine()}"
+        facts = {**identity, "steps": steps, "seconds": seconds, "data": matches.description, "processor": processor}
+        report(write_result(folder, name, module, facts), name)
     return folder
+
+
+def report(result: Result, name: str) -> None:
+    """Say on the terminal what came out and how to use it."""
+    for key, value in result.evaluation.figures.items():
+        console.print(f"{key:32} {value:.4f}", highlight=False)
+    console.print(f"[dim]{', '.join(str(path) for path in result.files)}[/dim]", highlight=False)
+    console.print(f"use it: python -m fmtorch.eval pipeline=sift_ratio 'pruner=[ratio,one_to_one,{name}]' "
+                  f"pruner.{name}.file={result.files[0]}", highlight=False, soft_wrap=True)  # fmt: skip
 
 
 def network_of(config: DictConfig, name: str) -> dict[str, Any]:
@@ -101,27 +98,19 @@ def network_of(config: DictConfig, name: str) -> dict[str, Any]:
 
 def use_of(name: str, options: Mapping[str, Any]) -> Use:
     """A way of using P(inlier) from its config: an estimator's preset, and a threshold or null."""
-    unknown = set(options) - {"estimator", "threshold"}
+    unknown = sorted(set(options) - {"estimator", "threshold"})
     if unknown or "estimator" not in options:
-        raise ValueError(f"validation.uses.{name} must have `estimator` and may have `threshold`, not {sorted(unknown)}")
+        raise ValueError(f"validation.uses.{name}: it has `estimator` and may have `threshold`, no {unknown}")
     return Use(presets.build("estimator", str(options["estimator"])), options.get("threshold"))
 
 
-def labelled_matches(config: DictConfig, progress: Progress) -> Matches:
-    """The matches of the config's data set, split by scenes, and of its further validation sets.
-
-    Raises ValueError where a side is empty.
-    """
-    options = plain(config.dataset)
-    if options.get("name") == "rendered":
-        options["split"] = "train"
-    dataset: PairDataset
-    if "_target_" in options:
-        dataset = presets.instantiate(options, "dataset")
-    else:
-        dataset = data.load(**options, progress=reporter(progress, "drawing scenes"))
-    front = _front(config)
-    training, held_out = split_scenes(dataset, config.validation.scenes, config.limit)
-    sets = {"matches to train on": training, "matches to validate on": held_out}
-    for root in config.validation.roots:
-        sets[f"matches of {root}"] = Subset(data.load("fmbench", root=root))
+def expect_positive(config: DictConfig) -> None:
+    """Raises ValueError for counts of the config that are not whole numbers of at least one."""
+    counts = {
+        "batch": config.batch, "checkpoint_every": config.checkpoint_every,
+        "validation.every": config.validation.every, "validation.pairs": config.validation.pairs,
+        "validation.scenes": config.validation.scenes, "limit": config.limit,
+    }  # fmt: skip
+    for name, value in counts.items():
+        if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
+            raise ValueError(f"{name}={value}; it must be a whole number of at least 1")

@@ -1,0 +1,129 @@
+"""What a pruner is trained and validated on: the labelled matches that a config asks for."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+from collections import Counter
+from typing import Any
+
+from omegaconf import DictConfig
+from rich.progress import Progress
+
+from fmtorch import data, presets
+from fmtorch.command import plain, reporter
+from fmtorch.data import ImagePair, PairDataset
+from fmtorch.data.subset import subset
+from fmtorch.evaluation.run import select
+from fmtorch.matched import Augmentation, LabelledMatches, MatchedPairs, StoredMatches
+from fmtorch.matched.transforms import keep_ratio
+from fmtorch.pipeline import Pipeline
+from fmtorch.storage.features import cached
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Matches:
+    """Labelled matches to train on, and to validate on with their pairs; what defines them; what a card says of them."""
+
+    training: StoredMatches
+    validation: list[tuple[ImagePair, LabelledMatches]]
+    digest: str
+    description: dict[str, str]
+
+
+def labelled_matches(config: DictConfig, progress: Progress) -> Matches:
+    """The matches of the config's data set, split by scenes, and of its further validation sets.
+
+    Raises ValueError where there is nothing to train on or to validate on.
+    """
+    dataset = _dataset(config, progress)
+    training, held_out = _split(dataset, config.validation.scenes)
+    chosen = _limited(dataset, training, config.limit)
+    if not chosen:
+        raise ValueError(f"no pairs to train on: {config.validation.scenes} scenes of each family are for validation")
+    front = _front(config)
+    matched = _matched(config, dataset, chosen, front, progress, "matches to train on")
+    digests, validation = [matched.folder.name], []
+    sets: list[tuple[PairDataset, list[int], str]] = [(dataset, held_out, "matches to validate on")]
+    for root in config.validation.roots:
+        real = data.load("fmbench", root=root)
+        sets.append((real, list(range(len(real))), f"matches of {root}"))
+    for source, indices, title in sets:
+        some = _limited(source, indices, config.validation.pairs)
+        if not some:
+            continue
+        stored = _matched(config, source, some, front, progress, title)
+        digests.append(stored.folder.name)
+        pairs = {source[i].key: source[i] for i in some}
+        for i, about in enumerate(stored.pairs):
+            matches = keep_ratio(stored.stored(i), config.validation.ratio).compact()
+            validation.append((pairs[about["key"]], matches))
+    if not validation:
+        raise ValueError("no pairs to validate on: give validation.scenes or validation.roots")
+    families = Counter(pair.family for pair, _ in validation)
+    scenes = {about["scene"] for about in matched.pairs}
+    description = {
+        "training": f"{len(matched)} pairs of {len(scenes)} scenes of {dataset.name}",
+        "validation": ", ".join(f"{count} pairs of {family}" for family, count in families.items())
+        + f" (of {dataset.name} the last {config.validation.scenes} scenes of each family, which share photographs "
+        "with the training scenes)",
+    }
+    augmented = matched.augmented(Augmentation(**_ranges(plain(config.augmentation))), config.seed)
+    return Matches(augmented, validation, hashlib.sha256(" ".join(digests).encode()).hexdigest(), description)
+
+
+def _dataset(config: DictConfig, progress: Progress) -> PairDataset:
+    """The data set to train on; of the embedded one always the training side."""
+    options = plain(config.dataset)
+    if options.get("name") == "rendered":
+        options["split"] = "train"
+    if "_target_" in options:
+        dataset: PairDataset = presets.instantiate(options, "dataset")
+        return dataset
+    return data.load(**options, progress=reporter(progress, "drawing scenes"))
+
+
+def _split(dataset: PairDataset, last: int) -> tuple[list[int], list[int]]:
+    """Indices of the pairs to train on, and of those in the last scenes of each family."""
+    pairs = [dataset[i] for i in range(len(dataset))]
+    scenes: dict[str, list[str]] = {}
+    for pair in sorted(pairs, key=lambda pair: pair.scene):
+        names = scenes.setdefault(pair.family, [])
+        if pair.scene not in names:
+            names.append(pair.scene)
+    held = {name for names in scenes.values() for name in names[max(1, len(names) - last) :]}
+    sides: tuple[list[int], list[int]] = ([], [])
+    for i, pair in enumerate(pairs):
+        sides[pair.scene in held].append(i)
+    return sides
+
+
+def _limited(dataset: PairDataset, indices: list[int], limit: int | None) -> list[int]:
+    """At most `limit` pairs of each family, chosen by their keys."""
+    index = {dataset[i].key: i for i in indices}
+    return sorted(index[pair.key] for pair in select([dataset[i] for i in indices], limit))
+
+
+def _front(config: DictConfig) -> Pipeline:
+    """Features, matcher and the pruners before the trained one."""
+    extractor = cached(presets.instantiate(config.features, "features"), config.cache, config.cache_limit)
+    before = {str(name): presets.build("pruner", str(name)) for name in config.before}
+    matcher: Any = presets.instantiate(config.matcher, "matcher")
+    return Pipeline(extractor, matcher, before, _no_estimator)
+
+
+def _no_estimator(c: Any, seed: int = 0) -> Any:
+    raise NotImplementedError("the stages before estimation only")
+
+
+def _matched(
+    config: DictConfig, dataset: PairDataset, indices: list[int], front: Pipeline, progress: Progress, title: str
+) -> MatchedPairs:
+    some = subset(dataset, indices) if len(indices) < len(dataset) else dataset
+    workers = config.workers or os.cpu_count() or 1
+    return MatchedPairs(some, front, workers=workers, progress=reporter(progress, title))
+
+
+def _ranges(options: dict[str, Any]) -> dict[str, Any]:
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in options.items()}
