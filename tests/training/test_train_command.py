@@ -1,0 +1,114 @@
+"""`python -m fmtorch.train`, as a user runs it: from another directory, with a network of one's own."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("lightning", reason="training needs the extra `train`")
+
+from tests.test_pipeline import draw
+
+SHORT = [
+    "optimisation.steps=6", "objective.classification_steps=2", "batch=2", "threads=1", "workers=1", "cache=off",
+    "validation.scenes=1", "validation.pairs=2", "validation.every=3", "checkpoint_every=2",
+    "validation.uses.hard.estimator=ransac", "validation.uses.prior.estimator=msac", "augmentation.crop=0",
+    "features.max_features=300",
+]  # fmt: skip
+
+
+def command(name: str, *arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """Run a command of the package as a user does, in another directory."""
+    source = str(Path(__file__).resolve().parents[2])
+    own = {"PYTHONPATH": source, "COLUMNS": "200", "FMTORCH_CACHE": f"{cwd}/cache", "OMP_NUM_THREADS": "1"}
+    called = [sys.executable, "-m", f"fmtorch.{name}", *arguments]
+    return subprocess.run(
+        called, cwd=cwd, env={**os.environ, **own}, capture_output=True, text=True, timeout=300, check=False
+    )
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A set of two scenes in the FM-Bench layout: photographs moved sideways."""
+    lines, scenes = [], []
+    for scene in ("a", "b"):
+        images = tmp_path / "Set" / scene / "Images"
+        images.mkdir(parents=True)
+        for i in range(3):
+            draw(images / f"{i:08d}.png", seed=ord(scene), shift=9 * i)
+        for l, r in ((0, 1), (0, 2), (1, 2)):
+            lines.append(f"{l} {r} 0 0 0 0 0 -1 0 1 0")
+            scenes.append(f"{scene}/")
+    (tmp_path / "Set" / "pairs_with_gt.txt").write_text("\n".join(lines) + "\n")
+    (tmp_path / "Set" / "pairs_which_dataset.txt").write_text("\n".join(scenes) + "\n")
+    return tmp_path / "Set"
+
+
+def documented(title: str) -> list[str]:
+    """The code blocks of a section of docs/training.md."""
+    page = (Path(__file__).resolve().parents[2] / "docs" / "training.md").read_text()
+    section = re.split(r"^## ", page.partition(f"## {title}\n")[2], flags=re.MULTILINE)[0]
+    return re.findall(r"```\w+\n(.*?)```", section, flags=re.DOTALL)
+
+
+def test_a_network_of_ones_own_is_trained_and_used(root: Path, tmp_path: Path) -> None:
+    """The files and commands of the docs, in an empty directory, on a small data set."""
+    here = tmp_path / "here"
+    here.mkdir()
+    module, preset, commands = documented("A network of your own")
+    (here / "mine.py").write_text(module)
+    (here / "my_conf" / "pruner").mkdir(parents=True)
+    (here / "my_conf" / "pruner" / "mine.yaml").write_text(preset)
+    train, evaluate = (line.removeprefix("python -m fmtorch.").split() for line in commands.strip().splitlines())
+    data = ["dataset=fmbench", f"dataset.root={root}"]
+    trained = command(*[w.strip("'") for w in train if not w.startswith("dataset")], *data, *SHORT, "output=out", cwd=here)
+    assert trained.returncode == 0, trained.stderr
+    assert (here / "out" / "mine.safetensors").is_file()
+    assert "| trained on | 3 pairs of 1 scenes of fmbench |" in (here / "out" / "mine.md").read_text()
+    figures = json.loads((here / "out" / "validation.json").read_text())
+    assert 0 <= figures["prior/AUC@0.05"] <= 1
+    used = [w.strip("'") for w in evaluate if not w.startswith(("dataset", "pruner.mine.file"))]
+    evaluated = command(
+        *used, *data, "pruner.mine.file=out/mine.safetensors", "run_dir=run", "features.max_features=300", cwd=here
+    )
+    assert evaluated.returncode == 0, evaluated.stderr
+    identity = (here / "run" / "run.json").read_text()
+    assert "mine" in identity
+
+
+def test_the_command_goes_on_and_refuses_another_training(root: Path, tmp_path: Path) -> None:
+    options = ["pruner=lc", "dataset=fmbench", f"dataset.root={root}", *SHORT, "pruner.lc.network.channels=8",
+               "pruner.lc.network.blocks=2", "output=out"]  # fmt: skip
+    first = command("train", *options, cwd=tmp_path)
+    assert first.returncode == 0, first.stderr
+    weights = (tmp_path / "out" / "lc.safetensors").read_bytes()
+    again = command("train", *options, cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert (tmp_path / "out" / "lc.safetensors").read_bytes() == weights
+    other = command("train", *options, "seed=1", cwd=tmp_path)
+    assert other.returncode == 1
+    assert "holds another training (it differs in seed)" in other.stderr
+    assert "Traceback" not in other.stderr
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("pruner=ratio", "pruner=ratio has nothing to train"),
+        ("batch=0", "batch=0; it must be a whole number of at least 1"),
+        ("limit=-3", "limit=-3; it must be a whole number of at least 1"),
+        ("optimisation.steps=0", "learning_rate and steps must be positive"),
+        ("objective.coordinates=pixels", "it must be one of: size, K"),
+    ],
+)
+def test_mistakes_are_told_in_a_line(option: str, message: str, tmp_path: Path) -> None:
+    ended = command("train", option, "dataset=fmbench", "dataset.root=nowhere", cwd=tmp_path)
+    assert ended.returncode == 1
+    assert message in ended.stderr
+    assert "Traceback" not in ended.stderr
