@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.onnx_session import NetworkFileError, onnx_session
 from fmtorch.resources import models_dir
 
 PRECISIONS = ("fp32", "int8")
@@ -21,10 +21,6 @@ HINT_INT8 = (
     "python scripts/export_onnx.py precision=int8 makes it from a checkpoint, checkpoint=FILE, and patches that "
     "calibrate it, calibration=FOLDER (scripts/train_patch_network.py leaves both)"
 )
-
-
-class NetworkFileError(ValueError):
-    """A network file that is absent, unreadable or of another shape; the message names it and what makes it."""
 
 
 def network_file(name: str, precision: str = "fp32") -> Path:
@@ -69,7 +65,7 @@ class PatchNetwork:
         """
         if patches.ndim != 4 or tuple(patches.shape[1:]) != PATCH_SHAPE:
             raise ValueError(f"patches are {tuple(patches.shape)}; a patch network takes (N, 1, 32, 32)")
-        session, name, outputs = _session(str(self.path.absolute()), self.threads)
+        session, name, outputs = _session(self.path, self.threads)
         array = np.ascontiguousarray(patches.detach().to("cpu", torch.float32).numpy())
         result = np.zeros((len(array), outputs), np.float32)
         for start in range(0, len(array), self.batch):
@@ -87,7 +83,7 @@ class PatchNetwork:
     @property
     def outputs(self) -> int:
         """D, the length of an output; opens the file."""
-        return _session(str(self.path.absolute()), self.threads)[2]
+        return _session(self.path, self.threads)[2]
 
 
 def _filled(part: NDArray[np.float32], count: int) -> NDArray[np.float32]:
@@ -96,22 +92,9 @@ def _filled(part: NDArray[np.float32], count: int) -> NDArray[np.float32]:
     return np.concatenate([part, np.zeros((count - len(part), *PATCH_SHAPE), np.float32)])
 
 
-@functools.lru_cache(maxsize=16)
-def _session(path: str, threads: int) -> tuple[Any, str, int]:
+def _session(path: Path, threads: int) -> tuple[Any, str, int]:
     """An inference session, its input's name and the length of an output."""
-    import onnxruntime
-    from onnxruntime.capi import onnxruntime_pybind11_state as errors
-
-    if not Path(path).is_file():
-        raise NetworkFileError(f"{path} does not exist: {_hint(path)}")
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-    options.log_severity_level = 3
-    try:
-        session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-    except (errors.InvalidProtobuf, errors.InvalidGraph, errors.Fail, errors.InvalidArgument, errors.NotImplemented,
-            errors.RuntimeException) as error:  # fmt: skip
-        raise NetworkFileError(f"{path} is no ONNX network that can be run ({error}): {_hint(path)}") from error
+    session = onnx_session(path, threads, _hint(path))
     inputs, outputs = session.get_inputs(), session.get_outputs()
     shape = inputs[0].shape if len(inputs) == 1 else None
     fits = shape is not None and len(shape) == 4 and tuple(shape[1:]) == PATCH_SHAPE and not isinstance(shape[0], int)

@@ -4,6 +4,7 @@ from fmtorch.pruning.calibration import Calibration, RatioPrior
 from fmtorch.pruning.code import CODE, Coherence, LikelihoodField, SmoothMotion, code, coherence
 from fmtorch.pruning.frame_consistency import FrameConsistency, frame_agreement
 from fmtorch.pruning.gms import GMS, gms, gms_support
+from fmtorch.pruning.learned import LearnedPruner
 from fmtorch.pruning.likely import Likely
 from fmtorch.pruning.lpm import LPM, lpm, lpm_cost
 from fmtorch.pruning.match_noise import MatchNoise, match_noise
@@ -19,6 +20,7 @@ __all__ = [
     "Calibration",
     "Coherence",
     "FrameConsistency",
+    "LearnedPruner",
     "LikelihoodField",
     "Likely",
     "MatchNoise",

@@ -25,9 +25,9 @@ def configuration(part: object) -> Any:
     """A part of a pipeline as plain values that JSON can hold; equal values mean equal results.
 
     A dataclass is its class, its code and the code that it imports from its own package, and its fields (not those with
-    ``compare=False``); an object with an attribute `identity` is that attribute in place of the fields; a `Path` is the
-    digest of the file; tensors and networks are the digests of their values. Raises TypeError for anything that does
-    not say what defines it, and OSError for a file that cannot be read.
+    ``compare=False``); an object with an attribute `identity` is that attribute in place of the fields; a class is its
+    name and code; a `Path` is the digest of the file; tensors and networks are the digests of their values.
+    Raises TypeError for anything that does not say what defines it, and OSError for a file that cannot be read.
     """
     if part is None or isinstance(part, bool | int | float | str):
         return part
@@ -37,6 +37,8 @@ def configuration(part: object) -> Any:
         return {str(key): configuration(value) for key, value in part.items()}
     if isinstance(part, list | tuple):
         return [configuration(value) for value in part]
+    if isinstance(part, type):
+        return _class(part)
     if isinstance(part, torch.Tensor):
         values = part.detach().cpu().contiguous()
         return {"tensor": [str(part.dtype), list(part.shape), _digest(values.reshape(-1).view(torch.uint8).numpy())]}

@@ -2,6 +2,6 @@
 
 from fmtorch.pruning.networks.inputs import MatchInputs
 from fmtorch.pruning.networks.lc import LC
-from fmtorch.pruning.networks.prediction import Prediction
+from fmtorch.pruning.networks.prediction import Exportable, Prediction
 
-__all__ = ["LC", "MatchInputs", "Prediction"]
+__all__ = ["LC", "Exportable", "MatchInputs", "Prediction"]

@@ -51,7 +51,7 @@ class Perceptron(nn.Module):
 
     def forward(self, x: Float[Tensor, "c b n"]) -> Float[Tensor, "d b n"]:
         """The matrix product; a bias also reaches masked slots."""
-        y: Tensor = torch.mm(self.weight, x.flatten(1)).view(-1, *x.shape[1:])
+        y: Tensor = torch.mm(self.weight, x.flatten(1)).view(len(self.weight), *x.shape[1:])
         return y if self.bias is None else y + self.bias[:, None, None]
 
 

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
-from torch import Tensor, nn
+from torch import nn
 
 from fmtorch.pruning.networks.inputs import MatchInputs
-from fmtorch.pruning.networks.layers import Perceptron, ResidualBlock, Slots
-from fmtorch.pruning.networks.prediction import Prediction
+from fmtorch.pruning.networks.layers import Slots
+from fmtorch.pruning.networks.pointcn import PointCN
+from fmtorch.pruning.networks.prediction import Backbone, Prediction
 from fmtorch.types import Correspondences
 
 
 class LC(nn.Module):
-    """PointCN: the same perceptrons for every match, which see the others through context normalisation.
+    """Classifies all matches of a pair at once.
 
     Yi, Trulls, Ono, Lepetit, Salzmann, Fua, "Learning to find good correspondences", CVPR 2018.
 
@@ -34,31 +34,24 @@ class LC(nn.Module):
     ) -> None:
         super().__init__()
         self.inputs = MatchInputs(coordinates, tuple(side))
-        self.p_in = Perceptron(self.inputs.channels, channels)
-        self.blocks = nn.ModuleList(ResidualBlock(channels) for _ in range(blocks))
-        self.p_out = Perceptron(channels, 1)
+        self.options = {"channels": channels, "blocks": blocks, "coordinates": coordinates, "side": list(side)}
+        self.input_channels = self.inputs.channels
+        self.backbone = PointCN(self.input_channels, channels, blocks)
 
-    @property
-    def options(self) -> dict[str, object]:
-        """The arguments that build this network, as plain values."""
-        return {
-            "channels": self.p_in.weight.shape[0], "blocks": len(self.blocks),
-            "coordinates": self.inputs.coordinates, "side": list(self.inputs.side),
-        }  # fmt: skip
+    def extra_repr(self) -> str:
+        """The options, which the run's identity holds."""
+        return ", ".join(f"{key}={value}" for key, value in self.options.items())
 
     def forward(self, c: Correspondences) -> Prediction:
         """One stage; ``weight = tanh(relu(logit))`` as published (section 3.3), 0 where masked.
 
         Raises ValueError where image sizes or calibration matrices are missing.
         """
+        return self.predict(c, self.backbone)
+
+    def predict(self, c: Correspondences, backbone: Backbone) -> Prediction:
+        """`forward` with something else that computes what `backbone` does, e.g. an ONNX file."""
         x, mask = self.inputs(c)
-        logit = self.logit(x, Slots.of(mask))
+        logit = backbone(x, Slots.of(mask))[:, 0]
         weight = torch.where(mask, torch.tanh(torch.relu(logit)), 0)
         return Prediction(logit[None], weight[None])
-
-    def logit(self, x: Float[Tensor, "b channels n"], slots: Slots) -> Float[Tensor, "b n"]:
-        """Log-odds of each match from its `inputs`, which are zero in masked slots."""
-        y = slots.clean(torch.relu(self.p_in(x.transpose(0, 1))))
-        for block in self.blocks:
-            y = block(y, slots)
-        return self.p_out(y)[0]  # type: ignore[no-any-return]

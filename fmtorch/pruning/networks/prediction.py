@@ -1,14 +1,18 @@
-"""What a learned pruner says of a batch of pairs."""
+"""What a learned pruner says of a batch of pairs, and what it has to be made of to run without torch."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from fmtorch.pruning.networks.layers import Slots
 from fmtorch.types import Correspondences
+
+Backbone = Callable[[Tensor, Slots], Tensor]  # (B, channels, N), zero in masked slots -> (B, outputs, N)
 
 
 class Prediction(NamedTuple):
@@ -23,6 +27,22 @@ class Prediction(NamedTuple):
     logit: Float[Tensor, "stages b n"]
     weight: Float[Tensor, "stages b n"]
     F: Float[Tensor, "stages b 3 3"] | None = None
+
+
+@runtime_checkable
+class Exportable(Protocol):
+    """A network whose parameters all belong to its `backbone`, a function of tensors: ONNX Runtime can take its place.
+
+    input_channels: of the backbone. options: the arguments that build the network, which its files state.
+    """
+
+    backbone: Any
+    input_channels: int
+    options: Mapping[str, Any]
+
+    def predict(self, c: Correspondences, backbone: Backbone) -> Prediction:
+        """The prediction, with `backbone` or what takes its place."""
+        ...
 
 
 def predict(network: nn.Module, c: Correspondences) -> Prediction:

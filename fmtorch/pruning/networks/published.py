@@ -25,5 +25,5 @@ def ngransac_state(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
         if kind == "num_batches_tracked" or (kind == "bias" and position in ("s0", "s2")):
             continue
         name = f"blocks.{block}.{_LAYERS[position]}" if position in _LAYERS else layer
-        state[f"{name}.{kind}"] = value.flatten(1) if value.dim() == 4 else value
+        state[f"backbone.{name}.{kind}"] = value.flatten(1) if value.dim() == 4 else value
     return state

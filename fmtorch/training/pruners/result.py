@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,9 +11,10 @@ from typing import Any
 
 import torch
 
-from fmtorch.pruning.networks.files import export_onnx, save
+from fmtorch.pruning.networks.prediction import Exportable
 from fmtorch.storage.files import replacing
 from fmtorch.training.model_card import OWN_LICENCE, sha256
+from fmtorch.training.pruner_export import export_onnx, save_weights
 from fmtorch.training.pruners.loop import BEST, CHECKPOINTS
 from fmtorch.training.pruners.module import PrunerTraining
 from fmtorch.training.pruners.validation import Evaluation
@@ -45,9 +47,9 @@ def write_result(folder: Path, name: str, module: PrunerTraining, facts: Mapping
     evaluation = module.validation(network)
     temperature = evaluation.temperature()
     weights = folder / f"{name}.safetensors"
-    save(network, weights, temperature=temperature)
+    save_weights(network, weights, temperature=temperature)
     files = [weights]
-    if hasattr(network, "onnx"):
+    if isinstance(network, Exportable) and importlib.util.find_spec("onnxscript") is not None:
         files.append(folder / f"{name}.onnx")
         export_onnx(network, files[-1], temperature=temperature)
     card = folder / f"{name}.md"

@@ -1,0 +1,47 @@
+"""ONNX files opened for inference on a CPU."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import Any
+
+
+class NetworkFileError(ValueError):
+    """A network file that is absent, unreadable or of another shape; the message names it and what makes it."""
+
+
+def onnx_session(path: Path | str, threads: int, hint: str) -> Any:
+    """An inference session of ONNX Runtime on CPU; one for each file and thread count serves the whole process.
+
+    Args:
+        path: the file.
+        threads: of one operator; operators run one after the other.
+        hint: what makes such a file, for the errors.
+
+    Returns:
+        An ``onnxruntime.InferenceSession``, which several threads may use. A file that changed is opened again.
+
+    Raises:
+        NetworkFileError: the file is absent or cannot be run.
+    """
+    from onnxruntime.capi import onnxruntime_pybind11_state as errors
+
+    path = Path(path).absolute()
+    if not path.is_file():
+        raise NetworkFileError(f"{path} does not exist: {hint}")
+    try:
+        return _opened(str(path), path.stat().st_mtime_ns, threads)
+    except (errors.InvalidProtobuf, errors.InvalidGraph, errors.Fail, errors.InvalidArgument, errors.NotImplemented,
+            errors.RuntimeException) as error:  # fmt: skip
+        raise NetworkFileError(f"{path} is no ONNX network that can be run ({error}): {hint}") from error
+
+
+@functools.lru_cache(maxsize=16)
+def _opened(path: str, modified: int, threads: int) -> Any:
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    options.log_severity_level = 3
+    return onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
