@@ -20,6 +20,8 @@ class Stream(enum.IntEnum):
     PARALLAX = 6
     REFINEMENT = 7
     FOCAL = 8
+    AUGMENTATION = 9
+    BATCHES = 10
 
 
 def _wrap(value: int) -> int:

@@ -7,12 +7,14 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int8
+from jaxtyping import Bool, Float, Int, Int8
 from torch import Tensor
 
 from fmtorch import types
 from fmtorch.matched.labels import IGNORED, INLIER
 from fmtorch.types import Correspondences, Index
+
+_PER_MATCH = ("x0", "x1", "mask", "quality", "prior", "lafs0", "lafs1", "mutual", "noise")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -58,12 +60,39 @@ class LabelledMatches(types._Record):
         i = types._as_index(index, len(self))
         return self._map(lambda value: value[i])
 
+    def keep(self, mask: Bool[Tensor, "b n"]) -> LabelledMatches:
+        """The same matches, of which only those also in `mask` survive."""
+        return self.replace(correspondences=self.correspondences.keep(mask))
+
     def compact(self, multiple: int = 1) -> LabelledMatches:
-        """Matches moved to the front, padding cut to the longest pair (rounded up to `multiple`)."""
-        order = torch.argsort(self.correspondences.mask.logical_not().to(torch.uint8), dim=-1, stable=True)
-        c = self.correspondences.compact(multiple)
-        label = _padded(torch.gather(self.label, 1, order), c.x0.shape[1])
-        return LabelledMatches(c, label, self.F)
+        """Matches moved to the front in their order, padding cut to the longest pair (rounded up to `multiple`)."""
+        mask = self.correspondences.mask
+        order = torch.argsort(mask.logical_not().to(torch.uint8), dim=-1, stable=True)
+        longest = int(mask.sum(-1).max()) if mask.numel() else 0
+        n = -(-longest // multiple) * multiple
+        moved = self.reorder(order[:, :n])
+        if moved.label.shape[1] == n:
+            return moved
+        return dataclasses.replace(
+            moved, correspondences=moved.correspondences.compact(multiple), label=_padded(moved.label, n)
+        )
+
+    def reorder(self, order: Int[Tensor, "b m"]) -> LabelledMatches:
+        """The matches in the slots `order` of each pair, in that order."""
+
+        def take(value: Tensor) -> Tensor:
+            index = order.reshape(*order.shape, *[1] * (value.dim() - 2)).expand(-1, -1, *value.shape[2:])
+            return torch.gather(value, 1, index)
+
+        c = self.correspondences
+        moved = {name: take(value) for name in _PER_MATCH if (value := getattr(c, name)) is not None}
+        return LabelledMatches(c.replace(**moved), take(self.label), self.F)
+
+    def first(self, count: int) -> LabelledMatches:
+        """The first `count` slots of each pair."""
+        c = self.correspondences
+        cut = {name: value[:, :count] for name in _PER_MATCH if (value := getattr(c, name)) is not None}
+        return LabelledMatches(c.replace(**cut), self.label[:, :count], self.F)
 
     def _map(self, function: Any, **changes: Any) -> LabelledMatches:
         parts = {"correspondences": self.correspondences._map(function)}

@@ -16,17 +16,14 @@ from fmtorch.storage.files import replacing
 FORMAT = 1  # of the files; raised when the schema changes
 
 _PER_MATCH = {
-    "x0": ("float32", 2), "x1": ("float32", 2), "label": ("int8", 1),
-    "quality": ("float32", 1), "prior": ("float32", 1), "noise": ("float32", 1), "mutual": ("uint8", 1),
-    "lafs0": ("float32", 6), "lafs1": ("float32", 6),
+    **dict.fromkeys(("x0", "x1"), ("float32", (-1, 2))), "label": ("int8", (-1,)),
+    **dict.fromkeys(("quality", "prior", "noise"), ("float32", (-1,))), "mutual": ("uint8", (-1,)),
+    **dict.fromkeys(("lafs0", "lafs1"), ("float32", (-1, 2, 3))),
 }  # fmt: skip
 _PER_PAIR = {
-    "F": ("float64", 9),
-    "K0": ("float64", 9),
-    "K1": ("float64", 9),
-    "size0": ("int64", 2),
-    "size1": ("int64", 2),
-}
+    **dict.fromkeys(("F", "K0", "K1"), ("float64", (3, 3))), **dict.fromkeys(("size0", "size1"), ("int64", (2,))),
+}  # fmt: skip
+_SHAPES = {name: shape for name, (_, shape) in (_PER_PAIR | _PER_MATCH).items()}
 _TEXTS = ("identity", "family", "scene", "reason")
 SCHEMA = pa.schema(
     [
@@ -93,16 +90,10 @@ class Shard:
         """What is known of each pair without its matches: the columns of `INDEX`."""
         return {name: self.batch.column(name).to_pylist() for name in INDEX}
 
-    def read(self, row: int) -> dict[str, NDArray[Any]]:
+    def read(self, row: int, names: Sequence[str] = (*_PER_PAIR, *_PER_MATCH)) -> dict[str, NDArray[Any]]:
         """A pair's arrays, views of the file: points (n, 2), frames (n, 2, 3), F (3, 3), ...; absent ones left out."""
-        return {
-            **{
-                n: a.reshape(3, 3) if w == 9 else a
-                for n, (_, w) in _PER_PAIR.items()
-                if (a := self._list(n, row)) is not None
-            },
-            **{n: a.reshape(_shape(w)) for n, (_, w) in _PER_MATCH.items() if (a := self._list(n, row)) is not None},
-        }
+        found = ((name, self._list(name, row)) for name in names)
+        return {name: values.reshape(_SHAPES[name]) for name, values in found if values is not None}
 
     def _list(self, name: str, row: int) -> NDArray[Any] | None:
         column = self.batch.column(name)
@@ -111,10 +102,6 @@ class Shard:
         start, end = (column.offsets[i].as_py() for i in (row, row + 1))
         values: NDArray[Any] = column.values.slice(start, end - start).to_numpy(zero_copy_only=True)
         return values
-
-
-def _shape(width: int) -> tuple[int, ...]:
-    return {1: (-1,), 2: (-1, 2), 6: (-1, 2, 3)}[width]
 
 
 def _checksum(batch: pa.RecordBatch) -> int:

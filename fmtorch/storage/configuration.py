@@ -98,13 +98,16 @@ def environment() -> dict[str, str]:
 
 @functools.cache
 def _code_digest(module: str) -> str:
-    """The digest of a module's source and of all modules of its own top-level package that it imports, at any depth."""
+    """The digest of a module's source and of all modules of its own top-level package that it imports, at any depth.
+
+    Of a module of `LIBRARIES`, whose versions `environment` tells, the digest of its source alone.
+    """
     file = getattr(sys.modules[module], "__file__", None)
     if file is None:
         raise TypeError(f"the code of {module} is in no file, so its changes cannot be noticed")
     package = module.partition(".")[0]
     home = getattr(sys.modules.get(package), "__file__", None)
-    root = Path(home).parents[1] if home and "." in module else None
+    root = Path(home).parents[1] if home and "." in module and package not in LIBRARIES else None
     sources: dict[str, bytes] = {}
     waiting = [(module, Path(file))]
     while waiting:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import os
 import subprocess
 import sys
@@ -289,6 +290,37 @@ def test_configuration_of_files_tensors_networks_and_code(tmp_path: Path, monkey
     configuration_module._code_digest.cache_clear()
     assert configuration(sift)["code"] != code
     configuration_module._code_digest.cache_clear()
+
+
+def test_code_is_what_a_module_imports_from_its_own_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = tmp_path / "somebody"
+    (package / "parts").mkdir(parents=True)
+    sources = {
+        "__init__.py": "", "parts/__init__.py": "", "unused.py": "", "deep.py": "", "parts/beside.py": "",
+        "used.py": "def helper():\n    from somebody import deep\n    return deep\n",
+        "parts/detector.py": "import dataclasses\nfrom somebody.used import helper\n\n"
+        "@dataclasses.dataclass(frozen=True)\nclass Detector:\n    step: int = 8\n",
+    }  # fmt: skip
+    for name, text in sources.items():
+        (package / name).write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    detector = importlib.import_module("somebody.parts.detector").Detector()
+
+    def code() -> str:
+        configuration_module._code_digest.cache_clear()
+        return str(configuration(detector)["code"])
+
+    before = code()
+    for name, matters in {
+        "unused.py": False, "parts/beside.py": False, "deep.py": True, "used.py": True, "__init__.py": True,
+        "parts/detector.py": True,
+    }.items():  # fmt: skip
+        (package / name).write_text(sources[name] + "\nchanged = True\n")
+        assert (code() != before) == matters, name
+        (package / name).write_text(sources[name])
+    assert code() == before
+    for name in [name for name in sys.modules if name.partition(".")[0] == "somebody"]:
+        monkeypatch.delitem(sys.modules, name)
 
 
 def test_learned_files_are_digests(tmp_path: Path) -> None:
