@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from torch.utils.data import DataLoader, Sampler
 
-from fmtorch.matched import Draw, LabelledMatches, MatchedPairs, SimilarLengthBatches, collate_trimmed
+from fmtorch.matched import Draw, LabelledMatches, SimilarLengthBatches, StoredMatches, collate_trimmed
 
 
 class EndlessBatches(Sampler[list[Draw]]):
@@ -25,7 +25,7 @@ class EndlessBatches(Sampler[list[Draw]]):
 
 
 def training_batches(
-    matches: MatchedPairs, batch: int, seed: int, step: int, rank: int = 0, processes: int = 1, *, workers: int = 0
+    matches: StoredMatches, batch: int, seed: int, step: int, rank: int = 0, processes: int = 1, *, workers: int = 0
 ) -> DataLoader[LabelledMatches]:
     """A loader of augmented batches from `step` on, which never ends.
 

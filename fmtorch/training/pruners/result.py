@@ -103,8 +103,8 @@ def model_card(
         f"{100 * figures['match_precision']:.1f} % and recall {100 * figures['match_recall']:.1f} % of the matches. "
         f"Reliability (expected calibration error {100 * table.error:.1f} %):", "",
         "| P(inlier) | " + " | ".join(f"{p:.2f}" for p in table.predicted.tolist()) + " |",
-        "| --- |" + " ---: |" * len(table.count),
+        "| --- |" + " ---: |" * len(table.matches),
         "| share of inliers | " + " | ".join(f"{p:.2f}" for p in table.observed.tolist()) + " |",
-        "| matches | " + " | ".join(str(n) for n in table.count.tolist()) + " |",
+        "| matches | " + " | ".join(str(n) for n in table.matches.tolist()) + " |",
     ]  # fmt: skip
     return "\n".join(lines) + "\n"
