@@ -13,6 +13,11 @@ import pytest
 
 pytest.importorskip("lightning", reason="training needs the extra `train`")
 
+from hydra import compose, initialize_config_dir
+
+from fmtorch.resources import conf_dir
+from fmtorch.training.pruners.loop import TrainingFolderError
+from fmtorch.training.pruners.run import run
 from tests.test_pipeline import draw
 
 SHORT = [
@@ -82,33 +87,43 @@ def test_a_network_of_ones_own_is_trained_and_used(root: Path, tmp_path: Path) -
     assert "mine" in identity
 
 
-def test_the_command_goes_on_and_refuses_another_training(root: Path, tmp_path: Path) -> None:
-    options = ["pruner=lc", "dataset=fmbench", f"dataset.root={root}", *SHORT, "pruner.lc.network.channels=8",
-               "pruner.lc.network.blocks=2", "output=out"]  # fmt: skip
-    first = command("train", *options, cwd=tmp_path)
-    assert first.returncode == 0, first.stderr
-    weights = (tmp_path / "out" / "lc.safetensors").read_bytes()
-    again = command("train", *options, cwd=tmp_path)
-    assert again.returncode == 0, again.stderr
-    assert (tmp_path / "out" / "lc.safetensors").read_bytes() == weights
-    other = command("train", *options, "seed=1", cwd=tmp_path)
-    assert other.returncode == 1
-    assert "holds another training (it differs in seed)" in other.stderr
-    assert "Traceback" not in other.stderr
+def trained(monkeypatch: pytest.MonkeyPatch, folder: Path, *overrides: str) -> Path:
+    """The command without a process of its own."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("FMTORCH_CACHE", str(folder / "cache"))
+    with initialize_config_dir(str(conf_dir()), version_base=None):
+        config = compose("train", list(overrides))
+    return run(config, "lc")
+
+
+def test_the_command_goes_on_and_refuses_another_training(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = ["pruner.lc.network.channels=8", "pruner.lc.network.blocks=2", "output=out"]
+    options = ["dataset=fmbench", f"dataset.root={root}", *SHORT, *small]
+    folder = trained(monkeypatch, tmp_path, *options)
+    weights = (folder / "lc.safetensors").read_bytes()
+    assert (folder / "lc.onnx").is_file()
+    trained(monkeypatch, tmp_path, *options)
+    assert (folder / "lc.safetensors").read_bytes() == weights
+    with pytest.raises(TrainingFolderError, match=r"holds another training \(it differs in seed\)"):
+        trained(monkeypatch, tmp_path, *options, "seed=1")
 
 
 @pytest.mark.parametrize(
     ("option", "message"),
     [
-        ("pruner=ratio", "pruner=ratio has nothing to train"),
+        ("pruner=ratio", "pruner=lc has nothing to train"),
         ("batch=0", "batch=0; it must be a whole number of at least 1"),
         ("limit=-3", "limit=-3; it must be a whole number of at least 1"),
         ("optimisation.steps=0", "learning_rate and steps must be positive"),
         ("objective.coordinates=pixels", "it must be one of: size, K"),
+        ("seed=0", "nowhere: no such folder"),
     ],
 )
-def test_mistakes_are_told_in_a_line(option: str, message: str, tmp_path: Path) -> None:
-    ended = command("train", option, "dataset=fmbench", "dataset.root=nowhere", cwd=tmp_path)
-    assert ended.returncode == 1
-    assert message in ended.stderr
-    assert "Traceback" not in ended.stderr
+def test_mistakes_are_told_before_anything_is_written(
+    option: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        trained(monkeypatch, tmp_path, option, "dataset=fmbench", "dataset.root=nowhere")
+    assert list(tmp_path.iterdir()) == []
