@@ -1,0 +1,74 @@
+"""Losses of learned pruners, one pair, one match and one point at a time, written from the definitions."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from tests.reference.metrics import border_points, distance, homogeneous
+
+
+def cross_entropy(logits: list[float], labels: list[int]) -> float | None:
+    """Mean of -log P(label) over labelled matches; None without any."""
+    terms = []
+    for z, label in zip(logits, labels, strict=True):
+        if label >= 0:
+            p = 1 / (1 + math.exp(-z))
+            terms.append(-math.log(p if label == 1 else 1 - p))
+    return sum(terms) / len(terms) if terms else None
+
+
+def balanced_cross_entropy(logits: list[float], labels: list[int]) -> float | None:
+    """Each class's share of the loss its weight 1 / (n + 1), the log-odds of the classes taken off the logits."""
+    n1, n0 = labels.count(1) + 1, labels.count(0) + 1
+    total = weights = 0.0
+    for z, label in zip(logits, labels, strict=True):
+        if label >= 0:
+            p = 1 / (1 + math.exp(-(z - math.log(n1 / n0))))
+            w = 1 / n1 if label == 1 else 1 / n0
+            total, weights = total - w * math.log(p if label == 1 else 1 - p), weights + w
+    return total / weights if weights else None
+
+
+def virtual_points(
+    F: np.ndarray, size0: np.ndarray, size1: np.ndarray, uniforms: np.ndarray, count: int
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The first `count` draws (tries, 3) whose line meets image 1."""
+    points: list[tuple[np.ndarray, np.ndarray]] = []
+    for u in uniforms:
+        m = np.array([u[0] * size0[1] - 0.5, u[1] * size0[0] - 0.5])
+        ends = border_points(F @ homogeneous(m), size1, -0.5)
+        if ends is not None and len(points) < count:
+            points.append((m, ends[0] + u[2] * (ends[1] - ends[0])))
+    return points
+
+
+def by_size(size: np.ndarray) -> np.ndarray:
+    """From [-1, 1] along the longer side, 0 at the middle, to pixels."""
+    h, w = size
+    return np.array([[max(h, w) / 2, 0, (w - 1) / 2], [0, max(h, w) / 2, (h - 1) / 2], [0, 0, 1.0]])
+
+
+def geometric_loss(
+    F_est: np.ndarray, points: list[tuple[np.ndarray, np.ndarray]], A0: np.ndarray, A1: np.ndarray, limit: float
+) -> float:
+    """Mean over points of the sum of squared distances from the lines of A1^T F A0, clamped."""
+    F = A1.T @ F_est @ A0
+    total = 0.0
+    for m0, m1 in points:
+        y0, y1 = (np.linalg.inv(A) @ homogeneous(m) for A, m in ((A0, m0), (A1, m1)))
+        squared = distance(y1, F @ y0) ** 2 + distance(y0, F.T @ y1) ** 2
+        total += min(squared, limit)
+    return total / len(points)
+
+
+def expected_calibration_error(p: list[float], labels: list[int], bins: int) -> float:
+    """Naeini et al., AAAI 2015."""
+    error, total = 0.0, len(p)
+    for b in range(bins):
+        inside = [i for i in range(total) if min(int(p[i] * bins), bins - 1) == b]
+        if inside:
+            gap = sum(p[i] for i in inside) / len(inside) - sum(labels[i] for i in inside) / len(inside)
+            error += len(inside) / total * abs(gap)
+    return error

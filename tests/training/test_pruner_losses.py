@@ -1,0 +1,306 @@
+"""Losses of learned pruners: known answers, scalar references, gradients, degenerate pairs, a training through them."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from fmtorch.geometry import eight_point, fundamental_from_calibration
+from fmtorch.random import Stream, uniform
+from fmtorch.training import virtual_points as virtual
+from fmtorch.training.pruner_losses import LIMIT_E, LIMIT_F, classification_loss, geometric_loss, nsgd_loss
+from fmtorch.training.reliability import MAX_TEMPERATURE, reliability, temperature
+from fmtorch.training.virtual_points import virtual_points
+from fmtorch.types import collate
+from tests import laws
+from tests.metrics.test_nsgd import random_pairs, rows_shifted
+from tests.reference import metrics as metric_reference
+from tests.reference import pruner_losses as reference
+
+VGA = torch.tensor([480, 640])
+
+
+def generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def sizes(*batch: int) -> tuple[Tensor, Tensor]:
+    return VGA.expand(*batch, 2), VGA.flip(0).expand(*batch, 2)
+
+
+def labels(seed: int, b: int, n: int) -> Tensor:
+    return torch.randint(-1, 2, (b, n), generator=generator(seed), dtype=torch.int8)
+
+
+@pytest.mark.parametrize("balanced", [False, True])
+def test_classification_matches_scalar_reference(balanced: bool) -> None:
+    logit = 3 * torch.randn(2, 5, 40, generator=generator(0), dtype=torch.float64)
+    label = labels(1, 5, 40)
+    label[1], label[2], label[3, :20] = -1, 1, -1
+    scalar = reference.balanced_cross_entropy if balanced else reference.cross_entropy
+    stages = []
+    for stage in logit:
+        pairs = [scalar(z.tolist(), y.tolist()) for z, y in zip(stage, label, strict=True)]
+        counted = [value for value in pairs if value is not None]
+        assert len(counted) == 4
+        stages.append(sum(counted) / 4)
+    found = classification_loss(logit, label, balanced=balanced)
+    assert found.item() == pytest.approx(sum(stages) / 2, rel=1e-12)
+    first = classification_loss(logit[0], label, balanced=balanced)
+    assert first.item() == pytest.approx(stages[0], rel=1e-12)
+
+
+@pytest.mark.parametrize("balanced", [False, True])
+def test_classification_is_least_at_the_share_of_inliers(balanced: bool) -> None:
+    """Matches that look alike share one logit, whose best value is the log-odds of their share of inliers."""
+    label = torch.tensor([[1] * 30 + [0] * 90 + [-1] * 7], dtype=torch.int8)
+    z = torch.tensor(math.log(30 / 90), dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(classification_loss(z.expand(1, 127), label, balanced=balanced), z)
+    assert abs(gradient.item()) < 1e-15
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 1000), balanced=st.booleans())
+def test_ignored_and_masked_matches_are_invisible(seed: int, balanced: bool) -> None:
+    logit = torch.randn(3, 20, generator=generator(seed), dtype=torch.float64).requires_grad_()
+    label = labels(seed, 3, 20)
+    loss = classification_loss(logit, label, balanced=balanced)
+    (gradient,) = torch.autograd.grad(loss, logit)
+    ignored = label < 0
+    assert bool((gradient[ignored] == 0).all())
+    garbage = torch.where(ignored, torch.nan, logit.detach())
+    padded = torch.nn.functional.pad(garbage, (0, 9), value=torch.inf).requires_grad_()
+    more = torch.nn.functional.pad(label, (0, 9), value=-1)
+    other = classification_loss(padded, more, balanced=balanced)
+    torch.testing.assert_close(other, loss)  # exp has other last bits at other places in memory
+    (padded_gradient,) = torch.autograd.grad(other, padded)
+    torch.testing.assert_close(padded_gradient[:, :20], gradient)
+    assert bool((padded_gradient[:, 20:] == 0).all())
+
+
+@pytest.mark.parametrize("balanced", [False, True])
+def test_classification_of_degenerate_pairs(balanced: bool) -> None:
+    """No labels, one class, huge logits: finite; a batch without labels gives zero, attached to the graph."""
+    logit = torch.tensor([[0.3, -2.0], [1.0, 1.0], [80.0, -1e4], [1e30, -1e30]]).requires_grad_()
+    label = torch.tensor([[-1, -1], [1, 1], [0, 1], [1, 0]], dtype=torch.int8)
+    loss = classification_loss(logit, label, balanced=balanced)
+    (gradient,) = torch.autograd.grad(loss, logit)
+    assert bool(loss.isfinite())
+    assert bool(gradient.isfinite().all())
+    assert float(gradient.abs().max()) <= 1
+    assert bool((gradient[0] == 0).all())
+    assert bool((gradient[1] < 0).all())
+    nothing = classification_loss(logit, torch.full_like(label, -1), balanced=balanced)
+    assert nothing.item() == 0
+    assert bool((torch.autograd.grad(nothing, logit)[0] == 0).all())
+    assert classification_loss(logit.half().clamp(-1e4, 1e4), label, balanced=balanced).dtype == torch.float32
+
+
+def test_virtual_points_match_scalar_reference() -> None:
+    F, _ = random_pairs(3, 4, spread=2.0)
+    size0, size1 = sizes(4)
+    key = torch.arange(4)
+    x0, x1, mask = virtual_points(F, size0, size1, count=20, seed=5, key=key)
+    uniforms = uniform(5, key, Stream.TRAINING, 0, virtual.TRIES * 20, 3).numpy()
+    for i in range(4):
+        points = reference.virtual_points(F[i].numpy(), size0[i].numpy(), size1[i].numpy(), uniforms[i], 20)
+        assert int(mask[i].sum()) == len(points)
+        for j, (m0, m1) in enumerate(points):
+            np.testing.assert_allclose(x0[i, j], m0, rtol=1e-12)
+            np.testing.assert_allclose(x1[i, j], m1, rtol=1e-9, atol=1e-9)  # as in the tests of NSGD
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 1000), scale=st.floats(-9, 9))
+def test_virtual_points_are_exact_and_inside(seed: int, scale: float) -> None:
+    F, _ = random_pairs(seed, 3)
+    F[2] = torch.tensor([torch.nan, 0.0, 1.0])[seed % 3]
+    size0, size1 = sizes(3)
+    x0, x1, mask = virtual_points(F * 10**scale, size0, size1, count=30, seed=seed)
+    assert not bool(mask[2].any()) or seed % 3 == 2
+    assert bool((x0[~mask] == 0).all())
+    for x, size in ((x0, size0), (x1, size1)):
+        limit = size.flip(-1)[:, None] - 0.5
+        assert bool(((x >= -0.5 - 1e-9) & (x <= limit + 1e-9))[mask].all())
+    for i in range(2):
+        for m0, m1 in zip(x0[i, mask[i]].numpy(), x1[i, mask[i]].numpy(), strict=True):
+            line = F[i].numpy() @ metric_reference.homogeneous(m0)
+            assert metric_reference.distance(m1, line) < 1e-8
+    alone = virtual_points(F[1:2], size0[1:2], size1[1:2], count=30, seed=seed)
+    torch.testing.assert_close(alone.x1[0], x1[1], rtol=1e-9, atol=1e-9)
+    with pytest.raises(ValueError, match="count is 0"):
+        virtual_points(F, size0, size1, count=0)
+
+
+K = torch.tensor([[500.0, 1.0, 310.0], [0.0, 520.0, 250.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_geometric_loss_matches_scalar_reference(calibrated: bool) -> None:
+    F_true, F_est = random_pairs(2, 3, spread=0.2)
+    size0, size1 = sizes(3)
+    limit = LIMIT_E if calibrated else LIMIT_F
+    K0 = K.expand(3, 3, 3) if calibrated else None
+    found = geometric_loss(torch.stack([F_est, F_true]), F_true, size0, size1, K0=K0, K1=K0, points=25, seed=4)
+    uniforms = uniform(4, torch.zeros(1, dtype=torch.int64), Stream.TRAINING, 0, virtual.TRIES * 25, 3)[0].numpy()
+    values, clamped = [], 0
+    for i in range(3):
+        s0, s1 = size0[i].numpy(), size1[i].numpy()
+        points = reference.virtual_points(F_true[i].numpy(), s0, s1, uniforms, 25)
+        A0, A1 = (K.numpy(), K.numpy()) if calibrated else (reference.by_size(s0), reference.by_size(s1))
+        values.append(reference.geometric_loss(F_est[i].numpy(), points, A0, A1, limit))
+        clamped += values[-1] != reference.geometric_loss(F_est[i].numpy(), points, A0, A1, 1e9)
+    assert clamped  # or the limit would not be tested
+    # Two stages: the estimates, and the truth, which is exact up to rounding: squares of 1e-13.
+    assert found.item() == pytest.approx(sum(values) / 3 / 2, rel=1e-9)
+    with pytest.raises(ValueError, match="K0 and K1"):
+        geometric_loss(F_est, F_true, size0, size1, K0=K.expand(3, 3, 3))
+
+
+def test_geometric_loss_known_answer() -> None:
+    """Rows 8 px off, both ways: 2 (8 / 320)^2 in half longer sides, 2 (8 / 500)^2 in focal lengths."""
+    F_true, F_est = rows_shifted(0.0)[None], rows_shifted(8.0)[None]
+    size = VGA.expand(1, 2)
+    assert geometric_loss(F_est, F_true, size, size).item() == pytest.approx(2 * (8 / 320) ** 2, rel=1e-9)
+    focal = torch.diag(torch.tensor([500.0, 500.0, 1.0], dtype=torch.float64))[None]
+    in_focal = geometric_loss(F_est, F_true, size, size, K0=focal, K1=focal)
+    assert in_focal.item() == pytest.approx(2 * (8 / 500) ** 2, rel=1e-9)
+    far = geometric_loss(rows_shifted(100.0)[None].float(), F_true, size, size)
+    assert far.item() == pytest.approx(LIMIT_F)
+    assert far.dtype == torch.float32
+    assert nsgd_loss(F_est, F_true, size, size).item() == pytest.approx(8 / 800, rel=1e-9)
+    assert nsgd_loss(F_est, F_true, size, size, limit=0.001).item() == 0.001
+
+
+def test_losses_of_the_estimate_pass_gradcheck() -> None:
+    """On an image of a few pixels, so that finite differences suit all elements of F; no limit, which has a kink."""
+    F_true, F_est = (torch.randn(2, 3, 3, generator=generator(s), dtype=torch.float64) for s in (2, 5))
+    size = torch.tensor([[3, 4]]).expand(2, 2)
+    for loss in (functools.partial(geometric_loss, points=6, limit=1e9), functools.partial(nsgd_loss, samples=6)):
+
+        def of_estimate(F: Tensor, loss: functools.partial[Tensor] = loss) -> Tensor:
+            return loss(F, F_true, size, size)
+
+        assert torch.autograd.gradcheck(of_estimate, [F_est.clone().requires_grad_()], eps=1e-7, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("loss", [geometric_loss, nsgd_loss])
+def test_failed_fits_add_nothing(loss: object) -> None:
+    """Estimates that are zero, not finite, of rank 1, or whose lines miss the image; truths that are not known."""
+    assert callable(loss)
+    F_true, F_est = random_pairs(6, 8)
+    F_est[1], F_est[2], F_est[3, 0, 0] = torch.nan, 0.0, torch.inf
+    F_est[4] = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    F_est[5] = rows_shifted(1e5)
+    F_true[6], F_true[7] = torch.nan, 0.0
+    size0, size1 = sizes(8)
+    key = torch.arange(8)
+    F_est.requires_grad_()
+    value = loss(F_est, F_true, size0, size1, key=key)
+    assert bool(value.isfinite())
+    (gradient,) = torch.autograd.grad(value, F_est)
+    assert bool(gradient.isfinite().all())
+    assert bool((gradient[[1, 2, 3, 6, 7]] == 0).all())
+    assert float(gradient[0].abs().max()) > 0
+    # Three estimates count: those of the pairs 0, 4 and 5. With `valid` only the first.
+    valid = torch.zeros(8, dtype=torch.bool)
+    valid[:4] = True
+    alone = loss(F_est[:1], F_true[:1], size0[:1], size1[:1], key=key[:1])
+    assert torch.equal(loss(F_est, F_true, size0, size1, key=key, valid=valid), alone)
+    (its_gradient,) = torch.autograd.grad(alone, F_est)
+    torch.testing.assert_close(gradient[0] * 3, its_gradient[0], rtol=1e-9, atol=0)
+    nothing = loss(F_est, F_true, size0, size1, key=key, valid=valid & False)
+    assert nothing.item() == 0
+    assert bool((torch.autograd.grad(nothing, F_est)[0] == 0).all())
+
+
+def test_training_goes_through_degenerate_scenes() -> None:
+    """A small network learns on good pairs beside every degenerate one; every gradient of every step is finite.
+
+    Losses: classification, and the geometry of the weighted 8-point algorithm in both forms.
+    """
+    pairs = [laws.scene(1), laws.scene(2), *laws.degenerate().values()]
+    c = collate(pairs)
+    b = len(c.mask)
+    truth = fundamental_from_calibration(
+        K[None], K[None], torch.eye(3, dtype=torch.float64)[None], torch.tensor([[1.0, 0.0, 0.2]]).double()
+    ).expand(b, 3, 3)
+    label = torch.where(c.mask, (c.quality < 0.6).to(torch.int8), -1)
+    torch.manual_seed(0)
+    network = torch.nn.Sequential(torch.nn.Linear(1, 8), torch.nn.Tanh(), torch.nn.Linear(8, 1)).double()
+    optimiser = torch.optim.Adam(network.parameters(), lr=1e-2)
+    losses = []
+    for step in range(20):
+        logit = network(torch.where(c.mask, c.quality, 0.0)[..., None].double())[..., 0]
+        weight = torch.where(c.mask, torch.sigmoid(logit), 0.0)
+        F, valid = eight_point(c.x0.double(), c.x1.double(), weight, c.mask)
+        assert c.size0 is not None
+        assert c.size1 is not None
+        shared = (truth, c.size0, c.size1)
+        options = {"valid": valid, "seed": step, "key": c.key}
+        loss = classification_loss(logit, label) + 0.5 * geometric_loss(F, *shared, **options)
+        loss = loss + 0.1 * nsgd_loss(F, *shared, **options)
+        optimiser.zero_grad()
+        loss.backward()
+        assert bool(loss.isfinite())
+        for parameter in network.parameters():
+            assert parameter.grad is not None
+            assert bool(parameter.grad.isfinite().all())
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimiser.step()
+        losses.append(classification_loss(logit, label).item())
+    assert losses[-1] < losses[0]
+
+
+@settings(max_examples=20, deadline=None)
+@given(true=st.floats(0.05, 20), seed=st.integers(0, 100))
+def test_temperature_is_the_least_of_the_loss(true: float, seed: int) -> None:
+    """No other temperature is better; logits scaled by s have s times the temperature; calibrated ones about 1."""
+    z = 2 * torch.randn(20, 200, generator=generator(seed), dtype=torch.float64)
+    label = (torch.rand(20, 200, generator=generator(seed + 1), dtype=torch.float64) < torch.sigmoid(z)).to(torch.int8)
+    label[:, 150:] = -1
+    found = temperature(z * true, label)
+    assert found == pytest.approx(true * temperature(z, label), rel=1e-9)
+    # 3,000 matches of logits of variance 4: Fisher information E[p (1 - p) z^2] is some 0.35 each.
+    assert found / true == pytest.approx(1, abs=4.5 / math.sqrt(0.35 * 3000))
+
+    def loss(t: float) -> float:
+        kept = label >= 0
+        cross_entropy = torch.nn.functional.binary_cross_entropy_with_logits
+        return cross_entropy((z * true / t)[kept], label[kept].double()).item()
+
+    assert loss(found) <= min(loss(found * 1.01), loss(found / 1.01))
+
+
+def test_temperature_of_degenerate_validation() -> None:
+    z = torch.tensor([2.0, -1.0, 0.5])
+    one = torch.ones(3, dtype=torch.int8)
+    assert temperature(z, -one) == 1
+    assert temperature(z * 0, one) == 1
+    assert temperature(z, (z > 0).to(torch.int8)) == pytest.approx(1 / MAX_TEMPERATURE)
+    assert temperature(z, (z < 0).to(torch.int8)) == pytest.approx(MAX_TEMPERATURE)
+
+
+def test_reliability() -> None:
+    p = torch.rand(500, generator=generator(0), dtype=torch.float64)
+    p[0], p[1] = 1.0, 0.0
+    label = labels(1, 1, 500)[0]
+    table = reliability(p, label, bins=7)
+    kept = label >= 0
+    expected = reference.expected_calibration_error(p[kept].tolist(), label[kept].tolist(), 7)
+    assert table.error == pytest.approx(expected, rel=1e-12)
+    assert int(table.matches.sum()) == int(kept.sum())
+    exact = reliability(torch.tensor([0.25] * 4 + [0.875] * 8), torch.tensor([1, 0, 0, 0, 0] + [1] * 7).to(torch.int8))
+    assert exact.error == 0
+    assert exact.observed[[2, 8]].tolist() == [0.25, 0.875]
+    assert bool(exact.predicted[[0, 1, 9]].isnan().all())
+    assert math.isnan(reliability(p, torch.full_like(label, -1)).error)
+    with pytest.raises(ValueError, match="bins is 0"):
+        reliability(p, label, bins=0)
