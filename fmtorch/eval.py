@@ -42,9 +42,8 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
     with _progress() as progress:
         dataset = _load(config.dataset, progress)
         pipeline = presets.build_pipeline(config, device)
-        stages = {group: plain(config.get(group)) for group in presets.STAGES}
         identity = {
-            "pipeline": pipeline_name, **stages, "seed": config.seed, "version": __version__,
+            "pipeline": pipeline_name, **presets.stages(config), "seed": config.seed, "version": __version__,
             "learned": _learned(pipeline),
             "dataset": {**{k: v for k, v in plain(config.dataset).items() if k != "root"}, "digest": dataset.digest},
         }  # fmt: skip

@@ -102,6 +102,17 @@ def test_batch_and_workers_change_no_row(root: Path, tmp_path: Path) -> None:
     assert 4 <= int(computed[1]) <= 6  # two processes may come upon the same image at the same time
 
 
+def test_the_order_of_pruners_is_part_of_the_run(root: Path, tmp_path: Path) -> None:
+    arguments = ["dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"run_dir={tmp_path / 'run'}", "limit=1"]
+    first = evaluate(*arguments, "pruner=[one_to_one,ratio]", cwd=tmp_path)
+    assert first.returncode == 0, first.stderr
+    stored = json.loads((tmp_path / "run" / "run.json").read_text())["config"]["pruner"]
+    assert [list(entry) for entry in stored] == [["one_to_one"], ["ratio"]]
+    other = evaluate(*arguments, "pruner=[ratio,one_to_one]", cwd=tmp_path)
+    assert other.returncode == 1
+    assert "pruner: [one_to_one, ratio] -> [ratio, one_to_one]. " in other.stderr
+
+
 def test_sweep_gives_each_job_a_folder(root: Path, tmp_path: Path) -> None:
     run = evaluate(
         "-m", "pipeline=sift_ratio,sift_lmeds", "dataset=fmbench", f"dataset.root={root}", "limit=1", cwd=tmp_path
