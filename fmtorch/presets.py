@@ -84,6 +84,14 @@ def targets_of(config: object) -> frozenset[str]:
     return frozenset()
 
 
+def own_modules(config: object) -> dict[str, str]:
+    """The modules that define the targets within a config that are none of this project's, by the targets' names."""
+    own = sorted(name for name in targets_of(config) if name.partition(".")[0] != "fmtorch")
+    return {
+        name: str(getattr(hydra.utils.get_object(name), "__module__", None) or name.rpartition(".")[0]) for name in own
+    }
+
+
 def build(group: str, name: str, config_dir: Path | str | None = None, **options: Any) -> Any:
     """The object that a preset describes, with some of its options replaced.
 

@@ -1,4 +1,4 @@
-"""A pair of a run seen again: its pictures, and how what its pipeline makes of it now differs from the row of the run."""
+"""A pair of a run seen again: its pictures, and where its pipeline now gives another result than the run stored."""
 
 from __future__ import annotations
 
