@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
-import hashlib
+import importlib
 import importlib.metadata
 import platform
-import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,10 @@ import cv2
 import torch
 
 from fmtorch import __version__
+from fmtorch.storage.code import code_digest, digest
 
 LIBRARIES = ("numpy", "torch", "kornia", "onnxruntime")  # and OpenCV, which has several names as a package
+VARIANTS = {"onnxruntime": ("onnxruntime-gpu", "onnxruntime-directml")}  # other packages of the same library
 
 
 def configuration(part: object) -> Any:
@@ -31,7 +33,7 @@ def configuration(part: object) -> Any:
     if part is None or isinstance(part, bool | int | float | str):
         return part
     if isinstance(part, Path):
-        return {"file": _file_digest(part, part.stat().st_mtime_ns)}
+        return {"file": file_digest(part)}
     if isinstance(part, Mapping):
         return {str(key): configuration(value) for key, value in part.items()}
     if isinstance(part, list | tuple):
@@ -40,7 +42,7 @@ def configuration(part: object) -> Any:
         return _class(part)
     if isinstance(part, torch.Tensor):
         values = part.detach().cpu().contiguous()
-        return {"tensor": [str(part.dtype), list(part.shape), _digest(values.reshape(-1).view(torch.uint8).numpy())]}
+        return {"tensor": [str(part.dtype), list(part.shape), digest(values.reshape(-1).view(torch.uint8).numpy())]}
     return {**_options(part), **_class(type(part))}
 
 
@@ -65,7 +67,7 @@ def _learned(value: Any) -> Iterator[str]:
             if key == "file" and isinstance(entry, str):
                 yield entry
             elif key == "weights":
-                yield _digest(repr(entry).encode())
+                yield digest(repr(entry).encode())
             else:
                 yield from _learned(entry)
 
@@ -84,31 +86,35 @@ def _options(part: object) -> dict[str, Any]:
 
 
 def _class(kind: type) -> dict[str, str]:
-    return {"class": f"{kind.__module__}.{kind.__qualname__}", "code": _code_digest(kind.__module__)}
+    return {"class": f"{kind.__module__}.{kind.__qualname__}", "code": code_digest(kind.__module__)}
 
 
 @functools.cache
 def environment() -> dict[str, str]:
     """Versions of what computes, and the processor's instruction set, on which the last bits of a result depend."""
-    versions = {name: importlib.metadata.version(name) for name in LIBRARIES}
+    versions = {name: _version(name) for name in LIBRARIES}
     processor = f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}"
     return {"fmtorch": __version__, "opencv": cv2.__version__, **versions, "processor": processor}
 
 
-@functools.cache
-def _code_digest(module: str) -> str:
-    """The digest of a module's source and, where it belongs to a package, of the files beside and below it."""
-    file = getattr(sys.modules[module], "__file__", None)
-    if file is None:
-        raise TypeError(f"the code of {module} is in no file, so its changes cannot be noticed")
-    files = sorted(Path(file).parent.rglob("*.py")) if "." in module else [Path(file)]
-    return _digest(b"".join(_digest(path.read_bytes()).encode() for path in files))
+def libraries(others: Iterable[str] = ()) -> dict[str, str]:
+    """Versions of the libraries that decide numbers, and of other packages; of a build for some device its version."""
+    versions = {"opencv": cv2.__version__, **{name: _version(name) for name in (*LIBRARIES, *others)}}
+    return {name: version.partition("+")[0] for name, version in sorted(versions.items())}
+
+
+def _version(package: str) -> str:
+    for name in (package, *VARIANTS.get(package, ())):
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            return importlib.metadata.version(name)
+    return str(getattr(importlib.import_module(package), "__version__", "unknown"))
+
+
+def file_digest(path: Path) -> str:
+    """The hex digest of a file's contents, read once unless the file is changed. Raises OSError."""
+    return _file_digest(path, path.stat().st_mtime_ns)
 
 
 @functools.lru_cache(maxsize=256)
 def _file_digest(path: Path, modified: int) -> str:
-    return _digest(path.read_bytes())
-
-
-def _digest(data: Any) -> str:
-    return hashlib.blake2b(data, digest_size=16).hexdigest()
+    return digest(path.read_bytes())

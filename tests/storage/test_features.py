@@ -286,9 +286,9 @@ def test_configuration_of_files_tensors_networks_and_code(tmp_path: Path, monkey
     source.mkdir()
     (source / "sift.py").write_text("edited")
     monkeypatch.setattr(sys.modules["fmtorch.features.sift"], "__file__", str(source / "sift.py"))
-    configuration_module._code_digest.cache_clear()
+    configuration_module.code_digest.cache_clear()
     assert configuration(sift)["code"] != code
-    configuration_module._code_digest.cache_clear()
+    configuration_module.code_digest.cache_clear()
 
 
 def test_learned_files_are_digests(tmp_path: Path) -> None:
