@@ -20,16 +20,15 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from fmtorch import __version__, data, presets
+from fmtorch import data, presets
 from fmtorch.command import console, exits_with_message, plain
 from fmtorch.data import PairDataset
+from fmtorch.evaluation.identity import run_identity
 from fmtorch.evaluation.plots import plot_recall_curves
 from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import ALL, summarize, summary_markdown, summary_table
-from fmtorch.pipeline import Pipeline
 from fmtorch.resources import conf_dir
 from fmtorch.storage import RunFolder, identity_digest
-from fmtorch.storage.configuration import learned
 from fmtorch.storage.features import CachedFeatures
 
 MANY = 500  # pairs from which on processes are worth their start
@@ -42,12 +41,7 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
     with _progress() as progress:
         dataset = _load(config.dataset, progress)
         pipeline = presets.build_pipeline(config, device)
-        stages = {group: plain(config.get(group)) for group in presets.STAGES}
-        identity = {
-            "pipeline": pipeline_name, **stages, "seed": config.seed, "version": __version__,
-            "learned": _learned(pipeline),
-            "dataset": {**{k: v for k, v in plain(config.dataset).items() if k != "root"}, "digest": dataset.digest},
-        }  # fmt: skip
+        identity = run_identity(config, pipeline_name, pipeline, dataset.digest)
         name = f"{pipeline_name}-{identity_digest(identity)[:8]}"
         folder = RunFolder.open(Path(config.run_dir or f"runs/{dataset.name}/{name}"), identity)
         chosen = select([dataset[i] for i in range(len(dataset))], config.limit)
@@ -63,6 +57,9 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
             pipeline, todo, seed=config.seed, batch=config.batch, workers=workers, store=folder.append, build=build
         ):
             progress.advance(bar, count)
+    if len(todo) < len(chosen):
+        taken = f"{len(chosen) - len(todo)} of {len(chosen)} pairs taken from an earlier run in {folder.path}"
+        console.print(taken, markup=False, highlight=False)
     keys = {pair.key for pair in chosen}
     table = folder.read(keys)
     summary = summarize(table)
@@ -78,13 +75,6 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
             f"every pair failed, the first because: {reason}. Once that is mended, delete {folder.path} to run again"
         )
     return folder.path
-
-
-def _learned(pipeline: Pipeline) -> list[str]:
-    """Digests of the learned files of features and matcher."""
-    extractor = pipeline.extractor
-    parts = [extractor.extractor if isinstance(extractor, CachedFeatures) else extractor, pipeline.matcher]
-    return sorted(digest for part in parts for digest in learned(part))
 
 
 def _load(config: DictConfig, progress: Progress) -> PairDataset:

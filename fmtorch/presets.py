@@ -84,6 +84,14 @@ def targets_of(config: object) -> frozenset[str]:
     return frozenset()
 
 
+def own_modules(config: object) -> dict[str, str]:
+    """The modules that define the targets within a config that are none of this project's, by the targets' names."""
+    own = sorted(name for name in targets_of(config) if name.partition(".")[0] != "fmtorch")
+    return {
+        name: str(getattr(hydra.utils.get_object(name), "__module__", None) or name.rpartition(".")[0]) for name in own
+    }
+
+
 def build(group: str, name: str, config_dir: Path | str | None = None, **options: Any) -> Any:
     """The object that a preset describes, with some of its options replaced.
 
@@ -134,10 +142,39 @@ def resolve_device(name: str) -> torch.device:
     return device
 
 
+def stages(config: DictConfig) -> dict[str, Any]:
+    """What a composed config says of each group of `STAGES`, as plain values.
+
+    Pruners are a list of mappings of one name each, in the order in which they run, which decides results and which no
+    mapping keeps on its way through JSON with sorted keys.
+    """
+    plain = {group: OmegaConf.to_container(config[group], resolve=True) for group in STAGES if config.get(group)}
+    return {**plain, "pruner": [{name: value} for name, value in _pruners(config).items()]}
+
+
+def composed(stages: Mapping[str, Any]) -> dict[str, Any]:
+    """The config that `stages` was made of. Raises ValueError where several pruners stand in no order."""
+    pruners = stages.get("pruner") or []
+    if isinstance(pruners, Mapping):  # of a version that did not keep the order
+        if len(pruners) > 1:
+            raise ValueError(f"the order of its pruners ({', '.join(pruners)}) is not known; evaluate it again")
+        pruners = [pruners]
+    return {**stages, "pruner": {name: value for entry in pruners for name, value in entry.items()}}
+
+
+def _pruners(config: DictConfig) -> dict[str, Any]:
+    """The pruners' configs by name, in the order in which they run."""
+    if not config.get("pruner"):
+        return {}
+    plain = OmegaConf.to_container(config.pruner, resolve=True)
+    assert isinstance(plain, dict)
+    return {str(name): value for name, value in plain.items()}
+
+
 def build_pipeline(config: DictConfig, device: torch.device | str = "cpu") -> Pipeline:
     """The pipeline that features (with cache), matcher, pruner and estimator of a composed config describe."""
     extractor = cached(instantiate(config.features, "features"), config.cache, config.cache_limit)
-    pruners = {str(k): instantiate(v, f"pruner={k}") for k, v in (config.get("pruner") or {}).items()}
+    pruners = {name: instantiate(value, f"pruner={name}") for name, value in _pruners(config).items()}
     return Pipeline(
         extractor,
         instantiate(config.matcher, "matcher"),

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-import numpy as np
 import pyarrow as pa
-import torch
+import pyarrow.compute as pc
 from omegaconf import DictConfig, OmegaConf
 from rich.progress import track
 
@@ -18,9 +17,8 @@ from fmtorch import data, presets
 from fmtorch.command import console, exits_with_message
 from fmtorch.data import DataError, ImageError, ImagePair, read_image
 from fmtorch.evaluation.page import Picture, Section, ShownPair, differing_pairs, render
-from fmtorch.evaluation.pictures import Image, draw_epipolar_lines, draw_matches
-from fmtorch.metrics import nsgd
-from fmtorch.pipeline import Outcome, Pipeline
+from fmtorch.evaluation.redraw import difference, drawn
+from fmtorch.pipeline import Pipeline
 from fmtorch.resources import conf_dir
 from fmtorch.storage import RunFolder, RunFolderError
 from fmtorch.storage.files import replacing
@@ -172,45 +170,31 @@ def _pipeline(r: _Run, config: DictConfig) -> Pipeline:
     foreign = presets.targets_of(stages) - presets.known_targets()
     if foreign:
         raise ValueError(f"{r.name} has parts of your own ({', '.join(sorted(foreign))}), which a report does not load")
-    composed = OmegaConf.create({**stages, "cache": config.cache, "cache_limit": config.cache_limit})
-    return presets.build_pipeline(composed, presets.resolve_device(str(config.device)))
+    try:
+        composed = presets.composed(stages)
+    except ValueError as error:
+        raise ValueError(f"{r.name}, made by an earlier version, cannot be drawn again: {error}") from error
+    cache = {"cache": config.cache, "cache_limit": config.cache_limit}
+    return presets.build_pipeline(OmegaConf.create({**composed, **cache}), presets.resolve_device(str(config.device)))
 
 
 def _shown(pair: ImagePair, runs: Sequence[_Run], pipelines: Mapping[str, Pipeline]) -> ShownPair:
     pictures: list[Picture] = []
     errors: list[str] = []
+    notes: list[str] = []
     try:
         images = [read_image(source) for source in (pair.image0, pair.image1)]
     except ImageError as error:
         return ShownPair(f"{pair.identity}: {error}", [])
     for r in runs:
         (outcome,) = pipelines[r.name].run([pair], int(r.folder.config.get("seed", 0)))
-        made, text = _drawn(pair, images, outcome, r.name)
-        pictures += made
-        errors.append(f"{r.name} {text}")
-    return ShownPair(f"{pair.identity}: NSGD {', '.join(errors)}", pictures)
-
-
-def _drawn(pair: ImagePair, images: Sequence[Image], outcome: Outcome, name: str) -> tuple[list[Picture], str]:
-    """A run's matches and epipolar lines of a pair, and its NSGD."""
-    c, estimate = outcome.correspondences, outcome.estimate
-    if c is None or estimate is None or not bool(estimate.ok[0]):
-        return [], f"failed ({outcome.reason})"
-    x0, x1 = (x[0].cpu().numpy().astype(np.float64) for x in (c.x0, c.x1))
-    inliers, F = estimate.inliers[0].cpu().numpy(), estimate.F[0].cpu().numpy()
-    sizes = [torch.tensor([image.shape[:2]]) for image in images]
-    error = float(nsgd(torch.from_numpy(pair.F)[None], estimate.F.cpu(), *sizes, key=torch.tensor([pair.key]))[0])
-    matches = draw_matches(
-        images[0], images[1], x0, x1, inliers, names=("inliers of F", "other matches given to the estimator")
-    )
-    lines = draw_epipolar_lines(images[0], images[1], x0[inliers], x1[inliers], F, truth=pair.F)
-    said = f"{name}: NSGD {error:.4f}, {int(inliers.sum())} inliers of {len(inliers)} matches"
-    return [
-        Picture(matches, f"matches of {name}", said),
-        Picture(
-            lines, f"epipolar lines of {name}", f"{name}: epipolar lines of some inliers; the true ones dashed in white"
-        ),
-    ], f"{error:.4f}"
+        stored = r.table.filter(pc.equal(r.table["key"], pair.key)).to_pylist()[0]
+        errors.append(f"{r.name} {stored['nsgd']:.4f}" if stored["ok"] else f"{r.name} failed ({stored['reason']})")
+        note = difference(pair, images, stored, outcome)
+        if note:
+            notes.append(f"{r.name} {note}")
+        pictures += drawn(pair, images, stored, outcome, r.name)
+    return ShownPair(f"{pair.identity}: NSGD {', '.join(errors)}", pictures, notes)
 
 
 @hydra.main(version_base=None, config_path=str(conf_dir()), config_name="report")

@@ -22,6 +22,8 @@ from fmtorch.types import Correspondences, collate
 OTHER_LIBRARIES = ("opencv_", "poselib", "kornia_ransac", "magsac_cpp", "gc_ransac_cpp", "degensac_cpp")
 """Prefixes of the presets that call other libraries' estimators; of these only OpenCV's keep the laws."""
 
+SMALL_KINDS = ("collinear", "collinear in image 1", "planar", "coincident", "half coincident")
+
 Result = dict[str, Tensor]  # every value has the batch as its first dimension; masks (B, N) may be padded on the right
 
 
@@ -130,6 +132,32 @@ def degenerate() -> dict[str, Correspondences]:
         "huge": good.replace(x0=good.x0 * 1e6, x1=good.x1 * 1e6),
         "tiny": good.replace(x0=good.x0 * 1e-6, x1=good.x1 * 1e-6),
     }
+
+
+def small() -> dict[str, Correspondences]:
+    """Pairs of few matches, from a minimal sample to 20: random ones, and those that determine no model."""
+
+    def pair(kind: str, count: int) -> Correspondences:
+        rng = np.random.default_rng([count, len(kind)])
+        x0, x1 = rng.uniform([0, 0], [960, 640], (2, count, 2))
+        along = rng.integers(0, 600, count)[:, None] * [1, 0.5] + [0, 20]  # exact in float32
+        if kind.startswith("collinear"):
+            x0, x1 = along if kind != "collinear in image 1" else x0, along + 5 if kind == "collinear" else along[::-1]
+        if kind == "planar":
+            plane = np.c_[x0, np.ones(count)] @ np.array([[1.1, -0.03, 1e-5], [0.02, 0.95, 2e-5], [5, 9, 1]])
+            x1 = plane[:, :2] / plane[:, 2:]
+        if kind == "coincident":
+            x0, x1 = np.full_like(x0, 7), np.full_like(x1, 9)
+        if kind == "half coincident":
+            x0[count // 2 :], x1[count // 2 :] = x0[0], x1[0]
+        known = scene(count, count)
+        lafs0, lafs1 = known.lafs0.clone(), known.lafs1.clone()
+        points = [torch.from_numpy(x.astype(np.float32))[None] for x in (x0, x1)]
+        lafs0[..., 2], lafs1[..., 2] = points
+        return known.replace(x0=points[0], x1=points[1], lafs0=lafs0, lafs1=lafs1)
+
+    counts = {"random": (7, 8, 9, 12, 16, 20), **dict.fromkeys(SMALL_KINDS, (8, 20))}
+    return {f"{count} {kind}": pair(kind, count) for kind, some in counts.items() for count in some}
 
 
 def assert_same(a: Result, b: Result, what: str) -> None:

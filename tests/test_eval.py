@@ -63,6 +63,8 @@ def test_a_run_from_start_to_end(root: Path, tmp_path: Path) -> None:
     everything = {str(row["pair"]): row for row in rows(run_dir)}
     assert len(everything) == len(rows(run_dir)) == 5
     assert sum(bool(row["ok"]) for row in everything.values()) == 3
+    assert "earlier run" not in first.stdout
+    assert f"2 of 5 pairs taken from an earlier run in {run_dir}" in second.stdout
     assert "00000004.png" in str(everything["Set/scene/0-4"]["reason"])
     assert "line 5" in str(everything["Set/scene/2-3"]["reason"])
     for row in everything.values():
@@ -100,6 +102,17 @@ def test_batch_and_workers_change_no_row(root: Path, tmp_path: Path) -> None:
     computed = re.search(r"features of (\d+) images computed", told)
     assert computed is not None
     assert 4 <= int(computed[1]) <= 6  # two processes may come upon the same image at the same time
+
+
+def test_the_order_of_pruners_is_part_of_the_run(root: Path, tmp_path: Path) -> None:
+    arguments = ["dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"run_dir={tmp_path / 'run'}", "limit=1"]
+    first = evaluate(*arguments, "pruner=[one_to_one,ratio]", cwd=tmp_path)
+    assert first.returncode == 0, first.stderr
+    stored = json.loads((tmp_path / "run" / "run.json").read_text())["config"]["pruner"]
+    assert [list(entry) for entry in stored] == [["one_to_one"], ["ratio"]]
+    other = evaluate(*arguments, "pruner=[ratio,one_to_one]", cwd=tmp_path)
+    assert other.returncode == 1
+    assert "pruner: [one_to_one, ratio] -> [ratio, one_to_one]. " in other.stderr
 
 
 def test_sweep_gives_each_job_a_folder(root: Path, tmp_path: Path) -> None:
@@ -167,7 +180,26 @@ def test_a_learned_file_is_part_of_the_run(root: Path, tmp_path: Path) -> None:
     second = evaluate(*arguments, cwd=tmp_path)
     assert second.returncode == 1
     assert "holds another run" in second.stderr
-    assert "learned: " in second.stderr
+    assert "learned.features: " in second.stderr
+
+
+def test_the_code_of_a_users_own_stage_is_part_of_the_run(root: Path, tmp_path: Path) -> None:
+    own = tmp_path / "my_conf" / "estimator"
+    own.mkdir(parents=True)
+    (own / "mine.yaml").write_text("_target_: my_estimator.Mine\n")
+    (tmp_path / "my_estimator.py").write_text(
+        "from my_constants import METHOD\nfrom fmtorch.estimators import opencv\n"
+        "def Mine():\n    return opencv(method=METHOD)\n"
+    )
+    (tmp_path / "my_constants.py").write_text("METHOD = 'FM_LMEDS'\n")
+    data = ["dataset=fmbench", f"dataset.root={root}", "features.max_features=500", "limit=1"]
+    arguments = ["--config-dir", str(tmp_path / "my_conf"), "estimator=mine", *data, f"run_dir={tmp_path / 'run'}"]
+    first = evaluate(*arguments, cwd=tmp_path)
+    assert first.returncode == 0, first.stderr
+    (tmp_path / "my_constants.py").write_text("METHOD = 'FM_RANSAC'\n")
+    second = evaluate(*arguments, cwd=tmp_path)
+    assert second.returncode == 1
+    assert "code.my_estimator.Mine: " in second.stderr
 
 
 def test_a_run_in_which_nothing_succeeds_is_told(root: Path, tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from tests.laws import (
     quick,
     scene,
     scenes,
+    small,
     with_padding,
 )
 
@@ -84,6 +85,7 @@ def _good_alone(subject: Subject) -> Result:
 
 GOOD = [scene(1), scene(2, 60)]
 SUBJECTS = _subjects()
+PLAIN = [s for s in SUBJECTS if not s.name.endswith("with noise")]
 everything = pytest.mark.parametrize("subject", SUBJECTS, ids=[s.name for s in SUBJECTS])
 
 
@@ -114,6 +116,18 @@ def test_no_pair_takes_its_batch_down(subject: Subject, kind: str) -> None:
     assert_same(_good_alone(subject), kept, f"{subject.name} beside {kind}")
     for value in mixed.values():
         assert not bool(torch.isnan(value.to(torch.float64)).any()), f"{subject.name}: NaN for {kind}"
+
+
+@pytest.mark.parametrize("subject", PLAIN, ids=[s.name for s in PLAIN])
+def test_few_matches_alone_and_in_a_batch(subject: Subject) -> None:
+    pairs = small()
+    together = subject.run(collate(list(pairs.values())))
+    for i, (kind, pair) in enumerate(pairs.items()):
+        n = pair.mask.shape[1]
+        shared = {k: v[i : i + 1, :n] if k in PER_MATCH else v[i : i + 1] for k, v in together.items()}
+        assert_same(subject.run(pair), shared, f"{subject.name}: {kind}")
+    for value in together.values():
+        assert not bool(torch.isnan(value.to(torch.float64)).any()), f"{subject.name}: NaN"
 
 
 @pytest.mark.parametrize("name", OWN)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import re
@@ -11,12 +12,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from omegaconf import OmegaConf
 
 from fmtorch import presets, report
+from fmtorch.data import read_image
 from fmtorch.evaluation.page import Section, differing_pairs, render
+from fmtorch.evaluation.redraw import difference
+from fmtorch.evaluation.rows import evaluate
+from fmtorch.pipeline import Outcome
 from fmtorch.storage import PairRow, RunFolder, RunFolderError, to_table
-from tests.test_pipeline import draw
+from fmtorch.types import Estimate
+from tests.test_pipeline import draw, pair
 
 OPTIONS = {
     "output": "deep/report.html", "title": "Runs", "pictures": 3, "root": None, "device": "cpu", "cache": "off",
@@ -114,6 +121,68 @@ def test_a_run_folder_runs_no_code(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert not called.exists()
 
 
+@pytest.mark.parametrize("order", [["ratio", "one_to_one"], ["one_to_one", "ratio"]])
+def test_a_pipeline_is_drawn_again_as_it_was_and_a_difference_is_said(order: list[str], tmp_path: Path) -> None:
+    one, other = (pair(name, draw(tmp_path / "a.png", 0), draw(tmp_path / "b.png", 0, shift=12)) for name in "ab")
+    overrides = [
+        "features.max_features=300",
+        "estimator=lmeds",
+        "estimator.hypotheses=100",
+        f"pruner=[{','.join(order)}]",
+    ]
+    config = presets._compose("match", ("pipeline=sift_ratio", "cache=off", *overrides))
+    rows = evaluate(presets.build_pipeline(config).run([one, other], seed=3), seed=3)
+    F = np.array([0, 0, 0, 0, 0, -1, 0, 1, 0]) / np.sqrt(2)
+    rows[1] = dataclasses.replace(rows[1], F=F.tolist(), nsgd=0.0)
+    identity = {"pipeline": "sift_ratio", "seed": 3, **presets.stages(config)}
+    RunFolder.open(tmp_path / "run", identity).append(rows)
+    (r,) = report._named([RunFolder.load(tmp_path / "run")])
+    pipeline = report._pipeline(r, OmegaConf.create(OPTIONS))
+    assert list(pipeline.pruners) == order
+    assert report._shown(one, [r], {r.name: pipeline}).notes == []
+    shown = report._shown(other, [r], {r.name: pipeline})
+    assert shown.heading == "b: NSGD sift_ratio 0.0000"
+    (note,) = shown.notes
+    assert note.startswith("sift_ratio gives another F when it is drawn again: NSGD 0.")
+    assert "in its run 0.0000" in note
+    assert note in render("", [Section("set", {"one": r.table}, [shown])], [])
+
+
+def test_a_result_that_cannot_be_had_again_is_said(tmp_path: Path) -> None:
+    one = pair("a", draw(tmp_path / "a.png", 0), draw(tmp_path / "b.png", 0, shift=12))
+    images = [read_image(source) for source in (one.image0, one.image1)]
+    F = np.array([0, 0, 0, 0, 0, -1, 0, 1, 0]) / np.sqrt(2)
+    solved, failed = {"ok": True, "nsgd": 0.0, "F": F.tolist()}, {"ok": False, "nsgd": 1.0, "F": None}
+    estimate = Estimate(
+        torch.from_numpy(F.reshape(1, 3, 3)),
+        torch.ones(1, 9).bool(),
+        torch.tensor([True]),
+        ("",),
+        torch.zeros(1).long(),
+    )
+    lost, found = Outcome(one, reason="no keypoints"), Outcome(one, estimate=estimate)
+    assert "(no keypoints), unlike in its run" in difference(one, images, solved, lost)
+    assert "NSGD 0.0000, unlike in its run" in difference(one, images, failed, found)
+    assert difference(one, images, solved, found) == difference(one, images, failed, lost) == ""
+
+
+def test_an_older_run_is_drawn_where_its_pruners_have_one_order(tmp_path: Path) -> None:
+    config = presets._compose("match", ("pipeline=sift_ratio", "cache=off"))
+    stages = presets.stages(config)
+    for names, drawn in (([], True), (["ratio"], True), (["ratio", "one_to_one"], False)):
+        pruner = {name: value for entry in stages["pruner"] for name, value in entry.items() if name in names}
+        old = {"pipeline": "sift_ratio", **stages, "pruner": pruner}
+        folder = RunFolder(tmp_path, old, 1)
+        r = report._Run("sift_ratio", folder, to_table([]))
+        if drawn:
+            assert list(report._pipeline(r, OmegaConf.create(OPTIONS)).pruners) == names
+        else:
+            with pytest.raises(
+                ValueError, match=r"made by an earlier version.*order of its pruners \(ratio, one_to_one\)"
+            ):
+                report._pipeline(r, OmegaConf.create(OPTIONS))
+
+
 def test_the_command_on_two_runs(tmp_path: Path) -> None:
     images = tmp_path / "Set" / "scene" / "Images"
     images.mkdir(parents=True)
@@ -139,6 +208,7 @@ def test_the_command_on_two_runs(tmp_path: Path) -> None:
     done = command("fmtorch.report", "root=Set", "pictures=2")
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "report.html").read_text()
+    assert "drawn again" not in page  # what is drawn is what was stored
     assert page.count("data:image/jpeg") == 2 * 2 * 2  # pairs, runs, pictures
     assert "fmbench, test: Set" in page
     assert page.count("<td>sift_ratio lmeds hypotheses=100</td>") >= 3

@@ -24,6 +24,12 @@ Solution = tuple[Points | None, NDArray[np.bool_]]
 
 LEAST_MATCHES = 8
 
+PEERS = {
+    "poselib": "poselib", "poselib_shared_focal": "poselib", "magsac_cpp": "pymagsac", "gc_ransac_cpp": "pygcransac",
+    "degensac_cpp": "pydegensac",
+}  # fmt: skip
+"""The packages whose versions decide what the functions of these names compute."""
+
 FAILURES = (cv2.error, RuntimeError, ValueError)  # how these libraries say that they cannot solve a pair
 # The numbers of the samplers in the authors' bindings of MAGSAC++ and GC-RANSAC.
 SAMPLERS = {"uniform": 0, "prosac": 1, "progressive_napsac": 2, "importance": 3, "adaptive": 4}

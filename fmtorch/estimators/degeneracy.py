@@ -59,6 +59,8 @@ class Degensac:
         best: the score to beat. drawn: all models of the round in the order of their draws, index: the samples, start:
         the first draw.
         """
+        if not score.shape[1]:  # no sample of any pair gave a model
+            return F, score
         top, order = torch.sort(score, dim=1, descending=True, stable=True)
         rising = top[:, 0] > best
         model = F.gather(2, order[:, :1].expand(9, -1, -1))[..., 0]

@@ -36,10 +36,11 @@ class Picture:
 
 @dataclasses.dataclass(frozen=True)
 class ShownPair:
-    """A pair of images with pictures of it."""
+    """A pair of images with pictures of it; notes: what the reader should know of them."""
 
     heading: str
     pictures: Sequence[Picture]
+    notes: Sequence[str] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,6 +122,7 @@ def _context(section: Section) -> dict[str, Any]:
         "pictures": [
             {
                 "heading": pair.heading,
+                "notes": pair.notes,
                 "pictures": [{"source": _jpeg(p.image), "alt": p.alt, "caption": p.caption} for p in pair.pictures],
             }
             for pair in section.pairs

@@ -16,7 +16,7 @@ from fmtorch.geometry.epipolar import (
     symmetric_squared,
     unit_frobenius,
 )
-from fmtorch.geometry.irls import irls
+from fmtorch.geometry.irls import Fits, irls, reweighted_fits
 from fmtorch.geometry.normalize import canonical, denormalize_fundamental, normalize_pair, normalize_points
 from fmtorch.geometry.pose import Pose, pose_from_fundamental
 from fmtorch.geometry.rank2 import nearest_rank2
@@ -26,6 +26,7 @@ from fmtorch.geometry.seven_point import seven_point
 
 __all__ = [
     "KERNELS",
+    "Fits",
     "Pose",
     "algebraic",
     "attached_step",
@@ -44,6 +45,7 @@ __all__ = [
     "point_to_line",
     "pose_from_fundamental",
     "refine",
+    "reweighted_fits",
     "sampson",
     "sampson_squared",
     "seven_point",

@@ -166,11 +166,12 @@ class Normalised:
         live = torch.isfinite(x).all(-1) & torch.isfinite(w)
         if mask is not None:
             live = live & mask.reshape(p, n)
-        order = torch.argsort((~live).to(torch.uint8), dim=1, stable=True)
-        live = live.gather(1, order)
+        self.counts = live.reshape(x0.shape[:-1])
+        self._order = order = torch.argsort((~live).to(torch.uint8), dim=1, stable=True)
+        self._live = live = live.gather(1, order)
         inside = live[..., None]
         x = torch.where(inside, x.gather(1, order[..., None].expand(-1, -1, 4)), 0)
-        self.weight = torch.where(live, w.gather(1, order), 0)
+        self.weight = self.ordered(w)
         low = torch.where(inside, x.detach(), torch.inf).amin(1) if n else x.new_full((len(x), 4), torch.inf)
         high = torch.where(inside, x.detach(), -torch.inf).amax(1) if n else -low
         some = live.any(1)
@@ -183,8 +184,17 @@ class Normalised:
         self.scale = torch.as_tensor(scale, dtype=torch.float64, device=x.device).expand(x0.shape[:-2]).reshape(p)
         self.scale = self.scale / self.unit
         A0, A1 = self._affinity(0), self._affinity(2)
+        # What is no model gets no gradient.
+        F = torch.where(
+            (torch.isfinite(F) & (F != 0).any(-1, True).any(-2, True)).all(-1, True).all(-2, True), F, F.detach()
+        )
         matrices = F.to(torch.float64).reshape(p, math.prod(F.shape[x0.dim() - 2 : -2]), 3, 3)
-        self.models = _flat(matmul3(matmul3(A1.mT, matrices), A0))
+        self.models = _flat(_about_unit(matmul3(matmul3(A1.mT, matrices), A0)))
+
+    def ordered(self, weight: Float[Tensor, "*batch n"]) -> Float[Tensor, "p n"]:
+        """Values of matches in the caller's order in the order of `points`, 0 in padded slots; float64."""
+        flat = weight.to(torch.float64).reshape(self._order.shape)
+        return torch.where(self._live, flat.gather(1, self._order), 0)
 
     def to_pixels(self, models: Float[Tensor, "9 p k"]) -> Float[Tensor, "p k 3 3"]:
         """Matrices in pixels, of unit norm."""
@@ -207,6 +217,13 @@ class Normalised:
 
 def _flat(F: Float[Tensor, "p k 3 3"]) -> Float[Tensor, "9 p k"]:
     return F.flatten(2).permute(2, 0, 1).contiguous()
+
+
+def _about_unit(F: Float[Tensor, "p k 3 3"]) -> Float[Tensor, "p k 3 3"]:
+    """Matrices scaled by a power of two, which rounds nothing, so that no square under- or overflows."""
+    largest = F.detach().abs().amax((-2, -1), keepdim=True)
+    usual = (largest > 1e-300) & (largest < 1e300)
+    return F / torch.exp2(torch.floor(torch.log2(torch.where(usual, largest, 1))))
 
 
 def matrices(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "p k 3 3"]:

@@ -26,7 +26,8 @@ import pyarrow.parquet as pq
 from fmtorch.storage.files import replacing, sync, temporary_name
 from fmtorch.storage.rows import PAIR_SCHEMA, PairRow, to_table
 
-FORMAT = 1  # of the folder; to be raised when the schema changes
+FORMAT = 2  # of the folder; to be raised when the schema changes, or what the identity tells
+READABLE = (1, FORMAT)  # formats that `load` reads; 1 lost the order of the pruners
 _SHOWN = 5  # differing fields shown in an error
 
 
@@ -54,6 +55,7 @@ class RunFolder:
 
     path: Path
     config: dict[str, Any]  # what defines the results, see `identity_digest`
+    format: int = FORMAT
 
     @classmethod
     def open(cls, path: Path | str, config: Mapping[str, Any]) -> RunFolder:
@@ -76,6 +78,12 @@ class RunFolder:
                 )
             _claim(path / "run.json", wanted)
         folder = cls.load(path)
+        if folder.format != FORMAT:
+            raise RunFolderError(
+                f"{path} holds a run of format {folder.format}, whose identity tells too little (not the order of the "
+                f"pruners, say); this version continues format {FORMAT} only, but `fmtorch.report` still reads it. "
+                "Choose another run_dir, or delete the folder"
+            )
         if folder.identity != identity_digest(wanted):
             raise RunFolderError(
                 f"{path} holds another run; what differs (there -> now): {_some(_differences(folder.config, wanted))}. "
@@ -86,7 +94,10 @@ class RunFolder:
 
     @classmethod
     def load(cls, path: Path | str) -> RunFolder:
-        """The existing run in `path`, whatever its identity. Raises RunFolderError where there is none."""
+        """The existing run in `path`, whatever its identity and of any format in `READABLE`.
+
+        Raises RunFolderError where there is none.
+        """
         file = Path(path) / "run.json"
         try:
             stored = json.loads(file.read_text(encoding="utf-8"))
@@ -96,11 +107,12 @@ class RunFolder:
             raise RunFolderError(f"{file} is not valid JSON ({error}); delete the folder and run again") from error
         if not isinstance(stored, dict) or not isinstance(stored.get("config"), dict):
             raise RunFolderError(f"{file} was not written by this program: it has no 'config'")
-        if stored.get("format") != FORMAT:
+        if stored.get("format") not in READABLE:
+            formats = " and ".join(map(str, READABLE))
             raise RunFolderError(
-                f"{file} has format {stored.get('format')}, this version reads format {FORMAT}; choose another run_dir"
+                f"{file} has format {stored.get('format')}, this version reads {formats}; choose another run_dir"
             )
-        return cls(Path(path), stored["config"])
+        return cls(Path(path), stored["config"], stored["format"])
 
     @property
     def identity(self) -> str:
@@ -184,7 +196,14 @@ def _differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
 
 
 def leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
-    """Dotted names and JSON texts of all that a nested configuration holds."""
+    """Dotted names and JSON texts of all that a nested configuration holds.
+
+    A list of mappings of one name each, such as a pipeline's pruners, is that order of names, and what is below each.
+    """
+    if isinstance(value, list) and value and all(isinstance(entry, dict) and len(entry) == 1 for entry in value):
+        names = [key for entry in value for key in entry]
+        yield name, f"[{', '.join(names)}]"
+        value = {key: below for entry in value for key, below in entry.items()}
     if isinstance(value, dict) and value:
         for key, entry in value.items():
             yield from leaves(entry, f"{name}.{key}" if name else key)

@@ -287,9 +287,9 @@ def test_configuration_of_files_tensors_networks_and_code(tmp_path: Path, monkey
     source.mkdir()
     (source / "sift.py").write_text("edited")
     monkeypatch.setattr(sys.modules["fmtorch.features.sift"], "__file__", str(source / "sift.py"))
-    configuration_module._code_digest.cache_clear()
+    configuration_module.code_digest.cache_clear()
     assert configuration(sift)["code"] != code
-    configuration_module._code_digest.cache_clear()
+    configuration_module.code_digest.cache_clear()
 
 
 def test_code_is_what_a_module_imports_from_its_own_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

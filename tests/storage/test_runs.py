@@ -134,6 +134,25 @@ def test_a_broken_run_json_is_named(tmp_path: Path, content: str) -> None:
         RunFolder.open(tmp_path, CONFIG)
 
 
+def test_a_folder_of_the_first_format_is_read_but_not_continued(tmp_path: Path) -> None:
+    run = RunFolder.open(tmp_path, CONFIG)
+    run.append([row("a")])
+    stored = json.loads((tmp_path / "run.json").read_text())
+    (tmp_path / "run.json").write_text(json.dumps({**stored, "format": 1}))
+    assert RunFolder.load(tmp_path).read().num_rows == 1
+    with pytest.raises(RunFolderError, match=r"format 1.*order of the pruners.*Choose another run_dir"):
+        RunFolder.open(tmp_path, CONFIG)
+
+
+def test_the_order_of_a_list_of_names_is_part_of_the_identity(tmp_path: Path) -> None:
+    stages = [{"ratio": {"threshold": 0.8}}, {"gms": {"with_scale": True}}]
+    RunFolder.open(tmp_path, {"pruner": stages})
+    with pytest.raises(RunFolderError, match=r"differs \(there -> now\): pruner: \[ratio, gms\] -> \[gms, ratio\]\. "):
+        RunFolder.open(tmp_path, {"pruner": stages[::-1]})
+    with pytest.raises(RunFolderError, match=r"\): pruner\.ratio\.threshold: 0\.8 -> 0\.9\. "):
+        RunFolder.open(tmp_path, {"pruner": [{"ratio": {"threshold": 0.9}}, stages[1]]})
+
+
 def test_load_reads_whatever_the_identity(tmp_path: Path) -> None:
     RunFolder.open(tmp_path, CONFIG).append([row("a")])
     run = RunFolder.load(tmp_path)

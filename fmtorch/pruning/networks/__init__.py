@@ -1,7 +1,8 @@
 """Networks that tell inliers from outliers: Correspondences -> Prediction."""
 
+from fmtorch.pruning.networks.dfe import DFE
 from fmtorch.pruning.networks.inputs import MatchInputs
 from fmtorch.pruning.networks.lc import LC
 from fmtorch.pruning.networks.prediction import Exportable, Prediction
 
-__all__ = ["LC", "Exportable", "MatchInputs", "Prediction"]
+__all__ = ["DFE", "LC", "Exportable", "MatchInputs", "Prediction"]

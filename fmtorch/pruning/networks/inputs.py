@@ -66,24 +66,44 @@ class MatchInputs:
             channels += [torch.where(mask & torch.isfinite(value), value.float(), 0) for value in SIDE[name][1](c)]
         return torch.stack(channels, 1), mask
 
+    def unit(self, c: Correspondences) -> Float[Tensor, " b"]:
+        """How many pixels one unit of the coordinates is, on average over both images; as `x0` in type.
+
+        Raises ValueError where image sizes or calibration matrices are missing.
+        """
+        if self.coordinates == "size":
+            sizes = _known(c.size0, "size0", BY_SIZE), _known(c.size1, "size1", BY_SIZE)
+            unit0, unit1 = (size.amax(-1) for size in sizes)
+            return (unit0 + unit1).to(c.x0.dtype) / 2
+        matrices = _known(c.K0, "K0", BY_CALIBRATION), _known(c.K1, "K1", BY_CALIBRATION)
+        unit0, unit1 = ((K[:, 0, 0].abs() + K[:, 1, 1].abs()) / 2 for K in matrices)
+        return (unit0 + unit1).to(c.x0.dtype) / 2
+
+
+BY_SIZE = (
+    "coordinates=size needs `{}`, the images' (h, w): give image sizes with the matches, or take a network trained on "
+    "calibrated coordinates (coordinates=K)"
+)
+BY_CALIBRATION = (
+    "coordinates=K needs `{}`, the calibration matrices: take a data set that has them, or a network trained on "
+    "coordinates by image size (coordinates=size)"
+)
+
+
+def _known(value: Tensor | None, name: str, message: str) -> Tensor:
+    if value is None:
+        raise ValueError(message.format(name))
+    return value
+
 
 def _by_size(x: Float[Tensor, "b n 2"], size: Tensor | None, name: str) -> Float[Tensor, "b n 2"]:
-    if size is None:
-        raise ValueError(
-            f"coordinates=size needs `{name}`, the images' (h, w): give image sizes with the matches, or take a "
-            "network trained on calibrated coordinates (coordinates=K)"
-        )
-    size = size.to(x.dtype)
+    size = _known(size, name, BY_SIZE).to(x.dtype)
     longest = size.amax(-1)[:, None, None]
     return (x - size.flip(-1)[:, None] / 2) / longest
 
 
 def _by_calibration(x: Float[Tensor, "b n 2"], K: Tensor | None, name: str) -> Float[Tensor, "b n 2"]:
-    if K is None:
-        raise ValueError(
-            f"coordinates=K needs `{name}`, the calibration matrices: take a data set that has them, or a network "
-            "trained on coordinates by image size (coordinates=size)"
-        )
+    K = _known(K, name, BY_CALIBRATION)
     fx, skew, cx, fy, cy = (K[:, i, j, None].to(x.dtype) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
     y = (x[..., 1] - cy) / fy
     return torch.stack([(x[..., 0] - cx - skew * y) / fx, y], -1)

@@ -20,8 +20,8 @@ class Prediction(NamedTuple):
 
     logit: log-odds that a match is an inlier, (S, B, N); finite and without meaning in masked slots.
     weight: of the match in a weighted 8-point fit, (S, B, N); not negative, 0 where masked.
-    F: fundamental matrices that the network fits itself, (S, B, 3, 3), float64, in pixels and of unit Frobenius norm,
-    zero where a fit is not determined; None where it fits none.
+    F: fundamental matrices that the network fits itself, (S, B, 3, 3), float64, in pixels and of unit Frobenius norm;
+    where a fit is not determined the one of the stage before, or zero; None where the network fits none.
     """
 
     logit: Float[Tensor, "stages b n"]

@@ -1,0 +1,88 @@
+"""What defines the results of a run: the pipeline and all that its stages are made of, the data set, the seed.
+
+Not what changes speed or extent alone: limit, device, batch, workers, processes, cache.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from fmtorch import presets
+from fmtorch.command import plain
+from fmtorch.estimators.adapters import PEERS
+from fmtorch.pipeline import Pipeline
+from fmtorch.storage.code import code_digest, fmtorch_version
+from fmtorch.storage.configuration import file_digest, learned, libraries
+from fmtorch.storage.features import CachedFeatures
+
+
+def run_identity(config: DictConfig, pipeline_name: str, pipeline: Pipeline, dataset_digest: str) -> dict[str, Any]:
+    """The identity of a run, as plain values.
+
+    Args:
+        config: a composed config: stages, data set, seed.
+        pipeline_name: the preset that it began with.
+        pipeline: what was built of the config.
+        dataset_digest: of the contents of the data set.
+
+    Returns:
+        `pipeline`, each stage's config (pruners as a list), `seed`; `version` of fmtorch, in a checkout its commit;
+        `libraries`: their versions; `learned`: digests of each stage's learned files; `code`: digests of the sources of
+        parts of the user's own; `dataset`: its config, without where it lies, and its digest.
+    """
+    stages = presets.stages(config)
+    dataset = {
+        **{key: value for key, value in plain(config.dataset).items() if key != "root"},
+        "digest": dataset_digest,
+    }
+    peers = {PEERS[name] for target in presets.targets_of(stages) if (name := target.rpartition(".")[2]) in PEERS}
+    return {
+        "pipeline": pipeline_name, **stages, "seed": config.seed, "version": fmtorch_version(),
+        "libraries": libraries(sorted(peers)), "learned": _learned(stages, pipeline),
+        "code": _code({"stages": stages, "dataset": dataset}), "dataset": dataset,
+    }  # fmt: skip
+
+
+def _learned(stages: Mapping[str, Any], pipeline: Pipeline) -> dict[str, list[str]]:
+    """Digests of the learned files and networks of each stage that has some."""
+    extractor = pipeline.extractor
+    parts: dict[str, list[object]] = {
+        "features": [extractor.extractor if isinstance(extractor, CachedFeatures) else extractor],
+        "matcher": [pipeline.matcher], "pruner": list(pipeline.pruners.values()), "estimator": [pipeline.estimator],
+    }  # fmt: skip
+    digests = {
+        group: {*(digest for part in parts[group] for digest in learned(part)), *_files(stages.get(group))}
+        for group in presets.STAGES
+    }
+    return {group: sorted(found) for group, found in digests.items() if found}
+
+
+def _files(config: object, option: str = "") -> Iterator[str]:
+    """Digests of the files that options name: a part that does not say what defines it may well read them."""
+    if isinstance(config, Mapping):
+        for key, value in config.items():
+            yield from _files(value, str(key))
+    elif isinstance(config, list):
+        for value in config:
+            yield from _files(value, option)
+    elif isinstance(config, str) and option != "_target_" and Path(config).suffix:
+        path = Path(config).expanduser()
+        with contextlib.suppress(OSError, ValueError):
+            if path.is_file():
+                yield file_digest(path)
+
+
+def _code(config: object) -> dict[str, str]:
+    """Digests of the sources that define the parts of the user's own, by the names of these."""
+    digests = {}
+    for target, module in presets.own_modules(config).items():
+        try:
+            digests[target] = code_digest(module)
+        except (TypeError, KeyError, OSError):
+            digests[target] = "in no file"
+    return digests

@@ -1,0 +1,66 @@
+"""A pair of a run seen again: its pictures, and where its pipeline now gives another result than the run stored."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from fmtorch.data import ImagePair
+from fmtorch.evaluation.page import Picture
+from fmtorch.evaluation.pictures import Image, draw_epipolar_lines, draw_matches
+from fmtorch.metrics import nsgd
+from fmtorch.pipeline import Outcome
+
+SAME_F = 1e-12  # difference of any element, of unit Frobenius norm, within which two F are the same
+SAME_NSGD = 1e-4  # between the F of a run and the one drawn again, up to which they are the same: what captions show
+
+
+def difference(pair: ImagePair, images: Sequence[Image], stored: Mapping[str, Any], outcome: Outcome) -> str:
+    """What differs between the row of a pair and what its pipeline makes of it now; empty where nothing does."""
+    again, reason = outcome.estimate, outcome.reason
+    if again is None or not bool(again.ok[0]):
+        return f"gives no F when it is drawn again ({reason}), unlike in its run" if stored["ok"] else ""
+    run = torch.tensor(stored["F"], dtype=torch.float64) if stored["ok"] else None
+    if run is not None and torch.allclose(run, again.F[0].cpu().flatten(), rtol=0, atol=SAME_F):
+        return ""
+    sizes = [torch.tensor([image.shape[:2]]) for image in images]
+
+    def distance(F: torch.Tensor) -> float:
+        return float(nsgd(F.reshape(1, 3, 3), again.F.cpu(), *sizes, key=torch.tensor([pair.key]))[0])
+
+    error = distance(torch.from_numpy(pair.F))
+    if run is None:
+        return f"gives an F when it is drawn again, of NSGD {error:.4f}, unlike in its run"
+    apart = distance(run)
+    if apart <= SAME_NSGD:
+        return ""
+    return (
+        f"gives another F when it is drawn again: NSGD {error:.4f}, in its run {stored['nsgd']:.4f}; the two are "
+        f"{apart:.4f} apart. Its matches below are those of now, its epipolar lines those of the run"
+    )
+
+
+def drawn(
+    pair: ImagePair, images: Sequence[Image], stored: Mapping[str, Any], outcome: Outcome, name: str
+) -> list[Picture]:
+    """A run's matches of a pair, drawn again, and the epipolar lines of the F that it stored."""
+    c, estimate = outcome.correspondences, outcome.estimate
+    if c is None or estimate is None or not bool(estimate.ok[0]) or not stored["ok"]:
+        return []
+    x0, x1 = (x[0].cpu().numpy().astype(np.float64) for x in (c.x0, c.x1))
+    inliers = estimate.inliers[0].cpu().numpy()
+    matches = draw_matches(
+        images[0], images[1], x0, x1, inliers, names=("inliers of F", "other matches given to the estimator")
+    )
+    F = np.array(stored["F"]).reshape(3, 3)
+    lines = draw_epipolar_lines(images[0], images[1], x0[inliers], x1[inliers], F, truth=pair.F)
+    said = f"{name}: NSGD {stored['nsgd']:.4f}, {int(inliers.sum())} inliers of {len(inliers)} matches"
+    return [
+        Picture(matches, f"matches of {name}", said),
+        Picture(
+            lines, f"epipolar lines of {name}", f"{name}: epipolar lines of some inliers; the true ones dashed in white"
+        ),
+    ]

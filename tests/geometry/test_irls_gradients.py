@@ -1,0 +1,268 @@
+"""Gradients of iteratively reweighted least squares: finite differences, both kinds, degenerate scenes, the laws."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from fmtorch.geometry import eight_point, irls, reweighted_fits, sampson
+from fmtorch.geometry.robust_kernels import KERNELS, named_kernel
+from fmtorch.types import Correspondences, collate
+from tests import laws
+from tests.geometry.test_refine import distance, scene
+
+SCALE = 0.02
+GRADIENTS = ("implicit", "unrolled")
+
+
+def tolerances(kernel: str) -> dict[str, float | bool]:
+    """Of `gradcheck`, along random directions. Central differences round 1e-15 times the condition 1e3 over the step.
+
+    The tabulated kernel is linear between its entries, 1 / 1000 apart, whose slopes differ by as much.
+    """
+    return {"eps": 1e-6, "atol": 1e-5, "rtol": 1e-3 if kernel == "magsac" else 1e-5, "fast_mode": True}
+
+
+def inputs(seed: int, n: int = 24, noise: float = 3e-3, outliers: int = 3) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Points of both images, a first model and weights."""
+    F, x0, x1 = (torch.from_numpy(v) for v in scene(seed, n, noise, outliers))
+    rng = np.random.default_rng(seed)
+    near = F + 0.02 * torch.from_numpy(rng.normal(size=(3, 3)))
+    return x0, x1, near, torch.from_numpy(rng.uniform(0.2, 1, n))
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_unrolled_gradients_are_those_of_the_function(kernel: str) -> None:
+    """To points, first model and weights, one of them zero, whatever the number of iterations."""
+    values = inputs(1)
+    values[3][5] = 0.0
+    for iterations in (1, 3):
+
+        def function(x0: Tensor, x1: Tensor, F0: Tensor, w: Tensor, iterations: int = iterations) -> Tensor:
+            options = {"kernel": kernel, "scale": SCALE, "iterations": iterations}
+            # Negative weights are not allowed, so finite differences at zero need some room.
+            return irls(x0, x1, F0, w + 1e-5, gradient="unrolled", **options)
+
+        attached = [v.clone().requires_grad_() for v in values]
+        assert torch.autograd.gradcheck(function, attached, **tolerances(kernel))
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_implicit_gradients_are_those_of_the_fixed_point(kernel: str) -> None:
+    """Finite differences of the converged iteration, and the gradients through all of it."""
+    x0, x1, F0, weight = inputs(2, outliers=1)
+
+    def function(x0: Tensor, x1: Tensor, w: Tensor, gradient: str) -> Tensor:
+        return irls(x0, x1, F0, w, kernel=kernel, scale=SCALE, iterations=40, gradient=gradient)
+
+    attached = [v.clone().requires_grad_() for v in (x0, x1, weight)]
+    implicit = functools.partial(function, gradient="implicit")
+    assert torch.autograd.gradcheck(implicit, attached, **tolerances(kernel))
+    direction = torch.from_numpy(np.random.default_rng(0).normal(size=(3, 3)))
+    both = [torch.autograd.grad((function(*attached, kind) * direction).sum(), attached) for kind in GRADIENTS]
+    for one, other in zip(*both, strict=True):
+        # The eigenvector's gradient knows gaps of some 1e-3 of the trace to rounding: 1e-13, times the sum over fits.
+        torch.testing.assert_close(one, other, rtol=1e-8, atol=1e-8 * float(other.abs().max()))
+
+
+def test_models_of_a_pool_have_their_own_gradients() -> None:
+    x0, x1, F0, weight = inputs(3)
+    pool = torch.stack([F0, F0 + 0.01, -F0])
+    for gradient in GRADIENTS:
+        w = weight.clone().requires_grad_()
+        found = irls(x0, x1, pool, w, scale=SCALE, gradient=gradient)
+        for i in range(3):
+            alone = irls(x0, x1, pool[i], w, scale=SCALE, gradient=gradient)
+            pooled, own = (torch.autograd.grad(F.square()[0].sum(), w, retain_graph=True)[0] for F in (found[i], alone))
+            torch.testing.assert_close(pooled, own, rtol=1e-10, atol=1e-12)
+
+
+def test_nothing_is_recorded_without_need() -> None:
+    x0, x1, F0, weight = inputs(3)
+    plain = irls(x0, x1, F0, weight, scale=SCALE)
+    assert not plain.requires_grad
+    attached = [v.clone().requires_grad_() for v in (x0, x1, weight)]
+    with torch.no_grad():
+        assert not irls(*attached[:2], F0, attached[2], scale=SCALE).requires_grad
+    first = F0.clone().requires_grad_()
+    assert not irls(x0, x1, first, weight, scale=SCALE, gradient="implicit").requires_grad
+    for gradient in GRADIENTS:
+        found = irls(*attached[:2], first, attached[2], scale=SCALE, gradient=gradient)
+        assert found.requires_grad
+        assert torch.equal(found, plain)
+    with pytest.raises(ValueError, match="gradient is 'none'"):
+        irls(x0, x1, F0, gradient="none")
+
+
+def degenerate() -> dict[str, Correspondences]:
+    """Every pair that may not take its batch down, and more that only a gradient minds."""
+    good = laws.scene(1)
+    slots = torch.arange(good.mask.shape[1])[None]
+    noisy = good.x0 * 1.1 + 3 + 0.3 * torch.randn(good.x0.shape, generator=torch.Generator().manual_seed(0))
+    return {
+        **laws.degenerate(),
+        "eight matches": good.replace(mask=slots < 8),
+        "no weight": good.replace(prior=good.prior * 0),
+        "a weight that is NaN": good.replace(prior=torch.where(slots == 3, torch.nan, good.prior)),
+        "masked NaN": good.replace(
+            mask=slots < 80, x0=torch.where((slots < 80)[..., None], good.x0, torch.nan),
+            prior=torch.where(slots < 80, good.prior, torch.nan),
+        ),
+        "a plane with noise": good.replace(x1=noisy),
+        "very small": good.replace(x0=good.x0.double() * 1e-9, x1=good.x1.double() * 1e-9),
+        "very large": good.replace(x0=good.x0.double() * 1e9, x1=good.x1.double() * 1e9),
+    }  # fmt: skip
+
+
+@functools.cache
+def first_model() -> Tensor:
+    clean = laws.scene(1, outliers=0.0)
+    return eight_point(clean.x0.double(), clean.x1.double())[0][0]
+
+
+@pytest.mark.parametrize("gradient", GRADIENTS)
+@pytest.mark.parametrize("kind", degenerate())
+def test_gradients_are_finite_and_do_not_touch_neighbours(kind: str, gradient: str) -> None:
+    """A good pair beside a degenerate one has the bits it has alone, and the gradients up to rounding."""
+    good, bad = laws.scene(1), degenerate()[kind]
+    size = {"very small": 1e-9, "very large": 1e9}.get(kind, 1.0)
+    shrink = torch.diag(torch.tensor([1 / size, 1 / size, 1.0], dtype=torch.float64))
+    F0 = torch.stack([first_model(), shrink @ first_model() @ shrink, first_model()])
+    pairs = [good.replace(x0=good.x0.double(), x1=good.x1.double()), bad, laws.scene(2)]
+    c = collate([pair.replace(x0=pair.x0.double(), x1=pair.x1.double()) for pair in pairs])
+
+    def fitted(c: Correspondences, F0: Tensor) -> tuple[Tensor, list[Tensor]]:
+        assert c.prior is not None
+        attached = [v.double().clone().requires_grad_() for v in (c.x0, c.x1, c.prior, F0)]
+        x0, x1, weight, first = attached
+        scale = torch.tensor([2.0, 2.0 * size, 2.0], dtype=torch.float64)[: len(F0)]
+        F = irls(x0, x1, first, weight, c.mask, scale=scale, gradient=gradient)
+        gradients = torch.autograd.grad(F.sum(), attached, allow_unused=gradient == "implicit")
+        return F.detach(), [g for g in gradients if g is not None]
+
+    F, gradients = fitted(c, F0)
+    assert bool(F.isfinite().all())
+    assert len(gradients) == (3 if gradient == "implicit" else 4)
+    for g in gradients:
+        assert bool(g.isfinite().all())
+    for g in gradients[:3]:
+        assert bool((g[~c.mask] == 0).all())
+    alone, its_gradients = fitted(pairs[0], F0[:1])
+    assert torch.equal(F[0], alone[0])
+    n = good.mask.shape[1]
+    for g, own in zip(gradients, its_gradients, strict=True):
+        torch.testing.assert_close(g[0, :n], own[0], rtol=1e-8, atol=1e-10 * float(own.abs().max()))
+
+
+@pytest.mark.parametrize("gradient", GRADIENTS)
+def test_padding_is_invisible_to_gradients(gradient: str) -> None:
+    x0, x1, F0, weight = inputs(4)
+    where = torch.arange(24) * 2 + 7
+    padded = [torch.full((61, *v.shape[1:]), torch.nan, dtype=torch.float64) for v in (x0, x1, weight)]
+    for long, short in zip(padded, (x0, x1, weight), strict=True):
+        long[where] = short
+    mask = torch.zeros(61, dtype=torch.bool)
+    mask[where] = True
+    results = []
+    for a, b, w, m in ((x0, x1, weight, None), (*padded, mask)):
+        attached = [v.clone().requires_grad_() for v in (a, b, w)]
+        F = irls(*attached[:2], F0, attached[2], m, scale=SCALE, gradient=gradient)
+        results.append((F.detach(), torch.autograd.grad(F[0].sum(), attached)))
+    assert torch.equal(results[0][0], results[1][0])
+    for short, long in zip(results[0][1], results[1][1], strict=True):
+        torch.testing.assert_close(long[where], short, rtol=1e-10, atol=1e-12)
+        assert bool((long[~mask] == 0).all())
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_weights_of_a_kernel_make_it_irls(kernel: str) -> None:
+    """The same step serves both: `irls` is the iteration whose weights are w rho'(r^2) / g^2."""
+    x0, x1, F0, weight = (torch.stack(v) for v in zip(*(inputs(s) for s in range(3)), strict=True))
+    F0 = F0 / F0.flatten(1).norm(dim=1)[:, None, None]
+    robust = named_kernel(kernel)
+
+    def weigh(F: Tensor | None, residual: Tensor | None) -> Tensor:
+        assert F is not None
+        assert residual is not None
+        line1 = torch.einsum("bij,bnj->bni", F, torch.nn.functional.pad(x0, (0, 1), value=1.0))
+        line0 = torch.einsum("bji,bnj->bni", F, torch.nn.functional.pad(x1, (0, 1), value=1.0))
+        g2 = line1[..., :2].square().sum(-1) + line0[..., :2].square().sum(-1)
+        return weight * robust.weight(residual.square(), torch.tensor(SCALE**2, dtype=torch.float64)) / g2
+
+    fits = reweighted_fits(x0, x1, weigh, 3, F0=F0)
+    assert bool(fits.valid.all())
+    assert fits.F.shape == (3, 3, 3, 3)
+    for i in range(3):
+        expected = irls(x0, x1, F0, weight, kernel=kernel, scale=SCALE, iterations=i + 1)
+        # Rounding of 1e-16 times the condition of the normal equations, 1e6.
+        assert float(distance(fits.F[i].flatten(1).T, expected.flatten(1).T).max()) < 1e-9
+
+
+def test_a_network_learns_through_the_fits() -> None:
+    """Weights of side information and residuals fed back: gradients reach every parameter; descending them helps."""
+    c = collate([laws.scene(1), laws.scene(2, 60)])
+    assert c.quality is not None
+    truth = torch.stack(
+        [
+            eight_point(p.x0.double(), p.x1.double())[0][0]
+            for p in (laws.scene(i, n, 0.0, 0.0) for i, n in ((1, 150), (2, 60)))
+        ]
+    )
+    quality = torch.where(c.mask, c.quality, 0).double()
+    torch.manual_seed(0)
+    network = torch.nn.Sequential(torch.nn.Linear(2, 8), torch.nn.Tanh(), torch.nn.Linear(8, 1)).double()
+
+    def weigh(F: Tensor | None, residual: Tensor | None) -> Tensor:
+        assert (F is None) == (residual is None)
+        distance = torch.zeros_like(quality) if residual is None else residual
+        assert distance.shape == quality.shape
+        return torch.sigmoid(network(torch.stack([quality, torch.log1p(distance)], -1))[..., 0])
+
+    optimiser = torch.optim.Adam(network.parameters(), lr=0.1)
+    losses = []
+    for _ in range(20):
+        fits = reweighted_fits(c.x0, c.x1, weigh, 3, c.mask)
+        assert bool(fits.valid.all())
+        clean0, clean1 = (torch.where(c.mask[..., None], x, 0).double() for x in (c.x0, c.x1))
+        inliers = c.mask & (sampson(truth, clean0, clean1) < 3)
+        loss = torch.log1p(torch.where(inliers, sampson(fits.F, clean0, clean1), 0)).mean()
+        optimiser.zero_grad()
+        loss.backward()
+        assert all(p.grad is not None and bool((p.grad != 0).any()) for p in network.parameters())
+        optimiser.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.9 * losses[0]
+
+
+def test_fits_of_hopeless_pairs() -> None:
+    """Zero and not valid without a start, and that start with one; a fit that fails later repeats the last."""
+    pairs = [laws.scene(1), *degenerate().values()]
+    c = collate([pair.replace(x0=pair.x0.double(), x1=pair.x1.double()) for pair in pairs])
+    base = torch.where(c.mask, c.prior, 0).double().nan_to_num(0)
+    weight = base.clone().requires_grad_()
+    calls: list[int] = []
+
+    def weigh(F: Tensor | None, residual: Tensor | None) -> Tensor:
+        calls.append(0)
+        weights = weight if residual is None else weight / (1 + residual.square())
+        return weights if len(calls) < 3 else torch.where(torch.arange(len(c.mask))[:, None] == 0, -weights, weights)
+
+    fits = reweighted_fits(c.x0, c.x1, weigh, 3, c.mask)
+    assert fits.valid[:, 0].tolist() == [True, True, False]
+    assert torch.equal(fits.F[2, 0], fits.F[1, 0])
+    assert bool(fits.F.isfinite().all())
+    never = ~fits.valid.any(0)
+    assert bool(never.any())
+    assert bool((fits.F[:, never] == 0).all())
+    (gradient,) = torch.autograd.grad(fits.F.sum(), weight)
+    assert bool(gradient.isfinite().all())
+    assert bool((gradient[never] == 0).all())
+    start = torch.eye(3, dtype=torch.float64).expand(len(c.mask), 3, 3) / 3**0.5
+    calls.clear()
+    assert bool((reweighted_fits(c.x0, c.x1, weigh, 1, c.mask, F0=start).F[0, never] == start[0]).all())
+    alone = reweighted_fits(pairs[0].x0.double(), pairs[0].x1.double(), lambda F, r: base[:1, :150], 1)
+    assert torch.equal(alone.F[0, 0], fits.F[0, 0])
