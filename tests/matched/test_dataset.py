@@ -15,9 +15,11 @@ import torch
 from torch.utils.data import DataLoader
 
 from fmtorch import presets
+from fmtorch.data import load
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.data.rendered import RenderedPairs
 from fmtorch.data.rendered.generate import FAMILIES, PLANS, Task
+from fmtorch.geometry.epipolar import symmetric_max
 from fmtorch.matched import (
     Augmentation,
     Draw,
@@ -33,6 +35,7 @@ from fmtorch.matched import labels as labels_module
 from fmtorch.matched.compute import SHARD, partition
 from fmtorch.matched.labels import label
 from fmtorch.pipeline import Pipeline
+from tests.conftest import shared_path
 from tests.matched.conftest import SIFT
 
 
@@ -194,6 +197,18 @@ def test_pairs_that_fail_are_left_out_and_told(rendered: RenderedPairs, tmp_path
     nameless = Pipeline(stages.extractor, lambda a, b: stages.matcher(a, b), {}, stages.estimator)
     with pytest.raises(ValueError, match="cannot be kept"):
         MatchedPairs(Some([good]), nameless, root=tmp_path)
+
+
+def test_a_folder_in_the_benchmarks_layout_is_labelled_by_epipolar_lines(tmp_path: Path) -> None:
+    pairs = load("fmbench", root=shared_path("data/Strecha"))
+    matches = MatchedPairs(Some([pairs[0], pairs[1]]), **SIFT, root=tmp_path)
+    for item in (matches[0], matches[1]):
+        c = item.correspondences
+        distance = symmetric_max(item.F, c.x0.double(), c.x1.double())
+        expected = torch.where(distance <= 3, 1, torch.where(distance > 6, 0, -1)).to(torch.int8)
+        clear = ((distance - 3).abs() > 1e-6) & ((distance - 6).abs() > 1e-6)  # rounding decides on the thresholds
+        assert torch.equal(item.label[clear], expected[clear])
+        assert set(item.label[0].tolist()) == {-1, 0, 1}
 
 
 def test_a_shard_holds_pairs_of_one_scene(rendered: RenderedPairs) -> None:
