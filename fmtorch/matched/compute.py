@@ -17,7 +17,8 @@ from fmtorch.matched.shards import write_shard
 from fmtorch.pipeline import Outcome, Pipeline
 from fmtorch.types import Correspondences
 
-SHARD = 32  # pairs in a file, all of one scene: what an interruption can cost
+Progress = Callable[[int, int], None]  # called with (pairs done, pairs in all)
+SHARD = 32  # pairs in a file, all of one scene: what an interruption can cost; a change is one of shards.FORMAT
 _IMAGES = 64  # whose features each worker may need again
 _FLOATS = ("quality", "prior", "noise")
 _FRAMES = ("lafs0", "lafs1")
@@ -107,6 +108,3 @@ def _best(c: Correspondences, most: int) -> Correspondences:
 
 def _flat(value: torch.Tensor, kind: torch.dtype) -> Any:
     return value.to(kind).reshape(-1).numpy()
-
-
-Progress = Callable[[int, int], None]

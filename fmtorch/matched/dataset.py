@@ -31,7 +31,8 @@ class MatchedPairs(StoredMatches):
     Matches are computed once, by `workers` threads, and kept on disk; an interrupted computation goes on where it
     stopped, a damaged file is computed anew. The folder's name holds a digest of all that defines them: data set,
     stages before estimation, label rules, libraries. Pairs come ordered by family, scene and images. A pipeline without
-    a ratio test leaves the threshold to the `augmentation`.
+    a ratio test leaves the threshold to the `augmentation`. Several processes may compute the same folder at once: each
+    does all that is missing when it starts, and they agree.
 
     Args:
         dataset: image pairs with ground truth; labels are by depth where it is a `DepthDataset`.

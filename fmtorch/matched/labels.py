@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.data.pairs import DepthDataset, ImagePair, PairDataset
+from fmtorch.data.pairs import DepthDataset, ImagePair, ImageSource, PairDataset
 
 INLIER, OUTLIER, IGNORED = 1, 0, -1
 INLIER_PX = 3.0  # largest error of an inlier, pixels
@@ -59,10 +59,10 @@ def _banded(error: NDArray[np.float64]) -> Labels:
     return np.select([error <= INLIER_PX, error > OUTLIER_PX], [INLIER, OUTLIER], IGNORED).astype(np.int8)
 
 
-def depths(dataset: DepthDataset, image: object, x: Points) -> NDArray[np.float64]:
+def depths(dataset: DepthDataset, image: ImageSource, x: Points) -> NDArray[np.float64]:
     """The depths (k, n) at points (n, 2) of an image and `EDGE_PX` beside them."""
     around = (x[None] + _AROUND[:, None]).reshape(-1, 2)
-    return dataset.depth(image, around).reshape(len(_AROUND), -1)  # type: ignore[arg-type]
+    return dataset.depth(image, around).reshape(len(_AROUND), -1)
 
 
 def transfer_error(

@@ -41,10 +41,10 @@ def staged(monkeypatch: pytest.MonkeyPatch) -> tuple[Task, Camera]:
     light = Light((0.0, 0.0, 1.0))
     sky = np.zeros((8, 8, 3), np.uint8)
     scene = Scene([wall_and_screen(False), wall_and_screen(True)], [light] * 2, sky, shots, [(0, 1)])
-    monkeypatch.setattr(depth_module, "_scene", lambda task: scene)
-    depth_module._visible.cache_clear()
-    yield Task("indoor", "test", 0, 0, SMALL), camera
-    depth_module._visible.cache_clear()
+    recent = depth_module._Recent()
+    recent.scene = lambda task: scene  # type: ignore[assignment]
+    monkeypatch.setattr(depth_module, "_recent", recent)
+    return Task("indoor", "test", 0, 0, SMALL), camera
 
 
 def test_what_moves_is_where_it_was_when_the_photograph_was_taken(staged: tuple[Task, Camera]) -> None:

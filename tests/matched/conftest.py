@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -11,14 +13,21 @@ from fmtorch.data.rendered.cameras import calibration
 from fmtorch.matched import LabelledMatches, MatchedPairs
 from fmtorch.types import Correspondences, pair_key
 
-TINY = Plan(scenes=2, shots=3, pairs=3, scale=0.3)
+TINY = Plan(scenes=2, shots=4, pairs=4, scale=0.25)
+FAMILY = "indoor"  # the quickest to draw
 SIFT = {"pipeline": "sift_ratio", "overrides": ["pruner=[one_to_one]"]}
 
 
 @pytest.fixture(scope="session")
-def rendered(tmp_path_factory: pytest.TempPathFactory) -> RenderedPairs:
-    """Pairs of two training scenes of two families."""
-    return RenderedPairs("train", families=["indoor", "driving"], root=tmp_path_factory.mktemp("drawn"), plan=TINY)
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cache folder, as $FMTORCH_CACHE names one, in which the scenes of `rendered` are."""
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="session")
+def rendered(cache: Path) -> RenderedPairs:
+    """Pairs of two training scenes."""
+    return RenderedPairs("train", families=[FAMILY], root=cache / "rendered", plan=TINY, workers=1)
 
 
 @pytest.fixture(scope="session")

@@ -15,8 +15,11 @@ import torch
 from torch.utils.data import DataLoader
 
 from fmtorch import presets
+from fmtorch.data import load
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.data.rendered import RenderedPairs
+from fmtorch.data.rendered.generate import FAMILIES, PLANS, Task
+from fmtorch.geometry.epipolar import symmetric_max
 from fmtorch.matched import (
     Augmentation,
     Draw,
@@ -32,6 +35,7 @@ from fmtorch.matched import labels as labels_module
 from fmtorch.matched.compute import SHARD, partition
 from fmtorch.matched.labels import label
 from fmtorch.pipeline import Pipeline
+from tests.conftest import shared_path
 from tests.matched.conftest import SIFT
 
 
@@ -95,24 +99,33 @@ def test_computed_once_by_any_number_of_workers(rendered: RenderedPairs, matched
 
 
 def test_an_interrupted_computation_goes_on(
-    rendered: RenderedPairs, matched: MatchedPairs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    rendered: RenderedPairs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stop(done: int, total: int) -> None:
-        if done:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        MatchedPairs(rendered, **SIFT, root=tmp_path, workers=1, progress=stop)
-    (folder,) = tmp_path.iterdir()
-    before = {path: path.stat().st_mtime_ns for path in folder.glob("shard-*")}
-    assert 0 < len(before) < len(contents(matched.folder))
+    monkeypatch.setattr(compute_module, "SHARD", 1)
+    whole = MatchedPairs(rendered, **SIFT, root=tmp_path / "whole", workers=1)
     written: list[Path] = []
     original = compute_module.write_shard
+
+    def interrupted(path: Path, rows: Any) -> None:
+        if len(written) == 2:
+            raise KeyboardInterrupt
+        written.append(path)
+        original(path, rows)
+
+    monkeypatch.setattr(compute_module, "write_shard", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        MatchedPairs(rendered, **SIFT, root=tmp_path / "parts", workers=1)
+    folder = tmp_path / "parts" / whole.folder.name
+    assert set(contents(folder)) == {path.name for path in written}
+    assert len(contents(whole.folder)) > 2
+    first = set(written)
     monkeypatch.setattr(compute_module, "write_shard", lambda path, rows: (written.append(path), original(path, rows)))
-    MatchedPairs(rendered, **SIFT, root=tmp_path, workers=1)
-    assert not set(written) & set(before)
-    assert contents(folder) == contents(matched.folder)
-    assert all(path.stat().st_mtime_ns == time for path, time in before.items())
+    calls: list[tuple[int, int]] = []
+    MatchedPairs(rendered, **SIFT, root=tmp_path / "parts", workers=1, progress=lambda *c: calls.append(c))
+    assert calls[0] == (2, len(rendered))
+    assert len(written) == len(set(written)) == len(contents(whole.folder))
+    assert first < set(written)
+    assert contents(folder) == contents(whole.folder)
 
 
 @pytest.mark.parametrize("damage", ["changed", "cut", "fewer pairs"])
@@ -186,6 +199,18 @@ def test_pairs_that_fail_are_left_out_and_told(rendered: RenderedPairs, tmp_path
         MatchedPairs(Some([good]), nameless, root=tmp_path)
 
 
+def test_a_folder_in_the_benchmarks_layout_is_labelled_by_epipolar_lines(tmp_path: Path) -> None:
+    pairs = load("fmbench", root=shared_path("data/Strecha"))
+    matches = MatchedPairs(Some([pairs[0], pairs[1]]), **SIFT, root=tmp_path)
+    for item in (matches[0], matches[1]):
+        c = item.correspondences
+        distance = symmetric_max(item.F, c.x0.double(), c.x1.double())
+        expected = torch.where(distance <= 3, 1, torch.where(distance > 6, 0, -1)).to(torch.int8)
+        clear = ((distance - 3).abs() > 1e-6) & ((distance - 6).abs() > 1e-6)  # rounding decides on the thresholds
+        assert torch.equal(item.label[clear], expected[clear])
+        assert set(item.label[0].tolist()) == {-1, 0, 1}
+
+
 def test_a_shard_holds_pairs_of_one_scene(rendered: RenderedPairs) -> None:
     pairs = [dataclasses.replace(rendered[0], identity=f"{i}", scene=f"{i % 3}") for i in range(3 * SHARD + 10)]
     shards = partition(pairs)
@@ -239,9 +264,20 @@ def test_epochs_and_draws(matched: MatchedPairs) -> None:
 def test_validation_scenes_are_the_last_of_each_family(matched: MatchedPairs) -> None:
     training, validation = split_scenes(matched, last=1)
     assert len(training) + len(validation) == len(matched)
-    assert {about["scene"] for about in validation.pairs} == {"indoor-train-001", "driving-train-001"}
-    assert {about["scene"] for about in training.pairs} == {"indoor-train-000", "driving-train-000"}
+    assert {about["scene"] for about in validation.pairs} == {"indoor-train-001"}
+    assert {about["scene"] for about in training.pairs} == {"indoor-train-000"}
     where = [about["identity"] for about in matched.pairs].index(validation.pairs[0]["identity"])
     assert torch.equal(validation[0].label, matched[where].label)
     with pytest.raises(ValueError, match="2 scenes"):
         split_scenes(matched)
+
+
+def test_training_has_no_scene_of_the_test_split(matched: MatchedPairs) -> None:
+    """What the scenes are made of is compared in tests/data/test_rendered.py."""
+    plans = {plan for (_, split), plan in PLANS.items() if split == "test"}
+    test = {Task(family, "test", n, 0, plan).name for plan in plans for family in FAMILIES for n in range(plan.scenes)}
+    training = {about["scene"] for about in matched.pairs}
+    assert test
+    assert training
+    assert not training & test
+    assert all(f"rendered/{about['scene']}/" in about["identity"] for about in matched.pairs)
