@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import json
-from collections.abc import Mapping
+import logging
+import warnings
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import torch
@@ -58,10 +61,11 @@ def export_onnx(
     alone = _OnePair(copy.deepcopy(network.backbone)).eval().cpu().float()
     generator = torch.Generator().manual_seed(0)
     example = torch.rand(1, network.input_channels, EXAMPLE_MATCHES, generator=generator)
-    program = torch.onnx.export(
-        alone, (example,), dynamo=True, opset_version=OPSET, input_names=[INPUT], output_names=[OUTPUT],
-        dynamic_shapes={"x": {2: torch.export.Dim("n", min=1)}}, verbose=False,
-    )  # fmt: skip
+    with _quiet():
+        program = torch.onnx.export(
+            alone, (example,), dynamo=True, opset_version=OPSET, input_names=[INPUT], output_names=[OUTPUT],
+            dynamic_shapes={"x": {2: torch.export.Dim("n", min=1)}}, verbose=False,
+        )  # fmt: skip
     assert program is not None
     model = program.model_proto
     onnx.helper.set_model_props(model, _metadata(network, temperature, notes))
@@ -69,6 +73,20 @@ def export_onnx(
     with replacing(path) as unfinished:
         onnx.save(model, unfinished)
         _check(network, alone, unfinished, torch.rand(1, network.input_channels, 3 * EXAMPLE_MATCHES))
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without the exporter's messages on operators that are not installed and on its own deprecated calls."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)
+            yield
+    finally:
+        logger.setLevel(level)
 
 
 class _OnePair(nn.Module):

@@ -22,7 +22,7 @@ from fmtorch.training.pruners.validation import Use, Validation
 from tests.training.synthetic_matches import batches, labelled_pair
 
 STEPS = 12
-CPU = {"accelerator": "cpu", "devices": 1, "gradient_clip_val": 1.0, "enable_progress_bar": False}
+CPU = {"accelerator": "cpu", "devices": 1, "gradient_clip_val": 1.0}
 
 
 def module() -> PrunerTraining:

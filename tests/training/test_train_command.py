@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 pytest.importorskip("lightning", reason="training needs the extra `train`")
 
@@ -85,6 +86,19 @@ def test_a_network_of_ones_own_is_trained_and_used(root: Path, tmp_path: Path) -
     assert evaluated.returncode == 0, evaluated.stderr
     identity = (here / "run" / "run.json").read_text()
     assert "mine" in identity
+
+
+def test_two_processes_train_one_network(root: Path, tmp_path: Path) -> None:
+    """With gloo, on the CPU: each has batches of its own, and gradients are averaged."""
+    small = ["pruner.lc.network.channels=8", "pruner.lc.network.blocks=2", "output=out"]
+    two = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
+    ended = command("train", "dataset=fmbench", f"dataset.root={root}", *SHORT, *small, *two, cwd=tmp_path)
+    assert ended.returncode == 0, ended.stderr
+    checkpoint = torch.load(tmp_path / "out" / "checkpoints" / "step=6.ckpt", weights_only=True)
+    assert checkpoint["global_step"] == 6
+    assert all(bool(torch.isfinite(value).all()) for value in checkpoint["state_dict"].values())
+    assert ended.stdout.count("pairs to train on") == 1
+    assert (tmp_path / "out" / "lc.safetensors").is_file()
 
 
 def trained(monkeypatch: pytest.MonkeyPatch, folder: Path, *overrides: str) -> Path:

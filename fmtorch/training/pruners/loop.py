@@ -20,6 +20,7 @@ from torch.utils.data import DataLoader
 from fmtorch.storage.files import replacing
 from fmtorch.storage.runs import identity_digest
 from fmtorch.training.pruners.module import PrunerTraining
+from fmtorch.training.pruners.progress import TrainingBar
 
 CHECKPOINTS, BEST, LOGS = "checkpoints", "best.ckpt", "logs"
 
@@ -109,8 +110,9 @@ def train(
         lightning_trainer = lightning.Trainer(
             max_steps=total, max_epochs=1, val_check_interval=every, check_val_every_n_epoch=None,
             num_sanity_val_steps=0, log_every_n_steps=min(10, every), default_root_dir=folder,
-            logger=TensorBoardLogger(folder, name=LOGS, version=""), callbacks=[kept, best, *stop, *callbacks],
-            use_distributed_sampler=False, enable_model_summary=False, deterministic=True, **trainer,
+            logger=TensorBoardLogger(folder, name=LOGS, version=""), use_distributed_sampler=False,
+            callbacks=[kept, best, *stop, TrainingBar(total, monitor), *callbacks],
+            enable_progress_bar=False, enable_model_summary=False, deterministic=True, **trainer,
         )  # fmt: skip
         if step < total:
             own = batches(step, lightning_trainer.global_rank, lightning_trainer.world_size)

@@ -52,8 +52,10 @@ def run(config: DictConfig, name: str) -> Path:
     network = presets.instantiate(network_config, f"pruner={name}, network")
     validation = Validation([m for _, m in matches.validation], uses, [p.family for p, _ in matches.validation])
     module = PrunerTraining(network, objective, optimisation, validation)
-    about = f"{len(matches.training)} pairs to train on, {len(matches.validation)} to validate on"
-    console.print(f"{about}; {folder}", highlight=False)
+    first = int(os.environ.get("LOCAL_RANK", "0")) == 0  # of several processes the one that reports
+    if first:
+        about = f"{len(matches.training)} pairs to train on, {len(matches.validation)} to validate on"
+        console.print(f"{about}; {folder}", highlight=False, markup=False)
     shown = matches.validation[:: max(1, len(matches.validation) // PICTURES)][:PICTURES]
     steps, seconds = train(
         module,
@@ -68,7 +70,7 @@ def run(config: DictConfig, name: str) -> Path:
         monitor=config.validation.monitor,
         callbacks=(ValidationPictures(shown),),
     )
-    if int(os.environ.get("LOCAL_RANK", "0")) == 0:
+    if first:
         processor = f"{os.cpu_count()} cores of {platform.processor() or platform.machine()}"
         facts = {**identity, "steps": steps, "seconds": seconds, "data": matches.description, "processor": processor}
         report(write_result(folder, name, module, facts), name)
@@ -79,9 +81,9 @@ def report(result: Result, name: str) -> None:
     """Say on the terminal what came out and how to use it."""
     for key, value in result.evaluation.figures.items():
         console.print(f"{key:32} {value:.4f}", highlight=False)
-    console.print(f"[dim]{', '.join(str(path) for path in result.files)}[/dim]", highlight=False)
-    console.print(f"use it: python -m fmtorch.eval pipeline=sift_ratio 'pruner=[ratio,one_to_one,{name}]' "
-                  f"pruner.{name}.file={result.files[0]}", highlight=False, soft_wrap=True)  # fmt: skip
+    use = f"python -m fmtorch.eval pipeline=sift_ratio 'pruner=[ratio,one_to_one,{name}]' pruner.{name}.file={result.files[0]}"
+    for line in (", ".join(str(path) for path in result.files), f"use it: {use}"):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def network_of(config: DictConfig, name: str) -> dict[str, Any]:
