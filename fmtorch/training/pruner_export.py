@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from jaxtyping import Float
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from fmtorch.pruning.networks.files import INPUT, NETWORK, OUTPUT, TEMPERATURE, OnnxBackbone, stated_network
+from fmtorch.pruning.networks.files import INPUT, OUTPUT, LearnedFile, OnnxBackbone, stated_network
 from fmtorch.pruning.networks.layers import Slots
 from fmtorch.pruning.networks.prediction import Exportable
 from fmtorch.storage.files import replacing
@@ -92,4 +91,4 @@ def _check(network: nn.Module, alone: nn.Module, path: Path, x: Tensor) -> None:
 
 
 def _metadata(network: nn.Module, temperature: float, notes: Mapping[str, str] | None) -> dict[str, str]:
-    return {**(notes or {}), NETWORK: json.dumps(stated_network(network)), TEMPERATURE: repr(float(temperature))}
+    return LearnedFile(stated_network(network), float(temperature), dict(notes or {})).metadata()
