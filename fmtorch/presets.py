@@ -19,12 +19,14 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
+from fmtorch import hydra_source
 from fmtorch.pipeline import Pipeline
 from fmtorch.resources import conf_dir
 from fmtorch.storage.features import cached
 
 STAGES = ("features", "matcher", "pruner", "estimator")  # groups that a pipeline chooses from
 _composing = threading.Lock()  # Hydra composes through a global
+hydra_source.register()
 
 
 def available(group: str, config_dir: Path | str | None = None) -> list[str]:
@@ -116,7 +118,8 @@ def instantiate(config: Mapping[str, Any] | DictConfig, where: str, **extra: Any
     A value that is a mapping with a `_target_` of its own becomes an object first.
     Raises ValueError for an unknown option, naming those that exist; what the target itself raises passes through.
     """
-    values = OmegaConf.to_container(config, resolve=True) if isinstance(config, DictConfig) else dict(config)
+    values = OmegaConf.to_container(config, resolve=True) if isinstance(config, DictConfig) else config
+    values = dict(values) if isinstance(values, Mapping) else values
     if not isinstance(values, dict) or "_target_" not in values:
         raise ValueError(f"{where}: a preset is a mapping with a `_target_`, the dotted name of what it builds")
     target = hydra.utils.get_object(str(values.pop("_target_")))
@@ -168,6 +171,11 @@ def _pruners(config: DictConfig) -> dict[str, Any]:
         return {}
     plain = OmegaConf.to_container(config.pruner, resolve=True)
     assert isinstance(plain, dict)
+    if "_target_" in plain:
+        raise ValueError(
+            "pruner: a `_target_` stands where the names of pruners belong; the `# @package` line of a preset of yours "
+            "must be `# @package pruner.<name>`, or be left out"
+        )
     return {str(name): value for name, value in plain.items()}
 
 

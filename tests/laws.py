@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.stages import Estimator
+from fmtorch.stages import Estimator, Pruner
 from fmtorch.types import Correspondences, collate
 
 OTHER_LIBRARIES = ("opencv_", "poselib", "kornia_ransac", "magsac_cpp", "gc_ransac_cpp", "degensac_cpp")
@@ -48,6 +48,27 @@ def quick(name: str, hypotheses: int = 200, round: int = 100) -> Estimator:
 
     built: Estimator = presets.build("estimator", name, **fewer(presets.load("estimator", name)))
     return built
+
+
+SMALL_NETWORKS = {
+    "fmtorch.pruning.networks.LC": {"channels": 16, "blocks": 2},
+    "fmtorch.pruning.networks.DFE": {"widths": [16, 8], "iterations": 3},
+}
+
+
+def quick_pruner(name: str) -> Pruner:
+    """A pruner preset; a learned one with a small untrained network, on which the laws do not depend."""
+    network = presets.load("pruner", name).get("network")
+    torch.manual_seed(7)  # with which about half of the matches have P > 0.5
+    small = {} if network is None else {"file": None, "network": SMALL_NETWORKS[network["_target_"]]}
+    built: Pruner = presets.build("pruner", name, **small)
+    return built
+
+
+def calibrated(c: Correspondences) -> Correspondences:
+    """The same pairs with the calibration matrices of `scene`, which some learned pruners need."""
+    K = torch.tensor([[800.0, 0, 480], [0, 800, 320], [0, 0, 1]]).expand(len(c), 3, 3)
+    return c.replace(K0=K, K1=K)
 
 
 def scene(index: int, count: int = 150, outliers: float = 0.4, noise: float = 0.3) -> Correspondences:

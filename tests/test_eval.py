@@ -136,6 +136,61 @@ def test_a_users_own_estimator_by_config_dir(root: Path, tmp_path: Path) -> None
     assert json.loads((tmp_path / "run" / "run.json").read_text())["config"]["estimator"]["method"] == "FM_LMEDS"
 
 
+OWN_PRUNER = """import torch
+
+class Mine(torch.nn.Module):
+    def forward(self, c):
+        return 4 - 8 * c.quality
+"""
+OWN_PRESET = """_target_: fmtorch.pruning.LearnedPruner
+network: {_target_: mine.Mine}
+threshold: 0.5
+prior: false
+"""
+
+
+@pytest.mark.parametrize("header", ["", "# @package _group_\n", "# @package pruner.mine\n"])
+def test_a_users_own_pruner_by_config_dir(root: Path, tmp_path: Path, header: str) -> None:
+    """With or without a `@package` line it goes under its file's name, in its place, and takes options by that name."""
+    here = tmp_path / "here"
+    (here / "my_conf" / "pruner").mkdir(parents=True)
+    (here / "my_conf" / "pruner" / "mine.yaml").write_text(header + OWN_PRESET)
+    (here / "mine.py").write_text(OWN_PRUNER)
+    run = evaluate(
+        "--config-dir", "my_conf", "pruner=[one_to_one,mine,likely]", "pruner.mine.prior=true", "dataset=fmbench",
+        f"dataset.root={root}", *OPTIONS, "run_dir=run", "limit=2", cwd=here,
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr
+    config = json.loads((here / "run" / "run.json").read_text())["config"]
+    assert [list(entry) for entry in config["pruner"]] == [["one_to_one"], ["mine"], ["likely"]]
+    assert config["pruner"][1]["mine"]["prior"] is True
+    assert "mine.Mine" in config["code"]
+    assert all(row["ok"] for row in rows(here / "run"))
+
+
+def test_mistakes_in_a_users_own_pruner_are_told(root: Path, tmp_path: Path) -> None:
+    own = tmp_path / "my_conf" / "pruner"
+    own.mkdir(parents=True)
+    (own / "empty.yaml").write_text("threshold: 0.5\n")
+    (own / "elsewhere.yaml").write_text("# @package _global_\npruner: {_target_: fmtorch.pruning.OneToOne}\n")
+    (own / "typo.yaml").write_text("_target_: fmtorch.pruning.RatioTest\nthreshhold: 0.5\n")
+    told = {
+        "pruner=empty": "pruner=empty: a preset is a mapping with a `_target_`",
+        "pruner=elsewhere": "must be `# @package pruner.<name>`, or be left out",
+        "pruner=typo": "pruner=typo: no option threshhold; there are: threshold",
+        "pruner=lc pruner.lc.file=runs/absent": "absent.safetensors does not exist: python -m fmtorch.train pruner=lc",
+    }
+    for options, message in told.items():
+        run = evaluate(
+            "--config-dir", str(tmp_path / "my_conf"), *options.split(), "dataset=fmbench", f"dataset.root={root}",
+            *OPTIONS, f"run_dir={tmp_path / 'run'}", "limit=1", cwd=tmp_path,
+        )  # fmt: skip
+        assert run.returncode == 1, options
+        assert message in run.stderr
+        assert "Traceback" not in run.stderr
+        assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize(
     ("damage", "told"),
     [

@@ -18,9 +18,11 @@ from tests.laws import (
     Result,
     Subject,
     assert_same,
+    calibrated,
     degenerate,
     live_values,
     quick,
+    quick_pruner,
     scene,
     scenes,
     small,
@@ -47,10 +49,10 @@ def _estimator(name: str) -> Subject:
 
 
 def _pruner(name: str) -> Subject:
-    pruner = presets.build("pruner", name)
+    pruner = quick_pruner(name)
 
     def run(c: Correspondences) -> Result:
-        pruned = pruner(c)
+        pruned = pruner(calibrated(c))
         told = {name: getattr(pruned, name) for name in ("prior", "noise")}
         return {"kept": pruned.mask, **{name: value for name, value in told.items() if value is not None}}
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import json
 import logging
 import warnings
 from collections.abc import Iterator, Mapping
@@ -15,7 +14,7 @@ from jaxtyping import Float
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from fmtorch.pruning.networks.files import INPUT, NETWORK, OUTPUT, TEMPERATURE, OnnxBackbone, stated_network
+from fmtorch.pruning.networks.files import INPUT, OUTPUT, LearnedFile, OnnxBackbone, stated_network
 from fmtorch.pruning.networks.layers import Slots
 from fmtorch.pruning.networks.prediction import Exportable
 from fmtorch.storage.files import replacing
@@ -110,4 +109,4 @@ def _check(network: nn.Module, alone: nn.Module, path: Path, x: Tensor) -> None:
 
 
 def _metadata(network: nn.Module, temperature: float, notes: Mapping[str, str] | None) -> dict[str, str]:
-    return {**(notes or {}), NETWORK: json.dumps(stated_network(network)), TEMPERATURE: repr(float(temperature))}
+    return LearnedFile(stated_network(network), float(temperature), dict(notes or {})).metadata()

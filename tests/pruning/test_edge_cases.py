@@ -11,7 +11,7 @@ import torch
 
 from fmtorch import presets
 from fmtorch.types import Correspondences
-from tests.laws import scene
+from tests.laws import calibrated, quick_pruner, scene
 
 PRUNERS = presets.available("pruner")
 PER_MATCH = ("x0", "x1", "quality", "prior", "lafs0", "lafs1", "mutual")
@@ -47,7 +47,7 @@ def edge_cases() -> dict[str, Correspondences]:
 @pytest.mark.parametrize("case", edge_cases())
 def test_edge_case(name: str, case: str) -> None:
     c = edge_cases()[case]
-    pruned = presets.build("pruner", name)(c)
+    pruned = quick_pruner(name)(calibrated(c))
     assert pruned.mask.shape == c.mask.shape
     assert not (pruned.mask & ~c.mask).any()
     if pruned.prior is not None and pruned.prior is not c.prior:
@@ -67,12 +67,11 @@ def test_matches_that_all_move_alike_in_one_cell_are_kept(name: str) -> None:
 MOST = [name for name in PRUNERS if name != "code"]  # code_soft does the same work, tests/pruning/test_code.py the rest
 MANY = """
 import sys, torch
-from fmtorch import presets
-from tests.laws import scene
+from tests.laws import calibrated, quick_pruner, scene
 torch.set_num_threads(1)
-many = scene(1, 50_000)
+many = calibrated(scene(1, 50_000))
 for name in sys.argv[1:]:
-    stage = presets.build("pruner", name)
+    stage = quick_pruner(name)
     framed = {} if name == "frame_consistency" else {"lafs0": None, "lafs1": None}  # the scene's frames are random
     pruned = stage(many.replace(**framed))
     assert 0 < int(pruned.mask.sum()) <= 50_000, name

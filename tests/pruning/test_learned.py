@@ -252,6 +252,16 @@ def test_a_users_network_runs_with_torch_alone() -> None:
         LearnedPruner(Wrong())(scene(0))
 
 
+def test_equal_networks_are_equal_files(tmp_path: Path) -> None:
+    network = LC(channels=4, blocks=1)
+    notes = {str(i): "x" for i in range(9)}
+    for name in ("a", "b"):
+        save_weights(network, tmp_path / f"{name}.safetensors", notes=notes)
+        export_onnx(network, tmp_path / f"{name}.onnx", notes=notes)
+    for suffix in (".safetensors", ".onnx"):
+        assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
+
+
 def test_identity_is_the_file_and_the_options(files: tuple[nn.Module, Path], tmp_path: Path) -> None:
     network, path = files
     pruner = LearnedPruner(network, file=path)

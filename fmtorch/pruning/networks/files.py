@@ -6,6 +6,7 @@ Reading one executes nothing of it: whoever reads the file builds the network, w
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,15 +21,23 @@ from fmtorch.pruning.networks.layers import Slots
 from fmtorch.resources import models_dir
 
 SUFFIXES = {"torch": ".safetensors", "onnx": ".onnx"}  # of the file that each runtime reads
-NETWORK, TEMPERATURE = "network", "temperature"  # keys of a file's metadata: JSON, and a number
+METADATA = "fmtorch"  # the one key of a file's metadata: several have no fixed order, and so no digest, in safetensors
 INPUT, OUTPUT = "matches", "outputs"  # of an ONNX file: (1, channels, N) and (1, outputs, N)
 
 
 class LearnedFile(NamedTuple):
-    """What a learned file says beside its weights. notes: all of its metadata."""
+    """What a learned file says beside its weights, kept in it as JSON.
 
+    network: as of `stated_network`. temperature: by which log-odds are divided. notes: anything else.
+    """
+
+    network: Mapping[str, Any]
     temperature: float
     notes: Mapping[str, str]
+
+    def metadata(self) -> dict[str, str]:
+        """As a file's metadata; equal contents are equal bytes."""
+        return {METADATA: json.dumps(self._asdict(), sort_keys=True)}
 
 
 def learned_file(name: str | Path, runtime: str) -> Path:
@@ -72,10 +81,10 @@ def load_weights(network: nn.Module, path: Path, hint: str) -> LearnedFile:
         raise NetworkFileError(f"{path} does not exist: {hint}")
     try:
         with safe_open(path, framework="pt") as file:
-            notes, state = file.metadata() or {}, {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+            metadata, state = file.metadata() or {}, {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     except SafetensorError as error:
         raise NetworkFileError(f"{path} is no safetensors file ({error}): {hint}") from error
-    known = _checked(network, path, notes)
+    known = _checked(network, path, metadata)
     try:
         network.load_state_dict(state, strict=True)
     except RuntimeError as error:
@@ -108,17 +117,20 @@ class OnnxBackbone:
         return onnx_session(self.path, self.threads, self.hint)
 
 
-def _checked(network: nn.Module, path: Path, notes: Mapping[str, str]) -> LearnedFile:
+def _checked(network: nn.Module, path: Path, metadata: Mapping[str, str]) -> LearnedFile:
     """What a file's metadata says. Raises NetworkFileError where it states another network, or none."""
-    if NETWORK not in notes:
+    if METADATA not in metadata:
         raise NetworkFileError(f"{path} does not state its network: fmtorch.training.pruner_export makes such files")
     try:
-        stated, temperature = json.loads(notes[NETWORK]), float(notes.get(TEMPERATURE, 1))
-    except ValueError as error:
-        raise NetworkFileError(f"{path}: its metadata cannot be read: {error}") from error
+        content = json.loads(metadata[METADATA])
+        stated = LearnedFile(content["network"], float(content["temperature"]), content["notes"])
+    except (ValueError, TypeError, KeyError) as error:
+        raise NetworkFileError(f"{path}: its metadata cannot be read: {error!r}") from error
+    if not (stated.temperature > 0 and math.isfinite(stated.temperature)):
+        raise NetworkFileError(f"{path}: temperature {stated.temperature}; it has to be positive")
     expected = stated_network(network)
-    if stated != expected:
+    if stated.network != expected:
         raise NetworkFileError(
-            f"{path} holds {stated}, the preset names {expected}: take the file's options, or train this network"
+            f"{path} holds {stated.network}, the preset names {expected}: take the file's options, or train this one"
         )
-    return LearnedFile(temperature, dict(notes))
+    return stated

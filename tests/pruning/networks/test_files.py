@@ -1,0 +1,56 @@
+"""Learned files: others' checkpoints converted, refusals."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from fmtorch.pruning import LearnedPruner
+from fmtorch.pruning.networks import LC
+from fmtorch.pruning.networks.published import ngransac_state
+from fmtorch.types import Correspondences
+from tests.conftest import oracle, shared_path
+
+SCRIPT = Path(__file__).resolve().parents[3] / "scripts" / "convert_ngransac.py"
+
+
+def convert(checkpoint: Path, out: Path) -> subprocess.CompletedProcess[str]:
+    called = [sys.executable, str(SCRIPT), str(checkpoint), str(out)]
+    return subprocess.run(called, capture_output=True, text=True, timeout=300, check=False)
+
+
+def test_a_checkpoint_of_neural_guided_ransac_becomes_a_pruner(tmp_path: Path) -> None:
+    """As the authors' .net and as .npz: the same file, whose P(inlier) gives the authors' sampling probabilities."""
+    weights = oracle("weights_ngransac_F_r1.00.npz")
+    net = tmp_path / "weights.net"
+    torch.save({key: torch.from_numpy(value) for key, value in weights.items()}, net)
+    for source in (net, shared_path("oracles/weights_ngransac_F_r1.00.npz")):
+        done = convert(source, tmp_path / f"{source.suffix[1:]}.safetensors")
+        assert done.returncode == 0, done.stderr
+    assert (tmp_path / "net.safetensors").read_bytes() == (tmp_path / "npz.safetensors").read_bytes()
+    data = oracle("ngransac_net.npz")
+    x0, x1, ratio, size0, size1 = (
+        torch.from_numpy(data[f"001.{name}"])[None] for name in ("X1", "X2", "ratio", "size1", "size2")
+    )
+    mask = torch.ones(x0.shape[:2], dtype=torch.bool)
+    c = Correspondences(x0, x1, mask, quality=ratio.double(), size0=size0, size1=size1)
+    p = LearnedPruner(LC(side=["ratio"]), file=tmp_path / "net.safetensors").probability(c)[0].double()
+    expected = data["001.logprob_F_r1.00"].astype(np.float64)
+    found = (p / p.sum()).log().numpy()
+    np.testing.assert_allclose(found, expected, rtol=0, atol=4e-4)  # of both float32 against float64: 2e-4 each
+
+
+def test_what_is_no_such_checkpoint_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"conv1\.weight is no parameter of a network of neural-guided RANSAC"):
+        ngransac_state({"conv1.weight": torch.zeros(3)})
+    torch.save({"conv1.weight": torch.zeros(3)}, tmp_path / "other.net")
+    done = convert(tmp_path / "other.net", tmp_path / "out.safetensors")
+    assert done.returncode == 1
+    assert "conv1.weight is no parameter" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "out.safetensors").exists()
