@@ -159,6 +159,22 @@ def test_gradients_are_finite_and_do_not_touch_neighbours(kind: str, gradient: s
 
 
 @pytest.mark.parametrize("gradient", GRADIENTS)
+def test_what_is_no_model_has_no_gradient(gradient: str) -> None:
+    x0, x1, F0, weight = inputs(3)
+    pool = torch.stack([F0, F0 * torch.nan]).requires_grad_()
+    attached = [v.clone().requires_grad_() for v in (x0, x1, weight)]
+    found = irls(*attached[:2], pool, attached[2], scale=SCALE, gradient=gradient)
+    alone = irls(*attached[:2], F0, attached[2], scale=SCALE, gradient=gradient)
+    sums = [torch.autograd.grad(f.sum(), attached, retain_graph=True) for f in (found, alone)]
+    for g, own in zip(*sums, strict=True):
+        torch.testing.assert_close(g, own, rtol=1e-8, atol=1e-8 * float(own.abs().max()))
+    if gradient == "unrolled":
+        (to_pool,) = torch.autograd.grad(found.sum(), pool)
+        assert bool((to_pool[1:] == 0).all())
+        assert bool(to_pool.isfinite().all())
+
+
+@pytest.mark.parametrize("gradient", GRADIENTS)
 def test_padding_is_invisible_to_gradients(gradient: str) -> None:
     x0, x1, F0, weight = inputs(4)
     where = torch.arange(24) * 2 + 7
