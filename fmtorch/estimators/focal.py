@@ -22,10 +22,10 @@ from fmtorch.estimators.cheirality import share_in_front
 from fmtorch.estimators.choice import Chosen, TwoCameras, ranked
 from fmtorch.estimators.problem import Problem
 from fmtorch.estimators.scoring import SaturatedGains, geman_mcclure_gain, sampson_squared, score_models
+from fmtorch.geometry.optimum import STEP_DAMPING, gradient_of_cost
 from fmtorch.geometry.rank2 import complement
 from fmtorch.geometry.rank2_manifold import start, unit
 from fmtorch.geometry.reduce import component_sum
-from fmtorch.geometry.refine import STEP_DAMPING, gradient_of_cost
 from fmtorch.geometry.robust_kernels import KERNELS
 from fmtorch.geometry.sampson_objective import Objective
 

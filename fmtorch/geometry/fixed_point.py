@@ -60,6 +60,6 @@ def at_fixed_point(F: Float[Tensor, "9 p k"], step: Callable[[Tensor], Tensor]) 
     U, s, Vh = torch.linalg.svd(difference)
     inverse = (Vh.mT * (s / (s * s + CONTRACTION_GAP**2))[..., None, :]) @ U.mT
     inverse = torch.where(known[..., None, None], inverse, 0.0).movedim((-2, -1), (0, 1))
-    size = component_sum(F * fixed)
-    moved = component_sum(inverse * (attached - attached.detach()), 1) * torch.where(usable, size, 0.0)
-    return F + moved
+    size = torch.where(usable, component_sum(F * fixed), 0.0)
+    moved = component_sum(inverse * (attached - attached.detach()), 1) * size
+    return F + torch.where(usable, moved, 0.0)  # keeps the gradient of what is not finite out

@@ -13,9 +13,9 @@ from fmtorch.geometry.eight_point import linear_fundamental
 from fmtorch.geometry.epipolar import sampson
 from fmtorch.geometry.fixed_point import at_fixed_point, gradient_wanted
 from fmtorch.geometry.normalize import canonical, denormalize_fundamental, normalize_points
+from fmtorch.geometry.normalized_matches import NormalizedMatches
 from fmtorch.geometry.rank2 import nearest_rank2
 from fmtorch.geometry.rank2_manifold import RANK_TWO, constant
-from fmtorch.geometry.refine import Normalised
 from fmtorch.geometry.robust_kernels import Kernel, named_kernel
 from fmtorch.geometry.sampson_objective import homogeneous, linearise
 
@@ -70,7 +70,7 @@ def irls(
     robust = named_kernel(kernel)
     wanted = gradient_wanted(gradient, x0, x1, weight, scale, F0 if gradient == "unrolled" else None)
     with torch.set_grad_enabled(wanted):
-        problem = Normalised(x0, x1, weight, mask, F0, scale)
+        problem = NormalizedMatches(x0, x1, weight, mask, F0, scale)
 
         def step(F: Tensor) -> Tensor:
             return reweighted(F, problem.points, problem.weight, robust, problem.scale)
@@ -121,7 +121,7 @@ def reweighted_fits(
         is negative or not finite, is not valid and repeats the last one that was, or zero.
     """
     first = torch.zeros(len(x0), 3, 3, dtype=torch.float64, device=x0.device) if F0 is None else F0.to(torch.float64)
-    problem = Normalised(x0, x1, None, mask, first, 1.0)
+    problem = NormalizedMatches(x0, x1, None, mask, first, 1.0)
     clean0, clean1 = (torch.where(problem.counts[..., None], x, 0).to(torch.float64) for x in (x0, x1))
     F, residual = (None, None) if F0 is None else (first, sampson(first, clean0, clean1))
     fits, valid = [], []

@@ -24,7 +24,13 @@ def tolerances(kernel: str) -> dict[str, float | bool]:
 
     The tabulated kernel is linear between its entries, 1 / 1000 apart, whose slopes differ by as much.
     """
-    return {"eps": 1e-6, "atol": 1e-5, "rtol": 1e-3 if kernel == "magsac" else 1e-5, "fast_mode": True}
+    return {
+        "eps": 1e-6,
+        "atol": 1e-5,
+        "rtol": 1e-3 if kernel == "magsac" else 1e-5,
+        "fast_mode": True,
+        "check_undefined_grad": False,
+    }
 
 
 def inputs(seed: int, n: int = 24, noise: float = 3e-3, outliers: int = 3) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -55,15 +61,16 @@ def test_unrolled_gradients_are_those_of_the_function(kernel: str) -> None:
 def test_implicit_gradients_are_those_of_the_fixed_point(kernel: str) -> None:
     """Finite differences of the converged iteration, and the gradients through all of it."""
     x0, x1, F0, weight = inputs(2, outliers=1)
+    converged = irls(x0, x1, F0, weight, kernel=kernel, scale=SCALE, iterations=60)
 
-    def function(x0: Tensor, x1: Tensor, w: Tensor, gradient: str) -> Tensor:
-        return irls(x0, x1, F0, w, kernel=kernel, scale=SCALE, iterations=40, gradient=gradient)
+    def function(x0: Tensor, x1: Tensor, w: Tensor, gradient: str, iterations: int = 15) -> Tensor:
+        return irls(x0, x1, converged, w, kernel=kernel, scale=SCALE, iterations=iterations, gradient=gradient)
 
     attached = [v.clone().requires_grad_() for v in (x0, x1, weight)]
     implicit = functools.partial(function, gradient="implicit")
     assert torch.autograd.gradcheck(implicit, attached, **tolerances(kernel))
     direction = torch.from_numpy(np.random.default_rng(0).normal(size=(3, 3)))
-    both = [torch.autograd.grad((function(*attached, kind) * direction).sum(), attached) for kind in GRADIENTS]
+    both = [torch.autograd.grad((function(*attached, kind, 40) * direction).sum(), attached) for kind in GRADIENTS]
     for one, other in zip(*both, strict=True):
         # The eigenvector's gradient knows gaps of some 1e-3 of the trace to rounding: 1e-13, times the sum over fits.
         torch.testing.assert_close(one, other, rtol=1e-8, atol=1e-8 * float(other.abs().max()))
@@ -156,6 +163,22 @@ def test_gradients_are_finite_and_do_not_touch_neighbours(kind: str, gradient: s
     n = good.mask.shape[1]
     for g, own in zip(gradients, its_gradients, strict=True):
         torch.testing.assert_close(g[0, :n], own[0], rtol=1e-8, atol=1e-10 * float(own.abs().max()))
+
+
+@pytest.mark.parametrize("gradient", GRADIENTS)
+def test_what_is_no_model_has_no_gradient(gradient: str) -> None:
+    x0, x1, F0, weight = inputs(3)
+    pool = torch.stack([F0, F0 * torch.nan]).requires_grad_()
+    attached = [v.clone().requires_grad_() for v in (x0, x1, weight)]
+    found = irls(*attached[:2], pool, attached[2], scale=SCALE, gradient=gradient)
+    alone = irls(*attached[:2], F0, attached[2], scale=SCALE, gradient=gradient)
+    sums = [torch.autograd.grad(f.sum(), attached, retain_graph=True) for f in (found, alone)]
+    for g, own in zip(*sums, strict=True):
+        torch.testing.assert_close(g, own, rtol=1e-8, atol=1e-8 * float(own.abs().max()))
+    if gradient == "unrolled":
+        (to_pool,) = torch.autograd.grad(found.sum(), pool)
+        assert bool((to_pool[1:] == 0).all())
+        assert bool(to_pool.isfinite().all())
 
 
 @pytest.mark.parametrize("gradient", GRADIENTS)

@@ -1,0 +1,147 @@
+"""Gradients of the least robust Sampson error: of the optimum itself, or through the steps that led there."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from fmtorch.geometry.rank2_manifold import RANK_TWO, cofactors, constant, start, unit
+from fmtorch.geometry.reduce import component_sum, stable_sum
+from fmtorch.geometry.robust_kernels import Kernel
+from fmtorch.geometry.sampson_objective import Objective, homogeneous, linearise
+
+STEP_DAMPING = 1e-10  # of the attached step: bounds its gradient where the points leave a direction open
+
+
+class Step(NamedTuple):
+    """A Levenberg-Marquardt step: the models it started from, its damping, and which models it improved."""
+
+    F: Float[Tensor, "9 p k"]
+    damping: Float[Tensor, "p k"]
+    accepted: Bool[Tensor, "p k"]
+
+
+def gradient_of_cost(
+    F: Float[Tensor, "9 p k"],
+    points: Float[Tensor, "4 p n"],
+    weight: Float[Tensor, "p n"],
+    robust: Kernel,
+    scale: Float[Tensor, " p"],
+) -> Float[Tensor, "9 p k"]:
+    """Half the gradient of the cost with respect to F, ``sum_i w_i rho'(r_i^2) r_i dr_i``; attached to all inputs."""
+    J, e, inverse, r2 = linearise(F, homogeneous(points[:, None, :, None]))
+    influence = weight[:, None] * robust.weight(r2, scale.square()[:, None, None]) * inverse * e
+    return stable_sum(J.flatten(0, 1) * influence)[:, 0]
+
+
+def at_optimum(
+    F: Float[Tensor, "9 p k"],
+    points: Float[Tensor, "4 p n"],
+    weight: Float[Tensor, "p n"],
+    robust: Kernel,
+    scale: Float[Tensor, " p"],
+) -> Float[Tensor, "9 p k"]:
+    """F, optima of rank 2 and unit norm, attached to the graph of points and weights by the implicit function theorem.
+
+    The optimum moves by ``dF = -H^-1 d(gradient)`` in the tangent space of the manifold. H is the Hessian of the cost
+    on it, exact: with the curvature of the residuals, and with that of the constraint ``det F = 0`` by its Lagrange
+    multiplier. Where it is not positive definite, at what is no strict minimum, Gauss and Newton's takes its place.
+    Directions that the points leave open are damped; what is not finite or zero has a gradient of zero.
+
+    Arguments as of `gradient_of_cost`; F on no graph. Returns the same values.
+    """
+    with torch.no_grad():
+        usable = torch.isfinite(F).all(0) & (F != 0).any(0)
+        model = unit(torch.where(usable, F, constant(F, RANK_TWO)))
+        C = cofactors(model)
+        size = component_sum(C * C)
+        usable = usable & (size > 0)
+        normal = C / torch.where(size > 0, size, 1).sqrt()
+        curved = robust._replace(weight=robust.curvature)  # Newton's weights of J^T J, not those of IRLS
+        gauss_newton = Objective(points, weight, curved, scale)(model, True)[0][:9, :9].movedim((0, 1), (-2, -1))
+        frame = torch.stack([model, normal], -1).movedim(0, -2)
+    exact = _hessian(model, C, size, points.detach(), weight.detach(), robust, scale.detach())
+    with torch.no_grad():
+        across = torch.eye(9, dtype=F.dtype, device=F.device) - frame @ frame.mT
+        largest = gauss_newton.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None]
+        blocked = largest * (frame @ frame.mT)  # so that these directions do not look open
+        finite = torch.isfinite(exact).flatten(-2).all(-1)[..., None, None]
+        tangent = across @ torch.where(finite, exact, gauss_newton) @ across + blocked
+        strict = finite[..., 0, 0] & (torch.linalg.eigvalsh(tangent)[..., 0] > STEP_DAMPING * largest[..., 0, 0])
+        tangent = torch.where(strict[..., None, None], tangent, across @ gauss_newton @ across + blocked)
+        values, vectors = torch.linalg.eigh(tangent)
+        open_below = STEP_DAMPING * torch.where(largest > 0, largest, 1)[..., 0]
+        inverse = (vectors * (values / (values * values + open_below * open_below))[..., None, :]) @ vectors.mT
+        inverse = (across @ inverse @ across).movedim((-2, -1), (0, 1))
+    gradient = gradient_of_cost(model, points, weight, robust, scale)
+    moved = component_sum(inverse * (gradient - gradient.detach()), 1)
+    return F - torch.where(usable, moved, 0)  # keeps the gradient of what is not finite out
+
+
+def _hessian(
+    F: Tensor, C: Tensor, size: Tensor, points: Tensor, weight: Tensor, robust: Kernel, scale: Tensor
+) -> Float[Tensor, "p k 9 9"]:
+    """Half the second derivative of the Lagrangian ``cost + 2 multiplier det F``; C are F's cofactors, size |C|^2."""
+    with torch.enable_grad():
+        model = F.detach().clone().requires_grad_()
+        gradient = gradient_of_cost(model, points, weight, robust, scale)
+        multiplier = -component_sum(gradient.detach() * C) / torch.where(size > 0, size, 1)
+        total = gradient + multiplier * cofactors(model)
+        rows = [torch.autograd.grad(total[i].sum(), model, retain_graph=True)[0] for i in range(9)]
+    H = torch.stack(rows).movedim((0, 1), (-2, -1))
+    return (H + H.mT) / 2
+
+
+def through_steps(
+    F: Float[Tensor, "9 p k"],
+    F0: Float[Tensor, "9 p k"],
+    steps: list[Step],
+    points: Float[Tensor, "4 p n"],
+    weight: Float[Tensor, "p n"],
+    robust: Kernel,
+    scale: Float[Tensor, " p"],
+) -> Float[Tensor, "9 p k"]:
+    """F, to which these steps led from F0, attached to the graph of F0, points and weights through each of them.
+
+    Damping and the choice of the steps that are accepted are constants. Arguments as of `gradient_of_cost`. Returns the
+    same values.
+    """
+    usable = torch.isfinite(F).all(0) & (F != 0).any(0)
+    current = start(torch.where(usable, F0, constant(F, RANK_TWO)))[0]
+    for before, damping, accepted in steps:
+        accepted = accepted & usable
+        if not bool(accepted.any()):
+            continue
+        known = torch.where(usable, before, constant(F, RANK_TWO))
+        current = known + torch.where(usable, current - current.detach(), 0)
+        moved = _step(current, points, weight, robust, scale, torch.where(accepted, damping, 1))
+        current = torch.where(accepted, moved, current)
+    return F + torch.where(usable, current - current.detach(), 0)
+
+
+def _step(
+    F: Tensor, points: Tensor, weight: Tensor, robust: Kernel, scale: Tensor, damping: Tensor
+) -> Float[Tensor, "9 p k"]:
+    """The model after one damped step of Gauss and Newton, as `solve` and `retract` take it, attached to all inputs."""
+    J, e, inverse, r2 = linearise(F, homogeneous(points[:, None, :, None]))
+    J, e = J.flatten(0, 1)[:, 0], e[0]
+    influence = (weight[:, None] * robust.weight(r2, scale.square()[:, None, None]) * inverse)[0]
+    H = torch.einsum("apkn,bpkn->pkab", J * influence, J)
+    gradient = torch.einsum("apkn,pkn->pka", J * influence, e)
+    model = F.movedim(0, -1)
+    normal = unit(cofactors(F)).movedim(0, -1)
+    curvature = H.diagonal(dim1=-2, dim2=-1).amax(-1)
+    curvature = torch.where(curvature > 0, curvature, 1.0)
+    blocked = model[..., :, None] * model[..., None, :] + torch.diag_embed(damping[..., None].expand_as(model))
+    Q = torch.cat([H + curvature[..., None, None] * blocked, normal[..., None]], -1)
+    last = torch.cat([normal, torch.zeros_like(normal[..., :1])], -1)
+    Q = torch.cat([Q, last[..., None, :]], -2)
+    right = torch.cat([-gradient, torch.zeros_like(gradient[..., :1])], -1)
+    step = torch.linalg.solve(Q, right[..., None])[..., :9, 0]
+    G = F + step.movedim(-1, 0)
+    C, n = cofactors(G), unit(cofactors(F))
+    determinant = component_sum(C[:3] * G[:3])
+    return unit(G - determinant / component_sum(C * n) * n)
