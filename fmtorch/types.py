@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeVar, cast
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
 Index = int | slice | Sequence[int] | Sequence[bool] | Tensor
@@ -155,8 +155,8 @@ class Correspondences(_Record):
     prior: Float[Tensor, "b n"] | None = None
     lafs0: Float[Tensor, "b n 2 3"] | None = None
     lafs1: Float[Tensor, "b n 2 3"] | None = None
-    size0: Int[Tensor, "b 2"] | None = None
-    size1: Int[Tensor, "b 2"] | None = None
+    size0: Real[Tensor, "b 2"] | None = None
+    size1: Real[Tensor, "b 2"] | None = None
     K0: Float[Tensor, "b 3 3"] | None = None
     K1: Float[Tensor, "b 3 3"] | None = None
     key: Int[Tensor, " b"] | None = None
@@ -219,7 +219,8 @@ class Correspondences(_Record):
 class Estimate(_Record):
     """Fundamental matrices of B pairs.
 
-    F: (B, 3, 3) with unit Frobenius norm, zero where `ok` is False. inliers: (B, N), within the mask.
+    F: (B, 3, 3) with unit Frobenius norm, zero where `ok` is False. inliers: (B, N), within the mask, none where `ok` is
+    False.
     ok: (B,). reason: why a pair failed, empty where it did not. draws: minimal samples drawn, (B,).
     """
 

@@ -35,18 +35,19 @@ class Subject:
     run: Callable[[Correspondences], Result]
 
 
+def few(config: Mapping[str, Any], hypotheses: int = 200, round: int = 100) -> dict[str, Any]:
+    """Options with which an estimator's preset does little in each of its stages."""
+    if config["_target_"] == "fmtorch.estimators.HypothesizeAndVerify":
+        options = {"hypotheses": hypotheses, "round": round, "pool": min(config.get("pool", 1), 8)}
+        return options | ({"refine_matches": 64} if config.get("refine_matches") else {})  # fewer than a scene has
+    if config["_target_"] == "fmtorch.estimators.IterativelyReweighted":
+        return {"starts": [0, 2], "iterations": 5, "refine_iterations": 5}
+    return {key: few(value, hypotheses, round) for key, value in config.items() if isinstance(value, dict)}
+
+
 def quick(name: str, hypotheses: int = 200, round: int = 100) -> Estimator:
     """An estimator preset that does little in each of its stages: the laws do not depend on how much."""
-
-    def fewer(config: Mapping[str, Any]) -> dict[str, Any]:
-        if config["_target_"] == "fmtorch.estimators.HypothesizeAndVerify":
-            few = {"hypotheses": hypotheses, "round": round, "pool": min(config.get("pool", 1), 8)}
-            return few | ({"refine_matches": 64} if config.get("refine_matches") else {})  # fewer than a scene has
-        if config["_target_"] == "fmtorch.estimators.IterativelyReweighted":
-            return {"starts": [0, 2], "iterations": 5, "refine_iterations": 5}
-        return {key: fewer(value) for key, value in config.items() if isinstance(value, dict)}
-
-    built: Estimator = presets.build("estimator", name, **fewer(presets.load("estimator", name)))
+    built: Estimator = presets.build("estimator", name, **few(presets.load("estimator", name), hypotheses, round))
     return built
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -17,12 +18,14 @@ import torch
 from numpy.typing import NDArray
 
 from fmtorch.estimators.problem import usable
+from fmtorch.estimators.support import lack_of_support, relative_rounding
 from fmtorch.types import Correspondences, Estimate
 
 Points = NDArray[np.float64]
 Solution = tuple[Points | None, NDArray[np.bool_]]
 
 LEAST_MATCHES = 8
+MINIMAL_SAMPLE = 7  # inliers below which a model is none
 
 PEERS = {
     "poselib": "poselib", "poselib_shared_focal": "poselib", "magsac_cpp": "pymagsac", "gc_ransac_cpp": "pygcransac",
@@ -86,6 +89,10 @@ class PairwiseEstimator:
                 continue
             if estimate is None or estimate.shape != (3, 3) or not np.isfinite(estimate).all() or not np.any(estimate):
                 reasons[i] = f"{self.name} found no fundamental matrix"
+                continue
+            lack = _lack_of_support(x0, x1, inside, relative_rounding(c.x0.dtype))
+            if lack:
+                reasons[i] = lack
                 continue
             F[i] = torch.from_numpy(estimate / np.linalg.norm(estimate))
             inliers[i, index[torch.from_numpy(inside)]] = True
@@ -256,6 +263,14 @@ def _solution(F: Any, inliers: Any) -> Solution:
     return None if F is None else np.asarray(F, dtype=np.float64), np.asarray(inliers, dtype=np.bool_).ravel()
 
 
+def _lack_of_support(x0: Points, x1: Points, inliers: NDArray[np.bool_], rounding: float) -> str:
+    points = np.hstack([x0, x1])
+    largest, points = np.abs(points).max(), points - points.min(0)
+    unit = points.max() or 1.0
+    scaled, inside = torch.from_numpy(points.T[:, None] / unit), torch.from_numpy(inliers[None])
+    return lack_of_support(scaled, inside, MINIMAL_SAMPLE, torch.tensor([largest / unit * rounding]))[0]
+
+
 def _likelihood(c: Correspondences, i: int) -> torch.Tensor:
     if c.prior is not None:
         value = c.prior[i]
@@ -269,7 +284,7 @@ def _likelihood(c: Correspondences, i: int) -> torch.Tensor:
 def _size(sizes: torch.Tensor | None, x: Points, i: int) -> tuple[int, int]:
     """The image's (h, w); where it is not known, that of the box of the points from the origin."""
     if sizes is not None:
-        h, w = (int(v) for v in sizes[i].tolist())
+        h, w = (math.ceil(v) for v in sizes[i].tolist())
         return h, w
     w, h = (int(v) + 1 for v in np.ceil(x.max(0, initial=0.0)))
     return h, w

@@ -43,6 +43,7 @@ GATE = 0.85
 RIVAL, SAME = 0.85, 1e-3
 ALIKE = 1e-2  # the same for candidates of plausible cameras: if these agree so well, nobody else is asked
 PARALLEL = 4.0  # px in image 1: rays that differ less do not tell on which side of the cameras they meet
+SMALLEST_IMAGE = 16.0  # longer side of both images below which sizes are taken for those of another unit than pixels
 ITERATIONS = 12  # Levenberg-Marquardt steps
 MOST = 12  # candidates that are refined
 SHORTEST, LONGEST = 0.25, 5.0  # focal lengths outside are not believed at the start
@@ -154,7 +155,9 @@ class Cameras:
         assert problem.size0 is not None
         assert problem.size1 is not None
         middle = torch.cat([problem.size0.flip(-1), problem.size1.flip(-1)], -1).to(torch.float64)
-        self.offset = ((problem.centre - (middle - 1) / 2) / problem.unit[:, None]).T
+        # Half a pixel, of images in pixels; of sizes in another unit nobody knows what it is, and it is small.
+        pixel = torch.where(middle.amax(-1, keepdim=True) < SMALLEST_IMAGE, 0.0, 1.0)
+        self.offset = ((problem.centre - (middle - pixel) / 2) / problem.unit[:, None]).T
         self.points = problem.points + self.offset[..., None]
         self.longest = torch.stack([problem.size0.amax(-1), problem.size1.amax(-1)]).to(torch.float64) / problem.unit
         self.same_size = (problem.size0 == problem.size1).all(-1)

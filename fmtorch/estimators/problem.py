@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
 from fmtorch.geometry import canonical
@@ -16,6 +16,7 @@ from fmtorch.geometry.reduce import matmul3
 from fmtorch.types import Correspondences
 
 SMALLEST_BUCKET = 128
+FARTHEST = 1e100  # px; a match beyond is none: numbers made of its coordinates would overflow
 LEAST_NOISE, MOST_NOISE = 0.1, 10.0  # of a match, relative to a usual one; what is beyond is taken for these
 
 
@@ -42,8 +43,8 @@ class Problem:
     quality: Float[Tensor, "p n"] | None
     prior: Float[Tensor, "p n"] | None
     seed: int
-    size0: Int[Tensor, "p 2"] | None = None
-    size1: Int[Tensor, "p 2"] | None = None
+    size0: Real[Tensor, "p 2"] | None = None
+    size1: Real[Tensor, "p 2"] | None = None
     noise: Float[Tensor, "p n"] | None = None
 
     @property
@@ -104,8 +105,8 @@ def bucket(count: int) -> int:
 
 
 def usable(c: Correspondences) -> Bool[Tensor, "b n"]:
-    """Live matches with finite coordinates."""
-    return c.mask & torch.isfinite(c.x0).all(-1) & torch.isfinite(c.x1).all(-1)
+    """Live matches with finite coordinates, whose squares are finite too."""
+    return c.mask & (c.x0.abs() < FARTHEST).all(-1) & (c.x1.abs() < FARTHEST).all(-1)
 
 
 def problems(c: Correspondences, seed: int, least: int) -> tuple[list[Problem], dict[int, str]]:

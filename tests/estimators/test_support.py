@@ -1,0 +1,163 @@
+"""No estimate without support: enough different inliers, not on one line, at any scale of the coordinates."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from fmtorch import find_fundamental, presets
+from fmtorch.estimators import degeneracy, final_fits, focal, support
+from fmtorch.estimators.adapters import PEERS
+from fmtorch.estimators.local_optimization import GraphCut
+from fmtorch.estimators.support import lack_of_support
+from fmtorch.types import Correspondences, Estimate, collate
+from tests.laws import OTHER_LIBRARIES, few, quick, scene, small
+
+EVERY = presets.available("estimator")
+OWN = [name for name in EVERY if not name.startswith(OTHER_LIBRARIES)]
+PIXELS = [  # what is a distance in pixels and no option
+    (final_fits, "SMALLEST"), (final_fits, "LARGEST"), (final_fits, "UNKNOWN"), (degeneracy, "PLANE_THRESHOLD"),
+    (focal, "SIGMA"), (focal, "SCALE"), (focal, "PARALLEL"), (GraphCut, "RADIUS"),
+]  # fmt: skip
+
+
+def estimator(name: str) -> Any:
+    if name in PEERS and importlib.util.find_spec(PEERS[name]) is None:
+        pytest.skip(f"{PEERS[name]} (extra `peers`) is not installed")
+    return quick(name) if name in OWN else presets.build("estimator", name)
+
+
+def assert_supported(estimate: Estimate, c: Correspondences, what: str) -> None:
+    """What is ok has a minimal sample of different inliers, off a line, and an F of unit norm; the rest has nothing."""
+    points = torch.cat([c.x0, c.x1], -1).to(torch.float64).numpy()
+    for i, ok in enumerate(estimate.ok.tolist()):
+        inside = points[i][estimate.inliers[i].numpy()]
+        assert ok == (estimate.reason[i] == ""), what
+        if not ok:
+            assert not len(inside), what
+            assert not bool(estimate.F[i].any()), what
+            continue
+        assert len(np.unique(inside, axis=0)) >= 7, f"{what}, pair {i}"
+        for image in (inside[:, :2], inside[:, 2:]):
+            spread = np.linalg.svd(image - image.mean(0), compute_uv=False)
+            assert spread[1] > 1e-9 * spread[0], f"{what}, pair {i}"
+        assert float(estimate.F[i].norm()) == pytest.approx(1), f"{what}, pair {i}"
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_few_and_degenerate_matches_give_no_unsupported_model(name: str) -> None:
+    pairs = list(small().values())
+    pairs += [scene(100 + i, 20, outliers=1.0) for i in range(8)]
+    c = collate(pairs)
+    assert_supported(estimator(name)(c, 2), c, name)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_coordinates_scaled_alone_give_a_sound_result_or_none(name: str) -> None:
+    c = scene(1, 60, outliers=0.3, noise=0.1)
+    c = c.replace(x0=c.x0.double(), x1=c.x1.double())
+    scales = torch.tensor([1e-300, 1e-150, 1e-12, 1e-6, 1e-3, 1e3, 1e6, 1e12, 1e150, 1e300], dtype=torch.float64)
+    many = collate([c] * len(scales))
+    many = many.replace(x0=many.x0 * scales[:, None, None], x1=many.x1 * scales[:, None, None])
+    assert_supported(estimator(name)(many, 0), many, name)
+
+
+def test_the_default_has_no_support_at_thresholds_far_below_rounding() -> None:
+    c = scene(0, 60, outliers=0.0, noise=0.0)
+    estimate = find_fundamental(c.x0.double() * 1e12, c.x1.double() * 1e12)
+    assert not bool(estimate.ok[0])
+    assert "different inliers; at least 7 are needed" in estimate.reason[0]
+
+
+def scaled(config: Mapping[str, Any], scale: float) -> dict[str, Any]:
+    """The thresholds within a preset, times `scale`."""
+    levels = {key: scaled(value, scale) for key, value in config.items() if isinstance(value, Mapping)}
+    own = {k: v * scale for k, v in config.items() if k.endswith("threshold") and isinstance(v, int | float)}
+    return {**levels, **own}
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_coordinates_sizes_and_thresholds_scaled_together_give_the_same_inliers(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pairs = [scene(i, 100, outliers=0.2, noise=0.1) for i in range(3)]
+    c = collate(
+        [p.replace(x0=p.x0.double(), x1=p.x1.double(), size0=p.size0.double(), size1=p.size1.double()) for p in pairs]
+    )
+    preset = presets.load("estimator", name)
+    options = {} if name.startswith("irls") else few(preset)
+    pixels = {(owner, constant): getattr(owner, constant) for owner, constant in PIXELS}
+    inliers = {}
+    for scale in (1.0, 1e-9, 1e-3, 1e3, 1e9):
+        for (owner, constant), value in pixels.items():
+            monkeypatch.setattr(owner, constant, value * scale)
+        built = presets.build("estimator", name, **presets._merged(options, scaled(preset, scale)))
+        sizes = {"size0": c.size0 * scale, "size1": c.size1 * scale}
+        estimate = built(c.replace(x0=c.x0 * scale, x1=c.x1 * scale, **sizes), 3)
+        assert bool(estimate.ok.all()) or name == "irls_huber", estimate.reason  # outliers carry that loss away
+        inliers[scale] = estimate.inliers
+    for scale, found in inliers.items():
+        assert torch.equal(found, inliers[1.0]), (
+            f"{name}: {int((found != inliers[1.0]).sum())} inliers differ at {scale}"
+        )
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_a_shift_changes_nothing(name: str) -> None:
+    pairs = [scene(i, 100, outliers=0.2, noise=0.1) for i in range(3)]
+    # Whole 1/256 of a pixel, so that shifted by whole pixels no coordinate is rounded; sizes say where the images are.
+    c = collate(
+        [
+            p.replace(
+                x0=(p.x0.double() * 256).round() / 256, x1=(p.x1.double() * 256).round() / 256, size0=None, size1=None
+            )
+            for p in pairs
+        ]
+    )
+    built = quick(name)
+    before = built(c, 3)
+    shift0, shift1 = torch.tensor([1e6, -3e5], dtype=torch.float64), torch.tensor([-7e4, 2e9], dtype=torch.float64)
+    after = built(c.replace(x0=c.x0 + shift0, x1=c.x1 + shift1), 3)
+    assert torch.equal(after.inliers, before.inliers)
+    assert torch.equal(after.ok, before.ok)
+
+
+# the check itself
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("shift", [0.0, 3000.0])
+def test_points_of_a_line_are_told_from_points_near_one(dtype: torch.dtype, shift: float) -> None:
+    rng = np.random.default_rng(0)
+    for seed in range(20):
+        direction, start = rng.normal(size=2), rng.uniform(0, 500, 2) + shift
+        line = start + rng.uniform(-300, 300, (30, 1)) * direction / np.linalg.norm(direction)
+        near = line + rng.normal(0, 0.02, (30, 2))  # px: no detector is as exact
+        other = rng.uniform(0, 500, (30, 2))
+        for x0, x1, told in (
+            (line, other, "image 0"),
+            (other, line, "image 1"),
+            (line, line[::-1], "image 0 and image 1"),
+            (near, other, ""),
+        ):
+            points = torch.from_numpy(np.hstack([x0, x1])).to(dtype).to(torch.float64).T[:, None]
+            rounding = points.abs().amax((0, 2)) * support.relative_rounding(dtype)
+            (reason,) = lack_of_support(points, torch.ones(1, 30, dtype=torch.bool), 7, rounding)
+            assert reason == (f"the inliers of the best model lie on one line in {told}" if told else ""), seed
+
+
+def test_inliers_count_once_at_one_place_and_late_ones_are_seen() -> None:
+    rng = np.random.default_rng(1)
+    points = torch.from_numpy(rng.uniform(0, 500, (4, 3, 1000)))
+    inliers = torch.zeros(3, 1000, dtype=torch.bool)
+    inliers[0, [3, 900, 901, 902, 903, 904, 999]] = True
+    inliers[1, 300:320] = True
+    points[:, 1, 306:320] = points[:, 1, 305:306]  # 20 inliers at six places
+    inliers[2, 7] = True
+    reasons = lack_of_support(points, inliers, 7, torch.zeros(3, dtype=torch.float64))
+    assert [reason[:26] for reason in reasons] == ["", "the best model has 6 diffe", "the best model has 1 diffe"]
