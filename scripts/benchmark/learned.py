@@ -3,7 +3,7 @@
 python scripts/benchmark learned --root DATA/Strecha --root DATA/KITTI --json FILE
 python scripts/benchmark learned --rendered full --limit 50 --json FILE
 python scripts/benchmark learned --from FILE FILE --markdown docs/learned.md
-python scripts/benchmark learned --ngransac FILE.safetensors ...      # also the weights that NG-RANSAC's authors publish
+python scripts/benchmark learned --ngransac FILE.safetensors ...      # also NG-RANSAC's published weights
 
 A pruner's time is that of its stage alone, on one thread. Every pair is estimated once, with seed 0.
 """

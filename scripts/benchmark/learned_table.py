@@ -23,10 +23,9 @@ def tables(rows: list[dict[str, Any]]) -> list[Sheet]:
     for features in dict.fromkeys(row["features"] for row in rows):
         mine = [row for row in rows if row["features"] == features]
         for title, families in _groups([row["family"] for row in mine]).items():
-            own = [row for row in mine if row["family"] in families]
             for use in ("hard", "prior"):
-                if any(row["use"] == use for row in own):
-                    sheets.append(_sheet(title, features, use, [row for row in own if row["use"] == use]))
+                own = [row for row in mine if row["family"] in families and row["use"] == use]
+                sheets += [_sheet(title, features, use, own)] if own else []
     return sheets
 
 
@@ -63,12 +62,17 @@ def _sheet(title: str, features: str, use: str, rows: list[dict[str, Any]]) -> S
         once = [row for row in own if row["estimator"] == estimators[0]]
         if use == "hard":
             rate = [row["inlier_rate_before"] for row in once if not np.isnan(row["inlier_rate_before"])]
-            line += [f"{100 * np.mean(rate):.1f}" if rate else "-", f"{np.mean([row['corrs_before'] for row in once]):.0f}"]
+            line += [
+                f"{100 * np.mean(rate):.1f}" if rate else "-",
+                f"{np.mean([row['corrs_before'] for row in once]):.0f}",
+            ]
         line.append(f"{np.median([row['ms'] for row in once]):.1f}")
         lines.append(line)
     what = "matches dropped before the paper's estimators" if use == "hard" else "P(inlier) as the prior of `fmtorch`"
     return Sheet(
-        f"{title}: {what}; {features}, {len(pairs)} pairs of {len(scenes)} scene{'s' * (len(scenes) > 1)}", columns, lines
+        f"{title}: {what}; {features}, {len(pairs)} pairs of {len(scenes)} scene{'s' * (len(scenes) > 1)}",
+        columns,
+        lines,
     )
 
 

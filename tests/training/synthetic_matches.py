@@ -19,9 +19,13 @@ def labelled_pair(number: int, matches: int = 60, outliers: float = 0.4) -> Labe
     """A batch of one, a function of its number."""
     rng = torch.Generator().manual_seed(number)
     K = torch.tensor([[FOCAL, 0, (SIZE[1] - 1) / 2], [0, FOCAL, (SIZE[0] - 1) / 2], [0, 0, 1]], dtype=torch.float64)
-    X = torch.rand(matches, 3, generator=rng, dtype=torch.float64) * torch.tensor([4.0, 3, 4]) + torch.tensor([-2.0, -1.5, 4])
+    X = torch.rand(matches, 3, generator=rng, dtype=torch.float64) * torch.tensor([4.0, 3, 4]) + torch.tensor(
+        [-2.0, -1.5, 4]
+    )
     angle = 0.2 + 0.3 * float(torch.rand((), generator=rng))
-    R = torch.tensor([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]]).double()
+    R = torch.tensor(
+        [[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]]
+    ).double()
     t = torch.tensor([-1.5, 0.2, 0.3], dtype=torch.float64)
     P0 = K @ torch.eye(3, 4, dtype=torch.float64)
     P1 = K @ torch.cat([R, t[:, None]], 1)

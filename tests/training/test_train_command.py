@@ -48,8 +48,8 @@ def root(tmp_path: Path) -> Path:
         images.mkdir(parents=True)
         for i in range(3):
             draw(images / f"{i:08d}.png", seed=ord(scene), shift=9 * i)
-        for l, r in ((0, 1), (0, 2), (1, 2)):
-            lines.append(f"{l} {r} 0 0 0 0 0 -1 0 1 0")
+        for left, right in ((0, 1), (0, 2), (1, 2)):
+            lines.append(f"{left} {right} 0 0 0 0 0 -1 0 1 0")
             scenes.append(f"{scene}/")
     (tmp_path / "Set" / "pairs_with_gt.txt").write_text("\n".join(lines) + "\n")
     (tmp_path / "Set" / "pairs_which_dataset.txt").write_text("\n".join(scenes) + "\n")
@@ -73,7 +73,9 @@ def test_a_network_of_ones_own_is_trained_and_used(root: Path, tmp_path: Path) -
     (here / "my_conf" / "pruner" / "mine.yaml").write_text(preset)
     train, evaluate = (line.removeprefix("python -m fmtorch.").split() for line in commands.strip().splitlines())
     data = ["dataset=fmbench", f"dataset.root={root}"]
-    trained = command(*[w.strip("'") for w in train if not w.startswith("dataset")], *data, *SHORT, "output=out", cwd=here)
+    trained = command(
+        *[w.strip("'") for w in train if not w.startswith("dataset")], *data, *SHORT, "output=out", cwd=here
+    )
     assert trained.returncode == 0, trained.stderr
     assert (here / "out" / "mine.safetensors").is_file()
     assert "| trained on | 3 pairs of 1 scenes of fmbench |" in (here / "out" / "mine.md").read_text()

@@ -1,4 +1,4 @@
-"""The training batches as one endless sequence, each a function of (seed, step, rank), so that it can start anywhere."""
+"""Training batches as one endless sequence, each a function of (seed, step, rank), so that it can start anywhere."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from fmtorch.storage.features import cached
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Matches:
-    """Labelled matches to train on, and to validate on with their pairs; what defines them; what a card says of them."""
+    """Labelled matches to train on, and to validate on with their pairs; their digest; what a card says of them."""
 
     training: StoredMatches
     validation: list[tuple[ImagePair, LabelledMatches]]

@@ -15,7 +15,7 @@ import lightning
 import torch
 from lightning.pytorch.callbacks import Callback, EarlyStopping, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Dataset
 
 from fmtorch.storage.files import replacing
 from fmtorch.storage.runs import identity_digest
@@ -105,7 +105,9 @@ def train(
         folder / CHECKPOINTS, "best", monitor=f"validation/{monitor}", mode="max", enable_version_counter=False,
         save_weights_only=True,
     )  # fmt: skip
-    stop = [] if patience is None else [EarlyStopping(f"validation/{monitor}", mode="max", patience=patience, strict=True)]
+    stop = (
+        [] if patience is None else [EarlyStopping(f"validation/{monitor}", mode="max", patience=patience, strict=True)]
+    )
     with _quiet():
         lightning_trainer = lightning.Trainer(
             max_steps=total, max_epochs=1, val_check_interval=every, check_val_every_n_epoch=None,
@@ -116,9 +118,21 @@ def train(
         )  # fmt: skip
         if step < total:
             own = batches(step, lightning_trainer.global_rank, lightning_trainer.world_size)
-            lightning_trainer.fit(module, own, DataLoader([0], batch_size=None), ckpt_path=path, weights_only=True)
+            lightning_trainer.fit(module, own, DataLoader(_Once(), batch_size=None), ckpt_path=path, weights_only=True)
             step = lightning_trainer.global_step
     return step, module.seconds
+
+
+class _Once(Dataset[int]):
+    """One item, for the one step of validation, which has its own pairs."""
+
+    def __len__(self) -> int:
+        return 1
+
+    def __getitem__(self, index: int) -> int:
+        if index:
+            raise IndexError(index)
+        return 0
 
 
 @contextlib.contextmanager

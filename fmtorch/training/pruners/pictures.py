@@ -8,6 +8,8 @@ import lightning
 import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.loggers import TensorBoardLogger
+from numpy.typing import NDArray
 
 from fmtorch.data import ImagePair, read_image
 from fmtorch.evaluation.pictures import draw_matches
@@ -31,7 +33,7 @@ class ValidationPictures(Callback):
     def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Adds the pictures of the network's present state to the log."""
         assert isinstance(pl_module, PrunerTraining)
-        if trainer.logger is None or not trainer.is_global_zero:
+        if not isinstance(trainer.logger, TensorBoardLogger) or not trainer.is_global_zero:
             return
         board = trainer.logger.experiment
         for pair, matches in self.pairs:
@@ -40,7 +42,7 @@ class ValidationPictures(Callback):
 
 
 @torch.no_grad()
-def classified(pair: ImagePair, matches: LabelledMatches, network: torch.nn.Module) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+def classified(pair: ImagePair, matches: LabelledMatches, network: torch.nn.Module) -> NDArray[np.uint8]:
     """The two images of a pair with its matches as a network classifies them; RGB (H, W, 3)."""
     device = next((p.device for p in network.parameters()), torch.device("cpu"))
     training = network.training
@@ -50,5 +52,6 @@ def classified(pair: ImagePair, matches: LabelledMatches, network: torch.nn.Modu
     network.train(training)
     inside = c.mask[0].numpy()
     x0, x1 = (x[0].double().numpy()[inside] for x in (c.x0, c.x1))
-    images = [read_image(image) for image in (pair.image0, pair.image1)]
-    return draw_matches(*images, x0, x1, kept[inside], height=HEIGHT, names=("P(inlier) >= 0.5", "below"))
+    image0, image1 = read_image(pair.image0), read_image(pair.image1)
+    names = ("P(inlier) >= 0.5", "below")
+    return draw_matches(image0, image1, x0, x1, kept[inside], height=HEIGHT, names=names)

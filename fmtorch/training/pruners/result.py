@@ -54,7 +54,9 @@ def write_result(folder: Path, name: str, module: PrunerTraining, facts: Mapping
         export_onnx(network, files[-1], temperature=temperature)
     card = folder / f"{name}.md"
     with replacing(card) as temporary:
-        temporary.write_text(model_card(files, facts, evaluation, temperature, int(best["global_step"])), encoding="utf-8")
+        temporary.write_text(
+            model_card(files, facts, evaluation, temperature, int(best["global_step"])), encoding="utf-8"
+        )
     with replacing(folder / "validation.json") as temporary:
         temporary.write_text(json.dumps({**evaluation.figures, "temperature": temperature}, indent=2) + "\n")
     return Result((*files, card), evaluation, temperature)
@@ -87,15 +89,27 @@ def model_card(
     lines = [f"# {files[0].stem}", "", "| | |", "| --- | --- |", *(f"| {k} | {v} |" for k, v in rows.items()), ""]
     figures = evaluation.figures
     uses = sorted({key.split("/")[0] for key in figures if key.endswith("/AUC@0.05")})
-    lines += ["On the validation pairs (recall in %):", "", "| use | R.05 | R.01 | AUC@0.05 |", "| --- | ---: | ---: | ---: |"]
+    lines += [
+        "On the validation pairs (recall in %):",
+        "",
+        "| use | R.05 | R.01 | AUC@0.05 |",
+        "| --- | ---: | ---: | ---: |",
+    ]
     for use in uses:
         values = (100 * figures[f"{use}/{figure}"] for figure in ("recall@0.05", "recall@0.01", "AUC@0.05"))
         lines.append(f"| {use} | " + " | ".join(f"{value:.1f}" for value in values) + " |")
     families = sorted({key.split("/")[2] for key in figures if key.count("/") == 2})
     if families:
-        lines += ["", "AUC@0.05 by family:", "", "| use | " + " | ".join(families) + " |", "| --- |" + " ---: |" * len(families)]
         lines += [
-            f"| {use} | " + " | ".join(f"{100 * figures[f'{use}/AUC@0.05/{f}']:.1f}" for f in families) + " |" for use in uses
+            "",
+            "AUC@0.05 by family:",
+            "",
+            "| use | " + " | ".join(families) + " |",
+            "| --- |" + " ---: |" * len(families),
+        ]
+        lines += [
+            f"| {use} | " + " | ".join(f"{100 * figures[f'{use}/AUC@0.05/{f}']:.1f}" for f in families) + " |"
+            for use in uses
         ]
     table = reliability(torch.sigmoid(evaluation.logit / temperature), evaluation.label)
     lines += [

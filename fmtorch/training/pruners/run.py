@@ -81,7 +81,8 @@ def report(result: Result, name: str) -> None:
     """Say on the terminal what came out and how to use it."""
     for key, value in result.evaluation.figures.items():
         console.print(f"{key:32} {value:.4f}", highlight=False)
-    use = f"python -m fmtorch.eval pipeline=sift_ratio 'pruner=[ratio,one_to_one,{name}]' pruner.{name}.file={result.files[0]}"
+    stages = f"'pruner=[ratio,one_to_one,{name}]' pruner.{name}.file={result.files[0]}"
+    use = f"python -m fmtorch.eval pipeline=sift_ratio {stages}"
     for line in (", ".join(str(path) for path in result.files), f"use it: {use}"):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
 

@@ -102,7 +102,8 @@ class Validation:
             else:
                 c = c.keep(p >= use.threshold).compact()
             estimate = use.estimator(c, self.seed)
-            assert c.size0 is not None and c.size1 is not None
+            assert c.size0 is not None
+            assert c.size1 is not None
             error = metrics.nsgd(pair.F, estimate.F.to(torch.float64), c.size0, c.size1, seed=self.seed, key=c.keys)
             values.append(torch.where(estimate.ok, error, 1.0))
         return torch.cat(values)
