@@ -14,6 +14,7 @@ from torch import Tensor
 from fmtorch import presets
 from fmtorch.stages import Estimator, Pruner
 from fmtorch.types import Correspondences, Estimate
+from fmtorch.validation import expect_values
 
 Array = Tensor | NDArray[Any]
 
@@ -49,16 +50,22 @@ def find_fundamental(
     estimator: a preset of conf/estimator; `options` replace values of it (``threshold=0.5``).
 
     Returns an `Estimate` of B pairs (of one pair for (N, 2) points): F with unit Frobenius norm, inliers, ok, reason.
-    Raises ValueError for points of another shape, an unknown preset or an unknown option; a pair that cannot be solved
-    is ``ok=False``, never an exception.
+    Raises ValueError for points of another shape, a prior outside [0, 1], a noise or an image size that is not
+    positive, the size of one image only, an unknown preset or an unknown option; a pair that cannot be solved is
+    ``ok=False``, never an exception.
     """
-    points0, points1 = _tensor(x0), _tensor(x1)
+    points0, points1 = (x if x.is_floating_point() else x.to(torch.float64) for x in (_tensor(x0), _tensor(x1)))
     for name, points in (("x0", points0), ("x1", points1)):
         if points.dim() not in (2, 3) or points.shape[-1] != 2:
             raise ValueError(f"{name} has shape {tuple(points.shape)}; it must be (N, 2) or (B, N, 2)")
     if points0.shape != points1.shape:
         raise ValueError(f"x0 has shape {tuple(points0.shape)} but x1 {tuple(points1.shape)}; they must be equal")
     single = points0.dim() == 2
+    if not single and points0.shape[1] == 1 and len(points0) > 1 and mask is None:
+        raise ValueError(
+            f"x0 and x1 have shape {tuple(points0.shape)}, as OpenCV stores {len(points0)} points; give x0[:, 0] and "
+            f"x1[:, 0] for one pair (with a mask they are {len(points0)} pairs of one match)"
+        )
 
     def batch(value: Array | None, dims: int) -> Tensor | None:
         if value is None:
@@ -75,6 +82,7 @@ def find_fundamental(
         lafs0=batch(lafs0, 4), lafs1=batch(lafs1, 4), size0=batch(size0, 2), size1=batch(size1, 2), key=batch(key, 1),
         noise=batch(noise, 2),
     )  # fmt: skip
+    expect_values(c)
     chosen = _estimator(estimator, json.dumps(options, sort_keys=True))
     if prior is None and getattr(chosen, "uses_prior", False):
         framed = lafs0 is not None and lafs1 is not None and quality is not None

@@ -177,6 +177,9 @@ class Correspondences(_Record):
         }  # fmt: skip
         for name, shape in shapes.items():
             _expect(name, getattr(self, name), shape)
+        if (self.size0 is None) != (self.size1 is None):
+            known, missing = ("size1", "size0") if self.size0 is None else ("size0", "size1")
+            raise ValueError(f"{known} is given but {missing} is not; give the sizes of both images, or of neither")
 
     @property
     def keys(self) -> Int[Tensor, " b"]:
@@ -219,9 +222,8 @@ class Correspondences(_Record):
 class Estimate(_Record):
     """Fundamental matrices of B pairs.
 
-    F: (B, 3, 3) with unit Frobenius norm, zero where `ok` is False. inliers: (B, N), within the mask, none where `ok` is
-    False.
-    ok: (B,). reason: why a pair failed, empty where it did not. draws: minimal samples drawn, (B,).
+    F: (B, 3, 3) with unit Frobenius norm, zero where `ok` is False. inliers: (B, N), within the mask; none where `ok`
+    is False. ok: (B,). reason: why a pair failed, empty where it did not. draws: minimal samples drawn, (B,).
     """
 
     F: Float[Tensor, "b 3 3"]

@@ -150,6 +150,7 @@ def degenerate() -> dict[str, Correspondences]:
         "all outliers": scene(4, outliers=1.0),
         "NaN": good.replace(x0=torch.full_like(good.x0, torch.nan)),
         "some NaN": good.replace(x1=torch.where(torch.arange(n)[None, :, None] % 3 == 0, torch.nan, good.x1)),
+        "NaN ratio": good.replace(quality=torch.where(torch.arange(n)[None] % 3 == 0, torch.nan, good.quality)),
         "infinite": good.replace(x1=torch.full_like(good.x1, torch.inf)),
         "huge": good.replace(x0=good.x0 * 1e6, x1=good.x1 * 1e6),
         "tiny": good.replace(x0=good.x0 * 1e-6, x1=good.x1 * 1e-6),

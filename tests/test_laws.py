@@ -118,6 +118,10 @@ def test_no_pair_takes_its_batch_down(subject: Subject, kind: str) -> None:
     assert_same(_good_alone(subject), kept, f"{subject.name} beside {kind}")
     for value in mixed.values():
         assert not bool(torch.isnan(value.to(torch.float64)).any()), f"{subject.name}: NaN for {kind}"
+    if "prior" in mixed:
+        assert 0 <= float(mixed["prior"].min()) <= float(mixed["prior"].max()) <= 1, f"{subject.name}: prior for {kind}"
+    if "noise" in mixed:
+        assert 0 < float(mixed["noise"].min()) <= float(mixed["noise"].max()) < np.inf, f"{subject.name}: {kind}"
 
 
 @pytest.mark.parametrize("subject", PLAIN, ids=[s.name for s in PLAIN])

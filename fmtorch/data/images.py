@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
+import kornia_rs
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +17,8 @@ from fmtorch.data.pairs import ImageSource
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _JPEG_MARKER = re.compile(rb"\xff+([^\x00\xff\xd0-\xd7])", re.DOTALL)
 _END_OF_IMAGE, _START_OF_IMAGE = 0xD9, 0xD8
+_HUFFMAN_FRAMES = (0xC0, 0xC1, 0xC2)  # baseline, extended sequential, progressive
+_TurboJpeg = getattr(kornia_rs, "io", kornia_rs).ImageDecoder  # where it is depends on the version
 
 
 class ImageError(ValueError):
@@ -26,8 +30,8 @@ def read_image(source: ImageSource | Path | str, *, orient: bool = False) -> NDA
 
     Any format OpenCV decodes; 16 bits are reduced to 8, transparency is dropped.
     orient: turn the image as its EXIF orientation says. Off by default: ground truth is given for the pixels as stored.
-    Raises ImageError for a file that is missing, empty, truncated, corrupt or no image: OpenCV alone fills the
-    missing part of a truncated file with grey and says nothing.
+    Raises ImageError for a file that is missing, empty, truncated, corrupt or no image: OpenCV alone makes up what is
+    missing or damaged and says nothing, or but a line on the standard error output.
     """
     path = source.path if isinstance(source, ImageSource) else Path(source)
     try:
@@ -44,6 +48,8 @@ def read_image(source: ImageSource | Path | str, *, orient: bool = False) -> NDA
         raise ImageError(f"{path}: OpenCV refuses it ({error}); it must be a sound image") from error
     if image is None:
         raise ImageError(f"{path}: no image that OpenCV can decode; it must be JPEG, PNG, TIFF or WebP")
+    if data.startswith(_JPEG) and not _jpeg_decodes(data):
+        raise ImageError(f"{path}: corrupt JPEG, its compressed data are damaged; copy it again")
     return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)  # type: ignore[return-value]
 
 
@@ -63,17 +69,43 @@ def _expect_complete(path: Path, data: bytes) -> None:
 
 
 def _jpeg_ends(data: bytes) -> bool:
-    """Whether the markers of a JPEG lead to its end-of-image marker (ITU-T T.81, annex B)."""
+    """Whether the markers of a JPEG lead to its end-of-image marker."""
+    return any(marker == _END_OF_IMAGE for marker, _ in _jpeg_segments(data))
+
+
+def _jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
+    """The markers of a JPEG up to its end-of-image marker, and where what follows each begins (ITU-T T.81, annex B)."""
     position = 2
     while found := _JPEG_MARKER.search(data, position):
         marker = found[1][0]
         position = found.end()
+        yield marker, position
         if marker == _END_OF_IMAGE:
-            return True
+            return
         if marker == 0x01 or marker == _START_OF_IMAGE:  # markers without a length
             continue
         position += int.from_bytes(data[position : position + 2], "big")
-    return False
+
+
+def _jpeg_decodes(data: bytes) -> bool:
+    """Whether a JPEG decodes without a warning of libjpeg, which TurboJPEG takes for an error.
+
+    True where nobody tells: for frames that it does not convert to RGB, which are neither grey nor of three components,
+    of more than 8 bits, or coded in a rare way.
+    """
+    frame = next((data[at : at + 8] for marker, at in _jpeg_segments(data) if marker in _HUFFMAN_FRAMES), b"")
+    if len(frame) < 8 or frame[2] != 8 or frame[7] not in (1, 3):
+        return True
+    decoder = _TurboJpeg()
+    try:
+        decoder.read_header(data)
+    except Exception:  # the library knows no other; a form of JPEG that it does not take
+        return True
+    try:
+        decoder.decode(data)
+    except Exception:
+        return False
+    return True
 
 
 def _png_fault(data: bytes) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fmtorch.estimators.problem import usable
+from fmtorch.estimators.problem import unfit_pairs, usable
 from fmtorch.estimators.support import lack_of_support, relative_rounding
 from fmtorch.types import Correspondences, Estimate
 
@@ -69,17 +69,17 @@ class PairwiseEstimator:
         b, n = c.mask.shape
         F = torch.zeros(b, 3, 3, dtype=torch.float64)
         inliers = torch.zeros(b, n, dtype=torch.bool)
-        reasons = [""] * b
-        live = usable(c).cpu()
+        live = usable(c)
+        _, reasons = unfit_pairs(c, live, LEAST_MATCHES)
+        live = live.cpu()
         for i in range(b):
+            if reasons[i]:
+                continue
             index = live[i].nonzero()[:, 0]
             likelihood = _likelihood(c, i)[index]
             if self._best_first:
                 order = likelihood.argsort(descending=True, stable=True)
                 index, likelihood = index[order], likelihood[order]
-            if len(index) < LEAST_MATCHES:
-                reasons[i] = f"{len(index)} matches; at least {LEAST_MATCHES} are needed"
-                continue
             x0, x1 = (x[i].detach().cpu()[index].to(torch.float64).numpy() for x in (c.x0, c.x1))
             size0, size1 = _size(c.size0, x0, i), _size(c.size1, x1, i)
             try:

@@ -14,6 +14,7 @@ from torch import Tensor
 from fmtorch.geometry import canonical
 from fmtorch.geometry.reduce import matmul3
 from fmtorch.types import Correspondences
+from fmtorch.validation import reason, wrong_values
 
 SMALLEST_BUCKET = 128
 FARTHEST = 1e100  # px; a match beyond is none: numbers made of its coordinates would overflow
@@ -112,13 +113,11 @@ def usable(c: Correspondences) -> Bool[Tensor, "b n"]:
 def problems(c: Correspondences, seed: int, least: int) -> tuple[list[Problem], dict[int, str]]:
     """Problems of equal bucket, and the reason for each pair that cannot be one (fewer than `least` matches, say)."""
     live = usable(c)
-    counts = live.sum(-1).tolist()
-    reasons: dict[int, str] = {}
+    counts, unfit = unfit_pairs(c, live, least)
+    reasons = {i: reason for i, reason in enumerate(unfit) if reason}
     groups: dict[int, list[int]] = {}
     for i, n in enumerate(counts):
-        if n < least:
-            reasons[i] = f"{n} matches; at least {least} are needed"
-        else:
+        if i not in reasons:
             groups.setdefault(bucket(n), []).append(i)
     made: list[Problem] = []
     for n, members in groups.items():
@@ -129,6 +128,15 @@ def problems(c: Correspondences, seed: int, least: int) -> tuple[list[Problem], 
         if bool(spread.any()):
             made.append(problem if bool(spread.all()) else problem[spread.nonzero()[:, 0]])
     return made, reasons
+
+
+def unfit_pairs(c: Correspondences, live: Bool[Tensor, "b n"], least: int) -> tuple[list[int], list[str]]:
+    """The live matches of each pair, and why it cannot be estimated: too few of them, or wrong values."""
+    wrong = wrong_values(c, live)
+    table = torch.stack([live.sum(-1), *wrong.values()], 1).tolist()  # all at once: a GPU is asked but once
+    counts = [n for n, *_ in table]
+    few = [f"{n} matches; at least {least} are needed" if n < least else "" for n in counts]
+    return counts, [a or reason(dict(zip(wrong, row[1:], strict=True))) for a, row in zip(few, table, strict=True)]
 
 
 def _problem(c: Correspondences, live: Tensor, pair: Tensor, n: int, seed: int) -> Problem:

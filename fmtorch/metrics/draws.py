@@ -14,6 +14,7 @@ from torch import Tensor
 
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.random import Stream, uniform
+from fmtorch.validation import expect_sizes
 
 COLUMNS = 6  # random numbers of a draw: for each of its two halves a point (x, y) and a place on its line
 BLOCK = 128  # draws made before pairs with enough accepted ones are left out
@@ -40,7 +41,8 @@ class Pairs:
         size1: Real[Tensor, "*#batch 2"],
         key: Int[Tensor, "*#batch"] | None,
     ) -> tuple[Pairs, torch.Size]:
-        """The pairs and their common leading shape; without keys every key is 0."""
+        """The pairs and their common leading shape; without keys every key is 0. Raises ValueError for wrong sizes."""
+        expect_sizes(size0=size0, size1=size1)
         if key is None:
             key = torch.zeros((), dtype=torch.int64, device=F_est.device)
         shape = (F_gt[..., 0, 0] + F_est[..., 0, 0] + size0[..., 0] + size1[..., 0] + key).shape

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from fmtorch.geometry import epipolar_distances
 from fmtorch.metrics.draws import diagonal
+from fmtorch.validation import expect_sizes
 
 THRESHOLD = 0.003  # of the image diagonal (Bian et al., BMVC 2019)
 
@@ -58,6 +59,7 @@ def ground_truth_inliers(
     x0, x1: (..., N, 2) in pixels. size0, size1: (..., 2) as (h, w); each distance is compared with the diagonal of the
     image in which it is measured. No match is an inlier where F_gt is zero or not finite.
     """
+    expect_sizes(size0=size0, size1=size1)
     F_gt, x0, x1 = (value.to(torch.float64) for value in (F_gt, x0, x1))
     d0, d1 = epipolar_distances(F_gt, x0, x1)
     limit0, limit1 = (threshold * diagonal(size.to(torch.float64))[..., None] for size in (size0, size1))

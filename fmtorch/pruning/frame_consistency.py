@@ -114,7 +114,7 @@ class FrameConsistency:
         self.odds, self.floor, self.slope = odds, floor, slope
 
     def __call__(self, c: Correspondences) -> Correspondences:
-        """The same matches with a prior."""
+        """The same matches with a prior; zero for one whose ratio is not finite."""
         if c.lafs0 is None or c.lafs1 is None or c.quality is None:
             return c
         frames0, frames1, ratio = c.lafs0, c.lafs1, c.quality
@@ -122,6 +122,7 @@ class FrameConsistency:
 
     def _with_prior(self, c: Correspondences, lafs0: Tensor, lafs1: Tensor, ratio: Tensor) -> Correspondences:
         w = frame_agreement(c.x0, c.x1, lafs0, lafs1, ratio, c.mask) + self.floor
-        quality = torch.where(c.mask, ratio, 1)
+        known = c.mask & torch.isfinite(ratio)
+        quality = torch.where(known, ratio, 1)
         odds = self.odds * w * w * w / (1 + self.slope * quality).square()
-        return c.replace(prior=torch.where(c.mask, odds / (1 + odds), 0))
+        return c.replace(prior=torch.where(known, odds / (1 + odds), 0))

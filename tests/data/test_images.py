@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from fmtorch.data import ImageError, ImageSource, read_image, to_grey
 from tests.conftest import shared_path
@@ -66,6 +67,32 @@ def test_truncated_jpeg_is_refused(tmp_path: Path, kind: str) -> None:
         path.write_bytes(data[:length])
         with pytest.raises(ImageError, match=r"a\.jpg: truncated JPEG"):
             read_image(path)
+
+
+@pytest.mark.parametrize("kind", JPEGS)
+def test_a_jpeg_that_libjpeg_warns_of_is_refused(tmp_path: Path, kind: str) -> None:
+    path, data, half = tmp_path / "a.jpg", JPEGS[kind], len(JPEGS[kind]) // 2
+    damages = {
+        "cut, with an end": data[:half] + b"\xff\xd9",
+        "zeros": data[:half] + bytes(300) + data[half + 300 :],
+        "a piece missing": data[:half] + data[half + 300 :],
+    }
+    if kind == "restarts":
+        damages["order of restarts"] = data.replace(b"\xff\xd3", b"\xff\xd5")
+    for name, damaged in damages.items():
+        path.write_bytes(damaged)
+        assert cv2.imread(str(path)) is not None, name  # OpenCV makes something of it
+        with pytest.raises(ImageError, match=r"a\.jpg: corrupt JPEG, its compressed data are damaged"):
+            read_image(path)
+
+
+@pytest.mark.parametrize(
+    ("mode", "options"),
+    [("L", {}), ("RGB", {"subsampling": "4:1:1"}), ("RGB", {"subsampling": 0, "progressive": True}), ("CMYK", {})],
+)
+def test_sound_jpegs_of_any_kind_are_read(tmp_path: Path, mode: str, options: dict[str, object]) -> None:
+    Image.fromarray(COLOUR).convert(mode).save(tmp_path / "a.jpg", "JPEG", **options)
+    assert read_image(tmp_path / "a.jpg").shape[:2] == COLOUR.shape[:2]
 
 
 def test_a_thumbnails_end_is_not_the_images(tmp_path: Path) -> None:
