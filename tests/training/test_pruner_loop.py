@@ -37,7 +37,7 @@ def trained(folder: Path, seen: list[int] | None = None) -> PrunerTraining:
     """The trained module; `seen` gets the steps that were made."""
     made = module()
     made.on_train_batch_start = lambda *_: None if seen is None else seen.append(made.global_step)
-    steps = train(made, batches, folder, CPU, every=5, checkpoint_every=3, patience=None, monitor="hard/AUC@0.05")
+    steps, _ = train(made, batches, folder, CPU, every=5, checkpoint_every=3, patience=None, monitor="hard/AUC@0.05")
     assert steps == STEPS
     return made
 
