@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from fmtorch.pruning.networks.layers import Slots
 from fmtorch.types import Correspondences
@@ -42,3 +43,22 @@ class Exportable(Protocol):
     def predict(self, c: Correspondences, backbone: Backbone) -> Prediction:
         """The prediction, with `backbone` or what takes its place."""
         ...
+
+
+def predict(network: nn.Module, c: Correspondences) -> Prediction:
+    """What any network says of a batch: one that returns log-odds (B, N) alone gets weights of ``tanh(relu(logit))``.
+
+    Raises TypeError or ValueError where the network returns something else.
+    """
+    output = network(c)
+    if isinstance(output, Prediction):
+        return output
+    if not isinstance(output, Tensor):
+        kind = type(output).__name__
+        raise TypeError(f"{type(network).__name__} returns {kind}; a network of matches returns log-odds or Prediction")
+    if output.shape != c.mask.shape:
+        raise ValueError(
+            f"{type(network).__name__} returns log-odds of shape {tuple(output.shape)} for matches of shape "
+            f"{tuple(c.mask.shape)}; there must be one for each match"
+        )
+    return Prediction(output[None], torch.where(c.mask, torch.tanh(torch.relu(output)), 0)[None])
