@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from fmtorch.onnx_session import NetworkFileError
 from fmtorch.pruning.networks.files import SUFFIXES, OnnxBackbone, learned_file, load_weights
-from fmtorch.pruning.networks.prediction import Exportable, Prediction
+from fmtorch.pruning.networks.prediction import Exportable, Prediction, predict
 from fmtorch.types import Correspondences
 
 RUNTIMES = ("auto", *SUFFIXES)
@@ -98,12 +98,10 @@ class LearnedPruner:
         """P(inlier) of the matches of one pair without padding."""
         runtime = self._runtime(c.x0.device)
         ready, temperature = self._prepared(runtime, c.x0.device)
-        predicted = self.network.predict(c, ready) if runtime == "onnx" else ready(c)  # type: ignore[operator]
-        logit = predicted.logit[-1] if isinstance(predicted, Prediction) else predicted
-        if tuple(logit.shape) != tuple(c.mask.shape):
-            raise ValueError(f"{type(self.network).__name__} gives {tuple(logit.shape)} for matches "
-                             f"{tuple(c.mask.shape)}: it has to give log-odds (B, N), or a Prediction")  # fmt: skip
-        p = torch.sigmoid(logit[0] / temperature).to(c.x0.dtype)
+        prediction: Prediction = (
+            self.network.predict(c, ready) if runtime == "onnx" else predict(ready, c)  # type: ignore[operator]
+        )
+        p = torch.sigmoid(prediction.logit[-1, 0] / temperature).to(c.x0.dtype)
         return torch.where(torch.isfinite(p), p, 0)
 
     def _prepared(self, runtime: str, device: torch.device) -> tuple[Any, float]:

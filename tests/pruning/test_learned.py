@@ -248,7 +248,7 @@ def test_a_users_network_runs_with_torch_alone() -> None:
         def forward(self, c: Correspondences) -> Tensor:
             return torch.zeros(3)
 
-    with pytest.raises(ValueError, match=r"Wrong gives \(3,\) for matches \(1, 150\)"):
+    with pytest.raises(ValueError, match=r"Wrong returns log-odds of shape \(3,\) for matches of shape \(1, 150\)"):
         LearnedPruner(Wrong())(scene(0))
 
 

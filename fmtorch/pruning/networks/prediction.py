@@ -55,9 +55,7 @@ def predict(network: nn.Module, c: Correspondences) -> Prediction:
         return output
     if not isinstance(output, Tensor):
         kind = type(output).__name__
-        raise TypeError(
-            f"{type(network).__name__} returns {kind}; a network of matches returns log-odds or a Prediction"
-        )
+        raise TypeError(f"{type(network).__name__} returns {kind}; a network of matches returns log-odds or Prediction")
     if output.shape != c.mask.shape:
         raise ValueError(
             f"{type(network).__name__} returns log-odds of shape {tuple(output.shape)} for matches of shape "

@@ -23,6 +23,7 @@ from fmtorch.training.pruners.module import PrunerTraining
 from fmtorch.training.pruners.progress import TrainingBar
 
 CHECKPOINTS, BEST, LOGS = "checkpoints", "best.ckpt", "logs"
+SMALLER_IS_BETTER = ("log_loss", "calibration_error")  # figures of validation; of the others larger is
 
 
 class TrainingFolderError(ValueError):
@@ -92,22 +93,20 @@ def train(
         trainer: further arguments of lightning.Trainer (accelerator, devices, strategy, precision, gradient clipping).
         every: steps between two validations. checkpoint_every: steps between two checkpoints.
         patience: validations without a better figure after which training ends; None: never.
-        monitor: the figure of validation that counts, larger is better.
+        monitor: the figure of validation that chooses the best weights.
         callbacks: further ones.
     """
     path, step = latest_checkpoint(folder)
+    figure, mode = f"validation/{monitor}", "min" if monitor in SMALLER_IS_BETTER else "max"
     total = module.optimisation.steps
     kept = ModelCheckpoint(
         folder / CHECKPOINTS, "{step}", save_top_k=1, monitor="step", mode="max", every_n_train_steps=checkpoint_every,
         enable_version_counter=False, save_on_train_epoch_end=False,
     )  # fmt: skip
     best = ModelCheckpoint(
-        folder / CHECKPOINTS, "best", monitor=f"validation/{monitor}", mode="max", enable_version_counter=False,
-        save_weights_only=True,
-    )  # fmt: skip
-    stop = (
-        [] if patience is None else [EarlyStopping(f"validation/{monitor}", mode="max", patience=patience, strict=True)]
+        folder / CHECKPOINTS, "best", monitor=figure, mode=mode, enable_version_counter=False, save_weights_only=True
     )
+    stop = [] if patience is None else [EarlyStopping(figure, mode=mode, patience=patience, strict=True)]
     with _quiet():
         lightning_trainer = lightning.Trainer(
             max_steps=total, max_epochs=1, val_check_interval=every, check_val_every_n_epoch=None,

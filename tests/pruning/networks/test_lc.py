@@ -3,11 +3,12 @@
 import pytest
 import torch
 
-from fmtorch.pruning.networks import LC
+from fmtorch.pruning.networks import DFE, LC
 from fmtorch.pruning.networks.layers import Slots
 from fmtorch.pruning.networks.published import ngransac_state
-from fmtorch.types import Correspondences
+from fmtorch.types import Correspondences, collate
 from tests.conftest import oracle
+from tests.laws import scene
 
 
 @pytest.mark.parametrize("model", ["F_r0.80", "F_rs_r0.80", "F_r1.00"])
@@ -29,3 +30,66 @@ def test_outputs_of_neural_guided_ransac(model: str) -> None:
             logit = network.backbone(x.double(), Slots.of(mask, torch.float64))[0, 0]
         log_probability = torch.nn.functional.logsigmoid(logit).log_softmax(0)
         torch.testing.assert_close(log_probability, data[f"{case}.logprob_{model}"].double(), rtol=0, atol=2e-4)
+
+
+def matches(counts: tuple[int, ...]) -> Correspondences:
+    """Pairs of several lengths with NaN in their padding."""
+    c = collate([scene(i, count=n) for i, n in enumerate(counts)])
+    return c.replace(x1=torch.where(c.mask[..., None], c.x1, torch.nan))
+
+
+def test_padding_and_neighbours() -> None:
+    """In evaluation mode a pair's log-odds in a padded batch are those of the pair alone, to rounding of float32."""
+    torch.manual_seed(0)
+    network, counts = LC(side=["ratio"], blocks=4).eval(), (60, 1, 100, 30)
+    with torch.no_grad():
+        together = network(matches(counts))
+        for i, n in enumerate(counts):
+            alone = network(scene(i, count=n))
+            torch.testing.assert_close(together.logit[:, i, :n], alone.logit[:, 0], rtol=1e-4, atol=1e-4)
+            assert not together.weight[:, i, n:].any()
+    assert torch.isfinite(together.logit).all()
+
+
+def test_wider_padding_changes_no_step_of_training() -> None:
+    """Statistics of the batch and gradients exclude padding."""
+    gradients = []
+    for slots in (0, 37):
+        torch.manual_seed(0)
+        network, c = LC(side=["ratio"], blocks=2, channels=16).double(), matches((60, 100, 30))
+        wide = collate([c, c[0].keep(torch.zeros(1, 100, dtype=torch.bool)), scene(9, count=100 + slots)])
+        wide = wide[:-1]  # one pair without matches, and padding as long as the longest that was there
+        x, mask = network.inputs(wide)
+        logit = network.backbone(x.double(), Slots.of(mask, torch.float64))[:, 0]
+        loss = torch.where(mask, logit, 0).square().sum()
+        gradients.append(torch.autograd.grad(loss, list(network.parameters())))
+        assert wide.mask.shape == (4, 100 + slots)
+    torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-9, atol=1e-12)
+
+
+def test_weights_are_those_published() -> None:
+    torch.manual_seed(7)
+    network, c = LC(side=["ratio"], blocks=2, channels=16).eval(), matches((60, 30))
+    logit, weight, F = network(c)
+    expected = torch.where(c.mask, torch.tanh(logit[0].clamp_min(0)), 0)
+    assert (expected > 0).any()
+    assert (expected[c.mask] == 0).any()
+    assert torch.equal(weight[0], expected)
+    assert F is None
+
+
+@pytest.mark.parametrize("network", [LC(side=["ratio"], blocks=2), DFE(side=["ratio"], widths=(32, 16))])
+def test_mixed_precision(network: torch.nn.Module) -> None:
+    """Products in bfloat16, statistics in float32: finite values and gradients close to those of float32."""
+    c = matches((60, 100))
+    losses = []
+    for mixed in (False, True):
+        with torch.autocast("cpu", torch.bfloat16, enabled=mixed):
+            logit = network(c).logit[0]
+        assert logit.dtype == torch.float32
+        losses.append(torch.where(c.mask, logit, 0).square().sum())
+    gradients = [torch.autograd.grad(loss, list(network.parameters()), allow_unused=True)[0] for loss in losses]
+    torch.testing.assert_close(losses[1], losses[0], rtol=0.05, atol=0.05)
+    assert torch.isfinite(gradients[1]).all()
+    cosine = torch.nn.functional.cosine_similarity(*(g.flatten() for g in gradients), dim=0)
+    assert cosine > 0.95
