@@ -85,9 +85,10 @@ class HypothesizeAndVerify:
     refine_thresholds of a model of the pool; null: at all.
     inliers: `threshold`, `lmeds` (2.5 robust standard deviations) or `median` (the better half).
     inlier_threshold: of the inliers reported, Sampson distance in pixels; null: the score's threshold.
-    final: `least_squares` (8-point on the inliers), `gauss_newton` (one attached step), `adaptive` (refined at the
-    scale of the pair's own noise, with the prior on the focal lengths where the choice assumed one and the matches do
-    not contradict it; with the gradients of the optimum) or `none`.
+    final: `least_squares` (8-point on the inliers, weighted by prior and noise where there is a prior),
+    `unweighted_least_squares` (8-point on the inliers, all alike), `gauss_newton` (one attached step), `adaptive`
+    (refined at the scale of the pair's own noise, with the prior on the focal lengths where the choice assumed one and
+    the matches do not contradict it; with the gradients of the optimum) or `none`.
     refit_inliers: recompute the inliers after the final fit.
     compile: build the score with torch.compile (of a saturated one the first look, at a subset), for long runs: the
     first calls take some ten seconds each and need a C++ compiler (RuntimeError where there is none). Scores, and so
