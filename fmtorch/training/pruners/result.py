@@ -30,18 +30,26 @@ class Result:
     temperature: float
 
 
-def write_result(folder: Path, name: str, module: PrunerTraining, facts: Mapping[str, Any]) -> Result:
-    """Evaluate the best weights of a training and write `name` as .safetensors, .onnx (where the network can be
-    exported) and .md into its folder.
+def write_result(
+    folder: Path, name: str, module: PrunerTraining, facts: Mapping[str, Any], checkpoint: Path | None = None
+) -> Result:
+    """Evaluate the best weights of a training and write them into its folder.
+
+    The files are `name` with .safetensors, .md and, where the network can be exported and the extra `export` is
+    installed, .onnx.
 
     Args:
         folder: of the training. name: of the files. module: of the training; takes the best weights.
-        facts: what the card says of the training: `data`, `seconds`, `steps`, `licence`, and the identity.
+        facts: what the card says of the training: `data`, `seconds`, `steps`, `processor`, and the identity.
+        checkpoint: whose weights to take instead of the best ones.
 
     Returns:
-        What was written. Raises FileNotFoundError where there are no best weights.
+        What was written.
+
+    Raises:
+        FileNotFoundError: there is no such checkpoint.
     """
-    best = torch.load(folder / CHECKPOINTS / BEST, map_location="cpu", weights_only=True)
+    best = torch.load(checkpoint or folder / CHECKPOINTS / BEST, map_location="cpu", weights_only=True)
     module.load_state_dict(best["state_dict"])
     network = module.network.to("cpu").eval()
     evaluation = module.validation(network)
