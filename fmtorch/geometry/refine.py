@@ -106,8 +106,8 @@ def refine(
             none to F. Or "unrolled" through all accepted steps, also to F; their choice and the centre of the
             coordinates, on which they depend before convergence, are constants. Both agree at convergence, and before
             it the implicit one is the nearer to the optimum's. (`attached_step` takes Gauss and Newton's Hessian: its
-            gradient is off by some 1 % at a noise of 1 px with a focal length of 1000 px, by 6 to 65 % at 10 px, and by
-            1 to 50 % where a robust kernel weighs wrong matches.)
+            gradient is off by 0.2 to 5 % at a noise of 1 px with a focal length of 1000 px, by 6 to 65 % at 10 px, and
+            by 1 to 50 % where a robust kernel weighs wrong matches.)
 
     Returns:
         Matrices of rank 2 and unit norm in float64; one that cannot be refined comes back as it was, scaled.

@@ -87,10 +87,10 @@ def test_padding_is_zero_and_not_finite_matches_are_masked(coordinates: str) -> 
     assert torch.isfinite(x).all()
 
 
-@pytest.mark.parametrize(("coordinates", "name"), [("size", "size1"), ("K", "K1")])
-def test_what_is_missing_is_named(coordinates: str, name: str) -> None:
-    with pytest.raises(ValueError, match=f"coordinates={coordinates} needs `{name}`"):
-        MatchInputs(coordinates)(one_match(**{name: None}))
+@pytest.mark.parametrize(("coordinates", "missing"), [("size", ("size0", "size1")), ("K", ("K1",))])
+def test_what_is_missing_is_named(coordinates: str, missing: tuple[str, ...]) -> None:
+    with pytest.raises(ValueError, match=f"coordinates={coordinates} needs `{missing[0]}`"):
+        MatchInputs(coordinates)(one_match(**dict.fromkeys(missing)))
 
 
 @pytest.mark.parametrize(
