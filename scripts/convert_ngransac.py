@@ -39,7 +39,7 @@ def main() -> None:
         network = LC(side=["ratio"])
         network.load_state_dict(ngransac_state(read(arguments.checkpoint)))
         save_weights(network, arguments.out, notes={"origin": "vislearn/ngransac, BSD 3-clause"})
-        console.print(f"{arguments.out}: LC with side=[ratio]; log-odds are not calibrated")
+        console.print(f"{arguments.out}: LC with side=[ratio]; log-odds are not calibrated", markup=False)
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ def _groups(present: list[str]) -> dict[str, list[str]]:
     for kind in ("real", "rendered"):
         for name, members in (("wide", WIDE), ("short", SHORT)):
             some = [f for f in families if members.get(f) == kind]
-            if some:
+            if len(some) > 1:
                 groups[f"{kind.capitalize()}, {name} baselines ({', '.join(some)})"] = some
     return groups | {family: [family] for family in families}
 
