@@ -71,13 +71,16 @@ def match(
     for matching, and thresholds are in pixels of the reduced images; the results are always in pixels of the originals.
     seed: of sampling.
 
-    Raises ImageError for a file that is no sound image, ValueError for an array of another type or shape, an unknown
-    pipeline, or a device that is not there. Photographs that cannot be related are no error: `ok` is False.
+    Raises ImageError for a file that is no sound image, TypeError for what is neither a path nor an array, ValueError
+    for an array of another type or shape, an unknown pipeline, or a device that is not there. Photographs that cannot
+    be related are no error: `ok` is False.
     """
     if longest_side < 1:
         raise ValueError(f"longest_side is {longest_side}; it must be at least 1 px")
     if isinstance(pipeline, str):
         pipeline = _pipeline(pipeline, str(presets.resolve_device("auto" if device is None else str(device))))
+    elif not isinstance(pipeline, Pipeline):
+        raise TypeError(f"pipeline is a {type(pipeline).__name__}; it must be the name of a preset or a Pipeline")
     elif device is not None and torch.device(device) != pipeline.device:
         raise ValueError(f"device={device}, but the pipeline was built for {pipeline.device}; leave one of them out")
     images = [_image(image, name) for image, name in ((image0, "image0"), (image1, "image1"))]
@@ -99,6 +102,8 @@ def _pipeline(name: str, device: str) -> Pipeline:
 def _image(image: Path | str | Image, name: str) -> Image:
     if isinstance(image, Path | str):
         return read_image(image, orient=True)
+    if not isinstance(image, np.ndarray):
+        raise TypeError(f"{name} is a {type(image).__name__}; it must be a file's path or a uint8 array of NumPy")
     colour = image.ndim == 3 and image.shape[2] == 3
     if image.dtype != np.uint8 or image.size == 0 or not (image.ndim == 2 or colour):
         raise ValueError(f"{name} is {image.dtype} {image.shape}; it must be non-empty uint8, (H, W) or RGB (H, W, 3)")

@@ -133,11 +133,24 @@ class Pipeline:
         return [dataclasses.replace(outcome, correspondences=c[i]) for i, outcome in enumerate(outcomes)]
 
     def _estimate(self, outcomes: list[Outcome], seed: int) -> list[Outcome]:
-        estimate = self.estimator(_collated(outcomes), seed).detach()
+        estimate = _expect_finite(self.estimator(_collated(outcomes), seed).detach())
         return [
             dataclasses.replace(outcome, estimate=estimate[i], reason=estimate.reason[i])
             for i, outcome in enumerate(outcomes)
         ]
+
+
+def _expect_finite(estimate: Estimate) -> Estimate:
+    """The estimate, whose pairs are not ok where F is no matrix: anybody's estimator may have made it."""
+    sound = torch.isfinite(estimate.F).flatten(1).all(1) & (estimate.F != 0).flatten(1).any(1)
+    wrong = (estimate.ok & ~sound).tolist()
+    if not any(wrong):
+        return estimate
+    said = "estimation: F is zero or not finite, though the estimator calls it ok"
+    reason = tuple(said if bad else old for bad, old in zip(wrong, estimate.reason, strict=True))
+    keep = sound[:, None]
+    F, inliers = torch.where(keep[..., None], estimate.F, 0), estimate.inliers & keep
+    return estimate.replace(F=F, inliers=inliers, ok=estimate.ok & sound, reason=reason)
 
 
 def _collated(outcomes: list[Outcome]) -> Correspondences:

@@ -192,17 +192,35 @@ def build_pipeline(config: DictConfig, device: torch.device | str = "cpu") -> Pi
     )
 
 
-def pipeline(name: str, device: torch.device | str = "cpu", overrides: Sequence[str] = ()) -> Pipeline:
+def pipeline(
+    name: str,
+    device: torch.device | str = "cpu",
+    overrides: Sequence[str] = (),
+    config_dir: Path | str | None = None,
+) -> Pipeline:
     """The pipeline of ``conf/pipeline/<name>.yaml``, changed by `overrides` as on the command line.
 
     E.g. ``pipeline("sift_gms", overrides=["estimator=lmeds", "pruner.gms.with_scale=true"])``. Unlike the commands it
     keeps no features on disk unless asked to (``overrides=["cache=null"]``, or a folder).
-    Raises ValueError for an unknown pipeline, naming those there are, and for an override that does not apply.
+
+    Args:
+        name: a preset of conf/pipeline, or of `config_dir`.
+        device: where features are described and everything behind them is computed.
+        overrides: as words of a command.
+        config_dir: a folder with presets of your own, as the commands take it by `--config-dir`.
+
+    Raises:
+        ValueError: for an unknown pipeline, naming those there are, for an override that does not apply, and where
+            `config_dir` is no folder.
     """
-    if name not in available("pipeline"):
-        raise ValueError(f"no preset {name!r} in conf/pipeline; there are: {', '.join(available('pipeline'))}")
+    if config_dir is not None and not Path(config_dir).is_dir():
+        raise ValueError(f"config_dir={config_dir} is no folder")
+    known = available("pipeline", config_dir)
+    if name not in known:
+        raise ValueError(f"no preset {name!r} in conf/pipeline; there are: {', '.join(known)}")
+    words = (f"pipeline={name}", "cache=off", *overrides)
     try:
-        config = _compose("match", (f"pipeline={name}", "cache=off", *overrides))
+        config = _compose("match", words) if config_dir is None else _composed("match", words, Path(config_dir))
     except HydraException as error:
         raise ValueError(f"pipeline={name} with {', '.join(overrides)}: {error}") from error
     return build_pipeline(config, device)
@@ -211,10 +229,16 @@ def pipeline(name: str, device: torch.device | str = "cpu", overrides: Sequence[
 @functools.lru_cache(maxsize=64)
 def _compose(config_name: str, overrides: tuple[str, ...]) -> DictConfig:
     """The config that a command composes from its arguments; a caller's own Hydra stays as it is."""
+    return _composed(config_name, overrides)
+
+
+def _composed(config_name: str, overrides: Sequence[str], config_dir: Path | None = None) -> DictConfig:
+    """The same, read anew, with a user's presets."""
+    own = [] if config_dir is None else [f"hydra.searchpath=['file://{config_dir.resolve()}']"]
     with _composing:
         hydra_of_caller, GlobalHydra.instance().hydra = GlobalHydra.instance().hydra, None
         try:
             with hydra.initialize_config_dir(str(conf_dir()), version_base=None):
-                return hydra.compose(config_name, list(overrides))
+                return hydra.compose(config_name, [*own, *overrides])
         finally:
             GlobalHydra.instance().hydra = hydra_of_caller

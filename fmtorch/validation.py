@@ -15,7 +15,7 @@ from fmtorch.types import Correspondences
 
 PER_MATCH: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
     "prior": (lambda prior: (prior >= 0) & (prior <= 1), "it is P(inlier), within [0, 1]"),
-    "noise": (lambda noise: (noise > 0) & (noise < torch.inf), "it is a standard deviation, positive and finite"),
+    "noise": (lambda noise: noise > 0, "it is a standard deviation, positive"),
 }
 """Which values of a match are right, and what is said of others. NaN is never right."""
 SIZE = "image sizes (h, w) are positive"

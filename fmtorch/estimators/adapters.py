@@ -65,7 +65,15 @@ class PairwiseEstimator:
         self.name, self._solve, self._best_first = name, solve, best_first
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
-        """Estimate each pair in turn; a pair without a solution is `ok=False` with a reason."""
+        """Estimate each pair in turn; a pair without a solution is `ok=False` with a reason.
+
+        Raises ValueError where somebody asks for gradients, which no other library gives.
+        """
+        if c.requires_grad:
+            raise ValueError(
+                f"{self.name} passes no gradient on: give it matches that need none (`x0.detach()`), or take an "
+                "estimator of this project"
+            )
         b, n = c.mask.shape
         F = torch.zeros(b, 3, 3, dtype=torch.float64)
         inliers = torch.zeros(b, n, dtype=torch.bool)
@@ -96,7 +104,7 @@ class PairwiseEstimator:
                 continue
             F[i] = torch.from_numpy(estimate / np.linalg.norm(estimate))
             inliers[i, index[torch.from_numpy(inside)]] = True
-        ok = torch.tensor([not reason for reason in reasons])
+        ok = torch.tensor([not reason for reason in reasons], dtype=torch.bool)
         draws = torch.zeros(b, dtype=torch.int64)  # not reported by these libraries
         return Estimate(F, inliers, ok, tuple(reasons), draws).to(c.mask.device)
 

@@ -1,5 +1,6 @@
-"""Figures of merit for fundamental matrices and matches, as plain batched functions.
+"""Figures of merit for fundamental matrices and matches, as plain batched functions of tensors or NumPy arrays.
 
+Their results are tensors; sizes may also be tuples (h, w).
 `fmtorch.metrics.torchmetrics` has thin classes over them that accumulate over batches and processes.
 """
 

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
+from fmtorch.arguments import takes_arrays
 from fmtorch.geometry import epipolar_distances
 from fmtorch.metrics.draws import diagonal
 from fmtorch.validation import expect_sizes
@@ -22,6 +23,7 @@ class InlierRate(NamedTuple):
     after: Tensor
 
 
+@takes_arrays
 def inlier_rate(
     F_gt: Float[Tensor, "*#batch 3 3"],
     x0: Float[Tensor, "*#batch n 2"],
@@ -44,6 +46,7 @@ def inlier_rate(
     return InlierRate(_share(correct, given), _share(correct & kept, kept))
 
 
+@takes_arrays
 def ground_truth_inliers(
     F_gt: Float[Tensor, "*#batch 3 3"],
     x0: Float[Tensor, "*#batch n 2"],

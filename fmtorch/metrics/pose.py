@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from fmtorch.arguments import takes_arrays
 from fmtorch.geometry.epipolar import inverse_root
 
 
@@ -24,6 +25,7 @@ class PoseError(NamedTuple):
         return torch.maximum(self.rotation, self.translation)
 
 
+@takes_arrays
 def pose_error(
     R_est: Float[Tensor, "*#batch 3 3"],
     t_est: Float[Tensor, "*#batch 3"],
@@ -59,6 +61,7 @@ def pose_error(
     return PoseError(torch.where(usable, rotation, 180.0), translation)
 
 
+@takes_arrays
 def pose_auc(
     errors: Float[Tensor, "*batch pairs"], thresholds: Sequence[float | int] = (5, 10, 20)
 ) -> Float[Tensor, "*batch t"]:

@@ -6,15 +6,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from fmtorch.arguments import takes_arrays
+
 THRESHOLD = 0.05  # NSGD below which an estimate counts as recalled (Bian et al., BMVC 2019)
 CURVE = (0.0, 0.2, 20)  # first and last threshold and their number, as in the paper's curves
 
 
+@takes_arrays
 def recall(nsgd: Float[Tensor, "*batch pairs"], threshold: float = THRESHOLD) -> Float[Tensor, "*batch"]:
     """Share of all pairs with NSGD strictly below the threshold; NaN, a failure, counts as a miss."""
     return (nsgd < threshold).to(nsgd.dtype).mean(-1)
 
 
+@takes_arrays
 def recall_curve(
     nsgd: Float[Tensor, "*batch pairs"], thresholds: Float[Tensor, " t"] | None = None
 ) -> Float[Tensor, "*batch t"]:
@@ -25,6 +29,7 @@ def recall_curve(
     return (nsgd[..., None, :] < thresholds[:, None]).to(nsgd.dtype).mean(-1)
 
 
+@takes_arrays
 def mean_recall(nsgd: Float[Tensor, "*batch pairs"], maximum: float = THRESHOLD) -> Float[Tensor, "*batch"]:
     """Mean of `recall` over thresholds from 0 to `maximum`: the exact area under its step curve over `maximum`.
 

@@ -54,6 +54,8 @@ def frame_agreement(
 
 def tiled(function: Callable[[Tensor, Tensor], Tensor], rows: Tensor, sound: Bool[Tensor, "b n"]) -> Tensor:
     """function(rows (d, b, n), sound) over so many pairs at once that TILE matches bound its memory."""
+    if not sound.numel():
+        return rows.new_zeros(sound.shape)
     pairs = max(1, (GPU_TILE if sound.is_cuda else TILE) // max(sound.shape[1], 1))
     if len(sound) <= pairs:
         return function(rows, sound)

@@ -49,8 +49,6 @@ def position_agreement(
     ``e = |S dx0 - dx1| / (s |dx0| + |dx1| + NOISE)``; the agreement is the mean of ``(1 + (e / TOLERANCE)^2 / 8)^-8``
     over the neighbours in both images, weighted by votes (`frame_agreement` has the same constants and votes).
     """
-    if mask.shape[1] == 0:
-        return torch.zeros_like(x0[..., 0])
     vote = torch.ones_like(x0[..., 0]) if quality is None else (WORST_RATIO - quality).clamp_min(LEAST_VOTE)
     rows = torch.stack([*x0.unbind(-1), *x1.unbind(-1), vote])
     sound = mask & (rows.abs() < _FARTHEST).all(0)

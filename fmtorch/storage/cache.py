@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import threading
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from fmtorch.storage.files import replacing
 
 Arrays = dict[str, NDArray[Any]]
+DIGEST = "digest"  # the array that holds the digest of the others
 SLACK = 0.05  # share of the bound that is freed at once, so that the folder is not listed for every file
 ABANDONED = 3600.0  # seconds after which a temporary file is a dead writer's
 
@@ -26,7 +28,8 @@ class ArrayCache:
     """Files ``<folder>/<section>/<name>.npz``, each whole or absent. Safe with several threads and processes.
 
     limit: bytes; when more are kept, the least recently used files go (each process may exceed it by `SLACK`). None: no
-    bound. A file that is damaged counts as absent, with a warning; what cannot be written is not kept, with a warning.
+    bound. A file that is damaged, or holds other arrays than were written under its name, counts as absent, with a
+    warning, one of a version that kept no digest without; what cannot be written is not kept, with a warning.
     Raises ValueError where the folder is a file or the limit is not positive.
     """
 
@@ -54,6 +57,11 @@ class ArrayCache:
         try:
             with np.load(path, allow_pickle=False) as file:
                 arrays = {key: file[key] for key in file.files}
+            kept = arrays.pop(DIGEST, None)
+            if kept is None:
+                return None
+            if kept.tobytes() != self._digest(section, name, arrays):
+                raise ValueError("it is not what was written there")
             os.utime(path)  # used now
         except FileNotFoundError:
             return None
@@ -68,7 +76,8 @@ class ArrayCache:
         with self._excused(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             with replacing(path) as temporary, temporary.open("wb") as file:
-                np.savez(file, **arrays)  # type: ignore[arg-type]
+                digest = np.frombuffer(self._digest(section, name, arrays), np.uint8)
+                np.savez(file, **arrays, **{DIGEST: digest})  # type: ignore[arg-type]
             self._grown(sum(array.nbytes for array in arrays.values()))
 
     def files(self) -> Iterator[tuple[Path, os.stat_result]]:
@@ -91,6 +100,15 @@ class ArrayCache:
                 break
             path.unlink(missing_ok=True)
             excess -= status.st_size
+
+    @staticmethod
+    def _digest(section: str, name: str, arrays: Arrays) -> bytes:
+        """Of the file's place and all that it holds."""
+        digest = hashlib.blake2b(f"{section}/{name}".encode(), digest_size=16)
+        for key, array in sorted(arrays.items()):
+            digest.update(repr((key, array.dtype.str, array.shape)).encode())
+            digest.update(np.ascontiguousarray(array).data)
+        return digest.digest()
 
     def _path(self, section: str, name: str) -> Path:
         return self.folder / section / f"{name}.npz"

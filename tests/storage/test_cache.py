@@ -204,3 +204,33 @@ def test_bad_arguments(tmp_path: Path) -> None:
         ArrayCache(tmp_path / "file")
     with pytest.raises(ValueError, match="must be positive"):
         ArrayCache(tmp_path, limit=0)
+
+
+@pytest.mark.parametrize("change", ["value", "shape", "name", "another image's", "no digest"])
+def test_a_sound_file_of_wrong_content_is_absent(tmp_path: Path, change: str) -> None:
+    cache = ArrayCache(tmp_path)
+    cache.write("s", "a", {"x": np.arange(6.0), "seconds": np.array(1.0)})
+    cache.write("s", "b", {"x": np.arange(9.0), "seconds": np.array(1.0)})
+    path = tmp_path / "s" / "a.npz"
+    with np.load(path) as file:
+        arrays = dict(file)
+    if change == "another image's":
+        path.write_bytes((tmp_path / "s" / "b.npz").read_bytes())
+    else:
+        changed = {
+            "value": {**arrays, "x": arrays["x"] + np.eye(6)[0]}, "shape": {**arrays, "x": arrays["x"].reshape(2, 3)},
+            "name": {"y": arrays["x"], "seconds": arrays["seconds"], "digest": arrays["digest"]},
+            "no digest": {"x": arrays["x"], "seconds": arrays["seconds"]},
+        }[change]  # fmt: skip
+        np.savez(path, **changed)
+    if change == "no digest":  # of an earlier version
+        assert cache.read("s", "a") is None
+    else:
+        with pytest.warns(
+            UserWarning, match="a.npz is damaged .it is not what was written there.; it is computed anew"
+        ):
+            assert cache.read("s", "a") is None
+    cache.write("s", "a", {"x": np.arange(6.0), "seconds": np.array(1.0)})
+    again = cache.read("s", "a")
+    assert again is not None
+    np.testing.assert_array_equal(again["x"], np.arange(6.0))
