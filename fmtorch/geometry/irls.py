@@ -124,7 +124,6 @@ def reweighted_fits(
     problem = NormalizedMatches(x0, x1, None, mask, first, 1.0)
     clean0, clean1 = (torch.where(problem.counts[..., None], x, 0).to(torch.float64) for x in (x0, x1))
 
-
     def distances(F: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b n"]:
         return torch.where(problem.counts, sampson(F, clean0, clean1), 0)
 
