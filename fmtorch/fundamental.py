@@ -13,6 +13,7 @@ import numpy as np
 from fmtorch import presets
 from fmtorch.arguments import Arrays, correspondences
 from fmtorch.stages import Estimator, Pruner
+from fmtorch.threads import one_thread
 from fmtorch.types import Estimate
 from fmtorch.validation import expect_values
 
@@ -72,7 +73,8 @@ def find_fundamental(
     chosen = _estimator(estimator, config_dir, options)
     if prior is None and getattr(chosen, "uses_prior", False):
         framed = c.lafs0 is not None and c.lafs1 is not None and c.quality is not None
-        c = _consistency("frame_consistency" if framed else "position_consistency")(c)
+        with one_thread(c.mask.device):
+            c = _consistency("frame_consistency" if framed else "position_consistency")(c)
     return chosen(c, seed)
 
 

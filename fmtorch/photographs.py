@@ -18,6 +18,7 @@ from fmtorch import presets
 from fmtorch.data.images import read_image
 from fmtorch.geometry.epipolar import unit_frobenius
 from fmtorch.pipeline import Pipeline
+from fmtorch.threads import one_thread
 from fmtorch.types import Correspondences, Estimate, Features
 
 Image = NDArray[np.uint8]
@@ -136,7 +137,8 @@ def _relate(pipeline: Pipeline, features0: Features, features1: Features, seed: 
     counts = {"matching": int(c.count())}
     slots = torch.arange(c.mask.shape[1], device=c.mask.device)
     for name, pruner in pipeline.pruners.items():
-        c = pruner(c)
+        with one_thread(pipeline.device):
+            c = pruner(c)
         slots, c = slots[c.mask[0]], c.compact()
         clock(name)
         counts[name] = len(slots)

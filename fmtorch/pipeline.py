@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from fmtorch.data.images import read_image
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.stages import Estimator, FeatureExtractor, Matcher, Pruner, TimedExtractor
+from fmtorch.threads import one_thread
 from fmtorch.types import Correspondences, Estimate, Features, collate
 
 STAGES = ("features", "matching", "pruning", "estimation")
@@ -93,10 +94,11 @@ class Pipeline:
         """A batched stage over the pairs that live; where it raises, once more pair by pair: only the culprit fails."""
         alive = [i for i, outcome in enumerate(outcomes) if outcome.correspondences is not None]
         start = time.perf_counter()
-        try:
-            made = function([outcomes[i] for i in alive]) if alive else []
-        except Exception:  # whose fault it is shows pair by pair
-            made = [_alone(stage, function, outcomes[i]) for i in alive]
+        with one_thread(self.device):
+            try:
+                made = function([outcomes[i] for i in alive]) if alive else []
+            except Exception:  # whose fault it is shows pair by pair
+                made = [_alone(stage, function, outcomes[i]) for i in alive]
         _synchronise(self.device)
         share = (time.perf_counter() - start) / max(len(alive), 1)
         result = list(outcomes)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from fmtorch.estimators.problem import Problem, problems
 from fmtorch.estimators.support import lack_of_support, relative_rounding
+from fmtorch.threads import one_thread
 from fmtorch.types import Correspondences, Estimate, ungraphed
 
 Solve = Callable[[Problem], tuple[Tensor, Tensor, Tensor, Tensor]]
@@ -21,7 +22,8 @@ def solve_all(c: Correspondences, seed: int, least: int, solve: Solve, not_found
     least: matches below which a pair is not tried, and inliers below which a model is none. not_found: the reason for
     pairs that `solve` does not find a model for. limit: pairs that are solved together; changes no result.
     """
-    return ungraphed(c, lambda: _solve_all(c, seed, least, solve, not_found, limit))
+    with one_thread(c.mask.device):
+        return ungraphed(c, lambda: _solve_all(c, seed, least, solve, not_found, limit))
 
 
 def _solve_all(c: Correspondences, seed: int, least: int, solve: Solve, not_found: str, limit: int) -> Estimate:

@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from fmtorch.threads import one_thread
+
 _GROUP = 32  # columns whose minimum is taken together; a group is searched only where it can hold a neighbour
 _FLOAT32_NORM = 2.0**11  # integer vectors no longer than this have squared distances up to 2^24: exact in float32
 _FLOAT64_NORM = 2.0**25  # likewise 2^52 in float64
@@ -61,6 +63,13 @@ def nearest_neighbors(
     """
     if chunk < 1:
         raise ValueError(f"chunk is {chunk}; it must be at least 1")
+    with one_thread(descriptors0.device):
+        return _nearest_neighbors(descriptors0, descriptors1, mask0, mask1, chunk)
+
+
+def _nearest_neighbors(
+    descriptors0: Tensor, descriptors1: Tensor, mask0: Tensor | None, mask1: Tensor | None, chunk: int
+) -> Neighbors:
     batch, (n0, n1) = descriptors0.shape[:-2], (descriptors0.shape[-2], descriptors1.shape[-2])
     flat0, flat1 = (d.reshape(math.prod(batch), *d.shape[-2:]) for d in (descriptors0, descriptors1))
     usable0, usable1 = _usable(flat0, mask0), _usable(flat1, mask1)
