@@ -265,7 +265,7 @@ def test_training_goes_through_degenerate_scenes(fit: Fit) -> None:
     optimiser = torch.optim.Adam(network.parameters(), lr=2e-2)
     losses = []
     for step in range(8):
-        logit = network(torch.where(c.mask, c.quality, 0.0)[..., None].double())[..., 0]
+        logit = network(torch.where(c.mask, c.quality, 0.0).nan_to_num(0.0)[..., None].double())[..., 0]
         F, valid = fit(c, torch.where(c.mask, torch.sigmoid(logit), 0.0))
         options = {"valid": valid, "seed": step, "key": c.key}
         judged = classification_loss(logit, label)
