@@ -3,7 +3,7 @@
 python scripts/benchmark learned --root DATA/Strecha --root DATA/KITTI --json FILE
 python scripts/benchmark learned --rendered full --limit 50 --json FILE
 python scripts/benchmark learned --from FILE FILE --markdown docs/learned.md
-python scripts/benchmark learned --ngransac FILE.safetensors ...      # also NG-RANSAC's published weights
+python scripts/benchmark learned --ngransac FILE.safetensors ...      # also NG-RANSAC's published weights, as a prior
 
 A pruner's time is the processor's, of its stage alone, on one thread. Every pair is estimated once, with seed 0.
 """
@@ -111,11 +111,9 @@ def measure(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
     }  # fmt: skip
     if arguments.ngransac:
         network = {"_target_": "fmtorch.pruning.networks.LC", "side": ["ratio"]}
-        for use, threshold in (("hard", 0.5), ("prior", None)):
-            options = {"file": str(arguments.ngransac), "threshold": threshold, "prior": threshold is None}
-            pruner = presets.build("pruner", "lc", network=network, **options)
-            before = [(name, stage(name)) for name in sorted(GIVEN, reverse=True)]
-            built[use]["NG-RANSAC's network"] = [*before, ("lc", pruner)]
+        pruner = presets.build("pruner", "lc_soft", network=network, file=str(arguments.ngransac))
+        before = [(name, stage(name)) for name in sorted(GIVEN, reverse=True)]
+        built["prior"]["NG-RANSAC's network"] = [*before, ("lc", pruner)]  # its outputs are weights of samples
     for pair in track(pairs, "pairs", console=console):
         yield from rows(front, pair, built, estimators, arguments.features)
 
