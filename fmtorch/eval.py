@@ -9,19 +9,10 @@ from pathlib import Path
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import Progress
 
 from fmtorch import data, presets
-from fmtorch.command import console, exits_with_message, plain
+from fmtorch.command import console, exits_with_message, plain, progress_bars, reporter
 from fmtorch.data import PairDataset
 from fmtorch.evaluation.identity import run_identity
 from fmtorch.evaluation.plots import plot_recall_curves
@@ -38,7 +29,7 @@ MOST_PROCESSES = 8  # unless more are asked for: each holds the networks of the 
 def run(config: DictConfig, pipeline_name: str) -> Path:
     """Evaluate one composed config and return the run folder."""
     device = presets.resolve_device(config.device)
-    with _progress() as progress:
+    with progress_bars() as progress:
         dataset = _load(config.dataset, progress)
         pipeline = presets.build_pipeline(config, device)
         identity = run_identity(config, pipeline_name, pipeline, dataset.digest)
@@ -79,29 +70,11 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
 
 def _load(config: DictConfig, progress: Progress) -> PairDataset:
     """The data set of a config; the embedded one is drawn on first use, which the progress bar shows."""
-    bar: list[TaskID] = []
-
-    def drawn(done: int, total: int) -> None:
-        if not bar:
-            bar.append(progress.add_task("drawing scenes", total=total))
-        progress.update(bar[0], completed=done, total=total)
-
     options = plain(config)
     if "_target_" in options:  # somebody's own data set
         dataset: PairDataset = presets.instantiate(options, "dataset")
         return dataset
-    return data.load(**options, progress=drawn)
-
-
-def _progress() -> Progress:
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    return Progress(*columns, console=Console(stderr=True))
+    return data.load(**options, progress=reporter(progress, "drawing scenes"))
 
 
 @hydra.main(version_base=None, config_path=str(conf_dir()), config_name="eval")
