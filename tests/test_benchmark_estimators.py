@@ -76,3 +76,13 @@ def test_truth_is_the_fit_that_starts_from_the_true_matrix(tmp_path: Path) -> No
         near, far = result["nsgd"][0]
         assert 1e-6 < near < 0.01, spec  # the matches' noise moves it
         assert far > 0.05, spec  # and does not bring it home from elsewhere
+
+
+def test_a_baseline_from_before_the_figures_had_these_names_is_refused(tmp_path: Path) -> None:
+    import estimators
+
+    assert "KITTI" in estimators.baseline(SCRIPTS / "estimators.json")
+    earlier = tmp_path / "figures.json"
+    earlier.write_text('{"figures": {"KITTI": {"ransac": {"recall_05": 1.0, "mean_recall": 0.5}}}}')
+    with pytest.raises(SystemExit, match=r"figures\.json has no auc_05"):
+        estimators.baseline(earlier)

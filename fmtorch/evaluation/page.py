@@ -135,7 +135,7 @@ def _merit(summaries: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """All figures over all pairs, a row a run."""
     columns = {heading: column for heading, column in MARKDOWN_COLUMNS.items() if heading}
     rows = [[name, *(column(summary[ALL]) for column in columns.values())] for name, summary in summaries.items()]
-    ranked = {"%Recall [interval]": "recall", f"at {FINE_THRESHOLD}": "recall_fine", "mAA": "mean_recall"}
+    ranked = {"%Recall [interval]": "recall", f"at {FINE_THRESHOLD}": "recall_fine", "AUC@0.05": "auc_05"}
     best = {
         heading: _best([summary[ALL][field] for summary in summaries.values()]) for heading, field in ranked.items()
     }
@@ -143,7 +143,7 @@ def _merit(summaries: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _families(summaries: Mapping[str, Mapping[str, Any]]) -> dict[str, Any] | None:
-    """Recall and mean recall by family; None where there is but one."""
+    """Recall and AUC@0.05 by family; None where there is but one."""
     names = dict.fromkeys(family for summary in summaries.values() for family in summary if family != ALL)
     if len(names) < 2:
         return None
@@ -151,13 +151,11 @@ def _families(summaries: Mapping[str, Mapping[str, Any]]) -> dict[str, Any] | No
     for name, summary in summaries.items():
         groups = [summary.get(family) for family in names]
         rows.append(
-            [name, *("–" if g is None else f"{100 * g['recall']:.1f} / {100 * g['mean_recall']:.1f}" for g in groups)]
+            [name, *("–" if g is None else f"{100 * g['recall']:.1f} / {100 * g['auc_05']:.1f}" for g in groups)]
         )
     for i, family in enumerate(names, start=1):
-        best[i] = _best(
-            [summary[family]["mean_recall"] if family in summary else None for summary in summaries.values()]
-        )
-    return _table(f"By family: %Recall at {THRESHOLD} / mAA", ["run", *names], rows, best)
+        best[i] = _best([summary[family]["auc_05"] if family in summary else None for summary in summaries.values()])
+    return _table(f"By family: %Recall at {THRESHOLD} / AUC@0.05", ["run", *names], rows, best)
 
 
 def _differences(runs: Mapping[str, pa.Table]) -> dict[str, Any] | None:
@@ -172,13 +170,13 @@ def _differences(runs: Mapping[str, pa.Table]) -> dict[str, Any] | None:
         two = {first: runs[first], other: runs[other]}
         a, b = _common(two, "nsgd")
         rows.append([other, f"{len(a):,}", *_ahead(a, b, [scene[key] for key in _keys(two)])])
-    head = ["run", "shared pairs", f"recall at {THRESHOLD}", f"at {FINE_THRESHOLD}", "mAA"]
+    head = ["run", "shared pairs", f"recall at {THRESHOLD}", f"at {FINE_THRESHOLD}", "AUC@0.05"]
     note = "In points, with the paired 95 % bootstrap interval: a difference whose interval holds 0 may be chance."
     return {**_table(f"What {first} is ahead by", head, rows, {}), "note": note}
 
 
 def _ahead(a: NDArray[np.float64], b: NDArray[np.float64], scenes: Sequence[str]) -> list[str]:
-    """Differences of recall at both thresholds and of mean recall, of NSGD of the same pairs."""
+    """Differences of recall at both thresholds and of AUC@0.05, of NSGD of the same pairs."""
     if not len(a):
         return ["–"] * 3
     merits = [((a < t).astype(np.float64), (b < t).astype(np.float64)) for t in (THRESHOLD, FINE_THRESHOLD)]

@@ -36,8 +36,8 @@ def summarize(table: pa.Table) -> dict[str, Group]:
     - pairs, scenes: how many.
     - recall: share of all pairs with NSGD < 0.05, a failed pair being a miss; recall_interval: its 95 % bootstrap
       interval, and interval_over: what was resampled (see `bootstrap_mean`). recall_fine: at NSGD < 0.01.
-      mean_recall: mean over the thresholds from 0 to 0.05. recall_released: by the published evaluator's NSGD, where
-      that was computed for each pair that did not fail.
+      auc_05: AUC@0.05, the mean of recall over the thresholds from 0 to 0.05. recall_released: by the published
+      evaluator's NSGD, where that was computed for each pair that did not fail.
     - inlier_rate: share of the estimator's inliers that obey the true F, and inlier_rate_before: share of the matches
       given to it; means over the pairs that did not fail, as the paper; ``*_failures_0``: means over all pairs with 0
       for failures and where there is no figure.
@@ -57,13 +57,13 @@ def _group(table: pa.Table) -> Group:
     scenes = [f"{family}/{scene}" for family, scene in places]
     group: Group = {"pairs": len(ok), "scenes": len(set(scenes))}
 
-    group |= {"recall": None, "recall_interval": None, "interval_over": None, "recall_fine": None, "mean_recall": None}
+    group |= {"recall": None, "recall_interval": None, "interval_over": None, "recall_fine": None, "auc_05": None}
     if len(ok):
         interval = bootstrap_mean((nsgd < THRESHOLD).astype(np.float64), scenes)
         group |= {
             "recall": recall(nsgd), "recall_interval": [interval.low, interval.high], "interval_over": interval.over,
             "recall_fine": recall(nsgd, FINE_THRESHOLD),
-            "mean_recall": float(metrics.mean_recall(torch.from_numpy(nsgd), THRESHOLD)),
+            "auc_05": float(metrics.mean_recall(torch.from_numpy(nsgd), THRESHOLD)),
         }  # fmt: skip
     released = np.where(ok, _column(table, "nsgd_released"), 1.0)
     group["recall_released"] = recall(released) if len(ok) and not np.isnan(released).any() else None
@@ -140,8 +140,8 @@ def caption(summary: Mapping[str, Group]) -> str:
     over = "; ".join(f"{o}s" + (f" ({', '.join(names)})" if len(where) > 1 else "") for o, names in where.items())
     return (
         f"%Recall: NSGD < {THRESHOLD}, failures are misses; [{LEVEL:.0%} bootstrap interval, {RESAMPLES:,} resamples "
-        f"of {over or 'pairs'}]. mAA: mean recall over NSGD 0 to {THRESHOLD}. %Inlier, #Corrs: after estimation, -m: "
-        "before; means over the pairs that did not fail."
+        f"of {over or 'pairs'}]. AUC@0.05: area under the recall curve to NSGD {THRESHOLD}. "
+        "%Inlier, #Corrs: after estimation, -m: before; means over the pairs that did not fail."
     )
 
 
@@ -184,7 +184,7 @@ _TERMINAL: dict[str, Callable[[Group], str]] = {
     "": lambda group: "",
     "Pairs": lambda group: str(group["pairs"]),
     "%Recall": _recall,
-    "mAA": _percent("mean_recall"),
+    "AUC@0.05": _percent("auc_05"),
     "%Inlier (-m)": _inliers,
     "#Corrs (-m)": _corrs,
     "Failed": lambda group: str(group["failures"]),
@@ -195,7 +195,7 @@ MARKDOWN_COLUMNS: dict[str, Callable[[Group], str]] = {
     "Scenes": lambda group: str(group["scenes"]),
     "%Recall [interval]": _recall,
     f"at {FINE_THRESHOLD}": _percent("recall_fine"),
-    "mAA": _percent("mean_recall"),
+    "AUC@0.05": _percent("auc_05"),
     "%Recall (released NSGD)": _percent("recall_released"),
     "%Inlier": _percent("inlier_rate"),
     "with failures 0": _percent("inlier_rate_failures_0"),

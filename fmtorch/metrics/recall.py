@@ -33,6 +33,8 @@ def recall_curve(
 def mean_recall(nsgd: Float[Tensor, "*batch pairs"], maximum: float = THRESHOLD) -> Float[Tensor, "*batch"]:
     """Mean of `recall` over thresholds from 0 to `maximum`: the exact area under its step curve over `maximum`.
 
+    With the default this is AUC@0.05.
+
     A pair with NSGD e is recalled on the share max(0, 1 - e / maximum) of the thresholds, so the figure is the mean of
     that over pairs, and differentiable in e. NaN counts as a miss.
     """

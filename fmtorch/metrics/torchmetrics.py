@@ -81,7 +81,7 @@ class Recall(_MeanOverPairs):
 
 
 class MeanRecall(_MeanOverPairs):
-    """`fmtorch.metrics.mean_recall` over all pairs, from their NSGD."""
+    """AUC@0.05: `fmtorch.metrics.mean_recall` over all pairs, from their NSGD."""
 
     is_differentiable = True
     higher_is_better = True

@@ -1,4 +1,4 @@
-"""Robust estimators on the same matches, one thread each: recall, mean recall, milliseconds, paired intervals.
+"""Robust estimators on the same matches, one thread each: recall, AUC@0.05, milliseconds, paired intervals.
 
 An estimator is named as PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]; the pruners after @ count into its time. The preset
 `truth` is none: it is the fit that starts from the true matrix, and so what the matches allow.
@@ -64,13 +64,21 @@ def run(arguments: argparse.Namespace) -> None:
     for group, inside in groups(pairs).items():
         table.report(f"{group}: {int(inside.sum())} pairs, {arguments.seeds} seeds", figures[group])
     if arguments.baseline:
-        table.compare(figures, json.loads(arguments.baseline.read_text())["figures"])
+        table.compare(figures, baseline(arguments.baseline))
     if arguments.json:
         machine = {"processor": platform.processor() or platform.machine(), "torch": torch.__version__}
         content = {"machine": machine, "pairs": len(pairs), "seeds": arguments.seeds, "figures": figures}
         arguments.json.write_text(json.dumps(content, indent=1) + "\n")
     if arguments.update:
         table.write(arguments.update, arguments.marker, figures, pairs, arguments.seeds)
+
+
+def baseline(path: Path) -> dict[str, dict[str, dict[str, Any]]]:
+    """The figures of a file written by --json. Raises SystemExit for one from before AUC@0.05 had this name."""
+    figures: dict[str, dict[str, dict[str, Any]]] = json.loads(path.read_text())["figures"]
+    if any("auc_05" not in row for group in figures.values() for row in group.values()):
+        raise SystemExit(f"{path} has no auc_05 (earlier versions wrote mean_recall); measure it again")
+    return figures
 
 
 def read_specs(path: Path) -> list[str]:
@@ -148,9 +156,9 @@ def summaries(results: dict[str, Result], pairs: list[ImagePair], inside: np.nda
         found[spec] = {
             "recall_05": 100 * float((nsgd < 0.05).mean()),
             "recall_01": 100 * float((nsgd < 0.01).mean()),
-            "mean_recall": 100 * float(np.clip(1 - nsgd / 0.05, 0, 1).mean()),
+            "auc_05": 100 * float(np.clip(1 - nsgd / 0.05, 0, 1).mean()),
             "ahead_recall_01": paired_interval(1.0 * (first["nsgd"] < 0.01) - 1.0 * (nsgd < 0.01), clusters),
-            "ahead_mean_recall": paired_interval(
+            "ahead_auc_05": paired_interval(
                 np.clip(1 - first["nsgd"] / 0.05, 0, 1) - np.clip(1 - nsgd / 0.05, 0, 1), clusters
             ),
             "ms_median": float(np.median(ms)),

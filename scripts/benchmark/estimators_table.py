@@ -11,20 +11,20 @@ from rich.table import Table
 
 from fmtorch.data import ImagePair
 
-COLUMNS = ("R.05", "R.01", "mAA", "first minus this: R.01", "mAA", "ms median", "ms mean", "ratio")
+COLUMNS = ("R.05", "R.01", "AUC@0.05", "first minus this: R.01", "AUC@0.05", "ms median", "ms mean", "ratio")
 
 
 def ahead(figures: dict[str, Any]) -> list[str]:
-    """The differences in recall at 0.01 and in mean recall, with their intervals; empty for the first itself."""
+    """The differences in recall at 0.01 and in AUC@0.05, with their intervals; empty for the first itself."""
     return [
         "" if figures[key] == (0.0, 0.0, 0.0) else "{:+.1f} [{:+.1f}, {:+.1f}]".format(*figures[key])
-        for key in ("ahead_recall_01", "ahead_mean_recall")
+        for key in ("ahead_recall_01", "ahead_auc_05")
     ]
 
 
 def cells(figures: dict[str, Any]) -> list[str]:
     """One estimator's row of COLUMNS."""
-    recalls = [f"{figures[key]:.1f}" for key in ("recall_05", "recall_01", "mean_recall")]
+    recalls = [f"{figures[key]:.1f}" for key in ("recall_05", "recall_01", "auc_05")]
     return [*recalls, *ahead(figures), *(f"{figures[key]:.2f}" for key in ("ms_median", "ms_mean", "ms_ratio"))]
 
 
@@ -40,18 +40,16 @@ def report(title: str, figures: dict[str, dict[str, Any]]) -> None:
 
 
 def recall_table(figures: dict[str, dict[str, dict[str, Any]]], pairs: list[ImagePair], seeds: int) -> str:
-    """Recall at 0.05 / at 0.01 / mean recall of each family, and the median time over all: a row an estimator."""
+    """Recall at 0.05 / at 0.01 / AUC@0.05 of each family, and the median time over all: a row an estimator."""
     counts = {group: int(inside.sum()) for group, inside in groups(pairs).items()}
     shown = [group for group in figures if group != "all" and not group.endswith("baselines")]
     head = ["estimator", *(f"{group} ({counts[group]})" for group in shown)]
     lines = [f"| {' | '.join([*head, 'ms'])} |", f"| --- {'| ---: ' * (len(head))}|"]
     for spec, whole in figures[list(figures)[-1]].items():
-        recalls = [
-            "{recall_05:.1f} / {recall_01:.1f} / {mean_recall:.1f}".format(**figures[group][spec]) for group in shown
-        ]
+        recalls = ["{recall_05:.1f} / {recall_01:.1f} / {auc_05:.1f}".format(**figures[group][spec]) for group in shown]
         lines.append(f"| `{spec}` | {' | '.join(recalls)} | {whole['ms_median']:.1f} |")
     note = (
-        "Recall at NSGD 0.05 / at 0.01 / mean recall over 0..0.05, in %; pairs in brackets; "
+        "Recall at NSGD 0.05 / at 0.01 / AUC@0.05 (area under the recall curve to NSGD 0.05), in %; pairs in brackets; "
         f"mean of {seeds} seeds; median milliseconds of processor time a pair over all, one thread."
     )
     return "\n".join([note, "", *lines])
@@ -64,17 +62,17 @@ def difference_table(figures: dict[str, dict[str, dict[str, Any]]], pairs: list[
     first = next(iter(figures[shown[0]]))
     head = ["estimator"]
     for group in shown:
-        head += [f"{group} ({counts[group]})", "ahead, R.01", "ahead, mAA"]
+        head += [f"{group} ({counts[group]})", "ahead, R.01", "ahead, AUC@0.05"]
     lines = [f"| {' | '.join([*head, 'time'])} |", f"| --- {'| ---: ' * (len(head))}|"]
     for spec, whole in figures[list(figures)[-1]].items():
         cell = [f"`{spec}`"]
         for group in shown:
             own = figures[group][spec]
-            cell.append("{recall_05:.1f} / {recall_01:.1f} / {mean_recall:.1f}".format(**own))
+            cell.append("{recall_05:.1f} / {recall_01:.1f} / {auc_05:.1f}".format(**own))
             cell += ahead(own)
         lines.append(f"| {' | '.join(cell)} | {whole['ms_ratio']:.2f} |")
     note = (
-        f"What `{first}` is ahead by: mean difference of recall at 0.01 and of mean recall, in points, with its 95 % "
+        f"What `{first}` is ahead by: mean difference of recall at 0.01 and of AUC@0.05, in points, with its 95 % "
         f"bootstrap interval, clustered by scene; {seeds} seeds. Time: median ratio to that of `{first}`, pair by pair."
     )
     return "\n".join([note, "", *lines])
@@ -102,7 +100,7 @@ def replaced(path: Path, name: str, text: str) -> bool:
 
 def compare(figures: dict[str, dict[str, dict[str, Any]]], before: dict[str, dict[str, dict[str, Any]]]) -> None:
     """How recall and time differ from an earlier run's, group by group."""
-    keys = ("recall_05", "recall_01", "mean_recall", "ms_median")
+    keys = ("recall_05", "recall_01", "auc_05", "ms_median")
     for group in figures.keys() & before.keys():
         for spec in figures[group].keys() & before[group].keys():
             now, then = figures[group][spec], before[group][spec]

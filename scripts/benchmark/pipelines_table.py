@@ -30,7 +30,7 @@ Row = dict[str, Any]
 # A figure of one pair, the mean over seeds; NaN where it is not defined.
 FIGURES: dict[str, tuple[Callable[[Row], float], str]] = {
     "%Recall": (lambda row: 100 * float(np.mean([e < RECALL for e in row["nsgd"]])), ".1f"),
-    "mAA": (lambda row: 100 * float(np.mean([max(0.0, 1 - e / RECALL) for e in row["nsgd"]])), ".1f"),
+    "AUC@0.05": (lambda row: 100 * float(np.mean([max(0.0, 1 - e / RECALL) for e in row["nsgd"]])), ".1f"),
     "%Inlier": (lambda row: 100 * _solved_mean(row, "inlier_rate"), ".1f"),
     "%Inlier-m": (lambda row: 100 * _solved_mean(row, "inlier_rate_before"), ".1f"),
     "#Corrs": (lambda row: _solved_mean(row, "corrs"), ".0f"),
@@ -92,7 +92,7 @@ def _interval(i: Interval, form: str) -> str:
 
 
 def _order(rows: list[Row], families: list[str]) -> Sheet:
-    """What one pipeline has more than another on the same pairs: %Recall, mAA and %Inlier-m.
+    """What one pipeline has more than another on the same pairs: %Recall, AUC@0.05 and %Inlier-m.
 
     Those with a label are compared with their like without one.
     """
@@ -109,9 +109,9 @@ def _order(rows: list[Row], families: list[str]) -> Sheet:
             if not common or (len(members) < 2 and group not in families):
                 continue
             shown = [_difference(name, [first[p] for p in common], [second[p] for p in common])
-                     for name in ("%Recall", "mAA", "%Inlier-m")]  # fmt: skip
+                     for name in ("%Recall", "AUC@0.05", "%Inlier-m")]  # fmt: skip
             lines.append([f"{group}: `{better}` - `{worse}`", str(len(common)), *shown])
-    return Sheet("Paired differences, in points", ["", "pairs", "%Recall", "mAA", "%Inlier-m"], lines)
+    return Sheet("Paired differences, in points", ["", "pairs", "%Recall", "AUC@0.05", "%Inlier-m"], lines)
 
 
 def _difference(name: str, first: list[Row], second: list[Row]) -> str:

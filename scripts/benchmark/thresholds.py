@@ -1,4 +1,4 @@
-"""The best threshold of each estimator on tuning data: mean recall averaged over the families, so each counts alike.
+"""The best threshold of each estimator on tuning data: AUC@0.05 averaged over the families, so each counts alike.
 
 python scripts/benchmark thresholds --root DATA/castle --root DATA/fox --rendered small --split train \\
     --values 0.35 0.5 0.75 1 1.5 2 3 --estimators poselib:prosac=true opencv_usac_magsac
@@ -31,7 +31,7 @@ def run(arguments: argparse.Namespace) -> None:
     items = matched.load(arguments)
     torch.set_num_threads(1)
     families = {g: i for g, i in groups([pair for pair, _ in items]).items() if g not in ("all",) and "base" not in g}
-    table = Table(title=f"mean recall, {len(items)} pairs, {arguments.seeds} seeds")
+    table = Table(title=f"AUC@0.05, {len(items)} pairs, {arguments.seeds} seeds")
     for column in ("estimator", arguments.option, *families, "mean", "best"):
         table.add_column(column, justify="left" if column == "estimator" else "right")
     for spec in arguments.estimators:

@@ -52,7 +52,7 @@ def test_known_answer() -> None:
     assert (indoor["pairs"], indoor["scenes"], indoor["failures"], indoor["failure_share"]) == (5, 5, 1, 0.2)
     assert indoor["recall"] == pytest.approx(3 / 5)  # strictly below 0.05
     assert indoor["recall_fine"] == pytest.approx(2 / 5)
-    assert indoor["mean_recall"] == pytest.approx((1 + 0.9 + 0.5 + 0 + 0) / 5)
+    assert indoor["auc_05"] == pytest.approx((1 + 0.9 + 0.5 + 0 + 0) / 5)
     assert indoor["recall_released"] == pytest.approx(3 / 5)
     assert indoor["interval_over"] == "scene"
     assert indoor["inlier_rate"] == pytest.approx(0.75)  # of the pairs that did not fail and have a rate
@@ -78,7 +78,7 @@ def test_failing_never_pays() -> None:
     rows = [good(str(i), 0.01 * i, inlier_rate=0.1 * i) for i in range(8)]
     failed = [*rows[:7], bad("7")]
     before, after = (summarize(to_table(r))["all"] for r in (rows, failed))
-    for figure in ("recall", "recall_fine", "mean_recall", "inlier_rate_failures_0", "inlier_rate_before_failures_0"):
+    for figure in ("recall", "recall_fine", "auc_05", "inlier_rate_failures_0", "inlier_rate_before_failures_0"):
         assert after[figure] <= before[figure]
 
 
@@ -87,7 +87,7 @@ def test_summary_does_not_depend_on_the_order_of_pairs() -> None:
     turned = table.take(np.arange(len(table))[::-1])
     a, b = summarize(table), summarize(turned)
     for name in a:
-        for figure in ("recall", "mean_recall", "inlier_rate", "corrs", "failures"):
+        for figure in ("recall", "auc_05", "inlier_rate", "corrs", "failures"):
             assert a[name][figure] == pytest.approx(b[name][figure], abs=1e-15)
 
 
