@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from typing import Any
+
 import fmtorch
 
 project = "fmtorch"
@@ -23,3 +26,21 @@ napoleon_numpy_docstring = False
 html_theme = "furo"
 html_title = "fmtorch"
 html_copy_source = False
+
+
+def _plain_text(app: object, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    """Docstrings are plain text: backquotes mean code, stars and bars mean themselves."""
+    for i, line in enumerate(lines):
+        code_and_text = re.split(r"(``[^`]+``|`[^`]+`)", line)
+        for j, part in enumerate(code_and_text):
+            if j % 2 == 0:
+                escaped = re.sub(r"([*|]|_(?!\w))", r"\\\1", part)
+                code_and_text[j] = ("\\ " if j and re.match(r"\w", part) else "") + escaped
+            elif not part.startswith("``"):
+                code_and_text[j] = f"`{part}`"
+        lines[i] = "".join(code_and_text)
+
+
+def setup(app: Any) -> None:
+    """Called by Sphinx."""
+    app.connect("autodoc-process-docstring", _plain_text, priority=1000)

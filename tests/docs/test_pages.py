@@ -1,0 +1,17 @@
+"""The examples of the pages give what they say."""
+
+from __future__ import annotations
+
+import doctest
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+@pytest.mark.parametrize("page", ["conventions.md"])
+def test_the_examples_of_a_page_run(page: str) -> None:
+    failed, attempted = doctest.testfile(str(DOCS / page), module_relative=False)
+    assert attempted > 0
+    assert failed == 0
