@@ -2,36 +2,27 @@
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fmtorch.data import ImagePair, ImageSource
+from fmtorch.evaluation.bootstrap import paired_bootstrap
 from fmtorch.geometry import eight_point
+from scripts.benchmark import estimators, estimators_table, matched
 from tests.laws import scene
 
-SCRIPTS = Path(__file__).resolve().parent.parent / "scripts" / "benchmark"
-
-
-@pytest.fixture(autouse=True)
-def _importable(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "path", [str(SCRIPTS), *sys.path])
+FIGURES = Path(__file__).resolve().parent.parent / "scripts" / "benchmark" / "estimators.json"
 
 
 def test_options_are_numbers_switches_or_words() -> None:
-    import matched
-
     assert matched.options("a=0.5,b=true,c=null,d=focal") == {"a": 0.5, "b": True, "c": None, "d": "focal"}
     assert matched.options("") == {}
 
 
 def test_tables_stand_between_their_markers(tmp_path: Path) -> None:
-    import estimators
-    import estimators_table
-    import matched
-
     rng = np.random.default_rng(0)
     image = ImageSource("none", tmp_path / "none.png")  # not looked at
     families = ["orbit", "orbit", "driving", "driving"]
@@ -63,8 +54,6 @@ def test_tables_stand_between_their_markers(tmp_path: Path) -> None:
 
 
 def test_truth_is_the_fit_that_starts_from_the_true_matrix(tmp_path: Path) -> None:
-    import estimators
-
     exact = scene(0, 200, outliers=0, noise=0)
     (F,), _ = eight_point(exact.x0.double(), exact.x1.double())
     image = ImageSource("none", tmp_path / "none.png")  # not looked at
@@ -79,10 +68,55 @@ def test_truth_is_the_fit_that_starts_from_the_true_matrix(tmp_path: Path) -> No
 
 
 def test_a_baseline_from_before_the_figures_had_these_names_is_refused(tmp_path: Path) -> None:
-    import estimators
-
-    assert "KITTI" in estimators.baseline(SCRIPTS / "estimators.json")
+    assert "KITTI" in estimators.baseline(FIGURES)
     earlier = tmp_path / "figures.json"
     earlier.write_text('{"figures": {"KITTI": {"ransac": {"recall_05": 1.0, "mean_recall": 0.5}}}}')
     with pytest.raises(SystemExit, match=r"figures\.json has no auc_05"):
         estimators.baseline(earlier)
+
+
+def pairs_of(scenes: list[str]) -> list[ImagePair]:
+    image = ImageSource("none", Path("none.png"))  # not looked at
+    return [ImagePair(f"orbit/{i}", "orbit", name, image, image, np.eye(3)) for i, name in enumerate(scenes)]
+
+
+@pytest.mark.parametrize(("count", "over"), [(3, "pair"), (8, "scene")])
+def test_intervals_are_those_of_every_other_table_and_the_page_says_over_what(
+    count: int, over: str, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(0)
+    pairs = pairs_of([f"s{i % count}" for i in range(48)])
+    nsgd = rng.uniform(0, 0.08, (2, 2, 48))  # two methods, two seeds
+    results = {name: {"nsgd": e, "ms": np.ones((2, 48))} for name, e in zip(("ours", "theirs"), nsgd, strict=True)}
+    figures = estimators.summaries(results, pairs, np.ones(48, bool))["theirs"]
+    share = np.clip(1 - nsgd / 0.05, 0, 1).mean(1)
+    expected = paired_bootstrap(100 * share[0], 100 * share[1], [f"orbit/{pair.scene}" for pair in pairs])
+    assert (figures["interval_over"], expected.over) == (over, over)
+    assert figures["ahead_auc_05"] == pytest.approx([expected.value, expected.low, expected.high], abs=1e-9)
+    assert figures["auc_05"] == pytest.approx(100 * share[1].mean())
+    assert figures["recall_05"] == pytest.approx(100 * (nsgd[1] < 0.05).mean())
+
+    page = tmp_path / "page.md"
+    page.write_text("<!-- a -->\n<!-- end a -->\n<!-- a differences -->\n<!-- end a differences -->\n")
+    groups = {g: estimators.summaries(results, pairs, inside) for g, inside in matched.groups(pairs).items()}
+    estimators_table.write(page, "a", groups, pairs, 2)
+    assert f"48 pairs of {count} scenes, intervals over {over}s" in page.read_text()
+
+
+def test_a_first_method_that_is_level_with_the_next_still_shows_the_interval() -> None:
+    pairs = pairs_of([f"s{i}" for i in range(6)])
+    same = {"nsgd": np.full((1, 6), 0.02), "ms": np.ones((1, 6))}
+    figures = estimators.summaries({"a": same, "b": same}, pairs, np.ones(6, bool))
+    assert estimators_table.ahead(figures, "a") == ["", ""]
+    assert estimators_table.ahead(figures, "b") == ["+0.0 [+0.0, +0.0]"] * 2
+
+
+def test_a_split_is_the_rendered_sets_alone(tmp_path: Path) -> None:
+    """`--root SET --split train`, as in the commands of the ablation and of the thresholds."""
+    (tmp_path / "pairs_with_gt.txt").write_text("0 1 0 0 0 0 0 -1 0 1 0\n")
+    (tmp_path / "pairs_which_dataset.txt").write_text("scene/\n")
+    (tmp_path / "scene" / "Images").mkdir(parents=True)
+    parser = argparse.ArgumentParser()
+    matched.add_set_arguments(parser)
+    (found,) = matched.sets_of(parser.parse_args(["--root", str(tmp_path), "--split", "train"]))
+    assert len(found) == 1

@@ -15,7 +15,7 @@ SOURCE = Path(__file__).resolve().parents[1]
 
 def benchmark(*arguments: str, cwd: Path) -> str:
     env = {**os.environ, "PYTHONPATH": str(SOURCE), "COLUMNS": "200", "FMTORCH_CACHE": f"{cwd}/cache"}
-    command = [sys.executable, str(SOURCE / "scripts/benchmark"), "pipelines", *arguments]
+    command = [sys.executable, "-m", "scripts.benchmark", "pipelines", *arguments]
     result = subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, timeout=300, check=False)
     assert result.returncode == 0, result.stderr
     return result.stdout
@@ -49,7 +49,7 @@ def test_an_interrupted_run_goes_on(tmp_path: Path) -> None:
     table.write_text("before\n<!-- figures -->\n<!-- end of figures -->\nafter\n")
     benchmark("--from", str(tmp_path / "rows.jsonl"), "--markdown", str(table), cwd=tmp_path)
     written = table.read_text()
-    assert "### Set: 3 pairs of 1 scene" in written
+    assert "### Set: 3 pairs of 1 scene, intervals over pairs" in written
     assert "| `rootsiftpca_gms` | " in written
     assert written.startswith("before")
     assert written.endswith("after\n")

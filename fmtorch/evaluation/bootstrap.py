@@ -17,12 +17,18 @@ _BLOCK = 1 << 22  # numbers drawn at once: bounds the memory to some 100 MB
 
 @dataclasses.dataclass(frozen=True)
 class Interval:
-    """A mean with its percentile bootstrap interval. over: what was resampled, ``scene`` or ``pair``."""
+    """A mean with its percentile bootstrap interval. over: what was resampled, ``scene`` or ``pair``.
+
+    As text it is ``value [low, high]``, each number in the given format: ``f"{interval:+.1f}"``.
+    """
 
     value: float
     low: float
     high: float
     over: str
+
+    def __format__(self, form: str) -> str:
+        return f"{self.value:{form}} [{self.low:{form}}, {self.high:{form}}]"
 
 
 def bootstrap_mean(values: NDArray[np.float64], scenes: Sequence[str]) -> Interval:

@@ -16,10 +16,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from fmtorch.evaluation.bootstrap import paired_bootstrap
 from fmtorch.evaluation.pictures import Image
 from fmtorch.evaluation.plots import plot_recall_curves
-from fmtorch.evaluation.summary import ALL, FINE_THRESHOLD, MARKDOWN_COLUMNS, STAGES, THRESHOLD, caption, summarize
+from fmtorch.evaluation.statistics import FINE_THRESHOLD, MERITS, PERCENT, THRESHOLD, difference, scene_names
+from fmtorch.evaluation.summary import ALL, MARKDOWN_COLUMNS, STAGES, caption, summarize
 
 QUALITY, WIDTH = 82, 1280  # of JPEG pictures; px
 DISAGREEMENT = 0.1  # NSGD beyond which a result is as bad as any
@@ -163,8 +163,8 @@ def _differences(runs: Mapping[str, pa.Table]) -> dict[str, Any] | None:
     if len(runs) < 2:
         return None
     first, *others = runs
-    columns = (runs[first][name].to_pylist() for name in ("key", "family", "scene"))
-    scene = {key: f"{family}/{place}" for key, family, place in zip(*columns, strict=True)}
+    key, family, place = (runs[first][name].to_pylist() for name in ("key", "family", "scene"))
+    scene = dict(zip(key, scene_names(family, place), strict=True))
     rows = []
     for other in others:
         two = {first: runs[first], other: runs[other]}
@@ -177,12 +177,8 @@ def _differences(runs: Mapping[str, pa.Table]) -> dict[str, Any] | None:
 
 def _ahead(a: NDArray[np.float64], b: NDArray[np.float64], scenes: Sequence[str]) -> list[str]:
     """Differences of recall at both thresholds and of AUC@0.05, of NSGD of the same pairs."""
-    if not len(a):
-        return ["–"] * 3
-    merits = [((a < t).astype(np.float64), (b < t).astype(np.float64)) for t in (THRESHOLD, FINE_THRESHOLD)]
-    merits.append((np.clip(1 - a / THRESHOLD, 0, 1), np.clip(1 - b / THRESHOLD, 0, 1)))
-    cells = [paired_bootstrap(x, y, scenes) for x, y in merits]
-    return [f"{100 * c.value:+.1f} [{100 * c.low:+.1f}, {100 * c.high:+.1f}]" for c in cells]
+    found = [difference(values(a), values(b), scenes, scale=PERCENT) for values in MERITS.values()]
+    return ["–" if interval is None else f"{interval:+.1f}" for interval in found]
 
 
 def _seconds(summaries: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -14,7 +14,8 @@ import torch
 from numpy.typing import NDArray
 
 from fmtorch import metrics
-from fmtorch.evaluation.summary import ALL, THRESHOLD, recall
+from fmtorch.evaluation.statistics import THRESHOLD, recalled
+from fmtorch.evaluation.summary import ALL
 from fmtorch.storage import replacing
 
 if TYPE_CHECKING:
@@ -83,7 +84,7 @@ def _draw(ax: Axes, title: str, curves: Mapping[str, NDArray[np.float64]]) -> No
         share = metrics.recall_curve(torch.from_numpy(nsgd), thresholds).numpy()
         whole = name == ALL
         ax.plot(
-            thresholds.numpy(), 100 * share, label=f"{100 * recall(nsgd):.1f}  {name}",
+            thresholds.numpy(), 100 * share, label=f"{100 * recalled(nsgd).mean():.1f}  {name}",
             color="#000000" if whole else colour, linestyle=dash, linewidth=2.4 if whole else 1.7, zorder=3,
         )  # fmt: skip
     ax.set(xlim=(0, MAXIMUM), ylim=(0, 101), yticks=range(0, 101, 20))

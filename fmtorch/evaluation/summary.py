@@ -9,18 +9,15 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import torch
 from numpy.typing import NDArray
 from rich import box
 from rich.table import Table
 
-from fmtorch import metrics
 from fmtorch.evaluation.bootstrap import LEVEL, RESAMPLES, bootstrap_mean
+from fmtorch.evaluation.statistics import FINE_THRESHOLD, MERITS, THRESHOLD, recalled, scene_names
 from fmtorch.storage import PAIR_SCHEMA
 
 ALL = "all"
-THRESHOLD = 0.05  # NSGD, the paper's
-FINE_THRESHOLD = 0.01  # NSGD
 STAGES = tuple(name.removeprefix("seconds_") for name in PAIR_SCHEMA.names if name.startswith("seconds_"))
 _REASONS = 3  # commonest reasons kept
 _DASH = "–"
@@ -53,20 +50,18 @@ def summarize(table: pa.Table) -> dict[str, Group]:
 def _group(table: pa.Table) -> Group:
     ok = table["ok"].to_numpy().astype(bool)
     nsgd = _column(table, "nsgd")
-    places = zip(table["family"].to_pylist(), table["scene"].to_pylist(), strict=True)
-    scenes = [f"{family}/{scene}" for family, scene in places]
+    scenes = scene_names(table["family"].to_pylist(), table["scene"].to_pylist())
     group: Group = {"pairs": len(ok), "scenes": len(set(scenes))}
 
     group |= {"recall": None, "recall_interval": None, "interval_over": None, "recall_fine": None, "auc_05": None}
     if len(ok):
-        interval = bootstrap_mean((nsgd < THRESHOLD).astype(np.float64), scenes)
+        interval = bootstrap_mean(recalled(nsgd), scenes)
         group |= {
-            "recall": recall(nsgd), "recall_interval": [interval.low, interval.high], "interval_over": interval.over,
-            "recall_fine": recall(nsgd, FINE_THRESHOLD),
-            "auc_05": float(metrics.mean_recall(torch.from_numpy(nsgd), THRESHOLD)),
+            "recall": interval.value, "recall_interval": [interval.low, interval.high], "interval_over": interval.over,
+            "recall_fine": float(MERITS["recall_01"](nsgd).mean()), "auc_05": float(MERITS["auc_05"](nsgd).mean()),
         }  # fmt: skip
     released = np.where(ok, _column(table, "nsgd_released"), 1.0)
-    group["recall_released"] = recall(released) if len(ok) and not np.isnan(released).any() else None
+    group["recall_released"] = float(recalled(released).mean()) if len(ok) and not np.isnan(released).any() else None
 
     for name in ("inlier_rate", "inlier_rate_before"):
         rate = _column(table, name)
@@ -85,11 +80,6 @@ def _group(table: pa.Table) -> Group:
     group["seconds"] = {stage: _median(row) for stage, row in zip(STAGES, seconds, strict=True)}
     group["seconds"]["total"] = _median(np.nansum(seconds, axis=0))
     return group
-
-
-def recall(nsgd: NDArray[np.float64], threshold: float = THRESHOLD) -> float:
-    """Share of the pairs whose NSGD is below the threshold."""
-    return float(metrics.recall(torch.from_numpy(nsgd), threshold))
 
 
 def summary_table(summary: Mapping[str, Group], title: str) -> Table:

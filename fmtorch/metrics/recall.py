@@ -9,6 +9,7 @@ from torch import Tensor
 from fmtorch.arguments import takes_arrays
 
 THRESHOLD = 0.05  # NSGD below which an estimate counts as recalled (Bian et al., BMVC 2019)
+FINE_THRESHOLD = 0.01  # NSGD below which it counts as accurate
 CURVE = (0.0, 0.2, 20)  # first and last threshold and their number, as in the paper's curves
 
 

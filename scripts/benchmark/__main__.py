@@ -1,26 +1,27 @@
-"""`python scripts/benchmark estimators ...`: speed and accuracy against peers, in one run, on the same inputs."""
+"""`python -m scripts.benchmark estimators ...`, in the checkout's folder: one command for each benchmark."""
 
 from __future__ import annotations
 
 import argparse
-import sys
-from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
+if not __package__:
+    raise SystemExit("run it in the checkout's folder, as a module: python -m scripts.benchmark COMMAND ...")
 
-import estimators
-import features
-import learned
-import matching
-import memory
-import pipelines
-import pruning
-import speed
-import thresholds
+from scripts.benchmark import (
+    estimators,
+    features,
+    learned,
+    matching,
+    memory,
+    pipelines,
+    pruning,
+    speed,
+    thresholds,
+)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="scripts/benchmark", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m scripts.benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     for module in (estimators, features, learned, matching, memory, pipelines, pruning, speed, thresholds):
         module.add_arguments(commands)

@@ -3,9 +3,9 @@
 An estimator is named as PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]; the pruners after @ count into its time. The preset
 `truth` is none: it is the fit that starts from the true matrix, and so what the matches allow.
 
-python scripts/benchmark estimators --root DATA/Strecha --root DATA/PhotoTourism --seeds 5 \\
+python -m scripts.benchmark estimators --root DATA/Strecha --root DATA/PhotoTourism --seeds 5 \\
     --estimators fmtorch@frame_consistency opencv_usac_magsac:threshold=1.0 poselib:threshold=0.5,prosac=true
-python scripts/benchmark estimators --rendered full --specs scripts/benchmark/estimators.txt --json figures.json
+python -m scripts.benchmark estimators --rendered full --specs scripts/benchmark/estimators.txt --json figures.json
 """
 
 from __future__ import annotations
@@ -20,19 +20,22 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import estimators_table as table
-import matched
 import numpy as np
 import torch
-from matched import Item, console, groups, options, paired_interval
+from numpy.typing import NDArray
 from rich.progress import track
 
 from fmtorch import metrics, presets
 from fmtorch.data import ImagePair
+from fmtorch.evaluation.statistics import MERITS, PERCENT, described, difference
 from fmtorch.geometry import refine
+from fmtorch.stages import Estimator
 from fmtorch.types import Correspondences, Estimate
+from scripts.benchmark import estimators_table as table
+from scripts.benchmark import matched
+from scripts.benchmark.matched import Item, console, groups, options
 
-Result = dict[str, np.ndarray]  # nsgd, ms: (seeds, pairs)
+Result = dict[str, NDArray[np.float64]]  # nsgd, ms: (seeds, pairs)
 
 
 def add_arguments(commands: Any) -> None:
@@ -62,7 +65,8 @@ def run(arguments: argparse.Namespace) -> None:
     pairs = [pair for pair, _ in items]
     figures = {group: summaries(results, pairs, inside) for group, inside in groups(pairs).items()}
     for group, inside in groups(pairs).items():
-        table.report(f"{group}: {int(inside.sum())} pairs, {arguments.seeds} seeds", figures[group])
+        place = described([scene for scene, one in zip(matched.scenes(pairs), inside, strict=True) if one])
+        table.report(f"{group}: {place}; {arguments.seeds} seeds", figures[group])
     if arguments.baseline:
         table.compare(figures, baseline(arguments.baseline))
     if arguments.json:
@@ -73,9 +77,9 @@ def run(arguments: argparse.Namespace) -> None:
         table.write(arguments.update, arguments.marker, figures, pairs, arguments.seeds)
 
 
-def baseline(path: Path) -> dict[str, dict[str, dict[str, Any]]]:
+def baseline(path: Path) -> table.Groups:
     """The figures of a file written by --json. Raises SystemExit for one from before AUC@0.05 had this name."""
-    figures: dict[str, dict[str, dict[str, Any]]] = json.loads(path.read_text())["figures"]
+    figures: table.Groups = json.loads(path.read_text())["figures"]
     if any("auc_05" not in row for group in figures.values() for row in group.values()):
         raise SystemExit(f"{path} has no auc_05 (earlier versions wrote mean_recall); measure it again")
     return figures
@@ -86,7 +90,7 @@ def read_specs(path: Path) -> list[str]:
     return [text for line in path.read_text().splitlines() if (text := line.partition("#")[0].strip())]
 
 
-def build(spec: str) -> Callable[[Correspondences, int], Estimate]:
+def build(spec: str) -> Estimator:
     """The function of `PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]`: pruners in order, then the estimator."""
     front, _, stages = spec.partition("@")
     name, _, rest = front.partition(":")
@@ -146,21 +150,22 @@ def measure(specs: list[str], items: list[Item], seeds: int) -> dict[str, Result
     return results
 
 
-def summaries(results: dict[str, Result], pairs: list[ImagePair], inside: np.ndarray) -> dict[str, dict[str, Any]]:
-    """The figures of each estimator over some pairs, and what the first is ahead by, with 95 % intervals."""
+def summaries(results: dict[str, Result], pairs: list[ImagePair], inside: NDArray[np.bool_]) -> table.Figures:
+    """The figures of each estimator over some pairs, in percent; ahead_*: what the first has more, with its interval.
+
+    interval_over: what the intervals resample, scenes or, where there are fewer than five, pairs.
+    """
     first = {key: value[:, inside] for key, value in next(iter(results.values())).items()}
-    clusters = np.array([pair.scene for pair in pairs])[inside]
-    found = {}
+    scenes = [scene for scene, one in zip(matched.scenes(pairs), inside, strict=True) if one]
+    found: table.Figures = {}
     for spec, result in results.items():
         nsgd, ms = result["nsgd"][:, inside], result["ms"][:, inside]
-        found[spec] = {
-            "recall_05": 100 * float((nsgd < 0.05).mean()),
-            "recall_01": 100 * float((nsgd < 0.01).mean()),
-            "auc_05": 100 * float(np.clip(1 - nsgd / 0.05, 0, 1).mean()),
-            "ahead_recall_01": paired_interval(1.0 * (first["nsgd"] < 0.01) - 1.0 * (nsgd < 0.01), clusters),
-            "ahead_auc_05": paired_interval(
-                np.clip(1 - first["nsgd"] / 0.05, 0, 1) - np.clip(1 - nsgd / 0.05, 0, 1), clusters
-            ),
+        found[spec] = {name: PERCENT * float(values(nsgd).mean()) for name, values in MERITS.items()}
+        for name in ("recall_01", "auc_05"):
+            ahead = difference(MERITS[name](first["nsgd"]), MERITS[name](nsgd), scenes, scale=PERCENT)
+            assert ahead is not None  # NSGD is never NaN
+            found[spec] |= {f"ahead_{name}": [ahead.value, ahead.low, ahead.high], "interval_over": ahead.over}
+        found[spec] |= {
             "ms_median": float(np.median(ms)),
             "ms_mean": float(ms.mean()),
             "ms_ratio": float(np.median(ms.mean(0) / first["ms"].mean(0))),

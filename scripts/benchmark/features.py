@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> None:
     cv2.setNumThreads(1)
     h, w = arguments.size
     picture = photograph("chelsea.png") if arguments.image is None else read_image(arguments.image)
-    image = np.ascontiguousarray(cv2.resize(to_grey(picture), (w, h), interpolation=cv2.INTER_AREA))
+    image = np.ascontiguousarray(cv2.resize(to_grey(picture), (w, h), interpolation=cv2.INTER_AREA), np.uint8)
     tensor = torch.from_numpy(image)[None, None].float() / 255
     n = arguments.features
     lafs = HessianDetector(n).detect(image)[0]
@@ -144,5 +144,6 @@ def _right_matches(extract: Callable[..., Features], image: np.ndarray) -> str:
     matrix = cv2.getRotationMatrix2D((w / 2, h / 2), 20, 0.9)
     c = NearestNeighborMatcher()(extract(image), extract(cv2.warpAffine(image, matrix, (w, h))))
     error = c.x0[0].numpy() @ matrix[:, :2].T + matrix[:, 2] - c.x1[0].numpy()
+    assert c.quality is not None
     kept = (c.quality[0] < 0.8).numpy()
     return f"{int((np.linalg.norm(error[kept], axis=1) < 3).sum())} of {int(kept.sum())}"

@@ -1,9 +1,9 @@
 """Learned pruners beside all others, on the same matches: before the paper's estimators, and as a prior for our own.
 
-python scripts/benchmark learned --root DATA/Strecha --root DATA/KITTI --json FILE
-python scripts/benchmark learned --rendered full --limit 50 --json FILE
-python scripts/benchmark learned --from FILE FILE --markdown docs/learned.md
-python scripts/benchmark learned --ngransac FILE.safetensors ...      # also NG-RANSAC's published weights, as a prior
+python -m scripts.benchmark learned --root DATA/Strecha --root DATA/KITTI --json FILE
+python -m scripts.benchmark learned --rendered full --limit 50 --json FILE
+python -m scripts.benchmark learned --from FILE FILE --markdown docs/learned.md
+python -m scripts.benchmark learned --ngransac FILE.safetensors ...  # also NG-RANSAC's published weights, as a prior
 
 A pruner's time is the processor's, of its stage alone, on one thread. Every pair is estimated once, with seed 0.
 """
@@ -19,11 +19,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import learned_table
 import torch
-from matched import add_set_arguments, sets_of
-from pruning import machine, stage
-from pruning_table import put
 from rich.console import Console
 from rich.progress import track
 
@@ -33,6 +29,10 @@ from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.run import select
 from fmtorch.pipeline import Outcome, Pipeline
 from fmtorch.storage.features import cached
+from scripts.benchmark import learned_table
+from scripts.benchmark.matched import add_set_arguments, sets_of
+from scripts.benchmark.pruning import machine, stage
+from scripts.benchmark.sheet import put
 
 console = Console(width=None if sys.stdout.isatty() else 160)
 # Pruners in order after one match per location; `ratio` stands in every chain but CODE's, which takes all matches.
@@ -128,6 +128,7 @@ def rows(
             for estimator in USES[use][1]:
                 front.estimator = estimators[estimator]
                 row = evaluate(front.estimate([outcome]))[0]
+                assert row.seconds_estimation is not None
                 values = {field: getattr(row, field) for field in KEPT}
                 about = {"use": use, "method": name, "estimator": estimator, "features": features}
                 yield {**about, **values, "ms": 1e3 * seconds, "ms_estimator": 1e3 * row.seconds_estimation}

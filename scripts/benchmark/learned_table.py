@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from pruning_table import Sheet
 
-from fmtorch.evaluation.bootstrap import bootstrap_mean, paired_bootstrap
+from fmtorch.evaluation.statistics import MERITS, PERCENT, described, difference, interval
+from scripts.benchmark.pruning_table import Row, nsgd_of, scenes_of
+from scripts.benchmark.sheet import MISSING, Sheet, shown
 
-AUC_LIMIT = 0.05  # NSGD up to which recall is averaged
-STRICT = 0.01
+areas = MERITS["auc_05"]
 WIDE = {"Strecha": "real", "PhotoTourism": "real", "orbit": "rendered", "collection": "rendered"}
 SHORT = {"KITTI": "real", "TUM": "real", "indoor": "rendered", "driving": "rendered"}
 BASELINE = {"hard": "ratio", "prior": "frame consistency"}
 ESTIMATOR = {"ransac_eight_point": "RANSAC", "lmeds_eight_point": "LMedS", "fmtorch": "fmtorch"}
 
 
-def tables(rows: list[dict[str, Any]]) -> list[Sheet]:
+def tables(rows: list[Row]) -> list[Sheet]:
     """Real and rendered sets apart: wide and short baselines, then each family; one table for each use."""
     sheets = []
     for features in dict.fromkeys(row["features"] for row in rows):
@@ -40,8 +38,7 @@ def _groups(present: list[str]) -> dict[str, list[str]]:
     return groups | {family: [family] for family in families}
 
 
-def _sheet(title: str, features: str, use: str, rows: list[dict[str, Any]]) -> Sheet:
-    pairs, scenes = ({row[field] for row in rows} for field in ("pair", "scene"))
+def _sheet(title: str, features: str, use: str, rows: list[Row]) -> Sheet:
     estimators = list(dict.fromkeys(row["estimator"] for row in rows))
     columns = [""]
     for estimator in estimators:
@@ -56,39 +53,29 @@ def _sheet(title: str, features: str, use: str, rows: list[dict[str, Any]]) -> S
             some = [row for row in own if row["estimator"] == estimator]
             base = {row["pair"]: row for row in rows
                     if row["method"] == BASELINE[use] and row["estimator"] == estimator}  # fmt: skip
-            nsgd = np.array([row["nsgd"] for row in some])
-            line += [f"{100 * (nsgd < 0.05).mean():.1f}", f"{100 * (nsgd < STRICT).mean():.1f}", _auc(some)]
+            nsgd = nsgd_of(some)
+            line += [f"{100 * MERITS[name](nsgd).mean():.1f}" for name in ("recall_05", "recall_01")]
+            line.append(shown(interval(areas(nsgd), scenes_of(some), PERCENT), ".1f"))
             line.append(_difference(some, base) if method != BASELINE[use] else "")
         once = [row for row in own if row["estimator"] == estimators[0]]
         if use == "hard":
             rate = [row["inlier_rate_before"] for row in once if not np.isnan(row["inlier_rate_before"])]
             line += [
-                f"{100 * np.mean(rate):.1f}" if rate else "-",
+                f"{100 * np.mean(rate):.1f}" if rate else MISSING,
                 f"{np.mean([row['corrs_before'] for row in once]):.0f}",
             ]
         line.append(f"{np.median([row['ms'] for row in once]):.1f}")
         lines.append(line)
     what = "matches dropped before the paper's estimators" if use == "hard" else "P(inlier) as the prior of `fmtorch`"
     return Sheet(
-        f"{title}: {what}; {features}, {len(pairs)} pairs of {len(scenes)} scene{'s' * (len(scenes) > 1)}",
+        f"{title}: {what}; {features}, {described(scenes_of({row['pair']: row for row in rows}.values()))}",
         columns,
         lines,
     )
 
 
-def _share(row: dict[str, Any]) -> float:
-    """What a pair adds to the area under the recall curve, in percent."""
-    return 100 * max(0.0, 1 - row["nsgd"] / AUC_LIMIT)
-
-
-def _auc(rows: list[dict[str, Any]]) -> str:
-    i = bootstrap_mean(np.array([_share(row) for row in rows]), [row["scene"] for row in rows])
-    return f"{i.value:.1f} [{i.low:.0f}, {i.high:.0f}]"
-
-
-def _difference(rows: list[dict[str, Any]], base: dict[str, dict[str, Any]]) -> str:
+def _difference(rows: list[Row], base: dict[str, Row]) -> str:
     if not rows or any(row["pair"] not in base for row in rows):
         return ""
-    own, other = (np.array([_share(r) for r in some]) for some in (rows, [base[row["pair"]] for row in rows]))
-    i = paired_bootstrap(own, other, [row["scene"] for row in rows])
-    return f"{i.value:+.1f} [{i.low:+.1f}, {i.high:+.1f}]"
+    other = [base[row["pair"]] for row in rows]
+    return shown(difference(areas(nsgd_of(rows)), areas(nsgd_of(other)), scenes_of(rows), PERCENT), "+.1f")

@@ -10,13 +10,15 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
 from fmtorch import data, presets
 from fmtorch.data import ImagePair, PairDataset
+from fmtorch.evaluation.statistics import scene_names
 from fmtorch.pipeline import Pipeline
-from fmtorch.types import Correspondences
+from fmtorch.types import Correspondences, Estimate
 
 console = Console(width=None if sys.stdout.isatty() else 170)
 
@@ -30,13 +32,13 @@ def add_set_arguments(parser: argparse.ArgumentParser, limit: str = "pairs of ea
     """The options that say which pairs; `limit` is the help of the last one."""
     parser.add_argument("--root", action="append", default=[], help="a set in the FM-Bench layout; may be repeated")
     parser.add_argument("--rendered", choices=["small", "full"], help="also the embedded data set, of this size")
-    parser.add_argument("--split", default="test")
+    parser.add_argument("--split", default="test", help="of --rendered: test or train; a --root has no splits")
     parser.add_argument("--limit", type=int, help=limit)
 
 
 def sets_of(arguments: argparse.Namespace) -> list[PairDataset]:
     """The data sets that these options name, before any limit."""
-    sets = [data.load("fmbench", arguments.split, root) for root in arguments.root]
+    sets = [data.load("fmbench", root=root) for root in arguments.root]
     if arguments.rendered:
         sets.append(data.load("rendered", arguments.split, size=arguments.rendered))
     return sets
@@ -72,7 +74,7 @@ def load(arguments: argparse.Namespace) -> list[Item]:
     pruners: dict[str, Any] = {name: presets.build("pruner", name) for name in arguments.pruners}
     front = Pipeline(
         presets.build("features", arguments.features), presets.build("matcher", "nearest"), pruners,
-        lambda c, seed=0: None,
+        _no_estimator,
     )  # fmt: skip
     with ThreadPoolExecutor(torch.get_num_threads()) as workers:
         matched = workers.map(lambda pair: front.match([pair])[0], pairs)
@@ -83,8 +85,12 @@ def load(arguments: argparse.Namespace) -> list[Item]:
     return items
 
 
-def groups(pairs: list[ImagePair]) -> dict[str, np.ndarray]:
-    """Which pairs belong to each family, to the wide and to the short baselines, and to all."""
+def _no_estimator(c: Correspondences, seed: int = 0) -> Estimate:
+    raise NotImplementedError("matches alone are asked for")
+
+
+def groups(pairs: list[ImagePair]) -> dict[str, NDArray[np.bool_]]:
+    """Which pairs (n,) belong to each family, to the wide and to the short baselines, and to all."""
     found = {family: np.array([p.family == family for p in pairs]) for family in sorted({p.family for p in pairs})}
     wide = np.array([p.family in WIDE for p in pairs])
     if len(found) > 1:
@@ -94,18 +100,6 @@ def groups(pairs: list[ImagePair]) -> dict[str, np.ndarray]:
     return found
 
 
-def paired_interval(difference: np.ndarray, clusters: np.ndarray, resamples: int = 2000) -> tuple[float, float, float]:
-    """Mean of (seeds, pairs) differences in percent and its 95 % bootstrap interval.
-
-    Scenes are resampled, and pairs within each; with a single scene only pairs.
-    """
-    rng = np.random.default_rng(0)
-    per_pair = difference.mean(0)
-    members = [np.flatnonzero(clusters == cluster) for cluster in np.unique(clusters)]
-    means = np.empty(resamples)
-    for b in range(resamples):
-        scenes = rng.integers(len(members), size=len(members)) if len(members) > 1 else [0]
-        index = np.concatenate([rng.choice(members[s], len(members[s])) for s in scenes])
-        means[b] = per_pair[index].mean()
-    low, high = np.percentile(means, [2.5, 97.5])
-    return 100 * float(per_pair.mean()), 100 * float(low), 100 * float(high)
+def scenes(pairs: list[ImagePair]) -> list[str]:
+    """The scene of each pair, with its family."""
+    return scene_names([pair.family for pair in pairs], [pair.scene for pair in pairs])

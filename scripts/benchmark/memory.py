@@ -1,6 +1,6 @@
 """Peak memory of robust estimators: how far the resident set grows during one call, each in a process of its own.
 
-python scripts/benchmark memory --pairs 64 --matches 8000 --estimators fmtorch gc_ransac
+python -m scripts.benchmark memory --pairs 64 --matches 8000 --estimators fmtorch gc_ransac
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from estimators import build
-from matched import console
 from rich.table import Table
-from synthetic import synthetic_pair
 
 from fmtorch import presets
 from fmtorch.types import collate
+from scripts.benchmark.estimators import build
+from scripts.benchmark.matched import console
+from scripts.benchmark.synthetic import synthetic_pair
 
 OTHER_LIBRARIES = ("opencv_", "poselib", "kornia_ransac", "magsac_cpp", "gc_ransac_cpp", "degensac_cpp")
 

@@ -21,5 +21,5 @@ for line in sys.stdin:
         sizes = [(int(case[name][1]), int(case[name][0])) for name in ("size0", "size1")]
         options = (bool(case["rotation"]), bool(case["scale"]), float(case["factor"]))
     start = time.process_time()
-    kept = cv2.xfeatures2d.matchGMS(*sizes, *keypoints, matches, *options)
+    kept = cv2.xfeatures2d.matchGMS(*sizes, *keypoints, matches, *options)  # type: ignore[attr-defined]
     print(1e3 * (time.process_time() - start), len(kept), flush=True)

@@ -1,8 +1,8 @@
 """Pipelines of different features: recall, inlier rates and counts, beside the paper's figures.
 
-python scripts/benchmark pipelines --root DATA/Strecha --root DATA/PhotoTourism --json features.jsonl
-python scripts/benchmark pipelines --rendered full --limit 40 --json features.jsonl
-python scripts/benchmark pipelines --from features.jsonl --markdown docs/features.md
+python -m scripts.benchmark pipelines --root DATA/Strecha --root DATA/PhotoTourism --json features.jsonl
+python -m scripts.benchmark pipelines --rendered full --limit 40 --json features.jsonl
+python -m scripts.benchmark pipelines --from features.jsonl --markdown docs/features.md
 
 --json is appended to batch by batch: started again, the command goes on where it was interrupted. A row counts only
 for the learned files and options that it was made with. GMS runs with scale on wide baselines, as in the paper.
@@ -16,10 +16,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import pipelines_table
 import torch
-from matched import WIDE, add_set_arguments, console, sets_of
-from pruning import pruned_by
 from rich.progress import track
 
 from fmtorch import presets
@@ -30,6 +27,10 @@ from fmtorch.pipeline import Outcome, Pipeline
 from fmtorch.storage import identity_digest
 from fmtorch.storage.configuration import configuration
 from fmtorch.storage.features import CachedFeatures
+from scripts.benchmark import pipelines_table
+from scripts.benchmark.matched import WIDE, add_set_arguments, console, sets_of
+from scripts.benchmark.pruning import pruned_by
+from scripts.benchmark.sheet import put
 
 FEATURES = ("sift", "dspsift", "rootsiftpca", "l2net", "hardnet", "hesaffnet")
 SYSTEMS = ("rootsiftpca", "hardnet", "hesaffnet")
@@ -62,7 +63,7 @@ def run(arguments: argparse.Namespace) -> None:
     for table in tables:
         console.print(table.terminal())
     if arguments.markdown:
-        pipelines_table.put(arguments.markdown, tables)
+        put(arguments.markdown, tables)
 
 
 def read(path: Path) -> list[dict[str, Any]]:

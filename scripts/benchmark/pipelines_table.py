@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from matched import WIDE
-from pruning_table import KIN, RECALL, Sheet, put
+from numpy.typing import NDArray
 
-from fmtorch.evaluation.bootstrap import Interval, bootstrap_mean, paired_bootstrap
-
-__all__ = ["put", "tables"]
+from fmtorch.evaluation.statistics import PERCENT, areas, described, difference, interval, recalled
+from scripts.benchmark.matched import WIDE
+from scripts.benchmark.pruning_table import KIN, Row, scenes_of
+from scripts.benchmark.sheet import Published, Sheet, compared, published, shown
 
 # Bian et al., "An Evaluation of Feature Matchers for Fundamental Matrix Estimation", BMVC 2019, features and systems.
 PAPER = Path(__file__).resolve().parent / "paper_features.csv"
@@ -24,24 +22,24 @@ ORDER = (
 )  # fmt: skip
 """Pairs of pipelines of which the paper has the first above the second on wide baselines."""
 REAL = ("Strecha", "PhotoTourism", "CPC", "Tanks_and_Temples", "KITTI", "TUM")
-METHODS = [line["method"] for line in csv.DictReader(PAPER.open()) if line["dataset"] == "CPC"]
+METHODS = [method for dataset, method in published(PAPER) if dataset == "CPC"]
 
-Row = dict[str, Any]
-# A figure of one pair, the mean over seeds; NaN where it is not defined.
-FIGURES: dict[str, tuple[Callable[[Row], float], str]] = {
-    "%Recall": (lambda row: 100 * float(np.mean([e < RECALL for e in row["nsgd"]])), ".1f"),
-    "AUC@0.05": (lambda row: 100 * float(np.mean([max(0.0, 1 - e / RECALL) for e in row["nsgd"]])), ".1f"),
-    "%Inlier": (lambda row: 100 * _solved_mean(row, "inlier_rate"), ".1f"),
-    "%Inlier-m": (lambda row: 100 * _solved_mean(row, "inlier_rate_before"), ".1f"),
-    "#Corrs": (lambda row: _solved_mean(row, "corrs"), ".0f"),
-    "#Corrs-m": (lambda row: _solved_mean(row, "corrs_before"), ".0f"),
+Values = NDArray[np.float64]
+# A figure of each pair, (n,), the mean over seeds; NaN where it is not defined. Its factor and format.
+FIGURES: dict[str, tuple[Callable[[list[Row]], Values], float, str]] = {
+    "%Recall": (lambda rows: recalled(_nsgd(rows)), PERCENT, ".1f"),
+    "AUC@0.05": (lambda rows: areas(_nsgd(rows)), PERCENT, ".1f"),
+    "%Inlier": (lambda rows: _solved_means(rows, "inlier_rate"), PERCENT, ".1f"),
+    "%Inlier-m": (lambda rows: _solved_means(rows, "inlier_rate_before"), PERCENT, ".1f"),
+    "#Corrs": (lambda rows: _solved_means(rows, "corrs"), 1.0, ".0f"),
+    "#Corrs-m": (lambda rows: _solved_means(rows, "corrs_before"), 1.0, ".0f"),
 }
 
 
 def tables(rows: list[Row]) -> list[Sheet]:
     """A table for each family and one of paired differences; of several rows of a pair the last counts."""
     newest = sorted({(r["method"], r["pair"]): r for r in rows}.values(), key=lambda r: (_place(r), r["method"]))
-    paper = {(line["dataset"], line["method"]): line for line in csv.DictReader(PAPER.open())}
+    paper = published(PAPER)
     families = sorted({row["family"] for row in newest}, key=lambda f: (f not in REAL, f not in WIDE, f))
     sheets = [_family(family, [r for r in newest if r["family"] == family], paper) for family in families]
     return [*sheets, _order(newest, families)]
@@ -53,42 +51,36 @@ def _place(row: Row) -> int:
     return METHODS.index(name) if name in METHODS else len(METHODS)
 
 
-def _solved_mean(row: Row, field: str) -> float:
-    values = [v for v, ok in zip(row[field], row["ok"], strict=True) if ok and not np.isnan(v)]
-    return float(np.mean(values)) if values else np.nan
+def _nsgd(rows: list[Row]) -> Values:
+    """(seeds, n)."""
+    return np.array([row["nsgd"] for row in rows], np.float64).T
 
 
-def _family(family: str, rows: list[Row], paper: dict[tuple[str, str], Any]) -> Sheet:
-    pairs, scenes = ({row[field] for row in rows} for field in ("pair", "scene"))
+def _solved_means(rows: list[Row], field: str) -> Values:
+    """The mean of each pair over the seeds with which it was solved, (n,); NaN where there is none."""
+    values = np.array([row[field] for row in rows], np.float64)
+    solved = np.array([row["ok"] for row in rows], bool) & ~np.isnan(values)
+    total, count = np.where(solved, values, 0.0).sum(1), solved.sum(1)
+    means: Values = np.divide(total, count, out=np.full(len(rows), np.nan), where=count > 0)
+    return means
+
+
+def _family(family: str, rows: list[Row], paper: Published) -> Sheet:
+    pairs = {row["pair"]: row for row in rows}
     kin = KIN.get(family, "")
     lines = []
     for method in dict.fromkeys(row["method"] for row in rows):
         own = [row for row in rows if row["method"] == method]
-        known = paper.get((kin, method))
-        theirs = " / ".join(known[k] for k in ("recall", "inlier", "inlier_m", "corrs", "corrs_m")) if known else ""
         some = "" if len(own) == len(pairs) else f", {len(own)} pairs"
-        lines.append([f"`{method}`{some}", *(_shown(own, name) for name in FIGURES), _failed(own), theirs])
-    title = f"{family}: {len(pairs)} pairs of {len(scenes)} scene{'s' * (len(scenes) > 1)}"
+        figures = [shown(interval(f(own), scenes_of(own), scale), form) for f, scale, form in FIGURES.values()]
+        lines.append([f"`{method}`{some}", *figures, _failed(own), compared(paper, kin, method)])
+    title = f"{family}: {described(scenes_of(pairs.values()))}"
     return Sheet(title, ["", *FIGURES, "failed", f"paper, {kin}: recall, inlier, -m, #, -m"], lines)
 
 
 def _failed(rows: list[Row]) -> str:
     """Pairs without an estimate, as a mean over seeds."""
     return f"{sum(1 - np.mean(row['ok']) for row in rows):.1f}"
-
-
-def _shown(rows: list[Row], name: str) -> str:
-    figure, form = FIGURES[name]
-    values = np.array([figure(row) for row in rows], np.float64)
-    defined = ~np.isnan(values)
-    if not defined.any():
-        return "–"
-    scenes = [row["scene"] for row, d in zip(rows, defined, strict=True) if d]
-    return _interval(bootstrap_mean(values[defined], scenes), form)
-
-
-def _interval(i: Interval, form: str) -> str:
-    return f"{i.value:{form}} [{i.low:{form}}, {i.high:{form}}]"
 
 
 def _order(rows: list[Row], families: list[str]) -> Sheet:
@@ -108,14 +100,13 @@ def _order(rows: list[Row], families: list[str]) -> Sheet:
             common = [pair for pair in first if pair in second and first[pair]["family"] in members]
             if not common or (len(members) < 2 and group not in families):
                 continue
-            shown = [_difference(name, [first[p] for p in common], [second[p] for p in common])
+            cells = [_difference(name, [first[p] for p in common], [second[p] for p in common])
                      for name in ("%Recall", "AUC@0.05", "%Inlier-m")]  # fmt: skip
-            lines.append([f"{group}: `{better}` - `{worse}`", str(len(common)), *shown])
-    return Sheet("Paired differences, in points", ["", "pairs", "%Recall", "AUC@0.05", "%Inlier-m"], lines)
+            place = described(scenes_of([first[p] for p in common]))
+            lines.append([f"{group}: `{better}` - `{worse}`", place, *cells])
+    return Sheet("Paired differences, in points", ["", "of", "%Recall", "AUC@0.05", "%Inlier-m"], lines)
 
 
 def _difference(name: str, first: list[Row], second: list[Row]) -> str:
-    a, b = (np.array([FIGURES[name][0](row) for row in rows], np.float64) for rows in (first, second))
-    defined = ~(np.isnan(a) | np.isnan(b))
-    scenes = [row["scene"] for row, d in zip(first, defined, strict=True) if d]
-    return _interval(paired_bootstrap(a[defined], b[defined], scenes), "+.1f") if defined.any() else "–"
+    figure, scale, _ = FIGURES[name]
+    return shown(difference(figure(first), figure(second), scenes_of(first), scale), "+.1f")

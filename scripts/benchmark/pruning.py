@@ -1,8 +1,8 @@
 """Pruners on the same matches with RANSAC: recall, inlier rates and counts before and after estimation.
 
-python scripts/benchmark pruning --root DATA/Strecha --root DATA/KITTI --rendered small --json FILE
-python scripts/benchmark pruning --from FILE FILE --markdown docs/pruning.md
-python scripts/benchmark pruning --contrib-python ENVIRONMENT/bin/python      # also times GMS against OpenCV's
+python -m scripts.benchmark pruning --root DATA/Strecha --root DATA/KITTI --rendered small --json FILE
+python -m scripts.benchmark pruning --from FILE FILE --markdown docs/pruning.md
+python -m scripts.benchmark pruning --contrib-python ENVIRONMENT/bin/python      # also times GMS against OpenCV's
 
 ASIFT features take a minute a pair: --asift-limit pairs of each family have them, by default 10.
 """
@@ -18,10 +18,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pruning_speed
-import pruning_table
 import torch
-from matched import add_set_arguments, options, sets_of
 from rich.console import Console
 from rich.progress import track
 
@@ -31,6 +28,9 @@ from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.run import select
 from fmtorch.pipeline import Outcome, Pipeline
 from fmtorch.storage.features import cached
+from scripts.benchmark import pruning_speed, pruning_table
+from scripts.benchmark.matched import add_set_arguments, options, sets_of
+from scripts.benchmark.sheet import put
 
 console = Console(width=None if sys.stdout.isatty() else 160)
 # Method: features, then pruners in order, with options as name:key=value. One match per location everywhere but in the
@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.json:
         arguments.json.write_text(json.dumps(merged, indent=0) + "\n")
     if arguments.markdown:
-        pruning_table.put(arguments.markdown, tables)
+        put(arguments.markdown, tables)
 
 
 def machine() -> dict[str, str]:

@@ -112,15 +112,17 @@ def moving(n: int, seed: int) -> tuple[Tensor, Tensor]:
 def _against_opencv(peer: Any, path: Path, n: int, searched: bool, pairs: int, repeats: int) -> dict[str, Any]:
     cases = [moving(n, seed) for seed in range(pairs)]
     x0, x1 = (torch.stack(points) for points in zip(*cases, strict=True))
-    sizes = {name: torch.tensor([SIZE] * pairs) for name in ("size0", "size1")}
-    options = {"with_rotation": searched, "with_scale": searched, "threshold_factor": FACTOR}
+    size = torch.tensor([SIZE] * pairs)
+    ours_on = functools.partial(
+        gms, x0, x1, size0=size, size1=size, with_rotation=searched, with_scale=searched, threshold_factor=FACTOR
+    )
     np.savez(
         path, x0=x0[0], x1=x1[0], size0=SIZE, size1=SIZE, rotation=searched, scale=searched, factor=FACTOR,
     )  # fmt: skip
-    kept = int(gms(x0, x1, **sizes, **options)[0].sum())
+    kept = int(ours_on()[0].sum())
     ours, theirs = [], []
     for _ in range(repeats if pairs == 1 or not searched else max(3, repeats // 10)):
-        ours.append(_milliseconds(functools.partial(gms, x0, x1, **sizes, **options)) / pairs)
+        ours.append(_milliseconds(ours_on) / pairs)
         peer.stdin.write(f"{path}\n")
         peer.stdin.flush()
         milliseconds, count = peer.stdout.readline().split()

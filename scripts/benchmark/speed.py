@@ -1,7 +1,7 @@
 """Milliseconds a pair of robust estimators, one thread: one pair a call and many, peers interleaved, prior included.
 
-python scripts/benchmark speed --estimators fmtorch msac:confidence=null --peers poselib opencv_usac_magsac
-python scripts/benchmark speed --device cuda --batch 4000 --pairs 4000 --peers --estimators msac:confidence=null
+python -m scripts.benchmark speed --estimators fmtorch msac:confidence=null --peers poselib opencv_usac_magsac
+python -m scripts.benchmark speed --device cuda --batch 4000 --pairs 4000 --peers --estimators msac:confidence=null
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from estimators import build
-from matched import add_arguments as add_matches_arguments
-from matched import console, load
 from rich.table import Table
-from synthetic import synthetic_pair
 
 from fmtorch import presets
 from fmtorch.types import Correspondences, Estimate, collate
+from scripts.benchmark.estimators import build
+from scripts.benchmark.matched import add_arguments as add_matches_arguments
+from scripts.benchmark.matched import console, load
+from scripts.benchmark.synthetic import synthetic_pair
 
 
 def add_arguments(commands: Any) -> None:

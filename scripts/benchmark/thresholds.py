@@ -1,6 +1,6 @@
 """The best threshold of each estimator on tuning data: AUC@0.05 averaged over the families, so each counts alike.
 
-python scripts/benchmark thresholds --root DATA/castle --root DATA/fox --rendered small --split train \\
+python -m scripts.benchmark thresholds --root DATA/castle --root DATA/fox --rendered small --split train \\
     --values 0.35 0.5 0.75 1 1.5 2 3 --estimators poselib:prosac=true opencv_usac_magsac
 """
 
@@ -9,12 +9,13 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-import estimators
-import matched
 import numpy as np
 import torch
-from matched import console, groups
 from rich.table import Table
+
+from fmtorch.evaluation.statistics import areas
+from scripts.benchmark import estimators, matched
+from scripts.benchmark.matched import console, groups
 
 
 def add_arguments(commands: Any) -> None:
@@ -41,8 +42,7 @@ def run(arguments: argparse.Namespace) -> None:
             option = f"{arguments.option}={value}"
             varied = f"{front}{',' if ':' in front else ':'}{option}{at}{stages}"
             nsgd = estimators.measure([varied], items, arguments.seeds)[varied]["nsgd"]
-            gain = 100 * np.clip(1 - nsgd / 0.05, 0, 1).mean(0)
-            per_family = [float(gain[inside].mean()) for inside in families.values()]
+            per_family = [100 * float(areas(nsgd[:, inside]).mean()) for inside in families.values()]
             rows.append((value, per_family, float(np.mean(per_family))))
         best = max(mean for *_, mean in rows)
         for value, per_family, mean in rows:

@@ -10,12 +10,11 @@ from torch import Tensor, nn
 
 from fmtorch import metrics
 from fmtorch.matched import LabelledMatches
+from fmtorch.metrics.recall import FINE_THRESHOLD
 from fmtorch.pruning.networks.prediction import predict
 from fmtorch.stages import Estimator
 from fmtorch.training.pruner_losses import classification_loss
 from fmtorch.training.reliability import reliability, temperature
-
-STRICT = 0.01  # NSGD; the usual threshold is metrics.recall's, 0.05
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -111,7 +110,7 @@ class Validation:
     def _recalls(self, name: str, nsgd: Tensor) -> dict[str, float]:
         figures = {
             f"{name}/recall@0.05": float(metrics.recall(nsgd)),
-            f"{name}/recall@0.01": float(metrics.recall(nsgd, STRICT)),
+            f"{name}/recall@0.01": float(metrics.recall(nsgd, FINE_THRESHOLD)),
             f"{name}/AUC@0.05": float(metrics.mean_recall(nsgd)),
         }
         for family in sorted(set(self.families) - {""}):

@@ -1,0 +1,90 @@
+"""Recall, AUC@0.05, their differences and intervals: what every table of this project takes its figures from.
+
+A figure is the mean over pairs of what each pair adds to it, so that one bootstrap serves all of them. Pairs of one
+scene succeed and fail together: intervals resample scenes, and pairs only where there are fewer than five scenes, which
+every table then says (`described`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from fmtorch import metrics
+from fmtorch.evaluation.bootstrap import MIN_SCENES, Interval, bootstrap_mean, paired_bootstrap
+from fmtorch.metrics.recall import FINE_THRESHOLD as FINE_THRESHOLD
+from fmtorch.metrics.recall import THRESHOLD as THRESHOLD
+
+PERCENT = 100.0
+Values = NDArray[np.float64]
+
+
+def recalled(nsgd: Values, threshold: float = THRESHOLD) -> Values:
+    """What each pair adds to recall, (n,): 1 where its NSGD is below the threshold, else 0; the mean over seeds.
+
+    nsgd: (n,), or (seeds, n); NaN is a miss.
+    """
+    return _per_pair(metrics.recall(torch.from_numpy(nsgd)[..., None], threshold))
+
+
+def areas(nsgd: Values) -> Values:
+    """What each pair adds to AUC@0.05, (n,): the share of thresholds from 0 to 0.05 above its NSGD; mean over seeds.
+
+    nsgd: (n,), or (seeds, n); NaN is a miss.
+    """
+    return _per_pair(metrics.mean_recall(torch.from_numpy(nsgd)[..., None], THRESHOLD))
+
+
+MERITS: dict[str, Callable[[Values], Values]] = {
+    "recall_05": recalled,
+    "recall_01": partial(recalled, threshold=FINE_THRESHOLD),
+    "auc_05": areas,
+}
+"""The figures of merit, by the names that rows, summaries and JSON files have for them: NSGD -> values of pairs."""
+
+
+def interval(values: Values, scenes: Sequence[str], scale: float = 1.0) -> Interval | None:
+    """Mean of the values that are not NaN, times `scale`, with its 95 % interval; None where all are NaN.
+
+    values, scenes: one per pair, (n,).
+    """
+    known = ~np.isnan(values)
+    if not known.any():
+        return None
+    return bootstrap_mean(scale * values[known], _those(scenes, known))
+
+
+def difference(a: Values, b: Values, scenes: Sequence[str], scale: float = 1.0) -> Interval | None:
+    """mean(a) - mean(b) of two methods on the same pairs, times `scale`, with its 95 % interval.
+
+    Of the pairs for which both are not NaN; None where there is none. a, b, scenes: one per pair, (n,).
+    """
+    known = ~(np.isnan(a) | np.isnan(b))
+    if not known.any():
+        return None
+    return paired_bootstrap(scale * a[known], scale * b[known], _those(scenes, known))
+
+
+def scene_names(families: Sequence[str], scenes: Sequence[str]) -> list[str]:
+    """The scene of each pair, with its family: two data sets may use one name for different scenes."""
+    return [f"{family}/{scene}" for family, scene in zip(families, scenes, strict=True)]
+
+
+def described(scenes: Sequence[str]) -> str:
+    """``79 pairs of 2 scenes, intervals over pairs``: how many there are, and what intervals resample."""
+    count = len(set(scenes))
+    over = "scenes" if count >= MIN_SCENES else "pairs"
+    return f"{len(scenes)} pair{'s' * (len(scenes) != 1)} of {count} scene{'s' * (count != 1)}, intervals over {over}"
+
+
+def _per_pair(values: torch.Tensor) -> Values:
+    found: Values = values.double().numpy()
+    return found.mean(0) if found.ndim > 1 else found
+
+
+def _those(scenes: Sequence[str], known: NDArray[np.bool_]) -> list[str]:
+    return [scene for scene, one in zip(scenes, known, strict=True) if one]

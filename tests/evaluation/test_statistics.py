@@ -1,0 +1,64 @@
+"""Figures of merit equal the metrics' and their definition, over seeds; intervals leave out what is not defined."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from fmtorch import metrics
+from fmtorch.evaluation.bootstrap import bootstrap_mean, paired_bootstrap
+from fmtorch.evaluation.statistics import MERITS, PERCENT, areas, described, difference, interval, recalled, scene_names
+from tests.reference import metrics as reference
+
+
+def errors(*shape: int) -> np.ndarray:
+    nsgd = np.random.default_rng(0).uniform(0, 0.1, shape)
+    nsgd.flat[:4] = (0.0, 0.05, 1.0, math.nan)
+    return nsgd
+
+
+def test_means_over_pairs_are_the_metrics() -> None:
+    nsgd = errors(50)
+    tensor = torch.from_numpy(nsgd)
+    assert recalled(nsgd).mean() == pytest.approx(float(metrics.recall(tensor)))
+    assert recalled(nsgd, 0.01).mean() == pytest.approx(float(metrics.recall(tensor, 0.01)))
+    assert areas(nsgd).mean() == pytest.approx(float(metrics.mean_recall(tensor)))
+    assert areas(nsgd).mean() == pytest.approx(reference.mean_recall(np.nan_to_num(nsgd, nan=1.0), 0.05))
+    assert set(recalled(nsgd)) == {0.0, 1.0}
+    assert (recalled(nsgd)[:4].tolist(), areas(nsgd)[:4].tolist()) == ([1, 0, 0, 0], [1, 0, 0, 0])
+
+
+def test_seeds_are_averaged_pair_by_pair() -> None:
+    nsgd = errors(3, 20)
+    for values in MERITS.values():
+        np.testing.assert_allclose(values(nsgd), np.mean([values(one) for one in nsgd], axis=0), rtol=1e-15)
+
+
+def test_intervals_are_of_what_is_defined() -> None:
+    rng = np.random.default_rng(1)
+    a, b = rng.random((2, 30))
+    scenes = [f"s{i % 7}" for i in range(30)]
+    some = a.copy()
+    some[::4] = math.nan
+    kept = [i for i in range(30) if i % 4]
+    expected = bootstrap_mean(PERCENT * a[kept], [scenes[i] for i in kept])
+    assert interval(some, scenes, PERCENT) == expected
+    assert difference(some, b, scenes) == paired_bootstrap(a[kept], b[kept], [scenes[i] for i in kept])
+    assert difference(b, some, scenes) == paired_bootstrap(b[kept], a[kept], [scenes[i] for i in kept])
+    nothing = np.full(30, math.nan)
+    assert interval(nothing, scenes) is None
+    assert difference(nothing, b, scenes) is None
+    assert f"{expected:.1f}" == f"{expected.value:.1f} [{expected.low:.1f}, {expected.high:.1f}]"
+
+
+def test_what_intervals_resample_is_said() -> None:
+    assert described(["a"]) == "1 pair of 1 scene, intervals over pairs"
+    assert described(list("aabbcdcd")) == "8 pairs of 4 scenes, intervals over pairs"
+    assert described(list("abcdeabcde")) == "10 pairs of 5 scenes, intervals over scenes"
+
+
+def test_one_name_in_two_families_is_two_scenes() -> None:
+    assert len(set(scene_names(["indoor", "orbit", "orbit"], ["s0", "s0", "s0"]))) == 2
