@@ -1,0 +1,65 @@
+"""The parts of docs/own_parts.md, saved in an empty folder, are evaluated by the page's command, together and alone."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from fmtorch import data
+from fmtorch.stages import Estimator, FeatureExtractor, Matcher, Pruner
+
+SOURCE = Path(__file__).resolve().parents[2]
+PAGE = (SOURCE / "docs" / "own_parts.md").read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """The page's files, and the photographs and pairs that it leaves to the reader."""
+    for name, content in re.findall(r"```(?:python|yaml)\n# (\S+)\n(.*?)```", PAGE, flags=re.DOTALL):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(content)
+    pair = data.load("stereo")[0]
+    for name, source in (("left.png", pair.image0), ("right.png", pair.image1)):
+        shutil.copyfile(source.path, tmp_path / name)
+    there = {"scene": "motorcycle", "image0": "left.png", "image1": "right.png", "F": pair.F.ravel().tolist()}
+    back = {"scene": "motorcycle", "image0": "right.png", "image1": "left.png", "F": pair.F.T.ravel().tolist()}
+    (tmp_path / "pairs.jsonl").write_text("".join(json.dumps(line) + "\n" for line in (there, back)))
+    return tmp_path
+
+
+def test_every_part_is_evaluated(folder: Path) -> None:
+    (command,) = re.findall(r"```bash\n(.*?)```", PAGE, flags=re.DOTALL)
+    env = {**os.environ, "PYTHONPATH": str(SOURCE), "FMTORCH_CACHE": f"{folder}/cache", "COLUMNS": "200"}
+    words = [sys.executable, *shlex.split(command)[1:], "run_dir=run"]
+    ended = subprocess.run(words, cwd=folder, env=env, capture_output=True, text=True, timeout=300, check=False)
+    assert ended.returncode == 0, ended.stderr
+    rows = [row for part in (folder / "run" / "pairs").glob("*.parquet") for row in pq.read_table(part).to_pylist()]
+    assert sorted(row["pair"] for row in rows) == ["left.png right.png", "right.png left.png"]
+    assert all(row["ok"] and row["corrs"] >= 8 and row["nsgd"] < 0.05 for row in rows), [
+        (row["reason"], row["corrs"], row["nsgd"]) for row in rows
+    ]
+    identity = (folder / "run" / "run.json").read_text()
+    for target in ("my_features.ORB", "my_matcher.MutualMatcher", "my_pruner.UsualMotion", "my_estimator.Refitted"):
+        assert target in identity
+
+
+@pytest.mark.parametrize(
+    ("group", "protocol"),
+    [("features", FeatureExtractor), ("matcher", Matcher), ("pruner", Pruner), ("estimator", Estimator)],
+)
+def test_each_is_built_by_name_in_python(
+    group: str, protocol: type, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from fmtorch import presets
+
+    monkeypatch.syspath_prepend(str(folder))
+    assert isinstance(presets.build(group, "mine", config_dir=folder / "my_conf"), protocol)
