@@ -155,6 +155,12 @@ def stages(config: DictConfig) -> dict[str, Any]:
     return {**plain, "pruner": [{name: value} for name, value in _pruners(config).items()]}
 
 
+@functools.cache
+def pipeline_stages(name: str) -> dict[str, Any] | None:
+    """The `stages` of the project's own pipeline `name`, unchanged; None where it has no such pipeline."""
+    return stages(_compose("match", (f"pipeline={name}",))) if name in available("pipeline") else None
+
+
 def composed(stages: Mapping[str, Any]) -> dict[str, Any]:
     """The config that `stages` was made of. Raises ValueError where several pruners stand in no order."""
     pruners = stages.get("pruner") or []

@@ -17,6 +17,7 @@ from omegaconf import OmegaConf
 
 from fmtorch import presets, report
 from fmtorch.data import read_image
+from fmtorch.evaluation.gallery import Options, Run, rebuilt, shown_pair
 from fmtorch.evaluation.page import Section, differing_pairs, render
 from fmtorch.evaluation.redraw import difference
 from fmtorch.evaluation.rows import evaluate
@@ -26,9 +27,10 @@ from fmtorch.types import Estimate
 from tests.test_pipeline import draw, pair
 
 OPTIONS = {
-    "output": "deep/report.html", "title": "Runs", "pictures": 3, "root": None, "device": "cpu", "cache": "off",
-    "cache_limit": None,
+    "output": "deep/report.html", "title": "Runs", "pictures": 3, "order": None, "root": None, "own_code": False,
+    "device": "cpu", "cache": "off", "cache_limit": None,
 }  # fmt: skip
+SHOWN = Options(count=3, cache="off")
 
 
 def results(nsgd: list[float], scene: str = "scene") -> list[PairRow]:
@@ -42,7 +44,7 @@ def test_figures_and_differences_are_those_of_the_rows() -> None:
     first = [0.001, 0.02, 0.03, 0.2, 0.004, 0.3, 0.01, 0.02]
     second = [0.02, 0.02, 0.2, 0.2, 0.2, 0.3, 0.2, 0.02]
     runs = {"one": to_table(results(first)), "two <b>": to_table(results(second))}
-    page = render("A & B", [Section("set", runs)], [["one", "abc", "0.1", "0", "runs/one"]])
+    page = render("A & B", [Section("set", runs)], [["one", "set", "abc", "0.1", "0", "runs/one"]])
     text = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", page))
     assert "A &amp; B" in text
     assert "two &lt;b&gt;" in text
@@ -52,12 +54,13 @@ def test_figures_and_differences_are_those_of_the_rows() -> None:
     assert f"{100 * np.mean(np.clip(1 - np.array(first) / 0.05, 0, 1)):.1f}" in text
     assert "+37.5 [" in text  # three pairs more
     assert "+25.0 [" in text  # two pairs more at 0.01
-    assert "What one is ahead by" in text
+    assert "one minus each other run" in text
     assert not re.search(r"(?:src|href)=\"(?!data:)", page)  # all that it shows is in it
 
 
 def test_one_run_is_ahead_of_none() -> None:
     page = render("One", [Section("set", {"one": to_table(results([0.01, 0.2]))})], [])
+    assert "minus each other" not in page
     assert "ahead" not in page
     assert 'class="best"' not in page
 
@@ -83,42 +86,32 @@ def test_folders_of_runs_are_found_and_missed(tmp_path: Path) -> None:
         report.run(OmegaConf.create({**OPTIONS, "runs": [str(tmp_path)]}))
 
 
-def test_runs_are_told_apart_by_what_differs(tmp_path: Path) -> None:
-    base = {
-        "pipeline": "sift_ratio", "seed": 0, "features": {"_target_": "a"}, "pruner": {"r": {"threshold": 0.8}},
-        "estimator": {"_target_": "b"}, "dataset": {"name": "stereo"},
-    }  # fmt: skip
-    changes: dict[str, dict[str, object]] = {
-        "sift_ratio seed=0 estimator._target_=b": {},
-        "sift_ratio lmeds seed=1": {"seed": 1, "estimator": presets.load("estimator", "lmeds")},
-        "sift_gms": {"pipeline": "sift_gms"},
-    }
-    folders = []
-    for i, change in enumerate(changes.values()):
-        folders.append(RunFolder.open(tmp_path / str(i), {**base, **change}))
-        folders[-1].append(results([0.1]))
-    names = [" ".join(sorted(r.name.split())) for r in report._named(folders)]
-    assert names == [" ".join(sorted(name.split())) for name in changes]
-    twice = [*folders, RunFolder.open(tmp_path / "twice", {**base, "learned": ["x"]})]
-    twice[-1].append(results([0.1]))
-    names = [r.name for r in report._named(twice)]
-    assert len(set(names)) == 4
-    assert names[0].split()[-1] == folders[0].identity[:6]  # nothing that a name tells differs
-
-
-def test_a_run_folder_runs_no_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_keep_the_order_given_and_folders_are_ordered_by_recall(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
-    called = tmp_path / "called"
-    evil = {"_target_": "pathlib.Path.touch", "self": str(called)}
-    config = {
-        "pipeline": "mine", "seed": 0, "version": "0", "features": {"_target_": "fmtorch.features.OpenCVSIFT"},
-        "matcher": {}, "pruner": {"a": {"inner": [evil]}}, "estimator": evil, "dataset": {"name": "stereo"},
-    }  # fmt: skip
-    RunFolder.open(tmp_path / "run", config).append(results([0.01, 0.2]))
-    monkeypatch.setattr(report, "_images", lambda r, config: {})
-    output = report.run(OmegaConf.create({**OPTIONS, "runs": ["run"]}))
-    assert "pathlib.Path.touch), which a report does not load" in output.read_text()
-    assert not called.exists()
+    for name, nsgd in (("a", 0.2), ("b", 0.01), ("c", 0.2)):
+        RunFolder.open(tmp_path / "runs" / name, {"pipeline": name}).append(results([nsgd, 0.3]))
+
+    def order(*runs: str, **options: str) -> list[str]:
+        output = report.run(OmegaConf.create({**OPTIONS, "runs": list(runs), **options}))
+        return re.findall(r'<li data-run="(\w)"', output.read_text())
+
+    assert order("runs") == order("runs/c", "runs/b", order="recall", runs=["runs"]) == ["b", "a", "c"]
+    assert order("runs/c", "runs/b", "runs/a") == ["c", "b", "a"]
+    assert order("runs", order="given") == ["a", "b", "c"]
+    with pytest.raises(ValueError, match="order=best must be given or recall"):
+        order("runs", order="best")
+
+
+def test_three_right_pairs_are_not_said_to_be_certain() -> None:
+    page = render(
+        "Few", [Section("set", {"one": to_table(results([0.01] * 3)), "two": to_table(results([0.3] * 3))})], []
+    )
+    assert "100.0 [44, 100]" in page
+    assert "0.0 [0, 56]" in page
+    assert "[100, 100]" not in page
+    assert "+80.0 (n too small)" in page
 
 
 @pytest.mark.parametrize("order", [["ratio", "one_to_one"], ["one_to_one", "ratio"]])
@@ -136,16 +129,16 @@ def test_a_pipeline_is_drawn_again_as_it_was_and_a_difference_is_said(order: lis
     rows[1] = dataclasses.replace(rows[1], F=F.tolist(), nsgd=0.0)
     identity = {"pipeline": "sift_ratio", "seed": 3, **presets.stages(config)}
     RunFolder.open(tmp_path / "run", identity).append(rows)
-    (r,) = report._named([RunFolder.load(tmp_path / "run")])
-    pipeline = report._pipeline(r, OmegaConf.create(OPTIONS))
+    (r,) = report.named([RunFolder.load(tmp_path / "run")])
+    pipeline = rebuilt(r, SHOWN)
     assert list(pipeline.pruners) == order
-    assert report._shown(one, [r], {r.name: pipeline}).notes == []
-    shown = report._shown(other, [r], {r.name: pipeline})
-    assert shown.heading == "b: NSGD sift_ratio 0.0000"
+    assert shown_pair(one, [r], {r.name: pipeline}).notes == []
+    shown = shown_pair(other, [r], {r.name: pipeline})
+    assert (shown.name, [(seen.run, seen.nsgd) for seen in shown.runs]) == ("b", [("sift_ratio", 0.0)])
     (note,) = shown.notes
     assert note.startswith("sift_ratio gives another F when it is drawn again: NSGD 0.")
     assert "in its run 0.0000" in note
-    assert note in render("", [Section("set", {"one": r.table}, [shown])], [])
+    assert note in render("", [Section("set", {r.name: r.table}, [shown])], [])
 
 
 def test_a_result_that_cannot_be_had_again_is_said(tmp_path: Path) -> None:
@@ -173,14 +166,14 @@ def test_an_older_run_is_drawn_where_its_pruners_have_one_order(tmp_path: Path) 
         pruner = {name: value for entry in stages["pruner"] for name, value in entry.items() if name in names}
         old = {"pipeline": "sift_ratio", **stages, "pruner": pruner}
         folder = RunFolder(tmp_path, old, 1)
-        r = report._Run("sift_ratio", folder, to_table([]))
+        r = Run("sift_ratio", folder, to_table([]))
         if drawn:
-            assert list(report._pipeline(r, OmegaConf.create(OPTIONS)).pruners) == names
+            assert list(rebuilt(r, SHOWN).pruners) == names
         else:
             with pytest.raises(
                 ValueError, match=r"made by an earlier version.*order of its pruners \(ratio, one_to_one\)"
             ):
-                report._pipeline(r, OmegaConf.create(OPTIONS))
+                rebuilt(r, SHOWN)
 
 
 def test_the_command_on_two_runs(tmp_path: Path) -> None:
@@ -211,8 +204,9 @@ def test_the_command_on_two_runs(tmp_path: Path) -> None:
     assert "drawn again" not in page  # what is drawn is what was stored
     assert page.count("data:image/jpeg") == 2 * 2 * 2  # pairs, runs, pictures
     assert "fmbench, test: Set" in page
-    assert page.count("<td>sift_ratio lmeds hypotheses=100</td>") >= 3
-    assert page.count("<td>sift_ratio msac hypotheses=100</td>") >= 3
+    assert re.search(r"pipeline <b>sift_ratio</b>", page)
+    assert set(re.findall(r'<tr data-run="([^"]*)"', page)) == {"lmeds", "msac"}  # what they share is said once
+    assert "estimator" not in re.sub(r"<style>.*</style>", "", page, flags=re.S).split("<h2>")[0]
     # Without the images there are figures, and why there are no pictures.
     done = command("fmtorch.report", "output=bare.html")
     assert done.returncode == 0, done.stderr

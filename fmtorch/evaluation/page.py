@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import base64
 import dataclasses
-import tempfile
+import hashlib
 from collections.abc import Mapping, Sequence
 from importlib import resources
-from pathlib import Path
 from typing import Any
 
 import cv2
 import jinja2
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
+from markupsafe import Markup
 
+from fmtorch.evaluation import curves, tables
 from fmtorch.evaluation.pictures import Image
-from fmtorch.evaluation.plots import plot_recall_curves
-from fmtorch.evaluation.statistics import FINE_THRESHOLD, MERITS, PERCENT, THRESHOLD, difference, scene_names
-from fmtorch.evaluation.summary import ALL, MARKDOWN_COLUMNS, STAGES, caption, summarize
+from fmtorch.evaluation.statistics import THRESHOLD
+from fmtorch.evaluation.summary import caption, summarize
 
-QUALITY, WIDTH = 82, 1280  # of JPEG pictures; px
+QUALITY, WIDTH = 80, 1280  # of JPEG pictures; px
 DISAGREEMENT = 0.1  # NSGD beyond which a result is as bad as any
 
 
@@ -35,11 +34,21 @@ class Picture:
 
 
 @dataclasses.dataclass(frozen=True)
-class ShownPair:
-    """A pair of images with pictures of it; notes: what the reader should know of them."""
+class Shown:
+    """A pair as one run sees it. nsgd: None where it failed, with the reason."""
 
-    heading: str
-    pictures: Sequence[Picture]
+    run: str
+    nsgd: float | None
+    reason: str = ""
+    pictures: Sequence[Picture] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class ShownPair:
+    """A pair of images as each run sees it; notes: what the reader should know of the pictures."""
+
+    name: str
+    runs: Sequence[Shown]
     notes: Sequence[str] = ()
 
 
@@ -47,22 +56,35 @@ class ShownPair:
 class Section:
     """The runs on one data set: tables of `PAIR_SCHEMA` by the runs' names, the first is what others differ from.
 
-    no_pictures: why there are none, for the reader.
+    notes: what the reader should know of the pictures of pairs, or why there are none.
     """
 
     heading: str
     runs: Mapping[str, pa.Table]
     pairs: Sequence[ShownPair] = ()
-    no_pictures: str = ""
+    notes: Sequence[str] = ()
 
 
-def render(title: str, sections: Sequence[Section], runs: Sequence[Sequence[str]]) -> str:
-    """The page. runs: name, identity, version, seed and folder of each run."""
-    text = resources.files("fmtorch.evaluation").joinpath("report.html.j2").read_text(encoding="utf-8")
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    return environment.from_string(text).render(title=title, sections=[_context(s) for s in sections], runs=runs)
+def render(
+    title: str,
+    sections: Sequence[Section],
+    runs: Sequence[Sequence[str]],
+    shared: Sequence[tuple[str, str]] = (),
+) -> str:
+    """The page: one file that loads nothing, whose script sorts and filters and whose content does without it.
+
+    runs: name, data set, identity, version, seed and folder of each run. shared: settings that all have in common.
+    """
+    names = list(dict.fromkeys([*(row[0] for row in runs), *(name for s in sections for name in s.runs)]))
+    script = _resource("report.js")
+    return _template().render(
+        title=title, runs=runs, shared=shared, names=names,
+        swatches={name: Markup(curves.swatch(i)) for i, name in enumerate(names)},
+        sections=[_context(section, names) for section in sections],
+        style=Markup(_resource("report.css")), script=Markup(script),
+        policy="default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-"
+        + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() + "'",
+    )  # fmt: skip
 
 
 def differing_pairs(runs: Mapping[str, pa.Table], count: int) -> list[str]:
@@ -70,10 +92,10 @@ def differing_pairs(runs: Mapping[str, pa.Table], count: int) -> list[str]:
 
     Of a single run: from its best pair to its worst, in equal steps.
     """
-    nsgd = np.stack([np.minimum(v, DISAGREEMENT) for v in _common(runs, "nsgd")])
+    nsgd = np.stack([np.minimum(v, DISAGREEMENT) for v in tables.common(runs, "nsgd")])
     first = next(iter(runs.values()))
     at = {key: i for i, key in enumerate(first["key"].to_pylist())}
-    rows = [at[key] for key in _keys(runs)]
+    rows = [at[key] for key in tables.shared_keys(runs)]
     if not rows or count < 1:
         return []
     names, scenes = first["pair"].to_pylist(), first["scene"].to_pylist()
@@ -91,141 +113,60 @@ def differing_pairs(runs: Mapping[str, pa.Table], count: int) -> list[str]:
     return [names[rows[i]] for i in chosen]
 
 
-def _keys(runs: Mapping[str, pa.Table]) -> list[int]:
-    """The pairs that all runs hold, in the order of the first."""
-    tables = list(runs.values())
-    shared = set.intersection(*(set(table["key"].to_pylist()) for table in tables))
-    return [key for key in tables[0]["key"].to_pylist() if key in shared]
+def _template() -> jinja2.Template:
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.from_string(_resource("report.html.j2"))
 
 
-def _common(runs: Mapping[str, pa.Table], column: str) -> list[NDArray[np.float64]]:
-    """A column of each run, of the pairs that all hold."""
-    keys = _keys(runs)
-    found = []
-    for table in runs.values():
-        values = dict(zip(table["key"].to_pylist(), table[column].to_pylist(), strict=True))
-        found.append(np.array([values[key] for key in keys], np.float64))
-    return found
+def _resource(name: str) -> str:
+    return resources.files("fmtorch.evaluation").joinpath(name).read_text(encoding="utf-8")
 
 
-def _context(section: Section) -> dict[str, Any]:
+def _context(section: Section, names: Sequence[str]) -> dict[str, Any]:
     summaries = {name: summarize(table) for name, table in section.runs.items()}
-    pairs = {name: table.num_rows for name, table in section.runs.items()}
-    facts = f"{len(section.runs)} runs" if len(section.runs) > 1 else "one run"
-    counts = f"{min(pairs.values()):,}" + (f" to {max(pairs.values()):,}" if len(set(pairs.values())) > 1 else "")
+    pairs = {table.num_rows for table in section.runs.values()}
+    facts = f"{len(section.runs)} runs" if len(section.runs) > 1 else "One run"
+    counts = f"{min(pairs):,}" + (f" to {max(pairs):,}" if len(pairs) > 1 else "")
+    made = (tables.merit(summaries), tables.families(summaries), tables.differences(section.runs))
     return {
         "heading": section.heading,
-        "facts": f"{facts}, {counts} pairs each. {caption(next(iter(summaries.values())))}",
-        "tables": [table for table in (_merit(summaries), _families(summaries), _differences(section.runs)) if table]
-        + [_seconds(summaries)],
-        "curves": _curves(section.runs),
-        "pictures": [
-            {
-                "heading": pair.heading,
-                "notes": pair.notes,
-                "pictures": [{"source": _jpeg(p.image), "alt": p.alt, "caption": p.caption} for p in pair.pictures],
-            }
-            for pair in section.pairs
+        "facts": f"{facts}, {counts} pair{'s' * (pairs != {1})}{' each' * (len(section.runs) > 1)}.",
+        "legend": caption(next(iter(summaries.values()))),
+        "tables": [*(table for table in made if table), tables.seconds(summaries)],
+        "names": list(section.runs),
+        "curves": [
+            (title, Markup(curves.svg(title, panel, names))) for title, panel in curves.panels(section.runs).items()
         ],
-        "no_pictures": section.no_pictures,
+        "pairs": [_pair(pair) for pair in section.pairs],
+        "notes": section.notes,
     }
 
 
-def _merit(summaries: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """All figures over all pairs, a row a run."""
-    columns = {heading: column for heading, column in MARKDOWN_COLUMNS.items() if heading}
-    rows = [[name, *(column(summary[ALL]) for column in columns.values())] for name, summary in summaries.items()]
-    ranked = {"%Recall [interval]": "recall", f"at {FINE_THRESHOLD}": "recall_fine", "AUC@0.05": "auc_05"}
-    best = {
-        heading: _best([summary[ALL][field] for summary in summaries.values()]) for heading, field in ranked.items()
+def _pair(pair: ShownPair) -> dict[str, Any]:
+    return {
+        "name": pair.name,
+        "notes": pair.notes,
+        "runs": [
+            {
+                "name": shown.run,
+                "result": f"failed: {shown.reason}" if shown.nsgd is None else f"NSGD {shown.nsgd:.4f}",
+                "good": shown.nsgd is not None and shown.nsgd < THRESHOLD,
+                "pictures": [_encoded(picture) for picture in shown.pictures],
+            }
+            for shown in pair.runs
+        ],
     }
-    return _table("Figures of merit", ["run", *columns], rows, {1 + list(columns).index(h): b for h, b in best.items()})
 
 
-def _families(summaries: Mapping[str, Mapping[str, Any]]) -> dict[str, Any] | None:
-    """Recall and AUC@0.05 by family; None where there is but one."""
-    names = dict.fromkeys(family for summary in summaries.values() for family in summary if family != ALL)
-    if len(names) < 2:
-        return None
-    rows, best = [], {}
-    for name, summary in summaries.items():
-        groups = [summary.get(family) for family in names]
-        rows.append(
-            [name, *("–" if g is None else f"{100 * g['recall']:.1f} / {100 * g['auc_05']:.1f}" for g in groups)]
-        )
-    for i, family in enumerate(names, start=1):
-        best[i] = _best([summary[family]["auc_05"] if family in summary else None for summary in summaries.values()])
-    return _table(f"By family: %Recall at {THRESHOLD} / AUC@0.05", ["run", *names], rows, best)
-
-
-def _differences(runs: Mapping[str, pa.Table]) -> dict[str, Any] | None:
-    """What the first run is ahead of the others by, on the pairs they share; None of a single run."""
-    if len(runs) < 2:
-        return None
-    first, *others = runs
-    key, family, place = (runs[first][name].to_pylist() for name in ("key", "family", "scene"))
-    scene = dict(zip(key, scene_names(family, place), strict=True))
-    rows = []
-    for other in others:
-        two = {first: runs[first], other: runs[other]}
-        a, b = _common(two, "nsgd")
-        rows.append([other, f"{len(a):,}", *_ahead(a, b, [scene[key] for key in _keys(two)])])
-    head = ["run", "shared pairs", f"recall at {THRESHOLD}", f"at {FINE_THRESHOLD}", "AUC@0.05"]
-    note = "In points, with the paired 95 % bootstrap interval: a difference whose interval holds 0 may be chance."
-    return {**_table(f"What {first} is ahead by", head, rows, {}), "note": note}
-
-
-def _ahead(a: NDArray[np.float64], b: NDArray[np.float64], scenes: Sequence[str]) -> list[str]:
-    """Differences of recall at both thresholds and of AUC@0.05, of NSGD of the same pairs."""
-    found = [difference(values(a), values(b), scenes, scale=PERCENT) for values in MERITS.values()]
-    return ["–" if interval is None else f"{interval:+.1f}" for interval in found]
-
-
-def _seconds(summaries: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    stages = [*STAGES, "total"]
-    rows = [
-        [name, *("–" if (s := summary[ALL]["seconds"][stage]) is None else f"{s:.3f}" for stage in stages)]
-        for name, summary in summaries.items()
-    ]
-    failed = [
-        f"{name}: {count} × {reason}"
-        for name, summary in summaries.items()
-        for reason, count in summary[ALL]["reasons"].items()
-    ]
-    note = ("Pairs that failed: " + "; ".join(failed)) if failed else ""
-    return {**_table("Seconds a pair, median", ["run", *stages], rows, {}), "note": note}
-
-
-def _table(
-    heading: str, head: Sequence[str], rows: Sequence[Sequence[str]], best: Mapping[int, set[int]]
-) -> dict[str, Any]:
-    """best: the rows to stress of some columns."""
-    cells = [
-        [{"text": text, "best": i in best.get(j, set())} for j, text in enumerate(row)] for i, row in enumerate(rows)
-    ]
-    return {"heading": heading, "head": list(head), "rows": cells, "note": ""}
-
-
-def _best(values: Sequence[float | None]) -> set[int]:
-    """Where the largest is; nowhere of a single value."""
-    known = [value for value in values if value is not None]
-    return {i for i, value in enumerate(values) if value == max(known)} if len(known) > 1 else set()
-
-
-def _curves(runs: Mapping[str, pa.Table]) -> str:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "recall.svg"
-        plot_recall_curves(runs, path)
-        return _data("image/svg+xml", path.read_bytes())
-
-
-def _jpeg(image: Image) -> str:
+def _encoded(picture: Picture) -> dict[str, Any]:
+    """A picture as a JPEG within the page, and its size, which keeps its place until it is shown."""
+    image = picture.image
     if image.shape[1] > WIDTH:
         height = round(image.shape[0] * WIDTH / image.shape[1])
         image = np.asarray(cv2.resize(image, (WIDTH, height), interpolation=cv2.INTER_AREA), np.uint8)
     encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
-    return _data("image/jpeg", encoded.tobytes())
-
-
-def _data(kind: str, content: bytes) -> str:
-    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
+    source = f"data:image/jpeg;base64,{base64.b64encode(encoded.tobytes()).decode('ascii')}"
+    height, width = image.shape[:2]
+    return {"source": source, "alt": picture.alt, "caption": picture.caption, "width": width, "height": height}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -27,6 +27,8 @@ _GAP = 6  # px between the two images
 _STACKED = 5.0  # images whose widths add up to more than so many heights stand one above the other
 _SUBPIXEL = 4  # fractional bits of the coordinates that are drawn
 _PARALLEL = 1e-9  # a line with this slope at most leaves an image only at its two other sides
+_CORNERS = 200  # among which to choose
+_RIM = 0.06  # share of an image at either side without corners
 _FARTHEST = 1e12  # px; a line farther from the first pixel is the line at infinity
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _COLOUR_LEFT = 0.45  # of the photographs' own, so that lines stand out
@@ -71,23 +73,78 @@ def draw_epipolar_lines(
     dashed and white. x0, x1: (N, 2) pixels, of which `most` are drawn at most, spread over both images.
     """
     canvas, place0, place1 = _placed(image0, image1, None)
-    unit = _unit(canvas)
     finite = np.flatnonzero(np.isfinite(x0).all(1) & np.isfinite(x1).all(1))
     index = finite[spread(np.hstack([place0(x0), place1(x1)])[finite], most)]
     for place, own, other, transpose in ((place0, x0, x1, True), (place1, x1, x0, False)):
         matrices = [(matrix.T if transpose else matrix) for matrix in (F, truth) if matrix is not None]
-        part = place.view(canvas)
-        partners = np.column_stack([other[index], np.ones(len(index))])
-        drawn = [[place.clip(line) for line in partners @ matrix.T] for matrix in matrices]
-        for k, ends in enumerate(drawn[0]):
-            _segment(part, ends, COLOURS[k % len(COLOURS)], 1.9 * unit)
-        for ends in drawn[1] if truth is not None else []:
-            for dash in _dashes(ends, 15 * unit):
-                _segment(part, dash, (255, 255, 255), 1.3 * unit)
-        for k, point in enumerate(_fixed(place(own[index]) - place.origin)):
-            for colour, radius in (((0, 0, 0), 5.8), ((255, 255, 255), 5.0), (COLOURS[k % len(COLOURS)], 3.6)):
-                cv2.circle(part, point, round(radius * unit * (1 << _SUBPIXEL)), colour, -1, cv2.LINE_AA, _SUBPIXEL)
+        _lines_and_points(canvas, place, _lines(place, matrices, other[index]), own[index], 0)
     return canvas
+
+
+def draw_epipolar_lines_of_corners(
+    image0: Image, image1: Image, F: Points, *, truth: Points | None = None, most: int = 7
+) -> Image:
+    """Two images with some of their own corners as points, and the epipolar line of each in the other image; RGB.
+
+    For an F whose matches are not known. A point and its line have one colour, which no other point has where `most` is
+    that of `COLOURS` or fewer; more than half of the points lie in image 0. Where there is a choice they are corners
+    whose true line crosses the other image. truth: as for `draw_epipolar_lines`.
+    """
+    canvas, place0, place1 = _placed(image0, image1, None)
+    known = F if truth is None else truth
+    chosen0 = _corners(image0, lambda line: place1.clip(line), known, most - most // 2)
+    chosen1 = _corners(image1, lambda line: place0.clip(line), known.T, most // 2)
+    both = [matrix for matrix in (F, truth) if matrix is not None]
+    first = len(chosen0)
+    lines0 = _lines(place0, [matrix.T for matrix in both], chosen1)
+    _lines_and_points(canvas, place0, lines0, chosen0, 0, first)
+    _lines_and_points(canvas, place1, _lines(place1, both, chosen0), chosen1, first, 0)
+    return canvas
+
+
+def _corners(image: Image, clip: Callable[[Points], NDArray[np.float64]], F: Points, count: int) -> NDArray[np.float64]:
+    """At most `count` corners of an image, (n, 2), far from one another; those first whose line `clip` finds."""
+    grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+    inner = np.zeros(grey.shape, np.uint8)  # the rims of undistorted images have corners of their own
+    rows, columns = (slice(int(_RIM * size), size - int(_RIM * size)) for size in grey.shape)
+    inner[rows, columns] = 255
+    found = cv2.goodFeaturesToTrack(grey, _CORNERS, 0.02, max(2.0, min(grey.shape) / 40), mask=inner)
+    if found is None:
+        return np.zeros((0, 2))
+    corners = np.asarray(found, np.float64).reshape(-1, 2)
+    seen = np.array([len(clip(F @ [x, y, 1.0])) > 0 for x, y in corners])
+    corners = corners[seen] if seen.any() else corners
+    return corners[spread(corners, count)]
+
+
+def _lines(place: _Place, matrices: Sequence[Points], points: Points) -> list[list[NDArray[np.float64]]]:
+    """Of each matrix the ends of the points' epipolar lines in the image at `place`."""
+    homogeneous = np.column_stack([points, np.ones(len(points))])
+    return [[place.clip(line) for line in homogeneous @ matrix.T] for matrix in matrices]
+
+
+def _lines_and_points(
+    canvas: Image,
+    place: _Place,
+    lines: Sequence[Sequence[NDArray[np.float64]]],
+    points: Points,
+    colour: int,
+    line_colour: int | None = None,
+) -> None:
+    """Draw in one image lines and, dashed and white, true lines if `lines` has them; then points on top.
+
+    colour, line_colour: the colours' numbers of the first point and, if it is another, the first line.
+    """
+    part, unit = place.view(canvas), _unit(canvas)
+    start = colour if line_colour is None else line_colour
+    for k, ends in enumerate(lines[0], start):
+        _segment(part, ends, COLOURS[k % len(COLOURS)], 1.9 * unit)
+    for ends in lines[1] if len(lines) > 1 else []:
+        for dash in _dashes(ends, 15 * unit):
+            _segment(part, dash, (255, 255, 255), 1.3 * unit)
+    for k, point in enumerate(_fixed(place(points) - place.origin), colour):
+        for ring, radius in (((0, 0, 0), 5.8), ((255, 255, 255), 5.0), (COLOURS[k % len(COLOURS)], 3.6)):
+            cv2.circle(part, point, round(radius * unit * (1 << _SUBPIXEL)), ring, -1, cv2.LINE_AA, _SUBPIXEL)
 
 
 def spread(points: Points, count: int) -> NDArray[np.intp]:

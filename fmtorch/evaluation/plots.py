@@ -38,9 +38,9 @@ def plot_recall_curves(runs: Mapping[str, pa.Table], path: Path) -> None:
     from matplotlib.figure import Figure  # no pyplot: no global state and no window
 
     panels = _panels(runs)
-    rows = max(1, math.ceil(len(panels) / 3))
+    rows = max(1, math.ceil(len(panels) / 2))
     columns = max(1, math.ceil(len(panels) / rows))
-    width, height = (6.4, 4.4) if len(panels) <= 1 else (4.6 * columns, 3.7 * rows)
+    width, height = (7.4, 4.4) if len(panels) <= 1 else (6.2 * columns, 3.7 * rows)
     figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
     grid: Any = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     titles = list(panels)
@@ -97,8 +97,8 @@ def _draw(ax: Axes, title: str, curves: Mapping[str, NDArray[np.float64]]) -> No
         ax.spines[side].set_visible(False)
     ax.spines["bottom"].set_color("#999999")
     if curves:
-        legend = ax.legend(
-            title=f"recall [%] at {THRESHOLD}", fontsize=8, title_fontsize=8, loc="best", alignment="left",
-            labelcolor=_INK, framealpha=0.9, edgecolor="none", handlelength=2.0,
+        legend = ax.legend(  # beside the curves, none of which it hides
+            title=f"recall [%] at {THRESHOLD}", fontsize=8, title_fontsize=8, loc="upper left", alignment="left",
+            bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, labelcolor=_INK, frameon=False, handlelength=2.0,
         )  # fmt: skip
         legend.get_title().set_color(_INK)

@@ -10,7 +10,7 @@ import torch
 
 from fmtorch.data import ImagePair
 from fmtorch.evaluation.page import Picture
-from fmtorch.evaluation.pictures import Image, draw_epipolar_lines, draw_matches
+from fmtorch.evaluation.pictures import Image, draw_epipolar_lines, draw_epipolar_lines_of_corners, draw_matches
 from fmtorch.metrics import nsgd
 from fmtorch.pipeline import Outcome
 
@@ -46,21 +46,31 @@ def difference(pair: ImagePair, images: Sequence[Image], stored: Mapping[str, An
 def drawn(
     pair: ImagePair, images: Sequence[Image], stored: Mapping[str, Any], outcome: Outcome, name: str
 ) -> list[Picture]:
-    """A run's matches of a pair, drawn again, and the epipolar lines of the F that it stored."""
+    """A run's matches of a pair, drawn again, and the epipolar lines of the F that it stored.
+
+    Of a pair that has no F, its matches; nothing where there are none, or none of an F that was stored.
+    """
     c, estimate = outcome.correspondences, outcome.estimate
-    if c is None or estimate is None or not bool(estimate.ok[0]) or not stored["ok"]:
+    if c is None or estimate is None or (stored["ok"] and not bool(estimate.ok[0])):
         return []
     x0, x1 = (x[0].cpu().numpy().astype(np.float64) for x in (c.x0, c.x1))
-    inliers = estimate.inliers[0].cpu().numpy()
-    matches = draw_matches(
-        images[0], images[1], x0, x1, inliers, names=("inliers of F", "other matches given to the estimator")
-    )
+    inliers = estimate.inliers[0].cpu().numpy() & bool(stored["ok"])
+    matches = draw_matches(images[0], images[1], x0, x1, inliers)
+    said = f"{int(inliers.sum())} inliers of F (green) of {len(inliers)} matches; a sample of either is drawn"
+    pictures = [Picture(matches, f"matches of {name}", said)]
+    if stored["ok"]:
+        F = np.array(stored["F"]).reshape(3, 3)
+        lines = draw_epipolar_lines(images[0], images[1], x0[inliers], x1[inliers], F, truth=pair.F)
+        said = "Epipolar lines of some inliers; the true ones dashed in white"
+        pictures.append(Picture(lines, f"epipolar lines of {name}", said))
+    return pictures
+
+
+def from_stored(pair: ImagePair, images: Sequence[Image], stored: Mapping[str, Any], name: str) -> list[Picture]:
+    """The epipolar lines of the F that a run stored, of corners of the images; nothing of a pair without F."""
+    if not stored["ok"]:
+        return []
     F = np.array(stored["F"]).reshape(3, 3)
-    lines = draw_epipolar_lines(images[0], images[1], x0[inliers], x1[inliers], F, truth=pair.F)
-    said = f"{name}: NSGD {stored['nsgd']:.4f}, {int(inliers.sum())} inliers of {len(inliers)} matches"
-    return [
-        Picture(matches, f"matches of {name}", said),
-        Picture(
-            lines, f"epipolar lines of {name}", f"{name}: epipolar lines of some inliers; the true ones dashed in white"
-        ),
-    ]
+    lines = draw_epipolar_lines_of_corners(images[0], images[1], F, truth=pair.F)
+    said = "Epipolar lines of some corners, each in the other image, by the stored F; the true ones dashed in white"
+    return [Picture(lines, f"epipolar lines of {name}", said)]

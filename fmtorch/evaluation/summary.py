@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -13,11 +11,14 @@ from numpy.typing import NDArray
 from rich import box
 from rich.table import Table
 
-from fmtorch.evaluation.bootstrap import LEVEL, RESAMPLES, bootstrap_mean
+from fmtorch.evaluation.bootstrap import LEVEL
+from fmtorch.evaluation.intervals import share_interval
+from fmtorch.evaluation.reasons import common_reasons
 from fmtorch.evaluation.statistics import FINE_THRESHOLD, MERITS, THRESHOLD, recalled, scene_names
 from fmtorch.storage import PAIR_SCHEMA
 
 ALL = "all"
+RECALL = "%Recall [interval]"  # the column that has an interval
 STAGES = tuple(name.removeprefix("seconds_") for name in PAIR_SCHEMA.names if name.startswith("seconds_"))
 _REASONS = 3  # commonest reasons kept
 _DASH = "–"
@@ -31,15 +32,16 @@ def summarize(table: pa.Table) -> dict[str, Group]:
     All shares are in [0, 1]; a figure that is not defined is None. Of each group:
 
     - pairs, scenes: how many.
-    - recall: share of all pairs with NSGD < 0.05, a failed pair being a miss; recall_interval: its 95 % bootstrap
-      interval, and interval_over: what was resampled (see `bootstrap_mean`). recall_fine: at NSGD < 0.01.
+    - recall: share of all pairs with NSGD < 0.05, a failed pair being a miss; recall_interval: its 95 % score
+      interval, and interval_over: the unit that is independent (see `share_interval`). recall_fine: at NSGD < 0.01.
       auc_05: AUC@0.05, the mean of recall over the thresholds from 0 to 0.05. recall_released: by the published
       evaluator's NSGD, where that was computed for each pair that did not fail.
     - inlier_rate: share of the estimator's inliers that obey the true F, and inlier_rate_before: share of the matches
       given to it; means over the pairs that did not fail, as the paper; ``*_failures_0``: means over all pairs with 0
       for failures and where there is no figure.
     - corrs, corrs_before: number of inliers and of matches given to the estimator; means over pairs that did not fail.
-    - failures, failure_share, reasons: the commonest reasons (numbers in them replaced by N) and how often.
+    - failures, failure_share, reasons: the commonest reasons and how often; reasons that differ in numbers alone are
+      one, with the range of these.
     - seconds: median per pair for each stage, and ``total``.
     """
     families = table["family"].to_pylist()
@@ -55,7 +57,7 @@ def _group(table: pa.Table) -> Group:
 
     group |= {"recall": None, "recall_interval": None, "interval_over": None, "recall_fine": None, "auc_05": None}
     if len(ok):
-        interval = bootstrap_mean(recalled(nsgd), scenes)
+        interval = share_interval(nsgd < THRESHOLD, scenes)
         group |= {
             "recall": interval.value, "recall_interval": [interval.low, interval.high], "interval_over": interval.over,
             "recall_fine": float(MERITS["recall_01"](nsgd).mean()), "auc_05": float(MERITS["auc_05"](nsgd).mean()),
@@ -70,15 +72,15 @@ def _group(table: pa.Table) -> Group:
     for name in ("corrs", "corrs_before"):
         group[name] = _mean(_column(table, name)[ok])
 
-    reasons = Counter(re.sub(r"\d+", "N", reason) for reason in table["reason"].to_pylist() if reason)
     failures = int((~ok).sum())
     group |= {
         "failures": failures, "failure_share": failures / len(ok) if len(ok) else None,
-        "reasons": dict(reasons.most_common(_REASONS)),
+        "reasons": common_reasons([reason for reason in table["reason"].to_pylist() if reason], _REASONS),
     }  # fmt: skip
     seconds = np.stack([_column(table, f"seconds_{stage}") for stage in STAGES])
     group["seconds"] = {stage: _median(row) for stage, row in zip(STAGES, seconds, strict=True)}
-    group["seconds"]["total"] = _median(np.nansum(seconds, axis=0))
+    unknown = np.isnan(seconds).all(0)
+    group["seconds"]["total"] = _median(np.where(unknown, np.nan, np.nansum(seconds, axis=0)))
     return group
 
 
@@ -103,14 +105,14 @@ def summary_markdown(summary: Mapping[str, Group], title: str) -> str:
     for name, group in _rows(summary):
         stages.append([name, *(_number(group["seconds"][stage], "{:.3f}") for stage in (*STAGES, "total"))])
     failures = [
-        f"- {name}: {count} x {_escape(reason)}"
+        f"- {name}: {_escape(reason)} ({count})"
         for name, group in _rows(summary)
         if name != ALL or len(summary) == 1
         for reason, count in group["reasons"].items()
     ]
     parts = [f"# {title}", _lines(rows), caption(summary), _lines(stages)]
     if failures:
-        parts += ["Commonest reasons of failure (numbers replaced by N):", "\n".join(failures)]
+        parts += ["Commonest reasons of failure, with the number of pairs:", "\n".join(failures)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -124,13 +126,13 @@ def _cells(columns: Mapping[str, Callable[[Group], str]], name: str, group: Grou
 
 
 def caption(summary: Mapping[str, Group]) -> str:
-    """What the columns mean, and what the intervals were resampled over."""
+    """What the columns mean, and what the intervals take for independent."""
     overs = dict.fromkeys(group["interval_over"] for _, group in _rows(summary) if group["interval_over"])
     where = {over: [name for name, g in _rows(summary) if g["interval_over"] == over] for over in overs}
     over = "; ".join(f"{o}s" + (f" ({', '.join(names)})" if len(where) > 1 else "") for o, names in where.items())
     return (
-        f"%Recall: NSGD < {THRESHOLD}, failures are misses; [{LEVEL:.0%} bootstrap interval, {RESAMPLES:,} resamples "
-        f"of {over or 'pairs'}]. AUC@0.05: area under the recall curve to NSGD {THRESHOLD}. "
+        f"%Recall: NSGD < {THRESHOLD}, failures are misses; [{LEVEL:.0%} Wilson interval; independent units: "
+        f"{over or 'pairs'}]. AUC@0.05: area under the recall curve to NSGD {THRESHOLD}. "
         "%Inlier, #Corrs: after estimation, -m: before; means over the pairs that did not fail."
     )
 
@@ -183,7 +185,7 @@ MARKDOWN_COLUMNS: dict[str, Callable[[Group], str]] = {
     "": lambda group: "",
     "Pairs": lambda group: str(group["pairs"]),
     "Scenes": lambda group: str(group["scenes"]),
-    "%Recall [interval]": _recall,
+    RECALL: _recall,
     f"at {FINE_THRESHOLD}": _percent("recall_fine"),
     "AUC@0.05": _percent("auc_05"),
     "%Recall (released NSGD)": _percent("recall_released"),

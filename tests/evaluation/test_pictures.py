@@ -15,6 +15,7 @@ from fmtorch.evaluation.pictures import (
     WIDTH,
     _Place,
     draw_epipolar_lines,
+    draw_epipolar_lines_of_corners,
     draw_matches,
     spread,
     thinned,
@@ -108,6 +109,29 @@ def test_epipolar_lines_run_through_the_points_and_the_truth_is_white() -> None:
     half = with_truth.shape[1] // 2 + 10
     assert 0.4 < white[half:].mean() < 0.7  # dashed
     assert not white[: half - 20].any()
+
+
+def test_corners_have_their_lines_in_the_other_image() -> None:
+    images = np.zeros((2, 90, 100, 3), np.uint8)
+    for k in range(4):  # dots, no two of one height
+        images[0, 12 + 16 * k : 14 + 16 * k, 20 * k + 10 : 20 * k + 12] = 255
+        images[1, 20 + 16 * k : 22 + 16 * k, 80 - 20 * k : 82 - 20 * k] = 255
+    picture = draw_epipolar_lines_of_corners(images[0], images[1], ROWS)
+    half = picture.shape[1] // 2
+    sides = picture[:, : half - 10], picture[:, half + 10 :]
+    heights = set()
+    for k in range(7):
+        points, lines = sides if k < 4 else sides[::-1]
+        share = near(lines, COLOURS[k], 40).mean(1)
+        (row,) = np.flatnonzero(np.diff((share > 0.5).astype(int)) == 1)  # one line, which runs across
+        own = np.flatnonzero(near(points, COLOURS[k], 40).any(1))
+        assert abs(own.mean() - row) < 5  # px of the picture, of eleven to one of the images
+        heights.add(row)
+    assert len(heights) == 7
+    blank = draw_epipolar_lines_of_corners(grey(50, 60), grey(50, 60), ROWS)  # without corners there is nothing to draw
+    assert (blank[10:-10, 10:50] == 128).all()
+    for shape in ((1, 1), (1, 500), (8, 8)):
+        assert draw_epipolar_lines_of_corners(grey(*shape), grey(480, 640)[..., 0], ROWS).size
 
 
 finite = st.floats(-100, 100)

@@ -64,6 +64,24 @@ def test_curve_values() -> None:
     assert [text.get_text() for text in ax.get_legend().get_texts()] == ["25.0  run"]
 
 
+def test_no_curve_is_hidden_by_the_legend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from matplotlib.figure import Figure
+
+    drawn: list[Figure] = []
+    save = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (drawn.append(self), save(self, *a, **k))[1])
+    for runs in (
+        {"one run": table("a", "b", "c", "d")},
+        {f"a run of a long name {i}": table("a", "b") for i in range(9)},
+    ):
+        plots.plot_recall_curves(runs, tmp_path / "recall.png")
+        for ax in drawn[-1].axes:
+            if ax.get_legend() is not None:
+                legend = ax.get_legend().get_window_extent()
+                assert not any(legend.overlaps(other.get_window_extent()) for other in drawn[-1].axes)
+                assert legend.x1 <= drawn[-1].bbox.x1 + 1
+
+
 def test_matplotlib_is_loaded_only_when_drawing() -> None:
     code = "import sys, fmtorch.evaluation.plots; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[2], check=False).returncode == 0

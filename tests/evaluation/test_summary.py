@@ -68,9 +68,14 @@ def test_known_answer() -> None:
     assert orbit["recall"] == pytest.approx(1 / 3)
     assert everything["recall"] == pytest.approx(4 / 8)
     assert everything["scenes"] == 6
-    assert everything["reasons"] == {"N matches; at least N are needed": 2, "no keypoints in a|b.png": 1}
+    assert everything["reasons"] == {"5 to 7 matches; at least 8 are needed": 2, "no keypoints in a|b.png": 1}
     low, high = everything["recall_interval"]
     assert 0 <= low < everything["recall"] < high <= 1
+
+
+def test_seconds_that_nobody_measured_are_not_zero() -> None:
+    unmeasured = {f"seconds_{stage}": None for stage in ("features", "matching", "pruning", "estimation", "metrics")}
+    assert summarize(to_table([good("a", 0.0, **unmeasured)]))["all"]["seconds"]["total"] is None
 
 
 def test_failing_never_pays() -> None:

@@ -1,0 +1,148 @@
+"""The pairs that a report shows: images from wherever they lie, each run's matches again, or what it stored."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import torch
+from omegaconf import OmegaConf
+
+from fmtorch import data, presets
+from fmtorch.data import DataError, ImageError, ImagePair, PairDataset, read_image
+from fmtorch.evaluation.page import Picture, Shown, ShownPair, differing_pairs
+from fmtorch.evaluation.redraw import difference, drawn, from_stored
+from fmtorch.pipeline import Pipeline
+from fmtorch.storage import RunFolder
+
+MOST_RUNS = 8  # whose pictures a pair has: each adds some 0.4 MB to the page
+_NOT_BUILT = (ValueError, TypeError, AttributeError, ImportError, OSError)
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A run folder, its results, and how the page calls it."""
+
+    name: str
+    folder: RunFolder
+    table: pa.Table
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What a report may use for its pictures.
+
+    roots: folders where images may lie; which data set is in which shows by its digest. own_code: whether parts and
+    data sets that are not this project's are loaded, which runs their code. cache, cache_limit: of features.
+    """
+
+    count: int
+    roots: Sequence[Path] = ()
+    own_code: bool = False
+    device: torch.device = dataclasses.field(default_factory=lambda: torch.device("cpu"))
+    cache: str | None = None
+    cache_limit: int | float | None = None
+
+
+def gallery(
+    runs: Sequence[Run], options: Options, progress: Callable[[Sequence[str]], Any] = lambda pairs: pairs
+) -> tuple[list[ShownPair], list[str]]:
+    """Pairs of one data set as each run sees them, and what the reader should know of them, or why there are none."""
+    wanted = differing_pairs({r.name: r.table for r in runs}, options.count)
+    if not wanted:
+        return [], [] if options.count == 0 else ["No pictures: the runs share no pair."]
+    try:
+        dataset = find_dataset(runs[0].folder.config.get("dataset") or {}, options)
+    except _NOT_BUILT as error:
+        return [], [f"No pictures: {error}"]
+    pairs = {dataset[i].identity: dataset[i] for i in range(len(dataset))}
+    notes = []
+    if len(runs) > MOST_RUNS:
+        notes.append(f"Pictures are of the first {MOST_RUNS} of {len(runs)} runs.")
+    pipelines: dict[str, Pipeline | None] = {}
+    for r in runs[:MOST_RUNS]:
+        try:
+            pipelines[r.name] = rebuilt(r, options)
+        except _NOT_BUILT as error:
+            pipelines[r.name] = None
+            notes.append(f"{r.name} is shown by the F that it stored, without its matches: {error}.")
+    shown = [shown_pair(pairs[name], runs[:MOST_RUNS], pipelines) for name in progress(wanted) if name in pairs]
+    return shown, notes if shown else ["No pictures: the data set does not hold the pairs of the runs."]
+
+
+def find_dataset(stored: Mapping[str, Any], options: Options) -> PairDataset:
+    """The data set that a run evaluated, in the first of the roots that holds it.
+
+    stored: its config and digest in the run's identity. A run of others' results, which names no data set, is looked
+    for in the roots in the layout of `fmbench`. Raises DataError where it is another or nowhere to be found.
+    """
+    known = {key: value for key, value in stored.items() if key != "digest"}
+    own = "_target_" in known
+    if own and not options.own_code:
+        raise DataError("the data set is one of your own, which a report loads with own_code=true")
+    known = known if own or "name" in known else {"name": "fmbench"}
+    reasons = []
+    for root in _roots(known, options.roots):
+        try:
+            if own:
+                return _same(presets.instantiate({**known, **({"root": root} if root else {})}, "dataset"), stored)
+            return _same(data.load(**known, root=root), stored)
+        except _NOT_BUILT as error:
+            reasons.append(str(error))
+    raise DataError("; ".join(dict.fromkeys(reasons)))
+
+
+def _roots(known: Mapping[str, Any], roots: Sequence[Path]) -> list[Path | None]:
+    """Where a data set may lie; None: its usual place."""
+    if known.get("name") == "rendered":  # which is drawn where it does not lie, and never among something else
+        drawn = f"*-{known.get('split', 'test')}-{known.get('size', 'small')}-*"
+        return [root for root in roots if any(root.glob(drawn))] or [None]
+    return list(roots) or [None] if known.get("name") == "fmbench" else [None, *roots]
+
+
+def _same(dataset: PairDataset, stored: Mapping[str, Any]) -> PairDataset:
+    if stored.get("digest") not in (None, dataset.digest):
+        raise DataError("the data set has changed since the run, or another one lies in root")
+    return dataset
+
+
+def rebuilt(r: Run, options: Options) -> Pipeline:
+    """The pipeline of a run. Raises ValueError for parts that are not the project's own, unless these are allowed."""
+    stages = {group: r.folder.config[group] for group in presets.STAGES if group in r.folder.config}
+    if not stages:
+        raise ValueError("its folder does not say what its pipeline was")
+    foreign = presets.targets_of(stages) - presets.known_targets()
+    if foreign and not options.own_code:
+        raise ValueError(
+            f"it has parts of your own ({', '.join(sorted(foreign))}), which a report loads with own_code=true"
+        )
+    try:
+        composed = presets.composed(stages)
+    except ValueError as error:
+        raise ValueError(f"made by an earlier version, {error}") from error
+    cache = {"cache": options.cache, "cache_limit": options.cache_limit}
+    return presets.build_pipeline(OmegaConf.create({**composed, **cache}), options.device)
+
+
+def shown_pair(pair: ImagePair, runs: Sequence[Run], pipelines: Mapping[str, Pipeline | None]) -> ShownPair:
+    """A pair as each run sees it: drawn again by its pipeline, or where there is none by the F that it stored."""
+    try:
+        images = [read_image(source) for source in (pair.image0, pair.image1)]
+    except ImageError as error:
+        return ShownPair(pair.identity, [], [str(error)])
+    seen, notes = [], []
+    for r in runs:
+        stored = next(row for row in r.table.to_pylist() if row["key"] == pair.key)
+        pipeline = pipelines[r.name]
+        pictures: list[Picture] = []
+        if pipeline is not None:
+            (outcome,) = pipeline.run([pair], int(r.folder.config.get("seed", 0)))
+            note = difference(pair, images, stored, outcome)
+            notes += [f"{r.name} {note}"] if note else []
+            pictures = drawn(pair, images, stored, outcome, r.name)
+        pictures = pictures or from_stored(pair, images, stored, r.name)
+        seen.append(Shown(r.name, float(stored["nsgd"]) if stored["ok"] else None, str(stored["reason"]), pictures))
+    return ShownPair(pair.identity, seen, notes)

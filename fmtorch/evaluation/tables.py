@@ -1,0 +1,189 @@
+"""The tables of a report, as cells: figures of merit, families, paired differences, seconds."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from fmtorch.evaluation.bootstrap import LEVEL, Interval
+from fmtorch.evaluation.intervals import MIN_UNITS, mean_difference, share_difference
+from fmtorch.evaluation.statistics import FINE_THRESHOLD, PERCENT, THRESHOLD, areas, scene_names
+from fmtorch.evaluation.summary import ALL, MARKDOWN_COLUMNS, RECALL, STAGES
+
+DASH = "–"
+Summaries = Mapping[str, Mapping[str, Any]]  # of `summarize`, by the runs' names
+
+
+@dataclasses.dataclass(frozen=True)
+class Bar:
+    """What a cell draws below its figure, in percent of its width: an interval, its value, and a line at zero."""
+
+    low: float
+    value: float
+    high: float
+    zero: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """A figure. best: the best of its column. shares: the parts, in percent, of a stacked bar."""
+
+    text: str
+    best: bool = False
+    bar: Bar | None = None
+    shares: Sequence[float] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """Cells by the runs' names, below their headings; the first heading is that of the names."""
+
+    heading: str
+    head: Sequence[str]
+    rows: Mapping[str, Sequence[Cell]]
+    note: str = ""
+    stages: bool = False  # whether the headings are keys to the parts of stacked bars
+
+
+def merit(summaries: Summaries) -> Table:
+    """All figures over all pairs, a row a run."""
+    counts = ("Pairs", "Scenes")  # which stand last: recall is what is looked for
+    columns = {heading: column for heading, column in MARKDOWN_COLUMNS.items() if heading and heading not in counts}
+    columns |= {heading: MARKDOWN_COLUMNS[heading] for heading in counts}
+    ranked = {RECALL: "recall", f"at {FINE_THRESHOLD}": "recall_fine", "AUC@0.05": "auc_05"}
+    best = {heading: _best({n: s[ALL][field] for n, s in summaries.items()}) for heading, field in ranked.items()}
+    rows = {
+        name: [
+            Cell(
+                column(summary[ALL]), name in best.get(heading, ()), _share(summary[ALL]) if heading == RECALL else None
+            )
+            for heading, column in columns.items()
+        ]
+        for name, summary in summaries.items()
+    }
+    return Table("Figures of merit", ["run", *columns], rows)
+
+
+def families(summaries: Summaries) -> Table | None:
+    """Recall with its interval, and AUC@0.05, by family; None where there is but one."""
+    names = list(dict.fromkeys(family for summary in summaries.values() for family in summary if family != ALL))
+    if len(names) < 2:
+        return None
+    best = {f: _best({n: s[f]["auc_05"] for n, s in summaries.items() if f in s}) for f in names}
+    rows = {
+        name: [
+            Cell(f"{100 * group['recall']:.1f} / {100 * group['auc_05']:.1f}", name in best[family], _share(group))
+            if (group := summary.get(family))
+            else Cell(DASH)
+            for family in names
+        ]
+        for name, summary in summaries.items()
+    }
+    note = f"Bars: the {LEVEL:.0%} Wilson interval of recall, from 0 to 100 %. Bold: the largest AUC@0.05."
+    return Table(f"By family: %Recall at {THRESHOLD} / AUC@0.05", ["run", *names], rows, note)
+
+
+def differences(runs: Mapping[str, pa.Table]) -> Table | None:
+    """The first run minus each other one, on the pairs that the two share; None of a single run."""
+    if len(runs) < 2:
+        return None
+    first, *others = runs
+    key, family, place = (runs[first][name].to_pylist() for name in ("key", "family", "scene"))
+    scene = dict(zip(key, scene_names(family, place), strict=True))
+    found = {}
+    for other in others:
+        two = {first: runs[first], other: runs[other]}
+        a, b = common(two, "nsgd")
+        found[other] = (len(a), _ahead(a, b, [scene[key] for key in shared_keys(two)]))
+    ends = [abs(end) for _, cells in found.values() for _, i in cells if i for end in (i.low, i.high)]
+    widest = max(ends, default=1.0) or 1.0
+    rows = {
+        name: [Cell(f"{count:,}"), *(Cell(text, bar=_around_zero(i, widest)) for text, i in cells)]
+        for name, (count, cells) in found.items()
+    }
+    head = ["run", "shared pairs", f"recall at {THRESHOLD}", f"at {FINE_THRESHOLD}", "AUC@0.05"]
+    note = (
+        f"In points; positive where {first} is ahead of the row's run. In brackets the paired {LEVEL:.0%} interval "
+        f"(Bonett and Price's for recall, a bootstrap for AUC@0.05 from {MIN_UNITS} scenes or pairs on): a difference "
+        "whose interval holds 0 may be chance."
+    )
+    return Table(f"{first} minus each other run, pair by pair", head, rows, note)
+
+
+def seconds(summaries: Summaries) -> Table:
+    """Median seconds a pair of each stage, and the commonest failures."""
+    stages = [*STAGES, "total"]
+    totals = {name: summary[ALL]["seconds"]["total"] or 0.0 for name, summary in summaries.items()}
+    slowest = max(totals.values(), default=0.0)
+    rows = {}
+    for name, summary in summaries.items():
+        known = summary[ALL]["seconds"]
+        cells = [Cell(DASH if known[stage] is None else f"{known[stage]:.3f}") for stage in stages]
+        whole = sum(known[stage] or 0.0 for stage in STAGES)
+        width = 100 * totals[name] / slowest / whole if slowest and whole else 0.0
+        rows[name] = [*cells[:-1], dataclasses.replace(cells[-1], shares=[width * (known[s] or 0.0) for s in STAGES])]
+    failed = [
+        f"{name}: {reason} ({count})"
+        for name, summary in summaries.items()
+        for reason, count in summary[ALL]["reasons"].items()
+    ]
+    note = ("Pairs that failed: " + "; ".join(failed) + ".") if failed else ""
+    return Table("Seconds a pair, median", ["run", *stages], rows, note, stages=True)
+
+
+def shared_keys(runs: Mapping[str, pa.Table]) -> list[int]:
+    """The pairs that all runs hold, in the order of the first."""
+    tables = list(runs.values())
+    shared = set.intersection(*(set(table["key"].to_pylist()) for table in tables))
+    return [key for key in tables[0]["key"].to_pylist() if key in shared]
+
+
+def common(runs: Mapping[str, pa.Table], column: str) -> list[NDArray[np.float64]]:
+    """A column of each run, of the pairs that all hold."""
+    keys = shared_keys(runs)
+    found = []
+    for table in runs.values():
+        values = dict(zip(table["key"].to_pylist(), table[column].to_pylist(), strict=True))
+        found.append(np.array([values[key] for key in keys], np.float64))
+    return found
+
+
+def _ahead(a: NDArray[np.float64], b: NDArray[np.float64], scenes: Sequence[str]) -> list[tuple[str, Interval | None]]:
+    """Differences of recall at both thresholds and of AUC@0.05, with intervals, of NSGD of the same pairs."""
+    if not len(a):
+        return [(DASH, None)] * 3
+    intervals = [share_difference(a < t, b < t, scenes) for t in (THRESHOLD, FINE_THRESHOLD)]
+    parts = areas(a), areas(b)
+    area = mean_difference(*parts, scenes)
+    texts = [(_signed(i), i) for i in intervals]
+    few = f"{PERCENT * float((parts[0] - parts[1]).mean()):+.1f} (n too small)"
+    return [*texts, (few, None) if area is None else (_signed(area), area)]
+
+
+def _signed(i: Interval) -> str:
+    return f"{100 * i.value:+.1f} [{100 * i.low:+.1f}, {100 * i.high:+.1f}]"
+
+
+def _share(group: Mapping[str, Any]) -> Bar | None:
+    if group["recall"] is None:
+        return None
+    low, high = group["recall_interval"]
+    return Bar(100 * low, 100 * group["recall"], 100 * high)
+
+
+def _around_zero(i: Interval | None, widest: float) -> Bar | None:
+    if i is None:
+        return None
+    low, value, high = (50 + 50 * end / widest for end in (i.low, i.value, i.high))
+    return Bar(low, value, high, zero=50.0)
+
+
+def _best(values: Mapping[str, float | None]) -> set[str]:
+    """Whose is the largest; nobody's of a single value."""
+    known = [value for value in values.values() if value is not None]
+    return {name for name, value in values.items() if value == max(known)} if len(known) > 1 else set()
