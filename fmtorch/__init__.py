@@ -1,9 +1,62 @@
 """fmtorch: batched, differentiable two-view geometry in PyTorch."""
 
+import importlib
+import importlib.util
+import sys
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from fmtorch.fundamental import find_fundamental
+    from fmtorch.photographs import MatchResult, match
+    from fmtorch.pipeline import Pipeline
+    from fmtorch.types import Correspondences, Estimate, Features
+
 __version__ = "0.1.0"
 
-from fmtorch.fundamental import find_fundamental
-from fmtorch.photographs import MatchResult, match
-from fmtorch.types import Correspondences, Estimate, Features
+__all__ = [
+    "Correspondences",
+    "Estimate",
+    "Features",
+    "MatchResult",
+    "Pipeline",
+    "__version__",
+    "find_fundamental",
+    "match",
+]
 
-__all__ = ["Correspondences", "Estimate", "Features", "MatchResult", "__version__", "find_fundamental", "match"]
+_MODULES = {
+    "Correspondences": "types", "Estimate": "types", "Features": "types", "MatchResult": "photographs",
+    "Pipeline": "pipeline", "find_fundamental": "fundamental", "match": "photographs",
+}  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    """Public names and submodules, imported at their first use: `fmtorch --help` need not wait for torch."""
+    if name in _MODULES:
+        value = getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+    elif not name.startswith("_") and importlib.util.find_spec(f"{__name__}.{name}") is not None:
+        value = importlib.import_module(f"{__name__}.{name}")
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+class _Package(ModuleType):
+    """The package, in which `match` is the function.
+
+    Python makes each submodule that is imported an attribute of its package, `fmtorch.match` too, which runs the
+    command of that name; it stays ``sys.modules["fmtorch.match"]`` alone.
+    """
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not (name == "match" and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import PurePosixPath
 
-from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra._internal.core_plugins import file_config_source
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult
@@ -17,8 +17,12 @@ from hydra.plugins.config_source import ConfigResult
 SEVERAL = ("pruner",)  # groups of which several presets are chosen at once
 
 
-class NamedPresets(FileConfigSource):
-    """Hydra's reader of config folders, which gives presets of such groups the package of their name."""
+class FileConfigSource(file_config_source.FileConfigSource):
+    """Hydra's reader of config folders, which gives presets of such groups the package of their name.
+
+    It has the name of the reader that it replaces: a launcher's processes register Hydra's own once more, which Hydra
+    skips where one of the same name is there and refuses where it is of another.
+    """
 
     def load_config(self, config_path: str) -> ConfigResult:
         """A file and its header."""
@@ -31,6 +35,6 @@ class NamedPresets(FileConfigSource):
 
 
 def register() -> None:
-    """Have Hydra read folders by `NamedPresets`; once is enough for a process."""
+    """Have Hydra read folders by this reader; once is enough for a process."""
     Plugins.instance()  # registers Hydra's own readers, of which this replaces one
-    SourcesRegistry.instance().types[FileConfigSource.scheme()] = NamedPresets
+    SourcesRegistry.instance().types[FileConfigSource.scheme()] = FileConfigSource

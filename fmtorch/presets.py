@@ -6,9 +6,8 @@ With the commands this is the only user of Hydra and OmegaConf.
 from __future__ import annotations
 
 import functools
-import inspect
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,8 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
-from fmtorch import hydra_source
+from fmtorch import data, hydra_source
+from fmtorch.options import expect_options, nearest
 from fmtorch.pipeline import Pipeline
 from fmtorch.resources import conf_dir
 from fmtorch.storage.features import cached
@@ -48,7 +48,7 @@ def load(group: str, name: str, config_dir: Path | str | None = None) -> dict[st
             if not isinstance(values, dict):
                 raise ValueError(f"{path}: a preset is a mapping with a `_target_`, the dotted name of what it builds")
             return {str(key): value for key, value in values.items()}
-    raise ValueError(f"no preset {name!r} in conf/{group}; there are: {', '.join(available(group, config_dir))}")
+    raise ValueError(f"no preset {name!r} in conf/{group}; there are: {nearest(name, available(group, config_dir))}")
 
 
 @functools.cache
@@ -112,34 +112,66 @@ def _merged(config: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, 
     return {**config, **changes}
 
 
+def plain(config: Any) -> dict[str, Any]:
+    """A part of a config as a dictionary without interpolations; empty for null."""
+    container = OmegaConf.to_container(config, resolve=True) if isinstance(config, DictConfig) else {}
+    assert isinstance(container, dict)
+    return {str(key): value for key, value in container.items()}
+
+
 def instantiate(config: Mapping[str, Any] | DictConfig, where: str, **extra: Any) -> Any:
     """The object of a config with a `_target_`; `where` names the config in errors, `extra` arguments are added.
 
     A value that is a mapping with a `_target_` of its own becomes an object first.
-    Raises ValueError for an unknown option, naming those that exist; what the target itself raises passes through.
+    Raises ValueError where `expect_buildable` does; what the target itself raises passes through.
     """
-    values = OmegaConf.to_container(config, resolve=True) if isinstance(config, DictConfig) else config
-    values = dict(values) if isinstance(values, Mapping) else values
-    if not isinstance(values, dict) or "_target_" not in values:
+    values = plain(config) if isinstance(config, DictConfig) else config
+    expect_buildable(values, where, extra)
+    return _instantiated(values, where, extra)
+
+
+def expect_buildable(config: Mapping[str, Any], where: str, given: Iterable[str] = ()) -> None:
+    """Raises ValueError, naming the option, where a config, or one within it, does not fit its target's signature."""
+    if not isinstance(config, Mapping) or "_target_" not in config:
         raise ValueError(f"{where}: a preset is a mapping with a `_target_`, the dotted name of what it builds")
-    target = hydra.utils.get_object(str(values.pop("_target_")))
-    known = inspect.signature(target).parameters
-    takes_any = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in known.values())
-    unknown = [str(key) for key in values if key not in known]
-    if unknown and not takes_any:
-        raise ValueError(f"{where}: no option {', '.join(unknown)}; there are: {', '.join(known)}")
+    values = {str(key): value for key, value in config.items() if key != "_target_"}
+    expect_options(_target(config, where), values, where, given)
+    for key, value in values.items():
+        if _is_object(value):
+            expect_buildable(value, f"{where}.{key}")
+
+
+def _is_object(value: object) -> bool:
+    return isinstance(value, Mapping) and "_target_" in value
+
+
+def _target(config: Mapping[str, Any], where: str) -> Callable[..., Any]:
+    name = str(config["_target_"])
+    try:
+        target: Callable[..., Any] = hydra.utils.get_object(name)
+    except (ImportError, ValueError) as error:
+        cause = " ".join(str(error.__cause__ or error).split())
+        raise ValueError(f"{where}: _target_={name} cannot be imported: {cause}") from error
+    return target
+
+
+def _instantiated(config: Mapping[str, Any], where: str, extra: Mapping[str, Any]) -> Any:
     built = {
-        str(key): instantiate(value, f"{where}.{key!s}") if isinstance(value, dict) and "_target_" in value else value
-        for key, value in values.items()
+        str(key): _instantiated(value, f"{where}.{key}", {}) if _is_object(value) else value
+        for key, value in config.items()
+        if key != "_target_"
     }
-    return target(**built, **extra)
+    return _target(config, where)(**built, **extra)
 
 
 def resolve_device(name: str) -> torch.device:
     """The torch device of a config: `auto` takes a GPU where there is one. Raises ValueError where it is not there."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    device = torch.device(name)
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise ValueError(f"device={name}; it must be auto, cpu, cuda, cuda:1 or mps") from error
     if device.type == "cuda" and not torch.cuda.is_available():
         raise ValueError(f"device={name}: this installation of torch sees no CUDA device; use device=cpu")
     return device
@@ -171,6 +203,14 @@ def composed(stages: Mapping[str, Any]) -> dict[str, Any]:
     return {**stages, "pruner": {name: value for entry in pruners for name, value in entry.items()}}
 
 
+def top_level_names(config_name: str) -> list[str]:
+    """What the command of this config takes by name: its fields and the groups it chooses from."""
+    fields = OmegaConf.load(conf_dir() / f"{config_name}.yaml")
+    assert isinstance(fields, DictConfig)
+    groups = [str(group) for entry in fields.get("defaults", []) if entry != "_self_" for group in entry]
+    return [name for name in (*map(str, fields), *groups) if name not in ("defaults", "hydra") and " " not in name]
+
+
 def _pruners(config: DictConfig) -> dict[str, Any]:
     """The pruners' configs by name, in the order in which they run."""
     if not config.get("pruner"):
@@ -185,10 +225,28 @@ def _pruners(config: DictConfig) -> dict[str, Any]:
     return {str(name): value for name, value in plain.items()}
 
 
+def expect_stages(config: DictConfig) -> None:
+    """Raises ValueError, naming the option, where a stage of a composed config cannot be built with its options."""
+    for group in STAGES:
+        if group != "pruner" and group in config:  # a training has no estimator
+            expect_buildable(plain(config[group]), group)
+    for name, value in _pruners(config).items():
+        expect_buildable(value, f"pruner.{name}")
+
+
+def expect_dataset(config: DictConfig) -> None:
+    """Raises ValueError, naming the option, where a data set cannot be loaded with the options of its config."""
+    options = plain(config)
+    if "_target_" in options:
+        expect_buildable(options, "dataset")
+    else:
+        data.expect_loadable(**options)
+
+
 def build_pipeline(config: DictConfig, device: torch.device | str = "cpu") -> Pipeline:
     """The pipeline that features (with cache), matcher, pruner and estimator of a composed config describe."""
     extractor = cached(instantiate(config.features, "features"), config.cache, config.cache_limit)
-    pruners = {name: instantiate(value, f"pruner={name}") for name, value in _pruners(config).items()}
+    pruners = {name: instantiate(value, f"pruner.{name}") for name, value in _pruners(config).items()}
     return Pipeline(
         extractor,
         instantiate(config.matcher, "matcher"),
@@ -223,7 +281,7 @@ def pipeline(
         raise ValueError(f"config_dir={config_dir} is no folder")
     known = available("pipeline", config_dir)
     if name not in known:
-        raise ValueError(f"no preset {name!r} in conf/pipeline; there are: {', '.join(known)}")
+        raise ValueError(f"no preset {name!r} in conf/pipeline; there are: {nearest(name, known)}")
     words = (f"pipeline={name}", "cache=off", *overrides)
     try:
         config = _compose("match", words) if config_dir is None else _composed("match", words, Path(config_dir))

@@ -25,7 +25,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 
-from fmtorch.command import console, exits_with_message
+from fmtorch.terminal import console, exits_with_message
 
 DEFAULTS = {"weights": None, "sha256": None, "folder": "weights", "url": None, "timeout": 60}
 AFFNET = "https://raw.githubusercontent.com/ducha-aiki/affnet/da7cf51ba09cb92e3cf0f46c12a89881f79e5051"

@@ -175,9 +175,9 @@ def test_mistakes_in_a_users_own_pruner_are_told(root: Path, tmp_path: Path) -> 
     (own / "elsewhere.yaml").write_text("# @package _global_\npruner: {_target_: fmtorch.pruning.OneToOne}\n")
     (own / "typo.yaml").write_text("_target_: fmtorch.pruning.RatioTest\nthreshhold: 0.5\n")
     told = {
-        "pruner=empty": "pruner=empty: a preset is a mapping with a `_target_`",
+        "pruner=empty": "pruner.empty: a preset is a mapping with a `_target_`",
         "pruner=elsewhere": "must be `# @package pruner.<name>`, or be left out",
-        "pruner=typo": "pruner=typo: no option threshhold; there are: threshold",
+        "pruner=typo": "pruner.typo: no option threshhold; there are: threshold",
         "pruner=lc pruner.lc.file=runs/absent": "absent.safetensors does not exist: python -m fmtorch.train pruner=lc",
     }
     for options, message in told.items():

@@ -221,19 +221,6 @@ def test_overrides_and_a_callers_own_hydra() -> None:
         presets.pipeline("sift_gms", overrides=["pruner.gms.angle=1"])
 
 
-@pytest.mark.parametrize(
-    "code",
-    [
-        "import fmtorch; f = fmtorch.match; import fmtorch.match; assert fmtorch.match is f",
-        "import importlib; f = importlib.import_module('fmtorch.match'); from fmtorch import match; assert match is f",
-    ],
-)
-def test_the_name_is_the_function_in_every_order_of_imports(code: str) -> None:
-    check = f"{code}\nimport inspect, fmtorch\nassert inspect.isfunction(fmtorch.match)"
-    done = run_python("-c", check, cwd=Path.cwd())
-    assert done.returncode == 0, done.stderr
-
-
 def run_python(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     source = str(Path(__file__).resolve().parents[1])
     own = {"COLUMNS": "200", "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1", "FMTORCH_CACHE": f"{cwd}/cache"}

@@ -15,7 +15,8 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from fmtorch import presets, report
+from fmtorch import presets
+from fmtorch.commands import report
 from fmtorch.data import read_image
 from fmtorch.evaluation.gallery import Options, Run, rebuilt, shown_pair
 from fmtorch.evaluation.page import Section, differing_pairs, render

@@ -15,6 +15,7 @@ from torch import Tensor
 from fmtorch.data.fmbench import DataError, FMBenchPairs
 from fmtorch.data.images import ImageError, read_image, to_grey
 from fmtorch.data.pairs import DepthDataset, ImagePair, ImageSource, PairDataset
+from fmtorch.options import expect_options
 
 __all__ = [
     "DataError",
@@ -26,6 +27,7 @@ __all__ = [
     "PairBatch",
     "PairDataset",
     "collate",
+    "expect_loadable",
     "load",
     "read_image",
     "to_grey",
@@ -53,8 +55,7 @@ def load(
     generated set is drawn for the first time. options: the data set's own.
     Raises DataError (a ValueError) for an unknown name or for data that cannot be used.
     """
-    if name not in _CLASSES:
-        raise DataError(f"no data set {name!r}; there are {', '.join(_CLASSES)}")
+    expect_loadable(name, split=split, root=root, **options)
     if root is not None:
         options["root"] = root
     elif name == "fmbench":
@@ -63,8 +64,22 @@ def load(
         options["split"] = split
     if name in _GENERATED and progress is not None:
         options["progress"] = progress
+    return _class(name)(**options)
+
+
+def expect_loadable(name: str, **options: Any) -> None:
+    """Raises ValueError where there is no such data set, or it does not take these options of `load`."""
+    if name not in _CLASSES:
+        raise DataError(f"no data set {name!r}; there are {', '.join(_CLASSES)}")
+    if name in _WITHOUT_SPLIT:
+        options.pop("split", None)
+    given = {key: value for key, value in options.items() if not (key == "root" and value is None)}
+    expect_options(_class(name), given, "dataset", given=("root",))
+
+
+def _class(name: str) -> Callable[..., PairDataset]:
     module, cls = _CLASSES[name]
-    return cast(PairDataset, getattr(importlib.import_module(module), cls)(**options))
+    return cast(Callable[..., PairDataset], getattr(importlib.import_module(module), cls))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -13,9 +13,9 @@ from typing import Any
 from omegaconf import DictConfig
 
 from fmtorch import presets
-from fmtorch.command import plain
 from fmtorch.estimators.adapters import PEERS
 from fmtorch.pipeline import Pipeline
+from fmtorch.presets import plain
 from fmtorch.storage.code import code_digest, fmtorch_version
 from fmtorch.storage.configuration import file_digest, learned, libraries
 from fmtorch.storage.features import CachedFeatures

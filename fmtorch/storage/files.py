@@ -14,16 +14,28 @@ def replacing(path: Path) -> Iterator[Path]:
     """A temporary name beside `path` to write to; on leaving it becomes `path`, after an error it is removed.
 
     A process that dies in between leaves at most a file that ends in ``.tmp``. Safe with several writers: each has a
-    name of its own, and the last one to leave wins.
+    name of its own, and the last one to leave wins. An OSError within, such as of a full disk, names `path`.
     """
     temporary = temporary_name(path)
     try:
-        yield temporary
-        sync(temporary)
-        os.replace(temporary, path)
-        sync(path.parent)
+        with naming(path, temporary):
+            yield temporary
+            sync(temporary)
+            os.replace(temporary, path)
+            sync(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
+    """Within it an OSError that names no file, or the temporary one for it, names `path`: what a full disk says."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is None or error.filename not in (None, temporary, str(temporary)):
+            raise
+        raise OSError(error.errno, error.strerror or os.strerror(error.errno), str(path)) from error
 
 
 def temporary_name(path: Path) -> Path:

@@ -23,7 +23,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fmtorch.storage.files import replacing, sync, temporary_name
+from fmtorch.storage.files import naming, replacing, sync, temporary_name
 from fmtorch.storage.rows import PAIR_SCHEMA, PairRow, to_table
 
 FORMAT = 2  # of the folder; to be raised when the schema changes, or what the identity tells
@@ -174,8 +174,9 @@ def _claim(file: Path, config: dict[str, Any]) -> None:
     temporary = temporary_name(file)
     stored = {"format": FORMAT, "identity": identity_digest(config), "config": config}
     try:
-        temporary.write_text(json.dumps(stored, indent=2) + "\n", encoding="utf-8")
-        sync(temporary)
+        with naming(file, temporary):
+            temporary.write_text(json.dumps(stored, indent=2) + "\n", encoding="utf-8")
+            sync(temporary)
         try:
             os.link(temporary, file)  # unlike a rename it fails where the name is taken
         except FileExistsError:

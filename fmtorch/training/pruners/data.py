@@ -12,14 +12,15 @@ from omegaconf import DictConfig
 from rich.progress import Progress
 
 from fmtorch import data, presets
-from fmtorch.command import plain, reporter
 from fmtorch.data import ImagePair, PairDataset
 from fmtorch.data.subset import subset
 from fmtorch.evaluation.run import select
 from fmtorch.matched import Augmentation, LabelledMatches, MatchedPairs, StoredMatches
 from fmtorch.matched.transforms import keep_ratio
 from fmtorch.pipeline import Pipeline
+from fmtorch.presets import plain
 from fmtorch.storage.features import cached
+from fmtorch.terminal import reporter
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

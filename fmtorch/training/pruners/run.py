@@ -7,14 +7,19 @@ import os
 import platform
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from lightning import Trainer
 from omegaconf import DictConfig
 
 from fmtorch import __version__, presets
-from fmtorch.command import console, plain, progress_bars
+from fmtorch.fields import Cache, Count, Gigabytes, Seed, read_fields
+from fmtorch.matched import Augmentation
+from fmtorch.options import Within, expect_options
+from fmtorch.presets import plain
 from fmtorch.storage.runs import identity_digest
+from fmtorch.terminal import console, progress_bars
 from fmtorch.training.pruners.batches import training_batches
 from fmtorch.training.pruners.data import labelled_matches
 from fmtorch.training.pruners.loop import claim, train
@@ -27,16 +32,55 @@ from fmtorch.training.pruners.validation import Use, Validation
 PICTURES = 4  # validation pairs that are drawn into the log
 
 
+@dataclasses.dataclass(frozen=True)
+class ValidationFields:
+    """What ``validation`` of the command's config holds; ``conf/train.yaml`` says what each is."""
+
+    every: Count = 250
+    scenes: Count = 4
+    roots: list[str] = dataclasses.field(default_factory=list)
+    pairs: Count = 25
+    ratio: float = 0.8
+    uses: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    monitor: str = "log_loss"
+    patience: Count | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Fields:
+    """What the command takes at the top level, beside what it chooses; ``conf/train.yaml`` says what each is."""
+
+    before: list[str] = dataclasses.field(default_factory=list)
+    limit: Count | None = None
+    seed: Seed = 0
+    output: Path | None = None
+    cache: Cache = None
+    cache_limit: Gigabytes | None = 20
+    workers: Count | None = None
+    loaders: Annotated[int, Within(0)] = 0
+    threads: Count | None = None
+    batch: Count = 32
+    checkpoint_every: Count = 100
+
+
+PARTS = {"optimisation": Optimisation, "objective": Objective, "augmentation": Augmentation, "trainer": Trainer}
+
+
 def run(config: DictConfig, name: str) -> Path:
     """Train what a composed config describes and return the folder of the result.
 
     Started again, it goes on from the last checkpoint; a finished training only writes its files anew.
     name: of the pruner's preset, e.g. ``lc``. Raises ValueError for options that cannot be.
     """
+    read_fields(Fields, config)
+    read_fields(ValidationFields, config.validation, "validation")
+    for group, part in PARTS.items():
+        expect_options(part, plain(config[group]), group)
+    presets.expect_dataset(config.dataset)
+    presets.expect_stages(config)
     network_config = network_of(config, name)
     optimisation, objective = Optimisation(**plain(config.optimisation)), Objective(**plain(config.objective))
     uses = {key: use_of(key, value) for key, value in plain(config.validation.uses).items()}
-    expect_positive(config)
     with progress_bars() as progress:
         matches = labelled_matches(config, progress)
     identity = {
@@ -105,15 +149,3 @@ def use_of(name: str, options: Mapping[str, Any]) -> Use:
     if unknown or "estimator" not in options:
         raise ValueError(f"validation.uses.{name}: it has `estimator` and may have `threshold`, no {unknown}")
     return Use(presets.build("estimator", str(options["estimator"])), options.get("threshold"))
-
-
-def expect_positive(config: DictConfig) -> None:
-    """Raises ValueError for counts of the config that are not whole numbers of at least one."""
-    counts = {
-        "batch": config.batch, "checkpoint_every": config.checkpoint_every,
-        "validation.every": config.validation.every, "validation.pairs": config.validation.pairs,
-        "validation.scenes": config.validation.scenes, "limit": config.limit,
-    }  # fmt: skip
-    for name, value in counts.items():
-        if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
-            raise ValueError(f"{name}={value}; it must be a whole number of at least 1")

@@ -1,13 +1,11 @@
-"""What the commands share: the console, plain parts of a config, and how errors end a command."""
+"""What the commands share: the console, progress bars, and how errors end a command."""
 
 from __future__ import annotations
 
 import contextlib
 import sys
 from collections.abc import Callable, Iterator
-from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -20,13 +18,7 @@ from rich.progress import (
 )
 
 console = Console()
-
-
-def plain(config: Any) -> dict[str, Any]:
-    """A part of a config as a dictionary without interpolations; empty for null."""
-    container = OmegaConf.to_container(config, resolve=True) if isinstance(config, DictConfig) else {}
-    assert isinstance(container, dict)
-    return {str(key): value for key, value in container.items()}
+MISTAKES = (ValueError, OSError, ImportError)  # what a user can put right
 
 
 def progress_bars() -> Progress:
@@ -53,6 +45,15 @@ def reporter(progress: Progress, description: str) -> Callable[[int, int], None]
     return report
 
 
+def told(error: BaseException) -> str:
+    """An error in one line, with the path that an OSError is about."""
+    text = str(error)
+    if isinstance(error, OSError) and error.strerror and error.errno is not None:
+        paths = [str(path) for path in (error.filename, error.filename2) if path is not None]
+        text = f"{' -> '.join(paths)}: {error.strerror}" if paths else error.strerror
+    return " ".join(text.split())
+
+
 @contextlib.contextmanager
 def exits_with_message(interrupted: str = "interrupted") -> Iterator[None]:
     """Ends the process with status 1 and one line for what a user can put right, rather than with a traceback."""
@@ -60,5 +61,5 @@ def exits_with_message(interrupted: str = "interrupted") -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         sys.exit(interrupted)
-    except (ValueError, OSError, ImportError) as error:
-        sys.exit(f"error: {error}")
+    except MISTAKES as error:
+        sys.exit(f"error: {told(error)}")

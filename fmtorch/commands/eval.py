@@ -1,0 +1,112 @@
+"""`python -m fmtorch.eval pipeline=sift_ratio`: run a pipeline over a data set of image pairs and evaluate it."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import os
+from pathlib import Path
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+from rich.progress import Progress
+
+from fmtorch import data, presets
+from fmtorch.commands.main import job, run_command
+from fmtorch.data import PairDataset
+from fmtorch.evaluation.identity import run_identity
+from fmtorch.evaluation.plots import plot_recall_curves
+from fmtorch.evaluation.run import evaluate_pairs, select
+from fmtorch.evaluation.summary import ALL, summarize, summary_markdown, summary_table
+from fmtorch.fields import Cache, Count, Device, Gigabytes, Seed, path_fields, read_fields
+from fmtorch.presets import plain
+from fmtorch.storage import RunFolder, identity_digest
+from fmtorch.storage.features import CachedFeatures
+from fmtorch.terminal import console, progress_bars, reporter
+
+MANY = 500  # pairs from which on processes are worth their start
+MOST_PROCESSES = 8  # unless more are asked for: each holds the networks of the pipeline and some 0.5 GB
+
+
+@dataclasses.dataclass(frozen=True)
+class Fields:
+    """What the command takes beside stages and the data set; ``conf/eval.yaml`` says what each is."""
+
+    limit: Count | None = None
+    seed: Seed = 0
+    device: Device = "auto"
+    batch: Count = 16
+    workers: Count | None = None
+    processes: bool | None = None
+    run_dir: Path | None = None
+    cache: Cache = None
+    cache_limit: Gigabytes | None = 20
+
+
+def run(config: DictConfig, pipeline_name: str) -> Path:
+    """Evaluate one composed config and return the run folder.
+
+    Raises ValueError, before anything is computed or written, where an option is not what it may be.
+    """
+    fields = read_fields(Fields, config)
+    device = presets.resolve_device(fields.device)
+    presets.expect_dataset(config.dataset)
+    presets.expect_stages(config)
+    with progress_bars() as progress:
+        pipeline = presets.build_pipeline(config, device)
+        dataset = _load(config.dataset, progress)
+        identity = run_identity(config, pipeline_name, pipeline, dataset.digest)
+        name = f"{pipeline_name}-{identity_digest(identity)[:8]}"
+        folder = RunFolder.open(fields.run_dir or Path(f"runs/{dataset.name}/{name}"), identity)
+        chosen = select([dataset[i] for i in range(len(dataset))], fields.limit)
+        done = folder.done()
+        todo = [pair for pair in chosen if pair.key not in done]
+        processes = len(todo) >= MANY if fields.processes is None else fields.processes
+        processes = processes and device.type == "cpu"
+        cores = os.cpu_count() or 1
+        workers = fields.workers or (1 if device.type != "cpu" else min(cores, MOST_PROCESSES) if processes else cores)
+        bar = progress.add_task(pipeline_name, total=len(chosen), completed=len(chosen) - len(todo))
+        build = functools.partial(presets.build_pipeline, config, device) if processes and workers > 1 else None
+        for count in evaluate_pairs(
+            pipeline, todo, seed=fields.seed, batch=fields.batch, workers=workers, store=folder.append, build=build
+        ):
+            progress.advance(bar, count)
+    if len(todo) < len(chosen):
+        taken = f"{len(chosen) - len(todo)} of {len(chosen)} pairs taken from an earlier run in {folder.path}"
+        console.print(taken, markup=False, highlight=False)
+    keys = {pair.key for pair in chosen}
+    table = folder.read(keys)
+    summary = summarize(table)
+    folder.write_summary(summary, summary_markdown(summary, title=f"{pipeline_name} on {dataset.name}"))
+    plot_recall_curves({pipeline_name: table}, folder.path / "recall.png")
+    console.print(summary_table(summary, title=f"{pipeline_name} on {dataset.name}"))
+    console.print(f"[dim]{folder.path}: pairs/, summary.json, summary.md, recall.png[/dim]")
+    if isinstance(pipeline.extractor, CachedFeatures):
+        console.print(f"[dim]{pipeline.extractor.report()}[/dim]")
+    if chosen and summary[ALL]["failures"] == len(chosen):
+        reason = next(iter(table["reason"].to_pylist()))
+        raise ValueError(
+            f"every pair failed, the first because: {reason}. Once that is mended, delete {folder.path} to run again"
+        )
+    return folder.path
+
+
+def _load(config: DictConfig, progress: Progress) -> PairDataset:
+    """The data set of a config; the embedded one is drawn on first use, which the progress bar shows."""
+    options = plain(config)
+    if "_target_" in options:  # somebody's own data set
+        dataset: PairDataset = presets.instantiate(options, "dataset")
+        return dataset
+    return data.load(**options, progress=reporter(progress, "drawing scenes"))
+
+
+@job
+def task(config: DictConfig) -> None:
+    """What Hydra runs."""
+    run(config, str(HydraConfig.get().runtime.choices["pipeline"]))
+
+
+def main() -> None:
+    """The command."""
+    paths = [*path_fields(Fields), "dataset.root"]
+    run_command("eval", task, paths=paths, interrupted="interrupted; the same command continues the run")

@@ -1,0 +1,172 @@
+"""`python -m fmtorch.match image0=a.jpg image1=b.jpg`: the fundamental matrix of two photographs, with pictures."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from hydra.core.hydra_config import HydraConfig
+from numpy.typing import NDArray
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.table import Table
+
+from fmtorch import __version__, presets
+from fmtorch.commands.main import job, run_command
+from fmtorch.data import read_image
+from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_matches
+from fmtorch.fields import Cache, Count, Device, Gigabytes, Seed, path_fields, read_fields
+from fmtorch.metrics import nsgd
+from fmtorch.photographs import Image, MatchResult, match
+from fmtorch.storage.features import CachedFeatures
+from fmtorch.storage.files import replacing
+from fmtorch.terminal import console
+
+
+@dataclasses.dataclass(frozen=True)
+class Fields:
+    """What the command takes beside stages; ``conf/match.yaml`` says what each is."""
+
+    image0: Path | None = None
+    image1: Path | None = None
+    truth: Path | None = None
+    output: Path | None = None
+    orient: bool = True
+    longest_side: Count = 1600
+    seed: Seed = 0
+    device: Device = "auto"
+    cache: Cache = None
+    cache_limit: Gigabytes | None = 20
+
+
+def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -> Path:
+    """Match the two photographs of a composed config and return the folder with the results.
+
+    overrides: what the command line changed of the pipeline of that name; said beside it.
+    """
+    fields = read_fields(Fields, config)
+    paths = [_given(fields.image0, "image0"), _given(fields.image1, "image1")]
+    presets.expect_stages(config)
+    truth = None if fields.truth is None else read_matrix(fields.truth)
+    image0, image1 = (read_image(path, orient=fields.orient) for path in paths)
+    pipeline = presets.build_pipeline(config, presets.resolve_device(fields.device))
+    result = match(image0, image1, pipeline=pipeline, longest_side=fields.longest_side, seed=fields.seed)
+    report = {
+        "version": __version__, "pipeline": pipeline_name, "overrides": list(overrides), "seed": fields.seed,
+        "image0": str(paths[0]), "image1": str(paths[1]),
+        **_report(result, image0, image1, truth),
+    }  # fmt: skip
+    folder = fields.output or Path(f"matches/{paths[0].stem}-{paths[1].stem}")
+    folder.mkdir(parents=True, exist_ok=True)
+    with replacing(folder / "result.json") as path:
+        path.write_text(json.dumps(report) + "\n")
+    written = ["result.json", *_draw(folder, result, image0, image1, truth)]
+    heading = f"{' '.join([pipeline_name, *overrides])}: {paths[0].name}, {paths[1].name}"
+    console.print(heading, style="italic", markup=False, highlight=False)
+    console.print(_table(result))
+    if "nsgd" in report:
+        console.print(f"NSGD to the true F: {report['nsgd']:.4f}", highlight=False)
+    for trouble in filter(None, (f"no F: {result.reason}" if result.reason else "", result.warning)):
+        Console(stderr=True).print(f"[bold]{trouble}[/bold]", highlight=False)
+    console.print(f"[dim]{folder}: {', '.join(written)}[/dim]", highlight=False)
+    if isinstance(pipeline.extractor, CachedFeatures):
+        console.print(f"[dim]{pipeline.extractor.report()}[/dim]", highlight=False)
+    return folder
+
+
+def read_matrix(path: Path) -> NDArray[np.float64]:
+    """The 3 x 3 matrix of a text file of nine numbers, row by row, apart by spaces, commas or new lines.
+
+    Raises ValueError for a file of anything else.
+    """
+    words = path.read_text().replace(",", " ").split()
+    try:
+        numbers = np.array([float(word) for word in words])
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}; it must hold nine numbers, F row by row") from error
+    if numbers.shape != (9,) or not np.isfinite(numbers).all() or not numbers.any():
+        raise ValueError(f"{path}: holds {len(words)} numbers; it must hold nine finite ones, F row by row")
+    return numbers.reshape(3, 3)
+
+
+def _given(path: Path | None, name: str) -> Path:
+    if path is None:
+        raise ValueError(f"{name} is missing; give two image files: fmtorch match a.jpg b.jpg")
+    return path
+
+
+def _report(result: MatchResult, image0: Image, image1: Image, truth: NDArray[np.float64] | None) -> dict[str, Any]:
+    """What result.json holds of a result; points in pixels of the images."""
+    c = result.correspondences
+    report: dict[str, Any] = {
+        "size0": image0.shape[:2], "size1": image1.shape[:2],
+        "F": result.F.tolist() if result.ok else None, "reason": result.reason, "warning": result.warning,
+        "features": [len(result.keypoints0), len(result.keypoints1)],
+        "matches": result.counts, "seconds": result.seconds,
+        "x0": c.x0[0].tolist(), "x1": c.x1[0].tolist(), "inliers": result.inliers.tolist(),
+        "ratio": None if c.quality is None else c.quality[0].tolist(),
+    }  # fmt: skip
+    if truth is not None and result.ok:
+        sizes = (torch.tensor([image.shape[:2]]) for image in (image0, image1))
+        report["nsgd"] = float(nsgd(torch.from_numpy(truth)[None], result.F.cpu()[None], *sizes)[0])
+    return report
+
+
+def _draw(
+    folder: Path, result: MatchResult, image0: Image, image1: Image, truth: NDArray[np.float64] | None
+) -> list[str]:
+    """Draw the pictures into the folder; the names of those there are."""
+    x0, x1 = (x[0].cpu().numpy().astype(np.float64) for x in (result.putative.x0, result.putative.x1))
+    kept = result.kept.cpu().numpy()
+    good = kept.copy()
+    if result.ok:
+        good[good] = result.inliers.cpu().numpy()
+    names = (
+        ("inliers of F", "others, dropped by pruning or estimation") if result.ok else ("kept", "dropped by pruning")
+    )
+    pictures = {"matches.png": draw_matches(image0, image1, x0, x1, good, names=names)}
+    pruners = [step for step in result.counts if step not in ("matching", "estimation")]
+    if pruners:
+        names = (f"kept by pruning ({', '.join(pruners)})", "dropped")
+        pictures["pruning.png"] = draw_matches(image0, image1, x0, x1, kept, names=names)
+    F = result.F.cpu().numpy() if result.ok else truth
+    if F is not None:
+        dashed = truth if result.ok else None
+        pictures["epipolar.png"] = draw_epipolar_lines(image0, image1, x0[good], x1[good], F, truth=dashed)
+    for name, picture in pictures.items():
+        with replacing(folder / name) as path:
+            path.write_bytes(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
+    for name in {"pruning.png", "epipolar.png"} - pictures.keys():  # of an earlier run
+        (folder / name).unlink(missing_ok=True)
+    return list(pictures)
+
+
+def _table(result: MatchResult) -> Table:
+    table = Table()
+    table.add_column("step")
+    table.add_column("left", justify="right")
+    table.add_column("seconds", justify="right")
+    for step, seconds in result.seconds.items():
+        counts = [len(result.keypoints0), len(result.keypoints1)] if step == "features" else [result.counts[step]]
+        unit = {"features": "keypoints", "estimation": "inliers"}.get(step, "matches")
+        table.add_row(step, f"{' + '.join(f'{count:,}' for count in counts)} {unit}", f"{seconds:.3f}")
+    return table
+
+
+@job
+def task(config: DictConfig) -> None:
+    """What Hydra runs."""
+    hydra_config = HydraConfig.get()
+    changed = [o for o in hydra_config.overrides.task if o.lstrip("+~").startswith(presets.STAGES)]
+    run(config, str(hydra_config.runtime.choices["pipeline"]), changed)
+
+
+def main() -> None:
+    """The command."""
+    run_command("match", task, paths=path_fields(Fields), positional=("image0", "image1"))

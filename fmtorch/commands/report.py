@@ -1,0 +1,140 @@
+"""`python -m fmtorch.report runs=[runs]`: runs of `fmtorch.eval` side by side on one HTML page."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from omegaconf import DictConfig
+from rich.progress import track
+
+from fmtorch import presets
+from fmtorch.commands.main import job, run_command
+from fmtorch.evaluation.gallery import Options, Run, gallery
+from fmtorch.evaluation.names import run_names, shared_settings
+from fmtorch.evaluation.page import Section, render
+from fmtorch.evaluation.statistics import recalled
+from fmtorch.fields import Cache, Device, Gigabytes, path_fields, read_fields
+from fmtorch.options import Within
+from fmtorch.storage import RunFolder, RunFolderError
+from fmtorch.storage.files import replacing
+from fmtorch.terminal import console
+
+
+@dataclasses.dataclass(frozen=True)
+class Fields:
+    """What the command takes; ``conf/report.yaml`` says what each is."""
+
+    runs: str | list[str]
+    output: Path
+    title: str = "Fundamental matrices"
+    pictures: Annotated[int, Within(0)] = 6
+    order: str | None = None
+    root: str | list[str] | None = None
+    own_code: bool = False
+    device: Device = "auto"
+    cache: Cache = None
+    cache_limit: Gigabytes | None = 20
+
+
+def run(config: DictConfig) -> Path:
+    """Write the page of a composed config and return its path. Raises ValueError where there is no run."""
+    fields = read_fields(Fields, config)
+    paths = [Path(path) for path in ([fields.runs] if isinstance(fields.runs, str) else fields.runs)]
+    runs = named([RunFolder.load(path) for path in run_folders(paths)])
+    if _order(fields.order, paths) == "recall":
+        runs.sort(key=lambda r: -recalled(np.array(r.table["nsgd"].to_pylist())).mean())
+    roots = [fields.root] if isinstance(fields.root, str) else fields.root or []
+    options = Options(
+        fields.pictures, [Path(root) for root in roots], fields.own_code, presets.resolve_device(fields.device),
+        config.cache, fields.cache_limit,
+    )  # fmt: skip
+    sections, by_dataset = [], _by_dataset(runs)
+    for heading, group in by_dataset.items():
+        bar = functools.partial(track, description="drawing pairs", console=console, transient=True)
+        pairs, notes = gallery(group, options, bar)
+        sections.append(Section(heading, {r.name: r.table for r in group}, pairs, notes))
+    rows = [
+        [r.name, heading, r.folder.identity[:8], *(str(r.folder.config.get(k)) for k in ("version", "seed")),
+         str(r.folder.path)]
+        for heading, group in by_dataset.items() for r in group
+    ]  # fmt: skip
+    output = fields.output
+    output.parent.mkdir(parents=True, exist_ok=True)
+    page = render(str(config.title), sections, rows, shared_settings([r.folder.config for r in runs]))
+    with replacing(output) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+    for section in sections:
+        for note in section.notes:
+            console.print(f"{section.heading}: {note}", markup=False, highlight=False)
+    console.print(f"[dim]{output}: {len(runs)} runs, {output.stat().st_size / 2**20:.1f} MB[/dim]", highlight=False)
+    return output
+
+
+def run_folders(paths: Iterable[Path]) -> list[Path]:
+    """The run folders that the paths are or hold, at any depth. Raises RunFolderError for a path without any."""
+    found: dict[Path, None] = {}
+    for path in paths:
+        inside = [path] if (path / "run.json").exists() else sorted(file.parent for file in path.glob("**/run.json"))
+        if not inside:
+            raise RunFolderError(f"{path} holds no run; `python -m fmtorch.eval pipeline=NAME` makes one in runs/")
+        found |= dict.fromkeys(inside)
+    return list(found)
+
+
+def named(folders: Sequence[RunFolder]) -> list[Run]:
+    """The runs that hold results, under short names."""
+    held = [(folder, table) for folder in folders if (table := folder.read()).num_rows]
+    if not held:
+        raise RunFolderError("no run holds results yet; the command that began one continues it")
+    configs = [{"pipeline": folder.path.name, **folder.config} for folder, _ in held]
+    names = run_names(configs, [folder.identity for folder, _ in held], [_dataset(folder) for folder, _ in held])
+    return [Run(name, folder, table) for name, (folder, table) in zip(names, held, strict=True)]
+
+
+def _order(order: str | None, paths: Sequence[Path]) -> str:
+    """`given` or `recall`; unless one is asked for, by recall where runs were looked for in folders."""
+    if order not in (None, "given", "recall"):
+        raise ValueError(f"order={order} must be given or recall")
+    return order or ("given" if all((path / "run.json").exists() for path in paths) else "recall")
+
+
+def _by_dataset(runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """The runs of each data set, under a heading that says which: its options and families."""
+    groups: dict[str, list[Run]] = {}
+    for r in runs:
+        groups.setdefault(_dataset(r.folder), []).append(r)
+    headings = {digest: _heading(group) for digest, group in groups.items()}
+    for digest, heading in headings.items():
+        if list(headings.values()).count(heading) > 1:
+            headings[digest] = f"{heading} ({digest[:6]})"
+    return {headings[digest]: group for digest, group in groups.items()}
+
+
+def _dataset(folder: RunFolder) -> str:
+    """What tells a run's data set from others: the digest of its contents."""
+    return str((folder.config.get("dataset") or {}).get("digest"))
+
+
+def _heading(runs: Sequence[Run]) -> str:
+    options = runs[0].folder.config.get("dataset") or {}
+    words = [
+        str(value) for key, value in options.items() if key not in ("digest", "_target_") and isinstance(value, str)
+    ]
+    families = dict.fromkeys(name for r in runs for name in r.table["family"].to_pylist())
+    return ": ".join(dict.fromkeys(", ".join(part) for part in (words, families) if part))
+
+
+@job
+def task(config: DictConfig) -> None:
+    """What Hydra runs."""
+    run(config)
+
+
+def main() -> None:
+    """The command."""
+    run_command("report", task, paths=path_fields(Fields), positional=("runs...",))

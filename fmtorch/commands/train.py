@@ -1,0 +1,25 @@
+"""`python -m fmtorch.train pruner=lc`: train a learned pruner on the labelled matches of a data set."""
+
+from __future__ import annotations
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from fmtorch.commands.main import job, run_command
+
+
+@job
+def task(config: DictConfig) -> None:
+    """What Hydra runs."""
+    try:
+        from fmtorch.training.pruners.run import run
+    except ModuleNotFoundError as error:
+        if (error.name or "").split(".")[0] not in ("lightning", "tensorboard"):
+            raise
+        raise ImportError(f"training needs {error.name}: pip install 'fmtorch[train]'") from error
+    run(config, str(HydraConfig.get().runtime.choices["pruner"]))
+
+
+def main() -> None:
+    """The command."""
+    run_command("train", task, interrupted="interrupted; the same command continues the training")

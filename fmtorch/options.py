@@ -1,0 +1,173 @@
+"""Options that a user sets, checked against the signature of what takes them before anything is built."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import enum
+import inspect
+import math
+import os
+import types
+import typing
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+PLAIN = (bool, int, float, str, type(None), list, tuple, Mapping)  # what a YAML file or a command line can say
+MOST_NAMES = 12  # that a message lists
+
+
+@dataclasses.dataclass(frozen=True)
+class Within:
+    """Bounds of a number, for ``Annotated[int, Within(1)]``; both may be reached."""
+
+    least: int | float = -math.inf
+    most: int | float = math.inf
+
+    def __call__(self, value: Any) -> bool:
+        """Whether a number is in bounds."""
+        return bool(self.least <= value <= self.most)
+
+    def __str__(self) -> str:
+        if self.most == math.inf:
+            return f"of at least {self.least:g}"
+        return f"of at most {self.most:g}" if self.least == -math.inf else f"from {self.least:g} to {self.most:g}"
+
+
+def expect_options(
+    target: Callable[..., Any], values: Mapping[str, Any], where: str, given: Iterable[str] = ()
+) -> None:
+    """Raises ValueError, naming the option, where `values` are no keyword arguments of `target`.
+
+    Values are compared with the target's annotations as far as these say what a plain value may be; objects, and
+    mappings with a `_target_`, are taken on trust. A mapping for a dataclass is checked against its fields.
+
+    Args:
+        target: a class or function.
+        values: its arguments, as a config or a user gives them.
+        where: the name of the whole, as a user knows it: ``pruner.ratio`` or ``estimator=fmtorch``.
+        given: names of arguments that are added later.
+    """
+    known = inspect.signature(target).parameters
+    named = [name for name, p in known.items() if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)]
+    if len(named) == len(known):  # else it takes any
+        for key in values:
+            if key not in known:
+                raise ValueError(f"{where}: no option {key}; there are: {nearest(str(key), named) or 'none'}")
+    missing = [n for n in named if known[n].default is inspect.Parameter.empty and n not in {*values, *given}]
+    if missing:
+        raise ValueError(f"{where}: {', '.join(missing)} is missing")
+    annotations = _annotations(target)
+    for key, value in values.items():
+        annotation = annotations.get(str(key), Any)
+        place = f"{where}: {key}" if "=" in where else f"{where}.{key}" if where else str(key)
+        nested = _dataclass_in(annotation)
+        if isinstance(value, Mapping) and "_target_" not in value and nested is not None:
+            expect_options(nested, value, place)
+        elif not fits(value, annotation):
+            raise ValueError(f"{place}={shown(value)}; it must be {expected(annotation)}")
+
+
+def fits(value: Any, annotation: Any) -> bool:
+    """Whether a value may stand where an annotation is; what an annotation leaves open is not checked."""
+    origin, args = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is typing.Annotated:
+        return fits(value, args[0]) and all(rule(value) for rule in args[1:] if callable(rule))
+    if origin in (typing.Union, types.UnionType):
+        return any(fits(value, option) for option in args)
+    if origin is typing.Literal:
+        return value in args
+    if not isinstance(value, PLAIN) or (isinstance(value, Mapping) and "_target_" in value):
+        return True
+    if annotation in (None, type(None)):
+        return value is None
+    if annotation in (bool, int, float, str):
+        number = annotation is float and isinstance(value, int) and not isinstance(value, bool)
+        return number or (isinstance(value, annotation) and isinstance(value, bool) is (annotation is bool))
+    kind = origin or annotation
+    if annotation is Any or annotation is object or not isinstance(kind, type):  # or a type variable
+        return True
+    if issubclass(kind, os.PathLike | enum.Enum):
+        return isinstance(value, str)
+    if isinstance(value, list | tuple):
+        return _fit(value, kind, args)
+    if isinstance(value, str) and issubclass(kind, Iterable):
+        return False
+    try:
+        return isinstance(value, kind)
+    except TypeError:  # a protocol that is not for run time
+        return True
+
+
+def _fit(values: Sequence[Any], kind: type, args: tuple[Any, ...]) -> bool:
+    """Whether a list, and its elements, fit a generic type and its arguments."""
+    if not (issubclass(list, kind) or issubclass(kind, tuple | set | frozenset)):
+        return False
+    if issubclass(kind, tuple) and args and args[-1] is not Ellipsis:
+        return len(values) == len(args) and all(map(fits, values, args))
+    return not args or all(fits(value, args[0]) for value in values)
+
+
+def expected(annotation: Any) -> str:
+    """What fits an annotation, in words."""
+    origin, args = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is typing.Annotated:
+        return " ".join([expected(args[0]), *(str(rule) for rule in args[1:])])
+    if origin in (typing.Union, types.UnionType):
+        words = list(dict.fromkeys(expected(option) for option in args if not (option is int and float in args)))
+        return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
+    if origin is typing.Literal:
+        return f"one of: {', '.join(map(shown, args))}"
+    names = {bool: "true or false", int: "a whole number", float: "a number", str: "text", type(None): "null"}
+    if annotation in names:
+        return names[annotation]
+    kind = origin or annotation
+    if not isinstance(kind, type):
+        return str(annotation)
+    if issubclass(kind, os.PathLike):
+        return "a path"
+    if issubclass(kind, Mapping):
+        return "a mapping"
+    if args and issubclass(kind, tuple) and args[-1] is not Ellipsis:
+        return f"a list of {', '.join(map(expected, args))}"
+    if issubclass(list, kind) or issubclass(kind, list | tuple):
+        return "a list" + (f", each {expected(args[0])}" if args else "")
+    return f"a {kind.__name__}: a mapping with a `_target_`"
+
+
+def shown(value: Any) -> str:
+    """A value as a command line or a YAML file has it."""
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(shown, value))}]"
+    return str(value)
+
+
+def nearest(name: str, names: Iterable[str]) -> str:
+    """The names there are, those most like `name` first; of many only those."""
+    ordered = sorted(names, key=lambda known: -difflib.SequenceMatcher(None, name, known).ratio())
+    more = len(ordered) - MOST_NAMES
+    return ", ".join(ordered[:MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
+
+
+def _annotations(target: Callable[..., Any]) -> dict[str, Any]:
+    """The annotations of a target's parameters; without those that cannot be resolved."""
+    function = inspect.unwrap(target.__init__ if isinstance(target, type) else target)  # type: ignore[misc]
+    names = getattr(function, "__globals__", {})
+    found = {}
+    for name, annotation in getattr(function, "__annotations__", {}).items():
+        if isinstance(annotation, str):
+            try:
+                annotation = eval(annotation, names)
+            except Exception:  # names that only type checkers see
+                continue
+        found[name] = annotation
+    return found
+
+
+def _dataclass_in(annotation: Any) -> type | None:
+    """The dataclass that an annotation allows, if it is one."""
+    options = typing.get_args(annotation) if typing.get_origin(annotation) in (typing.Union, types.UnionType) else ()
+    found = [kind for kind in (annotation, *options) if isinstance(kind, type) and dataclasses.is_dataclass(kind)]
+    return found[0] if len(found) == 1 else None
