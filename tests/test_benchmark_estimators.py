@@ -22,6 +22,10 @@ def test_options_are_numbers_switches_or_words() -> None:
     assert matched.options("") == {}
 
 
+def test_options_of_a_part_are_nested() -> None:
+    assert matched.options("a.b=1,c=x,a.d=2") == {"a": {"b": 1, "d": 2}, "c": "x"}
+
+
 def test_tables_stand_between_their_markers(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     image = ImageSource("none", tmp_path / "none.png")  # not looked at

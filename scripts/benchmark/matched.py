@@ -45,8 +45,18 @@ def sets_of(arguments: argparse.Namespace) -> list[PairDataset]:
 
 
 def options(text: str) -> dict[str, Any]:
-    """``KEY=VALUE,...``: numbers, true, false or null as in JSON; anything else is text."""
-    return {key: parsed(value) for key, value in (item.split("=") for item in text.split(",") if item)}
+    """``KEY=VALUE,...``: numbers, true, false or null as in JSON; anything else is text.
+
+    ``PART.KEY=VALUE`` is the option KEY of a part, as on the command line.
+    """
+    found: dict[str, Any] = {}
+    for key, value in (item.split("=") for item in text.split(",") if item):
+        *parts, last = key.split(".")
+        inside = found
+        for part in parts:
+            inside = inside.setdefault(part, {})
+        inside[last] = parsed(value)
+    return found
 
 
 def parsed(value: str) -> Any:

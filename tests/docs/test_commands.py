@@ -1,0 +1,237 @@
+"""Every command in the fenced blocks of README.md and docs/ runs, on data and with sizes as small as they can be.
+
+A command runs as it stands there, but for the words that `smaller` exchanges; a command that no rule knows fails. Those
+that take long run with ``-m slow``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import os
+import re
+import runpy
+import shlex
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hydra.core.global_hydra import GlobalHydra
+
+from fmtorch import data
+from fmtorch.data import read_image
+
+SOURCE = Path(__file__).resolve().parents[2]
+PAGES = ["README.md", "CONTRIBUTING.md", *(f"docs/{path.name}" for path in sorted((SOURCE / "docs").glob("*.md")))]
+SETS = ("Strecha", "PhotoTourism", "KITTI", "TUM", "Strecha_train", "TanksLike")
+
+ELSEWHERE = {
+    r"python3? -m venv|pip install": "a fresh environment: continuous integration runs these",
+    r"python -m pytest|ruff check|sphinx-build": "what continuous integration does",
+    r"convert_ngransac": "needs the authors' weights; tests/pruning/networks/test_files.py runs it on others",
+    r"--contrib-python": "needs a Python with opencv-contrib",
+    r"--config-dir my_conf (pruner|pipeline)=": "tests/training/test_train_command.py runs these files and commands",
+    r"--config-dir my_conf features=": "tests/docs/test_own_parts.py runs this page",
+}
+"""Commands that are not run here, and why."""
+
+SLOW = (
+    r"fmtorch\.train",
+    r"benchmark (memory|features)",
+    r"-m pipeline=",
+    r"estimators\.txt +#",
+    r"--marker rendered",
+    r"--label",
+)
+
+PEERS = {"poselib": "poselib", "poselib_shared_focal": "poselib", "degensac_cpp": "pydegensac",
+         "gc_ransac_cpp": "pygcransac", "magsac_cpp": "pymagsac"}  # fmt: skip
+
+TINY = ["features.max_features=500"]
+DATASET = ["dataset=fmbench", "dataset.root=DATA/Strecha", "limit=1"]
+TRAINED = [
+    "optimisation.steps=4", "objective.classification_steps=2", "validation.every=2", "batch=2", "threads=1",
+    "validation.scenes=1", "validation.pairs=1", "checkpoint_every=2", "workers=1",
+]  # fmt: skip
+APPENDED = {
+    "fmtorch.match": ["pipeline=sift_gms"],
+    "fmtorch.eval": [*DATASET, "workers=1"],
+    "fmtorch.train": ["dataset=fmbench", "dataset.root=DATA", "dataset.sets=[Strecha_train,TanksLike]", *TRAINED],
+    "fmtorch.report": ["pictures=1", "root=DATA/Strecha"],
+    "estimators": ["--limit", "1", "--seeds", "1"],
+    "thresholds": ["--limit", "1", "--seeds", "1", "--values", "0.5", "0.75"],
+    "pipelines": ["--limit", "1", "--seeds", "1", "--cache", "kept"],
+    "pruning": ["--limit", "1", "--asift-limit", "0", "--cache", "kept"],
+    "learned": ["--limit", "1", "--cache", "kept", "--methods", "ratio", "LC, E", "DFE"],
+    "speed": ["--pairs", "2", "--batch", "2", "--repeats", "1", "--matches", "200"],
+    "memory": ["--pairs", "1", "--matches", "200", "--estimators", "ransac"],
+    "features": ["--features", "100", "--repeats", "1", "--size", "120", "160"],
+    "matching": ["--features", "200", "--repeats", "1"],
+}
+"""Options that come last and win."""
+
+
+def commands(page: str) -> list[str]:
+    """The commands of a page's ```bash blocks, continued lines joined, comments at their ends kept."""
+    found = []
+    for block in re.findall(r"```bash\n(.*?)```", (SOURCE / page).read_text(encoding="utf-8"), flags=re.DOTALL):
+        found += [line.strip() for line in block.replace("\\\n", " ").splitlines() if line.strip()]
+    return found
+
+
+def smaller(command: str) -> list[str]:
+    """The words to run instead: on a set of one scene in place of the rendered ones, with the least of everything."""
+    words = shlex.split(command, comments=True)
+    text = shlex.join(words)
+    for pattern, replacement in (
+        (r"--rendered \w+", "--root DATA/Strecha"),
+        (r"--root DATA/\w+ (?=.*--root)", ""),
+        (r" --ngransac \S+", ""),
+        (r" dataset\.size=\w+", ""),
+        (r"FOLDER", "kept"),
+        (r" root=DIR", ""),
+        (r" d\.json", ""),
+        (r"runs=\[runs/a,runs/b\]", "runs=[runs/fmbench]"),
+    ):
+        text = re.sub(pattern, replacement, text)
+    words = shlex.split(text)
+    name = words[3] if words[2] == "scripts.benchmark" else words[2]
+    if name not in APPENDED:
+        raise AssertionError(f"no rule for {command!r}: say in APPENDED how to run it small, or in ELSEWHERE why not")
+    added = APPENDED[name]
+    if "--from" in words:  # shows what is there
+        added = []
+    if name == "speed" and importlib.util.find_spec("poselib") is None:
+        added = [*added, "--peers", "opencv_usac_magsac"]
+    return [*(word for word in words if _installed(word)), *added]
+
+
+def _installed(estimator: str) -> bool:
+    """False of the name of an estimator whose library is absent (extra `peers`)."""
+    library = PEERS.get(re.split("[:@]", estimator)[0])
+    return library is None or importlib.util.find_spec(library) is not None
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder like a checkout's, with the data that the pages leave to the reader."""
+    folder = tmp_path_factory.mktemp("workplace")
+    shutil.copytree(SOURCE / "docs", folder / "docs", ignore=shutil.ignore_patterns("site"))
+    shutil.copy(SOURCE / "README.md", folder)
+    (folder / "scripts" / "benchmark").mkdir(parents=True)
+    for specs in (SOURCE / "scripts" / "benchmark").glob("*.txt"):
+        lines = [line for line in specs.read_text().splitlines() if _installed(line.split(" ")[0])]
+        (folder / "scripts" / "benchmark" / specs.name).write_text("\n".join(lines))
+    pair = data.load("stereo")[0]
+    images = [_half(read_image(source)) for source in (pair.image0, pair.image1)]
+    halved = np.diag([2.0, 2.0, 1.0])
+    F = halved.T @ pair.F @ halved
+    for name, scenes in ((name, ("a", "b")) for name in SETS):
+        for scene in scenes:
+            (folder / "DATA" / name / scene / "Images").mkdir(parents=True)
+            for i, image in enumerate(images):
+                cv2.imwrite(str(folder / "DATA" / name / scene / "Images" / f"{i:08d}.png"), image[..., ::-1])
+            cameras = [(pair.K0, np.eye(3), np.zeros(3)), (pair.K1, pair.R, pair.t)]
+            numbers = [np.concatenate([(np.diag([0.5, 0.5, 1]) @ K).ravel(), R.ravel(), t]) for K, R, t in cameras]
+            np.savetxt(folder / "DATA" / name / scene / "Camera.txt", numbers)
+        line = f"0 1 {' '.join(map(str, F.ravel()))}\n"
+        (folder / "DATA" / name / "pairs_with_gt.txt").write_text(line * len(scenes))
+        (folder / "DATA" / name / "pairs_which_dataset.txt").write_text("".join(f"{s}/\n" for s in scenes))
+    for name, image in zip(("a.jpg", "b.jpg"), images, strict=True):
+        cv2.imwrite(str(folder / name), image[..., ::-1])
+    (folder / "my_conf" / "estimator").mkdir(parents=True)
+    yaml = re.findall(
+        r"```yaml\n# my_conf/estimator/mine.yaml\n(.*?)```", (SOURCE / "README.md").read_text(), re.DOTALL
+    )
+    (folder / "my_conf" / "estimator" / "mine.yaml").write_text(yaml[0] + "hypotheses: 100\n")
+    (folder / "my_package.py").write_text(
+        "from fmtorch import presets\n\n\n"
+        "def MyEstimator(threshold, hypotheses):\n"
+        "    return presets.build('estimator', 'ransac', threshold=threshold, hypotheses=hypotheses)\n"
+    )
+    return folder
+
+
+def _half(image: np.ndarray) -> np.ndarray:
+    return cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+
+
+@contextlib.contextmanager
+def as_a_command(words: list[str], folder: Path) -> Iterator[None]:
+    """The state of a process of its own, as far as the commands change it."""
+    before, argv, threads = Path.cwd(), sys.argv, torch.get_num_threads()
+    os.chdir(folder)
+    sys.argv = words
+    sys.path.insert(0, str(folder))
+    try:
+        yield
+    finally:
+        os.chdir(before)
+        sys.argv = argv
+        sys.path.remove(str(folder))
+        torch.set_num_threads(threads)
+        GlobalHydra.instance().clear()
+
+
+def run(words: list[str], folder: Path) -> None:
+    """`python -m MODULE ...`, within this process."""
+    assert words[:2] == ["python", "-m"], words
+    with as_a_command(words[2:], folder):
+        try:
+            runpy.run_module(words[2], run_name="__main__", alter_sys=True)
+        except SystemExit as end:
+            if end.code not in (None, 0):
+                raise AssertionError(f"{shlex.join(words)} ended with: {end.code}") from end
+
+
+def is_slow(command: str) -> bool:
+    return any(re.search(pattern, command) for pattern in SLOW)
+
+
+def elsewhere(command: str) -> bool:
+    return any(re.search(pattern, command) for pattern in ELSEWHERE)
+
+
+def those(slow: bool) -> list[object]:
+    """Parameters: each page with its commands, in their order."""
+    here = {page: [c for c in commands(page) if not elsewhere(c) and is_slow(c) == slow] for page in PAGES}
+    return [pytest.param(some, id=page) for page, some in here.items() if some]
+
+
+def run_all(some: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FMTORCH_CACHE", str(workplace / "cache"))
+    for command in some:
+        print(command)
+        run(smaller(command), workplace)
+
+
+@pytest.mark.parametrize("some", those(slow=False))
+def test_the_commands_of_a_page_run(some: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_all(some, workplace, monkeypatch)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("some", those(slow=True))
+def test_the_long_commands_of_a_page_run(some: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_all(some, workplace, monkeypatch)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_a_page_says_what_its_capital_words_are(page: str) -> None:
+    """DATA, FOLDER and the like, which a reader replaces, are explained on the page that uses them."""
+    words = {word for command in commands(page) for word in re.findall(r"\b[A-Z]{3,}\b(?=/|$| |\])", command)} - set(
+        SETS
+    )
+    text = re.sub(r"```.*?```", "", (SOURCE / page).read_text(encoding="utf-8"), flags=re.DOTALL)
+    assert not {word for word in words if f"`{word}`" not in text}
+
+
+def test_what_is_run_elsewhere_is_there() -> None:
+    everything = "\n".join(command for page in PAGES for command in commands(page))
+    assert all(re.search(pattern, everything) for pattern in ELSEWHERE)
+    assert all(re.search(pattern, everything) for pattern in SLOW)
