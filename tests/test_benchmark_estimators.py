@@ -84,7 +84,7 @@ def pairs_of(scenes: list[str]) -> list[ImagePair]:
     return [ImagePair(f"orbit/{i}", "orbit", name, image, image, np.eye(3)) for i, name in enumerate(scenes)]
 
 
-@pytest.mark.parametrize(("count", "over"), [(3, "pair"), (8, "scene")])
+@pytest.mark.parametrize(("count", "over"), [(3, "pair"), (12, "scene")])
 def test_intervals_are_those_of_every_other_table_and_the_page_says_over_what(
     count: int, over: str, tmp_path: Path
 ) -> None:
@@ -108,11 +108,15 @@ def test_intervals_are_those_of_every_other_table_and_the_page_says_over_what(
 
 
 def test_a_first_method_that_is_level_with_the_next_still_shows_the_interval() -> None:
-    pairs = pairs_of([f"s{i}" for i in range(6)])
-    same = {"nsgd": np.full((1, 6), 0.02), "ms": np.ones((1, 6))}
-    figures = estimators.summaries({"a": same, "b": same}, pairs, np.ones(6, bool))
+    pairs = pairs_of([f"s{i}" for i in range(12)])
+    same = {"nsgd": np.full((1, 12), 0.02), "ms": np.ones((1, 12))}
+    figures = estimators.summaries({"a": same, "b": same}, pairs, np.ones(12, bool))
     assert estimators_table.ahead(figures, "a") == ["", ""]
-    assert estimators_table.ahead(figures, "b") == ["+0.0 [+0.0, +0.0]"] * 2
+    recall, area = estimators_table.ahead(figures, "b")
+    assert recall.startswith("+0.0 [-")  # twelve pairs cannot tell more
+    assert area == "+0.0 [+0.0, +0.0]"
+    few = estimators.summaries({"a": same, "b": same}, pairs, np.arange(12) < 3)
+    assert estimators_table.ahead(few, "b")[1] == "n too small"
 
 
 def test_a_split_is_the_rendered_sets_alone(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from scipy.special import ndtri, stdtrit
 from fmtorch.evaluation.bootstrap import LEVEL, MIN_SCENES, Interval, paired_bootstrap
 
 MIN_UNITS = 10  # scenes, or pairs where those are resampled, below which a bootstrap of any other mean is not shown
+Successes = NDArray[np.bool_] | NDArray[np.float64]
 _Z = float(ndtri((1 + LEVEL) / 2))
 
 
@@ -46,11 +47,11 @@ def effective_pairs(values: NDArray[np.float64], scenes: Sequence[str]) -> float
     return n / (max(1.0, together / alone) * quantiles**2)
 
 
-def share_interval(successes: NDArray[np.bool_], scenes: Sequence[str]) -> Interval:
+def share_interval(successes: Successes, scenes: Sequence[str]) -> Interval:
     """The share of pairs that succeed, with Wilson's 95 % score interval for the effective number of pairs.
 
     Args:
-        successes: (n,), n >= 1.
+        successes: (n,), n >= 1; of several seeds the share of those with which a pair succeeds, in [0, 1].
         scenes: the scene of each pair; `Interval.over` says whether scenes were many enough to be the units.
     """
     values = successes.astype(np.float64)
@@ -61,7 +62,7 @@ def share_interval(successes: NDArray[np.bool_], scenes: Sequence[str]) -> Inter
     return Interval(p, min(max(0.0, middle - half), p), max(min(1.0, middle + half), p), _unit(scenes))
 
 
-def share_difference(a: NDArray[np.bool_], b: NDArray[np.bool_], scenes: Sequence[str]) -> Interval:
+def share_difference(a: Successes, b: Successes, scenes: Sequence[str]) -> Interval:
     """Share of a minus share of b, of the same pairs, with the adjusted Wald interval of Bonett and Price.
 
     One pair more is counted on either side ("Adjusted Wald confidence interval for a difference of binomial proportions
@@ -69,12 +70,12 @@ def share_difference(a: NDArray[np.bool_], b: NDArray[np.bool_], scenes: Sequenc
     pair still have an interval of the width that so few pairs allow.
 
     Args:
-        a, b: (n,), n >= 1, where either method succeeds.
+        a, b: (n,), n >= 1, where either method succeeds; of several seeds as in `share_interval`.
         scenes: the scene of each pair.
     """
     difference = a.astype(np.float64) - b.astype(np.float64)
     n = effective_pairs(difference, scenes)
-    only_a, only_b = (float((difference == sign).mean()) for sign in (1, -1))
+    only_a, only_b = (float((sign * difference).clip(min=0.0).mean()) for sign in (1, -1))
     p, q = (n * only_a + 1) / (n + 2), (n * only_b + 1) / (n + 2)
     half = _Z * math.sqrt((p + q - (p - q) ** 2) / (n + 2))
     value = float(difference.mean())

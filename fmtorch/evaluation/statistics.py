@@ -1,8 +1,8 @@
 """Recall, AUC@0.05, their differences and intervals: what every table of this project takes its figures from.
 
-A figure is the mean over pairs of what each pair adds to it, so that one bootstrap serves all of them. Pairs of one
-scene succeed and fail together: intervals resample scenes, and pairs only where there are fewer than five scenes, which
-every table then says (`described`).
+A figure is the mean over pairs of what each pair adds to it. Shares of pairs, such as recall, have score intervals, all
+other means the bootstrap's (see `intervals`). Pairs of one scene succeed and fail together: the units are scenes, and
+pairs only where there are fewer than five scenes, which every table then says (`described`).
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ import torch
 from numpy.typing import NDArray
 
 from fmtorch import metrics
-from fmtorch.evaluation.bootstrap import MIN_SCENES, Interval, bootstrap_mean, paired_bootstrap
+from fmtorch.evaluation.bootstrap import MIN_SCENES, Interval, bootstrap_mean
+from fmtorch.evaluation.intervals import mean_difference, share_difference, share_interval
 from fmtorch.metrics.recall import FINE_THRESHOLD as FINE_THRESHOLD
 from fmtorch.metrics.recall import THRESHOLD as THRESHOLD
 
@@ -47,26 +48,34 @@ MERITS: dict[str, Callable[[Values], Values]] = {
 """The figures of merit, by the names that rows, summaries and JSON files have for them: NSGD -> values of pairs."""
 
 
-def interval(values: Values, scenes: Sequence[str], scale: float = 1.0) -> Interval | None:
+SHARES = ("recall_05", "recall_01")
+"""Those of them that are shares of pairs."""
+
+
+def interval(values: Values, scenes: Sequence[str], scale: float = 1.0, share: bool = False) -> Interval | None:
     """Mean of the values that are not NaN, times `scale`, with its 95 % interval; None where all are NaN.
 
-    values, scenes: one per pair, (n,).
+    values, scenes: one per pair, (n,). share: the values are successes, see `share_interval`.
     """
     known = ~np.isnan(values)
     if not known.any():
         return None
-    return bootstrap_mean(scale * values[known], _those(scenes, known))
+    of = share_interval if share else bootstrap_mean
+    return _scaled(of(values[known], _those(scenes, known)), scale)
 
 
-def difference(a: Values, b: Values, scenes: Sequence[str], scale: float = 1.0) -> Interval | None:
+def difference(a: Values, b: Values, scenes: Sequence[str], scale: float = 1.0, share: bool = False) -> Interval | None:
     """mean(a) - mean(b) of two methods on the same pairs, times `scale`, with its 95 % interval.
 
-    Of the pairs for which both are not NaN; None where there is none. a, b, scenes: one per pair, (n,).
+    Of the pairs for which both are not NaN; None where there are none, or too few for the figure (`mean_difference`).
+    a, b, scenes: one per pair, (n,). share: the values are successes, see `share_difference`.
     """
     known = ~(np.isnan(a) | np.isnan(b))
     if not known.any():
         return None
-    return paired_bootstrap(scale * a[known], scale * b[known], _those(scenes, known))
+    of = share_difference if share else mean_difference
+    found = of(a[known], b[known], _those(scenes, known))
+    return None if found is None else _scaled(found, scale)
 
 
 def scene_names(families: Sequence[str], scenes: Sequence[str]) -> list[str]:
@@ -77,13 +86,22 @@ def scene_names(families: Sequence[str], scenes: Sequence[str]) -> list[str]:
 def described(scenes: Sequence[str]) -> str:
     """``79 pairs of 2 scenes, intervals over pairs``: how many there are, and what intervals resample."""
     count = len(set(scenes))
-    over = "scenes" if count >= MIN_SCENES else "pairs"
-    return f"{len(scenes)} pair{'s' * (len(scenes) != 1)} of {count} scene{'s' * (count != 1)}, intervals over {over}"
+    pairs = f"{len(scenes)} pair{'s' * (len(scenes) != 1)}"
+    return f"{pairs} of {count} scene{'s' * (count != 1)}, intervals over {unit(scenes)}s"
+
+
+def unit(scenes: Sequence[str]) -> str:
+    """What the intervals of these pairs take as independent: ``scene``, or ``pair`` where scenes are too few."""
+    return "scene" if len(set(scenes)) >= MIN_SCENES else "pair"
 
 
 def _per_pair(values: torch.Tensor) -> Values:
     found: Values = values.double().numpy()
     return found.mean(0) if found.ndim > 1 else found
+
+
+def _scaled(i: Interval, scale: float) -> Interval:
+    return Interval(scale * i.value, scale * i.low, scale * i.high, i.over)
 
 
 def _those(scenes: Sequence[str], known: NDArray[np.bool_]) -> list[str]:

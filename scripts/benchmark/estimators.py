@@ -27,7 +27,7 @@ from rich.progress import track
 
 from fmtorch import metrics, presets
 from fmtorch.data import ImagePair
-from fmtorch.evaluation.statistics import MERITS, PERCENT, described, difference
+from fmtorch.evaluation.statistics import MERITS, PERCENT, SHARES, described, difference, unit
 from fmtorch.geometry import refine
 from fmtorch.stages import Estimator
 from fmtorch.types import Correspondences, Estimate
@@ -153,7 +153,7 @@ def measure(specs: list[str], items: list[Item], seeds: int) -> dict[str, Result
 def summaries(results: dict[str, Result], pairs: list[ImagePair], inside: NDArray[np.bool_]) -> table.Figures:
     """The figures of each estimator over some pairs, in percent; ahead_*: what the first has more, with its interval.
 
-    interval_over: what the intervals resample, scenes or, where there are fewer than five, pairs.
+    None where the pairs are too few for one. interval_over: its units, scenes or, of fewer than five scenes, pairs.
     """
     first = {key: value[:, inside] for key, value in next(iter(results.values())).items()}
     scenes = [scene for scene, one in zip(matched.scenes(pairs), inside, strict=True) if one]
@@ -162,9 +162,10 @@ def summaries(results: dict[str, Result], pairs: list[ImagePair], inside: NDArra
         nsgd, ms = result["nsgd"][:, inside], result["ms"][:, inside]
         found[spec] = {name: PERCENT * float(values(nsgd).mean()) for name, values in MERITS.items()}
         for name in ("recall_01", "auc_05"):
-            ahead = difference(MERITS[name](first["nsgd"]), MERITS[name](nsgd), scenes, scale=PERCENT)
-            assert ahead is not None  # NSGD is never NaN
-            found[spec] |= {f"ahead_{name}": [ahead.value, ahead.low, ahead.high], "interval_over": ahead.over}
+            own, other = MERITS[name](first["nsgd"]), MERITS[name](nsgd)
+            ahead = difference(own, other, scenes, PERCENT, share=name in SHARES)
+            found[spec][f"ahead_{name}"] = None if ahead is None else [ahead.value, ahead.low, ahead.high]
+        found[spec]["interval_over"] = unit(scenes)
         found[spec] |= {
             "ms_median": float(np.median(ms)),
             "ms_mean": float(ms.mean()),

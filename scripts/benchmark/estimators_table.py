@@ -23,7 +23,8 @@ def ahead(figures: Figures, spec: str) -> list[str]:
     """What the first has more in recall at 0.01 and in AUC@0.05, with intervals; empty for the first itself."""
     if spec == next(iter(figures)):
         return ["", ""]
-    return ["{:+.1f} [{:+.1f}, {:+.1f}]".format(*figures[spec][key]) for key in ("ahead_recall_01", "ahead_auc_05")]
+    found = (figures[spec][key] for key in ("ahead_recall_01", "ahead_auc_05"))
+    return ["n too small" if i is None else "{:+.1f} [{:+.1f}, {:+.1f}]".format(*i) for i in found]
 
 
 def cells(figures: Figures, spec: str) -> list[str]:
@@ -86,7 +87,7 @@ def difference_table(figures: Groups, pairs: list[ImagePair], seeds: int) -> str
     ]
     note = (
         f"What `{first}` is ahead by: mean difference of recall at 0.01 and of AUC@0.05, in points, with its 95 % "
-        f"bootstrap interval ({'; '.join(places)}); {seeds} seeds. "
+        f"interval ({'; '.join(places)}); {seeds} seeds. "
         f"Time: median ratio to that of `{first}`, pair by pair."
     )
     return "\n".join([note, "", *lines])

@@ -35,6 +35,8 @@ FIGURES: dict[str, tuple[Callable[[list[Row]], Values], float, str]] = {
     "#Corrs-m": (lambda rows: _solved_means(rows, "corrs_before"), 1.0, ".0f"),
 }
 
+SHARES = ("%Recall",)
+
 
 def tables(rows: list[Row]) -> list[Sheet]:
     """A table for each family and one of paired differences; of several rows of a pair the last counts."""
@@ -72,7 +74,7 @@ def _family(family: str, rows: list[Row], paper: Published) -> Sheet:
     for method in dict.fromkeys(row["method"] for row in rows):
         own = [row for row in rows if row["method"] == method]
         some = "" if len(own) == len(pairs) else f", {len(own)} pairs"
-        figures = [shown(interval(f(own), scenes_of(own), scale), form) for f, scale, form in FIGURES.values()]
+        figures = [_interval(name, own) for name in FIGURES]
         lines.append([f"`{method}`{some}", *figures, _failed(own), compared(paper, kin, method)])
     title = f"{family}: {described(scenes_of(pairs.values()))}"
     return Sheet(title, ["", *FIGURES, "failed", f"paper, {kin}: recall, inlier, -m, #, -m"], lines)
@@ -107,6 +109,12 @@ def _order(rows: list[Row], families: list[str]) -> Sheet:
     return Sheet("Paired differences, in points", ["", "of", "%Recall", "AUC@0.05", "%Inlier-m"], lines)
 
 
+def _interval(name: str, rows: list[Row]) -> str:
+    figure, scale, form = FIGURES[name]
+    return shown(interval(figure(rows), scenes_of(rows), scale, share=name in SHARES), form)
+
+
 def _difference(name: str, first: list[Row], second: list[Row]) -> str:
     figure, scale, _ = FIGURES[name]
-    return shown(difference(figure(first), figure(second), scenes_of(first), scale), "+.1f")
+    i = difference(figure(first), figure(second), scenes_of(first), scale, share=name in SHARES)
+    return shown(i, "+.1f")

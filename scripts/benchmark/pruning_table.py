@@ -79,7 +79,7 @@ def _intervals(rows: list[Row]) -> list[str]:
     figures = [("inlier_rate", PERCENT, ".1f"), ("inlier_rate_before", PERCENT, ".1f"), ("corrs", 1.0, ".0f"),
                ("corrs_before", 1.0, ".0f")]  # fmt: skip
     return [
-        shown(interval(recalled(nsgd_of(rows)), scenes_of(rows), PERCENT), ".1f"),
+        shown(interval(recalled(nsgd_of(rows)), scenes_of(rows), PERCENT, share=True), ".1f"),
         *(
             shown(interval(np.array([row[name] for row in solved], np.float64), scenes_of(solved), scale), form)
             for name, scale, form in figures
@@ -92,4 +92,6 @@ def _against(rows: list[Row], baseline: dict[str, Row]) -> str:
     if any(row["pair"] not in baseline or row["method"] == BASELINE for row in rows):
         return ""
     other = [baseline[row["pair"]] for row in rows]
-    return shown(difference(recalled(nsgd_of(rows)), recalled(nsgd_of(other)), scenes_of(rows), PERCENT), "+.1f")
+    return shown(
+        difference(recalled(nsgd_of(rows)), recalled(nsgd_of(other)), scenes_of(rows), PERCENT, share=True), "+.1f"
+    )

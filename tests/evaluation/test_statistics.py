@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from fmtorch import metrics
-from fmtorch.evaluation.bootstrap import bootstrap_mean, paired_bootstrap
+from fmtorch.evaluation.bootstrap import bootstrap_mean
+from fmtorch.evaluation.intervals import mean_difference, share_difference, share_interval
 from fmtorch.evaluation.statistics import MERITS, PERCENT, areas, described, difference, interval, recalled, scene_names
 from tests.reference import metrics as reference
 
@@ -40,18 +41,38 @@ def test_seeds_are_averaged_pair_by_pair() -> None:
 def test_intervals_are_of_what_is_defined() -> None:
     rng = np.random.default_rng(1)
     a, b = rng.random((2, 30))
-    scenes = [f"s{i % 7}" for i in range(30)]
+    scenes = [f"s{i % 12}" for i in range(30)]
     some = a.copy()
     some[::4] = math.nan
     kept = [i for i in range(30) if i % 4]
-    expected = bootstrap_mean(PERCENT * a[kept], [scenes[i] for i in kept])
-    assert interval(some, scenes, PERCENT) == expected
-    assert difference(some, b, scenes) == paired_bootstrap(a[kept], b[kept], [scenes[i] for i in kept])
-    assert difference(b, some, scenes) == paired_bootstrap(b[kept], a[kept], [scenes[i] for i in kept])
+    expected = bootstrap_mean(a[kept], [scenes[i] for i in kept])
+    assert interval(some, scenes) == expected
+    percent = interval(some, scenes, PERCENT)
+    assert percent is not None
+    assert (percent.value, percent.low, percent.high) == tuple(
+        PERCENT * end for end in (expected.value, expected.low, expected.high)
+    )
+    assert difference(some, b, scenes) == mean_difference(a[kept], b[kept], [scenes[i] for i in kept])
+    assert difference(b, some, scenes) == mean_difference(b[kept], a[kept], [scenes[i] for i in kept])
     nothing = np.full(30, math.nan)
     assert interval(nothing, scenes) is None
     assert difference(nothing, b, scenes) is None
     assert f"{expected:.1f}" == f"{expected.value:.1f} [{expected.low:.1f}, {expected.high:.1f}]"
+
+
+def test_shares_have_the_intervals_of_shares_over_several_seeds_too() -> None:
+    """As every run's summary; the mean over equal seeds is one seed."""
+    nsgd = np.random.default_rng(2).uniform(0, 0.1, (2, 40))
+    scenes = [f"s{i % 8}" for i in range(40)]
+    a, b = (recalled(e) for e in nsgd)
+    assert interval(a, scenes, share=True) == share_interval(nsgd[0] < 0.05, scenes)
+    assert difference(a, b, scenes, share=True) == share_difference(nsgd[0] < 0.05, nsgd[1] < 0.05, scenes)
+    twice = recalled(np.stack([nsgd[0], nsgd[0]]))
+    assert interval(twice, scenes, share=True) == interval(a, scenes, share=True)
+    both = recalled(nsgd)
+    found = difference(both, b, scenes, share=True)
+    assert found is not None
+    assert found.low < found.value == pytest.approx((a.mean() - b.mean()) / 2) < found.high
 
 
 def test_what_intervals_resample_is_said() -> None:
