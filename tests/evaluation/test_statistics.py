@@ -72,7 +72,8 @@ def test_shares_have_the_intervals_of_shares_over_several_seeds_too() -> None:
     both = recalled(nsgd)
     found = difference(both, b, scenes, share=True)
     assert found is not None
-    assert found.low < found.value == pytest.approx((a.mean() - b.mean()) / 2) < found.high
+    assert found.value == pytest.approx((a.mean() - b.mean()) / 2)
+    assert found.low < found.value < found.high
 
 
 def test_what_intervals_resample_is_said() -> None:
