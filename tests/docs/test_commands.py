@@ -97,7 +97,9 @@ def smaller(command: str) -> list[str]:
         (r"FOLDER", "kept"),
         (r" root=DIR", ""),
         (r" d\.json", ""),
-        (r"runs=\[runs/a,runs/b\]", "runs=[runs/fmbench]"),
+        (r"runs=\[runs/a,runs/b\]|runs/a runs/b", "runs=[runs/fmbench]"),
+        (r" 'root=\[\S*\]'", ""),
+        (r"^fmtorch (\w+)", r"python -m fmtorch.\1"),
     ):
         text = re.sub(pattern, replacement, text)
     words = shlex.split(text)
@@ -212,6 +214,8 @@ def run_all(some: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setenv("FMTORCH_CACHE", str(workplace / "cache"))
     for command in some:
         print(command)
+        if "report" in command and not (workplace / "runs").exists():
+            run(smaller("python -m fmtorch.eval pipeline=sift_ratio"), workplace)
         run(smaller(command), workplace)
 
 
