@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import functools
-import inspect
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar, cast
+import math
+import operator
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -19,7 +20,6 @@ Arrays = Array | Sequence[Any]
 """One array, or a list of them: of pairs of different lengths."""
 
 PER_MATCH = {"mask": 1, "quality": 1, "prior": 1, "noise": 1, "lafs0": 3, "lafs1": 3}  # dimensions, of one pair
-Result = TypeVar("Result")
 
 
 def as_tensor(value: Any, name: str) -> Tensor:
@@ -46,27 +46,23 @@ def as_tensor(value: Any, name: str) -> Tensor:
     return torch.from_numpy(array if array.flags.writeable else array.copy())
 
 
-def takes_arrays(function: Callable[..., Result]) -> Callable[..., Result]:
-    """The function with NumPy arrays, and for sizes tuples, where it takes tensors; its results stay tensors."""
-    names = list(inspect.signature(function).parameters)
-
-    def converted(name: str, value: Any, device: torch.device) -> Any:
-        array = isinstance(value, np.ndarray | np.generic)
-        size = name.startswith("size") and isinstance(value, list | tuple)
-        return as_tensor(value, name).to(device) if array or size else value
-
-    @functools.wraps(function)
-    def taking(*args: Any, **options: Any) -> Result:
-        values = [*args, *options.values()]
-        if all(isinstance(value, Tensor) for value in values):
-            return function(*args, **options)
-        device = next((value.device for value in values if isinstance(value, Tensor)), torch.device("cpu"))
-        args = (
-            tuple(converted(name, value, device) for name, value in zip(names, args, strict=False)) + args[len(names) :]
-        )
-        return function(*args, **{name: converted(name, value, device) for name, value in options.items()})
-
-    return taking
+def number(name: str, value: Any, whole: bool) -> Any:
+    """A number, not NaN; what has one element may be one. Raises TypeError or ValueError naming the argument."""
+    if isinstance(value, bool | np.bool_ | str | bytes | complex | np.complexfloating):
+        raise TypeError(f"{name} is {value!r}; it must be a {'whole ' if whole else ''}number")
+    if isinstance(value, int | float):
+        plain: Any = value
+    else:
+        try:
+            plain = operator.index(value) if whole else float(value)
+        except (TypeError, ValueError, RuntimeError, OverflowError):
+            said = "whole number" if whole else "number"
+            raise TypeError(f"{name} is a {type(value).__name__}; it must be a {said}") from None
+    if whole and not isinstance(plain, int):
+        raise TypeError(f"{name} is {value!r}; it must be a whole number")
+    if math.isnan(plain):
+        raise ValueError(f"{name} is nan; it must be a number")
+    return value if isinstance(value, int | float) else plain
 
 
 def correspondences(x0: Arrays, x1: Arrays, **fields: Any) -> Correspondences:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from fmtorch import presets
-from fmtorch.arguments import Arrays, correspondences
+from fmtorch.arguments import Arrays, correspondences, number
 from fmtorch.stages import Estimator, Pruner
 from fmtorch.threads import one_thread
 from fmtorch.types import Estimate
@@ -70,6 +70,7 @@ def find_fundamental(
         size1=size1, key=key,
     )  # fmt: skip
     expect_values(c)
+    seed = int(number("seed", seed, whole=True))
     chosen = _estimator(estimator, config_dir, options)
     if prior is None and getattr(chosen, "uses_prior", False):
         framed = c.lafs0 is not None and c.lafs1 is not None and c.quality is not None

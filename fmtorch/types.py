@@ -19,6 +19,14 @@ from torch import Tensor
 Index = int | slice | Sequence[int] | Sequence[bool] | Tensor
 Record = TypeVar("Record", bound="_Record")
 
+FLOATING, WHOLE, REAL, BOOLEAN = "floating-point numbers", "whole numbers", "real numbers", "booleans"
+NUMBERS = {
+    **dict.fromkeys(("mask", "mutual", "inliers", "ok"), BOOLEAN),
+    **dict.fromkeys(("key", "draws", "image_size", "label"), WHOLE),
+    **dict.fromkeys(("size0", "size1"), REAL),
+}
+"""What the elements of a field are, where not floating-point numbers."""
+
 
 def pair_key(identity: str) -> int:
     """The stable signed 64-bit key of a pair's identity (blake2b), which selects its random streams."""
@@ -83,8 +91,33 @@ def _as_index(index: Index, length: int) -> slice | Tensor:
     return torch.as_tensor(chosen, dtype=torch.bool if is_mask else torch.int64)
 
 
-def _expect(name: str, value: Tensor | None, shape: tuple[int, ...]) -> None:
-    if value is not None and tuple(value.shape) != shape:
+def _expect(name: str, value: Tensor | None, shape: tuple[int, ...], device: torch.device | None = None) -> None:
+    """Raises TypeError or ValueError for what is no tensor of this shape, of the field's numbers, on the device."""
+    if value is None:
+        return
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name} is a {type(value).__name__}; it must be a tensor")
+    if tuple(value.shape) != shape:
+        raise ValueError(f"{name} has shape {tuple(value.shape)}; it must be {shape}")
+    if device is not None and value.device != device:
+        raise ValueError(f"{name} is on {value.device} and another field on {device}; all must be on one device")
+    wanted, kind = NUMBERS.get(name, FLOATING), _numbers(value)
+    if kind != wanted and not (wanted == REAL and kind in (FLOATING, WHOLE)):
+        raise ValueError(f"{name} is of {value.dtype}; it must hold {wanted}")
+
+
+def _numbers(value: Tensor) -> str:
+    """What a tensor's elements are."""
+    if value.dtype == torch.bool:
+        return BOOLEAN
+    return FLOATING if value.is_floating_point() else "complex numbers" if value.is_complex() else WHOLE
+
+
+def _expect_dimensions(name: str, value: Tensor, *numbers: int, shape: str) -> None:
+    """Raises TypeError or ValueError unless the value is a tensor of one of these numbers of dimensions."""
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name} is a {type(value).__name__}; it must be a tensor")
+    if value.dim() not in numbers:
         raise ValueError(f"{name} has shape {tuple(value.shape)}; it must be {shape}")
 
 
@@ -104,14 +137,17 @@ class Features(_Record):
     mask: Bool[Tensor, "*batch n"] | None = None
 
     def __post_init__(self) -> None:
+        _expect_dimensions("lafs", self.lafs, 3, 4, shape="(N, 2, 3), or (B, N, 2, 3) of a batch")
+        _expect_dimensions("descriptors", self.descriptors, 2, 3, shape="(N, D), or (B, N, D) of a batch")
         batch_n = tuple(self.lafs.shape[:-2])
         _expect("lafs", self.lafs, (*batch_n, 2, 3))
-        _expect("scores", self.scores, batch_n)
-        _expect("descriptors", self.descriptors, (*batch_n, self.descriptors.shape[-1]))
-        _expect("image_size", self.image_size, (*batch_n[:-1], 2))
+        device = self.lafs.device
+        _expect("scores", self.scores, batch_n, device)
+        _expect("descriptors", self.descriptors, (*batch_n, self.descriptors.shape[-1]), device)
+        _expect("image_size", self.image_size, (*batch_n[:-1], 2), device)
         if self.mask is None:
-            object.__setattr__(self, "mask", torch.ones(batch_n, dtype=torch.bool, device=self.lafs.device))
-        _expect("mask", self.mask, batch_n)
+            object.__setattr__(self, "mask", torch.ones(batch_n, dtype=torch.bool, device=device))
+        _expect("mask", self.mask, batch_n, device)
 
     @property
     def keypoints(self) -> Float[Tensor, "*batch n 2"]:
@@ -164,19 +200,20 @@ class Correspondences(_Record):
     noise: Float[Tensor, "b n"] | None = None
 
     def __post_init__(self) -> None:
-        if self.x0.dim() != 3 or self.x0.shape[-1] != 2:
-            raise ValueError(f"x0 has shape {tuple(self.x0.shape)}; it must be (B, N, 2)")
+        _expect_dimensions("x0", self.x0, 3, shape="(B, N, 2)")
+        _expect_dimensions("x1", self.x1, 3, shape="(B, N, 2)")
+        _expect_dimensions("mask", self.mask, 2, shape="(B, N)")
         b, n = self.x0.shape[:2]
         if self.key is None:
             object.__setattr__(self, "key", torch.zeros(b, dtype=torch.int64, device=self.x0.device))
         shapes = {
-            "x1": (b, n, 2), "mask": (b, n), "quality": (b, n), "prior": (b, n),
+            "x0": (b, n, 2), "x1": (b, n, 2), "mask": (b, n), "quality": (b, n), "prior": (b, n),
             "lafs0": (b, n, 2, 3), "lafs1": (b, n, 2, 3), "size0": (b, 2), "size1": (b, 2),
             "K0": (b, 3, 3), "K1": (b, 3, 3), "key": (b,), "mutual": (b, n),
             "noise": (b, n),
         }  # fmt: skip
         for name, shape in shapes.items():
-            _expect(name, getattr(self, name), shape)
+            _expect(name, getattr(self, name), shape, self.x0.device)
         if (self.size0 is None) != (self.size1 is None):
             known, missing = ("size1", "size0") if self.size0 is None else ("size0", "size1")
             raise ValueError(f"{known} is given but {missing} is not; give the sizes of both images, or of neither")
@@ -233,6 +270,8 @@ class Estimate(_Record):
     draws: Int[Tensor, " b"]
 
     def __post_init__(self) -> None:
+        _expect_dimensions("F", self.F, 3, shape="(B, 3, 3)")
+        _expect_dimensions("inliers", self.inliers, 2, shape="(B, N)")
         b = self.F.shape[0]
         _expect("F", self.F, (b, 3, 3))
         _expect("inliers", self.inliers, (b, self.inliers.shape[-1]))

@@ -119,7 +119,12 @@ def reweighted_fits(
     Returns:
         The fits in float64. One that its weights do not determine, as when fewer than eight matches count or a weight
         is negative or not finite, is not valid and repeats the last one that was, or zero.
+
+    Raises:
+        ValueError: iterations below 1.
     """
+    if iterations < 1:
+        raise ValueError(f"iterations is {iterations}; it must be at least 1")
     first = torch.zeros(len(x0), 3, 3, dtype=torch.float64, device=x0.device) if F0 is None else F0.to(torch.float64)
     problem = NormalizedMatches(x0, x1, None, mask, first, 1.0)
     clean0, clean1 = (torch.where(problem.counts[..., None], x, 0).to(torch.float64) for x in (x0, x1))

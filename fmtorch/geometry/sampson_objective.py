@@ -50,7 +50,7 @@ class Objective:
         robust: Kernel,
         scale: Float[Tensor, " p"] | Float[Tensor, "p slots"],
     ) -> None:
-        s2 = scale.square().reshape(len(scale), -1)
+        s2 = scale.square() if scale.dim() > 1 else scale.square()[:, None]
         if s2.shape[1] > 1:
             s2 = torch.nn.functional.pad(s2, (0, -s2.shape[1] % LANES), value=1)
             self.s2 = s2.reshape(len(s2), -1, 1, LANES).transpose(0, 1).contiguous()
@@ -68,7 +68,7 @@ class Objective:
         Blocks are added one after the other, so zeros at the end change nothing.
         """
         p, k = F.shape[1:]
-        pairs = max(1, TILE_MODELS // k)
+        pairs = max(1, TILE_MODELS // max(1, k))
         if p <= pairs and k <= TILE_MODELS:
             return self._tile(F, slice(None), derivatives)
         rows = 10 if derivatives else 0
@@ -82,7 +82,7 @@ class Objective:
 
     def _tile(self, F: Tensor, pairs: slice, derivatives: bool) -> tuple[Tensor, Tensor]:
         points, weight, s2 = self.points[:, :, :, pairs], self.weight[:, pairs], self.s2[:, pairs]
-        count = max(1, TILE_ELEMENTS // (F[0].numel() * LANES))
+        count = max(1, TILE_ELEMENTS // (max(1, F[0].numel()) * LANES))
         products, costs = [], []
         for first in range(0, len(weight), count):
             some = slice(first, first + count)

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
-from fmtorch.arguments import takes_arrays
-from fmtorch.geometry import epipolar_distances
+from fmtorch.checked import checked
+from fmtorch.geometry.epipolar import epipolar_distances
 from fmtorch.metrics.draws import diagonal
 from fmtorch.validation import expect_sizes
 
@@ -23,7 +23,7 @@ class InlierRate(NamedTuple):
     after: Tensor
 
 
-@takes_arrays
+@checked
 def inlier_rate(
     F_gt: Float[Tensor, "*#batch 3 3"],
     x0: Float[Tensor, "*#batch n 2"],
@@ -46,7 +46,7 @@ def inlier_rate(
     return InlierRate(_share(correct, given), _share(correct & kept, kept))
 
 
-@takes_arrays
+@checked
 def ground_truth_inliers(
     F_gt: Float[Tensor, "*#batch 3 3"],
     x0: Float[Tensor, "*#batch n 2"],

@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
-from fmtorch.arguments import takes_arrays
+from fmtorch.checked import checked
 from fmtorch.geometry.epipolar import lines_through, residual_and_normals, unit_largest
 from fmtorch.metrics.draws import Pairs, diagonal, mean_terms, segment_in_image
 
@@ -28,7 +28,7 @@ BORDER = -0.5  # left and top edge of the first pixel
 NORMAL_FLOOR = 1e-12  # length of a normal, for F of unit size, that is as good as none: its line is at infinity
 
 
-@takes_arrays
+@checked
 def sgd(
     F_gt: Float[Tensor, "*#batch 3 3"],
     F_est: Float[Tensor, "*#batch 3 3"],
@@ -44,7 +44,7 @@ def sgd(
     return _mean_distance(torch.ones_like, F_gt, F_est, size0, size1, samples, seed, key, cap)
 
 
-@takes_arrays
+@checked
 def nsgd(
     F_gt: Float[Tensor, "*#batch 3 3"],
     F_est: Float[Tensor, "*#batch 3 3"],

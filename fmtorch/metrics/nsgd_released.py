@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Int, Real
 from torch import Tensor
 
-from fmtorch.arguments import takes_arrays
+from fmtorch.checked import checked
 from fmtorch.geometry.epipolar import lines_through
 from fmtorch.metrics.draws import Pairs, diagonal, mean_terms, segment_in_image
 
@@ -24,7 +24,7 @@ BORDER = 0.5  # left and top edge of the first pixel where pixels count from 1
 NORMAL_OFFSET = 1e-10
 
 
-@takes_arrays
+@checked
 @torch.no_grad()
 def nsgd_released(
     F_gt: Float[Tensor, "*#batch 3 3"],

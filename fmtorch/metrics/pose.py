@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.arguments import takes_arrays
+from fmtorch.checked import checked
 from fmtorch.geometry.epipolar import inverse_root
 
 
@@ -25,7 +25,7 @@ class PoseError(NamedTuple):
         return torch.maximum(self.rotation, self.translation)
 
 
-@takes_arrays
+@checked
 def pose_error(
     R_est: Float[Tensor, "*#batch 3 3"],
     t_est: Float[Tensor, "*#batch 3"],
@@ -61,15 +61,17 @@ def pose_error(
     return PoseError(torch.where(usable, rotation, 180.0), translation)
 
 
-@takes_arrays
+@checked
 def pose_auc(
     errors: Float[Tensor, "*batch pairs"], thresholds: Sequence[float | int] = (5, 10, 20)
 ) -> Float[Tensor, "*batch t"]:
     """Area under the recall curve of pose errors up to each threshold in degrees, divided by the threshold.
 
     As SuperGlue and LoFTR compute it: the curve rises linearly between sorted errors, from recall 0 at error 0. NaN
-    and infinity count as misses.
+    and infinity count as misses. Raises ValueError unless the thresholds are positive.
     """
+    if not thresholds or not all(threshold > 0 for threshold in thresholds):
+        raise ValueError(f"thresholds are {tuple(thresholds)}; they must be positive, and at least one")
     pairs = errors.shape[-1]
     errors = torch.where(errors.isnan(), torch.inf, errors).sort(dim=-1).values
     step = torch.arange(1, pairs + 1, dtype=errors.dtype, device=errors.device) / pairs

@@ -6,20 +6,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.arguments import takes_arrays
+from fmtorch.checked import checked
 
 THRESHOLD = 0.05  # NSGD below which an estimate counts as recalled (Bian et al., BMVC 2019)
 FINE_THRESHOLD = 0.01  # NSGD below which it counts as accurate
 CURVE = (0.0, 0.2, 20)  # first and last threshold and their number, as in the paper's curves
 
 
-@takes_arrays
+@checked
 def recall(nsgd: Float[Tensor, "*batch pairs"], threshold: float = THRESHOLD) -> Float[Tensor, "*batch"]:
     """Share of all pairs with NSGD strictly below the threshold; NaN, a failure, counts as a miss."""
     return (nsgd < threshold).to(nsgd.dtype).mean(-1)
 
 
-@takes_arrays
+@checked
 def recall_curve(
     nsgd: Float[Tensor, "*batch pairs"], thresholds: Float[Tensor, " t"] | None = None
 ) -> Float[Tensor, "*batch t"]:
@@ -30,15 +30,17 @@ def recall_curve(
     return (nsgd[..., None, :] < thresholds[:, None]).to(nsgd.dtype).mean(-1)
 
 
-@takes_arrays
+@checked
 def mean_recall(nsgd: Float[Tensor, "*batch pairs"], maximum: float = THRESHOLD) -> Float[Tensor, "*batch"]:
     """Mean of `recall` over thresholds from 0 to `maximum`: the exact area under its step curve over `maximum`.
 
     With the default this is AUC@0.05.
 
     A pair with NSGD e is recalled on the share max(0, 1 - e / maximum) of the thresholds, so the figure is the mean of
-    that over pairs, and differentiable in e. NaN counts as a miss.
+    that over pairs, and differentiable in e. NaN counts as a miss. Raises ValueError unless `maximum` is positive.
     """
+    if not maximum > 0:
+        raise ValueError(f"maximum is {maximum}; it must be positive")
     missed = nsgd.isnan()
     share = (1 - torch.where(missed, maximum, nsgd) / maximum).clamp(min=0.0)
     return share.mean(-1)

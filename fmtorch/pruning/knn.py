@@ -37,7 +37,7 @@ def by_tree(queries: Float[Tensor, "n 2"], points: Float[Tensor, "m 2"], count: 
     The tree breaks ties in no fixed order: so more neighbours are asked for, until the last is farther than the ones
     that are wanted, and what one attempt with many does not settle is searched exhaustively.
     """
-    at, places = queries.numpy(), points.numpy()
+    at, places = queries.detach().numpy(), points.detach().numpy()
     tree = KDTree(places)
     found = np.empty((len(at), count), np.int64)
     todo = np.arange(len(at))

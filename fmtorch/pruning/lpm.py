@@ -32,7 +32,7 @@ def lpm(
     neighbour that does not exist, where matches are few, counts as lost.
 
     Points in any common unit. Non-finite points are dropped. Memory is linear in the number of matches. Raises
-    ValueError for K below 4.
+    ValueError for K below 4, and for options of different lengths.
     """
     kept = torch.zeros(x0.shape[:2], dtype=torch.bool, device=x0.device)
     for pair, match, passes in _passes(x0, x1, mask, thresholds, neighbors, taus):
@@ -69,6 +69,10 @@ def _passes(
     taus: Sequence[float],
 ) -> Iterator[tuple[int, Int[Tensor, " n"], list[Float[Tensor, " n"]]]]:
     """Of each pair its live matches and, for every pass that there was, the mean cost of each of them."""
+    passes = {"thresholds": len(thresholds), "neighbors": len(neighbors), "taus": len(taus)}
+    if len(set(passes.values())) > 1 or not thresholds:
+        said = ", ".join(f"{name} has {count}" for name, count in passes.items())
+        raise ValueError(f"{said} values; they must have one for each pass, and there must be a pass")
     if min(neighbors) < 4:
         raise ValueError(f"neighbors is {neighbors}; each must be at least 4, so that the smallest neighbourhood has 2")
     alive = torch.isfinite(x0).all(-1) & torch.isfinite(x1).all(-1)
@@ -76,12 +80,12 @@ def _passes(
     for pair, here in enumerate(alive):
         points = torch.stack([x0[pair][here], x1[pair][here]]).double()
         members = torch.arange(points.shape[1], device=points.device)
-        passes: list[Tensor] = []
+        costs: list[Tensor] = []
         for threshold, K, tau in zip(thresholds, neighbors, taus, strict=True):
-            if not passes or len(members) >= K + 4:
-                passes.append(_cost(points, members, K, tau) / 3)
-                members = (passes[-1] <= threshold).nonzero()[:, 0]
-        yield pair, here.nonzero()[:, 0], passes
+            if not costs or len(members) >= K + 4:
+                costs.append(_cost(points, members, K, tau) / 3)
+                members = (costs[-1] <= threshold).nonzero()[:, 0]
+        yield pair, here.nonzero()[:, 0], costs
 
 
 def _cost(points: Float[Tensor, "2 n 2"], members: Int[Tensor, " m"], K: int, tau: float) -> Float[Tensor, " n"]:

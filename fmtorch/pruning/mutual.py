@@ -14,11 +14,13 @@ def mutual(
 ) -> Bool[Tensor, "b n0"]:
     """True for a feature i of image 0 whose match j = index[i] is matched back to it, reverse[j] = i.
 
-    Negative entries are features without a match.
+    Negative entries are features without a match. Raises ValueError for a feature of image 1 that there is not.
     """
     if reverse.shape[-1] == 0:
         return torch.zeros_like(index, dtype=torch.bool)
     matched = index >= 0 if mask is None else (index >= 0) & mask
+    if bool((matched & (index >= reverse.shape[-1])).any()):
+        raise ValueError(f"index holds {int(index.max())}, but reverse has {reverse.shape[-1]} features only")
     back = reverse.gather(-1, torch.where(matched, index, 0))
     return matched & (back == torch.arange(index.shape[-1], device=index.device))
 

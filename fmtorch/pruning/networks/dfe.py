@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from fmtorch.geometry import reweighted_fits
+from fmtorch.geometry.irls import reweighted_fits
 from fmtorch.pruning.networks.inputs import MatchInputs
 from fmtorch.pruning.networks.layers import ContextBatchNormReLU, Perceptron, Slots
 from fmtorch.pruning.networks.prediction import Backbone, Prediction

@@ -1,0 +1,43 @@
+"""What the trials share: the process that starts commands, a data set, the runs that nothing disturbs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.reliability.commands import Starter, data_set, evaluation, results
+
+Rows = list[dict[str, object]]
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The whole runs on demand only: ``-m reliability``."""
+    for item in items:
+        chosen = item.config.getoption("markexpr", "")
+        if item.get_closest_marker("reliability") and "reliability" not in chosen:
+            item.add_marker(pytest.mark.skip(reason="a whole trial: -m reliability"))
+
+
+@pytest.fixture(scope="package")
+def starter() -> Iterator[Starter]:
+    """Starts commands."""
+    started = Starter()
+    yield started
+    started.close()
+
+
+@pytest.fixture(scope="package")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data set of nine pairs."""
+    return data_set(tmp_path_factory.mktemp("data") / "Set", scenes=1, images=10)
+
+
+@pytest.fixture(scope="package")
+def truth(starter: Starter, root: Path, tmp_path_factory: pytest.TempPathFactory) -> Rows:
+    """The rows of an evaluation that nothing disturbs."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    done = starter.run(folder, "eval", *evaluation(root, folder / "run"))
+    assert done.status == 0, done.said()
+    return results(folder / "run")

@@ -1,0 +1,402 @@
+"""Generated calls of every public function: a sound result or a clear error, whatever is handed over.
+
+``python -m tests.reliability.generated [--calls 10] [name ...]`` makes so many calls of each subject whose name begins
+with one of the names. It is a program of its own since the test suite checks the shapes of all functions, which users
+do not have. The calls are the same every time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import faulthandler
+import functools
+import inspect
+import json
+import linecache
+import math
+import re
+import sys
+import time
+import typing
+import warnings
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import torch
+from hypothesis import HealthCheck, Phase, given, note, seed, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+import fmtorch
+from fmtorch import geometry, matching, metrics, presets, pruning
+from fmtorch.checked import expectation
+from fmtorch.types import Correspondences, Estimate, Features, collate
+from tests.laws import calibrated, few, quick_pruner
+from tests.reliability.arguments import KINDS, MISTAKES, NUMBERS, SEQUENCES, Scene, batches, scenes
+from tests.reliability.arguments import given as as_given
+
+HOME = str(Path(fmtorch.__file__).parent)
+MINIMAL_SAMPLE = 7
+Call = Callable[[], Any]
+Check = Callable[[Any], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Subject:
+    """What is called: `draw` makes a call, the names that an error may name, and a check of the result."""
+
+    name: str
+    draw: Callable[[st.DataObject], tuple[Call, set[str], Check]]
+
+
+# Arguments ------------------------------------------------------------------------------------------------------------
+
+
+def mistaken(data: st.DataObject, arguments: dict[str, Any], numbers: dict[str, Any], *, movable: bool = True) -> bool:
+    """Spoil some arguments in place, often none; whether any is. movable: devices differ, too."""
+    spoiled = []
+    for _ in range(data.draw(st.sampled_from([0, 0, 1, 1, 1, 2]), label="mistakes")):
+        name = data.draw(st.sampled_from(sorted({**arguments, **numbers})), label="argument")
+        if name in numbers:
+            arguments[name] = data.draw(st.sampled_from(NUMBERS), label="value")
+            spoiled.append(name)
+            continue
+        mistake = data.draw(st.sampled_from(sorted(MISTAKES)), label="mistake")
+        if mistake == "on another device" and not movable:
+            continue
+        others = [value for key, value in arguments.items() if key != name]
+        if mistake == "on another device" and not any(isinstance(value, Tensor) and value.dim() for value in others):
+            continue  # it would be the only one
+        try:
+            arguments[name] = MISTAKES[mistake](arguments[name])
+        except (TypeError, ValueError, AttributeError, IndexError, RuntimeError):
+            continue  # a second mistake that cannot be made of the first one
+        spoiled.append(name)
+    return bool(spoiled)
+
+
+def function_call(function: Callable[..., Any], data: st.DataObject) -> tuple[Call, set[str], Check]:
+    """A call of a function by its annotations."""
+    hints = typing.get_type_hints(function)
+    parameters = inspect.signature(function).parameters
+    wanted = {name: expectation(hints[name]) for name in parameters}
+    single = any("b" in want.shape for want in wanted.values())
+    scene = data.draw(batches() if single else scenes(), label="scene")
+    kind = data.draw(st.sampled_from(KINDS), label="kind")
+    arguments: dict[str, Any] = {}
+    numbers: dict[str, Any] = {}
+    for name, want in wanted.items():
+        if name == "weigh":
+            shape = np.shape(arguments["x0"])[:2]
+            arguments[name] = lambda F, residual: torch.ones(shape)
+        elif want.kind in ("Float", "Bool", "Int", "Real") and not want.number:
+            if not want.optional or data.draw(st.booleans(), label=f"{name} is given"):
+                arguments[name] = as_given(scene.array(name, want.kind, want.shape), kind)
+            elif parameters[name].default is parameters[name].empty:
+                arguments[name] = None
+        elif want.kind.endswith("numbers"):
+            if data.draw(st.booleans(), label=f"{name} is given"):
+                arguments[name] = data.draw(st.sampled_from(SEQUENCES), label=name)
+        elif want.kind in ("int", "float", "str", "bool", "choice") or want.number:
+            numbers[name] = None
+            if parameters[name].default is parameters[name].empty:
+                arguments[name] = 2 if want.kind == "int" else 0.7
+    spoiled = mistaken(data, arguments, numbers)
+    clean = not spoiled and 1e-9 <= scene.scale <= 1e9
+    check = functools.partial(sound_result, function.__name__, clean)
+    return functools.partial(function, **arguments), set(parameters), check
+
+
+UNDEFINED = {"inlier_rate", "recall", "recall_curve", "mean_recall", "pose_auc"}  # NaN of an empty set
+UNIT_INTERVAL = {
+    "nsgd",
+    "nsgd_released",
+    "recall",
+    "recall_curve",
+    "mean_recall",
+    "pose_auc",
+    "inlier_rate",
+    "gms_support",
+}
+NOT_NEGATIVE = {"sampson", "sampson_squared", "epipolar_distances", "symmetric_max", "symmetric_mean", "point_to_line"}
+
+
+def tensors(result: Any) -> Iterator[Tensor]:
+    """The tensors of a result, at any depth."""
+    if isinstance(result, Tensor):
+        yield result
+    elif isinstance(result, tuple | list):
+        for entry in result:
+            yield from tensors(entry)
+
+
+def sound_result(name: str, clean: bool, result: Any) -> None:
+    """What holds of every result; of finite input of a moderate scale also that no NaN comes out."""
+    for value in tensors(result):
+        if not value.is_floating_point() or value.device.type == "meta":
+            continue
+        known = value[~value.isnan()]
+        if name in UNIT_INTERVAL and name != "gms_support":
+            assert bool(((known >= 0) & (known <= 1 + 1e-6)).all()), f"{name} is outside [0, 1]: {known}"
+        if name in NOT_NEGATIVE:
+            assert bool((known >= 0).all()), f"{name} is negative"
+        if clean and name not in UNDEFINED:
+            assert not bool(value.isnan().any()), f"{name} is NaN for finite arguments"
+
+
+# Subjects -------------------------------------------------------------------------------------------------------------
+
+
+def functions(module: ModuleType) -> dict[str, Callable[..., Any]]:
+    """The functions that a package exports."""
+    named = {name: getattr(module, name) for name in module.__all__}
+    return {name: value for name, value in named.items() if inspect.isfunction(value)}
+
+
+FIELDS: Mapping[str, tuple[str, tuple[str, ...]]] = {
+    "x0": ("Float", ("b", "n", "2")), "x1": ("Float", ("b", "n", "2")), "mask": ("Bool", ("b", "n")),
+    "quality": ("Float", ("b", "n")), "prior": ("Float", ("b", "n")), "noise": ("Float", ("b", "n")),
+    "lafs0": ("Float", ("b", "n", "2", "3")), "lafs1": ("Float", ("b", "n", "2", "3")),
+    "size0": ("Real", ("b", "2")), "size1": ("Real", ("b", "2")), "key": ("Int", ("b",)),
+}  # fmt: skip
+REQUIRED = ("x0", "x1", "mask")
+
+
+def fields(data: st.DataObject, scene: Scene, kind: str) -> dict[str, Any]:
+    """Some fields of a batch of correspondences."""
+    values = {}
+    sizes = data.draw(st.booleans(), label="sizes are given")
+    for name, (numbers, shape) in FIELDS.items():
+        wanted = sizes if name.startswith("size") else name in REQUIRED or data.draw(st.booleans(), label=name)
+        if wanted:
+            values[name] = as_given(scene.array(name, numbers, shape), kind)
+    return values
+
+
+def estimation(name: str, options: dict[str, Any], data: st.DataObject) -> tuple[Call, set[str], Check]:
+    """find_fundamental with a preset."""
+    scene = data.draw(batches(), label="scene")
+    arguments = fields(data, scene, data.draw(st.sampled_from(KINDS), label="kind"))
+    if scene.batch == (1,) and data.draw(st.booleans(), label="without the batch dimension"):
+        arguments = {key: value[0] for key, value in arguments.items()}
+    elif data.draw(st.sampled_from([False, False, True]), label="as lists"):
+        per_match = [key for key in arguments if not key.startswith(("size", "key"))]
+        arguments.update({key: list(arguments[key]) for key in per_match})
+    mistaken(data, arguments, {"seed": None}, movable=False)
+    call = functools.partial(fmtorch.find_fundamental, **arguments, estimator=name, **options)
+    return call, {*inspect.signature(fmtorch.find_fundamental).parameters}, sound_estimate
+
+
+def sound_estimate(estimate: Any) -> None:
+    """The promises of `Estimate`: of a pair that is ok a finite F of unit norm with support, of another a reason."""
+    F, ok, reason = estimate.F.detach().double(), estimate.ok, estimate.reason
+    assert F.shape == (len(ok), 3, 3)
+    assert estimate.inliers.dtype == torch.bool
+    for i in range(len(ok)):
+        support = int(estimate.inliers[i].sum())
+        if bool(ok[i]):
+            assert reason[i] == "", f"ok with a reason: {reason[i]}"
+            assert bool(F[i].isfinite().all()), "ok with an F that is not finite"
+            assert math.isclose(float(F[i].norm()), 1, rel_tol=1e-4), f"ok with an F of norm {float(F[i].norm())}"
+            assert support >= MINIMAL_SAMPLE, f"ok with {support} inliers"
+        else:
+            assert reason[i], "not ok without a reason"
+            assert not bool(F[i].any()), "not ok with an F"
+            assert support == 0, f"not ok with {support} inliers"
+
+
+def stage(name: str, built: Any, data: st.DataObject) -> tuple[Call, set[str], Check]:
+    """A pruner's preset on correspondences."""
+    scene = data.draw(batches(), label="scene")
+    kind = data.draw(st.sampled_from(KINDS[:2]), label="kind")
+    arguments = fields(data, scene, kind)
+    if data.draw(st.booleans(), label="mutual"):
+        arguments["mutual"] = arguments["mask"]
+    mistaken(data, arguments, {})
+
+    def call() -> tuple[Correspondences, Correspondences]:
+        c = Correspondences(**arguments)
+        c = calibrated(c) if name.startswith(("lc", "dfe")) else c
+        return c, built(c)
+
+    return call, {*FIELDS, "mutual"}, sound_pruning
+
+
+def sound_pruning(result: Any) -> None:
+    """Of the matches some survive, no others; a prior is a probability."""
+    before, after = result
+    assert after.mask.shape == before.mask.shape
+    assert not bool((after.mask & ~before.mask).any()), "a masked match survives"
+    if after.prior is not None and after.prior is not before.prior:
+        live = after.prior[after.mask]
+        assert bool(((live >= 0) & (live <= 1)).all()), "a prior outside [0, 1]"
+
+
+def record(kind: type, data: st.DataObject) -> tuple[Call, set[str], Check]:
+    """What travels between the stages: made, indexed, joined."""
+    scene = data.draw(batches(), label="scene")
+    library = data.draw(st.sampled_from(["torch.float32", "torch.float64"]), label="kind")
+    if kind is Correspondences:
+        arguments = fields(data, scene, library)
+    else:
+        hints = typing.get_type_hints(kind)
+        wanted = {name: expectation(hint) for name, hint in hints.items()}
+        arguments = {
+            name: as_given(scene.array(name, want.kind, want.shape), library)
+            for name, want in wanted.items()
+            if want.shape and (not want.optional or data.draw(st.booleans(), label=name))
+        }
+        if kind is Estimate:
+            arguments["reason"] = ("",) * len(arguments["F"])
+    mistaken(data, arguments, {})
+
+    def call() -> Any:
+        made: Any = kind(**arguments)
+        if kind is Features and made.lafs.dim() == 3:
+            return collate([made, made])
+        half = made[: max(1, len(made) // 2)] if kind is not Features else made
+        joined = collate([made, half])
+        return joined.compact() if kind is Correspondences else joined
+
+    return call, set(typing.get_type_hints(kind)), lambda result: None
+
+
+IMAGES = ("noise", "flat", "empty", "one pixel", "one row", "huge row", "grey", "rgb", "rgba", "floats", "16 bit", "a list", "None", "a tensor")  # fmt: skip
+
+
+def image(kind: str, seed: int) -> Any:
+    """A picture, or something that a user takes for one."""
+    rng = np.random.default_rng(seed)
+    soft = np.kron(rng.integers(0, 255, (12, 16)), np.ones((8, 8))).astype(np.uint8)
+    return {
+        "noise": rng.integers(0, 255, (60, 80)).astype(np.uint8), "flat": np.full((60, 80), 9, np.uint8),
+        "empty": np.zeros((0, 9), np.uint8), "one pixel": soft[:1, :1], "one row": soft[:1], "grey": soft,
+        "huge row": np.tile(soft[:2], (1, 100)), "rgb": np.dstack([soft] * 3), "rgba": np.dstack([soft] * 4),
+        "floats": soft / 255, "16 bit": soft.astype(np.uint16), "a list": soft.tolist(), "None": None,
+        "a tensor": torch.from_numpy(soft),
+    }[kind]  # fmt: skip
+
+
+def photographs(pipelines: Mapping[str, Any], data: st.DataObject) -> tuple[Call, set[str], Check]:
+    """fmtorch.match on arrays."""
+    images = [image(data.draw(st.sampled_from(IMAGES), label="image"), data.draw(st.integers(0, 3))) for _ in range(2)]
+    pipeline = pipelines[data.draw(st.sampled_from(sorted(pipelines)), label="pipeline")]
+    side = data.draw(st.sampled_from([1600, 1600, 50, 1, 0, -1]), label="longest_side")
+    call = functools.partial(fmtorch.match, *images, pipeline=pipeline, longest_side=side)
+    return call, {*inspect.signature(fmtorch.match).parameters}, sound_match
+
+
+def sound_match(result: Any) -> None:
+    """A matrix or a reason."""
+    assert result.ok == (result.reason == "")
+    assert bool(result.F.isfinite().all())
+    assert bool(result.F.any()) == result.ok
+
+
+def subjects(names: list[str]) -> list[Subject]:
+    """All that is called, of names that begin so."""
+    found = []
+    for module in (geometry, metrics, pruning, matching):
+        short = module.__name__.removeprefix("fmtorch.")
+        for name, function in functions(module).items():
+            found.append(Subject(f"{short}.{name}", functools.partial(function_call, function)))
+    for kind in (Correspondences, Features, Estimate):
+        found.append(Subject(f"types.{kind.__name__}", functools.partial(record, kind)))
+    wanted = [s for s in found if not names or s.name.startswith(tuple(names))]
+    for name in presets.available("estimator"):
+        if not names or f"find_fundamental.{name}".startswith(tuple(names)):
+            options = few(presets.load("estimator", name), 200, 100)
+            wanted.append(Subject(f"find_fundamental.{name}", functools.partial(estimation, name, options)))
+    for name in presets.available("pruner"):
+        if not names or f"pruner.{name}".startswith(tuple(names)):
+            wanted.append(Subject(f"pruner.{name}", functools.partial(stage, name, quick_pruner(name))))
+    if not names or "match".startswith(tuple(names)):
+        off = ["cache=off", "features.max_features=200"]
+        pipelines = {name: presets.pipeline(name, overrides=off) for name in ("sift_gms", "sift_fmtorch")}
+        wanted.append(Subject("match", functools.partial(photographs, pipelines)))
+    return wanted
+
+
+# Outcomes -------------------------------------------------------------------------------------------------------------
+
+
+class Unclear(AssertionError):
+    """An exception that a user cannot make sense of."""
+
+
+def outcome(call: Call, names: set[str], check: Check) -> str:
+    """Make the call: "sound" or "refused". Raises Unclear for any other error, AssertionError for an unsound result."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            warnings.filterwarnings("error", category=RuntimeWarning, module="fmtorch")
+            result = call()
+    except Exception as error:
+        _expect_clear(error, names)
+        return "refused"
+    check(result)
+    return "sound"
+
+
+def _expect_clear(error: Exception, names: set[str]) -> None:
+    """A ValueError or TypeError that this package raises itself, and that names an argument."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    assert trace is not None
+    file, line = trace.tb_frame.f_code.co_filename, trace.tb_lineno
+    ours = file.startswith(HOME) and linecache.getline(file, line).strip().startswith("raise ")
+    named = any(re.search(rf"\b{name}\b", str(error)) for name in names)
+    if not (isinstance(error, ValueError | TypeError) and ours and named):
+        raise Unclear(f"{type(error).__name__} at {file}:{line}: {error}") from error
+
+
+def trial(subject: Subject, calls: int) -> Counter[str]:
+    """Make so many calls of a subject and count what came of them. Raises what hypothesis raises for the first fault."""
+    counted: Counter[str] = Counter()
+
+    @seed(zlib.crc32(subject.name.encode()))
+    @settings(
+        max_examples=calls, deadline=None, database=None, report_multiple_bugs=False,
+        suppress_health_check=list(HealthCheck), phases=[Phase.generate, Phase.shrink],
+    )  # fmt: skip
+    @given(st.data())
+    def one(data: st.DataObject) -> None:
+        call, names, check = subject.draw(data)
+        note(f"{subject.name}: {call}"[:2000])
+        counted[outcome(call, names, check)] += 1
+
+    one()
+    return counted
+
+
+def main() -> None:
+    """The program: a line of JSON a subject; status 1 where one of them has a fault."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("names", nargs="*")
+    parser.add_argument("--calls", type=int, default=10)
+    options = parser.parse_args()
+    faulthandler.enable()
+    torch.set_num_threads(1)
+    faults = 0
+    for subject in subjects(options.names):
+        start = time.process_time()
+        try:
+            counted: Mapping[str, Any] = trial(subject, options.calls)
+        except Exception as error:
+            faults += 1
+            notes = "\n".join(getattr(error, "__notes__", []))
+            counted = {"fault": f"{type(error).__name__}: {error}", "call": notes[-1500:]}
+        line = {"subject": subject.name, **counted, "seconds": round(time.process_time() - start, 2)}
+        print(json.dumps(line), flush=True)
+    sys.exit(1 if faults else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+"""Starts commands quickly: one process imports the libraries, and forks another for each command.
+
+Lines of JSON come in on standard input: ``{"start": [module, arguments ...], "cwd": ..., "log": ..., "environment": {}}``
+is answered by the process's id, ``{"wait": id}`` by its exit status. What is forked runs a module as ``python -m`` does.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import runpy
+import sys
+import traceback
+
+LIBRARIES = (
+    "torch", "kornia", "cv2", "hydra", "omegaconf", "pyarrow.parquet", "matplotlib.figure", "skimage.io", "rich.progress",
+    "scipy.spatial", "lightning", "lightning.pytorch.loggers", "torch.utils.tensorboard",
+)  # fmt: skip
+
+
+def run(job: dict[str, object]) -> None:
+    """In the process that was forked: become the command. Never returns."""
+    status = 1
+    try:
+        log = os.open(str(job["log"]), os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        nothing = os.open(os.devnull, os.O_RDONLY)
+        for descriptor, source in ((0, nothing), (1, log), (2, log)):
+            os.dup2(source, descriptor)
+        os.environ.update(job["environment"])  # type: ignore[call-overload]
+        os.chdir(str(job["cwd"]))
+        module, *arguments = job["start"]  # type: ignore[misc]
+        sys.argv = [module, *arguments]
+        sys.path.insert(0, str(job["cwd"]))
+        before = job.get("before")
+        if before:
+            exec(str(before), {})
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
+        status = 0
+    except SystemExit as end:
+        status = end.code if isinstance(end.code, int) else 0 if end.code is None else 1
+        if isinstance(end.code, str):
+            print(end.code, file=sys.stderr)
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+
+
+def main() -> None:
+    """Serve until standard input is closed."""
+    for name in LIBRARIES:
+        try:
+            importlib.import_module(name)
+        except ImportError:
+            continue
+    for line in sys.stdin:
+        job = json.loads(line)
+        if "wait" in job:
+            _, status = os.waitpid(job["wait"], 0)
+            print(os.waitstatus_to_exitcode(status), flush=True)
+            continue
+        child = os.fork()
+        if child == 0:
+            run(job)
+        print(child, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,173 @@
+"""kill -9 when some results are already on disk: the same command goes on, and ends as if nothing had happened."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable
+from itertools import islice
+from pathlib import Path
+
+import pytest
+
+from tests.reliability.commands import Starter, data_set, delays, evaluation, parts, results
+from tests.reliability.conftest import Rows
+
+EVAL_KILLS, MATCH_KILLS, TRAIN_KILLS, PROCESS_KILLS = (
+    int(number) for number in os.environ.get("FMTORCH_KILLS", "40,20,35,5").split(",")
+)
+TRAIN = [
+    "optimisation.steps=12", "objective.classification_steps=2", "batch=2", "threads=1", "workers=1",
+    "validation.scenes=1", "validation.pairs=2", "validation.every=4", "checkpoint_every=1",
+    "validation.uses.hard.estimator=ransac", "validation.uses.prior.estimator=msac", "augmentation.crop=0",
+    "features.max_features=300", "pruner.lc.network.channels=8", "pruner.lc.network.blocks=2",
+]  # fmt: skip
+
+
+def evaluate_with_kills(
+    starter: Starter, root: Path, folder: Path, kills: int, seed: int, *extra: str
+) -> tuple[int, list[Rows]]:
+    """Evaluate, killed once more rows than before are on disk, and again, until that many kills; the runs' rows."""
+    killed, finished, wait = 0, [], delays(seed)
+    while killed < kills:
+        run_dir = folder / f"run{len(finished)}"
+        while True:
+            before = parts(run_dir)
+            command = starter.start(folder, "eval", *evaluation(root, run_dir, *extra))
+            if killed < kills and command.kill_when(lambda: parts(run_dir) > before, next(wait)):  # noqa: B023
+                killed += 1
+                assert parts(run_dir) >= min(before + 1, 9)
+                continue
+            assert command.wait() == 0, command.said()
+            break
+        finished.append(results(run_dir))
+    return killed, finished
+
+
+def test_an_evaluation_goes_on(starter: Starter, root: Path, truth: Rows, tmp_path: Path) -> None:
+    killed, finished = evaluate_with_kills(starter, root, tmp_path, 3, 0)
+    assert killed == 3
+    assert all(rows == truth for rows in finished)
+
+
+@pytest.mark.reliability
+def test_an_evaluation_goes_on_always(
+    starter: Starter, root: Path, truth: Rows, tmp_path: Path, record_property: Callable[[str, object], None]
+) -> None:
+    killed, finished = evaluate_with_kills(starter, root, tmp_path, EVAL_KILLS, 1)
+    assert all(rows == truth for rows in finished)
+    record_property("kills of eval", killed)
+
+
+@pytest.mark.reliability
+def test_with_processes_none_is_left_behind(
+    starter: Starter, root: Path, truth: Rows, tmp_path: Path, record_property: Callable[[str, object], None]
+) -> None:
+    extra = ("processes=true", "workers=2", "batch=1")
+    killed, finished = evaluate_with_kills(starter, root, tmp_path, PROCESS_KILLS, 2, *extra)
+    assert all(rows == truth for rows in finished)
+    deadline = time.monotonic() + 60
+    while (left := running(str(tmp_path))) and time.monotonic() < deadline:
+        time.sleep(0.5)
+    assert left == []
+    record_property("kills of eval with processes", killed)
+
+
+def running(cwd: str) -> list[str]:
+    """The command lines of the processes that work in a folder."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            if os.readlink(process / "cwd") == cwd:
+                found.append((process / "cmdline").read_text().replace("\0", " "))
+        except OSError:
+            continue
+    return found
+
+
+def match_result(folder: Path) -> dict[str, object]:
+    """What the command for two photographs leaves, without what depends on the time."""
+    result: dict[str, object] = json.loads((folder / "result.json").read_text())
+    pictures = {path.name: path.read_bytes() for path in sorted(folder.glob("*.png"))}
+    return {**{k: v for k, v in result.items() if k != "seconds"}, **pictures}
+
+
+def match_with_kills(starter: Starter, root: Path, folder: Path, kills: int, seed: int) -> int:
+    """Match two photographs, killed once the result is on disk, then to the end; checks that nothing is different."""
+    images = [f"image{i}={root}/scene0/Images/{i:08d}.png" for i in (0, 1)]
+    arguments = ["pipeline=sift_gms", *images]
+    done = starter.run(folder, "match", *arguments, "output=undisturbed")
+    assert done.status == 0, done.said()
+    truth, killed = match_result(folder / "undisturbed"), 0
+    for i, later in enumerate(islice(delays(seed), 10 * kills)):
+        output = folder / f"out{i}"
+        command = starter.start(folder, "match", *arguments, f"output={output}")
+        if not command.kill_when((output / "result.json").exists, later):
+            assert command.wait() == 0, command.said()
+            continue
+        killed += 1
+        json.loads((output / "result.json").read_text())  # whole
+        again = starter.run(folder, "match", *arguments, f"output={output}")
+        assert again.status == 0, again.said()
+        assert match_result(output) == truth
+        if killed == kills:
+            break
+    return killed
+
+
+def test_two_photographs_are_matched_again(starter: Starter, root: Path, tmp_path: Path) -> None:
+    assert match_with_kills(starter, root, tmp_path, 1, 0) == 1
+
+
+@pytest.mark.reliability
+def test_two_photographs_are_matched_again_always(
+    starter: Starter, root: Path, tmp_path: Path, record_property: Callable[[str, object], None]
+) -> None:
+    killed = match_with_kills(starter, root, tmp_path, MATCH_KILLS, 1)
+    assert killed == MATCH_KILLS
+    record_property("kills of match", killed)
+
+
+def trained(folder: Path) -> dict[str, bytes]:
+    """The weights and figures of a training."""
+    return {name: (folder / name).read_bytes() for name in ("lc.safetensors", "validation.json")}
+
+
+def newest(folder: Path) -> int:
+    """The steps of the last checkpoint, -1 where there is none."""
+    return max((int(path.stem.removeprefix("step=")) for path in folder.glob("checkpoints/step=*.ckpt")), default=-1)
+
+
+def train_with_kills(starter: Starter, folder: Path, kills: int, seed: int) -> int:
+    """Train, killed once a later checkpoint is on disk, and again; checks that the weights are no others."""
+    pytest.importorskip("lightning", reason="training needs the extra `train`")
+    root = data_set(folder / "Set", scenes=2, images=4)
+    arguments = ["dataset=fmbench", f"dataset.root={root}", *TRAIN]
+    done = starter.run(folder, "train", *arguments, "output=undisturbed")
+    assert done.status == 0, done.said()
+    truth, killed, wait, count = trained(folder / "undisturbed"), 0, delays(seed), 0
+    while killed < kills:
+        output = folder / f"out{count}"
+        count += 1
+        while True:
+            before = newest(output)
+            command = starter.start(folder, "train", *arguments, f"output={output}")
+            if killed < kills and command.kill_when(lambda: newest(output) > before, next(wait)):  # noqa: B023
+                killed += 1
+                continue
+            assert command.wait() == 0, command.said()
+            break
+        assert trained(output) == truth
+    return killed
+
+
+def test_a_training_goes_on(starter: Starter, tmp_path: Path) -> None:
+    assert train_with_kills(starter, tmp_path, 1, 0) == 1
+
+
+@pytest.mark.reliability
+def test_a_training_goes_on_always(
+    starter: Starter, tmp_path: Path, record_property: Callable[[str, object], None]
+) -> None:
+    record_property("kills of train", train_with_kills(starter, tmp_path, TRAIN_KILLS, 1))
