@@ -45,6 +45,7 @@ HOME = str(Path(fmtorch.__file__).parent)
 MINIMAL_SAMPLE = 7
 Call = Callable[[], Any]
 Check = Callable[[Any], None]
+Draw = Callable[[st.DataObject], tuple[Call, set[str], Check]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +53,7 @@ class Subject:
     """What is called: `draw` makes a call, the names that an error may name, and a check of the result."""
 
     name: str
-    draw: Callable[[st.DataObject], tuple[Call, set[str], Check]]
+    draw: Draw
 
 
 # Arguments ------------------------------------------------------------------------------------------------------------
@@ -93,8 +94,7 @@ def function_call(function: Callable[..., Any], data: st.DataObject) -> tuple[Ca
     numbers: dict[str, Any] = {}
     for name, want in wanted.items():
         if name == "weigh":
-            shape = np.shape(arguments["x0"])[:2]
-            arguments[name] = lambda F, residual: torch.ones(shape)
+            arguments[name] = functools.partial(_alike, np.shape(arguments["x0"])[:2])
         elif want.kind in ("Float", "Bool", "Int", "Real") and not want.number:
             if not want.optional or data.draw(st.booleans(), label=f"{name} is given"):
                 arguments[name] = as_given(scene.array(name, want.kind, want.shape), kind)
@@ -114,17 +114,13 @@ def function_call(function: Callable[..., Any], data: st.DataObject) -> tuple[Ca
 
 
 UNDEFINED = {"inlier_rate", "recall", "recall_curve", "mean_recall", "pose_auc"}  # NaN of an empty set
-UNIT_INTERVAL = {
-    "nsgd",
-    "nsgd_released",
-    "recall",
-    "recall_curve",
-    "mean_recall",
-    "pose_auc",
-    "inlier_rate",
-    "gms_support",
-}
+UNIT_INTERVAL = {"nsgd", "nsgd_released", "recall", "recall_curve", "mean_recall", "pose_auc", "inlier_rate"}
 NOT_NEGATIVE = {"sampson", "sampson_squared", "epipolar_distances", "symmetric_max", "symmetric_mean", "point_to_line"}
+
+
+def _alike(shape: tuple[int, ...], F: Tensor | None, residual: Tensor | None) -> Tensor:
+    """Equal weights for all matches."""
+    return torch.ones(shape)
 
 
 def tensors(result: Any) -> Iterator[Tensor]:
@@ -142,7 +138,7 @@ def sound_result(name: str, clean: bool, result: Any) -> None:
         if not value.is_floating_point() or value.device.type == "meta":
             continue
         known = value[~value.isnan()]
-        if name in UNIT_INTERVAL and name != "gms_support":
+        if name in UNIT_INTERVAL:
             assert bool(((known >= 0) & (known <= 1 + 1e-6)).all()), f"{name} is outside [0, 1]: {known}"
         if name in NOT_NEGATIVE:
             assert bool((known >= 0).all()), f"{name} is negative"
@@ -267,7 +263,10 @@ def record(kind: type, data: st.DataObject) -> tuple[Call, set[str], Check]:
     return call, set(typing.get_type_hints(kind)), lambda result: None
 
 
-IMAGES = ("noise", "flat", "empty", "one pixel", "one row", "huge row", "grey", "rgb", "rgba", "floats", "16 bit", "a list", "None", "a tensor")  # fmt: skip
+IMAGES = (
+    "noise", "flat", "empty", "one pixel", "one row", "huge row", "grey", "rgb", "rgba", "floats", "16 bit", "a list",
+    "None", "a tensor",
+)  # fmt: skip
 
 
 def image(kind: str, seed: int) -> Any:
@@ -301,26 +300,31 @@ def sound_match(result: Any) -> None:
 
 def subjects(names: list[str]) -> list[Subject]:
     """All that is called, of names that begin so."""
-    found = []
+    made: dict[str, Callable[[], Draw]] = {}
     for module in (geometry, metrics, pruning, matching):
         short = module.__name__.removeprefix("fmtorch.")
         for name, function in functions(module).items():
-            found.append(Subject(f"{short}.{name}", functools.partial(function_call, function)))
+            made[f"{short}.{name}"] = functools.partial(functools.partial, function_call, function)
     for kind in (Correspondences, Features, Estimate):
-        found.append(Subject(f"types.{kind.__name__}", functools.partial(record, kind)))
-    wanted = [s for s in found if not names or s.name.startswith(tuple(names))]
+        made[f"types.{kind.__name__}"] = functools.partial(functools.partial, record, kind)
     for name in presets.available("estimator"):
-        if not names or f"find_fundamental.{name}".startswith(tuple(names)):
-            options = few(presets.load("estimator", name), 200, 100)
-            wanted.append(Subject(f"find_fundamental.{name}", functools.partial(estimation, name, options)))
+        options = few(presets.load("estimator", name), 200, 100)
+        made[f"find_fundamental.{name}"] = functools.partial(functools.partial, estimation, name, options)
     for name in presets.available("pruner"):
-        if not names or f"pruner.{name}".startswith(tuple(names)):
-            wanted.append(Subject(f"pruner.{name}", functools.partial(stage, name, quick_pruner(name))))
-    if not names or "match".startswith(tuple(names)):
-        off = ["cache=off", "features.max_features=200"]
-        pipelines = {name: presets.pipeline(name, overrides=off) for name in ("sift_gms", "sift_fmtorch")}
-        wanted.append(Subject("match", functools.partial(photographs, pipelines)))
-    return wanted
+        made[f"pruner.{name}"] = functools.partial(_stage, name)
+    made["match"] = lambda: functools.partial(photographs, {name: _pipeline(name) for name in PIPELINES})
+    return [Subject(name, draw()) for name, draw in made.items() if not names or name.startswith(tuple(names))]
+
+
+PIPELINES = ("sift_gms", "sift_fmtorch")
+
+
+def _pipeline(name: str) -> Any:
+    return presets.pipeline(name, overrides=["cache=off", "features.max_features=200"])
+
+
+def _stage(name: str) -> Draw:
+    return functools.partial(stage, name, quick_pruner(name))
 
 
 # Outcomes -------------------------------------------------------------------------------------------------------------
@@ -358,7 +362,7 @@ def _expect_clear(error: Exception, names: set[str]) -> None:
 
 
 def trial(subject: Subject, calls: int) -> Counter[str]:
-    """Make so many calls of a subject and count what came of them. Raises what hypothesis raises for the first fault."""
+    """Make so many calls of a subject and count what came of them. Raises what the first fault raises."""
     counted: Counter[str] = Counter()
 
     @seed(zlib.crc32(subject.name.encode()))

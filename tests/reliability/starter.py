@@ -1,7 +1,8 @@
 """Starts commands quickly: one process imports the libraries, and forks another for each command.
 
-Lines of JSON come in on standard input: ``{"start": [module, arguments ...], "cwd": ..., "log": ..., "environment": {}}``
-is answered by the process's id, ``{"wait": id}`` by its exit status. What is forked runs a module as ``python -m`` does.
+Lines of JSON come in on standard input: ``{"start": [module, arguments ...], "cwd": ..., "log": ..., "environment":
+{...}, "before": code}`` is answered by the process's id, ``{"wait": id}`` by its exit status. What is forked runs a
+module as ``python -m`` does, after the code.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ import sys
 import traceback
 
 LIBRARIES = (
-    "torch", "kornia", "cv2", "hydra", "omegaconf", "pyarrow.parquet", "matplotlib.figure", "skimage.io", "rich.progress",
-    "scipy.spatial", "lightning", "lightning.pytorch.loggers", "torch.utils.tensorboard",
+    "torch", "kornia", "cv2", "hydra", "omegaconf", "pyarrow.parquet", "matplotlib.figure", "skimage.io",
+    "rich.progress", "scipy.spatial", "lightning", "lightning.pytorch.loggers", "torch.utils.tensorboard",
 )  # fmt: skip
 
 
