@@ -135,7 +135,8 @@ def _of_list(x0: Sequence[Any], x1: Sequence[Any], fields: Mapping[str, Any]) ->
     """A padded batch of pairs of different lengths."""
     count = len(x0)
     for name, value in {"x1": x1, **{name: fields[name] for name in PER_MATCH if fields.get(name) is not None}}.items():
-        if not hasattr(value, "__len__") or len(value) != count:
+        listed = isinstance(value, list | tuple | Tensor | np.ndarray) and getattr(value, "ndim", 1) > 0
+        if not listed or len(cast(Any, value)) != count:
             raise ValueError(f"{name} must be a list of {count} arrays, one for each pair of x0")
     if not count:
         return correspondences(torch.zeros(0, 0, 2), torch.zeros(0, 0, 2))

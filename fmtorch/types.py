@@ -139,6 +139,8 @@ class Features(_Record):
     def __post_init__(self) -> None:
         _expect_dimensions("lafs", self.lafs, 3, 4, shape="(N, 2, 3), or (B, N, 2, 3) of a batch")
         _expect_dimensions("descriptors", self.descriptors, 2, 3, shape="(N, D), or (B, N, D) of a batch")
+        _expect_dimensions("scores", self.scores, 1, 2, shape="(N,), or (B, N) of a batch")
+        _expect_dimensions("image_size", self.image_size, 1, 2, shape="(2,), or (B, 2) of a batch")
         batch_n = tuple(self.lafs.shape[:-2])
         _expect("lafs", self.lafs, (*batch_n, 2, 3))
         device = self.lafs.device
@@ -272,6 +274,8 @@ class Estimate(_Record):
     def __post_init__(self) -> None:
         _expect_dimensions("F", self.F, 3, shape="(B, 3, 3)")
         _expect_dimensions("inliers", self.inliers, 2, shape="(B, N)")
+        _expect_dimensions("ok", self.ok, 1, shape="(B,)")
+        _expect_dimensions("draws", self.draws, 1, shape="(B,)")
         b = self.F.shape[0]
         _expect("F", self.F, (b, 3, 3))
         _expect("inliers", self.inliers, (b, self.inliers.shape[-1]))

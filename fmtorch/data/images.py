@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 import zlib
 from collections.abc import Iterator
@@ -11,14 +12,20 @@ import cv2
 import kornia_rs
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from fmtorch.data.pairs import ImageSource
 
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _JPEG_MARKER = re.compile(rb"\xff+([^\x00\xff\xd0-\xd7])", re.DOTALL)
 _END_OF_IMAGE, _START_OF_IMAGE = 0xD9, 0xD8
+_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # of any coding; the three are tables and an extension
 _HUFFMAN_FRAMES = (0xC0, 0xC1, 0xC2)  # baseline, extended sequential, progressive
 _TurboJpeg = getattr(kornia_rs, "io", kornia_rs).ImageDecoder  # where it is depends on the version
+
+
+MAX_PIXELS = 2**28
+"""Larger images are refused by their headers: a few kilobytes may claim gigabytes. The largest sensors have 2e8."""
 
 
 class ImageError(ValueError):
@@ -30,8 +37,8 @@ def read_image(source: ImageSource | Path | str, *, orient: bool = False) -> NDA
 
     Any format OpenCV decodes; 16 bits are reduced to 8, transparency is dropped.
     orient: turn the image as its EXIF orientation says. Off by default: ground truth is given for the pixels as stored.
-    Raises ImageError for a file that is missing, empty, truncated, corrupt or no image: OpenCV alone makes up what is
-    missing or damaged and says nothing, or but a line on the standard error output.
+    Raises ImageError for a file that is missing, empty, truncated, corrupt, no image, or of more than `MAX_PIXELS`:
+    OpenCV alone makes up what is missing or damaged and says nothing, or but a line on the standard error output.
     """
     path = source.path if isinstance(source, ImageSource) else Path(source)
     try:
@@ -41,6 +48,7 @@ def read_image(source: ImageSource | Path | str, *, orient: bool = False) -> NDA
     if not data:
         raise ImageError(f"{path}: the file is empty; it must be a complete image")
     _expect_complete(path, data)
+    _expect_moderate(path, data)
     flags = cv2.IMREAD_ANYCOLOR | (0 if orient else cv2.IMREAD_IGNORE_ORIENTATION)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -66,6 +74,31 @@ def _expect_complete(path: Path, data: bytes) -> None:
         fault = _png_fault(data)
         if fault:
             raise ImageError(f"{path}: {fault}; copy it again")
+
+
+def _expect_moderate(path: Path, data: bytes) -> None:
+    """Raises ImageError for an image whose header tells of more than `MAX_PIXELS`."""
+    if data.startswith(_PNG):
+        sizes = [(data[16:20], data[20:24])]  # IHDR comes first
+    elif data.startswith(_JPEG):
+        frames = (at for marker, at in _jpeg_segments(data) if marker in _FRAMES)
+        sizes = [(data[at + 5 : at + 7], data[at + 3 : at + 5]) for at in frames]
+    else:
+        _expect_moderate_rarity(path, data)
+        return
+    for width, height in ((int.from_bytes(w, "big"), int.from_bytes(h, "big")) for w, h in sizes):
+        if width * height > MAX_PIXELS:
+            raise ImageError(f"{path}: {width} x {height} px; it must have at most {MAX_PIXELS} pixels, reduce it")
+
+
+def _expect_moderate_rarity(path: Path, data: bytes) -> None:
+    """The same for other formats, of which Pillow reads the header; its own limit is 1.8e8 pixels."""
+    try:
+        Image.open(io.BytesIO(data)).close()
+    except Image.DecompressionBombError as error:
+        raise ImageError(f"{path}: {error}; it must have fewer pixels, reduce it") from error
+    except Exception:  # what is no image to Pillow may be one to OpenCV, which is asked next
+        return
 
 
 def _jpeg_ends(data: bytes) -> bool:

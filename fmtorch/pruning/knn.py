@@ -14,6 +14,7 @@ _LEAF = 16  # points a leaf
 _LEAVES = 12  # leaves that are searched for the points of a leaf; what they do not settle is searched exhaustively
 _DISTANCES_CPU, _DISTANCES_GPU = 2**18, 2**26  # distances that exist at a time
 _ATTEMPT = 8  # times as many neighbours as are wanted are asked of the tree where ties are not settled
+_LARGEST = 1e150  # coordinate whose square is surely a number
 _ROUNDING = 1 + 1e-14  # of squared distances, in the tree's arithmetic and in ours
 
 
@@ -26,9 +27,19 @@ def nearest_points(queries: Float[Tensor, "n 2"], points: Float[Tensor, "m 2"], 
     found = torch.full((len(queries), count), -1, device=queries.device)
     wanted = min(count, len(points))
     if wanted and len(queries):
+        queries, points = _in_range(queries.detach().double(), points.detach().double())
         search = by_tree if queries.device.type == "cpu" else by_leaves
-        found[:, :wanted] = search(queries.double(), points.double(), wanted)
+        found[:, :wanted] = search(queries, points, wanted)
     return found
+
+
+def _in_range(queries: Float[Tensor, "n 2"], points: Float[Tensor, "m 2"]) -> tuple[Tensor, Tensor]:
+    """Both, divided by a power of two where squares of their coordinates would overflow."""
+    largest = max(float(x.abs().max()) for x in (queries, points))
+    if not _LARGEST < largest < math.inf:
+        return queries, points
+    exponent = math.frexp(largest)[1]
+    return queries * 0.5**exponent, points * 0.5**exponent
 
 
 def by_tree(queries: Float[Tensor, "n 2"], points: Float[Tensor, "m 2"], count: int) -> Int[Tensor, "n count"]:
@@ -37,7 +48,7 @@ def by_tree(queries: Float[Tensor, "n 2"], points: Float[Tensor, "m 2"], count: 
     The tree breaks ties in no fixed order: so more neighbours are asked for, until the last is farther than the ones
     that are wanted, and what one attempt with many does not settle is searched exhaustively.
     """
-    at, places = queries.detach().numpy(), points.detach().numpy()
+    at, places = queries.numpy(), points.numpy()
     tree = KDTree(places)
     found = np.empty((len(at), count), np.int64)
     todo = np.arange(len(at))

@@ -3,7 +3,7 @@
 ::
 
     run.json               the identity; written first, never changed
-    pairs/part-*.parquet   rows of `PAIR_SCHEMA`; any number of processes may add parts
+    pairs/part-*.parquet   rows of `PAIR_SCHEMA`; any number of processes may add parts; a name ends with a digest
     summary.json, summary.md
 """
 
@@ -112,6 +112,11 @@ class RunFolder:
             raise RunFolderError(
                 f"{file} has format {stored.get('format')}, this version reads {formats}; choose another run_dir"
             )
+        if stored["format"] == FORMAT and stored.get("identity") != identity_digest(stored["config"]):
+            raise RunFolderError(
+                f"{file} was changed: its identity is not that of its config; put it back as it was, or delete the "
+                "folder and run again"
+            )
         return cls(Path(path), stored["config"], stored["format"])
 
     @property
@@ -123,10 +128,13 @@ class RunFolder:
         """Add results, as a new part that is either whole or absent. Safe with several processes."""
         if not rows:
             return
+        sink = pa.BufferOutputStream()
+        pq.write_table(to_table(rows), sink)
+        data = sink.getvalue().to_pybytes()
         # Parts sort by the time they were written; the second half keeps simultaneous writers apart.
-        name = f"part-{time.time_ns():020d}-{uuid.uuid4().hex[:8]}.parquet"
+        name = f"part-{time.time_ns():020d}-{uuid.uuid4().hex[:8]}-{_content_digest(data)}.parquet"
         with replacing(self.path / "pairs" / name) as temporary:
-            pq.write_table(to_table(rows), temporary)
+            temporary.write_bytes(data)
 
     def done(self) -> set[int]:
         """The keys of the pairs that have a result."""
@@ -156,7 +164,11 @@ class RunFolder:
         """The parts in the order they were written; of a part's columns only those asked for."""
         for file in sorted((self.path / "pairs").glob("part-*.parquet")):
             try:
-                with pq.ParquetFile(file) as parquet:
+                data = file.read_bytes()
+                digest = file.stem.split("-")[3:]  # those of earlier versions tell none
+                if digest and digest != [_content_digest(data)]:
+                    raise pa.ArrowInvalid("it is not what was written there")
+                with pq.ParquetFile(pa.BufferReader(data)) as parquet:
                     if not parquet.schema_arrow.equals(PAIR_SCHEMA):
                         raise pa.ArrowInvalid("its columns are not those of this version")
                     yield parquet.read(columns=columns)
@@ -164,6 +176,11 @@ class RunFolder:
                 raise RunFolderError(
                     f"{file} cannot be read ({error}); delete it and start the run again, which computes its pairs anew"
                 ) from error
+
+
+def _content_digest(data: bytes) -> str:
+    """Hex digest (blake2b, 64 bits) of a part, which its name ends with."""
+    return hashlib.blake2b(data, digest_size=8).hexdigest()
 
 
 def _claim(file: Path, config: dict[str, Any]) -> None:

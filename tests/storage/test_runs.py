@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
 import multiprocessing
 import os
@@ -266,12 +267,14 @@ def test_a_broken_part_is_named_and_the_remedy_works(tmp_path: Path, damage: str
 def test_an_error_while_writing_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = RunFolder.open(tmp_path, CONFIG)
 
-    def full_disk(table: object, path: Path) -> None:
-        path.write_bytes(b"half")
-        raise OSError("No space left on device")
+    write = Path.write_bytes
 
-    monkeypatch.setattr(pq, "write_table", full_disk)
-    with pytest.raises(OSError, match="No space"):
+    def full_disk(path: Path, data: bytes) -> None:
+        write(path, data[: len(data) // 2])
+        raise OSError(errno.ENOSPC, "No space left on device")  # as the system says it: of no file
+
+    monkeypatch.setattr(Path, "write_bytes", full_disk)
+    with pytest.raises(OSError, match=f"No space left on device: '{tmp_path}/pairs/part-.*parquet'"):
         run.append([row("a")])
     assert list((tmp_path / "pairs").iterdir()) == []
 

@@ -1,0 +1,191 @@
+"""Damaged files: told, computed anew, or of no consequence; never another result, never a crash."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fmtorch.data.images import ImageError, read_image
+from fmtorch.resources import models_dir
+from fmtorch.storage import PairRow, RunFolder
+from fmtorch.storage.cache import ArrayCache
+from fmtorch.storage.runs import RunFolderError
+from fmtorch.types import pair_key
+from tests.reliability.commands import ONE_THREAD
+from tests.reliability.images import NO_IMAGES, SOUND
+
+BOUNDED, WHOLE = 40, 2000  # damages to each kind of file
+Property = Callable[[str, object], None]
+
+
+def damages(data: bytes, count: int, seed: int) -> Iterator[bytes]:
+    """The file cut short, with a bit turned, bytes overwritten, a block lost or doubled, or zeros at its end."""
+    rng = np.random.default_rng(seed)
+    yield b""
+    for _ in range(count - 1):
+        at, end = np.sort(rng.integers(0, len(data), 2))
+        kind = rng.integers(0, 6)
+        if kind == 0:
+            yield data[:at]
+        elif kind <= 2:
+            bits = bytearray(data)
+            bits[at] ^= 1 << int(rng.integers(0, 8))
+            yield bytes(bits)
+        elif kind == 3:
+            yield data[:at] + rng.bytes(min(64, len(data) - int(at))) + data[at + 64 :]
+        elif kind == 4:
+            yield data[:at] + data[end:] if rng.random() < 0.5 else data[:end] + data[at:]
+        else:
+            yield data[:at] + bytes(len(data) - int(at))
+
+
+def run_folder(path: Path) -> RunFolder:
+    """A run with rows."""
+    run = RunFolder.open(path, {"pipeline": "sift", "seed": 0, "pruner": [{"ratio": {"threshold": 0.8}}]})
+    names = [f"a/{i}" for i in range(8)]
+    run.append([PairRow(n, pair_key(n), "a", "b", True, nsgd=0.01 * i, F=[0.1 * i] * 9) for i, n in enumerate(names)])
+    return run
+
+
+def damaged_parts(path: Path, count: int, seed: int) -> int:
+    """Damage a part of a run; it is told every time."""
+    run = run_folder(path)
+    truth, part = run.read(), next((path / "pairs").iterdir())
+    data, told = part.read_bytes(), 0
+    for damage in damages(data, count, seed):
+        part.write_bytes(damage)
+        if damage == data:
+            assert run.read() == truth
+            continue
+        for use in (run.read, run.done):
+            with pytest.raises(RunFolderError, match=rf"{part.name} cannot be read .*delete it"):
+                use()
+        told += 1
+    return told
+
+
+def damaged_identities(path: Path, count: int, seed: int) -> int:
+    """Damage run.json: it is told, or it is of no consequence."""
+    run = run_folder(path)
+    file, config = path / "run.json", run.config
+    data, told = file.read_bytes(), 0
+    for damage in damages(data, count, seed):
+        file.write_bytes(damage)
+        try:
+            assert RunFolder.load(path).config == config
+        except RunFolderError as error:
+            assert str(file) in str(error)  # noqa: PT017
+            told += 1
+    return told
+
+
+def damaged_features(path: Path, count: int, seed: int) -> int:
+    """Damage a file of the feature cache: it counts as absent."""
+    cache = ArrayCache(path)
+    arrays = {"lafs": np.random.default_rng(0).normal(size=(9, 2, 3)), "seconds": np.array(0.5)}
+    cache.write("section", "name", arrays)
+    file = next(path.glob("*/*.npz"))
+    data, told = file.read_bytes(), 0
+    for damage in damages(data, count, seed):
+        file.write_bytes(damage)
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            found = cache.read("section", "name")
+        if found is None:
+            assert any(str(file) in str(warning.message) for warning in said)
+            told += 1
+        else:
+            assert all(np.array_equal(found[name], arrays[name]) for name in arrays)
+    return told
+
+
+TRIALS = {"parts": damaged_parts, "run.json": damaged_identities, "features": damaged_features}
+
+
+@pytest.mark.parametrize("kind", TRIALS)
+def test_damaged_files(kind: str, tmp_path: Path) -> None:
+    assert TRIALS[kind](tmp_path / "here", BOUNDED, 0) > BOUNDED / 2
+
+
+@pytest.mark.reliability
+@pytest.mark.parametrize("kind", TRIALS)
+def test_many_damaged_files(kind: str, tmp_path: Path, record_property: Property) -> None:
+    record_property(f"damaged {kind}, told", TRIALS[kind](tmp_path / "here", WHOLE, 1))
+
+
+def damaged_networks(path: Path, count: int) -> str:
+    """Open damaged networks in a process of its own, and run those that open; what came of them."""
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-m", "tests.reliability.networks", str(models_dir() / "lc_e.onnx"), str(path),
+         str(count)],
+        cwd=Path(__file__).resolve().parents[2], capture_output=True, text=True, check=False,
+        env={**os.environ, **ONE_THREAD},
+    )  # fmt: skip
+    assert done.returncode == 0, f"{done.returncode}: {done.stdout[-500:]} {done.stderr[-2000:]}"
+    return done.stdout.splitlines()[-1]
+
+
+def test_damaged_networks(tmp_path: Path) -> None:
+    assert "told" in damaged_networks(tmp_path, 12)
+
+
+@pytest.mark.reliability
+def test_many_damaged_networks(tmp_path: Path, record_property: Property) -> None:
+    record_property("damaged networks", damaged_networks(tmp_path, 400))
+
+
+@pytest.mark.parametrize("name", SOUND)
+def test_images_of_any_kind(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.write_bytes(SOUND[name]())
+    image = read_image(path)
+    assert image.dtype == np.uint8
+    assert image.ndim == 2 or image.shape[2] == 3
+    assert image.std() > 10 or image.shape[0] == 1  # it is the picture
+
+
+@pytest.mark.parametrize("name", NO_IMAGES)
+def test_files_that_are_no_image(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.write_bytes(NO_IMAGES[name]())
+    with pytest.raises(ImageError, match=rf"{path}: .*(it must|copy it again)"):
+        read_image(path)
+
+
+DAMAGED = ("grey.jpg", "progressive.jpg", "16 bit.png", "palette.png", "alpha.webp", "16 bit.tiff", "animated.gif")
+
+
+def damaged_images(path: Path, count: int, seed: int) -> tuple[int, int]:
+    """Damage images: an image of some kind, or an error; how often each. (GIF, TIFF and WebP have no checksums.)"""
+    refused = read = 0
+    for name in DAMAGED:
+        data = SOUND[name]()
+        file = path / name
+        for damage in damages(data, count // len(DAMAGED), seed):
+            file.write_bytes(damage)
+            try:
+                image = read_image(file)
+            except ImageError as error:
+                assert str(file) in str(error)  # noqa: PT017
+                refused += 1
+                continue
+            assert image.dtype == np.uint8
+            read += 1
+    return refused, read
+
+
+def test_damaged_images(tmp_path: Path) -> None:
+    refused, read = damaged_images(tmp_path, 140, 0)
+    assert refused > read
+
+
+@pytest.mark.reliability
+def test_many_damaged_images(tmp_path: Path, record_property: Property) -> None:
+    record_property("damaged images, refused and read", damaged_images(tmp_path, 7000, 1))

@@ -1,0 +1,56 @@
+"""Generated calls of every public function, in a process of their own (see `generated`)."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fmtorch import geometry, matching, metrics, presets, pruning
+from tests.reliability.commands import ONE_THREAD
+
+HERE = Path(__file__).resolve().parents[2]
+BOUNDED = 4  # calls of each subject
+WHOLE = {
+    "geometry.": 120, "metrics.": 120, "pruning.": 100, "matching.": 200, "types.": 200, "find_fundamental.": 90,
+    "pruner.": 35, "match": 120,
+}  # fmt: skip
+"""Calls of each subject by the beginning of its name: some 10,000 in all."""
+
+
+def generate(calls: int, *names: str) -> list[dict[str, Any]]:
+    """What came of so many calls of each subject; fails where one has a fault."""
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-m", "tests.reliability.generated", "--calls", str(calls), *names],
+        cwd=HERE, capture_output=True, text=True, check=False, env={**os.environ, **ONE_THREAD},
+    )  # fmt: skip
+    found = [json.loads(line) for line in done.stdout.splitlines() if line.startswith('{"subject"')]
+    faults = "\n\n".join(f"{line['subject']}: {line['fault']}\n{line['call']}" for line in found if "fault" in line)
+    assert not faults, faults
+    assert done.returncode == 0, f"{done.returncode} after {found[-1:]}: {done.stderr[-3000:]}"
+    return found
+
+
+def test_some_calls_of_everything() -> None:
+    found = generate(BOUNDED)
+    called = {line["subject"] for line in found}
+    for module in (geometry, metrics, pruning, matching):
+        names = {name for name in module.__all__ if name.islower()}
+        assert {f"{module.__name__.removeprefix('fmtorch.')}.{name}" for name in names} <= called
+    assert {f"find_fundamental.{name}" for name in presets.available("estimator")} <= called
+    assert {f"pruner.{name}" for name in presets.available("pruner")} <= called
+    assert sum(line.get("sound", 0) for line in found) > len(found)
+
+
+@pytest.mark.reliability
+@pytest.mark.parametrize("beginning", WHOLE)
+def test_many_calls(beginning: str, record_property: Callable[[str, object], None]) -> None:
+    found = generate(WHOLE[beginning], beginning)
+    for outcome in ("sound", "refused"):
+        record_property(f"{beginning} {outcome}", sum(line.get(outcome, 0) for line in found))
