@@ -8,7 +8,10 @@ hundred megabytes each.
 from __future__ import annotations
 
 import multiprocessing
+import multiprocessing.connection
+import os
 import signal
+import threading
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -65,6 +68,18 @@ def _work(pipeline: Pipeline, pairs: list[ImagePair], seed: int) -> Work:
     return Work(evaluate(pipeline.run(pairs, seed), seed))
 
 
+def end_with_parent() -> None:
+    """Have this process end when the one that started it does, however that does: a worker would wait forever."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def wait() -> None:
+        multiprocessing.connection.wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
 _mine: Pipeline | None = None  # of a process that works for another
 
 
@@ -72,6 +87,7 @@ def _begin(build: Build) -> None:
     """The start of a process: an interrupt is for the one that asked, which waits for what is under way."""
     global _mine
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     _mine = build()

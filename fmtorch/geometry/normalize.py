@@ -51,8 +51,8 @@ def normalize_pair(
 
 
 def denormalize_fundamental(
-    F: Float[Tensor, "*batch 3 3"], T0: Float[Tensor, "*batch0 3 3"], T1: Float[Tensor, "*batch1 3 3"]
-) -> Float[Tensor, "*batchF 3 3"]:
+    F: Float[Tensor, "*#batch 3 3"], T0: Float[Tensor, "*#batch 3 3"], T1: Float[Tensor, "*#batch 3 3"]
+) -> Float[Tensor, "*#batch 3 3"]:
     """The fundamental matrix T1^T F T0 of points x, given F of the normalised points T x; leading shapes broadcast."""
     return matmul3(matmul3(T1.mT, F), T0)
 

@@ -42,5 +42,5 @@ def mean_recall(nsgd: Float[Tensor, "*batch pairs"], maximum: float = THRESHOLD)
     if not maximum > 0:
         raise ValueError(f"maximum is {maximum}; it must be positive")
     missed = nsgd.isnan()
-    share = (1 - torch.where(missed, maximum, nsgd) / maximum).clamp(min=0.0)
+    share = (1 - torch.where(missed, maximum, nsgd) / maximum).clamp(0.0, 1.0)
     return share.mean(-1)

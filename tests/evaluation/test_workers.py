@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -29,3 +32,35 @@ def test_a_process_that_ends_is_told() -> None:
     with pytest.raises(RuntimeError, match="the same command goes on"):
         list(run)
     assert rows == []
+
+
+WORKER = """
+import multiprocessing, time
+from fmtorch.evaluation.workers import end_with_parent
+def work():
+    end_with_parent()
+    print(multiprocessing.current_process().pid, flush=True)
+    time.sleep(300)
+multiprocessing.get_context("fork").Process(target=work).start()
+time.sleep(300)
+"""
+
+
+def test_a_worker_ends_with_the_process_that_was_killed() -> None:
+    parent = subprocess.Popen([sys.executable, "-c", WORKER], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    worker = int(parent.stdout.readline())
+    parent.kill()
+    parent.wait()
+    deadline = time.monotonic() + 60
+    while alive(worker) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert not alive(worker)
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs; one that has ended and waits to be buried does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
