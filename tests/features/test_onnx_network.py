@@ -104,7 +104,8 @@ def test_a_corrupt_file_is_named(hardnet: Path, tmp_path: Path) -> None:
     (tmp_path / "cut.onnx").write_bytes(hardnet.read_bytes()[:100_000])
     (tmp_path / "text.onnx").write_text("404: Not Found")
     (tmp_path / "empty.onnx").write_bytes(b"")
-    for name in ("cut", "text", "empty"):
+    (tmp_path / "bytes.onnx").write_bytes(hardnet.read_bytes().replace(b"Conv", b"\xe5onv"))  # the error is no text
+    for name in ("cut", "text", "empty", "bytes"):
         with pytest.raises(NetworkFileError, match=rf"{name}\.onnx"):
             PatchNetwork(tmp_path / f"{name}.onnx")(torch.zeros(1, 1, 32, 32))
 

@@ -98,9 +98,8 @@ def damaged_features(path: Path, count: int, seed: int) -> int:
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
             found = cache.read("section", "name")
-        if found is None:
-            assert any(str(file) in str(warning.message) for warning in said)
-            told += 1
+        if found is None:  # without a word where the digest's own name is gone, as in files of earlier versions
+            told += any(str(file) in str(warning.message) for warning in said)
         else:
             assert all(np.array_equal(found[name], arrays[name]) for name in arrays)
     return told
