@@ -15,7 +15,7 @@ from tests.reliability.commands import Starter, data_set, delays, evaluation, pa
 from tests.reliability.conftest import Rows
 
 EVAL_KILLS, MATCH_KILLS, TRAIN_KILLS, PROCESS_KILLS = (
-    int(number) for number in os.environ.get("FMTORCH_KILLS", "40,20,35,5").split(",")
+    int(number) for number in os.environ.get("FMTORCH_KILLS", "40,20,30,10").split(",")
 )
 TRAIN = [
     "optimisation.steps=12", "objective.classification_steps=2", "batch=2", "threads=1", "workers=1",
