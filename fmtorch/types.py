@@ -281,6 +281,8 @@ class Estimate(_Record):
         _expect("inliers", self.inliers, (b, self.inliers.shape[-1]))
         _expect("ok", self.ok, (b,))
         _expect("draws", self.draws, (b,))
+        if not isinstance(self.reason, tuple | list) or not all(isinstance(entry, str) for entry in self.reason):
+            raise TypeError(f"reason is a {type(self.reason).__name__}; it must be a tuple of strings")
         if len(self.reason) != b:
             raise ValueError(f"reason has {len(self.reason)} entries; it must have one for each of the {b} pairs")
 

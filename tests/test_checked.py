@@ -162,6 +162,7 @@ for call in (
     lambda: Correspondences(x[None].numpy(), x[None], torch.ones(1, 9) > 0),
     lambda: Correspondences(x[None], x[None], torch.ones(1, 9)),
     lambda: Correspondences(x[None], x[None].to("meta"), torch.ones(1, 9) > 0),
+    lambda: Estimate(F[None], torch.ones(1, 9) > 0, torch.ones(1) > 0, None, torch.zeros(1, dtype=torch.int64)),
     lambda: Estimate(F[None], torch.ones(1, 9) > 0, None, ("",), torch.zeros(1, dtype=torch.int64)),
 ):
     try:
@@ -186,6 +187,7 @@ ValueError: mask must be a list of 1 arrays, one for each pair of x0
 TypeError: x0 is a ndarray; it must be a tensor
 ValueError: mask is of torch.float32; it must hold booleans
 ValueError: x1 is on meta and another field on cpu; all must be on one device
+TypeError: reason is a NoneType; it must be a tuple of strings
 TypeError: ok is a NoneType; it must be a tensor
 """  # noqa: E501
 
