@@ -283,6 +283,7 @@ class Estimate(_Record):
         _expect("draws", self.draws, (b,))
         if not isinstance(self.reason, tuple | list) or not all(isinstance(entry, str) for entry in self.reason):
             raise TypeError(f"reason is a {type(self.reason).__name__}; it must be a tuple of strings")
+        object.__setattr__(self, "reason", tuple(self.reason))
         if len(self.reason) != b:
             raise ValueError(f"reason has {len(self.reason)} entries; it must have one for each of the {b} pairs")
 
