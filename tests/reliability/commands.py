@@ -22,7 +22,7 @@ SOURCE = Path(__file__).resolve().parents[2]
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 EVAL = ["features.max_features=400", "estimator=lmeds", "estimator.hypotheses=200", "batch=1", "workers=1"]
 SIDEWAYS = "0 0 0 0 0 -1 0 1 0"
-PATIENCE = 300.0  # seconds after which a command hangs
+PATIENCE = 1200.0  # seconds after which a command hangs
 
 
 class Command:

@@ -18,10 +18,10 @@ from tests.reliability.commands import ONE_THREAD
 HERE = Path(__file__).resolve().parents[2]
 BOUNDED = 4  # calls of each subject
 WHOLE = {
-    "geometry.": 120, "metrics.": 120, "pruning.": 100, "matching.": 200, "types.": 200, "find_fundamental.": 90,
-    "pruner.": 35, "match": 120,
+    "geometry.": 120, "metrics.": 120, "pruning.": 100, "matching.": 200, "types.": 200, "find_fundamental.": 150,
+    "pruner.": 150, "match": 150,
 }  # fmt: skip
-"""Calls of each subject by the beginning of its name: some 10,000 in all."""
+"""Calls of each subject by the beginning of its name: some 15,000 in all."""
 
 
 def generate(calls: int, *names: str) -> list[dict[str, Any]]:
