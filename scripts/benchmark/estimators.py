@@ -146,6 +146,8 @@ def measure(specs: list[str], items: list[Item], seeds: int) -> dict[str, Result
             results[spec]["ms"][seed, i] = 1e3 * (time.process_time() - start)
             if bool(estimate.ok[0]):
                 F = torch.from_numpy(pair.F)[None]
+                assert c.size0 is not None
+                assert c.size1 is not None
                 results[spec]["nsgd"][seed, i] = float(metrics.nsgd(F, estimate.F, c.size0, c.size1, key=c.keys))
     return results
 
