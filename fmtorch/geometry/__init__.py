@@ -23,6 +23,7 @@ from fmtorch.geometry.rank2 import nearest_rank2
 from fmtorch.geometry.refine import attached_step, refine
 from fmtorch.geometry.robust_kernels import KERNELS
 from fmtorch.geometry.seven_point import seven_point
+from fmtorch.geometry.significance import significance
 
 __all__ = [
     "KERNELS",
@@ -49,6 +50,7 @@ __all__ = [
     "sampson",
     "sampson_squared",
     "seven_point",
+    "significance",
     "symmetric_max",
     "symmetric_mean",
     "symmetric_squared",
