@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import binomtest
 
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.types import RELATED
@@ -54,12 +53,6 @@ def test_the_photographs_of_a_drawn_scene_are_known(tmp_path: Path) -> None:
     (shown,) = related_pairs.photographs_shown(dataset).values()
     assert shown
     assert shown <= set(PICTURES["train"])
-
-
-@pytest.mark.parametrize(("hits", "n"), [(0, 30), (1, 100), (50, 100), (100, 100)])
-def test_wilson_is_the_interval_of_the_books(hits: int, n: int) -> None:
-    expected = binomtest(hits, n).proportion_ci(0.95, "wilson")
-    assert related_table.wilson(hits, n) == pytest.approx((expected.low, expected.high), abs=1e-4)
 
 
 def row(true: bool, nsgd: float, significance: float, inliers: int, matches: int = 50) -> related_table.Row:

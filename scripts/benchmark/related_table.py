@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from fmtorch.evaluation.intervals import share_interval
 from fmtorch.types import RELATED
 
 Row = dict[str, Any]
 RIGHT = 0.05  # NSGD below which an estimate of a related pair is right
 LEVELS = (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 5.0, 8.0)
-Z = 1.96  # of a 95 % interval
 
 RULES: dict[str, Callable[[Row], bool]] = {
     "COLMAP's": lambda row: _inliers(row) >= 15 and _inliers(row) >= 0.25 * row["matches"],
@@ -26,8 +26,8 @@ RULES: dict[str, Callable[[Row], bool]] = {
 def text(rows: dict[str, list[Row]]) -> str:
     """The tables as Markdown."""
     note = (
-        f"At level {RELATED:g}: unrelated pairs accepted and right ones (NSGD < {RIGHT}) rejected, in %, with Wilson's "
-        "95 % intervals.\nOther rules: accepted / rejected; COLMAP's is 15 inliers that are a quarter of the matches "
+        f"At level {RELATED:g}: unrelated pairs accepted and right ones (NSGD < {RIGHT}) rejected, in %, with score "
+        "intervals (95 %).\nOther rules: accepted / rejected; COLMAP's is 15 inliers that are a quarter of the matches "
         "or more. `ok`: unrelated\npairs with an F. Area: under the ROC curve of right against unrelated pairs."
     )
     return "\n\n".join([note, rules(rows), levels(rows), families(rows)])
@@ -39,9 +39,8 @@ def rules(rows: dict[str, list[Row]]) -> str:
     lines = []
     for name, own in rows.items():
         unrelated, right = split(own)
-        accepted, rejected = ([_significance(r) >= RELATED for r in some] for some in (unrelated, right))
         cells: list[object] = [f"`{name}`", len(unrelated), len(right), percent([r["ok"] for r in unrelated])]
-        cells += [share(accepted), share([not value for value in rejected])]
+        cells += [share(unrelated, _related), share(right, lambda row: not _related(row))]
         for rule in RULES.values():
             cells.append(f"{percent([rule(r) for r in unrelated])} / {percent([not rule(r) for r in right])}")
         cells += [f"{area(right, unrelated, figure):.5f}" for figure in (_significance, _inliers)]
@@ -70,8 +69,8 @@ def families(rows: dict[str, list[Row]]) -> str:
         cells: list[object] = [family]
         for own in rows.values():
             some = [row for row in own if row["family"] == family]
-            right = [_significance(row) >= RELATED for row in some if row["true"] and row["nsgd"] < RIGHT]
-            wrong = [_significance(row) >= RELATED for row in some if not (row["true"] and row["nsgd"] < RIGHT)]
+            right = [_related(row) for row in some if row["true"] and row["nsgd"] < RIGHT]
+            wrong = [_related(row) for row in some if not (row["true"] and row["nsgd"] < RIGHT)]
             cells.append(f"{sum(right)} of {len(right)}; {sum(wrong)} of {len(wrong)}")
         lines.append(cells)
     return table(["called related: right ones; others", *(f"`{name}`" for name in rows)], lines)
@@ -82,24 +81,17 @@ def split(rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
     return [r for r in rows if not r["true"]], [r for r in rows if r["true"] and r["nsgd"] < RIGHT]
 
 
-def share(values: Sequence[bool]) -> str:
-    """A share in % with its interval (Wilson 1927)."""
-    low, high = wilson(sum(values), len(values))
-    return f"{percent(values)} [{100 * low:.2f}, {100 * high:.2f}]"
+def share(rows: Sequence[Row], holds: Callable[[Row], bool]) -> str:
+    """The share of pairs for which something holds, in %, with its interval."""
+    if not rows:
+        return "–"
+    i = share_interval(np.array([holds(row) for row in rows]), [f"{row['family']}/{row['scene']}" for row in rows])
+    return f"{100 * i.value:.2f} [{100 * i.low:.2f}, {100 * i.high:.2f}]"
 
 
 def percent(values: Sequence[bool]) -> str:
     """A share in %; a dash where there is nothing to take it of."""
     return f"{100 * np.mean(values):.2f}" if values else "–"
-
-
-def wilson(hits: int, n: int) -> tuple[float, float]:
-    """The 95 % interval of a share, of n independent trials; (0, 1) without any."""
-    if n == 0:
-        return 0.0, 1.0
-    p, spread = hits / n, Z * math.sqrt(hits / n * (1 - hits / n) / n + Z**2 / (4 * n**2))
-    centre, scale = p + Z**2 / (2 * n), 1 + Z**2 / n
-    return max(0.0, (centre - spread) / scale), min(1.0, (centre + spread) / scale)
 
 
 def area(right: Sequence[Row], unrelated: Sequence[Row], figure: Callable[[Row], float]) -> float:
@@ -118,6 +110,10 @@ def table(heads: Sequence[str], lines: Sequence[Sequence[object]]) -> str:
 
 def _significance(row: Row) -> float:
     return float(row["significance"])
+
+
+def _related(row: Row) -> bool:
+    return _significance(row) >= RELATED
 
 
 def _inliers(row: Row) -> int:
