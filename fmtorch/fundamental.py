@@ -16,6 +16,7 @@ from fmtorch.stages import Estimator, Pruner
 from fmtorch.threads import one_thread
 from fmtorch.types import Estimate
 from fmtorch.validation import expect_values
+from fmtorch.verdict import judged
 
 
 def find_fundamental(
@@ -58,7 +59,8 @@ def find_fundamental(
 
     Returns:
         An `Estimate` of B pairs (of one pair for (N, 2) points, of none for an empty list): F with unit Frobenius norm,
-        inliers, ok, reason. A pair that cannot be solved is ``ok=False``, never an exception.
+        inliers, ok, reason, significance. A pair that cannot be solved is ``ok=False``, never an exception. An
+            F that is ok may be of images that show nothing in common: `related` tells.
 
     Raises:
         ValueError: for points of another shape, a prior outside [0, 1], a noise or an image size that is not positive,
@@ -76,7 +78,7 @@ def find_fundamental(
         framed = c.lafs0 is not None and c.lafs1 is not None and c.quality is not None
         with one_thread(c.mask.device):
             c = _consistency("frame_consistency" if framed else "position_consistency")(c)
-    return chosen(c, seed)
+    return judged(chosen(c, seed), c)
 
 
 def _estimator(name: str, config_dir: Path | str | None, options: Mapping[str, Any]) -> Estimator:

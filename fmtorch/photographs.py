@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 import time
 from pathlib import Path
+from typing import cast
 
 import cv2
 import numpy as np
@@ -19,7 +21,8 @@ from fmtorch.data.images import read_image
 from fmtorch.geometry.epipolar import unit_frobenius
 from fmtorch.pipeline import Pipeline
 from fmtorch.threads import one_thread
-from fmtorch.types import Correspondences, Estimate, Features
+from fmtorch.types import RELATED, Correspondences, Estimate, Features
+from fmtorch.verdict import judged
 
 Image = NDArray[np.uint8]
 STILL = 0.1  # px of the images as matched: a median motion below it is none
@@ -33,6 +36,7 @@ class MatchResult:
     putative: the matcher's matches, a batch of one. kept: which of them the pruners kept, (M,).
     correspondences: the kept ones, a batch of one. inliers: which of those agree with F, (K,).
     F: (3, 3) float64 of unit Frobenius norm; zero where there is none, and `reason` then says why.
+    significance: how far the support of F is beyond chance (`fmtorch.geometry.significance`); -inf where there is no F.
     warning: why F, though found, means little; mostly empty. counts: matches after each step, in order. seconds: of
     each step, cached features with those they took when they were computed.
     """
@@ -48,6 +52,12 @@ class MatchResult:
     warning: str = ""
     counts: dict[str, int] = dataclasses.field(default_factory=dict)
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+    significance: float = -math.inf
+
+    @property
+    def related(self) -> bool:
+        """Whether the photographs are taken to show one scene: F was found, and its support is beyond chance."""
+        return self.ok and self.significance >= RELATED
 
     @property
     def ok(self) -> bool:
@@ -74,7 +84,7 @@ def match(
 
     Raises ImageError for a file that is no sound image, TypeError for what is neither a path nor an array, ValueError
     for an array of another type or shape, an unknown pipeline, or a device that is not there. Photographs that cannot
-    be related are no error: `ok` is False.
+    be related are no error: `related` is False, and mostly `ok` is True, since some F is found all the same.
     """
     if longest_side < 1:
         raise ValueError(f"longest_side is {longest_side}; it must be at least 1 px")
@@ -143,13 +153,13 @@ def _relate(pipeline: Pipeline, features0: Features, features1: Features, seed: 
         clock(name)
         counts[name] = len(slots)
     kept = torch.zeros_like(putative.mask[0]).index_fill(0, slots, True)
-    estimate: Estimate = pipeline.estimator(c, seed).detach()
+    estimate: Estimate = judged(pipeline.estimator(c, seed).detach(), c)
     clock("estimation")
     inliers = estimate.inliers[0]
     counts["estimation"] = int(inliers.sum())
     return MatchResult(
         *ends, putative, kept, c, inliers, estimate.F[0].to(torch.float64), estimate.reason[0], _still(c, inliers),
-        counts, clock.seconds,
+        counts, clock.seconds, float(cast(Tensor, estimate.significance)[0]),
     )  # fmt: skip
 
 

@@ -20,6 +20,7 @@ from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.stages import Estimator, FeatureExtractor, Matcher, Pruner, TimedExtractor
 from fmtorch.threads import one_thread
 from fmtorch.types import Correspondences, Estimate, Features, collate
+from fmtorch.verdict import judged
 
 STAGES = ("features", "matching", "pruning", "estimation")
 
@@ -135,7 +136,8 @@ class Pipeline:
         return [dataclasses.replace(outcome, correspondences=c[i]) for i, outcome in enumerate(outcomes)]
 
     def _estimate(self, outcomes: list[Outcome], seed: int) -> list[Outcome]:
-        estimate = _expect_finite(self.estimator(_collated(outcomes), seed).detach())
+        c = _collated(outcomes)
+        estimate = judged(_expect_finite(self.estimator(c, seed).detach()), c)
         return [
             dataclasses.replace(outcome, estimate=estimate[i], reason=estimate.reason[i])
             for i, outcome in enumerate(outcomes)
@@ -152,7 +154,7 @@ def _expect_finite(estimate: Estimate) -> Estimate:
     reason = tuple(said if bad else old for bad, old in zip(wrong, estimate.reason, strict=True))
     keep = sound[:, None]
     F, inliers = torch.where(keep[..., None], estimate.F, 0), estimate.inliers & keep
-    return estimate.replace(F=F, inliers=inliers, ok=estimate.ok & sound, reason=reason)
+    return estimate.replace(F=F, inliers=inliers, ok=estimate.ok & sound, reason=reason, significance=None)
 
 
 def _collated(outcomes: list[Outcome]) -> Correspondences:

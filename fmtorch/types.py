@@ -27,6 +27,9 @@ NUMBERS = {
 }
 """What the elements of a field are, where not floating-point numbers."""
 
+RELATED = 1.0
+"""The significance from which on two images are called related; chosen on tuning pairs (docs/related.md)."""
+
 
 def pair_key(identity: str) -> int:
     """The stable signed 64-bit key of a pair's identity (blake2b), which selects its random streams."""
@@ -263,6 +266,9 @@ class Estimate(_Record):
 
     F: (B, 3, 3) with unit Frobenius norm, zero where `ok` is False. inliers: (B, N), within the mask; none where `ok`
     is False. ok: (B,). reason: why a pair failed, empty where it did not. draws: minimal samples drawn, (B,).
+    significance: (B,), how far the support of F is beyond chance, see `fmtorch.geometry.significance`: -log10 of the
+    number of models with as much support that are expected among images that show nothing in common; -inf where `ok`
+    is False, NaN where nobody has computed it; never None.
     """
 
     F: Float[Tensor, "b 3 3"]
@@ -270,6 +276,7 @@ class Estimate(_Record):
     ok: Bool[Tensor, " b"]
     reason: tuple[str, ...]
     draws: Int[Tensor, " b"]
+    significance: Float[Tensor, " b"] | None = None
 
     def __post_init__(self) -> None:
         _expect_dimensions("F", self.F, 3, shape="(B, 3, 3)")
@@ -277,6 +284,9 @@ class Estimate(_Record):
         _expect_dimensions("ok", self.ok, 1, shape="(B,)")
         _expect_dimensions("draws", self.draws, 1, shape="(B,)")
         b = self.F.shape[0]
+        if self.significance is None:
+            unknown = torch.full((b,), torch.nan, dtype=torch.float64, device=self.F.device)
+            object.__setattr__(self, "significance", unknown)
         _expect("F", self.F, (b, 3, 3))
         _expect("inliers", self.inliers, (b, self.inliers.shape[-1]))
         _expect("ok", self.ok, (b,))
@@ -284,8 +294,17 @@ class Estimate(_Record):
         if not isinstance(self.reason, tuple | list) or not all(isinstance(entry, str) for entry in self.reason):
             raise TypeError(f"reason is a {type(self.reason).__name__}; it must be a tuple of strings")
         object.__setattr__(self, "reason", tuple(self.reason))
+        _expect("significance", self.significance, (b,))
         if len(self.reason) != b:
             raise ValueError(f"reason has {len(self.reason)} entries; it must have one for each of the {b} pairs")
+
+    @property
+    def related(self) -> Bool[Tensor, " b"]:
+        """Whether the two images are taken to show one scene: ok, with a significance of at least `RELATED`.
+
+        Recall and all other figures are of `ok` alone; this tells whom to believe.
+        """
+        return self.ok & (cast(Tensor, self.significance) >= RELATED)
 
     def __len__(self) -> int:
         """Number of pairs."""

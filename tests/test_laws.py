@@ -43,7 +43,7 @@ def _estimator(name: str) -> Subject:
 
     def run(c: Correspondences) -> Result:
         e = estimator(c, seed=5)
-        return {"F": e.F, "inliers": e.inliers, "ok": e.ok, "draws": e.draws}
+        return {"F": e.F, "inliers": e.inliers, "ok": e.ok, "draws": e.draws, "significance": e.significance}
 
     return Subject(f"estimator={name}", run)
 
@@ -64,7 +64,7 @@ def _noisy(name: str) -> Subject:
 
     def run(c: Correspondences) -> Result:
         e = estimator(noise(c), seed=5)
-        return {"F": e.F, "inliers": e.inliers, "ok": e.ok, "draws": e.draws}
+        return {"F": e.F, "inliers": e.inliers, "ok": e.ok, "draws": e.draws, "significance": e.significance}
 
     return Subject(f"estimator={name} with noise", run)
 
@@ -152,7 +152,7 @@ def test_batch_workers_threads_and_tiles_change_nothing(name: str, monkeypatch: 
 
     def run(some: list[Correspondences]) -> Result:
         e = estimator(collate(some), seed=5)
-        return {"F": e.F, "inliers": e.inliers, "ok": e.ok, "draws": e.draws}
+        return {"F": e.F, "inliers": e.inliers, "ok": e.ok, "draws": e.draws, "significance": e.significance}
 
     def first(result: Result, pairs: int, matches: int) -> Result:
         return {k: v[:pairs, :matches] if k == "inliers" else v[:pairs] for k, v in result.items()}

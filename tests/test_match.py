@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from fmtorch.data import ImageError, read_image
 from fmtorch.geometry import sampson
 from fmtorch.metrics import nsgd
 from fmtorch.resources import conf_dir
+from fmtorch.types import RELATED
 from tests.conftest import shared_path
 
 ROWS = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # a sideways camera: epipolar lines are rows
@@ -180,8 +182,26 @@ def test_photographs_that_cannot_be_related(pipeline: fmtorch.pipeline.Pipeline)
         assert result.correspondences.mask.shape == (1, 0)
     unrelated = fmtorch.match(image, stereo(seed=1)[0], pipeline=pipeline)
     assert "at least 8 are needed" in unrelated.reason
+    assert not unrelated.related
+    assert unrelated.significance == -math.inf
     same = fmtorch.match(image, image, pipeline=pipeline)
     assert "no motion" in same.warning
+
+
+def test_an_f_of_photographs_with_nothing_in_common() -> None:
+    """Some F is found, and the verdict tells that it means nothing."""
+    lenient = presets.pipeline("sift_lmeds", overrides=["features.max_features=1500", "pruner.ratio.threshold=0.95"])
+    images = stereo()[0], stereo(seed=1)[0]
+    result = fmtorch.match(*images, pipeline=lenient)
+    assert result.ok
+    assert not result.related
+    assert result.significance < RELATED
+    good = fmtorch.match(*stereo(), pipeline=lenient)
+    assert good.related
+    assert good.significance > 10
+    # In other pixels the same; here of images reduced by half.
+    halved = fmtorch.match(*stereo(), pipeline=lenient, longest_side=320)
+    assert halved.related
 
 
 @pytest.mark.parametrize(
@@ -247,6 +267,9 @@ def test_the_command(tmp_path: Path) -> None:
     assert report["overrides"] == []
     assert report["size0"] == report["size1"] == [480, 640]
     assert report["reason"] == ""
+    assert report["related"] is True
+    assert report["significance"] > 100
+    assert "not the same scene" not in done.stderr
     assert report["nsgd"] < 0.01
     kept = report["matches"]["frame_consistency"]
     assert np.shape(report["x0"]) == np.shape(report["x1"]) == (kept, 2)
@@ -270,6 +293,19 @@ def test_the_command(tmp_path: Path) -> None:
     assert report["overrides"] == ["pruner=[ratio]"]
     assert report["F"] is None
     assert "no keypoints" in report["reason"]
+    assert report["related"] is False
+    assert report["significance"] is None
+
+    # With F, of photographs that show nothing in common.
+    Image.fromarray(stereo(seed=1)[0]).save(tmp_path / "other.png")
+    other = ("image1=other.png", f"output={folder}", "pipeline=sift_lmeds", "pruner.ratio.threshold=0.95")
+    done = run_python("-m", "fmtorch.match", "image0=a.png", *other, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "probably not the same scene" in done.stderr
+    report = json.loads((folder / "result.json").read_text())
+    assert np.shape(report["F"]) == (3, 3)
+    assert report["related"] is False
+    assert report["significance"] < RELATED
 
 
 @pytest.mark.parametrize(

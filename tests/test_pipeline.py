@@ -74,6 +74,19 @@ def test_failures_are_outcomes_with_reasons(pairs: list[ImagePair]) -> None:
     assert by_name["known"].reason == "pairs.txt, line 3: F is NaN"
 
 
+def test_an_estimator_that_says_nothing_of_significance_is_judged(pairs: list[ImagePair]) -> None:
+    own = presets.build("estimator", "lmeds", hypotheses=200)
+
+    def silent(c: Correspondences, seed: int = 0) -> Estimate:
+        return own(c, seed).replace(significance=None)
+
+    outcomes = [pipeline(estimator=estimator).run(pairs[:3]) for estimator in (own, silent)]
+    for first, second in zip(*outcomes, strict=True):
+        if first.estimate is not None and second.estimate is not None:
+            assert torch.equal(first.estimate.significance, second.estimate.significance)
+    assert [o.estimate is not None and bool(o.estimate.related[0]) for o in outcomes[1]] == [True, False, True]
+
+
 def test_batches_change_nothing(pairs: list[ImagePair]) -> None:
     together = pipeline().run(pairs, seed=3)
     for one, outcome in zip(pairs, together, strict=True):

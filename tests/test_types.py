@@ -55,6 +55,7 @@ def estimate(b: int = 4, n: int = 6, seed: int = 0) -> Estimate:
         ok=ok,
         reason=tuple("" if good else f"reason {i}" for i, good in enumerate(ok.tolist())),
         draws=torch.arange(b) + seed,
+        significance=torch.where(ok, torch.rand(b, generator=g, dtype=torch.float64), -torch.inf),
     )
 
 

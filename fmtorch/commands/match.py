@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from fmtorch.photographs import Image, MatchResult, match
 from fmtorch.storage.features import CachedFeatures
 from fmtorch.storage.files import replacing
 from fmtorch.terminal import console
+from fmtorch.types import RELATED
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +74,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     console.print(_table(result))
     if "nsgd" in report:
         console.print(f"NSGD to the true F: {report['nsgd']:.4f}", highlight=False)
-    for trouble in filter(None, (f"no F: {result.reason}" if result.reason else "", result.warning)):
+    for trouble in _troubles(result):
         Console(stderr=True).print(f"[bold]{trouble}[/bold]", highlight=False)
     console.print(f"[dim]{folder}: {', '.join(written)}[/dim]", highlight=False)
     if isinstance(pipeline.extractor, CachedFeatures):
@@ -107,6 +109,7 @@ def _report(result: MatchResult, image0: Image, image1: Image, truth: NDArray[np
     report: dict[str, Any] = {
         "size0": image0.shape[:2], "size1": image1.shape[:2],
         "F": result.F.tolist() if result.ok else None, "reason": result.reason, "warning": result.warning,
+        "related": result.related, "significance": result.significance if math.isfinite(result.significance) else None,
         "features": [len(result.keypoints0), len(result.keypoints1)],
         "matches": result.counts, "seconds": result.seconds,
         "x0": c.x0[0].tolist(), "x1": c.x1[0].tolist(), "inliers": result.inliers.tolist(),
@@ -145,6 +148,17 @@ def _draw(
     for name in {"pruning.png", "epipolar.png"} - pictures.keys():  # of an earlier run
         (folder / name).unlink(missing_ok=True)
     return list(pictures)
+
+
+def _troubles(result: MatchResult) -> list[str]:
+    """What is said of a result that is not to be relied on."""
+    if not result.ok:
+        return list(filter(None, (f"no F: {result.reason}", result.warning)))
+    chance = (
+        "probably not the same scene: so much support is no surprise by chance alone "
+        f"(significance {result.significance:.1f}; related from {RELATED:g} on)"
+    )
+    return list(filter(None, ("" if result.related else chance, result.warning)))
 
 
 def _table(result: MatchResult) -> Table:

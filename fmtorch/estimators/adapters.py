@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from fmtorch.estimators.problem import unfit_pairs, usable
 from fmtorch.estimators.support import lack_of_support, relative_rounding
 from fmtorch.types import Correspondences, Estimate
+from fmtorch.verdict import judged
 
 Points = NDArray[np.float64]
 Solution = tuple[Points | None, NDArray[np.bool_]]
@@ -106,7 +107,7 @@ class PairwiseEstimator:
             inliers[i, index[torch.from_numpy(inside)]] = True
         ok = torch.tensor([not reason for reason in reasons], dtype=torch.bool)
         draws = torch.zeros(b, dtype=torch.int64)  # not reported by these libraries
-        return Estimate(F, inliers, ok, tuple(reasons), draws).to(c.mask.device)
+        return judged(Estimate(F, inliers, ok, tuple(reasons), draws).to(c.mask.device), c)
 
 
 def opencv(

@@ -11,6 +11,7 @@ from fmtorch.estimators.problem import Problem, problems
 from fmtorch.estimators.support import lack_of_support, relative_rounding
 from fmtorch.threads import one_thread
 from fmtorch.types import Correspondences, Estimate, ungraphed
+from fmtorch.verdict import judged
 
 Solve = Callable[[Problem], tuple[Tensor, Tensor, Tensor, Tensor]]
 """A problem -> F (p, 3, 3) in normalised units, inliers (p, n), found (p,), draws (p,)."""
@@ -54,4 +55,4 @@ def _solve_all(c: Correspondences, seed: int, least: int, solve: Solve, not_foun
     for i in (~sound).nonzero()[:, 0].tolist():
         reasons.setdefault(i, "the final fit is not finite")
     ok = torch.tensor([i not in reasons for i in range(b)], dtype=torch.bool, device=device)
-    return Estimate(F, inliers & ok[:, None], ok, tuple(reasons.get(i, "") for i in range(b)), draws)
+    return judged(Estimate(F, inliers & ok[:, None], ok, tuple(reasons.get(i, "") for i in range(b)), draws), c)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fmtorch.stages import Estimator
 from fmtorch.types import Correspondences, Estimate
+from fmtorch.verdict import judged
 
 
 class CoarseToFine:
@@ -11,6 +12,7 @@ class CoarseToFine:
 
     coarse: one that prunes well, GC-RANSAC or USAC in the paper. fine: one that fits well, LMedS in the paper.
     A pair that one of them cannot solve is ``ok=False`` with that one's reason; `draws` counts those of both.
+    Its significance is that among all matches, also those which the coarse one dropped.
     Gradients are the fine estimator's: the coarse one only chooses matches.
     """
 
@@ -30,4 +32,5 @@ class CoarseToFine:
             f"coarse: {first}" if first else f"fine: {second}" if second else ""
             for first, second in zip(coarse.reason, fine.reason, strict=True)
         )
-        return fine.replace(reason=reasons, draws=coarse.draws + fine.draws)
+        whole = fine.replace(reason=reasons, draws=coarse.draws + fine.draws, significance=None)
+        return judged(whole, c)

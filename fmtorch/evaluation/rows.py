@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -86,5 +87,7 @@ def _row(outcome: Outcome, figures: dict[str, float], seconds: float) -> PairRow
         features0=outcome.features[0], features1=outcome.features[1],
         draws=int(estimate.draws[0]) if estimate is not None else 0,
         **{f"seconds_{stage}": outcome.seconds.get(stage, math.nan) for stage in STAGES}, seconds_metrics=seconds,
-        F=estimate.F[0].flatten().tolist() if estimate is not None and ok else None, **figures,
+        F=estimate.F[0].flatten().tolist() if estimate is not None and ok else None,
+        significance=float(cast(Tensor, estimate.significance)[0]) if estimate is not None and ok else None,
+        related=bool(estimate.related[0]) if estimate is not None else False, **figures,
     )  # fmt: skip

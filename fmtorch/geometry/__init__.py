@@ -29,6 +29,7 @@ from fmtorch.geometry.refine import attached_step as _attached_step
 from fmtorch.geometry.refine import refine as _refine
 from fmtorch.geometry.robust_kernels import KERNELS
 from fmtorch.geometry.seven_point import seven_point as _seven_point
+from fmtorch.geometry.significance import significance as _significance
 
 _public = public(__name__)
 eight_point = _public(_eight_point)
@@ -56,6 +57,7 @@ nearest_rank2 = _public(_nearest_rank2)
 attached_step = _public(_attached_step)
 refine = _public(_refine)
 seven_point = _public(_seven_point)
+significance = _public(_significance)
 
 __all__ = [
     "KERNELS",
@@ -82,6 +84,7 @@ __all__ = [
     "sampson",
     "sampson_squared",
     "seven_point",
+    "significance",
     "symmetric_max",
     "symmetric_mean",
     "symmetric_squared",

@@ -31,6 +31,8 @@ PAIR_SCHEMA = pa.schema(
         pa.field("seconds_estimation", pa.float64()),
         pa.field("seconds_metrics", pa.float64()),
         pa.field("F", pa.list_(pa.float64(), 9)),
+        pa.field("significance", pa.float64()),
+        pa.field("related", pa.bool_(), nullable=False),
     ]
 )
 
@@ -64,10 +66,14 @@ class PairRow:
     seconds_estimation: float | None = None
     seconds_metrics: float | None = None
     F: Sequence[float] | None = None  # row by row, x1^T F x0 = 0 in pixels, unit Frobenius norm
+    significance: float | None = None  # how far the support of F is beyond chance
+    related: bool = False  # whether the images are therefore taken to show one scene; recall does not ask
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.nsgd <= 1.0:
             raise ValueError(f"pair {self.pair!r}: nsgd is {self.nsgd}; it must be in [0, 1]")
+        if self.related and not self.ok:
+            raise ValueError(f"pair {self.pair!r} failed, but is called related")
         if self.ok:
             if self.reason:
                 raise ValueError(f"pair {self.pair!r} is ok but has a reason of failure: {self.reason!r}")

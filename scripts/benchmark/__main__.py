@@ -15,6 +15,7 @@ from scripts.benchmark import (
     memory,
     pipelines,
     pruning,
+    related,
     speed,
     thresholds,
 )
@@ -23,7 +24,7 @@ from scripts.benchmark import (
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m scripts.benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    for module in (estimators, features, learned, matching, memory, pipelines, pruning, speed, thresholds):
+    for module in (estimators, features, learned, matching, memory, pipelines, pruning, related, speed, thresholds):
         module.add_arguments(commands)
     arguments = parser.parse_args()
     arguments.run(arguments)

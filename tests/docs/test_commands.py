@@ -48,6 +48,7 @@ SLOW = (
     r"estimators\.txt +#",
     r"--marker rendered",
     r"--label",
+    r"benchmark related .*(hardnet|hesaffnet)",
 )
 
 PEERS = {"poselib": "poselib", "poselib_shared_focal": "poselib", "degensac_cpp": "pydegensac",
@@ -68,6 +69,7 @@ APPENDED = {
     "thresholds": ["--limit", "1", "--seeds", "1", "--values", "0.5", "0.75"],
     "pipelines": ["--limit", "1", "--seeds", "1", "--cache", "kept"],
     "pruning": ["--limit", "1", "--asift-limit", "0", "--cache", "kept"],
+    "related": ["--limit", "1", "--unrelated", "1"],
     "learned": ["--limit", "1", "--cache", "kept", "--methods", "ratio", "LC, E", "DFE"],
     "speed": ["--pairs", "2", "--batch", "2", "--repeats", "1", "--matches", "200"],
     "memory": ["--pairs", "1", "--matches", "200", "--estimators", "ransac"],

@@ -196,6 +196,13 @@ def test_rows_come_back_as_they_went(tmp_path: Path) -> None:
     assert len(list((tmp_path / "pairs").iterdir())) == 2
 
 
+def test_only_an_estimate_can_be_of_related_images() -> None:
+    assert row("a", related=True, significance=3.5).related
+    assert not row("a").related
+    with pytest.raises(ValueError, match="called related"):
+        dataclasses.replace(failed("b"), related=True)
+
+
 def test_every_column_has_a_field() -> None:
     fields = {field.name for field in dataclasses.fields(PairRow)}
     assert fields == set(PAIR_SCHEMA.names)
