@@ -129,6 +129,8 @@ def judge(name: str, batch: str, pairs: Sequence[ImagePair], c: Correspondences,
     estimate = pipeline.estimator(c, 0).detach()
     significance = estimate.significance
     assert significance is not None
+    assert c.size0 is not None
+    assert c.size1 is not None
     F = torch.stack([torch.from_numpy(pair.F) for pair in pairs])
     true = F.flatten(1).any(1)
     error = torch.where(true & estimate.ok, metrics.nsgd(F, estimate.F, c.size0, c.size1, key=c.keys), 1.0)

@@ -167,7 +167,6 @@ def test_a_training_goes_on(starter: Starter, tmp_path: Path) -> None:
 
 
 @pytest.mark.reliability
-@pytest.mark.xfail(strict=False, reason="a kill between a checkpoint and its validation loses the validation")
 def test_a_training_goes_on_always(
     starter: Starter, tmp_path: Path, record_property: Callable[[str, object], None]
 ) -> None:

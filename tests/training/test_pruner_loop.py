@@ -72,6 +72,36 @@ t.trained(Path({str(tmp_path / "parts")!r}))
         assert torch.equal(value, parts.state_dict()[name]), name
 
 
+class Ended(Exception):
+    """What a kill would do."""
+
+
+@pytest.mark.parametrize("last", [1, 2, 3])  # validations after 4, 8 and 12 steps
+def test_ended_before_a_validation_it_is_made_again(tmp_path: Path, last: int) -> None:
+    """Checkpoints are at the steps of validation; the best weights are those of an undisturbed training."""
+
+    def run(folder: Path, ends_at: int | None) -> None:
+        made, count = module(), 0
+
+        def starts() -> None:
+            nonlocal count
+            count += 1
+            if count == ends_at:
+                raise Ended
+
+        made.on_validation_start = starts  # type: ignore[method-assign]
+        train(made, batches, folder, CPU, every=4, checkpoint_every=4, patience=None, monitor="log_loss")
+
+    run(tmp_path / "whole", None)
+    with pytest.raises(Ended):
+        run(tmp_path / "parts", last)
+    run(tmp_path / "parts", None)
+    whole, parts = (torch.load(tmp_path / name / CHECKPOINTS / BEST, weights_only=True) for name in ("whole", "parts"))
+    assert whole["global_step"] == parts["global_step"]
+    for name, value in whole["state_dict"].items():
+        assert torch.equal(value, parts["state_dict"][name]), name
+
+
 def test_damaged_checkpoint_is_passed_over(tmp_path: Path) -> None:
     trained(tmp_path)
     (tmp_path / CHECKPOINTS / "step=99.ckpt").write_bytes(b"not a checkpoint")

@@ -99,9 +99,9 @@ def train(
     path, step = latest_checkpoint(folder)
     figure, mode = f"validation/{monitor}", "min" if monitor in SMALLER_IS_BETTER else "max"
     total = module.optimisation.steps
-    kept = ModelCheckpoint(
+    kept = _ResumableCheckpoint(
         folder / CHECKPOINTS, "{step}", save_top_k=1, monitor="step", mode="max", every_n_train_steps=checkpoint_every,
-        enable_version_counter=False, save_on_train_epoch_end=False,
+        enable_version_counter=False, save_on_train_epoch_end=False, validated_every=every,
     )  # fmt: skip
     best = ModelCheckpoint(
         folder / CHECKPOINTS, "best", monitor=figure, mode=mode, enable_version_counter=False, save_weights_only=True
@@ -112,7 +112,7 @@ def train(
             max_steps=total, max_epochs=1, val_check_interval=every, check_val_every_n_epoch=None,
             num_sanity_val_steps=0, log_every_n_steps=min(10, every), default_root_dir=folder,
             logger=TensorBoardLogger(folder, name=LOGS, version=""), use_distributed_sampler=False,
-            callbacks=[kept, best, *stop, TrainingBar(total, monitor), *callbacks],
+            callbacks=[best, kept, *stop, TrainingBar(total, monitor), *callbacks],
             enable_progress_bar=False, enable_model_summary=False, deterministic=True, **trainer,
         )  # fmt: skip
         if step < total:
@@ -120,6 +120,27 @@ def train(
             lightning_trainer.fit(module, own, DataLoader(_Once(), batch_size=None), ckpt_path=path, weights_only=True)
             step = lightning_trainer.global_step
     return step, module.seconds
+
+
+class _ResumableCheckpoint(ModelCheckpoint):
+    """Checkpoints at every so many steps: at a step of validation when that is done, its best figure included.
+
+    Lightning saves before it validates, and a training that goes on from there would lack that validation.
+    """
+
+    def __init__(self, *args: Any, validated_every: int, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.validated_every = validated_every
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
+        """Save after a step that no validation follows."""
+        if trainer.global_step % self.validated_every:
+            super().on_train_batch_end(trainer, trainer.lightning_module, {}, None, 0)
+
+    def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Save after a validation; that of the best weights comes before in the list of callbacks."""
+        super().on_train_batch_end(trainer, pl_module, {}, None, 0)
+        super().on_validation_end(trainer, pl_module)  # what the last batch puts off
 
 
 class _Once(Dataset[int]):
