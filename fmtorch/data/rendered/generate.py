@@ -33,6 +33,7 @@ SPLITS = ("test", "train")
 
 # The paper's rule for a pair: more than 20 SIFT matches within 1 px of the true epipolar lines in both images.
 SIFT_FEATURES, RATIO, NEAR_LINE, ENOUGH = 8000, 0.8, 1.0, 20
+_AT_ONCE = 512  # keypoints that are matched together
 
 
 @dataclasses.dataclass(frozen=True)
@@ -213,11 +214,24 @@ def ratio_matches(a: Keypoints, b: Keypoints) -> tuple[NDArray[np.float64], NDAr
 
 
 def matchable(a: Keypoints, b: Keypoints, F: NDArray[np.float64]) -> bool:
-    """Whether more than `ENOUGH` ratio matches lie within `NEAR_LINE` pixels of the true lines in both images."""
-    x0, x1 = ratio_matches(a, b)
+    """Whether more than `ENOUGH` ratio matches lie within `NEAR_LINE` pixels of the true lines in both images.
+
+    Looks at some of the first image's keypoints at a time, until there are enough.
+    """
+    found = 0
+    for begin in range(0, len(a[0]), _AT_ONCE):
+        some = a[0][begin : begin + _AT_ONCE], a[1][begin : begin + _AT_ONCE]
+        found += _near_lines(*ratio_matches(some, b), F)
+        if found > ENOUGH:
+            return True
+    return False
+
+
+def _near_lines(x0: NDArray[np.float64], x1: NDArray[np.float64], F: NDArray[np.float64]) -> int:
+    """How many matches (n, 2), (n, 2) lie within `NEAR_LINE` pixels of the true lines in both images."""
     h0, h1 = np.column_stack([x0, np.ones(len(x0))]), np.column_stack([x1, np.ones(len(x1))])
     l1, l0 = h0 @ F.T, h1 @ F
     error = np.abs((h1 * l1).sum(1))
     with np.errstate(divide="ignore", invalid="ignore"):
         worst = error / np.minimum(np.hypot(l0[:, 0], l0[:, 1]), np.hypot(l1[:, 0], l1[:, 1]))
-    return int((worst < NEAR_LINE).sum()) > ENOUGH
+    return int((worst < NEAR_LINE).sum())
