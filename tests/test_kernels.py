@@ -135,6 +135,22 @@ def test_the_folder_depends_on_what_decides_the_machine_code(monkeypatch: pytest
     assert kernel_cache.folder() != before
 
 
+def test_fused_arithmetic_rounds_once_compiled_and_not(tmp_path: Path) -> None:
+    source = """
+from fmtorch.kernels import fused, kernel
+
+@kernel("f4[::1], f4[::1], f4[::1], f4[::1]")
+def all_fused(a, b, c, out):
+    for i in range(len(a)):
+        out[i] = fused(a[i], b[i], c[i])
+"""
+    a, b, c = np.random.default_rng(0).normal(0, 1, (3, 2000)).astype(np.float32)
+    out = np.empty_like(a)
+    load(tmp_path, source).all_fused(a, b, c, out)
+    np.testing.assert_array_equal(out, [kernels.fused(*values) for values in zip(a, b, c, strict=True)])
+    assert (out != a + b * c).any()
+
+
 def test_an_edited_kernel_outside_the_package_is_compiled_anew(tmp_path: Path) -> None:
     assert result(load(tmp_path)) == EXPECTED
     assert result(load(tmp_path, SOURCE.replace("x * x", "x * x * x"))) == [[2, 16], [54, 128]]

@@ -7,12 +7,14 @@ renamed when complete, so that an interrupted generation goes on where it stoppe
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
+import itertools
 import json
 import os
 import shutil
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +35,7 @@ SPLITS = ("test", "train")
 
 # The paper's rule for a pair: more than 20 SIFT matches within 1 px of the true epipolar lines in both images.
 SIFT_FEATURES, RATIO, NEAR_LINE, ENOUGH = 8000, 0.8, 1.0, 20
+RECORD = Path(__file__).with_name("pairs.json")
 _AT_ONCE = 512  # keypoints that are matched together
 
 
@@ -113,6 +116,17 @@ def draw(scene: Scene, seed: np.random.SeedSequence) -> Iterator[Pixels]:
         yield expose(stages[shot.light], cameras, shot.lens, np.random.default_rng(noise))
 
 
+@functools.cache
+def recorded_pairs() -> dict[str, dict[str, dict[str, Any]]]:
+    """What the rule for pairs has decided: by digest and scene the number of photographs and the pairs.
+
+    Drawn and judged once by ``scripts/record_rendered_pairs.py``; with other versions of the generator or of OpenCV,
+    whose digests are not here, it is judged anew.
+    """
+    record: dict[str, dict[str, dict[str, Any]]] = json.loads(RECORD.read_text(encoding="utf-8"))
+    return record
+
+
 def generate(task: Task, folder: Path) -> Path:
     """Draws one scene into ``folder/<name>`` unless it stands there complete, and returns that path."""
     final = folder / task.name
@@ -125,7 +139,14 @@ def generate(task: Task, folder: Path) -> Path:
         temporary = folder / f".{task.name}-{os.getpid()}-{uuid.uuid4().hex[:8]}.tmp"
         temporary.mkdir(parents=True)
         try:
-            _write(temporary, scene, draw(scene, seeds(task)), task.plan)
+            decided = recorded_pairs().get(digest(task.family, task.split, task.seed, task.plan), {}).get(task.name)
+            photographs = draw(scene, seeds(task))
+            if decided is None:
+                _write(temporary, scene, photographs, task.plan)
+            else:
+                taken = list(itertools.islice(zip(scene.shots, photographs, strict=True), decided["photographs"]))
+                cameras = [_saved(temporary, i, shot, image) for i, (shot, image) in enumerate(taken)]
+                _record(temporary, cameras, decided["pairs"])
             os.replace(temporary, final)
         except OSError:
             if not final.is_dir():  # otherwise another process was faster, with the same bytes
@@ -143,9 +164,10 @@ def _write(folder: Path, scene: Scene, images: Iterable[Pixels], plan: Plan) -> 
     cameras: list[dict[str, Any]] = []
     waiting, kept = list(scene.pairs), list[tuple[int, int]]()
     for i, (shot, image) in enumerate(zip(scene.shots, images, strict=True)):
-        path = folder / f"{i:02d}.jpg"
-        features.append(keypoints(_saved(path, image, shot.jpeg)))
-        cameras.append(_as_json(path.name, shot))
+        cameras.append(_saved(folder, i, shot, image))
+        grey = cv2.imread(str(folder / cameras[-1]["image"]), cv2.IMREAD_GRAYSCALE)
+        assert grey is not None
+        features.append(keypoints(grey.astype(np.uint8, copy=False)))
         if len(features) < plan.shots:
             continue
         possible = [pair for pair in waiting if max(pair) <= i]
@@ -157,26 +179,25 @@ def _write(folder: Path, scene: Scene, images: Iterable[Pixels], plan: Plan) -> 
                 kept.append((a, b))
         if len(kept) == plan.pairs:
             break
-    record = {"cameras": cameras, "pairs": sorted(kept)}
-    (folder / "scene.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
+    _record(folder, cameras, sorted(kept))
 
 
-def _saved(path: Path, image: Pixels, quality: int) -> Pixels:
-    """Writes a photograph and returns it as it is read back, in grey."""
+def _saved(folder: Path, number: int, shot: Shot, image: Pixels) -> dict[str, Any]:
+    """Writes a photograph and returns what is recorded of it."""
+    path = folder / f"{number:02d}.jpg"
     picture = image if image.ndim == 2 else np.ascontiguousarray(image[..., ::-1])
-    if not cv2.imwrite(str(path), picture, [cv2.IMWRITE_JPEG_QUALITY, quality]):
+    if not cv2.imwrite(str(path), picture, [cv2.IMWRITE_JPEG_QUALITY, shot.jpeg]):
         raise OSError(f"{path} could not be written")
-    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    assert grey is not None
-    return grey.astype(np.uint8, copy=False)
-
-
-def _as_json(name: str, shot: Shot) -> dict[str, Any]:
     camera = shot.camera
     return {
-        "image": name, "size": list(camera.size),
+        "image": path.name, "size": list(camera.size),
         "K": camera.K.tolist(), "R": camera.R.tolist(), "t": camera.t.tolist(),
     }  # fmt: skip
+
+
+def _record(folder: Path, cameras: list[dict[str, Any]], pairs: Sequence[Sequence[int]]) -> None:
+    record = {"cameras": cameras, "pairs": pairs}
+    (folder / "scene.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
 
 
 def read(folder: Path) -> tuple[list[tuple[Path, Camera]], list[tuple[int, int]]]:

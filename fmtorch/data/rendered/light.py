@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from fmtorch import kernels
 from fmtorch.data.rendered.cameras import Camera, Matrix
 from fmtorch.data.rendered.light_kernels import affine, footprints, group_by_texture, shade
-from fmtorch.data.rendered.mipmap import TO_LINEAR, Floats, Pixels, Real, to_srgb
+from fmtorch.data.rendered.mipmap import TO_LINEAR, Floats, Pixels, Real, bilinear, to_srgb
 from fmtorch.data.rendered.raycast import Geometry, Hits
+from fmtorch.data.rendered.raycast_kernels import cast_pieces
 
 # Four rays a pixel, one on each row and column of a 4 x 4 grid (rotated grid); their mean is the pixel centre.
 SAMPLES = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))
+KERNELS = (cast_pieces, shade, footprints, affine, group_by_texture)  # that drawing calls, the slowest to compile first
 _SHADOW_MAP = 1400  # pixels
 _ANISOTROPY = 4.0  # the four rays share a footprint's long side, so each filters only a quarter of it
 
@@ -93,10 +95,9 @@ class Stage:
     def radiance(self, camera: Camera, offset: tuple[Real, Real]) -> Floats:
         """Linear colour (h, w, 3) along the rays `offset` away from the pixel centres."""
         hits = self.geometry.look(camera, offset)
-        if (hits.piece >= 0).all():
-            out = np.empty((*camera.size, 3), dtype=np.float32)
-        else:
-            out = self._background(camera, offset)
+        out = np.empty((*camera.size, 3), dtype=np.float32)
+        beyond = np.flatnonzero(hits.piece.reshape(-1) < 0)
+        out.reshape(-1, 3)[beyond] = self._background(camera, offset, beyond)
         if kernels.available():
             self._shade_compiled(hits, offset, out.reshape(-1, 3))
         else:
@@ -184,20 +185,18 @@ class Stage:
         light += sky[:, None] * np.array(self.light.sky, dtype=np.float32)
         return light
 
-    def _background(self, camera: Camera, offset: tuple[Real, Real]) -> Floats:
-        """The sky (h, w, 3), at infinity: looked up by azimuth (once round) and elevation (horizon to zenith)."""
+    def _background(self, camera: Camera, offset: tuple[Real, Real], index: NDArray[np.int64]) -> Floats:
+        """The sky (n, 3) at pixels (n,), at infinity: looked up by azimuth (once round) and elevation."""
         h, w = camera.size
         toward = camera.R.T @ np.linalg.inv(camera.K)
-        x = (np.arange(w) + offset[0]).astype(np.float32)
-        y = (np.arange(h) + offset[1]).astype(np.float32)[:, None]
+        x = np.take((np.arange(w) + offset[0]).astype(np.float32), index % w)
+        y = np.take((np.arange(h) + offset[1]).astype(np.float32), index // w)
         X, Y, Z = (np.float32(r[0]) * x + (np.float32(r[1]) * y + np.float32(r[2])) for r in toward)
         tall, wide = self.sky.shape[:2]
         azimuth = np.arctan2(Y, X) * np.float32(wide / (2 * np.pi))
         elevation = np.arctan2(Z, np.hypot(X, Y)) * np.float32(2 / np.pi)
-        coded = cv2.remap(
-            self.sky, np.mod(azimuth, wide - 1), np.clip((1 - elevation) * (tall - 1), 0, tall - 1), cv2.INTER_LINEAR
-        )
-        return np.asarray(cv2.LUT(coded, TO_LINEAR), dtype=np.float32)
+        coded = bilinear(self.sky, np.mod(azimuth, wide - 1), np.clip((1 - elevation) * (tall - 1), 0, tall - 1))
+        return np.take(TO_LINEAR, coded)
 
 
 def expose(stage: Stage, cameras: Sequence[Camera], lens: Lens, rng: np.random.Generator) -> Pixels:

@@ -92,10 +92,15 @@ class Texture:
     def _lookup(self, u: Floats, v: Floats, level: NDArray[np.int32]) -> Pixels:
         x = np.take(self.origin[:, 0], level) + u * np.take(self.scale[:, 0], level)
         y = np.take(self.origin[:, 1], level) + v * np.take(self.scale[:, 1], level)
-        n = len(x)
-        rows = max(1, -(-n // _ROW))
-        maps = np.zeros((2, rows * _ROW), dtype=np.float32)
-        maps[0, :n], maps[1, :n] = x, y
-        table = maps.reshape(2, rows, _ROW)
-        out = cv2.remap(self.atlas, table[0], table[1], cv2.INTER_LINEAR)
-        return out.reshape(rows * _ROW, -1)[:n].astype(np.uint8, copy=False)
+        return bilinear(self.atlas, x, y)
+
+
+def bilinear(picture: Pixels, x: Floats, y: Floats) -> Pixels:
+    """Colours (n, c) of a picture at points (n,) and (n,) in pixels."""
+    n = len(x)
+    rows = max(1, -(-n // _ROW))
+    maps = np.zeros((2, rows * _ROW), dtype=np.float32)
+    maps[0, :n], maps[1, :n] = x, y
+    table = maps.reshape(2, rows, _ROW)
+    out = cv2.remap(picture, table[0], table[1], cv2.INTER_LINEAR)
+    return out.reshape(rows * _ROW, -1)[:n].astype(np.uint8, copy=False)

@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.kernels import inner, kernel
+from fmtorch.kernels import fused, inner, kernel
 
 Floats = NDArray[np.float32]
 Integers = NDArray[np.int64]
@@ -16,12 +16,6 @@ Real: TypeAlias = Any  # a number of Python's or NumPy's; in a compiled function
 Index: TypeAlias = Any
 
 _OPAQUE_FROM = 128  # of 255
-
-
-@inner
-def fused(a: Real, b: Real, c: Real) -> np.float32:
-    """a + b c, rounded once to float32, of float32 numbers: what the processor's fused instruction gives."""
-    return np.float32(np.float64(a) + np.float64(b) * np.float64(c))
 
 
 @kernel(
@@ -107,8 +101,7 @@ def _open_holes(
             at_y = window[7] + (v - np.floor(v)) * window[9]
             left, top = np.floor(at_x), np.floor(at_y)
             corner = start + np.int64(top) * stride + np.int64(left)
-            f = at_x - left
-            above = fused(np.float32(opacity[corner]), f, np.float32(opacity[corner + 1]) - np.float32(opacity[corner]))
-            corner += stride
-            below = fused(np.float32(opacity[corner]), f, np.float32(opacity[corner + 1]) - np.float32(opacity[corner]))
+            a, b = np.float32(opacity[corner]), np.float32(opacity[corner + 1])
+            c, d = np.float32(opacity[corner + stride]), np.float32(opacity[corner + stride + 1])
+            above, below = fused(a, at_x - left, b - a), fused(c, at_x - left, d - c)
             hit[x] = np.rint(fused(above, at_y - top, below - above)) >= _OPAQUE_FROM
