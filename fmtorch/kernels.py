@@ -150,7 +150,7 @@ class _Fused(Inner[[Any, Any, Any], Any]):
         def fused(a: Any, b: Any, c: Any) -> Any:
             return instruction(b, c, a)
 
-        return numba.njit(**OPTIONS, no_cpython_wrapper=True)(fused)
+        return numba.njit(**OPTIONS, no_cpython_wrapper=True)(inspect.unwrap(fused))
 
 
 def _fused(a: Any, b: Any, c: Any) -> Any:

@@ -12,6 +12,7 @@ from fmtorch.data.rendered.cameras import Camera, calibration, look_at
 from fmtorch.data.rendered.depth import depth_at
 from fmtorch.data.rendered.generate import FAMILIES, Plan, Task, build
 from fmtorch.data.rendered.light import Lens, Light, Stage, expose
+from fmtorch.data.rendered.patterns import fractal
 from fmtorch.data.rendered.raycast import Geometry
 from fmtorch.data.rendered.surfaces import Surfaces, vec
 
@@ -101,6 +102,17 @@ def test_both_forms_give_the_same_depth(monkeypatch: pytest.MonkeyPatch) -> None
             depths.append(thread.submit(depth_at, task, 1, points).result())
     np.testing.assert_array_equal(*depths)
     assert np.isfinite(depths[0]).any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_both_forms_draw_the_same_noise(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = np.random.default_rng(seed).integers(9, 400, (20, 2)).tolist()
+    drawn = []
+    for form in FORMS:
+        monkeypatch.setenv(kernels.SWITCH, form)
+        drawn.append([fractal(np.random.default_rng(seed), h, w, coarsest=64 << (h % 3)) for h, w in sizes])
+    for compiled, reference in zip(*drawn, strict=True):
+        np.testing.assert_array_equal(compiled, reference)
 
 
 def test_textures_too_small_to_shrink_are_refused() -> None:

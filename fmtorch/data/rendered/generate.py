@@ -25,8 +25,11 @@ from numpy.typing import NDArray
 from fmtorch.data.rendered import collection, driving, indoor, orbit
 from fmtorch.data.rendered.cameras import Camera, fundamental
 from fmtorch.data.rendered.light import Stage, expose
+from fmtorch.data.rendered.light_kernels import affine, footprints, group_by_texture, shade
 from fmtorch.data.rendered.mipmap import Pixels
+from fmtorch.data.rendered.noise_kernels import add_enlarged
 from fmtorch.data.rendered.raycast import Geometry
+from fmtorch.data.rendered.raycast_kernels import cast_pieces
 from fmtorch.data.rendered.scene import Scene, Shot
 
 VERSION = 3  # of the generator: raised by every change that changes a picture or a pair
@@ -35,6 +38,7 @@ SPLITS = ("test", "train")
 
 # The paper's rule for a pair: more than 20 SIFT matches within 1 px of the true epipolar lines in both images.
 SIFT_FEATURES, RATIO, NEAR_LINE, ENOUGH = 8000, 0.8, 1.0, 20
+KERNELS = (cast_pieces, shade, footprints, add_enlarged, affine, group_by_texture)  # that drawing calls, slowest first
 RECORD = Path(__file__).with_name("pairs.json")
 _AT_ONCE = 512  # keypoints that are matched together
 

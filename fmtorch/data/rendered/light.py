@@ -14,11 +14,9 @@ from fmtorch.data.rendered.cameras import Camera, Matrix
 from fmtorch.data.rendered.light_kernels import affine, footprints, group_by_texture, shade
 from fmtorch.data.rendered.mipmap import TO_LINEAR, Floats, Pixels, Real, bilinear, to_srgb
 from fmtorch.data.rendered.raycast import Geometry, Hits
-from fmtorch.data.rendered.raycast_kernels import cast_pieces
 
 # Four rays a pixel, one on each row and column of a 4 x 4 grid (rotated grid); their mean is the pixel centre.
 SAMPLES = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))
-KERNELS = (cast_pieces, shade, footprints, affine, group_by_texture)  # that drawing calls, the slowest to compile first
 _SHADOW_MAP = 1400  # pixels
 _ANISOTROPY = 4.0  # the four rays share a footprint's long side, so each filters only a quarter of it
 

@@ -18,8 +18,7 @@ from pathlib import Path
 
 import fmtorch
 from fmtorch import kernels
-from fmtorch.data.rendered.generate import Task, generate
-from fmtorch.data.rendered.light import KERNELS
+from fmtorch.data.rendered.generate import KERNELS, Task, generate
 
 Progress = Callable[[int, int], None]
 _MOST = 8  # workers; each takes some 0.5 GB
