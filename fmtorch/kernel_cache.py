@@ -93,18 +93,17 @@ def _remove_unused(used: Path) -> None:
 class KernelFile:
     """The file of one kernel and signature; what numba calls the cache of a function.
 
-    missed: whether the function had to be compiled. kept: where it lies, in words for a message.
+    missing: called before the function is compiled, with words that say where it will be kept.
     """
 
-    def __init__(self, function: Callable[..., Any], signature: str) -> None:
-        self.missed, self.kept = False, "(kept in no file)"
+    def __init__(self, function: Callable[..., Any], signature: str, missing: Callable[[str], None]) -> None:
+        self.missing = missing
         self.path: Path | None = None
         where = folder()
         if where is not None and Path(function.__code__.co_filename).is_file():
             source = Path(function.__code__.co_filename).read_bytes()
             version = _hex(source + signature.encode())[:8]
             self.path = where / f"{function.__module__}.{function.__qualname__}-{version}.bin"
-            self.kept = f"(once for this machine; kept in {where})"
 
     @property
     def cache_path(self) -> str | None:
@@ -127,7 +126,8 @@ class KernelFile:
             pass
         except OSError as error:
             warnings.warn(f"{self.path} cannot be read ({error}); it is compiled anew", stacklevel=2)
-        self.missed = True
+        kept = "for this process" if self.path is None else f"for this machine, once (kept in {self.path.parent})"
+        self.missing(kept)
         return None
 
     def save_overload(self, signature: Any, result: Any) -> None:
@@ -135,7 +135,6 @@ class KernelFile:
         from numba.core.serialize import dumps
 
         if self.path is None or result.library.has_dynamic_globals:
-            self.kept = "(kept in no file)"
             return
         from fmtorch.storage.files import replacing
 
@@ -144,7 +143,6 @@ class KernelFile:
             with replacing(self.path) as temporary:
                 temporary.write_bytes(_signature(data) + data)
         except OSError as error:
-            self.kept = "(kept in no file)"
             warnings.warn(f"compiled kernels are not kept: {error}", stacklevel=2)
 
     def flush(self) -> None:

@@ -18,7 +18,6 @@ import os
 import platform
 import sys
 import threading
-import time
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, Generic, ParamSpec, TypeVar, overload
@@ -197,13 +196,13 @@ def _compiled(function: Callable[P, R], signature: str, count: str) -> Callable[
     dispatcher: Any = numba.njit(**OPTIONS)(function)
     if not hasattr(dispatcher, "compile"):
         return function  # NUMBA_DISABLE_JIT=1
-    cached = dispatcher._cache = kernel_cache.KernelFile(function, signature)
-    begun = time.perf_counter()
+
+    def tell(where: str) -> None:
+        print(f"{count}compiling {function.__name__} {where}", file=sys.stderr, flush=True)
+
+    dispatcher._cache = kernel_cache.KernelFile(function, signature, tell)
     dispatcher.compile(signature)
     dispatcher.disable_compile()
-    if cached.missed:
-        seconds = time.perf_counter() - begun
-        print(f"{count}compiled {function.__name__} in {seconds:.1f} s {cached.kept}", file=sys.stderr, flush=True)
     compiled: Callable[P, R] = dispatcher
     return compiled
 
