@@ -34,7 +34,9 @@ def draw(table: Array, totals: Array, mixed_seed: int, key: int, start: int, out
                 if position < begin[k]:
                     break
                 position += length[k]
-            index, first, weight = position, position, 1
+            index: Any = position
+            first: Any = position
+            weight: Any = 1
             if len(table):
                 index = guide[position >> shift]
                 while table[index] <= position:
@@ -79,7 +81,8 @@ def prosac_table(size: int, growth: int, out: Array) -> None:
 
     growth: T_N. Chum & Matas (CVPR 2005), equations 3 and 4, as `Prosac.table` has them.
     """
-    total, before, draws = len(out), 0.0, 0
+    total, before = len(out), 0.0
+    draws: Any = 0
     for n in range(1, total + 1):
         expected = float(growth)
         for i in range(size):
