@@ -21,6 +21,7 @@ COUNT, TRUNCATED_SQUARES, GEMAN_MCCLURE, TABLE = 0, 1, 2, 3  # gains
 ONE, ZERO, TINY = np.float32(1), np.float32(0), np.finfo(np.float32).tiny
 REST = np.float32(1 / 26)  # of the gain of Geman & McClure at 5 scales, from which on it is zero
 STRETCH = np.float32(1 / (1 - 1 / 26))
+BIN_SHIFT, BINS = 21, 1 << 10  # of a float32 the exponent and two bits more
 
 
 @kernel("f4[:, ::1], i8[::1], f4[:, ::1], f4[::1], f4[::1], i8, f4[::1], i8, f8[::1]")
@@ -101,10 +102,11 @@ def saturated_cells(points: Array, support: Array, out: Array) -> None:
 def score_median(F: Array, which: Array, points: Array, out: Array) -> None:
     """Minus the median squared residual, of an even number the lower middle one."""
     n = points.shape[1]
-    r2, scale = np.empty(n, np.float32), np.ones(n, np.float32)
+    r2, scale, some = np.empty(n, np.float32), np.ones(n, np.float32), np.empty(n + 1, np.float32)
+    counts = np.empty(BINS, np.int32)
     for k in range(len(which)):
         _squared(F[which[k]], points, scale, r2)
-        out[k] = -_smallest(r2, (n + 1) // 2)
+        out[k] = -_smallest(r2, counts, some, (n + 1) // 2)
 
 
 @inner
@@ -139,12 +141,33 @@ def _rounded(gain: Array, support: Array, bits: int, out: Array) -> None:
 
 
 @inner
-def _smallest(values: Array, rank: int) -> Any:
-    """The value of a rank, from 1, in ascending order (Hoare's selection); reorders them. NaN counts as infinite."""
+def _smallest(values: Array, counts: Array, some: Array, rank: int) -> Any:
+    """The value of a rank, from 1, in ascending order, of numbers that are not negative; NaN counts as infinite.
+
+    counts: (BINS,), some: (n + 1,), for the work. First the bin of the value is found, by its upper bits.
+    """
     for i in range(len(values)):
-        if math.isnan(values[i]):
-            values[i] = math.inf
-    low, high, k = 0, len(values) - 1, rank - 1
+        values[i] = values[i] if values[i] == values[i] else np.float32(math.inf)
+    bits = values.view(np.int32)
+    for b in range(BINS):
+        counts[b] = 0
+    for i in range(len(values)):
+        counts[bits[i] >> BIN_SHIFT] += 1
+    wanted, left = 0, rank
+    while counts[wanted] < left:
+        left -= counts[wanted]
+        wanted += 1
+    m = 0
+    for i in range(len(values)):
+        some[m] = values[i]
+        m += (bits[i] >> BIN_SHIFT) == wanted
+    return _selected(some, m, left - 1)
+
+
+@inner
+def _selected(values: Array, n: int, k: int) -> Any:
+    """The k-th smallest, from 0, of the first n values, which are reordered (Hoare)."""
+    low, high = 0, n - 1
     while low < high:
         pivot, i, j = values[(low + high) >> 1], low, high
         while i <= j:

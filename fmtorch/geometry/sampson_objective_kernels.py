@@ -15,7 +15,7 @@ WIDTH = 32  # partial sums over the matches: part of the last bits
 TINY = 1e-30  # as in `sampson_objective`
 HUBER, CAUCHY, GEMAN_MCCLURE, TRUNCATED, MAGSAC = 0, 1, 2, 3, 4  # losses
 LOSSES = {"huber": HUBER, "cauchy": CAUCHY, "geman_mcclure": GEMAN_MCCLURE, "truncated": TRUNCATED, "magsac": MAGSAC}
-JACOBIAN, RESIDUAL, INVERSE, SQUARED, LOSS, COUNT, SCALE, ROWS = 0, 9, 10, 11, 12, 13, 14, 15  # rows of a block
+RESIDUAL, INVERSE, SQUARED, LOSS, COUNT, SCALE, POINTS, ROWS = 9, 10, 11, 12, 13, 14, 15, 19  # of a block, after J
 
 
 @kernel("f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], i8, f8[:, ::1], b1, f8[:, :, ::1], f8[::1]")
@@ -64,15 +64,14 @@ def _linearise(f: Array, points: Array, weight: Array, s2: Array, first: int, bl
         block[0], block[1], block[2], block[3], block[4], block[5], block[6], block[7], block[8],
     )  # fmt: skip
     E, V, R, W, S = block[RESIDUAL], block[INVERSE], block[SQUARED], block[COUNT], block[SCALE]
-    x, count = np.zeros((4, WIDTH)), min(WIDTH, len(weight) - first)
-    for i in range(WIDTH):
-        W[i], S[i] = 0.0, 1.0
+    X0, Y0, X1, Y1 = block[POINTS], block[POINTS + 1], block[POINTS + 2], block[POINTS + 3]
+    count = min(WIDTH, len(weight) - first)
     for i in range(count):
+        X0[i], Y0[i] = points[0, first + i], points[1, first + i]
+        X1[i], Y1[i] = points[2, first + i], points[3, first + i]
         W[i], S[i] = weight[first + i], s2[first + i]
-    for k in range(4):
-        for i in range(count):
-            x[k, i] = points[k, first + i]
-    X0, Y0, X1, Y1 = x[0], x[1], x[2], x[3]
+    for i in range(count, WIDTH):
+        X0[i], Y0[i], X1[i], Y1[i], W[i], S[i] = 0.0, 0.0, 0.0, 0.0, 0.0, 1.0
     for i in range(WIDTH):
         x0, y0, x1, y1 = X0[i], Y0[i], X1[i], Y1[i]
         a0, b0 = f0 * x0 + f1 * y0 + f2, f3 * x0 + f4 * y0 + f5

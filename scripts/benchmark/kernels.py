@@ -8,6 +8,7 @@ wall; compiled into an empty cache folder.
 
 from __future__ import annotations
 
+import functools
 import os
 import sys
 import tempfile
@@ -75,13 +76,14 @@ def pruning(c: Correspondences) -> None:
             os.environ[kernels.SWITCH] = form
             stage(c)
 
-        line(name, lambda run=run: run("on"), lambda run=run: run("off"))
+        line(name, functools.partial(run, "on"), functools.partial(run, "off"))
     os.environ[kernels.SWITCH] = "on"
 
 
 def search(c: Correspondences) -> None:
     """Draws, solvers and scores: 500 samples, 1,000 models on 600 matches."""
     from fmtorch.estimators import calibrated, sampling, sampling_kernels, scores_kernels, scoring
+    from fmtorch.estimators.focal import Cameras
     from fmtorch.estimators.parts import EightPoint, SevenPoint
     from fmtorch.estimators.problem import problems
     from fmtorch.geometry.eight_point_kernels import eight_point
@@ -108,7 +110,7 @@ def search(c: Correspondences) -> None:
         tensors = torch.from_numpy(points[:, index]).float()[:, :, None]
         line(name, lambda k=kernel, i=index: k(points, i, F, draw), lambda s=solver, t=tensors: s(t))  # type: ignore[misc]
     fives, depth = np.ascontiguousarray(sample[:5]), np.full((2, samples), 1.2)
-    cameras = calibrated.Cameras(pair)
+    cameras = Cameras(pair)
     centred, offset = (
         np.ascontiguousarray(cameras.points[:, 0, :COUNT].numpy()),
         cameras.offset[:, 0].contiguous().numpy(),

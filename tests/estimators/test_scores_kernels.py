@@ -156,3 +156,15 @@ def test_residuals_and_matches_near_a_pool() -> None:
     clear = np.abs(squared.min(0) / limit - 1) > 1e-2  # not on the limit
     np.testing.assert_array_equal(near[clear], (squared.min(0) <= limit)[clear])
     assert 0 < near.sum() < 300
+
+
+@pytest.mark.parametrize("kind", ["equal", "tiny and huge", "some zero"])
+def test_median_of_unusual_residuals(kind: str) -> None:
+    """x1' F x0 = y1 - y0 for F of rectified images, so that residuals are half of (y1 - y0)^2."""
+    n = 101
+    apart = {"equal": np.full(n, 0.5), "tiny and huge": 10.0 ** np.linspace(-15, 15, n)}.get(kind, np.arange(n) // 60.0)
+    points = np.zeros((4, n), np.float32)
+    points[3] = np.random.default_rng(0).permutation(apart)
+    F, out = np.array([[0, 0, 0, 0, 0, 1, 0, -1, 0]], np.float32), np.empty(1)
+    scores_kernels.score_median(F, np.zeros(1, np.int64), points, out)
+    assert -out[0] == pytest.approx(np.sort(points[3].astype(np.float64) ** 2 / 2)[(n + 1) // 2 - 1], rel=1e-6)
