@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.geometry.arithmetic_kernels import exponential, logarithm
-from fmtorch.geometry.rank2_kernels import complement, unit
+from fmtorch.geometry.rank2_kernels import assign, assign_rows, complement, unit
 from fmtorch.geometry.rank2_manifold_kernels import eliminate, start_one
 from fmtorch.kernels import inner, kernel
 
@@ -228,8 +228,14 @@ def accept(
         damping[k] = min(max(damping[k] / 10 if better else damping[k] * 10, SMALLEST_DAMPING), LARGEST_DAMPING)
         done[k] |= tolerance >= 0 and cost[k] - trial[k] <= tolerance
         if better:
-            axes[k], focal[k], F[k], cost[k] = new_axes[k], new_focal[k], new_F[k], trial[k]
-            gradient[k], hessian[k], tangents[k] = new_gradient[k], new_hessian[k], new_tangents[k]
+            cost[k] = trial[k]
+            assign(focal[k], new_focal[k])
+            assign(F[k], new_F[k])
+            assign(gradient[k], new_gradient[k])
+            assign_rows(axes[k, 0], new_axes[k, 0])
+            assign_rows(axes[k, 1], new_axes[k, 1])
+            assign_rows(hessian[k], new_hessian[k])
+            assign_rows(tangents[k], new_tangents[k])
         everything = everything and done[k]
     return everything
 

@@ -15,6 +15,20 @@ EPS = float(np.finfo(np.float64).eps)
 
 
 @inner
+def assign(target: Array, source: Array) -> None:
+    """Copies vectors. (A slice assigned to a slice takes seconds to compile.)"""
+    for i in range(len(target)):
+        target[i] = source[i]
+
+
+@inner
+def assign_rows(target: Array, source: Array) -> None:
+    """Copies matrices."""
+    for i in range(len(target)):
+        assign(target[i], source[i])
+
+
+@inner
 def cofactors(F: Array, C: Array) -> None:
     """The matrix of cofactors of F -> C."""
     C[0], C[1], C[2] = F[4] * F[8] - F[5] * F[7], F[5] * F[6] - F[3] * F[8], F[3] * F[7] - F[4] * F[6]

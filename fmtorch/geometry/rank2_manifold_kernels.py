@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.geometry.rank2_kernels import cofactors, unit
+from fmtorch.geometry.rank2_kernels import assign, assign_rows, cofactors, unit
 from fmtorch.kernels import inner, kernel
 
 Array = NDArray[Any]
@@ -140,6 +140,10 @@ def accept(
         damping[k] = min(max(damping[k] / 10 if better else damping[k] * 10, SMALLEST_DAMPING), LARGEST_DAMPING)
         if better:
             done[k] |= tolerance > 0 and cost[k] - trial[k] <= tolerance * cost[k]
-            cost[k], F[k], e0[k], e1[k], products[k] = trial[k], G[k], g0[k], g1[k], others[k]
+            cost[k] = trial[k]
+            assign(F[k], G[k])
+            assign(e0[k], g0[k])
+            assign(e1[k], g1[k])
+            assign_rows(products[k], others[k])
         everything = everything and done[k]
     return everything
