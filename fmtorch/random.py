@@ -44,7 +44,7 @@ def _mix(x: Int[Tensor, "*shape"]) -> Int[Tensor, "*shape"]:
     return x ^ _shift_right(x, 31)
 
 
-def _mixed_seed(seed: int, stream: Stream) -> int:
+def mixed_seed(seed: int, stream: Stream) -> int:
     """`_mix` of the seed and the stream, in Python's integers: the same bits without the cost of tensors."""
     x = ((seed * 2 + 1) * 0x9E3779B97F4A7C15 + int(stream)) % (1 << 64)
     x = (x ^ (x >> 30)) * 0xBF58476D1CE4E5B9 % (1 << 64)
@@ -58,7 +58,7 @@ def bits(
     """Random 63-bit non-negative integers for the draws start .. start + count - 1, `columns` numbers a draw."""
     device = key.device
     counter = torch.arange(start * columns, (start + count) * columns, device=device, dtype=torch.int64)
-    state = _mix(key ^ _mixed_seed(seed, stream))[:, None] + (counter * _GAMMA)[None]
+    state = _mix(key ^ mixed_seed(seed, stream))[:, None] + (counter * _GAMMA)[None]
     return _shift_right(_mix(state), 1).reshape(len(key), count, columns)
 
 

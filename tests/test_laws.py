@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch import presets
+from fmtorch import kernels, presets
 from fmtorch.estimators import engine, irls, local_optimization, scoring
 from fmtorch.geometry import sampson_objective
 from fmtorch.types import Correspondences, collate
@@ -32,6 +32,9 @@ from tests.laws import (
 OWN = [n for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES)]
 PER_MATCH = ("inliers", "kept", "prior", "noise")
 NOISY = ("fmtorch", "fmtorch_max", "gc_ransac", "msac")  # are also told the noise of matches
+COMPILED = (  # pruners of two forms: a kernel, and tensors
+    "frame_consistency", "gms", "gms_soft", "lpm", "lpm_soft", "match_noise", "one_to_one", "position_consistency",
+)  # fmt: skip
 TILES = [  # what bounds memory and fills caches, and must change no result
     (engine, "CPU_SAMPLES", 150), (scoring, "CPU_TILE", 1000), (local_optimization, "CPU_TILE", 1000),
     (irls, "TILE", 1000), (sampson_objective, "TILE_ELEMENTS", 1), (sampson_objective, "TILE_MODELS", 3),
@@ -48,15 +51,18 @@ def _estimator(name: str) -> Subject:
     return Subject(f"estimator={name}", run)
 
 
-def _pruner(name: str) -> Subject:
+def _pruner(name: str, kernel: bool = True) -> Subject:
     pruner = quick_pruner(name)
 
     def run(c: Correspondences) -> Result:
-        pruned = pruner(calibrated(c))
+        with pytest.MonkeyPatch.context() as environment:
+            if not kernel:
+                environment.setenv(kernels.SWITCH, "off")
+            pruned = pruner(calibrated(c))
         told = {name: getattr(pruned, name) for name in ("prior", "noise")}
         return {"kept": pruned.mask, **{name: value for name, value in told.items() if value is not None}}
 
-    return Subject(f"pruner={name}", run)
+    return Subject(f"pruner={name}" + ("" if kernel else " without kernels"), run)
 
 
 def _noisy(name: str) -> Subject:
@@ -72,7 +78,8 @@ def _noisy(name: str) -> Subject:
 def _subjects() -> list[Subject]:
     """Every preset of these groups: a new file in conf/ joins by being there."""
     estimators = [_estimator(n) for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES[1:])]
-    return [*estimators, *(_pruner(n) for n in presets.available("pruner")), *(_noisy(n) for n in NOISY)]
+    pruners = [*(_pruner(n) for n in presets.available("pruner")), *(_pruner(n, kernel=False) for n in COMPILED)]
+    return [*estimators, *pruners, *(_noisy(n) for n in NOISY)]
 
 
 @functools.cache

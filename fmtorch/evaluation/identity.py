@@ -12,7 +12,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from fmtorch import presets
+from fmtorch import kernels, presets
 from fmtorch.estimators.adapters import PEERS
 from fmtorch.pipeline import Pipeline
 from fmtorch.presets import plain
@@ -32,8 +32,9 @@ def run_identity(config: DictConfig, pipeline_name: str, pipeline: Pipeline, dat
 
     Returns:
         `pipeline`, each stage's config (pruners as a list), `seed`; `version` of fmtorch, in a checkout its commit;
-        `libraries`: their versions; `learned`: digests of each stage's learned files; `code`: digests of the sources of
-        parts of the user's own; `dataset`: its config, without where it lies, and its digest.
+        `libraries`: their versions; `kernels`: by which numba, or off; `learned`: digests of each stage's learned
+        files; `code`: digests of the sources of parts of the user's own; `dataset`: its config, without where it lies,
+        and its digest.
     """
     stages = presets.stages(config)
     dataset = {
@@ -43,7 +44,7 @@ def run_identity(config: DictConfig, pipeline_name: str, pipeline: Pipeline, dat
     peers = {PEERS[name] for target in presets.targets_of(stages) if (name := target.rpartition(".")[2]) in PEERS}
     return {
         "pipeline": pipeline_name, **stages, "seed": config.seed, "version": fmtorch_version(),
-        "libraries": libraries(sorted(peers)), "learned": _learned(stages, pipeline),
+        "libraries": libraries(sorted(peers)), "kernels": kernels.identity(), "learned": _learned(stages, pipeline),
         "code": _code({"stages": stages, "dataset": dataset}), "dataset": dataset,
     }  # fmt: skip
 

@@ -74,12 +74,17 @@ def mean_terms(pairs: Pairs, draw: Draw, *, samples: int, seed: int) -> tuple[Fl
 
     `draw` maps pairs and their uniform numbers (b, draws, 6) to values and accepted flags, both (b, draws).
     """
-    if samples < 1:
-        raise ValueError(f"samples is {samples}; it must be at least 1")
+    expect_samples(samples)
     step = max(1, TILE // BLOCK)
     starts = range(0, max(1, len(pairs.key)), step)  # one empty tile for an empty batch
     parts = [_tile_terms(pairs.take(slice(i, i + step)), draw, samples, seed) for i in starts]
     return torch.cat([total for total, _ in parts]), torch.cat([count for _, count in parts])
+
+
+def expect_samples(samples: int) -> None:
+    """Raises ValueError unless there is at least one."""
+    if samples < 1:
+        raise ValueError(f"samples is {samples}; it must be at least 1")
 
 
 def _tile_terms(pairs: Pairs, draw: Draw, samples: int, seed: int) -> tuple[Tensor, Tensor]:

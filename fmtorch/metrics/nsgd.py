@@ -22,7 +22,10 @@ from torch import Tensor
 
 from fmtorch.checked import checked
 from fmtorch.geometry.epipolar import lines_through, residual_and_normals, unit_largest
-from fmtorch.metrics.draws import Pairs, diagonal, mean_terms, segment_in_image
+from fmtorch.metrics import nsgd_kernels as compiled
+from fmtorch.metrics.draws import Pairs, diagonal, expect_samples, mean_terms, segment_in_image
+from fmtorch.pair_arrays import for_each_pair, kernels_serve
+from fmtorch.random import Stream, mixed_seed
 
 BORDER = -0.5  # left and top edge of the first pixel
 NORMAL_FLOOR = 1e-12  # length of a normal, for F of unit size, that is as good as none: its line is at infinity
@@ -112,8 +115,24 @@ def _mean_distance(
         unit0, unit1 = unit(diagonal(tile.size0)), unit(diagonal(tile.size1))
         return (d0 / unit0[:, None] + d1 / unit1[:, None]) / 2, accepted
 
-    total, count = mean_terms(pairs, draw, samples=samples, seed=seed)
+    if kernels_serve(pairs.F_gt, pairs.F_est, pairs.size0, pairs.size1):
+        total, count = _compiled_terms(unit, pairs, samples, seed)
+    else:
+        total, count = mean_terms(pairs, draw, samples=samples, seed=seed)
     diagonal0, diagonal1 = diagonal(pairs.size0), diagonal(pairs.size1)
     worst = (diagonal0 / unit(diagonal0) + diagonal1 / unit(diagonal1)) / 2
     value = torch.where(count > 0, total / count.clamp(min=1), worst)
     return (torch.minimum(value, worst) if cap else value).reshape(shape).to(F_est.dtype)
+
+
+def _compiled_terms(
+    unit: Callable[[Tensor], Tensor], pairs: Pairs, samples: int, seed: int
+) -> tuple[Float[Tensor, " b"], Float[Tensor, " b"]]:
+    """Sum and number of the accepted draws of each pair, by the kernel."""
+    expect_samples(samples)
+    units = torch.stack([unit(diagonal(size)) for size in (pairs.size0, pairs.size1)], -1)
+    tensors = (pairs.F_gt, pairs.F_est, pairs.size0, pairs.size1, units, pairs.key[:, None])
+    constants = (mixed_seed(seed, Stream.METRIC), samples)
+    out = torch.empty(len(units), 2, dtype=torch.float64)
+    terms = for_each_pair(compiled.accepted_draws, tensors, *constants, out=out, kind=torch.float64)
+    return terms[:, 0], terms[:, 1]

@@ -5,10 +5,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from fmtorch.pair_arrays import for_each_pair, kernels_serve
+from fmtorch.pruning import calibration_kernels as compiled
 from fmtorch.types import Correspondences
 
 _SQUARINGS = 10
@@ -42,6 +45,12 @@ class Calibration:
         fitted = self.alone if c.quality is None else self.with_ratio
         if fitted is None:
             return c
+        if kernels_serve(c.x0, evidence, c.quality):
+            numbers = (fitted["constant"], fitted["evidence"], fitted.get("ratio", 0.0), _LARGEST, 2.0**-_SQUARINGS)
+            out = torch.empty(c.mask.shape, dtype=torch.float32)
+            tensors = (evidence, c.quality, c.mask)
+            prior = for_each_pair(compiled.calibrated, tensors, np.array(numbers, np.float32), out=out)
+            return c.replace(prior=prior.to(c.x0.dtype))
         log_odds = fitted["constant"] + fitted["evidence"] * torch.where(c.mask, evidence.to(c.x0.dtype), 0)
         if c.quality is not None:
             log_odds = log_odds + fitted["ratio"] * torch.where(c.mask, c.quality, 0).nan_to_num(nan=1.0)

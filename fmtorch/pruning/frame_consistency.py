@@ -12,12 +12,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.geometry.curves import curve_orders
 from fmtorch.geometry.reduce import component_sum
+from fmtorch.pair_arrays import for_each_pair, kernels_serve
+from fmtorch.pruning import consistency_kernels as compiled
 from fmtorch.types import Correspondences, ungraphed
 
 WINDOW = 8  # neighbours before and after each match along each curve
@@ -27,6 +30,12 @@ NOISE = 4.0  # px, keeps close neighbours from being judged by their localisatio
 WORST_RATIO, LEAST_VOTE = 0.85, 0.02  # a neighbour votes with WORST_RATIO - ratio, at least LEAST_VOTE
 TILE = 1 << 12  # matches looked at together: what a processor's cache holds; changes no result
 GPU_TILE = 1 << 17
+LEAST_SQUARE, LEAST_VOTES = 1e-12, float(np.finfo(np.float32).tiny)  # keep a root's gradient and a quotient finite
+
+# For the kernels: shift, cosine and sine of each curve; their other numbers.
+CURVE_TABLE = np.array([(shift, math.cos(angle), math.sin(angle)) for shift, angle in CURVES], np.float32)
+NUMBERS = (WORST_RATIO, LEAST_VOTE, NOISE, TOLERANCE**-2 / 8, LEAST_SQUARE, LEAST_VOTES)
+_NUMBERS = np.array(NUMBERS, np.float32)
 
 
 def frame_agreement(
@@ -41,8 +50,12 @@ def frame_agreement(
 
     For neighbours i, j with frame maps S: ``e = max(|S_i dx0 - dx1|, |S_j dx0 - dx1|) / (s_i |dx0| + |dx1| + NOISE)``
     with s the scale change of S; the agreement is the mean of ``(1 + (e / TOLERANCE)^2 / 8)^-8`` over the neighbours in
-    both images, weighted by votes.
+    both images, weighted by votes. On a CPU and without gradients it is computed in float32, by a kernel.
     """
+    if kernels_serve(x0, x1, lafs0, lafs1, quality):
+        tensors = (x0, x1, lafs0, lafs1, quality, mask)
+        out = torch.empty(mask.shape, dtype=torch.float32)
+        return for_each_pair(compiled.frame_agreement, tensors, CURVE_TABLE, _NUMBERS, out=out).to(x0.dtype)
     S = frame_map(lafs0, lafs1)
     vote = torch.ones_like(x0[..., 0]) if quality is None else (WORST_RATIO - quality).clamp_min(LEAST_VOTE)
     scale = (S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]).abs().sqrt()
@@ -91,7 +104,11 @@ def _along_curve(rows: Float[Tensor, "10 b n"]) -> Float[Tensor, "2 b n"]:
     rows = rows[:, :, None]
     dx, dy, ux, uy = near[:4] - rows[:4]
     error = torch.maximum(_prediction_error(rows[4:8], dx, dy, ux, uy), _prediction_error(near[4:8], dx, dy, ux, uy))
-    length = (dx.square() + dy.square() + 1e-12).sqrt() * rows[8] + (ux.square() + uy.square() + 1e-12).sqrt() + NOISE
+    length = (
+        (dx.square() + dy.square() + LEAST_SQUARE).sqrt() * rows[8]
+        + (ux.square() + uy.square() + LEAST_SQUARE).sqrt()
+        + NOISE
+    )
     # exp(-z) in arithmetic alone, whose last bits, unlike exp's, do not depend on where in memory a number stands
     agree = (1 + error / length.square() * (TOLERANCE**-2 / 8)).square().square().square().reciprocal()
     votes = torch.stack([agree * near[9], near[9]])
@@ -123,7 +140,12 @@ class FrameConsistency:
         return ungraphed(c, lambda: self._with_prior(c, frames0, frames1, ratio))
 
     def _with_prior(self, c: Correspondences, lafs0: Tensor, lafs1: Tensor, ratio: Tensor) -> Correspondences:
-        w = frame_agreement(c.x0, c.x1, lafs0, lafs1, ratio, c.mask) + self.floor
+        w = frame_agreement(c.x0, c.x1, lafs0, lafs1, ratio, c.mask)
+        if kernels_serve(w, ratio):
+            out = torch.empty(c.mask.shape, dtype=torch.float32)
+            prior = for_each_pair(compiled.frame_prior, (w, ratio, c.mask), self.odds, self.floor, self.slope, out=out)
+            return c.replace(prior=prior.to(w.dtype))
+        w = w + self.floor
         known = c.mask & torch.isfinite(ratio)
         quality = torch.where(known, ratio, 1)
         odds = self.odds * w * w * w / (1 + self.slope * quality).square()

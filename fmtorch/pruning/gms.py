@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from fmtorch.pair_arrays import for_each_pair, kernels_serve
+from fmtorch.pruning import gms_kernels as compiled
 from fmtorch.pruning.calibration import calibration_of
 from fmtorch.pruning.gms_table import GRIDS, Border, Moves, Surroundings, Table, give_back, moves_in_blocks, tabulated
 from fmtorch.types import Correspondences, ungraphed
@@ -42,6 +45,10 @@ def gms(
     size is bounded.
     """
     grids, turns = GRIDS if with_scale else GRIDS[:1], 8 if with_rotation else 1
+    if kernels_serve(x0.detach(), x1.detach()):
+        out = torch.empty(x0.shape[:2], dtype=torch.bool)
+        options = (np.array(grids), turns, threshold_factor, border == "authors")
+        return for_each_pair(compiled.gms, _per_pair(x0, x1, size0, size1, mask), *options, out=out, kind=torch.float64)
     kept = torch.zeros(x0.shape[:2], dtype=torch.bool, device=x0.device)
     for moves, place in moves_in_blocks(x0, x1, size0, size1, mask, grids, border):
         table = tabulated(moves)
@@ -73,6 +80,11 @@ def gms_support(
     most matches of the pair in `gms`, whose arguments these are.
     """
     grids, turns = GRIDS if with_scale else GRIDS[:1], 8 if with_rotation else 1
+    if kernels_serve(x0.detach(), x1.detach()):
+        out = torch.empty(x0.shape[:2], dtype=torch.float64)
+        options = (np.array(grids), turns, threshold_factor, border == "authors", _HALF_SUPPORT)
+        tensors = _per_pair(x0, x1, size0, size1, mask)
+        return for_each_pair(compiled.gms_support, tensors, *options, out=out, kind=torch.float64).to(x0.dtype)
     support = torch.zeros(x0.shape[:2], dtype=x0.dtype, device=x0.device)
     for moves, place in moves_in_blocks(x0, x1, size0, size1, mask, grids, border):
         table = tabulated(moves)
@@ -83,6 +95,12 @@ def gms_support(
         give_back(table)
         support.view(-1)[place] = (z / (z + _HALF_SUPPORT)).to(support.dtype)
     return support
+
+
+def _per_pair(x0: Tensor, x1: Tensor, size0: Tensor, size1: Tensor, mask: Tensor | None) -> tuple[Tensor, ...]:
+    """What the kernels are given of each pair."""
+    mask = torch.ones_like(x0[..., 0], dtype=torch.bool) if mask is None else mask
+    return x0, x1, size0.float(), size1.float(), mask
 
 
 def _standing(table: Table, moves: Moves, turns: int, factor: float) -> UInt8[Tensor, "s m"]:

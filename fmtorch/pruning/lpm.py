@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from fmtorch.pair_arrays import for_each_pair, kernels_serve
+from fmtorch.pruning import lpm_kernels as compiled
 from fmtorch.pruning.calibration import calibration_of
 from fmtorch.pruning.knn import nearest_points
 from fmtorch.types import Correspondences
@@ -34,6 +37,8 @@ def lpm(
     Points in any common unit. Non-finite points are dropped. Memory is linear in the number of matches. Raises
     ValueError for K below 4, and for options of different lengths.
     """
+    if kernels_serve(x0.detach(), x1.detach()):
+        return _compiled(x0, x1, mask, thresholds, neighbors, taus)[:, 0] > 0
     kept = torch.zeros(x0.shape[:2], dtype=torch.bool, device=x0.device)
     for pair, match, passes in _passes(x0, x1, mask, thresholds, neighbors, taus):
         kept[pair, match] = passes[-1] <= thresholds[len(passes) - 1]
@@ -54,10 +59,38 @@ def lpm_cost(
     The first pass sees all matches, the second those that the first kept: together they tell right matches from wrong
     ones better than either does. Arguments as `lpm`.
     """
+    if kernels_serve(x0.detach(), x1.detach()):
+        return _compiled(x0, x1, mask, thresholds, neighbors, taus)[:, 1].to(x0.dtype)
     cost = torch.ones(x0.shape[:2], dtype=torch.float64, device=x0.device)
     for pair, match, passes in _passes(x0, x1, mask, thresholds, neighbors, taus):
         cost[pair, match] = sum(passes[1:], passes[0]) / len(passes)
     return cost.to(x0.dtype)
+
+
+def _compiled(
+    x0: Tensor,
+    x1: Tensor,
+    mask: Tensor | None,
+    thresholds: Sequence[float],
+    neighbors: Sequence[int],
+    taus: Sequence[float],
+) -> Float[Tensor, "b 2 n"]:
+    """Of each match 1 if it is kept, and its cost, by the kernel."""
+    _expect_passes(thresholds, neighbors, taus)
+    mask = torch.ones_like(x0[..., 0], dtype=torch.bool) if mask is None else mask
+    rows = zip(thresholds, neighbors, taus, strict=True)
+    options = [np.array(row, kind) for row, kind in zip(zip(*rows, strict=True), "dld", strict=True)]
+    out = torch.empty(len(x0), 2, x0.shape[1], dtype=torch.float64)
+    return for_each_pair(compiled.lpm, (x0, x1, mask), *options, out=out, kind=torch.float64)
+
+
+def _expect_passes(thresholds: Sequence[float], neighbors: Sequence[int], taus: Sequence[float]) -> None:
+    passes = {"thresholds": len(thresholds), "neighbors": len(neighbors), "taus": len(taus)}
+    if len(set(passes.values())) > 1 or not thresholds:
+        said = ", ".join(f"{name} has {count}" for name, count in passes.items())
+        raise ValueError(f"{said} values; they must have one for each pass, and there must be a pass")
+    if min(neighbors) < 4:
+        raise ValueError(f"neighbors is {neighbors}; each must be at least 4, so that the smallest neighbourhood has 2")
 
 
 def _passes(
@@ -69,12 +102,7 @@ def _passes(
     taus: Sequence[float],
 ) -> Iterator[tuple[int, Int[Tensor, " n"], list[Float[Tensor, " n"]]]]:
     """Of each pair its live matches and, for every pass that there was, the mean cost of each of them."""
-    passes = {"thresholds": len(thresholds), "neighbors": len(neighbors), "taus": len(taus)}
-    if len(set(passes.values())) > 1 or not thresholds:
-        said = ", ".join(f"{name} has {count}" for name, count in passes.items())
-        raise ValueError(f"{said} values; they must have one for each pass, and there must be a pass")
-    if min(neighbors) < 4:
-        raise ValueError(f"neighbors is {neighbors}; each must be at least 4, so that the smallest neighbourhood has 2")
+    _expect_passes(thresholds, neighbors, taus)
     alive = torch.isfinite(x0).all(-1) & torch.isfinite(x1).all(-1)
     alive = alive if mask is None else alive & mask
     for pair, here in enumerate(alive):

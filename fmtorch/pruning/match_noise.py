@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from fmtorch.pair_arrays import for_each_pair, kernels_serve
+from fmtorch.pruning import match_noise_kernels as compiled
 from fmtorch.types import Correspondences, ungraphed
 
 LEAST_AREA = 1e-12  # square pixels: keeps the gradient of the scale finite
@@ -63,6 +66,10 @@ class MatchNoise:
         lafs0, lafs1 = c.lafs0, c.lafs1
         if lafs0 is None or lafs1 is None:
             return c
+        if kernels_serve(lafs0, lafs1, c.quality, c.prior, floats=(torch.float32,)):
+            numbers = np.array((self.usual, self.radius, self.slope, LEAST_AREA, LEAST_PRIOR), np.float32)
+            tensors = (lafs0, lafs1, c.quality, c.prior, c.mask)
+            return c.replace(noise=for_each_pair(compiled.match_noise, tensors, numbers, out=torch.empty(c.mask.shape)))
         return ungraphed(c, lambda: self._with_noise(c, lafs0, lafs1))
 
     def _with_noise(self, c: Correspondences, lafs0: Tensor, lafs1: Tensor) -> Correspondences:

@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.pair_arrays import for_each_pair, kernels_serve
+from fmtorch.pruning import one_to_one_kernels as compiled
 from fmtorch.types import Correspondences
 
 
@@ -22,8 +24,12 @@ def one_to_one(
     The best has the lowest `quality` (NaN is worst), ties by lowest index. Locations are the same when the coordinates
     are exactly equal, as those of one keypoint with several orientations are. The rule is symmetric in the images and
     independent of the order of the matches, ties apart. Matches with a non-finite coordinate are dropped.
-    O(N log N).
+    O(N log N), on a CPU O(N).
     """
+    if kernels_serve(x0.detach(), x1.detach(), quality.detach()):
+        tensors = (x0, x1, quality, torch.ones_like(x0[..., 0], dtype=torch.bool) if mask is None else mask)
+        out = torch.empty(x0.shape[:2], dtype=torch.bool)
+        return for_each_pair(compiled.one_to_one, tensors, out=out, kind=torch.float64)
     usable = torch.isfinite(x0).all(-1) & torch.isfinite(x1).all(-1)
     if mask is not None:
         usable = usable & mask

@@ -11,14 +11,28 @@ import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch.geometry.curves import curve_orders
 from fmtorch.geometry.reduce import component_sum
+from fmtorch.pair_arrays import for_each_pair, kernels_serve
+from fmtorch.pruning import consistency_kernels as compiled
 from fmtorch.pruning.calibration import Calibration
-from fmtorch.pruning.frame_consistency import CURVES, LEAST_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO, tiled
+from fmtorch.pruning.frame_consistency import (
+    CURVE_TABLE,
+    CURVES,
+    LEAST_SQUARE,
+    LEAST_VOTE,
+    NOISE,
+    NUMBERS,
+    TOLERANCE,
+    WINDOW,
+    WORST_RATIO,
+    tiled,
+)
 from fmtorch.types import Correspondences, ungraphed
 
 TURNS = 16  # hypotheses of the common turn
@@ -27,6 +41,16 @@ _BINS = len(SCALES) * TURNS
 _IDENTITY = SCALES.index(1.0) * TURNS
 _EDGES = tuple(2.0 ** (k / 2) for k in range(-9, 11, 2))  # of squared scales, halfway between the hypotheses
 _FARTHEST = 1e15  # px; a match beyond is none: its squares could overflow
+_ANGLES = tuple(2 * math.pi * k / TURNS for k in range(TURNS))
+_HALF_SECTOR, _TWO_SECTORS = math.pi / TURNS, math.pi / 8
+
+# For the kernel: its numbers, the edges, and of each scale and turn the scaled cosine and sine and the scale.
+_NUMBERS = np.array(
+    (*NUMBERS, _FARTHEST, math.cos(_HALF_SECTOR), math.sin(_HALF_SECTOR), math.tan(_TWO_SECTORS), _IDENTITY), np.float32
+)
+_EDGE_TABLE, _SCALE_TABLE = np.array(_EDGES, np.float32), np.array(SCALES, np.float32)[:, None]
+_COSINES, _SINES = (np.array([f(angle) for angle in _ANGLES], np.float32) for f in (math.cos, math.sin))
+_MAPS = np.stack(np.broadcast_arrays(_SCALE_TABLE * _COSINES, _SCALE_TABLE * _SINES, _SCALE_TABLE), -1).copy()
 
 
 class Similarity(NamedTuple):
@@ -47,8 +71,13 @@ def position_agreement(
 
     For neighbours with differences dx0, dx1 and the common similarity S of the pair, of scale s,
     ``e = |S dx0 - dx1| / (s |dx0| + |dx1| + NOISE)``; the agreement is the mean of ``(1 + (e / TOLERANCE)^2 / 8)^-8``
-    over the neighbours in both images, weighted by votes (`frame_agreement` has the same constants and votes).
+    over the neighbours in both images, weighted by votes (`frame_agreement` has the same constants and votes). On a CPU
+    and without gradients it is computed in float32, by a kernel.
     """
+    if kernels_serve(x0, x1, quality):
+        constants = (CURVE_TABLE, _NUMBERS, _EDGE_TABLE, _MAPS)
+        out = torch.empty(mask.shape, dtype=torch.float32)
+        return for_each_pair(compiled.position_agreement, (x0, x1, quality, mask), *constants, out=out).to(x0.dtype)
     vote = torch.ones_like(x0[..., 0]) if quality is None else (WORST_RATIO - quality).clamp_min(LEAST_VOTE)
     rows = torch.stack([*x0.unbind(-1), *x1.unbind(-1), vote])
     sound = mask & (rows.abs() < _FARTHEST).all(0)
@@ -83,9 +112,8 @@ def common_similarity(
     index = torch.arange(_BINS, device=merit.device)
     first = (_IDENTITY - index).remainder(_BINS)  # of equals the identity wins
     best = (merit * _BINS + (_BINS - 1 - first)).argmax(1, keepdim=True)
-    angles = [2 * math.pi * k / TURNS for k in range(TURNS)]
     scale = along0.new_tensor(SCALES)[best // TURNS]
-    cosine, sine = (along0.new_tensor([f(angle) for angle in angles])[best % TURNS] for f in (math.cos, math.sin))
+    cosine, sine = (along0.new_tensor([f(angle) for angle in _ANGLES])[best % TURNS] for f in (math.cos, math.sin))
     return Similarity(scale * cosine, scale * sine, scale)
 
 
@@ -106,7 +134,7 @@ def _histogram(along: Float[Tensor, "5 b n"], count: Int[Tensor, " b"]) -> Int[T
 
 def _turn(x: Tensor, y: Tensor) -> Int[Tensor, "b n"]:
     """Which of 16 sectors, centred on multiples of 22.5 degrees, the direction (x, y) is in; by comparisons alone."""
-    cosine, sine = math.cos(math.pi / TURNS), math.sin(math.pi / TURNS)
+    cosine, sine = math.cos(_HALF_SECTOR), math.sin(_HALF_SECTOR)
     x, y = cosine * x - sine * y, sine * x + cosine * y
     half = y < 0
     x, y = torch.where(half, -x, x), torch.where(half, -y, y)
@@ -114,7 +142,7 @@ def _turn(x: Tensor, y: Tensor) -> Int[Tensor, "b n"]:
     x, y = torch.where(quarter, y, x), torch.where(quarter, -x, y)
     eighth = y >= x
     x, y = torch.where(eighth, x + y, x), torch.where(eighth, y - x, y)
-    sixteenth = y >= math.tan(math.pi / 8) * x
+    sixteenth = y >= math.tan(_TWO_SECTORS) * x
     return 8 * half.long() + 4 * quarter.long() + 2 * eighth.long() + sixteenth.long()
 
 
@@ -132,7 +160,11 @@ def _along_curve(rows: Float[Tensor, "5 b n"], S: Similarity) -> tuple[Float[Ten
     later = torch.stack([padded[..., k : k + n] for k in range(1, reach + 1)], 1)  # (5, reach, b, n)
     dx, dy, ux, uy = later[:4] - rows[:4, None]
     error = (S.a * dx - S.b * dy - ux).square() + (S.b * dx + S.a * dy - uy).square()
-    length = S.scale * (dx.square() + dy.square() + 1e-12).sqrt() + (ux.square() + uy.square() + 1e-12).sqrt() + NOISE
+    length = (
+        S.scale * (dx.square() + dy.square() + LEAST_SQUARE).sqrt()
+        + (ux.square() + uy.square() + LEAST_SQUARE).sqrt()
+        + NOISE
+    )
     agree = (1 + error / length.square() * (TOLERANCE**-2 / 8)).square().square().square().reciprocal()
     # Added one by one: the order of a sum must not depend on the batch.
     forward, backward = agree * later[4], agree * rows[4]

@@ -1,28 +1,53 @@
-"""`python -m fmtorch.storage [DIR]`: what the feature cache holds."""
+"""`python -m fmtorch.storage [DIR]`: what the feature cache and the folder of compiled kernels hold."""
 
 from __future__ import annotations
 
 import argparse
+import shutil
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
+from fmtorch.kernel_cache import ABOUT, kernels_dir
 from fmtorch.resources import cache_dir
 from fmtorch.storage.cache import ArrayCache
+
+Sizes = Mapping[str, Sequence[int]]
 
 
 def main() -> None:
     """The command."""
-    parser = argparse.ArgumentParser(prog="python -m fmtorch.storage", description="What the feature cache holds.")
+    parser = argparse.ArgumentParser(
+        prog="python -m fmtorch.storage", description="What the feature cache and the folder of compiled kernels hold."
+    )
     parser.add_argument("folder", nargs="?", type=Path, default=cache_dir() / "features", metavar="DIR")
-    folder: Path = parser.parse_args().folder
-    sizes: dict[str, list[int]] = {}
-    for path, status in ArrayCache(folder).files():
-        sizes.setdefault(path.parent.name, []).append(status.st_size)
+    parser.add_argument("--clear-kernels", action="store_true", help="remove the compiled kernels of all versions")
+    options = parser.parse_args()
+    if options.clear_kernels and kernels_dir().is_dir():
+        shutil.rmtree(kernels_dir())
+    features: dict[str, list[int]] = {}
+    for path, status in ArrayCache(options.folder).files():
+        features.setdefault(path.parent.name, []).append(status.st_size)
+    _show(options.folder, "configuration", features)
+    _show(kernels_dir(), "version of the compiled kernels", _kernels())
+
+
+def _kernels() -> Sizes:
+    """Sizes of the compiled kernels of each version, and when it was last used."""
+    sizes = {}
+    for about in kernels_dir().glob(f"*/{ABOUT}"):
+        day = time.strftime("%Y-%m-%d", time.localtime(about.stat().st_mtime))
+        sizes[f"{about.parent.name}, used {day}"] = [file.stat().st_size for file in about.parent.glob("*.bin")]
+    return sizes
+
+
+def _show(folder: Path, kind: str, sizes: Sizes) -> None:
     table = Table(title=f"{folder}: {sum(map(len, sizes.values()))} files, {_megabytes(sum(map(sum, sizes.values())))}")
-    for name in ("configuration", "files", "size"):
-        table.add_column(name, justify="left" if name == "configuration" else "right")
+    for name in (kind, "files", "size"):
+        table.add_column(name, justify="left" if name == kind else "right")
     for section, some in sorted(sizes.items()):
         table.add_row(section, str(len(some)), _megabytes(sum(some)))
     Console().print(table)

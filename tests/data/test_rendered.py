@@ -257,3 +257,28 @@ def test_scene_file_holds_the_cameras_exactly(tiny: RenderedPairs) -> None:
     for entry, camera in zip(record["cameras"], cameras, strict=True):
         np.testing.assert_array_equal(entry["R"], camera.R)
         np.testing.assert_array_equal(entry["t"], camera.t)
+
+
+def test_recorded_pairs_are_those_of_the_rule(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    task = Task("indoor", "test", 0, 0, PLANS["small", "test"])
+    if generation.digest(task.family, task.split, task.seed, task.plan) not in generation.recorded_pairs():
+        pytest.skip("pairs are recorded for another release of OpenCV")
+    recorded = generate(task, tmp_path / "recorded")
+    monkeypatch.setattr(generation, "recorded_pairs", dict)
+    judged = generate(task, tmp_path / "judged")
+    names = sorted(path.name for path in judged.iterdir())
+    assert sorted(path.name for path in recorded.iterdir()) == names
+    for name in names:
+        assert (recorded / name).read_bytes() == (judged / name).read_bytes()
+
+
+def test_the_record_is_of_plans_that_there_are() -> None:
+    plans = {
+        generation.digest(family, split, 0, plan): plan for (_, split), plan in PLANS.items() for family in FAMILIES
+    }
+    for name, scenes in generation.recorded_pairs().items():
+        if name in plans:
+            assert len(scenes) == plans[name].scenes
+            for scene in scenes.values():
+                assert scene["photographs"] <= plans[name].shots + plans[name].spare
+                assert len(scene["pairs"]) <= plans[name].pairs

@@ -73,6 +73,14 @@ def test_versions_of_libraries_are_part_of_it(monkeypatch: pytest.MonkeyPatch) -
     assert "poselib" in identity("estimator=poselib")["libraries"]
 
 
+def test_whether_kernels_are_used_is_part_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FMTORCH_KERNELS", "off")
+    assert identity()["kernels"] == "off"
+    monkeypatch.setenv("FMTORCH_KERNELS", "on")
+    numba = pytest.importorskip("numba", reason="numba is not installed")
+    assert identity()["kernels"] == f"numba {numba.__version__}"
+
+
 def test_learned_files_of_every_stage_are_part_of_it(tmp_path: Path) -> None:
     files = {name: tmp_path / f"{name}.bin" for name in ("matcher", "first", "second", "estimator")}
     for name, file in files.items():

@@ -9,8 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch import kernels
 from fmtorch.data.rendered.cameras import Camera, Matrix
-from fmtorch.data.rendered.mipmap import TO_LINEAR, Floats, Pixels, Real, to_srgb
+from fmtorch.data.rendered.light_kernels import affine, footprints, group_by_texture, shade
+from fmtorch.data.rendered.mipmap import TO_LINEAR, Floats, Pixels, Real, bilinear, to_srgb
 from fmtorch.data.rendered.raycast import Geometry, Hits
 
 # Four rays a pixel, one on each row and column of a 4 x 4 grid (rotated grid); their mean is the pixel centre.
@@ -79,17 +81,52 @@ class Stage:
         self.table[..., 5] = world[..., 2]
         self.table[..., 6] = geometry.normals @ toward
         self.table[..., 7] = geometry.normals[..., 2]
-        met = self.table[hits.piece, :, 4]
-        distance = met[..., 0] + hits.s * met[..., 1] + hits.t * met[..., 2]
-        self.shadow: Floats = np.where(hits.piece >= 0, distance, np.inf).astype(np.float32)
+        self.shadow: Floats = np.full((_SHADOW_MAP, _SHADOW_MAP), np.inf, dtype=np.float32)
+        if kernels.available():
+            piece, s, t = hits.flat()
+            affine(piece, s, t, self.table, 4, self.shadow.reshape(-1))
+        else:
+            met = self.table[hits.piece, :, 4]
+            distance = met[..., 0] + hits.s * met[..., 1] + hits.t * met[..., 2]
+            np.copyto(self.shadow, distance, where=hits.piece >= 0)
 
     def radiance(self, camera: Camera, offset: tuple[Real, Real]) -> Floats:
         """Linear colour (h, w, 3) along the rays `offset` away from the pixel centres."""
         hits = self.geometry.look(camera, offset)
-        if (hits.piece >= 0).all():
-            out = np.empty((*camera.size, 3), dtype=np.float32)
+        out = np.empty((*camera.size, 3), dtype=np.float32)
+        beyond = np.flatnonzero(hits.piece.reshape(-1) < 0)
+        out.reshape(-1, 3)[beyond] = self._background(camera, offset, beyond)
+        if kernels.available():
+            self._shade_compiled(hits, offset, out.reshape(-1, 3))
         else:
-            out = self._background(camera, offset)
+            self._shade(hits, offset, out.reshape(-1, 3))
+        return out
+
+    def _shade_compiled(self, hits: Hits, offset: tuple[Real, Real], out: Floats) -> None:
+        """As `_shade`, with the same results: NumPy takes the transcendental functions here too."""
+        geometry, (piece, s, t) = self.geometry, hits.flat()
+        side, foot = np.ones(len(piece), dtype=np.float32), np.zeros(len(piece), dtype=np.float32)
+        count = np.zeros(len(geometry.textures), dtype=np.int64)
+        size = geometry.texture_size.astype(np.float32)
+        footprints(
+            piece, s, t, hits.piece.shape[1], self.table, self._homography(hits), size, geometry.texture, side, foot,
+            count,
+        )  # fmt: skip
+        np.log2(side, out=side)
+        np.exp(foot, out=foot)
+        end = np.cumsum(count)
+        index = np.empty(end[-1], dtype=np.int32)
+        group_by_texture(piece, geometry.texture, end - count, index)
+        light = np.array([self.light.sun, self.light.sky], dtype=np.float32)
+        for i in np.flatnonzero(count).tolist():
+            texture = geometry.textures[i]
+            shade(
+                index[end[i] - count[i] : end[i]], piece, s, t, self.table, side, foot, texture.atlas, texture.origin,
+                texture.scale, texture.coarsest, TO_LINEAR, self.shadow, 2 * np.float32(offset[0]),
+                2 * np.float32(offset[1]), self._bias, light, self.light.ground_shade, out,
+            )  # fmt: skip
+
+    def _shade(self, hits: Hits, offset: tuple[Real, Real], out: Floats) -> None:
         index = np.flatnonzero(hits.piece.ravel() >= 0)
         piece = hits.piece.ravel()[index]
         order = np.argsort(self.geometry.texture[piece], kind="stable")
@@ -100,24 +137,18 @@ class Stage:
         value += t[:, None] * self.table[piece, 2]
         colour = self._albedo(hits, index, piece, s, t, value)
         colour *= self._irradiance(value, offset)
-        out.reshape(-1, 3)[index] = colour
-        return out
+        out[index] = colour
 
     def _albedo(
         self, hits: Hits, index: NDArray[np.int64], piece: NDArray[np.int32], s: Floats, t: Floats, value: Floats
     ) -> Floats:
         """Filtered texture colour (n, 3); level of detail from the pixel's footprint in texels."""
         geometry = self.geometry
-        size = np.stack([texture.size for texture in geometry.textures])[geometry.texture]
-        uv = geometry.uv * size[:, None]
-        # Homography from pixel to texel: numerator rows (n, 2, 3) over the third row of G^-1.
-        numerator = np.einsum("nki,nkj->nij", uv[:, [1, 2, 0]], hits.inverse)
-        table = np.concatenate([numerator[:, :, :2].reshape(-1, 4), hits.inverse[:, 2]], axis=1).astype(np.float32)
-        rows = table[piece]
+        rows = self._homography(hits)[piece]
         w = hits.piece.shape[1]
         y, x = (index // w).astype(np.float32), (index % w).astype(np.float32)
         z = 1 / (rows[:, 4] * x + rows[:, 5] * y + rows[:, 6])
-        texel = value[:, :2] * size.astype(np.float32)[piece]
+        texel = value[:, :2] * geometry.texture_size.astype(np.float32)[piece]
         ux, vx = (rows[:, 0] - texel[:, 0] * rows[:, 4]) * z, (rows[:, 2] - texel[:, 1] * rows[:, 4]) * z
         uy, vy = (rows[:, 1] - texel[:, 0] * rows[:, 5]) * z, (rows[:, 3] - texel[:, 1] * rows[:, 5]) * z
         a, b, c = ux * ux + uy * uy, ux * vx + uy * vy, vx * vx + vy * vy
@@ -133,6 +164,12 @@ class Stage:
                 colour[part] = texture(value[part, 0], value[part, 1], lod[part])
         return colour
 
+    def _homography(self, hits: Hits) -> Floats:
+        """From pixel to texel, of each piece (n, 7): rows (2, 2) of the numerator, and G^-1's last, the denominator."""
+        uv = self.geometry.uv * self.geometry.texture_size[:, None]
+        numerator = np.einsum("nki,nkj->nij", uv[:, [1, 2, 0]], hits.inverse)
+        return np.concatenate([numerator[:, :, :2].reshape(-1, 4), hits.inverse[:, 2]], axis=1).astype(np.float32)
+
     def _irradiance(self, value: Floats, offset: tuple[Real, Real]) -> Floats:
         """Light (n, 3): the sun where it is not shadowed, and the sky, less towards the ground and near it."""
         last = _SHADOW_MAP - 1
@@ -146,20 +183,18 @@ class Stage:
         light += sky[:, None] * np.array(self.light.sky, dtype=np.float32)
         return light
 
-    def _background(self, camera: Camera, offset: tuple[Real, Real]) -> Floats:
-        """The sky (h, w, 3), at infinity: looked up by azimuth (once round) and elevation (horizon to zenith)."""
+    def _background(self, camera: Camera, offset: tuple[Real, Real], index: NDArray[np.int64]) -> Floats:
+        """The sky (n, 3) at pixels (n,), at infinity: looked up by azimuth (once round) and elevation."""
         h, w = camera.size
         toward = camera.R.T @ np.linalg.inv(camera.K)
-        x = (np.arange(w) + offset[0]).astype(np.float32)
-        y = (np.arange(h) + offset[1]).astype(np.float32)[:, None]
+        x = np.take((np.arange(w) + offset[0]).astype(np.float32), index % w)
+        y = np.take((np.arange(h) + offset[1]).astype(np.float32), index // w)
         X, Y, Z = (np.float32(r[0]) * x + (np.float32(r[1]) * y + np.float32(r[2])) for r in toward)
         tall, wide = self.sky.shape[:2]
         azimuth = np.arctan2(Y, X) * np.float32(wide / (2 * np.pi))
         elevation = np.arctan2(Z, np.hypot(X, Y)) * np.float32(2 / np.pi)
-        coded = cv2.remap(
-            self.sky, np.mod(azimuth, wide - 1), np.clip((1 - elevation) * (tall - 1), 0, tall - 1), cv2.INTER_LINEAR
-        )
-        return np.asarray(cv2.LUT(coded, TO_LINEAR), dtype=np.float32)
+        coded = bilinear(self.sky, np.mod(azimuth, wide - 1), np.clip((1 - elevation) * (tall - 1), 0, tall - 1))
+        return np.take(TO_LINEAR, coded)
 
 
 def expose(stage: Stage, cameras: Sequence[Camera], lens: Lens, rng: np.random.Generator) -> Pixels:

@@ -28,10 +28,13 @@ class Texture:
     """A picture (h, w, 3) or, with opacity, (h, w, 4), sRGB in 8 bits; it repeats in both directions.
 
     Levels are halved in linear light, so that a surface keeps its brightness with distance; opacity is carried along.
+    Raises ValueError for a picture that cannot be halved.
     """
 
     def __init__(self, picture: Pixels) -> None:
         h, w = picture.shape[:2]
+        if min(h, w) < 5:
+            raise ValueError(f"a texture of {w} x {h} pixels; each side must have at least 5")
         self.opaque = picture.shape[2] == 3
         level = cv2.LUT(picture[..., :3], TO_LINEAR)
         alpha: Floats | None = None if self.opaque else np.float32(1 / 255) * picture[..., 3]
@@ -46,6 +49,7 @@ class Texture:
             levels.append((coded * 255 + 0.5).astype(np.uint8))
         self.size = np.array(picture.shape[1::-1], dtype=np.float32)
         self.levels = len(levels)
+        self.coarsest = self.levels - 1.001  # level that is looked up
         self.scale = np.array([level.shape[1::-1] for level in levels], dtype=np.float32)
         self.origin = np.zeros((len(levels), 2), dtype=np.float32)
         padded = [np.pad(level, ((_BORDER, _BORDER), (_BORDER, _BORDER), (0, 0)), mode="wrap") for level in levels]
@@ -62,7 +66,7 @@ class Texture:
 
     def __call__(self, u: Floats, v: Floats, lod: Floats) -> Floats:
         """Linear colour (n, 3) at u, v (1 = the whole picture, any real number) and pyramid level `lod` (n,)."""
-        lod = np.clip(lod, 0.0, self.levels - 1.001)
+        lod = np.clip(lod, 0.0, self.coarsest)
         low = lod.astype(np.int32)
         u, v = u - np.floor(u), v - np.floor(v)
         fine, coarse = self._at(u, v, low), self._at(u, v, low + 1)
@@ -73,8 +77,12 @@ class Texture:
 
     def opacity(self, u: Floats, v: Floats, lod: float) -> Floats:
         """Opacity (n,) in [0, 1], at one pyramid level for all."""
-        level = np.full(u.shape, min(max(int(lod), 0), self.levels - 1), dtype=np.int32)
+        level = np.full(u.shape, self.level(lod), dtype=np.int32)
         return self._lookup(u - np.floor(u), v - np.floor(v), level)[:, 3] * np.float32(1 / 255)
+
+    def level(self, lod: float) -> int:
+        """The pyramid level that `opacity` takes."""
+        return min(max(int(lod), 0), self.levels - 1)
 
     def _at(self, u: Floats, v: Floats, level: NDArray[np.int32]) -> Floats:
         coded = self._lookup(u, v, level)[:, :3]
@@ -84,10 +92,15 @@ class Texture:
     def _lookup(self, u: Floats, v: Floats, level: NDArray[np.int32]) -> Pixels:
         x = np.take(self.origin[:, 0], level) + u * np.take(self.scale[:, 0], level)
         y = np.take(self.origin[:, 1], level) + v * np.take(self.scale[:, 1], level)
-        n = len(x)
-        rows = max(1, -(-n // _ROW))
-        maps = np.zeros((2, rows * _ROW), dtype=np.float32)
-        maps[0, :n], maps[1, :n] = x, y
-        table = maps.reshape(2, rows, _ROW)
-        out = cv2.remap(self.atlas, table[0], table[1], cv2.INTER_LINEAR)
-        return out.reshape(rows * _ROW, -1)[:n].astype(np.uint8, copy=False)
+        return bilinear(self.atlas, x, y)
+
+
+def bilinear(picture: Pixels, x: Floats, y: Floats) -> Pixels:
+    """Colours (n, c) of a picture at points (n,) and (n,) in pixels."""
+    n = len(x)
+    rows = max(1, -(-n // _ROW))
+    maps = np.zeros((2, rows * _ROW), dtype=np.float32)
+    maps[0, :n], maps[1, :n] = x, y
+    table = maps.reshape(2, rows, _ROW)
+    out = cv2.remap(picture, table[0], table[1], cv2.INTER_LINEAR)
+    return out.reshape(rows * _ROW, -1)[:n].astype(np.uint8, copy=False)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.data.rendered.mipmap import Floats, Pixels, Real
+from fmtorch.data.rendered.noise import BORDER, add_octave
 
 Rng = np.random.Generator
 
@@ -36,14 +37,10 @@ def fractal(rng: Rng, h: int, w: int, coarsest: int = 256, finest: int = 1, roug
         rows, cols = max(1, round(h / step)), max(1, round(w / step))
         grid = rng.standard_normal((rows, cols), dtype=np.float32)
         if step > 1:
-            grid = np.pad(grid, 2, mode="wrap") if min(rows, cols) > 1 else np.pad(grid, 2, mode="edge")
-            big = cv2.resize(
-                grid, (round(w / cols * (cols + 4)), round(h / rows * (rows + 4))), interpolation=cv2.INTER_CUBIC
-            )
-            y, x = round(2 * h / rows), round(2 * w / cols)
-            grid = big[y : y + h, x : x + w].astype(np.float32)
-            grid = cv2.resize(grid, (w, h)).astype(np.float32) if grid.shape != (h, w) else grid
-        total += np.float32(weight) * grid
+            grid = np.pad(grid, BORDER, mode="wrap" if min(rows, cols) > 1 else "edge")
+            add_octave(total, grid, weight)
+        else:
+            total += np.float32(weight) * grid
         weight *= roughness
         step //= 2
     total -= total.mean()

@@ -8,12 +8,15 @@ depth z is the reciprocal of the third form. Each piece is intersected with the 
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch import kernels
 from fmtorch.data.rendered.cameras import Camera
-from fmtorch.data.rendered.mipmap import Floats
+from fmtorch.data.rendered.mipmap import Floats, Pixels
+from fmtorch.data.rendered.raycast_kernels import cast_pieces
 from fmtorch.data.rendered.surfaces import Surfaces
 
 Matrix = NDArray[np.float64]
@@ -31,6 +34,21 @@ class Hits:
     t: Floats
     inverse: Matrix
 
+    def flat(self) -> tuple[NDArray[np.int32], Floats, Floats]:
+        """The piece, s and t of all pixels in a row."""
+        return self.piece.reshape(-1), self.s.reshape(-1), self.t.reshape(-1)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Pieces:
+    """Pieces as one camera sees them: the order to cast them in, pixel boxes, linear forms, depths, nearest depths."""
+
+    order: NDArray[np.int64]
+    boxes: NDArray[np.int64]
+    forms: Floats
+    depth: Floats
+    closest: Floats
+
 
 class Geometry:
     """The pieces of a scene as arrays, ready to be cast against any number of cameras."""
@@ -41,6 +59,7 @@ class Geometry:
         self.uv, self.normals = arrays["uv"], arrays["normals"]
         self.texture, self.triangle, self.both_sides = surfaces.labels()
         self.textures = surfaces.textures
+        self.texture_size = np.array([texture.size for texture in self.textures]).reshape(-1, 2)[self.texture]
         normal = np.cross(self.V, self.U)
         self.normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
         self.corners = np.stack([self.O, self.O + self.U, self.O + self.U + self.V, self.O + self.V], axis=1)
@@ -73,44 +92,81 @@ class Geometry:
         order = np.argsort(nearest.min(1), kind="stable")
         order = order[((boxes[:, 0] < boxes[:, 2]) & (boxes[:, 1] < boxes[:, 3]))[order]]
         # The linear forms, re-centred on each box in float64 so that float32 is accurate inside it.
-        forms = inverse.copy()
-        forms[:, :, 2] += (inverse[:, :, :2] * boxes[:, None, :2]).sum(-1)
-        forms = forms.astype(np.float32)
+        exact = inverse.copy()
+        exact[:, :, 2] += (inverse[:, :, :2] * boxes[:, None, :2]).sum(-1)
+        forms = exact.astype(np.float32)
         z_of = np.stack([self.U @ depth[:3], self.V @ depth[:3], self.O @ depth[:3] + depth[3]], 1).astype(np.float32)
         closest = np.where(nearest.min(1) > NEAR, 0.999 * nearest.min(1), -np.inf).astype(np.float32)
+        pieces = _Pieces(order, boxes, forms, z_of, closest)
+        s, t = np.zeros((2, h, w), dtype=np.float32)
+        hits = Hits(np.full((h, w), -1, dtype=np.int32), s, t, inverse)
+        near = -np.inf if centre is None else NEAR
+        if kernels.available():
+            self._cast_compiled(pieces, hits, near)
+        else:
+            self._cast(pieces, hits, near)
+        return hits
+
+    def _cast(self, pieces: _Pieces, hits: Hits, near: float) -> None:
+        h, w = hits.piece.shape
         x_axis, y_axis = np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32)
         buffer = np.full((h, w), np.inf, dtype=np.float32)
-        piece = np.full((h, w), -1, dtype=np.int32)
-        where = np.zeros((2, h, w), dtype=np.float32)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            for i in order.tolist():
-                x0, y0, x1, y1 = boxes[i].tolist()
+            for i in pieces.order.tolist():
+                x0, y0, x1, y1 = pieces.boxes[i].tolist()
                 view = np.s_[y0:y1, x0:x1]
                 before = buffer[view]
-                if before.max() < closest[i]:
+                if before.max() < pieces.closest[i]:
                     continue
-                A = forms[i]
+                A = pieces.forms[i]
                 rows = A[:, 1:2] * y_axis[: y1 - y0] + A[:, 2:]
                 stq = A[:, 0, None, None] * x_axis[: x1 - x0] + rows[:, :, None]
                 st = stq[:2]
                 st /= stq[2]
                 s, t = st
-                z = z_of[i, 0] * s + (z_of[i, 1] * t + z_of[i, 2])
-                hit = (s > -_SEAM) & (t > -_SEAM) & (z < before)
+                z_s, z_t, z_0 = pieces.depth[i]
+                z = z_s * s + (z_t * t + z_0)
+                hit = (s > -_SEAM) & (t > -_SEAM) & (z < before) & (z > near)
                 if self.triangle[i]:
                     hit &= s + t < 1 + _SEAM
                 else:
                     hit &= (s < 1 + _SEAM) & (t < 1 + _SEAM)
-                if centre is not None:
-                    hit &= z > NEAR
                 if not hit.any():
                     continue
                 if not self.textures[self.texture[i]].opaque:
                     hit[hit] = self._solid(i, s[hit], t[hit], (x1 - x0, y1 - y0))
                 np.copyto(before, z, where=hit)
-                np.copyto(piece[view], np.int32(i), where=hit)
-                np.copyto(where[:, y0:y1, x0:x1], st, where=hit)
-        return Hits(piece, where[0], where[1], inverse)
+                np.copyto(hits.piece[view], np.int32(i), where=hit)
+                np.copyto(hits.s[view], s, where=hit)
+                np.copyto(hits.t[view], t, where=hit)
+
+    def _cast_compiled(self, pieces: _Pieces, hits: Hits, near: float) -> None:
+        """As `_cast`, with the same results."""
+        cutout, window = self._cutouts(pieces.boxes)
+        cast_pieces(
+            pieces.order, pieces.boxes, pieces.forms, pieces.depth, pieces.closest, self.triangle, cutout, window,
+            self._opacity[0], -_SEAM, 1 + _SEAM, near, np.full(hits.piece.shape, np.inf, dtype=np.float32), hits.piece,
+            hits.s, hits.t,
+        )  # fmt: skip
+
+    @functools.cached_property
+    def _opacity(self) -> tuple[Pixels, NDArray[np.int64]]:
+        """The opacities of all pictures with holes in a row, and where each picture begins (-1: it has none)."""
+        planes = [np.zeros(0, np.uint8) if t.opaque else t.atlas[..., 3].ravel() for t in self.textures]
+        end = np.cumsum([0, *map(len, planes)])
+        return np.concatenate(planes), np.array([e if len(p) else -1 for p, e in zip(planes, end, strict=False)])
+
+    def _cutouts(self, boxes: NDArray[np.int64]) -> tuple[NDArray[np.int64], Floats]:
+        """For `cast_pieces`: of pieces (n,) with holes, where their picture is, and where they show it."""
+        cutout, window = np.full((len(boxes), 2), -1), np.zeros((len(boxes), 10), dtype=np.float32)
+        start = self._opacity[1]
+        for i in np.flatnonzero((start[self.texture] >= 0) & (boxes[:, :2] < boxes[:, 2:]).all(1)).tolist():
+            x0, y0, x1, y1 = boxes[i].tolist()
+            texture = self.textures[self.texture[i]]
+            level = texture.level(self._detail(i, (x1 - x0, y1 - y0)))
+            cutout[i] = start[self.texture[i]], texture.atlas.shape[1]
+            window[i] = *self.uv[i].T.ravel(), *texture.origin[level], *texture.scale[level]
+        return cutout, window
 
     def look(self, camera: Camera, offset: tuple[float, float] = (0.0, 0.0)) -> Hits:
         """The rays through the points `offset` (x, y) away from the pixel centres of a camera."""
@@ -130,12 +186,14 @@ class Geometry:
         return depth
 
     def _solid(self, i: int, s: Floats, t: Floats, box: tuple[int, int]) -> NDArray[np.bool_]:
-        texture = self.textures[self.texture[i]]
-        u, v = (self.uv[i, :, :].astype(np.float32).T[k] @ np.stack([np.ones_like(s), s, t]) for k in range(2))
-        texels = np.abs(self.uv[i, 1:]).max(0) * texture.size
-        lod = float(np.log2(max(1.0, (texels / np.array(box)).max())))
-        solid: NDArray[np.bool_] = texture.opacity(u, v, lod) > 0.5
+        u, v = (_fused(_fused(a, b, s), c, t) for a, b, c in self.uv[i].T.astype(np.float32))
+        solid: NDArray[np.bool_] = self.textures[self.texture[i]].opacity(u, v, self._detail(i, box)) > 0.5
         return solid
+
+    def _detail(self, i: int, box: tuple[int, int]) -> float:
+        """The pyramid level at which the opacity of a piece is looked up, whose bounding box has these sides."""
+        texels = np.abs(self.uv[i, 1:]).max(0) * self.textures[self.texture[i]].size
+        return float(np.log2(max(1.0, (texels / np.array(box)).max())))
 
     def _boxes(self, P: Matrix, size: tuple[int, int], usable: NDArray[np.bool_]) -> NDArray[np.int64]:
         """Pixel bounding boxes (n, 4) as x0, y0, x1, y1 (end excluded) of what lies before the near plane."""
@@ -153,6 +211,12 @@ class Geometry:
         boxes[:, :2] = np.floor(boxes[:, :2])
         boxes[:, 2:] = np.ceil(boxes[:, 2:]) + 1
         return np.clip(np.nan_to_num(boxes), 0, [w, h, w, h]).astype(np.int64)
+
+
+def _fused(a: Floats | np.float32, b: np.float32, c: Floats) -> Floats:
+    """a + b c, rounded once to float32."""
+    fused: Floats = (a + b.astype(np.float64) * c).astype(np.float32)
+    return fused
 
 
 def _clip(X: Matrix) -> Matrix:

@@ -132,5 +132,5 @@ class Surfaces:
 
     def labels(self) -> tuple[NDArray[np.int32], NDArray[np.bool_], NDArray[np.bool_]]:
         """Per piece: number of its texture, whether it is a triangle, whether it is seen from both sides."""
-        flags = np.array(self._flags, dtype=bool).reshape(-1, 2)
-        return np.array(self._texture, dtype=np.int32), flags[:, 0], flags[:, 1]
+        triangle, both_sides = np.array(self._flags, dtype=bool).reshape(-1, 2).T.copy()
+        return np.array(self._texture, dtype=np.int32), triangle, both_sides

@@ -17,7 +17,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import fmtorch
-from fmtorch.data.rendered.generate import Task, generate
+from fmtorch import kernels
+from fmtorch.data.rendered.generate import KERNELS, Task, generate
 
 Progress = Callable[[int, int], None]
 _MOST = 8  # workers; each takes some 0.5 GB
@@ -51,6 +52,8 @@ def generate_all(
     processes = [_start() for _ in range(count)]
     threads = [threading.Thread(target=_feed, args=(p, waiting, finished), daemon=True) for p in processes]
     try:
+        if kernels.available():  # once, while the workers start, rather than in each of them
+            kernels.prepare(KERNELS)
         for thread in threads:
             thread.start()
         for _ in missing:

@@ -1,0 +1,34 @@
+"""Focal lengths drawn from their prior for the samples of one pair, compiled: the numbers that `calibrated` draws."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fmtorch.geometry.arithmetic_kernels import exponential
+from fmtorch.kernels import kernel
+from fmtorch.random_kernels import random_bits, stream_state
+
+Array = NDArray[Any]
+
+
+@kernel("f8[::1], f8[::1], b1, f8[::1], i8, i8, i8, f8[:, ::1]")
+def draw_depths(
+    normal: Array, numbers: Array, same_size: bool, longest: Array, mixed_seed: int, key: int, start: int, out: Array
+) -> None:  # fmt: skip
+    """Focal lengths of draws start, start + 1, ... in the unit of the points -> out (2, count).
+
+    normal: (2^k,), quantiles of the normal distribution. numbers: mean and deviation of the mean logarithm, half the
+    deviation of the logarithm of the ratio, share of draws of one focal length where the images have the same size.
+    longest: (2,), the longer sides of the images. mixed_seed: of the seed and the stream.
+    """
+    state, mask = stream_state(mixed_seed, key), np.uint64(len(normal) - 1)
+    for d in range(out.shape[1]):
+        first = (start + d) * 3
+        mean = numbers[0] + numbers[1] * normal[random_bits(state, first) & mask]
+        half = numbers[2] * normal[random_bits(state, first + 1) & mask]
+        if same_size and np.int64(random_bits(state, first + 2) & mask) < numbers[3] * len(normal):
+            half = 0.0
+        out[0, d], out[1, d] = exponential(mean + half) * longest[0], exponential(mean - half) * longest[1]

@@ -1,0 +1,235 @@
+"""The eight-point algorithm on the samples of one pair, and weighted on its matches, compiled; float64."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fmtorch.geometry.nullspace_kernels import LANES, equations, gather, null_space
+from fmtorch.geometry.orientation_kernels import consistently_oriented
+from fmtorch.geometry.rank2_kernels import EPS, nearest_rank2
+from fmtorch.kernels import inner, kernel
+
+Array = NDArray[Any]
+WIDTH = 32  # partial sums over the matches: part of the last bits of a weighted fit
+SHIFT, RANK_TOLERANCE, SQUARINGS = 1e-14, 1e-12, 14  # as in `eigenvector`
+
+
+@kernel("f8[:, ::1], i8[:, ::1], f4[:, ::1], i8[::1]")
+def eight_point(points: Array, sample: Array, F: Array, draw: Array) -> int:
+    """Consistently oriented models of samples (8, s) of points (4, n) -> F (s, 9), draw (s,); how many there are.
+
+    As `minimal.eight_point_components`, in the order of the samples.
+    """
+    X, N, A = np.empty((4, 8 * LANES)), np.empty((4, 8 * LANES)), np.empty(72 * LANES)
+    B, work, full_rank = np.empty(9 * LANES), np.empty(10 * LANES), np.empty(LANES, np.bool_)
+    centre, scale, f = np.empty((4, LANES)), np.empty((2, LANES)), np.empty(9)
+    models = 0
+    for first in range(0, sample.shape[1], LANES):
+        gather(points, sample, first, 8, X)
+        for lane in range(LANES):
+            for image in range(2):
+                _normalise(X, image, lane, N, centre, scale)
+        equations(N, 8, A)
+        null_space(A, 8, B, full_rank, work)
+        for lane in range(min(LANES, sample.shape[1] - first)):
+            if not (full_rank[lane] and scale[0, lane] > 0 and scale[1, lane] > 0):
+                continue
+            for q in range(9):
+                f[q] = B[q * LANES + lane]
+            nearest_rank2(f)
+            for image in range(2):
+                _denormalise(f, image, scale[image, lane], centre[2 * image, lane], centre[2 * image + 1, lane])
+            norm = 0.0
+            for q in range(9):
+                norm += f[q] * f[q]
+            norm = math.sqrt(norm)
+            if norm > 0 and math.isfinite(norm) and consistently_oriented(f, X, 8, LANES, lane):
+                for q in range(9):
+                    F[models, q] = f[q] / norm
+                draw[models] = first + lane
+                models += 1
+    return models
+
+
+@inner
+def _normalise(X: Array, image: int, lane: int, N: Array, centre: Array, scale: Array) -> None:
+    """One sample's points in one image, normalised (Hartley 1997) -> N, its centre and scale; scale 0: no spread."""
+    x, y, u, v = X[2 * image], X[2 * image + 1], N[2 * image], N[2 * image + 1]
+    cx, cy, mean = 0.0, 0.0, 0.0
+    for j in range(8):
+        cx += x[j * LANES + lane]
+        cy += y[j * LANES + lane]
+    cx, cy = cx / 8, cy / 8
+    for j in range(8):
+        dx, dy = x[j * LANES + lane] - cx, y[j * LANES + lane] - cy
+        mean += math.sqrt(dx * dx + dy * dy)
+    mean /= 8
+    spread = mean > 4 * EPS * max(abs(cx), abs(cy))
+    s = 2**0.5 / mean if spread else 1.0
+    for j in range(8):
+        u[j * LANES + lane], v[j * LANES + lane] = (x[j * LANES + lane] - cx) * s, (y[j * LANES + lane] - cy) * s
+    centre[2 * image, lane], centre[2 * image + 1, lane], scale[image, lane] = cx, cy, s if spread else 0.0
+
+
+@inner
+def _denormalise(f: Array, image: int, s: float, cx: float, cy: float) -> None:
+    """F for points of image 0 (or of image 1: F's rows) before they were moved from (cx, cy) and scaled, in place."""
+    across, along = (1, 3) if image == 0 else (3, 1)
+    for k in range(3):
+        a, b, c = k * along, k * along + across, k * along + 2 * across
+        f[a], f[b] = f[a] * s, f[b] * s
+        f[c] -= f[a] * cx + f[b] * cy
+
+
+@kernel("f8[:, ::1], f8[::1], f8[::1]")
+def weighted_eight_point(points: Array, weight: Array, F: Array) -> bool:
+    """The F of least sum w (x1^T F x0)^2, made rank two, of unit norm, largest entry positive -> F (9,).
+
+    `eight_point.eight_point` of points (4, n) and weights (n,), not negative: whether there is one.
+    """
+    n, largest = len(weight), 0.0
+    for i in range(n):
+        largest = max(largest, weight[i])
+    if not (largest > 0 and math.isfinite(largest)):
+        return False
+    blocks = (n + WIDTH - 1) // WIDTH
+    X, w = np.zeros((4, blocks * WIDTH)), np.zeros(blocks * WIDTH)
+    similarity = np.empty((2, 3))
+    for i in range(n):
+        w[i] = weight[i] / largest
+        for k in range(4):
+            X[k, i] = points[k, i]
+    for image in range(2):
+        _similarity(X[2 * image], X[2 * image + 1], w, similarity[image])
+    M = _normal_matrix(X, w)
+    found = smallest_eigenvector(M, F)
+    if not found:
+        return False
+    nearest_rank2(F)
+    for image in range(2):
+        _denormalise(F, image, similarity[image, 0], similarity[image, 1], similarity[image, 2])
+    peak, norm = 0, 0.0
+    for q in range(9):
+        peak = q if abs(F[q]) > abs(F[peak]) else peak
+    for q in range(9):
+        norm += F[q] * F[q]
+    norm = math.copysign(math.sqrt(norm), F[peak])
+    for q in range(9):
+        F[q] /= norm
+    return math.isfinite(norm) and norm != 0
+
+
+@inner
+def _similarity(x: Array, y: Array, w: Array, out: Array) -> None:
+    """Normalises points (n,) in place; their scale and centre -> out (3,). The means are weighted."""
+    total, sums = 0.0, np.zeros((4, WIDTH))
+    for b in range(0, len(w), WIDTH):
+        for i in range(WIDTH):
+            sums[0, i] += w[b + i]
+            sums[1, i] += w[b + i] * x[b + i]
+            sums[2, i] += w[b + i] * y[b + i]
+    total, cx, cy, mean = _added(sums[0]), _added(sums[1]), _added(sums[2]), 0.0
+    cx, cy = cx / total, cy / total
+    for b in range(0, len(w), WIDTH):
+        for i in range(WIDTH):
+            x[b + i] -= cx
+            y[b + i] -= cy
+            sums[3, i] += w[b + i] * math.sqrt(x[b + i] * x[b + i] + y[b + i] * y[b + i])
+    mean = _added(sums[3]) / total
+    scale = 2**0.5 / mean if mean > 4 * EPS * max(abs(cx), abs(cy)) else 1.0
+    for i in range(len(w)):
+        x[i], y[i] = x[i] * scale, y[i] * scale
+    out[0], out[1], out[2] = scale, cx, cy
+
+
+@inner
+def _added(sums: Array) -> Any:
+    """The sum of WIDTH partial sums, in order."""
+    total = 0.0
+    for i in range(WIDTH):
+        total += sums[i]
+    return total
+
+
+@inner
+def _normal_matrix(X: Array, w: Array) -> Array:
+    """The sum of w a a^T with a . vec(F) = x1^T F x0, (9, 9), of points (4, n), n a multiple of WIDTH."""
+    p, q, sums = np.empty((6, WIDTH)), np.empty((6, WIDTH)), np.zeros((36, WIDTH))
+    for b in range(0, len(w), WIDTH):
+        for i in range(WIDTH):
+            x0, y0, x1, y1, v = X[0, b + i], X[1, b + i], X[2, b + i], X[3, b + i], w[b + i]
+            p[0, i], p[1, i], p[2, i], p[3, i], p[4, i], p[5, i] = x0 * x0, x0 * y0, y0 * y0, x0, y0, 1.0
+            q[0, i], q[1, i], q[2, i] = v * (x1 * x1), v * (x1 * y1), v * (y1 * y1)
+            q[3, i], q[4, i], q[5, i] = v * x1, v * y1, v
+        for r in range(6):
+            for c in range(6):
+                for i in range(WIDTH):
+                    sums[6 * r + c, i] += q[r, i] * p[c, i]
+    M, product = np.empty((9, 9)), np.array(((0, 1, 3), (1, 2, 4), (3, 4, 5)))
+    for i in range(9):
+        for j in range(9):
+            M[i, j] = _added(sums[6 * product[i // 3, j // 3] + product[i % 3, j % 3]])
+    return M
+
+
+@inner
+def smallest_eigenvector(M: Array, v: Array) -> bool:
+    """`eigenvector.smallest_eigenvector` of a symmetric matrix (n, n), overwritten -> v; whether it is determined."""
+    n, trace = len(M), 0.0
+    for i in range(n):
+        trace += M[i, i]
+    if not (trace > 0 and math.isfinite(trace)):
+        return False
+    L, X, Y = np.eye(n), np.empty((n, n)), np.empty((n, n))
+    pivot = np.empty(n)
+    for i in range(n):
+        for j in range(n):
+            M[i, j] /= trace
+        M[i, i] += SHIFT
+    for k in range(n):  # M = L D L^T; L becomes the inverse of L
+        pivot[k] = max(M[k, k], SHIFT / 2)
+        for i in range(k + 1, n):
+            factor = M[i, k] / pivot[k]
+            for j in range(k + 1):
+                L[i, j] -= factor * L[k, j]
+            for j in range(k + 1, n):
+                M[i, j] -= factor * M[k, j]
+    size = 0.0
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for k in range(n):
+                total += L[k, i] / pivot[k] * L[k, j]
+            X[i, j] = total
+        size += X[i, i]
+    inverse = X / size
+    X = inverse.copy()
+    for _ in range(SQUARINGS):
+        trace = 0.0
+        for i in range(n):
+            for j in range(n):
+                Y[i, j] = 0.0
+            for k in range(n):
+                for j in range(n):
+                    Y[i, j] += X[i, k] * X[k, j]
+            trace += Y[i, i]
+        for i in range(n):
+            for j in range(n):
+                X[i, j] = Y[i, j] / trace
+        if trace > 1 - 1e-14:
+            break
+    best, norm, along = 0, 0.0, 0.0
+    for i in range(n):
+        best = i if X[i, i] > X[best, best] else best
+    for i in range(n):
+        norm += X[best, i] * X[best, i]
+    for i in range(n):
+        v[i] = X[best, i] / math.sqrt(norm)
+    for i in range(n):
+        for j in range(n):
+            along += v[i] * inverse[i, j] * v[j]
+    return (1 - along) * size * RANK_TOLERANCE < 1

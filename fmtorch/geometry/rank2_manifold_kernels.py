@@ -1,0 +1,149 @@
+"""`rank2_manifold` for the models of one pair, compiled: starts, steps, and which steps are taken."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fmtorch.geometry.rank2_kernels import assign, assign_rows, cofactors, unit
+from fmtorch.kernels import inner, kernel
+
+Array = NDArray[Any]
+SMALLEST_DAMPING, LARGEST_DAMPING = 1e-12, 1e6  # as in `refine`
+
+
+@kernel("f8[:, ::1], i8, f8[:, ::1], f8[:, ::1], f8[:, ::1]")
+def start(F: Array, squarings: int, G: Array, e0: Array, e1: Array) -> None:
+    """`rank2_manifold.start` of models (k, 9) -> G (k, 9), epipoles e0, e1 (k, 3)."""
+    for k in range(len(F)):
+        start_one(F[k], squarings, G[k], e0[k], e1[k])
+
+
+@inner
+def start_one(F: Array, squarings: int, G: Array, e0: Array, e1: Array) -> None:
+    """`start` of one model (9,)."""
+    C, K, P = np.empty(9), np.empty((3, 3)), np.empty((3, 3))
+    for i in range(9):
+        G[i] = F[i]
+    unit(G)
+    cofactors(G, C)
+    for r in range(3):
+        for c in range(3):
+            K[r, c] = C[r] * C[c] + C[3 + r] * C[3 + c] + C[6 + r] * C[6 + c]
+    for _ in range(squarings):
+        peak = 0.0
+        for r in range(3):
+            for c in range(3):
+                peak = max(peak, abs(K[r, c]))
+        for r in range(3):
+            for c in range(3):
+                P[r, c] = K[r, c] / peak
+        for r in range(3):
+            for c in range(3):
+                K[r, c] = P[0, r] * P[0, c] + P[1, r] * P[1, c] + P[2, r] * P[2, c]
+    best, most = 0, -1.0
+    for r in range(3):
+        size = K[r, 0] * K[r, 0] + K[r, 1] * K[r, 1] + K[r, 2] * K[r, 2]
+        if size > most:
+            best, most = r, size
+    for c in range(3):
+        e0[c] = K[c, best]
+    unit(e0)
+    for r in range(3):
+        along = G[3 * r] * e0[0] + G[3 * r + 1] * e0[1] + G[3 * r + 2] * e0[2]
+        for c in range(3):
+            G[3 * r + c] -= along * e0[c]
+    unit(G)
+    cofactors(G, C)
+    for r in range(3):
+        e1[r] = C[3 * r] * e0[0] + C[3 * r + 1] * e0[1] + C[3 * r + 2] * e0[2]
+    unit(e1)
+
+
+@kernel("f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]")
+def step(
+    products: Array, F: Array, e0: Array, e1: Array, damping: Array, G: Array, g0: Array, g1: Array
+) -> None:  # fmt: skip
+    """Damped Gauss-Newton steps of models (k, 9), epipoles (k, 3) -> G (k, 9), g0, g1 (k, 3), again of rank 2.
+
+    products: (k, 10, 10), of `sampson_objective_kernels.evaluate`. damping: (k,).
+    """
+    Q, C = np.empty((10, 11)), np.empty(9)
+    for k in range(len(F)):
+        curvature = 0.0
+        for i in range(9):
+            curvature = max(curvature, products[k, i, i])
+        for r in range(9):
+            for c in range(9):
+                Q[r, c] = products[k, r, c] + curvature * F[k, r] * F[k, c]
+            Q[r, r] += curvature * damping[k]
+            normal = e1[k, r // 3] * e0[k, r % 3]
+            Q[r, 9], Q[9, r], Q[r, 10] = normal, normal, -products[k, r, 9]
+        Q[9, 9], Q[9, 10] = 0.0, 0.0
+        eliminate(Q)
+        for i in range(9):
+            G[k, i] = F[k, i] + Q[i, 10]
+        _retract(G[k], e0[k], e1[k], g0[k], g1[k], C)
+
+
+@inner
+def eliminate(Q: Array) -> None:
+    """Gauss-Jordan elimination of (n, n + 1) without pivoting, in place: the solution is the last column."""
+    n = len(Q)
+    for i in range(n):
+        pivot = Q[i, i]
+        for c in range(i, n + 1):
+            Q[i, c] /= pivot
+        for r in range(n):
+            if r != i:
+                factor = Q[r, i]
+                for c in range(i, n + 1):
+                    Q[r, c] -= factor * Q[i, c]
+
+
+@inner
+def _retract(G: Array, e0: Array, e1: Array, g0: Array, g1: Array, C: Array) -> None:
+    """G made rank 2 along ``e1 e0^T`` and of unit norm, in place; its epipoles -> g0, g1."""
+    cofactors(G, C)
+    determinant, along = C[0] * G[0] + C[1] * G[1] + C[2] * G[2], 0.0
+    for i in range(9):
+        along += C[i] * (e1[i // 3] * e0[i % 3])
+    for i in range(9):
+        G[i] -= determinant / along * (e1[i // 3] * e0[i % 3])
+    unit(G)
+    cofactors(G, C)
+    for c in range(3):
+        g0[c] = C[c] * e1[0] + C[3 + c] * e1[1] + C[6 + c] * e1[2]
+        g1[c] = C[3 * c] * e0[0] + C[3 * c + 1] * e0[1] + C[3 * c + 2] * e0[2]
+    unit(g0)
+    unit(g1)
+
+
+@kernel(
+    "f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], "
+    "f8[::1], f8[::1], b1[::1], f8"
+)
+def accept(
+    F: Array, e0: Array, e1: Array, products: Array, cost: Array, G: Array, g0: Array, g1: Array, others: Array,
+    trial: Array, damping: Array, done: Array, tolerance: float,
+) -> bool:  # fmt: skip
+    """Takes the steps G, g0, g1, of products `others`, whose costs `trial` are lower, in place; whether all are done.
+
+    damping (k,), done (k,): of each model. tolerance: the share of its cost by which a model's last step lowers it; 0:
+    none is ever done.
+    """
+    everything = True
+    for k in range(len(F)):
+        better = trial[k] < cost[k] and not done[k]
+        damping[k] = min(max(damping[k] / 10 if better else damping[k] * 10, SMALLEST_DAMPING), LARGEST_DAMPING)
+        if better:
+            done[k] |= tolerance > 0 and cost[k] - trial[k] <= tolerance * cost[k]
+            cost[k] = trial[k]
+            assign(F[k], G[k])
+            assign(e0[k], g0[k])
+            assign(e1[k], g1[k])
+            assign_rows(products[k], others[k])
+        everything = everything and done[k]
+    return everything

@@ -1,0 +1,213 @@
+"""Functions that numba compiles for this machine when they are first called, kept in a cache folder of their own.
+
+A kernel loops over NumPy arrays where a tensor form would take many small operations::
+
+    @kernel("f4[:, ::1], f8, f4[::1]")
+    def row_sums(x: Floats, scale: float, out: Floats) -> None: ...
+
+Kernels live in modules named ``*_kernels.py``, whose sources version the cache folder (`fmtorch.kernel_cache`); they
+import nothing of fmtorch but one another and this module. `FMTORCH_KERNELS=off` takes the other form everywhere.
+Nothing is imported from numba before the first call.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import os
+import platform
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any, Generic, ParamSpec, TypeVar, overload
+
+import numpy as np
+
+from fmtorch import kernel_cache
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+SWITCH = "FMTORCH_KERNELS"
+OPTIONS = {"nogil": True, "error_model": "numpy", "fastmath": False, "no_cfunc_wrapper": True}
+_lock = threading.RLock()  # numba compiles one function at a time; a kernel may compile those that it calls
+
+
+class Kernel(Generic[P, R]):
+    """A function of NumPy arrays and numbers, compiled for one signature when it is first called.
+
+    Arrays of another dtype, number of axes or memory order are refused with a TypeError, never converted; numbers are
+    converted. Kernels and inner functions may call it, too. It holds no Python lock while it runs.
+    """
+
+    def __init__(self, function: Callable[P, R], signature: str) -> None:
+        self.function: Callable[P, R] = inspect.unwrap(
+            function
+        )  # without the checks that tests wrap around every function
+        functools.update_wrapper(self, self.function)
+        self.signature = f"({signature})"
+        self._compiled: Callable[P, R] | None = None
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        """The function's value. Raises ImportError where numba cannot be imported."""
+        return (self._compiled or self.compiled())(*args, **kwargs)
+
+    def compiled(self, count: str = "") -> Callable[P, R]:
+        """The compiled function: of this process, of the cache folder, or compiled now, which a message tells.
+
+        count: what the message begins with. Raises ImportError where numba cannot be imported.
+        """
+        with _lock:
+            if self._compiled is None:
+                self._compiled = _compiled(self.function, self.signature, count)
+        return self._compiled
+
+    @property
+    def _numba_type_(self) -> Any:  # asked by numba where a kernel calls this one
+        return _type_of(self.compiled())
+
+    def __reduce__(self) -> str:
+        return str(self.__qualname__)  # type: ignore[attr-defined]  # the name to import it by
+
+
+class Inner(Generic[P, R]):
+    """A function for kernels to call, compiled into each of them for the types that it is called with.
+
+    Called from Python it is the plain function, slow and easy to test.
+    """
+
+    def __init__(self, function: Callable[P, R], inline: bool) -> None:
+        self.function: Callable[P, R] = inspect.unwrap(function)
+        self.inline = inline
+        functools.update_wrapper(self, self.function)
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        """The function's value."""
+        return self.function(*args, **kwargs)
+
+    @functools.cached_property
+    def _dispatcher(self) -> Any:
+        import numba
+
+        how = {"inline": "always"} if self.inline else {}
+        return numba.njit(**OPTIONS, no_cpython_wrapper=True, **how)(self.function)
+
+    @property
+    def _numba_type_(self) -> Any:
+        return _type_of(self._dispatcher)
+
+    def __reduce__(self) -> str:
+        return str(self.__qualname__)  # type: ignore[attr-defined]  # the name to import it by
+
+
+def kernel(signature: str) -> Callable[[Callable[P, R]], Kernel[P, R]]:
+    """Makes a function a `Kernel` of the given types, as numba writes them: ``"f4[:, ::1], i8[::1], f8"``.
+
+    ``[:, ::1]`` is an array of two axes in C order; it must be writable.
+    """
+    return lambda function: Kernel(function, signature)
+
+
+@overload
+def inner(function: Callable[P, R]) -> Inner[P, R]: ...
+@overload
+def inner(*, inline: bool) -> Callable[[Callable[P, R]], Inner[P, R]]: ...
+def inner(function: Callable[P, R] | None = None, *, inline: bool = False) -> Any:
+    """Makes a function an `Inner` one. inline: numba, too, inlines it; LLVM does so anyway where it is small."""
+    return Inner(function, inline) if function is not None else lambda f: Inner(f, inline)
+
+
+def prepare(kernels: Sequence[Kernel[..., Any]]) -> None:
+    """Have kernels ready to be called: those that this machine has not compiled yet are compiled, with messages.
+
+    Raises ImportError where numba cannot be imported.
+    """
+    for number, each in enumerate(kernels, start=1):
+        each.compiled(f"{number} of {len(kernels)}: ")
+
+
+class _Fused(Inner[[Any, Any, Any], Any]):
+    """`fused`, compiled into one instruction where the processor has it."""
+
+    @functools.cached_property
+    def _dispatcher(self) -> Any:
+        import numba
+        from llvmlite import binding
+        from numba.extending import intrinsic
+
+        if not binding.get_host_cpu_features().get("fma", platform.machine() in ("arm64", "aarch64")):
+            return numba.njit(**OPTIONS, no_cpython_wrapper=True)(self.function)
+
+        @intrinsic  # type: ignore[untyped-decorator]
+        def instruction(context: Any, b: Any, c: Any, a: Any) -> Any:
+            def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+                return builder.fma(*values)
+
+            return numba.types.float32(*[numba.types.float32] * 3), code
+
+        def fused(a: Any, b: Any, c: Any) -> Any:
+            return instruction(b, c, a)
+
+        return numba.njit(**OPTIONS, no_cpython_wrapper=True)(inspect.unwrap(fused))
+
+
+def _fused(a: Any, b: Any, c: Any) -> Any:
+    """a + b c of float32 numbers, rounded once, to float32."""
+    return np.float32(np.float64(a) + np.float64(b) * np.float64(c))
+
+
+fused = _Fused(_fused, inline=False)
+
+
+def available() -> bool:
+    """Whether kernels are to be used: not switched off, and numba is there, of whose absence a warning tells once.
+
+    Raises ValueError if $FMTORCH_KERNELS is neither on nor off.
+    """
+    switch = os.environ.get(SWITCH, "")
+    if switch == "off":
+        return False
+    if switch not in ("", "on"):
+        raise ValueError(f"{SWITCH}={switch}; it must be on or off")
+    return numba_version() is not None
+
+
+@functools.cache
+def numba_version() -> str | None:
+    """The version of numba, None, with a warning, where it cannot be imported."""
+    try:
+        import numba
+    except (ImportError, OSError) as error:
+        reason = str(error).partition("\n")[0]
+        warnings.warn(f"without numba ({reason}) the slower tensor and NumPy forms are used", stacklevel=3)
+        return None
+    return str(numba.__version__)
+
+
+def identity() -> str:
+    """What a run says of its kernels: ``numba 0.68.1``, or ``off``."""
+    return f"numba {numba_version()}" if available() else "off"
+
+
+def _compiled(function: Callable[P, R], signature: str, count: str) -> Callable[P, R]:
+    import numba
+
+    dispatcher: Any = numba.njit(**OPTIONS)(function)
+    if not hasattr(dispatcher, "compile"):
+        return function  # NUMBA_DISABLE_JIT=1
+
+    def tell(where: str) -> None:
+        print(f"{count}compiling {function.__name__} {where}", file=sys.stderr, flush=True)
+
+    dispatcher._cache = kernel_cache.KernelFile(function, signature, tell)
+    dispatcher.compile(signature)
+    dispatcher.disable_compile()
+    compiled: Callable[P, R] = dispatcher
+    return compiled
+
+
+def _type_of(dispatcher: Any) -> Any:
+    import numba
+
+    return numba.types.Dispatcher(dispatcher)

@@ -1,0 +1,102 @@
+"""`nsgd` for one pair, compiled: the same draws and the same sums."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fmtorch.kernels import inner, kernel
+from fmtorch.random_kernels import stream_state, uniform
+
+Array = NDArray[Any]
+BLOCK, TRIES, COLUMNS, PARALLEL = 128, 10, 6, 1e-12  # as in `draws`
+BORDER, NORMAL_FLOOR = -0.5, 1e-12  # as in `nsgd`
+
+
+@kernel("f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], i8[::1], i8, i8, f8[::1]")
+def accepted_draws(
+    F_gt: Array, F_est: Array, size0: Array, size1: Array, unit: Array, key: Array, mixed_seed: int, samples: int,
+    out: Array,
+) -> None:  # fmt: skip
+    """`draws.mean_terms` of a pair: the sum of its accepted draws, and their number -> out (2,).
+
+    F_gt, F_est: scaled to a largest element of 1. unit: by which distances in image 0 and 1 are divided. key: (1,).
+    mixed_seed: of the seed and the stream.
+    """
+    state = stream_state(mixed_seed, key[0])
+    u, values = np.empty(COLUMNS), np.empty(BLOCK)
+    total, count = 0.0, 0
+    for start in range(0, TRIES * samples, BLOCK):
+        draws = min(BLOCK, TRIES * samples - start)
+        for draw in range(draws):
+            for column in range(COLUMNS):
+                u[column] = uniform(state, (start + draw) * COLUMNS + column)
+            a0, a1, hits_a = _half_draw(F_gt, F_est, size0, size1, u[:3])
+            b0, b1, hits_b = _half_draw(F_est, F_gt, size0, size1, u[3:])
+            taken = hits_a and hits_b and count < samples
+            values[draw] = ((a0 + b0) / 2 / unit[0] + (a1 + b1) / 2 / unit[1]) / 2 if taken else 0.0
+            count += taken
+        total += _tree_sum(values, draws)
+        if count >= samples:
+            break
+    out[0], out[1] = total, count
+
+
+@inner
+def _half_draw(F: Array, other: Array, size0: Array, size1: Array, u: Array) -> tuple[float, float, bool]:
+    """A match exact for F, its distances from the other matrix's lines in images 0 and 1, and whether it counts."""
+    x0, y0 = u[0] * size0[1] + BORDER, u[1] * size0[0] + BORDER
+    a, b = F[0, 0] * x0 + F[0, 1] * y0 + F[0, 2], F[1, 0] * x0 + F[1, 1] * y0 + F[1, 2]
+    c = F[2, 0] * x0 + F[2, 1] * y0 + F[2, 2]
+    left, top, right, bottom, hits = _segment_in_image(a, b, c, size1)
+    x1, y1 = left + u[2] * (right - left), top + u[2] * (bottom - top)
+    a1, b1 = other[0, 0] * x0 + other[0, 1] * y0 + other[0, 2], other[1, 0] * x0 + other[1, 1] * y0 + other[1, 2]
+    c1 = other[2, 0] * x0 + other[2, 1] * y0 + other[2, 2]
+    a0, b0 = other[0, 0] * x1 + other[1, 0] * y1 + other[2, 0], other[0, 1] * x1 + other[1, 1] * y1 + other[2, 1]
+    e, floor = abs(a1 * x1 + b1 * y1 + c1), NORMAL_FLOOR * NORMAL_FLOOR
+    return e / math.sqrt(a0 * a0 + b0 * b0 + floor), e / math.sqrt(a1 * a1 + b1 * b1 + floor), hits
+
+
+@inner
+def _segment_in_image(a: float, b: float, c: float, size: Array) -> tuple[float, float, float, float, bool]:
+    """`draws.segment_in_image` of a line: x and y of its end points, and whether there are any."""
+    half_h, half_w = size[0] / 2, size[1] / 2
+    centre_x, centre_y = half_w + BORDER, half_h + BORDER
+    squared = a * a + b * b
+    scale = 1 / math.sqrt(squared) if squared != 0 else 0.0
+    if a > 0 if abs(b * scale) < PARALLEL else b < 0:
+        scale = -scale
+    a, b = a * scale, b * scale
+    c = c * scale + a * centre_x + b * centre_y
+    middle_x, reach_x, misses_x = _slab(a * c, b, half_w)
+    middle_y, reach_y, misses_y = _slab(-b * c, a, half_h)
+    low, high = max(middle_x - reach_x, middle_y - reach_y), min(middle_x + reach_x, middle_y + reach_y)
+    hits = low < high and not misses_x and not misses_y and scale != 0
+    if not hits:
+        low, high = 0.0, 0.0
+    x, y = centre_x - a * c, centre_y - b * c
+    return x + low * b, y - low * a, x + high * b, y - high * a, hits
+
+
+@inner
+def _slab(offset: float, direction: float, half: float) -> tuple[float, float, bool]:
+    """Middle and half-length of the interval where |t direction - offset| <= half, and whether it is empty."""
+    if abs(direction) < PARALLEL:
+        return 0.0, math.inf, abs(offset) > half
+    return offset / direction, half / abs(direction), False
+
+
+@inner
+def _tree_sum(values: Array, n: int) -> Any:
+    """The sum of the first n values by halves, in place."""
+    while n > 1:
+        half = n // 2
+        for i in range(half):
+            values[i] += values[half + i]
+        if n % 2:
+            values[half] = values[n - 1]
+        n = half + n % 2
+    return values[0]

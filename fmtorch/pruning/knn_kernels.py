@@ -1,0 +1,148 @@
+"""`knn`, compiled: a balanced k-d tree whose nodes are known by arithmetic."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fmtorch.kernels import inner, kernel
+
+Array = NDArray[Any]
+_LEAF = 8  # points a leaf, at most
+
+
+@kernel("f8[:, ::1], f8[:, ::1], i8[:, ::1]")
+def nearest_points(queries: Array, points: Array, found: Array) -> None:
+    """`knn.nearest_points` of queries (n, 2) among points (m, 2) -> found (n, count); -1 for no more points."""
+    search(queries, points, found)
+
+
+@inner
+def search(queries: Array, points: Array, found: Array) -> None:
+    """`nearest_points`. Squared distances in float64, ties by index, exactly as an exhaustive search finds them.
+
+    Node j of depth d holds the places from (j m) >> d on in an order of the points, its box and their lowest index.
+    """
+    m = len(points)
+    found[:] = -1
+    if m == 0:
+        return
+    depth = 0
+    while ((m - 1) >> depth) >= _LEAF:
+        depth += 1
+    order = _order(points, depth)
+    boxes, lowest = _boxes(points, order, depth)
+    stack, distances = np.empty((depth + 2, 3), np.int64), np.empty(found.shape[1])
+    bounds = np.empty(depth + 2)
+    for i in range(len(queries)):
+        x, y = queries[i, 0], queries[i, 1]
+        distances[:] = math.inf
+        filled, height = 0, 1
+        stack[0, 0], stack[0, 1], bounds[0] = 0, 0, 0.0
+        while height:
+            height -= 1
+            d, j, bound = stack[height, 0], stack[height, 1], bounds[height]
+            if filled == len(distances):
+                last = distances[filled - 1]
+                if bound > last or (bound == last and lowest[(1 << d) + j] > found[i, filled - 1]):
+                    continue
+            if d < depth:
+                node = (2 << d) + 2 * j
+                near, far = _outside(boxes[node], x, y), _outside(boxes[node + 1], x, y)
+                first = 0 if near < far or (near == far and lowest[node] < lowest[node + 1]) else 1
+                stack[height, 0], stack[height, 1], bounds[height] = d + 1, 2 * j + 1 - first, max(near, far)
+                stack[height + 1, 0], stack[height + 1, 1], bounds[height + 1] = d + 1, 2 * j + first, min(near, far)
+                height += 2
+                continue
+            for place in range((j * m) >> d, ((j + 1) * m) >> d):
+                index = order[place]
+                dx, dy = points[index, 0] - x, points[index, 1] - y
+                filled = _insert(dx * dx + dy * dy, index, distances, found[i], filled)
+
+
+@inner
+def _insert(squared: float, index: int, distances: Array, found: Array, filled: int) -> int:
+    """Inserts a point among the nearest so far, sorted by (distance, index); their number."""
+    k = filled
+    if k == len(found):
+        k -= 1
+        if squared > distances[k] or (squared == distances[k] and index > found[k]):
+            return filled
+    while k > 0 and (squared < distances[k - 1] or (squared == distances[k - 1] and index < found[k - 1])):
+        distances[k], found[k] = distances[k - 1], found[k - 1]
+        k -= 1
+    distances[k], found[k] = squared, index
+    return min(filled + 1, len(found))
+
+
+@inner
+def _outside(box: Array, x: float, y: float) -> Any:
+    """The squared distance of a point from a box (low x, low y, high x, high y); no point in it rounds to less."""
+    dx, dy = max(max(box[0] - x, x - box[2]), 0.0), max(max(box[1] - y, y - box[3]), 0.0)
+    return dx * dx + dy * dy
+
+
+@inner
+def _order(points: Array, depth: int) -> Array:
+    """Indices of the points (m,) such that each node's stand together."""
+    m = len(points)
+    order = np.arange(m)
+    for d in range(depth):
+        for j in range(1 << d):
+            begin, end, middle = (j * m) >> d, ((j + 1) * m) >> d, ((2 * j + 1) * m) >> (d + 1)
+            low, high = points[order[begin]].copy(), points[order[begin]].copy()
+            for place in range(begin, end):
+                for k in range(2):
+                    low[k], high[k] = min(low[k], points[order[place], k]), max(high[k], points[order[place], k])
+            _split(points, 0 if high[0] - low[0] >= high[1] - low[1] else 1, order, begin, end - 1, middle)
+    return order
+
+
+@inner
+def _split(points: Array, axis: int, order: Array, low: int, high: int, middle: int) -> None:
+    """Reorders order[low .. high] so that no coordinate before `middle` is larger than one from there on (Hoare)."""
+    while low < high:
+        pivot = points[order[(low + high) >> 1], axis]
+        i, j = low, high
+        while i <= j:
+            while points[order[i], axis] < pivot:
+                i += 1
+            while points[order[j], axis] > pivot:
+                j -= 1
+            if i <= j:
+                order[i], order[j] = order[j], order[i]
+                i += 1
+                j -= 1
+        if middle <= j:
+            high = j
+        elif middle >= i:
+            low = i
+        else:
+            return
+
+
+@inner
+def _boxes(points: Array, order: Array, depth: int) -> tuple[Array, Array]:
+    """Low and high corners (2^(depth + 1), 4) of the nodes and their lowest indices; node j of depth d at 2^d + j."""
+    m, leaves = len(points), 1 << depth
+    boxes, lowest = np.empty((2 * leaves, 4)), np.empty(2 * leaves, np.int64)
+    for node in range(2 * leaves - 1, 0, -1):
+        if node < leaves:
+            for k in range(2):
+                boxes[node, k] = min(boxes[2 * node, k], boxes[2 * node + 1, k])
+                boxes[node, 2 + k] = max(boxes[2 * node, 2 + k], boxes[2 * node + 1, 2 + k])
+            lowest[node] = min(lowest[2 * node], lowest[2 * node + 1])
+            continue
+        j = node - leaves
+        boxes[node, 0], boxes[node, 1], boxes[node, 2], boxes[node, 3] = math.inf, math.inf, -math.inf, -math.inf
+        lowest[node] = m
+        for place in range((j * m) >> depth, ((j + 1) * m) >> depth):
+            index = order[place]
+            lowest[node] = min(lowest[node], index)
+            for k in range(2):
+                boxes[node, k] = min(boxes[node, k], points[index, k])
+                boxes[node, 2 + k] = max(boxes[node, 2 + k], points[index, k])
+    return boxes, lowest

@@ -1,0 +1,80 @@
+"""`lpm` for one pair, compiled: the same costs."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fmtorch.kernels import inner, kernel
+from fmtorch.pruning.knn_kernels import search
+
+Array = NDArray[Any]
+
+
+@kernel("f8[:, ::1], f8[:, ::1], b1[::1], f8[::1], i8[::1], f8[::1], f8[:, ::1]")
+def lpm(
+    x0: Array, x1: Array, mask: Array, thresholds: Array, neighbors: Array, taus: Array, out: Array
+) -> None:  # fmt: skip
+    """`lpm.lpm` of x0, x1 (n, 2), mask (n,) -> out[0] (n,), 1 for matches that are kept; `lpm.lpm_cost` -> out[1]."""
+    n, m = len(mask), 0
+    out[0], out[1] = 0, 1
+    match, points = np.empty(n, np.int64), np.empty((2, n, 2))
+    for i in range(n):
+        finite = math.isfinite(x0[i, 0]) and math.isfinite(x0[i, 1])
+        match[m] = i
+        for k in range(2):
+            points[0, m, k], points[1, m, k] = x0[i, k], x1[i, k]
+        m += mask[i] and finite and math.isfinite(x1[i, 0]) and math.isfinite(x1[i, 1])
+    points0, points1 = points[0, :m], points[1, :m]
+    members, cost, total, passes = np.arange(m), np.empty(m), np.zeros(m), 0
+    for k in range(len(thresholds)):
+        if passes > 0 and len(members) < neighbors[k] + 4:
+            continue
+        _cost(points0, points1, members, neighbors[k], taus[k], cost)
+        passes += 1
+        total += cost
+        kept = 0
+        members = np.empty(m, np.int64)
+        for i in range(m):
+            members[kept] = i
+            kept += cost[i] <= thresholds[k]
+        members = members[:kept]
+    for i in range(m):
+        out[0, match[i]] = cost[i] <= thresholds[passes - 1]
+        out[1, match[i]] = total[i] / passes
+
+
+@inner
+def _cost(points0: Array, points1: Array, members: Array, K: int, tau: float, cost: Array) -> None:
+    """The mean over the three neighbourhood sizes -> cost (n,); the neighbours are among the members."""
+    n, width = len(points0), K + 3
+    near0, near1 = np.empty((n, width), np.int64), np.empty((n, width), np.int64)
+    search(points0, points0[members], near0)
+    search(points1, points1[members], near1)
+    for i in range(n):
+        cost[i] = 0
+        for scale in range(3):  # as in the tensor form: neighbours 1..K+2, 2..K+1, 3..K
+            size = K + 2 - 2 * scale
+            kept = 0
+            for a in range(1 + scale, width - scale):
+                place = 0
+                for b in range(width):
+                    if near0[i, a] == near1[i, b] and near0[i, a] >= 0:
+                        place = b
+                if scale < place < width - scale:
+                    kept += not _differs(points0, points1, i, members[near0[i, a]], tau)
+            cost[i] += (size - kept) / size
+        cost[i] /= 3
+
+
+@inner
+def _differs(points0: Array, points1: Array, i: int, j: int, tau: float) -> Any:
+    """Whether matches i and j move differently; never where one of the two does not move."""
+    x, y = points1[i, 0] - points0[i, 0], points1[i, 1] - points0[i, 1]
+    u, v = points1[j, 0] - points0[j, 0], points1[j, 1] - points0[j, 1]
+    length, other = x * x + y * y, u * u + v * v
+    cosine = (x * u + y * v) / math.sqrt(length * other)
+    return cosine * min(length, other) / max(length, other) < tau

@@ -1,0 +1,73 @@
+"""The five-point algorithm and its focal lengths by kernels, against the tensor form."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from fmtorch.estimators import calibrated
+from fmtorch.estimators.calibrated_kernels import draw_depths
+from fmtorch.estimators.focal import FOCAL_DEVIATION, RATIO_DEVIATION, USUAL_FOCAL, Cameras, exponential
+from fmtorch.estimators.problem import Problem, problems
+from fmtorch.geometry.five_point_kernels import five_point
+from fmtorch.random import Stream, mixed_seed
+from tests.laws import degenerate, scene, small
+
+pytest.importorskip("numba", reason="numba is not installed")
+
+SEED, START, SAMPLES = 3, 100, 203  # not whole lanes
+
+
+def pairs() -> dict[str, Problem]:
+    given = {"random": scene(1, 300), "other sizes": scene(2, 300), **degenerate(), **small()}
+    given["other sizes"] = given["other sizes"].replace(size1=torch.tensor([[960, 960]]))
+    made = {name: problems(c, SEED, 7)[0] for name, c in given.items()}
+    return {name: some[0] for name, some in made.items() if some}
+
+
+def depths(pair: Problem, cameras: Cameras) -> np.ndarray:
+    numbers = np.array([math.log(USUAL_FOCAL), FOCAL_DEVIATION, RATIO_DEVIATION / 2, calibrated.SAME_FOCAL], np.float64)
+    out, seed = np.empty((2, SAMPLES)), mixed_seed(SEED, Stream.FOCAL)
+    same, longest = bool(cameras.same_size[0]), cameras.longest[:, 0].contiguous().numpy()
+    draw_depths(calibrated._NORMAL.numpy(), numbers, same, longest, seed, int(pair.key[0]), START, out)
+    return out
+
+
+def test_models_are_those_of_the_tensor_form() -> None:
+    for name, pair in pairs().items():
+        n, cameras = int(pair.count[0]), Cameras(pair)
+        depth = depths(pair, cameras)
+        focal = calibrated.draw_focal_lengths(pair, cameras, START, SAMPLES)
+        np.testing.assert_array_equal(depth, (exponential(focal) * cameras.longest[..., None])[:, 0].numpy())
+        rng = np.random.default_rng(0)
+        sample = np.stack([rng.permutation(n)[:5] for _ in range(SAMPLES)], 1)
+        points = np.ascontiguousarray(cameras.points[:, 0, :n].numpy())
+        F, draw = np.empty((10 * SAMPLES, 9), np.float32), np.empty(10 * SAMPLES, np.int64)
+        count = five_point(points, sample, depth, cameras.offset[:, 0].contiguous().numpy(), F, draw)
+        assert np.isfinite(F[:count]).all()
+        assert (np.diff(draw[:count]) >= 0).all()
+        if name not in ("random", "other sizes", "all outliers", "20 random"):
+            continue
+        expected, valid = calibrated.calibrated_hypotheses(pair, torch.from_numpy(sample)[:, None], START)
+        models = expected[:, 0][:, valid[0]].T.numpy()
+        assert len(models) == count > 50
+        # Models of nearly double roots are unstable; the others equal to the rounding of float32.
+        apart = np.abs(F[:count] - models).max(1)
+        assert np.quantile(apart, 0.95) < 1e-6, name
+        assert np.quantile(apart, 0.99) < 1e-3, name
+
+
+def test_models_explain_their_samples() -> None:
+    pair = pairs()["random"]
+    cameras = Cameras(pair)
+    sample = np.stack([np.random.default_rng(s).permutation(300)[:5] for s in range(SAMPLES)], 1)
+    F, draw = np.empty((10 * SAMPLES, 9), np.float32), np.empty(10 * SAMPLES, np.int64)
+    points = np.ascontiguousarray(cameras.points[:, 0, :300].numpy())
+    count = five_point(points, sample, depths(pair, cameras), cameras.offset[:, 0].contiguous().numpy(), F, draw)
+    own = pair.points[:, 0].numpy()[:, sample[:, draw[:count]]]
+    x0, x1 = (np.concatenate([x, np.ones((1, 5, count))]) for x in (own[:2], own[2:]))
+    residual = np.einsum("isk,kij,jsk->ks", x1, F[:count].astype(np.float64).reshape(-1, 3, 3), x0)
+    assert np.abs(residual).max() < 1e-5  # float32 models of points of about 1

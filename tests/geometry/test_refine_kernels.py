@@ -1,0 +1,95 @@
+"""Levenberg-Marquardt on the manifold of rank 2 by kernels, against the tensor form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from fmtorch.geometry.rank2_manifold_kernels import accept, start, step
+from fmtorch.geometry.refine import DAMPING, refine_components
+from fmtorch.geometry.robust_kernels import KERNELS
+from fmtorch.geometry.sampson_objective import Objective
+from fmtorch.geometry.sampson_objective_kernels import LOSSES, evaluate
+from fmtorch.geometry.sigma_consensus import _INTEGRAL, _WEIGHT
+
+pytest.importorskip("numba", reason="numba is not installed")
+
+TABLE = np.stack([_WEIGHT.numpy(), _INTEGRAL.numpy()])
+SCALE = 0.02
+
+
+def matches(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Models (5, 9) near matches' own, points (4, n), weights and squared scales (n,)."""
+    rng = np.random.default_rng(seed)
+    X = np.concatenate([rng.uniform(-1, 1, (n, 2)), rng.uniform(2, 4, (n, 1))], 1)
+    R, _ = np.linalg.qr(np.eye(3) + 0.2 * rng.normal(size=(3, 3)))
+    R *= np.sign(np.linalg.det(R))
+    t = rng.normal(size=3) * 0.5
+    x0, x1 = X[:, :2] / X[:, 2:], (X @ R.T + t)[:, :2] / (X @ R.T + t)[:, 2:]
+    points = np.ascontiguousarray(np.concatenate([x0, x1], 1).T + 0.003 * rng.normal(size=(4, n)))
+    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    F = (cross @ R).ravel() + 0.02 * rng.normal(size=(5, 9))
+    return F, points, rng.random(n), (SCALE * rng.uniform(0.5, 2, n)) ** 2
+
+
+@pytest.mark.parametrize("n", [8, 32, 300])
+@pytest.mark.parametrize("loss", LOSSES)
+def test_costs_and_normal_equations(loss: str, n: int) -> None:
+    F, points, weight, s2 = matches(n)
+    tensors = [torch.from_numpy(a) for a in (F.T[:, None].copy(), points[:, None], weight[None], np.sqrt(s2)[None])]
+    expected, expected_cost = Objective(tensors[1], tensors[2], KERNELS[loss], tensors[3])(tensors[0], True)
+    for derivatives in (True, False):
+        products, cost = np.zeros((5, 10, 10)), np.empty(5)
+        evaluate(F, points, weight, s2, LOSSES[loss], TABLE, derivatives, products, cost)
+        np.testing.assert_allclose(cost, expected_cost[0].numpy(), rtol=1e-11)
+        if derivatives:
+            normal = expected[:, :, 0].permute(2, 0, 1).numpy()
+            size = np.sqrt(np.einsum("kii,kjj->kij", normal, normal))  # what the sums of an entry cancel from, at most
+            assert (np.abs(products - normal) <= 1e-12 * size + 1e-300).all()
+        else:
+            assert not products.any()
+
+
+def refined(
+    F: np.ndarray, points: np.ndarray, weight: np.ndarray, s2: np.ndarray, loss: str, iterations: int, tolerance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The loop of `refine_components` over the kernels."""
+    k = len(F)
+    state, trial = (
+        [np.empty((k, 9)), np.empty((k, 3)), np.empty((k, 3)), np.zeros((k, 10, 10)), np.empty(k)] for _ in range(2)
+    )
+    start(F, 5, *state[:3])
+    evaluate(state[0], points, weight, s2, LOSSES[loss], TABLE, True, *state[3:])
+    damping, done = np.full(k, DAMPING), np.zeros(k, bool)
+    for _ in range(iterations):
+        step(state[3], *state[:3], damping, *trial[:3])
+        evaluate(trial[0], points, weight, s2, LOSSES[loss], TABLE, True, *trial[3:])
+        if accept(*state, *trial, damping, done, tolerance):
+            break
+    return state[0], state[4]
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 1e-3])
+@pytest.mark.parametrize("loss", LOSSES)
+def test_refinement(loss: str, tolerance: float) -> None:
+    F, points, weight, s2 = matches(200)
+    tensors = [torch.from_numpy(a) for a in (F.T[:, None].copy(), points[:, None], weight[None])]
+    for iterations in (0, 1, 3, 8):
+        expected, expected_cost = refine_components(
+            *tensors, loss, torch.from_numpy(np.sqrt(s2)[None]), iterations, tolerance
+        )
+        found, cost = refined(F, points, weight, s2, loss, iterations, tolerance)
+        np.testing.assert_allclose(cost, expected_cost[0].numpy(), rtol=1e-9)
+        np.testing.assert_allclose(found, expected[:, 0].T.numpy(), atol=1e-8)
+        assert np.abs(np.linalg.det(found.reshape(-1, 3, 3))).max() < 1e-14
+
+
+def test_what_cannot_be_refined_is_told() -> None:
+    F, points, weight, s2 = matches(50)
+    F[1], F[2] = 0, np.nan
+    found, cost = refined(F, points, weight, s2, "truncated", 3, 0.0)
+    assert np.isfinite(cost).tolist() == [True, False, False, True, True]
+    alone, alone_cost = refined(F[3:4].copy(), points, weight, s2, "truncated", 3, 0.0)
+    np.testing.assert_array_equal(alone[0], found[3])
+    assert alone_cost[0] == cost[3]
