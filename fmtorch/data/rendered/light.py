@@ -120,10 +120,11 @@ class Stage:
         light = np.array([self.light.sun, self.light.sky], dtype=np.float32)
         for i in np.flatnonzero(count).tolist():
             texture = geometry.textures[i]
+            _, wide, channels = texture.atlas.shape
             shade(
-                index[end[i] - count[i] : end[i]], piece, s, t, self.table, side, foot, texture.atlas, texture.origin,
-                texture.scale, texture.coarsest, TO_LINEAR, self.shadow, 2 * np.float32(offset[0]),
-                2 * np.float32(offset[1]), self._bias, light, self.light.ground_shade, out,
+                index[end[i] - count[i] : end[i]], piece, s, t, self.table, side, foot, texture.atlas.reshape(-1),
+                wide, channels, texture.origin, texture.scale, texture.coarsest, TO_LINEAR, self.shadow,
+                2 * np.float32(offset[0]), 2 * np.float32(offset[1]), self._bias, light, self.light.ground_shade, out,
             )  # fmt: skip
 
     def _shade(self, hits: Hits, offset: tuple[Real, Real], out: Floats) -> None:

@@ -71,30 +71,38 @@ def group_by_texture(
 
 
 @inner
-def _code(atlas: Pixels, row: Index, column: Index, channel: Index, right: Real, down: Real) -> np.int64:
-    """One channel of a picture between four texels, rounded to 8 bits, as `cv2.remap` does."""
-    a, b = np.float32(atlas[row, column, channel]), np.float32(atlas[row, column + 1, channel])
-    c, d = np.float32(atlas[row + 1, column, channel]), np.float32(atlas[row + 1, column + 1, channel])
-    above, below = fused(a, right, b - a), fused(c, right, d - c)
-    return np.int64(np.rint(fused(above, down, below - above)))
+def _code(atlas: Pixels, corner: Index, beside: Index, below: Index, right: Real, down: Real) -> np.uint64:
+    """One channel of a picture between four texels, rounded to 8 bits, as `cv2.remap` does.
+
+    corner: place of the first texel's value; beside, below: how far on the next ones' are. Unsigned, as are colours:
+    numba looks at signed places whether they count from the end.
+    """
+    a, b = np.float32(atlas[corner]), np.float32(atlas[corner + beside])
+    c, d = np.float32(atlas[corner + below]), np.float32(atlas[corner + below + beside])
+    left, farther = fused(a, right, b - a), fused(c, right, d - c)
+    return np.uint64(np.rint(fused(left, down, farther - left)))
 
 
 @kernel(
-    "i4[::1], i4[::1], f4[::1], f4[::1], f4[:, :, ::1], f4[::1], f4[::1], u1[:, :, ::1], f4[:, ::1], f4[:, ::1], f4,"
+    "i4[::1], i4[::1], f4[::1], f4[::1], f4[:, :, ::1], f4[::1], f4[::1], u1[::1], i8, i8, f4[:, ::1], f4[:, ::1], f4,"
     "f4[::1], f4[:, ::1], f4, f4, f8, f4[:, ::1], f4, f4[:, ::1]"
 )
 def shade(
     index: NDArray[np.int32], piece: NDArray[np.int32], s: Floats, t: Floats, table: Floats, detail: Floats,
-    foot: Floats, atlas: Pixels, origin: Floats, scale: Floats, coarsest: Real, to_linear: Floats, shadow: Floats,
-    shift_x: Real, shift_y: Real, bias: Real, light: Floats, ground_shade: Real, out: Floats,
+    foot: Floats, atlas: Pixels, across: Index, channels: Index, origin: Floats, scale: Floats, coarsest: Real,
+    to_linear: Floats, shadow: Floats, shift_x: Real, shift_y: Real, bias: Real, light: Floats,
+    ground_shade: Real, out: Floats,
 ) -> None:  # fmt: skip
     """Linear colour `out` (m, 3) of the pixels `index`, which all show one texture.
 
-    detail (m,): pyramid level. foot (m,): how near the ground, from 1 on. atlas: see `Texture`, with the origin and
-    scale of each level; levels end before `coarsest`. to_linear (256,): of 8-bit codes. shadow: map of the distances
-    that the sun reaches, looked up `shift` beside, lit if farther by less than `bias`. light (2, 3): sun and sky.
+    detail (m,): pyramid level. foot (m,): how near the ground, from 1 on. atlas: see `Texture`, in a row, with its
+    width, its channels, and the origin and scale of each level; levels end before `coarsest`. to_linear (256,): of
+    8-bit codes. shadow: map of the distances that the sun reaches, looked up `shift` beside, lit if farther by less
+    than `bias`. light (2, 3): sun and sky.
     """
     last = np.float32(shadow.shape[0] - 1)
+    wide, beside = np.uint64(across), np.uint64(channels)
+    below = wide * beside
     for k in range(len(index)):
         p = index[k]
         value, along, down = table[piece[p], 0], table[piece[p], 1], table[piece[p], 2]
@@ -118,11 +126,13 @@ def shade(
         part = level - np.float32(low)
         x, y = origin[low, 0] + u * scale[low, 0], origin[low, 1] + v * scale[low, 1]
         x2, y2 = origin[low + 1, 0] + u * scale[low + 1, 0], origin[low + 1, 1] + v * scale[low + 1, 1]
-        column, row = np.int64(np.floor(x)), np.int64(np.floor(y))
-        column2, row2 = np.int64(np.floor(x2)), np.int64(np.floor(y2))
-        right, below, right2, below2 = x - np.floor(x), y - np.floor(y), x2 - np.floor(x2), y2 - np.floor(y2)
+        left, top, left2, top2 = np.floor(x), np.floor(y), np.floor(x2), np.floor(y2)
+        right, lower, right2, lower2 = x - left, y - top, x2 - left2, y2 - top2
+        corner = (np.uint64(top) * wide + np.uint64(left)) * beside
+        corner2 = (np.uint64(top2) * wide + np.uint64(left2)) * beside
         for channel in range(3):
-            fine = to_linear[_code(atlas, row, column, channel, right, below)]
-            coarse = to_linear[_code(atlas, row2, column2, channel, right2, below2)]
+            place = np.uint64(channel)
+            fine = to_linear[_code(atlas, corner + place, beside, below, right, lower)]
+            coarse = to_linear[_code(atlas, corner2 + place, beside, below, right2, lower2)]
             colour = fine + (coarse - fine) * part
             out[p, channel] = colour * (sun * light[0, channel] + sky * light[1, channel])
