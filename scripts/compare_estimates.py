@@ -200,9 +200,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="fewer pairs, one seed: a minute in place of many")
     parser.add_argument("--presets", nargs="*", default=[], help="of conf/estimator; all by default")
     parser.add_argument("--matches", type=Path, help="real pairs: an .npz file with names, NNN.X1, .X2, .size1, .size2")
-    parser.add_argument(
-        "--save", type=Path, help="keep what BEFORE computes in this file; alone where AFTER is the same"
-    )
+    parser.add_argument("--save", type=Path, help="keep what BEFORE computes (nothing else where AFTER is the same)")
     parser.add_argument("--dump", type=Path, nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.dump:

@@ -19,14 +19,13 @@ from fmtorch.estimators.focal import (
     RATIO_DEVIATION,
     USUAL_FOCAL,
     Cameras,
-    exponential,
     scales,
     translated,
 )
 from fmtorch.estimators.problem import Problem
+from fmtorch.geometry.arithmetic import component_sum, exponential
 from fmtorch.geometry.five_point import five_point_components
 from fmtorch.geometry.orientation import consistently_oriented
-from fmtorch.geometry.reduce import component_sum
 from fmtorch.random import Stream
 
 SAMPLE = 5

@@ -11,9 +11,8 @@ from torch import Tensor
 from fmtorch import random
 from fmtorch.estimators.problem import Problem
 from fmtorch.estimators.sampling import PriorWeighted
-from fmtorch.estimators.scoring import CPU_TILE, GPU_TILE, Score, score_models
+from fmtorch.estimators.scoring import Score, score_models
 from fmtorch.geometry.homography import (
-    four_point_components,
     least_squares_homography,
     plane_and_parallax,
     plane_homography,
@@ -95,50 +94,6 @@ class Degensac:
         return H.gather(2, most.indices[:, :1].expand(9, -1, -1))[..., 0], most.values[:, 0] >= self.ON_PLANE
 
 
-class PlaneAndParallax:
-    """Candidates from the scene's planes: the strongest homography, that of the rest, each with two matches off it.
-
-    score: of the engine.
-    """
-
-    PLANES = 2
-    DRAWS = 500  # minimal samples of four matches for each plane
-
-    def __init__(self, score: Score) -> None:
-        self.score = score
-
-    def __call__(self, problem: Problem) -> tuple[Float[Tensor, "9 p k"], Float[Tensor, "p k"]]:
-        """Models, float32, and their scores; minus infinity where there is none."""
-        limit = GPU_TILE if problem.points.is_cuda else CPU_TILE
-        pairs = max(1, limit // (self.DRAWS * problem.live.shape[1]))
-        tiles = torch.split(torch.arange(len(problem.pair), device=problem.points.device), pairs)
-        made = [self._tile(problem[tile]) for tile in tiles]
-        return torch.cat([F for F, _ in made], 1), torch.cat([score for _, score in made])
-
-    def _tile(self, problem: Problem) -> tuple[Tensor, Tensor]:
-        weight = PriorWeighted().weight(problem)
-        models, scores = [], []
-        for plane in range(self.PLANES):
-            H = _fitted(self._strongest(weight, problem, plane), problem)
-            F, score = _parallax(H, problem, self.score, plane)
-            models.append(F)
-            scores.append(score)
-            near = (transfer_squared(H[..., None], problem.points) <= _limit(problem))[:, 0]
-            weight = torch.where(near, 0, weight)
-        return torch.cat(models, 2), torch.cat(scores, 1)
-
-    def _strongest(self, weight: Int[Tensor, "p n"], problem: Problem, plane: int) -> Float[Tensor, "9 p"]:
-        """Of homographies through four matches that of the greatest weight of matches near it; float64."""
-        index = _draw(weight, problem, Stream.PLANE, plane * self.DRAWS, self.DRAWS, 4)
-        points = problem.points.to(torch.float32)
-        sample = torch.stack([points.gather(2, i.expand(4, -1, -1)) for i in index], 1)
-        H, valid = four_point_components(sample)
-        near = transfer_squared(H, points) <= _limit(problem).to(torch.float32)
-        support = torch.where(near, weight[:, None], 0).sum(-1).masked_fill_(~valid, -1)
-        best = torch.sort(support, dim=1, descending=True, stable=True).indices[:, :1]
-        return H.gather(2, best.expand(9, -1, -1))[..., 0].to(torch.float64)
-
-
 def _limit(problem: Problem) -> Float[Tensor, "p 1 1"]:
     """The squared threshold of a plane in normalised units."""
     return (PLANE_THRESHOLD / problem.unit).square()[:, None, None]
@@ -190,4 +145,3 @@ def _draw(
 
 
 DEGENERACIES: dict[str, Callable[[Score], Degensac]] = {"degensac": Degensac}
-CANDIDATES: dict[str, Callable[[Score], PlaneAndParallax]] = {"plane_and_parallax": PlaneAndParallax}

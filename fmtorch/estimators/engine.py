@@ -18,15 +18,15 @@ from fmtorch.estimators.batching import solve_all
 from fmtorch.estimators.calibrated import SAMPLE as FIVE
 from fmtorch.estimators.calibrated import calibrated_hypotheses
 from fmtorch.estimators.choice import Chosen, TwoCameras, best_of
-from fmtorch.estimators.compiled import compiled
-from fmtorch.estimators.degeneracy import CANDIDATES, DEGENERACIES, Degensac
+from fmtorch.estimators.degeneracy import DEGENERACIES, Degensac
 from fmtorch.estimators.final_fits import FINAL_FITS
 from fmtorch.estimators.focal import FocalPrior, Refined
 from fmtorch.estimators.local_optimization import LOCAL_OPTIMIZATIONS
 from fmtorch.estimators.parts import CHOICES, INLIER_RULES, SAMPLERS, SCORES, SOLVERS, Refinement, part
 from fmtorch.estimators.problem import Problem
 from fmtorch.estimators.sampling import PriorWeighted
-from fmtorch.estimators.scoring import SaturatedGains, sampson_squared, score_models
+from fmtorch.estimators.scoring import SaturatedGains, score_models
+from fmtorch.geometry.residuals import sampson_squared
 from fmtorch.random import Stream
 from fmtorch.types import Correspondences, Estimate
 
@@ -68,7 +68,6 @@ class HypothesizeAndVerify:
     preselect: models are first scored on this many matches, chosen by the pair's key; 0: always on all.
     survivors: models of a round that pass the preselection.
     degeneracy: `degensac` completes a best model whose sample lies on a plane by plane and parallax, null: no check.
-    candidates: `plane_and_parallax` adds models of the scene's planes to the pool, null: none.
     calibrated: samples of five matches with focal lengths drawn from their prior, 0: none; where the image sizes are
     known and the choice is a `focal` one. The best calibrated_pool of their models are refined with the prior. They are
     all that is asked of a pair whose images have one size, or whose good candidates agree, if the stopping rule is
@@ -90,10 +89,6 @@ class HypothesizeAndVerify:
     (refined at the scale of the pair's own noise, with the prior on the focal lengths where the choice assumed one and
     the matches do not contradict it; with the gradients of the optimum) or `none`.
     refit_inliers: recompute the inliers after the final fit.
-    compile: build the score with torch.compile (of a saturated one the first look, at a subset), for long runs: the
-    first calls take some ten seconds each and need a C++ compiler (RuntimeError where there is none). Scores, and so
-    estimates, may differ from those without. That they have the same bits in any batch is by construction, but depends
-    on the compiler: it is tested of the score alone.
 
     Memory: for a batch of pairs of N matches, the points (48 N bytes a pair), the samples of 2^14 draws (about 40 MB),
     2^10 samples of five (about 20 MB) and eight buffers of one scoring tile (256 KB each); on a GPU 2^21 draws, 2^19
@@ -113,7 +108,6 @@ class HypothesizeAndVerify:
         preselect: int = 128,
         survivors: int = 256,
         degeneracy: str | None = None,
-        candidates: str | None = None,
         pool: int = 1,
         calibrated: int = 0,
         calibrated_pool: int = 12,
@@ -130,7 +124,6 @@ class HypothesizeAndVerify:
         inlier_threshold: float | None = None,
         final: str = "least_squares",
         refit_inliers: bool = True,
-        compile: bool = False,
     ) -> None:
         if hypotheses < 1 or round < 1:
             raise ValueError(f"hypotheses={hypotheses}, round={round}: both must be at least 1")
@@ -140,9 +133,6 @@ class HypothesizeAndVerify:
         self.sampler = part("sampler", sampler, SAMPLERS)()
         self.score = part("score", score, SCORES)(threshold)
         self.coarse = self.score.unsaturated if isinstance(self.score, SaturatedGains) else self.score
-        if compile:
-            self.coarse = compiled(self.coarse)
-            self.score = self.coarse if self.coarse is self.score else compiled(self.score)
         self.inlier_threshold = threshold if inlier_threshold is None else inlier_threshold
         self.hypotheses, self.confidence = hypotheses, confidence
         self.round = round if confidence is not None else max(round, UNSTOPPED_ROUND)
@@ -150,7 +140,6 @@ class HypothesizeAndVerify:
         self.degeneracy = None if degeneracy is None else part("degeneracy", degeneracy, DEGENERACIES)(self.score)
         if self.degeneracy is not None and self.solver.size != Degensac.SAMPLE:
             raise ValueError(f"degeneracy={degeneracy} needs solver=seven_point; solver is {solver!r}")
-        self.candidates = None if candidates is None else part("candidates", candidates, CANDIDATES)(self.score)
         self.pool = pool
         self.calibrated, self.calibrated_pool = calibrated, calibrated_pool
         self.local_optimization = None
@@ -216,9 +205,6 @@ class HypothesizeAndVerify:
     def _searched(self, problem: Problem, refined: Refined | None) -> tuple[Chosen, Tensor, Tensor]:
         """The same by search without assumptions; refined: candidates of plausible cameras."""
         search = self._search(problem)
-        if self.candidates is not None:
-            F, score = self.candidates(problem)
-            search.F, search.score = torch.cat([search.F, F], 2), torch.cat([search.score, score], 1)
         found = torch.isfinite(search.score).any(1)
         return self._chosen(search, problem, refined), found, search.draws
 

@@ -21,13 +21,15 @@ from torch import Tensor
 from fmtorch.estimators.cheirality import share_in_front
 from fmtorch.estimators.choice import Chosen, TwoCameras, ranked
 from fmtorch.estimators.problem import Problem
-from fmtorch.estimators.scoring import SaturatedGains, geman_mcclure_gain, sampson_squared, score_models
+from fmtorch.estimators.scoring import SaturatedGains, geman_mcclure_gain, score_models
+from fmtorch.geometry.arithmetic import component_sum, exponential, logarithm, unit
+from fmtorch.geometry.levenberg_marquardt import Damping, TensorObjective, TensorState, levenberg_marquardt
 from fmtorch.geometry.optimum import STEP_DAMPING, gradient_of_cost
 from fmtorch.geometry.rank2 import complement
-from fmtorch.geometry.rank2_manifold import start, unit
-from fmtorch.geometry.reduce import component_sum
+from fmtorch.geometry.rank2_manifold import start
+from fmtorch.geometry.residuals import sampson_squared
 from fmtorch.geometry.robust_kernels import KERNELS
-from fmtorch.geometry.sampson_objective import Objective
+from fmtorch.geometry.sampson_objective import SampsonObjective
 
 USUAL_FOCAL = 1.2  # median focal length in units of the longer image side
 FOCAL_DEVIATION = 0.4  # of its logarithm, averaged over the two images
@@ -47,7 +49,6 @@ SMALLEST_IMAGE = 16.0  # longer side of both images below which sizes are taken 
 ITERATIONS = 12  # Levenberg-Marquardt steps
 MOST = 12  # candidates that are refined
 SHORTEST, LONGEST = 0.25, 5.0  # focal lengths outside are not believed at the start
-DAMPING, SMALLEST_DAMPING, LARGEST_DAMPING = 1e-3, 1e-9, 1e6
 
 
 class FocalPrior:
@@ -176,7 +177,7 @@ def refine_focal(
         cameras = Cameras(problem)
         objective = _Objective(problem, cameras, "geman_mcclure", SCALE / problem.units, SIGMA / problem.unit)
         shifted = translated(F, -cameras.offset)
-        state = _minimised(objective, _start(shifted, cameras.longest), iterations)
+        state = levenberg_marquardt(objective, _start(shifted, cameras.longest), iterations)
         models = unit(translated(state.F, cameras.offset))
         sound = torch.isfinite(models).all(0) & torch.isfinite(state.cost)
         depth = exponential(state.focal) * cameras.longest[..., None]
@@ -232,8 +233,10 @@ def fit_focal(
     """
     with torch.no_grad():
         cameras = Cameras(problem)
-        objective = _Objective(problem, cameras, "truncated", truncation[:, None] / problem.units, sigma / problem.unit)
-        state = _minimised(objective, (start.axes[..., None], start.focal[..., None]), iterations, tolerance)
+        objective = _Objective(
+            problem, cameras, "truncated", truncation[:, None] / problem.units, sigma / problem.unit, tolerance
+        )
+        state = levenberg_marquardt(objective, (start.axes[..., None], start.focal[..., None]), iterations)
         fitted = translated(state.F, cameras.offset)[..., 0].T.reshape(-1, 3, 3)
         _, gradient, hessian = _prior(state.focal, cameras.same_size)
         data = state.hessian.clone()
@@ -244,28 +247,8 @@ def fit_focal(
         return FocalFit(fitted, -component_sum(slope * step)[:, 0] / 2, state, objective)
 
 
-def _minimised(
-    objective: _Objective, start: tuple[Tensor, Tensor], iterations: int, tolerance: float | None = None
-) -> _State:
-    """The state of least cost that so many Levenberg-Marquardt steps reach; with its derivatives given a tolerance."""
-    state = objective.at(*start, True)
-    damping = torch.full_like(state.cost, DAMPING)
-    done = torch.zeros_like(state.cost, dtype=torch.bool)
-    for i in range(iterations):
-        step = _solved(state.hessian, -state.gradient, damping)
-        trial = objective.at(*_moved(state, step), i + 1 < iterations or tolerance is not None)
-        better = (trial.cost < state.cost) & ~done
-        damping = torch.where(better, damping / 10, damping * 10).clamp_(SMALLEST_DAMPING, LARGEST_DAMPING)
-        if tolerance is not None:
-            done |= state.cost - trial.cost <= tolerance
-        state = state.replaced(trial, better)
-        if tolerance is not None and bool(done.all()):
-            break
-    return state
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
-class _State:
+class _State(TensorState):
     """``E = U diag(1, 1, 0) V^T`` and log focal lengths; with F, the cost, its derivatives there.
 
     axes: U and V, (3, 3, 2, p, k), rows first. focal: (2, p, k), logarithms, f in units of the longer side.
@@ -275,25 +258,30 @@ class _State:
     axes: Tensor
     focal: Tensor
     F: Tensor
-    cost: Tensor
     gradient: Tensor
     hessian: Tensor
     tangents: Tensor
 
-    def replaced(self, other: _State, condition: Tensor) -> _State:
-        """The other state where the condition holds; without derivatives if the other has none."""
-        merged = {}
-        for field in dataclasses.fields(self):
-            mine, new = getattr(self, field.name), getattr(other, field.name)
-            merged[field.name] = torch.where(condition, new, mine) if len(new) else mine
-        return _State(**merged)
 
+class _Objective(TensorObjective[_State]):
+    """The negative logarithm of the posterior, with its derivatives by five rotations and two log focal lengths.
 
-class _Objective:
-    """The negative logarithm of the posterior, with its derivatives by five rotations and two log focal lengths."""
+    tolerance: what a step must lower that by, if the fit is to go on.
+    """
 
-    def __init__(self, problem: Problem, cameras: Cameras, kernel: str, scale: Tensor, sigma: Tensor) -> None:
-        self.data = Objective(cameras.points, problem.weight(), KERNELS[kernel], scale)
+    damping = Damping(1e-3, 1e-9, 1e6)
+
+    def __init__(
+        self,
+        problem: Problem,
+        cameras: Cameras,
+        kernel: str,
+        scale: Tensor,
+        sigma: Tensor,
+        tolerance: float | None = None,
+    ) -> None:
+        self.tolerance = tolerance
+        self.data = SampsonObjective(cameras.points, problem.weight(), KERNELS[kernel], scale)
         self.precision = (1 / sigma).square()[:, None]
         self.longest, self.same_size = cameras.longest, cameras.same_size
         # The derivatives of E by rotations of U about its three axes and of V about the first two, in products of a
@@ -301,8 +289,9 @@ class _Objective:
         self.columns = torch.tensor([7, 6, 3, 5, 2], device=self.longest.device)
         self.signs = self.longest.new_tensor([1.0, -1.0, 1.0, 1.0, -1.0])[:, None, None]
 
-    def at(self, axes: Tensor, focal: Tensor, derivatives: bool) -> _State:
-        """The state of these parameters."""
+    def evaluate(self, parameters: tuple[Tensor, Tensor], derivatives: bool) -> _State:
+        """As `Objective.evaluate`; parameters: axes and log focal lengths."""
+        axes, focal = parameters
         depth = exponential(focal) * self.longest[..., None]
         U, V = axes.unbind(2)
         outer = (U[:, None, :, None] * V[None, :, None]).flatten(2, 3)  # (3, 3, 3i + j, p, k)
@@ -312,7 +301,7 @@ class _Objective:
         prior, prior_gradient, prior_hessian = _prior(focal, self.same_size)
         cost = cost * self.precision / 2 + prior
         if not derivatives:
-            return _State(axes, focal, F.flatten(0, 1), cost, cost[:0], cost[:0], cost[:0])
+            return _State(cost, axes, focal, F.flatten(0, 1), cost[:0], cost[:0], cost[:0])
         tangents = F.new_zeros(3, 3, 7, *focal.shape[1:])
         rotations = outer.index_select(2, self.columns).mul_(self.signs)
         rotations[:, :, 2] -= outer[:, :, 1]
@@ -324,7 +313,16 @@ class _Objective:
         gradient = along[:, 9] * self.precision
         hessian[5:, 5:] += prior_hessian
         gradient[5:] += prior_gradient
-        return _State(axes, focal, F.flatten(0, 1), cost, gradient, hessian, T)
+        return _State(cost, axes, focal, F.flatten(0, 1), gradient, hessian, T)
+
+    def step(self, state: _State, damping: Tensor) -> tuple[Tensor, Tensor]:
+        """As `Objective.step`."""
+        return _moved(state, _solved(state.hessian, -state.gradient, damping))
+
+    def negligible(self, decrease: Tensor, state: _State, better: Tensor) -> Bool[Tensor, "p k"]:
+        """As `TensorObjective.negligible`."""
+        assert self.tolerance is not None
+        return decrease <= self.tolerance
 
 
 def _prior(focal: Float[Tensor, "2 p k"], same_size: Bool[Tensor, " p"]) -> tuple[Tensor, Tensor, Tensor]:
@@ -430,30 +428,3 @@ def bougnoux(
 
     f = F.reshape(3, 3, *F.shape[1:])
     return torch.stack([squared(f, e1), squared(f.transpose(0, 1), e0)])
-
-
-def exponential(x: Tensor) -> Tensor:
-    """exp(x) for |x| up to about 5 by arithmetic alone: library functions differ in the last bit with memory layout.
-
-    Pade's approximant of order 4 at x / 32, to rounding there, and five squarings.
-    """
-    y = x / 32
-    y2 = y * y
-    even, odd = 1680 + y2 * (180 + y2), y * (840 + 20 * y2)
-    value = (even + odd) / (even - odd)
-    for _ in range(5):
-        value = value * value
-    return value
-
-
-def logarithm(x: Tensor) -> Tensor:
-    """ln(x) of positive numbers, to rounding, by arithmetic alone: the series of atanh at the mantissa."""
-    mantissa, exponent = torch.frexp(x)
-    m = mantissa * math.sqrt(2)
-    z = (m - 1) / (m + 1)
-    z2 = z * z
-    series = torch.full_like(z, 1 / 19)
-    for k in range(17, 0, -2):
-        series = series * z2 + 1 / k
-    value: Tensor = 2 * z * series + (exponent.to(x.dtype) - 0.5) * math.log(2)
-    return value

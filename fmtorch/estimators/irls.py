@@ -12,10 +12,10 @@ from fmtorch.estimators.batching import solve_all
 from fmtorch.estimators.choice import best_of
 from fmtorch.estimators.parts import WithinThreshold, median_of_live
 from fmtorch.estimators.problem import Problem
-from fmtorch.estimators.scoring import sampson_squared
 from fmtorch.geometry import attached_step, eight_point
 from fmtorch.geometry.irls import reweighted
 from fmtorch.geometry.refine import refine_components
+from fmtorch.geometry.residuals import sampson_squared
 from fmtorch.geometry.robust_kernels import named_kernel
 from fmtorch.types import Correspondences, Estimate
 

@@ -11,9 +11,10 @@ from torch import Tensor
 
 from fmtorch import random
 from fmtorch.estimators.problem import Problem
-from fmtorch.estimators.scoring import CPU_TILE, GPU_TILE, Score, sampson_squared, score_models
+from fmtorch.estimators.scoring import CPU_TILE, GPU_TILE, Score, score_models
 from fmtorch.estimators.spatial import gaussian_kernel, neighbor_graph, spatially_coherent_inliers
 from fmtorch.geometry.eight_point import NormalEquations, fundamental_of
+from fmtorch.geometry.residuals import sampson_squared
 from fmtorch.random import Stream
 
 FIRST_DRAW = 1 << 32  # of the samples drawn here: beyond those of any search, so that they are others

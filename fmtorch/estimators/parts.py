@@ -23,11 +23,11 @@ from fmtorch.estimators.scoring import (
     SigmaConsensus,
     TruncatedSquares,
     median_rank,
-    sampson_squared,
 )
 from fmtorch.geometry.minimal import eight_point_components, seven_point_components
 from fmtorch.geometry.orientation import consistently_oriented
 from fmtorch.geometry.refine import RANK_TWO_ALREADY, refine_components
+from fmtorch.geometry.residuals import sampson_squared
 
 T = TypeVar("T")
 

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
 from fmtorch.geometry import canonical
-from fmtorch.geometry.reduce import matmul3
+from fmtorch.geometry.pixel_frame import PixelFrame
 from fmtorch.types import Correspondences
 from fmtorch.validation import reason, wrong_values
 
@@ -86,17 +86,14 @@ class Problem:
             noise=None if self.noise is None else torch.where(live, self.noise.gather(1, index), 1),
         )  # fmt: skip
 
+    @property
+    def frame(self) -> PixelFrame:
+        """The coordinates of the points."""
+        return PixelFrame(self.centre, self.unit, torch.ones_like(self.unit, dtype=torch.bool))
+
     def to_pixels(self, F: Float[Tensor, "p 3 3"]) -> Float[Tensor, "p 3 3"]:
         """Fundamental matrices of normalised coordinates, in pixels, canonical in scale and sign."""
-        T0, T1 = self._similarity(self.centre[:, :2]), self._similarity(self.centre[:, 2:])
-        return canonical(matmul3(matmul3(T1.mT, F), T0))
-
-    def _similarity(self, centre: Tensor) -> Tensor:
-        T = torch.zeros(len(centre), 3, 3, dtype=torch.float64, device=centre.device)
-        T[:, 0, 0] = T[:, 1, 1] = 1 / self.unit
-        T[:, :2, 2] = -centre / self.unit[:, None]
-        T[:, 2, 2] = 1
-        return T
+        return canonical(self.frame.to_pixels(F[:, None])[:, 0])
 
 
 def bucket(count: int) -> int:
@@ -121,8 +118,7 @@ def problems(c: Correspondences, seed: int, least: int) -> tuple[list[Problem], 
             groups.setdefault(bucket(n), []).append(i)
     made: list[Problem] = []
     for n, members in groups.items():
-        problem = _problem(c, live, torch.tensor(members, device=live.device), n, seed)
-        spread = problem.unit > 0
+        problem, spread = _problem(c, live, torch.tensor(members, device=live.device), n, seed)
         for i in problem.pair[~spread].tolist():
             reasons[i] = "all matches coincide"
         if bool(spread.any()):
@@ -139,7 +135,7 @@ def unfit_pairs(c: Correspondences, live: Bool[Tensor, "b n"], least: int) -> tu
     return counts, [a or reason(dict(zip(wrong, row[1:], strict=True))) for a, row in zip(few, table, strict=True)]
 
 
-def _problem(c: Correspondences, live: Tensor, pair: Tensor, n: int, seed: int) -> Problem:
+def _problem(c: Correspondences, live: Tensor, pair: Tensor, n: int, seed: int) -> tuple[Problem, Tensor]:
     live = live[pair]
     order = torch.argsort((~live).to(torch.uint8), dim=-1, stable=True)[:, :n]
     order = torch.nn.functional.pad(order, (0, n - order.shape[1]))
@@ -151,21 +147,17 @@ def _problem(c: Correspondences, live: Tensor, pair: Tensor, n: int, seed: int) 
 
     coordinates = torch.cat([c.x0, c.x1], -1)[pair].to(torch.float64)
     pixels = coordinates.gather(1, order[..., None].expand(-1, -1, 4))
-    inside = live[..., None]
-    low = torch.where(inside, pixels.detach(), torch.inf).amin(1)
-    high = torch.where(inside, pixels.detach(), -torch.inf).amax(1)
-    centre = (low + high) / 2
-    half = ((high - low) / 2).amax(-1)
-    # A power of two, so that scaling rounds nothing. Zero when all points coincide in both images.
-    unit = torch.where(half > 0, torch.exp2(torch.ceil(torch.log2(half.clamp_min(1e-300)))), 0)
-    points = torch.where(inside, (pixels - centre[:, None]) / unit.clamp_min(1e-300)[:, None, None], 0)
+    frame = PixelFrame.around(pixels, live)
+    points = torch.where(live[..., None], frame.normalized(pixels), 0)
     prior, noise = take(c.prior), take(c.noise)
     if noise is not None:
         noise = torch.where(live, noise.nan_to_num(1).clamp(LEAST_NOISE, MOST_NOISE), 1)
-    return Problem(
-        points.permute(2, 0, 1).contiguous(), live, count, unit, centre, order, pair, c.keys[pair],
+    problem = Problem(
+        points.permute(2, 0, 1).contiguous(), live, count, frame.pixels_per_unit, frame.centre, order, pair,
+        c.keys[pair],
         take(None if c.quality is None else c.quality),
         None if prior is None else prior.nan_to_num(0).clamp(0, 1), seed,
         None if c.size0 is None else c.size0[pair], None if c.size1 is None else c.size1[pair],
         noise,
     )  # fmt: skip
+    return problem, frame.spread

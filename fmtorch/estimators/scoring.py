@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch.estimators.problem import Problem
+from fmtorch.geometry.residuals import sampson_squared, sampson_squared_of
 from fmtorch.geometry.sigma_consensus import marginal_loss
 
 CPU_TILE = 1 << 16  # elements of one tile: 256 KB of float32, so that the handful of buffers stay in the L2 cache
@@ -21,28 +22,6 @@ GEMAN_MCCLURE_REACH = 5.0  # scales from which on that gain is zero
 GRID = 12  # cells along each side of each image, of saturated gains
 VECTORS = 128  # bytes that a processor computes on together, at most: two vectors
 LANES = 64  # matches are scored in multiples of it: whole vectors of the processor
-
-
-def sampson_squared(F: Float[Tensor, "9 p m"], points: Float[Tensor, "4 p n"]) -> Float[Tensor, "p m n"]:
-    """Squared Sampson distances of every point to every model, component by component.
-
-    Written with in-place products of a column and a row, which torch vectorises, instead of matrix products, whose
-    last bits depend on the shape of the batch. Hartley & Zisserman (2004), equation 11.9.
-    """
-    return _sampson(F[..., None], points[:, :, None])
-
-
-def _sampson(f: Tensor, points: Tensor) -> Tensor:
-    """As `sampson_squared`, of the nine entries of models and the four of points, which broadcast."""
-    x0, y0, x1, y1 = points
-    a0 = (f[0] * x0).addcmul_(f[1], y0).add_(f[2])  # F x0: the epipolar line in image 1
-    b0 = (f[3] * x0).addcmul_(f[4], y0).add_(f[5])
-    error = (f[6] * x0).addcmul_(f[7], y0).add_(f[8]).addcmul_(a0, x1).addcmul_(b0, y1)
-    a1 = (f[0] * x1).addcmul_(f[3], y1).add_(f[6])  # F^T x1: the epipolar line in image 0
-    b1 = (f[1] * x1).addcmul_(f[4], y1).add_(f[7])
-    slope: Tensor = a0.square_().addcmul_(b0, b0).addcmul_(a1, a1).addcmul_(b1, b1)
-    distance: Tensor = error.square_().div_(slope.clamp_min_(torch.finfo(slope.dtype).tiny))
-    return distance
 
 
 def geman_mcclure_gain(squared: Tensor) -> Tensor:
@@ -147,7 +126,8 @@ class SaturatedGains:
         F = torch.nn.functional.pad(F, (0, -m % whole))
         bits = _fractional_bits(n, F.dtype)
         scale = (unit / self.threshold).square().to(F.dtype)[..., None]
-        r2 = _sampson(F[:, :, None], points[..., None]).mul_(scale)  # (p, n, m): rows of models are added to a cell
+        # (p, n, m): rows of models are added to a cell.
+        r2 = sampson_squared_of(F[:, :, None], points[..., None]).mul_(scale)
         gain = _rounded(geman_mcclure_gain(r2).mul_(weight[..., None]), bits).flatten(0, 1)
         first = GRID * GRID * torch.arange(p, device=F.device)[:, None]
         total = torch.zeros_like(F[0])

@@ -16,8 +16,8 @@ from fmtorch.geometry.normalize import canonical, denormalize_fundamental, norma
 from fmtorch.geometry.normalized_matches import NormalizedMatches
 from fmtorch.geometry.rank2 import nearest_rank2
 from fmtorch.geometry.rank2_manifold import RANK_TWO, constant
+from fmtorch.geometry.residuals import homogeneous, linearise
 from fmtorch.geometry.robust_kernels import Kernel, named_kernel
-from fmtorch.geometry.sampson_objective import homogeneous, linearise
 
 Weigh = Callable[[Tensor | None, Tensor | None], Tensor]
 

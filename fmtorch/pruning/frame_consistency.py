@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.geometry.arithmetic import component_sum
 from fmtorch.geometry.curves import curve_orders
-from fmtorch.geometry.reduce import component_sum
 from fmtorch.types import Correspondences, ungraphed
 
 WINDOW = 8  # neighbours before and after each match along each curve

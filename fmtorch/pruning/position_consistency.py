@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from fmtorch.geometry.arithmetic import component_sum
 from fmtorch.geometry.curves import curve_orders
-from fmtorch.geometry.reduce import component_sum
 from fmtorch.pruning.calibration import Calibration
 from fmtorch.pruning.frame_consistency import CURVES, LEAST_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO, tiled
 from fmtorch.types import Correspondences, ungraphed

@@ -10,7 +10,7 @@ from torch import Tensor
 from fmtorch.estimators import HypothesizeAndVerify
 from fmtorch.estimators.local_optimization import GraphCut
 from fmtorch.estimators.problem import Problem, problems
-from fmtorch.estimators.scoring import TruncatedSquares, sampson_squared, score_models
+from fmtorch.estimators.scoring import TruncatedSquares, score_models
 from fmtorch.estimators.spatial import (
     NeighborGraph,
     energy,
@@ -20,6 +20,7 @@ from fmtorch.estimators.spatial import (
     neighbor_graph,
     spatially_coherent_inliers,
 )
+from fmtorch.geometry.residuals import sampson_squared
 from fmtorch.types import Correspondences, collate
 from tests.conftest import oracle
 from tests.laws import scene
