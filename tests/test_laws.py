@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from fmtorch import presets
-from fmtorch.estimators import engine, irls, local_optimization, scoring
+from fmtorch.estimators import graph_cut, irls, scores, solvers
+from fmtorch.estimators.focal import hypotheses
 from fmtorch.geometry import sampson_objective
 from fmtorch.types import Correspondences, collate
 from tests.laws import (
@@ -33,7 +34,8 @@ OWN = [n for n in presets.available("estimator") if not n.startswith(OTHER_LIBRA
 PER_MATCH = ("inliers", "kept", "prior", "noise")
 NOISY = ("fmtorch", "fmtorch_max", "gc_ransac", "msac")  # are also told the noise of matches
 TILES = [  # what bounds memory and fills caches, and must change no result
-    (engine, "CPU_SAMPLES", 150), (scoring, "CPU_TILE", 1000), (local_optimization, "CPU_TILE", 1000),
+    (solvers, "CPU_SAMPLES", 150), (hypotheses, "CPU_SAMPLES", 150), (scores, "CPU_TILE", 1000),
+    (graph_cut, "CPU_TILE", 1000),
     (irls, "TILE", 1000), (sampson_objective, "TILE_ELEMENTS", 1), (sampson_objective, "TILE_MODELS", 3),
 ]  # fmt: skip
 

@@ -6,8 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.estimators.scoring import exact_sum
-from fmtorch.geometry.arithmetic import determinant
+from fmtorch.geometry.arithmetic import determinant, exact_sum
 
 
 def share_in_front(

@@ -12,15 +12,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fmtorch.estimators.problem import Problem
-from fmtorch.geometry.residuals import sampson_squared, sampson_squared_of
+from fmtorch.estimators.pairs import NormalizedPairs
+from fmtorch.geometry.arithmetic import exact_sum
+from fmtorch.geometry.residuals import sampson_squared
 from fmtorch.geometry.sigma_consensus import marginal_loss
 
 CPU_TILE = 1 << 16  # elements of one tile: 256 KB of float32, so that the handful of buffers stay in the L2 cache
 GPU_TILE = 1 << 26
 GEMAN_MCCLURE_REACH = 5.0  # scales from which on that gain is zero
-GRID = 12  # cells along each side of each image, of saturated gains
-VECTORS = 128  # bytes that a processor computes on together, at most: two vectors
 LANES = 64  # matches are scored in multiples of it: whole vectors of the processor
 
 
@@ -32,7 +31,10 @@ def geman_mcclure_gain(squared: Tensor) -> Tensor:
 
 @runtime_checkable
 class Score(Protocol):
-    """Scores models. prior_weighted: each match counts as much as its prior, where it has one."""
+    """Scores models. prior_weighted: each match counts as much as its prior, where it has one.
+
+    One may have a `first_look`, another score by which models are compared on few matches.
+    """
 
     prior_weighted: bool
 
@@ -41,9 +43,9 @@ class Score(Protocol):
         F: Float[Tensor, "9 p m"],
         points: Float[Tensor, "4 p n"],
         weight: Float[Tensor, "p n"],
-        unit: Float[Tensor, "p slots"],
+        scale: Float[Tensor, "p slots"],
     ) -> Float[Tensor, "p m"]:
-        """Scores of models of points in normalised units, `unit` the pixels in one of them: (p, 1), or (p, n) where
+        """Scores of models of points in normalised units, `scale` the pixels in one of them: (p, 1), or (p, n) where
         each match has its own noise, by which its pixels are divided.
 
         weight: what each match counts, in [0, 1]; zero in padded slots.
@@ -51,7 +53,8 @@ class Score(Protocol):
         ...
 
 
-def _check_threshold(threshold: float) -> None:
+def check_threshold(threshold: float) -> None:
+    """Raise ValueError for what is no distance."""
     if not threshold > 0:
         raise ValueError(f"threshold is {threshold}; it is a distance in pixels and must be positive")
 
@@ -63,14 +66,14 @@ class SummedGains:
     """
 
     def __init__(self, threshold: float, prior_weighted: bool = False) -> None:
-        _check_threshold(threshold)
+        check_threshold(threshold)
         self.threshold = float(threshold)
         self.prior_weighted = prior_weighted
 
-    def __call__(self, F: Tensor, points: Tensor, weight: Tensor, unit: Tensor) -> Tensor:
+    def __call__(self, F: Tensor, points: Tensor, weight: Tensor, scale: Tensor) -> Tensor:
         """As `Score`."""
-        scale = (unit / self.threshold).square().to(F.dtype)[:, None]
-        gain = self._gain(sampson_squared(F, points).mul_(scale))
+        squared = (scale / self.threshold).square().to(F.dtype)[:, None]
+        gain = self._gain(sampson_squared(F, points).mul_(squared))
         return exact_sum(gain.mul_(weight[:, None]))
 
     def _gain(self, squared: Float[Tensor, "p m n"]) -> Float[Tensor, "p m n"]:
@@ -101,52 +104,6 @@ class GemanMcClure(SummedGains):
 
     def _gain(self, squared: Float[Tensor, "p m n"]) -> Float[Tensor, "p m n"]:
         return geman_mcclure_gain(squared)
-
-
-class SaturatedGains:
-    """The sum over grid cells of ``sqrt(sum of P g(r))``, over both images; g is the gain of Geman & McClure.
-
-    Saturates where matches crowd, so that a model which explains the whole image beats one that explains a single
-    textured plane. The narrow peak of g tells exact models from those nearby, and its tail lets one scale serve scenes
-    of different noise. The grid is that of the box around the matches of weight.
-    threshold: the scale, at which a match counts half, Sampson distance, px. unsaturated: the plain sum of g, for a
-    first look at few matches.
-    """
-
-    def __init__(self, threshold: float, prior_weighted: bool = True) -> None:
-        _check_threshold(threshold)
-        self.threshold = float(threshold)
-        self.prior_weighted = prior_weighted
-        self.unsaturated = GemanMcClure(threshold, prior_weighted)
-
-    def __call__(self, F: Tensor, points: Tensor, weight: Tensor, unit: Tensor) -> Tensor:
-        """As `Score`."""
-        (p, n), m = weight.shape, F.shape[2]
-        whole = VECTORS // F.element_size()  # so many models at a time: the rest would be rounded differently
-        F = torch.nn.functional.pad(F, (0, -m % whole))
-        bits = _fractional_bits(n, F.dtype)
-        scale = (unit / self.threshold).square().to(F.dtype)[..., None]
-        # (p, n, m): rows of models are added to a cell.
-        r2 = sampson_squared_of(F[:, :, None], points[..., None]).mul_(scale)
-        gain = _rounded(geman_mcclure_gain(r2).mul_(weight[..., None]), bits).flatten(0, 1)
-        first = GRID * GRID * torch.arange(p, device=F.device)[:, None]
-        total = torch.zeros_like(F[0])
-        for image in (points[:2], points[2:]):
-            cell = (_cells(image, weight > 0) + first).flatten()
-            sums = gain.new_zeros(p * GRID * GRID, F.shape[2]).index_add_(0, cell, gain)
-            total += _rounded(sums.sqrt_(), bits).view(p, GRID * GRID, -1).sum(1)
-        return total[:, :m].nan_to_num_(0)
-
-
-def _cells(points: Float[Tensor, "2 p n"], live: Bool[Tensor, "p n"]) -> Int[Tensor, "p n"]:
-    """The cell of each point in a grid over the live points' bounding box."""
-    low = torch.where(live, points, torch.inf).amin(-1, keepdim=True)
-    high = torch.where(live, points, -torch.inf).amax(-1, keepdim=True)
-    share = (points - low) / (high - low).clamp_min(torch.finfo(points.dtype).tiny)
-    x: Tensor
-    y: Tensor
-    x, y = (share * GRID).nan_to_num(0).clamp(0, GRID - 1).to(torch.int64)
-    return y * GRID + x
 
 
 class SigmaConsensus(SummedGains):
@@ -180,11 +137,11 @@ class Median:
 
     prior_weighted = False
 
-    def __call__(self, F: Tensor, points: Tensor, weight: Tensor, unit: Tensor) -> Tensor:
+    def __call__(self, F: Tensor, points: Tensor, weight: Tensor, scale: Tensor) -> Tensor:
         """As `Score`."""
-        live = weight > 0
-        r2 = sampson_squared(F, points).masked_fill_(~live[:, None], torch.inf)
-        rank = median_rank(live.sum(-1)).tolist()
+        mask = weight > 0
+        r2 = sampson_squared(F, points).masked_fill_(~mask[:, None], torch.inf)
+        rank = median_rank(mask.sum(-1)).tolist()
         return torch.stack([-pair.kthvalue(k, dim=-1).values for pair, k in zip(r2, rank, strict=True)])
 
 
@@ -193,52 +150,36 @@ def median_rank(count: Tensor) -> Tensor:
     return (count + 1) // 2
 
 
-def exact_sum(gain: Float[Tensor, "p m n"]) -> Float[Tensor, "p m"]:
-    """Sum over matches of gains in [0, 1], each first rounded, in place, so that the sum is exact."""
-    return _rounded(gain, _fractional_bits(gain.shape[-1], gain.dtype)).sum(-1)
-
-
-def _fractional_bits(count: int, dtype: torch.dtype) -> int:
-    """Of so many numbers in [0, 1], for their sums to be exact: 10 (fewer beyond 2^14 numbers), 20 in float64."""
-    return 20 if dtype == torch.float64 else min(10, 24 - (count - 1).bit_length())
-
-
-def _rounded(value: Tensor, fractional_bits: int) -> Tensor:
-    """Rounded to so many fractional bits, in place: 1.5 * 2^(23 - b) is added to a float32 and subtracted again."""
-    magic = 1.5 * 2.0 ** ((52 if value.dtype == torch.float64 else 23) - fractional_bits)
-    return value.add_(magic).sub_(magic)
-
-
 def score_models(
     score: Score,
     F: Float[Tensor, "9 p m"],
-    problem: Problem,
-    points: Float[Tensor, "4 p n"],
+    pairs: NormalizedPairs,
     subset: Int[Tensor, "p k"] | None = None,
     valid: Bool[Tensor, "p m"] | None = None,
 ) -> Float[Tensor, "p m"]:
     """Scores of the models on all matches, or on the `subset` (P, K) of them, in tiles of bounded size.
 
     valid: False for slots that hold no model, which must stand last in each pair; they score minus infinity.
-    Memory: eight buffers of one tile. Models are float32 in normalised units, as are the points.
+    Memory: eight buffers of one tile. Scores are computed in the type of the models.
     """
-    weight = problem.prior if score.prior_weighted and problem.prior is not None else problem.live
-    weight, units = weight.to(F.dtype), problem.units
-    width = problem.count.tolist()
+    points = pairs.points32 if F.dtype == torch.float32 else pairs.points.detach()
+    weight = pairs.prior if score.prior_weighted and pairs.prior is not None else pairs.mask
+    weight, scale = weight.to(F.dtype), pairs.scale
+    width = pairs.count.tolist()
     if subset is not None:
         points, weight = points.gather(2, subset.expand(4, -1, -1)), weight.gather(1, subset)
-        units = units.gather(1, subset) if problem.noise is not None else units
+        scale = scale.gather(1, subset) if pairs.noise is not None else scale
         width = [subset.shape[1]] * len(width)
     p, m = F.shape[1:]
     height = [m] * p if valid is None else valid.sum(1).tolist()
     scores = F.new_full((p, m), -torch.inf)
     limit = GPU_TILE if F.is_cuda else CPU_TILE
-    pairs = max(1, limit // (points.shape[2] * max(m, 1)))
-    for i in range(0, p, pairs):
-        some = slice(i, i + pairs)
+    at_once = max(1, limit // (points.shape[2] * max(m, 1)))
+    for i in range(0, p, at_once):
+        some = slice(i, i + at_once)
         n = min(-(-max(width[some]) // LANES) * LANES, points.shape[2])
-        models = max(1, limit // (n * pairs))
+        models = max(1, limit // (n * at_once))
         for j in range(0, max(height[some]), models):
             these = slice(j, min(j + models, max(height[some])))
-            scores[some, these] = score(F[:, some, these], points[:, some, :n], weight[some, :n], units[some, :n])
+            scores[some, these] = score(F[:, some, these], points[:, some, :n], weight[some, :n], scale[some, :n])
     return scores if valid is None else scores.masked_fill_(~valid, -torch.inf)
