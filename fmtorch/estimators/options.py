@@ -90,7 +90,7 @@ class Focal:
         _at_least(1, **{"focal.pool": self.pool, "focal.candidates": self.candidates})
 
 
-def group(name: str, value: Group | Mapping[str, Any] | None, kind: type[Group]) -> Group | None:
+def group(name: str, value: object, kind: type[Group]) -> Group | None:
     """The options of a stage from a mapping, or as they are; ValueError for an unknown one, naming those there are."""
     if value is None or isinstance(value, kind):
         return value

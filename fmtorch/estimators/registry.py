@@ -77,4 +77,4 @@ def part(role: str, spec: Any, **context: Any) -> Any:
     unknown = [key for key in options if key not in known]
     if unknown:
         raise ValueError(f"{role}={name}: no option {', '.join(unknown)}; there are: {', '.join(known) or 'none'}")
-    return make(**{key: value for key, value in context.items() if key in known}, **options)
+    return make(**({key: value for key, value in context.items() if key in known} | options))
