@@ -77,10 +77,8 @@ def test_pairs_that_are_confident_are_left_alone() -> None:
         asked.append(len(some))
         return [int(row) == 1 for row in some.row]  # the second pair, at once
 
-    search = Search(
-        MinimalSamples(SevenPoint(), Uniform()), Verifier(TruncatedSquares(1.0), None), 4, 150, 50, confident
-    )
-    pool = search(pairs)
+    generator, verify = MinimalSamples(SevenPoint(), Uniform()), Verifier(TruncatedSquares(1.0), None)
+    pool = Search(generator, verify, 4, 150, 50, confident)(pairs)
     assert asked == [3, 2]
     assert pool.draws.tolist() == [150, 50, 150]
     whole = Search(generator, verify, 4, 150, 50)(pairs)
