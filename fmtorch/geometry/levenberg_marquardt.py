@@ -88,8 +88,8 @@ class TensorObjective(Generic[Self_]):
     damping: Damping
     tolerance: float | None = None
 
-    def negligible(self, decrease: Tensor, state: Self_, better: Tensor) -> Bool[Tensor, "p k"]:
-        """Which models are done, by how much a step lowered their cost."""
+    def negligible(self, decrease: Tensor, state: Self_) -> Bool[Tensor, "p k"]:
+        """Which models are done, by how much an accepted step lowered their cost."""
         raise NotImplementedError
 
     def begin(self, state: Self_) -> tuple[Tensor, Tensor]:
@@ -101,5 +101,5 @@ class TensorObjective(Generic[Self_]):
         better = (trial.cost < state.cost) & ~done
         damping = torch.where(better, damping / 10, damping * 10).clamp_(self.damping.least, self.damping.most)
         if self.tolerance is not None:
-            done = done | self.negligible(state.cost - trial.cost, state, better)
+            done = done | (better & self.negligible(state.cost - trial.cost, state))  # a rejected step ends no fit
         return state.replaced(trial, better), damping, done

@@ -194,7 +194,7 @@ class _RankTwoObjective(TensorObjective[_State]):
             self.steps.append(Step(state.F, damping, (trial.cost < state.cost) & ~done))
         return super().accept(state, trial, damping, done)
 
-    def negligible(self, decrease: Tensor, state: _State, better: Tensor) -> Bool[Tensor, "p k"]:
+    def negligible(self, decrease: Tensor, state: _State) -> Bool[Tensor, "p k"]:
         """As `TensorObjective.negligible`."""
         assert self.tolerance is not None
-        return better & (decrease <= self.tolerance * state.cost)
+        return decrease <= self.tolerance * state.cost

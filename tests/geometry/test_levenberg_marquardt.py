@@ -37,8 +37,8 @@ class _Valley(TensorObjective[_State]):
     def step(self, state: _State, damping: Tensor) -> Tensor:
         return state.x - state.slope[0] / (state.curvature[0] * (1 + damping))
 
-    def negligible(self, decrease: Tensor, state: _State, better: Tensor) -> Tensor:
-        return better & (decrease <= self.tolerance)
+    def negligible(self, decrease: Tensor, state: _State) -> Tensor:
+        return decrease <= self.tolerance
 
 
 START = torch.tensor([[3.0, 1e-3, -2.0]], dtype=torch.float64)
@@ -59,6 +59,12 @@ def test_rejected_steps_are_made_again_with_more_damping() -> None:
     leap = valley.log[1][0][0, 1]
     assert float(leap) > 1e9
     assert float(levenberg_marquardt(_Valley(), START, 40).cost[0, 1]) < 1e-18
+
+
+def test_a_rejected_step_ends_no_fit() -> None:
+    """The first step from 0.001 raises the cost: that is no sign that the fit has converged."""
+    end = levenberg_marquardt(_Valley(1e-9), START[:, 1:2], 40)
+    assert float(end.cost) < 1e-6
 
 
 @pytest.mark.parametrize("iterations", [0, 1, 4])

@@ -103,7 +103,7 @@ class Posterior(TensorObjective[State]):
         """As `Objective.step`."""
         return _moved(state, damped_step(state.hessian, -state.gradient, damping))
 
-    def negligible(self, decrease: Tensor, state: State, better: Tensor) -> Bool[Tensor, "p k"]:
+    def negligible(self, decrease: Tensor, state: State) -> Bool[Tensor, "p k"]:
         """As `TensorObjective.negligible`."""
         assert self.tolerance is not None
         return decrease <= self.tolerance

@@ -197,3 +197,23 @@ def test_an_exact_plane_has_a_solution_where_cameras_are_plausible() -> None:
     assert float(sampson(estimate.F, c.x0, c.x1).max()) < 1e-3
     assert int(estimate.inliers.sum()) == 150
     assert _error(estimate.F[0], c, truth) < 0.05
+
+
+def test_a_fit_goes_on_after_a_rejected_step() -> None:
+    """The first step from this start raises the cost; shorter ones gain more than what ends the fit."""
+    c, truth = _pair(2, noise=0.5, outliers=0.3)
+    normalized = _normalized(c)
+    unit = float(normalized.pixels_per_unit[0])
+    A = [np.array([[unit, 0, x], [0, unit, y], [0, 0, 1]]) for x, y in normalized.centre[0].reshape(2, 2).tolist()]
+    model = torch.from_numpy(A[1].T @ truth.numpy() @ A[0]).reshape(9, 1, 1)
+    *_, start = refine_with_prior(model / model.norm(), normalized)
+    ratio = torch.tensor([0.1, -0.1], dtype=torch.float64)[:, None, None]
+    start = TwoCameras(start.axes, start.focal + ratio)
+    px = torch.tensor([1.0], dtype=torch.float64)
+    posterior = truncated_posterior(normalized, CentredPairs(normalized), px, px / 2, None)
+    before = posterior.evaluate((start.axes, start.focal), True)
+    trial = posterior.evaluate(posterior.step(before, posterior.begin(before)[0]), False)
+    assert float(trial.cost) > float(before.cost)
+    fit = fit_focal(TwoCameras(start.axes[..., 0], start.focal[..., 0]), normalized, px, px / 2, 30, 0.05)
+    after = posterior.evaluate((fit.cameras.axes[..., None], fit.cameras.focal[..., None]), False)
+    assert float(after.cost) < float(before.cost) - 0.05
