@@ -23,7 +23,7 @@ from fmtorch.estimators.focal.hypotheses import FocalSamples
 from fmtorch.estimators.focal.selection import Candidates, FocalSelection
 from fmtorch.estimators.inliers import Confidence
 from fmtorch.estimators.models import Pool
-from fmtorch.estimators.options import Focal, Preselect, Refine, Select, group
+from fmtorch.estimators.options import Focal, Preselect, Refine, Select, at_least_one, group, thresholds
 from fmtorch.estimators.pairs import NormalizedPairs
 from fmtorch.estimators.pool import Verifier, near_models
 from fmtorch.estimators.registry import part
@@ -46,7 +46,7 @@ class HypothesizeAndVerify:
         solver: minimal solver, `seven_point` or `eight_point`.
         sampler: draws the matches of a sample, `uniform`, `prosac` or `prior`.
         score: by which models are compared.
-        threshold: Sampson distance in pixels up to which a match supports a model (unused by `median`).
+        threshold: Sampson distance in pixels up to which a match supports a model; None: 1.
         hypotheses: minimal samples drawn at most.
         round: samples between two looks at the stopping rule.
         confidence: stop once an all-inlier sample was drawn with this probability; None: never before `hypotheses`.
@@ -68,6 +68,10 @@ class HypothesizeAndVerify:
             the pair's own noise, with the prior on focal lengths unless the matches contradict it) or `none`.
         refit_inliers: recompute the inliers after the final fit.
 
+    Raises:
+        ValueError: for an unknown part or option, and for one that would have no effect, such as a threshold where
+            neither score nor inliers have one.
+
     Memory: for a batch of pairs of N matches, the points (48 N bytes a pair), the samples of 2^14 draws (about 40 MB),
     2^10 samples of five (about 20 MB) and eight buffers of one scoring tile (256 KB each); on a GPU 2^21 draws, 2^19
     samples of five and 256 MB a buffer.
@@ -79,7 +83,7 @@ class HypothesizeAndVerify:
         solver: Any = "seven_point",
         sampler: Any = "uniform",
         score: Any = "msac",
-        threshold: float = 1.0,
+        threshold: float | None = None,
         hypotheses: int = 2000,
         round: int = 500,
         confidence: float | None = 0.9999,
@@ -95,11 +99,11 @@ class HypothesizeAndVerify:
         final: Any = "least_squares",
         refit_inliers: bool = True,
     ) -> None:
-        if hypotheses < 1 or round < 1:
-            raise ValueError(f"hypotheses={hypotheses}, round={round}: both must be at least 1")
+        at_least_one(hypotheses=hypotheses, round=round, pool=pool)
         if confidence is not None and not 0 < confidence < 1:
             raise ValueError(f"confidence is {confidence}; it is a probability between 0 and 1, or null")
-        inlier_px = threshold if inlier_threshold is None else inlier_threshold
+        stops = confidence is not None
+        threshold, inlier_px = thresholds(threshold, inlier_threshold, score, inliers, stops, local_optimization)
         self.sampler, self.score = part("sampler", sampler), part("score", score, threshold=threshold)
         generator = MinimalSamples(part("solver", solver), self.sampler)
         check = part("degeneracy", degeneracy, score=self.score)

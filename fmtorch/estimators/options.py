@@ -6,9 +6,12 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
+from fmtorch.estimators.registry import takes
 from fmtorch.geometry.robust_kernels import named_kernel
 
 Group = TypeVar("Group")
+
+DEFAULT_THRESHOLD_PX = 1.0
 
 
 def _at_least(least: int, **values: int) -> None:
@@ -90,6 +93,11 @@ class Focal:
         _at_least(1, **{"focal.pool": self.pool, "focal.candidates": self.candidates})
 
 
+def at_least_one(**values: int) -> None:
+    """Raise ValueError for a number below one."""
+    _at_least(1, **values)
+
+
 def group(name: str, value: object, kind: type[Group]) -> Group | None:
     """The options of a stage from a mapping, or as they are; ValueError for an unknown one, naming those there are."""
     if value is None or isinstance(value, kind):
@@ -104,3 +112,21 @@ def group(name: str, value: object, kind: type[Group]) -> Group | None:
     if missing:
         raise ValueError(f"{name}: {', '.join(missing)} is missing; the options are: {', '.join(known)}")
     return kind(**value)
+
+
+def thresholds(
+    threshold: float | None, inlier_threshold: float | None, score: Any, inliers: Any, stops: bool, optimization: Any
+) -> tuple[float, float]:
+    """The thresholds of score and of inliers, px; ValueError where one is given that nothing asks for.
+
+    score, inliers, optimization: as options name these parts. stops: whether there is a stopping rule, which counts
+    inliers.
+    """
+    by_distance = stops or takes("inliers", inliers, "threshold")
+    if inlier_threshold is not None and not by_distance:
+        raise ValueError(f"inlier_threshold={inlier_threshold} has no effect: inliers={inliers} takes none")
+    scored = takes("score", score, "threshold") or optimization is not None
+    if threshold is not None and not scored and (not by_distance or inlier_threshold is not None):
+        raise ValueError(f"threshold={threshold} has no effect: score={score} takes none, nor does anything else")
+    of_score = DEFAULT_THRESHOLD_PX if threshold is None else threshold
+    return of_score, of_score if inlier_threshold is None else inlier_threshold

@@ -60,6 +60,13 @@ PARTS: dict[str, dict[str, Entry]] = {
 }
 
 
+def takes(role: str, spec: Any, option: str) -> bool:
+    """Whether a named part asks the engine for this option."""
+    name = spec.get("name") if isinstance(spec, Mapping) else spec
+    entry = PARTS[role].get(name) if isinstance(name, str) else None
+    return entry is not None and option in inspect.signature(entry.tensor).parameters
+
+
 def part(role: str, spec: Any, **context: Any) -> Any:
     """The part that an option describes, None for none.
 

@@ -102,7 +102,7 @@ def test_too_few_matches_have_a_reason() -> None:
     [
         ({"score": "psac"}, "score is 'psac'; it must be one of: inlier_count"),
         ({"solver": "five_point"}, "solver is 'five_point'"),
-        ({"hypotheses": 0}, "must be at least 1"),
+        ({"hypotheses": 0}, "hypotheses is 0; it must be at least 1"),
         ({"confidence": 1.5}, "a probability between 0 and 1"),
     ],
 )

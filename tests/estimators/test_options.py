@@ -15,6 +15,8 @@ from fmtorch.estimators.registry import PARTS, part
 from fmtorch.estimators.scores import InlierCount, TruncatedSquares
 from tests.laws import scene
 
+MEDIAN = {"score": "median", "inliers": "lmeds", "confidence": None}
+
 
 def test_groups_are_made_of_mappings() -> None:
     assert group("preselect", {"survivors": 64}, Preselect) == Preselect(128, 64)
@@ -41,12 +43,28 @@ def test_groups_are_made_of_mappings() -> None:
         ({"score": "prior_saturated"}, "score is 'prior_saturated'; it must be one of: inlier_count, msac, saturated"),
         ({"score": {"name": "msac", "weighted": True}}, "score=msac: no option weighted; there are: threshold, prior"),
         ({"score": {"prior_weighted": True}}, "score is None; it must be one of"),
+        ({"pool": 0}, "pool is 0; it must be at least 1"),
+        (MEDIAN | {"threshold": 2.0}, "threshold=2.0 has no effect: score=median takes none"),
+        (MEDIAN | {"inlier_threshold": 2.0}, "inlier_threshold=2.0 has no effect: inliers=lmeds takes none"),
         ({"local_optimization": "x"}, "local_optimization is 'x'; it must be one of: graph_cut"),
     ],
 )
 def test_bad_options_are_told(options: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         HypothesizeAndVerify(**options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"threshold": 2.0, "inliers": "threshold"},
+        {"inlier_threshold": 2.0, "inliers": "threshold"},
+        {"threshold": 2.0, "confidence": 0.99},  # of the stopping rule
+        {"threshold": 2.0, "local_optimization": "graph_cut"},
+    ],
+)
+def test_thresholds_that_something_asks_for_are_taken(options: dict[str, object]) -> None:
+    HypothesizeAndVerify(**(MEDIAN | options))  # type: ignore[arg-type]
 
 
 def test_a_part_is_a_name_a_mapping_or_an_object() -> None:
