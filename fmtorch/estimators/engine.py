@@ -18,18 +18,21 @@ from torch import Tensor
 
 from fmtorch.estimators.batching import solve_all
 from fmtorch.estimators.degeneracy import Degensac
-from fmtorch.estimators.final_fits import Fit
+from fmtorch.estimators.final_fits import FinalFit, Fit
 from fmtorch.estimators.focal.hypotheses import FocalSamples
 from fmtorch.estimators.focal.selection import Candidates, FocalSelection
-from fmtorch.estimators.inliers import Confidence
+from fmtorch.estimators.graph_cut import LocalOptimization
+from fmtorch.estimators.inliers import Confidence, InlierRule
 from fmtorch.estimators.models import Pool
 from fmtorch.estimators.options import Focal, Preselect, Refine, Select, at_least_one, group, thresholds
 from fmtorch.estimators.pairs import NormalizedPairs
 from fmtorch.estimators.pool import Verifier, near_models
 from fmtorch.estimators.registry import part
+from fmtorch.estimators.sampling import Sampler
+from fmtorch.estimators.scores import Score
 from fmtorch.estimators.search import Search
 from fmtorch.estimators.selection import BestScore, FirstOfPool, Selection, Selector
-from fmtorch.estimators.solvers import MinimalSamples
+from fmtorch.estimators.solvers import MinimalSamples, Solver
 from fmtorch.geometry.refine import RANK_TWO_ALREADY, refine_components
 from fmtorch.types import Correspondences, Estimate
 
@@ -80,23 +83,23 @@ class HypothesizeAndVerify:
     def __init__(
         self,
         *,
-        solver: Any = "seven_point",
-        sampler: Any = "uniform",
-        score: Any = "msac",
+        solver: str | Mapping[str, Any] | Solver = "seven_point",
+        sampler: str | Mapping[str, Any] | Sampler = "uniform",
+        score: str | Mapping[str, Any] | Score = "msac",
         threshold: float | None = None,
         hypotheses: int = 2000,
         round: int = 500,
         confidence: float | None = 0.9999,
         preselect: Preselect | Mapping[str, Any] | None = DEFAULT_PRESELECT,
-        degeneracy: Any = None,
+        degeneracy: str | Mapping[str, Any] | None = None,
         pool: int = 1,
-        local_optimization: Any = None,
+        local_optimization: str | Mapping[str, Any] | LocalOptimization | None = None,
         refine: Refine | Mapping[str, Any] | None = None,
         select: Select | Mapping[str, Any] | None = None,
         focal: Focal | Mapping[str, Any] | None = None,
-        inliers: Any = "threshold",
+        inliers: str | Mapping[str, Any] | InlierRule = "threshold",
         inlier_threshold: float | None = None,
-        final: Any = "least_squares",
+        final: str | Mapping[str, Any] | FinalFit = "least_squares",
         refit_inliers: bool = True,
     ) -> None:
         at_least_one(hypotheses=hypotheses, round=round, pool=pool)
