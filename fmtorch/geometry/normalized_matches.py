@@ -32,16 +32,15 @@ class NormalizedMatches:
         p, n = math.prod(x0.shape[:-2]), x0.shape[-2]
         x = torch.cat([x0, x1], -1).to(torch.float64).reshape(p, n, 4)
         w = torch.ones_like(x[..., 0]) if weight is None else weight.to(torch.float64).reshape(p, n)
-        live = torch.isfinite(x).all(-1) & torch.isfinite(w)
-        if mask is not None:
-            live = live & mask.reshape(p, n)
-        self.counts = live.reshape(x0.shape[:-1])
-        self._order = order = torch.argsort((~live).to(torch.uint8), dim=1, stable=True)
-        self._live = live = live.gather(1, order)
-        inside = live[..., None]
+        usable = torch.isfinite(x).all(-1) & torch.isfinite(w)
+        mask = usable if mask is None else usable & mask.reshape(p, n)
+        self.counts = mask.reshape(x0.shape[:-1])
+        self._order = order = torch.argsort((~mask).to(torch.uint8), dim=1, stable=True)
+        self._mask = mask = mask.gather(1, order)
+        inside = mask[..., None]
         x = torch.where(inside, x.gather(1, order[..., None].expand(-1, -1, 4)), 0)
         self.weight = self.ordered(w)
-        self.frame = PixelFrame.around(x, live)
+        self.frame = PixelFrame.around(x, mask)
         self.points = torch.where(inside, self.frame.normalized(x), 0).permute(2, 0, 1).contiguous()
         self.scale = torch.as_tensor(scale, dtype=torch.float64, device=x.device).expand(x0.shape[:-2]).reshape(p)
         self.scale = self.scale / self.frame.pixels_per_unit
@@ -53,7 +52,7 @@ class NormalizedMatches:
     def ordered(self, weight: Float[Tensor, "*batch n"]) -> Float[Tensor, "p n"]:
         """Values of matches in the caller's order in the order of `points`, 0 in padded slots; float64."""
         flat = weight.to(torch.float64).reshape(self._order.shape)
-        return torch.where(self._live, flat.gather(1, self._order), 0)
+        return torch.where(self._mask, flat.gather(1, self._order), 0)
 
     def to_pixels(self, models: Float[Tensor, "9 p k"]) -> Float[Tensor, "p k 3 3"]:
         """Matrices in pixels, of unit norm."""

@@ -107,15 +107,15 @@ def refine(
     robust = named_kernel(kernel)
     wanted = gradient_wanted(gradient, x0, x1, weight, F if gradient == "unrolled" else None)
     with torch.set_grad_enabled(wanted):
-        problem = NormalizedMatches(x0, x1, weight, mask, F, scale)
-        shared = (problem.points, problem.weight)
+        matches = NormalizedMatches(x0, x1, weight, mask, F, scale)
+        shared = (matches.points, matches.weight)
         steps: list[Step] | None = [] if wanted and gradient == "unrolled" else None
-        models, _ = refine_components(problem.models, *shared, kernel, problem.scale, iterations, steps=steps)
+        models, _ = refine_components(matches.models, *shared, kernel, matches.scale, iterations, steps=steps)
         if steps is not None:
-            models = through_steps(models, problem.models, steps, *shared, robust, problem.scale)
+            models = through_steps(models, matches.models, steps, *shared, robust, matches.scale)
         elif wanted:
-            models = at_optimum(models, *shared, robust, problem.scale)
-        return problem.to_pixels(models).reshape(F.shape)
+            models = at_optimum(models, *shared, robust, matches.scale)
+        return matches.to_pixels(models).reshape(F.shape)
 
 
 def attached_step(
@@ -136,12 +136,12 @@ def attached_step(
     leave a direction open, the step and its gradients in it are damped; where F or the step is not finite, F comes
     back with gradients of zero.
     """
-    problem = NormalizedMatches(x0, x1, weight, mask, F.detach(), scale)
+    matches = NormalizedMatches(x0, x1, weight, mask, F.detach(), scale)
     with torch.no_grad():
-        model, e0, e1 = start(problem.models)
+        model, e0, e1 = start(matches.models)
         robust = named_kernel(kernel)
         curved = robust._replace(weight=robust.curvature)  # Newton's weights of J^T J, not those of IRLS
-        H = SampsonObjective(problem.points, problem.weight, curved, problem.scale)(model, True)[0][:9, :9]
+        H = SampsonObjective(matches.points, matches.weight, curved, matches.scale)(model, True)[0][:9, :9]
         identity = torch.eye(9, dtype=H.dtype, device=H.device)[:, :, None, None].expand_as(H)
         inverse = constrained_solve(H, model, e0, e1, torch.full_like(H[0, 0], STEP_DAMPING), identity)
         sound = torch.isfinite(inverse).flatten(0, 1).all(0)
@@ -149,10 +149,10 @@ def attached_step(
         # Something of rank 2 instead of what is not finite: `where` alone would not keep NaN out of the gradients.
         model = torch.where(sound, model, constant(model, RANK_TWO))
         e0, e1 = (torch.where(sound, e, constant(e, RANK_TWO_EPIPOLE)) for e in (e0, e1))
-    gradient = gradient_of_cost(model, problem.points, problem.weight, robust, problem.scale)
+    gradient = gradient_of_cost(model, matches.points, matches.weight, robust, matches.scale)
     step = -component_sum((inverse * gradient).transpose(0, 1))
     moved, _, _ = retract(model, step, e0, e1)
-    return problem.to_pixels(torch.where(sound, moved, problem.models)).reshape(F.shape)
+    return matches.to_pixels(torch.where(sound, moved, matches.models)).reshape(F.shape)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
