@@ -20,7 +20,6 @@ FIGURES = Path(__file__).resolve().parent.parent / "scripts" / "benchmark" / "es
 def test_options_are_numbers_switches_or_words() -> None:
     assert matched.options("a=0.5,b=true,c=null,d=focal") == {"a": 0.5, "b": True, "c": None, "d": "focal"}
     assert matched.options("") == {}
-    assert matched.options("a.b=1,a.c=null,d=2") == {"a": {"b": 1, "c": None}, "d": 2}
 
 
 def test_options_of_a_part_are_nested() -> None:
