@@ -39,7 +39,8 @@ def few(config: Mapping[str, Any], hypotheses: int = 200, round: int = 100) -> d
     """Options with which an estimator's preset does little in each of its stages."""
     if config["_target_"] == "fmtorch.estimators.HypothesizeAndVerify":
         options = {"hypotheses": hypotheses, "round": round, "pool": min(config.get("pool", 1), 8)}
-        return options | ({"refine_matches": 64} if config.get("refine_matches") else {})  # fewer than a scene has
+        limited = (config.get("refine") or {}).get("matches")
+        return options | ({"refine": {"matches": 64}} if limited else {})  # fewer than a scene has
     if config["_target_"] == "fmtorch.estimators.IterativelyReweighted":
         return {"starts": [0, 2], "iterations": 5, "refine_iterations": 5}
     return {key: few(value, hypotheses, round) for key, value in config.items() if isinstance(value, dict)}

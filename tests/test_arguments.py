@@ -131,7 +131,7 @@ def test_presets_of_ones_own(tmp_path: Path) -> None:
     assert not torch.equal(own.F, fmtorch.find_fundamental(x0, x1, estimator="mine", config_dir=str(tmp_path)).F)
     built = presets.pipeline("my_pipeline", config_dir=tmp_path)
     assert list(built.pruners) == ["one_to_one", "ratio"]
-    assert built.estimator.hypotheses == 100  # type: ignore[attr-defined]
+    assert built.estimator.search.hypotheses == 100  # type: ignore[attr-defined]
     with pytest.raises(ValueError, match=r"no preset 'their_pipeline' in conf/pipeline; there are: .*my_pipeline"):
         presets.pipeline("their_pipeline", config_dir=tmp_path)
     with pytest.raises(ValueError, match=r"config_dir=.*nowhere is no folder"):

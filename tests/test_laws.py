@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from fmtorch import kernels, presets
-from fmtorch.estimators import engine, irls, local_optimization, scoring
+from fmtorch.estimators import graph_cut, irls, scores, solvers
+from fmtorch.estimators.focal import hypotheses
 from fmtorch.geometry import sampson_objective
 from fmtorch.types import Correspondences, collate
 from tests.laws import (
@@ -36,7 +37,8 @@ COMPILED = (  # pruners of two forms: a kernel, and tensors
     "frame_consistency", "gms", "gms_soft", "lpm", "lpm_soft", "match_noise", "one_to_one", "position_consistency",
 )  # fmt: skip
 TILES = [  # what bounds memory and fills caches, and must change no result
-    (engine, "CPU_SAMPLES", 150), (scoring, "CPU_TILE", 1000), (local_optimization, "CPU_TILE", 1000),
+    (solvers, "CPU_SAMPLES", 150), (hypotheses, "CPU_SAMPLES", 150), (scores, "CPU_TILE", 1000),
+    (graph_cut, "CPU_TILE", 1000),
     (irls, "TILE", 1000), (sampson_objective, "TILE_ELEMENTS", 1), (sampson_objective, "TILE_MODELS", 3),
 ]  # fmt: skip
 

@@ -14,7 +14,7 @@ from fmtorch.data import read_image
 from fmtorch.estimators import batching
 from fmtorch.matching import nearest
 from fmtorch.pruning import position_consistency as consistency
-from fmtorch.types import Correspondences, Estimate
+from fmtorch.types import Estimate
 from tests.laws import scene
 from tests.test_pipeline import draw, pair, pipeline
 
@@ -64,7 +64,7 @@ def test_matching_and_find_fundamental_have_one_thread(threads: int, monkeypatch
     for module, name in (
         (nearest, "_usable"),
         (nearest, "_two_nearest"),
-        (batching, "problems"),
+        (batching, "normalized_pairs"),
         (consistency, "tiled"),
     ):
         watch(module, name)
@@ -76,11 +76,12 @@ def test_matching_and_find_fundamental_have_one_thread(threads: int, monkeypatch
 
 
 def test_an_error_leaves_threads_as_they_were(threads: int) -> None:
-    def failing(c: Correspondences, seed: int = 0) -> Estimate:
-        raise RuntimeError("no")
+    class Failing:
+        def value(self, *_: object) -> Estimate:
+            raise RuntimeError("no")
 
     built = presets.build("estimator", "msac", hypotheses=10)
-    built.final = failing
-    with pytest.raises(TypeError):
+    built.final = Failing()
+    with pytest.raises(RuntimeError, match="no"):
         built(scene(0, 60))
     assert torch.get_num_threads() == threads

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fmtorch.estimators.problem import unfit_pairs, usable
+from fmtorch.estimators.pairs import finite_matches, unfit_pairs
 from fmtorch.estimators.support import lack_of_support, relative_rounding
 from fmtorch.types import Correspondences, Estimate
 from fmtorch.verdict import judged
@@ -78,13 +78,13 @@ class PairwiseEstimator:
         b, n = c.mask.shape
         F = torch.zeros(b, 3, 3, dtype=torch.float64)
         inliers = torch.zeros(b, n, dtype=torch.bool)
-        live = usable(c)
-        _, reasons = unfit_pairs(c, live, LEAST_MATCHES)
-        live = live.cpu()
+        mask = finite_matches(c)
+        _, reasons = unfit_pairs(c, mask, LEAST_MATCHES)
+        mask = mask.cpu()
         for i in range(b):
             if reasons[i]:
                 continue
-            index = live[i].nonzero()[:, 0]
+            index = mask[i].nonzero()[:, 0]
             likelihood = _likelihood(c, i)[index]
             if self._best_first:
                 order = likelihood.argsort(descending=True, stable=True)

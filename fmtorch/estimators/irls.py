@@ -9,13 +9,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.estimators.batching import solve_all
-from fmtorch.estimators.choice import best_of
-from fmtorch.estimators.parts import WithinThreshold, median_of_live
-from fmtorch.estimators.problem import Problem
-from fmtorch.estimators.scoring import sampson_squared
+from fmtorch.estimators.inliers import WithinThreshold, median_of_matches
+from fmtorch.estimators.pairs import NormalizedPairs
+from fmtorch.estimators.selection import best_of
 from fmtorch.geometry import attached_step, eight_point
 from fmtorch.geometry.irls import reweighted
 from fmtorch.geometry.refine import refine_components
+from fmtorch.geometry.residuals import sampson_squared
 from fmtorch.geometry.robust_kernels import named_kernel
 from fmtorch.types import Correspondences, Estimate
 
@@ -41,7 +41,7 @@ class IterativelyReweighted:
     """
 
     uses_prior = True
-    LEAST = 8
+    MIN_MATCHES = 8
 
     def __init__(
         self,
@@ -65,48 +65,48 @@ class IterativelyReweighted:
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
-        pairs = TILE // (max(1, c.mask.shape[1]) * len(self.starts))
-        return solve_all(c, seed, self.LEAST, self._solve, "the matches do not determine a model", pairs)
+        at_once = TILE // (max(1, c.mask.shape[1]) * len(self.starts))
+        return solve_all(c, seed, self.MIN_MATCHES, self._solve, "the matches do not determine a model", at_once)
 
-    def _solve(self, problem: Problem) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        weight = _weight(problem)
-        scale = self.threshold / problem.unit
+    def _solve(self, pairs: NormalizedPairs) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        weight = _weight(pairs)
+        scale = self.threshold / pairs.pixels_per_unit
         with torch.no_grad():
-            F, valid = self._first(problem, weight)
-            start = self._first_scale(F, valid, problem)
+            F, valid = self._first(pairs, weight)
+            start = self._first_scale(F, valid, pairs)
             for i in range(self.iterations):
-                F = reweighted(F, problem.points, weight, self.robust, torch.maximum(start * DECAY**i, scale))
-            F, cost = refine_components(F, problem.points, weight, self.kernel, scale, self.refine_iterations)
+                F = reweighted(F, pairs.points, weight, self.robust, torch.maximum(start * DECAY**i, scale))
+            F, cost = refine_components(F, pairs.points, weight, self.kernel, scale, self.refine_iterations)
             best = best_of(F, -cost, valid & torch.isfinite(cost)).T.reshape(-1, 3, 3)
             found = (valid & torch.isfinite(cost)).any(1)
-        x0, x1 = problem.points[:2].permute(1, 2, 0), problem.points[2:].permute(1, 2, 0)
+        x0, x1 = pairs.points[:2].permute(1, 2, 0), pairs.points[2:].permute(1, 2, 0)
         estimate = attached_step(best, x0, x1, weight, kernel=self.kernel, scale=scale)
         with torch.no_grad():
-            inliers = self.inlier_rule(estimate, problem)
-        return estimate, inliers, found, torch.zeros_like(problem.count)
+            inliers = self.inlier_rule(estimate, pairs)
+        return estimate, inliers, found, torch.zeros_like(pairs.count)
 
-    def _first(self, problem: Problem, weight: Tensor) -> tuple[Float[Tensor, "9 p k"], Bool[Tensor, "p k"]]:
+    def _first(self, pairs: NormalizedPairs, weight: Tensor) -> tuple[Float[Tensor, "9 p k"], Bool[Tensor, "p k"]]:
         """The 8-point algorithm on all matches, with each power of the weights, and whether these determine a model."""
-        powers = [problem.live.to(weight.dtype)]
+        powers = [pairs.mask.to(weight.dtype)]
         for _ in range(self.starts[-1]):
             powers.append(powers[-1] * weight)
         weights = torch.stack([powers[i] for i in self.starts], 1)
-        points = problem.points[:, :, None].expand(-1, -1, len(self.starts), -1)
+        points = pairs.points[:, :, None].expand(-1, -1, len(self.starts), -1)
         F, valid = eight_point(points[:2].movedim(0, -1), points[2:].movedim(0, -1), weights)
         return F.flatten(2).permute(2, 0, 1), valid
 
-    def _first_scale(self, F: Tensor, valid: Tensor, problem: Problem) -> Float[Tensor, " p"]:
-        r2 = sampson_squared(F, problem.points)
-        medians = torch.stack([median_of_live(r2[:, i], problem)[:, 0] for i in range(r2.shape[1])], 1)
+    def _first_scale(self, F: Tensor, valid: Tensor, pairs: NormalizedPairs) -> Float[Tensor, " p"]:
+        r2 = sampson_squared(F, pairs.points)
+        medians = torch.stack([median_of_matches(r2[:, i], pairs)[:, 0] for i in range(r2.shape[1])], 1)
         return self.start_scale * 1.4826 * torch.where(valid, medians, 0).amax(1).sqrt()
 
 
-def _weight(problem: Problem) -> Float[Tensor, "p n"]:
+def _weight(pairs: NormalizedPairs) -> Float[Tensor, "p n"]:
     """The prior, or the rank by quality, or 1; 0 in padded slots."""
-    if problem.prior is not None:
-        return problem.prior
-    if problem.quality is None:
-        return problem.live.to(torch.float64)
-    order = torch.sort(torch.where(problem.live, problem.quality, torch.inf), dim=1, stable=True).indices
+    if pairs.prior is not None:
+        return pairs.prior
+    if pairs.quality is None:
+        return pairs.mask.to(torch.float64)
+    order = torch.sort(torch.where(pairs.mask, pairs.quality, torch.inf), dim=1, stable=True).indices
     rank = torch.argsort(order, dim=1)
-    return torch.where(problem.live, 1 - rank / problem.count[:, None], 0).to(torch.float64)
+    return torch.where(pairs.mask, 1 - rank / pairs.count[:, None], 0).to(torch.float64)

@@ -24,7 +24,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fmtorch.estimators.problem import Problem
+from fmtorch.estimators.pairs import NormalizedPairs
 from fmtorch.geometry.curves import curve_order
 
 WINDOW = 8  # candidates for neighbours before and after each match along each curve
@@ -54,19 +54,19 @@ class NeighborGraph:
         return total.reshape(p, n, k).transpose(1, 2)
 
 
-def neighbor_graph(problem: Problem, radius: float) -> NeighborGraph:
+def neighbor_graph(pairs: NormalizedPairs, radius: float) -> NeighborGraph:
     """Matches within `radius` px of each other in (x0, y0, x1, y1), among those that are close along the curves."""
-    points, live = problem.points.detach(), problem.live
-    p, n = live.shape
-    limit = (radius / problem.unit).square()[:, None]
-    first = torch.arange(p, device=live.device)[:, None] * n
+    points, mask = pairs.points.detach(), pairs.mask
+    p, n = mask.shape
+    limit = (radius / pairs.pixels_per_unit).square()[:, None]
+    first = torch.arange(p, device=mask.device)[:, None] * n
     found = []
     for shift in SHIFTS:
-        order = curve_order(points, live, shift)  # live matches first
+        order = curve_order(points, mask, shift)  # matches of the mask first
         along = points.gather(2, order.expand(4, -1, -1))
         for step in range(1, WINDOW + 1):
             dx0, dy0, dx1, dy1 = (along[..., step:] - along[..., :-step]).square()
-            near = (dx0 + dy0 + dx1 + dy1 <= limit) & live[:, step:]
+            near = (dx0 + dy0 + dx1 + dy1 <= limit) & mask[:, step:]
             one, other = (first + order)[:, :-step][near], (first + order)[:, step:][near]
             found += [one * (p * n) + other, other * (p * n) + one]
     edges = torch.unique(torch.cat(found))
@@ -89,7 +89,7 @@ def gaussian_kernel(squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]
 def energy(
     labels: Bool[Tensor, "p k n"],
     kernel: Float[Tensor, "p k n"],
-    live: Bool[Tensor, "p n"],
+    mask: Bool[Tensor, "p n"],
     graph: NeighborGraph,
     coherence: float,
 ) -> Float[Tensor, "p k"]:
@@ -101,20 +101,20 @@ def energy(
     of_inlier = outliers + inliers - (inliers * K + inlier_kernels) / 2
     of_outlier = inliers + (outliers * K + outlier_kernels) / 2
     pairwise = torch.where(labels, of_inlier, of_outlier)
-    inside = live[:, None]
+    inside = mask[:, None]
     unary, pairwise = (torch.where(inside, value, 0).to(torch.float64).sum(-1) for value in (unary, pairwise))
     return unary + coherence / 2 * pairwise  # an edge was seen from both ends
 
 
 def field(
-    kernel: Float[Tensor, "p k n"], live: Bool[Tensor, "p n"], graph: NeighborGraph, coherence: float
+    kernel: Float[Tensor, "p k n"], mask: Bool[Tensor, "p n"], graph: NeighborGraph, coherence: float
 ) -> Float[Tensor, "p k n"]:
     """h of ``E(L) = constant + sum_p h_p L_p - lambda sum_(p, q) L_p L_q``; infinite where there is no match.
 
     ``h_p = 1 - 2 K_p + lambda sum_q (1 - (K_p + K_q) / 2)``, from ``R = m + (1 - m) (L_p + L_q) - L_p L_q``.
     """
     pulled = graph.degree[:, None] * (1 - kernel / 2) - graph.sum(kernel) / 2
-    return torch.where(live[:, None], 1 - 2 * kernel + coherence * pulled, torch.inf)
+    return torch.where(mask[:, None], 1 - 2 * kernel + coherence * pulled, torch.inf)
 
 
 def fixed_points(
@@ -137,9 +137,9 @@ def fixed_points(
 
 
 def spatially_coherent_inliers(
-    kernel: Float[Tensor, "p k n"], live: Bool[Tensor, "p n"], graph: NeighborGraph, coherence: float
+    kernel: Float[Tensor, "p k n"], mask: Bool[Tensor, "p n"], graph: NeighborGraph, coherence: float
 ) -> Bool[Tensor, "p k n"]:
     """Labels of nearly the least energy: the better of the two that `fixed_points` encloses the least cut with."""
-    inner, outer = fixed_points(field(kernel, live, graph, coherence), graph, coherence)
-    lower, upper = (energy(labels, kernel, live, graph, coherence) for labels in (inner, outer))
+    inner, outer = fixed_points(field(kernel, mask, graph, coherence), graph, coherence)
+    lower, upper = (energy(labels, kernel, mask, graph, coherence) for labels in (inner, outer))
     return torch.where((lower <= upper)[..., None], inner, outer)

@@ -23,7 +23,7 @@ _SPREADING = (
 def curve_order(
     points: Float[Tensor, "d b n"], mask: Bool[Tensor, "b n"], shift: float | Float[Tensor, "b 1"]
 ) -> Int[Tensor, "b n"]:
-    """The order of the live points along a Morton curve over a shifted grid; the others last.
+    """The order of the points in the mask along a Morton curve over a shifted grid; the others last.
 
     points: of 2 or 4 coordinates. shift: of the grid, between 0 and 1, in thirds of the curve's extent, which is 1.5
     times that of the points along the axis on which they extend furthest.

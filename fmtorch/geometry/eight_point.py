@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.geometry.arithmetic import stable_sum
 from fmtorch.geometry.eigenvector import smallest_eigenvector
 from fmtorch.geometry.normalize import canonical, denormalize_fundamental, normalize_points
 from fmtorch.geometry.rank2 import nearest_rank2
-from fmtorch.geometry.reduce import stable_sum
 
 
 def eight_point(

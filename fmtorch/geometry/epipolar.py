@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from fmtorch.geometry.arithmetic import matmul3
+
 
 def cross_matrix(t: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """The skew-symmetric matrix [t]_x with ``[t]_x v = t x v``."""
@@ -50,10 +52,10 @@ def fundamental_from_calibration(
     t: Float[Tensor, "*#batch 3"],
 ) -> Float[Tensor, "*#batch 3 3"]:
     """F = K1^-T [t]_x R K0^-1 of unit Frobenius norm, for ``X1 = R X0 + t`` (Hartley & Zisserman, eq. 9.12)."""
-    E = _matmul(cross_matrix(t), R)
+    E = matmul3(cross_matrix(t), R)
     inverse0 = _cofactors(unit_largest(K0)).mT  # K^-1 up to the scale det K
     inverse1_t = _cofactors(unit_largest(K1))
-    return unit_frobenius(_matmul(_matmul(inverse1_t, unit_largest(E)), inverse0))
+    return unit_frobenius(matmul3(matmul3(inverse1_t, unit_largest(E)), inverse0))
 
 
 def epipolar_lines(F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"]) -> Float[Tensor, "*#batch n 3"]:
@@ -163,12 +165,6 @@ def _matrix(elements: list[Tensor]) -> Tensor:
     """A 3 x 3 matrix from its nine elements, row by row."""
     stacked = torch.stack(elements, -1)
     return stacked.reshape(*stacked.shape[:-1], 3, 3)
-
-
-def _matmul(a: Tensor, b: Tensor) -> Tensor:
-    """Product of 3 x 3 matrices in a fixed order of summation."""
-    x, y, z = (a[..., :, k, None] * b[..., None, k, :] for k in range(3))
-    return x + y + z
 
 
 def _cofactors(matrix: Tensor) -> Tensor:

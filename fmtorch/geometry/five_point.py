@@ -14,9 +14,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from fmtorch.geometry.arithmetic import component_sum, cross
 from fmtorch.geometry.nullspace import null_space
-from fmtorch.geometry.rank2 import cross
-from fmtorch.geometry.reduce import component_sum
 
 GRID = 64  # intervals of the projective line in which a root is looked for
 POLISHING_STEPS = 4  # of Newton's method, from the secant through the ends of the interval

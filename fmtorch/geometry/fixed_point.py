@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.geometry.rank2_manifold import RANK_TWO, constant, unit
-from fmtorch.geometry.reduce import component_sum
+from fmtorch.geometry.arithmetic import component_sum, unit
+from fmtorch.geometry.rank2_manifold import RANK_TWO, constant
 
 GRADIENTS = ("implicit", "unrolled")
 CONTRACTION_GAP = 1e-6  # singular values of I - J below it, of an iteration that does not contract, are held off zero

@@ -10,23 +10,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.geometry.arithmetic import as_rows, component_sum, cross, matmul3, stable_sum
 from fmtorch.geometry.eigenvector import smallest_eigenvector
 from fmtorch.geometry.normalize import normalize_points
-from fmtorch.geometry.nullspace import null_space
-from fmtorch.geometry.rank2 import cross
-from fmtorch.geometry.reduce import component_sum, matmul3, stable_sum
-
-
-def four_point_components(points: Float[Tensor, "4 4 *s"]) -> tuple[Float[Tensor, " 9 *s"], Bool[Tensor, "*s"]]:
-    """The homography of four matches, of unit norm, and whether they determine one (no three of them on a line).
-
-    The null vector of the eight equations of `_equations`. Points should be of about unit scale.
-    """
-    finite = points.isfinite()
-    points = torch.where(finite, points, 0.0)
-    H, full_rank = null_space(_equations(points).flatten(0, 1))
-    valid = full_rank & finite.flatten(0, 1).all(0) & (_determinant(H[0]) != 0)
-    return torch.where(valid, H[0], 0.0), valid
 
 
 def least_squares_homography(
@@ -98,7 +84,7 @@ def plane_and_parallax(
 
 def cross_times(e: Float[Tensor, " 3 *s"], A: Float[Tensor, " 9 *s"]) -> Float[Tensor, " 9 *s"]:
     """``[e]_x A``: the cross product of e with each column of A."""
-    rows = A.reshape(3, 3, *A.shape[1:])
+    rows = as_rows(A)
     return cross(e[:, None].expand_as(rows), rows).flatten(0, 1)
 
 
@@ -125,10 +111,5 @@ def _squared(H: Tensor, x: Tensor, y: Tensor, u: Tensor, v: Tensor) -> Float[Ten
 
 def _adjugate(H: Float[Tensor, " 9 *s"]) -> Float[Tensor, " 9 *s"]:
     """A multiple of the inverse: the transposed cofactors."""
-    rows = H.reshape(3, 3, *H.shape[1:])
+    rows = as_rows(H)
     return torch.stack([cross(rows[1], rows[2]), cross(rows[2], rows[0]), cross(rows[0], rows[1])], 1).flatten(0, 1)
-
-
-def _determinant(H: Float[Tensor, " 9 *s"]) -> Tensor:
-    rows = H.reshape(3, 3, *H.shape[1:])
-    return component_sum(rows[0] * cross(rows[1], rows[2]))

@@ -16,8 +16,8 @@ from fmtorch.geometry.normalize import canonical, denormalize_fundamental, norma
 from fmtorch.geometry.normalized_matches import NormalizedMatches
 from fmtorch.geometry.rank2 import nearest_rank2
 from fmtorch.geometry.rank2_manifold import RANK_TWO, constant
+from fmtorch.geometry.residuals import homogeneous, linearise
 from fmtorch.geometry.robust_kernels import Kernel, named_kernel
-from fmtorch.geometry.sampson_objective import homogeneous, linearise
 
 Weigh = Callable[[Tensor | None, Tensor | None], Tensor]
 
@@ -70,18 +70,18 @@ def irls(
     robust = named_kernel(kernel)
     wanted = gradient_wanted(gradient, x0, x1, weight, scale, F0 if gradient == "unrolled" else None)
     with torch.set_grad_enabled(wanted):
-        problem = NormalizedMatches(x0, x1, weight, mask, F0, scale)
+        matches = NormalizedMatches(x0, x1, weight, mask, F0, scale)
 
         def step(F: Tensor) -> Tensor:
-            return reweighted(F, problem.points, problem.weight, robust, problem.scale)
+            return reweighted(F, matches.points, matches.weight, robust, matches.scale)
 
-        F = problem.models
+        F = matches.models
         with torch.set_grad_enabled(wanted and gradient == "unrolled"):
             for _ in range(iterations):
                 F = step(F)
         if wanted and gradient == "implicit":
             F = at_fixed_point(F.detach(), step)
-        return problem.to_pixels(F).reshape(F0.shape)
+        return matches.to_pixels(F).reshape(F0.shape)
 
 
 class Fits(NamedTuple):
@@ -126,19 +126,19 @@ def reweighted_fits(
     if iterations < 1:
         raise ValueError(f"iterations is {iterations}; it must be at least 1")
     first = torch.zeros(len(x0), 3, 3, dtype=torch.float64, device=x0.device) if F0 is None else F0.to(torch.float64)
-    problem = NormalizedMatches(x0, x1, None, mask, first, 1.0)
-    clean0, clean1 = (torch.where(problem.counts[..., None], x, 0).to(torch.float64) for x in (x0, x1))
+    matches = NormalizedMatches(x0, x1, None, mask, first, 1.0)
+    clean0, clean1 = (torch.where(matches.counts[..., None], x, 0).to(torch.float64) for x in (x0, x1))
 
     def distances(F: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b n"]:
-        return torch.where(problem.counts, sampson(F, clean0, clean1), 0)
+        return torch.where(matches.counts, sampson(F, clean0, clean1), 0)
 
     F, residual = (None, None) if F0 is None else (first, distances(first))
     fits, valid = [], []
     for _ in range(iterations):
-        weight = problem.ordered(weigh(F, residual))
-        fitted, determined = weighted_fit(problem.points, weight[:, None])
+        weight = matches.ordered(weigh(F, residual))
+        fitted, determined = weighted_fit(matches.points, weight[:, None])
         # Of rank 2 instead of what is not determined: `where` alone would not keep NaN out of the gradients.
-        pixels = problem.to_pixels(torch.where(determined, fitted, constant(fitted, RANK_TWO)))[:, 0]
+        pixels = matches.to_pixels(torch.where(determined, fitted, constant(fitted, RANK_TWO)))[:, 0]
         F = torch.where(determined[..., None], canonical(pixels), first if F is None else F)
         residual = distances(F)
         fits.append(F)

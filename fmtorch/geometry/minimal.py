@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.geometry.arithmetic import component_sum, determinant
 from fmtorch.geometry.cubic import cubic_roots
 from fmtorch.geometry.nullspace import null_space
-from fmtorch.geometry.rank2 import cross, rank2_components
-from fmtorch.geometry.reduce import component_sum
+from fmtorch.geometry.rank2 import rank2_components
 
 
 def seven_point_components(
@@ -75,7 +75,7 @@ def _cubic(basis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     e0, e1 = f0.to(torch.float64), f1.to(torch.float64)
     half = 0.5**0.5
     directions = torch.stack([e0, e1, (e0 + e1) * half, (e0 - e1) * half], 1)
-    p = _determinant(directions.reshape(3, 3, *directions.shape[1:]))
+    p = determinant(directions.reshape(3, 3, *directions.shape[1:]))
     best = p.detach().abs().argmax(0)
     turned, exchanged = best >= 2, (best == 0) | (best == 2)
     plus, minus = (f0 + f1) * half, (f0 - f1) * half
@@ -89,10 +89,6 @@ def _cubic(basis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     c0, c3 = torch.where(exchanged, q1, q0), torch.where(exchanged, q0, q1)
     c2, c1 = (s + d) / 2 - c0, (s - d) / 2 - c3
     return F0, F1, torch.stack([c3, c2, c1, c0])
-
-
-def _determinant(F: Tensor) -> Tensor:
-    return component_sum(F[0] * cross(F[1], F[2]))
 
 
 def _hartley(points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

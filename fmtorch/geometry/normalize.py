@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.geometry.arithmetic import component_sum, matmul3, stable_sum
 from fmtorch.geometry.epipolar import unit_frobenius
-from fmtorch.geometry.reduce import component_sum, matmul3, stable_sum
 
 
 def normalize_points(

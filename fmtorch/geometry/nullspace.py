@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.geometry.reduce import component_sum
+from fmtorch.geometry.arithmetic import component_sum
 
 RANK_TOLERANCE = 64
 """A row counts as dependent on the rows before it when less than this many eps of its length is left over."""

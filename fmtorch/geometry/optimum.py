@@ -8,10 +8,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.geometry.rank2_manifold import RANK_TWO, cofactors, constant, start, unit
-from fmtorch.geometry.reduce import component_sum, stable_sum
+from fmtorch.geometry.arithmetic import as_rows, cofactors, component_sum, stable_sum, unit
+from fmtorch.geometry.rank2_manifold import RANK_TWO, constant, start
+from fmtorch.geometry.residuals import homogeneous, linearise
 from fmtorch.geometry.robust_kernels import Kernel
-from fmtorch.geometry.sampson_objective import Objective, homogeneous, linearise
+from fmtorch.geometry.sampson_objective import SampsonObjective
 
 STEP_DAMPING = 1e-10  # of the attached step: bounds its gradient where the points leave a direction open
 
@@ -56,12 +57,12 @@ def at_optimum(
     with torch.no_grad():
         usable = torch.isfinite(F).all(0) & (F != 0).any(0)
         model = unit(torch.where(usable, F, constant(F, RANK_TWO)))
-        C = cofactors(model)
+        C = cofactors(as_rows(model)).flatten(0, 1)
         size = component_sum(C * C)
         usable = usable & (size > 0)
         normal = C / torch.where(size > 0, size, 1).sqrt()
         curved = robust._replace(weight=robust.curvature)  # Newton's weights of J^T J, not those of IRLS
-        gauss_newton = Objective(points, weight, curved, scale)(model, True)[0][:9, :9].movedim((0, 1), (-2, -1))
+        gauss_newton = SampsonObjective(points, weight, curved, scale)(model, True)[0][:9, :9].movedim((0, 1), (-2, -1))
         frame = torch.stack([model, normal], -1).movedim(0, -2)
     exact = _hessian(model, C, size, points.detach(), weight.detach(), robust, scale.detach())
     with torch.no_grad():
@@ -89,7 +90,7 @@ def _hessian(
         model = F.detach().clone().requires_grad_()
         gradient = gradient_of_cost(model, points, weight, robust, scale)
         multiplier = -component_sum(gradient.detach() * C) / torch.where(size > 0, size, 1)
-        total = gradient + multiplier * cofactors(model)
+        total = gradient + multiplier * cofactors(as_rows(model)).flatten(0, 1)
         rows = [torch.autograd.grad(total[i].sum(), model, retain_graph=True)[0] for i in range(9)]
     H = torch.stack(rows).movedim((0, 1), (-2, -1))
     return (H + H.mT) / 2
@@ -132,7 +133,7 @@ def _step(
     H = torch.einsum("apkn,bpkn->pkab", J * influence, J)
     gradient = torch.einsum("apkn,pkn->pka", J * influence, e)
     model = F.movedim(0, -1)
-    normal = unit(cofactors(F)).movedim(0, -1)
+    normal = unit(cofactors(as_rows(F)).flatten(0, 1)).movedim(0, -1)
     curvature = H.diagonal(dim1=-2, dim2=-1).amax(-1)
     curvature = torch.where(curvature > 0, curvature, 1.0)
     blocked = model[..., :, None] * model[..., None, :] + torch.diag_embed(damping[..., None].expand_as(model))
@@ -142,6 +143,6 @@ def _step(
     right = torch.cat([-gradient, torch.zeros_like(gradient[..., :1])], -1)
     step = torch.linalg.solve(Q, right[..., None])[..., :9, 0]
     G = F + step.movedim(-1, 0)
-    C, n = cofactors(G), unit(cofactors(F))
+    C, n = cofactors(as_rows(G)).flatten(0, 1), unit(cofactors(as_rows(F)).flatten(0, 1))
     determinant = component_sum(C[:3] * G[:3])
     return unit(G - determinant / component_sum(C * n) * n)

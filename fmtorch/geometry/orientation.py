@@ -5,7 +5,7 @@ from __future__ import annotations
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.geometry.rank2 import cross
+from fmtorch.geometry.arithmetic import as_rows, cross
 
 _COLUMNS = (0.618, 0.414)  # of a generic combination, so that no usual epipole makes both columns parallel
 
@@ -18,7 +18,7 @@ def consistently_oriented(F: Float[Tensor, " 9 *s"], points: Float[Tensor, " 4 n
     F: rank-two matrices, row by row. points: x0, y0, x1, y1 of the matches that a model was made from; *t broadcasts
     against *s.
     """
-    f = F.reshape(3, 3, *F.shape[1:])
+    f = as_rows(F)
     u, v = _COLUMNS
     ex, ey, ez = cross(f[:, 0] + u * f[:, 2], f[:, 1] + v * f[:, 2])  # across all columns: the left epipole
     x0, y0, x1, y1 = points

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fmtorch.geometry.rank2 import cofactors, complement, cross, last_right_singular_vector
-from fmtorch.geometry.reduce import component_sum
+from fmtorch.geometry.arithmetic import cofactors, component_sum, cross, product
+from fmtorch.geometry.rank2 import complement, last_right_singular_vector
 
 
 class Pose(NamedTuple):
@@ -44,7 +44,7 @@ def pose_from_fundamental(
     F_, K0_, K1_ = (A.to(torch.float64).movedim((-2, -1), (0, 1)) for A in (F, K0, K1))
     finite = torch.stack([A.isfinite().all(0).all(0) for A in (F_, K0_, K1_)]).all(0)
     F_, K0_, K1_ = (torch.where(finite, A, 0.0) for A in (F_, K0_, K1_))
-    E = _product(_product(K1_.transpose(0, 1), F_), K0_)
+    E = product(product(K1_.transpose(0, 1), F_), K0_)
     inverse0, regular0 = _inverse(K0_)
     inverse1, regular1 = _inverse(K1_)
     E, t, two = _essential(E)
@@ -104,11 +104,6 @@ def _rays(inverse: Tensor, x: Tensor) -> Tensor:
     x = x.to(torch.float64)
     columns = inverse[..., None]
     return columns[:, 0] * x[..., 0] + columns[:, 1] * x[..., 1] + columns[:, 2]
-
-
-def _product(A: Tensor, B: Tensor) -> Tensor:
-    """A B, component-first."""
-    return component_sum(A[:, :, None] * B[None], 1)
 
 
 def _cross_matrix_product(t: Tensor, E: Tensor) -> Tensor:

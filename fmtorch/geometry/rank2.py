@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.geometry.reduce import component_sum
+from fmtorch.geometry.arithmetic import cofactors, component_sum, determinant
 
 GAP = 1e-6
 """Eigenvalue gaps of F^T F below this share of its largest eigenvalue have their gradient held finite."""
@@ -64,8 +64,8 @@ def _attach(F: Tensor, v: Tensor) -> Tensor:
         b00, b11 = b00 - smallest, b11 - smallest
         eps2 = (GAP * (M[0, 0] + M[1, 1] + M[2, 2])) ** 2
         s00, s01, s11 = b00 * b00 + b01 * b01 + eps2, b01 * (b00 + b11), b01 * b01 + b11 * b11 + eps2
-        determinant = s00 * s11 - s01 * s01
-        inverse = torch.where(determinant > 0, 1.0 / torch.where(determinant > 0, determinant, 1.0), 0.0)
+        area = s00 * s11 - s01 * s01
+        inverse = torch.where(area > 0, 1.0 / torch.where(area > 0, area, 1.0), 0.0)
         i00 = (s11 * b00 - s01 * b01) * inverse
         i01 = (s11 * b01 - s01 * b11) * inverse
         i11 = (s00 * b11 - s01 * b01) * inverse
@@ -74,18 +74,6 @@ def _attach(F: Tensor, v: Tensor) -> Tensor:
     change = Mv - Mv.detach()
     along_p, along_q = component_sum(p * change), component_sum(q * change)
     return v - (p * (i00 * along_p + i01 * along_q) + q * (i01 * along_p + i11 * along_q))
-
-
-def cofactors(F: Tensor) -> Tensor:
-    """The cofactor matrix: row i is the cross product of the other two rows of F."""
-    product: Tensor = torch.linalg.cross(F.roll(-1, 0), F.roll(-2, 0), dim=1)
-    return product
-
-
-def cross(a: Float[Tensor, " 3 *s"], b: Float[Tensor, " 3 *s"]) -> Float[Tensor, " 3 *s"]:
-    """The cross product of component-first vectors."""
-    product: Tensor = torch.linalg.cross(a, b, dim=0)
-    return product
 
 
 def _scaled(A: Tensor) -> Tensor:
@@ -112,12 +100,12 @@ def _largest_eigenvector(K: Tensor) -> Tensor:
         D[i, i] = K[i, i] - mean
     m = (component_sum(component_sum(D * D, 1)) / 6).sqrt()
     X = D / torch.where(m > 0, m, 1.0)
-    determinant = component_sum(X[0] * cross(X[1], X[2])).clamp(-2.0, 2.0)
+    constant = determinant(X).clamp(-2.0, 2.0)
     y = torch.full_like(m, 2.0)
     for _ in range(5):
-        y = (2 * y * y * y + determinant.abs()) / (3 * (y * y - 1))
+        y = (2 * y * y * y + constant.abs()) / (3 * (y * y - 1))
     middle = ((3 * (2 - y).clamp_min(0) * (2 + y)).sqrt() + y) / 2
-    largest = torch.where(determinant >= 0, y, middle)
+    largest = torch.where(constant >= 0, y, middle)
     for i in range(3):
         X[i, i] = X[i, i] - largest
     candidates = cofactors(X)

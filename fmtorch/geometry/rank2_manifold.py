@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.geometry.reduce import component_sum
+from fmtorch.geometry.arithmetic import as_rows, cofactors, component_sum, unit
 
 RANK_TWO, RANK_TWO_EPIPOLE = (0.5**0.5, 0.0, 0.0, 0.0, 0.5**0.5, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 
@@ -55,11 +55,11 @@ def constrained_solve(
 def retract(F: Tensor, step: Tensor, e0: Tensor, e1: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The rank-2 matrix of unit norm ``F + step + alpha e1 e0^T``, and its epipoles."""
     G = F + step
-    C = cofactors(G)
+    C = cofactors(as_rows(G)).flatten(0, 1)
     determinant = component_sum(C[:3] * G[:3])
     normal = (e1[:, None] * e0[None]).flatten(0, 1)
     G = unit(G - determinant / component_sum(C * normal) * normal)
-    C = square(cofactors(G))  # a multiple of e1 e0^T
+    C = cofactors(as_rows(G))  # a multiple of e1 e0^T
     return G, unit(component_sum(C * e1[:, None])), unit(component_sum(C * e0, 1))
 
 
@@ -71,7 +71,7 @@ def start(F: Float[Tensor, "9 p k"], squarings: int = SQUARINGS) -> tuple[Tensor
     rank 2 up to rounding already. The result has rank 2 in any case.
     """
     F = unit(F)
-    C = square(cofactors(F))
+    C = cofactors(as_rows(F))
     K = component_sum(C[:, :, None] * C[:, None])  # C^T C
     for _ in range(squarings):
         K = K / K.abs().amax((0, 1))
@@ -79,27 +79,9 @@ def start(F: Float[Tensor, "9 p k"], squarings: int = SQUARINGS) -> tuple[Tensor
     size = component_sum(K * K, 1)
     column = size.argmax(0)
     e0 = unit(K.gather(0, column.expand(1, 3, *column.shape))[0])
-    M = square(F)
+    M = as_rows(F)
     G = unit((M - component_sum(M * e0, 1)[:, None] * e0).flatten(0, 1))
-    return G, e0, unit(component_sum(square(cofactors(G)) * e0, 1))
-
-
-def cofactors(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "9 p k"]:
-    """The matrix of cofactors: ``det(F) F^-T`` where F is regular."""
-    rows = square(F)
-    crossed: Tensor = torch.linalg.cross(rows.roll(-1, 0), rows.roll(-2, 0), dim=1)
-    return crossed.flatten(0, 1)
-
-
-def square(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "3 3 p k"]:
-    """The components as rows and columns."""
-    return F.reshape(3, 3, *F.shape[1:])
-
-
-def unit(x: Float[Tensor, "c p k"]) -> Float[Tensor, "c p k"]:
-    """Scaled to unit norm over the components; NaN where that is not possible."""
-    norm: Tensor = component_sum(x * x).sqrt()
-    return x / norm
+    return G, e0, unit(component_sum(cofactors(as_rows(G)) * e0, 1))
 
 
 def constant(like: Tensor, components: tuple[float, ...]) -> Tensor:

@@ -6,11 +6,15 @@ and unit norm (see `rank2_manifold`). A model is refined to the same bits in any
 
 from __future__ import annotations
 
+import dataclasses
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.geometry.arithmetic import component_sum
 from fmtorch.geometry.fixed_point import gradient_wanted
+from fmtorch.geometry.levenberg_marquardt import Damping, TensorObjective, TensorState, levenberg_marquardt
 from fmtorch.geometry.normalized_matches import NormalizedMatches
 from fmtorch.geometry.optimum import STEP_DAMPING, Step, at_optimum, gradient_of_cost, through_steps
 from fmtorch.geometry.rank2_manifold import (
@@ -23,12 +27,10 @@ from fmtorch.geometry.rank2_manifold import (
     solve,
     start,
 )
-from fmtorch.geometry.reduce import component_sum
 from fmtorch.geometry.robust_kernels import named_kernel
-from fmtorch.geometry.sampson_objective import Objective
+from fmtorch.geometry.sampson_objective import SampsonObjective
 
-DAMPING = 1e-4  # initial, relative to the mean curvature; divided or multiplied by 10 at each step
-SMALLEST_DAMPING, LARGEST_DAMPING = 1e-12, 1e6
+DAMPING = Damping(1e-4, 1e-12, 1e6)
 RANK_TWO_ALREADY = 1  # squarings that suffice where the last singular value is but rounding of float32
 
 
@@ -41,7 +43,7 @@ def refine_components(
     iterations: int,
     tolerance: float = 0.0,
     squarings: int = SQUARINGS,
-    damping: float = DAMPING,
+    damping: float = DAMPING.first,
     steps: list[Step] | None = None,
 ) -> tuple[Float[Tensor, "9 p k"], Float[Tensor, "p k"]]:
     """Refined models and their costs ``sum_i w_i rho(r_i^2)``, component by component, without gradients.
@@ -55,22 +57,9 @@ def refine_components(
     is not finite comes back as it was, with infinite cost.
     """
     with torch.no_grad():
-        objective = Objective(points, weight, named_kernel(kernel), scale)
-        state = _State(objective, *start(F, squarings), iterations > 0)
-        damped = torch.full_like(state.cost, damping)
-        done = torch.zeros_like(state.cost, dtype=torch.bool)
-        for i in range(iterations):
-            step = solve(state.products, state.F, state.e0, state.e1, damped)
-            trial = _State(objective, *retract(state.F, step, state.e0, state.e1), i + 1 < iterations)
-            better = (trial.cost < state.cost) & ~done
-            if steps is not None:
-                steps.append(Step(state.F, damped, better))
-            damped = torch.where(better, damped / 10, damped * 10).clamp_(SMALLEST_DAMPING, LARGEST_DAMPING)
-            if tolerance:
-                done |= better & (state.cost - trial.cost <= tolerance * state.cost)
-            state.adopt(trial, better)
-            if tolerance and bool(done.all()):
-                break
+        sampson = SampsonObjective(points, weight, named_kernel(kernel), scale)
+        objective = _RankTwoObjective(sampson, DAMPING._replace(first=damping), tolerance or None, steps)
+        state = levenberg_marquardt(objective, start(F, squarings), iterations)
         kept = torch.isfinite(state.cost)
         return torch.where(kept, state.F, F), torch.where(kept, state.cost, torch.inf)
 
@@ -118,15 +107,15 @@ def refine(
     robust = named_kernel(kernel)
     wanted = gradient_wanted(gradient, x0, x1, weight, F if gradient == "unrolled" else None)
     with torch.set_grad_enabled(wanted):
-        problem = NormalizedMatches(x0, x1, weight, mask, F, scale)
-        shared = (problem.points, problem.weight)
+        matches = NormalizedMatches(x0, x1, weight, mask, F, scale)
+        shared = (matches.points, matches.weight)
         steps: list[Step] | None = [] if wanted and gradient == "unrolled" else None
-        models, _ = refine_components(problem.models, *shared, kernel, problem.scale, iterations, steps=steps)
+        models, _ = refine_components(matches.models, *shared, kernel, matches.scale, iterations, steps=steps)
         if steps is not None:
-            models = through_steps(models, problem.models, steps, *shared, robust, problem.scale)
+            models = through_steps(models, matches.models, steps, *shared, robust, matches.scale)
         elif wanted:
-            models = at_optimum(models, *shared, robust, problem.scale)
-        return problem.to_pixels(models).reshape(F.shape)
+            models = at_optimum(models, *shared, robust, matches.scale)
+        return matches.to_pixels(models).reshape(F.shape)
 
 
 def attached_step(
@@ -147,12 +136,12 @@ def attached_step(
     leave a direction open, the step and its gradients in it are damped; where F or the step is not finite, F comes
     back with gradients of zero.
     """
-    problem = NormalizedMatches(x0, x1, weight, mask, F.detach(), scale)
+    matches = NormalizedMatches(x0, x1, weight, mask, F.detach(), scale)
     with torch.no_grad():
-        model, e0, e1 = start(problem.models)
+        model, e0, e1 = start(matches.models)
         robust = named_kernel(kernel)
         curved = robust._replace(weight=robust.curvature)  # Newton's weights of J^T J, not those of IRLS
-        H = Objective(problem.points, problem.weight, curved, problem.scale)(model, True)[0][:9, :9]
+        H = SampsonObjective(matches.points, matches.weight, curved, matches.scale)(model, True)[0][:9, :9]
         identity = torch.eye(9, dtype=H.dtype, device=H.device)[:, :, None, None].expand_as(H)
         inverse = constrained_solve(H, model, e0, e1, torch.full_like(H[0, 0], STEP_DAMPING), identity)
         sound = torch.isfinite(inverse).flatten(0, 1).all(0)
@@ -160,24 +149,52 @@ def attached_step(
         # Something of rank 2 instead of what is not finite: `where` alone would not keep NaN out of the gradients.
         model = torch.where(sound, model, constant(model, RANK_TWO))
         e0, e1 = (torch.where(sound, e, constant(e, RANK_TWO_EPIPOLE)) for e in (e0, e1))
-    gradient = gradient_of_cost(model, problem.points, problem.weight, robust, problem.scale)
+    gradient = gradient_of_cost(model, matches.points, matches.weight, robust, matches.scale)
     step = -component_sum((inverse * gradient).transpose(0, 1))
     moved, _, _ = retract(model, step, e0, e1)
-    return problem.to_pixels(torch.where(sound, moved, problem.models)).reshape(F.shape)
+    return matches.to_pixels(torch.where(sound, moved, matches.models)).reshape(F.shape)
 
 
-class _State:
+@dataclasses.dataclass(frozen=True, eq=False)
+class _State(TensorState):
     """A rank-2 model, its epipoles and cost, and the normal equations there."""
 
-    def __init__(self, objective: Objective, F: Tensor, e0: Tensor, e1: Tensor, derivatives: bool) -> None:
-        self.F, self.e0, self.e1 = F, e0, e1
-        self.products, self.cost = objective(F, derivatives)
+    F: Float[Tensor, "9 p k"]
+    e0: Float[Tensor, "3 p k"]
+    e1: Float[Tensor, "3 p k"]
+    products: Float[Tensor, "rows columns p k"]
 
-    def adopt(self, other: _State, condition: Tensor) -> None:
-        """Become the other state where the condition holds (without its products if it has none)."""
-        self.F = torch.where(condition, other.F, self.F)
-        self.e0 = torch.where(condition, other.e0, self.e0)
-        self.e1 = torch.where(condition, other.e1, self.e1)
-        self.cost = torch.where(condition, other.cost, self.cost)
-        if len(other.products):
-            self.products = torch.where(condition, other.products, self.products)
+
+class _RankTwoObjective(TensorObjective[_State]):
+    """The robust Sampson error on the manifold of rank 2 and unit norm, with steps in its tangent space.
+
+    tolerance: the share of its cost by which a step must lower it, if the fit is to go on. steps: where given, those
+    taken are appended to it.
+    """
+
+    def __init__(
+        self, sampson: SampsonObjective, damping: Damping, tolerance: float | None, steps: list[Step] | None
+    ) -> None:
+        self.sampson, self.damping, self.tolerance, self.steps = sampson, damping, tolerance, steps
+
+    def evaluate(self, parameters: tuple[Tensor, Tensor, Tensor], derivatives: bool) -> _State:
+        """As `Objective.evaluate`; parameters: the model and its epipoles."""
+        F, e0, e1 = parameters
+        products, cost = self.sampson(F, derivatives)
+        return _State(cost, F, e0, e1, products)
+
+    def step(self, state: _State, damping: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """As `Objective.step`."""
+        moved = solve(state.products, state.F, state.e0, state.e1, damping)
+        return retract(state.F, moved, state.e0, state.e1)
+
+    def accept(self, state: _State, trial: _State, damping: Tensor, done: Tensor) -> tuple[_State, Tensor, Tensor]:
+        """As `Objective.accept`."""
+        if self.steps is not None:
+            self.steps.append(Step(state.F, damping, (trial.cost < state.cost) & ~done))
+        return super().accept(state, trial, damping, done)
+
+    def negligible(self, decrease: Tensor, state: _State) -> Bool[Tensor, "p k"]:
+        """As `TensorObjective.negligible`."""
+        assert self.tolerance is not None
+        return decrease <= self.tolerance * state.cost

@@ -10,18 +10,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.geometry.reduce import component_sum, stable_sum
+from fmtorch.geometry.arithmetic import component_sum, stable_sum
+from fmtorch.geometry.residuals import homogeneous, linearise
 from fmtorch.geometry.robust_kernels import Kernel
 
 LANES = 64  # points are summed in blocks of so many, and these one by one: part of the result's last bits
 TILE_MODELS = 24  # models whose sums stay in the L2 cache together; changes no result
 TILE_ELEMENTS = 1 << 13  # points times models of one step; changes no result
-TINY = 1e-30  # squared slope of the epipolar constraint below which it is taken for this
-
-
-def homogeneous(points: Float[Tensor, " 4 *s"]) -> Float[Tensor, " 2 3 *s"]:
-    """x0, y0, x1, y1 as homogeneous points of the two images."""
-    return torch.cat([points.reshape(2, 2, *points.shape[1:]), torch.ones_like(points[:2])[:, None]], 1)
 
 
 def blocks(
@@ -37,7 +32,7 @@ def blocks(
     return points, weight.reshape(p, m, 1, LANES).transpose(0, 1).contiguous()
 
 
-class Objective:
+class SampsonObjective:
     """The robust cost of models of some pairs, with its normal equations, in tiles that stay in the cache.
 
     scale: of the kernel, one for all matches of a pair, (p,) or (p, 1), or one for each (p, n).
@@ -115,30 +110,3 @@ def block_products(
 def _in_order(blocks: list[Tensor]) -> Tensor:
     """The sum over all blocks, one after the other: those of zeros at the end change nothing."""
     return component_sum(blocks[0] if len(blocks) == 1 else torch.cat(blocks))
-
-
-def linearise(
-    F: Float[Tensor, "9 p k"], points: Float[Tensor, "2 3 m p 1 lanes"], derivatives: bool = True
-) -> tuple[Tensor, Float[Tensor, "m p k lanes"], Float[Tensor, "m p k lanes"], Float[Tensor, "m p k lanes"]]:
-    """The Sampson residual ``r = e / g`` and its Jacobian: g J (3, 3, m, p, k, lanes), then e, 1 / g^2, and r^2.
-
-    ``e = x1^T F x0``, ``g^2`` the squared norm of the first two entries of ``F x0`` and ``F^T x1`` together (Hartley &
-    Zisserman 2004, equation 11.9), so ``g dr = x1^T dF x0 - (e / g^2) ((F x0)^T D dF x0 + x1^T dF D F^T x1)`` with
-    ``D = diag(1, 1, 0)``: the sum of two products of a column and a row. points: homogeneous. Without derivatives the
-    first is empty.
-    """
-    x0, x1 = points
-    rows = F.reshape(3, 3, 1, *F.shape[1:], 1)
-    line1 = torch.addcmul(torch.addcmul(rows[:, 2], rows[:, 0], x0[0]), rows[:, 1], x0[1])  # F x0
-    line0 = torch.addcmul(torch.addcmul(rows[2, :2], rows[0, :2], x1[0]), rows[1, :2], x1[1])  # F^T x1
-    slope1 = line1[:2]
-    e = torch.addcmul(torch.addcmul(line1[2], slope1[0], x1[0]), slope1[1], x1[1])
-    a, b = torch.addcmul(slope1 * slope1, line0, line0)
-    inverse = (a + b).clamp_min(TINY).reciprocal()
-    c = e * inverse
-    r2 = e * c
-    if not derivatives:
-        return e.new_empty(0), e, inverse, r2
-    across1 = torch.cat([torch.addcmul(x1[:2], c, slope1, value=-1), torch.ones_like(e)[None]])  # x1 - c D F x0
-    across0 = torch.cat([-c * line0, torch.zeros_like(e)[None]])  # -c D F^T x1
-    return torch.addcmul(across1[:, None] * x0, x1[:, None], across0), e, inverse, r2

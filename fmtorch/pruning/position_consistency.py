@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from fmtorch.geometry.arithmetic import component_sum
 from fmtorch.geometry.curves import curve_orders
-from fmtorch.geometry.reduce import component_sum
 from fmtorch.pair_arrays import for_each_pair, kernels_serve
 from fmtorch.pruning import consistency_kernels as compiled
 from fmtorch.pruning.calibration import Calibration

@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int, Int8, Real
 from torch import Tensor
 
+from fmtorch.geometry.arithmetic import matmul3, stable_sum
 from fmtorch.geometry.epipolar import residual_and_normals, unit_largest
-from fmtorch.geometry.reduce import matmul3, stable_sum
 from fmtorch.metrics import nsgd
 from fmtorch.training.virtual_points import virtual_points
 

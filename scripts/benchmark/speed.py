@@ -48,7 +48,6 @@ def add_arguments(commands: Any) -> None:
         type=int,
         help="also pairs a second, by the clock, of so many threads and processes over batches",
     )
-    parser.add_argument("--compile", action="store_true", help="add each engine preset again, with torch.compile")
     parser.add_argument("--json", type=Path, help="write the figures here")
     parser.set_defaults(run=run)
 
@@ -66,12 +65,8 @@ def run(arguments: argparse.Namespace) -> None:
     console.print(f"{len(pairs)} pairs, {np.median(counts):.0f} matches (median; {counts.min()} to {counts.max()})")
 
     specs = [*arguments.peers, *arguments.estimators]
-    if arguments.compile:
-        for spec in arguments.estimators:
-            front, at, stages = spec.partition("@")
-            specs.append(f"{front}{',' if ':' in front else ':'}compile=true{at}{stages}")
     methods = {spec: functools.partial(build(spec), seed=0) for spec in specs}
-    first = {spec: seconds(run_one, pairs[0]) for spec, run_one in methods.items()}  # lazy initialisation, compilation
+    first = {spec: seconds(run_one, pairs[0]) for spec, run_one in methods.items()}  # lazy initialisation
     batches = [collate(pairs[i : i + arguments.batch]) for i in range(0, len(pairs), arguments.batch or len(pairs) + 1)]
     if arguments.batch and device.type == "cuda":
         for run_one in methods.values():

@@ -8,9 +8,9 @@ import torch
 
 import fmtorch
 from fmtorch import presets
-from fmtorch.estimators import HypothesizeAndVerify, engine
-from fmtorch.estimators.parts import residuals_squared
-from fmtorch.estimators.problem import problems
+from fmtorch.estimators import HypothesizeAndVerify, solvers
+from fmtorch.estimators.inliers import residuals_squared_px
+from fmtorch.estimators.pairs import NormalizedPairs, normalized_pairs
 from fmtorch.types import collate
 from tests.laws import OTHER_LIBRARIES, quick, scene, scenes
 
@@ -48,7 +48,7 @@ def test_confidence_stops_early_and_null_never() -> None:
 def test_chunks_of_pairs_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     estimator = HypothesizeAndVerify(hypotheses=200)
     whole = estimator(scenes(), seed=3)
-    monkeypatch.setattr(engine, "CPU_SAMPLES", 1)
+    monkeypatch.setattr(solvers, "CPU_SAMPLES", 1)
     chunked = estimator(scenes(), seed=3)
     assert torch.equal(whole.F, chunked.F)
     assert torch.equal(whole.inliers, chunked.inliers)
@@ -102,7 +102,7 @@ def test_too_few_matches_have_a_reason() -> None:
     [
         ({"score": "psac"}, "score is 'psac'; it must be one of: inlier_count"),
         ({"solver": "five_point"}, "solver is 'five_point'"),
-        ({"hypotheses": 0}, "must be at least 1"),
+        ({"hypotheses": 0}, "hypotheses is 0; it must be at least 1"),
         ({"confidence": 1.5}, "a probability between 0 and 1"),
     ],
 )
@@ -134,18 +134,22 @@ def test_find_fundamental_names_what_is_wrong() -> None:
 
 
 def test_the_pool_is_refined_on_matches_near_one_of_its_models() -> None:
-    (problem,), _ = problems(scene(3, 400, outliers=0.5, noise=0.3), 0, 7)
-    F = HypothesizeAndVerify(pool=4)._search(problem).F
-    r = torch.stack([residuals_squared(f.T.reshape(1, 3, 3).double(), problem) for f in F.unbind(2)]).amin(0).sqrt()
-    refining = HypothesizeAndVerify(pool=4, refine="truncated", refine_threshold=1.5, refine_matches=150)
-    few = refining._near(F, problem)
-    assert few.count.tolist() == [150] == few.live.sum(1).tolist()
+    (pairs,), _ = normalized_pairs(scene(3, 400, outliers=0.5, noise=0.3), 0, 7)
+    pool = HypothesizeAndVerify(pool=4).search(pairs)
+    r2 = [residuals_squared_px(f.T.reshape(1, 3, 3).double(), pairs) for f in pool.F.unbind(2)]
+    r = torch.stack(r2).amin(0).sqrt()
+
+    def near(matches: int) -> NormalizedPairs:
+        refining = HypothesizeAndVerify(pool=4, refine={"kernel": "truncated", "scale": 1.5, "matches": matches})
+        found = refining.refine(pool, pairs).near
+        assert found is not None
+        return found
+
+    few, every = near(150), near(1000)
+    assert few.count.tolist() == [150] == few.mask.sum(1).tolist()
     assert len(set(few.slot[0].tolist())) == 150
-    assert (r[0, few.slot[0]] <= 6.0 + 1e-3).all()  # REACH times the threshold
+    assert (r[0, few.slot[0]] <= 6.0 + 1e-3).all()  # four times the scale
     places = few.slot.expand(4, -1, -1)
-    assert torch.equal(few.points, problem.points.gather(2, places))
-    every = HypothesizeAndVerify(pool=4, refine="truncated", refine_threshold=1.5, refine_matches=1000)._near(
-        F, problem
-    )
+    assert torch.equal(few.points, pairs.points.gather(2, places))
     assert every.count.tolist() == [int((r <= 6.0).sum())]
-    assert not every.points[:, ~every.live].any()
+    assert not every.points[:, ~every.mask].any()

@@ -11,9 +11,10 @@ import pytest
 import torch
 
 from fmtorch import find_fundamental, presets
-from fmtorch.estimators import degeneracy, final_fits, focal, support
+from fmtorch.estimators import degeneracy, final_fits, support
 from fmtorch.estimators.adapters import PEERS
-from fmtorch.estimators.local_optimization import GraphCut
+from fmtorch.estimators.focal import posterior
+from fmtorch.estimators.graph_cut import GraphCut
 from fmtorch.estimators.support import lack_of_support
 from fmtorch.types import Correspondences, Estimate, collate
 from tests.laws import OTHER_LIBRARIES, few, quick, scene, small
@@ -21,8 +22,9 @@ from tests.laws import OTHER_LIBRARIES, few, quick, scene, small
 EVERY = presets.available("estimator")
 OWN = [name for name in EVERY if not name.startswith(OTHER_LIBRARIES)]
 PIXELS = [  # what is a distance in pixels and no option
-    (final_fits, "SMALLEST"), (final_fits, "LARGEST"), (final_fits, "UNKNOWN"), (degeneracy, "PLANE_THRESHOLD"),
-    (focal, "SIGMA"), (focal, "SCALE"), (focal, "PARALLEL"), (GraphCut, "RADIUS"),
+    (final_fits, "MIN_TRUNCATION_PX"), (final_fits, "MAX_TRUNCATION_PX"), (final_fits, "DEFAULT_TRUNCATION_PX"),
+    (degeneracy, "PLANE_THRESHOLD_PX"), (posterior, "INLIER_SIGMA_PX"), (posterior, "LOSS_SCALE_PX"),
+    (posterior, "PARALLEL_PX"), (GraphCut, "RADIUS_PX"),
 ]  # fmt: skip
 
 
@@ -77,7 +79,8 @@ def test_the_default_has_no_support_at_thresholds_far_below_rounding() -> None:
 def scaled(config: Mapping[str, Any], scale: float) -> dict[str, Any]:
     """The thresholds within a preset, times `scale`."""
     levels = {key: scaled(value, scale) for key, value in config.items() if isinstance(value, Mapping)}
-    own = {k: v * scale for k, v in config.items() if k.endswith("threshold") and isinstance(v, int | float)}
+    pixels = ("threshold", "inlier_threshold", "scale")
+    own = {k: v * scale for k, v in config.items() if k in pixels and v is not None}
     return {**levels, **own}
 
 

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from fmtorch.geometry.homography import (
-    four_point_components,
     least_squares_homography,
     plane_and_parallax,
     plane_homography,
@@ -38,26 +37,6 @@ def _pairs(points: torch.Tensor, i: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _skew(e: np.ndarray) -> np.ndarray:
     return np.array([[0, -e[2], e[1]], [e[2], 0, -e[0]], [-e[1], e[0], 0]])
-
-
-def test_four_points() -> None:
-    points, _ = _planar(4, noise=0.1)
-    H, valid = four_point_components(points.transpose(1, 2).contiguous())
-    assert bool(valid.all())
-    for i in range(BATCH):
-        # 1e-16 times the condition of eight equations, which is below 1e4 for all but a few random samples.
-        np.testing.assert_allclose(_matrix(H[:, i]), reference.dlt(*_pairs(points, i)), atol=1e-10)
-
-
-def test_three_points_on_a_line_or_equal_ones_are_no_sample() -> None:
-    points, _ = _planar(4)
-    line = points.transpose(1, 2).contiguous()
-    line[:, :3] = torch.tensor([0.0, 1.0, 0.5])[None, :, None] * torch.tensor([1.0, 0.0, 0.5, 0.25])[:, None, None]
-    assert not bool(four_point_components(line)[1].any())
-    equal = points.transpose(1, 2).contiguous()
-    equal[:, 3] = equal[:, 0]
-    equal[0, 1, 0] = torch.nan
-    assert not bool(four_point_components(equal)[1].any())
 
 
 def test_least_squares() -> None:
@@ -122,7 +101,6 @@ def test_neighbours_are_invisible(position: int) -> None:
     one = slice(position, position + 1)
     models = torch.from_numpy(H).flatten(1).T.contiguous()
     e1 = torch.randn(3, BATCH, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
-    assert torch.equal(four_point_components(samples)[0][:, one], four_point_components(samples[..., one])[0])
     triplet, pair = samples[:, :3].contiguous(), samples[:, :2].contiguous()
     whole = plane_homography(models, e1, triplet)[0][:, one]
     assert torch.equal(whole, plane_homography(models[:, one], e1[:, one], triplet[..., one])[0])

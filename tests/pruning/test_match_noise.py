@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from fmtorch import find_fundamental, metrics, presets
-from fmtorch.estimators import scoring
+from fmtorch.estimators import scores
 from fmtorch.geometry import sampson, sampson_objective
 from fmtorch.geometry.refine import refine_components
 from fmtorch.pruning import match_noise
@@ -112,7 +112,7 @@ def test_tiles_change_nothing(name: str, monkeypatch: pytest.MonkeyPatch) -> Non
     whole = estimator(c, 5)
     assert not torch.equal(whole.F, estimator(c.replace(noise=None), 5).F)
     for module, constant, value in (
-        (scoring, "CPU_TILE", 1000), (sampson_objective, "TILE_ELEMENTS", 1), (sampson_objective, "TILE_MODELS", 3),
+        (scores, "CPU_TILE", 1000), (sampson_objective, "TILE_ELEMENTS", 1), (sampson_objective, "TILE_MODELS", 3),
     ):  # fmt: skip
         monkeypatch.setattr(module, constant, value)
     assert torch.equal(whole.F, estimator(c, 5).F)

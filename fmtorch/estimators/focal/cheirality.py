@@ -6,8 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.estimators.scoring import exact_sum
-from fmtorch.geometry.reduce import component_sum
+from fmtorch.geometry.arithmetic import determinant, exact_sum
 
 
 def share_in_front(
@@ -36,7 +35,7 @@ def share_in_front(
         for M, f, x, y in ((V, depth[0], x0, y0), (U, depth[1], x1, y1))
     )
     a, b = a1 * a1 + a2 * a2, b1 * b1 + b2 * b2
-    handed = torch.where((_determinant(U) > 0) == (_determinant(V) > 0), 1.0, -1.0).to(a3)[..., None]
+    handed = torch.where((determinant(U) > 0) == (determinant(V) > 0), 1.0, -1.0).to(a3)[..., None]
     side = a1 * b2 - a2 * b1
     distance = b3 * side.abs() - handed * a3 * b
     # |b x r| is |distance| / sqrt(b), and the sine of the angle between the rays that over |b| |r|.
@@ -45,7 +44,3 @@ def share_in_front(
     fronts = torch.stack([exact_sum(torch.where(s > 0, x, 0)) for s in (side, -side) for x in (ahead, behind)])
     share: Tensor = fronts.amax(0) / exact_sum(support.clone())  # which is rounded in place
     return share
-
-
-def _determinant(M: Float[Tensor, "3 3 p k"]) -> Float[Tensor, "p k"]:
-    return component_sum(M[0] * torch.linalg.cross(M[1], M[2], dim=0))

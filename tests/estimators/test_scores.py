@@ -7,19 +7,19 @@ import pytest
 import torch
 from scipy import integrate
 
-from fmtorch.estimators import scoring
-from fmtorch.estimators.problem import problems
-from fmtorch.estimators.scoring import (
+from fmtorch.estimators import scores
+from fmtorch.estimators.pairs import normalized_pairs
+from fmtorch.estimators.saturated_gains import GRID, SaturatedGains
+from fmtorch.estimators.scores import (
     GEMAN_MCCLURE_REACH,
-    GRID,
     GemanMcClure,
     InlierCount,
     Median,
-    SaturatedGains,
     SigmaConsensus,
     TruncatedSquares,
     score_models,
 )
+from fmtorch.geometry.arithmetic import exact_sum
 from fmtorch.geometry.sigma_consensus import QUANTILE
 from tests.laws import scene
 from tests.reference import ransac as reference
@@ -46,23 +46,23 @@ NAMES = [
 ]
 
 
-def _models(problem: object, count: int = 40) -> torch.Tensor:
+def _models(pairs: object, count: int = 40) -> torch.Tensor:
     return (
         torch.randn(9, 1, count, generator=torch.Generator().manual_seed(0)) * torch.logspace(-2, 0, 9)[:, None, None]
     )
 
 
 @pytest.mark.parametrize("score", SCORES, ids=NAMES)
-def test_scores_equal_their_definitions(score: scoring.Score) -> None:
-    problem = problems(scene(0, 60), 0, 8)[0][0]
-    F = _models(problem)
-    batched = score_models(score, F, problem, problem.points.float())[0].numpy()
-    points = problem.points[:, 0, :60].float().double().numpy()
-    prior = problem.prior[0, :60].numpy() if problem.prior is not None else None
+def test_scores_equal_their_definitions(score: scores.Score) -> None:
+    pairs = normalized_pairs(scene(0, 60), 0, 8)[0][0]
+    F = _models(pairs)
+    batched = score_models(score, F, pairs)[0].numpy()
+    points = pairs.points[:, 0, :60].float().double().numpy()
+    prior = pairs.prior[0, :60].numpy() if pairs.prior is not None else None
     for m in range(F.shape[2]):
         model = F[:, 0, m].double().numpy().reshape(3, 3)
         residual = np.array([reference.sampson(model, points[:2, n], points[2:, n]) for n in range(60)])
-        pixels = residual * float(problem.unit[0])
+        pixels = residual * float(pairs.pixels_per_unit[0])
         if isinstance(score, InlierCount):
             border = np.abs(pixels - 2.0) < 1e-3  # float32 residuals this close to the threshold may fall either way
             assert abs(batched[m] - (pixels <= 2.0).sum()) <= border.sum()
@@ -72,7 +72,7 @@ def test_scores_equal_their_definitions(score: scoring.Score) -> None:
         elif isinstance(score, SaturatedGains):
             weights = prior if score.prior_weighted and prior is not None else np.ones(60)
             expected = reference.saturated(pixels, points, 2.0, GEMAN_MCCLURE_REACH, GRID, weights)
-            double = score_models(score, F[..., m : m + 1].double(), problem, problem.points)
+            double = score_models(score, F[..., m : m + 1].double(), pairs)
             # A gain just below half a rounding step counts nothing, and its root is missed: 2^-10.5, 2^-5.5 in float32.
             assert abs(float(double) - expected) <= 2.0**-10.5
             assert abs(batched[m] - expected) <= 2.0**-5.5
@@ -88,19 +88,19 @@ def test_scores_equal_their_definitions(score: scoring.Score) -> None:
 
 @pytest.mark.parametrize("score", SCORES, ids=NAMES)
 @pytest.mark.parametrize("tile", [1, 200, 5000, 1 << 20])
-def test_tiles_change_no_score(score: scoring.Score, tile: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    problem = problems(scene(0, 300), 0, 8)[0][0]
-    F = _models(problem)
-    whole = score_models(score, F, problem, problem.points.float())
-    monkeypatch.setattr(scoring, "CPU_TILE", tile)
-    assert torch.equal(score_models(score, F, problem, problem.points.float()), whole)
+def test_tiles_change_no_score(score: scores.Score, tile: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    pairs = normalized_pairs(scene(0, 300), 0, 8)[0][0]
+    F = _models(pairs)
+    whole = score_models(score, F, pairs)
+    monkeypatch.setattr(scores, "CPU_TILE", tile)
+    assert torch.equal(score_models(score, F, pairs), whole)
 
 
 def test_exact_sum_does_not_depend_on_the_order() -> None:
     gain = torch.rand(1, 3, 20000, generator=torch.Generator().manual_seed(0))
     shuffled = gain[..., torch.randperm(20000, generator=torch.Generator().manual_seed(1))]
-    assert torch.equal(scoring.exact_sum(gain.clone()), scoring.exact_sum(shuffled.clone()))
-    np.testing.assert_allclose(scoring.exact_sum(gain.clone()).numpy(), gain.double().sum(-1).numpy(), rtol=1e-3)
+    assert torch.equal(exact_sum(gain.clone()), exact_sum(shuffled.clone()))
+    np.testing.assert_allclose(exact_sum(gain.clone()).numpy(), gain.double().sum(-1).numpy(), rtol=1e-3)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -145,9 +145,9 @@ def test_sigma_consensus_is_the_integral_over_sigma() -> None:
 
 
 def test_models_that_are_none_score_minus_infinity_and_change_no_other() -> None:
-    problem = problems(scene(0, 300), 0, 8)[0][0]
-    F = _models(problem)
+    pairs = normalized_pairs(scene(0, 300), 0, 8)[0][0]
+    F = _models(pairs)
     valid = torch.arange(40)[None] < 25
-    scores = score_models(TruncatedSquares(2.0), F, problem, problem.points.float(), valid=valid)
-    whole = score_models(TruncatedSquares(2.0), F, problem, problem.points.float())
+    scores = score_models(TruncatedSquares(2.0), F, pairs, valid=valid)
+    whole = score_models(TruncatedSquares(2.0), F, pairs)
     assert torch.equal(scores, torch.where(valid, whole, -torch.inf))

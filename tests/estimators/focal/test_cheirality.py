@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from fmtorch.estimators.cheirality import share_in_front
+from fmtorch.estimators.focal.cheirality import share_in_front
 from tests.reference import cheirality as reference
 
 

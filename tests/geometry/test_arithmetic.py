@@ -3,7 +3,23 @@ from __future__ import annotations
 import pytest
 import torch
 
-from fmtorch.geometry.reduce import SMALL, component_sum, matmul3, outer_sum, stable_sum
+from fmtorch.geometry.arithmetic import (
+    SMALL,
+    as_components,
+    as_matrices,
+    as_rows,
+    cofactors,
+    component_sum,
+    cross,
+    determinant,
+    exponential,
+    logarithm,
+    matmul3,
+    outer_sum,
+    product,
+    stable_sum,
+    unit,
+)
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 7, 8, 9, 100, 760, 1000])
@@ -53,3 +69,24 @@ def test_outer_sum():
     a, b = (torch.randint(-9, 9, (5, n, 20), generator=generator).double() for n in (3, 4))
     expected = torch.einsum("kis,kjs->ijs", a, b)
     assert torch.equal(outer_sum(a[:, :, None], b[:, None]), expected)  # integers: exact
+
+
+def test_exponential_and_logarithm() -> None:
+    x = torch.linspace(-3, 3, 601, dtype=torch.float64)
+    # Eight squarings multiply the rounding error of one by 256; the logarithm inherits it.
+    assert float((exponential(x) / x.exp() - 1).abs().max()) < 512 * 2**-52
+    assert float((logarithm(x.exp()) - x).abs().max()) < 512 * 2**-52
+
+
+def test_small_matrices_as_by_numpy() -> None:
+    generator = torch.Generator().manual_seed(0)
+    A, B = torch.randn(2, 4, 5, 3, 3, generator=generator, dtype=torch.float64).unbind(0)
+    a, b = (as_rows(as_components(M)) for M in (A, B))
+    # Some additions of products of numbers of about 1: a few eps of absolute error.
+    tight = {"rtol": 0, "atol": 1e-13}
+    torch.testing.assert_close(as_matrices(product(a, b).flatten(0, 1)), A @ B, **tight)
+    torch.testing.assert_close(determinant(a), torch.linalg.det(A), **tight)
+    expected = torch.linalg.det(A)[..., None, None] * torch.linalg.inv(A).mT
+    torch.testing.assert_close(as_matrices(cofactors(a).flatten(0, 1)), expected, rtol=1e-11, atol=1e-11)
+    torch.testing.assert_close(cross(a[0], b[0]).movedim(0, -1), torch.cross(A[..., 0, :], B[..., 0, :], -1), **tight)
+    torch.testing.assert_close(unit(a.flatten(0, 1)).square().sum(0), torch.ones(4, 5, dtype=torch.float64), **tight)

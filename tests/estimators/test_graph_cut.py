@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from fmtorch.estimators import HypothesizeAndVerify
-from fmtorch.estimators.local_optimization import GraphCut
-from fmtorch.estimators.problem import Problem, problems
-from fmtorch.estimators.scoring import TruncatedSquares, sampson_squared, score_models
+from fmtorch.estimators.graph_cut import GraphCut
+from fmtorch.estimators.pairs import NormalizedPairs, normalized_pairs
+from fmtorch.estimators.scores import TruncatedSquares, score_models
 from fmtorch.estimators.spatial import (
     NeighborGraph,
     energy,
@@ -20,6 +20,7 @@ from fmtorch.estimators.spatial import (
     neighbor_graph,
     spatially_coherent_inliers,
 )
+from fmtorch.geometry.residuals import sampson_squared
 from fmtorch.types import Correspondences, collate
 from tests.conftest import oracle
 from tests.laws import scene
@@ -28,8 +29,8 @@ from tests.reference import graph_cut
 RADIUS = 20.0
 
 
-def _problem(c: Correspondences) -> Problem:
-    return problems(c, 0, 7)[0][0]
+def _problem(c: Correspondences) -> NormalizedPairs:
+    return normalized_pairs(c, 0, 7)[0][0]
 
 
 def _edges(graph: NeighborGraph, n: int, pair: int = 0) -> list[tuple[int, int]]:
@@ -44,7 +45,7 @@ def _random_graph(n: int, edges: list[tuple[int, int]]) -> NeighborGraph:
     return NeighborGraph(head, tail, torch.bincount(head, minlength=n)[None].to(torch.float32))
 
 
-def _real() -> list[tuple[Problem, Tensor, str]]:
+def _real() -> list[tuple[NormalizedPairs, Tensor, str]]:
     """Real matches with squared residuals, px^2, under models from a robust estimator (OpenCV's USAC_MAGSAC)."""
     arrays = oracle("robust.npz")
     found = []
@@ -52,7 +53,7 @@ def _real() -> list[tuple[Problem, Tensor, str]]:
         x0, x1 = (torch.from_numpy(arrays[f"{i:03d}.{name}"])[None] for name in ("X1", "X2"))
         problem = _problem(Correspondences(x0, x1, torch.ones(x0.shape[:2], dtype=torch.bool)))
         F = torch.from_numpy(arrays[f"{i:03d}.cv2_USAC_MAGSAC.F"][0]).reshape(9, 1, 1)
-        pixels = torch.where(problem.live, problem.points * problem.unit + problem.centre.T[..., None], 0)
+        pixels = torch.where(problem.mask, problem.points * problem.pixels_per_unit + problem.centre.T[..., None], 0)
         found.append((problem, sampson_squared(F, pixels), str(arrays["names"][i])))
     return found
 
@@ -96,10 +97,10 @@ def test_labels_are_almost_those_of_the_exact_cut_on_real_pairs(epsilon: float, 
     for problem, r2, name in _real():
         graph = neighbor_graph(problem, RADIUS)
         n = int(problem.count)
-        edges = _edges(graph, problem.live.shape[1])
+        edges = _edges(graph, problem.mask.shape[1])
         kernel = gaussian_kernel(r2 / epsilon**2)
-        labels = spatially_coherent_inliers(kernel, problem.live, graph, coherence)
-        inner, outer = fixed_points(field(kernel, problem.live, graph, coherence), graph, coherence)
+        labels = spatially_coherent_inliers(kernel, problem.mask, graph, coherence)
+        inner, outer = fixed_points(field(kernel, problem.mask, graph, coherence), graph, coherence)
         K, found = kernel[0, 0, :n].double().numpy(), labels[0, 0, :n].numpy()
         cut = graph_cut.least_cut(K, edges, coherence).astype(bool)
         least = graph_cut.energy(cut, K, edges, coherence)
@@ -116,12 +117,12 @@ def test_labels_are_almost_those_of_the_exact_cut_on_real_pairs(epsilon: float, 
 def test_neighbors_are_within_the_radius_and_nearly_all_of_those() -> None:
     found = there = 0
     for problem, _, _ in _real():
-        n = problem.live.shape[1]
+        n = problem.mask.shape[1]
         graph = neighbor_graph(problem, RADIUS)
         edges = _edges(graph, n)
         assert 2 * len(edges) == len(graph.head)
         assert len(set(edges)) == len(edges)
-        points = (problem.points * problem.unit)[:, 0].T[: int(problem.count)]
+        points = (problem.points * problem.pixels_per_unit)[:, 0].T[: int(problem.count)]
         distance = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist")
         assert all(float(distance[p, q]) <= RADIUS * (1 + 1e-12) for p, q in edges)
         found += len(edges)
@@ -141,17 +142,16 @@ def test_local_optimization_never_lowers_a_score_and_raises_most() -> None:
     problem = _problem(pairs)
     rng = np.random.default_rng(0)
     score = TruncatedSquares(1.0)
-    points = problem.points.to(torch.float32)
     sample = torch.from_numpy(rng.standard_normal((9, 4, 6)))  # nonsense, which must not get worse either
     models = HypothesizeAndVerify(hypotheses=200, final="none")(pairs).F
     A = torch.zeros(2, 4, 3, 3, dtype=torch.float64)
     for image, T in enumerate(A):
-        T[:, 0, 0] = T[:, 1, 1] = problem.unit
+        T[:, 0, 0] = T[:, 1, 1] = problem.pixels_per_unit
         T[:, :2, 2] = problem.centre[:, 2 * image : 2 * image + 2]
         T[:, 2, 2] = 1
     sample[:, :, 0] = (A[1].mT @ models @ A[0]).flatten(1).T
     improved = GraphCut(1.0, score)(sample, problem)
-    before, after = (score_models(score, F.to(torch.float32), problem, points) for F in (sample, improved))
+    before, after = (score_models(score, F.to(torch.float32), problem) for F in (sample, improved))
     assert bool((after >= before).all())
     assert bool((after[:, 0] > before[:, 0]).all())
 

@@ -1,0 +1,132 @@
+"""Options of the engine's stages, as configs write them: a mapping for each stage, null to leave the stage out."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+from fmtorch.estimators.registry import takes
+from fmtorch.geometry.robust_kernels import named_kernel
+
+Group = TypeVar("Group")
+
+DEFAULT_THRESHOLD_PX = 1.0
+
+
+def _at_least(least: int, **values: int) -> None:
+    for name, value in values.items():
+        if not value >= least:
+            raise ValueError(f"{name} is {value}; it must be at least {least}")
+
+
+def _positive(**values: float) -> None:
+    for name, value in values.items():
+        if not value > 0:
+            raise ValueError(f"{name} is {value}; it must be positive")
+
+
+@dataclasses.dataclass(frozen=True)
+class Preselect:
+    """A first look at the models of a round. matches: looked at. survivors: models that are scored on all matches."""
+
+    matches: int = 128
+    survivors: int = 256
+
+    def __post_init__(self) -> None:
+        _at_least(1, **{"preselect.matches": self.matches, "preselect.survivors": self.survivors})
+
+
+@dataclasses.dataclass(frozen=True)
+class Refine:
+    """Levenberg-Marquardt of the robust Sampson error, from each model of the pool.
+
+    kernel: a name of `geometry.KERNELS`. scale: its scale, Sampson distance, px. iterations: steps. matches: at most so
+    many are looked at, drawn by the pair's key from those within RADIUS scales of a model of the pool; None: all.
+    """
+
+    kernel: str
+    scale: float = 1.0
+    iterations: int = 5
+    matches: int | None = None
+
+    RADIUS = 4.0  # scales: a match farther from all models of the pool is not looked at again
+
+    def __post_init__(self) -> None:
+        named_kernel(self.kernel)
+        _positive(**{"refine.scale": self.scale})
+        _at_least(0, **{"refine.iterations": self.iterations})
+        if self.matches is not None:
+            _at_least(1, **{"refine.matches": self.matches})
+
+
+@dataclasses.dataclass(frozen=True)
+class Select:
+    """Which refined model is the estimate: that of the largest score.
+
+    score: a name of the registry, or a score. scale: of it, Sampson distance, px.
+    """
+
+    score: Any = "saturated"
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        _positive(**{"select.scale": self.scale})
+
+
+@dataclasses.dataclass(frozen=True)
+class Focal:
+    """The prior on focal lengths, for whole photographs of known size.
+
+    samples: of five matches, with focal lengths drawn from the prior; 0: none, the prior only selects. pool: the best
+    of their models, which are refined with the prior. candidates: models of the other search that are, too.
+    iterations: steps of that refinement.
+    """
+
+    samples: int = 250
+    pool: int = 12
+    candidates: int = 12
+    iterations: int = 12
+
+    def __post_init__(self) -> None:
+        _at_least(0, **{"focal.samples": self.samples, "focal.iterations": self.iterations})
+        _at_least(1, **{"focal.pool": self.pool, "focal.candidates": self.candidates})
+
+
+def at_least_one(**values: int) -> None:
+    """Raise ValueError for a number below one."""
+    _at_least(1, **values)
+
+
+def group(name: str, value: object, kind: type[Group]) -> Group | None:
+    """The options of a stage from a mapping, or as they are; ValueError for an unknown one, naming those there are."""
+    if value is None or isinstance(value, kind):
+        return value
+    known = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{name} is {value!r}; it must be null or a mapping of: {', '.join(known)}")
+    unknown = [key for key in value if key not in known]
+    if unknown:
+        raise ValueError(f"{name}: no option {', '.join(map(str, unknown))}; there are: {', '.join(known)}")
+    missing = [key for key, f in known.items() if f.default is dataclasses.MISSING and key not in value]
+    if missing:
+        raise ValueError(f"{name}: {', '.join(missing)} is missing; the options are: {', '.join(known)}")
+    return kind(**value)
+
+
+def thresholds(
+    threshold: float | None, inlier_threshold: float | None, score: Any, inliers: Any, stops: bool, optimization: Any
+) -> tuple[float, float]:
+    """The thresholds of score and of inliers, px; ValueError where one is given that nothing asks for.
+
+    score, inliers, optimization: as options name these parts. stops: whether there is a stopping rule, which counts
+    inliers.
+    """
+    by_distance = stops or takes("inliers", inliers, "threshold")
+    if inlier_threshold is not None and not by_distance:
+        raise ValueError(f"inlier_threshold={inlier_threshold} has no effect: inliers={inliers} takes none")
+    scored = takes("score", score, "threshold") or optimization is not None
+    if threshold is not None and not scored and (not by_distance or inlier_threshold is not None):
+        raise ValueError(f"threshold={threshold} has no effect: score={score} takes none, nor does anything else")
+    of_score = DEFAULT_THRESHOLD_PX if threshold is None else threshold
+    return of_score, of_score if inlier_threshold is None else inlier_threshold

@@ -1,0 +1,153 @@
+"""Arithmetic whose last bit depends on the values alone: not on padding, on the batch, or on memory layout.
+
+Library reductions (`sum`, `matmul`, LAPACK) choose their order of summation by shape and alignment, and functions like
+`exp` differ between the body and the tail of a vector. Here each order is fixed, and made of element-wise operations
+only, which are rounded correctly one by one.
+
+Matrices come in two layouts: with the entries last, (*batch, 3, 3), as users have them, and component-first, (3, 3, *s)
+or (9, *s) row by row, over which an operation on one entry runs over all matrices at once.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def stable_sum(x: Tensor, dim: int = -1) -> Tensor:
+    """The sum over `dim` in a balanced binary tree that trailing zeros do not change.
+
+    With h the largest power of two below n, element i is added to element i + h, then h is halved: the tree over the
+    length rounded up to a power of two, in which absent elements are zeros. Padding with zeros, however long, leaves
+    every bit as it is. The rounding error grows with log2(n).
+    """
+    dim = dim % x.dim()
+    n = x.shape[dim]
+    if n == 0:
+        return x.sum(dim)
+    while n > 1:
+        half = 1 << ((n - 1).bit_length() - 1)
+        upper = x.narrow(dim, half, n - half)
+        folded = x.narrow(dim, 0, n - half) + upper
+        x = folded if n == 2 * half else torch.cat([folded, x.narrow(dim, n - half, 2 * half - n)], dim)
+        n = half
+    return x.squeeze(dim)
+
+
+SMALL = 1 << 13  # elements up to which a cumulative sum takes less time than one addition after the other
+
+
+def component_sum(x: Tensor, dim: int = 0) -> Tensor:
+    """The sum over a short axis of fixed length, in order; of float64 numbers of any layout the same bits.
+
+    Small tensors are summed by a cumulative sum, which is sequential by definition: one call instead of many.
+    """
+    if x.numel() <= SMALL and x.dtype == torch.float64 and not x.is_cuda and not x.requires_grad:
+        return x.cumsum(dim).select(dim, -1)
+    first, *rest = x.unbind(dim)
+    first = first + 0.0  # -0 becomes 0, as in a cumulative sum
+    for part in rest:
+        first = first + part
+    return first
+
+
+def outer_sum(a: Float[Tensor, " k *s"], b: Float[Tensor, " k *t"]) -> Tensor:
+    """The sum over k, in order, of the products of a[k] and b[k], which broadcast; without the temporaries of a sum."""
+    total: Tensor = a[0] * b[0]
+    for one, other in zip(a[1:].unbind(0), b[1:].unbind(0), strict=True):
+        total = torch.addcmul(total, one, other)
+    return total
+
+
+def exact_sum(gain: Float[Tensor, "p m n"]) -> Float[Tensor, "p m"]:
+    """Sum over matches of gains in [0, 1], each first rounded, in place, so that the sum is exact."""
+    return rounded_to(gain, fractional_bits(gain.shape[-1], gain.dtype)).sum(-1)
+
+
+def fractional_bits(count: int, dtype: torch.dtype) -> int:
+    """Of so many numbers in [0, 1], for their sums to be exact: 10 (fewer beyond 2^14 numbers), 20 in float64."""
+    return 20 if dtype == torch.float64 else min(10, 24 - (count - 1).bit_length())
+
+
+def rounded_to(value: Tensor, bits: int) -> Tensor:
+    """Rounded to so many fractional bits b, in place: 1.5 * 2^(23 - b) is added to a float32 and subtracted again."""
+    magic = 1.5 * 2.0 ** ((52 if value.dtype == torch.float64 else 23) - bits)
+    return value.add_(magic).sub_(magic)
+
+
+def matmul3(a: Float[Tensor, "*batch 3 3"], b: Float[Tensor, "*batch2 3 3"]) -> Float[Tensor, "*batch3 3 3"]:
+    """The product of 3 x 3 matrices, batched, in a fixed order of summation."""
+    return a[..., :, 0:1] * b[..., 0:1, :] + a[..., :, 1:2] * b[..., 1:2, :] + a[..., :, 2:3] * b[..., 2:3, :]
+
+
+def as_rows(F: Float[Tensor, " 9 *s"]) -> Float[Tensor, " 3 3 *s"]:
+    """Component-first entries as rows and columns."""
+    return F.reshape(3, 3, *F.shape[1:])
+
+
+def as_matrices(F: Float[Tensor, "9 p k"]) -> Float[Tensor, "p k 3 3"]:
+    """Component-first entries as matrices."""
+    return F.permute(1, 2, 0).reshape(*F.shape[1:], 3, 3)
+
+
+def as_components(F: Float[Tensor, "p k 3 3"]) -> Float[Tensor, "9 p k"]:
+    """Matrices as component-first entries."""
+    return F.flatten(2).permute(2, 0, 1).contiguous()
+
+
+def product(A: Float[Tensor, " 3 3 *s"], B: Float[Tensor, " 3 3 *s"]) -> Float[Tensor, " 3 3 *s"]:
+    """``A B`` of component-first matrices."""
+    return component_sum(A[:, :, None] * B[None], 1)
+
+
+def cross(a: Float[Tensor, " 3 *s"], b: Float[Tensor, " 3 *s"]) -> Float[Tensor, " 3 *s"]:
+    """The cross product of component-first vectors."""
+    crossed: Tensor = torch.linalg.cross(a, b, dim=0)
+    return crossed
+
+
+def cofactors(A: Float[Tensor, " 3 3 *s"]) -> Float[Tensor, " 3 3 *s"]:
+    """The matrix of cofactors, ``det(A) A^-T`` where A is regular: row i is the cross product of the other two."""
+    crossed: Tensor = torch.linalg.cross(A.roll(-1, 0), A.roll(-2, 0), dim=1)
+    return crossed
+
+
+def determinant(A: Float[Tensor, " 3 3 *s"]) -> Float[Tensor, "*s"]:
+    """The determinant of component-first matrices."""
+    return component_sum(A[0] * cross(A[1], A[2]))
+
+
+def unit(x: Float[Tensor, " c *s"]) -> Float[Tensor, " c *s"]:
+    """Scaled to unit norm over the components; NaN where that is not possible."""
+    norm: Tensor = component_sum(x * x).sqrt()
+    return x / norm
+
+
+def exponential(x: Tensor) -> Tensor:
+    """exp(x) for |x| up to about 5 by arithmetic alone: library functions differ in the last bit with memory layout.
+
+    Pade's approximant of order 4 at x / 32, to rounding there, and five squarings.
+    """
+    y = x / 32
+    y2 = y * y
+    even, odd = 1680 + y2 * (180 + y2), y * (840 + 20 * y2)
+    value = (even + odd) / (even - odd)
+    for _ in range(5):
+        value = value * value
+    return value
+
+
+def logarithm(x: Tensor) -> Tensor:
+    """ln(x) of positive numbers, to rounding, by arithmetic alone: the series of atanh at the mantissa."""
+    mantissa, exponent = torch.frexp(x)
+    m = mantissa * math.sqrt(2)
+    z = (m - 1) / (m + 1)
+    z2 = z * z
+    series = torch.full_like(z, 1 / 19)
+    for k in range(17, 0, -2):
+        series = series * z2 + 1 / k
+    value: Tensor = 2 * z * series + (exponent.to(x.dtype) - 0.5) * math.log(2)
+    return value

@@ -1,0 +1,226 @@
+"""Do two checkouts compute the same estimates, to the bit? Run on one machine, before and after a change.
+
+    python scripts/compare_estimates.py BEFORE [AFTER] [--quick] [--presets ransac fmtorch] [--matches robust.npz]
+
+BEFORE and AFTER are checkouts, or files written with --save; AFTER is this checkout by default. Every estimator preset
+of the project runs on the same pairs in a process of each checkout: synthetic scenes with and without prior, noise,
+image sizes; pairs that are degenerate; and, with --matches, real ones. Compared are F, inliers, ok, reasons, draws,
+the models before the final fit, and gradients, besides public functions of `fmtorch.geometry`.
+Exit status 1 where anything differs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+HERE = Path(__file__).resolve().parents[1]
+OWN = ("HypothesizeAndVerify", "IterativelyReweighted", "CoarseToFine")
+QUICK_MATCHES, MATCHES = 400, 1000  # of a real pair, at most
+FIELDS = ("x0", "x1", "mask", "quality", "prior", "noise", "size0", "size1", "key", "lafs0", "lafs1")
+
+
+def inputs(quick: bool, matches: Path | None) -> dict[str, dict[str, torch.Tensor]]:
+    """Batches of pairs as plain tensors, by name, so that both checkouts read the same."""
+    sys.path.insert(0, str(HERE))
+    from fmtorch.types import collate
+    from tests.laws import degenerate, scene, small
+
+    rng = np.random.default_rng(0)
+
+    def noise(c: Any) -> torch.Tensor:
+        return torch.from_numpy(np.exp(rng.normal(0, 0.5, tuple(c.mask.shape))).astype(np.float32))
+
+    scenes = collate([scene(i, n) for i, n in enumerate((150, 40, 333) if quick else (150, 40, 333, 90, 150, 700))])
+    hard = collate([scene(20 + i, 260, outliers=0.7, noise=0.6) for i in range(2 if quick else 6)])
+    other = torch.tensor([[700, 900]]).expand(len(scenes), 2)
+    found = {
+        "scenes": scenes.replace(noise=noise(scenes)),
+        "no prior, no sizes": scenes.replace(prior=None, size0=None, size1=None),
+        "two sizes": hard.replace(size1=other[:1].expand(len(hard), 2)),
+    }
+    if not quick:
+        found |= {
+            "hard": hard,
+            "two sizes, noise, no prior": scenes.replace(size1=other, noise=noise(scenes), prior=None),
+            "no quality": scenes.replace(quality=None),
+        }
+    kinds = [*degenerate().values(), *small().values()]
+    found["degenerate"] = collate(kinds[::4] if quick else kinds)
+    if matches is not None:
+        arrays = np.load(matches)
+        names = range(0, len(arrays["names"]), 8 if quick else 1)
+        found |= {f"real {i}": real(arrays, i, QUICK_MATCHES if quick else MATCHES) for i in names}
+    return {
+        name: {f: v.clone() for f in FIELDS if isinstance(v := getattr(c, f), torch.Tensor)}
+        for name, c in found.items()
+    }
+
+
+def real(arrays: Any, i: int, most: int) -> Any:
+    from fmtorch import presets
+    from fmtorch.types import Correspondences
+
+    x0, x1 = (torch.from_numpy(arrays[f"{i:03d}.{x}"][:most].astype(np.float32))[None] for x in ("X1", "X2"))
+    size0, size1 = (torch.from_numpy(arrays[f"{i:03d}.{s}"].astype(np.int64))[None] for s in ("size1", "size2"))
+    quality = torch.from_numpy(np.random.default_rng(i).uniform(0.3, 0.95, x0.shape[:2]).astype(np.float32))
+    c = Correspondences(x0, x1, torch.ones(x0.shape[:2], dtype=torch.bool), quality, size0=size0, size1=size1)
+    return presets.build("pruner", "position_consistency")(c.replace(key=torch.tensor([i + 1])))
+
+
+def dump(pairs: Path, out: Path, presets_: list[str], quick: bool) -> None:
+    """What this process's fmtorch computes of the pairs."""
+    from fmtorch import presets
+    from fmtorch.types import Correspondences
+
+    torch.set_num_threads(1)
+    batches = {name: Correspondences(**fields) for name, fields in torch.load(pairs).items()}
+    own = [n for n in presets.available("estimator") if str(presets.load("estimator", n)["_target_"]).endswith(OWN)]
+    found: dict[str, torch.Tensor] = geometry()
+    for name in presets_ or own:
+        estimator = presets.build("estimator", name)
+        config = presets.load("estimator", name)
+        unfitted = {"fine": {"final": "none"}} if "fine" in config else {"final": "none"} if "final" in config else None
+        for label, c in batches.items():
+            for seed in range(1 if quick else 3):
+                what = f"{name} | {label} | seed {seed} |"
+                found |= told(what, estimator(c, seed))
+            if label == "scenes":
+                found |= gradients(f"{name} | {label} |", estimator, c)
+                if unfitted is not None:
+                    plain = presets.build("estimator", name, **unfitted)(c, 0)
+                    found[f"{name} | {label} | before the final fit"] = plain.F
+    torch.save(found, out)
+
+
+def told(what: str, estimate: Any) -> dict[str, torch.Tensor]:
+    reasons = torch.frombuffer(bytearray("\n".join(estimate.reason).encode() + b"\n"), dtype=torch.uint8).clone()
+    values = {f: getattr(estimate, f) for f in ("F", "inliers", "ok", "draws")}
+    return {f"{what} {f}": v for f, v in {**values, "reasons": reasons}.items()}
+
+
+def gradients(what: str, estimator: Any, c: Any) -> dict[str, torch.Tensor]:
+    asked = {f: getattr(c, f).double().requires_grad_() for f in ("x0", "x1", "prior", "noise")}
+    estimate = estimator(c.replace(**asked), 1)
+    weights = torch.linspace(-1, 1, 9, dtype=torch.float64).reshape(3, 3)
+    if not estimate.F.requires_grad:
+        return {f"{what} F with gradients": estimate.F}
+    grads = torch.autograd.grad((estimate.F * weights).sum(), list(asked.values()), allow_unused=True)
+    named = {f"{what} gradient to {f}": g for f, g in zip(asked, grads, strict=True) if g is not None}
+    return {f"{what} F with gradients": estimate.F.detach(), **named}
+
+
+def geometry() -> dict[str, torch.Tensor]:
+    """Public functions on random input, with gradients."""
+    from fmtorch import geometry as g
+
+    rng = torch.Generator().manual_seed(0)
+    x0, x1 = (torch.rand(5, 40, 2, generator=rng, dtype=torch.float64) * 600 for _ in range(2))
+    w = torch.rand(5, 40, generator=rng, dtype=torch.float64)
+    F0 = torch.randn(5, 2, 3, 3, generator=rng, dtype=torch.float64) * torch.tensor([1e-3, 1e-3, 1.0])
+    K = torch.tensor([[700.0, 0, 300], [0, 720, 310], [0, 0, 1]], dtype=torch.float64).expand(5, 3, 3)
+    mask = w > 0.1
+    calls = {
+        "seven_point": lambda a, b, v: g.seven_point(a[:, :7], b[:, :7])[0],
+        "eight_point": lambda a, b, v: g.eight_point(a, b, v, mask)[0],
+        "pose": lambda a, b, v: g.pose_from_fundamental(g.eight_point(a, b, v)[0], K, K, a, b).R,
+        "sampson": lambda a, b, v: g.sampson(F0[:, 0], a, b),
+        "calibration": lambda a, b, v: g.fundamental_from_calibration(K, K, K / 700, a[:, 0, :1].expand(5, 3) + 1),
+        **{
+            f"{name} {kernel} {gradient}": lambda a, b, v, f=f, k=kernel, gradient=gradient: f(
+                *((F0, a, b) if f is g.refine else (a, b, F0)), v, mask, kernel=k, scale=3.0, gradient=gradient
+            )
+            for name, f in (("refine", g.refine), ("irls", g.irls))
+            for kernel in ("cauchy", "truncated", "magsac")
+            for gradient in ("implicit", "unrolled")
+        },
+        "attached step": lambda a, b, v: g.attached_step(F0, a, b, v, mask, kernel="huber", scale=3.0),
+    }
+    found = {}
+    for name, call in calls.items():
+        asked = [x.clone().requires_grad_() for x in (x0, x1, w)]
+        value = call(*asked)
+        found[f"geometry | {name}"] = value.detach()
+        grads = torch.autograd.grad(value.sum(), asked, allow_unused=True)
+        found |= {f"geometry | {name} | gradient {i}": x for i, x in enumerate(grads) if x is not None}
+    return found
+
+
+def computed(source: Path, pairs: Path, arguments: argparse.Namespace, folder: Path) -> dict[str, torch.Tensor]:
+    """The results of a checkout, or those of a file."""
+    if source.is_file():
+        loaded: dict[str, torch.Tensor] = torch.load(source)
+        return loaded
+    out = folder / f"{len(list(folder.iterdir()))}.pt"
+    command = [sys.executable, str(Path(__file__).resolve()), "--dump", str(pairs), str(out), "--presets"]
+    command += [*arguments.presets, *(["--quick"] if arguments.quick else [])]
+    environment = {**os.environ, "PYTHONPATH": str(source.resolve()), "OMP_NUM_THREADS": "1"}
+    subprocess.run(command, check=True, env=environment, cwd=source)
+    loaded = torch.load(out)
+    return loaded
+
+
+def same(a: torch.Tensor, b: torch.Tensor) -> bool:
+    """Bit for bit, any NaN equal to any other."""
+    if a.shape != b.shape or a.dtype != b.dtype:
+        return False
+    equal = (a == b) | ((a != a) & (b != b))
+    if a.is_floating_point():
+        equal &= (a.signbit() == b.signbit()) | (a != a)
+    return bool(equal.all())
+
+
+def differences(before: dict[str, torch.Tensor], after: dict[str, torch.Tensor], presets_: list[str]) -> list[str]:
+    """What differs, in words."""
+    found = []
+    for name in sorted(before.keys() | after.keys()):
+        if presets_ and name.split(" | ")[0] not in (*presets_, "geometry"):
+            continue
+        if name not in before or name not in after:
+            found.append(f"{name}: only {'before' if name in before else 'after'}")
+        elif not same(before[name], after[name]):
+            a, b = before[name].double(), after[name].double()
+            size = f"by {float((a - b).abs().nan_to_num().max()):.3g}" if a.shape == b.shape else "in shape"
+            found.append(f"{name}: differs {size}")
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("before", type=Path, nargs="?")
+    parser.add_argument("after", type=Path, nargs="?", default=HERE)
+    parser.add_argument("--quick", action="store_true", help="fewer pairs, one seed: a minute in place of many")
+    parser.add_argument("--presets", nargs="*", default=[], help="of conf/estimator; all by default")
+    parser.add_argument("--matches", type=Path, help="real pairs: an .npz file with names, NNN.X1, .X2, .size1, .size2")
+    parser.add_argument("--save", type=Path, help="keep what BEFORE computes (nothing else where AFTER is the same)")
+    parser.add_argument("--dump", type=Path, nargs=2, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.dump:
+        dump(*arguments.dump, arguments.presets, arguments.quick)
+        return
+    if arguments.before is None:
+        parser.error("BEFORE is missing: a checkout, or a file written with --save")
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        torch.save(inputs(arguments.quick, arguments.matches), folder / "pairs.pt")
+        before = computed(arguments.before, folder / "pairs.pt", arguments, folder)
+        if arguments.save:
+            torch.save(before, arguments.save)
+        if arguments.save and arguments.after.resolve() == arguments.before.resolve():
+            return
+        after = computed(arguments.after, folder / "pairs.pt", arguments, folder)
+    found = differences(before, after, arguments.presets)
+    print("\n".join(found[:60]) + f"\n{len(found)} of {len(before.keys() | after.keys())} arrays differ")
+    sys.exit(bool(found))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,131 @@
+"""Options as configs write them: groups, parts by name, by mapping and by object, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from fmtorch import find_fundamental, presets
+from fmtorch.estimators import HypothesizeAndVerify
+from fmtorch.estimators.options import Focal, Preselect, Refine, Select, group
+from fmtorch.estimators.registry import PARTS, part
+from fmtorch.estimators.scores import InlierCount, TruncatedSquares
+from tests.laws import scene
+
+MEDIAN = {"score": "median", "inliers": "lmeds", "confidence": None}
+
+
+def test_groups_are_made_of_mappings() -> None:
+    assert group("preselect", {"survivors": 64}, Preselect) == Preselect(128, 64)
+    assert group("refine", {"kernel": "cauchy", "scale": 0.5}, Refine) == Refine("cauchy", 0.5)
+    assert group("focal", None, Focal) is None
+    with pytest.raises(ValueError, match="refine is 'truncated'; it must be null or a mapping of: kernel, scale"):
+        group("refine", "truncated", Refine)
+    select = Select(scale=0.3)
+    assert group("select", select, Select) is select
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"refine": {"kernel": "truncated", "threshold": 1}}, "refine: no option threshold; there are: kernel"),
+        ({"refine": {"scale": 1.0}}, "refine: kernel is missing"),
+        ({"refine": {"kernel": "l1"}}, "kernel is 'l1'"),
+        ({"refine": {"kernel": "cauchy", "scale": 0.0}}, "refine.scale is 0.0; it must be positive"),
+        ({"refine": {"kernel": "cauchy", "matches": 0}}, "refine.matches is 0; it must be at least 1"),
+        ({"preselect": {"matches": 0}}, "preselect.matches is 0; it must be at least 1"),
+        ({"select": {"scale": 0.0}}, "select.scale is 0.0; it must be positive"),
+        ({"select": {}, "focal": {"samples": -1}}, "focal.samples is -1; it must be at least 0"),
+        ({"focal": {}}, "focal needs select"),
+        ({"score": "prior_saturated"}, "score is 'prior_saturated'; it must be one of: inlier_count, msac, saturated"),
+        ({"score": {"name": "msac", "weighted": True}}, "score=msac: no option weighted; there are: threshold, prior"),
+        ({"score": {"prior_weighted": True}}, "score is None; it must be one of"),
+        ({"pool": 0}, "pool is 0; it must be at least 1"),
+        (MEDIAN | {"threshold": 2.0}, "threshold=2.0 has no effect: score=median takes none"),
+        (MEDIAN | {"inlier_threshold": 2.0}, "inlier_threshold=2.0 has no effect: inliers=lmeds takes none"),
+        ({"local_optimization": "x"}, "local_optimization is 'x'; it must be one of: graph_cut"),
+    ],
+)
+def test_bad_options_are_told(options: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        HypothesizeAndVerify(**options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"threshold": 2.0, "inliers": "threshold"},
+        {"inlier_threshold": 2.0, "inliers": "threshold"},
+        {"threshold": 2.0, "confidence": 0.99},  # of the stopping rule
+        {"threshold": 2.0, "local_optimization": "graph_cut"},
+    ],
+)
+def test_thresholds_that_something_asks_for_are_taken(options: dict[str, object]) -> None:
+    HypothesizeAndVerify(**(MEDIAN | options))  # type: ignore[arg-type]
+
+
+def test_a_part_is_a_name_a_mapping_or_an_object() -> None:
+    named = part("score", "msac", threshold=2.0)
+    assert isinstance(named, TruncatedSquares)
+    assert (named.threshold, named.prior_weighted) == (2.0, False)
+    weighted = part("score", {"name": "msac", "prior_weighted": True}, threshold=2.0)
+    assert (weighted.threshold, weighted.prior_weighted) == (2.0, True)
+    own = part("score", {"name": "msac", "threshold": 3.0}, threshold=2.0)
+    assert own.threshold == 3.0
+    assert part("score", weighted) is weighted
+    assert part("degeneracy", None) is None
+
+
+@pytest.mark.parametrize("role", PARTS)
+def test_every_part_can_be_made(role: str) -> None:
+    for name in PARTS[role]:
+        assert part(role, name, threshold=1.0, score=InlierCount(1.0)) is not None
+
+
+def test_flat_and_nested_options_replace_those_of_a_preset() -> None:
+    c = scene(0, 200)
+    assert c.size0 is not None
+    found = find_fundamental(
+        c.x0, c.x1, prior=c.prior, size0=c.size0, size1=c.size1, hypotheses=500, preselect={"survivors": 30},
+        focal={"samples": 100},
+    )  # fmt: skip
+    built = presets.build("estimator", "fmtorch", hypotheses=500, preselect={"survivors": 30}, focal={"samples": 100})
+    assert built.search.hypotheses == 500
+    assert built.search.verify.preselect == Preselect(64, 30)
+    assert built.focal_search.hypotheses == 100
+    assert built.focal_search.pool == 12
+    assert torch.equal(found.F, built(c.replace(key=None, quality=None)).F)
+    without = presets.build("estimator", "fmtorch", focal=None)
+    assert without.focal is None
+    assert without.focal_search is None
+
+
+class Nearest:
+    """A score of somebody else's: minus the squared distance of the `rank`-th nearest match."""
+
+    prior_weighted = False
+
+    def __init__(self, rank: int) -> None:
+        self.rank = rank
+
+    def __call__(self, F: Tensor, points: Tensor, weight: Tensor, scale: Tensor) -> Tensor:
+        from fmtorch.geometry.residuals import sampson_squared
+
+        r2 = sampson_squared(F, points).masked_fill_(weight[:, None] <= 0, torch.inf)
+        return -r2.kthvalue(self.rank, dim=-1).values
+
+
+def test_a_score_of_ones_own_in_a_preset_of_ones_own(tmp_path: Path) -> None:
+    (tmp_path / "estimator").mkdir()
+    (tmp_path / "estimator" / "nearest.yaml").write_text(
+        "_target_: fmtorch.estimators.HypothesizeAndVerify\n"
+        "score:\n  _target_: tests.estimators.test_options.Nearest\n  rank: 60\n"
+        "hypotheses: 300\nconfidence: null\ninliers: threshold\nthreshold: 1.0\n"
+    )
+    c = scene(1, 150)
+    found = find_fundamental(c.x0, c.x1, estimator="nearest", config_dir=tmp_path)
+    assert bool(found.ok[0])
+    assert int(found.inliers.sum()) > 60
