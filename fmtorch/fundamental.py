@@ -62,6 +62,16 @@ def find_fundamental(
         inliers, ok, reason, significance. A pair that cannot be solved is ``ok=False``, never an exception. An
             F that is ok may be of images that show nothing in common: `related` tells.
 
+    Example:
+        >>> import torch, fmtorch
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> X = torch.rand(80, 3, generator=generator, dtype=torch.float64) + torch.tensor([0.0, 0.0, 2.0])
+        >>> x0, x1 = (500 * Y[:, :2] / Y[:, 2:] for Y in (X, X + torch.tensor([-0.5, 0.0, 0.2])))
+        >>> x1[:20] = x1[:20].flip(0)                            # twenty wrong matches
+        >>> estimate = fmtorch.find_fundamental(x0, x1)
+        >>> bool(estimate.ok[0]), int(estimate.inliers[0, 20:].sum())
+        (True, 60)
+
     Raises:
         ValueError: for points of another shape, a prior outside [0, 1], a noise or an image size that is not positive,
             the size of one image only, an unknown preset or an unknown option.

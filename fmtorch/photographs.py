@@ -76,15 +76,29 @@ def match(
 ) -> MatchResult:
     """Match two photographs and estimate their fundamental matrix.
 
-    image0, image1: files, turned as their EXIF orientation says, or uint8 arrays, (H, W) or RGB (H, W, 3).
-    pipeline: a preset of conf/pipeline, or a `Pipeline` (``presets.pipeline("sift_gms", overrides=[...])``).
-    device: of a pipeline given by name; None: a GPU where there is one. longest_side: larger images are reduced to it
-    for matching, and thresholds are in pixels of the reduced images; the results are always in pixels of the originals.
-    seed: of sampling.
+    Args:
+        image0, image1: files, turned as their EXIF orientation says, or uint8 arrays, (H, W) or RGB (H, W, 3).
+        pipeline: a preset of conf/pipeline, or a `Pipeline` (``presets.pipeline("sift_gms", overrides=[...])``).
+        device: of a pipeline given by name; None: a GPU where there is one.
+        longest_side: larger images are reduced to it for matching, and thresholds are in pixels of the reduced images;
+            the results are always in pixels of the originals.
+        seed: of sampling.
 
-    Raises ImageError for a file that is no sound image, TypeError for what is neither a path nor an array, ValueError
-    for an array of another type or shape, an unknown pipeline, or a device that is not there. Photographs that cannot
-    be related are no error: `related` is False, and mostly `ok` is True, since some F is found all the same.
+    Returns:
+        Matches, F and inliers in pixels of the originals. Photographs that cannot be related are no error: `related` is
+        False, and mostly `ok` is True, since some F is found all the same.
+
+    Raises:
+        ImageError: for a file that is no sound image.
+        TypeError: for what is neither a path nor an array.
+        ValueError: for an array of another type or shape, an unknown pipeline, or a device that is not there.
+
+    Example:
+        >>> import fmtorch, skimage.data
+        >>> left, right, _ = skimage.data.stereo_motorcycle()
+        >>> result = fmtorch.match(left, right, pipeline="sift_gms", longest_side=400)
+        >>> result.ok, result.related, tuple(result.F.shape)
+        (True, True, (3, 3))
     """
     if longest_side < 1:
         raise ValueError(f"longest_side is {longest_side}; it must be at least 1 px")

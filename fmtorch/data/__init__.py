@@ -51,9 +51,21 @@ def load(
 ) -> PairDataset:
     """The data set `name` (fmbench, rendered, stereo): an indexable of `ImagePair`, as torch's DataLoader takes it.
 
-    root: where it lies, or for generated sets where they are kept. progress: called with (done, total) while a
-    generated set is drawn for the first time. options: the data set's own.
-    Raises DataError (a ValueError) for an unknown name or for data that cannot be used.
+    Args:
+        name: of the set.
+        split: `test` or `train`.
+        root: where it lies, or for generated sets where they are kept.
+        progress: called with (done, total) while a generated set is drawn for the first time.
+        options: the data set's own.
+
+    Raises:
+        DataError: (a ValueError) for an unknown name or for data that cannot be used.
+
+    Example:
+        >>> from fmtorch.data import load
+        >>> pair = load("stereo")[0]
+        >>> pair.family, pair.F.shape
+        ('stereo', (3, 3))
     """
     expect_loadable(name, split=split, root=root, **options)
     if root is not None:

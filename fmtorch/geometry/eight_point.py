@@ -27,9 +27,28 @@ def eight_point(
     largest entry positive. Differentiable in points and weights (not in a root of the weights, so also at zero).
     Computed in float64, returned in x0's type.
 
-    weight: non-negative, any scale. mask: True for a real match. Invalid (F = 0): fewer than eight independent
-    equations (too few points, coincident or collinear ones, an exact plane), or anything not finite, or a negative
-    weight, among the unmasked points. The result has the same bits in any batch and with any padding.
+    Args:
+        x0: points of image 0, pixels.
+        x1: their matches in image 1.
+        weight: of each match, not negative, any scale; 1 by default.
+        mask: True for a real match; all by default.
+
+    Returns:
+        F, and whether it is valid. Invalid (F = 0): fewer than eight independent equations (too few points, coincident
+        or collinear ones, an exact plane), or anything not finite, or a negative weight, among the unmasked points. The
+        result has the same bits in any batch and with any padding.
+
+    Example:
+        >>> import torch
+        >>> from fmtorch.geometry import eight_point, sampson
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> X = torch.rand(20, 3, generator=generator, dtype=torch.float64) + torch.tensor([0.0, 0.0, 2.0])
+        >>> x0 = 500 * X[:, :2] / X[:, 2:]                       # one camera, and one moved to the right and back
+        >>> X1 = X + torch.tensor([-0.5, 0.0, 0.2])
+        >>> x1 = 500 * X1[:, :2] / X1[:, 2:]
+        >>> F, valid = eight_point(x0, x1)
+        >>> bool(valid), bool((sampson(F, x0, x1) < 1e-6).all())
+        (True, True)
     """
     F, valid = fundamental_of(NormalEquations.of(x0, x1, weight, mask))
     return F.to(x0.dtype), valid

@@ -15,7 +15,15 @@ CURVE = (0.0, 0.2, 20)  # first and last threshold and their number, as in the p
 
 @checked
 def recall(nsgd: Float[Tensor, "*batch pairs"], threshold: float = THRESHOLD) -> Float[Tensor, "*batch"]:
-    """Share of all pairs with NSGD strictly below the threshold; NaN, a failure, counts as a miss."""
+    """Share of all pairs with NSGD strictly below the threshold; NaN, a failure, counts as a miss.
+
+    Example:
+        >>> import torch
+        >>> from fmtorch.metrics import mean_recall, recall
+        >>> nsgd = torch.tensor([0.0, 0.01, 0.2, torch.nan])
+        >>> recall(nsgd).item(), round(mean_recall(nsgd).item(), 3)
+        (0.5, 0.45)
+    """
     return (nsgd < threshold).to(nsgd.dtype).mean(-1)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+import importlib
 from pathlib import Path
 
 import pytest
@@ -13,5 +14,12 @@ DOCS = Path(__file__).parents[2] / "docs"
 @pytest.mark.parametrize("page", ["conventions.md"])
 def test_the_examples_of_a_page_run(page: str) -> None:
     failed, attempted = doctest.testfile(str(DOCS / page), module_relative=False)
+    assert attempted > 0
+    assert failed == 0
+
+
+@pytest.mark.parametrize("module", ["data", "fundamental", "geometry.eight_point", "metrics.recall", "photographs"])
+def test_the_examples_of_docstrings_run(module: str) -> None:
+    failed, attempted = doctest.testmod(importlib.import_module(f"fmtorch.{module}"))
     assert attempted > 0
     assert failed == 0
