@@ -58,9 +58,14 @@ def find_fundamental(
         options: replace values of the preset (``threshold=0.5``).
 
     Returns:
-        An `Estimate` of B pairs (of one pair for (N, 2) points, of none for an empty list): F with unit Frobenius norm,
-        inliers, ok, reason, significance. A pair that cannot be solved is ``ok=False``, never an exception. An
-            F that is ok may be of images that show nothing in common: `related` tells.
+        An `Estimate` of B pairs (of one pair for (N, 2) points, of none for an empty list), with F of unit Frobenius
+        norm, inliers, ok, reason, significance. A pair that cannot be solved is ``ok=False``, never an exception. An F
+        that is ok may be of images that show nothing in common: `related` tells.
+
+    Raises:
+        ValueError: for points of another shape, a prior outside [0, 1], a noise or an image size that is not positive,
+            the size of one image only, an unknown preset or an unknown option.
+        TypeError: for what is no array of numbers.
 
     Example:
         >>> import torch, fmtorch
@@ -71,11 +76,6 @@ def find_fundamental(
         >>> estimate = fmtorch.find_fundamental(x0, x1)
         >>> bool(estimate.ok[0]), int(estimate.inliers[0, 20:].sum())
         (True, 60)
-
-    Raises:
-        ValueError: for points of another shape, a prior outside [0, 1], a noise or an image size that is not positive,
-            the size of one image only, an unknown preset or an unknown option.
-        TypeError: for what is no array of numbers.
     """
     c = correspondences(
         x0, x1, mask=mask, quality=quality, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, size0=size0,
