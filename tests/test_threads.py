@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import fmtorch
-from fmtorch import presets
+from fmtorch import kernels, presets
 from fmtorch.data import read_image
 from fmtorch.estimators import batching
 from fmtorch.matching import nearest
@@ -50,6 +50,7 @@ def test_pruners_and_estimators_of_a_pipeline_have_one_thread(threads: int, tmp_
 
 
 def test_matching_and_find_fundamental_have_one_thread(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(kernels.SWITCH, "off")  # the tensor forms, which torch's threads would slow down
     seen = []
 
     def watch(module: object, name: str) -> None:

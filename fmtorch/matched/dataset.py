@@ -22,7 +22,7 @@ from fmtorch.storage.features import CachedFeatures
 from fmtorch.storage.files import replacing
 from fmtorch.storage.runs import canonical, identity_digest
 
-MOST = 4000  # matches kept of a pair
+MAX_MATCHES = 4000  # matches kept of a pair
 
 
 class MatchedPairs(StoredMatches):
@@ -64,7 +64,7 @@ class MatchedPairs(StoredMatches):
         root: str | Path | None = None,
         workers: int | None = None,
         progress: Progress | None = None,
-        most: int = MOST,
+        most: int = MAX_MATCHES,
         augmentation: Augmentation | None = None,
         seed: int = 0,
     ) -> None:
