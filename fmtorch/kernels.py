@@ -46,7 +46,7 @@ class Kernel(Generic[P, R]):
             function
         )  # without the checks that tests wrap around every function
         functools.update_wrapper(self, self.function)
-        self.signature = f"({signature})"
+        self.signature = f"({signature},)"  # a tuple, of one argument too
         self._compiled: Callable[P, R] | None = None
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:

@@ -93,6 +93,17 @@ def test_what_does_not_fit_the_signature_is_refused(module: types.ModuleType) ->
     assert len(module.scaled_squares.compiled().signatures) == 1
 
 
+def test_a_signature_of_one_argument(tmp_path: Path) -> None:
+    source = """
+from fmtorch.kernels import kernel
+
+@kernel("f8[:, ::1]")
+def first(x):
+    return x[0, 0]
+"""
+    assert load(tmp_path, source).first(np.full((1, 1), 2.0)) == 2
+
+
 def test_what_was_compiled_is_kept_and_told_once(
     tmp_path: Path, cache: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -19,7 +19,7 @@ def draw(table: Array, totals: Array, mixed_seed: int, key: int, start: int, out
     """Weighted sampling without replacement, draws start, start + 1, ... -> out (size, count), indices of matches.
 
     table: cumulative weights (n,), below 2^30; empty for weights of one. totals: (count,), of the weights that each
-    draw is made from. mixed_seed: of the seed and the stream. The algorithm is that of `sampling._draw`.
+    draw is made from. mixed_seed: of the seed and the stream. The algorithm is that of `sampling._without_replacement`.
     """
     size, count = out.shape
     state, guide = stream_state(mixed_seed, key), _guide(table)
@@ -79,7 +79,7 @@ def _guide(table: Array) -> Array:
 def prosac_table(size: int, growth: int, out: Array) -> None:
     """T'_n for n = 1 .. N -> out (N,): the last draw whose sample of `size` comes from the first n matches.
 
-    growth: T_N. Chum & Matas (CVPR 2005), equations 3 and 4, as `Prosac.table` has them.
+    growth: T_N. Chum & Matas (CVPR 2005), equations 3 and 4, as `Prosac.growth` has them.
     """
     total, before = len(out), 0.0
     draws: Any = 0

@@ -12,7 +12,7 @@ from fmtorch.kernels import inner, kernel
 
 Array = NDArray[Any]
 WIDTH = 32  # partial sums over the matches: part of the last bits
-TINY = 1e-30  # as in `sampson_objective`
+TINY = 1e-30  # as in `residuals`
 HUBER, CAUCHY, GEMAN_MCCLURE, TRUNCATED, MAGSAC = 0, 1, 2, 3, 4  # losses
 LOSSES = {"huber": HUBER, "cauchy": CAUCHY, "geman_mcclure": GEMAN_MCCLURE, "truncated": TRUNCATED, "magsac": MAGSAC}
 RESIDUAL, INVERSE, SQUARED, LOSS, COUNT, SCALE, POINTS, ROWS = 9, 10, 11, 12, 13, 14, 15, 19  # of a block, after J
@@ -23,7 +23,7 @@ def evaluate(
     F: Array, points: Array, weight: Array, s2: Array, loss: int, table: Array, derivatives: bool, products: Array,
     cost: Array,
 ) -> None:  # fmt: skip
-    """`Objective` of models (k, 9), points (4, n), weights (n,) -> products (k, 10, 10), if asked for; cost (k,).
+    """`SampsonObjective` of models (k, 9), points (4, n), weights (n,) -> products (k, 10, 10), if wanted; cost (k,).
 
     s2: (n,), squared scales of the loss, a code. table: (2, t + 2), of the loss MAGSAC, its weight at the ends of t
     intervals of r^2 / s^2 and beyond, and the weight's integral up to there.

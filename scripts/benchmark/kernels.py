@@ -82,23 +82,25 @@ def pruning(c: Correspondences) -> None:
 
 def search(c: Correspondences) -> None:
     """Draws, solvers and scores: 500 samples, 1,000 models on 600 matches."""
-    from fmtorch.estimators import calibrated, sampling, sampling_kernels, scores_kernels, scoring
-    from fmtorch.estimators.focal import Cameras
-    from fmtorch.estimators.parts import EightPoint, SevenPoint
-    from fmtorch.estimators.problem import problems
+    from fmtorch.estimators import sampling, sampling_kernels, scores, scores_kernels
+    from fmtorch.estimators.focal.cameras import CentredPairs
+    from fmtorch.estimators.focal.hypotheses import FocalSamples
+    from fmtorch.estimators.pairs import normalized_pairs
+    from fmtorch.estimators.saturated_gains import SaturatedGains
+    from fmtorch.estimators.solvers import EightPoint, SevenPoint
     from fmtorch.geometry.eight_point_kernels import eight_point
     from fmtorch.geometry.five_point_kernels import five_point
     from fmtorch.geometry.seven_point_kernels import seven_point
 
-    (pair,), _ = problems(c.replace(prior=1 - c.quality), 0, 7)  # type: ignore[operator]
+    (pair,), _ = normalized_pairs(c.replace(prior=1 - c.quality), 0, 7)  # type: ignore[operator]
     sampler, samples = sampling.PriorWeighted(), 500
-    table = sampler.table(pair, 7)
-    cumulative, totals = table[0, :COUNT].contiguous().numpy(), np.full(samples, int(table[0, -1]))
+    cumulative = sampler.weight(pair)[0, :COUNT].cumsum(0).numpy()
+    totals = np.full(samples, cumulative[-1])
     sample = np.empty((7, samples), np.int64)
     line(
         "draw 500 of seven",
         lambda: sampling_kernels.draw(cumulative, totals, 12345, 7, 0, sample),
-        lambda: sampler.draw(pair, table, 0, samples, 7),
+        lambda: sampler.draw(pair, 0, samples, 7),
     )
     points = np.ascontiguousarray(pair.points[:, 0, :COUNT].numpy())
     F, draw = np.empty((10 * samples, 9), np.float32), np.empty(10 * samples, np.int64)
@@ -110,15 +112,13 @@ def search(c: Correspondences) -> None:
         tensors = torch.from_numpy(points[:, index]).float()[:, :, None]
         line(name, lambda k=kernel, i=index: k(points, i, F, draw), lambda s=solver, t=tensors: s(t))  # type: ignore[misc]
     fives, depth = np.ascontiguousarray(sample[:5]), np.full((2, samples), 1.2)
-    cameras = Cameras(pair)
-    centred, offset = (
-        np.ascontiguousarray(cameras.points[:, 0, :COUNT].numpy()),
-        cameras.offset[:, 0].contiguous().numpy(),
-    )
+    cameras, five = CentredPairs(pair), torch.from_numpy(fives)[:, None]
+    centred, offset = np.ascontiguousarray(cameras.points[:, 0, :COUNT].numpy()), cameras.offset[:, 0].numpy().copy()
+    hypotheses = FocalSamples(lambda *_: five)
     line(
         "500 of five",
         lambda: five_point(centred, fives, depth, offset, F, draw),
-        lambda: calibrated.calibrated_hypotheses(pair, torch.from_numpy(fives)[:, None], 0),
+        lambda: hypotheses(pair, 0, samples),
     )
     models = np.random.default_rng(0).normal(size=(1000, 9)).astype(np.float32)
     which, out = np.arange(1000), np.empty(1000)
@@ -126,26 +126,26 @@ def search(c: Correspondences) -> None:
     scale, none = np.full(COUNT, 1e4, np.float32), np.empty(0, np.float32)
     cells = np.empty((2, COUNT), np.int32)
     scores_kernels.saturated_cells(p32, ones, cells)
-    tensor_models, tensor_points = torch.from_numpy(models).T[:, None].contiguous(), pair.points.float()
+    tensor_models = torch.from_numpy(models).T[:, None].contiguous()
     for name, code, score in (
-        ("count", scores_kernels.COUNT, scoring.InlierCount(1.0)),
-        ("msac", scores_kernels.TRUNCATED_SQUARES, scoring.TruncatedSquares(1.0)),
-        ("geman_mcclure", scores_kernels.GEMAN_MCCLURE, scoring.GemanMcClure(1.0)),
+        ("count", scores_kernels.COUNT, scores.InlierCount(1.0)),
+        ("msac", scores_kernels.TRUNCATED_SQUARES, scores.TruncatedSquares(1.0)),
+        ("geman_mcclure", scores_kernels.GEMAN_MCCLURE, scores.GemanMcClure(1.0)),
     ):
         line(
             f"1,000 by {name}",
             lambda code=code: scores_kernels.score_gains(models, which, p32, ones, scale, code, none, 10, out),  # type: ignore[misc]
-            lambda score=score: scoring.score_models(score, tensor_models, pair, tensor_points),  # type: ignore[misc]
+            lambda score=score: scores.score_models(score, tensor_models, pair),  # type: ignore[misc]
         )
     line(
         "1,000 saturated",
         lambda: scores_kernels.score_saturated(models, which, p32, ones, scale, cells, 10, out),
-        lambda: scoring.score_models(scoring.SaturatedGains(1.0), tensor_models, pair, tensor_points),
+        lambda: scores.score_models(SaturatedGains(1.0), tensor_models, pair),
     )
     line(
         "1,000 medians",
         lambda: scores_kernels.score_median(models, which, p32, out),
-        lambda: scoring.score_models(scoring.Median(), tensor_models, pair, tensor_points),
+        lambda: scores.score_models(scores.Median(), tensor_models, pair),
     )
 
 
@@ -157,7 +157,7 @@ def refinement(c: Correspondences) -> None:
     from fmtorch.geometry.rank2_manifold_kernels import start as start_kernel
     from fmtorch.geometry.rank2_manifold_kernels import step
     from fmtorch.geometry.robust_kernels import KERNELS
-    from fmtorch.geometry.sampson_objective import Objective
+    from fmtorch.geometry.sampson_objective import SampsonObjective
     from fmtorch.geometry.sampson_objective_kernels import GEMAN_MCCLURE, evaluate
 
     rng = np.random.default_rng(0)
@@ -168,7 +168,7 @@ def refinement(c: Correspondences) -> None:
     tensors = [
         torch.from_numpy(a) for a in (models.T[:, None].copy(), points[:, None], weight[None], np.sqrt(s2)[None])
     ]
-    objective = Objective(tensors[1], tensors[2], KERNELS["geman_mcclure"], tensors[3])
+    objective = SampsonObjective(tensors[1], tensors[2], KERNELS["geman_mcclure"], tensors[3])
     line("start of 12", lambda: start_kernel(models, 5, F, e0, e1), lambda: start(tensors[0]))
     state = start(tensors[0])
     line(

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from fmtorch.estimators import sampling_kernels
-from fmtorch.estimators.problem import problems
+from fmtorch.estimators.pairs import normalized_pairs
 from fmtorch.estimators.sampling import PriorWeighted, Prosac, Uniform
 from fmtorch.random import Stream, mixed_seed
 from fmtorch.types import Correspondences
@@ -31,37 +31,36 @@ def pair(count: int, prior: str = "given") -> Correspondences:
 @pytest.mark.parametrize("size", [5, 7, 8])
 @pytest.mark.parametrize("count", [8, 9, 40, 150, 700, 5000])
 def test_weighted_samples(count: int, size: int, prior: str) -> None:
-    (problem,), _ = problems(pair(count, prior), 3, 7)
+    (pairs,), _ = normalized_pairs(pair(count, prior), 3, 7)
     for sampler in (PriorWeighted(), Uniform()):
         for start, draws in ((0, 300), (700, 41)):
-            table = sampler.table(problem, size)
-            expected = sampler.draw(problem, table, start, draws, size)[:, 0]
-            cumulative = table[0, :count].contiguous().numpy()
+            expected = sampler.draw(pairs, start, draws, size)[:, 0]
+            cumulative = sampler.weight(pairs)[0, :count].cumsum(0).numpy()
             for given in (cumulative, np.empty(0, np.int64)):
                 if len(given) == 0 and int(cumulative[-1]) != count:
                     continue  # not all weights are one
                 out = np.empty((size, draws), np.int64)
                 totals = np.full(draws, cumulative[-1])
                 seed = mixed_seed(3, Stream.SAMPLING)
-                sampling_kernels.draw(given, totals, seed, int(problem.key[0]), start, out)
+                sampling_kernels.draw(given, totals, seed, int(pairs.key[0]), start, out)
                 np.testing.assert_array_equal(out, expected.numpy())
 
 
 @pytest.mark.parametrize("count", [8, 40, 700])
 def test_samples_of_prosac(count: int) -> None:
-    (problem,), _ = problems(pair(count), 3, 7)
+    (pairs,), _ = normalized_pairs(pair(count), 3, 7)
     sampler = Prosac()
     for size in (5, 7, 8):
-        expected = sampler.table(problem, size)[0, :count].numpy()
+        expected = sampler.growth(pairs, size)[0, :count].numpy()
         table = np.empty(count, np.int64)
         sampling_kernels.prosac_table(size, sampler.GROWTH, table)
         np.testing.assert_array_equal(table, expected)
         for start in (0, 5000, 250_000):
-            samples = sampler.draw(problem, sampler.table(problem, size), start, 200, size)[:, 0].numpy()
+            samples = sampler.draw(pairs, start, 200, size)[:, 0].numpy()
             newest = np.minimum(np.searchsorted(table, np.arange(start + 1, start + 201)), count - 1)
             others = np.empty((size - 1, 200), np.int64)
             seed, none = mixed_seed(3, Stream.SAMPLING), np.empty(0, np.int64)
-            sampling_kernels.draw(none, newest, seed, int(problem.key[0]), start, others)
-            assert problem.quality is not None
-            order = np.argsort(problem.quality[0, :count].numpy(), kind="stable")
+            sampling_kernels.draw(none, newest, seed, int(pairs.key[0]), start, others)
+            assert pairs.quality is not None
+            order = np.argsort(pairs.quality[0, :count].numpy(), kind="stable")
             np.testing.assert_array_equal(order[np.vstack([others, newest])], samples)

@@ -7,19 +7,19 @@ import pytest
 import torch
 
 from fmtorch.estimators import pool_kernels, scores_kernels
-from fmtorch.estimators.choice import ranked
-from fmtorch.estimators.problem import Problem, problems
-from fmtorch.estimators.scoring import (
+from fmtorch.estimators.models import Models, Pool
+from fmtorch.estimators.pairs import NormalizedPairs, normalized_pairs
+from fmtorch.estimators.saturated_gains import SaturatedGains
+from fmtorch.estimators.scores import (
     GemanMcClure,
     InlierCount,
     Median,
-    SaturatedGains,
     SigmaConsensus,
     TruncatedSquares,
-    sampson_squared,
     score_models,
 )
 from fmtorch.geometry import eight_point
+from fmtorch.geometry.residuals import sampson_squared
 from tests.laws import degenerate, scene
 
 pytest.importorskip("numba", reason="numba is not installed")
@@ -34,15 +34,15 @@ GAINS = {
 }
 
 
-def problem(count: int, noise: bool, kind: str = "") -> Problem:
+def normalized(count: int, noise: bool, kind: str = "") -> NormalizedPairs:
     c = degenerate()[kind] if kind else scene(count, count)
     if noise:
         c = c.replace(noise=torch.linspace(0.2, 5, c.mask.shape[1])[None])
-    (made,), _ = problems(c, 0, 7)
+    (made,), _ = normalized_pairs(c, 0, 7)
     return made
 
 
-def models(pair: Problem, count: int) -> np.ndarray:
+def models(pair: NormalizedPairs, count: int) -> np.ndarray:
     """Models of random eights, which fit some of the matches, and a zero one."""
     n = int(pair.count[0])
     index = np.random.default_rng(0).integers(0, n, (count, 8))
@@ -52,14 +52,14 @@ def models(pair: Problem, count: int) -> np.ndarray:
     return F.flatten(1).float().numpy()
 
 
-def arrays(pair: Problem, threshold: float, weighted: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def arrays(pair: NormalizedPairs, threshold: float, weighted: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     n = int(pair.count[0])
     points = np.ascontiguousarray(pair.points[:, 0, :n].float().numpy())
     support = np.ones(n, np.float32)
     if weighted:
         assert pair.prior is not None
         support = pair.prior[0, :n].float().numpy()
-    scale = (pair.units / threshold).square().float().expand(1, pair.live.shape[1])[0, :n].contiguous().numpy()
+    scale = (pair.scale / threshold).square().float().expand(1, pair.mask.shape[1])[0, :n].contiguous().numpy()
     return points, support, scale
 
 
@@ -77,12 +77,12 @@ CASES = [
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("gain", GAINS)
 def test_summed_gains(gain: str, weighted: bool, count: int, noise: bool, kind: str) -> None:
-    pair = problem(count, noise, kind)
+    pair = normalized(count, noise, kind)
     code, tensor_form = GAINS[gain]
     score = tensor_form(1.5)
     score.prior_weighted = weighted
     F = models(pair, 200)
-    expected = score_models(score, torch.from_numpy(F).T[:, None], pair, pair.points.float())[0].numpy()
+    expected = score_models(score, torch.from_numpy(F).T[:, None], pair)[0].numpy()
     points, support, scale = arrays(pair, 1.5, weighted)
     table = score._table.numpy() if isinstance(score, SigmaConsensus) else NONE
     which, out = np.arange(200)[::-1].copy(), np.empty(200)
@@ -97,10 +97,10 @@ def test_summed_gains(gain: str, weighted: bool, count: int, noise: bool, kind: 
 
 @pytest.mark.parametrize(("count", "noise", "kind"), CASES)
 def test_saturated_gains(count: int, noise: bool, kind: str) -> None:
-    pair = problem(count, noise, kind)
+    pair = normalized(count, noise, kind)
     score = SaturatedGains(1.5)
     F = models(pair, 100)
-    expected = score_models(score, torch.from_numpy(F).T[:, None], pair, pair.points.float())[0].numpy()
+    expected = score_models(score, torch.from_numpy(F).T[:, None], pair)[0].numpy()
     points, support, scale = arrays(pair, 1.5, True)
     cells, which, out = np.empty((2, len(support)), np.int32), np.arange(100), np.empty(100)
     scores_kernels.saturated_cells(points, support, cells)
@@ -113,9 +113,9 @@ def test_saturated_gains(count: int, noise: bool, kind: str) -> None:
 
 @pytest.mark.parametrize("count", [8, 9, 150, 701])
 def test_median(count: int) -> None:
-    pair = problem(count, False)
+    pair = normalized(count, False)
     F = models(pair, 100)
-    expected = score_models(Median(), torch.from_numpy(F).T[:, None], pair, pair.points.float())[0].numpy()
+    expected = score_models(Median(), torch.from_numpy(F).T[:, None], pair)[0].numpy()
     points, _, _ = arrays(pair, 1.0, False)
     out = np.empty(100)
     scores_kernels.score_median(F, np.arange(100), points, out)
@@ -136,14 +136,18 @@ def test_the_best_of_a_round_and_of_a_search(m: int, k: int) -> None:
     pool, pool_score, pool_draw, filled = np.zeros((12, 9), np.float32), np.empty(12), np.empty(12, np.int64), 0
     for some in np.array_split(which, 3):
         filled = pool_kernels.merge(F, some, score[some], draw, filled, pool, pool_score, pool_draw)
-    best, top = ranked(torch.from_numpy(F[which]).T[:, None], torch.from_numpy(score[which])[None], 12)
+    best, index = Pool.empty(1, 12, torch.device("cpu")), torch.from_numpy(which)
+    best.merge(torch.tensor([0]), Models(
+        torch.from_numpy(F)[index].T[:, None], torch.ones(1, k, dtype=torch.bool), torch.from_numpy(draw)[index][None],
+        torch.empty(0, 1, m, dtype=torch.int64), 0, torch.from_numpy(score)[index][None].float(),
+    ))  # fmt: skip
     assert filled == min(12, k)
-    np.testing.assert_array_equal(pool[:filled], best[:, 0].T.numpy())
-    np.testing.assert_array_equal(pool_score[:filled], top[0].numpy())
+    np.testing.assert_array_equal(pool[:filled], best.F[:, 0, :filled].T.numpy())
+    np.testing.assert_array_equal(pool_score[:filled], best.score[0, :filled].numpy())
 
 
 def test_residuals_and_matches_near_a_pool() -> None:
-    pair = problem(300, False)
+    pair = normalized(300, False)
     F = models(pair, 20)[1:]
     points = np.ascontiguousarray(pair.points[:, 0, :300].numpy())
     squared = sampson_squared(torch.from_numpy(F).double().T[:, None].contiguous(), pair.points[..., :300])[0].numpy()

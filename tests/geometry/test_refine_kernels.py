@@ -9,7 +9,7 @@ import torch
 from fmtorch.geometry.rank2_manifold_kernels import accept, start, step
 from fmtorch.geometry.refine import DAMPING, refine_components
 from fmtorch.geometry.robust_kernels import KERNELS
-from fmtorch.geometry.sampson_objective import Objective
+from fmtorch.geometry.sampson_objective import SampsonObjective
 from fmtorch.geometry.sampson_objective_kernels import LOSSES, evaluate
 from fmtorch.geometry.sigma_consensus import _INTEGRAL, _WEIGHT
 
@@ -38,7 +38,7 @@ def matches(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
 def test_costs_and_normal_equations(loss: str, n: int) -> None:
     F, points, weight, s2 = matches(n)
     tensors = [torch.from_numpy(a) for a in (F.T[:, None].copy(), points[:, None], weight[None], np.sqrt(s2)[None])]
-    expected, expected_cost = Objective(tensors[1], tensors[2], KERNELS[loss], tensors[3])(tensors[0], True)
+    expected, expected_cost = SampsonObjective(tensors[1], tensors[2], KERNELS[loss], tensors[3])(tensors[0], True)
     for derivatives in (True, False):
         products, cost = np.zeros((5, 10, 10)), np.empty(5)
         evaluate(F, points, weight, s2, LOSSES[loss], TABLE, derivatives, products, cost)
@@ -61,7 +61,7 @@ def refined(
     )
     start(F, 5, *state[:3])
     evaluate(state[0], points, weight, s2, LOSSES[loss], TABLE, True, *state[3:])
-    damping, done = np.full(k, DAMPING), np.zeros(k, bool)
+    damping, done = np.full(k, DAMPING.first), np.zeros(k, bool)
     for _ in range(iterations):
         step(state[3], *state[:3], damping, *trial[:3])
         evaluate(trial[0], points, weight, s2, LOSSES[loss], TABLE, True, *trial[3:])

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.estimators.parts import EightPoint, SevenPoint
-from fmtorch.estimators.problem import Problem, problems
+from fmtorch.estimators.pairs import NormalizedPairs, normalized_pairs
+from fmtorch.estimators.solvers import EightPoint, SevenPoint
 from fmtorch.geometry import eight_point
 from fmtorch.geometry.eight_point_kernels import eight_point as eight_point_kernel
 from fmtorch.geometry.eight_point_kernels import weighted_eight_point
@@ -25,9 +25,9 @@ SOLVERS: dict[str, tuple[type[SevenPoint] | type[EightPoint], Kernel, int]] = {
 }
 
 
-def pairs() -> dict[str, Problem]:
+def pairs() -> dict[str, NormalizedPairs]:
     given = {"random": scene(1, 300), **degenerate(), **small()}
-    made = {name: problems(c, 0, 7)[0] for name, c in given.items()}
+    made = {name: normalized_pairs(c, 0, 7)[0] for name, c in given.items()}
     return {name: some[0] for name, some in made.items() if some}
 
 

@@ -1,4 +1,4 @@
-"""Focal lengths drawn from their prior for the samples of one pair, compiled: the numbers that `calibrated` draws."""
+"""Focal lengths drawn from their prior for the samples of one pair, compiled: those of `prior.draw_focal_lengths`."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from fmtorch.kernels import inner, kernel
 
 Array = NDArray[Any]
 BITS = 20  # fractional, of the support, so that its sums are exact
-REST = 1 / 26  # of the gain of Geman & McClure, as in `scoring`
+REST = 1 / 26  # of the gain of Geman & McClure, as in `scores`
 TINY = float(np.finfo(np.float64).tiny)
 
 
