@@ -36,6 +36,7 @@ NOISY = ("fmtorch", "fmtorch_max", "gc_ransac", "msac")  # are also told the noi
 COMPILED = (  # pruners of two forms: a kernel, and tensors
     "frame_consistency", "gms", "gms_soft", "lpm", "lpm_soft", "match_noise", "one_to_one", "position_consistency",
 )  # fmt: skip
+KERNEL_FORM = ("lmeds", "lmeds_eight_point", "msac", "ransac", "ransac_eight_point")  # wholes of kernels
 TILES = [  # what bounds memory and fills caches, and must change no result
     (solvers, "CPU_SAMPLES", 150), (hypotheses, "CPU_SAMPLES", 150), (scores, "CPU_TILE", 1000),
     (graph_cut, "CPU_TILE", 1000),
@@ -43,14 +44,17 @@ TILES = [  # what bounds memory and fills caches, and must change no result
 ]  # fmt: skip
 
 
-def _estimator(name: str) -> Subject:
+def _estimator(name: str, kernel: bool = True) -> Subject:
     estimator = quick(name)
 
     def run(c: Correspondences) -> Result:
-        e = estimator(c, seed=5)
+        with pytest.MonkeyPatch.context() as environment:
+            if not kernel:
+                environment.setenv(kernels.SWITCH, "off")
+            e = estimator(c, seed=5)
         return {"F": e.F, "inliers": e.inliers, "ok": e.ok, "draws": e.draws, "significance": e.significance}
 
-    return Subject(f"estimator={name}", run)
+    return Subject(f"estimator={name}" + ("" if kernel else " without kernels"), run)
 
 
 def _pruner(name: str, kernel: bool = True) -> Subject:
@@ -80,6 +84,7 @@ def _noisy(name: str) -> Subject:
 def _subjects() -> list[Subject]:
     """Every preset of these groups: a new file in conf/ joins by being there."""
     estimators = [_estimator(n) for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES[1:])]
+    estimators += [_estimator(n, kernel=False) for n in KERNEL_FORM]
     pruners = [*(_pruner(n) for n in presets.available("pruner")), *(_pruner(n, kernel=False) for n in COMPILED)]
     return [*estimators, *pruners, *(_noisy(n) for n in NOISY)]
 

@@ -9,25 +9,30 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
+from fmtorch import kernels
 from fmtorch.estimators.batching import solve_all
 from fmtorch.estimators.degeneracy import Degensac
-from fmtorch.estimators.final_fits import FinalFit, Fit
+from fmtorch.estimators.final_fits import FinalFit
 from fmtorch.estimators.focal.hypotheses import FocalSamples
 from fmtorch.estimators.focal.selection import Candidates, FocalSelection
+from fmtorch.estimators.forms import Form, Outcome, pair_by_pair
 from fmtorch.estimators.graph_cut import LocalOptimization
 from fmtorch.estimators.inliers import Confidence, InlierRule
 from fmtorch.estimators.models import Pool
+from fmtorch.estimators.one_pair import inliers as one_pair_inliers
+from fmtorch.estimators.one_pair import models as one_pair_models
+from fmtorch.estimators.one_pair import pool as one_pair_pool
+from fmtorch.estimators.one_pair import solvers as one_pair_solvers
 from fmtorch.estimators.options import Focal, Preselect, Refine, Select, at_least_one, group, thresholds
 from fmtorch.estimators.pairs import NormalizedPairs
 from fmtorch.estimators.pool import Verifier, near_models
-from fmtorch.estimators.registry import part
+from fmtorch.estimators.registry import kernel_form, part
 from fmtorch.estimators.sampling import Sampler
 from fmtorch.estimators.scores import Score
 from fmtorch.estimators.search import Search
@@ -113,7 +118,8 @@ class HypothesizeAndVerify:
         if check is not None and generator.size != Degensac.SAMPLE:
             raise ValueError(f"degeneracy={degeneracy} needs solver=seven_point; solver is {solver!r}")
         self.confidence = None if confidence is None else Confidence(confidence, inlier_px, self.sampler)
-        verify = Verifier(self.score, group("preselect", preselect, Preselect))
+        self.preselect = group("preselect", preselect, Preselect)
+        verify = Verifier(self.score, self.preselect)
         self.search = Search(generator, verify, pool, hypotheses, round, self._confident(generator.size), check)
         self.local_optimization = part("local_optimization", local_optimization, threshold=threshold, score=self.score)
         self.refinement = group("refine", refine, Refine)
@@ -132,7 +138,9 @@ class HypothesizeAndVerify:
                 self.focal_search = Search(samples, verify, prior.pool, prior.samples, FOCAL_ROUND)
         self.inlier_rule = part("inliers", inliers, threshold=inlier_px)
         self.final = part("final", final)
-        self.refit_inliers = refit_inliers
+        self.tensor_form = Form(self._selected, self.inlier_rule, self.final, refit_inliers)
+        staged = (check, self.local_optimization, self.refinement, choice, prior)
+        self.kernel_form = None if any(stage is not None for stage in staged) else self._kernel_form(refit_inliers)
 
     @property
     def uses_prior(self) -> bool:
@@ -143,18 +151,41 @@ class HypothesizeAndVerify:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
         least = self.search.generator.size
         at_once = self.search.generator.samples_at_once(c.mask.device) // self.search.round
-        return solve_all(c, seed, least, self._solve, "every minimal sample was degenerate", at_once)
+        form: Callable[[NormalizedPairs], Outcome] = self.tensor_form
+        if self.kernel_form is not None and c.mask.device.type == "cpu" and kernels.available():
+            form = functools.partial(pair_by_pair, self.kernel_form)
+        solve = functools.partial(self._solve, form)
+        return solve_all(c, seed, least, solve, "every minimal sample was degenerate", at_once)
 
-    def _solve(self, pairs: NormalizedPairs) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Search to fit: F (p, 3, 3) in normalised units, inliers (p, n), found (p,), draws (p,)."""
+    def _solve(
+        self, form: Callable[[NormalizedPairs], Outcome], pairs: NormalizedPairs
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Search to fit: F (p, 3, 3) in normalised units, inliers (p, n), found (p,), draws (p,).
+
+        F is attached to the graph of points, prior and noise where one is recorded.
+        """
         with torch.no_grad():
-            selection = self._selected(pairs)
-            inliers = self.inlier_rule(selection.matrices, pairs)
-        F = self.fit(selection, pairs, inliers)
-        if self.refit_inliers:
-            with torch.no_grad():
-                inliers = self.inlier_rule(F, pairs)
-        return F, inliers, selection.found, selection.draws
+            fit, inliers, found, draws = form(pairs)
+        F = fit.F + self.final.attached(fit, pairs) if pairs.requires_grad else fit.F
+        return F, inliers, found, draws
+
+    def _kernel_form(self, refit_inliers: bool) -> Form | None:
+        """The same parts in their kernel form; None unless each of them has one."""
+        search = self.search
+        parts = (search.generator.solver, self.sampler, self.score, self.inlier_rule, self.final)
+        solver, sampler, score, inlier_rule, final = map(kernel_form, parts)
+        if None in (solver, sampler, score, inlier_rule, final):
+            return None
+        confident = None
+        if self.confidence is not None:
+            rule = one_pair_inliers.Confidence(self.confidence, sampler)
+            confident = functools.partial(rule, size=solver.size)
+        generator = one_pair_solvers.MinimalSamples(solver, sampler)
+        verify = one_pair_pool.Verifier(score, self.preselect)
+        rounds = dataclasses.replace(
+            search, generator=generator, verify=verify, confident=confident, nothing=one_pair_models.Pool.of
+        ).rounds
+        return Form(lambda pair: one_pair_models.first_of_pool(rounds(pair), pair), inlier_rule, final, refit_inliers)
 
     def _selected(self, pairs: NormalizedPairs) -> Selection:
         """Search, refine and select: with plausible cameras first where the image sizes are known."""
@@ -168,7 +199,7 @@ class HypothesizeAndVerify:
         assert pairs.size1 is not None
         decided = ((pairs.size0 == pairs.size1).all(-1) | candidates.unambiguous()).tolist()
         confident = self._confident(FocalSamples.size)
-        enough = [False] * len(pairs) if confident is None else confident(F, pool.draws, pairs)
+        enough = [False] * len(pairs) if confident is None else confident((F, pool.draws), pairs)
         open_ = [i for i, (one, other) in enumerate(zip(decided, enough, strict=True)) if not (one and other)]
         if open_:
             rows, some = torch.tensor(open_, device=pairs.row.device), pairs.only(open_)
@@ -197,15 +228,6 @@ class HypothesizeAndVerify:
             return self.selector(pool, pairs)
         F, cameras = self.focal(pool.F, pool.valid, pairs, pool.near, candidates)
         return Selection(F, cameras, pool.valid.any(1), pool.draws)
-
-    def fit(self, selection: Selection, pairs: NormalizedPairs, inliers: Tensor) -> Float[Tensor, "p 3 3"]:
-        """The estimate, attached to the graph of points, prior and noise where one is recorded."""
-        with torch.no_grad():
-            fit: Fit = self.final.value(selection, pairs, inliers)
-        if not pairs.requires_grad:
-            return fit.F
-        gradient: Tensor = self.final.attached(fit, pairs)
-        return fit.F + gradient
 
     def _near(self, pool: Pool, pairs: NormalizedPairs) -> NormalizedPairs:
         """The pairs with the matches on which the pool's models are refined."""

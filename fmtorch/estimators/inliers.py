@@ -79,9 +79,10 @@ class Confidence:
         self.probability, self.threshold, self.sampler = probability, threshold, sampler
 
     def __call__(
-        self, F: Float[Tensor, "9 p"], draws: Int[Tensor, " p"], pairs: NormalizedPairs, size: int
+        self, best: tuple[Float[Tensor, "9 p"], Int[Tensor, " p"]], pairs: NormalizedPairs, size: int
     ) -> list[bool]:
-        """Whether the best model of each pair may be taken for the best there is. size: of the samples drawn."""
+        """Whether the best model of each pair, after so many draws of `size` matches, may be taken for the best there is."""
+        F, draws = best
         r2 = sampson_squared(F[..., None].contiguous(), pairs.points.to(F.dtype))[:, 0]
         support = r2 <= (self.threshold / pairs.pixels_per_unit).square().to(r2.dtype)[:, None]
         weight = self.sampler.weight(pairs)

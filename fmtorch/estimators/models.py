@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -61,6 +62,11 @@ class Pool:
         )
 
     @staticmethod
+    def of(pairs: NormalizedPairs, size: int) -> Pool:
+        """Nothing found yet of these pairs."""
+        return Pool.empty(len(pairs), size, pairs.points.device)
+
+    @staticmethod
     def joined(parts: list[Pool]) -> Pool:
         """The pools of several groups of pairs, one after the other."""
         if len(parts) == 1:
@@ -73,12 +79,19 @@ class Pool:
         """Which slots hold a model."""
         return torch.isfinite(self.score)
 
-    def merge(self, rows: Int[Tensor, " q"], models: Models) -> None:
-        """Keep the best of these rows' models and the new ones; the earlier draw wins a tie."""
+    def merge(self, rows: Sequence[int] | Int[Tensor, " q"], models: Models, draws: int) -> None:
+        """Keep the best of these rows' models and the new ones; the earlier draw wins a tie. draws: all until now."""
         assert models.score is not None
+        rows = torch.as_tensor(rows, device=self.score.device)
+        self.draws[rows] = draws
         F = torch.cat([self.F[:, rows], models.F], 2)
         score = torch.cat([self.score[rows], models.score], 1)
         top, order = torch.sort(score, dim=1, descending=True, stable=True)
         size = self.score.shape[1]
         self.score[rows] = top[:, :size]
         self.F[:, rows] = F.gather(2, order[:, :size].expand(9, -1, -1))
+
+    def best(self, rows: Sequence[int]) -> tuple[Float[Tensor, "9 q"], Int[Tensor, " q"]]:
+        """The best model of each of these rows, zero where there is none, and the samples drawn."""
+        index = torch.as_tensor(rows, device=self.score.device)
+        return self.F[:, index, 0], self.draws[index]

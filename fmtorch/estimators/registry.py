@@ -7,6 +7,7 @@ An option that names a part holds its name (``score: msac``), or a mapping of it
 from __future__ import annotations
 
 import inspect
+import pkgutil
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -27,33 +28,40 @@ from fmtorch.estimators.solvers import EightPoint, SevenPoint
 
 
 class Entry(NamedTuple):
-    """A part in its two forms. tensor: makes the one on padded tensors. kernel: dotted name of the compiled one."""
+    """A part in its two forms. tensor: makes the one on padded tensors. kernel: name of the other within `one_pair`."""
 
     tensor: Callable[..., Any]
     kernel: str | None = None
 
 
 PARTS: dict[str, dict[str, Entry]] = {
-    "solver": {"seven_point": Entry(SevenPoint), "eight_point": Entry(EightPoint)},
-    "sampler": {"uniform": Entry(Uniform), "prosac": Entry(Prosac), "prior": Entry(PriorWeighted)},
+    "solver": {
+        "seven_point": Entry(SevenPoint, "solvers.SevenPoint"),
+        "eight_point": Entry(EightPoint, "solvers.EightPoint"),
+    },
+    "sampler": {
+        "uniform": Entry(Uniform, "sampling.Uniform"),
+        "prosac": Entry(Prosac, "sampling.Prosac"),
+        "prior": Entry(PriorWeighted, "sampling.PriorWeighted"),
+    },
     "score": {
-        "inlier_count": Entry(InlierCount),
-        "msac": Entry(TruncatedSquares),
+        "inlier_count": Entry(InlierCount, "scores.InlierCount"),
+        "msac": Entry(TruncatedSquares, "scores.TruncatedSquares"),
         "saturated": Entry(SaturatedGains),
-        "magsac": Entry(SigmaConsensus),
-        "median": Entry(Median),
+        "magsac": Entry(SigmaConsensus, "scores.SigmaConsensus"),
+        "median": Entry(Median, "scores.Median"),
     },
     "degeneracy": {"degensac": Entry(Degensac)},
     "local_optimization": {"graph_cut": Entry(GraphCut)},
     "inliers": {
-        "threshold": Entry(WithinThreshold),
-        "median": Entry(BetterHalf),
-        "lmeds": Entry(RobustDeviations),
+        "threshold": Entry(WithinThreshold, "inliers.WithinThreshold"),
+        "median": Entry(BetterHalf, "inliers.BetterHalf"),
+        "lmeds": Entry(RobustDeviations, "inliers.RobustDeviations"),
     },
     "final": {
-        "none": Entry(NoFit),
-        "least_squares": Entry(LeastSquares),
-        "unweighted_least_squares": Entry(UnweightedLeastSquares),
+        "none": Entry(NoFit, "final_fits.NoFit"),
+        "least_squares": Entry(LeastSquares, "final_fits.LeastSquares"),
+        "unweighted_least_squares": Entry(UnweightedLeastSquares, "final_fits.LeastSquares"),
         "gauss_newton": Entry(GaussNewton),
         "adaptive": Entry(AdaptiveGaussNewton),
     },
@@ -85,3 +93,13 @@ def part(role: str, spec: Any, **context: Any) -> Any:
     if unknown:
         raise ValueError(f"{role}={name}: no option {', '.join(unknown)}; there are: {', '.join(known) or 'none'}")
     return make(**({key: value for key, value in context.items() if key in known} | options))
+
+
+def kernel_form(made: object) -> Any:
+    """The kernel form of a part, with the same options; None where there is none, as of a user's own part."""
+    for entries in PARTS.values():
+        for entry in entries.values():
+            if entry.tensor is type(made) and entry.kernel is not None:
+                module, _, name = entry.kernel.partition(".")
+                return pkgutil.resolve_name(f"fmtorch.estimators.one_pair.{module}:{name}")(made)
+    return None

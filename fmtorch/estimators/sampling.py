@@ -89,14 +89,18 @@ class PriorWeighted:
         """The priors, quantised so that their sums are exact, the same on any device and under any padding."""
         if pairs.prior is None:
             return pairs.mask.to(torch.int64)
-        largest = 1 << (_TOTAL_BITS - (pairs.mask.shape[1] - 1).bit_length())
-        weight = (pairs.prior * largest).round().to(torch.int64).clamp_min(1)
+        weight = (pairs.prior * largest_weight(pairs.mask.shape[1])).round().to(torch.int64).clamp_min(1)
         return torch.where(pairs.mask, weight, 0)
 
     def draw(self, pairs: NormalizedPairs, start: int, count: int, size: int) -> Int[Tensor, "size p count"]:
         """As `Sampler.draw`."""
         table = pairs.once("cumulative priors", lambda: self.weight(pairs).cumsum(-1))
         return torch.stack(_without_replacement(pairs, table[:, -1:].expand(-1, count), table, start, size))
+
+
+def largest_weight(slots: int) -> int:
+    """The weight of a prior of one in a bucket of so many slots."""
+    return 1 << (_TOTAL_BITS - (slots - 1).bit_length())
 
 
 def _without_replacement(

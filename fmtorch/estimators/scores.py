@@ -121,6 +121,11 @@ class SigmaConsensus(SummedGains):
         middle = (torch.arange(self.ENTRIES, dtype=torch.float64) + 0.5) / self.ENTRIES
         self._table = torch.cat([self.gain(middle), torch.zeros(1, dtype=torch.float64)]).to(torch.float32)
 
+    @property
+    def table(self) -> Float[Tensor, " entries"]:
+        """The gains of `ENTRIES` intervals of (r / threshold)^2, and 0 from the threshold on; float32."""
+        return self._table
+
     @staticmethod
     def gain(squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
         """1 - rho / rho_max of residuals below the threshold, as a function of (r / threshold)^2."""

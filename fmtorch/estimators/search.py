@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float, Int
-from torch import Tensor
-
 from fmtorch.estimators.degeneracy import Degensac
 from fmtorch.estimators.models import Models, Pool
 from fmtorch.estimators.pairs import NormalizedPairs
 
-Confident = Callable[[Float[Tensor, "9 p"], Int[Tensor, " p"], NormalizedPairs], list[bool]]
-"""Whether the best model of each pair, after so many draws, may be taken for the best there is."""
+Confident = Callable[[Any, Any], list[bool]]
+"""Of the best model of each pair with the draws until now, and the pairs: whether it may be taken for the best there is."""
 
 
 @runtime_checkable
@@ -35,41 +32,42 @@ class Generator(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Search:
-    """One loop for every generator.
+    """One loop for every generator, in both forms: of pairs in tensors, and of one pair in arrays.
 
     verify: scores models, drops weak ones. pool: the best models that are kept. hypotheses: samples drawn at most.
     round: samples between two looks at the stopping rule `confident`, None: never before `hypotheses`. degeneracy:
-    completes a best model whose sample is degenerate.
+    completes a best model whose sample is degenerate. nothing: makes the empty pool of pairs, in the form of the parts.
     """
 
-    generator: Generator
-    verify: Callable[[Models, NormalizedPairs], Models]
+    generator: Any  # a Generator, or its kernel form
+    verify: Callable[[Any, Any], Any]
     pool: int
     hypotheses: int
     round: int
     confident: Confident | None = None
     degeneracy: Degensac | None = None
+    nothing: Callable[[Any, int], Any] = Pool.of
 
     def __call__(self, pairs: NormalizedPairs) -> Pool:
         """The best models of each pair."""
         at_once = self.generator.samples_at_once(pairs.points.device) // min(self.hypotheses, self.round)
         tiles = torch.split(torch.arange(len(pairs), device=pairs.row.device), max(1, at_once))
-        return Pool.joined([self._tile(pairs.only(tile)) for tile in tiles])
+        return Pool.joined([self.rounds(pairs.only(tile)) for tile in tiles])
 
-    def _tile(self, pairs: NormalizedPairs) -> Pool:
-        pool = Pool.empty(len(pairs), self.pool, pairs.points.device)
+    def rounds(self, pairs: Any) -> Any:
+        """The pool of pairs that are searched together."""
+        pool = self.nothing(pairs, self.pool)
         active = list(range(len(pairs)))
         start = 0
         while start < self.hypotheses and active:
             count = min(self.round, self.hypotheses - start)
-            rows, some = torch.tensor(active, device=pairs.row.device), pairs.only(active)
+            some = pairs.only(active)
             models = self.verify(self.generator(some, start, count), some)
             if self.degeneracy is not None:
-                models = self.degeneracy(models, pool.score[rows, 0], some)
-            pool.merge(rows, models)
+                models = self.degeneracy(models, pool.score[torch.as_tensor(active, device=pairs.row.device), 0], some)
             start += count
-            pool.draws[rows] = start
+            pool.merge(active, models, start)
             if self.confident is not None and start < self.hypotheses:
-                done = self.confident(pool.F[:, rows, 0], pool.draws[rows], some)
+                done = self.confident(pool.best(active), some)
                 active = [row for row, stop in zip(active, done, strict=True) if not stop]
         return pool

@@ -1,0 +1,92 @@
+"""`inliers` on the arrays of one pair: rules that tell inliers, and the rule that stops a search."""
+
+from __future__ import annotations
+
+import math
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from fmtorch.estimators import inliers
+from fmtorch.estimators.one_pair.pair import Array, OnePair
+from fmtorch.estimators.one_pair.sampling import Sampler
+from fmtorch.estimators.pool_kernels import residuals_squared
+
+
+def residuals_squared_px(F: Array, pair: OnePair) -> Array:
+    """Squared Sampson distances (n,) to a model of nine entries in squared pixels, float64."""
+    out = np.empty(pair.count)
+    residuals_squared(np.ascontiguousarray(F, np.float64).reshape(9), pair.points, out)
+    out *= pair.pixels_per_unit**2
+    return out
+
+
+def median_of_matches(r2: Array) -> float:
+    """The (lower) median."""
+    rank = (len(r2) + 1) // 2 - 1
+    return float(np.partition(r2, rank)[rank])
+
+
+@runtime_checkable
+class InlierRule(Protocol):
+    """As `inliers.InlierRule`."""
+
+    def __call__(self, F: Array, pair: OnePair) -> Array:
+        """The inliers (n,) of a model (3, 3)."""
+        ...
+
+
+class WithinThreshold:
+    """As `inliers.WithinThreshold`."""
+
+    def __init__(self, part: inliers.WithinThreshold) -> None:
+        self.part = part
+
+    def __call__(self, F: Array, pair: OnePair) -> Array:
+        """As `InlierRule`."""
+        within: Array = residuals_squared_px(F, pair) <= self.part.threshold**2
+        return within
+
+
+class BetterHalf:
+    """As `inliers.BetterHalf`."""
+
+    def __init__(self, part: inliers.BetterHalf) -> None:
+        pass
+
+    def __call__(self, F: Array, pair: OnePair) -> Array:
+        """As `InlierRule`."""
+        r2 = residuals_squared_px(F, pair)
+        better: Array = r2 <= median_of_matches(r2)
+        return better
+
+
+class RobustDeviations:
+    """As `inliers.RobustDeviations`."""
+
+    def __init__(self, part: inliers.RobustDeviations) -> None:
+        self.part = part
+
+    def __call__(self, F: Array, pair: OnePair) -> Array:
+        """As `InlierRule`."""
+        r2 = residuals_squared_px(F, pair)
+        spare = max(pair.count - self.part.PARAMETERS, 1)
+        sigma = 1.4826 * (1 + 5 / spare) * math.sqrt(median_of_matches(r2))
+        within: Array = r2 <= (2.5 * sigma) ** 2
+        return within
+
+
+class Confidence:
+    """As `inliers.Confidence`."""
+
+    def __init__(self, part: inliers.Confidence, sampler: Sampler) -> None:
+        self.part, self.sampler = part, sampler
+
+    def __call__(self, best: tuple[Array, int], pair: OnePair, size: int) -> list[bool]:
+        """Whether the best model (9,), after so many draws of `size` matches, may be taken for the best there is."""
+        F, draws = best
+        support = residuals_squared_px(F, pair) <= self.part.threshold**2
+        weight = self.sampler.weight(pair)
+        share = int(weight[support].sum()) / int(weight.sum())
+        missed = math.log1p(-min(share**size, 1 - 1e-12)) * draws
+        return [missed <= math.log1p(-self.part.probability)]

@@ -1,0 +1,70 @@
+"""`models` as arrays of one pair: what a generator of hypotheses makes, a search keeps and the engine selects."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from fmtorch.estimators.one_pair.pair import Array, OnePair
+from fmtorch.estimators.pool_kernels import merge
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Models:
+    """Hypotheses of one round in the order of their draws: F (m, 9) float32, and the draw (m,) that each is made of.
+
+    which: (k,), those that are left once verified, in their order. score: theirs, (k,); larger is better.
+    """
+
+    F: Array
+    draw: Array
+    which: Array | None = None
+    score: Array | None = None
+
+
+@dataclasses.dataclass(eq=False)
+class Pool:
+    """The best models of a pair, F (k, 9) float32 with descending scores (k,), of which `filled` are there.
+
+    draw: (k,), that each model is made of. draws: minimal samples drawn.
+    """
+
+    F: Array
+    score: Array
+    draw: Array
+    filled: int = 0
+    draws: int = 0
+
+    @staticmethod
+    def of(pair: OnePair, size: int) -> Pool:
+        """Nothing found yet."""
+        return Pool(np.zeros((size, 9), np.float32), np.full(size, -np.inf), np.zeros(size, np.int64))
+
+    def merge(self, rows: Sequence[int], models: Models, draws: int) -> None:
+        """Keep the best of this pool's models and the new ones; the earlier draw wins a tie. draws: all until now."""
+        assert models.which is not None
+        assert models.score is not None
+        finite = np.isfinite(models.score)
+        which, score = models.which[finite], models.score[finite]
+        self.filled = merge(models.F, which, score, models.draw, self.filled, self.F, self.score, self.draw)
+        self.draws = draws
+
+    def best(self, rows: Sequence[int]) -> tuple[Array, int]:
+        """The best model (9,), zero where there is none, and the samples drawn."""
+        return self.F[0], self.draws
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Selection:
+    """The selected model (3, 3), float64; whether there is one, and the samples drawn."""
+
+    matrices: Array
+    found: bool
+    draws: int
+
+
+def first_of_pool(pool: Pool, pair: OnePair) -> Selection:
+    """The best model as the search found it."""
+    return Selection(pool.F[0].astype(np.float64).reshape(3, 3), pool.filled > 0, pool.draws)

@@ -1,0 +1,48 @@
+"""`pool` on the arrays of one pair: from a round's hypotheses to those that may enter the pool."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from fmtorch.estimators.one_pair.models import Models
+from fmtorch.estimators.one_pair.pair import Array, OnePair
+from fmtorch.estimators.one_pair.scores import Score
+from fmtorch.estimators.options import Preselect
+from fmtorch.estimators.pool_kernels import best
+from fmtorch.random import Stream, mixed_seed
+from fmtorch.random_kernels import random_words
+
+
+class Verifier:
+    """As `pool.Verifier`."""
+
+    def __init__(self, score: Score, preselect: Preselect | None) -> None:
+        self.score, self.preselect = score, preselect
+
+    def __call__(self, models: Models, pair: OnePair) -> Models:
+        """As `pool.Verifier`."""
+        which = np.arange(len(models.F))
+        first_look = self._first_look(pair) if len(which) else None
+        if first_look is not None and self.preselect is not None and len(which) > self.preselect.survivors:
+            score, which = self.score(models.F, which, first_look), np.empty(self.preselect.survivors, np.int64)
+            best(score, which)
+        return dataclasses.replace(models, which=which, score=self.score(models.F, which, pair))
+
+    def _first_look(self, pair: OnePair) -> OnePair | None:
+        """The pair with the matches of the first look; None where there is none."""
+        if self.preselect is None or pair.slots < 2 * self.preselect.matches:
+            return None
+        matches = self.preselect.matches
+        found: OnePair = pair.once(
+            f"{matches} matches of a first look", lambda: pair.take(shuffled(pair, Stream.PRESELECTION)[:matches])
+        )
+        return found
+
+
+def shuffled(pair: OnePair, stream: Stream) -> Array:
+    """The matches, (n,), in an order that the pair's key decides: as `pool.shuffled` of all of them."""
+    words = np.empty(pair.count, np.int64)
+    random_words(mixed_seed(pair.seed, stream), pair.key, 0, words)
+    return np.argsort(words, kind="stable")

@@ -1,0 +1,256 @@
+"""The kernel form of the engine's parts against the tensor form, and whole presets in both forms."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+
+from fmtorch import kernels, presets
+from fmtorch.estimators import HypothesizeAndVerify, final_fits, inliers, sampling, scores
+from fmtorch.estimators.models import Models as TensorModels
+from fmtorch.estimators.one_pair import inliers as compiled_inliers
+from fmtorch.estimators.one_pair import sampling as compiled_sampling
+from fmtorch.estimators.one_pair.models import Models, Selection
+from fmtorch.estimators.one_pair.pair import OnePair, each_pair
+from fmtorch.estimators.one_pair.pool import Verifier, shuffled
+from fmtorch.estimators.options import Preselect
+from fmtorch.estimators.pairs import NormalizedPairs, normalized_pairs
+from fmtorch.estimators.pool import Verifier as TensorVerifier
+from fmtorch.estimators.pool import shuffled as shuffled_tensor
+from fmtorch.estimators.registry import PARTS, kernel_form
+from fmtorch.estimators.selection import without_cameras
+from fmtorch.geometry import eight_point
+from fmtorch.random import Stream
+from fmtorch.types import Correspondences, Estimate, collate
+from tests.laws import degenerate, scene, scenes, small, with_padding
+
+pytest.importorskip("numba", reason="numba is not installed")
+
+PRESETS = ("lmeds", "lmeds_eight_point", "msac", "ransac", "ransac_eight_point")
+COUNTS = (8, 40, 128, 129, 150, 250, 700)
+SEED = 3
+
+
+def both(c: Correspondences) -> tuple[NormalizedPairs, OnePair]:
+    (pairs,), _ = normalized_pairs(c, SEED, 7)
+    (pair,) = each_pair(pairs)
+    return pairs, pair
+
+
+def told(count: int, kind: str = "all") -> Correspondences:
+    c = scene(count, count)
+    c = c.replace(noise=torch.linspace(0.2, 5, count)[None])
+    return c.replace(**dict.fromkeys(("prior", "quality", "noise"))) if kind == "nothing" else c
+
+
+def models(pairs: NormalizedPairs, count: int) -> torch.Tensor:
+    """Models (count, 9) of random eights of the first pair, which fit some of its matches; the first is zero."""
+    index = np.random.default_rng(0).integers(0, int(pairs.count[0]), (count, 8))
+    points = pairs.points[:, 0, index].permute(1, 2, 0)
+    F, _ = eight_point(points[..., :2], points[..., 2:])
+    F[0] = 0
+    return F.flatten(1).float()
+
+
+@pytest.mark.parametrize("kind", ["all", "nothing"])
+def test_a_pair_holds_its_own_matches_in_order(kind: str) -> None:
+    c = with_padding(collate([told(count, kind) for count in COUNTS]), np.random.default_rng(1), float("nan"))
+    buckets, _ = normalized_pairs(c, SEED, 7)
+    for pairs in buckets:
+        for i, pair in enumerate(each_pair(pairs)):
+            mask = pairs.mask[i]
+            assert (len(pair), pair.count, pair.slots) == (1, int(pairs.count[i]), len(mask))
+            assert (pair.key, pair.seed) == (int(pairs.key[i]), SEED)
+            np.testing.assert_array_equal(pair.points, pairs.points[:, i, mask])
+            np.testing.assert_array_equal(pair.points32, pairs.points32[:, i, mask])
+            np.testing.assert_array_equal(pair.scale, pairs.scale.expand(pairs.mask.shape)[i, mask])
+            np.testing.assert_array_equal(pair.weight, pairs.weight[i, mask])
+            for name in ("quality", "prior", "noise"):
+                value, expected = getattr(pair, name), getattr(pairs, name)
+                assert (value is None) == (expected is None) == (kind == "nothing")
+                if expected is not None:
+                    np.testing.assert_array_equal(value, expected[i, mask])
+            assert pair.points.flags.c_contiguous
+
+
+def test_a_pair_is_a_copy() -> None:
+    pairs, pair = both(told(40))
+    before = pairs.points.clone()
+    pair.points[:] = 0
+    assert torch.equal(pairs.points, before)
+
+
+@pytest.mark.parametrize("kind", ["all", "nothing"])
+@pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.parametrize("name", PARTS["sampler"])
+def test_samples_and_weights_are_the_same(name: str, count: int, kind: str) -> None:
+    pairs, pair = both(told(count, kind))
+    part = PARTS["sampler"][name].tensor()
+    compiled = kernel_form(part)
+    np.testing.assert_array_equal(compiled.weight(pair), part.weight(pairs)[0, :count])
+    for size in (7, 8):
+        for start, draws in ((0, 100), (70_000, 31)):
+            expected = part.draw(pairs, start, draws, size)[:, 0].numpy()
+            np.testing.assert_array_equal(compiled.draw(pair, start, draws, size), expected)
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_priors_are_quantised_alike_however_small(count: int) -> None:
+    prior = torch.logspace(-12, 0, count)[None]
+    pairs, pair = both(told(count).replace(prior=prior))
+    part = sampling.PriorWeighted()
+    np.testing.assert_array_equal(kernel_form(part).weight(pair), part.weight(pairs)[0, :count])
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_matches_are_shuffled_alike(count: int) -> None:
+    pairs, pair = both(told(count))
+    expected = shuffled_tensor(pairs, Stream.PRESELECTION, pairs.mask)[0, :count].numpy()
+    np.testing.assert_array_equal(shuffled(pair, Stream.PRESELECTION), expected)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("score", [scores.InlierCount, scores.TruncatedSquares, scores.SigmaConsensus, scores.Median])
+@pytest.mark.parametrize("count", [8, 150, 250, 700])
+def test_the_same_models_survive_a_first_look(count: int, score: type, weighted: bool) -> None:
+    """Scores are exact sums of rounded gains: a unit of 2^-10 a match apart, a gain for one on the threshold."""
+    pairs, pair = both(told(count))
+    part = score() if score is scores.Median else score(1.5)
+    part.prior_weighted = weighted and score is not scores.Median
+    F = models(pairs, 120)
+    draw = torch.arange(120)
+    tensors = TensorModels(
+        F.T[:, None].contiguous(), torch.ones(1, 120, dtype=torch.bool), draw[None], torch.zeros(7, 1, 1).long(), 0
+    )
+    for preselect in (None, Preselect(survivors=120), Preselect(survivors=40)):
+        expected = TensorVerifier(part, preselect)(tensors, pairs)
+        found = Verifier(kernel_form(part), preselect)(Models(F.numpy(), draw.numpy()), pair)
+        assert expected.score is not None
+        assert found.score is not None
+        assert found.which is not None
+        common, mine, theirs = np.intersect1d(found.which, expected.draw[0].numpy(), return_indices=True)
+        assert len(found.which) == expected.draw.shape[1]
+        assert len(common) >= 0.95 * len(found.which)  # the last to survive may be nearly equal
+        a, b = found.score[mine], expected.score[0].numpy()[theirs].astype(np.float64)
+        if score is scores.Median:
+            np.testing.assert_allclose(np.sqrt(-a), np.sqrt(-b), rtol=1e-3, atol=1e-5)
+        else:
+            assert np.abs(a - b).max() <= count / 8 * 2.0**-10 + (0 if score is scores.TruncatedSquares else 2)
+
+
+@pytest.mark.parametrize("count", [8, 9, 150, 701])
+@pytest.mark.parametrize(
+    "rule", [inliers.WithinThreshold(1.5), inliers.BetterHalf(), inliers.RobustDeviations()], ids=lambda r: type(r).__name__
+)  # fmt: skip
+def test_inliers_are_the_same(rule: inliers.InlierRule, count: int) -> None:
+    pairs, pair = both(told(count))
+    for F in models(pairs, 20)[1:].double():
+        expected = rule(F.reshape(1, 3, 3), pairs)[0, :count].numpy()
+        np.testing.assert_array_equal(kernel_form(rule)(F.reshape(3, 3).numpy(), pair), expected)
+
+
+@pytest.mark.parametrize("sampler", [sampling.Uniform(), sampling.PriorWeighted()])
+def test_searches_stop_alike(sampler: sampling.Sampler) -> None:
+    decisions = set()
+    for outliers in (0.0, 0.3, 0.6):
+        pairs, pair = both(scene(2, 300, outliers=outliers))
+        rule = inliers.Confidence(0.99, 1.0, sampler)
+        compiled = compiled_inliers.Confidence(rule, kernel_form(sampler))
+        for F in models(pairs, 20)[1:]:
+            for draws in (1, 30, 1000, 100_000):
+                expected = rule((F[:, None], torch.tensor([draws])), pairs, 7)
+                assert compiled((F.numpy(), draws), pair, 7) == expected
+                decisions.add(expected[0])
+    assert decisions == {False, True}
+
+
+@pytest.mark.parametrize("kind", ["all", "nothing"])
+@pytest.mark.parametrize("fit", [final_fits.NoFit, final_fits.LeastSquares, final_fits.UnweightedLeastSquares])
+def test_fits_are_the_same(fit: type, kind: str) -> None:
+    pairs, pair = both(told(300, kind))
+    (pool,) = [HypothesizeAndVerify(hypotheses=200).search(pairs)]
+    selection = without_cameras(pool.F[:, :, 0].double(), pool)
+    inside = inliers.WithinThreshold(1.0)(selection.matrices, pairs)
+    for counted in (inside, inside & (inside.cumsum(1) < 6)):  # too few leave the model as it is
+        expected = fit().value(selection, pairs, counted)
+        one = Selection(selection.matrices[0].numpy(), True, 200)
+        found = kernel_form(fit()).value(one, pair, counted[0, :300].numpy())
+        np.testing.assert_allclose(found.F, expected.F[0], atol=1e-11)
+        np.testing.assert_array_equal(found.at, expected.at[0])
+        np.testing.assert_array_equal(found.counted, expected.counted[0, :300])
+
+
+def in_both_forms(estimator: HypothesizeAndVerify, c: Correspondences) -> tuple[Estimate, Estimate]:
+    assert estimator.kernel_form is not None
+    compiled = estimator(c, seed=SEED)
+    with pytest.MonkeyPatch.context() as environment:
+        environment.setenv(kernels.SWITCH, "off")
+        return compiled, estimator(c, seed=SEED)
+
+
+def inputs() -> Iterator[tuple[str, Correspondences]]:
+    yield "scenes", scenes()
+    yield "nothing told", told(300, "nothing")
+    yield "noise", told(300)
+    for kind in ("empty", "one match", "all points equal", "NaN", "infinite", "some NaN", "huge"):
+        yield kind, degenerate()[kind]
+    for kind in ("8 coincident", "20 coincident", "8 collinear", "20 collinear", "7 random", "20 random"):
+        yield kind, small()[kind]
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_in_both_forms(name: str) -> None:
+    estimator = presets.build("estimator", name)
+    for what, c in inputs():
+        compiled, tensors = in_both_forms(estimator, c)
+        assert compiled.reason == tensors.reason, what
+        assert torch.equal(compiled.ok, tensors.ok), what
+        assert torch.equal(compiled.draws, tensors.draws), what
+        assert compiled.F.dtype == tensors.F.dtype
+        assert compiled.inliers.shape == tensors.inliers.shape
+    compiled, tensors = in_both_forms(estimator, scenes())
+    torch.testing.assert_close(compiled.F, tensors.F, rtol=0, atol=1e-9)
+    assert torch.equal(compiled.inliers, tensors.inliers)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_gradients_in_both_forms(name: str) -> None:
+    gradients = []
+    estimator = presets.build("estimator", name, refit_inliers=False)
+    for switch in ("on", "off"):
+        with pytest.MonkeyPatch.context() as environment:
+            environment.setenv(kernels.SWITCH, switch)
+            c = scenes()
+            x0 = c.x0.double().requires_grad_()
+            estimator(c.replace(x0=x0, x1=c.x1.double())).F.square()[:, 0, 1].sum().backward()
+        assert x0.grad is not None
+        gradients.append(x0.grad)
+    assert bool((gradients[0] != 0).any())
+    torch.testing.assert_close(gradients[0], gradients[1], rtol=1e-6, atol=1e-12)
+
+
+def test_which_wholes_have_a_kernel_form() -> None:
+    """All parts, or none: a user's part, or a stage without a kernel form, takes the tensor form."""
+
+    class Own(scores.TruncatedSquares):
+        pass
+
+    assert HypothesizeAndVerify().kernel_form is not None
+    assert HypothesizeAndVerify(sampler="prosac", score="magsac", final="none").kernel_form is not None
+    for options in (
+        {"score": Own(1.0)}, {"score": "saturated"}, {"final": "gauss_newton"}, {"degeneracy": "degensac"},
+        {"refine": {"kernel": "truncated"}}, {"local_optimization": "graph_cut"}, {"select": {}},
+    ):  # fmt: skip
+        assert HypothesizeAndVerify(**options).kernel_form is None, options
+
+
+def test_kernels_switched_off_are_not_called(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiled_sampling, "draw", None)
+    monkeypatch.setenv(kernels.SWITCH, "off")
+    assert bool(HypothesizeAndVerify(hypotheses=100)(scene(0)).ok)
+    monkeypatch.setenv(kernels.SWITCH, "on")
+    with pytest.raises(TypeError):
+        HypothesizeAndVerify(hypotheses=100)(scene(0))
