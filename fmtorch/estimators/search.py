@@ -7,12 +7,13 @@ from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 import torch
+
 from fmtorch.estimators.degeneracy import Degensac
 from fmtorch.estimators.models import Models, Pool
 from fmtorch.estimators.pairs import NormalizedPairs
 
 Confident = Callable[[Any, Any], list[bool]]
-"""Of the best model of each pair with the draws until now, and the pairs: whether it may be taken for the best there is."""
+"""Of the best model of each pair with the draws until now, and the pairs: whether it is taken for the best there is."""
 
 
 @runtime_checkable

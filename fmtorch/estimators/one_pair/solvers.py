@@ -1,4 +1,4 @@
-"""`solvers` on the arrays of one pair: float64 until the model is rounded to float32, where tensors solve in float32."""
+"""`solvers` on the arrays of one pair: float64 up to the model, where tensors solve in float32."""
 
 from __future__ import annotations
 
