@@ -81,7 +81,7 @@ class Confidence:
     def __call__(
         self, best: tuple[Float[Tensor, "9 p"], Int[Tensor, " p"]], pairs: NormalizedPairs, size: int
     ) -> list[bool]:
-        """Whether the best model of each pair, after its draws of `size` matches, may be taken for the best there is."""
+        """Whether the best model of each pair, after its draws of `size` matches, is taken for the best there is."""
         F, draws = best
         r2 = sampson_squared(F[..., None].contiguous(), pairs.points.to(F.dtype))[:, 0]
         support = r2 <= (self.threshold / pairs.pixels_per_unit).square().to(r2.dtype)[:, None]
