@@ -199,7 +199,7 @@ class HypothesizeAndVerify:
         assert pairs.size1 is not None
         decided = ((pairs.size0 == pairs.size1).all(-1) | candidates.unambiguous()).tolist()
         confident = self._confident(FocalSamples.size)
-        enough = [False] * len(pairs) if confident is None else confident((F, pool.draws), pairs)
+        enough = [False] * len(pairs) if confident is None else confident(F, pool.draws, pairs)
         open_ = [i for i, (one, other) in enumerate(zip(decided, enough, strict=True)) if not (one and other)]
         if open_:
             rows, some = torch.tensor(open_, device=pairs.row.device), pairs.only(open_)

@@ -79,10 +79,9 @@ class Confidence:
         self.probability, self.threshold, self.sampler = probability, threshold, sampler
 
     def __call__(
-        self, best: tuple[Float[Tensor, "9 p"], Int[Tensor, " p"]], pairs: NormalizedPairs, size: int
+        self, F: Float[Tensor, "9 p"], draws: Int[Tensor, " p"], pairs: NormalizedPairs, size: int
     ) -> list[bool]:
-        """Whether the best model of each pair, after its draws of `size` matches, is taken for the best there is."""
-        F, draws = best
+        """Whether the best model of each pair may be taken for the best there is. size: of the samples drawn."""
         r2 = sampson_squared(F[..., None].contiguous(), pairs.points.to(F.dtype))[:, 0]
         support = r2 <= (self.threshold / pairs.pixels_per_unit).square().to(r2.dtype)[:, None]
         weight = self.sampler.weight(pairs)

@@ -79,17 +79,20 @@ class Pool:
         """Which slots hold a model."""
         return torch.isfinite(self.score)
 
-    def merge(self, rows: Sequence[int] | Int[Tensor, " q"], models: Models, draws: int) -> None:
-        """Keep the best of these rows' models and the new ones; the earlier draw wins a tie. draws: all until now."""
+    def merge(self, rows: Sequence[int] | Int[Tensor, " q"], models: Models) -> None:
+        """Keep the best of these rows' models and the new ones; the earlier draw wins a tie."""
         assert models.score is not None
         rows = torch.as_tensor(rows, device=self.score.device)
-        self.draws[rows] = draws
         F = torch.cat([self.F[:, rows], models.F], 2)
         score = torch.cat([self.score[rows], models.score], 1)
         top, order = torch.sort(score, dim=1, descending=True, stable=True)
         size = self.score.shape[1]
         self.score[rows] = top[:, :size]
         self.F[:, rows] = F.gather(2, order[:, :size].expand(9, -1, -1))
+
+    def drawn(self, rows: Sequence[int], draws: int) -> None:
+        """So many samples were drawn until now for each of these rows."""
+        self.draws[torch.as_tensor(rows, device=self.score.device)] = draws
 
     def best(self, rows: Sequence[int]) -> tuple[Float[Tensor, "9 q"], Int[Tensor, " q"]]:
         """The best model of each of these rows, zero where there is none, and the samples drawn."""

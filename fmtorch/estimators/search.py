@@ -12,8 +12,8 @@ from fmtorch.estimators.degeneracy import Degensac
 from fmtorch.estimators.models import Models, Pool
 from fmtorch.estimators.pairs import NormalizedPairs
 
-Confident = Callable[[Any, Any], list[bool]]
-"""Of the best model of each pair with the draws until now, and the pairs: whether it is taken for the best there is."""
+Confident = Callable[[Any, Any, Any], list[bool]]
+"""Whether the best model of each pair, after so many draws, may be taken for the best there is; in either form."""
 
 
 @runtime_checkable
@@ -67,8 +67,10 @@ class Search:
             if self.degeneracy is not None:
                 models = self.degeneracy(models, pool.score[torch.as_tensor(active, device=pairs.row.device), 0], some)
             start += count
-            pool.merge(active, models, start)
+            pool.merge(active, models)
+            pool.drawn(active, start)
             if self.confident is not None and start < self.hypotheses:
-                done = self.confident(pool.best(active), some)
+                F, drawn = pool.best(active)
+                done = self.confident(F, drawn, some)
                 active = [row for row, stop in zip(active, done, strict=True) if not stop]
         return pool

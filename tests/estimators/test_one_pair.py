@@ -161,8 +161,8 @@ def test_searches_stop_alike(sampler: sampling.Sampler) -> None:
         compiled = compiled_inliers.Confidence(rule, kernel_form(sampler))
         for F in models(pairs, 20)[1:]:
             for draws in (1, 30, 1000, 100_000):
-                expected = rule((F[:, None], torch.tensor([draws])), pairs, 7)
-                assert compiled((F.numpy(), draws), pair, 7) == expected
+                expected = rule(F[:, None], torch.tensor([draws]), pairs, 7)
+                assert compiled(F.numpy(), draws, pair, 7) == expected
                 decisions.add(expected[0])
     assert decisions == {False, True}
 

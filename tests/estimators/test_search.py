@@ -60,7 +60,7 @@ def test_a_pool_keeps_the_best_and_the_earlier_of_equals() -> None:
         none = torch.zeros(7, 1, 1, dtype=torch.int64)
         draw = torch.zeros(1, len(scores), dtype=torch.int64)
         valid = torch.ones(1, len(scores), dtype=torch.bool)
-        pool.merge([0], Models(F, valid, draw, none, 0, torch.tensor([scores])), 1)
+        pool.merge(torch.tensor([0]), Models(F, valid, draw, none, 0, torch.tensor([scores])))
 
     offer([1.0, 3.0], 10)
     assert pool.valid.tolist() == [[True, True, False]]

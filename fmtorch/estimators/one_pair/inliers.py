@@ -82,9 +82,8 @@ class Confidence:
     def __init__(self, part: inliers.Confidence, sampler: Sampler) -> None:
         self.part, self.sampler = part, sampler
 
-    def __call__(self, best: tuple[Array, int], pair: OnePair, size: int) -> list[bool]:
+    def __call__(self, F: Array, draws: int, pair: OnePair, size: int) -> list[bool]:
         """Whether the best model (9,), after so many draws of `size` matches, may be taken for the best there is."""
-        F, draws = best
         support = residuals_squared_px(F, pair) <= self.part.threshold**2
         weight = self.sampler.weight(pair)
         share = int(weight[support].sum()) / int(weight.sum())

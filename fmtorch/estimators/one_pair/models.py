@@ -42,13 +42,16 @@ class Pool:
         """Nothing found yet."""
         return Pool(np.zeros((size, 9), np.float32), np.full(size, -np.inf), np.zeros(size, np.int64))
 
-    def merge(self, rows: Sequence[int], models: Models, draws: int) -> None:
-        """Keep the best of this pool's models and the new ones; the earlier draw wins a tie. draws: all until now."""
+    def merge(self, rows: Sequence[int], models: Models) -> None:
+        """Keep the best of this pool's models and the new ones; the earlier draw wins a tie."""
         assert models.which is not None
         assert models.score is not None
         finite = np.isfinite(models.score)
         which, score = models.which[finite], models.score[finite]
         self.filled = merge(models.F, which, score, models.draw, self.filled, self.F, self.score, self.draw)
+
+    def drawn(self, rows: Sequence[int], draws: int) -> None:
+        """So many samples were drawn until now."""
         self.draws = draws
 
     def best(self, rows: Sequence[int]) -> tuple[Array, int]:
