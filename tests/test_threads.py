@@ -14,7 +14,6 @@ from fmtorch.data import read_image
 from fmtorch.estimators import batching
 from fmtorch.matching import nearest
 from fmtorch.pruning import position_consistency as consistency
-from fmtorch.types import Estimate
 from tests.laws import scene
 from tests.test_pipeline import draw, pair, pipeline
 
@@ -76,13 +75,12 @@ def test_matching_and_find_fundamental_have_one_thread(threads: int, monkeypatch
     assert torch.get_num_threads() == threads
 
 
-def test_an_error_leaves_threads_as_they_were(threads: int) -> None:
-    class Failing:
-        def value(self, *_: object) -> Estimate:
-            raise RuntimeError("no")
+def test_an_error_leaves_threads_as_they_were(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> None:
+        raise RuntimeError("no")
 
+    monkeypatch.setattr(batching, "normalized_pairs", fails)
     built = presets.build("estimator", "msac", hypotheses=10)
-    built.final = Failing()
     with pytest.raises(RuntimeError, match="no"):
         built(scene(0, 60))
     assert torch.get_num_threads() == threads

@@ -11,6 +11,7 @@ import argparse
 import dataclasses
 import faulthandler
 import functools
+import importlib.util
 import inspect
 import json
 import linecache
@@ -36,6 +37,7 @@ from torch import Tensor
 import fmtorch
 from fmtorch import geometry, matching, metrics, presets, pruning
 from fmtorch.checked import expectation
+from fmtorch.estimators.adapters import PEERS
 from fmtorch.types import Correspondences, Estimate, Features, collate
 from tests.laws import calibrated, few, quick_pruner
 from tests.reliability.arguments import KINDS, MISTAKES, NUMBERS, SEQUENCES, Scene, batches, scenes
@@ -298,6 +300,11 @@ def sound_match(result: Any) -> None:
     assert bool(result.F.any()) == result.ok
 
 
+def installed_estimators() -> list[str]:
+    """The presets whose library is there: those of peers need an extra."""
+    return [n for n in presets.available("estimator") if n not in PEERS or importlib.util.find_spec(PEERS[n])]
+
+
 def subjects(names: list[str]) -> list[Subject]:
     """All that is called, of names that begin so."""
     made: dict[str, Callable[[], Draw]] = {}
@@ -307,7 +314,7 @@ def subjects(names: list[str]) -> list[Subject]:
             made[f"{short}.{name}"] = functools.partial(functools.partial, function_call, function)
     for kind in (Correspondences, Features, Estimate):
         made[f"types.{kind.__name__}"] = functools.partial(functools.partial, record, kind)
-    for name in presets.available("estimator"):
+    for name in installed_estimators():
         options = few(presets.load("estimator", name), 200, 100)
         made[f"find_fundamental.{name}"] = functools.partial(functools.partial, estimation, name, options)
     for name in presets.available("pruner"):

@@ -14,6 +14,7 @@ import pytest
 
 from fmtorch import geometry, matching, metrics, presets, pruning
 from tests.reliability.commands import ONE_THREAD
+from tests.reliability.generated import installed_estimators
 
 HERE = Path(__file__).resolve().parents[2]
 BOUNDED = 4  # calls of each subject
@@ -43,7 +44,7 @@ def test_some_calls_of_everything() -> None:
     for module in (geometry, metrics, pruning, matching):
         names = {name for name in module.__all__ if name.islower()}
         assert {f"{module.__name__.removeprefix('fmtorch.')}.{name}" for name in names} <= called
-    assert {f"find_fundamental.{name}" for name in presets.available("estimator")} <= called
+    assert {f"find_fundamental.{name}" for name in installed_estimators()} <= called
     assert {f"pruner.{name}" for name in presets.available("pruner")} <= called
     assert sum(line.get("sound", 0) for line in found) > len(found)
 
