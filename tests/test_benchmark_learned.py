@@ -19,11 +19,12 @@ def row(family: str, i: int, method: str, use: str, estimator: str, nsgd: float)
 
 
 def some_rows() -> list[dict]:
-    """Ten pairs of each family. The other training's NSGD is some 0.01 larger on wide baselines, equal on short ones."""
+    """Thirty pairs of each family. The other training is worse by some 0.01 on wide baselines, equal on short ones."""
     return [
-        row(family, i, method, use, estimator, nsgd + (0.01 + 0.0002 * i) * (method == "seed 1" and family == "Strecha"))
+        row(family, i, method, use, estimator, nsgd + worse * (0.01 + 0.0002 * i))
         for use, estimator in (("hard", "ransac_eight_point"), ("prior", "fmtorch"))
-        for family, nsgd in FAMILIES.items() for i in range(10) for method in METHODS
+        for family, nsgd in FAMILIES.items() for i in range(30) for method in METHODS
+        for worse in [method == "seed 1" and family == "Strecha"]
     ]  # fmt: skip
 
 
@@ -33,18 +34,18 @@ def test_other_trainings_stand_apart() -> None:
     assert all("seed 1" not in {line[0] for line in sheet.rows} for sheet in main)
     for sheet in (hard, prior):
         assert [line[0] for line in sheet.rows] == ["LC, F", "seed 1"]
-        assert [c for c in sheet.columns if "R.05" in c] == ["real, wide (10): R.05", "real, short (10): R.05"]
+        assert [c for c in sheet.columns if "R.05" in c] == ["real, wide (30): R.05", "real, short (30): R.05"]
         shipped, other = sheet.rows
         assert shipped[1:4] == ["100.0", "92.0", ""]  # area of a step at 0.004 up to 0.05
-        assert other[1:3] == ["100.0", "70.2"]
-        assert other[3].startswith("-21.8 [")
+        assert other[1:3] == ["100.0", "66.2"]
+        assert other[3].startswith("-25.8 [")
         assert shipped[5] == other[5]
 
 
 def test_trainings_are_compared_on_pairs_that_all_have() -> None:
-    rows = [r for r in some_rows() if not (r["method"] == "seed 1" and r["pair"].endswith("/3"))]
+    rows = [r for r in some_rows() if not (r["method"] == "seed 1" and r["pair"].endswith("3"))]
     hard = learned_table.tables(rows)[-2]
-    assert "real, wide (9): R.05" in hard.columns
+    assert "real, wide (27): R.05" in hard.columns
 
 
 @pytest.mark.parametrize("text", ["seed 1", "=x", "seed 1=/no/such/file"])
