@@ -46,7 +46,7 @@ def _shared_out(c: Correspondences) -> list[Tensor]:
     work, order = c.count().clamp_min(MATCHES_AT_LEAST).sort(descending=True)
     before = work.cumsum(0) - work
     part = before * (PARTS_OF_A_THREAD * available()) // max(1, int(work.sum()))
-    return list(order.split(torch.unique_consecutive(part, return_counts=True)[1].tolist()))
+    return list(torch.split(order, torch.unique_consecutive(part, return_counts=True)[1].tolist()))
 
 
 def _solve_all(c: Correspondences, seed: int, least: int, solve: Solve, not_found: str, limit: int) -> Estimate:
