@@ -26,9 +26,7 @@ class PoolRefinement:
         """As `refinement.PoolRefinement.near`."""
         if self.refine is None:
             return pair
-        return near_models(
-            pool.F[: max(pool.filled, 1)], pair, self.refine.RADIUS * self.refine.scale, self.refine.matches
-        )
+        return near_models(pool.F[: pool.filled], pair, self.refine.RADIUS * self.refine.scale, self.refine.matches)
 
     def __call__(self, pool: Pool, pair: OnePair) -> Pool:
         """As `refinement.PoolRefinement`."""

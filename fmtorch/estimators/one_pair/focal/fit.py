@@ -1,4 +1,4 @@
-"""`focal.fit` on the arrays of one pair: the maximum a posteriori at the pair's noise, and what the prior costs there."""
+"""`focal.fit` on the arrays of one pair: the maximum a posteriori at the pair's noise, and what the prior costs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fmtorch.geometry.optimum import STEP_DAMPING
 
 
 class FocalFit(NamedTuple):
-    """As `fit.FocalFit`: a model (9,), its cameras, and what the logarithm of the likelihood would gain without prior."""
+    """As `fit.FocalFit`: a model (9,), its cameras, and what the log likelihood would gain without prior."""
 
     F: Array
     cameras: TwoCameras
