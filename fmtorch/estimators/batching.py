@@ -9,8 +9,9 @@ from torch import Tensor
 
 from fmtorch.estimators.pairs import NormalizedPairs, normalized_pairs
 from fmtorch.estimators.support import lack_of_support, relative_rounding
+from fmtorch.records import ungraphed
 from fmtorch.threads import one_thread
-from fmtorch.types import Correspondences, Estimate, ungraphed
+from fmtorch.types import Correspondences, Estimate
 from fmtorch.verdict import judged
 
 Solve = Callable[[NormalizedPairs], tuple[Tensor, Tensor, Tensor, Tensor]]
