@@ -152,10 +152,11 @@ class HypothesizeAndVerify:
         least = self.search.generator.size
         at_once = self.search.generator.samples_at_once(c.mask.device) // self.search.round
         form: Callable[[NormalizedPairs], Outcome] = self.tensor_form
-        if self.kernel_form is not None and c.mask.device.type == "cpu" and kernels.available():
-            form = functools.partial(pair_by_pair, self.kernel_form)
-        solve = functools.partial(self._solve, form)
-        return solve_all(c, seed, least, solve, "every minimal sample was degenerate", at_once)
+        compiled = self.kernel_form if c.mask.device.type == "cpu" and kernels.available() else None
+        if compiled is not None:
+            form = functools.partial(pair_by_pair, compiled)
+        solve, threads = functools.partial(self._solve, form), compiled is not None
+        return solve_all(c, seed, least, solve, "every minimal sample was degenerate", at_once, threads)
 
     def _solve(
         self, form: Callable[[NormalizedPairs], Outcome], pairs: NormalizedPairs

@@ -21,7 +21,8 @@ from fmtorch.geometry.arithmetic import component_sum
 from fmtorch.geometry.curves import curve_orders
 from fmtorch.pair_arrays import for_each_pair, kernels_serve
 from fmtorch.pruning import consistency_kernels as compiled
-from fmtorch.types import Correspondences, ungraphed
+from fmtorch.records import ungraphed
+from fmtorch.types import Correspondences
 
 WINDOW = 8  # neighbours before and after each match along each curve
 CURVES = ((0.0, 0.0), (0.5, math.pi / 4))  # shift of the grid (in thirds of the extent) and rotation of each curve

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from fmtorch.pair_arrays import for_each_pair, kernels_serve
 from fmtorch.pruning import match_noise_kernels as compiled
-from fmtorch.types import Correspondences, ungraphed
+from fmtorch.records import ungraphed
+from fmtorch.types import Correspondences
 
 LEAST_AREA = 1e-12  # square pixels: keeps the gradient of the scale finite
 LEAST_PRIOR = 0.02  # matches less likely than that are not taken for noisier

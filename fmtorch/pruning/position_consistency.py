@@ -33,7 +33,8 @@ from fmtorch.pruning.frame_consistency import (
     WORST_RATIO,
     tiled,
 )
-from fmtorch.types import Correspondences, ungraphed
+from fmtorch.records import ungraphed
+from fmtorch.types import Correspondences
 
 TURNS = 16  # hypotheses of the common turn
 SCALES = tuple(2.0 ** (k / 2) for k in range(-4, 5))  # hypotheses of the common change of scale
