@@ -39,11 +39,13 @@ _CLASSES = {
     "fmbench": ("fmtorch.data.fmbench", "FMBenchPairs"),
     "rendered": ("fmtorch.data.rendered", "RenderedPairs"),
     "stereo": ("fmtorch.data.rendered", "StereoPair"),
+    "tum": ("fmtorch.data.tum", "tum_pairs"),
     "kitti": ("fmtorch.data.kitti", "KittiPairs"),
     "colmap": ("fmtorch.data.colmap", "ColmapPairs"),
 }
 NEEDS_ROOT = {
     "fmbench": "a set's folder with pairs_with_gt.txt, or a folder of such sets",
+    "tum": "the folder of the sequences' folders of TUM RGB-D",
     "kitti": "the folder with sequences/ and poses/ of KITTI odometry",
     "colmap": "a folder of scenes with a COLMAP model each, or one such scene",
 }
@@ -62,7 +64,7 @@ def load(
     """The data set `name`: an indexable of `ImagePair`, as torch's DataLoader takes it.
 
     Args:
-        name: of the set: rendered, stereo, fmbench, kitti, colmap.
+        name: of the set: rendered, stereo, fmbench, tum, kitti, colmap.
         split: `test` or `train`.
         root: where it lies, or for generated sets where they are kept.
         progress: called with (done, total) while a generated set is drawn for the first time.

@@ -91,3 +91,29 @@ def to_binary(sparse: Path) -> None:
 
 
 COLMAP_NUMBERS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
+
+
+def write_tum(root: Path, name: str = "rgbd_dataset_freiburg1_test", frames: int = 12, depth: bool = False) -> Path:
+    """A sequence at 10 frames a second with poses at 100: along x at 1 m/s, turning about y at 1 rad/s."""
+    folder = root / name
+    start = 1305031236.0
+    rgb, poses, depths = ["# timestamp filename"], ["# timestamp tx ty tz qx qy qz qw"], ["# depth"]
+    for i in range(frames):
+        stamp = f"{start + 0.1 * i + 0.003:.6f}"
+        write_image(folder / f"rgb/{stamp}.png", i, (480, 640))
+        rgb.append(f"{stamp} rgb/{stamp}.png")
+        if depth:
+            later = f"{start + 0.1 * i + 0.013:.6f}"
+            depths.append(f"{later} depth/{later}.png")
+            (folder / "depth").mkdir(exist_ok=True)
+            plane = np.tile(np.arange(640, dtype=np.uint16) * 50, (480, 1))  # x / 100 metres
+            plane[100:200, 300:400] = 0
+            assert cv2.imwrite(str(folder / f"depth/{later}.png"), plane)
+    for i in range(frames * 10 + 2):
+        t = 0.01 * i
+        poses.append(f"{start + t:.4f} {t:.4f} 0.5 1 0 {np.sin(t / 2):.7f} 0 {np.cos(t / 2):.7f}")
+    (folder / "rgb.txt").write_text("\n".join(rgb) + "\n")
+    (folder / "groundtruth.txt").write_text("\n".join(poses) + "\n")
+    if depth:
+        (folder / "depth.txt").write_text("\n".join(depths) + "\n")
+    return folder
