@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.geometry.order_kernels import smallest_but
 from fmtorch.kernels import inner, kernel
 
 Array = NDArray[Any]
@@ -161,28 +162,4 @@ def _smallest(values: Array, counts: Array, some: Array, rank: int) -> Any:
     for i in range(len(values)):
         some[m] = values[i]
         m += (bits[i] >> BIN_SHIFT) == wanted
-    return _selected(some, m, left - 1)
-
-
-@inner
-def _selected(values: Array, n: int, k: int) -> Any:
-    """The k-th smallest, from 0, of the first n values, which are reordered (Hoare)."""
-    low, high = 0, n - 1
-    while low < high:
-        pivot, i, j = values[(low + high) >> 1], low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while values[j] > pivot:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if k <= j:
-            high = j
-        elif k >= i:
-            low = i
-        else:
-            break
-    return values[k]
+    return smallest_but(some, 0, m, left - 1)

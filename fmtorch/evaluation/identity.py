@@ -13,7 +13,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from fmtorch import kernels, presets
-from fmtorch.estimators.adapters import PEERS
+from fmtorch.estimators.peers import PEERS
 from fmtorch.pipeline import Pipeline
 from fmtorch.presets import plain
 from fmtorch.storage.code import code_digest, fmtorch_version

@@ -10,12 +10,20 @@ from __future__ import annotations
 
 import functools
 import math
+from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Real
+from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.geometry import significance_kernels as compiled
+from fmtorch.geometry.arithmetic import logarithm
 from fmtorch.geometry.epipolar import epipolar_distances
+from fmtorch.pair_arrays import for_each_pair, kernels_serve
+
+Array = NDArray[Any]
 
 SAMPLE = 7  # matches that determine a model
 MODELS = 3  # of a minimal sample at most
@@ -59,6 +67,10 @@ def significance(
     if x0.shape[1] <= SAMPLE:
         return torch.full((len(F),), -torch.inf, dtype=torch.float64, device=F.device)
     mask = torch.ones(x0.shape[:2], dtype=torch.bool, device=x0.device) if mask is None else mask
+    if kernels_serve(F, x0, x1, mask, size0, size1):
+        sizes = (None if size is None else size.to(torch.float64) for size in (size0, size1))
+        out = torch.empty(len(F), 1, dtype=torch.float64)
+        return for_each_pair(_of_one_pair, (F, x0, x1, mask, *sizes), out=out, kind=torch.float64)[:, 0]
     mask = mask & (x0.abs() < FARTHEST).all(-1) & (x1.abs() < FARTHEST).all(-1)
     points = [torch.where(mask[..., None], x, 0).to(torch.float64) for x in (x0, x1)]
     sound = torch.isfinite(F).flatten(1).all(1) & (F != 0).flatten(1).any(1)
@@ -77,6 +89,19 @@ def significance(
             place = place * MOST_CELLS + column
     counted, n = _one_of_each_place(chance.clamp(LEAST_CHANCE, 1.0), place, mask)
     return torch.where(sound, _significance(counted, n), -torch.inf)
+
+
+def _of_one_pair(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array, out: Array) -> None:
+    """`significance` of one pair by kernels -> out (1,)."""
+    chance = np.empty(len(mask))
+    chance = chance[: compiled.counted_chances(F, x0, x1, mask, size0, size1, chance)]
+    chance.sort()
+    out[0] = compiled.most_significant(chance, _log_factorials(_table_size(len(mask))).numpy())
+
+
+def _table_size(matches: int) -> int:
+    """How long a table of log i! is taken: for few sizes, so that it is seldom made."""
+    return 1 << max(matches, SAMPLE + 1).bit_length()
 
 
 def _one_of_each_place(
@@ -98,14 +123,14 @@ def _one_of_each_place(
 
 def _significance(chance: Float[Tensor, "b n"], n: Int[Tensor, " b"]) -> Float[Tensor, " b"]:
     """-log10 of the least number of false alarms over k, of ascending chances of which the first n are meant."""
-    factorial = _log_factorials(1 << max(chance.shape[1], SAMPLE + 1).bit_length()).to(chance.device)
+    factorial = _log_factorials(_table_size(chance.shape[1])).to(chance.device)
     k = torch.arange(SAMPLE + 1, chance.shape[1] + 1, device=chance.device)
     n = n[:, None]
     spare = (n - k).clamp_min(0)
     subsets = factorial[n] - factorial[k] - factorial[spare]
     samples = factorial[k] - factorial[k - SAMPLE] - factorial[SAMPLE]
     tests = _logarithms(factorial)[(n - SAMPLE).clamp_min(1)] + subsets + samples + math.log(MODELS)
-    alarms = tests + (k - SAMPLE) * _log(chance[:, SAMPLE:].clamp_max(1.0))
+    alarms = tests + (k - SAMPLE) * logarithm(chance[:, SAMPLE:].clamp_max(1.0))
     return torch.where(k <= n, -alarms, -torch.inf).amax(1) / math.log(10)
 
 
@@ -122,18 +147,3 @@ def _log_factorials(count: int) -> Float[Tensor, " count"]:
 def _logarithms(factorial: Tensor) -> Tensor:
     """log i from log i!; of 0 that of 1."""
     return torch.cat([factorial[:1], factorial[1:] - factorial[:-1]])
-
-
-def _log(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """The natural logarithm of positive numbers, within 1e-11, from operations that round alike in any tensor.
-
-    With x = m 2^e and z = (m - 1/sqrt 2) / (m + 1/sqrt 2): log m = 2 artanh z - log(2) / 2. The library's logarithm
-    may differ in its last bit between the body of a tensor and its end.
-    """
-    m, e = torch.frexp(x)
-    z = (m - math.sqrt(0.5)) / (m + math.sqrt(0.5))
-    z2 = z * z
-    series = torch.zeros_like(z)
-    for power in (13, 11, 9, 7, 5, 3, 1):
-        series = series * z2 + 1 / power
-    return 2 * z * series + (e.to(x.dtype) - 0.5) * math.log(2)

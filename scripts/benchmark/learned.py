@@ -4,6 +4,7 @@ python -m scripts.benchmark learned --root DATA/Strecha --root DATA/KITTI --json
 python -m scripts.benchmark learned --rendered full --limit 50 --json FILE
 python -m scripts.benchmark learned --from FILE FILE --markdown docs/learned.md
 python -m scripts.benchmark learned --ngransac FILE.safetensors ...  # also NG-RANSAC's published weights, as a prior
+python -m scripts.benchmark learned --network "seed 1=FILE.safetensors" ...      # also other trainings of `lc`
 
 A pruner's time is the processor's, of its stage alone, on one thread. Every pair is estimated once, with seed 0.
 """
@@ -65,6 +66,8 @@ GIVEN = frozenset(("ratio", "one_to_one"))  # what every method has, and what is
 KEPT = ("pair", "family", "scene", "ok", "nsgd", "inlier_rate", "inlier_rate_before", "corrs", "corrs_before")
 
 
+TRAINED = "LC, F"  # the network whose trainings are compared
+
 Chain = list[tuple[str, Any]]  # names of presets and the stages
 
 
@@ -74,6 +77,8 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument("--features", default="sift", help="features of another kind than the networks saw in training")
     parser.add_argument("--methods", nargs="*", default=list(HARD | PRIOR), choices=list(HARD | PRIOR))
     parser.add_argument("--ngransac", type=Path, help="NG-RANSAC's published weights, converted to safetensors")
+    parser.add_argument("--network", action="append", default=[], type=_named, metavar="NAME=FILE",
+                        help=f"weights of another training of {TRAINED}; may be repeated")  # fmt: skip
     parser.add_argument("--cache", default="off", help="a folder that keeps features from run to run; off: nowhere")
     parser.add_argument("--json", type=Path, help="write the figures of every pair here")
     parser.add_argument("--from", nargs="*", type=Path, default=[], dest="earlier", help="add earlier runs' --json")
@@ -114,8 +119,21 @@ def measure(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
         pruner = presets.build("pruner", "lc_soft", network=network, file=str(arguments.ngransac))
         before = [(name, stage(name)) for name in sorted(GIVEN, reverse=True)]
         built["prior"]["NG-RANSAC's network"] = [*before, ("lc", pruner)]  # its outputs are weights of samples
+    for name, file in arguments.network:
+        for use, preset in (("hard", "lc"), ("prior", "lc_soft")):
+            before = [(given, stage(given)) for given in sorted(GIVEN, reverse=True)]
+            built[use][name] = [*before, (preset, presets.build("pruner", preset, file=file))]
+    others = {name: TRAINED for name, _ in arguments.network}
     for pair in track(pairs, "pairs", console=console):
-        yield from rows(front, pair, built, estimators, arguments.features)
+        for row in rows(front, pair, built, estimators, arguments.features):
+            yield {**row, "training_of": others.get(row["method"])}
+
+
+def _named(text: str) -> tuple[str, str]:
+    name, _, file = text.partition("=")
+    if not name or not Path(file).is_file():
+        raise argparse.ArgumentTypeError(f"{text!r}: NAME=FILE is wanted, with a file of learned weights")
+    return name, file
 
 
 def rows(

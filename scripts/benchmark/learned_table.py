@@ -16,7 +16,11 @@ ESTIMATOR = {"ransac_eight_point": "RANSAC", "lmeds_eight_point": "LMedS", "fmto
 
 
 def tables(rows: list[Row]) -> list[Sheet]:
-    """Real and rendered sets apart: wide and short baselines, then each family; one table for each use."""
+    """Real and rendered sets apart: wide and short baselines, then each family; one table for each use.
+
+    Last, other trainings of a network beside the one that is shipped.
+    """
+    trainings, rows = rows, [row for row in rows if not row.get("training_of")]
     sheets = []
     for features in dict.fromkeys(row["features"] for row in rows):
         mine = [row for row in rows if row["features"] == features]
@@ -24,7 +28,34 @@ def tables(rows: list[Row]) -> list[Sheet]:
             for use in ("hard", "prior"):
                 own = [row for row in mine if row["family"] in families and row["use"] == use]
                 sheets += [_sheet(title, features, use, own)] if own else []
+    for shipped in dict.fromkeys(row["training_of"] for row in trainings if row.get("training_of")):
+        own = [row for row in trainings if row.get("training_of") == shipped or row["method"] == shipped]
+        sheets += [_trainings(shipped, use, [row for row in own if row["use"] == use]) for use in ("hard", "prior")]
     return sheets
+
+
+def _trainings(shipped: str, use: str, rows: list[Row]) -> Sheet:
+    """A line for each training, the shipped one first; pairs that all of them have, by kind of baseline."""
+    estimator = rows[0]["estimator"]
+    rows = [row for row in rows if row["estimator"] == estimator]
+    methods = [shipped, *dict.fromkeys(row["method"] for row in rows if row["method"] != shipped)]
+    by_method = {name: {row["pair"]: row for row in rows if row["method"] == name} for name in methods}
+    common = set.intersection(*(set(own) for own in by_method.values()))
+    columns, lines = [""], [[name] for name in methods]
+    for kind in ("real", "rendered"):
+        for baselines, members in (("wide", WIDE), ("short", SHORT)):
+            base = [row for row in by_method[shipped].values()
+                    if row["pair"] in common and members.get(row["family"]) == kind]  # fmt: skip
+            if not base:
+                continue
+            columns += [f"{kind}, {baselines} ({len(base)}): R.05", "AUC@0.05", f"AUC - {shipped}"]
+            for name, line in zip(methods, lines, strict=True):
+                own = [by_method[name][row["pair"]] for row in base]
+                nsgd = nsgd_of(own)
+                line += [f"{100 * MERITS['recall_05'](nsgd).mean():.1f}", f"{100 * areas(nsgd).mean():.1f}"]
+                line.append("" if name == shipped else _difference(own, {row["pair"]: row for row in base}))
+    how = f"P < 0.5 dropped, {ESTIMATOR[estimator]}" if use == "hard" else "P(inlier) as the prior of `fmtorch`"
+    return Sheet(f"Trainings of {shipped}: {how}; {rows[0]['features']}, pairs in brackets", columns, lines)
 
 
 def _groups(present: list[str]) -> dict[str, list[str]]:

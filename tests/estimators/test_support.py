@@ -12,9 +12,9 @@ import torch
 
 from fmtorch import find_fundamental, presets
 from fmtorch.estimators import degeneracy, final_fits, support
-from fmtorch.estimators.adapters import PEERS
 from fmtorch.estimators.focal import posterior
 from fmtorch.estimators.graph_cut import GraphCut
+from fmtorch.estimators.peers import PEERS
 from fmtorch.estimators.support import lack_of_support
 from fmtorch.types import Correspondences, Estimate, collate
 from tests.laws import OTHER_LIBRARIES, few, quick, scene, small

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
@@ -76,6 +77,13 @@ def test_exponential_and_logarithm() -> None:
     # Eight squarings multiply the rounding error of one by 256; the logarithm inherits it.
     assert float((exponential(x) / x.exp() - 1).abs().max()) < 512 * 2**-52
     assert float((logarithm(x.exp()) - x).abs().max()) < 512 * 2**-52
+
+
+def test_the_logarithm_is_alike_everywhere_and_far_from_one() -> None:
+    x = torch.cat([torch.logspace(-300, 300, 1001, dtype=torch.float64), torch.linspace(0.4, 2.1, 1001).double()])
+    torch.testing.assert_close(logarithm(x), torch.from_numpy(np.log(x.numpy())), rtol=4 * 2**-52, atol=4 * 2**-52)
+    for start in range(1, 20):
+        assert torch.equal(logarithm(x[start:]), logarithm(x)[start:])
 
 
 def test_small_matrices_as_by_numpy() -> None:

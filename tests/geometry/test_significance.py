@@ -9,13 +9,21 @@ import pytest
 import torch
 from torch import Tensor
 
+from fmtorch import kernels
 from fmtorch.geometry import significance
-from fmtorch.geometry.significance import _log
 from fmtorch.types import RELATED
+from tests.conftest import oracle
 from tests.geometry.scenes import scene
+from tests.laws import degenerate, small
 from tests.reference import significance as reference
 
 SIZE = (800, 1000)
+
+
+@pytest.fixture(params=["on", "off"], autouse=True)
+def form(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By kernels, and by tensors."""
+    monkeypatch.setenv(kernels.SWITCH, request.param)
 
 
 def pair(n: int, seed: int = 0, outliers: float = 0.4) -> tuple[Tensor, Tensor, Tensor]:
@@ -139,8 +147,30 @@ def test_few_inliers_of_many_are_chance_and_many_are_not() -> None:
         assert float(significance(other, x0, x1, size0=size, size1=size)[0]) < 0
 
 
-def test_the_logarithm_is_exact_and_alike_everywhere() -> None:
-    x = torch.cat([torch.logspace(-300, 300, 1001, dtype=torch.float64), torch.linspace(0.4, 2.1, 1001).double()])
-    assert torch.allclose(_log(x), torch.from_numpy(np.log(x.numpy())), rtol=1e-12, atol=1e-11)
-    for start in range(1, 20):
-        assert torch.equal(_log(x[start:]), _log(x)[start:])
+def assert_same_in_both_forms(monkeypatch: pytest.MonkeyPatch, F: Tensor, *c: Tensor | None) -> None:
+    """Within rounding: sums of up to a hundred thousand logarithms of factorials, of which each form rounds one."""
+    found = []
+    for switch in ("on", "off"):
+        monkeypatch.setenv(kernels.SWITCH, switch)
+        found.append(significance(F, *c))
+    torch.testing.assert_close(*found, rtol=1e-12, atol=1e-9)
+
+
+@pytest.mark.parametrize("sizes", [False, True])
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
+def test_both_forms_agree_on_degenerate_pairs(scale: float, sizes: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    models = torch.cat([torch.eye(3)[None], torch.zeros(1, 3, 3), scene(20, 1).F[None].float(), torch.ones(1, 3, 3)])
+    for c in (*degenerate().values(), *small().values()):
+        size = scale * torch.tensor([SIZE]) if sizes else None
+        for F in models[:, None]:
+            assert_same_in_both_forms(monkeypatch, F, scale * c.x0, scale * c.x1, c.mask, size, size)
+
+
+def test_both_forms_agree_on_real_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    file = oracle("robust.npz")
+    for i in range(len(file["names"])):
+        F, x0, x1, *sizes = (
+            torch.from_numpy(file[f"{i:03d}.{name}"])[None] for name in ("F_gt", "X1", "X2", "size1", "size2")
+        )
+        assert_same_in_both_forms(monkeypatch, F, x0, x1, None, *sizes)
+        assert_same_in_both_forms(monkeypatch, F, x0, x1)

@@ -11,21 +11,18 @@ import torch
 
 from fmtorch import geometry, presets
 from fmtorch.estimators import PairwiseEstimator
-from fmtorch.estimators.adapters import Pair, Solution
+from fmtorch.estimators.peers import PEERS
+from fmtorch.estimators.peers.pairwise import Pair, Solution
 from fmtorch.types import collate
 from tests.laws import OTHER_LIBRARIES, scene
 
 NAMES = [n for n in presets.available("estimator") if n.startswith(OTHER_LIBRARIES)]
-MODULES = {
-    "poselib": "poselib", "poselib_shared_focal": "poselib", "magsac_cpp": "pymagsac", "gc_ransac_cpp": "pygcransac",
-    "degensac_cpp": "pydegensac",
-}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_recovers_the_geometry_in_a_batch(name: str) -> None:
-    if name in MODULES:
-        pytest.importorskip(MODULES[name])
+    if name in PEERS:
+        pytest.importorskip(PEERS[name])
     pairs = [scene(0, 300, outliers=0.3, noise=0.1), scene(1, 5), scene(2, 200, outliers=0.2, noise=0.1)]
     batch = collate(pairs)
     options = {"rounds": 2} if name == "kornia_ransac" else {}
@@ -40,11 +37,17 @@ def test_recovers_the_geometry_in_a_batch(name: str) -> None:
         assert not bool((estimate.inliers[i] & ~batch.mask[i]).any())
 
 
-@pytest.mark.parametrize("name", MODULES)
+@pytest.mark.parametrize("name", PEERS)
 def test_a_missing_library_is_named(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, MODULES[name], None)
-    with pytest.raises(ImportError, match=rf"{MODULES[name]}.*fmtorch\[peers\]"):
+    monkeypatch.setitem(sys.modules, PEERS[name], None)
+    with pytest.raises(ImportError, match=rf"{PEERS[name]}.*fmtorch\[peers\]"):
         presets.build("estimator", name)
+
+
+@pytest.mark.parametrize("name", ["magsac_cpp", "gc_ransac_cpp"])
+def test_an_unknown_sampler_is_refused_with_the_choices(name: str) -> None:
+    with pytest.raises(ValueError, match="sampler is 'napsac'; it must be one of: uniform, prosac, progressive_napsac"):
+        presets.build("estimator", name, sampler="napsac")
 
 
 def test_the_prior_orders_matches_before_the_quality() -> None:

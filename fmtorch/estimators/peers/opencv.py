@@ -1,0 +1,29 @@
+"""OpenCV's robust estimators of fundamental matrices."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from fmtorch.estimators.peers.pairwise import Pair, PairwiseEstimator, Solution
+
+
+def opencv(
+    *, method: str, threshold: float = 1.0, confidence: float = 0.999, iterations: int = 2000
+) -> PairwiseEstimator:
+    """`cv2.findFundamentalMat` with one of its robust methods.
+
+    method: name of OpenCV's constant, e.g. FM_RANSAC, FM_LMEDS, USAC_MAGSAC. threshold: pixels, point to epipolar line
+    (FM_RANSAC) or Sampson distance (USAC_*). USAC_PROSAC gets the matches best first, as it expects.
+    """
+    code = getattr(cv2, method, None)
+    if code is None or not method.startswith(("FM_", "USAC_")):
+        raise ValueError(f"method is {method!r}; it must name one of cv2's constants FM_* or USAC_*")
+
+    def solve(pair: Pair) -> Solution:
+        F, mask = cv2.findFundamentalMat(pair.x0, pair.x1, int(code), threshold, confidence, iterations)
+        if F is None or mask is None:  # a minimal set may also give several solutions, stacked
+            return None, np.zeros(len(pair.x0), dtype=np.bool_)
+        return F.astype(np.float64), mask.ravel().astype(np.bool_)
+
+    return PairwiseEstimator(f"OpenCV {method}", solve, best_first=method == "USAC_PROSAC")

@@ -1,0 +1,137 @@
+"""Any function of one pair's matches as an estimator of batches, and what the functions of this folder share."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import math
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from fmtorch.estimators.pairs import finite_matches, unfit_pairs
+from fmtorch.estimators.support import lack_of_support, relative_rounding
+from fmtorch.types import Correspondences, Estimate
+from fmtorch.verdict import judged
+
+Points = NDArray[np.float64]
+Solution = tuple[Points | None, NDArray[np.bool_]]
+
+LEAST_MATCHES = 8
+MINIMAL_SAMPLE = 7  # inliers below which a model is none
+FAILURES = (cv2.error, RuntimeError, ValueError)  # how these libraries say that they cannot solve a pair
+
+
+@dataclasses.dataclass(frozen=True)
+class Pair:
+    """A pair's live matches as these libraries take them: x0, x1 (N, 2) in pixels, likelihood (N,), sizes (h, w).
+
+    likelihood: the prior where there is one, else 1 - quality, else 1; matches are in its descending order if asked.
+    """
+
+    x0: Points
+    x1: Points
+    likelihood: NDArray[np.float64]
+    size0: tuple[int, int]
+    size1: tuple[int, int]
+    seed: int
+
+    @property
+    def joined(self) -> Points:
+        """x0, y0, x1, y1 a row."""
+        return np.ascontiguousarray(np.hstack([self.x0, self.x1]))
+
+
+class PairwiseEstimator:
+    """Runs a function of a `Pair` -> (F or None, inliers) on each pair's live matches, best first if asked."""
+
+    def __init__(self, name: str, solve: Callable[[Pair], Solution], best_first: bool = False) -> None:
+        self.name, self._solve, self._best_first = name, solve, best_first
+
+    def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
+        """Estimate each pair in turn; a pair without a solution is `ok=False` with a reason.
+
+        Raises ValueError where somebody asks for gradients, which no other library gives.
+        """
+        if c.requires_grad:
+            raise ValueError(
+                f"{self.name} passes no gradient on: give it matches that need none (`x0.detach()`), or take an "
+                "estimator of this project"
+            )
+        b, n = c.mask.shape
+        F = torch.zeros(b, 3, 3, dtype=torch.float64)
+        inliers = torch.zeros(b, n, dtype=torch.bool)
+        mask = finite_matches(c)
+        _, reasons = unfit_pairs(c, mask, LEAST_MATCHES)
+        mask = mask.cpu()
+        for i in range(b):
+            if reasons[i]:
+                continue
+            index = mask[i].nonzero()[:, 0]
+            likelihood = _likelihood(c, i)[index]
+            if self._best_first:
+                order = likelihood.argsort(descending=True, stable=True)
+                index, likelihood = index[order], likelihood[order]
+            x0, x1 = (x[i].detach().cpu()[index].to(torch.float64).numpy() for x in (c.x0, c.x1))
+            size0, size1 = _size(c.size0, x0, i), _size(c.size1, x1, i)
+            try:
+                estimate, inside = self._solve(Pair(x0, x1, likelihood.numpy(), size0, size1, seed))
+            except FAILURES as failure:  # OpenCV's USAC asserts what some matches do not fulfil
+                reasons[i] = f"{self.name} failed: {' '.join(str(failure).split())}"
+                continue
+            if estimate is None or estimate.shape != (3, 3) or not np.isfinite(estimate).all() or not np.any(estimate):
+                reasons[i] = f"{self.name} found no fundamental matrix"
+                continue
+            lack = _lack_of_support(x0, x1, inside, relative_rounding(c.x0.dtype))
+            if lack:
+                reasons[i] = lack
+                continue
+            F[i] = torch.from_numpy(estimate / np.linalg.norm(estimate))
+            inliers[i, index[torch.from_numpy(inside)]] = True
+        ok = torch.tensor([not reason for reason in reasons], dtype=torch.bool)
+        draws = torch.zeros(b, dtype=torch.int64)  # not reported by these libraries
+        return judged(Estimate(F, inliers, ok, tuple(reasons), draws).to(c.mask.device), c)
+
+
+def peer(module: str, name: str) -> Any:
+    """The module of a library of the extra `peers`. Raises ImportError with a hint where it is not installed."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ImportError(f"{name} ({module}) is not installed: pip install 'fmtorch[peers]'") from error
+
+
+def solution(F: Any, inliers: Any) -> Solution:
+    """What a binding returns, as arrays."""
+    return None if F is None else np.asarray(F, dtype=np.float64), np.asarray(inliers, dtype=np.bool_).ravel()
+
+
+def _lack_of_support(x0: Points, x1: Points, inliers: NDArray[np.bool_], rounding: float) -> str:
+    points = np.hstack([x0, x1])
+    largest, points = np.abs(points).max(), points - points.min(0)
+    unit = points.max() or 1.0
+    scaled, inside = torch.from_numpy(points.T[:, None] / unit), torch.from_numpy(inliers[None])
+    return lack_of_support(scaled, inside, MINIMAL_SAMPLE, torch.tensor([largest / unit * rounding]))[0]
+
+
+def _likelihood(c: Correspondences, i: int) -> torch.Tensor:
+    if c.prior is not None:
+        value = c.prior[i]
+    elif c.quality is not None:
+        value = 1 - c.quality[i]
+    else:
+        value = torch.ones(c.mask.shape[1])
+    return value.detach().cpu().to(torch.float64)
+
+
+def _size(sizes: torch.Tensor | None, x: Points, i: int) -> tuple[int, int]:
+    """The image's (h, w); where it is not known, that of the box of the points from the origin."""
+    if sizes is not None:
+        h, w = (math.ceil(v) for v in sizes[i].tolist())
+        return h, w
+    w, h = (int(v) + 1 for v in np.ceil(x.max(0, initial=0.0)))
+    return h, w

@@ -1,0 +1,35 @@
+"""Order statistics, compiled."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numpy.typing import NDArray
+
+from fmtorch.kernels import inner
+
+Array = NDArray[Any]
+
+
+@inner
+def smallest_but(values: Array, begin: int, end: int, k: int) -> Any:
+    """The k-th smallest, from 0, of values[begin:end], which are reordered (Hoare). No NaN."""
+    low, high = begin, end - 1
+    while low < high:
+        pivot, i, j = values[(low + high) >> 1], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while values[j] > pivot:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if begin + k <= j:
+            high = j
+        elif begin + k >= i:
+            low = i
+        else:
+            break
+    return values[begin + k]

@@ -1,0 +1,127 @@
+"""`significance` for the matches of one pair, compiled: the same operations, in float64."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fmtorch.geometry.arithmetic_kernels import logarithm
+from fmtorch.geometry.order_kernels import smallest_but
+from fmtorch.kernels import inner, kernel
+
+Array = NDArray[Any]
+SAMPLE, MODELS, CELLS, LEAST_CHANCE, MOST_CELLS, FARTHEST = 7, 3, 64, 2.0**-13, 1 << 15, 1e100  # as in `significance`
+FREE = -1  # a place of no match: in a slot of the table that is not taken
+GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # spreads places over the table
+
+
+@kernel("f8[:, ::1], f8[:, ::1], f8[:, ::1], b1[::1], f8[::1], f8[::1], f8[::1]")
+def counted_chances(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array, out: Array) -> int:
+    """The chances of a pair's matches, the median one of each place, in no order -> out (m,); m, 0 without a model.
+
+    F: (3, 3). x0, x1: (n, 2). size0, size1: (h, w) in pixels, empty where unknown.
+    """
+    n = len(mask)
+    peak = 0.0
+    for i in range(9):
+        value = F[i // 3, i % 3]
+        if not math.isfinite(value):
+            return 0
+        peak = max(peak, abs(value))
+    if peak == 0:
+        return 0
+    point, count = np.empty((4, n)), 0
+    for i in range(n):
+        a, b, c, d = x0[i, 0], x0[i, 1], x1[i, 0], x1[i, 1]
+        if mask[i] and abs(a) < FARTHEST and abs(b) < FARTHEST and abs(c) < FARTHEST and abs(d) < FARTHEST:
+            point[0, count], point[1, count], point[2, count], point[3, count] = a, b, c, d
+            count += 1
+    if count <= SAMPLE:
+        return 0
+    chance, place = np.zeros(count), np.zeros(count, np.int64)
+    strip0 = _placed(point[0], point[1], size0, place)
+    strip1 = _placed(point[2], point[3], size1, place)
+    f0, f1, f2 = F[0, 0] / peak, F[0, 1] / peak, F[0, 2] / peak
+    f3, f4, f5 = F[1, 0] / peak, F[1, 1] / peak, F[1, 2] / peak
+    f6, f7, f8 = F[2, 0] / peak, F[2, 1] / peak, F[2, 2] / peak
+    for i in range(count):
+        u, v, x, y = point[0, i], point[1, i], point[2, i], point[3, i]
+        a1, b1, c1 = f0 * u + f1 * v + f2, f3 * u + f4 * v + f5, f6 * u + f7 * v + f8
+        a0, b0 = f0 * x + f3 * y + f6, f1 * x + f4 * y + f7
+        e = abs(a1 * x + b1 * y + c1)
+        chance[i] = max(_chance(e, a0 * a0 + b0 * b0, strip0), _chance(e, a1 * a1 + b1 * b1, strip1))
+    return _median_of_places(chance, place, out)
+
+
+@inner
+def _placed(x: Array, y: Array, size: Array, place: Array) -> Any:
+    """Appends the cells of points of an image to the numbers of their places; what turns a distance into a chance."""
+    left, top, right, bottom = math.inf, math.inf, -math.inf, -math.inf
+    for i in range(len(place)):
+        left, right, top, bottom = min(left, x[i]), max(right, x[i]), min(top, y[i]), max(bottom, y[i])
+    h, w = (size[0], size[1]) if len(size) else (bottom - top, right - left)
+    diagonal = math.sqrt(h * h + w * w)
+    side = diagonal / CELLS
+    for i in range(len(place)):
+        place[i] = (place[i] * MOST_CELLS + _cell((x[i] - left) / side)) * MOST_CELLS + _cell((y[i] - top) / side)
+    return 2 * diagonal / (h * w) if h * w > 0 else math.inf
+
+
+@inner
+def _cell(position: float) -> int:
+    """The number of a cell; of what is not a number the first, beyond the grid the last."""
+    if not position > 0:
+        return 0
+    return int(position) if position < MOST_CELLS else MOST_CELLS - 1
+
+
+@inner
+def _chance(e: float, squared: float, strip: float) -> float:
+    """The chance of a point as near to its line; certain where there is no line, or no image."""
+    chance = e * (1 / math.sqrt(squared)) * strip if squared != 0 else 0 * strip
+    chance = chance if chance < 1 else 1.0  # NaN, too
+    return chance if chance > LEAST_CHANCE else LEAST_CHANCE
+
+
+@inner
+def _median_of_places(chance: Array, place: Array, out: Array) -> int:
+    """The median chance of the matches of each place, the upper one of two -> out (m,); how many places there are."""
+    n, bits = len(place), 1
+    while (1 << bits) < 2 * n:
+        bits += 1
+    shift, last = np.uint64(64 - bits), (1 << bits) - 1
+    table, group, which = np.full(1 << bits, FREE), np.empty(1 << bits, np.int64), np.empty(n, np.int64)
+    begin, groups = np.zeros(n + 1, np.int64), 0
+    for i in range(n):
+        slot = np.int64((np.uint64(place[i]) * GOLDEN) >> shift)
+        while table[slot] != FREE and table[slot] != place[i]:
+            slot = (slot + 1) & last
+        if table[slot] == FREE:
+            table[slot], group[slot] = place[i], groups
+            groups += 1
+        which[i] = group[slot]
+        begin[which[i] + 1] += 1
+    for g in range(groups):
+        begin[g + 1] += begin[g]
+    grouped, free = np.empty(n), begin.copy()
+    for i in range(n):
+        grouped[free[which[i]]] = chance[i]
+        free[which[i]] += 1
+    for g in range(groups):
+        out[g] = smallest_but(grouped, begin[g], begin[g + 1], (begin[g + 1] - begin[g]) // 2)
+    return groups
+
+
+@kernel("f8[::1], f8[::1]")
+def most_significant(chance: Array, factorial: Array) -> float:
+    """-log10 of the least number of false alarms over k, of ascending chances; factorial: log i!, for i to n."""
+    n, best = len(chance), -math.inf
+    for k in range(SAMPLE + 1, n + 1):
+        subsets = factorial[n] - factorial[k] - factorial[n - k]
+        samples = factorial[k] - factorial[k - SAMPLE] - factorial[SAMPLE]
+        tests = factorial[n - SAMPLE] - factorial[n - SAMPLE - 1] + subsets + samples + math.log(MODELS)
+        best = max(best, -(tests + (k - SAMPLE) * logarithm(chance[k - 1])))
+    return best / math.log(10)
