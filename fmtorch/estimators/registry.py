@@ -52,7 +52,7 @@ PARTS: dict[str, dict[str, Entry]] = {
         "median": Entry(Median, "scores.Median"),
     },
     "degeneracy": {"degensac": Entry(Degensac, "degeneracy.Degensac")},
-    "local_optimization": {"graph_cut": Entry(GraphCut)},
+    "local_optimization": {"graph_cut": Entry(GraphCut, "graph_cut.GraphCut")},
     "inliers": {
         "threshold": Entry(WithinThreshold, "inliers.WithinThreshold"),
         "median": Entry(BetterHalf, "inliers.BetterHalf"),

@@ -65,9 +65,10 @@ def _confident(rule: Any, sampler: Any) -> Any:
 def _refinement(part: refinement.PoolRefinement | refinement.AsFound) -> PoolRefinement | AsFound:
     if isinstance(part, refinement.AsFound):
         return AsFound()
-    if part.local_optimization is not None:
-        raise TensorsOnly(type(part.local_optimization).__name__)
-    return PoolRefinement(part.refine)
+    optimization: Any = part.local_optimization
+    if optimization is not None:
+        optimization = _part(optimization, _part(optimization.score))
+    return PoolRefinement(part.refine, optimization)
 
 
 def _selector(part: Any) -> Any:
