@@ -32,7 +32,10 @@ from tests.laws import degenerate, scene, scenes, small, with_padding
 
 pytest.importorskip("numba", reason="numba is not installed")
 
-PRESETS = ("lmeds", "lmeds_eight_point", "magsac", "msac", "ransac", "ransac_eight_point", "usac", "usac_paper")
+PRESETS = (
+    "gc_ransac", "gc_ransac_paper", "lmeds", "lmeds_eight_point", "magsac", "msac", "ransac", "ransac_eight_point",
+    "usac", "usac_paper",
+)  # fmt: skip
 COUNTS = (8, 40, 128, 129, 150, 250, 700)
 SEED = 3
 
@@ -267,11 +270,11 @@ def test_which_wholes_have_a_kernel_form() -> None:
     for options in (
         {"sampler": "prosac", "score": "magsac", "final": "none"}, {"select": {}, "focal": {}, "final": "adaptive"},
         {"refine": {"kernel": "truncated"}}, {"score": "saturated"}, {"final": "gauss_newton"},
-        {"degeneracy": "degensac"},
+        {"degeneracy": "degensac"}, {"local_optimization": "graph_cut"},
     ):  # fmt: skip
         assert HypothesizeAndVerify(**options).kernel_form is not None, options
     for options in (
-        {"score": Own(1.0)}, {"local_optimization": "graph_cut"}, {"select": {"score": Own(1.0)}},
+        {"score": Own(1.0)}, {"select": {"score": Own(1.0)}},
     ):  # fmt: skip
         assert HypothesizeAndVerify(**options).kernel_form is None, options
 
