@@ -37,8 +37,9 @@ _CLASSES = {
     "fmbench": ("fmtorch.data.fmbench", "FMBenchPairs"),
     "rendered": ("fmtorch.data.rendered", "RenderedPairs"),
     "stereo": ("fmtorch.data.rendered", "StereoPair"),
+    "h5": ("fmtorch.exchange.dataset", "H5Pairs"),
 }
-_WITHOUT_SPLIT = frozenset(("stereo",))
+_WITHOUT_SPLIT = frozenset(("stereo", "h5"))
 _GENERATED = frozenset(("rendered",))
 
 
@@ -49,7 +50,7 @@ def load(
     progress: Callable[[int, int], None] | None = None,
     **options: Any,
 ) -> PairDataset:
-    """The data set `name` (fmbench, rendered, stereo): an indexable of `ImagePair`, as torch's DataLoader takes it.
+    """The data set `name` (fmbench, rendered, stereo, h5): an indexable of `ImagePair`, as torch's DataLoader takes it.
 
     Args:
         name: of the set.
@@ -70,6 +71,8 @@ def load(
     expect_loadable(name, split=split, root=root, **options)
     if root is not None:
         options["root"] = root
+    elif name == "h5":
+        raise DataError("h5 needs root: the file, or the folder of the files, that hold the matches")
     elif name == "fmbench":
         raise DataError("fmbench needs root: a set's folder with pairs_with_gt.txt, or a folder of such sets")
     if name not in _WITHOUT_SPLIT:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.types import pair_key
+from fmtorch.types import Correspondences, pair_key
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,6 +19,13 @@ class ImageSource:
 
     identity: str
     path: Path
+
+
+class GivenMatches(NamedTuple):
+    """Matches of one pair that somebody else computed, and how many keypoints each image has."""
+
+    correspondences: Correspondences
+    features: tuple[int, int]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -31,6 +38,7 @@ class ImagePair:
     F: (3, 3) float64 with ``x1^T F x0 = 0`` in pixels.
     K0, K1: (3, 3), R: (3, 3), t: (3,) with ``X1 = R X0 + t``, where known.
     problem: why this pair cannot be used (a bad line of a pairs file, say); None for a sound pair.
+    matches: reads the matches that come with the pair, in place of features and matcher; can be sent between processes.
     """
 
     identity: str
@@ -44,6 +52,7 @@ class ImagePair:
     R: NDArray[np.float64] | None = None
     t: NDArray[np.float64] | None = None
     problem: str | None = None
+    matches: Callable[[], GivenMatches] | None = None
 
     @property
     def key(self) -> int:
