@@ -26,6 +26,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 from fmtorch import data
 from fmtorch.data import read_image
+from tests.conftest import own_cache
 
 SOURCE = Path(__file__).resolve().parents[2]
 PAGES = ["README.md", "CONTRIBUTING.md", *(f"docs/{path.name}" for path in sorted((SOURCE / "docs").glob("*.md")))]
@@ -213,7 +214,7 @@ def those(slow: bool) -> list[object]:
 
 
 def run_all(some: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FMTORCH_CACHE", str(workplace / "cache"))
+    monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(workplace)))
     for command in some:
         print(command)
         if "report" in command and not (workplace / "runs").exists():

@@ -16,6 +16,7 @@ import pytest
 
 from fmtorch import data
 from fmtorch.stages import Estimator, FeatureExtractor, Matcher, Pruner
+from tests.conftest import own_cache
 
 SOURCE = Path(__file__).resolve().parents[2]
 PAGE = (SOURCE / "docs" / "own_parts.md").read_text(encoding="utf-8")
@@ -38,7 +39,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_every_part_is_evaluated(folder: Path) -> None:
     (command,) = re.findall(r"```bash\n(.*?)```", PAGE, flags=re.DOTALL)
-    env = {**os.environ, "PYTHONPATH": str(SOURCE), "FMTORCH_CACHE": f"{folder}/cache", "COLUMNS": "200"}
+    env = {**os.environ, "PYTHONPATH": str(SOURCE), "FMTORCH_CACHE": str(own_cache(folder)), "COLUMNS": "200"}
     words = [sys.executable, *shlex.split(command)[1:], "run_dir=run"]
     ended = subprocess.run(words, cwd=folder, env=env, capture_output=True, text=True, timeout=300, check=False)
     assert ended.returncode == 0, ended.stderr
