@@ -13,6 +13,7 @@ import os
 import runpy
 import sys
 import traceback
+from typing import Any
 
 LIBRARIES = (
     "torch", "kornia", "cv2", "hydra", "omegaconf", "pyarrow.parquet", "matplotlib.figure", "skimage.io",
@@ -21,7 +22,7 @@ LIBRARIES = (
 )  # fmt: skip
 
 
-def run(job: dict[str, object]) -> None:
+def run(job: dict[str, Any]) -> None:
     """In the process that was forked: become the command. Never returns."""
     status = 1
     try:
@@ -29,9 +30,9 @@ def run(job: dict[str, object]) -> None:
         nothing = os.open(os.devnull, os.O_RDONLY)
         for descriptor, source in ((0, nothing), (1, log), (2, errors)):
             os.dup2(source, descriptor)
-        os.environ.update(job["environment"])  # type: ignore[call-overload]
+        os.environ.update(job["environment"])
         os.chdir(str(job["cwd"]))
-        module, *arguments = job["start"]  # type: ignore[misc]
+        module, *arguments = job["start"]
         sys.argv = [module, *arguments]
         sys.path.insert(0, str(job["cwd"]))
         before = job.get("before")
