@@ -110,5 +110,5 @@ def task(config: DictConfig) -> None:
 
 def main() -> None:
     """The command."""
-    paths = [*path_fields(Fields), "dataset.root"]
+    paths = [*path_fields(Fields), "dataset.root", "dataset.truth", "dataset.images"]
     run_command("eval", task, paths=paths, interrupted="interrupted; the same command continues the run")

@@ -42,15 +42,17 @@ _CLASSES = {
     "tum": ("fmtorch.data.tum", "tum_pairs"),
     "kitti": ("fmtorch.data.kitti", "KittiPairs"),
     "colmap": ("fmtorch.data.colmap", "ColmapPairs"),
+    "h5": ("fmtorch.exchange.dataset", "H5Pairs"),
 }
 NEEDS_ROOT = {
     "fmbench": "a set's folder with pairs_with_gt.txt, or a folder of such sets",
     "tum": "the folder of the sequences' folders of TUM RGB-D",
     "kitti": "the folder with sequences/ and poses/ of KITTI odometry",
     "colmap": "a folder of scenes with a COLMAP model each, or one such scene",
+    "h5": "the file, or the folder of the files, that hold the matches",
 }
 """What `root` must be, by the names of the data sets that cannot do without."""
-_WITHOUT_SPLIT = frozenset(("stereo",))
+_WITHOUT_SPLIT = frozenset(("stereo", "h5"))
 _GENERATED = frozenset(("rendered",))
 
 
@@ -64,7 +66,7 @@ def load(
     """The data set `name`: an indexable of `ImagePair`, as torch's DataLoader takes it.
 
     Args:
-        name: of the set: rendered, stereo, fmbench, tum, kitti, colmap.
+        name: of the set: rendered, stereo, fmbench, tum, kitti, colmap, h5.
         split: `test` or `train`.
         root: where it lies, or for generated sets where they are kept.
         progress: called with (done, total) while a generated set is drawn for the first time.
