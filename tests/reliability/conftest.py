@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from tests import processes
 from tests.processes import Starter
 from tests.reliability.commands import data_set, evaluation, results
 
