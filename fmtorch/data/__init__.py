@@ -20,6 +20,7 @@ from fmtorch.options import expect_options
 
 __all__ = [
     "NEEDS_ROOT",
+    "SCENE_SETS",
     "DataError",
     "DepthDataset",
     "FMBenchPairs",
@@ -42,14 +43,18 @@ _CLASSES = {
     "tum": ("fmtorch.data.tum", "tum_pairs"),
     "kitti": ("fmtorch.data.kitti", "KittiPairs"),
     "colmap": ("fmtorch.data.colmap", "ColmapPairs"),
+    "cameras": ("fmtorch.data.camera_files", "CameraFilePairs"),
 }
 NEEDS_ROOT = {
     "fmbench": "a set's folder with pairs_with_gt.txt, or a folder of such sets",
     "tum": "the folder of the sequences' folders of TUM RGB-D",
     "kitti": "the folder with sequences/ and poses/ of KITTI odometry",
     "colmap": "a folder of scenes with a COLMAP model each, or one such scene",
+    "cameras": "a folder of scenes with Camera.txt and Images/ each, or one such scene",
 }
 """What `root` must be, by the names of the data sets that cannot do without."""
+SCENE_SETS = tuple(name for name in NEEDS_ROOT if name != "fmbench")
+"""The data sets of scenes with cameras, whose candidates `fmtorch pairs` judges."""
 _WITHOUT_SPLIT = frozenset(("stereo",))
 _GENERATED = frozenset(("rendered",))
 
@@ -64,7 +69,7 @@ def load(
     """The data set `name`: an indexable of `ImagePair`, as torch's DataLoader takes it.
 
     Args:
-        name: of the set: rendered, stereo, fmbench, tum, kitti, colmap.
+        name: of the set: rendered, stereo, fmbench, tum, kitti, colmap, cameras.
         split: `test` or `train`.
         root: where it lies, or for generated sets where they are kept.
         progress: called with (done, total) while a generated set is drawn for the first time.

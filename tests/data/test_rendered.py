@@ -14,10 +14,11 @@ import cv2
 import numpy as np
 import pytest
 
+from fmtorch.data.matchable import Keypoints, keypoints
 from fmtorch.data.rendered import Plan, RenderedPairs
 from fmtorch.data.rendered import generate as generation
 from fmtorch.data.rendered.cameras import fundamental
-from fmtorch.data.rendered.generate import FAMILIES, PLANS, Keypoints, Task, build, generate, keypoints, read, seeds
+from fmtorch.data.rendered.generate import FAMILIES, PLANS, Task, build, generate, read, seeds
 from fmtorch.data.rendered.photographs import MATERIALS, PICTURES
 from fmtorch.data.rendered.scene import Scene
 
