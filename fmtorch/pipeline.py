@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from fmtorch.data.images import read_image
 from fmtorch.data.lenses import Lens
-from fmtorch.data.pairs import ImagePair, ImageSource
+from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
 from fmtorch.stages import Estimator, FeatureExtractor, Matcher, Pruner, TimedExtractor
 from fmtorch.threads import one_thread
 from fmtorch.types import Correspondences, Estimate, Features, collate
@@ -112,6 +112,8 @@ class Pipeline:
     def _match(self, pair: ImagePair) -> Outcome:
         if pair.problem is not None:
             return Outcome(pair, reason=pair.problem)
+        if pair.matches is not None:
+            return self._given(pair, pair.matches)
         try:
             (features0, seconds0), (features1, seconds1) = self.features(pair.image0), self.features(pair.image1)
         except Exception as error:  # a pair that fails becomes a row with this reason
@@ -127,9 +129,20 @@ class Pipeline:
         except Exception as error:
             return Outcome(pair, counts, seconds=seconds, reason=_describe("matching", error))
         seconds["matching"] = time.perf_counter() - start
+        return Outcome(pair, counts, self._told(pair, c), None, seconds)
+
+    def _given(self, pair: ImagePair, matches: Callable[[], GivenMatches]) -> Outcome:
+        """The matches that come with a pair, in place of the first two stages."""
+        try:
+            c, counts = matches()
+        except Exception as error:  # a pair that cannot be read becomes a row with this reason
+            return Outcome(pair, reason=_describe("matches", error))
+        return Outcome(pair, counts, self._told(pair, c.to(self.device)))
+
+    def _told(self, pair: ImagePair, c: Correspondences) -> Correspondences:
+        """The matches with the pair's key and calibrations."""
         K0, K1 = (_calibration(K, self.device) for K in (pair.K0, pair.K1))
-        c = c.replace(key=torch.tensor([pair.key], device=self.device), K0=K0, K1=K1)
-        return Outcome(pair, counts, c, None, seconds)
+        return c.replace(key=torch.tensor([pair.key], device=self.device), K0=K0, K1=K1)
 
     def _prune(self, outcomes: list[Outcome]) -> list[Outcome]:
         c = _collated(outcomes)

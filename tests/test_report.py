@@ -18,10 +18,12 @@ from omegaconf import OmegaConf
 from fmtorch import presets
 from fmtorch.commands import report
 from fmtorch.data import read_image
+from fmtorch.evaluation import tables
 from fmtorch.evaluation.gallery import Options, Run, rebuilt, shown_pair
 from fmtorch.evaluation.page import Section, differing_pairs, render
 from fmtorch.evaluation.redraw import difference
 from fmtorch.evaluation.rows import evaluate
+from fmtorch.evaluation.summary import summarize
 from fmtorch.pipeline import Outcome
 from fmtorch.presets.composition import compose
 from fmtorch.storage import PairRow, RunFolder, RunFolderError, to_table
@@ -58,6 +60,21 @@ def test_figures_and_differences_are_those_of_the_rows() -> None:
     assert "+25.0 [" in text  # two pairs more at 0.01
     assert "one minus each other run" in text
     assert not re.search(r"(?:src|href)=\"(?!data:)", page)  # all that it shows is in it
+
+
+def test_poses_are_shown_where_a_run_has_them() -> None:
+    posed = [dataclasses.replace(r, rotation_error=2.0, translation_error=4.0) for r in results([0.01] * 4)]
+    runs = {"with": to_table(posed), "without": to_table(results([0.01] * 4))}
+    table = tables.poses({name: summarize(rows) for name, rows in runs.items()})
+    assert table is not None
+    figures = dict(zip(table.head[1:], (cell.text for cell in table.rows["with"]), strict=True))
+    # To 4 degrees a triangle up to the first of the four pairs, then 6 at 1.
+    assert figures["AUC@10°"] == "65.0"
+    assert (figures["mAA(10°)"], figures["mAP@10°"], figures["t error"]) == ("70.0", "100.0", "4.00°")
+    assert {cell.text for cell in table.rows["without"]} == {"–"}
+    page = render("Poses", [Section("set", runs)], [])
+    assert "Relative pose" in page
+    assert "Relative pose" not in render("None", [Section("set", {"without": runs["without"]})], [])
 
 
 def test_one_run_is_ahead_of_none() -> None:

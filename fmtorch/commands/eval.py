@@ -17,7 +17,7 @@ from fmtorch.data import PairDataset
 from fmtorch.evaluation.identity import run_identity
 from fmtorch.evaluation.plots import plot_recall_curves
 from fmtorch.evaluation.run import evaluate_pairs, select
-from fmtorch.evaluation.summary import ALL, summarize, summary_markdown, summary_table
+from fmtorch.evaluation.summary import ALL, pose_table, summarize, summary_markdown, summary_table
 from fmtorch.fields import Cache, Count, Device, Gigabytes, Seed, path_fields, read_fields
 from fmtorch.presets import plain
 from fmtorch.storage import RunFolder, identity_digest
@@ -80,6 +80,8 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
     folder.write_summary(summary, summary_markdown(summary, title=f"{pipeline_name} on {dataset.name}"))
     plot_recall_curves({pipeline_name: table}, folder.path / "recall.png")
     console.print(summary_table(summary, title=f"{pipeline_name} on {dataset.name}"))
+    if (poses := pose_table(summary)) is not None:
+        console.print(poses)
     console.print(f"[dim]{folder.path}: pairs/, summary.json, summary.md, recall.png[/dim]")
     if isinstance(pipeline.extractor, CachedFeatures):
         console.print(f"[dim]{pipeline.extractor.report()}[/dim]")
@@ -108,5 +110,5 @@ def task(config: DictConfig) -> None:
 
 def main() -> None:
     """The command."""
-    paths = [*path_fields(Fields), "dataset.root"]
+    paths = [*path_fields(Fields), "dataset.root", "dataset.truth", "dataset.images"]
     run_command("eval", task, paths=paths, interrupted="interrupted; the same command continues the run")

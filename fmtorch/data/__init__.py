@@ -44,6 +44,7 @@ _CLASSES = {
     "kitti": ("fmtorch.data.kitti", "KittiPairs"),
     "colmap": ("fmtorch.data.colmap", "ColmapPairs"),
     "cameras": ("fmtorch.data.camera_files", "CameraFilePairs"),
+    "h5": ("fmtorch.exchange.dataset", "H5Pairs"),
 }
 NEEDS_ROOT = {
     "fmbench": "a set's folder with pairs_with_gt.txt, or a folder of such sets",
@@ -51,11 +52,12 @@ NEEDS_ROOT = {
     "kitti": "the folder with sequences/ and poses/ of KITTI odometry",
     "colmap": "a folder of scenes with a COLMAP model each, or one such scene",
     "cameras": "a folder of scenes with Camera.txt and Images/ each, or one such scene",
+    "h5": "the file, or the folder of the files, that hold the matches",
 }
 """What `root` must be, by the names of the data sets that cannot do without."""
-SCENE_SETS = tuple(name for name in NEEDS_ROOT if name != "fmbench")
+SCENE_SETS = ("tum", "kitti", "colmap", "cameras")
 """The data sets of scenes with cameras, whose candidates `fmtorch pairs` judges."""
-_WITHOUT_SPLIT = frozenset(("stereo",))
+_WITHOUT_SPLIT = frozenset(("stereo", "h5"))
 _GENERATED = frozenset(("rendered",))
 
 
@@ -69,7 +71,7 @@ def load(
     """The data set `name`: an indexable of `ImagePair`, as torch's DataLoader takes it.
 
     Args:
-        name: of the set: rendered, stereo, fmbench, tum, kitti, colmap, cameras.
+        name: of the set: rendered, stereo, fmbench, tum, kitti, colmap, cameras, h5.
         split: `test` or `train`.
         root: where it lies, or for generated sets where they are kept.
         progress: called with (done, total) while a generated set is drawn for the first time.

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.data.lenses import Lens
-from fmtorch.types import pair_key
+from fmtorch.types import Correspondences, pair_key
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,6 +29,13 @@ class ImageSource:
     lens: Lens | None = None
 
 
+class GivenMatches(NamedTuple):
+    """Matches of one pair that somebody else computed, and how many keypoints each image has."""
+
+    correspondences: Correspondences
+    features: tuple[int, int]
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class ImagePair:
     """Two images of one scene and how they are related.
@@ -39,6 +46,7 @@ class ImagePair:
     F: (3, 3) float64 with ``x1^T F x0 = 0`` in pixels.
     K0, K1: (3, 3), R: (3, 3), t: (3,) with ``X1 = R X0 + t``, where known.
     problem: why this pair cannot be used (a bad line of a pairs file, say); None for a sound pair.
+    matches: reads the matches that come with the pair, in place of features and matcher; can be sent between processes.
     """
 
     identity: str
@@ -52,6 +60,7 @@ class ImagePair:
     R: NDArray[np.float64] | None = None
     t: NDArray[np.float64] | None = None
     problem: str | None = None
+    matches: Callable[[], GivenMatches] | None = None
 
     @property
     def key(self) -> int:

@@ -20,6 +20,8 @@ from fmtorch.storage.code import code_digest, fmtorch_version
 from fmtorch.storage.configuration import file_digest, learned, libraries
 from fmtorch.storage.features import CachedFeatures
 
+PLACES = ("root", "truth", "images")  # options of data sets that say where things lie; the digest says what they are
+
 
 def run_identity(config: DictConfig, pipeline_name: str, pipeline: Pipeline, dataset_digest: str) -> dict[str, Any]:
     """The identity of a run, as plain values.
@@ -38,7 +40,7 @@ def run_identity(config: DictConfig, pipeline_name: str, pipeline: Pipeline, dat
     """
     stages = presets.stages(config)
     dataset = {
-        **{key: value for key, value in plain(config.dataset).items() if key != "root"},
+        **{key: value for key, value in plain(config.dataset).items() if key not in PLACES},
         "digest": dataset_digest,
     }
     peers = {PEERS[name] for target in presets.targets_of(stages) if (name := target.rpartition(".")[2]) in PEERS}

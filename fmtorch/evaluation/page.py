@@ -16,7 +16,7 @@ import pyarrow as pa
 from markupsafe import Markup
 
 from fmtorch.evaluation import curves, tables
-from fmtorch.evaluation.pictures import Image
+from fmtorch.evaluation.canvas import Image
 from fmtorch.evaluation.statistics import THRESHOLD
 from fmtorch.evaluation.summary import caption, summarize
 
@@ -129,7 +129,9 @@ def _context(section: Section, names: Sequence[str]) -> dict[str, Any]:
     pairs = {table.num_rows for table in section.runs.values()}
     facts = f"{len(section.runs)} runs" if len(section.runs) > 1 else "One run"
     counts = f"{min(pairs):,}" + (f" to {max(pairs):,}" if len(pairs) > 1 else "")
-    made = (tables.merit(summaries), tables.families(summaries), tables.differences(section.runs))
+    made = (
+        tables.merit(summaries), tables.families(summaries), tables.poses(summaries), tables.differences(section.runs),
+    )  # fmt: skip
     return {
         "heading": section.heading,
         "facts": f"{facts}, {counts} pair{'s' * (pairs != {1})}{' each' * (len(section.runs) > 1)}.",

@@ -7,13 +7,13 @@ import time
 from collections.abc import Sequence
 from typing import cast
 
-import torch
 from torch import Tensor
 
 from fmtorch import metrics
+from fmtorch.evaluation.outcomes import joined_correspondences, joined_estimates, joined_true, solved
+from fmtorch.evaluation.poses import PairPose, pose_errors
 from fmtorch.pipeline import STAGES, Outcome
 from fmtorch.storage import PairRow
-from fmtorch.types import Correspondences, Estimate, collate
 
 
 def evaluate(outcomes: Sequence[Outcome], seed: int = 0) -> list[PairRow]:
@@ -21,43 +21,27 @@ def evaluate(outcomes: Sequence[Outcome], seed: int = 0) -> list[PairRow]:
     start = time.perf_counter()
     nsgd, released = _distances(outcomes, seed)
     before, after = _inlier_rates(outcomes)
+    poses = pose_errors(outcomes)
     seconds = (time.perf_counter() - start) / max(len(outcomes), 1)
     return [
-        _row(outcome, {"nsgd": a, "nsgd_released": b, "inlier_rate_before": c, "inlier_rate": d}, seconds)
-        for outcome, a, b, c, d in zip(outcomes, nsgd, released, before, after, strict=True)
+        _row(outcome, {"nsgd": a, "nsgd_released": b, "inlier_rate_before": c, "inlier_rate": d}, pose, seconds)
+        for outcome, a, b, c, d, pose in zip(outcomes, nsgd, released, before, after, poses, strict=True)
     ]
-
-
-def _solved(outcome: Outcome) -> bool:
-    return outcome.estimate is not None and bool(outcome.estimate.ok[0])
-
-
-def _correspondences(outcomes: Sequence[Outcome]) -> Correspondences:
-    """On the CPU: metrics are float64, and so little work needs no GPU."""
-    return collate([o.correspondences.to("cpu") for o in outcomes if o.correspondences is not None])
-
-
-def _estimates(outcomes: Sequence[Outcome]) -> Estimate:
-    return collate([o.estimate.to("cpu") for o in outcomes if o.estimate is not None])
-
-
-def _true(outcomes: Sequence[Outcome]) -> Tensor:
-    return torch.stack([torch.from_numpy(o.pair.F) for o in outcomes])
 
 
 def _distances(outcomes: Sequence[Outcome], seed: int) -> tuple[list[float], list[float]]:
     """NSGD in both forms."""
     nsgd, released = [1.0] * len(outcomes), [1.0] * len(outcomes)
-    solved = [i for i, o in enumerate(outcomes) if _solved(o)]
-    if solved:
-        some = [outcomes[i] for i in solved]
-        c = _correspondences(some)
+    known = [i for i, o in enumerate(outcomes) if solved(o)]
+    if known:
+        some = [outcomes[i] for i in known]
+        c = joined_correspondences(some)
         if c.size0 is None or c.size1 is None:
             raise ValueError("correspondences come without image sizes (size0, size1); the matcher must supply them")
-        arguments = (_true(some), _estimates(some).F, c.size0, c.size1)
+        arguments = (joined_true(some), joined_estimates(some).F, c.size0, c.size1)
         values = metrics.nsgd(*arguments, seed=seed, key=c.keys).tolist()
         values_released = metrics.nsgd_released(*arguments, seed=seed, key=c.keys).tolist()
-        for i, a, b in zip(solved, values, values_released, strict=True):
+        for i, a, b in zip(known, values, values_released, strict=True):
             nsgd[i], released[i] = a, b
     return nsgd, released
 
@@ -68,18 +52,18 @@ def _inlier_rates(outcomes: Sequence[Outcome]) -> tuple[list[float], list[float]
     matched = [i for i, o in enumerate(outcomes) if o.estimate is not None and o.correspondences is not None]
     if matched:
         some = [outcomes[i] for i in matched]
-        c, estimate = _correspondences(some), _estimates(some)
+        c, estimate = joined_correspondences(some), joined_estimates(some)
         if c.size0 is None or c.size1 is None:
             raise ValueError("correspondences come without image sizes (size0, size1); the matcher must supply them")
-        rates = metrics.inlier_rate(_true(some), c.x0, c.x1, estimate.inliers, c.size0, c.size1, mask=c.mask)
+        rates = metrics.inlier_rate(joined_true(some), c.x0, c.x1, estimate.inliers, c.size0, c.size1, mask=c.mask)
         for i, a, b in zip(matched, rates.before.tolist(), rates.after.tolist(), strict=True):
-            before[i], after[i] = a, b if _solved(outcomes[i]) else math.nan
+            before[i], after[i] = a, b if solved(outcomes[i]) else math.nan
     return before, after
 
 
-def _row(outcome: Outcome, figures: dict[str, float], seconds: float) -> PairRow:
+def _row(outcome: Outcome, figures: dict[str, float], pose: PairPose, seconds: float) -> PairRow:
     pair, c, estimate = outcome.pair, outcome.correspondences, outcome.estimate
-    ok = _solved(outcome)
+    ok = solved(outcome)
     return PairRow(
         pair=pair.identity, key=pair.key, family=pair.family, scene=pair.scene, ok=ok, reason=outcome.reason,
         corrs=int(estimate.inliers.sum()) if estimate is not None else 0,
@@ -90,4 +74,5 @@ def _row(outcome: Outcome, figures: dict[str, float], seconds: float) -> PairRow
         F=estimate.F[0].flatten().tolist() if estimate is not None and ok else None,
         significance=float(cast(Tensor, estimate.significance)[0]) if estimate is not None and ok else None,
         related=bool(estimate.related[0]) if estimate is not None else False, **figures,
+        rotation_error=pose.rotation, translation_error=pose.translation, pose_reason=pose.reason,
     )  # fmt: skip

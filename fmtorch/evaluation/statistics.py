@@ -20,6 +20,7 @@ from fmtorch.evaluation.intervals import mean_difference, share_difference, shar
 from fmtorch.metrics.recall import FINE_THRESHOLD as FINE_THRESHOLD
 from fmtorch.metrics.recall import THRESHOLD as THRESHOLD
 
+POSE_THRESHOLDS = (5, 10, 20)  # degrees
 PERCENT = 100.0
 Values = NDArray[np.float64]
 
@@ -50,6 +51,30 @@ MERITS: dict[str, Callable[[Values], Values]] = {
 
 SHARES = ("recall_05", "recall_01")
 """Those of them that are shares of pairs."""
+
+
+def pose_figures(rotation: Values, translation: Values) -> dict[str, float | int] | None:
+    """Accuracy of poses over the pairs whose true pose is known; None where there is none.
+
+    rotation, translation: angles in degrees of each pair, (n,); NaN where the true pose is unknown.
+
+    - pairs: how many are known.
+    - auc_5, auc_10, auc_20: `fmtorch.metrics.pose_auc` of the larger of the two angles; map_5, map_10, map_20: its
+      binned mAP, `pose_map`; maa_10: `pose_maa`.
+    - rotation, translation: median angles.
+    """
+    known = ~(np.isnan(rotation) | np.isnan(translation))
+    if not known.any():
+        return None
+    errors = torch.from_numpy(np.maximum(rotation, translation)[known])
+    areas, means = (f(errors, POSE_THRESHOLDS).tolist() for f in (metrics.pose_auc, metrics.pose_map))
+    return {
+        "pairs": int(known.sum()),
+        **{f"auc_{t}": value for t, value in zip(POSE_THRESHOLDS, areas, strict=True)},
+        "maa_10": float(metrics.pose_maa(errors)),
+        **{f"map_{t}": value for t, value in zip(POSE_THRESHOLDS, means, strict=True)},
+        "rotation": float(np.median(rotation[known])), "translation": float(np.median(translation[known])),
+    }  # fmt: skip
 
 
 def interval(values: Values, scenes: Sequence[str], scale: float = 1.0, share: bool = False) -> Interval | None:

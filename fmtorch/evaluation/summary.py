@@ -14,7 +14,15 @@ from rich.table import Table
 from fmtorch.evaluation.bootstrap import LEVEL
 from fmtorch.evaluation.intervals import share_interval
 from fmtorch.evaluation.reasons import common_reasons
-from fmtorch.evaluation.statistics import FINE_THRESHOLD, MERITS, THRESHOLD, recalled, scene_names
+from fmtorch.evaluation.statistics import (
+    FINE_THRESHOLD,
+    MERITS,
+    POSE_THRESHOLDS,
+    THRESHOLD,
+    pose_figures,
+    recalled,
+    scene_names,
+)
 from fmtorch.storage import PAIR_SCHEMA
 
 ALL = "all"
@@ -42,6 +50,7 @@ def summarize(table: pa.Table) -> dict[str, Group]:
     - corrs, corrs_before: number of inliers and of matches given to the estimator; means over pairs that did not fail.
     - failures, failure_share, reasons: the commonest reasons and how often; reasons that differ in numbers alone are
       one, with the range of these.
+    - pose: of the pairs whose cameras are known, see `pose_figures`; None where there are none.
     - seconds: median per pair for each stage, and ``total``.
     """
     families = table["family"].to_pylist()
@@ -72,6 +81,7 @@ def _group(table: pa.Table) -> Group:
     for name in ("corrs", "corrs_before"):
         group[name] = _mean(_column(table, name)[ok])
 
+    group["pose"] = pose_figures(_column(table, "rotation_error"), _column(table, "translation_error"))
     failures = int((~ok).sum())
     group |= {
         "failures": failures, "failure_share": failures / len(ok) if len(ok) else None,
@@ -97,6 +107,23 @@ def summary_table(summary: Mapping[str, Group], title: str) -> Table:
     return shown
 
 
+def pose_table(summary: Mapping[str, Group]) -> Table | None:
+    """The figures of poses, for a terminal of 80 columns; None where no pair has known cameras."""
+    rows = _pose_rows(summary)
+    if not rows:
+        return None
+    shown = Table(
+        title="Relative pose", title_style="bold", caption=POSE_CAPTION, caption_justify="left", caption_style="dim",
+        box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True,
+    )  # fmt: skip
+    columns = {heading: column for heading, column in POSE_COLUMNS.items() if "mAP" not in heading}
+    for i, heading in enumerate(columns):
+        shown.add_column(heading, justify="right" if i else "left", no_wrap=i > 0, overflow="fold")
+    for name, figures in rows:
+        shown.add_row(*_cells(columns, name, figures), style="bold" if name == ALL else "")
+    return shown
+
+
 def summary_markdown(summary: Mapping[str, Group], title: str) -> str:
     """All figures as a Markdown page."""
     rows = [list(MARKDOWN_COLUMNS), ["---", *["---:"] * (len(MARKDOWN_COLUMNS) - 1)]]
@@ -110,7 +137,11 @@ def summary_markdown(summary: Mapping[str, Group], title: str) -> str:
         if name != ALL or len(summary) == 1
         for reason, count in group["reasons"].items()
     ]
-    parts = [f"# {title}", _lines(rows), caption(summary), _lines(stages)]
+    parts = [f"# {title}", _lines(rows), caption(summary)]
+    if poses := _pose_rows(summary):
+        head = [["Relative pose", *list(POSE_COLUMNS)[1:]], ["---", *["---:"] * (len(POSE_COLUMNS) - 1)]]
+        parts += [_lines([*head, *(_cells(POSE_COLUMNS, name, group) for name, group in poses)]), POSE_CAPTION_BINNED]
+    parts.append(_lines(stages))
     if failures:
         parts += ["Commonest reasons of failure, with the number of pairs:", "\n".join(failures)]
     return "\n\n".join(parts) + "\n"
@@ -119,6 +150,11 @@ def summary_markdown(summary: Mapping[str, Group], title: str) -> str:
 def _rows(summary: Mapping[str, Group]) -> list[tuple[str, Group]]:
     """The groups to show: ``all`` last, and not where it repeats the only family."""
     return [(name, group) for name, group in summary.items() if name != ALL or len(summary) != 2]
+
+
+def _pose_rows(summary: Mapping[str, Group]) -> list[tuple[str, Group]]:
+    """The figures of poses of the groups to show that have some."""
+    return [(name, group["pose"]) for name, group in _rows(summary) if group["pose"] is not None]
 
 
 def _cells(columns: Mapping[str, Callable[[Group], str]], name: str, group: Group) -> list[str]:
@@ -195,6 +231,23 @@ MARKDOWN_COLUMNS: dict[str, Callable[[Group], str]] = {
     "#Corrs (-m)": _corrs,
     "Failures": _failures,
 }
+
+
+POSE_COLUMNS: dict[str, Callable[[Group], str]] = {
+    "": lambda group: "",
+    "Pairs": lambda group: str(group["pairs"]),
+    **{f"AUC@{t}°": _percent(f"auc_{t}") for t in POSE_THRESHOLDS},
+    "mAA(10°)": _percent("maa_10"),
+    **{f"mAP@{t}°": _percent(f"map_{t}") for t in POSE_THRESHOLDS},
+    "R error": lambda group: f"{group['rotation']:.2f}°",
+    "t error": lambda group: f"{group['translation']:.2f}°",
+}
+POSE_CAPTION = (
+    "Of the pairs with known cameras, by the larger of the angles of rotation and of translation (up to sign); "
+    "failures count as 180° and 90°. AUC: area under the recall curve; mAA(10°): mean of recall at 1°, ..., 10°; "
+    "R error, t error: medians."
+)
+POSE_CAPTION_BINNED = f"{POSE_CAPTION} mAP: mean of recall at 5°, 10°, ..., as in papers before 2020."
 
 
 def _column(table: pa.Table, name: str) -> NDArray[np.float64]:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from fmtorch.evaluation.bootstrap import LEVEL, Interval
 from fmtorch.evaluation.intervals import MIN_UNITS, mean_difference, share_difference
-from fmtorch.evaluation.statistics import FINE_THRESHOLD, PERCENT, THRESHOLD, areas, scene_names
-from fmtorch.evaluation.summary import ALL, MARKDOWN_COLUMNS, RECALL, STAGES
+from fmtorch.evaluation.statistics import FINE_THRESHOLD, PERCENT, POSE_THRESHOLDS, THRESHOLD, areas, scene_names
+from fmtorch.evaluation.summary import ALL, MARKDOWN_COLUMNS, POSE_CAPTION_BINNED, POSE_COLUMNS, RECALL, STAGES
 
 DASH = "–"
 Summaries = Mapping[str, Mapping[str, Any]]  # of `summarize`, by the runs' names
@@ -67,6 +67,24 @@ def merit(summaries: Summaries) -> Table:
         for name, summary in summaries.items()
     }
     return Table("Figures of merit", ["run", *columns], rows)
+
+
+def poses(summaries: Summaries) -> Table | None:
+    """Accuracy of relative poses over all pairs with known cameras; None where there are none."""
+    known = {name: summary[ALL]["pose"] for name, summary in summaries.items() if summary[ALL]["pose"] is not None}
+    if not known:
+        return None
+    columns = {heading: column for heading, column in POSE_COLUMNS.items() if heading}
+    ranked = {f"AUC@{t}°": f"auc_{t}" for t in POSE_THRESHOLDS} | {"mAA(10°)": "maa_10"}
+    best = {heading: _best({n: figures[field] for n, figures in known.items()}) for heading, field in ranked.items()}
+    rows = {
+        name: [
+            Cell(column(known[name]), name in best.get(heading, ())) if name in known else Cell(DASH)
+            for heading, column in columns.items()
+        ]
+        for name in summaries
+    }
+    return Table("Relative pose", ["run", *columns], rows, POSE_CAPTION_BINNED)
 
 
 def families(summaries: Summaries) -> Table | None:

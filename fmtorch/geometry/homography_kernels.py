@@ -30,7 +30,8 @@ def maps(H: Array, x: float, y: float, u: float, v: float, limit: float) -> bool
     depth = H[6] * x + H[7] * y + H[8]
     du = (H[0] * x + H[1] * y + H[2]) / depth - u
     dv = (H[3] * x + H[4] * y + H[5]) / depth - v
-    return du * du + dv * dv <= limit
+    within: bool = du * du + dv * dv <= limit
+    return within
 
 
 @inner

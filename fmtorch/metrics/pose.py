@@ -1,16 +1,16 @@
-"""Errors of a relative pose in degrees, and the area under their recall curve."""
+"""Errors of a relative pose in degrees."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.checked import checked
 from fmtorch.geometry.epipolar import inverse_root
+from fmtorch.geometry.pose import pose_from_fundamental
 
 
 class PoseError(NamedTuple):
@@ -21,7 +21,7 @@ class PoseError(NamedTuple):
 
     @property
     def worst(self) -> Tensor:
-        """The larger of the two: the pose error that `pose_auc` is about."""
+        """The larger of the two: the pose error of which recall is taken."""
         return torch.maximum(self.rotation, self.translation)
 
 
@@ -62,29 +62,35 @@ def pose_error(
 
 
 @checked
-def pose_auc(
-    errors: Float[Tensor, "*batch pairs"], thresholds: Sequence[float | int] = (5, 10, 20)
-) -> Float[Tensor, "*batch t"]:
-    """Area under the recall curve of pose errors up to each threshold in degrees, divided by the threshold.
+def fundamental_pose_error(
+    F: Float[Tensor, "*batch 3 3"],
+    K0: Float[Tensor, "*batch 3 3"],
+    K1: Float[Tensor, "*batch 3 3"],
+    x0: Float[Tensor, "*batch n 2"],
+    x1: Float[Tensor, "*batch n 2"],
+    R_gt: Float[Tensor, "*batch 3 3"],
+    t_gt: Float[Tensor, "*batch 3"],
+    mask: Bool[Tensor, "*batch n"] | None = None,
+    *,
+    up_to_sign: bool = True,
+) -> PoseError:
+    """`pose_error` of the pose that F has with known calibrations: E = K1^T F K0, decomposed, cheirality checked.
 
-    As SuperGlue and LoFTR compute it: the curve rises linearly between sorted errors, from recall 0 at error 0. NaN
-    and infinity count as misses. Raises ValueError unless the thresholds are positive.
+    Args:
+        F: estimated fundamental matrices, x1^T F x0 = 0 in pixels.
+        K0, K1: calibration matrices.
+        x0, x1: the matches whose depths must be positive, usually the estimator's inliers, in pixels.
+        R_gt, t_gt: the true motion, X1 = R X0 + t; the length of t does not count.
+        mask: which of the matches count; all when not given.
+        up_to_sign: see `pose_error`.
+
+    Returns:
+        Angles in degrees. Where there is no pose (F without rank 2, a singular calibration, no point in front of both
+        cameras) rotation is 180 and translation 90, or 180 with its sign. Differentiable in F, K0 and K1.
     """
-    if not thresholds or not all(threshold > 0 for threshold in thresholds):
-        raise ValueError(f"thresholds are {tuple(thresholds)}; they must be positive, and at least one")
-    pairs = errors.shape[-1]
-    errors = torch.where(errors.isnan(), torch.inf, errors).sort(dim=-1).values
-    step = torch.arange(1, pairs + 1, dtype=errors.dtype, device=errors.device) / pairs
-    return torch.stack([_area(errors, step, float(t)) / t for t in thresholds], -1)
-
-
-def _area(errors: Tensor, step: Tensor, threshold: float) -> Tensor:
-    """Trapezoids below the points (error, recall) left of the threshold, level from the last one to the threshold."""
-    reached = (errors < threshold).to(errors.dtype).mean(-1, keepdim=True)
-    zero = torch.zeros_like(reached)
-    e = torch.cat([zero, errors.clamp(max=threshold), zero + threshold], -1)
-    r = torch.cat([zero, torch.minimum(step, reached), reached], -1)
-    return ((r[..., 1:] + r[..., :-1]) / 2 * e.diff(dim=-1)).sum(-1)
+    pose = pose_from_fundamental(F, K0, K1, x0, x1, mask)
+    R = torch.where(pose.valid[..., None, None], pose.R, torch.nan)
+    return pose_error(R, pose.t, R_gt.to(R.dtype), t_gt.to(R.dtype), up_to_sign=up_to_sign)
 
 
 def _angle(sine: Tensor, cosine: Tensor) -> Tensor:

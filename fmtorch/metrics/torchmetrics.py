@@ -5,6 +5,7 @@ Needs the extra `metrics`: ``pip install 'fmtorch[metrics]'``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -12,6 +13,7 @@ from jaxtyping import Float, Int, Real
 from torch import Tensor
 
 from fmtorch.metrics.nsgd import nsgd
+from fmtorch.metrics.pose_recall import BIN, MAA_MAXIMUM, THRESHOLDS, pose_auc, pose_maa, pose_map
 from fmtorch.metrics.recall import THRESHOLD, mean_recall, recall
 
 try:
@@ -93,3 +95,57 @@ class MeanRecall(_MeanOverPairs):
     def update(self, nsgd: Float[Tensor, " b"]) -> None:
         """Adds the NSGD of a batch; NaN counts as a miss."""
         self._add(mean_recall(nsgd, self.maximum), len(nsgd))
+
+
+class PoseMAA(_MeanOverPairs):
+    """mAA(10): `fmtorch.metrics.pose_maa` over all pairs, from their pose errors in degrees."""
+
+    is_differentiable = False
+    higher_is_better = True
+
+    def __init__(self, *, maximum: int = MAA_MAXIMUM, **options: Any) -> None:
+        super().__init__(**options)
+        self.maximum = maximum
+
+    def update(self, errors: Float[Tensor, " b"]) -> None:
+        """Adds the pose errors of a batch, `PoseError.worst`; NaN counts as a miss."""
+        self._add(pose_maa(errors, self.maximum), len(errors))
+
+
+class PoseMAP(_MeanOverPairs):
+    """Binned mAP: `fmtorch.metrics.pose_map` at one threshold over all pairs, from their pose errors in degrees."""
+
+    is_differentiable = False
+    higher_is_better = True
+
+    def __init__(self, *, threshold: float | int = THRESHOLDS[1], bin: float | int = BIN, **options: Any) -> None:
+        super().__init__(**options)
+        self.threshold, self.bin = threshold, bin
+
+    def update(self, errors: Float[Tensor, " b"]) -> None:
+        """Adds the pose errors of a batch, `PoseError.worst`; NaN counts as a miss."""
+        self._add(pose_map(errors, (self.threshold,), self.bin)[0], len(errors))
+
+
+class PoseAUC(Metric):  # type: ignore[misc, unused-ignore]
+    """`fmtorch.metrics.pose_auc` over all pairs, (t,), from their pose errors in degrees, all of which are kept."""
+
+    is_differentiable = True
+    higher_is_better = True
+    full_state_update = False
+    errors: list[Tensor]
+
+    def __init__(self, *, thresholds: Sequence[float | int] = THRESHOLDS, **options: Any) -> None:
+        super().__init__(**options)
+        self.thresholds = tuple(thresholds)
+        self.add_state("errors", [], dist_reduce_fx="cat")
+
+    def update(self, errors: Float[Tensor, " b"]) -> None:
+        """Adds the pose errors of a batch, `PoseError.worst`; NaN counts as a miss."""
+        self.errors.append(errors)
+
+    def compute(self) -> Tensor:
+        """The area up to each threshold over all pairs so far, NaN when there are none."""
+        errors = [self.errors] if isinstance(self.errors, Tensor) else self.errors  # one tensor after a reduction
+        joined = torch.cat(errors) if errors else torch.zeros(0)
+        return pose_auc(joined, self.thresholds) if len(joined) else joined.new_full((len(self.thresholds),), torch.nan)

@@ -33,6 +33,9 @@ PAIR_SCHEMA = pa.schema(
         pa.field("F", pa.list_(pa.float64(), 9)),
         pa.field("significance", pa.float64()),
         pa.field("related", pa.bool_(), nullable=False),
+        pa.field("rotation_error", pa.float64()),
+        pa.field("translation_error", pa.float64()),
+        pa.field("pose_reason", pa.string()),
     ]
 )
 
@@ -42,7 +45,7 @@ class PairRow:
     """The result of one image pair. What could not be computed is None or NaN, and null in the table.
 
     Raises ValueError for a row that contradicts itself: a failed pair has a reason, NSGD 1 and no F; a sound one has no
-    reason and nine finite elements of F; NSGD is in [0, 1].
+    reason and nine finite elements of F; NSGD is in [0, 1]; there are both angles of a pose error or neither.
     """
 
     pair: str  # the pair's identity within its data set
@@ -68,10 +71,19 @@ class PairRow:
     F: Sequence[float] | None = None  # row by row, x1^T F x0 = 0 in pixels, unit Frobenius norm
     significance: float | None = None  # how far the support of F is beyond chance
     related: bool = False  # whether the images are therefore taken to show one scene; recall does not ask
+    rotation_error: float | None = None  # degrees, in [0, 180]; 180 where the pair failed; None without a true pose
+    translation_error: float | None = None  # degrees between directions up to sign, in [0, 90]; 90 where it failed
+    pose_reason: str | None = None  # why there is no pose error, or no pose; None where there is
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.nsgd <= 1.0:
             raise ValueError(f"pair {self.pair!r}: nsgd is {self.nsgd}; it must be in [0, 1]")
+        angles = [a for a in (self.rotation_error, self.translation_error) if a is not None and not math.isnan(a)]
+        if len(angles) == 1 or not all(0.0 <= a <= 180.0 for a in angles):
+            raise ValueError(
+                f"pair {self.pair!r}: rotation_error is {self.rotation_error} and translation_error is "
+                f"{self.translation_error}; both must be angles in [0, 180] degrees, or neither known"
+            )
         if self.related and not self.ok:
             raise ValueError(f"pair {self.pair!r} failed, but is called related")
         if self.ok:

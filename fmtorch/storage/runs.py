@@ -26,8 +26,11 @@ import pyarrow.parquet as pq
 from fmtorch.storage.files import naming, replacing, sync, temporary_name
 from fmtorch.storage.rows import PAIR_SCHEMA, PairRow, to_table
 
-FORMAT = 2  # of the folder; to be raised when the schema changes, or what the identity tells
-READABLE = (1, FORMAT)  # formats that `load` reads; 1 lost the order of the pruners
+FORMAT = 3  # of the folder; to be raised when the schema changes, or what the identity tells
+READABLE = (1, 2, FORMAT)  # formats that `load` reads; 1 lost the order of the pruners, 2 had no errors of poses
+_LACKS = {1: "the order of the pruners and the errors of poses", 2: "the errors of poses"}
+_ADDED = ("rotation_error", "translation_error", "pose_reason")  # columns that formats before the third lack
+_OLDER_SCHEMA = pa.schema([field for field in PAIR_SCHEMA if field.name not in _ADDED])
 _SHOWN = 5  # differing fields shown in an error
 
 
@@ -80,8 +83,8 @@ class RunFolder:
         folder = cls.load(path)
         if folder.format != FORMAT:
             raise RunFolderError(
-                f"{path} holds a run of format {folder.format}, whose identity tells too little (not the order of the "
-                f"pruners, say); this version continues format {FORMAT} only, but `fmtorch.report` still reads it. "
+                f"{path} holds a run of format {folder.format}, which lacks {_LACKS[folder.format]}; this version "
+                f"continues format {FORMAT} only, but `fmtorch.report` still reads it. "
                 "Choose another run_dir, or delete the folder"
             )
         if folder.identity != identity_digest(wanted):
@@ -112,7 +115,7 @@ class RunFolder:
             raise RunFolderError(
                 f"{file} has format {stored.get('format')}, this version reads {formats}; choose another run_dir"
             )
-        if stored["format"] == FORMAT and stored.get("identity") != identity_digest(stored["config"]):
+        if stored["format"] > 1 and stored.get("identity") != identity_digest(stored["config"]):
             raise RunFolderError(
                 f"{file} was changed: its identity is not that of its config; put it back as it was, or delete the "
                 "folder and run again"
@@ -169,9 +172,15 @@ class RunFolder:
                 if digest and digest != [_content_digest(data)]:
                     raise pa.ArrowInvalid("it is not what was written there")
                 with pq.ParquetFile(pa.BufferReader(data)) as parquet:
-                    if not parquet.schema_arrow.equals(PAIR_SCHEMA):
+                    older = self.format < FORMAT and parquet.schema_arrow.equals(_OLDER_SCHEMA)
+                    if not older and not parquet.schema_arrow.equals(PAIR_SCHEMA):
                         raise pa.ArrowInvalid("its columns are not those of this version")
-                    yield parquet.read(columns=columns)
+                    part = parquet.read(columns=[name for name in columns if not older or name not in _ADDED])
+                for name in _ADDED:
+                    if older and name in columns:
+                        field = PAIR_SCHEMA.field(name)
+                        part = part.append_column(field, pa.nulls(len(part), field.type))
+                yield part
             except (pa.ArrowException, OSError) as error:
                 raise RunFolderError(
                     f"{file} cannot be read ({error}); delete it and start the run again, which computes its pairs anew"

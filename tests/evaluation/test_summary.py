@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
+import torch
 from rich.console import Console
 
-from fmtorch.evaluation.summary import summarize, summary_markdown, summary_table
+from fmtorch import metrics
+from fmtorch.evaluation.summary import pose_table, summarize, summary_markdown, summary_table
 from fmtorch.storage import PairRow, to_table
 from fmtorch.types import pair_key
 
@@ -132,6 +134,44 @@ def test_markdown() -> None:
     assert "| indoor | 5 | 5 | 60.0 [" in text
     assert "a\\|b.png" in text
     assert "1 (20.0%)" in text
+
+
+def posed(name: str, rotation: float, translation: float, **changes: Any) -> PairRow:
+    return good(name, 0.01, rotation_error=rotation, translation_error=translation, **changes)
+
+
+def test_poses_known_answer() -> None:
+    """By the larger angle, of the pairs with known cameras; a failed one is a miss."""
+    failed = bad("d", rotation_error=180.0, translation_error=90.0, pose_reason="no F")
+    unknown = good("e", 0.0, pose_reason="K0, K1 unknown", family="orbit")
+    rows = [posed("a", 0.5, 2.0), posed("b", 4.5, 1.0), posed("c", 1.0, 12.0), failed, unknown]
+    indoor, orbit, everything = summarize(to_table(rows)).values()
+    assert orbit["pose"] is None
+    assert everything["pose"] == indoor["pose"]
+    pose = indoor["pose"]
+    assert pose["pairs"] == 4
+    errors = torch.tensor([2.0, 4.5, 12.0, 180.0], dtype=torch.float64)
+    assert [pose[f"auc_{t}"] for t in (5, 10, 20)] == pytest.approx(metrics.pose_auc(errors).tolist())
+    assert [pose[f"map_{t}"] for t in (5, 10, 20)] == pytest.approx([2 / 4, 2 / 4, (2 + 2 + 3 + 3) / 16])
+    assert pose["maa_10"] == pytest.approx((0 + 1 + 1 + 1 + 6 * 2) / 40)
+    assert (pose["rotation"], pose["translation"]) == (2.75, 7.0)
+
+
+def test_poses_are_shown_where_cameras_are_known() -> None:
+    without = summarize(known())
+    assert pose_table(without) is None
+    assert "Relative pose" not in summary_markdown(without, title="t")
+    with_poses = summarize(to_table([posed("a", 0.5, 2.0), posed("b", 4.5, 1.0, family="orbit")]))
+    console = Console(width=80, color_system=None)
+    with console.capture() as capture:
+        console.print(pose_table(with_poses))
+    lines = capture.get().splitlines()
+    assert max(map(len, lines)) <= 80
+    assert "…" not in capture.get()
+    orbit = next(line.split() for line in lines if line.strip().startswith("orbit"))
+    assert orbit == ["orbit", "1", "55.0", "77.5", "88.8", "60.0", "4.50°", "1.00°"]
+    text = summary_markdown(with_poses, title="t")
+    assert "| orbit | 1 | 55.0 | 77.5 | 88.8 | 60.0 | 100.0 | 100.0 | 100.0 | 4.50° | 1.00° |" in text
 
 
 def test_a_single_family_is_not_repeated_as_all() -> None:

@@ -1,18 +1,20 @@
-"""Pose errors and their area under the curve: known answers, SuperGlue's evaluation, gradients, laws."""
+"""Pose errors: known answers, SuperGlue's evaluation, OpenCV's decomposition, gradients, laws."""
 
 from __future__ import annotations
 
 import math
 
+import cv2
+import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from torch import Tensor
 
 from fmtorch.geometry import cross_matrix
-from fmtorch.metrics import pose_auc, pose_error
+from fmtorch.metrics import fundamental_pose_error, pose_error
+from tests.geometry.scenes import scene
 from tests.reference import metrics as reference
+from tests.reference import solvers
 
 
 def rotation(axis_angle: Tensor) -> Tensor:
@@ -79,24 +81,63 @@ def test_gradients() -> None:
         assert value.isfinite().all()
 
 
-def test_auc_known_answers() -> None:
-    errors = torch.tensor([2.0, 12.0], dtype=torch.float64)
-    # To 5: a triangle of base 2 and height 1/2, then 3 at 1/2. To 20: up to 12 it rises from 1/2 to 1, then 8 at 1.
-    expected = [(0.5 + 1.5) / 5, (0.5 + 4) / 10, (0.5 + 7.5 + 8) / 20]
-    assert pose_auc(errors).tolist() == pytest.approx(expected)
-    assert pose_auc(torch.tensor([torch.nan, torch.inf])).tolist() == [0, 0, 0]
+def perturbed(count: int) -> list[Tensor]:
+    """F of noisy matches by the eight-point algorithm, K0, K1, the matches, and the true motion: (count, ...)."""
+    scenes = [scene(20, seed, noise=1.0) for seed in range(count)]
+    F = [torch.from_numpy(cv2.findFundamentalMat(s.x0.numpy(), s.x1.numpy(), cv2.FM_8POINT)[0]) for s in scenes]
+    columns = zip(*((f, s.K0, s.K1, s.x0, s.x1, s.R, s.t) for f, s in zip(F, scenes, strict=True)), strict=True)
+    return [torch.stack(list(column)) for column in columns]
 
 
-@given(st.lists(st.floats(0, 40) | st.just(5.0) | st.just(float("inf")), min_size=1, max_size=20))
-def test_auc_as_superglue(values: list[float]) -> None:
-    thresholds = (5, 10, 20)
-    auc = pose_auc(torch.tensor(values, dtype=torch.float64), thresholds)
-    assert auc.tolist() == pytest.approx(reference.pose_auc(values, thresholds), abs=1e-12)
+def test_of_a_fundamental_matrix_as_brute_force_and_opencv() -> None:
+    inputs = perturbed(10)
+    error = fundamental_pose_error(*inputs)
+    for i, (F, K0, K1, x0, x1, R_gt, t_gt) in enumerate(zip(*(a.numpy() for a in inputs), strict=True)):
+        R, t, _ = solvers.pose(F, K0, K1, x0, x1)
+        rays = [solvers.homogeneous(x) @ np.linalg.inv(K).T for x, K in ((x0, K0), (x1, K1))]
+        _, R_cv, t_cv, _ = cv2.recoverPose(K1.T @ F @ K0, rays[0][:, :2], rays[1][:, :2], np.eye(3))
+        for rotation, direction in ((R, t), (R_cv, t_cv[:, 0])):
+            # arccos at a cosine near 1: its rounding of 1e-16 is an angle of 1e-16 / sin(angle)
+            expected = reference.rotation_angle(rotation, R_gt), reference.direction_angle(direction, t_gt)
+            assert (error.rotation[i].item(), error.translation[i].item()) == pytest.approx(expected, abs=1e-7)
 
 
-def test_auc_batches() -> None:
-    errors = torch.rand(2, 3, 40, dtype=torch.float64) * 30
-    auc = pose_auc(errors)
-    assert auc.shape == (2, 3, 3)
-    torch.testing.assert_close(auc[1, 2], pose_auc(errors[1, 2]), rtol=1e-13, atol=0)
-    assert torch.autograd.gradcheck(pose_auc, errors[0].requires_grad_())
+def test_the_right_fundamental_matrix_has_no_error_at_any_scale_and_sign() -> None:
+    s = scene(20, 3)
+    for factor in (1.0, -1.0, 1e-6, 1e6):
+        error = fundamental_pose_error(factor * s.F, s.K0, s.K1, s.x0, s.x1, s.R, 7 * s.t)
+        assert error.worst.item() < 1e-8
+    signed = fundamental_pose_error(s.F, s.K0, s.K1, s.x0, s.x1, s.R, -s.t, up_to_sign=False)
+    assert signed.translation.item() == pytest.approx(180, abs=1e-5)
+
+
+def test_of_a_fundamental_matrix_the_three_laws() -> None:
+    inputs = perturbed(6)
+    mask = torch.arange(20).expand(6, 20) < torch.tensor([20, 15, 12, 20, 0, 8])[:, None]
+    for x in inputs[3:5]:
+        x[~mask] = torch.nan
+    inputs[0][3] = torch.nan
+    leaves = [a.requires_grad_() for a in inputs[:3]]
+    error = fundamental_pose_error(*inputs, mask)
+    assert error.rotation[[3, 4]].tolist() == [180, 180]  # no F; no match whose depth could be looked at
+    assert error.translation[[3, 4]].tolist() == [90, 90]
+    assert error.worst[[0, 1, 2, 5]].max() < 90
+    for i, n in enumerate([20, 15, 12, 20, 0, 8]):
+        F, K0, K1, x0, x1, R, t = (a[i] for a in inputs)
+        alone = fundamental_pose_error(F, K0, K1, x0[:n], x1[:n], R, t)
+        assert torch.equal(alone.rotation, error.rotation[i])
+        assert torch.equal(alone.translation, error.translation[i])
+    for gradient in torch.autograd.grad(error.worst.sum(), leaves):
+        assert gradient.isfinite().all()
+
+
+def test_gradient_of_a_fundamental_matrix() -> None:
+    F, K0, K1, x0, x1, R, t = (a[0] for a in perturbed(1))
+    pixels = torch.diag(torch.tensor([500.0, 500, 1], dtype=torch.float64))  # of unit size, for finite differences
+    F, K0, K1 = pixels @ F @ pixels, pixels.inverse() @ K0, pixels.inverse() @ K1
+    leaves = [a.requires_grad_() for a in (F / F.norm(), K0, K1)]
+
+    def angles(F: Tensor, K0: Tensor, K1: Tensor) -> tuple[Tensor, Tensor]:
+        return tuple(fundamental_pose_error(F, K0, K1, x0 / 500, x1 / 500, R, t))
+
+    assert torch.autograd.gradcheck(angles, leaves)

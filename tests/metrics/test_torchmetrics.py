@@ -21,7 +21,6 @@ def test_says_which_extra_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_accumulates_over_batches() -> None:
-    pytest.importorskip("torchmetrics", reason="the extra `metrics` is not installed")
     classes = importlib.import_module("fmtorch.metrics.torchmetrics")
     F_gt, F_est = random_pairs(0, 7)
     sizes, key = VGA.expand(7, 2), torch.arange(7)
@@ -39,3 +38,20 @@ def test_accumulates_over_batches() -> None:
     torch.testing.assert_close(mean_recall.compute(), metrics.mean_recall(values, 0.1), rtol=1e-14, atol=0)
     recall.reset()
     assert recall.compute().isnan()
+
+
+def test_pose_errors_accumulate_over_batches() -> None:
+    classes = importlib.import_module("fmtorch.metrics.torchmetrics")
+    errors = torch.tensor([0.5, 3.0, torch.nan, 7.0, 12.0, 18.0, 40.0], dtype=torch.float64)
+    parts = (errors[:4], errors[4:4], errors[4:])
+    for metric, expected in (
+        (classes.PoseAUC(), metrics.pose_auc(errors)),
+        (classes.PoseAUC(thresholds=(7.5, 3)), metrics.pose_auc(errors, (7.5, 3))),
+        (classes.PoseMAA(), metrics.pose_maa(errors)),
+        (classes.PoseMAP(threshold=20), metrics.pose_map(errors, (20,))[0]),
+    ):
+        for part in parts:
+            metric.update(part)
+        torch.testing.assert_close(metric.compute(), expected, rtol=1e-14, atol=0)
+        metric.reset()
+        assert metric.compute().isnan().all()

@@ -153,3 +153,15 @@ def pose_auc(errors: list[float], thresholds: tuple[float, ...]) -> list[float]:
         r, e = [*curve[:last], curve[last - 1]], [*ordered[:last], t]
         areas.append(float(trapezoid(r, x=e)) / t)
     return areas
+
+
+def pose_map(errors: list[float], thresholds: tuple[float, ...]) -> list[float]:
+    """Mean average precision as OANet's published evaluation computes it: a histogram of bins of 5 degrees."""
+    edges = np.arange(7) * 5
+    share = np.cumsum(np.histogram(errors, edges)[0] / len(errors))
+    return [float(np.mean(share[: int(t) // 5])) for t in thresholds]
+
+
+def pose_maa(errors: list[float]) -> float:
+    """Mean average accuracy to 10 degrees as the RANSAC tutorial (CVPR 2020) computes it."""
+    return float(np.mean([np.mean([e <= t for e in errors]) for t in np.linspace(1.0, 10, 10)]))

@@ -145,6 +145,25 @@ def test_a_folder_of_the_first_format_is_read_but_not_continued(tmp_path: Path) 
         RunFolder.open(tmp_path, CONFIG)
 
 
+def test_a_folder_from_before_errors_of_poses_is_read_but_not_continued(tmp_path: Path) -> None:
+    run = RunFolder.open(tmp_path, CONFIG)
+    run.append([row("a")])
+    part = next((tmp_path / "pairs").iterdir())
+    old = pq.read_table(part).drop_columns(["rotation_error", "translation_error", "pose_reason"])
+    pq.write_table(old, part.with_name("part-0.parquet"))
+    part.unlink()
+    with pytest.raises(RunFolderError, match="columns are not those"):
+        run.read()
+    stored = json.loads((tmp_path / "run.json").read_text())
+    (tmp_path / "run.json").write_text(json.dumps({**stored, "format": 2}))
+    table = RunFolder.load(tmp_path).read()
+    assert table.schema == PAIR_SCHEMA
+    assert table["rotation_error"].to_pylist() == [None]
+    assert RunFolder.load(tmp_path).done() == {pair_key("a")}
+    with pytest.raises(RunFolderError, match=r"format 2, which lacks the errors of poses.*Choose another run_dir"):
+        RunFolder.open(tmp_path, CONFIG)
+
+
 def test_the_order_of_a_list_of_names_is_part_of_the_identity(tmp_path: Path) -> None:
     stages = [{"ratio": {"threshold": 0.8}}, {"gms": {"with_scale": True}}]
     RunFolder.open(tmp_path, {"pruner": stages})
@@ -179,7 +198,8 @@ def test_rows_come_back_as_they_went(tmp_path: Path) -> None:
     full = row(
         "a/b c/ü", scene="t", nsgd=0.25, nsgd_released=0.3, inlier_rate=0.5, inlier_rate_before=0.25, corrs=3,
         corrs_before=9, features0=100, features1=8000, draws=2000, seconds_features=0.5, seconds_matching=0.25,
-        seconds_pruning=0.0, seconds_estimation=1e-3, seconds_metrics=2.0,
+        seconds_pruning=0.0, seconds_estimation=1e-3, seconds_metrics=2.0, rotation_error=1.5, translation_error=89.0,
+        pose_reason=None,
     )  # fmt: skip
     run = RunFolder.open(tmp_path, CONFIG)
     run.append([full, failed("b")])
@@ -215,6 +235,9 @@ def test_every_column_has_a_field() -> None:
         ({"nsgd": float("nan")}, "nsgd"),
         ({"nsgd": 1.5}, "nsgd"),
         ({"reason": "x"}, "has a reason"),
+        ({"rotation_error": 3.0}, "both must be angles"),
+        ({"rotation_error": 3.0, "translation_error": float("nan")}, "both must be angles"),
+        ({"rotation_error": 190.0, "translation_error": 0.0}, "both must be angles"),
         ({"F": None}, "nine finite"),
         ({"F": F[:8]}, "nine finite"),
         ({"F": (float("nan"), *F[1:])}, "nine finite"),

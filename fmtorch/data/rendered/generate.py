@@ -7,7 +7,6 @@ renamed when complete, so that an interrupted generation goes on where it stoppe
 from __future__ import annotations
 
 import dataclasses
-import functools
 import hashlib
 import itertools
 import json
@@ -21,11 +20,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from fmtorch.data.matchable import Keypoints, keypoints, matchable
 from fmtorch.data.rendered import collection, driving, indoor, orbit
 from fmtorch.data.rendered.cameras import Camera, fundamental
 from fmtorch.data.rendered.light import Stage, expose
 from fmtorch.data.rendered.light_kernels import affine, footprints, group_by_texture, shade
+from fmtorch.data.rendered.matchable import Keypoints, keypoints, matchable, recorded_pairs
 from fmtorch.data.rendered.mipmap import Pixels
 from fmtorch.data.rendered.noise_kernels import add_enlarged
 from fmtorch.data.rendered.raycast import Geometry
@@ -37,7 +36,6 @@ FAMILIES = {"indoor": indoor.scene, "driving": driving.scene, "orbit": orbit.sce
 SPLITS = ("test", "train")
 
 KERNELS = (cast_pieces, shade, footprints, add_enlarged, affine, group_by_texture)  # that drawing calls, slowest first
-RECORD = Path(__file__).with_name("pairs.json")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,17 +113,6 @@ def draw(scene: Scene, seed: np.random.SeedSequence) -> Iterator[Pixels]:
             stages[shot.light] = Stage(Geometry(surfaces), scene.lights[shot.light], scene.sky)
         cameras = shot.moments or [shot.camera]
         yield expose(stages[shot.light], cameras, shot.lens, np.random.default_rng(noise))
-
-
-@functools.cache
-def recorded_pairs() -> dict[str, dict[str, dict[str, Any]]]:
-    """What the rule for pairs has decided: by digest and scene the number of photographs and the pairs.
-
-    Drawn and judged once by ``scripts/record_rendered_pairs.py``; with other versions of the generator or of OpenCV,
-    whose digests are not here, it is judged anew.
-    """
-    record: dict[str, dict[str, dict[str, Any]]] = json.loads(RECORD.read_text(encoding="utf-8"))
-    return record
 
 
 def generate(task: Task, folder: Path) -> Path:

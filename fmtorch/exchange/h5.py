@@ -1,0 +1,142 @@
+"""HDF5 files of others, read with errors that name file and key."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fmtorch.data.text_files import DataError
+
+HASHED_WHOLE = 1 << 30  # bytes up to which a file is hashed as a whole
+_BLOCKS, _BLOCK = 4096, 1 << 16  # of larger files: how many blocks of how many bytes
+SUFFIXES = (".h5", ".hdf5")
+
+
+def library() -> ModuleType:
+    """h5py. Raises ImportError naming the extra where it is not installed."""
+    try:
+        import h5py
+    except ImportError as error:
+        raise ImportError("h5py is not installed; pip install 'fmtorch[h5]' brings it") from error
+    module: ModuleType = h5py
+    return module
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """An HDF5 file for reading. Raises DataError where it is missing, no such file, or damaged."""
+    h5py = library()
+    try:
+        file = h5py.File(path, "r")
+    except FileNotFoundError as error:
+        raise DataError(f"{path}: no such file") from error
+    except OSError as error:
+        raise DataError(f"{path}: is no sound HDF5 file ({_first_line(error)})") from error
+    with file:
+        yield file
+
+
+def keys(file: Any) -> list[str]:
+    """The names directly below a file or group. Raises DataError where they cannot be read."""
+    try:
+        return [str(name) for name in file]
+    except (OSError, RuntimeError) as error:
+        raise DataError(f"{_where(file)}: its keys cannot be read ({_first_line(error)})") from error
+
+
+def holds(file: Any, key: str) -> bool:
+    """Whether a file or group has the key, at any depth."""
+    try:
+        return key in file
+    except (OSError, RuntimeError) as error:
+        raise DataError(f"{_where(file, key)} cannot be read ({_first_line(error)})") from error
+
+
+def array(file: Any, key: str, *shape: int | None) -> NDArray[Any]:
+    """The array under a key, of this shape; None stands for any length, no shape for any.
+
+    Raises DataError, naming file and key, where it is missing, damaged or of another shape.
+    """
+    if not holds(file, key):
+        raise DataError(f"{_where(file, key)} is missing")
+    try:
+        entry = file[key]
+        if not hasattr(entry, "shape"):
+            raise DataError(f"{_where(file, key)} is a group; it must be an array")
+        values = np.asarray(entry[()])
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
+        if isinstance(error, DataError):
+            raise
+        raise DataError(f"{_where(file, key)} cannot be read ({_first_line(error)})") from error
+    fits = len(values.shape) == len(shape) and all(
+        want in (None, got) for want, got in zip(shape, values.shape, strict=True)
+    )
+    if shape and not fits:
+        wanted = ", ".join("any" if n is None else str(n) for n in shape)
+        raise DataError(f"{_where(file, key)} has shape {values.shape}; it must be ({wanted})")
+    return values
+
+
+def numbers(file: Any, key: str, *shape: int | None) -> NDArray[np.float64]:
+    """`array` as float64. Raises DataError where it holds no real numbers."""
+    values = array(file, key, *shape)
+    if values.dtype.kind not in "fiub":
+        raise DataError(f"{_where(file, key)} is of {values.dtype}; it must hold real numbers")
+    return values.astype(np.float64)
+
+
+def reshaped(file: Any, key: str, *shape: int) -> NDArray[np.float64]:
+    """`numbers` of any shape that hold as many as this one, finite. Raises DataError where they do not."""
+    values = numbers(file, key)
+    if values.size != int(np.prod(shape)):
+        raise DataError(f"{_where(file, key)} has shape {values.shape}; it must hold {int(np.prod(shape))} numbers")
+    if not np.isfinite(values).all():
+        raise DataError(f"{_where(file, key)} has an entry that is not finite")
+    return values.reshape(shape)
+
+
+def text(file: Any, key: str) -> str:
+    """The string under a key, be it alone or the only one of an array."""
+    value: Any = array(file, key).reshape(-1)
+    value = value[0] if len(value) else ""
+    return value.decode() if isinstance(value, bytes) else str(value)
+
+
+def add_to_digest(digest: Any, path: Path) -> None:
+    """Add a file's name, size and bytes; of a file beyond a gigabyte, blocks that are spread over it."""
+    size = path.stat().st_size
+    digest.update(f"{path.name}:{size}:".encode())
+    with path.open("rb") as file:
+        if size <= HASHED_WHOLE:
+            digest.update(hashlib.file_digest(file, "blake2b").digest())
+            return
+        for start in np.linspace(0, size - _BLOCK, _BLOCKS).astype(np.int64):
+            file.seek(int(start))
+            digest.update(file.read(_BLOCK))
+
+
+def files(root: Path) -> list[Path]:
+    """The HDF5 file that root is, or those directly below it. Raises DataError where there are none."""
+    if root.is_file():
+        return [root]
+    found = sorted(path for suffix in SUFFIXES for path in root.glob(f"*{suffix}"))
+    if not found:
+        raise DataError(f"{root}: {'holds no' if root.is_dir() else 'no such'} file {' or '.join(SUFFIXES)}")
+    return found
+
+
+def _where(file: Any, key: str | None = None) -> str:
+    group = str(getattr(file, "name", "") or "").strip("/")
+    path = "/".join(part for part in (group, key or "") if part)
+    return f"{file.file.filename}: {path!r}" if path else str(file.file.filename)
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__

@@ -1,0 +1,81 @@
+"""Pose errors of rows: of known cameras as the reference has them, and why a pair has none."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from fmtorch.data import ImagePair, ImageSource
+from fmtorch.evaluation.rows import evaluate
+from fmtorch.pipeline import Outcome
+from fmtorch.types import Correspondences, Estimate
+from tests.geometry.scenes import scene
+from tests.reference import metrics as reference
+from tests.reference import solvers
+
+N = 30
+
+
+def outcome(seed: int, noise: float = 1.0) -> Outcome:
+    """A pair of known cameras whose F is of the eight-point algorithm, with a match or two that are no inliers."""
+    s = scene(N, seed, noise)
+    F = torch.from_numpy(solvers.eight_point(s.x0.numpy(), s.x1.numpy()))
+    pair = ImagePair(
+        f"p{seed}", "family", "scene", ImageSource("a", Path("a")), ImageSource("b", Path("b")), s.F.numpy(),
+        s.K0.numpy(), s.K1.numpy(), s.R.numpy(), s.t.numpy(),
+    )  # fmt: skip
+    size = torch.tensor([[800, 1000]])
+    c = Correspondences(s.x0[None], s.x1[None], torch.ones(1, N, dtype=torch.bool), size0=size, size1=size)
+    inliers = torch.arange(N)[None] < N - seed
+    estimate = Estimate((F / F.norm())[None], inliers, torch.tensor([True]), ("",), torch.tensor([1]))
+    return Outcome(pair, (N, N), c, estimate)
+
+
+def without(o: Outcome, **changes: object) -> Outcome:
+    return dataclasses.replace(o, pair=dataclasses.replace(o.pair, **changes))
+
+
+def test_rows_have_the_pose_errors_of_the_reference() -> None:
+    some = [outcome(seed) for seed in range(4)]
+    for o, row in zip(some, evaluate(some), strict=True):
+        assert o.correspondences is not None
+        assert o.estimate is not None
+        kept = o.estimate.inliers[0].numpy()
+        x0, x1 = (x[0].numpy()[kept] for x in (o.correspondences.x0, o.correspondences.x1))
+        R, t, _ = solvers.pose(o.estimate.F[0].numpy(), o.pair.K0, o.pair.K1, x0, x1)
+        assert row.rotation_error == pytest.approx(reference.rotation_angle(R, o.pair.R), abs=1e-7)
+        assert row.translation_error == pytest.approx(reference.direction_angle(t, o.pair.t), abs=1e-7)
+        assert row.pose_reason is None
+        assert 0 < row.rotation_error < 20
+
+
+def test_why_a_pair_has_no_pose_error() -> None:
+    sound = outcome(0)
+    failed = dataclasses.replace(outcome(1), estimate=None, correspondences=None, reason="no keypoints in image 0")
+    assert sound.estimate is not None
+    nothing = dataclasses.replace(
+        outcome(2), estimate=sound.estimate.replace(inliers=torch.zeros(1, N, dtype=torch.bool))
+    )
+    uncalibrated = without(outcome(3), K0=None, K1=None)
+    unposed = without(outcome(4), R=None, t=None)
+    broken = without(outcome(5), t=np.full(3, np.nan))
+    rows = evaluate([failed, uncalibrated, sound, unposed, nothing, broken])
+    assert [(row.rotation_error, row.translation_error, row.pose_reason) for row in (*rows[:2], *rows[3:])] == [
+        (180.0, 90.0, "no F"),
+        (None, None, "K0, K1 unknown"),
+        (None, None, "R, t unknown"),
+        (180.0, 90.0, "no inlier in front of both cameras"),
+        (None, None, "t not finite"),
+    ]
+    (alone,) = evaluate([sound])
+    assert (alone.rotation_error, alone.translation_error) == (rows[2].rotation_error, rows[2].translation_error)
+
+
+def test_a_failed_pair_of_unknown_cameras_has_no_error() -> None:
+    failed = without(dataclasses.replace(outcome(0), estimate=None, correspondences=None, reason="x"), K0=None)
+    (row,) = evaluate([failed])
+    assert (row.rotation_error, row.translation_error, row.pose_reason) == (None, None, "K0 unknown")
