@@ -38,6 +38,7 @@ ELSEWHERE = {
     r"convert_ngransac": "needs the authors' weights; tests/pruning/networks/test_files.py runs it on others",
     r"--contrib-python": "needs a Python with opencv-contrib",
     r"--config-dir my_conf (pruner|pipeline)=": "tests/training/test_train_command.py runs these files and commands",
+    r"dataset=(tum|kitti|colmap|bundler|fmbench dataset\.root=KITTI)": "tests/data runs these on data of their layout",
     r"--config-dir my_conf features=": "tests/docs/test_own_parts.py runs this page",
 }
 """Commands that are not run here, and why."""
@@ -65,6 +66,7 @@ APPENDED = {
     "fmtorch.match": ["pipeline=sift_gms"],
     "fmtorch.eval": [*DATASET, "workers=1"],
     "fmtorch.train": ["dataset=fmbench", "dataset.root=DATA", "dataset.sets=[Strecha_train,TanksLike]", *TRAINED],
+    "fmtorch.pairs": ["dataset.root=DATA/Strecha", "workers=1"],
     "fmtorch.report": ["pictures=1", "root=DATA/Strecha"],
     "estimators": ["--limit", "1", "--seeds", "1"],
     "thresholds": ["--limit", "1", "--seeds", "1", "--values", "0.5", "0.75"],
