@@ -29,7 +29,8 @@ def library() -> ModuleType:
 def write_database(
     path: Path, images: Iterable[ExportedImage], pairs: Iterable[ExportedPair], shared_camera: bool = False
 ) -> None:
-    """Write a database: keypoints, the matches given to the estimator, and F with its inliers as verified geometry.
+    """Write a database: keypoints, the matches given to the estimator, and F with its inliers as verified geometry
+    where its support is beyond chance.
 
     A known K is a PINHOLE camera with a trusted focal length; images of equal K and size share it. Otherwise an image
     has a SIMPLE_RADIAL camera of COLMAP's default focal length, or shares it with all of its size. Pixels are moved by
@@ -54,7 +55,7 @@ def write_database(
             ends = ids[pair.name0], ids[pair.name1]
             matches = _one_to_one(pair)
             database.write_matches(*ends, np.ascontiguousarray(pair.matches[matches], np.uint32))
-            if pair.ok:
+            if pair.related and pair.F.any():
                 geometry = _geometry(pycolmap, pair, pair.matches[matches & pair.inliers], known)
                 database.write_two_view_geometry(*ends, geometry)
 

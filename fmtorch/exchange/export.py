@@ -61,7 +61,8 @@ def write_hloc(
     """hloc's features and matches, float32 and int32.
 
     hloc itself writes float16 and int16, of which the second overflows beyond 32,767 keypoints. Each pair holds beside
-    ``matches0`` and ``matching_scores0``, which hloc knows, ``inliers0`` (bool), and F as an attribute.
+    ``matches0`` and ``matching_scores0``, which hloc knows, ``inliers0`` (bool), and F and
+    `related` as attributes.
     """
     h5py = h5.library()
     counts: dict[str, int] = {}
@@ -76,7 +77,7 @@ def write_hloc(
             group = file.create_group(pair_key_of(pair.name0, pair.name1))
             for name, values in _by_keypoint(pair, counts[pair.name0]):
                 group[name] = values
-            group.attrs["F"] = pair.F
+            group.attrs["F"], group.attrs["related"] = pair.F, pair.related
 
 
 def _by_keypoint(pair: ExportedPair, count: int) -> Iterator[tuple[str, np.ndarray]]:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from fmtorch.storage.files import replacing
 
 Array = NDArray[np.float64]
+_PAIR = ("matches", "scores", "inliers", "F", "related")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -36,7 +37,7 @@ class ExportedImage:
 class ExportedPair:
     """The matches given to the estimator, (m, 2) indices of points; scores (m,) in [0, 1]; inliers (m,) of F (3, 3).
 
-    F is zero where there is none.
+    F is zero where there is none. related: whether its support is beyond chance.
     """
 
     name0: str
@@ -45,11 +46,7 @@ class ExportedPair:
     scores: NDArray[np.float32]
     inliers: NDArray[np.bool_]
     F: Array
-
-    @property
-    def ok(self) -> bool:
-        """Whether there is an F."""
-        return bool(self.F.any())
+    related: bool = True
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,8 +71,7 @@ class Journal:
         _write(self._image(image), arrays if value.K is None else {**arrays, "K": value.K})
 
     def add_pair(self, image0: Path, image1: Path, value: ExportedPair) -> None:
-        names = ("matches", "scores", "inliers", "F")
-        _write(self._pair(image0, image1), {name: getattr(value, name) for name in names})
+        _write(self._pair(image0, image1), {name: np.asarray(getattr(value, name)) for name in _PAIR})
 
     def image(self, image: Path) -> ExportedImage:
         with np.load(self._image(image)) as stored:
@@ -84,8 +80,9 @@ class Journal:
 
     def pair(self, image0: Path, image1: Path) -> ExportedPair:
         with np.load(self._pair(image0, image1)) as stored:
-            values = (stored[name] for name in ("matches", "scores", "inliers", "F"))
-            return ExportedPair(self.name(image0), self.name(image1), *values)
+            matches, scores, inliers, F, related = (stored[name] for name in _PAIR)
+        names = self.name(image0), self.name(image1)
+        return ExportedPair(*names, matches, scores, inliers, F, bool(related))
 
     def _image(self, image: Path) -> Path:
         return self.folder / "images" / f"{self._digest(image)}.npz"
