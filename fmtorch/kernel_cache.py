@@ -134,7 +134,7 @@ class KernelFile:
         """Write a compiled function; where that fails, it is not kept, with a warning."""
         from numba.core.serialize import dumps
 
-        if self.path is None or result.library.has_dynamic_globals:
+        if self.path is None or result._asdict()["library"].has_dynamic_globals:
             return
         from fmtorch.storage.files import replacing
 

@@ -160,7 +160,9 @@ def _annotations(target: Callable[..., Any]) -> dict[str, Any]:
         if isinstance(annotation, str):
             try:
                 annotation = eval(annotation, names)
-            except Exception:  # names that only type checkers see
+            except (
+                Exception
+            ):  # any expression may stand there, of names that only type checkers see too: taken on trust
                 continue
         found[name] = annotation
     return found

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch import kernels
+from fmtorch.threads import available, mapped
+
+PAIRS_OF_A_THREAD = 8  # at least; a thread takes as long to begin as a kernel for a pair
 
 
 def kernels_serve(*tensors: Tensor | None, floats: Sequence[torch.dtype] = (torch.float32, torch.float64)) -> bool:
@@ -32,12 +35,18 @@ def for_each_pair(
 ) -> Tensor:
     """`out` (B, ...) after function(row of each tensor, constants, row of out) for each of B pairs.
 
-    Rows are C-contiguous arrays, floating ones of type `kind`; of what is not known (None) an empty one.
+    Rows are C-contiguous arrays, floating ones of type `kind`; of what is not known (None) an empty one. Pairs are
+    shared out among threads.
     """
     arrays = [_array(t, kind, len(out)) for t in tensors]
     results = out.numpy()
-    for pair in range(len(results)):
-        function(*(array[pair] for array in arrays), *constants, results[pair])
+
+    def some(pairs: range) -> None:
+        for pair in pairs:
+            function(*(array[pair] for array in arrays), *constants, results[pair])
+
+    parts = max(1, min(available(), len(results) // PAIRS_OF_A_THREAD))
+    mapped(some, [range(first, len(results), parts) for first in range(parts)])
     return out
 
 

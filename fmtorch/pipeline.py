@@ -9,6 +9,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
+from pathlib import Path
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -16,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from fmtorch.data.images import read_image
+from fmtorch.data.lenses import Lens
 from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
 from fmtorch.stages import Estimator, FeatureExtractor, Matcher, Pruner, TimedExtractor
 from fmtorch.threads import one_thread
@@ -61,11 +63,11 @@ class Pipeline:
     ) -> None:
         self.extractor, self.matcher, self.pruners, self.estimator = features, matcher, dict(pruners), estimator
         self.device = torch.device(device)
-        self._memo: _Memo[str, tuple[Features, float]] = _Memo(memory)
+        self._memo: _Memo[tuple[Path, Lens | None], tuple[Features, float]] = _Memo(memory)
 
     def features(self, image: ImageSource) -> tuple[Features, float]:
         """The features of an image and the seconds they took, kept for the next pair that shows the image."""
-        return self._memo.get(f"{image.path}", lambda: self.extract(read_image(image)))
+        return self._memo.get((image.path, image.lens), lambda: self.extract(read_image(image)))
 
     def extract(self, image: NDArray[np.uint8]) -> tuple[Features, float]:
         """The features of pixels on the pipeline's device, and the seconds that computing them takes or took."""

@@ -9,23 +9,14 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, TypeVar, cast
 
 import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
-Index = int | slice | Sequence[int] | Sequence[bool] | Tensor
-Record = TypeVar("Record", bound="_Record")
-
-FLOATING, WHOLE, REAL, BOOLEAN = "floating-point numbers", "whole numbers", "real numbers", "booleans"
-NUMBERS = {
-    **dict.fromkeys(("mask", "mutual", "inliers", "ok"), BOOLEAN),
-    **dict.fromkeys(("key", "draws", "image_size", "label"), WHOLE),
-    **dict.fromkeys(("size0", "size1"), REAL),
-}
-"""What the elements of a field are, where not floating-point numbers."""
+from fmtorch.records import Index, Record, as_index, expect_fields, gathered, padded, slotted
 
 RELATED = 1.0
 """The significance from which on two images are called related; chosen on tuning pairs (docs/related.md)."""
@@ -36,96 +27,8 @@ def pair_key(identity: str) -> int:
     return int.from_bytes(hashlib.blake2b(identity.encode(), digest_size=8).digest(), "big", signed=True)
 
 
-class _Record:
-    """Tensors with a common leading batch dimension, moved, indexed and replaced together."""
-
-    def to(self: Record, device: torch.device | str) -> Record:
-        """The same record with every tensor on `device`."""
-        return self._map(lambda value: value.to(device))
-
-    def detach(self: Record) -> Record:
-        """The same record cut off from the graph."""
-        return self._map(lambda value: value.detach())
-
-    @property
-    def requires_grad(self) -> bool:
-        """Whether a gradient can reach any of the tensors."""
-        values = [getattr(self, f.name) for f in dataclasses.fields(cast(Any, self))]
-        return torch.is_grad_enabled() and any(isinstance(v, Tensor) and v.requires_grad for v in values)
-
-    def replace(self: Record, **changes: Any) -> Record:
-        """A copy with some fields changed (shapes are checked again)."""
-        return cast(Record, dataclasses.replace(cast(Any, self), **changes))
-
-    def _map(self: Record, function: Any, **changes: Any) -> Record:
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(cast(Any, self))}
-        mapped = {name: function(v) for name, v in values.items() if isinstance(v, Tensor)}
-        return self.replace(**mapped, **changes)
-
-
-def ungraphed(inputs: _Record, compute: Callable[[], Record]) -> Record:
-    """compute(), without autograd's bookkeeping unless a gradient can reach the inputs.
-
-    That takes a fifth of the time of small tensors. The result's tensors are ordinary ones, free to use in a graph.
-    """
-    if inputs.requires_grad or torch.is_inference_mode_enabled():
-        return compute()
-    with torch.inference_mode():
-        result = compute()
-    return result._map(lambda value: value.clone() if value.is_inference() else value)
-
-
-def _as_index(index: Index, length: int) -> slice | Tensor:
-    """An index that keeps the batch dimension: the integer i selects the batch of one that holds element i.
-
-    A list of booleans is a mask. Raises IndexError for an integer that is out of range, which also ends iteration.
-    """
-    if isinstance(index, slice):
-        return index
-    if isinstance(index, Tensor) and index.dim() > 0:
-        return index
-    if isinstance(index, int | Tensor):
-        i = int(index)
-        if not -length <= i < length:
-            raise IndexError(f"index {i} is out of range for {length} elements")
-        return slice(i, i + 1 or None)
-    chosen = list(index)
-    is_mask = bool(chosen) and all(isinstance(i, bool) for i in chosen)
-    return torch.as_tensor(chosen, dtype=torch.bool if is_mask else torch.int64)
-
-
-def _expect(name: str, value: Tensor | None, shape: tuple[int, ...], device: torch.device | None = None) -> None:
-    """Raises TypeError or ValueError for what is no tensor of this shape, of the field's numbers, on the device."""
-    if value is None:
-        return
-    if not isinstance(value, Tensor):
-        raise TypeError(f"{name} is a {type(value).__name__}; it must be a tensor")
-    if tuple(value.shape) != shape:
-        raise ValueError(f"{name} has shape {tuple(value.shape)}; it must be {shape}")
-    if device is not None and value.device != device:
-        raise ValueError(f"{name} is on {value.device} and another field on {device}; all must be on one device")
-    wanted, kind = NUMBERS.get(name, FLOATING), _numbers(value)
-    if kind != wanted and not (wanted == REAL and kind in (FLOATING, WHOLE)):
-        raise ValueError(f"{name} is of {value.dtype}; it must hold {wanted}")
-
-
-def _numbers(value: Tensor) -> str:
-    """What a tensor's elements are."""
-    if value.dtype == torch.bool:
-        return BOOLEAN
-    return FLOATING if value.is_floating_point() else "complex numbers" if value.is_complex() else WHOLE
-
-
-def _expect_dimensions(name: str, value: Tensor, *numbers: int, shape: str) -> None:
-    """Raises TypeError or ValueError unless the value is a tensor of one of these numbers of dimensions."""
-    if not isinstance(value, Tensor):
-        raise TypeError(f"{name} is a {type(value).__name__}; it must be a tensor")
-    if value.dim() not in numbers:
-        raise ValueError(f"{name} has shape {tuple(value.shape)}; it must be {shape}")
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
-class Features(_Record):
+class Features(Record):
     """The local features of one image, or of a padded batch of images (a leading dimension on every field).
 
     lafs: local affine frames (N, 2, 3) in kornia's convention, the last column being the centre in pixels.
@@ -140,19 +43,10 @@ class Features(_Record):
     mask: Bool[Tensor, "*batch n"] | None = None
 
     def __post_init__(self) -> None:
-        _expect_dimensions("lafs", self.lafs, 3, 4, shape="(N, 2, 3), or (B, N, 2, 3) of a batch")
-        _expect_dimensions("descriptors", self.descriptors, 2, 3, shape="(N, D), or (B, N, D) of a batch")
-        _expect_dimensions("scores", self.scores, 1, 2, shape="(N,), or (B, N) of a batch")
-        _expect_dimensions("image_size", self.image_size, 1, 2, shape="(2,), or (B, 2) of a batch")
-        batch_n = tuple(self.lafs.shape[:-2])
-        _expect("lafs", self.lafs, (*batch_n, 2, 3))
-        device = self.lafs.device
-        _expect("scores", self.scores, batch_n, device)
-        _expect("descriptors", self.descriptors, (*batch_n, self.descriptors.shape[-1]), device)
-        _expect("image_size", self.image_size, (*batch_n[:-1], 2), device)
+        expect_fields(self)
         if self.mask is None:
-            object.__setattr__(self, "mask", torch.ones(batch_n, dtype=torch.bool, device=device))
-        _expect("mask", self.mask, batch_n, device)
+            mask = torch.ones(self.lafs.shape[:-2], dtype=torch.bool, device=self.lafs.device)
+            object.__setattr__(self, "mask", mask)
 
     @property
     def keypoints(self) -> Float[Tensor, "*batch n 2"]:
@@ -170,13 +64,13 @@ class Features(_Record):
 
     def __getitem__(self, index: Index) -> Features:
         """Of a batch, the selected images (still a batch); of one image, the selected features."""
-        i = _as_index(index, self.lafs.shape[0])
+        i = as_index(index, self.lafs.shape[0])
         size = self.image_size[i] if self.image_size.dim() > 1 else self.image_size
         return Features(self.lafs[i], self.scores[i], self.descriptors[i], size, self.valid[i])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Correspondences(_Record):
+class Correspondences(Record):
     """A batch of B image pairs with their putative matches, padded to N slots.
 
     x0, x1: matched points (B, N, 2) in pixels. mask: (B, N).
@@ -205,20 +99,9 @@ class Correspondences(_Record):
     noise: Float[Tensor, "b n"] | None = None
 
     def __post_init__(self) -> None:
-        _expect_dimensions("x0", self.x0, 3, shape="(B, N, 2)")
-        _expect_dimensions("x1", self.x1, 3, shape="(B, N, 2)")
-        _expect_dimensions("mask", self.mask, 2, shape="(B, N)")
-        b, n = self.x0.shape[:2]
+        expect_fields(self)
         if self.key is None:
-            object.__setattr__(self, "key", torch.zeros(b, dtype=torch.int64, device=self.x0.device))
-        shapes = {
-            "x0": (b, n, 2), "x1": (b, n, 2), "mask": (b, n), "quality": (b, n), "prior": (b, n),
-            "lafs0": (b, n, 2, 3), "lafs1": (b, n, 2, 3), "size0": (b, 2), "size1": (b, 2),
-            "K0": (b, 3, 3), "K1": (b, 3, 3), "key": (b,), "mutual": (b, n),
-            "noise": (b, n),
-        }  # fmt: skip
-        for name, shape in shapes.items():
-            _expect(name, getattr(self, name), shape, self.x0.device)
+            object.__setattr__(self, "key", torch.zeros(len(self), dtype=torch.int64, device=self.x0.device))
         if (self.size0 is None) != (self.size1 is None):
             known, missing = ("size1", "size0") if self.size0 is None else ("size0", "size1")
             raise ValueError(f"{known} is given but {missing} is not; give the sizes of both images, or of neither")
@@ -234,7 +117,7 @@ class Correspondences(_Record):
 
     def __getitem__(self, index: Index) -> Correspondences:
         """The selected pairs, always as a batch."""
-        i = _as_index(index, len(self))
+        i = as_index(index, len(self))
         return self._map(lambda value: value[i])
 
     def count(self) -> Int[Tensor, " b"]:
@@ -250,18 +133,11 @@ class Correspondences(_Record):
         longest = int(self.count().max()) if self.mask.numel() else 0
         n = -(-longest // multiple) * multiple
         order = torch.argsort(self.mask.logical_not().to(torch.uint8), dim=-1, stable=True)[:, :n]
-        short = n - order.shape[1]
-
-        def take(value: Tensor) -> Tensor:
-            index = order.reshape(*order.shape, *[1] * (value.dim() - 2)).expand(-1, -1, *value.shape[2:])
-            return _pad(torch.gather(value, 1, index), 1, order.shape[1] + short)
-
-        per_match = ("x0", "x1", "mask", "quality", "prior", "lafs0", "lafs1", "mutual", "noise")
-        return self.replace(**{f: take(getattr(self, f)) for f in per_match if getattr(self, f) is not None})
+        return self.replace(**{name: padded(gathered(v, order), 1, n) for name, v in slotted(self).items()})
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Estimate(_Record):
+class Estimate(Record):
     """Fundamental matrices of B pairs.
 
     F: (B, 3, 3) with unit Frobenius norm, zero where `ok` is False. inliers: (B, N), within the mask; none where `ok`
@@ -279,22 +155,14 @@ class Estimate(_Record):
     significance: Float[Tensor, " b"] | None = None
 
     def __post_init__(self) -> None:
-        _expect_dimensions("F", self.F, 3, shape="(B, 3, 3)")
-        _expect_dimensions("inliers", self.inliers, 2, shape="(B, N)")
-        _expect_dimensions("ok", self.ok, 1, shape="(B,)")
-        _expect_dimensions("draws", self.draws, 1, shape="(B,)")
-        b = self.F.shape[0]
+        expect_fields(self)
+        b = len(self)
         if self.significance is None:
             unknown = torch.full((b,), torch.nan, dtype=torch.float64, device=self.F.device)
             object.__setattr__(self, "significance", unknown)
-        _expect("F", self.F, (b, 3, 3))
-        _expect("inliers", self.inliers, (b, self.inliers.shape[-1]))
-        _expect("ok", self.ok, (b,))
-        _expect("draws", self.draws, (b,))
         if not isinstance(self.reason, tuple | list) or not all(isinstance(entry, str) for entry in self.reason):
             raise TypeError(f"reason is a {type(self.reason).__name__}; it must be a tuple of strings")
         object.__setattr__(self, "reason", tuple(self.reason))
-        _expect("significance", self.significance, (b,))
         if len(self.reason) != b:
             raise ValueError(f"reason has {len(self.reason)} entries; it must have one for each of the {b} pairs")
 
@@ -312,19 +180,9 @@ class Estimate(_Record):
 
     def __getitem__(self, index: Index) -> Estimate:
         """The selected pairs, always as a batch."""
-        i = _as_index(index, len(self))
+        i = as_index(index, len(self))
         picked = torch.arange(len(self), device=self.ok.device)[i].tolist()
         return self._map(lambda value: value[i], reason=tuple(self.reason[j] for j in picked))
-
-
-def _pad(value: Tensor, dim: int, length: int) -> Tensor:
-    """`value` filled with zeros (False) along `dim` up to `length`."""
-    missing = length - value.shape[dim]
-    if missing <= 0:
-        return value
-    shape = list(value.shape)
-    shape[dim] = missing
-    return torch.cat([value, value.new_zeros(shape)], dim)
 
 
 Item = TypeVar("Item", Features, Correspondences, Estimate)
@@ -342,6 +200,7 @@ def collate(items: Sequence[Item]) -> Item:
     if len({(type(item), item.lafs.dim() if isinstance(item, Features) else 0) for item in items}) > 1:
         raise TypeError(f"collate needs items of one kind, not {', '.join(type(item).__name__ for item in items[:5])}")
     n = max(_slots(item) for item in items)
+    single = isinstance(first, Features) and first.image_size.dim() == 1
     merged: dict[str, Any] = {}
     for field in dataclasses.fields(first):
         values = [getattr(item, field.name) for item in items]
@@ -349,21 +208,12 @@ def collate(items: Sequence[Item]) -> Item:
             merged[field.name] = sum(values, ())
         elif any(value is None for value in values):
             merged[field.name] = None
-        elif isinstance(first, Features) and first.image_size.dim() == 1:
-            stacked = [_pad(value, 0, n) if field.name != "image_size" else value for value in values]
-            merged[field.name] = torch.stack(stacked)
         else:
-            padded = field.name in _PER_SLOT
-            merged[field.name] = torch.cat([_pad(value, 1, n) if padded else value for value in values])
+            filled = (
+                [padded(value, 0 if single else 1, n) for value in values] if field.name in first.per_slot else values
+            )
+            merged[field.name] = torch.stack(filled) if single else torch.cat(filled)
     return type(first)(**merged)
-
-
-_PER_SLOT = frozenset(
-    (
-        *("lafs", "scores", "descriptors", "inliers"),
-        *("x0", "x1", "mask", "quality", "prior", "lafs0", "lafs1", "mutual", "noise"),
-    )
-)
 
 
 def _slots(item: Features | Correspondences | Estimate) -> int:

@@ -36,7 +36,9 @@ NOISY = ("fmtorch", "fmtorch_max", "gc_ransac", "msac")  # are also told the noi
 COMPILED = (  # pruners of two forms: a kernel, and tensors
     "frame_consistency", "gms", "gms_soft", "lpm", "lpm_soft", "match_noise", "one_to_one", "position_consistency",
 )  # fmt: skip
-KERNEL_FORM = ("lmeds", "lmeds_eight_point", "msac", "ransac", "ransac_eight_point")  # wholes of kernels
+KERNEL_FORM = (  # wholes of kernels
+    "fmtorch", "fmtorch_max", "lmeds", "lmeds_eight_point", "msac", "ransac", "ransac_eight_point",
+)  # fmt: skip
 TILES = [  # what bounds memory and fills caches, and must change no result
     (solvers, "CPU_SAMPLES", 150), (hypotheses, "CPU_SAMPLES", 150), (scores, "CPU_TILE", 1000),
     (graph_cut, "CPU_TILE", 1000),

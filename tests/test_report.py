@@ -25,6 +25,7 @@ from fmtorch.evaluation.redraw import difference
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.summary import summarize
 from fmtorch.pipeline import Outcome
+from fmtorch.presets.composition import compose
 from fmtorch.storage import PairRow, RunFolder, RunFolderError, to_table
 from fmtorch.types import Estimate
 from tests.test_pipeline import draw, pair
@@ -141,7 +142,7 @@ def test_a_pipeline_is_drawn_again_as_it_was_and_a_difference_is_said(order: lis
         "estimator.hypotheses=100",
         f"pruner=[{','.join(order)}]",
     ]
-    config = presets._compose("match", ("pipeline=sift_ratio", "cache=off", *overrides))
+    config = compose("match", ("pipeline=sift_ratio", "cache=off", *overrides))
     rows = evaluate(presets.build_pipeline(config).run([one, other], seed=3), seed=3)
     F = np.array([0, 0, 1, 0, 0, 0, -1, 0, 0]) / np.sqrt(2)  # of a vertical motion; that of the images is horizontal
     rows[1] = dataclasses.replace(rows[1], F=F.tolist(), nsgd=0.0)
@@ -178,7 +179,7 @@ def test_a_result_that_cannot_be_had_again_is_said(tmp_path: Path) -> None:
 
 
 def test_an_older_run_is_drawn_where_its_pruners_have_one_order(tmp_path: Path) -> None:
-    config = presets._compose("match", ("pipeline=sift_ratio", "cache=off"))
+    config = compose("match", ("pipeline=sift_ratio", "cache=off"))
     stages = presets.stages(config)
     for names, drawn in (([], True), (["ratio"], True), (["ratio", "one_to_one"], False)):
         pruner = {name: value for entry in stages["pruner"] for name, value in entry.items() if name in names}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -12,9 +13,12 @@ import fmtorch
 from fmtorch import kernels, presets
 from fmtorch.data import read_image
 from fmtorch.estimators import batching
+from fmtorch.evaluation.run import evaluate_pairs
 from fmtorch.matching import nearest
 from fmtorch.pruning import position_consistency as consistency
-from tests.laws import scene
+from fmtorch.threads import available, mapped, one_thread
+from fmtorch.types import collate
+from tests.laws import degenerate, scene
 from tests.test_pipeline import draw, pair, pipeline
 
 
@@ -84,3 +88,77 @@ def test_an_error_leaves_threads_as_they_were(threads: int, monkeypatch: pytest.
     with pytest.raises(RuntimeError, match="no"):
         built(scene(0, 60))
     assert torch.get_num_threads() == threads
+
+
+def test_threads_that_torch_may_use_stay_known(threads: int) -> None:
+    with one_thread("cpu"):
+        with one_thread("cpu"):
+            assert (torch.get_num_threads(), available()) == (1, threads)
+        assert available() == threads
+    torch.set_num_threads(1)
+    with one_thread("cpu"):
+        assert available() == 1
+
+
+def test_items_are_mapped_in_order_by_threads_that_share_no_more(threads: int) -> None:
+    together = threading.Barrier(threads, timeout=60)
+
+    def meet(item: int) -> tuple[int, int, int]:
+        together.wait()  # for as many as there are threads
+        return item, torch.get_num_threads(), available()
+
+    with one_thread("cpu"):
+        assert mapped(meet, range(6)) == [(i, 1, 1) for i in range(6)]
+    torch.set_num_threads(1)
+    here = threading.get_ident()
+    assert mapped(lambda _: threading.get_ident(), range(3)) == [here] * 3
+
+
+def test_the_first_error_of_an_item_is_raised(threads: int) -> None:
+    begun = []
+
+    def fails(item: int) -> None:
+        begun.append(item)
+        if item >= 2:
+            raise RuntimeError(f"item {item}")
+
+    with pytest.raises(RuntimeError, match="item 2"):
+        mapped(fails, range(1000))
+    assert len(begun) < 1000
+
+
+@pytest.mark.parametrize("graph", [True, False])
+def test_a_batch_in_threads_has_the_bits_of_one_thread(threads: int, graph: bool) -> None:
+    """Of pairs of many sizes with degenerate ones among them; gradients are summed in another order."""
+    c = collate([*(scene(i, 20 + 61 * i % 400) for i in range(9)), *degenerate().values()])
+    estimator, found = presets.build("estimator", "msac", hypotheses=100, round=50), []
+    for count in (threads, 1):
+        torch.set_num_threads(count)
+        x0 = c.x0.double().requires_grad_()
+        with torch.set_grad_enabled(graph):
+            e = estimator(c.replace(x0=x0, x1=c.x1.double()), seed=5)
+        assert e.F.requires_grad == graph
+        if graph:
+            e.F.square()[:, 0, 1].sum().backward()
+        found.append((e, x0.grad))
+    (one, gradient), (other, expected) = found
+    for name in ("F", "inliers", "ok", "draws", "significance"):
+        assert torch.equal(getattr(one, name), getattr(other, name)), name
+    assert one.reason == other.reason
+    if graph:
+        torch.testing.assert_close(gradient, expected)
+
+
+def test_workers_of_an_evaluation_share_no_threads(threads: int, tmp_path: Path) -> None:
+    seen, built = [], pipeline()
+    estimator = built.estimator
+
+    def watched(*arguments: object) -> object:
+        seen.append(available())
+        return estimator(*arguments)  # type: ignore[arg-type]
+
+    built.estimator = watched  # type: ignore[assignment]
+    pairs = [pair(str(i), draw(tmp_path / f"{i}a.png", i), draw(tmp_path / f"{i}b.png", i, shift=12)) for i in range(4)]
+    for _ in evaluate_pairs(built, pairs, seed=0, batch=1, workers=2, store=lambda rows: None):
+        pass
+    assert seen == [1] * 4

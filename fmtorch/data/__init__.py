@@ -12,12 +12,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from fmtorch.data.fmbench import DataError, FMBenchPairs
+from fmtorch.data.fmbench import FMBenchPairs
 from fmtorch.data.images import ImageError, read_image, to_grey
 from fmtorch.data.pairs import DepthDataset, ImagePair, ImageSource, PairDataset
+from fmtorch.data.text_files import DataError
 from fmtorch.options import expect_options
 
 __all__ = [
+    "NEEDS_ROOT",
     "DataError",
     "DepthDataset",
     "FMBenchPairs",
@@ -37,8 +39,19 @@ _CLASSES = {
     "fmbench": ("fmtorch.data.fmbench", "FMBenchPairs"),
     "rendered": ("fmtorch.data.rendered", "RenderedPairs"),
     "stereo": ("fmtorch.data.rendered", "StereoPair"),
+    "tum": ("fmtorch.data.tum", "tum_pairs"),
+    "kitti": ("fmtorch.data.kitti", "KittiPairs"),
+    "colmap": ("fmtorch.data.colmap", "ColmapPairs"),
     "h5": ("fmtorch.exchange.dataset", "H5Pairs"),
 }
+NEEDS_ROOT = {
+    "fmbench": "a set's folder with pairs_with_gt.txt, or a folder of such sets",
+    "tum": "the folder of the sequences' folders of TUM RGB-D",
+    "kitti": "the folder with sequences/ and poses/ of KITTI odometry",
+    "colmap": "a folder of scenes with a COLMAP model each, or one such scene",
+    "h5": "the file, or the folder of the files, that hold the matches",
+}
+"""What `root` must be, by the names of the data sets that cannot do without."""
 _WITHOUT_SPLIT = frozenset(("stereo", "h5"))
 _GENERATED = frozenset(("rendered",))
 
@@ -50,10 +63,10 @@ def load(
     progress: Callable[[int, int], None] | None = None,
     **options: Any,
 ) -> PairDataset:
-    """The data set `name` (fmbench, rendered, stereo, h5): an indexable of `ImagePair`, as torch's DataLoader takes it.
+    """The data set `name`: an indexable of `ImagePair`, as torch's DataLoader takes it.
 
     Args:
-        name: of the set.
+        name: of the set: rendered, stereo, fmbench, tum, kitti, colmap, h5.
         split: `test` or `train`.
         root: where it lies, or for generated sets where they are kept.
         progress: called with (done, total) while a generated set is drawn for the first time.
@@ -71,10 +84,8 @@ def load(
     expect_loadable(name, split=split, root=root, **options)
     if root is not None:
         options["root"] = root
-    elif name == "h5":
-        raise DataError("h5 needs root: the file, or the folder of the files, that hold the matches")
-    elif name == "fmbench":
-        raise DataError("fmbench needs root: a set's folder with pairs_with_gt.txt, or a folder of such sets")
+    elif name in NEEDS_ROOT:
+        raise DataError(f"{name} needs root: {NEEDS_ROOT[name]}")
     if name not in _WITHOUT_SPLIT:
         options["split"] = split
     if name in _GENERATED and progress is not None:

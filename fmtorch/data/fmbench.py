@@ -12,23 +12,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.data.cameras import Camera, relative_pose
 from fmtorch.data.pairs import ImagePair, ImageSource
+from fmtorch.data.text_files import DataError, read_lines, read_numbers
 
 _PAIRS, _SUBSETS, _CAMERAS = "pairs_with_gt.txt", "pairs_which_dataset.txt", "Camera.txt"
 _SUFFIXES = (".jpg", ".png")
 _PAIR_COLUMNS = "l r F11 F12 F13 F21 F22 F23 F31 F32 F33"
+_LAYOUT = f"the layout is <set>/{_PAIRS} and <set>/{_SUBSETS}"
 _CAMERA_COLUMNS = "K (9 numbers, row by row), R (9), t (3)"
-
-
-class DataError(ValueError):
-    """A data set that cannot be used as a whole; the message names file, line and what would be right."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Camera:
-    K: NDArray[np.float64]
-    R: NDArray[np.float64]
-    t: NDArray[np.float64]
 
 
 class FMBenchPairs:
@@ -80,8 +72,8 @@ class FMBenchPairs:
         return iter(self._pairs)
 
     def _read_set(self, folder: Path) -> None:
-        table = _read_numbers(folder / _PAIRS, _PAIR_COLUMNS, 11)
-        scenes = [line.strip().replace("\\", "/").strip("/") for line in _read_lines(folder / _SUBSETS)]
+        table = read_numbers(folder / _PAIRS, _PAIR_COLUMNS, 11, _LAYOUT)
+        scenes = [line.strip().replace("\\", "/").strip("/") for line in read_lines(folder / _SUBSETS, _LAYOUT)]
         if len(table) != len(scenes):
             raise DataError(
                 f"{folder / _SUBSETS} has {len(scenes)} lines and {folder / _PAIRS} has {len(table)}; "
@@ -98,13 +90,13 @@ class FMBenchPairs:
                 line = f"{folder / _PAIRS}, line {row + 1}"
                 self._pairs.append(self._pair(line, folder, scene, numbers, images[scene], cameras[scene]))
 
-    def _read_cameras(self, folder: Path, scene: str) -> list[_Camera] | None:
+    def _read_cameras(self, folder: Path, scene: str) -> list[Camera] | None:
         path = folder / scene / _CAMERAS
         if not self._cameras or not path.is_file():
             return None
         self._add_to_digest(f"{folder.name}/{scene}", path)
-        rows = _read_numbers(path, f"{_CAMERA_COLUMNS}; or give cameras=false to do without", 21)
-        return [_Camera(r[:9].reshape(3, 3), r[9:18].reshape(3, 3), r[18:]) for r in rows]
+        rows = read_numbers(path, f"{_CAMERA_COLUMNS}; or give cameras=false to do without", 21)
+        return [Camera(r[:9].reshape(3, 3), r[9:18].reshape(3, 3), r[18:]) for r in rows]
 
     def _add_to_digest(self, name: str, *paths: Path) -> None:
         for path in paths:
@@ -118,7 +110,7 @@ class FMBenchPairs:
         scene: str,
         numbers: NDArray[np.float64],
         images: dict[str, Path],
-        cameras: list[_Camera] | None,
+        cameras: list[Camera] | None,
     ) -> ImagePair:
         left, right = (_image_number(line, value) for value in numbers[:2])
         F, problems = _normalized(numbers[2:].reshape(3, 3))
@@ -149,8 +141,8 @@ class FMBenchPairs:
                 "line i + 1 must be the camera of image i"
             )
         c0, c1 = cameras[left], cameras[right]
-        R = c1.R @ c0.R.T
-        return dataclasses.replace(pair, K0=c0.K, K1=c1.K, R=R, t=c1.t - R @ c0.t)
+        R, t = relative_pose(c0, c1)
+        return dataclasses.replace(pair, K0=c0.K, K1=c1.K, R=R, t=t)
 
 
 def _normalized(F: NDArray[np.float64]) -> tuple[NDArray[np.float64], list[str]]:
@@ -191,31 +183,6 @@ def _images(folder: Path, scene: str) -> dict[str, Path]:
         raise DataError(f"{folder / _SUBSETS} names {scene}/, but there is no folder {images}")
     files = sorted(images.iterdir(), reverse=True)  # .jpg comes last and wins over .png
     return {file.stem: file for file in files if file.suffix in _SUFFIXES}
-
-
-def _read_lines(path: Path) -> list[str]:
-    """The lines of a text file without the empty ones at its end."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        raise DataError(f"{path}: no such file; the layout is <set>/{_PAIRS} and <set>/{_SUBSETS}") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: cannot be read as text ({error})") from error
-    return text.rstrip().splitlines()
-
-
-def _read_numbers(path: Path, columns: str, count: int) -> list[NDArray[np.float64]]:
-    """A table of numbers, one array a line."""
-    rows = []
-    for number, line in enumerate(_read_lines(path), start=1):
-        words = line.split()
-        if len(words) != count:
-            raise DataError(f"{path}, line {number}: {len(words)} columns; it must have {count}: {columns}")
-        try:
-            rows.append(np.array([float(word) for word in words]))
-        except ValueError as error:
-            raise DataError(f"{path}, line {number}: {error}; it must hold {count} numbers: {columns}") from error
-    return rows
 
 
 def _image_number(line: str, value: float) -> int:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from fmtorch.data.pairs import ImageSource
+from fmtorch.data.undistort import undistorted
 
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _JPEG_MARKER = re.compile(rb"\xff+([^\x00\xff\xd0-\xd7])", re.DOTALL)
@@ -36,11 +37,26 @@ def read_image(source: ImageSource | Path | str, *, orient: bool = False) -> NDA
     """The image at `source` as uint8, (H, W) when the file is grey and RGB (H, W, 3) when it has colour.
 
     Any format OpenCV decodes; 16 bits are reduced to 8, transparency is dropped.
+    An `ImageSource` with a lens gives the undistorted image (`undistorted`).
     orient: turn the image as its EXIF orientation says. Off by default: ground truth is given for the pixels as stored.
-    Raises ImageError for a file that is missing, empty, truncated, corrupt, no image, or of more than `MAX_PIXELS`:
-    OpenCV alone makes up what is missing or damaged and says nothing, or but a line on the standard error output.
+    Raises ImageError for a file that is missing, empty, truncated, corrupt, no image, of more than `MAX_PIXELS`, or of
+    another size than its source says: OpenCV alone makes up what is missing or damaged and says nothing, or but a line
+    on the standard error output.
     """
-    path = source.path if isinstance(source, ImageSource) else Path(source)
+    if not isinstance(source, ImageSource):
+        return _decoded(Path(source), orient)
+    image = _decoded(source.path, orient)
+    if source.size is not None and image.shape[:2] != source.size:
+        (h, w), (height, width) = image.shape[:2], source.size
+        raise ImageError(
+            f"{source.path}: {w} x {h} px, but its camera is of {width} x {height} px; it must be the image as it was "
+            "when its camera was determined"
+        )
+    return image if source.lens is None else undistorted(image, source.lens)
+
+
+def _decoded(path: Path, orient: bool) -> NDArray[np.uint8]:
+    """The pixels of a file."""
     try:
         data = path.read_bytes()
     except OSError as error:

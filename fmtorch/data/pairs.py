@@ -10,15 +10,23 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.data.lenses import Lens
 from fmtorch.types import Correspondences, pair_key
 
 
 @dataclasses.dataclass(frozen=True)
 class ImageSource:
-    """One image on disk. `identity` names it within its data set and is the key of feature caches."""
+    """One image on disk.
+
+    identity: names it within its data set.
+    size: (h, w) that the file must have, where the data set says so: cameras hold for one size alone.
+    lens: whose distortion `read_image` takes out; None for an image without.
+    """
 
     identity: str
     path: Path
+    size: tuple[int, int] | None = None
+    lens: Lens | None = None
 
 
 class GivenMatches(NamedTuple):

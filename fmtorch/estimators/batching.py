@@ -9,22 +9,45 @@ from torch import Tensor
 
 from fmtorch.estimators.pairs import NormalizedPairs, normalized_pairs
 from fmtorch.estimators.support import lack_of_support, relative_rounding
-from fmtorch.threads import one_thread
-from fmtorch.types import Correspondences, Estimate, ungraphed
+from fmtorch.records import ungraphed
+from fmtorch.threads import available, mapped, one_thread
+from fmtorch.types import Correspondences, Estimate, collate
 from fmtorch.verdict import judged
 
 Solve = Callable[[NormalizedPairs], tuple[Tensor, Tensor, Tensor, Tensor]]
 """Pairs -> F (p, 3, 3) in normalised units, inliers (p, n), found (p,), draws (p,)."""
 
 
-def solve_all(c: Correspondences, seed: int, least: int, solve: Solve, not_found: str, limit: int) -> Estimate:
+PARTS_OF_A_THREAD = 4  # so that no thread is long alone at the end
+MATCHES_AT_LEAST = 500  # a pair of few matches takes as long as one of these
+
+
+def solve_all(
+    c: Correspondences, seed: int, least: int, solve: Solve, not_found: str, limit: int, threads: bool = False
+) -> Estimate:
     """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`.
 
     least: matches below which a pair is not tried, and inliers below which a model is none. not_found: the reason for
-    pairs that `solve` does not find a model for. limit: pairs that are solved together; changes no result.
+    pairs that `solve` does not find a model for. limit: pairs that are solved together. threads: whether pairs may be
+    shared out among threads. Neither changes a result.
     """
+
+    def solved(part: Correspondences) -> Estimate:
+        return ungraphed(part, lambda: _solve_all(part, seed, least, solve, not_found, limit))
+
     with one_thread(c.mask.device):
-        return ungraphed(c, lambda: _solve_all(c, seed, least, solve, not_found, limit))
+        rows = _shared_out(c) if threads and available() > 1 else []
+        if len(rows) < 2:
+            return solved(c)
+        return collate(mapped(solved, [c[some] for some in rows]))[torch.argsort(torch.cat(rows))]
+
+
+def _shared_out(c: Correspondences) -> list[Tensor]:
+    """The rows of a batch in parts of about equal work, pairs of many matches first."""
+    work, order = c.count().clamp_min(MATCHES_AT_LEAST).sort(descending=True)
+    before = work.cumsum(0) - work
+    part = before * (PARTS_OF_A_THREAD * available()) // max(1, int(work.sum()))
+    return list(torch.split(order, torch.unique_consecutive(part, return_counts=True)[1].tolist()))
 
 
 def _solve_all(c: Correspondences, seed: int, least: int, solve: Solve, not_found: str, limit: int) -> Estimate:

@@ -20,25 +20,22 @@ from fmtorch.estimators.batching import solve_all
 from fmtorch.estimators.degeneracy import Degensac
 from fmtorch.estimators.final_fits import FinalFit
 from fmtorch.estimators.focal.hypotheses import FocalSamples
-from fmtorch.estimators.focal.selection import Candidates, FocalSelection
+from fmtorch.estimators.focal.selection import FocalSelection
 from fmtorch.estimators.forms import Form, Outcome, pair_by_pair
 from fmtorch.estimators.graph_cut import LocalOptimization
 from fmtorch.estimators.inliers import Confidence, InlierRule
-from fmtorch.estimators.models import Pool
-from fmtorch.estimators.one_pair import inliers as one_pair_inliers
-from fmtorch.estimators.one_pair import models as one_pair_models
-from fmtorch.estimators.one_pair import pool as one_pair_pool
-from fmtorch.estimators.one_pair import solvers as one_pair_solvers
+from fmtorch.estimators.one_pair.whole import whole
 from fmtorch.estimators.options import Focal, Preselect, Refine, Select, at_least_one, group, thresholds
 from fmtorch.estimators.pairs import NormalizedPairs
-from fmtorch.estimators.pool import Verifier, near_models
-from fmtorch.estimators.registry import kernel_form, part
+from fmtorch.estimators.pool import Verifier
+from fmtorch.estimators.refinement import AsFound, PoolRefinement
+from fmtorch.estimators.registry import part
 from fmtorch.estimators.sampling import Sampler
 from fmtorch.estimators.scores import Score
 from fmtorch.estimators.search import Search
-from fmtorch.estimators.selection import BestScore, FirstOfPool, Selection, Selector
+from fmtorch.estimators.selection import BestScore, FirstOfPool, Selector
 from fmtorch.estimators.solvers import MinimalSamples, Solver
-from fmtorch.geometry.refine import RANK_TWO_ALREADY, refine_components
+from fmtorch.estimators.verbs import FocalParts, Verbs
 from fmtorch.types import Correspondences, Estimate
 
 FOCAL_ROUND = 500  # samples of five matches of a pair at a time
@@ -118,29 +115,30 @@ class HypothesizeAndVerify:
         if check is not None and generator.size != Degensac.SAMPLE:
             raise ValueError(f"degeneracy={degeneracy} needs solver=seven_point; solver is {solver!r}")
         self.confidence = None if confidence is None else Confidence(confidence, inlier_px, self.sampler)
-        self.preselect = group("preselect", preselect, Preselect)
-        verify = Verifier(self.score, self.preselect)
+        verify = Verifier(self.score, group("preselect", preselect, Preselect))
         self.search = Search(generator, verify, pool, hypotheses, round, self._confident(generator.size), check)
-        self.local_optimization = part("local_optimization", local_optimization, threshold=threshold, score=self.score)
-        self.refinement = group("refine", refine, Refine)
+        optimization = part("local_optimization", local_optimization, threshold=threshold, score=self.score)
+        refinement = group("refine", refine, Refine)
         choice, prior = group("select", select, Select), group("focal", focal, Focal)
         gain = None if choice is None else part("score", choice.score, threshold=choice.scale)
         self.selector: Selector = BestScore(self.score) if gain is None else BestScore(gain, torch.float64)
-        if gain is None and self.local_optimization is None and self.refinement is None:
-            self.selector = FirstOfPool()
-        self.focal_search, self.focal = None, None
+        self.refine: PoolRefinement | AsFound = PoolRefinement(refinement, optimization)
+        if gain is None and optimization is None and refinement is None:
+            self.selector, self.refine = FirstOfPool(), AsFound()
+        self.focal = None
         if prior is not None:
             if gain is None:
                 raise ValueError("focal needs select: the score by which models with the prior are compared")
-            self.focal = FocalSelection(gain, prior.iterations, prior.candidates)
+            self.focal = FocalParts(FocalSelection(gain, prior.iterations, prior.candidates))
             if prior.samples:
-                samples = FocalSamples(self.sampler.draw)
-                self.focal_search = Search(samples, verify, prior.pool, prior.samples, FOCAL_ROUND)
-        self.inlier_rule = part("inliers", inliers, threshold=inlier_px)
+                samples = Search(FocalSamples(self.sampler.draw), verify, prior.pool, prior.samples, FOCAL_ROUND)
+                self.focal = dataclasses.replace(
+                    self.focal, search=samples, confident=self._confident(FocalSamples.size)
+                )
         self.final = part("final", final)
-        self.tensor_form = Form(self._selected, self.inlier_rule, self.final, refit_inliers)
-        staged = (check, self.local_optimization, self.refinement, choice, prior)
-        self.kernel_form = None if any(stage is not None for stage in staged) else self._kernel_form(refit_inliers)
+        verbs = Verbs(self.search, self.refine, self.selector, self.focal)
+        self.tensor_form = Form(verbs, part("inliers", inliers, threshold=inlier_px), self.final, refit_inliers)
+        self.kernel_form = whole(self.tensor_form)
 
     @property
     def uses_prior(self) -> bool:
@@ -152,10 +150,11 @@ class HypothesizeAndVerify:
         least = self.search.generator.size
         at_once = self.search.generator.samples_at_once(c.mask.device) // self.search.round
         form: Callable[[NormalizedPairs], Outcome] = self.tensor_form
-        if self.kernel_form is not None and c.mask.device.type == "cpu" and kernels.available():
-            form = functools.partial(pair_by_pair, self.kernel_form)
-        solve = functools.partial(self._solve, form)
-        return solve_all(c, seed, least, solve, "every minimal sample was degenerate", at_once)
+        compiled = self.kernel_form if c.mask.device.type == "cpu" and kernels.available() else None
+        if compiled is not None:
+            form = functools.partial(pair_by_pair, compiled)
+        solve, threads = functools.partial(self._solve, form), compiled is not None
+        return solve_all(c, seed, least, solve, "every minimal sample was degenerate", at_once, threads)
 
     def _solve(
         self, form: Callable[[NormalizedPairs], Outcome], pairs: NormalizedPairs
@@ -168,71 +167,6 @@ class HypothesizeAndVerify:
             fit, inliers, found, draws = form(pairs)
         F = fit.F + self.final.attached(fit, pairs) if pairs.requires_grad else fit.F
         return F, inliers, found, draws
-
-    def _kernel_form(self, refit_inliers: bool) -> Form | None:
-        """The same parts in their kernel form; None unless each of them has one."""
-        search = self.search
-        parts = (search.generator.solver, self.sampler, self.score, self.inlier_rule, self.final)
-        solver, sampler, score, inlier_rule, final = map(kernel_form, parts)
-        if None in (solver, sampler, score, inlier_rule, final):
-            return None
-        confident = None
-        if self.confidence is not None:
-            rule = one_pair_inliers.Confidence(self.confidence, sampler)
-            confident = functools.partial(rule, size=solver.size)
-        generator = one_pair_solvers.MinimalSamples(solver, sampler)
-        verify = one_pair_pool.Verifier(score, self.preselect)
-        rounds = dataclasses.replace(
-            search, generator=generator, verify=verify, confident=confident, nothing=one_pair_models.Pool.of
-        ).rounds
-        return Form(lambda pair: one_pair_models.first_of_pool(rounds(pair), pair), inlier_rule, final, refit_inliers)
-
-    def _selected(self, pairs: NormalizedPairs) -> Selection:
-        """Search, refine and select: with plausible cameras first where the image sizes are known."""
-        if self.focal_search is None or self.focal is None or not pairs.sizes_known:
-            return self.select(self.refine(self.search(pairs), pairs), pairs)
-        pool = self.focal_search(pairs)
-        candidates = self.focal.refined(pool.F.to(torch.float64), pool.valid, pairs, self._near(pool, pairs))
-        F, cameras, posterior = candidates.best()
-        selection = Selection(F, cameras, torch.isfinite(posterior), pool.draws)
-        assert pairs.size0 is not None
-        assert pairs.size1 is not None
-        decided = ((pairs.size0 == pairs.size1).all(-1) | candidates.unambiguous()).tolist()
-        confident = self._confident(FocalSamples.size)
-        enough = [False] * len(pairs) if confident is None else confident(F, pool.draws, pairs)
-        open_ = [i for i, (one, other) in enumerate(zip(decided, enough, strict=True)) if not (one and other)]
-        if open_:
-            rows, some = torch.tensor(open_, device=pairs.row.device), pairs.only(open_)
-            other = self.select(self.refine(self.search(some), some), some, candidates[rows])
-            found, draws = other.found | selection.found[rows], other.draws + selection.draws[rows]
-            selection = selection.replaced(rows, dataclasses.replace(other, found=found, draws=draws))
-        return selection
-
-    def refine(self, pool: Pool, pairs: NormalizedPairs) -> Pool:
-        """The models of the pool, float64, optimised on their inliers and refined on the matches near them."""
-        if isinstance(self.selector, FirstOfPool):
-            return pool
-        F, near = pool.F.to(torch.float64), self._near(pool, pairs)
-        if self.local_optimization is not None:
-            F = self.local_optimization(F, pairs)
-        if (refine := self.refinement) is not None:
-            F, _ = refine_components(
-                F, near.points, near.weight, refine.kernel, refine.scale / near.scale, refine.iterations,
-                squarings=RANK_TWO_ALREADY,
-            )  # fmt: skip
-        return dataclasses.replace(pool, F=F, near=near)
-
-    def select(self, pool: Pool, pairs: NormalizedPairs, candidates: Candidates | None = None) -> Selection:
-        """One model of each refined pool, or of the candidates of plausible cameras."""
-        if self.focal is None or not pairs.sizes_known or pool.near is None:
-            return self.selector(pool, pairs)
-        F, cameras = self.focal(pool.F, pool.valid, pairs, pool.near, candidates)
-        return Selection(F, cameras, pool.valid.any(1), pool.draws)
-
-    def _near(self, pool: Pool, pairs: NormalizedPairs) -> NormalizedPairs:
-        """The pairs with the matches on which the pool's models are refined."""
-        refine = self.refinement
-        return pairs if refine is None else near_models(pool.F, pairs, refine.RADIUS * refine.scale, refine.matches)
 
     def _confident(self, size: int) -> Any:
         """The stopping rule for samples of this size; None: never stop before all samples are drawn."""

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from fmtorch.estimators.final_fits import Fit
+from fmtorch.estimators.focal.cameras import TwoCameras
 from fmtorch.estimators.one_pair.pair import Array, each_pair
 from fmtorch.estimators.pairs import NormalizedPairs
 
@@ -50,7 +51,8 @@ def pair_by_pair(form: Form, pairs: NormalizedPairs) -> Outcome:
     F, at = (torch.from_numpy(np.stack([getattr(one.fit, name) for one in solved])) for name in ("F", "at"))
     found, draws = (torch.tensor([getattr(one, name) for one in solved]) for name in ("found", "draws"))
     counted = _padded([one.fit.counted for one in solved], pairs)
-    return Outcome(Fit(F, at, counted), _padded([one.inliers for one in solved], pairs), found, draws)
+    adapted = _adapted([one.fit for one in solved])
+    return Outcome(Fit(F, at, counted, *adapted), _padded([one.inliers for one in solved], pairs), found, draws)
 
 
 def _padded(rows: list[Array], pairs: NormalizedPairs) -> Bool[Tensor, "p n"]:
@@ -59,3 +61,13 @@ def _padded(rows: list[Array], pairs: NormalizedPairs) -> Bool[Tensor, "p n"]:
     for place, row in zip(out, rows, strict=True):
         place[: len(row)] = row
     return torch.from_numpy(out)
+
+
+def _adapted(fits: list[Any]) -> tuple[TwoCameras, Tensor] | tuple[()]:
+    """The cameras and truncation distances of fits that are adapted to their pairs; nothing of others."""
+    if fits[0].truncation is None:
+        return ()
+    axes, focal = (torch.from_numpy(np.stack([fit.cameras[i] for fit in fits], -1)) for i in (0, 1))
+    return TwoCameras(axes.permute(1, 2, 0, 3), focal), torch.tensor(
+        [fit.truncation for fit in fits], dtype=torch.float64
+    )

@@ -79,6 +79,11 @@ class Pool:
         """Which slots hold a model."""
         return torch.isfinite(self.score)
 
+    @property
+    def models(self) -> Float[Tensor, "9 p k"]:
+        """The models in float64, zero where there is none."""
+        return self.F.to(torch.float64)
+
     def merge(self, rows: Sequence[int] | Int[Tensor, " q"], models: Models) -> None:
         """Keep the best of these rows' models and the new ones; the earlier draw wins a tie."""
         assert models.score is not None

@@ -72,7 +72,8 @@ def near_models(F: Float[Tensor, "9 p k"], pairs: NormalizedPairs, radius: float
     """
     if most is None:
         return pairs
-    r2 = sampson_squared(F, pairs.points32).nan_to_num_(torch.inf).amin(1)
+    r2 = sampson_squared(F, pairs.points32).nan_to_num_(torch.inf)
+    r2 = r2.masked_fill_((F == 0).all(0)[..., None], torch.inf).amin(1)  # nothing is near a place that holds no model
     near = pairs.mask & (r2 * pairs.pixels_per_unit.square()[:, None].to(r2.dtype) <= radius**2)
     longest = min(most, max(int(near.sum(1).max()), 1))
     return pairs.take(shuffled(pairs, Stream.REFINEMENT, near)[:, :longest], near)

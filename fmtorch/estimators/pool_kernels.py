@@ -71,13 +71,17 @@ def merge(
 
 @kernel("f4[:, ::1], f4[:, ::1], f4, b1[::1]")
 def near(F: Array, points: Array, limit: Any, out: Array) -> None:
-    """Which of the points (4, n) are within a squared Sampson distance of one of the models (k, 9) -> out (n,)."""
+    """Which of the points (4, n) are within a squared Sampson distance of one of the models (k, 9) -> out (n,).
+
+    Nothing is near a model of zeros.
+    """
     x0, y0, x1, y1 = points[0], points[1], points[2], points[3]
     out[:] = False
     for k in range(len(F)):
         f0, f1, f2, f3, f4 = F[k, 0], F[k, 1], F[k, 2], F[k, 3], F[k, 4]
         f5, f6, f7, f8 = F[k, 5], F[k, 6], F[k, 7], F[k, 8]
-        for i in range(len(out)):
+        zero = f0 == 0 and f1 == 0 and f2 == 0 and f3 == 0 and f4 == 0 and f5 == 0 and f6 == 0 and f7 == 0 and f8 == 0
+        for i in range(0 if zero else len(out)):
             a0, b0 = f0 * x0[i] + f1 * y0[i] + f2, f3 * x0[i] + f4 * y0[i] + f5
             e = f6 * x0[i] + f7 * y0[i] + f8 + a0 * x1[i] + b0 * y1[i]
             a1, b1 = f0 * x1[i] + f3 * y1[i] + f6, f1 * x1[i] + f4 * y1[i] + f7

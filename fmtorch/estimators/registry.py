@@ -47,7 +47,7 @@ PARTS: dict[str, dict[str, Entry]] = {
     "score": {
         "inlier_count": Entry(InlierCount, "scores.InlierCount"),
         "msac": Entry(TruncatedSquares, "scores.TruncatedSquares"),
-        "saturated": Entry(SaturatedGains),
+        "saturated": Entry(SaturatedGains, "saturated_gains.SaturatedGains"),
         "magsac": Entry(SigmaConsensus, "scores.SigmaConsensus"),
         "median": Entry(Median, "scores.Median"),
     },
@@ -63,7 +63,7 @@ PARTS: dict[str, dict[str, Entry]] = {
         "least_squares": Entry(LeastSquares, "final_fits.LeastSquares"),
         "unweighted_least_squares": Entry(UnweightedLeastSquares, "final_fits.LeastSquares"),
         "gauss_newton": Entry(GaussNewton),
-        "adaptive": Entry(AdaptiveGaussNewton),
+        "adaptive": Entry(AdaptiveGaussNewton, "final_fits.AdaptiveGaussNewton"),
     },
 }
 

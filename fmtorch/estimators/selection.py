@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -33,6 +34,12 @@ class Selection:
             found=self.found.index_copy(0, rows, other.found),
             draws=self.draws.index_copy(0, rows, other.draws),
         )
+
+    def merged(self, rows: Sequence[int], other: Selection) -> Selection:
+        """With what another search of these pairs has selected; a pair has a model if either has found one."""
+        index = torch.tensor(rows, device=self.found.device)
+        found, draws = other.found | self.found[index], other.draws + self.draws[index]
+        return self.replaced(index, dataclasses.replace(other, found=found, draws=draws))
 
     @property
     def matrices(self) -> Float[Tensor, "p 3 3"]:

@@ -100,7 +100,7 @@ def _roots(known: Mapping[str, Any], roots: Sequence[Path]) -> list[Path | None]
     if known.get("name") == "rendered":  # which is drawn where it does not lie, and never among something else
         drawn = f"*-{known.get('split', 'test')}-{known.get('size', 'small')}-*"
         return [root for root in roots if any(root.glob(drawn))] or [None]
-    return list(roots) or [None] if known.get("name") == "fmbench" else [None, *roots]
+    return list(roots) or [None] if known.get("name") in data.NEEDS_ROOT else [None, *roots]
 
 
 def _same(dataset: PairDataset, stored: Mapping[str, Any]) -> PairDataset:

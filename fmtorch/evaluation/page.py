@@ -16,7 +16,7 @@ import pyarrow as pa
 from markupsafe import Markup
 
 from fmtorch.evaluation import curves, tables
-from fmtorch.evaluation.pictures import Image
+from fmtorch.evaluation.canvas import Image
 from fmtorch.evaluation.statistics import THRESHOLD
 from fmtorch.evaluation.summary import caption, summarize
 

@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Image = NDArray[np.uint8]
-Points = NDArray[np.floating]
-# RGB; told apart by all kinds of colour vision, and in grey (Okabe & Ito, "Color Universal Design", 2008), lightened.
-GOOD, BAD = (20, 205, 140), (225, 75, 20)
+from fmtorch.evaluation.canvas import (
+    BAD,
+    GOOD,
+    SUBPIXEL,
+    Image,
+    Place,
+    Points,
+    captioned,
+    dashes,
+    fine_line,
+    fixed,
+    placed,
+    segment,
+    whole,
+)  # fmt: skip
+from fmtorch.evaluation.sparse import spread, thinned
+
+# RGB; told apart by all kinds of colour vision (Okabe & Ito), lightened.
 COLOURS = (
     (0, 158, 235),
     (240, 228, 66),
@@ -22,16 +35,8 @@ COLOURS = (
     (110, 205, 250),
     (245, 170, 0),
 )
-WIDTH, HEIGHT = 1920, 1000  # px, of a picture at most
-_GAP = 6  # px between the two images
-_STACKED = 5.0  # images whose widths add up to more than so many heights stand one above the other
-_SUBPIXEL = 4  # fractional bits of the coordinates that are drawn
-_PARALLEL = 1e-9  # a line with this slope at most leaves an image only at its two other sides
 _CORNERS = 200  # among which to choose
 _RIM = 0.06  # share of an image at either side without corners
-_FARTHEST = 1e12  # px; a line farther from the first pixel is the line at infinity
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
-_COLOUR_LEFT = 0.45  # of the photographs' own, so that lines stand out
 
 
 def draw_matches(
@@ -45,23 +50,23 @@ def draw_matches(
     shows its share of them. names: what good and other matches are called in a line below the images, which also says
     how many there are and how many are drawn; None: no such line.
     """
-    canvas, place0, place1 = _placed(image0, image1, height)
+    canvas, place0, place1 = placed(image0, image1, height)
     ends0, ends1 = place0(x0), place1(x1)
-    unit = _unit(canvas)
+    unit = fine_line(canvas)
     styles = ((BAD, ~good, most_bad, 0.6 * unit, 0.6), (GOOD, good, most, 1.1 * unit, 0.85))
     for colour, chosen, count, width, opacity in styles:
         index = np.flatnonzero(chosen & np.isfinite(ends0).all(1) & np.isfinite(ends1).all(1))
         index = index[thinned(ends0[index], count)]
         layer = canvas.copy()
-        for a, b in zip(_fixed(ends0[index]), _fixed(ends1[index]), strict=True):
-            cv2.line(layer, a, b, colour, _pixels(width), cv2.LINE_AA, _SUBPIXEL)
-        for point in _fixed(np.concatenate([ends0[index], ends1[index]])):
-            cv2.circle(layer, point, round(2.6 * width * (1 << _SUBPIXEL)), colour, -1, cv2.LINE_AA, _SUBPIXEL)
+        for a, b in zip(fixed(ends0[index]), fixed(ends1[index]), strict=True):
+            cv2.line(layer, a, b, colour, whole(width), cv2.LINE_AA, SUBPIXEL)
+        for point in fixed(np.concatenate([ends0[index], ends1[index]])):
+            cv2.circle(layer, point, round(2.6 * width * (1 << SUBPIXEL)), colour, -1, cv2.LINE_AA, SUBPIXEL)
         canvas = np.asarray(cv2.addWeighted(layer, opacity, canvas, 1 - opacity, 0), np.uint8)
     if names is None:
         return canvas
     counts = int(good.sum()), int((~good).sum())
-    return _captioned(canvas, names, counts, (min(counts[0], most), min(counts[1], most_bad)))
+    return captioned(canvas, names, counts, (min(counts[0], most), min(counts[1], most_bad)))
 
 
 def draw_epipolar_lines(
@@ -72,7 +77,7 @@ def draw_epipolar_lines(
     A match has one colour: its point and the line of its partner in each image. truth: the true F, whose lines are
     dashed and white. x0, x1: (N, 2) pixels, of which `most` are drawn at most, spread over both images.
     """
-    canvas, place0, place1 = _placed(image0, image1, None)
+    canvas, place0, place1 = placed(image0, image1, None)
     finite = np.flatnonzero(np.isfinite(x0).all(1) & np.isfinite(x1).all(1))
     index = finite[spread(np.hstack([place0(x0), place1(x1)])[finite], most)]
     for place, own, other, transpose in ((place0, x0, x1, True), (place1, x1, x0, False)):
@@ -90,7 +95,7 @@ def draw_epipolar_lines_of_corners(
     that of `COLOURS` or fewer; more than half of the points lie in image 0. Where there is a choice they are corners
     whose true line crosses the other image. truth: as for `draw_epipolar_lines`.
     """
-    canvas, place0, place1 = _placed(image0, image1, None)
+    canvas, place0, place1 = placed(image0, image1, None)
     known = F if truth is None else truth
     chosen0 = _corners(image0, lambda line: place1.clip(line), known, most - most // 2)
     chosen1 = _corners(image1, lambda line: place0.clip(line), known.T, most // 2)
@@ -117,7 +122,7 @@ def _corners(image: Image, clip: Callable[[Points], NDArray[np.float64]], F: Poi
     return corners[spread(corners, count)]
 
 
-def _lines(place: _Place, matrices: Sequence[Points], points: Points) -> list[list[NDArray[np.float64]]]:
+def _lines(place: Place, matrices: Sequence[Points], points: Points) -> list[list[NDArray[np.float64]]]:
     """Of each matrix the ends of the points' epipolar lines in the image at `place`."""
     homogeneous = np.column_stack([points, np.ones(len(points))])
     return [[place.clip(line) for line in homogeneous @ matrix.T] for matrix in matrices]
@@ -125,7 +130,7 @@ def _lines(place: _Place, matrices: Sequence[Points], points: Points) -> list[li
 
 def _lines_and_points(
     canvas: Image,
-    place: _Place,
+    place: Place,
     lines: Sequence[Sequence[NDArray[np.float64]]],
     points: Points,
     colour: int,
@@ -135,159 +140,13 @@ def _lines_and_points(
 
     colour, line_colour: the colours' numbers of the first point and, if it is another, the first line.
     """
-    part, unit = place.view(canvas), _unit(canvas)
+    part, unit = place.view(canvas), fine_line(canvas)
     start = colour if line_colour is None else line_colour
     for k, ends in enumerate(lines[0], start):
-        _segment(part, ends, COLOURS[k % len(COLOURS)], 1.9 * unit)
+        segment(part, ends, COLOURS[k % len(COLOURS)], 1.9 * unit)
     for ends in lines[1] if len(lines) > 1 else []:
-        for dash in _dashes(ends, 15 * unit):
-            _segment(part, dash, (255, 255, 255), 1.3 * unit)
-    for k, point in enumerate(_fixed(place(points) - place.origin), colour):
+        for dash in dashes(ends, 15 * unit):
+            segment(part, dash, (255, 255, 255), 1.3 * unit)
+    for k, point in enumerate(fixed(place(points) - place.origin), colour):
         for ring, radius in (((0, 0, 0), 5.8), ((255, 255, 255), 5.0), (COLOURS[k % len(COLOURS)], 3.6)):
-            cv2.circle(part, point, round(radius * unit * (1 << _SUBPIXEL)), ring, -1, cv2.LINE_AA, _SUBPIXEL)
-
-
-def spread(points: Points, count: int) -> NDArray[np.intp]:
-    """Indices, ascending, of at most `count` points (N, D) far from one another: each the farthest from those before.
-
-    The first is the nearest to the mean. O(N count). Ties go to the lowest index.
-    """
-    if len(points) <= count:
-        return np.arange(len(points))
-    distance = -((points - points.mean(0)) ** 2).sum(1)
-    chosen = [int(distance.argmax())]
-    distance = np.full(len(points), np.inf)
-    for _ in range(count - 1):
-        distance = np.minimum(distance, ((points - points[chosen[-1]]) ** 2).sum(1))
-        chosen.append(int(distance.argmax()))
-    return np.sort(np.array(chosen, np.intp))
-
-
-def thinned(points: Points, count: int) -> NDArray[np.intp]:
-    """Indices, ascending, of at most `count` points (N, 2): of a path through all of them every so many-th.
-
-    The path goes up one strip of the plane and down the next. Dense and sparse regions keep their shares, and among
-    matches so do right and wrong ones, whereas `spread` prefers what is far from the rest: the wrong.
-    """
-    if len(points) <= count:
-        return np.arange(len(points))
-    x, y = points.T
-    strip = np.floor((x - x.min()) / max(np.ptp(x), np.finfo(np.float64).tiny) * np.sqrt(count))
-    path = np.lexsort((np.where(strip % 2 == 0, y, -y), strip))
-    return np.sort(path[(2 * np.arange(count) + 1) * len(points) // (2 * count)])
-
-
-@dataclasses.dataclass(frozen=True)
-class _Place:
-    """Where an image of `shape` (h, w) stands on the canvas: its first corner (x, y) and its size (w, h) there."""
-
-    shape: tuple[int, int]
-    origin: tuple[int, int]
-    size: tuple[int, int]
-
-    def __call__(self, x: Points) -> NDArray[np.float64]:
-        """Pixels of the image as pixels of the canvas; (0, 0) is the centre of the first pixel of either."""
-        scale = np.array(self.size) / self.shape[::-1]
-        return np.asarray((x + 0.5) * scale - 0.5 + self.origin, np.float64)
-
-    def view(self, canvas: Image) -> Image:
-        """The image's part of the canvas."""
-        return canvas[self.origin[1] : self.origin[1] + self.size[1], self.origin[0] : self.origin[0] + self.size[0]]
-
-    def clip(self, line: Points) -> NDArray[np.float64]:
-        """The part of a line (a, b, c) within the image: its ends (2, 2) in pixels of `view`; (0, 2) where none is."""
-        w, h = self.shape[::-1]
-        length = float(np.hypot(line[0], line[1]))
-        if not np.isfinite(line).all() or length <= abs(line[2]) / _FARTHEST:
-            return np.zeros((0, 2))
-        normal, middle = line[:2] / length, np.array([w - 1, h - 1]) / 2
-        foot = middle - normal * (normal @ middle + line[2] / length)
-        direction = np.array([-normal[1], normal[0]])
-        first, last = -np.inf, np.inf
-        for start, step, low, high in zip(foot, direction, (-0.5, -0.5), (w - 0.5, h - 0.5), strict=True):
-            if abs(step) < _PARALLEL:
-                if not low <= start <= high:
-                    return np.zeros((0, 2))
-                continue
-            near, far = sorted(((low - start) / step, (high - start) / step))
-            first, last = max(first, near), min(last, far)
-        if first > last:
-            return np.zeros((0, 2))
-        return self(foot + np.array([[first], [last]]) * direction) - self.origin
-
-
-def _placed(image0: Image, image1: Image, height: int | None) -> tuple[Image, _Place, _Place]:
-    """A canvas with both images, and where they stand on it: in a row of one height, or in a column of one width."""
-    shapes = [image.shape[:2] for image in (image0, image1)]
-    widths = [w / h for h, w in shapes]  # at height 1
-    if height is None and sum(widths) > _STACKED:
-        width = min(WIDTH, (HEIGHT - _GAP) / sum(1 / x for x in widths))
-        sizes = [(max(1, round(width)), max(1, round(width / x))) for x in widths]
-        origins = [(0, 0), (0, sizes[0][1] + _GAP)]
-    else:
-        tall = height or min(HEIGHT, (WIDTH - _GAP) / sum(widths))
-        sizes = [(max(1, round(tall * x)), max(1, round(tall))) for x in widths]
-        origins = [(0, 0), (sizes[0][0] + _GAP, 0)]
-    end = np.array(origins[1]) + np.max(sizes, axis=0) * [origins[1][0] == 0, origins[1][1] == 0]
-    end += np.array(sizes[1]) * [origins[1][0] > 0, origins[1][1] > 0]
-    canvas = np.full((end[1], end[0], 3), 255, np.uint8)
-    places = []
-    for image, shape, origin, size in zip((image0, image1), shapes, origins, sizes, strict=True):
-        place = _Place((shape[0], shape[1]), origin, size)
-        place.view(canvas)[:] = _faded(image, size)
-        places.append(place)
-    return canvas, places[0], places[1]
-
-
-def _faded(image: Image, size: tuple[int, int]) -> Image:
-    """The image in another size (w, h) and paler colours."""
-    shrinks = size[0] < image.shape[1]
-    image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC), np.uint8)
-    if image.ndim == 2:
-        return np.repeat(image[..., None], 3, 2)
-    grey = np.repeat(np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))[..., None], 3, 2)
-    return np.asarray(cv2.addWeighted(image, _COLOUR_LEFT, grey, 1 - _COLOUR_LEFT, 0), np.uint8)
-
-
-def _captioned(canvas: Image, names: tuple[str, str], counts: tuple[int, int], drawn: tuple[int, int]) -> Image:
-    """The picture with a line below it that says what its two colours are."""
-    size = max(0.45, 0.62 * canvas.shape[1] / WIDTH)  # of letters, in OpenCV's unit
-    height, gap, rise = round(44 * size), round(22 * size), round(30 * size)
-    line = np.full((height, canvas.shape[1], 3), 255, np.uint8)
-    x = gap
-    for colour, name, count, shown in zip((GOOD, BAD), names, counts, drawn, strict=True):
-        text = f"{count} {name}" + (f", {shown} of them drawn" if shown < count else "")
-        cv2.line(line, (x, rise - round(7 * size)), (x + 2 * gap, rise - round(7 * size)), colour, _pixels(5 * size))
-        cv2.putText(line, text, (x + 3 * gap, rise), _FONT, size, (0, 0, 0), _pixels(1.3 * size), cv2.LINE_AA)
-        x += 5 * gap + cv2.getTextSize(text, _FONT, size, _pixels(1.3 * size))[0][0]
-    return np.concatenate([canvas, line])
-
-
-def _unit(canvas: Image) -> float:
-    """The width of a fine line: 1 px for a picture of WIDTH x 640."""
-    return float(np.sqrt(canvas.shape[0] * canvas.shape[1] / (WIDTH * 640)))
-
-
-def _pixels(width: float) -> int:
-    return max(1, round(width))
-
-
-def _segment(canvas: Image, ends: Points, colour: tuple[int, int, int], width: float) -> None:
-    """A line on a dark rim, which can be seen on any ground."""
-    if len(ends):
-        a, b = _fixed(ends)
-        cv2.line(canvas, a, b, (0, 0, 0), _pixels(width) + 2, cv2.LINE_AA, _SUBPIXEL)
-        cv2.line(canvas, a, b, colour, _pixels(width), cv2.LINE_AA, _SUBPIXEL)
-
-
-def _dashes(ends: Points, length: float) -> Iterator[Points]:
-    """Pieces of a line with gaps of the same length between them."""
-    if len(ends):
-        pieces = max(1, round(float(np.linalg.norm(ends[1] - ends[0])) / length))
-        stops = ends[0] + np.linspace(0, 1, pieces + 1)[:, None] * (ends[1] - ends[0])
-        yield from (stops[i : i + 2] for i in range(0, pieces, 2))
-
-
-def _fixed(points: Points) -> list[tuple[int, int]]:
-    whole = np.round(points * (1 << _SUBPIXEL)).astype(int)
-    return [(int(x), int(y)) for x, y in whole]
+            cv2.circle(part, point, round(radius * unit * (1 << SUBPIXEL)), ring, -1, cv2.LINE_AA, SUBPIXEL)

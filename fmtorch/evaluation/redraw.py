@@ -9,8 +9,9 @@ import numpy as np
 import torch
 
 from fmtorch.data import ImagePair
+from fmtorch.evaluation.canvas import Image
 from fmtorch.evaluation.page import Picture
-from fmtorch.evaluation.pictures import Image, draw_epipolar_lines, draw_epipolar_lines_of_corners, draw_matches
+from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_epipolar_lines_of_corners, draw_matches
 from fmtorch.metrics import nsgd
 from fmtorch.pipeline import Outcome
 

@@ -7,8 +7,9 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from fmtorch.data.fmbench import DataError, FMBenchPairs
+from fmtorch.data.fmbench import FMBenchPairs
 from fmtorch.data.pairs import ImagePair, PairDataset
+from fmtorch.data.text_files import DataError
 from fmtorch.exchange import h5
 from fmtorch.exchange.oanet import oanet_pairs
 from fmtorch.exchange.posebench import posebench_pairs

@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from fmtorch.data.fmbench import DataError
 from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
+from fmtorch.data.text_files import DataError
 from fmtorch.geometry.epipolar import fundamental_from_projections
 from fmtorch.types import Correspondences
 

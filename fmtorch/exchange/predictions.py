@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.data.fmbench import DataError
 from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource, PairDataset
+from fmtorch.data.text_files import DataError
 from fmtorch.exchange import h5
 from fmtorch.exchange.given import Array, Size, given, size_of
 from fmtorch.exchange.names import first, hloc_keys, names_of, pair_keys

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fmtorch.data.fmbench import DataError
 from fmtorch.data.pairs import GivenMatches, ImagePair
+from fmtorch.data.text_files import DataError
 from fmtorch.exchange import h5
 from fmtorch.exchange.given import Array, Size, broken, calibrated, given, image, size_by_centre, size_of
 

@@ -52,6 +52,7 @@ _WEIGHT = torch.cat(
     [marginal_weight(torch.linspace(0, 1, ENTRIES + 1, dtype=torch.float64)), torch.zeros(1, dtype=torch.float64)]
 )
 _INTEGRAL = torch.nn.functional.pad(((_WEIGHT[:-1] + _WEIGHT[1:]) / (2 * ENTRIES)).cumsum(0), (1, 0))
+LOSS_TABLE = torch.stack([_WEIGHT, _INTEGRAL]).numpy()  # as kernels take both
 
 
 def tabulated_loss(r2: Tensor, s2: Tensor) -> Tensor:

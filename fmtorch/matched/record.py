@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int, Int8
@@ -12,13 +11,12 @@ from torch import Tensor
 
 from fmtorch import types
 from fmtorch.matched.labels import IGNORED, INLIER
-from fmtorch.types import Correspondences, Index
-
-_PER_MATCH = ("x0", "x1", "mask", "quality", "prior", "lafs0", "lafs1", "mutual", "noise")
+from fmtorch.records import Index, Record, as_index, expect_fields, gathered, slotted
+from fmtorch.types import Correspondences
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class LabelledMatches(types._Record):
+class LabelledMatches(Record):
     """A batch of B pairs with N matches each (padded), labels and the true fundamental matrices.
 
     correspondences: the matches. label: (B, N) int8, 1 inlier, 0 outlier, -1 ignored, always -1 in masked slots.
@@ -31,8 +29,7 @@ class LabelledMatches(types._Record):
 
     def __post_init__(self) -> None:
         b, n = self.correspondences.x0.shape[:2]
-        types._expect("label", self.label, (b, n))
-        types._expect("F", self.F, (b, 3, 3))
+        expect_fields(self, b=b, n=n)
         label = torch.where(self.correspondences.mask, self.label, IGNORED)
         object.__setattr__(self, "label", label)
 
@@ -46,18 +43,13 @@ class LabelledMatches(types._Record):
         """True for the matches that are right."""
         return self.label == INLIER
 
-    @property
-    def requires_grad(self) -> bool:
-        """Whether a gradient can reach any of the tensors."""
-        return self.correspondences.requires_grad or (torch.is_grad_enabled() and self.F.requires_grad)
-
     def __len__(self) -> int:
         """Number of pairs."""
         return len(self.correspondences)
 
     def __getitem__(self, index: Index) -> LabelledMatches:
         """The selected pairs, always as a batch."""
-        i = types._as_index(index, len(self))
+        i = as_index(index, len(self))
         return self._map(lambda value: value[i])
 
     def keep(self, mask: Bool[Tensor, "b n"]) -> LabelledMatches:
@@ -79,25 +71,13 @@ class LabelledMatches(types._Record):
 
     def reorder(self, order: Int[Tensor, "b m"]) -> LabelledMatches:
         """The matches in the slots `order` of each pair, in that order."""
-
-        def take(value: Tensor) -> Tensor:
-            index = order.reshape(*order.shape, *[1] * (value.dim() - 2)).expand(-1, -1, *value.shape[2:])
-            return torch.gather(value, 1, index)
-
-        c = self.correspondences
-        moved = {name: take(value) for name in _PER_MATCH if (value := getattr(c, name)) is not None}
-        return LabelledMatches(c.replace(**moved), take(self.label), self.F)
+        moved = {name: gathered(value, order) for name, value in slotted(self.correspondences).items()}
+        return LabelledMatches(self.correspondences.replace(**moved), gathered(self.label, order), self.F)
 
     def first(self, count: int) -> LabelledMatches:
         """The first `count` slots of each pair."""
-        c = self.correspondences
-        cut = {name: value[:, :count] for name in _PER_MATCH if (value := getattr(c, name)) is not None}
-        return LabelledMatches(c.replace(**cut), self.label[:, :count], self.F)
-
-    def _map(self, function: Any, **changes: Any) -> LabelledMatches:
-        parts = {"correspondences": self.correspondences._map(function)}
-        parts |= {"label": function(self.label), "F": function(self.F)}
-        return dataclasses.replace(self, **{**parts, **changes})
+        cut = {name: value[:, :count] for name, value in slotted(self.correspondences).items()}
+        return LabelledMatches(self.correspondences.replace(**cut), self.label[:, :count], self.F)
 
 
 def collate(items: Sequence[LabelledMatches]) -> LabelledMatches:

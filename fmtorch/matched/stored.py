@@ -154,9 +154,17 @@ def split_scenes(matches: StoredMatches, last: int = 4) -> tuple[StoredMatches, 
             raise ValueError(
                 f"family {family} has {len(names)} scenes; with {last} for validation none is left to train"
             )
-    held = {(family, name) for family, names in scenes.items() for name in sorted(names)[len(names) - last :]}
+    held = last_scenes(((about["family"], about["scene"]) for about in matches.pairs), last)
     inside = [(about["family"], about["scene"]) in held for about in matches.pairs]
     return (
         matches.select(i for i, held_out in enumerate(inside) if not held_out),
         matches.select(i for i, held_out in enumerate(inside) if held_out),
     )
+
+
+def last_scenes(scenes: Iterable[tuple[str, str]], last: int) -> set[tuple[str, str]]:
+    """Of scenes (family, name), each given any number of times, the last of each family by name; never its first."""
+    names: dict[str, set[str]] = {}
+    for family, name in scenes:
+        names.setdefault(family, set()).add(name)
+    return {(family, name) for family, some in names.items() for name in sorted(some)[max(1, len(some) - last) :]}

@@ -32,8 +32,8 @@ class Neighbors(NamedTuple):
     @property
     def ratio(self) -> Float[Tensor, "*batch n0"]:
         """distance / second in [0, 1]; 1 where no second neighbour makes the first distinctive (one candidate, 0/0)."""
-        sound = torch.isfinite(self.second) & (self.second > 0)
-        return torch.where(sound, self.distance / torch.where(sound, self.second, 1.0), 1.0)
+        distinctive = torch.isfinite(self.second) & (self.second > 0)
+        return torch.where(distinctive, self.distance / torch.where(distinctive, self.second, 1.0), 1.0)
 
     @property
     def mutual(self) -> Bool[Tensor, "*batch n0"]:
@@ -72,15 +72,16 @@ def _nearest_neighbors(
 ) -> Neighbors:
     batch, (n0, n1) = descriptors0.shape[:-2], (descriptors0.shape[-2], descriptors1.shape[-2])
     flat0, flat1 = (d.reshape(math.prod(batch), *d.shape[-2:]) for d in (descriptors0, descriptors1))
-    usable0, usable1 = _usable(flat0, mask0), _usable(flat1, mask1)
-    found = [_match_one_pair(*pair, chunk) for pair in zip(flat0, flat1, usable0, usable1, strict=True)]
+    mask0, mask1 = _finite(flat0, mask0), _finite(flat1, mask1)
+    found = [_match_one_pair(*pair, chunk) for pair in zip(flat0, flat1, mask0, mask1, strict=True)]
     if not found:
         found = [_nothing(descriptors0, n0, n1)]
         return Neighbors(*(column.expand(*batch, -1) for column in found[0]))
     return Neighbors(*(torch.stack(column).reshape(*batch, column[0].shape[-1]) for column in zip(*found, strict=True)))
 
 
-def _usable(flat: Tensor, mask: Tensor | None) -> Tensor:
+def _finite(flat: Tensor, mask: Tensor | None) -> Tensor:
+    """The mask of the descriptors that are finite."""
     finite = torch.isfinite(flat).all(-1)
     return finite if mask is None else finite & mask.reshape(finite.shape)
 
@@ -91,10 +92,10 @@ def _nothing(like: Tensor, n0: int, n1: int) -> Neighbors:
     return Neighbors(index[:n0], distance, distance.clone(), index[n0:])
 
 
-def _match_one_pair(d0: Tensor, d1: Tensor, usable0: Tensor, usable1: Tensor, chunk: int) -> Neighbors:
+def _match_one_pair(d0: Tensor, d1: Tensor, mask0: Tensor, mask1: Tensor, chunk: int) -> Neighbors:
     """`nearest_neighbors` of one pair: padding is taken out before anything is computed."""
     result = _nothing(d0, len(d0), len(d1))
-    slots0, slots1 = usable0.nonzero()[:, 0], usable1.nonzero()[:, 0]
+    slots0, slots1 = mask0.nonzero()[:, 0], mask1.nonzero()[:, 0]
     if len(slots0) == 0 or len(slots1) == 0:
         return result
     rows, columns, unit = _integers(d0[slots0], d1[slots1])

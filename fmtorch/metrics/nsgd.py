@@ -106,8 +106,8 @@ def _mean_distance(
 ) -> Tensor:
     """Mean over accepted draws; `unit` makes of an image's diagonal the length its distances are divided by."""
     pairs, shape = Pairs.flatten(F_gt, F_est, size0, size1, key)
-    usable = pairs.F_gt.isfinite().all(-1).all(-1) & pairs.F_est.isfinite().all(-1).all(-1)
-    scaled = [unit_largest(torch.where(usable[:, None, None], F, 0.0)) for F in (pairs.F_gt, pairs.F_est)]
+    valid = pairs.F_gt.isfinite().all(-1).all(-1) & pairs.F_est.isfinite().all(-1).all(-1)
+    scaled = [unit_largest(torch.where(valid[:, None, None], F, 0.0)) for F in (pairs.F_gt, pairs.F_est)]
     pairs = replace(pairs, F_gt=scaled[0], F_est=scaled[1])
 
     def draw(tile: Pairs, uniforms: Tensor) -> tuple[Tensor, Tensor]:

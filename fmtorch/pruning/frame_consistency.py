@@ -21,7 +21,8 @@ from fmtorch.geometry.arithmetic import component_sum
 from fmtorch.geometry.curves import curve_orders
 from fmtorch.pair_arrays import for_each_pair, kernels_serve
 from fmtorch.pruning import consistency_kernels as compiled
-from fmtorch.types import Correspondences, ungraphed
+from fmtorch.records import ungraphed
+from fmtorch.types import Correspondences
 
 WINDOW = 8  # neighbours before and after each match along each curve
 CURVES = ((0.0, 0.0), (0.5, math.pi / 4))  # shift of the grid (in thirds of the extent) and rotation of each curve
@@ -60,31 +61,31 @@ def frame_agreement(
     vote = torch.ones_like(x0[..., 0]) if quality is None else (WORST_RATIO - quality).clamp_min(LEAST_VOTE)
     scale = (S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]).abs().sqrt()
     rows = torch.stack([*x0.unbind(-1), *x1.unbind(-1), *S.flatten(2).unbind(-1), scale, vote])
-    sound = mask & torch.isfinite(rows).all(0)
-    rows = torch.where(sound, rows, 0)
-    return tiled(_agreement, rows, sound)
+    mask = mask & torch.isfinite(rows).all(0)
+    rows = torch.where(mask, rows, 0)
+    return tiled(_agreement, rows, mask)
 
 
-def tiled(function: Callable[[Tensor, Tensor], Tensor], rows: Tensor, sound: Bool[Tensor, "b n"]) -> Tensor:
-    """function(rows (d, b, n), sound) over so many pairs at once that TILE matches bound its memory."""
-    if not sound.numel():
-        return rows.new_zeros(sound.shape)
-    pairs = max(1, (GPU_TILE if sound.is_cuda else TILE) // max(sound.shape[1], 1))
-    if len(sound) <= pairs:
-        return function(rows, sound)
-    tiles = zip(torch.split(rows, pairs, 1), torch.split(sound, pairs), strict=True)
+def tiled(function: Callable[[Tensor, Tensor], Tensor], rows: Tensor, mask: Bool[Tensor, "b n"]) -> Tensor:
+    """function(rows (d, b, n), mask) over so many pairs at once that TILE matches bound its memory."""
+    if not mask.numel():
+        return rows.new_zeros(mask.shape)
+    pairs = max(1, (GPU_TILE if mask.is_cuda else TILE) // max(mask.shape[1], 1))
+    if len(mask) <= pairs:
+        return function(rows, mask)
+    tiles = zip(torch.split(rows, pairs, 1), torch.split(mask, pairs), strict=True)
     return torch.cat([function(*tile) for tile in tiles])
 
 
-def _agreement(rows: Float[Tensor, "10 b n"], sound: Bool[Tensor, "b n"]) -> Float[Tensor, "b n"]:
+def _agreement(rows: Float[Tensor, "10 b n"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b n"]:
     """The agreement of matches x0, y0, x1, y1, S, scale, vote along all curves in both images at once."""
-    orders = curve_orders(rows[0:2].detach(), rows[2:4].detach(), sound, CURVES)
-    orders = orders[..., : max(int(sound.sum(1).max()), 1)]  # what is not sound stands last
+    orders = curve_orders(rows[0:2].detach(), rows[2:4].detach(), mask, CURVES)
+    orders = orders[..., : max(int(mask.sum(1).max()), 1)]  # masked slots stand last
     along = rows[:, None].expand(-1, len(orders), -1, -1).gather(3, orders.expand(len(rows), -1, -1, -1))
     sums = _along_curve(along.flatten(1, 2)).reshape(2, *orders.shape)
-    found = sums.new_zeros(*sums.shape[:3], sound.shape[1]).scatter(3, orders.expand(2, -1, -1, -1), sums)
+    found = sums.new_zeros(*sums.shape[:3], mask.shape[1]).scatter(3, orders.expand(2, -1, -1, -1), sums)
     agreement, votes = component_sum(found, 1)
-    return torch.where(sound, agreement / votes.clamp_min(torch.finfo(votes.dtype).tiny), 0)
+    return torch.where(mask, agreement / votes.clamp_min(torch.finfo(votes.dtype).tiny), 0)
 
 
 def frame_map(lafs0: Float[Tensor, "b n 2 3"], lafs1: Float[Tensor, "b n 2 3"]) -> Float[Tensor, "b n 2 2"]:

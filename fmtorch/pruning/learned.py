@@ -86,12 +86,12 @@ class LearnedPruner:
     @torch.no_grad()
     def probability(self, c: Correspondences) -> Float[Tensor, "b n"]:
         """P(inlier) of each match, in the type of x0; zero where masked."""
-        sound = c.mask & torch.isfinite(c.x0).all(-1) & torch.isfinite(c.x1).all(-1)
+        mask = c.mask & torch.isfinite(c.x0).all(-1) & torch.isfinite(c.x1).all(-1)
         p = torch.zeros_like(c.x0[..., 0])
-        counts = sound.sum(1).tolist()
+        counts = mask.sum(1).tolist()
         for i, count in enumerate(counts):
             if count:
-                p[i, sound[i]] = self._alone(c[i].keep(sound[i : i + 1]).compact())
+                p[i, mask[i]] = self._alone(c[i].keep(mask[i : i + 1]).compact())
         return p
 
     def _alone(self, c: Correspondences) -> Float[Tensor, " n"]:

@@ -16,6 +16,8 @@ from fmtorch.pruning.calibration import calibration_of
 from fmtorch.pruning.knn import nearest_points
 from fmtorch.types import Correspondences
 
+Pass = tuple[float, int, float]  # threshold lambda, neighbours K, tau
+
 
 def lpm(
     x0: Float[Tensor, "b n 2"],
@@ -37,11 +39,12 @@ def lpm(
     Points in any common unit. Non-finite points are dropped. Memory is linear in the number of matches. Raises
     ValueError for K below 4, and for options of different lengths.
     """
+    passes = _passes(thresholds, neighbors, taus)
     if kernels_serve(x0.detach(), x1.detach()):
-        return _compiled(x0, x1, mask, thresholds, neighbors, taus)[:, 0] > 0
+        return _compiled(x0, x1, mask, passes)[:, 0] > 0
     kept = torch.zeros(x0.shape[:2], dtype=torch.bool, device=x0.device)
-    for pair, match, passes in _passes(x0, x1, mask, thresholds, neighbors, taus):
-        kept[pair, match] = passes[-1] <= thresholds[len(passes) - 1]
+    for pair, match, costs in _costs(x0, x1, mask, passes):
+        kept[pair, match] = costs[-1] <= thresholds[len(costs) - 1]
     return kept
 
 
@@ -59,57 +62,45 @@ def lpm_cost(
     The first pass sees all matches, the second those that the first kept: together they tell right matches from wrong
     ones better than either does. Arguments as `lpm`.
     """
+    passes = _passes(thresholds, neighbors, taus)
     if kernels_serve(x0.detach(), x1.detach()):
-        return _compiled(x0, x1, mask, thresholds, neighbors, taus)[:, 1].to(x0.dtype)
+        return _compiled(x0, x1, mask, passes)[:, 1].to(x0.dtype)
     cost = torch.ones(x0.shape[:2], dtype=torch.float64, device=x0.device)
-    for pair, match, passes in _passes(x0, x1, mask, thresholds, neighbors, taus):
-        cost[pair, match] = sum(passes[1:], passes[0]) / len(passes)
+    for pair, match, costs in _costs(x0, x1, mask, passes):
+        cost[pair, match] = sum(costs[1:], costs[0]) / len(costs)
     return cost.to(x0.dtype)
 
 
-def _compiled(
-    x0: Tensor,
-    x1: Tensor,
-    mask: Tensor | None,
-    thresholds: Sequence[float],
-    neighbors: Sequence[int],
-    taus: Sequence[float],
-) -> Float[Tensor, "b 2 n"]:
+def _compiled(x0: Tensor, x1: Tensor, mask: Tensor | None, passes: Sequence[Pass]) -> Float[Tensor, "b 2 n"]:
     """Of each match 1 if it is kept, and its cost, by the kernel."""
-    _expect_passes(thresholds, neighbors, taus)
     mask = torch.ones_like(x0[..., 0], dtype=torch.bool) if mask is None else mask
-    rows = zip(thresholds, neighbors, taus, strict=True)
-    options = [np.array(row, kind) for row, kind in zip(zip(*rows, strict=True), "dld", strict=True)]
+    options = [np.array(row, kind) for row, kind in zip(zip(*passes, strict=True), "dld", strict=True)]
     out = torch.empty(len(x0), 2, x0.shape[1], dtype=torch.float64)
     return for_each_pair(compiled.lpm, (x0, x1, mask), *options, out=out, kind=torch.float64)
 
 
-def _expect_passes(thresholds: Sequence[float], neighbors: Sequence[int], taus: Sequence[float]) -> None:
-    passes = {"thresholds": len(thresholds), "neighbors": len(neighbors), "taus": len(taus)}
-    if len(set(passes.values())) > 1 or not thresholds:
-        said = ", ".join(f"{name} has {count}" for name, count in passes.items())
+def _passes(thresholds: Sequence[float], neighbors: Sequence[int], taus: Sequence[float]) -> list[Pass]:
+    """The options by pass; raises ValueError where they do not belong together."""
+    counts = {"thresholds": len(thresholds), "neighbors": len(neighbors), "taus": len(taus)}
+    if len(set(counts.values())) > 1 or not thresholds:
+        said = ", ".join(f"{name} has {count}" for name, count in counts.items())
         raise ValueError(f"{said} values; they must have one for each pass, and there must be a pass")
     if min(neighbors) < 4:
         raise ValueError(f"neighbors is {neighbors}; each must be at least 4, so that the smallest neighbourhood has 2")
+    return list(zip(thresholds, neighbors, taus, strict=True))
 
 
-def _passes(
-    x0: Tensor,
-    x1: Tensor,
-    mask: Tensor | None,
-    thresholds: Sequence[float],
-    neighbors: Sequence[int],
-    taus: Sequence[float],
+def _costs(
+    x0: Tensor, x1: Tensor, mask: Tensor | None, passes: Sequence[Pass]
 ) -> Iterator[tuple[int, Int[Tensor, " n"], list[Float[Tensor, " n"]]]]:
     """Of each pair its live matches and, for every pass that there was, the mean cost of each of them."""
-    _expect_passes(thresholds, neighbors, taus)
-    alive = torch.isfinite(x0).all(-1) & torch.isfinite(x1).all(-1)
-    alive = alive if mask is None else alive & mask
-    for pair, here in enumerate(alive):
+    finite = torch.isfinite(x0).all(-1) & torch.isfinite(x1).all(-1)
+    mask = finite if mask is None else finite & mask
+    for pair, here in enumerate(mask):
         points = torch.stack([x0[pair][here], x1[pair][here]]).double()
         members = torch.arange(points.shape[1], device=points.device)
         costs: list[Tensor] = []
-        for threshold, K, tau in zip(thresholds, neighbors, taus, strict=True):
+        for threshold, K, tau in passes:
             if not costs or len(members) >= K + 4:
                 costs.append(_cost(points, members, K, tau) / 3)
                 members = (costs[-1] <= threshold).nonzero()[:, 0]

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from fmtorch.pair_arrays import for_each_pair, kernels_serve
 from fmtorch.pruning import match_noise_kernels as compiled
-from fmtorch.types import Correspondences, ungraphed
+from fmtorch.records import ungraphed
+from fmtorch.types import Correspondences
 
 LEAST_AREA = 1e-12  # square pixels: keeps the gradient of the scale finite
 LEAST_PRIOR = 0.02  # matches less likely than that are not taken for noisier
@@ -73,13 +74,13 @@ class MatchNoise:
         return ungraphed(c, lambda: self._with_noise(c, lafs0, lafs1))
 
     def _with_noise(self, c: Correspondences, lafs0: Tensor, lafs1: Tensor) -> Correspondences:
-        sound = c.mask & torch.isfinite(lafs0).flatten(2).all(2) & torch.isfinite(lafs1).flatten(2).all(2)
+        mask = c.mask & torch.isfinite(lafs0).flatten(2).all(2) & torch.isfinite(lafs1).flatten(2).all(2)
         for known in (c.quality, c.prior):
-            sound = sound if known is None else sound & torch.isfinite(known)
-        inside = sound[..., None, None]
-        quality, prior = (None if known is None else torch.where(sound, known, 1) for known in (c.quality, c.prior))
+            mask = mask if known is None else mask & torch.isfinite(known)
+        inside = mask[..., None, None]
+        quality, prior = (None if known is None else torch.where(mask, known, 1) for known in (c.quality, c.prior))
         noise = match_noise(
             torch.where(inside, lafs0, 0), torch.where(inside, lafs1, 0), quality, prior,
             usual=self.usual, radius=self.radius, slope=self.slope,
         )  # fmt: skip
-        return c.replace(noise=torch.where(sound, noise, 1))
+        return c.replace(noise=torch.where(mask, noise, 1))

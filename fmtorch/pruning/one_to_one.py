@@ -30,23 +30,22 @@ def one_to_one(
         tensors = (x0, x1, quality, torch.ones_like(x0[..., 0], dtype=torch.bool) if mask is None else mask)
         out = torch.empty(x0.shape[:2], dtype=torch.bool)
         return for_each_pair(compiled.one_to_one, tensors, out=out, kind=torch.float64)
-    usable = torch.isfinite(x0).all(-1) & torch.isfinite(x1).all(-1)
-    if mask is not None:
-        usable = usable & mask
-    rank = torch.where(usable & ~quality.isnan(), quality, torch.inf)
-    return usable & _best_at_location(x0, rank, usable) & _best_at_location(x1, rank, usable)
+    finite = torch.isfinite(x0).all(-1) & torch.isfinite(x1).all(-1)
+    mask = finite if mask is None else finite & mask
+    rank = torch.where(mask & ~quality.isnan(), quality, torch.inf)
+    return mask & _best_at_location(x0, rank, mask) & _best_at_location(x1, rank, mask)
 
 
-def _best_at_location(x: Tensor, rank: Tensor, usable: Tensor) -> Tensor:
+def _best_at_location(x: Tensor, rank: Tensor, mask: Tensor) -> Tensor:
     """True for the first match of every location, in the lexicographic order of (x, y, rank, index)."""
-    x = torch.where(usable[..., None], x, torch.inf)
+    x = torch.where(mask[..., None], x, torch.inf)
     order = torch.argsort(rank, dim=-1, stable=True)
     for column in (x[..., 1], x[..., 0]):
         order = order.gather(-1, torch.argsort(column.gather(-1, order), dim=-1, stable=True))
     location = x.gather(1, order[..., None].expand(-1, -1, 2))
-    first = torch.ones_like(usable)
+    first = torch.ones_like(mask)
     first[:, 1:] = (location[:, 1:] != location[:, :-1]).any(-1)
-    return torch.zeros_like(usable).scatter(-1, order, first)
+    return torch.zeros_like(mask).scatter(-1, order, first)
 
 
 @dataclasses.dataclass(frozen=True)

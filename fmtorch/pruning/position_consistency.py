@@ -33,7 +33,8 @@ from fmtorch.pruning.frame_consistency import (
     WORST_RATIO,
     tiled,
 )
-from fmtorch.types import Correspondences, ungraphed
+from fmtorch.records import ungraphed
+from fmtorch.types import Correspondences
 
 TURNS = 16  # hypotheses of the common turn
 SCALES = tuple(2.0 ** (k / 2) for k in range(-4, 5))  # hypotheses of the common change of scale
@@ -80,22 +81,22 @@ def position_agreement(
         return for_each_pair(compiled.position_agreement, (x0, x1, quality, mask), *constants, out=out).to(x0.dtype)
     vote = torch.ones_like(x0[..., 0]) if quality is None else (WORST_RATIO - quality).clamp_min(LEAST_VOTE)
     rows = torch.stack([*x0.unbind(-1), *x1.unbind(-1), vote])
-    sound = mask & (rows.abs() < _FARTHEST).all(0)
-    rows = torch.where(sound, rows, 0)
-    return tiled(_agreement, rows, sound)
+    mask = mask & (rows.abs() < _FARTHEST).all(0)
+    rows = torch.where(mask, rows, 0)
+    return tiled(_agreement, rows, mask)
 
 
-def _agreement(rows: Float[Tensor, "5 b n"], sound: Bool[Tensor, "b n"]) -> Float[Tensor, "b n"]:
+def _agreement(rows: Float[Tensor, "5 b n"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b n"]:
     """The agreement of matches x0, y0, x1, y1, vote along all curves in both images at once."""
-    orders = curve_orders(rows[0:2].detach(), rows[2:4].detach(), sound, CURVES)
-    orders = orders[..., : max(int(sound.sum(1).max()), 1)]  # what is not sound stands last
+    orders = curve_orders(rows[0:2].detach(), rows[2:4].detach(), mask, CURVES)
+    orders = orders[..., : max(int(mask.sum(1).max()), 1)]  # masked slots stand last
     along = rows[:, None].expand(-1, len(orders), -1, -1).gather(3, orders.expand(len(rows), -1, -1, -1))
-    S = common_similarity(along[:, 0].detach(), along[:, len(CURVES)].detach(), sound.sum(1))
+    S = common_similarity(along[:, 0].detach(), along[:, len(CURVES)].detach(), mask.sum(1))
     S = Similarity(*(value.repeat(len(orders), 1) for value in S))
     sums = torch.stack(_along_curve(along.flatten(1, 2), S)).reshape(2, *orders.shape)
-    found = sums.new_zeros(*sums.shape[:3], sound.shape[1]).scatter(3, orders.expand(2, -1, -1, -1), sums)
+    found = sums.new_zeros(*sums.shape[:3], mask.shape[1]).scatter(3, orders.expand(2, -1, -1, -1), sums)
     agreement, votes = component_sum(found, 1)
-    return torch.where(sound, agreement / votes.clamp_min(torch.finfo(votes.dtype).tiny), 0)
+    return torch.where(mask, agreement / votes.clamp_min(torch.finfo(votes.dtype).tiny), 0)
 
 
 def common_similarity(

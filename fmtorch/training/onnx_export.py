@@ -6,12 +6,14 @@ import copy
 import tempfile
 from pathlib import Path
 
+import onnx
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from fmtorch.features.onnx_network import PatchNetwork
+from fmtorch.training.onnx_origin import forget_origin
 
 ATOL = 1e-4  # of torch against ONNX
 OPSET = 18
@@ -42,6 +44,7 @@ def export(network: nn.Module, path: Path) -> None:
     )  # fmt: skip
     assert program is not None
     program.save(str(unfinished))
+    _without_origin(unfinished)
     check(network, unfinished, example)
     unfinished.replace(path)
 
@@ -82,4 +85,12 @@ def quantize(source: Path, path: Path, patches: Float[Tensor, "n 1 32 32"]) -> N
             activation_type=QuantType.QUInt8, weight_type=QuantType.QInt8, op_types_to_quantize=["Conv", "Relu"],
             calibrate_method=CalibrationMethod.MinMax,
         )  # fmt: skip
+    _without_origin(unfinished)
     unfinished.replace(path)
+
+
+def _without_origin(path: Path) -> None:
+    """Write a file anew without the exporter's notes of source lines."""
+    model = onnx.load(path)
+    forget_origin(model)
+    onnx.save(model, path)

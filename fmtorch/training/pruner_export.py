@@ -8,7 +8,6 @@ import logging
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -19,6 +18,7 @@ from fmtorch.pruning.networks.files import INPUT, OUTPUT, LearnedFile, OnnxBackb
 from fmtorch.pruning.networks.layers import Slots
 from fmtorch.pruning.networks.prediction import Exportable
 from fmtorch.storage.files import replacing
+from fmtorch.training.onnx_origin import forget_origin
 
 ATOL = 1e-4  # of torch against ONNX, in log-odds
 OPSET = 18
@@ -68,20 +68,12 @@ def export_onnx(
         )  # fmt: skip
     assert program is not None
     model = program.model_proto
-    _forget_origin(model.graph)
+    forget_origin(model)
     onnx.helper.set_model_props(model, _metadata(network, temperature, notes))
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as unfinished:
         onnx.save(model, unfinished)
         _check(network, alone, unfinished, torch.rand(1, network.input_channels, 3 * EXAMPLE_MATCHES))
-
-
-def _forget_origin(graph: Any) -> None:
-    """Drop what the exporter notes of the source lines that each node comes from: half of a small file, and paths."""
-    for part in (*graph.node, *graph.value_info, *graph.input, *graph.output, *graph.initializer):
-        part.ClearField("metadata_props")
-        part.ClearField("doc_string")
-    graph.ClearField("metadata_props")
 
 
 @contextlib.contextmanager

@@ -17,7 +17,8 @@ import pytest
 from fmtorch.data.rendered import Plan, RenderedPairs
 from fmtorch.data.rendered import generate as generation
 from fmtorch.data.rendered.cameras import fundamental
-from fmtorch.data.rendered.generate import FAMILIES, PLANS, Keypoints, Task, build, generate, keypoints, read, seeds
+from fmtorch.data.rendered.generate import FAMILIES, PLANS, Task, build, generate, read, seeds
+from fmtorch.data.rendered.matchable import Keypoints, keypoints, matchable, recorded_pairs
 from fmtorch.data.rendered.photographs import MATERIALS, PICTURES
 from fmtorch.data.rendered.scene import Scene
 
@@ -191,7 +192,7 @@ def test_pairs_obey_the_rule_and_images_have_keypoints(tmp_path: Path) -> None:
     found = [keypoints(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path, _ in views]
     assert min(len(points) for points, _ in found) > 200
     for i, j in pairs:
-        assert generation.matchable(found[i], found[j], fundamental(views[i][1], views[j][1]))
+        assert matchable(found[i], found[j], fundamental(views[i][1], views[j][1]))
 
 
 def rule(wanted: set[tuple[int, int]]) -> Callable[[Keypoints, Keypoints, object], bool]:
@@ -261,7 +262,7 @@ def test_scene_file_holds_the_cameras_exactly(tiny: RenderedPairs) -> None:
 
 def test_recorded_pairs_are_those_of_the_rule(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     task = Task("indoor", "test", 0, 0, PLANS["small", "test"])
-    if generation.digest(task.family, task.split, task.seed, task.plan) not in generation.recorded_pairs():
+    if generation.digest(task.family, task.split, task.seed, task.plan) not in recorded_pairs():
         pytest.skip("pairs are recorded for another release of OpenCV")
     recorded = generate(task, tmp_path / "recorded")
     monkeypatch.setattr(generation, "recorded_pairs", dict)
@@ -276,7 +277,7 @@ def test_the_record_is_of_plans_that_there_are() -> None:
     plans = {
         generation.digest(family, split, 0, plan): plan for (_, split), plan in PLANS.items() for family in FAMILIES
     }
-    for name, scenes in generation.recorded_pairs().items():
+    for name, scenes in recorded_pairs().items():
         if name in plans:
             assert len(scenes) == plans[name].scenes
             for scene in scenes.values():

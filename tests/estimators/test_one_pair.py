@@ -14,9 +14,10 @@ from fmtorch.estimators import HypothesizeAndVerify, final_fits, inliers, sampli
 from fmtorch.estimators.models import Models as TensorModels
 from fmtorch.estimators.one_pair import inliers as compiled_inliers
 from fmtorch.estimators.one_pair import sampling as compiled_sampling
-from fmtorch.estimators.one_pair.models import Models, Selection
+from fmtorch.estimators.one_pair.models import Models
 from fmtorch.estimators.one_pair.pair import OnePair, each_pair
 from fmtorch.estimators.one_pair.pool import Verifier, shuffled
+from fmtorch.estimators.one_pair.selection import Selection
 from fmtorch.estimators.options import Preselect
 from fmtorch.estimators.pairs import NormalizedPairs, normalized_pairs
 from fmtorch.estimators.pool import Verifier as TensorVerifier
@@ -258,10 +259,14 @@ def test_which_wholes_have_a_kernel_form() -> None:
         pass
 
     assert HypothesizeAndVerify().kernel_form is not None
-    assert HypothesizeAndVerify(sampler="prosac", score="magsac", final="none").kernel_form is not None
     for options in (
-        {"score": Own(1.0)}, {"score": "saturated"}, {"final": "gauss_newton"}, {"degeneracy": "degensac"},
-        {"refine": {"kernel": "truncated"}}, {"local_optimization": "graph_cut"}, {"select": {}},
+        {"sampler": "prosac", "score": "magsac", "final": "none"}, {"select": {}, "focal": {}, "final": "adaptive"},
+        {"refine": {"kernel": "truncated"}}, {"score": "saturated"},
+    ):  # fmt: skip
+        assert HypothesizeAndVerify(**options).kernel_form is not None, options
+    for options in (
+        {"score": Own(1.0)}, {"final": "gauss_newton"}, {"degeneracy": "degensac"},
+        {"local_optimization": "graph_cut"}, {"select": {"score": Own(1.0)}},
     ):  # fmt: skip
         assert HypothesizeAndVerify(**options).kernel_form is None, options
 

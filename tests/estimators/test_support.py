@@ -16,6 +16,7 @@ from fmtorch.estimators.focal import posterior
 from fmtorch.estimators.graph_cut import GraphCut
 from fmtorch.estimators.peers import PEERS
 from fmtorch.estimators.support import lack_of_support
+from fmtorch.presets.objects import merged
 from fmtorch.types import Correspondences, Estimate, collate
 from tests.laws import OTHER_LIBRARIES, few, quick, scene, small
 
@@ -99,7 +100,7 @@ def test_coordinates_sizes_and_thresholds_scaled_together_give_the_same_inliers(
     for scale in (1.0, 1e-9, 1e-3, 1e3, 1e9):
         for (owner, constant), value in pixels.items():
             monkeypatch.setattr(owner, constant, value * scale)
-        built = presets.build("estimator", name, **presets._merged(options, scaled(preset, scale)))
+        built = presets.build("estimator", name, **merged(options, scaled(preset, scale)))
         sizes = {"size0": c.size0 * scale, "size1": c.size1 * scale}
         estimate = built(c.replace(x0=c.x0 * scale, x1=c.x1 * scale, **sizes), 3)
         assert bool(estimate.ok.all()) or name == "irls_huber", estimate.reason  # outliers carry that loss away

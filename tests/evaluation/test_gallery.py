@@ -17,6 +17,7 @@ from fmtorch.data import DataError
 from fmtorch.evaluation import gallery as module
 from fmtorch.evaluation.gallery import Options, Run, find_dataset, gallery
 from fmtorch.evaluation.page import Section, ShownPair, render
+from fmtorch.presets.composition import compose
 from fmtorch.storage import PairRow, RunFolder, to_table
 from tests.test_pipeline import draw
 
@@ -94,7 +95,7 @@ def test_own_methods_keep_their_pictures_and_run_only_where_that_is_asked_for(
     )
     monkeypatch.syspath_prepend(tmp_path)
     root = distribution(tmp_path)
-    stages = presets.stages(presets._compose("match", ("pipeline=sift_ratio", "cache=off")))
+    stages = presets.stages(compose("match", ("pipeline=sift_ratio", "cache=off")))
     stages["estimator"] = {"_target_": "own_estimator_of_a_test.Mine", "threshold": 1}
     config = {"pipeline": "sift_ratio", **stages, "seed": 0, "dataset": {"name": "fmbench", "split": "test"}}
     mine = run("mine", config, rows(root))

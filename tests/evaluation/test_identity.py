@@ -13,6 +13,7 @@ from fmtorch import presets
 from fmtorch.evaluation import identity as identity_module
 from fmtorch.evaluation.identity import run_identity
 from fmtorch.pipeline import Pipeline
+from fmtorch.presets.composition import compose
 from fmtorch.stages import Pruner
 from fmtorch.storage import identity_digest
 from fmtorch.storage.configuration import libraries
@@ -52,7 +53,7 @@ class Described:
 
 
 def identity(*overrides: str, pipeline: Pipeline | None = None, **own: dict[str, object]) -> dict[str, object]:
-    composed = presets._compose("eval", ("pipeline=sift_ratio", "cache=off", *overrides))
+    composed = compose("eval", ("pipeline=sift_ratio", "cache=off", *overrides))
     config = OmegaConf.create({**{name: composed[name] for name in composed}, **own})
     return run_identity(config, "sift_ratio", pipeline or presets.build_pipeline(config), "abc")
 

@@ -7,19 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fmtorch.evaluation.pictures import (
-    BAD,
-    COLOURS,
-    GOOD,
-    HEIGHT,
-    WIDTH,
-    _Place,
-    draw_epipolar_lines,
-    draw_epipolar_lines_of_corners,
-    draw_matches,
-    spread,
-    thinned,
-)
+from fmtorch.evaluation.canvas import BAD, GOOD, HEIGHT, WIDTH, Place
+from fmtorch.evaluation.pictures import COLOURS, draw_epipolar_lines, draw_epipolar_lines_of_corners, draw_matches
+from fmtorch.evaluation.sparse import spread, thinned
 
 ROWS = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # a sideways camera: epipolar lines are rows
 NONE = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, bool)
@@ -139,7 +129,7 @@ finite = st.floats(-100, 100)
 
 @given(finite, finite, st.floats(-5000, 5000), st.integers(1, 60), st.integers(1, 60))
 def test_lines_end_at_the_border(a: float, b: float, c: float, h: int, w: int) -> None:
-    place = _Place((h, w), (0, 0), (w, h))  # drawn as large as the image is
+    place = Place((h, w), (0, 0), (w, h))  # drawn as large as the image is
     ends = place.clip(np.array([a, b, c]))
     norm = float(np.hypot(a, b))
     if norm < 1e-3:  # its distance from the image is beyond float64
@@ -157,7 +147,7 @@ def test_lines_end_at_the_border(a: float, b: float, c: float, h: int, w: int) -
 
 
 def test_a_line_that_is_none_is_not_drawn() -> None:
-    place = _Place((10, 10), (0, 0), (10, 10))
+    place = Place((10, 10), (0, 0), (10, 10))
     for line in ([0.0, 0, 1], [np.nan, 1, 0], [np.inf, 1, 0]):
         assert place.clip(np.array(line)).shape == (0, 2)
 

@@ -35,7 +35,7 @@ def depths(pair: NormalizedPairs, centred: CentredPairs) -> np.ndarray:
     numbers = np.array([mean, deviation, prior.RATIO_DEVIATION / 2, prior.SAME_CAMERA_SHARE], np.float64)
     out, seed = np.empty((2, SAMPLES)), mixed_seed(SEED, Stream.FOCAL)
     same, longest = bool(centred.same_size[0]), centred.longest[:, 0].contiguous().numpy()
-    draw_depths(prior._NORMAL.numpy(), numbers, same, longest, seed, int(pair.key[0]), START, out)
+    draw_depths(prior.NORMAL.numpy(), numbers, same, longest, seed, int(pair.key[0]), START, out)
     return out
 
 

@@ -11,11 +11,10 @@ from fmtorch.geometry.refine import DAMPING, refine_components
 from fmtorch.geometry.robust_kernels import KERNELS
 from fmtorch.geometry.sampson_objective import SampsonObjective
 from fmtorch.geometry.sampson_objective_kernels import LOSSES, evaluate
-from fmtorch.geometry.sigma_consensus import _INTEGRAL, _WEIGHT
+from fmtorch.geometry.sigma_consensus import LOSS_TABLE
 
 pytest.importorskip("numba", reason="numba is not installed")
 
-TABLE = np.stack([_WEIGHT.numpy(), _INTEGRAL.numpy()])
 SCALE = 0.02
 
 
@@ -41,7 +40,7 @@ def test_costs_and_normal_equations(loss: str, n: int) -> None:
     expected, expected_cost = SampsonObjective(tensors[1], tensors[2], KERNELS[loss], tensors[3])(tensors[0], True)
     for derivatives in (True, False):
         products, cost = np.zeros((5, 10, 10)), np.empty(5)
-        evaluate(F, points, weight, s2, LOSSES[loss], TABLE, derivatives, products, cost)
+        evaluate(F, points, weight, s2, LOSSES[loss], LOSS_TABLE, derivatives, products, cost)
         np.testing.assert_allclose(cost, expected_cost[0].numpy(), rtol=1e-11)
         if derivatives:
             normal = expected[:, :, 0].permute(2, 0, 1).numpy()
@@ -60,11 +59,11 @@ def refined(
         [np.empty((k, 9)), np.empty((k, 3)), np.empty((k, 3)), np.zeros((k, 10, 10)), np.empty(k)] for _ in range(2)
     )
     start(F, 5, *state[:3])
-    evaluate(state[0], points, weight, s2, LOSSES[loss], TABLE, True, *state[3:])
+    evaluate(state[0], points, weight, s2, LOSSES[loss], LOSS_TABLE, True, *state[3:])
     damping, done = np.full(k, DAMPING.first), np.zeros(k, bool)
     for _ in range(iterations):
         step(state[3], *state[:3], damping, *trial[:3])
-        evaluate(trial[0], points, weight, s2, LOSSES[loss], TABLE, True, *trial[3:])
+        evaluate(trial[0], points, weight, s2, LOSSES[loss], LOSS_TABLE, True, *trial[3:])
         if accept(*state, *trial, damping, done, tolerance):
             break
     return state[0], state[4]

@@ -1,4 +1,4 @@
-"""Exact pinhole cameras, and what two of them say about an image pair."""
+"""Exact pinhole cameras with the size of their images."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.data.cameras import fundamental, relative_pose
 from fmtorch.data.rendered.mipmap import Real
+
+__all__ = ["Camera", "Matrix", "calibration", "fundamental", "look_at", "relative_pose"]
 
 Matrix = NDArray[np.float64]
 
@@ -61,17 +64,3 @@ def look_at(
     cos, sin = np.cos(roll), np.sin(roll)
     R = np.stack([cos * right + sin * down, cos * down - sin * right, forward])
     return Camera(K, R, -R @ c, size)
-
-
-def relative_pose(camera0: Camera, camera1: Camera) -> tuple[Matrix, Matrix]:
-    """R and t of ``X1 = R X0 + t``, with X0 and X1 in the two cameras' coordinates."""
-    R = camera1.R @ camera0.R.T
-    return R, camera1.t - R @ camera0.t
-
-
-def fundamental(camera0: Camera, camera1: Camera) -> Matrix:
-    """F with ``x1^T F x0 = 0`` and unit Frobenius norm: ``K1^-T [t]x R K0^-1`` (Hartley and Zisserman, eq. 9.12)."""
-    R, t = relative_pose(camera0, camera1)
-    cross = np.array([[0.0, -t[2], t[1]], [t[2], 0.0, -t[0]], [-t[1], t[0], 0.0]])
-    F: Matrix = np.linalg.inv(camera1.K).T @ cross @ R @ np.linalg.inv(camera0.K)
-    return F / np.linalg.norm(F)

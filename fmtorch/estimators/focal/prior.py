@@ -23,7 +23,7 @@ SAME_CAMERA_DEVIATION = 0.01  # width of the well for images of equal size
 SAME_CAMERA_GAIN = 5.0  # its depth, in logarithms of the likelihood
 SAME_CAMERA_SHARE = 0.7  # of the draws for images of equal size that have one focal length for both
 _BITS = 10
-_NORMAL = torch.special.ndtri((torch.arange(1 << _BITS, dtype=torch.float64) + 0.5) / (1 << _BITS))
+NORMAL = torch.special.ndtri((torch.arange(1 << _BITS, dtype=torch.float64) + 0.5) / (1 << _BITS))
 
 
 def focal_cost(focal: Float[Tensor, "2 p k"], same_size: Bool[Tensor, " p"]) -> tuple[Tensor, Tensor, Tensor]:
@@ -47,7 +47,7 @@ def draw_focal_lengths(
 ) -> Float[Tensor, "2 p s"]:
     """Log focal lengths of both images for the draws start .. start + count - 1."""
     bits = random.bits(pairs.seed, pairs.key, Stream.FOCAL, start, count, 3) & ((1 << _BITS) - 1)
-    normal = _NORMAL.to(bits.device)
+    normal = NORMAL.to(bits.device)
     mean = math.log(USUAL_FOCAL) + FOCAL_DEVIATION * normal[bits[..., 0]]
     half = RATIO_DEVIATION / 2 * normal[bits[..., 1]]
     equal = same_size[:, None] & (bits[..., 2] < SAME_CAMERA_SHARE * (1 << _BITS))

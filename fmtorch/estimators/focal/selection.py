@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch.estimators.focal.cameras import TwoCameras
 from fmtorch.estimators.focal.posterior import refine_with_prior
+from fmtorch.estimators.models import Pool
 from fmtorch.estimators.pairs import NormalizedPairs
 from fmtorch.estimators.saturated_gains import SaturatedGains
 from fmtorch.estimators.scores import score_models
+from fmtorch.estimators.selection import Selection
 from fmtorch.geometry.arithmetic import component_sum
 
 # Share of the best gain without prior that gain minus prior cost must reach; chosen on castle-P19, fox, crops of them.
@@ -30,9 +33,10 @@ class Candidates:
     posterior: Float[Tensor, "p k"]
     cameras: TwoCameras
 
-    def __getitem__(self, rows: Tensor) -> Candidates:
+    def only(self, rows: Sequence[int]) -> Candidates:
         """Those of the selected pairs."""
-        return Candidates(self.F[:, rows], self.posterior[rows], self.cameras[rows])
+        index = torch.tensor(rows, device=self.posterior.device)
+        return Candidates(self.F[:, index], self.posterior[index], self.cameras[index])
 
     def joined(self, other: Candidates) -> Candidates:
         """The candidates of both."""
@@ -48,6 +52,18 @@ class Candidates:
             return x.gather(-1, first.expand(*x.shape[:-2], -1, -1))[..., 0]
 
         return taken(self.F), TwoCameras(taken(self.cameras.axes), taken(self.cameras.focal)), top[:, 0]
+
+    def selection(self, draws: Int[Tensor, " p"]) -> Selection:
+        """The best candidates, from so many minimal samples."""
+        F, cameras, posterior = self.best()
+        return Selection(F, cameras, torch.isfinite(posterior), draws)
+
+    def decided(self, pairs: NormalizedPairs) -> list[bool]:
+        """Whether these candidates may suffice: for images of one size, or where all good ones are one model."""
+        assert pairs.size0 is not None
+        assert pairs.size1 is not None
+        decided: list[bool] = ((pairs.size0 == pairs.size1).all(-1) | self.unambiguous()).tolist()
+        return decided
 
     def unambiguous(self) -> Bool[Tensor, " p"]:
         """Whether all good candidates are one and the same model."""
@@ -75,6 +91,12 @@ class FocalSelection:
         models, cost, front, cameras = refine_with_prior(F, near, self.iterations)
         posterior = score_models(self.gain, models, pairs) * front - cost
         return Candidates(models, torch.where(valid, posterior.nan_to_num(nan=-torch.inf), -torch.inf), cameras)
+
+    def select(self, pool: Pool, pairs: NormalizedPairs, others: Candidates | None) -> Selection:
+        """The selection of a refined pool, or of other candidates."""
+        assert pool.near is not None
+        F, cameras = self(pool.models, pool.valid, pairs, pool.near, others)
+        return Selection(F, cameras, pool.valid.any(1), pool.draws)
 
     def __call__(
         self,

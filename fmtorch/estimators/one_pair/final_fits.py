@@ -2,14 +2,34 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from fmtorch.estimators import final_fits
-from fmtorch.estimators.one_pair.models import Selection
+from fmtorch.estimators.final_fits import (
+    DAMPING,
+    DEFAULT_TRUNCATION_PX,
+    FOCAL_ITERATIONS,
+    FOCAL_TOLERANCE,
+    ITERATIONS,
+    MAX_TRUNCATION_PX,
+    MIN_INLIERS_FOR_NOISE,
+    MIN_PRIOR_FOR_NOISE,
+    MIN_TRUNCATION_PX,
+    PRIOR_CONFLICT_GAIN,
+    TOLERANCE,
+    TRUNCATION_SIGMAS,
+)
+from fmtorch.estimators.one_pair.focal.cameras import TwoCameras
+from fmtorch.estimators.one_pair.focal.fit import fit_focal
+from fmtorch.estimators.one_pair.inliers import median_of_matches, residuals_squared_px
 from fmtorch.estimators.one_pair.pair import Array, OnePair
+from fmtorch.estimators.one_pair.refine import refine_models
+from fmtorch.estimators.one_pair.selection import Selection
 from fmtorch.geometry.eight_point_kernels import weighted_eight_point
+from fmtorch.geometry.refine import RANK_TWO_ALREADY
 
 
 class Fit(NamedTuple):
@@ -18,6 +38,8 @@ class Fit(NamedTuple):
     F: Array
     at: Array
     counted: Array
+    cameras: TwoCameras | None = None
+    truncation: float | None = None
 
 
 @runtime_checkable
@@ -53,3 +75,45 @@ class LeastSquares:
         F = np.empty(9)
         fitted = weighted_eight_point(pair.points, weight, F)
         return Fit(F.reshape(3, 3) if fitted else selection.matrices, selection.matrices, inliers)
+
+
+class AdaptiveGaussNewton:
+    """As `final_fits.AdaptiveGaussNewton`."""
+
+    def __init__(self, part: final_fits.AdaptiveGaussNewton) -> None:
+        pass
+
+    def value(self, selection: Selection, pair: OnePair, inliers: Array) -> Fit:
+        """As `FinalFit.value`."""
+        F, cameras = selection.F, TwoCameras.none()
+        likely = inliers if pair.prior is None else inliers & (pair.prior > MIN_PRIOR_FOR_NOISE)
+        truncation = truncation_distance(_squared_in_noises(F, pair)[likely])
+        assumed = False
+        if selection.cameras.known:
+            own = fit_focal(
+                selection.cameras, pair, truncation, truncation / TRUNCATION_SIGMAS, FOCAL_ITERATIONS, FOCAL_TOLERANCE
+            )
+            assumed = own.gain <= PRIOR_CONFLICT_GAIN and bool(np.isfinite(own.F).all())
+            if assumed:
+                F, cameras = own.F, own.cameras
+        if not assumed:
+            (F,) = refine_models(
+                F[None], pair, "truncated", truncation, ITERATIONS, RANK_TWO_ALREADY, TOLERANCE, DAMPING
+            )
+        counted = _squared_in_noises(F, pair) <= truncation**2
+        matrix = F.reshape(3, 3)
+        return Fit(matrix, matrix, counted, cameras, truncation)
+
+
+def _squared_in_noises(F: Array, pair: OnePair) -> Array:
+    """Squared Sampson distances (n,) in squared pixels, of matches of usual noise."""
+    r2 = residuals_squared_px(F, pair)
+    return r2 if pair.noise is None else r2 / np.square(pair.noise)
+
+
+def truncation_distance(r2: Array) -> float:
+    """As `final_fits.truncation_distance`, of the inliers' squared distances."""
+    if len(r2) < MIN_INLIERS_FOR_NOISE:
+        return DEFAULT_TRUNCATION_PX
+    truncation = TRUNCATION_SIGMAS * 1.4826 * math.sqrt(median_of_matches(r2))
+    return min(max(truncation, MIN_TRUNCATION_PX), MAX_TRUNCATION_PX)

@@ -28,7 +28,8 @@ class Models:
 class Pool:
     """The best models of a pair, F (k, 9) float32 with descending scores (k,), of which `filled` are there.
 
-    draw: (k,), that each model is made of. draws: minimal samples drawn.
+    draw: (k,), that each model is made of. draws: minimal samples drawn. near: the pair with the matches on which these
+    models are refined; then they are float64.
     """
 
     F: Array
@@ -36,11 +37,22 @@ class Pool:
     draw: Array
     filled: int = 0
     draws: int = 0
+    near: OnePair | None = None
 
     @staticmethod
     def of(pair: OnePair, size: int) -> Pool:
         """Nothing found yet."""
         return Pool(np.zeros((size, 9), np.float32), np.full(size, -np.inf), np.zeros(size, np.int64))
+
+    @property
+    def models(self) -> Array:
+        """The models in float64, (m, 9); where there is none one of zeros."""
+        return self.F[: max(self.filled, 1)].astype(np.float64)
+
+    @property
+    def valid(self) -> Array:
+        """Which of `models` are there."""
+        return np.arange(max(self.filled, 1)) < self.filled
 
     def merge(self, rows: Sequence[int], models: Models) -> None:
         """Keep the best of this pool's models and the new ones; the earlier draw wins a tie."""
@@ -57,17 +69,3 @@ class Pool:
     def best(self, rows: Sequence[int]) -> tuple[Array, int]:
         """The best model (9,), zero where there is none, and the samples drawn."""
         return self.F[0], self.draws
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Selection:
-    """The selected model (3, 3), float64; whether there is one, and the samples drawn."""
-
-    matrices: Array
-    found: bool
-    draws: int
-
-
-def first_of_pool(pool: Pool, pair: OnePair) -> Selection:
-    """The best model as the search found it."""
-    return Selection(pool.F[0].astype(np.float64).reshape(3, 3), pool.filled > 0, pool.draws)

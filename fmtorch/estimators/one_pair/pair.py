@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -21,7 +22,8 @@ class OnePair:
     """What `NormalizedPairs` holds of one pair, without mask and padding. Arrays are float64 and C-contiguous.
 
     points: (4, n), rows x0, y0, x1, y1 in normalised units. slots: of the pair's bucket, which decides how priors are
-    quantised and whether there is a first look. quality, prior, noise: (n,), None where the caller has none.
+    quantised and whether there is a first look. quality, prior, noise: (n,), None where the caller has none. centre:
+    (4,), of the points in pixels. sizes: (2, 2) of the images as (h, w), pixels, or None.
     """
 
     points: Array
@@ -32,6 +34,8 @@ class OnePair:
     quality: Array | None
     prior: Array | None
     noise: Array | None
+    centre: Array
+    sizes: Array | None = None
     kept: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -42,6 +46,11 @@ class OnePair:
     def count(self) -> int:
         """Number of matches."""
         return int(self.points.shape[1])
+
+    @property
+    def sizes_known(self) -> bool:
+        """Whether the sizes of the images are known."""
+        return self.sizes is not None
 
     @functools.cached_property
     def points32(self) -> Array:
@@ -85,10 +94,16 @@ def each_pair(pairs: NormalizedPairs) -> Iterator[OnePair]:
     """The pairs of a bucket one by one, copied, on no graph."""
     points = pairs.points.detach().numpy()
     quality, prior, noise = (_array(value) for value in (pairs.quality, pairs.prior, pairs.noise))
+    centre, sizes = pairs.centre.numpy(), None
+    if pairs.size0 is not None and pairs.size1 is not None:
+        sizes = torch.stack([pairs.size0, pairs.size1], 1).to(torch.float64).numpy()
     table = zip(pairs.count.tolist(), pairs.pixels_per_unit.tolist(), pairs.key.tolist(), strict=True)
     for i, (n, unit, key) in enumerate(table):
         q, p, s = (None if value is None else value[i, :n].copy() for value in (quality, prior, noise))
-        yield OnePair(np.ascontiguousarray(points[:, i, :n]), points.shape[2], unit, key, pairs.seed, q, p, s)
+        yield OnePair(
+            np.ascontiguousarray(points[:, i, :n]), points.shape[2], unit, key, pairs.seed, q, p, s, centre[i],
+            None if sizes is None else sizes[i],
+        )  # fmt: skip
 
 
 def _array(value: Tensor | None) -> Array | None:

@@ -20,13 +20,14 @@ class Verifier:
 
     def __init__(self, score: Score, preselect: Preselect | None) -> None:
         self.score, self.preselect = score, preselect
+        self.first_look: Score = getattr(score, "first_look", score)
 
     def __call__(self, models: Models, pair: OnePair) -> Models:
         """As `pool.Verifier`."""
         which = np.arange(len(models.F))
         first_look = self._first_look(pair) if len(which) else None
         if first_look is not None and self.preselect is not None and len(which) > self.preselect.survivors:
-            score, which = self.score(models.F, which, first_look), np.empty(self.preselect.survivors, np.int64)
+            score, which = self.first_look(models.F, which, first_look), np.empty(self.preselect.survivors, np.int64)
             best(score, which)
         return dataclasses.replace(models, which=which, score=self.score(models.F, which, pair))
 
@@ -41,8 +42,12 @@ class Verifier:
         return found
 
 
-def shuffled(pair: OnePair, stream: Stream) -> Array:
-    """The matches, (n,), in an order that the pair's key decides: as `pool.shuffled` of all of them."""
+def shuffled(pair: OnePair, stream: Stream, wanted: Array | None = None) -> Array:
+    """The matches, or those wanted (n,), in an order that the pair's key decides: as `pool.shuffled`."""
     words = np.empty(pair.count, np.int64)
     random_words(mixed_seed(pair.seed, stream), pair.key, 0, words)
-    return np.argsort(words, kind="stable")
+    if wanted is None:
+        return np.argsort(words, kind="stable")
+    (some,) = wanted.nonzero()
+    ordered: Array = some[np.argsort(words[some], kind="stable")]
+    return ordered

@@ -9,7 +9,14 @@ import torch
 
 from fmtorch.estimators import scores
 from fmtorch.estimators.one_pair.pair import Array, OnePair
-from fmtorch.estimators.scores_kernels import COUNT, TABLE, TRUNCATED_SQUARES, score_gains, score_median
+from fmtorch.estimators.scores_kernels import (
+    COUNT,
+    GEMAN_MCCLURE,
+    TABLE,
+    TRUNCATED_SQUARES,
+    score_gains,
+    score_median,
+)
 from fmtorch.geometry.arithmetic import fractional_bits
 
 NO_TABLE = np.empty(0, np.float32)
@@ -24,6 +31,18 @@ class Score(Protocol):
         ...
 
 
+def matches(pair: OnePair, threshold: float, prior_weighted: bool) -> tuple[Array, Array]:
+    """What each match counts (n,), and one over the square of its threshold (n,), float32; made once."""
+
+    def made() -> tuple[Array, Array]:
+        prior = pair.prior if prior_weighted else None
+        support = np.ones(pair.count, np.float32) if prior is None else prior.astype(np.float32)
+        return support, np.square(pair.scale / threshold).astype(np.float32)
+
+    found: tuple[Array, Array] = pair.once(f"support and scale {threshold, prior_weighted}", made)
+    return found
+
+
 class SummedGains:
     """As `scores.SummedGains`."""
 
@@ -35,16 +54,10 @@ class SummedGains:
     def __call__(self, F: Array, which: Array, pair: OnePair) -> Array:
         """As `Score`."""
         out = np.empty(len(which))
-        support, scale = pair.once(f"support and scale of {self.part.threshold} px", lambda: self._matches(pair))
+        support, scale = matches(pair, self.part.threshold, self.part.prior_weighted)
         bits = fractional_bits(pair.count, torch.float32)
         score_gains(F, which, pair.points32, support, scale, self.GAIN, self._table(), bits, out)
         return out
-
-    def _matches(self, pair: OnePair) -> tuple[Array, Array]:
-        """What each match counts (n,), and one over the square of its threshold."""
-        weighted = self.part.prior_weighted and pair.prior is not None
-        support = pair.prior if weighted and pair.prior is not None else np.ones(pair.count)
-        return support.astype(np.float32), np.square(pair.scale / self.part.threshold).astype(np.float32)
 
     def _table(self) -> Array:
         return NO_TABLE
@@ -60,6 +73,12 @@ class TruncatedSquares(SummedGains):
     """As `scores.TruncatedSquares`."""
 
     GAIN = TRUNCATED_SQUARES
+
+
+class GemanMcClure(SummedGains):
+    """As `scores.GemanMcClure`."""
+
+    GAIN = GEMAN_MCCLURE
 
 
 class SigmaConsensus(SummedGains):

@@ -59,11 +59,11 @@ def match_domain(
 def sound_matches(*values: Tensor | None) -> Bool[Tensor, "b n"]:
     """True where every value of a match, (B, N, ...), is finite and no frame (B, N, 2, 3) is degenerate."""
     given = [value for value in values if value is not None]
-    sound = torch.stack([torch.isfinite(v.flatten(2)).all(-1) for v in given]).all(0)
+    mask = torch.stack([torch.isfinite(v.flatten(2)).all(-1) for v in given]).all(0)
     for frame in (v for v in given if v.dim() == 4):
         (a, b), (c, d) = (row.unbind(-1) for row in frame[..., :2].double().unbind(-2))
-        sound = sound & ((a * d - b * c) != 0)
-    return sound
+        mask = mask & ((a * d - b * c) != 0)
+    return mask
 
 
 def _normalized(x: Float[Tensor, "n 2"]) -> tuple[Float[Tensor, "n 2"], Float[Tensor, ""]]:

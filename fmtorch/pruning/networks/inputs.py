@@ -121,12 +121,12 @@ def _frame_map(c: Correspondences) -> Float[Tensor, "b n 2 2"] | None:
     """The linear part of the map from frame 0 to frame 1; the identity's in masked slots and for unusable frames."""
     if c.lafs0 is None or c.lafs1 is None:
         return None
-    sound = c.mask
+    mask = c.mask
     for lafs in (c.lafs0, c.lafs1):
         (a, b), (d, e) = (row.unbind(-1) for row in lafs[..., :2].unbind(-2))
-        sound = sound & torch.isfinite(lafs).flatten(2).all(2) & (a * e - b * d != 0)
+        mask = mask & torch.isfinite(lafs).flatten(2).all(2) & (a * e - b * d != 0)
     unit = torch.eye(2, 3, dtype=c.lafs0.dtype, device=c.lafs0.device)
-    return frame_map(*(torch.where(sound[..., None, None], lafs, unit) for lafs in (c.lafs0, c.lafs1)))
+    return frame_map(*(torch.where(mask[..., None, None], lafs, unit) for lafs in (c.lafs0, c.lafs1)))
 
 
 def _scale(c: Correspondences) -> list[Tensor]:

@@ -16,6 +16,7 @@ from fmtorch.data import ImagePair, PairDataset
 from fmtorch.data.subset import subset
 from fmtorch.evaluation.run import select
 from fmtorch.matched import Augmentation, LabelledMatches, MatchedPairs, StoredMatches
+from fmtorch.matched.stored import last_scenes
 from fmtorch.matched.transforms import keep_ratio
 from fmtorch.pipeline import Pipeline
 from fmtorch.presets import plain
@@ -88,15 +89,10 @@ def _dataset(config: DictConfig, progress: Progress) -> PairDataset:
 def _split(dataset: PairDataset, last: int) -> tuple[list[int], list[int]]:
     """Indices of the pairs to train on, and of those in the last scenes of each family."""
     pairs = [dataset[i] for i in range(len(dataset))]
-    scenes: dict[str, list[str]] = {}
-    for pair in sorted(pairs, key=lambda pair: pair.scene):
-        names = scenes.setdefault(pair.family, [])
-        if pair.scene not in names:
-            names.append(pair.scene)
-    held = {name for names in scenes.values() for name in names[max(1, len(names) - last) :]}
+    held = last_scenes(((pair.family, pair.scene) for pair in pairs), last)
     sides: tuple[list[int], list[int]] = ([], [])
     for i, pair in enumerate(pairs):
-        sides[pair.scene in held].append(i)
+        sides[(pair.family, pair.scene) in held].append(i)
     return sides
 
 

@@ -65,7 +65,7 @@ def latest_checkpoint(folder: Path) -> tuple[Path | None, int]:
     for step, path in sorted(found, reverse=True):
         try:
             torch.load(path, map_location="cpu", weights_only=True)
-        except Exception as error:  # whatever a damaged file raises: an older one may do
+        except Exception as error:  # torch.load raises nearly anything for damaged bytes; an older file may do
             warnings.warn(f"{path} cannot be read and is passed over ({error})", stacklevel=2)
             continue
         return path, step

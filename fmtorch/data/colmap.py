@@ -1,0 +1,107 @@
+"""Scenes reconstructed by COLMAP, such as those of Tanks and Temples (SIGGRAPH 2017) and CPC / 1DSfM (ECCV 2014)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+from fmtorch.data.candidates import MIN_SHARED, AllPairs, Candidates, sharing_points
+from fmtorch.data.colmap_binary import read_binary
+from fmtorch.data.colmap_model import Model
+from fmtorch.data.colmap_text import read_text
+from fmtorch.data.pairs import ImageSource
+from fmtorch.data.scenes import Scene, ScenePairs, View, folders
+from fmtorch.data.splits import chosen
+from fmtorch.data.text_files import DataError
+
+_MODELS = ("sparse/0", "sparse", "dense/sparse", ".")  # below a scene's folder, in the order in which they are tried
+_FILES = ("cameras.bin", "cameras.txt")
+
+
+class ColmapPairs(ScenePairs):
+    """Pairs of the images of COLMAP models, text or binary, one folder a scene.
+
+    root: a folder of scenes, or one scene's folder. split: test (Panther, Playground, Train, Roman_Forum) or train
+    (Family, Francis, Horse, Lighthouse, M60), as in the paper. sequences: names of scenes to take instead. A root that
+    is itself a scene is taken whatever the split.
+    model, images: folders within the scene's; model null: the first of sparse/0, sparse, dense/sparse and the scene's.
+    candidates: all pairs of a scene, or those whose images share at least `shared` points of the reconstruction.
+    pairs, seed: as in `ScenePairs`. family: of the pairs; null: the name of the folder of scenes.
+
+    Images with lens distortion are undistorted when they are read, to a pinhole of the same focal lengths, principal
+    point and size (`fmtorch.data.undistort`). Principal points are lowered by COLMAP's half pixel. An image of another
+    size than its camera's is refused when it is read.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        split: str = "test",
+        sequences: Sequence[str] | None = None,
+        model: str | None = None,
+        images: str = "images",
+        candidates: Literal["all", "points"] = "all",
+        shared: int = MIN_SHARED,
+        pairs: int | None = 1000,
+        seed: int = 0,
+        family: str | None = None,
+    ) -> None:
+        home, found = scene_folders(root, split, sequences, model)
+        scenes, files = [], []
+        for folder in found:
+            reconstruction = read_model(_model_folder(folder, model), points=candidates == "points")
+            scenes.append(_scene(folder, reconstruction, images, candidates, shared, family or home.name))
+            files += [(f"{folder.name}/{path.name}", path) for path in reconstruction.files]
+        super().__init__("colmap", scenes, files, (candidates, shared, family or home.name), pairs, seed)
+
+
+def read_model(folder: Path, points: bool = True) -> Model:
+    """The model in a folder, of binary files where these are there, else of text files.
+
+    points: read which points each image sees. Raises DataError, naming file and line or record, for damaged files.
+    """
+    if (folder / "cameras.bin").is_file():
+        return read_binary(folder, points)
+    if (folder / "cameras.txt").is_file():
+        return read_text(folder, points)
+    raise DataError(f"{folder}: neither cameras.bin nor cameras.txt; it must hold a COLMAP model")
+
+
+def scene_folders(
+    root: str | Path, split: str, sequences: Sequence[str] | None, model: str | None
+) -> tuple[Path, list[Path]]:
+    """The folder of scenes, and the scenes' folders: `root` itself where it is one."""
+    home = Path(root).expanduser().absolute()
+    if sequences is None and any((home / place / file).is_file() for place in _places(model) for file in _FILES):
+        return home.parent, [home]
+    return home, folders(
+        home, chosen("colmap", split, sequences, ()), "a folder for each scene, with sparse/ and images/"
+    )
+
+
+def _places(model: str | None) -> tuple[str, ...]:
+    return _MODELS if model is None else (model,)
+
+
+def _model_folder(folder: Path, model: str | None) -> Path:
+    for place in _places(model):
+        if any((folder / place / file).is_file() for file in _FILES):
+            return folder / place
+    tried = ", ".join(_places(model))
+    raise DataError(f"{folder}: no COLMAP model in {tried}; one of these must hold {' or '.join(_FILES)}")
+
+
+def _scene(
+    folder: Path, model: Model, images: str, candidates: Literal["all", "points"], shared: int, family: str
+) -> Scene:
+    views = []
+    for image in model.images:
+        camera = model.cameras[image.camera]
+        lens = camera.lens if camera.lens.bends else None
+        source = ImageSource(f"{family}/{folder.name}/{image.name}", folder / images / image.name, camera.size, lens)
+        views.append(View(source, camera.lens.K, image.R, image.t, image.place))
+    pairs: Candidates = AllPairs(len(views))
+    if candidates == "points":
+        pairs = sharing_points([image.points for image in model.images], shared)
+    return Scene(folder.name, family, views, pairs)

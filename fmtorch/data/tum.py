@@ -1,0 +1,180 @@
+"""TUM RGB-D (Sturm et al., IROS 2012): hand-held Kinect videos with poses of a motion-capture system."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from fmtorch.data.candidates import WINDOW, following
+from fmtorch.data.depth_images import DepthImages
+from fmtorch.data.lenses import Lens
+from fmtorch.data.pairs import ImageSource
+from fmtorch.data.scenes import Scene, ScenePairs, View, folders
+from fmtorch.data.splits import chosen
+from fmtorch.data.text_files import DataError, numbered, to_finite
+
+SIZE = (480, 640)  # h, w of all images
+CALIBRATIONS = {
+    "freiburg1": Lens(517.3, 516.5, 318.6, 255.3, "FULL_OPENCV", (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "freiburg2": Lens(520.9, 521.0, 325.1, 249.7, "FULL_OPENCV", (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "freiburg3": Lens(535.4, 539.2, 320.1, 247.6),
+}
+"""The colour cameras as the set's page gives them, for OpenCV; the images of freiburg3 are undistorted already."""
+TOLERANCE = 0.02  # s between a frame and the poses around it, or its depth image: that of the set's own tools
+DEPTH_SCALE = 5000.0  # of a depth image, per metre
+
+_LAYOUT = "a sequence holds rgb.txt, groundtruth.txt and rgb/"
+_LISTED = "timestamp filename"
+_POSE = "timestamp tx ty tz qx qy qz qw"
+
+
+class TumPairs(ScenePairs):
+    """Pairs of frames at most a window apart; see `tum_pairs`."""
+
+    def __init__(
+        self, scenes: Sequence[Scene], files: list[tuple[str, Path]], window: float, pairs: int | None, seed: int
+    ) -> None:
+        super().__init__("tum", scenes, files, (window,), pairs, seed)
+
+
+class TumDepthPairs(TumPairs):
+    """The same where each sequence has ``depth.txt``."""
+
+    depth_images: DepthImages
+
+    def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Depth (n,) in metres along the optical axis at points (n, 2) of an undistorted image; NaN where unknown."""
+        return self.depth_images.at(image, points)
+
+
+def tum_pairs(
+    root: str | Path,
+    split: str = "test",
+    sequences: Sequence[str] | None = None,
+    camera: str | None = None,
+    window: float = WINDOW,
+    pairs: int | None = 1000,
+    seed: int = 0,
+    depth: bool = True,
+) -> TumPairs:
+    """Pairs of frames at most `window` seconds apart.
+
+    Args:
+        root: the folder of the sequences' folders.
+        split: test (fr3/teddy, fr3/large_cabinet, fr3/long_office_household) or train (all others there), as the paper.
+        sequences: names of folders to take instead.
+        camera: freiburg1, freiburg2 or freiburg3; None: as the name of each sequence says.
+        pairs, seed: as in `ScenePairs`.
+        depth: know the depth of points, for labels, where every sequence has ``depth.txt``.
+
+    The images of freiburg1 and freiburg2 are undistorted when they are read; those of freiburg3 are so already. The
+    pose of a frame is interpolated between the two around it (linearly, and along the great circle); frames farther
+    than `TOLERANCE` from either are left out. Raises DataError, naming file and line, for files that are missing,
+    damaged or out of order.
+    """
+    home = Path(root).expanduser()
+    there = sorted(f.parent.name for f in home.glob("*/groundtruth.txt") if (f.parent / "rgb.txt").is_file())
+    found = folders(home, chosen("tum", split, sequences, there), "a folder for each sequence")
+    scenes = [_scene(folder, _lens(folder, camera), window) for folder in found]
+    files = [(folder.name, folder / name) for folder in found for name in ("rgb.txt", "groundtruth.txt")]
+    if not depth or not all((folder / "depth.txt").is_file() for folder in found):
+        return TumPairs(scenes, files, window, pairs, seed)
+    files += [(folder.name, folder / "depth.txt") for folder in found]
+    dataset = TumDepthPairs(scenes, files, window, pairs, seed)
+    paths = [_depth_paths(folder, scene) for folder, scene in zip(found, scenes, strict=True)]
+    dataset.depth_images = DepthImages({key: path for some in paths for key, path in some.items()}, DEPTH_SCALE)
+    return dataset
+
+
+def read_listed(path: Path) -> tuple[NDArray[np.float64], list[str], list[int]]:
+    """Time stamps (n,) in seconds, file names and line numbers of an ``rgb.txt`` or ``depth.txt``."""
+    times, names, lines = list[float](), list[str](), list[int]()
+    for number, line in numbered(path, _LAYOUT):
+        words = line.split(maxsplit=1)
+        if len(words) != 2:
+            raise DataError(f"{path}, line {number}: {len(words)} columns; it must hold {_LISTED}")
+        times.append(_time(path, number, words[0], times, _LISTED))
+        names.append(words[1].strip())
+        lines.append(number)
+    if not times:
+        raise DataError(f"{path}: no line with {_LISTED}")
+    return np.array(times), names, lines
+
+
+def read_trajectory(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], Rotation]:
+    """Times (n,) in seconds, positions (n, 3) and orientations of a ``groundtruth.txt``, camera to world."""
+    times, poses = list[float](), list[NDArray[np.float64]]()
+    for number, line in numbered(path, _LAYOUT):
+        words = line.split()
+        values = to_finite(path, number, words, _POSE, 8)
+        if not values[4:].any():
+            raise DataError(f"{path}, line {number}: the quaternion is zero; it must be a rotation")
+        time = _time(path, number, words[0], times, _POSE)
+        if not times or time > times[-1]:  # a repeated stamp adds nothing
+            times.append(time)
+            poses.append(values[1:])
+    if len(times) < 2:
+        raise DataError(f"{path}: {len(times)} poses; it must hold lines of {_POSE}")
+    table = np.array(poses)
+    return np.array(times), table[:, :3], Rotation.from_quat(table[:, 3:])
+
+
+def interpolated(
+    path: Path, wanted: NDArray[np.float64]
+) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
+    """Which of the wanted times (n,) have a pose; of those rotations (m, 3, 3) and positions (m, 3), to the world."""
+    times, positions, orientations = read_trajectory(path)
+    after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
+    early, late = wanted - times[after - 1], times[after] - wanted
+    has = (early >= 0) & (late >= 0) & (np.maximum(early, late) <= TOLERANCE)
+    at = wanted[has]
+    where = np.stack([np.interp(at, times, axis) for axis in positions.T], -1)
+    return has, Slerp(times, orientations)(at).as_matrix().reshape(-1, 3, 3), where
+
+
+def _time(path: Path, number: int, word: str, before: list[float], columns: str) -> float:
+    (time,) = to_finite(path, number, [word], columns, 1)
+    if before and time < before[-1]:
+        raise DataError(f"{path}, line {number}: {word} comes after {before[-1]:.6f}; time stamps must ascend")
+    return float(time)
+
+
+def _lens(folder: Path, camera: str | None) -> Lens:
+    names = [name for name in CALIBRATIONS if name == camera or (camera is None and name in folder.name)]
+    if len(names) != 1:
+        given = f"camera={camera}" if camera else f"{folder}: its name tells no camera"
+        raise DataError(f"{given}; dataset.camera must be one of {', '.join(CALIBRATIONS)}")
+    return CALIBRATIONS[names[0]]
+
+
+def _scene(folder: Path, lens: Lens, window: float) -> Scene:
+    listed = folder / "rgb.txt"
+    times, names, lines = read_listed(listed)
+    has, rotations, positions = interpolated(folder / "groundtruth.txt", times)
+    if not has.any():
+        raise DataError(
+            f"{folder / 'groundtruth.txt'}: no pose at the times of {listed.name}; is it another sequence's?"
+        )
+    views = []
+    for frame, to_world, position in zip(np.flatnonzero(has).tolist(), rotations, positions, strict=True):
+        key = f"TUM/{folder.name}/{names[frame]}"
+        source = ImageSource(key, folder / names[frame], SIZE, lens if lens.bends else None)
+        views.append(View(source, lens.K, to_world.T, -to_world.T @ position, f"{listed}, line {lines[frame]}"))
+    return Scene(folder.name, "TUM", views, following(times[has], window))
+
+
+def _depth_paths(folder: Path, scene: Scene) -> dict[str, Path]:
+    """The depth image next in time to each view, by the identity of its image."""
+    rgb = dict(zip(*read_listed(folder / "rgb.txt")[1::-1], strict=True))
+    times, names, _ = read_listed(folder / "depth.txt")
+    found = {}
+    for view in scene.views:
+        time = rgb[str(view.image.path.relative_to(folder))]
+        nearest = int(np.abs(times - time).argmin())
+        if abs(times[nearest] - time) <= TOLERANCE:
+            found[view.image.identity] = folder / names[nearest]
+    return found

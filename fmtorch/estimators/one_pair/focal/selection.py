@@ -1,0 +1,91 @@
+"""`focal.selection` on the arrays of one pair: the choice among candidates refined with the prior."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from fmtorch.estimators.focal import selection
+from fmtorch.estimators.focal.selection import MIN_GAIN_SHARE, RIVAL_GAIN_SHARE, SAME_CAMERAS, SAME_MODEL
+from fmtorch.estimators.one_pair.focal.cameras import CentredPair, TwoCameras
+from fmtorch.estimators.one_pair.focal.posterior import refine_with_prior
+from fmtorch.estimators.one_pair.models import Pool
+from fmtorch.estimators.one_pair.pair import Array, OnePair
+from fmtorch.estimators.one_pair.scores import Score
+from fmtorch.estimators.one_pair.selection import Selection, scored
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Candidates:
+    """As `selection.Candidates`: models (k, 9), posteriors (k,), cameras."""
+
+    F: Array
+    posterior: Array
+    cameras: TwoCameras
+
+    def only(self, rows: Sequence[int]) -> Candidates:
+        """As `selection.Candidates.only`: itself."""
+        return self
+
+    def joined(self, other: Candidates) -> Candidates:
+        """The candidates of both."""
+        F, posterior = np.concatenate([self.F, other.F]), np.concatenate([self.posterior, other.posterior])
+        return Candidates(F, posterior, self.cameras.joined(other.cameras))
+
+    def best(self) -> int:
+        """The candidate of the greatest posterior, the first of several."""
+        return int(np.argmax(self.posterior))
+
+    def selection(self, draws: int) -> Selection:
+        """As `selection.Candidates.selection`."""
+        best = self.best()
+        return Selection(self.F[best], bool(np.isfinite(self.posterior[best])), draws, self.cameras.of(best))
+
+    def decided(self, pair: OnePair) -> list[bool]:
+        """As `selection.Candidates.decided`."""
+        return [CentredPair.of(pair).same_size or self._unambiguous()]
+
+    def _unambiguous(self) -> bool:
+        """Whether all good candidates are one and the same model."""
+        best = self.best()
+        return bool(np.isfinite(self.posterior[best])) and not _rivals(self.F, self.posterior, best, SAME_CAMERAS)
+
+
+class FocalSelection:
+    """As `selection.FocalSelection`."""
+
+    def __init__(self, part: selection.FocalSelection, gain: Score) -> None:
+        self.gain, self.iterations, self.candidates = gain, part.iterations, part.candidates
+
+    def refined(self, F: Array, valid: Array, pair: OnePair, near: OnePair) -> Candidates:
+        """As `selection.FocalSelection.refined`."""
+        models, cost, share, cameras = refine_with_prior(F, near, self.iterations)
+        posterior = scored(self.gain, models, pair) * share - cost
+        return Candidates(models, np.where(valid & ~np.isnan(posterior), posterior, -np.inf), cameras)
+
+    def select(self, pool: Pool, pair: OnePair, others: Candidates | None) -> Selection:
+        """As `selection.FocalSelection.select`."""
+        assert pool.near is not None
+        models, found = pool.models, pool.filled > 0
+        gain = np.where(pool.valid, scored(self.gain, models, pair), -np.inf)
+        order = np.argsort(-gain, kind="stable")
+        models, gain = models[order], gain[order]
+        free = Selection(models[0], found, pool.draws)
+        if others is None and not _rivals(models, gain, 0, SAME_MODEL):
+            return free
+        tried = slice(self.candidates)
+        candidates = self.refined(np.ascontiguousarray(models[tried]), np.isfinite(gain[tried]), pair, pool.near)
+        if others is not None:
+            candidates = candidates.joined(others)
+        best = candidates.best()
+        if not candidates.posterior[best] >= MIN_GAIN_SHARE * gain[0]:
+            return free
+        return dataclasses.replace(free, F=candidates.F[best], cameras=candidates.cameras.of(best))
+
+
+def _rivals(F: Array, gain: Array, best: int, same: float) -> bool:
+    """Whether a good candidate is another model than the best."""
+    apart = 1 - np.abs((F * F[best]).sum(1))
+    return bool(((gain >= RIVAL_GAIN_SHARE * gain[best]) & ~(apart <= same)).any())

@@ -1,0 +1,57 @@
+"""`refinement` on the arrays of one pair: the models of a pool refined before one of them is selected."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from fmtorch.estimators.one_pair.models import Pool
+from fmtorch.estimators.one_pair.pair import Array, OnePair
+from fmtorch.estimators.one_pair.pool import shuffled
+from fmtorch.estimators.one_pair.refine import refine_models
+from fmtorch.estimators.options import Refine
+from fmtorch.estimators.pool_kernels import near
+from fmtorch.geometry.refine import RANK_TWO_ALREADY
+from fmtorch.random import Stream
+
+
+class PoolRefinement:
+    """As `refinement.PoolRefinement`, without local optimisation."""
+
+    def __init__(self, refine: Refine | None) -> None:
+        self.refine = refine
+
+    def near(self, pool: Pool, pair: OnePair) -> OnePair:
+        """As `refinement.PoolRefinement.near`."""
+        if self.refine is None:
+            return pair
+        return near_models(pool.F[: pool.filled], pair, self.refine.RADIUS * self.refine.scale, self.refine.matches)
+
+    def __call__(self, pool: Pool, pair: OnePair) -> Pool:
+        """As `refinement.PoolRefinement`."""
+        F, near = pool.models, self.near(pool, pair)
+        if (refine := self.refine) is not None:
+            F = refine_models(F, near, refine.kernel, refine.scale, refine.iterations, RANK_TWO_ALREADY)
+        return dataclasses.replace(pool, F=F, near=near)
+
+
+class AsFound:
+    """As `refinement.AsFound`."""
+
+    def near(self, pool: Pool, pair: OnePair) -> OnePair:
+        """As `PoolRefinement.near`."""
+        return pair
+
+    def __call__(self, pool: Pool, pair: OnePair) -> Pool:
+        """As `PoolRefinement`."""
+        return pool
+
+
+def near_models(F: Array, pair: OnePair, radius: float, most: int | None) -> OnePair:
+    """As `pool.near_models` of models (k, 9), float32."""
+    if most is None:
+        return pair
+    wanted = np.empty(pair.count, np.bool_)
+    near(F, pair.points32, np.float32((radius / pair.pixels_per_unit) ** 2), wanted)
+    return pair.take(shuffled(pair, Stream.REFINEMENT, wanted)[:most])

@@ -1,0 +1,87 @@
+"""Preset files, ``conf/<group>/<name>.yaml``: which there are, what they say and what they name."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import hydra.utils
+from omegaconf import DictConfig, OmegaConf
+
+from fmtorch.options import nearest
+from fmtorch.resources import conf_dir
+
+
+def available(group: str, config_dir: Path | str | None = None) -> list[str]:
+    """Names of the presets of a group, e.g. ``available("estimator")``."""
+    folders = [Path(config_dir) / group] if config_dir is not None else []
+    return sorted({path.stem for folder in [*folders, conf_dir() / group] for path in folder.glob("*.yaml")})
+
+
+def load(group: str, name: str, config_dir: Path | str | None = None) -> dict[str, Any]:
+    """The contents of one preset file; files in `config_dir` come before the project's own.
+
+    Raises ValueError with the available names where there is no such preset.
+    """
+    folders = [Path(config_dir)] if config_dir is not None else []
+    for folder in [*folders, conf_dir()]:
+        path = folder / group / f"{name}.yaml"
+        if path.is_file():
+            values = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
+            if not isinstance(values, dict):
+                raise ValueError(f"{path}: a preset is a mapping with a `_target_`, the dotted name of what it builds")
+            return {str(key): value for key, value in values.items()}
+    raise ValueError(f"no preset {name!r} in conf/{group}; there are: {nearest(name, available(group, config_dir))}")
+
+
+@functools.cache
+def known_targets() -> frozenset[str]:
+    """What the project's own presets build: dotted names that are safe to take from a file."""
+    files = conf_dir().glob("*/*.yaml")
+    return frozenset().union(*(targets_of(OmegaConf.to_container(OmegaConf.load(path))) for path in files))
+
+
+def closest(group: str, config: Mapping[str, Any]) -> tuple[str, dict[str, Any]] | None:
+    """The project's preset of a group from which a config differs least, and the options in which it does.
+
+    None where no preset builds what the config does, or the options are not those of the preset.
+    """
+    found = []
+    for name, preset in _shipped(group).items():
+        if preset.get("_target_") == config.get("_target_") and preset.keys() >= config.keys():
+            found.append((name, {key: value for key, value in config.items() if preset[key] != value}))
+    return min(found, key=lambda pair: len(pair[1]), default=None)
+
+
+@functools.cache
+def _shipped(group: str) -> dict[str, dict[str, Any]]:
+    """The project's own presets of a group, by name."""
+    return {name: load(group, name) for name in available(group)}
+
+
+def targets_of(config: object) -> frozenset[str]:
+    """The `_target_`s anywhere within a config."""
+    if isinstance(config, Mapping):
+        own = [str(config["_target_"])] if "_target_" in config else []
+        return frozenset(own).union(*(targets_of(value) for value in config.values()))
+    if isinstance(config, list):
+        return frozenset().union(*(targets_of(value) for value in config))
+    return frozenset()
+
+
+def own_modules(config: object) -> dict[str, str]:
+    """The modules that define the targets within a config that are none of this project's, by the targets' names."""
+    own = sorted(name for name in targets_of(config) if name.partition(".")[0] != "fmtorch")
+    return {
+        name: str(getattr(hydra.utils.get_object(name), "__module__", None) or name.rpartition(".")[0]) for name in own
+    }
+
+
+def top_level_names(config_name: str) -> list[str]:
+    """What the command of this config takes by name: its fields and the groups it chooses from."""
+    fields = OmegaConf.load(conf_dir() / f"{config_name}.yaml")
+    assert isinstance(fields, DictConfig)
+    groups = [str(group) for entry in fields.get("defaults", []) if entry != "_self_" for group in entry]
+    return [name for name in (*map(str, fields), *groups) if name not in ("defaults", "hydra") and " " not in name]

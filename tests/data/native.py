@@ -1,0 +1,119 @@
+"""Small native data sets for the tests: cameras on a path, images of noise, files as the sources describe them."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+SIZE = (24, 32)  # h, w of the images
+
+
+def write_image(path: Path, seed: int = 0, size: tuple[int, int] = SIZE) -> Path:
+    """An image of noise."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pixels = np.random.default_rng(seed).integers(0, 256, size).astype(np.uint8)
+    assert cv2.imwrite(str(path), pixels)
+    return path
+
+
+def turned(angle: float) -> np.ndarray:
+    """A rotation about the y axis."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
+
+
+def write_kitti(root: Path, names: tuple[str, ...] = ("06",), frames: int = 14) -> Path:
+    """Sequences in KITTI's layout at 10 frames a second, driving along a curve."""
+    for name in names:
+        folder = root / "sequences" / name
+        for i in range(frames):
+            write_image(folder / "image_0" / f"{i:06d}.png", i)
+        K = "40 0 15.5 {} 0 40 11.5 0 0 0 1 0"
+        (folder / "calib.txt").write_text(f"P0: {K.format(0)}\nP1: {K.format(-21.5)}\n")
+        (folder / "times.txt").write_text("".join(f"{0.1 * i:e}\n" for i in range(frames)))
+        (root / "poses").mkdir(exist_ok=True)
+        poses = [np.column_stack([turned(0.02 * i), [0.1 * i, 0.0, 1.0 * i]]).ravel() for i in range(frames)]
+        (root / "poses" / f"{name}.txt").write_text("".join(" ".join(f"{v:e}" for v in p) + "\n" for p in poses))
+    return root
+
+
+COLMAP_LINES = {
+    "SIMPLE_PINHOLE": "40 16 12",
+    "PINHOLE": "40 41 16 12",
+    "SIMPLE_RADIAL": "40 16 12 0.1",
+    "OPENCV": "40 41 16 12 0.1 -0.02 0.001 0.002",
+    "OPENCV_FISHEYE": "40 41 16 12 0.01 0.01 0 0",
+}
+"""Parameters of cameras for images of `SIZE`."""
+
+
+def write_colmap(folder: Path, models: tuple[str, ...] = ("SIMPLE_PINHOLE", "PINHOLE", "OPENCV")) -> Path:
+    """A scene with a text model: image i has the camera of model i, sees the points i to i + 4, and looks along z."""
+    sparse = folder / "sparse" / "0"
+    sparse.mkdir(parents=True)
+    cameras, images = ["# Camera list"], ["# Image list", f"# Number of images: {len(models)}, mean observations"]
+    for i, model in enumerate(models):
+        cameras.append(f"{i + 7} {model} {SIZE[1]} {SIZE[0]} {COLMAP_LINES[model]}")
+        half = 0.05 * i
+        pose = [np.cos(half), 0.0, np.sin(half), 0.0, 0.5 * i, 0.1 * i, 0.2]
+        name = f"night walk/{i:02d}.png" if i == 1 else f"{i:02d}.png"
+        images.append(f"{20 - i} {' '.join(str(float(v)) for v in pose)} {i + 7} {name}")
+        images.append(" ".join(f"{3.5 + p} 4.5 {p if p < i + 5 else -1}" for p in range(i, i + 6)))
+        write_image(folder / "images" / name, i)
+    (sparse / "cameras.txt").write_text("\n".join(cameras) + "\n")
+    (sparse / "images.txt").write_text("\n".join(images) + "\n")
+    return folder
+
+
+def to_binary(sparse: Path) -> None:
+    """Replace a text model by a binary one, written from the format's description."""
+    cameras, images = b"", b""
+    lines = [line for line in (sparse / "cameras.txt").read_text().splitlines() if not line.startswith("#")]
+    for line in lines:
+        key, model, width, height, *values = line.split()
+        number = list(COLMAP_NUMBERS).index(model)
+        cameras += struct.pack(f"<iiQQ{len(values)}d", int(key), number, int(width), int(height), *map(float, values))
+    (sparse / "cameras.bin").write_bytes(struct.pack("<Q", len(lines)) + cameras)
+    lines = [line for line in (sparse / "images.txt").read_text().splitlines() if not line.startswith("#")]
+    for line, points in zip(lines[::2], lines[1::2], strict=True):
+        key, *pose, camera, name = line.split(maxsplit=9)
+        images += struct.pack("<i7di", int(key), *map(float, pose), int(camera)) + name.encode() + b"\0"
+        words = points.split()
+        images += struct.pack("<Q", len(words) // 3)
+        for x, y, point in zip(words[::3], words[1::3], words[2::3], strict=True):
+            images += struct.pack("<ddq", float(x), float(y), int(point))
+    (sparse / "images.bin").write_bytes(struct.pack("<Q", len(lines) // 2) + images)
+    (sparse / "cameras.txt").unlink()
+    (sparse / "images.txt").unlink()
+
+
+COLMAP_NUMBERS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
+
+
+def write_tum(root: Path, name: str = "rgbd_dataset_freiburg1_test", frames: int = 12, depth: bool = False) -> Path:
+    """A sequence at 10 frames a second with poses at 100: along x at 1 m/s, turning about y at 1 rad/s."""
+    folder = root / name
+    start = 1305031236.0
+    rgb, poses, depths = ["# timestamp filename"], ["# timestamp tx ty tz qx qy qz qw"], ["# depth"]
+    for i in range(frames):
+        stamp = f"{start + 0.1 * i + 0.003:.6f}"
+        write_image(folder / f"rgb/{stamp}.png", i, (480, 640))
+        rgb.append(f"{stamp} rgb/{stamp}.png")
+        if depth:
+            later = f"{start + 0.1 * i + 0.013:.6f}"
+            depths.append(f"{later} depth/{later}.png")
+            (folder / "depth").mkdir(exist_ok=True)
+            plane = np.tile(np.arange(640, dtype=np.uint16) * 50, (480, 1))  # x / 100 metres
+            plane[100:200, 300:400] = 0
+            assert cv2.imwrite(str(folder / f"depth/{later}.png"), plane)
+    for i in range(frames * 10 + 2):
+        t = 0.01 * i
+        poses.append(f"{start + t:.4f} {t:.4f} 0.5 1 0 {np.sin(t / 2):.7f} 0 {np.cos(t / 2):.7f}")
+    (folder / "rgb.txt").write_text("\n".join(rgb) + "\n")
+    (folder / "groundtruth.txt").write_text("\n".join(poses) + "\n")
+    if depth:
+        (folder / "depth.txt").write_text("\n".join(depths) + "\n")
+    return folder

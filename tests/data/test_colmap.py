@@ -1,0 +1,213 @@
+"""The readers of COLMAP models: on a real scene, against pycolmap, text against binary, and on damaged files."""
+
+from __future__ import annotations
+
+import dataclasses
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fmtorch.data import DataError, ImageError, load, read_image
+from fmtorch.data.colmap import read_model
+from fmtorch.data.lenses import Lens
+from tests.conftest import shared_path
+from tests.data.native import SIZE, to_binary, write_colmap, write_image
+from tests.data.test_kitti import same_up_to_sign
+
+
+def test_real_images_have_the_f_and_the_pixels_of_the_fmbench_file() -> None:
+    """The FM-Bench copy was undistorted from the same originals; it is JPEG, hence grey levels differ by its loss."""
+    native = {p.identity.rpartition("/")[2]: p for p in load("colmap", root=_real(), pairs=None)}
+    copy = load("fmbench", root=shared_path("data/PhotoTourism"))
+    assert len(native) == 45
+    assert len(copy) == 34
+    for pair in copy:
+        assert same_up_to_sign(native[pair.identity.rpartition("/")[2]].F, pair.F) < 1e-6
+    source, theirs = native["6-8"].image1, read_image(copy[29].image1).astype(int)
+    assert copy[29].identity.endswith("/6-8")
+    assert np.abs(read_image(source) - theirs).mean() < 2
+    assert np.abs(read_image(dataclasses.replace(source, lens=None)) - theirs).mean() > 4
+
+
+def test_real_model_is_that_of_pycolmap(tmp_path: Path) -> None:
+    """Text as it stands, and the binary files that COLMAP itself writes of it."""
+    pycolmap = pytest.importorskip("pycolmap")
+    reconstruction = pycolmap.Reconstruction(str(_real() / "sparse"))
+    reconstruction.write_binary(str(tmp_path))
+    text, binary = read_model(_real() / "sparse"), read_model(tmp_path)
+    assert text.cameras == binary.cameras
+    theirs = {image.name: image for image in reconstruction.images.values()}
+    for a, b in zip(text.images, binary.images, strict=True):
+        matrix = theirs[a.name].cam_from_world().matrix()
+        seen = [point.point3D_id for point in theirs[a.name].points2D if point.has_point3D()]
+        for image in (a, b):
+            np.testing.assert_allclose(np.column_stack([image.R, image.t]), matrix, atol=1e-12)
+            assert image.points.tolist() == seen
+
+
+def _real() -> Path:
+    return shared_path("data/native/colmap_sacre_coeur")
+
+
+def test_the_pixel_origin_is_half_a_pixel_lower(tmp_path: Path) -> None:
+    """COLMAP's (16, 12) is the middle of a 32 x 24 image; here that middle is (15.5, 11.5)."""
+    model = read_model(write_colmap(tmp_path / "scene") / "sparse/0")
+    assert model.cameras[7].lens == Lens(40.0, 40.0, 15.5, 11.5, "SIMPLE_PINHOLE")
+    assert model.cameras[8].lens == Lens(40.0, 41.0, 15.5, 11.5, "PINHOLE")
+    assert model.cameras[9].lens == Lens(40.0, 41.0, 15.5, 11.5, "OPENCV", (0.1, -0.02, 0.001, 0.002))
+    assert model.cameras[9].size == SIZE
+    assert [image.name for image in model.images] == ["00.png", "02.png", "night walk/01.png"]
+
+
+def test_text_and_binary_are_one_model(tmp_path: Path) -> None:
+    models = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE")
+    text = load("colmap", root=write_colmap(tmp_path / "text/scene", models), pairs=None, family="f")
+    folder = write_colmap(tmp_path / "binary/scene", models)
+    to_binary(folder / "sparse/0")
+    binary = load("colmap", root=folder, pairs=None, family="f", candidates="points", shared=3)
+    for a, b in zip(text.scenes[0].views, binary.scenes[0].views, strict=True):
+        assert (a.image.identity, a.image.size, a.image.lens) == (b.image.identity, b.image.size, b.image.lens)
+        for x, y in ((a.K, b.K), (a.R, b.R), (a.t, b.t)):
+            np.testing.assert_array_equal(x, y)
+    assert len(text) == 10
+    numbers = [int(view.image.path.stem) for view in binary.scenes[0].views]
+    seen = {frozenset((numbers[i], numbers[j])) for i, j in binary.scenes[0].candidates.at(np.arange(len(binary)))}
+    assert seen == {frozenset((i, j)) for i in range(5) for j in range(i) if i - j <= 2}  # share 5 - |i - j| points
+
+
+def test_pairs_of_different_sizes_and_undistorted_images(tmp_path: Path) -> None:
+    folder = write_colmap(tmp_path / "set/scene")
+    pair = next(p for p in load("colmap", root=tmp_path / "set", sequences=["scene"]) if p.image1.path.stem == "02")
+    assert (pair.family, pair.scene, pair.problem) == ("set", "scene", None)
+    assert pair.image0.lens is None
+    assert pair.image1.lens is not None
+    assert not np.array_equal(read_image(pair.image1), read_image(pair.image1.path))
+    write_image(folder / "images/02.png", size=(48, 64))
+    with pytest.raises(ImageError, match=r"02\.png: 64 x 48 px, but its camera is of 32 x 24 px; it must be the image"):
+        read_image(pair.image1)
+
+
+def test_the_model_is_looked_for_where_colmap_puts_it(tmp_path: Path) -> None:
+    folder = write_colmap(tmp_path / "set/scene")
+    first = load("colmap", root=folder, pairs=None)
+    (folder / "sparse/0").rename(tmp_path / "model")
+    (folder / "sparse").rmdir()
+    (tmp_path / "model").rename(folder / "sparse")
+    assert load("colmap", root=folder, pairs=None)[0].identity == first[0].identity
+    (folder / "sparse").rename(folder / "other")
+    with pytest.raises(DataError, match="scene: no COLMAP model in sparse/0, sparse, dense/sparse,"):
+        load("colmap", root=tmp_path / "set", sequences=["scene"])
+    assert len(load("colmap", root=tmp_path / "set", sequences=["scene"], model="other", pairs=None)) == 3
+    with pytest.raises(DataError, match=r"no sequence 'Panther'; there are: scene\."):
+        load("colmap", root=tmp_path / "set")
+
+
+def test_a_missing_image_is_a_problem_of_its_pairs_alone(tmp_path: Path) -> None:
+    folder = write_colmap(tmp_path / "scene")
+    (folder / "images/02.png").unlink()
+    problems = {p.identity.rpartition("/")[2]: p.problem for p in load("colmap", root=folder, pairs=None)}
+    assert problems["0-2"] is None
+    assert "images.txt, line 7: no image " in str(problems["0-1"])
+    assert str(problems["0-1"]).endswith("images/02.png")
+
+
+def edit(name: str, old: str, new: str) -> Callable[[Path], None]:
+    def apply(sparse: Path) -> None:
+        text = (sparse / name).read_text()
+        assert old in text
+        (sparse / name).write_text(text.replace(old, new, 1))
+
+    return apply
+
+
+TEXT_DAMAGE = {
+    "unknown model": (edit("cameras.txt", "OPENCV", "MAGIC"), r"cameras\.txt, line 4: camera model MAGIC is not known"),
+    "panorama": (edit("cameras.txt", "OPENCV", "EQUIRECTANGULAR"), "line 4: camera model EQUIRECTANGULAR is not known"),
+    "parameters": (
+        edit("cameras.txt", "40 41 16 12\n", "40 41 16\n"),
+        r"cameras\.txt, line 3: 3 parameters; PINHOLE has 4: fx, fy, cx, cy",
+    ),
+    "no number": (edit("cameras.txt", "40 41 16 12\n", "40 x 16 12\n"), r"cameras\.txt, line 3: .*'x'"),
+    "focal length": (edit("cameras.txt", "40 16 12", "-40 16 12"), r"line 2: .*focal lengths must be positive"),
+    "size": (edit("cameras.txt", "32 24", "0 24"), r"cameras\.txt, line 2: an image of 0 x 24 px"),
+    "twice": (edit("cameras.txt", "8 PINHOLE", "7 PINHOLE"), r"cameras\.txt, line 3: camera 7 stands twice"),
+    "no such camera": (edit("images.txt", " 7 00.png", " 3 00.png"), r"images\.txt, line 3: camera 3 of 00\.png"),
+    "same name": (edit("images.txt", "02.png", "00.png"), r"images\.txt, line 7: image 00\.png is already at .*line 3"),
+    "zero quaternion": (
+        edit("images.txt", "20 1.0 0.0 0.0 0.0", "20 0 0 0 0"),
+        r"images\.txt, line 3: quaternion .*; it must be finite and not zero",
+    ),
+    "nan": (edit("images.txt", "20 1.0", "20 nan"), r"images\.txt, line 3: a number that is not finite"),
+    "missing columns": (edit("images.txt", " 7 00.png", ""), r"images\.txt, line 3: 8 columns; it must hold IMAGE_ID"),
+    "cut in a line": (edit("images.txt", " 4.5 -1\n19", "\n19"), r"images\.txt, line 4: 16 columns; it must be a line"),
+    "no point": (edit("images.txt", "4.5 0 ", "4.5 zero "), r"images\.txt, line 4: .*'zero'"),
+    "cut": (edit("images.txt", "images: 3", "images: 4"), r"images\.txt: 3 images, but it announces 4"),
+    "empty": (lambda sparse: (sparse / "images.txt").write_text("# none\n"), r"images\.txt: no image; a model"),
+    "absent": (lambda sparse: (sparse / "images.txt").unlink(), r"images\.txt: no such file"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", TEXT_DAMAGE)
+def test_damaged_text_is_named_with_its_line(damage: str, tmp_path: Path) -> None:
+    folder = write_colmap(tmp_path / "scene")
+    change, message = TEXT_DAMAGE[damage]
+    change(folder / "sparse/0")
+    with pytest.raises(DataError, match=message) as raised:
+        load("colmap", root=folder, candidates="points")
+    assert "\n" not in str(raised.value)
+
+
+def test_an_image_without_points_has_an_empty_line(tmp_path: Path) -> None:
+    folder = write_colmap(tmp_path / "scene")
+    path = folder / "sparse/0/images.txt"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:3], "", *lines[4:-1], ""]) + "\n")
+    model = read_model(folder / "sparse/0")
+    assert [len(image.points) for image in model.images] == [0, 0, 5]
+
+
+def test_binary_files_cut_anywhere_are_refused(tmp_path: Path) -> None:
+    """Every shorter file is refused with its record, and so is every longer one; none makes a traceback."""
+    sparse = write_colmap(tmp_path / "scene") / "sparse/0"
+    to_binary(sparse)
+    for name, record in (("cameras.bin", "camera 3 of 3"), ("images.bin", "image 3 of 3")):
+        whole = (sparse / name).read_bytes()
+        for length in {0, 5, 8, 20, *range(30, len(whole), 31), len(whole) - 1}:
+            (sparse / name).write_bytes(whole[:length])
+            with pytest.raises(DataError, match=rf"{name}: damaged or truncated, its {length} bytes end within"):
+                read_model(sparse)
+        (sparse / name).write_bytes(whole + b"\0" * 3)
+        with pytest.raises(DataError, match=f"damaged, 3 bytes are left after {record}; copy it again"):
+            read_model(sparse)
+        (sparse / name).write_bytes(whole)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_damaged_bytes_never_make_a_traceback(seed: int, tmp_path: Path) -> None:
+    """Random bytes are overwritten: the model is read, or refused by a DataError."""
+    sparse = write_colmap(tmp_path / "scene") / "sparse/0"
+    to_binary(sparse)
+    rng = np.random.default_rng(seed)
+    path = sparse / ("cameras.bin" if seed % 2 else "images.bin")
+    data = bytearray(path.read_bytes())
+    for at in rng.integers(0, len(data), 3):
+        data[at] = rng.integers(0, 256)
+    path.write_bytes(data)
+    try:
+        model = read_model(sparse)
+    except DataError:
+        return
+    assert all(np.isfinite(image.t).all() for image in model.images)
+
+
+def test_an_unknown_model_number_is_refused(tmp_path: Path) -> None:
+    sparse = write_colmap(tmp_path / "scene") / "sparse/0"
+    to_binary(sparse)
+    data = bytearray((sparse / "cameras.bin").read_bytes())
+    data[12:16] = struct.pack("<i", 99)
+    (sparse / "cameras.bin").write_bytes(data)
+    with pytest.raises(DataError, match=r"cameras\.bin, camera 1 of 3: camera model number 99 is not known here"):
+        read_model(sparse)
