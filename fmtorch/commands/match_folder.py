@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Literal
 
 from omegaconf import DictConfig
 from rich.console import Console
@@ -12,50 +13,26 @@ from rich.console import Console
 from fmtorch import presets
 from fmtorch.exchange.export import export_kinds, write_exports
 from fmtorch.exchange.journal import Journal
+from fmtorch.fields import Count, Device, Seed
 from fmtorch.folder import FolderMatches, chosen_pairs, images_below, open_folder
 from fmtorch.storage.code import fmtorch_version
 from fmtorch.storage.features import CachedFeatures
 from fmtorch.terminal import console, progress_bars
 
 
-class FolderFields(Protocol):
-    """What the command takes of a folder; ``conf/match.yaml`` says what each is."""
+@dataclasses.dataclass(frozen=True)
+class FolderFields:
+    """What the command takes of a folder, and of a single pair too; ``conf/match.yaml`` says what each is."""
 
-    @property
-    def image0(self) -> Path | None: ...
-
-    @property
-    def image1(self) -> Path | None: ...
-
-    @property
-    def truth(self) -> Path | None: ...
-
-    @property
-    def images(self) -> Path | None: ...
-
-    @property
-    def pairs(self) -> Path | None: ...
-
-    @property
-    def export(self) -> str | list[str] | None: ...
-
-    @property
-    def camera(self) -> str: ...
-
-    @property
-    def output(self) -> Path | None: ...
-
-    @property
-    def orient(self) -> bool: ...
-
-    @property
-    def longest_side(self) -> int: ...
-
-    @property
-    def seed(self) -> int: ...
-
-    @property
-    def device(self) -> str: ...
+    images: Path | None = None
+    pairs: Path | None = None
+    export: str | list[str] | None = None
+    camera: Literal["per_image", "shared"] = "per_image"
+    output: Path | None = None
+    orient: bool = True
+    longest_side: Count = 1600
+    seed: Seed = 0
+    device: Device = "auto"
 
 
 def match_folder(config: DictConfig, fields: FolderFields, pipeline_name: str, overrides: Sequence[str]) -> Path:
@@ -63,8 +40,6 @@ def match_folder(config: DictConfig, fields: FolderFields, pipeline_name: str, o
 
     Raises ValueError for what the options cannot mean, and where no pair could be matched.
     """
-    if fields.image0 is not None or fields.image1 is not None or fields.truth is not None:
-        raise ValueError("images takes a folder; image0, image1 and truth are of a single pair")
     folder = fields.images
     assert folder is not None
     kinds = export_kinds(fields.export)
