@@ -177,7 +177,6 @@ def test_an_evaluation_and_its_way_back(tmp_path: Path) -> None:
     for column in ("pair", "ok", "corrs_before", "inlier_rate_before"):
         assert theirs[column] == plain[column]
     assert theirs["features0"][:3] == plain["features0"][:3]
-    assert max(theirs["nsgd"][:3]) < 0.05
     assert all(np.isnan(seconds or np.nan) for seconds in theirs["seconds_features"])
     with pytest.raises(ValueError, match="no pair has images in which a pipeline finds keypoints"):
         run("none", *words, "pruner=[]", "export=h5")
