@@ -13,7 +13,6 @@ import re
 import runpy
 import shlex
 import shutil
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,6 +25,8 @@ from hydra.core.global_hydra import GlobalHydra
 
 from fmtorch import data
 from fmtorch.data import read_image
+from tests.conftest import own_cache
+from tests.processes import run_command
 
 SOURCE = Path(__file__).resolve().parents[2]
 PAGES = ["README.md", "CONTRIBUTING.md", *(f"docs/{path.name}" for path in sorted((SOURCE / "docs").glob("*.md")))]
@@ -190,8 +191,8 @@ def run(words: list[str], folder: Path) -> None:
     """`python -m MODULE ...`: within this process, which saves its start, where the module can be run twice in one."""
     assert words[:2] == ["python", "-m"], words
     if words[2] == "fmtorch.report":  # defines classes of its own, which the tests' type checker would mistake
-        env = {**os.environ, "PYTHONPATH": str(SOURCE)}
-        subprocess.run([sys.executable, *words[1:]], cwd=folder, env=env, check=True, timeout=300)
+        ended = run_command("report", *words[3:], cwd=folder)
+        assert ended.returncode == 0, ended.stderr
         return
     with as_a_command(words[2:], folder):
         try:
@@ -216,7 +217,7 @@ def those(slow: bool) -> list[object]:
 
 
 def run_all(some: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FMTORCH_CACHE", str(workplace / "cache"))
+    monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(workplace)))
     for command in some:
         print(command)
         if "report" in command and not (workplace / "runs").exists():
