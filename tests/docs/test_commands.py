@@ -26,6 +26,7 @@ from hydra.core.global_hydra import GlobalHydra
 from fmtorch import data
 from fmtorch.data import read_image
 from tests.conftest import own_cache
+from tests.exchange import writers
 from tests.processes import run_command
 
 SOURCE = Path(__file__).resolve().parents[2]
@@ -35,9 +36,11 @@ SETS = ("Strecha", "PhotoTourism", "KITTI", "TUM", "Strecha_train", "TanksLike")
 ELSEWHERE = {
     r"python3? -m venv|pip install": "a fresh environment: continuous integration runs these",
     r"python -m pytest|ruff check|sphinx-build": "what continuous integration does",
+    r"scripts/download": "tests/test_download.py runs it against a server of its own",
     r"convert_ngransac": "needs the authors' weights; tests/pruning/networks/test_files.py runs it on others",
     r"--contrib-python": "needs a Python with opencv-contrib",
     r"--config-dir my_conf (pruner|pipeline)=": "tests/training/test_train_command.py runs these files and commands",
+    r"dataset=(tum|kitti|colmap|bundler|fmbench dataset\.root=KITTI)": "tests/data runs these on data of their layout",
     r"--config-dir my_conf features=": "tests/docs/test_own_parts.py runs this page",
 }
 """Commands that are not run here, and why."""
@@ -65,6 +68,7 @@ APPENDED = {
     "fmtorch.match": ["pipeline=sift_gms"],
     "fmtorch.eval": [*DATASET, "workers=1"],
     "fmtorch.train": ["dataset=fmbench", "dataset.root=DATA", "dataset.sets=[Strecha_train,TanksLike]", *TRAINED],
+    "fmtorch.pairs": ["dataset.root=DATA/Strecha", "workers=1"],
     "fmtorch.report": ["pictures=1", "root=DATA/Strecha"],
     "estimators": ["--limit", "1", "--seeds", "1"],
     "thresholds": ["--limit", "1", "--seeds", "1", "--values", "0.5", "0.75"],
@@ -98,6 +102,7 @@ def smaller(command: str) -> list[str]:
         (r" --ngransac \S+", ""),
         (r" dataset\.size=\w+", ""),
         (r"FOLDER", "kept"),
+        (r"(dataset\.layout=(\w+) dataset\.root=)FILES", r"\1FILES/\2"),
         (r" root=DIR", ""),
         (r" d\.json", ""),
         (r"runs=\[runs/a,runs/b\]|runs/a runs/b", "runs=[runs/fmbench]"),
@@ -110,6 +115,8 @@ def smaller(command: str) -> list[str]:
     if name not in APPENDED:
         raise AssertionError(f"no rule for {command!r}: say in APPENDED how to run it small, or in ELSEWHERE why not")
     added = APPENDED[name]
+    if "dataset=h5" in words:
+        added = ["limit=1", "workers=1"]
     if "--from" in words:  # shows what is there
         added = []
     if name == "speed" and importlib.util.find_spec("poselib") is None:
@@ -150,6 +157,13 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / "DATA" / name / "pairs_which_dataset.txt").write_text("".join(f"{s}/\n" for s in scenes))
     for name, image in zip(("a.jpg", "b.jpg"), images, strict=True):
         cv2.imwrite(str(folder / name), image[..., ::-1])
+    (folder / "PHOTOS").mkdir()
+    for name in ("a.jpg", "b.jpg"):
+        shutil.copy(folder / name, folder / "PHOTOS")
+    (folder / "list.txt").write_text("a.jpg b.jpg\n")
+    for layout in ("posebench", "hloc", "oanet"):
+        writers.WRITERS[layout](folder / "FILES" / layout)
+    writers.truth(folder / "SET")
     (folder / "my_conf" / "estimator").mkdir(parents=True)
     yaml = re.findall(
         r"```yaml\n# my_conf/estimator/mine.yaml\n(.*?)```", (SOURCE / "README.md").read_text(), re.DOTALL
