@@ -13,7 +13,6 @@ import re
 import runpy
 import shlex
 import shutil
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,6 +25,8 @@ from hydra.core.global_hydra import GlobalHydra
 
 from fmtorch import data
 from fmtorch.data import read_image
+from tests.conftest import own_cache
+from tests.processes import run_command
 
 SOURCE = Path(__file__).resolve().parents[2]
 PAGES = ["README.md", "CONTRIBUTING.md", *(f"docs/{path.name}" for path in sorted((SOURCE / "docs").glob("*.md")))]
@@ -37,6 +38,7 @@ ELSEWHERE = {
     r"convert_ngransac": "needs the authors' weights; tests/pruning/networks/test_files.py runs it on others",
     r"--contrib-python": "needs a Python with opencv-contrib",
     r"--config-dir my_conf (pruner|pipeline)=": "tests/training/test_train_command.py runs these files and commands",
+    r"dataset=(tum|kitti|colmap|bundler|fmbench dataset\.root=KITTI)": "tests/data runs these on data of their layout",
     r"--config-dir my_conf features=": "tests/docs/test_own_parts.py runs this page",
 }
 """Commands that are not run here, and why."""
@@ -64,6 +66,7 @@ APPENDED = {
     "fmtorch.match": ["pipeline=sift_gms"],
     "fmtorch.eval": [*DATASET, "workers=1"],
     "fmtorch.train": ["dataset=fmbench", "dataset.root=DATA", "dataset.sets=[Strecha_train,TanksLike]", *TRAINED],
+    "fmtorch.pairs": ["dataset.root=DATA/Strecha", "workers=1"],
     "fmtorch.report": ["pictures=1", "root=DATA/Strecha"],
     "estimators": ["--limit", "1", "--seeds", "1"],
     "thresholds": ["--limit", "1", "--seeds", "1", "--values", "0.5", "0.75"],
@@ -187,8 +190,8 @@ def run(words: list[str], folder: Path) -> None:
     """`python -m MODULE ...`: within this process, which saves its start, where the module can be run twice in one."""
     assert words[:2] == ["python", "-m"], words
     if words[2] == "fmtorch.report":  # defines classes of its own, which the tests' type checker would mistake
-        env = {**os.environ, "PYTHONPATH": str(SOURCE)}
-        subprocess.run([sys.executable, *words[1:]], cwd=folder, env=env, check=True, timeout=300)
+        ended = run_command("report", *words[3:], cwd=folder)
+        assert ended.returncode == 0, ended.stderr
         return
     with as_a_command(words[2:], folder):
         try:
@@ -213,7 +216,7 @@ def those(slow: bool) -> list[object]:
 
 
 def run_all(some: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FMTORCH_CACHE", str(workplace / "cache"))
+    monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(workplace)))
     for command in some:
         print(command)
         if "report" in command and not (workplace / "runs").exists():
