@@ -225,7 +225,7 @@ def test_every_pipeline_composes_by_name(name: str, monkeypatch: pytest.MonkeyPa
     for module in ("features.kornia_features", "matching.lightglue"):  # without fetching others' weights
         monkeypatch.setattr(f"fmtorch.{module}.pretrained", lambda load, *_: torch.nn.Identity())
     built = presets.pipeline(name)
-    assert built.pruners or name in ("aliked_lightglue", "disk_lightglue")
+    assert built.pruners or name in ("aliked_lightglue", "disk_lightglue", "given_fmtorch")
 
 
 def test_overrides_and_a_callers_own_hydra() -> None:

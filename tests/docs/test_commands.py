@@ -26,6 +26,7 @@ from hydra.core.global_hydra import GlobalHydra
 from fmtorch import data
 from fmtorch.data import read_image
 from tests.conftest import own_cache
+from tests.exchange import writers
 from tests.processes import run_command
 
 SOURCE = Path(__file__).resolve().parents[2]
@@ -35,6 +36,7 @@ SETS = ("Strecha", "PhotoTourism", "KITTI", "TUM", "Strecha_train", "TanksLike")
 ELSEWHERE = {
     r"python3? -m venv|pip install": "a fresh environment: continuous integration runs these",
     r"python -m pytest|ruff check|sphinx-build": "what continuous integration does",
+    r"scripts/download": "tests/test_download.py runs it against a server of its own",
     r"convert_ngransac": "needs the authors' weights; tests/pruning/networks/test_files.py runs it on others",
     r"--contrib-python": "needs a Python with opencv-contrib",
     r"--config-dir my_conf (pruner|pipeline)=": "tests/training/test_train_command.py runs these files and commands",
@@ -100,6 +102,7 @@ def smaller(command: str) -> list[str]:
         (r" --ngransac \S+", ""),
         (r" dataset\.size=\w+", ""),
         (r"FOLDER", "kept"),
+        (r"(dataset\.layout=(\w+) dataset\.root=)FILES", r"\1FILES/\2"),
         (r" root=DIR", ""),
         (r" d\.json", ""),
         (r"runs=\[runs/a,runs/b\]|runs/a runs/b", "runs=[runs/fmbench]"),
@@ -112,6 +115,8 @@ def smaller(command: str) -> list[str]:
     if name not in APPENDED:
         raise AssertionError(f"no rule for {command!r}: say in APPENDED how to run it small, or in ELSEWHERE why not")
     added = APPENDED[name]
+    if "dataset=h5" in words:
+        added = ["limit=1", "workers=1"]
     if "--from" in words:  # shows what is there
         added = []
     if name == "speed" and importlib.util.find_spec("poselib") is None:
@@ -152,6 +157,13 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / "DATA" / name / "pairs_which_dataset.txt").write_text("".join(f"{s}/\n" for s in scenes))
     for name, image in zip(("a.jpg", "b.jpg"), images, strict=True):
         cv2.imwrite(str(folder / name), image[..., ::-1])
+    (folder / "PHOTOS").mkdir()
+    for name in ("a.jpg", "b.jpg"):
+        shutil.copy(folder / name, folder / "PHOTOS")
+    (folder / "list.txt").write_text("a.jpg b.jpg\n")
+    for layout in ("posebench", "hloc", "oanet"):
+        writers.WRITERS[layout](folder / "FILES" / layout)
+    writers.truth(folder / "SET")
     (folder / "my_conf" / "estimator").mkdir(parents=True)
     yaml = re.findall(
         r"```yaml\n# my_conf/estimator/mine.yaml\n(.*?)```", (SOURCE / "README.md").read_text(), re.DOTALL
