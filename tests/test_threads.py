@@ -66,7 +66,7 @@ def test_matching_and_find_fundamental_have_one_thread(threads: int, monkeypatch
         monkeypatch.setattr(module, name, watched)
 
     for module, name in (
-        (nearest, "_usable"),
+        (nearest, "_finite"),
         (nearest, "_two_nearest"),
         (batching, "normalized_pairs"),
         (consistency, "tiled"),

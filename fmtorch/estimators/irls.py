@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch import kernels
 from fmtorch.estimators.batching import solve_all
 from fmtorch.estimators.inliers import WithinThreshold, median_of_matches
+from fmtorch.estimators.one_pair import irls as one_pair
+from fmtorch.estimators.one_pair.pair import each_pair
 from fmtorch.estimators.pairs import NormalizedPairs
 from fmtorch.estimators.selection import best_of
 from fmtorch.geometry import attached_step, eight_point
@@ -74,24 +79,44 @@ class IterativelyReweighted:
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
         at_once = TILE // (max(1, c.mask.shape[1]) * len(self.starts))
-        return solve_all(c, seed, self.MIN_MATCHES, self._solve, "the matches do not determine a model", at_once)
+        compiled = c.mask.device.type == "cpu" and kernels.available()
+        solve = functools.partial(self._solve, self._by_kernels if compiled else self._by_tensors)
+        return solve_all(c, seed, self.MIN_MATCHES, solve, "the matches do not determine a model", at_once, compiled)
 
-    def _solve(self, pairs: NormalizedPairs) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        weight = _weight(pairs)
-        scale = self.threshold / pairs.pixels_per_unit
+    def _solve(
+        self, optimum: Callable[[NormalizedPairs], tuple[Tensor, Tensor]], pairs: NormalizedPairs
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         with torch.no_grad():
-            F, valid = self._first(pairs, weight)
-            start = self._first_scale(F, valid, pairs)
-            for i in range(self.iterations):
-                F = reweighted(F, pairs.points, weight, self.robust, torch.maximum(start * DECAY**i, scale))
-            F, cost = refine_components(F, pairs.points, weight, self.kernel, scale, self.refine_iterations)
-            best = best_of(F, -cost, valid & torch.isfinite(cost)).T.reshape(-1, 3, 3)
-            found = (valid & torch.isfinite(cost)).any(1)
+            best, found = optimum(pairs)
+        weight, scale = _weight(pairs), self.threshold / pairs.pixels_per_unit
         x0, x1 = pairs.points[:2].permute(1, 2, 0), pairs.points[2:].permute(1, 2, 0)
         estimate = attached_step(best, x0, x1, weight, kernel=self.kernel, scale=scale)
         with torch.no_grad():
             inliers = self.inlier_rule(estimate, pairs)
         return estimate, inliers, found, torch.zeros_like(pairs.count)
+
+    def _by_tensors(self, pairs: NormalizedPairs) -> tuple[Float[Tensor, "p 3 3"], Bool[Tensor, " p"]]:
+        """The models of least cost, and which pairs have one."""
+        weight, scale = _weight(pairs), self.threshold / pairs.pixels_per_unit
+        F, valid = self._first(pairs, weight)
+        start = self._first_scale(F, valid, pairs)
+        for i in range(self.iterations):
+            F = reweighted(F, pairs.points, weight, self.robust, torch.maximum(start * DECAY**i, scale))
+        F, cost = refine_components(F, pairs.points, weight, self.kernel, scale, self.refine_iterations)
+        some = valid & torch.isfinite(cost)
+        return best_of(F, -cost, some).T.reshape(-1, 3, 3), some.any(1)
+
+    def _by_kernels(self, pairs: NormalizedPairs) -> tuple[Float[Tensor, "p 3 3"], Bool[Tensor, " p"]]:
+        """The same, pair by pair."""
+        decays = [DECAY**i for i in range(self.iterations)]
+        found = [
+            one_pair.optimum(
+                pair, self.kernel, self.threshold / pair.pixels_per_unit, self.starts, self.start_scale, decays,
+                self.refine_iterations,
+            )
+            for pair in each_pair(pairs)
+        ]  # fmt: skip
+        return torch.from_numpy(np.stack([F for F, _ in found])), torch.tensor([there for _, there in found])
 
     def _first(self, pairs: NormalizedPairs, weight: Tensor) -> tuple[Float[Tensor, "9 p k"], Bool[Tensor, "p k"]]:
         """The 8-point algorithm on all matches, with each power of the weights, and whether these determine a model."""

@@ -37,8 +37,8 @@ def evaluate(
             for i in range(WIDTH):
                 sums[q, i] = 0.0
         for first in range(0, len(weight), WIDTH):
-            _linearise(F[k], points, weight, s2, first, block)
-            _robust(block, loss, table)
+            linearise(F[k], points, weight, s2, first, block)
+            robust(block, loss, table)
             for i in range(WIDTH):
                 costs[i] += block[LOSS, i] * block[COUNT, i]
             if derivatives:
@@ -57,7 +57,7 @@ def evaluate(
 
 
 @inner
-def _linearise(f: Array, points: Array, weight: Array, s2: Array, first: int, block: Array) -> None:
+def linearise(f: Array, points: Array, weight: Array, s2: Array, first: int, block: Array) -> None:
     """Jacobian, residual and what belongs to them of the matches from `first` on; weight zero where there are none."""
     f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
     J0, J1, J2, J3, J4, J5, J6, J7, J8 = (
@@ -88,7 +88,7 @@ def _linearise(f: Array, points: Array, weight: Array, s2: Array, first: int, bl
 
 
 @inner
-def _robust(block: Array, loss: int, table: Array) -> None:
+def robust(block: Array, loss: int, table: Array) -> None:
     """The losses; and what the products of derivatives are weighted with, in place of the inverse slopes."""
     R, S, L, W, V = block[SQUARED], block[SCALE], block[LOSS], block[COUNT], block[INVERSE]
     if loss == TRUNCATED:

@@ -1,6 +1,6 @@
 """Kernels and their tensor forms, interleaved: milliseconds of processor time a call, and seconds to compile each.
 
-    python -m scripts.benchmark.kernels [pruning] [search] [refinement]
+    python -m scripts.benchmark.kernels [pruning] [search] [refinement] [estimators]
 
 On synthetic matches of one pair. Processor time, which other work on the machine disturbs less than the time on the
 wall; compiled into an empty cache folder.
@@ -28,6 +28,7 @@ REPEATS = 15
 PRUNERS = (
     "frame_consistency", "position_consistency", "match_noise", "ratio_prior", "one_to_one", "gms", "gms_soft", "lpm",
 )  # fmt: skip
+ESTIMATORS = ("ransac", "msac", "lmeds", "usac", "magsac", "gc_ransac", "cf_ransac", "irls_magsac")
 
 
 def main(groups: list[str]) -> None:
@@ -36,7 +37,7 @@ def main(groups: list[str]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         os.environ["FMTORCH_CACHE"] = folder
         c = framed(correspondences(COUNT))
-        measured = {"pruning": pruning, "search": search, "refinement": refinement}
+        measured = {"pruning": pruning, "search": search, "refinement": refinement, "estimators": estimators}
         for group in groups or list(measured):
             measured[group](c)
 
@@ -186,6 +187,19 @@ def refinement(c: Correspondences) -> None:
     many, ones, out = rng.uniform(-1, 1, (4, COUNT)), np.ones(COUNT), np.empty(9)
     x0, x1 = (torch.from_numpy(x.T.copy()) for x in (many[:2], many[2:]))
     line("weighted eight-point", lambda: weighted_eight_point(many, ones, out), lambda: eight_point(x0, x1))
+
+
+def estimators(c: Correspondences) -> None:
+    """Whole estimators; the seconds are those of kernels that none before it has compiled."""
+    for name in ESTIMATORS:
+        estimator = presets.build("estimator", name)
+
+        def run(form: str, estimator: Any = estimator) -> None:
+            os.environ[kernels.SWITCH] = form
+            estimator(c)
+
+        line(name, functools.partial(run, "on"), functools.partial(run, "off"))
+    os.environ[kernels.SWITCH] = "on"
 
 
 if __name__ == "__main__":
