@@ -11,6 +11,7 @@ from fmtorch.features.patch_sift import PatchSIFT, sift_of_patches
 from fmtorch.features.patches import ImagePyramid
 from fmtorch.features.rootsift_pca import RootSIFTPCA, learn_projection
 from fmtorch.features.sift import SIFT, keypoints_to_lafs, root_sift
+from fmtorch.features.vlfeat_sift import VLFeatSIFT
 
 __all__ = [
     "ASIFT",
@@ -25,6 +26,7 @@ __all__ = [
     "NetworkShape",
     "PatchSIFT",
     "RootSIFTPCA",
+    "VLFeatSIFT",
     "dominant_gradient",
     "frame_scale",
     "keypoints_to_lafs",
