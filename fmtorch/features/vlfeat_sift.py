@@ -46,7 +46,8 @@ class VLFeatSIFT:
         """The features of a grey (H, W) or RGB (H, W, 3) uint8 image; none, with N = 0, where nothing is found.
 
         lafs: half side `FRAME_SIGMAS` sigma. scores: sigma in pixels, as VLFeat tells no contrast. descriptors:
-        (N, 128) float32, whole numbers from 0 to 255 unless `root`. Raises ValueError for another type, shape or an empty image.
+        (N, 128) float32, whole numbers from 0 to 255 unless `root`. Raises ValueError for another type, shape or an
+        empty image.
         """
         grey = as_grey(image)
         size = torch.tensor(grey.shape, dtype=torch.int64)
