@@ -13,6 +13,7 @@ from fmtorch.estimators import HypothesizeAndVerify, final_fits, pool, saturated
 from fmtorch.estimators.engine import Form
 from fmtorch.estimators.inliers import WithinThreshold
 from fmtorch.estimators.models import Pool
+from fmtorch.estimators.one_pair import ahead
 from fmtorch.estimators.one_pair.focal.cameras import CentredPair, TwoCameras
 from fmtorch.estimators.one_pair.focal.selection import Candidates
 from fmtorch.estimators.one_pair.models import Pool as PoolOfOne
@@ -23,6 +24,7 @@ from fmtorch.estimators.one_pair.selection import Selection, scored
 from fmtorch.estimators.pairs import NormalizedPairs
 from fmtorch.estimators.registry import kernel_form
 from fmtorch.estimators.scores import score_models
+from fmtorch.kernels import Kernel
 from fmtorch.random import Stream
 from fmtorch.types import Correspondences, collate
 from tests.conftest import oracle
@@ -252,3 +254,17 @@ def test_few_matches_of_any_scale_are_sound(name: str, factor: float) -> None:
         else:
             assert alone.reason[0]
             assert not bool(alone.F.any())
+
+
+def test_the_kernels_that_are_compiled_together_are_those_that_are_called(monkeypatch: pytest.MonkeyPatch) -> None:
+    called: set[Kernel] = set()
+
+    def recorded(self: Kernel, *args: object) -> object:
+        called.add(self)
+        return self.compiled()(*args)
+
+    monkeypatch.setattr(Kernel, "__call__", recorded)
+    estimator = presets.build("estimator", "fmtorch")
+    for c in (scene(0, 300), scene(0, 300, outliers=0.8).replace(size1=torch.tensor([[700, 900]]))):
+        estimator(c)
+    assert called == set(ahead.FOCAL)
