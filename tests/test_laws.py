@@ -37,7 +37,8 @@ COMPILED = (  # pruners of two forms: a kernel, and tensors
     "frame_consistency", "gms", "gms_soft", "lpm", "lpm_soft", "match_noise", "one_to_one", "position_consistency",
 )  # fmt: skip
 KERNEL_FORM = (  # wholes of kernels
-    "fmtorch", "fmtorch_max", "lmeds", "lmeds_eight_point", "msac", "ransac", "ransac_eight_point",
+    "fmtorch", "fmtorch_max", "gc_ransac", "lmeds", "lmeds_eight_point", "magsac", "msac", "ransac",
+    "ransac_eight_point", "usac",
 )  # fmt: skip
 TILES = [  # what bounds memory and fills caches, and must change no result
     (solvers, "CPU_SAMPLES", 150), (hypotheses, "CPU_SAMPLES", 150), (scores, "CPU_TILE", 1000),

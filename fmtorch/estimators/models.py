@@ -99,6 +99,10 @@ class Pool:
         """So many samples were drawn until now for each of these rows."""
         self.draws[torch.as_tensor(rows, device=self.score.device)] = draws
 
+    def best_score(self, rows: Sequence[int]) -> Float[Tensor, " q"]:
+        """The score of the best model of each of these rows, minus infinity where there is none."""
+        return self.score[torch.as_tensor(rows, device=self.score.device), 0]
+
     def best(self, rows: Sequence[int]) -> tuple[Float[Tensor, "9 q"], Int[Tensor, " q"]]:
         """The best model of each of these rows, zero where there is none, and the samples drawn."""
         index = torch.as_tensor(rows, device=self.score.device)

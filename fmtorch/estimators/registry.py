@@ -51,8 +51,8 @@ PARTS: dict[str, dict[str, Entry]] = {
         "magsac": Entry(SigmaConsensus, "scores.SigmaConsensus"),
         "median": Entry(Median, "scores.Median"),
     },
-    "degeneracy": {"degensac": Entry(Degensac)},
-    "local_optimization": {"graph_cut": Entry(GraphCut)},
+    "degeneracy": {"degensac": Entry(Degensac, "degeneracy.Degensac")},
+    "local_optimization": {"graph_cut": Entry(GraphCut, "graph_cut.GraphCut")},
     "inliers": {
         "threshold": Entry(WithinThreshold, "inliers.WithinThreshold"),
         "median": Entry(BetterHalf, "inliers.BetterHalf"),
@@ -62,7 +62,7 @@ PARTS: dict[str, dict[str, Entry]] = {
         "none": Entry(NoFit, "final_fits.NoFit"),
         "least_squares": Entry(LeastSquares, "final_fits.LeastSquares"),
         "unweighted_least_squares": Entry(UnweightedLeastSquares, "final_fits.LeastSquares"),
-        "gauss_newton": Entry(GaussNewton),
+        "gauss_newton": Entry(GaussNewton, "final_fits.GaussNewton"),
         "adaptive": Entry(AdaptiveGaussNewton, "final_fits.AdaptiveGaussNewton"),
     },
 }
@@ -95,11 +95,14 @@ def part(role: str, spec: Any, **context: Any) -> Any:
     return make(**({key: value for key, value in context.items() if key in known} | options))
 
 
-def kernel_form(made: object) -> Any:
-    """The kernel form of a part, with the same options; None where there is none, as of a user's own part."""
+def kernel_form(made: object, *others: object) -> Any:
+    """The kernel form of a part, with the same options; None where there is none, as of a user's own part.
+
+    others: parts in their kernel form that this one calls.
+    """
     for entries in PARTS.values():
         for entry in entries.values():
             if entry.tensor is type(made) and entry.kernel is not None:
                 module, _, name = entry.kernel.partition(".")
-                return pkgutil.resolve_name(f"fmtorch.estimators.one_pair.{module}:{name}")(made)
+                return pkgutil.resolve_name(f"fmtorch.estimators.one_pair.{module}:{name}")(made, *others)
     return None

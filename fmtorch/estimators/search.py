@@ -8,7 +8,6 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 
-from fmtorch.estimators.degeneracy import Degensac
 from fmtorch.estimators.models import Models, Pool
 from fmtorch.estimators.pairs import NormalizedPairs
 
@@ -46,7 +45,7 @@ class Search:
     hypotheses: int
     round: int
     confident: Confident | None = None
-    degeneracy: Degensac | None = None
+    degeneracy: Any = None  # a Degensac, or its kernel form
     nothing: Callable[[Any, int], Any] = Pool.of
 
     def __call__(self, pairs: NormalizedPairs) -> Pool:
@@ -65,7 +64,7 @@ class Search:
             some = pairs.only(active)
             models = self.verify(self.generator(some, start, count), some)
             if self.degeneracy is not None:
-                models = self.degeneracy(models, pool.score[torch.as_tensor(active, device=pairs.row.device), 0], some)
+                models = self.degeneracy(models, pool.best_score(active), some)
             start += count
             pool.merge(active, models)
             pool.drawn(active, start)

@@ -25,7 +25,7 @@ def adjugate(H: Array, A: Array) -> None:
 
 
 @inner
-def maps(H: Array, x: float, y: float, u: float, v: float, limit: float) -> bool:
+def maps(H: Array, x: float, y: float, u: float, v: float, limit: float) -> Any:
     """Whether H maps (x, y) to within a squared distance of (u, v)."""
     depth = H[6] * x + H[7] * y + H[8]
     du = (H[0] * x + H[1] * y + H[2]) / depth - u

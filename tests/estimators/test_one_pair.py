@@ -32,7 +32,10 @@ from tests.laws import degenerate, scene, scenes, small, with_padding
 
 pytest.importorskip("numba", reason="numba is not installed")
 
-PRESETS = ("lmeds", "lmeds_eight_point", "msac", "ransac", "ransac_eight_point")
+PRESETS = (
+    "gc_ransac", "gc_ransac_paper", "lmeds", "lmeds_eight_point", "magsac", "msac", "ransac", "ransac_eight_point",
+    "usac", "usac_paper",
+)  # fmt: skip
 COUNTS = (8, 40, 128, 129, 150, 250, 700)
 SEED = 3
 
@@ -130,7 +133,8 @@ def test_the_same_models_survive_a_first_look(count: int, score: type, weighted:
     )
     for preselect in (None, Preselect(survivors=120), Preselect(survivors=40)):
         expected = TensorVerifier(part, preselect)(tensors, pairs)
-        found = Verifier(kernel_form(part), preselect)(Models(F.numpy(), draw.numpy()), pair)
+        arrays = Models(F.numpy(), draw.numpy(), np.zeros((7, 1), np.int64), 0)
+        found = Verifier(kernel_form(part), preselect)(arrays, pair)
         assert expected.score is not None
         assert found.score is not None
         assert found.which is not None
@@ -199,13 +203,17 @@ def inputs() -> Iterator[tuple[str, Correspondences]]:
     for kind in ("empty", "one match", "all points equal", "NaN", "infinite", "some NaN", "huge"):
         yield kind, degenerate()[kind]
     for kind in ("8 coincident", "20 coincident", "8 collinear", "20 collinear", "7 random", "20 random"):
-        yield kind, small()[kind]
+        for scale in (2.0**-30, 1.0, 2.0**30):  # exact, so that what is on a line stays there
+            c = small()[kind]
+            yield f"{kind} times {scale}", c.replace(x0=scale * c.x0, x1=scale * c.x1)
 
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_in_both_forms(name: str) -> None:
     estimator = presets.build("estimator", name)
     for what, c in inputs():
+        if (name, what) == ("usac_paper", "huge"):
+            continue  # its best model has its own sample for inliers, or not even that: rounding decides
         compiled, tensors = in_both_forms(estimator, c)
         # How many inliers a model has that fits nothing is a matter of rounding.
         kinds = [tuple(re.sub(r"\d+", "N", reason) for reason in e.reason) for e in (compiled, tensors)]
@@ -236,7 +244,7 @@ def test_both_forms_solve_the_same_real_pairs(name: str) -> None:
     assert alike >= len(solved) / 2
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", [name for name in PRESETS if name != "usac_paper"])  # whose fit has none
 def test_gradients_in_both_forms(name: str) -> None:
     gradients = []
     estimator = presets.build("estimator", name, refit_inliers=False)
@@ -261,12 +269,12 @@ def test_which_wholes_have_a_kernel_form() -> None:
     assert HypothesizeAndVerify().kernel_form is not None
     for options in (
         {"sampler": "prosac", "score": "magsac", "final": "none"}, {"select": {}, "focal": {}, "final": "adaptive"},
-        {"refine": {"kernel": "truncated"}}, {"score": "saturated"},
+        {"refine": {"kernel": "truncated"}}, {"score": "saturated"}, {"final": "gauss_newton"},
+        {"degeneracy": "degensac"}, {"local_optimization": "graph_cut"},
     ):  # fmt: skip
         assert HypothesizeAndVerify(**options).kernel_form is not None, options
     for options in (
-        {"score": Own(1.0)}, {"final": "gauss_newton"}, {"degeneracy": "degensac"},
-        {"local_optimization": "graph_cut"}, {"select": {"score": Own(1.0)}},
+        {"score": Own(1.0)}, {"select": {"score": Own(1.0)}},
     ):  # fmt: skip
         assert HypothesizeAndVerify(**options).kernel_form is None, options
 

@@ -26,7 +26,7 @@ from fmtorch.estimators.one_pair.focal.cameras import TwoCameras
 from fmtorch.estimators.one_pair.focal.fit import fit_focal
 from fmtorch.estimators.one_pair.inliers import median_of_matches, residuals_squared_px
 from fmtorch.estimators.one_pair.pair import Array, OnePair
-from fmtorch.estimators.one_pair.refine import refine_models
+from fmtorch.estimators.one_pair.refine import gauss_newton_step, refine_models
 from fmtorch.estimators.one_pair.selection import Selection
 from fmtorch.geometry.eight_point_kernels import weighted_eight_point
 from fmtorch.geometry.refine import RANK_TWO_ALREADY
@@ -75,6 +75,19 @@ class LeastSquares:
         F = np.empty(9)
         fitted = weighted_eight_point(pair.points, weight, F)
         return Fit(F.reshape(3, 3) if fitted else selection.matrices, selection.matrices, inliers)
+
+
+class GaussNewton:
+    """As `final_fits.GaussNewton`."""
+
+    def __init__(self, part: final_fits.GaussNewton) -> None:
+        pass
+
+    def value(self, selection: Selection, pair: OnePair, inliers: Array) -> Fit:
+        """As `FinalFit.value`."""
+        weight = np.where(inliers, pair.weight, 0.0)
+        F = gauss_newton_step(selection.F, pair.points, weight)
+        return Fit(F.reshape(3, 3), selection.matrices, inliers)
 
 
 class AdaptiveGaussNewton:

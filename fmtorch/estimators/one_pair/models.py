@@ -15,13 +15,21 @@ from fmtorch.estimators.pool_kernels import merge
 class Models:
     """Hypotheses of one round in the order of their draws: F (m, 9) float32, and the draw (m,) that each is made of.
 
-    which: (k,), those that are left once verified, in their order. score: theirs, (k,); larger is better.
+    samples: (size, s), the matches of the draws start, start + 1, ... which: (k,), the models that are left once
+    verified, in their order. score: theirs, (k,); larger is better.
     """
 
     F: Array
     draw: Array
+    samples: Array
+    start: int
     which: Array | None = None
     score: Array | None = None
+
+    def sample_of(self, draw: int) -> Array:
+        """The matches (size,) of a draw."""
+        sample: Array = self.samples[:, draw - self.start]
+        return sample
 
 
 @dataclasses.dataclass(eq=False)
@@ -65,6 +73,10 @@ class Pool:
     def drawn(self, rows: Sequence[int], draws: int) -> None:
         """So many samples were drawn until now."""
         self.draws = draws
+
+    def best_score(self, rows: Sequence[int]) -> float:
+        """The score of the best model, minus infinity where there is none."""
+        return float(self.score[0])
 
     def best(self, rows: Sequence[int]) -> tuple[Array, int]:
         """The best model (9,), zero where there is none, and the samples drawn."""

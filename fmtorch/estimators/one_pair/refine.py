@@ -9,6 +9,8 @@ import numpy as np
 from fmtorch.estimators.one_pair.pair import Array, OnePair
 from fmtorch.geometry import rank2_manifold_kernels as manifold
 from fmtorch.geometry.levenberg_marquardt import levenberg_marquardt
+from fmtorch.geometry.optimum import STEP_DAMPING
+from fmtorch.geometry.rank2_manifold import SQUARINGS
 from fmtorch.geometry.refine import DAMPING
 from fmtorch.geometry.sampson_objective_kernels import LOSSES, evaluate
 from fmtorch.geometry.sigma_consensus import LOSS_TABLE
@@ -75,3 +77,14 @@ def refine_models(
     manifold.start(F, squarings, *start)
     state = levenberg_marquardt(objective, start, iterations)
     return np.where(np.isfinite(state.cost)[:, None], state.F, F)
+
+
+def gauss_newton_step(F: Array, points: Array, weight: Array) -> Array:
+    """The model (9,) of unit norm after the step of `geometry.attached_step`; itself where there is none."""
+    squared_scale = np.full(len(weight), np.inf)
+    objective = RankTwoObjective(points, weight, "truncated", squared_scale, None, STEP_DAMPING)
+    start = np.empty((1, 9)), np.empty((1, 3)), np.empty((1, 3))
+    manifold.start(F[None], SQUARINGS, *start)
+    state = objective.evaluate(start, True)
+    moved: Array = objective.step(state, objective.begin(state)[0])[0][0]
+    return moved if np.isfinite(moved).all() else F

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 
+from fmtorch.estimators.one_pair.graph_cut import LocalOptimization
 from fmtorch.estimators.one_pair.models import Pool
 from fmtorch.estimators.one_pair.pair import Array, OnePair
 from fmtorch.estimators.one_pair.pool import shuffled
@@ -17,10 +18,10 @@ from fmtorch.random import Stream
 
 
 class PoolRefinement:
-    """As `refinement.PoolRefinement`, without local optimisation."""
+    """As `refinement.PoolRefinement`."""
 
-    def __init__(self, refine: Refine | None) -> None:
-        self.refine = refine
+    def __init__(self, refine: Refine | None, local_optimization: LocalOptimization | None = None) -> None:
+        self.refine, self.local_optimization = refine, local_optimization
 
     def near(self, pool: Pool, pair: OnePair) -> OnePair:
         """As `refinement.PoolRefinement.near`."""
@@ -31,6 +32,8 @@ class PoolRefinement:
     def __call__(self, pool: Pool, pair: OnePair) -> Pool:
         """As `refinement.PoolRefinement`."""
         F, near = pool.models, self.near(pool, pair)
+        if self.local_optimization is not None:
+            F = self.local_optimization(F, pair)
         if (refine := self.refine) is not None:
             F = refine_models(F, near, refine.kernel, refine.scale, refine.iterations, RANK_TWO_ALREADY)
         return dataclasses.replace(pool, F=F, near=near)

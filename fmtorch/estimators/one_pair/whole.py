@@ -33,8 +33,8 @@ def whole(form: Form) -> Form | None:
         return None
 
 
-def _part(made: Any) -> Any:
-    found = kernel_form(made)
+def _part(made: Any, *others: Any) -> Any:
+    found = kernel_form(made, *others)
     if found is None:
         raise TensorsOnly(type(made).__name__)
     return found
@@ -48,12 +48,13 @@ def _verbs(parts: Any) -> Verbs:
 
 
 def _search(search: Search, generator: Any, sampler: Any) -> Search:
-    if search.degeneracy is not None:
-        raise TensorsOnly(type(search.degeneracy).__name__)
     tensor_verify: Any = search.verify
-    verify = Verifier(_part(tensor_verify.score), tensor_verify.preselect)
-    confident = _confident(search.confident, sampler)
-    return dataclasses.replace(search, generator=generator, verify=verify, confident=confident, nothing=Pool.of)
+    score, confident = _part(tensor_verify.score), _confident(search.confident, sampler)
+    verify = Verifier(score, tensor_verify.preselect)
+    check = None if search.degeneracy is None else _part(search.degeneracy, score)
+    return dataclasses.replace(
+        search, generator=generator, verify=verify, confident=confident, degeneracy=check, nothing=Pool.of
+    )
 
 
 def _confident(rule: Any, sampler: Any) -> Any:
@@ -64,9 +65,10 @@ def _confident(rule: Any, sampler: Any) -> Any:
 def _refinement(part: refinement.PoolRefinement | refinement.AsFound) -> PoolRefinement | AsFound:
     if isinstance(part, refinement.AsFound):
         return AsFound()
-    if part.local_optimization is not None:
-        raise TensorsOnly(type(part.local_optimization).__name__)
-    return PoolRefinement(part.refine)
+    optimization: Any = part.local_optimization
+    if optimization is not None:
+        optimization = _part(optimization, _part(optimization.score))
+    return PoolRefinement(part.refine, optimization)
 
 
 def _selector(part: Any) -> Any:
