@@ -11,6 +11,7 @@ from fmtorch import __version__
 COMMANDS = {
     "eval": "run a pipeline over a data set of image pairs and evaluate it",
     "match": "the fundamental matrix of two photographs, with pictures: fmtorch match a.jpg b.jpg",
+    "pairs": "which pairs of images with known cameras can be matched, as a data set",
     "report": "compare runs of eval on one HTML page",
     "train": "train a learned pruner on labelled matches of a data set",
 }

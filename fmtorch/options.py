@@ -8,8 +8,10 @@ import enum
 import inspect
 import math
 import os
+import sys
 import types
 import typing
+from collections import ChainMap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -152,14 +154,19 @@ def nearest(name: str, names: Iterable[str]) -> str:
 
 
 def _annotations(target: Callable[..., Any]) -> dict[str, Any]:
-    """The annotations of a target's parameters; without those that cannot be resolved."""
+    """The annotations of a target's parameters; without those that cannot be resolved.
+
+    Those of a dataclass's fields may stand in a base of it, in whose module they mean something.
+    """
     function = inspect.unwrap(target.__init__ if isinstance(target, type) else target)  # type: ignore[misc]
     names = getattr(function, "__globals__", {})
+    bases = [vars(sys.modules[base.__module__]) for base in target.__mro__] if isinstance(target, type) else []
+    known = ChainMap(*bases)
     found = {}
     for name, annotation in getattr(function, "__annotations__", {}).items():
         if isinstance(annotation, str):
             try:
-                annotation = eval(annotation, names)
+                annotation = eval(annotation, names, known)
             except (
                 Exception
             ):  # any expression may stand there, of names that only type checkers see too: taken on trust

@@ -109,14 +109,42 @@ def match(
     elif device is not None and torch.device(device) != pipeline.device:
         raise ValueError(f"device={device}, but the pipeline was built for {pipeline.device}; leave one of them out")
     images = [_image(image, name) for image, name in ((image0, "image0"), (image1, "image1"))]
+    described0, described1 = (describe(pipeline, image, longest_side) for image in images)
+    return relate(pipeline, described0, described1, seed)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Described:
+    """A photograph's features in pixels of it as it was reduced, the scale of that in x and y, and its size (h, w).
+
+    seconds: that describing it takes or took.
+    """
+
+    features: Features
+    scale: Float[Tensor, " xy"]
+    size: tuple[int, int]
+    seconds: float
+
+    @property
+    def points(self) -> Float[Tensor, "n 2"]:
+        """The keypoints in pixels of the photograph."""
+        return _to_original(self.features.keypoints, self.scale.to(self.features.keypoints))
+
+
+def describe(pipeline: Pipeline, image: Image, longest_side: int) -> Described:
+    """The features of a photograph, for `relate`; see `match`."""
+    reduced, scale = _reduced(image, longest_side)
+    features, seconds = pipeline.extract(reduced)
+    return Described(features, scale, (image.shape[0], image.shape[1]), seconds)
+
+
+def relate(pipeline: Pipeline, described0: Described, described1: Described, seed: int = 0) -> MatchResult:
+    """What `match` finds of two photographs that are described already."""
     clock = _Clock(pipeline.device)
-    reduced = [_reduced(image, longest_side) for image in images]
-    (features0, seconds0), (features1, seconds1) = (pipeline.extract(image) for image, _ in reduced)
-    clock("features", seconds0 + seconds1)
-    scales = [scale for _, scale in reduced]
-    sizes = [torch.tensor([image.shape[:2]], device=pipeline.device) for image in images]
-    found = _relate(pipeline, features0, features1, seed, clock)
-    return _restored(found, scales, sizes)
+    clock("features", described0.seconds + described1.seconds)
+    found = _relate(pipeline, described0.features, described1.features, seed, clock)
+    sizes = [torch.tensor([d.size], device=pipeline.device) for d in (described0, described1)]
+    return _restored(found, [described0.scale, described1.scale], sizes)
 
 
 @functools.lru_cache(maxsize=8)
@@ -196,24 +224,28 @@ def _restored(found: MatchResult, scales: list[Tensor], sizes: list[Tensor]) -> 
     A0, A1 = (A.to(found.F) for A in to_reduced)
     s0, s1 = (s.to(found.keypoints0) for s in scales)
 
-    def points(x: Tensor, s: Tensor) -> Tensor:
-        return x / s + (1 - s) / (2 * s)  # exactly x where nothing was reduced
-
     def frames(lafs: Tensor | None, s: Tensor) -> Tensor | None:
-        return None if lafs is None else torch.cat([lafs[..., :2] / s[:, None], points(lafs[..., 2:].mT, s).mT], -1)
+        return (
+            None if lafs is None else torch.cat([lafs[..., :2] / s[:, None], _to_original(lafs[..., 2:].mT, s).mT], -1)
+        )
 
     def matches(c: Correspondences) -> Correspondences:
         return c.replace(
-            x0=points(c.x0, s0), x1=points(c.x1, s1), lafs0=frames(c.lafs0, s0), lafs1=frames(c.lafs1, s1),
+            x0=_to_original(c.x0, s0), x1=_to_original(c.x1, s1), lafs0=frames(c.lafs0, s0), lafs1=frames(c.lafs1, s1),
             size0=sizes[0], size1=sizes[1],
         )  # fmt: skip
 
     return dataclasses.replace(
         found,
-        keypoints0=points(found.keypoints0, s0), keypoints1=points(found.keypoints1, s1),
+        keypoints0=_to_original(found.keypoints0, s0), keypoints1=_to_original(found.keypoints1, s1),
         putative=matches(found.putative), correspondences=matches(found.correspondences),
         F=unit_frobenius(A1.T @ found.F @ A0),
     )  # fmt: skip
+
+
+def _to_original(x: Tensor, s: Tensor) -> Tensor:
+    """Points of a reduced image in pixels of the original; exactly x where nothing was reduced."""
+    return x / s + (1 - s) / (2 * s)
 
 
 class _Clock:

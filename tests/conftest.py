@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from pathlib import Path
 
@@ -9,9 +10,22 @@ import numpy as np
 import pytest
 import torch
 
+from fmtorch.kernel_cache import kernels_dir
+
 torch.set_num_threads(1)
 
 SHARED = Path(os.environ.get("FMTORCH_TEST_DATA", Path(__file__).resolve().parents[2] / "shared"))
+KERNELS = kernels_dir()  # before any test sets $FMTORCH_CACHE
+
+
+def own_cache(folder: Path) -> Path:
+    """`folder`/cache, for $FMTORCH_CACHE: nobody else's, but for the compiled kernels, which all tests share."""
+    cache = folder / "cache"
+    for path in (cache, KERNELS):
+        path.mkdir(parents=True, exist_ok=True)
+    with contextlib.suppress(FileExistsError):
+        (cache / "kernels").symlink_to(KERNELS, target_is_directory=True)
+    return cache
 
 
 def shared_path(relative: str) -> Path:

@@ -62,7 +62,7 @@ def quick_pruner(name: str) -> Pruner:
     """A pruner preset; a learned one with a small untrained network, on which the laws do not depend."""
     network = presets.load("pruner", name).get("network")
     torch.manual_seed(7)  # with which about half of the matches have P > 0.5
-    small = {} if network is None else {"file": None, "network": SMALL_NETWORKS[network["_target_"]]}
+    small: dict[str, Any] = {} if network is None else {"file": None, "network": SMALL_NETWORKS[network["_target_"]]}
     built: Pruner = presets.build("pruner", name, **small)
     return built
 
@@ -136,6 +136,8 @@ def live_values(result: Result, c: Correspondences) -> Result:
 def degenerate() -> dict[str, Correspondences]:
     """Pairs that no estimator can solve, or only by luck."""
     good = scene(3)
+    quality = good.quality
+    assert quality is not None
     n = good.x0.shape[1]
     line = torch.linspace(0, 600, n)
     collinear = torch.stack([line, 0.5 * line + 20], -1)[None]
@@ -151,7 +153,7 @@ def degenerate() -> dict[str, Correspondences]:
         "all outliers": scene(4, outliers=1.0),
         "NaN": good.replace(x0=torch.full_like(good.x0, torch.nan)),
         "some NaN": good.replace(x1=torch.where(torch.arange(n)[None, :, None] % 3 == 0, torch.nan, good.x1)),
-        "NaN ratio": good.replace(quality=torch.where(torch.arange(n)[None] % 3 == 0, torch.nan, good.quality)),
+        "NaN ratio": good.replace(quality=torch.where(torch.arange(n)[None] % 3 == 0, torch.nan, quality)),
         "infinite": good.replace(x1=torch.full_like(good.x1, torch.inf)),
         "huge": good.replace(x0=good.x0 * 1e6, x1=good.x1 * 1e6),
         "tiny": good.replace(x0=good.x0 * 1e-6, x1=good.x1 * 1e-6),
@@ -175,6 +177,8 @@ def small() -> dict[str, Correspondences]:
         if kind == "half coincident":
             x0[count // 2 :], x1[count // 2 :] = x0[0], x1[0]
         known = scene(count, count)
+        assert known.lafs0 is not None
+        assert known.lafs1 is not None
         lafs0, lafs1 = known.lafs0.clone(), known.lafs1.clone()
         points = [torch.from_numpy(x.astype(np.float32))[None] for x in (x0, x1)]
         lafs0[..., 2], lafs1[..., 2] = points

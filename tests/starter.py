@@ -1,8 +1,8 @@
 """Starts commands quickly: one process imports the libraries, and forks another for each command.
 
-Lines of JSON come in on standard input: ``{"start": [module, arguments ...], "cwd": ..., "log": ..., "environment":
-{...}, "before": code}`` is answered by the process's id, ``{"wait": id}`` by its exit status. What is forked runs a
-module as ``python -m`` does, after the code.
+Lines of JSON come in on standard input: ``{"start": [module, arguments ...], "cwd": ..., "log": ..., "errors": ...,
+"environment": {...}, "before": code}`` is answered by the process's id, ``{"wait": id}`` by its exit status. What is
+forked runs a module as ``python -m`` does, after the code.
 """
 
 from __future__ import annotations
@@ -13,24 +13,26 @@ import os
 import runpy
 import sys
 import traceback
+from typing import Any
 
 LIBRARIES = (
     "torch", "kornia", "cv2", "hydra", "omegaconf", "pyarrow.parquet", "matplotlib.figure", "skimage.io",
-    "rich.progress", "scipy.spatial", "lightning", "lightning.pytorch.loggers", "torch.utils.tensorboard",
+    "rich.progress", "scipy.spatial", "numba", "onnxruntime", "lightning", "lightning.pytorch.loggers",
+    "torch.utils.tensorboard",
 )  # fmt: skip
 
 
-def run(job: dict[str, object]) -> None:
+def run(job: dict[str, Any]) -> None:
     """In the process that was forked: become the command. Never returns."""
     status = 1
     try:
-        log = os.open(str(job["log"]), os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        log, errors = (os.open(str(job[key]), os.O_WRONLY | os.O_CREAT | os.O_APPEND) for key in ("log", "errors"))
         nothing = os.open(os.devnull, os.O_RDONLY)
-        for descriptor, source in ((0, nothing), (1, log), (2, log)):
+        for descriptor, source in ((0, nothing), (1, log), (2, errors)):
             os.dup2(source, descriptor)
-        os.environ.update(job["environment"])  # type: ignore[call-overload]
+        os.environ.update(job["environment"])
         os.chdir(str(job["cwd"]))
-        module, *arguments = job["start"]  # type: ignore[misc]
+        module, *arguments = job["start"]
         sys.argv = [module, *arguments]
         sys.path.insert(0, str(job["cwd"]))
         before = job.get("before")

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
+from tests.processes import run_command
 from tests.test_pipeline import draw
 
 SOURCE = Path(__file__).resolve().parents[1]
 
 
 def benchmark(*arguments: str, cwd: Path) -> str:
-    env = {**os.environ, "PYTHONPATH": str(SOURCE), "COLUMNS": "200", "FMTORCH_CACHE": f"{cwd}/cache"}
-    command = [sys.executable, "-m", "scripts.benchmark", "pipelines", *arguments]
-    result = subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, timeout=300, check=False)
+    result = run_command("scripts.benchmark", "pipelines", *arguments, cwd=cwd)
     assert result.returncode == 0, result.stderr
     return result.stdout
 

@@ -18,7 +18,7 @@ from fmtorch.data import load
 from fmtorch.stages import FeatureExtractor
 from fmtorch.storage.cache import ArrayCache
 from fmtorch.storage.features import CachedFeatures
-from tests.conftest import shared_path
+from tests.conftest import own_cache, shared_path
 from tests.test_eval import OPTIONS, evaluate, rows
 from tests.test_match import run_python
 from tests.test_pipeline import draw
@@ -59,7 +59,7 @@ def arguments(root: Path, run_dir: Path, *extra: str) -> list[str]:
 
 def start(cwd: Path, *arguments: str) -> subprocess.Popen[str]:
     source = str(Path(__file__).resolve().parents[1])
-    env = {**os.environ, "PYTHONPATH": source, "COLUMNS": "200", "FMTORCH_CACHE": f"{cwd}/cache"}
+    env = {**os.environ, "PYTHONPATH": source, "COLUMNS": "200", "FMTORCH_CACHE": str(own_cache(cwd))}
     command = [sys.executable, "-m", "fmtorch.eval", *arguments]
     return subprocess.Popen(command, cwd=cwd, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 

@@ -31,7 +31,7 @@ def test_help_lists_the_commands_without_torch() -> None:
         "from fmtorch.__main__ import main\n"
         "sys.argv = ['fmtorch', '--help']\n"
         "with contextlib.redirect_stdout(io.StringIO()) as told: main()\n"
-        "assert all(f'  {name} ' in told.getvalue() for name in ('eval', 'match', 'report', 'train'))\n"
+        "assert all(f'  {name} ' in told.getvalue() for name in ('eval', 'match', 'pairs', 'report', 'train'))\n"
         "assert not {'torch', 'hydra', 'numpy'} & set(sys.modules)"
     )
 
@@ -49,7 +49,7 @@ def test_a_subcommand_runs_as_its_module_does(tmp_path: Path, monkeypatch: pytes
     options = {"run_name": "__main__", "alter_sys": True}
     assert called == [(("fmtorch.eval",), options, ["/usr/bin/fmtorch", "-m", "seed=1,2"], str(tmp_path))]
     monkeypatch.setattr(sys, "argv", ["fmtorch", "evaluate"])
-    with pytest.raises(SystemExit, match="error: no command 'evaluate'; there are: eval, match, report, train"):
+    with pytest.raises(SystemExit, match="error: no command 'evaluate'; there are: eval, match, pairs, report, train"):
         fmtorch.__main__.main()
 
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from tests.conftest import shared_path
+from tests.processes import run_command
 from tests.test_pipeline import draw
 
 OPTIONS = ["features.max_features=500", "estimator=lmeds", "estimator.hypotheses=200"]
@@ -21,11 +20,7 @@ OPTIONS = ["features.max_features=500", "estimator=lmeds", "estimator.hypotheses
 
 def evaluate(*arguments: str, cwd: Path, environment: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
     """Run the command as a user does, in another directory."""
-    source = str(Path(__file__).resolve().parents[1])
-    own = {"PYTHONPATH": source, "COLUMNS": "200", "FMTORCH_CACHE": f"{cwd}/cache"}
-    env = {**os.environ, **own, **(environment or {})}
-    command = [sys.executable, "-m", "fmtorch.eval", *arguments]
-    return subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, timeout=300, check=False)
+    return run_command("eval", *arguments, cwd=cwd, environment=environment)
 
 
 @pytest.fixture

@@ -165,7 +165,7 @@ def test_hopeless_pairs_have_a_reason(name: str, kind: str) -> None:
 @pytest.mark.parametrize("name", OWN)
 def test_batch_workers_threads_and_tiles_change_nothing(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     estimator = quick(name, 60, 30)
-    pairs = [scene(i, 24 + 53 * i % 120) for i in range(64)]
+    pairs = [scene(i, 24 + 53 * i % 120) for i in range(24)]
 
     def run(some: list[Correspondences]) -> Result:
         e = estimator(collate(some), seed=5)
@@ -182,7 +182,7 @@ def test_batch_workers_threads_and_tiles_change_nothing(name: str, monkeypatch: 
         torch.set_num_threads(threads)
     seven = run(pairs[:7])
     n = seven["inliers"].shape[1]
-    assert_same(seven, first(whole, 7, n), f"{name}: a batch of 7, and one of 64 in four threads")
+    assert_same(seven, first(whole, 7, n), f"{name}: a batch of 7, and one of 24 in four threads")
     with ThreadPoolExecutor(4) as workers:
         for i, alone in enumerate(workers.map(lambda pair: run([pair]), pairs[:7])):
             n_alone = pairs[i].mask.shape[1]

@@ -24,7 +24,8 @@ from fmtorch.geometry import sampson
 from fmtorch.metrics import nsgd
 from fmtorch.resources import conf_dir
 from fmtorch.types import RELATED
-from tests.conftest import shared_path
+from tests.conftest import own_cache, shared_path
+from tests.processes import run_command
 
 ROWS = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # a sideways camera: epipolar lines are rows
 BANDS = (30, 5, 42, 18, 36, 11)  # disparities of bands of the picture, from the top, in 1/640 of its width
@@ -224,7 +225,7 @@ def test_every_pipeline_composes_by_name(name: str, monkeypatch: pytest.MonkeyPa
     for module in ("features.kornia_features", "matching.lightglue"):  # without fetching others' weights
         monkeypatch.setattr(f"fmtorch.{module}.pretrained", lambda load, *_: torch.nn.Identity())
     built = presets.pipeline(name)
-    assert built.pruners or name in ("aliked_lightglue", "disk_lightglue")
+    assert built.pruners or name in ("aliked_lightglue", "disk_lightglue", "given_fmtorch")
 
 
 def test_overrides_and_a_callers_own_hydra() -> None:
@@ -242,8 +243,12 @@ def test_overrides_and_a_callers_own_hydra() -> None:
 
 
 def run_python(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """Run a command as a user does, or other arguments of Python."""
+    if arguments[0] == "-m":
+        name = arguments[1].removeprefix("fmtorch.")
+        return run_command(name, *arguments[2:], cwd=cwd, environment={"CUDA_VISIBLE_DEVICES": ""})
     source = str(Path(__file__).resolve().parents[1])
-    own = {"COLUMNS": "200", "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1", "FMTORCH_CACHE": f"{cwd}/cache"}
+    own = {"COLUMNS": "200", "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1", "FMTORCH_CACHE": str(own_cache(cwd))}
     env = {**os.environ, "PYTHONPATH": source, **own}
     command = [sys.executable, *arguments]
     return subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, timeout=300, check=False)

@@ -134,3 +134,14 @@ def test_a_wrong_option_is_refused_before_anything_within_is_built() -> None:
         presets.instantiate(OmegaConf.create(config), "pruner.mine")
     with pytest.raises(ValueError, match="estimator=fmtorch: hypotheses=many; it must be a whole number"):
         presets.build("estimator", "fmtorch", hypotheses="many")
+
+
+def test_fields_of_a_base_in_another_module_are_checked() -> None:
+    """Their annotations are names of the module where the base is."""
+    from fmtorch.commands.match import Fields
+
+    expect_options(Fields, {"camera": "shared", "longest_side": 800}, "")
+    with pytest.raises(ValueError, match="camera=mine; it must be one of: per_image, shared"):
+        expect_options(Fields, {"camera": "mine"}, "")
+    with pytest.raises(ValueError, match="longest_side=0; it must be a whole number of at least 1"):
+        expect_options(Fields, {"longest_side": 0}, "")

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import re
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +26,7 @@ from fmtorch.pipeline import Outcome
 from fmtorch.presets.composition import compose
 from fmtorch.storage import PairRow, RunFolder, RunFolderError, to_table
 from fmtorch.types import Estimate
+from tests.processes import run_command
 from tests.test_pipeline import draw, pair
 
 OPTIONS = {
@@ -205,11 +204,7 @@ def test_the_command_on_two_runs(tmp_path: Path) -> None:
     (tmp_path / "Set" / "pairs_which_dataset.txt").write_text("scene/\n" * 2)
 
     def command(*arguments: str) -> subprocess.CompletedProcess[str]:
-        source = str(Path(__file__).resolve().parents[1])
-        env = {**os.environ, "PYTHONPATH": source, "COLUMNS": "200", "FMTORCH_CACHE": f"{tmp_path}/cache"}
-        return subprocess.run(
-            [sys.executable, "-m", *arguments], cwd=tmp_path, env=env, capture_output=True, text=True, timeout=300
-        )
+        return run_command(arguments[0].removeprefix("fmtorch."), *arguments[1:], cwd=tmp_path)
 
     for estimator in ("lmeds", "msac"):
         evaluated = command(

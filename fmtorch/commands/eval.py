@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
@@ -13,11 +14,14 @@ from rich.progress import Progress
 
 from fmtorch import data, presets
 from fmtorch.commands.main import job, run_command
-from fmtorch.data import PairDataset
+from fmtorch.data import ImagePair, PairDataset
+from fmtorch.evaluation.exporting import exportable
 from fmtorch.evaluation.identity import run_identity
 from fmtorch.evaluation.plots import plot_recall_curves
 from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import ALL, pose_table, summarize, summary_markdown, summary_table
+from fmtorch.exchange.export import export_kinds, write_exports
+from fmtorch.exchange.journal import Journal
 from fmtorch.fields import Cache, Count, Device, Gigabytes, Seed, path_fields, read_fields
 from fmtorch.presets import plain
 from fmtorch.storage import RunFolder, identity_digest
@@ -41,6 +45,7 @@ class Fields:
     run_dir: Path | None = None
     cache: Cache = None
     cache_limit: Gigabytes | None = 20
+    export: str | list[str] | None = None
 
 
 def run(config: DictConfig, pipeline_name: str) -> Path:
@@ -50,6 +55,7 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
     """
     fields = read_fields(Fields, config)
     device = presets.resolve_device(fields.device)
+    kinds = export_kinds(fields.export)
     presets.expect_dataset(config.dataset)
     presets.expect_stages(config)
     with progress_bars() as progress:
@@ -60,7 +66,8 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
         folder = RunFolder.open(fields.run_dir or Path(f"runs/{dataset.name}/{name}"), identity)
         chosen = select([dataset[i] for i in range(len(dataset))], fields.limit)
         done = folder.done()
-        todo = [pair for pair in chosen if pair.key not in done]
+        journal = _journal(folder.path, chosen) if kinds else None
+        todo = [p for p in chosen if p.key not in done or (journal is not None and _to_export(journal, p))]
         processes = len(todo) >= MANY if fields.processes is None else fields.processes
         processes = processes and device.type == "cpu"
         cores = os.cpu_count() or 1
@@ -68,8 +75,9 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
         bar = progress.add_task(pipeline_name, total=len(chosen), completed=len(chosen) - len(todo))
         build = functools.partial(presets.build_pipeline, config, device) if processes and workers > 1 else None
         for count in evaluate_pairs(
-            pipeline, todo, seed=fields.seed, batch=fields.batch, workers=workers, store=folder.append, build=build
-        ):
+            pipeline, todo, seed=fields.seed, batch=fields.batch, workers=workers, store=folder.append, build=build,
+            journal=journal,
+        ):  # fmt: skip
             progress.advance(bar, count)
     if len(todo) < len(chosen):
         taken = f"{len(chosen) - len(todo)} of {len(chosen)} pairs taken from an earlier run in {folder.path}"
@@ -83,6 +91,10 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
     if (poses := pose_table(summary)) is not None:
         console.print(poses)
     console.print(f"[dim]{folder.path}: pairs/, summary.json, summary.md, recall.png[/dim]")
+    if journal is not None:
+        ends = [(p.image0.path, p.image1.path) for p in chosen if exportable(p)]
+        written = write_exports(journal, ends, kinds, folder.path)
+        console.print(f"[dim]{folder.path}: {', '.join(written)}; names of images are below {journal.root}[/dim]")
     if isinstance(pipeline.extractor, CachedFeatures):
         console.print(f"[dim]{pipeline.extractor.report()}[/dim]")
     if chosen and summary[ALL]["failures"] == len(chosen):
@@ -91,6 +103,20 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
             f"every pair failed, the first because: {reason}. Once that is mended, delete {folder.path} to run again"
         )
     return folder.path
+
+
+def _journal(folder: Path, pairs: Sequence[ImagePair]) -> Journal:
+    """Where what is to be exported is kept. Raises ValueError where no pair has images to name."""
+    parents = {str(image.path.absolute().parent) for p in pairs if exportable(p) for image in (p.image0, p.image1)}
+    if not parents:
+        raise ValueError("export: no pair has images in which a pipeline finds keypoints")
+    return Journal(folder / "export", Path(os.path.commonpath(sorted(parents))))
+
+
+def _to_export(journal: Journal, pair: ImagePair) -> bool:
+    """Whether a pair's matches are not in the journal yet, and its images are there."""
+    ends = pair.image0.path, pair.image1.path
+    return exportable(pair) and all(path.is_file() for path in ends) and not journal.has_pair(*ends)
 
 
 def _load(config: DictConfig, progress: Progress) -> PairDataset:
@@ -110,5 +136,5 @@ def task(config: DictConfig) -> None:
 
 def main() -> None:
     """The command."""
-    paths = [*path_fields(Fields), "dataset.root", "dataset.truth", "dataset.images"]
+    paths = [*path_fields(Fields), "dataset.root", "dataset.truth", "dataset.images", "export"]
     run_command("eval", task, paths=paths, interrupted="interrupted; the same command continues the run")

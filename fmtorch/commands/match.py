@@ -20,9 +20,11 @@ from rich.table import Table
 
 from fmtorch import __version__, presets
 from fmtorch.commands.main import job, run_command
+from fmtorch.commands.match_folder import FolderFields, match_folder
 from fmtorch.data import read_image
 from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_matches
-from fmtorch.fields import Cache, Count, Device, Gigabytes, Seed, path_fields, read_fields
+from fmtorch.fields import Cache, Gigabytes, path_fields, read_fields
+from fmtorch.folder import EXHAUSTIVE
 from fmtorch.metrics import nsgd
 from fmtorch.photographs import Image, MatchResult, match
 from fmtorch.storage.features import CachedFeatures
@@ -32,17 +34,12 @@ from fmtorch.types import RELATED
 
 
 @dataclasses.dataclass(frozen=True)
-class Fields:
+class Fields(FolderFields):
     """What the command takes beside stages; ``conf/match.yaml`` says what each is."""
 
     image0: Path | None = None
     image1: Path | None = None
     truth: Path | None = None
-    output: Path | None = None
-    orient: bool = True
-    longest_side: Count = 1600
-    seed: Seed = 0
-    device: Device = "auto"
     cache: Cache = None
     cache_limit: Gigabytes | None = 20
 
@@ -53,6 +50,12 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     overrides: what the command line changed of the pipeline of that name; said beside it.
     """
     fields = read_fields(Fields, config)
+    if fields.images is not None:
+        if fields.image0 is not None or fields.image1 is not None or fields.truth is not None:
+            raise ValueError("images takes a folder; image0, image1 and truth are of a single pair")
+        return match_folder(config, fields, pipeline_name, overrides)
+    if fields.export is not None or str(fields.pairs or EXHAUSTIVE) != EXHAUSTIVE:
+        raise ValueError("export and pairs are of a folder of images: give images=FOLDER")
     paths = [_given(fields.image0, "image0"), _given(fields.image1, "image1")]
     presets.expect_stages(config)
     truth = None if fields.truth is None else read_matrix(fields.truth)
@@ -183,4 +186,4 @@ def task(config: DictConfig) -> None:
 
 def main() -> None:
     """The command."""
-    run_command("match", task, paths=path_fields(Fields), positional=("image0", "image1"))
+    run_command("match", task, paths=[*path_fields(Fields), "export"], positional=("image0", "image1"))

@@ -20,6 +20,7 @@ from fmtorch.options import expect_options
 
 __all__ = [
     "NEEDS_ROOT",
+    "SCENE_SETS",
     "DataError",
     "DepthDataset",
     "FMBenchPairs",
@@ -42,6 +43,8 @@ _CLASSES = {
     "tum": ("fmtorch.data.tum", "tum_pairs"),
     "kitti": ("fmtorch.data.kitti", "KittiPairs"),
     "colmap": ("fmtorch.data.colmap", "ColmapPairs"),
+    "bundler": ("fmtorch.data.bundler", "BundlerPairs"),
+    "cameras": ("fmtorch.data.camera_files", "CameraFilePairs"),
     "h5": ("fmtorch.exchange.dataset", "H5Pairs"),
 }
 NEEDS_ROOT = {
@@ -49,9 +52,13 @@ NEEDS_ROOT = {
     "tum": "the folder of the sequences' folders of TUM RGB-D",
     "kitti": "the folder with sequences/ and poses/ of KITTI odometry",
     "colmap": "a folder of scenes with a COLMAP model each, or one such scene",
+    "bundler": "a folder of scenes with list.txt and a Bundler file each, or one such scene",
+    "cameras": "a folder of scenes with Camera.txt and Images/ each, or one such scene",
     "h5": "the file, or the folder of the files, that hold the matches",
 }
 """What `root` must be, by the names of the data sets that cannot do without."""
+SCENE_SETS = ("tum", "kitti", "colmap", "bundler", "cameras")
+"""The data sets of scenes with cameras, whose candidates `fmtorch pairs` judges."""
 _WITHOUT_SPLIT = frozenset(("stereo", "h5"))
 _GENERATED = frozenset(("rendered",))
 
@@ -66,7 +73,7 @@ def load(
     """The data set `name`: an indexable of `ImagePair`, as torch's DataLoader takes it.
 
     Args:
-        name: of the set: rendered, stereo, fmbench, tum, kitti, colmap, h5.
+        name: of the set: rendered, stereo, fmbench, tum, kitti, colmap, bundler, cameras, h5.
         split: `test` or `train`.
         root: where it lies, or for generated sets where they are kept.
         progress: called with (done, total) while a generated set is drawn for the first time.

@@ -34,15 +34,15 @@ class AllPairs:
 
     def __init__(self, n: int) -> None:
         self.n = n
+        self._starts = np.cumsum([0, *range(n - 1, 0, -1)])  # where the pairs that begin with image i begin
 
     def __len__(self) -> int:
         return self.n * (self.n - 1) // 2
 
     def at(self, ranks: Indices) -> Indices:
         """The pairs (n, 2) at these places (n,)."""
-        starts = np.cumsum([0, *range(self.n - 1, 0, -1)])  # where the pairs that begin with image i begin
-        first = np.searchsorted(starts, ranks, side="right") - 1
-        return np.stack([first, first + 1 + ranks - starts[first]], -1)
+        first = np.searchsorted(self._starts, ranks, side="right") - 1
+        return np.stack([first, first + 1 + ranks - self._starts[first]], -1)
 
 
 class ListedPairs:
@@ -59,7 +59,7 @@ class ListedPairs:
         return self.pairs[ranks]
 
 
-def following(times: Sequence[float] | NDArray[np.float64], window: float = WINDOW) -> ListedPairs:
+def following(times: Sequence[float] | NDArray[np.float64], window: int | float = WINDOW) -> ListedPairs:
     """Each frame with those at most `window` seconds later; times (n,) in seconds, ascending."""
     t = np.asarray(times, dtype=np.float64)
     ends = np.searchsorted(t, t + window + _ROUNDING, side="right")
@@ -92,8 +92,8 @@ def sharing_points(points: Sequence[NDArray[np.int64]], minimum: int = MIN_SHARE
     return ListedPairs(np.concatenate([*found, np.zeros((0, 2), np.int64)]))
 
 
-def drawn(total: int, count: int | None, seed: int) -> Indices:
+def drawn(total: int, count: int | None, seed: int) -> Sequence[int] | Indices:
     """Places of `count` of `total` pairs, drawn at random by the seed and sorted; all where there are no more."""
     if count is None or count >= total:
-        return np.arange(total)
+        return range(total)
     return np.sort(np.random.default_rng(seed).choice(total, count, replace=False))

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.data.camera_files import COLUMNS
 from fmtorch.data.cameras import Camera, relative_pose
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.data.text_files import DataError, read_lines, read_numbers
@@ -20,7 +21,6 @@ _PAIRS, _SUBSETS, _CAMERAS = "pairs_with_gt.txt", "pairs_which_dataset.txt", "Ca
 _SUFFIXES = (".jpg", ".png")
 _PAIR_COLUMNS = "l r F11 F12 F13 F21 F22 F23 F31 F32 F33"
 _LAYOUT = f"the layout is <set>/{_PAIRS} and <set>/{_SUBSETS}"
-_CAMERA_COLUMNS = "K (9 numbers, row by row), R (9), t (3)"
 
 
 class FMBenchPairs:
@@ -95,7 +95,7 @@ class FMBenchPairs:
         if not self._cameras or not path.is_file():
             return None
         self._add_to_digest(f"{folder.name}/{scene}", path)
-        rows = read_numbers(path, f"{_CAMERA_COLUMNS}; or give cameras=false to do without", 21)
+        rows = read_numbers(path, f"{COLUMNS}; or give cameras=false to do without", 21)
         return [Camera(r[:9].reshape(3, 3), r[9:18].reshape(3, 3), r[18:]) for r in rows]
 
     def _add_to_digest(self, name: str, *paths: Path) -> None:

@@ -38,7 +38,7 @@ class KittiPairs(ScenePairs):
         split: str = "test",
         sequences: Sequence[str] | None = None,
         camera: int = 0,
-        window: float = WINDOW,
+        window: int | float = WINDOW,
         pairs: int | None = 1000,
         seed: int = 0,
     ) -> None:
@@ -71,7 +71,7 @@ def read_times(path: Path) -> NDArray[np.float64]:
     return np.array(times)
 
 
-def _scene(home: Path, folder: Path, camera: int, window: float) -> Scene:
+def _scene(home: Path, folder: Path, camera: int, window: int | float) -> Scene:
     name, images = folder.name, folder / f"image_{camera}"
     projections = read_projections(folder / "calib.txt")
     if f"P{camera}" not in projections:

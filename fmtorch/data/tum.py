@@ -36,7 +36,7 @@ class TumPairs(ScenePairs):
     """Pairs of frames at most a window apart; see `tum_pairs`."""
 
     def __init__(
-        self, scenes: Sequence[Scene], files: list[tuple[str, Path]], window: float, pairs: int | None, seed: int
+        self, scenes: Sequence[Scene], files: list[tuple[str, Path]], window: int | float, pairs: int | None, seed: int
     ) -> None:
         super().__init__("tum", scenes, files, (window,), pairs, seed)
 
@@ -56,7 +56,7 @@ def tum_pairs(
     split: str = "test",
     sequences: Sequence[str] | None = None,
     camera: str | None = None,
-    window: float = WINDOW,
+    window: int | float = WINDOW,
     pairs: int | None = 1000,
     seed: int = 0,
     depth: bool = True,
@@ -151,7 +151,7 @@ def _lens(folder: Path, camera: str | None) -> Lens:
     return CALIBRATIONS[names[0]]
 
 
-def _scene(folder: Path, lens: Lens, window: float) -> Scene:
+def _scene(folder: Path, lens: Lens, window: int | float) -> Scene:
     listed = folder / "rgb.txt"
     times, names, lines = read_listed(listed)
     has, rotations, positions = interpolated(folder / "groundtruth.txt", times)

@@ -10,10 +10,13 @@ from fmtorch.verdict import judged
 class CoarseToFine:
     """Two estimators in a row: the fine one sees the inliers of the coarse one, and its model is the estimate.
 
-    coarse: one that prunes well, GC-RANSAC or USAC in the paper. fine: one that fits well, LMedS in the paper.
     A pair that one of them cannot solve is ``ok=False`` with that one's reason; `draws` counts those of both.
     Its significance is that among all matches, also those which the coarse one dropped.
     Gradients are the fine estimator's: the coarse one only chooses matches.
+
+    Args:
+        coarse: an estimator that prunes well, GC-RANSAC or USAC in the paper.
+        fine: one that fits well, LMedS in the paper.
     """
 
     def __init__(self, *, coarse: Estimator, fine: Estimator) -> None:

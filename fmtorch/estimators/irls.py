@@ -32,12 +32,20 @@ class IterativelyReweighted:
     with the 8-point weights of Torr & Murray 1997), so that a redescending kernel is not caught in the nearest minimum.
     Of the refined models the one of least cost is the estimate.
 
-    kernel: a name of `geometry.KERNELS`. threshold: its scale, Sampson distance, px. starts: powers of w, integers, at
-    least 0. iterations: reweighted fits. start_scale: the kernel's first scale, in robust standard deviations of the
-    residuals under a first model, the widest of them. refine_iterations: Levenberg-Marquardt steps of the end.
-    inlier_threshold: of the inliers reported, Sampson distance, px; null: the threshold.
-
     Gradients reach the points and the prior through one attached Gauss-Newton step: those of the optimum.
+
+    Args:
+        kernel: a name of `geometry.KERNELS`.
+        threshold: its scale, Sampson distance, px.
+        starts: powers of w, integers, at least 0.
+        iterations: reweighted fits.
+        start_scale: the kernel's first scale, in robust standard deviations of the residuals under a first model, the
+            widest of them.
+        refine_iterations: Levenberg-Marquardt steps of the end.
+        inlier_threshold: of the inliers reported, Sampson distance, px; null: the threshold.
+
+    Raises:
+        ValueError: for a threshold that is not positive, for no starts or a negative one, and for an unknown kernel.
     """
 
     uses_prior = True

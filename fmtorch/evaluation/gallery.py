@@ -15,6 +15,7 @@ from fmtorch import data, presets
 from fmtorch.data import DataError, ImageError, ImagePair, PairDataset, read_image
 from fmtorch.evaluation.page import Picture, Shown, ShownPair, differing_pairs
 from fmtorch.evaluation.redraw import difference, drawn, from_stored
+from fmtorch.exchange.dataset import WITHOUT_GEOMETRY
 from fmtorch.pipeline import Pipeline
 from fmtorch.storage import RunFolder
 
@@ -85,14 +86,24 @@ def find_dataset(stored: Mapping[str, Any], options: Options) -> PairDataset:
         raise DataError("the data set is one of your own, which a report loads with own_code=true")
     known = known if own or "name" in known else {"name": "fmbench"}
     reasons = []
-    for root in _roots(known, options.roots):
+    for place in _places(known, options.roots):
         try:
             if own:
-                return _same(presets.instantiate({**known, **({"root": root} if root else {})}, "dataset"), stored)
-            return _same(data.load(**known, root=root), stored)
+                given = {name: value for name, value in place.items() if value is not None}
+                return _same(presets.instantiate({**known, **given}, "dataset"), stored)
+            return _same(data.load(**{**known, **place}), stored)
         except _NOT_BUILT as error:
             reasons.append(str(error))
     raise DataError("; ".join(dict.fromkeys(reasons)))
+
+
+def _places(known: Mapping[str, Any], roots: Sequence[Path]) -> list[dict[str, Any]]:
+    """The options that say where a data set, and what it needs beside itself, may lie."""
+    if known.get("name") != "h5":
+        return [{"root": root} for root in _roots(known, roots)]
+    other = "truth" if known.get("layout") in WITHOUT_GEOMETRY else "images"
+    places = [{"root": root, other: place} for root in roots for place in roots if place != root]
+    return places + [{"root": root} for root in roots] or [{"root": None}]
 
 
 def _roots(known: Mapping[str, Any], roots: Sequence[Path]) -> list[Path | None]:

@@ -10,6 +10,7 @@ import torch
 
 from fmtorch.data.pairs import ImagePair
 from fmtorch.evaluation.workers import Build, Work, Workers
+from fmtorch.exchange.journal import Journal
 from fmtorch.pipeline import Pipeline
 from fmtorch.storage import PairRow
 from fmtorch.storage.features import CachedFeatures
@@ -38,10 +39,12 @@ def evaluate_pairs(
     workers: int,
     store: Callable[[list[PairRow]], None],
     build: Build | None = None,
+    journal: Journal | None = None,
 ) -> Iterator[int]:
     """Run and evaluate the pairs, hand each batch's rows to `store`, and yield how many pairs it held.
 
     build: makes the same pipeline in another process: workers are then processes, otherwise threads (see `Workers`).
+    journal: keeps keypoints, matches and F for an export.
     Results do not depend on `batch`, `workers` or `build`. Raises RuntimeError where a process dies.
     """
     before = torch.get_num_threads()
@@ -61,7 +64,7 @@ def evaluate_pairs(
         todo = (list(pairs[i : i + batch]) for i in range(0, len(pairs), batch))
         while True:
             for some in todo:
-                waiting.add(team.submit(some, seed))
+                waiting.add(team.submit(some, seed, journal))
                 if len(waiting) > workers:
                     break
             if not waiting:

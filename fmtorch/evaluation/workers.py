@@ -20,7 +20,9 @@ import cv2
 import torch
 
 from fmtorch.data.pairs import ImagePair
+from fmtorch.evaluation.exporting import keep_outcomes
 from fmtorch.evaluation.rows import evaluate
+from fmtorch.exchange.journal import Journal
 from fmtorch.pipeline import Pipeline
 from fmtorch.storage import PairRow
 from fmtorch.storage.features import CachedFeatures
@@ -53,19 +55,22 @@ class Workers:
                 workers, multiprocessing.get_context("spawn"), initializer=_begin, initargs=(build,)
             )
 
-    def submit(self, pairs: list[ImagePair], seed: int) -> Future[Work]:
-        """The rows of these pairs, some time."""
+    def submit(self, pairs: list[ImagePair], seed: int, journal: Journal | None = None) -> Future[Work]:
+        """The rows of these pairs, some time. journal: keeps keypoints, matches and F of them too."""
         if self.pipeline is None:
-            return self.executor.submit(_in_process, pairs, seed)
-        return self.executor.submit(_work, self.pipeline, pairs, seed)
+            return self.executor.submit(_in_process, pairs, seed, journal)
+        return self.executor.submit(_work, self.pipeline, pairs, seed, journal)
 
     def close(self) -> None:
         """Wait for what is under way; what has not begun is dropped."""
         self.executor.shutdown(wait=True, cancel_futures=True)
 
 
-def _work(pipeline: Pipeline, pairs: list[ImagePair], seed: int) -> Work:
-    return Work(evaluate(pipeline.run(pairs, seed), seed))
+def _work(pipeline: Pipeline, pairs: list[ImagePair], seed: int, journal: Journal | None) -> Work:
+    outcomes = pipeline.run(pairs, seed)
+    if journal is not None:
+        keep_outcomes(journal, pipeline, outcomes)
+    return Work(evaluate(outcomes, seed))
 
 
 def end_with_parent() -> None:
@@ -93,11 +98,11 @@ def _begin(build: Build) -> None:
     _mine = build()
 
 
-def _in_process(pairs: list[ImagePair], seed: int) -> Work:
+def _in_process(pairs: list[ImagePair], seed: int, journal: Journal | None) -> Work:
     assert _mine is not None
     extractor = _mine.extractor
     if not isinstance(extractor, CachedFeatures):
-        return _work(_mine, pairs, seed)
+        return _work(_mine, pairs, seed, journal)
     computed, found = extractor.computed, extractor.found
-    rows = _work(_mine, pairs, seed).rows
+    rows = _work(_mine, pairs, seed, journal).rows
     return Work(rows, extractor.computed - computed, extractor.found - found)

@@ -39,6 +39,13 @@ def fundamental_from_projections(
     Each element is a 4 x 4 determinant of two rows of P0 and two of P1 (Hartley & Zisserman, Multiple View Geometry,
     2nd ed., eq. 17.3), so it holds for finite and infinite cameras and is smooth in both. Cameras with one centre
     have no fundamental matrix: the zero matrix is returned.
+
+    Args:
+        P0: projection (..., 3, 4) of image 0, world to pixels, of any scale.
+        P1: that of image 1; leading dimensions broadcast.
+
+    Returns:
+        (..., 3, 3).
     """
     lines0, lines1 = _pluecker_of_row_pairs(unit_largest(P0)), _pluecker_of_row_pairs(unit_largest(P1))
     # The sign is that of [t]_x for P0 = [I | 0], P1 = [I | t].
@@ -51,7 +58,26 @@ def fundamental_from_calibration(
     R: Float[Tensor, "*#batch 3 3"],
     t: Float[Tensor, "*#batch 3"],
 ) -> Float[Tensor, "*#batch 3 3"]:
-    """F = K1^-T [t]_x R K0^-1 of unit Frobenius norm, for ``X1 = R X0 + t`` (Hartley & Zisserman, eq. 9.12)."""
+    """F = K1^-T [t]_x R K0^-1 of unit Frobenius norm, for ``X1 = R X0 + t`` (Hartley & Zisserman, eq. 9.12).
+
+    Args:
+        K0: calibration matrix (..., 3, 3) of image 0.
+        K1: that of image 1.
+        R: rotation (..., 3, 3) from camera 0 to camera 1.
+        t: translation (..., 3), of any length but zero.
+
+    Returns:
+        (..., 3, 3).
+
+    Example:
+        >>> import torch
+        >>> from fmtorch.geometry import algebraic, fundamental_from_calibration
+        >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+        >>> F = fundamental_from_calibration(K, K, torch.eye(3), torch.tensor([1.0, 0, 0]))  # a step to the right
+        >>> x0, x1 = torch.tensor([[100.0, 50]]), torch.tensor([[60.0, 50]])  # the same row
+        >>> bool(algebraic(F, x0, x1).abs() < 1e-6)
+        True
+    """
     E = matmul3(cross_matrix(t), R)
     inverse0 = _cofactors(unit_largest(K0)).mT  # K^-1 up to the scale det K
     inverse1_t = _cofactors(unit_largest(K1))
@@ -62,6 +88,13 @@ def epipolar_lines(F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n
     """The lines (a, b, c) of x0 in image 1, ``a x + b y + c = 0`` with a^2 + b^2 = 1; pass ``F.mT`` for image 0.
 
     Where a = b = 0 (the epipole, or the line at infinity) the line is returned unscaled, as OpenCV does.
+
+    Args:
+        F: fundamental matrices (..., 3, 3), of any scale.
+        x0: points (..., N, 2), px.
+
+    Returns:
+        Lines (..., N, 3) in pixels.
     """
     a, b, c = lines_through(unit_largest(F), x0)
     squared = a * a + b * b
@@ -70,7 +103,15 @@ def epipolar_lines(F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n
 
 
 def point_to_line(x: Float[Tensor, "*#batch n 2"], line: Float[Tensor, "*#batch n 3"]) -> Float[Tensor, "*#batch n"]:
-    """Distance in pixels of each point to its line (a, b, c) of any scale; 0 where a = b = 0."""
+    """Distance in pixels of each point to its line (a, b, c) of any scale; 0 where a = b = 0.
+
+    Args:
+        x: points (..., N, 2), px.
+        line: lines (..., N, 3).
+
+    Returns:
+        (..., N), at least 0.
+    """
     a, b, c = line.unbind(-1)
     return (a * x[..., 0] + b * x[..., 1] + c).abs() * inverse_root(a * a + b * b)
 
@@ -78,7 +119,16 @@ def point_to_line(x: Float[Tensor, "*#batch n 2"], line: Float[Tensor, "*#batch 
 def algebraic(
     F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
 ) -> Float[Tensor, "*#batch n"]:
-    """The signed algebraic residual ``x1^T F x0``, in units of F."""
+    """The signed algebraic residual ``x1^T F x0``, in units of F.
+
+    Args:
+        F: fundamental matrices (..., 3, 3), of any scale and sign.
+        x0: points in image 0, (..., N, 2), px.
+        x1: their matches in image 1, (..., N, 2), px.
+
+    Returns:
+        (..., N).
+    """
     a, b, c = lines_through(F, x0)
     return a * x1[..., 0] + b * x1[..., 1] + c
 
@@ -86,7 +136,16 @@ def algebraic(
 def epipolar_distances(
     F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
 ) -> tuple[Float[Tensor, "*#batch n"], Float[Tensor, "*#batch n"]]:
-    """Point-to-line distances in pixels: of x0 to the line ``F^T x1`` in image 0, of x1 to ``F x0`` in image 1."""
+    """Point-to-line distances in pixels: of x0 to the line ``F^T x1`` in image 0, of x1 to ``F x0`` in image 1.
+
+    Args:
+        F: fundamental matrices (..., 3, 3), of any scale and sign.
+        x0: points in image 0, (..., N, 2), px.
+        x1: their matches in image 1, (..., N, 2), px.
+
+    Returns:
+        Two tensors (..., N), at least 0: in image 0, in image 1.
+    """
     e, squared0, squared1 = residual_and_normals(F, x0, x1)
     return e.abs() * inverse_root(squared0), e.abs() * inverse_root(squared1)
 
@@ -94,7 +153,16 @@ def epipolar_distances(
 def symmetric_mean(
     F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
 ) -> Float[Tensor, "*#batch n"]:
-    """Mean of the two point-to-line distances, in pixels."""
+    """Mean of the two point-to-line distances, in pixels.
+
+    Args:
+        F: fundamental matrices (..., 3, 3), of any scale and sign.
+        x0: points in image 0, (..., N, 2), px.
+        x1: their matches in image 1, (..., N, 2), px.
+
+    Returns:
+        (..., N).
+    """
     d0, d1 = epipolar_distances(F, x0, x1)
     return (d0 + d1) / 2
 
@@ -102,7 +170,16 @@ def symmetric_mean(
 def symmetric_max(
     F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
 ) -> Float[Tensor, "*#batch n"]:
-    """Larger of the two point-to-line distances, in pixels."""
+    """Larger of the two point-to-line distances, in pixels.
+
+    Args:
+        F: fundamental matrices (..., 3, 3), of any scale and sign.
+        x0: points in image 0, (..., N, 2), px.
+        x1: their matches in image 1, (..., N, 2), px.
+
+    Returns:
+        (..., N).
+    """
     d0, d1 = epipolar_distances(F, x0, x1)
     return torch.maximum(d0, d1)
 
@@ -110,7 +187,16 @@ def symmetric_max(
 def symmetric_squared(
     F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
 ) -> Float[Tensor, "*#batch n"]:
-    """Sum of the two squared point-to-line distances, in squared pixels (Hartley & Zisserman, eq. 11.10)."""
+    """Sum of the two squared point-to-line distances, in squared pixels (Hartley & Zisserman, eq. 11.10).
+
+    Args:
+        F: fundamental matrices (..., 3, 3), of any scale and sign.
+        x0: points in image 0, (..., N, 2), px.
+        x1: their matches in image 1, (..., N, 2), px.
+
+    Returns:
+        (..., N).
+    """
     d0, d1 = epipolar_distances(F, x0, x1)
     return d0 * d0 + d1 * d1
 
@@ -118,7 +204,23 @@ def symmetric_squared(
 def sampson(
     F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
 ) -> Float[Tensor, "*#batch n"]:
-    """Sampson distance in pixels: |x1^T F x0| over the norm of its gradient (Hartley & Zisserman, eq. 11.9)."""
+    """Sampson distance in pixels: |x1^T F x0| over the norm of its gradient (Hartley & Zisserman, eq. 11.9).
+
+    Args:
+        F: fundamental matrices (..., 3, 3), of any scale and sign.
+        x0: points in image 0, (..., N, 2), px.
+        x1: their matches in image 1, (..., N, 2), px.
+
+    Returns:
+        (..., N), at least 0.
+
+    Example:
+        >>> import torch
+        >>> from fmtorch.geometry import sampson
+        >>> F = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # a sideways camera: matches are in one row
+        >>> round(float(sampson(F, torch.tensor([[10.0, 20]]), torch.tensor([[5.0, 22]]))), 3)
+        1.414
+    """
     e, squared0, squared1 = residual_and_normals(F, x0, x1)
     return e.abs() * inverse_root(squared0 + squared1)
 
@@ -126,7 +228,16 @@ def sampson(
 def sampson_squared(
     F: Float[Tensor, "*#batch 3 3"], x0: Float[Tensor, "*#batch n 2"], x1: Float[Tensor, "*#batch n 2"]
 ) -> Float[Tensor, "*#batch n"]:
-    """Squared Sampson distance, in squared pixels."""
+    """Squared Sampson distance, in squared pixels.
+
+    Args:
+        F: fundamental matrices (..., 3, 3), of any scale and sign.
+        x0: points in image 0, (..., N, 2), px.
+        x1: their matches in image 1, (..., N, 2), px.
+
+    Returns:
+        (..., N).
+    """
     distance = sampson(F, x0, x1)
     return distance * distance
 

@@ -19,6 +19,14 @@ def normalize_points(
 
     Hartley, In Defense of the Eight-Point Algorithm, PAMI 1997. Means are over the points in `mask`, weighted by
     `weight`. Masked slots come out zero. Coincident points (or none) are centred and keep their scale.
+
+    Args:
+        x: points (..., N, 2).
+        mask: (..., N), True for the points that count; all by default.
+        weight: (..., N), at least 0; 1 by default.
+
+    Returns:
+        The points moved (..., N, 2), and T (..., 3, 3).
     """
     x, w = _clean(x, mask, weight)
     centroid = _mean(x, w)
@@ -41,6 +49,14 @@ def normalize_pair(
 
     The mean distance to the centroid, over both images, becomes sqrt(2). Distances keep their proportions between the
     images, so a threshold in pixels stays one number. Masked slots come out zero; coincident points keep their scale.
+
+    Args:
+        x0: points in image 0, (..., N, 2), px.
+        x1: their matches in image 1, (..., N, 2), px.
+        mask: (..., N), True for the matches that count; all by default.
+
+    Returns:
+        The points moved, (..., N, 2) each, and the similarities (..., 3, 3) that move them.
     """
     (x0, w), (x1, _) = _clean(x0, mask, None), _clean(x1, mask, None)
     c0, c1 = _mean(x0, w), _mean(x1, w)
@@ -53,7 +69,16 @@ def normalize_pair(
 def denormalize_fundamental(
     F: Float[Tensor, "*#batch 3 3"], T0: Float[Tensor, "*#batch 3 3"], T1: Float[Tensor, "*#batch 3 3"]
 ) -> Float[Tensor, "*#batch 3 3"]:
-    """The fundamental matrix T1^T F T0 of points x, given F of the normalised points T x; leading shapes broadcast."""
+    """The fundamental matrix T1^T F T0 of points x, given F of the normalised points T x; leading shapes broadcast.
+
+    Args:
+        F: of normalised points, (..., 3, 3).
+        T0: the similarity (..., 3, 3) that normalised the points of image 0.
+        T1: that of image 1.
+
+    Returns:
+        (..., 3, 3), not scaled.
+    """
     return matmul3(matmul3(T1.mT, F), T0)
 
 

@@ -39,6 +39,17 @@ def pose_from_fundamental(
     essential matrix (singular values 1, 1, 0), and then R = cof(E) -+ [t]x E (Horn, Recovering Baseline and
     Orientation from Essential Matrix, 1990). Float64 inside, F's type outside; differentiable in F, K0 and K1.
     Invalid: F or a calibration not finite or singular where it must not be, or no point in front of both cameras.
+
+    Args:
+        F: fundamental matrices (..., 3, 3), of any scale and sign.
+        K0: calibration matrices (..., 3, 3) of image 0.
+        K1: those of image 1.
+        x0: points in image 0, (..., N, 2), px.
+        x1: their matches in image 1, (..., N, 2), px.
+        mask: (..., N), True for the matches that decide; all by default.
+
+    Returns:
+        A `Pose`.
     """
     mask = torch.ones_like(x0[..., 0], dtype=torch.bool) if mask is None else mask
     F_, K0_, K1_ = (A.to(torch.float64).movedim((-2, -1), (0, 1)) for A in (F, K0, K1))

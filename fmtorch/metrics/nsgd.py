@@ -43,7 +43,21 @@ def sgd(
     key: Int[Tensor, "*#batch"] | None = None,
     cap: bool = True,
 ) -> Float[Tensor, "*#batch"]:
-    """Symmetric geometry distance in pixels, at most the mean of the two image diagonals; otherwise as `nsgd`."""
+    """Symmetric geometry distance in pixels, at most the mean of the two image diagonals; otherwise as `nsgd`.
+
+    Args:
+        F_gt: true fundamental matrices (..., 3, 3), of any scale and sign.
+        F_est: estimated ones.
+        size0: sizes (..., 2) of image 0 as (h, w).
+        size1: those of image 1.
+        samples: accepted draws.
+        seed: of the draws.
+        key: (...), the pairs' keys.
+        cap: whether the value has that limit.
+
+    Returns:
+        (...).
+    """
     return _mean_distance(torch.ones_like, F_gt, F_est, size0, size1, samples, seed, key, cap)
 
 
@@ -61,12 +75,31 @@ def nsgd(
 ) -> Float[Tensor, "*#batch"]:
     """Normalised symmetric geometry distance: each distance divided by the diagonal of the image it is measured in.
 
-    F_gt, F_est: (..., 3, 3), any scale and sign. size0, size1: (..., 2) as (h, w). key: the pairs' keys, which select
-    their random points; with the same key and seed the points are the same. samples: accepted draws, of at most ten
-    times as many tries.
+    The value is 1 where no draw is accepted, and where a matrix is zero or not finite.
 
-    The value is 1 where no draw is accepted, and where a matrix is zero or not finite. `cap` limits the mean to 1;
-    without it the value is a loss, differentiable with respect to both matrices and unbounded.
+    Args:
+        F_gt: true fundamental matrices (..., 3, 3), of any scale and sign.
+        F_est: estimated ones.
+        size0: sizes (..., 2) of image 0 as (h, w).
+        size1: those of image 1.
+        samples: accepted draws, of at most ten times as many tries.
+        seed: of the draws.
+        key: (...), the pairs' keys, which select their random points; with the same key and seed the points are the
+            same.
+        cap: limit the mean to 1. Without it the value is a loss, differentiable with respect to both matrices and
+            unbounded.
+
+    Returns:
+        (...), at least 0.
+
+    Example:
+        >>> import torch
+        >>> from fmtorch.metrics import nsgd
+        >>> rows = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # a sideways camera
+        >>> columns = torch.tensor([[0.0, 0, 1], [0, 0, 0], [-1, 0, 0]])  # one that moves up
+        >>> size = torch.tensor([480, 640])
+        >>> round(nsgd(rows, 5 * rows, size, size).item(), 6), bool(nsgd(rows, columns, size, size) > 0.05)
+        (0.0, True)
     """
     return _mean_distance(torch.clone, F_gt, F_est, size0, size1, samples, seed, key, cap)
 

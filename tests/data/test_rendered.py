@@ -76,6 +76,7 @@ def test_image_sizes_are_the_cameras(tiny: RenderedPairs) -> None:
             assert (image.ndim == 2) == (pair.family == "driving")
 
 
+@pytest.mark.slow
 def test_full_scale_sizes_are_those_of_the_sets_they_stand_for() -> None:
     sizes = {f: {s.camera.size for s in built(f, "test").shots} for f in FAMILIES}
     assert sizes["indoor"] == {(480, 640)}
@@ -170,6 +171,7 @@ def test_splits_share_no_photograph_and_no_random_stream() -> None:
     assert len(streams) == len(FAMILIES) * (PLANS["full", "test"].scenes + PLANS["full", "train"].scenes)
 
 
+@pytest.mark.slow
 def test_no_texture_of_the_test_split_is_in_training() -> None:
     """Of all families together; the last training scene is one for validation."""
 

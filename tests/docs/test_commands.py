@@ -13,7 +13,6 @@ import re
 import runpy
 import shlex
 import shutil
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,6 +25,9 @@ from hydra.core.global_hydra import GlobalHydra
 
 from fmtorch import data
 from fmtorch.data import read_image
+from tests.conftest import own_cache
+from tests.exchange import writers
+from tests.processes import run_command
 
 SOURCE = Path(__file__).resolve().parents[2]
 PAGES = ["README.md", "CONTRIBUTING.md", *(f"docs/{path.name}" for path in sorted((SOURCE / "docs").glob("*.md")))]
@@ -37,6 +39,7 @@ ELSEWHERE = {
     r"convert_ngransac": "needs the authors' weights; tests/pruning/networks/test_files.py runs it on others",
     r"--contrib-python": "needs a Python with opencv-contrib",
     r"--config-dir my_conf (pruner|pipeline)=": "tests/training/test_train_command.py runs these files and commands",
+    r"dataset=(tum|kitti|colmap|bundler|fmbench dataset\.root=KITTI)": "tests/data runs these on data of their layout",
     r"--config-dir my_conf features=": "tests/docs/test_own_parts.py runs this page",
 }
 """Commands that are not run here, and why."""
@@ -64,6 +67,7 @@ APPENDED = {
     "fmtorch.match": ["pipeline=sift_gms"],
     "fmtorch.eval": [*DATASET, "workers=1"],
     "fmtorch.train": ["dataset=fmbench", "dataset.root=DATA", "dataset.sets=[Strecha_train,TanksLike]", *TRAINED],
+    "fmtorch.pairs": ["dataset.root=DATA/Strecha", "workers=1"],
     "fmtorch.report": ["pictures=1", "root=DATA/Strecha"],
     "estimators": ["--limit", "1", "--seeds", "1"],
     "thresholds": ["--limit", "1", "--seeds", "1", "--values", "0.5", "0.75"],
@@ -97,6 +101,7 @@ def smaller(command: str) -> list[str]:
         (r" --ngransac \S+", ""),
         (r" dataset\.size=\w+", ""),
         (r"FOLDER", "kept"),
+        (r"(dataset\.layout=(\w+) dataset\.root=)FILES", r"\1FILES/\2"),
         (r" root=DIR", ""),
         (r" d\.json", ""),
         (r"runs=\[runs/a,runs/b\]|runs/a runs/b", "runs=[runs/fmbench]"),
@@ -109,6 +114,8 @@ def smaller(command: str) -> list[str]:
     if name not in APPENDED:
         raise AssertionError(f"no rule for {command!r}: say in APPENDED how to run it small, or in ELSEWHERE why not")
     added = APPENDED[name]
+    if "dataset=h5" in words:
+        added = ["limit=1", "workers=1"]
     if "--from" in words:  # shows what is there
         added = []
     if name == "speed" and importlib.util.find_spec("poselib") is None:
@@ -149,6 +156,13 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / "DATA" / name / "pairs_which_dataset.txt").write_text("".join(f"{s}/\n" for s in scenes))
     for name, image in zip(("a.jpg", "b.jpg"), images, strict=True):
         cv2.imwrite(str(folder / name), image[..., ::-1])
+    (folder / "PHOTOS").mkdir()
+    for name in ("a.jpg", "b.jpg"):
+        shutil.copy(folder / name, folder / "PHOTOS")
+    (folder / "list.txt").write_text("a.jpg b.jpg\n")
+    for layout in ("posebench", "hloc", "oanet"):
+        writers.WRITERS[layout](folder / "FILES" / layout)
+    writers.truth(folder / "SET")
     (folder / "my_conf" / "estimator").mkdir(parents=True)
     yaml = re.findall(
         r"```yaml\n# my_conf/estimator/mine.yaml\n(.*?)```", (SOURCE / "README.md").read_text(), re.DOTALL
@@ -187,8 +201,8 @@ def run(words: list[str], folder: Path) -> None:
     """`python -m MODULE ...`: within this process, which saves its start, where the module can be run twice in one."""
     assert words[:2] == ["python", "-m"], words
     if words[2] == "fmtorch.report":  # defines classes of its own, which the tests' type checker would mistake
-        env = {**os.environ, "PYTHONPATH": str(SOURCE)}
-        subprocess.run([sys.executable, *words[1:]], cwd=folder, env=env, check=True, timeout=300)
+        ended = run_command("report", *words[3:], cwd=folder)
+        assert ended.returncode == 0, ended.stderr
         return
     with as_a_command(words[2:], folder):
         try:
@@ -213,7 +227,7 @@ def those(slow: bool) -> list[object]:
 
 
 def run_all(some: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FMTORCH_CACHE", str(workplace / "cache"))
+    monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(workplace)))
     for command in some:
         print(command)
         if "report" in command and not (workplace / "runs").exists():

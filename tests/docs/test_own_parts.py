@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -16,6 +13,7 @@ import pytest
 
 from fmtorch import data
 from fmtorch.stages import Estimator, FeatureExtractor, Matcher, Pruner
+from tests.processes import run_command
 
 SOURCE = Path(__file__).resolve().parents[2]
 PAGE = (SOURCE / "docs" / "own_parts.md").read_text(encoding="utf-8")
@@ -38,9 +36,9 @@ def folder(tmp_path: Path) -> Path:
 
 def test_every_part_is_evaluated(folder: Path) -> None:
     (command,) = re.findall(r"```bash\n(.*?)```", PAGE, flags=re.DOTALL)
-    env = {**os.environ, "PYTHONPATH": str(SOURCE), "FMTORCH_CACHE": f"{folder}/cache", "COLUMNS": "200"}
-    words = [sys.executable, *shlex.split(command)[1:], "run_dir=run"]
-    ended = subprocess.run(words, cwd=folder, env=env, capture_output=True, text=True, timeout=300, check=False)
+    words = shlex.split(command)
+    assert words[:3] == ["python", "-m", "fmtorch.eval"]
+    ended = run_command("eval", *words[3:], "run_dir=run", cwd=folder)
     assert ended.returncode == 0, ended.stderr
     rows = [row for part in (folder / "run" / "pairs").glob("*.parquet") for row in pq.read_table(part).to_pylist()]
     assert sorted(row["pair"] for row in rows) == ["left.png right.png", "right.png left.png"]

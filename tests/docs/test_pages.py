@@ -18,7 +18,10 @@ def test_the_examples_of_a_page_run(page: str) -> None:
     assert failed == 0
 
 
-@pytest.mark.parametrize("module", ["data", "fundamental", "geometry.eight_point", "metrics.recall", "photographs"])
+@pytest.mark.parametrize("module", [
+    "data", "fundamental", "geometry.eight_point", "geometry.epipolar", "geometry.seven_point", "metrics.nsgd",
+    "metrics.recall", "photographs",
+])  # fmt: skip
 def test_the_examples_of_docstrings_run(module: str) -> None:
     failed, attempted = doctest.testmod(importlib.import_module(f"fmtorch.{module}"))
     assert attempted > 0

@@ -15,6 +15,7 @@ import torch
 
 from fmtorch import data, presets
 from fmtorch.data import DataError, ImagePair
+from fmtorch.evaluation.gallery import Options, find_dataset
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.exchange.dataset import H5Pairs
 from fmtorch.pipeline import Outcome, Pipeline
@@ -272,3 +273,13 @@ def test_says_which_extra_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(ImportError, match=r"pip install 'fmtorch\[h5\]'"):
         reload("posebench", root)
+
+
+@pytest.mark.parametrize(("layout", "roots"), [("hloc", ["Truth", "hloc"]), ("posebench", ["posebench"])])
+def test_a_report_finds_it(layout: str, roots: list[str], tmp_path: Path) -> None:
+    dataset = load(layout, tmp_path)
+    stored = {"name": "h5", "layout": layout, "features": None, "matches": None, "origin": None}
+    options = Options(1, [tmp_path / root for root in roots])
+    assert find_dataset({**stored, "digest": dataset.digest}, options).digest == dataset.digest
+    with pytest.raises(DataError, match="has changed since the run"):
+        find_dataset({**stored, "digest": "another"}, options)

@@ -12,6 +12,7 @@ from fmtorch.data.rendered import Plan, RenderedPairs
 from fmtorch.data.rendered.cameras import calibration
 from fmtorch.matched import LabelledMatches, MatchedPairs
 from fmtorch.types import Correspondences, pair_key
+from tests.conftest import own_cache
 
 TINY = Plan(scenes=2, shots=4, pairs=4, scale=0.25)
 FAMILY = "indoor"  # the quickest to draw
@@ -21,7 +22,7 @@ SIFT = {"pipeline": "sift_ratio", "overrides": ["pruner=[one_to_one]"]}
 @pytest.fixture(scope="session")
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A cache folder, as $FMTORCH_CACHE names one, in which the scenes of `rendered` are."""
-    return tmp_path_factory.mktemp("cache")
+    return own_cache(tmp_path_factory.mktemp("cache"))
 
 
 @pytest.fixture(scope="session")

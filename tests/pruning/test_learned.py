@@ -276,6 +276,7 @@ def test_identity_is_the_file_and_the_options(files: tuple[nn.Module, Path], tmp
     assert configuration(LearnedPruner(small(seed=0))) != configuration(LearnedPruner(small(seed=1)))
 
 
+@pytest.mark.slow
 def test_log_odds_of_onnx_and_torch_agree_at_full_size(tmp_path: Path) -> None:
     """The network as published, 12 blocks of 128 channels."""
     torch.manual_seed(0)

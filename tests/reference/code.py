@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
@@ -19,7 +20,7 @@ def shape(S: np.ndarray) -> np.ndarray:
     return np.append(S.ravel() / size, math.log(size))
 
 
-def predictive_gaussian(match: tuple, centre: tuple, widths: dict[str, float]) -> float:
+def predictive_gaussian(match: tuple[Any, ...], centre: tuple[Any, ...], widths: dict[str, float]) -> float:
     """match, centre: (p0, p1, S)."""
     (a0, a1, A), (b0, b1, B) = match, centre
     difference = shape(A) - shape(B)
@@ -67,7 +68,9 @@ def huber_regression(basis: np.ndarray, target: np.ndarray, ridge: np.ndarray, s
     return found.x.reshape(m, k)
 
 
-def likelihood(matches: list[tuple], widths: dict[str, float], centres: int, ridge: float, scale: float) -> np.ndarray:
+def likelihood(
+    matches: list[tuple[Any, ...]], widths: dict[str, float], centres: int, ridge: float, scale: float
+) -> np.ndarray:
     """Likelihood of every match, all of them distinctive."""
     kernel = np.array([[predictive_gaussian(a, b, widths) for b in matches] for a in matches])
     basis = kernel[:, spread_centres(kernel, centres)]

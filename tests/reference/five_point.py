@@ -18,12 +18,12 @@ def five_point(x0: np.ndarray, x1: np.ndarray) -> np.ndarray:
     """All real essential matrices (m, 3, 3) of unit norm of five matches of rays (x, y, 1), each (5, 2)."""
     h0, h1 = (np.concatenate([x, np.ones((5, 1))], 1) for x in (x0, x1))
     A = (h1[:, :, None] * h0[:, None]).reshape(5, 9)
-    basis = np.linalg.svd(A)[2][5:].reshape(4, 3, 3)
+    basis: np.ndarray = np.linalg.svd(A)[2][5:].reshape(4, 3, 3)
     place = {m: i for i, m in enumerate(_CUBICS + _OTHERS)}
-    equations = np.zeros((10, 20))
+    equations: np.ndarray = np.zeros((10, 20))
     for a, b, c in itertools.product(range(4), repeat=3):
         X, Y, Z = basis[a], basis[b], basis[c]
-        exponents = tuple(sum(v == k for v in (a, b, c)) for k in range(3))
+        exponents = ((a, b, c).count(0), (a, b, c).count(1), (a, b, c).count(2))
         trace = X @ Y.T @ Z - np.trace(X @ Y.T) * Z / 2
         determinant = X[0] @ np.cross(Y[1], Z[2])
         equations[:, place[exponents]] += np.append(trace.ravel(), determinant)

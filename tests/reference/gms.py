@@ -42,18 +42,18 @@ def run(p0: np.ndarray, p1: np.ndarray, scale: float, turn: int, factor: float, 
         partner = {}
         for a in filled:
             found = {b: n for (start, b), n in moves.items() if start == a}
-            b = min(found, key=lambda b: (-found[b], b[1] * grid1 + b[0]))
+            best = min(found, key=lambda b: (-found[b], b[1] * grid1 + b[0]))
             score, total, pairs = 0, 0, 0
             for j, (dx, dy) in enumerate((*RING, (0, 0))):
                 ex, ey = RING[(j - turn) % 8] if j < 8 else (0, 0)
-                na, nb = (a[0] + dx, a[1] + dy), (b[0] + ex, b[1] + ey)
+                na, nb = (a[0] + dx, a[1] + dy), (best[0] + ex, best[1] + ey)
                 if min(*na, *nb) < 0 or max(na) >= GRID or max(nb) >= grid1:
                     continue
                 score, total, pairs = score + moves[na, nb], total + filled[na], pairs + 1
             if score >= factor * math.sqrt(total / pairs):
-                partner[a] = b
-        for i, (a, b) in enumerate(zip(left, right, strict=True)):
-            if a is not None and b is not None and partner.get(a) == b:
+                partner[a] = best
+        for i, (start, end) in enumerate(zip(left, right, strict=True)):
+            if start is not None and end is not None and partner.get(start) == end:
                 kept[i] = True
     return kept
 

@@ -27,7 +27,7 @@ def dlt(x0: np.ndarray, x1: np.ndarray, weight: np.ndarray | None = None) -> np.
 def transfer(H: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> float:
     """The greater of the distances from H x0 to x1 and from H^-1 x1 to x0."""
     there, back = H @ np.append(x0, 1), np.linalg.inv(H) @ np.append(x1, 1)
-    return max(np.linalg.norm(there[:2] / there[2] - x1), np.linalg.norm(back[:2] / back[2] - x0))
+    return float(max(np.linalg.norm(there[:2] / there[2] - x1), np.linalg.norm(back[:2] / back[2] - x0)))
 
 
 def through_plane(F: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:
@@ -44,5 +44,5 @@ def through_plane(F: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:
 def plane_and_parallax(H: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:
     """[e1]_x H with e1 where the lines through x1 and H x0 of two matches meet."""
     lines = [np.cross(b, H @ a) for a, b in zip(homogeneous(x0), homogeneous(x1), strict=True)]
-    e = np.cross(*lines)
+    e = np.cross(lines[0], lines[1])
     return unit(np.array([[0, -e[2], e[1]], [e[2], 0, -e[0]], [-e[1], e[0], 0]]) @ H)

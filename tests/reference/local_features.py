@@ -84,7 +84,7 @@ def _refine(volume: np.ndarray, at: tuple[int, ...]) -> tuple[tuple[int, ...], n
             return None
         offset = -np.linalg.solve(hessian, gradient)
         if (np.abs(offset) <= 0.6).all():
-            return at, offset, value(np.zeros(3, int)) + gradient @ offset / 2
+            return at, offset, value(np.zeros(3, int)) + float(gradient @ offset) / 2
         moved = tuple(int(v) for v in np.array(at) + np.clip(np.round(offset), -1, 1))
         if moves_left == 0 or any(not 1 <= m <= n - 2 for m, n in zip(moved, volume.shape, strict=True)):
             return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -49,6 +50,6 @@ def passes(
     return members, costs
 
 
-def lpm(x: np.ndarray, y: np.ndarray, *options: tuple[float, float]) -> np.ndarray:
+def lpm(x: np.ndarray, y: np.ndarray, *options: Any) -> np.ndarray:
     """Which matches survive the two passes."""
     return np.isin(np.arange(len(x)), passes(x, y, *options)[0])

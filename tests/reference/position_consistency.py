@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from tests.reference.frame_consistency import morton_order
 
 
-def similarity(p0: np.ndarray, p1: np.ndarray, curves: tuple, turns: int, scales: tuple) -> complex:
+def similarity(p0: np.ndarray, p1: np.ndarray, curves: Sequence[Any], turns: int, scales: Any) -> complex:
     """The common turn and scale, a complex number: the best bin of the product of both images' smoothed histograms."""
     product = np.ones((len(scales), turns))
     for points in (p0, p1):
@@ -32,7 +34,7 @@ def similarity(p0: np.ndarray, p1: np.ndarray, curves: tuple, turns: int, scales
 
 
 def agreement(
-    x0: np.ndarray, x1: np.ndarray, S: complex, vote: np.ndarray, curves: tuple,
+    x0: np.ndarray, x1: np.ndarray, S: complex, vote: np.ndarray, curves: Sequence[Any],
     window: int, tolerance: float, noise: float,
 ) -> np.ndarray:  # fmt: skip
     """The weighted share of neighbours along the curves whose displacement the similarity S predicts."""

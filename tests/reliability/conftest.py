@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.reliability.commands import Starter, data_set, evaluation, results
+from tests import processes
+from tests.processes import Starter
+from tests.reliability.commands import data_set, evaluation, results
 
 Rows = list[dict[str, object]]
 
@@ -21,11 +22,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(scope="package")
-def starter() -> Iterator[Starter]:
+def starter() -> Starter:
     """Starts commands."""
-    started = Starter()
-    yield started
-    started.close()
+    return processes.starter()
 
 
 @pytest.fixture(scope="package")

@@ -18,7 +18,7 @@ from fmtorch.storage import PairRow, RunFolder
 from fmtorch.storage.cache import ArrayCache
 from fmtorch.storage.runs import RunFolderError
 from fmtorch.types import pair_key
-from tests.reliability.commands import ONE_THREAD
+from tests.processes import ONE_THREAD
 from tests.reliability.images import NO_IMAGES, SOUND
 
 BOUNDED, WHOLE = 40, 2000  # damages to each kind of file

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.reliability.commands import Command, Starter, evaluation, parts, remount, results, small_disk
+from tests.processes import Command, Starter
+from tests.reliability.commands import evaluation, parts, remount, results, small_disk
 from tests.reliability.conftest import Rows
 
 

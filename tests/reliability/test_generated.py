@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from fmtorch import geometry, matching, metrics, presets, pruning
-from tests.reliability.commands import ONE_THREAD
+from tests.processes import ONE_THREAD
 from tests.reliability.generated import installed_estimators
 
 HERE = Path(__file__).resolve().parents[2]

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.reliability.commands import Starter, data_set, delays, evaluation, parts, results
+from tests.processes import Starter
+from tests.reliability.commands import data_set, delays, evaluation, parts, results
 from tests.reliability.conftest import Rows
 
 EVAL_KILLS, MATCH_KILLS, TRAIN_KILLS, PROCESS_KILLS = (

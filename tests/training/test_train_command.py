@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -19,6 +17,8 @@ from hydra import compose, initialize_config_dir
 from fmtorch.resources import conf_dir
 from fmtorch.training.pruners.loop import TrainingFolderError
 from fmtorch.training.pruners.run import run
+from tests.conftest import own_cache
+from tests.processes import run_command
 from tests.test_pipeline import draw
 
 SHORT = [
@@ -31,12 +31,7 @@ SHORT = [
 
 def command(name: str, *arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     """Run a command of the package as a user does, in another directory."""
-    source = str(Path(__file__).resolve().parents[2])
-    own = {"PYTHONPATH": source, "COLUMNS": "200", "FMTORCH_CACHE": f"{cwd}/cache", "OMP_NUM_THREADS": "1"}
-    called = [sys.executable, "-m", f"fmtorch.{name}", *arguments]
-    return subprocess.run(
-        called, cwd=cwd, env={**os.environ, **own}, capture_output=True, text=True, timeout=300, check=False
-    )
+    return run_command(name, *arguments, cwd=cwd)
 
 
 @pytest.fixture
@@ -106,7 +101,7 @@ def test_two_processes_train_one_network(root: Path, tmp_path: Path) -> None:
 def trained(monkeypatch: pytest.MonkeyPatch, folder: Path, *overrides: str) -> Path:
     """The command without a process of its own."""
     monkeypatch.chdir(folder)
-    monkeypatch.setenv("FMTORCH_CACHE", str(folder / "cache"))
+    monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(folder)))
     with initialize_config_dir(str(conf_dir()), version_base=None):
         config = compose("train", list(overrides))
     return run(config, "lc")
@@ -142,4 +137,4 @@ def test_mistakes_are_told_before_anything_is_written(
 ) -> None:
     with pytest.raises(ValueError, match=re.escape(message)):
         trained(monkeypatch, tmp_path, option, "dataset=fmbench", "dataset.root=nowhere")
-    assert list(tmp_path.iterdir()) == []
+    assert [path.name for path in tmp_path.rglob("*")] == ["cache", "kernels"]  # put there by `own_cache`

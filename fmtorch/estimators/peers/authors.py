@@ -13,8 +13,18 @@ def magsac_cpp(
 ) -> PairwiseEstimator:
     """MAGSAC++ by its authors (Barath et al., CVPR 2020), which draws its own random seed.
 
-    threshold: pixels, the largest noise scale. sampler: one of `SAMPLERS`. Raises ImportError without
-    `pymagsac`, ValueError for another sampler.
+    Args:
+        threshold: pixels, the largest noise scale.
+        confidence: of having drawn a sample without an outlier, at which the search ends.
+        iterations: samples at most.
+        sampler: one of `SAMPLERS`.
+
+    Returns:
+        The estimator.
+
+    Raises:
+        ImportError: where `pymagsac` is not installed.
+        ValueError: for another sampler.
     """
     number, library = _sampler(sampler), peer("pymagsac", "MAGSAC++")
 
@@ -39,8 +49,19 @@ def gc_ransac_cpp(
 ) -> PairwiseEstimator:
     """GC-RANSAC by its authors (Barath & Matas, CVPR 2018), which draws its own random seed.
 
-    threshold: pixels. coherence: weight of the spatial term. Raises ImportError without
-    `pygcransac`, ValueError for another sampler.
+    Args:
+        threshold: pixels.
+        confidence: of having drawn a sample without an outlier, at which the search ends.
+        iterations: samples at most.
+        sampler: one of `SAMPLERS`.
+        coherence: weight of the spatial term.
+
+    Returns:
+        The estimator.
+
+    Raises:
+        ImportError: where `pygcransac` is not installed.
+        ValueError: for another sampler.
     """
     number, library = _sampler(sampler), peer("pygcransac", "GC-RANSAC")
 
@@ -56,9 +77,18 @@ def gc_ransac_cpp(
 
 
 def degensac_cpp(*, threshold: float = 0.5, confidence: float = 0.9999, iterations: int = 10000) -> PairwiseEstimator:
-    """DEGENSAC by its authors (Chum et al., CVPR 2005; Mishkin et al., 2015). threshold: pixels, Sampson distance.
+    """DEGENSAC by its authors (Chum et al., CVPR 2005; Mishkin et al., 2015).
 
-    Raises ImportError without `pydegensac`.
+    Args:
+        threshold: pixels, Sampson distance.
+        confidence: of having drawn a sample without an outlier, at which the search ends.
+        iterations: samples at most.
+
+    Returns:
+        The estimator.
+
+    Raises:
+        ImportError: where `pydegensac` is not installed.
     """
     library = peer("pydegensac", "DEGENSAC")
 

@@ -12,7 +12,18 @@ from fmtorch.estimators.peers.pairwise import Pair, PairwiseEstimator, Solution
 def kornia_ransac(
     *, threshold: float = 1.0, confidence: float = 0.9999, batch_size: int = 2048, rounds: int = 10, prosac: bool = True
 ) -> PairwiseEstimator:
-    """`kornia.geometry.RANSAC` with MSAC scores. threshold: pixels; rounds: batches of `batch_size` samples at most."""
+    """`kornia.geometry.RANSAC` with MSAC scores.
+
+    Args:
+        threshold: pixels.
+        confidence: of having drawn a sample without an outlier, at which the search ends.
+        batch_size: samples that are drawn together.
+        rounds: batches at most.
+        prosac: draw samples from the best matches first.
+
+    Returns:
+        The estimator.
+    """
 
     def solve(pair: Pair) -> Solution:
         estimator = kornia.geometry.RANSAC(

@@ -13,8 +13,19 @@ def opencv(
 ) -> PairwiseEstimator:
     """`cv2.findFundamentalMat` with one of its robust methods.
 
-    method: name of OpenCV's constant, e.g. FM_RANSAC, FM_LMEDS, USAC_MAGSAC. threshold: pixels, point to epipolar line
-    (FM_RANSAC) or Sampson distance (USAC_*). USAC_PROSAC gets the matches best first, as it expects.
+    USAC_PROSAC gets the matches best first, as it expects.
+
+    Args:
+        method: name of OpenCV's constant, e.g. FM_RANSAC, FM_LMEDS, USAC_MAGSAC.
+        threshold: pixels, point to epipolar line (FM_RANSAC) or Sampson distance (USAC_*).
+        confidence: of having drawn a sample without an outlier, at which the search ends.
+        iterations: samples at most.
+
+    Returns:
+        The estimator.
+
+    Raises:
+        ValueError: for a name that is no such constant.
     """
     code = getattr(cv2, method, None)
     if code is None or not method.startswith(("FM_", "USAC_")):

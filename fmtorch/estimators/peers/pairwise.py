@@ -47,7 +47,13 @@ class Pair:
 
 
 class PairwiseEstimator:
-    """Runs a function of a `Pair` -> (F or None, inliers) on each pair's live matches, best first if asked."""
+    """Runs a function of a `Pair` -> (F or None, inliers) on each pair's live matches, best first if asked.
+
+    Args:
+        name: what it is called in reasons.
+        solve: the function; what it raises of `FAILURES` becomes the pair's reason.
+        best_first: order the matches by likelihood.
+    """
 
     def __init__(self, name: str, solve: Callable[[Pair], Solution], best_first: bool = False) -> None:
         self.name, self._solve, self._best_first = name, solve, best_first

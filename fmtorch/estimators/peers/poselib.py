@@ -12,9 +12,19 @@ from fmtorch.estimators.peers.pairwise import Pair, PairwiseEstimator, Solution,
 def poselib(
     *, threshold: float = 1.0, confidence: float = 0.9999, iterations: int = 10000, prosac: bool = False
 ) -> PairwiseEstimator:
-    """PoseLib's LO-RANSAC for fundamental matrices (Larsson 2020). threshold: pixels, Sampson distance.
+    """PoseLib's LO-RANSAC for fundamental matrices (Larsson 2020).
 
-    prosac: draw samples from the best matches first. Raises ImportError with a hint where PoseLib is not installed.
+    Args:
+        threshold: pixels, Sampson distance.
+        confidence: of having drawn a sample without an outlier, at which the search ends.
+        iterations: samples at most.
+        prosac: draw samples from the best matches first.
+
+    Returns:
+        The estimator.
+
+    Raises:
+        ImportError: with a hint, where PoseLib is not installed.
     """
     library, options = peer("poselib", "PoseLib"), _poselib_options(threshold, confidence, iterations, prosac)
 
@@ -30,8 +40,19 @@ def poselib_shared_focal(
 ) -> PairwiseEstimator:
     """PoseLib's LO-RANSAC for two cameras of one unknown focal length, principal points central, square pixels.
 
-    Pairs whose images differ in size get its fundamental matrix. Options as of `poselib`. Raises ImportError with a
-    hint where PoseLib is not installed.
+    Pairs whose images differ in size get its fundamental matrix.
+
+    Args:
+        threshold: pixels, Sampson distance.
+        confidence: of having drawn a sample without an outlier, at which the search ends.
+        iterations: samples at most.
+        prosac: draw samples from the best matches first.
+
+    Returns:
+        The estimator.
+
+    Raises:
+        ImportError: with a hint, where PoseLib is not installed.
     """
     library, options = peer("poselib", "PoseLib"), _poselib_options(threshold, confidence, iterations, prosac)
 

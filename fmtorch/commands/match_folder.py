@@ -1,0 +1,73 @@
+"""`python -m fmtorch.match images=FOLDER export=h5,colmap`: the pairs of a folder of images, for other programs."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+from omegaconf import DictConfig
+from rich.console import Console
+
+from fmtorch import presets
+from fmtorch.exchange.export import export_kinds, write_exports
+from fmtorch.exchange.journal import Journal
+from fmtorch.fields import Count, Device, Seed
+from fmtorch.folder import FolderMatches, chosen_pairs, images_below, open_folder
+from fmtorch.storage.code import fmtorch_version
+from fmtorch.storage.features import CachedFeatures
+from fmtorch.terminal import console, progress_bars
+
+
+@dataclasses.dataclass(frozen=True)
+class FolderFields:
+    """What the command takes of a folder, and of a single pair too; ``conf/match.yaml`` says what each is."""
+
+    images: Path | None = None
+    pairs: Path | None = None
+    export: str | list[str] | None = None
+    camera: Literal["per_image", "shared"] = "per_image"
+    output: Path | None = None
+    orient: bool = True
+    longest_side: Count = 1600
+    seed: Seed = 0
+    device: Device = "auto"
+
+
+def match_folder(config: DictConfig, fields: FolderFields, pipeline_name: str, overrides: Sequence[str]) -> Path:
+    """Match the pairs of a folder of images, write what is to be exported and return the folder with it.
+
+    Raises ValueError for what the options cannot mean, and where no pair could be matched.
+    """
+    folder = fields.images
+    assert folder is not None
+    kinds = export_kinds(fields.export)
+    pairs = chosen_pairs(folder, images_below(folder), fields.pairs)
+    presets.expect_stages(config)
+    pipeline = presets.build_pipeline(config, presets.resolve_device(fields.device))
+    output = fields.output or Path(f"matches/{folder.absolute().name}")
+    identity = {
+        "version": fmtorch_version(), **presets.stages(config), "seed": fields.seed, "orient": fields.orient,
+        "longest_side": fields.longest_side,
+    }  # fmt: skip
+    journal = Journal(open_folder(output, identity), folder)
+    console.print(f"{' '.join([pipeline_name, *overrides])}: {folder}", style="italic", markup=False, highlight=False)
+    work = FolderMatches(pipeline, journal, fields.longest_side, fields.orient, fields.seed)
+    with progress_bars() as progress:
+        bar = progress.add_task(pipeline_name, total=len(pairs))
+        for pair in pairs:
+            work.match(*pair)
+            progress.advance(bar)
+    for trouble in work.troubles:
+        Console(stderr=True).print(trouble, style="bold", markup=False, highlight=False)
+    if work.taken:
+        console.print(f"{work.taken} of {len(pairs)} pairs taken from an earlier run", highlight=False)
+    if work.troubles and not work.done + work.taken:
+        raise ValueError(f"no pair could be matched, the first because: {work.troubles[0]}")
+    console.print(f"{work.related} of {len(pairs)} pairs show one scene", highlight=False)
+    written = ["export.json", *write_exports(journal, pairs, kinds, output, fields.camera == "shared")]
+    console.print(f"[dim]{output}: {', '.join(written)}[/dim]", highlight=False)
+    if isinstance(pipeline.extractor, CachedFeatures):
+        console.print(f"[dim]{pipeline.extractor.report()}[/dim]", highlight=False)
+    return output

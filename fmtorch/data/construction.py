@@ -1,0 +1,201 @@
+"""Which candidates of a data set make pairs by the paper's rule, and the FM-Bench layout that holds them.
+
+Candidates are judged in blocks, each a file once it is done, so that an interrupted construction goes on from there.
+With a count, candidates come in an order drawn by the seed until so many pass: as if drawn among all that pass.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fmtorch.data.camera_files import CAMERAS, IMAGES, SUFFIXES
+from fmtorch.data.images import ImageError, read_image, to_grey
+from fmtorch.data.matchable import ENOUGH, NEAR_LINE, RATIO, SIFT_FEATURES, Keypoints, keypoints, matchable
+from fmtorch.data.pairs import ImageSource
+from fmtorch.data.scenes import ScenePairs, image_pair
+from fmtorch.storage.files import replacing
+
+BLOCK = 64  # candidates that one worker judges at a time
+MOST_DRAWN = 10_000_000  # candidates of which an order is drawn, 80 MB; with more, among so many drawn at random
+RULE = {"features": SIFT_FEATURES, "ratio": RATIO, "near_line_px": NEAR_LINE, "more_than": ENOUGH}
+_VERSION = 1  # of the rule and the layout
+
+
+@dataclasses.dataclass(frozen=True)
+class Verdicts:
+    """What became of a block's candidates: whether each makes a pair, and what was wrong with images, each once."""
+
+    kept: list[bool]
+    problems: list[str]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Construction:
+    """The construction of pairs in a folder.
+
+    dataset: with the candidates. folder: of the set that is made; its name is the set's. count: how many pairs, drawn
+    at random by `seed`; None: all. quality: of JPEG images that are written because they were undistorted.
+    """
+
+    dataset: ScenePairs
+    folder: Path
+    count: int | None = None
+    seed: int = 0
+    quality: int = 95
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What defines the pairs and the images."""
+        return {
+            "version": _VERSION, "opencv": ".".join(cv2.__version__.split(".")[:2]), "dataset": self.dataset.name,
+            "cameras": self.dataset.cameras_digest, "rule": RULE, "count": self.count, "seed": self.seed,
+            "quality": self.quality,
+        }  # fmt: skip
+
+    @property
+    def work(self) -> Path:
+        """The folder of features and verdicts, which goes when the set is complete."""
+        return self.folder / "work"
+
+    @property
+    def complete(self) -> bool:
+        """Whether the set is there."""
+        return (self.folder / "pairs_with_gt.txt").is_file()
+
+    def begin(self) -> None:
+        """Make the folder, or go on with it. Raises ValueError where it holds another set, or anything else."""
+        record = self.folder / "pairs.json"
+        if record.is_file():
+            there = json.loads(record.read_text(encoding="utf-8"))["identity"]
+            differing = [key for key, value in self.identity.items() if there.get(key) != value]
+            if differing:
+                said = ", ".join(f"{key} {there.get(key)} there, {self.identity[key]} now" for key in differing)
+                raise ValueError(f"output={self.folder} holds pairs that differ in {said}; name another folder")
+        elif self.folder.is_dir() and any(self.folder.iterdir()):
+            raise ValueError(f"output={self.folder} holds something else; name a new folder")
+        else:
+            self.work.mkdir(parents=True)
+            with replacing(record) as path:
+                path.write_text(json.dumps({"identity": self.identity}, indent=1) + "\n", encoding="utf-8")
+
+    def order(self) -> Sequence[int] | NDArray[np.int64]:
+        """The candidates in the order in which they are judged."""
+        total, rng = self.dataset.candidates, np.random.default_rng(self.seed)
+        if self.count is None:
+            return range(total)
+        return rng.permutation(total) if total <= MOST_DRAWN else rng.choice(total, MOST_DRAWN, replace=False)
+
+    def judge(self, block: int, ranks: Sequence[int]) -> Verdicts:
+        """Judge the candidates of a block and keep the verdicts; what was judged before is read."""
+        file = self._verdicts(block)
+        if file.is_file():
+            return Verdicts(**json.loads(file.read_text(encoding="utf-8")))
+        kept, problems = [], list[str]()
+        for rank in ranks:
+            scene, i, j = self.dataset.candidate(rank)
+            pair = image_pair(self.dataset.scenes[scene], i, j)
+            try:
+                if pair.problem is not None:
+                    raise ImageError(pair.problem)
+                kept.append(matchable(self._keypoints(pair.image0), self._keypoints(pair.image1), pair.F))
+            except ImageError as error:
+                kept.append(False)
+                problems.append(str(error))
+        verdicts = Verdicts(kept, sorted(set(problems)))
+        file.parent.mkdir(exist_ok=True)
+        with replacing(file) as path:
+            path.write_text(json.dumps(dataclasses.asdict(verdicts)), encoding="utf-8")
+        return verdicts
+
+    def write_image(self, scene: int, number: int) -> None:
+        """Write one image of a scene unless it is there: the file itself, or as JPEG what was undistorted."""
+        source = self.dataset.scenes[scene].views[number].image
+        target = self._image(scene, number)
+        if target.is_file():
+            return
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(target) as path:
+            if _as_it_is(source):
+                shutil.copyfile(source.path, path)
+                return
+            image = read_image(source)
+            colour = image if image.ndim == 2 else image[..., ::-1]
+            path.write_bytes(cv2.imencode(".jpg", colour, [cv2.IMWRITE_JPEG_QUALITY, self.quality])[1].tobytes())
+
+    def finish(self, ranks: Sequence[int], summary: Mapping[str, Any]) -> None:
+        """Write the set's text files, the list of pairs last, once its images are there; the work folder goes."""
+        pairs, subsets = [], []
+        places = sorted(self.dataset.candidate(rank) for rank in ranks)
+        for number in sorted({scene for scene, _, _ in places}):
+            self._write_scene(number)
+        for number, i, j in places:
+            scene = self.dataset.scenes[number]
+            pairs.append(f"{i} {j} {_numbers(image_pair(scene, i, j).F)}\n")
+            subsets.append(f"{scene.name}/\n")
+        record = {"identity": self.identity, "summary": dict(summary)}
+        for name, text in (
+            ("pairs.json", json.dumps(record, indent=1) + "\n"),
+            ("pairs_which_dataset.txt", "".join(subsets)),
+            ("pairs_with_gt.txt", "".join(pairs)),
+        ):
+            with replacing(self.folder / name) as path:
+                path.write_text(text, encoding="utf-8")
+        shutil.rmtree(self.work, ignore_errors=True)
+
+    def used(self, ranks: Sequence[int]) -> list[tuple[int, int]]:
+        """The images (scene, number) of pairs, each once."""
+        places = [self.dataset.candidate(rank) for rank in ranks]
+        return sorted({(scene, number) for scene, i, j in places for number in (i, j)})
+
+    def _write_scene(self, number: int) -> None:
+        """The cameras and the names at the source of all images of a scene."""
+        scene = self.dataset.scenes[number]
+        lines = [f"{_numbers(view.K)} {_numbers(view.R)} {_numbers(view.t)}\n" for view in scene.views]
+        names = [f"{i:08d} {view.image.identity}\n" for i, view in enumerate(scene.views)]
+        for name, text in ((CAMERAS, lines), ("names.txt", names)):
+            with replacing(self.folder / scene.name / name) as path:
+                path.write_text("".join(text), encoding="utf-8")
+
+    def _image(self, scene: int, number: int) -> Path:
+        source = self.dataset.scenes[scene].views[number].image
+        suffix = source.path.suffix if _as_it_is(source) else SUFFIXES[0]
+        return self.folder / self.dataset.scenes[scene].name / IMAGES / f"{number:08d}{suffix}"
+
+    def _verdicts(self, block: int) -> Path:
+        return self.work / "verdicts" / f"{block:08d}.json"
+
+    def _keypoints(self, image: ImageSource) -> Keypoints:
+        """SIFT of an image, from the work folder where it is there; descriptors are whole numbers up to 255."""
+        path = self.work / "features" / f"{image.identity}.npz"
+        if path.is_file():
+            with np.load(path) as file:
+                return file["points"].astype(np.float64), file["descriptors"].astype(np.float32)
+        points, descriptors = keypoints(to_grey(read_image(image)))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as temporary, temporary.open("wb") as file:
+            np.savez(file, points=points.astype(np.float32), descriptors=descriptors.astype(np.uint8))
+        return points, descriptors
+
+
+def _as_it_is(source: ImageSource) -> bool:
+    """Whether the layout can take the file itself."""
+    return source.lens is None and source.path.suffix in SUFFIXES
+
+
+def _numbers(values: NDArray[np.float64]) -> str:
+    return " ".join(repr(float(value)) for value in values.ravel())
+
+
+def blocks(order: Sequence[int] | NDArray[np.int64]) -> Iterator[tuple[int, list[int]]]:
+    """The blocks of an order of candidates: their numbers and candidates."""
+    for begin in range(0, len(order), BLOCK):
+        yield begin // BLOCK, [int(rank) for rank in order[begin : begin + BLOCK]]

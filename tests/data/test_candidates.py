@@ -1,0 +1,73 @@
+"""Which pairs are looked at, against slow counting."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from fmtorch.data.candidates import AllPairs, ListedPairs, drawn, following, sharing_points
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3, 7, 50])
+def test_all_pairs_are_all_combinations_in_order(n: int) -> None:
+    pairs = AllPairs(n)
+    expected = list(itertools.combinations(range(n), 2))
+    assert len(pairs) == len(expected)
+    assert [tuple(p) for p in pairs.at(np.arange(len(pairs)))] == expected
+
+
+def test_all_pairs_of_a_million_images_are_not_listed() -> None:
+    pairs = AllPairs(1_000_000)
+    assert len(pairs) == 499_999_500_000
+    assert pairs.at(np.array([0, 999_999, len(pairs) - 1])).tolist() == [[0, 1], [1, 2], [999_998, 999_999]]
+    ranks = np.asarray(drawn(len(pairs), 1000, seed=0))
+    assert len(set(ranks.tolist())) == 1000
+    assert (np.diff(pairs.at(ranks)) > 0).all()
+
+
+@pytest.mark.parametrize("window", [0.0, 0.1, 0.35, 1.0, 100.0])
+def test_following_frames_are_those_within_the_window(window: float) -> None:
+    times = np.cumsum(np.random.default_rng(0).uniform(0.01, 0.2, 60))
+    expected = [(i, j) for i, j in itertools.combinations(range(60), 2) if times[j] - times[i] <= window]
+    pairs = following(times, window)
+    assert [tuple(p) for p in pairs.at(np.arange(len(pairs)))] == expected
+
+
+def test_frames_of_ten_a_second_reach_the_tenth() -> None:
+    """Time stamps of text files are rounded; 1.0000000001 s is a second."""
+    pairs = following([float(f"{0.1 * i:.6e}") for i in range(30)])
+    assert {j - i for i, j in pairs.pairs.tolist()} == set(range(1, 11))
+    assert len(following([])) == len(following([3.0])) == 0
+
+
+@pytest.mark.parametrize("minimum", [1, 2, 5])
+def test_images_that_share_points_are_those_counted_one_by_one(minimum: int) -> None:
+    rng = np.random.default_rng(1)
+    points = [rng.integers(0, 60, rng.integers(0, 25)) for _ in range(40)]
+    points[4], points[7] = rng.integers(0, 2**40, 3).repeat(2), np.zeros(0, np.int64)
+    expected = [
+        (i, j)
+        for i, j in itertools.combinations(range(40), 2)
+        if len(set(points[i].tolist()) & set(points[j].tolist())) >= minimum
+    ]
+    pairs = sharing_points(points, minimum)
+    assert [tuple(p) for p in pairs.pairs.tolist()] == expected
+    assert len(expected) > 50
+    assert len(sharing_points([])) == 0
+
+
+def test_a_draw_is_without_repetition_and_of_the_seed() -> None:
+    assert list(drawn(5, None, 0)) == list(drawn(5, 7, 0)) == [0, 1, 2, 3, 4]
+    first, again, other = (np.asarray(drawn(10**6, 500, seed)) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+    assert len(set(first.tolist())) == 500
+    assert (np.diff(first) > 0).all()
+    assert abs(first.mean() - 5e5) < 4 * 1e6 / np.sqrt(12 * 500)
+
+
+def test_listed_pairs_are_taken_by_place() -> None:
+    pairs = ListedPairs(np.array([[0, 3], [1, 2]]))
+    assert pairs.at(np.array([1])).tolist() == [[1, 2]]

@@ -1,0 +1,146 @@
+"""Commands in processes of their own, started quickly, and killed at a chosen moment."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import functools
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from tests.conftest import own_cache
+
+SOURCE = Path(__file__).resolve().parents[1]
+ENVIRONMENT = dict(os.environ)  # before any test changes it
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+PATIENCE = 1200.0  # seconds after which a command hangs
+
+
+class Command:
+    """A command that runs."""
+
+    def __init__(self, starter: Starter, pid: int, log: Path) -> None:
+        self._starter, self.pid, self.log = starter, pid, log
+        self.status: int | None = None
+
+    def kill(self) -> bool:
+        """Kill it; whether it was still running."""
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self.pid, signal.SIGKILL)
+        return self.wait() == -signal.SIGKILL
+
+    def wait(self) -> int:
+        """The exit status."""
+        if self.status is None:
+            self.status = self._starter.ask({"wait": self.pid})
+        return self.status
+
+    def runs(self) -> bool:
+        """Whether it has not ended, killed or by itself."""
+        try:
+            state = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()[0]
+        except OSError:
+            return False
+        return state != "Z"
+
+    def kill_when(self, reached: Callable[[], bool], later: float = 0.0) -> bool:
+        """Kill it `later` seconds after something is so; whether it was still running then."""
+        deadline = time.monotonic() + PATIENCE
+        while not reached() and self.runs() and time.monotonic() < deadline:
+            time.sleep(0.001)
+        time.sleep(later)
+        return self.kill()
+
+    def said(self) -> str:
+        """All that it wrote to the terminal."""
+        return self.log.read_text(errors="replace")
+
+
+class Starter:
+    """A process with the libraries imported, which forks commands; see `starter`."""
+
+    def __init__(self) -> None:
+        environment = {**ENVIRONMENT, **ONE_THREAD, "PYTHONPATH": str(SOURCE), "COLUMNS": "200"}
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "tests.starter"], cwd=SOURCE, env=environment, text=True,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        )  # fmt: skip
+        self._count = 0
+
+    def ask(self, job: dict[str, Any]) -> int:
+        """The answer to one line."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(json.dumps(job) + "\n")
+        self._process.stdin.flush()
+        return int(self._process.stdout.readline())
+
+    def start(
+        self,
+        cwd: Path,
+        name: str,
+        *arguments: str,
+        before: str = "",
+        log: Path | None = None,
+        errors: Path | None = None,
+        environment: Mapping[str, str] | None = None,
+    ) -> Command:
+        """``python -m fmtorch.<name> arguments`` in a folder; before: Python code that runs first.
+
+        log, errors: files for standard output and standard error, which go into one in the folder if not given.
+        """
+        self._count += 1
+        log = log or cwd / f"{name}-{self._count}.log"
+        own = {"FMTORCH_CACHE": str(own_cache(cwd)), "PYTHONPATH": str(SOURCE), **(environment or {})}
+        job = {
+            "start": [name if name.startswith("scripts") else f"fmtorch.{name}", *arguments], "cwd": str(cwd),
+            "log": str(log), "errors": str(errors or log), "environment": own, "before": before,
+        }  # fmt: skip
+        return Command(self, self.ask(job), log)
+
+    def run(self, cwd: Path, name: str, *arguments: str, before: str = "") -> Command:
+        """The same to its end."""
+        command = self.start(cwd, name, *arguments, before=before)
+        command.wait()
+        return command
+
+    def close(self) -> None:
+        """End the process."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait()
+
+
+@functools.cache
+def starter() -> Starter:
+    """The process that starts the commands of this test process."""
+    started = Starter()
+    atexit.register(started.close)
+    return started
+
+
+def run_command(
+    name: str, *arguments: str, cwd: Path, environment: Mapping[str, str] | None = None, patience: float = 300.0
+) -> subprocess.CompletedProcess[str]:
+    """``python -m fmtorch.<name> arguments`` as a user runs it in a folder, to its end; it has a cache of its own.
+
+    The process is forked from one that has imported the libraries, which saves seconds. Raises TimeoutError.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        log, errors = (Path(folder) / stream for stream in ("out", "errors"))
+        command = starter().start(cwd, name, *arguments, log=log, errors=errors, environment=environment)
+        deadline = time.monotonic() + patience
+        while command.runs():
+            if time.monotonic() > deadline:
+                command.kill()
+                raise TimeoutError(f"{name} {' '.join(arguments)}: {log.read_text()}{errors.read_text()}")
+            time.sleep(0.05)
+        return subprocess.CompletedProcess([name, *arguments], command.wait(), log.read_text(), errors.read_text())
