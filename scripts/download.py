@@ -1,6 +1,9 @@
-"""Fetches networks published by their authors, verified where their SHA-256 is known.
+"""Fetches networks and data sets published by their authors, verified where their SHA-256 is known.
 
 python scripts/download.py                                        lists what there is
+python scripts/download.py dataset=tum folder=TUM                 the paper's test sequences, unpacked; can be continued
+python scripts/download.py dataset=tum files=[freiburg1_xyz]      others; docs/data.md says what each set is
+python scripts/download.py dataset=kitti                          what to do where a form must be filled in
 python scripts/download.py weights=affnet                         -> weights/AffNet.pth
 python scripts/download.py weights=hardnet++ sha256=HEX           for a file whose SHA-256 is not pinned here
 python scripts/download.py weights=hardnet++ sha256=any           accepts what comes, and prints its SHA-256
@@ -15,11 +18,14 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import http.client
 import os
 import re
+import tarfile
 import tempfile
 import urllib.error
 import urllib.request
+import zlib
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
@@ -27,7 +33,9 @@ from rich.table import Table
 
 from fmtorch.terminal import console, exits_with_message
 
-DEFAULTS = {"weights": None, "sha256": None, "folder": "weights", "url": None, "timeout": 60}
+DEFAULTS = {
+    "weights": None, "dataset": None, "files": None, "sha256": None, "folder": None, "url": None, "timeout": 60,
+}  # fmt: skip
 AFFNET = "https://raw.githubusercontent.com/ducha-aiki/affnet/da7cf51ba09cb92e3cf0f46c12a89881f79e5051"
 HARDNET = "https://github.com/DagnyT/hardnet/raw/master/pretrained"
 
@@ -66,6 +74,135 @@ TABLE = {
     "hardnet++": Weights(f"{HARDNET}/pretrained_all_datasets/HardNet++.pth", "hardnet", "MIT"),
     "hardnet_liberty": Weights(f"{HARDNET}/train_liberty_with_aug/checkpoint_liberty_with_aug.pth", "hardnet", "MIT"),
 }  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Source:
+    """A published data set: `url` of an archive by its file's name, the files that the paper tests on, its terms.
+
+    by_hand: what to do where there is no address to fetch from.
+    """
+
+    licence: str
+    citation: str
+    url: str = ""
+    files: tuple[str, ...] = ()
+    by_hand: str = ""
+
+
+DATASETS = {
+    "tum": Source(
+        "CC BY 4.0", "Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS 2012",
+        "https://cvg.cit.tum.de/rgbd/dataset/{camera}/rgbd_dataset_{file}.tgz",
+        ("freiburg3_teddy", "freiburg3_large_cabinet", "freiburg3_long_office_household"),
+    ),
+    "1dsfm": Source(
+        "photographs of Flickr under their owners' licences",
+        "Wilson and Snavely, Robust Global Translations, ECCV 2014",
+        "http://landmark.cs.cornell.edu/projects/1dsfm/images.{file}.tar", ("Roman_Forum",),
+    ),
+    "kitti": Source(
+        "CC BY-NC-SA 3.0", "Geiger et al., Are we ready for Autonomous Driving?, CVPR 2012",
+        by_hand="on https://www.cvlibs.net/datasets/kitti/eval_odometry.php ask, with an e-mail address, for "
+        "data_odometry_gray.zip, data_odometry_calib.zip and data_odometry_poses.zip; unpack all three in one folder",
+    ),
+    "tanks_and_temples": Source(
+        "CC BY-NC-SA 3.0, as its page states", "Knapitsch et al., Tanks and Temples, SIGGRAPH 2017",
+        by_hand="take the images of Panther, Playground and Train from https://www.tanksandtemples.org/download, and "
+        "reconstruct each scene with COLMAP",
+    ),
+    "fmbench": Source(
+        "those of its four sets", "Bian et al., An Evaluation of Feature Matchers, BMVC 2019",
+        by_hand="follow the link on https://github.com/JiawangBian/FM-Bench and unpack the archive",
+    ),
+}  # fmt: skip
+
+
+def fetch_dataset(config: DictConfig) -> list[Path]:
+    """Fetch and unpack a data set's archives; those whose folders are there are skipped."""
+    if config.dataset not in DATASETS:
+        raise ValueError(f"dataset={config.dataset}; there are: {', '.join(DATASETS)}")
+    source = DATASETS[config.dataset]
+    console.print(f"licence: {source.licence}\ncite: {source.citation}", highlight=False, markup=False)
+    if source.by_hand:
+        raise ValueError(f"{config.dataset} cannot be fetched from here: {source.by_hand}")
+    folder, made = Path(config.folder or config.dataset), []
+    for file in config.files or source.files:
+        address = config.url or source.url
+        url = address.format(file=file, camera=file.partition("_")[0])
+        target = folder / f".{file}.archive"
+        if (folder / f".{file}.complete").is_file():
+            console.print(f"{file} is there", highlight=False)
+            continue
+        resume(url, target, config.timeout)
+        if config.sha256 is not None and config.sha256 != "any":
+            expect_digest(url, target, config.sha256)
+        made += unpack(target, folder)
+        (folder / f".{file}.complete").touch()
+        target.unlink()
+    for path in made:
+        console.print(str(path), highlight=False, markup=False)
+    return made
+
+
+def expect_digest(url: str, path: Path, sha256: str) -> None:
+    """Raises ValueError, and drops the file, where it is another one."""
+    with path.open("rb") as file:
+        found = hashlib.file_digest(file, "sha256").hexdigest()
+    if found != sha256.lower():
+        path.unlink()
+        raise ValueError(f"{url} has SHA-256 {found}, not {sha256}: it was not kept")
+
+
+def resume(url: str, path: Path, timeout: float = 60) -> None:
+    """Fetch `url` into `path`, beside which an unfinished part is kept, and continued where the server can.
+
+    Raises ConnectionError where it cannot be fetched whole; the same call then goes on.
+    """
+    if path.is_file():
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".part")
+    begin = part.stat().st_size if part.is_file() else 0
+    request = urllib.request.Request(url, headers={"Range": f"bytes={begin}-"} if begin else {})
+    try:
+        with urllib.request.urlopen(request, timeout=timeout) as response:
+            begin = begin if response.status == 206 else 0  # else the server sends it from the beginning
+            with part.open("ab" if begin else "wb") as file:
+                while some := response.read(1 << 20):
+                    file.write(some)
+                length = response.headers.get("Content-Length")
+                if length is not None and file.tell() != begin + int(length):
+                    raise ConnectionError(f"{url} broke off after {file.tell()} of {begin + int(length)} bytes")
+    except urllib.error.HTTPError as error:
+        if error.code != 416:  # nothing is left to send
+            raise ConnectionError(f"{url} cannot be fetched ({error.code} {error.reason})") from error
+    except (urllib.error.URLError, http.client.HTTPException, TimeoutError) as error:
+        raise ConnectionError(f"{url} broke off or cannot be fetched ({error}); the same command goes on") from error
+    os.replace(part, path)
+
+
+def unpack(archive: Path, folder: Path) -> list[Path]:
+    """Unpack a tar archive; its files and folders appear in `folder` when all are there. Returns them.
+
+    Raises ValueError for a damaged archive, for members that would leave the folder, and for links and devices.
+    """
+    if not hasattr(tarfile, "data_filter"):
+        raise ValueError("unpacking safely needs Python 3.11.4 or newer")
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".unpacking") as temporary:
+        try:
+            with tarfile.open(archive) as tar:
+                tar.extractall(temporary, filter="data")
+        except (tarfile.TarError, EOFError, zlib.error, OSError) as error:
+            raise ValueError(f"{archive}: cannot be unpacked ({error}); delete it and fetch it again") from error
+        made = []
+        for path in sorted(Path(temporary).iterdir()):
+            if (folder / path.name).exists():
+                raise ValueError(f"{folder / path.name} is there already; name another folder or remove it")
+        for path in sorted(Path(temporary).iterdir()):
+            os.replace(path, folder / path.name)
+            made.append(folder / path.name)
+    return made
 
 
 def download(url: str, path: Path, sha256: str | None, timeout: float = 60) -> str:
@@ -111,7 +248,7 @@ def fetch(config: DictConfig) -> Path:
         )
     if expected != "any" and not re.fullmatch(r"[0-9a-fA-F]{64}", expected):
         raise ValueError(f"sha256={expected} is no SHA-256: 64 hexadecimal digits, or any")
-    path = Path(config.folder) / entry.file
+    path = Path(config.folder or "weights") / entry.file
     found = download(config.url or entry.url, path, None if expected == "any" else expected, config.timeout)
     state = "not verified" if expected == "any" else "verified"
     console.print(f"{path}  SHA-256 {found} ({state})  licence: {entry.licence}  architecture={entry.architecture}")
@@ -122,11 +259,17 @@ def main() -> None:
     with exits_with_message():
         config = OmegaConf.merge(OmegaConf.create(DEFAULTS), OmegaConf.from_cli())
         assert isinstance(config, DictConfig)
-        if config.weights is None:
+        if config.dataset is not None:
+            fetch_dataset(config)
+        elif config.weights is None:
             table = Table("weights", "architecture", "licence", "SHA-256", "URL")
             for name, entry in TABLE.items():
                 table.add_row(name, entry.architecture, entry.licence, entry.sha256 or "not known", entry.url)
             console.print(table)
+            sets = Table("dataset", "files", "licence", "citation")
+            for name, source in DATASETS.items():
+                sets.add_row(name, ", ".join(source.files) or "by hand", source.licence, source.citation)
+            console.print(sets)
         else:
             fetch(config)
 

@@ -42,6 +42,12 @@ def test_other_trainings_stand_apart() -> None:
         assert shipped[5] == other[5]
 
 
+def test_features_are_not_mixed() -> None:
+    """The shipped network on other features of the same pairs is not what its other trainings are compared with."""
+    others = [{**r, "features": "hardnet", "nsgd": 0.5} for r in some_rows() if r["training_of"] is None]
+    assert learned_table.tables(some_rows() + others)[-2:] == learned_table.tables(some_rows())[-2:]
+
+
 def test_trainings_are_compared_on_pairs_that_all_have() -> None:
     rows = [r for r in some_rows() if not (r["method"] == "seed 1" and r["pair"].endswith("3"))]
     hard = learned_table.tables(rows)[-2]

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import re
-import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -18,7 +14,8 @@ from fmtorch.data import load
 from fmtorch.stages import FeatureExtractor
 from fmtorch.storage.cache import ArrayCache
 from fmtorch.storage.features import CachedFeatures
-from tests.conftest import own_cache, shared_path
+from tests.conftest import shared_path
+from tests.processes import Command, starter
 from tests.test_eval import OPTIONS, evaluate, rows
 from tests.test_match import run_python
 from tests.test_pipeline import draw
@@ -57,11 +54,9 @@ def arguments(root: Path, run_dir: Path, *extra: str) -> list[str]:
     return ["dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"run_dir={run_dir}", *extra]
 
 
-def start(cwd: Path, *arguments: str) -> subprocess.Popen[str]:
-    source = str(Path(__file__).resolve().parents[1])
-    env = {**os.environ, "PYTHONPATH": source, "COLUMNS": "200", "FMTORCH_CACHE": str(own_cache(cwd))}
-    command = [sys.executable, "-m", "fmtorch.eval", *arguments]
-    return subprocess.Popen(command, cwd=cwd, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+def start(cwd: Path, log: Path, *arguments: str) -> Command:
+    """The command in a process of its own; `log` and `log`.errors are what it writes."""
+    return starter().start(cwd, "eval", *arguments, log=log, errors=log.with_suffix(".errors"))
 
 
 def results(run_dir: Path) -> Rows:
@@ -98,13 +93,11 @@ def test_the_same_rows_with_an_empty_and_with_a_damaged_cache(root: Path, truth:
 
 def test_a_killed_run_continues_with_what_it_had(root: Path, truth: Rows, tmp_path: Path) -> None:
     these = arguments(root, tmp_path / "run", "batch=1", "workers=1")
-    process = start(tmp_path, *these)
+    process = start(tmp_path, tmp_path / "killed", *these)
     deadline = time.monotonic() + 120
     while len(list(tmp_path.glob("cache/features/*/*.npz"))) < 5 and time.monotonic() < deadline:
         time.sleep(0.002)
-    process.send_signal(signal.SIGKILL)
-    process.communicate(timeout=60)
-    assert process.returncode == -signal.SIGKILL
+    assert process.kill()
     had = len(list(tmp_path.glob("cache/features/*/*.npz")))
     assert 5 <= had < IMAGES
     again = evaluate(*these, cwd=tmp_path)
@@ -118,9 +111,13 @@ def test_a_killed_run_continues_with_what_it_had(root: Path, truth: Rows, tmp_pa
 
 def test_two_runs_at_once_share_the_cache(root: Path, truth: Rows, tmp_path: Path) -> None:
     names = ("a", "b")
-    processes = [start(tmp_path, *arguments(root, tmp_path / name, "workers=2", "batch=3")) for name in names]
-    told = [process.communicate(timeout=300) for process in processes]
-    assert [process.returncode for process in processes] == [0, 0], told
+    processes = [
+        start(tmp_path, tmp_path / f"{name}.out", *arguments(root, tmp_path / name, "workers=2", "batch=3"))
+        for name in names
+    ]
+    ended = [process.wait() for process in processes]
+    told = [(process.log.read_text(), process.log.with_suffix(".errors").read_text()) for process in processes]
+    assert ended == [0, 0], told
     assert all("damaged" not in err and "nothing is kept" not in err for _, err in told)
     assert results(tmp_path / "a") == results(tmp_path / "b") == truth
     kept = list(ArrayCache(tmp_path / "cache" / "features").files())

@@ -121,13 +121,7 @@ def algebraic(
 ) -> Float[Tensor, "*#batch n"]:
     """The signed algebraic residual ``x1^T F x0``, in units of F.
 
-    Args:
-        F: fundamental matrices (..., 3, 3), of any scale and sign.
-        x0: points in image 0, (..., N, 2), px.
-        x1: their matches in image 1, (..., N, 2), px.
-
-    Returns:
-        (..., N).
+    Arguments and shape as of `sampson`.
     """
     a, b, c = lines_through(F, x0)
     return a * x1[..., 0] + b * x1[..., 1] + c
@@ -155,13 +149,7 @@ def symmetric_mean(
 ) -> Float[Tensor, "*#batch n"]:
     """Mean of the two point-to-line distances, in pixels.
 
-    Args:
-        F: fundamental matrices (..., 3, 3), of any scale and sign.
-        x0: points in image 0, (..., N, 2), px.
-        x1: their matches in image 1, (..., N, 2), px.
-
-    Returns:
-        (..., N).
+    Arguments and shape as of `sampson`.
     """
     d0, d1 = epipolar_distances(F, x0, x1)
     return (d0 + d1) / 2
@@ -172,13 +160,7 @@ def symmetric_max(
 ) -> Float[Tensor, "*#batch n"]:
     """Larger of the two point-to-line distances, in pixels.
 
-    Args:
-        F: fundamental matrices (..., 3, 3), of any scale and sign.
-        x0: points in image 0, (..., N, 2), px.
-        x1: their matches in image 1, (..., N, 2), px.
-
-    Returns:
-        (..., N).
+    Arguments and shape as of `sampson`.
     """
     d0, d1 = epipolar_distances(F, x0, x1)
     return torch.maximum(d0, d1)
@@ -189,13 +171,7 @@ def symmetric_squared(
 ) -> Float[Tensor, "*#batch n"]:
     """Sum of the two squared point-to-line distances, in squared pixels (Hartley & Zisserman, eq. 11.10).
 
-    Args:
-        F: fundamental matrices (..., 3, 3), of any scale and sign.
-        x0: points in image 0, (..., N, 2), px.
-        x1: their matches in image 1, (..., N, 2), px.
-
-    Returns:
-        (..., N).
+    Arguments and shape as of `sampson`.
     """
     d0, d1 = epipolar_distances(F, x0, x1)
     return d0 * d0 + d1 * d1
@@ -230,13 +206,7 @@ def sampson_squared(
 ) -> Float[Tensor, "*#batch n"]:
     """Squared Sampson distance, in squared pixels.
 
-    Args:
-        F: fundamental matrices (..., 3, 3), of any scale and sign.
-        x0: points in image 0, (..., N, 2), px.
-        x1: their matches in image 1, (..., N, 2), px.
-
-    Returns:
-        (..., N).
+    Arguments and shape as of `sampson`.
     """
     distance = sampson(F, x0, x1)
     return distance * distance

@@ -36,6 +36,7 @@ SETS = ("Strecha", "PhotoTourism", "KITTI", "TUM", "Strecha_train", "TanksLike")
 ELSEWHERE = {
     r"python3? -m venv|pip install": "a fresh environment: continuous integration runs these",
     r"python -m pytest|ruff check|sphinx-build": "what continuous integration does",
+    r"scripts/download": "tests/test_download.py runs it against a server of its own",
     r"convert_ngransac": "needs the authors' weights; tests/pruning/networks/test_files.py runs it on others",
     r"--contrib-python": "needs a Python with opencv-contrib",
     r"--config-dir my_conf (pruner|pipeline)=": "tests/training/test_train_command.py runs these files and commands",
