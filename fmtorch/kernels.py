@@ -64,6 +64,17 @@ class Kernel(Generic[P, R]):
         return self._compiled
 
     @property
+    def ready(self) -> bool:
+        """Whether this process has it compiled."""
+        return self._compiled is not None
+
+    @property
+    def kept(self) -> bool:
+        """Whether the cache folder holds it. Raises ImportError where numba cannot be imported."""
+        path = kernel_cache.KernelFile(self.function, self.signature, print).path
+        return path is not None and path.is_file()
+
+    @property
     def _numba_type_(self) -> Any:  # asked by numba where a kernel calls this one
         return _type_of(self.compiled())
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fmtorch import kernel_cache, kernels
+from fmtorch import kernel_cache, kernel_compiler, kernels
 from fmtorch.kernels import Inner, Kernel, inner, kernel
 
 SOURCE = """
@@ -122,6 +122,35 @@ def test_kernels_can_be_prepared(module: types.ModuleType, capsys: pytest.Captur
     assert "1 of 2: compiling rows" in capsys.readouterr().err
     assert result(module) == EXPECTED
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("importable", [True, False])
+def test_two_processes_compile_together(
+    module: types.ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cache: Path, importable: bool
+) -> None:
+    """What the other process cannot compile is compiled here."""
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path) if importable else "")
+    monkeypatch.setattr(kernel_compiler, "_cores", lambda: 2)
+    both = [module.rows, module.scaled_squares]
+    assert not any(each.ready or each.kept for each in both)
+    kernel_compiler.compile_together(both)
+    assert all(each.ready and each.kept for each in both)
+    assert len(list(cache.rglob("*.bin"))) == 2
+    assert result(module) == EXPECTED
+    monkeypatch.setattr(kernel_compiler, "_helper", None)  # is not asked again
+    kernel_compiler.compile_together(both)
+
+
+def test_the_other_process_compiles_what_it_is_told(module: types.ModuleType, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "fmtorch.kernel_compiler"]
+    path = os.pathsep.join([str(REPOSITORY), str(tmp_path)])
+    told = subprocess.run(
+        command, input="some_kernels rows 1 of 1: \n", capture_output=True, text=True, check=True,
+        env={**os.environ, "PYTHONPATH": path},
+    )  # fmt: skip
+    assert told.stdout.split() == ["ready", "rows"]
+    assert "1 of 1: compiling rows" in told.stderr
+    assert module.rows.kept
 
 
 def test_an_edited_callee_changes_the_folder(tmp_path: Path) -> None:

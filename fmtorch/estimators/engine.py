@@ -24,6 +24,7 @@ from fmtorch.estimators.focal.selection import FocalSelection
 from fmtorch.estimators.forms import Form, Outcome, pair_by_pair
 from fmtorch.estimators.graph_cut import LocalOptimization
 from fmtorch.estimators.inliers import Confidence, InlierRule
+from fmtorch.estimators.one_pair import ahead
 from fmtorch.estimators.one_pair.whole import whole
 from fmtorch.estimators.options import Focal, Preselect, Refine, Select, at_least_one, group, thresholds
 from fmtorch.estimators.pairs import NormalizedPairs
@@ -36,6 +37,7 @@ from fmtorch.estimators.search import Search
 from fmtorch.estimators.selection import BestScore, FirstOfPool, Selector
 from fmtorch.estimators.solvers import MinimalSamples, Solver
 from fmtorch.estimators.verbs import FocalParts, Verbs
+from fmtorch.kernel_compiler import compile_together
 from fmtorch.types import Correspondences, Estimate
 
 FOCAL_ROUND = 500  # samples of five matches of a pair at a time
@@ -153,6 +155,8 @@ class HypothesizeAndVerify:
         compiled = self.kernel_form if c.mask.device.type == "cpu" and kernels.available() else None
         if compiled is not None:
             form = functools.partial(pair_by_pair, compiled)
+            if self.focal is not None:
+                compile_together(ahead.FOCAL)
         solve, threads = functools.partial(self._solve, form), compiled is not None
         return solve_all(c, seed, least, solve, "every minimal sample was degenerate", at_once, threads)
 

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.geometry.order_kernels import smallest_but
+from fmtorch.geometry.rank2_kernels import assign
 from fmtorch.kernels import kernel
 
 Array = NDArray[Any]
@@ -17,26 +19,7 @@ TINY = float(np.finfo(np.float64).tiny)
 def best(score: Array, out: Array) -> None:
     """The indices of the k best of m >= k scores, in ascending order -> out (k,)."""
     m, k = len(score), len(out)
-    values = score.copy()
-    low, high, wanted = 0, m - 1, k - 1
-    while low < high:  # Hoare's selection of the k-th best
-        pivot, i, j = values[(low + high) >> 1], low, high
-        while i <= j:
-            while values[i] > pivot:
-                i += 1
-            while values[j] < pivot:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if wanted <= j:
-            high = j
-        elif wanted >= i:
-            low = i
-        else:
-            break
-    least, better = values[wanted], 0
+    least, better = smallest_but(score.copy(), 0, m, m - k), 0
     for i in range(m):
         better += score[i] > least
     equal, place = k - better, 0
@@ -60,11 +43,13 @@ def merge(
             continue
         place = min(filled, len(pool_score) - 1)
         while place > 0 and pool_score[place - 1] < score[k]:
-            pool_score[place], pool_draw[place] = pool_score[place - 1], pool_draw[place - 1]
-            pool[place] = pool[place - 1]
+            pool_score[place] = pool_score[place - 1]
+            pool_draw[place] = pool_draw[place - 1]
+            assign(pool[place], pool[place - 1])
             place -= 1
-        pool_score[place], pool_draw[place] = score[k], draw[which[k]]
-        pool[place] = F[which[k]]
+        pool_score[place] = score[k]
+        pool_draw[place] = draw[which[k]]
+        assign(pool[place], F[which[k]])
         filled = min(filled + 1, len(pool_score))
     return filled
 

@@ -16,6 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from fmtorch.geometry import arithmetic_kernels
+
 
 def stable_sum(x: Tensor, dim: int = -1) -> Tensor:
     """The sum over `dim` in a balanced binary tree that trailing zeros do not change.
@@ -129,14 +131,9 @@ def unit(x: Float[Tensor, " c *s"]) -> Float[Tensor, " c *s"]:
 def exponential(x: Tensor) -> Tensor:
     """exp(x) for |x| up to about 5 by arithmetic alone: library functions differ in the last bit with memory layout.
 
-    Pade's approximant of order 4 at x / 32, to rounding there, and five squarings.
+    To rounding; written once for tensors and kernels.
     """
-    y = x / 32
-    y2 = y * y
-    even, odd = 1680 + y2 * (180 + y2), y * (840 + 20 * y2)
-    value = (even + odd) / (even - odd)
-    for _ in range(5):
-        value = value * value
+    value: Tensor = arithmetic_kernels.exponential(x)
     return value
 
 

@@ -11,8 +11,8 @@ ROOT2, LOG2 = math.sqrt(2), math.log(2)
 
 
 @inner
-def exponential(x: float) -> Any:
-    """exp(x) for |x| up to about 5: Pade's approximant of order 4 at x / 32, and five squarings."""
+def exponential(x: Any) -> Any:
+    """exp(x) for |x| up to about 5: Pade's approximant of order 4 at x / 32, and five squarings. Of tensors, too."""
     y = x / 32
     y2 = y * y
     even, odd = 1680 + y2 * (180 + y2), y * (840 + 20 * y2)

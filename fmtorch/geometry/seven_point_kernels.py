@@ -31,10 +31,7 @@ def seven_point(points: Array, sample: Array, F: Array, draw: Array) -> int:
         gather(points, sample, first, 7, X)
         equations(X, 7, A)
         null_space(A, 7, B, full_rank, work)
-        _determinants(B, 1.0, 0.0, p, 0)
-        _determinants(B, 0.0, 1.0, p, LANES)
-        _determinants(B, HALF, HALF, p, 2 * LANES)
-        _determinants(B, HALF, -HALF, p, 3 * LANES)
+        _determinants(B, p)
         for lane in range(min(LANES, sample.shape[1] - first)):
             if not full_rank[lane]:
                 continue
@@ -62,25 +59,21 @@ def seven_point(points: Array, sample: Array, F: Array, draw: Array) -> int:
 
 
 @inner
-def _determinants(B: Array, a: float, b: float, p: Array, o: int) -> None:
-    """det(a F0 + b F1) -> p[o : o + LANES]."""
-    for lane in range(LANES):
-        f0, f1, f2 = (
-            a * B[lane] + b * B[9 * LANES + lane],
-            a * B[LANES + lane] + b * B[10 * LANES + lane],
-            a * B[2 * LANES + lane] + b * B[11 * LANES + lane],
-        )
-        f3, f4, f5 = (
-            a * B[3 * LANES + lane] + b * B[12 * LANES + lane],
-            a * B[4 * LANES + lane] + b * B[13 * LANES + lane],
-            a * B[5 * LANES + lane] + b * B[14 * LANES + lane],
-        )
-        f6, f7, f8 = (
-            a * B[6 * LANES + lane] + b * B[15 * LANES + lane],
-            a * B[7 * LANES + lane] + b * B[16 * LANES + lane],
-            a * B[8 * LANES + lane] + b * B[17 * LANES + lane],
-        )
-        p[o + lane] = f0 * (f4 * f8 - f5 * f7) + f1 * (f5 * f6 - f3 * f8) + f2 * (f3 * f7 - f4 * f6)
+def _determinants(B: Array, p: Array) -> None:
+    """det(a F0 + b F1) at (1, 0), (0, 1), and their sum and difference over the root of two -> p (4, LANES)."""
+    for k in range(4):
+        a, b = (1.0 - k, float(k)) if k < 2 else (HALF, HALF if k == 2 else -HALF)
+        for i in range(LANES):
+            f0 = a * B[i] + b * B[9 * LANES + i]
+            f1 = a * B[LANES + i] + b * B[10 * LANES + i]
+            f2 = a * B[2 * LANES + i] + b * B[11 * LANES + i]
+            f3 = a * B[3 * LANES + i] + b * B[12 * LANES + i]
+            f4 = a * B[4 * LANES + i] + b * B[13 * LANES + i]
+            f5 = a * B[5 * LANES + i] + b * B[14 * LANES + i]
+            f6 = a * B[6 * LANES + i] + b * B[15 * LANES + i]
+            f7 = a * B[7 * LANES + i] + b * B[16 * LANES + i]
+            f8 = a * B[8 * LANES + i] + b * B[17 * LANES + i]
+            p[k * LANES + i] = f0 * (f4 * f8 - f5 * f7) + f1 * (f5 * f6 - f3 * f8) + f2 * (f3 * f7 - f4 * f6)
 
 
 @inner

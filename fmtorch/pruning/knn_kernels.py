@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.geometry.order_kernels import smallest_but
 from fmtorch.kernels import inner, kernel
 
 Array = NDArray[Any]
@@ -97,31 +98,34 @@ def _order(points: Array, depth: int) -> Array:
             for place in range(begin, end):
                 for k in range(2):
                     low[k], high[k] = min(low[k], points[order[place], k]), max(high[k], points[order[place], k])
-            _split(points, 0 if high[0] - low[0] >= high[1] - low[1] else 1, order, begin, end - 1, middle)
+            _split(points, 0 if high[0] - low[0] >= high[1] - low[1] else 1, order, begin, end, middle)
     return order
 
 
 @inner
-def _split(points: Array, axis: int, order: Array, low: int, high: int, middle: int) -> None:
-    """Reorders order[low .. high] so that no coordinate before `middle` is larger than one from there on (Hoare)."""
-    while low < high:
-        pivot = points[order[(low + high) >> 1], axis]
-        i, j = low, high
-        while i <= j:
-            while points[order[i], axis] < pivot:
-                i += 1
-            while points[order[j], axis] > pivot:
-                j -= 1
-            if i <= j:
-                order[i], order[j] = order[j], order[i]
-                i += 1
-                j -= 1
-        if middle <= j:
-            high = j
-        elif middle >= i:
-            low = i
+def _split(points: Array, axis: int, order: Array, begin: int, end: int, middle: int) -> None:
+    """Reorders order[begin:end] so that no coordinate before `middle` is larger than one from there on."""
+    n = end - begin
+    index, values = order[begin:end].copy(), np.empty(n, points.dtype)
+    for i in range(n):
+        values[i] = points[index[i], axis]
+    median = smallest_but(values, 0, n, middle - begin)
+    below, same = begin, 0
+    for i in range(n):
+        below += points[index[i], axis] < median
+        same += points[index[i], axis] == median
+    first, second, third = begin, below, below + same
+    for i in range(n):
+        value = points[index[i], axis]
+        if value < median:
+            order[first] = index[i]
+            first += 1
+        elif value == median:
+            order[second] = index[i]
+            second += 1
         else:
-            return
+            order[third] = index[i]
+            third += 1
 
 
 @inner

@@ -19,7 +19,7 @@ from torch import Tensor
 from fmtorch.geometry.arithmetic import component_sum
 from fmtorch.geometry.curves import curve_orders
 from fmtorch.pair_arrays import for_each_pair, kernels_serve
-from fmtorch.pruning import consistency_kernels as compiled
+from fmtorch.pruning import position_consistency_kernels as compiled
 from fmtorch.pruning.calibration import Calibration
 from fmtorch.pruning.frame_consistency import (
     CURVE_TABLE,

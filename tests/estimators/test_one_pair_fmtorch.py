@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch import metrics, presets
+from fmtorch import kernels, metrics, presets
 from fmtorch.estimators import HypothesizeAndVerify, final_fits, pool, saturated_gains
 from fmtorch.estimators.engine import Form
 from fmtorch.estimators.inliers import WithinThreshold
 from fmtorch.estimators.models import Pool
+from fmtorch.estimators.one_pair import ahead
 from fmtorch.estimators.one_pair.focal.cameras import CentredPair, TwoCameras
 from fmtorch.estimators.one_pair.focal.selection import Candidates
 from fmtorch.estimators.one_pair.models import Pool as PoolOfOne
@@ -23,6 +24,7 @@ from fmtorch.estimators.one_pair.selection import Selection, scored
 from fmtorch.estimators.pairs import NormalizedPairs
 from fmtorch.estimators.registry import kernel_form
 from fmtorch.estimators.scores import score_models
+from fmtorch.kernels import Kernel
 from fmtorch.random import Stream
 from fmtorch.types import Correspondences, collate
 from tests.conftest import oracle
@@ -252,3 +254,36 @@ def test_few_matches_of_any_scale_are_sound(name: str, factor: float) -> None:
         else:
             assert alone.reason[0]
             assert not bool(alone.F.any())
+
+
+def test_the_kernels_that_are_compiled_together_are_those_that_are_called(monkeypatch: pytest.MonkeyPatch) -> None:
+    called: set[Kernel] = set()
+
+    def recorded(self: Kernel, *args: object) -> object:
+        called.add(self)
+        return self.compiled()(*args)
+
+    monkeypatch.setattr(Kernel, "__call__", recorded)
+    estimator = presets.build("estimator", "fmtorch")
+    for c in (scene(0, 300), scene(0, 300, outliers=0.8).replace(size1=torch.tensor([[700, 900]]))):
+        estimator(c)
+    assert called == set(ahead.FOCAL)
+
+
+def test_gradients_in_both_forms() -> None:
+    """To points and prior, of pairs where both forms find the same optimum; noise is told, cameras are assumed."""
+    estimator = presets.build("estimator", "fmtorch")
+    c = collate([scene(i, 300, outliers=0.3) for i in range(2)])
+    found = []
+    for switch in ("on", "off"):
+        x0, prior = c.x0.double().requires_grad_(), (c.prior.double() if c.prior is not None else c.x0).requires_grad_()
+        told_ = c.replace(x0=x0, x1=c.x1.double(), prior=prior, noise=torch.linspace(0.5, 2, 300).expand(2, -1))
+        with pytest.MonkeyPatch.context() as environment:
+            environment.setenv(kernels.SWITCH, switch)
+            estimator(told_).F.square()[:, 0, 1].sum().backward()
+        assert x0.grad is not None
+        assert prior.grad is not None
+        found.append((x0.grad, prior.grad))
+    for one, other in zip(*found, strict=True):
+        assert float(other.abs().max()) > 0
+        assert float((one - other).abs().max()) < 1e-6 * float(other.abs().max())

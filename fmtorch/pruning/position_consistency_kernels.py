@@ -1,4 +1,4 @@
-"""`frame_consistency` and `position_consistency` for one pair, compiled: the same orders and the same sums.
+"""`position_consistency` for one pair, compiled: the same orders and the same sums.
 
 Arrays of a pair are in one floating type, float32 or float64. `numbers` are constants in that type:
 shift, cosine and sine of each curve, then what each kernel names.
@@ -14,125 +14,9 @@ from numpy.typing import NDArray
 
 from fmtorch.geometry.curves_kernels import curve_order
 from fmtorch.kernels import inner, kernel
+from fmtorch.pruning.frame_consistency_kernels import WINDOW, add_products
 
 Array = NDArray[Any]
-WINDOW = 8  # as in `frame_consistency`
-
-
-@kernel("f4[:, ::1], f4[:, ::1], f4[:, :, ::1], f4[:, :, ::1], f4[::1], b1[::1], f4[:, ::1], f4[::1], f4[::1]")
-def frame_agreement(
-    x0: Array, x1: Array, lafs0: Array, lafs1: Array, quality: Array, mask: Array, curves: Array, numbers: Array,
-    out: Array,
-) -> None:  # fmt: skip
-    """`frame_consistency.frame_agreement` of x0, x1 (n, 2), lafs0, lafs1 (n, 2, 3), mask (n,) -> out (n,).
-
-    quality: (n,), empty where unknown. curves: (c, 3), shift of the grid, cosine and sine of the rotation.
-    numbers: of votes the worst ratio and the least, noise in pixels, TOLERANCE^-2 / 8, 1e-12, the least divisor.
-    """
-    n, zero = len(mask), x0.dtype.type(0)
-    rows, match = np.empty((10, n), x0.dtype), np.empty(n, np.int64)
-    m = 0
-    for i in range(n):
-        out[i] = zero
-        a, b, c, d = lafs0[i, 0, 0], lafs0[i, 0, 1], lafs0[i, 1, 0], lafs0[i, 1, 1]
-        determinant = a * d - b * c
-        rows[0, m], rows[1, m], rows[2, m], rows[3, m] = x0[i, 0], x0[i, 1], x1[i, 0], x1[i, 1]
-        rows[4, m] = (lafs1[i, 0, 0] * d + lafs1[i, 0, 1] * -c) / determinant
-        rows[5, m] = (lafs1[i, 0, 0] * -b + lafs1[i, 0, 1] * a) / determinant
-        rows[6, m] = (lafs1[i, 1, 0] * d + lafs1[i, 1, 1] * -c) / determinant
-        rows[7, m] = (lafs1[i, 1, 0] * -b + lafs1[i, 1, 1] * a) / determinant
-        rows[8, m] = math.sqrt(abs(rows[4, m] * rows[7, m] - rows[5, m] * rows[6, m]))
-        rows[9, m] = max(numbers[0] - quality[i], numbers[1]) if len(quality) else x0.dtype.type(1)
-        sound = mask[i] and not (len(quality) and math.isnan(quality[i]))
-        for k in range(10):
-            sound = sound and math.isfinite(rows[k, m])
-        match[m] = i
-        m += sound
-    order, along = np.empty(m, np.int64), np.empty((10, m), x0.dtype)
-    agreement, votes = np.zeros(m, x0.dtype), np.zeros(m, x0.dtype)
-    ahead, behind = np.empty((WINDOW, m), x0.dtype), np.empty((WINDOW, m), x0.dtype)
-    for image in range(2):
-        for curve in range(len(curves)):
-            curve_order(
-                rows[2 * image, :m],
-                rows[2 * image + 1, :m],
-                curves[curve, 0],
-                curves[curve, 1],
-                curves[curve, 2],
-                order,
-            )
-            for k in range(10):
-                for i in range(m):
-                    along[k, i] = rows[k, order[i]]
-            for k in range(1, WINDOW + 1):
-                _frames_agree(along, k, numbers, ahead[k - 1], behind[k - 1])
-            _add_votes(along[9], ahead, behind, order, agreement, votes)
-    for i in range(m):
-        out[match[i]] = agreement[i] / max(votes[i], numbers[5])
-
-
-@inner
-def _frames_agree(along: Array, k: int, numbers: Array, ahead: Array, behind: Array) -> None:
-    """For matches i and j = i + k: how well j agrees with i -> ahead[i], i with j -> behind[i]."""
-    noise, sharpness, tiny, one = numbers[2], numbers[3], numbers[4], along.dtype.type(1)
-    X0, Y0, X1, Y1, A, B, C, D, S = (
-        along[0], along[1], along[2], along[3], along[4], along[5], along[6], along[7], along[8],
-    )  # fmt: skip
-    for i in range(along.shape[1] - k):
-        j = i + k
-        dx, dy, ux, uy = X0[j] - X0[i], Y0[j] - Y0[i], X1[j] - X1[i], Y1[j] - Y1[i]
-        p, q = A[i] * dx + B[i] * dy - ux, C[i] * dx + D[i] * dy - uy
-        r, s = A[j] * dx + B[j] * dy - ux, C[j] * dx + D[j] * dy - uy
-        own, other = p * p + q * q, r * r + s * s
-        error = own if own > other else other
-        length0, length1 = math.sqrt(dx * dx + dy * dy + tiny), math.sqrt(ux * ux + uy * uy + tiny)
-        length = length0 * S[i] + length1 + noise
-        t = one + error / (length * length) * sharpness
-        t = t * t
-        t = t * t
-        t = t * t
-        ahead[i] = one / t
-        length = length0 * S[j] + length1 + noise
-        t = one + error / (length * length) * sharpness
-        t = t * t
-        t = t * t
-        t = t * t
-        behind[i] = one / t
-
-
-@inner
-def _add_votes(vote: Array, ahead: Array, behind: Array, order: Array, agreement: Array, votes: Array) -> None:
-    """Adds the votes of the neighbours along a curve, from the farthest before to the farthest after."""
-    m = len(vote)
-    total, all_votes = np.zeros(m, vote.dtype), np.zeros(m, vote.dtype)
-    for k in range(min(WINDOW, m - 1), 0, -1):
-        _add_products(behind[k - 1], vote, m - k, total[k:], all_votes[k:])
-    for k in range(1, min(WINDOW, m - 1) + 1):
-        _add_products(ahead[k - 1], vote[k:], m - k, total, all_votes)
-    for i in range(m):
-        agreement[order[i]] += total[i]
-        votes[order[i]] += all_votes[i]
-
-
-@inner
-def _add_products(agree: Array, vote: Array, count: int, total: Array, votes: Array) -> None:
-    """Adds the first agreeing votes to the totals, and the votes."""
-    for i in range(count):
-        total[i] += agree[i] * vote[i]
-    for i in range(count):
-        votes[i] += vote[i]
-
-
-@kernel("f4[::1], f4[::1], b1[::1], f4, f4, f4, f4[::1]")
-def frame_prior(
-    agreement: Array, quality: Array, mask: Array, odds: Any, floor: Any, slope: Any, out: Array
-) -> None:  # fmt: skip
-    """P(inlier) of `FrameConsistency` from agreement and ratio (n,) -> out (n,); zero where masked or not finite."""
-    one = agreement.dtype.type(1)
-    for i in range(len(mask)):
-        w, divisor = agreement[i] + floor, one + slope * quality[i]
-        o = odds * w * w * w / (divisor * divisor)
-        out[i] = o / (one + o) if mask[i] and math.isfinite(quality[i]) else one - one
 
 
 @kernel("f4[:, ::1], f4[:, ::1], f4[::1], b1[::1], f4[:, ::1], f4[::1], f4[::1], f4[:, :, ::1], f4[::1]")
@@ -184,8 +68,8 @@ def position_agreement(
         total, all_votes = np.zeros(m, x0.dtype), np.zeros(m, x0.dtype)
         for k in range(1, min(WINDOW, m - 1) + 1):
             _positions_agree(along, k, maps[best // maps.shape[1], best % maps.shape[1]], numbers, agree)
-            _add_products(agree, along[4, k:], m - k, total, all_votes)
-            _add_products(agree, along[4], m - k, total[k:], all_votes[k:])
+            add_products(agree, along[4, k:], m - k, total, all_votes)
+            add_products(agree, along[4], m - k, total[k:], all_votes[k:])
         for i in range(m):
             agreement[orders[o, i]] += total[i]
             votes[orders[o, i]] += all_votes[i]

@@ -1,0 +1,55 @@
+"""The kernels of an estimator with the prior on focal lengths, to be compiled together before it is first called."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fmtorch.estimators import pool_kernels, sampling_kernels, scores_kernels
+from fmtorch.estimators.focal import (
+    cameras_kernels,
+    cheirality_kernels,
+    fit_kernels,
+    hypotheses_kernels,
+    posterior_kernels,
+    prior_kernels,
+)
+from fmtorch.geometry import (
+    five_point_kernels,
+    rank2_manifold_kernels,
+    sampson_objective_kernels,
+    seven_point_kernels,
+    significance_kernels,
+)
+from fmtorch.kernels import Kernel
+from fmtorch.random_kernels import random_words
+
+FOCAL: tuple[Kernel[..., Any], ...] = (  # the slowest to compile first
+    five_point_kernels.five_point,
+    seven_point_kernels.seven_point,
+    sampson_objective_kernels.evaluate,
+    cameras_kernels.nearest_cameras,
+    significance_kernels.counted_chances,
+    rank2_manifold_kernels.start,
+    sampling_kernels.draw,
+    cheirality_kernels.share_in_front,
+    rank2_manifold_kernels.step,
+    scores_kernels.score_gains,
+    posterior_kernels.step,
+    posterior_kernels.accept,
+    scores_kernels.score_saturated,
+    posterior_kernels.posterior,
+    pool_kernels.residuals_squared,
+    pool_kernels.best,
+    rank2_manifold_kernels.accept,
+    cameras_kernels.translate,
+    posterior_kernels.models,
+    pool_kernels.merge,
+    pool_kernels.near,
+    fit_kernels.gain_without_prior,
+    scores_kernels.saturated_cells,
+    hypotheses_kernels.draw_depths,
+    significance_kernels.most_significant,
+    posterior_kernels.to_unit_norm,
+    prior_kernels.prior_costs,
+    random_words,
+)
