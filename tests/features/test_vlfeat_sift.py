@@ -83,6 +83,5 @@ def test_grey_and_colour_threads_and_empty_images() -> None:
         features(np.zeros((0, 4), np.uint8))
 
 
-def test_takes_the_place_of_opencvs_in_a_pipeline() -> None:
-    pipeline = presets.pipeline("sift_ratio_paper", overrides=["features=sift_vlfeat", "cache=off"])
-    assert len(pipeline.features(texture(3)).lafs) == len(VLFeatSIFT()(texture(3)).lafs)
+def test_the_preset_names_it() -> None:
+    assert presets.build("features", "sift_vlfeat", max_features=50) == VLFeatSIFT(max_features=50)
