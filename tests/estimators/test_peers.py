@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import types
 
 import cv2
 import numpy as np
@@ -48,6 +49,23 @@ def test_a_missing_library_is_named(name: str, monkeypatch: pytest.MonkeyPatch) 
 def test_an_unknown_sampler_is_refused_with_the_choices(name: str) -> None:
     with pytest.raises(ValueError, match="sampler is 'napsac'; it must be one of: uniform, prosac, progressive_napsac"):
         presets.build("estimator", name, sampler="napsac")
+
+
+@pytest.mark.parametrize("flags", [0, 1])
+def test_inliers_of_gc_ransac_are_told_from_its_matrix(flags: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its binding returns flags that are all set, or none, whatever the matrix."""
+    c = scene(0, 40)
+    truth = presets.build("estimator", "lmeds")(c).F[0].numpy()
+
+    def found(matches: np.ndarray, *_: object) -> tuple[np.ndarray, np.ndarray]:
+        return truth, np.full(len(matches), bool(flags))
+
+    monkeypatch.setitem(sys.modules, "pygcransac", types.SimpleNamespace(findFundamentalMatrix=found))
+    estimate = presets.build("estimator", "gc_ransac_cpp", threshold=2.0)(c)
+    near = geometry.sampson(torch.from_numpy(truth), c.x0[0].double(), c.x1[0].double()) <= 2
+    assert estimate.ok.all()
+    assert torch.equal(estimate.inliers[0], near & c.mask[0])
+    assert 8 <= near.sum() < c.mask.sum()
 
 
 def test_the_prior_orders_matches_before_the_quality() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fmtorch.estimators.peers.pairwise import Pair, PairwiseEstimator, Solution, peer, solution
+from fmtorch.estimators.peers.pairwise import Pair, PairwiseEstimator, Solution, peer, solution, within
 
 # The numbers of the samplers in the authors' bindings of MAGSAC++ and GC-RANSAC.
 SAMPLERS = {"uniform": 0, "prosac": 1, "progressive_napsac": 2, "importance": 3, "adaptive": 4}
@@ -49,8 +49,10 @@ def gc_ransac_cpp(
 ) -> PairwiseEstimator:
     """GC-RANSAC by its authors (Barath & Matas, CVPR 2018), which draws its own random seed.
 
+    Inliers are told from its F: the flags that its binding returns (pygcransac 0.1.1) are all set, or none.
+
     Args:
-        threshold: pixels.
+        threshold: pixels, Sampson distance.
         confidence: of having drawn a sample without an outlier, at which the search ends.
         iterations: samples at most.
         sampler: one of `SAMPLERS`.
@@ -67,11 +69,11 @@ def gc_ransac_cpp(
 
     def solve(pair: Pair) -> Solution:
         weights = pair.likelihood.tolist() if number > 2 else []
-        F, inside = library.findFundamentalMatrix(
+        F, _ = library.findFundamentalMatrix(
             pair.joined, *pair.size0, *pair.size1, weights, threshold, confidence, coherence, iterations, 50, True,
             1e-5, number,
         )  # fmt: skip
-        return solution(F, inside)
+        return solution(F, [] if F is None else within(F, pair, threshold))
 
     return PairwiseEstimator("GC-RANSAC", solve, best_first=number in (1, 2))
 

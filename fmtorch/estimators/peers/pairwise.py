@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from fmtorch.estimators.pairs import finite_matches, unfit_pairs
 from fmtorch.estimators.support import lack_of_support, relative_rounding
+from fmtorch.geometry.epipolar import sampson
 from fmtorch.types import Correspondences, Estimate
 from fmtorch.verdict import judged
 
@@ -114,6 +115,13 @@ def peer(module: str, name: str) -> Any:
 def solution(F: Any, inliers: Any) -> Solution:
     """What a binding returns, as arrays."""
     return None if F is None else np.asarray(F, dtype=np.float64), np.asarray(inliers, dtype=np.bool_).ravel()
+
+
+def within(F: Any, pair: Pair, threshold: float) -> NDArray[np.bool_]:
+    """Which matches lie within a Sampson distance of F, in pixels, (N,)."""
+    matrix, x0, x1 = (torch.from_numpy(np.asarray(value, np.float64)) for value in (F, pair.x0, pair.x1))
+    inside: NDArray[np.bool_] = (sampson(matrix, x0, x1) <= threshold).numpy()
+    return inside
 
 
 def _lack_of_support(x0: Points, x1: Points, inliers: NDArray[np.bool_], rounding: float) -> str:
