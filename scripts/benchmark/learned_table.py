@@ -30,10 +30,11 @@ def tables(rows: list[Row]) -> list[Sheet]:
                 sheets += [_sheet(title, features, use, own)] if own else []
     for shipped in dict.fromkeys(row["training_of"] for row in trainings if row.get("training_of")):
         own = [row for row in trainings if row.get("training_of") == shipped or row["method"] == shipped]
-        seen = dict.fromkeys(row["features"] for row in own if row.get("training_of"))
+        seen = dict.fromkeys(row["features"] for row in own if row["method"] == shipped)
+        others = {row["features"] for row in own if row.get("training_of")}
         sheets += [
             _trainings(shipped, use, [row for row in own if (row["features"], row["use"]) == (features, use)])
-            for features in seen for use in ("hard", "prior")
+            for features in seen if features in others for use in ("hard", "prior")
         ]  # fmt: skip
     return sheets
 

@@ -75,7 +75,7 @@ APPENDED = {
     "pipelines": ["--limit", "1", "--seeds", "1", "--cache", "kept"],
     "pruning": ["--limit", "1", "--asift-limit", "0", "--cache", "kept"],
     "related": ["--limit", "1", "--unrelated", "1"],
-    "learned": ["--limit", "1", "--cache", "kept", "--methods", "ratio", "LC, E", "DFE"],
+    "learned": ["--limit", "1", "--cache", "kept", "--methods", "ratio", "LC, F", "DFE"],
     "speed": ["--pairs", "2", "--batch", "2", "--repeats", "1", "--matches", "200"],
     "memory": ["--pairs", "1", "--matches", "200", "--estimators", "ransac"],
     "features": ["--features", "100", "--repeats", "1", "--size", "120", "160"],
@@ -157,6 +157,9 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / "DATA" / name / "pairs_which_dataset.txt").write_text("".join(f"{s}/\n" for s in scenes))
     for name, image in zip(("a.jpg", "b.jpg"), images, strict=True):
         cv2.imwrite(str(folder / name), image[..., ::-1])
+    for training in ("S1", "S2"):
+        (folder / training).mkdir()
+        shutil.copy(SOURCE / "models" / "lc_f.safetensors", folder / training / "lc.safetensors")
     (folder / "PHOTOS").mkdir()
     for name in ("a.jpg", "b.jpg"):
         shutil.copy(folder / name, folder / "PHOTOS")
