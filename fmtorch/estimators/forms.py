@@ -47,7 +47,8 @@ class Form:
 
 def pair_by_pair(form: Form, pairs: NormalizedPairs) -> Outcome:
     """The outcome of pairs on the CPU by a kernel form."""
-    solved = [form(pair) for pair in each_pair(pairs)]
+    with np.errstate(all="ignore"):  # infinite or NaN beyond the range of a float, as in tensors
+        solved = [form(pair) for pair in each_pair(pairs)]
     F, at = (torch.from_numpy(np.stack([getattr(one.fit, name) for one in solved])) for name in ("F", "at"))
     found, draws = (torch.tensor([getattr(one, name) for one in solved]) for name in ("found", "draws"))
     counted = _padded([one.fit.counted for one in solved], pairs)

@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 
 from fmtorch.estimators import degeneracy
-from fmtorch.estimators.degeneracy import FITS, KEPT, PARALLAX_DRAWS, PLANE_THRESHOLD_PX
+from fmtorch.estimators.degeneracy import FITS, KEPT, PARALLAX_DRAWS
 from fmtorch.estimators.degeneracy_kernels import fit_plane, parallax, plane_of_sample
 from fmtorch.estimators.one_pair.models import Models
-from fmtorch.estimators.one_pair.pair import Array, OnePair
+from fmtorch.estimators.one_pair.pair import Array, OnePair, squared
 from fmtorch.estimators.one_pair.sampling import PriorWeighted
 from fmtorch.estimators.one_pair.scores import Score
 from fmtorch.estimators.sampling import PriorWeighted as TensorPriorWeighted
@@ -70,4 +70,4 @@ class Degensac:
 
 def _limit(pair: OnePair) -> float:
     """The squared threshold of a plane in normalised units."""
-    return (PLANE_THRESHOLD_PX / pair.pixels_per_unit) ** 2
+    return squared(degeneracy.PLANE_THRESHOLD_PX / pair.pixels_per_unit)

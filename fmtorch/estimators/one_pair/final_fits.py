@@ -10,14 +10,11 @@ import numpy as np
 from fmtorch.estimators import final_fits
 from fmtorch.estimators.final_fits import (
     DAMPING,
-    DEFAULT_TRUNCATION_PX,
     FOCAL_ITERATIONS,
     FOCAL_TOLERANCE,
     ITERATIONS,
-    MAX_TRUNCATION_PX,
     MIN_INLIERS_FOR_NOISE,
     MIN_PRIOR_FOR_NOISE,
-    MIN_TRUNCATION_PX,
     PRIOR_CONFLICT_GAIN,
     TOLERANCE,
     TRUNCATION_SIGMAS,
@@ -25,7 +22,7 @@ from fmtorch.estimators.final_fits import (
 from fmtorch.estimators.one_pair.focal.cameras import TwoCameras
 from fmtorch.estimators.one_pair.focal.fit import fit_focal
 from fmtorch.estimators.one_pair.inliers import median_of_matches, residuals_squared_px
-from fmtorch.estimators.one_pair.pair import Array, OnePair
+from fmtorch.estimators.one_pair.pair import Array, OnePair, squared
 from fmtorch.estimators.one_pair.refine import gauss_newton_step, refine_models
 from fmtorch.estimators.one_pair.selection import Selection
 from fmtorch.geometry.eight_point_kernels import weighted_eight_point
@@ -113,7 +110,7 @@ class AdaptiveGaussNewton:
             (F,) = refine_models(
                 F[None], pair, "truncated", truncation, ITERATIONS, RANK_TWO_ALREADY, TOLERANCE, DAMPING
             )
-        counted = _squared_in_noises(F, pair) <= truncation**2
+        counted = _squared_in_noises(F, pair) <= squared(truncation)
         matrix = F.reshape(3, 3)
         return Fit(matrix, matrix, counted, cameras, truncation)
 
@@ -127,6 +124,6 @@ def _squared_in_noises(F: Array, pair: OnePair) -> Array:
 def truncation_distance(r2: Array) -> float:
     """As `final_fits.truncation_distance`, of the inliers' squared distances."""
     if len(r2) < MIN_INLIERS_FOR_NOISE:
-        return DEFAULT_TRUNCATION_PX
+        return final_fits.DEFAULT_TRUNCATION_PX
     truncation = TRUNCATION_SIGMAS * 1.4826 * math.sqrt(median_of_matches(r2))
-    return min(max(truncation, MIN_TRUNCATION_PX), MAX_TRUNCATION_PX)
+    return min(max(truncation, final_fits.MIN_TRUNCATION_PX), final_fits.MAX_TRUNCATION_PX)

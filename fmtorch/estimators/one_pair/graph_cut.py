@@ -9,7 +9,7 @@ import numpy as np
 from fmtorch.estimators import graph_cut
 from fmtorch.estimators.graph_cut import FIRST_DRAW
 from fmtorch.estimators.graph_cut_kernels import fits
-from fmtorch.estimators.one_pair.pair import Array, OnePair
+from fmtorch.estimators.one_pair.pair import Array, OnePair, squared
 from fmtorch.estimators.one_pair.scores import Score
 from fmtorch.estimators.one_pair.selection import scored
 from fmtorch.estimators.spatial import SHIFTS, SWEEPS, WINDOW
@@ -51,7 +51,7 @@ class GraphCut:
     def labels(self, F: Array, pair: OnePair, graph: tuple[Array, Array]) -> Array:
         """The inliers (n,) of a model (9,)."""
         out = np.empty(pair.count, np.bool_)
-        scale = (pair.pixels_per_unit / self.part.threshold) ** 2
+        scale = squared(pair.pixels_per_unit / self.part.threshold)
         label(F, pair.points, scale, *graph, self.part.COHERENCE, SWEEPS, out)
         return out
 
@@ -69,5 +69,5 @@ def neighbor_graph(pair: OnePair, radius: float) -> tuple[Array, Array]:
         curve_codes(pair.points, shift, codes)
         order[:] = np.argsort(codes, kind="stable")
     graph, degree = np.empty((pair.count, MOST), np.int32), np.empty(pair.count, np.int32)
-    neighbours(pair.points, orders, (radius / pair.pixels_per_unit) ** 2, WINDOW, graph, degree)
+    neighbours(pair.points, orders, squared(radius / pair.pixels_per_unit), WINDOW, graph, degree)
     return graph, degree

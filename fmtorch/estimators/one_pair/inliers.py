@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from fmtorch.estimators import inliers
-from fmtorch.estimators.one_pair.pair import Array, OnePair
+from fmtorch.estimators.one_pair.pair import Array, OnePair, squared
 from fmtorch.estimators.one_pair.sampling import Sampler
 from fmtorch.estimators.pool_kernels import residuals_squared
 
@@ -17,7 +17,7 @@ def residuals_squared_px(F: Array, pair: OnePair) -> Array:
     """Squared Sampson distances (n,) to a model of nine entries in squared pixels, float64."""
     out = np.empty(pair.count)
     residuals_squared(np.ascontiguousarray(F, np.float64).reshape(9), pair.points, out)
-    out *= pair.pixels_per_unit**2
+    out *= squared(pair.pixels_per_unit)
     return out
 
 
@@ -44,7 +44,7 @@ class WithinThreshold:
 
     def __call__(self, F: Array, pair: OnePair) -> Array:
         """As `InlierRule`."""
-        within: Array = residuals_squared_px(F, pair) <= self.part.threshold**2
+        within: Array = residuals_squared_px(F, pair) <= squared(self.part.threshold)
         return within
 
 
@@ -72,7 +72,7 @@ class RobustDeviations:
         r2 = residuals_squared_px(F, pair)
         spare = max(pair.count - self.part.PARAMETERS, 1)
         sigma = 1.4826 * (1 + 5 / spare) * math.sqrt(median_of_matches(r2))
-        within: Array = r2 <= (2.5 * sigma) ** 2
+        within: Array = r2 <= squared(2.5 * sigma)
         return within
 
 
@@ -84,7 +84,7 @@ class Confidence:
 
     def __call__(self, F: Array, draws: int, pair: OnePair, size: int) -> list[bool]:
         """Whether the best model (9,), after so many draws of `size` matches, may be taken for the best there is."""
-        support = residuals_squared_px(F, pair) <= self.part.threshold**2
+        support = residuals_squared_px(F, pair) <= squared(self.part.threshold)
         weight = self.sampler.weight(pair)
         share = int(weight[support].sum()) / int(weight.sum())
         missed = math.log1p(-min(share**size, 1 - 1e-12)) * draws

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fmtorch.estimators.one_pair.inliers import median_of_matches
-from fmtorch.estimators.one_pair.pair import Array, OnePair
+from fmtorch.estimators.one_pair.pair import Array, OnePair, squared
 from fmtorch.estimators.one_pair.refine import RankTwoObjective
 from fmtorch.estimators.pool_kernels import residuals_squared
 from fmtorch.geometry import rank2_manifold_kernels as manifold
@@ -39,9 +39,9 @@ def optimum(
         return np.zeros((3, 3)), False
     widest = first_scale * 1.4826 * math.sqrt(max(_median(model, pair) for model in F))
     for decay in decays:
-        s2 = np.full(pair.count, max(widest * decay, scale) ** 2)
+        s2 = np.full(pair.count, squared(max(widest * decay, scale)))
         reweighted(F, pair.points, weight, s2, LOSSES[loss], LOSS_TABLE)
-    objective = RankTwoObjective(pair.points, weight, loss, np.full(pair.count, scale**2), None, DAMPING.first)
+    objective = RankTwoObjective(pair.points, weight, loss, np.full(pair.count, squared(scale)), None, DAMPING.first)
     start = np.empty_like(F), np.empty((len(F), 3)), np.empty((len(F), 3))
     manifold.start(F, SQUARINGS, *start)
     state = levenberg_marquardt(objective, start, iterations)

@@ -90,6 +90,11 @@ class OnePair:
         )  # fmt: skip
 
 
+def squared(value: float) -> float:
+    """The square; infinite beyond the range of a float, as of tensors, where ``**`` of a Python float raises."""
+    return value * value
+
+
 def each_pair(pairs: NormalizedPairs) -> Iterator[OnePair]:
     """The pairs of a bucket one by one, copied, on no graph."""
     points = pairs.points.detach().numpy()

@@ -8,7 +8,7 @@ import numpy as np
 
 from fmtorch.estimators.one_pair.graph_cut import LocalOptimization
 from fmtorch.estimators.one_pair.models import Pool
-from fmtorch.estimators.one_pair.pair import Array, OnePair
+from fmtorch.estimators.one_pair.pair import Array, OnePair, squared
 from fmtorch.estimators.one_pair.pool import shuffled
 from fmtorch.estimators.one_pair.refine import refine_models
 from fmtorch.estimators.options import Refine
@@ -56,5 +56,5 @@ def near_models(F: Array, pair: OnePair, radius: float, most: int | None) -> One
     if most is None:
         return pair
     wanted = np.empty(pair.count, np.bool_)
-    near(F, pair.points32, np.float32((radius / pair.pixels_per_unit) ** 2), wanted)
+    near(F, pair.points32, np.float32(squared(radius / pair.pixels_per_unit)), wanted)
     return pair.take(shuffled(pair, Stream.REFINEMENT, wanted)[:most])

@@ -10,10 +10,9 @@ from fmtorch.estimators.focal import posterior
 from fmtorch.estimators.focal import posterior_kernels as compiled
 from fmtorch.estimators.focal.cameras_kernels import nearest_cameras, translate
 from fmtorch.estimators.focal.cheirality_kernels import share_in_front
-from fmtorch.estimators.focal.posterior import INLIER_SIGMA_PX, LOSS_SCALE_PX, PARALLEL_PX
 from fmtorch.estimators.focal.prior_kernels import prior_costs
 from fmtorch.estimators.one_pair.focal.cameras import CentredPair, TwoCameras
-from fmtorch.estimators.one_pair.pair import Array, OnePair
+from fmtorch.estimators.one_pair.pair import Array, OnePair, squared
 from fmtorch.geometry.levenberg_marquardt import levenberg_marquardt
 from fmtorch.geometry.sampson_objective_kernels import LOSSES, evaluate
 from fmtorch.geometry.sigma_consensus import LOSS_TABLE
@@ -42,7 +41,7 @@ class Posterior:
     ) -> None:
         self.centred, self.tolerance = CentredPair.of(pair), tolerance
         self.data = self.centred.points, pair.weight, np.square(scale_px / pair.scale), LOSSES[loss], LOSS_TABLE
-        self.precision = (pair.pixels_per_unit / sigma_px) ** 2
+        self.precision = squared(pair.pixels_per_unit / sigma_px)
 
     def evaluate(self, parameters: tuple[Array, Array], derivatives: bool) -> State:
         """As `Objective.evaluate`; parameters: axes and log focal lengths."""
@@ -77,7 +76,7 @@ class Posterior:
 
 def refine_with_prior(F: Array, pair: OnePair, iterations: int) -> tuple[Array, Array, Array, TwoCameras]:
     """As `posterior.refine_with_prior` of models (k, 9): models, prior costs (k,), shares in front (k,), cameras."""
-    objective, k = Posterior(pair, "geman_mcclure", LOSS_SCALE_PX, INLIER_SIGMA_PX), len(F)
+    objective, k = Posterior(pair, "geman_mcclure", posterior.LOSS_SCALE_PX, posterior.INLIER_SIGMA_PX), len(F)
     centred, shifted, start = objective.centred, np.empty_like(F), TwoCameras(np.empty((k, 2, 3, 3)), np.empty((k, 2)))
     translate(F, -centred.offset, shifted)
     nearest_cameras(shifted, centred.longest, *start)
@@ -89,6 +88,6 @@ def refine_with_prior(F: Array, pair: OnePair, iterations: int) -> tuple[Array, 
     cost[~(np.isfinite(models).all(1) & np.isfinite(state.cost))] = np.inf
     support = np.ones(pair.count) if pair.prior is None else pair.prior
     depth, unit_px = np.exp(state.focal) * centred.longest, pair.pixels_per_unit
-    scale, parallel = np.square(pair.scale / LOSS_SCALE_PX), PARALLEL_PX / unit_px
+    scale, parallel = np.square(pair.scale / posterior.LOSS_SCALE_PX), posterior.PARALLEL_PX / unit_px
     share_in_front(state.axes, depth, state.F, centred.points, support, scale, parallel, share)
     return models, cost, share, TwoCameras(state.axes, state.focal)
