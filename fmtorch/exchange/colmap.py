@@ -16,7 +16,7 @@ ORIGIN = 0.5  # px: COLMAP's coordinates of the first pixel's centre
 FOCAL_LENGTH = 1.2  # of the longer side, where it is unknown: COLMAP's own default
 
 
-def library() -> ModuleType:
+def imported() -> ModuleType:
     """pycolmap. Raises ImportError naming the extra where it is not installed."""
     try:
         import pycolmap
@@ -36,7 +36,7 @@ def write_database(
     has a SIMPLE_RADIAL camera of COLMAP's default focal length, or shares it with all of its size. Pixels are moved by
     half of one, as COLMAP counts. With both cameras known the geometry is calibrated, and has E too.
     """
-    pycolmap = library()
+    pycolmap = imported()
     cameras: dict[object, int] = {}
     ids: dict[str, int] = {}
     known: dict[str, NDArray[np.float64] | None] = {}

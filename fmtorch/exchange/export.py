@@ -23,9 +23,9 @@ def export_kinds(value: str | Sequence[str] | None) -> tuple[str, ...]:
     if unknown:
         raise ValueError(f"export={','.join(words)}: {unknown[0]!r} is none of {', '.join(KINDS)}")
     if "h5" in words:
-        h5.library()
+        h5.imported()
     if "colmap" in words:
-        colmap.library()
+        colmap.imported()
     return tuple(dict.fromkeys(words))
 
 
@@ -64,7 +64,7 @@ def write_hloc(
     ``matches0`` and ``matching_scores0``, which hloc knows, ``inliers0`` (bool), and F and
     `related` as attributes.
     """
-    h5py = h5.library()
+    h5py = h5.imported()
     counts: dict[str, int] = {}
     with replacing(folder / FEATURES) as temporary, h5py.File(temporary, "w") as file:
         for image in images:

@@ -19,7 +19,7 @@ _BLOCKS, _BLOCK = 4096, 1 << 16  # of larger files: how many blocks of how many 
 SUFFIXES = (".h5", ".hdf5")
 
 
-def library() -> ModuleType:
+def imported() -> ModuleType:
     """h5py. Raises ImportError naming the extra where it is not installed."""
     try:
         import h5py
@@ -32,7 +32,7 @@ def library() -> ModuleType:
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[Any]:
     """An HDF5 file for reading. Raises DataError where it is missing, no such file, or damaged."""
-    h5py = library()
+    h5py = imported()
     try:
         file = h5py.File(path, "r")
     except FileNotFoundError as error:
