@@ -13,7 +13,7 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,9 @@ REPEATS = 15
 PRUNERS = (
     "frame_consistency", "position_consistency", "match_noise", "ratio_prior", "one_to_one", "gms", "gms_soft", "lpm",
 )  # fmt: skip
-ESTIMATORS = ("ransac", "msac", "lmeds", "usac", "magsac", "gc_ransac", "cf_ransac", "irls_magsac")
+ESTIMATORS = (
+    "fmtorch", "fmtorch_max", "ransac", "msac", "lmeds", "usac", "magsac", "gc_ransac", "cf_ransac", "irls_magsac",
+)  # fmt: skip
 
 
 def main(groups: list[str]) -> None:
@@ -70,8 +72,18 @@ def framed(c: Correspondences) -> Correspondences:
 
 def pruning(c: Correspondences) -> None:
     """Pruners as stages."""
-    for name in PRUNERS:
-        stage = presets.build("pruner", name)
+    whole("pruner", PRUNERS, c)
+
+
+def estimators(c: Correspondences) -> None:
+    """Whole estimators; the seconds are those of kernels that none before it has compiled."""
+    whole("estimator", ESTIMATORS, c)
+
+
+def whole(group: str, names: Sequence[str], c: Correspondences) -> None:
+    """Presets of a group, called with kernels and without."""
+    for name in names:
+        stage = presets.build(group, name)
 
         def run(form: str, stage: Any = stage) -> None:
             os.environ[kernels.SWITCH] = form
@@ -187,19 +199,6 @@ def refinement(c: Correspondences) -> None:
     many, ones, out = rng.uniform(-1, 1, (4, COUNT)), np.ones(COUNT), np.empty(9)
     x0, x1 = (torch.from_numpy(x.T.copy()) for x in (many[:2], many[2:]))
     line("weighted eight-point", lambda: weighted_eight_point(many, ones, out), lambda: eight_point(x0, x1))
-
-
-def estimators(c: Correspondences) -> None:
-    """Whole estimators; the seconds are those of kernels that none before it has compiled."""
-    for name in ESTIMATORS:
-        estimator = presets.build("estimator", name)
-
-        def run(form: str, estimator: Any = estimator) -> None:
-            os.environ[kernels.SWITCH] = form
-            estimator(c)
-
-        line(name, functools.partial(run, "on"), functools.partial(run, "off"))
-    os.environ[kernels.SWITCH] = "on"
 
 
 if __name__ == "__main__":
