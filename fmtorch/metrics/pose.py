@@ -41,9 +41,9 @@ def pose_error(
     largest possible, as is the second where t_est is zero; where t_gt is zero there is no direction to miss and the
     second is 0, as in LoFTR. Both come from the tangent of the half angle (Kahan), accurate near 0.
     """
-    usable = R_est.isfinite().all(-1).all(-1) & t_est.isfinite().all(-1)
-    R_est = torch.where(usable[..., None, None], R_est, 0.0)
-    t_est = torch.where(usable[..., None], t_est, 0.0)
+    finite = R_est.isfinite().all(-1).all(-1) & t_est.isfinite().all(-1)
+    R_est = torch.where(finite[..., None, None], R_est, 0.0)
+    t_est = torch.where(finite[..., None], t_est, 0.0)
 
     difference = _sum_of_squares((R_est - R_gt).flatten(-2))  # 8 sin^2(angle / 2)
     trace_plus_1 = 1 + _dot(R_est.flatten(-2), R_gt.flatten(-2))  # 4 cos^2(angle / 2)
@@ -57,8 +57,8 @@ def pose_error(
 
     largest = 90.0 if up_to_sign else 180.0
     translation = torch.where((t_est == 0).all(-1), largest, translation)
-    translation = torch.where((t_gt == 0).all(-1) & usable, 0.0, translation)
-    return PoseError(torch.where(usable, rotation, 180.0), translation)
+    translation = torch.where((t_gt == 0).all(-1) & finite, 0.0, translation)
+    return PoseError(torch.where(finite, rotation, 180.0), translation)
 
 
 @checked
