@@ -12,11 +12,14 @@ from fmtorch.estimators.search import Confident
 class FocalParts:
     """The prior on focal lengths. selection: a `FocalSelection`. search: makes a pool with it; None: it only selects.
 
-    confident: the stopping rule for that search, None: it never suffices.
+    rounds: of that search, of so many samples each, at most; each refines candidates of its own. confident: the
+    stopping rule for these samples, None: all rounds are made, and never suffice.
     """
 
     selection: Any
     search: Any = None
+    samples: int = 0
+    rounds: int = 1
     confident: Confident | None = None
 
 
@@ -33,17 +36,38 @@ class Verbs:
         """The selection: with plausible cameras first where the image sizes are known."""
         if self.focal is None or self.focal.search is None or not pairs.sizes_known:
             return self.select(self.refine(self.search(pairs), pairs), pairs)
-        pool, confident = self.focal.search(pairs), self.focal.confident
-        candidates = self.focal.selection.refined(pool.models, pool.valid, pairs, self.refine.near(pool, pairs))
-        selection = candidates.selection(pool.draws)
-        decided = candidates.decided(pairs)
-        enough = [False] * len(pairs) if confident is None else confident(selection.F, pool.draws, pairs)
-        open_ = [i for i, (one, other) in enumerate(zip(decided, enough, strict=True)) if not (one and other)]
+        selection, candidates, open_ = self.plausible(self.focal, pairs)
         if not open_:
             return selection
         some = pairs.only(open_)
-        other = self.select(self.refine(self.search(some), some), some, candidates.only(open_))
+        other = self.select(self.refine(self.search(some), some), some, candidates)
         return selection.merged(open_, other)
+
+    def plausible(self, focal: FocalParts, pairs: Any) -> tuple[Any, Any, list[int]]:
+        """The selection among plausible cameras; which pairs these do not settle, and the candidates of those.
+
+        Rounds go on until good candidates are one model, or a round finds the best of those before it again, and the
+        stopping rule is content. After the last one pairs whose images have one size need no such agreement.
+        """
+        some, rows = pairs, list(range(len(pairs)))
+        selection: Any = None
+        candidates: Any = None
+        for turn in range(focal.rounds):
+            pool = focal.search(some, turn * focal.samples)
+            made = focal.selection.refined(pool.models, pool.valid, some, self.refine.near(pool, some))
+            again = [False] * len(rows) if candidates is None else candidates.same_best(made)
+            candidates = made if candidates is None else candidates.joined(made)
+            found = candidates.selection(pool.draws)
+            selection = found if selection is None else selection.replaced(rows, found)
+            enough = [False] * len(rows) if focal.confident is None else focal.confident(found.F, pool.draws, some)
+            agreed = candidates.decided(some) if turn + 1 == focal.rounds else candidates.unambiguous()
+            settled = [e and (one or two) for e, one, two in zip(enough, agreed, again, strict=True)]
+            left = [i for i, done in enumerate(settled) if not done]
+            rows = [rows[i] for i in left]
+            if not rows:
+                break
+            some, candidates = some.only(left), candidates.only(left)
+        return selection, candidates, rows
 
     def select(self, pool: Any, pairs: Any, candidates: Any = None) -> Any:
         """One model of each refined pool, or of the candidates of plausible cameras."""

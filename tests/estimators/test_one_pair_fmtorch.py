@@ -149,6 +149,8 @@ def test_candidates_and_the_choice_among_them(count: int, same_size: bool) -> No
     np.testing.assert_allclose(found.cameras.focal, expected.cameras.focal[:, 0, :5].T.numpy(), atol=1e-6)
     np.testing.assert_allclose(found.posterior, expected.posterior[0, :5].numpy(), rtol=0.02, atol=0.1)
     assert found.decided(pair) == expected.decided(pairs)
+    assert found.unambiguous() == expected.unambiguous()
+    assert found.same_best(found) == expected.same_best(expected) == [True]
     assert CentredPair.of(pair).same_size == same_size
     for others in (None, (expected, found)):
         theirs = part.select(dataclasses.replace(given[0], near=pairs), pairs, others and others[0])
@@ -165,9 +167,28 @@ def test_candidates_that_differ_decide_nothing() -> None:
     for posterior, same, decided in (([5.0, 4.9], False, False), ([5.0, 1.0], False, True), ([5.0, 4.9], True, True)):
         both_ = np.stack([F[0], F[0] if same else F[1]])
         assert Candidates(both_, np.array(posterior), cameras).decided(pair) == [decided]
+        alone = Candidates(both_[1:], np.array([1.0]), cameras)
+        assert Candidates(both_, np.array(posterior), cameras).same_best(alone) == [same]
     nothing = Candidates(F, np.full(2, -np.inf), cameras)
-    assert nothing.decided(pair) == [False]
+    assert nothing.decided(pair) == nothing.same_best(nothing) == [False]
     assert not nothing.selection(250).found
+
+
+@pytest.mark.parametrize("switch", ["on", "off"])
+def test_rounds_go_on_where_the_search_is_not_settled(switch: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An easy pair has one round, random matches have all, and the other search besides; in a batch as alone."""
+    if switch == "off":
+        monkeypatch.setenv(kernels.SWITCH, "off")
+    estimator = HypothesizeAndVerify(
+        sampler="prior",
+        select={"scale": 1.0},
+        threshold=1.5,
+        focal={"samples": 40, "rounds": 3, "pool": 4},
+        hypotheses=20,
+    )
+    pairs = [scene(1, 200, outliers=0.0), scene(2, 200, outliers=1.0)]
+    assert estimator(collate(pairs), seed=1).draws.tolist() == [40, 3 * 40 + 20]
+    assert [int(estimator(pair, seed=1).draws) for pair in pairs] == [40, 3 * 40 + 20]
 
 
 @pytest.mark.parametrize("cameras", [False, True])
