@@ -53,6 +53,19 @@ class Candidates:
 
         return taken(self.F), TwoCameras(taken(self.cameras.axes), taken(self.cameras.focal)), top[:, 0]
 
+    def best_alone(self) -> Candidates:
+        """The candidate of the greatest posterior alone."""
+        F, cameras, posterior = self.best()
+        return Candidates(
+            F[..., None], posterior[:, None], TwoCameras(cameras.axes[..., None], cameras.focal[..., None])
+        )
+
+    def replaced(self, rows: Sequence[int], other: Candidates) -> Candidates:
+        """With other candidates, as many, for these pairs."""
+        index = torch.tensor(rows, device=self.posterior.device)
+        F, posterior = self.F.index_copy(1, index, other.F), self.posterior.index_copy(0, index, other.posterior)
+        return Candidates(F, posterior, self.cameras.replaced(index, other.cameras))
+
     def selection(self, draws: Int[Tensor, " p"]) -> Selection:
         """The best candidates, from so many minimal samples."""
         F, cameras, posterior = self.best()

@@ -38,6 +38,16 @@ class Candidates:
         """The candidate of the greatest posterior, the first of several."""
         return int(np.argmax(self.posterior))
 
+    def best_alone(self) -> Candidates:
+        """As `selection.Candidates.best_alone`."""
+        one = slice(self.best(), self.best() + 1)
+        cameras = TwoCameras(self.cameras.axes[one], self.cameras.focal[one])
+        return Candidates(self.F[one], self.posterior[one], cameras)
+
+    def replaced(self, rows: Sequence[int], other: Candidates) -> Candidates:
+        """As `selection.Candidates.replaced`: the other."""
+        return other
+
     def selection(self, draws: int) -> Selection:
         """As `selection.Candidates.selection`."""
         best = self.best()
