@@ -8,6 +8,7 @@ if not __package__:
     raise SystemExit("run it in the checkout's folder, as a module: python -m scripts.benchmark COMMAND ...")
 
 from scripts.benchmark import (
+    curves,
     estimators,
     features,
     learned,
@@ -24,7 +25,19 @@ from scripts.benchmark import (
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m scripts.benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    for module in (estimators, features, learned, matching, memory, pipelines, pruning, related, speed, thresholds):
+    for module in (
+        curves,
+        estimators,
+        features,
+        learned,
+        matching,
+        memory,
+        pipelines,
+        pruning,
+        related,
+        speed,
+        thresholds,
+    ):
         module.add_arguments(commands)
     arguments = parser.parse_args()
     arguments.run(arguments)
