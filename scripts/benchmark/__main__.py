@@ -10,9 +10,11 @@ if not __package__:
 from scripts.benchmark import (
     estimators,
     features,
+    gc_ransac,
     learned,
     matching,
     memory,
+    paper,
     pipelines,
     pruning,
     related,
@@ -24,7 +26,10 @@ from scripts.benchmark import (
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m scripts.benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    for module in (estimators, features, learned, matching, memory, pipelines, pruning, related, speed, thresholds):
+    for module in (
+        estimators, features, gc_ransac, learned, matching, memory, paper, pipelines, pruning, related, speed,
+        thresholds,
+    ):  # fmt: skip
         module.add_arguments(commands)
     arguments = parser.parse_args()
     arguments.run(arguments)

@@ -93,7 +93,7 @@ def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
             identity = {name: digest for name, (_, digest) in group.items()}
             own = [row for row in known if identity.get(row["method"]) == row["identity"]]
             rows += own
-            done = {row["pair"] for row in own}
+            done = set.intersection(*({row["pair"] for row in own if row["method"] == name} for name in group))
             todo = [pair for pair in some if pair.identity not in done]
             batches = [todo[i : i + BATCH] for i in range(0, len(todo), BATCH)]
             for batch in track(batches, next(iter(pipelines)), console=console):
@@ -115,7 +115,7 @@ def by_features(arguments: argparse.Namespace, wide: bool) -> Iterator[dict[str,
         pipeline = presets.pipeline(name, overrides=[f"cache={arguments.cache}", *overrides])
         extractor = pipeline.extractor
         features = extractor.extractor if isinstance(extractor, CachedFeatures) else extractor
-        made_with = {"features": configuration(features), "preset": presets.load("pipeline", name),
+        made_with = {"features": configuration(features), "stages": presets.pipeline_stages(name),
                      "overrides": overrides, "seeds": arguments.seeds}  # fmt: skip
         label = name + arguments.label
         groups.setdefault(name.split("_")[0], {})[label] = pipeline, identity_digest(made_with)[:16]
