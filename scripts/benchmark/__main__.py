@@ -15,6 +15,7 @@ from scripts.benchmark import (
     matching,
     memory,
     paper,
+    paper_times,
     pipelines,
     pruning,
     related,
@@ -27,8 +28,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m scripts.benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     for module in (
-        estimators, features, gc_ransac, learned, matching, memory, paper, pipelines, pruning, related, speed,
-        thresholds,
+        estimators, features, gc_ransac, learned, matching, memory, paper, paper_times, pipelines, pruning, related,
+        speed, thresholds,
     ):  # fmt: skip
         module.add_arguments(commands)
     arguments = parser.parse_args()
