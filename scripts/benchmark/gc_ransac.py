@@ -49,9 +49,14 @@ def add_arguments(commands: Any) -> None:
 def variants() -> dict[str, Estimator]:
     """The estimators that are compared, by what the table calls them."""
     found: dict[str, Estimator] = {}
-    for threshold in (0.31, 2.0, 3.0, 5.0):
-        name = f"`gc_ransac_paper`, Sampson distance below {threshold:g} px"
-        found[name] = presets.build("estimator", "gc_ransac_paper", threshold=threshold)
+    for threshold, confidence in (ARTICLE, (2.0, 0.99), (3.0, 0.99)):
+        name = f"`gc_ransac_paper`, t = {threshold:g} px, Sampson distance"
+        found[name] = presets.build("estimator", "gc_ransac_paper", threshold=threshold, confidence=confidence)
+    found["`gc_ransac_paper` as it is"] = presets.build("estimator", "gc_ransac_paper")
+    found["`gc_ransac_paper`, MSAC's score"] = presets.build("estimator", "gc_ransac_paper", score="msac")
+    for name in ("cf_ransac_paper", "lmeds_paper"):
+        found[f"`{name}`"] = presets.build("estimator", name)
+    found["`cf_ransac_paper`, coarse stage with the article's t"] = coarse_to_fine(*ARTICLE)
     for release, factor in (("next", NEXT), ("first", FIRST)):
         for source, (threshold, confidence) in (("article", ARTICLE), ("example", EXAMPLE)):
             within = factor * threshold
@@ -60,6 +65,17 @@ def variants() -> dict[str, Estimator]:
                 name = f"{release} release, t of the {source}: below {within:.2f} px{fit}"
                 found[name] = EarlyGCRansac(within, confidence, normalized=normalized).estimator()
     return found
+
+
+def coarse_to_fine(threshold: float, confidence: float) -> Estimator:
+    """`cf_ransac_paper` with another coarse stage."""
+    coarse = {
+        **presets.load("estimator", "cf_ransac_paper")["coarse"],
+        "threshold": threshold,
+        "confidence": confidence,
+    }
+    estimator: Estimator = presets.build("estimator", "cf_ransac_paper", coarse=coarse)
+    return estimator
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -21,13 +21,13 @@ from scripts.benchmark.matched import add_set_arguments, console
 from scripts.benchmark.sheet import put
 
 METHODS = list(paper_table.METHODS)
-FRONTS = {paper_table.VLFEAT: (METHODS, ["features=sift_vlfeat"]), "": (METHODS[:1], [])}
-"""What follows a pipeline's name in the rows: which pipelines, and the overrides that it stands for."""
+OPENCV = METHODS[:1]  # what gets OpenCV's matches, too
 
 
 def add_arguments(commands: Any) -> None:
     parser = commands.add_parser("paper", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_set_arguments(parser, "pairs of each family at most, chosen by hash")
+    parser.add_argument("--estimators", nargs="*", default=METHODS, choices=METHODS, help="pipelines to measure")
     parser.add_argument("--seeds", type=int, default=3, help="of the estimators; recall is their mean")
     parser.add_argument("--cache", default="null", help="folder of features; null: the user's")
     parser.add_argument("--json", type=Path, help="keep the figures of every pair here, one line each")
@@ -40,8 +40,9 @@ def run(arguments: argparse.Namespace) -> None:
     torch.set_num_threads(1)
     rows = [row for path in arguments.earlier for row in pipelines.read(path)]
     if arguments.root or arguments.rendered:
-        for label, (names, overrides) in FRONTS.items():
-            front = {"pipelines": names, "label": label, "overrides": overrides}
+        vlfeat = {"pipelines": arguments.estimators, "label": paper_table.VLFEAT, "overrides": ["features=sift_vlfeat"]}
+        opencv = {"pipelines": [m for m in OPENCV if m in arguments.estimators], "label": "", "overrides": []}
+        for front in (vlfeat, opencv):
             rows += pipelines.measure(argparse.Namespace(**{**vars(arguments), **front}))
     sheets = paper_table.tables(rows)
     for sheet in sheets:
