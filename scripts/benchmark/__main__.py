@@ -20,6 +20,7 @@ from scripts.benchmark import (
     pruning,
     related,
     speed,
+    sweep,
     thresholds,
 )
 
@@ -29,7 +30,7 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     for module in (
         estimators, features, gc_ransac, learned, matching, memory, paper, paper_times, pipelines, pruning, related,
-        speed, thresholds,
+        speed, sweep, thresholds,
     ):  # fmt: skip
         module.add_arguments(commands)
     arguments = parser.parse_args()

@@ -52,6 +52,7 @@ SLOW = (
     r"estimators\.txt +#",
     r"--marker rendered",
     r"--label",
+    r"benchmark paper_times",
     r"benchmark related .*(hardnet|hesaffnet)",
 )
 
@@ -73,6 +74,10 @@ APPENDED = {
     "estimators": ["--limit", "1", "--seeds", "1"],
     "thresholds": ["--limit", "1", "--seeds", "1", "--values", "0.5", "0.75"],
     "pipelines": ["--limit", "1", "--seeds", "1", "--cache", "kept"],
+    "paper": ["--limit", "1", "--seeds", "1", "--cache", "kept"],
+    "paper_times": ["--limit", "1"],
+    "gc_ransac": ["--limit", "1", "--cache", "kept"],
+    "sweep": [],
     "pruning": ["--limit", "1", "--asift-limit", "0", "--cache", "kept"],
     "related": ["--limit", "1", "--unrelated", "1"],
     "learned": ["--limit", "1", "--cache", "kept", "--methods", "ratio", "LC, F", "DFE"],
