@@ -19,11 +19,11 @@ import numpy as np
 import torch
 from rich.progress import track
 
-from fmtorch import presets
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.run import select
 from fmtorch.evaluation.statistics import PERCENT
 from fmtorch.pipeline import Pipeline
+from fmtorch.presets import build, load, pipeline
 from fmtorch.stages import Estimator
 from fmtorch.storage import PairRow
 from scripts.benchmark.early_gc_ransac import EarlyGCRansac
@@ -49,14 +49,13 @@ def add_arguments(commands: Any) -> None:
 def variants() -> dict[str, Estimator]:
     """The estimators that are compared, by what the table calls them."""
     found: dict[str, Estimator] = {}
-    for threshold, confidence in (ARTICLE, (2.0, 0.99), (3.0, 0.99)):
-        name = f"`gc_ransac_paper`, t = {threshold:g} px, Sampson distance"
-        found[name] = presets.build("estimator", "gc_ransac_paper", threshold=threshold, confidence=confidence)
-    found["`gc_ransac_paper` as it is"] = presets.build("estimator", "gc_ransac_paper")
-    found["`gc_ransac_paper`, MSAC's score"] = presets.build("estimator", "gc_ransac_paper", score="msac")
-    for name in ("cf_ransac_paper", "lmeds_paper"):
-        found[f"`{name}`"] = presets.build("estimator", name)
-    found["`cf_ransac_paper`, coarse stage with the article's t"] = coarse_to_fine(*ARTICLE)
+    for threshold in (0.31, 2.0, 3.0):
+        options = article(threshold)
+        found[f"`gc_ransac_paper` as in the article, {threshold:g} px"] = build(
+            "estimator", "gc_ransac_paper", **options
+        )
+    found["`gc_ransac_paper`, MSAC's score"] = build("estimator", "gc_ransac_paper", score="msac")
+    found["`gc_ransac_paper`"] = build("estimator", "gc_ransac_paper")
     for release, factor in (("next", NEXT), ("first", FIRST)):
         for source, (threshold, confidence) in (("article", ARTICLE), ("example", EXAMPLE)):
             within = factor * threshold
@@ -64,18 +63,16 @@ def variants() -> dict[str, Estimator]:
                 fit = ", normalised last fit" if normalized else ""
                 name = f"{release} release, t of the {source}: below {within:.2f} px{fit}"
                 found[name] = EarlyGCRansac(within, confidence, normalized=normalized).estimator()
+    found["`lmeds_paper`"] = build("estimator", "lmeds_paper")
+    coarse = {**load("estimator", "cf_ransac_paper")["coarse"], **article(ARTICLE[0])}
+    found["`cf_ransac_paper`, coarse stage as in the article"] = build("estimator", "cf_ransac_paper", coarse=coarse)
+    found["`cf_ransac_paper`"] = build("estimator", "cf_ransac_paper")
     return found
 
 
-def coarse_to_fine(threshold: float, confidence: float) -> Estimator:
-    """`cf_ransac_paper` with another coarse stage."""
-    coarse = {
-        **presets.load("estimator", "cf_ransac_paper")["coarse"],
-        "threshold": threshold,
-        "confidence": confidence,
-    }
-    estimator: Estimator = presets.build("estimator", "cf_ransac_paper", coarse=coarse)
-    return estimator
+def article(threshold: float) -> dict[str, Any]:
+    """The options of the article (Barath & Matas, CVPR 2018, section 4), but for the threshold."""
+    return {"threshold": threshold, "confidence": ARTICLE[1], "score": "msac"}
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -83,13 +80,13 @@ def run(arguments: argparse.Namespace) -> None:
     cv2.setNumThreads(1)
     pairs = select([dataset[i] for dataset in sets_of(arguments) for i in range(len(dataset))], arguments.limit)
     overrides = ["features=sift_vlfeat", f"cache={arguments.cache}"]
-    front = presets.pipeline(METHOD, overrides=overrides)
+    front = pipeline(METHOD, overrides=overrides)
     matched = [front.match([pair])[0] for pair in track(pairs, "matching", console=console, transient=True)]
     rows: dict[str, list[PairRow]] = {}
     for name, estimator in variants().items():
-        pipeline = Pipeline(front.extractor, front.matcher, {}, estimator)
+        estimation = Pipeline(front.extractor, front.matcher, {}, estimator)
         outcomes = track(matched, name, console=console, transient=True)
-        rows[name] = [row for outcome in outcomes for row in evaluate(pipeline.estimate([outcome]))]
+        rows[name] = [row for outcome in outcomes for row in evaluate(estimation.estimate([outcome]))]
     sheet = table(rows)
     console.print(sheet.terminal())
     if arguments.markdown:

@@ -1,6 +1,6 @@
 """Runs of `fmtorch.eval` in one table: a line for each family and pipeline.
 
-python -m scripts.benchmark sweep runs/fmbench/* runs/rendered/* --markdown docs/paper.md
+python -m scripts.benchmark sweep runs --markdown docs/paper.md
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from fmtorch.commands.report import run_folders
 from fmtorch.data.baselines import WIDE
 from fmtorch.evaluation.statistics import PERCENT
 from fmtorch.evaluation.summary import ALL, summarize
@@ -24,14 +25,14 @@ COLUMNS = ("", "pairs", "%Recall", "R.01", "AUC@0.05", "%Inlier", "%Inlier-m", "
 
 def add_arguments(commands: Any) -> None:
     parser = commands.add_parser("sweep", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("runs", nargs="+", type=Path, help="folders of runs")
+    parser.add_argument("runs", nargs="+", type=Path, help="folders of runs, or folders that hold such")
     parser.add_argument("--markdown", type=Path, help="put the table between the marks `sweep` of this file")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> None:
     groups: dict[tuple[str, str], Mapping[str, Any]] = {}
-    for path in arguments.runs:
+    for path in run_folders(arguments.runs):
         folder = RunFolder.load(path)
         summary = summarize(folder.read())
         groups |= {(family, folder.config["pipeline"]): group for family, group in summary.items() if family != ALL}

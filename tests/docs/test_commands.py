@@ -52,7 +52,6 @@ SLOW = (
     r"estimators\.txt +#",
     r"--marker rendered",
     r"--label",
-    r"benchmark paper_times",
     r"benchmark related .*(hardnet|hesaffnet)",
 )
 
