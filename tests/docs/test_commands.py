@@ -112,6 +112,7 @@ def smaller(command: str) -> list[str]:
         (r"--root DATA/\w+ (?=.*--root)", ""),
         (r" --ngransac \S+", ""),
         (r" dataset\.size=\w+", ""),
+        (r" '?dataset\.sets=\[\S*\]'?", ""),
         (r"FOLDER", "kept"),
         (r"(dataset\.layout=(\w+) dataset\.root=)FILES", r"\1FILES/\2"),
         (r" root=DIR", ""),
