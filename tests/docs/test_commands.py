@@ -53,6 +53,7 @@ SLOW = (
     r"--marker rendered",
     r"--label",
     r"benchmark related .*(hardnet|hesaffnet)",
+    r"benchmark (paper|gc_ransac|sweep)",
 )
 
 PEERS = {"poselib": "poselib", "poselib_shared_focal": "poselib", "degensac_cpp": "pydegensac",
@@ -79,6 +80,10 @@ APPENDED = {
     "estimators": ["--limit", "1", "--seeds", "1"],
     "thresholds": ["--limit", "1", "--seeds", "1", "--values", "0.5", "0.75"],
     "pipelines": ["--limit", "1", "--seeds", "1", "--cache", "kept"],
+    "paper": ["--limit", "1", "--seeds", "1", "--cache", "kept"],
+    "paper_times": ["--limit", "1"],
+    "gc_ransac": ["--limit", "1", "--cache", "kept"],
+    "sweep": [],
     "pruning": ["--limit", "1", "--asift-limit", "0", "--cache", "kept"],
     "related": ["--limit", "1", "--unrelated", "1"],
     "learned": ["--limit", "1", "--cache", "kept", "--methods", "ratio", "LC, F", "DFE"],
@@ -107,6 +112,7 @@ def smaller(command: str) -> list[str]:
         (r"--root DATA/\w+ (?=.*--root)", ""),
         (r" --ngransac \S+", ""),
         (r" dataset\.size=\w+", ""),
+        (r" '?dataset\.sets=\[\S*\]'?", ""),
         (r"FOLDER", "kept"),
         (r"(dataset\.layout=(\w+) dataset\.root=)FILES", r"\1FILES/\2"),
         (r" root=DIR", ""),
@@ -242,7 +248,7 @@ def run_all(some: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(workplace)))
     for command in some:
         print(command)
-        if "report" in command and not (workplace / "runs").exists():
+        if ("report" in command or "sweep runs" in command) and not (workplace / "runs").exists():
             run(smaller("python -m fmtorch.eval pipeline=sift_ratio"), workplace)
         run(smaller(command), workplace)
 
