@@ -17,6 +17,7 @@ from scripts.benchmark import (
     pruning,
     related,
     speed,
+    stress,
     thresholds,
 )
 
@@ -24,7 +25,19 @@ from scripts.benchmark import (
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m scripts.benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    for module in (estimators, features, learned, matching, memory, pipelines, pruning, related, speed, thresholds):
+    for module in (
+        estimators,
+        features,
+        learned,
+        matching,
+        memory,
+        pipelines,
+        pruning,
+        related,
+        speed,
+        stress,
+        thresholds,
+    ):
         module.add_arguments(commands)
     arguments = parser.parse_args()
     arguments.run(arguments)
