@@ -129,15 +129,14 @@ def methods(path: Path) -> tuple[dict[str, Method], dict[str, Method]]:
     specs = read_specs(path)
     bracketed = [spec.strip("()") for spec in specs if spec.startswith("(")]
     return (
-        {spec: method(spec) for spec in specs if not spec.startswith("(")},
-        {spec: method(spec) for spec in bracketed},
+        {spec: informed(spec, STAGES) for spec in specs if not spec.startswith("(")},
+        {spec: informed(spec, STAGES) for spec in bracketed},
     )
 
 
-def method(spec: str) -> Method:
-    """As `estimators.informed`; the stage `sizeless`, which comes last, takes away the image sizes."""
-    stages = spec.removesuffix("+sizeless")
-    inner = informed(stages)
-    if stages == spec:
-        return inner
-    return lambda pair, c, seed: inner(pair, c.replace(size0=None, size1=None), seed)
+def sizeless(c: Correspondences) -> Correspondences:
+    """The matches of images whose sizes nobody tells."""
+    return c.replace(size0=None, size1=None)
+
+
+STAGES = {"sizeless": sizeless}
