@@ -15,12 +15,13 @@ from fmtorch.storage import replacing
 from scripts.benchmark.estimators_table import replaced
 from scripts.benchmark.matched import WIDE, console
 from scripts.benchmark.sheet import MISSING, Sheet
+from scripts.benchmark.stress_changes import CONDITIONS
 
 Row = dict[str, Any]
 Level = float | str
 GROUPS = ("real, wide", "real, short", "rendered")
 AXES = {"inlier ratio": "inlier ratio", "noise": "added noise [px]", "match count": "matches"}
-LOGARITHMIC = ("match count",)
+LOGARITHMIC = ("inlier ratio", "match count")
 PLANE, TURN = 0.8, 0.02
 INK = "#808080"  # legible on white and on black
 COLOURS = ("#D55E00", "#E69F00", "#009E73", "#56B4E9", "#2F8FD0", "#CC79A7", "#9A9A9A", "#B8A800")
@@ -78,8 +79,9 @@ def recall_sheet(name: str, rows: Sequence[Row]) -> Sheet:
             cells.append(
                 " / ".join(f"{PERCENT * of(nsgd).mean():.0f}" for of in MERITS.values()) if nsgd.size else MISSING
             )
-        lines.append([f"`{method}`", *cells])
-    title = f"{name}: recall at NSGD 0.05 / at 0.01 / AUC@0.05, in %, mean of {seeds} seed{'s' * (seeds != 1)}"
+        lines.append([label(method), *cells])
+    kind = f"recall at NSGD 0.05 / at 0.01 / AUC@0.05, in %, {seeds} seed{'s' * (seeds != 1)}"
+    title = f"{titled(rows, name)}: {kind}"
     heads = [f"{head(level)} ({count(rows, level)})" for level in levels(rows)]
     return Sheet(title, ["estimator (pairs in brackets)", *heads], lines)
 
@@ -95,9 +97,9 @@ def difference_sheet(name: str, rows: Sequence[Row]) -> Sheet:
             units |= {unit(scenes)} if scenes else set()
             gain = difference(areas(own), areas(other), scenes, PERCENT) if scenes else None
             cells.append(MISSING if gain is None else f"{gain.value:+.0f} [{gain.low:+.0f}, {gain.high:+.0f}]")
-        lines.append([f"`{method}`", *cells])
+        lines.append([label(method), *cells])
     over = " or ".join(sorted(units))
-    title = f"{name}: AUC@0.05 of `{first}` minus this row's, in points, with 95 % intervals over {over}s"
+    title = f"{titled(rows, name)}: AUC@0.05 of {label(first)} minus this row, in points, 95 % intervals over {over}s"
     return Sheet(title, ["estimator", *(head(level) for level in levels(rows))], lines)
 
 
@@ -106,8 +108,8 @@ def time_sheet(rows: Sequence[Row]) -> Sheet:
     lines = [["matches", *(f"{np.median([r['matches'] for r in at(rows, level)]):.0f}" for level in levels(rows))]]
     for method in methods(rows):
         cells = [figures(rows, method, level)[1] for level in levels(rows)]
-        lines.append([f"`{method}`", *(f"{np.median(ms):.1f}" if ms.size else MISSING for ms in cells)])
-    title = "all: median number of matches, median processor milliseconds a pair"
+        lines.append([label(method), *(f"{np.median(ms):.1f}" if ms.size else MISSING for ms in cells)])
+    title = f"{titled(rows, 'all')}: median number of matches, median processor milliseconds a pair"
     return Sheet(title, ["", *(head(level) for level in levels(rows))], lines)
 
 
@@ -126,8 +128,8 @@ def draw(rows: Sequence[Row], sweep: str, path: Path) -> None:
                 points = [(x, figures(own, method, x)[0]) for x in levels(own)]
                 drawn = [(float(x), PERCENT * float(areas(nsgd).mean())) for x, nsgd in points if nsgd.size]
                 panel.plot(
-                    *zip(*drawn, strict=True), DASHES[i % len(DASHES)], color=COLOURS[i % len(COLOURS)], marker="o",
-                    markersize=2.5, linewidth=2.4 if i == 0 else 1.4, label=short(method), zorder=3 - i / 100,
+                    *zip(*drawn, strict=True), DASHES[i % len(DASHES)], color=COLOURS[i % len(COLOURS)],
+                    linewidth=2.4 if i == 0 else 1.4, label=label(method), zorder=3 - i / 100,
                 )  # fmt: skip
             panel.set_title(name, loc="left", fontsize=9, color=INK)
             panel.set(xlabel=AXES[sweep], xscale="log" if sweep in LOGARITHMIC else "linear")
@@ -146,9 +148,19 @@ def draw(rows: Sequence[Row], sweep: str, path: Path) -> None:
             figure.savefig(temporary, format="svg", transparent=True, metadata={"Date": None})
 
 
-def short(method: str) -> str:
-    """An estimator's name without options and stages."""
-    return method.partition("@")[0].partition(":")[0]
+def label(method: str) -> str:
+    """An estimator's name in tables: without its stages and the options that all of its kind have."""
+    front, _, stages = method.partition("@")
+    name, _, rest = front.partition(":")
+    telling = [
+        option for option in rest.split(",") if option and option.partition("=")[0] not in ("threshold", "prosac")
+    ]
+    return ", ".join([name, *telling, *(["no sizes"] if "sizeless" in stages else [])])
+
+
+def titled(rows: Sequence[Row], name: str) -> str:
+    """The beginning of a table's title: sweep and group."""
+    return f"{str(rows[0]['sweep']).capitalize()}; {name}"
 
 
 def head(level: Level) -> str:
@@ -164,7 +176,8 @@ def levels(rows: Sequence[Row]) -> list[Level]:
     found = list(dict.fromkeys(row["level"] for row in rows))
     if all(isinstance(level, float) for level in found):
         return sorted(found)
-    return [*found, *(name for name in NATURAL if at(rows, name))]
+    ordered = [name for name in CONDITIONS if name in found]
+    return [*ordered, *(name for name in NATURAL if at(rows, name))]
 
 
 def flat(row: Row) -> bool:
