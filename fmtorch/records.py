@@ -67,27 +67,44 @@ class Record:
 
     def to(self: AnyRecord, device: torch.device | str) -> AnyRecord:
         """The same record with every tensor on `device`."""
-        return self._map(lambda value: value.to(device))
+        return self._each(lambda value: value.to(device))
 
     def detach(self: AnyRecord) -> AnyRecord:
         """The same record cut off from the graph."""
-        return self._map(lambda value: value.detach())
+        return self._each(lambda value: value.detach())
 
     @property
     def requires_grad(self) -> bool:
         """Whether a gradient can reach any of the tensors."""
-        values = [getattr(self, f.name) for f in dataclasses.fields(cast(Any, self))]
-        return torch.is_grad_enabled() and any(isinstance(v, Tensor | Record) and v.requires_grad for v in values)
+        if not torch.is_grad_enabled():
+            return False
+        return any(isinstance(v, Tensor | Record) and v.requires_grad for v in vars(self).values())
 
     def replace(self: AnyRecord, **changes: Any) -> AnyRecord:
         """A copy with some fields changed (shapes are checked again)."""
         return cast(AnyRecord, dataclasses.replace(cast(Any, self), **changes))
 
+    def derived(self: AnyRecord, **changes: Any) -> AnyRecord:
+        """A copy with some fields changed, unchecked: by tensors that fit because of how they are made of this record.
+
+        What a user may have a hand in goes through `replace`.
+        """
+        made = object.__new__(type(self))
+        vars(made).update(vars(self), **changes)
+        return made
+
     def _map(self: AnyRecord, function: Any, **changes: Any) -> AnyRecord:
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(cast(Any, self))}
-        mapped = {name: function(v) for name, v in values.items() if isinstance(v, Tensor)}
-        mapped |= {name: v._map(function) for name, v in values.items() if isinstance(v, Record)}
-        return self.replace(**mapped, **changes)
+        return self.replace(**_mapped(self, function, Record._map), **changes)
+
+    def _each(self: AnyRecord, function: Any) -> AnyRecord:
+        """As `_map`, of a function that keeps shape and kind."""
+        return self.derived(**_mapped(self, function, Record._each))
+
+
+def _mapped(record: Record, function: Any, within: Any) -> dict[str, Any]:
+    """The function of each tensor of a record; within(record, function) of a record in it."""
+    values = {name: v for name, v in vars(record).items() if isinstance(v, Tensor | Record)}
+    return {name: function(v) if isinstance(v, Tensor) else within(v, function) for name, v in values.items()}
 
 
 def expect_fields(record: Record, **sizes: int) -> None:
@@ -145,7 +162,7 @@ def ungraphed(inputs: Record, compute: Callable[[], AnyRecord]) -> AnyRecord:
         return compute()
     with torch.inference_mode():
         result = compute()
-    return result._map(lambda value: value.clone() if value.is_inference() else value)
+    return result._each(lambda value: value.clone() if value.is_inference() else value)
 
 
 def as_index(index: Index, length: int) -> slice | Tensor:

@@ -133,7 +133,7 @@ class Correspondences(Record):
         longest = int(self.count().max()) if self.mask.numel() else 0
         n = -(-longest // multiple) * multiple
         order = torch.argsort(self.mask.logical_not().to(torch.uint8), dim=-1, stable=True)[:, :n]
-        return self.replace(**{name: padded(gathered(v, order), 1, n) for name, v in slotted(self).items()})
+        return self.derived(**{name: padded(gathered(v, order), 1, n) for name, v in slotted(self).items()})
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ Each is checked where a user's tensors come in, all at once, so that a GPU is as
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Int
@@ -13,11 +14,11 @@ from torch import Tensor
 
 from fmtorch.types import Correspondences
 
-PER_MATCH: dict[str, tuple[Callable[[Tensor], Tensor], str]] = {
+PER_MATCH: dict[str, tuple[Callable[[Any], Any], str]] = {
     "prior": (lambda prior: (prior >= 0) & (prior <= 1), "it is P(inlier), within [0, 1]"),
     "noise": (lambda noise: noise > 0, "it is a standard deviation, positive"),
 }
-"""Which values of a match are right, and what is said of others. NaN is never right."""
+"""Which values of a match are right, in a tensor or an array, and what is said of others. NaN is never right."""
 SIZE = "image sizes (h, w) are positive"
 
 
@@ -31,7 +32,7 @@ def wrong_values(c: Correspondences, live: Bool[Tensor, "b n"]) -> dict[str, Int
     for name in ("size0", "size1"):
         value = getattr(c, name)
         if value is not None:
-            wrong[name] = (~_right_size(value)).sum(1)
+            wrong[name] = (~right_size(value)).sum(1)
     return wrong
 
 
@@ -61,13 +62,14 @@ def expect_values(c: Correspondences) -> None:
 def expect_sizes(**sizes: Tensor | None) -> None:
     """Raises ValueError naming the argument and the first size that is not positive and finite."""
     given = {name: size for name, size in sizes.items() if size is not None}
-    if all(bool(_right_size(size).all()) for size in given.values()):
+    if all(bool(right_size(size).all()) for size in given.values()):
         return
     for name, size in given.items():
         rows = size.detach().reshape(-1, size.shape[-1])
-        for row in rows[~_right_size(rows).all(-1)].tolist():
+        for row in rows[~right_size(rows).all(-1)].tolist():
             raise ValueError(f"{name} is {tuple(row)}; {SIZE}")
 
 
-def _right_size(size: Tensor) -> Tensor:
+def right_size(size: Any) -> Any:
+    """Which numbers of image sizes are right; of a tensor or an array."""
     return (size > 0) & (size < torch.inf)

@@ -29,4 +29,4 @@ def judged(estimate: Estimate, c: Correspondences) -> Estimate:
     with one_thread(c.mask.device):
         found = significance(estimate.F.detach(), c.x0.detach(), c.x1.detach(), c.mask, c.size0, c.size1)
     found = torch.where(estimate.ok, found, -torch.inf)
-    return estimate.replace(significance=torch.where(unknown, found, given))
+    return estimate.derived(significance=torch.where(unknown, found, given))

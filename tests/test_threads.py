@@ -13,6 +13,7 @@ import fmtorch
 from fmtorch import kernels, presets
 from fmtorch.data import read_image
 from fmtorch.estimators import batching
+from fmtorch.estimators.one_pair import batch as one_pair
 from fmtorch.evaluation.run import evaluate_pairs
 from fmtorch.matching import nearest
 from fmtorch.pruning import position_consistency as consistency
@@ -84,10 +85,13 @@ def test_an_error_leaves_threads_as_they_were(threads: int, monkeypatch: pytest.
         raise RuntimeError("no")
 
     monkeypatch.setattr(batching, "normalized_pairs", fails)
+    monkeypatch.setattr(one_pair, "opened", fails)
     built = presets.build("estimator", "msac", hypotheses=10)
-    with pytest.raises(RuntimeError, match="no"):
-        built(scene(0, 60))
-    assert torch.get_num_threads() == threads
+    for form in ("off", "on"):
+        monkeypatch.setenv(kernels.SWITCH, form)
+        with pytest.raises(RuntimeError, match="no"):
+            built(collate([scene(0, 60), scene(1, 60)]))
+        assert torch.get_num_threads() == threads
 
 
 def test_threads_that_torch_may_use_stay_known(threads: int) -> None:

@@ -20,6 +20,7 @@ Solve = Callable[[NormalizedPairs], tuple[Tensor, Tensor, Tensor, Tensor]]
 
 PARTS_OF_A_THREAD = 4  # so that no thread is long alone at the end
 MATCHES_AT_LEAST = 500  # a pair of few matches takes as long as one of these
+NOT_FINITE = "the final fit is not finite"
 
 
 def solve_all(
@@ -36,13 +37,13 @@ def solve_all(
         return ungraphed(part, lambda: _solve_all(part, seed, least, solve, not_found, limit))
 
     with one_thread(c.mask.device):
-        rows = _shared_out(c) if threads and available() > 1 else []
+        rows = shared_out(c) if threads and available() > 1 else []
         if len(rows) < 2:
             return solved(c)
         return collate(mapped(solved, [c[some] for some in rows]))[torch.argsort(torch.cat(rows))]
 
 
-def _shared_out(c: Correspondences) -> list[Tensor]:
+def shared_out(c: Correspondences) -> list[Tensor]:
     """The rows of a batch in parts of about equal work, pairs of many matches first."""
     work, order = c.count().clamp_min(MATCHES_AT_LEAST).sort(descending=True)
     before = work.cumsum(0) - work
@@ -76,6 +77,6 @@ def _solve_all(c: Correspondences, seed: int, least: int, solve: Solve, not_foun
     finite = torch.isfinite(F).flatten(1).all(1)
     F = torch.where(finite[:, None, None], F, 0)
     for i in (~finite).nonzero()[:, 0].tolist():
-        reasons.setdefault(i, "the final fit is not finite")
+        reasons.setdefault(i, NOT_FINITE)
     ok = torch.tensor([i not in reasons for i in range(b)], dtype=torch.bool, device=device)
     return judged(Estimate(F, inliers & ok[:, None], ok, tuple(reasons.get(i, "") for i in range(b)), draws), c)

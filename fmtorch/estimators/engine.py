@@ -25,6 +25,7 @@ from fmtorch.estimators.forms import Form, Outcome, pair_by_pair
 from fmtorch.estimators.graph_cut import LocalOptimization
 from fmtorch.estimators.inliers import Confidence, InlierRule
 from fmtorch.estimators.one_pair import ahead
+from fmtorch.estimators.one_pair.batch import estimated
 from fmtorch.estimators.one_pair.whole import whole
 from fmtorch.estimators.options import Focal, Preselect, Refine, Select, at_least_one, group, thresholds
 from fmtorch.estimators.pairs import NormalizedPairs
@@ -42,6 +43,7 @@ from fmtorch.types import Correspondences, Estimate
 
 FOCAL_ROUND = 500  # samples of five matches of a pair at a time
 DEFAULT_PRESELECT = Preselect()
+NOT_FOUND = "every minimal sample was degenerate"
 
 
 class HypothesizeAndVerify:
@@ -154,11 +156,13 @@ class HypothesizeAndVerify:
         form: Callable[[NormalizedPairs], Outcome] = self.tensor_form
         compiled = self.kernel_form if c.mask.device.type == "cpu" and kernels.available() else None
         if compiled is not None:
-            form = functools.partial(pair_by_pair, compiled)
             if self.focal is not None:
                 compile_together(ahead.FOCAL)
-        solve, threads = functools.partial(self._solve, form), compiled is not None
-        return solve_all(c, seed, least, solve, "every minimal sample was degenerate", at_once, threads)
+            if not c.requires_grad:
+                return estimated(c, seed, least, compiled, NOT_FOUND)
+            form = functools.partial(pair_by_pair, compiled)
+        solve = functools.partial(self._solve, form)
+        return solve_all(c, seed, least, solve, NOT_FOUND, at_once, compiled is not None)
 
     def _solve(
         self, form: Callable[[NormalizedPairs], Outcome], pairs: NormalizedPairs

@@ -162,8 +162,13 @@ def unfit_pairs(c: Correspondences, mask: Bool[Tensor, "b n"], least: int) -> tu
     wrong = wrong_values(c, mask)
     table = torch.stack([mask.sum(-1), *wrong.values()], 1).tolist()  # all at once: a GPU is asked but once
     counts = [n for n, *_ in table]
-    few = [f"{n} matches; at least {least} are needed" if n < least else "" for n in counts]
+    few = [too_few(n, least) for n in counts]
     return counts, [a or reason(dict(zip(wrong, row[1:], strict=True))) for a, row in zip(few, table, strict=True)]
+
+
+def too_few(count: int, least: int) -> str:
+    """Why so few matches cannot be estimated; empty of enough."""
+    return f"{count} matches; at least {least} are needed" if count < least else ""
 
 
 def _bucket_of(c: Correspondences, mask: Tensor, row: Tensor, n: int, seed: int) -> tuple[NormalizedPairs, Tensor]:

@@ -36,13 +36,13 @@ def lack_of_support(
     if inliers.shape[1] <= FIRST_LOOK or not any(first):
         return first
     everything = _lack(points, inliers, minimal, rounding)
-    return [second if reason else "" for reason, second in zip(first, everything, strict=True)]
+    return [second if lack else "" for lack, second in zip(first, everything, strict=True)]
 
 
 def _lack(points: Tensor, inliers: Tensor, minimal: int, rounding: Tensor) -> list[str]:
     on_line = [_collinear(image, inliers, rounding) for image in (points[:2], points[2:])]
     table = torch.stack([_different(points, inliers), *on_line], 1).tolist()
-    return [_reason(count, [bool(line0), bool(line1)], minimal) for count, line0, line1 in table]
+    return [reason(count, [bool(line0), bool(line1)], minimal) for count, line0, line1 in table]
 
 
 def _different(points: Float[Tensor, "4 p n"], inliers: Bool[Tensor, "p n"]) -> Int[Tensor, " p"]:
@@ -53,7 +53,8 @@ def _different(points: Float[Tensor, "4 p n"], inliers: Bool[Tensor, "p n"]) -> 
     return (changes & torch.isfinite(ordered[:, :-1])).sum(1) + torch.isfinite(ordered[:, -1])
 
 
-def _reason(count: int, on_line: list[bool], minimal: int) -> str:
+def reason(count: int, on_line: list[bool], minimal: int) -> str:
+    """What is said of a model of so many different inliers; on_line: whether they are, in each image."""
     if count < minimal:
         return f"the best model has {count} different inliers; at least {minimal} are needed"
     if any(on_line):

@@ -38,7 +38,8 @@ class PixelFrame(NamedTuple):
         centre = torch.where(some[:, None], (low + high) / 2, 0)
         half = torch.where(some, ((high - low) / 2).amax(-1), 0)
         spread = half > 0
-        unit = torch.exp2(torch.ceil(torch.log2(half.clamp(1e-300, 1e300))))
+        mantissa, exponent = torch.frexp(half.clamp(1e-300, 1e300))
+        unit = torch.exp2(torch.where(mantissa == 0.5, exponent - 1, exponent).to(half.dtype))
         return cls(centre, torch.where(spread, unit, 1), spread)
 
     def normalized(self, pixels: Float[Tensor, "p n 4"]) -> Float[Tensor, "p n 4"]:

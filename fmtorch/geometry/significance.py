@@ -70,7 +70,7 @@ def significance(
     if kernels_serve(F, x0, x1, mask, size0, size1):
         sizes = (None if size is None else size.to(torch.float64) for size in (size0, size1))
         out = torch.empty(len(F), 1, dtype=torch.float64)
-        return for_each_pair(_of_one_pair, (F, x0, x1, mask, *sizes), out=out, kind=torch.float64)[:, 0]
+        return for_each_pair(_into, (F, x0, x1, mask, *sizes), out=out, kind=torch.float64)[:, 0]
     mask = mask & (x0.abs() < FARTHEST).all(-1) & (x1.abs() < FARTHEST).all(-1)
     points = [torch.where(mask[..., None], x, 0).to(torch.float64) for x in (x0, x1)]
     sound = torch.isfinite(F).flatten(1).all(1) & (F != 0).flatten(1).any(1)
@@ -91,12 +91,16 @@ def significance(
     return torch.where(sound, _significance(counted, n), -torch.inf)
 
 
-def _of_one_pair(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array, out: Array) -> None:
-    """`significance` of one pair by kernels -> out (1,)."""
+def of_one_pair(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array) -> float:
+    """`significance` of one pair by kernels; float64, sizes empty where unknown."""
     chance = np.empty(len(mask))
     chance = chance[: compiled.counted_chances(F, x0, x1, mask, size0, size1, chance)]
     chance.sort()
-    out[0] = compiled.most_significant(chance, _log_factorials(_table_size(len(mask))).numpy())
+    return compiled.most_significant(chance, _log_factorials(_table_size(len(mask))).numpy())
+
+
+def _into(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array, out: Array) -> None:
+    out[0] = of_one_pair(F, x0, x1, mask, size0, size1)
 
 
 def _table_size(matches: int) -> int:

@@ -50,11 +50,11 @@ class Calibration:
             out = torch.empty(c.mask.shape, dtype=torch.float32)
             tensors = (evidence, c.quality, c.mask)
             prior = for_each_pair(compiled.calibrated, tensors, np.array(numbers, np.float32), out=out)
-            return c.replace(prior=prior.to(c.x0.dtype))
+            return c.derived(prior=prior.to(c.x0.dtype))
         log_odds = fitted["constant"] + fitted["evidence"] * torch.where(c.mask, evidence.to(c.x0.dtype), 0)
         if c.quality is not None:
             log_odds = log_odds + fitted["ratio"] * torch.where(c.mask, c.quality, 0).nan_to_num(nan=1.0)
-        return c.replace(prior=torch.where(c.mask, logistic(log_odds), 0))
+        return c.derived(prior=torch.where(c.mask, logistic(log_odds), 0))
 
 
 def calibration_of(

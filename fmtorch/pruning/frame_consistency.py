@@ -11,10 +11,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.geometry.arithmetic import component_sum
@@ -23,6 +25,8 @@ from fmtorch.pair_arrays import for_each_pair, kernels_serve
 from fmtorch.pruning import frame_consistency_kernels as compiled
 from fmtorch.records import ungraphed
 from fmtorch.types import Correspondences
+
+Array = NDArray[Any]
 
 WINDOW = 8  # neighbours before and after each match along each curve
 CURVES = ((0.0, 0.0), (0.5, math.pi / 4))  # shift of the grid (in thirds of the extent) and rotation of each curve
@@ -138,16 +142,22 @@ class FrameConsistency:
         if c.lafs0 is None or c.lafs1 is None or c.quality is None:
             return c
         frames0, frames1, ratio = c.lafs0, c.lafs1, c.quality
+        if kernels_serve(c.x0, c.x1, frames0, frames1, ratio):
+            tensors = (c.x0, c.x1, frames0, frames1, ratio, c.mask)
+            prior = for_each_pair(self._of_one_pair, tensors, out=torch.empty(c.mask.shape, dtype=torch.float32))
+            return c.derived(prior=prior.to(c.x0.dtype))
         return ungraphed(c, lambda: self._with_prior(c, frames0, frames1, ratio))
 
+    def _of_one_pair(
+        self, x0: Array, x1: Array, lafs0: Array, lafs1: Array, ratio: Array, mask: Array, out: Array
+    ) -> None:
+        w = np.empty_like(out)
+        compiled.frame_agreement(x0, x1, lafs0, lafs1, ratio, mask, CURVE_TABLE, _NUMBERS, w)
+        compiled.frame_prior(w, ratio, mask, self.odds, self.floor, self.slope, out)
+
     def _with_prior(self, c: Correspondences, lafs0: Tensor, lafs1: Tensor, ratio: Tensor) -> Correspondences:
-        w = frame_agreement(c.x0, c.x1, lafs0, lafs1, ratio, c.mask)
-        if kernels_serve(w, ratio):
-            out = torch.empty(c.mask.shape, dtype=torch.float32)
-            prior = for_each_pair(compiled.frame_prior, (w, ratio, c.mask), self.odds, self.floor, self.slope, out=out)
-            return c.replace(prior=prior.to(w.dtype))
-        w = w + self.floor
+        w = frame_agreement(c.x0, c.x1, lafs0, lafs1, ratio, c.mask) + self.floor
         known = c.mask & torch.isfinite(ratio)
         quality = torch.where(known, ratio, 1)
         odds = self.odds * w * w * w / (1 + self.slope * quality).square()
-        return c.replace(prior=torch.where(known, odds / (1 + odds), 0))
+        return c.derived(prior=torch.where(known, odds / (1 + odds), 0))

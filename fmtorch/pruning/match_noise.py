@@ -70,7 +70,7 @@ class MatchNoise:
         if kernels_serve(lafs0, lafs1, c.quality, c.prior, floats=(torch.float32,)):
             numbers = np.array((self.usual, self.radius, self.slope, LEAST_AREA, LEAST_PRIOR), np.float32)
             tensors = (lafs0, lafs1, c.quality, c.prior, c.mask)
-            return c.replace(noise=for_each_pair(compiled.match_noise, tensors, numbers, out=torch.empty(c.mask.shape)))
+            return c.derived(noise=for_each_pair(compiled.match_noise, tensors, numbers, out=torch.empty(c.mask.shape)))
         return ungraphed(c, lambda: self._with_noise(c, lafs0, lafs1))
 
     def _with_noise(self, c: Correspondences, lafs0: Tensor, lafs1: Tensor) -> Correspondences:
@@ -83,4 +83,4 @@ class MatchNoise:
             torch.where(inside, lafs0, 0), torch.where(inside, lafs1, 0), quality, prior,
             usual=self.usual, radius=self.radius, slope=self.slope,
         )  # fmt: skip
-        return c.replace(noise=torch.where(mask, noise, 1))
+        return c.derived(noise=torch.where(mask, noise, 1))

@@ -290,3 +290,13 @@ def test_float32_distances() -> None:
     bound = ((p1.abs() * terms).sum(-1) + exact * terms[..., :2].norm(dim=-1)) / normal
     assert single.dtype == torch.float32
     assert ((single - exact).abs() <= 8 * torch.finfo(torch.float32).eps * bound).all()
+
+
+def test_matrices_of_unit_norm_are_rounded_correctly() -> None:
+    F = np.random.default_rng(0).normal(size=(1000, 3, 3))
+    scaled = F / np.abs(F).max((1, 2), keepdims=True)
+    squared = np.zeros(len(F))
+    for i in range(9):
+        squared += scaled[:, i // 3, i % 3] ** 2
+    expected = scaled * (1 / np.sqrt(squared))[:, None, None]
+    np.testing.assert_array_equal(geometry.unit_frobenius(torch.from_numpy(F)), expected)
