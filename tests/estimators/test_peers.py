@@ -84,6 +84,15 @@ def test_the_check_of_focal_lengths_leaves_pixels_as_they_are() -> None:
     assert float(geometry.sampson(estimate.F, clean.x0.double(), clean.x1.double()).median()) < 0.5
 
 
+def test_superansac_does_the_same_at_every_call() -> None:
+    """Its binding changes the settings that it is given."""
+    pytest.importorskip("pysuperansac")
+    estimator, c = presets.build("estimator", "superansac_cpp"), scene(0, 200, outliers=0.2, noise=0.1)
+    first, *others = (estimator(c).inliers for _ in range(3))
+    assert first.sum() > 100
+    assert all(torch.equal(first, other) for other in others)
+
+
 def test_unknown_parts_of_superansac_are_refused_with_the_choices() -> None:
     with pytest.raises(ValueError, match="sampler is 'napsac'; it must be one of: uniform, prosac, importance"):
         presets.build("estimator", "superansac_cpp", sampler="napsac")

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TypeVar
 
+import numpy as np
+
 from fmtorch.estimators.peers.pairwise import Pair, PairwiseEstimator, Solution, peer, solution, within
 
 Part = TypeVar("Part", int, str)
@@ -126,8 +128,7 @@ def superansac_cpp(
 ) -> PairwiseEstimator:
     """SupeRANSAC by its author (Barath, arXiv 2506.04803), with nested RANSAC and a final iterated least-squares fit.
 
-    It takes no seed. Inliers are told from its F: its binding (pysuperansac 1.0) may return a tenth of them. Its graph
-    cut and progressive NAPSAC are left out: they refuse negative coordinates.
+    It takes no seed. Its graph cut and progressive NAPSAC are left out: they refuse negative coordinates.
 
     Args:
         threshold: pixels.
@@ -145,17 +146,21 @@ def superansac_cpp(
     """
     named = _named("sampler", sampler, SUPERANSAC_SAMPLERS), _named("score", score, SUPERANSAC_SCORES)
     library = peer("pysuperansac", "SupeRANSAC")
-    settings = library.RANSACSettings()
-    settings.sampler = getattr(library.SamplerType, named[0])
-    settings.scoring = getattr(library.ScoringType, named[1])
-    settings.inlier_threshold, settings.confidence = threshold, confidence
-    settings.min_iterations, settings.max_iterations = min(1000, iterations), iterations
 
     def solve(pair: Pair) -> Solution:
+        settings = (
+            library.RANSACSettings()
+        )  # each call divides the threshold of its settings by the scale of the points
+        settings.sampler = getattr(library.SamplerType, named[0])
+        settings.scoring = getattr(library.ScoringType, named[1])
+        settings.inlier_threshold, settings.confidence = threshold, confidence
+        settings.min_iterations, settings.max_iterations = min(1000, iterations), iterations
         (h0, w0), (h1, w1) = pair.size0, pair.size1
         weights = pair.likelihood.tolist() if sampler in ("importance", "adaptive") else []
-        F, *_ = library.estimateFundamentalMatrix(pair.joined, [w0, h0, w1, h1], weights, settings)
-        return solution(F, within(F, pair, threshold))
+        F, found, _, _ = library.estimateFundamentalMatrix(pair.joined, [w0, h0, w1, h1], weights, settings)
+        inliers = np.zeros(len(pair.x0), dtype=np.bool_)
+        inliers[found] = True
+        return solution(F, inliers)
 
     return PairwiseEstimator("SupeRANSAC", solve, best_first=sampler == "prosac")
 
