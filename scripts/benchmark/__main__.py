@@ -8,16 +8,21 @@ if not __package__:
     raise SystemExit("run it in the checkout's folder, as a module: python -m scripts.benchmark COMMAND ...")
 
 from scripts.benchmark import (
+    curves,
     estimators,
     features,
+    gc_ransac,
     learned,
     matching,
     memory,
+    paper,
+    paper_times,
     pipelines,
     pruning,
     related,
     speed,
     stress,
+    sweep,
     thresholds,
 )
 
@@ -26,18 +31,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m scripts.benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     for module in (
-        estimators,
-        features,
-        learned,
-        matching,
-        memory,
-        pipelines,
-        pruning,
-        related,
-        speed,
-        stress,
-        thresholds,
-    ):
+        curves, estimators, features, gc_ransac, learned, matching, memory, paper, paper_times, pipelines, pruning,
+        related, speed, stress, sweep, thresholds,
+    ):  # fmt: skip
         module.add_arguments(commands)
     arguments = parser.parse_args()
     arguments.run(arguments)

@@ -70,23 +70,7 @@ def poselib_shared_focal(
 ) -> PairwiseEstimator:
     """PoseLib's LO-RANSAC for two cameras of one unknown focal length, principal points central, square pixels.
 
-    Pairs whose images differ in size get its fundamental matrix.
-
-    Args:
-        threshold: pixels, Sampson distance.
-        confidence: of having drawn a sample without an outlier, at which the search ends.
-        iterations: samples at most.
-        min_iterations: samples at least, though not more than at most.
-        prosac: draw samples from the best matches first.
-        loss: of the non-linear refinement, one of `LOSSES`; PoseLib's own if not given.
-        loss_scale: pixels; PoseLib's own, half the threshold, if not given.
-
-    Returns:
-        The estimator.
-
-    Raises:
-        ImportError: with a hint, where PoseLib is not installed.
-        ValueError: for another loss.
+    Pairs whose images differ in size get its fundamental matrix. Arguments, result and errors are those of `poselib`.
     """
     library = peer("poselib", "PoseLib")
     options = _options(library, threshold, confidence, iterations, min_iterations, prosac)
