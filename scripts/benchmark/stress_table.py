@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.data.baselines import WIDE
 from fmtorch.data.rendered.generate import FAMILIES
 from fmtorch.evaluation.statistics import MERITS, PERCENT, areas, difference, scene_names, unit
 from fmtorch.storage import replacing
 from scripts.benchmark.estimators_table import replaced
-from scripts.benchmark.matched import WIDE, console
+from scripts.benchmark.matched import console
 from scripts.benchmark.sheet import MISSING, Sheet
 from scripts.benchmark.stress_changes import CONDITIONS
 
