@@ -39,8 +39,9 @@ def few(config: Mapping[str, Any], hypotheses: int = 200, round: int = 100) -> d
     """Options with which an estimator's preset does little in each of its stages."""
     if config["_target_"] == "fmtorch.estimators.HypothesizeAndVerify":
         options = {"hypotheses": hypotheses, "round": round, "pool": min(config.get("pool", 1), 8)}
-        limited = (config.get("refine") or {}).get("matches")
-        return options | ({"refine": {"matches": 64}} if limited else {})  # fewer than a scene has
+        if (config.get("refine") or {}).get("matches"):
+            options["refine"] = {"matches": 64}  # fewer than a scene has
+        return options | ({"focal": {"samples": 60, "rounds": 2, "min_rounds": 1}} if config.get("focal") else {})
     if config["_target_"] == "fmtorch.estimators.IterativelyReweighted":
         return {"starts": [0, 2], "iterations": 5, "refine_iterations": 5}
     return {key: few(value, hypotheses, round) for key, value in config.items() if isinstance(value, dict)}

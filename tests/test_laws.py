@@ -31,13 +31,13 @@ from tests.laws import (
 
 OWN = [n for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES)]
 PER_MATCH = ("inliers", "kept", "prior", "noise")
-NOISY = ("fmtorch", "fmtorch_max", "gc_ransac", "msac")  # are also told the noise of matches
+NOISY = ("fmtorch", "fmtorch_fast", "fmtorch_max", "gc_ransac", "msac")  # are also told the noise of matches
 COMPILED = (  # pruners of two forms: a kernel, and tensors
     "frame_consistency", "gms", "gms_soft", "lpm", "lpm_soft", "match_noise", "one_to_one", "position_consistency",
 )  # fmt: skip
 KERNEL_FORM = (  # wholes of kernels
-    "fmtorch", "fmtorch_max", "gc_ransac", "irls_magsac", "lmeds", "lmeds_eight_point", "magsac", "msac",
-    "ransac", "ransac_eight_point", "usac",
+    "fmtorch", "fmtorch_fast", "fmtorch_max", "gc_ransac", "irls_magsac", "lmeds", "lmeds_eight_point", "magsac",
+    "msac", "ransac", "ransac_eight_point", "usac",
 )  # fmt: skip
 TILES = [  # what bounds memory and fills caches, and must change no result
     (solvers, "CPU_SAMPLES", 150), (hypotheses, "CPU_SAMPLES", 150), (scores, "CPU_TILE", 1000),

@@ -78,19 +78,32 @@ class Select:
 class Focal:
     """The prior on focal lengths, for whole photographs of known size.
 
-    samples: of five matches, with focal lengths drawn from the prior; 0: none, the prior only selects. pool: the best
-    of their models, which are refined with the prior. candidates: models of the other search that are, too.
-    iterations: steps of that refinement.
+    samples: of five matches, with focal lengths drawn from the prior; 0: none, the prior only selects. rounds,
+    min_rounds: of so many samples, at most and at least; in between a pair goes on while its good candidates differ or
+    the stopping rule asks for more. pool: the best models of a round, which are refined with the prior. candidates:
+    models of the other search that are, too. iterations: steps of that refinement.
     """
 
     samples: int = 250
+    rounds: int = 1
+    min_rounds: int = 1
     pool: int = 12
     candidates: int = 12
     iterations: int = 12
 
     def __post_init__(self) -> None:
+        if self.min_rounds > self.rounds:
+            raise ValueError(f"focal.min_rounds is {self.min_rounds}; it must be at most focal.rounds, {self.rounds}")
         _at_least(0, **{"focal.samples": self.samples, "focal.iterations": self.iterations})
-        _at_least(1, **{"focal.pool": self.pool, "focal.candidates": self.candidates})
+        _at_least(
+            1,
+            **{
+                "focal.min_rounds": self.min_rounds,
+                "focal.rounds": self.rounds,
+                "focal.pool": self.pool,
+                "focal.candidates": self.candidates,
+            },
+        )
 
 
 def at_least_one(**values: int) -> None:

@@ -44,8 +44,9 @@ class Uniform:
 class Prosac:
     """PROSAC (Chum & Matas, CVPR 2005): samples from the best matches first, from all of them in the end.
 
-    Matches are ranked by quality, smaller first, or by prior where there is no quality. Draw t takes the n(t)-th match
-    and the others from those before it, n(t) growing as the paper's equation 3 says for T_N draws.
+    Matches are ranked by quality, smaller first, or by prior where there is no quality; without either all sets are
+    equally likely, since the order of matches means nothing. Draw t takes the n(t)-th match and the others from those
+    before it, n(t) growing as the paper's equation 3 says for T_N draws.
     """
 
     GROWTH = 200_000  # T_N: after so many draws PROSAC is RANSAC; the paper's value
@@ -67,14 +68,14 @@ class Prosac:
 
     def draw(self, pairs: NormalizedPairs, start: int, count: int, size: int) -> Int[Tensor, "size p count"]:
         """As `Sampler.draw`."""
+        rank = pairs.quality if pairs.quality is not None else pairs.prior
+        if rank is None:
+            return Uniform().draw(pairs, start, count, size)
         table = pairs.once(f"growth of samples of {size}", lambda: self.growth(pairs, size))
         t = torch.arange(start + 1, start + count + 1, device=table.device).expand(len(table), -1)
         newest = torch.minimum(torch.searchsorted(table, t.contiguous()), pairs.count[:, None] - 1)
         others = _without_replacement(pairs, newest, None, start, size - 1)
         sample = torch.stack([*others, newest])
-        rank = pairs.quality if pairs.quality is not None else pairs.prior
-        if rank is None:
-            return sample
         worst = torch.where(pairs.mask, rank if pairs.quality is not None else -rank, torch.inf)
         order = pairs.once("best matches first", lambda: torch.sort(worst, dim=1, stable=True).indices)
         return order.expand(size, -1, -1).gather(2, sample)

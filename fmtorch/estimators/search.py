@@ -48,19 +48,19 @@ class Search:
     degeneracy: Any = None  # a Degensac, or its kernel form
     nothing: Callable[[Any, int], Any] = Pool.of
 
-    def __call__(self, pairs: NormalizedPairs) -> Pool:
-        """The best models of each pair."""
+    def __call__(self, pairs: NormalizedPairs, start: int = 0) -> Pool:
+        """The best models of each pair. start: draws made before."""
         at_once = self.generator.samples_at_once(pairs.points.device) // min(self.hypotheses, self.round)
         tiles = torch.split(torch.arange(len(pairs), device=pairs.row.device), max(1, at_once))
-        return Pool.joined([self.rounds(pairs.only(tile)) for tile in tiles])
+        return Pool.joined([self.rounds(pairs.only(tile), start) for tile in tiles])
 
-    def rounds(self, pairs: Any) -> Any:
-        """The pool of pairs that are searched together."""
+    def rounds(self, pairs: Any, start: int = 0) -> Any:
+        """The pool of pairs that are searched together. start: draws made before."""
         pool = self.nothing(pairs, self.pool)
         active = list(range(len(pairs)))
-        start = 0
-        while start < self.hypotheses and active:
-            count = min(self.round, self.hypotheses - start)
+        end = start + self.hypotheses
+        while start < end and active:
+            count = min(self.round, end - start)
             some = pairs.only(active)
             models = self.verify(self.generator(some, start, count), some)
             if self.degeneracy is not None:
@@ -68,7 +68,7 @@ class Search:
             start += count
             pool.merge(active, models)
             pool.drawn(active, start)
-            if self.confident is not None and start < self.hypotheses:
+            if self.confident is not None and start < end:
                 F, drawn = pool.best(active)
                 done = self.confident(F, drawn, some)
                 active = [row for row, stop in zip(active, done, strict=True) if not stop]

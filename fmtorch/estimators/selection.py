@@ -25,21 +25,22 @@ class Selection:
     found: Bool[Tensor, " p"]
     draws: Int[Tensor, " p"]
 
-    def replaced(self, rows: Int[Tensor, " q"], other: Selection) -> Selection:
+    def replaced(self, rows: Sequence[int], other: Selection) -> Selection:
         """With other models and cameras for these pairs."""
+        index = torch.tensor(rows, device=self.found.device)
         return dataclasses.replace(
             self,
-            F=self.F.index_copy(1, rows, other.F),
-            cameras=self.cameras.replaced(rows, other.cameras),
-            found=self.found.index_copy(0, rows, other.found),
-            draws=self.draws.index_copy(0, rows, other.draws),
+            F=self.F.index_copy(1, index, other.F),
+            cameras=self.cameras.replaced(index, other.cameras),
+            found=self.found.index_copy(0, index, other.found),
+            draws=self.draws.index_copy(0, index, other.draws),
         )
 
     def merged(self, rows: Sequence[int], other: Selection) -> Selection:
         """With what another search of these pairs has selected; a pair has a model if either has found one."""
         index = torch.tensor(rows, device=self.found.device)
         found, draws = other.found | self.found[index], other.draws + self.draws[index]
-        return self.replaced(index, dataclasses.replace(other, found=found, draws=draws))
+        return self.replaced(rows, dataclasses.replace(other, found=found, draws=draws))
 
     @property
     def matrices(self) -> Float[Tensor, "p 3 3"]:

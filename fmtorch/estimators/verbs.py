@@ -12,11 +12,15 @@ from fmtorch.estimators.search import Confident
 class FocalParts:
     """The prior on focal lengths. selection: a `FocalSelection`. search: makes a pool with it; None: it only selects.
 
-    confident: the stopping rule for that search, None: it never suffices.
+    rounds, min_rounds: of that search, of so many samples each, at most and at least; each refines candidates of its
+    own. confident: the stopping rule for these samples, None: all rounds are made, and never suffice.
     """
 
     selection: Any
     search: Any = None
+    samples: int = 0
+    rounds: int = 1
+    min_rounds: int = 1
     confident: Confident | None = None
 
 
@@ -33,17 +37,46 @@ class Verbs:
         """The selection: with plausible cameras first where the image sizes are known."""
         if self.focal is None or self.focal.search is None or not pairs.sizes_known:
             return self.select(self.refine(self.search(pairs), pairs), pairs)
-        pool, confident = self.focal.search(pairs), self.focal.confident
-        candidates = self.focal.selection.refined(pool.models, pool.valid, pairs, self.refine.near(pool, pairs))
-        selection = candidates.selection(pool.draws)
-        decided = candidates.decided(pairs)
-        enough = [False] * len(pairs) if confident is None else confident(selection.F, pool.draws, pairs)
-        open_ = [i for i, (one, other) in enumerate(zip(decided, enough, strict=True)) if not (one and other)]
+        selection, best, open_ = self.plausible(self.focal, pairs)
         if not open_:
             return selection
         some = pairs.only(open_)
-        other = self.select(self.refine(self.search(some), some), some, candidates.only(open_))
+        other = self.select(self.refine(self.search(some), some), some, best.only(open_))
         return selection.merged(open_, other)
+
+    def plausible(self, focal: FocalParts, pairs: Any) -> tuple[Any, Any, list[int]]:
+        """The selection among plausible cameras, the candidates selected, and the pairs which these do not settle.
+
+        Rounds go on until good candidates are one model, or a round finds the best of those before it again, and the
+        stopping rule is content. A pair is settled if that rule is content and its images have one size or its good
+        candidates are one model.
+        """
+        some, rows = pairs, list(range(len(pairs)))
+        selection: Any = None
+        best: Any = None
+        candidates: Any = None
+        unsettled: list[int] = []
+        for turn in range(focal.rounds):
+            pool = focal.search(some, turn * focal.samples)
+            made = focal.selection.refined(pool.models, pool.valid, some, self.refine.near(pool, some))
+            again = [False] * len(rows) if candidates is None else candidates.same_best(made)
+            candidates = made if candidates is None else candidates.joined(made)
+            top = candidates.best_alone()
+            found = top.selection(pool.draws)
+            best = top if best is None else best.replaced(rows, top)
+            selection = found if selection is None else selection.replaced(rows, found)
+            enough = [False] * len(rows) if focal.confident is None else focal.confident(found.F, pool.draws, some)
+            agreed = [one or two for one, two in zip(candidates.unambiguous(), again, strict=True)]
+            last = turn + 1 == focal.rounds
+            ended = [last or (turn + 1 >= focal.min_rounds and a and e) for a, e in zip(agreed, enough, strict=True)]
+            settled = [a and e for a, e in zip(candidates.decided(some), enough, strict=True)]
+            unsettled += [row for row, over, one in zip(rows, ended, settled, strict=True) if over and not one]
+            left = [i for i, over in enumerate(ended) if not over]
+            rows = [rows[i] for i in left]
+            if not rows:
+                break
+            some, candidates = some.only(left), candidates.only(left)
+        return selection, best, sorted(unsettled)
 
     def select(self, pool: Any, pairs: Any, candidates: Any = None) -> Any:
         """One model of each refined pool, or of the candidates of plausible cameras."""

@@ -8,15 +8,20 @@ if not __package__:
     raise SystemExit("run it in the checkout's folder, as a module: python -m scripts.benchmark COMMAND ...")
 
 from scripts.benchmark import (
+    curves,
     estimators,
     features,
+    gc_ransac,
     learned,
     matching,
     memory,
+    paper,
+    paper_times,
     pipelines,
     pruning,
     related,
     speed,
+    sweep,
     thresholds,
 )
 
@@ -24,7 +29,10 @@ from scripts.benchmark import (
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m scripts.benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    for module in (estimators, features, learned, matching, memory, pipelines, pruning, related, speed, thresholds):
+    for module in (
+        curves, estimators, features, gc_ransac, learned, matching, memory, paper, paper_times, pipelines, pruning,
+        related, speed, sweep, thresholds,
+    ):  # fmt: skip
         module.add_arguments(commands)
     arguments = parser.parse_args()
     arguments.run(arguments)

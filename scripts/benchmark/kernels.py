@@ -29,7 +29,8 @@ PRUNERS = (
     "frame_consistency", "position_consistency", "match_noise", "ratio_prior", "one_to_one", "gms", "gms_soft", "lpm",
 )  # fmt: skip
 ESTIMATORS = (
-    "fmtorch", "fmtorch_max", "ransac", "msac", "lmeds", "usac", "magsac", "gc_ransac", "cf_ransac", "irls_magsac",
+    "fmtorch", "fmtorch_fast", "fmtorch_max", "ransac", "msac", "lmeds", "usac", "magsac", "gc_ransac", "cf_ransac",
+    "irls_magsac",
 )  # fmt: skip
 
 

@@ -94,3 +94,9 @@ def test_prosac_draws_the_best_first() -> None:
     sample = rank[_draw(Prosac(), pairs, 0, 300, 7)[:, 0]]
     assert sorted(sample[:, 0].tolist()) == list(range(7))
     assert bool((sample.amax(0).diff() >= 0).all())
+
+
+def test_without_a_rank_the_order_of_matches_means_nothing() -> None:
+    """Else two thousand draws would come from the first half of the matches alone, which is a part of the image."""
+    pairs = normalized_pairs(scene(1, 100).replace(quality=None, prior=None), 0, 8)[0][0]
+    assert torch.equal(_draw(Prosac(), pairs, 100, 300, 7), _draw(Uniform(), pairs, 100, 300, 7))

@@ -7,6 +7,8 @@ import pytest
 import torch
 
 from fmtorch.estimators import sampling_kernels
+from fmtorch.estimators.one_pair import sampling as one_pair
+from fmtorch.estimators.one_pair.pair import each_pair
 from fmtorch.estimators.pairs import normalized_pairs
 from fmtorch.estimators.sampling import PriorWeighted, Prosac, Uniform
 from fmtorch.random import Stream, mixed_seed
@@ -64,3 +66,10 @@ def test_samples_of_prosac(count: int) -> None:
             assert pairs.quality is not None
             order = np.argsort(pairs.quality[0, :count].numpy(), kind="stable")
             np.testing.assert_array_equal(order[np.vstack([others, newest])], samples)
+
+
+def test_prosac_without_a_rank_draws_the_same_uniform_samples() -> None:
+    (pairs,), _ = normalized_pairs(pair(100).replace(quality=None, prior=None), 3, 7)
+    (one,) = each_pair(pairs)
+    expected = Prosac().draw(pairs, 100, 300, 7)[:, 0].numpy()
+    np.testing.assert_array_equal(one_pair.Prosac(Prosac()).draw(one, 100, 300, 7), expected)

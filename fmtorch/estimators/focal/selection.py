@@ -53,6 +53,19 @@ class Candidates:
 
         return taken(self.F), TwoCameras(taken(self.cameras.axes), taken(self.cameras.focal)), top[:, 0]
 
+    def best_alone(self) -> Candidates:
+        """The candidate of the greatest posterior alone."""
+        F, cameras, posterior = self.best()
+        return Candidates(
+            F[..., None], posterior[:, None], TwoCameras(cameras.axes[..., None], cameras.focal[..., None])
+        )
+
+    def replaced(self, rows: Sequence[int], other: Candidates) -> Candidates:
+        """With other candidates, as many, for these pairs."""
+        index = torch.tensor(rows, device=self.posterior.device)
+        F, posterior = self.F.index_copy(1, index, other.F), self.posterior.index_copy(0, index, other.posterior)
+        return Candidates(F, posterior, self.cameras.replaced(index, other.cameras))
+
     def selection(self, draws: Int[Tensor, " p"]) -> Selection:
         """The best candidates, from so many minimal samples."""
         F, cameras, posterior = self.best()
@@ -62,11 +75,22 @@ class Candidates:
         """Whether these candidates may suffice: for images of one size, or where all good ones are one model."""
         assert pairs.size0 is not None
         assert pairs.size1 is not None
-        decided: list[bool] = ((pairs.size0 == pairs.size1).all(-1) | self.unambiguous()).tolist()
+        decided: list[bool] = ((pairs.size0 == pairs.size1).all(-1) | self._unambiguous()).tolist()
         return decided
 
-    def unambiguous(self) -> Bool[Tensor, " p"]:
+    def same_best(self, other: Candidates) -> list[bool]:
+        """Whether the best candidates of both are one and the same model."""
+        (mine, _, posterior), (theirs, _, their_posterior) = self.best(), other.best()
+        found = torch.isfinite(posterior) & torch.isfinite(their_posterior)
+        same: list[bool] = (found & (1 - component_sum(mine * theirs).abs() <= SAME_CAMERAS)).tolist()
+        return same
+
+    def unambiguous(self) -> list[bool]:
         """Whether all good candidates are one and the same model."""
+        one: list[bool] = self._unambiguous().tolist()
+        return one
+
+    def _unambiguous(self) -> Bool[Tensor, " p"]:
         posterior, order = torch.sort(self.posterior, dim=1, descending=True, stable=True)
         F = self.F.gather(2, order.expand(9, -1, -1))
         return torch.isfinite(posterior[:, 0]) & ~_rivals(F, posterior, SAME_CAMERAS)

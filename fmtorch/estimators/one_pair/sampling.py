@@ -60,11 +60,11 @@ class Prosac:
 
     def draw(self, pair: OnePair, start: int, count: int, size: int) -> Array:
         """As `Sampler.draw`."""
+        if pair.quality is None and pair.prior is None:
+            return _drawn(pair, WEIGHTS_OF_ONE, np.full(count, pair.count), start, size)
         table = pair.once(f"growth of samples of {size}", lambda: self.growth(pair, size))
         newest = np.minimum(np.searchsorted(table, np.arange(start + 1, start + count + 1)), pair.count - 1)
         sample = np.vstack([_drawn(pair, WEIGHTS_OF_ONE, newest, start, size - 1), newest])
-        if pair.quality is None and pair.prior is None:
-            return sample
         ordered: Array = pair.once("best matches first", lambda: _best_first(pair))[sample]
         return ordered
 

@@ -22,6 +22,10 @@ class Selection:
     draws: int
     cameras: TwoCameras = dataclasses.field(default_factory=TwoCameras.none)
 
+    def replaced(self, rows: Sequence[int], other: Selection) -> Selection:
+        """As `selection.Selection.replaced`: the other."""
+        return other
+
     def merged(self, rows: Sequence[int], other: Selection) -> Selection:
         """As `selection.Selection.merged`."""
         return dataclasses.replace(other, found=other.found or self.found, draws=other.draws + self.draws)

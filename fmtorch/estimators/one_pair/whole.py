@@ -78,4 +78,4 @@ def _selector(part: Any) -> Any:
 def _focal(parts: FocalParts, sampler: Any) -> FocalParts:
     search = None if parts.search is None else _search(parts.search, FocalSamples(sampler), sampler).rounds
     chosen = FocalSelection(parts.selection, _part(parts.selection.gain))
-    return FocalParts(chosen, search, _confident(parts.confident, sampler))
+    return dataclasses.replace(parts, selection=chosen, search=search, confident=_confident(parts.confident, sampler))

@@ -38,6 +38,16 @@ class Candidates:
         """The candidate of the greatest posterior, the first of several."""
         return int(np.argmax(self.posterior))
 
+    def best_alone(self) -> Candidates:
+        """As `selection.Candidates.best_alone`."""
+        one = slice(self.best(), self.best() + 1)
+        cameras = TwoCameras(self.cameras.axes[one], self.cameras.focal[one])
+        return Candidates(self.F[one], self.posterior[one], cameras)
+
+    def replaced(self, rows: Sequence[int], other: Candidates) -> Candidates:
+        """As `selection.Candidates.replaced`: the other."""
+        return other
+
     def selection(self, draws: int) -> Selection:
         """As `selection.Candidates.selection`."""
         best = self.best()
@@ -45,12 +55,18 @@ class Candidates:
 
     def decided(self, pair: OnePair) -> list[bool]:
         """As `selection.Candidates.decided`."""
-        return [CentredPair.of(pair).same_size or self._unambiguous()]
+        return [CentredPair.of(pair).same_size or self.unambiguous()[0]]
 
-    def _unambiguous(self) -> bool:
-        """Whether all good candidates are one and the same model."""
+    def same_best(self, other: Candidates) -> list[bool]:
+        """As `selection.Candidates.same_best`."""
+        i, j = self.best(), other.best()
+        found = bool(np.isfinite(self.posterior[i]) and np.isfinite(other.posterior[j]))
+        return [found and bool(1 - abs(self.F[i] @ other.F[j]) <= SAME_CAMERAS)]
+
+    def unambiguous(self) -> list[bool]:
+        """As `selection.Candidates.unambiguous`."""
         best = self.best()
-        return bool(np.isfinite(self.posterior[best])) and not _rivals(self.F, self.posterior, best, SAME_CAMERAS)
+        return [bool(np.isfinite(self.posterior[best])) and not _rivals(self.F, self.posterior, best, SAME_CAMERAS)]
 
 
 class FocalSelection:
