@@ -9,7 +9,6 @@ import time
 from pathlib import Path
 from typing import cast
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -18,8 +17,8 @@ from torch import Tensor
 
 from fmtorch import presets
 from fmtorch.data.images import read_image
-from fmtorch.geometry.epipolar import unit_frobenius
 from fmtorch.pipeline import Pipeline
+from fmtorch.reduced_images import frames_to_original, fundamental_to_original, reduced_image, to_original
 from fmtorch.threads import one_thread
 from fmtorch.types import RELATED, Correspondences, Estimate, Features
 from fmtorch.verdict import judged
@@ -128,12 +127,12 @@ class Described:
     @property
     def points(self) -> Float[Tensor, "n 2"]:
         """The keypoints in pixels of the photograph."""
-        return _to_original(self.features.keypoints, self.scale.to(self.features.keypoints))
+        return to_original(self.features.keypoints, self.scale.to(self.features.keypoints))
 
 
 def describe(pipeline: Pipeline, image: Image, longest_side: int) -> Described:
     """The features of a photograph, for `relate`; see `match`."""
-    reduced, scale = _reduced(image, longest_side)
+    reduced, scale = reduced_image(image, longest_side)
     features, seconds = pipeline.extract(reduced)
     return Described(features, scale, (image.shape[0], image.shape[1]), seconds)
 
@@ -161,16 +160,6 @@ def _image(image: Path | str | Image, name: str) -> Image:
     if image.dtype != np.uint8 or image.size == 0 or not (image.ndim == 2 or colour):
         raise ValueError(f"{name} is {image.dtype} {image.shape}; it must be non-empty uint8, (H, W) or RGB (H, W, 3)")
     return image
-
-
-def _reduced(image: Image, longest_side: int) -> tuple[Image, Float[Tensor, " xy"]]:
-    """The image with its longest side at most that long, and its scale in x and y (rounding makes them differ)."""
-    h, w = image.shape[:2]
-    scale = min(1.0, longest_side / max(h, w))
-    size = (max(1, round(w * scale)), max(1, round(h * scale)))
-    if size != (w, h):
-        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-    return image, torch.tensor([size[0] / w, size[1] / h], dtype=torch.float64)
 
 
 def _relate(pipeline: Pipeline, features0: Features, features1: Features, seed: int, clock: _Clock) -> MatchResult:
@@ -216,36 +205,21 @@ def _still(c: Correspondences, inliers: Tensor) -> str:
 
 def _restored(found: MatchResult, scales: list[Tensor], sizes: list[Tensor]) -> MatchResult:
     """The result in pixels of the original images of these sizes, whose reduction had these scales."""
-    # (0, 0) is the centre of the first pixel, so x_reduced + 1/2 = s (x + 1/2).
-    to_reduced = [
-        torch.tensor([[s[0], 0, (s[0] - 1) / 2], [0, s[1], (s[1] - 1) / 2], [0, 0, 1]], dtype=torch.float64)
-        for s in scales
-    ]
-    A0, A1 = (A.to(found.F) for A in to_reduced)
     s0, s1 = (s.to(found.keypoints0) for s in scales)
-
-    def frames(lafs: Tensor | None, s: Tensor) -> Tensor | None:
-        return (
-            None if lafs is None else torch.cat([lafs[..., :2] / s[:, None], _to_original(lafs[..., 2:].mT, s).mT], -1)
-        )
 
     def matches(c: Correspondences) -> Correspondences:
         return c.replace(
-            x0=_to_original(c.x0, s0), x1=_to_original(c.x1, s1), lafs0=frames(c.lafs0, s0), lafs1=frames(c.lafs1, s1),
+            x0=to_original(c.x0, s0), x1=to_original(c.x1, s1),
+            lafs0=frames_to_original(c.lafs0, s0), lafs1=frames_to_original(c.lafs1, s1),
             size0=sizes[0], size1=sizes[1],
         )  # fmt: skip
 
     return dataclasses.replace(
         found,
-        keypoints0=_to_original(found.keypoints0, s0), keypoints1=_to_original(found.keypoints1, s1),
+        keypoints0=to_original(found.keypoints0, s0), keypoints1=to_original(found.keypoints1, s1),
         putative=matches(found.putative), correspondences=matches(found.correspondences),
-        F=unit_frobenius(A1.T @ found.F @ A0),
+        F=fundamental_to_original(found.F, *scales),
     )  # fmt: skip
-
-
-def _to_original(x: Tensor, s: Tensor) -> Tensor:
-    """Points of a reduced image in pixels of the original; exactly x where nothing was reduced."""
-    return x / s + (1 - s) / (2 * s)
 
 
 class _Clock:

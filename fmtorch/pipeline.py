@@ -49,6 +49,7 @@ class Pipeline:
     """Features, matcher, pruners in order, estimator. Safe to call from several threads.
 
     memory: how many images' features are kept for pairs to come (about 5 MB an image at 8,000 SIFT features).
+    families: by family, pruners that its pairs get in place of those of the same names.
     """
 
     def __init__(
@@ -60,8 +61,10 @@ class Pipeline:
         *,
         device: torch.device | str = "cpu",
         memory: int = 64,
+        families: Mapping[str, Mapping[str, Pruner]] | None = None,
     ) -> None:
         self.extractor, self.matcher, self.pruners, self.estimator = features, matcher, dict(pruners), estimator
+        self.families = dict(families or {})
         self.device = torch.device(device)
         self._memo: _Memo[tuple[Path, Lens | None], tuple[Features, float]] = _Memo(memory)
 
@@ -144,11 +147,22 @@ class Pipeline:
         K0, K1 = (_calibration(K, self.device) for K in (pair.K0, pair.K1))
         return c.replace(key=torch.tensor([pair.key], device=self.device), K0=K0, K1=K1)
 
+    def pruners_of(self, family: str) -> dict[str, Pruner]:
+        """The pruners that pairs of a family get, in order."""
+        return {**self.pruners, **self.families.get(family, {})}
+
     def _prune(self, outcomes: list[Outcome]) -> list[Outcome]:
-        c = _collated(outcomes)
-        for pruner in self.pruners.values():
-            c = pruner(c).compact()
-        return [dataclasses.replace(outcome, correspondences=c[i]) for i, outcome in enumerate(outcomes)]
+        result = list(outcomes)
+        others = {outcome.pair.family for outcome in outcomes} & self.families.keys()
+        for family in [None, *sorted(others)]:  # None: all that have no pruners of their own
+            own = [i for i, o in enumerate(outcomes) if (o.pair.family if o.pair.family in others else None) == family]
+            if own:
+                c = _collated([outcomes[i] for i in own])
+                for pruner in self.pruners_of(family or "").values():
+                    c = pruner(c).compact()
+                for place, i in enumerate(own):
+                    result[i] = dataclasses.replace(outcomes[i], correspondences=c[place])
+        return result
 
     def _estimate(self, outcomes: list[Outcome], seed: int) -> list[Outcome]:
         c = _collated(outcomes)

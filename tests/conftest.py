@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import os
 from pathlib import Path
 
@@ -16,6 +17,26 @@ torch.set_num_threads(1)
 
 SHARED = Path(os.environ.get("FMTORCH_TEST_DATA", Path(__file__).resolve().parents[2] / "shared"))
 KERNELS = kernels_dir()  # before any test sets $FMTORCH_CACHE
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile every kernel before several processes run the whole suite, each of which would compile them again."""
+    config = session.config
+    starts_others = getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput")
+    if starts_others and config.args_source is pytest.Config.ArgsSource.TESTPATHS:
+        compile_all()
+
+
+def compile_all() -> None:
+    """Compile every kernel of the package that this machine has not compiled yet."""
+    from fmtorch import kernel_cache, kernel_compiler, kernels  # not before the import hook of the type checker
+
+    if not kernels.available():
+        return
+    paths = [path.relative_to(kernel_cache.PACKAGE.parent) for path in kernel_cache.sources(kernel_cache.PACKAGE)]
+    modules = [importlib.import_module(".".join(path.with_suffix("").parts)) for path in paths]
+    found = [value for module in modules for value in vars(module).values() if isinstance(value, kernels.Kernel)]
+    kernel_compiler.compile_together(list({id(each): each for each in found}.values()))
 
 
 def own_cache(folder: Path) -> Path:

@@ -1,8 +1,8 @@
-"""Starts commands quickly: one process imports the libraries, and forks another for each command.
+"""Starts commands quickly: one process imports the libraries and the package, and forks another for each command.
 
-Lines of JSON come in on standard input: ``{"start": [module, arguments ...], "cwd": ..., "log": ..., "errors": ...,
-"environment": {...}, "before": code}`` is answered by the process's id, ``{"wait": id}`` by its exit status. What is
-forked runs a module as ``python -m`` does, after the code.
+Lines of JSON come in on standard input: ``{"start": [module or -c, arguments ...], "cwd": ..., "log": ...,
+"errors": ..., "environment": {...}, "before": code}`` is answered by the process's id, ``{"wait": id}`` by its exit
+status. What is forked runs a module as ``python -m`` does, or what follows ``-c``, after the code.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ from typing import Any
 LIBRARIES = (
     "torch", "kornia", "cv2", "hydra", "omegaconf", "pyarrow.parquet", "matplotlib.figure", "skimage.io",
     "rich.progress", "scipy.spatial", "numba", "onnxruntime", "lightning", "lightning.pytorch.loggers",
-    "torch.utils.tensorboard",
+    "torch.utils.tensorboard", "antlr4", "jinja2", "h5py",
+    "fmtorch.commands.eval", "fmtorch.commands.match", "fmtorch.commands.pairs", "fmtorch.commands.report",
+    "fmtorch.estimators", "fmtorch.features", "fmtorch.pruning", "fmtorch.matching",
 )  # fmt: skip
 
 
@@ -38,7 +40,11 @@ def run(job: dict[str, Any]) -> None:
         before = job.get("before")
         if before:
             exec(str(before), {})
-        runpy.run_module(module, run_name="__main__", alter_sys=True)
+        if module == "-c":
+            sys.argv = ["-c", *arguments[1:]]
+            exec(arguments[0], {"__name__": "__main__"})
+        else:
+            runpy.run_module(module, run_name="__main__", alter_sys=True)
         status = 0
     except SystemExit as end:
         status = end.code if isinstance(end.code, int) else 0 if end.code is None else 1

@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.types import RELATED
-from scripts.benchmark import related, related_pairs, related_table
+from scripts.benchmark import related, related_figure, related_pairs, related_table
 from tests.test_pipeline import draw
 
 
@@ -77,6 +78,19 @@ def test_tables_tell_what_each_rule_does() -> None:
     assert "0 of 0; 1 of 2" in text  # of unrelated pairs
 
 
+def test_roc_goes_from_all_to_none_and_is_drawn_the_same_every_time(tmp_path: Path) -> None:
+    rows = [row(False, 1, s, 9) for s in (-math.inf, 0.0, 1.0)] + [row(True, 0, s, 9) for s in (1.0, 2.0)]
+    accepted, rejected = related_figure.roc([*rows, row(True, 0.9, 3.0, 9)], related_table.significance)
+    assert accepted.tolist() == pytest.approx([1, 2 / 3, 1 / 3, 0, 0])  # at -inf, 0, 1, 2 and above all
+    assert rejected.tolist() == [0, 0, 0, 0.5, 1]
+    for name in ("a.svg", "b.svg"):
+        related_figure.draw({"sift_a": rows, "sift_b": rows[:1] + rows[4:], "none": rows[:3]}, tmp_path / name)
+    drawn = (tmp_path / "a.svg").read_text()
+    assert drawn == (tmp_path / "b.svg").read_text()
+    texts = [element.text.strip() for element in ElementTree.fromstring(drawn).iter("{http://www.w3.org/2000/svg}text")]
+    assert {"sift_a", "sift_b (along the axes)", "unrelated pairs accepted, %", "right pairs rejected, %"} <= set(texts)
+
+
 def test_an_interrupted_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for seed, scene in enumerate(("a", "b")):
         images = tmp_path / "Set" / scene / "Images"
@@ -90,6 +104,7 @@ def test_an_interrupted_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     arguments = argparse.Namespace(
         root=[str(tmp_path / "Set")], rendered=None, split="test", limit=None, pipelines=["sift_lmeds", "sift_gms"],
         unrelated=3, folder=tmp_path / "kept", update=page, marker="related",
+        figure=tmp_path / "roc.svg",
     )  # fmt: skip
     monkeypatch.setattr(related, "BATCH", 2)
     related.run(arguments)
@@ -100,6 +115,7 @@ def test_an_interrupted_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert not any(r["significance"] >= RELATED for r in rows["sift_lmeds"] if not r["true"])
     text = page.read_text()
     assert "sift_gms" in text
+    assert "sift_lmeds" in arguments.figure.read_text()
 
     next((tmp_path / "kept" / "rows" / "sift_gms").iterdir()).unlink()
     monkeypatch.setattr(related.Pipeline, "match", lambda *_: pytest.fail("matches are kept"))

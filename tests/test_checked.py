@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import pickle
-import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -17,6 +15,7 @@ from torch import Tensor
 
 from fmtorch import geometry, matching, metrics, pruning
 from fmtorch.checked import checked, expectation, public
+from tests.processes import run_command
 
 X = torch.rand(5, 2)
 F = torch.rand(3, 3)
@@ -192,8 +191,7 @@ TypeError: ok is a NoneType; it must be a tensor
 """  # noqa: E501
 
 
-def test_users_are_told_what_the_generated_calls_found() -> None:
+def test_users_are_told_what_the_generated_calls_found(tmp_path: Path) -> None:
     """Without the test suite's own check of shapes, which users do not have."""
-    source = Path(__file__).resolve().parents[1]
-    done = subprocess.run([sys.executable, "-c", CALLS], cwd=source, capture_output=True, text=True, check=False)
+    done = run_command("-c", CALLS, cwd=tmp_path)
     assert done.stdout == TOLD, done.stderr

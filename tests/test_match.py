@@ -255,7 +255,7 @@ def run_python(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_command(tmp_path: Path) -> None:
-    image0, image1 = stereo()
+    image0, image1 = stereo(240, 320)
     Image.fromarray(image0).save(tmp_path / "a.png")
     Image.fromarray(image1).save(tmp_path / "b.webp", quality=95)
     (tmp_path / "F.txt").write_text("0 0 0\n0 0 -2\n0, 2, 0\n")
@@ -270,7 +270,7 @@ def test_the_command(tmp_path: Path) -> None:
     report = json.loads((folder / "result.json").read_text())
     assert report["pipeline"] == "hesaffnet_fmtorch"
     assert report["overrides"] == []
-    assert report["size0"] == report["size1"] == [480, 640]
+    assert report["size0"] == report["size1"] == [240, 320]
     assert report["reason"] == ""
     assert report["related"] is True
     assert report["significance"] > 100
@@ -302,7 +302,7 @@ def test_the_command(tmp_path: Path) -> None:
     assert report["significance"] is None
 
     # With F, of photographs that show nothing in common.
-    Image.fromarray(stereo(seed=1)[0]).save(tmp_path / "other.png")
+    Image.fromarray(stereo(240, 320, seed=1)[0]).save(tmp_path / "other.png")
     other = ("image1=other.png", f"output={folder}", "pipeline=sift_lmeds", "pruner.ratio.threshold=0.95")
     done = run_python("-m", "fmtorch.match", "image0=a.png", *other, cwd=tmp_path)
     assert done.returncode == 0, done.stderr

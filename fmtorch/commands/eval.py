@@ -19,7 +19,8 @@ from fmtorch.evaluation.exporting import exportable
 from fmtorch.evaluation.identity import run_identity
 from fmtorch.evaluation.plots import plot_recall_curves
 from fmtorch.evaluation.run import evaluate_pairs, select
-from fmtorch.evaluation.summary import ALL, pose_table, summarize, summary_markdown, summary_table
+from fmtorch.evaluation.summary import ALL, summarize
+from fmtorch.evaluation.summary_tables import pose_table, summary_markdown, summary_table
 from fmtorch.exchange.export import export_kinds, write_exports
 from fmtorch.exchange.journal import Journal
 from fmtorch.fields import Cache, Count, Device, Gigabytes, Seed, path_fields, read_fields

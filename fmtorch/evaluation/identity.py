@@ -56,7 +56,8 @@ def _learned(stages: Mapping[str, Any], pipeline: Pipeline) -> dict[str, list[st
     extractor = pipeline.extractor
     parts: dict[str, list[object]] = {
         "features": [extractor.extractor if isinstance(extractor, CachedFeatures) else extractor],
-        "matcher": [pipeline.matcher], "pruner": list(pipeline.pruners.values()), "estimator": [pipeline.estimator],
+        "matcher": [pipeline.matcher], "estimator": [pipeline.estimator],
+        "pruner": [pruner for some in (pipeline.pruners, *pipeline.families.values()) for pruner in some.values()],
     }  # fmt: skip
     digests = {
         group: {*(digest for part in parts[group] for digest in learned(part)), *_files(stages.get(group))}

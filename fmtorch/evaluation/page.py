@@ -18,7 +18,8 @@ from markupsafe import Markup
 from fmtorch.evaluation import curves, tables
 from fmtorch.evaluation.canvas import Image
 from fmtorch.evaluation.statistics import THRESHOLD
-from fmtorch.evaluation.summary import caption, summarize
+from fmtorch.evaluation.summary import summarize
+from fmtorch.evaluation.summary_tables import caption
 
 QUALITY, WIDTH = 80, 1280  # of JPEG pictures; px
 DISAGREEMENT = 0.1  # NSGD beyond which a result is as bad as any

@@ -1,35 +1,21 @@
-"""The table of a run: recall with its interval, inlier rates, counts, failures and seconds, by family and over all."""
+"""The figures of a run: recall with its interval, inlier rates, counts, failures, seconds; by family and over all."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from rich import box
-from rich.table import Table
 
-from fmtorch.evaluation.bootstrap import LEVEL
 from fmtorch.evaluation.intervals import share_interval
 from fmtorch.evaluation.reasons import common_reasons
-from fmtorch.evaluation.statistics import (
-    FINE_THRESHOLD,
-    MERITS,
-    POSE_THRESHOLDS,
-    THRESHOLD,
-    pose_figures,
-    recalled,
-    scene_names,
-)
+from fmtorch.evaluation.statistics import MERITS, THRESHOLD, pose_figures, recalled, scene_names
 from fmtorch.storage import PAIR_SCHEMA
 
 ALL = "all"
-RECALL = "%Recall [interval]"  # the column that has an interval
 STAGES = tuple(name.removeprefix("seconds_") for name in PAIR_SCHEMA.names if name.startswith("seconds_"))
 _REASONS = 3  # commonest reasons kept
-_DASH = "–"
 
 Group = dict[str, Any]
 
@@ -92,162 +78,6 @@ def _group(table: pa.Table) -> Group:
     unknown = np.isnan(seconds).all(0)
     group["seconds"]["total"] = _median(np.where(unknown, np.nan, np.nansum(seconds, axis=0)))
     return group
-
-
-def summary_table(summary: Mapping[str, Group], title: str) -> Table:
-    """The main figures, for a terminal of 80 columns."""
-    shown = Table(
-        title=title, title_style="bold", caption=caption(summary), caption_justify="left", caption_style="dim",
-        box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True,
-    )  # fmt: skip
-    for i, heading in enumerate(_TERMINAL):
-        shown.add_column(heading, justify="right" if i else "left", no_wrap=i > 0, overflow="fold")
-    for name, group in _rows(summary):
-        shown.add_row(*_cells(_TERMINAL, name, group), style="bold" if name == ALL else "")
-    return shown
-
-
-def pose_table(summary: Mapping[str, Group]) -> Table | None:
-    """The figures of poses, for a terminal of 80 columns; None where no pair has known cameras."""
-    rows = _pose_rows(summary)
-    if not rows:
-        return None
-    shown = Table(
-        title="Relative pose", title_style="bold", caption=POSE_CAPTION, caption_justify="left", caption_style="dim",
-        box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True,
-    )  # fmt: skip
-    columns = {heading: column for heading, column in POSE_COLUMNS.items() if "mAP" not in heading}
-    for i, heading in enumerate(columns):
-        shown.add_column(heading, justify="right" if i else "left", no_wrap=i > 0, overflow="fold")
-    for name, figures in rows:
-        shown.add_row(*_cells(columns, name, figures), style="bold" if name == ALL else "")
-    return shown
-
-
-def summary_markdown(summary: Mapping[str, Group], title: str) -> str:
-    """All figures as a Markdown page."""
-    rows = [list(MARKDOWN_COLUMNS), ["---", *["---:"] * (len(MARKDOWN_COLUMNS) - 1)]]
-    rows += [_cells(MARKDOWN_COLUMNS, name, group) for name, group in _rows(summary)]
-    stages = [["seconds (median per pair)", *STAGES, "total"], ["---", *["---:"] * (len(STAGES) + 1)]]
-    for name, group in _rows(summary):
-        stages.append([name, *(_number(group["seconds"][stage], "{:.3f}") for stage in (*STAGES, "total"))])
-    failures = [
-        f"- {name}: {_escape(reason)} ({count})"
-        for name, group in _rows(summary)
-        if name != ALL or len(summary) == 1
-        for reason, count in group["reasons"].items()
-    ]
-    parts = [f"# {title}", _lines(rows), caption(summary)]
-    if poses := _pose_rows(summary):
-        head = [["Relative pose", *list(POSE_COLUMNS)[1:]], ["---", *["---:"] * (len(POSE_COLUMNS) - 1)]]
-        parts += [_lines([*head, *(_cells(POSE_COLUMNS, name, group) for name, group in poses)]), POSE_CAPTION_BINNED]
-    parts.append(_lines(stages))
-    if failures:
-        parts += ["Commonest reasons of failure, with the number of pairs:", "\n".join(failures)]
-    return "\n\n".join(parts) + "\n"
-
-
-def _rows(summary: Mapping[str, Group]) -> list[tuple[str, Group]]:
-    """The groups to show: ``all`` last, and not where it repeats the only family."""
-    return [(name, group) for name, group in summary.items() if name != ALL or len(summary) != 2]
-
-
-def _pose_rows(summary: Mapping[str, Group]) -> list[tuple[str, Group]]:
-    """The figures of poses of the groups to show that have some."""
-    return [(name, group["pose"]) for name, group in _rows(summary) if group["pose"] is not None]
-
-
-def _cells(columns: Mapping[str, Callable[[Group], str]], name: str, group: Group) -> list[str]:
-    return [name, *(column(group) for heading, column in columns.items() if heading)]
-
-
-def caption(summary: Mapping[str, Group]) -> str:
-    """What the columns mean, and what the intervals take for independent."""
-    overs = dict.fromkeys(group["interval_over"] for _, group in _rows(summary) if group["interval_over"])
-    where = {over: [name for name, g in _rows(summary) if g["interval_over"] == over] for over in overs}
-    over = "; ".join(f"{o}s" + (f" ({', '.join(names)})" if len(where) > 1 else "") for o, names in where.items())
-    return (
-        f"%Recall: NSGD < {THRESHOLD}, failures are misses; [{LEVEL:.0%} Wilson interval; independent units: "
-        f"{over or 'pairs'}]. AUC@0.05: area under the recall curve to NSGD {THRESHOLD}. "
-        "%Inlier, #Corrs: after estimation, -m: before; means over the pairs that did not fail."
-    )
-
-
-def _lines(rows: list[list[str]]) -> str:
-    return "\n".join("| " + " | ".join(_escape(cell) for cell in row) + " |" for row in rows)
-
-
-def _escape(text: str) -> str:
-    return " ".join(text.replace("|", "\\|").split())
-
-
-def _number(value: float | int | None, form: str) -> str:
-    return _DASH if value is None else form.format(value)
-
-
-def _percent(field: str) -> Callable[[Group], str]:
-    return lambda group: _number(None if group[field] is None else 100 * group[field], "{:.1f}")
-
-
-def _recall(group: Group) -> str:
-    if group["recall"] is None:
-        return _DASH
-    low, high = group["recall_interval"]
-    return f"{100 * group['recall']:.1f} [{100 * low:.0f}, {100 * high:.0f}]"
-
-
-def _inliers(group: Group) -> str:
-    return f"{_percent('inlier_rate')(group)} ({_percent('inlier_rate_before')(group)})"
-
-
-def _corrs(group: Group) -> str:
-    return f"{_number(group['corrs'], '{:.0f}')} ({_number(group['corrs_before'], '{:.0f}')})"
-
-
-def _failures(group: Group) -> str:
-    return f"{group['failures']} ({_number(group['failure_share'], '{:.1%}')})" if group["failures"] else "0"
-
-
-_TERMINAL: dict[str, Callable[[Group], str]] = {
-    "": lambda group: "",
-    "Pairs": lambda group: str(group["pairs"]),
-    "%Recall": _recall,
-    "AUC@0.05": _percent("auc_05"),
-    "%Inlier (-m)": _inliers,
-    "#Corrs (-m)": _corrs,
-    "Failed": lambda group: str(group["failures"]),
-}
-MARKDOWN_COLUMNS: dict[str, Callable[[Group], str]] = {
-    "": lambda group: "",
-    "Pairs": lambda group: str(group["pairs"]),
-    "Scenes": lambda group: str(group["scenes"]),
-    RECALL: _recall,
-    f"at {FINE_THRESHOLD}": _percent("recall_fine"),
-    "AUC@0.05": _percent("auc_05"),
-    "%Recall (released NSGD)": _percent("recall_released"),
-    "%Inlier": _percent("inlier_rate"),
-    "with failures 0": _percent("inlier_rate_failures_0"),
-    "%Inlier-m": _percent("inlier_rate_before"),
-    "#Corrs (-m)": _corrs,
-    "Failures": _failures,
-}
-
-
-POSE_COLUMNS: dict[str, Callable[[Group], str]] = {
-    "": lambda group: "",
-    "Pairs": lambda group: str(group["pairs"]),
-    **{f"AUC@{t}°": _percent(f"auc_{t}") for t in POSE_THRESHOLDS},
-    "mAA(10°)": _percent("maa_10"),
-    **{f"mAP@{t}°": _percent(f"map_{t}") for t in POSE_THRESHOLDS},
-    "R error": lambda group: f"{group['rotation']:.2f}°",
-    "t error": lambda group: f"{group['translation']:.2f}°",
-}
-POSE_CAPTION = (
-    "Of the pairs with known cameras, by the larger of the angles of rotation and of translation (up to sign); "
-    "failures count as 180° and 90°. AUC: area under the recall curve; mAA(10°): mean of recall at 1°, ..., 10°; "
-    "R error, t error: medians."
-)
-POSE_CAPTION_BINNED = f"{POSE_CAPTION} mAP: mean of recall at 5°, 10°, ..., as in papers before 2020."
 
 
 def _column(table: pa.Table, name: str) -> NDArray[np.float64]:

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from fmtorch.evaluation.bootstrap import LEVEL, Interval
 from fmtorch.evaluation.intervals import MIN_UNITS, mean_difference, share_difference
 from fmtorch.evaluation.statistics import FINE_THRESHOLD, PERCENT, POSE_THRESHOLDS, THRESHOLD, areas, scene_names
-from fmtorch.evaluation.summary import ALL, MARKDOWN_COLUMNS, POSE_CAPTION_BINNED, POSE_COLUMNS, RECALL, STAGES
+from fmtorch.evaluation.summary import ALL, STAGES
+from fmtorch.evaluation.summary_tables import MARKDOWN_COLUMNS, POSE_CAPTION_BINNED, POSE_COLUMNS, RECALL
 
 DASH = "–"
 Summaries = Mapping[str, Mapping[str, Any]]  # of `summarize`, by the runs' names

@@ -11,7 +11,7 @@ from PIL import Image
 
 from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
 from fmtorch.data.text_files import DataError
-from fmtorch.geometry.epipolar import fundamental_from_projections
+from fmtorch.geometry.cameras import fundamental_from_projections
 from fmtorch.types import Correspondences
 
 Array = NDArray[np.float64]

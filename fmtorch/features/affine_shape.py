@@ -39,8 +39,8 @@ class NetworkShape:
         columns = [first * shape[:, :1, k] + second * shape[:, 1:, k] for k in (0, 1)]
         shaped = make_upright(torch.stack([*columns, centre], -1))
         shaped = _rescaled(shaped, frame_scale(upright) / frame_scale(shaped))
-        sound = torch.isfinite(shaped).all(2).all(1) & (_elongation(shaped) <= LONGEST)
-        return torch.where(sound[:, None, None], shaped, upright)
+        valid = torch.isfinite(shaped).all(2).all(1) & (_elongation(shaped) <= LONGEST)
+        return torch.where(valid[:, None, None], shaped, upright)
 
 
 def _rescaled(lafs: Tensor, factor: Tensor) -> Tensor:

@@ -1,13 +1,13 @@
 """Two-view projective geometry as pure, batched, differentiable functions."""
 
 from fmtorch.checked import public
+from fmtorch.geometry.cameras import cross_matrix as _cross_matrix
+from fmtorch.geometry.cameras import fundamental_from_calibration as _fundamental_from_calibration
+from fmtorch.geometry.cameras import fundamental_from_projections as _fundamental_from_projections
 from fmtorch.geometry.eight_point import eight_point as _eight_point
 from fmtorch.geometry.epipolar import algebraic as _algebraic
-from fmtorch.geometry.epipolar import cross_matrix as _cross_matrix
 from fmtorch.geometry.epipolar import epipolar_distances as _epipolar_distances
 from fmtorch.geometry.epipolar import epipolar_lines as _epipolar_lines
-from fmtorch.geometry.epipolar import fundamental_from_calibration as _fundamental_from_calibration
-from fmtorch.geometry.epipolar import fundamental_from_projections as _fundamental_from_projections
 from fmtorch.geometry.epipolar import point_to_line as _point_to_line
 from fmtorch.geometry.epipolar import sampson as _sampson
 from fmtorch.geometry.epipolar import sampson_squared as _sampson_squared

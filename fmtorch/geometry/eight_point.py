@@ -57,22 +57,22 @@ def eight_point(
 class NormalEquations(NamedTuple):
     """What the eight-point algorithm needs to know of a set of matches, however many these are.
 
-    M: the sum of w a a^T over normalised matches. T0, T1: the similarities that normalise the points. sound: whether
+    M: the sum of w a a^T over normalised matches. T0, T1: the similarities that normalise the points. valid: whether
     everything was finite.
     """
 
     M: Float[Tensor, "*batch 9 9"]
     T0: Float[Tensor, "*batch 3 3"]
     T1: Float[Tensor, "*batch 3 3"]
-    sound: Bool[Tensor, "*batch"]
+    valid: Bool[Tensor, "*batch"]
 
     @classmethod
     def of(cls, x0: Tensor, x1: Tensor, weight: Tensor | None = None, mask: Tensor | None = None) -> NormalEquations:
         """Arguments as of `eight_point`."""
-        x0d, x1d, w, sound = _door(x0, x1, weight, mask)
+        x0d, x1d, w, valid = _door(x0, x1, weight, mask)
         x0n, T0 = normalize_points(x0d, weight=w)
         x1n, T1 = normalize_points(x1d, weight=w)
-        return cls(normal_matrix(x0n, x1n, w), T0, T1, sound)
+        return cls(normal_matrix(x0n, x1n, w), T0, T1, valid)
 
 
 def fundamental_of(equations: NormalEquations) -> tuple[Float[Tensor, "*batch 3 3"], Bool[Tensor, "*batch"]]:
@@ -80,7 +80,7 @@ def fundamental_of(equations: NormalEquations) -> tuple[Float[Tensor, "*batch 3 
     f, determined = smallest_eigenvector(equations.M)
     linear = f.reshape(*f.shape[:-1], 3, 3)
     F = canonical(denormalize_fundamental(nearest_rank2(linear), equations.T0, equations.T1))
-    valid = equations.sound & determined & (F.detach() != 0).any(-1).any(-1)
+    valid = equations.valid & determined & (F.detach() != 0).any(-1).any(-1)
     return torch.where(valid[..., None, None], F, 0.0), valid
 
 
@@ -121,12 +121,12 @@ def _products(x: Tensor) -> Tensor:
 
 
 def _door(x0: Tensor, x1: Tensor, weight: Tensor | None, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Points and weights in float64, zero where they do not count; False for a set with something unusable in it."""
+    """Points and weights in float64, zero where they do not count; False for a set in which one cannot be used."""
     w = torch.ones_like(x0[..., 0]) if weight is None else weight
     good = (x0.isfinite() & x1.isfinite()).all(-1) & w.isfinite() & (w >= 0)
     keep = good if mask is None else good & mask
-    sound = (good if mask is None else good | ~mask).all(-1)
+    valid = (good if mask is None else good | ~mask).all(-1)
     x0d, x1d = (torch.where(keep[..., None], x, 0.0).to(torch.float64) for x in (x0, x1))
     wd = torch.where(keep, w, 0.0).to(torch.float64)
     largest = wd.detach().amax(-1, keepdim=True) if wd.shape[-1] else wd.new_ones(*wd.shape[:-1], 1)
-    return x0d, x1d, wd / torch.where(largest > 0, largest, 1.0), sound
+    return x0d, x1d, wd / torch.where(largest > 0, largest, 1.0), valid

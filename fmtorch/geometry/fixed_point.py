@@ -41,8 +41,8 @@ def at_fixed_point(F: Float[Tensor, "9 p k"], step: Callable[[Tensor], Tensor]) 
     Returns:
         The same values.
     """
-    usable = torch.isfinite(F).all(0) & (F != 0).any(0)
-    fixed = unit(torch.where(usable, F, constant(F, RANK_TWO)))
+    valid = torch.isfinite(F).all(0) & (F != 0).any(0)
+    fixed = unit(torch.where(valid, F, constant(F, RANK_TWO)))
 
     def mapped(start: Tensor) -> Tensor:
         G = unit(step(start))
@@ -55,11 +55,11 @@ def at_fixed_point(F: Float[Tensor, "9 p k"], step: Callable[[Tensor], Tensor]) 
         rows = [torch.autograd.grad(end[i].sum(), start, retain_graph=True)[0] for i in range(9)]
         attached = mapped(fixed)
     J = torch.stack(rows).movedim((0, 1), (-2, -1))
-    known = usable & torch.isfinite(J).flatten(-2).all(-1)
+    known = valid & torch.isfinite(J).flatten(-2).all(-1)
     difference = torch.eye(9, dtype=J.dtype, device=J.device) - torch.where(known[..., None, None], J, 0.0)
     U, s, Vh = torch.linalg.svd(difference)
     inverse = (Vh.mT * (s / (s * s + CONTRACTION_GAP**2))[..., None, :]) @ U.mT
     inverse = torch.where(known[..., None, None], inverse, 0.0).movedim((-2, -1), (0, 1))
-    size = torch.where(usable, component_sum(F * fixed), 0.0)
+    size = torch.where(valid, component_sum(F * fixed), 0.0)
     moved = component_sum(inverse * (attached - attached.detach()), 1) * size
-    return F + torch.where(usable, moved, 0.0)  # keeps the gradient of what is not finite out
+    return F + torch.where(valid, moved, 0.0)  # keeps the gradient of what is not finite out

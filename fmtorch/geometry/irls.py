@@ -175,14 +175,14 @@ def weighted_fit(
     points: as of `reweighted`. Models of rank 2, of any scale; what is not determined means nothing but is finite.
     """
     p, k = weight.shape[:2]
-    usable = (torch.isfinite(weight) & (weight >= 0)).all(-1, keepdim=True) & (weight > 0).any(-1, keepdim=True)
-    scales = torch.where(usable, weight.detach(), 1)  # changes no fit
-    largest = scales.amax(-1, keepdim=True) if scales.shape[-1] else torch.ones_like(usable, dtype=scales.dtype)
-    w = torch.where(usable, weight, 0) / largest
+    valid = (torch.isfinite(weight) & (weight >= 0)).all(-1, keepdim=True) & (weight > 0).any(-1, keepdim=True)
+    scales = torch.where(valid, weight.detach(), 1)  # changes no fit
+    largest = scales.amax(-1, keepdim=True) if scales.shape[-1] else torch.ones_like(valid, dtype=scales.dtype)
+    w = torch.where(valid, weight, 0) / largest
     points = points[:, :, None].expand(4, p, k, -1).movedim(0, -1)
     x0, T0 = normalize_points(points[..., :2], weight=w)
     x1, T1 = normalize_points(points[..., 2:], weight=w)
     linear, determined = linear_fundamental(x0, x1, w)
     fitted = denormalize_fundamental(nearest_rank2(linear), T0, T1).flatten(2).movedim(-1, 0)
-    determined = determined & usable[..., 0] & torch.isfinite(fitted).all(0) & (fitted != 0).any(0)
+    determined = determined & valid[..., 0] & torch.isfinite(fitted).all(0) & (fitted != 0).any(0)
     return fitted, determined

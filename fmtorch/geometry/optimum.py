@@ -55,11 +55,11 @@ def at_optimum(
     Arguments as of `gradient_of_cost`; F on no graph. Returns the same values.
     """
     with torch.no_grad():
-        usable = torch.isfinite(F).all(0) & (F != 0).any(0)
-        model = unit(torch.where(usable, F, constant(F, RANK_TWO)))
+        valid = torch.isfinite(F).all(0) & (F != 0).any(0)
+        model = unit(torch.where(valid, F, constant(F, RANK_TWO)))
         C = cofactors(as_rows(model)).flatten(0, 1)
         size = component_sum(C * C)
-        usable = usable & (size > 0)
+        valid = valid & (size > 0)
         normal = C / torch.where(size > 0, size, 1).sqrt()
         curved = robust._replace(weight=robust.curvature)  # Newton's weights of J^T J, not those of IRLS
         gauss_newton = SampsonObjective(points, weight, curved, scale)(model, True)[0][:9, :9].movedim((0, 1), (-2, -1))
@@ -79,7 +79,7 @@ def at_optimum(
         inverse = (across @ inverse @ across).movedim((-2, -1), (0, 1))
     gradient = gradient_of_cost(model, points, weight, robust, scale)
     moved = component_sum(inverse * (gradient - gradient.detach()), 1)
-    return F - torch.where(usable, moved, 0)  # keeps the gradient of what is not finite out
+    return F - torch.where(valid, moved, 0)  # keeps the gradient of what is not finite out
 
 
 def _hessian(
@@ -110,17 +110,17 @@ def through_steps(
     Damping and the choice of the steps that are accepted are constants. Arguments as of `gradient_of_cost`. Returns the
     same values.
     """
-    usable = torch.isfinite(F).all(0) & (F != 0).any(0)
-    current = start(torch.where(usable, F0, constant(F, RANK_TWO)))[0]
+    valid = torch.isfinite(F).all(0) & (F != 0).any(0)
+    current = start(torch.where(valid, F0, constant(F, RANK_TWO)))[0]
     for before, damping, accepted in steps:
-        accepted = accepted & usable
+        accepted = accepted & valid
         if not bool(accepted.any()):
             continue
-        known = torch.where(usable, before, constant(F, RANK_TWO))
-        current = known + torch.where(usable, current - current.detach(), 0)
+        known = torch.where(valid, before, constant(F, RANK_TWO))
+        current = known + torch.where(valid, current - current.detach(), 0)
         moved = _step(current, points, weight, robust, scale, torch.where(accepted, damping, 1))
         current = torch.where(accepted, moved, current)
-    return F + torch.where(usable, current - current.detach(), 0)
+    return F + torch.where(valid, current - current.detach(), 0)
 
 
 def _step(

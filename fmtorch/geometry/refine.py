@@ -128,13 +128,22 @@ def attached_step(
     kernel: str = "truncated",
     scale: float | Tensor = 1.0,
 ) -> Float[Tensor, "*models 3 3"]:
-    """One Gauss-Newton step from a refined F, whose gradients are those of the optimum; arguments as of `refine`.
+    """One Gauss-Newton step from a refined F, whose gradients are those of the optimum.
 
-    The gradient of the cost is attached to the graph of points and weights, the normal matrix is not: the implicit
-    function theorem, with the Hessian in Gauss and Newton's approximation: it has the kernel's curvature, but not that
-    of the residuals, so it is exact where the residuals that count vanish. F itself gets no gradient. Where the points
-    leave a direction open, the step and its gradients in it are damped; where F or the step is not finite, F comes
-    back with gradients of zero.
+    The gradient of the cost is attached to the graph of points and weights, the normal matrix is not. This is the
+    implicit function theorem with the Hessian in the Gauss-Newton approximation, which has the curvature of the kernel
+    but not that of the residuals: it is exact where the residuals that count vanish.
+
+    Args:
+        F: the optimum, as `refine` returns it; it gets no gradient.
+        x0, x1, weight, mask, kernel, scale: those with which `refine` found it.
+
+    Returns:
+        F after the step. Where the points leave a direction undetermined, the step and its gradients in that direction
+        are damped; where F or the step is not finite, F comes back with gradients of zero.
+
+    Raises:
+        ValueError: there is no such kernel.
     """
     matches = NormalizedMatches(x0, x1, weight, mask, F.detach(), scale)
     with torch.no_grad():
@@ -144,15 +153,15 @@ def attached_step(
         H = SampsonObjective(matches.points, matches.weight, curved, matches.scale)(model, True)[0][:9, :9]
         identity = torch.eye(9, dtype=H.dtype, device=H.device)[:, :, None, None].expand_as(H)
         inverse = constrained_solve(H, model, e0, e1, torch.full_like(H[0, 0], STEP_DAMPING), identity)
-        sound = torch.isfinite(inverse).flatten(0, 1).all(0)
-        inverse = torch.where(sound, inverse, 0)
+        valid = torch.isfinite(inverse).flatten(0, 1).all(0)
+        inverse = torch.where(valid, inverse, 0)
         # Something of rank 2 instead of what is not finite: `where` alone would not keep NaN out of the gradients.
-        model = torch.where(sound, model, constant(model, RANK_TWO))
-        e0, e1 = (torch.where(sound, e, constant(e, RANK_TWO_EPIPOLE)) for e in (e0, e1))
+        model = torch.where(valid, model, constant(model, RANK_TWO))
+        e0, e1 = (torch.where(valid, e, constant(e, RANK_TWO_EPIPOLE)) for e in (e0, e1))
     gradient = gradient_of_cost(model, matches.points, matches.weight, robust, matches.scale)
     step = -component_sum((inverse * gradient).transpose(0, 1))
     moved, _, _ = retract(model, step, e0, e1)
-    return matches.to_pixels(torch.where(sound, moved, matches.models)).reshape(F.shape)
+    return matches.to_pixels(torch.where(valid, moved, matches.models)).reshape(F.shape)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

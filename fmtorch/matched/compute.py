@@ -47,7 +47,7 @@ def compute_shards(
     """
     pipeline = Pipeline(
         pipeline.extractor, pipeline.matcher, pipeline.pruners, pipeline.estimator,
-        device=pipeline.device, memory=_IMAGES * workers,
+        device=pipeline.device, memory=_IMAGES * workers, families=pipeline.families,
     )  # fmt: skip
 
     def work(path: Path, pairs: list[ImagePair]) -> int:

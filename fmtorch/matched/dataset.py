@@ -99,7 +99,9 @@ def _identity(dataset: PairDataset, stages: Pipeline, most: int) -> dict[str, An
     if isinstance(extractor, CachedFeatures):
         extractor = extractor.extractor
     try:
-        parts = configuration([extractor, stages.matcher, stages.pruners])
+        parts = configuration(
+            [extractor, stages.matcher, stages.pruners, *([stages.families] if stages.families else [])]
+        )
     except TypeError as error:
         raise ValueError(f"the matches of this pipeline cannot be kept: {error}") from error
     rules = [labels.INLIER_PX, labels.OUTLIER_PX, labels.EDGE_PX]

@@ -35,10 +35,33 @@ def inlier_rate(
     mask: Bool[Tensor, "*#batch n"] | None = None,
     threshold: float = THRESHOLD,
 ) -> InlierRate:
-    """Inlier rate before and after estimation, (...), float64: the paper's %Inlier-m and %Inlier as shares.
+    """Inlier rate before and after estimation: the paper's %Inlier-m and %Inlier as shares.
 
-    Before: the share of the matches in `mask` (all by default) that are ground-truth inliers; after: the same among
-    those that are in `inliers` too. NaN where the set is empty. Other arguments as `ground_truth_inliers`.
+    Args:
+        F_gt: true fundamental matrices, x1^T F x0 = 0 in pixels.
+        x0, x1: the matches given to the estimator, in pixels.
+        inliers: those that the estimator kept.
+        size0, size1: image sizes as (h, w), pixels.
+        mask: which of the matches count; all when not given.
+        threshold: of `ground_truth_inliers`, in image diagonals.
+
+    Returns:
+        Shares of ground-truth inliers (...), float64: `before`, among the matches in `mask`, and `after`, among those
+        of them that are in `inliers`. NaN where there are none.
+
+    Raises:
+        ValueError: a size is not positive.
+
+    Example:
+        >>> import torch
+        >>> from fmtorch.metrics import inlier_rate
+        >>> F = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # a sideways camera: epipolar lines are rows
+        >>> x0 = torch.tensor([[100.0, 50], [200, 80], [300, 20]])
+        >>> x1 = x0 + torch.tensor([[-9.0, 0], [-5, 0], [0, 40]])
+        >>> size = torch.tensor([480, 640])
+        >>> rate = inlier_rate(F, x0, x1, torch.tensor([True, True, False]), size, size)
+        >>> round(rate.before.item(), 3), rate.after.item()
+        (0.667, 1.0)
     """
     correct = ground_truth_inliers(F_gt, x0, x1, size0, size1, mask=mask, threshold=threshold)
     given = torch.ones_like(correct) if mask is None else mask.expand(correct.shape)
@@ -57,10 +80,20 @@ def ground_truth_inliers(
     mask: Bool[Tensor, "*#batch n"] | None = None,
     threshold: float = THRESHOLD,
 ) -> Bool[Tensor, "*#batch n"]:
-    """Matches in `mask` whose two distances to their true epipolar lines are both below `threshold` x diagonal.
+    """Matches whose two distances to their true epipolar lines are both below `threshold` image diagonals.
 
-    x0, x1: (..., N, 2) in pixels. size0, size1: (..., 2) as (h, w); each distance is compared with the diagonal of the
-    image in which it is measured. No match is an inlier where F_gt is zero or not finite.
+    Args:
+        F_gt: true fundamental matrices, x1^T F x0 = 0 in pixels.
+        x0, x1: matches in pixels.
+        size0, size1: image sizes as (h, w), pixels.
+        mask: which of the matches count; all when not given.
+        threshold: in diagonals of the image in which a distance is measured.
+
+    Returns:
+        (..., N). No match is an inlier where F_gt is zero or not finite.
+
+    Raises:
+        ValueError: a size is not positive.
     """
     expect_sizes(size0=size0, size1=size1)
     F_gt, x0, x1 = (value.to(torch.float64) for value in (F_gt, x0, x1))

@@ -36,10 +36,25 @@ def pose_error(
 ) -> PoseError:
     """Angle of the rotation R_est R_gt^T, and angle between the translation directions, in degrees.
 
-    Without the sign of t, as SuperGlue (Sarlin et al., CVPR 2020) and LoFTR (Sun et al., CVPR 2021) evaluate it, the
-    second is at most 90; with `up_to_sign=False` it is at most 180. Where the estimate is not finite both are the
-    largest possible, as is the second where t_est is zero; where t_gt is zero there is no direction to miss and the
-    second is 0, as in LoFTR. Both come from the tangent of the half angle (Kahan), accurate near 0.
+    Both come from the tangent of the half angle (Kahan), accurate near 0.
+
+    Args:
+        R_est, t_est: estimated motion, X1 = R X0 + t; the length of t does not count.
+        R_gt, t_gt: the true motion.
+        up_to_sign: ignore the sign of t, as SuperGlue (Sarlin et al., CVPR 2020) and LoFTR (Sun et al., CVPR 2021).
+
+    Returns:
+        `rotation`, at most 180, and `translation`, at most 90, or 180 with its sign. Where the estimate is not finite
+        both are the largest possible, as is the second where t_est is zero. Where t_gt is zero there is no direction to
+        miss and the second is 0, as in LoFTR.
+
+    Example:
+        >>> import torch
+        >>> from fmtorch.metrics import pose_error
+        >>> quarter = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # a turn about the vertical
+        >>> error = pose_error(quarter, torch.tensor([-1.0, 0, 0]), torch.eye(3), torch.tensor([1.0, 0, 0]))
+        >>> round(error.rotation.item(), 3), error.translation.item()
+        (90.0, 0.0)
     """
     finite = R_est.isfinite().all(-1).all(-1) & t_est.isfinite().all(-1)
     R_est = torch.where(finite[..., None, None], R_est, 0.0)

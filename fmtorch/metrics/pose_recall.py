@@ -19,10 +19,26 @@ BIN = 5  # degrees, as Yi et al. (CVPR 2018) and OANet (Zhang et al., ICCV 2019)
 def pose_auc(
     errors: Float[Tensor, "*batch pairs"], thresholds: Sequence[float | int] = THRESHOLDS
 ) -> Float[Tensor, "*batch t"]:
-    """Area under the recall curve of pose errors up to each threshold in degrees, divided by the threshold.
+    """Area under the recall curve of pose errors up to each threshold, divided by the threshold.
 
-    As SuperGlue and LoFTR compute it: the curve rises linearly between sorted errors, from recall 0 at error 0. NaN
-    and infinity count as misses. Raises ValueError unless the thresholds are positive.
+    As SuperGlue and LoFTR compute it: the curve rises linearly between sorted errors, from recall 0 at error 0.
+
+    Args:
+        errors: of each pair, in degrees; NaN and infinity count as misses.
+        thresholds: in degrees.
+
+    Returns:
+        The area for each threshold, within [0, 1].
+
+    Raises:
+        ValueError: a threshold is not positive, or there is none.
+
+    Example:
+        >>> import torch
+        >>> from fmtorch.metrics import pose_auc, pose_maa
+        >>> errors = torch.tensor([0.5, 4.0, torch.nan])
+        >>> [round(auc, 3) for auc in pose_auc(errors).tolist()], round(pose_maa(errors).item(), 3)
+        ([0.5, 0.583, 0.625], 0.567)
     """
     _expect_positive(thresholds)
     pairs = errors.shape[-1]
@@ -44,12 +60,21 @@ def _area(errors: Tensor, step: Tensor, threshold: float) -> Tensor:
 def pose_map(
     errors: Float[Tensor, "*batch pairs"], thresholds: Sequence[float | int] = THRESHOLDS, bin: float | int = BIN
 ) -> Float[Tensor, "*batch t"]:
-    """Binned mAP of pose errors up to each threshold in degrees: the mean of recall at bin, 2 bin, ..., threshold.
+    """Binned mAP of pose errors up to each threshold: the mean of recall at bin, 2 bin, ..., threshold.
 
     As Yi et al. (CVPR 2018) and OANet (Zhang et al., ICCV 2019) report it; mAP at 5 degrees is recall there. It is a
-    coarse mean and usually larger than `pose_auc`, with which it is not to be compared. An error is recalled strictly
-    below a bin's end; NaN is a miss.
-    Raises ValueError unless the thresholds are positive multiples of the bin.
+    coarse mean and usually larger than `pose_auc`, with which it is not to be compared.
+
+    Args:
+        errors: of each pair, in degrees, recalled strictly below a bin's end; NaN is a miss.
+        thresholds: in degrees, multiples of `bin`.
+        bin: in degrees.
+
+    Returns:
+        The mean for each threshold, within [0, 1].
+
+    Raises:
+        ValueError: a threshold is not a positive multiple of the bin, or there is none.
     """
     _expect_positive(thresholds)
     counts = [round(threshold / bin) if bin > 0 else 0 for threshold in thresholds]
@@ -61,10 +86,19 @@ def pose_map(
 
 @checked
 def pose_maa(errors: Float[Tensor, "*batch pairs"], maximum: int = MAA_MAXIMUM) -> Float[Tensor, "*batch"]:
-    """Mean average accuracy to `maximum` degrees: the mean of recall at 1, 2, ..., maximum.
+    """Mean average accuracy: the mean of recall at 1, 2, ..., `maximum` degrees.
 
-    As the Image Matching Challenge (Jin et al., IJCV 2021) and the RANSAC tutorial (CVPR 2020) define mAA(10). An error
-    is recalled up to and with the threshold; NaN is a miss. Raises ValueError unless `maximum` is positive.
+    As the Image Matching Challenge (Jin et al., IJCV 2021) and the RANSAC tutorial (CVPR 2020) define mAA(10).
+
+    Args:
+        errors: of each pair, in degrees, recalled up to and including a threshold; NaN is a miss.
+        maximum: the last threshold, in degrees.
+
+    Returns:
+        The mean, within [0, 1].
+
+    Raises:
+        ValueError: `maximum` is less than 1.
     """
     if maximum < 1:
         raise ValueError(f"maximum is {maximum}; it must be a whole number of degrees from 1")

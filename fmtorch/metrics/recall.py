@@ -15,7 +15,14 @@ CURVE = (0.0, 0.2, 20)  # first and last threshold and their number, as in the p
 
 @checked
 def recall(nsgd: Float[Tensor, "*batch pairs"], threshold: float = THRESHOLD) -> Float[Tensor, "*batch"]:
-    """Share of all pairs with NSGD strictly below the threshold; NaN, a failure, counts as a miss.
+    """Share of all pairs with NSGD strictly below the threshold.
+
+    Args:
+        nsgd: of each pair; NaN, a failure, counts as a miss.
+        threshold: in image diagonals, as NSGD.
+
+    Returns:
+        The share, NaN where there are no pairs.
 
     Example:
         >>> import torch
@@ -31,7 +38,15 @@ def recall(nsgd: Float[Tensor, "*batch pairs"], threshold: float = THRESHOLD) ->
 def recall_curve(
     nsgd: Float[Tensor, "*batch pairs"], thresholds: Float[Tensor, " t"] | None = None
 ) -> Float[Tensor, "*batch t"]:
-    """`recall` at each threshold, by default at 20 from 0 to 0.2."""
+    """`recall` at each of several thresholds.
+
+    Args:
+        nsgd: of each pair; NaN counts as a miss.
+        thresholds: in image diagonals; when not given, the paper's: 20 from 0 to 0.2.
+
+    Returns:
+        The share of the pairs below each threshold.
+    """
     if thresholds is None:
         first, last, count = CURVE
         thresholds = torch.linspace(first, last, count, dtype=nsgd.dtype, device=nsgd.device)
@@ -40,12 +55,20 @@ def recall_curve(
 
 @checked
 def mean_recall(nsgd: Float[Tensor, "*batch pairs"], maximum: float = THRESHOLD) -> Float[Tensor, "*batch"]:
-    """Mean of `recall` over thresholds from 0 to `maximum`: the exact area under its step curve over `maximum`.
+    """Mean of `recall` over thresholds from 0 to `maximum`, by default AUC@0.05: the area under its curve, exactly.
 
-    With the default this is AUC@0.05.
+    A pair with NSGD e is recalled at the share max(0, 1 - e / maximum) of the thresholds, so this is the mean of that
+    over pairs, and differentiable in e.
 
-    A pair with NSGD e is recalled on the share max(0, 1 - e / maximum) of the thresholds, so the figure is the mean of
-    that over pairs, and differentiable in e. NaN counts as a miss. Raises ValueError unless `maximum` is positive.
+    Args:
+        nsgd: of each pair; NaN counts as a miss.
+        maximum: the last threshold, in image diagonals.
+
+    Returns:
+        The area over `maximum`, within [0, 1].
+
+    Raises:
+        ValueError: `maximum` is not positive.
     """
     if not maximum > 0:
         raise ValueError(f"maximum is {maximum}; it must be positive")

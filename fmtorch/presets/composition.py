@@ -19,6 +19,7 @@ from fmtorch.options import nearest
 from fmtorch.pipeline import Pipeline
 from fmtorch.presets.files import available
 from fmtorch.presets.objects import expect_buildable, instantiate, plain
+from fmtorch.presets.pruners import build_pruners, expect_pruners, pruner_configs
 from fmtorch.resources import conf_dir
 from fmtorch.storage.features import cached
 
@@ -34,7 +35,7 @@ def stages(config: DictConfig) -> dict[str, Any]:
     mapping keeps on its way through JSON with sorted keys.
     """
     plain = {group: OmegaConf.to_container(config[group], resolve=True) for group in STAGES if config.get(group)}
-    return {**plain, "pruner": [{name: value} for name, value in _pruners(config).items()]}
+    return {**plain, "pruner": [{name: value} for name, value in pruner_configs(config).items()]}
 
 
 @functools.cache
@@ -53,27 +54,12 @@ def composed(stages: Mapping[str, Any]) -> dict[str, Any]:
     return {**stages, "pruner": {name: value for entry in pruners for name, value in entry.items()}}
 
 
-def _pruners(config: DictConfig) -> dict[str, Any]:
-    """The pruners' configs by name, in the order in which they run."""
-    if not config.get("pruner"):
-        return {}
-    plain = OmegaConf.to_container(config.pruner, resolve=True)
-    assert isinstance(plain, dict)
-    if "_target_" in plain:
-        raise ValueError(
-            "pruner: a `_target_` stands where the names of pruners belong; the `# @package` line of a preset of yours "
-            "must be `# @package pruner.<name>`, or be left out"
-        )
-    return {str(name): value for name, value in plain.items()}
-
-
 def expect_stages(config: DictConfig) -> None:
     """Raises ValueError, naming the option, where a stage of a composed config cannot be built with its options."""
     for group in STAGES:
         if group != "pruner" and group in config:  # a training has no estimator
             expect_buildable(plain(config[group]), group)
-    for name, value in _pruners(config).items():
-        expect_buildable(value, f"pruner.{name}")
+    expect_pruners(config)
 
 
 def expect_dataset(config: DictConfig) -> None:
@@ -88,13 +74,14 @@ def expect_dataset(config: DictConfig) -> None:
 def build_pipeline(config: DictConfig, device: torch.device | str = "cpu") -> Pipeline:
     """The pipeline that features (with cache), matcher, pruner and estimator of a composed config describe."""
     extractor = cached(instantiate(config.features, "features"), config.cache, config.cache_limit)
-    pruners = {name: instantiate(value, f"pruner.{name}") for name, value in _pruners(config).items()}
+    pruners, for_families = build_pruners(config)
     return Pipeline(
         extractor,
         instantiate(config.matcher, "matcher"),
         pruners,
         instantiate(config.estimator, "estimator"),
         device=device,
+        families=for_families,
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -39,8 +40,8 @@ def load(group: str, name: str, config_dir: Path | str | None = None) -> dict[st
 @functools.cache
 def known_targets() -> frozenset[str]:
     """What the project's own presets build: dotted names that are safe to take from a file."""
-    files = conf_dir().glob("*/*.yaml")
-    return frozenset().union(*(targets_of(OmegaConf.to_container(OmegaConf.load(path))) for path in files))
+    texts = [path.read_text(encoding="utf-8") for path in conf_dir().glob("*/*.yaml")]
+    return frozenset(name for text in texts for name in re.findall(r"\b_target_: *([\w.]+)", text))
 
 
 def closest(group: str, config: Mapping[str, Any]) -> tuple[str, dict[str, Any]] | None:

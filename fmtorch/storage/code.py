@@ -10,7 +10,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fmtorch import __version__
 
@@ -82,29 +82,49 @@ def _imported(file: Path, start: Path, own: bool) -> set[Path]:
         if file in found:
             continue
         found.add(file)
-        try:
-            tree = ast.parse(file.read_bytes())
-        except (SyntaxError, ValueError):
-            continue
-        todo += [path for node in ast.walk(tree) for path in _files_of(node, file, start, own)]
+        todo += [path for statement in _imports(file.read_bytes()) for path in _files_of(statement, file, start, own)]
     return found
 
 
-def _files_of(node: ast.AST, file: Path, start: Path, own: bool) -> Iterator[Path]:
+class _Import(NamedTuple):
+    """An import statement: the dots it begins with (None: no `from`), the module after `from`, and the names."""
+
+    level: int | None
+    module: str
+    names: tuple[str, ...]
+
+
+@functools.cache  # parts of a pipeline share most of what they import
+def _imports(source: bytes) -> tuple[_Import, ...]:
+    """The import statements of a file, wherever in it; none where it does not compile."""
+    try:
+        nodes = ast.walk(ast.parse(source))
+    except (SyntaxError, ValueError):
+        return ()
+    return tuple(
+        _Import(
+            node.level if isinstance(node, ast.ImportFrom) else None,
+            (isinstance(node, ast.ImportFrom) and node.module) or "",
+            tuple(alias.name for alias in node.names),
+        )
+        for node in nodes
+        if isinstance(node, ast.Import | ast.ImportFrom)
+    )
+
+
+def _files_of(statement: _Import, file: Path, start: Path, own: bool) -> Iterator[Path]:
     """The files below `start` that an import statement of `file` names.
 
     Of anybody's own code with the packages on the way; of fmtorch's, whose packages import all that is in them,
     without.
     """
-    if isinstance(node, ast.Import):
-        names = [(start, alias.name) for alias in node.names]
-    elif isinstance(node, ast.ImportFrom):
-        folder = file.parents[node.level - 1] if node.level else start
-        module = node.module or ""
-        names = [(folder, f"{module}.{alias.name}".strip(".")) for alias in node.names]
-        names += [(folder, module)] if module and own else []
+    level, module, imported = statement
+    if level is None:
+        names = [(start, name) for name in imported]
     else:
-        return
+        folder = file.parents[level - 1] if level else start
+        names = [(folder, f"{module}.{name}".strip(".")) for name in imported]
+        names += [(folder, module)] if module and own else []
     for folder, name in names:
         if folder == start and (name.partition(".")[0] == PACKAGE.name) != own:
             continue  # its version tells

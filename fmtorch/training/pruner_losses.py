@@ -103,15 +103,15 @@ def geometric_loss(
     calibrated = (A0.isfinite() & A1.isfinite()).all(-1).all(-1) & _diagonal(A0) & _diagonal(A1)
     A0, A1 = (torch.where(calibrated[:, None, None], A, torch.eye(3, dtype=A.dtype, device=A.device)) for A in (A0, A1))
     mask = mask & calibrated[:, None]
-    usable = _usable(F_est, valid)
-    F = unit_largest(torch.where(usable[..., None, None], F_est.to(torch.float64), 0.0))
+    valid = _valid_models(F_est, valid)
+    F = unit_largest(torch.where(valid[..., None, None], F_est.to(torch.float64), 0.0))
     F = unit_largest(matmul3(matmul3(A1.mT, F), A0))
     e, squared0, squared1 = residual_and_normals(F, _normalised(x0, A0), _normalised(x1, A1))
     floor = NORMAL_FLOOR**2
     squared = e * e * (1 / (squared0 + floor) + 1 / (squared1 + floor))
     count = mask.sum(-1)
     mean = stable_sum(torch.where(mask, squared.clamp(max=limit), 0.0)) / count.clamp(min=1)
-    return _mean_over_pairs(mean, usable & (count > 0)).to(F_est.dtype)
+    return _mean_over_pairs(mean, valid & (count > 0)).to(F_est.dtype)
 
 
 def nsgd_loss(
@@ -148,11 +148,11 @@ def nsgd_loss(
     Raises:
         ValueError: samples is less than 1.
     """
-    usable = _usable(F_est, valid)
-    F = torch.where(usable[..., None, None], F_est.to(torch.float64), 0.0)
+    valid = _valid_models(F_est, valid)
+    F = torch.where(valid[..., None, None], F_est.to(torch.float64), 0.0)
     value = nsgd(F_true.to(torch.float64), F, size0, size1, samples=samples, seed=seed, key=key, cap=False)
     value = value if limit is None else value.clamp(max=limit)
-    return _mean_over_pairs(value, usable & _usable(F_true)).to(F_est.dtype)
+    return _mean_over_pairs(value, valid & _valid_models(F_true)).to(F_est.dtype)
 
 
 def _mean_over_pairs(value: Float[Tensor, "*stages b"], counted: Bool[Tensor, "*#stages b"]) -> Float[Tensor, ""]:
@@ -162,7 +162,7 @@ def _mean_over_pairs(value: Float[Tensor, "*stages b"], counted: Bool[Tensor, "*
     return (stable_sum(torch.where(counted, value, 0.0)) / count).mean()
 
 
-def _usable(F: Float[Tensor, "*stages b 3 3"], valid: Tensor | None = None) -> Bool[Tensor, "*stages b"]:
+def _valid_models(F: Float[Tensor, "*stages b 3 3"], valid: Tensor | None = None) -> Bool[Tensor, "*stages b"]:
     """Which matrices are finite, not zero, and not said to be invalid."""
     finite = F.detach().isfinite().all(-1).all(-1) & (F.detach() != 0).any(-1).any(-1)
     return finite if valid is None else finite & valid

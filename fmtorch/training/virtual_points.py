@@ -58,8 +58,8 @@ def virtual_points(
         raise ValueError(f"count is {count}; it must be at least 1")
     with torch.no_grad():
         F = F.to(torch.float64)
-        usable = F.isfinite().all(-1).all(-1)
-        F = unit_largest(torch.where(usable[:, None, None], F, 0.0))
+        valid = F.isfinite().all(-1).all(-1)
+        F = unit_largest(torch.where(valid[:, None, None], F, 0.0))
         height0, width0 = size0.to(torch.float64)[:, None].unbind(-1)
         key = torch.zeros(len(F), dtype=torch.int64, device=F.device) if key is None else key
         u, v, along = uniform(seed, key, Stream.TRAINING, 0, TRIES * count, 3).unbind(-1)

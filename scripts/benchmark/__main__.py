@@ -11,13 +11,17 @@ from scripts.benchmark import (
     curves,
     estimators,
     features,
+    gc_ransac,
     learned,
     matching,
     memory,
+    paper,
+    paper_times,
     pipelines,
     pruning,
     related,
     speed,
+    sweep,
     thresholds,
 )
 
@@ -26,18 +30,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m scripts.benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     for module in (
-        curves,
-        estimators,
-        features,
-        learned,
-        matching,
-        memory,
-        pipelines,
-        pruning,
-        related,
-        speed,
-        thresholds,
-    ):
+        curves, estimators, features, gc_ransac, learned, matching, memory, paper, paper_times, pipelines, pruning,
+        related, speed, sweep, thresholds,
+    ):  # fmt: skip
         module.add_arguments(commands)
     arguments = parser.parse_args()
     arguments.run(arguments)

@@ -16,14 +16,12 @@ from rich.progress import track
 
 from fmtorch import data, presets
 from fmtorch.data import ImagePair, PairDataset
+from fmtorch.data.baselines import WIDE
 from fmtorch.evaluation.statistics import scene_names
 from fmtorch.pipeline import Pipeline
 from fmtorch.types import Correspondences, Estimate
 
 console = Console(width=None if sys.stdout.isatty() else 170)
-
-WIDE = ("Strecha", "PhotoTourism", "CPC", "Tanks_and_Temples", "Strecha_train", "TanksLike", "orbit", "collection")
-"""Families of wide baselines; the others are videos, whose baselines are short."""
 
 Item = tuple[ImagePair, Correspondences]
 

@@ -5,7 +5,7 @@ python -m scripts.benchmark pipelines --rendered full --limit 40 --json features
 python -m scripts.benchmark pipelines --from features.jsonl --markdown docs/features.md
 
 --json is appended to batch by batch: started again, the command goes on where it was interrupted. A row counts only
-for the learned files and options that it was made with. GMS runs with scale on wide baselines, as in the paper.
+for the learned files and options that it was made with.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from rich.progress import track
 
 from fmtorch import presets
 from fmtorch.data import ImagePair
+from fmtorch.data.baselines import WIDE
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.run import select
 from fmtorch.pipeline import Outcome, Pipeline
@@ -28,7 +29,7 @@ from fmtorch.storage import identity_digest
 from fmtorch.storage.configuration import configuration
 from fmtorch.storage.features import CachedFeatures
 from scripts.benchmark import pipelines_table
-from scripts.benchmark.matched import WIDE, add_set_arguments, console, sets_of
+from scripts.benchmark.matched import add_set_arguments, console, sets_of
 from scripts.benchmark.pruning import pruned_by
 from scripts.benchmark.sheet import put
 
@@ -88,12 +89,12 @@ def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     rows = []
     for wide in (True, False):
         some = [pair for pair in pairs if (pair.family in WIDE) == wide]
-        for group in by_features(arguments, wide) if some else []:
+        for group in by_features(arguments) if some else []:
             pipelines = {name: pipeline for name, (pipeline, _) in group.items()}
             identity = {name: digest for name, (_, digest) in group.items()}
             own = [row for row in known if identity.get(row["method"]) == row["identity"]]
             rows += own
-            done = {row["pair"] for row in own}
+            done = set.intersection(*({row["pair"] for row in own if row["method"] == name} for name in group))
             todo = [pair for pair in some if pair.identity not in done]
             batches = [todo[i : i + BATCH] for i in range(0, len(todo), BATCH)]
             for batch in track(batches, next(iter(pipelines)), console=console):
@@ -103,20 +104,18 @@ def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     return rows
 
 
-def by_features(arguments: argparse.Namespace, wide: bool) -> Iterator[dict[str, tuple[Pipeline, str]]]:
+def by_features(arguments: argparse.Namespace) -> Iterator[dict[str, tuple[Pipeline, str]]]:
     """The pipelines in groups that share features and matches, by the names that the tables show.
 
     With each the digest of its options and learned files.
     """
     groups: dict[str, dict[str, tuple[Pipeline, str]]] = {}
     for name in arguments.pipelines:
-        scale = [f"pruner.gms.with_scale={str(wide).lower()}"] if name.endswith("_gms") else []
-        overrides = [*scale, *arguments.overrides]
-        pipeline = presets.pipeline(name, overrides=[f"cache={arguments.cache}", *overrides])
+        pipeline = presets.pipeline(name, overrides=[f"cache={arguments.cache}", *arguments.overrides])
         extractor = pipeline.extractor
         features = extractor.extractor if isinstance(extractor, CachedFeatures) else extractor
-        made_with = {"features": configuration(features), "preset": presets.load("pipeline", name),
-                     "overrides": overrides, "seeds": arguments.seeds}  # fmt: skip
+        made_with = {"features": configuration(features), "stages": presets.pipeline_stages(name),
+                     "overrides": arguments.overrides, "seeds": arguments.seeds}  # fmt: skip
         label = name + arguments.label
         groups.setdefault(name.split("_")[0], {})[label] = pipeline, identity_digest(made_with)[:16]
     yield from groups.values()
@@ -132,8 +131,10 @@ def rows_of(
     front = min(pipelines.values(), key=lambda p: len(p.pruners))
     matched = front.match(batch)
     for name, pipeline in pipelines.items():
-        further = [stage for key, stage in pipeline.pruners.items() if key not in front.pruners]
-        outcomes: list[Outcome] = [pruned_by(outcome, further) for outcome in matched]
+        outcomes: list[Outcome] = []
+        for outcome in matched:
+            stages = pipeline.pruners_of(outcome.pair.family)
+            outcomes.append(pruned_by(outcome, [stage for key, stage in stages.items() if key not in front.pruners]))
         runs = [evaluate(pipeline.estimate(outcomes, seed), seed) for seed in range(seeds)]
         for same in zip(*runs, strict=True):
             row = {field: getattr(same[0], field) for field in ("pair", "family", "scene", "features0", "features1")}

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.data.baselines import WIDE
 from fmtorch.evaluation.statistics import PERCENT, areas, described, difference, interval, recalled
-from scripts.benchmark.matched import WIDE
 from scripts.benchmark.pruning_table import KIN, Row, scenes_of
 from scripts.benchmark.sheet import Published, Sheet, compared, published, shown
 
@@ -21,18 +21,18 @@ ORDER = (
     ("hesaffnet_gms", "sift_ratio"),
 )  # fmt: skip
 """Pairs of pipelines of which the paper has the first above the second on wide baselines."""
-REAL = ("Strecha", "PhotoTourism", "CPC", "Tanks_and_Temples", "KITTI", "TUM")
+REAL = ("Strecha", "PhotoTourism", "CPC", "Tanks_and_Temples", "TanksLike", "KITTI", "TUM")
 METHODS = [method for dataset, method in published(PAPER) if dataset == "CPC"]
 
 Values = NDArray[np.float64]
 # A figure of each pair, (n,), the mean over seeds; NaN where it is not defined. Its factor and format.
 FIGURES: dict[str, tuple[Callable[[list[Row]], Values], float, str]] = {
-    "%Recall": (lambda rows: recalled(_nsgd(rows)), PERCENT, ".1f"),
-    "AUC@0.05": (lambda rows: areas(_nsgd(rows)), PERCENT, ".1f"),
-    "%Inlier": (lambda rows: _solved_means(rows, "inlier_rate"), PERCENT, ".1f"),
-    "%Inlier-m": (lambda rows: _solved_means(rows, "inlier_rate_before"), PERCENT, ".1f"),
-    "#Corrs": (lambda rows: _solved_means(rows, "corrs"), 1.0, ".0f"),
-    "#Corrs-m": (lambda rows: _solved_means(rows, "corrs_before"), 1.0, ".0f"),
+    "%Recall": (lambda rows: recalled(nsgd_by_seed(rows)), PERCENT, ".1f"),
+    "AUC@0.05": (lambda rows: areas(nsgd_by_seed(rows)), PERCENT, ".1f"),
+    "%Inlier": (lambda rows: solved_means(rows, "inlier_rate"), PERCENT, ".1f"),
+    "%Inlier-m": (lambda rows: solved_means(rows, "inlier_rate_before"), PERCENT, ".1f"),
+    "#Corrs": (lambda rows: solved_means(rows, "corrs"), 1.0, ".0f"),
+    "#Corrs-m": (lambda rows: solved_means(rows, "corrs_before"), 1.0, ".0f"),
 }
 
 SHARES = ("%Recall",)
@@ -53,12 +53,12 @@ def _place(row: Row) -> int:
     return METHODS.index(name) if name in METHODS else len(METHODS)
 
 
-def _nsgd(rows: list[Row]) -> Values:
+def nsgd_by_seed(rows: list[Row]) -> Values:
     """(seeds, n)."""
     return np.array([row["nsgd"] for row in rows], np.float64).T
 
 
-def _solved_means(rows: list[Row], field: str) -> Values:
+def solved_means(rows: list[Row], field: str) -> Values:
     """The mean of each pair over the seeds with which it was solved, (n,); NaN where there is none."""
     values = np.array([row[field] for row in rows], np.float64)
     solved = np.array([row["ok"] for row in rows], bool) & ~np.isnan(values)
@@ -75,12 +75,12 @@ def _family(family: str, rows: list[Row], paper: Published) -> Sheet:
         own = [row for row in rows if row["method"] == method]
         some = "" if len(own) == len(pairs) else f", {len(own)} pairs"
         figures = [_interval(name, own) for name in FIGURES]
-        lines.append([f"`{method}`{some}", *figures, _failed(own), compared(paper, kin, method)])
+        lines.append([f"`{method}`{some}", *figures, failed(own), compared(paper, kin, method)])
     title = f"{family}: {described(scenes_of(pairs.values()))}"
     return Sheet(title, ["", *FIGURES, "failed", f"paper, {kin}: recall, inlier, -m, #, -m"], lines)
 
 
-def _failed(rows: list[Row]) -> str:
+def failed(rows: list[Row]) -> str:
     """Pairs without an estimate, as a mean over seeds."""
     return f"{sum(1 - np.mean(row['ok']) for row in rows):.1f}"
 

@@ -17,7 +17,7 @@ PAPER = Path(__file__).resolve().parent / "paper_pruning.csv"
 # The paper's set of the same kind of camera motion; none of them is the same set.
 KIN = {
     "TUM": "TUM", "indoor": "TUM", "KITTI": "KITTI", "driving": "KITTI", "Strecha": "T&T", "orbit": "T&T",
-    "PhotoTourism": "CPC", "collection": "CPC",
+    "TanksLike": "T&T", "PhotoTourism": "CPC", "collection": "CPC",
 }  # fmt: skip
 BASELINE = "RATIO"
 FIGURES = ("%Recall", f"less {BASELINE}'s", "%Inlier", "%Inlier-m", "#Corrs", "#Corrs-m")

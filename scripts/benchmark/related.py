@@ -2,10 +2,10 @@
 
 python -m scripts.benchmark related --root DATA/Strecha --root DATA/PhotoTourism --root DATA/KITTI --root DATA/TUM \
     --folder related/test --update docs/related.md
-python -m scripts.benchmark related --folder related/test --update docs/related.md   # the tables of what is there
+python -m scripts.benchmark related --folder related/test --update docs/related.md --figure docs/related.svg
 
-Features, matches and rows are kept in the folder: started again, the command goes on where it was interrupted. Take
-another folder for other code or other options.
+The second line shows what the folder holds. It keeps features, matches and rows: started again, the command goes on
+where it was interrupted. Take another folder for other code or other options.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from fmtorch.data import ImagePair
 from fmtorch.pipeline import Pipeline
 from fmtorch.storage.files import replacing
 from fmtorch.types import Correspondences, collate
-from scripts.benchmark import related_table
+from scripts.benchmark import related_figure, related_table
 from scripts.benchmark.estimators_table import replaced
 from scripts.benchmark.matched import add_set_arguments, console, sets_of
 from scripts.benchmark.related_pairs import UNRELATED, in_order, unrelated_pairs
@@ -44,6 +44,7 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument("--unrelated", type=int, default=300, help="pairs of each two scenes at most, chosen by hash")
     parser.add_argument("--folder", type=Path, default=Path("related"), help="keeps features, matches and rows")
     parser.add_argument("--update", type=Path, help="put the tables between the marks of this file")
+    parser.add_argument("--figure", type=Path, help="draw the ROC curves here, as SVG")
     parser.add_argument("--marker", default="related", help="which marks: <!-- MARKER --> and <!-- end MARKER -->")
     parser.set_defaults(run=run)
 
@@ -59,10 +60,13 @@ def run(arguments: argparse.Namespace) -> None:
             for name, some, c in matches(feature, pairs, arguments.folder):
                 for pipeline in names:
                     judge(pipeline, name, some, c, arguments.folder)
-    text = related_table.text(read(arguments.folder, arguments.pipelines))
+    rows = read(arguments.folder, arguments.pipelines)
+    text = related_table.text(rows)
     console.print(text, markup=False)
     if arguments.update and not replaced(arguments.update, arguments.marker, text):
         raise SystemExit(f"{arguments.update} has no lines <!-- {arguments.marker} --> and <!-- end ... -->")
+    if arguments.figure:
+        related_figure.draw(rows, arguments.figure)
 
 
 def chosen_pairs(arguments: argparse.Namespace) -> list[ImagePair]:

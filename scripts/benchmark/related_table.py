@@ -16,9 +16,9 @@ RIGHT = 0.05  # NSGD below which an estimate of a related pair is right
 LEVELS = (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 5.0, 8.0)
 
 RULES: dict[str, Callable[[Row], bool]] = {
-    "COLMAP's": lambda row: _inliers(row) >= 15 and _inliers(row) >= 0.25 * row["matches"],
-    "15 inliers": lambda row: _inliers(row) >= 15,
-    "20 inliers": lambda row: _inliers(row) >= 20,
+    "COLMAP's": lambda row: inliers(row) >= 15 and inliers(row) >= 0.25 * row["matches"],
+    "15 inliers": lambda row: inliers(row) >= 15,
+    "20 inliers": lambda row: inliers(row) >= 20,
 }
 """What others accept a pair by. COLMAP's default: 15 inliers that are a quarter of the matches."""
 
@@ -43,7 +43,7 @@ def rules(rows: dict[str, list[Row]]) -> str:
         cells += [share(unrelated, _related), share(right, lambda row: not _related(row))]
         for rule in RULES.values():
             cells.append(f"{percent([rule(r) for r in unrelated])} / {percent([not rule(r) for r in right])}")
-        cells += [f"{area(right, unrelated, figure):.5f}" for figure in (_significance, _inliers)]
+        cells += [f"{area(right, unrelated, figure):.5f}" for figure in (significance, inliers)]
         lines.append(cells)
     return table(heads, lines)
 
@@ -55,8 +55,8 @@ def levels(rows: dict[str, list[Row]]) -> str:
         unrelated, right = split(own)
         cells: list[object] = [f"`{name}`"]
         for level in LEVELS:
-            accepted = percent([_significance(r) >= level for r in unrelated])
-            cells.append(f"{accepted} / {percent([_significance(r) < level for r in right])}")
+            accepted = percent([significance(r) >= level for r in unrelated])
+            cells.append(f"{accepted} / {percent([significance(r) < level for r in right])}")
         lines.append(cells)
     return table(["accepted / rejected at level", *(f"{level:g}" for level in LEVELS)], lines)
 
@@ -108,13 +108,15 @@ def table(heads: Sequence[str], lines: Sequence[Sequence[object]]) -> str:
     return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in (heads, rule, *lines))
 
 
-def _significance(row: Row) -> float:
+def significance(row: Row) -> float:
+    """How far the support of a pair's F is beyond chance."""
     return float(row["significance"])
 
 
 def _related(row: Row) -> bool:
-    return _significance(row) >= RELATED
+    return significance(row) >= RELATED
 
 
-def _inliers(row: Row) -> int:
+def inliers(row: Row) -> int:
+    """The number of inliers of a pair, 0 where there is no F."""
     return int(row["inliers"]) if row["ok"] else 0

@@ -11,7 +11,6 @@ from rich.table import Table
 
 from fmtorch.evaluation.bootstrap import Interval
 
-BEGIN, END = "<!-- figures -->", "<!-- end of figures -->"
 MISSING = "–"
 PUBLISHED = ("recall", "inlier", "inlier_m", "corrs", "corrs_m")  # columns of the paper's tables
 
@@ -37,13 +36,14 @@ class Sheet:
         return f"### {self.title}\n\n" + "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def put(path: Path, sheets: Sequence[Sheet]) -> None:
+def put(path: Path, sheets: Sequence[Sheet], marker: str = "figures") -> None:
     """Replace what stands between the marks of a Markdown file. Raises SystemExit for a file without them."""
+    begin, end = f"<!-- {marker} -->", f"<!-- end of {marker} -->"
     text = path.read_text(encoding="utf-8")
-    if BEGIN not in text or END not in text:
-        raise SystemExit(f"{path} must hold the lines {BEGIN} and {END}; the tables go between them")
-    before, after = text.split(BEGIN)[0], text.split(END)[1]
-    path.write_text(before + "\n\n".join([BEGIN, *(sheet.markdown() for sheet in sheets), END]) + after, "utf-8")
+    if begin not in text or end not in text:
+        raise SystemExit(f"{path} must hold the lines {begin} and {end}; the tables go between them")
+    before, after = text.split(begin)[0], text.split(end)[1]
+    path.write_text(before + "\n\n".join([begin, *(sheet.markdown() for sheet in sheets), end]) + after, "utf-8")
 
 
 def shown(interval: Interval | None, form: str) -> str:

@@ -62,17 +62,27 @@ TINY = ["features.max_features=500"]
 DATASET = ["dataset=fmbench", "dataset.root=DATA/Strecha", "limit=1"]
 TRAINED = [
     "optimisation.steps=4", "objective.classification_steps=2", "validation.every=2", "batch=2", "threads=1",
-    "validation.scenes=1", "validation.pairs=1", "checkpoint_every=2", "workers=1",
+    "validation.scenes=1", "validation.pairs=1", "checkpoint_every=2", "workers=1", *TINY,
 ]  # fmt: skip
 APPENDED = {
-    "fmtorch.match": ["pipeline=sift_gms"],
-    "fmtorch.eval": [*DATASET, "workers=1"],
-    "fmtorch.train": ["dataset=fmbench", "dataset.root=DATA", "dataset.sets=[Strecha_train,TanksLike]", *TRAINED],
+    "fmtorch.match": ["pipeline=sift_gms", *TINY],
+    "fmtorch.eval": [*DATASET, *TINY, "workers=1"],
+    "fmtorch.train": [
+        "dataset=fmbench",
+        "dataset.root=DATA",
+        "dataset.sets=[Strecha_train,TanksLike]",
+        *TRAINED,
+        *TINY,
+    ],
     "fmtorch.pairs": ["dataset.root=DATA/Strecha", "workers=1"],
     "fmtorch.report": ["pictures=1", "root=DATA/Strecha"],
     "estimators": ["--limit", "1", "--seeds", "1"],
     "thresholds": ["--limit", "1", "--seeds", "1", "--values", "0.5", "0.75"],
     "pipelines": ["--limit", "1", "--seeds", "1", "--cache", "kept"],
+    "paper": ["--limit", "1", "--seeds", "1", "--cache", "kept"],
+    "paper_times": ["--limit", "1"],
+    "gc_ransac": ["--limit", "1", "--cache", "kept"],
+    "sweep": [],
     "pruning": ["--limit", "1", "--asift-limit", "0", "--cache", "kept"],
     "related": ["--limit", "1", "--unrelated", "1"],
     "learned": ["--limit", "1", "--cache", "kept", "--methods", "ratio", "LC, F", "DFE"],
@@ -119,6 +129,8 @@ def smaller(command: str) -> list[str]:
         added = ["limit=1", "workers=1"]
     if "--from" in words:  # shows what is there
         added = []
+    elif name == "pipelines" and "--overrides" not in words:
+        added = [*added, "--overrides", *TINY]
     if name == "speed" and importlib.util.find_spec("poselib") is None:
         added = [*added, "--peers", "opencv_usac_magsac"]
     return [*(word for word in words if _installed(word)), *added]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch import kernels, metrics, presets
+from fmtorch import kernels, presets
 from fmtorch.estimators import HypothesizeAndVerify, final_fits, pool, saturated_gains
 from fmtorch.estimators.engine import Form
 from fmtorch.estimators.inliers import WithinThreshold
@@ -26,9 +26,8 @@ from fmtorch.estimators.registry import kernel_form
 from fmtorch.estimators.scores import score_models
 from fmtorch.kernels import Kernel
 from fmtorch.random import Stream
-from fmtorch.types import Correspondences, collate
-from tests.conftest import oracle
-from tests.estimators.test_one_pair import both, in_both_forms, models, told
+from fmtorch.types import collate
+from tests.estimators.test_one_pair import both, in_both_forms, models, real_pairs, solved, told
 from tests.laws import SMALL_KINDS, degenerate, scene, small
 
 pytest.importorskip("numba", reason="numba is not installed")
@@ -236,20 +235,12 @@ def test_presets_on_scenes(name: str) -> None:
 @pytest.mark.parametrize("name", PRESETS[:2])
 def test_both_forms_solve_the_same_real_pairs(name: str) -> None:
     """Near-ties may select other models, but neither form is better."""
-    file = oracle("robust.npz")
-    estimator, solved, draws = presets.build("estimator", name, focal=FEW_ROUNDS), [], []
-    for i in range(len(file["names"])):
-        x0, x1 = (torch.from_numpy(file[f"{i:03d}.{field}"])[None, :1000] for field in ("X1", "X2"))
-        F_true, *sizes = (torch.from_numpy(file[f"{i:03d}.{field}"])[None] for field in ("F_gt", "size1", "size2"))
-        size0, size1 = (size.long() for size in sizes)
-        mask = torch.ones(x0.shape[:2], dtype=torch.bool)
-        c = Correspondences(x0.float(), x1.float(), mask, size0=size0, size1=size1, key=torch.tensor([i]))
-        both_ = in_both_forms(estimator, presets.build("pruner", "position_consistency")(c))
-        solved.append([float(metrics.nsgd(F_true, e.F, size0, size1)) < 0.05 for e in both_])
-        draws.append([int(e.draws) for e in both_])
-    compiled, tensors = np.array(solved).T
-    assert np.count_nonzero(compiled != tensors) <= 2
-    assert np.mean([one == other for one, other in draws]) > 0.8  # a decision between the searches may go another way
+    c = real_pairs()[0]
+    c = presets.build("pruner", "position_consistency")(c.replace(x0=c.x0.float(), x1=c.x1.float()))
+    compiled, tensors = in_both_forms(presets.build("estimator", name, focal=FEW_ROUNDS), c)
+    assert int((solved(compiled) != solved(tensors)).sum()) <= 2
+    # A decision between the searches may go another way.
+    assert float((compiled.draws == tensors.draws).float().mean()) > 0.8
 
 
 @pytest.mark.parametrize("name", PRESETS)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 import pytest
 import torch
 
-from fmtorch import kernels, metrics, presets
+from fmtorch import kernels, presets
 from fmtorch.estimators.irls import _weight
 from fmtorch.estimators.one_pair.irls import weights
 from fmtorch.geometry.irls import reweighted
@@ -17,10 +15,16 @@ from fmtorch.geometry.robust_kernels import KERNELS
 from fmtorch.geometry.sampson_objective_kernels import LOSSES
 from fmtorch.geometry.sigma_consensus import LOSS_TABLE
 from fmtorch.types import Correspondences, Estimate
-from tests.conftest import oracle
-from tests.estimators.test_one_pair import both, inputs, told
+from tests.estimators.test_one_pair import (
+    assert_scenes_alike,
+    assert_told_alike,
+    both,
+    inputs,
+    real_pairs,
+    solved,
+    told,
+)
 from tests.geometry.test_refine_kernels import matches
-from tests.laws import scenes
 
 pytest.importorskip("numba", reason="numba is not installed")
 
@@ -62,25 +66,16 @@ def test_weights_of_matches(known: tuple[str, ...]) -> None:
 
 @pytest.mark.parametrize("loss", ["magsac", "huber"])
 def test_presets_in_both_forms(loss: str) -> None:
-    """Of degenerate pairs both forms say the same; how many inliers fit nothing is a matter of rounding."""
-    for what, c in inputs():
+    for names, c in inputs():
         compiled, tensors = in_both_forms(f"irls_{loss}", c)
-        kinds = [tuple(re.sub(r"\d+", "N", reason) for reason in e.reason) for e in (compiled, tensors)]
-        assert kinds[0] == kinds[1], what
-        assert torch.equal(compiled.ok, tensors.ok), what
-    compiled, tensors = in_both_forms(f"irls_{loss}", scenes())
-    torch.testing.assert_close(compiled.F, tensors.F, rtol=0, atol=1e-7)
+        assert_told_alike(compiled, tensors, names)
+        if len(names) > 1:
+            assert_scenes_alike(compiled, tensors, 1e-7)
 
 
 @pytest.mark.parametrize("loss", ["magsac", "cauchy"])
 def test_both_forms_solve_the_same_real_pairs(loss: str) -> None:
     """Minima of nearly the same cost may be taken for each other: at most one pair is solved by one form alone."""
-    file, solved = oracle("robust.npz"), []
-    for i in range(0, len(file["names"]), 4):
-        x0, x1 = (torch.from_numpy(file[f"{i:03d}.{field}"])[None] for field in ("X1", "X2"))
-        c = Correspondences(x0, x1, torch.ones(x0.shape[:2], dtype=torch.bool), key=torch.tensor([i]))
-        F_true, *sizes = (torch.from_numpy(file[f"{i:03d}.{field}"])[None] for field in ("F_gt", "size1", "size2"))
-        forms = in_both_forms(f"irls_{loss}", c)
-        solved.append([float(metrics.nsgd(F_true, e.F, *(s.long() for s in sizes))) < 0.05 for e in forms])
-    compiled, tensors = np.array(solved).T
-    assert np.count_nonzero(compiled != tensors) <= 1
+    c = real_pairs(step=4)[0].replace(size0=None, size1=None)
+    compiled, tensors = in_both_forms(f"irls_{loss}", c)
+    assert int((solved(compiled, step=4) != solved(tensors, step=4)).sum()) <= 1

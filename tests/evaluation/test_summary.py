@@ -11,7 +11,8 @@ import torch
 from rich.console import Console
 
 from fmtorch import metrics
-from fmtorch.evaluation.summary import pose_table, summarize, summary_markdown, summary_table
+from fmtorch.evaluation.summary import summarize
+from fmtorch.evaluation.summary_tables import pose_table, summary_markdown, summary_table
 from fmtorch.storage import PairRow, to_table
 from fmtorch.types import pair_key
 

@@ -394,6 +394,7 @@ def main() -> None:
     parser.add_argument("--calls", type=int, default=10)
     options = parser.parse_args()
     faulthandler.enable()
+    warnings.simplefilter("ignore")
     torch.set_num_threads(1)
     faults = 0
     for subject in subjects(options.names):

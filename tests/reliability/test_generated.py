@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,10 +10,9 @@ from typing import Any
 import pytest
 
 from fmtorch import geometry, matching, metrics, presets, pruning
-from tests.processes import ONE_THREAD
+from tests.processes import run_command
 from tests.reliability.generated import installed_estimators
 
-HERE = Path(__file__).resolve().parents[2]
 BOUNDED = 4  # calls of each subject
 WHOLE = {
     "geometry.": 120, "metrics.": 120, "pruning.": 100, "matching.": 200, "types.": 200, "find_fundamental.": 150,
@@ -25,12 +21,9 @@ WHOLE = {
 """Calls of each subject by the beginning of its name: some 15,000 in all."""
 
 
-def generate(calls: int, *names: str) -> list[dict[str, Any]]:
+def generate(folder: Path, calls: int, *names: str) -> list[dict[str, Any]]:
     """What came of so many calls of each subject; fails where one has a fault."""
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-m", "tests.reliability.generated", "--calls", str(calls), *names],
-        cwd=HERE, capture_output=True, text=True, check=False, env={**os.environ, **ONE_THREAD},
-    )  # fmt: skip
+    done = run_command("tests.reliability.generated", "--calls", str(calls), *names, cwd=folder, patience=7200)
     found = [json.loads(line) for line in done.stdout.splitlines() if line.startswith('{"subject"')]
     faults = "\n\n".join(f"{line['subject']}: {line['fault']}\n{line['call']}" for line in found if "fault" in line)
     assert not faults, faults
@@ -38,8 +31,8 @@ def generate(calls: int, *names: str) -> list[dict[str, Any]]:
     return found
 
 
-def test_some_calls_of_everything() -> None:
-    found = generate(BOUNDED)
+def test_some_calls_of_everything(tmp_path: Path) -> None:
+    found = generate(tmp_path, BOUNDED)
     called = {line["subject"] for line in found}
     for module in (geometry, metrics, pruning, matching):
         names = {name for name in module.__all__ if name.islower()}
@@ -51,7 +44,7 @@ def test_some_calls_of_everything() -> None:
 
 @pytest.mark.reliability
 @pytest.mark.parametrize("beginning", WHOLE)
-def test_many_calls(beginning: str, record_property: Callable[[str, object], None]) -> None:
-    found = generate(WHOLE[beginning], beginning)
+def test_many_calls(beginning: str, tmp_path: Path, record_property: Callable[[str, object], None]) -> None:
+    found = generate(tmp_path, WHOLE[beginning], beginning)
     for outcome in ("sound", "refused"):
         record_property(f"{beginning} {outcome}", sum(line.get(outcome, 0) for line in found))

@@ -40,19 +40,7 @@ def poselib_shared_focal(
 ) -> PairwiseEstimator:
     """PoseLib's LO-RANSAC for two cameras of one unknown focal length, principal points central, square pixels.
 
-    Pairs whose images differ in size get its fundamental matrix.
-
-    Args:
-        threshold: pixels, Sampson distance.
-        confidence: of having drawn a sample without an outlier, at which the search ends.
-        iterations: samples at most.
-        prosac: draw samples from the best matches first.
-
-    Returns:
-        The estimator.
-
-    Raises:
-        ImportError: with a hint, where PoseLib is not installed.
+    Pairs whose images differ in size get its fundamental matrix. Arguments, result and errors are those of `poselib`.
     """
     library, options = peer("poselib", "PoseLib"), _poselib_options(threshold, confidence, iterations, prosac)
 

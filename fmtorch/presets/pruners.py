@@ -1,0 +1,79 @@
+"""Pruners of a composed config, and those that take other options for pairs of some families."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from fmtorch.data.baselines import WIDE
+from fmtorch.presets.objects import expect_buildable, instantiate
+from fmtorch.stages import Pruner
+
+FAMILIES = "families"  # among a pruner's options: family -> options that its pairs get instead
+WIDE_FAMILIES = "wide"  # stands there for every family of wide baselines
+
+
+def pruner_configs(config: DictConfig) -> dict[str, Any]:
+    """The pruners' configs by name, in the order in which they run.
+
+    Raises ValueError where one pruner's options stand in the place of the names.
+    """
+    if not config.get("pruner"):
+        return {}
+    plain = OmegaConf.to_container(config.pruner, resolve=True)
+    assert isinstance(plain, dict)
+    if "_target_" in plain:
+        raise ValueError(
+            "pruner: a `_target_` stands where the names of pruners belong; the `# @package` line of a preset of yours "
+            "must be `# @package pruner.<name>`, or be left out"
+        )
+    return {str(name): value for name, value in plain.items()}
+
+
+def expect_pruners(config: DictConfig) -> None:
+    """Raises ValueError, naming the option, where a pruner cannot be built with its options, for any family."""
+    for name, value in pruner_configs(config).items():
+        for where, options, _ in _versions(name, value):
+            expect_buildable(options, where)
+
+
+def build_pruners(config: DictConfig) -> tuple[dict[str, Pruner], dict[str, dict[str, Pruner]]]:
+    """The pruners by name, and by family those that pairs of this family get in their places."""
+    usual: dict[str, Pruner] = {}
+    for_families: dict[str, dict[str, Pruner]] = {}
+    for name, value in pruner_configs(config).items():
+        for where, options, families in _versions(name, value):
+            pruner = instantiate(options, where)
+            if not families:
+                usual[name] = pruner
+            for family in families:
+                for_families.setdefault(family, {})[name] = pruner
+    return usual, for_families
+
+
+def _versions(name: str, config: Any) -> Iterator[tuple[str, Any, tuple[str, ...]]]:
+    """Where the options of a pruner stand, the options, and the families that they are for: none, the usual ones first.
+
+    Those of a family that is named come after those of all wide baselines, which they add to.
+    """
+    where = f"pruner.{name}"
+    if not isinstance(config, Mapping) or FAMILIES not in config:
+        yield where, config, ()
+        return
+    usual = {key: value for key, value in config.items() if key != FAMILIES}
+    yield where, usual, ()
+    families = config[FAMILIES] or {}
+    if not isinstance(families, Mapping) or not all(isinstance(options, Mapping) for options in families.values()):
+        raise ValueError(
+            f"{where}.{FAMILIES}={families}; it must be a mapping of families to options, e.g. "
+            "{wide: {with_scale: true}}"
+        )
+    wide = families.get(WIDE_FAMILIES, {})
+    if WIDE_FAMILIES in families:
+        yield f"{where}.{FAMILIES}.{WIDE_FAMILIES}", {**usual, **wide}, WIDE
+    for family, options in families.items():
+        if family != WIDE_FAMILIES:
+            below = wide if family in WIDE else {}
+            yield f"{where}.{FAMILIES}.{family}", {**usual, **below, **options}, (str(family),)

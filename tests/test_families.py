@@ -1,0 +1,90 @@
+"""Pruners that take other options for pairs of some families: of one pipeline, in one batch."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from fmtorch import presets
+from fmtorch.data import ImagePair, ImageSource
+from fmtorch.data.pairs import GivenMatches
+from fmtorch.pipeline import Pipeline
+from fmtorch.presets.composition import compose
+from fmtorch.types import Correspondences
+
+RATIO = "pruner.ratio.families"
+
+
+def matches(seed: int) -> GivenMatches:
+    """Forty matches whose qualities lie between 0 and 1."""
+    generator = torch.Generator().manual_seed(seed)
+    x0, x1, quality = (torch.rand(1, 40, *size, generator=generator) for size in ((2,), (2,), ()))
+    size = torch.tensor([[480, 640]])
+    mask = torch.ones(1, 40, dtype=torch.bool)
+    return GivenMatches(Correspondences(600 * x0, 600 * x1, mask, size0=size, size1=size, quality=quality), (40, 40))
+
+
+def pairs(*families: str) -> list[ImagePair]:
+    image = ImageSource("image", Path("image.jpg"))
+    return [
+        ImagePair(str(i), family, "scene", image, image, np.eye(3), matches=functools.partial(matches, i))
+        for i, family in enumerate(families)
+    ]
+
+
+def qualities(pipeline: Pipeline, some: list[ImagePair]) -> list[torch.Tensor]:
+    """The qualities of the matches that are left of each pair."""
+    found = []
+    for outcome in pipeline.match(some):
+        c = outcome.correspondences
+        assert c is not None
+        assert c.quality is not None
+        found.append(c.quality[c.mask])
+    return found
+
+
+def test_each_pair_of_a_batch_gets_the_options_of_its_family() -> None:
+    options = ["pruner.ratio.threshold=0.5", f"+{RATIO}.wide.threshold=0.7", f"+{RATIO}.CPC.threshold=0.9"]
+    pipeline = presets.pipeline("sift_ratio_paper", overrides=options)
+    some = pairs("KITTI", "orbit", "CPC", "mine", "Strecha")
+    limits = (0.5, 0.7, 0.9, 0.5, 0.7)
+    for pair, kept, limit in zip(some, qualities(pipeline, some), limits, strict=True):
+        given = matches(int(pair.identity)).correspondences.quality
+        assert given is not None
+        assert torch.equal(kept, given[given < limit])
+        assert torch.equal(kept, qualities(pipeline, [pair])[0])
+
+
+def test_gms_tries_scales_on_wide_baselines_alone() -> None:
+    for name in ("sift_gms", "hesaffnet_gms_paper"):
+        pipeline = presets.pipeline(name, overrides=["+pruner.gms.families.mine.with_scale=true"])
+        scale = {family: pipeline.pruners_of(family)["gms"].with_scale for family in ("TUM", "CPC", "mine", "other")}  # type: ignore[attr-defined]
+        assert scale == {"TUM": False, "CPC": True, "mine": True, "other": False}
+        assert {pruner.threshold_factor for pruner in (pipeline.pruners_of(f)["gms"] for f in scale)} == {4.0}  # type: ignore[attr-defined]
+        usual = presets.pipeline(name, overrides=["pruner.gms.families=null"])
+        assert not usual.pruners_of("CPC")["gms"].with_scale  # type: ignore[attr-defined]
+
+
+def test_they_are_part_of_the_stages_of_a_run_and_come_back_from_them() -> None:
+    config = compose("match", ("pipeline=sift_gms_paper",))
+    stages = presets.stages(config)
+    assert stages["pruner"][1]["gms"]["families"] == {"wide": {"with_scale": True}}
+    assert presets.composed(stages)["pruner"]["gms"]["families"] == {"wide": {"with_scale": True}}
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        (f"+{RATIO}.wide.angle=1", r"pruner\.ratio\.families\.wide: no option angle"),
+        (f"+{RATIO}.CPC.threshold=high", r"pruner\.ratio\.families\.CPC.*threshold=high"),
+        (f"+{RATIO}=[CPC]", r"pruner\.ratio\.families=.*must be a mapping of families to options"),
+        (f"+{RATIO}.CPC=0.9", r"pruner\.ratio\.families=.*must be a mapping of families to options"),
+    ],
+)
+def test_what_is_wrong_with_them_is_said(override: str, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        presets.expect_stages(compose("match", ("pipeline=sift_ratio_paper", override)))
