@@ -57,7 +57,7 @@ SLOW = (
 )
 
 PEERS = {"poselib": "poselib", "poselib_shared_focal": "poselib", "degensac_cpp": "pydegensac",
-         "gc_ransac_cpp": "pygcransac", "magsac_cpp": "pymagsac"}  # fmt: skip
+         "gc_ransac_cpp": "pygcransac", "magsac_cpp": "pymagsac", "superansac_cpp": "pysuperansac"}  # fmt: skip
 
 TINY = ["features.max_features=500"]
 DATASET = ["dataset=fmbench", "dataset.root=DATA/Strecha", "limit=1"]
@@ -87,6 +87,7 @@ APPENDED = {
     "pruning": ["--limit", "1", "--asift-limit", "0", "--cache", "kept"],
     "related": ["--limit", "1", "--unrelated", "1"],
     "learned": ["--limit", "1", "--cache", "kept", "--methods", "ratio", "LC, F", "DFE"],
+    "stress": ["--limit", "1", "--only", "noise"],
     "speed": ["--pairs", "2", "--batch", "2", "--repeats", "1", "--matches", "200"],
     "memory": ["--pairs", "1", "--matches", "200", "--estimators", "ransac"],
     "features": ["--features", "100", "--repeats", "1", "--size", "120", "160"],
