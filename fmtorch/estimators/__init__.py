@@ -3,7 +3,7 @@
 from fmtorch.estimators.coarse_to_fine import CoarseToFine
 from fmtorch.estimators.engine import HypothesizeAndVerify
 from fmtorch.estimators.irls import IterativelyReweighted
-from fmtorch.estimators.peers.authors import degensac_cpp, gc_ransac_cpp, magsac_cpp
+from fmtorch.estimators.peers.authors import degensac_cpp, gc_ransac_cpp, magsac_cpp, superansac_cpp
 from fmtorch.estimators.peers.kornia import kornia_ransac
 from fmtorch.estimators.peers.opencv import opencv
 from fmtorch.estimators.peers.pairwise import PairwiseEstimator
@@ -21,4 +21,5 @@ __all__ = [
     "opencv",
     "poselib",
     "poselib_shared_focal",
+    "superansac_cpp",
 ]

@@ -21,6 +21,7 @@ from scripts.benchmark import (
     pruning,
     related,
     speed,
+    stress,
     sweep,
     thresholds,
 )
@@ -31,7 +32,7 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     for module in (
         curves, estimators, features, gc_ransac, learned, matching, memory, paper, paper_times, pipelines, pruning,
-        related, speed, sweep, thresholds,
+        related, speed, stress, sweep, thresholds,
     ):  # fmt: skip
         module.add_arguments(commands)
     arguments = parser.parse_args()

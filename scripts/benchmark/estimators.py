@@ -1,7 +1,8 @@
 """Robust estimators on the same matches, one thread each: recall, AUC@0.05, milliseconds, paired intervals.
 
 An estimator is named as PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]; the pruners after @ count into its time. The preset
-`truth` is none: it is the fit that starts from the true matrix, and so what the matches allow.
+`truth` is none: it is the fit that starts from the true matrix, and so what the matches allow. The pruner `ngransac` is
+the network of --ngransac; without it, estimators that name it are left out.
 
 python -m scripts.benchmark estimators --root DATA/Strecha --root DATA/PhotoTourism --seeds 5 \\
     --estimators fmtorch@frame_consistency opencv_usac_magsac:threshold=1.0 poselib:threshold=0.5,prosac=true
@@ -15,7 +16,7 @@ import functools
 import json
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,9 @@ from scripts.benchmark import matched
 from scripts.benchmark.matched import Item, console, groups, options
 
 Result = dict[str, NDArray[np.float64]]  # nsgd, ms: (seeds, pairs)
+Stage = Callable[[Correspondences], Correspondences]
+NGRANSAC = "ngransac"
+NONE: Mapping[str, Stage] = {}
 
 
 def add_arguments(commands: Any) -> None:
@@ -43,6 +47,7 @@ def add_arguments(commands: Any) -> None:
     matched.add_arguments(parser)
     parser.add_argument("--estimators", nargs="+", default=[], help="PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]")
     parser.add_argument("--specs", type=Path, help="a file with one estimator a line; # starts a comment")
+    parser.add_argument("--ngransac", type=Path, help="NG-RANSAC's published weights (scripts/convert_ngransac.py)")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--json", type=Path, help="write the figures here")
     parser.add_argument("--baseline", type=Path, help="a file written by --json, to compare recall and time with")
@@ -59,9 +64,12 @@ def run(arguments: argparse.Namespace) -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     specs = [*arguments.estimators, *(read_specs(arguments.specs) if arguments.specs else [])]
+    extra = {NGRANSAC: ngransac(arguments.ngransac)} if arguments.ngransac else {}
+    if not extra:
+        specs = [spec for spec in specs if NGRANSAC not in stages_of(spec)]
     if not specs:
         raise SystemExit("name at least one estimator: --estimators or --specs")
-    results = measure(specs, items, arguments.seeds)
+    results = measure(specs, items, arguments.seeds, extra)
     pairs = [pair for pair, _ in items]
     figures = {group: summaries(results, pairs, inside) for group, inside in groups(pairs).items()}
     for group, inside in groups(pairs).items():
@@ -90,11 +98,18 @@ def read_specs(path: Path) -> list[str]:
     return [text for line in path.read_text().splitlines() if (text := line.partition("#")[0].strip())]
 
 
-def build(spec: str) -> Estimator:
-    """The function of `PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]`: pruners in order, then the estimator."""
-    front, _, stages = spec.partition("@")
-    name, _, rest = front.partition(":")
-    estimator, prune = presets.build("estimator", name, **options(rest)), pruning(stages)
+def stages_of(spec: str) -> list[str]:
+    """The pruners of `PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]`."""
+    return [stage for stage in spec.partition("@")[2].split("+") if stage]
+
+
+def build(spec: str, extra: Mapping[str, Stage] = NONE) -> Estimator:
+    """The function of `PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]`: pruners in order, then the estimator.
+
+    extra: pruners that are no presets.
+    """
+    name, _, rest = spec.partition("@")[0].partition(":")
+    estimator, prune = presets.build("estimator", name, **options(rest)), pruning(spec, extra)
 
     def call(c: Correspondences, seed: int = 0) -> Estimate:
         estimate: Estimate = estimator(prune(c), seed)
@@ -103,19 +118,27 @@ def build(spec: str) -> Estimator:
     return call
 
 
-def pruning(stages: str) -> Callable[[Correspondences], Correspondences]:
-    """The pruners `PRUNER+PRUNER...`, in order; of nothing, the matches as they are."""
-    pruners = [presets.build("pruner", stage) for stage in stages.split("+") if stage]
+def pruning(spec: str, extra: Mapping[str, Stage] = NONE) -> Stage:
+    """The pruners of a spec, in order; of nothing, the matches as they are."""
+    pruners = [extra[stage] if stage in extra else presets.build("pruner", stage) for stage in stages_of(spec)]
     return lambda c: functools.reduce(lambda kept, pruner: pruner(kept), pruners, c)
 
 
-def informed(spec: str) -> Callable[[ImagePair, Correspondences, int], Estimate]:
+def ngransac(file: Path) -> Stage:
+    """The network of neural-guided RANSAC (Brachmann & Rother, ICCV 2019) as prior: its weights of samples."""
+    if not file.is_file():
+        raise SystemExit(f"--ngransac {file}: no such file; scripts/convert_ngransac.py makes it")
+    network = {"_target_": "fmtorch.pruning.networks.LC", "side": ["ratio"]}
+    stage: Stage = presets.build("pruner", "lc_soft", network=network, file=str(file))
+    return stage
+
+
+def informed(spec: str, extra: Mapping[str, Stage] = NONE) -> Callable[[ImagePair, Correspondences, int], Estimate]:
     """As `build`, of methods that are told the pair: only `truth` looks at it."""
-    name, _, stages = spec.partition("@")
-    if name == "truth":
-        prune = pruning(stages)
+    if spec.partition("@")[0] == "truth":
+        prune = pruning(spec, extra)
         return lambda pair, c, seed: from_truth(pair, prune(c))
-    method = build(spec)
+    method = build(spec, extra)
     return lambda pair, c, seed: method(c, seed)
 
 
@@ -128,12 +151,12 @@ def from_truth(pair: ImagePair, c: Correspondences) -> Estimate:
     return Estimate(F, c.mask, ok, ("",), torch.zeros(1, dtype=torch.int64))
 
 
-def measure(specs: list[str], items: list[Item], seeds: int) -> dict[str, Result]:
+def measure(specs: list[str], items: list[Item], seeds: int, extra: Mapping[str, Stage] = NONE) -> dict[str, Result]:
     """NSGD (seeds, pairs) and milliseconds of processor time (seeds, pairs) of each estimator, one pair a call.
 
     The estimators take turns at each pair, so that what else the machine does slows them down alike.
     """
-    methods = {spec: informed(spec) for spec in specs}
+    methods = {spec: informed(spec, extra) for spec in specs}
     results = {spec: {"nsgd": np.ones((seeds, len(items))), "ms": np.zeros((seeds, len(items)))} for spec in specs}
     for method in methods.values():
         method(*items[0], 0)  # not counted: lazy initialisation

@@ -31,6 +31,7 @@ from fmtorch.evaluation.run import select
 from fmtorch.pipeline import Outcome, Pipeline
 from fmtorch.storage.features import cached
 from scripts.benchmark import learned_table
+from scripts.benchmark.estimators import ngransac
 from scripts.benchmark.matched import add_set_arguments, sets_of
 from scripts.benchmark.pruning import machine, stage
 from scripts.benchmark.sheet import put
@@ -115,10 +116,8 @@ def measure(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
         for use, (methods, _) in USES.items()
     }  # fmt: skip
     if arguments.ngransac:
-        network = {"_target_": "fmtorch.pruning.networks.LC", "side": ["ratio"]}
-        pruner = presets.build("pruner", "lc_soft", network=network, file=str(arguments.ngransac))
         before = [(name, stage(name)) for name in sorted(GIVEN, reverse=True)]
-        built["prior"]["NG-RANSAC's network"] = [*before, ("lc", pruner)]  # its outputs are weights of samples
+        built["prior"]["NG-RANSAC's network"] = [*before, ("lc", ngransac(arguments.ngransac))]
     for name, file in arguments.network:
         for use, preset in (("hard", "lc"), ("prior", "lc_soft")):
             before = [(given, stage(given)) for given in sorted(GIVEN, reverse=True)]

@@ -22,7 +22,15 @@ from scripts.benchmark.estimators import build
 from scripts.benchmark.matched import console
 from scripts.benchmark.synthetic import synthetic_pair
 
-OTHER_LIBRARIES = ("opencv_", "poselib", "kornia_ransac", "magsac_cpp", "gc_ransac_cpp", "degensac_cpp")
+OTHER_LIBRARIES = (
+    "opencv_",
+    "poselib",
+    "kornia_ransac",
+    "magsac_cpp",
+    "gc_ransac_cpp",
+    "degensac_cpp",
+    "superansac_cpp",
+)
 
 
 def add_arguments(commands: Any) -> None:

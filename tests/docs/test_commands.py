@@ -53,10 +53,11 @@ SLOW = (
     r"--marker rendered",
     r"--label",
     r"benchmark related .*(hardnet|hesaffnet)",
+    r"benchmark (paper|gc_ransac|sweep)",
 )
 
 PEERS = {"poselib": "poselib", "poselib_shared_focal": "poselib", "degensac_cpp": "pydegensac",
-         "gc_ransac_cpp": "pygcransac", "magsac_cpp": "pymagsac"}  # fmt: skip
+         "gc_ransac_cpp": "pygcransac", "magsac_cpp": "pymagsac", "superansac_cpp": "pysuperansac"}  # fmt: skip
 
 TINY = ["features.max_features=500"]
 DATASET = ["dataset=fmbench", "dataset.root=DATA/Strecha", "limit=1"]
@@ -86,6 +87,7 @@ APPENDED = {
     "pruning": ["--limit", "1", "--asift-limit", "0", "--cache", "kept"],
     "related": ["--limit", "1", "--unrelated", "1"],
     "learned": ["--limit", "1", "--cache", "kept", "--methods", "ratio", "LC, F", "DFE"],
+    "stress": ["--limit", "1", "--only", "noise"],
     "speed": ["--pairs", "2", "--batch", "2", "--repeats", "1", "--matches", "200"],
     "memory": ["--pairs", "1", "--matches", "200", "--estimators", "ransac"],
     "features": ["--features", "100", "--repeats", "1", "--size", "120", "160"],
@@ -111,6 +113,7 @@ def smaller(command: str) -> list[str]:
         (r"--root DATA/\w+ (?=.*--root)", ""),
         (r" --ngransac \S+", ""),
         (r" dataset\.size=\w+", ""),
+        (r" '?dataset\.sets=\[\S*\]'?", ""),
         (r"FOLDER", "kept"),
         (r"(dataset\.layout=(\w+) dataset\.root=)FILES", r"\1FILES/\2"),
         (r" root=DIR", ""),
@@ -246,7 +249,7 @@ def run_all(some: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(workplace)))
     for command in some:
         print(command)
-        if "report" in command and not (workplace / "runs").exists():
+        if ("report" in command or "sweep runs" in command) and not (workplace / "runs").exists():
             run(smaller("python -m fmtorch.eval pipeline=sift_ratio"), workplace)
         run(smaller(command), workplace)
 

@@ -45,6 +45,61 @@ def test_a_missing_library_is_named(name: str, monkeypatch: pytest.MonkeyPatch) 
         presets.build("estimator", name)
 
 
+@pytest.mark.parametrize("name", ["poselib", "poselib_shared_focal"])
+def test_poselib_gets_the_options_that_are_named(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[tuple[np.ndarray, dict[str, object], dict[str, object]]] = []
+
+    def found(x0: np.ndarray, x1: np.ndarray, *rest: object) -> None:
+        seen.append((x0, *rest[-2:]))
+        raise RuntimeError("enough")
+
+    known = types.SimpleNamespace(
+        RansacOptions=lambda: {"real_focal_check": False}, estimate_fundamental=found,
+        estimate_shared_focal_relative_pose=found,
+    )  # fmt: skip
+    monkeypatch.setitem(sys.modules, "poselib", known)
+    c = scene(0, 40)
+    named = {"threshold": 0.5, "iterations": 500, "prosac": True, "loss": "huber", "loss_scale": 0.3}
+    presets.build("estimator", name, **named)(c, 7)
+    x0, options, refinement = seen.pop()
+    expected = {"max_epipolar_error": 0.5, "success_prob": 0.9999, "max_iterations": 500, "min_iterations": 500}
+    assert options == expected | {"progressive_sampling": True, "seed": 7}
+    assert refinement == {"loss_type": "HUBER", "loss_scale": 0.3}
+    with pytest.raises(ValueError, match="loss is 'l3'; it must be one of: trivial, truncated"):
+        presets.build("estimator", name, loss="l3")
+    if name == "poselib":
+        presets.build("estimator", name, real_focal_check=True, prosac=True)(c)
+        centred, options, _ = seen.pop()
+        assert options["real_focal_check"] is True
+        assert np.allclose(x0 - centred, [(c.size0[0, 1] - 1) / 2, (c.size0[0, 0] - 1) / 2])
+        monkeypatch.setattr(known, "RansacOptions", dict)
+        with pytest.raises(ValueError, match="no real_focal_check"):
+            presets.build("estimator", name, real_focal_check=True)
+
+
+def test_the_check_of_focal_lengths_leaves_pixels_as_they_are() -> None:
+    pytest.importorskip("poselib")
+    c, clean = scene(0, 200, outliers=0.2, noise=0.1), scene(0, 200, outliers=0.0, noise=0.0)
+    estimate = presets.build("estimator", "poselib", real_focal_check=True)(c)
+    assert float(geometry.sampson(estimate.F, clean.x0.double(), clean.x1.double()).median()) < 0.5
+
+
+def test_superansac_does_the_same_at_every_call() -> None:
+    """Its binding changes the settings that it is given."""
+    pytest.importorskip("pysuperansac")
+    estimator, c = presets.build("estimator", "superansac_cpp"), scene(0, 200, outliers=0.2, noise=0.1)
+    first, *others = (estimator(c).inliers for _ in range(3))
+    assert first.sum() > 100
+    assert all(torch.equal(first, other) for other in others)
+
+
+def test_unknown_parts_of_superansac_are_refused_with_the_choices() -> None:
+    with pytest.raises(ValueError, match="sampler is 'napsac'; it must be one of: uniform, prosac, importance"):
+        presets.build("estimator", "superansac_cpp", sampler="napsac")
+    with pytest.raises(ValueError, match="score is 'lmeds'; it must be one of: ransac, msac, magsac"):
+        presets.build("estimator", "superansac_cpp", score="lmeds")
+
+
 @pytest.mark.parametrize("name", ["magsac_cpp", "gc_ransac_cpp"])
 def test_an_unknown_sampler_is_refused_with_the_choices(name: str) -> None:
     with pytest.raises(ValueError, match="sampler is 'napsac'; it must be one of: uniform, prosac, progressive_napsac"):

@@ -1,11 +1,26 @@
-"""MAGSAC++, GC-RANSAC and DEGENSAC as their authors published them (extra `peers`)."""
+"""MAGSAC++, GC-RANSAC, DEGENSAC and SupeRANSAC as their authors published them (extra `peers`)."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import TypeVar
+
+import numpy as np
+
 from fmtorch.estimators.peers.pairwise import Pair, PairwiseEstimator, Solution, peer, solution, within
+
+Part = TypeVar("Part", int, str)
 
 # The numbers of the samplers in the authors' bindings of MAGSAC++ and GC-RANSAC.
 SAMPLERS = {"uniform": 0, "prosac": 1, "progressive_napsac": 2, "importance": 3, "adaptive": 4}
+# The names of the parts in the binding of SupeRANSAC.
+SUPERANSAC_SAMPLERS = {
+    "uniform": "Uniform",
+    "prosac": "PROSAC",
+    "importance": "ImportanceSampler",
+    "adaptive": "ARSampler",
+}
+SUPERANSAC_SCORES = {"ransac": "RANSAC", "msac": "MSAC", "magsac": "MAGSAC"}
 
 
 def magsac_cpp(
@@ -103,8 +118,60 @@ def degensac_cpp(*, threshold: float = 0.5, confidence: float = 0.9999, iteratio
     return PairwiseEstimator("DEGENSAC", solve)
 
 
+def superansac_cpp(
+    *,
+    threshold: float = 1.5,
+    confidence: float = 0.9999,
+    iterations: int = 10000,
+    sampler: str = "prosac",
+    score: str = "magsac",
+) -> PairwiseEstimator:
+    """SupeRANSAC by its author (Barath, arXiv 2506.04803), with nested RANSAC and a final iterated least-squares fit.
+
+    It takes no seed. Its graph cut and progressive NAPSAC are left out: they refuse negative coordinates.
+
+    Args:
+        threshold: pixels.
+        confidence: of having drawn a sample without an outlier, at which the search ends.
+        iterations: samples at most.
+        sampler: one of `SUPERANSAC_SAMPLERS`.
+        score: one of `SUPERANSAC_SCORES`.
+
+    Returns:
+        The estimator.
+
+    Raises:
+        ImportError: where `pysuperansac` is not installed.
+        ValueError: for another sampler or score.
+    """
+    named = _named("sampler", sampler, SUPERANSAC_SAMPLERS), _named("score", score, SUPERANSAC_SCORES)
+    library = peer("pysuperansac", "SupeRANSAC")
+
+    def solve(pair: Pair) -> Solution:
+        settings = (
+            library.RANSACSettings()
+        )  # each call divides the threshold of its settings by the scale of the points
+        settings.sampler = getattr(library.SamplerType, named[0])
+        settings.scoring = getattr(library.ScoringType, named[1])
+        settings.inlier_threshold, settings.confidence = threshold, confidence
+        settings.min_iterations, settings.max_iterations = min(1000, iterations), iterations
+        (h0, w0), (h1, w1) = pair.size0, pair.size1
+        weights = pair.likelihood.tolist() if sampler in ("importance", "adaptive") else []
+        F, found, _, _ = library.estimateFundamentalMatrix(pair.joined, [w0, h0, w1, h1], weights, settings)
+        inliers = np.zeros(len(pair.x0), dtype=np.bool_)
+        inliers[found] = True
+        return solution(F, inliers)
+
+    return PairwiseEstimator("SupeRANSAC", solve, best_first=sampler == "prosac")
+
+
 def _sampler(name: str) -> int:
     """The number of a sampler of `SAMPLERS`; raises ValueError for any other name."""
-    if name not in SAMPLERS:
-        raise ValueError(f"sampler is {name!r}; it must be one of: {', '.join(SAMPLERS)}")
-    return SAMPLERS[name]
+    return _named("sampler", name, SAMPLERS)
+
+
+def _named(option: str, name: str, choices: Mapping[str, Part]) -> Part:
+    """What an option's value stands for; raises ValueError for a name that is not among its choices."""
+    if name not in choices:
+        raise ValueError(f"{option} is {name!r}; it must be one of: {', '.join(choices)}")
+    return choices[name]
