@@ -53,6 +53,7 @@ SLOW = (
     r"--marker rendered",
     r"--label",
     r"benchmark related .*(hardnet|hesaffnet)",
+    r"benchmark (paper|gc_ransac|sweep)",
 )
 
 PEERS = {"poselib": "poselib", "poselib_shared_focal": "poselib", "degensac_cpp": "pydegensac",
@@ -112,6 +113,7 @@ def smaller(command: str) -> list[str]:
         (r"--root DATA/\w+ (?=.*--root)", ""),
         (r" --ngransac \S+", ""),
         (r" dataset\.size=\w+", ""),
+        (r" '?dataset\.sets=\[\S*\]'?", ""),
         (r"FOLDER", "kept"),
         (r"(dataset\.layout=(\w+) dataset\.root=)FILES", r"\1FILES/\2"),
         (r" root=DIR", ""),
@@ -247,7 +249,7 @@ def run_all(some: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(workplace)))
     for command in some:
         print(command)
-        if "report" in command and not (workplace / "runs").exists():
+        if ("report" in command or "sweep runs" in command) and not (workplace / "runs").exists():
             run(smaller("python -m fmtorch.eval pipeline=sift_ratio"), workplace)
         run(smaller(command), workplace)
 
