@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from fmtorch.data import ImagePair, ImageSource
-from fmtorch.geometry.epipolar import fundamental_from_calibration
+from fmtorch.geometry import fundamental_from_calibration
 from fmtorch.types import Correspondences
 from scripts.benchmark import stress, stress_cases, stress_table
 from scripts.benchmark.stress_cases import RIGHT_PX, Case, on_plane, parallax
