@@ -24,8 +24,8 @@ def eight_point(points: Array, sample: Array, F: Array, draw: Array) -> int:
 
     As `minimal.eight_point_components`, in the order of the samples.
     """
-    X, N, A = np.empty((4, 8 * LANES)), np.empty((4, 8 * LANES)), np.empty(72 * LANES)
-    B, work, full_rank = np.empty(9 * LANES), np.empty(10 * LANES), np.empty(LANES, np.bool_)
+    X, N, A = np.empty((4, 8 * LANES)), np.empty((4, 8 * LANES)), np.empty((72, LANES))
+    B, work, full_rank = np.empty((9, LANES)), np.empty((10, LANES)), np.empty(LANES, np.bool_)
     centre, scale, f = np.empty((4, LANES)), np.empty((2, LANES)), np.empty(9)
     models = 0
     for first in range(0, sample.shape[1], LANES):
@@ -39,7 +39,7 @@ def eight_point(points: Array, sample: Array, F: Array, draw: Array) -> int:
             if not (full_rank[lane] and scale[0, lane] > 0 and scale[1, lane] > 0):
                 continue
             for q in range(9):
-                f[q] = B[q * LANES + lane]
+                f[q] = B[q, lane]
             nearest_rank2(f)
             for image in range(2):
                 _denormalise(f, image, scale[image, lane], centre[2 * image, lane], centre[2 * image + 1, lane])

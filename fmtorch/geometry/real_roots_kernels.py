@@ -1,6 +1,6 @@
 """Real roots of polynomials of degree ten, LANES samples at a time, compiled: signs on a grid, then Newton.
 
-As in `five_point`: the projective line in two charts, in which flat buffers have the sample as their innermost axis.
+As in `five_point`: the projective line in two charts, in which buffers have the sample as their last axis.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ def real_roots(p: Array, count: int, usable: Array, lane: Array, chart: Array, z
 
     In chart 0 z is the root, in chart 1 its inverse.
     """
-    size, values = np.zeros(LANES), np.empty(2 * KNOTS * LANES)
+    size, values = np.zeros(LANES), np.empty((2 * KNOTS, LANES))
     ends, coefficients = np.empty((4, MOST)), np.empty((11, MOST))
     for d in range(11):
         for i in range(LANES):
-            size[i] = max(size[i], abs(p[d * LANES + i]))
+            size[i] = max(size[i], abs(p[d, i]))
     for i in range(LANES):
         usable[i] &= size[i] > 0 and math.isfinite(size[i])
     for c in range(2):
         for k in range(KNOTS):
-            o, x = (c * KNOTS + k) * LANES, _knot(c, k)
+            o, x = c * KNOTS + k, _knot(c, k)
             for i in range(LANES):
-                values[o + i] = p[(10 * c) * LANES + i]
+                values[o, i] = p[10 * c, i]
             for d in range(1, 11):
-                q = (d if c == 0 else 10 - d) * LANES
+                q = d if c == 0 else 10 - d
                 for i in range(LANES):
-                    values[o + i] = p[q + i] + values[o + i] * x
+                    values[o, i] = p[q, i] + values[o, i] * x
     found = 0
     for i in range(count):
         for c in range(2 if usable[i] else 0):
             for k in range(KNOTS - 1):
-                low, high = values[(c * KNOTS + k) * LANES + i], values[(c * KNOTS + k + 1) * LANES + i]
+                low, high = values[c * KNOTS + k, i], values[c * KNOTS + k + 1, i]
                 if (low < 0) != (high < 0) and found < MOST:
                     lane[found], chart[found] = i, c
                     ends[0, found], ends[1, found], ends[2, found], ends[3, found] = (
@@ -55,7 +55,7 @@ def real_roots(p: Array, count: int, usable: Array, lane: Array, chart: Array, z
                         high,
                     )
                     for d in range(11):
-                        coefficients[d, found] = p[(d if c == 0 else 10 - d) * LANES + i]
+                        coefficients[d, found] = p[d if c == 0 else 10 - d, i]
                     found += 1
     _polish(coefficients, ends, found, z)
     return found

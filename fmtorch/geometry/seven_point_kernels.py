@@ -23,8 +23,8 @@ def seven_point(points: Array, sample: Array, F: Array, draw: Array) -> int:
 
     They stand in the order of the samples, and of one sample in that of `minimal.seven_point_components`.
     """
-    X, A, B = np.empty((4, 7 * LANES)), np.empty(63 * LANES), np.empty(18 * LANES)
-    work, full_rank, p = np.empty(9 * LANES), np.empty(LANES, np.bool_), np.empty(4 * LANES)
+    X, A, B = np.empty((4, 7 * LANES)), np.empty((63, LANES)), np.empty((18, LANES))
+    work, full_rank, p = np.empty((9, LANES)), np.empty(LANES, np.bool_), np.empty((4, LANES))
     c, roots, valid, f = np.empty(4), np.empty(3), np.empty(3, np.bool_), np.empty(9)
     models = 0
     for first in range(0, sample.shape[1], LANES):
@@ -48,7 +48,7 @@ def seven_point(points: Array, sample: Array, F: Array, draw: Array) -> int:
                     a, b = (a + b) * HALF, (a - b) * HALF
                 finite = True
                 for q in range(9):
-                    f[q] = a * B[q * LANES + lane] + b * B[(9 + q) * LANES + lane]
+                    f[q] = a * B[q, lane] + b * B[9 + q, lane]
                     finite = finite and math.isfinite(f[q])
                 if finite and consistently_oriented(f, X, 7, LANES, lane):
                     for q in range(9):
@@ -64,16 +64,16 @@ def _determinants(B: Array, p: Array) -> None:
     for k in range(4):
         a, b = (1.0 - k, float(k)) if k < 2 else (HALF, HALF if k == 2 else -HALF)
         for i in range(LANES):
-            f0 = a * B[i] + b * B[9 * LANES + i]
-            f1 = a * B[LANES + i] + b * B[10 * LANES + i]
-            f2 = a * B[2 * LANES + i] + b * B[11 * LANES + i]
-            f3 = a * B[3 * LANES + i] + b * B[12 * LANES + i]
-            f4 = a * B[4 * LANES + i] + b * B[13 * LANES + i]
-            f5 = a * B[5 * LANES + i] + b * B[14 * LANES + i]
-            f6 = a * B[6 * LANES + i] + b * B[15 * LANES + i]
-            f7 = a * B[7 * LANES + i] + b * B[16 * LANES + i]
-            f8 = a * B[8 * LANES + i] + b * B[17 * LANES + i]
-            p[k * LANES + i] = f0 * (f4 * f8 - f5 * f7) + f1 * (f5 * f6 - f3 * f8) + f2 * (f3 * f7 - f4 * f6)
+            f0 = a * B[0, i] + b * B[9, i]
+            f1 = a * B[1, i] + b * B[10, i]
+            f2 = a * B[2, i] + b * B[11, i]
+            f3 = a * B[3, i] + b * B[12, i]
+            f4 = a * B[4, i] + b * B[13, i]
+            f5 = a * B[5, i] + b * B[14, i]
+            f6 = a * B[6, i] + b * B[15, i]
+            f7 = a * B[7, i] + b * B[16, i]
+            f8 = a * B[8, i] + b * B[17, i]
+            p[k, i] = f0 * (f4 * f8 - f5 * f7) + f1 * (f5 * f6 - f3 * f8) + f2 * (f3 * f7 - f4 * f6)
 
 
 @inner
@@ -84,10 +84,10 @@ def _coefficients(p: Array, lane: int, c: Array) -> tuple[bool, bool]:
     """
     best = 0
     for k in range(1, 4):
-        if abs(p[k * LANES + lane]) > abs(p[best * LANES + lane]):
+        if abs(p[k, lane]) > abs(p[best, lane]):
             best = k
     turned, exchanged = best >= 2, best == 0 or best == 2
-    first, last, plus, minus = p[lane], p[LANES + lane], p[2 * LANES + lane], p[3 * LANES + lane]
+    first, last, plus, minus = p[0, lane], p[1, lane], p[2, lane], p[3, lane]
     if turned:
         first, last, plus, minus = plus, minus, first, last
     s, d = plus * 2**1.5, minus * 2**1.5

@@ -1,4 +1,4 @@
-"""Runs of `fmtorch.eval` in one table: a line for each family and pipeline.
+"""Runs of `fmtorch.eval` in one table: a line for each family and pipeline, of pairs that all runs of a data set have.
 
 python -m scripts.benchmark sweep runs --markdown docs/paper.md
 """
@@ -32,9 +32,10 @@ def add_arguments(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     groups: dict[tuple[str, str], Mapping[str, Any]] = {}
-    for path in run_folders(arguments.runs):
-        folder = RunFolder.load(path)
-        summary = summarize(folder.read())
+    folders = [RunFolder.load(path) for path in run_folders(arguments.runs)]
+    for folder in folders:
+        alike = [other for other in folders if other.config["dataset"] == folder.config["dataset"]]
+        summary = summarize(folder.read(set.intersection(*(other.done() for other in alike))))
         groups |= {(family, folder.config["pipeline"]): group for family, group in summary.items() if family != ALL}
     sheet = table(groups)
     console.print(sheet.terminal())
