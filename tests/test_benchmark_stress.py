@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from fmtorch.data import ImagePair, ImageSource
-from fmtorch.geometry.epipolar import fundamental_from_calibration
+from fmtorch.geometry import fundamental_from_calibration
 from fmtorch.types import Correspondences
 from scripts.benchmark import stress, stress_cases, stress_table
 from scripts.benchmark.stress_cases import RIGHT_PX, Case, on_plane, parallax
@@ -110,7 +110,7 @@ def test_an_interrupted_run_goes_on_and_its_tables_stand_in_the_page(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     specs = tmp_path / "specs.txt"
-    specs.write_text("opencv_lmeds\nopencv_ransac\n(opencv_lmeds@ratio_prior+sizeless)\n")
+    specs.write_text("opencv_lmeds\n(opencv_lmeds@ratio_prior+sizeless)\n")
     page = tmp_path / "page.md"
     names = [f"stress {sweep}" for sweep in ("noise", "conditions")]
     page.write_text("".join(f"<!-- {name} -->\n<!-- end {name} -->\n" for name in names))
