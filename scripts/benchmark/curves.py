@@ -128,7 +128,8 @@ def table(
     whole = list(figures)[-1]
     shown = [group for group in figures if group.endswith("baselines")] or [whole]
     lines = [
-        f"Median milliseconds of processor time over all pairs, and R.05 / R.01 / AUC@0.05 in %; {seeds} seeds. "
+        "Median milliseconds of processor time over all pairs, and R.05 / R.01 / AUC@0.05 in %; "
+        f"{seeds} {'seed' if seeds == 1 else 'seeds'}. "
         "The knee of each curve, chosen on tuning data, is in bold.",
         "",
         f"| | | ms | {' | '.join(shown)} |",

@@ -10,7 +10,7 @@ from fmtorch.evaluation.curves import style
 
 Figures = Mapping[str, Mapping[str, Mapping[str, float]]]
 
-_WIDTH, _HEIGHT, _LEGEND = 380, 300, 210  # of a panel, and the width of the legend, px
+_WIDTH, _HEIGHT, _LEGEND = 380, 300, 260  # of a panel, and the width of the legend, px
 _LEFT, _RIGHT, _TOP, _BOTTOM = 40, 14, 28, 40  # margins of a panel
 _TICKS = (1, 2, 5, 10, 20, 50, 100, 200, 500)  # ms
 _COLOURS = (
