@@ -67,13 +67,13 @@ def recall_table(figures: Groups, pairs: list[ImagePair], seeds: int) -> str:
 
 
 def difference_table(figures: Groups, pairs: list[ImagePair], seeds: int) -> str:
-    """What the first estimator is ahead of each by, on wide and on short baselines, with intervals; times."""
+    """The lead of the first estimator over each, on wide and on short baselines, with intervals; times."""
     counts = {group: int(inside.sum()) for group, inside in groups(pairs).items()}
     shown = [group for group in figures if group.endswith("baselines")] or [list(figures)[-1]]
     first = next(iter(figures[shown[0]]))
     head = ["estimator"]
     for group in shown:
-        head += [f"{group} ({counts[group]})", "ahead, R.01", "ahead, AUC@0.05"]
+        head += [f"{group} ({counts[group]})", "lead, R.01", "lead, AUC@0.05"]
     lines = [f"| {' | '.join([*head, 'time'])} |", f"| --- {'| ---: ' * (len(head))}|"]
     for spec, whole in figures[list(figures)[-1]].items():
         cell = [f"`{spec}`"]
@@ -86,8 +86,8 @@ def difference_table(figures: Groups, pairs: list[ImagePair], seeds: int) -> str
         for group in shown
     ]
     note = (
-        f"What `{first}` is ahead by: mean difference of recall at 0.01 and of AUC@0.05, in points, with its 95 % "
-        f"interval ({'; '.join(places)}); {seeds} seeds. "
+        f"Lead of `{first}` over each estimator: mean difference of recall at 0.01 and of AUC@0.05, in points, with "
+        f"its 95 % interval ({'; '.join(places)}); {seeds} seeds. "
         f"Time: median ratio to that of `{first}`, pair by pair."
     )
     return "\n".join([note, "", *lines])
