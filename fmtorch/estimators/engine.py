@@ -68,8 +68,8 @@ class HypothesizeAndVerify:
         focal: `Focal`, the prior on focal lengths, where the image sizes are known: for whole photographs, not crops.
             Models of five matches and drawn focal lengths are searched first, in rounds, until all good candidates are
             one model or a round finds the best one before it again, and the stopping rule is content. They suffice for
-            a pair whose images have one size, or whose good candidates are one model, if that rule is content; other
-            pairs are searched without assumptions, too, and both kinds compared. Needs `select`.
+            a pair whose images have one size, if that rule is content; other pairs are searched without assumptions,
+            too, and both kinds compared. Needs `select`.
         inliers: `threshold`, `lmeds` (2.5 robust standard deviations) or `median` (the better half).
         inlier_threshold: of the inliers reported and of the stopping rule, Sampson distance in pixels; None: the
             threshold.

@@ -78,6 +78,14 @@ class NormalizedPairs:
         return self.size0 is not None and self.size1 is not None
 
     @property
+    def same_size(self) -> list[bool]:
+        """Whether both images of each pair have one size. Of pairs whose sizes are known."""
+        assert self.size0 is not None
+        assert self.size1 is not None
+        same: list[bool] = (self.size0 == self.size1).all(-1).tolist()
+        return same
+
+    @property
     def requires_grad(self) -> bool:
         """Whether a gradient can reach points, prior or noise."""
         inputs = (self.points, self.prior, self.noise)

@@ -48,8 +48,7 @@ class Verbs:
         """The selection among plausible cameras, the candidates selected, and the pairs which these do not settle.
 
         Rounds go on until good candidates are one model, or a round finds the best of those before it again, and the
-        stopping rule is content. A pair is settled if that rule is content and its images have one size or its good
-        candidates are one model.
+        stopping rule is content. A pair is settled if that rule is content and its images have one size.
         """
         some, rows = pairs, list(range(len(pairs)))
         selection: Any = None
@@ -69,7 +68,7 @@ class Verbs:
             agreed = [one or two for one, two in zip(candidates.unambiguous(), again, strict=True)]
             last = turn + 1 == focal.rounds
             ended = [last or (turn + 1 >= focal.min_rounds and a and e) for a, e in zip(agreed, enough, strict=True)]
-            settled = [a and e for a, e in zip(candidates.decided(some), enough, strict=True)]
+            settled = [a and e for a, e in zip(some.same_size, enough, strict=True)]
             unsettled += [row for row, over, one in zip(rows, ended, settled, strict=True) if over and not one]
             left = [i for i, over in enumerate(ended) if not over]
             rows = [rows[i] for i in left]

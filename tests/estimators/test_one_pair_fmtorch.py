@@ -148,7 +148,7 @@ def test_candidates_and_the_choice_among_them(count: int, same_size: bool) -> No
     np.testing.assert_allclose(found.F, expected.F[:, 0, :5].T.numpy(), atol=1e-6)
     np.testing.assert_allclose(found.cameras.focal, expected.cameras.focal[:, 0, :5].T.numpy(), atol=1e-6)
     np.testing.assert_allclose(found.posterior, expected.posterior[0, :5].numpy(), rtol=0.02, atol=0.1)
-    assert found.decided(pair) == expected.decided(pairs)
+    assert pair.same_size == pairs.same_size == [same_size]
     assert found.unambiguous() == expected.unambiguous()
     assert found.same_best(found) == expected.same_best(expected) == [True]
     assert CentredPair.of(pair).same_size == same_size
@@ -160,17 +160,17 @@ def test_candidates_and_the_choice_among_them(count: int, same_size: bool) -> No
         assert mine.found == bool(theirs.found)
 
 
-def test_candidates_that_differ_decide_nothing() -> None:
-    pairs, pair = sized(60, same=False)
+def test_the_best_candidates_of_two_rounds_are_one_model_or_not() -> None:
+    pairs, _ = sized(60, same=False)
     F = searched(pairs, 2).double().numpy()
     cameras = TwoCameras(np.zeros((2, 2, 3, 3)), np.zeros((2, 2)))
-    for posterior, same, decided in (([5.0, 4.9], False, False), ([5.0, 1.0], False, True), ([5.0, 4.9], True, True)):
+    for posterior, same, one in (([5.0, 4.9], False, False), ([5.0, 1.0], False, True), ([5.0, 4.9], True, True)):
         both_ = np.stack([F[0], F[0] if same else F[1]])
-        assert Candidates(both_, np.array(posterior), cameras).decided(pair) == [decided]
+        assert Candidates(both_, np.array(posterior), cameras).unambiguous() == [one]
         alone = Candidates(both_[1:], np.array([1.0]), cameras)
         assert Candidates(both_, np.array(posterior), cameras).same_best(alone) == [same]
     nothing = Candidates(F, np.full(2, -np.inf), cameras)
-    assert nothing.decided(pair) == nothing.same_best(nothing) == [False]
+    assert nothing.unambiguous() == nothing.same_best(nothing) == [False]
     assert not nothing.selection(250).found
 
 

@@ -71,13 +71,6 @@ class Candidates:
         F, cameras, posterior = self.best()
         return Selection(F, cameras, torch.isfinite(posterior), draws)
 
-    def decided(self, pairs: NormalizedPairs) -> list[bool]:
-        """Whether these candidates may suffice: for images of one size, or where all good ones are one model."""
-        assert pairs.size0 is not None
-        assert pairs.size1 is not None
-        decided: list[bool] = ((pairs.size0 == pairs.size1).all(-1) | self._unambiguous()).tolist()
-        return decided
-
     def same_best(self, other: Candidates) -> list[bool]:
         """Whether the best candidates of both are one and the same model."""
         (mine, _, posterior), (theirs, _, their_posterior) = self.best(), other.best()
@@ -87,13 +80,10 @@ class Candidates:
 
     def unambiguous(self) -> list[bool]:
         """Whether all good candidates are one and the same model."""
-        one: list[bool] = self._unambiguous().tolist()
-        return one
-
-    def _unambiguous(self) -> Bool[Tensor, " p"]:
         posterior, order = torch.sort(self.posterior, dim=1, descending=True, stable=True)
         F = self.F.gather(2, order.expand(9, -1, -1))
-        return torch.isfinite(posterior[:, 0]) & ~_rivals(F, posterior, SAME_CAMERAS)
+        one: list[bool] = (torch.isfinite(posterior[:, 0]) & ~_rivals(F, posterior, SAME_CAMERAS)).tolist()
+        return one
 
 
 class FocalSelection:

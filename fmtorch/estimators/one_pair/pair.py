@@ -52,6 +52,12 @@ class OnePair:
         """Whether the sizes of the images are known."""
         return self.sizes is not None
 
+    @property
+    def same_size(self) -> list[bool]:
+        """As `NormalizedPairs.same_size`."""
+        assert self.sizes is not None
+        return [bool((self.sizes[0] == self.sizes[1]).all())]
+
     @functools.cached_property
     def points32(self) -> Array:
         """The points as scores take them, float32."""

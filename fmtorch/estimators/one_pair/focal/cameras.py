@@ -59,5 +59,4 @@ def _centred(pair: OnePair) -> CentredPair:
     pixel = 0.0 if middle.max() < MIN_IMAGE_SIDE_PX else 1.0
     offset = (pair.centre - (middle - pixel) / 2) / pair.pixels_per_unit
     longest = pair.sizes.max(1) / pair.pixels_per_unit
-    same = bool((pair.sizes[0] == pair.sizes[1]).all())
-    return CentredPair(pair.points + offset[:, None], offset, longest, same)
+    return CentredPair(pair.points + offset[:, None], offset, longest, pair.same_size[0])

@@ -9,7 +9,7 @@ import numpy as np
 
 from fmtorch.estimators.focal import selection
 from fmtorch.estimators.focal.selection import MIN_GAIN_SHARE, RIVAL_GAIN_SHARE, SAME_CAMERAS, SAME_MODEL
-from fmtorch.estimators.one_pair.focal.cameras import CentredPair, TwoCameras
+from fmtorch.estimators.one_pair.focal.cameras import TwoCameras
 from fmtorch.estimators.one_pair.focal.posterior import refine_with_prior
 from fmtorch.estimators.one_pair.models import Pool
 from fmtorch.estimators.one_pair.pair import Array, OnePair
@@ -52,10 +52,6 @@ class Candidates:
         """As `selection.Candidates.selection`."""
         best = self.best()
         return Selection(self.F[best], bool(np.isfinite(self.posterior[best])), draws, self.cameras.of(best))
-
-    def decided(self, pair: OnePair) -> list[bool]:
-        """As `selection.Candidates.decided`."""
-        return [CentredPair.of(pair).same_size or self.unambiguous()[0]]
 
     def same_best(self, other: Candidates) -> list[bool]:
         """As `selection.Candidates.same_best`."""
