@@ -69,6 +69,14 @@ def test_gms_tries_scales_on_wide_baselines_alone() -> None:
         assert not usual.pruners_of("CPC")["gms"].with_scale  # type: ignore[attr-defined]
 
 
+def test_those_of_a_pruner_that_others_replace_go_with_it() -> None:
+    config = compose("match", ("pipeline=sift_gms", "pruner=[ratio]"))
+    presets.expect_stages(config)
+    assert [list(entry) for entry in presets.stages(config)["pruner"]] == [["ratio"]]
+    pipeline = presets.pipeline("sift_gms", overrides=["pruner=[lpm,ratio]"])
+    assert list(pipeline.pruners_of("CPC")) == ["lpm", "ratio"]
+
+
 def test_they_are_part_of_the_stages_of_a_run_and_come_back_from_them() -> None:
     config = compose("match", ("pipeline=sift_gms_paper",))
     stages = presets.stages(config)

@@ -29,7 +29,12 @@ def pruner_configs(config: DictConfig) -> dict[str, Any]:
             "pruner: a `_target_` stands where the names of pruners belong; the `# @package` line of a preset of yours "
             "must be `# @package pruner.<name>`, or be left out"
         )
-    return {str(name): value for name, value in plain.items()}
+    return {str(name): value for name, value in plain.items() if not _left_over(value)}
+
+
+def _left_over(value: Any) -> bool:
+    """Whether a pipeline's preset says this of a pruner that others have taken the place of."""
+    return isinstance(value, Mapping) and set(value) == {FAMILIES}
 
 
 def expect_pruners(config: DictConfig) -> None:

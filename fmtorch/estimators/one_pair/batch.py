@@ -59,4 +59,6 @@ def estimated(c: Correspondences, seed: int, least: int, solve: Callable[[OnePai
     mapped(some, parts)
     ok = [not reason for reason in reasons]
     matrices, flags, verdicts = torch.from_numpy(F), torch.from_numpy(inliers), torch.from_numpy(significance)
-    return Estimate(matrices, flags, torch.tensor(ok), tuple(reasons), torch.from_numpy(draws), verdicts)
+    return Estimate(
+        matrices, flags, torch.tensor(ok, dtype=torch.bool), tuple(reasons), torch.from_numpy(draws), verdicts
+    )
