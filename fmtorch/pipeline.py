@@ -97,18 +97,18 @@ class Pipeline:
     def _batched(
         self, stage: str, function: Callable[[list[Outcome]], list[Outcome]], outcomes: Sequence[Outcome]
     ) -> list[Outcome]:
-        """A batched stage over the pairs that live; where it raises, once more pair by pair: only the culprit fails."""
-        alive = [i for i, outcome in enumerate(outcomes) if outcome.correspondences is not None]
+        """A batched stage over the pairs with matches; where it raises, pair by pair: only the culprit fails."""
+        matched = [i for i, outcome in enumerate(outcomes) if outcome.correspondences is not None]
         start = time.perf_counter()
         with one_thread(self.device):
             try:
-                made = function([outcomes[i] for i in alive]) if alive else []
+                made = function([outcomes[i] for i in matched]) if matched else []
             except Exception:  # whose fault it is shows pair by pair
-                made = [_alone(stage, function, outcomes[i]) for i in alive]
+                made = [_alone(stage, function, outcomes[i]) for i in matched]
         _synchronise(self.device)
-        share = (time.perf_counter() - start) / max(len(alive), 1)
+        share = (time.perf_counter() - start) / max(len(matched), 1)
         result = list(outcomes)
-        for i, outcome in zip(alive, made, strict=True):
+        for i, outcome in zip(matched, made, strict=True):
             result[i] = dataclasses.replace(outcome, seconds={**outcome.seconds, stage: share})
         return result
 
@@ -175,15 +175,15 @@ class Pipeline:
 
 def _expect_finite(estimate: Estimate) -> Estimate:
     """The estimate, whose pairs are not ok where F is no matrix: anybody's estimator may have made it."""
-    sound = torch.isfinite(estimate.F).flatten(1).all(1) & (estimate.F != 0).flatten(1).any(1)
-    wrong = (estimate.ok & ~sound).tolist()
+    valid = torch.isfinite(estimate.F).flatten(1).all(1) & (estimate.F != 0).flatten(1).any(1)
+    wrong = (estimate.ok & ~valid).tolist()
     if not any(wrong):
         return estimate
     said = "estimation: F is zero or not finite, though the estimator calls it ok"
     reason = tuple(said if bad else old for bad, old in zip(wrong, estimate.reason, strict=True))
-    keep = sound[:, None]
+    keep = valid[:, None]
     F, inliers = torch.where(keep[..., None], estimate.F, 0), estimate.inliers & keep
-    return estimate.replace(F=F, inliers=inliers, ok=estimate.ok & sound, reason=reason, significance=None)
+    return estimate.replace(F=F, inliers=inliers, ok=estimate.ok & valid, reason=reason, significance=None)
 
 
 def _collated(outcomes: list[Outcome]) -> Correspondences:

@@ -22,13 +22,13 @@ PER_MATCH: dict[str, tuple[Callable[[Any], Any], str]] = {
 SIZE = "image sizes (h, w) are positive"
 
 
-def wrong_values(c: Correspondences, live: Bool[Tensor, "b n"]) -> dict[str, Int[Tensor, " b"]]:
-    """How many values of each argument are wrong, in each pair; in slots other than `live` nothing is."""
+def wrong_values(c: Correspondences, mask: Bool[Tensor, "b n"]) -> dict[str, Int[Tensor, " b"]]:
+    """How many values of each argument are wrong, in each pair; in slots other than `mask` nothing is."""
     wrong = {}
     for name, (right, _) in PER_MATCH.items():
         value = getattr(c, name)
         if value is not None:
-            wrong[name] = (live & ~right(value.detach())).sum(1)
+            wrong[name] = (mask & ~right(value.detach())).sum(1)
     for name in ("size0", "size1"):
         value = getattr(c, name)
         if value is not None:

@@ -66,15 +66,15 @@ def _pair(
     Scores are one less the matcher's figure, a ratio, and 1 where there is none. Raises ValueError for matches that are
     at no keypoint.
     """
-    live = c.mask[0].cpu()
+    mask = c.mask[0].cpu()
     index = [
-        indices(journal.image(end).points, x[0].detach().cpu().float()[live].numpy())
+        indices(journal.image(end).points, x[0].detach().cpu().float()[mask].numpy())
         for end, x in zip(ends, (c.x0, c.x1), strict=True)
     ]
-    quality = torch.zeros(len(live)) if c.quality is None else c.quality[0].detach().cpu().float()
-    scores = (1 - quality[live]).nan_to_num(0.0).clamp(0.0, 1.0)
+    quality = torch.zeros(len(mask)) if c.quality is None else c.quality[0].detach().cpu().float()
+    scores = (1 - quality[mask]).nan_to_num(0.0).clamp(0.0, 1.0)
     name0, name1 = (journal.name(end) for end in ends)
     return ExportedPair(
-        name0, name1, np.stack(index, -1).astype(np.int32), scores.numpy(), inliers.cpu()[live].numpy(),
+        name0, name1, np.stack(index, -1).astype(np.int32), scores.numpy(), inliers.cpu()[mask].numpy(),
         F.detach().cpu().double().numpy(), related,
     )  # fmt: skip

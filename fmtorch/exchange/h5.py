@@ -38,7 +38,7 @@ def opened(path: Path) -> Iterator[Any]:
     except FileNotFoundError as error:
         raise DataError(f"{path}: no such file") from error
     except OSError as error:
-        raise DataError(f"{path}: is no sound HDF5 file ({_first_line(error)})") from error
+        raise DataError(f"{path}: is not a valid HDF5 file ({_first_line(error)})") from error
     with file:
         yield file
 

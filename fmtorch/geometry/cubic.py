@@ -23,12 +23,12 @@ def cubic_roots(
     Differentiable by the implicit function theorem, with a finite gradient at multiple roots. Best in float64.
     """
     scale = coefficients.detach().abs().amax(0)
-    usable = scale.isfinite() & (scale > 0)
-    c = torch.where(usable, coefficients, 1.0) / torch.where(usable, scale, 1.0)
+    scalable = scale.isfinite() & (scale > 0)
+    c = torch.where(scalable, coefficients, 1.0) / torch.where(scalable, scale, 1.0)
     c = torch.where(c.abs() < _NEGLIGIBLE, 0.0, c)
     with torch.no_grad():
         roots, valid = _closed_form(*c.detach())
-        valid = valid & usable
+        valid = valid & scalable
         roots = torch.where(valid, roots, 0.0)
         for _ in range(_POLISHING_STEPS):
             f, slope = _evaluate(c, roots)

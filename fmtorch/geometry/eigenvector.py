@@ -60,8 +60,8 @@ def _inverse_power(M: Tensor) -> tuple[Tensor, Tensor]:
     """`smallest_eigenvector` with the matrix axes first: (n, n, *s) to (n, *s)."""
     n = M.shape[0]
     trace = component_sum(M.diagonal(dim1=0, dim2=1).movedim(-1, 0))
-    usable = trace > 0
-    A = M / torch.where(usable, trace, 1.0)
+    nonzero = trace > 0
+    A = M / torch.where(nonzero, trace, 1.0)
     for i in range(n):
         A[i, i] += SHIFT
     inverse_of_L = torch.eye(n, dtype=M.dtype, device=M.device)
@@ -77,7 +77,7 @@ def _inverse_power(M: Tensor) -> tuple[Tensor, Tensor]:
     inverse = outer_sum((inverse_of_L / D[:, None])[:, :, None], inverse_of_L[:, None])
     size = _trace(inverse)
     X = inverse = inverse / size
-    done = torch.zeros_like(usable)
+    done = torch.zeros_like(nonzero)
     for _ in range(_SQUARINGS):
         squared = outer_sum(X[:, :, None], X[:, None])
         trace = _trace(squared)
@@ -89,7 +89,7 @@ def _inverse_power(M: Tensor) -> tuple[Tensor, Tensor]:
     v = torch.gather(X, 0, best[None, None].expand(1, *X.shape[1:]))[0]
     v = v / component_sum(v * v).sqrt()
     across = (1 - component_sum(v * component_sum(inverse * v, 1))) * size  # the sum of 1 / eigenvalue over the others
-    return v, usable & (across * RANK_TOLERANCE < 1)
+    return v, nonzero & (across * RANK_TOLERANCE < 1)
 
 
 def _trace(X: Tensor) -> Tensor:

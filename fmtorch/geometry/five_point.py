@@ -142,19 +142,19 @@ def _determinant(B: Float[Tensor, "3 3 5 s"]) -> Float[Tensor, "11 s"]:
 
 
 def _solutions(
-    basis: Float[Tensor, "4 9 s"], B: Float[Tensor, "3 3 5 s"], usable: Bool[Tensor, " s"]
+    basis: Float[Tensor, "4 9 s"], B: Float[Tensor, "3 3 5 s"], valid: Bool[Tensor, " s"]
 ) -> tuple[Float[Tensor, "9 r"], Int[Tensor, " r"]]:
     p = _determinant(B)
     size = p.abs().amax(0)
-    usable = usable & size.isfinite() & (size > 0)
-    p = torch.where(usable, p, 0.0) / torch.where(usable, size, 1.0)
+    valid = valid & size.isfinite() & (size > 0)
+    p = torch.where(valid, p, 0.0) / torch.where(valid, size, 1.0)
     # The projective line in two charts, z from -1 to 1 and 1 / z from 1 down to -1: the degree is even, so signs fit.
     knots = torch.arange(GRID // 2 + 1, dtype=p.dtype, device=p.device) / (GRID // 4) - 1
     knots = torch.stack([knots, knots.flip(0)])
     charts = torch.stack([p, p.flip(0)], 1)
     values = _horner(charts[:, :, None], knots[:, :, None])
     negative = values < 0
-    sample, chart, interval = ((negative[:, :-1] != negative[:, 1:]) & usable).permute(2, 0, 1).nonzero(as_tuple=True)
+    sample, chart, interval = ((negative[:, :-1] != negative[:, 1:]) & valid).permute(2, 0, 1).nonzero(as_tuple=True)
     low, high = ((knots[chart, interval + k], values[chart, interval + k, sample]) for k in (0, 1))
     z = _polished(charts[:, chart, sample], *low, *high)
     far = chart == 1
@@ -172,8 +172,8 @@ def _solutions(
     )
     E = component_sum(basis.index_select(2, sample) * weights[:, None])
     norm = component_sum(E * E).sqrt()
-    sound = norm.isfinite() & (norm > 0)
-    return (E / norm)[:, sound], sample[sound]
+    valid = norm.isfinite() & (norm > 0)
+    return (E / norm)[:, valid], sample[valid]
 
 
 def _horner(p: Float[Tensor, c * s], z: Tensor) -> Tensor:

@@ -55,8 +55,8 @@ def five_point(points: Array, sample: Array, depth: Array, offset: Array, F: Arr
         count = real_roots(p, min(LANES, sample.shape[1] - first), full_rank, lane, chart, z)
         for r in range(count):
             i = lane[r]
-            sound = _essential(B, e, i, chart[r] == 1, z[r], E) and consistently_oriented(E, X, 5, LANES, i)
-            if sound and _uncalibrated(E, depth[0, first + i], depth[1, first + i], offset, F[models]):
+            valid = _essential(B, e, i, chart[r] == 1, z[r], E) and consistently_oriented(E, X, 5, LANES, i)
+            if valid and _uncalibrated(E, depth[0, first + i], depth[1, first + i], offset, F[models]):
                 draw[models] = first + i
                 models += 1
     return models

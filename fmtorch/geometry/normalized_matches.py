@@ -32,8 +32,8 @@ class NormalizedMatches:
         p, n = math.prod(x0.shape[:-2]), x0.shape[-2]
         x = torch.cat([x0, x1], -1).to(torch.float64).reshape(p, n, 4)
         w = torch.ones_like(x[..., 0]) if weight is None else weight.to(torch.float64).reshape(p, n)
-        usable = torch.isfinite(x).all(-1) & torch.isfinite(w)
-        mask = usable if mask is None else usable & mask.reshape(p, n)
+        finite = torch.isfinite(x).all(-1) & torch.isfinite(w)
+        mask = finite if mask is None else finite & mask.reshape(p, n)
         self.counts = mask.reshape(x0.shape[:-1])
         self._order = order = torch.argsort((~mask).to(torch.uint8), dim=1, stable=True)
         self._mask = mask = mask.gather(1, order)

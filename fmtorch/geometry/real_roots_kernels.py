@@ -20,7 +20,7 @@ MOST = 10 * LANES  # roots of LANES polynomials
 
 
 @inner
-def real_roots(p: Array, count: int, usable: Array, lane: Array, chart: Array, z: Array) -> int:
+def real_roots(p: Array, count: int, valid: Array, lane: Array, chart: Array, z: Array) -> int:
     """Real roots of p (11, LANES) of `count` samples -> lane, chart, z (MOST,), in their order; how many there are.
 
     In chart 0 z is the root, in chart 1 its inverse.
@@ -31,7 +31,7 @@ def real_roots(p: Array, count: int, usable: Array, lane: Array, chart: Array, z
         for i in range(LANES):
             size[i] = max(size[i], abs(p[d, i]))
     for i in range(LANES):
-        usable[i] &= size[i] > 0 and math.isfinite(size[i])
+        valid[i] &= size[i] > 0 and math.isfinite(size[i])
     for c in range(2):
         for k in range(KNOTS):
             o, x = c * KNOTS + k, _knot(c, k)
@@ -43,7 +43,7 @@ def real_roots(p: Array, count: int, usable: Array, lane: Array, chart: Array, z
                     values[o, i] = p[q, i] + values[o, i] * x
     found = 0
     for i in range(count):
-        for c in range(2 if usable[i] else 0):
+        for c in range(2 if valid[i] else 0):
             for k in range(KNOTS - 1):
                 low, high = values[c * KNOTS + k, i], values[c * KNOTS + k + 1, i]
                 if (low < 0) != (high < 0) and found < MOST:

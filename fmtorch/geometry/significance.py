@@ -73,8 +73,8 @@ def significance(
         return for_each_pair(_into, (F, x0, x1, mask, *sizes), out=out, kind=torch.float64)[:, 0]
     mask = mask & (x0.abs() < FARTHEST).all(-1) & (x1.abs() < FARTHEST).all(-1)
     points = [torch.where(mask[..., None], x, 0).to(torch.float64) for x in (x0, x1)]
-    sound = torch.isfinite(F).flatten(1).all(1) & (F != 0).flatten(1).any(1)
-    F = torch.where(sound[:, None, None], F, 0).to(torch.float64)
+    valid = torch.isfinite(F).flatten(1).all(1) & (F != 0).flatten(1).any(1)
+    F = torch.where(valid[:, None, None], F, 0).to(torch.float64)
     chance = torch.zeros_like(points[0][..., 0])
     place = torch.zeros_like(chance, dtype=torch.int64)
     for x, size, distance in zip(points, (size0, size1), epipolar_distances(F, *points), strict=True):
@@ -88,7 +88,7 @@ def significance(
         for column in cell.clamp(0, MOST_CELLS - 1).to(torch.int64).unbind(-1):
             place = place * MOST_CELLS + column
     counted, n = _one_of_each_place(chance.clamp(LEAST_CHANCE, 1.0), place, mask)
-    return torch.where(sound, _significance(counted, n), -torch.inf)
+    return torch.where(valid, _significance(counted, n), -torch.inf)
 
 
 def of_one_pair(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array) -> float:

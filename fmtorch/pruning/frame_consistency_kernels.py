@@ -43,11 +43,11 @@ def frame_agreement(
         rows[7, m] = (lafs1[i, 1, 0] * -b + lafs1[i, 1, 1] * a) / determinant
         rows[8, m] = math.sqrt(abs(rows[4, m] * rows[7, m] - rows[5, m] * rows[6, m]))
         rows[9, m] = max(numbers[0] - quality[i], numbers[1]) if len(quality) else x0.dtype.type(1)
-        sound = mask[i] and not (len(quality) and math.isnan(quality[i]))
+        valid = mask[i] and not (len(quality) and math.isnan(quality[i]))
         for k in range(10):
-            sound = sound and math.isfinite(rows[k, m])
+            valid = valid and math.isfinite(rows[k, m])
         match[m] = i
-        m += sound
+        m += valid
     order, along = np.empty(m, np.int64), np.empty((10, m), x0.dtype)
     agreement, votes = np.zeros(m, x0.dtype), np.zeros(m, x0.dtype)
     ahead, behind = np.empty((WINDOW, m), x0.dtype), np.empty((WINDOW, m), x0.dtype)

@@ -34,14 +34,14 @@ def moves_in_blocks(
     entries = 4 * CELLS * sum(g * g for g in grids)
     pairs = max(1, min(table // entries, matches // max(1, n)))
     blocks = zip(*(torch.split(a, pairs) for a in (x0, x1, size0, size1, mask)), strict=True)
-    for i, (points0, points1, extent0, extent1, alive) in enumerate(blocks if b else ()):
+    for i, (points0, points1, extent0, extent1, mask) in enumerate(blocks if b else ()):
         p = torch.cat([_normalized(points0, extent0), _normalized(points1, extent1)])
-        alive = alive & (p.amin(0) >= 0) & (p.amax(0) < 1)
-        place = alive.flatten().nonzero()[:, 0]
-        pair = torch.arange(len(alive), device=p.device).repeat_interleave(alive.sum(1))
+        mask = mask & (p.amin(0) >= 0) & (p.amax(0) < 1)
+        place = mask.flatten().nonzero()[:, 0]
+        pair = torch.arange(len(mask), device=p.device).repeat_interleave(mask.sum(1))
         p = p.flatten(1).index_select(1, place)
-        line, end = _lines(p[:2], pair, len(alive), border), _cells(p[2:], grids)
-        yield Moves(line, end, pair, len(alive), grids), i * pairs * n + place
+        line, end = _lines(p[:2], pair, len(mask), border), _cells(p[2:], grids)
+        yield Moves(line, end, pair, len(mask), grids), i * pairs * n + place
 
 
 def _normalized(x: Tensor, size: Tensor) -> Float[Tensor, "2 b n"]:

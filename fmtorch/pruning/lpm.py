@@ -93,7 +93,7 @@ def _passes(thresholds: Sequence[float], neighbors: Sequence[int], taus: Sequenc
 def _costs(
     x0: Tensor, x1: Tensor, mask: Tensor | None, passes: Sequence[Pass]
 ) -> Iterator[tuple[int, Int[Tensor, " n"], list[Float[Tensor, " n"]]]]:
-    """Of each pair its live matches and, for every pass that there was, the mean cost of each of them."""
+    """Of each pair its matches and, for every pass that there was, the mean cost of each of them."""
     finite = torch.isfinite(x0).all(-1) & torch.isfinite(x1).all(-1)
     mask = finite if mask is None else finite & mask
     for pair, here in enumerate(mask):

@@ -24,15 +24,15 @@ def match_noise(
     for i in range(len(mask)):
         size = max(_scale(lafs0, i, numbers[3]), _scale(lafs1, i, numbers[3]))
         noise = (one + size / numbers[1]) / numbers[0]
-        sound = mask[i] and _finite(lafs0, i) and _finite(lafs1, i)
+        valid = mask[i] and _finite(lafs0, i) and _finite(lafs1, i)
         if len(quality):
-            sound = sound and math.isfinite(quality[i])
+            valid = valid and math.isfinite(quality[i])
             factor = one + numbers[2] * quality[i]
             noise *= factor * factor
         if len(prior):
-            sound = sound and math.isfinite(prior[i])
+            valid = valid and math.isfinite(prior[i])
             noise /= math.sqrt(math.sqrt(max(prior[i], numbers[4])))
-        out[i] = noise if sound else one
+        out[i] = noise if valid else one
 
 
 @inner

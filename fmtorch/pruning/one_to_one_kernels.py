@@ -18,20 +18,20 @@ Array = NDArray[Any]
 def one_to_one(x0: Array, x1: Array, quality: Array, mask: Array, out: Array) -> None:
     """`one_to_one` of x0, x1 (n, 2), quality, mask (n,) -> out (n,)."""
     n = len(mask)
-    usable, rank = np.empty(n, np.bool_), np.empty(n)
+    valid, rank = np.empty(n, np.bool_), np.empty(n)
     for i in range(n):
         finite = math.isfinite(x0[i, 0]) and math.isfinite(x0[i, 1])
-        usable[i] = mask[i] and finite and math.isfinite(x1[i, 0]) and math.isfinite(x1[i, 1])
+        valid[i] = mask[i] and finite and math.isfinite(x1[i, 0]) and math.isfinite(x1[i, 1])
         rank[i] = math.inf if math.isnan(quality[i]) else quality[i]
-        out[i] = usable[i]
-    _drop_all_but_the_best(x0, rank, usable, out)
-    _drop_all_but_the_best(x1, rank, usable, out)
+        out[i] = valid[i]
+    _drop_all_but_the_best(x0, rank, valid, out)
+    _drop_all_but_the_best(x1, rank, valid, out)
 
 
 @inner
-def _drop_all_but_the_best(x: Array, rank: Array, usable: Array, out: Array) -> None:
-    """Sets out[i] to False where another usable match at the same location has a lower (rank, index)."""
-    n = len(usable)
+def _drop_all_but_the_best(x: Array, rank: Array, valid: Array, out: Array) -> None:
+    """Sets out[i] to False where another valid match at the same location has a lower (rank, index)."""
+    n = len(valid)
     size = 4
     while size < 2 * n:
         size *= 2
@@ -39,7 +39,7 @@ def _drop_all_but_the_best(x: Array, rank: Array, usable: Array, out: Array) -> 
     at = x + 0.0  # -0 becomes 0
     bits = at.view(np.uint64)
     for i in range(n):
-        if not usable[i]:
+        if not valid[i]:
             continue
         slot = np.int64(mix(bits[i, 0] + np.uint64(0x9E3779B97F4A7C15) * mix(bits[i, 1])) & np.uint64(size - 1))
         while best[slot] >= 0 and (at[best[slot], 0] != at[i, 0] or at[best[slot], 1] != at[i, 1]):
@@ -48,5 +48,5 @@ def _drop_all_but_the_best(x: Array, rank: Array, usable: Array, out: Array) -> 
         if best[slot] < 0 or rank[i] < rank[best[slot]]:
             best[slot] = i
     for i in range(n):
-        if usable[i] and best[place[i]] != i:
+        if valid[i] and best[place[i]] != i:
             out[i] = False

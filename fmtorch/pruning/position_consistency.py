@@ -123,9 +123,9 @@ def _histogram(along: Float[Tensor, "5 b n"], count: Int[Tensor, " b"]) -> Int[T
     dx, dy, ux, uy = along[:4, :, 1:] - along[:4, :, :-1]
     length0, length1 = dx.square() + dy.square(), ux.square() + uy.square()
     level = torch.bucketize(length1 / length0, along.new_tensor(_EDGES)) - 1
-    live = torch.arange(1, along.shape[2], device=along.device) < count[:, None]
-    live = live & (length0 > 0) & (length1 > 0) & (level >= 0) & (level < len(SCALES))
-    place = torch.where(live, level * TURNS + _turn(dx * ux + dy * uy, dx * uy - dy * ux), _BINS)
+    valid = torch.arange(1, along.shape[2], device=along.device) < count[:, None]
+    valid = valid & (length0 > 0) & (length1 > 0) & (level >= 0) & (level < len(SCALES))
+    place = torch.where(valid, level * TURNS + _turn(dx * ux + dy * uy, dx * uy - dy * ux), _BINS)
     votes = torch.zeros(len(count), _BINS + 1, dtype=torch.int64, device=along.device)
     votes = votes.scatter_add(1, place, torch.ones_like(place))[:, :-1].reshape(-1, len(SCALES), TURNS)
     votes = 2 * votes + votes.roll(1, 2) + votes.roll(-1, 2)

@@ -38,11 +38,11 @@ def position_agreement(
         out[i] = 0
         rows[0, m], rows[1, m], rows[2, m], rows[3, m] = x0[i, 0], x0[i, 1], x1[i, 0], x1[i, 1]
         rows[4, m] = max(numbers[0] - quality[i], numbers[1]) if len(quality) else x0.dtype.type(1)
-        sound = mask[i] and not (len(quality) and math.isnan(quality[i]))
+        valid = mask[i] and not (len(quality) and math.isnan(quality[i]))
         for k in range(5):
-            sound = sound and abs(rows[k, m]) < numbers[6]
+            valid = valid and abs(rows[k, m]) < numbers[6]
         match[m] = i
-        m += sound
+        m += valid
     if m == 0:
         return
     orders, along = np.empty((2 * len(curves), m), np.int64), np.empty((5, m), x0.dtype)

@@ -35,7 +35,7 @@ IMAGES = 256  # whose features are kept, some 5 MB each
 class Case:
     """A pair with its matches.
 
-    c: a batch of one, all slots live. right: (n,), True within RIGHT_PX of the true epipolar lines in both images.
+    c: a batch of one, no slot masked. right: (n,), True within RIGHT_PX of the true epipolar lines in both images.
     wrong: (n,), True beyond WRONG_PX in one of them. spare: wrong nearest neighbours that the ratio test took away.
     """
 

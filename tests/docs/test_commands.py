@@ -78,6 +78,7 @@ APPENDED = {
     "fmtorch.pairs": ["dataset.root=DATA/Strecha", "workers=1"],
     "fmtorch.report": ["pictures=1", "root=DATA/Strecha"],
     "estimators": ["--limit", "1", "--seeds", "1"],
+    "curves": ["--limit", "1", "--specs", "curves.txt"],
     "thresholds": ["--limit", "1", "--seeds", "1", "--values", "0.5", "0.75"],
     "pipelines": ["--limit", "1", "--seeds", "1", "--cache", "kept"],
     "paper": ["--limit", "1", "--seeds", "1", "--cache", "kept"],
@@ -155,6 +156,7 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for specs in (SOURCE / "scripts" / "benchmark").glob("*.txt"):
         lines = [line for line in specs.read_text().splitlines() if _installed(line.split(" ")[0])]
         (folder / "scripts" / "benchmark" / specs.name).write_text("\n".join(lines))
+    (folder / "curves.txt").write_text("samples | msac:hypotheses={} | 50 100\n")
     pair = data.load("stereo")[0]
     images = [_half(read_image(source)) for source in (pair.image0, pair.image1)]
     halved = np.diag([2.0, 2.0, 1.0])
@@ -172,7 +174,7 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / "DATA" / name / "pairs_which_dataset.txt").write_text("".join(f"{s}/\n" for s in scenes))
     for name, image in zip(("a.jpg", "b.jpg"), images, strict=True):
         cv2.imwrite(str(folder / name), image[..., ::-1])
-    for training in ("S1", "S2"):
+    for training in ("S1", "S2", "C"):
         (folder / training).mkdir()
         shutil.copy(SOURCE / "models" / "lc_f.safetensors", folder / training / "lc.safetensors")
     (folder / "PHOTOS").mkdir()

@@ -211,7 +211,7 @@ def test_a_truncated_file_is_named(layout: str, tmp_path: Path) -> None:
     root = writers.WRITERS[layout](tmp_path / layout)
     for path in sorted(root.rglob("*.h*5")):
         path.write_bytes(path.read_bytes()[:100])
-    with pytest.raises(DataError, match=r"\.h(df)?5: is no sound HDF5 file"):
+    with pytest.raises(DataError, match=r"\.h(df)?5: is not a valid HDF5 file"):
         reload(layout, root)
 
 

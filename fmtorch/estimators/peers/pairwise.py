@@ -29,7 +29,7 @@ FAILURES = (cv2.error, RuntimeError, ValueError)  # how these libraries say that
 
 @dataclasses.dataclass(frozen=True)
 class Pair:
-    """A pair's live matches as these libraries take them: x0, x1 (N, 2) in pixels, likelihood (N,), sizes (h, w).
+    """A pair's matches as these libraries take them: x0, x1 (N, 2) in pixels, likelihood (N,), sizes (h, w).
 
     likelihood: the prior where there is one, else 1 - quality, else 1; matches are in its descending order if asked.
     """
@@ -48,7 +48,7 @@ class Pair:
 
 
 class PairwiseEstimator:
-    """Runs a function of a `Pair` -> (F or None, inliers) on each pair's live matches, best first if asked.
+    """Runs a function of a `Pair` -> (F or None, inliers) on each pair's matches, best first if asked.
 
     Args:
         name: what it is called in reasons.

@@ -56,7 +56,7 @@ def match_domain(
     return MatchDomain(p0.float(), p1.float(), bounded.float(), shape.float())
 
 
-def sound_matches(*values: Tensor | None) -> Bool[Tensor, "b n"]:
+def finite_matches(*values: Tensor | None) -> Bool[Tensor, "b n"]:
     """True where every value of a match, (B, N, ...), is finite and no frame (B, N, 2, 3) is degenerate."""
     given = [value for value in values if value is not None]
     mask = torch.stack([torch.isfinite(v.flatten(2)).all(-1) for v in given]).all(0)

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.pruning.code.domain import match_domain, sound_matches
+from fmtorch.pruning.code.domain import finite_matches, match_domain
 from fmtorch.pruning.code.likelihood import LikelihoodField
 from fmtorch.pruning.code.motion import SmoothMotion
 from fmtorch.types import Correspondences
@@ -69,14 +69,14 @@ def coherence(
     Two robust regressions on radial basis functions, as in CODE; our form differs from the authors' in that the
     centres are chosen where distinctive matches crowd, and that each predicts its neighbours' displacement by its
     frame. Points in pixels or any unit; `quality` is the distance ratio. Matches that are not finite or have a
-    degenerate frame are none. Every pair is computed from its live matches alone; memory is linear in their number.
+    degenerate frame are none. Every pair is computed from its own matches alone; memory is linear in their number.
     Not differentiable.
     """
-    alive = sound_matches(x0, x1, lafs0, lafs1)
-    alive = alive if mask is None else alive & mask
+    finite = finite_matches(x0, x1, lafs0, lafs1)
+    mask = finite if mask is None else finite & mask
     likelihood, motion = likelihood or LikelihoodField(), motion or SmoothMotion()
-    found = Coherence(torch.zeros(alive.shape, device=x0.device), torch.full(alive.shape, math.inf, device=x0.device))
-    for pair, here in enumerate(alive):
+    found = Coherence(torch.zeros(mask.shape, device=x0.device), torch.full(mask.shape, math.inf, device=x0.device))
+    for pair, here in enumerate(mask):
         if not bool(here.any()):
             continue
         ratios, frames0, frames1 = (None if v is None else v[pair][here] for v in (quality, lafs0, lafs1))
