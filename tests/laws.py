@@ -19,17 +19,6 @@ from fmtorch import presets
 from fmtorch.stages import Estimator, Pruner
 from fmtorch.types import Correspondences, collate
 
-OTHER_LIBRARIES = (
-    "opencv_",
-    "poselib",
-    "kornia_ransac",
-    "magsac_cpp",
-    "gc_ransac_cpp",
-    "degensac_cpp",
-    "superansac_cpp",
-)
-"""Prefixes of the presets that call other libraries' estimators; of these only OpenCV's keep the laws."""
-
 SMALL_KINDS = ("collinear", "collinear in image 1", "planar", "coincident", "half coincident")
 
 Result = dict[str, Tensor]  # every value has the batch as its first dimension; masks (B, N) may be padded on the right

@@ -13,7 +13,8 @@ from fmtorch import metrics, presets
 from fmtorch.data import ImageSource
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.types import Correspondences, Estimate, collate
-from tests.laws import OTHER_LIBRARIES, quick, scene
+from scripts.benchmark.memory import OTHER_LIBRARIES
+from tests.laws import quick, scene
 from tests.test_match import run_python
 from tests.test_pipeline import draw, pair, pipeline
 

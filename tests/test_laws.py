@@ -13,8 +13,8 @@ from fmtorch.estimators import graph_cut, irls, scores, solvers
 from fmtorch.estimators.focal import hypotheses
 from fmtorch.geometry import sampson_objective
 from fmtorch.types import Correspondences, collate
+from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.laws import (
-    OTHER_LIBRARIES,
     Result,
     Subject,
     assert_same,

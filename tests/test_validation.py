@@ -9,7 +9,8 @@ import torch
 import fmtorch
 from fmtorch import metrics, presets
 from fmtorch.types import Correspondences, collate
-from tests.laws import OTHER_LIBRARIES, quick, scene
+from scripts.benchmark.memory import OTHER_LIBRARIES
+from tests.laws import quick, scene
 
 OWN = [n for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES)]
 WRONG = [

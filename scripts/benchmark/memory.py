@@ -31,6 +31,7 @@ OTHER_LIBRARIES = (
     "degensac_cpp",
     "superansac_cpp",
 )
+"""Prefixes of the presets that call other libraries' estimators; of these only OpenCV's keep the laws."""
 
 
 def add_arguments(commands: Any) -> None:

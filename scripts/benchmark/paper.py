@@ -11,7 +11,6 @@ compare the matches. --json is appended to batch by batch: started again, the co
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -28,11 +27,7 @@ def add_arguments(commands: Any) -> None:
     parser = commands.add_parser("paper", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_set_arguments(parser, "pairs of each family at most, chosen by hash")
     parser.add_argument("--estimators", nargs="*", default=METHODS, choices=METHODS, help="pipelines to measure")
-    parser.add_argument("--seeds", type=int, default=3, help="of the estimators; recall is their mean")
-    parser.add_argument("--cache", default="null", help="folder of features; null: the user's")
-    parser.add_argument("--json", type=Path, help="keep the figures of every pair here, one line each")
-    parser.add_argument("--from", nargs="*", type=Path, default=[], dest="earlier", help="only show earlier --json")
-    parser.add_argument("--markdown", type=Path, help="put the tables between the marks of this file")
+    pipelines.add_measure_arguments(parser, seeds=3)
     parser.set_defaults(run=run)
 
 

@@ -46,12 +46,17 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument("--pipelines", nargs="*", default=PIPELINES, help="names of presets in conf/pipeline")
     parser.add_argument("--overrides", nargs="*", default=[], help="of each pipeline, e.g. features.precision=int8")
     parser.add_argument("--label", default="", help="appended to the pipelines' names in the tables")
-    parser.add_argument("--seeds", type=int, default=5, help="of the estimators; recall is their mean")
+    add_measure_arguments(parser, seeds=5)
+    parser.set_defaults(run=run)
+
+
+def add_measure_arguments(parser: argparse.ArgumentParser, seeds: int) -> None:
+    """The options of `measure` and of what is done with its rows."""
+    parser.add_argument("--seeds", type=int, default=seeds, help="of the estimators; recall is their mean")
     parser.add_argument("--cache", default="null", help="folder of features; null: the user's")
     parser.add_argument("--json", type=Path, help="keep the figures of every pair here, one line each")
     parser.add_argument("--from", nargs="*", type=Path, default=[], dest="earlier", help="only show earlier --json")
     parser.add_argument("--markdown", type=Path, help="put the tables between the marks of this file")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -18,7 +18,8 @@ from fmtorch.estimators.peers import PEERS
 from fmtorch.estimators.support import lack_of_support
 from fmtorch.presets.objects import merged
 from fmtorch.types import Correspondences, Estimate, collate
-from tests.laws import OTHER_LIBRARIES, few, quick, scene, small
+from scripts.benchmark.memory import OTHER_LIBRARIES
+from tests.laws import few, quick, scene, small
 
 EVERY = presets.available("estimator")
 OWN = [name for name in EVERY if not name.startswith(OTHER_LIBRARIES)]
