@@ -12,7 +12,8 @@ from fmtorch.estimators import HypothesizeAndVerify, solvers
 from fmtorch.estimators.inliers import residuals_squared_px
 from fmtorch.estimators.pairs import NormalizedPairs, normalized_pairs
 from fmtorch.types import collate
-from tests.laws import OTHER_LIBRARIES, quick, scene, scenes
+from scripts.benchmark.memory import OTHER_LIBRARIES
+from tests.laws import quick, scene, scenes
 
 OWN = [n for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES)]
 

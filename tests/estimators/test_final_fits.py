@@ -10,8 +10,9 @@ from torch import Tensor
 
 from fmtorch import presets
 from fmtorch.types import Correspondences, collate
+from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.geometry.test_irls_gradients import degenerate
-from tests.laws import OTHER_LIBRARIES, quick, scene, scenes
+from tests.laws import quick, scene, scenes
 
 
 @functools.cache

@@ -15,7 +15,8 @@ from fmtorch.estimators import PairwiseEstimator
 from fmtorch.estimators.peers import PEERS
 from fmtorch.estimators.peers.pairwise import Pair, Solution
 from fmtorch.types import collate
-from tests.laws import OTHER_LIBRARIES, scene
+from scripts.benchmark.memory import OTHER_LIBRARIES
+from tests.laws import scene
 
 NAMES = [n for n in presets.available("estimator") if n.startswith(OTHER_LIBRARIES)]
 
