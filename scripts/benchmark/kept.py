@@ -17,6 +17,7 @@ from fmtorch.storage.code import code_digest
 from fmtorch.storage.configuration import learned, libraries
 
 Row = dict[str, Any]
+Stages = list[tuple[str, str, Mapping[str, Any]]]  # group, preset and changed options of each
 DIGITS = 16  # of an identity
 
 
@@ -76,11 +77,11 @@ def _whole_lines(path: Path) -> bytes:
     return content[: content.rfind(b"\n") + 1]
 
 
-def identity(stages: Sequence[tuple[str, str, Mapping[str, Any]]], *others: Any) -> str:
+def identity(stages: Stages, *others: Any) -> str:
     """The digest of what defines the results of some stages.
 
     Args:
-        stages: group, preset and changed options of each, e.g. ``("estimator", "usac", {"threshold": 1.0})``.
+        stages: e.g. ``[("estimator", "usac", {"threshold": 1.0})]``.
         others: stages without a preset, of which only the learned files count, and plain values.
 
     Returns:

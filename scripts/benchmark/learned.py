@@ -32,7 +32,7 @@ from fmtorch.evaluation.run import select
 from fmtorch.pipeline import Outcome, Pipeline
 from fmtorch.storage.features import cached
 from scripts.benchmark import learned_table
-from scripts.benchmark.kept import Kept, Row, identity, read
+from scripts.benchmark.kept import Kept, Row, Stages, identity, read
 from scripts.benchmark.matched import add_set_arguments, options, sets_of
 from scripts.benchmark.pruning import stage
 from scripts.benchmark.sheet import put
@@ -115,7 +115,7 @@ def measure(arguments: argparse.Namespace) -> list[Row]:
     )
     built = chains(arguments)
     others = {name: TRAINED for name, _ in arguments.network}
-    before = [("features", arguments.features, {}), ("matcher", "nearest", {})]
+    before: Stages = [("features", arguments.features, {}), ("matcher", "nearest", {})]
     made_with = {
         (use, name, estimator): identity(
             [*before, *_presets(chain), ("estimator", estimator, {})], extractor, *(pruner for _, pruner in chain)
@@ -141,7 +141,7 @@ def measure(arguments: argparse.Namespace) -> list[Row]:
     return rows
 
 
-def _presets(chain: Chain) -> list[tuple[str, str, dict[str, Any]]]:
+def _presets(chain: Chain) -> Stages:
     """The presets of the pruners, with the options that were changed."""
     specs = [spec.partition(":") for spec, _ in chain]
     return [("pruner", name, options(rest)) for name, _, rest in specs]

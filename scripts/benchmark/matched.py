@@ -77,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def identity(arguments: argparse.Namespace) -> str:
     """The digest of what the matches of `load` depend on, but for the images."""
-    stages = [("features", arguments.features, {}), ("matcher", "nearest", {})]
+    stages: kept.Stages = [("features", arguments.features, {}), ("matcher", "nearest", {})]
     stages += [("pruner", name, {}) for name in arguments.pruners]
     return kept.identity(stages, *(presets.build(group, name) for group, name, _ in stages))
 

@@ -36,7 +36,7 @@ def stages_of(spec: str) -> list[str]:
 def identity(spec: str, extra: Mapping[str, Stage] = NONE) -> str:
     """The digest of what an estimator's results depend on: options, code, learned files, versions of peers."""
     name, _, rest = spec.partition("@")[0].partition(":")
-    stages = [] if name == TRUTH else [("estimator", name, options(rest))]
+    stages: kept.Stages = [] if name == TRUTH else [("estimator", name, options(rest))]
     stages += [("pruner", stage, {}) for stage in stages_of(spec) if stage not in extra]
     own = [part for stage in stages_of(spec) if stage in extra for part in (stage, extra[stage])]
     built = [presets.build("pruner", name) for group, name, _ in stages if group == "pruner"]

@@ -88,8 +88,8 @@ def measure(cases: Iterator[Case], arguments: argparse.Namespace) -> list[Row]:
             new = [row | facts | {"identity": made_with[row["method"]]} for row in measured]
             rows |= {place[row["method"]]: row for row in new}
             kept.add(new)
-    some = [row for row in rows.values() if len(row["nsgd"]) >= arguments.seeds]
-    return [row | {name: row[name][: arguments.seeds] for name in ("nsgd", "ms")} for row in some]
+    complete = [row for row in rows.values() if len(row["nsgd"]) >= arguments.seeds]
+    return [row | {name: row[name][: arguments.seeds] for name in ("nsgd", "ms")} for row in complete]
 
 
 def changes(only: list[str]) -> Iterator[tuple[str, float | str, Change]]:
