@@ -80,11 +80,11 @@ def test_gms_tries_scales_on_wide_baselines_alone() -> None:
         ("pruner.gms.with_scale=false", (False, False, False)),
         ("pruner.gms={with_scale:false}", (False, False, False)),
         ("pruner.gms.with_scale=true", (True, True, True)),
-        ("pruner.gms.threshold_factor=6", (False, True, True)),
+        ("pruner.gms.threshold_factor=6.0", (False, True, True)),
         ("pruner.gms.with_scale=false +pruner.gms.families.CPC.with_scale=true", (False, False, True)),
         ("pruner.gms.with_scale=false +pruner.gms.families.CPC={with_scale:true}", (False, False, True)),
         ("pruner.gms.with_scale=false pruner.gms.families.wide.with_scale=true", (False, True, True)),
-        ("pruner.gms.with_scale=false +pruner.gms.families.wide.threshold_factor=6", (False, False, False)),
+        ("pruner.gms.with_scale=false +pruner.gms.families.wide.threshold_factor=6.0", (False, False, False)),
         ("pruner.gms.with_scale=true pruner.gms.families=null", (True, True, True)),
     ],
 )
