@@ -106,6 +106,28 @@ def test_sweeps_vary_one_quantity() -> None:
     assert (moved.c.x0 - still.c.x0).std().item() == pytest.approx(2.0, rel=0.1)
 
 
+def test_tables_are_of_pairs_that_all_estimators_have_and_say_who_has_fewer_seeds() -> None:
+    def row(method: str, pair: str, level: float, seeds: int) -> stress.Row:
+        return {
+            "sweep": "noise",
+            "level": level,
+            "pair": pair,
+            "method": method,
+            "nsgd": [0.1] * seeds,
+            "ms": [1.0] * seeds,
+        }
+
+    rows = [row("b", "0", 1.0, 1), row("b", "1", 1.0, 2), row("a", "0", 1.0, 3), row("a", "1", 1.0, 3),
+            row("a", "2", 1.0, 1), row("a", "0", 2.0, 3)]  # fmt: skip
+    found = stress_table.comparable(rows, ["c", "a"])
+    assert [(r["method"], r["pair"], r["level"]) for r in found] == [
+        ("a", "0", 1.0), ("a", "1", 1.0), ("b", "0", 1.0), ("b", "1", 1.0),
+    ]  # fmt: skip
+    assert [len(r["nsgd"]) for r in found] == [len(r["ms"]) for r in found] == [3, 3, 1, 1]
+    assert stress_table.seeds(found) == "3 seeds (b: 1)"
+    assert stress_table.seeds(found[:2]) == "3 seeds"
+
+
 def test_an_interrupted_run_goes_on_and_its_tables_stand_in_the_page(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -57,6 +57,7 @@ def run(arguments: argparse.Namespace) -> None:
         rows += measure(stress_cases.load(arguments), arguments)
     if not rows:
         raise SystemExit("nothing to show: name sets with --root or --rendered, or earlier figures with --from")
+    rows = stress_table.comparable(rows, [spec.strip("()") for spec in read_specs(arguments.specs)])
     stress_table.show(rows)
     if arguments.update:
         stress_table.write(arguments.update, rows)

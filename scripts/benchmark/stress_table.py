@@ -36,6 +36,36 @@ def group(family: str) -> str:
     return "real, wide" if family in WIDE else "real, short"
 
 
+def comparable(rows: Sequence[Row], order: Sequence[str] = ()) -> list[Row]:
+    """The rows of the pairs that all estimators have at a level, with as many seeds in all rows of an estimator.
+
+    order: estimators that come first, in this order.
+    """
+    names = [name for name in dict.fromkeys([*order, *methods(rows)]) if name in set(methods(rows))]
+    by_cell: dict[tuple[str, str, Level], dict[str, Row]] = {}
+    for row in rows:
+        by_cell.setdefault((row["sweep"], row["pair"], row["level"]), {})[row["method"]] = row
+    wanted = {sweep: set(methods([r for r in rows if r["sweep"] == sweep])) for sweep in {r["sweep"] for r in rows}}
+    whole = [cell for (sweep, *_), cell in by_cell.items() if cell.keys() >= wanted[sweep]]
+    seeds = {name: min((len(cell[name]["nsgd"]) for cell in whole if name in cell), default=0) for name in names}
+    return [
+        cell[name] | {figure: cell[name][figure][: seeds[name]] for figure in ("nsgd", "ms")}
+        for name in names for cell in whole if name in cell
+    ]  # fmt: skip
+
+
+def seeds(rows: Sequence[Row]) -> str:
+    """``3 seeds``, or ``3 seeds (poselib, truth: 1)`` where some estimators have fewer."""
+    own = {row["method"]: len(row["nsgd"]) for row in rows}
+    most = max(own.values())
+    fewer: dict[int, list[str]] = {}
+    for method, count in own.items():
+        if count < most:
+            fewer.setdefault(count, []).append(label(method))
+    others = "; ".join(f"{', '.join(names)}: {count}" for count, names in sorted(fewer.items()))
+    return f"{most} seed{'s' * (most != 1)}" + (f" ({others})" if others else "")
+
+
 def write(page: Path, rows: Sequence[Row]) -> None:
     """The tables between the markers of a Markdown file, the figures beside it. SystemExit where it has no markers."""
     written = []
@@ -71,7 +101,6 @@ def sheets(rows: Sequence[Row]) -> list[Sheet]:
 
 def recall_sheet(name: str, rows: Sequence[Row]) -> Sheet:
     """Recall at NSGD 0.05 / at 0.01 / AUC@0.05: a row an estimator, a column a level."""
-    seeds = len(rows[0]["nsgd"])
     lines = []
     for method in methods(rows):
         cells = []
@@ -81,7 +110,7 @@ def recall_sheet(name: str, rows: Sequence[Row]) -> Sheet:
                 " / ".join(f"{PERCENT * of(nsgd).mean():.0f}" for of in MERITS.values()) if nsgd.size else MISSING
             )
         lines.append([label(method), *cells])
-    kind = f"recall at NSGD 0.05 / at 0.01 / AUC@0.05, in %, {seeds} seed{'s' * (seeds != 1)}"
+    kind = f"recall at NSGD 0.05 / at 0.01 / AUC@0.05, in %, {seeds(rows)}"
     title = f"{titled(rows, name)}: {kind}"
     heads = [f"{head(level)} ({count(rows, level)})" for level in levels(rows)]
     return Sheet(title, ["estimator (pairs in brackets)", *heads], lines)
