@@ -27,6 +27,7 @@ from scripts.benchmark import matched
 from scripts.benchmark.curves_figure import figure
 from scripts.benchmark.estimators import Result, measure
 from scripts.benchmark.estimators_table import replaced
+from scripts.benchmark.kept import Kept
 from scripts.benchmark.matched import console, groups
 
 KNEE_TOLERANCE = 0.5  # points of AUC@0.05 below the best of its curve
@@ -46,6 +47,9 @@ def add_arguments(commands: Any) -> None:
     matched.add_arguments(parser)
     parser.add_argument("--specs", type=Path, default=SPECS, help="the curves; each line: CURVE | ESTIMATOR | VALUES")
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument(
+        "--rows", type=Path, help="keep what each estimator makes of each pair here, as `estimators` does"
+    )
     parser.add_argument("--json", type=Path, help="write the figures here")
     parser.add_argument("--knees", type=Path, help="a file of --json, measured on tuning data, whose knees are marked")
     parser.add_argument("--svg", type=Path, help="draw the curves into this file")
@@ -56,12 +60,14 @@ def add_arguments(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     curves = read(arguments.specs)
+    kept = Kept(arguments.rows)
     items = matched.load(arguments)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     pairs = [pair for pair, _ in items]
     specs = list(dict.fromkeys(spec for curve in curves for spec in curve.specs))
-    figures = summaries(measure(specs, items, arguments.seeds), pairs)
+    results = measure(specs, items, arguments.seeds, kept=kept, matches=matched.identity(arguments))
+    figures = summaries(results, pairs)
     knees = {curve.name: knee(curve, figures) for curve in curves}
     if arguments.knees:
         knees = json.loads(arguments.knees.read_text())["knees"]
