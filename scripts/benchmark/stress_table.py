@@ -128,8 +128,8 @@ def difference_sheet(name: str, rows: Sequence[Row]) -> Sheet:
             gain = difference(areas(own), areas(other), scenes, PERCENT) if scenes else None
             cells.append(MISSING if gain is None else f"{gain.value:+.0f} [{gain.low:+.0f}, {gain.high:+.0f}]")
         lines.append([label(method), *cells])
-    over = " or ".join(sorted(units))
-    title = f"{titled(rows, name)}: AUC@0.05 of {label(first)} minus this row, in points, 95 % intervals over {over}s"
+    over = " or ".join(f"{one}s" for one in sorted(units))
+    title = f"{titled(rows, name)}: AUC@0.05 of {label(first)} minus this row, in points, 95 % intervals over {over}"
     return Sheet(title, ["estimator", *(head(level) for level in levels(rows))], lines)
 
 

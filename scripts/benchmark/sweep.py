@@ -84,11 +84,11 @@ def _line(family: str, pipeline: str, group: Mapping[str, Any], paper: Published
 
 
 def differences(rows: Mapping[Place, pa.Table], against: Sequence[str]) -> Sheet:
-    """What each pipeline has more than those that it is compared with, on the pairs that both have, with intervals."""
+    """What each pipeline has more than those of `against`, on the pairs that both have, with intervals."""
     lines = []
-    for reference in against:
+    for i, reference in enumerate(against):
         for family, pipeline in _order(rows):
-            if pipeline != reference and (family, reference) in rows:
+            if pipeline not in against[: i + 1] and (family, reference) in rows:  # no two lines of the same two
                 lines += _difference(family, pipeline, reference, rows)
     heads = [*NAMES.values(), "paper: %Recall"]
     return Sheet("Paired differences, in points", ["", "of", *heads], lines)
