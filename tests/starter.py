@@ -20,8 +20,8 @@ import traceback
 from typing import Any
 
 LIBRARIES = (
-    "torch", "kornia", "cv2", "hydra", "omegaconf", "pyarrow.parquet", "pyarrow.compute", "matplotlib.figure", "skimage.io",
-    "rich.progress", "scipy.spatial", "numba", "onnxruntime", "lightning", "lightning.pytorch.loggers",
+    "torch", "kornia", "cv2", "hydra", "omegaconf", "pyarrow.parquet", "pyarrow.compute", "matplotlib.figure",
+    "skimage.io", "rich.progress", "scipy.spatial", "numba", "onnxruntime", "lightning", "lightning.pytorch.loggers",
     "torch.utils.tensorboard", "antlr4", "jinja2", "h5py",
     "fmtorch.commands.eval", "fmtorch.commands.match", "fmtorch.commands.pairs", "fmtorch.commands.report",
     "fmtorch.estimators", "fmtorch.features", "fmtorch.pruning", "fmtorch.matching",
