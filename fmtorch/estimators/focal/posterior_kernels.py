@@ -188,7 +188,7 @@ def _accept(state: _State, trial: _State, damping: Array, done: Array, data: _Da
 _minimise = levenberg_marquardt(_evaluate, _step, _accept)
 
 
-@kernel("f8[:, ::1], f8[:, ::1]")
+@kernel("f8[:, ::1], f8[:, ::1]", brief=True)
 def to_unit_norm(F: Array, out: Array) -> None:
     """Models (k, 9) scaled to unit norm -> out (k, 9)."""
     for k in range(len(F)):

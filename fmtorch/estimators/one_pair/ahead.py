@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fmtorch.estimators import pool_kernels, sampling_kernels, scores_kernels
+from fmtorch.estimators import pairs_kernels, pool_kernels, sampling_kernels, scores_kernels, support_kernels
 from fmtorch.estimators.focal import (
     cameras_kernels,
     cheirality_kernels,
@@ -29,10 +29,13 @@ FOCAL: tuple[Kernel[..., Any], ...] = (  # the slowest to compile first
     refine_kernels.refine,
     cameras_kernels.nearest_cameras,
     significance_kernels.counted_chances,
+    pairs_kernels.normalize,
     sampling_kernels.draw,
     cheirality_kernels.share_in_front,
     scores_kernels.score_gains,
     scores_kernels.score_saturated,
+    pairs_kernels.to_pixels,
+    support_kernels.support,
     pool_kernels.residuals_squared,
     pool_kernels.best,
     cameras_kernels.translate,
