@@ -1,12 +1,13 @@
-"""`scripts/benchmark paper` and `gc_ransac`: their tables from known rows; the early GC-RANSAC on exact matches."""
+"""`scripts/benchmark paper`, `sweep`, `gc_ransac`: tables from known rows; the early GC-RANSAC on exact matches."""
 
 from __future__ import annotations
 
+import pyarrow as pa
 import torch
 
 from fmtorch.evaluation.bootstrap import MIN_SCENES
 from fmtorch.types import Correspondences
-from scripts.benchmark import paper_table
+from scripts.benchmark import paper_table, sweep
 from scripts.benchmark.early_gc_ransac import EarlyGCRansac, eight_point, residuals, seven_point
 from tests.geometry.scenes import scene
 
@@ -44,6 +45,23 @@ def test_tables_put_each_figure_beside_the_papers() -> None:
     assert real.rows[0][1].startswith("+75.0 [")
     assert real.rows[0][2] == "+11.8"  # 69.2 - 57.4
     assert rendered.columns == ["", "orbit", "T&T"]
+
+
+def test_systems_are_compared_on_the_pairs_that_both_have() -> None:
+    def table(keys: range, nsgd: float) -> pa.Table:
+        return pa.table({"key": list(keys), "scene": ["a"] * len(keys), "nsgd": [nsgd] * len(keys)})
+
+    rows = {
+        ("TUM", "hesaffnet_gms"): table(range(30), 0.2),
+        ("TUM", "code_lmeds"): table(range(10, 50), 0.0),
+        ("TUM", "sift_ratio"): table(range(50, 60), 0.0),
+        ("orbit", "hesaffnet_gms"): table(range(30), 0.0),
+    }
+    sheet = sweep.differences(rows, ["code_lmeds"])
+    assert [line[0] for line in sheet.rows] == ["TUM: `hesaffnet_gms` - `code_lmeds`"]  # no pair in common: left out
+    (line,) = sheet.rows
+    assert line[1] == "20 pairs of 1 scene, intervals over pairs"
+    assert [cell.split(" ")[0] for cell in line[2:]] == ["-100.0", "-100.0", "-100.0", "-1.1"]  # 66.4 - 67.5
 
 
 def test_the_early_gc_ransac_finds_the_matches_of_the_true_model() -> None:

@@ -5,15 +5,20 @@ from __future__ import annotations
 import functools
 from pathlib import Path
 
+import hydra
 import numpy as np
 import pytest
 import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
 
 from fmtorch import presets
+from fmtorch.commands.main import job
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.data.pairs import GivenMatches
 from fmtorch.pipeline import Pipeline
 from fmtorch.presets.composition import compose
+from fmtorch.resources import conf_dir
 from fmtorch.types import Correspondences
 
 RATIO = "pruner.ratio.families"
@@ -67,6 +72,39 @@ def test_gms_tries_scales_on_wide_baselines_alone() -> None:
         assert {pruner.threshold_factor for pruner in (pipeline.pruners_of(f)["gms"] for f in scale)} == {4.0}  # type: ignore[attr-defined]
         usual = presets.pipeline(name, overrides=["pruner.gms.families=null"])
         assert not usual.pruners_of("CPC")["gms"].with_scale  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "scale"),
+    [
+        ("pruner.gms.with_scale=false", (False, False, False)),
+        ("pruner.gms={with_scale:false}", (False, False, False)),
+        ("pruner.gms.with_scale=true", (True, True, True)),
+        ("pruner.gms.threshold_factor=6.0", (False, True, True)),
+        ("pruner.gms.with_scale=false +pruner.gms.families.CPC.with_scale=true", (False, False, True)),
+        ("pruner.gms.with_scale=false +pruner.gms.families.CPC={with_scale:true}", (False, False, True)),
+        ("pruner.gms.with_scale=false pruner.gms.families.wide.with_scale=true", (False, True, True)),
+        ("pruner.gms.with_scale=false +pruner.gms.families.wide.threshold_factor=6.0", (False, False, False)),
+        ("pruner.gms.with_scale=true pruner.gms.families=null", (True, True, True)),
+    ],
+)
+def test_an_option_that_is_given_explicitly_holds_for_all_families(
+    overrides: str, scale: tuple[bool, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("pipeline=sift_gms", *overrides.split(" "))
+    expected = dict(zip(("KITTI", "Strecha", "CPC"), scale, strict=True))
+
+    def found(config: DictConfig) -> dict[str, bool]:
+        pipeline = presets.build_pipeline(config)
+        return {family: pipeline.pruners_of(family)["gms"].with_scale for family in expected}  # type: ignore[attr-defined]
+
+    assert found(compose("match", words)) == expected
+    with hydra.initialize_config_dir(str(conf_dir()), version_base=None):  # as a command
+        whole = hydra.compose("match", list(words), return_hydra_config=True)
+    monkeypatch.setattr(HydraConfig, "get", lambda: whole.hydra)
+    seen: list[dict[str, bool]] = []
+    job(lambda config: seen.append(found(config)))(whole)
+    assert seen == [expected]
 
 
 def test_those_of_a_pruner_that_others_replace_go_with_it() -> None:

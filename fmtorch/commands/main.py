@@ -16,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from fmtorch.commands.explain import explained
 from fmtorch.commands.words import hydra_words
+from fmtorch.presets.pruners import with_explicit
 from fmtorch.resources import conf_dir
 from fmtorch.terminal import MISTAKES, exits_with_message, told
 
@@ -32,7 +33,7 @@ def job(task: Task) -> Task:
     @functools.wraps(task)
     def wrapped(config: DictConfig) -> None:
         try:
-            task(config)
+            task(with_explicit(config, HydraConfig.get().overrides.task))
         except MISTAKES as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise Mistake(told(error)) from None

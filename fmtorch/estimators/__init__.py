@@ -7,7 +7,7 @@ from fmtorch.estimators.peers.authors import degensac_cpp, gc_ransac_cpp, magsac
 from fmtorch.estimators.peers.kornia import kornia_ransac
 from fmtorch.estimators.peers.opencv import opencv
 from fmtorch.estimators.peers.pairwise import PairwiseEstimator
-from fmtorch.estimators.peers.poselib import poselib, poselib_shared_focal
+from fmtorch.estimators.peers.poselib import poselib
 
 __all__ = [
     "CoarseToFine",
@@ -20,6 +20,5 @@ __all__ = [
     "magsac_cpp",
     "opencv",
     "poselib",
-    "poselib_shared_focal",
     "superansac_cpp",
 ]

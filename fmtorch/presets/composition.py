@@ -19,7 +19,7 @@ from fmtorch.options import nearest
 from fmtorch.pipeline import Pipeline
 from fmtorch.presets.files import available
 from fmtorch.presets.objects import expect_buildable, instantiate, plain
-from fmtorch.presets.pruners import build_pruners, expect_pruners, pruner_configs
+from fmtorch.presets.pruners import build_pruners, expect_pruners, pruner_configs, with_explicit
 from fmtorch.resources import conf_dir
 from fmtorch.storage.features import cached
 
@@ -132,6 +132,6 @@ def _composed(config_name: str, overrides: Sequence[str], config_dir: Path | Non
         hydra_of_caller, GlobalHydra.instance().hydra = GlobalHydra.instance().hydra, None
         try:
             with hydra.initialize_config_dir(str(conf_dir()), version_base=None):
-                return hydra.compose(config_name, [*own, *overrides])
+                return with_explicit(hydra.compose(config_name, [*own, *overrides]), overrides)
         finally:
             GlobalHydra.instance().hydra = hydra_of_caller

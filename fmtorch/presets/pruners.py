@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from fmtorch.data.baselines import WIDE
 from fmtorch.presets.objects import expect_buildable, instantiate
@@ -56,6 +57,46 @@ def build_pruners(config: DictConfig) -> tuple[dict[str, Pruner], dict[str, dict
             for family in families:
                 for_families.setdefault(family, {})[name] = pruner
     return usual, for_families
+
+
+def with_explicit(config: DictConfig, overrides: Sequence[str]) -> DictConfig:
+    """A composed config in which an option of a pruner that was given explicitly holds for all families.
+
+    A preset's options of families give way to it; those of a family that were given explicitly themselves stay.
+
+    Args:
+        config: what Hydra composed; it is not changed.
+        overrides: the words that it was composed with, e.g. ``pruner.gms.with_scale=false``.
+    """
+    words = [word for word in overrides if word.lstrip("+~").startswith("pruner.")]
+    given = {path[1:] for word in words for path in _given(word)}
+    changed = config
+    for name, value in (config.get("pruner") or {}).items():
+        families = value.get(FAMILIES) if isinstance(value, DictConfig) else None
+        own = {path[1:] for path in given if path[0] == name}
+        for family, options in families.items() if isinstance(families, DictConfig) else ():
+            for option in options if isinstance(options, DictConfig) else ():
+                explicit = (FAMILIES, str(family), str(option))
+                stays = any(path == explicit[: len(path)] or path[:3] == explicit for path in own)
+                if not stays and any(path[0] == option for path in own):
+                    changed = changed.copy() if changed is config else changed
+                    with open_dict(changed):
+                        del changed.pruner[name][FAMILIES][family][option]
+    return changed
+
+
+def _given(override: str) -> Iterator[tuple[str, ...]]:
+    """The paths of the options that an override gives: one, or those within a mapping."""
+    parsed = OverridesParser.create().parse_override(override)
+
+    def within(path: tuple[str, ...], value: Any) -> Iterator[tuple[str, ...]]:
+        if isinstance(value, Mapping) and value:
+            for key, inner in value.items():
+                yield from within((*path, str(key)), inner)
+        else:
+            yield path
+
+    yield from within(tuple(parsed.key_or_group.split(".")), parsed.value())
 
 
 def _versions(name: str, config: Any) -> Iterator[tuple[str, Any, tuple[str, ...]]]:

@@ -6,17 +6,21 @@ the network of --ngransac; without it, estimators that name it are left out.
 
 python -m scripts.benchmark estimators --root DATA/Strecha --root DATA/PhotoTourism --seeds 5 \\
     --estimators fmtorch@frame_consistency opencv_usac_magsac:threshold=1.0 poselib:threshold=0.5,prosac=true
-python -m scripts.benchmark estimators --rendered full --specs scripts/benchmark/estimators.txt --json figures.json
+python -m scripts.benchmark estimators --rendered full --specs scripts/benchmark/estimators.txt --json figures.json \\
+    --rows rows.jsonl
+
+--rows is appended to pair by pair: started again, the command goes on where it was interrupted, and measures what other
+seeds, pairs and estimators need. A row counts only for the code, options and learned files that it was made with.
+Estimators that were not measured in one run did not take turns, which their times may show.
 """
 
 from __future__ import annotations
 
 import argparse
-import functools
 import json
 import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,20 +30,16 @@ import torch
 from numpy.typing import NDArray
 from rich.progress import track
 
-from fmtorch import metrics, presets
+from fmtorch import metrics
 from fmtorch.data import ImagePair
 from fmtorch.evaluation.statistics import MERITS, PERCENT, SHARES, described, difference, unit
-from fmtorch.geometry import refine
-from fmtorch.stages import Estimator
-from fmtorch.types import Correspondences, Estimate
 from scripts.benchmark import estimators_table as table
 from scripts.benchmark import matched
-from scripts.benchmark.matched import Item, console, groups, options
+from scripts.benchmark.kept import Kept, Row
+from scripts.benchmark.matched import Item, console, groups
+from scripts.benchmark.specs import NGRANSAC, NONE, Method, Stage, identity, informed, ngransac, read_specs, stages_of
 
 Result = dict[str, NDArray[np.float64]]  # nsgd, ms: (seeds, pairs)
-Stage = Callable[[Correspondences], Correspondences]
-NGRANSAC = "ngransac"
-NONE: Mapping[str, Stage] = {}
 
 
 def add_arguments(commands: Any) -> None:
@@ -49,6 +49,7 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument("--specs", type=Path, help="a file with one estimator a line; # starts a comment")
     parser.add_argument("--ngransac", type=Path, help="NG-RANSAC's published weights (scripts/convert_ngransac.py)")
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--rows", type=Path, help="keep what each estimator makes of each pair here, one line each")
     parser.add_argument("--json", type=Path, help="write the figures here")
     parser.add_argument("--baseline", type=Path, help="a file written by --json, to compare recall and time with")
     parser.add_argument("--update", type=Path, help="write the tables into this Markdown file, between its markers")
@@ -60,6 +61,7 @@ def add_arguments(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
+    kept = Kept(arguments.rows)
     items = matched.load(arguments)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
@@ -69,7 +71,7 @@ def run(arguments: argparse.Namespace) -> None:
         specs = [spec for spec in specs if NGRANSAC not in stages_of(spec)]
     if not specs:
         raise SystemExit("name at least one estimator: --estimators or --specs")
-    results = measure(specs, items, arguments.seeds, extra)
+    results = measure(specs, items, arguments.seeds, extra, kept, matched.identity(arguments))
     pairs = [pair for pair, _ in items]
     figures = {group: summaries(results, pairs, inside) for group, inside in groups(pairs).items()}
     for group, inside in groups(pairs).items():
@@ -93,86 +95,71 @@ def baseline(path: Path) -> table.Groups:
     return figures
 
 
-def read_specs(path: Path) -> list[str]:
-    """One estimator a line, without comments."""
-    return [text for line in path.read_text().splitlines() if (text := line.partition("#")[0].strip())]
-
-
-def stages_of(spec: str) -> list[str]:
-    """The pruners of `PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]`."""
-    return [stage for stage in spec.partition("@")[2].split("+") if stage]
-
-
-def build(spec: str, extra: Mapping[str, Stage] = NONE) -> Estimator:
-    """The function of `PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]`: pruners in order, then the estimator.
-
-    extra: pruners that are no presets.
-    """
-    name, _, rest = spec.partition("@")[0].partition(":")
-    estimator, prune = presets.build("estimator", name, **options(rest)), pruning(spec, extra)
-
-    def call(c: Correspondences, seed: int = 0) -> Estimate:
-        estimate: Estimate = estimator(prune(c), seed)
-        return estimate
-
-    return call
-
-
-def pruning(spec: str, extra: Mapping[str, Stage] = NONE) -> Stage:
-    """The pruners of a spec, in order; of nothing, the matches as they are."""
-    pruners = [extra[stage] if stage in extra else presets.build("pruner", stage) for stage in stages_of(spec)]
-    return lambda c: functools.reduce(lambda kept, pruner: pruner(kept), pruners, c)
-
-
-def ngransac(file: Path) -> Stage:
-    """The network of neural-guided RANSAC (Brachmann & Rother, ICCV 2019) as prior: its weights of samples."""
-    if not file.is_file():
-        raise SystemExit(f"--ngransac {file}: no such file; scripts/convert_ngransac.py makes it")
-    network = {"_target_": "fmtorch.pruning.networks.LC", "side": ["ratio"]}
-    stage: Stage = presets.build("pruner", "lc_soft", network=network, file=str(file))
-    return stage
-
-
-def informed(spec: str, extra: Mapping[str, Stage] = NONE) -> Callable[[ImagePair, Correspondences, int], Estimate]:
-    """As `build`, of methods that are told the pair: only `truth` looks at it."""
-    if spec.partition("@")[0] == "truth":
-        prune = pruning(spec, extra)
-        return lambda pair, c, seed: from_truth(pair, prune(c))
-    method = build(spec, extra)
-    return lambda pair, c, seed: method(c, seed)
-
-
-def from_truth(pair: ImagePair, c: Correspondences) -> Estimate:
-    """The robust fit to the matches, weighted by their prior, that starts from the true matrix."""
-    F = torch.from_numpy(pair.F)[None]
-    for scale in (1.5, 0.7):  # px
-        F = refine(F, c.x0, c.x1, c.prior, c.mask, kernel="geman_mcclure", scale=scale, iterations=20)
-    ok = torch.isfinite(F).all(-1).all(-1)
-    return Estimate(F, c.mask, ok, ("",), torch.zeros(1, dtype=torch.int64))
-
-
-def measure(specs: list[str], items: list[Item], seeds: int, extra: Mapping[str, Stage] = NONE) -> dict[str, Result]:
+def measure(
+    specs: list[str],
+    items: list[Item],
+    seeds: int,
+    extra: Mapping[str, Stage] = NONE,
+    kept: Kept | None = None,
+    matches: str = "",
+) -> dict[str, Result]:
     """NSGD (seeds, pairs) and milliseconds of processor time (seeds, pairs) of each estimator, one pair a call.
 
     The estimators take turns at each pair, so that what else the machine does slows them down alike.
+
+    Args:
+        specs: the estimators.
+        items: pairs with their matches.
+        seeds: how many, from 0.
+        extra: pruners that are no presets.
+        kept: takes a row for each estimator, pair and seed; those that it has are not measured again.
+        matches: the digest of what the matches were made with.
     """
+    kept = Kept(None) if kept is None else kept
+    known = kept.by("pair", "seed", "method", "identity", "matches")
     methods = {spec: informed(spec, extra) for spec in specs}
-    results = {spec: {"nsgd": np.ones((seeds, len(items))), "ms": np.zeros((seeds, len(items)))} for spec in specs}
-    for method in methods.values():
-        method(*items[0], 0)  # not counted: lazy initialisation
-    calls = [(seed, i) for seed in range(seeds) for i in range(len(items))]
-    for seed, i in track(calls, "estimating", console=console, transient=True):
-        pair, c = items[i]
-        for spec, method in methods.items():
-            start = time.process_time()
-            estimate = method(pair, c, seed)
-            results[spec]["ms"][seed, i] = 1e3 * (time.process_time() - start)
-            if bool(estimate.ok[0]):
-                F = torch.from_numpy(pair.F)[None]
-                assert c.size0 is not None
-                assert c.size1 is not None
-                results[spec]["nsgd"][seed, i] = float(metrics.nsgd(F, estimate.F, c.size0, c.size1, key=c.keys))
-    return results
+    made_with = {spec: (spec, identity(spec, extra), matches) for spec in specs}
+    found: dict[str, dict[tuple[int, int], Row]] = {spec: {} for spec in specs}
+    todo: dict[tuple[int, int], dict[str, Method]] = {}
+    for seed in range(seeds):
+        for i, (pair, _) in enumerate(items):
+            for spec, method in methods.items():
+                row = known.get((pair.identity, seed, *made_with[spec]))
+                if row is None:
+                    todo.setdefault((seed, i), {})[spec] = method
+                else:
+                    found[spec][seed, i] = row
+    for spec in dict.fromkeys(spec for some in todo.values() for spec in some):
+        methods[spec](*items[0], 0)  # not counted: lazy initialisation
+    for (seed, i), some in track(todo.items(), "estimating", console=console, transient=True):
+        new = {spec: _row(method, items[i], seed) for spec, method in some.items()}
+        for spec, row in new.items():
+            row |= dict(zip(("method", "identity", "matches"), made_with[spec], strict=True))
+            found[spec][seed, i] = row
+        kept.add(list(new.values()))
+    return {spec: _result(rows, (seeds, len(items))) for spec, rows in found.items()}
+
+
+def _row(method: Method, item: Item, seed: int) -> Row:
+    """NSGD, 1 where there is no estimate, and milliseconds of one call."""
+    pair, c = item
+    start = time.process_time()
+    estimate = method(pair, c, seed)
+    ms = 1e3 * (time.process_time() - start)
+    nsgd = 1.0
+    if bool(estimate.ok[0]):
+        assert c.size0 is not None
+        assert c.size1 is not None
+        nsgd = float(metrics.nsgd(torch.from_numpy(pair.F)[None], estimate.F, c.size0, c.size1, key=c.keys))
+    return {"pair": pair.identity, "seed": seed, "nsgd": nsgd, "ms": ms}
+
+
+def _result(rows: Mapping[tuple[int, int], Row], shape: tuple[int, int]) -> Result:
+    """The figures of all seeds and pairs, (seeds, pairs) each."""
+    return {
+        name: np.array([[rows[seed, i][name] for i in range(shape[1])] for seed in range(shape[0])])
+        for name in ("nsgd", "ms")
+    }
 
 
 def summaries(results: dict[str, Result], pairs: list[ImagePair], inside: NDArray[np.bool_]) -> table.Figures:

@@ -104,6 +104,15 @@ def _warp_affine(image: np.ndarray, lafs: torch.Tensor) -> None:
         cv2.warpAffine(image, matrix, (32, 32), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
 
 
+def kornia_hesaffnet(
+    n: int, affine: torch.nn.Module | None = None, hardnet: torch.nn.Module | None = None
+) -> torch.nn.Module:
+    """kornia's Hessian, AffNet, dominant gradient and HardNet for n features; without networks random ones."""
+    shape = affine or KF.LAFAffNetShapeEstimator(False, preserve_orientation=False)
+    detector = KF.ScaleSpaceDetector(n, resp_module=KF.BlobHessian(), aff_module=shape, ori_module=KF.LAFOrienter(32))
+    return KF.LocalFeature(detector, KF.LAFDescriptor(hardnet or KF.HardNet(False))).eval()
+
+
 def _hesaffnet(n: int, folder: Path, random: bool) -> tuple[Callable[..., Features], Callable[..., Features]]:
     """Hessian + AffNet + dominant gradient + HardNet, ours and kornia's; with random weights of the same networks."""
     torch.manual_seed(0)
@@ -122,8 +131,7 @@ def _hesaffnet(n: int, folder: Path, random: bool) -> tuple[Callable[..., Featur
         orientation="dominant_gradient",
         max_features=n,
     )
-    detector = KF.ScaleSpaceDetector(n, resp_module=KF.BlobHessian(), aff_module=affine, ori_module=KF.LAFOrienter(32))
-    whole = KF.LocalFeature(detector, KF.LAFDescriptor(hardnet)).eval()
+    whole = kornia_hesaffnet(n, affine, hardnet)
 
     def peer(image: np.ndarray) -> Features:
         lafs, responses, descriptors = whole(torch.from_numpy(image)[None, None].float() / 255)

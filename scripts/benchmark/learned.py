@@ -1,19 +1,20 @@
 """Learned pruners beside all others, on the same matches: before the paper's estimators, and as a prior for our own.
 
-python -m scripts.benchmark learned --root DATA/Strecha --root DATA/KITTI --json FILE
-python -m scripts.benchmark learned --rendered full --limit 50 --json FILE
-python -m scripts.benchmark learned --from FILE FILE --markdown docs/learned.md
+python -m scripts.benchmark learned --root DATA/Strecha --root DATA/KITTI --json FILE.jsonl
+python -m scripts.benchmark learned --rendered full --limit 50 --json FILE.jsonl
+python -m scripts.benchmark learned --from FILE.jsonl FILE.jsonl --markdown docs/learned.md
 python -m scripts.benchmark learned --ngransac FILE.safetensors ...  # also NG-RANSAC's published weights, as a prior
 python -m scripts.benchmark learned --network "seed 1=FILE.safetensors" ...      # also other trainings of `lc`
 
 A pruner's time is the processor's, of its stage alone, on one thread. Every pair is estimated once, with seed 0.
+--json is appended to pair by pair: started again, the command goes on where it was interrupted. A row counts only for
+the code, options and learned files that it was made with.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import sys
 import time
 from collections.abc import Iterator
@@ -31,10 +32,11 @@ from fmtorch.evaluation.run import select
 from fmtorch.pipeline import Outcome, Pipeline
 from fmtorch.storage.features import cached
 from scripts.benchmark import learned_table
-from scripts.benchmark.estimators import ngransac
-from scripts.benchmark.matched import add_set_arguments, sets_of
-from scripts.benchmark.pruning import machine, stage
+from scripts.benchmark.kept import Kept, Row, Stages, identity, read
+from scripts.benchmark.matched import add_set_arguments, options, sets_of
+from scripts.benchmark.pruning import stage
 from scripts.benchmark.sheet import put
+from scripts.benchmark.specs import ngransac
 
 console = Console(width=None if sys.stdout.isatty() else 160)
 # Pruners in order after one match per location; `ratio` stands in every chain but CODE's, which takes all matches.
@@ -69,7 +71,9 @@ KEPT = ("pair", "family", "scene", "ok", "nsgd", "inlier_rate", "inlier_rate_bef
 
 TRAINED = "LC, F"  # the network whose trainings are compared
 
-Chain = list[tuple[str, Any]]  # names of presets and the stages
+Chain = list[tuple[str, Any]]  # names of presets, with options, and the stages
+Chains = dict[str, dict[str, Chain]]  # use -> method -> its pruners
+PLACE = ("pair", "features", "use", "method", "estimator")  # what tells rows apart
 
 
 def add_arguments(commands: Any) -> None:
@@ -81,51 +85,82 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument("--network", action="append", default=[], type=_named, metavar="NAME=FILE",
                         help=f"weights of another training of {TRAINED}; may be repeated")  # fmt: skip
     parser.add_argument("--cache", default="off", help="a folder that keeps features from run to run; off: nowhere")
-    parser.add_argument("--json", type=Path, help="write the figures of every pair here")
-    parser.add_argument("--from", nargs="*", type=Path, default=[], dest="earlier", help="add earlier runs' --json")
+    parser.add_argument("--json", type=Path, help="keep the figures of every pair here, one line each")
+    parser.add_argument("--from", nargs="*", type=Path, default=[], dest="earlier", help="add earlier --json")
     parser.add_argument("--markdown", type=Path, help="put the tables between the marks of this file")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> None:
     torch.set_num_threads(1)
-    runs = [json.loads(path.read_text()) for path in arguments.earlier]
+    rows = [row for path in arguments.earlier for row in read(path)]
     if arguments.root or arguments.rendered:
-        runs.append({"machine": machine(), "rows": list(measure(arguments))})
-    rows = [row for r in runs for row in r["rows"]]
-    unique = {(row["pair"], row["features"], row["use"], row["method"], row["estimator"]): row for row in rows}
-    merged = {"machine": [r["machine"] for r in runs], "rows": list(unique.values())}  # of equals the last
-    tables = learned_table.tables(merged["rows"])
+        rows += measure(arguments)
+    rows = list({tuple(row[name] for name in PLACE): row for row in rows}.values())  # of equals the last
+    tables = learned_table.tables(rows)
     for table in tables:
         console.print(table.terminal())
-    if arguments.json:
-        arguments.json.write_text(json.dumps(merged, indent=0) + "\n")
     if arguments.markdown:
         put(arguments.markdown, tables)
 
 
-def measure(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """A row for each pair, method, use and estimator."""
+def measure(arguments: argparse.Namespace) -> list[Row]:
+    """A row for each pair, method, use and estimator, those of an earlier run included."""
+    kept = Kept(arguments.json)
     pairs = select([dataset[i] for dataset in sets_of(arguments) for i in range(len(dataset))], arguments.limit)
-    features = cached(presets.build("features", arguments.features), arguments.cache)
+    extractor = presets.build("features", arguments.features)
     estimators = {name: presets.build("estimator", name) for _, names in USES.values() for name in names}
-    front = Pipeline(features, presets.build("matcher", "nearest"), {}, next(iter(estimators.values())))
+    front = Pipeline(
+        cached(extractor, arguments.cache), presets.build("matcher", "nearest"), {}, next(iter(estimators.values()))
+    )
+    built = chains(arguments)
+    others = {name: TRAINED for name, _ in arguments.network}
+    before: Stages = [("features", arguments.features, {}), ("matcher", "nearest", {})]
+    made_with = {
+        (use, name, estimator): identity(
+            [*before, *_presets(chain), ("estimator", estimator, {})], extractor, *(pruner for _, pruner in chain)
+        )
+        for use, methods in built.items() for name, chain in methods.items() for estimator in USES[use][1]
+    }  # fmt: skip
+    known = kept.by(*PLACE, "identity")
+    rows: list[Row] = []
+    for pair in track(pairs, "pairs", console=console):
+        place = {key: (pair.identity, arguments.features, *key, digest) for key, digest in made_with.items()}
+        rows += [known[at] for at in place.values() if at in known]
+        missing = [key for key, at in place.items() if at not in known]
+        if missing:
+            todo: Chains = {}
+            for use, name, _ in missing:
+                todo.setdefault(use, {})[name] = built[use][name]
+            new = list(rows_of(front, pair, todo, estimators, arguments.features))
+            for row in new:
+                row["training_of"] = others.get(row["method"])
+                row["identity"] = made_with[row["use"], row["method"], row["estimator"]]
+            kept.add(new)
+            rows += new
+    return rows
+
+
+def _presets(chain: Chain) -> Stages:
+    """The presets of the pruners, with the options that were changed."""
+    specs = [spec.partition(":") for spec, _ in chain]
+    return [("pruner", name, options(rest)) for name, _, rest in specs]
+
+
+def chains(arguments: argparse.Namespace) -> Chains:
+    """The pruners of each method that is asked for, by use and name."""
     built = {
         use: {name: [(spec, stage(spec)) for spec in chain.split()] for name, chain in methods.items()
               if name in arguments.methods}
         for use, (methods, _) in USES.items()
     }  # fmt: skip
+    before = [(name, stage(name)) for name in sorted(GIVEN, reverse=True)]
     if arguments.ngransac:
-        before = [(name, stage(name)) for name in sorted(GIVEN, reverse=True)]
         built["prior"]["NG-RANSAC's network"] = [*before, ("lc", ngransac(arguments.ngransac))]
     for name, file in arguments.network:
         for use, preset in (("hard", "lc"), ("prior", "lc_soft")):
-            before = [(given, stage(given)) for given in sorted(GIVEN, reverse=True)]
             built[use][name] = [*before, (preset, presets.build("pruner", preset, file=file))]
-    others = {name: TRAINED for name, _ in arguments.network}
-    for pair in track(pairs, "pairs", console=console):
-        for row in rows(front, pair, built, estimators, arguments.features):
-            yield {**row, "training_of": others.get(row["method"])}
+    return built
 
 
 def _named(text: str) -> tuple[str, str]:
@@ -135,9 +170,10 @@ def _named(text: str) -> tuple[str, str]:
     return name, file
 
 
-def rows(
-    front: Pipeline, pair: ImagePair, built: dict[str, dict[str, Chain]], estimators: dict[str, Any], features: str
-) -> Iterator[dict[str, Any]]:
+def rows_of(
+    front: Pipeline, pair: ImagePair, built: Chains, estimators: dict[str, Any], features: str
+) -> Iterator[Row]:
+    """A row for each method and estimator."""
     matched = front.match([pair])[0]
     for use, methods in built.items():
         for name, pruners in methods.items():

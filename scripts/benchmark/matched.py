@@ -19,7 +19,9 @@ from fmtorch.data import ImagePair, PairDataset
 from fmtorch.data.baselines import WIDE
 from fmtorch.evaluation.statistics import scene_names
 from fmtorch.pipeline import Pipeline
+from fmtorch.storage.features import cached
 from fmtorch.types import Correspondences, Estimate
+from scripts.benchmark import kept
 
 console = Console(width=None if sys.stdout.isatty() else 170)
 
@@ -70,6 +72,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_set_arguments(parser, "pairs of each set at most")
     parser.add_argument("--features", default="sift")
     parser.add_argument("--pruners", nargs="*", default=["ratio", "one_to_one"])
+    parser.add_argument("--cache", default="off", help="a folder that keeps features from run to run; off: nowhere")
+
+
+def identity(arguments: argparse.Namespace) -> str:
+    """The digest of what the matches of `load` depend on, but for the images."""
+    stages: kept.Stages = [("features", arguments.features, {}), ("matcher", "nearest", {})]
+    stages += [("pruner", name, {}) for name in arguments.pruners]
+    return kept.identity(stages, *(presets.build(group, name) for group, name, _ in stages))
 
 
 def load(arguments: argparse.Namespace) -> list[Item]:
@@ -81,8 +91,8 @@ def load(arguments: argparse.Namespace) -> list[Item]:
     pairs.sort(key=lambda pair: pair.identity)
     pruners: dict[str, Any] = {name: presets.build("pruner", name) for name in arguments.pruners}
     front = Pipeline(
-        presets.build("features", arguments.features), presets.build("matcher", "nearest"), pruners,
-        _no_estimator,
+        cached(presets.build("features", arguments.features), arguments.cache),
+        presets.build("matcher", "nearest"), pruners, _no_estimator,
     )  # fmt: skip
     with ThreadPoolExecutor(torch.get_num_threads()) as workers:
         matched = workers.map(lambda pair: front.match([pair])[0], pairs)

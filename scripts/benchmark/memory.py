@@ -18,8 +18,8 @@ from rich.table import Table
 
 from fmtorch import presets
 from fmtorch.types import collate
-from scripts.benchmark.estimators import build
 from scripts.benchmark.matched import console
+from scripts.benchmark.specs import build
 from scripts.benchmark.synthetic import synthetic_pair
 
 OTHER_LIBRARIES = (

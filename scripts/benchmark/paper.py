@@ -16,6 +16,7 @@ from typing import Any
 import torch
 
 from scripts.benchmark import paper_table, pipelines
+from scripts.benchmark.kept import read
 from scripts.benchmark.matched import add_set_arguments, console
 from scripts.benchmark.sheet import put
 
@@ -33,7 +34,7 @@ def add_arguments(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     torch.set_num_threads(1)
-    rows = [row for path in arguments.earlier for row in pipelines.read(path)]
+    rows = [row for path in arguments.earlier for row in read(path)]
     if arguments.root or arguments.rendered:
         vlfeat = {"pipelines": arguments.estimators, "label": paper_table.VLFEAT, "overrides": ["features=sift_vlfeat"]}
         opencv = {"pipelines": [m for m in OPENCV if m in arguments.estimators], "label": "", "overrides": []}

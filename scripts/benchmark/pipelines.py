@@ -11,7 +11,6 @@ for the learned files and options that it was made with.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,6 +28,7 @@ from fmtorch.storage import identity_digest
 from fmtorch.storage.configuration import configuration
 from fmtorch.storage.features import CachedFeatures
 from scripts.benchmark import pipelines_table
+from scripts.benchmark.kept import Kept, read
 from scripts.benchmark.matched import add_set_arguments, console, sets_of
 from scripts.benchmark.pruning import pruned_by
 from scripts.benchmark.sheet import put
@@ -72,25 +72,12 @@ def run(arguments: argparse.Namespace) -> None:
         put(arguments.markdown, tables)
 
 
-def read(path: Path) -> list[dict[str, Any]]:
-    """The rows of a file."""
-    return [json.loads(line) for line in whole_lines(path).splitlines()]
-
-
-def whole_lines(path: Path) -> str:
-    """What a file holds, without a last line that was cut off by an interruption."""
-    text = path.read_text(encoding="utf-8") if path.exists() else ""
-    return text[: text.rfind("\n") + 1]
-
-
 def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """A row for each pipeline and pair, those of an earlier run included."""
     every = [dataset[i] for dataset in sets_of(arguments) for i in range(len(dataset))]
     pairs = select(every, arguments.limit)
-    known = []
-    if arguments.json:
-        arguments.json.write_text(whole_lines(arguments.json), encoding="utf-8")
-        known = read(arguments.json)
+    kept = Kept(arguments.json)
+    known = list(kept.rows)
     rows = []
     for wide in (True, False):
         some = [pair for pair in pairs if (pair.family in WIDE) == wide]
@@ -105,7 +92,7 @@ def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
             for batch in track(batches, next(iter(pipelines)), console=console):
                 new = list(rows_of(pipelines, batch, arguments.seeds, identity))
                 rows += new
-                keep(arguments.json, new)
+                kept.add(new)
     return rows
 
 
@@ -145,9 +132,3 @@ def rows_of(
             row = {field: getattr(same[0], field) for field in ("pair", "family", "scene", "features0", "features1")}
             figures = {field: [getattr(r, field) for r in same] for field in FIGURES}
             yield {"method": name, "identity": identity[name], **row, **figures}
-
-
-def keep(path: Path | None, rows: Sequence[dict[str, Any]]) -> None:
-    if path is not None:
-        with open(path, "a", encoding="utf-8") as file:
-            file.write("".join(json.dumps(row) + "\n" for row in rows))

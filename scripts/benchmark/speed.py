@@ -24,9 +24,9 @@ from rich.table import Table
 
 from fmtorch import presets
 from fmtorch.types import Correspondences, Estimate, collate
-from scripts.benchmark.estimators import build
 from scripts.benchmark.matched import add_arguments as add_matches_arguments
 from scripts.benchmark.matched import console, load
+from scripts.benchmark.specs import build
 from scripts.benchmark.synthetic import synthetic_pair
 
 

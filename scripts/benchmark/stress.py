@@ -4,16 +4,16 @@ python -m scripts.benchmark stress --root DATA/Strecha --root DATA/PhotoTourism 
     --rendered full --json stress.jsonl --update docs/stress.md
 python -m scripts.benchmark stress --from stress.jsonl --update docs/stress.md
 
---json is appended to pair by pair: started again, the command goes on where it was interrupted. `sizeless` among an
+--json is appended to pair by pair: started again, the command goes on where it was interrupted, and measures what more
+seeds need. A row counts only for the code, options and learned files that it was made with. `sizeless` among an
 estimator's stages takes the image sizes away, and with them the prior on cameras.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,18 +21,15 @@ import cv2
 import torch
 
 from fmtorch import metrics
-from fmtorch.data import ImagePair
-from fmtorch.types import Correspondences, Estimate
+from fmtorch.types import Correspondences
 from scripts.benchmark import stress_cases, stress_table
-from scripts.benchmark.estimators import informed, read_specs
-from scripts.benchmark.pipelines import read, whole_lines
+from scripts.benchmark.kept import Kept, Row, read
+from scripts.benchmark.specs import Method, identity, informed, read_specs
 from scripts.benchmark.stress_cases import Case, on_plane, parallax
 from scripts.benchmark.stress_changes import CONDITIONS, SWEEPS, Change, sizes
 
 SPECS = Path(__file__).with_name("stress.txt")
 CONDITIONED = "conditions"
-Method = Callable[[ImagePair, Correspondences, int], Estimate]
-Row = dict[str, Any]
 
 
 def add_arguments(commands: Any) -> None:
@@ -67,31 +64,32 @@ def run(arguments: argparse.Namespace) -> None:
 
 def measure(cases: Iterator[Case], arguments: argparse.Namespace) -> list[Row]:
     """A row for each case, change and estimator; those of an interrupted run are not measured again."""
+    kept = Kept(arguments.json)
     always, under_conditions = methods(arguments.specs)
-    rows: list[Row] = []
-    if arguments.json:
-        arguments.json.write_text(whole_lines(arguments.json), encoding="utf-8")
-        rows = read(arguments.json)
-    known = {(row["pair"], row["sweep"], row["level"], row["method"]) for row in rows}
+    every = {**always, **under_conditions}
+    made_with = {name: identity(name, STAGES) for name in every}
+    known = kept.by("pair", "sweep", "level", "method", "identity")
+    rows = {key: row for key, row in known.items() if made_with.get(row["method"]) == row["identity"]}
     for case in cases:
         for sweep, level, change in changes(arguments.only):
-            some = {**always, **under_conditions} if sweep == CONDITIONED else always
-            todo = {n: m for n, m in some.items() if (case.pair.identity, sweep, level, n) not in known}
+            some = every if sweep == CONDITIONED else always
+            place = {name: (case.pair.identity, sweep, level, name, made_with[name]) for name in some}
+            before = {name: rows[key] for name, key in place.items() if key in rows}
+            todo = {n: m for n, m in some.items() if n not in before or len(before[n]["nsgd"]) < arguments.seeds}
             changed = change(case) if todo else None
             if changed is None:
                 continue
-            new = list(rows_of(changed, todo, arguments.seeds))
             facts: Row = {"sweep": sweep, "level": level}
             if sweep == CONDITIONED:
                 plane = float(on_plane(changed).sum() / changed.right.sum())
                 side = max(max(image.tolist()) for image in sizes(changed))
                 facts |= {"plane": round(plane, 3), "parallax": round(parallax(changed), 2), "side": side}
-            new = [row | facts for row in new]
-            rows += new
-            if arguments.json:
-                with open(arguments.json, "a", encoding="utf-8") as file:
-                    file.write("".join(json.dumps(row) + "\n" for row in new))
-    return rows
+            measured = rows_of(changed, todo, arguments.seeds, before)
+            new = [row | facts | {"identity": made_with[row["method"]]} for row in measured]
+            rows |= {place[row["method"]]: row for row in new}
+            kept.add(new)
+    complete = [row for row in rows.values() if len(row["nsgd"]) >= arguments.seeds]
+    return [row | {name: row[name][: arguments.seeds] for name in ("nsgd", "ms")} for row in complete]
 
 
 def changes(only: list[str]) -> Iterator[tuple[str, float | str, Change]]:
@@ -103,15 +101,23 @@ def changes(only: list[str]) -> Iterator[tuple[str, float | str, Change]]:
         yield from ((CONDITIONED, name, change) for name, change in CONDITIONS.items())
 
 
-def rows_of(case: Case, some: dict[str, Method], seeds: int) -> Iterator[Row]:
-    """A row for each estimator, with NSGD and processor milliseconds of each seed; they take turns."""
+def rows_of(
+    case: Case, some: Mapping[str, Method], seeds: int, before: Mapping[str, Row] | None = None
+) -> Iterator[Row]:
+    """A row for each estimator, with NSGD and processor milliseconds of each seed; they take turns.
+
+    before: rows with fewer seeds, whose figures are taken over.
+    """
     c, pair = case.c, case.pair
     F = torch.from_numpy(pair.F)[None]
     assert c.size0 is not None
     assert c.size1 is not None
-    found: dict[str, tuple[list[float], list[float]]] = {name: ([], []) for name in some}
+    earlier = {name: (before or {}).get(name, {"nsgd": [], "ms": []}) for name in some}
+    found = {name: (list(row["nsgd"]), list(row["ms"])) for name, row in earlier.items()}
     for seed in range(seeds):
         for name, method in some.items():
+            if seed < len(found[name][0]):
+                continue
             start = time.process_time()
             estimate = method(pair, c, seed)
             milliseconds = 1e3 * (time.process_time() - start)

@@ -91,6 +91,7 @@ APPENDED = {
     "stress": ["--limit", "1", "--only", "noise"],
     "speed": ["--pairs", "2", "--batch", "2", "--repeats", "1", "--matches", "200"],
     "memory": ["--pairs", "1", "--matches", "200", "--estimators", "ransac"],
+    "end_to_end": ["--limit", "1", "--pipelines", "sift_lmeds"],
     "features": ["--features", "100", "--repeats", "1", "--size", "120", "160"],
     "matching": ["--features", "200", "--repeats", "1"],
 }

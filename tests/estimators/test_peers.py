@@ -68,7 +68,10 @@ def test_poselib_gets_the_options_that_are_named(name: str, monkeypatch: pytest.
     assert refinement == {"loss_type": "HUBER", "loss_scale": 0.3}
     with pytest.raises(ValueError, match="loss is 'l3'; it must be one of: trivial, truncated"):
         presets.build("estimator", name, loss="l3")
-    if name == "poselib":
+    if name == "poselib_shared_focal":
+        with pytest.raises(ValueError, match="real_focal_check is of fundamental matrices alone"):
+            presets.build("estimator", name, real_focal_check=True)
+    else:
         presets.build("estimator", name, real_focal_check=True, prosac=True)(c)
         centred, options, _ = seen.pop()
         assert options["real_focal_check"] is True

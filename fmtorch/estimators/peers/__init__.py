@@ -8,4 +8,4 @@ PEERS = {
     "poselib": "poselib", "poselib_shared_focal": "poselib", "magsac_cpp": "pymagsac", "gc_ransac_cpp": "pygcransac",
     "degensac_cpp": "pydegensac", "superansac_cpp": "pysuperansac",
 }  # fmt: skip
-"""The packages whose versions decide what the functions of these names compute."""
+"""The packages whose versions decide what the functions and presets of these names compute."""

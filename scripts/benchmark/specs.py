@@ -1,0 +1,91 @@
+"""Estimators that are named in one word: PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import torch
+
+from fmtorch import presets
+from fmtorch.data import ImagePair
+from fmtorch.geometry import refine
+from fmtorch.stages import Estimator
+from fmtorch.types import Correspondences, Estimate
+from scripts.benchmark import kept
+from scripts.benchmark.matched import options
+
+Stage = Callable[[Correspondences], Correspondences]
+Method = Callable[[ImagePair, Correspondences, int], Estimate]
+NGRANSAC = "ngransac"
+TRUTH = "truth"
+NONE: Mapping[str, Stage] = {}
+
+
+def read_specs(path: Path) -> list[str]:
+    """One estimator a line, without comments."""
+    return [text for line in path.read_text().splitlines() if (text := line.partition("#")[0].strip())]
+
+
+def stages_of(spec: str) -> list[str]:
+    """The pruners of `PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]`."""
+    return [stage for stage in spec.partition("@")[2].split("+") if stage]
+
+
+def identity(spec: str, extra: Mapping[str, Stage] = NONE) -> str:
+    """The digest of what an estimator's results depend on: options, code, learned files, versions of peers."""
+    name, _, rest = spec.partition("@")[0].partition(":")
+    stages: kept.Stages = [] if name == TRUTH else [("estimator", name, options(rest))]
+    stages += [("pruner", stage, {}) for stage in stages_of(spec) if stage not in extra]
+    own = [part for stage in stages_of(spec) if stage in extra for part in (stage, extra[stage])]
+    built = [presets.build("pruner", name) for group, name, _ in stages if group == "pruner"]
+    return kept.identity(stages, name, *own, *built)
+
+
+def build(spec: str, extra: Mapping[str, Stage] = NONE) -> Estimator:
+    """The function of `PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]`: pruners in order, then the estimator.
+
+    extra: pruners that are no presets.
+    """
+    name, _, rest = spec.partition("@")[0].partition(":")
+    estimator, prune = presets.build("estimator", name, **options(rest)), pruning(spec, extra)
+
+    def call(c: Correspondences, seed: int = 0) -> Estimate:
+        estimate: Estimate = estimator(prune(c), seed)
+        return estimate
+
+    return call
+
+
+def pruning(spec: str, extra: Mapping[str, Stage] = NONE) -> Stage:
+    """The pruners of a spec, in order; of nothing, the matches as they are."""
+    pruners = [extra[stage] if stage in extra else presets.build("pruner", stage) for stage in stages_of(spec)]
+    return lambda c: functools.reduce(lambda kept, pruner: pruner(kept), pruners, c)
+
+
+def ngransac(file: Path) -> Stage:
+    """The network of neural-guided RANSAC (Brachmann & Rother, ICCV 2019) as prior: its weights of samples."""
+    if not file.is_file():
+        raise SystemExit(f"--ngransac {file}: no such file; scripts/convert_ngransac.py makes it")
+    network = {"_target_": "fmtorch.pruning.networks.LC", "side": ["ratio"]}
+    stage: Stage = presets.build("pruner", "lc_soft", network=network, file=str(file))
+    return stage
+
+
+def informed(spec: str, extra: Mapping[str, Stage] = NONE) -> Method:
+    """As `build`, of methods that are told the pair: only `truth` looks at it."""
+    if spec.partition("@")[0] == TRUTH:
+        prune = pruning(spec, extra)
+        return lambda pair, c, seed: from_truth(pair, prune(c))
+    method = build(spec, extra)
+    return lambda pair, c, seed: method(c, seed)
+
+
+def from_truth(pair: ImagePair, c: Correspondences) -> Estimate:
+    """The robust fit to the matches, weighted by their prior, that starts from the true matrix."""
+    F = torch.from_numpy(pair.F)[None]
+    for scale in (1.5, 0.7):  # px
+        F = refine(F, c.x0, c.x1, c.prior, c.mask, kernel="geman_mcclure", scale=scale, iterations=20)
+    ok = torch.isfinite(F).all(-1).all(-1)
+    return Estimate(F, c.mask, ok, ("",), torch.zeros(1, dtype=torch.int64))
