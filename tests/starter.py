@@ -1,5 +1,7 @@
 """Starts commands quickly: one process imports the libraries and the package, and forks another for each command.
 
+It has also done what each command does first and always alike, see `warm_up`.
+
 Lines of JSON come in on standard input: ``{"start": [module or -c, arguments ...], "cwd": ..., "log": ...,
 "errors": ..., "environment": {...}, "before": code}`` is answered by the process's id, ``{"wait": id}`` by its exit
 status. What is forked runs a module as ``python -m`` does, or what follows ``-c``, after the code.
@@ -7,7 +9,9 @@ status. What is forked runs a module as ``python -m`` does, or what follows ``-c
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import io
 import json
 import os
 import runpy
@@ -16,8 +20,8 @@ import traceback
 from typing import Any
 
 LIBRARIES = (
-    "torch", "kornia", "cv2", "hydra", "omegaconf", "pyarrow.parquet", "matplotlib.figure", "skimage.io",
-    "rich.progress", "scipy.spatial", "numba", "onnxruntime", "lightning", "lightning.pytorch.loggers",
+    "torch", "kornia", "cv2", "hydra", "omegaconf", "pyarrow.parquet", "pyarrow.compute", "matplotlib.figure",
+    "skimage.io", "rich.progress", "scipy.spatial", "numba", "onnxruntime", "lightning", "lightning.pytorch.loggers",
     "torch.utils.tensorboard", "antlr4", "jinja2", "h5py",
     "fmtorch.commands.eval", "fmtorch.commands.match", "fmtorch.commands.pairs", "fmtorch.commands.report",
     "fmtorch.estimators", "fmtorch.features", "fmtorch.pruning", "fmtorch.matching",
@@ -58,13 +62,33 @@ def run(job: dict[str, Any]) -> None:
         os._exit(status)
 
 
+def warm_up() -> None:
+    """Load what numba needs before its first kernel and matplotlib before its first figure; read the package's code.
+
+    Without threads, which a fork would lose.
+    """
+    with contextlib.suppress(ImportError):
+        from numba.core.registry import cpu_target
+
+        cpu_target.target_context.refresh()
+    from matplotlib.figure import Figure
+
+    figure = Figure()
+    figure.subplots().set_title("fonts")
+    figure.savefig(io.BytesIO())
+    from fmtorch.storage.code import code_digest, fmtorch_version
+
+    fmtorch_version()
+    for name in ("fmtorch.features.sift", "fmtorch.estimators", "fmtorch.matching", "fmtorch.pruning"):
+        code_digest(name)
+
+
 def main() -> None:
     """Serve until standard input is closed."""
     for name in LIBRARIES:
-        try:
+        with contextlib.suppress(ImportError):
             importlib.import_module(name)
-        except ImportError:
-            continue
+    warm_up()
     for line in sys.stdin:
         job = json.loads(line)
         if "wait" in job:

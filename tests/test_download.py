@@ -44,7 +44,7 @@ def server(tmp_path: Path) -> Iterator[str]:
 
     handler = functools.partial(Handler, directory=str(tmp_path / "served"))
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as httpd:
-        threading.Thread(target=httpd.serve_forever, daemon=True).start()
+        threading.Thread(target=httpd.serve_forever, args=(0.01,), daemon=True).start()  # ends soon
         yield f"http://127.0.0.1:{httpd.server_address[1]}"
         httpd.shutdown()
 
@@ -140,7 +140,7 @@ def ranges(tmp_path: Path) -> Iterator[tuple[type[Ranges], str]]:
     content = archive(tmp_path / "source.tgz", {"rgbd_dataset_x/rgb.txt": b"# list", "rgbd_dataset_x/rgb/1.png": noise})
     handler = type("Handler", (Ranges,), {"content": content, "limit": len(content), "asked": []})
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as httpd:
-        threading.Thread(target=httpd.serve_forever, daemon=True).start()
+        threading.Thread(target=httpd.serve_forever, args=(0.01,), daemon=True).start()  # ends soon
         yield handler, f"http://127.0.0.1:{httpd.server_address[1]}/{{camera}}/{{file}}.tgz"
         httpd.shutdown()
 

@@ -98,7 +98,7 @@ class _Import(NamedTuple):
 def _imports(source: bytes) -> tuple[_Import, ...]:
     """The import statements of a file, wherever in it; none where it does not compile."""
     try:
-        nodes = ast.walk(ast.parse(source))
+        nodes = _statements(ast.parse(source))
     except (SyntaxError, ValueError):
         return ()
     return tuple(
@@ -110,6 +110,18 @@ def _imports(source: bytes) -> tuple[_Import, ...]:
         for node in nodes
         if isinstance(node, ast.Import | ast.ImportFrom)
     )
+
+
+def _statements(tree: ast.Module) -> list[ast.AST]:
+    """All statements of a file, wherever in it; much faster than a walk through its expressions, too."""
+    found: list[ast.AST] = []
+    todo: list[ast.AST] = [tree]
+    while todo:
+        node = todo.pop()
+        found.append(node)
+        for block in ("body", "orelse", "finalbody", "handlers", "cases"):
+            todo += getattr(node, block, ())
+    return found
 
 
 def _files_of(statement: _Import, file: Path, start: Path, own: bool) -> Iterator[Path]:

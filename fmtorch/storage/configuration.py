@@ -30,20 +30,25 @@ def configuration(part: object) -> Any:
     a class is its name and code; a `Path` is the digest of the file; tensors and networks are the digests of their
     values. Raises TypeError for anything that does not say what defines it, and OSError for a file that cannot be read.
     """
+    return _plain(part, code=True)
+
+
+def _plain(part: object, code: bool) -> Any:
+    """The `configuration` of a part, or all of it but the digests of code."""
     if part is None or isinstance(part, bool | int | float | str):
         return part
     if isinstance(part, Path):
         return {"file": file_digest(part)}
     if isinstance(part, Mapping):
-        return {str(key): configuration(value) for key, value in part.items()}
+        return {str(key): _plain(value, code) for key, value in part.items()}
     if isinstance(part, list | tuple):
-        return [configuration(value) for value in part]
+        return [_plain(value, code) for value in part]
     if isinstance(part, type):
-        return _class(part)
+        return _class(part, code)
     if isinstance(part, torch.Tensor):
         values = part.detach().cpu().contiguous()
         return {"tensor": [str(part.dtype), list(part.shape), digest(values.reshape(-1).view(torch.uint8).numpy())]}
-    return {**_options(part), **_class(type(part))}
+    return {**_options(part, code), **_class(type(part), code)}
 
 
 def learned(part: object) -> list[str]:
@@ -52,7 +57,7 @@ def learned(part: object) -> list[str]:
     None for a part that does not say what defines it, or whose file cannot be read: it tells so itself when used.
     """
     try:
-        whole = configuration(part)
+        whole = _plain(part, code=False)
     except (TypeError, OSError):
         return []
     return sorted(set(_learned(whole)))
@@ -72,21 +77,22 @@ def _learned(value: Any) -> Iterator[str]:
                 yield from _learned(entry)
 
 
-def _options(part: object) -> dict[str, Any]:
+def _options(part: object, code: bool) -> dict[str, Any]:
     if hasattr(part, "identity"):
-        return {"identity": configuration(part.identity)}
+        return {"identity": _plain(part.identity, code)}
     if dataclasses.is_dataclass(part):
-        return {f.name: configuration(getattr(part, f.name)) for f in dataclasses.fields(part) if f.compare}
+        return {f.name: _plain(getattr(part, f.name), code) for f in dataclasses.fields(part) if f.compare}
     if isinstance(part, torch.nn.Module):
-        return {"network": repr(part), "weights": configuration(part.state_dict())}
+        return {"network": repr(part), "weights": _plain(part.state_dict(), code)}
     raise TypeError(
         f"{type(part).__module__}.{type(part).__qualname__} does not say what defines its results; "
         "make it a dataclass, or give it an attribute `identity` of plain values"
     )
 
 
-def _class(kind: type) -> dict[str, str]:
-    return {"class": f"{kind.__module__}.{kind.__qualname__}", "code": code_digest(kind.__module__)}
+def _class(kind: type, code: bool) -> dict[str, str]:
+    name = {"class": f"{kind.__module__}.{kind.__qualname__}"}
+    return {**name, "code": code_digest(kind.__module__)} if code else name
 
 
 @functools.cache

@@ -164,6 +164,7 @@ def test_networks_are_read_when_first_used(tmp_path: Path) -> None:
         CachedFeatures(extract, ArrayCache(tmp_path))
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # the older exporter takes a fraction of the time
 def test_hesaffnet_runs_through_onnx(tmp_path: Path) -> None:
     pytest.importorskip("onnx")
     files = {}

@@ -319,7 +319,7 @@ def subjects(names: list[str]) -> list[Subject]:
         made[f"find_fundamental.{name}"] = functools.partial(functools.partial, estimation, name, options)
     for name in presets.available("pruner"):
         made[f"pruner.{name}"] = functools.partial(_stage, name)
-    made["match"] = lambda: functools.partial(photographs, {name: _pipeline(name) for name in PIPELINES})
+    made["fmtorch.match"] = lambda: functools.partial(photographs, {name: _pipeline(name) for name in PIPELINES})
     return [Subject(name, draw()) for name, draw in made.items() if not names or name.startswith(tuple(names))]
 
 

@@ -150,6 +150,10 @@ def test_images_of_any_kind(name: str, tmp_path: Path) -> None:
     assert image.std() > 10 or image.shape[0] == 1  # it is the picture
 
 
+PILLOWS_WARNINGS = pytest.mark.filterwarnings("ignore:Corrupt EXIF data|Tag data larger than file:UserWarning")
+
+
+@PILLOWS_WARNINGS
 @pytest.mark.parametrize("name", NO_IMAGES)
 def test_files_that_are_no_image(name: str, tmp_path: Path) -> None:
     path = tmp_path / name
@@ -180,11 +184,13 @@ def damaged_images(path: Path, count: int, seed: int) -> tuple[int, int]:
     return refused, read
 
 
+@PILLOWS_WARNINGS
 def test_damaged_images(tmp_path: Path) -> None:
     refused, read = damaged_images(tmp_path, 140, 0)
     assert refused > read
 
 
+@PILLOWS_WARNINGS
 @pytest.mark.reliability
 def test_many_damaged_images(tmp_path: Path, record_property: Property) -> None:
     record_property("damaged images, refused and read", damaged_images(tmp_path, 7000, 1))

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import threading
+import types
 from pathlib import Path
 
 import numpy as np
@@ -323,7 +324,11 @@ def test_code_is_what_a_module_imports_from_its_own_package(tmp_path: Path, monk
         monkeypatch.delitem(sys.modules, name)
 
 
-def test_learned_files_are_digests(tmp_path: Path) -> None:
+class Typed(torch.nn.Linear):
+    """A network as if typed in where no file holds it."""
+
+
+def test_learned_files_are_digests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "a.npz"
     file.write_bytes(b"one")
     before = learned(presets.build("features", "rootsiftpca", descriptor={"name": "rootsiftpca", "model": str(file)}))
@@ -338,6 +343,9 @@ def test_learned_files_are_digests(tmp_path: Path) -> None:
     with torch.no_grad():
         network.weight[0, 0] += 1
     assert learned(network) != [before]
+    monkeypatch.setitem(sys.modules, "typed_in", types.ModuleType("typed_in"))
+    monkeypatch.setattr(Typed, "__module__", "typed_in")
+    assert len(learned(Typed(2, 2))) == 1
     assert learned(presets.build("features", "sift")) == []
     assert learned(lambda: None) == []
     assert learned(RootSIFTPCA(tmp_path / "absent.npz")) == []

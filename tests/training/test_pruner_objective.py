@@ -46,8 +46,9 @@ def test_terms_are_the_losses_of_the_weighted_fit() -> None:
     assert c.size0 is not None
     assert c.size1 is not None
     expected = geometric_loss(F, batch.F, c.size0, c.size1, valid=valid, points=100, seed=7, key=c.keys)
-    assert float(terms["geometric"]) == pytest.approx(float(expected))
-    assert float(terms["classification"]) == pytest.approx(float(classification_loss(made.logit, batch.label)))
+    assert float(terms["geometric"].detach()) == pytest.approx(float(expected.detach()))
+    classification = classification_loss(made.logit, batch.label)
+    assert float(terms["classification"].detach()) == pytest.approx(float(classification.detach()))
 
 
 def test_a_pair_that_cannot_be_judged_adds_nothing() -> None:
