@@ -38,15 +38,16 @@ class Kernel(Generic[P, R]):
     """A function of NumPy arrays and numbers, compiled for one signature when it is first called.
 
     Arrays of another dtype, number of axes or memory order are refused with a TypeError, never converted; numbers are
-    converted. Kernels and inner functions may call it, too. It holds no Python lock while it runs.
+    converted. Kernels and inner functions may call it, too. It holds no Python lock while it runs, unless it is brief.
     """
 
-    def __init__(self, function: Callable[P, R], signature: str) -> None:
+    def __init__(self, function: Callable[P, R], signature: str, brief: bool = False) -> None:
         self.function: Callable[P, R] = inspect.unwrap(
             function
         )  # without the checks that tests wrap around every function
         functools.update_wrapper(self, self.function)
         self.signature = f"({signature},)"  # a tuple, of one argument too
+        self.brief = brief
         self._compiled: Callable[P, R] | None = None
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
@@ -60,7 +61,7 @@ class Kernel(Generic[P, R]):
         """
         with _lock:
             if self._compiled is None:
-                self._compiled = _compiled(self.function, self.signature, count)
+                self._compiled = _compiled(self.function, self.signature, self.brief, count)
         return self._compiled
 
     @property
@@ -112,12 +113,13 @@ class Inner(Generic[P, R]):
         return str(self.__qualname__)  # type: ignore[attr-defined]  # the name to import it by
 
 
-def kernel(signature: str) -> Callable[[Callable[P, R]], Kernel[P, R]]:
+def kernel(signature: str, *, brief: bool = False) -> Callable[[Callable[P, R]], Kernel[P, R]]:
     """Makes a function a `Kernel` of the given types, as numba writes them: ``"f4[:, ::1], i8[::1], f8"``.
 
-    ``[:, ::1]`` is an array of two axes in C order; it must be writable.
+    ``[:, ::1]`` is an array of two axes in C order; it must be writable. brief: of some microseconds, for which it
+    keeps Python's lock: a thread that waits for it would wake too late to use them.
     """
-    return lambda function: Kernel(function, signature)
+    return lambda function: Kernel(function, signature, brief)
 
 
 @overload
@@ -201,10 +203,10 @@ def identity() -> str:
     return f"numba {numba_version()}" if available() else "off"
 
 
-def _compiled(function: Callable[P, R], signature: str, count: str) -> Callable[P, R]:
+def _compiled(function: Callable[P, R], signature: str, brief: bool, count: str) -> Callable[P, R]:
     import numba
 
-    dispatcher: Any = numba.njit(**OPTIONS)(function)
+    dispatcher: Any = numba.njit(**(OPTIONS | {"nogil": not brief}))(function)
     if not hasattr(dispatcher, "compile"):
         return function  # NUMBA_DISABLE_JIT=1
 

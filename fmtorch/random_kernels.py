@@ -38,7 +38,7 @@ def uniform(state: Word, counter: int) -> Any:
     return np.float64(random_bits(state, counter) >> np.uint64(10)) * 2.0**-53
 
 
-@kernel("i8, i8, i8, i8[::1]")
+@kernel("i8, i8, i8, i8[::1]", brief=True)
 def random_words(mixed_seed: int, key: int, start: int, out: NDArray[Any]) -> None:
     """Numbers start, start + 1, ... of a stream, 63 random bits each -> out (n,): what `random.bits` gives a column."""
     state = stream_state(mixed_seed, key)

@@ -38,6 +38,19 @@ def rows(x, out):
     for i in range(len(x)):
         scaled_squares(x[i], 2.0, out[i])
 """
+WAITING = """
+import numpy as np
+from fmtorch.kernels import kernel
+
+@kernel("i8[::1], i8", brief={brief})
+def answered(flags, rounds):
+    flags[0] = 1
+    for _ in range(rounds):
+        if flags[1]:
+            return True
+        np.empty(1)  # as far as the compiler knows, this may change the flags
+    return False
+"""
 REPOSITORY = Path(__file__).resolve().parents[1]
 numba = pytest.importorskip("numba", reason="numba is not installed")
 
@@ -278,6 +291,24 @@ def test_threads_compile_it_once_and_run_at_the_same_time(
         thread.join()
     assert results == [EXPECTED] * 4
     assert capsys.readouterr().err.count("compiling rows") == 1
+
+
+@pytest.mark.parametrize("brief", [False, True])
+def test_a_brief_kernel_keeps_the_lock_that_others_leave_to_other_threads(tmp_path: Path, brief: bool) -> None:
+    flags = np.zeros(2, np.int64)  # the kernel runs; a thread has seen that
+    answered = load(tmp_path, WAITING.format(brief=brief)).answered
+    answered(flags, 0)
+    flags[:] = 0
+
+    def answer() -> None:
+        while not flags[0]:
+            time.sleep(1e-4)
+        flags[1] = 1
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    assert answered(flags, 10**5 if brief else 10**9) == (not brief)
+    thread.join()
 
 
 def test_several_processes_share_the_folder(tmp_path: Path, cache: Path) -> None:

@@ -15,7 +15,7 @@ Array = NDArray[Any]
 TINY = float(np.finfo(np.float64).tiny)
 
 
-@kernel("f8[::1], i8[::1]")
+@kernel("f8[::1], i8[::1]", brief=True)
 def best(score: Array, out: Array) -> None:
     """The indices of the k best of m >= k scores, in ascending order -> out (k,)."""
     m, k = len(score), len(out)
@@ -30,7 +30,7 @@ def best(score: Array, out: Array) -> None:
             place += 1
 
 
-@kernel("f4[:, ::1], i8[::1], f8[::1], i8[::1], i8, f4[:, ::1], f8[::1], i8[::1]")
+@kernel("f4[:, ::1], i8[::1], f8[::1], i8[::1], i8, f4[:, ::1], f8[::1], i8[::1]", brief=True)
 def merge(
     F: Array, which: Array, score: Array, draw: Array, filled: int, pool: Array, pool_score: Array, pool_draw: Array
 ) -> int:  # fmt: skip
@@ -73,7 +73,7 @@ def near(F: Array, points: Array, limit: Any, out: Array) -> None:
             out[i] |= e * e <= limit * (a0 * a0 + b0 * b0 + a1 * a1 + b1 * b1)
 
 
-@kernel("f8[::1], f8[:, ::1], f8[::1]")
+@kernel("f8[::1], f8[:, ::1], f8[::1]", brief=True)
 def residuals_squared(F: Array, points: Array, out: Array) -> None:
     """Squared Sampson distances of points (4, n) to one model (9,) in float64 -> out (n,)."""
     x0, y0, x1, y1 = points[0], points[1], points[2], points[3]

@@ -83,7 +83,7 @@ def score_saturated(
         out[k] = total * 2.0**-bits
 
 
-@kernel("f4[:, ::1], f4[::1], i4[:, ::1]")
+@kernel("f4[:, ::1], f4[::1], i4[:, ::1]", brief=True)
 def saturated_cells(points: Array, support: Array, out: Array) -> None:
     """Each match's cells in grids over the matches of support -> out (2, n), of image 0 and, counted on, of image 1."""
     for image in range(2):

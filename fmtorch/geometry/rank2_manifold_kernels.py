@@ -1,4 +1,4 @@
-"""`rank2_manifold` for the models of one pair, compiled: starts, steps, and which steps are taken."""
+"""`rank2_manifold` for the models of one pair, compiled: starts and steps."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.geometry.rank2_kernels import assign, assign_rows, cofactors, unit
+from fmtorch.geometry.rank2_kernels import cofactors, unit
 from fmtorch.kernels import inner, kernel
 
 Array = NDArray[Any]
-SMALLEST_DAMPING, LARGEST_DAMPING = 1e-12, 1e6  # as in `refine`
 
 
 @kernel("f8[:, ::1], i8, f8[:, ::1], f8[:, ::1], f8[:, ::1]")
@@ -70,6 +69,14 @@ def step(
 
     products: (k, 10, 10), of `sampson_objective_kernels.evaluate`. damping: (k,).
     """
+    steps(products, F, e0, e1, damping, G, g0, g1)
+
+
+@inner
+def steps(
+    products: Array, F: Array, e0: Array, e1: Array, damping: Array, G: Array, g0: Array, g1: Array
+) -> None:  # fmt: skip
+    """`step`, for kernels."""
     Q, C = np.empty((10, 11)), np.empty(9)
     for k in range(len(F)):
         curvature = 0.0
@@ -119,31 +126,3 @@ def _retract(G: Array, e0: Array, e1: Array, g0: Array, g1: Array, C: Array) -> 
         g1[c] = C[3 * c] * e0[0] + C[3 * c + 1] * e0[1] + C[3 * c + 2] * e0[2]
     unit(g0)
     unit(g1)
-
-
-@kernel(
-    "f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], "
-    "f8[::1], f8[::1], b1[::1], f8"
-)
-def accept(
-    F: Array, e0: Array, e1: Array, products: Array, cost: Array, G: Array, g0: Array, g1: Array, others: Array,
-    trial: Array, damping: Array, done: Array, tolerance: float,
-) -> bool:  # fmt: skip
-    """Takes the steps G, g0, g1, of products `others`, whose costs `trial` are lower, in place; whether all are done.
-
-    damping (k,), done (k,): of each model. tolerance: the share of its cost by which a model's last step lowers it; 0:
-    none is ever done.
-    """
-    everything = True
-    for k in range(len(F)):
-        better = trial[k] < cost[k] and not done[k]
-        damping[k] = min(max(damping[k] / 10 if better else damping[k] * 10, SMALLEST_DAMPING), LARGEST_DAMPING)
-        if better:
-            done[k] |= tolerance > 0 and cost[k] - trial[k] <= tolerance * cost[k]
-            cost[k] = trial[k]
-            assign(F[k], G[k])
-            assign(e0[k], g0[k])
-            assign(e1[k], g1[k])
-            assign_rows(products[k], others[k])
-        everything = everything and done[k]
-    return everything

@@ -115,7 +115,7 @@ def _median_of_places(chance: Array, place: Array, out: Array) -> int:
     return groups
 
 
-@kernel("f8[::1], f8[::1]")
+@kernel("f8[::1], f8[::1]", brief=True)
 def most_significant(chance: Array, factorial: Array) -> float:
     """-log10 of the least number of false alarms over k, of ascending chances; factorial: log i!, for i to n."""
     n, best = len(chance), -math.inf

@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from fmtorch import presets
+from fmtorch.estimators import support, support_kernels
 from fmtorch.estimators.one_pair import exit as compiled
-from fmtorch.estimators.one_pair.door import power_of_two
+from fmtorch.estimators.pairs_kernels import power_of_two
 from fmtorch.estimators.support import lack_of_support
 from fmtorch.geometry.pixel_frame import PixelFrame
 from fmtorch.types import Correspondences, collate
@@ -60,6 +61,11 @@ def test_an_estimate_is_that_of_the_tensor_door(name: str) -> None:
     for field in ("F", "inliers", "ok", "draws", "significance"):
         assert torch.equal(getattr(ours, field), getattr(theirs, field).detach()), field
     assert bool(ours.ok.any()) == (name != "huge")
+
+
+def test_constants_are_those_of_the_tensor_form() -> None:
+    for name in ("ROUNDINGS", "EXTENT_ROUNDING", "DIRECTION"):
+        assert getattr(support_kernels, name) == getattr(support, name), name
 
 
 def test_support_is_told_alike() -> None:

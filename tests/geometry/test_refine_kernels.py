@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.geometry.rank2_manifold_kernels import accept, start, step
+from fmtorch.geometry import refine_kernels
+from fmtorch.geometry.rank2_manifold import SQUARINGS
 from fmtorch.geometry.refine import DAMPING, refine_components
 from fmtorch.geometry.robust_kernels import KERNELS
 from fmtorch.geometry.sampson_objective import SampsonObjective
@@ -53,20 +54,15 @@ def test_costs_and_normal_equations(loss: str, n: int) -> None:
 def refined(
     F: np.ndarray, points: np.ndarray, weight: np.ndarray, s2: np.ndarray, loss: str, iterations: int, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The loop of `refine_components` over the kernels."""
-    k = len(F)
-    state, trial = (
-        [np.empty((k, 9)), np.empty((k, 3)), np.empty((k, 3)), np.zeros((k, 10, 10)), np.empty(k)] for _ in range(2)
-    )
-    start(F, 5, *state[:3])
-    evaluate(state[0], points, weight, s2, LOSSES[loss], LOSS_TABLE, True, *state[3:])
-    damping, done = np.full(k, DAMPING.first), np.zeros(k, bool)
-    for _ in range(iterations):
-        step(state[3], *state[:3], damping, *trial[:3])
-        evaluate(trial[0], points, weight, s2, LOSSES[loss], LOSS_TABLE, True, *trial[3:])
-        if accept(*state, *trial, damping, done, tolerance):
-            break
-    return state[0], state[4]
+    """`refine_components` by the kernel."""
+    found, cost = np.empty_like(F), np.empty(len(F))
+    data, damping = (points, weight, s2, LOSSES[loss], LOSS_TABLE), DAMPING.first
+    refine_kernels.refine(F, SQUARINGS, *data, iterations, damping, tolerance, found, cost)
+    return found, cost
+
+
+def test_bounds_of_the_damping_are_those_of_the_tensor_form() -> None:
+    assert DAMPING[1:] == (refine_kernels.MIN_DAMPING, refine_kernels.MAX_DAMPING)
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 1e-3])

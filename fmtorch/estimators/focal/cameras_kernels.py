@@ -23,7 +23,7 @@ MIN_FOCAL, MAX_FOCAL = 0.25, 5.0  # as in `cameras`
 SQUARINGS = 5  # as in `rank2_manifold`
 
 
-@kernel("f8[:, ::1], f8[::1], f8[:, ::1]")
+@kernel("f8[:, ::1], f8[::1], f8[:, ::1]", brief=True)
 def translate(F: Array, offset: Array, out: Array) -> None:
     """Models (k, 9) for points from which the offset (4,) is taken -> out (k, 9)."""
     for k in range(len(F)):
@@ -35,7 +35,7 @@ def translate(F: Array, offset: Array, out: Array) -> None:
             out[k, 6 + c] += offset[2] * out[k, c] + offset[3] * out[k, 3 + c]
 
 
-@kernel("f8[:, ::1], f8[::1], f8[:, :, :, ::1], f8[:, ::1]")
+@kernel("f8[:, ::1], f8[::1], f8[:, :, :, ::1], f8[:, ::1]", brief=True)
 def nearest_cameras(F: Array, longest: Array, axes: Array, focal: Array) -> None:
     """Cameras near models (k, 9): those of their focal lengths, or of usual ones where these are implausible."""
     G, M, e0, e1 = np.empty(9), np.empty(9), np.empty(3), np.empty(3)

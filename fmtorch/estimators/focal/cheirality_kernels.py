@@ -16,7 +16,7 @@ REST = 1 / 26  # of the gain of Geman & McClure, as in `scores`
 TINY = float(np.finfo(np.float64).tiny)
 
 
-@kernel("f8[:, :, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8, f8[::1]")
+@kernel("f8[:, :, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8, f8[::1]", brief=True)
 def share_in_front(
     axes: Array, depth: Array, F: Array, points: Array, prior: Array, scale: Array, tolerance: float, out: Array
 ) -> None:  # fmt: skip

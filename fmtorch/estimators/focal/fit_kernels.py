@@ -14,7 +14,7 @@ from fmtorch.kernels import kernel
 Array = NDArray[Any]
 
 
-@kernel("f8[:, :, ::1], f8[:, ::1], f8[:, ::1], b1, f8, f8[::1]")
+@kernel("f8[:, :, ::1], f8[:, ::1], f8[:, ::1], b1, f8, f8[::1]", brief=True)
 def gain_without_prior(
     hessian: Array, gradient: Array, focal: Array, same_size: bool, damping: float, out: Array
 ) -> None:  # fmt: skip

@@ -14,7 +14,7 @@ from fmtorch.random_kernels import random_bits, stream_state
 Array = NDArray[Any]
 
 
-@kernel("f8[::1], f8[::1], b1, f8[::1], i8, i8, i8, f8[:, ::1]")
+@kernel("f8[::1], f8[::1], b1, f8[::1], i8, i8, i8, f8[:, ::1]", brief=True)
 def draw_depths(
     normal: Array, numbers: Array, same_size: bool, longest: Array, mixed_seed: int, key: int, start: int, out: Array
 ) -> None:  # fmt: skip

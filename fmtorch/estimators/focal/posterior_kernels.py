@@ -1,4 +1,4 @@
-"""`posterior.Posterior` for the candidates of one pair, compiled: models of two cameras, their posterior, its steps.
+"""`posterior.Posterior` minimised for the candidates of one pair, compiled: one call for a whole fit.
 
 axes: (k, 2, 3, 3), U and V of ``E = U diag(1, 1, 0) V^T``, rows first. focal: (k, 2), logarithms of focal lengths in
 units of the longer sides. longest: (2,), these sides in the unit of the points, which are from the principal points.
@@ -6,23 +6,92 @@ units of the longer sides. longest: (2,), these sides in the unit of the points,
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.estimators.focal.prior_kernels import focal_cost
 from fmtorch.geometry.arithmetic_kernels import exponential
+from fmtorch.geometry.levenberg_marquardt_kernels import levenberg_marquardt
 from fmtorch.geometry.rank2_kernels import assign, assign_rows, unit
 from fmtorch.geometry.rank2_manifold_kernels import eliminate
+from fmtorch.geometry.sampson_objective_kernels import evaluated
 from fmtorch.kernels import inner, kernel
 
 Array = NDArray[Any]
-MIN_DAMPING, MAX_DAMPING = 1e-9, 1e6  # as in `posterior`
+FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-9, 1e6  # as in `posterior`
 
 
-@kernel("f8[:, :, :, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, :, ::1]")
-def models(axes: Array, focal: Array, longest: Array, F: Array, tangents: Array) -> None:
+class _State(NamedTuple):
+    """Of k candidates, cameras, models (k, 9), costs (k,), and their derivatives (k, 7), (k, 7, 7)."""
+
+    axes: Array
+    focal: Array
+    F: Array
+    cost: Array
+    gradient: Array
+    hessian: Array
+
+
+class _Data(NamedTuple):
+    """What `minimise` is given of matches and images; tangents (k, 9, 7) and products (k, 10, 10) for the work."""
+
+    points: Array
+    weight: Array
+    s2: Array
+    loss: int
+    table: Array
+    longest: Array
+    same_size: bool
+    precision: float
+    tolerance: float
+    tangents: Array
+    products: Array
+
+
+@kernel(
+    "f8[:, :, :, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], i8, f8[:, ::1], f8[::1], b1, f8, i8, f8, "
+    "f8[:, ::1], f8[::1], f8[:, ::1], f8[:, :, ::1]"
+)
+def minimise(
+    axes: Array, focal: Array, points: Array, weight: Array, s2: Array, loss: int, table: Array, longest: Array,
+    same_size: bool, precision: float, iterations: int, tolerance: float, F: Array, cost: Array, gradient: Array,
+    hessian: Array,
+) -> None:  # fmt: skip
+    """Cameras of least negative logarithm of the posterior near axes and focal, in place; what it is there.
+
+    points, weight, s2, loss, table: of `sampson_objective_kernels.evaluate`. precision: one over the variance of an
+    inlier's distance. tolerance: what a step must lower the cost of a candidate by, if its fit is to go on; negative:
+    none is ever done, and the derivatives are not those at the end. Models -> F (k, 9), costs (k,), their derivatives
+    by five rotations and two logarithms -> gradient (k, 7), hessian (k, 7, 7).
+    """
+    k = len(cost)
+    state = _State(axes, focal, F, cost, gradient, hessian)
+    trial = _State(
+        np.empty((k, 2, 3, 3)), np.empty((k, 2)), np.empty((k, 9)), np.empty(k), np.empty((k, 7)), np.empty((k, 7, 7))
+    )
+    data = _Data(
+        points, weight, s2, loss, table, longest, same_size, precision, tolerance, np.empty((k, 9, 7)),
+        np.empty((k, 10, 10)),
+    )  # fmt: skip
+    _minimise(data, state, trial, np.full(k, FIRST_DAMPING), iterations, tolerance >= 0)
+
+
+@inner
+def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
+    _models(state.axes, state.focal, data.longest, state.F, data.tangents)
+    evaluated(state.F, data.points, data.weight, data.s2, data.loss, data.table, derivatives, data.products, state.cost)
+    work = np.empty(4)
+    for k in range(len(state.cost)):
+        prior = focal_cost(state.focal[k], data.same_size, work)
+        state.cost[k] = state.cost[k] * data.precision / 2 + prior
+        if derivatives:
+            _derivatives(data.products[k], data.tangents[k], work, data.precision, state.gradient[k], state.hessian[k])
+
+
+@inner
+def _models(axes: Array, focal: Array, longest: Array, F: Array, tangents: Array) -> None:
     """Fundamental matrices -> F (k, 9), and their derivatives by five rotations and two logarithms -> (k, 9, 7)."""
     for k in range(len(F)):
         U, V, T = axes[k, 0], axes[k, 1], tangents[k]
@@ -37,50 +106,40 @@ def models(axes: Array, focal: Array, longest: Array, F: Array, tangents: Array)
                 T[q, 5], T[q, 6] = F[k, q] if c == 2 else 0.0, F[k, q] if r == 2 else 0.0
 
 
-@kernel("f8[:, :, ::1], f8[::1], f8[:, :, ::1], f8[:, ::1], b1, f8, f8[:, :, ::1], f8[:, ::1]")
-def posterior(
-    products: Array, cost: Array, tangents: Array, focal: Array, same_size: bool, precision: float, hessian: Array,
-    gradient: Array,
+@inner
+def _derivatives(
+    products: Array, tangents: Array, prior: Array, precision: float, gradient: Array, hessian: Array
 ) -> None:  # fmt: skip
-    """The negative logarithm of the posterior, of data costs (k,), in place; derivatives -> (k, 7, 7), (k, 7).
-
-    products: (k, 10, 10), of `sampson_objective_kernels.evaluate` at the models. precision: one over the variance.
-    """
-    along, work = np.empty((7, 10)), np.empty(4)
-    for k in range(len(cost)):
-        T = tangents[k]
-        for i in range(7):
-            for j in range(10):
-                total = 0.0
-                for q in range(9):
-                    total += T[q, i] * products[k, q, j]
-                along[i, j] = total
-            gradient[k, i] = along[i, 9] * precision
-        for i in range(7):
-            for j in range(7):
-                total = 0.0
-                for q in range(9):
-                    total += T[q, i] * along[j, q]
-                hessian[k, i, j] = total * precision
-        cost[k] = cost[k] * precision / 2 + focal_cost(focal[k], same_size, work)
-        for i in range(2):
-            gradient[k, 5 + i] += work[i]
-            for j in range(2):
-                hessian[k, 5 + i, 5 + j] += work[2] if i == j else work[3]
+    """Of one candidate. products: (10, 10), of `evaluated`; tangents: (9, 7); prior: (4,), of `focal_cost`."""
+    along = np.empty((7, 10))
+    for i in range(7):
+        for j in range(10):
+            total = 0.0
+            for q in range(9):
+                total += tangents[q, i] * products[q, j]
+            along[i, j] = total
+        gradient[i] = along[i, 9] * precision
+    for i in range(7):
+        for j in range(7):
+            total = 0.0
+            for q in range(9):
+                total += tangents[q, i] * along[j, q]
+            hessian[i, j] = total * precision
+    for i in range(2):
+        gradient[5 + i] += prior[i]
+        for j in range(2):
+            hessian[5 + i, 5 + j] += prior[2] if i == j else prior[3]
 
 
-@kernel("f8[:, :, :, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[::1], f8[:, :, :, ::1], f8[:, ::1]")
-def step(
-    axes: Array, focal: Array, hessian: Array, gradient: Array, damping: Array, new_axes: Array, new_focal: Array
-) -> None:  # fmt: skip
-    """Damped Gauss-Newton steps of candidates with damping (k,) -> new_axes, new_focal."""
+@inner
+def _step(state: _State, damping: Array, trial: _State) -> None:
     Q = np.empty((7, 8))
-    for k in range(len(focal)):
-        damped_step(hessian[k], gradient[k], damping[k], Q)
-        _rotate(axes[k, 0], Q[0, 7] / 2, Q[1, 7] / 2, Q[2, 7] / 2, new_axes[k, 0])
-        _rotate(axes[k, 1], Q[3, 7] / 2, Q[4, 7] / 2, 0.0, new_axes[k, 1])
+    for k in range(len(damping)):
+        damped_step(state.hessian[k], state.gradient[k], damping[k], Q)
+        _rotate(state.axes[k, 0], Q[0, 7] / 2, Q[1, 7] / 2, Q[2, 7] / 2, trial.axes[k, 0])
+        _rotate(state.axes[k, 1], Q[3, 7] / 2, Q[4, 7] / 2, 0.0, trial.axes[k, 1])
         for i in range(2):
-            new_focal[k, i] = min(max(focal[k, i] + min(max(Q[5 + i, 7], -1.0), 1.0), -3.0), 3.0)
+            trial.focal[k, i] = min(max(state.focal[k, i] + min(max(Q[5 + i, 7], -1.0), 1.0), -3.0), 3.0)
 
 
 @inner
@@ -107,39 +166,29 @@ def _rotate(A: Array, x: float, y: float, z: float, out: Array) -> None:
         out[r, 2] = c + factor * (y * a - x * b + along * z - n * c)
 
 
-@kernel(
-    "f8[:, :, :, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], "
-    "f8[:, :, :, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], "
-    "f8[::1], b1[::1], f8"
-)
-def accept(
-    axes: Array, focal: Array, F: Array, cost: Array, gradient: Array, hessian: Array, tangents: Array,
-    new_axes: Array, new_focal: Array, new_F: Array, trial: Array, new_gradient: Array, new_hessian: Array,
-    new_tangents: Array, damping: Array, done: Array, tolerance: float,
-) -> bool:  # fmt: skip
-    """Takes the steps that lower the cost, in place; whether all candidates are done.
-
-    tolerance: what the last accepted step of a candidate lowers its cost by, at most; negative: none is ever done.
-    """
+@inner
+def _accept(state: _State, trial: _State, damping: Array, done: Array, data: _Data) -> bool:
     everything = True
-    for k in range(len(cost)):
-        better = trial[k] < cost[k] and not done[k]
+    for k in range(len(damping)):
+        better = trial.cost[k] < state.cost[k] and not done[k]
         damping[k] = min(max(damping[k] / 10 if better else damping[k] * 10, MIN_DAMPING), MAX_DAMPING)
         if better:
-            done[k] |= tolerance >= 0 and cost[k] - trial[k] <= tolerance
-            cost[k] = trial[k]
-            assign(focal[k], new_focal[k])
-            assign(F[k], new_F[k])
-            assign(gradient[k], new_gradient[k])
-            assign_rows(axes[k, 0], new_axes[k, 0])
-            assign_rows(axes[k, 1], new_axes[k, 1])
-            assign_rows(hessian[k], new_hessian[k])
-            assign_rows(tangents[k], new_tangents[k])
+            done[k] |= data.tolerance >= 0 and state.cost[k] - trial.cost[k] <= data.tolerance
+            state.cost[k] = trial.cost[k]
+            assign(state.focal[k], trial.focal[k])
+            assign(state.F[k], trial.F[k])
+            assign(state.gradient[k], trial.gradient[k])
+            assign_rows(state.axes[k, 0], trial.axes[k, 0])
+            assign_rows(state.axes[k, 1], trial.axes[k, 1])
+            assign_rows(state.hessian[k], trial.hessian[k])
         everything = everything and done[k]
     return everything
 
 
-@kernel("f8[:, ::1], f8[:, ::1]")
+_minimise = levenberg_marquardt(_evaluate, _step, _accept)
+
+
+@kernel("f8[:, ::1], f8[:, ::1]", brief=True)
 def to_unit_norm(F: Array, out: Array) -> None:
     """Models (k, 9) scaled to unit norm -> out (k, 9)."""
     for k in range(len(F)):

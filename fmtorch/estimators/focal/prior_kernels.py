@@ -30,7 +30,7 @@ def focal_cost(focal: Array, same_size: bool, out: Array) -> Any:
     return mean * mean / 2 + squared / (2 * RATIO_DEVIATION**2) - SAME_CAMERA_GAIN * well
 
 
-@kernel("f8[:, ::1], b1, f8[::1]")
+@kernel("f8[:, ::1], b1, f8[::1]", brief=True)
 def prior_costs(focal: Array, same_size: bool, out: Array) -> None:
     """The negative logarithm of the prior of focal lengths (k, 2) -> out (k,)."""
     work = np.empty(4)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fmtorch.estimators import pool_kernels, sampling_kernels, scores_kernels
+from fmtorch.estimators import pairs_kernels, pool_kernels, sampling_kernels, scores_kernels, support_kernels
 from fmtorch.estimators.focal import (
     cameras_kernels,
     cheirality_kernels,
@@ -15,8 +15,7 @@ from fmtorch.estimators.focal import (
 )
 from fmtorch.geometry import (
     five_point_kernels,
-    rank2_manifold_kernels,
-    sampson_objective_kernels,
+    refine_kernels,
     seven_point_kernels,
     significance_kernels,
 )
@@ -26,23 +25,20 @@ from fmtorch.random_kernels import random_words
 FOCAL: tuple[Kernel[..., Any], ...] = (  # the slowest to compile first
     five_point_kernels.five_point,
     seven_point_kernels.seven_point,
-    sampson_objective_kernels.evaluate,
+    posterior_kernels.minimise,
+    refine_kernels.refine,
     cameras_kernels.nearest_cameras,
     significance_kernels.counted_chances,
-    rank2_manifold_kernels.start,
+    pairs_kernels.normalize,
     sampling_kernels.draw,
     cheirality_kernels.share_in_front,
-    rank2_manifold_kernels.step,
     scores_kernels.score_gains,
-    posterior_kernels.step,
-    posterior_kernels.accept,
     scores_kernels.score_saturated,
-    posterior_kernels.posterior,
+    pairs_kernels.to_pixels,
+    support_kernels.support,
     pool_kernels.residuals_squared,
     pool_kernels.best,
-    rank2_manifold_kernels.accept,
     cameras_kernels.translate,
-    posterior_kernels.models,
     pool_kernels.merge,
     pool_kernels.near,
     fit_kernels.gain_without_prior,

@@ -43,7 +43,7 @@ def estimated(c: Correspondences, seed: int, least: int, solve: Callable[[OnePai
         if lack := lack_of_support(pair.points, outcome.inliers, least, rounding_of(pair, rounding)):
             return lack
         matrix = to_pixels(outcome.fit.F, pair)
-        if not np.isfinite(matrix).all():
+        if matrix is None:
             return NOT_FINITE
         F[i] = matrix
         inliers[i, slot] = outcome.inliers

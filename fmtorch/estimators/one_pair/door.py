@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +10,7 @@ from torch import Tensor
 
 from fmtorch.estimators.one_pair.pair import Array, OnePair
 from fmtorch.estimators.pairs import MAX_COORDINATE_PX, MAX_NOISE, MIN_NOISE, bucket, too_few
+from fmtorch.estimators.pairs_kernels import normalize
 from fmtorch.types import Correspondences
 from fmtorch.validation import PER_MATCH, reason, right_size
 
@@ -29,14 +29,20 @@ class Rows(NamedTuple):
     size0: Array | None
     size1: Array | None
     keys: list[int]
+    right: bool
 
     @staticmethod
     def of(c: Correspondences) -> Rows:
-        """Views where the tensors are of float32 or float64."""
+        """Views where the tensors are of float32 or float64; right: whether no value of a match or size is wrong."""
         told = (c.quality, c.prior, c.noise, c.size0, c.size1)
         quality, prior, noise, size0, size1 = (None if t is None else _array(t) for t in told)
         keys: list[int] = c.keys.tolist()
-        return Rows(_array(c.x0), _array(c.x1), c.mask.numpy(), quality, prior, noise, size0, size1, keys)
+        x0, x1, mask = _array(c.x0), _array(c.x1), c.mask.numpy()
+        values = {"prior": prior, "noise": noise}
+        checked = [PER_MATCH[name][0](v) | ~mask for name, v in values.items() if v is not None]
+        checked += [right_size(size) for size in (size0, size1) if size is not None]
+        right = all(bool(each.all()) for each in checked)
+        return Rows(x0, x1, mask, quality, prior, noise, size0, size1, keys, right)
 
 
 class Arrived(NamedTuple):
@@ -58,26 +64,22 @@ class Arrived(NamedTuple):
 
 def opened(rows: Rows, i: int, one: Arrived, seed: int, least: int) -> tuple[OnePair, Array] | str:
     """The pair of a row, and where its matches (n,) stood; or why it cannot be estimated."""
-    points = np.empty((4, len(one.mask)))
-    points[:2], points[2:] = one.x0.T, one.x1.T
-    (slot,) = (one.mask & (np.abs(points) < MAX_COORDINATE_PX).all(0)).nonzero()
+    n, frame = len(one.mask), np.empty(5)
+    slots, flat = np.empty(n, np.int64), np.empty(4 * n)
+    count = normalize(one.x0, one.x1, one.mask, MAX_COORDINATE_PX, slots, flat, frame)
+    slot, points = slots[:count], flat[: 4 * count].reshape(4, count)
     told = {"quality": rows.quality, "prior": rows.prior, "noise": rows.noise}
     values = {name: None if value is None else value[i, slot] for name, value in told.items()}
-    if lack := too_few(len(slot), least) or _wrong(values, one):
+    if lack := too_few(count, least) or ("" if rows.right else _wrong(values, one)):
         return lack
-    points = points.take(slot, 1)
-    low, high = points.min(1), points.max(1)
-    half = float(((high - low) / 2).max())
-    if not half > 0:
+    if not frame[4]:
         return "all matches coincide"
-    centre, unit = (low + high) / 2, power_of_two(half)
-    points -= centre[:, None]
-    points /= unit
     quality, prior, noise = (None if v is None else v.astype(np.float64) for v in values.values())
     if noise is not None:
         noise.clip(MIN_NOISE, MAX_NOISE, out=noise)
-    sizes = None if rows.size0 is None else np.stack([one.size0, one.size1])
-    pair = OnePair(points, bucket(len(slot)), unit, rows.keys[i], seed, quality, prior, noise, centre, sizes)
+    sizes = None if rows.size0 is None else np.concatenate([one.size0, one.size1]).reshape(2, 2)
+    unit = float(frame[4])
+    pair = OnePair(points, bucket(count), unit, rows.keys[i], seed, quality, prior, noise, frame[:4], sizes)
     return pair, slot
 
 
@@ -86,12 +88,6 @@ def _wrong(values: dict[str, Array | None], one: Arrived) -> str:
     right = {name: rule(v) for name, (rule, _) in PER_MATCH.items() if (v := values[name]) is not None}
     right |= {"size0": right_size(one.size0), "size1": right_size(one.size1)}
     return reason({name: len(each) - int(np.count_nonzero(each)) for name, each in right.items()})
-
-
-def power_of_two(half: float) -> float:
-    """The least power of two that is not smaller, as `PixelFrame.around`."""
-    mantissa, exponent = math.frexp(max(half, 1e-300))
-    return math.ldexp(1.0, exponent - (mantissa == 0.5))
 
 
 def _array(tensor: Tensor) -> Array:

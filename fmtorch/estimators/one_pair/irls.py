@@ -9,14 +9,10 @@ import numpy as np
 
 from fmtorch.estimators.one_pair.inliers import median_of_matches
 from fmtorch.estimators.one_pair.pair import Array, OnePair, squared
-from fmtorch.estimators.one_pair.refine import RankTwoObjective
+from fmtorch.estimators.one_pair.refine import refined
 from fmtorch.estimators.pool_kernels import residuals_squared
-from fmtorch.geometry import rank2_manifold_kernels as manifold
 from fmtorch.geometry.eight_point_kernels import weighted_eight_point
 from fmtorch.geometry.irls_kernels import reweighted
-from fmtorch.geometry.levenberg_marquardt import levenberg_marquardt
-from fmtorch.geometry.rank2_manifold import SQUARINGS
-from fmtorch.geometry.refine import DAMPING
 from fmtorch.geometry.sampson_objective_kernels import LOSSES
 from fmtorch.geometry.sigma_consensus import LOSS_TABLE
 
@@ -31,23 +27,20 @@ def optimum(
     standard deviations. decays: the share of the first scale in each iteration. iterations: of Levenberg-Marquardt.
     """
     weight = weights(pair)
-    F, found = np.empty((len(powers), 9)), np.empty(len(powers), np.bool_)
+    F, fitted = np.empty((len(powers), 9)), np.empty(len(powers), np.bool_)
     for i, power in enumerate(powers):
-        found[i] = weighted_eight_point(pair.points, weight**power, F[i])
-    F = F[found]
+        fitted[i] = weighted_eight_point(pair.points, weight**power, F[i])
+    F = F[fitted]
     if not len(F):
         return np.zeros((3, 3)), False
     widest = first_scale * 1.4826 * math.sqrt(max(_median(model, pair) for model in F))
     for decay in decays:
         s2 = np.full(pair.count, squared(max(widest * decay, scale)))
         reweighted(F, pair.points, weight, s2, LOSSES[loss], LOSS_TABLE)
-    objective = RankTwoObjective(pair.points, weight, loss, np.full(pair.count, squared(scale)), None, DAMPING.first)
-    start = np.empty_like(F), np.empty((len(F), 3)), np.empty((len(F), 3))
-    manifold.start(F, SQUARINGS, *start)
-    state = levenberg_marquardt(objective, start, iterations)
-    cost = np.where(np.isfinite(state.cost), state.cost, np.inf)
+    found, cost = refined(F, pair.points, weight, loss, np.full(pair.count, squared(scale)), iterations)
+    cost = np.where(np.isfinite(cost), cost, np.inf)
     best = int(np.argmin(cost))
-    return state.F[best].reshape(3, 3), bool(np.isfinite(cost[best]))
+    return found[best].reshape(3, 3), bool(np.isfinite(cost[best]))
 
 
 def weights(pair: OnePair) -> Array:

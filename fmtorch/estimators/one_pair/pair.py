@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -36,7 +36,7 @@ class OnePair:
     noise: Array | None
     centre: Array
     sizes: Array | None = None
-    kept: dict[str, Any] = dataclasses.field(default_factory=dict)
+    kept: dict[Hashable, Any] = dataclasses.field(default_factory=dict)
 
     def __len__(self) -> int:
         """One: of pairs, not of matches."""
@@ -56,25 +56,26 @@ class OnePair:
     def same_size(self) -> list[bool]:
         """As `NormalizedPairs.same_size`."""
         assert self.sizes is not None
-        return [bool((self.sizes[0] == self.sizes[1]).all())]
+        first, second = self.sizes.tolist()
+        return [first == second]
 
     @functools.cached_property
     def points32(self) -> Array:
         """The points as scores take them, float32."""
         return self.points.astype(np.float32)
 
-    @property
+    @functools.cached_property
     def scale(self) -> Array:
         """Pixels in one normalised unit, divided by each match's noise, (n,)."""
         return self.pixels_per_unit / (np.ones(self.count) if self.noise is None else self.noise)
 
-    @property
+    @functools.cached_property
     def weight(self) -> Array:
         """What each match counts in a fit, (n,): its prior divided by the square of its noise."""
         prior = np.ones(self.count) if self.prior is None else self.prior
         return prior if self.noise is None else prior / np.square(self.noise)
 
-    def once(self, name: str, compute: Callable[[], Any]) -> Any:
+    def once(self, name: Hashable, compute: Callable[[], Any]) -> Any:
         """What a part computes of all matches and needs again for the same pair."""
         if name not in self.kept:
             self.kept[name] = compute()
@@ -88,11 +89,11 @@ class OnePair:
         """The same pair with the matches of these indices."""
 
         def some(value: Array | None) -> Array | None:
-            return None if value is None else value[index]
+            return None if value is None else value.take(index)
 
-        return dataclasses.replace(
-            self, points=np.ascontiguousarray(self.points[:, index]), quality=some(self.quality),
-            prior=some(self.prior), noise=some(self.noise), kept={},
+        return OnePair(
+            self.points.take(index, 1), self.slots, self.pixels_per_unit, self.key, self.seed, some(self.quality),
+            some(self.prior), some(self.noise), self.centre, self.sizes,
         )  # fmt: skip
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 from fmtorch.estimators.one_pair.models import Models
@@ -29,7 +27,7 @@ class Verifier:
         if first_look is not None and self.preselect is not None and len(which) > self.preselect.survivors:
             score, which = self.first_look(models.F, which, first_look), np.empty(self.preselect.survivors, np.int64)
             best(score, which)
-        return dataclasses.replace(models, which=which, score=self.score(models.F, which, pair))
+        return Models(models.F, models.draw, models.samples, models.start, which, self.score(models.F, which, pair))
 
     def _first_look(self, pair: OnePair) -> OnePair | None:
         """The pair with the matches of the first look; None where there is none."""
@@ -37,7 +35,7 @@ class Verifier:
             return None
         matches = self.preselect.matches
         found: OnePair = pair.once(
-            f"{matches} matches of a first look", lambda: pair.take(shuffled(pair, Stream.PRESELECTION)[:matches])
+            ("first look", matches), lambda: pair.take(shuffled(pair, Stream.PRESELECTION)[:matches])
         )
         return found
 

@@ -62,7 +62,7 @@ class Prosac:
         """As `Sampler.draw`."""
         if pair.quality is None and pair.prior is None:
             return _drawn(pair, WEIGHTS_OF_ONE, np.full(count, pair.count), start, size)
-        table = pair.once(f"growth of samples of {size}", lambda: self.growth(pair, size))
+        table = pair.once(("growth", size), lambda: self.growth(pair, size))
         newest = np.minimum(np.searchsorted(table, np.arange(start + 1, start + count + 1)), pair.count - 1)
         sample = np.vstack([_drawn(pair, WEIGHTS_OF_ONE, newest, start, size - 1), newest])
         ordered: Array = pair.once("best matches first", lambda: _best_first(pair))[sample]
@@ -77,15 +77,20 @@ class PriorWeighted:
 
     def weight(self, pair: OnePair) -> Array:
         """As `sampling.PriorWeighted.weight`: how finely priors are quantised depends on the pair's bucket."""
-        if pair.prior is None:
-            return np.ones(pair.count, np.int64)
-        weight: Array = np.rint(pair.prior * sampling.largest_weight(pair.slots)).astype(np.int64)
-        return np.maximum(weight, 1)
+        weight: Array = pair.once("weights", lambda: _quantised(pair))
+        return weight
 
     def draw(self, pair: OnePair, start: int, count: int, size: int) -> Array:
         """As `Sampler.draw`."""
         table = pair.once("cumulative priors", lambda: np.cumsum(self.weight(pair)))
         return _drawn(pair, table, np.full(count, table[-1]), start, size)
+
+
+def _quantised(pair: OnePair) -> Array:
+    if pair.prior is None:
+        return np.ones(pair.count, np.int64)
+    weight: Array = np.rint(pair.prior * sampling.largest_weight(pair.slots)).astype(np.int64)
+    return np.maximum(weight, 1)
 
 
 def _best_first(pair: OnePair) -> Array:

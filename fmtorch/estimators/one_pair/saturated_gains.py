@@ -22,7 +22,7 @@ class SaturatedGains:
     def __call__(self, F: Array, which: Array, pair: OnePair) -> Array:
         """As `scores.Score`."""
         support, scale = matches(pair, self.part.threshold, self.part.prior_weighted)
-        cells = pair.once(f"cells, weighted: {self.part.prior_weighted}", lambda: _cells(pair, support))
+        cells = pair.once(("cells", self.part.prior_weighted), lambda: _cells(pair, support))
         out, bits = np.empty(len(which)), fractional_bits(pair.count, torch.float32)
         score_saturated(F, which, pair.points32, support, scale, cells, bits, out)
         return out

@@ -39,7 +39,7 @@ def matches(pair: OnePair, threshold: float, prior_weighted: bool) -> tuple[Arra
         support = np.ones(pair.count, np.float32) if prior is None else prior.astype(np.float32)
         return support, np.square(pair.scale / threshold).astype(np.float32)
 
-    found: tuple[Array, Array] = pair.once(f"support and scale {threshold, prior_weighted}", made)
+    found: tuple[Array, Array] = pair.once(("support and scale", threshold, prior_weighted), made)
     return found
 
 

@@ -55,8 +55,10 @@ class CentredPair(NamedTuple):
 
 def _centred(pair: OnePair) -> CentredPair:
     assert pair.sizes is not None
-    middle = pair.sizes[:, ::-1].reshape(4)
-    pixel = 0.0 if middle.max() < MIN_IMAGE_SIDE_PX else 1.0
-    offset = (pair.centre - (middle - pixel) / 2) / pair.pixels_per_unit
-    longest = pair.sizes.max(1) / pair.pixels_per_unit
+    unit, sizes = pair.pixels_per_unit, pair.sizes.ravel().tolist()
+    h0, w0, h1, w1 = sizes
+    sides = w0, h0, w1, h1
+    pixel = 0.0 if max(sides) < MIN_IMAGE_SIDE_PX else 1.0
+    offset = np.array([(x - (side - pixel) / 2) / unit for x, side in zip(pair.centre.tolist(), sides, strict=True)])
+    longest = np.array([max(h0, w0) / unit, max(h1, w1) / unit])
     return CentredPair(pair.points + offset[:, None], offset, longest, pair.same_size[0])
