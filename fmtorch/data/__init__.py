@@ -42,7 +42,7 @@ _CLASSES = {
     "stereo": ("fmtorch.data.rendered", "StereoPair"),
     "tum": ("fmtorch.data.tum", "tum_pairs"),
     "kitti": ("fmtorch.data.kitti", "KittiPairs"),
-    "colmap": ("fmtorch.data.colmap", "ColmapPairs"),
+    "colmap": ("fmtorch.data.colmap", "colmap_pairs"),
     "bundler": ("fmtorch.data.bundler", "BundlerPairs"),
     "cameras": ("fmtorch.data.camera_files", "CameraFilePairs"),
     "h5": ("fmtorch.exchange.dataset", "H5Pairs"),

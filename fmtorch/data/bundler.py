@@ -33,7 +33,7 @@ class BundlerPairs(ScenePairs):
     """Pairs of the images of Bundler files, one folder a scene.
 
     root: a folder of scenes, or one scene's folder, with ``list.txt`` and ``gt_bundle.out``, ``bundle.out`` or
-    ``bundle/bundle.out``. split, sequences, candidates, shared, pairs, seed, family: as in `ColmapPairs`.
+    ``bundle/bundle.out``. split, sequences, candidates, shared, pairs, seed, family: as in `colmap_pairs`.
 
     Cameras without a focal length, which Bundler did not register, are left out. Radial distortion is taken out when an
     image is read. The principal point is the middle of each image, whose size is read from its file.

@@ -6,10 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from fmtorch.data.candidates import MIN_SHARED, AllPairs, Candidates, sharing_points
 from fmtorch.data.colmap_binary import read_binary
 from fmtorch.data.colmap_model import Model
 from fmtorch.data.colmap_text import read_text
+from fmtorch.data.depth_images import DepthImages, read_colmap
 from fmtorch.data.pairs import ImageSource
 from fmtorch.data.scenes import Scene, ScenePairs, View, folders
 from fmtorch.data.splits import chosen
@@ -20,40 +24,94 @@ _FILES = ("cameras.bin", "cameras.txt")
 
 
 class ColmapPairs(ScenePairs):
-    """Pairs of the images of COLMAP models, text or binary, one folder a scene.
-
-    root: a folder of scenes, or one scene's folder. split: test (Panther, Playground, Train, Roman_Forum) or train
-    (Family, Francis, Horse, Lighthouse, M60), as in the paper. sequences: names of scenes to take instead. A root that
-    is itself a scene is taken whatever the split.
-    model, images: folders within the scene's; model null: the first of sparse/0, sparse, dense/sparse and the scene's.
-    candidates: all pairs of a scene, or those whose images share at least `shared` points of the reconstruction.
-    pairs, seed: as in `ScenePairs`. family: of the pairs; null: the name of the folder of scenes.
-
-    Images with lens distortion are undistorted when they are read, to a pinhole of the same focal lengths, principal
-    point and size (`fmtorch.data.undistort`). Principal points are lowered by COLMAP's half pixel. An image of another
-    size than its camera's is refused when it is read.
-    """
+    """Pairs of the images of COLMAP models, one folder a scene; see `colmap_pairs`."""
 
     def __init__(
         self,
-        root: str | Path,
-        split: str = "test",
-        sequences: Sequence[str] | None = None,
-        model: str | None = None,
-        images: str = "images",
-        candidates: Literal["all", "points"] = "all",
-        shared: int = MIN_SHARED,
-        pairs: int | None = 1000,
-        seed: int = 0,
-        family: str | None = None,
+        scenes: Sequence[Scene],
+        files: list[tuple[str, Path]],
+        options: tuple[str | int, ...],
+        pairs: int | None,
+        seed: int,
     ) -> None:
-        home, found = scene_folders(root, split, sequences, model)
-        scenes, files = [], []
-        for folder in found:
-            reconstruction = read_model(_model_folder(folder, model), points=candidates == "points")
-            scenes.append(_scene(folder, reconstruction, images, candidates, shared, family or home.name))
-            files += [(f"{folder.name}/{path.name}", path) for path in reconstruction.files]
-        super().__init__("colmap", scenes, files, (candidates, shared, family or home.name), pairs, seed)
+        super().__init__("colmap", scenes, files, options, pairs, seed)
+
+
+class ColmapDepthPairs(ColmapPairs):
+    """The same where each scene has depth maps."""
+
+    depth_images: DepthImages
+
+    def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Depth (n,) in the model's unit, along the optical axis at points (n, 2) of an image; NaN where unknown."""
+        return self.depth_images.at(image, points)
+
+
+def colmap_pairs(
+    root: str | Path,
+    split: str = "test",
+    sequences: Sequence[str] | None = None,
+    model: str | None = None,
+    images: str = "images",
+    candidates: Literal["all", "points"] = "all",
+    shared: int = MIN_SHARED,
+    pairs: int | None = 1000,
+    seed: int = 0,
+    family: str | None = None,
+    depth: bool = True,
+) -> ColmapPairs:
+    """Pairs of the images of COLMAP models, text or binary, one folder a scene.
+
+    Args:
+        root: a folder of scenes, or one scene's folder, which is taken whatever the split.
+        split: test (Panther, Playground, Train, Roman_Forum) or train (Family, Francis, Horse, Lighthouse, M60), as in
+            the paper.
+        sequences: names of scenes to take instead.
+        model: folder within the scene's; None: the first of sparse/0, sparse, dense/sparse and the scene's.
+        images: folder within the scene's.
+        candidates: all pairs of a scene, or those whose images share at least `shared` points of the reconstruction.
+        shared: that number.
+        pairs, seed: as in `ScenePairs`.
+        family: of the pairs; None: the name of the folder of scenes.
+        depth: know the depth of points, for labels, where every scene has depth maps of COLMAP's dense reconstruction,
+            in ``stereo/depth_maps`` beside the folder of the images; geometric ones, or else photometric.
+
+    Images with lens distortion are undistorted when they are read, to a pinhole of the same focal lengths, principal
+    point and size (`fmtorch.data.undistort`). Principal points are lowered by COLMAP's half pixel. An image of another
+    size than its camera's is refused when it is read. Raises DataError for a missing or damaged model.
+    """
+    home, found = scene_folders(root, split, sequences, model)
+    scenes, files = [], []
+    for folder in found:
+        reconstruction = read_model(_model_folder(folder, model), points=candidates == "points")
+        scenes.append(_scene(folder, reconstruction, images, candidates, shared, family or home.name))
+        files += [(f"{folder.name}/{path.name}", path) for path in reconstruction.files]
+    options = (candidates, shared, family or home.name)
+    if not depth or not all(_depth_folder(folder / images).is_dir() for folder in found):
+        return ColmapPairs(scenes, files, options, pairs, seed)
+    dataset = ColmapDepthPairs(scenes, files, (*options, "depth"), pairs, seed)
+    paths = [_depth_paths(folder / images, scene) for folder, scene in zip(found, scenes, strict=True)]
+    by_image = {key: path for some in paths for key, path in some.items()}
+    dataset.depth_images = DepthImages(by_image, 1.0, read_colmap, reduced=True)
+    return dataset
+
+
+def _depth_folder(images: Path) -> Path:
+    """Where COLMAP's dense reconstruction keeps the depth maps of a folder of images."""
+    return images.parent / "stereo" / "depth_maps"
+
+
+def _depth_paths(images: Path, scene: Scene) -> dict[str, Path]:
+    """The depth map of each view that has one, by the identity of its image."""
+    found = {}
+    for view in scene.views:
+        name = view.image.path.relative_to(images)
+        for kind in ("geometric", "photometric"):
+            path = _depth_folder(images) / f"{name}.{kind}.bin"
+            if path.is_file():
+                found[view.image.identity] = path
+                break
+    return found
 
 
 def read_model(folder: Path, points: bool = True) -> Model:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from fmtorch.data.candidates import WINDOW, following
-from fmtorch.data.depth_images import DepthImages
+from fmtorch.data.depth_images import DepthImages, read_grey
 from fmtorch.data.lenses import Lens
 from fmtorch.data.pairs import ImageSource
 from fmtorch.data.scenes import Scene, ScenePairs, View, folders
@@ -86,7 +86,8 @@ def tum_pairs(
     files += [(folder.name, folder / "depth.txt") for folder in found]
     dataset = TumDepthPairs(scenes, files, window, pairs, seed)
     paths = [_depth_paths(folder, scene) for folder, scene in zip(found, scenes, strict=True)]
-    dataset.depth_images = DepthImages({key: path for some in paths for key, path in some.items()}, DEPTH_SCALE)
+    by_image = {key: path for some in paths for key, path in some.items()}
+    dataset.depth_images = DepthImages(by_image, DEPTH_SCALE, read_grey)
     return dataset
 
 

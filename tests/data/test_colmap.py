@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fmtorch.data import DataError, ImageError, load, read_image
+from fmtorch.data import DataError, DepthDataset, ImageError, load, read_image
 from fmtorch.data.colmap import read_model
 from fmtorch.data.lenses import Lens
 from tests.conftest import shared_path
@@ -211,3 +211,53 @@ def test_an_unknown_model_number_is_refused(tmp_path: Path) -> None:
     (sparse / "cameras.bin").write_bytes(data)
     with pytest.raises(DataError, match=r"cameras\.bin, camera 1 of 3: camera model number 99 is not known here"):
         read_model(sparse)
+
+
+def _write_depth(path: Path, depth: np.ndarray) -> None:
+    """As the scripts of COLMAP write it: columns, rows and channels, the first varying fastest."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    h, w = depth.shape
+    path.write_bytes(f"{w}&{h}&1&".encode() + depth.T.astype("<f4").tobytes(order="F"))
+
+
+def test_depth_is_that_of_the_dense_reconstruction(tmp_path: Path) -> None:
+    """Maps of half the size: their pixel (2, 1) covers the photograph's (4, 2) to (5, 3)."""
+    maps = write_colmap(tmp_path / "scene", ("PINHOLE",) * 3) / "stereo" / "depth_maps"
+    h, w = SIZE[0] // 2, SIZE[1] // 2
+    depth = np.arange(h * w, dtype=float).reshape(h, w) + 0.5
+    depth[0, 0], depth[0, 1] = 0, -1
+    _write_depth(maps / "00.png.geometric.bin", depth)
+    _write_depth(maps / "00.png.photometric.bin", depth + 1000)
+    _write_depth(maps / "night walk" / "01.png.photometric.bin", np.ones(SIZE))
+    dataset = load("colmap", root=tmp_path, sequences=["scene"], pairs=None)
+    assert isinstance(dataset, DepthDataset)
+    by_path = {image.path.name: image for pair in dataset for image in (pair.image0, pair.image1)}
+    points = np.array([[4.0, 2.0], [5.4, 3.4], [5.6, 2.0], [0.0, 0.0], [3.0, 1.0], [-1.0, 5.0], [np.nan, 1.0]])
+    found = dataset.depth(by_path["00.png"], points)
+    np.testing.assert_array_equal(found, [depth[1, 2], depth[1, 2], depth[1, 3], *[np.nan] * 4])
+    assert (dataset.depth(by_path["01.png"], points[:2]) == 1).all()
+    assert np.isnan(dataset.depth(by_path["02.png"], points)).all()  # it has no map
+    assert not isinstance(load("colmap", root=tmp_path, sequences=["scene"], depth=False), DepthDataset)
+    write_colmap(tmp_path / "other")
+    assert not isinstance(load("colmap", root=tmp_path, sequences=["scene", "other"]), DepthDataset)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"P5 16 12", "must be a depth map of COLMAP"),
+        (b"16&12&3&" + bytes(12 * 16 * 12), "must be a depth map of COLMAP"),
+        (b"16&12&1&" + bytes(4 * 16 * 11), "704 bytes of depth; 16 x 12 px have 768: is it truncated"),
+        (b"16&16&1&" + bytes(4 * 16 * 16), r"\(16, 16\) px; its photograph has \(24, 32\)"),
+        (b"64&48&1&" + bytes(4 * 64 * 48), r"\(48, 64\) px; its photograph has \(24, 32\)"),
+    ],
+)
+def test_damaged_depth_is_named(content: bytes, message: str, tmp_path: Path) -> None:
+    maps = write_colmap(tmp_path / "scene") / "stereo" / "depth_maps"
+    maps.mkdir(parents=True)
+    (maps / "00.png.geometric.bin").write_bytes(content)
+    dataset = load("colmap", root=tmp_path, sequences=["scene"], pairs=None)
+    assert isinstance(dataset, DepthDataset)
+    image = next(image for pair in dataset for image in (pair.image0, pair.image1) if image.path.name == "00.png")
+    with pytest.raises(ImageError, match=rf"00\.png\.geometric\.bin: .*{message}"):
+        dataset.depth(image, np.zeros((1, 2)))
