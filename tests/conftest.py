@@ -19,6 +19,19 @@ SHARED = Path(os.environ.get("FMTORCH_TEST_DATA", Path(__file__).resolve().paren
 KERNELS = kernels_dir()  # before any test sets $FMTORCH_CACHE
 
 
+LONGEST = (
+    "training/test_train_command.py", "test_command_line.py", "docs/test_commands.py", "reliability/",
+    "features/test_large_images.py", "test_eval.py", "training/", "data/test_rendered.py",
+)  # fmt: skip
+"""Files and folders with tests of many seconds."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest tests come first, so that at the end no process waits for another that has just begun one."""
+    here = Path(__file__).parent
+    items.sort(key=lambda item: not item.path.relative_to(here).as_posix().startswith(LONGEST))
+
+
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile every kernel before several processes run the whole suite, each of which would compile them again."""
     config = session.config

@@ -19,6 +19,7 @@ import pytest
 
 from fmtorch import kernel_cache, kernel_compiler, kernels
 from fmtorch.kernels import Inner, Kernel, inner, kernel
+from tests.processes import run_command
 
 SOURCE = """
 import numpy as np
@@ -376,13 +377,15 @@ def test_decorators_take_checked_functions() -> None:
     assert inner(checked).function is written
 
 
-def test_the_storage_command_lists_and_clears_them(module: types.ModuleType, cache: Path) -> None:
+def test_the_storage_command_lists_and_clears_them(module: types.ModuleType, cache: Path, tmp_path: Path) -> None:
     result(module)
-    env = {**os.environ, "PYTHONPATH": str(REPOSITORY), "COLUMNS": "200"}
+    (tmp_path / "here").mkdir()
 
     def told(*options: str) -> str:
-        command = [sys.executable, "-m", "fmtorch.storage", *options]
-        return subprocess.run(command, env=env, capture_output=True, text=True, timeout=120, check=True).stdout
+        environment = {"FMTORCH_CACHE": str(cache.parent)}
+        done = run_command("storage", *options, cwd=tmp_path / "here", environment=environment)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
 
     version = next(cache.iterdir()).name
     assert f"{version}, used {time.strftime('%Y-%m-%d')} │     2 │" in told()

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -19,6 +17,7 @@ from fmtorch.training.pruners.loop import BEST, CHECKPOINTS, TrainingFolderError
 from fmtorch.training.pruners.module import Optimisation, PrunerTraining
 from fmtorch.training.pruners.objective import Objective
 from fmtorch.training.pruners.validation import Use, Validation
+from tests.processes import run_command
 from tests.training.synthetic_matches import batches, labelled_pair
 
 STEPS = 12
@@ -46,8 +45,7 @@ def test_killed_and_started_again_it_ends_with_the_same_weights(tmp_path: Path) 
     """Killed with SIGKILL in the middle of step 7, of 12; checkpoints are at 3 and 6, validation at 5 and 10."""
     whole = trained(tmp_path / "whole")
     script = f"""
-import os, signal, sys
-sys.path.insert(0, {str(Path.cwd())!r})
+import os, signal
 from pathlib import Path
 import torch
 torch.set_num_threads({torch.get_num_threads()})
@@ -60,7 +58,7 @@ def dies(self, batch, index):
 t.PrunerTraining.training_step = dies
 t.trained(Path({str(tmp_path / "parts")!r}))
 """
-    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    ended = run_command("-c", script, cwd=tmp_path)
     assert ended.returncode == -signal.SIGKILL, ended.stderr
     path, step = latest_checkpoint(tmp_path / "parts")
     assert path is not None
