@@ -39,7 +39,7 @@ class Sheet:
 def put(path: Path, sheets: Sequence[Sheet], marker: str = "figures") -> None:
     """Replace what stands between the marks of a Markdown file. Raises SystemExit for a file without them."""
     begin, end = f"<!-- {marker} -->", f"<!-- end of {marker} -->"
-    text = path.read_text(encoding="utf-8")
+    text = path.read_text(encoding="utf-8") if path.is_file() else ""
     if begin not in text or end not in text:
         raise SystemExit(f"{path} must hold the lines {begin} and {end}; the tables go between them")
     before, after = text.split(begin)[0], text.split(end)[1]
