@@ -49,7 +49,6 @@ SLOW = (
     r"fmtorch\.train",
     r"benchmark (memory|features)",
     r"-m pipeline=",
-    r"estimators\.txt +#",
     r"--marker rendered",
     r"--label",
     r"benchmark related .*(hardnet|hesaffnet)",
