@@ -174,7 +174,7 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / "DATA" / name / "pairs_which_dataset.txt").write_text("".join(f"{s}/\n" for s in scenes))
     for name, image in zip(("a.jpg", "b.jpg"), images, strict=True):
         cv2.imwrite(str(folder / name), image[..., ::-1])
-    for training in ("S1", "S2", "C"):
+    for training in ("S1", "S2", "C", "N"):
         (folder / training).mkdir()
         shutil.copy(SOURCE / "models" / "lc_f.safetensors", folder / training / "lc.safetensors")
     (folder / "PHOTOS").mkdir()
@@ -271,7 +271,7 @@ def test_the_long_commands_of_a_page_run(some: list[str], workplace: Path, monke
 def test_a_page_says_what_its_capital_words_are(page: str) -> None:
     """DATA, FOLDER and the like, which a reader replaces, are explained on the page that uses them."""
     spoken = [word for command in commands(page) for word in shlex.split(command, comments=True)]
-    words = {name for word in spoken for name in re.findall(r"\b[A-Z]{3,}\b", word)} - set(SETS)
+    words = {name for word in spoken for name in re.findall(r"\b[A-Z]{3,}\b", word)} - {*SETS, "NSGD"}
     text = re.sub(r"```.*?```", "", (SOURCE / page).read_text(encoding="utf-8"), flags=re.DOTALL)
     assert not {word for word in words if f"`{word}`" not in text}
 
