@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fmtorch.geometry.levenberg_marquardt_kernels import levenberg_marquardt
 from fmtorch.geometry.rank2_kernels import assign, assign_rows
 from fmtorch.geometry.rank2_manifold_kernels import start_one, steps
-from fmtorch.geometry.sampson_objective_kernels import evaluated
+from fmtorch.geometry.sampson_objective_kernels import evaluate
 from fmtorch.kernels import inner, kernel
 
 Array = NDArray[Any]
@@ -28,7 +28,7 @@ class _State(NamedTuple):
 
 
 class _Data(NamedTuple):
-    """What `evaluated` takes of the matches; tolerance: of `refine`."""
+    """What `evaluate` takes of the matches; tolerance: of `refine`."""
 
     points: Array
     weight: Array
@@ -59,9 +59,7 @@ def refine(
 
 @inner
 def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
-    evaluated(
-        state.F, data.points, data.weight, data.s2, data.loss, data.table, derivatives, state.products, state.cost
-    )
+    evaluate(state.F, data.points, data.weight, data.s2, data.loss, data.table, derivatives, state.products, state.cost)
 
 
 @inner

@@ -28,15 +28,6 @@ def evaluate(
     s2: (n,), squared scales of the loss, a code. table: (2, t + 2), of the loss MAGSAC, its weight at the ends of t
     intervals of r^2 / s^2 and beyond, and the weight's integral up to there.
     """
-    evaluated(F, points, weight, s2, loss, table, derivatives, products, cost)
-
-
-@inner
-def evaluated(
-    F: Array, points: Array, weight: Array, s2: Array, loss: int, table: Array, derivatives: bool, products: Array,
-    cost: Array,
-) -> None:  # fmt: skip
-    """`evaluate`, for kernels."""
     sums, block, weighted = np.empty((55, WIDTH)), np.empty((ROWS, WIDTH)), np.empty((10, WIDTH))
     costs = np.empty(WIDTH)
     for k in range(len(F)):

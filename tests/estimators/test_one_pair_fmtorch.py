@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch import kernels, presets
+from fmtorch import find_fundamental, kernels, presets
 from fmtorch.estimators import HypothesizeAndVerify, final_fits, pool, saturated_gains
 from fmtorch.estimators.engine import Form
 from fmtorch.estimators.inliers import WithinThreshold
@@ -24,6 +24,7 @@ from fmtorch.estimators.one_pair.selection import Selection, scored
 from fmtorch.estimators.pairs import NormalizedPairs
 from fmtorch.estimators.registry import kernel_form
 from fmtorch.estimators.scores import score_models
+from fmtorch.geometry import sampson_objective_kernels
 from fmtorch.kernels import Kernel
 from fmtorch.random import Stream
 from fmtorch.types import collate
@@ -283,7 +284,14 @@ def test_the_kernels_that_are_compiled_together_are_those_that_are_called(monkey
     estimator = presets.build("estimator", "fmtorch")
     for c in (scene(0, 300), scene(0, 300, outliers=0.8).replace(size1=torch.tensor([[700, 900]]))):
         estimator(c)
-    assert called == set(ahead.FOCAL)
+    within = {sampson_objective_kernels.evaluate}  # called by other kernels alone
+    assert called | within == set(ahead.FOCAL)
+    for framed, name in ((False, "position_consistency"), (True, "frame_consistency")):
+        c = scene(0, 300)
+        frames = {"lafs0": c.lafs0, "lafs1": c.lafs1, "quality": c.quality} if framed else {}
+        called.clear()
+        find_fundamental(c.x0, c.x1, size0=c.size0, size1=c.size1, **frames)
+        assert called - set(ahead.FOCAL) == set(ahead.PRIORS[name])
 
 
 def test_gradients_in_both_forms() -> None:

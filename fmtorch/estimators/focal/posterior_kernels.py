@@ -16,7 +16,7 @@ from fmtorch.geometry.arithmetic_kernels import exponential
 from fmtorch.geometry.levenberg_marquardt_kernels import levenberg_marquardt
 from fmtorch.geometry.rank2_kernels import assign, assign_rows, unit
 from fmtorch.geometry.rank2_manifold_kernels import eliminate
-from fmtorch.geometry.sampson_objective_kernels import evaluated
+from fmtorch.geometry.sampson_objective_kernels import evaluate
 from fmtorch.kernels import inner, kernel
 
 Array = NDArray[Any]
@@ -81,7 +81,7 @@ def minimise(
 @inner
 def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
     _models(state.axes, state.focal, data.longest, state.F, data.tangents)
-    evaluated(state.F, data.points, data.weight, data.s2, data.loss, data.table, derivatives, data.products, state.cost)
+    evaluate(state.F, data.points, data.weight, data.s2, data.loss, data.table, derivatives, data.products, state.cost)
     work = np.empty(4)
     for k in range(len(state.cost)):
         prior = focal_cost(state.focal[k], data.same_size, work)
@@ -110,7 +110,7 @@ def _models(axes: Array, focal: Array, longest: Array, F: Array, tangents: Array
 def _derivatives(
     products: Array, tangents: Array, prior: Array, precision: float, gradient: Array, hessian: Array
 ) -> None:  # fmt: skip
-    """Of one candidate. products: (10, 10), of `evaluated`; tangents: (9, 7); prior: (4,), of `focal_cost`."""
+    """Of one candidate. products: (10, 10), of `evaluate`; tangents: (9, 7); prior: (4,), of `focal_cost`."""
     along = np.empty((7, 10))
     for i in range(7):
         for j in range(10):

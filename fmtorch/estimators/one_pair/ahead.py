@@ -1,4 +1,4 @@
-"""The kernels of an estimator with the prior on focal lengths, to be compiled together before it is first called."""
+"""Kernels to be compiled together: of estimators with the prior on focal lengths, and of the pruners before them."""
 
 from __future__ import annotations
 
@@ -16,14 +16,17 @@ from fmtorch.estimators.focal import (
 from fmtorch.geometry import (
     five_point_kernels,
     refine_kernels,
+    sampson_objective_kernels,
     seven_point_kernels,
     significance_kernels,
 )
 from fmtorch.kernels import Kernel
+from fmtorch.pruning import calibration_kernels, frame_consistency_kernels, position_consistency_kernels
 from fmtorch.random_kernels import random_words
 
 FOCAL: tuple[Kernel[..., Any], ...] = (  # the slowest to compile first
     five_point_kernels.five_point,
+    sampson_objective_kernels.evaluate,  # called by `minimise` and `refine`
     seven_point_kernels.seven_point,
     posterior_kernels.minimise,
     refine_kernels.refine,
@@ -49,3 +52,8 @@ FOCAL: tuple[Kernel[..., Any], ...] = (  # the slowest to compile first
     prior_kernels.prior_costs,
     random_words,
 )
+
+PRIORS: dict[str, tuple[Kernel[..., Any], ...]] = {  # by the names of the pruners
+    "position_consistency": (position_consistency_kernels.position_agreement, calibration_kernels.calibrated),
+    "frame_consistency": (frame_consistency_kernels.frame_agreement, frame_consistency_kernels.frame_prior),
+}
