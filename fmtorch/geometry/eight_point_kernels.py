@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.geometry.nullspace_kernels import LANES, equations, gather, null_space
+from fmtorch.geometry.nullspace_kernels import equations, gather, null_space
 from fmtorch.geometry.orientation_kernels import consistently_oriented
 from fmtorch.geometry.rank2_kernels import EPS, nearest_rank2
 from fmtorch.kernels import inner, kernel
+from fmtorch.lanes import LANES, absolute, fill, load, sqrt, store, where
 
 Array = NDArray[Any]
 WIDTH = 32  # partial sums over the matches: part of the last bits of a weighted fit
@@ -22,22 +23,19 @@ SHIFT, RANK_TOLERANCE, SQUARINGS = 1e-14, 1e-12, 14  # as in `eigenvector`
 def eight_point(points: Array, sample: Array, F: Array, draw: Array) -> int:
     """Consistently oriented models of samples (8, s) of points (4, n) -> F (s, 9), draw (s,); how many there are.
 
-    As `minimal.eight_point_components`, in the order of the samples.
+    As `minimal.eight_point_components`, in the order of the samples. Buffers are rows of LANES numbers, one a sample.
     """
-    X, N, A = np.empty((4, 8 * LANES)), np.empty((4, 8 * LANES)), np.empty((72, LANES))
-    B, work, full_rank = np.empty((9, LANES)), np.empty((10, LANES)), np.empty(LANES, np.bool_)
+    X, N, A, B = np.empty((32, LANES)), np.empty((32, LANES)), np.empty((72, LANES)), np.empty((9, LANES))
+    work, there = np.empty((8, LANES)), np.empty((1, LANES), np.bool_)
     centre, scale, f = np.empty((4, LANES)), np.empty((2, LANES)), np.empty(9)
     models = 0
     for first in range(0, sample.shape[1], LANES):
-        gather(points, sample, first, 8, X)
-        for lane in range(LANES):
-            for image in range(2):
-                _normalise(X, image, lane, N, centre, scale)
+        gather(points, sample, first, X)
+        for image in range(2):
+            _normalise(X, image, N, centre, scale)
         equations(N, 8, A)
-        null_space(A, 8, B, full_rank, work)
-        for lane in range(min(LANES, sample.shape[1] - first)):
-            if not (full_rank[lane] and scale[0, lane] > 0 and scale[1, lane] > 0):
-                continue
+        store(there, 0, null_space(A, 8, B, work) & (load(scale, 0) > 0.0) & (load(scale, 1) > 0.0))
+        for lane in range(LANES):
             for q in range(9):
                 f[q] = B[q, lane]
             nearest_rank2(f)
@@ -47,32 +45,41 @@ def eight_point(points: Array, sample: Array, F: Array, draw: Array) -> int:
             for q in range(9):
                 norm += f[q] * f[q]
             norm = math.sqrt(norm)
-            if norm > 0 and math.isfinite(norm) and consistently_oriented(f, X, 8, LANES, lane):
+            for q in range(9):
+                B[q, lane] = f[q] / norm
+            there[0, lane] &= norm > 0 and math.isfinite(norm)
+        store(there, 0, load(there, 0) & consistently_oriented(B, X, 8))
+        for lane in range(min(LANES, sample.shape[1] - first)):
+            if there[0, lane]:
                 for q in range(9):
-                    F[models, q] = f[q] / norm
+                    F[models, q] = B[q, lane]
                 draw[models] = first + lane
                 models += 1
     return models
 
 
 @inner
-def _normalise(X: Array, image: int, lane: int, N: Array, centre: Array, scale: Array) -> None:
-    """One sample's points in one image, normalised (Hartley 1997) -> N, its centre and scale; scale 0: no spread."""
-    x, y, u, v = X[2 * image], X[2 * image + 1], N[2 * image], N[2 * image + 1]
-    cx, cy, mean = 0.0, 0.0, 0.0
-    for j in range(8):
-        cx += x[j * LANES + lane]
-        cy += y[j * LANES + lane]
-    cx, cy = cx / 8, cy / 8
-    for j in range(8):
-        dx, dy = x[j * LANES + lane] - cx, y[j * LANES + lane] - cy
-        mean += math.sqrt(dx * dx + dy * dy)
-    mean /= 8
-    spread = mean > 4 * EPS * max(abs(cx), abs(cy))
-    s = 2**0.5 / mean if spread else 1.0
-    for j in range(8):
-        u[j * LANES + lane], v[j * LANES + lane] = (x[j * LANES + lane] - cx) * s, (y[j * LANES + lane] - cy) * s
-    centre[2 * image, lane], centre[2 * image + 1, lane], scale[image, lane] = cx, cy, s if spread else 0.0
+def _normalise(X: Array, image: int, N: Array, centre: Array, scale: Array) -> None:
+    """Each sample's points in one image, normalised (Hartley 1997) -> N, centre and scale; scale 0: no spread."""
+    x, y = 2 * image, 2 * image + 1  # rows of each point
+    cx, cy, mean = fill(0.0), fill(0.0), fill(0.0)
+    for j in range(0, 32, 4):
+        cx += load(X, j + x)
+        cy += load(X, j + y)
+    cx, cy = cx / 8.0, cy / 8.0
+    for j in range(0, 32, 4):
+        dx, dy = load(X, j + x) - cx, load(X, j + y) - cy
+        mean += sqrt(dx * dx + dy * dy)
+    mean /= 8.0
+    farthest = where(absolute(cx) > absolute(cy), absolute(cx), absolute(cy))
+    spread = mean > 4 * EPS * farthest
+    by = where(spread, 2**0.5 / mean, 1.0)
+    for j in range(0, 32, 4):
+        store(N, j + x, (load(X, j + x) - cx) * by)
+        store(N, j + y, (load(X, j + y) - cy) * by)
+    store(centre, x, cx)
+    store(centre, y, cy)
+    store(scale, image, where(spread, by, 0.0))
 
 
 @inner

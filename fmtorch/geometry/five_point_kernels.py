@@ -1,6 +1,6 @@
 """The five-point algorithm on the samples of one pair, compiled; float64, LANES samples at a time, models in float32.
 
-As `five_point`: Nister (PAMI 2004), real roots by changes of sign on a grid. Buffers are rows, their last axis is the
+As `five_point`: Nister (PAMI 2004), real roots by changes of sign on a grid. Buffers are rows of LANES numbers, one a
 sample.
 """
 
@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.geometry.nullspace_kernels import LANES, equations, gather, null_space
+from fmtorch.geometry.nullspace_kernels import equations, gather, null_space
 from fmtorch.geometry.orientation_kernels import consistently_oriented
-from fmtorch.geometry.real_roots_kernels import MOST, real_roots
+from fmtorch.geometry.real_roots_kernels import DEGREE, real_roots, room_for_roots
 from fmtorch.kernels import inner, kernel
+from fmtorch.lanes import LANES, fill, load, sqrt, store, where
 
 Array = NDArray[Any]
 _MONOMIALS = (
@@ -35,30 +36,36 @@ def five_point(points: Array, sample: Array, depth: Array, offset: Array, F: Arr
     points: from the principal points. depth: (2, s), the focal lengths of each sample, in the unit of the points.
     offset: (4,), from the centre of the coordinates that F is for to the principal points. In the order of the samples.
     """
-    X, A, e = np.empty((4, 5 * LANES)), np.empty((45, LANES)), np.empty((36, LANES))
-    work, full_rank, C = np.empty((7, LANES)), np.empty(LANES, np.bool_), np.empty((200, LANES))
-    B, p = np.empty((45, LANES)), np.empty((11, LANES))
-    lane, chart, z = np.empty(MOST, np.int64), np.empty(MOST, np.int64), np.empty(MOST)
-    E, models = np.empty(9), 0
+    X, depths, A, e = np.empty((20, LANES)), np.empty((2, LANES)), np.empty((45, LANES)), np.empty((36, LANES))
+    scale, C, B, p = np.empty((5, LANES)), np.empty((200, LANES)), np.empty((45, LANES)), np.empty((11, LANES))
+    roots, right = room_for_roots(), np.empty((DEGREE, LANES), np.bool_)
+    E, uncalibrated = np.empty((9, LANES)), np.empty((DEGREE, 9, LANES))
+    models = 0
     for first in range(0, sample.shape[1], LANES):
-        gather(points, sample, first, 5, X)
-        for k in range(4):
-            for j in range(5):
-                for i in range(LANES):
-                    X[k, j * LANES + i] /= depth[k // 2, min(first + i, sample.shape[1] - 1)]
+        gather(points, sample, first, X)
+        for i in range(LANES):
+            for k in range(2):
+                depths[k, i] = depth[k, min(first + i, sample.shape[1] - 1)]
+        for k in range(20):
+            store(X, k, load(X, k) / load(depths, k % 4 // 2))
         equations(X, 5, A)
-        null_space(A, 5, e, full_rank, work)
+        full_rank = null_space(A, 5, e, scale)
         _constraints(e, C)
-        _eliminate(C, work)
+        _eliminate(C)
         _polynomials(C, B)
         _determinant(B, p)
-        count = real_roots(p, min(LANES, sample.shape[1] - first), full_rank, lane, chart, z)
-        for r in range(count):
-            i = lane[r]
-            valid = _essential(B, e, i, chart[r] == 1, z[r], E) and consistently_oriented(E, X, 5, LANES, i)
-            if valid and _uncalibrated(E, depth[0, first + i], depth[1, first + i], offset, F[models]):
-                draw[models] = first + i
-                models += 1
+        rows = real_roots(p, full_rank, roots)
+        for s in range(rows):
+            there = load(roots.found, s) & _essential(B, e, load(roots.far, s), load(roots.z, s), E)
+            there &= consistently_oriented(E, X, 5)
+            store(right, s, there & _uncalibrated(E, depths, offset, uncalibrated[s]))
+        for i in range(min(LANES, sample.shape[1] - first)):
+            for s in range(rows):
+                if right[s, i]:
+                    for q in range(9):
+                        F[models, q] = uncalibrated[s, q, i]
+                    draw[models] = first + i
+                    models += 1
     return models
 
 
@@ -68,23 +75,22 @@ def _constraints(e: Array, A: Array) -> None:
 
     e: (4 9, LANES), the basis X, Y, Z, W.
     """
-    Q, N = np.empty((9, LANES)), np.empty((3, LANES))
+    Q, N, zero = np.empty((9, LANES)), np.empty((3, LANES)), fill(0.0)
     for r in range(200):
-        for i in range(LANES):
-            A[r, i] = 0.0
+        store(A, r, zero)
     for pair in range(10):
         a, b = 9 * FIRST[pair], 9 * SECOND[pair]
         _quadratic_forms(e, a, b, 0.5 if a == b else 1.0, Q, N)
         for c in range(4):
             m, o = MONOMIAL[pair, c], 9 * c
-            for i in range(LANES):
-                A[m, i] += N[0, i] * e[o, i] + N[1, i] * e[o + 1, i] + N[2, i] * e[o + 2, i]
+            determinant = load(N, 0) * load(e, o) + load(N, 1) * load(e, o + 1) + load(N, 2) * load(e, o + 2)
+            store(A, m, load(A, m) + determinant)
             for row in range(3):
-                q = 3 * row
+                q0, q1, q2 = load(Q, 3 * row), load(Q, 3 * row + 1), load(Q, 3 * row + 2)
                 for column in range(3):
-                    w, f = (1 + q + column) * 20 + m, o + column
-                    for i in range(LANES):
-                        A[w, i] += Q[q, i] * e[f, i] + Q[q + 1, i] * e[f + 3, i] + Q[q + 2, i] * e[f + 6, i]
+                    w, f = (1 + 3 * row + column) * 20 + m, o + column
+                    product = q0 * load(e, f) + q1 * load(e, f + 3) + q2 * load(e, f + 6)
+                    store(A, w, load(A, w) + product)
 
 
 @inner
@@ -93,82 +99,69 @@ def _quadratic_forms(e: Array, a: int, b: int, share: float, Q: Array, N: Array)
     for row in range(3):
         for column in range(row, 3):
             p, q, r, s = a + 3 * row, b + 3 * column, b + 3 * row, a + 3 * column
-            u, v = 3 * row + column, 3 * column + row
-            for i in range(LANES):
-                value = e[p, i] * e[q, i] + e[p + 1, i] * e[q + 1, i]
-                value += e[p + 2, i] * e[q + 2, i]
-                value += e[r, i] * e[s, i] + e[r + 1, i] * e[s + 1, i]
-                value = (value + e[r + 2, i] * e[s + 2, i]) * share
-                Q[u, i] = value
-                Q[v, i] = value
-    for i in range(LANES):
-        half = (Q[0, i] + Q[4, i] + Q[8, i]) / 2
-        Q[0, i] -= half
-        Q[4, i] -= half
-        Q[8, i] -= half
+            value = load(e, p) * load(e, q) + load(e, p + 1) * load(e, q + 1)
+            value += load(e, p + 2) * load(e, q + 2)
+            value += load(e, r) * load(e, s) + load(e, r + 1) * load(e, s + 1)
+            value = (value + load(e, r + 2) * load(e, s + 2)) * share
+            store(Q, 3 * row + column, value)
+            store(Q, 3 * column + row, value)
+    half = (load(Q, 0) + load(Q, 4) + load(Q, 8)) / 2.0
+    for k in range(0, 9, 4):
+        store(Q, k, load(Q, k) - half)
     for k in range(3):  # rows 1 and 2 without column k
         p, q, r, s = 3 + (k + 1) % 3, 6 + (k + 2) % 3, 3 + (k + 2) % 3, 6 + (k + 1) % 3
-        for i in range(LANES):
-            value = e[a + p, i] * e[b + q, i] - e[a + r, i] * e[b + s, i]
-            N[k, i] = (value + e[b + p, i] * e[a + q, i] - e[b + r, i] * e[a + s, i]) * share
+        value = load(e, a + p) * load(e, b + q) - load(e, a + r) * load(e, b + s)
+        store(N, k, (value + load(e, b + p) * load(e, a + q) - load(e, b + r) * load(e, a + s)) * share)
 
 
 @inner
-def _eliminate(A: Array, work: Array) -> None:
+def _eliminate(A: Array) -> None:
     """Gauss elimination of A (10 20, LANES) without pivoting, in place; wholly of the last six rows."""
     for k in range(10):
-        for i in range(LANES):
-            work[0, i] = 1.0 / A[21 * k, i]
+        inverse = 1.0 / load(A, 21 * k)
         for c in range(k + 1, 20):
-            for i in range(LANES):
-                A[20 * k + c, i] *= work[0, i]
+            store(A, 20 * k + c, load(A, 20 * k + c) * inverse)
         for r in range(k + 1, 10):
-            _subtract(A, 20 * r + k, 20 * r, 20 * k, k + 1, work)
+            _subtract(A, 20 * r + k, 20 * r, 20 * k, k + 1)
     for r in range(8, 3, -1):
         for k in range(9, r, -1):
-            _subtract(A, 20 * r + k, 20 * r, 20 * k, 10, work)
+            _subtract(A, 20 * r + k, 20 * r, 20 * k, 10)
 
 
 @inner
-def _subtract(A: Array, factor: int, row: int, other: int, first: int, work: Array) -> None:
+def _subtract(A: Array, factor: int, row: int, other: int, first: int) -> None:
     """Subtracts from a row the factor times the other one, from a column on."""
-    for i in range(LANES):
-        work[0, i] = A[factor, i]
+    by = load(A, factor)
     for c in range(first, 20):
-        for i in range(LANES):
-            A[row + c, i] -= work[0, i] * A[other + c, i]
+        store(A, row + c, load(A, row + c) - by * load(A, other + c))
 
 
 @inner
 def _polynomials(A: Array, B: Array) -> None:
     """The 3 x 3 matrix of polynomials in z, highest power first, of null vector (x, y, 1) -> B (3 3 5, LANES)."""
+    zero = fill(0.0)
     for q in range(45):
-        for i in range(LANES):
-            B[q, i] = 0.0
+        store(B, q, zero)
     for r in range(3):
         for column in range(3):
             first, count = 10 + 3 * column, 4 if column == 2 else 3
             for s in range(count):
                 o = (3 * r + column) * 5 + 5 - count + s
                 p, q = 20 * (4 + 2 * r) + first + s, 20 * (5 + 2 * r) + first + s
-                for i in range(LANES):
-                    B[o, i] += A[p, i]
-                for i in range(LANES):
-                    B[o - 1, i] -= A[q, i]
+                store(B, o, load(B, o) + load(A, p))
+                store(B, o - 1, load(B, o - 1) - load(A, q))
 
 
 @inner
 def _determinant(B: Array, p: Array) -> None:
     """The determinant of B, a polynomial of degree ten -> p (11, LANES)."""
-    minor = np.empty((7, LANES))
+    minor, zero = np.empty((7, LANES)), fill(0.0)
     for q in range(11):
-        for i in range(LANES):
-            p[q, i] = 0.0
+        store(p, q, zero)
     for r in range(3):
         s, t = (r + 1) % 3, (r + 2) % 3
         for q in range(7):
-            for i in range(LANES):
-                minor[q, i] = 0.0
+            store(minor, q, zero)
         _multiply(B, 15 * s + 1, 4, B, 15 * t + 6, 4, 1.0, minor)
         _multiply(B, 15 * s + 6, 4, B, 15 * t + 1, 4, -1.0, minor)
         _multiply(minor, 0, 7, B, 15 * r + 10, 5, 1.0, p)
@@ -178,54 +171,65 @@ def _determinant(B: Array, p: Array) -> None:
 def _multiply(a: Array, o: int, m: int, b: Array, q: int, n: int, sign: float, out: Array) -> None:
     """Adds to a polynomial the product of two of m and n coefficients, which begin at a[o] and b[q]."""
     for j in range(m):
+        factor = sign * load(a, o + j)
         for k in range(n):
-            for i in range(LANES):
-                out[j + k, i] += sign * a[o + j, i] * b[q + k, i]
+            store(out, j + k, load(out, j + k) + factor * load(b, q + k))
 
 
 @inner
-def _essential(B: Array, e: Array, i: int, far: bool, z: float, E: Array) -> bool:
-    """The essential matrix of a root of sample i, of unit norm -> E (9,); whether there is one."""
-    m, norm = np.empty(9), 0.0
+def _essential(B: Array, e: Array, far: Any, z: Any, E: Array) -> Any:
+    """The essential matrix of a root of each sample, of unit norm -> E (9, LANES); a mask: whether there is one."""
+    m = np.empty((9, LANES))
     for q in range(9):
-        value = B[5 * q + (4 if far else 0), i]
+        value = where(far, load(B, 5 * q + 4), load(B, 5 * q))
         for d in range(1, 5):
-            value = B[5 * q + (4 - d if far else d), i] + value * z
-        m[q] = value
-    x, y, one, most = 0.0, 0.0, 0.0, -1.0
+            value = where(far, load(B, 5 * q + 4 - d), load(B, 5 * q + d)) + value * z
+        store(m, q, value)
+    zero = fill(0.0)
+    x, y, one, most = zero, zero, zero, fill(-1.0)
     for r in range(3):  # the longest cross product of two rows
         a, b = 3 * r, 3 * ((r + 1) % 3)
-        c0, c1 = m[a + 1] * m[b + 2] - m[a + 2] * m[b + 1], m[a + 2] * m[b] - m[a] * m[b + 2]
-        c2 = m[a] * m[b + 1] - m[a + 1] * m[b]
+        c0 = load(m, a + 1) * load(m, b + 2) - load(m, a + 2) * load(m, b + 1)
+        c1 = load(m, a + 2) * load(m, b) - load(m, a) * load(m, b + 2)
+        c2 = load(m, a) * load(m, b + 1) - load(m, a + 1) * load(m, b)
         length2 = c0 * c0 + c1 * c1 + c2 * c2
-        if length2 > most:
-            x, y, one, most = c0, c1, c2, length2
-    w0, w1, w2, w3 = (x * z, y * z, one, one * z) if far else (x, y, one * z, one)
+        longer = length2 > most
+        x, y, one = where(longer, c0, x), where(longer, c1, y), where(longer, c2, one)
+        most = where(longer, length2, most)
+    w0, w1 = where(far, x * z, x), where(far, y * z, y)
+    w2, w3 = where(far, one, one * z), where(far, one * z, one)
+    norm = zero
     for q in range(9):
-        E[q] = e[q, i] * w0 + e[9 + q, i] * w1
-        E[q] += e[18 + q, i] * w2 + e[27 + q, i] * w3
-        norm += E[q] * E[q]
-    norm = math.sqrt(norm)
+        value = load(e, q) * w0 + load(e, 9 + q) * w1
+        value += load(e, 18 + q) * w2 + load(e, 27 + q) * w3
+        store(E, q, value)
+        norm += value * value
+    norm = sqrt(norm)
     for q in range(9):
-        E[q] /= norm
-    return math.isfinite(norm) and norm > 0
+        store(E, q, load(E, q) / norm)
+    return (norm > 0.0) & (norm < math.inf)
 
 
 @inner
-def _uncalibrated(E: Array, depth0: float, depth1: float, offset: Array, F: Array) -> bool:
-    """The fundamental matrix of cameras of these focal lengths, of unit norm -> F (9,), float32; E is overwritten."""
-    norm = 0.0
+def _uncalibrated(E: Array, depth: Array, offset: Array, F: Array) -> Any:
+    """Fundamental matrices of cameras of these focal lengths, of unit norm -> F (9, LANES); a mask: whether finite.
+
+    E: (9, LANES), overwritten. depth: (2, LANES).
+    """
     for k in range(3):
-        E[3 * k + 2] *= depth0
+        store(E, 3 * k + 2, load(E, 3 * k + 2) * load(depth, 0))
     for k in range(3):
-        E[6 + k] *= depth1
+        store(E, 6 + k, load(E, 6 + k) * load(depth, 1))
     for k in range(3):
-        E[3 * k + 2] += offset[0] * E[3 * k] + offset[1] * E[3 * k + 1]
+        moved = offset[0] * load(E, 3 * k) + offset[1] * load(E, 3 * k + 1)
+        store(E, 3 * k + 2, load(E, 3 * k + 2) + moved)
     for k in range(3):
-        E[6 + k] += offset[2] * E[k] + offset[3] * E[3 + k]
+        moved = offset[2] * load(E, k) + offset[3] * load(E, 3 + k)
+        store(E, 6 + k, load(E, 6 + k) + moved)
+    norm = fill(0.0)
     for q in range(9):
-        norm += E[q] * E[q]
-    norm = math.sqrt(norm)
+        norm += load(E, q) * load(E, q)
+    norm = sqrt(norm)
     for q in range(9):
-        F[q] = E[q] / norm
-    return math.isfinite(norm) and norm > 0
+        store(F, q, load(E, q) / norm)
+    return (norm > 0.0) & (norm < math.inf)

@@ -1,92 +1,119 @@
 """Real roots of polynomials of degree ten, LANES samples at a time, compiled: signs on a grid, then Newton.
 
-As in `five_point`: the projective line in two charts, in which buffers have the sample as their last axis.
+As in `five_point`: the projective line in two charts. Buffers are rows of LANES numbers, one a sample.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.geometry.nullspace_kernels import LANES
 from fmtorch.kernels import inner
+from fmtorch.lanes import LANES, absolute, any_lane, fill, load, store, where
 
 Array = NDArray[Any]
 KNOTS, POLISHING_STEPS = 33, 4  # of the grid in each of two charts; as in `five_point`
-MOST = 10 * LANES  # roots of LANES polynomials
+DEGREE = 10
+
+
+class Roots(NamedTuple):
+    """Of LANES polynomials, their first roots in rows 0, their second in rows 1, ... (DEGREE, LANES).
+
+    far: whether in the second chart, in which z is the inverse of the root. found: whether there is one.
+    low, high, below, above: places of different sign around it, and the values there.
+    """
+
+    z: Array
+    far: Array
+    found: Array
+    low: Array
+    high: Array
+    below: Array
+    above: Array
 
 
 @inner
-def real_roots(p: Array, count: int, valid: Array, lane: Array, chart: Array, z: Array) -> int:
-    """Real roots of p (11, LANES) of `count` samples -> lane, chart, z (MOST,), in their order; how many there are.
+def room_for_roots() -> Any:
+    """Buffers for `real_roots`."""
+    z, far, found = np.empty((DEGREE, LANES)), np.empty((DEGREE, LANES), np.bool_), np.empty((DEGREE, LANES), np.bool_)
+    low, high = np.empty((DEGREE, LANES)), np.empty((DEGREE, LANES))
+    return Roots(z, far, found, low, high, np.empty((DEGREE, LANES)), np.empty((DEGREE, LANES)))
 
-    In chart 0 z is the root, in chart 1 its inverse.
+
+@inner
+def real_roots(p: Array, valid: Any, roots: Any) -> int:
+    """Real roots of p (DEGREE + 1, LANES), highest power first, in their order -> roots; how many rows of them.
+
+    valid: a mask; of other polynomials there are none.
     """
-    size, values = np.zeros(LANES), np.empty((2 * KNOTS, LANES))
-    ends, coefficients = np.empty((4, MOST)), np.empty((11, MOST))
-    for d in range(11):
-        for i in range(LANES):
-            size[i] = max(size[i], abs(p[d, i]))
-    for i in range(LANES):
-        valid[i] &= size[i] > 0 and math.isfinite(size[i])
-    for c in range(2):
+    size, most = fill(0.0), 0
+    for d in range(DEGREE + 1):
+        magnitude = absolute(load(p, d))
+        size = where(magnitude <= size, size, magnitude)
+    valid = valid & (size > 0.0) & (size < math.inf)
+    values, change, number = np.empty((KNOTS, LANES)), np.empty((1, LANES), np.bool_), np.zeros(LANES, np.int64)
+    for s in range(DEGREE):
+        store(roots.found, s, size != size)
+        store(roots.far, s, size != size)
+        store(roots.low, s, fill(0.0))
+        store(roots.high, s, fill(1.0))
+        store(roots.below, s, fill(-1.0))
+        store(roots.above, s, fill(1.0))
+    for chart in range(2):
         for k in range(KNOTS):
-            o, x = c * KNOTS + k, _knot(c, k)
+            store(values, k, _value(p, chart == 1, _knot(chart, k)))
+        for k in range(KNOTS - 1):
+            changes = valid & ((load(values, k) < 0.0) ^ (load(values, k + 1) < 0.0))
+            if not any_lane(changes):
+                continue
+            store(change, 0, changes)
             for i in range(LANES):
-                values[o, i] = p[10 * c, i]
-            for d in range(1, 11):
-                q = d if c == 0 else 10 - d
-                for i in range(LANES):
-                    values[o, i] = p[q, i] + values[o, i] * x
-    found = 0
-    for i in range(count):
-        for c in range(2 if valid[i] else 0):
-            for k in range(KNOTS - 1):
-                low, high = values[c * KNOTS + k, i], values[c * KNOTS + k + 1, i]
-                if (low < 0) != (high < 0) and found < MOST:
-                    lane[found], chart[found] = i, c
-                    ends[0, found], ends[1, found], ends[2, found], ends[3, found] = (
-                        _knot(c, k),
-                        _knot(c, k + 1),
-                        low,
-                        high,
-                    )
-                    for d in range(11):
-                        coefficients[d, found] = p[d if c == 0 else 10 - d, i]
-                    found += 1
-    _polish(coefficients, ends, found, z)
-    return found
+                s = number[i]
+                if change[0, i] and s < DEGREE:
+                    roots.found[s, i], roots.far[s, i] = True, chart == 1
+                    roots.low[s, i], roots.high[s, i] = _knot(chart, k), _knot(chart, k + 1)
+                    roots.below[s, i], roots.above[s, i] = values[k, i], values[k + 1, i]
+                    number[i] = s + 1
+                    most = max(most, s + 1)
+    coefficients = np.empty((DEGREE + 1, LANES))
+    for s in range(most):
+        _polish(p, s, roots, coefficients)
+    return most
 
 
 @inner
-def _knot(c: int, k: int) -> Any:
+def _knot(chart: int, k: int) -> Any:
     """A place of the grid: from -1 to 1 in chart 0, back in chart 1."""
-    return k / 16.0 - 1.0 if c == 0 else 1.0 - k / 16.0
+    return k / 16.0 - 1.0 if chart == 0 else 1.0 - k / 16.0
 
 
 @inner
-def _polish(p: Array, ends: Array, count: int, z: Array) -> None:
-    """Roots of polynomials (11, count) between places of different sign: Newton's method, or bisection -> z.
+def _value(p: Array, far: bool, x: float) -> Any:
+    """The polynomials, of which the second chart has the coefficients in the other order, at a place."""
+    value = load(p, DEGREE if far else 0)
+    for d in range(1, DEGREE + 1):
+        value = load(p, DEGREE - d if far else d) + value * x
+    return value
 
-    ends: low, high, and the values there.
-    """
-    low, high, below, above = ends[0], ends[1], ends[2], ends[3]
-    slope, value = np.empty(MOST), np.empty(MOST)
-    for i in range(count):
-        z[i] = low[i] - below[i] * (high[i] - low[i]) / (above[i] - below[i])
+
+@inner
+def _polish(p: Array, s: int, roots: Any, c: Array) -> None:
+    """A row of roots between places of different sign: Newton's method, or bisection -> z."""
+    far, low, high = load(roots.far, s), load(roots.low, s), load(roots.high, s)
+    below, above = load(roots.below, s), load(roots.above, s)
+    for d in range(DEGREE + 1):
+        store(c, d, where(far, load(p, DEGREE - d), load(p, d)))
+    z = low - below * (high - low) / (above - below)
     for _ in range(POLISHING_STEPS):
-        for i in range(count):
-            slope[i], value[i] = p[0, i], p[1, i] + p[0, i] * z[i]
-        for d in range(2, 11):
-            c = p[d]
-            for i in range(count):
-                slope[i] = value[i] + slope[i] * z[i]
-                value[i] = c[i] + value[i] * z[i]
-        for i in range(count):
-            same = (value[i] < 0) == (below[i] < 0)
-            low[i], high[i] = z[i] if same else low[i], high[i] if same else z[i]
-            x, a, b = z[i] - value[i] / slope[i], min(low[i], high[i]), max(low[i], high[i])
-            z[i] = x if a <= x <= b else (low[i] + high[i]) / 2
+        slope, value = load(c, 0), load(c, 1) + load(c, 0) * z
+        for d in range(2, DEGREE + 1):
+            slope = value + slope * z
+            value = load(c, d) + value * z
+        crossed = (value < 0.0) ^ (below < 0.0)
+        low, high = where(crossed, low, z), where(crossed, z, high)
+        x, a, b = z - value / slope, where(low < high, low, high), where(low < high, high, low)
+        z = where((a <= x) & (x <= b), x, (low + high) / 2.0)
+    store(roots.z, s, z)

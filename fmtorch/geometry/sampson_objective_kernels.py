@@ -1,4 +1,4 @@
-"""`sampson_objective` for models on the matches of one pair, compiled; float64, with WIDTH partial sums."""
+"""`sampson_objective` for models on the matches of one pair, compiled; float64, LANES matches at a time."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.kernels import inner, kernel
+from fmtorch.lanes import LANES, added, fill, load, sqrt, store, where
 
 Array = NDArray[Any]
-WIDTH = 32  # partial sums over the matches: part of the last bits
 TINY = 1e-30  # as in `residuals`
 HUBER, CAUCHY, GEMAN_MCCLURE, TRUNCATED, MAGSAC = 0, 1, 2, 3, 4  # losses
 LOSSES = {"huber": HUBER, "cauchy": CAUCHY, "geman_mcclure": GEMAN_MCCLURE, "truncated": TRUNCATED, "magsac": MAGSAC}
-RESIDUAL, INVERSE, SQUARED, LOSS, COUNT, SCALE, POINTS, ROWS = 9, 10, 11, 12, 13, 14, 15, 19  # of a block, after J
+MATCH = 6  # rows of LANES matches: x0, y0, x1, y1, their weights, squared scales
 
 
 @kernel("f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], i8, f8[:, ::1], b1, f8[:, :, ::1], f8[::1]")
@@ -28,111 +28,114 @@ def evaluate(
     s2: (n,), squared scales of the loss, a code. table: (2, t + 2), of the loss MAGSAC, its weight at the ends of t
     intervals of r^2 / s^2 and beyond, and the weight's integral up to there.
     """
-    sums, block, weighted = np.empty((55, WIDTH)), np.empty((ROWS, WIDTH)), np.empty((10, WIDTH))
-    costs = np.empty(WIDTH)
+    matches = in_rows(points, weight, s2)
+    sums, J, weighted, work = np.empty((55, LANES)), np.empty((10, LANES)), np.empty((10, LANES)), np.empty((3, LANES))
     for k in range(len(F)):
-        for i in range(WIDTH):
-            costs[i] = 0.0
+        costs = fill(0.0)
         for q in range(55 if derivatives else 0):
-            for i in range(WIDTH):
-                sums[q, i] = 0.0
-        for first in range(0, len(weight), WIDTH):
-            linearise(F[k], points, weight, s2, first, block)
-            robust(block, loss, table)
-            for i in range(WIDTH):
-                costs[i] += block[LOSS, i] * block[COUNT, i]
+            store(sums, q, costs)
+        for row in range(0, len(matches), MATCH):
+            inverse, r2 = linearise(F[k], matches, row, J)
+            share, slope = robust(r2, load(matches, row + 5), loss, table, work)
+            costs += share * load(matches, row + 4)
             if derivatives:
-                _add_products(block, weighted, sums)
-        cost[k] = 0.0
-        for i in range(WIDTH):
-            cost[k] += costs[i]
+                _add_products(J, inverse * (load(matches, row + 4) * slope), weighted, sums)
+        cost[k] = added(costs)
         q = 0
         for r in range(10 if derivatives else 0):
             for c in range(r + 1):
-                total = 0.0
-                for i in range(WIDTH):
-                    total += sums[q, i]
+                total = added(load(sums, q))
                 products[k, r, c], products[k, c, r] = total, total
                 q += 1
 
 
 @inner
-def linearise(f: Array, points: Array, weight: Array, s2: Array, first: int, block: Array) -> None:
-    """Jacobian, residual and what belongs to them of the matches from `first` on; weight zero where there are none."""
-    f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
-    J0, J1, J2, J3, J4, J5, J6, J7, J8 = (
-        block[0], block[1], block[2], block[3], block[4], block[5], block[6], block[7], block[8],
-    )  # fmt: skip
-    E, V, R, W, S = block[RESIDUAL], block[INVERSE], block[SQUARED], block[COUNT], block[SCALE]
-    X0, Y0, X1, Y1 = block[POINTS], block[POINTS + 1], block[POINTS + 2], block[POINTS + 3]
-    count = min(WIDTH, len(weight) - first)
-    for i in range(count):
-        X0[i], Y0[i] = points[0, first + i], points[1, first + i]
-        X1[i], Y1[i] = points[2, first + i], points[3, first + i]
-        W[i], S[i] = weight[first + i], s2[first + i]
-    for i in range(count, WIDTH):
-        X0[i], Y0[i], X1[i], Y1[i], W[i], S[i] = 0.0, 0.0, 0.0, 0.0, 0.0, 1.0
-    for i in range(WIDTH):
-        x0, y0, x1, y1 = X0[i], Y0[i], X1[i], Y1[i]
-        a0, b0 = f0 * x0 + f1 * y0 + f2, f3 * x0 + f4 * y0 + f5
-        a1, b1 = f0 * x1 + f3 * y1 + f6, f1 * x1 + f4 * y1 + f7
-        e = f6 * x0 + f7 * y0 + f8 + a0 * x1 + b0 * y1
-        slope = a0 * a0 + b0 * b0 + a1 * a1 + b1 * b1
-        inverse = 1.0 / (slope if slope > TINY else TINY)
-        c = e * inverse
-        E[i], V[i], R[i] = e, inverse, e * c
-        u, v, p, q = x1 - c * a0, y1 - c * b0, -c * a1, -c * b1
-        J0[i], J1[i], J2[i] = u * x0 + x1 * p, u * y0 + x1 * q, u
-        J3[i], J4[i], J5[i] = v * x0 + y1 * p, v * y0 + y1 * q, v
-        J6[i], J7[i], J8[i] = x0 + p, y0 + q, 1.0
+def in_rows(points: Array, weight: Array, s2: Array) -> Array:
+    """Matches (n,), LANES in MATCH rows each; those that fill the last ones have no weight."""
+    n = len(weight)
+    count = (n + LANES - 1) // LANES
+    rows = np.zeros((MATCH * count, LANES))
+    for first in range(0, n, LANES):
+        row = first // LANES * MATCH
+        for i in range(LANES):
+            rows[row + 5, i] = 1.0
+        for i in range(min(LANES, n - first)):
+            for k in range(4):
+                rows[row + k, i] = points[k, first + i]
+            rows[row + 4, i], rows[row + 5, i] = weight[first + i], s2[first + i]
+    return rows
 
 
 @inner
-def robust(block: Array, loss: int, table: Array) -> None:
-    """The losses; and what the products of derivatives are weighted with, in place of the inverse slopes."""
-    R, S, L, W, V = block[SQUARED], block[SCALE], block[LOSS], block[COUNT], block[INVERSE]
+def linearise(f: Array, matches: Array, row: int, J: Array) -> tuple[Any, Any]:
+    """Jacobian and residual of LANES matches -> J (10, LANES); inverse squared slopes, squared Sampson distances."""
+    x0, y0, x1, y1 = load(matches, row), load(matches, row + 1), load(matches, row + 2), load(matches, row + 3)
+    a0, b0 = f[0] * x0 + f[1] * y0 + f[2], f[3] * x0 + f[4] * y0 + f[5]
+    a1, b1 = f[0] * x1 + f[3] * y1 + f[6], f[1] * x1 + f[4] * y1 + f[7]
+    e = f[6] * x0 + f[7] * y0 + f[8] + a0 * x1 + b0 * y1
+    slope = a0 * a0 + b0 * b0 + a1 * a1 + b1 * b1
+    inverse = 1.0 / where(slope > TINY, slope, TINY)
+    c = e * inverse
+    u, v, p, q = x1 - c * a0, y1 - c * b0, -c * a1, -c * b1
+    store(J, 0, u * x0 + x1 * p)
+    store(J, 1, u * y0 + x1 * q)
+    store(J, 2, u)
+    store(J, 3, v * x0 + y1 * p)
+    store(J, 4, v * y0 + y1 * q)
+    store(J, 5, v)
+    store(J, 6, x0 + p)
+    store(J, 7, y0 + q)
+    store(J, 8, fill(1.0))
+    store(J, 9, e)
+    return inverse, e * c
+
+
+@inner
+def robust(r2: Any, s2: Any, loss: int, table: Array, work: Array) -> tuple[Any, Any]:
+    """The losses of squared residuals, and their derivatives by these. work: (3, LANES)."""
     if loss == TRUNCATED:
-        for i in range(WIDTH):
-            L[i] = R[i] if R[i] <= S[i] else S[i]
-            V[i] *= W[i] if R[i] <= S[i] else 0.0
+        value, slope = where(r2 <= s2, r2, s2), where(r2 <= s2, fill(1.0), 0.0)
     elif loss == GEMAN_MCCLURE:
-        for i in range(WIDTH):
-            share = S[i] / (S[i] + R[i])
-            L[i] = R[i] * share
-            V[i] *= W[i] * (share * share)
+        share = s2 / (s2 + r2)
+        value, slope = r2 * share, share * share
     elif loss == HUBER:
-        for i in range(WIDTH):
-            far = R[i] if R[i] > S[i] else S[i]
-            L[i] = R[i] if R[i] <= S[i] else 2 * math.sqrt(S[i] * far) - S[i]
-            V[i] *= W[i] * math.sqrt(S[i] / far)
+        far = where(r2 > s2, r2, s2)
+        value, slope = where(r2 <= s2, r2, 2.0 * sqrt(s2 * far) - s2), sqrt(s2 / far)
     elif loss == CAUCHY:
-        for i in range(WIDTH):
-            L[i] = S[i] * math.log1p(R[i] / S[i])
-            V[i] *= W[i] * (S[i] / (S[i] + R[i]))
+        store(work, 0, r2 / s2)
+        for i in range(LANES):
+            work[0, i] = math.log1p(work[0, i])
+        value, slope = s2 * load(work, 0), s2 / (s2 + r2)
     else:
-        entries = table.shape[1] - 2
-        for i in range(WIDTH):
-            position = R[i] / S[i] * entries
-            position = position if position < entries else float(entries)
-            interval = min(max(np.int64(position), 0), entries)
-            share, begin = position - interval, table[0, interval]
-            rise = table[0, interval + 1] - begin
-            L[i] = S[i] * (table[1, interval] + (begin + share * rise / 2) * share / entries)
-            V[i] *= W[i] * (begin + share * rise)
+        store(work, 0, r2 / s2)
+        _tabulated(table, work)
+        value, slope = s2 * load(work, 1), load(work, 2)
     # A residual that is not a number must not pass for a small loss.
-    for i in range(WIDTH):
-        L[i] = L[i] if R[i] == R[i] else math.nan
+    return where(r2 == r2, value, math.nan), slope
 
 
 @inner
-def _add_products(block: Array, weighted: Array, sums: Array) -> None:
-    """Adds the lower triangle of the products of Jacobian and residual, row by row."""
+def _tabulated(table: Array, work: Array) -> None:
+    """Integral and value of the table at r^2 / s^2, in row 0 of work (3, LANES) -> its rows 1 and 2."""
+    entries = table.shape[1] - 2
+    for i in range(LANES):
+        position = work[0, i] * entries
+        position = position if position < entries else float(entries)
+        interval = min(max(np.int64(position), 0), entries)
+        share, begin = position - interval, table[0, interval]
+        rise = table[0, interval + 1] - begin
+        work[1, i] = table[1, interval] + (begin + share * rise / 2) * share / entries
+        work[2, i] = begin + share * rise
+
+
+@inner
+def _add_products(J: Array, factor: Any, weighted: Array, sums: Array) -> None:
+    """Adds the lower triangle of the weighted products of Jacobian and residual, row by row."""
     for r in range(10):
-        for i in range(WIDTH):
-            weighted[r, i] = block[r, i] * block[INVERSE, i]
+        store(weighted, r, load(J, r) * factor)
     q = 0
     for r in range(10):
+        of_row = load(J, r)
         for c in range(r + 1):
-            for i in range(WIDTH):
-                sums[q, i] += block[r, i] * weighted[c, i]
+            store(sums, q, load(sums, q) + of_row * load(weighted, c))
             q += 1

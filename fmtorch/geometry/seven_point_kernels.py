@@ -1,4 +1,7 @@
-"""The seven-point algorithm on the samples of one pair, compiled; float64, models in float32."""
+"""The seven-point algorithm on the samples of one pair, compiled; float64, LANES samples at a time, models in float32.
+
+Buffers are rows of LANES numbers, one a sample.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.geometry.cubic_kernels import cubic_roots
-from fmtorch.geometry.nullspace_kernels import LANES, equations, gather, null_space
+from fmtorch.geometry.nullspace_kernels import equations, gather, null_space
 from fmtorch.geometry.orientation_kernels import consistently_oriented
 from fmtorch.kernels import inner, kernel
+from fmtorch.lanes import LANES, absolute, load, store
 
 Array = NDArray[Any]
 HALF = 0.5**0.5
@@ -23,36 +27,30 @@ def seven_point(points: Array, sample: Array, F: Array, draw: Array) -> int:
 
     They stand in the order of the samples, and of one sample in that of `minimal.seven_point_components`.
     """
-    X, A, B = np.empty((4, 7 * LANES)), np.empty((63, LANES)), np.empty((18, LANES))
-    work, full_rank, p = np.empty((9, LANES)), np.empty(LANES, np.bool_), np.empty((4, LANES))
-    c, roots, valid, f = np.empty(4), np.empty(3), np.empty(3, np.bool_), np.empty(9)
+    X, A, B, scale = np.empty((28, LANES)), np.empty((63, LANES)), np.empty((18, LANES)), np.empty((7, LANES))
+    p, mixed, there = np.empty((4, LANES)), np.empty((6, LANES)), np.empty((3, LANES), np.bool_)
+    f, full_rank = np.empty((3, 9, LANES)), np.empty((1, LANES), np.bool_)
     models = 0
     for first in range(0, sample.shape[1], LANES):
-        gather(points, sample, first, 7, X)
+        gather(points, sample, first, X)
         equations(X, 7, A)
-        null_space(A, 7, B, full_rank, work)
+        store(full_rank, 0, null_space(A, 7, B, scale))
         _determinants(B, p)
+        for lane in range(LANES):
+            _mixtures(p, lane, full_rank[0, lane], mixed, there)
+        for k in range(3):
+            a, b = load(mixed, 2 * k), load(mixed, 2 * k + 1)
+            finite = load(there, k)
+            for q in range(9):
+                value = a * load(B, q) + b * load(B, 9 + q)
+                finite &= absolute(value) < math.inf
+                store(f[k], q, value)
+            store(there, k, finite & consistently_oriented(f[k], X, 7))
         for lane in range(min(LANES, sample.shape[1] - first)):
-            if not full_rank[lane]:
-                continue
-            turned, exchanged = _coefficients(p, lane, c)
-            cubic_roots(c, roots, valid)
             for k in range(3):
-                if not valid[k]:
-                    continue
-                a = 1.0 / math.sqrt(1.0 + roots[k] * roots[k])
-                b = roots[k] * a
-                if exchanged:
-                    a, b = b, a
-                if turned:
-                    a, b = (a + b) * HALF, (a - b) * HALF
-                finite = True
-                for q in range(9):
-                    f[q] = a * B[q, lane] + b * B[9 + q, lane]
-                    finite = finite and math.isfinite(f[q])
-                if finite and consistently_oriented(f, X, 7, LANES, lane):
+                if there[k, lane]:
                     for q in range(9):
-                        F[models, q] = f[q]
+                        F[models, q] = f[k, q, lane]
                     draw[models] = first + lane
                     models += 1
     return models
@@ -61,19 +59,32 @@ def seven_point(points: Array, sample: Array, F: Array, draw: Array) -> int:
 @inner
 def _determinants(B: Array, p: Array) -> None:
     """det(a F0 + b F1) at (1, 0), (0, 1), and their sum and difference over the root of two -> p (4, LANES)."""
+    f = np.empty((9, LANES))
     for k in range(4):
         a, b = (1.0 - k, float(k)) if k < 2 else (HALF, HALF if k == 2 else -HALF)
-        for i in range(LANES):
-            f0 = a * B[0, i] + b * B[9, i]
-            f1 = a * B[1, i] + b * B[10, i]
-            f2 = a * B[2, i] + b * B[11, i]
-            f3 = a * B[3, i] + b * B[12, i]
-            f4 = a * B[4, i] + b * B[13, i]
-            f5 = a * B[5, i] + b * B[14, i]
-            f6 = a * B[6, i] + b * B[15, i]
-            f7 = a * B[7, i] + b * B[16, i]
-            f8 = a * B[8, i] + b * B[17, i]
-            p[k, i] = f0 * (f4 * f8 - f5 * f7) + f1 * (f5 * f6 - f3 * f8) + f2 * (f3 * f7 - f4 * f6)
+        for q in range(9):
+            store(f, q, a * load(B, q) + b * load(B, 9 + q))
+        c0 = load(f, 4) * load(f, 8) - load(f, 5) * load(f, 7)
+        c1 = load(f, 5) * load(f, 6) - load(f, 3) * load(f, 8)
+        c2 = load(f, 3) * load(f, 7) - load(f, 4) * load(f, 6)
+        store(p, k, load(f, 0) * c0 + load(f, 1) * c1 + load(f, 2) * c2)
+
+
+@inner
+def _mixtures(p: Array, lane: int, full_rank: bool, mixed: Array, there: Array) -> None:
+    """The singular matrices a F0 + b F1 of a sample -> a, b of each in two rows of mixed; whether there is one."""
+    c, roots, valid = np.empty(4), np.zeros(3), np.zeros(3, np.bool_)
+    turned, exchanged = _coefficients(p, lane, c)
+    if full_rank:
+        cubic_roots(c, roots, valid)
+    for k in range(3):
+        a = 1.0 / math.sqrt(1.0 + roots[k] * roots[k])
+        b = roots[k] * a
+        if exchanged:
+            a, b = b, a
+        if turned:
+            a, b = (a + b) * HALF, (a - b) * HALF
+        mixed[2 * k, lane], mixed[2 * k + 1, lane], there[k, lane] = a, b, valid[k]
 
 
 @inner
