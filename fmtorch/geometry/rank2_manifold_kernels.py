@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from fmtorch.geometry.rank2_kernels import cofactors, unit
 from fmtorch.kernels import inner, kernel
+from fmtorch.lanes import LANES, load, store
 
 Array = NDArray[Any]
 
@@ -77,37 +78,42 @@ def steps(
     products: Array, F: Array, e0: Array, e1: Array, damping: Array, G: Array, g0: Array, g1: Array
 ) -> None:  # fmt: skip
     """`step`, for kernels."""
-    Q, C = np.empty((10, 11)), np.empty(9)
+    Q, C = np.zeros((20, LANES)), np.empty(9)  # two rows of LANES for each of (10, 11)
     for k in range(len(F)):
         curvature = 0.0
         for i in range(9):
             curvature = max(curvature, products[k, i, i])
         for r in range(9):
             for c in range(9):
-                Q[r, c] = products[k, r, c] + curvature * F[k, r] * F[k, c]
-            Q[r, r] += curvature * damping[k]
+                Q[2 * r + c // LANES, c % LANES] = products[k, r, c] + curvature * F[k, r] * F[k, c]
+            Q[2 * r + r // LANES, r % LANES] += curvature * damping[k]
             normal = e1[k, r // 3] * e0[k, r % 3]
-            Q[r, 9], Q[9, r], Q[r, 10] = normal, normal, -products[k, r, 9]
-        Q[9, 9], Q[9, 10] = 0.0, 0.0
-        eliminate(Q)
+            Q[2 * r + 1, 9 - LANES], Q[18 + r // LANES, r % LANES] = normal, normal
+            Q[2 * r + 1, 10 - LANES] = -products[k, r, 9]
+        Q[19, 9 - LANES], Q[19, 10 - LANES] = 0.0, 0.0
+        eliminate(Q, 10)
         for i in range(9):
-            G[k, i] = F[k, i] + Q[i, 10]
+            G[k, i] = F[k, i] + Q[2 * i + 1, 10 - LANES]
         _retract(G[k], e0[k], e1[k], g0[k], g1[k], C)
 
 
 @inner
-def eliminate(Q: Array) -> None:
-    """Gauss-Jordan elimination of (n, n + 1) without pivoting, in place: the solution is the last column."""
-    n = len(Q)
+def eliminate(Q: Array, n: int) -> None:
+    """Gauss-Jordan elimination of (n, n + 1) without pivoting, in place: the solution is the last column.
+
+    Each row of the matrix is one or more of Q's rows of LANES.
+    """
+    wide = len(Q) // n
     for i in range(n):
-        pivot = Q[i, i]
-        for c in range(i, n + 1):
-            Q[i, c] /= pivot
+        first, lane = i // LANES, i % LANES
+        pivot = Q[i * wide + first, lane]
+        for w in range(i * wide + first, (i + 1) * wide):
+            store(Q, w, load(Q, w) / pivot)
         for r in range(n):
             if r != i:
-                factor = Q[r, i]
-                for c in range(i, n + 1):
-                    Q[r, c] -= factor * Q[i, c]
+                factor = Q[r * wide + first, lane]
+                for w in range(first, wide):
+                    store(Q, r * wide + w, load(Q, r * wide + w) - factor * load(Q, i * wide + w))
 
 
 @inner

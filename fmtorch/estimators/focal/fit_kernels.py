@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from fmtorch.estimators.focal.posterior_kernels import damped_step
 from fmtorch.estimators.focal.prior_kernels import focal_cost
 from fmtorch.kernels import kernel
+from fmtorch.lanes import LANES
 
 Array = NDArray[Any]
 
@@ -19,7 +20,7 @@ def gain_without_prior(
     hessian: Array, gradient: Array, focal: Array, same_size: bool, damping: float, out: Array
 ) -> None:  # fmt: skip
     """What the logarithm of the likelihood would rise by at an optimum without prior -> out (k,)."""
-    Q, H, g, work = np.empty((7, 8)), np.empty((7, 7)), np.empty(7), np.empty(4)
+    Q, H, g, work = np.empty((7, LANES)), np.empty((7, 7)), np.empty(7), np.empty(4)
     for k in range(len(focal)):
         focal_cost(focal[k], same_size, work)
         for i in range(7):

@@ -18,6 +18,7 @@ from fmtorch.geometry.rank2_kernels import assign, assign_rows, unit
 from fmtorch.geometry.rank2_manifold_kernels import eliminate
 from fmtorch.geometry.sampson_objective_kernels import evaluate
 from fmtorch.kernels import inner, kernel
+from fmtorch.lanes import LANES, fill, load, store
 
 Array = NDArray[Any]
 FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-9, 1e6  # as in `posterior`
@@ -35,7 +36,8 @@ class _State(NamedTuple):
 
 
 class _Data(NamedTuple):
-    """What `minimise` is given of matches and images; tangents (k, 9, 7) and products (k, 10, 10) for the work."""
+    """What `minimise` is given of matches and images; tangents (k, 9, LANES), of which 7 count, and products
+    (k, 10, 10) for the work."""
 
     points: Array
     weight: Array
@@ -72,7 +74,7 @@ def minimise(
         np.empty((k, 2, 3, 3)), np.empty((k, 2)), np.empty((k, 9)), np.empty(k), np.empty((k, 7)), np.empty((k, 7, 7))
     )
     data = _Data(
-        points, weight, s2, loss, table, longest, same_size, precision, tolerance, np.empty((k, 9, 7)),
+        points, weight, s2, loss, table, longest, same_size, precision, tolerance, np.zeros((k, 9, LANES)),
         np.empty((k, 10, 10)),
     )  # fmt: skip
     _minimise(data, state, trial, np.full(k, FIRST_DAMPING), iterations, tolerance >= 0)
@@ -92,7 +94,7 @@ def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
 
 @inner
 def _models(axes: Array, focal: Array, longest: Array, F: Array, tangents: Array) -> None:
-    """Fundamental matrices -> F (k, 9), and their derivatives by five rotations and two logarithms -> (k, 9, 7)."""
+    """Fundamental matrices -> F (k, 9), and their derivatives by five rotations and two logarithms -> (k, 9, LANES)."""
     for k in range(len(F)):
         U, V, T = axes[k, 0], axes[k, 1], tangents[k]
         d0, d1 = exponential(focal[k, 0]) * longest[0], exponential(focal[k, 1]) * longest[1]
@@ -110,21 +112,22 @@ def _models(axes: Array, focal: Array, longest: Array, F: Array, tangents: Array
 def _derivatives(
     products: Array, tangents: Array, prior: Array, precision: float, gradient: Array, hessian: Array
 ) -> None:  # fmt: skip
-    """Of one candidate. products: (10, 10), of `evaluate`; tangents: (9, 7); prior: (4,), of `focal_cost`."""
-    along = np.empty((7, 10))
+    """Of one candidate. products: (10, 10), of `evaluate`; tangents: (9, LANES); prior: (4,), of `focal_cost`."""
+    along, column = np.empty((10, LANES)), np.empty((1, LANES))
+    for j in range(10):
+        total = fill(0.0)
+        for q in range(9):
+            total += load(tangents, q) * products[q, j]
+        store(along, j, total)
     for i in range(7):
-        for j in range(10):
-            total = 0.0
-            for q in range(9):
-                total += tangents[q, i] * products[q, j]
-            along[i, j] = total
-        gradient[i] = along[i, 9] * precision
-    for i in range(7):
-        for j in range(7):
-            total = 0.0
-            for q in range(9):
-                total += tangents[q, i] * along[j, q]
-            hessian[i, j] = total * precision
+        gradient[i] = along[9, i] * precision
+    for j in range(7):
+        total = fill(0.0)
+        for q in range(9):
+            total += load(tangents, q) * along[q, j]
+        store(column, 0, total * precision)
+        for i in range(7):
+            hessian[i, j] = column[0, i]
     for i in range(2):
         gradient[5 + i] += prior[i]
         for j in range(2):
@@ -133,7 +136,7 @@ def _derivatives(
 
 @inner
 def _step(state: _State, damping: Array, trial: _State) -> None:
-    Q = np.empty((7, 8))
+    Q = np.empty((7, LANES))
     for k in range(len(damping)):
         damped_step(state.hessian[k], state.gradient[k], damping[k], Q)
         _rotate(state.axes[k, 0], Q[0, 7] / 2, Q[1, 7] / 2, Q[2, 7] / 2, trial.axes[k, 0])
@@ -144,13 +147,13 @@ def _step(state: _State, damping: Array, trial: _State) -> None:
 
 @inner
 def damped_step(hessian: Array, gradient: Array, damping: float, Q: Array) -> None:
-    """Solves ``(H + damping diag H) x = -gradient`` -> last column of Q (7, 8)."""
+    """Solves ``(H + damping diag H) x = -gradient`` -> last column of Q (7, LANES)."""
     for i in range(7):
         for j in range(7):
             Q[i, j] = hessian[i, j]
         Q[i, i] += hessian[i, i] * damping
         Q[i, 7] = -gradient[i]
-    eliminate(Q)
+    eliminate(Q, 7)
 
 
 @inner
