@@ -56,7 +56,8 @@ def sources(package: Path) -> list[Path]:
 
 def sources_digest(package: Path) -> str:
     """The digest of all kernels of a package, and of how they are compiled."""
-    files = [*sources(package), *(package / name for name in ("kernels.py", "lanes.py", "lane_types.py"))]
+    how = [path for name in ("kernels.py", "lanes.py", "lane_types.py") if (path := package / name).is_file()]
+    files = [*sources(package), *how]
     return _hex(b"".join(hashlib.blake2b(path.read_bytes()).digest() for path in files))
 
 

@@ -79,8 +79,9 @@ def _typed(function: Any, kind_of: Callable[[LanesType], LanesType]) -> None:
 
 def _lowered(function: Any, instruction: Callable[[Any, Any, Any], Any]) -> None:
     def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
-        kind = _operands(made.args)
-        return instruction(builder, *(_filled(context, builder, x, t, kind) for x, t in zip(args, made.args, strict=True)))
+        kind: Any = _operands(made.args)
+        a, b = (_filled(context, builder, value, given, kind) for value, given in zip(args, made.args, strict=True))
+        return instruction(builder, a, b)
 
     for number in (types.Float, types.Integer):
         lower_builtin(function, LanesType, number)(code)
@@ -293,7 +294,6 @@ def _library(name: str, arguments: int) -> Any:
         return made((value, other))
 
     return two
-
 
 
 def type_of(function: Any) -> Any:

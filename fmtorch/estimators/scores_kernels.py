@@ -15,9 +15,14 @@ from numpy.typing import NDArray
 
 from fmtorch.geometry.order_kernels import smallest_but
 from fmtorch.kernels import inner, kernel
+from fmtorch.lanes import added, lanes, sqrt, store, where
 
 Array = NDArray[Any]
+SINGLES = 16  # float32 numbers of a row
+load, fill = lanes(SINGLES)
+MATCH = 6  # rows of SINGLES matches
 GRID = 12  # cells along each side of each image, of saturated gains
+CELL_ROWS = 2 * GRID * GRID // SINGLES
 COUNT, TRUNCATED_SQUARES, GEMAN_MCCLURE, TABLE = 0, 1, 2, 3  # gains
 ONE, ZERO, TINY = np.float32(1), np.float32(0), np.finfo(np.float32).tiny
 REST = np.float32(1 / 26)  # of the gain of Geman & McClure at 5 scales, from which on it is zero
@@ -30,29 +35,33 @@ def score_gains(
     F: Array, which: Array, points: Array, support: Array, scale: Array, gain: int, table: Array, bits: int, out: Array
 ) -> None:
     """Sums of gains. gain: a code. table: of TABLE, over the squared residual from 0 to the threshold; 0 at its end."""
-    n = points.shape[1]
-    r2, gains = np.empty(n, np.float32), np.empty(n, np.int32)
+    matches, shift = _in_rows(points, support, scale), np.float32(1.5 * 2.0 ** (23 - bits))
+    gains = np.empty((len(matches) // MATCH, SINGLES), np.float32)
     for k in range(len(which)):
-        _squared(F[which[k]], points, scale, r2)
-        if gain == COUNT:
-            for i in range(n):
-                r2[i] = ONE if r2[i] <= ONE else ZERO
-        elif gain == TRUNCATED_SQUARES:
-            for i in range(n):
-                g = ONE - r2[i]
-                r2[i] = g if g > ZERO else ZERO
-        elif gain == GEMAN_MCCLURE:
-            _geman_mcclure(r2)
-        else:
-            last = np.float32(len(table) - 1)
-            for i in range(n):
-                entry = r2[i] * last
-                r2[i] = table[np.int32(entry if entry < last else last)]
-        _rounded(r2, support, bits, gains)
-        total = np.int32(0)
-        for i in range(n):
-            total += gains[i]
-        out[k] = total * 2.0**-bits
+        total = fill(ZERO)
+        for row in range(0, len(matches), MATCH):
+            g = _squared(F[which[k]], matches, row)
+            if gain == COUNT:
+                g = where(g <= ONE, fill(ONE), ZERO)
+            elif gain == TRUNCATED_SQUARES:
+                g = ONE - g
+            elif gain == GEMAN_MCCLURE:
+                g = _geman_mcclure(g)
+            store(gains, row // MATCH, g)
+        if gain == TABLE:
+            _looked_up(gains.ravel(), table)
+        for row in range(len(gains)):
+            total += _rounded(load(gains, row) * load(matches, MATCH * row + 5), shift)
+        out[k] = added(total)
+
+
+@inner
+def _looked_up(r2: Array, table: Array) -> None:
+    """The entries of a table at squared residuals, in place."""
+    last = np.float32(len(table) - 1)
+    for i in range(len(r2)):
+        entry = r2[i] * last
+        r2[i] = table[np.int32(entry if entry < last else last)]
 
 
 @kernel("f4[:, ::1], i8[::1], f4[:, ::1], f4[::1], f4[::1], i4[:, ::1], i8, f8[::1]")
@@ -60,27 +69,22 @@ def score_saturated(
     F: Array, which: Array, points: Array, support: Array, scale: Array, cells: Array, bits: int, out: Array
 ) -> None:  # fmt: skip
     """Sums over the cells of both images of roots of summed gains of Geman & McClure. cells: of `saturated_cells`."""
-    n = points.shape[1]
-    r2, gains = np.empty(n, np.float32), np.empty(n, np.int32)
-    sums, roots = np.empty(2 * GRID * GRID, np.int32), np.empty(2 * GRID * GRID, np.float32)
-    whole, rounded = np.ones(2 * GRID * GRID, np.float32), np.empty(2 * GRID * GRID, np.int32)
-    unit = np.float32(2.0**-bits)
+    matches, shift = _in_rows(points, support, scale), np.float32(1.5 * 2.0 ** (23 - bits))
+    gains, sums = np.empty((len(matches) // MATCH, SINGLES), np.float32), np.empty((CELL_ROWS, SINGLES), np.float32)
     for k in range(len(which)):
-        _squared(F[which[k]], points, scale, r2)
-        _geman_mcclure(r2)
-        _rounded(r2, support, bits, gains)
-        for c in range(len(sums)):
-            sums[c] = 0
-        for i in range(n):
-            sums[cells[0, i]] += gains[i]
-            sums[cells[1, i]] += gains[i]
-        for c in range(len(sums)):
-            roots[c] = math.sqrt(np.float32(sums[c]) * unit)
-        _rounded(roots, whole, bits, rounded)
-        total = np.int32(0)
-        for c in range(len(sums)):
-            total += rounded[c]
-        out[k] = total * 2.0**-bits
+        for row in range(0, len(matches), MATCH):
+            g = _geman_mcclure(_squared(F[which[k]], matches, row))
+            store(gains, row // MATCH, _rounded(g * load(matches, row + 5), shift))
+        for row in range(CELL_ROWS):
+            store(sums, row, fill(ZERO))
+        gain, of_cell = gains.ravel(), sums.ravel()
+        for i in range(points.shape[1]):
+            of_cell[cells[0, i]] += gain[i]
+            of_cell[cells[1, i]] += gain[i]
+        total = fill(ZERO)
+        for row in range(CELL_ROWS):
+            total += _rounded(sqrt(load(sums, row)), shift)
+        out[k] = added(total)
 
 
 @kernel("f4[:, ::1], f4[::1], i4[:, ::1]", brief=True)
@@ -103,42 +107,50 @@ def saturated_cells(points: Array, support: Array, out: Array) -> None:
 def score_median(F: Array, which: Array, points: Array, out: Array) -> None:
     """Minus the median squared residual, of an even number the lower middle one."""
     n = points.shape[1]
-    r2, scale, some = np.empty(n, np.float32), np.ones(n, np.float32), np.empty(n + 1, np.float32)
-    counts = np.empty(BINS, np.int32)
+    matches, some = _in_rows(points, np.ones(n, np.float32), np.ones(n, np.float32)), np.empty(n + 1, np.float32)
+    r2, counts = np.empty((len(matches) // MATCH, SINGLES), np.float32), np.empty(BINS, np.int32)
     for k in range(len(which)):
-        _squared(F[which[k]], points, scale, r2)
-        out[k] = -_smallest(r2, counts, some, (n + 1) // 2)
+        for row in range(0, len(matches), MATCH):
+            store(r2, row // MATCH, _squared(F[which[k]], matches, row))
+        out[k] = -_smallest(r2.ravel()[:n], counts, some, (n + 1) // 2)
 
 
 @inner
-def _squared(f: Array, points: Array, scale: Array, r2: Array) -> None:
-    """Squared Sampson distances of all matches, times their scale -> r2 (n,)."""
-    x0, y0, x1, y1 = points[0], points[1], points[2], points[3]
-    f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
-    for i in range(len(r2)):
-        a0, b0 = f0 * x0[i] + f1 * y0[i] + f2, f3 * x0[i] + f4 * y0[i] + f5
-        e = f6 * x0[i] + f7 * y0[i] + f8 + a0 * x1[i] + b0 * y1[i]
-        a1, b1 = f0 * x1[i] + f3 * y1[i] + f6, f1 * x1[i] + f4 * y1[i] + f7
-        slope = a0 * a0 + b0 * b0 + a1 * a1 + b1 * b1
-        r2[i] = e * e / (slope if slope > TINY else TINY) * scale[i]
+def _in_rows(points: Array, support: Array, scale: Array) -> Array:
+    """Matches (n,), SINGLES in MATCH rows each: points, scale, support; those that fill the last ones have none."""
+    n = len(support)
+    rows = np.zeros(((n + SINGLES - 1) // SINGLES * MATCH, SINGLES), np.float32)
+    for first in range(0, n, SINGLES):
+        row = first // SINGLES * MATCH
+        for i in range(min(SINGLES, n - first)):
+            for k in range(4):
+                rows[row + k, i] = points[k, first + i]
+            rows[row + 4, i], rows[row + 5, i] = scale[first + i], support[first + i]
+    return rows
 
 
 @inner
-def _geman_mcclure(r2: Array) -> None:
-    """The gain of Geman & McClure of squared residuals, in place."""
-    for i in range(len(r2)):
-        g = ONE / (r2[i] + ONE) - REST
-        r2[i] = (g if g > ZERO else ZERO) * STRETCH
+def _squared(f: Array, matches: Array, row: int) -> Any:
+    """Squared Sampson distances of SINGLES matches, times their scale."""
+    x0, y0, x1, y1 = load(matches, row), load(matches, row + 1), load(matches, row + 2), load(matches, row + 3)
+    a0, b0 = f[0] * x0 + f[1] * y0 + f[2], f[3] * x0 + f[4] * y0 + f[5]
+    e = f[6] * x0 + f[7] * y0 + f[8] + a0 * x1 + b0 * y1
+    a1, b1 = f[0] * x1 + f[3] * y1 + f[6], f[1] * x1 + f[4] * y1 + f[7]
+    slope = a0 * a0 + b0 * b0 + a1 * a1 + b1 * b1
+    return e * e / where(slope > TINY, slope, TINY) * load(matches, row + 4)
 
 
 @inner
-def _rounded(gain: Array, support: Array, bits: int, out: Array) -> None:
-    """Gains times support in units of 2^-bits, rounded to even -> out (n,) int32; what is not a number is zero."""
-    shift, unit = np.float32(1.5 * 2.0 ** (23 - bits)), np.float32(2.0**bits)
-    for i in range(len(out)):
-        g = gain[i] * support[i]
-        g = g if g > ZERO else ZERO
-        out[i] = np.int32((g + shift - shift) * unit)
+def _geman_mcclure(r2: Any) -> Any:
+    """The gain of Geman & McClure of squared residuals."""
+    g = ONE / (r2 + ONE) - REST
+    return where(g > ZERO, g, ZERO) * STRETCH
+
+
+@inner
+def _rounded(gain: Any, shift: Any) -> Any:
+    """Gains rounded to even multiples of what the shift, 1.5 2^(23 - bits), allows; what is not a number is zero."""
+    return where(gain > ZERO, gain, ZERO) + shift - shift
 
 
 @inner
