@@ -6,8 +6,8 @@ A kernel loops over NumPy arrays where a tensor form would take many small opera
     def row_sums(x: Floats, scale: float, out: Floats) -> None: ...
 
 Kernels live in modules named ``*_kernels.py``, whose sources version the cache folder (`fmtorch.kernel_cache`); they
-import nothing of fmtorch but one another, this module and `fmtorch.lanes`. `FMTORCH_KERNELS=off` takes the other form everywhere.
-Nothing is imported from numba before the first call.
+import nothing of fmtorch but one another, this module and `fmtorch.lanes`. `FMTORCH_KERNELS=off` takes the other form
+everywhere. Nothing is imported from numba before the first call.
 """
 
 from __future__ import annotations
