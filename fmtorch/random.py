@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import functools
 
 import torch
 from jaxtyping import Float, Int
@@ -44,6 +45,7 @@ def _mix(x: Int[Tensor, "*shape"]) -> Int[Tensor, "*shape"]:
     return x ^ _shift_right(x, 31)
 
 
+@functools.lru_cache(maxsize=64)
 def mixed_seed(seed: int, stream: Stream) -> int:
     """`_mix` of the seed and the stream, in Python's integers: the same bits without the cost of tensors."""
     x = ((seed * 2 + 1) * 0x9E3779B97F4A7C15 + int(stream)) % (1 << 64)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fmtorch.kernels import inner, kernel
+from fmtorch.kernels import inner
 
 Word = Any  # np.uint64
 
@@ -36,11 +35,3 @@ def random_bits(state: Word, counter: int) -> Word:
 def uniform(state: Word, counter: int) -> Any:
     """Number `counter` of a stream in [0, 1), with 53 random bits."""
     return np.float64(random_bits(state, counter) >> np.uint64(10)) * 2.0**-53
-
-
-@kernel("i8, i8, i8, i8[::1]", brief=True)
-def random_words(mixed_seed: int, key: int, start: int, out: NDArray[Any]) -> None:
-    """Numbers start, start + 1, ... of a stream, 63 random bits each -> out (n,): what `random.bits` gives a column."""
-    state = stream_state(mixed_seed, key)
-    for i in range(len(out)):
-        out[i] = np.int64(random_bits(state, start + i))

@@ -84,14 +84,19 @@ class Record:
         """A copy with some fields changed (shapes are checked again)."""
         return cast(AnyRecord, dataclasses.replace(cast(Any, self), **changes))
 
+    @classmethod
+    def made(cls: type[AnyRecord], **fields: Any) -> AnyRecord:
+        """A record of all its fields, unchecked: of tensors that fit because of how they are made."""
+        record = object.__new__(cls)
+        vars(record).update(fields)
+        return record
+
     def derived(self: AnyRecord, **changes: Any) -> AnyRecord:
         """A copy with some fields changed, unchecked: by tensors that fit because of how they are made of this record.
 
         What a user may have a hand in goes through `replace`.
         """
-        made = object.__new__(type(self))
-        vars(made).update(vars(self), **changes)
-        return made
+        return type(self).made(**(vars(self) | changes))
 
     def _map(self: AnyRecord, function: Any, **changes: Any) -> AnyRecord:
         return self.replace(**_mapped(self, function, Record._map), **changes)

@@ -13,14 +13,22 @@ from fmtorch.kernels import inner, kernel
 Array = NDArray[Any]
 
 
-@kernel("f8[:, ::1], f8[:, ::1], b1[::1], f8, i8[::1], f8[::1], f8[::1]", brief=True)
-def normalize(x0: Array, x1: Array, mask: Array, most: float, slot: Array, points: Array, frame: Array) -> int:
-    """Where the usable ones of n matches stand -> slot (m,); their normalised points -> the first 4 m of points; m.
+@kernel(
+    "f8[:, ::1], f8[:, ::1], b1[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], i8[::1], f8[::1], f8[::1]",
+    brief=True,
+)
+def normalize(
+    x0: Array, x1: Array, mask: Array, prior: Array, noise: Array, quality: Array, sizes: Array, bounds: Array,
+    slot: Array, table: Array, frame: Array,
+) -> int:  # fmt: skip
+    """Where the usable ones of n matches stand -> slot (m,); what is known of them -> the first 9 m of table; m.
 
-    x0, x1: (n, 2), pixels. most: what coordinates are below. points: (4 n,), rows x0, y0, x1, y1 one after the other.
-    frame: (5,), the middle of the box around the points of each image, and the unit in pixels; 0 where all coincide.
+    x0, x1: (n, 2), pixels. prior, noise, quality: (n,), sizes: (4,), sides of the images; empty where unknown. bounds:
+    (3,), what coordinates are below, the least noise and the greatest. table: (9 n,), the rows of `OnePair` one after
+    the other. frame: (6,), the middle of the box around the points of each image; the unit in pixels, 0 where all
+    coincide; and 1 where all priors, noises and sizes are right, otherwise 0.
     """
-    count, half = 0, 0.0
+    count, half, most, right = 0, 0.0, bounds[0], True
     for i in range(len(mask)):
         if mask[i] and abs(x0[i, 0]) < most and abs(x0[i, 1]) < most and abs(x1[i, 0]) < most and abs(x1[i, 1]) < most:
             slot[count] = i
@@ -29,13 +37,24 @@ def normalize(x0: Array, x1: Array, mask: Array, most: float, slot: Array, point
         x, low, high = x0 if r < 2 else x1, math.inf, -math.inf
         for i in range(count):
             value = x[slot[i], r % 2]
-            points[r * count + i] = value
+            table[r * count + i] = value
             low, high = min(low, value), max(high, value)
         frame[r], half = (low + high) / 2, max(half, (high - low) / 2)
-    frame[4] = power_of_two(half) if half > 0 else 0.0
+    unit = power_of_two(half) if half > 0 else 0.0
     for r in range(4 if half > 0 else 0):
         for i in range(r * count, (r + 1) * count):
-            points[i] = (points[i] - frame[r]) / frame[4]
+            table[i] = (table[i] - frame[r]) / unit
+    for i in range(count):
+        k = slot[i]
+        p, s = prior[k] if len(prior) else 1.0, noise[k] if len(noise) else 1.0
+        right = right and 0 <= p <= 1 and s > 0
+        s = min(max(s, bounds[1]), bounds[2])
+        table[4 * count + i], table[5 * count + i] = p / (s * s), unit / s
+        table[6 * count + i], table[7 * count + i] = p, s
+        table[8 * count + i] = quality[k] if len(quality) else 0.0
+    for side in sizes:
+        right = right and 0 < side < math.inf
+    frame[4], frame[5] = unit, 1.0 if right else 0.0
     return count
 
 

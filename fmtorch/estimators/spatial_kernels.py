@@ -96,9 +96,9 @@ def label(
 def _gaussian(F: Array, points: Array, scale: float, K: Array) -> None:
     """`spatial.gaussian_kernel` of the squared Sampson distances, times a scale -> K (n,)."""
     step, unit, r2 = np.float32(1 << HALVINGS), np.float32(UNIT), np.empty(len(K))
-    residuals_squared(F, points, r2)
+    residuals_squared(F, points, scale, r2)
     for i in range(len(K)):
-        half = r2[i] * scale / 2
+        half = r2[i] / 2
         value = ONE + np.float32(half if half < FARTHEST else FARTHEST) / step
         for _ in range(HALVINGS):
             value = value * value

@@ -1,4 +1,4 @@
-"""Order statistics, compiled."""
+"""Order statistics and sorting, compiled."""
 
 from __future__ import annotations
 
@@ -33,3 +33,19 @@ def smallest_but(values: Array, begin: int, end: int, k: int) -> Any:
         else:
             break
     return values[begin + k]
+
+
+@inner
+def sort_by(key: Array, value: Array) -> None:
+    """Sorts keys, ascending, and values along with them, where two have the same key by value (Shell)."""
+    gap = 1
+    while gap < len(key) // 3:
+        gap = 3 * gap + 1
+    while gap > 0:
+        for i in range(gap, len(key)):
+            k, v, j = key[i], value[i], i
+            while j >= gap and (key[j - gap] > k or (key[j - gap] == k and value[j - gap] > v)):
+                key[j], value[j] = key[j - gap], value[j - gap]
+                j -= gap
+            key[j], value[j] = k, v
+        gap //= 3

@@ -96,7 +96,7 @@ def of_one_pair(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1
     chance = np.empty(len(mask))
     chance = chance[: compiled.counted_chances(F, x0, x1, mask, size0, size1, chance)]
     chance.sort()
-    return compiled.most_significant(chance, _log_factorials(_table_size(len(mask))).numpy())
+    return compiled.most_significant(chance, _log_factorials(_table_size(len(mask))))
 
 
 def _into(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array, out: Array) -> None:
@@ -127,7 +127,7 @@ def _one_of_each_place(
 
 def _significance(chance: Float[Tensor, "b n"], n: Int[Tensor, " b"]) -> Float[Tensor, " b"]:
     """-log10 of the least number of false alarms over k, of ascending chances of which the first n are meant."""
-    factorial = _log_factorials(_table_size(chance.shape[1])).to(chance.device)
+    factorial = torch.from_numpy(_log_factorials(_table_size(chance.shape[1]))).to(chance.device)
     k = torch.arange(SAMPLE + 1, chance.shape[1] + 1, device=chance.device)
     n = n[:, None]
     spare = (n - k).clamp_min(0)
@@ -139,13 +139,13 @@ def _significance(chance: Float[Tensor, "b n"], n: Int[Tensor, " b"]) -> Float[T
 
 
 @functools.lru_cache(maxsize=8)
-def _log_factorials(count: int) -> Float[Tensor, " count"]:
-    """log i! for i = 0 ... count - 1, in ascending order of summation, so that longer tables begin alike."""
+def _log_factorials(count: int) -> Array:
+    """log i! (count,) for i = 0 ... count - 1, in ascending order of summation, so that longer tables begin alike."""
     total, table = 0.0, [0.0]
     for i in range(1, count):
         total += math.log(i)
         table.append(total)
-    return torch.tensor(table, dtype=torch.float64)
+    return np.array(table)
 
 
 def _logarithms(factorial: Tensor) -> Tensor:

@@ -18,7 +18,6 @@ from fmtorch.estimators.one_pair.focal.cameras import CentredPair, TwoCameras
 from fmtorch.estimators.one_pair.focal.selection import Candidates
 from fmtorch.estimators.one_pair.models import Pool as PoolOfOne
 from fmtorch.estimators.one_pair.pair import OnePair
-from fmtorch.estimators.one_pair.pool import shuffled
 from fmtorch.estimators.one_pair.refinement import near_models
 from fmtorch.estimators.one_pair.selection import Selection, scored
 from fmtorch.estimators.pairs import NormalizedPairs
@@ -26,7 +25,6 @@ from fmtorch.estimators.registry import kernel_form
 from fmtorch.estimators.scores import score_models
 from fmtorch.geometry import sampson_objective_kernels
 from fmtorch.kernels import Kernel
-from fmtorch.random import Stream
 from fmtorch.types import collate
 from tests.estimators.test_one_pair import both, in_both_forms, models, real_pairs, solved, told
 from tests.laws import SMALL_KINDS, degenerate, scene, small
@@ -61,7 +59,7 @@ def pools(F: torch.Tensor, size: int) -> tuple[Pool, PoolOfOne]:
     k = len(F)
     tensors = Pool.empty(1, size, torch.device("cpu"))
     tensors.F[:, 0, :k], tensors.score[0, :k] = F.T, torch.arange(k, 0, -1).float()
-    arrays = PoolOfOne(np.zeros((size, 9), np.float32), np.full(size, -np.inf), np.zeros(size, np.int64), k)
+    arrays = PoolOfOne(np.zeros((size, 9), np.float32), np.full(size, -np.inf), k)
     arrays.F[:k], arrays.score[:k] = F.numpy(), np.arange(k, 0, -1)
     return tensors, arrays
 
@@ -96,13 +94,6 @@ def test_matches_near_a_pool(count: int, most: int | None) -> None:
     assert found.count == n
 
 
-def test_wanted_matches_are_shuffled_alike() -> None:
-    pairs, pair = both(told(150))
-    wanted = torch.arange(192)[None] % 3 == 0
-    expected = pool.shuffled(pairs, Stream.REFINEMENT, wanted & pairs.mask)[0, :50].numpy()
-    np.testing.assert_array_equal(shuffled(pair, Stream.REFINEMENT, wanted[0, :150].numpy()), expected)
-
-
 @pytest.mark.parametrize("loss", ["truncated", "geman_mcclure", "magsac"])
 @pytest.mark.parametrize("count", COUNTS)
 def test_the_refined_pool(count: int, loss: str) -> None:
@@ -127,7 +118,7 @@ def test_the_hypotheses_of_the_focal_search(same_size: bool) -> None:
     tensors, kernels = forms(select={}, focal={}, sampler="prior")
     expected = tensors.selected.focal.search.generator(pairs, 50, 100)
     found = kernels.selected.focal.search.__self__.generator(pair, 50, 100)
-    draws, theirs = found.draw, expected.draw[expected.valid].numpy()
+    draws, theirs = found.start + found.draw, expected.draw[expected.valid].numpy()
     assert len(set(draws) ^ set(theirs)) <= 1
     counts = [np.bincount(some - 50, minlength=100) for some in (draws, theirs)]
     agree = counts[0] == counts[1]

@@ -132,13 +132,12 @@ def test_the_best_of_a_round_and_of_a_search(m: int, k: int) -> None:
     order = np.argsort(-score, kind="stable")[:k]
     np.testing.assert_array_equal(which, np.sort(order))
     F = rng.normal(size=(m, 9)).astype(np.float32)
-    draw = np.arange(m) // 3
-    pool, pool_score, pool_draw, filled = np.zeros((12, 9), np.float32), np.empty(12), np.empty(12, np.int64), 0
+    pool, pool_score, filled = np.zeros((12, 9), np.float32), np.empty(12), 0
     for some in np.array_split(which, 3):
-        filled = pool_kernels.merge(F, some, score[some], draw, filled, pool, pool_score, pool_draw)
+        filled = pool_kernels.merge(F, some, score[some], filled, pool, pool_score)
     best, index = Pool.empty(1, 12, torch.device("cpu")), torch.from_numpy(which)
     best.merge(torch.tensor([0]), Models(
-        torch.from_numpy(F)[index].T[:, None], torch.ones(1, k, dtype=torch.bool), torch.from_numpy(draw)[index][None],
+        torch.from_numpy(F)[index].T[:, None], torch.ones(1, k, dtype=torch.bool), index[None],
         torch.empty(0, 1, m, dtype=torch.int64), 0, torch.from_numpy(score)[index][None].float(),
     ))  # fmt: skip
     assert filled == min(12, k)
@@ -151,12 +150,14 @@ def test_residuals_and_matches_near_a_pool() -> None:
     F = models(pair, 20)[1:]
     points = np.ascontiguousarray(pair.points[:, 0, :300].numpy())
     squared = sampson_squared(torch.from_numpy(F).double().T[:, None].contiguous(), pair.points[..., :300])[0].numpy()
-    out = np.empty(300)
+    out, weight = np.empty(300), np.arange(1, 301)
     for k in range(len(F)):
-        pool_kernels.residuals_squared(F[k].astype(np.float64), points, out)
-        np.testing.assert_allclose(out, squared[k], rtol=1e-9, atol=1e-20)
-    near, limit = np.empty(300, bool), np.float32(1e-4)
-    pool_kernels.near(F, points.astype(np.float32), limit, near)
+        pool_kernels.residuals_squared(F[k].astype(np.float64), points, 3.0, out)
+        np.testing.assert_allclose(out, 3 * squared[k], rtol=1e-9, atol=1e-20)
+        share = pool_kernels.share_within(F[k].astype(np.float64), points, 3.0, float(np.median(out)), weight)
+        assert share == weight[out <= np.median(out)].sum() / weight.sum()
+    near, limit, index = np.zeros(300, bool), np.float32(1e-4), np.empty(300, np.int64)
+    near[index[: pool_kernels.near(F, points.astype(np.float32), limit, 1, 2, index)]] = True
     clear = np.abs(squared.min(0) / limit - 1) > 1e-2  # not on the limit
     np.testing.assert_array_equal(near[clear], (squared.min(0) <= limit)[clear])
     assert 0 < near.sum() < 300

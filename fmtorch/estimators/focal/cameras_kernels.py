@@ -35,13 +35,18 @@ def translate(F: Array, offset: Array, out: Array) -> None:
             out[k, 6 + c] += offset[2] * out[k, c] + offset[3] * out[k, 3 + c]
 
 
-@kernel("f8[:, ::1], f8[::1], f8[:, :, :, ::1], f8[:, ::1]", brief=True)
-def nearest_cameras(F: Array, longest: Array, axes: Array, focal: Array) -> None:
-    """Cameras near models (k, 9): those of their focal lengths, or of usual ones where these are implausible."""
+@kernel("f8[:, ::1], f8[::1], f8[::1], f8[:, :, :, ::1], f8[:, ::1]", brief=True)
+def nearest_cameras(F: Array, offset: Array, longest: Array, axes: Array, focal: Array) -> None:
+    """Cameras near models (k, 9): those of their focal lengths, or of usual ones where these are implausible.
+
+    offset: (4,), what is added to the models' points to have them from the principal points.
+    """
+    shifted = np.empty(F.shape)
+    translate(F, -offset, shifted)
     G, M, e0, e1 = np.empty(9), np.empty(9), np.empty(3), np.empty(3)
     p, q, a, b = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    for k in range(len(F)):
-        start_one(F[k], SQUARINGS, G, e0, e1)
+    for k in range(len(shifted)):
+        start_one(shifted[k], SQUARINGS, G, e0, e1)
         first = _squared_focal(G, 1, 3, e1) / (longest[0] * longest[0])
         second = _squared_focal(G, 3, 1, e0) / (longest[1] * longest[1])
         plausible = MIN_FOCAL**2 < first < MAX_FOCAL**2 and MIN_FOCAL**2 < second < MAX_FOCAL**2

@@ -6,11 +6,13 @@ units of the longer sides. longest: (2,), these sides in the unit of the points,
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.estimators.focal.cameras_kernels import translate
 from fmtorch.estimators.focal.prior_kernels import focal_cost
 from fmtorch.geometry.arithmetic_kernels import exponential
 from fmtorch.geometry.levenberg_marquardt_kernels import levenberg_marquardt
@@ -191,10 +193,21 @@ def _accept(state: _State, trial: _State, damping: Array, done: Array, data: _Da
 _minimise = levenberg_marquardt(_evaluate, _step, _accept)
 
 
-@kernel("f8[:, ::1], f8[:, ::1]", brief=True)
-def to_unit_norm(F: Array, out: Array) -> None:
-    """Models (k, 9) scaled to unit norm -> out (k, 9)."""
+@kernel("f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], b1, f8[:, ::1], f8[::1]", brief=True)
+def models_and_costs(
+    F: Array, cost: Array, focal: Array, offset: Array, same_size: bool, models: Array, prior: Array
+) -> None:  # fmt: skip
+    """What `minimise` found, as models of unit norm -> (k, 9), and what the prior costs -> (k,), infinite of no model.
+
+    F, cost, focal: of `minimise`. offset: (4,), what is taken from the points to have those of the models.
+    """
+    work = np.empty(4)
+    translate(F, offset, models)
     for k in range(len(F)):
+        unit(models[k])
+        prior[k] = focal_cost(focal[k], same_size, work)
+        finite = math.isfinite(cost[k])
         for i in range(9):
-            out[k, i] = F[k, i]
-        unit(out[k])
+            finite = finite and math.isfinite(models[k, i])
+        if not finite:
+            prior[k] = math.inf

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.kernels import inner, kernel
+from fmtorch.kernels import inner
 
 Array = NDArray[Any]
 USUAL_FOCAL, FOCAL_DEVIATION, RATIO_DEVIATION = 1.2, 0.4, 0.5  # these as in `prior`
@@ -28,11 +27,3 @@ def focal_cost(focal: Array, same_size: bool, out: Array) -> Any:
     pull = precision * difference
     out[0], out[1], out[2], out[3] = b * mean + pull, b * mean - pull, b * b + precision, b * b - precision
     return mean * mean / 2 + squared / (2 * RATIO_DEVIATION**2) - SAME_CAMERA_GAIN * well
-
-
-@kernel("f8[:, ::1], b1, f8[::1]", brief=True)
-def prior_costs(focal: Array, same_size: bool, out: Array) -> None:
-    """The negative logarithm of the prior of focal lengths (k, 2) -> out (k,)."""
-    work = np.empty(4)
-    for k in range(len(focal)):
-        out[k] = focal_cost(focal[k], same_size, work)

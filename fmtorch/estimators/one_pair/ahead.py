@@ -11,7 +11,7 @@ from fmtorch.estimators.focal import (
     fit_kernels,
     hypotheses_kernels,
     posterior_kernels,
-    prior_kernels,
+    selection_kernels,
 )
 from fmtorch.geometry import (
     five_point_kernels,
@@ -22,7 +22,6 @@ from fmtorch.geometry import (
 )
 from fmtorch.kernels import Kernel
 from fmtorch.pruning import calibration_kernels, frame_consistency_kernels, position_consistency_kernels
-from fmtorch.random_kernels import random_words
 
 FOCAL: tuple[Kernel[..., Any], ...] = (  # the slowest to compile first
     five_point_kernels.five_point,
@@ -48,9 +47,10 @@ FOCAL: tuple[Kernel[..., Any], ...] = (  # the slowest to compile first
     scores_kernels.saturated_cells,
     hypotheses_kernels.draw_depths,
     significance_kernels.most_significant,
-    posterior_kernels.to_unit_norm,
-    prior_kernels.prior_costs,
-    random_words,
+    posterior_kernels.models_and_costs,
+    pool_kernels.shuffled,
+    pool_kernels.share_within,
+    selection_kernels.rivals,
 )
 
 PRIORS: dict[str, tuple[Kernel[..., Any], ...]] = {  # by the names of the pruners

@@ -26,7 +26,7 @@ def estimated(c: Correspondences, seed: int, least: int, solve: Callable[[OnePai
     """As `batching.solve_all`; solve: makes the outcome of one pair, `Form.__call__` in its kernel form."""
     b, n = c.mask.shape
     rows, rounding = Rows.of(c), relative_rounding(c.x0.dtype)
-    F, inliers = np.zeros((b, 3, 3)), np.zeros((b, n), np.bool_)
+    F, inliers, ok = np.zeros((b, 3, 3)), np.zeros((b, n), np.bool_), np.zeros(b, np.bool_)
     draws, significance, reasons = np.zeros(b, np.int64), np.full(b, -np.inf), [""] * b
 
     def one(i: int) -> str:
@@ -48,6 +48,7 @@ def estimated(c: Correspondences, seed: int, least: int, solve: Callable[[OnePai
         F[i] = matrix
         inliers[i, slot] = outcome.inliers
         significance[i] = of_one_pair(matrix, *arrived)
+        ok[i] = True
         return ""
 
     def some(pairs: Sequence[int]) -> None:
@@ -57,8 +58,5 @@ def estimated(c: Correspondences, seed: int, least: int, solve: Callable[[OnePai
 
     parts = [part.tolist() for part in shared_out(c)] if b > 1 and available() > 1 else [range(b)]
     mapped(some, parts)
-    ok = [not reason for reason in reasons]
-    matrices, flags, verdicts = torch.from_numpy(F), torch.from_numpy(inliers), torch.from_numpy(significance)
-    return Estimate(
-        matrices, flags, torch.tensor(ok, dtype=torch.bool), tuple(reasons), torch.from_numpy(draws), verdicts
-    )
+    made = {"F": F, "inliers": inliers, "ok": ok, "draws": draws, "significance": significance}
+    return Estimate.made(reason=tuple(reasons), **{name: torch.from_numpy(value) for name, value in made.items()})

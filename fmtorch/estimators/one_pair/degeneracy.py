@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 from fmtorch.estimators import degeneracy
@@ -40,8 +38,7 @@ class Degensac:
             return models
         F, score = self.completed(H, pair, models.start)
         more = len(score)
-        return dataclasses.replace(
-            models,
+        return models._replace(
             F=np.concatenate([models.F, F]),
             draw=np.concatenate([models.draw, np.full(more, models.draw[which])]),
             which=np.concatenate([models.which, len(models.F) + np.arange(more)]),

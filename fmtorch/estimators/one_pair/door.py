@@ -14,35 +14,31 @@ from fmtorch.estimators.pairs_kernels import normalize
 from fmtorch.types import Correspondences
 from fmtorch.validation import PER_MATCH, reason, right_size
 
-UNKNOWN = np.empty(0)  # the size of an image
+UNKNOWN = np.empty(0)  # the sizes of the images, or what else is not told
+BOUNDS = np.array([MAX_COORDINATE_PX, MIN_NOISE, MAX_NOISE])  # as the kernel takes them
 
 
 class Rows(NamedTuple):
-    """The tensors of a batch on the CPU as arrays, one row a pair."""
+    """The tensors of a batch on the CPU as arrays, one row a pair; sizes: (b, 4), h, w, h, w, empty where unknown."""
 
     x0: Array
     x1: Array
     mask: Array
-    quality: Array | None
     prior: Array | None
     noise: Array | None
-    size0: Array | None
-    size1: Array | None
+    quality: Array | None
+    sizes: Array
     keys: list[int]
-    right: bool
 
     @staticmethod
     def of(c: Correspondences) -> Rows:
-        """Views where the tensors are of float32 or float64; right: whether no value of a match or size is wrong."""
-        told = (c.quality, c.prior, c.noise, c.size0, c.size1)
-        quality, prior, noise, size0, size1 = (None if t is None else _array(t) for t in told)
+        """Views where the tensors are of float32 or float64."""
+        prior, noise, quality = [None if t is None else _array(t) for t in (c.prior, c.noise, c.quality)]
         keys: list[int] = c.keys.tolist()
-        x0, x1, mask = _array(c.x0), _array(c.x1), c.mask.numpy()
-        values = {"prior": prior, "noise": noise}
-        checked = [PER_MATCH[name][0](v) | ~mask for name, v in values.items() if v is not None]
-        checked += [right_size(size) for size in (size0, size1) if size is not None]
-        right = all(bool(each.all()) for each in checked)
-        return Rows(x0, x1, mask, quality, prior, noise, size0, size1, keys, right)
+        sizes = np.empty((len(keys), 0 if c.size0 is None else 4))
+        if c.size0 is not None and c.size1 is not None:
+            sizes[:, :2], sizes[:, 2:] = _array(c.size0), _array(c.size1)
+        return Rows(_array(c.x0), _array(c.x1), c.mask.numpy(), prior, noise, quality, sizes, keys)
 
 
 class Arrived(NamedTuple):
@@ -57,40 +53,38 @@ class Arrived(NamedTuple):
     @staticmethod
     def of(rows: Rows, i: int) -> Arrived:
         """One row."""
-        x0, x1 = (np.ascontiguousarray(x[i], np.float64) for x in (rows.x0, rows.x1))
-        sizes = (UNKNOWN if size is None else size[i].astype(np.float64) for size in (rows.size0, rows.size1))
-        return Arrived(x0, x1, np.ascontiguousarray(rows.mask[i]), *sizes)
+        mask, sizes = np.ascontiguousarray(rows.mask[i]), rows.sizes[i]
+        return Arrived(_row(rows.x0, i), _row(rows.x1, i), mask, sizes[:2], sizes[2:])
 
 
 def opened(rows: Rows, i: int, one: Arrived, seed: int, least: int) -> tuple[OnePair, Array] | str:
     """The pair of a row, and where its matches (n,) stood; or why it cannot be estimated."""
-    n, frame = len(one.mask), np.empty(5)
-    slots, flat = np.empty(n, np.int64), np.empty(4 * n)
-    count = normalize(one.x0, one.x1, one.mask, MAX_COORDINATE_PX, slots, flat, frame)
-    slot, points = slots[:count], flat[: 4 * count].reshape(4, count)
-    told = {"quality": rows.quality, "prior": rows.prior, "noise": rows.noise}
-    values = {name: None if value is None else value[i, slot] for name, value in told.items()}
-    if lack := too_few(count, least) or ("" if rows.right else _wrong(values, one)):
+    n, sizes, frame = len(one.mask), rows.sizes[i], np.empty(6)
+    slots, flat = np.empty(n, np.int64), np.empty(9 * n)
+    told = rows.prior is not None, rows.noise is not None, rows.quality is not None
+    prior, noise, quality = _row(rows.prior, i), _row(rows.noise, i), _row(rows.quality, i)
+    count = normalize(one.x0, one.x1, one.mask, prior, noise, quality, sizes, BOUNDS, slots, flat, frame)
+    slot, table, (unit, right) = slots[:count], flat[: 9 * count].reshape(9, count), frame[4:].tolist()
+    if lack := too_few(count, least) or ("" if right else _wrong(rows, i, one, slot)):
         return lack
-    if not frame[4]:
+    if not unit:
         return "all matches coincide"
-    quality, prior, noise = (None if v is None else v.astype(np.float64) for v in values.values())
-    if noise is not None:
-        noise.clip(MIN_NOISE, MAX_NOISE, out=noise)
-    sizes = None if rows.size0 is None else np.concatenate([one.size0, one.size1]).reshape(2, 2)
-    unit = float(frame[4])
-    pair = OnePair(points, bucket(count), unit, rows.keys[i], seed, quality, prior, noise, frame[:4], sizes)
-    return pair, slot
+    return OnePair(table, told, bucket(count), unit, rows.keys[i], seed, frame[:4], sizes), slot
 
 
-def _wrong(values: dict[str, Array | None], one: Arrived) -> str:
-    """Why a pair with these values of its matches cannot be estimated; empty where they are right."""
-    right = {name: rule(v) for name, (rule, _) in PER_MATCH.items() if (v := values[name]) is not None}
+def _wrong(rows: Rows, i: int, one: Arrived, slot: Array) -> str:
+    """Why a pair whose matches have such values cannot be estimated."""
+    values = {"prior": rows.prior, "noise": rows.noise}
+    right = {name: PER_MATCH[name][0](v[i, slot]) for name, v in values.items() if v is not None}
     right |= {"size0": right_size(one.size0), "size1": right_size(one.size1)}
     return reason({name: len(each) - int(np.count_nonzero(each)) for name, each in right.items()})
 
 
+def _row(values: Array | None, i: int) -> Array:
+    return UNKNOWN if values is None else np.ascontiguousarray(values[i], np.float64)
+
+
 def _array(tensor: Tensor) -> Array:
-    known = not tensor.is_floating_point() or tensor.dtype in (torch.float32, torch.float64)
+    known = tensor.dtype in (torch.float32, torch.float64) or not tensor.is_floating_point()
     array: Array = (tensor if known else tensor.to(torch.float64)).detach().numpy()
     return array

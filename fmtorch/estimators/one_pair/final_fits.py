@@ -19,7 +19,7 @@ from fmtorch.estimators.final_fits import (
     TOLERANCE,
     TRUNCATION_SIGMAS,
 )
-from fmtorch.estimators.one_pair.focal.cameras import TwoCameras
+from fmtorch.estimators.one_pair.focal.cameras import UNKNOWN, TwoCameras
 from fmtorch.estimators.one_pair.focal.fit import fit_focal
 from fmtorch.estimators.one_pair.inliers import median_of_matches, residuals_squared_px
 from fmtorch.estimators.one_pair.pair import Array, OnePair, squared
@@ -95,7 +95,7 @@ class AdaptiveGaussNewton:
 
     def value(self, selection: Selection, pair: OnePair, inliers: Array) -> Fit:
         """As `FinalFit.value`."""
-        F, cameras = selection.F, TwoCameras.none()
+        F, cameras = selection.F, UNKNOWN
         likely = inliers if pair.prior is None else inliers & (pair.prior > MIN_PRIOR_FOR_NOISE)
         truncation = truncation_distance(_squared_in_noises(F, pair)[likely])
         assumed = False

@@ -10,14 +10,13 @@ import numpy as np
 from fmtorch.estimators import inliers
 from fmtorch.estimators.one_pair.pair import Array, OnePair, squared
 from fmtorch.estimators.one_pair.sampling import Sampler
-from fmtorch.estimators.pool_kernels import residuals_squared
+from fmtorch.estimators.pool_kernels import residuals_squared, share_within
 
 
 def residuals_squared_px(F: Array, pair: OnePair) -> Array:
     """Squared Sampson distances (n,) to a model of nine entries in squared pixels, float64."""
     out = np.empty(pair.count)
-    residuals_squared(np.ascontiguousarray(F, np.float64).reshape(9), pair.points, out)
-    out *= squared(pair.pixels_per_unit)
+    residuals_squared(F.astype(np.float64, copy=False).ravel(), pair.points, squared(pair.pixels_per_unit), out)
     return out
 
 
@@ -84,8 +83,7 @@ class Confidence:
 
     def __call__(self, F: Array, draws: int, pair: OnePair, size: int) -> list[bool]:
         """Whether the best model (9,), after so many draws of `size` matches, may be taken for the best there is."""
-        support = residuals_squared_px(F, pair) <= squared(self.part.threshold)
-        weight = self.sampler.weight(pair)
-        share = int(weight[support].sum()) / int(weight.sum())
+        factor, limit = squared(pair.pixels_per_unit), squared(self.part.threshold)
+        share = share_within(F.astype(np.float64), pair.points, factor, limit, self.sampler.weight(pair))
         missed = math.log1p(-min(share**size, 1 - 1e-12)) * draws
         return [missed <= math.log1p(-self.part.probability)]

@@ -57,5 +57,5 @@ def weights(pair: OnePair) -> Array:
 def _median(F: Array, pair: OnePair) -> float:
     """The median squared residual of a model (9,), in the unit of the points."""
     r2 = np.empty(pair.count)
-    residuals_squared(F, pair.points, r2)
+    residuals_squared(F, pair.points, 1.0, r2)
     return median_of_matches(r2)

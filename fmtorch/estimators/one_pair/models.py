@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,12 +12,11 @@ from fmtorch.estimators.one_pair.pair import Array, OnePair
 from fmtorch.estimators.pool_kernels import merge
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Models:
+class Models(NamedTuple):
     """Hypotheses of one round in the order of their draws: F (m, 9) float32, and the draw (m,) that each is made of.
 
-    samples: (size, s), the matches of the draws start, start + 1, ... which: (k,), the models that are left once
-    verified, in their order. score: theirs, (k,); larger is better.
+    draw: counted from `start`. samples: (size, s), the matches of the draws start, start + 1, ... which: (k,), the
+    models that are left once verified, in their order. score: theirs, (k,); larger is better.
     """
 
     F: Array
@@ -27,8 +27,8 @@ class Models:
     score: Array | None = None
 
     def sample_of(self, draw: int) -> Array:
-        """The matches (size,) of a draw."""
-        sample: Array = self.samples[:, draw - self.start]
+        """The matches (size,) of a draw, counted from `start`."""
+        sample: Array = self.samples[:, draw]
         return sample
 
 
@@ -36,13 +36,12 @@ class Models:
 class Pool:
     """The best models of a pair, F (k, 9) float32 with descending scores (k,), of which `filled` are there.
 
-    draw: (k,), that each model is made of. draws: minimal samples drawn. near: the pair with the matches on which these
-    models are refined; then they are float64.
+    draws: minimal samples drawn. near: the pair with the matches on which these models are refined; then they are
+    float64.
     """
 
     F: Array
     score: Array
-    draw: Array
     filled: int = 0
     draws: int = 0
     near: OnePair | None = None
@@ -50,7 +49,7 @@ class Pool:
     @staticmethod
     def of(pair: OnePair, size: int) -> Pool:
         """Nothing found yet."""
-        return Pool(np.zeros((size, 9), np.float32), np.full(size, -np.inf), np.zeros(size, np.int64))
+        return Pool(np.zeros((size, 9), np.float32), np.full(size, -np.inf))
 
     @property
     def models(self) -> Array:
@@ -66,9 +65,7 @@ class Pool:
         """Keep the best of this pool's models and the new ones; the earlier draw wins a tie."""
         assert models.which is not None
         assert models.score is not None
-        finite = np.isfinite(models.score)
-        which, score = models.which[finite], models.score[finite]
-        self.filled = merge(models.F, which, score, models.draw, self.filled, self.F, self.score, self.draw)
+        self.filled = merge(models.F, models.which, models.score, self.filled, self.F, self.score)
 
     def drawn(self, rows: Sequence[int], draws: int) -> None:
         """So many samples were drawn until now."""

@@ -2,84 +2,70 @@
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from fmtorch.estimators.pairs import NormalizedPairs
 
 Array = NDArray[Any]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class OnePair:
     """What `NormalizedPairs` holds of one pair, without mask and padding. Arrays are float64 and C-contiguous.
 
-    points: (4, n), rows x0, y0, x1, y1 in normalised units. slots: of the pair's bucket, which decides how priors are
-    quantised and whether there is a first look. quality, prior, noise: (n,), None where the caller has none. centre:
-    (4,), of the points in pixels. sizes: (2, 2) of the images as (h, w), pixels, or None.
+    table: (9, n), a row each of x0, y0, x1, y1 in normalised units, weight, scale, prior, noise, quality. points: the
+    first four. weight: what each match counts in a fit, its prior divided by the square of its noise. scale: pixels in
+    one normalised unit, divided by the noise. support: the prior, ones where the caller has none; prior, noise,
+    quality: None then. told: which of these three there are. slots: of the pair's bucket, which decides how priors are
+    quantised and whether there is a first look. centre: (4,), of the points in pixels. sizes: (4,), of the images as
+    h, w, h, w, pixels, empty where unknown. kept: by `once`. shared: what is true of the pair with any of its matches.
     """
 
-    points: Array
-    slots: int
-    pixels_per_unit: float
-    key: int
-    seed: int
-    quality: Array | None
-    prior: Array | None
-    noise: Array | None
-    centre: Array
-    sizes: Array | None = None
-    kept: dict[Hashable, Any] = dataclasses.field(default_factory=dict)
+    def __init__(
+        self, table: Array, told: tuple[bool, bool, bool], slots: int, pixels_per_unit: float, key: int, seed: int,
+        centre: Array, sizes: Array, shared: dict[Hashable, Any] | None = None,
+    ) -> None:  # fmt: skip
+        self.table, self.told, self.slots, self.pixels_per_unit = table, told, slots, pixels_per_unit
+        self.key, self.seed, self.centre, self.sizes = key, seed, centre, sizes
+        self.count = table.shape[1]
+        self.points, self.weight, self.scale, self.support = table[:4], table[4], table[5], table[6]
+        self.prior: Array | None = self.support if told[0] else None
+        self.noise: Array | None = table[7] if told[1] else None
+        self.quality: Array | None = table[8] if told[2] else None
+        self.kept: dict[Hashable, Any] = {}
+        self.shared: dict[Hashable, Any] = {} if shared is None else shared
 
     def __len__(self) -> int:
         """One: of pairs, not of matches."""
         return 1
 
     @property
-    def count(self) -> int:
-        """Number of matches."""
-        return int(self.points.shape[1])
-
-    @property
     def sizes_known(self) -> bool:
         """Whether the sizes of the images are known."""
-        return self.sizes is not None
+        return len(self.sizes) > 0
 
     @property
     def same_size(self) -> list[bool]:
         """As `NormalizedPairs.same_size`."""
-        assert self.sizes is not None
-        first, second = self.sizes.tolist()
-        return [first == second]
+        h0, w0, h1, w1 = self.sizes.tolist()
+        return [h0 == h1 and w0 == w1]
 
-    @functools.cached_property
+    @property
     def points32(self) -> Array:
         """The points as scores take them, float32."""
-        return self.points.astype(np.float32)
+        points: Array = self.once("points32", _points32)
+        return points
 
-    @functools.cached_property
-    def scale(self) -> Array:
-        """Pixels in one normalised unit, divided by each match's noise, (n,)."""
-        return self.pixels_per_unit / (np.ones(self.count) if self.noise is None else self.noise)
-
-    @functools.cached_property
-    def weight(self) -> Array:
-        """What each match counts in a fit, (n,): its prior divided by the square of its noise."""
-        prior = np.ones(self.count) if self.prior is None else self.prior
-        return prior if self.noise is None else prior / np.square(self.noise)
-
-    def once(self, name: Hashable, compute: Callable[[], Any]) -> Any:
-        """What a part computes of all matches and needs again for the same pair."""
-        if name not in self.kept:
-            self.kept[name] = compute()
-        return self.kept[name]
+    def once(self, name: Hashable, compute: Callable[[OnePair], Any]) -> Any:
+        """What a part computes of all these matches, and needs again."""
+        found = self.kept.get(name)
+        if found is None:
+            found = self.kept[name] = compute(self)
+        return found
 
     def only(self, rows: Sequence[int]) -> OnePair:
         """As `NormalizedPairs.only`: itself."""
@@ -87,14 +73,14 @@ class OnePair:
 
     def take(self, index: Array) -> OnePair:
         """The same pair with the matches of these indices."""
-
-        def some(value: Array | None) -> Array | None:
-            return None if value is None else value.take(index)
-
         return OnePair(
-            self.points.take(index, 1), self.slots, self.pixels_per_unit, self.key, self.seed, some(self.quality),
-            some(self.prior), some(self.noise), self.centre, self.sizes,
+            self.table.take(index, 1), self.told, self.slots, self.pixels_per_unit, self.key, self.seed, self.centre,
+            self.sizes, self.shared,
         )  # fmt: skip
+
+
+def _points32(pair: OnePair) -> Array:
+    return pair.points.astype(np.float32)
 
 
 def squared(value: float) -> float:
@@ -104,19 +90,16 @@ def squared(value: float) -> float:
 
 def each_pair(pairs: NormalizedPairs) -> Iterator[OnePair]:
     """The pairs of a bucket one by one, copied, on no graph."""
-    points = pairs.points.detach().numpy()
-    quality, prior, noise = (_array(value) for value in (pairs.quality, pairs.prior, pairs.noise))
-    centre, sizes = pairs.centre.numpy(), None
+    optional = (pairs.prior, pairs.noise, pairs.quality)
+    told = pairs.prior is not None, pairs.noise is not None, pairs.quality is not None
+    values = [torch.ones_like(pairs.mask, dtype=torch.float64) if value is None else value for value in optional]
+    scale = pairs.scale.expand_as(pairs.mask)
+    rows = torch.stack([*pairs.points, pairs.weight, scale, *values]).detach().numpy()
+    centre, sizes = pairs.centre.numpy(), np.empty((len(pairs), 4 if pairs.sizes_known else 0))
     if pairs.size0 is not None and pairs.size1 is not None:
-        sizes = torch.stack([pairs.size0, pairs.size1], 1).to(torch.float64).numpy()
+        sizes[:, :2], sizes[:, 2:] = pairs.size0.numpy(), pairs.size1.numpy()
     table = zip(pairs.count.tolist(), pairs.pixels_per_unit.tolist(), pairs.key.tolist(), strict=True)
     for i, (n, unit, key) in enumerate(table):
-        q, p, s = (None if value is None else value[i, :n].copy() for value in (quality, prior, noise))
         yield OnePair(
-            np.ascontiguousarray(points[:, i, :n]), points.shape[2], unit, key, pairs.seed, q, p, s, centre[i],
-            None if sizes is None else sizes[i],
-        )  # fmt: skip
-
-
-def _array(value: Tensor | None) -> Array | None:
-    return None if value is None else value.detach().numpy()
+            np.ascontiguousarray(rows[:, i, :n]), told, rows.shape[2], unit, key, pairs.seed, centre[i], sizes[i]
+        )

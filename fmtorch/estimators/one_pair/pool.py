@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from fmtorch.estimators import pool_kernels as compiled
 from fmtorch.estimators.one_pair.models import Models
 from fmtorch.estimators.one_pair.pair import Array, OnePair
 from fmtorch.estimators.one_pair.scores import Score
 from fmtorch.estimators.options import Preselect
-from fmtorch.estimators.pool_kernels import best
 from fmtorch.random import Stream, mixed_seed
-from fmtorch.random_kernels import random_words
 
 
 class Verifier:
@@ -26,7 +25,7 @@ class Verifier:
         first_look = self._first_look(pair) if len(which) else None
         if first_look is not None and self.preselect is not None and len(which) > self.preselect.survivors:
             score, which = self.first_look(models.F, which, first_look), np.empty(self.preselect.survivors, np.int64)
-            best(score, which)
+            compiled.best(score, which)
         return Models(models.F, models.draw, models.samples, models.start, which, self.score(models.F, which, pair))
 
     def _first_look(self, pair: OnePair) -> OnePair | None:
@@ -35,17 +34,12 @@ class Verifier:
             return None
         matches = self.preselect.matches
         found: OnePair = pair.once(
-            ("first look", matches), lambda: pair.take(shuffled(pair, Stream.PRESELECTION)[:matches])
+            ("first look", matches), lambda pair: pair.take(shuffled(pair, Stream.PRESELECTION, matches))
         )
         return found
 
 
-def shuffled(pair: OnePair, stream: Stream, wanted: Array | None = None) -> Array:
-    """The matches, or those wanted (n,), in an order that the pair's key decides: as `pool.shuffled`."""
-    words = np.empty(pair.count, np.int64)
-    random_words(mixed_seed(pair.seed, stream), pair.key, 0, words)
-    if wanted is None:
-        return np.argsort(words, kind="stable")
-    (some,) = wanted.nonzero()
-    ordered: Array = some[np.argsort(words[some], kind="stable")]
-    return ordered
+def shuffled(pair: OnePair, stream: Stream, most: int) -> Array:
+    """The first so many matches in an order that the pair's key decides: as `pool.shuffled`."""
+    index = np.empty(min(most, pair.count), np.int64)
+    return index[: compiled.shuffled(pair.count, mixed_seed(pair.seed, stream), pair.key, index)]

@@ -9,12 +9,11 @@ import numpy as np
 from fmtorch.estimators.one_pair.graph_cut import LocalOptimization
 from fmtorch.estimators.one_pair.models import Pool
 from fmtorch.estimators.one_pair.pair import Array, OnePair, squared
-from fmtorch.estimators.one_pair.pool import shuffled
 from fmtorch.estimators.one_pair.refine import refine_models
 from fmtorch.estimators.options import Refine
 from fmtorch.estimators.pool_kernels import near
 from fmtorch.geometry.refine import RANK_TWO_ALREADY
-from fmtorch.random import Stream
+from fmtorch.random import Stream, mixed_seed
 
 
 class PoolRefinement:
@@ -55,6 +54,5 @@ def near_models(F: Array, pair: OnePair, radius: float, most: int | None) -> One
     """As `pool.near_models` of models (k, 9), float32."""
     if most is None:
         return pair
-    wanted = np.empty(pair.count, np.bool_)
-    near(F, pair.points32, np.float32(squared(radius / pair.pixels_per_unit)), wanted)
-    return pair.take(shuffled(pair, Stream.REFINEMENT, wanted)[:most])
+    index, limit = np.empty(min(most, pair.count), np.int64), np.float32(squared(radius / pair.pixels_per_unit))
+    return pair.take(index[: near(F, pair.points32, limit, mixed_seed(pair.seed, Stream.REFINEMENT), pair.key, index)])

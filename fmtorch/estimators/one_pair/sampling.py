@@ -35,7 +35,7 @@ class Uniform:
 
     def weight(self, pair: OnePair) -> Array:
         """As `Sampler.weight`."""
-        return np.ones(pair.count, np.int64)
+        return _equal_weights(pair)
 
     def draw(self, pair: OnePair, start: int, count: int, size: int) -> Array:
         """As `Sampler.draw`."""
@@ -50,7 +50,7 @@ class Prosac:
 
     def weight(self, pair: OnePair) -> Array:
         """As `Sampler.weight`."""
-        return np.ones(pair.count, np.int64)
+        return _equal_weights(pair)
 
     def growth(self, pair: OnePair, size: int) -> Array:
         """As `sampling.Prosac.growth`, (n,) int64."""
@@ -62,10 +62,10 @@ class Prosac:
         """As `Sampler.draw`."""
         if pair.quality is None and pair.prior is None:
             return _drawn(pair, WEIGHTS_OF_ONE, np.full(count, pair.count), start, size)
-        table = pair.once(("growth", size), lambda: self.growth(pair, size))
+        table = pair.once(("growth", size), lambda pair: self.growth(pair, size))
         newest = np.minimum(np.searchsorted(table, np.arange(start + 1, start + count + 1)), pair.count - 1)
         sample = np.vstack([_drawn(pair, WEIGHTS_OF_ONE, newest, start, size - 1), newest])
-        ordered: Array = pair.once("best matches first", lambda: _best_first(pair))[sample]
+        ordered: Array = pair.once("best matches first", _best_first)[sample]
         return ordered
 
 
@@ -77,13 +77,18 @@ class PriorWeighted:
 
     def weight(self, pair: OnePair) -> Array:
         """As `sampling.PriorWeighted.weight`: how finely priors are quantised depends on the pair's bucket."""
-        weight: Array = pair.once("weights", lambda: _quantised(pair))
+        weight: Array = pair.once("weights", _quantised)
         return weight
 
     def draw(self, pair: OnePair, start: int, count: int, size: int) -> Array:
         """As `Sampler.draw`."""
-        table = pair.once("cumulative priors", lambda: np.cumsum(self.weight(pair)))
+        table = pair.once("cumulative priors", lambda pair: np.cumsum(self.weight(pair)))
         return _drawn(pair, table, np.full(count, table[-1]), start, size)
+
+
+def _equal_weights(pair: OnePair) -> Array:
+    weight: Array = pair.once("equal weights", lambda pair: np.ones(pair.count, np.int64))
+    return weight
 
 
 def _quantised(pair: OnePair) -> Array:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from fmtorch.estimators import saturated_gains
 from fmtorch.estimators.one_pair.pair import Array, OnePair
-from fmtorch.estimators.one_pair.scores import GemanMcClure, matches
+from fmtorch.estimators.one_pair.scores import GemanMcClure, Scored
 from fmtorch.estimators.scores_kernels import saturated_cells, score_saturated
-from fmtorch.geometry.arithmetic import fractional_bits
 
 
 class SaturatedGains:
@@ -21,14 +19,14 @@ class SaturatedGains:
 
     def __call__(self, F: Array, which: Array, pair: OnePair) -> Array:
         """As `scores.Score`."""
-        support, scale = matches(pair, self.part.threshold, self.part.prior_weighted)
-        cells = pair.once(("cells", self.part.prior_weighted), lambda: _cells(pair, support))
-        out, bits = np.empty(len(which)), fractional_bits(pair.count, torch.float32)
-        score_saturated(F, which, pair.points32, support, scale, cells, bits, out)
+        weighted, out = self.part.prior_weighted, np.empty(len(which))
+        of = Scored.of(pair, self.part.threshold, weighted)
+        cells = pair.once(("cells", weighted), lambda pair: _cells(of))
+        score_saturated(F, which, of.points, of.support, of.scale, cells, of.bits, out)
         return out
 
 
-def _cells(pair: OnePair, support: Array) -> Array:
-    cells = np.empty((2, pair.count), np.int32)
-    saturated_cells(pair.points32, support, cells)
+def _cells(of: Scored) -> Array:
+    cells = np.empty((2, len(of.support)), np.int32)
+    saturated_cells(of.points, of.support, cells)
     return cells

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -31,16 +31,26 @@ class Score(Protocol):
         ...
 
 
-def matches(pair: OnePair, threshold: float, prior_weighted: bool) -> tuple[Array, Array]:
-    """What each match counts (n,), and one over the square of its threshold (n,), float32; made once."""
+class Scored(NamedTuple):
+    """What a score takes of the matches of a pair, float32: points (4, n), what each counts (n,), one over the square
+    of its threshold (n,); and the fractional bits of gains.
+    """
 
-    def made() -> tuple[Array, Array]:
-        prior = pair.prior if prior_weighted else None
-        support = np.ones(pair.count, np.float32) if prior is None else prior.astype(np.float32)
-        return support, np.square(pair.scale / threshold).astype(np.float32)
+    points: Array
+    support: Array
+    scale: Array
+    bits: int
 
-    found: tuple[Array, Array] = pair.once(("support and scale", threshold, prior_weighted), made)
-    return found
+    @staticmethod
+    def of(pair: OnePair, threshold: float, prior_weighted: bool) -> Scored:
+        """Of all matches, made once."""
+        name = "scored", threshold, prior_weighted
+        found: Scored | None = pair.kept.get(name)
+        if found is None:
+            support = pair.support.astype(np.float32) if prior_weighted else np.ones(pair.count, np.float32)
+            scale = np.square(pair.scale / threshold).astype(np.float32)
+            found = pair.kept[name] = Scored(pair.points32, support, scale, fractional_bits(pair.count, torch.float32))
+        return found
 
 
 class SummedGains:
@@ -49,18 +59,13 @@ class SummedGains:
     GAIN: int
 
     def __init__(self, part: scores.SummedGains) -> None:
-        self.part = part
+        self.part, self.table = part, NO_TABLE
 
     def __call__(self, F: Array, which: Array, pair: OnePair) -> Array:
         """As `Score`."""
-        out = np.empty(len(which))
-        support, scale = matches(pair, self.part.threshold, self.part.prior_weighted)
-        bits = fractional_bits(pair.count, torch.float32)
-        score_gains(F, which, pair.points32, support, scale, self.GAIN, self._table(), bits, out)
+        out, of = np.empty(len(which)), Scored.of(pair, self.part.threshold, self.part.prior_weighted)
+        score_gains(F, which, of.points, of.support, of.scale, self.GAIN, self.table, of.bits, out)
         return out
-
-    def _table(self) -> Array:
-        return NO_TABLE
 
 
 class InlierCount(SummedGains):
@@ -88,10 +93,7 @@ class SigmaConsensus(SummedGains):
 
     def __init__(self, part: scores.SigmaConsensus) -> None:
         super().__init__(part)
-        self._entries: Array = part.table.numpy()
-
-    def _table(self) -> Array:
-        return self._entries
+        self.table: Array = part.table.numpy()
 
 
 class Median:

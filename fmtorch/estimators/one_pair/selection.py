@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from fmtorch.estimators.one_pair.focal.cameras import TwoCameras
+from fmtorch.estimators.one_pair.focal.cameras import UNKNOWN, TwoCameras
 from fmtorch.estimators.one_pair.models import Pool
 from fmtorch.estimators.one_pair.pair import Array, OnePair
 from fmtorch.estimators.one_pair.scores import Score
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Selection:
+class Selection(NamedTuple):
     """The selected model (9,), float64, and the cameras assumed; whether there is one, and the samples drawn."""
 
     F: Array
     found: bool
     draws: int
-    cameras: TwoCameras = dataclasses.field(default_factory=TwoCameras.none)
+    cameras: TwoCameras = UNKNOWN
 
     def replaced(self, rows: Sequence[int], other: Selection) -> Selection:
         """As `selection.Selection.replaced`: the other."""
@@ -28,7 +27,7 @@ class Selection:
 
     def merged(self, rows: Sequence[int], other: Selection) -> Selection:
         """As `selection.Selection.merged`."""
-        return dataclasses.replace(other, found=other.found or self.found, draws=other.draws + self.draws)
+        return other._replace(found=other.found or self.found, draws=other.draws + self.draws)
 
     @property
     def matrices(self) -> Array:

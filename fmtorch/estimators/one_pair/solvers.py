@@ -64,4 +64,4 @@ class MinimalSamples:
         F = np.empty((count * self.solver.solutions, 9), np.float32)
         draw = np.empty(len(F), np.int64)
         m = self.solver(pair.points, sample, F, draw)
-        return Models(F[:m], draw[:m] + start, sample, start)
+        return Models(F[:m], draw[:m], sample, start)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -13,21 +14,16 @@ from fmtorch.estimators.one_pair.pair import Array, OnePair
 class TwoCameras(NamedTuple):
     """As `cameras.TwoCameras`, of k candidates: axes (k, 2, 3, 3), U and V, rows first; focal (k, 2), logarithms.
 
-    Of one model (2, 3, 3) and (2,), NaN where none are assumed.
+    Of one model (2, 3, 3) and (2,), `UNKNOWN` where none are assumed.
     """
 
     axes: Array
     focal: Array
 
-    @staticmethod
-    def none() -> TwoCameras:
-        """No assumption about the cameras of one model."""
-        return TwoCameras(np.full((2, 3, 3), np.nan), np.full(2, np.nan))
-
     @property
     def known(self) -> bool:
         """Of one model: whether cameras are assumed."""
-        return bool(np.isfinite(self.focal[0]))
+        return math.isfinite(self.focal[0])
 
     def of(self, k: int) -> TwoCameras:
         """Those of one candidate."""
@@ -36,6 +32,10 @@ class TwoCameras(NamedTuple):
     def joined(self, other: TwoCameras) -> TwoCameras:
         """The candidates of both."""
         return TwoCameras(np.concatenate([self.axes, other.axes]), np.concatenate([self.focal, other.focal]))
+
+
+UNKNOWN = TwoCameras(np.full((2, 3, 3), np.nan), np.full(2, np.nan))
+"""No assumption about the cameras of one model."""
 
 
 class CentredPair(NamedTuple):
@@ -49,16 +49,22 @@ class CentredPair(NamedTuple):
     @staticmethod
     def of(pair: OnePair) -> CentredPair:
         """The matches of a pair whose image sizes are known, made once."""
-        made: CentredPair = pair.once("from the principal points", lambda: _centred(pair))
+        made: CentredPair = pair.once("from the principal points", _centred)
         return made
 
 
 def _centred(pair: OnePair) -> CentredPair:
-    assert pair.sizes is not None
-    unit, sizes = pair.pixels_per_unit, pair.sizes.ravel().tolist()
-    h0, w0, h1, w1 = sizes
+    images = pair.shared.get("images")
+    if images is None:
+        images = pair.shared["images"] = _images(pair)
+    return CentredPair(pair.points + images[0][:, None], *images)
+
+
+def _images(pair: OnePair) -> tuple[Array, Array, bool]:
+    """Offset, longest and same_size of `CentredPair`."""
+    unit, (h0, w0, h1, w1) = pair.pixels_per_unit, pair.sizes.tolist()
     sides = w0, h0, w1, h1
     pixel = 0.0 if max(sides) < MIN_IMAGE_SIDE_PX else 1.0
     offset = np.array([(x - (side - pixel) / 2) / unit for x, side in zip(pair.centre.tolist(), sides, strict=True)])
     longest = np.array([max(h0, w0) / unit, max(h1, w1) / unit])
-    return CentredPair(pair.points + offset[:, None], offset, longest, pair.same_size[0])
+    return offset, longest, pair.same_size[0]

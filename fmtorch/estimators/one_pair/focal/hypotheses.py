@@ -36,7 +36,7 @@ class FocalSamples:
         depth = depths(pair, centred, start, count)
         F, draw = np.empty((SOLUTIONS * count, 9), np.float32), np.empty(SOLUTIONS * count, np.int64)
         m = five_point(centred.points, sample, depth, centred.offset, F, draw)
-        return Models(F[:m], draw[:m] + start, sample, start)
+        return Models(F[:m], draw[:m], sample, start)
 
 
 def depths(pair: OnePair, centred: CentredPair, start: int, count: int) -> Array:

@@ -7,10 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from fmtorch.estimators.focal import posterior
-from fmtorch.estimators.focal.cameras_kernels import nearest_cameras, translate
+from fmtorch.estimators.focal.cameras_kernels import nearest_cameras
 from fmtorch.estimators.focal.cheirality_kernels import share_in_front
-from fmtorch.estimators.focal.posterior_kernels import minimise, to_unit_norm
-from fmtorch.estimators.focal.prior_kernels import prior_costs
+from fmtorch.estimators.focal.posterior_kernels import minimise, models_and_costs
 from fmtorch.estimators.one_pair.focal.cameras import CentredPair, TwoCameras
 from fmtorch.estimators.one_pair.pair import Array, OnePair, squared
 from fmtorch.geometry.sampson_objective_kernels import LOSSES
@@ -49,17 +48,12 @@ def optimum(
 def refine_with_prior(F: Array, pair: OnePair, iterations: int) -> tuple[Array, Array, Array, TwoCameras]:
     """As `posterior.refine_with_prior` of models (k, 9): models, prior costs (k,), shares in front (k,), cameras."""
     k, centred = len(F), CentredPair.of(pair)
-    shifted, cameras = np.empty_like(F), TwoCameras(np.empty((k, 2, 3, 3)), np.empty((k, 2)))
-    translate(F, -centred.offset, shifted)
-    nearest_cameras(shifted, centred.longest, *cameras)
+    cameras = TwoCameras(np.empty((k, 2, 3, 3)), np.empty((k, 2)))
+    nearest_cameras(F, centred.offset, centred.longest, *cameras)
     found = optimum(cameras, pair, "geman_mcclure", posterior.LOSS_SCALE_PX, posterior.INLIER_SIGMA_PX, iterations)
-    models, cost, share = np.empty_like(F), np.empty(k), np.empty(k)
-    translate(found.F, centred.offset, shifted)
-    to_unit_norm(shifted, models)
-    prior_costs(cameras.focal, centred.same_size, cost)
-    cost[~(np.isfinite(models).all(1) & np.isfinite(found.cost))] = np.inf
-    support = np.ones(pair.count) if pair.prior is None else pair.prior
-    depth, unit_px = np.exp(cameras.focal) * centred.longest, pair.pixels_per_unit
-    scale, parallel = np.square(pair.scale / posterior.LOSS_SCALE_PX), posterior.PARALLEL_PX / unit_px
-    share_in_front(cameras.axes, depth, found.F, centred.points, support, scale, parallel, share)
+    models, cost, share = np.empty((k, 9)), np.empty(k), np.empty(k)
+    models_and_costs(found.F, found.cost, cameras.focal, centred.offset, centred.same_size, models, cost)
+    depth, parallel = np.exp(cameras.focal) * centred.longest, posterior.PARALLEL_PX / pair.pixels_per_unit
+    scale = np.square(pair.scale / posterior.LOSS_SCALE_PX)
+    share_in_front(cameras.axes, depth, found.F, centred.points, pair.support, scale, parallel, share)
     return models, cost, share, cameras

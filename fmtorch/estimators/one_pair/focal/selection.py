@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from fmtorch.estimators.focal import selection
 from fmtorch.estimators.focal.selection import MIN_GAIN_SHARE, RIVAL_GAIN_SHARE, SAME_CAMERAS, SAME_MODEL
+from fmtorch.estimators.focal.selection_kernels import rivals
 from fmtorch.estimators.one_pair.focal.cameras import TwoCameras
 from fmtorch.estimators.one_pair.focal.posterior import refine_with_prior
 from fmtorch.estimators.one_pair.models import Pool
@@ -17,13 +18,16 @@ from fmtorch.estimators.one_pair.scores import Score
 from fmtorch.estimators.one_pair.selection import Selection, scored
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Candidates:
-    """As `selection.Candidates`: models (k, 9), posteriors (k,), cameras."""
+    """As `selection.Candidates`: models (k, 9), posteriors (k,), cameras.
 
-    F: Array
-    posterior: Array
-    cameras: TwoCameras
+    best: the candidate of the greatest posterior, the first of several. found: whether there is one.
+    """
+
+    def __init__(self, F: Array, posterior: Array, cameras: TwoCameras) -> None:
+        self.F, self.posterior, self.cameras = F, posterior, cameras
+        self.best = int(posterior.argmax())
+        self.found = math.isfinite(posterior[self.best])
 
     def only(self, rows: Sequence[int]) -> Candidates:
         """As `selection.Candidates.only`: itself."""
@@ -34,13 +38,9 @@ class Candidates:
         F, posterior = np.concatenate([self.F, other.F]), np.concatenate([self.posterior, other.posterior])
         return Candidates(F, posterior, self.cameras.joined(other.cameras))
 
-    def best(self) -> int:
-        """The candidate of the greatest posterior, the first of several."""
-        return int(np.argmax(self.posterior))
-
     def best_alone(self) -> Candidates:
         """As `selection.Candidates.best_alone`."""
-        one = slice(self.best(), self.best() + 1)
+        one = slice(self.best, self.best + 1)
         cameras = TwoCameras(self.cameras.axes[one], self.cameras.focal[one])
         return Candidates(self.F[one], self.posterior[one], cameras)
 
@@ -50,19 +50,16 @@ class Candidates:
 
     def selection(self, draws: int) -> Selection:
         """As `selection.Candidates.selection`."""
-        best = self.best()
-        return Selection(self.F[best], bool(np.isfinite(self.posterior[best])), draws, self.cameras.of(best))
+        return Selection(self.F[self.best], self.found, draws, self.cameras.of(self.best))
 
     def same_best(self, other: Candidates) -> list[bool]:
         """As `selection.Candidates.same_best`."""
-        i, j = self.best(), other.best()
-        found = bool(np.isfinite(self.posterior[i]) and np.isfinite(other.posterior[j]))
-        return [found and bool(1 - abs(self.F[i] @ other.F[j]) <= SAME_CAMERAS)]
+        cosine = self.F[self.best] @ other.F[other.best]
+        return [self.found and other.found and bool(1 - abs(cosine) <= SAME_CAMERAS)]
 
     def unambiguous(self) -> list[bool]:
         """As `selection.Candidates.unambiguous`."""
-        best = self.best()
-        return [bool(np.isfinite(self.posterior[best])) and not _rivals(self.F, self.posterior, best, SAME_CAMERAS)]
+        return [self.found and not rivals(self.F, self.posterior, self.best, RIVAL_GAIN_SHARE, SAME_CAMERAS)]
 
 
 class FocalSelection:
@@ -75,7 +72,8 @@ class FocalSelection:
         """As `selection.FocalSelection.refined`."""
         models, cost, share, cameras = refine_with_prior(F, near, self.iterations)
         posterior = scored(self.gain, models, pair) * share - cost
-        return Candidates(models, np.where(valid & ~np.isnan(posterior), posterior, -np.inf), cameras)
+        posterior[np.isnan(posterior) | ~valid] = -np.inf
+        return Candidates(models, posterior, cameras)
 
     def select(self, pool: Pool, pair: OnePair, others: Candidates | None) -> Selection:
         """As `selection.FocalSelection.select`."""
@@ -85,19 +83,13 @@ class FocalSelection:
         order = np.argsort(-gain, kind="stable")
         models, gain = models[order], gain[order]
         free = Selection(models[0], found, pool.draws)
-        if others is None and not _rivals(models, gain, 0, SAME_MODEL):
+        if others is None and not rivals(models, gain, 0, RIVAL_GAIN_SHARE, SAME_MODEL):
             return free
         tried = slice(self.candidates)
-        candidates = self.refined(np.ascontiguousarray(models[tried]), np.isfinite(gain[tried]), pair, pool.near)
+        candidates = self.refined(models[tried], np.isfinite(gain[tried]), pair, pool.near)
         if others is not None:
             candidates = candidates.joined(others)
-        best = candidates.best()
+        best = candidates.best
         if not candidates.posterior[best] >= MIN_GAIN_SHARE * gain[0]:
             return free
-        return dataclasses.replace(free, F=candidates.F[best], cameras=candidates.cameras.of(best))
-
-
-def _rivals(F: Array, gain: Array, best: int, same: float) -> bool:
-    """Whether a good candidate is another model than the best."""
-    apart = 1 - np.abs((F * F[best]).sum(1))
-    return bool(((gain >= RIVAL_GAIN_SHARE * gain[best]) & ~(apart <= same)).any())
+        return free._replace(F=candidates.F[best], cameras=candidates.cameras.of(best))
