@@ -13,7 +13,6 @@ import numpy as np
 from fmtorch import kernels, presets
 from fmtorch.arguments import Arrays, correspondences, number
 from fmtorch.estimators.one_pair import ahead
-from fmtorch.kernel_compiler import compile_together
 from fmtorch.stages import Estimator, Pruner
 from fmtorch.threads import one_thread
 from fmtorch.types import Estimate
@@ -90,7 +89,7 @@ def find_fundamental(
         framed = c.lafs0 is not None and c.lafs1 is not None and c.quality is not None
         name = "frame_consistency" if framed else "position_consistency"
         if c.mask.device.type == "cpu" and kernels.available() and getattr(chosen, "focal", None) is not None:
-            compile_together((*ahead.PRIORS[name], *ahead.FOCAL))
+            ahead.compiled(name)
         with one_thread(c.mask.device):
             c = _consistency(name)(c)
     return judged(chosen(c, seed), c)

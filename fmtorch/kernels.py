@@ -39,7 +39,11 @@ class Kernel(Generic[P, R]):
 
     Arrays of another dtype, number of axes or memory order are refused with a TypeError, never converted; numbers are
     converted. Kernels and inner functions may call it, too. It holds no Python lock while it runs, unless it is brief.
+    Raises ImportError where numba cannot be imported.
     """
+
+    __slots__ = ("__call__", "__dict__")  # so that to call a kernel is to call what is compiled, with nothing between
+    __call__: Callable[P, R]
 
     def __init__(self, function: Callable[P, R], signature: str, brief: bool = False) -> None:
         self.function: Callable[P, R] = inspect.unwrap(
@@ -49,10 +53,10 @@ class Kernel(Generic[P, R]):
         self.signature = f"({signature},)"  # a tuple, of one argument too
         self.brief = brief
         self._compiled: Callable[P, R] | None = None
+        self.__call__ = self._first_call
 
-    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        """The function's value. Raises ImportError where numba cannot be imported."""
-        return (self._compiled or self.compiled())(*args, **kwargs)
+    def _first_call(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        return self.compiled()(*args, **kwargs)
 
     def compiled(self, count: str = "") -> Callable[P, R]:
         """The compiled function: of this process, of the cache folder, or compiled now, which a message tells.
@@ -61,7 +65,7 @@ class Kernel(Generic[P, R]):
         """
         with _lock:
             if self._compiled is None:
-                self._compiled = _compiled(self.function, self.signature, self.brief, count)
+                self._compiled = self.__call__ = _compiled(self.function, self.signature, self.brief, count)
         return self._compiled
 
     @property

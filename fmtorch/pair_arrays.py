@@ -38,12 +38,12 @@ def for_each_pair(
     Rows are C-contiguous arrays, floating ones of type `kind`; of what is not known (None) an empty one. Pairs are
     shared out among threads.
     """
-    arrays = [_array(t, kind, len(out)) for t in tensors]
     results = out.numpy()
+    arrays = [_array(t, kind, len(results)) for t in tensors]
 
     def some(pairs: range) -> None:
         for pair in pairs:
-            function(*(array[pair] for array in arrays), *constants, results[pair])
+            function(*[array[pair] for array in arrays], *constants, results[pair])
 
     parts = max(1, min(available(), len(results) // PAIRS_OF_A_THREAD))
     mapped(some, [range(first, len(results), parts) for first in range(parts)])
@@ -53,6 +53,13 @@ def for_each_pair(
 def _array(tensor: Tensor | None, kind: torch.dtype, pairs: int) -> NDArray[Any]:
     if tensor is None:
         return np.empty((pairs, 0), torch.empty(0, dtype=kind).numpy().dtype)
-    converted = tensor.detach().to(kind) if tensor.is_floating_point() else tensor
-    array: NDArray[Any] = converted.contiguous().numpy()
+    if tensor.is_floating_point() and tensor.dtype != kind:
+        tensor = tensor.to(kind)
+    array: NDArray[Any] = as_array(tensor.contiguous())
+    return array
+
+
+def as_array(tensor: Tensor) -> NDArray[Any]:
+    """A tensor on the CPU as an array, a view, on no graph."""
+    array: NDArray[Any] = (tensor.detach() if tensor.requires_grad else tensor).numpy()
     return array

@@ -96,7 +96,9 @@ class Record:
 
         What a user may have a hand in goes through `replace`.
         """
-        return type(self).made(**(vars(self) | changes))
+        made = object.__new__(type(self))
+        vars(made).update(vars(self), **changes)
+        return made
 
     def _map(self: AnyRecord, function: Any, **changes: Any) -> AnyRecord:
         return self.replace(**_mapped(self, function, Record._map), **changes)

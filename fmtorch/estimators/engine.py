@@ -38,7 +38,6 @@ from fmtorch.estimators.search import Search
 from fmtorch.estimators.selection import BestScore, FirstOfPool, Selector
 from fmtorch.estimators.solvers import MinimalSamples, Solver
 from fmtorch.estimators.verbs import FocalParts, Verbs
-from fmtorch.kernel_compiler import compile_together
 from fmtorch.types import Correspondences, Estimate
 
 FOCAL_ROUND = 500  # samples of five matches of a pair at a time
@@ -154,15 +153,15 @@ class HypothesizeAndVerify:
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
         least = self.search.generator.size
-        at_once = self.search.generator.samples_at_once(c.mask.device) // self.search.round
         form: Callable[[NormalizedPairs], Outcome] = self.tensor_form
         compiled = self.kernel_form if c.mask.device.type == "cpu" and kernels.available() else None
         if compiled is not None:
             if self.focal is not None:
-                compile_together(ahead.FOCAL)
+                ahead.compiled()
             if not c.requires_grad:
                 return estimated(c, seed, least, compiled, NOT_FOUND)
             form = functools.partial(pair_by_pair, compiled)
+        at_once = self.search.generator.samples_at_once(c.mask.device) // self.search.round
         solve = functools.partial(self._solve, form)
         return solve_all(c, seed, least, solve, NOT_FOUND, at_once, compiled is not None)
 

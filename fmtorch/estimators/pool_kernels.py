@@ -123,6 +123,15 @@ def residuals_squared(F: Array, points: Array, factor: float, out: Array) -> Non
         out[i] = e * e / (slope if slope > TINY else TINY) * factor
 
 
+@kernel("f8[::1], f8[:, ::1], f8, f8, b1[::1]", brief=True)
+def within(F: Array, points: Array, factor: float, limit: float, out: Array) -> None:
+    """Which matches' `residuals_squared` are within a limit -> out (n,)."""
+    r2 = np.empty(len(out))
+    residuals_squared(F, points, factor, r2)
+    for i in range(len(out)):
+        out[i] = r2[i] <= limit
+
+
 @kernel("f8[::1], f8[:, ::1], f8, f8, i8[::1]", brief=True)
 def share_within(F: Array, points: Array, factor: float, limit: float, weight: Array) -> float:
     """The share of the matches' weights (n,) of those whose `residuals_squared` are within a limit."""

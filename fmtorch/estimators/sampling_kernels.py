@@ -52,6 +52,16 @@ def draw(table: Array, totals: Array, mixed_seed: int, key: int, start: int, out
             begin[k], length[k] = first, weight
 
 
+@kernel("f8[::1], f8, i8[::1], i8[::1]", brief=True)
+def quantise(prior: Array, largest: float, weight: Array, table: Array) -> None:
+    """Priors (n,) as weights from 1 up to the largest -> weight (n,), and these cumulated -> table (n,)."""
+    total = np.int64(0)
+    for i in range(len(prior)):
+        weight[i] = max(np.int64(np.rint(prior[i] * largest)), np.int64(1))
+        total += weight[i]
+        table[i] = total
+
+
 @inner
 def _guide_shift(table: Array) -> int:
     """Positions are looked up by their upper bits: about as many different ones as there are matches."""

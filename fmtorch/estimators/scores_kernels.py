@@ -30,6 +30,16 @@ STRETCH = np.float32(1 / (1 - 1 / 26))
 BIN_SHIFT, BINS = 21, 1 << 10  # of a float32 the exponent and two bits more
 
 
+@kernel("f8[:, ::1], f8, b1, f4[:, ::1]", brief=True)
+def matches(table: Array, threshold: float, weighted: bool, out: Array) -> None:
+    """Points, support and scale -> out (6, n). table: (9, n), of `OnePair`. weighted: by the prior."""
+    for i in range(table.shape[1]):
+        for r in range(4):
+            out[r, i] = table[r, i]
+        scale = table[5, i] / threshold
+        out[4, i], out[5, i] = table[6, i] if weighted else 1.0, scale * scale
+
+
 @kernel("f4[:, ::1], i8[::1], f4[:, ::1], f4[::1], f4[::1], i8, f4[::1], i8, f8[::1]")
 def score_gains(
     F: Array, which: Array, points: Array, support: Array, scale: Array, gain: int, table: Array, bits: int, out: Array

@@ -65,12 +65,13 @@ class Verbs:
             best = top if best is None else best.replaced(rows, top)
             selection = found if selection is None else selection.replaced(rows, found)
             enough = [False] * len(rows) if focal.confident is None else focal.confident(found.F, pool.draws, some)
-            agreed = [one or two for one, two in zip(candidates.unambiguous(), again, strict=True)]
-            last = turn + 1 == focal.rounds
-            ended = [last or (turn + 1 >= focal.min_rounds and a and e) for a, e in zip(agreed, enough, strict=True)]
-            settled = [a and e for a, e in zip(some.same_size, enough, strict=True)]
-            unsettled += [row for row, over, one in zip(rows, ended, settled, strict=True) if over and not one]
-            left = [i for i, over in enumerate(ended) if not over]
+            one_model, same_size, left = candidates.unambiguous(), some.same_size, []
+            for i, row in enumerate(rows):
+                content = turn + 1 >= focal.min_rounds and (one_model[i] or again[i]) and enough[i]
+                if not content and turn + 1 < focal.rounds:
+                    left.append(i)
+                elif not (same_size[i] and enough[i]):
+                    unsettled.append(row)
             rows = [rows[i] for i in left]
             if not rows:
                 break

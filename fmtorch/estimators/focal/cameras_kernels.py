@@ -35,6 +35,19 @@ def translate(F: Array, offset: Array, out: Array) -> None:
             out[k, 6 + c] += offset[2] * out[k, c] + offset[3] * out[k, 3 + c]
 
 
+@kernel("f8[:, ::1], f8[::1], f8, f8[:, ::1]", brief=True)
+def centre(table: Array, offset: Array, scale_px: float, out: Array) -> None:
+    """Points from the principal points, squared scales of a loss, and one over these -> out (6, n).
+
+    table: (9, n), of `OnePair`. offset: (4,), what is added to points. scale_px: of the loss, of a usual match.
+    """
+    for i in range(table.shape[1]):
+        for r in range(4):
+            out[r, i] = table[r, i] + offset[r]
+        scale = table[5, i]
+        out[4, i], out[5, i] = (scale_px / scale) * (scale_px / scale), (scale / scale_px) * (scale / scale_px)
+
+
 @kernel("f8[:, ::1], f8[::1], f8[::1], f8[:, :, :, ::1], f8[:, ::1]", brief=True)
 def nearest_cameras(F: Array, offset: Array, longest: Array, axes: Array, focal: Array) -> None:
     """Cameras near models (k, 9): those of their focal lengths, or of usual ones where these are implausible.

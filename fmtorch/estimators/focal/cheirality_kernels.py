@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.geometry.arithmetic_kernels import exponential
 from fmtorch.geometry.sampson_objective_kernels import MATCH, in_rows
 from fmtorch.kernels import inner, kernel
 from fmtorch.lanes import absolute, added, fill, load, sqrt, where
@@ -18,21 +19,22 @@ REST = 1 / 26  # of the gain of Geman & McClure, as in `scores`
 TINY = float(np.finfo(np.float64).tiny)
 
 
-@kernel("f8[:, :, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8, f8[::1]", brief=True)
+@kernel("f8[:, :, :, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8, f8[::1]", brief=True)
 def share_in_front(
-    axes: Array, depth: Array, F: Array, points: Array, prior: Array, scale: Array, tolerance: float, out: Array
+    axes: Array, focal: Array, longest: Array, F: Array, points: Array, prior: Array, scale: Array, tolerance: float,
+    out: Array,
 ) -> None:  # fmt: skip
     """`cheirality.share_in_front` of candidates -> out (k,). Support is prior times the gain of Geman & McClure.
 
-    axes: (k, 2, 3, 3), U and V. depth: (k, 2), focal lengths in the unit of the points. F: (k, 9), their models.
-    points: (4, n), from the principal points. prior, scale: (n,), the latter one over the square of each match's scale.
-    tolerance: in the unit of the points.
+    axes: (k, 2, 3, 3), U and V. focal: (k, 2), logarithms of focal lengths in units of the longer sides (2,), which are
+    in the unit of the points. F: (k, 9), their models. points: (4, n), from the principal points. prior, scale: (n,),
+    the latter one over the square of each match's scale. tolerance: in the unit of the points.
     """
     matches, shift = in_rows(points, prior, scale), 1.5 * 2.0 ** (52 - BITS)
     for k in range(len(out)):
         U, V, f = axes[k, 0], axes[k, 1], F[k]
         handed = 1.0 if (_determinant(U) > 0) == (_determinant(V) > 0) else -1.0
-        d0, d1 = depth[k, 0], depth[k, 1]
+        d0, d1 = exponential(focal[k, 0]) * longest[0], exponential(focal[k, 1]) * longest[1]
         total, front = fill(0.0), fill(0.0)
         back, mirrored, both = front, front, front
         for row in range(0, len(matches), MATCH):

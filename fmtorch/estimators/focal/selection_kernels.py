@@ -1,7 +1,8 @@
-"""Whether candidates are one and the same model, of one pair, compiled: as `selection`."""
+"""The candidates of one pair, compiled: what they are worth, and whether they are one and the same model."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from numpy.typing import NDArray
@@ -9,6 +10,14 @@ from numpy.typing import NDArray
 from fmtorch.kernels import kernel
 
 Array = NDArray[Any]
+
+
+@kernel("f8[::1], f8[::1], f8[::1], b1[::1], f8[::1]", brief=True)
+def posteriors(gain: Array, share: Array, cost: Array, valid: Array, out: Array) -> None:
+    """Gain times share in front minus cost -> out (k,), minus infinity of none: `selection.FocalSelection.refined`."""
+    for k in range(len(out)):
+        posterior = gain[k] * share[k] - cost[k]
+        out[k] = posterior if valid[k] and not math.isnan(posterior) else -math.inf
 
 
 @kernel("f8[:, ::1], f8[::1], i8, f8, f8", brief=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 from fmtorch.estimators import pairs_kernels, pool_kernels, sampling_kernels, scores_kernels, support_kernels
@@ -20,6 +21,7 @@ from fmtorch.geometry import (
     seven_point_kernels,
     significance_kernels,
 )
+from fmtorch.kernel_compiler import compile_together
 from fmtorch.kernels import Kernel
 from fmtorch.pruning import calibration_kernels, frame_consistency_kernels, position_consistency_kernels
 
@@ -50,6 +52,11 @@ FOCAL: tuple[Kernel[..., Any], ...] = (  # the slowest to compile first
     posterior_kernels.models_and_costs,
     pool_kernels.shuffled,
     pool_kernels.share_within,
+    pool_kernels.within,
+    cameras_kernels.centre,
+    scores_kernels.matches,
+    sampling_kernels.quantise,
+    selection_kernels.posteriors,
     selection_kernels.rivals,
 )
 
@@ -57,3 +64,12 @@ PRIORS: dict[str, tuple[Kernel[..., Any], ...]] = {  # by the names of the prune
     "position_consistency": (position_consistency_kernels.position_agreement, calibration_kernels.calibrated),
     "frame_consistency": (frame_consistency_kernels.frame_agreement, frame_consistency_kernels.frame_prior),
 }
+
+
+@functools.cache
+def compiled(prior: str = "") -> None:
+    """Have the kernels ready of an estimator with the prior on focal lengths, and those of a pruner before it.
+
+    Raises ImportError where numba cannot be imported.
+    """
+    compile_together((*PRIORS.get(prior, ()), *FOCAL))

@@ -11,6 +11,7 @@ from torch import Tensor
 from fmtorch.estimators.one_pair.pair import Array, OnePair
 from fmtorch.estimators.pairs import MAX_COORDINATE_PX, MAX_NOISE, MIN_NOISE, bucket, too_few
 from fmtorch.estimators.pairs_kernels import normalize
+from fmtorch.pair_arrays import as_array
 from fmtorch.types import Correspondences
 from fmtorch.validation import PER_MATCH, reason, right_size
 
@@ -86,5 +87,4 @@ def _row(values: Array | None, i: int) -> Array:
 
 def _array(tensor: Tensor) -> Array:
     known = tensor.dtype in (torch.float32, torch.float64) or not tensor.is_floating_point()
-    array: Array = (tensor if known else tensor.to(torch.float64)).detach().numpy()
-    return array
+    return as_array(tensor if known else tensor.to(torch.float64))

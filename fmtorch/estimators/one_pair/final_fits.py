@@ -21,7 +21,7 @@ from fmtorch.estimators.final_fits import (
 )
 from fmtorch.estimators.one_pair.focal.cameras import UNKNOWN, TwoCameras
 from fmtorch.estimators.one_pair.focal.fit import fit_focal
-from fmtorch.estimators.one_pair.inliers import median_of_matches, residuals_squared_px
+from fmtorch.estimators.one_pair.inliers import median_of_matches, residuals_squared_px, within_px
 from fmtorch.estimators.one_pair.pair import Array, OnePair, squared
 from fmtorch.estimators.one_pair.refine import gauss_newton_step, refine_models
 from fmtorch.estimators.one_pair.selection import Selection
@@ -103,14 +103,14 @@ class AdaptiveGaussNewton:
             own = fit_focal(
                 selection.cameras, pair, truncation, truncation / TRUNCATION_SIGMAS, FOCAL_ITERATIONS, FOCAL_TOLERANCE
             )
-            assumed = own.gain <= PRIOR_CONFLICT_GAIN and bool(np.isfinite(own.F).all())
+            assumed = own.gain <= PRIOR_CONFLICT_GAIN and all(map(math.isfinite, own.F.tolist()))
             if assumed:
                 F, cameras = own.F, own.cameras
         if not assumed:
             (F,) = refine_models(
                 F[None], pair, "truncated", truncation, ITERATIONS, RANK_TWO_ALREADY, TOLERANCE, DAMPING
             )
-        counted = _squared_in_noises(F, pair) <= squared(truncation)
+        counted = _within_noises(F, pair, truncation)
         matrix = F.reshape(3, 3)
         return Fit(matrix, matrix, counted, cameras, truncation)
 
@@ -119,6 +119,14 @@ def _squared_in_noises(F: Array, pair: OnePair) -> Array:
     """Squared Sampson distances (n,) in squared pixels, of matches of usual noise."""
     r2 = residuals_squared_px(F, pair)
     return r2 if pair.noise is None else r2 / np.square(pair.noise)
+
+
+def _within_noises(F: Array, pair: OnePair, truncation: float) -> Array:
+    """The matches (n,) within a distance that is in pixels for matches of usual noise."""
+    if pair.noise is None:
+        return within_px(F, pair, truncation)
+    near: Array = _squared_in_noises(F, pair) <= squared(truncation)
+    return near
 
 
 def truncation_distance(r2: Array) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from fmtorch.estimators import inliers
 from fmtorch.estimators.one_pair.pair import Array, OnePair, squared
 from fmtorch.estimators.one_pair.sampling import Sampler
-from fmtorch.estimators.pool_kernels import residuals_squared, share_within
+from fmtorch.estimators.pool_kernels import residuals_squared, share_within, within
 
 
 def residuals_squared_px(F: Array, pair: OnePair) -> Array:
@@ -20,10 +20,21 @@ def residuals_squared_px(F: Array, pair: OnePair) -> Array:
     return out
 
 
+def within_px(F: Array, pair: OnePair, threshold: float) -> Array:
+    """The matches (n,) whose Sampson distance to a model of nine entries is within a threshold in pixels."""
+    out = np.empty(pair.count, np.bool_)
+    within(
+        F.astype(np.float64, copy=False).ravel(), pair.points, squared(pair.pixels_per_unit), squared(threshold), out
+    )
+    return out
+
+
 def median_of_matches(r2: Array) -> float:
     """The (lower) median."""
     rank = (len(r2) + 1) // 2 - 1
-    return float(np.partition(r2, rank)[rank])
+    ordered = r2.copy()
+    ordered.partition(rank)
+    return float(ordered[rank])
 
 
 @runtime_checkable
@@ -43,8 +54,7 @@ class WithinThreshold:
 
     def __call__(self, F: Array, pair: OnePair) -> Array:
         """As `InlierRule`."""
-        within: Array = residuals_squared_px(F, pair) <= squared(self.part.threshold)
-        return within
+        return within_px(F, pair, self.part.threshold)
 
 
 class BetterHalf:
@@ -71,8 +81,8 @@ class RobustDeviations:
         r2 = residuals_squared_px(F, pair)
         spare = max(pair.count - self.part.PARAMETERS, 1)
         sigma = 1.4826 * (1 + 5 / spare) * math.sqrt(median_of_matches(r2))
-        within: Array = r2 <= squared(2.5 * sigma)
-        return within
+        inside: Array = r2 <= squared(2.5 * sigma)
+        return inside
 
 
 class Confidence:

@@ -59,7 +59,7 @@ class Pool:
     @property
     def valid(self) -> Array:
         """Which of `models` are there."""
-        return np.arange(max(self.filled, 1)) < self.filled
+        return np.ones(self.filled, np.bool_) if self.filled else np.zeros(1, np.bool_)
 
     def merge(self, rows: Sequence[int], models: Models) -> None:
         """Keep the best of this pool's models and the new ones; the earlier draw wins a tie."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from fmtorch.estimators import sampling
 from fmtorch.estimators.one_pair.pair import Array, OnePair
-from fmtorch.estimators.sampling_kernels import draw, prosac_table
+from fmtorch.estimators.sampling_kernels import draw, prosac_table, quantise
 from fmtorch.random import Stream, mixed_seed
 
 WEIGHTS_OF_ONE = np.empty(0, np.int64)  # as the kernel takes them
@@ -77,13 +77,14 @@ class PriorWeighted:
 
     def weight(self, pair: OnePair) -> Array:
         """As `sampling.PriorWeighted.weight`: how finely priors are quantised depends on the pair's bucket."""
-        weight: Array = pair.once("weights", _quantised)
+        weight: Array = pair.once("weights", _quantised)[0]
         return weight
 
     def draw(self, pair: OnePair, start: int, count: int, size: int) -> Array:
         """As `Sampler.draw`."""
-        table = pair.once("cumulative priors", lambda pair: np.cumsum(self.weight(pair)))
-        return _drawn(pair, table, np.full(count, table[-1]), start, size)
+        _, table = pair.once("weights", _quantised)
+        totals = pair.once(("totals", count), lambda pair: np.full(count, table[-1]))
+        return _drawn(pair, table, totals, start, size)
 
 
 def _equal_weights(pair: OnePair) -> Array:
@@ -91,11 +92,11 @@ def _equal_weights(pair: OnePair) -> Array:
     return weight
 
 
-def _quantised(pair: OnePair) -> Array:
-    if pair.prior is None:
-        return np.ones(pair.count, np.int64)
-    weight: Array = np.rint(pair.prior * sampling.largest_weight(pair.slots)).astype(np.int64)
-    return np.maximum(weight, 1)
+def _quantised(pair: OnePair) -> tuple[Array, Array]:
+    """Weights and cumulative weights."""
+    weight, table = np.empty(pair.count, np.int64), np.empty(pair.count, np.int64)
+    quantise(pair.support, 1 if pair.prior is None else sampling.largest_weight(pair.slots), weight, table)
+    return weight, table
 
 
 def _best_first(pair: OnePair) -> Array:

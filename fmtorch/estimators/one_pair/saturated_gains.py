@@ -6,7 +6,7 @@ import numpy as np
 
 from fmtorch.estimators import saturated_gains
 from fmtorch.estimators.one_pair.pair import Array, OnePair
-from fmtorch.estimators.one_pair.scores import GemanMcClure, Scored
+from fmtorch.estimators.one_pair.scores import GemanMcClure, matches
 from fmtorch.estimators.scores_kernels import saturated_cells, score_saturated
 
 
@@ -19,14 +19,20 @@ class SaturatedGains:
 
     def __call__(self, F: Array, which: Array, pair: OnePair) -> Array:
         """As `scores.Score`."""
-        weighted, out = self.part.prior_weighted, np.empty(len(which))
-        of = Scored.of(pair, self.part.threshold, weighted)
-        cells = pair.once(("cells", weighted), lambda pair: _cells(of))
-        score_saturated(F, which, of.points, of.support, of.scale, cells, of.bits, out)
+        out = np.empty(len(which))
+        points, support, scale, cells, bits = pair.once(self, self._matches)
+        score_saturated(F, which, points, support, scale, cells, bits, out)
         return out
 
+    def _matches(self, pair: OnePair) -> tuple[Array, Array, Array, Array, int]:
+        """What the kernel takes of the matches."""
+        weighted = self.part.prior_weighted
+        points, support, scale, bits = matches(pair, self.part.threshold, weighted)
+        cells = pair.once(("cells", weighted), lambda pair: _cells(points, support))
+        return points, support, scale, cells, bits
 
-def _cells(of: Scored) -> Array:
-    cells = np.empty((2, len(of.support)), np.int32)
-    saturated_cells(of.points, of.support, cells)
+
+def _cells(points: Array, support: Array) -> Array:
+    cells = np.empty((2, len(support)), np.int32)
+    saturated_cells(points, support, cells)
     return cells

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 
 from fmtorch.estimators import scores
+from fmtorch.estimators import scores_kernels as compiled
 from fmtorch.estimators.one_pair.pair import Array, OnePair
 from fmtorch.estimators.scores_kernels import (
     COUNT,
@@ -31,26 +32,14 @@ class Score(Protocol):
         ...
 
 
-class Scored(NamedTuple):
-    """What a score takes of the matches of a pair, float32: points (4, n), what each counts (n,), one over the square
-    of its threshold (n,); and the fractional bits of gains.
+def matches(pair: OnePair, threshold: float, prior_weighted: bool) -> tuple[Array, Array, Array, int]:
+    """Points (4, n), what each match counts (n,), one over the square of its threshold (n,); fractional bits of gains.
+
+    The arrays are float32.
     """
-
-    points: Array
-    support: Array
-    scale: Array
-    bits: int
-
-    @staticmethod
-    def of(pair: OnePair, threshold: float, prior_weighted: bool) -> Scored:
-        """Of all matches, made once."""
-        name = "scored", threshold, prior_weighted
-        found: Scored | None = pair.kept.get(name)
-        if found is None:
-            support = pair.support.astype(np.float32) if prior_weighted else np.ones(pair.count, np.float32)
-            scale = np.square(pair.scale / threshold).astype(np.float32)
-            found = pair.kept[name] = Scored(pair.points32, support, scale, fractional_bits(pair.count, torch.float32))
-        return found
+    out = np.empty((6, pair.count), np.float32)
+    compiled.matches(pair.table, threshold, prior_weighted, out)
+    return out[:4], out[4], out[5], fractional_bits(pair.count, torch.float32)
 
 
 class SummedGains:
@@ -63,9 +52,13 @@ class SummedGains:
 
     def __call__(self, F: Array, which: Array, pair: OnePair) -> Array:
         """As `Score`."""
-        out, of = np.empty(len(which)), Scored.of(pair, self.part.threshold, self.part.prior_weighted)
-        score_gains(F, which, of.points, of.support, of.scale, self.GAIN, self.table, of.bits, out)
+        out = np.empty(len(which))
+        points, support, scale, bits = pair.once(self, self._matches)
+        score_gains(F, which, points, support, scale, self.GAIN, self.table, bits, out)
         return out
+
+    def _matches(self, pair: OnePair) -> tuple[Array, Array, Array, int]:
+        return matches(pair, self.part.threshold, self.part.prior_weighted)
 
 
 class InlierCount(SummedGains):

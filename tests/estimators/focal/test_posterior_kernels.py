@@ -98,9 +98,8 @@ def test_refined_candidates(iterations: int, same_size: bool) -> None:
     np.testing.assert_allclose(costs, cost[0].numpy(), atol=1e-5)
     prior_weight = np.ones(n) if pair.prior is None else pair.prior[0, :n].numpy().copy()
     scale = np.ascontiguousarray((units[:n] / LOSS_SCALE_PX) ** 2)
-    depth = np.exp(lengths) * fit.longest
     tolerance = PARALLEL_PX / float(pair.pixels_per_unit)
-    share_in_front(axes, depth, state[2], fit.points, prior_weight, scale, tolerance, share)
+    share_in_front(axes, lengths, fit.longest, state[2], fit.points, prior_weight, scale, tolerance, share)
     np.testing.assert_allclose(share, front[0].numpy(), atol=1e-5)  # of sums of gains of 2^-20
 
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fmtorch.estimators.focal.cameras import MIN_IMAGE_SIDE_PX
+from fmtorch.estimators.focal.cameras_kernels import centre
 from fmtorch.estimators.one_pair.pair import Array, OnePair
 
 
@@ -39,25 +40,32 @@ UNKNOWN = TwoCameras(np.full((2, 3, 3), np.nan), np.full(2, np.nan))
 
 
 class CentredPair(NamedTuple):
-    """As `cameras.CentredPairs`: points (4, n) from the principal points; offset (4,); longest (2,); same_size."""
+    """As `cameras.CentredPairs`: points (4, n) from the principal points; offset (4,); longest (2,); same_size.
+
+    s2: (n,), the squared scales of a loss, in the unit of the points; precision: (n,), one over these.
+    """
 
     points: Array
+    s2: Array
+    precision: Array
     offset: Array
     longest: Array
     same_size: bool
 
     @staticmethod
-    def of(pair: OnePair) -> CentredPair:
-        """The matches of a pair whose image sizes are known, made once."""
-        made: CentredPair = pair.once("from the principal points", _centred)
+    def of(pair: OnePair, scale_px: float = 1.0) -> CentredPair:
+        """The matches of a pair whose image sizes are known, made once. scale_px: of the loss."""
+        made: CentredPair = pair.once(("centred", scale_px), lambda pair: _centred(pair, scale_px))
         return made
 
 
-def _centred(pair: OnePair) -> CentredPair:
+def _centred(pair: OnePair, scale_px: float) -> CentredPair:
     images = pair.shared.get("images")
     if images is None:
         images = pair.shared["images"] = _images(pair)
-    return CentredPair(pair.points + images[0][:, None], *images)
+    out = np.empty((6, pair.count))
+    centre(pair.table, images[0], scale_px, out)
+    return CentredPair(out[:4], out[4], out[5], *images)
 
 
 def _images(pair: OnePair) -> tuple[Array, Array, bool]:

@@ -35,10 +35,10 @@ def optimum(
     scale_px, sigma_px: of the loss and of an inlier's Sampson distance. Without tolerance the derivatives are not those
     at the end.
     """
-    k, centred = len(start.focal), CentredPair.of(pair)
+    k, centred = len(start.focal), CentredPair.of(pair, scale_px)
     F, cost, gradient, hessian = np.empty((k, 9)), np.empty(k), np.empty((k, 7)), np.empty((k, 7, 7))
     minimise(
-        *start, centred.points, pair.weight, np.square(scale_px / pair.scale), LOSSES[loss], LOSS_TABLE,
+        *start, centred.points, pair.weight, centred.s2, LOSSES[loss], LOSS_TABLE,
         centred.longest, centred.same_size, squared(pair.pixels_per_unit / sigma_px), iterations,
         -1.0 if tolerance is None else tolerance, F, cost, gradient, hessian,
     )  # fmt: skip
@@ -47,13 +47,12 @@ def optimum(
 
 def refine_with_prior(F: Array, pair: OnePair, iterations: int) -> tuple[Array, Array, Array, TwoCameras]:
     """As `posterior.refine_with_prior` of models (k, 9): models, prior costs (k,), shares in front (k,), cameras."""
-    k, centred = len(F), CentredPair.of(pair)
+    k, centred = len(F), CentredPair.of(pair, posterior.LOSS_SCALE_PX)
     cameras = TwoCameras(np.empty((k, 2, 3, 3)), np.empty((k, 2)))
     nearest_cameras(F, centred.offset, centred.longest, *cameras)
     found = optimum(cameras, pair, "geman_mcclure", posterior.LOSS_SCALE_PX, posterior.INLIER_SIGMA_PX, iterations)
     models, cost, share = np.empty((k, 9)), np.empty(k), np.empty(k)
     models_and_costs(found.F, found.cost, cameras.focal, centred.offset, centred.same_size, models, cost)
-    depth, parallel = np.exp(cameras.focal) * centred.longest, posterior.PARALLEL_PX / pair.pixels_per_unit
-    scale = np.square(pair.scale / posterior.LOSS_SCALE_PX)
-    share_in_front(cameras.axes, depth, found.F, centred.points, pair.support, scale, parallel, share)
+    parallel = posterior.PARALLEL_PX / pair.pixels_per_unit
+    share_in_front(*cameras, centred.longest, found.F, centred.points, pair.support, centred.precision, parallel, share)
     return models, cost, share, cameras

@@ -9,7 +9,7 @@ import numpy as np
 
 from fmtorch.estimators.focal import selection
 from fmtorch.estimators.focal.selection import MIN_GAIN_SHARE, RIVAL_GAIN_SHARE, SAME_CAMERAS, SAME_MODEL
-from fmtorch.estimators.focal.selection_kernels import rivals
+from fmtorch.estimators.focal.selection_kernels import posteriors, rivals
 from fmtorch.estimators.one_pair.focal.cameras import TwoCameras
 from fmtorch.estimators.one_pair.focal.posterior import refine_with_prior
 from fmtorch.estimators.one_pair.models import Pool
@@ -71,8 +71,8 @@ class FocalSelection:
     def refined(self, F: Array, valid: Array, pair: OnePair, near: OnePair) -> Candidates:
         """As `selection.FocalSelection.refined`."""
         models, cost, share, cameras = refine_with_prior(F, near, self.iterations)
-        posterior = scored(self.gain, models, pair) * share - cost
-        posterior[np.isnan(posterior) | ~valid] = -np.inf
+        posterior = np.empty(len(models))
+        posteriors(scored(self.gain, models, pair), share, cost, valid, posterior)
         return Candidates(models, posterior, cameras)
 
     def select(self, pool: Pool, pair: OnePair, others: Candidates | None) -> Selection:
