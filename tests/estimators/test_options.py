@@ -97,7 +97,7 @@ def test_flat_and_nested_options_replace_those_of_a_preset() -> None:
     assert built.search.hypotheses == 500
     assert built.search.verify.preselect == Preselect(64, 30)
     assert built.focal.search.hypotheses == 100
-    assert built.focal.search.pool == 12
+    assert built.focal.search.pool == 24
     assert torch.equal(found.F, built(c.replace(key=None, quality=None)).F)
     without = presets.build("estimator", "fmtorch", focal=None)
     assert without.focal is None
