@@ -8,7 +8,7 @@
 A value takes ``+ - * /`` and comparisons with another, of as many lanes, or with one number; a mask, which comparisons
 make, takes ``& | ^ ~``. In a kernel these are instructions of the processor on vectors in registers, in the order in
 which they are written; a loop over the lanes would have to ask first whether its arrays overlap, and hold its sums in
-memory. From Python a value is an array.
+memory. From Python a value is an array that no operator changes.
 """
 
 from __future__ import annotations
@@ -23,6 +23,14 @@ from numpy.typing import NDArray
 from fmtorch.kernels import Inner
 
 Array = NDArray[Any]
+
+
+class Value(np.ndarray):
+    """A value of lanes in Python: as of numbers, ``a += b`` leaves another name of the same value as it was."""
+
+    __iadd__, __isub__, __imul__ = np.ndarray.__add__, np.ndarray.__sub__, np.ndarray.__mul__  # type: ignore[assignment]
+    __itruediv__ = np.ndarray.__truediv__  # type: ignore[assignment]
+    __iand__, __ior__, __ixor__ = np.ndarray.__and__, np.ndarray.__or__, np.ndarray.__xor__  # type: ignore[assignment]
 
 
 class LaneFunction(Inner[..., Any]):
@@ -50,10 +58,10 @@ def lanes(count: int) -> Lanes:
     """The ways to values of so many lanes."""
 
     def load(A: Array, row: int) -> Any:
-        return A[row].copy()
+        return A[row].copy().view(Value)
 
     def fill(number: Any) -> Any:
-        return np.full(count, number)
+        return np.full(count, number).view(Value)
 
     return Lanes(LaneFunction(load, count), LaneFunction(fill, count))
 
@@ -71,7 +79,7 @@ def store(A: Array, row: int, value: Any) -> None:
 @LaneFunction
 def where(mask: Any, this: Any, that: Any) -> Any:
     """This value in the lanes of the mask, that in the others."""
-    return np.where(mask, this, that)
+    return np.where(mask, this, that).view(Value)
 
 
 @LaneFunction

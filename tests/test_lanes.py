@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from fmtorch import kernels
+from fmtorch.geometry.five_point_kernels import five_point
 from fmtorch.kernels import kernel
 from fmtorch.lanes import LANES, absolute, added, any_lane, copysign, fill, lanes, load, sqrt, store, where
 
@@ -84,3 +85,26 @@ def test_lanes_of_different_kinds_do_not_mix() -> None:
 
     with pytest.raises(numba.TypingError, match="lanes"):
         mixed(np.zeros((1, LANES)), np.zeros((1, SINGLES), np.float32))
+
+
+def test_an_operator_leaves_other_names_of_a_value_as_they_were() -> None:
+    total = start = fill(1.0)
+    total += 1.0
+    total *= 3.0
+    assert start.tolist() == [1.0] * LANES
+    assert total.tolist() == [6.0] * LANES
+
+
+@pytest.mark.filterwarnings("ignore:divide by zero|invalid value|overflow:RuntimeWarning")
+def test_a_solver_called_without_numba_finds_the_same_models() -> None:
+    generator = np.random.default_rng(0)
+    points = np.tile(generator.normal(size=(2, 30)), (2, 1)) + 0.1 * generator.normal(size=(4, 30))
+    sample = np.stack([generator.permutation(30)[:5] for _ in range(LANES + 3)], 1)
+    depth, made = np.full((2, LANES + 3), 1.2), []
+    for each in (five_point, five_point.function):
+        F, draw = np.zeros((10 * sample.shape[1], 9), np.float32), np.zeros(10 * sample.shape[1], np.int64)
+        count = each(points, sample, depth, np.zeros(4), F, draw)
+        made.append((count, F, draw))
+    assert made[0][0] > LANES
+    for compiled, plain in zip(*made, strict=True):
+        np.testing.assert_array_equal(compiled, plain)
