@@ -174,7 +174,7 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / "DATA" / name / "pairs_which_dataset.txt").write_text("".join(f"{s}/\n" for s in scenes))
     for name, image in zip(("a.jpg", "b.jpg"), images, strict=True):
         cv2.imwrite(str(folder / name), image[..., ::-1])
-    for training in ("S1", "S2", "C", "N"):
+    for training in ("S1", "S2", "C", "N", "P500", "P1500"):
         (folder / training).mkdir()
         shutil.copy(SOURCE / "models" / "lc_f.safetensors", folder / training / "lc.safetensors")
     (folder / "PHOTOS").mkdir()
