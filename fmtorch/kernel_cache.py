@@ -19,6 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from fmtorch import kernel_calls
 from fmtorch.resources import cache_dir
 
 PACKAGE = Path(__file__).resolve().parent
@@ -56,7 +57,11 @@ def sources(package: Path) -> list[Path]:
 
 def sources_digest(package: Path) -> str:
     """The digest of all kernels of a package, and of how they are compiled."""
-    how = [path for name in ("kernels.py", "lanes.py", "lane_types.py") if (path := package / name).is_file()]
+    how = [
+        path
+        for name in ("kernels.py", "kernel_calls.py", "lanes.py", "lane_types.py")
+        if (path := package / name).is_file()
+    ]
     files = [*sources(package), *how]
     return _hex(b"".join(hashlib.blake2b(path.read_bytes()).digest() for path in files))
 
@@ -94,11 +99,13 @@ def _remove_unused(used: Path) -> None:
 class KernelFile:
     """The file of one kernel and signature; what numba calls the cache of a function.
 
-    missing: called before the function is compiled, with words that say where it will be kept.
+    missing: called before the function is compiled, with words that say where it will be kept. calls: once loaded or
+    saved, the kernels that the function calls.
     """
 
     def __init__(self, function: Callable[..., Any], signature: str, missing: Callable[[str], None]) -> None:
         self.missing = missing
+        self.calls: list[Any] = []
         self.path: Path | None = None
         where = folder()
         if where is not None and Path(function.__code__.co_filename).is_file():
@@ -121,6 +128,7 @@ class KernelFile:
                 written = self.path.read_bytes()
                 data = written[_SIGNATURE_BYTES:]
                 if written[:_SIGNATURE_BYTES] == _signature(data):
+                    self.calls = kernel_calls.called(data)
                     return CompileResult._rebuild(target_context, *pickle.loads(data))
                 warnings.warn(f"{self.path} is damaged; it is compiled anew", stacklevel=2)
         except FileNotFoundError:
@@ -135,11 +143,12 @@ class KernelFile:
         """Write a compiled function; where that fails, it is not kept, with a warning."""
         from numba.core.serialize import dumps
 
+        data = dumps(result._reduce())
+        self.calls = kernel_calls.called(data)
         if self.path is None or result._asdict()["library"].has_dynamic_globals:
             return
         from fmtorch.storage.files import replacing
 
-        data = dumps(result._reduce())
         try:
             with replacing(self.path) as temporary:
                 temporary.write_bytes(_signature(data) + data)

@@ -24,7 +24,7 @@ from typing import Any, Generic, ParamSpec, TypeVar, overload
 
 import numpy as np
 
-from fmtorch import kernel_cache
+from fmtorch import kernel_cache, kernel_calls
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -53,25 +53,40 @@ class Kernel(Generic[P, R]):
         self.signature = f"({signature},)"  # a tuple, of one argument too
         self.brief = brief
         self._compiled: Callable[P, R] | None = None
+        self._calls: list[Kernel[..., Any]] = []
         self.__call__ = self._first_call
 
     def _first_call(self, *args: P.args, **kwargs: P.kwargs) -> R:
         return self.compiled()(*args, **kwargs)
 
-    def compiled(self, count: str = "") -> Callable[P, R]:
-        """The compiled function: of this process, of the cache folder, or compiled now, which a message tells.
+    def compiled(self) -> Callable[P, R]:
+        """The compiled function, ready to be called: of this process, of the cache folder, or compiled now.
 
-        count: what the message begins with. Raises ImportError where numba cannot be imported.
+        Raises ImportError where numba cannot be imported.
+        """
+        with _lock:
+            if not self.ready:
+                function = self.compiled_alone()
+                for each in self._calls:
+                    each.compiled()
+                self.__call__ = function
+        return self.__call__
+
+    def compiled_alone(self, count: str = "") -> Callable[P, R]:
+        """The compiled function, not to be called before those that it calls are compiled, too.
+
+        A message tells where it is compiled now; count: what the message begins with. Raises ImportError where numba
+        cannot be imported.
         """
         with _lock:
             if self._compiled is None:
-                self._compiled = self.__call__ = _compiled(self.function, self.signature, self.brief, count)
+                self._compiled, self._calls = _compiled(self.function, self.signature, self.brief, count)
         return self._compiled
 
     @property
     def ready(self) -> bool:
-        """Whether this process has it compiled."""
-        return self._compiled is not None
+        """Whether this process has compiled it and those that it calls."""
+        return self._compiled is not None and self.__call__ is self._compiled
 
     @property
     def kept(self) -> bool:
@@ -79,9 +94,9 @@ class Kernel(Generic[P, R]):
         path = kernel_cache.KernelFile(self.function, self.signature, print).path
         return path is not None and path.is_file()
 
-    @property
+    @functools.cached_property
     def _numba_type_(self) -> Any:  # asked by numba where a kernel calls this one
-        return _type_of(self.compiled())
+        return kernel_calls.callable_type(self.function, self.signature)
 
     def __reduce__(self) -> str:
         return str(self.__qualname__)  # type: ignore[attr-defined]  # the name to import it by
@@ -141,7 +156,9 @@ def prepare(kernels: Sequence[Kernel[..., Any]]) -> None:
     Raises ImportError where numba cannot be imported.
     """
     for number, each in enumerate(kernels, start=1):
-        each.compiled(f"{number} of {len(kernels)}: ")
+        each.compiled_alone(f"{number} of {len(kernels)}: ")
+    for each in kernels:
+        each.compiled()
 
 
 class _Fused(Inner[[Any, Any, Any], Any]):
@@ -207,21 +224,26 @@ def identity() -> str:
     return f"numba {numba_version()}" if available() else "off"
 
 
-def _compiled(function: Callable[P, R], signature: str, brief: bool, count: str) -> Callable[P, R]:
+def _compiled(
+    function: Callable[P, R], signature: str, brief: bool, count: str
+) -> tuple[Callable[P, R], list[Kernel[..., Any]]]:
+    """The compiled function, whose address its cell holds from now on, and the kernels that it calls."""
     import numba
 
     dispatcher: Any = numba.njit(**(OPTIONS | {"nogil": not brief}))(function)
     if not hasattr(dispatcher, "compile"):
-        return function  # NUMBA_DISABLE_JIT=1
+        return function, []  # NUMBA_DISABLE_JIT=1
 
     def tell(where: str) -> None:
         print(f"{count}compiling {function.__name__} {where}", file=sys.stderr, flush=True)
 
-    dispatcher._cache = kernel_cache.KernelFile(function, signature, tell)
+    file = dispatcher._cache = kernel_cache.KernelFile(function, signature, tell)
     dispatcher.compile(signature)
     dispatcher.disable_compile()
+    (made,) = dispatcher.overloads.values()
+    kernel_calls.publish(function, made)
     compiled: Callable[P, R] = dispatcher
-    return compiled
+    return compiled, file.calls
 
 
 def _type_of(dispatcher: Any) -> Any:

@@ -8,9 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-import torch
-
-Network = TypeVar("Network", bound=torch.nn.Module)
+Network = TypeVar("Network")
 
 _PACKAGE = Path(__file__).resolve().parent
 
@@ -43,6 +41,8 @@ def pretrained(load: Callable[[], Network], name: str, publisher: str, file: str
             warnings.simplefilter("ignore")  # of each attempt; the last one's error says it all
             network = load()
     except (RuntimeError, OSError) as error:
+        import torch
+
         cause = str(error.__cause__ or error).splitlines()[0]
         raise ConnectionError(
             f"the weights of {name} cannot be loaded ({cause}). They are not part of this project: run once with "

@@ -30,7 +30,7 @@ def square(x):
     return x * x
 
 @kernel("f4[::1], f8, f4[::1]")
-def scaled_squares(x, scale, out):
+def scaled_squares(x, scale, out) -> None:
     for i in range(len(x)):
         out[i] = np.float32(square(x[i]) * scale)
 
@@ -96,6 +96,41 @@ EXPECTED = [[2, 8], [18, 32]]
 def test_a_kernel_calls_kernels_and_inner_functions(module: types.ModuleType) -> None:
     assert result(module) == EXPECTED
     assert module.square(3) == 9  # an inner function is also a plain one
+
+
+RETURNING = """
+from fmtorch.kernels import kernel
+
+@kernel("f8")
+def half(x){annotation}:
+    return x / 2
+
+@kernel("f8, b1")
+def quarter(x, sure) -> float:
+    return half(half(x)) if sure else x
+"""
+
+
+def test_kernels_compiled_in_any_order_and_loaded_call_one_another(tmp_path: Path, cache: Path) -> None:
+    module = load(tmp_path, RETURNING.format(annotation=" -> float"))
+    module.quarter.compiled_alone()
+    assert not module.quarter.ready
+    assert not module.half.kept
+    assert module.quarter(8.0, True) == 2
+    assert module.half.kept
+    (folder,) = cache.iterdir()
+    for path in folder.glob("*half-*.bin"):
+        path.unlink()
+    again = load(tmp_path, RETURNING.format(annotation=" -> float"))
+    assert again.quarter(8.0, True) == 2
+    assert again.half.kept
+
+
+@pytest.mark.parametrize("annotation", ["", " -> int", " -> None", " -> tuple"])
+def test_what_a_kernel_returns_to_kernels_must_be_annotated(tmp_path: Path, annotation: str) -> None:
+    module = load(tmp_path, RETURNING.format(annotation=annotation))
+    with pytest.raises((TypeError, numba.core.errors.TypingError), match=r"half|none"):
+        module.quarter(8.0, True)
 
 
 def test_what_does_not_fit_the_signature_is_refused(module: types.ModuleType) -> None:
@@ -180,10 +215,10 @@ def test_an_edited_callee_changes_the_folder(tmp_path: Path) -> None:
     assert digests[0] != digests[1]
     callee.rename(tmp_path / "deep" / "c_kernels.py")
     assert kernel_cache.sources_digest(tmp_path) == digests[1]
-    for name in ("kernels.py", "lanes.py", "lane_types.py"):
+    for name in ("kernels.py", "kernel_calls.py", "lanes.py", "lane_types.py"):
         (tmp_path / name).write_text("other decorators")
         digests.append(kernel_cache.sources_digest(tmp_path))
-    assert len(set(digests)) == 5
+    assert len(set(digests)) == 6
 
 
 def test_the_folder_depends_on_what_decides_the_machine_code(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,94 @@
+"""How compiled kernels call one another: through an address that is looked up when the call is made.
+
+What numba compiles it links with all that it calls, and so compiles a kernel again for each that calls it. Here each
+kernel has a cell of memory that holds its address, and what calls it knows the cell by name. So every kernel is
+compiled once, alone and in any order; before it is first called, those that it calls must have their addresses.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+import re
+from collections.abc import Callable
+from typing import Any
+
+SYMBOL = "fmtorch_kernel:{module}:{name}:"  # of a cell; colons, since machine code may not separate its names
+_NAME = re.compile(rb"fmtorch_kernel:([\w.]+):(\w+):")
+RETURNED = {"None": "none", "bool": "boolean", "int": "int64", "float": "float64"}  # numba's types, by annotation
+_cells: dict[str, ctypes.c_void_p] = {}
+
+
+def cell(module: str, name: str) -> ctypes.c_void_p:
+    """The cell of the kernel of this name, which compiled code finds from now on."""
+    from llvmlite import binding
+
+    symbol = SYMBOL.format(module=module, name=name)
+    if symbol not in _cells:
+        _cells[symbol] = ctypes.c_void_p()
+        binding.add_symbol(symbol, ctypes.addressof(_cells[symbol]))
+    return _cells[symbol]
+
+
+def called(machine_code: bytes) -> list[Any]:
+    """The kernels whose cells are named in machine code; from now on it finds these cells."""
+    places = sorted({(found[1].decode(), found[2].decode()) for found in _NAME.finditer(machine_code)})
+    for module, name in places:
+        cell(module, name)
+    return [getattr(importlib.import_module(module), name) for module, name in places]
+
+
+def callable_type(function: Callable[..., Any], signature: str) -> Any:
+    """What a kernel is to numba where another one calls it: a function of one signature, called by its cell.
+
+    Raises TypeError unless the function says by an annotation that it returns None, bool, int or float.
+    """
+    from llvmlite import ir
+    from numba.core import cgutils, sigutils, types
+    from numba.core.registry import cpu_target
+    from numba.core.typing import signature as typed
+    from numba.core.typing.templates import make_concrete_template
+
+    annotation = _returned(function)
+    if annotation not in RETURNED:
+        names = ", ".join(RETURNED)
+        raise TypeError(f"{function.__qualname__} is called by a kernel: annotate what it returns as one of {names}")
+    arguments, _ = sigutils.normalize_signature(signature)
+    whole = typed(getattr(types, RETURNED[annotation]), *arguments)
+    module, name = function.__module__, function.__qualname__
+    cell(module, name)
+
+    def call(context: Any, builder: Any, made: Any, values: Any) -> Any:
+        code = context.call_conv.get_function_type(whole.return_type, whole.args).as_pointer()
+        symbol = SYMBOL.format(module=module, name=name)
+        place = builder.module.globals.get(symbol) or ir.GlobalVariable(builder.module, code, symbol)
+        status, value = context.call_conv.call_function(
+            builder, builder.load(place), whole.return_type, whole.args, values
+        )
+        with cgutils.if_unlikely(builder, status.is_error):
+            context.call_conv.return_status_propagate(builder, status)
+        return value
+
+    cpu_target.target_context.insert_func_defn([(call, function, whole.args)])
+    return types.Function(make_concrete_template(name, function, [whole]))
+
+
+def publish(function: Callable[..., Any], made: Any) -> None:
+    """Put a compiled function's address into its cell. made: numba's `CompileResult`.
+
+    Raises TypeError where it returns something else than its annotation says to those that call it.
+    """
+    from numba.core import types
+
+    annotation = _returned(function)
+    returned = made.signature.return_type
+    if annotation in RETURNED and returned != getattr(types, RETURNED[annotation]):
+        raise TypeError(f"{function.__qualname__} is annotated to return {annotation}, but returns {returned}")
+    address = made.library.get_pointer_to_function(made.fndesc.llvm_func_name)
+    cell(function.__module__, function.__qualname__).value = address
+
+
+def _returned(function: Callable[..., Any]) -> str:
+    """The name of what a function says that it returns; empty where it does not say."""
+    annotation = function.__annotations__.get("return", "")
+    return annotation if isinstance(annotation, str) else getattr(annotation, "__name__", str(annotation))
