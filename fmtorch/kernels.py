@@ -53,7 +53,7 @@ class Kernel(Generic[P, R]):
         self.signature = f"({signature},)"  # a tuple, of one argument too
         self.brief = brief
         self._compiled: Callable[P, R] | None = None
-        self._calls: list[Kernel[..., Any]] = []
+        self.calls: list[Kernel[..., Any]] = []  # those that it calls, once it is compiled
         self.__call__ = self._first_call
 
     def _first_call(self, *args: P.args, **kwargs: P.kwargs) -> R:
@@ -67,7 +67,7 @@ class Kernel(Generic[P, R]):
         with _lock:
             if not self.ready:
                 function = self.compiled_alone()
-                for each in self._calls:
+                for each in self.calls:
                     each.compiled()
                 self.__call__ = function
         return self.__call__
@@ -80,7 +80,7 @@ class Kernel(Generic[P, R]):
         """
         with _lock:
             if self._compiled is None:
-                self._compiled, self._calls = _compiled(self.function, self.signature, self.brief, count)
+                self._compiled, self.calls = _compiled(self.function, self.signature, self.brief, count)
         return self._compiled
 
     @property

@@ -52,6 +52,25 @@ def draw(table: Array, totals: Array, mixed_seed: int, key: int, start: int, out
             begin[k], length[k] = first, weight
 
 
+@inner
+def draw_from(
+    table: Array, totals: Array, newest: Array, order: Array, mixed_seed: int, key: int, start: int, out: Array
+) -> None:  # fmt: skip
+    """The samples of `one_pair.sampling.Urn` -> out (size, count).
+
+    newest: (count,), the last match of each draw, the others being drawn from those before it; empty: all are drawn.
+    order: (n,), the matches that indices stand for; empty: themselves.
+    """
+    drawn = len(out) - (1 if len(newest) else 0)
+    draw(table, totals, mixed_seed, key, start, out[:drawn])
+    for j in range(drawn, len(out)):
+        for d in range(len(newest)):
+            out[j, d] = newest[d]
+    for j in range(len(out) if len(order) else 0):
+        for d in range(out.shape[1]):
+            out[j, d] = order[out[j, d]]
+
+
 @kernel("f8[::1], f8, i8[::1], i8[::1]", brief=True)
 def quantise(prior: Array, largest: float, weight: Array, table: Array) -> None:
     """Priors (n,) as weights from 1 up to the largest -> weight (n,), and these cumulated -> table (n,)."""

@@ -13,7 +13,7 @@ from fmtorch import kernels, metrics, presets
 from fmtorch.estimators import HypothesizeAndVerify, final_fits, inliers, sampling, scores
 from fmtorch.estimators.models import Models as TensorModels
 from fmtorch.estimators.one_pair import inliers as compiled_inliers
-from fmtorch.estimators.one_pair import sampling as compiled_sampling
+from fmtorch.estimators.one_pair import solvers as compiled_solvers
 from fmtorch.estimators.one_pair.models import Models
 from fmtorch.estimators.one_pair.pair import OnePair, each_pair
 from fmtorch.estimators.one_pair.pool import Verifier, shuffled
@@ -28,6 +28,7 @@ from fmtorch.geometry import eight_point
 from fmtorch.random import Stream
 from fmtorch.types import Correspondences, Estimate, collate
 from tests.conftest import oracle
+from tests.estimators.draws import drawn
 from tests.laws import degenerate, scene, scenes, small, with_padding
 
 pytest.importorskip("numba", reason="numba is not installed")
@@ -100,7 +101,7 @@ def test_samples_and_weights_are_the_same(name: str, count: int, kind: str) -> N
     for size in (7, 8):
         for start, draws in ((0, 100), (70_000, 31)):
             expected = part.draw(pairs, start, draws, size)[:, 0].numpy()
-            np.testing.assert_array_equal(compiled.draw(pair, start, draws, size), expected)
+            np.testing.assert_array_equal(drawn(compiled, pair, start, draws, size), expected)
 
 
 @pytest.mark.parametrize("count", COUNTS)
@@ -311,7 +312,7 @@ def test_which_wholes_have_a_kernel_form() -> None:
 
 
 def test_kernels_switched_off_are_not_called(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compiled_sampling, "draw", None)
+    monkeypatch.setattr(compiled_solvers, "samples_of_seven", None)
     monkeypatch.setenv(kernels.SWITCH, "off")
     assert bool(HypothesizeAndVerify(hypotheses=100)(scene(0)).ok)
     monkeypatch.setenv(kernels.SWITCH, "on")

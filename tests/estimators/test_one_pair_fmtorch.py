@@ -23,7 +23,6 @@ from fmtorch.estimators.one_pair.selection import Selection, scored
 from fmtorch.estimators.pairs import NormalizedPairs
 from fmtorch.estimators.registry import kernel_form
 from fmtorch.estimators.scores import score_models
-from fmtorch.geometry import sampson_objective_kernels
 from fmtorch.kernels import Kernel
 from fmtorch.types import collate
 from tests.estimators.test_one_pair import both, in_both_forms, models, real_pairs, solved, told
@@ -275,14 +274,22 @@ def test_the_kernels_that_are_compiled_together_are_those_that_are_called(monkey
     estimator = presets.build("estimator", "fmtorch")
     for c in (scene(0, 300), scene(0, 300, outliers=0.8).replace(size1=torch.tensor([[700, 900]]))):
         estimator(c)
-    within = {sampson_objective_kernels.evaluate}  # called by other kernels alone
-    assert called | within == set(ahead.FOCAL)
+    assert with_callees(called) == set(ahead.FOCAL)
     for framed, name in ((False, "position_consistency"), (True, "frame_consistency")):
         c = scene(0, 300)
         frames = {"lafs0": c.lafs0, "lafs1": c.lafs1, "quality": c.quality} if framed else {}
         called.clear()
         find_fundamental(c.x0, c.x1, size0=c.size0, size1=c.size1, **frames)
-        assert called - set(ahead.FOCAL) == set(ahead.PRIORS[name])
+        assert with_callees(called) - set(ahead.FOCAL) == set(ahead.PRIORS[name])
+
+
+def with_callees(kernels: set[Kernel]) -> set[Kernel]:
+    """Kernels, and those that they call."""
+    found, new = set[Kernel](), kernels
+    while new:
+        found |= new
+        new = {callee for each in new for callee in each.calls} - found
+    return found
 
 
 def test_gradients_in_both_forms() -> None:

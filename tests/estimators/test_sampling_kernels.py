@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 
-from fmtorch.estimators import sampling_kernels
+from fmtorch.estimators import sampling_kernels, solvers
 from fmtorch.estimators.one_pair import sampling as one_pair
 from fmtorch.estimators.one_pair.pair import each_pair
+from fmtorch.estimators.one_pair.solvers import MinimalSamples, SevenPoint
 from fmtorch.estimators.pairs import normalized_pairs
+from fmtorch.estimators.registry import kernel_form
 from fmtorch.estimators.sampling import PriorWeighted, Prosac, Uniform
 from fmtorch.random import Stream, mixed_seed
 from fmtorch.types import Correspondences
+from tests.estimators.draws import drawn
 from tests.laws import scene
 
 pytest.importorskip("numba", reason="numba is not installed")
@@ -72,4 +77,15 @@ def test_prosac_without_a_rank_draws_the_same_uniform_samples() -> None:
     (pairs,), _ = normalized_pairs(pair(100).replace(quality=None, prior=None), 3, 7)
     (one,) = each_pair(pairs)
     expected = Prosac().draw(pairs, 100, 300, 7)[:, 0].numpy()
-    np.testing.assert_array_equal(one_pair.Prosac(Prosac()).draw(one, 100, 300, 7), expected)
+    np.testing.assert_array_equal(drawn(one_pair.Prosac(Prosac()), one, 100, 300, 7), expected)
+
+
+@pytest.mark.parametrize("prior", ["given", "none"])
+@pytest.mark.parametrize("tensors", [Uniform(), Prosac(), PriorWeighted()])
+def test_samples_that_are_drawn_and_solved_in_one_call(tensors: Any, prior: str) -> None:
+    (pairs,), _ = normalized_pairs(pair(150, prior), 3, 7)
+    (one,) = each_pair(pairs)
+    expected = tensors.draw(pairs, 60, 200, 7)[:, 0].numpy()
+    solver = SevenPoint(solvers.SevenPoint())
+    samples = MinimalSamples(solver, kernel_form(tensors))(one, 60, 200).samples
+    np.testing.assert_array_equal(samples, expected)

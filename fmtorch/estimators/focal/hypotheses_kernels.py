@@ -1,4 +1,4 @@
-"""Focal lengths drawn from their prior for the samples of one pair, compiled: those of `prior.draw_focal_lengths`."""
+"""Hypotheses of five matches and drawn focal lengths for one pair, compiled: those of `hypotheses`."""
 
 from __future__ import annotations
 
@@ -7,18 +7,39 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.estimators.sampling_kernels import draw_from
 from fmtorch.geometry.arithmetic_kernels import exponential
+from fmtorch.geometry.five_point_kernels import five_point
 from fmtorch.kernels import kernel
 from fmtorch.random_kernels import random_bits, stream_state
 
 Array = NDArray[Any]
 
 
+@kernel(
+    "i8[::1], i8[::1], i8[::1], i8[::1], f8[::1], f8[::1], b1, f8[::1], i8, i8, i8, i8, f8[:, ::1], f8[::1], "
+    "i8[:, ::1], f4[:, ::1], i8[::1]"
+)
+def samples_of_five(
+    table: Array, totals: Array, newest: Array, order: Array, normal: Array, numbers: Array, same_size: bool,
+    longest: Array, sampling_seed: int, focal_seed: int, key: int, start: int, points: Array, offset: Array,
+    sample: Array, F: Array, draw: Array,
+) -> int:  # fmt: skip
+    """Samples drawn and solved in one call: as `solvers_kernels`, with the focal lengths of `draw_depths`.
+
+    points: (4, n), from the principal points. offset: (4,), what was added to them.
+    """
+    depth = np.empty((2, sample.shape[1]))
+    draw_from(table, totals, newest, order, sampling_seed, key, start, sample)
+    draw_depths(normal, numbers, same_size, longest, focal_seed, key, start, depth)
+    return five_point(points, sample, depth, offset, F, draw)
+
+
 @kernel("f8[::1], f8[::1], b1, f8[::1], i8, i8, i8, f8[:, ::1]", brief=True)
 def draw_depths(
     normal: Array, numbers: Array, same_size: bool, longest: Array, mixed_seed: int, key: int, start: int, out: Array
 ) -> None:  # fmt: skip
-    """Focal lengths of draws start, start + 1, ... in the unit of the points -> out (2, count).
+    """Those of `prior.draw_focal_lengths`: of draws start, start + 1, ... in the unit of the points -> out (2, count).
 
     normal: (2^k,), quantiles of the normal distribution. numbers: mean and deviation of the mean logarithm, half the
     deviation of the logarithm of the ratio, share of draws of one focal length where the images have the same size.

@@ -5,13 +5,22 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-from fmtorch.estimators import pairs_kernels, pool_kernels, sampling_kernels, scores_kernels, support_kernels
+from fmtorch.estimators import (
+    pairs_kernels,
+    pool_kernels,
+    sampling_kernels,
+    scores_kernels,
+    solvers_kernels,
+    support_kernels,
+    verify_kernels,
+)
 from fmtorch.estimators.focal import (
     cameras_kernels,
     cheirality_kernels,
     fit_kernels,
     hypotheses_kernels,
     posterior_kernels,
+    refined_kernels,
     selection_kernels,
 )
 from fmtorch.geometry import (
@@ -48,6 +57,10 @@ FOCAL: tuple[Kernel[..., Any], ...] = (  # the slowest to compile first
     fit_kernels.gain_without_prior,
     scores_kernels.saturated_cells,
     hypotheses_kernels.draw_depths,
+    hypotheses_kernels.samples_of_five,
+    solvers_kernels.samples_of_seven,
+    verify_kernels.verify_by_saturated_gains,
+    refined_kernels.refine_with_prior,
     significance_kernels.most_significant,
     posterior_kernels.models_and_costs,
     pool_kernels.shuffled,

@@ -17,16 +17,13 @@ class Verifier:
 
     def __init__(self, score: Score, preselect: Preselect | None) -> None:
         self.score, self.preselect = score, preselect
-        self.first_look: Score = getattr(score, "first_look", score)
 
     def __call__(self, models: Models, pair: OnePair) -> Models:
         """As `pool.Verifier`."""
-        which = np.arange(len(models.F))
-        first_look = self._first_look(pair) if len(which) else None
-        if first_look is not None and self.preselect is not None and len(which) > self.preselect.survivors:
-            score, which = self.first_look(models.F, which, first_look), np.empty(self.preselect.survivors, np.int64)
-            compiled.best(score, which)
-        return Models(models.F, models.draw, models.samples, models.start, which, self.score(models.F, which, pair))
+        few = self._first_look(pair) if len(models.F) else None
+        survivors = len(models.F) if few is None or self.preselect is None else self.preselect.survivors
+        which, score = self.score.verify(models.F, survivors, pair if few is None else few, pair)
+        return Models(models.F, models.draw, models.samples, models.start, which, score)
 
     def _first_look(self, pair: OnePair) -> OnePair | None:
         """The pair with the matches of the first look; None where there is none."""

@@ -2,24 +2,38 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from fmtorch.estimators import sampling
 from fmtorch.estimators.one_pair.pair import Array, OnePair
-from fmtorch.estimators.sampling_kernels import draw, prosac_table, quantise
+from fmtorch.estimators.sampling_kernels import prosac_table, quantise
 from fmtorch.random import Stream, mixed_seed
 
-WEIGHTS_OF_ONE = np.empty(0, np.int64)  # as the kernel takes them
+NONE = np.empty(0, np.int64)
+
+
+class Urn(NamedTuple):
+    """What the samples of some draws are drawn from, as `draw_from` takes it.
+
+    table: (n,), cumulative weights of the matches; empty for weights of one. totals: (count,), of the weights that each
+    draw is made from. newest: (count,), the last match of each sample; order: (n,), the matches that indices stand
+    for; both may be empty.
+    """
+
+    table: Array
+    totals: Array
+    newest: Array = NONE
+    order: Array = NONE
 
 
 @runtime_checkable
 class Sampler(Protocol):
     """As `sampling.Sampler`."""
 
-    def draw(self, pair: OnePair, start: int, count: int, size: int) -> Array:
-        """Indices (size, count) of the matches in each of the draws start .. start + count - 1."""
+    def urn(self, pair: OnePair, start: int, count: int, size: int) -> Urn:
+        """Of samples of `size` matches, the draws start .. start + count - 1."""
         ...
 
     def weight(self, pair: OnePair) -> Array:
@@ -37,9 +51,9 @@ class Uniform:
         """As `Sampler.weight`."""
         return _equal_weights(pair)
 
-    def draw(self, pair: OnePair, start: int, count: int, size: int) -> Array:
-        """As `Sampler.draw`."""
-        return _drawn(pair, WEIGHTS_OF_ONE, np.full(count, pair.count), start, size)
+    def urn(self, pair: OnePair, start: int, count: int, size: int) -> Urn:
+        """As `Sampler.urn`."""
+        return _uniform(pair, count)
 
 
 class Prosac:
@@ -58,15 +72,13 @@ class Prosac:
         prosac_table(size, self.part.GROWTH, table)
         return table
 
-    def draw(self, pair: OnePair, start: int, count: int, size: int) -> Array:
-        """As `Sampler.draw`."""
+    def urn(self, pair: OnePair, start: int, count: int, size: int) -> Urn:
+        """As `Sampler.urn`."""
         if pair.quality is None and pair.prior is None:
-            return _drawn(pair, WEIGHTS_OF_ONE, np.full(count, pair.count), start, size)
+            return _uniform(pair, count)
         table = pair.once(("growth", size), lambda pair: self.growth(pair, size))
         newest = np.minimum(np.searchsorted(table, np.arange(start + 1, start + count + 1)), pair.count - 1)
-        sample = np.vstack([_drawn(pair, WEIGHTS_OF_ONE, newest, start, size - 1), newest])
-        ordered: Array = pair.once("best matches first", _best_first)[sample]
-        return ordered
+        return Urn(NONE, newest, newest, pair.once("best matches first", _best_first))
 
 
 class PriorWeighted:
@@ -80,11 +92,20 @@ class PriorWeighted:
         weight: Array = pair.once("weights", _quantised)[0]
         return weight
 
-    def draw(self, pair: OnePair, start: int, count: int, size: int) -> Array:
-        """As `Sampler.draw`."""
+    def urn(self, pair: OnePair, start: int, count: int, size: int) -> Urn:
+        """As `Sampler.urn`."""
         _, table = pair.once("weights", _quantised)
-        totals = pair.once(("totals", count), lambda pair: np.full(count, table[-1]))
-        return _drawn(pair, table, totals, start, size)
+        made: Urn = pair.once(("urn", count), lambda pair: Urn(table, np.full(count, table[-1])))
+        return made
+
+
+def seed_of(pair: OnePair) -> int:
+    """The seed of a pair's samples, mixed."""
+    return mixed_seed(pair.seed, Stream.SAMPLING)
+
+
+def _uniform(pair: OnePair, count: int) -> Urn:
+    return Urn(NONE, np.full(count, pair.count))
 
 
 def _equal_weights(pair: OnePair) -> Array:
@@ -105,10 +126,3 @@ def _best_first(pair: OnePair) -> Array:
         return np.argsort(pair.quality, kind="stable")
     assert pair.prior is not None
     return np.argsort(-pair.prior, kind="stable")
-
-
-def _drawn(pair: OnePair, table: Array, totals: Array, start: int, size: int) -> Array:
-    """Samples by the kernel `draw`, (size, count)."""
-    sample = np.empty((size, len(totals)), np.int64)
-    draw(table, totals, mixed_seed(pair.seed, Stream.SAMPLING), pair.key, start, sample)
-    return sample

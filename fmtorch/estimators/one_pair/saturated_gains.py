@@ -6,8 +6,11 @@ import numpy as np
 
 from fmtorch.estimators import saturated_gains
 from fmtorch.estimators.one_pair.pair import Array, OnePair
-from fmtorch.estimators.one_pair.scores import GemanMcClure, matches
+from fmtorch.estimators.one_pair.scores import GemanMcClure, OfMatches, matches, room
 from fmtorch.estimators.scores_kernels import saturated_cells, score_saturated
+from fmtorch.estimators.verify_kernels import verify_by_saturated_gains
+
+_OfMatches = tuple[Array, Array, Array, Array, int]  # points, support, scale, cells, fractional bits
 
 
 class SaturatedGains:
@@ -20,11 +23,20 @@ class SaturatedGains:
     def __call__(self, F: Array, which: Array, pair: OnePair) -> Array:
         """As `scores.Score`."""
         out = np.empty(len(which))
-        points, support, scale, cells, bits = pair.once(self, self._matches)
-        score_saturated(F, which, points, support, scale, cells, bits, out)
+        matches: _OfMatches = pair.once(self, self._matches)
+        score_saturated(F, which, *matches, out)
         return out
 
-    def _matches(self, pair: OnePair) -> tuple[Array, Array, Array, Array, int]:
+    def verify(self, F: Array, survivors: int, few: OnePair, pair: OnePair) -> tuple[Array, Array]:
+        """As `scores.Score.verify`, on few matches by the plain sum of gains."""
+        which, score = room(len(F), survivors)
+        look, matches = self.first_look, pair.once(self, self._matches)
+        first: OfMatches = few.once(look, look.matches)
+        points, support, scale, cells, bits = matches
+        verify_by_saturated_gains(F, *first, look.GAIN, look.table, points, support, scale, cells, bits, which, score)
+        return which, score
+
+    def _matches(self, pair: OnePair) -> _OfMatches:
         """What the kernel takes of the matches."""
         weighted = self.part.prior_weighted
         points, support, scale, bits = matches(pair, self.part.threshold, weighted)

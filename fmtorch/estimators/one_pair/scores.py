@@ -10,6 +10,7 @@ import torch
 from fmtorch.estimators import scores
 from fmtorch.estimators import scores_kernels as compiled
 from fmtorch.estimators.one_pair.pair import Array, OnePair
+from fmtorch.estimators.pool_kernels import best
 from fmtorch.estimators.scores_kernels import (
     COUNT,
     GEMAN_MCCLURE,
@@ -18,8 +19,10 @@ from fmtorch.estimators.scores_kernels import (
     score_gains,
     score_median,
 )
+from fmtorch.estimators.verify_kernels import verify_by_gains
 from fmtorch.geometry.arithmetic import fractional_bits
 
+OfMatches = tuple[Array, Array, Array, int]  # what `matches` makes
 NO_TABLE = np.empty(0, np.float32)
 
 
@@ -31,8 +34,15 @@ class Score(Protocol):
         """Scores (k,) of those of the models (m, 9), float32, that have the indices `which` (k,), on all matches."""
         ...
 
+    def verify(self, F: Array, survivors: int, few: OnePair, pair: OnePair) -> tuple[Array, Array]:
+        """The indices (k,), ascending, of the best k models on few matches, and their scores (k,) on all.
 
-def matches(pair: OnePair, threshold: float, prior_weighted: bool) -> tuple[Array, Array, Array, int]:
+        Where there are no more models than survivors, all are scored at once.
+        """
+        ...
+
+
+def matches(pair: OnePair, threshold: float, prior_weighted: bool) -> OfMatches:
     """Points (4, n), what each match counts (n,), one over the square of its threshold (n,); fractional bits of gains.
 
     The arrays are float32.
@@ -40,6 +50,12 @@ def matches(pair: OnePair, threshold: float, prior_weighted: bool) -> tuple[Arra
     out = np.empty((6, pair.count), np.float32)
     compiled.matches(pair.table, threshold, prior_weighted, out)
     return out[:4], out[4], out[5], fractional_bits(pair.count, torch.float32)
+
+
+def room(models: int, survivors: int) -> tuple[Array, Array]:
+    """For the indices and the scores of the models that are scored on all matches."""
+    k = min(models, survivors)
+    return np.empty(k, np.int64), np.empty(k)
 
 
 class SummedGains:
@@ -53,11 +69,20 @@ class SummedGains:
     def __call__(self, F: Array, which: Array, pair: OnePair) -> Array:
         """As `Score`."""
         out = np.empty(len(which))
-        points, support, scale, bits = pair.once(self, self._matches)
+        points, support, scale, bits = pair.once(self, self.matches)
         score_gains(F, which, points, support, scale, self.GAIN, self.table, bits, out)
         return out
 
-    def _matches(self, pair: OnePair) -> tuple[Array, Array, Array, int]:
+    def verify(self, F: Array, survivors: int, few: OnePair, pair: OnePair) -> tuple[Array, Array]:
+        """As `Score.verify`."""
+        which, score = room(len(F), survivors)
+        first: OfMatches = few.once(self, self.matches)
+        matches: OfMatches = pair.once(self, self.matches)
+        verify_by_gains(F, *first, self.GAIN, self.table, *matches, which, score)
+        return which, score
+
+    def matches(self, pair: OnePair) -> OfMatches:
+        """What kernels take of the matches."""
         return matches(pair, self.part.threshold, self.part.prior_weighted)
 
 
@@ -100,3 +125,13 @@ class Median:
         out = np.empty(len(which))
         score_median(F, which, pair.points32, out)
         return out
+
+    def verify(self, F: Array, survivors: int, few: OnePair, pair: OnePair) -> tuple[Array, Array]:
+        """As `Score.verify`."""
+        which, _ = room(len(F), survivors)
+        every = np.arange(len(F))
+        if len(which) < len(F):
+            best(self(F, every, few), which)
+        else:
+            which = every
+        return which, self(F, which, pair)

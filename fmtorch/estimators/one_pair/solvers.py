@@ -9,9 +9,8 @@ import numpy as np
 from fmtorch.estimators import solvers
 from fmtorch.estimators.one_pair.models import Models
 from fmtorch.estimators.one_pair.pair import Array, OnePair
-from fmtorch.estimators.one_pair.sampling import Sampler
-from fmtorch.geometry.eight_point_kernels import eight_point
-from fmtorch.geometry.seven_point_kernels import seven_point
+from fmtorch.estimators.one_pair.sampling import Sampler, Urn, seed_of
+from fmtorch.estimators.solvers_kernels import samples_of_eight, samples_of_seven
 
 
 @runtime_checkable
@@ -21,8 +20,10 @@ class Solver(Protocol):
     size: int
     solutions: int
 
-    def __call__(self, points: Array, sample: Array, F: Array, draw: Array) -> int:
-        """Models of samples (size, s) of points (4, n) -> F (m, 9) and the sample of each; how many there are."""
+    def __call__(
+        self, urn: Urn, seed: int, key: int, start: int, points: Array, sample: Array, F: Array, draw: Array
+    ) -> int:
+        """Draws from an urn and solves: as `solvers_kernels`."""
         ...
 
 
@@ -34,9 +35,11 @@ class SevenPoint:
     def __init__(self, part: solvers.SevenPoint) -> None:
         pass
 
-    def __call__(self, points: Array, sample: Array, F: Array, draw: Array) -> int:
+    def __call__(
+        self, urn: Urn, seed: int, key: int, start: int, points: Array, sample: Array, F: Array, draw: Array
+    ) -> int:
         """As `Solver`."""
-        return seven_point(points, sample, F, draw)
+        return samples_of_seven(*urn, seed, key, start, points, sample, F, draw)
 
 
 class EightPoint:
@@ -47,9 +50,11 @@ class EightPoint:
     def __init__(self, part: solvers.EightPoint) -> None:
         pass
 
-    def __call__(self, points: Array, sample: Array, F: Array, draw: Array) -> int:
+    def __call__(
+        self, urn: Urn, seed: int, key: int, start: int, points: Array, sample: Array, F: Array, draw: Array
+    ) -> int:
         """As `Solver`."""
-        return eight_point(points, sample, F, draw)
+        return samples_of_eight(*urn, seed, key, start, points, sample, F, draw)
 
 
 class MinimalSamples:
@@ -60,8 +65,8 @@ class MinimalSamples:
 
     def __call__(self, pair: OnePair, start: int, count: int) -> Models:
         """The models of the draws start .. start + count - 1, in their order."""
-        sample = self.sampler.draw(pair, start, count, self.size)
+        urn, sample = self.sampler.urn(pair, start, count, self.size), np.empty((self.size, count), np.int64)
         F = np.empty((count * self.solver.solutions, 9), np.float32)
         draw = np.empty(len(F), np.int64)
-        m = self.solver(pair.points, sample, F, draw)
+        m = self.solver(urn, seed_of(pair), pair.key, start, pair.points, sample, F, draw)
         return Models(F[:m], draw[:m], sample, start)

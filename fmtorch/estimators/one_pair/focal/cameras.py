@@ -59,17 +59,21 @@ class CentredPair(NamedTuple):
         return made
 
 
-def _centred(pair: OnePair, scale_px: float) -> CentredPair:
-    images = pair.shared.get("images")
+def images_of(pair: OnePair) -> tuple[Array, Array, bool]:
+    """Offset, longest and same_size of `CentredPair`, made once."""
+    images: tuple[Array, Array, bool] | None = pair.shared.get("images")
     if images is None:
         images = pair.shared["images"] = _images(pair)
-    out = np.empty((6, pair.count))
+    return images
+
+
+def _centred(pair: OnePair, scale_px: float) -> CentredPair:
+    images, out = images_of(pair), np.empty((6, pair.count))
     centre(pair.table, images[0], scale_px, out)
     return CentredPair(out[:4], out[4], out[5], *images)
 
 
 def _images(pair: OnePair) -> tuple[Array, Array, bool]:
-    """Offset, longest and same_size of `CentredPair`."""
     unit, (h0, w0, h1, w1) = pair.pixels_per_unit, pair.sizes.tolist()
     sides = w0, h0, w1, h1
     pixel = 0.0 if max(sides) < MIN_IMAGE_SIDE_PX else 1.0

@@ -7,12 +7,11 @@ import math
 import numpy as np
 
 from fmtorch.estimators.focal import hypotheses, prior
-from fmtorch.estimators.focal.hypotheses_kernels import draw_depths
+from fmtorch.estimators.focal.hypotheses_kernels import samples_of_five
 from fmtorch.estimators.one_pair.focal.cameras import CentredPair
 from fmtorch.estimators.one_pair.models import Models
-from fmtorch.estimators.one_pair.pair import Array, OnePair
-from fmtorch.estimators.one_pair.sampling import Sampler
-from fmtorch.geometry.five_point_kernels import five_point
+from fmtorch.estimators.one_pair.pair import OnePair
+from fmtorch.estimators.one_pair.sampling import Sampler, seed_of
 from fmtorch.random import Stream, mixed_seed
 
 SOLUTIONS = 10  # of five matches, at most
@@ -32,15 +31,11 @@ class FocalSamples:
 
     def __call__(self, pair: OnePair, start: int, count: int) -> Models:
         """The models of the draws start .. start + count - 1, in their order."""
-        sample, centred = self.sampler.draw(pair, start, count, self.size), CentredPair.of(pair)
-        depth = depths(pair, centred, start, count)
+        urn, centred = self.sampler.urn(pair, start, count, self.size), CentredPair.of(pair)
+        sample = np.empty((self.size, count), np.int64)
         F, draw = np.empty((SOLUTIONS * count, 9), np.float32), np.empty(SOLUTIONS * count, np.int64)
-        m = five_point(centred.points, sample, depth, centred.offset, F, draw)
+        m = samples_of_five(
+            *urn, QUANTILES, NUMBERS, centred.same_size, centred.longest, seed_of(pair),
+            mixed_seed(pair.seed, Stream.FOCAL), pair.key, start, centred.points, centred.offset, sample, F, draw,
+        )  # fmt: skip
         return Models(F[:m], draw[:m], sample, start)
-
-
-def depths(pair: OnePair, centred: CentredPair, start: int, count: int) -> Array:
-    """Focal lengths (2, count) of draws in the unit of the points: those of `prior.draw_focal_lengths`."""
-    out, seed = np.empty((2, count)), mixed_seed(pair.seed, Stream.FOCAL)
-    draw_depths(QUANTILES, NUMBERS, centred.same_size, centred.longest, seed, pair.key, start, out)
-    return out

@@ -6,11 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fmtorch.estimators.focal import posterior
-from fmtorch.estimators.focal.cameras_kernels import nearest_cameras
-from fmtorch.estimators.focal.cheirality_kernels import share_in_front
-from fmtorch.estimators.focal.posterior_kernels import minimise, models_and_costs
-from fmtorch.estimators.one_pair.focal.cameras import CentredPair, TwoCameras
+from fmtorch.estimators.focal import posterior, refined_kernels
+from fmtorch.estimators.focal.posterior_kernels import minimise
+from fmtorch.estimators.one_pair.focal.cameras import CentredPair, TwoCameras, images_of
 from fmtorch.estimators.one_pair.pair import Array, OnePair, squared
 from fmtorch.geometry.sampson_objective_kernels import LOSSES
 from fmtorch.geometry.sigma_consensus import LOSS_TABLE
@@ -47,12 +45,12 @@ def optimum(
 
 def refine_with_prior(F: Array, pair: OnePair, iterations: int) -> tuple[Array, Array, Array, TwoCameras]:
     """As `posterior.refine_with_prior` of models (k, 9): models, prior costs (k,), shares in front (k,), cameras."""
-    k, centred = len(F), CentredPair.of(pair, posterior.LOSS_SCALE_PX)
+    k, (offset, longest, same_size), unit = len(F), images_of(pair), pair.pixels_per_unit
     cameras = TwoCameras(np.empty((k, 2, 3, 3)), np.empty((k, 2)))
-    nearest_cameras(F, centred.offset, centred.longest, *cameras)
-    found = optimum(cameras, pair, "geman_mcclure", posterior.LOSS_SCALE_PX, posterior.INLIER_SIGMA_PX, iterations)
     models, cost, share = np.empty((k, 9)), np.empty(k), np.empty(k)
-    models_and_costs(found.F, found.cost, cameras.focal, centred.offset, centred.same_size, models, cost)
-    parallel = posterior.PARALLEL_PX / pair.pixels_per_unit
-    share_in_front(*cameras, centred.longest, found.F, centred.points, pair.support, centred.precision, parallel, share)
+    refined_kernels.refine_with_prior(
+        F, pair.table, offset, longest, same_size, posterior.LOSS_SCALE_PX, LOSSES["geman_mcclure"], LOSS_TABLE,
+        squared(unit / posterior.INLIER_SIGMA_PX), posterior.PARALLEL_PX / unit, iterations, *cameras, models, cost,
+        share,
+    )  # fmt: skip
     return models, cost, share, cameras
