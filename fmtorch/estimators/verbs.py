@@ -57,7 +57,7 @@ class Verbs:
         unsettled: list[int] = []
         for turn in range(focal.rounds):
             pool = focal.search(some, turn * focal.samples)
-            made = focal.selection.refined(pool.models, pool.valid, some, self.refine.near(pool, some))
+            made = focal.selection.of_pool(pool, some, self.refine)
             again = [False] * len(rows) if candidates is None else candidates.same_best(made)
             candidates = made if candidates is None else candidates.joined(made)
             top = candidates.best_alone()

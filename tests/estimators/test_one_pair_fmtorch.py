@@ -18,7 +18,7 @@ from fmtorch.estimators.one_pair.focal.cameras import CentredPair, TwoCameras
 from fmtorch.estimators.one_pair.focal.selection import Candidates
 from fmtorch.estimators.one_pair.models import Pool as PoolOfOne
 from fmtorch.estimators.one_pair.pair import OnePair
-from fmtorch.estimators.one_pair.refinement import near_models
+from fmtorch.estimators.one_pair.refinement import Near, near_models
 from fmtorch.estimators.one_pair.selection import Selection, scored
 from fmtorch.estimators.pairs import NormalizedPairs
 from fmtorch.estimators.registry import kernel_form
@@ -82,10 +82,10 @@ def test_matches_near_a_pool(count: int, most: int | None) -> None:
     pairs, pair = both(told(count))
     F = models(pairs, 6)
     if most is not None:
-        assert near_models(F[:0].numpy(), pair, 6.0, most).count == 0
+        assert near_models(F[:0].numpy(), pair, Near.of(pair, 6.0, most)).count == 0
         assert int(pool.near_models(torch.zeros(9, 1, 3), pairs, 6.0, most).count) == 0
     expected = pool.near_models(F.T[:, None].contiguous(), pairs, 6.0, most)
-    found = near_models(F.numpy(), pair, 6.0, most)
+    found = near_models(F.numpy(), pair, Near.of(pair, 6.0, most))
     n = int(expected.count)
     np.testing.assert_array_equal(found.points, expected.points[:, 0, :n])
     np.testing.assert_array_equal(found.weight, expected.weight[0, :n])

@@ -13,6 +13,7 @@ from fmtorch.estimators.focal.cameras import TwoCameras
 from fmtorch.estimators.focal.posterior import refine_with_prior
 from fmtorch.estimators.models import Pool
 from fmtorch.estimators.pairs import NormalizedPairs
+from fmtorch.estimators.refinement import AsFound, PoolRefinement
 from fmtorch.estimators.saturated_gains import SaturatedGains
 from fmtorch.estimators.scores import score_models
 from fmtorch.estimators.selection import Selection
@@ -97,6 +98,10 @@ class FocalSelection:
 
     def __init__(self, gain: SaturatedGains, iterations: int = 12, candidates: int = 12) -> None:
         self.gain, self.iterations, self.candidates = gain, iterations, candidates
+
+    def of_pool(self, pool: Pool, pairs: NormalizedPairs, refinement: PoolRefinement | AsFound) -> Candidates:
+        """The models of a pool refined on the matches near them, as `refinement` says which these are."""
+        return self.refined(pool.models, pool.valid, pairs, refinement.near(pool, pairs))
 
     def refined(
         self, F: Float[Tensor, "9 p k"], valid: Bool[Tensor, "p k"], pairs: NormalizedPairs, near: NormalizedPairs

@@ -61,6 +61,7 @@ FOCAL: tuple[Kernel[..., Any], ...] = (  # the slowest to compile first
     solvers_kernels.samples_of_seven,
     verify_kernels.verify_by_saturated_gains,
     refined_kernels.refine_with_prior,
+    refined_kernels.refine_near_with_prior,
     significance_kernels.most_significant,
     posterior_kernels.models_and_costs,
     pool_kernels.shuffled,

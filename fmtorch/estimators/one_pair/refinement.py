@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,17 +17,37 @@ from fmtorch.geometry.refine import RANK_TWO_ALREADY
 from fmtorch.random import Stream, mixed_seed
 
 
+class Near(NamedTuple):
+    """As `pool.near_models`: at most so many matches within a squared Sampson distance, in the unit of the points."""
+
+    limit: np.float32
+    mixed_seed: int
+    key: int
+    most: int
+
+    @staticmethod
+    def of(pair: OnePair, radius: float, most: int | None) -> Near | None:
+        """Of a pair. radius: in pixels. None: all matches."""
+        if most is None:
+            return None
+        limit = np.float32(squared(radius / pair.pixels_per_unit))
+        return Near(limit, mixed_seed(pair.seed, Stream.REFINEMENT), pair.key, most)
+
+
 class PoolRefinement:
     """As `refinement.PoolRefinement`."""
 
     def __init__(self, refine: Refine | None, local_optimization: LocalOptimization | None = None) -> None:
         self.refine, self.local_optimization = refine, local_optimization
 
+    def which_near(self, pair: OnePair) -> Near | None:
+        """Which matches near models these are refined on; None: all."""
+        refine = self.refine
+        return None if refine is None else Near.of(pair, refine.RADIUS * refine.scale, refine.matches)
+
     def near(self, pool: Pool, pair: OnePair) -> OnePair:
         """As `refinement.PoolRefinement.near`."""
-        if self.refine is None:
-            return pair
-        return near_models(pool.F[: pool.filled], pair, self.refine.RADIUS * self.refine.scale, self.refine.matches)
+        return near_models(pool.F[: pool.filled], pair, self.which_near(pair))
 
     def __call__(self, pool: Pool, pair: OnePair) -> Pool:
         """As `refinement.PoolRefinement`."""
@@ -41,6 +62,10 @@ class PoolRefinement:
 class AsFound:
     """As `refinement.AsFound`."""
 
+    def which_near(self, pair: OnePair) -> Near | None:
+        """As `PoolRefinement.which_near`."""
+        return None
+
     def near(self, pool: Pool, pair: OnePair) -> OnePair:
         """As `PoolRefinement.near`."""
         return pair
@@ -50,9 +75,9 @@ class AsFound:
         return pool
 
 
-def near_models(F: Array, pair: OnePair, radius: float, most: int | None) -> OnePair:
+def near_models(F: Array, pair: OnePair, which: Near | None) -> OnePair:
     """As `pool.near_models` of models (k, 9), float32."""
-    if most is None:
+    if which is None:
         return pair
-    index, limit = np.empty(min(most, pair.count), np.int64), np.float32(squared(radius / pair.pixels_per_unit))
-    return pair.take(index[: near(F, pair.points32, limit, mixed_seed(pair.seed, Stream.REFINEMENT), pair.key, index)])
+    index = np.empty(min(which.most, pair.count), np.int64)
+    return pair.take(index[: near(F, pair.points32, which.limit, which.mixed_seed, which.key, index)])

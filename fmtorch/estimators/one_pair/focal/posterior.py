@@ -10,6 +10,7 @@ from fmtorch.estimators.focal import posterior, refined_kernels
 from fmtorch.estimators.focal.posterior_kernels import minimise
 from fmtorch.estimators.one_pair.focal.cameras import CentredPair, TwoCameras, images_of
 from fmtorch.estimators.one_pair.pair import Array, OnePair, squared
+from fmtorch.estimators.one_pair.refinement import Near
 from fmtorch.geometry.sampson_objective_kernels import LOSSES
 from fmtorch.geometry.sigma_consensus import LOSS_TABLE
 
@@ -43,14 +44,46 @@ def optimum(
     return Optimum(start, F, cost, gradient, hessian)
 
 
-def refine_with_prior(F: Array, pair: OnePair, iterations: int) -> tuple[Array, Array, Array, TwoCameras]:
-    """As `posterior.refine_with_prior` of models (k, 9): models, prior costs (k,), shares in front (k,), cameras."""
-    k, (offset, longest, same_size), unit = len(F), images_of(pair), pair.pixels_per_unit
-    cameras = TwoCameras(np.empty((k, 2, 3, 3)), np.empty((k, 2)))
-    models, cost, share = np.empty((k, 9)), np.empty(k), np.empty(k)
-    refined_kernels.refine_with_prior(
-        F, pair.table, offset, longest, same_size, posterior.LOSS_SCALE_PX, LOSSES["geman_mcclure"], LOSS_TABLE,
-        squared(unit / posterior.INLIER_SIGMA_PX), posterior.PARALLEL_PX / unit, iterations, *cameras, models, cost,
-        share,
+class Refined(NamedTuple):
+    """Of k candidates, models (k, 9), prior costs (k,), shares in front (k,), cameras."""
+
+    models: Array
+    cost: Array
+    share: Array
+    cameras: TwoCameras
+
+
+def refine_with_prior(F: Array, pair: OnePair, iterations: int) -> Refined:
+    """As `posterior.refine_with_prior` of models (k, 9)."""
+    made = _room(len(F))
+    refined_kernels.refine_with_prior(F, pair.table, *_prior(pair, iterations), *_flat(made))
+    return made
+
+
+def refine_near_with_prior(F: Array, pair: OnePair, near: Near, iterations: int) -> Refined:
+    """The same of models (k, 9), float32, on the matches near them."""
+    made = _room(len(F))
+    refined_kernels.refine_near_with_prior(
+        F, pair.points32, near.limit, near.mixed_seed, near.key, near.most, pair.table, *_prior(pair, iterations),
+        *_flat(made),
     )  # fmt: skip
-    return models, cost, share, cameras
+    return made
+
+
+def _room(k: int) -> Refined:
+    return Refined(np.empty((k, 9)), np.empty(k), np.empty(k), TwoCameras(np.empty((k, 2, 3, 3)), np.empty((k, 2))))
+
+
+def _flat(made: Refined) -> tuple[Array, Array, Array, Array, Array]:
+    """In the kernels' order."""
+    return *made.cameras, made.models, made.cost, made.share
+
+
+def _prior(pair: OnePair, iterations: int) -> tuple[Array, Array, bool, float, int, Array, float, float, int]:
+    """What the kernels take of a pair's images and of the objective."""
+    offset, longest, same_size = images_of(pair)
+    unit = pair.pixels_per_unit
+    return (
+        offset, longest, same_size, posterior.LOSS_SCALE_PX, LOSSES["geman_mcclure"], LOSS_TABLE,
+        squared(unit / posterior.INLIER_SIGMA_PX), posterior.PARALLEL_PX / unit, iterations,
+    )  # fmt: skip

@@ -11,9 +11,10 @@ from fmtorch.estimators.focal import selection
 from fmtorch.estimators.focal.selection import MIN_GAIN_SHARE, RIVAL_GAIN_SHARE, SAME_CAMERAS, SAME_MODEL
 from fmtorch.estimators.focal.selection_kernels import posteriors, rivals
 from fmtorch.estimators.one_pair.focal.cameras import TwoCameras
-from fmtorch.estimators.one_pair.focal.posterior import refine_with_prior
+from fmtorch.estimators.one_pair.focal.posterior import Refined, refine_near_with_prior, refine_with_prior
 from fmtorch.estimators.one_pair.models import Pool
 from fmtorch.estimators.one_pair.pair import Array, OnePair
+from fmtorch.estimators.one_pair.refinement import AsFound, PoolRefinement
 from fmtorch.estimators.one_pair.scores import Score
 from fmtorch.estimators.one_pair.selection import Selection, scored
 
@@ -68,12 +69,22 @@ class FocalSelection:
     def __init__(self, part: selection.FocalSelection, gain: Score) -> None:
         self.gain, self.iterations, self.candidates = gain, part.iterations, part.candidates
 
+    def of_pool(self, pool: Pool, pair: OnePair, refinement: PoolRefinement | AsFound) -> Candidates:
+        """As `selection.FocalSelection.of_pool`."""
+        near = refinement.which_near(pair)
+        if near is None or not pool.filled:
+            return self.refined(pool.models, pool.valid, pair, refinement.near(pool, pair))
+        made = refine_near_with_prior(pool.F[: pool.filled], pair, near, self.iterations)
+        return self._candidates(made, pool.valid, pair)
+
     def refined(self, F: Array, valid: Array, pair: OnePair, near: OnePair) -> Candidates:
         """As `selection.FocalSelection.refined`."""
-        models, cost, share, cameras = refine_with_prior(F, near, self.iterations)
-        posterior = np.empty(len(models))
-        posteriors(scored(self.gain, models, pair), share, cost, valid, posterior)
-        return Candidates(models, posterior, cameras)
+        return self._candidates(refine_with_prior(F, near, self.iterations), valid, pair)
+
+    def _candidates(self, made: Refined, valid: Array, pair: OnePair) -> Candidates:
+        posterior = np.empty(len(made.models))
+        posteriors(scored(self.gain, made.models, pair), made.share, made.cost, valid, posterior)
+        return Candidates(made.models, posterior, made.cameras)
 
     def select(self, pool: Pool, pair: OnePair, others: Candidates | None) -> Selection:
         """As `selection.FocalSelection.select`."""
