@@ -59,7 +59,7 @@ def sources_digest(package: Path) -> str:
     """The digest of all kernels of a package, and of how they are compiled."""
     how = [
         path
-        for name in ("kernels.py", "kernel_calls.py", "lanes.py", "lane_types.py")
+        for name in ("kernels.py", "kernel_calls.py", "lanes.py", "lane_types.py", "lane_functions.py")
         if (path := package / name).is_file()
     ]
     files = [*sources(package), *how]

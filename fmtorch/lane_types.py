@@ -1,4 +1,4 @@
-"""`lanes` for numba: values of lanes as types, their operators and functions as vector instructions of LLVM.
+"""`lanes` for numba: values of lanes as types, their operators as vector instructions of LLVM.
 
 Imported when the first kernel that uses lanes is compiled.
 """
@@ -9,13 +9,10 @@ import operator
 from collections.abc import Callable
 from typing import Any
 
-import numba
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
-from numba.core.registry import cpu_target
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-from numba.extending import intrinsic, lower_builtin, models, register_model
+from numba.extending import lower_builtin, models, register_model
 
 INDEX = ir.IntType(64)
 ARITHMETIC = {"add": "fadd", "sub": "fsub", "mul": "fmul", "truediv": "fdiv"}
@@ -47,7 +44,7 @@ def _is_number(kind: Any) -> bool:
     return isinstance(kind, (types.Float, types.Integer))
 
 
-def _operands(args: tuple[Any, ...]) -> LanesType | None:
+def operands(args: tuple[Any, ...]) -> LanesType | None:
     """The type of lanes that both operands have or become; None where there is none."""
     found = {kind for kind in args if isinstance(kind, LanesType)}
     if len(found) != 1 or not all(kind in found or _is_number(kind) for kind in args):
@@ -56,7 +53,7 @@ def _operands(args: tuple[Any, ...]) -> LanesType | None:
     return None if kind.dtype == types.boolean else kind
 
 
-def _filled(context: Any, builder: Any, number: Any, given: Any, kind: LanesType) -> Any:
+def filled(context: Any, builder: Any, number: Any, given: Any, kind: LanesType) -> Any:
     """A number in all lanes; a value of lanes as it is."""
     if isinstance(given, LanesType):
         return number
@@ -71,7 +68,7 @@ def _filled(context: Any, builder: Any, number: Any, given: Any, kind: LanesType
 def _typed(function: Any, kind_of: Callable[[LanesType], LanesType]) -> None:
     class Template(AbstractTemplate):  # type: ignore[misc]
         def generic(self, args: Any, kws: Any) -> Any:
-            kind = _operands(args)
+            kind = operands(args)
             return None if kind is None or len(args) != 2 else signature(kind_of(kind), *args)
 
     infer_global(function)(Template)
@@ -79,8 +76,8 @@ def _typed(function: Any, kind_of: Callable[[LanesType], LanesType]) -> None:
 
 def _lowered(function: Any, instruction: Callable[[Any, Any, Any], Any]) -> None:
     def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
-        kind: Any = _operands(made.args)
-        a, b = (_filled(context, builder, value, given, kind) for value, given in zip(args, made.args, strict=True))
+        kind: Any = operands(made.args)
+        a, b = (filled(context, builder, value, given, kind) for value, given in zip(args, made.args, strict=True))
         return instruction(builder, a, b)
 
     for number in (types.Float, types.Integer):
@@ -125,179 +122,8 @@ lower_builtin(operator.invert, LanesType)(lambda context, builder, made, args: b
 
 class _Negative(AbstractTemplate):  # type: ignore[misc]
     def generic(self, args: Any, kws: Any) -> Any:
-        return None if _operands(args) is None else signature(args[0], *args)
+        return None if operands(args) is None else signature(args[0], *args)
 
 
 infer_global(operator.neg)(_Negative)
 lower_builtin(operator.neg, LanesType)(lambda context, builder, made, args: builder.fneg(args[0]))
-
-
-def _place(context: Any, builder: Any, array: Any, given: Any, row: Any, count: int, bits: Any) -> Any:
-    """Where a row of an array (rows, lanes) begins, as the place of a vector."""
-    data = context.make_array(array)(context, builder, given).data
-    place = builder.gep(data, [builder.mul(row, ir.Constant(INDEX, count))])
-    return builder.bitcast(place, ir.VectorType(bits, count).as_pointer())
-
-
-def _size(dtype: Any) -> int:
-    return 1 if dtype == types.boolean else int(dtype.bitwidth) // 8
-
-
-def load(count: int) -> Any:
-    """`lanes.Lanes.load` of so many lanes."""
-
-    @intrinsic  # type: ignore[untyped-decorator]
-    def of_row(context: Any, A: Any, row: Any) -> Any:
-        kind = LanesType(A.dtype, count)
-
-        def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
-            bits = context.get_data_type(A.dtype)
-            value = builder.load(_place(context, builder, A, args[0], args[1], count, bits), align=_size(A.dtype))
-            if A.dtype != types.boolean:
-                return value
-            return builder.icmp_unsigned("!=", value, ir.Constant(value.type, [0] * count))
-
-        return kind(A, types.int64), code
-
-    return of_row
-
-
-def fill(count: int) -> Any:
-    """`lanes.Lanes.fill` of so many lanes."""
-
-    @intrinsic  # type: ignore[untyped-decorator]
-    def of_number(context: Any, number: Any) -> Any:
-        kind = LanesType(number if isinstance(number, types.Float) else types.float64, count)
-
-        def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
-            return _filled(context, builder, args[0], made.args[0], kind)
-
-        return kind(number), code
-
-    return of_number
-
-
-def store() -> Any:
-    """`lanes.store`."""
-
-    @intrinsic  # type: ignore[untyped-decorator]
-    def to_row(context: Any, A: Any, row: Any, value: Any) -> Any:
-        if A.dtype != value.dtype:
-            raise numba.TypingError(f"{value} cannot be stored in an array of {A.dtype}")
-
-        def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
-            bits, vector = context.get_data_type(A.dtype), args[2]
-            if A.dtype == types.boolean:
-                vector = builder.zext(vector, ir.VectorType(bits, value.count))
-            place = _place(context, builder, A, args[0], args[1], value.count, bits)
-            builder.store(vector, place, align=_size(A.dtype))
-            return context.get_dummy_value()
-
-        return types.void(A, types.int64, value), code
-
-    return to_row
-
-
-def where() -> Any:
-    """`lanes.where`."""
-
-    @intrinsic  # type: ignore[untyped-decorator]
-    def select(context: Any, mask: Any, this: Any, that: Any) -> Any:
-        kind = _operands((this, that))
-        if kind is None or mask != kind.mask:
-            raise numba.TypingError(f"where of {mask}, {this} and {that}")
-
-        def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
-            first = _filled(context, builder, args[1], this, kind)
-            return builder.select(args[0], first, _filled(context, builder, args[2], that, kind))
-
-        return kind(mask, this, that), code
-
-    return select
-
-
-def sqrt() -> Any:
-    """`lanes.sqrt`."""
-    return _library("llvm.sqrt", 1)
-
-
-def absolute() -> Any:
-    """`lanes.absolute`."""
-    return _library("llvm.fabs", 1)
-
-
-def copysign() -> Any:
-    """`lanes.copysign`."""
-    return _library("llvm.copysign", 2)
-
-
-def any_lane() -> Any:
-    """`lanes.any_lane`."""
-
-    @intrinsic  # type: ignore[untyped-decorator]
-    def of_mask(context: Any, mask: Any) -> Any:
-        def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
-            bits = builder.bitcast(args[0], ir.IntType(mask.count))
-            return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
-
-        return types.boolean(mask), code
-
-    return of_mask
-
-
-def added() -> Any:
-    """`lanes.added`."""
-
-    @intrinsic  # type: ignore[untyped-decorator]
-    def of_value(context: Any, value: Any) -> Any:
-        def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
-            (total,), count = args, value.count
-            while count > 1:
-                count //= 2
-                halves = [_some(builder, total, range(k * count, (k + 1) * count)) for k in range(2)]
-                total = builder.fadd(*halves)
-            return builder.extract_element(total, ir.Constant(INDEX, 0))
-
-        return value.dtype(value), code
-
-    return of_value
-
-
-def _some(builder: Any, vector: Any, lanes: range) -> Any:
-    """These lanes of a vector."""
-    which = ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), list(lanes))
-    return builder.shuffle_vector(vector, ir.Constant(vector.type, ir.Undefined), which)
-
-
-def _library(name: str, arguments: int) -> Any:
-    """A function of LLVM that takes so many values of lanes."""
-
-    def made(kinds: tuple[Any, ...]) -> Any:
-        def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
-            vector, kind = args[0].type, kinds[0]
-            called = ir.FunctionType(vector, [vector] * len(args))
-            suffix = f"v{kind.count}f{kind.dtype.bitwidth}"
-            return builder.call(cgutils.get_or_insert_function(builder.module, called, f"{name}.{suffix}"), args)
-
-        return kinds[0](*kinds), code
-
-    if arguments == 1:
-
-        @intrinsic  # type: ignore[untyped-decorator]
-        def one(context: Any, value: Any) -> Any:
-            return made((value,))
-
-        return one
-
-    @intrinsic  # type: ignore[untyped-decorator]
-    def two(context: Any, value: Any, other: Any) -> Any:
-        return made((value, other))
-
-    return two
-
-
-def type_of(function: Any) -> Any:
-    """The type of an intrinsic, as which a kernel knows it."""
-    context = cpu_target.typing_context
-    context.refresh()
-    return context.resolve_value_type(function)

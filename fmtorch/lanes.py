@@ -34,7 +34,7 @@ class Value(np.ndarray):
 
 
 class LaneFunction(Inner[..., Any]):
-    """A function of lanes: in Python that of arrays, in kernels the intrinsic of this name in `lane_types`."""
+    """A function of lanes: in Python that of arrays, in kernels the intrinsic of this name in `lane_functions`."""
 
     def __init__(self, function: Callable[..., Any], *parameters: int) -> None:
         super().__init__(function, inline=False)
@@ -42,9 +42,9 @@ class LaneFunction(Inner[..., Any]):
 
     @functools.cached_property
     def _numba_type_(self) -> Any:  # asked by numba where a kernel calls this function
-        from fmtorch import lane_types
+        from fmtorch import lane_functions
 
-        return lane_types.type_of(getattr(lane_types, self.function.__name__)(*self.parameters))
+        return lane_functions.type_of(getattr(lane_functions, self.function.__name__)(*self.parameters))
 
 
 class Lanes(NamedTuple):
