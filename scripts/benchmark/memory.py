@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
-import resource
 import sys
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from rich.table import Table
 from fmtorch import presets
 from fmtorch.types import collate
 from scripts.benchmark.matched import console
+from scripts.benchmark.peak import peak_growth
 from scripts.benchmark.specs import build
 from scripts.benchmark.synthetic import synthetic_pair
 
@@ -68,6 +68,4 @@ def peak(spec: str, pairs: int, matches: int) -> tuple[float, float]:
     estimator(synthetic_pair(0, 200, 0), 0)  # lazy initialisation is not counted
     c = collate([synthetic_pair(i, matches, 0) for i in range(pairs)])
     size = sum(value.nbytes for value in vars(c).values() if isinstance(value, torch.Tensor)) / 2**20
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
-    estimator(c, 0)
-    return size, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10 - before
+    return size, peak_growth(lambda: estimator(c, 0))

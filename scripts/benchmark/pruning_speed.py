@@ -24,6 +24,7 @@ from torch import Tensor
 from fmtorch import presets
 from fmtorch.pruning import gms, lpm
 from fmtorch.types import Correspondences
+from scripts.benchmark.peak import peak_growth
 
 PEER = Path(__file__).resolve().parent / "opencv_gms.py"
 SIZE = (960, 1280)
@@ -74,15 +75,7 @@ def _peak_growth(name: str, options: dict[str, Any], n: int) -> float:
     stage = presets.build("pruner", name, **options)
     stage(correspondences(200))  # lazy initialisation is not counted
     c = correspondences(n)
-    before = _status("VmRSS")
-    stage(c)
-    return (_status("VmHWM") - before) / 1024
-
-
-def _status(field: str) -> int:
-    """kB; of the process itself, whereas ru_maxrss is inherited."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith(field))
+    return peak_growth(lambda: stage(c))
 
 
 def correspondences(n: int) -> Correspondences:
