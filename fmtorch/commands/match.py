@@ -78,7 +78,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     if "nsgd" in report:
         console.print(f"NSGD to the true F: {report['nsgd']:.4f}", highlight=False)
     for trouble in _troubles(result):
-        Console(stderr=True).print(f"[bold]{trouble}[/bold]", highlight=False)
+        Console(stderr=True).print(f"[bold]{trouble}[/bold]", highlight=False, soft_wrap=True)
     console.print(f"[dim]{folder}: {', '.join(written)}[/dim]", highlight=False)
     if isinstance(pipeline.extractor, CachedFeatures):
         console.print(f"[dim]{pipeline.extractor.report()}[/dim]", highlight=False)

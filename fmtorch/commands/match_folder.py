@@ -60,7 +60,7 @@ def match_folder(config: DictConfig, fields: FolderFields, pipeline_name: str, o
             work.match(*pair)
             progress.advance(bar)
     for trouble in work.troubles:
-        Console(stderr=True).print(trouble, style="bold", markup=False, highlight=False)
+        Console(stderr=True).print(trouble, style="bold", markup=False, highlight=False, soft_wrap=True)
     if work.taken:
         console.print(f"{work.taken} of {len(pairs)} pairs taken from an earlier run", highlight=False)
     if work.troubles and not work.done + work.taken:
