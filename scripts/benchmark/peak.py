@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import gc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,10 @@ def peak_growth(call: Callable[[], Any]) -> float:
     What the process claimed before, as for compiled kernels, does not hide it. Raises SystemExit where the kernel does
     not tell peaks anew, as anywhere but on Linux.
     """
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # what was freed is given back, or the call would use it
+    if trim is not None:
+        trim(0)
     try:
         (PROC / "clear_refs").write_text("5")  # the peak is counted from here
         before = _resident("VmRSS")
