@@ -13,7 +13,7 @@ import torch
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.geometry import fundamental_from_calibration
 from fmtorch.types import Correspondences
-from scripts.benchmark import stress, stress_cases, stress_table
+from scripts.benchmark import stress, stress_cases, stress_rows, stress_table
 from scripts.benchmark.stress_cases import RIGHT_PX, Case, on_plane, parallax
 from scripts.benchmark.stress_changes import CONDITIONS, COUNTS, INLIER_RATIOS, SWEEPS, ZOOM, match_count, noise, sizes
 
@@ -119,7 +119,7 @@ def test_tables_are_of_pairs_that_all_estimators_have_and_say_who_has_fewer_seed
 
     rows = [row("b", "0", 1.0, 1), row("b", "1", 1.0, 2), row("a", "0", 1.0, 3), row("a", "1", 1.0, 3),
             row("a", "2", 1.0, 1), row("a", "0", 2.0, 3)]  # fmt: skip
-    found = stress_table.comparable(rows, ["c", "a"])
+    found = stress_rows.comparable(rows, ["c", "a"])
     assert [(r["method"], r["pair"], r["level"]) for r in found] == [
         ("a", "0", 1.0), ("a", "1", 1.0), ("b", "0", 1.0), ("b", "1", 1.0),
     ]  # fmt: skip
@@ -157,6 +157,6 @@ def test_an_interrupted_run_goes_on_and_its_tables_stand_in_the_page(
     assert "as they are (2)" in text
     ElementTree.parse(tmp_path / "stress_noise.svg")
     assert "stress_noise.svg" in text
-    assert set(stress_table.levels(rows)) >= {"as they are", "f = 0.4"}
+    assert set(stress_rows.levels(rows)) >= {"as they are", "f = 0.4"}
     with pytest.raises(SystemExit, match="must be one of"):
         stress.run(argparse.Namespace(**{**vars(arguments), "only": ["colour"]}))

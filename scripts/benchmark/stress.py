@@ -22,7 +22,7 @@ import torch
 
 from fmtorch import metrics
 from fmtorch.types import Correspondences
-from scripts.benchmark import stress_cases, stress_table
+from scripts.benchmark import stress_cases, stress_rows, stress_table
 from scripts.benchmark.kept import Kept, Row, read
 from scripts.benchmark.specs import Method, identity, informed, read_specs
 from scripts.benchmark.stress_cases import Case, on_plane, parallax
@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> None:
         rows += measure(stress_cases.load(arguments), arguments)
     if not rows:
         raise SystemExit("nothing to show: name sets with --root or --rendered, or earlier figures with --from")
-    rows = stress_table.comparable(rows, [spec.strip("()") for spec in read_specs(arguments.specs)])
+    rows = stress_rows.comparable(rows, [spec.strip("()") for spec in read_specs(arguments.specs)])
     stress_table.show(rows)
     if arguments.update:
         stress_table.write(arguments.update, rows)
