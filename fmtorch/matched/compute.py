@@ -83,7 +83,7 @@ def _row(dataset: PairDataset, outcome: Outcome, most: int) -> dict[str, Any]:
         return {**row, "reason": "no matches are left"}
     x0, x1 = (x[0].to(torch.float64).numpy() for x in (c.x0.to(torch.float32), c.x1.to(torch.float32)))
     labels = label(dataset, pair, x0, x1)
-    norm = np.linalg.norm(pair.F)
+    norm = np.linalg.norm(pair.F) or 1.0  # zero where the pair determines none
     row |= {
         "matches": len(labels), "inliers": int((labels == 1).sum()), "outliers": int((labels == 0).sum()),
         "label": labels, "F": (pair.F / norm).ravel(),

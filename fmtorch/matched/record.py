@@ -20,7 +20,7 @@ class LabelledMatches(Record):
     """A batch of B pairs with N matches each (padded), labels and the true fundamental matrices.
 
     correspondences: the matches. label: (B, N) int8, 1 inlier, 0 outlier, -1 ignored, always -1 in masked slots.
-    F: (B, 3, 3) float64 of unit Frobenius norm, ``x1^T F x0 = 0``.
+    F: (B, 3, 3) float64 of unit Frobenius norm, ``x1^T F x0 = 0``; zero where none is known or determined.
     """
 
     correspondences: Correspondences

@@ -102,6 +102,14 @@ class StoredMatches(Dataset[LabelledMatches]):
         other.pairs = [self.pairs[i] for i in chosen]
         return other
 
+    def joined(self, other: StoredMatches) -> StoredMatches:
+        """The pairs of both data sets, this one's first, with this one's random changes and folder."""
+        both = copy.copy(self)
+        both._paths, both._open = [*self._paths, *other._paths], {}
+        both._rows = [*self._rows, *((number + len(self._paths), row) for number, row in other._rows)]
+        both.pairs, both.failures = [*self.pairs, *other.pairs], [*self.failures, *other.failures]
+        return both
+
     def augmented(self, augmentation: Augmentation | None, seed: int = 0) -> StoredMatches:
         """The same data set with other random changes."""
         other = copy.copy(self)

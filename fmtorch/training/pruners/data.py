@@ -13,6 +13,7 @@ from rich.progress import Progress
 
 from fmtorch import data, presets
 from fmtorch.data import ImagePair, PairDataset
+from fmtorch.data.matchable import ENOUGH
 from fmtorch.data.subset import subset
 from fmtorch.evaluation.run import select
 from fmtorch.matched import Augmentation, LabelledMatches, MatchedPairs, StoredMatches
@@ -22,6 +23,8 @@ from fmtorch.pipeline import Pipeline
 from fmtorch.presets import plain
 from fmtorch.storage.features import cached
 from fmtorch.terminal import reporter
+from fmtorch.training.photographs import list_photographs
+from fmtorch.training.planes import PlanePairs, PlaneViews
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -71,6 +74,12 @@ def labelled_matches(config: DictConfig, progress: Progress) -> Matches:
         + f" (of {dataset.name} the last {config.validation.scenes} scenes of each family, which share photographs "
         "with the training scenes)",
     }
+    if config.planes.photographs is not None:
+        planes = _planes(config, front, progress)
+        digests.append(planes.folder.name)
+        photographs = {about["scene"] for about in planes.pairs}
+        description["training"] += f" and {len(planes)} pairs of {len(photographs)} photographs seen as planes"
+        matched = matched.joined(planes)
     augmented = matched.augmented(Augmentation(**_ranges(plain(config.augmentation))), config.seed)
     return Matches(augmented, validation, hashlib.sha256(" ".join(digests).encode()).hexdigest(), description)
 
@@ -84,6 +93,19 @@ def _dataset(config: DictConfig, progress: Progress) -> PairDataset:
         dataset: PairDataset = presets.instantiate(options, "dataset")
         return dataset
     return data.load(**options, progress=reporter(progress, "drawing scenes"))
+
+
+def _planes(config: DictConfig, front: Pipeline, progress: Progress) -> StoredMatches:
+    """The matches of views of the config's photographs, of pairs with more inliers than the paper asks of a pair."""
+    options = _ranges(plain(config.planes))
+    folder, seed = options.pop("photographs"), options.pop("seed")
+    photographs = list_photographs(folder, config.photographs.sources, config.photographs.excluded)
+    pairs = PlanePairs(
+        photographs, PlaneViews(**options), seed,
+        workers=config.workers or os.cpu_count() or 1, progress=reporter(progress, "views of photographs"),
+    )  # fmt: skip
+    matched = _matched(config, pairs, list(range(len(pairs))), front, progress, "matches of photographs")
+    return matched.select(i for i, about in enumerate(matched.pairs) if about["inliers"] > ENOUGH)
 
 
 def _split(dataset: PairDataset, last: int) -> tuple[list[int], list[int]]:
@@ -116,7 +138,7 @@ def _no_estimator(c: Any, seed: int = 0) -> Any:
 
 def _matched(
     config: DictConfig, dataset: PairDataset, indices: list[int], front: Pipeline, progress: Progress, title: str
-) -> MatchedPairs:
+) -> StoredMatches:
     some = subset(dataset, indices) if len(indices) < len(dataset) else dataset
     workers = config.workers or os.cpu_count() or 1
     return MatchedPairs(some, front, workers=workers, progress=reporter(progress, title))

@@ -20,6 +20,7 @@ from fmtorch.options import Within, expect_options
 from fmtorch.presets import plain
 from fmtorch.storage.runs import identity_digest
 from fmtorch.terminal import console, progress_bars
+from fmtorch.training.planes import PlaneViews
 from fmtorch.training.pruners.batches import training_batches
 from fmtorch.training.pruners.data import labelled_matches
 from fmtorch.training.pruners.loop import claim, train
@@ -63,6 +64,14 @@ class Fields:
     checkpoint_every: Count = 100
 
 
+@dataclasses.dataclass(frozen=True)
+class PlanesFields(PlaneViews):
+    """What ``planes`` of the command's config holds: how to look at them, at which photographs, and a seed."""
+
+    photographs: Path | None = None
+    seed: Seed = 0
+
+
 PARTS = {"optimisation": Optimisation, "objective": Objective, "augmentation": Augmentation, "trainer": Trainer}
 
 
@@ -74,6 +83,7 @@ def run(config: DictConfig, name: str) -> Path:
     """
     read_fields(Fields, config)
     read_fields(ValidationFields, config.validation, "validation")
+    read_fields(PlanesFields, config.planes, "planes")
     for group, part in PARTS.items():
         expect_options(part, plain(config[group]), group)
     presets.expect_dataset(config.dataset)

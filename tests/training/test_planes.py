@@ -1,0 +1,160 @@
+"""Photographs as planes: the views show what their cameras see, and matches of them are judged by that."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from fmtorch.data import DepthDataset, ImagePair
+from fmtorch.data.images import ImageError
+from fmtorch.data.rendered.cameras import Camera
+from fmtorch.matched import MatchedPairs, collate
+from fmtorch.training.photographs import Photograph, package_photographs
+from fmtorch.training.planes import PlanePairs, PlaneViews, plane_depth, plane_homography, random_camera
+from tests.matched.conftest import SIFT
+
+SIZE = (300, 400)
+
+
+def cameras(count: int, limits: PlaneViews | None = None) -> list[Camera]:
+    return [random_camera(np.random.default_rng(seed), SIZE, limits or PlaneViews()) for seed in range(count)]
+
+
+def on_plane(x: np.ndarray) -> np.ndarray:
+    """Points of the photograph in the world: its longest side is 1, its middle the origin."""
+    h, w = SIZE
+    return np.column_stack([(x - np.array([(w - 1) / 2, (h - 1) / 2])) / max(h, w), np.zeros(len(x))])
+
+
+@pytest.fixture(scope="module")
+def photographs() -> list[Photograph]:
+    return [p for p in package_photographs() if p.path.name in ("chelsea.png", "rocket.jpg")]
+
+
+@pytest.fixture(scope="module")
+def planes(photographs: list[Photograph], tmp_path_factory: pytest.TempPathFactory) -> PlanePairs:
+    return PlanePairs(photographs, PlaneViews(views=3), root=tmp_path_factory.mktemp("planes"))
+
+
+def test_the_homography_is_the_cameras_projection() -> None:
+    x = np.random.default_rng(0).uniform(0, 299, (50, 2))
+    for camera in cameras(20):
+        there, depth = camera.project(on_plane(x))
+        by_homography = cv2.perspectiveTransform(x[None], plane_homography(camera, SIZE))[0]
+        assert np.allclose(there, by_homography, atol=1e-8)
+        assert (depth > 0).all()
+
+
+def test_depth_leads_back_to_the_plane() -> None:
+    for camera in cameras(20):
+        h, w = camera.size
+        x = np.random.default_rng(1).uniform(0, [w - 1, h - 1], (50, 2))
+        rays = np.column_stack([x, np.ones(50)]) @ np.linalg.inv(camera.K).T
+        world = (plane_depth(camera, x)[:, None] * rays - camera.t) @ camera.R
+        assert np.abs(world[:, 2]).max() < 1e-9
+    outside = np.array([[-1.0, 5.0], [w, 5.0], [5.0, h]])
+    assert np.isnan(plane_depth(camera, outside)).all()
+
+
+def test_views_look_at_the_photograph_as_far_as_they_may() -> None:
+    limits = PlaneViews(tilt=50.0, roll=0.0, part=(0.5, 0.8))
+    tilts = []
+    for camera in cameras(200, limits):
+        middle = np.array([[(camera.size[1] - 1) / 2, (camera.size[0] - 1) / 2]])
+        seen = cv2.perspectiveTransform(middle[None], np.linalg.inv(plane_homography(camera, SIZE)))[0, 0]
+        assert (seen >= 0).all() and (seen <= [SIZE[1], SIZE[0]]).all()
+        tilts.append(np.degrees(np.arccos(camera.R[2, 2])))
+    assert 40 < max(tilts) <= 50.0
+    assert min(tilts) < 5
+
+
+def test_views_show_the_photograph(photographs: list[Photograph], tmp_path: Path) -> None:
+    """The view of a frontal camera is the photograph, but for light and noise."""
+    frontal = PlaneViews(views=2, tilt=0.0, roll=0.0, part=(1.0, 1.0), scale=(1.0, 1.0))
+    pairs = PlanePairs(photographs[:1], frontal, root=tmp_path)
+    view = cv2.imread(str(pairs[0].image0.path), cv2.IMREAD_GRAYSCALE).astype(float)
+    picture = cv2.imread(str(photographs[0].path), cv2.IMREAD_GRAYSCALE).astype(float)
+    assert view.shape == picture.shape
+    rank = [np.argsort(np.argsort(cv2.GaussianBlur(v, (0, 0), 4).ravel())) for v in (view, picture)]
+    assert np.corrcoef(*rank)[0, 1] > 0.7
+
+
+def test_matches_are_judged_by_the_homography(planes: PlanePairs, tmp_path: Path) -> None:
+    """Labels by depth are those of the map between the views, and SIFT finds enough right matches."""
+    assert isinstance(planes, DepthDataset)
+    assert len(planes) == 2 * 3
+    matched = MatchedPairs(planes, **SIFT, root=tmp_path, workers=1)
+    by_key = {pair.key: pair for pair in planes}
+    right = 0
+    for i, about in enumerate(matched.pairs):
+        pair, stored = by_key[about["key"]], matched.stored(i)
+        H = between_views(planes, pair)
+        x0, x1 = (x[0].double().numpy() for x in (stored.correspondences.x0, stored.correspondences.x1))
+        forward = np.linalg.norm(cv2.perspectiveTransform(x0[None], H)[0] - x1, axis=1)
+        backward = np.linalg.norm(cv2.perspectiveTransform(x1[None], np.linalg.inv(H))[0] - x0, axis=1)
+        label, worst = stored.label[0].numpy(), np.maximum(forward, backward)
+        clear = (np.abs(worst - 3) > 1.5) & (np.abs(worst - 6) > 1.5)  # the depths a pixel aside count, too
+        assert (label == np.select([worst <= 3, worst > 6], [1, 0], -1))[clear].all()
+        right += int((label == 1).sum())
+        assert not stored.F.any()
+    assert right > 100
+
+
+def between_views(planes: PlanePairs, pair: ImagePair) -> np.ndarray:
+    """The homography from the first view to the second, through four of the first one's points in space."""
+    x = np.array([[50.0, 50.0], [200.0, 50.0], [200.0, 200.0], [50.0, 200.0]])
+    X = planes.depth(pair.image0, x)[:, None] * np.column_stack([x, np.ones(4)]) @ np.linalg.inv(pair.K0).T
+    there = (X @ pair.R.T + pair.t) @ pair.K1.T
+    return cv2.getPerspectiveTransform(x.astype(np.float32), (there[:, :2] / there[:, 2:]).astype(np.float32))
+
+
+def test_pairs_of_planes_train_the_classification_alone(planes: PlanePairs, tmp_path: Path) -> None:
+    pytest.importorskip("lightning", reason="training needs the extra `train`")
+    from fmtorch.pruning.networks import LC
+    from fmtorch.pruning.networks.prediction import predict
+    from fmtorch.training.pruners.objective import Objective
+
+    matched = MatchedPairs(planes, **SIFT, root=tmp_path, workers=1)
+    batch = collate([matched[i] for i in range(3)])
+    torch.manual_seed(0)
+    network = LC(channels=8, blocks=1)
+    terms = Objective(geometric=1.0, nsgd=1.0, classification_steps=0)(
+        predict(network, batch.correspondences), batch, 0
+    )
+    assert terms["geometric"].item() == 0
+    assert terms["nsgd"].item() == 0
+    assert terms["loss"].item() == pytest.approx(terms["classification"].item())
+    terms["loss"].backward()
+    assert all(bool(torch.isfinite(p.grad).all()) for p in network.parameters() if p.grad is not None)
+
+
+def test_views_are_drawn_once_and_depend_on_what_defines_them(photographs: list[Photograph], tmp_path: Path) -> None:
+    def views(root: Path) -> dict[str, bytes]:
+        return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*.jpg")}
+
+    first = PlanePairs(photographs, PlaneViews(views=2), root=tmp_path / "a", workers=2)
+    alone = PlanePairs(photographs[1:], PlaneViews(views=2), root=tmp_path / "b")
+    assert views(tmp_path / "b").items() < views(tmp_path / "a").items()
+    assert first.digest != alone.digest
+    changed = {path: path.stat().st_mtime_ns for path in (tmp_path / "a").rglob("*.jpg")}
+    again = PlanePairs(photographs, PlaneViews(views=2), root=tmp_path / "a")
+    assert again.digest == first.digest
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "a").rglob("*.jpg")} == changed
+    other = PlanePairs(photographs, PlaneViews(views=2), seed=1, root=tmp_path / "a")
+    assert other.digest != first.digest
+
+
+def test_mistakes_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no photographs"):
+        PlanePairs([], root=tmp_path)
+    (tmp_path / "notes.jpg").write_text("not an image")
+    with pytest.raises(ImageError, match=r"notes\.jpg"):
+        PlanePairs([Photograph(tmp_path / "notes.jpg", "x")], root=tmp_path)
+    with pytest.raises(ValueError, match="planes.views=1; a pair needs 2"):
+        PlaneViews(views=1)
+    with pytest.raises(ValueError, match=r"planes\.part=\[1\.0, 0\.5\]"):
+        PlaneViews(part=(1.0, 0.5))
