@@ -32,24 +32,45 @@ class Verifier:
         """The models that are left, in the order of their draws, with their scores."""
         models = in_front(models)
         if self.preselect is not None and models.F.shape[2] > self.preselect.survivors:
-            subset = self._subset(pairs, self.preselect.matches)
-            if subset is not None:
-                score = score_models(self.first_look, models.F, pairs, subset, models.valid)
+            few = self._first_look(pairs, self.preselect.matches)
+            if few is not None:
+                score = score_models(self.first_look, models.F, few, models.valid)
                 order = torch.sort(score, dim=1, descending=True, stable=True).indices[:, : self.preselect.survivors]
                 models = models.take(torch.sort(order, dim=1).values)  # the order of the draws, which breaks ties
-        score = score_models(self.score, models.F, pairs, valid=models.valid)
+        score = score_models(self.score, models.F, pairs, models.valid)
         return dataclasses.replace(models, score=score)
 
-    @staticmethod
-    def _subset(pairs: NormalizedPairs, matches: int) -> Int[Tensor, "p k"] | None:
-        """The matches of the first look: those with the smallest hash. None where there are not many more."""
-        n = pairs.mask.shape[1]
-        if n < 2 * matches:
+    def _first_look(self, pairs: NormalizedPairs, matches: int) -> NormalizedPairs | None:
+        """The pairs with the matches of the first look. None where there are not many more.
+
+        A score that weighs matches by their prior gets such as are drawn by it, each of which counts as one.
+        """
+        if pairs.mask.shape[1] < 2 * matches:
             return None
-        return pairs.once(
-            f"{matches} matches of a first look",
-            lambda: shuffled(pairs, Stream.PRESELECTION, pairs.mask)[:, :matches].contiguous(),
-        )
+        by_prior = self.score.prior_weighted and pairs.prior is not None
+        order = by_priority if by_prior else in_random_order
+        index = pairs.once(f"{matches} matches of a first look", lambda: order(pairs)[:, :matches].contiguous())
+        few = pairs.take(index, pairs.mask)
+        if few.prior is None or not by_prior:
+            return few
+        return dataclasses.replace(few, prior=(few.prior > 0).to(torch.float64))
+
+
+def in_random_order(pairs: NormalizedPairs) -> Int[Tensor, "p n"]:
+    """The matches in an order that the pair's key decides, empty slots last."""
+    return shuffled(pairs, Stream.PRESELECTION, pairs.mask)
+
+
+def by_priority(pairs: NormalizedPairs) -> Int[Tensor, "p n"]:
+    """The matches by falling prior / u, u random and uniform, empty slots last.
+
+    The first ones are drawn by their prior and without replacement, and each stands for as much of it: priority
+    sampling (Duffield, Lund & Thorup, J. ACM 2007).
+    """
+    assert pairs.prior is not None
+    bits = random.bits(pairs.seed, pairs.key, Stream.PRESELECTION, 0, pairs.mask.shape[1], 1)[..., 0]
+    priority = torch.where(pairs.mask, pairs.prior.detach() / (bits.to(torch.float64) + 1), -1)
+    return torch.sort(priority, dim=1, descending=True, stable=True).indices
 
 
 def in_front(models: Models) -> Models:

@@ -91,6 +91,15 @@ def shuffled(count: int, mixed_seed: int, key: int, out: Array) -> int:
     return _first_shuffled(index, mixed_seed, key, out)
 
 
+@kernel("f8[::1], i8, i8, i8[::1]", brief=True)
+def drawn_by_prior(prior: Array, mixed_seed: int, key: int, out: Array) -> None:
+    """The first matches in the order of `pool.by_priority`, of priors (n,) -> out (k,), ascending."""
+    priority, state = np.empty(len(prior)), stream_state(mixed_seed, key)
+    for i in range(len(prior)):
+        priority[i] = prior[i] / (np.float64(random_bits(state, i)) + 1)
+    best(priority, out)
+
+
 @inner
 def _first_shuffled(index: Array, mixed_seed: int, key: int, out: Array) -> int:
     """The first ones of the matches (m,), ascending, in a random order -> out (k,); how many they are."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.estimators.pairs import NormalizedPairs
@@ -159,10 +159,9 @@ def score_models(
     score: Score,
     F: Float[Tensor, "9 p m"],
     pairs: NormalizedPairs,
-    subset: Int[Tensor, "p k"] | None = None,
     valid: Bool[Tensor, "p m"] | None = None,
 ) -> Float[Tensor, "p m"]:
-    """Scores of the models on all matches, or on the `subset` (P, K) of them, in tiles of bounded size.
+    """Scores of the models on all matches, in tiles of bounded size.
 
     valid: False for slots that hold no model, which must stand last in each pair; they score minus infinity.
     Memory: eight buffers of one tile. Scores are computed in the type of the models.
@@ -171,10 +170,6 @@ def score_models(
     weight = pairs.prior if score.prior_weighted and pairs.prior is not None else pairs.mask
     weight, scale = weight.to(F.dtype), pairs.scale
     width = pairs.count.tolist()
-    if subset is not None:
-        points, weight = points.gather(2, subset.expand(4, -1, -1)), weight.gather(1, subset)
-        scale = scale.gather(1, subset) if pairs.noise is not None else scale
-        width = [subset.shape[1]] * len(width)
     p, m = F.shape[1:]
     height = [m] * p if valid is None else valid.sum(1).tolist()
     scores = F.new_full((p, m), -torch.inf)

@@ -16,12 +16,14 @@ from fmtorch.estimators.one_pair import inliers as compiled_inliers
 from fmtorch.estimators.one_pair import solvers as compiled_solvers
 from fmtorch.estimators.one_pair.models import Models
 from fmtorch.estimators.one_pair.pair import OnePair, each_pair
-from fmtorch.estimators.one_pair.pool import Verifier, shuffled
+from fmtorch.estimators.one_pair.pool import Verifier, likely, shuffled
 from fmtorch.estimators.one_pair.selection import Selection
 from fmtorch.estimators.options import Preselect
 from fmtorch.estimators.pairs import NormalizedPairs, normalized_pairs
 from fmtorch.estimators.pool import Verifier as TensorVerifier
+from fmtorch.estimators.pool import by_priority
 from fmtorch.estimators.pool import shuffled as shuffled_tensor
+from fmtorch.estimators.pool_kernels import drawn_by_prior
 from fmtorch.estimators.registry import PARTS, kernel_form
 from fmtorch.estimators.selection import without_cameras
 from fmtorch.geometry import eight_point
@@ -120,6 +122,35 @@ def test_matches_are_shuffled_alike(count: int) -> None:
         np.testing.assert_array_equal(shuffled(pair, Stream.PRESELECTION, most), expected[:most])
 
 
+@pytest.mark.parametrize("count", COUNTS)
+def test_likely_matches_are_the_same(count: int) -> None:
+    pairs, pair = both(told(count))
+    order = by_priority(pairs)[0].numpy()
+    assert set(order[:count]) == set(range(count))
+    for most in (1, 5, count - 1, count, 2 * count):
+        few = likely(pair, most)
+        chosen = np.sort(order[: min(most, count)])
+        np.testing.assert_array_equal(few.points, pair.points[:, chosen])
+        np.testing.assert_array_equal(few.support, pair.support[chosen] > 0)
+    assert pair.prior is not None
+    assert pair.prior.max() < 1  # the pair's own prior stands
+
+
+def test_matches_of_a_first_look_are_drawn_by_their_prior() -> None:
+    """Three times as many of the kind three times as likely, and none that have no prior."""
+    n, k, seen = 900, 60, np.zeros(3)
+    prior = np.repeat([0.0, 0.2, 0.6], n // 3)
+    index = np.empty(k, np.int64)
+    for key in range(300):
+        drawn_by_prior(prior, 5, key, index)
+        assert len(set(index.tolist())) == k
+        seen += np.bincount(index // (n // 3), minlength=3)
+    assert seen[0] == 0
+    assert seen[2] / seen[1] == pytest.approx(3, rel=0.1)
+    drawn_by_prior(np.zeros(n), 5, 0, index)
+    np.testing.assert_array_equal(index, np.arange(k))
+
+
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("score", [scores.InlierCount, scores.TruncatedSquares, scores.SigmaConsensus, scores.Median])
 @pytest.mark.parametrize("count", [8, 150, 250, 700])
@@ -136,7 +167,7 @@ def test_the_same_models_survive_a_first_look(count: int, score: type, weighted:
     for preselect in (None, Preselect(survivors=120), Preselect(survivors=40)):
         expected = TensorVerifier(part, preselect)(tensors, pairs)
         arrays = Models(F.numpy(), draw.numpy(), np.zeros((7, 1), np.int64), 0)
-        found = Verifier(kernel_form(part), preselect)(arrays, pair)
+        found = Verifier(kernel_form(part), preselect, part.prior_weighted)(arrays, pair)
         assert expected.score is not None
         assert found.score is not None
         assert found.which is not None

@@ -64,6 +64,7 @@ FOCAL: tuple[Kernel[..., Any], ...] = (  # the slowest to compile first
     refined_kernels.refine_near_with_prior,
     significance_kernels.most_significant,
     posterior_kernels.models_and_costs,
+    pool_kernels.drawn_by_prior,
     pool_kernels.shuffled,
     pool_kernels.share_within,
     pool_kernels.within,

@@ -15,8 +15,8 @@ from fmtorch.random import Stream, mixed_seed
 class Verifier:
     """As `pool.Verifier`."""
 
-    def __init__(self, score: Score, preselect: Preselect | None) -> None:
-        self.score, self.preselect = score, preselect
+    def __init__(self, score: Score, preselect: Preselect | None, prior_weighted: bool) -> None:
+        self.score, self.preselect, self.prior_weighted = score, preselect, prior_weighted
 
     def __call__(self, models: Models, pair: OnePair) -> Models:
         """As `pool.Verifier`."""
@@ -30,10 +30,23 @@ class Verifier:
         if self.preselect is None or pair.slots < 2 * self.preselect.matches:
             return None
         matches = self.preselect.matches
-        found: OnePair = pair.once(
-            ("first look", matches), lambda pair: pair.take(shuffled(pair, Stream.PRESELECTION, matches))
-        )
+        few = likely if self.prior_weighted and pair.prior is not None else shuffled_first
+        found: OnePair = pair.once(("first look", few, matches), lambda pair: few(pair, matches))
         return found
+
+
+def shuffled_first(pair: OnePair, count: int) -> OnePair:
+    """The pair with so many of its matches in the order of `pool.in_random_order`."""
+    return pair.take(shuffled(pair, Stream.PRESELECTION, count))
+
+
+def likely(pair: OnePair, count: int) -> OnePair:
+    """The pair with so many of its matches in the order of `pool.by_priority`; those of any prior count as one."""
+    index = np.empty(min(count, pair.count), np.int64)
+    compiled.drawn_by_prior(pair.support, mixed_seed(pair.seed, Stream.PRESELECTION), pair.key, index)
+    few = pair.take(index)
+    np.greater(few.support, 0, out=few.support)
+    return few
 
 
 def shuffled(pair: OnePair, stream: Stream, most: int) -> Array:

@@ -50,7 +50,7 @@ def _verbs(parts: Any) -> Verbs:
 def _search(search: Search, generator: Any, sampler: Any) -> Search:
     tensor_verify: Any = search.verify
     score, confident = _part(tensor_verify.score), _confident(search.confident, sampler)
-    verify = Verifier(score, tensor_verify.preselect)
+    verify = Verifier(score, tensor_verify.preselect, tensor_verify.score.prior_weighted)
     check = None if search.degeneracy is None else _part(search.degeneracy, score)
     return dataclasses.replace(
         search, generator=generator, verify=verify, confident=confident, degeneracy=check, nothing=Pool.of
