@@ -66,9 +66,9 @@ class HypothesizeAndVerify:
         select: `Select`, by which score the estimate is selected from the refined pool; None: the search's own.
         focal: `Focal`, the prior on focal lengths, where the image sizes are known: for whole photographs, not crops.
             Models of five matches and drawn focal lengths are searched first, in rounds, until all good candidates are
-            one model or a round finds the best one before it again, and the stopping rule is content. They suffice for
-            a pair whose images have one size, if that rule is content; other pairs are searched without assumptions,
-            too, and both kinds compared. Needs `select`.
+            one model or enough rounds find the best one before them again, and the stopping rule is content. They
+            suffice for a pair whose images have one size, if that rule is content; other pairs are searched without
+            assumptions, too, and both kinds compared. Needs `select`.
         inliers: `threshold`, `lmeds` (2.5 robust standard deviations) or `median` (the better half).
         inlier_threshold: of the inliers reported and of the stopping rule, Sampson distance in pixels; None: the
             threshold.
@@ -137,8 +137,8 @@ class HypothesizeAndVerify:
             if prior.samples:
                 samples = Search(FocalSamples(self.sampler.draw), verify, prior.pool, prior.samples, FOCAL_ROUND)
                 self.focal = dataclasses.replace(
-                    self.focal, search=samples, samples=prior.samples, rounds=prior.rounds,
-                    min_rounds=prior.min_rounds,                    confident=self._confident(FocalSamples.size),
+                    self.focal, search=samples, samples=prior.samples, rounds=prior.rounds, min_rounds=prior.min_rounds,
+                    confirmations=prior.confirmations, confident=self._confident(FocalSamples.size),
                 )  # fmt: skip
         self.final = part("final", final)
         verbs = Verbs(self.search, self.refine, self.selector, self.focal)

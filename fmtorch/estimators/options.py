@@ -80,13 +80,15 @@ class Focal:
 
     samples: of five matches, with focal lengths drawn from the prior; 0: none, the prior only selects. rounds,
     min_rounds: of so many samples, at most and at least; in between a pair goes on while its good candidates differ or
-    the stopping rule asks for more. pool: the best models of a round, which are refined with the prior. candidates:
-    models of the other search that are, too. iterations: steps of that refinement.
+    the stopping rule asks for more. confirmations: rounds that find the best candidate of those before them again,
+    after which it does not matter that others differ. pool: the best models of a round, which are refined with the
+    prior. candidates: models of the other search that are, too. iterations: steps of that refinement.
     """
 
     samples: int = 250
     rounds: int = 1
     min_rounds: int = 1
+    confirmations: int = 1
     pool: int = 12
     candidates: int = 12
     iterations: int = 12
@@ -99,6 +101,7 @@ class Focal:
             1,
             **{
                 "focal.min_rounds": self.min_rounds,
+                "focal.confirmations": self.confirmations,
                 "focal.rounds": self.rounds,
                 "focal.pool": self.pool,
                 "focal.candidates": self.candidates,

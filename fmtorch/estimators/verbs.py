@@ -13,7 +13,8 @@ class FocalParts:
     """The prior on focal lengths. selection: a `FocalSelection`. search: makes a pool with it; None: it only selects.
 
     rounds, min_rounds: of that search, of so many samples each, at most and at least; each refines candidates of its
-    own. confident: the stopping rule for these samples, None: all rounds are made, and never suffice.
+    own. confirmations: rounds that find the best candidate of those before them again, for it to be taken. confident:
+    the stopping rule for these samples, None: all rounds are made, and never suffice.
     """
 
     selection: Any
@@ -21,6 +22,7 @@ class FocalParts:
     samples: int = 0
     rounds: int = 1
     min_rounds: int = 1
+    confirmations: int = 1
     confident: Confident | None = None
 
 
@@ -47,18 +49,21 @@ class Verbs:
     def plausible(self, focal: FocalParts, pairs: Any) -> tuple[Any, Any, list[int]]:
         """The selection among plausible cameras, the candidates selected, and the pairs which these do not settle.
 
-        Rounds go on until good candidates are one model, or a round finds the best of those before it again, and the
-        stopping rule is content. A pair is settled if that rule is content and its images have one size.
+        Rounds go on until good candidates are one model, or enough rounds found the best of those before again, and
+        the stopping rule is content. A pair is settled if that rule is content and its images have one size.
         """
         some, rows = pairs, list(range(len(pairs)))
         selection: Any = None
         best: Any = None
         candidates: Any = None
         unsettled: list[int] = []
+        confirmed = [0] * len(pairs)
         for turn in range(focal.rounds):
             pool = focal.search(some, turn * focal.samples)
             made = focal.selection.of_pool(pool, some, self.refine)
-            again = [False] * len(rows) if candidates is None else candidates.same_best(made)
+            if candidates is not None:
+                for row, again in zip(rows, candidates.same_best(made), strict=True):
+                    confirmed[row] += again
             candidates = made if candidates is None else candidates.joined(made)
             top = candidates.best_alone()
             found = top.selection(pool.draws)
@@ -67,7 +72,8 @@ class Verbs:
             enough = [False] * len(rows) if focal.confident is None else focal.confident(found.F, pool.draws, some)
             one_model, same_size, left = candidates.unambiguous(), some.same_size, []
             for i, row in enumerate(rows):
-                content = turn + 1 >= focal.min_rounds and (one_model[i] or again[i]) and enough[i]
+                one = one_model[i] or confirmed[row] >= focal.confirmations
+                content = turn + 1 >= focal.min_rounds and one and enough[i]
                 if not content and turn + 1 < focal.rounds:
                     left.append(i)
                 elif not (same_size[i] and enough[i]):

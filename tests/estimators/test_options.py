@@ -40,6 +40,7 @@ def test_groups_are_made_of_mappings() -> None:
         ({"select": {"scale": 0.0}}, "select.scale is 0.0; it must be positive"),
         ({"select": {}, "focal": {"samples": -1}}, "focal.samples is -1; it must be at least 0"),
         ({"select": {}, "focal": {"min_rounds": 2}}, "focal.min_rounds is 2; it must be at most focal.rounds, 1"),
+        ({"select": {}, "focal": {"confirmations": 0}}, "focal.confirmations is 0; it must be at least 1"),
         ({"focal": {}}, "focal needs select"),
         ({"score": "prior_saturated"}, "score is 'prior_saturated'; it must be one of: inlier_count, msac, saturated"),
         ({"score": {"name": "msac", "weighted": True}}, "score=msac: no option weighted; there are: threshold, prior"),

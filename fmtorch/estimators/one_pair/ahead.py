@@ -65,7 +65,6 @@ FOCAL: tuple[Kernel[..., Any], ...] = (  # the slowest to compile first
     significance_kernels.most_significant,
     posterior_kernels.models_and_costs,
     pool_kernels.drawn_by_prior,
-    pool_kernels.shuffled,
     pool_kernels.share_within,
     pool_kernels.within,
     cameras_kernels.centre,
