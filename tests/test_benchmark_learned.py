@@ -1,6 +1,7 @@
 """`scripts.benchmark learned`: its tables, and other trainings of a network beside the shipped one."""
 
 import argparse
+from pathlib import Path
 
 import pytest
 
@@ -54,7 +55,14 @@ def test_trainings_are_compared_on_pairs_that_all_have() -> None:
     assert "real, wide (27): R.05" in hard.columns
 
 
-@pytest.mark.parametrize("text", ["seed 1", "=x", "seed 1=/no/such/file"])
+@pytest.mark.parametrize("text", ["seed 1", "=x", "seed 1=/no/such/file", "seed 1=lc_side:/no/such/file"])
 def test_a_network_needs_a_name_and_a_file(text: str) -> None:
-    with pytest.raises(argparse.ArgumentTypeError, match="NAME=FILE"):
+    with pytest.raises(argparse.ArgumentTypeError, match=r"NAME=\[PRESET:\]FILE"):
         learned._named(text)
+
+
+def test_a_network_may_be_of_any_preset(tmp_path: Path) -> None:
+    file = tmp_path / "a:b.safetensors"
+    file.touch()
+    assert learned._named(f"seed 1={file}") == ("seed 1", "lc", str(file))
+    assert learned._named(f"seed 1=lc_side:{file}") == ("seed 1", "lc_side", str(file))

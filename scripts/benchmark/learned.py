@@ -69,7 +69,7 @@ GIVEN = frozenset(("ratio", "one_to_one"))  # what every method has, and what is
 KEPT = ("pair", "family", "scene", "ok", "nsgd", "inlier_rate", "inlier_rate_before", "corrs", "corrs_before")
 
 
-TRAINED = "LC, F"  # the network whose trainings are compared
+TRAINED = {"lc": "LC, F", "lc_e": "LC, E", "lc_side": "LC, F, side information", "dfe": "DFE"}  # methods, by presets
 
 Chain = list[tuple[str, Any]]  # names of presets, with options, and the stages
 Chains = dict[str, dict[str, Chain]]  # use -> method -> its pruners
@@ -82,8 +82,9 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument("--features", default="sift", help="features of another kind than the networks saw in training")
     parser.add_argument("--methods", nargs="*", default=list(HARD | PRIOR), choices=list(HARD | PRIOR))
     parser.add_argument("--ngransac", type=Path, help="NG-RANSAC's published weights, converted to safetensors")
-    parser.add_argument("--network", action="append", default=[], type=_named, metavar="NAME=FILE",
-                        help=f"weights of another training of {TRAINED}; may be repeated")  # fmt: skip
+    parser.add_argument("--network", action="append", default=[], type=_named, metavar="NAME=[PRESET:]FILE",
+                        help=f"weights of another training of a network, {', '.join(TRAINED)}, by default lc; may be "
+                        "repeated")  # fmt: skip
     parser.add_argument("--cache", default="off", help="a folder that keeps features from run to run; off: nowhere")
     parser.add_argument("--json", type=Path, help="keep the figures of every pair here, one line each")
     parser.add_argument("--from", nargs="*", type=Path, default=[], dest="earlier", help="add earlier --json")
@@ -114,7 +115,7 @@ def measure(arguments: argparse.Namespace) -> list[Row]:
         cached(extractor, arguments.cache), presets.build("matcher", "nearest"), {}, next(iter(estimators.values()))
     )
     built = chains(arguments)
-    others = {name: TRAINED for name, _ in arguments.network}
+    others = {name: TRAINED[preset] for name, preset, _ in arguments.network}
     before: Stages = [("features", arguments.features, {}), ("matcher", "nearest", {})]
     made_with = {
         (use, name, estimator): identity(
@@ -157,17 +158,21 @@ def chains(arguments: argparse.Namespace) -> Chains:
     before = [(name, stage(name)) for name in sorted(GIVEN, reverse=True)]
     if arguments.ngransac:
         built["prior"]["NG-RANSAC's network"] = [*before, ("lc", ngransac(arguments.ngransac))]
-    for name, file in arguments.network:
-        for use, preset in (("hard", "lc"), ("prior", "lc_soft")):
+    for name, network, file in arguments.network:
+        for use, preset in (("hard", network), ("prior", f"{network}_soft")):
             built[use][name] = [*before, (preset, presets.build("pruner", preset, file=file))]
     return built
 
 
-def _named(text: str) -> tuple[str, str]:
-    name, _, file = text.partition("=")
+def _named(text: str) -> tuple[str, str, str]:
+    """The name, preset and file of another training."""
+    name, _, where = text.partition("=")
+    preset, _, file = where.partition(":")
+    if preset not in TRAINED:
+        preset, file = "lc", where
     if not name or not Path(file).is_file():
-        raise argparse.ArgumentTypeError(f"{text!r}: NAME=FILE is wanted, with a file of learned weights")
-    return name, file
+        raise argparse.ArgumentTypeError(f"{text!r}: NAME=[PRESET:]FILE is wanted, with a file of learned weights")
+    return name, preset, file
 
 
 def rows_of(
