@@ -25,6 +25,11 @@ class FocalParts:
     confirmations: int = 1
     confident: Confident | None = None
 
+    def round(self, pairs: Any, turn: int, refinement: Any) -> tuple[Any, Any]:
+        """The candidates of a round, and the samples drawn until then. refinement: says on which matches."""
+        pool = self.search(pairs, turn * self.samples)
+        return self.selection.of_pool(pool, pairs, refinement), pool.draws
+
 
 @dataclasses.dataclass(frozen=True)
 class Verbs:
@@ -59,17 +64,16 @@ class Verbs:
         unsettled: list[int] = []
         confirmed = [0] * len(pairs)
         for turn in range(focal.rounds):
-            pool = focal.search(some, turn * focal.samples)
-            made = focal.selection.of_pool(pool, some, self.refine)
+            made, draws = focal.round(some, turn, self.refine)
             if candidates is not None:
                 for row, again in zip(rows, candidates.same_best(made), strict=True):
                     confirmed[row] += again
             candidates = made if candidates is None else candidates.joined(made)
             top = candidates.best_alone()
-            found = top.selection(pool.draws)
+            found = top.selection(draws)
             best = top if best is None else best.replaced(rows, top)
             selection = found if selection is None else selection.replaced(rows, found)
-            enough = [False] * len(rows) if focal.confident is None else focal.confident(found.F, pool.draws, some)
+            enough = [False] * len(rows) if focal.confident is None else focal.confident(found.F, draws, some)
             one_model, same_size, left = candidates.unambiguous(), some.same_size, []
             for i, row in enumerate(rows):
                 one = one_model[i] or confirmed[row] >= focal.confirmations

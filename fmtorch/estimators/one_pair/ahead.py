@@ -21,6 +21,7 @@ from fmtorch.estimators.focal import (
     hypotheses_kernels,
     posterior_kernels,
     refined_kernels,
+    round_kernels,
     selection_kernels,
 )
 from fmtorch.geometry import (
@@ -58,6 +59,7 @@ FOCAL: tuple[Kernel[..., Any], ...] = (  # the slowest to compile first
     scores_kernels.saturated_cells,
     hypotheses_kernels.draw_depths,
     hypotheses_kernels.samples_of_five,
+    round_kernels.candidates_of_five,
     solvers_kernels.samples_of_seven,
     verify_kernels.verify_by_saturated_gains,
     refined_kernels.refine_with_prior,

@@ -20,12 +20,12 @@ class Verifier:
 
     def __call__(self, models: Models, pair: OnePair) -> Models:
         """As `pool.Verifier`."""
-        few = self._first_look(pair) if len(models.F) else None
+        few = self.first_look(pair) if len(models.F) else None
         survivors = len(models.F) if few is None or self.preselect is None else self.preselect.survivors
         which, score = self.score.verify(models.F, survivors, pair if few is None else few, pair)
         return Models(models.F, models.draw, models.samples, models.start, which, score)
 
-    def _first_look(self, pair: OnePair) -> OnePair | None:
+    def first_look(self, pair: OnePair) -> OnePair | None:
         """The pair with the matches of the first look; None where there is none."""
         if self.preselect is None or pair.slots < 2 * self.preselect.matches:
             return None

@@ -23,18 +23,25 @@ class SaturatedGains:
     def __call__(self, F: Array, which: Array, pair: OnePair) -> Array:
         """As `scores.Score`."""
         out = np.empty(len(which))
-        matches: _OfMatches = pair.once(self, self._matches)
-        score_saturated(F, which, *matches, out)
+        score_saturated(F, which, *self.of(pair), out)
         return out
 
     def verify(self, F: Array, survivors: int, few: OnePair, pair: OnePair) -> tuple[Array, Array]:
         """As `scores.Score.verify`, on few matches by the plain sum of gains."""
         which, score = room(len(F), survivors)
-        look, matches = self.first_look, pair.once(self, self._matches)
-        first: OfMatches = few.once(look, look.matches)
-        points, support, scale, cells, bits = matches
-        verify_by_saturated_gains(F, *first, look.GAIN, look.table, points, support, scale, cells, bits, which, score)
+        verify_by_saturated_gains(F, *self.first_of(few), *self.of(pair), which, score)
         return which, score
+
+    def first_of(self, few: OnePair) -> tuple[Array, Array, Array, int, int, Array]:
+        """What a first look takes of its matches, and the gain that it sums."""
+        look = self.first_look
+        first: OfMatches = few.once(look, look.matches)
+        return (*first, look.GAIN, look.table)
+
+    def of(self, pair: OnePair) -> _OfMatches:
+        """What the kernels take of the matches, made once."""
+        matches: _OfMatches = pair.once(self, self._matches)
+        return matches
 
     def _matches(self, pair: OnePair) -> _OfMatches:
         """What the kernel takes of the matches."""

@@ -9,6 +9,7 @@ from typing import Any
 from fmtorch.estimators import refinement, selection
 from fmtorch.estimators.forms import Form
 from fmtorch.estimators.one_pair.focal.hypotheses import FocalSamples
+from fmtorch.estimators.one_pair.focal.rounds import JoinedRounds
 from fmtorch.estimators.one_pair.focal.selection import FocalSelection
 from fmtorch.estimators.one_pair.inliers import Confidence
 from fmtorch.estimators.one_pair.models import Pool
@@ -43,8 +44,9 @@ def _part(made: Any, *others: Any) -> Any:
 def _verbs(parts: Any) -> Verbs:
     sampler = _part(parts.search.generator.sampler)
     search = _search(parts.search, MinimalSamples(_part(parts.search.generator.solver), sampler), sampler)
-    focal = None if parts.focal is None else _focal(parts.focal, sampler)
-    return Verbs(search.rounds, _refinement(parts.refine), _selector(parts.selector), focal)
+    refinement = _refinement(parts.refine)
+    focal = None if parts.focal is None else _focal(parts.focal, sampler, refinement)
+    return Verbs(search.rounds, refinement, _selector(parts.selector), focal)
 
 
 def _search(search: Search, generator: Any, sampler: Any) -> Search:
@@ -75,7 +77,12 @@ def _selector(part: Any) -> Any:
     return FirstOfPool() if isinstance(part, selection.FirstOfPool) else BestScore(_part(part.score))
 
 
-def _focal(parts: FocalParts, sampler: Any) -> FocalParts:
-    search = None if parts.search is None else _search(parts.search, FocalSamples(sampler), sampler).rounds
+def _focal(parts: FocalParts, sampler: Any, refinement: PoolRefinement | AsFound) -> FocalParts:
     chosen = FocalSelection(parts.selection, _part(parts.selection.gain))
-    return dataclasses.replace(parts, selection=chosen, search=search, confident=_confident(parts.confident, sampler))
+    if parts.search is None:
+        return dataclasses.replace(parts, selection=chosen)
+    search = _search(parts.search, FocalSamples(sampler), sampler)
+    found = dataclasses.replace(
+        parts, selection=chosen, search=search.rounds, confident=_confident(parts.confident, sampler)
+    )
+    return JoinedRounds.of(found, search, refinement)

@@ -8,10 +8,10 @@ import numpy as np
 
 from fmtorch.estimators.focal import hypotheses, prior
 from fmtorch.estimators.focal.hypotheses_kernels import samples_of_five
-from fmtorch.estimators.one_pair.focal.cameras import CentredPair
+from fmtorch.estimators.one_pair.focal.cameras import CentredPair, images_of
 from fmtorch.estimators.one_pair.models import Models
-from fmtorch.estimators.one_pair.pair import OnePair
-from fmtorch.estimators.one_pair.sampling import Sampler, seed_of
+from fmtorch.estimators.one_pair.pair import Array, OnePair
+from fmtorch.estimators.one_pair.sampling import Sampler, Urn, seed_of
 from fmtorch.random import Stream, mixed_seed
 
 SOLUTIONS = 10  # of five matches, at most
@@ -31,11 +31,19 @@ class FocalSamples:
 
     def __call__(self, pair: OnePair, start: int, count: int) -> Models:
         """The models of the draws start .. start + count - 1, in their order."""
-        urn, centred = self.sampler.urn(pair, start, count, self.size), CentredPair.of(pair)
+        urn, numbers, centred = self.urn(pair, start, count), self.numbers(pair), CentredPair.of(pair)
         sample = np.empty((self.size, count), np.int64)
         F, draw = np.empty((SOLUTIONS * count, 9), np.float32), np.empty(SOLUTIONS * count, np.int64)
-        m = samples_of_five(
-            *urn, QUANTILES, NUMBERS, centred.same_size, centred.longest, seed_of(pair),
-            mixed_seed(pair.seed, Stream.FOCAL), pair.key, start, centred.points, centred.offset, sample, F, draw,
-        )  # fmt: skip
+        told = *urn, *numbers, start, centred.points, centred.offset
+        m = samples_of_five(*told, sample, F, draw)
         return Models(F[:m], draw[:m], sample, start)
+
+    def urn(self, pair: OnePair, start: int, count: int) -> Urn:
+        """What the draws start .. start + count - 1 are made from."""
+        return self.sampler.urn(pair, start, count, self.size)
+
+    @staticmethod
+    def numbers(pair: OnePair) -> tuple[Array, Array, bool, Array, int, int, int]:
+        """What kernels take of the prior and of a pair to draw samples and focal lengths."""
+        _, longest, same_size = images_of(pair)
+        return QUANTILES, NUMBERS, same_size, longest, seed_of(pair), mixed_seed(pair.seed, Stream.FOCAL), pair.key

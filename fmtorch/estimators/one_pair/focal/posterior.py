@@ -56,7 +56,7 @@ class Refined(NamedTuple):
 def refine_with_prior(F: Array, pair: OnePair, iterations: int) -> Refined:
     """As `posterior.refine_with_prior` of models (k, 9)."""
     made = _room(len(F))
-    refined_kernels.refine_with_prior(F, pair.table, *_prior(pair, iterations), *_flat(made))
+    refined_kernels.refine_with_prior(F, pair.table, *prior_of(pair, iterations), *_flat(made))
     return made
 
 
@@ -64,7 +64,7 @@ def refine_near_with_prior(F: Array, pair: OnePair, near: Near, iterations: int)
     """The same of models (k, 9), float32, on the matches near them."""
     made = _room(len(F))
     refined_kernels.refine_near_with_prior(
-        F, pair.points32, near.limit, near.mixed_seed, near.key, near.most, pair.table, *_prior(pair, iterations),
+        F, pair.points32, near.limit, near.mixed_seed, near.key, near.most, pair.table, *prior_of(pair, iterations),
         *_flat(made),
     )  # fmt: skip
     return made
@@ -79,7 +79,7 @@ def _flat(made: Refined) -> tuple[Array, Array, Array, Array, Array]:
     return *made.cameras, made.models, made.cost, made.share
 
 
-def _prior(pair: OnePair, iterations: int) -> tuple[Array, Array, bool, float, int, Array, float, float, int]:
+def prior_of(pair: OnePair, iterations: int) -> tuple[Array, Array, bool, float, int, Array, float, float, int]:
     """What the kernels take of a pair's images and of the objective."""
     offset, longest, same_size = images_of(pair)
     unit = pair.pixels_per_unit
