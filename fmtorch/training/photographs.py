@@ -32,7 +32,7 @@ def list_photographs(
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise FileNotFoundError(f"images={folder} is no folder of photographs")
+        raise FileNotFoundError(f"{folder} is no folder of photographs")
     table = folder / "sources.txt"
     if table.is_file():
         rows = [line.split(maxsplit=4) for line in table.read_text().splitlines() if line and not line.startswith("#")]
@@ -50,7 +50,7 @@ def list_photographs(
         if (sources is None or source in sources) and not any(part in full for part in excluded)
     ]
     if not kept:
-        raise ValueError(f"images={folder}: none of its {len(found)} photographs is left by sources and excluded")
+        raise ValueError(f"{folder}: none of its {len(found)} photographs is left by sources and excluded")
     return kept
 
 

@@ -44,11 +44,11 @@ class PlaneViews:
     """
 
     views: int = 5
-    tilt: float = 60.0
-    roll: float = 15.0
-    part: tuple[float, float] = (0.5, 1.0)
-    scale: tuple[float, float] = (0.7, 1.0)
-    focal: tuple[float, float] = (0.7, 1.8)
+    tilt: float | int = 60.0
+    roll: float | int = 15.0
+    part: tuple[float | int, float | int] = (0.5, 1.0)
+    scale: tuple[float | int, float | int] = (0.7, 1.0)
+    focal: tuple[float | int, float | int] = (0.7, 1.8)
 
     def __post_init__(self) -> None:
         if self.views < 2:
@@ -191,7 +191,7 @@ def plane_depth(camera: Camera, points: Matrix) -> Matrix:
     return np.where(inside & (depth > 0), depth, np.nan)
 
 
-def _log_uniform(rng: np.random.Generator, limits: tuple[float, float]) -> float:
+def _log_uniform(rng: np.random.Generator, limits: tuple[float | int, float | int]) -> float:
     return math.exp(rng.uniform(math.log(limits[0]), math.log(limits[1])))
 
 

@@ -174,9 +174,11 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / "DATA" / name / "pairs_which_dataset.txt").write_text("".join(f"{s}/\n" for s in scenes))
     for name, image in zip(("a.jpg", "b.jpg"), images, strict=True):
         cv2.imwrite(str(folder / name), image[..., ::-1])
-    for training in ("S1", "S2", "C", "N", "P500", "P1500"):
+    for training in ("S1", "S2", "C", "N", "P500", "P1500", "PLANES"):
         (folder / training).mkdir()
         shutil.copy(SOURCE / "models" / "lc_f.safetensors", folder / training / "lc.safetensors")
+    (folder / "PLANES_SIDE").mkdir()
+    shutil.copy(SOURCE / "models" / "lc_side.safetensors", folder / "PLANES_SIDE")
     (folder / "PHOTOS").mkdir()
     for name in ("a.jpg", "b.jpg"):
         shutil.copy(folder / name, folder / "PHOTOS")

@@ -121,9 +121,30 @@ def test_the_command_goes_on_and_refuses_another_training(
         trained(monkeypatch, tmp_path, *options, "seed=1")
 
 
+def test_photographs_join_the_training(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two photographs seen as planes beside the pairs of a data set; the same command finds its views and matches."""
+    for name in ("one", "two"):
+        (tmp_path / "photographs" / name).mkdir(parents=True)
+        draw(tmp_path / "photographs" / name / "a.png", seed=len(name))
+    options = ["dataset=fmbench", f"dataset.root={root}", *SHORT, "pruner.lc.network.channels=8",
+               "pruner.lc.network.blocks=2", f"planes.photographs={tmp_path / 'photographs'}", "planes.views=3",
+               "planes.tilt=30", "output=out"]  # fmt: skip
+    folder = trained(monkeypatch, tmp_path, *options)
+    weights = (folder / "lc.safetensors").read_bytes()
+    card = (folder / "lc.md").read_text()
+    assert re.search(r"3 pairs of 1 scenes of fmbench and [1-6] pairs of [12] photographs seen as planes", card)
+    trained(monkeypatch, tmp_path, *options)
+    assert (folder / "lc.safetensors").read_bytes() == weights
+    with pytest.raises(TrainingFolderError, match=r"it differs in matches"):
+        trained(monkeypatch, tmp_path, *options, "planes.seed=1")
+
+
 @pytest.mark.parametrize(
     ("option", "message"),
     [
+        ("planes.views=1", "planes.views=1; a pair needs 2"),
+        ("planes.views=many", "planes.views=many; it must be a whole number"),
+        ("planes.photographs=nothing", "nothing is no folder of photographs"),
         ("pruner=ratio", "pruner=lc has nothing to train"),
         ("batch=0", "batch=0; it must be a whole number of at least 1"),
         ("limit=-3", "limit=-3; it must be a whole number of at least 1"),
@@ -135,6 +156,6 @@ def test_the_command_goes_on_and_refuses_another_training(
 def test_mistakes_are_told_before_anything_is_written(
     option: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(ValueError, match=re.escape(message)):
+    with pytest.raises((ValueError, FileNotFoundError), match=re.escape(message)):
         trained(monkeypatch, tmp_path, option, "dataset=fmbench", "dataset.root=nowhere")
     assert [path.name for path in tmp_path.rglob("*")] == ["cache", "kernels"]  # put there by `own_cache`

@@ -23,7 +23,7 @@ from fmtorch.pipeline import Pipeline
 from fmtorch.presets import plain
 from fmtorch.storage.features import cached
 from fmtorch.terminal import reporter
-from fmtorch.training.photographs import list_photographs
+from fmtorch.training.photographs import Photograph, list_photographs
 from fmtorch.training.planes import PlanePairs, PlaneViews
 
 
@@ -42,6 +42,8 @@ def labelled_matches(config: DictConfig, progress: Progress) -> Matches:
 
     Raises ValueError where there is nothing to train on or to validate on.
     """
+    photographs = [] if config.planes.photographs is None else _photographs(config)
+    views = _views(config)
     dataset = _dataset(config, progress)
     training, held_out = _split(dataset, config.validation.scenes)
     chosen = _limited(dataset, training, config.limit)
@@ -74,11 +76,11 @@ def labelled_matches(config: DictConfig, progress: Progress) -> Matches:
         + f" (of {dataset.name} the last {config.validation.scenes} scenes of each family, which share photographs "
         "with the training scenes)",
     }
-    if config.planes.photographs is not None:
-        planes = _planes(config, front, progress)
+    if photographs:
+        planes = _planes(config, photographs, views, front, progress)
         digests.append(planes.folder.name)
-        photographs = {about["scene"] for about in planes.pairs}
-        description["training"] += f" and {len(planes)} pairs of {len(photographs)} photographs seen as planes"
+        seen = {about["scene"] for about in planes.pairs}
+        description["training"] += f" and {len(planes)} pairs of {len(seen)} photographs seen as planes"
         matched = matched.joined(planes)
     augmented = matched.augmented(Augmentation(**_ranges(plain(config.augmentation))), config.seed)
     return Matches(augmented, validation, hashlib.sha256(" ".join(digests).encode()).hexdigest(), description)
@@ -95,13 +97,21 @@ def _dataset(config: DictConfig, progress: Progress) -> PairDataset:
     return data.load(**options, progress=reporter(progress, "drawing scenes"))
 
 
-def _planes(config: DictConfig, front: Pipeline, progress: Progress) -> StoredMatches:
-    """The matches of views of the config's photographs, of pairs with more inliers than the paper asks of a pair."""
+def _photographs(config: DictConfig) -> list[Photograph]:
+    return list_photographs(config.planes.photographs, config.photographs.sources, config.photographs.excluded)
+
+
+def _views(config: DictConfig) -> PlaneViews:
     options = _ranges(plain(config.planes))
-    folder, seed = options.pop("photographs"), options.pop("seed")
-    photographs = list_photographs(folder, config.photographs.sources, config.photographs.excluded)
+    return PlaneViews(**{key: value for key, value in options.items() if key not in ("photographs", "seed")})
+
+
+def _planes(
+    config: DictConfig, photographs: list[Photograph], views: PlaneViews, front: Pipeline, progress: Progress
+) -> StoredMatches:
+    """The matches of views of photographs, of pairs with more inliers than the paper asks of a pair."""
     pairs = PlanePairs(
-        photographs, PlaneViews(**options), seed,
+        photographs, views, config.planes.seed,
         workers=config.workers or os.cpu_count() or 1, progress=reporter(progress, "views of photographs"),
     )  # fmt: skip
     matched = _matched(config, pairs, list(range(len(pairs))), front, progress, "matches of photographs")

@@ -65,8 +65,8 @@ class Fields:
 
 
 @dataclasses.dataclass(frozen=True)
-class PlanesFields(PlaneViews):
-    """What ``planes`` of the command's config holds: how to look at them, at which photographs, and a seed."""
+class PlanesFields:
+    """What ``planes`` of the command's config holds beside the options of `PlaneViews`."""
 
     photographs: Path | None = None
     seed: Seed = 0
@@ -84,6 +84,8 @@ def run(config: DictConfig, name: str) -> Path:
     read_fields(Fields, config)
     read_fields(ValidationFields, config.validation, "validation")
     read_fields(PlanesFields, config.planes, "planes")
+    own = {field.name for field in dataclasses.fields(PlanesFields)}
+    expect_options(PlaneViews, {k: v for k, v in plain(config.planes).items() if k not in own}, "planes")
     for group, part in PARTS.items():
         expect_options(part, plain(config[group]), group)
     presets.expect_dataset(config.dataset)
