@@ -28,7 +28,11 @@ def _positive(**values: float) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Preselect:
-    """A first look at the models of a round. matches: looked at. survivors: models that are scored on all matches."""
+    """A first look at the models of a round.
+
+    matches: looked at; any, or for a score that weighs them by their prior such as are drawn by it, each counting as
+    one. survivors: models that are scored on all matches.
+    """
 
     matches: int = 128
     survivors: int = 256
