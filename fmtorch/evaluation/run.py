@@ -15,6 +15,8 @@ from fmtorch.pipeline import Pipeline
 from fmtorch.storage import PairRow
 from fmtorch.storage.features import CachedFeatures
 
+BATCHES_OF_A_WORKER = 4  # at least, where there are pairs enough
+
 
 def select(pairs: Sequence[ImagePair], limit: int | None) -> list[ImagePair]:
     """The pairs, ordered so that those that share images follow one another; with a limit, that many of each family.
@@ -49,6 +51,7 @@ def evaluate_pairs(
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
+    batch = _shared_out(len(pairs), batch, workers)
     team = Workers(pipeline, max(1, min(workers, -(-len(pairs) // batch))), build)
     waiting: set[Future[Work]] = set()
 
@@ -83,3 +86,8 @@ def evaluate_pairs(
             if not future.cancelled() and future.exception() is None:
                 kept(future)
         torch.set_num_threads(before)
+
+
+def _shared_out(pairs: int, batch: int, workers: int) -> int:
+    """The size of a batch of so many pairs that no one of several workers is long alone at the end."""
+    return batch if workers == 1 else max(1, min(batch, -(-pairs // (BATCHES_OF_A_WORKER * workers))))

@@ -13,7 +13,7 @@ import pytest
 
 from fmtorch import presets
 from fmtorch.data.pairs import ImagePair, ImageSource
-from fmtorch.evaluation.run import evaluate_pairs
+from fmtorch.evaluation.run import _shared_out, evaluate_pairs
 from fmtorch.pipeline import Pipeline
 from fmtorch.storage import PairRow
 
@@ -64,3 +64,11 @@ def alive(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
+
+
+@pytest.mark.parametrize(
+    ("pairs", "batch", "workers", "size"),
+    [(80, 16, 2, 10), (80, 16, 1, 16), (3200, 16, 2, 16), (3, 16, 4, 1), (0, 16, 2, 1)],
+)
+def test_no_worker_is_long_alone_at_the_end(pairs: int, batch: int, workers: int, size: int) -> None:
+    assert _shared_out(pairs, batch, workers) == size
