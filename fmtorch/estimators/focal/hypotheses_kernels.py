@@ -14,6 +14,7 @@ from fmtorch.kernels import kernel
 from fmtorch.random_kernels import random_bits, stream_state
 
 Array = NDArray[Any]
+SOLUTIONS = 10  # of five matches, at most
 
 
 @kernel(

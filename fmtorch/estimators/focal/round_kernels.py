@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.estimators.focal.hypotheses_kernels import samples_of_five
+from fmtorch.estimators.focal.hypotheses_kernels import SOLUTIONS, samples_of_five
 from fmtorch.estimators.focal.refined_kernels import refine_near_with_prior
 from fmtorch.estimators.focal.selection_kernels import posteriors
 from fmtorch.estimators.pool_kernels import merge
@@ -25,7 +25,6 @@ from fmtorch.estimators.verify_kernels import verify_by_saturated_gains
 from fmtorch.kernels import kernel
 
 Array = NDArray[Any]
-SOLUTIONS = 10  # of five matches, at most
 OF_MATCHES = "f4[:, ::1], f4[::1], f4[::1], "
 SAMPLES = "i8[::1], i8[::1], i8[::1], i8[::1], f8[::1], f8[::1], b1, f8[::1], i8, i8, i8, f8[:, ::1], f8[::1], "
 VERIFICATION = OF_MATCHES + "i8, i8, f4[::1], " + OF_MATCHES + "i4[:, ::1], i8, "
