@@ -25,6 +25,7 @@ from fmtorch.resources import models_dir
 from fmtorch.terminal import console, exits_with_message
 from fmtorch.training.model_card import model_card
 from fmtorch.training.onnx_export import export, quantize
+from fmtorch.training.onnx_layout import lay_out
 from fmtorch.training.patch_metrics import evaluate_descriptor, middle, validation_pairs
 from fmtorch.training.patch_store import PatchStore
 
@@ -56,6 +57,7 @@ def main() -> None:
         path = folder / network_file(name, config.precision).name
         if config.precision == "fp32":
             export(network, path)
+            lay_out(path)
         else:
             if config.calibration is None:
                 raise ValueError("precision=int8 needs calibration=FOLDER of patches, e.g. <out>/patches/train")

@@ -1,0 +1,84 @@
+"""Networks in the layout that ONNX Runtime runs fastest: the same outputs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import numpy_helper
+from torch import Tensor
+
+from fmtorch.features.networks import ARCHITECTURES, build
+from fmtorch.features.onnx_network import PatchNetwork
+from fmtorch.resources import models_dir
+from fmtorch.training.onnx_export import export, quantize
+from fmtorch.training.onnx_layout import laid_out
+from tests.features.test_networks import randomized
+
+SHIPPED = [f"{name}{precision}.onnx" for name in ("hardnet", "l2net", "affnet") for precision in ("", ".int8")]
+
+
+@pytest.fixture(scope="module")
+def patches() -> Tensor:
+    """Noise, ramps, a constant patch and one of extreme values."""
+    generator = torch.Generator().manual_seed(3)
+    noise = torch.rand(40, 1, 32, 32, generator=generator)
+    ramp = torch.linspace(0, 1, 32).expand(1, 1, 32, 32)
+    extreme = (torch.rand(20, 1, 32, 32, generator=generator) > 0.5).float()
+    return torch.cat([noise, ramp, ramp.transpose(2, 3), torch.full((1, 1, 32, 32), 0.5), extreme])
+
+
+def exported(name: str, folder: Path, patches: Tensor) -> tuple[Path, Path]:
+    """A network of random weights in fp32 and int8, in the layouts that torch and the quantisation leave."""
+    fp32, int8 = folder / "fp32.onnx", folder / "int8.onnx"
+    export(randomized(build(name)), fp32)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fmtorch.training.onnx_export.lay_out", lambda path: None)
+        quantize(fp32, int8, patches)
+    return fp32, int8
+
+
+@pytest.mark.parametrize("name", ARCHITECTURES)
+def test_the_outputs_are_the_same(name: str, tmp_path: Path, patches: Tensor) -> None:
+    for path, atol in zip(exported(name, tmp_path, patches), (1e-5, 0.0), strict=True):
+        model = onnx.load(path)
+        onnx.save(laid_out(model, 32), tmp_path / "laid_out.onnx")
+        assert model == onnx.load(path)  # what was given is not changed
+        for batch in (1, 7, 64):
+            expected = PatchNetwork(path, batch=batch)(patches)
+            found = PatchNetwork(tmp_path / "laid_out.onnx", batch=batch)(patches)
+            assert float(expected.nan_to_num().std()) > 0
+            torch.testing.assert_close(found, expected, atol=atol, rtol=0, equal_nan=True)  # L2-Net of constant patches
+
+
+def test_rows_of_few_channels_give_several_pixels_and_the_last_convolution_is_a_product(
+    tmp_path: Path, patches: Tensor
+) -> None:
+    _, path = exported("affnet", tmp_path, patches)
+    nodes = laid_out(onnx.load(path), 32).graph
+    kernels = {
+        tuple(a.ints) for n in nodes.node for a in n.attribute if n.op_type == "Conv" and a.name == "kernel_shape"
+    }
+    assert kernels == {(3, 10), (3, 6), (3, 3)}  # eight pixels of grey, four of 16 channels, one of more
+    assert [n.op_type for n in nodes.node].count("Gemm") == 1
+    wide = {t.name: numpy_helper.to_array(t) for t in nodes.initializer}["features.0.weight_quantized"]
+    for pixel in range(8):
+        seen = wide[16 * pixel : 16 * (pixel + 1)]
+        assert np.array_equal(seen[..., pixel : pixel + 3], wide[:16, ..., :3])
+        assert np.count_nonzero(seen) == np.count_nonzero(wide[:16, ..., :3])
+
+
+def test_quantize_lays_out(tmp_path: Path, patches: Tensor) -> None:
+    export(randomized(build("hardnet")), tmp_path / "hardnet.onnx")
+    quantize(tmp_path / "hardnet.onnx", tmp_path / "hardnet.int8.onnx", patches)
+    assert "Gemm" in {node.op_type for node in onnx.load(tmp_path / "hardnet.int8.onnx").graph.node}
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_networks_are_laid_out(name: str) -> None:
+    nodes = onnx.load(models_dir() / name).graph.node
+    assert [node.op_type for node in nodes].count("Gemm") == 1
+    assert [node.op_type for node in nodes].count("Conv") == 6
