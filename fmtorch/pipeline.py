@@ -65,6 +65,7 @@ class Pipeline:
     ) -> None:
         self.extractor, self.matcher, self.pruners, self.estimator = features, matcher, dict(pruners), estimator
         self.families = dict(families or {})
+        self.memory = memory
         self.device = torch.device(device)
         self._memo: _Memo[tuple[Path, Lens | None], tuple[Features, float]] = _Memo(memory)
 

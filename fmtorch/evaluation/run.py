@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
+from typing import Any
 
 import torch
 
-from fmtorch.data.pairs import ImagePair
+from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.evaluation.workers import Build, Work, Workers
 from fmtorch.exchange.journal import Journal
 from fmtorch.pipeline import Pipeline
@@ -64,7 +66,12 @@ def evaluate_pairs(
         return len(work.rows)
 
     try:
-        todo = (list(pairs[i : i + batch]) for i in range(0, len(pairs), batch))
+        begun = 0
+        if build is None and team.size > 1:
+            begun = 1  # alone: where its stages compile kernels, others would wait for them
+            waiting.add(first := team.submit([pairs[0]], seed, journal))
+            _features_ahead(team, pipeline.memory, pairs, first)
+        todo = (list(pairs[i : i + batch]) for i in range(begun, len(pairs), batch))
         while True:
             for some in todo:
                 waiting.add(team.submit(some, seed, journal))
@@ -86,6 +93,29 @@ def evaluate_pairs(
             if not future.cancelled() and future.exception() is None:
                 kept(future)
         torch.set_num_threads(before)
+
+
+def _features_ahead(team: Workers, memory: int, pairs: Sequence[ImagePair], first: Future[Work]) -> None:
+    """While a worker is at the first pair, the others compute features of those that follow, as many as are kept."""
+    computing: set[Future[None]] = set()
+    for image in itertools.islice(_images_after_the_first(pairs), memory):
+        while len(computing) >= team.size - 1 and not first.done():
+            wait(list[Future[Any]]([first, *computing]), return_when=FIRST_COMPLETED)
+            computing = {future for future in computing if not future.done()}
+        if first.done():
+            return
+        computing.add(team.submit_features(image))
+
+
+def _images_after_the_first(pairs: Sequence[ImagePair]) -> Iterator[ImageSource]:
+    """The images that pairs show, each once, without those of the first pair."""
+    seen = {pairs[0].image0.path, pairs[0].image1.path}
+    for pair in pairs[1:]:
+        if pair.problem is None and pair.matches is None:
+            for image in (pair.image0, pair.image1):
+                if image.path not in seen:
+                    seen.add(image.path)
+                    yield image
 
 
 def _shared_out(pairs: int, batch: int, workers: int) -> int:

@@ -7,6 +7,7 @@ hundred megabytes each.
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import multiprocessing.connection
 import os
@@ -19,7 +20,7 @@ from dataclasses import dataclass
 import cv2
 import torch
 
-from fmtorch.data.pairs import ImagePair
+from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.evaluation.exporting import keep_outcomes
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.exchange.journal import Journal
@@ -46,6 +47,7 @@ class Workers:
     """
 
     def __init__(self, pipeline: Pipeline, workers: int, build: Build | None = None) -> None:
+        self.size = workers
         self.pipeline = None if build else pipeline
         self.executor: Executor
         if build is None:
@@ -61,6 +63,11 @@ class Workers:
             return self.executor.submit(_in_process, pairs, seed, journal)
         return self.executor.submit(_work, self.pipeline, pairs, seed, journal)
 
+    def submit_features(self, image: ImageSource) -> Future[None]:
+        """Have a thread compute an image's features, for the pipeline to keep; its pairs will tell what that raises."""
+        assert self.pipeline is not None, "processes share no features"
+        return self.executor.submit(_keep_features, self.pipeline, image)
+
     def close(self) -> None:
         """Wait for what is under way; what has not begun is dropped."""
         self.executor.shutdown(wait=True, cancel_futures=True)
@@ -71,6 +78,11 @@ def _work(pipeline: Pipeline, pairs: list[ImagePair], seed: int, journal: Journa
     if journal is not None:
         keep_outcomes(journal, pipeline, outcomes)
     return Work(evaluate(outcomes, seed))
+
+
+def _keep_features(pipeline: Pipeline, image: ImageSource) -> None:
+    with contextlib.suppress(Exception):
+        pipeline.features(image)
 
 
 def end_with_parent() -> None:

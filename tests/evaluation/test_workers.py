@@ -1,21 +1,25 @@
-"""Workers that are processes."""
+"""Workers that evaluate batches of pairs: threads that share features, and processes."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from fmtorch import presets
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.evaluation.run import _shared_out, evaluate_pairs
 from fmtorch.pipeline import Pipeline
 from fmtorch.storage import PairRow
+from fmtorch.types import Correspondences, Estimate, Features
 
 
 def _ends() -> Pipeline:
@@ -72,3 +76,52 @@ def alive(pid: int) -> bool:
 )
 def test_no_worker_is_long_alone_at_the_end(pairs: int, batch: int, workers: int, size: int) -> None:
     assert _shared_out(pairs, batch, workers) == size
+
+
+class Watched:
+    """A pipeline's stages that note what is called when; the first estimation waits until others have computed."""
+
+    def __init__(self, pipeline: Pipeline, images: int) -> None:
+        self.images, self.enough = images, threading.Event()
+        self.extracted: list[int] = []
+        self.at_first_estimate = -1
+        self.extractor, self.estimator = pipeline.extractor, pipeline.estimator
+        pipeline.extractor = self.extract  # type: ignore[assignment]
+        pipeline.estimator = self.estimate  # type: ignore[assignment]
+
+    def extract(self, image: NDArray[np.uint8]) -> Features:
+        features = self.extractor(image)
+        self.extracted.append(int(image.sum()))
+        if len(self.extracted) >= self.images:
+            self.enough.set()
+        return features
+
+    def estimate(self, c: Correspondences, seed: int) -> Estimate:
+        if self.at_first_estimate < 0:
+            self.enough.wait(60)
+            self.at_first_estimate = len(self.extracted)
+        return self.estimator(c, seed)
+
+
+def textured(path: Path, seed: int) -> Path:
+    noise = np.random.default_rng(seed).integers(0, 255, (60, 80), dtype=np.uint8)
+    cv2.imwrite(str(path), cv2.resize(noise, (240, 180)))
+    return path
+
+
+def test_features_are_computed_while_the_first_pair_is_worked_on(tmp_path: Path) -> None:
+    images = [ImageSource(f"scene/{i}", textured(tmp_path / f"{i}.png", i)) for i in range(7)]
+    bad = ImageSource("scene/bad", tmp_path / "absent.png")
+    pairs = [ImagePair(f"scene/0-{i}", "family", "scene", images[0], images[i], np.eye(3)) for i in range(1, 7)]
+    pairs.insert(2, ImagePair("scene/0-bad", "family", "scene", images[0], bad, np.eye(3)))
+    expected: list[PairRow] = []
+    list(evaluate_pairs(presets.pipeline("sift_ratio"), pairs, seed=0, batch=2, workers=1, store=expected.extend))
+    pipeline, rows = presets.pipeline("sift_ratio"), list[PairRow]()
+    watched = Watched(pipeline, len(images))
+    counts = list(evaluate_pairs(pipeline, pairs, seed=0, batch=2, workers=2, store=rows.extend))
+    assert watched.at_first_estimate == len(images)  # all of them, while the first pair waited
+    assert len(watched.extracted) == len(set(watched.extracted)) == len(images)  # each once
+    assert sum(counts) == len(pairs)
+    found = {row.pair: (row.nsgd, row.reason) for row in rows}
+    assert found == {row.pair: (row.nsgd, row.reason) for row in expected}
+    assert "absent.png" in found["scene/0-bad"][1]
