@@ -21,6 +21,7 @@ from fmtorch.data.images import to_grey
 from fmtorch.data.rendered.photographs import photograph
 from fmtorch.features import SIFT, DominantGradient, HessianDetector, ImagePyramid, PatchSIFT, local_feature
 from fmtorch.matching import NearestNeighborMatcher
+from fmtorch.training.onnx_layout import lay_out
 from fmtorch.types import Features
 
 OURS = "ours"
@@ -124,6 +125,7 @@ def _hesaffnet(n: int, folder: Path, random: bool) -> tuple[Callable[..., Featur
                 module, (torch.rand(4, 1, 32, 32),), str(folder / f"{name}.onnx"), input_names=["patches"],
                 output_names=["values"], dynamic_axes={"patches": {0: "n"}, "values": {0: "n"}}, dynamo=False,
             )  # fmt: skip
+            lay_out(folder / f"{name}.onnx")
     own = local_feature(
         "hessian",
         {"name": "hardnet", "network": str(folder / "hardnet.onnx")},
