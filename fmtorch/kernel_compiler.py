@@ -1,6 +1,6 @@
 """Many kernels compiled by two processes: numba compiles one function at a time in each.
 
-The other process is ``python -m fmtorch.kernel_compiler``, which is told one kernel a line and keeps what it compiles
+The other process runs `main` (`fmtorch.bare`), which is told one kernel a line and keeps what it compiles
 in the cache folder. It ends when its input is closed; what it did not compile is compiled here.
 """
 
@@ -14,15 +14,11 @@ import subprocess
 import sys
 import threading
 from collections.abc import Sequence
-from importlib.machinery import ModuleSpec
-from importlib.util import module_from_spec
-from pathlib import Path
 from typing import Any
 
-from fmtorch import kernel_cache
+from fmtorch import bare, kernel_cache
 from fmtorch.kernels import Kernel
 
-HOME = Path(__file__).resolve().parents[1]
 _lock = threading.Lock()
 
 
@@ -66,12 +62,8 @@ def _cores() -> int:
 
 def _helper() -> subprocess.Popen[str] | None:
     """The other process; None where it cannot be started."""
-    path = os.pathsep.join([str(HOME), *filter(None, [os.environ.get("PYTHONPATH")])])
-    command = [sys.executable, "-m", "fmtorch.kernel_compiler"]
     try:
-        return subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": path}
-        )
+        return bare.process("fmtorch.kernel_compiler")
     except OSError:
         return None
 
@@ -89,25 +81,8 @@ def _feed(helper: subprocess.Popen[str], waiting: collections.deque[tuple[str, K
 
 def main() -> None:
     """Compile the kernels that standard input names, one line each, and ask for the next by a line."""
-    _open_packages()
     print("ready", flush=True)
     for line in sys.stdin:
         module, name, count = line.rstrip("\n").split(" ", 2)
         getattr(importlib.import_module(module), name).compiled_alone(count)
         print(name, flush=True)
-
-
-def _open_packages() -> None:
-    """Let modules of fmtorch be imported without the `__init__` of the packages they are in, which import torch.
-
-    Kernels need none of that, and without it this process begins a second earlier.
-    """
-    for init in (HOME / "fmtorch").glob("*/**/__init__.py"):
-        folder = init.parent
-        spec = ModuleSpec(".".join(folder.relative_to(HOME).parts), None, is_package=True)
-        spec.submodule_search_locations = [str(folder)]
-        sys.modules.setdefault(spec.name, module_from_spec(spec))
-
-
-if __name__ == "__main__":
-    main()

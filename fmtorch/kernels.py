@@ -19,7 +19,7 @@ import platform
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Generic, ParamSpec, TypeVar, overload
 
 import numpy as np
@@ -148,17 +148,6 @@ def inner(*, inline: bool) -> Callable[[Callable[P, R]], Inner[P, R]]: ...
 def inner(function: Callable[P, R] | None = None, *, inline: bool = False) -> Any:
     """Makes a function an `Inner` one. inline: numba, too, inlines it; LLVM does so anyway where it is small."""
     return Inner(function, inline) if function is not None else lambda f: Inner(f, inline)
-
-
-def prepare(kernels: Sequence[Kernel[..., Any]]) -> None:
-    """Have kernels ready to be called: those that this machine has not compiled yet are compiled, with messages.
-
-    Raises ImportError where numba cannot be imported.
-    """
-    for number, each in enumerate(kernels, start=1):
-        each.compiled_alone(f"{number} of {len(kernels)}: ")
-    for each in kernels:
-        each.compiled()
 
 
 class _Fused(Inner[[Any, Any, Any], Any]):

@@ -166,13 +166,6 @@ def test_what_was_compiled_is_kept_and_told_once(
     assert {path: path.stat().st_mtime_ns for path in cache.rglob("*.bin")} == files
 
 
-def test_kernels_can_be_prepared(module: types.ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
-    kernels.prepare([module.rows, module.scaled_squares])
-    assert "1 of 2: compiling rows" in capsys.readouterr().err
-    assert result(module) == EXPECTED
-    assert capsys.readouterr().err == ""
-
-
 @pytest.mark.parametrize("importable", [True, False])
 def test_two_processes_compile_together(
     module: types.ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cache: Path, importable: bool
@@ -191,7 +184,7 @@ def test_two_processes_compile_together(
 
 
 def test_the_other_process_compiles_what_it_is_told(module: types.ModuleType, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "fmtorch.kernel_compiler"]
+    command = [sys.executable, "-m", "fmtorch.bare", "fmtorch.kernel_compiler"]
     path = os.pathsep.join([str(REPOSITORY), str(tmp_path)])
     told = subprocess.run(
         command, input="some_kernels rows 1 of 1: \n", capture_output=True, text=True, check=True,

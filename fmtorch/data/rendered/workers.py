@@ -1,7 +1,7 @@
 """Several scenes at a time, each worker a process of its own that draws one scene after another.
 
-The workers are started as ``python -m fmtorch.data.rendered``: unlike multiprocessing this asks nothing
-of the caller's main module, and forks no process that has threads. A worker ends when its input is closed.
+The workers run `main` in processes of their own (`fmtorch.bare`): unlike multiprocessing this asks nothing of the
+caller's main module, and forks no process that has threads. A worker ends when its input is closed.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import fmtorch
-from fmtorch import kernels
+from fmtorch import bare, kernels
 from fmtorch.data.rendered.generate import KERNELS, Task, generate
+from fmtorch.kernel_compiler import compile_together
 
 Progress = Callable[[int, int], None]
 _MOST = 8  # workers; each takes some 0.5 GB
@@ -49,11 +49,11 @@ def generate_all(
     for job in missing:
         waiting.put(job)
     finished: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-    processes = [_start() for _ in range(count)]
+    processes = [bare.process("fmtorch.data.rendered.workers", **_ONE_THREAD) for _ in range(count)]
     threads = [threading.Thread(target=_feed, args=(p, waiting, finished), daemon=True) for p in processes]
     try:
         if kernels.available():  # once, while the workers start, rather than in each of them
-            kernels.prepare(KERNELS)
+            compile_together(KERNELS)
         for thread in threads:
             thread.start()
         for _ in missing:
@@ -73,15 +73,6 @@ def generate_all(
 
 def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _start() -> subprocess.Popen[str]:
-    home = str(Path(fmtorch.__file__).resolve().parents[1])
-    path = os.pathsep.join([home, *filter(None, [os.environ.get("PYTHONPATH")])])
-    return subprocess.Popen(
-        [sys.executable, "-m", "fmtorch.data.rendered"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        text=True, env={**os.environ, **_ONE_THREAD, "PYTHONPATH": path},
-    )  # fmt: skip
 
 
 def _feed(
@@ -106,3 +97,12 @@ def _feed(
         finished.put(problem)
         if problem is not None:
             return
+
+
+def main() -> None:
+    """Draw the scenes that standard input names, one JSON object a line, and tell of each when it is complete."""
+    for line in sys.stdin:
+        job = json.loads(line)
+        task = Task.from_json(json.dumps(job["task"]))
+        generate(task, Path(job["folder"]))
+        print(task.name, flush=True)
