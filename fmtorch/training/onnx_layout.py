@@ -6,7 +6,8 @@
   it is. Where there are few channels, one row gives the outputs of several pixels beside one another: its kernel is as
   much wider, with zeros in the columns that a pixel does not see, and steps over them all.
 
-int8 networks keep their outputs to the last bit, those in fp32 up to the order of a sum.
+int8 networks keep their outputs to the last bit where the processor sums products of bytes exactly (VNNI; older ones
+saturate), those in fp32 up to the order of a sum.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from onnx import helper, numpy_helper
 from fmtorch.features.onnx_network import PATCH_SHAPE
 
 OUTPUTS = 64  # of a row, channels times pixels, where there are fewer channels than `FEW_CHANNELS`
-OUTPUTS_OF_GREY = 128
+OUTPUTS_OF_GREY = 128  # where the input has one channel, and a pixel's row is 9 numbers
 FEW_CHANNELS = 32
 
 
