@@ -19,7 +19,7 @@ from fmtorch import presets
 from fmtorch.data.images import read_image
 from fmtorch.pipeline import Pipeline
 from fmtorch.reduced_images import frames_to_original, fundamental_to_original, reduced_image, to_original
-from fmtorch.threads import one_thread
+from fmtorch.threads import mapped, one_thread
 from fmtorch.types import RELATED, Correspondences, Estimate, Features
 from fmtorch.verdict import judged
 
@@ -108,7 +108,9 @@ def match(
     elif device is not None and torch.device(device) != pipeline.device:
         raise ValueError(f"device={device}, but the pipeline was built for {pipeline.device}; leave one of them out")
     images = [_image(image, name) for image, name in ((image0, "image0"), (image1, "image1"))]
-    described0, described1 = (describe(pipeline, image, longest_side) for image in images)
+    describing = functools.partial(describe, pipeline, longest_side=longest_side)
+    at_once = functools.partial(mapped, share=True) if pipeline.device.type == "cpu" else map
+    described0, described1 = at_once(describing, images)
     return relate(pipeline, described0, described1, seed)
 
 

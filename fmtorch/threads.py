@@ -24,12 +24,18 @@ def one_thread(device: torch.device | str) -> Iterator[None]:
     matched 6,892 x 3,461 descriptors in 6 to 16 s where one needs 0.5 s, and estimated twenty times as slowly. What
     works pair by pair may still use the `available` threads.
     """
+    with _threads(1 if torch.device(device).type == "cpu" else torch.get_num_threads()):
+        yield
+
+
+@contextlib.contextmanager
+def _threads(count: int) -> Iterator[None]:
     before = torch.get_num_threads()
-    if torch.device(device).type != "cpu" or before == 1:
+    if before == count:
         yield
         return
     held = _held.set(before)
-    torch.set_num_threads(1)
+    torch.set_num_threads(count)
     try:
         yield
     finally:
@@ -42,20 +48,22 @@ def available() -> int:
     return max(_held.get(), torch.get_num_threads())
 
 
-def mapped(function: Callable[[T], R], items: Sequence[T]) -> list[R]:
+def mapped(function: Callable[[T], R], items: Sequence[T], *, share: bool = False) -> list[R]:
     """The function of each item, in their order, by as many threads as are `available`.
 
     For functions that leave Python's lock to others most of the time, as compiled ones do. They run as in this thread
-    as far as gradients go, and with one thread of torch's own. The first error, in the items' order, is raised here
-    once those under way have ended; the others are not begun.
+    as far as gradients go, and with one thread of torch's own, or with a share: of the threads that are left, each gets
+    as many. The first error, in the items' order, is raised here once those under way have ended; the others are not
+    begun.
     """
     threads = min(available(), len(items))
+    own = available() // threads if share and threads else 1
     if threads < 2:
         return [function(item) for item in items]
     graphs = torch.is_grad_enabled()
 
     def run(item: T) -> R:
-        with torch.set_grad_enabled(graphs), one_thread("cpu"):
+        with torch.set_grad_enabled(graphs), _threads(own):
             return function(item)
 
     with ThreadPoolExecutor(threads) as pool:

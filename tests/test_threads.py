@@ -153,6 +153,37 @@ def test_a_batch_in_threads_has_the_bits_of_one_thread(threads: int, graph: bool
         torch.testing.assert_close(gradient, expected)
 
 
+def test_mapped_items_share_the_threads_that_there_are(threads: int) -> None:
+    seen = mapped(lambda _: torch.get_num_threads(), range(2), share=True)
+    assert seen == [1, 1]
+    assert mapped(lambda _: torch.get_num_threads(), range(1), share=True) == [threads]
+    torch.set_num_threads(4)
+    assert mapped(lambda _: torch.get_num_threads(), range(2), share=True) == [2, 2]
+    assert torch.get_num_threads() == 4
+
+
+def test_two_photographs_are_described_at_once(threads: int, tmp_path: Path) -> None:
+    images = [read_image(pair(name, path, path).image0) for name, path in (
+        ("a", draw(tmp_path / "a.png", 0)), ("b", draw(tmp_path / "b.png", 0, shift=12))
+    )]  # fmt: skip
+    built, both = pipeline(), threading.Barrier(2)
+    extractor = built.extractor
+
+    def together(image: object) -> object:
+        both.wait(60)  # raises where the other does not come
+        return extractor(image)  # type: ignore[arg-type]
+
+    torch.set_num_threads(1)
+    expected = fmtorch.match(*images, pipeline=built)
+    torch.set_num_threads(threads)
+    built.extractor = together  # type: ignore[assignment]
+    found = fmtorch.match(*images, pipeline=built)
+    assert found.ok
+    assert torch.equal(found.F, expected.F)
+    for name in ("keypoints0", "keypoints1", "inliers"):
+        assert torch.equal(getattr(found, name), getattr(expected, name)), name
+
+
 def test_workers_of_an_evaluation_share_no_threads(threads: int, tmp_path: Path) -> None:
     seen, built = [], pipeline()
     estimator = built.estimator
