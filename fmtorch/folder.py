@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 import json
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,12 @@ from fmtorch.photographs import Described, describe, relate
 from fmtorch.pipeline import Pipeline
 from fmtorch.storage.files import replacing
 from fmtorch.storage.runs import canonical
+from fmtorch.threads import available, one_thread
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 EXHAUSTIVE = "exhaustive"
 MEMORY = 64  # images whose features are kept for pairs to come
+MOST_THREADS = 8  # that describe images: each holds an image and its scale space
 
 
 def images_below(folder: Path) -> list[Path]:
@@ -99,6 +102,26 @@ class FolderMatches:
         self.done = self.taken = self.related = 0
         self.troubles: list[str] = []
         self._described: OrderedDict[Path, Described | None] = OrderedDict()
+        self._begun: dict[Path, Future[Described]] = {}
+
+    def each(self, pairs: Sequence[tuple[Path, Path]]) -> Iterator[None]:
+        """Match the pairs, and yield after each; on a CPU images are described ahead, as many at a time as threads."""
+        threads = min(available(), MOST_THREADS) if self.pipeline.device.type == "cpu" else 1
+        if threads == 1:
+            for pair in pairs:
+                self.match(*pair)
+                yield
+            return
+        ahead = self._images_ahead(pairs)
+        with ThreadPoolExecutor(threads) as pool:
+            try:
+                for pair in pairs:
+                    for image in itertools.islice(ahead, threads + 1 - len(self._begun)):
+                        self._begun[image] = pool.submit(self._computed_alone, image)
+                    self.match(*pair)
+                    yield
+            finally:
+                pool.shutdown(wait=True, cancel_futures=True)
 
     def match(self, image0: Path, image1: Path) -> None:
         """Match one pair."""
@@ -121,10 +144,9 @@ class FolderMatches:
     def _describe(self, image: Path) -> Described | None:
         """An image's features, which the journal then has too; None where it cannot be read, which is said once."""
         if image not in self._described:
+            begun = self._begun.pop(image, None)
             try:
-                value: Described | None = describe(
-                    self.pipeline, read_image(image, orient=self.orient), self.longest_side
-                )
+                value: Described | None = self._computed(image) if begun is None else begun.result()
                 assert value is not None
                 if not self.journal.has_image(image):
                     keep_described(self.journal, image, value)
@@ -136,3 +158,20 @@ class FolderMatches:
         while len(self._described) > MEMORY:
             self._described.popitem(last=False)
         return self._described[image]
+
+    def _images_ahead(self, pairs: Sequence[tuple[Path, Path]]) -> Iterator[Path]:
+        """The images of pairs that are to be matched, each once, in the order in which they are needed."""
+        seen: set[Path] = set()
+        for pair in pairs:
+            if not self.journal.has_pair(*pair):
+                for image in pair:
+                    if image not in seen:
+                        seen.add(image)
+                        yield image
+
+    def _computed(self, image: Path) -> Described:
+        return describe(self.pipeline, read_image(image, orient=self.orient), self.longest_side)
+
+    def _computed_alone(self, image: Path) -> Described:
+        with one_thread(self.pipeline.device):
+            return self._computed(image)

@@ -56,8 +56,7 @@ def match_folder(config: DictConfig, fields: FolderFields, pipeline_name: str, o
     work = FolderMatches(pipeline, journal, fields.longest_side, fields.orient, fields.seed)
     with progress_bars() as progress:
         bar = progress.add_task(pipeline_name, total=len(pairs))
-        for pair in pairs:
-            work.match(*pair)
+        for _ in work.each(pairs):
             progress.advance(bar)
     for trouble in work.troubles:
         Console(stderr=True).print(trouble, style="bold", markup=False, highlight=False, soft_wrap=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +11,16 @@ import h5py
 import numpy as np
 import pycolmap
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from fmtorch import data
+from fmtorch import data, folder
 from fmtorch.commands import eval as eval_command
 from fmtorch.commands import match as match_command
 from fmtorch.exchange.export import DATABASE, FEATURES, MATCHES
 from fmtorch.folder import chosen_pairs, images_below, open_folder
+from fmtorch.photographs import Described
 from fmtorch.resources import conf_dir
 from fmtorch.storage import RunFolder
 from tests.test_pipeline import draw
@@ -89,6 +92,40 @@ def test_one_bad_image_does_not_end_the_work(images: Path, tmp_path: Path, capsy
         path.write_bytes(b"\x89PNG and no more")
     with pytest.raises(ValueError, match="no pair could be matched, the first because: ImageError"):
         match(images, tmp_path / "out2", "export=h5")
+
+
+def test_images_are_described_by_several_threads(
+    images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (images / "bad.png").write_bytes(b"\x89PNG and no more")
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    match(images, tmp_path / "one", "export=h5")
+    expected = capsys.readouterr()
+    both, described = threading.Barrier(2, timeout=60), folder.describe
+
+    def together(*arguments: Any) -> Described:
+        both.wait()  # raises where the other does not come
+        return described(*arguments)
+
+    monkeypatch.setattr(folder, "describe", together)  # of four sound images
+    torch.set_num_threads(2)
+    match(images, tmp_path / "two", "export=h5")
+    torch.set_num_threads(threads)
+    found = capsys.readouterr()
+    assert found.err == expected.err
+    assert "3 of 10 pairs show one scene" in found.out
+    for name in (FEATURES, MATCHES):
+        with h5py.File(tmp_path / "one" / name) as one, h5py.File(tmp_path / "two" / name) as two:
+            compared = []
+
+            def compare(at: str, item: object, other: h5py.File = two, seen: list[str] = compared) -> None:
+                if isinstance(item, h5py.Dataset):
+                    np.testing.assert_array_equal(item[:], other[at][:])
+                    seen.append(at)
+
+            one.visititems(compare)
+            assert len(compared) >= 4
 
 
 @pytest.mark.parametrize(
