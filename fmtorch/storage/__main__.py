@@ -1,4 +1,4 @@
-"""`python -m fmtorch.storage [DIR]`: what the feature cache and the folder of compiled kernels hold."""
+"""`python -m fmtorch.storage [DIR]`: what the cache folder holds of features, compiled kernels, scenes and matches."""
 
 from __future__ import annotations
 
@@ -16,12 +16,14 @@ from fmtorch.resources import cache_dir
 from fmtorch.storage.cache import ArrayCache
 
 Sizes = Mapping[str, Sequence[int]]
+OTHERS = {"rendered": "scenes drawn", "planes": "photographs as planes", "matched": "matches for training"}
 
 
 def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(
-        prog="python -m fmtorch.storage", description="What the feature cache and the folder of compiled kernels hold."
+        prog="python -m fmtorch.storage",
+        description="What the cache folder holds. Any of its folders may be deleted: what is missing is made again.",
     )
     parser.add_argument("folder", nargs="?", type=Path, default=cache_dir() / "features", metavar="DIR")
     parser.add_argument("--clear-kernels", action="store_true", help="remove the compiled kernels of all versions")
@@ -33,6 +35,13 @@ def main() -> None:
         features.setdefault(path.parent.name, []).append(status.st_size)
     _show(options.folder, "configuration", features)
     _show(kernels_dir(), "version of the compiled kernels", _kernels())
+    others = {f"{name}: {what}": _below(cache_dir() / name) for name, what in OTHERS.items()}
+    _show(cache_dir(), "other folders", {name: sizes for name, sizes in others.items() if sizes})
+
+
+def _below(folder: Path) -> list[int]:
+    """Sizes of the files of a folder, at any depth."""
+    return [file.stat().st_size for file in folder.rglob("*") if file.is_file()]
 
 
 def _kernels() -> Sizes:

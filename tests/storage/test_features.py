@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -358,5 +359,10 @@ def test_the_command_tells_what_is_there(tmp_path: Path) -> None:
     command = [sys.executable, "-W", "error", "-m", "fmtorch.storage"]
     told = subprocess.run(command, env=env, capture_output=True, text=True, timeout=120, check=True).stdout
     assert "2 files" in told
+    assert "scenes drawn" not in told
+    (tmp_path / "rendered" / "orbit").mkdir(parents=True)
+    (tmp_path / "rendered" / "orbit" / "00.jpg").write_bytes(bytes(1_500_000))
+    again = subprocess.run(command, env=env, capture_output=True, text=True, timeout=120, check=True).stdout
+    assert re.search(r"rendered: scenes drawn\s+│\s+1 │ 1\.5 MB", again)
     assert "detection-" in told
     assert "TwoSteps-" in told
