@@ -17,9 +17,10 @@ HOME = Path(__file__).resolve().parents[1]
 
 
 def process(module: str, **environment: str) -> subprocess.Popen[str]:
-    """A Python process that runs the `main` of a module, with pipes for its input and output; for absolute names.
+    """A Python process that runs the `main` of a module, with pipes for its standard input and output.
 
-    environment: variables besides those of this process. Raises OSError where it cannot be started.
+    module: its full name, as in ``import``. environment: variables besides those of this process. Raises OSError where
+    it cannot be started.
     """
     path = os.pathsep.join([str(HOME), *filter(None, [os.environ.get("PYTHONPATH")])])
     return subprocess.Popen(
@@ -28,7 +29,7 @@ def process(module: str, **environment: str) -> subprocess.Popen[str]:
     )  # fmt: skip
 
 
-def open_packages() -> None:
+def _open_packages() -> None:
     """Let modules of fmtorch be imported without the `__init__` of the packages they are in."""
     for init in (HOME / "fmtorch").glob("*/**/__init__.py"):
         folder = init.parent
@@ -38,5 +39,5 @@ def open_packages() -> None:
 
 
 if __name__ == "__main__":
-    open_packages()
+    _open_packages()
     importlib.import_module(sys.argv[1]).main()

@@ -24,17 +24,19 @@ def one_thread(device: torch.device | str) -> Iterator[None]:
     matched 6,892 x 3,461 descriptors in 6 to 16 s where one needs 0.5 s, and estimated twenty times as slowly. What
     works pair by pair may still use the `available` threads.
     """
-    with _threads(1 if torch.device(device).type == "cpu" else torch.get_num_threads()):
+    before = torch.get_num_threads()
+    if torch.device(device).type != "cpu" or before == 1:
+        yield
+        return
+    with _threads(1, before):
         yield
 
 
 @contextlib.contextmanager
-def _threads(count: int) -> Iterator[None]:
+def _threads(count: int, held_by_pairs: int) -> Iterator[None]:
+    """Within it torch computes with so many threads, and what works pair by pair may use so many."""
     before = torch.get_num_threads()
-    if before == count:
-        yield
-        return
-    held = _held.set(before)
+    held = _held.set(held_by_pairs)
     torch.set_num_threads(count)
     try:
         yield
@@ -52,9 +54,8 @@ def mapped(function: Callable[[T], R], items: Sequence[T], *, share: bool = Fals
     """The function of each item, in their order, by as many threads as are `available`.
 
     For functions that leave Python's lock to others most of the time, as compiled ones do. They run as in this thread
-    as far as gradients go, and with one thread of torch's own, or with a share: of the threads that are left, each gets
-    as many. The first error, in the items' order, is raised here once those under way have ended; the others are not
-    begun.
+    as far as gradients go, and with one thread of torch's own; with share=True torch's threads are shared out evenly.
+    The first error, in the items' order, is raised here once those under way have ended; the others are not begun.
     """
     threads = min(available(), len(items))
     own = available() // threads if share and threads else 1
@@ -63,7 +64,7 @@ def mapped(function: Callable[[T], R], items: Sequence[T], *, share: bool = Fals
     graphs = torch.is_grad_enabled()
 
     def run(item: T) -> R:
-        with torch.set_grad_enabled(graphs), _threads(own):
+        with torch.set_grad_enabled(graphs), _threads(own, own):
             return function(item)
 
     with ThreadPoolExecutor(threads) as pool:

@@ -154,12 +154,17 @@ def test_a_batch_in_threads_has_the_bits_of_one_thread(threads: int, graph: bool
 
 
 def test_mapped_items_share_the_threads_that_there_are(threads: int) -> None:
-    seen = mapped(lambda _: torch.get_num_threads(), range(2), share=True)
-    assert seen == [1, 1]
+    together = threading.Barrier(2, timeout=60)
+
+    def meet(_: int) -> tuple[int, int]:
+        together.wait()
+        return torch.get_num_threads(), available()
+
+    assert mapped(meet, range(2), share=True) == [(1, 1)] * 2
     assert mapped(lambda _: torch.get_num_threads(), range(1), share=True) == [threads]
     torch.set_num_threads(4)
-    assert mapped(lambda _: torch.get_num_threads(), range(2), share=True) == [2, 2]
-    assert torch.get_num_threads() == 4
+    assert mapped(meet, range(2), share=True) == [(2, 2)] * 2
+    assert torch.get_num_threads() == available() == 4
 
 
 def test_two_photographs_are_described_at_once(threads: int, tmp_path: Path) -> None:

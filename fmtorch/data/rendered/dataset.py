@@ -56,8 +56,8 @@ class RenderedPairs(Dataset[ImagePair]):
         digests = {family: digest(family, split, seed, plan) for family in chosen}
         self.digest = hashlib.sha256(" ".join(digests.values()).encode()).hexdigest()
         folders = {family: home / f"{family}-{split}-{size}-{digests[family][:16]}" for family in chosen}
-        # Scenes of all families in turn, so that the first pictures of each are there early; those that take longest
-        # first, so that no worker is long alone at the end.
+        # Scenes of all families in turn, so that the first pictures of each are there early; the last of `FAMILIES`,
+        # which takes longest, comes first, so that no worker is long alone at the end.
         tasks = [Task(family, split, n, seed, plan) for n in range(plan.scenes) for family in reversed(chosen)]
         for folder in folders.values():
             folder.mkdir(parents=True, exist_ok=True)
