@@ -7,10 +7,10 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from fmtorch.fundamental import find_fundamental
-    from fmtorch.photographs import MatchResult, match
-    from fmtorch.pipeline import Pipeline
-    from fmtorch.types import Correspondences, Estimate, Features
+    from fmtorch.core.types import Correspondences, Estimate, Features
+    from fmtorch.pipeline.fundamental import find_fundamental
+    from fmtorch.pipeline.photographs import MatchResult, match
+    from fmtorch.pipeline.pipeline import Pipeline
 
 __version__ = "0.1.0"
 
@@ -26,8 +26,9 @@ __all__ = [
 ]
 
 _MODULES = {
-    "Correspondences": "types", "Estimate": "types", "Features": "types", "MatchResult": "photographs",
-    "Pipeline": "pipeline", "find_fundamental": "fundamental", "match": "photographs",
+    "Correspondences": "core.types", "Estimate": "core.types", "Features": "core.types",
+    "MatchResult": "pipeline.photographs", "Pipeline": "pipeline.pipeline", "match": "pipeline.photographs",
+    "find_fundamental": "pipeline.fundamental",
 }  # fmt: skip
 
 

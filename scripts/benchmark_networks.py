@@ -14,8 +14,8 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 
+from fmtorch.core.terminal import console, exits_with_message
 from fmtorch.features.onnx_network import PatchNetwork
-from fmtorch.terminal import console, exits_with_message
 
 
 def main() -> None:

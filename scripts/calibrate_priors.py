@@ -22,9 +22,9 @@ from rich.progress import track
 from rich.table import Table
 
 from fmtorch import data, presets
+from fmtorch.core.types import Correspondences
 from fmtorch.geometry import sampson
-from fmtorch.pipeline import Pipeline
-from fmtorch.types import Correspondences
+from fmtorch.pipeline.pipeline import Pipeline
 
 STAGES = ("ratio_prior", "gms_soft", "lpm_soft", "position_consistency", "frame_consistency", "code_soft")
 NEWTON_STEPS = 30

@@ -31,7 +31,7 @@ FIELDS = ("x0", "x1", "mask", "quality", "prior", "noise", "size0", "size1", "ke
 def inputs(quick: bool, matches: Path | None) -> dict[str, dict[str, torch.Tensor]]:
     """Batches of pairs as plain tensors, by name, so that both checkouts read the same."""
     sys.path.insert(0, str(HERE))
-    from fmtorch.types import collate
+    from fmtorch.core.types import collate
     from tests.laws import degenerate, scene, small
 
     rng = np.random.default_rng(0)
@@ -66,8 +66,7 @@ def inputs(quick: bool, matches: Path | None) -> dict[str, dict[str, torch.Tenso
 
 
 def real(arrays: Any, i: int, most: int) -> Any:
-    from fmtorch import presets
-    from fmtorch.types import Correspondences
+    from fmtorch import Correspondences, presets
 
     x0, x1 = (torch.from_numpy(arrays[f"{i:03d}.{x}"][:most].astype(np.float32))[None] for x in ("X1", "X2"))
     size0, size1 = (torch.from_numpy(arrays[f"{i:03d}.{s}"].astype(np.int64))[None] for s in ("size1", "size2"))
@@ -78,8 +77,7 @@ def real(arrays: Any, i: int, most: int) -> Any:
 
 def dump(pairs: Path, out: Path, presets_: list[str], quick: bool) -> None:
     """What this process's fmtorch computes of the pairs."""
-    from fmtorch import presets
-    from fmtorch.types import Correspondences
+    from fmtorch import Correspondences, presets
 
     torch.set_num_threads(1)
     batches = {name: Correspondences(**fields) for name, fields in torch.load(pairs).items()}

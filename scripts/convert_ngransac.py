@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from fmtorch.core.terminal import console, exits_with_message
 from fmtorch.pruning.networks import LC
 from fmtorch.pruning.networks.published import ngransac_state
-from fmtorch.terminal import console, exits_with_message
 from fmtorch.training.pruner_export import save_weights
 
 

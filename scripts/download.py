@@ -23,8 +23,8 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 
+from fmtorch.core.terminal import console, exits_with_message
 from fmtorch.storage.fetching import download, expect_digest, resume, unpack
-from fmtorch.terminal import console, exits_with_message
 
 DEFAULTS = {
     "weights": None, "dataset": None, "files": None, "sha256": None, "folder": None, "url": None, "timeout": 60,

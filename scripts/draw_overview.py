@@ -13,7 +13,7 @@ import numpy as np
 
 from fmtorch import data, presets
 from fmtorch.evaluation.pictures import draw_matches
-from fmtorch.pipeline import Pipeline
+from fmtorch.pipeline.pipeline import Pipeline
 
 HEIGHT, GAP, WIDTH = 400, 8, 1600
 

@@ -18,11 +18,11 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
+from fmtorch.core.resources import models_dir
+from fmtorch.core.terminal import console, exits_with_message
 from fmtorch.features.networks import build, load_weights
 from fmtorch.features.networks.checkpoints import read_checkpoint
 from fmtorch.features.onnx_network import PatchNetwork, network_file
-from fmtorch.resources import models_dir
-from fmtorch.terminal import console, exits_with_message
 from fmtorch.training.model_card import model_card
 from fmtorch.training.onnx_export import export, quantize
 from fmtorch.training.onnx_layout import lay_out

@@ -20,11 +20,11 @@ from omegaconf import DictConfig
 from torch import nn
 
 from fmtorch import presets
+from fmtorch.core.resources import conf_dir
+from fmtorch.core.terminal import console, exits_with_message
 from fmtorch.features.networks import build, load_weights
 from fmtorch.features.networks.layers import PATCH_SIZE
 from fmtorch.presets import plain
-from fmtorch.resources import conf_dir
-from fmtorch.terminal import console, exits_with_message
 from fmtorch.training.correspondences import Tolerance
 from fmtorch.training.patch_loop import PatchTraining, TrainingOptions
 from fmtorch.training.patch_losses import LOSSES

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.kernel_cache import kernels_dir
+from fmtorch.compiling.cache import kernels_dir
 
 torch.set_num_threads(1)
 
@@ -42,14 +42,15 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 def compile_all() -> None:
     """Compile every kernel of the package that this machine has not compiled yet."""
-    from fmtorch import kernel_cache, kernel_compiler, kernels  # not before the import hook of the type checker
+    from fmtorch.compiling import cache, switch, together  # not before the import hook of the type checker
+    from fmtorch.compiling.kernel import Kernel
 
-    if not kernels.available():
+    if not switch.available():
         return
-    paths = [path.relative_to(kernel_cache.PACKAGE.parent) for path in kernel_cache.sources(kernel_cache.PACKAGE)]
+    paths = [path.relative_to(cache.PACKAGE.parent) for path in cache.sources(cache.PACKAGE)]
     modules = [importlib.import_module(".".join(path.with_suffix("").parts)) for path in paths]
-    found = [value for module in modules for value in vars(module).values() if isinstance(value, kernels.Kernel)]
-    kernel_compiler.compile_together(list({id(each): each for each in found}.values()))
+    found = [value for module in modules for value in vars(module).values() if isinstance(value, Kernel)]
+    together.compile_together(list({id(each): each for each in found}.values()))
 
 
 def own_cache(folder: Path) -> Path:

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.stages import Estimator, Pruner
-from fmtorch.types import Correspondences, collate
+from fmtorch.core.stages import Estimator, Pruner
+from fmtorch.core.types import Correspondences, collate
 
 SMALL_KINDS = ("collinear", "collinear in image 1", "planar", "coincident", "half coincident")
 

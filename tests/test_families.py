@@ -14,12 +14,12 @@ from omegaconf import DictConfig
 
 from fmtorch import presets
 from fmtorch.commands.main import job
+from fmtorch.core.resources import conf_dir
+from fmtorch.core.types import Correspondences
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.data.pairs import GivenMatches
-from fmtorch.pipeline import Pipeline
+from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets.composition import compose
-from fmtorch.resources import conf_dir
-from fmtorch.types import Correspondences
 
 RATIO = "pruner.ratio.families"
 

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch import kernels, presets
+from fmtorch import presets
+from fmtorch.compiling import switch
+from fmtorch.core.types import Correspondences, collate
 from fmtorch.estimators import graph_cut, irls, scores, solvers
 from fmtorch.estimators.focal import hypotheses
 from fmtorch.geometry import sampson_objective
-from fmtorch.types import Correspondences, collate
 from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.laws import (
     Result,
@@ -52,7 +53,7 @@ def _estimator(name: str, kernel: bool = True) -> Subject:
     def run(c: Correspondences) -> Result:
         with pytest.MonkeyPatch.context() as environment:
             if not kernel:
-                environment.setenv(kernels.SWITCH, "off")
+                environment.setenv(switch.SWITCH, "off")
             e = estimator(c, seed=5)
         return {"F": e.F, "inliers": e.inliers, "ok": e.ok, "draws": e.draws, "significance": e.significance}
 
@@ -65,7 +66,7 @@ def _pruner(name: str, kernel: bool = True) -> Subject:
     def run(c: Correspondences) -> Result:
         with pytest.MonkeyPatch.context() as environment:
             if not kernel:
-                environment.setenv(kernels.SWITCH, "off")
+                environment.setenv(switch.SWITCH, "off")
             pruned = pruner(calibrated(c))
         told = {name: getattr(pruned, name) for name in ("prior", "noise")}
         return {"kept": pruned.mask, **{name: value for name, value in told.items() if value is not None}}

@@ -14,20 +14,20 @@ from rich.progress import Progress
 
 from fmtorch import data, presets
 from fmtorch.commands.main import job, run_command
+from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.data import ImagePair, PairDataset
-from fmtorch.evaluation.exporting import exportable
 from fmtorch.evaluation.identity import run_identity
 from fmtorch.evaluation.plots import plot_recall_curves
 from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import ALL, summarize
 from fmtorch.evaluation.summary_tables import pose_table, summary_markdown, summary_table
-from fmtorch.exchange.export import export_kinds, write_exports
-from fmtorch.exchange.journal import Journal
-from fmtorch.fields import Cache, Count, Device, Gigabytes, Seed, path_fields, read_fields
 from fmtorch.presets import plain
+from fmtorch.presets.fields import Cache, Count, Device, Gigabytes, Seed, path_fields, read_fields
 from fmtorch.storage import RunFolder, identity_digest
+from fmtorch.storage.exchange.export import export_kinds, write_exports
+from fmtorch.storage.exchange.journal import Journal
+from fmtorch.storage.exporting import exportable
 from fmtorch.storage.features import CachedFeatures
-from fmtorch.terminal import console, progress_bars, reporter
 
 MANY = 500  # pairs from which on processes are worth their start
 MOST_PROCESSES = 8  # unless more are asked for: each holds the networks of the pipeline and some 0.5 GB

@@ -8,7 +8,7 @@ from hydra.errors import ConfigCompositionException, HydraException, MissingConf
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from fmtorch.options import nearest
+from fmtorch.core.options import nearest
 from fmtorch.presets import available, top_level_names
 
 

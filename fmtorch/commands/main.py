@@ -16,9 +16,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from fmtorch.commands.explain import explained
 from fmtorch.commands.words import hydra_words
+from fmtorch.core.resources import conf_dir
+from fmtorch.core.terminal import MISTAKES, exits_with_message, told
 from fmtorch.presets.pruners import with_explicit
-from fmtorch.resources import conf_dir
-from fmtorch.terminal import MISTAKES, exits_with_message, told
 
 Task = Callable[[DictConfig], None]
 

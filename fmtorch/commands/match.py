@@ -21,16 +21,16 @@ from rich.table import Table
 from fmtorch import __version__, presets
 from fmtorch.commands.main import job, run_command
 from fmtorch.commands.match_folder import FolderFields, match_folder
+from fmtorch.core.files import replacing
+from fmtorch.core.terminal import console
+from fmtorch.core.types import RELATED
 from fmtorch.data import read_image
 from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_matches
-from fmtorch.fields import Cache, Gigabytes, path_fields, read_fields
-from fmtorch.folder import EXHAUSTIVE
 from fmtorch.metrics import nsgd
-from fmtorch.photographs import Image, MatchResult, match
+from fmtorch.pipeline.folder import EXHAUSTIVE
+from fmtorch.pipeline.photographs import Image, MatchResult, match
+from fmtorch.presets.fields import Cache, Gigabytes, path_fields, read_fields
 from fmtorch.storage.features import CachedFeatures
-from fmtorch.storage.files import replacing
-from fmtorch.terminal import console
-from fmtorch.types import RELATED
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,13 +11,13 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from fmtorch import presets
-from fmtorch.exchange.export import export_kinds, write_exports
-from fmtorch.exchange.journal import Journal
-from fmtorch.fields import Count, Device, Seed
-from fmtorch.folder import FolderMatches, chosen_pairs, images_below, open_folder
+from fmtorch.core.terminal import console, progress_bars
+from fmtorch.pipeline.folder import FolderMatches, chosen_pairs, images_below, open_folder
+from fmtorch.presets.fields import Count, Device, Seed
 from fmtorch.storage.code import fmtorch_version
+from fmtorch.storage.exchange.export import export_kinds, write_exports
+from fmtorch.storage.exchange.journal import Journal
 from fmtorch.storage.features import CachedFeatures
-from fmtorch.terminal import console, progress_bars
 
 
 @dataclasses.dataclass(frozen=True)

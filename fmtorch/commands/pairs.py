@@ -21,13 +21,13 @@ from rich.progress import Progress
 
 from fmtorch import data, presets
 from fmtorch.commands.main import job, run_command
+from fmtorch.core.options import Within
+from fmtorch.core.terminal import console, progress_bars
 from fmtorch.data.construction import BLOCK, Construction, blocks
 from fmtorch.data.scenes import ScenePairs
 from fmtorch.evaluation.workers import end_with_parent
-from fmtorch.fields import Count, Seed, path_fields, read_fields
-from fmtorch.options import Within
 from fmtorch.presets import plain
-from fmtorch.terminal import console, progress_bars
+from fmtorch.presets.fields import Count, Seed, path_fields, read_fields
 
 MOST_PROCESSES = 8  # unless more are asked for
 FEW = 4 * BLOCK  # candidates up to which processes are not worth their start

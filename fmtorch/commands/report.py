@@ -14,15 +14,15 @@ from rich.progress import track
 
 from fmtorch import presets
 from fmtorch.commands.main import job, run_command
+from fmtorch.core.files import replacing
+from fmtorch.core.options import Within
+from fmtorch.core.terminal import console
 from fmtorch.evaluation.gallery import Options, Run, gallery
 from fmtorch.evaluation.names import run_names, shared_settings
 from fmtorch.evaluation.page import Section, render
 from fmtorch.evaluation.statistics import recalled
-from fmtorch.fields import Cache, Device, Gigabytes, path_fields, read_fields
-from fmtorch.options import Within
+from fmtorch.presets.fields import Cache, Device, Gigabytes, path_fields, read_fields
 from fmtorch.storage import RunFolder, RunFolderError
-from fmtorch.storage.files import replacing
-from fmtorch.terminal import console
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,11 +12,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from fmtorch.core.options import expect_options
 from fmtorch.data.fmbench import FMBenchPairs
 from fmtorch.data.images import ImageError, read_image, to_grey
 from fmtorch.data.pairs import DepthDataset, ImagePair, ImageSource, PairDataset
 from fmtorch.data.text_files import DataError
-from fmtorch.options import expect_options
 
 __all__ = [
     "NEEDS_ROOT",
@@ -45,7 +45,7 @@ _CLASSES = {
     "colmap": ("fmtorch.data.colmap", "colmap_pairs"),
     "bundler": ("fmtorch.data.bundler", "BundlerPairs"),
     "cameras": ("fmtorch.data.camera_files", "CameraFilePairs"),
-    "h5": ("fmtorch.exchange.dataset", "H5Pairs"),
+    "h5": ("fmtorch.storage.exchange.dataset", "H5Pairs"),
 }
 NEEDS_ROOT = {
     "fmbench": "a set's folder with pairs_with_gt.txt, or a folder of such sets",

@@ -17,12 +17,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.core.files import replacing
 from fmtorch.data.camera_files import CAMERAS, IMAGES, SUFFIXES
 from fmtorch.data.images import ImageError, read_image, to_grey
 from fmtorch.data.matchable import ENOUGH, NEAR_LINE, RATIO, SIFT_FEATURES, Keypoints, keypoints, matchable
 from fmtorch.data.pairs import ImageSource
 from fmtorch.data.scenes import ScenePairs, image_pair
-from fmtorch.storage.files import replacing
 
 BLOCK = 64  # candidates that one worker judges at a time
 MOST_DRAWN = 10_000_000  # candidates of which an order is drawn, 80 MB; with more, among so many drawn at random

@@ -10,8 +10,8 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.core.types import Correspondences, pair_key
 from fmtorch.data.lenses import Lens
-from fmtorch.types import Correspondences, pair_key
 
 
 @dataclasses.dataclass(frozen=True)

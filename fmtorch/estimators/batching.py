@@ -7,12 +7,12 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from fmtorch.core.records import ungraphed
+from fmtorch.core.threads import available, mapped, one_thread
+from fmtorch.core.types import Correspondences, Estimate, collate
 from fmtorch.estimators.pairs import NormalizedPairs, normalized_pairs
 from fmtorch.estimators.support import lack_of_support, relative_rounding
-from fmtorch.records import ungraphed
-from fmtorch.threads import available, mapped, one_thread
-from fmtorch.types import Correspondences, Estimate, collate
-from fmtorch.verdict import judged
+from fmtorch.geometry.verdict import judged
 
 Solve = Callable[[NormalizedPairs], tuple[Tensor, Tensor, Tensor, Tensor]]
 """Pairs -> F (p, 3, 3) in normalised units, inliers (p, n), found (p,), draws (p,)."""

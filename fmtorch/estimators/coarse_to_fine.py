@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from fmtorch.stages import Estimator
-from fmtorch.types import Correspondences, Estimate
-from fmtorch.verdict import judged
+from fmtorch.core.stages import Estimator
+from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.geometry.verdict import judged
 
 
 class CoarseToFine:

@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fmtorch import random
+from fmtorch.core import random
+from fmtorch.core.random import Stream
 from fmtorch.estimators.models import Models
 from fmtorch.estimators.pairs import NormalizedPairs
 from fmtorch.estimators.sampling import PriorWeighted, with_replacement
@@ -20,7 +21,6 @@ from fmtorch.geometry.homography import (
     transfer_squared,
 )
 from fmtorch.geometry.rank2 import last_right_singular_vector
-from fmtorch.random import Stream
 
 PLANE_THRESHOLD_PX = 2.0  # px, the greater of the two transfer distances up to which a match lies on a plane
 PARALLAX_DRAWS = 200  # pairs of matches off a plane

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import kernel
+from fmtorch.compiling.random_kernels import random_bits, stream_state
 from fmtorch.geometry.homography_kernels import (
     least_squares_homography,
     near_plane,
@@ -14,8 +16,6 @@ from fmtorch.geometry.homography_kernels import (
     plane_homography,
 )
 from fmtorch.geometry.rank2_kernels import assign, last_right_singular_vector
-from fmtorch.kernels import kernel
-from fmtorch.random_kernels import random_bits, stream_state
 
 Array = NDArray[Any]
 

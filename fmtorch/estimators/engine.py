@@ -15,7 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fmtorch import kernels
+from fmtorch.compiling import switch
+from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.batching import solve_all
 from fmtorch.estimators.degeneracy import Degensac
 from fmtorch.estimators.final_fits import FinalFit
@@ -38,7 +39,6 @@ from fmtorch.estimators.search import Search
 from fmtorch.estimators.selection import BestScore, FirstOfPool, Selector
 from fmtorch.estimators.solvers import MinimalSamples, Solver
 from fmtorch.estimators.verbs import FocalParts, Verbs
-from fmtorch.types import Correspondences, Estimate
 
 FOCAL_ROUND = 500  # samples of five matches of a pair at a time
 DEFAULT_PRESELECT = Preselect()
@@ -154,7 +154,7 @@ class HypothesizeAndVerify:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
         least = self.search.generator.size
         form: Callable[[NormalizedPairs], Outcome] = self.tensor_form
-        compiled = self.kernel_form if c.mask.device.type == "cpu" and kernels.available() else None
+        compiled = self.kernel_form if c.mask.device.type == "cpu" and switch.available() else None
         if compiled is not None:
             if self.focal is not None:
                 ahead.compiled()

@@ -8,14 +8,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fmtorch import random
+from fmtorch.core import random
+from fmtorch.core.random import Stream
 from fmtorch.estimators.pairs import NormalizedPairs
 from fmtorch.estimators.sampling import with_replacement
 from fmtorch.estimators.scores import CPU_TILE, GPU_TILE, Score, score_models
 from fmtorch.estimators.spatial import gaussian_kernel, neighbor_graph, spatially_coherent_inliers
 from fmtorch.geometry.eight_point import NormalEquations, fundamental_of
 from fmtorch.geometry.residuals import sampson_squared
-from fmtorch.random import Stream
 
 FIRST_DRAW = 1 << 32  # of the samples drawn here: beyond those of any search, so that they are others
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import kernel
+from fmtorch.compiling.random_kernels import random_bits, stream_state
 from fmtorch.geometry.eight_point_kernels import weighted_eight_point
-from fmtorch.kernels import kernel
-from fmtorch.random_kernels import random_bits, stream_state
 
 Array = NDArray[Any]
 

@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch import kernels
+from fmtorch.compiling import switch
+from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.batching import solve_all
 from fmtorch.estimators.inliers import WithinThreshold, median_of_matches
 from fmtorch.estimators.one_pair import irls as one_pair
@@ -22,7 +23,6 @@ from fmtorch.geometry.irls import reweighted
 from fmtorch.geometry.refine import refine_components
 from fmtorch.geometry.residuals import sampson_squared
 from fmtorch.geometry.robust_kernels import named_kernel
-from fmtorch.types import Correspondences, Estimate
 
 TILE = 1 << 16  # matches times models of the pairs that are solved together: bounds memory, changes no result
 DECAY = 0.65  # of the kernel's scale, from one iteration to the next, down to the threshold
@@ -79,7 +79,7 @@ class IterativelyReweighted:
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
         at_once = TILE // (max(1, c.mask.shape[1]) * len(self.starts))
-        compiled = c.mask.device.type == "cpu" and kernels.available()
+        compiled = c.mask.device.type == "cpu" and switch.available()
         solve = functools.partial(self._solve, self._by_kernels if compiled else self._by_tensors)
         return solve_all(c, seed, self.MIN_MATCHES, solve, "the matches do not determine a model", at_once, compiled)
 

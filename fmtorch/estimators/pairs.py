@@ -13,10 +13,10 @@ import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
+from fmtorch.core.types import Correspondences
+from fmtorch.core.validation import reason, wrong_values
 from fmtorch.geometry import canonical
 from fmtorch.geometry.pixel_frame import PixelFrame
-from fmtorch.types import Correspondences
-from fmtorch.validation import reason, wrong_values
 
 SMALLEST_BUCKET = 128
 MAX_COORDINATE_PX = 1e100  # a match beyond is none: numbers made of its coordinates would overflow

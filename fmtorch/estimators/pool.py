@@ -8,13 +8,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from fmtorch import random
+from fmtorch.core import random
+from fmtorch.core.random import Stream
 from fmtorch.estimators.models import Models
 from fmtorch.estimators.options import Preselect
 from fmtorch.estimators.pairs import NormalizedPairs
 from fmtorch.estimators.scores import Score, score_models
 from fmtorch.geometry.residuals import sampson_squared
-from fmtorch.random import Stream
 
 
 class Verifier:

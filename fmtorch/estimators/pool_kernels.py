@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.random_kernels import random_bits, stream_state
 from fmtorch.geometry.order_kernels import smallest_but, sort_by
 from fmtorch.geometry.rank2_kernels import assign
-from fmtorch.kernels import inner, kernel
-from fmtorch.random_kernels import random_bits, stream_state
 
 Array = NDArray[Any]
 TINY = float(np.finfo(np.float64).tiny)

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from fmtorch import random
+from fmtorch.core import random
+from fmtorch.core.random import Stream
 from fmtorch.estimators.pairs import NormalizedPairs
-from fmtorch.random import Stream
 
 _RANDOM_BITS = 32
 _TOTAL_BITS = 30  # cumulative weights stay below 2^30, so that 32 random bits times a total fit an int64

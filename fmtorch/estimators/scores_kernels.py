@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.lanes import added, lanes, sqrt, store, where
 from fmtorch.geometry.order_kernels import smallest_but
-from fmtorch.kernels import inner, kernel
-from fmtorch.lanes import added, lanes, sqrt, store, where
 
 Array = NDArray[Any]
 SINGLES = 16  # float32 numbers of a row

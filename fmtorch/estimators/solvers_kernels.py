@@ -11,10 +11,10 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import kernel
 from fmtorch.estimators.sampling_kernels import draw_from
 from fmtorch.geometry.eight_point_kernels import eight_point
 from fmtorch.geometry.seven_point_kernels import seven_point
-from fmtorch.kernels import kernel
 
 Array = NDArray[Any]
 SAMPLES = "i8[::1], i8[::1], i8[::1], i8[::1], i8, i8, i8, f8[:, ::1], i8[:, ::1], f4[:, ::1], i8[::1]"

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.estimators.pool_kernels import residuals_squared
-from fmtorch.kernels import inner, kernel
 
 Array = NDArray[Any]
 MOST = 32  # neighbours of a match: WINDOW on each side of it along each of two curves

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.estimators.pool_kernels import best
 from fmtorch.estimators.scores_kernels import score_gains, score_saturated
-from fmtorch.kernels import inner, kernel
 
 Array = NDArray[Any]
 FIRST_LOOK = "f4[:, ::1], f4[:, ::1], f4[::1], f4[::1], i8, i8, f4[::1]"

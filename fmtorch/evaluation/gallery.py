@@ -15,9 +15,9 @@ from fmtorch import data, presets
 from fmtorch.data import DataError, ImageError, ImagePair, PairDataset, read_image
 from fmtorch.evaluation.page import Picture, Shown, ShownPair, differing_pairs
 from fmtorch.evaluation.redraw import difference, drawn, from_stored
-from fmtorch.exchange.dataset import WITHOUT_GEOMETRY
-from fmtorch.pipeline import Pipeline
+from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.storage import RunFolder
+from fmtorch.storage.exchange.dataset import WITHOUT_GEOMETRY
 
 MOST_RUNS = 8  # whose pictures a pair has: each adds some 0.4 MB to the page
 _NOT_BUILT = (ValueError, TypeError, AttributeError, ImportError, OSError)

@@ -12,9 +12,10 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from fmtorch import kernels, presets
+from fmtorch import presets
+from fmtorch.compiling import switch
 from fmtorch.estimators.peers import PEERS
-from fmtorch.pipeline import Pipeline
+from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
 from fmtorch.storage.code import code_digest, fmtorch_version
 from fmtorch.storage.configuration import file_digest, learned, libraries
@@ -46,7 +47,7 @@ def run_identity(config: DictConfig, pipeline_name: str, pipeline: Pipeline, dat
     peers = {PEERS[name] for target in presets.targets_of(stages) if (name := target.rpartition(".")[2]) in PEERS}
     return {
         "pipeline": pipeline_name, **stages, "seed": config.seed, "version": fmtorch_version(),
-        "libraries": libraries(sorted(peers)), "kernels": kernels.identity(), "learned": _learned(stages, pipeline),
+        "libraries": libraries(sorted(peers)), "kernels": switch.identity(), "learned": _learned(stages, pipeline),
         "code": _code({"stages": stages, "dataset": dataset}), "dataset": dataset,
     }  # fmt: skip
 

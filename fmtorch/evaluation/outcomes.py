@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from fmtorch.pipeline import Outcome
-from fmtorch.types import Correspondences, Estimate, collate
+from fmtorch.core.types import Correspondences, Estimate, collate
+from fmtorch.pipeline.pipeline import Outcome
 
 
 def solved(outcome: Outcome) -> bool:

@@ -13,7 +13,7 @@ from torch import Tensor
 from fmtorch.data.pairs import ImagePair
 from fmtorch.evaluation.outcomes import joined_correspondences, joined_estimates, solved
 from fmtorch.metrics import fundamental_pose_error
-from fmtorch.pipeline import Outcome
+from fmtorch.pipeline.pipeline import Outcome
 
 LARGEST_ROTATION, LARGEST_TRANSLATION = 180.0, 90.0  # degrees: what a failed pair counts as
 

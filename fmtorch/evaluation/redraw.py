@@ -13,7 +13,7 @@ from fmtorch.evaluation.canvas import Image
 from fmtorch.evaluation.page import Picture
 from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_epipolar_lines_of_corners, draw_matches
 from fmtorch.metrics import nsgd
-from fmtorch.pipeline import Outcome
+from fmtorch.pipeline.pipeline import Outcome
 
 SAME_F = 1e-12  # difference of any element, of unit Frobenius norm, within which two F are the same
 SAME_NSGD = 1e-4  # between the F of a run and the one drawn again, up to which they are the same: what captions show

@@ -12,7 +12,7 @@ from torch import Tensor
 from fmtorch import metrics
 from fmtorch.evaluation.outcomes import joined_correspondences, joined_estimates, joined_true, solved
 from fmtorch.evaluation.poses import PairPose, pose_errors
-from fmtorch.pipeline import STAGES, Outcome
+from fmtorch.pipeline.pipeline import STAGES, Outcome
 from fmtorch.storage import PairRow
 
 

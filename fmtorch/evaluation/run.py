@@ -12,9 +12,9 @@ import torch
 
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.evaluation.workers import Build, Work, Workers
-from fmtorch.exchange.journal import Journal
-from fmtorch.pipeline import Pipeline
+from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.storage import PairRow
+from fmtorch.storage.exchange.journal import Journal
 from fmtorch.storage.features import CachedFeatures
 
 BATCHES_OF_A_WORKER = 4  # at least, where there are pairs enough

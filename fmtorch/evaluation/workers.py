@@ -21,11 +21,11 @@ import cv2
 import torch
 
 from fmtorch.data.pairs import ImagePair, ImageSource
-from fmtorch.evaluation.exporting import keep_outcomes
 from fmtorch.evaluation.rows import evaluate
-from fmtorch.exchange.journal import Journal
-from fmtorch.pipeline import Pipeline
+from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.storage import PairRow
+from fmtorch.storage.exchange.journal import Journal
+from fmtorch.storage.exporting import keep_outcomes
 from fmtorch.storage.features import CachedFeatures
 
 Build = Callable[[], Pipeline]

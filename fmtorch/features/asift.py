@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.core.types import Features
 from fmtorch.features.sift import SIFT, as_grey, strongest
-from fmtorch.types import Features
 
 ROTATION_STEP = 72.0  # degrees, divided by the tilt; section 5.2 of the paper
 ANTIALIAS_SIGMA = 0.8  # times sqrt(t^2 - 1), the blur along the axis that is then reduced t times; section 5.1

@@ -11,9 +11,9 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from fmtorch.core.resources import pretrained
+from fmtorch.core.types import Features
 from fmtorch.features.sift import strongest
-from fmtorch.resources import pretrained
-from fmtorch.types import Features
 
 SMALLEST = 32  # px, the shorter side: the networks reduce the image 16 and 32 times
 

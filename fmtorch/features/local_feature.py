@@ -11,10 +11,10 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.core.types import Features
 from fmtorch.features.orientation import PatchFunction
 from fmtorch.features.patches import ImagePyramid
 from fmtorch.features.sift import as_grey
-from fmtorch.types import Features
 
 
 @runtime_checkable

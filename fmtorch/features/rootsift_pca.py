@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from fmtorch.core.resources import models_dir
 from fmtorch.features.patch_sift import PatchSIFT, normalized
 from fmtorch.features.patches import ImagePyramid
-from fmtorch.resources import models_dir
 
 DIMENSIONS = 80  # of the paper's RootSIFT-PCA
 

@@ -14,8 +14,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.core.types import Features
 from fmtorch.features.frames import FRAME_SIGMAS
-from fmtorch.types import Features
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from fmtorch.core.types import Features
 from fmtorch.features.frames import FRAME_SIGMAS
 from fmtorch.features.sift import as_grey, root_sift
-from fmtorch.types import Features
 
 ORIENTATIONS = 4  # of one location at most, as VLFeat
 SMALLEST = 16  # px, the shorter side: the smallest octave has 8, and VLFeat takes no smaller image

@@ -1,6 +1,6 @@
 """Two-view projective geometry as pure, batched, differentiable functions."""
 
-from fmtorch.checked import public
+from fmtorch.core.checks import public
 from fmtorch.geometry.cameras import cross_matrix as _cross_matrix
 from fmtorch.geometry.cameras import fundamental_from_calibration as _fundamental_from_calibration
 from fmtorch.geometry.cameras import fundamental_from_projections as _fundamental_from_projections

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from fmtorch.kernels import inner
+from fmtorch.compiling.kernel import inner
 
 ROOT2, LOG2 = math.sqrt(2), math.log(2)
 

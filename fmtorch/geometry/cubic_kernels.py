@@ -7,7 +7,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from fmtorch.kernels import inner
+from fmtorch.compiling.kernel import inner
 
 Array = NDArray[Any]
 NEGLIGIBLE, SEPARATION, POLISHING_STEPS = 1e-60, 1e-4, 2  # as in `cubic`

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.kernels import inner
+from fmtorch.compiling.kernel import inner
 
 Array = NDArray[Any]
 _BITS = 15  # of each coordinate: a code of 30 bits

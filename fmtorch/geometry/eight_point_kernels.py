@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.lanes import LANES, absolute, fill, load, sqrt, store, where
 from fmtorch.geometry.nullspace_kernels import equations, gather, null_space
 from fmtorch.geometry.orientation_kernels import consistently_oriented
 from fmtorch.geometry.rank2_kernels import EPS, nearest_rank2
-from fmtorch.kernels import inner, kernel
-from fmtorch.lanes import LANES, absolute, fill, load, sqrt, store, where
 
 Array = NDArray[Any]
 WIDTH = 32  # partial sums over the matches: part of the last bits of a weighted fit

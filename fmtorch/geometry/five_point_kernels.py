@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.lanes import LANES, fill, load, sqrt, store, where
 from fmtorch.geometry.nullspace_kernels import equations, gather, null_space
 from fmtorch.geometry.orientation_kernels import consistently_oriented
 from fmtorch.geometry.real_roots_kernels import DEGREE, real_roots, room_for_roots
-from fmtorch.kernels import inner, kernel
-from fmtorch.lanes import LANES, fill, load, sqrt, store, where
 
 Array = NDArray[Any]
 _MONOMIALS = (

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import inner
 from fmtorch.geometry.eight_point_kernels import smallest_eigenvector
 from fmtorch.geometry.rank2_kernels import EPS
-from fmtorch.kernels import inner
 
 Array = NDArray[Any]
 ROUNDING = 16 * EPS  # as in `homography.plane_and_parallax`

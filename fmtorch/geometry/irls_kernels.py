@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import kernel
+from fmtorch.compiling.lanes import LANES, load, store
 from fmtorch.geometry.eight_point_kernels import weighted_eight_point
 from fmtorch.geometry.rank2_kernels import assign
 from fmtorch.geometry.sampson_objective_kernels import MATCH, in_rows, linearise, robust
-from fmtorch.kernels import kernel
-from fmtorch.lanes import LANES, load, store
 
 Array = NDArray[Any]
 

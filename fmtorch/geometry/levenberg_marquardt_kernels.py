@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.kernels import inner
+from fmtorch.compiling.kernel import inner
 
 Array = NDArray[Any]
 

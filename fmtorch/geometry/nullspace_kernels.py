@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.kernels import inner
-from fmtorch.lanes import LANES, copysign, fill, load, sqrt, store, where
+from fmtorch.compiling.kernel import inner
+from fmtorch.compiling.lanes import LANES, copysign, fill, load, sqrt, store, where
 
 Array = NDArray[Any]
 RANK_TOLERANCE2 = float((64 * np.finfo(np.float64).eps) ** 2)  # as in `nullspace`, of squared lengths

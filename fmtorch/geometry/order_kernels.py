@@ -6,7 +6,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from fmtorch.kernels import inner
+from fmtorch.compiling.kernel import inner
 
 Array = NDArray[Any]
 

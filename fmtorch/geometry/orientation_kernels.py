@@ -6,8 +6,8 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from fmtorch.kernels import inner
-from fmtorch.lanes import fill, load
+from fmtorch.compiling.kernel import inner
+from fmtorch.compiling.lanes import fill, load
 
 Array = NDArray[Any]
 

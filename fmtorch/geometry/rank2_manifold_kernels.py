@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.lanes import LANES, load, store
 from fmtorch.geometry.rank2_kernels import cofactors, unit
-from fmtorch.kernels import inner, kernel
-from fmtorch.lanes import LANES, load, store
 
 Array = NDArray[Any]
 

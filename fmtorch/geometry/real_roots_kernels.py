@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.kernels import inner
-from fmtorch.lanes import LANES, absolute, any_lane, fill, load, store, where
+from fmtorch.compiling.kernel import inner
+from fmtorch.compiling.lanes import LANES, absolute, any_lane, fill, load, store, where
 
 Array = NDArray[Any]
 KNOTS, POLISHING_STEPS = 33, 4  # of the grid in each of two charts; as in `five_point`

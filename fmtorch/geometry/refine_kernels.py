@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.geometry.levenberg_marquardt_kernels import levenberg_marquardt
 from fmtorch.geometry.rank2_kernels import assign, assign_rows
 from fmtorch.geometry.rank2_manifold_kernels import start_one, steps
 from fmtorch.geometry.sampson_objective_kernels import evaluate
-from fmtorch.kernels import inner, kernel
 
 Array = NDArray[Any]
 MIN_DAMPING, MAX_DAMPING = 1e-12, 1e6  # as in `refine`

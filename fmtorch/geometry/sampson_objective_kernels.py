@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.kernels import inner, kernel
-from fmtorch.lanes import LANES, added, fill, load, sqrt, store, where
+from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.lanes import LANES, added, fill, load, sqrt, store, where
 
 Array = NDArray[Any]
 TINY = 1e-30  # as in `residuals`

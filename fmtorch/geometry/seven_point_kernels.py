@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.lanes import LANES, absolute, load, store
 from fmtorch.geometry.cubic_kernels import cubic_roots
 from fmtorch.geometry.nullspace_kernels import equations, gather, null_space
 from fmtorch.geometry.orientation_kernels import consistently_oriented
-from fmtorch.kernels import inner, kernel
-from fmtorch.lanes import LANES, absolute, load, store
 
 Array = NDArray[Any]
 HALF = 0.5**0.5

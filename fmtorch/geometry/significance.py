@@ -18,10 +18,10 @@ from jaxtyping import Bool, Float, Int, Real
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.compiling.batches import for_each_pair, kernels_serve
 from fmtorch.geometry import significance_kernels as compiled
 from fmtorch.geometry.arithmetic import logarithm
 from fmtorch.geometry.epipolar import epipolar_distances
-from fmtorch.pair_arrays import for_each_pair, kernels_serve
 
 Array = NDArray[Any]
 

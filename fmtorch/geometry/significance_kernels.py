@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.geometry.arithmetic_kernels import logarithm
 from fmtorch.geometry.order_kernels import smallest_but
-from fmtorch.kernels import inner, kernel
 
 Array = NDArray[Any]
 SAMPLE, MODELS, CELLS, LEAST_CHANCE, MOST_CELLS, FARTHEST = 7, 3, 64, 2.0**-13, 1 << 15, 1e100  # as in `significance`

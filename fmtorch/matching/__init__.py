@@ -1,6 +1,6 @@
 """Features x Features -> Correspondences."""
 
-from fmtorch.checked import public
+from fmtorch.core.checks import public
 from fmtorch.matching.matcher import NearestNeighborMatcher
 from fmtorch.matching.nearest import Neighbors
 from fmtorch.matching.nearest import nearest_neighbors as _nearest_neighbors

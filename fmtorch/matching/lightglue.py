@@ -6,8 +6,8 @@ import kornia
 import torch
 from torch import Tensor, nn
 
-from fmtorch.resources import pretrained
-from fmtorch.types import Correspondences, Features
+from fmtorch.core.resources import pretrained
+from fmtorch.core.types import Correspondences, Features
 
 FEATURES = ("aliked", "disk")  # those that need no more than positions and descriptors, and that this project reads
 

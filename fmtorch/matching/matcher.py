@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from fmtorch.core.types import Correspondences, Features
 from fmtorch.matching.nearest import nearest_neighbors
-from fmtorch.types import Correspondences, Features
 
 
 @dataclasses.dataclass(frozen=True)

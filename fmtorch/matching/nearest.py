@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fmtorch.threads import one_thread
+from fmtorch.core.threads import one_thread
 
 _GROUP = 32  # columns whose minimum is taken together; a group is searched only where it can hold a neighbour
 _FLOAT32_NORM = 2.0**11  # integer vectors no longer than this have squared distances up to 2^24: exact in float32

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
+from fmtorch.core.random import Stream, uniform
+from fmtorch.core.validation import expect_sizes
 from fmtorch.geometry.epipolar import inverse_root
-from fmtorch.random import Stream, uniform
-from fmtorch.validation import expect_sizes
 
 COLUMNS = 6  # random numbers of a draw: for each of its two halves a point (x, y) and a place on its line
 BLOCK = 128  # draws made before pairs with enough accepted ones are left out

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
-from fmtorch.checked import checked
+from fmtorch.core.checks import checked
+from fmtorch.core.validation import expect_sizes
 from fmtorch.geometry.epipolar import epipolar_distances
 from fmtorch.metrics.draws import diagonal
-from fmtorch.validation import expect_sizes
 
 THRESHOLD = 0.003  # of the image diagonal (Bian et al., BMVC 2019)
 

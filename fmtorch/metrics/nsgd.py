@@ -20,12 +20,12 @@ import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
-from fmtorch.checked import checked
+from fmtorch.compiling.batches import for_each_pair, kernels_serve
+from fmtorch.core.checks import checked
+from fmtorch.core.random import Stream, mixed_seed
 from fmtorch.geometry.epipolar import lines_through, residual_and_normals, unit_largest
 from fmtorch.metrics import nsgd_kernels as compiled
 from fmtorch.metrics.draws import Pairs, diagonal, expect_samples, mean_terms, segment_in_image
-from fmtorch.pair_arrays import for_each_pair, kernels_serve
-from fmtorch.random import Stream, mixed_seed
 
 BORDER = -0.5  # left and top edge of the first pixel
 NORMAL_FLOOR = 1e-12  # length of a normal, for F of unit size, that is as good as none: its line is at infinity

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.kernels import inner, kernel
-from fmtorch.random_kernels import stream_state, uniform
+from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.random_kernels import stream_state, uniform
 
 Array = NDArray[Any]
 BLOCK, TRIES, COLUMNS, PARALLEL = 128, 10, 6, 1e-12  # as in `draws`

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Int, Real
 from torch import Tensor
 
-from fmtorch.checked import checked
+from fmtorch.core.checks import checked
 from fmtorch.geometry.epipolar import lines_through
 from fmtorch.metrics.draws import Pairs, diagonal, mean_terms, segment_in_image
 

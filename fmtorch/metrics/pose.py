@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.checked import checked
+from fmtorch.core.checks import checked
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.pose import pose_from_fundamental
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.checked import checked
+from fmtorch.core.checks import checked
 
 THRESHOLDS = (5, 10, 20)  # degrees, as SuperGlue (Sarlin et al., CVPR 2020)
 MAA_MAXIMUM = 10  # degrees, as the Image Matching Challenge

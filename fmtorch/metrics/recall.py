@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.checked import checked
+from fmtorch.core.checks import checked
 
 THRESHOLD = 0.05  # NSGD below which an estimate counts as recalled (Bian et al., BMVC 2019)
 FINE_THRESHOLD = 0.01  # NSGD below which it counts as accurate

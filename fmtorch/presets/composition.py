@@ -14,13 +14,14 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
-from fmtorch import data, hydra_source
-from fmtorch.options import nearest
-from fmtorch.pipeline import Pipeline
+from fmtorch import data
+from fmtorch.core.options import nearest
+from fmtorch.core.resources import conf_dir
+from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.presets import hydra_source
 from fmtorch.presets.files import available
 from fmtorch.presets.objects import expect_buildable, instantiate, plain
 from fmtorch.presets.pruners import build_pruners, expect_pruners, pruner_configs, with_explicit
-from fmtorch.resources import conf_dir
 from fmtorch.storage.features import cached
 
 STAGES = ("features", "matcher", "pruner", "estimator")  # groups that a pipeline chooses from

@@ -11,8 +11,8 @@ from typing import Any
 import hydra.utils
 from omegaconf import DictConfig, OmegaConf
 
-from fmtorch.options import nearest
-from fmtorch.resources import conf_dir
+from fmtorch.core.options import nearest
+from fmtorch.core.resources import conf_dir
 
 
 def available(group: str, config_dir: Path | str | None = None) -> list[str]:

@@ -10,7 +10,7 @@ import hydra.utils
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from fmtorch.options import expect_options
+from fmtorch.core.options import expect_options
 from fmtorch.presets.files import load
 
 

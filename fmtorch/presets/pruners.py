@@ -8,9 +8,9 @@ from typing import Any
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf, open_dict
 
+from fmtorch.core.stages import Pruner
 from fmtorch.data.baselines import WIDE
 from fmtorch.presets.objects import expect_buildable, instantiate
-from fmtorch.stages import Pruner
 
 FAMILIES = "families"  # among a pruner's options: family -> options that its pairs get instead
 WIDE_FAMILIES = "wide"  # stands there for every family of wide baselines

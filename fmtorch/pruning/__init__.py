@@ -1,6 +1,6 @@
 """Correspondences -> Correspondences: which matches survive."""
 
-from fmtorch.checked import public
+from fmtorch.core.checks import public
 from fmtorch.pruning.calibration import Calibration, RatioPrior
 from fmtorch.pruning.code import CODE, Coherence, LikelihoodField, SmoothMotion
 from fmtorch.pruning.code import code as _code

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.pair_arrays import for_each_pair, kernels_serve
+from fmtorch.compiling.batches import for_each_pair, kernels_serve
+from fmtorch.core.types import Correspondences
 from fmtorch.pruning import calibration_kernels as compiled
-from fmtorch.types import Correspondences
 
 _SQUARINGS = 10
 _LARGEST = 12.0  # log-odds beyond which P(inlier) is as good as 0 or 1; the logistic function here is 6e-6 off 1 there

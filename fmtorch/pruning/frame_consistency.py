@@ -19,12 +19,12 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.compiling.batches import for_each_pair, kernels_serve
+from fmtorch.core.records import ungraphed
+from fmtorch.core.types import Correspondences
 from fmtorch.geometry.arithmetic import component_sum
 from fmtorch.geometry.curves import curve_orders
-from fmtorch.pair_arrays import for_each_pair, kernels_serve
 from fmtorch.pruning import frame_consistency_kernels as compiled
-from fmtorch.records import ungraphed
-from fmtorch.types import Correspondences
 
 Array = NDArray[Any]
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.geometry.curves_kernels import curve_order
-from fmtorch.kernels import inner, kernel
 
 Array = NDArray[Any]
 WINDOW = 8  # as in `frame_consistency`

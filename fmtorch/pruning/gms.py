@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from fmtorch.pair_arrays import for_each_pair, kernels_serve
+from fmtorch.compiling.batches import for_each_pair, kernels_serve
+from fmtorch.core.records import ungraphed
+from fmtorch.core.types import Correspondences
 from fmtorch.pruning import gms_kernels as compiled
 from fmtorch.pruning.calibration import calibration_of
 from fmtorch.pruning.gms_table import GRIDS, Border, Moves, Surroundings, Table, give_back, moves_in_blocks, tabulated
-from fmtorch.records import ungraphed
-from fmtorch.types import Correspondences
 
 _HALF_SUPPORT = 1.5  # the score, in square roots of the mean, whose support is one half
 

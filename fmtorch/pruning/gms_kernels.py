@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.kernels import inner, kernel
+from fmtorch.compiling.kernel import inner, kernel
 
 Array = NDArray[Any]
 GRID = 20  # this and the ring as in `gms_table`

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.geometry.order_kernels import smallest_but
-from fmtorch.kernels import inner, kernel
 
 Array = NDArray[Any]
 _LEAF = 8  # points a leaf, at most

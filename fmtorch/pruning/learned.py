@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from fmtorch.onnx_session import NetworkFileError
+from fmtorch.core.onnx_session import NetworkFileError
+from fmtorch.core.types import Correspondences
 from fmtorch.pruning.networks.files import SUFFIXES, OnnxBackbone, learned_file, load_weights
 from fmtorch.pruning.networks.prediction import Exportable, Prediction, predict
-from fmtorch.types import Correspondences
 
 RUNTIMES = ("auto", *SUFFIXES)
 COMMAND = "python -m fmtorch.train pruner=NAME makes it, with the name of the preset"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from fmtorch.types import Correspondences
+from fmtorch.core.types import Correspondences
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fmtorch.pair_arrays import for_each_pair, kernels_serve
+from fmtorch.compiling.batches import for_each_pair, kernels_serve
+from fmtorch.core.types import Correspondences
 from fmtorch.pruning import lpm_kernels as compiled
 from fmtorch.pruning.calibration import calibration_of
 from fmtorch.pruning.knn import nearest_points
-from fmtorch.types import Correspondences
 
 Pass = tuple[float, int, float]  # threshold lambda, neighbours K, tau
 

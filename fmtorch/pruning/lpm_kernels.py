@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.kernels import inner, kernel
+from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.pruning.knn_kernels import search
 
 Array = NDArray[Any]

@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.pair_arrays import for_each_pair, kernels_serve
+from fmtorch.compiling.batches import for_each_pair, kernels_serve
+from fmtorch.core.records import ungraphed
+from fmtorch.core.types import Correspondences
 from fmtorch.pruning import match_noise_kernels as compiled
-from fmtorch.records import ungraphed
-from fmtorch.types import Correspondences
 
 LEAST_AREA = 1e-12  # square pixels: keeps the gradient of the scale finite
 LEAST_PRIOR = 0.02  # matches less likely than that are not taken for noisier

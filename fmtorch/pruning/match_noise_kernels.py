@@ -7,7 +7,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from fmtorch.kernels import inner, kernel
+from fmtorch.compiling.kernel import inner, kernel
 
 Array = NDArray[Any]
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from fmtorch.types import Correspondences
+from fmtorch.core.types import Correspondences
 
 
 def mutual(

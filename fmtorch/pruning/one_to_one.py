@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.pair_arrays import for_each_pair, kernels_serve
+from fmtorch.compiling.batches import for_each_pair, kernels_serve
+from fmtorch.core.types import Correspondences
 from fmtorch.pruning import one_to_one_kernels as compiled
-from fmtorch.types import Correspondences
 
 
 def one_to_one(

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.kernels import inner, kernel
-from fmtorch.random_kernels import mix
+from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.random_kernels import mix
 
 Array = NDArray[Any]
 

@@ -16,9 +16,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from fmtorch.compiling.batches import for_each_pair, kernels_serve
+from fmtorch.core.records import ungraphed
+from fmtorch.core.types import Correspondences
 from fmtorch.geometry.arithmetic import component_sum
 from fmtorch.geometry.curves import curve_orders
-from fmtorch.pair_arrays import for_each_pair, kernels_serve
 from fmtorch.pruning import position_consistency_kernels as compiled
 from fmtorch.pruning.calibration import Calibration
 from fmtorch.pruning.frame_consistency import (
@@ -33,8 +35,6 @@ from fmtorch.pruning.frame_consistency import (
     WORST_RATIO,
     tiled,
 )
-from fmtorch.records import ungraphed
-from fmtorch.types import Correspondences
 
 TURNS = 16  # hypotheses of the common turn
 SCALES = tuple(2.0 ** (k / 2) for k in range(-4, 5))  # hypotheses of the common change of scale

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.geometry.curves_kernels import curve_order
-from fmtorch.kernels import inner, kernel
 from fmtorch.pruning.frame_consistency_kernels import WINDOW, add_products
 
 Array = NDArray[Any]

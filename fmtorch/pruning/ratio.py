@@ -7,7 +7,7 @@ import dataclasses
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.types import Correspondences
+from fmtorch.core.types import Correspondences
 
 
 def ratio_test(

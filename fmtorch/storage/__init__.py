@@ -1,6 +1,6 @@
 """What is kept on disk: results and features."""
 
-from fmtorch.storage.files import replacing
+from fmtorch.core.files import replacing
 from fmtorch.storage.rows import PAIR_SCHEMA, PairRow, to_table
 from fmtorch.storage.runs import RunFolder, RunFolderError, identity_digest
 

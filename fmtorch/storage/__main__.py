@@ -11,8 +11,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from fmtorch.kernel_cache import ABOUT, kernels_dir
-from fmtorch.resources import cache_dir
+from fmtorch.compiling.cache import ABOUT, kernels_dir
+from fmtorch.core.resources import cache_dir
 from fmtorch.storage.cache import ArrayCache
 
 Sizes = Mapping[str, Sequence[int]]

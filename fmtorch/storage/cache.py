@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.storage.files import replacing
+from fmtorch.core.files import replacing
 
 Arrays = dict[str, NDArray[Any]]
 DIGEST = "digest"  # the array that holds the digest of the others

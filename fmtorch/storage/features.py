@@ -16,12 +16,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.resources import cache_dir
-from fmtorch.stages import FeatureExtractor, TwoStepExtractor
+from fmtorch.core.resources import cache_dir
+from fmtorch.core.stages import FeatureExtractor, TwoStepExtractor
+from fmtorch.core.types import Features
 from fmtorch.storage.cache import ArrayCache
 from fmtorch.storage.configuration import configuration, environment
 from fmtorch.storage.runs import identity_digest
-from fmtorch.types import Features
 
 OFF = ("off", "none", "")
 

@@ -23,7 +23,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fmtorch.storage.files import naming, replacing, sync, temporary_name
+from fmtorch.core.files import naming, replacing, sync, temporary_name
 from fmtorch.storage.rows import PAIR_SCHEMA, PairRow, to_table
 
 FORMAT = 3  # of the folder; to be raised when the schema changes, or what the identity tells

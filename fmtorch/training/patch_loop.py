@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Int
 from torch import Tensor, nn
 
-from fmtorch import random
+from fmtorch.core import random
+from fmtorch.core.random import Stream
 from fmtorch.features.networks.checkpoints import read_checkpoint
-from fmtorch.random import Stream
 from fmtorch.training.patch_objectives import DRAWS, Objective
 from fmtorch.training.patch_store import PatchStore
 

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch import random
-from fmtorch.random import Stream
+from fmtorch.core import random
+from fmtorch.core.random import Stream
 from fmtorch.training.patch_losses import distances
 from fmtorch.training.patch_store import PatchStore
 

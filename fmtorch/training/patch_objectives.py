@@ -12,8 +12,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from fmtorch import random
-from fmtorch.random import Stream
+from fmtorch.core import random
+from fmtorch.core.random import Stream
 from fmtorch.training.patch_losses import hard_negative_constant
 from fmtorch.training.patch_metrics import evaluate_descriptor, middle, patch_quality
 

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
+from fmtorch.core.random import Stream, uniform
 from fmtorch.geometry.epipolar import lines_through, unit_largest
 from fmtorch.metrics.draws import segment_in_image
 from fmtorch.metrics.nsgd import BORDER
-from fmtorch.random import Stream, uniform
 
 TRIES = 4  # draws made for each point wanted; those whose epipolar line misses image 1 are dropped
 

@@ -26,7 +26,7 @@ from fmtorch import presets
 from fmtorch.data import ImagePair, read_image
 from fmtorch.data.images import to_grey
 from fmtorch.evaluation.run import select
-from fmtorch.pipeline import STAGES, Pipeline
+from fmtorch.pipeline.pipeline import STAGES, Pipeline
 from scripts.benchmark.features import kornia_hesaffnet
 from scripts.benchmark.matched import add_set_arguments, console, sets_of
 from scripts.benchmark.sheet import Sheet, put

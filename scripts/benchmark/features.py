@@ -16,13 +16,13 @@ import numpy as np
 import torch
 from rich.console import Console
 
+from fmtorch.core.types import Features
 from fmtorch.data import read_image
 from fmtorch.data.images import to_grey
 from fmtorch.data.rendered.photographs import photograph
 from fmtorch.features import SIFT, DominantGradient, HessianDetector, ImagePyramid, PatchSIFT, local_feature
 from fmtorch.matching import NearestNeighborMatcher
 from fmtorch.training.onnx_layout import lay_out
-from fmtorch.types import Features
 
 OURS = "ours"
 

@@ -19,12 +19,12 @@ import numpy as np
 import torch
 from rich.progress import track
 
+from fmtorch.core.stages import Estimator
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.run import select
 from fmtorch.evaluation.statistics import PERCENT
-from fmtorch.pipeline import Pipeline
+from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import build, load, pipeline
-from fmtorch.stages import Estimator
 from fmtorch.storage import PairRow
 from scripts.benchmark.early_gc_ransac import EarlyGCRansac
 from scripts.benchmark.matched import add_set_arguments, console, sets_of

@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from fmtorch import kernels, presets
-from fmtorch.types import Correspondences
+from fmtorch import presets
+from fmtorch.compiling import switch
+from fmtorch.core.types import Correspondences
 from scripts.benchmark.pruning_speed import correspondences
 
 COUNT = 600  # matches of the pair
@@ -87,11 +88,11 @@ def whole(group: str, names: Sequence[str], c: Correspondences) -> None:
         stage = presets.build(group, name)
 
         def run(form: str, stage: Any = stage) -> None:
-            os.environ[kernels.SWITCH] = form
+            os.environ[switch.SWITCH] = form
             stage(c)
 
         line(name, functools.partial(run, "on"), functools.partial(run, "off"))
-    os.environ[kernels.SWITCH] = "on"
+    os.environ[switch.SWITCH] = "on"
 
 
 def search(c: Correspondences) -> None:

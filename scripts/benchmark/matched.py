@@ -15,12 +15,12 @@ from rich.console import Console
 from rich.progress import track
 
 from fmtorch import data, presets
+from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data import ImagePair, PairDataset
 from fmtorch.data.baselines import WIDE
 from fmtorch.evaluation.statistics import scene_names
-from fmtorch.pipeline import Pipeline
+from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.storage.features import cached
-from fmtorch.types import Correspondences, Estimate
 from scripts.benchmark import kept
 
 console = Console(width=None if sys.stdout.isatty() else 170)

@@ -16,7 +16,7 @@ import torch
 from rich.table import Table
 
 from fmtorch import presets
-from fmtorch.types import collate
+from fmtorch.core.types import collate
 from scripts.benchmark.matched import console
 from scripts.benchmark.peak import peak_growth
 from scripts.benchmark.specs import build

@@ -21,9 +21,9 @@ import torch
 from rich.progress import track
 
 from fmtorch import presets
+from fmtorch.core.types import Correspondences
 from fmtorch.data import ImagePair, read_image
 from fmtorch.evaluation.run import select
-from fmtorch.types import Correspondences
 from scripts.benchmark.matched import add_set_arguments, console, sets_of
 from scripts.benchmark.sheet import MISSING, Sheet, put
 

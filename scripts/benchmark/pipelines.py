@@ -23,7 +23,7 @@ from fmtorch.data import ImagePair
 from fmtorch.data.baselines import WIDE
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.run import select
-from fmtorch.pipeline import Outcome, Pipeline
+from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.storage import identity_digest
 from fmtorch.storage.configuration import configuration
 from fmtorch.storage.features import CachedFeatures

@@ -26,7 +26,7 @@ from fmtorch import presets
 from fmtorch.data import ImagePair
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.run import select
-from fmtorch.pipeline import Outcome, Pipeline
+from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.storage.features import cached
 from scripts.benchmark import pruning_speed, pruning_table
 from scripts.benchmark.matched import add_set_arguments, options, sets_of

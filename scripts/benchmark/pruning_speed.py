@@ -22,8 +22,8 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from fmtorch import presets
+from fmtorch.core.types import Correspondences
 from fmtorch.pruning import gms, lpm
-from fmtorch.types import Correspondences
 from scripts.benchmark.peak import peak_growth
 
 PEER = Path(__file__).resolve().parent / "opencv_gms.py"

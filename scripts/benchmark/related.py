@@ -22,10 +22,10 @@ import torch
 from rich.progress import track
 
 from fmtorch import metrics, presets
+from fmtorch.core.files import replacing
+from fmtorch.core.types import Correspondences, collate
 from fmtorch.data import ImagePair
-from fmtorch.pipeline import Pipeline
-from fmtorch.storage.files import replacing
-from fmtorch.types import Correspondences, collate
+from fmtorch.pipeline.pipeline import Pipeline
 from scripts.benchmark import related_figure, related_table
 from scripts.benchmark.estimators_table import replaced
 from scripts.benchmark.matched import add_set_arguments, console, sets_of

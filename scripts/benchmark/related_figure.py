@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator
 from numpy.typing import NDArray
 
-from fmtorch.storage.files import replacing
-from fmtorch.types import RELATED
+from fmtorch.core.files import replacing
+from fmtorch.core.types import RELATED
 from scripts.benchmark.related_table import Row, inliers, significance, split
 
 GREY = "#808080"  # of text and axes, on either page

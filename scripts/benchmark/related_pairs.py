@@ -9,11 +9,11 @@ from unittest import mock
 
 import numpy as np
 
+from fmtorch.core.types import pair_key
 from fmtorch.data import ImagePair, ImageSource, PairDataset
 from fmtorch.data.rendered import photographs
 from fmtorch.data.rendered.dataset import RenderedPairs
 from fmtorch.data.rendered.generate import build
-from fmtorch.types import pair_key
 
 UNRELATED = "unrelated"
 """What the names of families of pairs of different scenes begin with."""

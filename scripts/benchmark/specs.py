@@ -9,10 +9,10 @@ from pathlib import Path
 import torch
 
 from fmtorch import presets
+from fmtorch.core.stages import Estimator
+from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data import ImagePair
 from fmtorch.geometry import refine
-from fmtorch.stages import Estimator
-from fmtorch.types import Correspondences, Estimate
 from scripts.benchmark import kept
 from scripts.benchmark.matched import options
 

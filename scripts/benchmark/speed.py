@@ -23,7 +23,7 @@ import torch
 from rich.table import Table
 
 from fmtorch import presets
-from fmtorch.types import Correspondences, Estimate, collate
+from fmtorch.core.types import Correspondences, Estimate, collate
 from scripts.benchmark.matched import add_arguments as add_matches_arguments
 from scripts.benchmark.matched import console, load
 from scripts.benchmark.specs import build

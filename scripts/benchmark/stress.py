@@ -21,7 +21,7 @@ import cv2
 import torch
 
 from fmtorch import metrics
-from fmtorch.types import Correspondences
+from fmtorch.core.types import Correspondences
 from scripts.benchmark import stress_cases, stress_rows, stress_table
 from scripts.benchmark.kept import Kept, Row, read
 from scripts.benchmark.specs import Method, identity, informed, read_specs

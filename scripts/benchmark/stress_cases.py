@@ -15,13 +15,13 @@ from rich.progress import track
 from torch import Tensor
 
 from fmtorch import presets
+from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data import ImagePair
 from fmtorch.evaluation.run import select
 from fmtorch.geometry.epipolar import symmetric_max
 from fmtorch.geometry.homography import least_squares_homography, transfer_squared
-from fmtorch.pipeline import Pipeline
+from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pruning.one_to_one import one_to_one
-from fmtorch.types import Correspondences, Estimate
 from scripts.benchmark.matched import console, sets_of
 
 RATIO = 0.8

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.types import Correspondences
+from fmtorch.core.types import Correspondences
 from scripts.benchmark.stress_cases import LEAST_RIGHT, Case, on_plane, taken
 
 Change = Callable[[Case], Case | None]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from fmtorch.types import Correspondences
+from fmtorch.core.types import Correspondences
 
 SIZE = (768, 1024)  # (h, w)
 

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from fmtorch import kernels
+from fmtorch.compiling import switch
 from fmtorch.data.rendered.cameras import Camera, calibration, look_at
 from fmtorch.data.rendered.depth import depth_at
 from fmtorch.data.rendered.generate import FAMILIES, Plan, Task, build
@@ -16,7 +16,7 @@ from fmtorch.data.rendered.patterns import fractal
 from fmtorch.data.rendered.raycast import Geometry
 from fmtorch.data.rendered.surfaces import Surfaces, vec
 
-pytestmark = pytest.mark.skipif(not kernels.available(), reason="numba is not installed, or kernels are off")
+pytestmark = pytest.mark.skipif(not switch.available(), reason="numba is not installed, or kernels are off")
 FORMS = ("on", "off")
 SIZE = (90, 120)
 
@@ -24,7 +24,7 @@ SIZE = (90, 120)
 def stages(surfaces: Surfaces, light: Light, sky: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> list[Stage]:
     made = []
     for form in FORMS:
-        monkeypatch.setenv(kernels.SWITCH, form)
+        monkeypatch.setenv(switch.SWITCH, form)
         made.append(Stage(Geometry(surfaces), light, sky))
     np.testing.assert_array_equal(made[0].shadow, made[1].shadow)
     return made
@@ -35,7 +35,7 @@ def assert_equal_views(pair: list[Stage], camera: Camera, monkeypatch: pytest.Mo
     offset = (0.125, -0.375)
     seen = []
     for form, stage in zip(FORMS, pair, strict=True):
-        monkeypatch.setenv(kernels.SWITCH, form)
+        monkeypatch.setenv(switch.SWITCH, form)
         hits = stage.geometry.look(camera, offset)
         picture = expose(stage, [camera], Lens(), np.random.default_rng(0))
         seen.append((hits.piece, hits.s, hits.t, stage.radiance(camera, offset), picture))
@@ -97,7 +97,7 @@ def test_both_forms_give_the_same_depth(monkeypatch: pytest.MonkeyPatch) -> None
     points = np.random.default_rng(0).uniform(0, 100, (500, 2))
     depths = []
     for form in FORMS:
-        monkeypatch.setenv(kernels.SWITCH, form)
+        monkeypatch.setenv(switch.SWITCH, form)
         with ThreadPoolExecutor(1) as thread:  # each thread remembers its own views
             depths.append(thread.submit(depth_at, task, 1, points).result())
     np.testing.assert_array_equal(*depths)
@@ -109,7 +109,7 @@ def test_both_forms_draw_the_same_noise(seed: int, monkeypatch: pytest.MonkeyPat
     sizes = np.random.default_rng(seed).integers(9, 400, (20, 2)).tolist()
     drawn = []
     for form in FORMS:
-        monkeypatch.setenv(kernels.SWITCH, form)
+        monkeypatch.setenv(switch.SWITCH, form)
         drawn.append([fractal(np.random.default_rng(seed), h, w, coarsest=64 << (h % 3)) for h, w in sizes])
     for compiled, reference in zip(*drawn, strict=True):
         np.testing.assert_array_equal(compiled, reference)

@@ -26,8 +26,8 @@ from hydra.core.global_hydra import GlobalHydra
 from fmtorch import data
 from fmtorch.data import read_image
 from tests.conftest import own_cache
-from tests.exchange import writers
 from tests.processes import run_command
+from tests.storage.exchange import writers
 
 SOURCE = Path(__file__).resolve().parents[2]
 PAGES = ["README.md", "CONTRIBUTING.md", *(f"docs/{path.name}" for path in sorted((SOURCE / "docs").glob("*.md")))]

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from fmtorch import data
-from fmtorch.stages import Estimator, FeatureExtractor, Matcher, Pruner
+from fmtorch.core.stages import Estimator, FeatureExtractor, Matcher, Pruner
 from tests.processes import run_command
 
 SOURCE = Path(__file__).resolve().parents[2]

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from fmtorch import presets
+from fmtorch.core.types import Correspondences, Estimate, collate
 from fmtorch.estimators import CoarseToFine, HypothesizeAndVerify
-from fmtorch.types import Correspondences, Estimate, collate
 from tests.laws import scene
 
 COARSE = HypothesizeAndVerify(hypotheses=200, threshold=2.0)

@@ -9,13 +9,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from fmtorch import kernels
+from fmtorch.compiling import switch
+from fmtorch.core.types import Correspondences, Estimate, collate
 from fmtorch.estimators import HypothesizeAndVerify
 from fmtorch.estimators.degeneracy import PLANE_THRESHOLD_PX, Degensac
 from fmtorch.estimators.pairs import normalized_pairs
 from fmtorch.estimators.scores import TruncatedSquares
 from fmtorch.geometry.homography import transfer_squared
-from fmtorch.types import Correspondences, Estimate, collate
 from tests.laws import assert_same
 
 PAIRS = 64
@@ -74,7 +74,7 @@ def test_a_scene_ruled_by_a_plane() -> None:
 
 
 def test_a_general_scene_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(kernels.SWITCH, "off")  # DEGENSAC has the tensor form alone; equal bits need one form
+    monkeypatch.setenv(switch.SWITCH, "off")  # DEGENSAC has the tensor form alone; equal bits need one form
     options = {**OPTIONS, "refine": None, "final": "none", "pool": 1, "score": "inlier_count"}
     scenes = collate([_scene(i, 0.0)[0] for i in range(8)])
     plain = HypothesizeAndVerify(**options)(scenes)

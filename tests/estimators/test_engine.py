@@ -8,10 +8,10 @@ import torch
 
 import fmtorch
 from fmtorch import presets
+from fmtorch.core.types import collate
 from fmtorch.estimators import HypothesizeAndVerify, solvers
 from fmtorch.estimators.inliers import residuals_squared_px
 from fmtorch.estimators.pairs import NormalizedPairs, normalized_pairs
-from fmtorch.types import collate
 from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.laws import quick, scene, scenes
 

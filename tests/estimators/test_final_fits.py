@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.types import Correspondences, collate
+from fmtorch.core.types import Correspondences, collate
 from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.geometry.test_irls_gradients import degenerate
 from tests.laws import quick, scene, scenes

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from fmtorch.core.types import Correspondences, collate
 from fmtorch.estimators import HypothesizeAndVerify
 from fmtorch.estimators.graph_cut import GraphCut
 from fmtorch.estimators.pairs import NormalizedPairs, normalized_pairs
@@ -21,7 +22,6 @@ from fmtorch.estimators.spatial import (
     spatially_coherent_inliers,
 )
 from fmtorch.geometry.residuals import sampson_squared
-from fmtorch.types import Correspondences, collate
 from tests.conftest import oracle
 from tests.laws import scene
 from tests.reference import graph_cut

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from fmtorch import presets
+from fmtorch.core.types import collate
 from fmtorch.estimators import IterativelyReweighted
 from fmtorch.geometry import KERNELS
 from fmtorch.geometry.refine import refine
-from fmtorch.types import collate
 from tests.laws import scene, scenes
 from tests.reference import refine as reference
 

@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch import kernels, metrics, presets
+from fmtorch import metrics, presets
+from fmtorch.compiling import switch
+from fmtorch.core.random import Stream
+from fmtorch.core.types import Correspondences, Estimate, collate
 from fmtorch.estimators import HypothesizeAndVerify, final_fits, inliers, sampling, scores
 from fmtorch.estimators.models import Models as TensorModels
 from fmtorch.estimators.one_pair import inliers as compiled_inliers
@@ -27,8 +30,6 @@ from fmtorch.estimators.pool_kernels import drawn_by_prior
 from fmtorch.estimators.registry import PARTS, kernel_form
 from fmtorch.estimators.selection import without_cameras
 from fmtorch.geometry import eight_point
-from fmtorch.random import Stream
-from fmtorch.types import Correspondences, Estimate, collate
 from tests.conftest import oracle
 from tests.estimators.draws import drawn
 from tests.laws import degenerate, scene, scenes, small, with_padding
@@ -225,7 +226,7 @@ def in_both_forms(estimator: HypothesizeAndVerify, c: Correspondences) -> tuple[
     assert estimator.kernel_form is not None
     compiled = estimator(c, seed=SEED)
     with pytest.MonkeyPatch.context() as environment:
-        environment.setenv(kernels.SWITCH, "off")
+        environment.setenv(switch.SWITCH, "off")
         return compiled, estimator(c, seed=SEED)
 
 
@@ -311,9 +312,9 @@ def test_both_forms_solve_the_same_real_pairs(name: str) -> None:
 def test_gradients_in_both_forms(name: str) -> None:
     gradients = []
     estimator = presets.build("estimator", name, refit_inliers=False)
-    for switch in ("on", "off"):
+    for state in ("on", "off"):
         with pytest.MonkeyPatch.context() as environment:
-            environment.setenv(kernels.SWITCH, switch)
+            environment.setenv(switch.SWITCH, state)
             c = scenes()
             x0 = c.x0.double().requires_grad_()
             estimator(c.replace(x0=x0, x1=c.x1.double())).F.square()[:, 0, 1].sum().backward()
@@ -344,8 +345,8 @@ def test_which_wholes_have_a_kernel_form() -> None:
 
 def test_kernels_switched_off_are_not_called(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compiled_solvers, "samples_of_seven", None)
-    monkeypatch.setenv(kernels.SWITCH, "off")
+    monkeypatch.setenv(switch.SWITCH, "off")
     assert bool(HypothesizeAndVerify(hypotheses=100)(scene(0)).ok)
-    monkeypatch.setenv(kernels.SWITCH, "on")
+    monkeypatch.setenv(switch.SWITCH, "on")
     with pytest.raises(TypeError):
         HypothesizeAndVerify(hypotheses=100)(scene(0))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from fmtorch.core.types import Correspondences
 from fmtorch.estimators import HypothesizeAndVerify, final_fits, inliers
 from fmtorch.estimators.degeneracy import Degensac, _fitted, _parallax
 from fmtorch.estimators.degeneracy_kernels import fit_plane
@@ -20,7 +21,6 @@ from fmtorch.estimators.pairs import NormalizedPairs
 from fmtorch.estimators.registry import kernel_form
 from fmtorch.estimators.scores import TruncatedSquares
 from fmtorch.estimators.selection import without_cameras
-from fmtorch.types import Correspondences
 from tests.conftest import oracle
 from tests.estimators.test_degeneracy import _scene
 from tests.estimators.test_one_pair import both, told

@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from fmtorch import presets
+from fmtorch.core.types import Correspondences, collate
 from fmtorch.estimators import support, support_kernels
 from fmtorch.estimators.one_pair import exit as compiled
 from fmtorch.estimators.pairs_kernels import power_of_two
 from fmtorch.estimators.support import lack_of_support
 from fmtorch.geometry.pixel_frame import PixelFrame
-from fmtorch.types import Correspondences, collate
 from tests.laws import degenerate, scene, small, with_padding
 
 pytest.importorskip("numba", reason="numba is not installed")

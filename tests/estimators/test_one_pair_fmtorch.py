@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch import find_fundamental, kernels, presets
+from fmtorch import find_fundamental, presets
+from fmtorch.compiling.kernel import Kernel
+from fmtorch.core.types import collate
 from fmtorch.estimators import HypothesizeAndVerify, final_fits, pool, saturated_gains
 from fmtorch.estimators.engine import Form
 from fmtorch.estimators.inliers import WithinThreshold
@@ -23,8 +25,6 @@ from fmtorch.estimators.one_pair.selection import Selection, scored
 from fmtorch.estimators.pairs import NormalizedPairs
 from fmtorch.estimators.registry import kernel_form
 from fmtorch.estimators.scores import score_models
-from fmtorch.kernels import Kernel
-from fmtorch.types import collate
 from tests.estimators.test_one_pair import both, in_both_forms, models, real_pairs, solved, told
 from tests.laws import SMALL_KINDS, degenerate, scene, small
 
@@ -165,11 +165,11 @@ def test_the_best_candidates_of_two_rounds_are_one_model_or_not() -> None:
     assert not nothing.selection(250).found
 
 
-@pytest.mark.parametrize("switch", ["on", "off"])
-def test_rounds_go_on_where_the_search_is_not_settled(switch: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("state", ["on", "off"])
+def test_rounds_go_on_where_the_search_is_not_settled(state: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """An easy pair has one round, random matches have all, and the other search besides; in a batch as alone."""
-    if switch == "off":
-        monkeypatch.setenv(kernels.SWITCH, "off")
+    if state == "off":
+        monkeypatch.setenv(switch.SWITCH, "off")
     estimator = HypothesizeAndVerify(
         sampler="prior",
         select={"scale": 1.0},
@@ -297,11 +297,11 @@ def test_gradients_in_both_forms() -> None:
     estimator = presets.build("estimator", "fmtorch")
     c = collate([scene(i, 300, outliers=0.3) for i in range(2)])
     found = []
-    for switch in ("on", "off"):
+    for state in ("on", "off"):
         x0, prior = c.x0.double().requires_grad_(), (c.prior.double() if c.prior is not None else c.x0).requires_grad_()
         told_ = c.replace(x0=x0, x1=c.x1.double(), prior=prior, noise=torch.linspace(0.5, 2, 300).expand(2, -1))
         with pytest.MonkeyPatch.context() as environment:
-            environment.setenv(kernels.SWITCH, switch)
+            environment.setenv(switch.SWITCH, state)
             estimator(told_).F.square()[:, 0, 1].sum().backward()
         assert x0.grad is not None
         assert prior.grad is not None

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from fmtorch.core.types import Correspondences
 from fmtorch.estimators import HypothesizeAndVerify
 from fmtorch.estimators.graph_cut import GraphCut
 from fmtorch.estimators.one_pair.graph_cut import GraphCut as GraphCutOfOne
@@ -17,7 +18,6 @@ from fmtorch.estimators.registry import kernel_form
 from fmtorch.estimators.scores import TruncatedSquares
 from fmtorch.estimators.spatial import gaussian_kernel, neighbor_graph, spatially_coherent_inliers
 from fmtorch.geometry.residuals import sampson_squared
-from fmtorch.types import Correspondences
 from tests.conftest import oracle
 from tests.estimators.test_one_pair import both, told
 from tests.laws import SMALL_KINDS, small

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch import kernels, presets
+from fmtorch import presets
+from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.irls import _weight
 from fmtorch.estimators.one_pair.irls import weights
 from fmtorch.geometry.irls import reweighted
@@ -14,7 +15,6 @@ from fmtorch.geometry.irls_kernels import reweighted as compiled_reweighted
 from fmtorch.geometry.robust_kernels import KERNELS
 from fmtorch.geometry.sampson_objective_kernels import LOSSES
 from fmtorch.geometry.sigma_consensus import LOSS_TABLE
-from fmtorch.types import Correspondences, Estimate
 from tests.estimators.test_one_pair import (
     assert_scenes_alike,
     assert_told_alike,
@@ -31,9 +31,9 @@ pytest.importorskip("numba", reason="numba is not installed")
 
 def in_both_forms(name: str, c: Correspondences) -> list[Estimate]:
     estimator, found = presets.build("estimator", name), []
-    for switch in ("on", "off"):
+    for state in ("on", "off"):
         with pytest.MonkeyPatch.context() as environment:
-            environment.setenv(kernels.SWITCH, switch)
+            environment.setenv(switch.SWITCH, state)
             found.append(estimator(c, seed=3))
     return found
 

@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from fmtorch import geometry, presets
+from fmtorch.core.types import collate
 from fmtorch.estimators import PairwiseEstimator
 from fmtorch.estimators.peers import PEERS
 from fmtorch.estimators.peers.pairwise import Pair, Solution
-from fmtorch.types import collate
 from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.laws import scene
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 from scipy import stats
 
+from fmtorch.core.types import collate
 from fmtorch.estimators.pairs import NormalizedPairs, bucket, normalized_pairs
 from fmtorch.estimators.sampling import PriorWeighted, Prosac, Sampler, Uniform
-from fmtorch.types import collate
 from tests.laws import scene, with_padding
 
 SAMPLERS = [Uniform(), PriorWeighted(), Prosac()]

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from fmtorch.core.random import Stream, mixed_seed
+from fmtorch.core.types import Correspondences
 from fmtorch.estimators import sampling_kernels, solvers
 from fmtorch.estimators.one_pair import sampling as one_pair
 from fmtorch.estimators.one_pair.pair import each_pair
@@ -15,8 +17,6 @@ from fmtorch.estimators.one_pair.solvers import MinimalSamples, SevenPoint
 from fmtorch.estimators.pairs import normalized_pairs
 from fmtorch.estimators.registry import kernel_form
 from fmtorch.estimators.sampling import PriorWeighted, Prosac, Uniform
-from fmtorch.random import Stream, mixed_seed
-from fmtorch.types import Correspondences
 from tests.estimators.draws import drawn
 from tests.laws import scene
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from fmtorch.core.types import collate
 from fmtorch.estimators.models import Models, Pool
 from fmtorch.estimators.options import Preselect
 from fmtorch.estimators.pairs import NormalizedPairs, normalized_pairs
@@ -13,7 +14,6 @@ from fmtorch.estimators.sampling import Prosac, Uniform
 from fmtorch.estimators.scores import TruncatedSquares
 from fmtorch.estimators.search import Search
 from fmtorch.estimators.solvers import EightPoint, MinimalSamples, SevenPoint, Solver
-from fmtorch.types import collate
 from tests.laws import scene
 
 

@@ -11,13 +11,13 @@ import pytest
 import torch
 
 from fmtorch import find_fundamental, presets
+from fmtorch.core.types import Correspondences, Estimate, collate
 from fmtorch.estimators import degeneracy, final_fits, support
 from fmtorch.estimators.focal import posterior
 from fmtorch.estimators.graph_cut import GraphCut
 from fmtorch.estimators.peers import PEERS
 from fmtorch.estimators.support import lack_of_support
 from fmtorch.presets.objects import merged
-from fmtorch.types import Correspondences, Estimate, collate
 from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.laws import few, quick, scene, small
 

@@ -19,7 +19,7 @@ from fmtorch.evaluation.gallery import Options, Run, find_dataset, gallery
 from fmtorch.evaluation.page import Section, ShownPair, render
 from fmtorch.presets.composition import compose
 from fmtorch.storage import PairRow, RunFolder, to_table
-from tests.test_pipeline import draw
+from tests.pipeline.test_pipeline import draw
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "report.md"
 F = np.array([0, 0, 0, 0, 0, -1, 0, 1, 0]) / np.sqrt(2)

@@ -10,14 +10,14 @@ import torch
 from omegaconf import OmegaConf
 
 from fmtorch import presets
+from fmtorch.core.stages import Pruner
+from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.evaluation import identity as identity_module
 from fmtorch.evaluation.identity import run_identity
-from fmtorch.pipeline import Pipeline
+from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets.composition import compose
-from fmtorch.stages import Pruner
 from fmtorch.storage import identity_digest
 from fmtorch.storage.configuration import libraries
-from fmtorch.types import Correspondences, Estimate
 
 GROUPS = ("features", "matcher", "pruner", "estimator", "dataset")
 

@@ -9,9 +9,9 @@ import pyarrow as pa
 import pytest
 from matplotlib import image as mpimg
 
+from fmtorch.core.types import pair_key
 from fmtorch.evaluation import plots
 from fmtorch.storage import PairRow, to_table
-from fmtorch.types import pair_key
 
 
 def table(*families: str, nsgd: float = 0.03) -> pa.Table:

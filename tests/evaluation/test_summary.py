@@ -11,10 +11,10 @@ import torch
 from rich.console import Console
 
 from fmtorch import metrics
+from fmtorch.core.types import pair_key
 from fmtorch.evaluation.summary import summarize
 from fmtorch.evaluation.summary_tables import pose_table, summary_markdown, summary_table
 from fmtorch.storage import PairRow, to_table
-from fmtorch.types import pair_key
 
 F = (0.0, -0.5, 0.1, 0.5, 0.0, -0.1, 0.2, 0.3, 0.59)
 

@@ -15,11 +15,11 @@ import pytest
 from numpy.typing import NDArray
 
 from fmtorch import presets
+from fmtorch.core.types import Correspondences, Estimate, Features
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.evaluation.run import _shared_out, evaluate_pairs
-from fmtorch.pipeline import Pipeline
+from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.storage import PairRow
-from fmtorch.types import Correspondences, Estimate, Features
 
 
 def _ends() -> Pipeline:

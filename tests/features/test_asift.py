@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from fmtorch import presets
+from fmtorch.core.types import Features
 from fmtorch.features import ASIFT, SIFT, simulate_view, simulated_views
 from fmtorch.matching import NearestNeighborMatcher
-from fmtorch.types import Features
 
 
 def texture(seed: int, h: int = 160, w: int = 200) -> np.ndarray:

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from fmtorch import presets
+from fmtorch.core.types import Features
 from fmtorch.features import (
     SIFT,
     DominantGradient,
@@ -22,7 +23,6 @@ from fmtorch.features import (
 from fmtorch.matching import NearestNeighborMatcher
 from fmtorch.storage.cache import ArrayCache
 from fmtorch.storage.features import CachedFeatures
-from fmtorch.types import Features
 from tests.features.scenes import texture
 
 WITHOUT_NETWORK = ("rootsift", "dspsift", "rootsiftpca")

@@ -11,10 +11,10 @@ import torch
 from onnx import TensorProto, helper
 from torch import Tensor
 
+from fmtorch.core.onnx_session import NetworkFileError
+from fmtorch.core.resources import models_dir
 from fmtorch.features.networks import ARCHITECTURES, build, load_weights
 from fmtorch.features.onnx_network import PatchNetwork, network_file
-from fmtorch.onnx_session import NetworkFileError
-from fmtorch.resources import models_dir
 from fmtorch.training.onnx_export import export, quantize
 from tests.conftest import oracle, shared_path
 from tests.features.test_networks import randomized

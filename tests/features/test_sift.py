@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from fmtorch.core.types import Features
 from fmtorch.features import FRAME_SIGMAS, SIFT, keypoints_to_lafs, root_sift
-from fmtorch.types import Features
 from tests.conftest import oracle
 
 

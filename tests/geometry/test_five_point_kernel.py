@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from fmtorch.core.random import Stream, mixed_seed
 from fmtorch.estimators.focal import prior
 from fmtorch.estimators.focal.cameras import CentredPairs
 from fmtorch.estimators.focal.hypotheses import FocalSamples
@@ -15,7 +16,6 @@ from fmtorch.estimators.focal.hypotheses_kernels import draw_depths
 from fmtorch.estimators.pairs import NormalizedPairs, normalized_pairs
 from fmtorch.geometry.arithmetic import exponential
 from fmtorch.geometry.five_point_kernels import five_point
-from fmtorch.random import Stream, mixed_seed
 from tests.laws import degenerate, scene, small
 
 pytest.importorskip("numba", reason="numba is not installed")

@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from fmtorch.core.types import Correspondences, collate
 from fmtorch.geometry import eight_point, irls, reweighted_fits
 from fmtorch.geometry.robust_kernels import KERNELS
-from fmtorch.types import Correspondences, collate
 from tests import laws
 from tests.geometry.test_refine import scene
 

@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from fmtorch import presets
+from fmtorch.core.types import Features
 from fmtorch.matching.lightglue import LightGlue
-from fmtorch.pipeline import Pipeline
-from fmtorch.types import Features
-from tests.test_pipeline import draw, pair
+from fmtorch.pipeline.pipeline import Pipeline
+from tests.pipeline.test_pipeline import draw, pair
 
 
 def matcher(threshold: float = -1.0) -> LightGlue:

@@ -3,8 +3,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from fmtorch.core.types import Features, collate
 from fmtorch.matching import NearestNeighborMatcher, nearest_neighbors
-from fmtorch.types import Features, collate
 
 
 def features(seed: int, n: int) -> Features:

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from fmtorch import data, presets
+from fmtorch.core.types import Correspondences
 from fmtorch.geometry import sampson
-from fmtorch.pipeline import Pipeline
-from fmtorch.types import Correspondences
+from fmtorch.pipeline.pipeline import Pipeline
 from tests.conftest import shared_path
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from fmtorch import presets
-from fmtorch.types import Correspondences
+from fmtorch.core.types import Correspondences
 from tests.laws import calibrated, quick_pruner, scene
 
 PRUNERS = presets.available("pruner")

@@ -8,9 +8,9 @@ import torch
 
 import fmtorch
 from fmtorch import presets
+from fmtorch.core.types import Correspondences
 from fmtorch.pruning import frame_agreement
 from fmtorch.pruning.frame_consistency import CURVES, LEAST_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO
-from fmtorch.types import Correspondences
 from tests.laws import scene
 from tests.reference import frame_consistency as reference
 

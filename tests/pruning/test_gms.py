@@ -5,8 +5,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from fmtorch.core.types import Correspondences
 from fmtorch.pruning import GMS, gms
-from fmtorch.types import Correspondences
 from tests.conftest import oracle
 from tests.reference.gms import gms as reference
 

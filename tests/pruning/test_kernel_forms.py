@@ -9,9 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from fmtorch import kernels, presets
+from fmtorch import presets
+from fmtorch.compiling import switch
+from fmtorch.core.types import Correspondences
 from fmtorch.pruning import knn_kernels
-from fmtorch.types import Correspondences
 from tests.laws import degenerate, scene, scenes, small, with_padding
 
 pytest.importorskip("numba", reason="numba is not installed")
@@ -29,9 +30,9 @@ def both_forms(
     c: Correspondences, name: str, monkeypatch: pytest.MonkeyPatch, **options: object
 ) -> tuple[Correspondences, Correspondences]:
     stage = presets.build("pruner", name, **options)
-    monkeypatch.setenv(kernels.SWITCH, "on")
+    monkeypatch.setenv(switch.SWITCH, "on")
     compiled = stage(c)
-    monkeypatch.setenv(kernels.SWITCH, "off")
+    monkeypatch.setenv(switch.SWITCH, "off")
     return compiled, stage(c)
 
 

@@ -12,14 +12,14 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from fmtorch.onnx_session import NetworkFileError
+from fmtorch.core.onnx_session import NetworkFileError
+from fmtorch.core.resources import models_dir
+from fmtorch.core.types import Correspondences, collate
 from fmtorch.pruning import LearnedPruner
 from fmtorch.pruning.networks import DFE, LC
 from fmtorch.pruning.networks.files import learned_file
-from fmtorch.resources import models_dir
 from fmtorch.storage.configuration import configuration, learned
 from fmtorch.training.pruner_export import export_onnx, save_weights
-from fmtorch.types import Correspondences, collate
 from tests.laws import scene
 
 K = torch.tensor([[[800.0, 0, 480], [0, 800, 320], [0, 0, 1]]])

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from fmtorch.core.types import Correspondences
 from fmtorch.pruning import LPM, lpm
 from fmtorch.pruning.knn import by_leaves, by_tree, nearest_points
-from fmtorch.types import Correspondences
 from tests.conftest import oracle
 from tests.reference.lpm import lpm as reference
 from tests.reference.lpm import nearest

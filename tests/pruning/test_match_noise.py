@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from fmtorch import find_fundamental, metrics, presets
+from fmtorch.core.types import collate
 from fmtorch.estimators import scores
 from fmtorch.geometry import sampson, sampson_objective
 from fmtorch.geometry.refine import refine_components
 from fmtorch.pruning import match_noise
-from fmtorch.types import collate
 from tests.laws import quick, scene
 
 NUMBERS = {"usual": 4.06, "radius": 15.0, "slope": 0.65}

@@ -10,10 +10,10 @@ import torch
 
 import fmtorch
 from fmtorch import presets
+from fmtorch.core.types import Correspondences, collate
 from fmtorch.pruning import position_agreement
 from fmtorch.pruning.frame_consistency import CURVES, LEAST_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO
 from fmtorch.pruning.position_consistency import SCALES, TURNS
-from fmtorch.types import Correspondences, collate
 from tests.laws import scene
 from tests.reference import position_consistency as reference
 

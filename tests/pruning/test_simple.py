@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from torch import Tensor
 
+from fmtorch.core.types import Correspondences, Features
 from fmtorch.matching import NearestNeighborMatcher, nearest_neighbors
 from fmtorch.pruning import MutualCheck, OneToOne, RatioTest, mutual, one_to_one, ratio_test
-from fmtorch.types import Correspondences, Features
 from tests.reference import matching as matching_reference
 from tests.reference.matching import one_to_one as one_to_one_reference
 

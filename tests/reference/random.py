@@ -1,4 +1,4 @@
-"""The random numbers of `fmtorch.random`, one at a time in Python's integers, from the definition of splitmix64."""
+"""The random numbers of `core.random`, one at a time in Python's integers, from the definition of splitmix64."""
 
 from __future__ import annotations
 

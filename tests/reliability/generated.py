@@ -36,9 +36,9 @@ from torch import Tensor
 
 import fmtorch
 from fmtorch import geometry, matching, metrics, presets, pruning
-from fmtorch.checked import expectation
+from fmtorch.core.checks import expectation
+from fmtorch.core.types import Correspondences, Estimate, Features, collate
 from fmtorch.estimators.peers import PEERS
-from fmtorch.types import Correspondences, Estimate, Features, collate
 from tests.laws import calibrated, few, quick_pruner
 from tests.reliability.arguments import KINDS, MISTAKES, NUMBERS, SEQUENCES, Scene, batches, scenes
 from tests.reliability.arguments import given as as_given

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fmtorch.core.resources import models_dir
+from fmtorch.core.types import pair_key
 from fmtorch.data.images import ImageError, read_image
-from fmtorch.resources import models_dir
 from fmtorch.storage import PairRow, RunFolder
 from fmtorch.storage.cache import ArrayCache
 from fmtorch.storage.runs import RunFolderError
-from fmtorch.types import pair_key
 from tests.processes import ONE_THREAD
 from tests.reliability.images import NO_IMAGES, SOUND
 

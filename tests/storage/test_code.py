@@ -83,7 +83,7 @@ OWN = {
     "other.py": "",
     "parts/__init__.py": "",
     "parts/common.py": "import lone",
-    "parts/deep/stage.py": "from ..common import lone\nfrom . import near\nimport fmtorch.types",
+    "parts/deep/stage.py": "from ..common import lone\nfrom . import near\nimport fmtorch.core.types",
     "parts/deep/near.py": "",
     "parts/deep/below/far.py": "",
     "parts/broken.py": "",

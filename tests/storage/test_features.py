@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch import presets
+from fmtorch.core.stages import TimedExtractor, TwoStepExtractor
+from fmtorch.core.types import Features
 from fmtorch.features import RootSIFTPCA
-from fmtorch.stages import TimedExtractor, TwoStepExtractor
 from fmtorch.storage import configuration as configuration_module
 from fmtorch.storage.cache import ArrayCache
 from fmtorch.storage.configuration import configuration, learned
 from fmtorch.storage.features import CachedFeatures, cached, image_digest
-from fmtorch.types import Features
 from tests.conftest import shared_path
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from fmtorch.core.types import pair_key
 from fmtorch.storage import PAIR_SCHEMA, PairRow, RunFolder, RunFolderError, identity_digest, replacing, to_table
-from fmtorch.types import pair_key
 
 CONFIG = {
     "pipeline": {"name": "sift_ratio", "estimator": {"threshold": 0.5, "samples": 2000}, "stages": ["a", "b"]},

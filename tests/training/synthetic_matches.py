@@ -7,9 +7,9 @@ import math
 import torch
 from torch.utils.data import DataLoader, Dataset
 
+from fmtorch.core.types import Correspondences
 from fmtorch.geometry import fundamental_from_projections
-from fmtorch.matched import LabelledMatches, collate
-from fmtorch.types import Correspondences
+from fmtorch.pipeline.matched import LabelledMatches, collate
 
 SIZE = 480, 640
 FOCAL = 600.0

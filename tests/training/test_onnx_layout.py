@@ -11,9 +11,9 @@ import torch
 from onnx import numpy_helper
 from torch import Tensor
 
+from fmtorch.core.resources import models_dir
 from fmtorch.features.networks import ARCHITECTURES, build
 from fmtorch.features.onnx_network import PatchNetwork
-from fmtorch.resources import models_dir
 from fmtorch.training.onnx_export import export, quantize
 from fmtorch.training.onnx_layout import laid_out
 from tests.features.test_networks import randomized

@@ -12,10 +12,10 @@ import torch
 from fmtorch.data import DepthDataset, ImagePair
 from fmtorch.data.images import ImageError
 from fmtorch.data.rendered.cameras import Camera
-from fmtorch.matched import MatchedPairs, collate
+from fmtorch.pipeline.matched import MatchedPairs, collate
 from fmtorch.training.photographs import Photograph, package_photographs
 from fmtorch.training.planes import PlanePairs, PlaneViews, plane_depth, plane_homography, random_camera
-from tests.matched.conftest import SIFT
+from tests.pipeline.matched.conftest import SIFT
 
 SIZE = (300, 400)
 

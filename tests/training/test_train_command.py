@@ -14,12 +14,12 @@ pytest.importorskip("lightning", reason="training needs the extra `train`")
 
 from hydra import compose, initialize_config_dir
 
-from fmtorch.resources import conf_dir
+from fmtorch.core.resources import conf_dir
 from fmtorch.training.pruners.loop import TrainingFolderError
 from fmtorch.training.pruners.run import run
 from tests.conftest import own_cache
+from tests.pipeline.test_pipeline import draw
 from tests.processes import run_command
-from tests.test_pipeline import draw
 
 SHORT = [
     "optimisation.steps=6", "objective.classification_steps=2", "batch=2", "threads=1", "workers=1", "cache=off",

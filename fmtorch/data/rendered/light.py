@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch import kernels
+from fmtorch.compiling import switch
 from fmtorch.data.rendered.cameras import Camera, Matrix
 from fmtorch.data.rendered.light_kernels import affine, footprints, group_by_texture, shade
 from fmtorch.data.rendered.mipmap import TO_LINEAR, Floats, Pixels, Real, bilinear, to_srgb
@@ -82,7 +82,7 @@ class Stage:
         self.table[..., 6] = geometry.normals @ toward
         self.table[..., 7] = geometry.normals[..., 2]
         self.shadow: Floats = np.full((_SHADOW_MAP, _SHADOW_MAP), np.inf, dtype=np.float32)
-        if kernels.available():
+        if switch.available():
             piece, s, t = hits.flat()
             affine(piece, s, t, self.table, 4, self.shadow.reshape(-1))
         else:
@@ -96,7 +96,7 @@ class Stage:
         out = np.empty((*camera.size, 3), dtype=np.float32)
         beyond = np.flatnonzero(hits.piece.reshape(-1) < 0)
         out.reshape(-1, 3)[beyond] = self._background(camera, offset, beyond)
-        if kernels.available():
+        if switch.available():
             self._shade_compiled(hits, offset, out.reshape(-1, 3))
         else:
             self._shade(hits, offset, out.reshape(-1, 3))

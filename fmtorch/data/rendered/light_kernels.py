@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import fused, inner, kernel
 from fmtorch.data.rendered.raycast_kernels import Floats, Index, Real
-from fmtorch.kernels import fused, inner, kernel
 
 Pixels = NDArray[np.uint8]
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch import kernels
+from fmtorch.compiling import switch
 from fmtorch.data.rendered.mipmap import Floats
 from fmtorch.data.rendered.noise_kernels import add_enlarged
 
@@ -20,7 +20,7 @@ _PERIOD = 8  # of the comb by which the weights of neighbours are told apart
 def add_octave(total: Floats, grid: Floats, weight: float) -> None:
     """Adds `weight` x a grid (rows + 4, columns + 4), whose inner part is enlarged to the size of `total`."""
     rows, cols = (side - 2 * BORDER for side in grid.shape)
-    if kernels.available() and min(total.shape[0] / rows, total.shape[1] / cols) >= _COMPILED_FROM and _same_bits():
+    if switch.available() and min(total.shape[0] / rows, total.shape[1] / cols) >= _COMPILED_FROM and _same_bits():
         if not _add_compiled(total, grid, weight):
             _add(total, grid, weight)
     else:

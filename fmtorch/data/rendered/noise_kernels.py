@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.kernels import fused, kernel
+from fmtorch.compiling.kernel import fused, kernel
 
 Floats = NDArray[np.float32]
 Integers = NDArray[np.int64]

@@ -13,7 +13,7 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch import kernels
+from fmtorch.compiling import switch
 from fmtorch.data.rendered.cameras import Camera
 from fmtorch.data.rendered.mipmap import Floats, Pixels
 from fmtorch.data.rendered.raycast_kernels import cast_pieces
@@ -101,7 +101,7 @@ class Geometry:
         s, t = np.zeros((2, h, w), dtype=np.float32)
         hits = Hits(np.full((h, w), -1, dtype=np.int32), s, t, inverse)
         near = -np.inf if centre is None else NEAR
-        if kernels.available():
+        if switch.available():
             self._cast_compiled(pieces, hits, near)
         else:
             self._cast(pieces, hits, near)

@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.kernels import fused, inner, kernel
+from fmtorch.compiling.kernel import fused, inner, kernel
 
 Floats = NDArray[np.float32]
 Integers = NDArray[np.int64]

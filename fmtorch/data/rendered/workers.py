@@ -1,7 +1,7 @@
 """Several scenes at a time, each worker a process of its own that draws one scene after another.
 
-The workers run `main` in processes of their own (`fmtorch.bare`): unlike multiprocessing this asks nothing of the
-caller's main module, and forks no process that has threads. A worker ends when its input is closed.
+The workers run `main` in processes of their own (`fmtorch.compiling.process`): unlike multiprocessing this asks
+nothing of the caller's main module, and forks no process that has threads. A worker ends when its input is closed.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from fmtorch import bare, kernels
+from fmtorch.compiling import process, switch
+from fmtorch.compiling.together import compile_together
 from fmtorch.data.rendered.generate import KERNELS, Task, generate
-from fmtorch.kernel_compiler import compile_together
 
 Progress = Callable[[int, int], None]
 _MOST = 8  # workers; each takes some 0.5 GB
@@ -49,10 +49,10 @@ def generate_all(
     for job in missing:
         waiting.put(job)
     finished: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-    processes = [bare.process("fmtorch.data.rendered.workers", **_ONE_THREAD) for _ in range(count)]
+    processes = [process.start("fmtorch.data.rendered.workers", **_ONE_THREAD) for _ in range(count)]
     threads = [threading.Thread(target=_feed, args=(p, waiting, finished), daemon=True) for p in processes]
     try:
-        if kernels.available():  # once, while the workers start, rather than in each of them
+        if switch.available():  # once, while the workers start, rather than in each of them
             compile_together(KERNELS)
         for thread in threads:
             thread.start()

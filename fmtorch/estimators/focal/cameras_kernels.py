@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.estimators.focal.prior_kernels import LOG_USUAL
 from fmtorch.geometry.arithmetic_kernels import exponential, logarithm
 from fmtorch.geometry.rank2_kernels import complement
 from fmtorch.geometry.rank2_manifold_kernels import start_one
-from fmtorch.kernels import inner, kernel
 
 Array = NDArray[Any]
 MIN_FOCAL, MAX_FOCAL = 0.25, 5.0  # as in `cameras`

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.lanes import absolute, added, fill, load, sqrt, where
 from fmtorch.geometry.arithmetic_kernels import exponential
 from fmtorch.geometry.sampson_objective_kernels import MATCH, in_rows
-from fmtorch.kernels import inner, kernel
-from fmtorch.lanes import absolute, added, fill, load, sqrt, where
 
 Array = NDArray[Any]
 BITS = 20  # fractional, of the support, so that its sums are exact

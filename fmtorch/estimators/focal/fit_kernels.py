@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import kernel
+from fmtorch.compiling.lanes import LANES
 from fmtorch.estimators.focal.posterior_kernels import damped_step
 from fmtorch.estimators.focal.prior_kernels import focal_cost
-from fmtorch.kernels import kernel
-from fmtorch.lanes import LANES
 
 Array = NDArray[Any]
 

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import kernel
+from fmtorch.compiling.random_kernels import random_bits, stream_state
 from fmtorch.estimators.sampling_kernels import draw_from
 from fmtorch.geometry.arithmetic_kernels import exponential
 from fmtorch.geometry.five_point_kernels import five_point
-from fmtorch.kernels import kernel
-from fmtorch.random_kernels import random_bits, stream_state
 
 Array = NDArray[Any]
 SOLUTIONS = 10  # of five matches, at most

@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.lanes import LANES, fill, load, store
 from fmtorch.estimators.focal.cameras_kernels import translate
 from fmtorch.estimators.focal.prior_kernels import focal_cost
 from fmtorch.geometry.arithmetic_kernels import exponential
@@ -19,8 +21,6 @@ from fmtorch.geometry.levenberg_marquardt_kernels import levenberg_marquardt
 from fmtorch.geometry.rank2_kernels import assign, assign_rows, unit
 from fmtorch.geometry.rank2_manifold_kernels import eliminate
 from fmtorch.geometry.sampson_objective_kernels import evaluate
-from fmtorch.kernels import inner, kernel
-from fmtorch.lanes import LANES, fill, load, store
 
 Array = NDArray[Any]
 FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-9, 1e6  # as in `posterior`

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch import random
+from fmtorch.core import random
+from fmtorch.core.random import Stream
 from fmtorch.estimators.pairs import NormalizedPairs
-from fmtorch.random import Stream
 
 USUAL_FOCAL = 1.2  # median focal length in units of the longer image side
 FOCAL_DEVIATION = 0.4  # of its logarithm, averaged over the two images

@@ -7,7 +7,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from fmtorch.kernels import inner
+from fmtorch.compiling.kernel import inner
 
 Array = NDArray[Any]
 USUAL_FOCAL, FOCAL_DEVIATION, RATIO_DEVIATION = 1.2, 0.4, 0.5  # these as in `prior`

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import kernel
 from fmtorch.estimators.focal.cameras_kernels import centre, nearest_cameras
 from fmtorch.estimators.focal.cheirality_kernels import share_in_front
 from fmtorch.estimators.focal.posterior_kernels import minimise, models_and_costs
 from fmtorch.estimators.pool_kernels import near
-from fmtorch.kernels import kernel
 
 Array = NDArray[Any]
 

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.kernel import kernel
 from fmtorch.estimators.focal.hypotheses_kernels import SOLUTIONS, samples_of_five
 from fmtorch.estimators.focal.refined_kernels import refine_near_with_prior
 from fmtorch.estimators.focal.selection_kernels import posteriors
 from fmtorch.estimators.pool_kernels import merge
 from fmtorch.estimators.scores_kernels import score_saturated
 from fmtorch.estimators.verify_kernels import verify_by_saturated_gains
-from fmtorch.kernels import kernel
 
 Array = NDArray[Any]
 OF_MATCHES = "f4[:, ::1], f4[::1], f4[::1], "

@@ -7,7 +7,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from fmtorch.kernels import kernel
+from fmtorch.compiling.kernel import kernel
 
 Array = NDArray[Any]
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import functools
 from typing import Any
 
+from fmtorch.compiling.kernel import Kernel
+from fmtorch.compiling.together import compile_together
 from fmtorch.estimators import (
     pairs_kernels,
     pool_kernels,
@@ -31,8 +33,6 @@ from fmtorch.geometry import (
     seven_point_kernels,
     significance_kernels,
 )
-from fmtorch.kernel_compiler import compile_together
-from fmtorch.kernels import Kernel
 from fmtorch.pruning import calibration_kernels, frame_consistency_kernels, position_consistency_kernels
 
 FOCAL: tuple[Kernel[..., Any], ...] = (  # the slowest to compile first

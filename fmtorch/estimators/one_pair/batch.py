@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import torch
 
+from fmtorch.core.threads import available, mapped
+from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.batching import NOT_FINITE, shared_out
 from fmtorch.estimators.one_pair.door import Arrived, Rows, opened
 from fmtorch.estimators.one_pair.exit import lack_of_support, rounding_of, to_pixels
 from fmtorch.estimators.one_pair.pair import OnePair
 from fmtorch.estimators.support import relative_rounding
 from fmtorch.geometry.significance import of_one_pair
-from fmtorch.threads import available, mapped
-from fmtorch.types import Correspondences, Estimate
 
 
 def estimated(c: Correspondences, seed: int, least: int, solve: Callable[[OnePair], Any], not_found: str) -> Estimate:

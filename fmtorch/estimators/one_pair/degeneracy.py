@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fmtorch.core.random import Stream, mixed_seed
 from fmtorch.estimators import degeneracy
 from fmtorch.estimators.degeneracy import FITS, KEPT, PARALLAX_DRAWS
 from fmtorch.estimators.degeneracy_kernels import fit_plane, parallax, plane_of_sample
@@ -12,7 +13,6 @@ from fmtorch.estimators.one_pair.pair import Array, OnePair, squared
 from fmtorch.estimators.one_pair.sampling import PriorWeighted
 from fmtorch.estimators.one_pair.scores import Score
 from fmtorch.estimators.sampling import PriorWeighted as TensorPriorWeighted
-from fmtorch.random import Stream, mixed_seed
 
 
 class Degensac:

@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from fmtorch.compiling.batches import as_array
+from fmtorch.core.types import Correspondences
+from fmtorch.core.validation import PER_MATCH, reason, right_size
 from fmtorch.estimators.one_pair.pair import Array, OnePair
 from fmtorch.estimators.pairs import MAX_COORDINATE_PX, MAX_NOISE, MIN_NOISE, bucket, too_few
 from fmtorch.estimators.pairs_kernels import normalize
-from fmtorch.pair_arrays import as_array
-from fmtorch.types import Correspondences
-from fmtorch.validation import PER_MATCH, reason, right_size
 
 UNKNOWN = np.empty(0)  # the sizes of the images, or what else is not told
 BOUNDS = np.array([MAX_COORDINATE_PX, MIN_NOISE, MAX_NOISE])  # as the kernel takes them

@@ -6,6 +6,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from fmtorch.core.random import Stream, mixed_seed
 from fmtorch.estimators import graph_cut
 from fmtorch.estimators.graph_cut import FIRST_DRAW
 from fmtorch.estimators.graph_cut_kernels import fits
@@ -14,7 +15,6 @@ from fmtorch.estimators.one_pair.scores import Score
 from fmtorch.estimators.one_pair.selection import scored
 from fmtorch.estimators.spatial import SHIFTS, SWEEPS, WINDOW
 from fmtorch.estimators.spatial_kernels import MOST, curve_codes, label, neighbours
-from fmtorch.random import Stream, mixed_seed
 
 
 @runtime_checkable

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from fmtorch.core.random import Stream, mixed_seed
 from fmtorch.estimators import pool_kernels as compiled
 from fmtorch.estimators.one_pair.models import Models
 from fmtorch.estimators.one_pair.pair import Array, OnePair
 from fmtorch.estimators.one_pair.scores import Score
 from fmtorch.estimators.options import Preselect
-from fmtorch.random import Stream, mixed_seed
 
 
 class Verifier:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fmtorch.core.random import Stream, mixed_seed
 from fmtorch.estimators.one_pair.graph_cut import LocalOptimization
 from fmtorch.estimators.one_pair.models import Pool
 from fmtorch.estimators.one_pair.pair import Array, OnePair, squared
@@ -14,7 +15,6 @@ from fmtorch.estimators.one_pair.refine import refine_models
 from fmtorch.estimators.options import Refine
 from fmtorch.estimators.pool_kernels import near
 from fmtorch.geometry.refine import RANK_TWO_ALREADY
-from fmtorch.random import Stream, mixed_seed
 
 
 class Near(NamedTuple):

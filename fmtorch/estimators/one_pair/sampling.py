@@ -6,10 +6,10 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
+from fmtorch.core.random import Stream, mixed_seed
 from fmtorch.estimators import sampling
 from fmtorch.estimators.one_pair.pair import Array, OnePair
 from fmtorch.estimators.sampling_kernels import prosac_table, quantise
-from fmtorch.random import Stream, mixed_seed
 
 NONE = np.empty(0, np.int64)
 

@@ -13,11 +13,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.pairs import finite_matches, unfit_pairs
 from fmtorch.estimators.support import lack_of_support, relative_rounding
 from fmtorch.geometry.epipolar import sampson
-from fmtorch.types import Correspondences, Estimate
-from fmtorch.verdict import judged
+from fmtorch.geometry.verdict import judged
 
 Points = NDArray[np.float64]
 Solution = tuple[Points | None, NDArray[np.bool_]]

@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.core.types import Correspondences
 from fmtorch.pruning.code.domain import finite_matches, match_domain
 from fmtorch.pruning.code.likelihood import LikelihoodField
 from fmtorch.pruning.code.motion import SmoothMotion
-from fmtorch.types import Correspondences
 
 LEAST_LIKELIHOOD, LARGEST_RESIDUAL = 0.5, 0.06
 

@@ -16,9 +16,9 @@ from jaxtyping import Float
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
-from fmtorch.onnx_session import NetworkFileError, onnx_session
+from fmtorch.core.onnx_session import NetworkFileError, onnx_session
+from fmtorch.core.resources import models_dir
 from fmtorch.pruning.networks.layers import Slots
-from fmtorch.resources import models_dir
 
 SUFFIXES = {"torch": ".safetensors", "onnx": ".onnx"}  # of the file that each runtime reads
 METADATA = "fmtorch"  # the one key of a file's metadata: several have no fixed order, and so no digest, in safetensors

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.core.types import Correspondences
 from fmtorch.pruning.frame_consistency import frame_agreement, frame_map
-from fmtorch.types import Correspondences
 
 COORDINATES = ("size", "K")
 LEAST_AREA_RATIO = 1e-12  # of two frames; keeps the gradient of the logarithm finite

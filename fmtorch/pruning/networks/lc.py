@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import torch
 from torch import nn
 
+from fmtorch.core.types import Correspondences
 from fmtorch.pruning.networks.inputs import MatchInputs
 from fmtorch.pruning.networks.layers import Slots
 from fmtorch.pruning.networks.pointcn import PointCN
 from fmtorch.pruning.networks.prediction import Backbone, Prediction
-from fmtorch.types import Correspondences
 
 
 class LC(nn.Module):

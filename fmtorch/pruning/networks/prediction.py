@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from fmtorch.core.types import Correspondences
 from fmtorch.pruning.networks.layers import Slots
-from fmtorch.types import Correspondences
 
 Backbone = Callable[[Tensor, Slots], Tensor]  # (B, channels, N), zero in masked slots -> (B, outputs, N)
 

@@ -12,17 +12,17 @@ from omegaconf import DictConfig
 from rich.progress import Progress
 
 from fmtorch import data, presets
+from fmtorch.core.terminal import reporter
 from fmtorch.data import ImagePair, PairDataset
 from fmtorch.data.matchable import ENOUGH
 from fmtorch.data.subset import subset
 from fmtorch.evaluation.run import select
-from fmtorch.matched import Augmentation, LabelledMatches, MatchedPairs, StoredMatches
-from fmtorch.matched.stored import last_scenes
-from fmtorch.matched.transforms import keep_ratio
-from fmtorch.pipeline import Pipeline
+from fmtorch.pipeline.matched import Augmentation, LabelledMatches, MatchedPairs, StoredMatches
+from fmtorch.pipeline.matched.stored import last_scenes
+from fmtorch.pipeline.matched.transforms import keep_ratio
+from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
 from fmtorch.storage.features import cached
-from fmtorch.terminal import reporter
 from fmtorch.training.photographs import Photograph, list_photographs
 from fmtorch.training.planes import PlanePairs, PlaneViews
 

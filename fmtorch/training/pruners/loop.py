@@ -17,7 +17,7 @@ from lightning.pytorch.callbacks import Callback, EarlyStopping, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch.utils.data import DataLoader, Dataset
 
-from fmtorch.storage.files import replacing
+from fmtorch.core.files import replacing
 from fmtorch.storage.runs import identity_digest
 from fmtorch.training.pruners.module import PrunerTraining
 from fmtorch.training.pruners.progress import TrainingBar

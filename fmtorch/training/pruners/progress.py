@@ -8,7 +8,7 @@ import lightning
 from lightning.pytorch.callbacks import Callback
 from rich.progress import Progress, TaskID
 
-from fmtorch.terminal import progress_bars
+from fmtorch.core.terminal import progress_bars
 
 
 class TrainingBar(Callback):

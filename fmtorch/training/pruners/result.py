@@ -11,8 +11,8 @@ from typing import Any
 
 import torch
 
+from fmtorch.core.files import replacing
 from fmtorch.pruning.networks.prediction import Exportable
-from fmtorch.storage.files import replacing
 from fmtorch.training.model_card import OWN_LICENCE, sha256
 from fmtorch.training.pruner_export import export_onnx, save_weights
 from fmtorch.training.pruners.loop import BEST, CHECKPOINTS

@@ -14,12 +14,12 @@ from lightning import Trainer
 from omegaconf import DictConfig
 
 from fmtorch import __version__, presets
-from fmtorch.fields import Cache, Count, Gigabytes, Seed, read_fields
-from fmtorch.matched import Augmentation
-from fmtorch.options import Within, expect_options
+from fmtorch.core.options import Within, expect_options
+from fmtorch.core.terminal import console, progress_bars
+from fmtorch.pipeline.matched import Augmentation
 from fmtorch.presets import plain
+from fmtorch.presets.fields import Cache, Count, Gigabytes, Seed, read_fields
 from fmtorch.storage.runs import identity_digest
-from fmtorch.terminal import console, progress_bars
 from fmtorch.training.planes import PlaneViews
 from fmtorch.training.pruners.batches import training_batches
 from fmtorch.training.pruners.data import labelled_matches

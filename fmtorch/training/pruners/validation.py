@@ -9,10 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from fmtorch import metrics
-from fmtorch.matched import LabelledMatches
+from fmtorch.core.stages import Estimator
 from fmtorch.metrics.recall import FINE_THRESHOLD
+from fmtorch.pipeline.matched import LabelledMatches
 from fmtorch.pruning.networks.prediction import predict
-from fmtorch.stages import Estimator
 from fmtorch.training.pruner_losses import classification_loss
 from fmtorch.training.reliability import reliability, temperature
 

@@ -10,6 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from fmtorch import presets
+from fmtorch.core.types import Correspondences, collate
 from fmtorch.estimators import HypothesizeAndVerify
 from fmtorch.estimators.final_fits import PRIOR_CONFLICT_GAIN
 from fmtorch.estimators.focal.cameras import CentredPairs, TwoCameras
@@ -21,7 +22,6 @@ from fmtorch.estimators.pairs import NormalizedPairs, normalized_pairs
 from fmtorch.geometry import sampson
 from fmtorch.geometry.refine import refine_components
 from fmtorch.metrics import nsgd
-from fmtorch.types import Correspondences, collate
 from tests.reference import focal as reference
 
 SIZE = (600, 800)  # (h, w)

@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from fmtorch.core.types import Correspondences, collate
 from fmtorch.estimators import HypothesizeAndVerify
 from fmtorch.estimators.focal.cameras import bougnoux
 from fmtorch.estimators.focal.posterior import LOSS_SCALE_PX, refine_with_prior
@@ -16,7 +17,6 @@ from fmtorch.estimators.saturated_gains import SaturatedGains
 from fmtorch.geometry.arithmetic import unit
 from fmtorch.geometry.rank2_manifold import start
 from fmtorch.geometry.refine import refine_components
-from fmtorch.types import Correspondences, collate
 from tests.conftest import oracle
 from tests.laws import scenes
 from tests.reference import focal as reference

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from fmtorch import presets
+from fmtorch.core.types import Correspondences, collate
 from fmtorch.estimators import HypothesizeAndVerify
 from fmtorch.estimators.one_pair.focal.rounds import JoinedRounds
 from fmtorch.estimators.verbs import FocalParts
-from fmtorch.types import Correspondences, collate
 from tests.estimators.test_one_pair import real_pairs
 from tests.laws import degenerate, scene, small
 

@@ -6,11 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from fmtorch.core.types import Correspondences, collate
 from fmtorch.geometry import eight_point, sampson
 from fmtorch.pruning.networks import DFE
 from fmtorch.pruning.networks.dfe import masked_softmax
 from fmtorch.pruning.networks.layers import Slots
-from fmtorch.types import Correspondences, collate
 from tests.laws import scene
 
 K = torch.tensor([[[800.0, 0, 480], [0, 800, 320], [0, 0, 1]]])

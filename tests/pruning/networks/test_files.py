@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
+from fmtorch.core.types import Correspondences
 from fmtorch.pruning import LearnedPruner
 from fmtorch.pruning.networks import LC
 from fmtorch.pruning.networks.published import ngransac_state
-from fmtorch.types import Correspondences
 from tests.conftest import oracle, shared_path
 
 SCRIPT = Path(__file__).resolve().parents[3] / "scripts" / "convert_ngransac.py"

@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 
+from fmtorch.core.types import Correspondences
 from fmtorch.pruning.networks import MatchInputs
-from fmtorch.types import Correspondences
 from tests.laws import scene
 
 SIDE = ("ratio", "mutual", "scale", "rotation", "agreement")

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
+from fmtorch.core.types import Correspondences, collate
 from fmtorch.pruning.networks import DFE, LC
 from fmtorch.pruning.networks.layers import Slots
 from fmtorch.pruning.networks.published import ngransac_state
-from fmtorch.types import Correspondences, collate
 from tests.conftest import oracle
 from tests.laws import scene
 

@@ -1,0 +1,65 @@
+"""The door from batched tensors to kernels, which see the arrays of one pair."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from fmtorch.compiling import switch
+from fmtorch.core.threads import available, mapped
+
+PAIRS_OF_A_THREAD = 8  # at least; a thread takes as long to begin as a kernel for a pair
+
+
+def kernels_serve(*tensors: Tensor | None, floats: Sequence[torch.dtype] = (torch.float32, torch.float64)) -> bool:
+    """Whether kernels stand for a tensor function of these: all on the CPU, no gradient to keep, these float types."""
+    given = [t for t in tensors if t is not None]
+    return (
+        all(t.device.type == "cpu" and (t.dtype in floats or not t.is_floating_point()) for t in given)
+        and not (torch.is_grad_enabled() and any(t.requires_grad for t in given))
+        and switch.available()
+    )
+
+
+def for_each_pair(
+    function: Callable[..., None],
+    tensors: Sequence[Tensor | None],
+    *constants: Any,
+    out: Tensor,
+    kind: torch.dtype = torch.float32,
+) -> Tensor:
+    """`out` (B, ...) after function(row of each tensor, constants, row of out) for each of B pairs.
+
+    Rows are C-contiguous arrays, floating ones of type `kind`; of what is not known (None) an empty one. Pairs are
+    shared out among threads.
+    """
+    results = out.numpy()
+    arrays = [_array(t, kind, len(results)) for t in tensors]
+
+    def some(pairs: range) -> None:
+        for pair in pairs:
+            function(*[array[pair] for array in arrays], *constants, results[pair])
+
+    parts = max(1, min(available(), len(results) // PAIRS_OF_A_THREAD))
+    mapped(some, [range(first, len(results), parts) for first in range(parts)])
+    return out
+
+
+def _array(tensor: Tensor | None, kind: torch.dtype, pairs: int) -> NDArray[Any]:
+    if tensor is None:
+        return np.empty((pairs, 0), torch.empty(0, dtype=kind).numpy().dtype)
+    if tensor.is_floating_point() and tensor.dtype != kind:
+        tensor = tensor.to(kind)
+    array: NDArray[Any] = as_array(tensor.contiguous())
+    return array
+
+
+def as_array(tensor: Tensor) -> NDArray[Any]:
+    """A tensor on the CPU as an array, a view, on no graph."""
+    array: NDArray[Any] = (tensor.detach() if tensor.requires_grad else tensor).numpy()
+    return array

@@ -1,0 +1,169 @@
+"""The folder of compiled kernels: one file each, in a folder for this version of the sources, numba, and processor.
+
+numba's own cache does not notice when a function that a kernel calls is edited in another module, and cannot be read
+where it cannot be written. Here the folder's name is a digest of all that decides the machine code, so that a file
+in it is never stale, and is written in one step, so that several processes may share it.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import pickle
+import platform
+import shutil
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from fmtorch.compiling import calls
+from fmtorch.core.resources import cache_dir
+
+PACKAGE = Path(__file__).resolve().parents[1]
+ABOUT = "about.json"  # in each folder; its time of change is when the folder was last used
+UNUSED_DAYS = 30  # after which a folder is removed
+_SETTINGS = ("BOUNDSCHECK", "CPU_FEATURES", "CPU_NAME", "DEBUGINFO_DEFAULT", "ENABLE_AVX", "LOOP_VECTORIZE", "OPT")
+_SIGNATURE_BYTES = 16
+
+
+def kernels_dir() -> Path:
+    """Where the folders of all versions are."""
+    return cache_dir() / "kernels"
+
+
+def versions() -> dict[str, str]:
+    """What decides the machine code: digest of the sources, numba, llvmlite, Python, processor, numba's settings."""
+    import llvmlite
+    import numba
+    from llvmlite import binding
+
+    settings = {name: str(getattr(numba.config, name, None)) for name in _SETTINGS}
+    features = binding.get_host_cpu_features().flatten()
+    return {
+        "sources": sources_digest(PACKAGE), "numba": numba.__version__, "llvmlite": llvmlite.__version__,
+        "python": platform.python_version(), "machine": f"{platform.system()} {platform.machine()}",
+        "processor": binding.get_host_cpu_name(), "features": features, "settings": json.dumps(settings),
+    }  # fmt: skip
+
+
+def sources(package: Path) -> list[Path]:
+    """The files of a package that hold kernels: those named ``*_kernels.py`` that import the decorators."""
+    named = sorted(package.rglob("*_kernels.py"), key=lambda path: path.relative_to(package).as_posix())
+    return [path for path in named if b"from fmtorch.compiling.kernel import" in path.read_bytes()]
+
+
+def sources_digest(package: Path) -> str:
+    """The digest of all kernels of a package, and of how they are compiled."""
+    how = [
+        path
+        for name in ("kernel.py", "calls.py", "lanes.py", "lane_types.py", "lane_functions.py")
+        if (path := package / "compiling" / name).is_file()
+    ]
+    files = [*sources(package), *how]
+    return _hex(b"".join(hashlib.blake2b(path.read_bytes()).digest() for path in files))
+
+
+@functools.cache
+def folder() -> Path | None:
+    """The folder for this version, marked as used now; None, with a warning, where there is none and none can be made.
+
+    Folders that were not used for `UNUSED_DAYS` are removed.
+    """
+    about = versions()
+    path = kernels_dir() / _hex(json.dumps(about).encode())[:16]
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        (path / ABOUT).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        if path.is_dir():
+            return path  # what is there can be read
+        warnings.warn(f"compiled kernels are not kept: {error}", stacklevel=2)
+        return None
+    _remove_unused(path)
+    return path
+
+
+def _remove_unused(used: Path) -> None:
+    oldest = time.time() - UNUSED_DAYS * 24 * 3600
+    for other in used.parent.iterdir():
+        try:
+            if other != used and (other / ABOUT).stat().st_mtime < oldest:
+                shutil.rmtree(other, ignore_errors=True)
+        except OSError:
+            continue  # not one of ours, or somebody else removed it
+
+
+class KernelFile:
+    """The file of one kernel and signature; what numba calls the cache of a function.
+
+    missing: called before the function is compiled, with words that say where it will be kept. calls: once loaded or
+    saved, the kernels that the function calls.
+    """
+
+    def __init__(self, function: Callable[..., Any], signature: str, missing: Callable[[str], None]) -> None:
+        self.missing = missing
+        self.calls: list[Any] = []
+        self.path: Path | None = None
+        where = folder()
+        if where is not None and Path(function.__code__.co_filename).is_file():
+            source = Path(function.__code__.co_filename).read_bytes()
+            version = _hex(source + signature.encode())[:8]
+            self.path = where / f"{function.__module__}.{function.__qualname__}-{version}.bin"
+
+    @property
+    def cache_path(self) -> str | None:
+        """The folder, for numba's statistics."""
+        return None if self.path is None else str(self.path.parent)
+
+    def load_overload(self, signature: Any, target_context: Any) -> Any:
+        """The compiled function of the file; None where there is none, with a warning if it is damaged."""
+        from numba.core.compiler import CompileResult
+
+        target_context.refresh()
+        try:
+            if self.path is not None:
+                written = self.path.read_bytes()
+                data = written[_SIGNATURE_BYTES:]
+                if written[:_SIGNATURE_BYTES] == _signature(data):
+                    self.calls = calls.called(data)
+                    return CompileResult._rebuild(target_context, *pickle.loads(data))
+                warnings.warn(f"{self.path} is damaged; it is compiled anew", stacklevel=2)
+        except FileNotFoundError:
+            pass
+        except OSError as error:
+            warnings.warn(f"{self.path} cannot be read ({error}); it is compiled anew", stacklevel=2)
+        kept = "for this process" if self.path is None else f"for this machine, once (kept in {self.path.parent})"
+        self.missing(kept)
+        return None
+
+    def save_overload(self, signature: Any, result: Any) -> None:
+        """Write a compiled function; where that fails, it is not kept, with a warning."""
+        from numba.core.serialize import dumps
+
+        data = dumps(result._reduce())
+        self.calls = calls.called(data)
+        if self.path is None or result._asdict()["library"].has_dynamic_globals:
+            return
+        from fmtorch.core.files import replacing
+
+        try:
+            with replacing(self.path) as temporary:
+                temporary.write_bytes(_signature(data) + data)
+        except OSError as error:
+            warnings.warn(f"compiled kernels are not kept: {error}", stacklevel=2)
+
+    def flush(self) -> None:
+        """Remove the file."""
+        if self.path is not None:
+            self.path.unlink(missing_ok=True)
+
+
+def _signature(data: bytes) -> bytes:
+    return hashlib.blake2b(data, digest_size=_SIGNATURE_BYTES).digest()
+
+
+def _hex(data: bytes) -> str:
+    return hashlib.blake2b(data, digest_size=16).hexdigest()

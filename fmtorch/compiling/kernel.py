@@ -1,0 +1,208 @@
+"""Functions that numba compiles for this machine when they are first called, kept in a cache folder of their own.
+
+A kernel loops over NumPy arrays where a tensor form would take many small operations::
+
+    @kernel("f4[:, ::1], f8, f4[::1]")
+    def row_sums(x: Floats, scale: float, out: Floats) -> None: ...
+
+Kernels live in modules named ``*_kernels.py``, whose sources version the cache folder (`fmtorch.compiling.cache`); they
+import nothing of fmtorch but one another, this module and `fmtorch.compiling.lanes`. Nothing is imported from numba
+before the first call.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import platform
+import sys
+import threading
+from collections.abc import Callable
+from typing import Any, Generic, ParamSpec, TypeVar, overload
+
+import numpy as np
+
+from fmtorch.compiling import cache, calls
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+OPTIONS = {"nogil": True, "error_model": "numpy", "fastmath": False, "no_cfunc_wrapper": True}
+_lock = threading.RLock()  # numba compiles one function at a time; a kernel may compile those that it calls
+
+
+class Kernel(Generic[P, R]):
+    """A function of NumPy arrays and numbers, compiled for one signature when it is first called.
+
+    Arrays of another dtype, number of axes or memory order are refused with a TypeError, never converted; numbers are
+    converted. Kernels and inner functions may call it, too. It holds no Python lock while it runs, unless it is brief.
+    Raises ImportError where numba cannot be imported.
+    """
+
+    __slots__ = ("__call__", "__dict__")  # so that to call a kernel is to call what is compiled, with nothing between
+    __call__: Callable[P, R]
+
+    def __init__(self, function: Callable[P, R], signature: str, brief: bool = False) -> None:
+        self.function: Callable[P, R] = inspect.unwrap(
+            function
+        )  # without the checks that tests wrap around every function
+        functools.update_wrapper(self, self.function)
+        self.signature = f"({signature},)"  # a tuple, of one argument too
+        self.brief = brief
+        self._compiled: Callable[P, R] | None = None
+        self.calls: list[Kernel[..., Any]] = []  # those that it calls, once it is compiled
+        self.__call__ = self._first_call
+
+    def _first_call(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        return self.compiled()(*args, **kwargs)
+
+    def compiled(self) -> Callable[P, R]:
+        """The compiled function, ready to be called: of this process, of the cache folder, or compiled now.
+
+        Raises ImportError where numba cannot be imported.
+        """
+        with _lock:
+            if not self.ready:
+                function = self.compiled_alone()
+                for each in self.calls:
+                    each.compiled()
+                self.__call__ = function
+        return self.__call__
+
+    def compiled_alone(self, count: str = "") -> Callable[P, R]:
+        """The compiled function, not to be called before those that it calls are compiled, too.
+
+        A message tells where it is compiled now; count: what the message begins with. Raises ImportError where numba
+        cannot be imported.
+        """
+        with _lock:
+            if self._compiled is None:
+                self._compiled, self.calls = _compiled(self.function, self.signature, self.brief, count)
+        return self._compiled
+
+    @property
+    def ready(self) -> bool:
+        """Whether this process has compiled it and those that it calls."""
+        return self._compiled is not None and self.__call__ is self._compiled
+
+    @property
+    def kept(self) -> bool:
+        """Whether the cache folder holds it. Raises ImportError where numba cannot be imported."""
+        path = cache.KernelFile(self.function, self.signature, print).path
+        return path is not None and path.is_file()
+
+    @functools.cached_property
+    def _numba_type_(self) -> Any:  # asked by numba where a kernel calls this one
+        return calls.callable_type(self.function, self.signature)
+
+    def __reduce__(self) -> str:
+        return str(self.__qualname__)  # type: ignore[attr-defined]  # the name to import it by
+
+
+class Inner(Generic[P, R]):
+    """A function for kernels to call, compiled into each of them for the types that it is called with.
+
+    Called from Python it is the plain function, slow and easy to test.
+    """
+
+    def __init__(self, function: Callable[P, R], inline: bool) -> None:
+        self.function: Callable[P, R] = inspect.unwrap(function)
+        self.inline = inline
+        functools.update_wrapper(self, self.function)
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        """The function's value."""
+        return self.function(*args, **kwargs)
+
+    @functools.cached_property
+    def _dispatcher(self) -> Any:
+        import numba
+
+        how = {"inline": "always"} if self.inline else {}
+        return numba.njit(**OPTIONS, no_cpython_wrapper=True, **how)(self.function)
+
+    @property
+    def _numba_type_(self) -> Any:
+        return _type_of(self._dispatcher)
+
+    def __reduce__(self) -> str:
+        return str(self.__qualname__)  # type: ignore[attr-defined]  # the name to import it by
+
+
+def kernel(signature: str, *, brief: bool = False) -> Callable[[Callable[P, R]], Kernel[P, R]]:
+    """Makes a function a `Kernel` of the given types, as numba writes them: ``"f4[:, ::1], i8[::1], f8"``.
+
+    ``[:, ::1]`` is an array of two axes in C order; it must be writable. brief: of some microseconds, for which it
+    keeps Python's lock: a thread that waits for it would wake too late to use them.
+    """
+    return lambda function: Kernel(function, signature, brief)
+
+
+@overload
+def inner(function: Callable[P, R]) -> Inner[P, R]: ...
+@overload
+def inner(*, inline: bool) -> Callable[[Callable[P, R]], Inner[P, R]]: ...
+def inner(function: Callable[P, R] | None = None, *, inline: bool = False) -> Any:
+    """Makes a function an `Inner` one. inline: numba, too, inlines it; LLVM does so anyway where it is small."""
+    return Inner(function, inline) if function is not None else lambda f: Inner(f, inline)
+
+
+class _Fused(Inner[[Any, Any, Any], Any]):
+    """`fused`, compiled into one instruction where the processor has it."""
+
+    @functools.cached_property
+    def _dispatcher(self) -> Any:
+        import numba
+        from llvmlite import binding
+        from numba.extending import intrinsic
+
+        if not binding.get_host_cpu_features().get("fma", platform.machine() in ("arm64", "aarch64")):
+            return numba.njit(**OPTIONS, no_cpython_wrapper=True)(self.function)
+
+        @intrinsic  # type: ignore[untyped-decorator]
+        def instruction(context: Any, b: Any, c: Any, a: Any) -> Any:
+            def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+                return builder.fma(*values)
+
+            return numba.types.float32(*[numba.types.float32] * 3), code
+
+        def fused(a: Any, b: Any, c: Any) -> Any:
+            return instruction(b, c, a)
+
+        return numba.njit(**OPTIONS, no_cpython_wrapper=True)(inspect.unwrap(fused))
+
+
+def _fused(a: Any, b: Any, c: Any) -> Any:
+    """a + b c of float32 numbers, rounded once, to float32."""
+    return np.float32(np.float64(a) + np.float64(b) * np.float64(c))
+
+
+fused = _Fused(_fused, inline=False)
+
+
+def _compiled(
+    function: Callable[P, R], signature: str, brief: bool, count: str
+) -> tuple[Callable[P, R], list[Kernel[..., Any]]]:
+    """The compiled function, whose address its cell holds from now on, and the kernels that it calls."""
+    import numba
+
+    dispatcher: Any = numba.njit(**(OPTIONS | {"nogil": not brief}))(function)
+    if not hasattr(dispatcher, "compile"):
+        return function, []  # NUMBA_DISABLE_JIT=1
+
+    def tell(where: str) -> None:
+        print(f"{count}compiling {function.__name__} {where}", file=sys.stderr, flush=True)
+
+    file = dispatcher._cache = cache.KernelFile(function, signature, tell)
+    dispatcher.compile(signature)
+    dispatcher.disable_compile()
+    (made,) = dispatcher.overloads.values()
+    calls.publish(function, made)
+    compiled: Callable[P, R] = dispatcher
+    return compiled, file.calls
+
+
+def _type_of(dispatcher: Any) -> Any:
+    import numba
+
+    return numba.types.Dispatcher(dispatcher)

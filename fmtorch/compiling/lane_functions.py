@@ -1,0 +1,188 @@
+"""`lanes` for numba: the functions of lanes as intrinsics, made of vector instructions of LLVM.
+
+Imported when the first kernel that uses lanes is compiled.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.registry import cpu_target
+from numba.extending import intrinsic
+
+from fmtorch.compiling.lane_types import INDEX, LanesType, filled, operands
+
+
+def _place(context: Any, builder: Any, array: Any, given: Any, row: Any, count: int, bits: Any) -> Any:
+    """Where a row of an array (rows, lanes) begins, as the place of a vector."""
+    data = context.make_array(array)(context, builder, given).data
+    place = builder.gep(data, [builder.mul(row, ir.Constant(INDEX, count))])
+    return builder.bitcast(place, ir.VectorType(bits, count).as_pointer())
+
+
+def _size(dtype: Any) -> int:
+    return 1 if dtype == types.boolean else int(dtype.bitwidth) // 8
+
+
+def load(count: int) -> Any:
+    """`lanes.Lanes.load` of so many lanes."""
+
+    @intrinsic  # type: ignore[untyped-decorator]
+    def of_row(context: Any, A: Any, row: Any) -> Any:
+        kind = LanesType(A.dtype, count)
+
+        def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
+            bits = context.get_data_type(A.dtype)
+            value = builder.load(_place(context, builder, A, args[0], args[1], count, bits), align=_size(A.dtype))
+            if A.dtype != types.boolean:
+                return value
+            return builder.icmp_unsigned("!=", value, ir.Constant(value.type, [0] * count))
+
+        return kind(A, types.int64), code
+
+    return of_row
+
+
+def fill(count: int) -> Any:
+    """`lanes.Lanes.fill` of so many lanes."""
+
+    @intrinsic  # type: ignore[untyped-decorator]
+    def of_number(context: Any, number: Any) -> Any:
+        kind = LanesType(number if isinstance(number, types.Float) else types.float64, count)
+
+        def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
+            return filled(context, builder, args[0], made.args[0], kind)
+
+        return kind(number), code
+
+    return of_number
+
+
+def store() -> Any:
+    """`lanes.store`."""
+
+    @intrinsic  # type: ignore[untyped-decorator]
+    def to_row(context: Any, A: Any, row: Any, value: Any) -> Any:
+        if A.dtype != value.dtype:
+            raise numba.TypingError(f"{value} cannot be stored in an array of {A.dtype}")
+
+        def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
+            bits, vector = context.get_data_type(A.dtype), args[2]
+            if A.dtype == types.boolean:
+                vector = builder.zext(vector, ir.VectorType(bits, value.count))
+            place = _place(context, builder, A, args[0], args[1], value.count, bits)
+            builder.store(vector, place, align=_size(A.dtype))
+            return context.get_dummy_value()
+
+        return types.void(A, types.int64, value), code
+
+    return to_row
+
+
+def where() -> Any:
+    """`lanes.where`."""
+
+    @intrinsic  # type: ignore[untyped-decorator]
+    def select(context: Any, mask: Any, this: Any, that: Any) -> Any:
+        kind = operands((this, that))
+        if kind is None or mask != kind.mask:
+            raise numba.TypingError(f"where of {mask}, {this} and {that}")
+
+        def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
+            first = filled(context, builder, args[1], this, kind)
+            return builder.select(args[0], first, filled(context, builder, args[2], that, kind))
+
+        return kind(mask, this, that), code
+
+    return select
+
+
+def sqrt() -> Any:
+    """`lanes.sqrt`."""
+    return _library("llvm.sqrt", 1)
+
+
+def absolute() -> Any:
+    """`lanes.absolute`."""
+    return _library("llvm.fabs", 1)
+
+
+def copysign() -> Any:
+    """`lanes.copysign`."""
+    return _library("llvm.copysign", 2)
+
+
+def any_lane() -> Any:
+    """`lanes.any_lane`."""
+
+    @intrinsic  # type: ignore[untyped-decorator]
+    def of_mask(context: Any, mask: Any) -> Any:
+        def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
+            bits = builder.bitcast(args[0], ir.IntType(mask.count))
+            return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
+
+        return types.boolean(mask), code
+
+    return of_mask
+
+
+def added() -> Any:
+    """`lanes.added`."""
+
+    @intrinsic  # type: ignore[untyped-decorator]
+    def of_value(context: Any, value: Any) -> Any:
+        def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
+            (total,), count = args, value.count
+            while count > 1:
+                count //= 2
+                halves = [_some(builder, total, range(k * count, (k + 1) * count)) for k in range(2)]
+                total = builder.fadd(*halves)
+            return builder.extract_element(total, ir.Constant(INDEX, 0))
+
+        return value.dtype(value), code
+
+    return of_value
+
+
+def _some(builder: Any, vector: Any, lanes: range) -> Any:
+    """These lanes of a vector."""
+    which = ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), list(lanes))
+    return builder.shuffle_vector(vector, ir.Constant(vector.type, ir.Undefined), which)
+
+
+def _library(name: str, arguments: int) -> Any:
+    """A function of LLVM that takes so many values of lanes."""
+
+    def made(kinds: tuple[Any, ...]) -> Any:
+        def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
+            vector, kind = args[0].type, kinds[0]
+            called = ir.FunctionType(vector, [vector] * len(args))
+            suffix = f"v{kind.count}f{kind.dtype.bitwidth}"
+            return builder.call(cgutils.get_or_insert_function(builder.module, called, f"{name}.{suffix}"), args)
+
+        return kinds[0](*kinds), code
+
+    if arguments == 1:
+
+        @intrinsic  # type: ignore[untyped-decorator]
+        def one(context: Any, value: Any) -> Any:
+            return made((value,))
+
+        return one
+
+    @intrinsic  # type: ignore[untyped-decorator]
+    def two(context: Any, value: Any, other: Any) -> Any:
+        return made((value, other))
+
+    return two
+
+
+def type_of(function: Any) -> Any:
+    """The type of an intrinsic, as which a kernel knows it."""
+    context = cpu_target.typing_context
+    context.refresh()
+    return context.resolve_value_type(function)

@@ -1,0 +1,115 @@
+"""Several numbers as one value, for kernels that do the same to many samples or matches at a time::
+
+    @inner
+    def add_product(a: Array, b: Array, out: Array) -> None:  # arrays (rows, LANES)
+        for r in range(len(out)):
+            store(out, r, load(out, r) + 2.0 * load(a, r) * load(b, r))
+
+A value takes ``+ - * /`` and comparisons with another, of as many lanes, or with one number; a mask, which comparisons
+make, takes ``& | ^ ~``. In a kernel these are instructions of the processor on vectors in registers, in the order in
+which they are written; a loop over the lanes would have to ask first whether its arrays overlap, and hold its sums in
+memory. From Python a value is an array that no operator changes.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fmtorch.compiling.kernel import Inner
+
+Array = NDArray[Any]
+
+
+class Value(np.ndarray):
+    """A value of lanes in Python: as of numbers, ``a += b`` leaves another name of the same value as it was."""
+
+    __iadd__, __isub__, __imul__ = np.ndarray.__add__, np.ndarray.__sub__, np.ndarray.__mul__  # type: ignore[assignment]
+    __itruediv__ = np.ndarray.__truediv__  # type: ignore[assignment]
+    __iand__, __ior__, __ixor__ = np.ndarray.__and__, np.ndarray.__or__, np.ndarray.__xor__  # type: ignore[assignment]
+
+
+class LaneFunction(Inner[..., Any]):
+    """A function of lanes: in Python that of arrays, in kernels the intrinsic of this name in `lane_functions`."""
+
+    def __init__(self, function: Callable[..., Any], *parameters: int) -> None:
+        super().__init__(function, inline=False)
+        self.parameters = parameters
+
+    @functools.cached_property
+    def _numba_type_(self) -> Any:  # asked by numba where a kernel calls this function
+        from fmtorch.compiling import lane_functions
+
+        return lane_functions.type_of(getattr(lane_functions, self.function.__name__)(*self.parameters))
+
+
+class Lanes(NamedTuple):
+    """load(A, r): row r of an array (rows, lanes). fill(x): the same number in all lanes."""
+
+    load: LaneFunction
+    fill: LaneFunction
+
+
+def lanes(count: int) -> Lanes:
+    """The ways to values of so many lanes."""
+
+    def load(A: Array, row: int) -> Any:
+        return A[row].copy().view(Value)
+
+    def fill(number: Any) -> Any:
+        return np.full(count, number).view(Value)
+
+    return Lanes(LaneFunction(load, count), LaneFunction(fill, count))
+
+
+LANES = 8  # of float64: two vectors of AVX2, one of AVX-512
+load, fill = lanes(LANES)
+
+
+@LaneFunction
+def store(A: Array, row: int, value: Any) -> None:
+    """Makes a value row r of an array (rows, lanes), a mask that of an array of booleans."""
+    A[row] = value
+
+
+@LaneFunction
+def where(mask: Any, this: Any, that: Any) -> Any:
+    """This value in the lanes of the mask, that in the others."""
+    return np.where(mask, this, that).view(Value)
+
+
+@LaneFunction
+def sqrt(value: Any) -> Any:
+    """The square root of each lane."""
+    return np.sqrt(value)
+
+
+@LaneFunction
+def absolute(value: Any) -> Any:
+    """The magnitude of each lane."""
+    return np.abs(value)
+
+
+@LaneFunction
+def copysign(value: Any, sign: Any) -> Any:
+    """The magnitudes of one value with the signs of the other."""
+    return np.copysign(value, sign)
+
+
+@LaneFunction
+def any_lane(mask: Any) -> Any:
+    """Whether the mask holds in any lane."""
+    return bool(mask.any())
+
+
+@LaneFunction
+def added(value: Any) -> Any:
+    """The sum of the lanes: of one half and the other lane by lane, until one number is left."""
+    while len(value) > 1:
+        half = len(value) // 2
+        value = value[:half] + value[half:]
+    return value[0]

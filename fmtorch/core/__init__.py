@@ -1,0 +1,1 @@
+"""What everything stands on: types, records, random numbers, threads, options, files."""

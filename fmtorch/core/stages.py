@@ -1,0 +1,70 @@
+"""The protocols of the four stages: what anything must look like to take its place in a pipeline."""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from fmtorch.core.types import Correspondences, Estimate, Features
+
+
+@runtime_checkable
+class FeatureExtractor(Protocol):
+    """An image (H, W) or (H, W, 3), uint8, RGB -> its local features."""
+
+    def __call__(self, image: NDArray[np.uint8]) -> Features: ...
+
+
+@runtime_checkable
+class TwoStepExtractor(FeatureExtractor, Protocol):
+    """An extractor whose two steps a cache keeps apart: extractors with the same detection share its results.
+
+    Calling it equals ``describe(image, lafs)`` after ``lafs, scores = detect(image)``: a descriptor for each frame.
+    """
+
+    @property
+    def detection(self) -> object:
+        """What defines the frames and scores: parts, options, files, see `storage.configuration.configuration`."""
+        ...
+
+    def detect(self, image: NDArray[np.uint8]) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:
+        """Local affine frames and their scores."""
+        ...
+
+    def describe(self, image: NDArray[np.uint8], lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n d"]:
+        """The descriptors of the frames, which may be on the CPU."""
+        ...
+
+
+@runtime_checkable
+class TimedExtractor(FeatureExtractor, Protocol):
+    """An extractor that knows what its result costs, such as one that may have it already."""
+
+    def timed(self, image: NDArray[np.uint8]) -> tuple[Features, float]:
+        """The features, and the seconds that computing them takes or took."""
+        ...
+
+
+@runtime_checkable
+class Matcher(Protocol):
+    """The features of two images -> putative correspondences of that one pair."""
+
+    def __call__(self, features0: Features, features1: Features) -> Correspondences: ...
+
+
+@runtime_checkable
+class Pruner(Protocol):
+    """Correspondences -> the same, fewer of them surviving, or with a prior."""
+
+    def __call__(self, c: Correspondences) -> Correspondences: ...
+
+
+@runtime_checkable
+class Estimator(Protocol):
+    """Correspondences -> fundamental matrices."""
+
+    def __call__(self, c: Correspondences, seed: int = 0) -> Estimate: ...

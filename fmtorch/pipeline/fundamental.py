@@ -1,0 +1,131 @@
+"""The two-line replacement for `cv2.findFundamentalMat`."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fmtorch import presets
+from fmtorch.compiling import switch
+from fmtorch.core.arguments import Arrays, correspondences, number
+from fmtorch.core.stages import Estimator, Pruner
+from fmtorch.core.threads import one_thread
+from fmtorch.core.types import Estimate
+from fmtorch.core.validation import expect_values
+from fmtorch.estimators.one_pair import ahead
+from fmtorch.geometry.verdict import judged
+
+
+def find_fundamental(
+    x0: Arrays,
+    x1: Arrays,
+    *,
+    estimator: str = "fmtorch",
+    mask: Arrays | None = None,
+    quality: Arrays | None = None,
+    prior: Arrays | None = None,
+    lafs0: Arrays | None = None,
+    lafs1: Arrays | None = None,
+    noise: Arrays | None = None,
+    size0: Arrays | None = None,
+    size1: Arrays | None = None,
+    key: Arrays | int | None = None,
+    seed: int = 0,
+    config_dir: Path | str | None = None,
+    **options: Any,
+) -> Estimate:
+    """Robustly estimate fundamental matrices from matched points, ``x1^T F x0 = 0``.
+
+    Args:
+        x0, x1: matched points in pixels, NumPy or torch, on any device: (N, 2) for one pair, (B, N, 2) for a padded
+            batch, or a list of (N, 2) for pairs of different lengths. Gradients reach them through the final fit.
+        estimator: a preset of conf/estimator.
+        mask: (B, N), True for real matches; all when not given. Like all that is told of matches it may come without
+            the leading B for one pair, and comes as a list where the points do.
+        quality: (B, N), the matcher's figure, smaller is better (a distance ratio).
+        prior: (B, N), P(inlier) in [0, 1]. Where an estimator uses a prior and none is given, it is derived from the
+            frames and the quality, if both are given, otherwise from the points and, if given, the quality.
+        lafs0, lafs1: (B, N, 2, 3) local affine frames.
+        noise: (B, N), each match's standard deviation relative to a usual one's (`fmtorch.pruning.MatchNoise` derives
+            it from frames).
+        size0, size1: image sizes (h, w), one for all pairs or (B, 2).
+        key: (B,) int64, selects each pair's random numbers.
+        seed: of the random numbers.
+        config_dir: a folder with presets of your own, ``<config_dir>/estimator/<name>.yaml``, which come first.
+        options: replace values of the preset (``threshold=0.5``).
+
+    Returns:
+        An `Estimate` of B pairs (of one pair for (N, 2) points, of none for an empty list), with F of unit Frobenius
+        norm, inliers, ok, reason, significance. A pair that cannot be solved is ``ok=False``, never an exception. An F
+        that is ok may be of images that show nothing in common: `related` tells.
+
+    Raises:
+        ValueError: for points of another shape, a prior outside [0, 1], a noise or an image size that is not positive,
+            the size of one image only, an unknown preset or an unknown option.
+        TypeError: for what is no array of numbers.
+
+    Example:
+        >>> import torch, fmtorch
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> X = torch.rand(80, 3, generator=generator, dtype=torch.float64) + torch.tensor([0.0, 0.0, 2.0])
+        >>> x0, x1 = (500 * Y[:, :2] / Y[:, 2:] for Y in (X, X + torch.tensor([-0.5, 0.0, 0.2])))
+        >>> x1[:20] = x1[:20].flip(0)                            # twenty wrong matches
+        >>> estimate = fmtorch.find_fundamental(x0, x1)
+        >>> bool(estimate.ok[0]), int(estimate.inliers[0, 20:].sum())
+        (True, 60)
+    """
+    c = correspondences(
+        x0, x1, mask=mask, quality=quality, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, size0=size0,
+        size1=size1, key=key,
+    )  # fmt: skip
+    expect_values(c)
+    seed = int(number("seed", seed, whole=True))
+    chosen = _estimator(estimator, config_dir, options)
+    if prior is None and getattr(chosen, "uses_prior", False):
+        framed = c.lafs0 is not None and c.lafs1 is not None and c.quality is not None
+        name = "frame_consistency" if framed else "position_consistency"
+        if c.mask.device.type == "cpu" and switch.available() and getattr(chosen, "focal", None) is not None:
+            ahead.compiled(name)
+        with one_thread(c.mask.device):
+            c = _consistency(name)(c)
+    return judged(chosen(c, seed), c)
+
+
+def _estimator(name: str, config_dir: Path | str | None, options: Mapping[str, Any]) -> Estimator:
+    """The estimator of a preset, built but once where its options are plain values and its file is not a user's."""
+    plain = _plain(options)
+    if config_dir is None:
+        try:
+            return _built(name, json.dumps(plain, sort_keys=True))
+        except TypeError:  # an option is an object of some kind
+            pass
+    built: Estimator = presets.build("estimator", name, config_dir, **plain)
+    return built
+
+
+@functools.lru_cache(maxsize=64)
+def _built(name: str, options: str) -> Estimator:
+    built: Estimator = presets.build("estimator", name, **json.loads(options))
+    return built
+
+
+def _plain(value: Any) -> Any:
+    """The value with numbers of NumPy as Python's, at any depth."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    return value
+
+
+@functools.lru_cache(maxsize=2)
+def _consistency(name: str) -> Pruner:
+    built: Pruner = presets.build("pruner", name)
+    return built

@@ -1,0 +1,242 @@
+"""The four stages in a row: features, matching, pruning, estimation; batching, timing, failures as data."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Generic, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from fmtorch.core.stages import Estimator, FeatureExtractor, Matcher, Pruner, TimedExtractor
+from fmtorch.core.threads import one_thread
+from fmtorch.core.types import Correspondences, Estimate, Features, collate
+from fmtorch.data.images import read_image
+from fmtorch.data.lenses import Lens
+from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
+from fmtorch.geometry.verdict import judged
+
+STAGES = ("features", "matching", "pruning", "estimation")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Outcome:
+    """What a pipeline made of one pair.
+
+    correspondences, estimate: batches of one; None where the pair failed before that stage.
+    features: how many each image has. seconds: per stage; a batched stage is shared out evenly, and features count in
+    full for each pair that uses them, cached ones with the seconds they took when they were computed.
+    reason: why the pair failed, empty where it did not.
+    """
+
+    pair: ImagePair
+    features: tuple[int, int] = (0, 0)
+    correspondences: Correspondences | None = None
+    estimate: Estimate | None = None
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+    reason: str = ""
+
+
+class Pipeline:
+    """Features, matcher, pruners in order, estimator. Safe to call from several threads.
+
+    memory: how many images' features are kept for pairs to come (about 5 MB an image at 8,000 SIFT features).
+    families: by family, pruners that its pairs get in place of those of the same names.
+    """
+
+    def __init__(
+        self,
+        features: FeatureExtractor,
+        matcher: Matcher,
+        pruners: Mapping[str, Pruner],
+        estimator: Estimator,
+        *,
+        device: torch.device | str = "cpu",
+        memory: int = 64,
+        families: Mapping[str, Mapping[str, Pruner]] | None = None,
+    ) -> None:
+        self.extractor, self.matcher, self.pruners, self.estimator = features, matcher, dict(pruners), estimator
+        self.families = dict(families or {})
+        self.memory = memory
+        self.device = torch.device(device)
+        self._memo: _Memo[tuple[Path, Lens | None], tuple[Features, float]] = _Memo(memory)
+
+    def features(self, image: ImageSource) -> tuple[Features, float]:
+        """The features of an image and the seconds they took, kept for the next pair that shows the image."""
+        return self._memo.get((image.path, image.lens), lambda: self.extract(read_image(image)))
+
+    def extract(self, image: NDArray[np.uint8]) -> tuple[Features, float]:
+        """The features of pixels on the pipeline's device, and the seconds that computing them takes or took."""
+        if isinstance(self.extractor, TimedExtractor):
+            features, seconds = self.extractor.timed(image)
+            return features.to(self.device), seconds
+        start = time.perf_counter()
+        features = self.extractor(image).to(self.device)
+        _synchronise(self.device)
+        return features, time.perf_counter() - start
+
+    def match(self, pairs: Sequence[ImagePair]) -> list[Outcome]:
+        """Take pairs through the stages before estimation; a pair that fails has a reason and harms no other."""
+        return self._batched("pruning", self._prune, [self._match(pair) for pair in pairs])
+
+    def estimate(self, outcomes: Sequence[Outcome], seed: int = 0) -> list[Outcome]:
+        """The last stage, for outcomes of `match`."""
+        return self._batched("estimation", functools.partial(self._estimate, seed=seed), outcomes)
+
+    def run(self, pairs: Sequence[ImagePair], seed: int = 0) -> list[Outcome]:
+        """Take a batch of pairs through all four stages."""
+        return self.estimate(self.match(pairs), seed)
+
+    def _batched(
+        self, stage: str, function: Callable[[list[Outcome]], list[Outcome]], outcomes: Sequence[Outcome]
+    ) -> list[Outcome]:
+        """A batched stage over the pairs with matches; where it raises, pair by pair: only the culprit fails."""
+        matched = [i for i, outcome in enumerate(outcomes) if outcome.correspondences is not None]
+        start = time.perf_counter()
+        with one_thread(self.device):
+            try:
+                made = function([outcomes[i] for i in matched]) if matched else []
+            except Exception:  # whose fault it is shows pair by pair
+                made = [_alone(stage, function, outcomes[i]) for i in matched]
+        _synchronise(self.device)
+        share = (time.perf_counter() - start) / max(len(matched), 1)
+        result = list(outcomes)
+        for i, outcome in zip(matched, made, strict=True):
+            result[i] = dataclasses.replace(outcome, seconds={**outcome.seconds, stage: share})
+        return result
+
+    def _match(self, pair: ImagePair) -> Outcome:
+        if pair.problem is not None:
+            return Outcome(pair, reason=pair.problem)
+        if pair.matches is not None:
+            return self._given(pair, pair.matches)
+        try:
+            (features0, seconds0), (features1, seconds1) = self.features(pair.image0), self.features(pair.image1)
+        except Exception as error:  # a pair that fails becomes a row with this reason
+            return Outcome(pair, reason=_describe("features", error))
+        seconds = {"features": seconds0 + seconds1}
+        counts = (len(features0), len(features1))
+        if min(counts) == 0:
+            which = " and ".join(f"image {i}" for i in (0, 1) if counts[i] == 0)
+            return Outcome(pair, counts, seconds=seconds, reason=f"no keypoints in {which}")
+        start = time.perf_counter()
+        try:
+            c = self.matcher(features0, features1)
+        except Exception as error:
+            return Outcome(pair, counts, seconds=seconds, reason=_describe("matching", error))
+        seconds["matching"] = time.perf_counter() - start
+        return Outcome(pair, counts, self._told(pair, c), None, seconds)
+
+    def _given(self, pair: ImagePair, matches: Callable[[], GivenMatches]) -> Outcome:
+        """The matches that come with a pair, in place of the first two stages."""
+        try:
+            c, counts = matches()
+        except Exception as error:  # a pair that cannot be read becomes a row with this reason
+            return Outcome(pair, reason=_describe("matches", error))
+        return Outcome(pair, counts, self._told(pair, c.to(self.device)))
+
+    def _told(self, pair: ImagePair, c: Correspondences) -> Correspondences:
+        """The matches with the pair's key and calibrations."""
+        K0, K1 = (_calibration(K, self.device) for K in (pair.K0, pair.K1))
+        return c.replace(key=torch.tensor([pair.key], device=self.device), K0=K0, K1=K1)
+
+    def pruners_of(self, family: str) -> dict[str, Pruner]:
+        """The pruners that pairs of a family get, in order."""
+        return {**self.pruners, **self.families.get(family, {})}
+
+    def _prune(self, outcomes: list[Outcome]) -> list[Outcome]:
+        result = list(outcomes)
+        others = {outcome.pair.family for outcome in outcomes} & self.families.keys()
+        for family in [None, *sorted(others)]:  # None: all that have no pruners of their own
+            own = [i for i, o in enumerate(outcomes) if (o.pair.family if o.pair.family in others else None) == family]
+            if own:
+                c = _collated([outcomes[i] for i in own])
+                for pruner in self.pruners_of(family or "").values():
+                    c = pruner(c).compact()
+                for place, i in enumerate(own):
+                    result[i] = dataclasses.replace(outcomes[i], correspondences=c[place])
+        return result
+
+    def _estimate(self, outcomes: list[Outcome], seed: int) -> list[Outcome]:
+        c = _collated(outcomes)
+        estimate = judged(_expect_finite(self.estimator(c, seed).detach()), c)
+        return [
+            dataclasses.replace(outcome, estimate=estimate[i], reason=estimate.reason[i])
+            for i, outcome in enumerate(outcomes)
+        ]
+
+
+def _expect_finite(estimate: Estimate) -> Estimate:
+    """The estimate, whose pairs are not ok where F is no matrix: anybody's estimator may have made it."""
+    valid = torch.isfinite(estimate.F).flatten(1).all(1) & (estimate.F != 0).flatten(1).any(1)
+    wrong = (estimate.ok & ~valid).tolist()
+    if not any(wrong):
+        return estimate
+    said = "estimation: F is zero or not finite, though the estimator calls it ok"
+    reason = tuple(said if bad else old for bad, old in zip(wrong, estimate.reason, strict=True))
+    keep = valid[:, None]
+    F, inliers = torch.where(keep[..., None], estimate.F, 0), estimate.inliers & keep
+    return estimate.replace(F=F, inliers=inliers, ok=estimate.ok & valid, reason=reason, significance=None)
+
+
+def _collated(outcomes: list[Outcome]) -> Correspondences:
+    return collate([outcome.correspondences for outcome in outcomes if outcome.correspondences is not None])
+
+
+def _alone(stage: str, function: Callable[[list[Outcome]], list[Outcome]], outcome: Outcome) -> Outcome:
+    """A stage on a single pair; what it raises becomes the reason for that pair's failure."""
+    try:
+        return function([outcome])[0]
+    except Exception as error:
+        return dataclasses.replace(outcome, correspondences=None, reason=_describe(stage, error))
+
+
+def _describe(stage: str, error: Exception) -> str:
+    return f"{stage}: {type(error).__name__}: {error}".splitlines()[0]
+
+
+def _calibration(K: NDArray[np.float64] | None, device: torch.device) -> torch.Tensor | None:
+    return None if K is None else torch.from_numpy(K).to(torch.float64).to(device)[None]
+
+
+def _synchronise(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+Key = TypeVar("Key")
+Value = TypeVar("Value")
+
+
+class _Memo(Generic[Key, Value]):
+    """Keeps the most recently used results; threads that ask for the same one share one computation."""
+
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._futures: OrderedDict[Key, Future[Value]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: Key, compute: Callable[[], Value]) -> Value:
+        """The value of `key`, computed if it is not there; an exception is kept and raised again."""
+        with self._lock:
+            future = self._futures.get(key)
+            mine = future is None
+            if future is None:
+                future = self._futures[key] = Future()
+            self._futures.move_to_end(key)
+            while len(self._futures) > self._capacity:
+                self._futures.popitem(last=False)
+        if mine:
+            try:
+                future.set_result(compute())
+            except BaseException as error:
+                future.set_exception(error)
+        return future.result()

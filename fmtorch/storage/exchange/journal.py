@@ -1,0 +1,122 @@
+"""What is to be exported, image by image and pair by pair, as files that are whole or absent: work can be resumed.
+
+::
+
+    images/<digest>.npz   keypoints, scores, size, K of an image; the digest is of its name and its file's bytes
+    pairs/<digest>.npz    indices of matched keypoints, their scores, F and its inliers; of the two images' digests
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fmtorch.core.files import replacing
+
+Array = NDArray[np.float64]
+_PAIR = ("matches", "scores", "inliers", "F", "related")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ExportedImage:
+    """An image: points (n, 2) in pixels, (0, 0) at the first pixel's centre; scores (n,); size (h, w); K if known."""
+
+    name: str
+    points: NDArray[np.float32]
+    scores: NDArray[np.float32]
+    size: tuple[int, int]
+    K: Array | None = None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ExportedPair:
+    """The matches given to the estimator, (m, 2) indices of points; scores (m,) in [0, 1]; inliers (m,) of F (3, 3).
+
+    F is zero where there is none. related: whether its support is beyond chance.
+    """
+
+    name0: str
+    name1: str
+    matches: NDArray[np.int32]
+    scores: NDArray[np.float32]
+    inliers: NDArray[np.bool_]
+    F: Array
+    related: bool = True
+
+
+@dataclasses.dataclass(frozen=True)
+class Journal:
+    """The folder of what was computed; names of images are paths below `root`. Any number of processes may add."""
+
+    folder: Path
+    root: Path
+
+    def name(self, image: Path) -> str:
+        """Under what name an image is exported."""
+        return image.absolute().relative_to(self.root.absolute()).as_posix()
+
+    def has_image(self, image: Path) -> bool:
+        return self._image(image).exists()
+
+    def has_pair(self, image0: Path, image1: Path) -> bool:
+        return self._pair(image0, image1).exists()
+
+    def add_image(self, image: Path, value: ExportedImage) -> None:
+        arrays = {"points": value.points, "scores": value.scores, "size": np.array(value.size)}
+        _write(self._image(image), arrays if value.K is None else {**arrays, "K": value.K})
+
+    def add_pair(self, image0: Path, image1: Path, value: ExportedPair) -> None:
+        _write(self._pair(image0, image1), {name: np.asarray(getattr(value, name)) for name in _PAIR})
+
+    def image(self, image: Path) -> ExportedImage:
+        with np.load(self._image(image)) as stored:
+            h, w = stored["size"].tolist()
+            return ExportedImage(self.name(image), stored["points"], stored["scores"], (h, w), stored.get("K"))
+
+    def pair(self, image0: Path, image1: Path) -> ExportedPair:
+        with np.load(self._pair(image0, image1)) as stored:
+            matches, scores, inliers, F, related = (stored[name] for name in _PAIR)
+        names = self.name(image0), self.name(image1)
+        return ExportedPair(*names, matches, scores, inliers, F, bool(related))
+
+    def _image(self, image: Path) -> Path:
+        return self.folder / "images" / f"{self._digest(image)}.npz"
+
+    def _pair(self, image0: Path, image1: Path) -> Path:
+        both = f"{self._digest(image0)} {self._digest(image1)}"
+        return self.folder / "pairs" / f"{hashlib.blake2b(both.encode(), digest_size=16).hexdigest()}.npz"
+
+    def _digest(self, image: Path) -> str:
+        status = image.stat()
+        return _digest(self.name(image), image.absolute(), status.st_size, status.st_mtime_ns)
+
+
+def indices(points: NDArray[np.float32], x: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Which of the points, (n, 2), each of x, (m, 2), is: the first at that location.
+
+    Raises ValueError where x holds a point that is none of them: a matcher that moves points cannot be exported so.
+    """
+    place = {tuple(point): i for i, point in reversed(list(enumerate(points.tolist())))}
+    try:
+        return np.array([place[tuple(point)] for point in x.tolist()], np.int32)
+    except KeyError as error:
+        raise ValueError(f"the match at {error.args[0]} is at no keypoint; such matches cannot be exported") from None
+
+
+@functools.lru_cache(maxsize=100_000)
+def _digest(name: str, path: Path, size: int, changed: int) -> str:
+    digest = hashlib.blake2b(f"{name}\0".encode(), digest_size=16)
+    with path.open("rb") as file:
+        digest.update(hashlib.file_digest(file, "blake2b").digest())
+    return digest.hexdigest()
+
+
+def _write(path: Path, arrays: dict[str, NDArray[np.generic]]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]

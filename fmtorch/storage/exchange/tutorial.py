@@ -1,0 +1,140 @@
+"""The layout of the RANSAC tutorial (CVPR 2020): a folder for each scene, with ``matches.h5`` and its neighbours.
+
+Of each pair ``<image0>-<image1>``: ``matches`` (n, 4) as x0, y0, x1, y1 in pixels; ``match_conf`` (n,), the ratio of
+distances, smaller being better; ``K1_K2``, the two calibration matrices, in whatever shape they were stored. Of each
+image: ``R`` (3, 3) and ``T`` (3,), world to camera. The test split has no R and T; ``Fgt``, where there is one, is
+used instead.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from fmtorch.data.pairs import GivenMatches, ImagePair
+from fmtorch.data.text_files import DataError
+from fmtorch.storage.exchange import h5
+from fmtorch.storage.exchange.given import Array, Size, broken, calibrated, given, image, size_by_centre, size_of
+
+MATCHES, RATIOS, CALIBRATIONS, ROTATIONS, TRANSLATIONS, TRUTH = (
+    f"{name}.h5" for name in ("matches", "match_conf", "K1_K2", "R", "T", "Fgt")
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class TutorialMatches:
+    """The matches of one pair."""
+
+    folder: Path
+    key: str
+    sizes: tuple[Size, Size]
+
+    def __call__(self) -> GivenMatches:
+        """Read them. Raises DataError naming file and key."""
+        with h5.opened(self.folder / MATCHES) as file:
+            points = h5.numbers(file, self.key, None, 4)
+        ratios = None
+        if (self.folder / RATIOS).exists():
+            with h5.opened(self.folder / RATIOS) as file:
+                ratios = h5.numbers(file, self.key).reshape(-1)
+            if len(ratios) != len(points):
+                raise DataError(
+                    f"{self.folder / RATIOS}: {self.key!r} has {len(ratios)} entries, "
+                    f"but {MATCHES} has {len(points)} matches of that pair"
+                )
+        return given(points[:, :2], points[:, 2:], self.sizes, (len(points), len(points)), ratios)
+
+
+def tutorial_files(root: Path) -> list[Path]:
+    """All that defines the data set."""
+    names = (MATCHES, RATIOS, CALIBRATIONS, ROTATIONS, TRANSLATIONS, TRUTH)
+    return [path for folder in scenes(root) for name in names if (path := folder / name).exists()]
+
+
+def tutorial_pairs(root: Path, images: Path | None) -> Iterator[ImagePair]:
+    """The pairs of every scene."""
+    for folder in scenes(root):
+        with h5.opened(folder / MATCHES) as file:
+            names = h5.keys(file)
+        cameras = _Cameras(folder)
+        for key in names:
+            yield _pair(root.name, folder, key, cameras, images)
+
+
+def scenes(root: Path) -> list[Path]:
+    """The folders that hold matches: root itself, or those below it."""
+    found = [root] if (root / MATCHES).is_file() else sorted(path.parent for path in root.glob(f"*/{MATCHES}"))
+    if not found:
+        raise DataError(f"{root}: neither {MATCHES} nor a sub-folder that holds one")
+    return found
+
+
+class _Cameras:
+    """What a scene's files say of its cameras."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.by_image: dict[str, tuple[Array, Array]] = {}
+        self.problems: dict[str, str] = {}
+        rotations, translations = folder / ROTATIONS, folder / TRANSLATIONS
+        if rotations.exists() and translations.exists():
+            with h5.opened(rotations) as R, h5.opened(translations) as T:
+                for name in h5.keys(R):
+                    try:
+                        self.by_image[name] = h5.reshaped(R, name, 3, 3), h5.reshaped(T, name, 3)
+                    except DataError as error:
+                        self.problems[name] = str(error)
+
+    def split(self, key: str) -> tuple[str, str]:
+        """The two images of a pair; their names may hold hyphens too."""
+        parts = key.split("-")
+        ways = [("-".join(parts[:i]), "-".join(parts[i:])) for i in range(1, len(parts))]
+        known = {*self.by_image, *self.problems}
+        for a, b in ways:
+            if a in known and b in known:
+                return a, b
+        if len(ways) == 1 and not known:
+            return ways[0]
+        missing = f"names no two images of {ROTATIONS} and {TRANSLATIONS}" if known else "does not name two images"
+        raise DataError(f"{self.folder / MATCHES}: {key!r} {missing}")
+
+    def calibration(self, key: str) -> tuple[Array, Array]:
+        with h5.opened(self.folder / CALIBRATIONS) as file:
+            K = h5.reshaped(file, key, 2, 3, 3)
+        return K[0], K[1]
+
+    def truth(self, key: str) -> Array:
+        if not (self.folder / TRUTH).exists():
+            raise DataError(
+                f"{self.folder}: neither {ROTATIONS} and {TRANSLATIONS} nor {TRUTH}: the test split has no ground truth"
+            )
+        with h5.opened(self.folder / TRUTH) as file:
+            return h5.reshaped(file, key, 3, 3)
+
+
+def _pair(family: str, folder: Path, key: str, cameras: _Cameras, images: Path | None) -> ImagePair:
+    scene, identity = folder.name, f"{family}/{folder.name}/{key}"
+    sources = image(family, scene, key, images), image(family, scene, key, images)
+    try:
+        name0, name1 = cameras.split(key)
+        sources = image(family, scene, name0, images), image(family, scene, name1, images)
+        for name in (name0, name1):
+            if name in cameras.problems:
+                raise DataError(cameras.problems[name])
+        K0, K1 = cameras.calibration(key)
+        sizes = size_of(sources[0]) or size_by_centre(K0), size_of(sources[1]) or size_by_centre(K1)
+        if cameras.by_image:
+            (R0, t0), (R1, t1) = cameras.by_image[name0], cameras.by_image[name1]
+            R = R1 @ R0.T
+            pair = calibrated(identity, family, scene, sources, (K0, K1), R, t1 - R @ t0)
+        else:
+            F = cameras.truth(key)
+            norm = float(np.linalg.norm(F))
+            problem = None if norm else f"{folder / TRUTH}: {key!r} is zero"
+            pair = ImagePair(identity, family, scene, *sources, F / (norm or 1.0), K0, K1, problem=problem)
+    except DataError as error:
+        return broken(identity, family, scene, sources, str(error))
+    return dataclasses.replace(pair, matches=TutorialMatches(folder, key, sizes))

@@ -1,0 +1,223 @@
+"""The doors of the commands: one name each in `python -m`, in the console script and in Python."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import fmtorch.__main__
+from fmtorch.commands.words import hydra_words
+from tests.conftest import own_cache
+from tests.pipeline.test_pipeline import draw
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+
+
+def python(code: str) -> None:
+    """Run code in a fresh interpreter, which must end well."""
+    environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_help_lists_the_commands_without_torch() -> None:
+    python(
+        "import sys, io, contextlib\n"
+        "from fmtorch.__main__ import main\n"
+        "sys.argv = ['fmtorch', '--help']\n"
+        "with contextlib.redirect_stdout(io.StringIO()) as told: main()\n"
+        "assert all(f'  {name} ' in told.getvalue() for name in ('eval', 'match', 'pairs', 'report', 'train'))\n"
+        "assert not {'torch', 'hydra', 'numpy'} & set(sys.modules)"
+    )
+
+
+def test_a_subcommand_runs_as_its_module_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Parts of a user's own are found in the working folder, wherever the script lies."""
+    called = []
+    monkeypatch.setattr(
+        runpy, "run_module", lambda *args, **options: called.append((args, options, sys.argv, sys.path[0]))
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", ["/usr/bin", *sys.path])
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/fmtorch", "eval", "-m", "seed=1,2"])
+    fmtorch.__main__.main()
+    options = {"run_name": "__main__", "alter_sys": True}
+    assert called == [(("fmtorch.eval",), options, ["/usr/bin/fmtorch", "-m", "seed=1,2"], str(tmp_path))]
+    monkeypatch.setattr(sys, "argv", ["fmtorch", "evaluate"])
+    with pytest.raises(SystemExit, match="error: no command 'evaluate'; there are: eval, match, pairs, report, train"):
+        fmtorch.__main__.main()
+
+
+def test_match_is_the_function_and_its_command_can_be_imported() -> None:
+    python(
+        "from fmtorch.match import main, run\n"  # the submodule before the function
+        "import inspect, sys, fmtorch, fmtorch.commands.match as command, fmtorch.match as imported\n"
+        "assert run is command.run and main is command.main\n"
+        "assert inspect.isfunction(fmtorch.match) and imported is fmtorch.match\n"
+        "from fmtorch import match\n"
+        "assert match is fmtorch.match\n"
+        "del sys.modules['fmtorch.match']\n"
+        "import fmtorch.match\n"  # and after it
+        "assert fmtorch.match is match and inspect.ismodule(sys.modules['fmtorch.match'])\n"
+        "assert fmtorch.Pipeline.__module__ == 'fmtorch.pipeline.pipeline'\n"
+        "assert set(fmtorch.__all__) <= set(dir(fmtorch)) and fmtorch.geometry.sampson\n"
+        "assert not hasattr(fmtorch, 'nothing')\n"
+    )
+
+
+def ended(monkeypatch: pytest.MonkeyPatch, folder: Path, command: str, *words: str) -> str:
+    """What a command ends with that is run in a folder, in this process."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(folder)))
+    monkeypatch.setattr(sys, "argv", [command, *words])
+    with pytest.raises(SystemExit) as end:
+        importlib.import_module(f"fmtorch.commands.{command}").main()
+    return str(end.value.code)
+
+
+COUNT = "it must be a whole number of at least 1"
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("eval limit=-3", f"limit=-3; {COUNT} or null"),
+        ("eval limit=0", f"limit=0; {COUNT} or null"),
+        ("eval limit=three", f"limit=three; {COUNT} or null"),
+        ("eval limit=2.5", f"limit=2.5; {COUNT} or null"),
+        ("eval batch=0", f"batch=0; {COUNT}"),
+        ("eval batch=true", f"batch=true; {COUNT}"),
+        ("eval workers=-2", f"workers=-2; {COUNT} or null"),
+        ("eval processes=maybe", "processes=maybe; it must be true or false or null"),
+        ("eval device=gpu", "device=gpu; it must be text that names a device: auto, cpu, cuda, cuda:1 or mps"),
+        ("eval seed=x", "seed=x; it must be a whole number from"),
+        ("eval cache_limit=-1", "cache_limit=-1; it must be a number of at least 0 or null"),
+        ("eval pruner.ratio.threshold=high", "pruner.ratio.threshold=high; it must be a number"),
+        ("eval estimator.hypotheses=1.5", "estimator.hypotheses=1.5; it must be a whole number"),
+        (
+            "eval estimator=cf_ransac estimator.fine.hypotheses=many",
+            "estimator.fine.hypotheses=many; it must be",
+        ),
+        ("eval +estimator.treshold=2", "estimator: no option treshold; there are: threshold"),
+        ("eval dataset.seed=x", "dataset.seed=x; it must be a whole number"),
+        ("eval dataset.families=indoor", "dataset.families=indoor; it must be a list"),
+        ("eval +dataset.sise=full", "dataset: no option sise; there are: size"),
+        ("eval estimator._target_=fmtorch.estimators.Magic", "estimator: _target_=fmtorch.estimators.Magic cannot be"),
+        ("eval pipeline=sift_magic", "no preset 'sift_magic' in pipeline; there are: sift_ma"),
+        ("eval estimator=ransak", "no preset 'ransak' in estimator; there are: ransac"),
+        ("eval pruner=[ratio,gmss]", "no preset 'gmss' in pruner; there are: gms"),
+        ("eval estimator.treshold=2", "no option estimator.treshold; there are: threshold"),
+        ("eval limitt=2", "no option limitt; there are: limit"),
+        ("eval estimater=lmeds", "no option estimater; there are: estimator"),
+        ("eval --config-dir nowhere", "nowhere' not found"),
+        ("eval limit=(1", "limit=(1 cannot be read; a value with special characters stands in quotes"),
+        ("eval sift_gms", "sift_gms is not of the form NAME=VALUE"),
+        ("match longest_side=big", f"longest_side=big; {COUNT}"),
+        ("match longest_side=0", f"longest_side=0; {COUNT}"),
+        ("match orient=up", "orient=up; it must be true or false"),
+        ("match a.png", "image1 is missing; give two image files: fmtorch match a.jpg b.jpg"),
+        ("match a.png b.png c.png", "c.png: only image0, image1 may stand without NAME="),
+        ("match a.png b.png truth=F.txt", "F.txt: No such file or directory"),
+        ("report pictures=-1", "pictures=-1; it must be a whole number of at least 0"),
+        ("report nowhere", "nowhere holds no run"),
+        ("train batch=0", f"batch=0; {COUNT}"),
+        ("train limit=three", f"limit=three; {COUNT} or null"),
+        ("train optimisation.steps=some", "optimisation.steps=some; it must be a whole number"),
+        ("train validation.every=0", f"validation.every=0; {COUNT}"),
+        ("train trainer.devices={}", "trainer.devices={}; it must be"),
+        ("train augmentation.crop=often", "augmentation.crop=often; it must be a number"),
+    ],
+)
+def test_a_mistake_is_told_in_one_line_and_nothing_written(
+    words: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    if words.startswith("train"):
+        pytest.importorskip("lightning", reason="training needs the extra `train`")
+    line = ended(monkeypatch, tmp_path, *words.split())
+    assert line.startswith("error: ")
+    assert told in line
+    assert len(line) < 300
+    assert "\n" not in line
+    assert [path.name for path in tmp_path.rglob("*")] == ["cache", "kernels"]  # put there by `own_cache`
+    assert capfd.readouterr() == ("", "")
+
+
+NAMES = [("my photo (1).png", "b=2,[x].png"), ("it's {a}.png", "c#d%.png"), ("null.png", "3")]
+
+
+@pytest.mark.parametrize("names", NAMES)
+@pytest.mark.parametrize("form", ["image0={} image1={}", "{} {}"])
+def test_any_file_name_is_a_photograph(
+    names: tuple[str, str], form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both are read: the command ends at the second, which is no image, and names it."""
+    draw(tmp_path / "a.png", seed=0, shift=0)
+    (tmp_path / "a.png").rename(tmp_path / names[0])
+    (tmp_path / names[1]).write_text("no image")
+    line = ended(monkeypatch, tmp_path, "match", *(f.format(n) for f, n in zip(form.split(), names, strict=True)))
+    assert line.startswith(f"error: {names[1]}: ")
+
+
+@pytest.mark.parametrize("name", ["My set (2024), part [1]", "a=b"])
+def test_any_folder_name_is_a_data_set(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / name).mkdir()
+    line = ended(monkeypatch, tmp_path, "eval", "dataset=fmbench", f"dataset.root={name}")
+    assert line.startswith(f"error: {tmp_path / name}: neither pairs_with_gt.txt")
+
+
+def test_flags_and_sweeps_stay_what_they_are() -> None:
+    paths, positional = ["image0", "run_dir"], ["image0", "image1"]
+    words = ["a b.png", "seed=1,2", "-m", "--config-dir", "my conf", "it's.png", "~cache", "run_dir=null", "x=[1, 2]"]
+    assert hydra_words(words, paths, positional) == [
+        "-m", "--config-dir", "my conf", "image0='a b.png'", r"image1='it\'s.png'", "seed=1,2", "~cache",
+        "run_dir=null", "x=[1, 2]",
+    ]  # fmt: skip
+    assert hydra_words(["-m", "run_dir=a,b"], paths, []) == ["-m", "run_dir=a,b"]
+    assert hydra_words(["run_dir=a,b"], paths, []) == ["run_dir='a,b'"]
+    assert hydra_words(["run_dir='a,b'", "++cache=1"], paths, []) == ["run_dir='a,b'", "++cache=1"]
+    assert hydra_words(["runs/a (1)", "b"], [], ["runs..."]) == ["runs=['runs/a (1)','b']"]
+
+
+SMALL = ["dataset=fmbench", "dataset.root=Set", "features.max_features=300", "estimator.hypotheses=100"]
+
+
+@pytest.fixture
+def data_set(tmp_path: Path) -> Path:
+    """A folder with a data set of one pair, ``Set``."""
+    images = tmp_path / "Set" / "scene" / "Images"
+    images.mkdir(parents=True)
+    for i in range(2):
+        draw(images / f"{i:08d}.png", seed=0, shift=9 * i)
+    (tmp_path / "Set" / "pairs_with_gt.txt").write_text("0 1 0 0 0 0 0 -1 0 1 0\n")
+    (tmp_path / "Set" / "pairs_which_dataset.txt").write_text("scene/\n")
+    return tmp_path
+
+
+def test_a_sweep_runs_all_jobs_and_tells_the_first_mistake(
+    data_set: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    words = ["-m", *SMALL, "limit=0,1", "run_dir=out"]
+    assert ended(monkeypatch, data_set, "eval", *words) == f"error: limit=0; {COUNT} or null"
+    assert (data_set / "out" / "summary.md").is_file()
+    assert "Traceback" not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
+def test_a_sweep_runs_in_processes_of_a_launcher(
+    launcher: str, data_set: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Two jobs in processes of their own; one is a user's mistake, which this one tells."""
+    plugin = {"joblib": "hydra_joblib_launcher", "submitit_local": "hydra_submitit_launcher"}[launcher]
+    pytest.importorskip(f"hydra_plugins.{plugin}", reason=f"needs {plugin}")
+    monkeypatch.setenv("PYTHONPATH", str(CHECKOUT))
+    jobs = ["hydra.launcher.n_jobs=2"] if launcher == "joblib" else []
+    words = ["-m", *SMALL, f"hydra/launcher={launcher}", *jobs, "limit=1,0", "run_dir=out"]
+    assert ended(monkeypatch, data_set, "eval", *words) == f"error: limit=0; {COUNT} or null", capfd.readouterr().err
+    assert (data_set / "out" / "summary.md").is_file()
+    assert "Traceback" not in capfd.readouterr().err

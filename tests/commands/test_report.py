@@ -1,0 +1,231 @@
+"""The command that compares runs on one page: figures as computed by hand, pictures, nothing taken on trust."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from fmtorch import presets
+from fmtorch.commands import report
+from fmtorch.core.types import Estimate
+from fmtorch.data import read_image
+from fmtorch.evaluation import tables
+from fmtorch.evaluation.gallery import Options, Run, rebuilt, shown_pair
+from fmtorch.evaluation.page import Section, differing_pairs, render
+from fmtorch.evaluation.redraw import difference
+from fmtorch.evaluation.rows import evaluate
+from fmtorch.evaluation.summary import summarize
+from fmtorch.pipeline.pipeline import Outcome
+from fmtorch.presets.composition import compose
+from fmtorch.storage import PairRow, RunFolder, RunFolderError, to_table
+from tests.pipeline.test_pipeline import draw, pair
+from tests.processes import run_command
+
+OPTIONS = {
+    "output": "deep/report.html", "title": "Runs", "pictures": 3, "order": None, "root": None, "own_code": False,
+    "device": "cpu", "cache": "off", "cache_limit": None,
+}  # fmt: skip
+SHOWN = Options(count=3, cache="off")
+
+
+def results(nsgd: list[float], scene: str = "scene") -> list[PairRow]:
+    return [
+        PairRow(f"{scene}/{i}", i + 1, "family", f"{scene}{i % 6}", True, nsgd=value, F=[1.0] + [0.0] * 8)
+        for i, value in enumerate(nsgd)
+    ]
+
+
+def test_figures_and_differences_are_those_of_the_rows() -> None:
+    first = [0.001, 0.02, 0.03, 0.2, 0.004, 0.3, 0.01, 0.02]
+    second = [0.02, 0.02, 0.2, 0.2, 0.2, 0.3, 0.2, 0.02]
+    runs = {"one": to_table(results(first)), "two <b>": to_table(results(second))}
+    page = render("A & B", [Section("set", runs)], [["one", "set", "abc", "0.1", "0", "runs/one"]])
+    text = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", page))
+    assert "A &amp; B" in text
+    assert "two &lt;b&gt;" in text
+    assert "<b>" not in page
+    assert "75.0 [" in text  # six of eight below 0.05
+    assert "37.5 [" in text
+    assert f"{100 * np.mean(np.clip(1 - np.array(first) / 0.05, 0, 1)):.1f}" in text
+    assert "+37.5 [" in text  # three pairs more
+    assert "+25.0 [" in text  # two pairs more at 0.01
+    assert "one minus each other run" in text
+    assert not re.search(r"(?:src|href)=\"(?!data:)", page)  # all that it shows is in it
+
+
+def test_poses_are_shown_where_a_run_has_them() -> None:
+    posed = [dataclasses.replace(r, rotation_error=2.0, translation_error=4.0) for r in results([0.01] * 4)]
+    runs = {"with": to_table(posed), "without": to_table(results([0.01] * 4))}
+    table = tables.poses({name: summarize(rows) for name, rows in runs.items()})
+    assert table is not None
+    figures = dict(zip(table.head[1:], (cell.text for cell in table.rows["with"]), strict=True))
+    # To 4 degrees a triangle up to the first of the four pairs, then 6 at 1.
+    assert figures["AUC@10°"] == "65.0"
+    assert (figures["mAA(10°)"], figures["mAP@10°"], figures["t error"]) == ("70.0", "100.0", "4.00°")
+    assert {cell.text for cell in table.rows["without"]} == {"–"}
+    page = render("Poses", [Section("set", runs)], [])
+    assert "Relative pose" in page
+    assert "Relative pose" not in render("None", [Section("set", {"without": runs["without"]})], [])
+
+
+def test_one_run_is_ahead_of_none() -> None:
+    page = render("One", [Section("set", {"one": to_table(results([0.01, 0.2]))})], [])
+    assert "minus each other" not in page
+    assert "ahead" not in page
+    assert 'class="best"' not in page
+
+
+def test_pairs_shown_are_those_where_runs_differ() -> None:
+    first = to_table(results([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.05, 0.0]))
+    second = to_table(results([0.0, 0.9, 0.06, 0.0, 0.0, 0.0, 0.0, 0.8]))
+    assert differing_pairs({"a": first, "b": second}, 1) == ["scene/1"]  # 0.9 is no worse than 0.8, and comes first
+    # 1 and 7 are of one scene, so that two others come between them
+    assert differing_pairs({"a": first, "b": second}, 3) == ["scene/1", "scene/2", "scene/6"]
+    assert differing_pairs({"a": first}, 2) == ["scene/0", "scene/6"]  # the best and the worst
+    assert differing_pairs({"a": first, "b": to_table(results([0.1], "else")).slice(0, 0)}, 3) == []
+
+
+def test_folders_of_runs_are_found_and_missed(tmp_path: Path) -> None:
+    for name in ("a", "deep/b"):
+        RunFolder.open(tmp_path / name, {"pipeline": name})
+    assert report.run_folders([tmp_path]) == [tmp_path / "a", tmp_path / "deep" / "b"]
+    assert report.run_folders([tmp_path / "deep" / "b", tmp_path]) == [tmp_path / "deep" / "b", tmp_path / "a"]
+    with pytest.raises(RunFolderError, match="holds no run"):
+        report.run_folders([tmp_path / "nowhere"])
+    with pytest.raises(RunFolderError, match="no run holds results yet"):
+        report.run(OmegaConf.create({**OPTIONS, "runs": [str(tmp_path)]}))
+
+
+def test_runs_keep_the_order_given_and_folders_are_ordered_by_recall(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, nsgd in (("a", 0.2), ("b", 0.01), ("c", 0.2)):
+        RunFolder.open(tmp_path / "runs" / name, {"pipeline": name}).append(results([nsgd, 0.3]))
+
+    def order(*runs: str, **options: str) -> list[str]:
+        output = report.run(OmegaConf.create({**OPTIONS, "runs": list(runs), **options}))
+        return re.findall(r'<li data-run="(\w)"', output.read_text())
+
+    assert order("runs") == order("runs/c", "runs/b", order="recall", runs=["runs"]) == ["b", "a", "c"]
+    assert order("runs/c", "runs/b", "runs/a") == ["c", "b", "a"]
+    assert order("runs", order="given") == ["a", "b", "c"]
+    with pytest.raises(ValueError, match="order=best must be given or recall"):
+        order("runs", order="best")
+
+
+def test_three_right_pairs_are_not_said_to_be_certain() -> None:
+    page = render(
+        "Few", [Section("set", {"one": to_table(results([0.01] * 3)), "two": to_table(results([0.3] * 3))})], []
+    )
+    assert "100.0 [44, 100]" in page
+    assert "0.0 [0, 56]" in page
+    assert "[100, 100]" not in page
+    assert "+80.0 (n too small)" in page
+
+
+@pytest.mark.parametrize("order", [["ratio", "one_to_one"], ["one_to_one", "ratio"]])
+def test_a_pipeline_is_drawn_again_as_it_was_and_a_difference_is_said(order: list[str], tmp_path: Path) -> None:
+    one, other = (pair(name, draw(tmp_path / "a.png", 0), draw(tmp_path / "b.png", 0, shift=12)) for name in "ab")
+    overrides = [
+        "features.max_features=300",
+        "estimator=lmeds",
+        "estimator.hypotheses=100",
+        f"pruner=[{','.join(order)}]",
+    ]
+    config = compose("match", ("pipeline=sift_ratio", "cache=off", *overrides))
+    rows = evaluate(presets.build_pipeline(config).run([one, other], seed=3), seed=3)
+    F = np.array([0, 0, 1, 0, 0, 0, -1, 0, 0]) / np.sqrt(2)  # of a vertical motion; that of the images is horizontal
+    rows[1] = dataclasses.replace(rows[1], F=F.tolist(), nsgd=0.0)
+    identity = {"pipeline": "sift_ratio", "seed": 3, **presets.stages(config)}
+    RunFolder.open(tmp_path / "run", identity).append(rows)
+    (r,) = report.named([RunFolder.load(tmp_path / "run")])
+    pipeline = rebuilt(r, SHOWN)
+    assert list(pipeline.pruners) == order
+    assert shown_pair(one, [r], {r.name: pipeline}).notes == []
+    shown = shown_pair(other, [r], {r.name: pipeline})
+    assert (shown.name, [(seen.run, seen.nsgd) for seen in shown.runs]) == ("b", [("sift_ratio", 0.0)])
+    (note,) = shown.notes
+    assert note.startswith("sift_ratio gives another F when it is drawn again: NSGD 0.")
+    assert "in its run 0.0000" in note
+    assert note in render("", [Section("set", {r.name: r.table}, [shown])], [])
+
+
+def test_a_result_that_cannot_be_had_again_is_said(tmp_path: Path) -> None:
+    one = pair("a", draw(tmp_path / "a.png", 0), draw(tmp_path / "b.png", 0, shift=12))
+    images = [read_image(source) for source in (one.image0, one.image1)]
+    F = np.array([0, 0, 0, 0, 0, -1, 0, 1, 0]) / np.sqrt(2)
+    solved, failed = {"ok": True, "nsgd": 0.0, "F": F.tolist()}, {"ok": False, "nsgd": 1.0, "F": None}
+    estimate = Estimate(
+        torch.from_numpy(F.reshape(1, 3, 3)),
+        torch.ones(1, 9).bool(),
+        torch.tensor([True]),
+        ("",),
+        torch.zeros(1).long(),
+    )
+    lost, found = Outcome(one, reason="no keypoints"), Outcome(one, estimate=estimate)
+    assert "(no keypoints), unlike in its run" in difference(one, images, solved, lost)
+    assert "NSGD 0.0000, unlike in its run" in difference(one, images, failed, found)
+    assert difference(one, images, solved, found) == difference(one, images, failed, lost) == ""
+
+
+def test_an_older_run_is_drawn_where_its_pruners_have_one_order(tmp_path: Path) -> None:
+    config = compose("match", ("pipeline=sift_ratio", "cache=off"))
+    stages = presets.stages(config)
+    for names, drawn in (([], True), (["ratio"], True), (["ratio", "one_to_one"], False)):
+        pruner = {name: value for entry in stages["pruner"] for name, value in entry.items() if name in names}
+        old = {"pipeline": "sift_ratio", **stages, "pruner": pruner}
+        folder = RunFolder(tmp_path, old, 1)
+        r = Run("sift_ratio", folder, to_table([]))
+        if drawn:
+            assert list(rebuilt(r, SHOWN).pruners) == names
+        else:
+            with pytest.raises(
+                ValueError, match=r"made by an earlier version.*order of its pruners \(ratio, one_to_one\)"
+            ):
+                rebuilt(r, SHOWN)
+
+
+def test_the_command_on_two_runs(tmp_path: Path) -> None:
+    images = tmp_path / "Set" / "scene" / "Images"
+    images.mkdir(parents=True)
+    for i in range(3):
+        draw(images / f"{i:08d}.png", seed=0, shift=9 * i)
+    F = "0 0 0 0 0 -1 0 1 0"
+    (tmp_path / "Set" / "pairs_with_gt.txt").write_text(f"0 1 {F}\n0 2 {F}\n")
+    (tmp_path / "Set" / "pairs_which_dataset.txt").write_text("scene/\n" * 2)
+
+    def command(*arguments: str) -> subprocess.CompletedProcess[str]:
+        return run_command(arguments[0].removeprefix("fmtorch."), *arguments[1:], cwd=tmp_path)
+
+    for estimator in ("lmeds", "msac"):
+        evaluated = command(
+            "fmtorch.eval", "dataset=fmbench", "dataset.root=Set", "features.max_features=300",
+            f"estimator={estimator}", "estimator.hypotheses=100",
+        )  # fmt: skip
+        assert evaluated.returncode == 0, evaluated.stderr
+    done = command("fmtorch.report", "root=Set", "pictures=2")
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "report.html").read_text()
+    assert "drawn again" not in page  # what is drawn is what was stored
+    assert page.count("data:image/jpeg") == 2 * 2 * 2  # pairs, runs, pictures
+    assert "fmbench, test: Set" in page
+    assert re.search(r"pipeline <b>sift_ratio</b>", page)
+    assert set(re.findall(r'<tr data-run="([^"]*)"', page)) == {"lmeds", "msac"}  # what they share is said once
+    assert "estimator" not in re.sub(r"<style>.*</style>", "", page, flags=re.S).split("<h2>")[0]
+    # Without the images there are figures, and why there are no pictures.
+    done = command("fmtorch.report", "output=bare.html")
+    assert done.returncode == 0, done.stderr
+    bare = (tmp_path / "bare.html").read_text()
+    assert "No pictures: fmbench needs root" in bare
+    assert "data:image/jpeg" not in bare
+    stored = next(tmp_path.glob("runs/*/*/run.json"))
+    assert json.loads(stored.read_text())["config"]["pipeline"] == "sift_ratio"

@@ -1,0 +1,197 @@
+"""The doors of public functions: NumPy and lists are taken, what does not fit is named, gradients pass."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import Bool, Float, Int, Real
+from torch import Tensor
+
+from fmtorch import geometry, matching, metrics, pruning
+from fmtorch.core.checks import checked, expectation, public
+from tests.processes import run_command
+
+X = torch.rand(5, 2)
+F = torch.rand(3, 3)
+
+
+def distance(
+    F: Float[Tensor, "*#batch 3 3"],
+    x: Float[Tensor, "*#batch n 2"],
+    mask: Bool[Tensor, "*#batch n"] | None = None,
+    key: Int[Tensor, "*#batch"] | None = None,
+    *,
+    size: Real[Tensor, "*#batch 2"] | None = None,
+    scale: float | Tensor = 1.0,
+    steps: int = 3,
+    taus: Sequence[float] = (1.0,),
+    counts: Sequence[int] = (1,),
+    border: Literal["a", "b"] = "a",
+    name: str = "",
+    cap: bool = True,
+    weigh: Callable[[Tensor], Tensor] | None = None,
+) -> Any:
+    """What it was given."""
+    return dict(locals())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"x": X[:, :1]}, ValueError, r"x has shape \(5, 1\); it must be \(\.\.\., N, 2\)"),
+        ({"x": X[0]}, ValueError, r"x has shape \(2,\); it must be \(\.\.\., N, 2\)"),
+        (
+            {"mask": torch.ones(4) > 0},
+            ValueError,
+            r"mask has shape \(4,\); it must be \(\.\.\., N\) with n = 5, as of x",
+        ),
+        ({"F": F.expand(2, 3, 3), "x": X.expand(3, 5, 2)}, ValueError, r"x .* broadcast with \(2,\), as of F"),
+        ({"mask": torch.ones(5)}, ValueError, "mask is of torch.float32; it must hold booleans"),
+        ({"key": torch.tensor(0.5)}, ValueError, "key is of torch.float32; it must hold whole numbers"),
+        ({"x": X > 0}, ValueError, "x is of torch.bool; it must hold floating-point numbers"),
+        ({"x": X.to(torch.complex64)}, ValueError, "x is of torch.complex64"),
+        ({"size": torch.ones(2) > 0}, ValueError, "size is of torch.bool; it must hold real numbers"),
+        ({"x": X.to("meta")}, ValueError, "x is on meta and another argument on cpu; all must be on one device"),
+        ({"x": "points"}, TypeError, "x is a str"),
+        ({"x": None}, TypeError, "x is a NoneType"),
+        ({"scale": "1"}, TypeError, "scale is '1'; it must be a number"),
+        ({"scale": float("nan")}, ValueError, "scale is nan; it must be a number"),
+        ({"steps": 2.5}, TypeError, "steps is 2.5; it must be a whole number"),
+        ({"steps": True}, TypeError, "steps is True; it must be a whole number"),
+        ({"steps": None}, TypeError, "steps is a NoneType; it must be a whole number"),
+        ({"taus": 3}, TypeError, "taus is a int; it must be a sequence of numbers"),
+        ({"taus": (1.0, "b")}, TypeError, r"taus\[1\] is 'b'; it must be a number"),
+        ({"counts": (1, 2.5)}, TypeError, r"counts\[1\] is 2.5; it must be a whole number"),
+        ({"border": "c"}, ValueError, "border is 'c'; it must be one of 'a', 'b'"),
+        ({"name": 3}, TypeError, "name is a int; it must be a string"),
+        ({"cap": 1}, TypeError, "cap is a int; it must be True or False"),
+        ({"weigh": 3}, TypeError, "weigh is a int; it must be a function"),
+    ],
+)
+def test_what_does_not_fit_is_named(arguments: dict[str, Any], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        checked(distance)(**{"F": F, "x": X, **arguments})
+
+
+def test_what_fits_is_handed_on_as_it_is() -> None:
+    mask, key = torch.ones(5, dtype=torch.bool), torch.tensor(3)
+    given = checked(distance)(F, X, mask, key=key, scale=X[0, 0], steps=4)
+    assert given["F"] is F
+    assert given["x"] is X
+    assert given["mask"] is mask
+    assert given["key"] is key
+    assert given["scale"] is not None
+    assert given["steps"] == 4
+
+
+def test_what_can_be_converted_is() -> None:
+    given = checked(distance)(
+        F.numpy(), X.round().int().tolist(), np.array([1, 0, 1, 1, 0], np.uint8), size=(480, 640), steps=np.int64(2),
+        scale=np.float32(0.5), taus=np.array([0.5, 0.7]),
+    )  # fmt: skip
+    assert torch.equal(given["F"], F)
+    assert given["x"].dtype == torch.float64
+    assert given["mask"].tolist() == [True, False, True, True, False]
+    assert given["size"].tolist() == [480, 640]
+    assert (given["steps"], given["scale"], given["taus"]) == (2, 0.5, (0.5, 0.7))
+    assert checked(distance)(F, X.half())["x"].dtype == torch.float32
+    one = public("tests")(distance)(F.double(), X)
+    assert one["x"].dtype == torch.float64
+    assert checked(distance)(F.double(), X)["x"].dtype == torch.float32
+
+
+def test_models_are_one_a_set_of_matches_or_several() -> None:
+    x0, x1 = torch.rand(2, 4, 20, 2) * 100
+    one, several = torch.rand(4, 3, 3), torch.rand(4, 6, 3, 3)
+    assert geometry.refine(one, x0, x1, iterations=1).shape == one.shape
+    assert geometry.refine(several, x0, x1, iterations=1).shape == several.shape
+    for wrong in (torch.rand(3, 3), torch.rand(3, 3, 3), torch.rand(4, 2, 2, 3, 3)):
+        with pytest.raises(ValueError, match=r"leading dimensions .*; they must be \(4,\), as of x0, or \(4,\)"):
+            geometry.refine(wrong, x0, x1)
+
+
+def test_annotations_are_read() -> None:
+    assert expectation(Float[Tensor, "*batch n 2"] | None) == ("Float", ("*batch", "n", "2"), True, (), False)
+    assert expectation(Any).kind == ""
+
+
+def test_gradients_pass() -> None:
+    x = torch.rand(8, 2, requires_grad=True)
+    geometry.sampson(F, x, X[:1].expand(8, 2)).sum().backward()  # type: ignore[no-untyped-call]
+    assert x.grad is not None
+
+
+def test_exported_functions_can_be_pickled_and_say_what_they_take() -> None:
+    for module in (geometry, metrics, pruning, matching):
+        for name in module.__all__:
+            function = getattr(module, name)
+            assert pickle.loads(pickle.dumps(function)) is not None
+            if name.islower():
+                assert function.__name__ == name
+                assert function.__doc__
+
+
+CALLS = """
+import torch
+import fmtorch
+from fmtorch import geometry, metrics, pruning
+from fmtorch.core.types import Correspondences, Estimate
+x, F = torch.rand(9, 2), torch.rand(3, 3)
+far = torch.tensor([[[1.0, 2.0], [3.0, 1e300], [5.0, 7.0], [8.0, 2.0], [9.0, 4.0]]], dtype=torch.float64)
+for call in (
+    lambda: geometry.sampson(F, x, x[:4]),
+    lambda: geometry.sampson(F.double(), x, x).shape,
+    lambda: geometry.eight_point(x, x, weight="all"),
+    lambda: geometry.refine(torch.zeros(0, 3, 3), torch.zeros(0, 4, 2), torch.zeros(0, 4, 2)).shape,
+    lambda: geometry.reweighted_fits(x[None], x[None], lambda F, r: torch.ones(1, 9), 0),
+    lambda: metrics.mean_recall(x[0], -1),
+    lambda: metrics.pose_auc(x[0], (0.0,)),
+    lambda: pruning.lpm(far, far.flip(1)).shape,
+    lambda: pruning.lpm(far.requires_grad_(), far.detach()).shape,
+    lambda: pruning.lpm(x[None], x[None], taus=(0.5,)),
+    lambda: pruning.mutual(torch.tensor([[7]]), torch.tensor([[0]])),
+    lambda: fmtorch.find_fundamental(x, x, seed=0.5),
+    lambda: fmtorch.find_fundamental([x], [x], mask={"x": 1}),
+    lambda: Correspondences(x[None].numpy(), x[None], torch.ones(1, 9) > 0),
+    lambda: Correspondences(x[None], x[None], torch.ones(1, 9)),
+    lambda: Correspondences(x[None], x[None].to("meta"), torch.ones(1, 9) > 0),
+    lambda: Estimate(F[None], torch.ones(1, 9) > 0, torch.ones(1) > 0, None, torch.zeros(1, dtype=torch.int64)),
+    lambda: Estimate(F[None], torch.ones(1, 9) > 0, None, ("",), torch.zeros(1, dtype=torch.int64)),
+):
+    try:
+        print(call())
+    except Exception as error:
+        print(f"{type(error).__name__}: {error}")
+"""
+TOLD = """\
+ValueError: x1 has shape (4, 2); it must be (..., N, 2) with n = 9, as of x0
+torch.Size([9])
+TypeError: weight is a str of <U3; it must be an array or tensor of numbers
+torch.Size([0, 3, 3])
+ValueError: iterations is 0; it must be at least 1
+ValueError: maximum is -1; it must be positive
+ValueError: thresholds are (0.0,); they must be positive, and at least one
+torch.Size([1, 5])
+torch.Size([1, 5])
+ValueError: thresholds has 2, neighbors has 2, taus has 1 values; they must have one for each pass, and there must be a pass
+ValueError: index holds 7, but reverse has 1 features only
+TypeError: seed is 0.5; it must be a whole number
+ValueError: mask must be a list of 1 arrays, one for each pair of x0
+TypeError: x0 is a ndarray; it must be a tensor
+ValueError: mask is of torch.float32; it must hold booleans
+ValueError: x1 is on meta and another field on cpu; all must be on one device
+TypeError: reason is a NoneType; it must be a tuple of strings
+TypeError: ok is a NoneType; it must be a tensor
+"""  # noqa: E501
+
+
+def test_users_are_told_what_the_generated_calls_found(tmp_path: Path) -> None:
+    """Without the test suite's own check of shapes, which users do not have."""
+    done = run_command("-c", CALLS, cwd=tmp_path)
+    assert done.stdout == TOLD, done.stderr

@@ -1,0 +1,57 @@
+"""Files that are whole or absent, and errors that name them."""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+
+import pytest
+
+from fmtorch.core.files import replacing
+from fmtorch.core.terminal import told
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), OSError(errno.EIO, "I/O error")])
+def test_a_failed_write_names_the_file_and_leaves_what_was_there(error: OSError, tmp_path: Path) -> None:
+    path = tmp_path / "run.json"
+    path.write_text("before")
+
+    def write() -> None:
+        with replacing(path) as temporary:
+            temporary.write_text("half")
+            raise error
+
+    with pytest.raises(OSError, match=error.strerror) as caught:
+        write()
+    assert caught.value.errno == error.errno
+    assert told(caught.value) == f"{path}: {error.strerror}"
+    assert path.read_text() == "before"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_that_is_not_there_is_named_by_the_file() -> None:
+    path = Path("/nowhere/at/all.txt")
+    with pytest.raises(FileNotFoundError) as caught, replacing(path) as temporary:
+        temporary.write_text("")
+    assert told(caught.value) == f"{path}: No such file or directory"
+
+
+def test_another_files_error_stays_its_own(tmp_path: Path) -> None:
+    other = tmp_path / "image.png"
+    with pytest.raises(FileNotFoundError) as caught, replacing(tmp_path / "out.json"):
+        other.read_bytes()
+    assert told(caught.value) == f"{other}: No such file or directory"
+
+
+def test_a_device_that_is_full(tmp_path: Path) -> None:
+    """The kernel's own error, which names no file."""
+    full = Path("/dev/full")
+    if not full.exists():
+        pytest.skip("this system has no /dev/full")
+    with (
+        pytest.raises(OSError, match="No space left") as caught,
+        replacing(tmp_path / "out.json"),
+        full.open("wb") as file,
+    ):
+        file.write(b"x" * 100_000)
+    assert told(caught.value) == f"{tmp_path / 'out.json'}: No space left on device"

@@ -1,0 +1,397 @@
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fmtorch.core.types import Correspondences, Estimate, Features, collate, pair_key
+
+NAN = float("nan")
+PER_MATCH = ("x0", "x1", "mask", "quality", "prior", "lafs0", "lafs1", "mutual", "noise")
+
+
+def features(n: int = 5, d: int = 3, seed: int = 0) -> Features:
+    g = torch.Generator().manual_seed(seed)
+    return Features(
+        lafs=torch.rand(n, 2, 3, generator=g),
+        scores=torch.rand(n, generator=g),
+        descriptors=torch.rand(n, d, generator=g),
+        image_size=torch.tensor([480, 640 + seed]),
+    )
+
+
+def matches(b: int = 4, n: int = 6, seed: int = 0) -> Correspondences:
+    g = torch.Generator().manual_seed(seed)
+    return Correspondences(
+        x0=torch.rand(b, n, 2, generator=g),
+        x1=torch.rand(b, n, 2, generator=g),
+        mask=torch.rand(b, n, generator=g) < 0.6,
+        quality=torch.rand(b, n, generator=g),
+        prior=torch.rand(b, n, generator=g),
+        lafs0=torch.rand(b, n, 2, 3, generator=g),
+        lafs1=torch.rand(b, n, 2, 3, generator=g),
+        size0=torch.tensor([[480, 640]]).repeat(b, 1),
+        size1=torch.tensor([[240, 320]]).repeat(b, 1),
+        K0=torch.rand(b, 3, 3, generator=g),
+        K1=torch.rand(b, 3, 3, generator=g),
+        key=torch.arange(b) + 100 * seed,
+        mutual=torch.rand(b, n, generator=g) < 0.5,
+        noise=torch.rand(b, n, generator=g),
+    )
+
+
+def estimate(b: int = 4, n: int = 6, seed: int = 0) -> Estimate:
+    g = torch.Generator().manual_seed(seed)
+    ok = torch.arange(b) % 2 == 0
+    return Estimate(
+        F=torch.rand(b, 3, 3, generator=g),
+        inliers=torch.rand(b, n, generator=g) < 0.5,
+        ok=ok,
+        reason=tuple("" if good else f"reason {i}" for i, good in enumerate(ok.tolist())),
+        draws=torch.arange(b) + seed,
+        significance=torch.where(ok, torch.rand(b, generator=g, dtype=torch.float64), -torch.inf),
+    )
+
+
+def batched_features(b: int = 4) -> Features:
+    return collate([features(n=5, seed=i) for i in range(b)])
+
+
+def same(a: Any, b: Any) -> bool:
+    """All fields are bit-equal."""
+
+    def equal(x: Any, y: Any) -> bool:
+        return torch.equal(x, y) if isinstance(x, torch.Tensor) and isinstance(y, torch.Tensor) else x == y
+
+    return type(a) is type(b) and all(
+        equal(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(type(a))
+    )
+
+
+RECORDS: list[Callable[..., Any]] = [batched_features, matches, estimate]
+records = pytest.mark.parametrize("make", RECORDS, ids=["Features", "Correspondences", "Estimate"])
+
+
+# pair_key
+
+
+def test_pair_key_is_blake2b_and_stable() -> None:
+    digest = hashlib.blake2b(b"Strecha/fountain-P11/3-7", digest_size=8).digest()
+    assert pair_key("Strecha/fountain-P11/3-7") == int.from_bytes(digest, "big", signed=True) == 3483045311563998181
+    torch.tensor([pair_key(str(i)) for i in range(100)])  # fits int64
+    assert any(pair_key(str(i)) < 0 for i in range(100))
+
+
+# what holds for every record
+
+
+@records
+def test_to_and_detach_change_neither_values_nor_type(make: Callable[..., Any]) -> None:
+    record = make()
+    assert same(record.to("cpu"), record)
+    assert same(record.to(torch.device("cpu")), record)
+    assert same(record.detach(), record)
+
+
+@records
+def test_to_moves_every_tensor(make: Callable[..., Any]) -> None:
+    moved = make().to("meta")
+    values = [getattr(moved, f.name) for f in dataclasses.fields(moved)]
+    assert all(v.device.type == "meta" for v in values if isinstance(v, torch.Tensor))
+    assert sum(isinstance(v, torch.Tensor) for v in values) >= 4
+
+
+def test_detach_cuts_the_graph_and_replace_keeps_it() -> None:
+    x0 = torch.rand(4, 6, 2, requires_grad=True)
+    record = matches().replace(x0=x0)
+    assert record.x0.requires_grad
+    assert not record.detach().x0.requires_grad
+
+
+@records
+@pytest.mark.parametrize(
+    ("index", "expected"),
+    [
+        (0, [0]),
+        (3, [3]),
+        (-1, [3]),
+        (-4, [0]),
+        (slice(1, 3), [1, 2]),
+        (slice(None, None, 2), [0, 2]),
+        (slice(-2, None), [2, 3]),
+        (slice(9, 12), []),
+        ([2, 0, 2], [2, 0, 2]),
+        ((1,), [1]),
+        ([-1], [3]),
+        ([], []),
+        ([True, False, False, True], [0, 3]),
+        (torch.tensor([3, 1]), [3, 1]),
+        (torch.tensor(2), [2]),
+        (torch.tensor([], dtype=torch.int64), []),
+        (torch.tensor([False, True, True, False]), [1, 2]),
+        (torch.zeros(4, dtype=torch.bool), []),
+    ],
+    ids=str,
+)
+def test_indexing_always_gives_a_batch(make: Callable[..., Any], index: Any, expected: list[int]) -> None:
+    record = make()
+    picked = record[index]
+    assert type(picked) is type(record)
+    for field in dataclasses.fields(record):
+        whole, part = getattr(record, field.name), getattr(picked, field.name)
+        if field.name == "reason":
+            assert part == tuple(whole[i] for i in expected)
+        else:
+            assert torch.equal(part, whole[torch.tensor(expected, dtype=torch.int64)])
+
+
+@records
+@pytest.mark.parametrize("index", [4, -5, torch.tensor(4), [0, 4], torch.tensor([-5])], ids=str)
+def test_an_index_out_of_range_is_an_error(make: Callable[..., Any], index: Any) -> None:
+    with pytest.raises(IndexError, match=r"out of (range|bounds)"):
+        make()[index]
+
+
+@records
+def test_iteration_gives_batches_of_one_and_ends(make: Callable[..., Any]) -> None:
+    record = make()
+    parts = list(record)
+    assert len(parts) == 4
+    assert same(collate(parts), record)
+
+
+@records
+def test_replace_checks_shapes_again(make: Callable[..., Any]) -> None:
+    record = make()
+    name = dataclasses.fields(record)[0].name
+    with pytest.raises(Exception, match=r"shape|type"):
+        record.replace(**{name: getattr(record, name)[..., :1, :1]})
+
+
+@records
+def test_records_are_immutable(make: Callable[..., Any]) -> None:
+    record = make()
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        setattr(record, dataclasses.fields(record)[0].name, torch.zeros(1))
+
+
+# Features
+
+
+def test_features_defaults() -> None:
+    f = features()
+    assert len(f) == 5
+    assert f.valid.all()
+    assert f.valid.shape == (5,)
+    assert torch.equal(f.keypoints, f.lafs[:, :, 2])
+    assert batched_features().keypoints.shape == (4, 5, 2)
+
+
+def test_features_of_one_image_are_indexed_by_feature() -> None:
+    f = features()
+    assert torch.equal(f[[4, 0]].scores, f.scores[[4, 0]])
+    best = f[f.scores.argsort(descending=True)[:2]]
+    assert len(best) == 2
+    assert torch.equal(best.image_size, f.image_size)
+    assert len(f[-1]) == 1
+    assert len(f[torch.zeros(5, dtype=torch.bool)]) == 0
+
+
+def test_no_features_at_all() -> None:
+    f = features(n=0)
+    assert len(f) == 0
+    assert collate([f, f]).lafs.shape == (2, 0, 2, 3)
+
+
+@pytest.mark.parametrize("field", ["lafs", "scores", "descriptors", "image_size", "mask"])
+def test_features_of_unequal_length_are_refused(field: str) -> None:
+    f = features()
+    with pytest.raises(Exception, match=r"shape|type"):
+        f.replace(**{field: getattr(f, field)[:-1]})
+
+
+# Correspondences
+
+
+def test_correspondences_defaults() -> None:
+    c = Correspondences(torch.zeros(2, 3, 2), torch.zeros(2, 3, 2), torch.ones(2, 3, dtype=torch.bool))
+    assert len(c) == 2
+    assert c.keys.tolist() == [0, 0]
+    assert c.keys.dtype == torch.int64
+    assert c.count().tolist() == [3, 3]
+    assert all(getattr(c, f) is None for f in ("quality", "prior", "lafs0", "lafs1", "size0", "size1", "K0", "K1"))
+    assert same(c[0].to("cpu").compact(), c[:1])
+
+
+@pytest.mark.parametrize("field", [f.name for f in dataclasses.fields(Correspondences)])
+def test_correspondences_of_wrong_shape_are_refused(field: str) -> None:
+    c = matches()
+    with pytest.raises(Exception, match=r"shape|type"):
+        c.replace(**{field: getattr(c, field)[:-1]})
+    with pytest.raises(Exception, match=r"shape|type"):
+        c.replace(**{field: getattr(c, field)[..., None]})
+
+
+def test_keep_only_ever_removes() -> None:
+    c = matches()
+    chosen = torch.rand(4, 6) < 0.5
+    assert torch.equal(c.keep(chosen).mask, c.mask & chosen)
+    assert same(c.keep(torch.ones_like(chosen)), c)
+
+
+def test_compact_known_answer() -> None:
+    x = torch.arange(8.0).reshape(2, 4, 1).expand(-1, -1, 2)
+    mask = torch.tensor([[False, True, False, True], [False, False, True, False]])
+    c = Correspondences(x, -x, mask, quality=x[..., 0]).compact()
+    assert c.x0.shape == (2, 2, 2)
+    assert c.mask.tolist() == [[True, True], [True, False]]
+    assert c.x0[0, :, 0].tolist() == [1, 3]
+    assert c.x0[1, 0].tolist() == [6, 6]
+    assert c.x1[0, :, 1].tolist() == [-1, -3]
+    assert c.quality is not None
+    assert c.quality[0].tolist() == [1, 3]
+
+
+def _survivors(c: Correspondences) -> list[dict[str, torch.Tensor]]:
+    """Per pair, the surviving matches of every per-match field, in order."""
+    return [{f: getattr(c, f)[i][c.mask[i]] for f in PER_MATCH} for i in range(len(c))]
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.integers(0, 4), st.integers(0, 9), st.integers(1, 8), st.integers(0, 2**31))
+def test_compact_keeps_survivors_and_their_order(b: int, n: int, multiple: int, seed: int) -> None:
+    c = matches(b, n, seed)
+    packed = c.compact(multiple)
+    slots = packed.x0.shape[1]
+    longest = int(c.count().max()) if b and n else 0
+    assert slots % multiple == 0
+    assert longest <= slots < longest + multiple
+    assert torch.equal(packed.count(), c.count())
+    assert (packed.mask.long().diff(dim=1) <= 0).all()  # survivors first
+    for before, after in zip(_survivors(c), _survivors(packed), strict=True):
+        assert all(torch.equal(before[f], after[f]) for f in PER_MATCH)
+    assert torch.equal(packed.keys, c.keys)
+    assert packed.K0 is not None
+    assert same(packed.compact(multiple), packed)
+
+
+def test_compact_does_not_see_what_stands_in_masked_slots() -> None:
+    c = matches()
+    garbage = {f: getattr(c, f).clone() for f in PER_MATCH if f != "mask"}
+    for value in garbage.values():
+        value[~c.mask] = NAN
+    for before, after in zip(_survivors(c.compact(4)), _survivors(c.replace(**garbage).compact(4)), strict=True):
+        assert all(torch.equal(before[f], after[f]) for f in PER_MATCH)
+
+
+def test_compact_passes_gradients_to_survivors_only() -> None:
+    c = matches()
+    x0 = c.x0.clone().requires_grad_()
+    packed = c.replace(x0=x0).compact(8)
+    torch.where(packed.mask[..., None], packed.x0, 0.0).sum().backward()
+    assert x0.grad is not None
+    assert torch.equal(x0.grad, c.mask[..., None].expand_as(x0).float())
+
+
+# Estimate
+
+
+def test_estimate_needs_a_reason_slot_for_each_pair() -> None:
+    e = estimate()
+    with pytest.raises(ValueError, match="reason has 1 entries"):
+        e.replace(reason=("",))
+
+
+@pytest.mark.parametrize("field", ["F", "inliers", "ok", "draws"])
+def test_estimates_of_unequal_length_are_refused(field: str) -> None:
+    e = estimate()
+    with pytest.raises(Exception, match=r"shape|type"):
+        e.replace(**{field: getattr(e, field)[:-1]})
+
+
+# collate
+
+
+def test_collate_stacks_and_pads_single_images() -> None:
+    items = [features(n, seed=n) for n in (3, 0, 5)]
+    batch = collate(items)
+    assert batch.lafs.shape == (3, 5, 2, 3)
+    assert batch.valid.sum(-1).tolist() == [3, 0, 5]
+    assert batch.image_size.tolist() == [[480, 643], [480, 640], [480, 645]]
+    for i, item in enumerate(items):
+        n = len(item)
+        assert torch.equal(batch.lafs[i, :n], item.lafs)
+        assert torch.equal(batch.scores[i, :n], item.scores)
+        assert torch.equal(batch.descriptors[i, :n], item.descriptors)
+        assert not batch.valid[i, n:].any()
+        assert not batch.descriptors[i, n:].any()
+
+
+def test_collate_joins_batches_of_images() -> None:
+    a, b = collate([features(3), features(2)]), collate([features(5, seed=1)])
+    joined = collate([a, b])
+    assert same(joined, collate([features(3), features(2), features(5, seed=1)]))
+
+
+def test_collate_keeps_given_masks() -> None:
+    f = features(3).replace(mask=torch.tensor([True, False, True]))
+    assert collate([f, features(4)]).valid.tolist() == [[True, False, True, False], [True] * 4]
+
+
+def test_collate_joins_and_pads_pairs() -> None:
+    a, b = matches(2, 3), matches(3, 6, seed=1)
+    joined = collate([a, b])
+    assert len(joined) == 5
+    assert joined.x0.shape == (5, 6, 2)
+    assert not joined.mask[:2, 3:].any()
+    assert torch.equal(joined.keys, torch.cat([a.keys, b.keys]))
+    assert joined.K0 is not None
+    assert joined.K0.shape == (5, 3, 3)
+    assert same(joined[:2].compact(), a.compact())
+    assert same(joined[2:], b)
+
+
+def test_collate_drops_a_field_that_some_item_lacks() -> None:
+    joined = collate([matches(), matches().replace(prior=None, K1=None)])
+    assert joined.prior is None
+    assert joined.K1 is None
+    assert joined.quality is not None
+
+
+def test_collate_joins_estimates_with_their_reasons() -> None:
+    a, b = estimate(2, 3), estimate(3, 5, seed=1)
+    joined = collate([a, b])
+    assert joined.inliers.shape == (5, 5)
+    assert joined.reason == a.reason + b.reason
+    assert joined.draws.tolist() == a.draws.tolist() + b.draws.tolist()
+    assert not joined.inliers[:2, 3:].any()
+
+
+@records
+def test_collate_of_one_is_the_same(make: Callable[..., Any]) -> None:
+    assert same(collate([make()]), make())
+
+
+def test_collate_errors() -> None:
+    with pytest.raises(ValueError, match="at least one"):
+        collate([])
+    with pytest.raises(TypeError, match="one kind"):
+        collate([matches(), estimate()])
+    with pytest.raises(TypeError, match="one kind"):
+        collate([features(5), batched_features()])
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@records
+def test_on_a_gpu(make: Callable[..., Any]) -> None:
+    record = make()
+    there = record.to("cuda")
+    for index in (-1, [2, 0], [True, False, True, False], torch.tensor([1]), slice(1, 3)):
+        assert same(there[index].to("cpu"), record[index])
+    assert same(collate([there, there]).to("cpu"), collate([record, record]))

@@ -1,0 +1,102 @@
+"""Whether two images show one scene: every estimator says so, of all the matches that it was given."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import fmtorch
+from fmtorch import presets
+from fmtorch.core.stages import Estimator
+from fmtorch.core.types import RELATED, Correspondences, Estimate, collate
+from fmtorch.geometry import significance
+from fmtorch.geometry.verdict import judged
+from tests.laws import degenerate, quick, scene
+
+ESTIMATORS = [n for n in presets.available("estimator") if "_cpp" not in n]
+NOT_ROBUST = ("irls_huber", "irls_cauchy")  # against three wrong matches in ten
+
+
+@functools.cache
+def chance() -> Correspondences:
+    """Pairs that show nothing in common: as many matches as unrelated photographs have, with ratios of wrong ones."""
+    pairs = [scene(i, count, outliers=1.0) for i, count in enumerate((8, 9, 10, 12, 16, 20, 30, 40, 60, 90) * 2)]
+    return collate(pairs)
+
+
+@functools.cache
+def common() -> Correspondences:
+    return collate([scene(i, 150, outliers=0.3) for i in range(6)])
+
+
+def estimator(name: str) -> Estimator:
+    try:
+        return quick(name, 400, 200)
+    except ImportError as error:
+        pytest.skip(str(error))
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_every_estimator_tells_scenes_from_chance(name: str) -> None:
+    c, chances = collate([chance(), common()]), len(chance())
+    estimate = estimator(name)(c, seed=1)
+    expected = significance(estimate.F, c.x0, c.x1, c.mask, c.size0, c.size1)
+    assert torch.equal(estimate.significance, torch.where(estimate.ok, expected, -torch.inf))
+    assert not bool(estimate.related[:chances].any()), estimate.significance[:chances].max()
+    if name not in NOT_ROBUST:
+        assert int(estimate.related[chances:].sum()) >= len(common()) - 1, estimate.significance[chances:]
+
+
+def test_a_pair_without_an_estimate_is_not_related() -> None:
+    pairs = degenerate()
+    estimate = quick("ransac", 100)(collate([scene(1), *(pairs[k] for k in ("empty", "all points equal", "NaN"))]))
+    assert estimate.related.tolist() == [True, False, False, False]
+    assert estimate.significance[1:].tolist() == [-math.inf] * 3
+
+
+def test_coarse_to_fine_is_judged_by_all_matches() -> None:
+    """The inliers of a first estimator agree by selection, and are no evidence for the second one."""
+    c = chance()
+    coarse = quick("ransac", 400, 200)
+    fine = quick("lmeds", 200, 100)
+    kept = c.keep(coarse(c).inliers)
+    assert float(fine(kept).significance.max()) > float(quick("cf_ransac", 400, 200)(c).significance.max())
+
+
+def silent(c: Correspondences, seed: int = 0) -> Estimate:
+    """An estimator of a user's own, which knows nothing of significance."""
+    known = quick("ransac", 200, 100)(c, seed)
+    return Estimate(known.F, known.inliers, known.ok, known.reason, known.draws)
+
+
+def test_what_an_estimator_does_not_say_is_said_by_the_caller() -> None:
+    c = common()
+    without = silent(c)
+    assert bool(without.significance.isnan().all())
+    assert not bool(without.related.any())
+    told = judged(without, c)
+    assert torch.equal(told.significance, quick("ransac", 200, 100)(c).significance)
+    assert bool(told.related.all())
+    own = without.replace(significance=torch.full((len(c),), 7.0, dtype=torch.float64))
+    assert judged(own, c) is own
+
+
+def test_find_fundamental_tells() -> None:
+    c = collate([scene(1, 100, 0.3), scene(2, 40, 1.0)])
+    estimate = fmtorch.find_fundamental(c.x0, c.x1, mask=c.mask, quality=c.quality, size0=(640, 960), size1=(640, 960))
+    assert estimate.ok[0]
+    assert estimate.related.tolist() == [True, False]
+    assert estimate[1:].significance.tolist() == estimate.significance[1:].tolist()
+    rng = np.random.default_rng(0)
+    assert not bool(fmtorch.find_fundamental(*rng.uniform(0, 500, (2, 20, 2)), estimator="ransac").related[0])
+
+
+def test_the_level_is_that_of_the_documentation() -> None:
+    estimate = silent(common()).replace(significance=torch.full((6,), RELATED, dtype=torch.float64))
+    assert bool(estimate.related.all())
+    below = estimate.replace(significance=estimate.significance - 1e-9)
+    assert not bool(below.related.any())

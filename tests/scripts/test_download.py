@@ -1,0 +1,208 @@
+"""scripts/download.py: what is fetched is whole and verified, or is not kept; data sets resume and unpack safely."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import http.server
+import io
+import random
+import re
+import runpy
+import tarfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+from omegaconf import OmegaConf
+
+SCRIPT = runpy.run_path(str(Path(__file__).resolve().parents[2] / "scripts" / "download.py"))
+CONTENT = b"weights" * 1000
+DIGEST = hashlib.sha256(CONTENT).hexdigest()
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[str]:
+    """The address of a server on this machine with one file, and one that breaks off."""
+    (tmp_path / "served").mkdir()
+    (tmp_path / "served" / "AffNet.pth").write_bytes(CONTENT)
+
+    class Handler(http.server.SimpleHTTPRequestHandler):
+        def do_GET(self) -> None:
+            if self.path != "/short.pth":
+                super().do_GET()
+                return
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(CONTENT) + 5))
+            self.end_headers()
+            self.wfile.write(CONTENT)
+
+        def log_message(self, *args: object) -> None:
+            pass
+
+    handler = functools.partial(Handler, directory=str(tmp_path / "served"))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as httpd:
+        threading.Thread(target=httpd.serve_forever, args=(0.01,), daemon=True).start()  # ends soon
+        yield f"http://127.0.0.1:{httpd.server_address[1]}"
+        httpd.shutdown()
+
+
+def config(**values: Any) -> Any:
+    return OmegaConf.merge(OmegaConf.create(SCRIPT["DEFAULTS"]), OmegaConf.create(values))
+
+
+def test_a_verified_file_is_kept(server: str, tmp_path: Path) -> None:
+    folder = tmp_path / "weights"
+    path = SCRIPT["fetch"](
+        config(weights="affnet", url=f"{server}/AffNet.pth", sha256=DIGEST.upper(), folder=str(folder))
+    )
+    assert path == folder / "AffNet.pth"
+    assert path.read_bytes() == CONTENT
+    assert [p.name for p in folder.iterdir()] == ["AffNet.pth"]
+
+
+def test_another_file_than_the_pinned_one_is_not_kept(server: str, tmp_path: Path) -> None:
+    folder = tmp_path / "weights"
+    with pytest.raises(ValueError, match=f"has SHA-256 {DIGEST}, not 65c8bb2c"):
+        SCRIPT["fetch"](config(weights="affnet", url=f"{server}/AffNet.pth", folder=str(folder)))
+    assert list(folder.iterdir()) == []
+
+
+def test_a_failed_fetch_leaves_what_was_there(server: str, tmp_path: Path) -> None:
+    path = tmp_path / "w.pth"
+    path.write_bytes(b"old")
+    for address in (f"{server}/absent.pth", f"{server}/short.pth", "http://127.0.0.1:9/x.pth"):
+        with pytest.raises(ConnectionError, match=re.escape(address)):
+            SCRIPT["download"](address, path, None, timeout=5)
+    assert path.read_bytes() == b"old"
+    assert {p.name for p in tmp_path.iterdir()} == {"w.pth", "served"}
+
+
+def test_a_file_without_a_pinned_hash_needs_a_word(server: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"SHA-256 of HardNet\+\+\.pth is not pinned: give sha256="):
+        SCRIPT["fetch"](config(weights="hardnet++"))
+    with pytest.raises(ValueError, match="sha256=abc is no SHA-256"):
+        SCRIPT["fetch"](config(weights="hardnet++", sha256="abc"))
+    path = SCRIPT["fetch"](
+        config(weights="hardnet++", sha256="any", url=f"{server}/AffNet.pth", folder=str(tmp_path / "w"))
+    )
+    assert path.name == "HardNet++.pth"
+
+
+def test_unknown_weights_are_answered_with_those_there_are() -> None:
+    with pytest.raises(ValueError, match=r"there are: affnet, orinet, .*hardnet\+\+"):
+        SCRIPT["fetch"](config(weights="superpoint"))
+    for entry in SCRIPT["TABLE"].values():
+        assert entry.url.startswith("https://")
+        assert entry.sha256 is None or re.fullmatch("[0-9a-f]{64}", entry.sha256)
+
+
+def archive(path: Path, members: dict[str, bytes], link: str | None = None) -> bytes:
+    """A gzipped tar of these files; link: a symbolic link to write besides."""
+    with tarfile.open(path, "w:gz") as tar:
+        for name, content in members.items():
+            member = tarfile.TarInfo(name)
+            member.size = len(content)
+            tar.addfile(member, io.BytesIO(content))
+        if link is not None:
+            member = tarfile.TarInfo("rgbd_dataset_x/link")
+            member.type, member.linkname = tarfile.SYMTYPE, link
+            tar.addfile(member)
+    return path.read_bytes()
+
+
+class Ranges(http.server.SimpleHTTPRequestHandler):
+    """Serves bytes from where they are asked for, and breaks off after `limit` of them."""
+
+    content, limit, ranges = b"", 0, True
+    asked: ClassVar[list[str | None]] = []
+
+    def do_GET(self) -> None:
+        wanted = self.headers.get("Range") if self.ranges else None
+        self.asked.append(self.headers.get("Range"))
+        begin = int(wanted.removeprefix("bytes=").rstrip("-")) if wanted else 0
+        rest = self.content[begin:]
+        self.send_response(206 if wanted else 200)
+        self.send_header("Content-Length", str(len(rest)))
+        self.end_headers()
+        self.wfile.write(rest[: self.limit])
+
+    def log_message(self, *args: object) -> None:
+        pass
+
+
+@pytest.fixture
+def ranges(tmp_path: Path) -> Iterator[tuple[type[Ranges], str]]:
+    """A server that can continue, with a sequence of 50 kB, and its address."""
+    noise = random.Random(0).randbytes(50_000)
+    content = archive(tmp_path / "source.tgz", {"rgbd_dataset_x/rgb.txt": b"# list", "rgbd_dataset_x/rgb/1.png": noise})
+    handler = type("Handler", (Ranges,), {"content": content, "limit": len(content), "asked": []})
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as httpd:
+        threading.Thread(target=httpd.serve_forever, args=(0.01,), daemon=True).start()  # ends soon
+        yield handler, f"http://127.0.0.1:{httpd.server_address[1]}/{{camera}}/{{file}}.tgz"
+        httpd.shutdown()
+
+
+@pytest.mark.parametrize("continues", [True, False])
+def test_a_data_set_that_broke_off_is_continued(
+    continues: bool, ranges: tuple[type[Ranges], str], tmp_path: Path
+) -> None:
+    handler, url = ranges
+    handler.ranges, handler.limit = continues, 20_000
+    asked = config(dataset="tum", files=["x_y"], url=url, folder=str(tmp_path / "TUM"), timeout=5)
+    with pytest.raises(ConnectionError, match="broke off"):
+        SCRIPT["fetch_dataset"](asked)
+    assert [path.name for path in (tmp_path / "TUM").iterdir()] == [".x_y.archive.part"]
+    handler.limit = len(handler.content)
+    made = SCRIPT["fetch_dataset"](asked)
+    assert handler.asked == [None, "bytes=20000-"]
+    assert made == [tmp_path / "TUM/rgbd_dataset_x"]
+    assert (made[0] / "rgb.txt").read_bytes() == b"# list"
+    assert len((made[0] / "rgb/1.png").read_bytes()) == 50_000
+    assert sorted(path.name for path in (tmp_path / "TUM").iterdir()) == [".x_y.complete", "rgbd_dataset_x"]
+    assert SCRIPT["fetch_dataset"](asked) == []  # it is there
+    assert len(handler.asked) == 2
+
+
+def test_another_archive_than_the_stated_one_is_not_unpacked(ranges: tuple[type[Ranges], str], tmp_path: Path) -> None:
+    asked = config(dataset="tum", files=["x"], url=ranges[1], folder=str(tmp_path / "TUM"), sha256="0" * 64)
+    with pytest.raises(ValueError, match=r"has SHA-256 .*, not 000"):
+        SCRIPT["fetch_dataset"](asked)
+    assert list((tmp_path / "TUM").iterdir()) == []
+
+
+@pytest.mark.parametrize("members", [{"../outside.txt": b"x"}, {"a/../../outside.txt": b"x"}, {}])
+def test_archives_cannot_write_elsewhere(members: dict[str, bytes], tmp_path: Path) -> None:
+    path = tmp_path / "evil.tgz"
+    archive(path, members, link=None if members else "/etc/passwd")
+    (tmp_path / "in/side").mkdir(parents=True)
+    with pytest.raises(ValueError, match=r"evil\.tgz: cannot be unpacked"):
+        SCRIPT["unpack"](path, tmp_path / "in/side")
+    assert sorted(p.name for p in tmp_path.rglob("*")) == ["evil.tgz", "in", "side"]
+
+
+def test_damaged_archives_and_folders_that_are_there_are_told(tmp_path: Path) -> None:
+    path, folder = tmp_path / "a.tgz", tmp_path / "folder"
+    content = archive(path, {"one/a": b"1" * 5000, "two/b": b"2"})
+    (folder / "two").mkdir(parents=True)
+    with pytest.raises(ValueError, match="two is there already; name another folder or remove it"):
+        SCRIPT["unpack"](path, folder)
+    assert [p.name for p in folder.iterdir()] == ["two"]
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(ValueError, match=r"a\.tgz: cannot be unpacked .*; delete it and fetch it again"):
+        SCRIPT["unpack"](path, folder)
+    assert [p.name for p in folder.iterdir()] == ["two"]
+
+
+def test_sets_behind_a_form_say_what_to_do() -> None:
+    for name in ("kitti", "tanks_and_temples", "fmbench"):
+        with pytest.raises(ValueError, match=f"{name} cannot be fetched from here: .*https://"):
+            SCRIPT["fetch_dataset"](config(dataset=name))
+    with pytest.raises(ValueError, match="dataset=imagenet; there are: tum, 1dsfm, kitti"):
+        SCRIPT["fetch_dataset"](config(dataset="imagenet"))
+    for source in SCRIPT["DATASETS"].values():
+        assert source.licence
+        assert source.citation
+        assert bool(source.by_hand) != bool(source.url and source.files)

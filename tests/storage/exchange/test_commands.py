@@ -1,0 +1,220 @@
+"""The commands that export: a folder of images and an evaluation, resumed, refused, and read back as a data set."""
+
+from __future__ import annotations
+
+import re
+import threading
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+from fmtorch import data
+from fmtorch.commands import eval as eval_command
+from fmtorch.commands import match as match_command
+from fmtorch.core.resources import conf_dir
+from fmtorch.pipeline.folder import chosen_pairs, images_below, open_folder
+from fmtorch.pipeline.photographs import Described
+from fmtorch.pipeline.pipeline import folder
+from fmtorch.storage import RunFolder
+from fmtorch.storage.exchange.export import DATABASE, FEATURES, MATCHES
+from tests.pipeline.test_pipeline import draw
+
+OPTIONS = ("features.max_features=400", "estimator=lmeds", "estimator.hypotheses=100", "cache=off")
+
+
+def config(command: str, *words: str) -> DictConfig:
+    with initialize_config_dir(str(conf_dir()), version_base=None):
+        return compose(command, ["pipeline=sift_ratio", *OPTIONS, *words])
+
+
+@pytest.fixture
+def images(tmp_path: Path) -> Path:
+    """Three views of one picture, one in a folder of its own, and another picture."""
+    (tmp_path / "images" / "more").mkdir(parents=True)
+    for i, name in enumerate(("a.png", "b.png", "more/c.png")):
+        draw(tmp_path / "images" / name, seed=0, shift=12 * i)
+    draw(tmp_path / "images" / "other.png", seed=1)
+    (tmp_path / "images" / "notes.txt").write_text("no image")
+    return tmp_path / "images"
+
+
+def match(images: Path, output: Path, *words: str) -> Path:
+    return match_command.run(config("match", f"images={images}", f"output={output}", *words), "sift_ratio")
+
+
+def test_a_folder_of_images(images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = match(images, tmp_path / "out", "export='h5,colmap'")
+    said = capsys.readouterr().out
+    assert "3 of 6 pairs show one scene" in said
+    assert "taken from" not in said
+    with h5py.File(output / FEATURES) as features, h5py.File(output / MATCHES) as matches:
+        points = {name: features[f"{name}/keypoints"][:] for name in ("a.png", "more/c.png")}
+        group = matches["a.png/more-c.png"]
+        i = np.flatnonzero(group["inliers0"])
+        moved = points["more/c.png"][group["matches0"][:][i]] - points["a.png"][i]
+        assert len(i) > 50
+        np.testing.assert_allclose(np.median(moved, axis=0), [-24, 0], atol=0.1)
+    with pycolmap.Database.open(output / DATABASE) as file:
+        assert (file.num_images(), file.num_cameras()) == (4, 4)
+        assert file.num_verified_image_pairs() == 3
+
+    # Again: nothing is computed, the files are the same.
+    before = (output / MATCHES).read_bytes()
+    match(images, tmp_path / "out", "export=h5")
+    assert "6 of 6 pairs taken from an earlier run" in capsys.readouterr().out
+    assert (output / MATCHES).read_bytes() == before
+
+    # Interrupted: what is missing is computed. Another image of a name: its pairs are computed anew.
+    next((output / "export" / "pairs").iterdir()).unlink()
+    draw(images / "other.png", seed=0, shift=30)
+    match(images, tmp_path / "out", "export=h5")
+    said = capsys.readouterr().out
+    assert re.search(r"[23] of 6 pairs taken from an earlier run", said)
+    assert "6 of 6 pairs show one scene" in said
+
+    with pytest.raises(ValueError, match=r"holds matches of other settings \(seed differ\); choose another output"):
+        match(images, tmp_path / "out", "seed=3")
+
+
+def test_one_bad_image_does_not_end_the_work(images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (images / "bad.png").write_bytes(b"\x89PNG and no more")
+    output = match(images, tmp_path / "out", "export=h5")
+    assert len(re.findall("bad.png", capsys.readouterr().err)) == 1
+    with h5py.File(output / FEATURES) as file:
+        assert sorted(file) == ["a.png", "b.png", "more", "other.png"]
+    for path in images.rglob("*.png"):
+        path.write_bytes(b"\x89PNG and no more")
+    with pytest.raises(ValueError, match="no pair could be matched, the first because: ImageError"):
+        match(images, tmp_path / "out2", "export=h5")
+
+
+def test_images_are_described_by_several_threads(
+    images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (images / "bad.png").write_bytes(b"\x89PNG and no more")
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    match(images, tmp_path / "one", "export=h5")
+    expected = capsys.readouterr()
+    both, described = threading.Barrier(2, timeout=60), folder.describe
+
+    def together(*arguments: Any) -> Described:
+        both.wait()  # raises where the other does not come
+        return described(*arguments)
+
+    monkeypatch.setattr(folder, "describe", together)  # of four sound images
+    torch.set_num_threads(2)
+    match(images, tmp_path / "two", "export=h5")
+    torch.set_num_threads(threads)
+    found = capsys.readouterr()
+    assert found.err == expected.err
+    assert "3 of 10 pairs show one scene" in found.out
+    for name in (FEATURES, MATCHES):
+        with h5py.File(tmp_path / "one" / name) as one, h5py.File(tmp_path / "two" / name) as two:
+            compared = []
+
+            def compare(at: str, item: object, other: h5py.File = two, seen: list[str] = compared) -> None:
+                if isinstance(item, h5py.Dataset):
+                    np.testing.assert_array_equal(item[:], other[at][:])
+                    seen.append(at)
+
+            one.visititems(compare)
+            assert len(compared) >= 4
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a.png\n", "line 1: 'a.png'; it must be the names of two images"),
+        ("# two\n\na.png a.png\n", "line 3: 'a.png a.png'; it must be"),
+        ("a.png nowhere.png\n", "line 1: no image nowhere.png in "),
+        ("\n", "names no pair"),
+    ],
+)
+def test_lists_of_pairs_that_are_none(text: str, said: str, images: Path, tmp_path: Path) -> None:
+    (tmp_path / "pairs.txt").write_text(text)
+    with pytest.raises(ValueError, match=said):
+        chosen_pairs(images, images_below(images), tmp_path / "pairs.txt")
+
+
+def test_lists_of_pairs(images: Path, tmp_path: Path) -> None:
+    found = images_below(images)
+    assert [path.relative_to(images).as_posix() for path in found] == ["a.png", "b.png", "more/c.png", "other.png"]
+    assert len(chosen_pairs(images, found, Path("exhaustive"))) == 6
+    (tmp_path / "pairs.txt").write_text("b.png a.png\n# again\na.png b.png\na.png other.png\n")
+    chosen = chosen_pairs(images, found, tmp_path / "pairs.txt")
+    assert [(a.name, b.name) for a, b in chosen] == [("b.png", "a.png"), ("a.png", "other.png")]
+    with pytest.raises(ValueError, match=r"list\.txt: no such file; it must be exhaustive, or a file"):
+        chosen_pairs(images, found, tmp_path / "list.txt")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["images=nowhere"], "images=nowhere is no folder"),
+        (["images=.", "image0=a.png"], "images takes a folder; image0, image1 and truth are of a single pair"),
+        (["image0=a.png", "image1=b.png", "export=h5"], "export and pairs are of a folder of images"),
+        (["images=.", "export=bundler"], "'bundler' is none of h5, colmap"),
+        (["images=.", "camera=mine"], "camera=mine; it must be one of: per_image, shared"),
+    ],
+)
+def test_mistakes_are_told(words: list[str], said: str, images: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(images)
+    with pytest.raises(ValueError, match=said):
+        match_command.run(config("match", *words), "sift_ratio")
+
+
+def test_settings_that_cannot_be_read(tmp_path: Path) -> None:
+    (tmp_path / "export.json").write_text("{")
+    with pytest.raises(ValueError, match=r"export\.json is not valid JSON .* delete"):
+        open_folder(tmp_path, {"seed": 0})
+
+
+def test_an_evaluation_and_its_way_back(tmp_path: Path) -> None:
+    """What an evaluation exports, also after it has ended, and what that is as a data set."""
+    folder = tmp_path / "Set" / "scene" / "Images"
+    folder.mkdir(parents=True)
+    for i in range(3):
+        draw(folder / f"{i:08d}.png", seed=0, shift=9 * i)
+    camera = np.concatenate([[300, 0, 160, 0, 300, 120, 0, 0, 1], np.eye(3).ravel()])
+    np.savetxt(folder.parent / "Camera.txt", [np.concatenate([camera, [-i, 0, 0]]) for i in range(3)])
+    F = "0 0 0 0 0 -1 0 1 0"
+    (tmp_path / "Set" / "pairs_with_gt.txt").write_text(f"0 1 {F}\n0 2 {F}\n1 2 {F}\n2 0 nan{F[1:]}\n")
+    (tmp_path / "Set" / "pairs_which_dataset.txt").write_text("scene/\n" * 4)
+
+    def run(run_dir: str, *words: str) -> tuple[Path, dict[str, list[Any]]]:
+        path = eval_command.run(config("eval", f"run_dir={tmp_path / run_dir}", *words), "sift_ratio")
+        return path, RunFolder.load(path).read().sort_by("pair").to_pydict()
+
+    ours = ("dataset=fmbench", f"dataset.root={tmp_path / 'Set'}")
+    _, plain = run("run", *ours)
+    path, rows = run("run", *ours, "export='h5,colmap'")  # its pairs are done, but were not kept
+    assert rows == plain
+    with pycolmap.Database.open(path / DATABASE) as file:
+        assert (file.num_images(), file.num_cameras(), file.num_matched_image_pairs()) == (3, 1, 3)
+        assert file.read_camera(1).has_prior_focal_length
+        assert file.read_two_view_geometry(1, 2).config == int(pycolmap.TwoViewGeometryConfiguration.CALIBRATED)
+    kept = sorted((path / "export").rglob("*.npz"))
+    assert len(kept) == 6
+    changed = [file.stat().st_mtime_ns for file in kept]
+    run("run", *ours, "export=h5")  # and now there is nothing to do
+    assert [file.stat().st_mtime_ns for file in kept] == changed
+
+    known = {"layout": "hloc", "truth": str(tmp_path / "Set")}
+    dataset = data.load("h5", root=path, **known)
+    assert [pair.problem is None for pair in dataset] == [True, True, True, False]
+    words = ["dataset=h5", f"dataset.root={path}", *(f"dataset.{key}={value}" for key, value in known.items())]
+    _, theirs = run("theirs", *words, "pruner=[]")
+    for column in ("pair", "ok", "corrs_before", "inlier_rate_before"):
+        assert theirs[column] == plain[column]
+    assert theirs["features0"][:3] == plain["features0"][:3]
+    assert all(np.isnan(seconds or np.nan) for seconds in theirs["seconds_features"])
+    with pytest.raises(ValueError, match="no pair has images in which a pipeline finds keypoints"):
+        run("none", *words, "pruner=[]", "export=h5")
