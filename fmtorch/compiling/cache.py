@@ -103,14 +103,14 @@ class KernelFile:
     saved, the kernels that the function calls.
     """
 
-    def __init__(self, function: Callable[..., Any], signature: str, missing: Callable[[str], None]) -> None:
+    def __init__(self, function: Callable[..., Any], signature: Any, missing: Callable[[str], None]) -> None:
         self.missing = missing
         self.calls: list[Any] = []
         self.path: Path | None = None
         where = folder()
         if where is not None and Path(function.__code__.co_filename).is_file():
             source = Path(function.__code__.co_filename).read_bytes()
-            version = _hex(source + signature.encode())[:8]
+            version = _hex(source + str(signature).encode())[:8]
             self.path = where / f"{function.__module__}.{function.__qualname__}-{version}.bin"
 
     @property

@@ -38,7 +38,7 @@ def called(machine_code: bytes) -> list[Any]:
     return [getattr(importlib.import_module(module), name) for module, name in places]
 
 
-def callable_type(function: Callable[..., Any], signature: str) -> Any:
+def callable_type(function: Callable[..., Any], signature: Any) -> Any:
     """What a kernel is to numba where another one calls it: a function of one signature, called by its cell.
 
     Raises TypeError unless the function says by an annotation that it returns None, bool, int or float.

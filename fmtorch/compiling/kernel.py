@@ -23,6 +23,7 @@ from typing import Any, Generic, ParamSpec, TypeVar, overload
 import numpy as np
 
 from fmtorch.compiling import cache, calls
+from fmtorch.compiling.signature import signature_of
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -42,16 +43,21 @@ class Kernel(Generic[P, R]):
     __slots__ = ("__call__", "__dict__")  # so that to call a kernel is to call what is compiled, with nothing between
     __call__: Callable[P, R]
 
-    def __init__(self, function: Callable[P, R], signature: str, brief: bool = False) -> None:
+    def __init__(self, function: Callable[P, R], signature: str | None = None, brief: bool = False) -> None:
         self.function: Callable[P, R] = inspect.unwrap(
             function
         )  # without the checks that tests wrap around every function
         functools.update_wrapper(self, self.function)
-        self.signature = f"({signature},)"  # a tuple, of one argument too
+        self._text = signature
         self.brief = brief
         self._compiled: Callable[P, R] | None = None
         self.calls: list[Kernel[..., Any]] = []  # those that it calls, once it is compiled
         self.__call__ = self._first_call
+
+    @functools.cached_property
+    def signature(self) -> Any:
+        """The types of its arguments."""
+        return signature_of(self.function) if self._text is None else f"({self._text},)"  # a tuple, of one too
 
     def _first_call(self, *args: P.args, **kwargs: P.kwargs) -> R:
         return self.compiled()(*args, **kwargs)
@@ -129,13 +135,21 @@ class Inner(Generic[P, R]):
         return str(self.__qualname__)  # type: ignore[attr-defined]  # the name to import it by
 
 
-def kernel(signature: str, *, brief: bool = False) -> Callable[[Callable[P, R]], Kernel[P, R]]:
-    """Makes a function a `Kernel` of the given types, as numba writes them: ``"f4[:, ::1], i8[::1], f8"``.
+@overload
+def kernel(signature: Callable[P, R]) -> Kernel[P, R]: ...
+@overload
+def kernel(
+    signature: str | None = None, *, brief: bool = False, holds_gil: bool = False
+) -> Callable[[Callable[P, R]], Kernel[P, R]]: ...
+def kernel(signature: Any = None, *, brief: bool = False, holds_gil: bool = False) -> Any:
+    """Makes a function a `Kernel` of the types of its annotations.
 
-    ``[:, ::1]`` is an array of two axes in C order; it must be writable. brief: of some microseconds, for which it
-    keeps Python's lock: a thread that waits for it would wake too late to use them.
+    Arrays must be writable. holds_gil: of some microseconds, for which it keeps Python's lock: a thread that waits for
+    it would wake too late to use them.
     """
-    return lambda function: Kernel(function, signature, brief)
+    if callable(signature):
+        return Kernel(signature)
+    return lambda function: Kernel(function, signature, brief or holds_gil)
 
 
 @overload
@@ -181,7 +195,7 @@ fused = _Fused(_fused, inline=False)
 
 
 def _compiled(
-    function: Callable[P, R], signature: str, brief: bool, count: str
+    function: Callable[P, R], signature: Any, brief: bool, count: str
 ) -> tuple[Callable[P, R], list[Kernel[..., Any]]]:
     """The compiled function, whose address its cell holds from now on, and the kernels that it calls."""
     import numba

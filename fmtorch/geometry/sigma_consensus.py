@@ -11,8 +11,10 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from numpy.typing import NDArray
 from torch import Tensor
 
 QUANTILE = 3.64
@@ -83,3 +85,11 @@ def _look_up(r2: Tensor, s2: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     table = _WEIGHT.to(r2.device)
     weight = torch.take(table, interval)
     return interval, position - interval, weight, torch.take(table, interval + 1) - weight
+
+
+def gain_table() -> NDArray[np.float32]:
+    """The gains of MAGSAC++ in ENTRIES intervals of (r / (k sigma_max))^2, and 0 from there on; float32."""
+    middle = (torch.arange(ENTRIES, dtype=torch.float64) + 0.5) / ENTRIES
+    gain = 1 - marginal_loss(middle) / marginal_loss(torch.ones_like(middle))
+    table: NDArray[np.float32] = torch.cat([gain, torch.zeros(1, dtype=torch.float64)]).to(torch.float32).numpy()
+    return table

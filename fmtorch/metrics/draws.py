@@ -12,7 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
-from fmtorch.core.random import Stream, uniform
+from fmtorch.core.random import uniform
+from fmtorch.core.streams import Stream
 from fmtorch.core.validation import expect_sizes
 from fmtorch.geometry.epipolar import inverse_root
 

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from fmtorch.compiling.batches import for_each_pair, kernels_serve
 from fmtorch.core.checks import checked
-from fmtorch.core.random import Stream, mixed_seed
+from fmtorch.core.streams import Stream, mixed_seed
 from fmtorch.geometry.epipolar import lines_through, residual_and_normals, unit_largest
 from fmtorch.metrics import nsgd_kernels as compiled
 from fmtorch.metrics.draws import Pairs, diagonal, expect_samples, mean_terms, segment_in_image

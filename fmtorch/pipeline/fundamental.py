@@ -12,12 +12,12 @@ import numpy as np
 
 from fmtorch import presets
 from fmtorch.compiling import switch
+from fmtorch.compiling.together import compile_together
 from fmtorch.core.arguments import Arrays, correspondences, number
 from fmtorch.core.stages import Estimator, Pruner
 from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Estimate
 from fmtorch.core.validation import expect_values
-from fmtorch.estimators.one_pair import ahead
 from fmtorch.geometry.verdict import judged
 
 
@@ -89,10 +89,11 @@ def find_fundamental(
     if prior is None and getattr(chosen, "uses_prior", False):
         framed = c.lafs0 is not None and c.lafs1 is not None and c.quality is not None
         name = "frame_consistency" if framed else "position_consistency"
-        if c.mask.device.type == "cpu" and switch.available() and getattr(chosen, "focal", None) is not None:
-            ahead.compiled(name)
+        pruner = _consistency(name)
+        if switch.available():
+            compile_together([*getattr(pruner, "kernels", ()), *getattr(chosen, "kernels", ())])
         with one_thread(c.mask.device):
-            c = _consistency(name)(c)
+            c = pruner(c)
     return judged(chosen(c, seed), c)
 
 

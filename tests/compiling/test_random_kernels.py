@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.core.random import Stream, bits, mixed_seed
+from fmtorch.core.random import bits
+from fmtorch.core.streams import Stream, mixed_seed
 from fmtorch.estimators.pool_kernels import shuffled
 
 pytest.importorskip("numba", reason="numba is not installed")

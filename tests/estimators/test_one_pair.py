@@ -11,7 +11,7 @@ import torch
 
 from fmtorch import metrics, presets
 from fmtorch.compiling import switch
-from fmtorch.core.random import Stream
+from fmtorch.core.streams import Stream
 from fmtorch.core.types import Correspondences, Estimate, collate
 from fmtorch.estimators import HypothesizeAndVerify, final_fits, inliers, sampling, scores
 from fmtorch.estimators.models import Models as TensorModels

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.core.random import Stream, mixed_seed
+from fmtorch.core.streams import Stream, mixed_seed
 from fmtorch.core.types import Correspondences
 from fmtorch.estimators import sampling_kernels, solvers
 from fmtorch.estimators.one_pair import sampling as one_pair

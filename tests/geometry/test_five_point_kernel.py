@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.core.random import Stream, mixed_seed
+from fmtorch.core.streams import Stream, mixed_seed
 from fmtorch.estimators.focal import prior
 from fmtorch.estimators.focal.cameras import CentredPairs
 from fmtorch.estimators.focal.hypotheses import FocalSamples
