@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.geometry import significance_kernels as compiled
-from fmtorch.geometry.arithmetic import logarithm
+from fmtorch.geometry.arithmetic import logarithm, sqrt
 from fmtorch.geometry.epipolar import epipolar_distances
 from fmtorch.pair_arrays import for_each_pair, kernels_serve
 
@@ -81,7 +81,7 @@ def significance(
         low = torch.where(mask[..., None], x, torch.inf).amin(1)
         box = (torch.where(mask[..., None], x, -torch.inf).amax(1) - low).flip(-1).clamp_min(0)
         h, w = (box if size is None else size.to(torch.float64)).unbind(-1)
-        diagonal = (h * h + w * w).sqrt()
+        diagonal = sqrt(h * h + w * w)
         strip = torch.where(h * w > 0, 2 * diagonal / (h * w), torch.inf)
         chance = torch.maximum(chance, (distance * strip[:, None]).nan_to_num(1.0, 1.0))
         cell = torch.floor((x - low[:, None]) / (diagonal / CELLS)[:, None, None]).nan_to_num(0)

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.threads import one_thread
 
 _GROUP = 32  # columns whose minimum is taken together; a group is searched only where it can hold a neighbour
@@ -101,8 +102,8 @@ def _match_one_pair(d0: Tensor, d1: Tensor, mask0: Tensor, mask1: Tensor, chunk:
     rows, columns, unit = _integers(d0[slots0], d1[slots1])
     nearest, reverse = _two_nearest(rows, columns, chunk)
     result.nearest[slots0] = slots1[nearest.column]
-    result.distance[slots0] = (nearest.squared.double().sqrt() * unit).float()
-    result.second[slots0] = (nearest.second_squared.double().sqrt() * unit).float()
+    result.distance[slots0] = (sqrt(nearest.squared.double()) * unit).float()
+    result.second[slots0] = (sqrt(nearest.second_squared.double()) * unit).float()
     result.reverse[slots1] = slots0[reverse]
     return result
 

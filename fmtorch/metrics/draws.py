@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
+from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.random import Stream, uniform
 from fmtorch.validation import expect_sizes
@@ -63,7 +64,7 @@ class Pairs:
 def diagonal(size: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
     """Length of the image diagonal, in pixels."""
     h, w = size.unbind(-1)
-    return (h * h + w * w).sqrt()
+    return sqrt(h * h + w * w)
 
 
 Draw = Callable[[Pairs, Tensor], tuple[Tensor, Tensor]]
