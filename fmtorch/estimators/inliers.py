@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -12,6 +11,8 @@ from torch import Tensor
 from fmtorch.estimators.pairs import NormalizedPairs
 from fmtorch.estimators.sampling import Sampler
 from fmtorch.estimators.scores import median_rank
+from fmtorch.geometry import arithmetic_kernels
+from fmtorch.geometry.arithmetic import logarithm_1p
 from fmtorch.geometry.residuals import sampson_squared
 
 
@@ -89,6 +90,6 @@ class Confidence:
         all_inliers = share
         for _ in range(size - 1):  # a power would not have the same last bits everywhere
             all_inliers = all_inliers * share
-        missed = torch.log1p(-all_inliers.clamp(max=1 - 1e-12)) * draws
-        confident: list[bool] = (missed <= math.log1p(-self.probability)).tolist()
+        missed = logarithm_1p(-all_inliers.clamp(max=1 - 1e-12)) * draws
+        confident: list[bool] = (missed <= arithmetic_kernels.logarithm_1p(-self.probability)).tolist()
         return confident

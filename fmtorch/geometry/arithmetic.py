@@ -10,7 +10,6 @@ or (9, *s) row by row, over which an operation on one entry runs over all matric
 
 from __future__ import annotations
 
-import math
 from typing import Any, cast
 
 import numpy as np
@@ -177,11 +176,16 @@ def exponential(x: Tensor) -> Tensor:
 def logarithm(x: Tensor) -> Tensor:
     """ln(x) of positive numbers, to rounding, by arithmetic alone: the series of atanh at the mantissa."""
     mantissa, exponent = torch.frexp(x)
-    m = mantissa * math.sqrt(2)
-    z = (m - 1) / (m + 1)
-    z2 = z * z
-    series = torch.full_like(z, 1 / 19)
-    for k in range(17, 0, -2):
-        series = series * z2 + 1 / k
-    value: Tensor = 2 * z * series + (exponent.to(x.dtype) - 0.5) * math.log(2)
+    m = mantissa * arithmetic_kernels.ROOT2
+    series = arithmetic_kernels.twice_atanh((m - 1) / (m + 1))
+    value: Tensor = series + (exponent.to(x.dtype) - 0.5) * arithmetic_kernels.LOG2
     return value
+
+
+def logarithm_1p(x: Tensor) -> Tensor:
+    """ln(1 + x) for x > -1, to rounding also near 0, by arithmetic alone."""
+    near = (x > -0.25) & (x < 0.4)
+    z = torch.where(near, x, 0.0)
+    far = torch.where(near | ~torch.isfinite(x), 0.0, x)
+    value = torch.where(near, arithmetic_kernels.twice_atanh(z / (z + 2)), logarithm(1 + far))
+    return torch.where(x < torch.inf, value, x)

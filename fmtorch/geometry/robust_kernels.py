@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from fmtorch.geometry.arithmetic import sqrt
+from fmtorch.geometry.arithmetic import logarithm_1p, sqrt
 from fmtorch.geometry.sigma_consensus import tabulated_curvature, tabulated_loss, tabulated_weight
 
 
@@ -47,7 +47,7 @@ def huber_curvature(r2: Tensor, s2: Tensor) -> Tensor:
 
 def cauchy_loss(r2: Tensor, s2: Tensor) -> Tensor:
     """``s^2 log(1 + r^2 / s^2)``."""
-    return s2 * torch.log1p(r2 / s2)
+    return s2 * logarithm_1p(r2 / s2)
 
 
 def cauchy_weight(r2: Tensor, s2: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.geometry.arithmetic_kernels import logarithm_1p
 from fmtorch.kernels import inner, kernel
 from fmtorch.lanes import LANES, added, fill, load, sqrt, store, where
 
@@ -104,7 +105,7 @@ def robust(r2: Any, s2: Any, loss: int, table: Array, work: Array) -> tuple[Any,
     elif loss == CAUCHY:
         store(work, 0, r2 / s2)
         for i in range(LANES):
-            work[0, i] = math.log1p(work[0, i])
+            work[0, i] = logarithm_1p(work[0, i])
         value, slope = s2 * load(work, 0), s2 / (s2 + r2)
     else:
         store(work, 0, r2 / s2)

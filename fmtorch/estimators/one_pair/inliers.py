@@ -11,6 +11,7 @@ from fmtorch.estimators import inliers
 from fmtorch.estimators.one_pair.pair import Array, OnePair, squared
 from fmtorch.estimators.one_pair.sampling import Sampler
 from fmtorch.estimators.pool_kernels import residuals_squared, share_within, within
+from fmtorch.geometry.arithmetic_kernels import logarithm_1p
 
 
 def residuals_squared_px(F: Array, pair: OnePair) -> Array:
@@ -95,5 +96,8 @@ class Confidence:
         """Whether the best model (9,), after so many draws of `size` matches, may be taken for the best there is."""
         factor, limit = squared(pair.pixels_per_unit), squared(self.part.threshold)
         share = share_within(F.astype(np.float64), pair.points, factor, limit, self.sampler.weight(pair))
-        missed = math.log1p(-min(share**size, 1 - 1e-12)) * draws
-        return [missed <= math.log1p(-self.part.probability)]
+        all_inliers = share
+        for _ in range(size - 1):
+            all_inliers *= share
+        missed = logarithm_1p(-min(all_inliers, 1 - 1e-12)) * draws
+        return [missed <= logarithm_1p(-self.part.probability)]

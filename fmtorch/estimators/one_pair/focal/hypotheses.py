@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from fmtorch.estimators.focal import hypotheses, prior
 from fmtorch.estimators.focal.hypotheses_kernels import SOLUTIONS, samples_of_five
+from fmtorch.estimators.focal.prior_kernels import LOG_USUAL
 from fmtorch.estimators.one_pair.focal.cameras import CentredPair, images_of
 from fmtorch.estimators.one_pair.models import Models
 from fmtorch.estimators.one_pair.pair import Array, OnePair
@@ -15,7 +14,7 @@ from fmtorch.estimators.one_pair.sampling import Sampler, Urn, seed_of
 from fmtorch.random import Stream, mixed_seed
 
 NUMBERS = np.array(
-    [math.log(prior.USUAL_FOCAL), prior.FOCAL_DEVIATION, prior.RATIO_DEVIATION / 2, prior.SAME_CAMERA_SHARE]
+    [LOG_USUAL, prior.FOCAL_DEVIATION, prior.RATIO_DEVIATION / 2, prior.SAME_CAMERA_SHARE]
 )  # as the kernel takes them
 QUANTILES = prior.NORMAL.numpy()
 
