@@ -9,48 +9,48 @@ Both are functions of ``u = (r / (k sigma_max))^2`` here.
 
 from __future__ import annotations
 
-import math
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from fmtorch.geometry.arithmetic import sqrt
 
 QUANTILE = 3.64
 ENTRIES = 2048  # intervals of u in [0, 1] between which the tabulated weight is linear: off by at most 3e-5
 
 _END = torch.tensor(QUANTILE**2 / 2, dtype=torch.float64)
+_TERMS = 40  # of series in x up to QUANTILE^2 / 2: what is left out is below a rounding error
 
 
 def marginal_loss(u: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """rho / sigma_max^2, for u in [0, 1]."""
     x = u * _END
-    return _lower_gamma_5_2(x) / 2 + x / 2 * (_upper_gamma_3_2(x) - _upper_gamma_3_2(_END))
+    return _lower_gamma(2.5, x) / 2 + x / 2 * (_lower_gamma(1.5, _END) - _lower_gamma(1.5, x))
 
 
 def marginal_weight(u: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """The derivative of the loss by r^2 over that at zero, for u in [0, 1]."""
-    zero = torch.zeros_like(_END)
-    rest = _upper_gamma_3_2(_END)
-    weight: Tensor = (_upper_gamma_3_2(u * _END) - rest) / (_upper_gamma_3_2(zero) - rest)
-    return weight
+    return 1 - _lower_gamma(1.5, u * _END) / _lower_gamma(1.5, _END)
 
 
-def _upper_gamma_3_2(x: Tensor) -> Tensor:
-    """The upper incomplete gamma function of 3/2."""
-    value: Tensor = x.sqrt() * torch.exp(-x) + math.sqrt(math.pi) / 2 * torch.special.erfc(x.sqrt())
-    return value
+def _lower_gamma(s: float, x: Tensor) -> Tensor:
+    """The lower incomplete gamma function of s, 3/2 or 5/2, of x from 0 to about 7.
 
-
-def _lower_gamma_5_2(x: Tensor) -> Tensor:
-    """The lower incomplete gamma function of 5/2."""
-    return 0.75 * math.sqrt(math.pi) - 1.5 * _upper_gamma_3_2(x) - x * x.sqrt() * torch.exp(-x)
+    ``x^s exp(-x) sum_n x^n / (s (s + 1) ... (s + n))``, and exp by its series, too: sums of positive terms, by
+    arithmetic alone, so that tables made of it are the same on every processor.
+    """
+    total, exponential = torch.zeros_like(x), torch.ones_like(x)
+    for n in range(_TERMS, -1, -1):
+        total = (total * x + 1) / (s + n)
+        exponential = exponential * x / (n + 1) + 1
+    power = x * sqrt(x) if s == 1.5 else x * x * sqrt(x)
+    return power * total / exponential
 
 
 # The weight at the ends of the intervals, zero beyond u = 1, and its integral up to each of them. Looked up rather than
-# evaluated, as by the authors, and because the last bits of exp depend on where in a batch its argument stands.
-_WEIGHT = torch.cat(
-    [marginal_weight(torch.linspace(0, 1, ENTRIES + 1, dtype=torch.float64)), torch.zeros(1, dtype=torch.float64)]
-)
+# evaluated, as by the authors.
+_WEIGHT = marginal_weight(torch.arange(ENTRIES + 1, dtype=torch.float64) / ENTRIES)
+_WEIGHT = torch.cat([_WEIGHT, _WEIGHT.new_zeros(1)])
 _INTEGRAL = torch.nn.functional.pad(((_WEIGHT[:-1] + _WEIGHT[1:]) / (2 * ENTRIES)).cumsum(0), (1, 0))
 LOSS_TABLE = torch.stack([_WEIGHT, _INTEGRAL]).numpy()  # as kernels take both
 
