@@ -55,8 +55,8 @@ class Candidates:
 
     def same_best(self, other: Candidates) -> list[bool]:
         """As `selection.Candidates.same_best`."""
-        cosine = self.F[self.best] @ other.F[other.best]
-        return [self.found and other.found and bool(1 - abs(cosine) <= SAME_CAMERAS)]
+        both = np.stack([self.F[self.best], other.F[other.best]])
+        return [self.found and other.found and not rivals(both, np.ones(2), 0, 1.0, SAME_CAMERAS)]
 
     def unambiguous(self) -> list[bool]:
         """As `selection.Candidates.unambiguous`."""
