@@ -27,9 +27,12 @@ def optimum(
     standard deviations. decays: the share of the first scale in each iteration. iterations: of Levenberg-Marquardt.
     """
     weight = weights(pair)
+    powered = [np.ones_like(weight)]
+    for _ in range(max(powers)):  # NumPy's powers have other last bits on another processor
+        powered.append(powered[-1] * weight)
     F, fitted = np.empty((len(powers), 9)), np.empty(len(powers), np.bool_)
     for i, power in enumerate(powers):
-        fitted[i] = weighted_eight_point(pair.points, weight**power, F[i])
+        fitted[i] = weighted_eight_point(pair.points, powered[power], F[i])
     F = F[fitted]
     if not len(F):
         return np.zeros((3, 3)), False
