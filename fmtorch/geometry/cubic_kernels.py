@@ -26,7 +26,7 @@ def cubic_roots(c: Array, roots: Array, valid: Array) -> None:
         if abs(c[k]) < NEGLIGIBLE:
             c[k] = 0.0
     a, b, d = c[0], c[1], c[3]
-    apart = abs(a * c[2]) <= SEPARATION * b * b and a * a * abs(d) <= SEPARATION**2 * abs(b) ** 3 and b != 0
+    apart = abs(a * c[2]) <= SEPARATION * b * b and a * a * abs(d) <= SEPARATION**2 * (b * b * abs(b)) and b != 0
     if a == 0 or apart:
         _quadratic(b, c[2], d, roots, valid)
         valid[2] = a != 0
