@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fmtorch.geometry.arithmetic import sqrt
+from fmtorch.geometry.arithmetic import sqrt, stable_sum
 from fmtorch.threads import one_thread
 
 _GROUP = 32  # columns whose minimum is taken together; a group is searched only where it can hold a neighbour
@@ -110,7 +110,7 @@ def _match_one_pair(d0: Tensor, d1: Tensor, mask0: Tensor, mask1: Tensor, chunk:
 
 def _integers(d0: Tensor, d1: Tensor) -> tuple[Tensor, Tensor, float]:
     """Both sets as integer-valued vectors in a type in which their squared distances are exact, and their unit."""
-    longest = max(float(torch.linalg.vector_norm(d, dim=-1).max()) for d in (d0, d1))
+    longest = max(float(sqrt(stable_sum(d.double().square())).max()) for d in (d0, d1))
     whole = bool((d0 == d0.round()).all() and (d1 == d1.round()).all())
     if whole and longest <= _FLOAT32_NORM:
         return d0.float(), d1.float(), 1.0
