@@ -119,10 +119,12 @@ class IterativelyReweighted:
 
     def _first(self, pair: Pair) -> Array:
         """The 8-point algorithm with each power of the weights, where these determine a model, (k, 9)."""
-        weight = pair.cached("irls weight", _weight)
+        powers = [np.ones(pair.count)]
+        for _ in range(self.starts[-1]):  # NumPy's powers have other last bits on another processor
+            powers.append(powers[-1] * pair.cached("irls weight", _weight))
         F, valid = np.empty((len(self.starts), 9)), np.empty(len(self.starts), np.bool_)
         for i, power in enumerate(self.starts):
-            valid[i] = weighted_eight_point(pair.points, weight**power, F[i])
+            valid[i] = weighted_eight_point(pair.points, powers[power], F[i])
         return F[valid]
 
 

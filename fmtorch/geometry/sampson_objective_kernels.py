@@ -10,6 +10,8 @@ import numpy as np
 from fmtorch.compiling.arrays import Array, F8x1, F8x2, F8x3
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.lanes import LANES, added, fill, load, sqrt, store, where
+from fmtorch.geometry.arithmetic_kernels import logarithm_1p
+from fmtorch.geometry.magsac import LOSS_TABLE
 
 TINY = 1e-30  # as in `residuals`
 HUBER, CAUCHY, GEMAN_MCCLURE, TRUNCATED, MAGSAC = 0, 1, 2, 3, 4  # losses
@@ -20,11 +22,7 @@ MATCH = 6  # rows of LANES matches: x0, y0, x1, y1, their weights, squared scale
 
 def loss_table(loss: str) -> Array:
     """What `Weighted.table` is for a loss of this name."""
-    if loss != "magsac":
-        return NO_TABLE
-    from fmtorch.geometry.sigma_consensus import LOSS_TABLE
-
-    return LOSS_TABLE
+    return LOSS_TABLE if loss == "magsac" else NO_TABLE
 
 
 class Weighted(NamedTuple):
@@ -121,7 +119,7 @@ def robust(r2: Any, s2: Any, loss: int, table: Array, work: Array) -> tuple[Any,
     elif loss == CAUCHY:
         store(work, 0, r2 / s2)
         for i in range(LANES):
-            work[0, i] = math.log1p(work[0, i])
+            work[0, i] = logarithm_1p(work[0, i])
         value, slope = s2 * load(work, 0), s2 / (s2 + r2)
     else:
         store(work, 0, r2 / s2)

@@ -19,7 +19,7 @@ from torch import Tensor
 from fmtorch.compiling.batches import for_each_pair, kernels_serve
 from fmtorch.core.records import ungraphed
 from fmtorch.core.types import Correspondences
-from fmtorch.geometry.arithmetic import component_sum
+from fmtorch.geometry.arithmetic import component_sum, sqrt
 from fmtorch.geometry.curves import curve_orders
 from fmtorch.pruning import position_consistency_kernels as compiled
 from fmtorch.pruning.calibration import Calibration
@@ -162,8 +162,8 @@ def _along_curve(rows: Float[Tensor, "5 b n"], S: Similarity) -> tuple[Float[Ten
     dx, dy, ux, uy = later[:4] - rows[:4, None]
     error = (S.a * dx - S.b * dy - ux).square() + (S.b * dx + S.a * dy - uy).square()
     length = (
-        S.scale * (dx.square() + dy.square() + LEAST_SQUARE).sqrt()
-        + (ux.square() + uy.square() + LEAST_SQUARE).sqrt()
+        S.scale * sqrt(dx.square() + dy.square() + LEAST_SQUARE)
+        + sqrt(ux.square() + uy.square() + LEAST_SQUARE)
         + NOISE
     )
     agree = (1 + error / length.square() * (TOLERANCE**-2 / 8)).square().square().square().reciprocal()

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from fmtorch.estimators.pool_kernels import shuffled
 
 from fmtorch.core.random import bits
 from fmtorch.core.streams import Stream, mixed_seed
-from fmtorch.estimators.pool_kernels import shuffled
 
 pytest.importorskip("numba", reason="numba is not installed")
 

@@ -6,7 +6,6 @@ camera.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from fmtorch.compiling.arrays import Array
@@ -18,7 +17,7 @@ RATIO_DEVIATION = 0.5  # of the logarithm of the two focal lengths' ratio, for i
 SAME_CAMERA_DEVIATION = 0.01  # width of the well for images of equal size
 SAME_CAMERA_GAIN = 5.0  # its depth, in logarithms of the likelihood
 SAME_CAMERA_SHARE = 0.7  # of the draws for images of equal size that have one focal length for both
-LOG_USUAL = math.log(USUAL_FOCAL)
+LOG_USUAL = 0.1823215567939546  # math.log(USUAL_FOCAL)
 
 
 @inner

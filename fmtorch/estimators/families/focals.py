@@ -107,9 +107,9 @@ def _truncated(pair: Pair, truncation: float) -> Weighted:
 
 @functools.cache
 def normal_quantiles() -> Array:
-    """QUANTILES quantiles of the normal distribution."""
+    """QUANTILES quantiles of the normal distribution, rounded so that the last bits of a library's log do not count."""
     normal = NormalDist()
-    return np.array([normal.inv_cdf((i + 0.5) / QUANTILES) for i in range(QUANTILES)])
+    return np.rint([normal.inv_cdf((i + 0.5) / QUANTILES) * 2.0**40 for i in range(QUANTILES)]) / 2.0**40
 
 
 class Subset(NamedTuple):

@@ -11,6 +11,7 @@ from fmtorch.compiling.arrays import Array, F8x1, F8x2, I8x1
 from fmtorch.compiling.kernel import kernel
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.parts.sampling import Sampler
+from fmtorch.geometry.arithmetic_kernels import logarithm_1p
 
 TINY = float(np.finfo(np.float64).tiny)
 
@@ -74,8 +75,11 @@ class StoppingRule:
         factor, limit = squared(pair.pixels_per_unit), squared(self.threshold)
         weight = np.ones(pair.count, np.int64) if self.weight is None else self.weight(pair)
         share = share_within(F.astype(np.float64), pair.points, factor, limit, weight)
-        missed = math.log1p(-min(share**size, 1 - 1e-12)) * draws
-        return missed <= math.log1p(-self.probability)
+        all_inliers = share
+        for _ in range(size - 1):  # a power would not have the same last bits everywhere
+            all_inliers *= share
+        missed: float = logarithm_1p(-min(all_inliers, 1 - 1e-12)) * draws
+        return missed <= float(logarithm_1p(-self.probability))
 
 
 def residuals_squared_px(F: Array, pair: Pair) -> Array:

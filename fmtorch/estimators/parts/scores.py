@@ -13,7 +13,7 @@ from fmtorch.compiling.arrays import Array, F4x1, F4x2, F8x1, F8x2, I8x1
 from fmtorch.compiling.kernel import Kernel, inner, kernel
 from fmtorch.compiling.lanes import added, lanes, store, where
 from fmtorch.estimators.pair import Pair
-from fmtorch.geometry.sigma_consensus import gain_table
+from fmtorch.geometry.magsac import GAIN_TABLE
 
 SINGLES = 16  # float32 numbers of a row
 load, fill = lanes(SINGLES)
@@ -139,11 +139,10 @@ class Magsac(CodedGains):
     threshold: k sigma_max, Sampson distance, px.
     """
 
-    CODE = TABLE
+    CODE, table = TABLE, GAIN_TABLE
 
     def __init__(self, threshold: float) -> None:
         super().__init__(threshold)
-        self.table = gain_table()
 
 
 def check_threshold(threshold: float) -> None:
