@@ -21,7 +21,8 @@ def signature_of(function: Callable[..., Any]) -> tuple[Any, ...]:
 
 
 def _type(hint: Any, what: str) -> Any:
-    from numba.core import sigutils, types
+    from numba import types
+    from numba.core import sigutils
 
     if hint in NUMBERS:
         return getattr(types, NUMBERS[hint])

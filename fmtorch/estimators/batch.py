@@ -18,7 +18,7 @@ from fmtorch.compiling.batches import as_array
 from fmtorch.core.threads import available, mapped
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.core.validation import PER_MATCH, reason, right_size
-from fmtorch.estimators.gradients import Attached, Solved, with_gradients
+from fmtorch.estimators.gradients import Attach, Solved, with_gradients
 from fmtorch.estimators.pair import Pair, PixelMatches, bucket, normalize_pair, to_pixels
 from fmtorch.estimators.parts.final_fits import Fit
 from fmtorch.estimators.parts.support import degenerate_support
@@ -40,7 +40,7 @@ class Solution(NamedTuple):
 
 
 def estimated(
-    c: Correspondences, seed: int, minimal: int, solve: Callable[[Pair], Solution], attached: Attached
+    c: Correspondences, seed: int, minimal: int, solve: Callable[[Pair], Solution], attach: Attach
 ) -> Estimate:
     """Estimate the models of a batch of pairs; a pair that cannot be solved is `ok=False` with a reason.
 
@@ -88,7 +88,7 @@ def estimated(
     fields = {"F": F, "inliers": inliers, "ok": ok, "draws": draws, "significance": significance}
     tensors = {name: torch.from_numpy(value).to(c.mask.device) for name, value in fields.items()}
     found = Estimate.made(reason=tuple(reasons), **tensors)
-    return with_gradients(found, c, solved, attached) if solved else found
+    return with_gradients(found, c, solved, attach) if solved else found
 
 
 def relative_rounding(c: Correspondences) -> float:
@@ -128,9 +128,10 @@ class Batch(NamedTuple):
 
     def pair(self, i: int) -> PixelMatches:
         """One row, in float64."""
-        rows = [_row(values, i) for values in (self.x0, self.x1)]
-        known = [_row(values, i) for values in (self.prior, self.noise, self.quality)]
-        return PixelMatches(*rows, np.ascontiguousarray(self.mask[i]), *known, self.sizes[i])
+        return PixelMatches(
+            _row(self.x0, i), _row(self.x1, i), np.ascontiguousarray(self.mask[i]), _row(self.prior, i),
+            _row(self.noise, i), _row(self.quality, i), self.sizes[i],
+        )  # fmt: skip
 
     def normalized(self, matches: PixelMatches, i: int, seed: int, minimal: int) -> tuple[Pair, Array] | str:
         """The pair of a row, and where its matches (n,) stood; or why it cannot be estimated."""

@@ -165,7 +165,7 @@ class HypothesizeAndVerify:
 
     def inliers(self, F: Array, pair: Pair) -> Array:
         """The inliers (n,) of a model (9,)."""
-        inliers: Any = self.inlier_rule(residuals_squared_px(F, pair), pair)
+        inliers = self.inlier_rule(residuals_squared_px(F, pair), pair)
         if getattr(inliers, "shape", None) != (pair.count,) or inliers.dtype != bool:
             raise ValueError(f"the rule of inliers returns {inliers!r}; it must be an array ({pair.count},) of bool")
         return inliers

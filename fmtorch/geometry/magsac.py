@@ -16,7 +16,7 @@ from fmtorch.compiling.arrays import Array
 QUANTILE = 3.64
 ENTRIES = 2048  # intervals of u in [0, 1] between which the tabulated weight is linear: off by at most 3e-5
 TERMS = 40  # of series in x up to QUANTILE^2 / 2: what is left out is below a rounding error
-END = np.float64(QUANTILE**2 / 2)
+END = np.array([QUANTILE**2 / 2])
 
 
 def marginal_loss(u: Array) -> Array:

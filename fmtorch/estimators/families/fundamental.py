@@ -25,7 +25,7 @@ class Fundamental:
 
     size: ClassVar[int]
     solutions: ClassVar[int]
-    minimal: ClassVar[Callable[[Array, Array, Array, Array], int]]
+    minimal: ClassVar[Callable[..., int]]
 
     def solve(self, pair: Pair, sample: Array, start: int) -> Hypotheses:
         """As `Family.solve`."""

@@ -161,7 +161,7 @@ def draw(draws: Draws, out: I8x2) -> None:
 
 
 @inner
-def _interval(table: Array, guide: Array, shift: int, position: int) -> tuple[Any, Any, Any]:
+def _interval(table: Array, guide: Array, shift: int, position: Any) -> tuple[Any, Any, Any]:
     """The match whose interval of weights a position falls in; the interval's beginning and length."""
     index: Any = position
     first: Any = position

@@ -226,7 +226,7 @@ def sum_gains(gains: F4x2, rows: F4x2, bits: int, out: F8x1) -> None:
     """Sums of the gains (k, n), each times the weight of its match, rounded to so many bits -> out (k,)."""
     shift = np.float32(1.5 * 2.0 ** (23 - bits))
     for k in range(len(out)):
-        total = 0.0
+        total: Any = 0.0
         for i in range(gains.shape[1]):
             gain = gains[k, i] * rows[i // SINGLES * MATCH + 5, i % SINGLES]
             total += (gain if gain > ZERO else ZERO) + shift - shift
