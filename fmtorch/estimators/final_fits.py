@@ -18,6 +18,7 @@ from fmtorch.estimators.inliers import residuals_squared_px
 from fmtorch.estimators.pairs import NormalizedPairs
 from fmtorch.estimators.selection import Selection
 from fmtorch.geometry import eight_point
+from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.geometry.refine import RANK_TWO_ALREADY, attached_step, refine_components
 
 TRUNCATION_SIGMAS = 2.0  # robust standard deviations beyond which a match does not count
@@ -200,5 +201,5 @@ def truncation_distance(r2: Float[Tensor, "p n"], inliers: Bool[Tensor, "p n"]) 
     count = inliers.sum(1)
     ordered = torch.where(inliers, r2, torch.inf).sort(1).values
     median = ordered.gather(1, ((count + 1) // 2 - 1).clamp_min(0)[:, None])[:, 0]
-    truncation = (TRUNCATION_SIGMAS * 1.4826 * median.sqrt()).clamp(MIN_TRUNCATION_PX, MAX_TRUNCATION_PX)
+    truncation = (TRUNCATION_SIGMAS * 1.4826 * sqrt(median)).clamp(MIN_TRUNCATION_PX, MAX_TRUNCATION_PX)
     return torch.where(count >= MIN_INLIERS_FOR_NOISE, truncation, DEFAULT_TRUNCATION_PX)

@@ -12,7 +12,7 @@ from fmtorch.estimators.pairs import NormalizedPairs
 from fmtorch.estimators.sampling import Sampler
 from fmtorch.estimators.scores import median_rank
 from fmtorch.geometry import arithmetic_kernels
-from fmtorch.geometry.arithmetic import logarithm_1p
+from fmtorch.geometry.arithmetic import logarithm_1p, sqrt
 from fmtorch.geometry.residuals import sampson_squared
 
 
@@ -66,7 +66,7 @@ class RobustDeviations:
         """As `InlierRule`."""
         r2 = residuals_squared_px(F, pairs)
         spare = (pairs.count - self.PARAMETERS).clamp_min(1)[:, None]
-        sigma = 1.4826 * (1 + 5 / spare) * median_of_matches(r2, pairs).sqrt()
+        sigma = 1.4826 * (1 + 5 / spare) * sqrt(median_of_matches(r2, pairs))
         return (r2 <= (2.5 * sigma).square()) & pairs.mask
 
 

@@ -18,6 +18,7 @@ from fmtorch.estimators.one_pair.pair import each_pair
 from fmtorch.estimators.pairs import NormalizedPairs
 from fmtorch.estimators.selection import best_of
 from fmtorch.geometry import attached_step, eight_point
+from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.geometry.irls import reweighted
 from fmtorch.geometry.refine import refine_components
 from fmtorch.geometry.residuals import sampson_squared
@@ -131,7 +132,7 @@ class IterativelyReweighted:
     def _first_scale(self, F: Tensor, valid: Tensor, pairs: NormalizedPairs) -> Float[Tensor, " p"]:
         r2 = sampson_squared(F, pairs.points)
         medians = torch.stack([median_of_matches(r2[:, i], pairs)[:, 0] for i in range(r2.shape[1])], 1)
-        return self.start_scale * 1.4826 * torch.where(valid, medians, 0).amax(1).sqrt()
+        return self.start_scale * 1.4826 * sqrt(torch.where(valid, medians, 0).amax(1))
 
 
 def _weight(pairs: NormalizedPairs) -> Float[Tensor, "p n"]:

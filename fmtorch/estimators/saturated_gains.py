@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch.estimators.scores import GemanMcClure, check_threshold, geman_mcclure_gain
-from fmtorch.geometry.arithmetic import fractional_bits, rounded_to
+from fmtorch.geometry.arithmetic import fractional_bits, rounded_to, sqrt
 from fmtorch.geometry.residuals import sampson_squared_of
 
 GRID = 12  # cells along each side of each image
@@ -45,7 +45,7 @@ class SaturatedGains:
         for image in (points[:2], points[2:]):
             cell = (_cells(image, weight > 0) + first).flatten()
             sums = gain.new_zeros(p * GRID * GRID, F.shape[2]).index_add_(0, cell, gain)
-            total += rounded_to(sums.sqrt_(), bits).view(p, GRID * GRID, -1).sum(1)
+            total += rounded_to(sqrt(sums), bits).view(p, GRID * GRID, -1).sum(1)
         return total[:, :m].nan_to_num_(0)
 
 

@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from fmtorch.geometry.arithmetic import sqrt
+
 ROUNDINGS = 4.0  # of coordinates, that exact points of a line may lie off it
 EXTENT_ROUNDING = 2.0**-23  # the same in units of the points' extent: nobody knows pixels better than a float32 holds
 FIRST_LOOK = 256  # matches that mostly suffice to see that there is support
@@ -80,7 +82,7 @@ def _collinear(
     length = squared.amax(1, keepdim=True)
     ux, uy = (first(inliers & (squared == length)) - first(inliers))[..., 0]
     across = (dx * uy[:, None] - dy * ux[:, None]).abs().amax(1)
-    extent = length[:, 0].sqrt()
+    extent = sqrt(length[:, 0])
     tolerance = torch.maximum(ROUNDINGS * rounding, EXTENT_ROUNDING * extent)
     on_line: Tensor = across <= tolerance * extent
     return on_line

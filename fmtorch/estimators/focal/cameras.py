@@ -11,7 +11,7 @@ from torch import Tensor
 
 from fmtorch.estimators.focal.prior import USUAL_FOCAL
 from fmtorch.estimators.pairs import NormalizedPairs
-from fmtorch.geometry.arithmetic import as_rows, component_sum, exponential, logarithm
+from fmtorch.geometry.arithmetic import as_rows, component_sum, exponential, logarithm, sqrt
 from fmtorch.geometry.rank2 import complement
 from fmtorch.geometry.rank2_manifold import start
 
@@ -105,7 +105,7 @@ def nearest_cameras(F: Float[Tensor, "9 p k"], longest: Float[Tensor, "2 p"]) ->
     m00, m01, m10, m11 = (component_sum(s * t) for s in (a, b) for t in (Mp, Mq))
     sign = torch.where(m00 * m11 >= m01 * m10, 1.0, -1.0).to(M)
     c, s = m00 + sign * m11, m10 - sign * m01
-    norm = (c * c + s * s).sqrt()
+    norm = sqrt(c * c + s * s)
     c, s = c / norm, s / norm
     U = torch.stack([a * c + b * s, sign * (b * c - a * s), e1], 1)
     return torch.stack([U, torch.stack([p, q, e0], 1)], 2), focal

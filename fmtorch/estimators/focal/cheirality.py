@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.geometry.arithmetic import determinant, exact_sum
+from fmtorch.geometry.arithmetic import determinant, exact_sum, sqrt
 
 
 def share_in_front(
@@ -39,7 +39,7 @@ def share_in_front(
     side = a1 * b2 - a2 * b1
     distance = b3 * side.abs() - handed * a3 * b
     # |b x r| is |distance| / sqrt(b), and the sine of the angle between the rays that over |b| |r|.
-    parallel = (b * (b + b3 * b3) * (a + a3 * a3)).sqrt() * (tolerance[:, None] / depth[1])[..., None]
+    parallel = sqrt(b * (b + b3 * b3) * (a + a3 * a3)) * (tolerance[:, None] / depth[1])[..., None]
     ahead, behind = (torch.where(d > -parallel, support, 0) for d in (distance, -distance))
     fronts = torch.stack([exact_sum(torch.where(s > 0, x, 0)) for s in (side, -side) for x in (ahead, behind)])
     share: Tensor = fronts.amax(0) / exact_sum(support.clone())  # which is rounded in place

@@ -17,7 +17,7 @@ from fmtorch.estimators.focal.cameras import CentredPairs, focal_scaling, transl
 from fmtorch.estimators.focal.prior import draw_focal_lengths
 from fmtorch.estimators.models import Models
 from fmtorch.estimators.pairs import NormalizedPairs
-from fmtorch.geometry.arithmetic import component_sum, exponential
+from fmtorch.geometry.arithmetic import component_sum, exponential, sqrt
 from fmtorch.geometry.five_point import five_point_components
 from fmtorch.geometry.orientation import consistently_oriented
 
@@ -54,7 +54,7 @@ class FocalSamples:
         F = E.reshape(3, 3, -1) * focal_scaling(depth.reshape(2, p * s)[:, which])
         pair = torch.div(which, s, rounding_mode="floor")
         F = translated(F.reshape(9, -1, 1), centred.offset[:, pair])[..., 0]
-        F = F / component_sum(F * F).sqrt()
+        F = F / sqrt(component_sum(F * F))
         made = torch.bincount(pair, minlength=p)
         slot = torch.arange(len(pair), device=pair.device) - (made.cumsum(0) - made)[pair]
         models = F.new_zeros(9, p, int(made.max()), dtype=torch.float32)
