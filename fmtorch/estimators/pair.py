@@ -11,6 +11,7 @@ import numpy as np
 from fmtorch.compiling.arrays import Array, B1x1, F8x1, F8x2, I8x1
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.random_kernels import stream_state, uniform
+from fmtorch.compiling.scratch import matrix
 from fmtorch.core.streams import Stream, mixed_seed
 
 T = TypeVar("T")
@@ -169,14 +170,14 @@ def to_pixels(F: F8x1, centre: F8x1, unit: float, out: F8x2) -> bool:
 
     centre: (4,), of the points in pixels; unit: pixels in one unit of the points.
     """
-    T0, T1, product, matrix = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    T0, T1, product, model = matrix(3, 3), matrix(3, 3), matrix(3, 3), matrix(3, 3)
     for i in range(3):
         for j in range(3):
             diagonal = (1.0 if i == 2 else 1 / unit) if i == j else 0.0
             T0[i, j] = -centre[i] / unit if i < j == 2 else diagonal
             T1[i, j] = -centre[2 + j] / unit if j < i == 2 else diagonal  # transposed
-            matrix[i, j] = F[3 * i + j]
-    _product(T1, matrix, product)
+            model[i, j] = F[3 * i + j]
+    _product(T1, model, product)
     _product(product, T0, out)
     largest, total, finite = out[0, 0], 0.0, True
     for i in range(9):

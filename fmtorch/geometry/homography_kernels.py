@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.compiling.kernel import inner
+from fmtorch.compiling.scratch import matrix, vector
 from fmtorch.geometry.eight_point_kernels import smallest_eigenvector
 from fmtorch.geometry.rank2_kernels import EPS
 
@@ -37,7 +38,7 @@ def maps(H: Array, x: float, y: float, u: float, v: float, limit: float) -> Any:
 @inner
 def near_plane(H: Array, points: Array, limit: float, out: Array) -> int:
     """Which matches have a `homography.transfer_squared` up to the limit -> out (n,); how many."""
-    A, count = np.empty(9), 0
+    A, count = vector(9), 0
     adjugate(H, A)
     x0, y0, x1, y1 = points[0], points[1], points[2], points[3]
     for i in range(len(out)):
@@ -57,7 +58,7 @@ def cross_times(e: Array, A: Array, out: Array) -> None:
 @inner
 def plane_homography(F: Array, e1: Array, points: Array, triplet: Array, H: Array) -> bool:
     """`homography.plane_homography` through the matches (3,) of a triplet -> H; whether it is determined."""
-    A, b, M = np.empty(9), np.empty(3), np.empty((3, 3))
+    A, b, M = vector(9), vector(3), matrix(3, 3)
     cross_times(e1, F, A)
     for k in range(3):
         i = triplet[k]
@@ -69,7 +70,7 @@ def plane_homography(F: Array, e1: Array, points: Array, triplet: Array, H: Arra
         if not length2 > 0:
             return False
         b[k] = ((y1 * r - q) * cx + (p - x1 * r) * cy + (x1 * q - y1 * p) * cz) / length2
-    determinant, v = 0.0, np.empty(3)
+    determinant, v = 0.0, vector(3)
     for c in range(3):  # Cramer's rule
         d, e = (c + 1) % 3, (c + 2) % 3
         qr, rp = M[1, d] * M[2, e] - M[1, e] * M[2, d], M[2, d] * M[0, e] - M[2, e] * M[0, d]
@@ -87,7 +88,7 @@ def plane_homography(F: Array, e1: Array, points: Array, triplet: Array, H: Arra
 @inner
 def plane_and_parallax(H: Array, points: Array, i: int, j: int, F: Array) -> bool:
     """`homography.plane_and_parallax` of a plane and the matches i and j -> F; whether there is one."""
-    lines, e, size2 = np.empty((2, 3)), np.empty(3), 0.0
+    lines, e, size2 = matrix(2, 3), vector(3), 0.0
     for k in range(9):
         size2 += H[k] * H[k]
     for k in range(2):
@@ -114,7 +115,7 @@ def plane_and_parallax(H: Array, points: Array, i: int, j: int, F: Array) -> boo
 @inner
 def least_squares_homography(points: Array, inside: Array, H: Array) -> bool:
     """`homography.least_squares_homography` of the matches inside -> H; whether it is determined."""
-    T, S, M = np.empty((2, 3)), np.zeros((4, 3, 3)), np.zeros((9, 9))
+    T, S, M = matrix(2, 3), np.zeros((4, 3, 3)), np.zeros((9, 9))
     for image in range(2):
         if not _similarity(points[2 * image], points[2 * image + 1], inside, T[image]):
             return False

@@ -8,6 +8,7 @@ import numpy as np
 
 from fmtorch.compiling.arrays import Array, F8x1, F8x2
 from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.scratch import matrix, vector
 from fmtorch.geometry.levenberg_marquardt_kernels import levenberg_marquardt
 from fmtorch.geometry.rank2_kernels import assign, assign_rows
 from fmtorch.geometry.rank2_manifold_kernels import start_one, steps
@@ -47,8 +48,8 @@ class _Data(NamedTuple):
 def refine(F: F8x2, matches: Weighted, schedule: Schedule, out: F8x2, cost: F8x1) -> None:
     """Models (k, 9) made rank 2 and refined -> out (k, 9), cost (k,); what cannot be is not finite, nor its cost."""
     k = len(F)
-    state = _State(out, np.empty((k, 3)), np.empty((k, 3)), np.empty((k, 10, 10)), cost)
-    trial = _State(np.empty((k, 9)), np.empty((k, 3)), np.empty((k, 3)), np.empty((k, 10, 10)), np.empty(k))
+    state = _State(out, matrix(k, 3), matrix(k, 3), np.empty((k, 10, 10)), cost)
+    trial = _State(matrix(k, 9), matrix(k, 3), matrix(k, 3), np.empty((k, 10, 10)), vector(k))
     data = _Data(matches, schedule.tolerance)
     for i in range(k):
         start_one(F[i], schedule.squarings, state.F[i], state.e0[i], state.e1[i])

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.scratch import matrix, vector
 from fmtorch.geometry.arithmetic_kernels import LOG10, logarithm
 from fmtorch.geometry.order_kernels import smallest_but
 
@@ -34,7 +35,7 @@ def counted_chances(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, s
         peak = max(peak, abs(value))
     if peak == 0:
         return 0
-    point, count = np.empty((4, n)), 0
+    point, count = matrix(4, n), 0
     for i in range(n):
         a, b, c, d = x0[i, 0], x0[i, 1], x1[i, 0], x1[i, 1]
         if mask[i] and abs(a) < FARTHEST and abs(b) < FARTHEST and abs(c) < FARTHEST and abs(d) < FARTHEST:
@@ -107,7 +108,7 @@ def _median_of_places(chance: Array, place: Array, out: Array) -> int:
         begin[which[i] + 1] += 1
     for g in range(groups):
         begin[g + 1] += begin[g]
-    grouped, free = np.empty(n), begin.copy()
+    grouped, free = vector(n), begin.copy()
     for i in range(n):
         grouped[free[which[i]]] = chance[i]
         free[which[i]] += 1

@@ -7,6 +7,7 @@ import numpy as np
 from fmtorch.compiling.arrays import Array, B1x1, F4x2, F8x1, F8x2, I8x1, I8x2
 from fmtorch.compiling.kernel import kernel
 from fmtorch.compiling.random_kernels import random_bits, stream_state
+from fmtorch.compiling.scratch import vector
 from fmtorch.core.streams import Stream
 from fmtorch.estimators.families.family import Hypotheses
 from fmtorch.estimators.pair import Pair, squared
@@ -88,7 +89,7 @@ def plane_of_sample(F: F8x1, sample: F8x2, triplets: I8x2, limit: float, H: F8x1
     sample: (4, 7), points. triplets: (t, 3), of the sample, through each of which one homography goes. limit: of
     squared transfer distances. Of equals the first is taken; without any H is zero.
     """
-    G, Ft, e1 = np.empty(9), np.empty(9), np.empty(3)
+    G, Ft, e1 = vector(9), vector(9), vector(3)
     near, most = np.empty(sample.shape[1], np.bool_), 0
     for i in range(9):
         Ft[i], H[i] = F[3 * (i % 3) + i // 3], 0.0
@@ -105,7 +106,7 @@ def plane_of_sample(F: F8x1, sample: F8x2, triplets: I8x2, limit: float, H: F8x1
 @kernel
 def fit_plane(H: F8x1, points: F8x2, limit: float, fits: int, inside: B1x1) -> None:
     """H (9,), in place, fitted to the matches near it as long as these become more; those matches -> inside (n,)."""
-    G, others = np.empty(9), np.empty(len(inside), np.bool_)
+    G, others = vector(9), np.empty(len(inside), np.bool_)
     count = near_plane(H, points, limit, inside)
     for _ in range(fits):
         if not least_squares_homography(points, inside, G):
@@ -127,7 +128,7 @@ def parallax(H: F8x1, points: F8x2, table: I8x1, stream: I8x1, out: F4x2) -> int
     seed, the key, and the first of the random numbers, two a draw.
     """
     state, total = stream_state(stream[0], stream[1]), np.uint64(table[-1])
-    F, pair, models = np.empty(9), np.empty(2, np.int64), 0
+    F, pair, models = vector(9), np.empty(2, np.int64), 0
     for draw in range(len(out)):
         for k in range(2):
             word = random_bits(state, stream[2] + 2 * draw + k) >> np.uint64(31)

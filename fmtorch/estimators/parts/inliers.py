@@ -9,6 +9,7 @@ import numpy as np
 
 from fmtorch.compiling.arrays import Array, F8x1, F8x2, I8x1
 from fmtorch.compiling.kernel import kernel
+from fmtorch.compiling.scratch import vector
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.parts.sampling import Sampler
 from fmtorch.geometry.arithmetic_kernels import logarithm_1p
@@ -113,7 +114,7 @@ def residuals_squared(F: F8x1, points: F8x2, factor: float, out: F8x1) -> None:
 @kernel(holds_gil=True)
 def share_within(F: F8x1, points: F8x2, factor: float, limit: float, weight: I8x1) -> float:
     """The share of the matches' weights (n,) of those whose `residuals_squared` are within a limit."""
-    r2, total, within = np.empty(len(weight)), np.int64(0), np.int64(0)
+    r2, total, within = vector(len(weight)), np.int64(0), np.int64(0)
     residuals_squared(F, points, factor, r2)
     for i in range(len(weight)):
         total += weight[i]
