@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
+from fmtorch.core.checks import reason, wrong_values
 from fmtorch.core.types import Correspondences
-from fmtorch.core.validation import reason, wrong_values
 from fmtorch.geometry import canonical
 from fmtorch.geometry.pixel_frame import PixelFrame
 

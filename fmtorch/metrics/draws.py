@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
+from fmtorch.core.checks import expect_sizes
 from fmtorch.core.random import Stream, uniform
-from fmtorch.core.validation import expect_sizes
 from fmtorch.geometry.epipolar import inverse_root
 
 COLUMNS = 6  # random numbers of a draw: for each of its two halves a point (x, y) and a place on its line

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from fmtorch.compiling.batches import as_array
-from fmtorch.core.types import Correspondences
-from fmtorch.core.validation import PER_MATCH, reason, right_size
+from fmtorch.core.checks import PER_MATCH, reason
+from fmtorch.core.types import SIZE, Correspondences
 from fmtorch.estimators.one_pair.pair import Array, OnePair
 from fmtorch.estimators.pairs import MAX_COORDINATE_PX, MAX_NOISE, MIN_NOISE, bucket, too_few
 from fmtorch.estimators.pairs_kernels import normalize
@@ -76,8 +76,8 @@ def opened(rows: Rows, i: int, one: Arrived, seed: int, least: int) -> tuple[One
 def _wrong(rows: Rows, i: int, one: Arrived, slot: Array) -> str:
     """Why a pair whose matches have such values cannot be estimated."""
     values = {"prior": rows.prior, "noise": rows.noise}
-    right = {name: PER_MATCH[name][0](v[i, slot]) for name, v in values.items() if v is not None}
-    right |= {"size0": right_size(one.size0), "size1": right_size(one.size1)}
+    right = {name: PER_MATCH[name].holds(v[i, slot]) for name, v in values.items() if v is not None}
+    right |= {"size0": SIZE.holds(one.size0), "size1": SIZE.holds(one.size1)}
     return reason({name: len(each) - int(np.count_nonzero(each)) for name, each in right.items()})
 
 
