@@ -38,8 +38,7 @@ import fmtorch
 from fmtorch import geometry, matching, metrics, presets, pruning
 from fmtorch.core.annotations import arguments_of, arrays_of
 from fmtorch.core.types import Correspondences, Estimate, Features, collate
-from fmtorch.estimators.peers import PEERS
-from tests.laws import calibrated, few, quick_pruner
+from tests.laws import PEERS, calibrated, few, quick_pruner
 from tests.reliability.arguments import KINDS, MISTAKES, NUMBERS, SEQUENCES, Scene, batches, scenes
 from tests.reliability.arguments import given as as_given
 
