@@ -6,13 +6,13 @@ import sys
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from fmtorch.core.version import __version__
+
 if TYPE_CHECKING:
     from fmtorch.core.types import Correspondences, Estimate, Features
     from fmtorch.pipeline.fundamental import find_fundamental
     from fmtorch.pipeline.photographs import MatchResult, match
     from fmtorch.pipeline.pipeline import Pipeline
-
-__version__ = "0.1.0"
 
 __all__ = [
     "Correspondences",

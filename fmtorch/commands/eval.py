@@ -21,12 +21,13 @@ from fmtorch.evaluation.plots import plot_recall_curves
 from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import ALL, summarize
 from fmtorch.evaluation.summary_tables import pose_table, summary_markdown, summary_table
+from fmtorch.pipeline.exporting import exportable
+from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
 from fmtorch.presets.fields import Cache, Count, Device, Gigabytes, Seed, path_fields, read_fields
 from fmtorch.storage import RunFolder, identity_digest
 from fmtorch.storage.exchange.export import export_kinds, write_exports
 from fmtorch.storage.exchange.journal import Journal
-from fmtorch.storage.exporting import exportable
 from fmtorch.storage.features import CachedFeatures
 
 MANY = 500  # pairs from which on processes are worth their start
@@ -60,7 +61,7 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
     presets.expect_dataset(config.dataset)
     presets.expect_stages(config)
     with progress_bars() as progress:
-        pipeline = presets.build_pipeline(config, device)
+        pipeline: Pipeline = presets.build_pipeline(config, device)
         dataset = _load(config.dataset, progress)
         identity = run_identity(config, pipeline_name, pipeline, dataset.digest)
         name = f"{pipeline_name}-{identity_digest(identity)[:8]}"

@@ -10,16 +10,21 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from collections.abc import Sequence
-from typing import Any, TypeVar, cast
+from typing import Annotated, Any, TypeVar, cast
 
 import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
+from fmtorch.core.annotations import Rule
 from fmtorch.core.records import Index, Record, as_index, expect_fields, gathered, padded, slotted
 
 RELATED = 1.0
 """The significance from which on two images are called related; chosen on tuning pairs (docs/related.md)."""
+
+PROBABILITY = Rule(lambda prior: (prior >= 0) & (prior <= 1), "it is P(inlier), within [0, 1]")
+DEVIATION = Rule(lambda noise: noise > 0, "it is a standard deviation, positive")
+SIZE = Rule(lambda size: (size > 0) & (size < torch.inf), "image sizes (h, w) are positive")
 
 
 def pair_key(identity: str) -> int:
@@ -87,16 +92,16 @@ class Correspondences(Record):
     x1: Float[Tensor, "b n 2"]
     mask: Bool[Tensor, "b n"]
     quality: Float[Tensor, "b n"] | None = None
-    prior: Float[Tensor, "b n"] | None = None
+    prior: Annotated[Float[Tensor, "b n"], PROBABILITY] | None = None
     lafs0: Float[Tensor, "b n 2 3"] | None = None
     lafs1: Float[Tensor, "b n 2 3"] | None = None
-    size0: Real[Tensor, "b 2"] | None = None
-    size1: Real[Tensor, "b 2"] | None = None
+    size0: Annotated[Real[Tensor, "b 2"], SIZE] | None = None
+    size1: Annotated[Real[Tensor, "b 2"], SIZE] | None = None
     K0: Float[Tensor, "b 3 3"] | None = None
     K1: Float[Tensor, "b 3 3"] | None = None
     key: Int[Tensor, " b"] | None = None
     mutual: Bool[Tensor, "b n"] | None = None
-    noise: Float[Tensor, "b n"] | None = None
+    noise: Annotated[Float[Tensor, "b n"], DEVIATION] | None = None
 
     def __post_init__(self) -> None:
         expect_fields(self)

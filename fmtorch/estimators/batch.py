@@ -15,9 +15,9 @@ from torch import Tensor
 
 from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.batches import as_array
+from fmtorch.core.checks import PER_MATCH, reason
 from fmtorch.core.threads import available, mapped
-from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.core.validation import PER_MATCH, reason, right_size
+from fmtorch.core.types import SIZE, Correspondences, Estimate
 from fmtorch.estimators.gradients import Attach, Solved, with_gradients
 from fmtorch.estimators.pair import Pair, PixelMatches, bucket, normalize_pair, to_pixels
 from fmtorch.estimators.parts.final_fits import Fit
@@ -152,8 +152,8 @@ class Batch(NamedTuple):
 def _wrong_values(matches: PixelMatches, slot: Array) -> str:
     """Why a pair whose matches have such values cannot be estimated."""
     values = {"prior": matches.prior, "noise": matches.noise}
-    right = {name: PER_MATCH[name][0](v[slot]) for name, v in values.items() if len(v)}
-    right |= {"size0": right_size(matches.sizes[:2]), "size1": right_size(matches.sizes[2:])}
+    right = {name: PER_MATCH[name].holds(v[slot]) for name, v in values.items() if len(v)}
+    right |= {"size0": SIZE.holds(matches.sizes[:2]), "size1": SIZE.holds(matches.sizes[2:])}
     return reason({name: len(each) - int(np.count_nonzero(each)) for name, each in right.items()})
 
 

@@ -135,7 +135,8 @@ def rebuilt(r: Run, options: Options) -> Pipeline:
     except ValueError as error:
         raise ValueError(f"made by an earlier version, {error}") from error
     cache = {"cache": options.cache, "cache_limit": options.cache_limit}
-    return presets.build_pipeline(OmegaConf.create({**composed, **cache}), options.device)
+    built: Pipeline = presets.build_pipeline(OmegaConf.create({**composed, **cache}), options.device)
+    return built
 
 
 def shown_pair(pair: ImagePair, runs: Sequence[Run], pipelines: Mapping[str, Pipeline | None]) -> ShownPair:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.data.pairs import ImagePair
-from fmtorch.evaluation.outcomes import joined_correspondences, joined_estimates, solved
+from fmtorch.evaluation.outcomes import joined_correspondences, joined_estimates
 from fmtorch.metrics import fundamental_pose_error
 from fmtorch.pipeline.pipeline import Outcome
 
@@ -52,7 +52,7 @@ def _without_estimate(outcome: Outcome) -> PairPose:
     missing = unknown(outcome.pair)
     if missing is not None:
         return PairPose(None, None, missing)
-    if not solved(outcome):
+    if not outcome.solved:
         return PairPose(LARGEST_ROTATION, LARGEST_TRANSLATION, "no F")
     return PairPose(None, None, None)
 

@@ -10,7 +10,7 @@ from typing import cast
 from torch import Tensor
 
 from fmtorch import metrics
-from fmtorch.evaluation.outcomes import joined_correspondences, joined_estimates, joined_true, solved
+from fmtorch.evaluation.outcomes import joined_correspondences, joined_estimates, joined_true
 from fmtorch.evaluation.poses import PairPose, pose_errors
 from fmtorch.pipeline.pipeline import STAGES, Outcome
 from fmtorch.storage import PairRow
@@ -32,7 +32,7 @@ def evaluate(outcomes: Sequence[Outcome], seed: int = 0) -> list[PairRow]:
 def _distances(outcomes: Sequence[Outcome], seed: int) -> tuple[list[float], list[float]]:
     """NSGD in both forms."""
     nsgd, released = [1.0] * len(outcomes), [1.0] * len(outcomes)
-    known = [i for i, o in enumerate(outcomes) if solved(o)]
+    known = [i for i, o in enumerate(outcomes) if o.solved]
     if known:
         some = [outcomes[i] for i in known]
         c = joined_correspondences(some)
@@ -57,13 +57,13 @@ def _inlier_rates(outcomes: Sequence[Outcome]) -> tuple[list[float], list[float]
             raise ValueError("correspondences come without image sizes (size0, size1); the matcher must supply them")
         rates = metrics.inlier_rate(joined_true(some), c.x0, c.x1, estimate.inliers, c.size0, c.size1, mask=c.mask)
         for i, a, b in zip(matched, rates.before.tolist(), rates.after.tolist(), strict=True):
-            before[i], after[i] = a, b if solved(outcomes[i]) else math.nan
+            before[i], after[i] = a, b if outcomes[i].solved else math.nan
     return before, after
 
 
 def _row(outcome: Outcome, figures: dict[str, float], pose: PairPose, seconds: float) -> PairRow:
     pair, c, estimate = outcome.pair, outcome.correspondences, outcome.estimate
-    ok = solved(outcome)
+    ok = outcome.solved
     return PairRow(
         pair=pair.identity, key=pair.key, family=pair.family, scene=pair.scene, ok=ok, reason=outcome.reason,
         corrs=int(estimate.inliers.sum()) if estimate is not None else 0,

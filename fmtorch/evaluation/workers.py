@@ -22,10 +22,10 @@ import torch
 
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.evaluation.rows import evaluate
+from fmtorch.pipeline.exporting import keep_outcomes
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.storage import PairRow
 from fmtorch.storage.exchange.journal import Journal
-from fmtorch.storage.exporting import keep_outcomes
 from fmtorch.storage.features import CachedFeatures
 
 Build = Callable[[], Pipeline]

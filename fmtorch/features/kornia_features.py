@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from fmtorch.core.resources import pretrained
+from fmtorch.core.pretrained import pretrained
 from fmtorch.core.types import Features
 from fmtorch.features.sift import strongest
 

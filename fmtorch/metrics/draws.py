@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
+from fmtorch.core.checks import expect_sizes
 from fmtorch.core.random import uniform
 from fmtorch.core.streams import Stream
-from fmtorch.core.validation import expect_sizes
 from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.geometry.epipolar import inverse_root
 

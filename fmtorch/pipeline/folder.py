@@ -13,10 +13,10 @@ from typing import Any
 from fmtorch.core.files import replacing
 from fmtorch.core.threads import available, one_thread
 from fmtorch.data.images import read_image
+from fmtorch.pipeline.exporting import keep_described, keep_match
 from fmtorch.pipeline.photographs import Described, describe, relate
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.storage.exchange.journal import Journal
-from fmtorch.storage.exporting import keep_described, keep_match
 from fmtorch.storage.runs import canonical
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")

@@ -14,10 +14,10 @@ from fmtorch import presets
 from fmtorch.compiling import switch
 from fmtorch.compiling.together import compile_together
 from fmtorch.core.arguments import Arrays, correspondences, number
+from fmtorch.core.checks import expect_values
 from fmtorch.core.stages import Estimator, Pruner
 from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Estimate
-from fmtorch.core.validation import expect_values
 from fmtorch.geometry.verdict import judged
 
 

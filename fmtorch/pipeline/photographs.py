@@ -150,7 +150,8 @@ def relate(pipeline: Pipeline, described0: Described, described1: Described, see
 
 @functools.lru_cache(maxsize=8)
 def _pipeline(name: str, device: str) -> Pipeline:
-    return presets.pipeline(name, device)
+    built: Pipeline = presets.pipeline(name, device)
+    return built
 
 
 def _image(image: Path | str | Image, name: str) -> Image:

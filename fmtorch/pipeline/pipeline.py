@@ -44,6 +44,11 @@ class Outcome:
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     reason: str = ""
 
+    @property
+    def solved(self) -> bool:
+        """Whether there is an F."""
+        return self.estimate is not None and bool(self.estimate.ok[0])
+
 
 class Pipeline:
     """Features, matcher, pruners in order, estimator. Safe to call from several threads.

@@ -72,6 +72,12 @@ def targets_of(config: object) -> frozenset[str]:
     return frozenset()
 
 
+def peer_packages(config: object) -> list[str]:
+    """The packages of other libraries whose versions decide what the targets within a config compute, sorted."""
+    packages = {getattr(hydra.utils.get_object(target), "peer_package", None) for target in targets_of(config)}
+    return sorted(package for package in packages if package)
+
+
 def own_modules(config: object) -> dict[str, str]:
     """The modules that define the targets within a config that are none of this project's, by the targets' names."""
     own = sorted(name for name in targets_of(config) if name.partition(".")[0] != "fmtorch")

@@ -134,6 +134,8 @@ class FrameConsistency:
     prior is left as it is. Linear memory: about 700 bytes a match.
     """
 
+    kernels = (compiled.frame_agreement, compiled.frame_prior)
+
     def __init__(self, *, odds: float, floor: float, slope: float) -> None:
         self.odds, self.floor, self.slope = odds, floor, slope
 

@@ -23,6 +23,7 @@ from fmtorch.geometry.arithmetic import component_sum, sqrt
 from fmtorch.geometry.curves import curve_orders
 from fmtorch.pruning import position_consistency_kernels as compiled
 from fmtorch.pruning.calibration import Calibration
+from fmtorch.pruning.calibration_kernels import calibrated
 from fmtorch.pruning.frame_consistency import (
     CURVE_TABLE,
     CURVES,
@@ -181,6 +182,8 @@ class PositionConsistency:
 
     Needs no frames, no sizes and no quality. Linear memory: about 600 bytes a match.
     """
+
+    kernels = (compiled.position_agreement, calibrated)
 
     def __init__(self, *, calibration: Mapping[str, Mapping[str, float]]) -> None:
         self.calibration = Calibration(**calibration)

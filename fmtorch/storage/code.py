@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fmtorch import __version__
+from fmtorch.core.version import __version__
 
 PACKAGE = Path(__file__).resolve().parents[1]
 DIGITS = 12  # of a commit or digest that a version shows

@@ -116,7 +116,8 @@ def _pipeline(pipeline: Pipeline | str, overrides: Sequence[str]) -> Pipeline:
     if isinstance(pipeline, str):
         from fmtorch import presets  # reads YAML files, which no other use of this package needs
 
-        return presets.pipeline(pipeline, overrides=overrides)
+        built: Pipeline = presets.pipeline(pipeline, overrides=overrides)
+        return built
     if overrides:
         raise ValueError("overrides change a pipeline that is given by name; this one is given as an object")
     return pipeline
