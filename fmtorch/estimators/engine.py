@@ -135,7 +135,7 @@ class HypothesizeAndVerify:
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
         compile_together(self.kernels)
-        return estimated(c, seed, self.family.size, self.estimate, Attached(self.final, self.family))
+        return estimated(c, seed, self.family.size, self.family, self.estimate, Attached(self.final, self.family))
 
     def estimate(self, pair: Pair) -> Solution:
         """Search to fit of one pair."""

@@ -21,7 +21,7 @@ from fmtorch.estimators.families.family import Refining
 from fmtorch.estimators.families.posterior import Limits, minimise, no_optimum, tangents_of
 from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair
 from fmtorch.estimators.parts.final_fits import FinalFit, Fit
-from fmtorch.geometry import canonical, eight_point
+from fmtorch.geometry import canonical, eight_point, unit_frobenius
 from fmtorch.geometry.optimum import STEP_DAMPING, gradient_of_cost
 from fmtorch.geometry.pixel_frame import PixelFrame
 from fmtorch.geometry.robust_kernels import KERNELS
@@ -118,7 +118,11 @@ def with_gradients(estimate: Estimate, c: Correspondences, solved: dict[int, Sol
     centre = torch.from_numpy(np.stack([pair.centre for pair in pairs])).to(zero)
     unit = torch.tensor([pair.pixels_per_unit for pair in pairs]).to(zero)
     frame = PixelFrame(centre, unit, torch.ones_like(rows, dtype=torch.bool))
-    G = canonical(frame.to_pixels((F + zero).reshape(-1, 1, 3, 3))[:, 0])
+    models = (F + zero).reshape(-1, 1, 3, 3)
+    if estimate.model == "homography":
+        G = unit_frobenius(frame.homography_to_pixels(models)[:, 0])
+    else:
+        G = canonical(frame.to_pixels(models)[:, 0])
     return estimate.derived(F=estimate.F.index_add(0, rows, G - G.detach()))
 
 

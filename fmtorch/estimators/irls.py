@@ -13,6 +13,7 @@ from torch import Tensor
 from fmtorch.compiling.arrays import Array
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.batch import Solution, estimated
+from fmtorch.estimators.families.fundamental import SevenPoint
 from fmtorch.estimators.gradients import GraphedMatches, Solved
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.parts.final_fits import Fit
@@ -80,7 +81,7 @@ class IterativelyReweighted:
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
-        return estimated(c, seed, self.MIN_MATCHES, self.solve, self.attached)
+        return estimated(c, seed, self.MIN_MATCHES, SevenPoint(), self.solve, self.attached)
 
     def solve(self, pair: Pair) -> Solution:
         """The model of least cost of one pair."""

@@ -6,10 +6,11 @@ and stopping rule are written once; what differs is the family's: minimal sample
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 
 from fmtorch.compiling.arrays import Array
 from fmtorch.estimators.pair import Pair
+from fmtorch.geometry.residual_kernels import Residual
 
 
 class Hypotheses(NamedTuple):
@@ -28,7 +29,7 @@ class Hypotheses(NamedTuple):
 class Family(Protocol):
     """A family of models. size: matches of a minimal sample."""
 
-    size: int
+    size: ClassVar[int]
 
     def solve(self, pair: Pair, sample: Array, start: int) -> Hypotheses:
         """The models of the samples (size, s), which are the draws start, start + 1, ..."""
@@ -52,7 +53,19 @@ class Steps(NamedTuple):
 
 
 @runtime_checkable
-class Refining(Family, Protocol):
+class Estimated(Protocol):
+    """What an estimate is. model: what it is called. residual: by which matches are judged."""
+
+    model: ClassVar[str]
+    residual: ClassVar[Residual]
+
+    def to_pixels(self, F: Array, pair: Pair, out: Array) -> bool:
+        """A model (9,) of normalised points as that of pixels, of unit norm -> out (3, 3); whether it is finite."""
+        ...
+
+
+@runtime_checkable
+class Refining(Family, Estimated, Protocol):
     """A family whose models can be refined and fitted on their own."""
 
     def refine(self, F: Array, pair: Pair, loss: Loss, steps: Steps) -> Array:
