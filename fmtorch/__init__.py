@@ -52,7 +52,9 @@ class _Package(ModuleType):
     """The package, in which `match` is the function.
 
     Python makes each submodule that is imported an attribute of its package, `fmtorch.match` too, which runs the
-    command of that name; it stays ``sys.modules["fmtorch.match"]`` alone.
+    command of that name; it stays ``sys.modules["fmtorch.match"]`` alone. Nothing shorter does: a module that puts the
+    function in its own place in `sys.modules` has no ``__spec__``, without which neither `fmtorch match` nor
+    ``importlib.reload`` finds it again.
     """
 
     def __setattr__(self, name: str, value: object) -> None:
