@@ -12,7 +12,7 @@ from fmtorch.compiling.arrays import Array, F4x2, F8x1, I8x1
 from fmtorch.compiling.kernel import Kernel, inner, kernel
 from fmtorch.compiling.lanes import store
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.scores import rows_of
+from fmtorch.estimators.parts.scored_matches import rows_of
 from fmtorch.geometry.order_kernels import smallest_but
 from fmtorch.geometry.residual_kernels import MATCH, SINGLES, Residual
 

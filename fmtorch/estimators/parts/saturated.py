@@ -11,14 +11,13 @@ from fmtorch.compiling.arrays import Array, F4x2, F8x1, F8x2, I4x2, I8x1
 from fmtorch.compiling.kernel import Kernel, kernel
 from fmtorch.compiling.lanes import added, sqrt, store
 from fmtorch.estimators.pair import Pair
+from fmtorch.estimators.parts.scored_matches import fractional_bits, scored_matches
 from fmtorch.estimators.parts.scores import (
     ZERO,
     GemanMcClure,
     check_threshold,
-    fractional_bits,
     geman_mcclure,
     rounded,
-    scored_matches,
 )
 from fmtorch.geometry.residual_kernels import MATCH, SAMPSON, SINGLES, TINY32, Residual, fill, load
 
