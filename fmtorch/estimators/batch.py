@@ -88,8 +88,8 @@ def estimated(
     mapped(estimate_all, [part.tolist() for part in shared_out(host)] if b > 1 and available() > 1 else [range(b)])
     fields = {"F": F, "inliers": inliers, "ok": ok, "draws": draws, "significance": significance}
     tensors = {name: torch.from_numpy(value).to(c.mask.device) for name, value in fields.items()}
-    found = Estimate.made(reason=tuple(reasons), model=family.model, **tensors)
-    return with_gradients(found, c, solved, attach) if solved else found
+    estimates = Estimate.made(reason=tuple(reasons), model=family.model, **tensors)
+    return with_gradients(estimates, c, solved, attach) if solved else estimates
 
 
 def _significance(F: Array, matches: PixelMatches) -> float:

@@ -129,9 +129,9 @@ def normalize_pair(matches: PixelMatches, slot: I8x1, table: F8x1, frame: F8x1) 
     image; the unit in pixels, 0 where all coincide; and 1 where all priors, noises and sizes are right, otherwise 0.
     """
     x0, x1, mask, prior, noise, quality, sizes = matches
-    count, half, most, right = 0, 0.0, MAX_COORDINATE_PX, True
+    count, half, end, right = 0, 0.0, MAX_COORDINATE_PX, True
     for i in range(len(mask)):
-        if mask[i] and abs(x0[i, 0]) < most and abs(x0[i, 1]) < most and abs(x1[i, 0]) < most and abs(x1[i, 1]) < most:
+        if mask[i] and abs(x0[i, 0]) < end and abs(x0[i, 1]) < end and abs(x1[i, 0]) < end and abs(x1[i, 1]) < end:
             slot[count] = i
             count += 1
     for r in range(4):
