@@ -22,6 +22,7 @@ from fmtorch.estimators.families.posterior import Limits, minimise, no_optimum, 
 from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair
 from fmtorch.estimators.parts.final_fits import FinalFit, Fit
 from fmtorch.geometry import canonical, eight_point, unit_frobenius
+from fmtorch.geometry.homography_error import homography_gradient
 from fmtorch.geometry.optimum import STEP_DAMPING, gradient_of_cost
 from fmtorch.geometry.pixel_frame import PixelFrame
 from fmtorch.geometry.robust_kernels import KERNELS
@@ -74,7 +75,10 @@ class Attached:
         self.final, self.family = final, family
         own: Attach | None = getattr(final, "attached", None)
         kinds: dict[str, Attach] = {"least_squares": self._least_squares, "optimum": self._optimum, "none": _none}
-        self._attach = own or kinds[getattr(final, "gradient", "none")]
+        kind = getattr(final, "gradient", "none")
+        if family.model == "homography" and kind == "least_squares":
+            kind = "optimum"  # of the Sampson error, near that of least squares
+        self._attach = own or kinds[kind]
 
     def __call__(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
         """As `Attach`."""
@@ -96,9 +100,14 @@ class Attached:
             for values in ([s.fit.at for s in solved], [self._response(s) for s in solved])
         )
         weight = torch.where(_padded([s.fit.counted for s in solved], matches.mask), matches.weight, 0)
-        unbounded = torch.full_like(at[:, 0], torch.inf)
-        gradient = gradient_of_cost(at.T[..., None], matches.points, weight, KERNELS["truncated"], unbounded)[..., 0]
-        return (response * (gradient - gradient.detach()).T[:, None]).sum(-1)
+        if self.family.model == "homography":
+            gradient = homography_gradient(at, matches.points, weight)
+        else:
+            unbounded = torch.full_like(at[:, 0], torch.inf)
+            gradient = gradient_of_cost(at.T[..., None], matches.points, weight, KERNELS["truncated"], unbounded)[
+                ..., 0
+            ].T
+        return (response * (gradient - gradient.detach())[:, None]).sum(-1)
 
     def _response(self, solved: Solved) -> Array:
         """How the fit of a pair moves with the gradient of its cost, (9, 9)."""

@@ -21,8 +21,9 @@ from fmtorch.estimators.parts.inliers import WithinThreshold, lower_median, resi
 from fmtorch.geometry import attached_step
 from fmtorch.geometry.eight_point_kernels import weighted_eight_point
 from fmtorch.geometry.irls_kernels import reweighted
+from fmtorch.geometry.levenberg_marquardt_kernels import Schedule
 from fmtorch.geometry.rank2_manifold_kernels import SQUARINGS
-from fmtorch.geometry.refine_kernels import Schedule, refine
+from fmtorch.geometry.refine_kernels import refine
 from fmtorch.geometry.robust_kernels import named_kernel
 from fmtorch.geometry.sampson_objective_kernels import LOSSES, Weighted, loss_table
 
@@ -93,8 +94,8 @@ class IterativelyReweighted:
         for i in range(self.iterations):
             reweighted(F, self._weighted(pair, max(widest * DECAY**i, scale)))
         refined, cost = np.empty_like(F), np.empty(len(F))
-        schedule = Schedule(self.refine_iterations, FIRST_DAMPING, 0.0, SQUARINGS)
-        refine(F, self._weighted(pair, scale), schedule, refined, cost)
+        schedule = Schedule(self.refine_iterations, FIRST_DAMPING, 0.0)
+        refine(F, SQUARINGS, self._weighted(pair, scale), schedule, refined, cost)
         best = int(np.argmin(np.where(np.isfinite(cost), cost, np.inf)))
         if not np.isfinite(cost[best]):
             return Solution(None, 0, reason=NOT_DETERMINED)

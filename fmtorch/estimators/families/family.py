@@ -36,6 +36,21 @@ class Family(Protocol):
         ...
 
 
+class FitScale(NamedTuple):
+    """How a fit at a pair's own noise tells it, and which matches then count.
+
+    sigmas_of_median: the standard deviation of a coordinate, in medians of inliers' residuals. truncation_sigmas:
+    beyond which a match does not count; that distance is within smallest_px and largest_px, and default_px where too
+    few inliers tell the noise.
+    """
+
+    sigmas_of_median: float = 1.4826
+    truncation_sigmas: float = 2.0
+    smallest_px: float = 0.3
+    largest_px: float = 2.0
+    default_px: float = 1.5
+
+
 class Loss(NamedTuple):
     """A robust loss of the Sampson distance. name: of `geometry.KERNELS`. scale: px, of a match of usual noise."""
 
@@ -67,6 +82,8 @@ class Estimated(Protocol):
 @runtime_checkable
 class Refining(Family, Estimated, Protocol):
     """A family whose models can be refined and fitted on their own."""
+
+    fit_scale: ClassVar[FitScale]
 
     def refine(self, F: Array, pair: Pair, loss: Loss, steps: Steps) -> Array:
         """Models (k, 9) of least robust error nearby, on all matches by prior and noise; float64.

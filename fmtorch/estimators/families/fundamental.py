@@ -8,11 +8,12 @@ from typing import ClassVar
 import numpy as np
 
 from fmtorch.compiling.arrays import Array
-from fmtorch.estimators.families.family import Hypotheses, Loss, Steps
+from fmtorch.estimators.families.family import FitScale, Hypotheses, Loss, Steps
 from fmtorch.estimators.pair import Pair, to_pixels
 from fmtorch.geometry.eight_point_kernels import eight_point, weighted_eight_point
+from fmtorch.geometry.levenberg_marquardt_kernels import Schedule
 from fmtorch.geometry.rank2_manifold_kernels import gauss_newton, response
-from fmtorch.geometry.refine_kernels import Schedule, refine
+from fmtorch.geometry.refine_kernels import refine
 from fmtorch.geometry.residual_kernels import SAMPSON, Residual
 from fmtorch.geometry.sampson_objective_kernels import LOSSES, NO_TABLE, Weighted, loss_table
 from fmtorch.geometry.seven_point_kernels import seven_point
@@ -26,6 +27,7 @@ class Fundamental:
 
     model: ClassVar[str] = "fundamental"
     residual: ClassVar[Residual] = SAMPSON
+    fit_scale: ClassVar[FitScale] = FitScale()
     size: ClassVar[int]
     solutions: ClassVar[int]
     minimal: ClassVar[Callable[..., int]]
@@ -46,7 +48,8 @@ class Fundamental:
         s2 = np.square(loss.scale / pair.pixels_per_noise)
         refined, cost = np.empty_like(F), np.empty(len(F))
         matches = Weighted(pair.points, pair.weight, s2, LOSSES[loss.name], loss_table(loss.name))
-        refine(F, matches, Schedule(steps.iterations, steps.damping, steps.tolerance or 0.0, SQUARINGS), refined, cost)
+        schedule = Schedule(steps.iterations, steps.damping, steps.tolerance or 0.0)
+        refine(F, SQUARINGS, matches, schedule, refined, cost)
         return np.where(np.isfinite(cost)[:, None], refined, F)
 
     def least_squares(self, F: Array, pair: Pair, weight: Array) -> Array:

@@ -13,16 +13,13 @@ import numpy as np
 
 from fmtorch.compiling.arrays import Array
 from fmtorch.estimators.families.cameras import Cameras
-from fmtorch.estimators.families.family import Loss, Refining, Steps
+from fmtorch.estimators.families.family import FitScale, Loss, Refining, Steps
 from fmtorch.estimators.families.focals import FundamentalWithFocals
 from fmtorch.estimators.families.posterior import Limits
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.parts.inliers import lower_median, residuals_squared_px
 from fmtorch.estimators.parts.selection import Selection
 
-TRUNCATION_SIGMAS = 2.0  # robust standard deviations beyond which a match does not count
-MIN_TRUNCATION_PX, MAX_TRUNCATION_PX = 0.3, 2.0  # bounds of that distance
-DEFAULT_TRUNCATION_PX = 1.5  # that distance where too few matches tell the noise
 MIN_INLIERS_FOR_NOISE = 15  # matches that tell the noise
 MIN_PRIOR_FOR_NOISE = 0.3  # matches of a smaller prior do not tell the noise
 STEPS = Steps(iterations=8, damping=1e-6, tolerance=1e-4)  # small damping, since the start is near the optimum
@@ -115,8 +112,8 @@ class Adaptive:
     best: on rendered training scenes this fit raises AUC@0.05 from 66.8 to 74.2 (indoor) and from 78.2 to 85.3
     (driving) and changes nothing on castle-P19 and fox.
     Where cameras are assumed it maximises the posterior, unless the matches contradict the prior. The noise is 1.4826
-    times the median Sampson distance of the inliers (Rousseeuw & Leroy 1987), the truncation TRUNCATION_SIGMAS times
-    that.
+    times the median Sampson distance of the inliers (Rousseeuw & Leroy 1987), the truncation twice that; of homographies
+    as their `FitScale` says.
     """
 
     gradient, weighted = "optimum", True
@@ -124,9 +121,10 @@ class Adaptive:
     def __call__(self, selection: Selection, pair: Pair, inliers: Array, family: Refining) -> Fit:
         """As `FinalFit`."""
         likely = inliers if pair.prior is None else inliers & (pair.prior > MIN_PRIOR_FOR_NOISE)
-        truncation = truncation_distance(squared_in_noises(selection.F, pair)[likely])
+        scale = family.fit_scale
+        truncation = truncation_distance(squared_in_noises(selection.F, pair)[likely], scale)
         if selection.cameras is not None:
-            precision = squared(pair.pixels_per_unit / (truncation / TRUNCATION_SIGMAS))
+            precision = squared(pair.pixels_per_unit / (truncation / scale.truncation_sigmas))
             limits = Limits(precision, FOCAL_ITERATIONS, FOCAL_TOLERANCE)
             fit = FundamentalWithFocals().fit(selection.cameras, pair, truncation, limits)
             if fit.gain <= PRIOR_CONFLICT_GAIN and all(map(math.isfinite, fit.F.tolist())):
@@ -147,9 +145,9 @@ def squared_in_noises(F: Array, pair: Pair) -> Array:
     return r2 if pair.noise is None else r2 / np.square(pair.noise)
 
 
-def truncation_distance(r2: Array) -> float:
+def truncation_distance(r2: Array, scale: FitScale) -> float:
     """The distance in pixels up to which a match counts, from the squared distances of the inliers."""
     if len(r2) < MIN_INLIERS_FOR_NOISE:
-        return DEFAULT_TRUNCATION_PX
-    truncation = TRUNCATION_SIGMAS * 1.4826 * math.sqrt(lower_median(r2))
-    return min(max(truncation, MIN_TRUNCATION_PX), MAX_TRUNCATION_PX)
+        return scale.default_px
+    truncation = scale.truncation_sigmas * scale.sigmas_of_median * math.sqrt(lower_median(r2))
+    return min(max(truncation, scale.smallest_px), scale.largest_px)
