@@ -10,7 +10,7 @@ from fmtorch.core.version import __version__
 
 if TYPE_CHECKING:
     from fmtorch.core.types import Correspondences, Estimate, Features
-    from fmtorch.pipeline.fundamental import find_fundamental
+    from fmtorch.pipeline.fundamental import find_fundamental, find_homography
     from fmtorch.pipeline.photographs import MatchResult, match
     from fmtorch.pipeline.pipeline import Pipeline
 
@@ -22,13 +22,14 @@ __all__ = [
     "Pipeline",
     "__version__",
     "find_fundamental",
+    "find_homography",
     "match",
 ]
 
 _MODULES = {
     "Correspondences": "core.types", "Estimate": "core.types", "Features": "core.types",
     "MatchResult": "pipeline.photographs", "Pipeline": "pipeline.pipeline", "match": "pipeline.photographs",
-    "find_fundamental": "pipeline.fundamental",
+    "find_fundamental": "pipeline.fundamental", "find_homography": "pipeline.fundamental",
 }  # fmt: skip
 
 

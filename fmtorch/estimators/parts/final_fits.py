@@ -112,8 +112,8 @@ class Adaptive:
     best: on rendered training scenes this fit raises AUC@0.05 from 66.8 to 74.2 (indoor) and from 78.2 to 85.3
     (driving) and changes nothing on castle-P19 and fox.
     Where cameras are assumed it maximises the posterior, unless the matches contradict the prior. The noise is 1.4826
-    times the median Sampson distance of the inliers (Rousseeuw & Leroy 1987), the truncation twice that; of homographies
-    as their `FitScale` says.
+    times the median Sampson distance of the inliers (Rousseeuw & Leroy 1987), the truncation twice that; `FitScale`
+    says what they are of homographies.
     """
 
     gradient, weighted = "optimum", True
