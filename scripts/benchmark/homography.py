@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import functools
+import json
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +21,6 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
-import yaml
 from numpy.typing import NDArray
 from rich.progress import track
 from rich.table import Table
@@ -74,7 +74,7 @@ def run(arguments: argparse.Namespace) -> None:
 def warped(path: Path, behind: Path, seed: int) -> Warped:
     """A photograph as a plane before a pinhole camera that looks at it from the side."""
     rng = np.random.default_rng(seed)
-    image, background = (_small(cv2.imread(str(p))) for p in (path, behind))
+    image, background = (_small(p) for p in (path, behind))
     h, w = image.shape[:2]
     tilt, direction, turn = np.deg2rad([rng.uniform(20, 55), rng.uniform(0, 360), rng.uniform(-20, 20)])
     focal, centre = 1.2 * max(h, w), np.array([w / 2, h / 2])
@@ -92,7 +92,11 @@ def warped(path: Path, behind: Path, seed: int) -> Warped:
     return Warped(image, noisy, H / np.linalg.norm(H), path.stem)
 
 
-def _small(image: Array) -> Array:
+def _small(path: Path) -> Array:
+    """A photograph whose longer side is SIDE, BGR."""
+    image = cv2.imread(str(path))
+    if image is None:
+        raise SystemExit(f"error: {path} is no photograph that OpenCV reads")
     scale = SIDE / max(image.shape[:2])
     return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
 
@@ -142,8 +146,16 @@ def options_of(setting: str) -> dict[str, Any]:
         group, _, option = key.rpartition(".")
         if group and group not in options:
             options[group] = dict(presets.load("estimator", "homography")[group])
-        (options[group] if group else options)[option] = yaml.safe_load(value)
+        (options[group] if group else options)[option] = _value(value)
     return options
+
+
+def _value(text: str) -> Any:
+    """A number, or a name."""
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
 
 
 def _ours(options: dict[str, Any], c: Correspondences, seed: int) -> Array | None:
