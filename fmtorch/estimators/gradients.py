@@ -40,11 +40,12 @@ class Solved(NamedTuple):
 class GraphedMatches(NamedTuple):
     """The usable matches of P pairs in normalised units, attached to the caller's graph, padded to N slots; float64.
 
-    weight: the prior divided by the square of the noise; one where there is no prior.
+    precision: one over the square of the noise. weight: the prior times that.
     """
 
     points: Float[Tensor, "4 p n"]
     mask: Bool[Tensor, "p n"]
+    precision: Float[Tensor, "p n"]
     weight: Float[Tensor, "p n"]
     prior: Float[Tensor, "p n"] | None
 
@@ -87,7 +88,7 @@ class Attached:
     def _least_squares(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
         counted = _padded([s.fit.counted for s in solved], matches.mask)
         weighted = self.final.weighted and matches.prior is not None
-        weight = torch.where(counted, matches.weight, 0) if weighted else counted.to(torch.float64)
+        weight = torch.where(counted > 0, matches.weight, 0) if weighted else counted
         fitted, valid = eight_point(matches.points0, matches.points1, weight)
         fitted = torch.where(valid[:, None, None], fitted, 0).flatten(1)
         return fitted - fitted.detach()
@@ -99,7 +100,9 @@ class Attached:
             torch.from_numpy(np.stack(values)).to(device)
             for values in ([s.fit.at for s in solved], [self._response(s) for s in solved])
         )
-        weight = torch.where(_padded([s.fit.counted for s in solved], matches.mask), matches.weight, 0)
+        counted = _padded([s.fit.counted for s in solved], matches.mask)
+        weight = matches.weight if self.family.fit_scale.by_prior else matches.precision
+        weight = torch.where(counted > 0, counted * weight, 0)
         if self.family.model == "homography":
             gradient = homography_gradient(at, matches.points, weight)
         else:
@@ -112,7 +115,7 @@ class Attached:
     def _response(self, solved: Solved) -> Array:
         """How the fit of a pair moves with the gradient of its cost, (9, 9)."""
         pair, fit = solved.pair, solved.fit
-        weight = np.where(fit.counted, pair.weight, 0.0)
+        weight = fit.counted * (pair.weight if self.family.fit_scale.by_prior else 1 / np.square(pair.noises))
         if fit.cameras is not None:
             return camera_response(fit.cameras, pair, weight, fit.precision)
         return self.family.response(fit.at, pair, weight)
@@ -153,10 +156,11 @@ def graphed_matches(c: Correspondences, solved: dict[int, Solved]) -> GraphedMat
     unit = torch.tensor([pair.pixels_per_unit for pair in pairs]).to(pixels)
     points = torch.where(mask[..., None], (pixels - centre[:, None]) / unit[:, None, None], 0).permute(2, 0, 1)
     prior, noise = take(c.prior), take(c.noise)
-    weight = mask.to(torch.float64) if prior is None else prior.nan_to_num(0).clamp(0, 1)
+    precision = mask.to(torch.float64)
     if noise is not None:
-        weight = weight / torch.where(mask, noise.nan_to_num(1).clamp(MIN_NOISE, MAX_NOISE), 1).square()
-    return GraphedMatches(points, mask, weight, prior)
+        precision = precision / torch.where(mask, noise.nan_to_num(1).clamp(MIN_NOISE, MAX_NOISE), 1).square()
+    weight = precision if prior is None else precision * prior.nan_to_num(0).clamp(0, 1)
+    return GraphedMatches(points, mask, precision, weight, prior)
 
 
 def camera_response(cameras: Cameras, pair: Pair, weight: Array, precision: float) -> Array:
@@ -183,9 +187,9 @@ def _none(solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]
     return matches.points.new_zeros(len(solved), 9)
 
 
-def _padded(rows: list[Array], mask: Bool[Tensor, "p n"]) -> Bool[Tensor, "p n"]:
-    """Flags of the matches of each pair, False in padded slots."""
-    out = np.zeros(tuple(mask.shape), np.bool_)
+def _padded(rows: list[Array], mask: Bool[Tensor, "p n"]) -> Float[Tensor, "p n"]:
+    """Numbers of the matches of each pair, zero in padded slots."""
+    out = np.zeros(tuple(mask.shape))
     for place, row in zip(out, rows, strict=True):
         place[: len(row)] = row
     return torch.from_numpy(out).to(mask.device)

@@ -100,7 +100,7 @@ class IterativelyReweighted:
         if not np.isfinite(cost[best]):
             return Solution(None, 0, reason=NOT_DETERMINED)
         inliers = self.inlier_rule(residuals_squared_px(refined[best], pair), pair)
-        return Solution(Fit(refined[best], refined[best], inliers), 0, inliers)
+        return Solution(Fit(refined[best], refined[best], inliers.astype(np.float64)), 0, inliers)
 
     def attached(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
         """As `gradients.Attach`: one Gauss-Newton step, whose gradients are those of the optimum."""

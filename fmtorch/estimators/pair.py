@@ -63,6 +63,12 @@ class Pair:
         return bool(h0 == h1 and w0 == w1)
 
     @property
+    def noises(self) -> Array:
+        """The noise of each match (n,), ones where none is known."""
+        noises: Array = self.table[7]
+        return noises
+
+    @property
     def points32(self) -> Array:
         """The points as scores take them, float32."""
         return self.cached("points32", lambda pair: pair.points.astype(np.float32))

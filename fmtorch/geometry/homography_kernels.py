@@ -130,7 +130,7 @@ def least_squares_homography(points: Array, weight: Array, H: Array) -> bool:
             x, y = (points[2, i] - T[1, 1]) * s1, (points[3, i] - T[1, 2]) * s1
             for r in range(3):
                 for c in range(r, 3):
-                    product = h[r] * h[c] * float(weight[i])
+                    product = h[r] * h[c] * (1.0 * weight[i])
                     S[0, r, c] += product
                     S[1, r, c] -= x * product
                     S[2, r, c] -= y * product

@@ -37,18 +37,20 @@ class Family(Protocol):
 
 
 class FitScale(NamedTuple):
-    """How a fit at a pair's own noise tells it, and which matches then count.
+    """The last fit, at a pair's own noise.
 
-    sigmas_of_median: the standard deviation of a coordinate, in medians of inliers' residuals. truncation_sigmas:
-    beyond which a match does not count; that distance is within smallest_px and largest_px, and default_px where too
-    few inliers tell the noise.
+    loss: its robust loss. sigmas_of_median: the standard deviation of a coordinate, in medians of inliers' residuals.
+    scale_sigmas: the scale of the loss in these; it is within smallest_px and largest_px, and default_px where too few
+    inliers tell the noise. by_prior: whether a match counts by its prior, too, not by its noise alone.
     """
 
+    loss: str = "truncated"
     sigmas_of_median: float = 1.4826
-    truncation_sigmas: float = 2.0
+    scale_sigmas: float = 2.0
     smallest_px: float = 0.3
     largest_px: float = 2.0
     default_px: float = 1.5
+    by_prior: bool = True
 
 
 class Loss(NamedTuple):

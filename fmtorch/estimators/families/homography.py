@@ -32,7 +32,7 @@ class Homography:
     model: ClassVar[str] = "homography"
     residual: ClassVar[Residual] = HOMOGRAPHY
     size: ClassVar[int] = 4
-    fit_scale: ClassVar[FitScale] = FitScale(sigmas_of_median=0.8493, truncation_sigmas=4.0, largest_px=4.0)
+    fit_scale: ClassVar[FitScale] = FitScale("cauchy", 0.8493, 1.5, 0.1, 4.0, 1.0, by_prior=False)
 
     def solve(self, pair: Pair, sample: Array, start: int) -> Hypotheses:
         """As `Family.solve`."""
@@ -46,10 +46,15 @@ class Homography:
         return homography_to_pixels(F, pair.centre, pair.pixels_per_unit, out)
 
     def refine(self, F: Array, pair: Pair, loss: Loss, steps: Steps) -> Array:
-        """As `Refining.refine`, of the Sampson error."""
+        """As `Refining.refine`, of the Sampson error, not by the prior.
+
+        A plane is easy: two equations a match keep wrong ones out, and weights cost efficiency. On 99 photographs under
+        known warps AUC of the corner error at 1 px is 66.2 without and 63.2 with them where matches are few, 83.1 and
+        83.0 otherwise; by a truncated loss in place of Cauchy's 62.2 and 80.9.
+        """
         s2 = np.square(loss.scale / pair.pixels_per_noise)
         refined, cost = np.empty_like(F), np.empty(len(F))
-        matches = Weighted(pair.points, pair.weight, s2, LOSSES[loss.name], loss_table(loss.name))
+        matches = Weighted(pair.points, 1 / np.square(pair.noises), s2, LOSSES[loss.name], loss_table(loss.name))
         refine_homographies(
             F, matches, Schedule(steps.iterations, steps.damping, steps.tolerance or 0.0), refined, cost
         )
