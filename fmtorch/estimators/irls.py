@@ -22,7 +22,7 @@ from fmtorch.geometry import attached_step, eight_point
 from fmtorch.geometry.irls import reweighted
 from fmtorch.geometry.refine import refine_components
 from fmtorch.geometry.residuals import sampson_squared
-from fmtorch.geometry.robust_kernels import named_kernel
+from fmtorch.geometry.robust_losses import named_kernel
 
 TILE = 1 << 16  # matches times models of the pairs that are solved together: bounds memory, changes no result
 DECAY = 0.65  # of the kernel's scale, from one iteration to the next, down to the threshold

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any, TypeVar
 
 from fmtorch.estimators.registry import takes
-from fmtorch.geometry.robust_kernels import named_kernel
+from fmtorch.geometry.robust_losses import named_kernel
 
 Group = TypeVar("Group")
 

@@ -14,8 +14,8 @@ from fmtorch.core.files import replacing
 from fmtorch.core.threads import available, one_thread
 from fmtorch.data.images import read_image
 from fmtorch.pipeline.exporting import keep_described, keep_match
-from fmtorch.pipeline.photographs import Described, describe, relate
 from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.pipeline.two_images import Described, describe, relate
 from fmtorch.storage.exchange.journal import Journal
 from fmtorch.storage.runs import canonical
 

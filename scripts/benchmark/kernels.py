@@ -171,7 +171,7 @@ def refinement(c: Correspondences) -> None:
     from fmtorch.geometry.rank2_manifold import retract, solve, start
     from fmtorch.geometry.rank2_manifold_kernels import start as start_kernel
     from fmtorch.geometry.rank2_manifold_kernels import step
-    from fmtorch.geometry.robust_kernels import KERNELS
+    from fmtorch.geometry.robust_losses import KERNELS
     from fmtorch.geometry.sampson_objective import SampsonObjective
     from fmtorch.geometry.sampson_objective_kernels import GEMAN_MCCLURE, evaluate
 

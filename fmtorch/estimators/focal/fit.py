@@ -15,7 +15,7 @@ from fmtorch.estimators.pairs import NormalizedPairs
 from fmtorch.geometry.arithmetic import component_sum
 from fmtorch.geometry.levenberg_marquardt import levenberg_marquardt
 from fmtorch.geometry.optimum import STEP_DAMPING, gradient_of_cost
-from fmtorch.geometry.robust_kernels import KERNELS
+from fmtorch.geometry.robust_losses import KERNELS
 
 
 class FocalFit(NamedTuple):

@@ -23,7 +23,7 @@ from fmtorch.estimators.scores import geman_mcclure_gain
 from fmtorch.geometry.arithmetic import component_sum, exponential, unit
 from fmtorch.geometry.levenberg_marquardt import Damping, TensorObjective, TensorState, levenberg_marquardt
 from fmtorch.geometry.residuals import sampson_squared
-from fmtorch.geometry.robust_kernels import KERNELS
+from fmtorch.geometry.robust_losses import KERNELS
 from fmtorch.geometry.sampson_objective import SampsonObjective
 
 INLIER_SIGMA_PX = 0.3  # standard deviation of an inlier's Sampson distance

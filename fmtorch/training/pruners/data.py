@@ -17,9 +17,9 @@ from fmtorch.data import ImagePair, PairDataset
 from fmtorch.data.matchable import ENOUGH
 from fmtorch.data.subset import subset
 from fmtorch.evaluation.run import select
-from fmtorch.pipeline.matched import Augmentation, LabelledMatches, MatchedPairs, StoredMatches
-from fmtorch.pipeline.matched.stored import last_scenes
-from fmtorch.pipeline.matched.transforms import keep_ratio
+from fmtorch.pipeline.labelled import Augmentation, LabelledMatches, MatchedPairs, StoredMatches
+from fmtorch.pipeline.labelled.stored import last_scenes
+from fmtorch.pipeline.labelled.transforms import keep_ratio
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
 from fmtorch.storage.features import cached

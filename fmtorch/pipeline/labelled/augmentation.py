@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch.core.random import Stream, bits, uniform
-from fmtorch.pipeline.matched import transforms
-from fmtorch.pipeline.matched.record import LabelledMatches
+from fmtorch.pipeline.labelled import transforms
+from fmtorch.pipeline.labelled.record import LabelledMatches
 
 MIN_INLIERS = 16  # no crop or ratio threshold that would leave fewer; twice what the eight-point algorithm needs
 MIN_MATCHES = 50  # no thinning of outliers below so many matches

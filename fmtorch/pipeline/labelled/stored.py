@@ -12,10 +12,10 @@ import torch
 from torch.utils.data import Dataset
 
 from fmtorch.core.types import Correspondences
-from fmtorch.pipeline.matched.augmentation import Augmentation
-from fmtorch.pipeline.matched.batches import Draw
-from fmtorch.pipeline.matched.record import LabelledMatches
-from fmtorch.pipeline.matched.shards import Shard
+from fmtorch.pipeline.labelled.augmentation import Augmentation
+from fmtorch.pipeline.labelled.batches import Draw
+from fmtorch.pipeline.labelled.record import LabelledMatches
+from fmtorch.pipeline.labelled.shards import Shard
 
 PATTERN = "shard-*.arrow"
 
