@@ -17,14 +17,14 @@ from omegaconf.errors import OmegaConfBaseException
 from fmtorch.commands.explain import explained
 from fmtorch.commands.overrides import hydra_arguments
 from fmtorch.core.resources import conf_dir
-from fmtorch.core.terminal import MISTAKES, exits_with_message, told
+from fmtorch.core.terminal import MISTAKES, error_line, exits_with_message
 from fmtorch.presets.pruners import with_explicit
 
 Task = Callable[[DictConfig], None]
 
 
 class Mistake(ValueError):
-    """A user's mistake in one job of a sweep, told by its message: it can be sent between processes."""
+    """A user's mistake in one job of a sweep, error_line by its message: it can be sent between processes."""
 
 
 def job(task: Task) -> Task:
@@ -36,8 +36,8 @@ def job(task: Task) -> Task:
             task(with_explicit(config, HydraConfig.get().overrides.task))
         except MISTAKES as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
-                raise Mistake(told(error)) from None
-            sys.exit(f"error: {told(error)}")
+                raise Mistake(error_line(error)) from None
+            sys.exit(f"error: {error_line(error)}")
 
     return wrapped
 

@@ -175,4 +175,8 @@ def last_scenes(scenes: Iterable[tuple[str, str]], last: int) -> set[tuple[str, 
     names: dict[str, set[str]] = {}
     for family, name in scenes:
         names.setdefault(family, set()).add(name)
-    return {(family, name) for family, some in names.items() for name in sorted(some)[max(1, len(some) - last) :]}
+    return {
+        (family, name)
+        for family, of_family in names.items()
+        for name in sorted(of_family)[max(1, len(of_family) - last) :]
+    }
