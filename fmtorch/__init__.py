@@ -11,8 +11,8 @@ from fmtorch.core.version import __version__
 if TYPE_CHECKING:
     from fmtorch.core.types import Correspondences, Estimate, Features
     from fmtorch.pipeline.fundamental import find_fundamental, find_homography
-    from fmtorch.pipeline.photographs import MatchResult, match
     from fmtorch.pipeline.pipeline import Pipeline
+    from fmtorch.pipeline.two_images import MatchResult, match
 
 __all__ = [
     "Correspondences",
@@ -28,7 +28,7 @@ __all__ = [
 
 _MODULES = {
     "Correspondences": "core.types", "Estimate": "core.types", "Features": "core.types",
-    "MatchResult": "pipeline.photographs", "Pipeline": "pipeline.pipeline", "match": "pipeline.photographs",
+    "MatchResult": "pipeline.two_images", "Pipeline": "pipeline.pipeline", "match": "pipeline.two_images",
     "find_fundamental": "pipeline.fundamental", "find_homography": "pipeline.fundamental",
 }  # fmt: skip
 

@@ -29,8 +29,8 @@ from fmtorch.data import read_image
 from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_matches
 from fmtorch.metrics import nsgd
 from fmtorch.pipeline.folder import EXHAUSTIVE
-from fmtorch.pipeline.photographs import Image, MatchResult, match
 from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.pipeline.two_images import Image, MatchResult, match
 from fmtorch.presets.fields import Cache, Gigabytes, path_fields, read_fields
 from fmtorch.storage.features import CachedFeatures
 

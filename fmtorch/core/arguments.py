@@ -127,8 +127,10 @@ def _field(name: str, value: object, single: bool, points: Tensor) -> Tensor:
     if tuple(tensor.shape) in (shape, (1, *shape)):
         return tensor.expand(len(points), *shape)
     if tuple(tensor.shape) != (len(points), *shape):
-        one = f"{shape} for all pairs" if shape else "one number for all pairs"
-        raise ValueError(f"{name} has shape {tuple(tensor.shape)}; it must be {one}, or {(len(points), *shape)}")
+        single_shape = f"{shape} for all pairs" if shape else "one number for all pairs"
+        raise ValueError(
+            f"{name} has shape {tuple(tensor.shape)}; it must be {single_shape}, or {(len(points), *shape)}"
+        )
     return tensor
 
 

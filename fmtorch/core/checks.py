@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any, ParamSpec, TypeVar
 
@@ -59,18 +60,18 @@ def checked(function: Callable[P, R], *, common_type: bool = False) -> Callable[
     return door
 
 
-def public(package: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """`checked` with one type for all tensors, for the functions that a package exports.
+def check_exported(package: str) -> None:
+    """Make the functions that a package exports, those of its `__all__`, `checked` with one type for all tensors.
 
     The package's own modules import each other's functions unchecked, from where they are defined.
     """
-
-    def export(function: Callable[P, R]) -> Callable[P, R]:
-        door = checked(function, common_type=True)
-        door.__module__ = package  # where pickle finds it
-        return door
-
-    return export
+    module = sys.modules[package]
+    for name in module.__all__:
+        function = getattr(module, name)
+        if inspect.isfunction(function):
+            door = checked(function, common_type=True)
+            door.__module__ = package  # where pickle finds it
+            setattr(module, name, door)
 
 
 def _checked_value(name: str, value: Any, want: Expected, device: torch.device) -> Any:

@@ -15,24 +15,28 @@ from typing import Any
 from fmtorch.core.annotations import UNIONS, resolved
 
 PLAIN = (bool, int, float, str, type(None), list, tuple, Mapping)  # what a YAML file or a command line can say
-MOST_NAMES = 12  # that a message lists
+MAX_NAMES = 12  # that a message lists
 
 
 @dataclasses.dataclass(frozen=True)
 class Within:
     """Bounds of a number, for ``Annotated[int, Within(1)]``; both may be reached."""
 
-    least: int | float = -math.inf
-    most: int | float = math.inf
+    minimum: int | float = -math.inf
+    maximum: int | float = math.inf
 
     def __call__(self, value: Any) -> bool:
         """Whether a number is in bounds."""
-        return bool(self.least <= value <= self.most)
+        return bool(self.minimum <= value <= self.maximum)
 
     def __str__(self) -> str:
-        if self.most == math.inf:
-            return f"of at least {self.least:g}"
-        return f"of at most {self.most:g}" if self.least == -math.inf else f"from {self.least:g} to {self.most:g}"
+        if self.maximum == math.inf:
+            return f"of at least {self.minimum:g}"
+        return (
+            f"of at most {self.maximum:g}"
+            if self.minimum == -math.inf
+            else f"from {self.minimum:g} to {self.maximum:g}"
+        )
 
 
 def expect_options(
@@ -148,12 +152,12 @@ def shown(value: Any) -> str:
 def nearest(name: str, names: Iterable[str]) -> str:
     """The names there are, those most like `name` first; of many only those."""
     ordered = sorted(names, key=lambda known: -difflib.SequenceMatcher(None, name, known).ratio())
-    more = len(ordered) - MOST_NAMES
-    return ", ".join(ordered[:MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
+    more = len(ordered) - MAX_NAMES
+    return ", ".join(ordered[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def _dataclass_in(annotation: Any) -> type | None:
     """The dataclass that an annotation allows, if it is one."""
     options = typing.get_args(annotation) if typing.get_origin(annotation) in UNIONS else ()
-    found = [kind for kind in (annotation, *options) if isinstance(kind, type) and dataclasses.is_dataclass(kind)]
-    return found[0] if len(found) == 1 else None
+    kinds = [kind for kind in (annotation, *options) if isinstance(kind, type) and dataclasses.is_dataclass(kind)]
+    return kinds[0] if len(kinds) == 1 else None

@@ -68,9 +68,9 @@ class Record:
 
         What a user may have a hand in goes through `replace`.
         """
-        made = object.__new__(type(self))
-        vars(made).update(vars(self), **changes)
-        return made
+        record = object.__new__(type(self))
+        vars(record).update(vars(self), **changes)
+        return record
 
     def _map(self: AnyRecord, function: Any, **changes: Any) -> AnyRecord:
         return self.replace(**_mapped(self, function, Record._map), **changes)
@@ -119,8 +119,8 @@ def expect_fields(record: Record, **sizes: int) -> None:
 
 def _in_letters(shape: tuple[str, ...]) -> str:
     """A declared shape as a reader knows it; BATCH stands for one dimension or none."""
-    one = ", ".join(name.upper() for name in shape if name != BATCH)
-    return f"({one}), or (B, {one}) of a batch" if BATCH in shape else f"({one})"
+    unbatched = ", ".join(name.upper() for name in shape if name != BATCH)
+    return f"({unbatched}), or (B, {unbatched}) of a batch" if BATCH in shape else f"({unbatched})"
 
 
 def slotted(record: Record) -> dict[str, Tensor]:

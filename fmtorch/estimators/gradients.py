@@ -25,7 +25,7 @@ from fmtorch.geometry import canonical, eight_point, unit_frobenius
 from fmtorch.geometry.homography_error import homography_gradient
 from fmtorch.geometry.optimum import STEP_DAMPING, gradient_of_cost
 from fmtorch.geometry.pixel_frame import PixelFrame
-from fmtorch.geometry.robust_kernels import KERNELS
+from fmtorch.geometry.robust_losses import KERNELS
 from fmtorch.geometry.sampson_objective_kernels import LOSSES, NO_TABLE, Weighted
 
 

@@ -24,7 +24,7 @@ from fmtorch.geometry.irls_kernels import reweighted
 from fmtorch.geometry.levenberg_marquardt_kernels import Schedule
 from fmtorch.geometry.rank2_manifold_kernels import SQUARINGS
 from fmtorch.geometry.refine_kernels import refine
-from fmtorch.geometry.robust_kernels import named_kernel
+from fmtorch.geometry.robust_losses import named_kernel
 from fmtorch.geometry.sampson_objective_kernels import LOSSES, Weighted, loss_table
 
 DECAY = 0.65  # of the kernel's scale, from one iteration to the next, down to the threshold

@@ -57,13 +57,13 @@ def _learned(stages: Mapping[str, Any], pipeline: Pipeline) -> dict[str, list[st
     parts: dict[str, list[object]] = {
         "features": [extractor.extractor if isinstance(extractor, CachedFeatures) else extractor],
         "matcher": [pipeline.matcher], "estimator": [pipeline.estimator],
-        "pruner": [pruner for some in (pipeline.pruners, *pipeline.families.values()) for pruner in some.values()],
+        "pruner": [p for pruners in (pipeline.pruners, *pipeline.families.values()) for p in pruners.values()],
     }  # fmt: skip
     digests = {
         group: {*(digest for part in parts[group] for digest in learned(part)), *_files(stages.get(group))}
         for group in presets.STAGES
     }
-    return {group: sorted(found) for group, found in digests.items() if found}
+    return {group: sorted(digests_of_group) for group, digests_of_group in digests.items() if digests_of_group}
 
 
 def _files(config: object, option: str = "") -> Iterator[str]:

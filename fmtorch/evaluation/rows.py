@@ -34,11 +34,11 @@ def _distances(outcomes: Sequence[Outcome], seed: int) -> tuple[list[float], lis
     nsgd, released = [1.0] * len(outcomes), [1.0] * len(outcomes)
     known = [i for i, o in enumerate(outcomes) if o.solved]
     if known:
-        some = [outcomes[i] for i in known]
-        c = joined_correspondences(some)
+        estimated = [outcomes[i] for i in known]
+        c = joined_correspondences(estimated)
         if c.size0 is None or c.size1 is None:
             raise ValueError("correspondences come without image sizes (size0, size1); the matcher must supply them")
-        arguments = (joined_true(some), joined_estimates(some).F, c.size0, c.size1)
+        arguments = (joined_true(estimated), joined_estimates(estimated).F, c.size0, c.size1)
         values = metrics.nsgd(*arguments, seed=seed, key=c.keys).tolist()
         values_released = metrics.nsgd_released(*arguments, seed=seed, key=c.keys).tolist()
         for i, a, b in zip(known, values, values_released, strict=True):
@@ -51,11 +51,13 @@ def _inlier_rates(outcomes: Sequence[Outcome]) -> tuple[list[float], list[float]
     before, after = [math.nan] * len(outcomes), [math.nan] * len(outcomes)
     matched = [i for i, o in enumerate(outcomes) if o.estimate is not None and o.correspondences is not None]
     if matched:
-        some = [outcomes[i] for i in matched]
-        c, estimate = joined_correspondences(some), joined_estimates(some)
+        with_matches = [outcomes[i] for i in matched]
+        c, estimate = joined_correspondences(with_matches), joined_estimates(with_matches)
         if c.size0 is None or c.size1 is None:
             raise ValueError("correspondences come without image sizes (size0, size1); the matcher must supply them")
-        rates = metrics.inlier_rate(joined_true(some), c.x0, c.x1, estimate.inliers, c.size0, c.size1, mask=c.mask)
+        rates = metrics.inlier_rate(
+            joined_true(with_matches), c.x0, c.x1, estimate.inliers, c.size0, c.size1, mask=c.mask
+        )
         for i, a, b in zip(matched, rates.before.tolist(), rates.after.tolist(), strict=True):
             before[i], after[i] = a, b if outcomes[i].solved else math.nan
     return before, after

@@ -115,6 +115,6 @@ def _in_process(pairs: list[ImagePair], seed: int, journal: Journal | None) -> W
     extractor = _mine.extractor
     if not isinstance(extractor, CachedFeatures):
         return _work(_mine, pairs, seed, journal)
-    computed, found = extractor.computed, extractor.found
+    computed, cached = extractor.computed, extractor.found
     rows = _work(_mine, pairs, seed, journal).rows
-    return Work(rows, extractor.computed - computed, extractor.found - found)
+    return Work(rows, extractor.computed - computed, extractor.found - cached)

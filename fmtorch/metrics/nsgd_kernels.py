@@ -21,7 +21,7 @@ def accepted_draws(
     F_gt: Array, F_est: Array, size0: Array, size1: Array, unit: Array, key: Array, mixed_seed: int, samples: int,
     out: Array,
 ) -> None:  # fmt: skip
-    """`draws.mean_terms` of a pair: the sum of its accepted draws, and their number -> out (2,).
+    """`draws.sum_of_draws` of a pair: the sum of its accepted draws, and their number -> out (2,).
 
     F_gt, F_est: scaled to a largest element of 1. unit: by which distances in image 0 and 1 are divided. key: (1,).
     mixed_seed: of the seed and the stream.

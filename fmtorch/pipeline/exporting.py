@@ -12,8 +12,8 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences
 from fmtorch.data.pairs import ImagePair, ImageSource
-from fmtorch.pipeline.photographs import Described, MatchResult
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
+from fmtorch.pipeline.two_images import Described, MatchResult
 from fmtorch.storage.exchange.journal import ExportedImage, ExportedPair, Journal, indices
 
 

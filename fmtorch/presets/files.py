@@ -49,11 +49,11 @@ def closest(group: str, config: Mapping[str, Any]) -> tuple[str, dict[str, Any]]
 
     None where no preset builds what the config does, or the options are not those of the preset.
     """
-    found = []
+    candidates = []
     for name, preset in _shipped(group).items():
         if preset.get("_target_") == config.get("_target_") and preset.keys() >= config.keys():
-            found.append((name, {key: value for key, value in config.items() if preset[key] != value}))
-    return min(found, key=lambda pair: len(pair[1]), default=None)
+            candidates.append((name, {key: value for key, value in config.items() if preset[key] != value}))
+    return min(candidates, key=lambda pair: len(pair[1]), default=None)
 
 
 @functools.cache

@@ -32,14 +32,14 @@ WINDOW = 8  # neighbours before and after each match along each curve
 CURVES = ((0.0, 0.0), (0.5, math.pi / 4))  # shift of the grid (in thirds of the extent) and rotation of each curve
 TOLERANCE = 0.25  # relative prediction error at which agreement falls to about 1/e
 NOISE = 4.0  # px, keeps close neighbours from being judged by their localisation noise
-WORST_RATIO, LEAST_VOTE = 0.85, 0.02  # a neighbour votes with WORST_RATIO - ratio, at least LEAST_VOTE
+WORST_RATIO, MIN_VOTE = 0.85, 0.02  # a neighbour votes with WORST_RATIO - ratio, at least MIN_VOTE
 TILE = 1 << 12  # matches looked at together: what a processor's cache holds; changes no result
 GPU_TILE = 1 << 17
-LEAST_SQUARE, LEAST_VOTES = 1e-12, float(np.finfo(np.float32).tiny)  # keep a root's gradient and a quotient finite
+MIN_SQUARE, MIN_VOTES = 1e-12, float(np.finfo(np.float32).tiny)  # keep a root's gradient and a quotient finite
 
 # For the kernels: shift, cosine and sine of each curve; their other numbers.
 CURVE_TABLE = np.array([(shift, math.cos(angle), math.sin(angle)) for shift, angle in CURVES], np.float32)
-NUMBERS = (WORST_RATIO, LEAST_VOTE, NOISE, TOLERANCE**-2 / 8, LEAST_SQUARE, LEAST_VOTES)
+NUMBERS = (WORST_RATIO, MIN_VOTE, NOISE, TOLERANCE**-2 / 8, MIN_SQUARE, MIN_VOTES)
 _NUMBERS = np.array(NUMBERS, np.float32)
 
 
@@ -62,7 +62,7 @@ def frame_agreement(
         out = torch.empty(mask.shape, dtype=torch.float32)
         return for_each_pair(compiled.frame_agreement, tensors, CURVE_TABLE, _NUMBERS, out=out).to(x0.dtype)
     S = frame_map(lafs0, lafs1)
-    vote = torch.ones_like(x0[..., 0]) if quality is None else (WORST_RATIO - quality).clamp_min(LEAST_VOTE)
+    vote = torch.ones_like(x0[..., 0]) if quality is None else (WORST_RATIO - quality).clamp_min(MIN_VOTE)
     scale = sqrt((S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]).abs())
     rows = torch.stack([*x0.unbind(-1), *x1.unbind(-1), *S.flatten(2).unbind(-1), scale, vote])
     mask = mask & torch.isfinite(rows).all(0)
@@ -87,8 +87,8 @@ def _agreement(rows: Float[Tensor, "10 b n"], mask: Bool[Tensor, "b n"]) -> Floa
     orders = orders[..., : max(int(mask.sum(1).max()), 1)]  # masked slots stand last
     along = rows[:, None].expand(-1, len(orders), -1, -1).gather(3, orders.expand(len(rows), -1, -1, -1))
     sums = _along_curve(along.flatten(1, 2)).reshape(2, *orders.shape)
-    found = sums.new_zeros(*sums.shape[:3], mask.shape[1]).scatter(3, orders.expand(2, -1, -1, -1), sums)
-    agreement, votes = component_sum(found, 1)
+    in_slots = sums.new_zeros(*sums.shape[:3], mask.shape[1]).scatter(3, orders.expand(2, -1, -1, -1), sums)
+    agreement, votes = component_sum(in_slots, 1)
     return torch.where(mask, agreement / votes.clamp_min(torch.finfo(votes.dtype).tiny), 0)
 
 
@@ -110,9 +110,7 @@ def _along_curve(rows: Float[Tensor, "10 b n"]) -> Float[Tensor, "2 b n"]:
     dx, dy, ux, uy = near[:4] - rows[:4]
     error = torch.maximum(_prediction_error(rows[4:8], dx, dy, ux, uy), _prediction_error(near[4:8], dx, dy, ux, uy))
     length = (
-        sqrt(dx.square() + dy.square() + LEAST_SQUARE) * rows[8]
-        + sqrt(ux.square() + uy.square() + LEAST_SQUARE)
-        + NOISE
+        sqrt(dx.square() + dy.square() + MIN_SQUARE) * rows[8] + sqrt(ux.square() + uy.square() + MIN_SQUARE) + NOISE
     )
     # exp(-z) in arithmetic alone, whose last bits, unlike exp's, do not depend on where in memory a number stands
     agree = (1 + error / length.square() * (TOLERANCE**-2 / 8)).square().square().square().reciprocal()

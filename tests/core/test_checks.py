@@ -15,7 +15,7 @@ from torch import Tensor
 
 from fmtorch import geometry, matching, metrics, pruning
 from fmtorch.core.annotations import Expected, Rule, arrays_of, expectation
-from fmtorch.core.checks import checked, public
+from fmtorch.core.checks import checked
 from fmtorch.core.types import Correspondences
 from tests.processes import run_command
 
@@ -103,7 +103,7 @@ def test_what_can_be_converted_is() -> None:
     assert given["size"].tolist() == [480, 640]
     assert (given["steps"], given["scale"], given["taus"]) == (2, 0.5, (0.5, 0.7))
     assert checked(distance)(F, X.half())["x"].dtype == torch.float32
-    one = public("tests")(distance)(F.double(), X)
+    one = checked(distance, common_type=True)(F.double(), X)
     assert one["x"].dtype == torch.float64
     assert checked(distance)(F.double(), X)["x"].dtype == torch.float32
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from fmtorch.data.rendered.cameras import calibration, look_at
 from fmtorch.data.rendered.drawings import sign
 from fmtorch.data.rendered.facade import Style, front, house
 from fmtorch.data.rendered.light import Lens, Light, sun
@@ -12,6 +11,7 @@ from fmtorch.data.rendered.mipmap import Real
 from fmtorch.data.rendered.orbit import ground
 from fmtorch.data.rendered.patterns import Rng, heaven, to_pixels
 from fmtorch.data.rendered.photographs import pictures
+from fmtorch.data.rendered.pinhole import calibration, look_at
 from fmtorch.data.rendered.props import ashlar, column, direction, foliage, marble, post, statue, tree, walker
 from fmtorch.data.rendered.scene import Scene, Shot
 from fmtorch.data.rendered.surfaces import Surfaces, vec

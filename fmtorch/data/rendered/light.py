@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.compiling import switch
-from fmtorch.data.rendered.cameras import Camera, Matrix
 from fmtorch.data.rendered.light_kernels import affine, footprints, group_by_texture, shade
 from fmtorch.data.rendered.mipmap import TO_LINEAR, Floats, Pixels, Real, bilinear, to_srgb
+from fmtorch.data.rendered.pinhole import Camera, Matrix
 from fmtorch.data.rendered.raycast import Geometry, Hits
 
 # Four rays a pixel, one on each row and column of a 4 x 4 grid (rotated grid); their mean is the pixel centre.

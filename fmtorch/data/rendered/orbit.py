@@ -6,13 +6,13 @@ from typing import Literal
 
 import numpy as np
 
-from fmtorch.data.rendered.cameras import calibration, look_at
 from fmtorch.data.rendered.drawings import poster
 from fmtorch.data.rendered.facade import Style, house, wall_picture
 from fmtorch.data.rendered.light import Lens, Light, sun
 from fmtorch.data.rendered.mipmap import Real
 from fmtorch.data.rendered.patterns import Rng, cells, colour, heaven, heights, masonry, meadow, to_pixels
 from fmtorch.data.rendered.photographs import material, pictures
+from fmtorch.data.rendered.pinhole import calibration, look_at
 from fmtorch.data.rendered.props import ashlar, column, direction, foliage, marble, post, rock, statue, tree, walker
 from fmtorch.data.rendered.scene import Scene, Shot
 from fmtorch.data.rendered.surfaces import Surfaces, vec

@@ -17,7 +17,7 @@ from fmtorch import presets
 from fmtorch.core.options import Within, expect_options
 from fmtorch.core.terminal import console, progress_bars
 from fmtorch.core.version import __version__
-from fmtorch.pipeline.matched import Augmentation
+from fmtorch.pipeline.labelled import Augmentation
 from fmtorch.presets import plain
 from fmtorch.presets.fields import Cache, Count, Gigabytes, Seed, read_fields
 from fmtorch.storage.runs import identity_digest
