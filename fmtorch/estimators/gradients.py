@@ -6,7 +6,7 @@ the same bits whether anybody asks for gradients or not, and gradients are those
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -58,6 +58,7 @@ class GraphedMatches(NamedTuple):
         return self.points[2:].permute(1, 2, 0)
 
 
+@runtime_checkable
 class Attach(Protocol):
     """Gives fits their gradients."""
 

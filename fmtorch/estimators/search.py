@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -58,6 +58,7 @@ class Verified(NamedTuple):
     score: Array
 
 
+@runtime_checkable
 class Degeneracy(Protocol):
     """Completes the best model of a round where its sample is degenerate."""
 

@@ -6,7 +6,7 @@ and stopping rule are written once; what differs is the family's: minimal sample
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from fmtorch.compiling.arrays import Array
 from fmtorch.estimators.pair import Pair
@@ -24,6 +24,7 @@ class Hypotheses(NamedTuple):
     start: int
 
 
+@runtime_checkable
 class Family(Protocol):
     """A family of models. size: matches of a minimal sample."""
 
@@ -50,6 +51,7 @@ class Steps(NamedTuple):
     tolerance: float | None = None
 
 
+@runtime_checkable
 class Refining(Family, Protocol):
     """A family whose models can be refined and fitted on their own."""
 
