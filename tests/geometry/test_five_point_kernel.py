@@ -100,7 +100,10 @@ def test_focal_lengths_and_the_centre_of_coordinates() -> None:
     F, same = solved(scaled, depth, offset)
     np.testing.assert_array_equal(draw, same)
     for model, essential, s in zip(F, E, draw, strict=True):
-        K0, K1 = (np.array([[f, 0, -x], [0, f, -y], [0, 0, 1]]) for f, (x, y) in zip(depth[:, s], offset.reshape(2, 2), strict=True))
+        K0, K1 = (
+            np.array([[f, 0, -x], [0, f, -y], [0, 0, 1]])
+            for f, (x, y) in zip(depth[:, s], offset.reshape(2, 2), strict=True)
+        )
         expected = K1.T @ model.reshape(3, 3) @ K0
         # Twice float32, through calibrations of condition 4; dividing scaled points rounds, which roots magnify.
         assert apart(expected.reshape(1, 9), essential[None])[0, 0] < 1e-4
