@@ -30,7 +30,7 @@ def scene(seed: int, noise: float = 0.0, plane: bool = False) -> tuple[np.ndarra
 def solved(
     points: np.ndarray, depth: np.ndarray | None = None, offset: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Models (m, 9) of every five points, and of which sample each is; focal lengths (2, s) and offset as the kernel's."""
+    """Models (m, 9) of every five points, and of which sample each is; depth, offset: the kernel's."""
     s = points.shape[1] // 5
     sample = np.arange(5 * s).reshape(s, 5).T.copy()
     F, draw = np.empty((10 * s, 9), np.float32), np.empty(10 * s, np.int64)
