@@ -161,13 +161,13 @@ def transfer_squared(H: Array, points: Array) -> Array:
 
     def distance(H: Array, x: Array, y: Array) -> Array:
         mapped = np.insert(x, 2, 1.0, axis=-1) @ H.transpose(0, 2, 1)
-        squared: Array = np.square(mapped[..., :2] / mapped[..., 2:] - y).sum(-1).astype(np.float64)
+        squared: Array = np.square(mapped[..., :2] / mapped[..., 2:] - y).sum(-1)
         return squared
 
     with np.errstate(all="ignore"):
         there, back = (
             distance(H, points[:, :2], points[:, 2:]),
-            distance(np.linalg.pinv(H), points[:, 2:], points[:, :2]),
+            distance(np.linalg.pinv(H).astype(np.float64), points[:, 2:], points[:, :2]),
         )
     greater: Array = np.maximum(there, back)
     return greater

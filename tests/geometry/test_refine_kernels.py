@@ -55,9 +55,8 @@ def refined(
     """`refine_components` by the kernel."""
     found, cost = np.empty_like(F), np.empty(len(F))
     schedule = Schedule(iterations, DAMPING.first, tolerance)
-    refine_kernels.refine(
-        F, SQUARINGS, Weighted(points, weight, s2, LOSSES[loss], loss_table(loss)), schedule, found, cost
-    )
+    weighted = Weighted(points, weight, s2, LOSSES[loss], loss_table(loss))
+    refine_kernels.refine(F, SQUARINGS, weighted, schedule, found, cost)
     return found, cost
 
 
