@@ -10,7 +10,7 @@ from fmtorch.core.version import __version__
 
 if TYPE_CHECKING:
     from fmtorch.core.types import Correspondences, Estimate, Features
-    from fmtorch.pipeline.fundamental import find_fundamental
+    from fmtorch.pipeline.fundamental import find_fundamental, find_homography
     from fmtorch.pipeline.pipeline import Pipeline
     from fmtorch.pipeline.two_images import MatchResult, match
 
@@ -22,13 +22,14 @@ __all__ = [
     "Pipeline",
     "__version__",
     "find_fundamental",
+    "find_homography",
     "match",
 ]
 
 _MODULES = {
     "Correspondences": "core.types", "Estimate": "core.types", "Features": "core.types",
     "MatchResult": "pipeline.two_images", "Pipeline": "pipeline.pipeline", "match": "pipeline.two_images",
-    "find_fundamental": "pipeline.fundamental",
+    "find_fundamental": "pipeline.fundamental", "find_homography": "pipeline.fundamental",
 }  # fmt: skip
 
 

@@ -26,12 +26,6 @@ MAY_IMPORT = {
     "training": " ".join(room for room in ROOMS if room != "commands"),
     "commands": " ".join(ROOMS),
 }
-EXCEPTIONS = {  # until the kernels that an estimator calls are listed by its parts
-    ("fmtorch.pipeline.fundamental", "fmtorch.estimators.one_pair.ahead"),
-    ("fmtorch.estimators.one_pair.ahead", "fmtorch.pruning.calibration_kernels"),
-    ("fmtorch.estimators.one_pair.ahead", "fmtorch.pruning.frame_consistency_kernels"),
-    ("fmtorch.estimators.one_pair.ahead", "fmtorch.pruning.position_consistency_kernels"),
-}
 TORCH = {"torch", "torchvision", "torchmetrics", "kornia", "lightning"}  # the last four import the first
 NUMBA = {"numba", "llvmlite"}
 TENSORS_OF_ESTIMATORS = ("batch.py", "gradients.py", "irls.py", "coarse_to_fine.py", "peers/")
@@ -105,8 +99,7 @@ def test_rooms_import_what_they_may() -> None:
         for name in within(module)
         if room(name) != room(module) and room(name) not in MAY_IMPORT[room(module)].split()
     }
-    assert sorted(astray - EXCEPTIONS) == []
-    assert sorted(EXCEPTIONS - astray) == [], "exceptions that are none any more"
+    assert sorted(astray) == []
 
 
 def test_numba_is_imported_by_compiling_alone() -> None:

@@ -2,35 +2,13 @@
 
 from __future__ import annotations
 
-import enum
-import functools
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from fmtorch.core.streams import Stream, mixed_seed, wrap
 
-class Stream(enum.IntEnum):
-    """What a random number is for; streams of the same pair are independent."""
-
-    SAMPLING = 1
-    PRESELECTION = 2
-    METRIC = 3
-    TRAINING = 4
-    PLANE = 5
-    PARALLAX = 6
-    REFINEMENT = 7
-    FOCAL = 8
-    AUGMENTATION = 9
-    BATCHES = 10
-
-
-def _wrap(value: int) -> int:
-    """An unsigned 64-bit constant as the int64 with the same bits."""
-    return value - (1 << 64) if value >= 1 << 63 else value
-
-
-_GAMMA, _MIX1, _MIX2 = (_wrap(c) for c in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
+_GAMMA, _MIX1, _MIX2 = (wrap(c) for c in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
 
 
 def _shift_right(x: Tensor, n: int) -> Tensor:
@@ -43,15 +21,6 @@ def _mix(x: Int[Tensor, "*shape"]) -> Int[Tensor, "*shape"]:
     x = (x ^ _shift_right(x, 30)) * _MIX1
     x = (x ^ _shift_right(x, 27)) * _MIX2
     return x ^ _shift_right(x, 31)
-
-
-@functools.lru_cache(maxsize=64)
-def mixed_seed(seed: int, stream: Stream) -> int:
-    """`_mix` of the seed and the stream, in Python's integers: the same bits without the cost of tensors."""
-    x = ((seed * 2 + 1) * 0x9E3779B97F4A7C15 + int(stream)) % (1 << 64)
-    x = (x ^ (x >> 30)) * 0xBF58476D1CE4E5B9 % (1 << 64)
-    x = (x ^ (x >> 27)) * 0x94D049BB133111EB % (1 << 64)
-    return _wrap(x ^ (x >> 31))
 
 
 def bits(

@@ -149,7 +149,8 @@ class Estimate(Record):
     is False. ok: (B,). reason: why a pair failed, empty where it did not. draws: minimal samples drawn, (B,).
     significance: (B,), how far the support of F is beyond chance, see `fmtorch.geometry.significance`: -log10 of the
     number of models with as much support that are expected among images that show nothing in common; -inf where `ok`
-    is False, NaN where nobody has computed it; never None.
+    is False, NaN where nobody has computed it; never None. model: what `F` is, "fundamental", or "homography" for
+    `x1 ~ F x0`, which is positive where the plane is seen; then `H` is another name for it.
     """
 
     F: Float[Tensor, "b 3 3"]
@@ -158,6 +159,7 @@ class Estimate(Record):
     reason: tuple[str, ...]
     draws: Int[Tensor, " b"]
     significance: Float[Tensor, " b"] | None = None
+    model: str = "fundamental"
 
     def __post_init__(self) -> None:
         expect_fields(self)
@@ -170,6 +172,13 @@ class Estimate(Record):
         object.__setattr__(self, "reason", tuple(self.reason))
         if len(self.reason) != b:
             raise ValueError(f"reason has {len(self.reason)} entries; it must have one for each of the {b} pairs")
+
+    @property
+    def H(self) -> Float[Tensor, "b 3 3"]:
+        """The homographies. Raises AttributeError where the estimate is of another model."""
+        if self.model != "homography":
+            raise AttributeError(f"these are {self.model} matrices; find_homography gives homographies")
+        return self.F
 
     @property
     def related(self) -> Bool[Tensor, " b"]:
@@ -211,6 +220,10 @@ def collate(items: Sequence[Item]) -> Item:
         values = [getattr(item, field.name) for item in items]
         if field.name == "reason":
             merged[field.name] = sum(values, ())
+        elif field.name == "model":
+            if len(set(values)) > 1:
+                raise TypeError(f"collate needs estimates of one model, not {', '.join(sorted(set(values)))}")
+            merged[field.name] = values[0]
         elif any(value is None for value in values):
             merged[field.name] = None
         else:

@@ -1,8 +1,12 @@
-"""Correspondences -> Estimate: robust estimation of fundamental matrices."""
+"""Correspondences -> Estimate: robust estimation of fundamental matrices, and what a part of one's own is made of."""
 
+from fmtorch.compiling.arrays import F4x1, F4x2, F8x1, F8x2, I8x1, I8x2
+from fmtorch.compiling.kernel import kernel
 from fmtorch.estimators.coarse_to_fine import CoarseToFine
 from fmtorch.estimators.engine import HypothesizeAndVerify
 from fmtorch.estimators.irls import IterativelyReweighted
+from fmtorch.estimators.pair import Pair
+from fmtorch.estimators.parts.scores import SummedGains
 from fmtorch.estimators.peers.authors import degensac_cpp, gc_ransac_cpp, magsac_cpp, superansac_cpp
 from fmtorch.estimators.peers.kornia import kornia_ransac
 from fmtorch.estimators.peers.opencv import opencv
@@ -11,11 +15,20 @@ from fmtorch.estimators.peers.poselib import poselib
 
 __all__ = [
     "CoarseToFine",
+    "F4x1",
+    "F4x2",
+    "F8x1",
+    "F8x2",
     "HypothesizeAndVerify",
+    "I8x1",
+    "I8x2",
     "IterativelyReweighted",
+    "Pair",
     "PairwiseEstimator",
+    "SummedGains",
     "degensac_cpp",
     "gc_ransac_cpp",
+    "kernel",
     "kornia_ransac",
     "magsac_cpp",
     "opencv",

@@ -2,30 +2,34 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.compiling import switch
+from fmtorch.compiling.arrays import Array
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.estimators.batching import solve_all
-from fmtorch.estimators.inliers import WithinThreshold, median_of_matches
-from fmtorch.estimators.one_pair import irls as one_pair
-from fmtorch.estimators.one_pair.pair import each_pair
-from fmtorch.estimators.pairs import NormalizedPairs
-from fmtorch.estimators.selection import best_of
-from fmtorch.geometry import attached_step, eight_point
-from fmtorch.geometry.irls import reweighted
-from fmtorch.geometry.refine import refine_components
-from fmtorch.geometry.residuals import sampson_squared
+from fmtorch.estimators.batch import Solution, estimated
+from fmtorch.estimators.families.fundamental import SevenPoint
+from fmtorch.estimators.gradients import GraphedMatches, Solved
+from fmtorch.estimators.pair import Pair, squared
+from fmtorch.estimators.parts.final_fits import Fit
+from fmtorch.estimators.parts.inliers import WithinThreshold, lower_median, residuals_squared, residuals_squared_px
+from fmtorch.geometry import attached_step
+from fmtorch.geometry.eight_point_kernels import weighted_eight_point
+from fmtorch.geometry.irls_kernels import reweighted
+from fmtorch.geometry.levenberg_marquardt_kernels import Schedule
+from fmtorch.geometry.rank2_manifold_kernels import SQUARINGS
+from fmtorch.geometry.refine_kernels import refine
 from fmtorch.geometry.robust_losses import named_kernel
+from fmtorch.geometry.sampson_objective_kernels import LOSSES, Weighted, loss_table
 
-TILE = 1 << 16  # matches times models of the pairs that are solved together: bounds memory, changes no result
 DECAY = 0.65  # of the kernel's scale, from one iteration to the next, down to the threshold
+FIRST_DAMPING = 1e-4  # of Levenberg-Marquardt
+NOT_DETERMINED = "the matches do not determine a model"
 
 
 class IterativelyReweighted:
@@ -71,75 +75,74 @@ class IterativelyReweighted:
             raise ValueError(f"threshold is {threshold}; it must be positive")
         if not starts or min(starts) < 0:
             raise ValueError(f"starts is {starts}; it must be a list of integers, each at least 0")
-        self.kernel, self.robust, self.threshold = kernel, named_kernel(kernel), threshold
-        self.starts = sorted(set(starts))
+        named_kernel(kernel)
+        self.kernel, self.threshold, self.starts = kernel, threshold, sorted(set(starts))
         self.iterations, self.start_scale, self.refine_iterations = iterations, start_scale, refine_iterations
         self.inlier_rule = WithinThreshold(threshold if inlier_threshold is None else inlier_threshold)
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
-        at_once = TILE // (max(1, c.mask.shape[1]) * len(self.starts))
-        compiled = c.mask.device.type == "cpu" and switch.available()
-        solve = functools.partial(self._solve, self._by_kernels if compiled else self._by_tensors)
-        return solve_all(c, seed, self.MIN_MATCHES, solve, "the matches do not determine a model", at_once, compiled)
+        return estimated(c, seed, self.MIN_MATCHES, SevenPoint(), self.solve, self.attached)
 
-    def _solve(
-        self, optimum: Callable[[NormalizedPairs], tuple[Tensor, Tensor]], pairs: NormalizedPairs
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        with torch.no_grad():
-            best, found = optimum(pairs)
-        weight, scale = _weight(pairs), self.threshold / pairs.pixels_per_unit
-        x0, x1 = pairs.points[:2].permute(1, 2, 0), pairs.points[2:].permute(1, 2, 0)
-        estimate = attached_step(best, x0, x1, weight, kernel=self.kernel, scale=scale)
-        with torch.no_grad():
-            inliers = self.inlier_rule(estimate, pairs)
-        return estimate, inliers, found, torch.zeros_like(pairs.count)
-
-    def _by_tensors(self, pairs: NormalizedPairs) -> tuple[Float[Tensor, "p 3 3"], Bool[Tensor, " p"]]:
-        """The models of least cost, and which pairs have one."""
-        weight, scale = _weight(pairs), self.threshold / pairs.pixels_per_unit
-        F, valid = self._first(pairs, weight)
-        start = self._first_scale(F, valid, pairs)
+    def solve(self, pair: Pair) -> Solution:
+        """The model of least cost of one pair."""
+        F = self._first(pair)
+        if not len(F):
+            return Solution(None, 0, reason=NOT_DETERMINED)
+        scale = self.threshold / pair.pixels_per_unit
+        widest = self.start_scale * 1.4826 * math.sqrt(max(_median(model, pair) for model in F))
         for i in range(self.iterations):
-            F = reweighted(F, pairs.points, weight, self.robust, torch.maximum(start * DECAY**i, scale))
-        F, cost = refine_components(F, pairs.points, weight, self.kernel, scale, self.refine_iterations)
-        some = valid & torch.isfinite(cost)
-        return best_of(F, -cost, some).T.reshape(-1, 3, 3), some.any(1)
+            reweighted(F, self._weighted(pair, max(widest * DECAY**i, scale)))
+        refined, cost = np.empty_like(F), np.empty(len(F))
+        schedule = Schedule(self.refine_iterations, FIRST_DAMPING, 0.0)
+        refine(F, SQUARINGS, self._weighted(pair, scale), schedule, refined, cost)
+        best = int(np.argmin(np.where(np.isfinite(cost), cost, np.inf)))
+        if not np.isfinite(cost[best]):
+            return Solution(None, 0, reason=NOT_DETERMINED)
+        inliers = self.inlier_rule(residuals_squared_px(refined[best], pair), pair)
+        return Solution(Fit(refined[best], refined[best], inliers.astype(np.float64)), 0, inliers)
 
-    def _by_kernels(self, pairs: NormalizedPairs) -> tuple[Float[Tensor, "p 3 3"], Bool[Tensor, " p"]]:
-        """The same, pair by pair."""
-        decays = [DECAY**i for i in range(self.iterations)]
-        found = [
-            one_pair.optimum(
-                pair, self.kernel, self.threshold / pair.pixels_per_unit, self.starts, self.start_scale, decays,
-                self.refine_iterations,
-            )
-            for pair in each_pair(pairs)
-        ]  # fmt: skip
-        return torch.from_numpy(np.stack([F for F, _ in found])), torch.tensor([there for _, there in found])
+    def attached(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
+        """As `gradients.Attach`: one Gauss-Newton step, whose gradients are those of the optimum."""
+        F = torch.from_numpy(np.stack([s.fit.at for s in solved])).to(matches.points).reshape(-1, 3, 3)
+        scale = torch.tensor([self.threshold / s.pair.pixels_per_unit for s in solved]).to(F)
+        weight = matches.prior
+        if weight is None:
+            weight = torch.zeros_like(matches.weight)
+            for row, each in zip(weight, solved, strict=True):
+                row[: each.pair.count] = torch.from_numpy(_weight(each.pair)).to(row)
+        step = attached_step(F, matches.points0, matches.points1, weight, kernel=self.kernel, scale=scale).flatten(1)
+        return step - step.detach()
 
-    def _first(self, pairs: NormalizedPairs, weight: Tensor) -> tuple[Float[Tensor, "9 p k"], Bool[Tensor, "p k"]]:
-        """The 8-point algorithm on all matches, with each power of the weights, and whether these determine a model."""
-        powers = [pairs.mask.to(weight.dtype)]
-        for _ in range(self.starts[-1]):
-            powers.append(powers[-1] * weight)
-        weights = torch.stack([powers[i] for i in self.starts], 1)
-        points = pairs.points[:, :, None].expand(-1, -1, len(self.starts), -1)
-        F, valid = eight_point(points[:2].movedim(0, -1), points[2:].movedim(0, -1), weights)
-        return F.flatten(2).permute(2, 0, 1), valid
+    def _weighted(self, pair: Pair, scale: float) -> Weighted:
+        """The matches with the loss at a scale, in the unit of the points."""
+        s2, loss = np.full(pair.count, squared(scale)), LOSSES[self.kernel]
+        return Weighted(pair.points, pair.cached("irls weight", _weight), s2, loss, loss_table(self.kernel))
 
-    def _first_scale(self, F: Tensor, valid: Tensor, pairs: NormalizedPairs) -> Float[Tensor, " p"]:
-        r2 = sampson_squared(F, pairs.points)
-        medians = torch.stack([median_of_matches(r2[:, i], pairs)[:, 0] for i in range(r2.shape[1])], 1)
-        return self.start_scale * 1.4826 * torch.where(valid, medians, 0).amax(1).sqrt()
+    def _first(self, pair: Pair) -> Array:
+        """The 8-point algorithm with each power of the weights, where these determine a model, (k, 9)."""
+        powers = [np.ones(pair.count)]
+        for _ in range(self.starts[-1]):  # NumPy's powers have other last bits on another processor
+            powers.append(powers[-1] * pair.cached("irls weight", _weight))
+        F, valid = np.empty((len(self.starts), 9)), np.empty(len(self.starts), np.bool_)
+        for i, power in enumerate(self.starts):
+            valid[i] = weighted_eight_point(pair.points, powers[power], F[i])
+        return F[valid]
 
 
-def _weight(pairs: NormalizedPairs) -> Float[Tensor, "p n"]:
-    """The prior, or the rank by quality, or 1; 0 in padded slots."""
-    if pairs.prior is not None:
-        return pairs.prior
-    if pairs.quality is None:
-        return pairs.mask.to(torch.float64)
-    order = torch.sort(torch.where(pairs.mask, pairs.quality, torch.inf), dim=1, stable=True).indices
-    rank = torch.argsort(order, dim=1)
-    return torch.where(pairs.mask, 1 - rank / pairs.count[:, None], 0).to(torch.float64)
+def _weight(pair: Pair) -> Array:
+    """The prior, or the rank by quality, or 1: (n,)."""
+    if pair.prior is not None:
+        return pair.prior
+    if pair.quality is None:
+        return np.ones(pair.count)
+    rank = np.empty(pair.count, np.float32)  # as torch divides integers
+    rank[np.argsort(pair.quality, kind="stable")] = np.arange(pair.count)
+    return (np.float32(1) - rank / np.float32(pair.count)).astype(np.float64)
+
+
+def _median(F: Array, pair: Pair) -> float:
+    """The median squared residual of a model (9,), in the unit of the points."""
+    r2 = np.empty(pair.count)
+    residuals_squared(F, pair.points, 1.0, r2)
+    return lower_median(r2)

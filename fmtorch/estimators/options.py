@@ -6,18 +6,15 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-from fmtorch.estimators.registry import takes
-from fmtorch.geometry.robust_losses import named_kernel
+from fmtorch.geometry.sampson_objective_kernels import LOSSES
 
 Group = TypeVar("Group")
 
-DEFAULT_THRESHOLD_PX = 1.0
 
-
-def _at_least(least: int, **values: int) -> None:
+def _at_least(minimum: int, **values: int) -> None:
     for name, value in values.items():
-        if not value >= least:
-            raise ValueError(f"{name} is {value}; it must be at least {least}")
+        if not value >= minimum:
+            raise ValueError(f"{name} is {value}; it must be at least {minimum}")
 
 
 def _positive(**values: float) -> None:
@@ -28,10 +25,10 @@ def _positive(**values: float) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Preselect:
-    """A first look at the models of a round.
+    """A round's models compared on few matches first.
 
-    matches: looked at; any, or for a score that weighs them by their prior such as are drawn by it, each counting as
-    one. survivors: models that are scored on all matches.
+    matches: any, or for a score that weighs them by their prior such as are drawn by it, each counting as one.
+    survivors: models that are scored on all matches.
     """
 
     matches: int = 128
@@ -57,7 +54,8 @@ class Refine:
     RADIUS = 4.0  # scales: a match farther from all models of the pool is not looked at again
 
     def __post_init__(self) -> None:
-        named_kernel(self.kernel)
+        if self.kernel not in LOSSES:
+            raise ValueError(f"kernel is {self.kernel!r}; it must be one of: {', '.join(LOSSES)}")
         _positive(**{"refine.scale": self.scale})
         _at_least(0, **{"refine.iterations": self.iterations})
         if self.matches is not None:
@@ -132,21 +130,3 @@ def group(name: str, value: object, kind: type[Group]) -> Group | None:
     if missing:
         raise ValueError(f"{name}: {', '.join(missing)} is missing; the options are: {', '.join(known)}")
     return kind(**value)
-
-
-def thresholds(
-    threshold: float | None, inlier_threshold: float | None, score: Any, inliers: Any, stops: bool, optimization: Any
-) -> tuple[float, float]:
-    """The thresholds of score and of inliers, px; ValueError where one is given that nothing asks for.
-
-    score, inliers, optimization: as options name these parts. stops: whether there is a stopping rule, which counts
-    inliers.
-    """
-    by_distance = stops or takes("inliers", inliers, "threshold")
-    if inlier_threshold is not None and not by_distance:
-        raise ValueError(f"inlier_threshold={inlier_threshold} has no effect: inliers={inliers} takes none")
-    scored = takes("score", score, "threshold") or optimization is not None
-    if threshold is not None and not scored and (not by_distance or inlier_threshold is not None):
-        raise ValueError(f"threshold={threshold} has no effect: score={score} takes none, nor does anything else")
-    of_score = DEFAULT_THRESHOLD_PX if threshold is None else threshold
-    return of_score, of_score if inlier_threshold is None else inlier_threshold

@@ -7,63 +7,41 @@ An option that names a part holds its name (``score: msac``), or a mapping of it
 from __future__ import annotations
 
 import inspect
-import pkgutil
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
-from fmtorch.estimators.degeneracy import Degensac
-from fmtorch.estimators.final_fits import (
-    AdaptiveGaussNewton,
-    GaussNewton,
-    LeastSquares,
-    NoFit,
-    UnweightedLeastSquares,
-)
-from fmtorch.estimators.graph_cut import GraphCut
-from fmtorch.estimators.inliers import BetterHalf, RobustDeviations, WithinThreshold
-from fmtorch.estimators.sampling import PriorWeighted, Prosac, Uniform
-from fmtorch.estimators.saturated_gains import SaturatedGains
-from fmtorch.estimators.scores import InlierCount, Median, SigmaConsensus, TruncatedSquares
-from fmtorch.estimators.solvers import EightPoint, SevenPoint
+from fmtorch.estimators.families.fundamental import EightPoint, SevenPoint
+from fmtorch.estimators.families.homography import Homography
+from fmtorch.estimators.parts.degensac import Degensac
+from fmtorch.estimators.parts.final_fits import Adaptive, GaussNewton, LeastSquares, NoFit, UnweightedLeastSquares
+from fmtorch.estimators.parts.graph_cut import GraphCut
+from fmtorch.estimators.parts.inliers import BetterHalf, RobustDeviations, WithinThreshold
+from fmtorch.estimators.parts.median import Median
+from fmtorch.estimators.parts.sampling import PriorWeighted, Prosac, Uniform
+from fmtorch.estimators.parts.saturated import SaturatedGains
+from fmtorch.estimators.parts.scores import InlierCount, Magsac, Msac
 
+DEFAULT_THRESHOLD_PX = 1.0
 
-class Entry(NamedTuple):
-    """A part in its two forms. tensor: makes the one on padded tensors. kernel: name of the other within `one_pair`."""
-
-    tensor: Callable[..., Any]
-    kernel: str | None = None
-
-
-PARTS: dict[str, dict[str, Entry]] = {
-    "solver": {
-        "seven_point": Entry(SevenPoint, "solvers.SevenPoint"),
-        "eight_point": Entry(EightPoint, "solvers.EightPoint"),
-    },
-    "sampler": {
-        "uniform": Entry(Uniform, "sampling.Uniform"),
-        "prosac": Entry(Prosac, "sampling.Prosac"),
-        "prior": Entry(PriorWeighted, "sampling.PriorWeighted"),
-    },
+PARTS: dict[str, dict[str, Callable[..., Any]]] = {
+    "solver": {"seven_point": SevenPoint, "eight_point": EightPoint, "four_point": Homography},
+    "sampler": {"uniform": Uniform, "prosac": Prosac, "prior": PriorWeighted},
     "score": {
-        "inlier_count": Entry(InlierCount, "scores.InlierCount"),
-        "msac": Entry(TruncatedSquares, "scores.TruncatedSquares"),
-        "saturated": Entry(SaturatedGains, "saturated_gains.SaturatedGains"),
-        "magsac": Entry(SigmaConsensus, "scores.SigmaConsensus"),
-        "median": Entry(Median, "scores.Median"),
+        "inlier_count": InlierCount,
+        "msac": Msac,
+        "saturated": SaturatedGains,
+        "magsac": Magsac,
+        "median": Median,
     },
-    "degeneracy": {"degensac": Entry(Degensac, "degeneracy.Degensac")},
-    "local_optimization": {"graph_cut": Entry(GraphCut, "graph_cut.GraphCut")},
-    "inliers": {
-        "threshold": Entry(WithinThreshold, "inliers.WithinThreshold"),
-        "median": Entry(BetterHalf, "inliers.BetterHalf"),
-        "lmeds": Entry(RobustDeviations, "inliers.RobustDeviations"),
-    },
+    "degeneracy": {"degensac": Degensac},
+    "local_optimization": {"graph_cut": GraphCut},
+    "inliers": {"threshold": WithinThreshold, "median": BetterHalf, "lmeds": RobustDeviations},
     "final": {
-        "none": Entry(NoFit, "final_fits.NoFit"),
-        "least_squares": Entry(LeastSquares, "final_fits.LeastSquares"),
-        "unweighted_least_squares": Entry(UnweightedLeastSquares, "final_fits.LeastSquares"),
-        "gauss_newton": Entry(GaussNewton, "final_fits.GaussNewton"),
-        "adaptive": Entry(AdaptiveGaussNewton, "final_fits.AdaptiveGaussNewton"),
+        "none": NoFit,
+        "least_squares": LeastSquares,
+        "unweighted_least_squares": UnweightedLeastSquares,
+        "gauss_newton": GaussNewton,
+        "adaptive": Adaptive,
     },
 }
 
@@ -71,8 +49,8 @@ PARTS: dict[str, dict[str, Entry]] = {
 def takes(role: str, spec: Any, option: str) -> bool:
     """Whether a named part asks the engine for this option."""
     name = spec.get("name") if isinstance(spec, Mapping) else spec
-    entry = PARTS[role].get(name) if isinstance(name, str) else None
-    return entry is not None and option in inspect.signature(entry.tensor).parameters
+    make = PARTS[role].get(name) if isinstance(name, str) else None
+    return make is not None and option in inspect.signature(make).parameters
 
 
 def part(role: str, spec: Any, **context: Any) -> Any:
@@ -87,7 +65,7 @@ def part(role: str, spec: Any, **context: Any) -> Any:
     options.pop("name", None)
     if name not in PARTS[role]:
         raise ValueError(f"{role} is {name!r}; it must be one of: {', '.join(PARTS[role])}")
-    make = PARTS[role][name].tensor
+    make = PARTS[role][name]
     known = inspect.signature(make).parameters
     unknown = [key for key in options if key not in known]
     if unknown:
@@ -95,14 +73,19 @@ def part(role: str, spec: Any, **context: Any) -> Any:
     return make(**({key: value for key, value in context.items() if key in known} | options))
 
 
-def kernel_form(made: object, *others: object) -> Any:
-    """The kernel form of a part, with the same options; None where there is none, as of a user's own part.
+def thresholds(
+    threshold: float | None, inlier_threshold: float | None, score: Any, inliers: Any, stops: bool, optimization: Any
+) -> tuple[float, float]:
+    """The thresholds of score and of inliers, px; ValueError where one is given that nothing asks for.
 
-    others: parts in their kernel form that this one calls.
+    score, inliers, optimization: as options name these parts. stops: whether there is a stopping rule, which counts
+    inliers.
     """
-    for entries in PARTS.values():
-        for entry in entries.values():
-            if entry.tensor is type(made) and entry.kernel is not None:
-                module, _, name = entry.kernel.partition(".")
-                return pkgutil.resolve_name(f"fmtorch.estimators.one_pair.{module}:{name}")(made, *others)
-    return None
+    by_distance = stops or takes("inliers", inliers, "threshold")
+    if inlier_threshold is not None and not by_distance:
+        raise ValueError(f"inlier_threshold={inlier_threshold} has no effect: inliers={inliers} takes none")
+    scored = takes("score", score, "threshold") or optimization is not None
+    if threshold is not None and not scored and (not by_distance or inlier_threshold is not None):
+        raise ValueError(f"threshold={threshold} has no effect: score={score} takes none, nor does anything else")
+    of_score = DEFAULT_THRESHOLD_PX if threshold is None else threshold
+    return of_score, of_score if inlier_threshold is None else inlier_threshold

@@ -3,73 +3,120 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+import math
+from typing import NamedTuple, Protocol, runtime_checkable
 
-import torch
+import numpy as np
 
-from fmtorch.estimators.models import Models, Pool
-from fmtorch.estimators.pairs import NormalizedPairs
+from fmtorch.compiling.arrays import Array, F4x2, F8x1, I8x1
+from fmtorch.compiling.kernel import kernel
+from fmtorch.estimators.families.family import Family, Hypotheses
+from fmtorch.estimators.pair import Pair
+from fmtorch.estimators.parts.inliers import StoppingRule
+from fmtorch.estimators.parts.preselection import Preselection
+from fmtorch.estimators.parts.sampling import Sampler
+from fmtorch.geometry.rank2_kernels import assign
 
-Confident = Callable[[Any, Any, Any], list[bool]]
-"""Whether the best model of each pair, after so many draws, may be taken for the best there is; in either form."""
+
+@dataclasses.dataclass(eq=False)
+class Pool:
+    """The best models of a pair, F (k, 9) float32 with descending scores (k,), of which `filled` are there.
+
+    draws: minimal samples drawn.
+    """
+
+    F: Array
+    score: Array
+    filled: int = 0
+    draws: int = 0
+
+    @staticmethod
+    def empty(size: int) -> Pool:
+        """No model yet."""
+        return Pool(np.zeros((size, 9), np.float32), np.full(size, -np.inf))
+
+    @property
+    def models(self) -> Array:
+        """The models in float64, (m, 9); where there is none one of zeros."""
+        return self.F[: max(self.filled, 1)].astype(np.float64)
+
+    @property
+    def valid(self) -> Array:
+        """Which of `models` are there."""
+        return np.full(max(self.filled, 1), self.filled > 0)
+
+    def merge(self, models: Verified) -> None:
+        """Keep the best of this pool's models and the new ones; the earlier draw wins a tie."""
+        self.filled = merge(models.F, models.which, models.score, self.filled, self.F, self.score)
+
+
+class Verified(NamedTuple):
+    """A round's models (m, 9) float32; the indices `which` (k,) of those that passed, and their scores (k,)."""
+
+    F: Array
+    which: Array
+    score: Array
 
 
 @runtime_checkable
-class Generator(Protocol):
-    """Makes hypotheses of minimal samples. size: matches of a sample. samples_at_once: of all pairs; bounds memory."""
+class Degeneracy(Protocol):
+    """Completes the best model of a round where its sample is degenerate."""
 
-    size: int
-
-    def samples_at_once(self, device: torch.device) -> int:
-        """How many samples of all pairs are solved together; changes no result."""
-        ...
-
-    def __call__(self, pairs: NormalizedPairs, start: int, count: int) -> Models:
-        """The models of the draws start .. start + count - 1, in their order."""
+    def __call__(self, hypotheses: Hypotheses, models: Verified, best: float, pair: Pair) -> Verified:
+        """The models of a round with those completed. best: the score to beat."""
         ...
 
 
 @dataclasses.dataclass(frozen=True)
 class Search:
-    """One loop for every generator, in both forms: of pairs in tensors, and of one pair in arrays.
+    """Rounds of minimal samples: drawn, solved, scored, the best kept.
 
-    verify: scores models, drops weak ones. pool: the best models that are kept. hypotheses: samples drawn at most.
-    round: samples between two looks at the stopping rule `confident`, None: never before `hypotheses`. degeneracy:
-    completes a best model whose sample is degenerate. nothing: makes the empty pool of pairs, in the form of the parts.
+    pool: the best models that are kept. hypotheses: samples drawn at most. round: samples between two looks at the
+    stopping rule, None: never before `hypotheses`.
     """
 
-    generator: Any  # a Generator, or its kernel form
-    verify: Callable[[Any, Any], Any]
+    family: Family
+    sampler: Sampler
+    preselection: Preselection
     pool: int
     hypotheses: int
     round: int
-    confident: Confident | None = None
-    degeneracy: Any = None  # a Degensac, or its kernel form
-    nothing: Callable[[Any, int], Any] = Pool.of
+    stop: StoppingRule | None = None
+    degeneracy: Degeneracy | None = None
 
-    def __call__(self, pairs: NormalizedPairs, start: int = 0) -> Pool:
-        """The best models of each pair. start: draws made before."""
-        at_once = self.generator.samples_at_once(pairs.points.device) // min(self.hypotheses, self.round)
-        tiles = torch.split(torch.arange(len(pairs), device=pairs.row.device), max(1, at_once))
-        return Pool.joined([self.rounds(pairs.only(tile), start) for tile in tiles])
-
-    def rounds(self, pairs: Any, start: int = 0) -> Any:
-        """The pool of pairs that are searched together. start: draws made before."""
-        pool = self.nothing(pairs, self.pool)
-        active = list(range(len(pairs)))
-        end = start + self.hypotheses
-        while start < end and active:
+    def __call__(self, pair: Pair, start: int = 0) -> Pool:
+        """The best models of a pair. start: draws made before."""
+        pool, end = Pool.empty(self.pool), start + self.hypotheses
+        while start < end:
             count = min(self.round, end - start)
-            some = pairs.only(active)
-            models = self.verify(self.generator(some, start, count), some)
+            sample = self.sampler.draw(pair, start, count, self.family.size)
+            hypotheses = self.family.solve(pair, sample, start)
+            models = Verified(hypotheses.F, *self.preselection(hypotheses.F, pair))
             if self.degeneracy is not None:
-                models = self.degeneracy(models, pool.best_score(active), some)
+                models = self.degeneracy(hypotheses, models, float(pool.score[0]), pair)
             start += count
-            pool.merge(active, models)
-            pool.drawn(active, start)
-            if self.confident is not None and start < end:
-                F, drawn = pool.best(active)
-                done = self.confident(F, drawn, some)
-                active = [row for row, stop in zip(active, done, strict=True) if not stop]
+            pool.merge(models)
+            pool.draws = start
+            if self.stop is not None and start < end and self.stop(pool.F[0], start, pair, self.family.size):
+                break
         return pool
+
+
+@kernel(holds_gil=True)
+def merge(F: F4x2, which: I8x1, score: F8x1, filled: int, pool: F4x2, pool_score: F8x1) -> int:
+    """Models F[which] (m, 9) with scores (k,) among the best so far -> pool (p, 9); how many there are.
+
+    filled: places of the pool in use, which are sorted, best first. A score that is not finite is that of no model.
+    """
+    for k in range(len(which)):
+        if not math.isfinite(score[k]) or (filled == len(pool_score) and not score[k] > pool_score[filled - 1]):
+            continue
+        place = min(filled, len(pool_score) - 1)
+        while place > 0 and pool_score[place - 1] < score[k]:
+            pool_score[place] = pool_score[place - 1]
+            assign(pool[place], pool[place - 1])
+            place -= 1
+        pool_score[place] = score[k]
+        assign(pool[place], F[which[k]])
+        filled = min(filled + 1, len(pool_score))
+    return filled

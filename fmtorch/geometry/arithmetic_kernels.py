@@ -1,4 +1,7 @@
-"""exp and log by arithmetic alone, compiled: the same operations, hence the same bits, as in the tensor form."""
+"""exp and log by arithmetic alone, compiled: the same operations, hence the same bits, as in the tensor form.
+
+Functions of the C library differ in the last bit from version to version.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from typing import Any
 
 from fmtorch.compiling.kernel import inner
 
-ROOT2, LOG2 = math.sqrt(2), math.log(2)
+ROOT2, LOG2, LOG10 = math.sqrt(2), 0.6931471805599453, 2.302585092994046
 
 
 @inner
@@ -27,9 +30,22 @@ def logarithm(x: float) -> Any:
     """ln(x) of a positive number: the series of atanh at the mantissa."""
     mantissa, exponent = math.frexp(x)
     m = mantissa * ROOT2
-    z = (m - 1) / (m + 1)
+    return twice_atanh((m - 1) / (m + 1)) + (exponent - 0.5) * LOG2
+
+
+@inner
+def logarithm_1p(x: float) -> Any:
+    """ln(1 + x) for x > -1, to rounding also near 0."""
+    if -0.25 < x < 0.4:
+        return twice_atanh(x / (x + 2))
+    return logarithm(1 + x) if x < math.inf else x
+
+
+@inner
+def twice_atanh(z: Any) -> Any:
+    """ln((1 + z) / (1 - z)) for |z| up to (sqrt 2 - 1) / (sqrt 2 + 1), to rounding, by its series. Of tensors, too."""
     z2 = z * z
-    series = 1 / 19
-    for k in range(17, 0, -2):
+    series = z2 * (1 / 19) + 1 / 17
+    for k in range(15, 0, -2):
         series = series * z2 + 1 / k
-    return 2 * z * series + (exponent - 0.5) * LOG2
+    return 2 * z * series

@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.geometry.arithmetic import sqrt
+
 _NEGLIGIBLE = 1e-60  # relative to the largest coefficient: counts as zero, so that no power over- or underflows
 _SEPARATION = 1e-4  # relative to the outermost root: the others are found as those of the quadratic that remains
 _POLISHING_STEPS = 2  # the closed form is good to 1e-8, the quadratic to 1e-4, and Newton's method squares that
@@ -74,16 +76,16 @@ def _depressed(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> tuple[Tensor, Tens
     three = discriminant <= 0
     sign = torch.where(Q < 0, 1.0, -1.0).to(a.dtype)
     # Three real roots: t = m y, y^3 - 3 y = 2 r with r in [0, 1] and the extreme root y in [sqrt 3, 2].
-    m = torch.where(three, -P, 1.0).clamp_min(0).sqrt()
+    m = sqrt(torch.where(three, -P, 1.0).clamp_min(0))
     m3 = m * m * m
     r = torch.where(m3 > 0, Q.abs() / torch.where(m3 > 0, m3, 1.0), 0.0).clamp_max(1.0)
     y = torch.full_like(r, 2.0)
     for _ in range(5):  # quadratic from an error of at most 0.27
         y = (2 * y * y * y + 2 * r) / (3 * (y * y - 1))
-    y1 = -(y + (3 * (2 - y).clamp_min(0) * (2 + y)).sqrt()) / 2
+    y1 = -(y + sqrt(3 * (2 - y).clamp_min(0) * (2 + y))) / 2
     t3 = torch.stack([y, y1, 2 * r / (y * y1)]) * (sign * m)
     # One real root: u^3 = -Q -+ sqrt(D), without cancellation.
-    root = torch.where(three, 0.0, discriminant).sqrt()
+    root = sqrt(torch.where(three, 0.0, discriminant))
     u = cube_root(torch.where(three, 1.0, Q.abs() + root))
     v = P / u
     t1 = torch.where(P < 0, u - v, 2 * Q.abs() / (u * u + P + v * v)) * sign
@@ -96,7 +98,7 @@ def _quadratic(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
     """Roots of a z^2 + b z + c, of which a, or a and b, may be zero."""
     discriminant = b * b - 4 * a * c
     real = discriminant >= 0
-    w = -(b + torch.copysign(torch.where(real, discriminant, 0.0).sqrt(), b)) / 2
+    w = -(b + torch.copysign(sqrt(torch.where(real, discriminant, 0.0)), b)) / 2
     near = torch.where(w == 0, 0.0, c / torch.where(w == 0, 1.0, w))
     far = torch.where(a == 0, 0.0, w / torch.where(a == 0, 1.0, a))
     return torch.stack([near, far]), torch.stack([real & ((w != 0) | (a != 0)), real & (a != 0)])

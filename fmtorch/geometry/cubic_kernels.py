@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.compiling.kernel import inner
@@ -26,7 +27,7 @@ def cubic_roots(c: Array, roots: Array, valid: Array) -> None:
         if abs(c[k]) < NEGLIGIBLE:
             c[k] = 0.0
     a, b, d = c[0], c[1], c[3]
-    apart = abs(a * c[2]) <= SEPARATION * b * b and a * a * abs(d) <= SEPARATION**2 * abs(b) ** 3 and b != 0
+    apart = abs(a * c[2]) <= SEPARATION * b * b and a * a * abs(d) <= SEPARATION**2 * (b * b * abs(b)) and b != 0
     if a == 0 or apart:
         _quadratic(b, c[2], d, roots, valid)
         valid[2] = a != 0
@@ -81,7 +82,9 @@ def _quadratic(a: float, b: float, c: float, roots: Array, valid: Array) -> None
 
 @inner
 def _cube_root(x: float) -> Any:
-    """The cube root of a positive number: the library's, with one step of Halley's method."""
-    y = x ** (1 / 3)
-    y3 = y * y * y
-    return y * ((y3 + 2 * x) / (2 * y3 + x))
+    """`cubic.cube_root`, the same bits: Halley's method from a third of the exponent."""
+    y = np.int64(np.float64(x).view(np.int64) // 3 + 0x2A9F7893782DA1CE).view(np.float64)
+    for _ in range(3):
+        y3 = y * y * y
+        y = y * ((y3 + 2 * x) / (2 * y3 + x))
+    return y

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.geometry.arithmetic import component_sum, outer_sum
+from fmtorch.geometry.arithmetic import component_sum, outer_sum, sqrt
 
 SHIFT = 1e-14  # relative to the trace: above the rounding error of the factorisation, below any eigenvalue that counts
 RANK_TOLERANCE = 1e-12  # relative to the trace: relative errors of 1e-6 in the rows that M was summed from
@@ -87,7 +87,7 @@ def _inverse_power(M: Tensor) -> tuple[Tensor, Tensor]:
             break
     best = X.diagonal(dim1=0, dim2=1).movedim(-1, 0).argmax(0)
     v = torch.gather(X, 0, best[None, None].expand(1, *X.shape[1:]))[0]
-    v = v / component_sum(v * v).sqrt()
+    v = v / sqrt(component_sum(v * v))
     across = (1 - component_sum(v * component_sum(inverse * v, 1))) * size  # the sum of 1 / eigenvalue over the others
     return v, nonzero & (across * RANK_TOLERANCE < 1)
 

@@ -168,8 +168,7 @@ def lines_through(F: Tensor, x: Tensor) -> list[Tensor]:
 def inverse_root(squared: Tensor) -> Tensor:
     """1 / sqrt(squared), and 0 with zero gradient where squared = 0.
 
-    On a CPU root and quotient are each rounded correctly; `sqrt` of contiguous float64 is not where torch takes it from
-    MKL.
+    On a CPU `rsqrt` rounds root and quotient correctly, one after the other, as `arithmetic.sqrt` and a division do.
     """
     positive = squared != 0  # NaN stays NaN
     return torch.where(positive, torch.where(positive, squared, 1.0).rsqrt(), 0.0)

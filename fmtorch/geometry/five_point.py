@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fmtorch.geometry.arithmetic import component_sum, cross
+from fmtorch.geometry.arithmetic import component_sum, cross, sqrt
 from fmtorch.geometry.nullspace import null_space
 
 GRID = 64  # intervals of the projective line in which a root is looked for
@@ -171,7 +171,7 @@ def _solutions(
         ]
     )
     E = component_sum(basis.index_select(2, sample) * weights[:, None])
-    norm = component_sum(E * E).sqrt()
+    norm = sqrt(component_sum(E * E))
     valid = norm.isfinite() & (norm > 0)
     return (E / norm)[:, valid], sample[valid]
 

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.geometry.arithmetic import as_rows, component_sum, cross, matmul3, stable_sum
+from fmtorch.geometry.arithmetic import as_rows, component_sum, cross, matmul3, sqrt, stable_sum
 from fmtorch.geometry.eigenvector import smallest_eigenvector
 from fmtorch.geometry.normalize import normalize_points
 
@@ -79,7 +79,7 @@ def plane_and_parallax(
     size2 = component_sum(lines[:, 0].square()) * component_sum(lines[:, 1].square()) * component_sum(H * H)
     rounding = 16 * torch.finfo(F.dtype).eps  # of cross products that should vanish, as of a match taken twice
     valid = (norm2 > rounding**2 * size2) & norm2.isfinite()
-    return torch.where(valid, F / torch.where(valid, norm2, 1.0).sqrt(), 0.0), valid
+    return torch.where(valid, F / sqrt(torch.where(valid, norm2, 1.0)), 0.0), valid
 
 
 def cross_times(e: Float[Tensor, " 3 *s"], A: Float[Tensor, " 9 *s"]) -> Float[Tensor, " 9 *s"]:

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.geometry.arithmetic import component_sum, determinant
+from fmtorch.geometry.arithmetic import component_sum, determinant, sqrt
 from fmtorch.geometry.cubic import cubic_roots
 from fmtorch.geometry.nullspace import null_space
 from fmtorch.geometry.rank2 import rank2_components
@@ -29,7 +29,7 @@ def seven_point_components(
     basis, full_rank = null_space(_equations(points))
     F0, F1, coefficients = _cubic(basis)
     roots, real = cubic_roots(coefficients)
-    cosine = 1.0 / (1.0 + roots * roots).sqrt()
+    cosine = 1.0 / sqrt(1.0 + roots * roots)
     a, b = cosine.to(points.dtype), (roots * cosine).to(points.dtype)
     valid = real & full_rank & finite
     F = a * F0[:, None] + b * F1[:, None]
@@ -49,7 +49,7 @@ def eight_point_components(points: Float[Tensor, " 4 8 *s"]) -> tuple[Float[Tens
     F = _denormalise(f, scale.to(f.dtype), centroid.to(f.dtype)).reshape(9, *null.shape[2:])
     norm = component_sum(F * F)
     valid = full_rank & finite & spread & (norm > 0)
-    F = F / torch.where(valid, norm, 1.0).sqrt()
+    F = F / sqrt(torch.where(valid, norm, 1.0))
     return torch.where(valid, F, 0.0).to(points.dtype), valid
 
 
@@ -98,7 +98,7 @@ def _hartley(points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     centred = x - centroid[:, :, None]
     d2 = component_sum(centred * centred, 1)
     away = d2 > 0
-    distance = torch.where(away, torch.where(away, d2, 1.0).sqrt(), 0.0)
+    distance = torch.where(away, sqrt(torch.where(away, d2, 1.0)), 0.0)
     mean = component_sum(distance, 1) / x.shape[2]
     spread = mean > 4 * torch.finfo(x.dtype).eps * centroid.detach().abs().amax(1)
     scale = torch.where(spread, 2**0.5 / torch.where(spread, mean, 1.0), 1.0)

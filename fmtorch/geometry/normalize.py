@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.geometry.arithmetic import component_sum, matmul3, stable_sum
+from fmtorch.geometry.arithmetic import component_sum, matmul3, sqrt, stable_sum
 from fmtorch.geometry.epipolar import unit_frobenius
 
 
@@ -109,7 +109,7 @@ def _mean_distance(centred: Tensor, w: Tensor) -> Tensor:
     """The mean distance to the origin; a point at the origin has gradient zero."""
     d2 = component_sum(centred * centred, -1)
     away = d2 > 0
-    distance = torch.where(away, torch.where(away, d2, 1.0).sqrt(), 0.0)
+    distance = torch.where(away, sqrt(torch.where(away, d2, 1.0)), 0.0)
     total = stable_sum(w, -1)
     return stable_sum(w * distance, -1) / torch.where(total > 0, total, 1.0)
 

@@ -63,4 +63,5 @@ def _about_unit(F: Float[Tensor, "p k 3 3"]) -> Float[Tensor, "p k 3 3"]:
     """Matrices scaled by a power of two, which rounds nothing, so that no square under- or overflows."""
     largest = F.detach().abs().amax((-2, -1), keepdim=True)
     usual = (largest > 1e-300) & (largest < 1e300)
-    return F / torch.exp2(torch.floor(torch.log2(torch.where(usual, largest, 1))))
+    largest = torch.where(usual, largest, 1)
+    return F / (largest / (2 * torch.frexp(largest).mantissa))  # the power of two below the largest entry: exact

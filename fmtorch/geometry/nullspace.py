@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.geometry.arithmetic import component_sum
+from fmtorch.geometry.arithmetic import component_sum, sqrt
 
 RANK_TOLERANCE = 64
 """A row counts as dependent on the rows before it when less than this many eps of its length is left over."""
@@ -32,7 +32,7 @@ def null_space(A: Float[Tensor, "m n *s"]) -> tuple[Float[Tensor, "k n *s"], Boo
         head, tail = row[0], row[1:]
         products = component_sum(rows * row, 1)
         remainder2 = products[0]
-        norm = torch.where(remainder2 > 0, remainder2, 1.0).sqrt()
+        norm = sqrt(torch.where(remainder2 > 0, remainder2, 1.0))
         shift = torch.copysign(norm, head)
         head = head + shift
         scale = 1.0 / (shift * head)

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.geometry.arithmetic import as_rows, cofactors, component_sum, stable_sum, unit
+from fmtorch.geometry.arithmetic import as_rows, cofactors, component_sum, sqrt, stable_sum, unit
 from fmtorch.geometry.rank2_manifold import RANK_TWO, constant, start
 from fmtorch.geometry.residuals import homogeneous, linearise
 from fmtorch.geometry.robust_losses import Kernel
@@ -60,7 +60,7 @@ def at_optimum(
         C = cofactors(as_rows(model)).flatten(0, 1)
         size = component_sum(C * C)
         valid = valid & (size > 0)
-        normal = C / torch.where(size > 0, size, 1).sqrt()
+        normal = C / sqrt(torch.where(size > 0, size, 1))
         curved = robust._replace(weight=robust.curvature)  # Newton's weights of J^T J, not those of IRLS
         gauss_newton = SampsonObjective(points, weight, curved, scale)(model, True)[0][:9, :9].movedim((0, 1), (-2, -1))
         frame = torch.stack([model, normal], -1).movedim(0, -2)

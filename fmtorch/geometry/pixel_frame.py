@@ -38,8 +38,9 @@ class PixelFrame(NamedTuple):
         centre = torch.where(some[:, None], (low + high) / 2, 0)
         half = torch.where(some, ((high - low) / 2).amax(-1), 0)
         spread = half > 0
-        mantissa, exponent = torch.frexp(half.clamp(1e-300, 1e300))
-        unit = torch.exp2(torch.where(mantissa == 0.5, exponent - 1, exponent).to(half.dtype))
+        half = half.clamp(1e-300, 1e300)
+        mantissa = torch.frexp(half).mantissa
+        unit = torch.where(mantissa == 0.5, half, half / mantissa)  # the power of two from there up: exact
         return cls(centre, torch.where(spread, unit, 1), spread)
 
     def normalized(self, pixels: Float[Tensor, "p n 4"]) -> Float[Tensor, "p n 4"]:
@@ -50,6 +51,10 @@ class PixelFrame(NamedTuple):
         """Fundamental matrices of points in the frame as those of pixels, of any scale."""
         T0, T1 = self._from_pixels(0), self._from_pixels(2)
         return matmul3(matmul3(T1.mT, F), T0)
+
+    def homography_to_pixels(self, H: Float[Tensor, "p k 3 3"]) -> Float[Tensor, "p k 3 3"]:
+        """Homographies of points in the frame as those of pixels, of any scale."""
+        return matmul3(matmul3(self._to_pixels(2), H), self._from_pixels(0))
 
     def from_pixels(self, F: Float[Tensor, "p k 3 3"]) -> Float[Tensor, "p k 3 3"]:
         """Fundamental matrices of pixels as those of points in the frame, of any scale."""

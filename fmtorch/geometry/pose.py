@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fmtorch.geometry.arithmetic import cofactors, component_sum, cross, product
+from fmtorch.geometry.arithmetic import cofactors, component_sum, cross, product, sqrt
 from fmtorch.geometry.rank2 import complement, last_right_singular_vector
 
 
@@ -93,7 +93,7 @@ def _essential(E: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     cosine, sine = a + sign * d, c - sign * b
     norm2 = cosine * cosine + sine * sine  # the square of s1 + s2
     two = (determinant.detach().abs() > 1e-10 * norm2.detach()) & (norm2.detach() > 0)
-    norm = torch.where(two, norm2, 1.0).sqrt()
+    norm = sqrt(torch.where(two, norm2, 1.0))
     cosine, sine = torch.where(two, cosine, 1.0) / norm, torch.where(two, sine, 0.0) / norm
     left0, left1 = cosine * p0 + sine * p1, sign * (cosine * p1 - sine * p0)
     return left0[:, None] * q0 + left1[:, None] * q1, u, two

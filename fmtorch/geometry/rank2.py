@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.geometry.arithmetic import cofactors, component_sum, determinant
+from fmtorch.geometry.arithmetic import cofactors, component_sum, determinant, sqrt
 
 GAP = 1e-6
 """Eigenvalue gaps of F^T F below this share of its largest eigenvalue have their gradient held finite."""
@@ -85,7 +85,7 @@ def _scaled(A: Tensor) -> Tensor:
 def _unit(x: Tensor, fallback: Tensor) -> Tensor:
     """x at unit length, or `fallback` where it has none."""
     norm2 = component_sum(x * x)
-    return torch.where(norm2 > 0, x / torch.where(norm2 > 0, norm2, 1.0).sqrt(), fallback)
+    return torch.where(norm2 > 0, x / sqrt(torch.where(norm2 > 0, norm2, 1.0)), fallback)
 
 
 def _largest_eigenvector(K: Tensor) -> Tensor:
@@ -98,13 +98,13 @@ def _largest_eigenvector(K: Tensor) -> Tensor:
     D = K.clone()
     for i in range(3):
         D[i, i] = K[i, i] - mean
-    m = (component_sum(component_sum(D * D, 1)) / 6).sqrt()
+    m = sqrt(component_sum(component_sum(D * D, 1)) / 6)
     X = D / torch.where(m > 0, m, 1.0)
     constant = determinant(X).clamp(-2.0, 2.0)
     y = torch.full_like(m, 2.0)
     for _ in range(5):
         y = (2 * y * y * y + constant.abs()) / (3 * (y * y - 1))
-    middle = ((3 * (2 - y).clamp_min(0) * (2 + y)).sqrt() + y) / 2
+    middle = (sqrt(3 * (2 - y).clamp_min(0) * (2 + y)) + y) / 2
     largest = torch.where(constant >= 0, y, middle)
     for i in range(3):
         X[i, i] = X[i, i] - largest

@@ -1,30 +1,26 @@
-"""`rank2_manifold` for the models of one pair, compiled: starts and steps."""
+"""Unit matrices of rank 2, for the models of one pair: starts, steps, and how an optimum moves."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from fmtorch.compiling.arrays import Array, F8x1, F8x2
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.lanes import LANES, load, store
-from fmtorch.geometry.rank2_kernels import cofactors, unit
+from fmtorch.compiling.scratch import matrix, vector
+from fmtorch.geometry.rank2_kernels import assign, cofactors, unit
+from fmtorch.geometry.sampson_objective_kernels import Weighted, evaluate
 
-Array = NDArray[Any]
-
-
-@kernel("f8[:, ::1], i8, f8[:, ::1], f8[:, ::1], f8[:, ::1]")
-def start(F: Array, squarings: int, G: Array, e0: Array, e1: Array) -> None:
-    """`rank2_manifold.start` of models (k, 9) -> G (k, 9), epipoles e0, e1 (k, 3)."""
-    for k in range(len(F)):
-        start_one(F[k], squarings, G[k], e0[k], e1[k])
+SQUARINGS = 5  # by which any model is made rank 2 to the last bits
 
 
 @inner
 def start_one(F: Array, squarings: int, G: Array, e0: Array, e1: Array) -> None:
-    """`start` of one model (9,)."""
-    C, K, P = np.empty(9), np.empty((3, 3)), np.empty((3, 3))
+    """The unit matrix of rank 2 near a model (9,) -> G, and its epipoles -> e0, e1 (3,).
+
+    squarings: of the matrix whose columns tend to the null vector; more for models that are farther from rank 2.
+    """
+    C, K, P = vector(9), matrix(3, 3), matrix(3, 3)
     for i in range(9):
         G[i] = F[i]
     unit(G)
@@ -62,39 +58,70 @@ def start_one(F: Array, squarings: int, G: Array, e0: Array, e1: Array) -> None:
     unit(e1)
 
 
-@kernel("f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]")
-def step(
-    products: Array, F: Array, e0: Array, e1: Array, damping: Array, G: Array, g0: Array, g1: Array
-) -> None:  # fmt: skip
-    """Damped Gauss-Newton steps of models (k, 9), epipoles (k, 3) -> G (k, 9), g0, g1 (k, 3), again of rank 2.
+@kernel(holds_gil=True)
+def gauss_newton(F: F8x1, matches: Weighted, damping: float, out: F8x1) -> None:
+    """One damped Gauss-Newton step of a model (9,) on the manifold -> out (9,), of unit norm."""
+    at, e0, e1 = matrix(1, 9), matrix(1, 3), matrix(1, 3)
+    moved, g0, g1 = matrix(1, 9), matrix(1, 3), matrix(1, 3)
+    products, cost = np.empty((1, 10, 10)), vector(1)
+    start_one(F, SQUARINGS, at[0], e0[0], e1[0])
+    evaluate(at, matches, True, products, cost)
+    steps(products, at, e0, e1, np.full(1, damping), moved, g0, g1)
+    assign(out, moved[0])
 
-    products: (k, 10, 10), of `sampson_objective_kernels.evaluate`. damping: (k,).
+
+@kernel(holds_gil=True)
+def response(F: F8x1, matches: Weighted, damping: float, out: F8x2) -> None:
+    """How an optimum (9,) moves with the gradient of its cost by the nine entries -> out (9, 9), minus inverse Hessian.
+
+    By the implicit function theorem, in the tangent space of the manifold, with Gauss and Newton's Hessian.
     """
-    steps(products, F, e0, e1, damping, G, g0, g1)
+    at, e0, e1 = matrix(1, 9), matrix(1, 3), matrix(1, 3)
+    products, cost, Q = np.empty((1, 10, 10)), vector(1), np.zeros((20, LANES))
+    start_one(F, SQUARINGS, at[0], e0[0], e1[0])
+    evaluate(at, matches, True, products, cost)
+    for j in range(9):
+        _system(products[0], at[0], e0[0], e1[0], damping, Q)
+        for r in range(10):
+            Q[2 * r + 1, 10 - LANES] = -1.0 if r == j else 0.0
+        eliminate(Q, 10)
+        for i in range(9):
+            out[i, j] = Q[2 * i + 1, 10 - LANES]
 
 
 @inner
 def steps(
     products: Array, F: Array, e0: Array, e1: Array, damping: Array, G: Array, g0: Array, g1: Array
 ) -> None:  # fmt: skip
-    """`step`, for kernels."""
-    Q, C = np.zeros((20, LANES)), np.empty(9)  # two rows of LANES for each of (10, 11)
+    """Damped Gauss-Newton steps of models (k, 9), epipoles (k, 3) -> G (k, 9), g0, g1 (k, 3), again of rank 2.
+
+    products: (k, 10, 10), of `sampson_objective_kernels.evaluate`. damping: (k,).
+    """
+    Q, C = np.zeros((20, LANES)), vector(9)
     for k in range(len(F)):
-        curvature = 0.0
-        for i in range(9):
-            curvature = max(curvature, products[k, i, i])
+        _system(products[k], F[k], e0[k], e1[k], damping[k], Q)
         for r in range(9):
-            for c in range(9):
-                Q[2 * r + c // LANES, c % LANES] = products[k, r, c] + curvature * F[k, r] * F[k, c]
-            Q[2 * r + r // LANES, r % LANES] += curvature * damping[k]
-            normal = e1[k, r // 3] * e0[k, r % 3]
-            Q[2 * r + 1, 9 - LANES], Q[18 + r // LANES, r % LANES] = normal, normal
             Q[2 * r + 1, 10 - LANES] = -products[k, r, 9]
-        Q[19, 9 - LANES], Q[19, 10 - LANES] = 0.0, 0.0
+        Q[19, 10 - LANES] = 0.0
         eliminate(Q, 10)
         for i in range(9):
             G[k, i] = F[k, i] + Q[2 * i + 1, 10 - LANES]
         _retract(G[k], e0[k], e1[k], g0[k], g1[k], C)
+
+
+@inner
+def _system(products: Array, F: Array, e0: Array, e1: Array, damping: float, Q: Array) -> None:
+    """The damped normal equations of a model -> Q, (10, 11) in two rows of LANES each, without right side."""
+    curvature = 0.0
+    for i in range(9):
+        curvature = max(curvature, products[i, i])
+    for r in range(9):
+        for c in range(9):
+            Q[2 * r + c // LANES, c % LANES] = products[r, c] + curvature * F[r] * F[c]
+        Q[2 * r + r // LANES, r % LANES] += curvature * damping
+        normal = e1[r // 3] * e0[r % 3]
+        Q[2 * r + 1, 9 - LANES], Q[18 + r // LANES, r % LANES] = normal, normal
+    Q[19, 9 - LANES] = 0.0
 
 
 @inner

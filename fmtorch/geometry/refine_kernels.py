@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fmtorch.compiling.arrays import Array, F8x1, F8x2
 from fmtorch.compiling.kernel import inner, kernel
-from fmtorch.geometry.levenberg_marquardt_kernels import levenberg_marquardt
+from fmtorch.compiling.scratch import matrix, vector
+from fmtorch.geometry.levenberg_marquardt_kernels import Schedule, levenberg_marquardt
 from fmtorch.geometry.rank2_kernels import assign, assign_rows
 from fmtorch.geometry.rank2_manifold_kernels import start_one, steps
-from fmtorch.geometry.sampson_objective_kernels import evaluate
+from fmtorch.geometry.sampson_objective_kernels import Weighted, evaluate
 
-Array = NDArray[Any]
 MIN_DAMPING, MAX_DAMPING = 1e-12, 1e6  # as in `refine`
 
 
@@ -28,38 +28,30 @@ class _State(NamedTuple):
 
 
 class _Data(NamedTuple):
-    """What `evaluate` takes of the matches; tolerance: of `refine`."""
+    """The matches; tolerance: of the schedule."""
 
-    points: Array
-    weight: Array
-    s2: Array
-    loss: int
-    table: Array
+    matches: Weighted
     tolerance: float
 
 
-@kernel("f8[:, ::1], i8, f8[:, ::1], f8[::1], f8[::1], i8, f8[:, ::1], i8, f8, f8, f8[:, ::1], f8[::1]")
-def refine(
-    F: Array, squarings: int, points: Array, weight: Array, s2: Array, loss: int, table: Array, iterations: int,
-    first_damping: float, tolerance: float, out: Array, cost: Array,
-) -> None:  # fmt: skip
+@kernel
+def refine(F: F8x2, squarings: int, matches: Weighted, schedule: Schedule, out: F8x2, cost: F8x1) -> None:
     """Models (k, 9) made rank 2 and refined -> out (k, 9), cost (k,); what cannot be is not finite, nor its cost.
 
-    points, weight, s2, loss, table: of `sampson_objective_kernels.evaluate`. squarings: of `start_one`. tolerance: a
-    model is done once a step has lowered its cost by no more than this share of it; 0: none is ever done.
+    squarings: of `start_one`.
     """
     k = len(F)
-    state = _State(out, np.empty((k, 3)), np.empty((k, 3)), np.empty((k, 10, 10)), cost)
-    trial = _State(np.empty((k, 9)), np.empty((k, 3)), np.empty((k, 3)), np.empty((k, 10, 10)), np.empty(k))
-    data = _Data(points, weight, s2, loss, table, tolerance)
+    state = _State(out, matrix(k, 3), matrix(k, 3), np.empty((k, 10, 10)), cost)
+    trial = _State(matrix(k, 9), matrix(k, 3), matrix(k, 3), np.empty((k, 10, 10)), vector(k))
+    data = _Data(matches, schedule.tolerance)
     for i in range(k):
         start_one(F[i], squarings, state.F[i], state.e0[i], state.e1[i])
-    _minimise(data, state, trial, np.full(k, first_damping), iterations, tolerance > 0)
+    _minimise(data, state, trial, np.full(k, schedule.damping), schedule.iterations, schedule.tolerance > 0)
 
 
 @inner
 def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
-    evaluate(state.F, data.points, data.weight, data.s2, data.loss, data.table, derivatives, state.products, state.cost)
+    evaluate(state.F, data.matches, derivatives, state.products, state.cost)
 
 
 @inner

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from fmtorch.geometry.arithmetic import logarithm_1p, sqrt
 from fmtorch.geometry.sigma_consensus import tabulated_curvature, tabulated_loss, tabulated_weight
 
 
@@ -31,12 +32,12 @@ class Kernel(NamedTuple):
 
 def huber_loss(r2: Tensor, s2: Tensor) -> Tensor:
     """``r^2`` up to the scale s, ``2 s |r| - s^2`` beyond (Huber 1964)."""
-    return torch.where(r2 <= s2, r2, 2 * (s2 * torch.maximum(r2, s2)).sqrt() - s2)
+    return torch.where(r2 <= s2, r2, 2 * sqrt(s2 * torch.maximum(r2, s2)) - s2)
 
 
 def huber_weight(r2: Tensor, s2: Tensor) -> Tensor:
     """1 up to the scale s, ``s / |r|`` beyond."""
-    return (s2 / torch.maximum(r2, s2)).sqrt()
+    return sqrt(s2 / torch.maximum(r2, s2))
 
 
 def huber_curvature(r2: Tensor, s2: Tensor) -> Tensor:
@@ -46,7 +47,7 @@ def huber_curvature(r2: Tensor, s2: Tensor) -> Tensor:
 
 def cauchy_loss(r2: Tensor, s2: Tensor) -> Tensor:
     """``s^2 log(1 + r^2 / s^2)``."""
-    return s2 * torch.log1p(r2 / s2)
+    return s2 * logarithm_1p(r2 / s2)
 
 
 def cauchy_weight(r2: Tensor, s2: Tensor) -> Tensor:

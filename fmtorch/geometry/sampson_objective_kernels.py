@@ -3,33 +3,49 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fmtorch.compiling.arrays import Array, F8x1, F8x2, F8x3
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.lanes import LANES, added, fill, load, sqrt, store, where
+from fmtorch.compiling.scratch import matrix
+from fmtorch.geometry.arithmetic_kernels import logarithm_1p
+from fmtorch.geometry.magsac import LOSS_TABLE
 
-Array = NDArray[Any]
 TINY = 1e-30  # as in `residuals`
 HUBER, CAUCHY, GEMAN_MCCLURE, TRUNCATED, MAGSAC = 0, 1, 2, 3, 4  # losses
 LOSSES = {"huber": HUBER, "cauchy": CAUCHY, "geman_mcclure": GEMAN_MCCLURE, "truncated": TRUNCATED, "magsac": MAGSAC}
+NO_TABLE = np.empty((2, 0))
 MATCH = 6  # rows of LANES matches: x0, y0, x1, y1, their weights, squared scales
 
 
-@kernel("f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], i8, f8[:, ::1], b1, f8[:, :, ::1], f8[::1]")
-def evaluate(
-    F: Array, points: Array, weight: Array, s2: Array, loss: int, table: Array, derivatives: bool, products: Array,
-    cost: Array,
-) -> None:  # fmt: skip
-    """`SampsonObjective` of models (k, 9), points (4, n), weights (n,) -> products (k, 10, 10), if wanted; cost (k,).
+def loss_table(loss: str) -> Array:
+    """What `Weighted.table` is for a loss of this name."""
+    return LOSS_TABLE if loss == "magsac" else NO_TABLE
 
-    s2: (n,), squared scales of the loss, a code. table: (2, t + 2), of the loss MAGSAC, its weight at the ends of t
-    intervals of r^2 / s^2 and beyond, and the weight's integral up to there.
+
+class Weighted(NamedTuple):
+    """Matches and a robust loss of their errors.
+
+    points: (4, n). weight: (n,), what each counts. s2: (n,), squared scales of the loss, a code. table: (2, t + 2), of
+    the loss MAGSAC, its weight at the ends of t intervals of r^2 / s^2 and beyond, and the weight's integral up to
+    there; of others it is not read.
     """
-    matches = in_rows(points, weight, s2)
-    sums, J, weighted, work = np.empty((55, LANES)), np.empty((10, LANES)), np.empty((10, LANES)), np.empty((3, LANES))
+
+    points: F8x2
+    weight: F8x1
+    s2: F8x1
+    loss: int
+    table: F8x2
+
+
+@kernel
+def evaluate(F: F8x2, weighted: Weighted, derivatives: bool, products: F8x3, cost: F8x1) -> None:
+    """`SampsonObjective` of models (k, 9) -> products (k, 10, 10), if wanted; cost (k,)."""
+    matches, loss, table = in_rows(weighted.points, weighted.weight, weighted.s2), weighted.loss, weighted.table
+    sums, J, scaled, work = matrix(55, LANES), matrix(10, LANES), matrix(10, LANES), matrix(3, LANES)
     for k in range(len(F)):
         costs = fill(0.0)
         for q in range(55 if derivatives else 0):
@@ -39,7 +55,7 @@ def evaluate(
             share, slope = robust(r2, load(matches, row + 5), loss, table, work)
             costs += share * load(matches, row + 4)
             if derivatives:
-                _add_products(J, inverse * (load(matches, row + 4) * slope), weighted, sums)
+                add_products(J, inverse * (load(matches, row + 4) * slope), scaled, sums)
         cost[k] = added(costs)
         q = 0
         for r in range(10 if derivatives else 0):
@@ -104,7 +120,7 @@ def robust(r2: Any, s2: Any, loss: int, table: Array, work: Array) -> tuple[Any,
     elif loss == CAUCHY:
         store(work, 0, r2 / s2)
         for i in range(LANES):
-            work[0, i] = math.log1p(work[0, i])
+            work[0, i] = logarithm_1p(work[0, i])
         value, slope = s2 * load(work, 0), s2 / (s2 + r2)
     else:
         store(work, 0, r2 / s2)
@@ -129,7 +145,7 @@ def _tabulated(table: Array, work: Array) -> None:
 
 
 @inner
-def _add_products(J: Array, factor: Any, weighted: Array, sums: Array) -> None:
+def add_products(J: Array, factor: Any, weighted: Array, sums: Array) -> None:
     """Adds the lower triangle of the weighted products of Jacobian and residual, row by row."""
     for r in range(10):
         store(weighted, r, load(J, r) * factor)

@@ -9,7 +9,6 @@ are to be expected then, in all that a search could have tried.
 from __future__ import annotations
 
 import functools
-import math
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,8 @@ from torch import Tensor
 
 from fmtorch.compiling.batches import for_each_pair, kernels_serve
 from fmtorch.geometry import significance_kernels as compiled
-from fmtorch.geometry.arithmetic import logarithm
+from fmtorch.geometry.arithmetic import logarithm, sqrt
+from fmtorch.geometry.arithmetic_kernels import LOG10
 from fmtorch.geometry.epipolar import epipolar_distances
 
 Array = NDArray[Any]
@@ -81,7 +81,7 @@ def significance(
         low = torch.where(mask[..., None], x, torch.inf).amin(1)
         box = (torch.where(mask[..., None], x, -torch.inf).amax(1) - low).flip(-1).clamp_min(0)
         h, w = (box if size is None else size.to(torch.float64)).unbind(-1)
-        diagonal = (h * h + w * w).sqrt()
+        diagonal = sqrt(h * h + w * w)
         strip = torch.where(h * w > 0, 2 * diagonal / (h * w), torch.inf)
         chance = torch.maximum(chance, (distance * strip[:, None]).nan_to_num(1.0, 1.0))
         cell = torch.floor((x - low[:, None]) / (diagonal / CELLS)[:, None, None]).nan_to_num(0)
@@ -133,19 +133,16 @@ def _significance(chance: Float[Tensor, "b n"], n: Int[Tensor, " b"]) -> Float[T
     spare = (n - k).clamp_min(0)
     subsets = factorial[n] - factorial[k] - factorial[spare]
     samples = factorial[k] - factorial[k - SAMPLE] - factorial[SAMPLE]
-    tests = _logarithms(factorial)[(n - SAMPLE).clamp_min(1)] + subsets + samples + math.log(MODELS)
+    tests = _logarithms(factorial)[(n - SAMPLE).clamp_min(1)] + subsets + samples + compiled.LOG_MODELS
     alarms = tests + (k - SAMPLE) * logarithm(chance[:, SAMPLE:].clamp_max(1.0))
-    return torch.where(k <= n, -alarms, -torch.inf).amax(1) / math.log(10)
+    return torch.where(k <= n, -alarms, -torch.inf).amax(1) / LOG10
 
 
 @functools.lru_cache(maxsize=8)
 def _log_factorials(count: int) -> Array:
     """log i! (count,) for i = 0 ... count - 1, in ascending order of summation, so that longer tables begin alike."""
-    total, table = 0.0, [0.0]
-    for i in range(1, count):
-        total += math.log(i)
-        table.append(total)
-    return np.array(table)
+    logarithms = logarithm(torch.arange(1, count, dtype=torch.float64))
+    return np.concatenate([np.zeros(1), np.cumsum(logarithms.numpy())])
 
 
 def _logarithms(factorial: Tensor) -> Tensor:

@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.compiling.kernel import inner, kernel
-from fmtorch.geometry.arithmetic_kernels import logarithm
+from fmtorch.compiling.scratch import matrix, vector
+from fmtorch.geometry.arithmetic_kernels import LOG10, logarithm
 from fmtorch.geometry.order_kernels import smallest_but
 
 Array = NDArray[Any]
 SAMPLE, MODELS, CELLS, LEAST_CHANCE, MOST_CELLS, FARTHEST = 7, 3, 64, 2.0**-13, 1 << 15, 1e100  # as in `significance`
+LOG_MODELS = 1.0986122886681098
 FREE = -1  # a place of no match: in a slot of the table that is not taken
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # spreads places over the table
 
@@ -33,7 +35,7 @@ def counted_chances(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, s
         peak = max(peak, abs(value))
     if peak == 0:
         return 0
-    point, count = np.empty((4, n)), 0
+    point, count = matrix(4, n), 0
     for i in range(n):
         a, b, c, d = x0[i, 0], x0[i, 1], x1[i, 0], x1[i, 1]
         if mask[i] and abs(a) < FARTHEST and abs(b) < FARTHEST and abs(c) < FARTHEST and abs(d) < FARTHEST:
@@ -106,7 +108,7 @@ def _median_of_places(chance: Array, place: Array, out: Array) -> int:
         begin[which[i] + 1] += 1
     for g in range(groups):
         begin[g + 1] += begin[g]
-    grouped, free = np.empty(n), begin.copy()
+    grouped, free = vector(n), begin.copy()
     for i in range(n):
         grouped[free[which[i]]] = chance[i]
         free[which[i]] += 1
@@ -122,6 +124,6 @@ def most_significant(chance: Array, factorial: Array) -> float:
     for k in range(SAMPLE + 1, n + 1):
         subsets = factorial[n] - factorial[k] - factorial[n - k]
         samples = factorial[k] - factorial[k - SAMPLE] - factorial[SAMPLE]
-        tests = factorial[n - SAMPLE] - factorial[n - SAMPLE - 1] + subsets + samples + math.log(MODELS)
+        tests = factorial[n - SAMPLE] - factorial[n - SAMPLE - 1] + subsets + samples + LOG_MODELS
         best = max(best, -(tests + (k - SAMPLE) * logarithm(chance[k - 1])))
-    return best / math.log(10)
+    return best / LOG10

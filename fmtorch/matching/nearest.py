@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch.core.threads import one_thread
+from fmtorch.geometry.arithmetic import sqrt, stable_sum
 
 _GROUP = 32  # columns whose minimum is taken together; a group is searched only where it can hold a neighbour
 _FLOAT32_NORM = 2.0**11  # integer vectors no longer than this have squared distances up to 2^24: exact in float32
@@ -103,15 +104,15 @@ def _match_one_pair(d0: Tensor, d1: Tensor, mask0: Tensor, mask1: Tensor, chunk:
     rows, columns, unit = _integers(d0[slots0], d1[slots1])
     nearest, reverse = _two_nearest(rows, columns, chunk)
     result.nearest[slots0] = slots1[nearest.column]
-    result.distance[slots0] = (nearest.squared.double().sqrt() * unit).float()
-    result.second[slots0] = (nearest.second_squared.double().sqrt() * unit).float()
+    result.distance[slots0] = (sqrt(nearest.squared.double()) * unit).float()
+    result.second[slots0] = (sqrt(nearest.second_squared.double()) * unit).float()
     result.reverse[slots1] = slots0[reverse]
     return result
 
 
 def _integers(d0: Tensor, d1: Tensor) -> tuple[Tensor, Tensor, float]:
     """Both sets as integer-valued vectors in a type in which their squared distances are exact, and their unit."""
-    longest = max(float(torch.linalg.vector_norm(d, dim=-1).max()) for d in (d0, d1))
+    longest = max(float(sqrt(stable_sum(d.double().square())).max()) for d in (d0, d1))
     whole = bool((d0 == d0.round()).all() and (d1 == d1.round()).all())
     if whole and longest <= _FLOAT32_NORM:
         return d0.float(), d1.float(), 1.0

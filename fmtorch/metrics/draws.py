@@ -13,7 +13,9 @@ from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
 from fmtorch.core.checks import expect_sizes
-from fmtorch.core.random import Stream, uniform
+from fmtorch.core.random import uniform
+from fmtorch.core.streams import Stream
+from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.geometry.epipolar import inverse_root
 
 COLUMNS = 6  # random numbers of a draw: for each of its two halves a point (x, y) and a place on its line
@@ -63,7 +65,7 @@ class Pairs:
 def diagonal(size: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
     """Length of the image diagonal, in pixels."""
     h, w = size.unbind(-1)
-    return (h * h + w * w).sqrt()
+    return sqrt(h * h + w * w)
 
 
 Draw = Callable[[Pairs, Tensor], tuple[Tensor, Tensor]]

@@ -22,7 +22,8 @@ from torch import Tensor
 
 from fmtorch.compiling.batches import for_each_pair, kernels_serve
 from fmtorch.core.checks import checked
-from fmtorch.core.random import Stream, mixed_seed
+from fmtorch.core.streams import Stream, mixed_seed
+from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.geometry.epipolar import lines_through, residual_and_normals, unit_largest
 from fmtorch.metrics import nsgd_kernels as compiled
 from fmtorch.metrics.draws import Pairs, diagonal, expect_samples, segment_in_image, sum_of_draws
@@ -123,7 +124,7 @@ def _half_draw(
     m_prime = start + uniforms[..., 2:] * (end - start)
     e, squared0, squared1 = residual_and_normals(F_other, m, m_prime)
     floor = NORMAL_FLOOR**2
-    return e.abs() / (squared0 + floor).sqrt(), e.abs() / (squared1 + floor).sqrt(), hits
+    return e.abs() / sqrt(squared0 + floor), e.abs() / sqrt(squared1 + floor), hits
 
 
 def _mean_distance(

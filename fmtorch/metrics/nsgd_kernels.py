@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.random_kernels import stream_state, uniform
+from fmtorch.compiling.scratch import vector
 
 Array = NDArray[Any]
 BLOCK, TRIES, COLUMNS, PARALLEL = 128, 10, 6, 1e-12  # as in `draws`
@@ -27,7 +27,7 @@ def accepted_draws(
     mixed_seed: of the seed and the stream.
     """
     state = stream_state(mixed_seed, key[0])
-    u, values = np.empty(COLUMNS), np.empty(BLOCK)
+    u, values = vector(COLUMNS), vector(BLOCK)
     total, count = 0.0, 0
     for start in range(0, TRIES * samples, BLOCK):
         draws = min(BLOCK, TRIES * samples - start)

@@ -17,6 +17,7 @@ from jaxtyping import Float, Int, Real
 from torch import Tensor
 
 from fmtorch.core.checks import checked
+from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.geometry.epipolar import lines_through
 from fmtorch.metrics.draws import Pairs, diagonal, segment_in_image, sum_of_draws
 
@@ -70,4 +71,4 @@ def _half_draw(F: Tensor, F_other: Tensor, size0: Tensor, size1: Tensor, uniform
 
 def _distance(x: Tensor, line: list[Tensor]) -> Tensor:
     a, b, c = line
-    return (a * x[..., 0] + b * x[..., 1] + c).abs() / ((a * a + b * b).sqrt() + NORMAL_OFFSET)
+    return (a * x[..., 0] + b * x[..., 1] + c).abs() / (sqrt(a * a + b * b) + NORMAL_OFFSET)

@@ -21,12 +21,13 @@ _LARGEST = 12.0  # log-odds beyond which P(inlier) is as good as 0 or 1; the log
 def logistic(z: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """``o / (1 + o)`` with ``o = (1 + z / 1024)^1024``, the logistic function but for 0.001 at most.
 
-    Made of arithmetic alone, whose last bits, unlike those of exp, do not depend on where in memory a number stands.
+    Made of arithmetic alone, whose last bits, unlike those of exp, do not depend on where in memory a number stands;
+    in float64, since the power multiplies a rounding error by 1024. The result has the type of z.
     """
-    odds: Tensor = 1 + z.clamp(-_LARGEST, _LARGEST) / 2**_SQUARINGS
+    odds: Tensor = 1 + z.clamp(-_LARGEST, _LARGEST).double() / 2**_SQUARINGS
     for _ in range(_SQUARINGS):
         odds = odds.square()
-    return odds / (odds + 1)
+    return (odds / (odds + 1)).to(z.dtype)
 
 
 @dataclasses.dataclass(frozen=True)

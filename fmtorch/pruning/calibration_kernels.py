@@ -23,7 +23,7 @@ def calibrated(evidence: Array, quality: Array, mask: Array, numbers: Array, out
         z = numbers[0] + numbers[1] * evidence[i]
         if len(quality):
             z += numbers[2] * (one if np.isnan(quality[i]) else quality[i])
-        o = one + min(max(z, -numbers[3]), numbers[3]) * numbers[4]
+        o = 1.0 + np.float64(min(max(z, -numbers[3]), numbers[3])) * numbers[4]
         for _ in range(10):
             o *= o
-        out[i] = o / (o + one) if mask[i] else one - one
+        out[i] = o / (o + 1.0) if mask[i] else 0.0

@@ -22,7 +22,7 @@ from torch import Tensor
 from fmtorch.compiling.batches import for_each_pair, kernels_serve
 from fmtorch.core.records import ungraphed
 from fmtorch.core.types import Correspondences
-from fmtorch.geometry.arithmetic import component_sum
+from fmtorch.geometry.arithmetic import component_sum, sqrt
 from fmtorch.geometry.curves import curve_orders
 from fmtorch.pruning import frame_consistency_kernels as compiled
 
@@ -63,7 +63,7 @@ def frame_agreement(
         return for_each_pair(compiled.frame_agreement, tensors, CURVE_TABLE, _NUMBERS, out=out).to(x0.dtype)
     S = frame_map(lafs0, lafs1)
     vote = torch.ones_like(x0[..., 0]) if quality is None else (WORST_RATIO - quality).clamp_min(MIN_VOTE)
-    scale = (S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]).abs().sqrt()
+    scale = sqrt((S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]).abs())
     rows = torch.stack([*x0.unbind(-1), *x1.unbind(-1), *S.flatten(2).unbind(-1), scale, vote])
     mask = mask & torch.isfinite(rows).all(0)
     rows = torch.where(mask, rows, 0)
@@ -110,9 +110,7 @@ def _along_curve(rows: Float[Tensor, "10 b n"]) -> Float[Tensor, "2 b n"]:
     dx, dy, ux, uy = near[:4] - rows[:4]
     error = torch.maximum(_prediction_error(rows[4:8], dx, dy, ux, uy), _prediction_error(near[4:8], dx, dy, ux, uy))
     length = (
-        (dx.square() + dy.square() + MIN_SQUARE).sqrt() * rows[8]
-        + (ux.square() + uy.square() + MIN_SQUARE).sqrt()
-        + NOISE
+        sqrt(dx.square() + dy.square() + MIN_SQUARE) * rows[8] + sqrt(ux.square() + uy.square() + MIN_SQUARE) + NOISE
     )
     # exp(-z) in arithmetic alone, whose last bits, unlike exp's, do not depend on where in memory a number stands
     agree = (1 + error / length.square() * (TOLERANCE**-2 / 8)).square().square().square().reciprocal()
@@ -133,6 +131,8 @@ class FrameConsistency:
     on the tuning scenes than a logistic model of ln(w) and the ratio. Where matches have no frames or no quality the
     prior is left as it is. Linear memory: about 700 bytes a match.
     """
+
+    kernels = (compiled.frame_agreement, compiled.frame_prior)
 
     def __init__(self, *, odds: float, floor: float, slope: float) -> None:
         self.odds, self.floor, self.slope = odds, floor, slope

@@ -13,6 +13,7 @@ from torch import Tensor
 from fmtorch.compiling.batches import for_each_pair, kernels_serve
 from fmtorch.core.records import ungraphed
 from fmtorch.core.types import Correspondences
+from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.pruning import gms_kernels as compiled
 from fmtorch.pruning.calibration import calibration_of
 from fmtorch.pruning.gms_table import GRIDS, Border, Moves, Surroundings, Table, give_back, moves_in_blocks, tabulated
@@ -120,7 +121,7 @@ def _standing(table: Table, moves: Moves, turns: int, factor: float) -> UInt8[Te
         stands = torch.zeros_like(assigned)
         for turn in range(turns):
             score, mean = around.turned(turn)
-            stands |= (score >= factor * mean.sqrt()).int() << turn
+            stands |= (score >= factor * sqrt(mean)).int() << turn
         verdict = stands.new_zeros(lines + 1)  # best cell and, in the low byte, bit k: it stands under rotation k
         verdict.index_copy_(0, occupied.long(), (assigned << 8) + stands)
         differs = verdict.index_select(0, line).view(4, -1) ^ (end << 8)  # bits beyond the low byte: another cell
@@ -154,7 +155,7 @@ def _own_support(table: Table, moves: Moves, winner: Int[Tensor, " pairs"], turn
         for line in moves.line:
             here = members[line[members] < moves.lines]
             score, mean = Surroundings(table, moves, grid, line[here], moves.end[grid, here]).turned(turn)
-            total.index_add_(0, here, (score - 1).clamp_min(0) / mean.clamp_min(1).sqrt() / 4)
+            total.index_add_(0, here, (score - 1).clamp_min(0) / sqrt(mean.clamp_min(1)) / 4)
     return total
 
 

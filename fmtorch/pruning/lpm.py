@@ -12,6 +12,7 @@ from torch import Tensor
 
 from fmtorch.compiling.batches import for_each_pair, kernels_serve
 from fmtorch.core.types import Correspondences
+from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.pruning import lpm_kernels as compiled
 from fmtorch.pruning.calibration import calibration_of
 from fmtorch.pruning.knn import nearest_points
@@ -132,7 +133,7 @@ def _differs(motion: Float[Tensor, "n 2"], near: Int[Tensor, "n k"], tau: float)
     """Whether each neighbour moves otherwise; never where one of the two does not move (0 / 0 in the cosine)."""
     others = motion[near.clamp(min=0)]
     length, lengths = motion.square().sum(-1)[:, None], others.square().sum(-1)
-    cosine = (motion[:, None] * others).sum(-1) / (length * lengths).sqrt()
+    cosine = (motion[:, None] * others).sum(-1) / sqrt(length * lengths)
     return cosine * torch.minimum(length, lengths) / torch.maximum(length, lengths) < tau
 
 

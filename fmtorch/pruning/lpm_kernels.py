@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.scratch import vector
 from fmtorch.pruning.knn_kernels import search
 
 Array = NDArray[Any]
@@ -29,7 +30,7 @@ def lpm(
             points[0, m, k], points[1, m, k] = x0[i, k], x1[i, k]
         m += mask[i] and finite and math.isfinite(x1[i, 0]) and math.isfinite(x1[i, 1])
     points0, points1 = points[0, :m], points[1, :m]
-    members, cost, total, passes = np.arange(m), np.empty(m), np.zeros(m), 0
+    members, cost, total, passes = np.arange(m), vector(m), np.zeros(m), 0
     for k in range(len(thresholds)):
         if passes > 0 and len(members) < neighbors[k] + 4:
             continue

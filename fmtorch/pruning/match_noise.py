@@ -12,6 +12,7 @@ from torch import Tensor
 from fmtorch.compiling.batches import for_each_pair, kernels_serve
 from fmtorch.core.records import ungraphed
 from fmtorch.core.types import Correspondences
+from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.pruning import match_noise_kernels as compiled
 
 MIN_AREA = 1e-12  # square pixels: keeps the gradient of the scale finite
@@ -39,14 +40,14 @@ def match_noise(
     if quality is not None:
         noise = noise * (1 + slope * quality).square()
     if prior is not None:
-        noise = noise / prior.clamp_min(MIN_PRIOR).sqrt().sqrt()
+        noise = noise / sqrt(sqrt(prior.clamp_min(MIN_PRIOR)))
     return noise
 
 
 def _scale(lafs: Float[Tensor, "b n 2 3"]) -> Float[Tensor, "b n"]:
     """The square root of the area that a frame maps the unit square to, pixels."""
     (a, b), (c, d) = (row.unbind(-1) for row in lafs[..., :2].unbind(-2))
-    return (a * d - b * c).abs().clamp_min(MIN_AREA).sqrt()
+    return sqrt((a * d - b * c).abs().clamp_min(MIN_AREA))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.random_kernels import mix
+from fmtorch.compiling.scratch import vector
 
 Array = NDArray[Any]
 
@@ -18,7 +19,7 @@ Array = NDArray[Any]
 def one_to_one(x0: Array, x1: Array, quality: Array, mask: Array, out: Array) -> None:
     """`one_to_one` of x0, x1 (n, 2), quality, mask (n,) -> out (n,)."""
     n = len(mask)
-    valid, rank = np.empty(n, np.bool_), np.empty(n)
+    valid, rank = np.empty(n, np.bool_), vector(n)
     for i in range(n):
         finite = math.isfinite(x0[i, 0]) and math.isfinite(x0[i, 1])
         valid[i] = mask[i] and finite and math.isfinite(x1[i, 0]) and math.isfinite(x1[i, 1])

@@ -19,10 +19,11 @@ from torch import Tensor
 from fmtorch.compiling.batches import for_each_pair, kernels_serve
 from fmtorch.core.records import ungraphed
 from fmtorch.core.types import Correspondences
-from fmtorch.geometry.arithmetic import component_sum
+from fmtorch.geometry.arithmetic import component_sum, sqrt
 from fmtorch.geometry.curves import curve_orders
 from fmtorch.pruning import position_consistency_kernels as compiled
 from fmtorch.pruning.calibration import Calibration
+from fmtorch.pruning.calibration_kernels import calibrated
 from fmtorch.pruning.frame_consistency import (
     CURVE_TABLE,
     CURVES,
@@ -162,9 +163,7 @@ def _along_curve(rows: Float[Tensor, "5 b n"], S: Similarity) -> tuple[Float[Ten
     dx, dy, ux, uy = later[:4] - rows[:4, None]
     error = (S.a * dx - S.b * dy - ux).square() + (S.b * dx + S.a * dy - uy).square()
     length = (
-        S.scale * (dx.square() + dy.square() + MIN_SQUARE).sqrt()
-        + (ux.square() + uy.square() + MIN_SQUARE).sqrt()
-        + NOISE
+        S.scale * sqrt(dx.square() + dy.square() + MIN_SQUARE) + sqrt(ux.square() + uy.square() + MIN_SQUARE) + NOISE
     )
     agree = (1 + error / length.square() * (TOLERANCE**-2 / 8)).square().square().square().reciprocal()
     # Added one by one: the order of a sum must not depend on the batch.
@@ -181,6 +180,8 @@ class PositionConsistency:
 
     Needs no frames, no sizes and no quality. Linear memory: about 600 bytes a match.
     """
+
+    kernels = (compiled.position_agreement, calibrated)
 
     def __init__(self, *, calibration: Mapping[str, Mapping[str, float]]) -> None:
         self.calibration = Calibration(**calibration)

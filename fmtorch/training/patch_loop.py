@@ -13,7 +13,7 @@ from jaxtyping import Int
 from torch import Tensor, nn
 
 from fmtorch.core import random
-from fmtorch.core.random import Stream
+from fmtorch.core.streams import Stream
 from fmtorch.features.networks.checkpoints import read_checkpoint
 from fmtorch.training.patch_objectives import DRAWS, Objective
 from fmtorch.training.patch_store import PatchStore

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fmtorch.core import random
-from fmtorch.core.random import Stream
+from fmtorch.core.streams import Stream
 from fmtorch.training.patch_losses import distances
 from fmtorch.training.patch_store import PatchStore
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from fmtorch.core import random
-from fmtorch.core.random import Stream
+from fmtorch.core.streams import Stream
 from fmtorch.training.patch_losses import hard_negative_constant
 from fmtorch.training.patch_metrics import evaluate_descriptor, middle, patch_quality
 

@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
-from fmtorch.core.random import Stream, uniform
+from fmtorch.core.random import uniform
+from fmtorch.core.streams import Stream
 from fmtorch.geometry.epipolar import lines_through, unit_largest
 from fmtorch.metrics.draws import segment_in_image
 from fmtorch.metrics.nsgd import BORDER

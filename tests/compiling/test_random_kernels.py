@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-
-from fmtorch.core.random import Stream, bits, mixed_seed
 from fmtorch.estimators.pool_kernels import shuffled
+
+from fmtorch.core.random import bits
+from fmtorch.core.streams import Stream, mixed_seed
 
 pytest.importorskip("numba", reason="numba is not installed")
 

@@ -5,7 +5,8 @@ import pytest
 import torch
 from scipy import stats
 
-from fmtorch.core.random import Stream, bits, uniform
+from fmtorch.core.random import bits, uniform
+from fmtorch.core.streams import Stream
 from fmtorch.core.types import pair_key
 from tests.reference import random as reference
 

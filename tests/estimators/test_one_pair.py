@@ -8,12 +8,6 @@ import re
 import numpy as np
 import pytest
 import torch
-
-from fmtorch import metrics, presets
-from fmtorch.compiling import switch
-from fmtorch.core.random import Stream
-from fmtorch.core.types import Correspondences, Estimate, collate
-from fmtorch.estimators import HypothesizeAndVerify, final_fits, inliers, sampling, scores
 from fmtorch.estimators.models import Models as TensorModels
 from fmtorch.estimators.one_pair import inliers as compiled_inliers
 from fmtorch.estimators.one_pair import solvers as compiled_solvers
@@ -21,14 +15,20 @@ from fmtorch.estimators.one_pair.models import Models
 from fmtorch.estimators.one_pair.pair import OnePair, each_pair
 from fmtorch.estimators.one_pair.pool import Verifier, likely, shuffled
 from fmtorch.estimators.one_pair.selection import Selection
-from fmtorch.estimators.options import Preselect
 from fmtorch.estimators.pairs import NormalizedPairs, normalized_pairs
 from fmtorch.estimators.pool import Verifier as TensorVerifier
 from fmtorch.estimators.pool import by_priority
 from fmtorch.estimators.pool import shuffled as shuffled_tensor
 from fmtorch.estimators.pool_kernels import drawn_by_prior
-from fmtorch.estimators.registry import PARTS, kernel_form
 from fmtorch.estimators.selection import without_cameras
+
+from fmtorch import metrics, presets
+from fmtorch.compiling import switch
+from fmtorch.core.streams import Stream
+from fmtorch.core.types import Correspondences, Estimate, collate
+from fmtorch.estimators import HypothesizeAndVerify, final_fits, inliers, sampling, scores
+from fmtorch.estimators.options import Preselect
+from fmtorch.estimators.registry import PARTS, kernel_form
 from fmtorch.geometry import eight_point
 from tests.conftest import oracle
 from tests.estimators.draws import drawn

@@ -7,12 +7,6 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-
-from fmtorch import find_fundamental, presets
-from fmtorch.compiling.kernel import Kernel
-from fmtorch.core.types import collate
-from fmtorch.estimators import HypothesizeAndVerify, final_fits, pool, saturated_gains
-from fmtorch.estimators.engine import Form
 from fmtorch.estimators.inliers import WithinThreshold
 from fmtorch.estimators.models import Pool
 from fmtorch.estimators.one_pair import ahead
@@ -23,8 +17,14 @@ from fmtorch.estimators.one_pair.pair import OnePair
 from fmtorch.estimators.one_pair.refinement import Near, near_models
 from fmtorch.estimators.one_pair.selection import Selection, scored
 from fmtorch.estimators.pairs import NormalizedPairs
-from fmtorch.estimators.registry import kernel_form
 from fmtorch.estimators.scores import score_models
+
+from fmtorch import find_fundamental, presets
+from fmtorch.compiling.kernel import Kernel
+from fmtorch.core.types import collate
+from fmtorch.estimators import HypothesizeAndVerify, final_fits, pool, saturated_gains
+from fmtorch.estimators.engine import Form
+from fmtorch.estimators.registry import kernel_form
 from tests.estimators.test_one_pair import both, in_both_forms, models, real_pairs, solved, told
 from tests.laws import SMALL_KINDS, degenerate, scene, small
 

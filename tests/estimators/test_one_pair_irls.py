@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from fmtorch.estimators.one_pair.irls import weights
 
 from fmtorch import presets
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.irls import _weight
-from fmtorch.estimators.one_pair.irls import weights
 from fmtorch.geometry.irls import reweighted
 from fmtorch.geometry.irls_kernels import reweighted as compiled_reweighted
 from fmtorch.geometry.robust_losses import KERNELS

@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-
-from fmtorch.core.random import Stream, mixed_seed
-from fmtorch.core.types import Correspondences
-from fmtorch.estimators import sampling_kernels, solvers
 from fmtorch.estimators.one_pair import sampling as one_pair
 from fmtorch.estimators.one_pair.pair import each_pair
 from fmtorch.estimators.one_pair.solvers import MinimalSamples, SevenPoint
 from fmtorch.estimators.pairs import normalized_pairs
-from fmtorch.estimators.registry import kernel_form
 from fmtorch.estimators.sampling import PriorWeighted, Prosac, Uniform
+
+from fmtorch.core.streams import Stream, mixed_seed
+from fmtorch.core.types import Correspondences
+from fmtorch.estimators import sampling_kernels, solvers
+from fmtorch.estimators.registry import kernel_form
 from tests.estimators.draws import drawn
 from tests.laws import scene
 

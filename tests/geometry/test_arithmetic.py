@@ -1,9 +1,13 @@
 from __future__ import annotations
 
+import decimal
+
 import numpy as np
 import pytest
 import torch
+from fmtorch.estimators.focal import prior_kernels
 
+from fmtorch.geometry import arithmetic_kernels, significance_kernels
 from fmtorch.geometry.arithmetic import (
     SMALL,
     as_components,
@@ -15,6 +19,7 @@ from fmtorch.geometry.arithmetic import (
     determinant,
     exponential,
     logarithm,
+    logarithm_1p,
     matmul3,
     outer_sum,
     product,
@@ -98,3 +103,26 @@ def test_small_matrices_as_by_numpy() -> None:
     torch.testing.assert_close(as_matrices(cofactors(a).flatten(0, 1)), expected, rtol=1e-11, atol=1e-11)
     torch.testing.assert_close(cross(a[0], b[0]).movedim(0, -1), torch.cross(A[..., 0, :], B[..., 0, :], -1), **tight)
     torch.testing.assert_close(unit(a.flatten(0, 1)).square().sum(0), torch.ones(4, 5, dtype=torch.float64), **tight)
+
+
+def test_the_logarithm_of_one_more_is_exact_near_zero_and_the_same_in_kernels() -> None:
+    small = torch.logspace(-300, 0, 1001, dtype=torch.float64)
+    x = torch.cat(
+        [small, -small * 0.999, torch.logspace(0, 300, 301).double(), torch.linspace(-0.3, 0.5, 999).double()]
+    )
+    expected = np.log1p(x.numpy())
+    # Some ten roundings of parts of the value, and of 1 + x where that is small against x or 1.
+    np.testing.assert_allclose(logarithm_1p(x).numpy(), expected, rtol=8 * 2**-52, atol=0)
+    assert logarithm_1p(x).tolist() == [arithmetic_kernels.logarithm_1p(number) for number in x.tolist()]
+    ends = torch.tensor([0.0, torch.inf, torch.nan], dtype=torch.float64)
+    assert logarithm_1p(ends)[:2].tolist() == [0, torch.inf]
+    assert torch.isnan(logarithm_1p(ends)[2])
+    assert [arithmetic_kernels.logarithm_1p(number) for number in (0.0, np.inf)] == [0, np.inf]
+
+
+def test_constants_are_the_nearest_numbers() -> None:
+    with decimal.localcontext(prec=40):
+        assert float(decimal.Decimal(2).ln()) == arithmetic_kernels.LOG2
+        assert float(decimal.Decimal(10).ln()) == arithmetic_kernels.LOG10
+        assert float(decimal.Decimal(significance_kernels.MODELS).ln()) == significance_kernels.LOG_MODELS
+        assert float(decimal.Decimal(prior_kernels.USUAL_FOCAL).ln()) == prior_kernels.LOG_USUAL

@@ -3,9 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from fmtorch.kernels import kernel
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from fmtorch.geometry import cubic_kernels
 from fmtorch.geometry.cubic import cube_root, cubic_roots
 
 
@@ -98,3 +100,17 @@ def test_gradient():
 def test_cube_root():
     x = 10.0 ** torch.linspace(-300, 300, 5001, dtype=torch.float64)
     torch.testing.assert_close(cube_root(x) ** 3, x, rtol=8 * torch.finfo(torch.float64).eps, atol=0)
+
+
+@kernel("f8[::1], f8[::1]")
+def cube_roots(x, out) -> None:
+    for i in range(len(x)):
+        out[i] = cubic_kernels._cube_root(x[i])
+
+
+def test_cube_roots_in_kernels_are_the_same():
+    x = torch.logspace(-300, 300, 10007, dtype=torch.float64)
+    out = np.empty(len(x))
+    cube_roots(x.numpy(), out)
+    np.testing.assert_array_equal(out, cube_root(x).numpy())
+    assert [cubic_kernels._cube_root(number) for number in x[::100].tolist()] == cube_root(x[::100]).tolist()

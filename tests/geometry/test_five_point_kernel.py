@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 import torch
-
-from fmtorch.core.random import Stream, mixed_seed
 from fmtorch.estimators.focal import prior
 from fmtorch.estimators.focal.cameras import CentredPairs
 from fmtorch.estimators.focal.hypotheses import FocalSamples
 from fmtorch.estimators.focal.hypotheses_kernels import draw_depths
 from fmtorch.estimators.pairs import NormalizedPairs, normalized_pairs
+
+from fmtorch.core.streams import Stream, mixed_seed
 from fmtorch.geometry.arithmetic import exponential
 from fmtorch.geometry.five_point_kernels import five_point
 from tests.laws import degenerate, scene, small

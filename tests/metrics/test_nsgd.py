@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fmtorch.core.random import Stream, uniform
+from fmtorch.core.random import uniform
+from fmtorch.core.streams import Stream
 from fmtorch.geometry import cross_matrix, unit_frobenius
 from fmtorch.metrics import draws, nsgd, nsgd_released, sgd
 from fmtorch.metrics.nsgd import draw_distances

@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fmtorch.core.random import Stream, uniform
+from fmtorch.core.random import uniform
+from fmtorch.core.streams import Stream
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.geometry import eight_point, fundamental_from_calibration, irls, refine, reweighted_fits
 from fmtorch.training import virtual_points as virtual

@@ -14,8 +14,8 @@ import torch
 from numpy.typing import NDArray
 
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.estimators.pairs import finite_matches, unfit_pairs
-from fmtorch.estimators.support import lack_of_support, relative_rounding
+from fmtorch.estimators.batch import Batch, relative_rounding
+from fmtorch.estimators.parts.support import degenerate_support
 from fmtorch.geometry.epipolar import sampson
 from fmtorch.geometry.verdict import judged
 
@@ -23,7 +23,7 @@ Points = NDArray[np.float64]
 Builder = TypeVar("Builder", bound=Callable[..., Any])
 Solution = tuple[Points | None, NDArray[np.bool_]]
 
-LEAST_MATCHES = 8
+MIN_MATCHES = 8
 MINIMAL_SAMPLE = 7  # inliers below which a model is none
 FAILURES = (cv2.error, RuntimeError, ValueError)  # how these libraries say that they cannot solve a pair
 
@@ -73,33 +73,32 @@ class PairwiseEstimator:
         b, n = c.mask.shape
         F = torch.zeros(b, 3, 3, dtype=torch.float64)
         inliers = torch.zeros(b, n, dtype=torch.bool)
-        mask = finite_matches(c)
-        _, reasons = unfit_pairs(c, mask, LEAST_MATCHES)
-        mask = mask.cpu()
+        reasons, batch = [""] * b, Batch.of(c.to("cpu"))
         for i in range(b):
-            if reasons[i]:
+            matches = batch.pair(i)
+            normalized = batch.normalized(matches, i, seed, MIN_MATCHES)
+            if isinstance(normalized, str):
+                reasons[i] = normalized
                 continue
-            index = mask[i].nonzero()[:, 0]
-            likelihood = _likelihood(c, i)[index]
-            if self._best_first:
-                order = likelihood.argsort(descending=True, stable=True)
-                index, likelihood = index[order], likelihood[order]
-            x0, x1 = (x[i].detach().cpu()[index].to(torch.float64).numpy() for x in (c.x0, c.x1))
+            pair, slot = normalized
+            likelihood = _likelihood(c, i)[slot].numpy()
+            order = np.argsort(-likelihood, kind="stable") if self._best_first else np.arange(len(slot))
+            x0, x1 = matches.x0[slot[order]], matches.x1[slot[order]]
             size0, size1 = _size(c.size0, x0, i), _size(c.size1, x1, i)
+            inside = np.zeros(len(slot), np.bool_)
             try:
-                estimate, inside = self._solve(Pair(x0, x1, likelihood.numpy(), size0, size1, seed))
+                estimate, inside[order] = self._solve(Pair(x0, x1, likelihood[order], size0, size1, seed))
             except FAILURES as failure:  # OpenCV's USAC asserts what some matches do not fulfil
                 reasons[i] = f"{self.name} failed: {' '.join(str(failure).split())}"
                 continue
             if estimate is None or estimate.shape != (3, 3) or not np.isfinite(estimate).all() or not np.any(estimate):
                 reasons[i] = f"{self.name} found no fundamental matrix"
                 continue
-            lack = _lack_of_support(x0, x1, inside, relative_rounding(c.x0.dtype))
-            if lack:
-                reasons[i] = lack
+            reasons[i] = degenerate_support(pair, inside, MINIMAL_SAMPLE, relative_rounding(c))
+            if reasons[i]:
                 continue
             F[i] = torch.from_numpy(estimate / np.linalg.norm(estimate))
-            inliers[i, index[torch.from_numpy(inside)]] = True
+            inliers[i, torch.from_numpy(slot[inside])] = True
         ok = torch.tensor([not reason for reason in reasons], dtype=torch.bool)
         draws = torch.zeros(b, dtype=torch.int64)  # not reported by these libraries
         return judged(Estimate(F, inliers, ok, tuple(reasons), draws).to(c.mask.device), c)
@@ -133,14 +132,6 @@ def within(F: Any, pair: Pair, threshold: float) -> NDArray[np.bool_]:
     matrix, x0, x1 = (torch.from_numpy(np.asarray(value, np.float64)) for value in (F, pair.x0, pair.x1))
     inside: NDArray[np.bool_] = (sampson(matrix, x0, x1) <= threshold).numpy()
     return inside
-
-
-def _lack_of_support(x0: Points, x1: Points, inliers: NDArray[np.bool_], rounding: float) -> str:
-    points = np.hstack([x0, x1])
-    largest, points = np.abs(points).max(), points - points.min(0)
-    unit = points.max() or 1.0
-    scaled, inside = torch.from_numpy(points.T[:, None] / unit), torch.from_numpy(inliers[None])
-    return lack_of_support(scaled, inside, MINIMAL_SAMPLE, torch.tensor([largest / unit * rounding]))[0]
 
 
 def _likelihood(c: Correspondences, i: int) -> torch.Tensor:

@@ -1,0 +1,35 @@
+"""The signature of a kernel, from its annotations: arrays of `arrays`, int, float, bool, and groups of these."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+NUMBERS = {int: "int64", float: "float64", bool: "boolean", np.float32: "float32"}  # numba's names
+
+
+def signature_of(function: Callable[..., Any]) -> tuple[Any, ...]:
+    """The types of a function's arguments, as numba compiles for them.
+
+    A group is a NamedTuple of such types. Raises TypeError, naming the argument, for a type that is none of these.
+    """
+    hints = get_type_hints(function, include_extras=True)
+    names = function.__code__.co_varnames[: function.__code__.co_argcount]
+    return tuple(_type(hints.get(name), f"{function.__qualname__}: {name}") for name in names)
+
+
+def _type(hint: Any, what: str) -> Any:
+    from numba import types
+    from numba.core import sigutils
+
+    if hint in NUMBERS:
+        return getattr(types, NUMBERS[hint])
+    if get_origin(hint) is Annotated:
+        ((array,), _) = sigutils.normalize_signature(f"({get_args(hint)[1]},)")
+        return array
+    if hasattr(hint, "_fields"):
+        fields = get_type_hints(hint, include_extras=True)
+        return types.NamedTuple([_type(fields[name], f"{what}.{name}") for name in hint._fields], hint)
+    raise TypeError(f"{what} is annotated {hint}; it must be a type of `compiling.arrays`, a number or a NamedTuple")

@@ -1,0 +1,174 @@
+"""From a batch of correspondences to one pair after the other, and from their solutions to estimates.
+
+Pairs are estimated on the host, whatever device the caller's tensors are on, and shared out among threads, which
+changes no result. What stands beside a pair in the batch is never looked at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fmtorch.compiling.arrays import Array
+from fmtorch.compiling.batches import as_array
+from fmtorch.core.checks import PER_MATCH, reason
+from fmtorch.core.threads import available, mapped
+from fmtorch.core.types import SIZE, Correspondences, Estimate
+from fmtorch.estimators.families.family import Estimated
+from fmtorch.estimators.gradients import Attach, Solved, with_gradients
+from fmtorch.estimators.pair import Pair, PixelMatches, bucket, normalize_pair
+from fmtorch.estimators.parts.final_fits import Fit
+from fmtorch.estimators.parts.support import degenerate_support
+from fmtorch.geometry.residual_kernels import SAMPSON, Residual
+from fmtorch.geometry.significance import of_one_pair
+
+PARTS_OF_A_THREAD = 4  # so that no thread is long alone at the end
+MIN_WORK = 500  # matches: a pair of fewer takes as long as one of these
+NOT_SOLVED = "every minimal sample was degenerate"
+NOT_FINITE = "the final fit is not finite"
+
+
+class Solution(NamedTuple):
+    """What an estimator says of one pair: the fit, None with a reason where there is none; samples drawn; inliers."""
+
+    fit: Fit | None
+    draws: int
+    inliers: Array | None = None
+    reason: str = ""
+
+
+def estimated(
+    c: Correspondences, seed: int, minimal: int, family: Estimated, solve: Callable[[Pair], Solution], attach: Attach
+) -> Estimate:
+    """Estimate the models of a batch of pairs; a pair that cannot be solved is `ok=False` with a reason.
+
+    minimal: matches below which a pair is not tried, and inliers below which a model is none. family: of the models.
+    """
+    host = c if c.mask.device.type == "cpu" else c.detach().to("cpu")
+    b, n = c.mask.shape
+    batch = Batch.of(host)
+    rounding = relative_rounding(c)
+    F, inliers, ok = np.zeros((b, 3, 3)), np.zeros((b, n), np.bool_), np.zeros(b, np.bool_)
+    draws, significance, reasons = np.zeros(b, np.int64), np.full(b, -np.inf), [""] * b
+    keep = torch.is_grad_enabled() and c.requires_grad
+    solved: dict[int, Solved] = {}
+
+    def estimate(i: int) -> str:
+        """Why there is no estimate of a pair; empty where there is one."""
+        matches = batch.pair(i)
+        normalized = batch.normalized(matches, i, seed, minimal, family.residual)
+        if isinstance(normalized, str):
+            return normalized
+        pair, slot = normalized
+        solution = solve(pair)
+        draws[i] = solution.draws
+        if solution.fit is None or solution.inliers is None:
+            return solution.reason
+        if degenerate := degenerate_support(pair, solution.inliers, minimal, rounding):
+            return degenerate
+        if not family.to_pixels(solution.fit.F, pair, F[i]):
+            F[i] = 0
+            return NOT_FINITE
+        inliers[i, slot] = solution.inliers
+        significance[i] = _significance(F[i], matches) if family.model == "fundamental" else np.nan
+        ok[i] = True
+        if keep:
+            solved[i] = Solved(pair, slot, solution.fit)
+        return ""
+
+    def estimate_all(rows: Sequence[int]) -> None:
+        with np.errstate(all="ignore"):  # infinite or NaN beyond the range of a float
+            for i in rows:
+                reasons[i] = estimate(i)
+
+    mapped(estimate_all, [part.tolist() for part in shared_out(host)] if b > 1 and available() > 1 else [range(b)])
+    fields = {"F": F, "inliers": inliers, "ok": ok, "draws": draws, "significance": significance}
+    tensors = {name: torch.from_numpy(value).to(c.mask.device) for name, value in fields.items()}
+    estimates = Estimate.made(reason=tuple(reasons), model=family.model, **tensors)
+    return with_gradients(estimates, c, solved, attach) if solved else estimates
+
+
+def _significance(F: Array, matches: PixelMatches) -> float:
+    """How far the support of a fundamental matrix (3, 3) is beyond chance."""
+    return of_one_pair(F, matches.x0, matches.x1, matches.mask, matches.sizes[:2], matches.sizes[2:])
+
+
+def relative_rounding(c: Correspondences) -> float:
+    """The rounding error of a coordinate of 1; 0 of integers."""
+    return torch.finfo(c.x0.dtype).eps if c.x0.dtype.is_floating_point else 0.0
+
+
+def shared_out(c: Correspondences) -> list[Tensor]:
+    """The rows of a batch in parts of about equal work, pairs of many matches first."""
+    work, order = c.count().clamp_min(MIN_WORK).sort(descending=True)
+    before = work.cumsum(0) - work
+    part = before * (PARTS_OF_A_THREAD * available()) // max(1, int(work.sum()))
+    return list(torch.split(order, torch.unique_consecutive(part, return_counts=True)[1].tolist()))
+
+
+class Batch(NamedTuple):
+    """The tensors of a batch on the host as arrays, one row a pair; sizes: (b, 4), h, w, h, w, empty where unknown."""
+
+    x0: Array
+    x1: Array
+    mask: Array
+    prior: Array | None
+    noise: Array | None
+    quality: Array | None
+    sizes: Array
+    keys: list[int]
+
+    @staticmethod
+    def of(c: Correspondences) -> Batch:
+        """Views where the tensors are of float32 or float64."""
+        prior, noise, quality = [None if t is None else _array(t) for t in (c.prior, c.noise, c.quality)]
+        keys: list[int] = c.keys.tolist()
+        sizes = np.empty((len(keys), 0 if c.size0 is None else 4))
+        if c.size0 is not None and c.size1 is not None:
+            sizes[:, :2], sizes[:, 2:] = _array(c.size0), _array(c.size1)
+        return Batch(_array(c.x0), _array(c.x1), c.mask.numpy(), prior, noise, quality, sizes, keys)
+
+    def pair(self, i: int) -> PixelMatches:
+        """One row, in float64."""
+        return PixelMatches(
+            _row(self.x0, i), _row(self.x1, i), np.ascontiguousarray(self.mask[i]), _row(self.prior, i),
+            _row(self.noise, i), _row(self.quality, i), self.sizes[i],
+        )  # fmt: skip
+
+    def normalized(
+        self, matches: PixelMatches, i: int, seed: int, minimal: int, residual: Residual = SAMPSON
+    ) -> tuple[Pair, Array] | str:
+        """The pair of a row, and where its matches (n,) stood; or why it cannot be estimated."""
+        n, frame = len(matches.mask), np.empty(6)
+        slots, flat = np.empty(n, np.int64), np.empty(9 * n)
+        known = self.prior is not None, self.noise is not None, self.quality is not None
+        count = normalize_pair(matches, slots, flat, frame)
+        slot, table, (unit, right) = slots[:count], flat[: 9 * count].reshape(9, count), frame[4:].tolist()
+        if count < minimal:
+            return f"{count} matches; at least {minimal} are needed"
+        if not right:
+            return _wrong_values(matches, slot)
+        if not unit:
+            return "all matches coincide"
+        return Pair(table, known, bucket(count), unit, self.keys[i], seed, frame[:4], matches.sizes, residual), slot
+
+
+def _wrong_values(matches: PixelMatches, slot: Array) -> str:
+    """Why a pair whose matches have such values cannot be estimated."""
+    values = {"prior": matches.prior, "noise": matches.noise}
+    right = {name: PER_MATCH[name].holds(v[slot]) for name, v in values.items() if len(v)}
+    right |= {"size0": SIZE.holds(matches.sizes[:2]), "size1": SIZE.holds(matches.sizes[2:])}
+    return reason({name: len(each) - int(np.count_nonzero(each)) for name, each in right.items()})
+
+
+def _row(values: Array | None, i: int) -> Array:
+    return np.empty(0) if values is None else np.ascontiguousarray(values[i], np.float64)
+
+
+def _array(tensor: Tensor) -> Array:
+    known = tensor.dtype in (torch.float32, torch.float64) or not tensor.is_floating_point()
+    return as_array(tensor if known else tensor.to(torch.float64))

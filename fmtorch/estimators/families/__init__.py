@@ -1,0 +1,1 @@
+"""Model families: what a minimal sample is, how it is solved, refined and fitted."""

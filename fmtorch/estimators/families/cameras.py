@@ -1,0 +1,175 @@
+"""Two cameras of square pixels and central principal points: fundamental matrices by their parameters.
+
+``E = U diag(1, 1, 0) V^T``, and F is E between the inverse calibrations. Focal lengths are logarithms in units of the
+longer sides of the images.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fmtorch.compiling.arrays import Array, F8x1, F8x2, F8x4
+from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.scratch import vector
+from fmtorch.estimators.families.focal_prior import LOG_USUAL
+from fmtorch.estimators.pair import Pair
+from fmtorch.geometry.arithmetic_kernels import exponential, logarithm
+from fmtorch.geometry.rank2_kernels import complement
+from fmtorch.geometry.rank2_manifold_kernels import SQUARINGS, start_one
+
+MIN_IMAGE_SIDE_PX = 16.0  # longer side of both images below which sizes are taken for those of another unit than pixels
+MIN_FOCAL, MAX_FOCAL = 0.25, 5.0  # focal lengths outside, in units of the longer side, are not believed at the start
+
+
+class Cameras(NamedTuple):
+    """The cameras of k candidates: axes (k, 2, 3, 3), U and V, rows first; focal (k, 2), logarithms."""
+
+    axes: F8x4
+    focal: F8x2
+
+    def of(self, k: int) -> Cameras:
+        """Those of one candidate."""
+        return Cameras(self.axes[k : k + 1], self.focal[k : k + 1])
+
+    def joined(self, other: Cameras) -> Cameras:
+        """The candidates of both."""
+        return Cameras(np.concatenate([self.axes, other.axes]), np.concatenate([self.focal, other.focal]))
+
+    def copy(self) -> Cameras:
+        """The same in memory of its own."""
+        return Cameras(self.axes.copy(), self.focal.copy())
+
+
+def no_cameras(k: int) -> Cameras:
+    """Room for the cameras of k candidates."""
+    return Cameras(np.empty((k, 2, 3, 3)), np.empty((k, 2)))
+
+
+class Images(NamedTuple):
+    """Two images in normalised units. offset: (4,), from the points to those from the principal points. longest: (2,),
+    the longer sides."""
+
+    offset: F8x1
+    longest: F8x1
+    same_size: bool
+
+
+def images_of(pair: Pair) -> Images:
+    """The images of a pair whose sizes are known, computed once."""
+    images: Images | None = pair.images.get("images")
+    if images is None:
+        images = pair.images["images"] = _images(pair)
+    return images
+
+
+def _images(pair: Pair) -> Images:
+    unit, (h0, w0, h1, w1) = pair.pixels_per_unit, pair.sizes.tolist()
+    sides = w0, h0, w1, h1
+    # Half a pixel, of images in pixels; of sizes in another unit nobody knows what it is, and it is small.
+    pixel = 0.0 if max(sides) < MIN_IMAGE_SIDE_PX else 1.0
+    offset = np.array([(x - (side - pixel) / 2) / unit for x, side in zip(pair.centre.tolist(), sides, strict=True)])
+    return Images(offset, np.array([max(h0, w0) / unit, max(h1, w1) / unit]), pair.same_size)
+
+
+class CentredMatches(NamedTuple):
+    """Points (4, n) from the principal points; s2 (n,), squared scales of a loss in the unit of the points; precision
+    (n,), one over these."""
+
+    points: Array
+    s2: Array
+    precision: Array
+
+
+def centred(pair: Pair, scale_px: float = 1.0) -> CentredMatches:
+    """The matches of a pair whose image sizes are known, computed once. scale_px: of the loss."""
+    return pair.cached(("centred", scale_px), lambda pair: _centred(pair, scale_px))
+
+
+def _centred(pair: Pair, scale_px: float) -> CentredMatches:
+    out = np.empty((6, pair.count))
+    centre(pair.table, images_of(pair).offset, scale_px, out)
+    return CentredMatches(out[:4], out[4], out[5])
+
+
+@kernel(holds_gil=True)
+def translate(F: F8x2, offset: F8x1, out: F8x2) -> None:
+    """Models (k, 9) for points from which the offset (4,) is taken -> out (k, 9)."""
+    for k in range(len(F)):
+        for r in range(3):
+            a, b = F[k, 3 * r], F[k, 3 * r + 1]
+            out[k, 3 * r], out[k, 3 * r + 1] = a, b
+            out[k, 3 * r + 2] = F[k, 3 * r + 2] + offset[0] * a + offset[1] * b
+        for c in range(3):
+            out[k, 6 + c] += offset[2] * out[k, c] + offset[3] * out[k, 3 + c]
+
+
+@kernel(holds_gil=True)
+def centre(table: F8x2, offset: F8x1, scale_px: float, out: F8x2) -> None:
+    """Points from the principal points, squared scales of a loss, and one over these -> out (6, n).
+
+    table: (9, n), of `Pair`. offset: (4,), what is added to points. scale_px: of the loss, of a usual match.
+    """
+    for i in range(table.shape[1]):
+        for r in range(4):
+            out[r, i] = table[r, i] + offset[r]
+        scale = table[5, i]
+        out[4, i], out[5, i] = (scale_px / scale) * (scale_px / scale), (scale / scale_px) * (scale / scale_px)
+
+
+@kernel(holds_gil=True)
+def nearest_cameras(F: F8x2, images: Images, cameras: Cameras) -> None:
+    """Cameras near models (k, 9): those of their focal lengths, or of usual ones where these are implausible."""
+    axes, focal, longest, shifted = cameras.axes, cameras.focal, images.longest, np.empty(F.shape)
+    translate(F, -images.offset, shifted)
+    G, M, e0, e1 = vector(9), vector(9), vector(3), vector(3)
+    for k in range(len(shifted)):
+        start_one(shifted[k], SQUARINGS, G, e0, e1)
+        first = _squared_focal(G, 1, 3, e1) / (longest[0] * longest[0])
+        second = _squared_focal(G, 3, 1, e0) / (longest[1] * longest[1])
+        plausible = MIN_FOCAL**2 < first < MAX_FOCAL**2 and MIN_FOCAL**2 < second < MAX_FOCAL**2
+        focal[k, 0] = logarithm(first) / 2 if plausible else LOG_USUAL
+        focal[k, 1] = logarithm(second) / 2 if plausible else LOG_USUAL
+        d0 = 1 / (exponential(focal[k, 0]) * longest[0])
+        d1 = 1 / (exponential(focal[k, 1]) * longest[1])
+        for r in range(3):
+            G[3 * r + 2] *= d0
+        for c in range(3):
+            G[6 + c] *= d1
+        start_one(G, 0, M, e0, e1)
+        _nearest_axes(M, e0, e1, axes[k])
+
+
+@inner
+def _nearest_axes(M: Array, e0: Array, e1: Array, axes: Array) -> None:
+    """U and V of the essential matrix nearest to M (9,), whose epipoles are e0, e1 -> axes (2, 3, 3).
+
+    In the planes across the epipoles M is 2 x 2; its nearest orthogonal matrix gives both singular values 1.
+    """
+    p, q, a, b = vector(3), vector(3), vector(3), vector(3)
+    complement(e0, p, q)
+    complement(e1, a, b)
+    m00, m01, m10, m11 = 0.0, 0.0, 0.0, 0.0
+    for r in range(3):
+        Mp = M[3 * r] * p[0] + M[3 * r + 1] * p[1] + M[3 * r + 2] * p[2]
+        Mq = M[3 * r] * q[0] + M[3 * r + 1] * q[1] + M[3 * r + 2] * q[2]
+        m00, m01, m10, m11 = m00 + a[r] * Mp, m01 + a[r] * Mq, m10 + b[r] * Mp, m11 + b[r] * Mq
+    sign = 1.0 if m00 * m11 >= m01 * m10 else -1.0
+    cosine, sine = m00 + sign * m11, m10 - sign * m01
+    norm = math.sqrt(cosine * cosine + sine * sine)
+    cosine, sine = cosine / norm, sine / norm
+    for r in range(3):
+        axes[0, r, 0], axes[0, r, 1] = a[r] * cosine + b[r] * sine, sign * (b[r] * cosine - a[r] * sine)
+        axes[1, r, 0], axes[1, r, 1] = p[r], q[r]
+        axes[0, r, 2], axes[1, r, 2] = e1[r], e0[r]
+
+
+@inner
+def _squared_focal(F: Array, column: int, row: int, e: Array) -> Any:
+    """Bougnoux's formula (ICCV 1998) for the camera whose points F's columns belong to; steps exchanged, the other."""
+    r0 = -F[0] * e[1] + F[row] * e[0]
+    r1 = -F[column] * e[1] + F[row + column] * e[0]
+    r2 = -F[2 * column] * e[1] + F[row + 2 * column] * e[0]
+    return -(r2 * F[8]) / (r0 * F[2 * row] + r1 * F[2 * row + column])

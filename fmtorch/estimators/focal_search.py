@@ -1,0 +1,163 @@
+"""The search among plausible cameras: rounds of samples of five, each refined with the prior on focal lengths."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from fmtorch.compiling.arrays import Array, B1x1, F8x1, F8x2
+from fmtorch.compiling.kernel import kernel
+from fmtorch.estimators.families.cameras import Cameras
+from fmtorch.estimators.families.focals import FundamentalWithFocals
+from fmtorch.estimators.options import Focal
+from fmtorch.estimators.pair import Pair
+from fmtorch.estimators.parts.inliers import StoppingRule
+from fmtorch.estimators.parts.refinement import Candidates, Refinement
+from fmtorch.estimators.parts.scores import Score
+from fmtorch.estimators.parts.selection import Selection, scores_of
+from fmtorch.estimators.search import Search
+
+# Share of the best gain without prior that gain minus prior cost must reach; chosen on castle-P19, fox, crops of them.
+MIN_GAIN_SHARE = 0.85
+# A good candidate has RIVAL_GAIN_SHARE of the best gain; it is another model than the best where 1 - |cosine| of the
+# two as vectors is above SAME_MODEL, or SAME_CAMERAS for candidates of plausible cameras.
+RIVAL_GAIN_SHARE, SAME_MODEL, SAME_CAMERAS = 0.85, 1e-3, 1e-2
+
+
+class PlausibleCandidates:
+    """Models F (k, 9) of greatest posterior nearby, what that is (k,), minus infinity for none, and their cameras.
+
+    best: the candidate of the greatest posterior, the first of several. valid: whether there is one.
+    """
+
+    def __init__(self, F: Array, posterior: Array, cameras: Cameras) -> None:
+        self.F, self.posterior, self.cameras = F, posterior, cameras
+        self.best = int(posterior.argmax())
+        self.valid = math.isfinite(posterior[self.best])
+
+    def joined(self, other: PlausibleCandidates) -> PlausibleCandidates:
+        """The candidates of both."""
+        F, posterior = np.concatenate([self.F, other.F]), np.concatenate([self.posterior, other.posterior])
+        return PlausibleCandidates(F, posterior, self.cameras.joined(other.cameras))
+
+    def best_alone(self) -> PlausibleCandidates:
+        """The candidate of the greatest posterior alone."""
+        k = slice(self.best, self.best + 1)
+        return PlausibleCandidates(self.F[k], self.posterior[k], self.cameras.of(self.best))
+
+    @property
+    def selection(self) -> Selection:
+        """The best one."""
+        return Selection(self.F[self.best], self.valid, self.cameras.of(self.best) if self.valid else None)
+
+    def confirmed(self, other: PlausibleCandidates) -> bool:
+        """Whether the best of both are one model."""
+        return self.valid and other.valid and same_model(self.F[self.best], other.F[other.best], SAME_CAMERAS)
+
+    @property
+    def unique_optimum(self) -> bool:
+        """Whether all good candidates are one model."""
+        return self.valid and not distinct_models(self.F, self.posterior, self.best, RIVAL_GAIN_SHARE, SAME_CAMERAS)
+
+
+class SearchResult(NamedTuple):
+    """All candidates of the rounds, whether the best of them is the estimate, and the samples drawn."""
+
+    candidates: PlausibleCandidates
+    settled: bool
+    draws: int
+
+
+@dataclasses.dataclass(frozen=True)
+class FocalSearch:
+    """The prior on focal lengths in a search. gain: by which candidates are compared. search: of one round; None: the
+    prior only selects. stop: the stopping rule for these samples; None: all rounds are made, and never suffice."""
+
+    options: Focal
+    family: FundamentalWithFocals
+    gain: Score
+    refinement: Refinement
+    search: Search | None
+    stop: StoppingRule | None
+
+    def __call__(self, pair: Pair) -> SearchResult:
+        """Rounds until good candidates are one model, or enough rounds have confirmed the best one, and the stopping
+        rule is content. The pair is settled if that rule is content and its images have one size."""
+        options, confirmations, stop = self.options, 0, False
+        candidates: PlausibleCandidates | None = None
+        draws = 0
+        for turn in range(options.rounds):
+            new, draws = self.round(pair, turn)
+            if candidates is None:
+                candidates = new
+            else:
+                confirmations += candidates.confirmed(new)
+                candidates = candidates.joined(new)
+            stop = self.stop is not None and self.stop(candidates.F[candidates.best], draws, pair, self.family.size)
+            agreed = candidates.unique_optimum or confirmations >= options.confirmations
+            if turn + 1 >= options.min_rounds and agreed and stop:
+                break
+        assert candidates is not None
+        return SearchResult(candidates, pair.same_size and stop, draws)
+
+    def round(self, pair: Pair, turn: int) -> tuple[PlausibleCandidates, int]:
+        """The candidates of a round, and the samples drawn until then."""
+        assert self.search is not None
+        pool = self.search(pair, turn * self.options.samples)
+        return self.refined(pool.models, pool.valid, pair, self.refinement.near(pool, pair)), pool.draws
+
+    def refined(self, F: Array, valid: Array, pair: Pair, near: Pair) -> PlausibleCandidates:
+        """Candidates near models (k, 9), refined on some matches and judged on all."""
+        cameras, refined = self.family.refine(F, near, self.options.iterations)
+        posterior = np.empty(len(F))
+        posteriors(scores_of(self.gain, refined.models, pair), refined.share, refined.cost, valid, posterior)
+        return PlausibleCandidates(refined.models, posterior, cameras)
+
+    def select(self, free: Candidates, pair: Pair, plausible: PlausibleCandidates | None) -> Selection:
+        """One of the models searched without assumptions, or of plausible cameras near them, or of those before.
+
+        Plausible cameras are taken where their gain minus the cost of the prior is nearly the best gain without one;
+        they are tried where good models differ, or where some were there before.
+        """
+        gain = np.where(free.valid, scores_of(self.gain, free.F, pair), -np.inf)
+        order = np.argsort(-gain, kind="stable")
+        models, gain = free.F[order], gain[order]
+        selection = Selection(models[0], bool(free.valid[0]))
+        if plausible is None and not distinct_models(models, gain, 0, RIVAL_GAIN_SHARE, SAME_MODEL):
+            return selection
+        tried = slice(self.options.candidates)
+        candidates = self.refined(models[tried], np.isfinite(gain[tried]), pair, free.near)
+        if plausible is not None:
+            candidates = candidates.joined(plausible)
+        if not candidates.posterior[candidates.best] >= MIN_GAIN_SHARE * gain[0]:
+            return selection
+        return selection._replace(F=candidates.F[candidates.best], cameras=candidates.cameras.of(candidates.best))
+
+
+@kernel(holds_gil=True)
+def posteriors(gain: F8x1, share: F8x1, cost: F8x1, valid: B1x1, out: F8x1) -> None:
+    """Gain times share in front of the cameras minus cost of the prior -> out (k,), minus infinity of none."""
+    for k in range(len(out)):
+        posterior = gain[k] * share[k] - cost[k]
+        out[k] = posterior if valid[k] and not math.isnan(posterior) else -math.inf
+
+
+@kernel(holds_gil=True)
+def distinct_models(F: F8x2, gain: F8x1, best: int, share: float, tolerance: float) -> bool:
+    """Whether a model (k, 9) that has a share of the gain (k,) of the best is another one than it."""
+    distinct = False
+    for k in range(len(F)):
+        distinct |= gain[k] >= share * gain[best] and not same_model(F[k], F[best], tolerance)
+    return distinct
+
+
+@kernel(holds_gil=True)
+def same_model(F: F8x1, G: F8x1, tolerance: float) -> bool:
+    """Whether two models (9,) of unit norm are one, up to the tolerance of 1 - |cosine|."""
+    cosine = 0.0
+    for i in range(9):
+        cosine += F[i] * G[i]
+    return 1 - abs(cosine) <= tolerance

@@ -1,0 +1,195 @@
+"""Gradients of estimates to points, prior and noise: the only tensors behind the door of an estimator.
+
+The value of an estimate is computed without a graph; a zero that has its gradients is added to it. So the estimate has
+the same bits whether anybody asks for gradients or not, and gradients are those of the fit, not of the search.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from fmtorch.compiling.arrays import Array
+from fmtorch.compiling.lanes import LANES
+from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.estimators.families.cameras import Cameras, centred, images_of, translate
+from fmtorch.estimators.families.family import Refining
+from fmtorch.estimators.families.posterior import Limits, minimise, no_optimum, tangents_of
+from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair
+from fmtorch.estimators.parts.final_fits import FinalFit, Fit
+from fmtorch.geometry import canonical, eight_point, unit_frobenius
+from fmtorch.geometry.homography_error import homography_gradient
+from fmtorch.geometry.optimum import STEP_DAMPING, gradient_of_cost
+from fmtorch.geometry.pixel_frame import PixelFrame
+from fmtorch.geometry.robust_losses import KERNELS
+from fmtorch.geometry.sampson_objective_kernels import LOSSES, NO_TABLE, Weighted
+
+
+class Solved(NamedTuple):
+    """A pair, where its matches stand in the caller's tensors (n,), and its fit."""
+
+    pair: Pair
+    slot: Array
+    fit: Fit
+
+
+class GraphedMatches(NamedTuple):
+    """The usable matches of P pairs in normalised units, attached to the caller's graph, padded to N slots; float64.
+
+    precision: one over the square of the noise. weight: the prior times that.
+    """
+
+    points: Float[Tensor, "4 p n"]
+    mask: Bool[Tensor, "p n"]
+    precision: Float[Tensor, "p n"]
+    weight: Float[Tensor, "p n"]
+    prior: Float[Tensor, "p n"] | None
+
+    @property
+    def points0(self) -> Float[Tensor, "p n 2"]:
+        """Points of image 0."""
+        return self.points[:2].permute(1, 2, 0)
+
+    @property
+    def points1(self) -> Float[Tensor, "p n 2"]:
+        """Points of image 1."""
+        return self.points[2:].permute(1, 2, 0)
+
+
+@runtime_checkable
+class Attach(Protocol):
+    """Gives fits their gradients."""
+
+    def __call__(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
+        """A zero with the gradients of the fits, models of normalised points."""
+        ...
+
+
+class Attached:
+    """The gradients of a final fit, by its `gradient`; a fit of one's own may have a method `attached` instead."""
+
+    def __init__(self, final: FinalFit, family: Refining) -> None:
+        self.final, self.family = final, family
+        own: Attach | None = getattr(final, "attached", None)
+        kinds: dict[str, Attach] = {"least_squares": self._least_squares, "optimum": self._optimum, "none": _none}
+        kind = getattr(final, "gradient", "none")
+        if family.model == "homography" and kind == "least_squares":
+            kind = "optimum"  # of the Sampson error, near that of least squares
+        self._attach = own or kinds[kind]
+
+    def __call__(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
+        """As `Attach`."""
+        return self._attach(solved, matches)
+
+    def _least_squares(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
+        counted = _padded([s.fit.counted for s in solved], matches.mask)
+        weighted = self.final.weighted and matches.prior is not None
+        weight = torch.where(counted > 0, matches.weight, 0) if weighted else counted
+        fitted, valid = eight_point(matches.points0, matches.points1, weight)
+        fitted = torch.where(valid[:, None, None], fitted, 0).flatten(1)
+        return fitted - fitted.detach()
+
+    def _optimum(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
+        """By the implicit function theorem: the optimum moves with the gradient of its cost."""
+        device = matches.mask.device
+        at, response = (
+            torch.from_numpy(np.stack(values)).to(device)
+            for values in ([s.fit.at for s in solved], [self._response(s) for s in solved])
+        )
+        counted = _padded([s.fit.counted for s in solved], matches.mask)
+        weight = matches.weight if self.family.fit_scale.by_prior else matches.precision
+        weight = torch.where(counted > 0, counted * weight, 0)
+        if self.family.model == "homography":
+            gradient = homography_gradient(at, matches.points, weight)
+        else:
+            unbounded = torch.full_like(at[:, 0], torch.inf)
+            gradient = gradient_of_cost(at.T[..., None], matches.points, weight, KERNELS["truncated"], unbounded)[
+                ..., 0
+            ].T
+        return (response * (gradient - gradient.detach())[:, None]).sum(-1)
+
+    def _response(self, solved: Solved) -> Array:
+        """How the fit of a pair moves with the gradient of its cost, (9, 9)."""
+        pair, fit = solved.pair, solved.fit
+        weight = fit.counted * (pair.weight if self.family.fit_scale.by_prior else 1 / np.square(pair.noises))
+        if fit.cameras is not None:
+            return camera_response(fit.cameras, pair, weight, fit.precision)
+        return self.family.response(fit.at, pair, weight)
+
+
+def with_gradients(estimate: Estimate, c: Correspondences, solved: dict[int, Solved], attach: Attach) -> Estimate:
+    """The estimate of a batch with the gradients of the pairs that are solved; the same values."""
+    rows = torch.tensor(list(solved), device=c.mask.device)
+    pairs = [s.pair for s in solved.values()]
+    zero = attach(list(solved.values()), graphed_matches(c, solved))
+    F = torch.from_numpy(np.stack([s.fit.F for s in solved.values()])).to(zero)
+    centre = torch.from_numpy(np.stack([pair.centre for pair in pairs])).to(zero)
+    unit = torch.tensor([pair.pixels_per_unit for pair in pairs]).to(zero)
+    frame = PixelFrame(centre, unit, torch.ones_like(rows, dtype=torch.bool))
+    models = (F + zero).reshape(-1, 1, 3, 3)
+    if estimate.model == "homography":
+        G = unit_frobenius(frame.homography_to_pixels(models)[:, 0])
+    else:
+        G = canonical(frame.to_pixels(models)[:, 0])
+    return estimate.derived(F=estimate.F.index_add(0, rows, G - G.detach()))
+
+
+def graphed_matches(c: Correspondences, solved: dict[int, Solved]) -> GraphedMatches:
+    """The usable matches of the pairs that are solved."""
+    rows, pairs = torch.tensor(list(solved), device=c.mask.device), [s.pair for s in solved.values()]
+    n = max(pair.count for pair in pairs)
+    slot = np.zeros((len(pairs), n), np.int64)
+    for place, each in zip(slot, solved.values(), strict=True):
+        place[: len(each.slot)] = each.slot
+    count, index = torch.tensor([pair.count for pair in pairs]), torch.from_numpy(slot).to(rows)
+    mask = (torch.arange(n) < count[:, None]).to(rows.device)
+
+    def take(value: Tensor | None) -> Tensor | None:
+        return None if value is None else torch.where(mask, value[rows].gather(1, index), 0).to(torch.float64)
+
+    pixels = torch.cat([c.x0, c.x1], -1)[rows].to(torch.float64).gather(1, index[..., None].expand(-1, -1, 4))
+    centre = torch.from_numpy(np.stack([pair.centre for pair in pairs])).to(pixels)
+    unit = torch.tensor([pair.pixels_per_unit for pair in pairs]).to(pixels)
+    points = torch.where(mask[..., None], (pixels - centre[:, None]) / unit[:, None, None], 0).permute(2, 0, 1)
+    prior, noise = take(c.prior), take(c.noise)
+    precision = mask.to(torch.float64)
+    if noise is not None:
+        precision = precision / torch.where(mask, noise.nan_to_num(1).clamp(MIN_NOISE, MAX_NOISE), 1).square()
+    weight = precision if prior is None else precision * prior.nan_to_num(0).clamp(0, 1)
+    return GraphedMatches(points, mask, precision, weight, prior)
+
+
+def camera_response(cameras: Cameras, pair: Pair, weight: Array, precision: float) -> Array:
+    """How the optimum of the posterior moves with the gradient of its cost by the nine entries, (9, 9).
+
+    weight: (n,), of the matches that count. precision: one over the variance of an inlier's distance.
+    """
+    images, optimum, tangents = images_of(pair), no_optimum(1), np.zeros((1, 9, LANES))
+    matches = Weighted(centred(pair).points, weight, np.full(pair.count, np.inf), LOSSES["truncated"], NO_TABLE)
+    minimise(cameras.copy(), matches, images, Limits(precision, 0, 0.0), optimum)
+    tangents_of(cameras, images.longest, optimum.F, tangents)
+    moves, hessian = np.empty((7, 9)), optimum.hessian[0]
+    translate(np.ascontiguousarray(tangents[0, :, :7].T), images.offset, moves)
+    try:
+        steps = np.linalg.solve(hessian + STEP_DAMPING * np.diag(np.diag(hessian)), moves)
+    except np.linalg.LinAlgError:
+        return np.zeros((9, 9))
+    response: Array = -precision * moves.T @ steps
+    return response if np.isfinite(response).all() else np.zeros((9, 9))
+
+
+def _none(solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
+    """No gradients."""
+    return matches.points.new_zeros(len(solved), 9)
+
+
+def _padded(rows: list[Array], mask: Bool[Tensor, "p n"]) -> Float[Tensor, "p n"]:
+    """Numbers of the matches of each pair, zero in padded slots."""
+    out = np.zeros(tuple(mask.shape))
+    for place, row in zip(out, rows, strict=True):
+        place[: len(row)] = row
+    return torch.from_numpy(out).to(mask.device)

@@ -1,0 +1,122 @@
+"""A round's models compared on few matches first, so that only the best of them are scored on all."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fmtorch.compiling.arrays import Array, F8x1, I8x1
+from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.random_kernels import random_bits, stream_state
+from fmtorch.compiling.scratch import vector
+from fmtorch.core.streams import Stream
+from fmtorch.estimators.options import Preselect
+from fmtorch.estimators.pair import Pair
+from fmtorch.estimators.parts.scores import Score
+from fmtorch.geometry.order_kernels import smallest_but, sort_by
+
+LAST_WORD = (1 << 63) - 1
+
+
+class Preselection:
+    """Scores a round's models, the weaker ones dropped after a look at few matches.
+
+    score: by which models are compared; its `preselection`, if it has one, on few matches. options: how many matches
+    these are, and how many models pass; None: every model is scored on every match.
+    """
+
+    def __init__(self, score: Score, options: Preselect | None) -> None:
+        self.score, self.options = score, options
+        self.first: Score = getattr(score, "preselection", score)
+
+    def __call__(self, F: Array, pair: Pair) -> tuple[Array, Array]:
+        """The indices (k,), ascending, of the models (m, 9) that pass, and their scores (k,) on all matches."""
+        which, options = np.arange(len(F)), self.options
+        if options is not None and len(F) > options.survivors:
+            subset = self.subset(pair)
+            if subset is not None:
+                first = self.first(F, which, subset)
+                which = np.empty(options.survivors, np.int64)
+                best(first, which)
+        return which, self.score(F, which, pair)
+
+    def subset(self, pair: Pair) -> Pair | None:
+        """The pair with the few matches; None where there are not many more.
+
+        A score that weighs matches by their prior gets such as are drawn by it, each of which counts as one.
+        """
+        if self.options is None or pair.bucket < 2 * self.options.matches:
+            return None
+        by_prior, matches = self.score.prior_weighted and pair.prior is not None, self.options.matches
+        draw = drawn_by_prior if by_prior else shuffled_first
+        return pair.cached(("subset", draw, matches), lambda pair: draw(pair, matches))
+
+
+def shuffled_first(pair: Pair, count: int) -> Pair:
+    """The pair with so many of its matches, in an order that its key decides."""
+    index = np.empty(min(count, pair.count), np.int64)
+    return pair.take(index[: shuffle(pair.count, pair.mixed_seed(Stream.PRESELECTION), pair.key, index)])
+
+
+def drawn_by_prior(pair: Pair, count: int) -> Pair:
+    """The pair with so many matches drawn by their prior, without replacement; those of any prior count as one.
+
+    They are the first by falling prior / u, u random and uniform, and each stands for as much of the prior: priority
+    sampling (Duffield, Lund & Thorup, J. ACM 2007).
+    """
+    index = np.empty(min(count, pair.count), np.int64)
+    draw_by_prior(pair.match_weight, pair.mixed_seed(Stream.PRESELECTION), pair.key, index)
+    subset = pair.take(index)
+    np.greater(subset.match_weight, 0, out=subset.match_weight)
+    return subset
+
+
+@kernel(holds_gil=True)
+def best(score: F8x1, out: I8x1) -> None:
+    """The indices of the k best of m >= k scores, in ascending order; of equal ones the first -> out (k,)."""
+    m, k = len(score), len(out)
+    threshold, better = smallest_but(score.copy(), 0, m, m - k), 0
+    for i in range(m):
+        better += score[i] > threshold
+    equal, place = k - better, 0
+    for i in range(m):
+        if score[i] > threshold or (score[i] == threshold and equal > 0):
+            equal -= score[i] == threshold
+            out[place] = i
+            place += 1
+
+
+@kernel(holds_gil=True)
+def draw_by_prior(prior: F8x1, mixed_seed: int, key: int, out: I8x1) -> None:
+    """The matches of the greatest prior / u -> out (k,), ascending; priors (n,)."""
+    priority, state = vector(len(prior)), stream_state(mixed_seed, key)
+    for i in range(len(prior)):
+        priority[i] = prior[i] / (np.float64(random_bits(state, i)) + 1)
+    best(priority, out)
+
+
+@kernel(holds_gil=True)
+def shuffle(count: int, mixed_seed: int, key: int, out: I8x1) -> int:
+    """The first of so many matches in the order of their random numbers -> out (k,); how many they are."""
+    index = np.empty(count, np.int64)
+    for i in range(count):
+        index[i] = i
+    return first_shuffled(index, mixed_seed, key, out)
+
+
+@inner
+def first_shuffled(index: Array, mixed_seed: int, key: int, out: Array) -> int:
+    """The first ones of the matches (m,), ascending, in a random order -> out (k,); how many they are."""
+    m, kept, state = len(index), 0, stream_state(mixed_seed, key)
+    word = np.empty(m, np.int64)
+    for i in range(m):
+        word[i] = np.int64(random_bits(state, index[i]))
+    last = smallest_but(word.copy(), 0, m, len(out) - 1) if 0 < len(out) < m else np.int64(LAST_WORD)
+    for i in range(m):
+        if word[i] <= last:
+            word[kept], index[kept] = word[i], index[i]
+            kept += 1
+    sort_by(word[:kept], index[:kept])
+    kept = min(kept, len(out))
+    for i in range(kept):
+        out[i] = index[i]
+    return kept

@@ -1,0 +1,237 @@
+"""How good a hypothesis is: the residual of every match under every model, turned into one number a model.
+
+Per-match gains are rounded to few fractional bits, so that their sums are exact in any order. Larger is better.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+
+from fmtorch.compiling.arrays import Array, F4x1, F4x2, F8x1, I8x1
+from fmtorch.compiling.kernel import Kernel, inner, kernel
+from fmtorch.compiling.lanes import added, store, where
+from fmtorch.estimators.pair import Pair
+from fmtorch.estimators.parts.scored_matches import fractional_bits, scored_matches
+from fmtorch.geometry.magsac import GAIN_TABLE
+from fmtorch.geometry.residual_kernels import MATCH, SAMPSON, SINGLES, Residual, fill, load
+
+COUNT, TRUNCATED_SQUARES, GEMAN_MCCLURE, TABLE = 0, 1, 2, 3  # gains
+ONE, ZERO = np.float32(1), np.float32(0)
+REST = np.float32(1 / 26)  # of the gain of Geman & McClure at 5 scales, from which on it is zero
+STRETCH = np.float32(1 / (1 - 1 / 26))
+NO_TABLE = np.empty(0, np.float32)
+
+
+@runtime_checkable
+class Score(Protocol):
+    """Scores models. prior_weighted: each match counts as much as its prior, where it has one.
+
+    One may have a `preselection`, another score by which models are compared on few matches.
+    """
+
+    prior_weighted: bool
+
+    def __call__(self, F: Array, which: Array, pair: Pair) -> Array:
+        """Scores (k,) float64 of those of the models (m, 9), float32, that have the indices `which` (k,) int64.
+
+        Models are of the pair's points in normalised units.
+        """
+        ...
+
+
+class Gain(NamedTuple):
+    """A gain as kernels take it. bits: fractional, that gains are rounded to. table: of TABLE, over the squared
+    residual from 0 to the threshold; 0 at its end."""
+
+    code: int
+    bits: int
+    table: F4x1
+
+
+class SummedGains:
+    """The sum over matches of a gain, from 1 at no residual to 0, times P(inlier) if so asked.
+
+    A score of one's own overrides `gain` in NumPy, or names a compiled `gain_kernel(squared, out)`; residuals and the
+    exact sum are compiled in any case. threshold: the scale of the residuals, Sampson distance, px.
+    """
+
+    gain_kernel: ClassVar[Kernel[..., None] | None] = None
+
+    def __init__(self, threshold: float, prior_weighted: bool = False) -> None:
+        check_threshold(threshold)
+        self.threshold, self.prior_weighted = float(threshold), prior_weighted
+
+    def gain(self, squared: Array) -> Array:
+        """Gains in [0, 1] at squared residuals in thresholds, (models, matches) float32."""
+        raise NotImplementedError(f"{type(self).__name__} must override `gain` or name a `gain_kernel`")
+
+    def __call__(self, F: Array, which: Array, pair: Pair) -> Array:
+        """As `Score`."""
+        rows, bits = pair.cached(self, self._matches)
+        squared = np.empty((len(which), pair.count), np.float32)
+        squared_residuals_of(pair.residual)(F, which, rows, squared)
+        if self.gain_kernel is not None:
+            gains = np.empty_like(squared)
+            self.gain_kernel(squared, gains)
+        else:
+            gains = np.asarray(self.gain(squared))
+        if gains.shape != squared.shape:
+            raise ValueError(
+                f"{type(self).__name__}.gain returns shape {gains.shape}; it must be that of its argument, "
+                f"{squared.shape}: (models, matches)"
+            )
+        out = np.empty(len(which))
+        sum_gains(np.ascontiguousarray(gains, np.float32), rows, bits, out)
+        return out
+
+    def _matches(self, pair: Pair) -> tuple[Array, int]:
+        """The matches in rows, and the fractional bits of their gains."""
+        return scored_matches(pair, self.threshold, self.prior_weighted), fractional_bits(pair.count)
+
+
+class CodedGains(SummedGains):
+    """A sum of gains that one kernel computes."""
+
+    CODE: ClassVar[int]
+    table = NO_TABLE
+
+    def __call__(self, F: Array, which: Array, pair: Pair) -> Array:
+        """As `Score`."""
+        rows, gain = pair.cached(self, self._coded)
+        out = np.empty(len(which))
+        score_gains_of(pair.residual)(F, which, rows, gain, out)
+        return out
+
+    def _coded(self, pair: Pair) -> tuple[Array, Gain]:
+        rows, bits = self._matches(pair)
+        return rows, Gain(self.CODE, bits, self.table)
+
+
+class InlierCount(CodedGains):
+    """RANSAC: the number of matches within the threshold (Fischler & Bolles 1981)."""
+
+    CODE = COUNT
+
+
+class Msac(CodedGains):
+    """MSAC: the sum of ``1 - r^2 / t^2`` over the matches within the threshold t (Torr & Zisserman 2000)."""
+
+    CODE = TRUNCATED_SQUARES
+
+
+class GemanMcClure(CodedGains):
+    """The sum over matches of ``1 / (1 + r^2 / s^2)``, shifted and scaled to be 1 at r = 0 and 0 from 5 s on.
+
+    Geman & McClure (1987); s is the threshold. A narrow peak with a long tail: exact matches decide, and matches with
+    larger noise still count, so that one scale serves scenes of different noise.
+    """
+
+    CODE = GEMAN_MCCLURE
+
+
+class Magsac(CodedGains):
+    """MAGSAC++: the likelihood marginalised over the noise scale (Barath et al., CVPR 2020, section 3.2).
+
+    The gain is ``1 - rho(r) / rho(k sigma_max)``, rho as in `sigma_consensus`, tabulated over r^2 as the authors do.
+    threshold: k sigma_max, Sampson distance, px.
+    """
+
+    CODE, table = TABLE, GAIN_TABLE
+
+    def __init__(self, threshold: float) -> None:
+        super().__init__(threshold)
+
+
+def check_threshold(threshold: float) -> None:
+    """Raise ValueError for what is no distance."""
+    if not threshold > 0:
+        raise ValueError(f"threshold is {threshold}; it is a distance in pixels and must be positive")
+
+
+@functools.cache
+def score_gains_of(residual: Residual) -> Kernel[..., None]:
+    """The kernel of sums of gains for a residual."""
+    of_row = residual.of_row
+
+    @kernel(name=f"score_gains_{residual.name}")
+    def score_gains(F: F4x2, which: I8x1, rows: F4x2, gain: Gain, out: F8x1) -> None:
+        """Sums of gains of the models F[which] -> out (k,)."""
+        shift = np.float32(1.5 * 2.0 ** (23 - gain.bits))
+        gains = np.empty((len(rows) // MATCH, SINGLES), np.float32)
+        for k in range(len(which)):
+            total = fill(ZERO)
+            for row in range(0, len(rows), MATCH):
+                g = of_row(F[which[k]], rows, row)
+                if gain.code == COUNT:
+                    g = where(g <= ONE, fill(ONE), ZERO)
+                elif gain.code == TRUNCATED_SQUARES:
+                    g = ONE - g
+                elif gain.code == GEMAN_MCCLURE:
+                    g = geman_mcclure(g)
+                store(gains, row // MATCH, g)
+            if gain.code == TABLE:
+                _look_up(gains.ravel(), gain.table)
+            for row in range(len(gains)):
+                total += rounded(load(gains, row) * load(rows, MATCH * row + 5), shift)
+            out[k] = added(total)
+
+    return score_gains
+
+
+@functools.cache
+def squared_residuals_of(residual: Residual) -> Kernel[..., None]:
+    """The kernel of squared residuals in thresholds, for gains in NumPy."""
+    of_row = residual.of_row
+
+    @kernel(name=f"squared_residuals_{residual.name}")
+    def squared_residuals(F: F4x2, which: I8x1, rows: F4x2, out: F4x2) -> None:
+        """Squared residuals in thresholds of n matches under the models F[which] -> out (k, n)."""
+        lane = np.empty((1, SINGLES), np.float32)
+        for k in range(len(which)):
+            for row in range(0, len(rows), MATCH):
+                store(lane, 0, of_row(F[which[k]], rows, row))
+                first = row // MATCH * SINGLES
+                for i in range(min(SINGLES, out.shape[1] - first)):
+                    out[k, first + i] = lane[0, i]
+
+    return squared_residuals
+
+
+@kernel
+def sum_gains(gains: F4x2, rows: F4x2, bits: int, out: F8x1) -> None:
+    """Sums of the gains (k, n), each times the weight of its match, rounded to so many bits -> out (k,)."""
+    shift = np.float32(1.5 * 2.0 ** (23 - bits))
+    for k in range(len(out)):
+        total: Any = 0.0
+        for i in range(gains.shape[1]):
+            gain = gains[k, i] * rows[i // SINGLES * MATCH + 5, i % SINGLES]
+            total += (gain if gain > ZERO else ZERO) + shift - shift
+        out[k] = total
+
+
+@inner
+def _look_up(r2: Array, table: Array) -> None:
+    """The entries of a table at squared residuals, in place."""
+    last = np.float32(len(table) - 1)
+    for i in range(len(r2)):
+        entry = r2[i] * last
+        r2[i] = table[np.int32(entry if entry < last else last)]
+
+
+@inner
+def geman_mcclure(r2: Any) -> Any:
+    """The gain of Geman & McClure of squared residuals."""
+    g = ONE / (r2 + ONE) - REST
+    return where(g > ZERO, g, ZERO) * STRETCH
+
+
+@inner
+def rounded(gain: Any, shift: Any) -> Any:
+    """Gains rounded to even multiples of what the shift, 1.5 2^(23 - bits), allows; what is not a number is zero."""
+    return where(gain > ZERO, gain, ZERO) + shift - shift
+
+
+score_gains = score_gains_of(SAMPSON)

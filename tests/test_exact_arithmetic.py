@@ -1,0 +1,141 @@
+"""Values are made of operations that every processor rounds alike; the others are refused by their names.
+
+A function of the C library or a vector library (exp, log, pow) is right to some ulps, which differ between versions and
+processors; a sum differs where BLAS or LAPACK chooses its order. `fmtorch.geometry.arithmetic` and `arithmetic_kernels`
+stand for them.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+PACKAGE = REPOSITORY / "fmtorch"
+DECORATORS = {"kernel", "inner", "njit", "jit"}
+INEXACT = {
+    "acos", "acosh", "arccos", "arccosh", "arcsin", "arcsinh", "arctan", "arctan2", "arctanh", "asin", "asinh", "atan",
+    "atan2", "atanh", "cbrt", "cos", "cosh", "erf", "erfc", "exp", "exp2", "expm1", "float_power", "gamma", "hypot",
+    "lgamma", "log", "log10", "log1p", "log2", "logaddexp", "pow", "power", "sin", "sinh", "tan", "tanh",
+}  # fmt: skip
+"""Functions of math and NumPy that are right to some ulps."""
+SUMS = {"convolve", "correlate", "dot", "einsum", "inner", "matmul", "norm", "tensordot", "vdot"}
+"""Of NumPy, and methods of arrays: in the order that a library chooses."""
+ALLOWED: dict[tuple[str, str], str] = {}
+"""(file, name): the reason why it may stay."""
+PEERS = "estimators/peers/"  # others' estimators
+ROOMS = ("estimators", "geometry", "matching", "metrics", "pruning")
+NETWORKS = ("pruning/networks/", "pruning/code/")  # values that agree to rounding only, docs/conventions.md
+
+
+def trees() -> Iterator[tuple[str, ast.Module]]:
+    for path in sorted(PACKAGE.rglob("*.py")):
+        yield path.relative_to(PACKAGE).as_posix(), ast.parse(path.read_text(encoding="utf-8"))
+
+
+def holds_kernels(tree: ast.Module) -> bool:
+    """Whether a function is decorated as a kernel, or as one for kernels to call."""
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    return any(last_name(decorator) in DECORATORS for f in functions for decorator in f.decorator_list)
+
+
+def imports_torch(tree: ast.Module) -> bool:
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
+    names = [alias.name for node in imports if isinstance(node, ast.Import) for alias in node.names]
+    names += [node.module or "" for node in imports if isinstance(node, ast.ImportFrom)]
+    return any(name.split(".")[0] == "torch" for name in names)
+
+
+def last_name(node: ast.expr) -> str:
+    """``inner`` of ``@inner``, ``@numba.inner`` and ``@inner(inline=True)``."""
+    if isinstance(node, ast.Call):
+        node = node.func
+    return node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
+
+
+def inexact(tree: ast.Module) -> list[tuple[int, str]]:
+    """The lines and names of what processors round differently."""
+    modules = {"math", "np", "numpy", "linalg", "fft"}
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute):
+            of_library = isinstance(node.value, ast.Name | ast.Attribute) and last_name(node.value) in modules
+            if (of_library and node.attr in INEXACT | SUMS | {"linalg", "fft"}) or node.attr in ("dot", "matmul"):
+                found.append((node.lineno, node.attr))
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in modules:
+            found += [(node.lineno, alias.name) for alias in node.names if alias.name in INEXACT | SUMS | {"linalg"}]
+        elif isinstance(node, ast.BinOp | ast.AugAssign) and isinstance(node.op, ast.MatMult):
+            found.append((node.lineno, "@"))
+        elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow) and not exact_power(node):
+            found.append((node.lineno, "**"))
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "pow":
+            found.append((node.lineno, "pow"))
+    return found
+
+
+def exact_power(node: ast.BinOp) -> bool:
+    """A square, a power of two, or one of two constants, which Python computes when it reads the file."""
+    base, exponent = node.left, node.right
+    constants = [isinstance(part, ast.Constant) for part in (base, exponent)]
+    square = isinstance(exponent, ast.Constant) and exponent.value == 2
+    of_two = isinstance(base, ast.Constant) and base.value == 2
+    return all(constants) or square or of_two
+
+
+def roots(tree: ast.Module) -> list[int]:
+    """The lines of `torch.sqrt`, ``x.sqrt()`` and ``x.norm()`` of tensors."""
+    return [
+        node.lineno
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)
+        and node.func.attr in ("sqrt", "sqrt_", "norm", "hypot", "cdist")
+        and not (isinstance(node.func.value, ast.Name) and node.func.value.id in ("math", "np"))
+    ]  # fmt: skip
+
+
+def test_kernels_and_what_calls_them_take_exact_operations() -> None:
+    found = []
+    for name, tree in trees():
+        if holds_kernels(tree) or (name.startswith("estimators/") and not (imports_torch(tree) or PEERS in name)):
+            found += [f"{name}:{line}: {what}" for line, what in inexact(tree) if (name, what) not in ALLOWED]
+    assert not found, "see fmtorch/geometry/arithmetic_kernels.py"
+
+
+def test_tensors_of_values_take_the_exact_root() -> None:
+    found = [
+        f"{name}:{line}"
+        for name, tree in trees()
+        if name.startswith(ROOMS) and not name.startswith((*NETWORKS, PEERS)) and name != "geometry/arithmetic.py"
+        for line in roots(tree)
+    ]
+    assert not found, "take fmtorch.geometry.arithmetic.sqrt"
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["math.exp(x)", "np.log1p(x)", "x @ y", "np.einsum('ij,j', x, y)", "np.linalg.norm(x)", "x.dot(y)", "x**y", "x**3",
+     "2.5**x", "pow(x, y)", "from math import log"],
+)  # fmt: skip
+def test_what_is_refused(line: str) -> None:
+    assert inexact(ast.parse(line))
+
+
+@pytest.mark.parametrize(
+    "line", ["math.sqrt(x)", "x * y + np.abs(z)", "x**2", "2**0.5", "2.0**x", "np.square(x)", "math.frexp(x)"]
+)
+def test_what_is_not_refused(line: str) -> None:
+    assert not inexact(ast.parse(line))
+
+
+@pytest.mark.parametrize("line", ["@kernel('f8')", "@inner", "@inner(inline=True)", "@numba.njit"])
+def test_kernels_are_found_by_their_decorators(line: str) -> None:
+    assert holds_kernels(ast.parse(f"{line}\ndef f(x): ..."))
+    assert not holds_kernels(ast.parse("@functools.cache\ndef f(x): ..."))
+
+
+def test_what_is_allowed_is_there() -> None:
+    for name, what in ALLOWED:
+        assert what in {each for _, each in inexact(ast.parse((PACKAGE / name).read_text(encoding="utf-8")))}
