@@ -55,6 +55,7 @@ class Kernel(Generic[P, R]):
         self.brief = brief
         self._compiled: Callable[P, R] | None = None
         self.calls: list[Kernel[..., Any]] = []  # those that it calls, once it is compiled
+        calls.KERNELS[self.function.__module__, self.function.__qualname__] = self
         self.__call__ = self._first_call
 
     @functools.cached_property
@@ -146,17 +147,24 @@ class Inner(Generic[P, R]):
 def kernel(signature: Callable[P, R]) -> Kernel[P, R]: ...
 @overload
 def kernel(
-    signature: str | None = None, *, brief: bool = False, holds_gil: bool = False
+    signature: str | None = None, *, brief: bool = False, holds_gil: bool = False, name: str = ""
 ) -> Callable[[Callable[P, R]], Kernel[P, R]]: ...
-def kernel(signature: Any = None, *, brief: bool = False, holds_gil: bool = False) -> Any:
+def kernel(signature: Any = None, *, brief: bool = False, holds_gil: bool = False, name: str = "") -> Any:
     """Makes a function a `Kernel` of the types of its annotations.
 
     Arrays must be writable. holds_gil: of some microseconds, for which it keeps Python's lock: a thread that waits for
-    it would wake too late to use them.
+    it would wake too late to use them. name: of one that a function makes for some other function, unique in its file.
     """
     if callable(signature):
         return Kernel(signature)
-    return lambda function: Kernel(function, signature, brief or holds_gil)
+
+    def named(function: Callable[P, R]) -> Kernel[P, R]:
+        if name:
+            function = inspect.unwrap(function)
+            function.__name__ = function.__qualname__ = name
+        return Kernel(function, signature, brief or holds_gil)
+
+    return named
 
 
 @overload

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import collections
 import contextlib
-import importlib
 import os
 import subprocess
 import sys
@@ -16,7 +15,7 @@ import threading
 from collections.abc import Sequence
 from typing import Any
 
-from fmtorch.compiling import cache, process, switch
+from fmtorch.compiling import cache, calls, process, switch
 from fmtorch.compiling.kernel import Kernel
 
 _lock = threading.Lock()
@@ -84,5 +83,5 @@ def main() -> None:
     print("ready", flush=True)
     for line in sys.stdin:
         module, name, count = line.rstrip("\n").split(" ", 2)
-        getattr(importlib.import_module(module), name).compiled_alone(count)
+        calls.kernel_of(module, name).compiled_alone(count)
         print(name, flush=True)

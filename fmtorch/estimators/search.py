@@ -62,7 +62,7 @@ class Verified(NamedTuple):
 class Degeneracy(Protocol):
     """Completes the best model of a round where its sample is degenerate."""
 
-    def __call__(self, made: Hypotheses, models: Verified, best: float, pair: Pair) -> Verified:
+    def __call__(self, hypotheses: Hypotheses, models: Verified, best: float, pair: Pair) -> Verified:
         """The models of a round with those completed. best: the score to beat."""
         ...
 
@@ -90,10 +90,10 @@ class Search:
         while start < end:
             count = min(self.round, end - start)
             sample = self.sampler.draw(pair, start, count, self.family.size)
-            made = self.family.solve(pair, sample, start)
-            models = Verified(made.F, *self.preselection(made.F, pair))
+            hypotheses = self.family.solve(pair, sample, start)
+            models = Verified(hypotheses.F, *self.preselection(hypotheses.F, pair))
             if self.degeneracy is not None:
-                models = self.degeneracy(made, models, float(pool.score[0]), pair)
+                models = self.degeneracy(hypotheses, models, float(pool.score[0]), pair)
             start += count
             pool.merge(models)
             pool.draws = start

@@ -55,7 +55,7 @@ def evaluate(F: F8x2, weighted: Weighted, derivatives: bool, products: F8x3, cos
             share, slope = robust(r2, load(matches, row + 5), loss, table, work)
             costs += share * load(matches, row + 4)
             if derivatives:
-                _add_products(J, inverse * (load(matches, row + 4) * slope), scaled, sums)
+                add_products(J, inverse * (load(matches, row + 4) * slope), scaled, sums)
         cost[k] = added(costs)
         q = 0
         for r in range(10 if derivatives else 0):
@@ -145,7 +145,7 @@ def _tabulated(table: Array, work: Array) -> None:
 
 
 @inner
-def _add_products(J: Array, factor: Any, weighted: Array, sums: Array) -> None:
+def add_products(J: Array, factor: Any, weighted: Array, sums: Array) -> None:
     """Adds the lower triangle of the weighted products of Jacobian and residual, row by row."""
     for r in range(10):
         store(weighted, r, load(J, r) * factor)

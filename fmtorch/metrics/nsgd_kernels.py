@@ -29,7 +29,7 @@ class Comparison(NamedTuple):
 
 @kernel
 def accepted_draws(pair: Comparison, key: int, mixed_seed: int, samples: int, out: F8x1) -> None:
-    """`draws.mean_terms` of a pair: the sum of its accepted draws, and their number -> out (2,).
+    """`draws.sum_of_draws` of a pair: the sum of its accepted draws, and their number -> out (2,).
 
     mixed_seed: of the seed and the stream. samples: how many draws to accept.
     """

@@ -14,14 +14,14 @@ CURVES = ((0.0, 0.0), (0.5, math.pi / 4))  # shift of the grid (in thirds of the
 TOLERANCE = 0.25  # relative prediction error at which agreement falls to about 1/e
 SHARPNESS = TOLERANCE**-2 / 8
 NOISE = 4.0  # px, keeps close neighbours from being judged by their localisation noise
-WORST_RATIO, LEAST_VOTE = 0.85, 0.02  # a neighbour votes with WORST_RATIO - ratio, at least LEAST_VOTE
-LEAST_SQUARE, LEAST_VOTES = 1e-12, float(np.finfo(np.float32).tiny)  # keep a root's gradient and a quotient finite
+WORST_RATIO, MIN_VOTE = 0.85, 0.02  # a neighbour votes with WORST_RATIO - ratio, at least MIN_VOTE
+MIN_SQUARE, MIN_VOTES = 1e-12, float(np.finfo(np.float32).tiny)  # keep a root's gradient and a quotient finite
 FARTHEST = 1e15  # px; a match beyond is none: its squares could overflow
 
 CURVES32 = np.array([(shift, math.cos(angle), math.sin(angle)) for shift, angle in CURVES], np.float32)
 SHARPNESS32, NOISE32, FARTHEST32 = np.float32(SHARPNESS), np.float32(NOISE), np.float32(FARTHEST)
-WORST_RATIO32, LEAST_VOTE32 = np.float32(WORST_RATIO), np.float32(LEAST_VOTE)
-LEAST_SQUARE32, LEAST_VOTES32 = np.float32(LEAST_SQUARE), np.float32(LEAST_VOTES)
+WORST_RATIO32, MIN_VOTE32 = np.float32(WORST_RATIO), np.float32(MIN_VOTE)
+MIN_SQUARE32, MIN_VOTES32 = np.float32(MIN_SQUARE), np.float32(MIN_VOTES)
 
 TURNS = 16  # hypotheses of the turn that a pair's neighbours have in common
 SCALES = tuple(2.0 ** (k / 2) for k in range(-4, 5))  # hypotheses of their change of scale

@@ -23,7 +23,7 @@ from fmtorch.core.types import Correspondences
 from fmtorch.geometry.arithmetic import component_sum, sqrt
 from fmtorch.geometry.curves import curve_orders
 from fmtorch.pruning import frame_consistency_kernels as compiled
-from fmtorch.pruning.agreement import CURVES, LEAST_SQUARE, LEAST_VOTE, NOISE, SHARPNESS, WINDOW, WORST_RATIO
+from fmtorch.pruning.agreement import CURVES, MIN_SQUARE, MIN_VOTE, NOISE, SHARPNESS, WINDOW, WORST_RATIO
 
 TILE = 1 << 12  # matches looked at together: what a processor's cache holds; changes no result
 GPU_TILE = 1 << 17
@@ -48,7 +48,7 @@ def frame_agreement(
         out = torch.empty(mask.shape, dtype=torch.float32)
         return for_each_pair(_agreement_into, tensors, out=out).to(x0.dtype)
     S = frame_map(lafs0, lafs1)
-    vote = torch.ones_like(x0[..., 0]) if quality is None else (WORST_RATIO - quality).clamp_min(LEAST_VOTE)
+    vote = torch.ones_like(x0[..., 0]) if quality is None else (WORST_RATIO - quality).clamp_min(MIN_VOTE)
     scale = sqrt((S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]).abs())
     rows = torch.stack([*x0.unbind(-1), *x1.unbind(-1), *S.flatten(2).unbind(-1), scale, vote])
     mask = mask & torch.isfinite(rows).all(0)
@@ -77,8 +77,8 @@ def _agreement(rows: Float[Tensor, "10 b n"], mask: Bool[Tensor, "b n"]) -> Floa
     orders = orders[..., : max(int(mask.sum(1).max()), 1)]  # masked slots stand last
     along = rows[:, None].expand(-1, len(orders), -1, -1).gather(3, orders.expand(len(rows), -1, -1, -1))
     sums = _along_curve(along.flatten(1, 2)).reshape(2, *orders.shape)
-    found = sums.new_zeros(*sums.shape[:3], mask.shape[1]).scatter(3, orders.expand(2, -1, -1, -1), sums)
-    agreement, votes = component_sum(found, 1)
+    in_slots = sums.new_zeros(*sums.shape[:3], mask.shape[1]).scatter(3, orders.expand(2, -1, -1, -1), sums)
+    agreement, votes = component_sum(in_slots, 1)
     return torch.where(mask, agreement / votes.clamp_min(torch.finfo(votes.dtype).tiny), 0)
 
 
@@ -100,9 +100,7 @@ def _along_curve(rows: Float[Tensor, "10 b n"]) -> Float[Tensor, "2 b n"]:
     dx, dy, ux, uy = near[:4] - rows[:4]
     error = torch.maximum(_prediction_error(rows[4:8], dx, dy, ux, uy), _prediction_error(near[4:8], dx, dy, ux, uy))
     length = (
-        sqrt(dx.square() + dy.square() + LEAST_SQUARE) * rows[8]
-        + sqrt(ux.square() + uy.square() + LEAST_SQUARE)
-        + NOISE
+        sqrt(dx.square() + dy.square() + MIN_SQUARE) * rows[8] + sqrt(ux.square() + uy.square() + MIN_SQUARE) + NOISE
     )
     # exp(-z) in arithmetic alone, whose last bits, unlike exp's, do not depend on where in memory a number stands
     agree = (1 + error / length.square() * SHARPNESS).square().square().square().reciprocal()
@@ -123,6 +121,8 @@ class FrameConsistency:
     on the tuning scenes than a logistic model of ln(w) and the ratio. Where matches have no frames or no quality the
     prior is left as it is. Linear memory: about 700 bytes a match.
     """
+
+    kernels = (compiled.frame_agreement, compiled.frame_prior)
 
     def __init__(self, *, odds: float, floor: float, slope: float) -> None:
         self.odds, self.floor, self.slope = odds, floor, slope

@@ -12,9 +12,9 @@ from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.geometry.curves_kernels import curve_order
 from fmtorch.pruning.agreement import (
     CURVES32,
-    LEAST_SQUARE32,
-    LEAST_VOTE32,
-    LEAST_VOTES32,
+    MIN_SQUARE32,
+    MIN_VOTE32,
+    MIN_VOTES32,
     NOISE32,
     SHARPNESS32,
     WINDOW,
@@ -53,7 +53,7 @@ def frame_agreement(matches: FramedMatches, out: F4x1) -> None:
         rows[6, m] = (lafs1[i, 1, 0] * d + lafs1[i, 1, 1] * -c) / determinant
         rows[7, m] = (lafs1[i, 1, 0] * -b + lafs1[i, 1, 1] * a) / determinant
         rows[8, m] = math.sqrt(abs(rows[4, m] * rows[7, m] - rows[5, m] * rows[6, m]))
-        rows[9, m] = max(WORST_RATIO32 - quality[i], LEAST_VOTE32) if len(quality) else x0.dtype.type(1)
+        rows[9, m] = max(WORST_RATIO32 - quality[i], MIN_VOTE32) if len(quality) else x0.dtype.type(1)
         valid = mask[i] and not (len(quality) and math.isnan(quality[i]))
         for k in range(10):
             valid = valid and math.isfinite(rows[k, m])
@@ -79,13 +79,13 @@ def frame_agreement(matches: FramedMatches, out: F4x1) -> None:
                 _frames_agree(along, k, ahead[k - 1], behind[k - 1])
             _add_votes(along[9], ahead, behind, order, agreement, votes)
     for i in range(m):
-        out[match[i]] = agreement[i] / max(votes[i], LEAST_VOTES32)
+        out[match[i]] = agreement[i] / max(votes[i], MIN_VOTES32)
 
 
 @inner
 def _frames_agree(along: Array, k: int, ahead: Array, behind: Array) -> None:
     """For matches i and j = i + k: how well j agrees with i -> ahead[i], i with j -> behind[i]."""
-    noise, sharpness, tiny, one = NOISE32, SHARPNESS32, LEAST_SQUARE32, along.dtype.type(1)
+    noise, sharpness, tiny, one = NOISE32, SHARPNESS32, MIN_SQUARE32, along.dtype.type(1)
     X0, Y0, X1, Y1, A, B, C, D, S = (
         along[0], along[1], along[2], along[3], along[4], along[5], along[6], along[7], along[8],
     )  # fmt: skip

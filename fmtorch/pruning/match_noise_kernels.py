@@ -31,10 +31,10 @@ def match_noise(matches: FramedMatches, numbers: F4x1, out: F4x1) -> None:
     numbers: usual, radius in pixels, slope, least area in square pixels, least prior.
     """
     lafs0, lafs1, quality, prior, mask = matches
-    usual, radius, slope, least_area, least_prior = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
+    usual, radius, slope, min_area, min_prior = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
     one = np.float32(1)
     for i in range(len(mask)):
-        size = max(_scale(lafs0, i, least_area), _scale(lafs1, i, least_area))
+        size = max(_scale(lafs0, i, min_area), _scale(lafs1, i, min_area))
         noise = (one + size / radius) / usual
         valid = mask[i] and _finite(lafs0, i) and _finite(lafs1, i)
         if len(quality):
@@ -43,7 +43,7 @@ def match_noise(matches: FramedMatches, numbers: F4x1, out: F4x1) -> None:
             noise *= factor * factor
         if len(prior):
             valid = valid and math.isfinite(prior[i])
-            noise /= math.sqrt(math.sqrt(max(prior[i], least_prior)))
+            noise /= math.sqrt(math.sqrt(max(prior[i], min_prior)))
         out[i] = noise if valid else one
 
 

@@ -28,8 +28,8 @@ from fmtorch.pruning.agreement import (
     FARTHEST,
     HALF_SECTOR,
     IDENTITY,
-    LEAST_SQUARE,
-    LEAST_VOTE,
+    MIN_SQUARE,
+    MIN_VOTE,
     NOISE,
     SCALES,
     SHARPNESS,
@@ -39,6 +39,7 @@ from fmtorch.pruning.agreement import (
     WORST_RATIO,
 )
 from fmtorch.pruning.calibration import Calibration
+from fmtorch.pruning.calibration_kernels import calibrated
 from fmtorch.pruning.frame_consistency import tiled
 
 _BINS = len(SCALES) * TURNS
@@ -68,7 +69,7 @@ def position_agreement(
     if kernels_serve(x0, x1, quality):
         out = torch.empty(mask.shape, dtype=torch.float32)
         return for_each_pair(compiled.position_agreement, (x0, x1, quality, mask), out=out).to(x0.dtype)
-    vote = torch.ones_like(x0[..., 0]) if quality is None else (WORST_RATIO - quality).clamp_min(LEAST_VOTE)
+    vote = torch.ones_like(x0[..., 0]) if quality is None else (WORST_RATIO - quality).clamp_min(MIN_VOTE)
     rows = torch.stack([*x0.unbind(-1), *x1.unbind(-1), vote])
     mask = mask & (rows.abs() < FARTHEST).all(0)
     rows = torch.where(mask, rows, 0)
@@ -83,8 +84,8 @@ def _agreement(rows: Float[Tensor, "5 b n"], mask: Bool[Tensor, "b n"]) -> Float
     S = common_similarity(along[:, 0].detach(), along[:, len(CURVES)].detach(), mask.sum(1))
     S = Similarity(*(value.repeat(len(orders), 1) for value in S))
     sums = torch.stack(_along_curve(along.flatten(1, 2), S)).reshape(2, *orders.shape)
-    found = sums.new_zeros(*sums.shape[:3], mask.shape[1]).scatter(3, orders.expand(2, -1, -1, -1), sums)
-    agreement, votes = component_sum(found, 1)
+    in_slots = sums.new_zeros(*sums.shape[:3], mask.shape[1]).scatter(3, orders.expand(2, -1, -1, -1), sums)
+    agreement, votes = component_sum(in_slots, 1)
     return torch.where(mask, agreement / votes.clamp_min(torch.finfo(votes.dtype).tiny), 0)
 
 
@@ -151,9 +152,7 @@ def _along_curve(rows: Float[Tensor, "5 b n"], S: Similarity) -> tuple[Float[Ten
     dx, dy, ux, uy = later[:4] - rows[:4, None]
     error = (S.a * dx - S.b * dy - ux).square() + (S.b * dx + S.a * dy - uy).square()
     length = (
-        S.scale * sqrt(dx.square() + dy.square() + LEAST_SQUARE)
-        + sqrt(ux.square() + uy.square() + LEAST_SQUARE)
-        + NOISE
+        S.scale * sqrt(dx.square() + dy.square() + MIN_SQUARE) + sqrt(ux.square() + uy.square() + MIN_SQUARE) + NOISE
     )
     agree = (1 + error / length.square() * SHARPNESS).square().square().square().reciprocal()
     # Added one by one: the order of a sum must not depend on the batch.
@@ -170,6 +169,8 @@ class PositionConsistency:
 
     Needs no frames, no sizes and no quality. Linear memory: about 600 bytes a match.
     """
+
+    kernels = (compiled.position_agreement, calibrated)
 
     def __init__(self, *, calibration: Mapping[str, Mapping[str, float]]) -> None:
         self.calibration = Calibration(**calibration)

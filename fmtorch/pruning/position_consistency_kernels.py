@@ -17,10 +17,10 @@ from fmtorch.pruning.agreement import (
     HALF_COSINE32,
     HALF_SINE32,
     IDENTITY,
-    LEAST_SQUARE32,
-    LEAST_VOTE32,
-    LEAST_VOTES32,
     MAPS32,
+    MIN_SQUARE32,
+    MIN_VOTE32,
+    MIN_VOTES32,
     NOISE32,
     SHARPNESS32,
     TWO_TANGENT32,
@@ -42,7 +42,7 @@ def position_agreement(x0: F4x2, x1: F4x2, quality: F4x1, mask: B1x1, out: F4x1)
     for i in range(n):
         out[i] = 0
         rows[0, m], rows[1, m], rows[2, m], rows[3, m] = x0[i, 0], x0[i, 1], x1[i, 0], x1[i, 1]
-        rows[4, m] = max(WORST_RATIO32 - quality[i], LEAST_VOTE32) if len(quality) else x0.dtype.type(1)
+        rows[4, m] = max(WORST_RATIO32 - quality[i], MIN_VOTE32) if len(quality) else x0.dtype.type(1)
         valid = mask[i] and not (len(quality) and math.isnan(quality[i]))
         for k in range(5):
             valid = valid and abs(rows[k, m]) < FARTHEST32
@@ -80,7 +80,7 @@ def position_agreement(x0: F4x2, x1: F4x2, quality: F4x1, mask: B1x1, out: F4x1)
             agreement[orders[o, i]] += total[i]
             votes[orders[o, i]] += all_votes[i]
     for i in range(m):
-        out[match[i]] = agreement[i] / max(votes[i], LEAST_VOTES32)
+        out[match[i]] = agreement[i] / max(votes[i], MIN_VOTES32)
 
 
 @inner
@@ -136,7 +136,7 @@ def _turn(x: Any, y: Any) -> int:
 @inner
 def _positions_agree(along: Array, k: int, similarity: Array, agree: Array) -> None:
     """How well matches i and i + k agree -> agree[i]."""
-    noise, sharpness, tiny, one = NOISE32, SHARPNESS32, LEAST_SQUARE32, along.dtype.type(1)
+    noise, sharpness, tiny, one = NOISE32, SHARPNESS32, MIN_SQUARE32, along.dtype.type(1)
     a, b, scale = similarity[0], similarity[1], similarity[2]
     X0, Y0, X1, Y1 = along[0], along[1], along[2], along[3]
     for i in range(along.shape[1] - k):

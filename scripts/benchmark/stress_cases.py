@@ -26,7 +26,7 @@ from scripts.benchmark.matched import console, sets_of
 
 RATIO = 0.8
 RIGHT_PX, WRONG_PX = 3.0, 10.0  # from the true epipolar lines in both images, and in one of them
-LEAST_RIGHT = 15
+MIN_RIGHT = 15
 PLANE_PX = 3.0
 IMAGES = 256  # whose features are kept, some 5 MB each
 
@@ -79,7 +79,7 @@ def load(arguments: argparse.Namespace) -> Iterator[Case]:
         matches = front.match([pair])[0].correspondences
         if matches is not None:
             case = made(pair, matches)
-            if int(case.right.sum()) >= LEAST_RIGHT:
+            if int(case.right.sum()) >= MIN_RIGHT:
                 yield case
 
 

@@ -12,7 +12,7 @@ from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.irls import _weight
 from fmtorch.geometry.irls import reweighted
 from fmtorch.geometry.irls_kernels import reweighted as compiled_reweighted
-from fmtorch.geometry.robust_kernels import KERNELS
+from fmtorch.geometry.robust_losses import KERNELS
 from fmtorch.geometry.sampson_objective_kernels import LOSSES
 from fmtorch.geometry.sigma_consensus import LOSS_TABLE
 from tests.estimators.test_one_pair import (

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from fmtorch.geometry.irls import irls
 from fmtorch.geometry.refine import refine
-from fmtorch.geometry.robust_kernels import KERNELS
+from fmtorch.geometry.robust_losses import KERNELS
 from tests.conftest import oracle
 from tests.geometry.test_refine import distance, scene
 from tests.reference import refine as reference

@@ -12,7 +12,7 @@ from fmtorch.geometry import sampson_objective
 from fmtorch.geometry.rank2_manifold import start
 from fmtorch.geometry.refine import attached_step, refine, refine_components
 from fmtorch.geometry.residuals import homogeneous, linearise
-from fmtorch.geometry.robust_kernels import KERNELS
+from fmtorch.geometry.robust_losses import KERNELS
 from fmtorch.geometry.sampson_objective import block_products
 from tests.conftest import oracle
 from tests.reference import refine as reference

@@ -9,7 +9,7 @@ import torch
 from fmtorch.geometry import refine_kernels
 from fmtorch.geometry.rank2_manifold import SQUARINGS
 from fmtorch.geometry.refine import DAMPING, refine_components
-from fmtorch.geometry.robust_kernels import KERNELS
+from fmtorch.geometry.robust_losses import KERNELS
 from fmtorch.geometry.sampson_objective import SampsonObjective
 from fmtorch.geometry.sampson_objective_kernels import LOSSES, evaluate
 from fmtorch.geometry.sigma_consensus import LOSS_TABLE

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from fmtorch.compiling import switch
 from fmtorch.data.rendered import light_kernels as compiled
-from fmtorch.data.rendered.cameras import Camera, Matrix
 from fmtorch.data.rendered.mipmap import TO_LINEAR, Floats, Pixels, Real, Texture, bilinear, to_srgb
+from fmtorch.data.rendered.pinhole import Camera, Matrix
 from fmtorch.data.rendered.raycast import Geometry, Hits
 
 # Four rays a pixel, one on each row and column of a 4 x 4 grid (rotated grid); their mean is the pixel centre.

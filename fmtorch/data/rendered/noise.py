@@ -57,12 +57,12 @@ def _neighbours(side: int, points: int) -> Neighbours | None:
     """
     whole, begin = _place(side, points)
     comb = (np.arange(points) % _PERIOD == np.arange(_PERIOD)[:, None]).astype(np.float32)
-    found = cv2.resize(comb, (whole, _PERIOD), interpolation=cv2.INTER_CUBIC)[:, begin : begin + side]
+    kernel_weights = cv2.resize(comb, (whole, _PERIOD), interpolation=cv2.INTER_CUBIC)[:, begin : begin + side]
     pixel = np.arange(begin, begin + side)
     first = np.floor((pixel + 0.5) * (points / whole) - 0.5).astype(np.int64) - 1
-    if found.shape[1] < side or first.min() < 0 or first.max() + 4 > points:
+    if kernel_weights.shape[1] < side or first.min() < 0 or first.max() + 4 > points:
         return None
-    weights = found[(first + np.arange(_PERIOD)[:, None]) % _PERIOD, pixel - begin]
+    weights = kernel_weights[(first + np.arange(_PERIOD)[:, None]) % _PERIOD, pixel - begin]
     return Neighbours(first, np.ascontiguousarray(weights[:4])) if not weights[4:].any() else None
 
 
@@ -70,6 +70,6 @@ def _neighbours(side: int, points: int) -> Neighbours | None:
 def _same_bits() -> bool:
     """Whether both forms round alike on this processor; without Intel's library, or with another, they may not."""
     grid = np.random.default_rng(0).standard_normal((9, 13), dtype=np.float32)
-    one, other = np.zeros((2, 83, 151), dtype=np.float32)
-    _add(one, grid, 1.0)
-    return _add_compiled(other, grid, 1.0) and bool((one == other).all())
+    expected, compiled = np.zeros((2, 83, 151), dtype=np.float32)
+    _add(expected, grid, 1.0)
+    return _add_compiled(compiled, grid, 1.0) and bool((expected == compiled).all())

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.compiling import switch
-from fmtorch.data.rendered.cameras import Camera
 from fmtorch.data.rendered.mipmap import Floats, Pixels
+from fmtorch.data.rendered.pinhole import Camera
 from fmtorch.data.rendered.raycast_kernels import Bounds, Cutouts, Met, Pieces, cast_pieces
 from fmtorch.data.rendered.surfaces import Surfaces
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from statistics import NormalDist
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -69,7 +69,7 @@ class FocalFit(NamedTuple):
 class FundamentalWithFocals:
     """Square pixels, central principal points, usual focal lengths, of images whose sizes are known."""
 
-    size = 5
+    size: ClassVar[int] = 5
 
     def solve(self, pair: Pair, sample: Array, start: int) -> Hypotheses:
         """As `Family.solve`, with focal lengths drawn from their prior."""

@@ -44,7 +44,7 @@ class Degensac:
     def __init__(self, score: Score) -> None:
         self.score, self.prior = score, PriorWeighted()
 
-    def __call__(self, made: Hypotheses, models: Verified, best: float, pair: Pair) -> Verified:
+    def __call__(self, hypotheses: Hypotheses, models: Verified, best: float, pair: Pair) -> Verified:
         """The verified models of a round, with those of plane and parallax. best: the score to beat."""
         if not len(models.score):  # no sample gave a model
             return models
@@ -52,11 +52,14 @@ class Degensac:
         if not models.score[first] > best:
             return models
         which = int(models.which[first])
-        sample = np.ascontiguousarray(pair.points[:, made.sample[:, made.draw[which]]])
+        sample = np.ascontiguousarray(pair.points[:, hypotheses.sample[:, hypotheses.draw[which]]])
         H = np.empty(9)
-        if plane_of_sample(made.F[which].astype(np.float64), sample, self.TRIPLETS, _limit(pair), H) < self.ON_PLANE:
+        if (
+            plane_of_sample(hypotheses.F[which].astype(np.float64), sample, self.TRIPLETS, _limit(pair), H)
+            < self.ON_PLANE
+        ):
             return models
-        F, score = self.completed(H, pair, made.start)
+        F, score = self.completed(H, pair, hypotheses.start)
         added = len(models.F) + np.arange(len(F))
         return Verified(
             np.concatenate([models.F, F]), np.concatenate([models.which, added]), np.concatenate([models.score, score])
@@ -90,17 +93,17 @@ def plane_of_sample(F: F8x1, sample: F8x2, triplets: I8x2, limit: float, H: F8x1
     squared transfer distances. Of equals the first is taken; without any H is zero.
     """
     G, Ft, e1 = vector(9), vector(9), vector(3)
-    near, most = np.empty(sample.shape[1], np.bool_), 0
+    near, largest = np.empty(sample.shape[1], np.bool_), 0
     for i in range(9):
         Ft[i], H[i] = F[3 * (i % 3) + i // 3], 0.0
     last_right_singular_vector(Ft, e1)
     for t in range(len(triplets)):
         if plane_homography(F, e1, sample, triplets[t], G):
             members = near_plane(G, sample, limit, near)
-            if members > most:
-                most = members
+            if members > largest:
+                largest = members
                 assign(H, G)
-    return most
+    return largest
 
 
 @kernel

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from fmtorch.geometry.robust_kernels import KERNELS, named_kernel
+from fmtorch.geometry.robust_losses import KERNELS, named_kernel
 
 S2 = torch.tensor(4.0, dtype=torch.float64)
 

@@ -143,14 +143,15 @@ def relate(pipeline: Pipeline, described0: Described, described1: Described, see
     """What `match` finds of two photographs that are described already."""
     clock = _Clock(pipeline.device)
     clock("features", described0.seconds + described1.seconds)
-    found = _relate(pipeline, described0.features, described1.features, seed, clock)
+    result = _relate(pipeline, described0.features, described1.features, seed, clock)
     sizes = [torch.tensor([d.size], device=pipeline.device) for d in (described0, described1)]
-    return _restored(found, [described0.scale, described1.scale], sizes)
+    return _restored(result, [described0.scale, described1.scale], sizes)
 
 
 @functools.lru_cache(maxsize=8)
 def _pipeline(name: str, device: str) -> Pipeline:
-    return presets.pipeline(name, device)
+    built: Pipeline = presets.pipeline(name, device)
+    return built
 
 
 def _image(image: Path | str | Image, name: str) -> Image:
@@ -168,13 +169,13 @@ def _relate(pipeline: Pipeline, features0: Features, features1: Features, seed: 
     """Matching, pruning and estimation, in pixels of the images as they were described."""
     ends = features0.keypoints, features1.keypoints
     nothing = Correspondences(ends[0][None, :0], ends[1][None, :0], features0.valid[None, :0])
-    found = MatchResult(
+    nothing_found = MatchResult(
         *ends, nothing, nothing.mask[0], nothing, nothing.mask[0], ends[0].new_zeros(3, 3, dtype=torch.float64)
     )
     empty = [f"image{i}" for i in (0, 1) if len(ends[i]) == 0]
     if empty:
         reason = f"no keypoints in {' and '.join(empty)}: too small, or without texture"
-        return dataclasses.replace(found, reason=reason, seconds=clock.seconds)
+        return dataclasses.replace(nothing_found, reason=reason, seconds=clock.seconds)
     putative = c = pipeline.matcher(features0, features1)
     clock("matching")
     counts = {"matching": int(c.count())}
@@ -205,9 +206,9 @@ def _still(c: Correspondences, inliers: Tensor) -> str:
     return "the images show no motion, as if they were one: infinitely many F agree with all matches"
 
 
-def _restored(found: MatchResult, scales: list[Tensor], sizes: list[Tensor]) -> MatchResult:
+def _restored(result: MatchResult, scales: list[Tensor], sizes: list[Tensor]) -> MatchResult:
     """The result in pixels of the original images of these sizes, whose reduction had these scales."""
-    s0, s1 = (s.to(found.keypoints0) for s in scales)
+    s0, s1 = (s.to(result.keypoints0) for s in scales)
 
     def matches(c: Correspondences) -> Correspondences:
         return c.replace(
@@ -217,10 +218,10 @@ def _restored(found: MatchResult, scales: list[Tensor], sizes: list[Tensor]) -> 
         )  # fmt: skip
 
     return dataclasses.replace(
-        found,
-        keypoints0=to_original(found.keypoints0, s0), keypoints1=to_original(found.keypoints1, s1),
-        putative=matches(found.putative), correspondences=matches(found.correspondences),
-        F=fundamental_to_original(found.F, *scales),
+        result,
+        keypoints0=to_original(result.keypoints0, s0), keypoints1=to_original(result.keypoints1, s1),
+        putative=matches(result.putative), correspondences=matches(result.correspondences),
+        F=fundamental_to_original(result.F, *scales),
     )  # fmt: skip
 
 

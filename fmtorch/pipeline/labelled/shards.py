@@ -92,8 +92,8 @@ class Shard:
 
     def read(self, row: int, names: Sequence[str] = (*_PER_PAIR, *_PER_MATCH)) -> dict[str, NDArray[Any]]:
         """A pair's arrays, views of the file: points (n, 2), frames (n, 2, 3), F (3, 3), ...; absent ones left out."""
-        found = ((name, self._list(name, row)) for name in names)
-        return {name: values.reshape(_SHAPES[name]) for name, values in found if values is not None}
+        columns = ((name, self._list(name, row)) for name in names)
+        return {name: values.reshape(_SHAPES[name]) for name, values in columns if values is not None}
 
     def _list(self, name: str, row: int) -> NDArray[Any] | None:
         column = self.batch.column(name)

@@ -12,9 +12,8 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences
 from fmtorch.data.pairs import ImagePair, ImageSource
-from fmtorch.evaluation.outcomes import solved
-from fmtorch.pipeline.photographs import Described, MatchResult
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
+from fmtorch.pipeline.two_images import Described, MatchResult
 from fmtorch.storage.exchange.journal import ExportedImage, ExportedPair, Journal, indices
 
 
@@ -27,7 +26,7 @@ def keep_outcomes(journal: Journal, pipeline: Pipeline, outcomes: Sequence[Outco
             continue
         for image, K in ((pair.image0, pair.K0), (pair.image1, pair.K1)):
             _keep_image(journal, pipeline, image, K)
-        F = estimate.F[0] if solved(outcome) else torch.zeros(3, 3)
+        F = estimate.F[0] if outcome.solved else torch.zeros(3, 3)
         journal.add_pair(*ends, _pair(journal, ends, c, F, estimate.inliers[0], bool(estimate.related[0])))
 
 

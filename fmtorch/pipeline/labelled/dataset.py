@@ -12,11 +12,11 @@ from typing import Any
 from fmtorch.core.files import replacing
 from fmtorch.core.resources import cache_dir
 from fmtorch.data.pairs import DepthDataset, PairDataset
-from fmtorch.pipeline.matched import labels
-from fmtorch.pipeline.matched.augmentation import Augmentation
-from fmtorch.pipeline.matched.compute import Progress, compute_shards, partition
-from fmtorch.pipeline.matched.shards import FORMAT, Shard, ShardError
-from fmtorch.pipeline.matched.stored import StoredMatches
+from fmtorch.pipeline.labelled import labels
+from fmtorch.pipeline.labelled.augmentation import Augmentation
+from fmtorch.pipeline.labelled.compute import Progress, compute_shards, partition
+from fmtorch.pipeline.labelled.shards import FORMAT, Shard, ShardError
+from fmtorch.pipeline.labelled.stored import StoredMatches
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.storage.configuration import configuration, environment
 from fmtorch.storage.features import CachedFeatures
@@ -48,7 +48,7 @@ class MatchedPairs(StoredMatches):
 
     Example:
         >>> from fmtorch.data import load
-        >>> from fmtorch.pipeline.matched import Augmentation, MatchedPairs
+        >>> from fmtorch.pipeline.labelled import Augmentation, MatchedPairs
         >>> rendered = load("rendered", split="train", size="full")  # doctest: +SKIP
         >>> matches = MatchedPairs(
         ...     rendered, "sift_ratio", overrides=["pruner=[one_to_one]"], augmentation=Augmentation()
@@ -116,7 +116,8 @@ def _pipeline(pipeline: Pipeline | str, overrides: Sequence[str]) -> Pipeline:
     if isinstance(pipeline, str):
         from fmtorch import presets  # reads YAML files, which no other use of this package needs
 
-        return presets.pipeline(pipeline, overrides=overrides)
+        built: Pipeline = presets.pipeline(pipeline, overrides=overrides)
+        return built
     if overrides:
         raise ValueError("overrides change a pipeline that is given by name; this one is given as an object")
     return pipeline

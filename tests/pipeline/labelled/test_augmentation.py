@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from fmtorch.geometry.epipolar import symmetric_max
-from fmtorch.pipeline.matched import Augmentation, LabelledMatches
-from fmtorch.pipeline.matched.augmentation import MIN_INLIERS, MIN_MATCHES, subset_size, thinned_counts
-from tests.pipeline.matched.conftest import exact
+from fmtorch.pipeline.labelled import Augmentation, LabelledMatches
+from fmtorch.pipeline.labelled.augmentation import MIN_INLIERS, MIN_MATCHES, subset_size, thinned_counts
+from tests.pipeline.labelled.conftest import exact
 
 NOISELESS = Augmentation(noise=None, matches=None)
 ALWAYS = Augmentation(swap=1, quarter_turn=0.5, turn=0.5, angle=180, crop=1, thin=1, noise=(1, 2), matches=(50, 60))

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from fmtorch.core.random import bits, uniform
 from fmtorch.core.streams import Stream
-from fmtorch.pipeline.matched import transforms
-from fmtorch.pipeline.matched.record import LabelledMatches
+from fmtorch.pipeline.labelled import transforms
+from fmtorch.pipeline.labelled.record import LabelledMatches
 
 MIN_INLIERS = 16  # no crop or ratio threshold that would leave fewer; twice what the eight-point algorithm needs
 MIN_MATCHES = 50  # no thinning of outliers below so many matches

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fmtorch.pipeline.matched.shards import SCHEMA, Shard, ShardError, write_shard
+from fmtorch.pipeline.labelled.shards import SCHEMA, Shard, ShardError, write_shard
 
 
 def rows(n: int = 5) -> list[dict[str, Any]]:

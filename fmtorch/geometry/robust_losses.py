@@ -1,4 +1,4 @@
-"""Robust kernels: losses of a squared residual that grow more slowly than the residual itself.
+"""Robust losses (kernels): functions of a squared residual that grow more slowly than the residual itself.
 
 Each is scaled so that ``loss ~ r^2`` for small residuals; ``weight = d loss / d r^2`` is then 1 at zero, and minimising
 ``sum weight * r^2`` with the weights held fixed, again and again, minimises the sum of losses (IRLS).

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import TypeCheckError
 
 from fmtorch.core.types import Correspondences
-from fmtorch.pipeline.matched import LabelledMatches, collate
-from tests.pipeline.matched.conftest import exact
+from fmtorch.pipeline.labelled import LabelledMatches, collate
+from tests.pipeline.labelled.conftest import exact
 
 
 def test_masked_slots_have_no_label() -> None:

@@ -20,7 +20,7 @@ from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.data.rendered import RenderedPairs
 from fmtorch.data.rendered.generate import FAMILIES, PLANS, Task
 from fmtorch.geometry.epipolar import symmetric_max
-from fmtorch.pipeline.matched import (
+from fmtorch.pipeline.labelled import (
     Augmentation,
     Draw,
     MatchedPairs,
@@ -30,13 +30,13 @@ from fmtorch.pipeline.matched import (
     collate_trimmed,
     split_scenes,
 )
-from fmtorch.pipeline.matched import compute as compute_module
-from fmtorch.pipeline.matched import labels as labels_module
-from fmtorch.pipeline.matched.compute import SHARD, partition
-from fmtorch.pipeline.matched.labels import label
+from fmtorch.pipeline.labelled import compute as compute_module
+from fmtorch.pipeline.labelled import labels as labels_module
+from fmtorch.pipeline.labelled.compute import SHARD, partition
+from fmtorch.pipeline.labelled.labels import label
 from fmtorch.pipeline.pipeline import Pipeline
 from tests.conftest import shared_path
-from tests.pipeline.matched.conftest import SIFT
+from tests.pipeline.labelled.conftest import SIFT
 
 
 def contents(folder: Path) -> dict[str, str]:

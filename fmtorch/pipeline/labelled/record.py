@@ -12,7 +12,7 @@ from torch import Tensor
 from fmtorch.core import types
 from fmtorch.core.records import Index, Record, as_index, expect_fields, gathered, slotted
 from fmtorch.core.types import Correspondences
-from fmtorch.pipeline.matched.labels import IGNORED, INLIER
+from fmtorch.pipeline.labelled.labels import IGNORED, INLIER
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -11,8 +11,8 @@ from torch.utils.data import Sampler
 
 from fmtorch.core.random import uniform
 from fmtorch.core.streams import Stream
-from fmtorch.pipeline.matched.augmentation import subset_size
-from fmtorch.pipeline.matched.record import LabelledMatches, collate
+from fmtorch.pipeline.labelled.augmentation import subset_size
+from fmtorch.pipeline.labelled.record import LabelledMatches, collate
 
 MAX_PADDING = 0.2  # share of a batch's slots
 _POOL = 8  # batches that are sorted by length together: more make lengths more similar and batches less random

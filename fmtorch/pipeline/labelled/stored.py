@@ -12,10 +12,10 @@ import torch
 from torch.utils.data import Dataset
 
 from fmtorch.core.types import Correspondences
-from fmtorch.pipeline.matched.augmentation import Augmentation
-from fmtorch.pipeline.matched.batches import Draw
-from fmtorch.pipeline.matched.record import LabelledMatches
-from fmtorch.pipeline.matched.shards import Shard
+from fmtorch.pipeline.labelled.augmentation import Augmentation
+from fmtorch.pipeline.labelled.batches import Draw
+from fmtorch.pipeline.labelled.record import LabelledMatches
+from fmtorch.pipeline.labelled.shards import Shard
 
 PATTERN = "shard-*.arrow"
 
@@ -175,4 +175,8 @@ def last_scenes(scenes: Iterable[tuple[str, str]], last: int) -> set[tuple[str, 
     names: dict[str, set[str]] = {}
     for family, name in scenes:
         names.setdefault(family, set()).add(name)
-    return {(family, name) for family, some in names.items() for name in sorted(some)[max(1, len(some) - last) :]}
+    return {
+        (family, name)
+        for family, of_family in names.items()
+        for name in sorted(of_family)[max(1, len(of_family) - last) :]
+    }

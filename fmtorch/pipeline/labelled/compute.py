@@ -13,8 +13,8 @@ import torch
 
 from fmtorch.core.types import Correspondences
 from fmtorch.data.pairs import ImagePair, PairDataset
-from fmtorch.pipeline.matched.labels import label
-from fmtorch.pipeline.matched.shards import write_shard
+from fmtorch.pipeline.labelled.labels import label
+from fmtorch.pipeline.labelled.shards import write_shard
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 
 Progress = Callable[[int, int], None]  # called with (pairs done, pairs in all)

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fmtorch.geometry.epipolar import unit_frobenius
-from fmtorch.pipeline.matched.record import LabelledMatches
+from fmtorch.pipeline.labelled.record import LabelledMatches
 
 _ROUNDING = 1e-6  # pixels that a rotated side may exceed a whole number by
 

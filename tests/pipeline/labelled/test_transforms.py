@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fmtorch.geometry.epipolar import symmetric_max
-from fmtorch.pipeline.matched import LabelledMatches
-from fmtorch.pipeline.matched.transforms import crop, keep_ratio, move, rotate, swap, transform
-from tests.pipeline.matched.conftest import exact
+from fmtorch.pipeline.labelled import LabelledMatches
+from fmtorch.pipeline.labelled.transforms import crop, keep_ratio, move, rotate, swap, transform
+from tests.pipeline.labelled.conftest import exact
 
 CHANGES: dict[str, Callable[[LabelledMatches], LabelledMatches]] = {
     "swap": swap,

@@ -15,7 +15,7 @@ OVERRIDE = re.compile(r"(?P<key>(?:\+\+|\+)?[A-Za-z_][\w./@:-]*)=(?P<value>.*)",
 LITERAL = re.compile(r"null|true|false|\?\?\?|'.*'|\".*\"", re.IGNORECASE | re.DOTALL)  # what a path field may hold
 
 
-def hydra_words(words: Sequence[str], paths: Sequence[str], positional: Sequence[str]) -> list[str]:
+def hydra_arguments(words: Sequence[str], paths: Sequence[str], positional: Sequence[str]) -> list[str]:
     """The arguments for Hydra: its own flags first, then ``name=value``.
 
     Args:

@@ -11,7 +11,7 @@ import torch
 
 from fmtorch.data.rendered import RenderedPairs
 from fmtorch.data.rendered import dataset as rendered_dataset
-from tests.pipeline.matched.conftest import FAMILY, TINY
+from tests.pipeline.labelled.conftest import FAMILY, TINY
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "training.md"
 

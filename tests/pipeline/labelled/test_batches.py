@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.pipeline.matched import Augmentation, Draw, LabelledMatches, SimilarLengthBatches, collate, collate_trimmed
-from fmtorch.pipeline.matched.batches import MAX_PADDING, longest
-from tests.pipeline.matched.conftest import exact
+from fmtorch.pipeline.labelled import (
+    Augmentation,
+    Draw,
+    LabelledMatches,
+    SimilarLengthBatches,
+    collate,
+    collate_trimmed,
+)
+from fmtorch.pipeline.labelled.batches import MAX_PADDING, longest
+from tests.pipeline.labelled.conftest import exact
 
 
 class Pairs:

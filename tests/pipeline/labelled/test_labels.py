@@ -10,8 +10,8 @@ import pytest
 
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.data.rendered import RenderedPairs
-from fmtorch.data.rendered.cameras import calibration, fundamental, look_at, relative_pose
-from fmtorch.pipeline.matched.labels import (
+from fmtorch.data.rendered.pinhole import calibration, fundamental, look_at, relative_pose
+from fmtorch.pipeline.labelled.labels import (
     EDGE_PX,
     by_line,
     by_transfer,

@@ -10,8 +10,8 @@ import torch
 
 from fmtorch.core.types import Correspondences, pair_key
 from fmtorch.data.rendered import Plan, RenderedPairs
-from fmtorch.data.rendered.cameras import calibration
-from fmtorch.pipeline.matched import LabelledMatches, MatchedPairs
+from fmtorch.data.rendered.pinhole import calibration
+from fmtorch.pipeline.labelled import LabelledMatches, MatchedPairs
 from tests.conftest import own_cache
 
 TINY = Plan(scenes=2, shots=4, pairs=4, scale=0.25)
