@@ -1,7 +1,9 @@
 """The five-point algorithm on the samples of one pair, compiled; float64, LANES samples at a time, models in float32.
 
-As `five_point`: Nister (PAMI 2004), real roots by changes of sign on a grid. Buffers are rows of LANES numbers, one a
-sample.
+Nister, "An efficient solution to the five-point relative pose problem" (PAMI 2004). Real roots of the polynomial of
+degree ten are those across which it changes its sign between the points of a grid. Buffers are rows of LANES numbers,
+one a sample.
+E = x X + y Y + z Z + W; a monomial is a sorted triple of 0 to 3 for x, y, z, 1, in the order of the paper.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""`homography` for one model, compiled; matrices are (9,), row by row, points (4, n), float64."""
+"""Homographies and the planes they stand for: ``x1 ~ H x0``. Matrices are (9,), row by row, points (4, n), float64.
+
+Hartley & Zisserman (2004), Multiple View Geometry, chapters 4 and 13.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ from fmtorch.geometry.eight_point_kernels import smallest_eigenvector
 from fmtorch.geometry.rank2_kernels import EPS, unit
 
 Array = NDArray[Any]
-ROUNDING = 16 * EPS  # as in `homography.plane_and_parallax`
+ROUNDING = 16 * EPS  # of cross products that should vanish, as of a match taken twice
 
 
 @inner
@@ -38,7 +41,7 @@ def maps(H: Array, x: float, y: float, u: float, v: float, limit: float) -> Any:
 
 @inner
 def near_plane(H: Array, points: Array, limit: float, out: Array) -> int:
-    """Which matches have a `homography.transfer_squared` up to the limit -> out (n,); how many."""
+    """Which matches H and its inverse map to within a squared distance of each other -> out (n,); how many."""
     A, count = vector(9), 0
     adjugate(H, A)
     x0, y0, x1, y1 = points[0], points[1], points[2], points[3]
@@ -58,7 +61,11 @@ def cross_times(e: Array, A: Array, out: Array) -> None:
 
 @inner
 def plane_homography(F: Array, e1: Array, points: Array, triplet: Array, H: Array) -> bool:
-    """`homography.plane_homography` through the matches (3,) of a triplet -> H; whether it is determined."""
+    """The homography of the plane through the matches (3,) of a triplet that satisfy F -> H; if it is determined.
+
+    ``H = A - e1 (M^-1 b)^T`` with ``A = [e1]_x F``, the rows of M the points in image 0, and
+    ``b_i = (x1_i x (A x0_i)) . (x1_i x e1) / |x1_i x e1|^2`` (result 13.6). e1: the epipole in image 1, ``F^T e1 = 0``.
+    """
     A, b, M = vector(9), vector(3), matrix(3, 3)
     cross_times(e1, F, A)
     for k in range(3):
@@ -88,7 +95,10 @@ def plane_homography(F: Array, e1: Array, points: Array, triplet: Array, H: Arra
 
 @inner
 def plane_and_parallax(H: Array, points: Array, i: int, j: int, F: Array) -> bool:
-    """`homography.plane_and_parallax` of a plane and the matches i and j -> F; whether there is one."""
+    """The fundamental matrix of a plane's homography and matches i and j off it -> F, of unit norm; if there is one.
+
+    ``F = [e1]_x H``: the lines through x1 and H x0 of both matches meet in the epipole e1 (section 13.2).
+    """
     lines, e, size2 = matrix(2, 3), vector(3), 0.0
     for k in range(9):
         size2 += H[k] * H[k]

@@ -1,6 +1,7 @@
 """Real roots of polynomials of degree ten, LANES samples at a time, compiled: signs on a grid, then Newton.
 
-As in `five_point`: the projective line in two charts. Buffers are rows of LANES numbers, one a sample.
+The projective line in two charts; two roots within one interval of the grid are not found, a tenth of all roots of the
+five-point algorithm. Buffers are rows of LANES numbers, one a sample.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from fmtorch.compiling.lanes import LANES, absolute, any_lane, fill, load, store
 from fmtorch.compiling.scratch import matrix
 
 Array = NDArray[Any]
-KNOTS, POLISHING_STEPS = 33, 4  # of the grid in each of two charts; as in `five_point`
+KNOTS, POLISHING_STEPS = 33, 4  # of the grid in each of two charts; of Newton's method, from the secant
 DEGREE = 10
 
 

@@ -31,7 +31,6 @@ from fmtorch.geometry.robust_losses import named_kernel
 from fmtorch.geometry.sampson_objective import SampsonObjective
 
 DAMPING = Damping(1e-4, 1e-12, 1e6)
-RANK_TWO_ALREADY = 1  # squarings that suffice where the last singular value is but rounding of float32
 
 
 def refine_components(

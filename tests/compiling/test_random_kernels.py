@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from fmtorch.estimators.pool_kernels import shuffled
 
 from fmtorch.core.random import bits
 from fmtorch.core.streams import Stream, mixed_seed
+from fmtorch.estimators.parts.preselection import shuffle
 
 pytest.importorskip("numba", reason="numba is not installed")
 
@@ -20,5 +20,5 @@ def test_the_same_bits(seed: int, key: int) -> None:
         words = bits(seed, torch.tensor([key]), stream, 0, 1000, 1)[0, :, 0]
         for most in (1, 17, 1000, 2000):
             out = np.empty(most, np.int64)
-            count = shuffled(1000, mixed_seed(seed, stream), key, out)
+            count = shuffle(1000, mixed_seed(seed, stream), key, out)
             np.testing.assert_array_equal(out[:count], words.argsort(stable=True)[:most].numpy())

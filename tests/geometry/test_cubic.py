@@ -3,10 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from fmtorch.kernels import kernel
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from fmtorch.compiling.kernel import kernel
 from fmtorch.geometry import cubic_kernels
 from fmtorch.geometry.cubic import cube_root, cubic_roots
 

@@ -7,14 +7,12 @@ import pytest
 import torch
 
 from fmtorch.geometry import refine_kernels
+from fmtorch.geometry.levenberg_marquardt_kernels import Schedule
 from fmtorch.geometry.rank2_manifold import SQUARINGS
 from fmtorch.geometry.refine import DAMPING, refine_components
 from fmtorch.geometry.robust_losses import KERNELS
 from fmtorch.geometry.sampson_objective import SampsonObjective
-from fmtorch.geometry.sampson_objective_kernels import LOSSES, evaluate
-from fmtorch.geometry.sigma_consensus import LOSS_TABLE
-
-pytest.importorskip("numba", reason="numba is not installed")
+from fmtorch.geometry.sampson_objective_kernels import LOSSES, Weighted, evaluate, loss_table
 
 SCALE = 0.02
 
@@ -41,7 +39,7 @@ def test_costs_and_normal_equations(loss: str, n: int) -> None:
     expected, expected_cost = SampsonObjective(tensors[1], tensors[2], KERNELS[loss], tensors[3])(tensors[0], True)
     for derivatives in (True, False):
         products, cost = np.zeros((5, 10, 10)), np.empty(5)
-        evaluate(F, points, weight, s2, LOSSES[loss], LOSS_TABLE, derivatives, products, cost)
+        evaluate(F, Weighted(points, weight, s2, LOSSES[loss], loss_table(loss)), derivatives, products, cost)
         np.testing.assert_allclose(cost, expected_cost[0].numpy(), rtol=1e-11)
         if derivatives:
             normal = expected[:, :, 0].permute(2, 0, 1).numpy()
@@ -56,8 +54,10 @@ def refined(
 ) -> tuple[np.ndarray, np.ndarray]:
     """`refine_components` by the kernel."""
     found, cost = np.empty_like(F), np.empty(len(F))
-    data, damping = (points, weight, s2, LOSSES[loss], LOSS_TABLE), DAMPING.first
-    refine_kernels.refine(F, SQUARINGS, *data, iterations, damping, tolerance, found, cost)
+    schedule = Schedule(iterations, DAMPING.first, tolerance)
+    refine_kernels.refine(
+        F, SQUARINGS, Weighted(points, weight, s2, LOSSES[loss], loss_table(loss)), schedule, found, cost
+    )
     return found, cost
 
 

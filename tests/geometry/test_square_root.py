@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from fmtorch.kernels import kernel
-from fmtorch.lanes import LANES, load, store
-from fmtorch.lanes import sqrt as sqrt_of_lanes
 
+from fmtorch.compiling.kernel import kernel
+from fmtorch.compiling.lanes import LANES, load, store
+from fmtorch.compiling.lanes import sqrt as sqrt_of_lanes
 from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.geometry.epipolar import inverse_root
 
