@@ -122,7 +122,7 @@ class KernelFile:
                     with contextlib.suppress(OSError):  # a folder that can be read, but not written
                         os.utime(self.path)  # so that files in use are not the oldest
                     self.calls = calls.called(data)
-                    return CompileResult._rebuild(target_context, *pickle.loads(data))
+                    return _of(signature, CompileResult._rebuild(target_context, *pickle.loads(data)))
                 warnings.warn(f"{self.path} is damaged; it is compiled anew", stacklevel=2)
         except FileNotFoundError:
             pass
@@ -152,6 +152,15 @@ class KernelFile:
         """Remove the file."""
         if self.path is not None:
             self.path.unlink(missing_ok=True)
+
+
+def _of(signature: Any, made: Any) -> Any:
+    """A compiled function by the types of this process: a group of a script or a notebook is another class in each."""
+    from numba.core import sigutils
+    from numba.core.typing import signature as typed
+
+    arguments, _ = sigutils.normalize_signature(signature)
+    return made._replace(signature=typed(made.signature.return_type, *arguments))
 
 
 def _signature(data: bytes) -> bytes:

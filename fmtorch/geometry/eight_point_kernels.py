@@ -6,8 +6,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fmtorch.compiling.arrays import Array, F4x2, F8x1, F8x2, I8x1, I8x2
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.lanes import LANES, absolute, fill, load, sqrt, store, where
 from fmtorch.compiling.scratch import matrix, vector
@@ -15,13 +15,12 @@ from fmtorch.geometry.nullspace_kernels import equations, gather, null_space
 from fmtorch.geometry.orientation_kernels import consistently_oriented
 from fmtorch.geometry.rank2_kernels import EPS, nearest_rank2
 
-Array = NDArray[Any]
 WIDTH = 32  # partial sums over the matches: part of the last bits of a weighted fit
 SHIFT, RANK_TOLERANCE, SQUARINGS = 1e-14, 1e-12, 14  # as in `eigenvector`
 
 
-@kernel("f8[:, ::1], i8[:, ::1], f4[:, ::1], i8[::1]")
-def eight_point(points: Array, sample: Array, F: Array, draw: Array) -> int:
+@kernel
+def eight_point(points: F8x2, sample: I8x2, F: F4x2, draw: I8x1) -> int:
     """Consistently oriented models of samples (8, s) of points (4, n) -> F (s, 9), draw (s,); how many there are.
 
     As `minimal.eight_point_components`, in the order of the samples. Buffers are rows of LANES numbers, one a sample.
@@ -93,8 +92,8 @@ def _denormalise(f: Array, image: int, s: float, cx: float, cy: float) -> None:
         f[c] -= f[a] * cx + f[b] * cy
 
 
-@kernel("f8[:, ::1], f8[::1], f8[::1]")
-def weighted_eight_point(points: Array, weight: Array, F: Array) -> bool:
+@kernel
+def weighted_eight_point(points: F8x2, weight: F8x1, F: F8x1) -> bool:
     """The F of least sum w (x1^T F x0)^2, made rank two, of unit norm, largest entry positive -> F (9,).
 
     `eight_point.eight_point` of points (4, n) and weights (n,), not negative: whether there is one.

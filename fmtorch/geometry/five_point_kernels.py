@@ -13,8 +13,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fmtorch.compiling.arrays import Array, F4x2, F8x1, F8x2, I8x1, I8x2
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.lanes import LANES, fill, load, sqrt, store, where
 from fmtorch.compiling.scratch import matrix
@@ -22,7 +22,6 @@ from fmtorch.geometry.nullspace_kernels import equations, gather, null_space
 from fmtorch.geometry.orientation_kernels import consistently_oriented
 from fmtorch.geometry.real_roots_kernels import DEGREE, real_roots, room_for_roots
 
-Array = NDArray[Any]
 _MONOMIALS = (
     "000", "111", "001", "011", "002", "003", "112", "113", "012", "013",
     "022", "023", "033", "122", "123", "133", "222", "223", "233", "333",
@@ -32,8 +31,8 @@ FIRST, SECOND = (np.array([pair[k] for pair in _PAIRS]) for k in (0, 1))
 MONOMIAL = np.array([[_MONOMIALS.index("".join(map(str, sorted((*pair, c))))) for c in range(4)] for pair in _PAIRS])
 
 
-@kernel("f8[:, ::1], i8[:, ::1], f8[:, ::1], f8[::1], f4[:, ::1], i8[::1]")
-def five_point(points: Array, sample: Array, depth: Array, offset: Array, F: Array, draw: Array) -> int:
+@kernel
+def five_point(points: F8x2, sample: I8x2, depth: F8x2, offset: F8x1, F: F4x2, draw: I8x1) -> int:
     """Consistently oriented models of samples (5, s) of points (4, n) -> F (10 s, 9), draw (10 s,); their number.
 
     points: from the principal points. depth: (2, s), the focal lengths of each sample, in the unit of the points.

@@ -6,11 +6,10 @@ Buffers are rows of LANES numbers, one a sample.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fmtorch.compiling.arrays import Array, F4x2, F8x2, I8x1, I8x2
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.lanes import LANES, absolute, load, store
 from fmtorch.compiling.scratch import matrix, vector
@@ -18,12 +17,11 @@ from fmtorch.geometry.cubic_kernels import cubic_roots
 from fmtorch.geometry.nullspace_kernels import equations, gather, null_space
 from fmtorch.geometry.orientation_kernels import consistently_oriented
 
-Array = NDArray[Any]
 HALF = 0.5**0.5
 
 
-@kernel("f8[:, ::1], i8[:, ::1], f4[:, ::1], i8[::1]")
-def seven_point(points: Array, sample: Array, F: Array, draw: Array) -> int:
+@kernel
+def seven_point(points: F8x2, sample: I8x2, F: F4x2, draw: I8x1) -> int:
     """Consistently oriented models of samples (7, s) of points (4, n) -> F (3 s, 9), draw (3 s,); how many there are.
 
     They stand in the order of the samples, and of one sample in that of `minimal.seven_point_components`.

@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
+from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.batches import for_each_pair, kernels_serve
 from fmtorch.core.checks import checked
 from fmtorch.core.streams import Stream, mixed_seed
@@ -168,5 +169,11 @@ def _compiled_sums(
     tensors = (pairs.F_gt, pairs.F_est, pairs.size0, pairs.size1, units, pairs.key[:, None])
     constants = (mixed_seed(seed, Stream.METRIC), samples)
     out = torch.empty(len(units), 2, dtype=torch.float64)
-    terms = for_each_pair(compiled.accepted_draws, tensors, *constants, out=out, kind=torch.float64)
+    terms = for_each_pair(_into, tensors, *constants, out=out, kind=torch.float64)
     return terms[:, 0], terms[:, 1]
+
+
+def _into(
+    F_gt: Array, F_est: Array, size0: Array, size1: Array, unit: Array, key: Array, seed: int, samples: int, out: Array
+) -> None:
+    compiled.accepted_draws(compiled.Comparison(F_gt, F_est, size0, size1, unit), int(key[0]), seed, samples, out)

@@ -6,18 +6,17 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fmtorch.compiling.arrays import Array, F8x2, I8x2
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.scratch import matrix, vector
 from fmtorch.geometry.order_kernels import smallest_but
 
-Array = NDArray[Any]
 _LEAF = 8  # points a leaf, at most
 
 
-@kernel("f8[:, ::1], f8[:, ::1], i8[:, ::1]")
-def nearest_points(queries: Array, points: Array, found: Array) -> None:
+@kernel
+def nearest_points(queries: F8x2, points: F8x2, found: I8x2) -> None:
     """`knn.nearest_points` of queries (n, 2) among points (m, 2) -> found (n, count); -1 for no more points."""
     search(queries, points, found)
 

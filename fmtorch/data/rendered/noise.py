@@ -6,11 +6,10 @@ import functools
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from fmtorch.compiling import switch
 from fmtorch.data.rendered.mipmap import Floats
-from fmtorch.data.rendered.noise_kernels import add_enlarged
+from fmtorch.data.rendered.noise_kernels import Neighbours, add_enlarged
 
 BORDER = 2  # grid points beyond each side
 _COMPILED_FROM = 8  # times enlarged; below, little is computed that is not used, and cv2 rounds otherwise at the sides
@@ -41,7 +40,7 @@ def _add_compiled(total: Floats, grid: Floats, weight: float) -> bool:
     rows, columns = _neighbours(total.shape[0], grid.shape[0]), _neighbours(total.shape[1], grid.shape[1])
     if rows is None or columns is None:
         return False
-    add_enlarged(np.ascontiguousarray(grid), *columns, *rows, weight, total)
+    add_enlarged(np.ascontiguousarray(grid), columns, rows, np.float32(weight), total)
     return True
 
 
@@ -51,11 +50,10 @@ def _place(side: int, points: int) -> tuple[int, int]:
     return round(side / inner * points), round(BORDER * side / inner)
 
 
-def _neighbours(side: int, points: int) -> tuple[NDArray[np.int64], Floats] | None:
-    """Of each pixel the first of the four grid points that it is interpolated from, and their weights (4, side).
+def _neighbours(side: int, points: int) -> Neighbours | None:
+    """The neighbours of the pixels of a side; None if the pixels or their neighbours are not all there.
 
-    The weights are those of `cv2.resize`, which enlarges combs: points of one and of zero. None if the pixels or
-    their neighbours are not all there.
+    The weights are those of `cv2.resize`, which enlarges combs: points of one and of zero.
     """
     whole, begin = _place(side, points)
     comb = (np.arange(points) % _PERIOD == np.arange(_PERIOD)[:, None]).astype(np.float32)
@@ -65,7 +63,7 @@ def _neighbours(side: int, points: int) -> tuple[NDArray[np.int64], Floats] | No
     if kernel_weights.shape[1] < side or first.min() < 0 or first.max() + 4 > points:
         return None
     weights = kernel_weights[(first + np.arange(_PERIOD)[:, None]) % _PERIOD, pixel - begin]
-    return (first, np.ascontiguousarray(weights[:4])) if not weights[4:].any() else None
+    return Neighbours(first, np.ascontiguousarray(weights[:4])) if not weights[4:].any() else None
 
 
 @functools.cache
