@@ -93,7 +93,7 @@ def plane_homography(F: Array, e1: Array, points: Array, triplet: Array, H: Arra
 
 @inner
 def plane_and_parallax(H: Array, points: Array, i: int, j: int, F: Array) -> bool:
-    """The fundamental matrix of a plane's homography and the matches i and j off it -> F, of unit norm; if there is one.
+    """The fundamental matrix of a plane's homography and matches i and j off it -> F, of unit norm; if there is one.
 
     ``F = [e1]_x H``: the lines through x1 and H x0 of both matches meet in the epipole e1 (section 13.2).
     """
@@ -123,7 +123,7 @@ def plane_and_parallax(H: Array, points: Array, i: int, j: int, F: Array) -> boo
 
 @inner
 def least_squares_homography(points: Array, inside: Array, H: Array) -> bool:
-    """The homography of least algebraic error of the matches inside, by the normalised DLT -> H; if it is determined."""
+    """The homography of least algebraic error of the matches inside, the normalised DLT -> H; if it is determined."""
     T, S, M = np.empty((2, 3)), np.zeros((4, 3, 3)), np.zeros((9, 9))
     for image in range(2):
         if not _similarity(points[2 * image], points[2 * image + 1], inside, T[image]):

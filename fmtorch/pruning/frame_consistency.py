@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -132,7 +132,10 @@ class FrameConsistency:
     The odds are ``odds (w + floor)^3 / (1 + slope ratio)^2`` with the agreement w: arithmetic alone, and a better fit
     on the tuning scenes than a logistic model of ln(w) and the ratio. Where matches have no frames or no quality the
     prior is left as it is. Linear memory: about 700 bytes a match.
+    kernels: worth compiling together with those of an estimator.
     """
+
+    kernels: ClassVar = (compiled.frame_agreement, compiled.frame_prior)
 
     def __init__(self, *, odds: float, floor: float, slope: float) -> None:
         self.odds, self.floor, self.slope = odds, floor, slope
