@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import itertools
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pruning.one_to_one import one_to_one
 from scripts.benchmark.matched import console, sets_of
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 RATIO = 0.8
 RIGHT_PX, WRONG_PX = 3.0, 10.0  # from the true epipolar lines in both images, and in one of them
 MIN_RIGHT = 15
