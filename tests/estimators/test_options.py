@@ -12,7 +12,8 @@ from fmtorch import find_fundamental, presets
 from fmtorch.estimators import HypothesizeAndVerify
 from fmtorch.estimators.options import Focal, Preselect, Refine, Select, group
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.scores import InlierCount, Msac, scored_matches, squared_residuals
+from fmtorch.estimators.parts.scored_matches import scored_matches
+from fmtorch.estimators.parts.scores import InlierCount, Msac, squared_residuals_of
 from fmtorch.estimators.registry import PARTS, part
 from tests.laws import scene
 
@@ -115,7 +116,7 @@ class Nearest:
 
     def __call__(self, F: np.ndarray, which: np.ndarray, pair: Pair) -> np.ndarray:
         squared = np.empty((len(which), pair.count), np.float32)
-        squared_residuals(F, which, scored_matches(pair, 1.0, False), squared)
+        squared_residuals_of(pair.residual)(F, which, scored_matches(pair, 1.0, False), squared)
         return -np.partition(squared, self.rank, 1)[:, self.rank].astype(np.float64)
 
 
