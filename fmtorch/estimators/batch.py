@@ -88,7 +88,7 @@ def estimated(
     fields = {"F": F, "inliers": inliers, "ok": ok, "draws": draws, "significance": significance}
     tensors = {name: torch.from_numpy(value).to(c.mask.device) for name, value in fields.items()}
     found = Estimate.made(reason=tuple(reasons), **tensors)
-    return with_gradients(found, c, solved, attach) if solved else found
+    return with_gradients(found, c, solved, attach) if keep else found
 
 
 def relative_rounding(c: Correspondences) -> float:
