@@ -26,7 +26,7 @@ from fmtorch.geometry.rank2_manifold import (
     solve,
     start,
 )
-from fmtorch.geometry.robust_kernels import named_kernel
+from fmtorch.geometry.robust_losses import named_kernel
 from fmtorch.geometry.sampson_objective import SampsonObjective
 
 DAMPING = Damping(1e-4, 1e-12, 1e6)
@@ -84,7 +84,7 @@ def refine(
         x1: their matches in image 1.
         weight: not negative, 1 by default.
         mask: False in slots to ignore, whatever they hold; a match that is not finite is ignored too.
-        kernel: a name of `robust_kernels.KERNELS`.
+        kernel: a name of `robust_losses.KERNELS`.
         scale: of the kernel, in pixels (a number, or one per set).
         iterations: Levenberg-Marquardt steps.
         gradient: "implicit", that of the optimum by the implicit function theorem, with the exact Hessian; there is

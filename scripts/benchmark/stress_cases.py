@@ -27,7 +27,7 @@ from scripts.benchmark.matched import console, sets_of
 Array = NDArray[Any]
 RATIO = 0.8
 RIGHT_PX, WRONG_PX = 3.0, 10.0  # from the true epipolar lines in both images, and in one of them
-LEAST_RIGHT = 15
+MIN_RIGHT = 15
 PLANE_PX = 3.0
 UNIT_PX = 300.0  # in which homographies are computed
 IMAGES = 256  # whose features are kept, some 5 MB each
@@ -81,7 +81,7 @@ def load(arguments: argparse.Namespace) -> Iterator[Case]:
         matches = front.match([pair])[0].correspondences
         if matches is not None:
             case = made(pair, matches)
-            if int(case.right.sum()) >= LEAST_RIGHT:
+            if int(case.right.sum()) >= MIN_RIGHT:
                 yield case
 
 
@@ -168,7 +168,7 @@ def transfer_squared(H: Array, points: Array) -> Array:
     with np.errstate(all="ignore"):
         there, back = (
             distance(H, points[:, :2], points[:, 2:]),
-            distance(np.linalg.pinv(H), points[:, 2:], points[:, :2]),
+            distance(np.linalg.pinv(H).astype(np.float64), points[:, 2:], points[:, :2]),
         )
     greater: Array = np.maximum(there, back)
     return greater

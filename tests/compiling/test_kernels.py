@@ -20,6 +20,7 @@ import pytest
 from fmtorch.compiling import cache as files
 from fmtorch.compiling import switch, together
 from fmtorch.compiling.kernel import Inner, Kernel, fused, inner, kernel
+from fmtorch.compiling.version import version_of
 from tests.processes import run_command
 
 SOURCE = """
@@ -160,11 +161,11 @@ def test_what_was_compiled_is_kept_and_told_once(
     assert result(load(tmp_path)) == EXPECTED
     told = capsys.readouterr().err
     assert [line.split(" for ")[0] for line in told.splitlines()] == ["compiling rows", "compiling scaled_squares"]
-    files = {path: path.stat().st_mtime_ns for path in cache.rglob("*.bin")}
+    files = {path: path.stat().st_ino for path in cache.rglob("*.bin")}
     assert len(files) == 2
     assert result(load(tmp_path)) == EXPECTED
     assert capsys.readouterr().err == ""
-    assert {path: path.stat().st_mtime_ns for path in cache.rglob("*.bin")} == files
+    assert {path: path.stat().st_ino for path in cache.rglob("*.bin")} == files
 
 
 @pytest.mark.parametrize("importable", [True, False])
@@ -196,24 +197,69 @@ def test_the_other_process_compiles_what_it_is_told(module: types.ModuleType, tm
     assert module.rows.kept
 
 
-def test_an_edited_callee_changes_the_folder(tmp_path: Path) -> None:
-    (tmp_path / "compiling").mkdir()
-    (tmp_path / "compiling" / "kernel.py").write_text("decorators")
-    (tmp_path / "deep").mkdir()
-    callee, other = tmp_path / "deep" / "a_kernels.py", tmp_path / "b.py"
-    digests = []
-    for text in ("x * x", "x * x * x"):
-        callee.write_text("from fmtorch.compiling.kernel import inner\n" + text)
-        digests.append(files.sources_digest(tmp_path))
-        other.write_text(text)
-        assert files.sources_digest(tmp_path) == digests[-1]
-    assert digests[0] != digests[1]
-    callee.rename(tmp_path / "deep" / "c_kernels.py")
-    assert files.sources_digest(tmp_path) == digests[1]
-    for name in ("kernel.py", "calls.py", "lanes.py", "lane_types.py", "lane_functions.py"):
-        (tmp_path / "compiling" / name).write_text("other decorators")
-        digests.append(files.sources_digest(tmp_path))
-    assert len(set(digests)) == 7
+EDITS = """
+import numpy as np
+from fmtorch.compiling.kernel import inner, kernel
+
+{constant}
+TABLE = np.arange({length})
+
+@inner
+def reached(x):
+    "{doc}"
+    return x * FACTOR + TABLE[0]
+
+@kernel("f8")
+def callee(x) -> float:
+    return {callee}
+
+@kernel("f8")
+def caller(x) -> float:
+    return reached(x) + callee(x)
+
+@kernel("f8")
+def other(x) -> float:
+    return x
+"""
+PLAIN = {"constant": "FACTOR = 2.0", "length": 3, "doc": "One.", "callee": "x"}
+
+
+def versions(folder: Path, **changes: object) -> dict[str, str]:
+    module = load(folder, EDITS.format(**(PLAIN | changes)))
+    kernels = {name: getattr(module, name) for name in ("callee", "caller", "other")}
+    return {name: version_of(each.function, each.signature) for name, each in kernels.items()}
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"constant": "FACTOR = 3.0"}, {"caller"}),
+        ({"length": 4}, {"caller"}),
+        ({"callee": "2 * x"}, {"callee"}),  # its caller finds it by its address
+        ({"doc": "Another docstring."}, set()),
+        ({"constant": "# a line more\nUNUSED = 1\nFACTOR = 2.0"}, set()),
+    ],
+)
+def test_an_edit_changes_the_kernels_that_reach_it(
+    change: dict[str, object], expected: set[str], tmp_path: Path
+) -> None:
+    before, after = versions(tmp_path), versions(tmp_path, **change)
+    assert {name for name in before if before[name] != after[name]} == expected
+
+
+def test_versions_are_the_same_in_every_process() -> None:
+    code = (
+        "from fmtorch.compiling.version import version_of; from fmtorch.estimators.precompiled import WITH_FOCALS;"
+        "print([version_of(each.function, each.signature) for each in WITH_FOCALS])"
+    )
+    outputs = {
+        subprocess.run(
+            [sys.executable, "-c", code], env={**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": str(REPOSITORY)},
+            capture_output=True, text=True, check=True,
+        ).stdout
+        for seed in ("1", "2")
+    }  # fmt: skip
+    assert len(outputs) == 1
 
 
 def test_the_folder_depends_on_what_decides_the_machine_code(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -242,17 +288,6 @@ def all_fused(a, b, c, out):
 def test_an_edited_kernel_outside_the_package_is_compiled_anew(tmp_path: Path) -> None:
     assert result(load(tmp_path)) == EXPECTED
     assert result(load(tmp_path, SOURCE.replace("x * x", "x * x * x"))) == [[2, 16], [54, 128]]
-
-
-def test_kernels_import_only_kernels() -> None:
-    """Otherwise what they import is compiled into them, but its changes do not change the folder."""
-    for path in files.sources(REPOSITORY / "fmtorch"):
-        for line in path.read_text().splitlines():
-            words = line.split()
-            if words[:1] in (["import"], ["from"]) and words[1].startswith(("fmtorch", ".")):
-                assert words[1] in ("fmtorch.compiling.kernel", "fmtorch.compiling.lanes") or (
-                    words[1].endswith("_kernels")
-                ), f"{path}: {line}"
 
 
 def test_a_damaged_file_is_compiled_anew(tmp_path: Path, cache: Path) -> None:

@@ -21,7 +21,7 @@ from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.estimators.pairs import pair_of
 from tests.laws import quick, scene, scenes
 
-OWN = [n for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES)]
+OWN = [n for n in presets.available("estimator") if not n.startswith((*OTHER_LIBRARIES, "homography"))]
 
 
 def _true_inlier_error(F: torch.Tensor, index: int, count: int) -> float:
@@ -156,6 +156,7 @@ WAY = (
     "geometry.seven_point_kernels",  # solved
     "estimators.parts.preselection",  # here without options: hands all models on
     "estimators.parts.scores",  # scored
+    "estimators.parts.scored_matches",  # on these matches
     "estimators.parts.refinement",  # hands the best on
     "geometry.refine_kernels",
 )

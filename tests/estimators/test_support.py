@@ -9,17 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from fmtorch.estimators.focal import posterior
+from fmtorch.estimators.graph_cut import GraphCut
+from fmtorch.estimators.support import lack_of_support
 
 from fmtorch import find_fundamental, presets
 from fmtorch.core.types import Correspondences, Estimate, collate
 from fmtorch.estimators import degeneracy, final_fits, support
-from fmtorch.estimators.focal import posterior
-from fmtorch.estimators.graph_cut import GraphCut
-from fmtorch.estimators.peers import PEERS
-from fmtorch.estimators.support import lack_of_support
 from fmtorch.presets.objects import merged
 from scripts.benchmark.memory import OTHER_LIBRARIES
-from tests.laws import few, quick, scene, small
+from tests.laws import PEERS, few, quick, scene, small
 
 EVERY = presets.available("estimator")
 OWN = [name for name in EVERY if not name.startswith(OTHER_LIBRARIES)]

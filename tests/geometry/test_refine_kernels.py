@@ -8,9 +8,10 @@ import torch
 
 from fmtorch.geometry import irls_kernels, refine_kernels
 from fmtorch.geometry.irls import reweighted
+from fmtorch.geometry.levenberg_marquardt_kernels import Schedule
 from fmtorch.geometry.rank2_manifold import SQUARINGS
 from fmtorch.geometry.refine import DAMPING, refine_components
-from fmtorch.geometry.robust_kernels import KERNELS
+from fmtorch.geometry.robust_losses import KERNELS
 from fmtorch.geometry.sampson_objective import SampsonObjective
 from fmtorch.geometry.sampson_objective_kernels import LOSSES, Weighted, evaluate, loss_table
 from tests.estimators.pairs import apart
@@ -73,8 +74,9 @@ def refined(
 ) -> tuple[np.ndarray, np.ndarray]:
     """`refine_components` by the kernel."""
     found, cost = np.empty_like(F), np.empty(len(F))
-    schedule = refine_kernels.Schedule(iterations, DAMPING.first, tolerance, SQUARINGS)
-    refine_kernels.refine(F, Weighted(points, weight, s2, LOSSES[loss], loss_table(loss)), schedule, found, cost)
+    schedule = Schedule(iterations, DAMPING.first, tolerance)
+    weighted = Weighted(points, weight, s2, LOSSES[loss], loss_table(loss))
+    refine_kernels.refine(F, SQUARINGS, weighted, schedule, found, cost)
     return found, cost
 
 
