@@ -128,7 +128,6 @@ def test_files_with_kernels_reach_no_torch() -> None:
     assert reaching == {}
 
 
-@pytest.mark.skipif((PACKAGE / "estimators/one_pair").exists(), reason="estimators still have a form of tensors")
 def test_estimators_take_tensors_at_their_edges_alone() -> None:
     root = PACKAGE / "estimators"
     files = {m: path.relative_to(root).as_posix() for m, path in FILES.items() if room(m) == "estimators"}

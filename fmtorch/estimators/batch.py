@@ -89,7 +89,7 @@ def estimated(
     fields = {"F": F, "inliers": inliers, "ok": ok, "draws": draws, "significance": significance}
     tensors = {name: torch.from_numpy(value).to(c.mask.device) for name, value in fields.items()}
     estimates = Estimate.made(reason=tuple(reasons), model=family.model, **tensors)
-    return with_gradients(estimates, c, solved, attach) if solved else estimates
+    return with_gradients(estimates, c, solved, attach) if keep else estimates
 
 
 def _significance(F: Array, matches: PixelMatches) -> float:

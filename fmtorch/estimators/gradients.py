@@ -122,7 +122,9 @@ class Attached:
 
 
 def with_gradients(estimate: Estimate, c: Correspondences, solved: dict[int, Solved], attach: Attach) -> Estimate:
-    """The estimate of a batch with the gradients of the pairs that are solved; the same values."""
+    """The estimate of a batch with the gradients of the pairs that are solved, zero of others; the same values."""
+    if not solved:
+        return estimate.derived(F=estimate.F + _nothing(c).to(estimate.F))
     rows = torch.tensor(list(solved), device=c.mask.device)
     pairs = [s.pair for s in solved.values()]
     zero = attach(list(solved.values()), graphed_matches(c, solved))
@@ -180,6 +182,12 @@ def camera_response(cameras: Cameras, pair: Pair, weight: Array, precision: floa
         return np.zeros((9, 9))
     response: Array = -precision * moves.T @ steps
     return response if np.isfinite(response).all() else np.zeros((9, 9))
+
+
+def _nothing(c: Correspondences) -> Tensor:
+    """Zero, with a gradient of zero to all that has one."""
+    attached = [t for t in (c.x0, c.x1, c.prior, c.noise) if t is not None and t.requires_grad]
+    return torch.stack([t[:0].sum().to(torch.float64) for t in attached]).sum() if attached else torch.zeros(())
 
 
 def _none(solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:

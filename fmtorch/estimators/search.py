@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -12,10 +13,12 @@ from fmtorch.compiling.arrays import Array, F4x2, F8x1, I8x1
 from fmtorch.compiling.kernel import kernel
 from fmtorch.estimators.families.family import Family, Hypotheses
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.inliers import StoppingRule
 from fmtorch.estimators.parts.preselection import Preselection
 from fmtorch.estimators.parts.sampling import Sampler
 from fmtorch.geometry.rank2_kernels import assign
+
+Stop = Callable[[Array, int, Pair, int], bool]
+"""Whether the best model (9,), after so many draws of samples of this size, may be taken for the best there is."""
 
 
 @dataclasses.dataclass(eq=False)
@@ -81,7 +84,7 @@ class Search:
     pool: int
     hypotheses: int
     round: int
-    stop: StoppingRule | None = None
+    stop: Stop | None = None
     degeneracy: Degeneracy | None = None
 
     def __call__(self, pair: Pair, start: int = 0) -> Pool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -20,6 +20,7 @@ from fmtorch.core.records import ungraphed
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry.arithmetic import component_sum, sqrt
 from fmtorch.geometry.curves import curve_orders
+from fmtorch.pruning import calibration_kernels
 from fmtorch.pruning import position_consistency_kernels as compiled
 from fmtorch.pruning.agreement import (
     ANGLES,
@@ -39,7 +40,6 @@ from fmtorch.pruning.agreement import (
     WORST_RATIO,
 )
 from fmtorch.pruning.calibration import Calibration
-from fmtorch.pruning.calibration_kernels import calibrated
 from fmtorch.pruning.frame_consistency import tiled
 
 _BINS = len(SCALES) * TURNS
@@ -168,9 +168,10 @@ class PositionConsistency:
     """Supplies ``prior``: P(inlier) from the agreement of neighbours' motion and, where known, the ratio.
 
     Needs no frames, no sizes and no quality. Linear memory: about 600 bytes a match.
+    kernels: worth compiling together with those of an estimator.
     """
 
-    kernels = (compiled.position_agreement, calibrated)
+    kernels: ClassVar = (compiled.position_agreement, calibration_kernels.calibrated)
 
     def __init__(self, *, calibration: Mapping[str, Mapping[str, float]]) -> None:
         self.calibration = Calibration(**calibration)

@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import itertools
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pruning.one_to_one import one_to_one
 from scripts.benchmark.matched import console, sets_of
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 RATIO = 0.8
 RIGHT_PX, WRONG_PX = 3.0, 10.0  # from the true epipolar lines in both images, and in one of them
 MIN_RIGHT = 15
@@ -161,13 +162,13 @@ def transfer_squared(H: Array, points: Array) -> Array:
 
     def distance(H: Array, x: Array, y: Array) -> Array:
         mapped = np.insert(x, 2, 1.0, axis=-1) @ H.transpose(0, 2, 1)
-        squared: Array = np.square(mapped[..., :2] / mapped[..., 2:] - y).sum(-1).astype(np.float64)
+        squared: Array = np.square(mapped[..., :2] / mapped[..., 2:] - y).sum(-1)
         return squared
 
     with np.errstate(all="ignore"):
         there, back = (
             distance(H, points[:, :2], points[:, 2:]),
-            distance(np.linalg.pinv(H), points[:, 2:], points[:, :2]),
+            distance(np.linalg.pinv(H).astype(np.float64), points[:, 2:], points[:, :2]),
         )
     greater: Array = np.maximum(there, back)
     return greater

@@ -5,9 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from scipy import integrate
-
-from fmtorch.estimators import scores
 from fmtorch.estimators.pairs import normalized_pairs
 from fmtorch.estimators.saturated_gains import GRID, SaturatedGains
 from fmtorch.estimators.scores import (
@@ -19,6 +16,9 @@ from fmtorch.estimators.scores import (
     TruncatedSquares,
     score_models,
 )
+from scipy import integrate
+
+from fmtorch.estimators import scores
 from fmtorch.geometry.arithmetic import exact_sum
 from fmtorch.geometry.sigma_consensus import QUANTILE
 from tests.laws import scene

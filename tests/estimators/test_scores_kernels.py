@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-
-from fmtorch.estimators import pool_kernels, scores_kernels
 from fmtorch.estimators.models import Models, Pool
 from fmtorch.estimators.pairs import NormalizedPairs, normalized_pairs
 from fmtorch.estimators.saturated_gains import SaturatedGains
@@ -18,6 +16,8 @@ from fmtorch.estimators.scores import (
     TruncatedSquares,
     score_models,
 )
+
+from fmtorch.estimators import pool_kernels, scores_kernels
 from fmtorch.geometry import eight_point
 from fmtorch.geometry.residuals import sampson_squared
 from tests.laws import degenerate, scene
