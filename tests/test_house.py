@@ -7,6 +7,7 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[1] / "fmtorch"
 MAX_FILE, MAX_FUNCTION, MAX_ROOMS = 250, 60, 15  # lines, lines without the docstring, folders
+MAX_ARGUMENTS = 6  # of a kernel
 
 
 def test_fifteen_rooms_at_most() -> None:
@@ -26,6 +27,27 @@ def test_functions_fit_on_a_screen() -> None:
         if isinstance(node, ast.FunctionDef)
     }
     assert {name: length for name, length in lengths.items() if length > MAX_FUNCTION} == {}
+
+
+def test_kernels_take_few_arguments_whose_types_are_annotated() -> None:
+    found, wrong = 0, []
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_bytes())):
+            if isinstance(node, ast.FunctionDef) and _is_kernel(node):
+                arguments = node.args
+                right = len(arguments.args) <= MAX_ARGUMENTS and all(each.annotation for each in arguments.args)
+                other = [*arguments.posonlyargs, *arguments.kwonlyargs, *arguments.defaults]
+                found += 1
+                if not right or other or arguments.vararg or arguments.kwarg:
+                    wrong.append(f"{path.relative_to(PACKAGE)}: {node.name}")
+    assert found > 50
+    assert wrong == []
+
+
+def _is_kernel(function: ast.FunctionDef) -> bool:
+    """Whether it is decorated by ``@kernel`` or ``@kernel(...)``."""
+    decorators = [each.func if isinstance(each, ast.Call) else each for each in function.decorator_list]
+    return any(isinstance(each, ast.Name) and each.id == "kernel" for each in decorators)
 
 
 def _length(function: ast.FunctionDef) -> int:

@@ -25,28 +25,30 @@ from tests.processes import run_command
 
 SOURCE = """
 import numpy as np
+from fmtorch.compiling.arrays import F4x1, F4x2
 from fmtorch.compiling.kernel import inner, kernel
 
 @inner
 def square(x):
     return x * x
 
-@kernel("f4[::1], f8, f4[::1]")
-def scaled_squares(x, scale, out) -> None:
+@kernel
+def scaled_squares(x: F4x1, scale: float, out: F4x1) -> None:
     for i in range(len(x)):
         out[i] = np.float32(square(x[i]) * scale)
 
-@kernel("f4[:, ::1], f4[:, ::1]")
-def rows(x, out):
+@kernel
+def rows(x: F4x2, out: F4x2):
     for i in range(len(x)):
         scaled_squares(x[i], 2.0, out[i])
 """
 WAITING = """
 import numpy as np
+from fmtorch.compiling.arrays import I8x1
 from fmtorch.compiling.kernel import kernel
 
-@kernel("i8[::1], i8", brief={brief})
-def answered(flags, rounds):
+@kernel(holds_gil={holds_gil})
+def answered(flags: I8x1, rounds: int):
     flags[0] = 1
     for _ in range(rounds):
         if flags[1]:
@@ -103,12 +105,12 @@ def test_a_kernel_calls_kernels_and_inner_functions(module: types.ModuleType) ->
 RETURNING = """
 from fmtorch.compiling.kernel import kernel
 
-@kernel("f8")
-def half(x){annotation}:
+@kernel
+def half(x: float){annotation}:
     return x / 2
 
-@kernel("f8, b1")
-def quarter(x, sure) -> float:
+@kernel
+def quarter(x: float, sure: bool) -> float:
     return half(half(x)) if sure else x
 """
 
@@ -146,10 +148,11 @@ def test_what_does_not_fit_the_signature_is_refused(module: types.ModuleType) ->
 
 def test_a_signature_of_one_argument(tmp_path: Path) -> None:
     source = """
+from fmtorch.compiling.arrays import F8x2
 from fmtorch.compiling.kernel import kernel
 
-@kernel("f8[:, ::1]")
-def first(x):
+@kernel
+def first(x: F8x2):
     return x[0, 0]
 """
     assert load(tmp_path, source).first(np.full((1, 1), 2.0)) == 2
@@ -209,16 +212,16 @@ def reached(x):
     "{doc}"
     return x * FACTOR + TABLE[0]
 
-@kernel("f8")
-def callee(x) -> float:
+@kernel
+def callee(x: float) -> float:
     return {callee}
 
-@kernel("f8")
-def caller(x) -> float:
+@kernel
+def caller(x: float) -> float:
     return reached(x) + callee(x)
 
-@kernel("f8")
-def other(x) -> float:
+@kernel
+def other(x: float) -> float:
     return x
 """
 PLAIN = {"constant": "FACTOR = 2.0", "length": 3, "doc": "One.", "callee": "x"}
@@ -271,10 +274,11 @@ def test_the_folder_depends_on_what_decides_the_machine_code(monkeypatch: pytest
 
 def test_fused_arithmetic_rounds_once_compiled_and_not(tmp_path: Path) -> None:
     source = """
+from fmtorch.compiling.arrays import F4x1
 from fmtorch.compiling.kernel import fused, kernel
 
-@kernel("f4[::1], f4[::1], f4[::1], f4[::1]")
-def all_fused(a, b, c, out):
+@kernel
+def all_fused(a: F4x1, b: F4x1, c: F4x1, out: F4x1):
     for i in range(len(a)):
         out[i] = fused(a[i], b[i], c[i])
 """
@@ -365,10 +369,10 @@ def test_threads_compile_it_once_and_run_at_the_same_time(
     assert capsys.readouterr().err.count("compiling rows") == 1
 
 
-@pytest.mark.parametrize("brief", [False, True])
-def test_a_brief_kernel_keeps_the_lock_that_others_leave_to_other_threads(tmp_path: Path, brief: bool) -> None:
+@pytest.mark.parametrize("holds_gil", [False, True])
+def test_a_kernel_may_keep_the_lock_that_others_leave_to_other_threads(tmp_path: Path, holds_gil: bool) -> None:
     flags = np.zeros(2, np.int64)  # the kernel runs; a thread has seen that
-    answered = load(tmp_path, WAITING.format(brief=brief)).answered
+    answered = load(tmp_path, WAITING.format(holds_gil=holds_gil)).answered
     answered(flags, 0)
     flags[:] = 0
 
@@ -379,7 +383,7 @@ def test_a_brief_kernel_keeps_the_lock_that_others_leave_to_other_threads(tmp_pa
 
     thread = threading.Thread(target=answer)
     thread.start()
-    assert answered(flags, 10**5 if brief else 10**9) == (not brief)
+    assert answered(flags, 10**5 if holds_gil else 10**9) == (not holds_gil)
     thread.join()
 
 
@@ -444,8 +448,9 @@ def test_decorators_take_checked_functions() -> None:
         return written(x)
 
     checked.__wrapped__ = written  # type: ignore[attr-defined]
-    assert isinstance(kernel("f8")(checked), Kernel)
-    assert kernel("f8")(checked).function is written
+    for decorator in (kernel, kernel(holds_gil=True)):
+        assert isinstance(decorator(checked), Kernel)
+        assert decorator(checked).function is written
     assert isinstance(inner(inline=True)(checked), Inner)
     assert inner(checked).function is written
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fmtorch.compiling.arrays import B1x1, F8x1, F8x2, I8x1
 from fmtorch.compiling.kernel import kernel
 from fmtorch.geometry import homography_kernels
 from tests.reference import homography as reference
@@ -12,23 +13,23 @@ from tests.reference.solvers import skew
 PROBLEMS = 12
 
 
-@kernel("f8[:, ::1], b1[::1], f8[::1]")
-def least_squares_homography(points, inside, H) -> bool:
+@kernel
+def least_squares_homography(points: F8x2, inside: B1x1, H: F8x1) -> bool:
     return homography_kernels.least_squares_homography(points, inside, H)
 
 
-@kernel("f8[::1], f8[::1], f8[:, ::1], i8[::1], f8[::1]")
-def plane_homography(F, e1, points, triplet, H) -> bool:
+@kernel
+def plane_homography(F: F8x1, e1: F8x1, points: F8x2, triplet: I8x1, H: F8x1) -> bool:
     return homography_kernels.plane_homography(F, e1, points, triplet, H)
 
 
-@kernel("f8[::1], f8[:, ::1], i8, i8, f8[::1]")
-def plane_and_parallax(H, points, i, j, F) -> bool:
+@kernel
+def plane_and_parallax(H: F8x1, points: F8x2, i: int, j: int, F: F8x1) -> bool:
     return homography_kernels.plane_and_parallax(H, points, i, j, F)
 
 
-@kernel("f8[::1], f8[:, ::1], f8, b1[::1]")
-def near_plane(H, points, limit, out) -> int:
+@kernel
+def near_plane(H: F8x1, points: F8x2, limit: float, out: B1x1) -> int:
     return homography_kernels.near_plane(H, points, limit, out)
 
 
