@@ -118,7 +118,7 @@ def _linearise(h: Array, rows: Array, row: int, G: Array, first: Array, second: 
     """
     x, y, u, v = load(rows, row), load(rows, row + 1), load(rows, row + 2), load(rows, row + 3)
     w = h[6] * x + h[7] * y + h[8]
-    front = w > 0.0
+    front, behind = w > 0.0, where(w <= 0.0, fill(BEHIND), math.nan)
     w = where(front, w, 1.0)
     e, f = h[0] * x + h[1] * y + h[2] - u * w, h[3] * x + h[4] * y + h[5] - v * w
     a, b, c, d = h[0] - u * h[6], h[1] - u * h[7], h[3] - v * h[6], h[4] - v * h[7]
@@ -151,7 +151,7 @@ def _linearise(h: Array, rows: Array, row: int, G: Array, first: Array, second: 
         store(second, 6 + q, r11 * load(G, 15 + q))
     store(first, 9, r00 * e + r01 * f)
     store(second, 9, r11 * f)
-    return where(front, e * l0 + f * l1, BEHIND)
+    return where(front, e * l0 + f * l1, behind)
 
 
 @kernel

@@ -154,6 +154,13 @@ def test_a_match_behind_the_horizon_does_not_stop_the_refinement() -> None:
         np.testing.assert_allclose(fits[0], fits[1], atol=1e-6)  # as the gradient above
 
 
+def test_a_model_that_is_no_number_has_no_cost() -> None:
+    for loss in KINDS:
+        p, out, cost = problem(0), np.empty((1, 9)), np.empty(1)
+        refine_homographies(np.full((1, 9), np.nan), p.weighted(loss), Schedule(3, 1e-4, 0.0), out, cost)
+        assert np.isnan(cost[0]) and np.isnan(out).all()
+
+
 def test_step_and_response_at_an_optimum() -> None:
     for seed in range(5):
         p = problem(seed, n=60)
