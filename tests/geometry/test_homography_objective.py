@@ -13,7 +13,6 @@ from fmtorch.geometry.homography_objective_kernels import (
     HOMOGRAPHY,
     evaluate_homographies,
     refine_homographies,
-    response_of_homography,
     step_of_homography,
 )
 from fmtorch.geometry.levenberg_marquardt_kernels import Schedule
@@ -161,20 +160,13 @@ def test_a_model_that_is_no_number_has_no_cost() -> None:
         assert np.isnan(cost[0]) and np.isnan(out).all()
 
 
-def test_step_and_response_at_an_optimum() -> None:
+def test_step_at_an_optimum() -> None:
     for seed in range(5):
         p = problem(seed, n=60)
-        out, moved, response = np.empty((1, 9)), np.empty(9), np.empty((9, 9))
+        out, moved = np.empty((1, 9)), np.empty(9)
         refine_homographies(p.h[None].copy(), p.unbounded(), Schedule(100, 1e-4, 0.0), out, np.empty(1))
         step_of_homography(out[0], p.unbounded(), 1e-10, moved)
         np.testing.assert_allclose(moved, out[0], atol=1e-7)  # sqrt(EPS) as above, times the condition
-        response_of_homography(out[0], p.unbounded(), 1e-10, response)
-        products, _ = evaluated(out[0], p.unbounded())
-        A = products[:9, :9]
-        tangent = np.eye(9) - np.outer(out[0], out[0])
-        # H of A x = -b on the sphere. The damping is 1e-10 of the greatest curvature, so the error that over the least.
-        values = np.linalg.eigvalsh(A)
-        np.testing.assert_allclose(A @ response, -tangent, atol=10 * 1e-10 * values[-1] / values[1])
 
 
 def test_gradient_in_tensors_and_its_graph() -> None:

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import fmtorch
+from fmtorch.estimators import HypothesizeAndVerify
 from tests.conftest import shared_path
 from tests.reference import homography_family as reference
 
@@ -187,6 +188,32 @@ def test_gradients_equal_finite_differences() -> None:
     assert (gradient[~m.right].abs() < 1e-3 * size).all()
 
 
+@pytest.mark.parametrize(("final", "tolerance"), [("gauss_newton", 0.03), ("adaptive", 0.05)])
+def test_gradients_under_noise_are_those_of_the_estimate(final: str, tolerance: float) -> None:
+    """Against finite differences of the whole estimate, along random directions.
+
+    The scale of the adaptive fit is held, and both stop near the optimum.
+    """
+    m = matches(2, 60, 0.3, 0.2)
+    x0, x1 = (torch.from_numpy(x).requires_grad_() for x in (m.x0, m.x1))
+    weight = torch.from_numpy(np.random.default_rng(0).normal(size=(3, 3)))
+
+    def value(x0: torch.Tensor, x1: torch.Tensor) -> torch.Tensor:
+        model = fmtorch.find_homography(x0, x1, final=final).H[0]
+        return (model / model[2, 2] * weight).sum()
+
+    gradients = torch.autograd.grad(value(x0, x1), (x0, x1))
+    rng, step, attached, numeric = np.random.default_rng(1), 1e-3, [], []  # px
+    for _ in range(12):
+        directions = [torch.from_numpy(rng.normal(size=(60, 2))) for _ in range(2)]
+        with torch.no_grad():
+            ahead, behind = (value(x0 + s * directions[0], x1 + s * directions[1]) for s in (step, -step))
+        numeric.append(float(ahead - behind) / (2 * step))
+        attached.append(float(sum((g * d).sum() for g, d in zip(gradients, directions, strict=True))))
+    apart = np.linalg.norm(np.subtract(attached, numeric)) / np.linalg.norm(numeric)
+    assert apart < tolerance, apart
+
+
 def test_the_same_bits_alone_and_in_a_batch() -> None:
     each = [matches(seed, count) for seed, count in ((6, 40), (7, 200), (8, 3), (9, 90))]
     x0, x1 = [m.x0 for m in each], [m.x1 for m in each]
@@ -216,8 +243,10 @@ def test_any_unit_of_pixels_is_solved_without_an_exception(scale: float) -> None
 
 def test_another_model_is_refused() -> None:
     m = matches(11)
-    with pytest.raises(ValueError, match="find_homography needs homographies"):
+    with pytest.raises(ValueError, match="gives fundamental matrices; find_homography needs"):
         fmtorch.find_homography(m.x0, m.x1, estimator="fmtorch")
+    with pytest.raises(ValueError, match="gives homography matrices; find_fundamental needs"):
+        fmtorch.find_fundamental(m.x0, m.x1, estimator="homography")
     with pytest.raises(AttributeError, match="fundamental"):
         _ = fmtorch.find_fundamental(m.x0, m.x1).H
 
@@ -239,3 +268,14 @@ def test_a_photographed_wall() -> None:
     c = fmtorch.match(a, b, pipeline="sift_fmtorch").correspondences
     estimate = fmtorch.find_homography(c.x0, c.x1, mask=c.mask, quality=c.quality, prior=c.prior, noise=c.noise)
     assert bool(estimate.ok) and corner_error(estimate.H[0], truth) < 5
+
+
+@pytest.mark.parametrize("options", [{"degeneracy": "degensac"}, {"local_optimization": "graph_cut"}, {"focal": {}}])
+def test_parts_for_fundamental_matrices_are_refused(options: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match="seven_point|is for fundamental matrices"):
+        HypothesizeAndVerify(solver="four_point", **options)
+
+
+def test_a_pipeline_needs_fundamental_matrices() -> None:
+    with pytest.raises(ValueError, match="the estimator gives homography matrices; a pipeline needs"):
+        fmtorch.presets.pipeline("sift_gms", overrides=["estimator=homography"])
