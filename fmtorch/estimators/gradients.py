@@ -102,7 +102,8 @@ class Attached:
         weight = matches.weight if self.family.fit_scale.by_prior else matches.precision
         weight = torch.where(counted > 0, counted * weight, 0)
         if self.family.model == "homography":
-            s2 = _padded([s.fit.s2 for s in solved], matches.mask) if solved[0].fit.s2 is not None else None
+            scales = [s.fit.s2 for s in solved if s.fit.s2 is not None]  # of all fits, or of none
+            s2 = _padded(scales, matches.mask) if scales else None
             gradient, response = homography_gradient(at, matches.points, weight, s2)
         else:
             unbounded = torch.full_like(at[:, 0], torch.inf)
