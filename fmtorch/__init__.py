@@ -6,13 +6,13 @@ import sys
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from fmtorch.core.version import __version__
+
 if TYPE_CHECKING:
     from fmtorch.core.types import Correspondences, Estimate, Features
-    from fmtorch.pipeline.fundamental import find_fundamental
-    from fmtorch.pipeline.photographs import MatchResult, match
+    from fmtorch.pipeline.fundamental import find_fundamental, find_homography
     from fmtorch.pipeline.pipeline import Pipeline
-
-__version__ = "0.1.0"
+    from fmtorch.pipeline.two_images import MatchResult, match
 
 __all__ = [
     "Correspondences",
@@ -22,13 +22,14 @@ __all__ = [
     "Pipeline",
     "__version__",
     "find_fundamental",
+    "find_homography",
     "match",
 ]
 
 _MODULES = {
     "Correspondences": "core.types", "Estimate": "core.types", "Features": "core.types",
-    "MatchResult": "pipeline.photographs", "Pipeline": "pipeline.pipeline", "match": "pipeline.photographs",
-    "find_fundamental": "pipeline.fundamental",
+    "MatchResult": "pipeline.two_images", "Pipeline": "pipeline.pipeline", "match": "pipeline.two_images",
+    "find_fundamental": "pipeline.fundamental", "find_homography": "pipeline.fundamental",
 }  # fmt: skip
 
 
@@ -52,7 +53,9 @@ class _Package(ModuleType):
     """The package, in which `match` is the function.
 
     Python makes each submodule that is imported an attribute of its package, `fmtorch.match` too, which runs the
-    command of that name; it stays ``sys.modules["fmtorch.match"]`` alone.
+    command of that name; it stays ``sys.modules["fmtorch.match"]`` alone. Nothing shorter does: a module that puts the
+    function in its own place in `sys.modules` has no ``__spec__``, without which neither `fmtorch match` nor
+    ``importlib.reload`` finds it again.
     """
 
     def __setattr__(self, name: str, value: object) -> None:

@@ -6,7 +6,7 @@ import os
 import runpy
 import sys
 
-from fmtorch import __version__
+from fmtorch.core.version import __version__
 
 COMMANDS = {
     "eval": "run a pipeline over a data set of image pairs and evaluate it",

@@ -12,7 +12,7 @@ import json
 from pathlib import Path
 
 from fmtorch.data.rendered.generate import FAMILIES, PLANS, SPLITS, digest
-from fmtorch.data.rendered.matchable import RECORD, recorded_pairs
+from fmtorch.data.rendered.recorded import RECORD, recorded_pairs
 
 
 def main() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import os
+import pkgutil
 from pathlib import Path
 
 import numpy as np
@@ -42,13 +43,14 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 def compile_all() -> None:
     """Compile every kernel of the package that this machine has not compiled yet."""
-    from fmtorch.compiling import cache, switch, together  # not before the import hook of the type checker
+    import fmtorch  # not before the import hook of the type checker
+    from fmtorch.compiling import switch, together
     from fmtorch.compiling.kernel import Kernel
 
     if not switch.available():
         return
-    paths = [path.relative_to(cache.PACKAGE.parent) for path in cache.sources(cache.PACKAGE)]
-    modules = [importlib.import_module(".".join(path.with_suffix("").parts)) for path in paths]
+    names = [each.name for each in pkgutil.walk_packages(fmtorch.__path__, "fmtorch.") if "__main__" not in each.name]
+    modules = [importlib.import_module(name) for name in names]
     found = [value for module in modules for value in vars(module).values() if isinstance(value, Kernel)]
     together.compile_together(list({id(each): each for each in found}.values()))
 

@@ -19,6 +19,12 @@ from fmtorch import presets
 from fmtorch.core.stages import Estimator, Pruner
 from fmtorch.core.types import Correspondences, collate
 
+PEERS = {
+    name: package
+    for name in presets.available("estimator")
+    for package in presets.peer_packages(presets.load("estimator", name))
+}
+"""The packages of the extra `peers` that presets of estimators need, by the presets' names."""
 SMALL_KINDS = ("collinear", "collinear in image 1", "planar", "coincident", "half coincident")
 
 Result = dict[str, Tensor]  # every value has the batch as its first dimension; masks (B, N) may be padded on the right

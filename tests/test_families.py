@@ -33,7 +33,7 @@ def matches(seed: int) -> GivenMatches:
     return GivenMatches(Correspondences(600 * x0, 600 * x1, mask, size0=size, size1=size, quality=quality), (40, 40))
 
 
-def pairs(*families: str) -> list[ImagePair]:
+def pairs_of_families(*families: str) -> list[ImagePair]:
     image = ImageSource("image", Path("image.jpg"))
     return [
         ImagePair(str(i), family, "scene", image, image, np.eye(3), matches=functools.partial(matches, i))
@@ -55,7 +55,7 @@ def qualities(pipeline: Pipeline, some: list[ImagePair]) -> list[torch.Tensor]:
 def test_each_pair_of_a_batch_gets_the_options_of_its_family() -> None:
     options = ["pruner.ratio.threshold=0.5", f"+{RATIO}.wide.threshold=0.7", f"+{RATIO}.CPC.threshold=0.9"]
     pipeline = presets.pipeline("sift_ratio_paper", overrides=options)
-    some = pairs("KITTI", "orbit", "CPC", "mine", "Strecha")
+    some = pairs_of_families("KITTI", "orbit", "CPC", "mine", "Strecha")
     limits = (0.5, 0.7, 0.9, 0.5, 0.7)
     for pair, kept, limit in zip(some, qualities(pipeline, some), limits, strict=True):
         given = matches(int(pair.identity)).correspondences.quality

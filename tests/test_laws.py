@@ -10,10 +10,7 @@ import torch
 
 from fmtorch import presets
 from fmtorch.compiling import switch
-from fmtorch.core.types import Correspondences, collate
-from fmtorch.estimators import graph_cut, irls, scores, solvers
-from fmtorch.estimators.focal import hypotheses
-from fmtorch.geometry import sampson_objective
+from fmtorch.core.types import Correspondences, Estimate, collate
 from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.laws import (
     Result,
@@ -36,28 +33,16 @@ NOISY = ("fmtorch", "fmtorch_fast", "fmtorch_max", "gc_ransac", "msac")  # are a
 COMPILED = (  # pruners of two forms: a kernel, and tensors
     "frame_consistency", "gms", "gms_soft", "lpm", "lpm_soft", "match_noise", "one_to_one", "position_consistency",
 )  # fmt: skip
-KERNEL_FORM = (  # wholes of kernels
-    "fmtorch", "fmtorch_fast", "fmtorch_max", "gc_ransac", "irls_magsac", "lmeds", "lmeds_eight_point", "magsac",
-    "msac", "ransac", "ransac_eight_point", "usac",
-)  # fmt: skip
-TILES = [  # what bounds memory and fills caches, and must change no result
-    (solvers, "CPU_SAMPLES", 150), (hypotheses, "CPU_SAMPLES", 150), (scores, "CPU_TILE", 1000),
-    (graph_cut, "CPU_TILE", 1000),
-    (irls, "TILE", 1000), (sampson_objective, "TILE_ELEMENTS", 1), (sampson_objective, "TILE_MODELS", 3),
-]  # fmt: skip
 
 
-def _estimator(name: str, kernel: bool = True) -> Subject:
+def _results(e: Estimate) -> Result:
+    values = {"F": e.F, "inliers": e.inliers, "ok": e.ok, "draws": e.draws}
+    return {**values, "significance": e.significance} if e.model == "fundamental" else values
+
+
+def _estimator(name: str) -> Subject:
     estimator = quick(name)
-
-    def run(c: Correspondences) -> Result:
-        with pytest.MonkeyPatch.context() as environment:
-            if not kernel:
-                environment.setenv(switch.SWITCH, "off")
-            e = estimator(c, seed=5)
-        return {"F": e.F, "inliers": e.inliers, "ok": e.ok, "draws": e.draws, "significance": e.significance}
-
-    return Subject(f"estimator={name}" + ("" if kernel else " without kernels"), run)
+    return Subject(f"estimator={name}", lambda c: _results(estimator(c, seed=5)))
 
 
 def _pruner(name: str, kernel: bool = True) -> Subject:
@@ -76,18 +61,12 @@ def _pruner(name: str, kernel: bool = True) -> Subject:
 
 def _noisy(name: str) -> Subject:
     estimator, noise = quick(name), presets.build("pruner", "match_noise")
-
-    def run(c: Correspondences) -> Result:
-        e = estimator(noise(c), seed=5)
-        return {"F": e.F, "inliers": e.inliers, "ok": e.ok, "draws": e.draws, "significance": e.significance}
-
-    return Subject(f"estimator={name} with noise", run)
+    return Subject(f"estimator={name} with noise", lambda c: _results(estimator(noise(c), seed=5)))
 
 
 def _subjects() -> list[Subject]:
     """Every preset of these groups: a new file in conf/ joins by being there."""
     estimators = [_estimator(n) for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES[1:])]
-    estimators += [_estimator(n, kernel=False) for n in KERNEL_FORM]
     pruners = [*(_pruner(n) for n in presets.available("pruner")), *(_pruner(n, kernel=False) for n in COMPILED)]
     return [*estimators, *pruners, *(_noisy(n) for n in NOISY)]
 
@@ -178,13 +157,12 @@ def test_hopeless_pairs_have_a_reason(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", OWN)
-def test_batch_workers_threads_and_tiles_change_nothing(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_batch_workers_and_threads_change_nothing(name: str) -> None:
     estimator = quick(name, 60, 30)
     pairs = [scene(i, 24 + 53 * i % 120) for i in range(24)]
 
     def run(some: list[Correspondences]) -> Result:
-        e = estimator(collate(some), seed=5)
-        return {"F": e.F, "inliers": e.inliers, "ok": e.ok, "draws": e.draws, "significance": e.significance}
+        return _results(estimator(collate(some), seed=5))
 
     def first(result: Result, pairs: int, matches: int) -> Result:
         return {k: v[:pairs, :matches] if k == "inliers" else v[:pairs] for k, v in result.items()}
@@ -203,6 +181,32 @@ def test_batch_workers_threads_and_tiles_change_nothing(name: str, monkeypatch: 
             n_alone = pairs[i].mask.shape[1]
             shared = {k: v[i : i + 1, :n_alone] if k == "inliers" else v[i : i + 1] for k, v in seven.items()}
             assert_same(alone, shared, f"{name}: pair {i} alone, in one of four workers")
-    for module, constant, value in TILES:
-        monkeypatch.setattr(module, constant, value)
-    assert_same(run(pairs[:7]), seven, f"{name}: other tiles")
+
+
+@pytest.mark.parametrize("factor", [1e-9, 1e9])
+@pytest.mark.parametrize("name", OWN)
+def test_pairs_of_any_scale_are_sound(name: str, factor: float) -> None:
+    """A reason, or a finite model of unit norm, F of rank two; alone as in a batch. Sizes are scaled alike."""
+    estimator = quick(name, 100)
+    kinds = degenerate()
+    pairs = [*small().values(), *(kinds[k] for k in ("one plane", "identity", "all outliers", "all points equal"))]
+    scaled = [
+        c.replace(
+            x0=c.x0.double() * factor, x1=c.x1.double() * factor,
+            size0=c.size0.double() * factor, size1=c.size1.double() * factor,
+        )
+        for c in pairs if c.size0 is not None and c.size1 is not None
+    ]  # fmt: skip
+    together = estimator(collate(scaled), seed=5)
+    norm, determinant = torch.linalg.matrix_norm(together.F), torch.linalg.det(together.F)
+    for i, c in enumerate(scaled):
+        if i % 3 == 0:  # of every kind some
+            n = c.mask.shape[1]
+            shared = {k: v[i : i + 1, :n] if k == "inliers" else v[i : i + 1] for k, v in _results(together).items()}
+            assert_same(_results(estimator(c, seed=5)), shared, f"{name}: pair {i}")
+        if bool(together.ok[i]):
+            assert abs(float(norm[i]) - 1) < 1e-12
+            assert together.model != "fundamental" or abs(float(determinant[i])) < 1e-12
+        else:
+            assert together.reason[i]
+            assert not bool(together.F[i].any())

@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fmtorch.estimators.focal.prior import NORMAL
 
-from fmtorch import geometry, kernels, presets
+from fmtorch import geometry, presets
+from fmtorch.compiling import switch
+from fmtorch.estimators.families.focals import normal_quantiles
 from fmtorch.geometry.sigma_consensus import LOSS_TABLE
 from fmtorch.matching import nearest_neighbors
 from fmtorch.metrics import nsgd
@@ -62,7 +63,8 @@ def inputs() -> dict[str, Any]:
 
 def results(given: dict[str, Any]) -> dict[str, np.ndarray]:
     """What is promised to have the same bits."""
-    found = {"quantiles of focal lengths": NORMAL, "table of MAGSAC++": torch.from_numpy(LOSS_TABLE)}
+    tables = {"quantiles of focal lengths": normal_quantiles(), "table of MAGSAC++": LOSS_TABLE}
+    found = {name: torch.from_numpy(table) for name, table in tables.items()}
     for what, c in given["pairs"].items():
         for name in ESTIMATORS:
             estimate = presets.build("estimator", name)(c, 1)
@@ -103,7 +105,7 @@ def runs_haswell() -> bool:
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="for x86-64")
 def test_an_older_processor_computes_the_same_bits(tmp_path: Path) -> None:
-    if not (kernels.available() and runs_haswell()):
+    if not (switch.available() and runs_haswell()):
         pytest.skip("needs kernels, and a processor with AVX2 and FMA")
     given = inputs()
     torch.save(given, tmp_path / "given.pt")

@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import pyarrow as pa
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich.progress import Progress
@@ -19,18 +20,19 @@ from fmtorch.data import ImagePair, PairDataset
 from fmtorch.evaluation.identity import run_identity
 from fmtorch.evaluation.plots import plot_recall_curves
 from fmtorch.evaluation.run import evaluate_pairs, select
-from fmtorch.evaluation.summary import ALL, summarize
+from fmtorch.evaluation.summary import ALL, Group, summarize
 from fmtorch.evaluation.summary_tables import pose_table, summary_markdown, summary_table
+from fmtorch.pipeline.exporting import exportable
+from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
 from fmtorch.presets.fields import Cache, Count, Device, Gigabytes, Seed, path_fields, read_fields
 from fmtorch.storage import RunFolder, identity_digest
 from fmtorch.storage.exchange.export import export_kinds, write_exports
 from fmtorch.storage.exchange.journal import Journal
-from fmtorch.storage.exporting import exportable
 from fmtorch.storage.features import CachedFeatures
 
-MANY = 500  # pairs from which on processes are worth their start
-MOST_PROCESSES = 8  # unless more are asked for: each holds the networks of the pipeline and some 0.5 GB
+MIN_PAIRS_FOR_PROCESSES = 500  # below which processes are not worth their start
+MAX_PROCESSES = 8  # unless more are asked for: each holds the networks of the pipeline and some 0.5 GB
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,54 +58,80 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
     """
     fields = read_fields(Fields, config)
     device = presets.resolve_device(fields.device)
-    kinds = export_kinds(fields.export)
+    exports = export_kinds(fields.export)
     presets.expect_dataset(config.dataset)
     presets.expect_stages(config)
     with progress_bars() as progress:
-        pipeline = presets.build_pipeline(config, device)
+        pipeline: Pipeline = presets.build_pipeline(config, device)
         dataset = _load(config.dataset, progress)
-        identity = run_identity(config, pipeline_name, pipeline, dataset.digest)
-        name = f"{pipeline_name}-{identity_digest(identity)[:8]}"
-        folder = RunFolder.open(fields.run_dir or Path(f"runs/{dataset.name}/{name}"), identity)
-        chosen = select([dataset[i] for i in range(len(dataset))], fields.limit)
-        done = folder.done()
-        journal = _journal(folder.path, chosen) if kinds else None
-        todo = [p for p in chosen if p.key not in done or (journal is not None and _to_export(journal, p))]
-        processes = len(todo) >= MANY if fields.processes is None else fields.processes
-        processes = processes and device.type == "cpu"
-        cores = os.cpu_count() or 1
-        workers = fields.workers or (1 if device.type != "cpu" else min(cores, MOST_PROCESSES) if processes else cores)
-        bar = progress.add_task(pipeline_name, total=len(chosen), completed=len(chosen) - len(todo))
-        build = functools.partial(presets.build_pipeline, config, device) if processes and workers > 1 else None
-        for count in evaluate_pairs(
-            pipeline, todo, seed=fields.seed, batch=fields.batch, workers=workers, store=folder.append, build=build,
-            journal=journal,
-        ):  # fmt: skip
+        folder = _open_folder(config, fields.run_dir, pipeline_name, pipeline, dataset)
+        pairs = select([dataset[i] for i in range(len(dataset))], fields.limit)
+        journal = _journal(folder.path, pairs) if exports else None
+        todo = _missing(pairs, folder, journal)
+        bar = progress.add_task(pipeline_name, total=len(pairs), completed=len(pairs) - len(todo))
+        for count in _evaluated(config, fields, pipeline, todo, folder, journal):
             progress.advance(bar, count)
-    if len(todo) < len(chosen):
-        taken = f"{len(chosen) - len(todo)} of {len(chosen)} pairs taken from an earlier run in {folder.path}"
-        console.print(taken, markup=False, highlight=False)
-    keys = {pair.key for pair in chosen}
-    table = folder.read(keys)
-    summary = summarize(table)
-    folder.write_summary(summary, summary_markdown(summary, title=f"{pipeline_name} on {dataset.name}"))
-    plot_recall_curves({pipeline_name: table}, folder.path / "recall.png")
-    console.print(summary_table(summary, title=f"{pipeline_name} on {dataset.name}"))
-    if (poses := pose_table(summary)) is not None:
-        console.print(poses)
-    console.print(f"[dim]{folder.path}: pairs/, summary.json, summary.md, recall.png[/dim]")
+    if len(todo) < len(pairs):
+        earlier = f"{len(pairs) - len(todo)} of {len(pairs)} pairs taken from an earlier run in {folder.path}"
+        console.print(earlier, markup=False, highlight=False)
+    table = folder.read({pair.key for pair in pairs})
+    summary = _summarize(table, folder, pipeline_name, dataset.name)
     if journal is not None:
-        ends = [(p.image0.path, p.image1.path) for p in chosen if exportable(p)]
-        written = write_exports(journal, ends, kinds, folder.path)
+        ends = [(p.image0.path, p.image1.path) for p in pairs if exportable(p)]
+        written = write_exports(journal, ends, exports, folder.path)
         console.print(f"[dim]{folder.path}: {', '.join(written)}; names of images are below {journal.root}[/dim]")
     if isinstance(pipeline.extractor, CachedFeatures):
         console.print(f"[dim]{pipeline.extractor.report()}[/dim]")
-    if chosen and summary[ALL]["failures"] == len(chosen):
+    if pairs and summary[ALL]["failures"] == len(pairs):
         reason = next(iter(table["reason"].to_pylist()))
         raise ValueError(
             f"every pair failed, the first because: {reason}. Once that is mended, delete {folder.path} to run again"
         )
     return folder.path
+
+
+def _open_folder(
+    config: DictConfig, run_dir: Path | None, pipeline_name: str, pipeline: Pipeline, dataset: PairDataset
+) -> RunFolder:
+    """The folder of the run with this identity, `run_dir` if given, new or to be continued."""
+    identity = run_identity(config, pipeline_name, pipeline, dataset.digest)
+    name = f"{pipeline_name}-{identity_digest(identity)[:8]}"
+    return RunFolder.open(run_dir or Path(f"runs/{dataset.name}/{name}"), identity)
+
+
+def _missing(pairs: Sequence[ImagePair], folder: RunFolder, journal: Journal | None) -> list[ImagePair]:
+    """The pairs that have no row yet, or whose matches are to be exported and not in the journal."""
+    done = folder.done()
+    return [p for p in pairs if p.key not in done or (journal is not None and _to_export(journal, p))]
+
+
+def _evaluated(
+    config: DictConfig, fields: Fields, pipeline: Pipeline, pairs: Sequence[ImagePair], folder: RunFolder,
+    journal: Journal | None,
+) -> Iterator[int]:  # fmt: skip
+    """Evaluates pairs into the folder and the journal; yields how many were done since."""
+    device, cores = pipeline.device, os.cpu_count() or 1
+    processes = len(pairs) >= MIN_PAIRS_FOR_PROCESSES if fields.processes is None else fields.processes
+    processes = processes and device.type == "cpu"
+    workers = fields.workers or (1 if device.type != "cpu" else min(cores, MAX_PROCESSES) if processes else cores)
+    build = functools.partial(presets.build_pipeline, config, device) if processes and workers > 1 else None
+    return evaluate_pairs(
+        pipeline, pairs, seed=fields.seed, batch=fields.batch, workers=workers, store=folder.append, build=build,
+        journal=journal,
+    )  # fmt: skip
+
+
+def _summarize(table: pa.Table, folder: RunFolder, pipeline_name: str, dataset_name: str) -> dict[str, Group]:
+    """The summary of a run's rows, written to its folder with the recall curve, and shown."""
+    title = f"{pipeline_name} on {dataset_name}"
+    summary = summarize(table)
+    folder.write_summary(summary, summary_markdown(summary, title=title))
+    plot_recall_curves({pipeline_name: table}, folder.path / "recall.png")
+    console.print(summary_table(summary, title=title))
+    if (poses := pose_table(summary)) is not None:
+        console.print(poses)
+    console.print(f"[dim]{folder.path}: pairs/, summary.json, summary.md, recall.png[/dim]")
+    return summary
 
 
 def _journal(folder: Path, pairs: Sequence[ImagePair]) -> Journal:

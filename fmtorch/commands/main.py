@@ -15,16 +15,16 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from fmtorch.commands.explain import explained
-from fmtorch.commands.words import hydra_words
+from fmtorch.commands.overrides import hydra_arguments
 from fmtorch.core.resources import conf_dir
-from fmtorch.core.terminal import MISTAKES, exits_with_message, told
+from fmtorch.core.terminal import MISTAKES, error_line, exits_with_message
 from fmtorch.presets.pruners import with_explicit
 
 Task = Callable[[DictConfig], None]
 
 
 class Mistake(ValueError):
-    """A user's mistake in one job of a sweep, told by its message: it can be sent between processes."""
+    """A user's mistake in one job of a sweep, error_line by its message: it can be sent between processes."""
 
 
 def job(task: Task) -> Task:
@@ -36,8 +36,8 @@ def job(task: Task) -> Task:
             task(with_explicit(config, HydraConfig.get().overrides.task))
         except MISTAKES as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
-                raise Mistake(told(error)) from None
-            sys.exit(f"error: {told(error)}")
+                raise Mistake(error_line(error)) from None
+            sys.exit(f"error: {error_line(error)}")
 
     return wrapped
 
@@ -55,11 +55,11 @@ def run_command(
     Args:
         name: of the command and of its config.
         task: a `job` that its module holds under its own name, so that launchers can send it to other processes.
-        paths, positional: fields that hold paths, and those that need no name, see `hydra_words`.
+        paths, positional: fields that hold paths, and those that need no name, see `hydra_arguments`.
         interrupted: what is said where the user stops it.
     """
     with exits_with_message(interrupted):
-        sys.argv[1:] = hydra_words(sys.argv[1:], paths, positional)
+        sys.argv[1:] = hydra_arguments(sys.argv[1:], paths, positional)
         try:
             with env_override({"HYDRA_FULL_ERROR": "1"}):  # Hydra then leaves errors to us
                 hydra.main(version_base=None, config_path=str(conf_dir()), config_name=name)(task)()

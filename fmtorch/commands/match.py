@@ -18,17 +18,19 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
-from fmtorch import __version__, presets
+from fmtorch import presets
 from fmtorch.commands.main import job, run_command
 from fmtorch.commands.match_folder import FolderFields, match_folder
 from fmtorch.core.files import replacing
 from fmtorch.core.terminal import console
 from fmtorch.core.types import RELATED
+from fmtorch.core.version import __version__
 from fmtorch.data import read_image
 from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_matches
 from fmtorch.metrics import nsgd
 from fmtorch.pipeline.folder import EXHAUSTIVE
-from fmtorch.pipeline.photographs import Image, MatchResult, match
+from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.pipeline.two_images import Image, MatchResult, match
 from fmtorch.presets.fields import Cache, Gigabytes, path_fields, read_fields
 from fmtorch.storage.features import CachedFeatures
 
@@ -60,7 +62,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     presets.expect_stages(config)
     truth = None if fields.truth is None else read_matrix(fields.truth)
     image0, image1 = (read_image(path, orient=fields.orient) for path in paths)
-    pipeline = presets.build_pipeline(config, presets.resolve_device(fields.device))
+    pipeline: Pipeline = presets.build_pipeline(config, presets.resolve_device(fields.device))
     result = match(image0, image1, pipeline=pipeline, longest_side=fields.longest_side, seed=fields.seed)
     report = {
         "version": __version__, "pipeline": pipeline_name, "overrides": list(overrides), "seed": fields.seed,

@@ -13,6 +13,7 @@ from rich.console import Console
 from fmtorch import presets
 from fmtorch.core.terminal import console, progress_bars
 from fmtorch.pipeline.folder import FolderMatches, chosen_pairs, images_below, open_folder
+from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets.fields import Count, Device, Seed
 from fmtorch.storage.code import fmtorch_version
 from fmtorch.storage.exchange.export import export_kinds, write_exports
@@ -45,7 +46,7 @@ def match_folder(config: DictConfig, fields: FolderFields, pipeline_name: str, o
     kinds = export_kinds(fields.export)
     pairs = chosen_pairs(folder, images_below(folder), fields.pairs)
     presets.expect_stages(config)
-    pipeline = presets.build_pipeline(config, presets.resolve_device(fields.device))
+    pipeline: Pipeline = presets.build_pipeline(config, presets.resolve_device(fields.device))
     output = fields.output or Path(f"matches/{folder.absolute().name}")
     identity = {
         "version": fmtorch_version(), **presets.stages(config), "seed": fields.seed, "orient": fields.orient,

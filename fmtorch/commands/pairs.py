@@ -29,8 +29,8 @@ from fmtorch.evaluation.workers import end_with_parent
 from fmtorch.presets import plain
 from fmtorch.presets.fields import Count, Seed, path_fields, read_fields
 
-MOST_PROCESSES = 8  # unless more are asked for
-FEW = 4 * BLOCK  # candidates up to which processes are not worth their start
+MAX_PROCESSES = 8  # unless more are asked for
+MIN_CANDIDATES_FOR_PROCESSES = 4 * BLOCK + 1  # below which processes are not worth their start
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
@@ -54,28 +54,30 @@ def run(config: DictConfig) -> Path:
     if fields.output is None:
         raise ValueError("output is missing; it names the folder of the set that is made: output=KITTI")
     dataset = _load(config.dataset)
-    made = Construction(dataset, fields.output, fields.count, fields.seed, fields.quality)
-    made.begin()
-    if made.complete:
-        console.print(f"{made.folder} is complete: dataset=fmbench dataset.root={made.folder}", highlight=False)
-        return made.folder
-    few = dataset.candidates <= FEW
-    workers = fields.workers or (1 if few else min(os.cpu_count() or 1, MOST_PROCESSES))
+    construction = Construction(dataset, fields.output, fields.count, fields.seed, fields.quality)
+    construction.begin()
+    if construction.complete:
+        console.print(
+            f"{construction.folder} is complete: dataset=fmbench dataset.root={construction.folder}", highlight=False
+        )
+        return construction.folder
+    many = dataset.candidates >= MIN_CANDIDATES_FOR_PROCESSES
+    workers = fields.workers or (min(os.cpu_count() or 1, MAX_PROCESSES) if many else 1)
     start = time.monotonic()
-    with progress_bars() as progress, _Team(made, workers) as team:
-        kept, judged, problems = _select(made, team, progress)
-        images = made.used(kept)
+    with progress_bars() as progress, _Team(construction, workers) as team:
+        kept, judged, problems = _select(construction, team, progress)
+        images = construction.used(kept)
         bar = progress.add_task("writing images", total=len(images))
         for _ in team.each("write_image", images):
             progress.advance(bar)
     summary = {"candidates": dataset.candidates, "judged": judged, "kept": len(kept), "images": len(images)}
     if not kept:
         raise ValueError(
-            f"none of {judged} candidates passes the rule{_first(problems)}; {made.folder} was not completed"
+            f"none of {judged} candidates passes the rule{_first(problems)}; {construction.folder} was not completed"
         )
-    made.finish(kept, summary)
-    _tell(made, summary, problems, time.monotonic() - start)
-    return made.folder
+    construction.finish(kept, summary)
+    _tell(construction, summary, problems, time.monotonic() - start)
+    return construction.folder
 
 
 def _load(config: DictConfig) -> ScenePairs:
@@ -93,11 +95,11 @@ def _load(config: DictConfig) -> ScenePairs:
     )
 
 
-def _select(made: Construction, team: _Team, progress: Progress) -> tuple[list[int], int, list[str]]:
+def _select(construction: Construction, team: _Team, progress: Progress) -> tuple[list[int], int, list[str]]:
     """The candidates that make pairs, how many were judged for that, and what was wrong with images."""
-    order = made.order()
-    total = len(order) if made.count is None else min(made.count, len(order))
-    bar = progress.add_task("judging candidates" if made.count is None else "finding pairs", total=total)
+    order = construction.order()
+    total = len(order) if construction.count is None else min(construction.count, len(order))
+    bar = progress.add_task("judging candidates" if construction.count is None else "finding pairs", total=total)
     kept, judged, problems = list[int](), 0, dict[str, None]()
     here, there = itertools.tee(blocks(order))
     for (_, ranks), verdicts in zip(here, team.each("judge", there), strict=False):
@@ -105,23 +107,25 @@ def _select(made: Construction, team: _Team, progress: Progress) -> tuple[list[i
         kept += passed
         judged += len(ranks)
         problems.update(dict.fromkeys(verdicts.problems))
-        progress.update(bar, completed=judged if made.count is None else min(len(kept), total))
-        if made.count is not None and len(kept) >= made.count:
+        progress.update(bar, completed=judged if construction.count is None else min(len(kept), total))
+        if construction.count is not None and len(kept) >= construction.count:
             break
-    return kept[: made.count], judged, list(problems)
+    return kept[: construction.count], judged, list(problems)
 
 
 class _Team:
     """Calls methods of a construction with many arguments, here or by several processes; results come in order."""
 
-    def __init__(self, made: Construction, workers: int) -> None:
-        self.made, self.workers = made, workers
+    def __init__(self, construction: Construction, workers: int) -> None:
+        self.construction, self.workers = construction, workers
         self.executor: ProcessPoolExecutor | None = None
 
     def __enter__(self) -> _Team:
         if self.workers > 1:
             context = multiprocessing.get_context("spawn")
-            self.executor = ProcessPoolExecutor(self.workers, context, initializer=_begin, initargs=(self.made,))
+            self.executor = ProcessPoolExecutor(
+                self.workers, context, initializer=_begin, initargs=(self.construction,)
+            )
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -132,7 +136,7 @@ class _Team:
         """The results, some of them computed ahead."""
         if self.executor is None:
             for given in arguments:
-                yield getattr(self.made, method)(*given)
+                yield getattr(self.construction, method)(*given)
             return
         waiting: list[Future[Any]] = []
         todo = iter(arguments)
@@ -154,21 +158,21 @@ class _Team:
                 future.cancel()
 
 
-_mine: Construction | None = None  # of a process that works for another
+_construction: Construction | None = None  # of a process that works for another
 
 
-def _begin(made: Construction) -> None:
+def _begin(construction: Construction) -> None:
     """The start of a process: an interrupt is for the one that asked, which waits for what is under way."""
-    global _mine
+    global _construction
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()
     cv2.setNumThreads(1)
-    _mine = made
+    _construction = construction
 
 
 def _in_process(method: str, given: tuple[object, ...]) -> Any:
-    assert _mine is not None
-    return getattr(_mine, method)(*given)
+    assert _construction is not None
+    return getattr(_construction, method)(*given)
 
 
 @contextlib.contextmanager
@@ -186,17 +190,19 @@ def _environment(values: dict[str, str]) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _tell(made: Construction, summary: dict[str, int], problems: list[str], seconds: float) -> None:
+def _tell(construction: Construction, summary: dict[str, int], problems: list[str], seconds: float) -> None:
     """What was made, on the console."""
     judged = f"{summary['judged']} of {summary['candidates']} candidates were judged in {seconds:.0f} s"
     console.print(f"{summary['kept']} pairs of {summary['images']} images; {judged}", highlight=False)
-    if made.count is not None and summary["kept"] < made.count:
-        console.print(f"no more pass the rule than these; {made.count} were asked for", highlight=False)
+    if construction.count is not None and summary["kept"] < construction.count:
+        console.print(f"no more pass the rule than these; {construction.count} were asked for", highlight=False)
     if problems:
         console.print(
             f"{len(problems)} candidates or images cannot be used{_first(problems)}", markup=False, highlight=False
         )
-    console.print(f"[dim]python -m fmtorch.eval dataset=fmbench dataset.root={made.folder}[/dim]", highlight=False)
+    console.print(
+        f"[dim]python -m fmtorch.eval dataset=fmbench dataset.root={construction.folder}[/dim]", highlight=False
+    )
 
 
 def _first(problems: list[str]) -> str:

@@ -77,13 +77,13 @@ def run(config: DictConfig) -> Path:
 
 def run_folders(paths: Iterable[Path]) -> list[Path]:
     """The run folders that the paths are or hold, at any depth. Raises RunFolderError for a path without any."""
-    found: dict[Path, None] = {}
+    folders: dict[Path, None] = {}
     for path in paths:
         inside = [path] if (path / "run.json").exists() else sorted(file.parent for file in path.glob("**/run.json"))
         if not inside:
             raise RunFolderError(f"{path} holds no run; `python -m fmtorch.eval pipeline=NAME` makes one in runs/")
-        found |= dict.fromkeys(inside)
-    return list(found)
+        folders |= dict.fromkeys(inside)
+    return list(folders)
 
 
 def named(folders: Sequence[RunFolder]) -> list[Run]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -52,11 +53,17 @@ def for_each_pair(
 
 def _array(tensor: Tensor | None, kind: torch.dtype, pairs: int) -> NDArray[Any]:
     if tensor is None:
-        return np.empty((pairs, 0), torch.empty(0, dtype=kind).numpy().dtype)
+        return np.empty((pairs, 0), _numpy(kind))
     if tensor.is_floating_point() and tensor.dtype != kind:
         tensor = tensor.to(kind)
     array: NDArray[Any] = as_array(tensor.contiguous())
     return array
+
+
+@functools.cache
+def _numpy(kind: torch.dtype) -> Any:
+    """NumPy's name of a type of torch's."""
+    return torch.empty(0, dtype=kind).numpy().dtype
 
 
 def as_array(tensor: Tensor) -> NDArray[Any]:

@@ -1,15 +1,17 @@
-"""The folder of compiled kernels: one file each, in a folder for this version of the sources, numba, and processor.
+"""The folder of compiled kernels: one file each, in a folder for this version of numba and this processor.
 
 numba's own cache does not notice when a function that a kernel calls is edited in another module, and cannot be read
-where it cannot be written. Here the folder's name is a digest of all that decides the machine code, so that a file
-in it is never stale, and is written in one step, so that several processes may share it.
+where it cannot be written. Here the names of folder and file hold digests of all that decides the machine code, so that
+a file is never stale, and it is written in one step, so that several processes may share it.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import json
+import os
 import pickle
 import platform
 import shutil
@@ -20,9 +22,11 @@ from pathlib import Path
 from typing import Any
 
 from fmtorch.compiling import calls
+from fmtorch.compiling.version import version_of
 from fmtorch.core.resources import cache_dir
 
-PACKAGE = Path(__file__).resolve().parents[1]
+HERE = Path(__file__).resolve().parent
+_HOW = ("kernel.py", "inner.py", "calls.py", "lanes.py", "lane_types.py", "lane_functions.py")  # the files that say how
 ABOUT = "about.json"  # in each folder; its time of change is when the folder was last used
 UNUSED_DAYS = 30  # after which a folder is removed
 _SETTINGS = ("BOUNDSCHECK", "CPU_FEATURES", "CPU_NAME", "DEBUGINFO_DEFAULT", "ENABLE_AVX", "LOOP_VECTORIZE", "OPT")
@@ -35,7 +39,7 @@ def kernels_dir() -> Path:
 
 
 def versions() -> dict[str, str]:
-    """What decides the machine code: digest of the sources, numba, llvmlite, Python, processor, numba's settings."""
+    """What decides the machine code besides the kernel: how it is compiled, numba, llvmlite, Python, the processor."""
     import llvmlite
     import numba
     from llvmlite import binding
@@ -43,27 +47,11 @@ def versions() -> dict[str, str]:
     settings = {name: str(getattr(numba.config, name, None)) for name in _SETTINGS}
     features = binding.get_host_cpu_features().flatten()
     return {
-        "sources": sources_digest(PACKAGE), "numba": numba.__version__, "llvmlite": llvmlite.__version__,
-        "python": platform.python_version(), "machine": f"{platform.system()} {platform.machine()}",
-        "processor": binding.get_host_cpu_name(), "features": features, "settings": json.dumps(settings),
+        "compiling": _hex(b"".join((HERE / name).read_bytes() for name in _HOW)), "numba": numba.__version__,
+        "llvmlite": llvmlite.__version__, "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}", "processor": binding.get_host_cpu_name(),
+        "features": features, "settings": json.dumps(settings),
     }  # fmt: skip
-
-
-def sources(package: Path) -> list[Path]:
-    """The files of a package that hold kernels: those named ``*_kernels.py`` that import the decorators."""
-    named = sorted(package.rglob("*_kernels.py"), key=lambda path: path.relative_to(package).as_posix())
-    return [path for path in named if b"from fmtorch.compiling.kernel import" in path.read_bytes()]
-
-
-def sources_digest(package: Path) -> str:
-    """The digest of all kernels of a package, and of how they are compiled."""
-    how = [
-        path
-        for name in ("kernel.py", "calls.py", "lanes.py", "lane_types.py", "lane_functions.py")
-        if (path := package / "compiling" / name).is_file()
-    ]
-    files = [*sources(package), *how]
-    return _hex(b"".join(hashlib.blake2b(path.read_bytes()).digest() for path in files))
 
 
 @functools.cache
@@ -88,6 +76,10 @@ def folder() -> Path | None:
 
 def _remove_unused(used: Path) -> None:
     oldest = time.time() - UNUSED_DAYS * 24 * 3600
+    for file in used.glob("*.bin"):
+        with contextlib.suppress(OSError):  # somebody else removed it
+            if file.stat().st_mtime < oldest:
+                file.unlink()
     for other in used.parent.iterdir():
         try:
             if other != used and (other / ABOUT).stat().st_mtime < oldest:
@@ -108,9 +100,8 @@ class KernelFile:
         self.calls: list[Any] = []
         self.path: Path | None = None
         where = folder()
-        if where is not None and Path(function.__code__.co_filename).is_file():
-            source = Path(function.__code__.co_filename).read_bytes()
-            version = _hex(source + str(signature).encode())[:8]
+        if where is not None:
+            version = version_of(function, signature)
             self.path = where / f"{function.__module__}.{function.__qualname__}-{version}.bin"
 
     @property
@@ -128,8 +119,10 @@ class KernelFile:
                 written = self.path.read_bytes()
                 data = written[_SIGNATURE_BYTES:]
                 if written[:_SIGNATURE_BYTES] == _signature(data):
+                    with contextlib.suppress(OSError):  # a folder that can be read, but not written
+                        os.utime(self.path)  # so that files in use are not the oldest
                     self.calls = calls.called(data)
-                    return CompileResult._rebuild(target_context, *pickle.loads(data))
+                    return _of(signature, CompileResult._rebuild(target_context, *pickle.loads(data)))
                 warnings.warn(f"{self.path} is damaged; it is compiled anew", stacklevel=2)
         except FileNotFoundError:
             pass
@@ -159,6 +152,15 @@ class KernelFile:
         """Remove the file."""
         if self.path is not None:
             self.path.unlink(missing_ok=True)
+
+
+def _of(signature: Any, made: Any) -> Any:
+    """A compiled function by the types of this process: a group of a script or a notebook is another class in each."""
+    from numba.core import sigutils
+    from numba.core.typing import signature as typed
+
+    arguments, _ = sigutils.normalize_signature(signature)
+    return made._replace(signature=typed(made.signature.return_type, *arguments))
 
 
 def _signature(data: bytes) -> bytes:

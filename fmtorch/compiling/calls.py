@@ -17,6 +17,8 @@ SYMBOL = "fmtorch_kernel:{module}:{name}:"  # of a cell; colons, since machine c
 _NAME = re.compile(rb"fmtorch_kernel:([\w.]+):(\w+):")
 RETURNED = {"None": "none", "bool": "boolean", "int": "int64", "float": "float64"}  # numba's types, by annotation
 _cells: dict[str, ctypes.c_void_p] = {}
+KERNELS: dict[tuple[str, str], Any] = {}
+"""All kernels of this process, by module and name."""
 
 
 def cell(module: str, name: str) -> ctypes.c_void_p:
@@ -35,7 +37,13 @@ def called(machine_code: bytes) -> list[Any]:
     places = sorted({(found[1].decode(), found[2].decode()) for found in _NAME.finditer(machine_code)})
     for module, name in places:
         cell(module, name)
-    return [getattr(importlib.import_module(module), name) for module, name in places]
+    return [kernel_of(module, name) for module, name in places]
+
+
+def kernel_of(module: str, name: str) -> Any:
+    """The kernel of this name in a module, which is imported if need be."""
+    importlib.import_module(module)
+    return KERNELS[module, name]
 
 
 def callable_type(function: Callable[..., Any], signature: Any) -> Any:

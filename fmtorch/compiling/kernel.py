@@ -2,27 +2,29 @@
 
 A kernel loops over NumPy arrays where a tensor form would take many small operations::
 
-    @kernel("f4[:, ::1], f8, f4[::1]")
-    def row_sums(x: Floats, scale: float, out: Floats) -> None: ...
+    @kernel
+    def row_sums(x: F4x2, scale: float, out: F4x1) -> None: ...
 
-Kernels live in modules named ``*_kernels.py``, whose sources version the cache folder (`fmtorch.compiling.cache`); they
-import nothing of fmtorch but one another, this module and `fmtorch.compiling.lanes`. Nothing is imported from numba
-before the first call.
+Kernels stand beside the class that calls them; what they are made of versions the file that keeps them
+(`fmtorch.compiling.version`). Nothing is imported from numba before the first call.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import gc
 import inspect
 import platform
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Generic, ParamSpec, TypeVar, overload
 
 import numpy as np
 
-from fmtorch.compiling import cache, calls
+from fmtorch.compiling import cache, calls, switch
+from fmtorch.compiling.inner import inner_compiler
 from fmtorch.compiling.signature import signature_of
 
 P = ParamSpec("P")
@@ -35,31 +37,35 @@ _lock = threading.RLock()  # numba compiles one function at a time; a kernel may
 class Kernel(Generic[P, R]):
     """A function of NumPy arrays and numbers, compiled for one signature when it is first called.
 
-    Arrays of another dtype, number of axes or memory order are refused with a TypeError, never converted; numbers are
-    converted. Kernels and inner functions may call it, too. It holds no Python lock while it runs, unless it is brief.
-    Raises ImportError where numba cannot be imported.
+    The signature is that of its annotations. Arrays of another dtype, number of axes or memory order are refused with a
+    TypeError, never converted, and so are numbers in a group; other numbers are converted. Kernels and inner functions
+    may call it, too. It holds no Python lock while it runs, unless it is made with holds_gil=True. With
+    FMTORCH_KERNELS=off, for a debugger, the plain function runs, a thousand times slower. Raises ImportError where
+    numba cannot be imported.
     """
 
     __slots__ = ("__call__", "__dict__")  # so that to call a kernel is to call what is compiled, with nothing between
     __call__: Callable[P, R]
 
-    def __init__(self, function: Callable[P, R], signature: str | None = None, brief: bool = False) -> None:
+    def __init__(self, function: Callable[P, R], holds_gil: bool = False) -> None:
         self.function: Callable[P, R] = inspect.unwrap(
             function
         )  # without the checks that tests wrap around every function
         functools.update_wrapper(self, self.function)
-        self._text = signature
-        self.brief = brief
+        self.holds_gil = holds_gil
         self._compiled: Callable[P, R] | None = None
         self.calls: list[Kernel[..., Any]] = []  # those that it calls, once it is compiled
+        calls.KERNELS[self.function.__module__, self.function.__qualname__] = self
         self.__call__ = self._first_call
 
     @functools.cached_property
     def signature(self) -> Any:
         """The types of its arguments."""
-        return signature_of(self.function) if self._text is None else f"({self._text},)"  # a tuple, of one too
+        return signature_of(self.function)
 
     def _first_call(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        if switch.off():
+            return self.function(*args, **kwargs)
         return self.compiled()(*args, **kwargs)
 
     def compiled(self) -> Callable[P, R]:
@@ -83,7 +89,7 @@ class Kernel(Generic[P, R]):
         """
         with _lock:
             if self._compiled is None:
-                self._compiled, self.calls = _compiled(self.function, self.signature, self.brief, count)
+                self._compiled, self.calls = _compiled(self.function, self.signature, self.holds_gil, count)
         return self._compiled
 
     @property
@@ -124,7 +130,9 @@ class Inner(Generic[P, R]):
     def _dispatcher(self) -> Any:
         import numba
 
-        how = {"inline": "always"} if self.inline else {}
+        how: dict[str, Any] = {"inline": "always"} if self.inline else {}
+        if (compiler := inner_compiler()) is not None:
+            how["pipeline_class"] = compiler
         return numba.njit(**OPTIONS, no_cpython_wrapper=True, **how)(self.function)
 
     @property
@@ -136,20 +144,25 @@ class Inner(Generic[P, R]):
 
 
 @overload
-def kernel(signature: Callable[P, R]) -> Kernel[P, R]: ...
+def kernel(function: Callable[P, R]) -> Kernel[P, R]: ...
 @overload
-def kernel(
-    signature: str | None = None, *, brief: bool = False, holds_gil: bool = False
-) -> Callable[[Callable[P, R]], Kernel[P, R]]: ...
-def kernel(signature: Any = None, *, brief: bool = False, holds_gil: bool = False) -> Any:
+def kernel(*, holds_gil: bool = False, name: str = "") -> Callable[[Callable[P, R]], Kernel[P, R]]: ...
+def kernel(function: Callable[P, R] | None = None, *, holds_gil: bool = False, name: str = "") -> Any:
     """Makes a function a `Kernel` of the types of its annotations.
 
     Arrays must be writable. holds_gil: of some microseconds, for which it keeps Python's lock: a thread that waits for
-    it would wake too late to use them.
+    it would wake too late to use them. name: of one that a function makes for some other function, unique in its file.
     """
-    if callable(signature):
-        return Kernel(signature)
-    return lambda function: Kernel(function, signature, brief or holds_gil)
+    if function is not None:
+        return Kernel(function)
+
+    def named(function: Callable[P, R]) -> Kernel[P, R]:
+        if name:
+            function = inspect.unwrap(function)
+            function.__name__ = function.__qualname__ = name
+        return Kernel(function, holds_gil)
+
+    return named
 
 
 @overload
@@ -195,12 +208,12 @@ fused = _Fused(_fused, inline=False)
 
 
 def _compiled(
-    function: Callable[P, R], signature: Any, brief: bool, count: str
+    function: Callable[P, R], signature: Any, holds_gil: bool, count: str
 ) -> tuple[Callable[P, R], list[Kernel[..., Any]]]:
     """The compiled function, whose address its cell holds from now on, and the kernels that it calls."""
     import numba
 
-    dispatcher: Any = numba.njit(**(OPTIONS | {"nogil": not brief}))(function)
+    dispatcher: Any = numba.njit(**(OPTIONS | {"nogil": not holds_gil}))(function)
     if not hasattr(dispatcher, "compile"):
         return function, []  # NUMBA_DISABLE_JIT=1
 
@@ -208,12 +221,25 @@ def _compiled(
         print(f"{count}compiling {function.__name__} {where}", file=sys.stderr, flush=True)
 
     file = dispatcher._cache = cache.KernelFile(function, signature, tell)
-    dispatcher.compile(signature)
+    with _no_garbage_collection():
+        dispatcher.compile(signature)
     dispatcher.disable_compile()
     (made,) = dispatcher.overloads.values()
     calls.publish(function, made)
     compiled: Callable[P, R] = dispatcher
     return compiled, file.calls
+
+
+@contextlib.contextmanager
+def _no_garbage_collection() -> Iterator[None]:
+    """Within it Python does not look for circles of objects: numba makes millions, nearly all of which stay."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def _type_of(dispatcher: Any) -> Any:

@@ -22,7 +22,7 @@ def mix(x: Word) -> Word:
 @inner
 def stream_state(mixed_seed: int, key: int) -> Word:
     """What the numbers of a pair's stream are made of, uint64; mixed_seed: of the seed and the stream, int64."""
-    return mix(np.uint64(key) ^ np.uint64(mixed_seed))
+    return mix(np.uint64(np.int64(key)) ^ np.uint64(np.int64(mixed_seed)))
 
 
 @inner

@@ -31,5 +31,6 @@ def _type(hint: Any, what: str) -> Any:
         return array
     if hasattr(hint, "_fields"):
         fields = get_type_hints(hint, include_extras=True)
-        return types.NamedTuple([_type(fields[name], f"{what}.{name}") for name in hint._fields], hint)
+        members = [_type(fields[name], f"{what}.{name}") for name in hint._fields]
+        return types.BaseTuple.from_types(members, hint)  # where all are alike, a type of its own
     raise TypeError(f"{what} is annotated {hint}; it must be a type of `compiling.arrays`, a number or a NamedTuple")

@@ -1,4 +1,4 @@
-"""Whether kernels are to be used: `FMTORCH_KERNELS=off` takes the other form everywhere."""
+"""`FMTORCH_KERNELS=off`: estimators run their kernels interpreted by Python, all else takes its tensor form."""
 
 from __future__ import annotations
 
@@ -9,17 +9,20 @@ import warnings
 SWITCH = "FMTORCH_KERNELS"
 
 
+def off() -> bool:
+    """Whether kernels are switched off. Raises ValueError if $FMTORCH_KERNELS is neither on nor off."""
+    switch = os.environ.get(SWITCH, "")
+    if switch not in ("", "on", "off"):
+        raise ValueError(f"{SWITCH}={switch}; it must be on or off")
+    return switch == "off"
+
+
 def available() -> bool:
-    """Whether kernels are to be used: not switched off, and numba is there, of whose absence a warning tells once.
+    """Whether kernels stand for tensor forms: not switched off, and numba is there; a warning says once that it is not.
 
     Raises ValueError if $FMTORCH_KERNELS is neither on nor off.
     """
-    switch = os.environ.get(SWITCH, "")
-    if switch == "off":
-        return False
-    if switch not in ("", "on"):
-        raise ValueError(f"{SWITCH}={switch}; it must be on or off")
-    return numba_version() is not None
+    return not off() and numba_version() is not None
 
 
 @functools.cache

@@ -19,7 +19,8 @@ Array = Tensor | NDArray[Any]
 Arrays = Array | Sequence[Any]
 """One array, or a list of them: of pairs of different lengths."""
 
-PER_MATCH = {"mask": 1, "quality": 1, "prior": 1, "noise": 1, "lafs0": 3, "lafs1": 3}  # dimensions, of one pair
+PER_MATCH = {name: len(Correspondences.declared[name].shape) - 1 for name in Correspondences.per_slot}
+"""The dimensions of what has an entry for each match, of one pair."""
 
 
 def as_tensor(value: Any, name: str) -> Tensor:
@@ -122,12 +123,14 @@ def _field(name: str, value: object, single: bool, points: Tensor) -> Tensor:
     tensor = tensor.to(torch.int64) if name == "key" else tensor
     if name in PER_MATCH:
         return tensor[None] if single and tensor.dim() == PER_MATCH[name] else tensor
-    shape = {"size0": (2,), "size1": (2,)}.get(name, ())
+    shape = tuple(map(int, Correspondences.declared[name].shape[1:]))
     if tuple(tensor.shape) in (shape, (1, *shape)):
         return tensor.expand(len(points), *shape)
     if tuple(tensor.shape) != (len(points), *shape):
-        one = f"{shape} for all pairs" if shape else "one number for all pairs"
-        raise ValueError(f"{name} has shape {tuple(tensor.shape)}; it must be {one}, or {(len(points), *shape)}")
+        single_shape = f"{shape} for all pairs" if shape else "one number for all pairs"
+        raise ValueError(
+            f"{name} has shape {tuple(tensor.shape)}; it must be {single_shape}, or {(len(points), *shape)}"
+        )
     return tensor
 
 

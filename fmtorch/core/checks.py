@@ -1,39 +1,30 @@
-"""What a public function says of its arguments, checked where it is called: shapes, types of numbers, devices.
+"""What arguments may be, checked where a user's come in: shapes, types of numbers, devices, values.
 
-The annotations are the source: ``Float[Tensor, "*batch n 2"]`` is both what a reader sees and what is asked for.
+Annotations are the source: ``Float[Tensor, "*batch n 2"]`` is both what a reader sees and what is asked for.
 """
 
 from __future__ import annotations
 
 import functools
 import inspect
-import typing
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, ParamSpec, TypeVar
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import AbstractArray
+from jaxtyping import Bool, Int
 from torch import Tensor
 
+from fmtorch.core.annotations import WHOLE, Expected, arguments_of, numbers_of
 from fmtorch.core.arguments import as_tensor, number
+from fmtorch.core.types import SIZE, Correspondences
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
-NUMBERS = {"Float": "floating-point numbers", "Int": "whole numbers", "Bool": "booleans", "Real": "real numbers"}
 WIDENED = (torch.float16, torch.bfloat16)  # in which no matrix can be decomposed
 MODELS, SETS = "models", "batch"  # leading dimensions of F and of the matches it is fitted to: one F a set, or several
-
-
-class Expected(NamedTuple):
-    """What an annotation asks for."""
-
-    kind: str  # of tensors a key of NUMBERS; "int", "float", "bool", "str", "numbers", ...; "" for anything
-    shape: tuple[str, ...] = ()  # of a tensor, as jaxtyping writes it: "*#batch", "n", "2"
-    optional: bool = False
-    choices: tuple[Any, ...] = ()  # of which the value must be one
-    number: bool = False  # whether a number will do in place of a tensor
 
 
 def checked(function: Callable[P, R], *, common_type: bool = False) -> Callable[P, R]:
@@ -47,11 +38,7 @@ def checked(function: Callable[P, R], *, common_type: bool = False) -> Callable[
     a type of numbers or a device that does not fit; the message begins with the argument's name.
     """
     signature = inspect.signature(function)
-
-    @functools.cache
-    def expected() -> dict[str, Expected]:
-        hints = typing.get_type_hints(function)
-        return {name: expectation(hints.get(name, Any)) for name in signature.parameters}
+    expected = functools.cache(functools.partial(arguments_of, function))
 
     @functools.wraps(function)
     def door(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -63,7 +50,7 @@ def checked(function: Callable[P, R], *, common_type: bool = False) -> Callable[
             if name not in values or (values[name] is None and want.optional):
                 continue
             values[name] = value = _checked_value(name, values[name], want, device)
-            if isinstance(value, Tensor) and want.kind in NUMBERS and not want.number:
+            if want.kind == "array":
                 tensors[name] = value
         _expect_shapes(tensors, expected())
         if common_type:
@@ -73,46 +60,23 @@ def checked(function: Callable[P, R], *, common_type: bool = False) -> Callable[
     return door
 
 
-def public(package: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """`checked` with one type for all tensors, for the functions that a package exports.
+def check_exported(package: str) -> None:
+    """Make the functions that a package exports, those of its `__all__`, `checked` with one type for all tensors.
 
     The package's own modules import each other's functions unchecked, from where they are defined.
     """
-
-    def export(function: Callable[P, R]) -> Callable[P, R]:
-        door = checked(function, common_type=True)
-        door.__module__ = package  # where pickle finds it
-        return door
-
-    return export
-
-
-def expectation(hint: Any) -> Expected:
-    """What a resolved annotation asks for."""
-    options = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, type(int | None)) else (hint,)
-    optional = type(None) in options
-    options = tuple(option for option in options if option is not type(None))
-    arrays = [option for option in options if isinstance(option, type) and issubclass(option, AbstractArray)]
-    if arrays:
-        kind = arrays[0].__name__.partition("[")[0]
-        return Expected(kind, tuple(str(arrays[0].dim_str).split()), optional)
-    if set(options) == {float, Tensor}:
-        return Expected("Float", ("...",), optional, number=True)
-    if len(options) == 1 and typing.get_origin(options[0]) is Sequence:
-        whole = typing.get_args(options[0]) == (int,)
-        return Expected("whole numbers" if whole else "numbers", (), optional)
-    if len(options) == 1 and typing.get_origin(options[0]) is typing.Literal:
-        return Expected("choice", (), optional, typing.get_args(options[0]))
-    if len(options) == 1 and typing.get_origin(options[0]) is Callable:
-        return Expected("function", (), optional)
-    if len(options) == 1 and options[0] in (int, float, bool, str):
-        return Expected(options[0].__name__, (), optional)
-    return Expected("", (), optional)
+    module = sys.modules[package]
+    for name in module.__all__:
+        function = getattr(module, name)
+        if inspect.isfunction(function):
+            door = checked(function, common_type=True)
+            door.__module__ = package  # where pickle finds it
+            setattr(module, name, door)
 
 
 def _checked_value(name: str, value: Any, want: Expected, device: torch.device) -> Any:
     """The value as the function takes it. Raises TypeError or ValueError naming the argument."""
-    if want.kind in ("int", "float") or (want.number and not isinstance(value, Tensor | np.ndarray)):
+    if want.kind in ("int", "float") or (want.kind == "number or array" and not isinstance(value, Tensor | np.ndarray)):
         return number(name, value, want.kind == "int")
     if want.kind in ("numbers", "whole numbers"):
         whole = want.kind == "whole numbers"
@@ -127,7 +91,7 @@ def _checked_value(name: str, value: Any, want: Expected, device: torch.device) 
         raise TypeError(f"{name} is a {type(value).__name__}; it must be a function")
     if want.kind == "choice" and value not in want.choices:
         raise ValueError(f"{name} is {value!r}; it must be one of {', '.join(map(repr, want.choices))}")
-    if want.kind not in NUMBERS:
+    if not want.dtype:
         return value
     if isinstance(value, Tensor):
         if value.device != device:
@@ -135,7 +99,7 @@ def _checked_value(name: str, value: Any, want: Expected, device: torch.device) 
         tensor = value
     else:
         tensor = as_tensor(value, name).to(device)
-    return _numbers(name, tensor, want.kind)
+    return _numbers(name, tensor, want)
 
 
 def _sequence(name: str, value: Any) -> list[Any]:
@@ -144,18 +108,17 @@ def _sequence(name: str, value: Any) -> list[Any]:
     return list(value)
 
 
-def _numbers(name: str, tensor: Tensor, kind: str) -> Tensor:
+def _numbers(name: str, tensor: Tensor, want: Expected) -> Tensor:
     """The tensor, with elements of the kind asked for. Raises ValueError naming the argument for others."""
-    floating, boolean = tensor.is_floating_point(), tensor.dtype == torch.bool
-    whole = not floating and not boolean and not tensor.is_complex() and not tensor.is_quantized
-    if kind == "Float" and whole:
+    whole = numbers_of(tensor.dtype) == WHOLE and not tensor.is_quantized
+    if want.dtype == "Float" and whole:
         return tensor.to(torch.float64)
-    if kind == "Bool" and whole:
+    if want.dtype == "Bool" and whole:
         return tensor != 0
-    if tensor.dtype in WIDENED and kind in ("Float", "Real"):
+    if tensor.dtype in WIDENED and want.dtype in ("Float", "Real"):
         return tensor.to(torch.float32)
-    if not {"Float": floating, "Int": whole, "Bool": boolean, "Real": floating or whole}[kind]:
-        raise ValueError(f"{name} is of {tensor.dtype}; it must hold {NUMBERS[kind]}")
+    if tensor.is_quantized or not want.holds(tensor.dtype):
+        raise ValueError(f"{name} is of {tensor.dtype}; it must hold {want.numbers}")
     return tensor
 
 
@@ -205,7 +168,7 @@ def _expect_leading(
 
 def _common_type(tensors: Mapping[str, Tensor], expected: Mapping[str, Expected]) -> dict[str, Tensor]:
     """Those floating-point tensors that are not of the widest type among them, in that type."""
-    floats = {name: tensor for name, tensor in tensors.items() if expected[name].kind == "Float"}
+    floats = {name: tensor for name, tensor in tensors.items() if expected[name].dtype == "Float"}
     kinds = {tensor.dtype for tensor in floats.values()}
     if len(kinds) < 2:
         return {}
@@ -217,3 +180,51 @@ def _readable(shape: tuple[str, ...]) -> str:
     """``(..., N, 2)`` of jaxtyping's ``*#batch n 2``."""
     tokens = ["..." if token.startswith("*") else token.lstrip("#").upper() for token in shape]
     return f"({', '.join(tokens)}{',' if len(tokens) == 1 else ''})"
+
+
+PER_MATCH = {name: rule for name in Correspondences.per_slot if (rule := Correspondences.declared[name].bounds)}
+RULES = {**PER_MATCH, "size0": SIZE, "size1": SIZE}
+"""The rules for values, in a tensor or an array. NaN is never right."""
+
+
+def wrong_values(c: Correspondences, mask: Bool[Tensor, "b n"]) -> dict[str, Int[Tensor, " b"]]:
+    """How many values of each argument are wrong, in each pair; in slots other than `mask` nothing is."""
+    wrong = {}
+    for name, rule in RULES.items():
+        if (value := getattr(c, name)) is not None:
+            broken = ~rule.holds(value.detach())
+            wrong[name] = (mask & broken if name in PER_MATCH else broken).sum(1)
+    return wrong
+
+
+def reason(wrong: dict[str, int]) -> str:
+    """What is said of a pair with so many wrong values of each argument; empty where there is none."""
+    for name, count in wrong.items():
+        if count:
+            matches = f" of {count} match{'' if count == 1 else 'es'}" if name in PER_MATCH else ""
+            return f"{name}{matches} is wrong: {RULES[name].text}"
+    return ""
+
+
+def expect_values(c: Correspondences) -> None:
+    """Raises ValueError naming the first wrong value of the real matches of a batch; a GPU is asked but once."""
+    wrong = wrong_values(c, c.mask)
+    if not wrong or not bool(torch.stack(list(wrong.values())).any()):
+        return
+    for name, rule in PER_MATCH.items():
+        if name in wrong and bool(wrong[name].any()):
+            pair, match = (c.mask & ~rule.holds(getattr(c, name))).nonzero()[0].tolist()
+            value = getattr(c, name)[pair, match].item()
+            raise ValueError(f"{name} of match {match} of pair {pair} is {value}; {rule.text}")
+    expect_sizes(size0=c.size0, size1=c.size1)
+
+
+def expect_sizes(**sizes: Tensor | None) -> None:
+    """Raises ValueError naming the argument and the first size that is not positive and finite."""
+    given = {name: size for name, size in sizes.items() if size is not None}
+    if all(bool(SIZE.holds(size).all()) for size in given.values()):
+        return
+    for name, size in given.items():
+        rows = size.detach().reshape(-1, size.shape[-1])
+        for row in rows[~SIZE.holds(rows).all(-1)].tolist():
+            raise ValueError(f"{name} is {tuple(row)}; {SIZE.text}")

@@ -8,32 +8,35 @@ import enum
 import inspect
 import math
 import os
-import sys
-import types
 import typing
-from collections import ChainMap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
+from fmtorch.core.annotations import UNIONS, resolved
+
 PLAIN = (bool, int, float, str, type(None), list, tuple, Mapping)  # what a YAML file or a command line can say
-MOST_NAMES = 12  # that a message lists
+MAX_NAMES = 12  # that a message lists
 
 
 @dataclasses.dataclass(frozen=True)
 class Within:
     """Bounds of a number, for ``Annotated[int, Within(1)]``; both may be reached."""
 
-    least: int | float = -math.inf
-    most: int | float = math.inf
+    minimum: int | float = -math.inf
+    maximum: int | float = math.inf
 
     def __call__(self, value: Any) -> bool:
         """Whether a number is in bounds."""
-        return bool(self.least <= value <= self.most)
+        return bool(self.minimum <= value <= self.maximum)
 
     def __str__(self) -> str:
-        if self.most == math.inf:
-            return f"of at least {self.least:g}"
-        return f"of at most {self.most:g}" if self.least == -math.inf else f"from {self.least:g} to {self.most:g}"
+        if self.maximum == math.inf:
+            return f"of at least {self.minimum:g}"
+        return (
+            f"of at most {self.maximum:g}"
+            if self.minimum == -math.inf
+            else f"from {self.minimum:g} to {self.maximum:g}"
+        )
 
 
 def expect_options(
@@ -59,7 +62,7 @@ def expect_options(
     missing = [n for n in named if known[n].default is inspect.Parameter.empty and n not in {*values, *given}]
     if missing:
         raise ValueError(f"{where}: {', '.join(missing)} is missing")
-    annotations = _annotations(target)
+    annotations = resolved(target)
     for key, value in values.items():
         annotation = annotations.get(str(key), Any)
         place = f"{where}: {key}" if "=" in where else f"{where}.{key}" if where else str(key)
@@ -75,7 +78,7 @@ def fits(value: Any, annotation: Any) -> bool:
     origin, args = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Annotated:
         return fits(value, args[0]) and all(rule(value) for rule in args[1:] if callable(rule))
-    if origin in (typing.Union, types.UnionType):
+    if origin in UNIONS:
         return any(fits(value, option) for option in args)
     if origin is typing.Literal:
         return value in args
@@ -115,7 +118,7 @@ def expected(annotation: Any) -> str:
     origin, args = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Annotated:
         return " ".join([expected(args[0]), *(str(rule) for rule in args[1:])])
-    if origin in (typing.Union, types.UnionType):
+    if origin in UNIONS:
         words = list(dict.fromkeys(expected(option) for option in args if not (option is int and float in args)))
         return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
     if origin is typing.Literal:
@@ -149,34 +152,12 @@ def shown(value: Any) -> str:
 def nearest(name: str, names: Iterable[str]) -> str:
     """The names there are, those most like `name` first; of many only those."""
     ordered = sorted(names, key=lambda known: -difflib.SequenceMatcher(None, name, known).ratio())
-    more = len(ordered) - MOST_NAMES
-    return ", ".join(ordered[:MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
-
-
-def _annotations(target: Callable[..., Any]) -> dict[str, Any]:
-    """The annotations of a target's parameters; without those that cannot be resolved.
-
-    Those of a dataclass's fields may stand in a base of it, in whose module they mean something.
-    """
-    function = inspect.unwrap(target.__init__ if isinstance(target, type) else target)  # type: ignore[misc]
-    names = getattr(function, "__globals__", {})
-    bases = [vars(sys.modules[base.__module__]) for base in target.__mro__] if isinstance(target, type) else []
-    known = ChainMap(*bases)
-    found = {}
-    for name, annotation in getattr(function, "__annotations__", {}).items():
-        if isinstance(annotation, str):
-            try:
-                annotation = eval(annotation, names, known)
-            except (
-                Exception
-            ):  # any expression may stand there, of names that only type checkers see too: taken on trust
-                continue
-        found[name] = annotation
-    return found
+    more = len(ordered) - MAX_NAMES
+    return ", ".join(ordered[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def _dataclass_in(annotation: Any) -> type | None:
     """The dataclass that an annotation allows, if it is one."""
-    options = typing.get_args(annotation) if typing.get_origin(annotation) in (typing.Union, types.UnionType) else ()
-    found = [kind for kind in (annotation, *options) if isinstance(kind, type) and dataclasses.is_dataclass(kind)]
-    return found[0] if len(found) == 1 else None
+    options = typing.get_args(annotation) if typing.get_origin(annotation) in UNIONS else ()
+    kinds = [kind for kind in (annotation, *options) if isinstance(kind, type) and dataclasses.is_dataclass(kind)]
+    return kinds[0] if len(kinds) == 1 else None

@@ -7,48 +7,20 @@ is made, the numbers that it holds, and, by the dimension ``n``, that it has an 
 from __future__ import annotations
 
 import dataclasses
-import functools
-import typing
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple, TypeVar, cast
+from typing import Any, ClassVar, TypeVar, cast
 
 import torch
-from jaxtyping import AbstractArray, Int
+from jaxtyping import Int
 from torch import Tensor
+
+from fmtorch.core.annotations import Expected, arrays_of
 
 Index = int | slice | Sequence[int] | Sequence[bool] | Tensor
 AnyRecord = TypeVar("AnyRecord", bound="Record")
 
-FLOATING, WHOLE, REAL, BOOLEAN = "floating-point numbers", "whole numbers", "real numbers", "booleans"
-NUMBERS = {"Float": FLOATING, "Int": WHOLE, "Int8": WHOLE, "Real": REAL, "Bool": BOOLEAN}
 BATCH, SLOTS = "*batch", "n"  # dimensions: of a batch, where there is one; of features or matches, padding included
 FIXED = {"2": 2, "3": 3}  # dimensions that have a size by their names
-
-
-class Declared(NamedTuple):
-    """What the annotation of a tensor's field says."""
-
-    shape: tuple[str, ...]  # names of dimensions and numbers; BATCH stands for one dimension or none
-    numbers: str
-    optional: bool
-
-    @property
-    def in_letters(self) -> str:
-        """The shape as a reader knows it."""
-        one = ", ".join(name.upper() for name in self.shape if name != BATCH)
-        return f"({one}), or (B, {one}) of a batch" if BATCH in self.shape else f"({one})"
-
-
-def _declared(kind: type) -> dict[str, Declared]:
-    """What the annotations of a class say of its tensors, by field."""
-    found = {}
-    for name, hint in typing.get_type_hints(kind).items():
-        options = typing.get_args(hint) or (hint,)
-        arrays = [option for option in options if isinstance(option, type) and issubclass(option, AbstractArray)]
-        for array in arrays:
-            numbers = NUMBERS[array.__name__.partition("[")[0]]
-            found[name] = Declared(tuple(str(array.dim_str).split()), numbers, type(None) in options)
-    return found
 
 
 class Record:
@@ -57,12 +29,12 @@ class Record:
     declared: what the annotations of a kind's tensors say, by field. per_slot: the fields with an entry for each slot.
     """
 
-    declared: ClassVar[Mapping[str, Declared]] = {}
+    declared: ClassVar[Mapping[str, Expected]] = {}
     per_slot: ClassVar[tuple[str, ...]] = ()
 
     def __init_subclass__(cls) -> None:
         """Read the annotations once."""
-        cls.declared = _declared(cls)
+        cls.declared = arrays_of(cls)
         cls.per_slot = tuple(name for name, field in cls.declared.items() if SLOTS in field.shape)
 
     def to(self: AnyRecord, device: torch.device | str) -> AnyRecord:
@@ -96,9 +68,9 @@ class Record:
 
         What a user may have a hand in goes through `replace`.
         """
-        made = object.__new__(type(self))
-        vars(made).update(vars(self), **changes)
-        return made
+        record = object.__new__(type(self))
+        vars(record).update(vars(self), **changes)
+        return record
 
     def _map(self: AnyRecord, function: Any, **changes: Any) -> AnyRecord:
         return self.replace(**_mapped(self, function, Record._map), **changes)
@@ -136,22 +108,19 @@ def expect_fields(record: Record, **sizes: int) -> None:
         wanted = tuple([known.get(dimension) for dimension in dimensions])
         if shape != wanted:
             raise ValueError(
-                f"{name} has shape {tuple(shape)}; it must be {field.in_letters if None in wanted else wanted}"
+                f"{name} has shape {tuple(shape)}; it must be {_in_letters(field.shape) if None in wanted else wanted}"
             )
         device = value.device if device is None else device
         if value.device != device:
             raise ValueError(f"{name} is on {value.device} and another field on {device}; all must be on one device")
-        numbers = _numbers(value.dtype)
-        if numbers != field.numbers and not (field.numbers == REAL and numbers in (FLOATING, WHOLE)):
+        if not field.holds(value.dtype):
             raise ValueError(f"{name} is of {value.dtype}; it must hold {field.numbers}")
 
 
-@functools.cache
-def _numbers(dtype: torch.dtype) -> str:
-    """What a tensor's elements are."""
-    if dtype == torch.bool:
-        return BOOLEAN
-    return FLOATING if dtype.is_floating_point else "complex numbers" if dtype.is_complex else WHOLE
+def _in_letters(shape: tuple[str, ...]) -> str:
+    """A declared shape as a reader knows it; BATCH stands for one dimension or none."""
+    unbatched = ", ".join(name.upper() for name in shape if name != BATCH)
+    return f"({unbatched}), or (B, {unbatched}) of a batch" if BATCH in shape else f"({unbatched})"
 
 
 def slotted(record: Record) -> dict[str, Tensor]:

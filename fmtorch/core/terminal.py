@@ -45,7 +45,7 @@ def reporter(progress: Progress, description: str) -> Callable[[int, int], None]
     return report
 
 
-def told(error: BaseException) -> str:
+def error_line(error: BaseException) -> str:
     """An error in one line, with the path that an OSError is about."""
     text = str(error)
     if isinstance(error, OSError) and error.strerror and error.errno is not None:
@@ -62,4 +62,4 @@ def exits_with_message(interrupted: str = "interrupted") -> Iterator[None]:
     except KeyboardInterrupt:
         sys.exit(interrupted)
     except MISTAKES as error:
-        sys.exit(f"error: {told(error)}")
+        sys.exit(f"error: {error_line(error)}")

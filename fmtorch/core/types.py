@@ -10,16 +10,21 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from collections.abc import Sequence
-from typing import Any, TypeVar, cast
+from typing import Annotated, Any, TypeVar, cast
 
 import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
+from fmtorch.core.annotations import Rule
 from fmtorch.core.records import Index, Record, as_index, expect_fields, gathered, padded, slotted
 
 RELATED = 1.0
 """The significance from which on two images are called related; chosen on tuning pairs (docs/related.md)."""
+
+PROBABILITY = Rule(lambda prior: (prior >= 0) & (prior <= 1), "it is P(inlier), within [0, 1]")
+DEVIATION = Rule(lambda noise: noise > 0, "it is a standard deviation, positive")
+SIZE = Rule(lambda size: (size > 0) & (size < torch.inf), "image sizes (h, w) are positive")
 
 
 def pair_key(identity: str) -> int:
@@ -87,16 +92,16 @@ class Correspondences(Record):
     x1: Float[Tensor, "b n 2"]
     mask: Bool[Tensor, "b n"]
     quality: Float[Tensor, "b n"] | None = None
-    prior: Float[Tensor, "b n"] | None = None
+    prior: Annotated[Float[Tensor, "b n"], PROBABILITY] | None = None
     lafs0: Float[Tensor, "b n 2 3"] | None = None
     lafs1: Float[Tensor, "b n 2 3"] | None = None
-    size0: Real[Tensor, "b 2"] | None = None
-    size1: Real[Tensor, "b 2"] | None = None
+    size0: Annotated[Real[Tensor, "b 2"], SIZE] | None = None
+    size1: Annotated[Real[Tensor, "b 2"], SIZE] | None = None
     K0: Float[Tensor, "b 3 3"] | None = None
     K1: Float[Tensor, "b 3 3"] | None = None
     key: Int[Tensor, " b"] | None = None
     mutual: Bool[Tensor, "b n"] | None = None
-    noise: Float[Tensor, "b n"] | None = None
+    noise: Annotated[Float[Tensor, "b n"], DEVIATION] | None = None
 
     def __post_init__(self) -> None:
         expect_fields(self)
@@ -144,7 +149,8 @@ class Estimate(Record):
     is False. ok: (B,). reason: why a pair failed, empty where it did not. draws: minimal samples drawn, (B,).
     significance: (B,), how far the support of F is beyond chance, see `fmtorch.geometry.significance`: -log10 of the
     number of models with as much support that are expected among images that show nothing in common; -inf where `ok`
-    is False, NaN where nobody has computed it; never None.
+    is False, NaN where nobody has computed it; never None. model: what `F` is, "fundamental", or "homography" for
+    `x1 ~ F x0`, which is positive where the plane is seen; then `H` is another name for it.
     """
 
     F: Float[Tensor, "b 3 3"]
@@ -153,6 +159,7 @@ class Estimate(Record):
     reason: tuple[str, ...]
     draws: Int[Tensor, " b"]
     significance: Float[Tensor, " b"] | None = None
+    model: str = "fundamental"
 
     def __post_init__(self) -> None:
         expect_fields(self)
@@ -165,6 +172,13 @@ class Estimate(Record):
         object.__setattr__(self, "reason", tuple(self.reason))
         if len(self.reason) != b:
             raise ValueError(f"reason has {len(self.reason)} entries; it must have one for each of the {b} pairs")
+
+    @property
+    def H(self) -> Float[Tensor, "b 3 3"]:
+        """The homographies. Raises AttributeError where the estimate is of another model."""
+        if self.model != "homography":
+            raise AttributeError(f"these are {self.model} matrices; find_homography gives homographies")
+        return self.F
 
     @property
     def related(self) -> Bool[Tensor, " b"]:
@@ -206,6 +220,10 @@ def collate(items: Sequence[Item]) -> Item:
         values = [getattr(item, field.name) for item in items]
         if field.name == "reason":
             merged[field.name] = sum(values, ())
+        elif field.name == "model":
+            if len(set(values)) > 1:
+                raise TypeError(f"collate needs estimates of one model, not {', '.join(sorted(set(values)))}")
+            merged[field.name] = values[0]
         elif any(value is None for value in values):
             merged[field.name] = None
         else:

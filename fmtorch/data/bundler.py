@@ -53,13 +53,13 @@ class BundlerPairs(ScenePairs):
         home = Path(root).expanduser().absolute()
         if sequences is None and (home / _LIST).is_file():
             home, sequences = home.parent, [home.name]
-        found = folders(home, chosen("colmap", split, sequences, ()), f"a folder for each scene, with {_LIST}")
-        files = [_bundle(folder) for folder in found]
+        scene_folders = folders(home, chosen("colmap", split, sequences, ()), f"a folder for each scene, with {_LIST}")
+        files = [_bundle(folder) for folder in scene_folders]
         scenes = [
             _scene(folder, file, candidates, shared, family or home.name)
-            for folder, file in zip(found, files, strict=True)
+            for folder, file in zip(scene_folders, files, strict=True)
         ]
-        sources = [(f.name, path) for f, file in zip(found, files, strict=True) for path in (file, f / _LIST)]
+        sources = [(f.name, path) for f, file in zip(scene_folders, files, strict=True) for path in (file, f / _LIST)]
         super().__init__("bundler", scenes, sources, (candidates, shared, family or home.name), pairs, seed)
 
 
@@ -145,4 +145,4 @@ def _seen(file: Path, lines: list[str], cameras: int, points: int, numbers: dict
             camera = to_whole(file, number, word, "the number of a camera")
             if camera in numbers:
                 seen[numbers[camera]].append(point)
-    return [np.array(some, dtype=np.int64) for some in seen]
+    return [np.array(indices, dtype=np.int64) for indices in seen]

@@ -42,11 +42,11 @@ class CameraFilePairs(ScenePairs):
         if sequences is None and (home / CAMERAS).is_file():
             home, sequences = home.parent, [home.name]
         names = sequences or sorted(path.parent.name for path in home.glob(f"*/{CAMERAS}"))
-        found = folders(home, names, f"a folder for each scene, with {CAMERAS} and {IMAGES}/")
-        if not found:
+        scene_folders = folders(home, names, f"a folder for each scene, with {CAMERAS} and {IMAGES}/")
+        if not scene_folders:
             raise DataError(f"{home}: no folder with {CAMERAS}, one line an image: {COLUMNS}")
-        scenes = [_scene(folder, fps, window) for folder in found]
-        super().__init__("cameras", scenes, [(f.name, f / CAMERAS) for f in found], (fps, window), pairs, seed)
+        scenes = [_scene(folder, fps, window) for folder in scene_folders]
+        super().__init__("cameras", scenes, [(f.name, f / CAMERAS) for f in scene_folders], (fps, window), pairs, seed)
 
 
 def _scene(folder: Path, fps: int | float | None, window: int | float) -> Scene:

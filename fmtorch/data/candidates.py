@@ -82,14 +82,14 @@ def sharing_points(points: Sequence[NDArray[np.int64]], minimum: int = MIN_SHARE
         (np.ones(len(columns), np.int32), columns.astype(np.int64), starts),
         shape=(len(seen), int(columns.max(initial=-1)) + 1),
     )
-    found = []
+    blocks = []
     for begin in range(0, len(seen), _AT_ONCE):
         shared = (sees[begin : begin + _AT_ONCE] @ sees.T).tocoo()
         first, second = shared.row.astype(np.int64) + begin, shared.col.astype(np.int64)
         kept = (shared.data >= minimum) & (first < second)
-        some = np.stack([first[kept], second[kept]], -1)
-        found.append(some[np.lexsort((some[:, 1], some[:, 0]))])
-    return ListedPairs(np.concatenate([*found, np.zeros((0, 2), np.int64)]))
+        pairs = np.stack([first[kept], second[kept]], -1)
+        blocks.append(pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))])
+    return ListedPairs(np.concatenate([*blocks, np.zeros((0, 2), np.int64)]))
 
 
 def drawn(total: int, count: int | None, seed: int) -> Sequence[int] | Indices:

@@ -80,18 +80,18 @@ def colmap_pairs(
     point and size (`fmtorch.data.undistort`). Principal points are lowered by COLMAP's half pixel. An image of another
     size than its camera's is refused when it is read. Raises DataError for a missing or damaged model.
     """
-    home, found = scene_folders(root, split, sequences, model)
+    home, model_folders = scene_folders(root, split, sequences, model)
     scenes, files = [], []
-    for folder in found:
+    for folder in model_folders:
         reconstruction = read_model(_model_folder(folder, model), points=candidates == "points")
         scenes.append(_scene(folder, reconstruction, images, candidates, shared, family or home.name))
         files += [(f"{folder.name}/{path.name}", path) for path in reconstruction.files]
     options = (candidates, shared, family or home.name)
-    if not depth or not all(_depth_folder(folder / images).is_dir() for folder in found):
+    if not depth or not all(_depth_folder(folder / images).is_dir() for folder in model_folders):
         return ColmapPairs(scenes, files, options, pairs, seed)
     dataset = ColmapDepthPairs(scenes, files, (*options, "depth"), pairs, seed)
-    paths = [_depth_paths(folder / images, scene) for folder, scene in zip(found, scenes, strict=True)]
-    by_image = {key: path for some in paths for key, path in some.items()}
+    paths = [_depth_paths(folder / images, scene) for folder, scene in zip(model_folders, scenes, strict=True)]
+    by_image = {key: path for by_identity in paths for key, path in by_identity.items()}
     dataset.depth_images = DepthImages(by_image, 1.0, read_colmap, reduced=True)
     return dataset
 
@@ -103,15 +103,15 @@ def _depth_folder(images: Path) -> Path:
 
 def _depth_paths(images: Path, scene: Scene) -> dict[str, Path]:
     """The depth map of each view that has one, by the identity of its image."""
-    found = {}
+    paths = {}
     for view in scene.views:
         name = view.image.path.relative_to(images)
         for kind in ("geometric", "photometric"):
             path = _depth_folder(images) / f"{name}.{kind}.bin"
             if path.is_file():
-                found[view.image.identity] = path
+                paths[view.image.identity] = path
                 break
-    return found
+    return paths
 
 
 def read_model(folder: Path, points: bool = True) -> Model:

@@ -14,7 +14,7 @@ from fmtorch.data.lenses import MODELS
 from fmtorch.data.text_files import DataError
 
 _POINT = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
-_MOST_NAME = 4096  # bytes of a file name
+_MAX_NAME = 4096  # bytes of a file name
 
 
 class _Bytes:
@@ -44,7 +44,7 @@ class _Bytes:
 
     def name(self) -> str:
         """The next text, which ends in a zero byte."""
-        end = self.data.find(b"\0", self.at, self.at + _MOST_NAME)
+        end = self.data.find(b"\0", self.at, self.at + _MAX_NAME)
         text = self.take((end if end >= 0 else len(self.data) + 1) - self.at)
         self.at += 1
         try:
@@ -66,7 +66,7 @@ def read_binary(folder: Path, points: bool = True) -> Model:
 
 
 def _cameras(path: Path) -> dict[int, ModelCamera]:
-    data, found, names = _Bytes(path), {}, list(MODELS)
+    data, cameras, names = _Bytes(path), {}, list(MODELS)
     (count,) = data.unpack("Q")
     for i in range(count):
         data.record = f"camera {i + 1} of {count}"
@@ -75,9 +75,9 @@ def _cameras(path: Path) -> dict[int, ModelCamera]:
         expect_known(place, names[model] if 0 <= model < len(names) else f"number {model}")
         kind = MODELS[names[model]]
         parameters = np.array(data.unpack(f"{len(kind.parameters)}d"))
-        found[key] = camera(place, names[model], width, height, parameters)
+        cameras[key] = camera(place, names[model], width, height, parameters)
     data.expect_end()
-    return found
+    return cameras
 
 
 def _images(path: Path, points: bool) -> list[ModelImage]:

@@ -25,7 +25,7 @@ def read_text(folder: Path, points: bool = True) -> Model:
 
 
 def _cameras(path: Path) -> dict[int, ModelCamera]:
-    found = {}
+    cameras = {}
     for number, line in numbered(path):
         words, place = line.split(), f"{path}, line {number}"
         if len(words) < 4:
@@ -33,11 +33,11 @@ def _cameras(path: Path) -> dict[int, ModelCamera]:
         expect_known(place, words[1])
         key, width, height = (to_whole(path, number, words[i], _CAMERA.split()[i]) for i in (0, 2, 3))
         parameters = to_finite(path, number, words[4:], "the parameters of the camera", len(words) - 4)
-        if key in found:
+        if key in cameras:
             raise DataError(f"{place}: camera {key} stands twice")
-        found[key] = camera(place, words[1], width, height, parameters)
-    _expect_announced(path, "cameras", len(found))
-    return found
+        cameras[key] = camera(place, words[1], width, height, parameters)
+    _expect_announced(path, "cameras", len(cameras))
+    return cameras
 
 
 def _images(path: Path, points: bool) -> list[ModelImage]:

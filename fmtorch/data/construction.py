@@ -25,7 +25,7 @@ from fmtorch.data.pairs import ImageSource
 from fmtorch.data.scenes import ScenePairs, image_pair
 
 BLOCK = 64  # candidates that one worker judges at a time
-MOST_DRAWN = 10_000_000  # candidates of which an order is drawn, 80 MB; with more, among so many drawn at random
+MAX_DRAWN = 10_000_000  # candidates of which an order is drawn, 80 MB; with more, among so many drawn at random
 RULE = {"features": SIFT_FEATURES, "ratio": RATIO, "near_line_px": NEAR_LINE, "more_than": ENOUGH}
 _VERSION = 1  # of the rule and the layout
 
@@ -92,7 +92,7 @@ class Construction:
         total, rng = self.dataset.candidates, np.random.default_rng(self.seed)
         if self.count is None:
             return range(total)
-        return rng.permutation(total) if total <= MOST_DRAWN else rng.choice(total, MOST_DRAWN, replace=False)
+        return rng.permutation(total) if total <= MAX_DRAWN else rng.choice(total, MAX_DRAWN, replace=False)
 
     def judge(self, block: int, ranks: Sequence[int]) -> Verdicts:
         """Judge the candidates of a block and keep the verdicts; what was judged before is read."""

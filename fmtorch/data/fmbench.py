@@ -161,15 +161,15 @@ def _set_folders(root: Path, sets: Sequence[str] | None) -> list[Path]:
         raise DataError(f"{root}: no such folder; it must be a set's folder with {_PAIRS}, or a folder of such sets")
     root = Path(os.path.abspath(root))  # a link keeps its name
     if (root / _PAIRS).is_file():
-        found = {root.name: root}
+        folders = {root.name: root}
     else:
-        found = {folder.name: folder for folder in sorted(root.iterdir()) if (folder / _PAIRS).is_file()}
-    if not found:
+        folders = {folder.name: folder for folder in sorted(root.iterdir()) if (folder / _PAIRS).is_file()}
+    if not folders:
         raise DataError(f"{root}: neither {_PAIRS} nor a sub-folder that holds one")
     for name in sets or ():
-        if name not in found:
-            raise DataError(f"{root}: no set {name!r}; it has {_listed(found)}")
-    return [found[name] for name in (sets or found)]
+        if name not in folders:
+            raise DataError(f"{root}: no set {name!r}; it has {_listed(folders)}")
+    return [folders[name] for name in (sets or folders)]
 
 
 def _listed(names: Sequence[str] | set[str] | dict[str, Path]) -> str:

@@ -125,9 +125,9 @@ def _jpeg_ends(data: bytes) -> bool:
 def _jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
     """The markers of a JPEG up to its end-of-image marker, and where what follows each begins (ITU-T T.81, annex B)."""
     position = 2
-    while found := _JPEG_MARKER.search(data, position):
-        marker = found[1][0]
-        position = found.end()
+    while match := _JPEG_MARKER.search(data, position):
+        marker = match[1][0]
+        position = match.end()
         yield marker, position
         if marker == _END_OF_IMAGE:
             return

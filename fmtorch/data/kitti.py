@@ -44,20 +44,22 @@ class KittiPairs(ScenePairs):
     ) -> None:
         home = Path(root).expanduser()
         there = sorted(f.name for f in (home / "sequences").iterdir()) if (home / "sequences").is_dir() else []
-        found = folders(home / "sequences", chosen("kitti", split, sequences, there), "a folder for each sequence")
-        scenes = [_scene(home, folder, camera, window) for folder in found]
-        files = [(f.name, f / name) for f in found for name in ("calib.txt", "times.txt")]
-        poses = [(f.name, home / "poses" / f"{f.name}.txt") for f in found]
+        sequence_folders = folders(
+            home / "sequences", chosen("kitti", split, sequences, there), "a folder for each sequence"
+        )
+        scenes = [_scene(home, folder, camera, window) for folder in sequence_folders]
+        files = [(f.name, f / name) for f in sequence_folders for name in ("calib.txt", "times.txt")]
+        poses = [(f.name, home / "poses" / f"{f.name}.txt") for f in sequence_folders]
         super().__init__("kitti", scenes, [*files, *poses], (camera, window), pairs, seed)
 
 
 def read_projections(path: Path) -> dict[str, Matrix]:
     """The matrices (3, 4) of a ``calib.txt`` by their names, P0 to P3; others, such as Tr, too."""
-    found = {}
+    projections = {}
     for number, line in numbered(path, _LAYOUT):
         name, _, rest = line.partition(":")
-        found[name.strip()] = to_finite(path, number, rest.split(), _PROJECTION, 12).reshape(3, 4)
-    return found
+        projections[name.strip()] = to_finite(path, number, rest.split(), _PROJECTION, 12).reshape(3, 4)
+    return projections
 
 
 def read_times(path: Path) -> NDArray[np.float64]:

@@ -17,10 +17,10 @@ Keypoints = tuple[NDArray[np.float64], NDArray[np.float32]]
 
 def keypoints(grey: NDArray[np.uint8]) -> Keypoints:
     """OpenCV's SIFT: points (n, 2) and descriptors (n, 128)."""
-    found, descriptors = cv2.SIFT.create(nfeatures=SIFT_FEATURES).detectAndCompute(grey, np.ones_like(grey))
-    if not found:
+    detected, descriptors = cv2.SIFT.create(nfeatures=SIFT_FEATURES).detectAndCompute(grey, np.ones_like(grey))
+    if not detected:
         return np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32)
-    return np.array([k.pt for k in found], dtype=np.float64), descriptors.astype(np.float32)
+    return np.array([k.pt for k in detected], dtype=np.float64), descriptors.astype(np.float32)
 
 
 def ratio_matches(a: Keypoints, b: Keypoints) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -41,11 +41,11 @@ def matchable(a: Keypoints, b: Keypoints, F: NDArray[np.float64]) -> bool:
 
     Looks at some of the first image's keypoints at a time, until there are enough.
     """
-    found = 0
+    near = 0
     for begin in range(0, len(a[0]), _AT_ONCE):
-        some = a[0][begin : begin + _AT_ONCE], a[1][begin : begin + _AT_ONCE]
-        found += _near_lines(*ratio_matches(some, b), F)
-        if found > ENOUGH:
+        block = a[0][begin : begin + _AT_ONCE], a[1][begin : begin + _AT_ONCE]
+        near += _near_lines(*ratio_matches(block, b), F)
+        if near > ENOUGH:
             return True
     return False
 

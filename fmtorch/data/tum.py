@@ -78,15 +78,15 @@ def tum_pairs(
     """
     home = Path(root).expanduser()
     there = sorted(f.parent.name for f in home.glob("*/groundtruth.txt") if (f.parent / "rgb.txt").is_file())
-    found = folders(home, chosen("tum", split, sequences, there), "a folder for each sequence")
-    scenes = [_scene(folder, _lens(folder, camera), window) for folder in found]
-    files = [(folder.name, folder / name) for folder in found for name in ("rgb.txt", "groundtruth.txt")]
-    if not depth or not all((folder / "depth.txt").is_file() for folder in found):
+    sequence_folders = folders(home, chosen("tum", split, sequences, there), "a folder for each sequence")
+    scenes = [_scene(folder, _lens(folder, camera), window) for folder in sequence_folders]
+    files = [(folder.name, folder / name) for folder in sequence_folders for name in ("rgb.txt", "groundtruth.txt")]
+    if not depth or not all((folder / "depth.txt").is_file() for folder in sequence_folders):
         return TumPairs(scenes, files, window, pairs, seed)
-    files += [(folder.name, folder / "depth.txt") for folder in found]
+    files += [(folder.name, folder / "depth.txt") for folder in sequence_folders]
     dataset = TumDepthPairs(scenes, files, window, pairs, seed)
-    paths = [_depth_paths(folder, scene) for folder, scene in zip(found, scenes, strict=True)]
-    by_image = {key: path for some in paths for key, path in some.items()}
+    paths = [_depth_paths(folder, scene) for folder, scene in zip(sequence_folders, scenes, strict=True)]
+    by_image = {key: path for by_identity in paths for key, path in by_identity.items()}
     dataset.depth_images = DepthImages(by_image, DEPTH_SCALE, read_grey)
     return dataset
 
@@ -172,10 +172,10 @@ def _depth_paths(folder: Path, scene: Scene) -> dict[str, Path]:
     """The depth image next in time to each view, by the identity of its image."""
     rgb = dict(zip(*read_listed(folder / "rgb.txt")[1::-1], strict=True))
     times, names, _ = read_listed(folder / "depth.txt")
-    found = {}
+    paths = {}
     for view in scene.views:
         time = rgb[str(view.image.path.relative_to(folder))]
         nearest = int(np.abs(times - time).argmin())
         if abs(times[nearest] - time) <= TOLERANCE:
-            found[view.image.identity] = folder / names[nearest]
-    return found
+            paths[view.image.identity] = folder / names[nearest]
+    return paths

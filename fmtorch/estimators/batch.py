@@ -15,13 +15,15 @@ from torch import Tensor
 
 from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.batches import as_array
+from fmtorch.core.checks import PER_MATCH, reason
 from fmtorch.core.threads import available, mapped
-from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.core.validation import PER_MATCH, reason, right_size
+from fmtorch.core.types import SIZE, Correspondences, Estimate
+from fmtorch.estimators.families.family import Estimated
 from fmtorch.estimators.gradients import Attach, Solved, with_gradients
-from fmtorch.estimators.pair import Pair, PixelMatches, bucket, normalize_pair, to_pixels
+from fmtorch.estimators.pair import Pair, PixelMatches, bucket, normalize_pair
 from fmtorch.estimators.parts.final_fits import Fit
 from fmtorch.estimators.parts.support import degenerate_support
+from fmtorch.geometry.residual_kernels import SAMPSON, Residual
 from fmtorch.geometry.significance import of_one_pair
 
 PARTS_OF_A_THREAD = 4  # so that no thread is long alone at the end
@@ -40,11 +42,11 @@ class Solution(NamedTuple):
 
 
 def estimated(
-    c: Correspondences, seed: int, minimal: int, solve: Callable[[Pair], Solution], attach: Attach
+    c: Correspondences, seed: int, minimal: int, family: Estimated, solve: Callable[[Pair], Solution], attach: Attach
 ) -> Estimate:
     """Estimate the models of a batch of pairs; a pair that cannot be solved is `ok=False` with a reason.
 
-    minimal: matches below which a pair is not tried, and inliers below which a model is none.
+    minimal: matches below which a pair is not tried, and inliers below which a model is none. family: of the models.
     """
     host = c if c.mask.device.type == "cpu" else c.detach().to("cpu")
     b, n = c.mask.shape
@@ -58,7 +60,7 @@ def estimated(
     def estimate(i: int) -> str:
         """Why there is no estimate of a pair; empty where there is one."""
         matches = batch.pair(i)
-        normalized = batch.normalized(matches, i, seed, minimal)
+        normalized = batch.normalized(matches, i, seed, minimal, family.residual)
         if isinstance(normalized, str):
             return normalized
         pair, slot = normalized
@@ -68,12 +70,11 @@ def estimated(
             return solution.reason
         if degenerate := degenerate_support(pair, solution.inliers, minimal, rounding):
             return degenerate
-        if not to_pixels(solution.fit.F, pair.centre, pair.pixels_per_unit, F[i]):
+        if not family.to_pixels(solution.fit.F, pair, F[i]):
             F[i] = 0
             return NOT_FINITE
         inliers[i, slot] = solution.inliers
-        size0, size1 = matches.sizes[:2], matches.sizes[2:]
-        significance[i] = of_one_pair(F[i], matches.x0, matches.x1, matches.mask, size0, size1)
+        significance[i] = _significance(F[i], matches) if family.model == "fundamental" else np.nan
         ok[i] = True
         if keep:
             solved[i] = Solved(pair, slot, solution.fit)
@@ -87,8 +88,13 @@ def estimated(
     mapped(estimate_all, [part.tolist() for part in shared_out(host)] if b > 1 and available() > 1 else [range(b)])
     fields = {"F": F, "inliers": inliers, "ok": ok, "draws": draws, "significance": significance}
     tensors = {name: torch.from_numpy(value).to(c.mask.device) for name, value in fields.items()}
-    found = Estimate.made(reason=tuple(reasons), **tensors)
-    return with_gradients(found, c, solved, attach) if solved else found
+    estimates = Estimate.made(reason=tuple(reasons), model=family.model, **tensors)
+    return with_gradients(estimates, c, solved, attach) if keep else estimates
+
+
+def _significance(F: Array, matches: PixelMatches) -> float:
+    """How far the support of a fundamental matrix (3, 3) is beyond chance."""
+    return of_one_pair(F, matches.x0, matches.x1, matches.mask, matches.sizes[:2], matches.sizes[2:])
 
 
 def relative_rounding(c: Correspondences) -> float:
@@ -133,7 +139,9 @@ class Batch(NamedTuple):
             _row(self.noise, i), _row(self.quality, i), self.sizes[i],
         )  # fmt: skip
 
-    def normalized(self, matches: PixelMatches, i: int, seed: int, minimal: int) -> tuple[Pair, Array] | str:
+    def normalized(
+        self, matches: PixelMatches, i: int, seed: int, minimal: int, residual: Residual = SAMPSON
+    ) -> tuple[Pair, Array] | str:
         """The pair of a row, and where its matches (n,) stood; or why it cannot be estimated."""
         n, frame = len(matches.mask), np.empty(6)
         slots, flat = np.empty(n, np.int64), np.empty(9 * n)
@@ -146,14 +154,14 @@ class Batch(NamedTuple):
             return _wrong_values(matches, slot)
         if not unit:
             return "all matches coincide"
-        return Pair(table, known, bucket(count), unit, self.keys[i], seed, frame[:4], matches.sizes), slot
+        return Pair(table, known, bucket(count), unit, self.keys[i], seed, frame[:4], matches.sizes, residual), slot
 
 
 def _wrong_values(matches: PixelMatches, slot: Array) -> str:
     """Why a pair whose matches have such values cannot be estimated."""
     values = {"prior": matches.prior, "noise": matches.noise}
-    right = {name: PER_MATCH[name][0](v[slot]) for name, v in values.items() if len(v)}
-    right |= {"size0": right_size(matches.sizes[:2]), "size1": right_size(matches.sizes[2:])}
+    right = {name: PER_MATCH[name].holds(v[slot]) for name, v in values.items() if len(v)}
+    right |= {"size0": SIZE.holds(matches.sizes[:2]), "size1": SIZE.holds(matches.sizes[2:])}
     return reason({name: len(each) - int(np.count_nonzero(each)) for name, each in right.items()})
 
 

@@ -43,7 +43,8 @@ class HypothesizeAndVerify:
     Parts are named as in `registry`; the options of a stage are those of the class of that name in `options`.
 
     Args:
-        solver: minimal solver, `seven_point` or `eight_point`.
+        solver: minimal solver, `seven_point` or `eight_point`, and with it the family of models; `four_point` for
+            homographies.
         sampler: draws the matches of a sample, `uniform`, `prosac` or `prior`.
         score: by which models are compared.
         threshold: Sampson distance in pixels up to which a match supports a model; None: 1.
@@ -114,6 +115,7 @@ class HypothesizeAndVerify:
         check = part("degeneracy", degeneracy, score=self.score)
         if check is not None and self.family.size != Degensac.SAMPLE:
             raise ValueError(f"degeneracy={degeneracy} needs solver=seven_point; solver is {solver!r}")
+        self._expect_fundamental(degeneracy=check, local_optimization=local_optimization, focal=focal)
         self.search = Search(self.family, self.sampler, preselection, pool, hypotheses, round, stop, check)
         optimization = part("local_optimization", local_optimization, threshold=threshold, score=self.score)
         refinement = Refinement(group("refine", refine, Refine), optimization)
@@ -121,6 +123,12 @@ class HypothesizeAndVerify:
         self.refine = refinement
         self.select = _selector(self.score, choice, threshold, refinement)
         self.focal = _focal_search(group("focal", focal, Focal), self.select, self.search, refinement, choice)
+
+    def _expect_fundamental(self, **options: object) -> None:
+        """Raise ValueError for an option that is there and serves fundamental matrices alone."""
+        wrong = [name for name, value in options.items() if value is not None]
+        if wrong and self.family.model != "fundamental":
+            raise ValueError(f"{wrong[0]} is for fundamental matrices; the solver gives {self.family.model} matrices")
 
     @property
     def kernels(self) -> tuple[Kernel[..., Any], ...]:
@@ -135,7 +143,7 @@ class HypothesizeAndVerify:
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
         compile_together(self.kernels)
-        return estimated(c, seed, self.family.size, self.estimate, Attached(self.final, self.family))
+        return estimated(c, seed, self.family.size, self.family, self.estimate, Attached(self.final, self.family))
 
     def estimate(self, pair: Pair) -> Solution:
         """Search to fit of one pair."""

@@ -14,11 +14,10 @@ from fmtorch.estimators.families.cameras import Cameras
 from fmtorch.estimators.families.focals import FundamentalWithFocals
 from fmtorch.estimators.options import Focal
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.inliers import StoppingRule
 from fmtorch.estimators.parts.refinement import Candidates, Refinement
 from fmtorch.estimators.parts.scores import Score
 from fmtorch.estimators.parts.selection import Selection, scores_of
-from fmtorch.estimators.search import Search
+from fmtorch.estimators.search import Search, Stop
 
 # Share of the best gain without prior that gain minus prior cost must reach; chosen on castle-P19, fox, crops of them.
 MIN_GAIN_SHARE = 0.85
@@ -81,7 +80,7 @@ class FocalSearch:
     gain: Score
     refinement: Refinement
     search: Search | None
-    stop: StoppingRule | None
+    stop: Stop | None
 
     def __call__(self, pair: Pair) -> SearchResult:
         """Rounds until good candidates are one model, or enough rounds have confirmed the best one, and the stopping

@@ -6,7 +6,7 @@ the same bits whether anybody asks for gradients or not, and gradients are those
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -21,10 +21,11 @@ from fmtorch.estimators.families.family import Refining
 from fmtorch.estimators.families.posterior import Limits, minimise, no_optimum, tangents_of
 from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair
 from fmtorch.estimators.parts.final_fits import FinalFit, Fit
-from fmtorch.geometry import canonical, eight_point
+from fmtorch.geometry import canonical, eight_point, unit_frobenius
+from fmtorch.geometry.homography_error import homography_gradient
 from fmtorch.geometry.optimum import STEP_DAMPING, gradient_of_cost
 from fmtorch.geometry.pixel_frame import PixelFrame
-from fmtorch.geometry.robust_kernels import KERNELS
+from fmtorch.geometry.robust_losses import KERNELS
 from fmtorch.geometry.sampson_objective_kernels import LOSSES, NO_TABLE, Weighted
 
 
@@ -39,11 +40,12 @@ class Solved(NamedTuple):
 class GraphedMatches(NamedTuple):
     """The usable matches of P pairs in normalised units, attached to the caller's graph, padded to N slots; float64.
 
-    weight: the prior divided by the square of the noise; one where there is no prior.
+    precision: one over the square of the noise. weight: the prior times that.
     """
 
     points: Float[Tensor, "4 p n"]
     mask: Bool[Tensor, "p n"]
+    precision: Float[Tensor, "p n"]
     weight: Float[Tensor, "p n"]
     prior: Float[Tensor, "p n"] | None
 
@@ -58,6 +60,7 @@ class GraphedMatches(NamedTuple):
         return self.points[2:].permute(1, 2, 0)
 
 
+@runtime_checkable
 class Attach(Protocol):
     """Gives fits their gradients."""
 
@@ -73,7 +76,10 @@ class Attached:
         self.final, self.family = final, family
         own: Attach | None = getattr(final, "attached", None)
         kinds: dict[str, Attach] = {"least_squares": self._least_squares, "optimum": self._optimum, "none": _none}
-        self._attach = own or kinds[getattr(final, "gradient", "none")]
+        kind = getattr(final, "gradient", "none")
+        if family.model == "homography" and kind == "least_squares":
+            kind = "optimum"  # of the Sampson error, near that of least squares
+        self._attach = own or kinds[kind]
 
     def __call__(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
         """As `Attach`."""
@@ -82,7 +88,7 @@ class Attached:
     def _least_squares(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
         counted = _padded([s.fit.counted for s in solved], matches.mask)
         weighted = self.final.weighted and matches.prior is not None
-        weight = torch.where(counted, matches.weight, 0) if weighted else counted.to(torch.float64)
+        weight = torch.where(counted > 0, matches.weight, 0) if weighted else counted
         fitted, valid = eight_point(matches.points0, matches.points1, weight)
         fitted = torch.where(valid[:, None, None], fitted, 0).flatten(1)
         return fitted - fitted.detach()
@@ -94,22 +100,31 @@ class Attached:
             torch.from_numpy(np.stack(values)).to(device)
             for values in ([s.fit.at for s in solved], [self._response(s) for s in solved])
         )
-        weight = torch.where(_padded([s.fit.counted for s in solved], matches.mask), matches.weight, 0)
-        unbounded = torch.full_like(at[:, 0], torch.inf)
-        gradient = gradient_of_cost(at.T[..., None], matches.points, weight, KERNELS["truncated"], unbounded)[..., 0]
-        return (response * (gradient - gradient.detach()).T[:, None]).sum(-1)
+        counted = _padded([s.fit.counted for s in solved], matches.mask)
+        weight = matches.weight if self.family.fit_scale.by_prior else matches.precision
+        weight = torch.where(counted > 0, counted * weight, 0)
+        if self.family.model == "homography":
+            gradient = homography_gradient(at, matches.points, weight)
+        else:
+            unbounded = torch.full_like(at[:, 0], torch.inf)
+            gradient = gradient_of_cost(at.T[..., None], matches.points, weight, KERNELS["truncated"], unbounded)[
+                ..., 0
+            ].T
+        return (response * (gradient - gradient.detach())[:, None]).sum(-1)
 
     def _response(self, solved: Solved) -> Array:
         """How the fit of a pair moves with the gradient of its cost, (9, 9)."""
         pair, fit = solved.pair, solved.fit
-        weight = np.where(fit.counted, pair.weight, 0.0)
+        weight = fit.counted * (pair.weight if self.family.fit_scale.by_prior else 1 / np.square(pair.noises))
         if fit.cameras is not None:
             return camera_response(fit.cameras, pair, weight, fit.precision)
         return self.family.response(fit.at, pair, weight)
 
 
 def with_gradients(estimate: Estimate, c: Correspondences, solved: dict[int, Solved], attach: Attach) -> Estimate:
-    """The estimate of a batch with the gradients of the pairs that are solved; the same values."""
+    """The estimate of a batch with the gradients of the pairs that are solved, zero of others; the same values."""
+    if not solved:
+        return estimate.derived(F=estimate.F + _nothing(c).to(estimate.F))
     rows = torch.tensor(list(solved), device=c.mask.device)
     pairs = [s.pair for s in solved.values()]
     zero = attach(list(solved.values()), graphed_matches(c, solved))
@@ -117,7 +132,11 @@ def with_gradients(estimate: Estimate, c: Correspondences, solved: dict[int, Sol
     centre = torch.from_numpy(np.stack([pair.centre for pair in pairs])).to(zero)
     unit = torch.tensor([pair.pixels_per_unit for pair in pairs]).to(zero)
     frame = PixelFrame(centre, unit, torch.ones_like(rows, dtype=torch.bool))
-    G = canonical(frame.to_pixels((F + zero).reshape(-1, 1, 3, 3))[:, 0])
+    models = (F + zero).reshape(-1, 1, 3, 3)
+    if estimate.model == "homography":
+        G = unit_frobenius(frame.homography_to_pixels(models)[:, 0])
+    else:
+        G = canonical(frame.to_pixels(models)[:, 0])
     return estimate.derived(F=estimate.F.index_add(0, rows, G - G.detach()))
 
 
@@ -139,10 +158,11 @@ def graphed_matches(c: Correspondences, solved: dict[int, Solved]) -> GraphedMat
     unit = torch.tensor([pair.pixels_per_unit for pair in pairs]).to(pixels)
     points = torch.where(mask[..., None], (pixels - centre[:, None]) / unit[:, None, None], 0).permute(2, 0, 1)
     prior, noise = take(c.prior), take(c.noise)
-    weight = mask.to(torch.float64) if prior is None else prior.nan_to_num(0).clamp(0, 1)
+    precision = mask.to(torch.float64)
     if noise is not None:
-        weight = weight / torch.where(mask, noise.nan_to_num(1).clamp(MIN_NOISE, MAX_NOISE), 1).square()
-    return GraphedMatches(points, mask, weight, prior)
+        precision = precision / torch.where(mask, noise.nan_to_num(1).clamp(MIN_NOISE, MAX_NOISE), 1).square()
+    weight = precision if prior is None else precision * prior.nan_to_num(0).clamp(0, 1)
+    return GraphedMatches(points, mask, precision, weight, prior)
 
 
 def camera_response(cameras: Cameras, pair: Pair, weight: Array, precision: float) -> Array:
@@ -164,14 +184,20 @@ def camera_response(cameras: Cameras, pair: Pair, weight: Array, precision: floa
     return response if np.isfinite(response).all() else np.zeros((9, 9))
 
 
+def _nothing(c: Correspondences) -> Tensor:
+    """Zero, with a gradient of zero to all that has one."""
+    attached = [t for t in (c.x0, c.x1, c.prior, c.noise) if t is not None and t.requires_grad]
+    return torch.stack([t[:0].sum().to(torch.float64) for t in attached]).sum() if attached else torch.zeros(())
+
+
 def _none(solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
     """No gradients."""
     return matches.points.new_zeros(len(solved), 9)
 
 
-def _padded(rows: list[Array], mask: Bool[Tensor, "p n"]) -> Bool[Tensor, "p n"]:
-    """Flags of the matches of each pair, False in padded slots."""
-    out = np.zeros(tuple(mask.shape), np.bool_)
+def _padded(rows: list[Array], mask: Bool[Tensor, "p n"]) -> Float[Tensor, "p n"]:
+    """Numbers of the matches of each pair, zero in padded slots."""
+    out = np.zeros(tuple(mask.shape))
     for place, row in zip(out, rows, strict=True):
         place[: len(row)] = row
     return torch.from_numpy(out).to(mask.device)

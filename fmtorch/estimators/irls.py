@@ -13,6 +13,7 @@ from torch import Tensor
 from fmtorch.compiling.arrays import Array
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.batch import Solution, estimated
+from fmtorch.estimators.families.fundamental import SevenPoint
 from fmtorch.estimators.gradients import GraphedMatches, Solved
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.parts.final_fits import Fit
@@ -20,9 +21,10 @@ from fmtorch.estimators.parts.inliers import WithinThreshold, lower_median, resi
 from fmtorch.geometry import attached_step
 from fmtorch.geometry.eight_point_kernels import weighted_eight_point
 from fmtorch.geometry.irls_kernels import reweighted
+from fmtorch.geometry.levenberg_marquardt_kernels import Schedule
 from fmtorch.geometry.rank2_manifold_kernels import SQUARINGS
-from fmtorch.geometry.refine_kernels import Schedule, refine
-from fmtorch.geometry.robust_kernels import named_kernel
+from fmtorch.geometry.refine_kernels import refine
+from fmtorch.geometry.robust_losses import named_kernel
 from fmtorch.geometry.sampson_objective_kernels import LOSSES, Weighted, loss_table
 
 DECAY = 0.65  # of the kernel's scale, from one iteration to the next, down to the threshold
@@ -80,7 +82,7 @@ class IterativelyReweighted:
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
-        return estimated(c, seed, self.MIN_MATCHES, self.solve, self.attached)
+        return estimated(c, seed, self.MIN_MATCHES, SevenPoint(), self.solve, self.attached)
 
     def solve(self, pair: Pair) -> Solution:
         """The model of least cost of one pair."""
@@ -92,13 +94,13 @@ class IterativelyReweighted:
         for i in range(self.iterations):
             reweighted(F, self._weighted(pair, max(widest * DECAY**i, scale)))
         refined, cost = np.empty_like(F), np.empty(len(F))
-        schedule = Schedule(self.refine_iterations, FIRST_DAMPING, 0.0, SQUARINGS)
-        refine(F, self._weighted(pair, scale), schedule, refined, cost)
+        schedule = Schedule(self.refine_iterations, FIRST_DAMPING, 0.0)
+        refine(F, SQUARINGS, self._weighted(pair, scale), schedule, refined, cost)
         best = int(np.argmin(np.where(np.isfinite(cost), cost, np.inf)))
         if not np.isfinite(cost[best]):
             return Solution(None, 0, reason=NOT_DETERMINED)
         inliers = self.inlier_rule(residuals_squared_px(refined[best], pair), pair)
-        return Solution(Fit(refined[best], refined[best], inliers), 0, inliers)
+        return Solution(Fit(refined[best], refined[best], inliers.astype(np.float64)), 0, inliers)
 
     def attached(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
         """As `gradients.Attach`: one Gauss-Newton step, whose gradients are those of the optimum."""

@@ -11,7 +11,9 @@ import numpy as np
 from fmtorch.compiling.arrays import Array, B1x1, F8x1, F8x2, I8x1
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.random_kernels import stream_state, uniform
+from fmtorch.compiling.scratch import matrix
 from fmtorch.core.streams import Stream, mixed_seed
+from fmtorch.geometry.residual_kernels import SAMPSON, Residual
 
 T = TypeVar("T")
 MAX_COORDINATE_PX = 1e100  # a match beyond is none: numbers made of its coordinates would overflow
@@ -23,22 +25,23 @@ class Pair:
     """The matches of one pair. Arrays are float64 and C-contiguous.
 
     table: (9, n), a row each of x0, y0, x1, y1 in normalised units, weight, pixels per noise, match weight, noise,
-    quality. points: the first four: ``x = centre + pixels_per_unit * point``. weight: what each match counts in a fit,
-    its prior divided by the square of its noise. pixels_per_noise: pixels in one normalised unit, divided by the noise.
-    match_weight: what it counts in a score, the prior, or one. prior, noise, quality: (n,), None where the caller has
-    none; noise is between MIN_NOISE and MAX_NOISE. bucket: of the number of matches of the whole pair, which decides
-    how priors are quantised and whether models are preselected. pixels_per_unit: a power of two. centre: (4,), of the
-    points, pixels. sizes: (4,), of the images as h, w, h, w, pixels; empty where unknown. key, seed: of every random
-    choice. images: what families compute of the images, for all subsets of the matches.
+    quality. points: the first four: ``x = centre + pixels_per_unit * point``. weight: what each match counts in a
+    fit, its prior divided by the square of its noise. pixels_per_noise: pixels in one normalised unit, divided by
+    the noise. match_weight: what it counts in a score, the prior, or one. prior, noise, quality: (n,), None where
+    the caller has none; noise is between MIN_NOISE and MAX_NOISE. bucket: of the number of matches of the whole
+    pair, which decides how priors are quantised and whether models are preselected. pixels_per_unit: a power of
+    two. centre: (4,), of the points, pixels. sizes: (4,), of the images as h, w, h, w, pixels; empty where unknown.
+    key, seed: of every random choice. residual: of the family of models, by which matches are judged. images: what
+    families compute of the images, for all subsets of the matches.
     """
 
     def __init__(
         self, table: Array, known: tuple[bool, bool, bool], bucket: int, pixels_per_unit: float, key: int, seed: int,
-        centre: Array, sizes: Array, images: dict[Hashable, Any] | None = None,
+        centre: Array, sizes: Array, residual: Residual = SAMPSON, images: dict[Hashable, Any] | None = None,
     ) -> None:  # fmt: skip
         """known: whether the caller has given a prior, noise, quality."""
         self.table, self.known, self.bucket, self.pixels_per_unit = table, known, bucket, pixels_per_unit
-        self.key, self.seed, self.centre, self.sizes = key, seed, centre, sizes
+        self.key, self.seed, self.centre, self.sizes, self.residual = key, seed, centre, sizes, residual
         self.count = table.shape[1]
         self.points, self.weight = table[:4], table[4]
         self.pixels_per_noise, self.match_weight = table[5], table[6]
@@ -58,6 +61,12 @@ class Pair:
         """Whether both images have one size. Of a pair whose sizes are known."""
         h0, w0, h1, w1 = self.sizes.tolist()
         return bool(h0 == h1 and w0 == w1)
+
+    @property
+    def noises(self) -> Array:
+        """The noise of each match (n,), ones where none is known."""
+        noises: Array = self.table[7]
+        return noises
 
     @property
     def points32(self) -> Array:
@@ -88,7 +97,7 @@ class Pair:
         """The same pair with the matches of these indices."""
         return Pair(
             self.table.take(index, 1), self.known, self.bucket, self.pixels_per_unit, self.key, self.seed, self.centre,
-            self.sizes, self.images,
+            self.sizes, self.residual, self.images,
         )  # fmt: skip
 
 
@@ -126,9 +135,9 @@ def normalize_pair(matches: PixelMatches, slot: I8x1, table: F8x1, frame: F8x1) 
     image; the unit in pixels, 0 where all coincide; and 1 where all priors, noises and sizes are right, otherwise 0.
     """
     x0, x1, mask, prior, noise, quality, sizes = matches
-    count, half, most, right = 0, 0.0, MAX_COORDINATE_PX, True
+    count, half, end, right = 0, 0.0, MAX_COORDINATE_PX, True
     for i in range(len(mask)):
-        if mask[i] and abs(x0[i, 0]) < most and abs(x0[i, 1]) < most and abs(x1[i, 0]) < most and abs(x1[i, 1]) < most:
+        if mask[i] and abs(x0[i, 0]) < end and abs(x0[i, 1]) < end and abs(x1[i, 0]) < end and abs(x1[i, 1]) < end:
             slot[count] = i
             count += 1
     for r in range(4):
@@ -169,14 +178,14 @@ def to_pixels(F: F8x1, centre: F8x1, unit: float, out: F8x2) -> bool:
 
     centre: (4,), of the points in pixels; unit: pixels in one unit of the points.
     """
-    T0, T1, product, matrix = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    T0, T1, product, model = matrix(3, 3), matrix(3, 3), matrix(3, 3), matrix(3, 3)
     for i in range(3):
         for j in range(3):
             diagonal = (1.0 if i == 2 else 1 / unit) if i == j else 0.0
             T0[i, j] = -centre[i] / unit if i < j == 2 else diagonal
             T1[i, j] = -centre[2 + j] / unit if j < i == 2 else diagonal  # transposed
-            matrix[i, j] = F[3 * i + j]
-    _product(T1, matrix, product)
+            model[i, j] = F[3 * i + j]
+    _product(T1, model, product)
     _product(product, T0, out)
     largest, total, finite = out[0, 0], 0.0, True
     for i in range(9):

@@ -7,7 +7,16 @@ from typing import Any
 from fmtorch.compiling.kernel import Kernel
 from fmtorch.estimators import focal_search, pair, search
 from fmtorch.estimators.families import cameras, cheirality, focals, posterior
-from fmtorch.estimators.parts import inliers, preselection, refinement, sampling, saturated, scores, support
+from fmtorch.estimators.parts import (
+    inliers,
+    preselection,
+    refinement,
+    sampling,
+    saturated,
+    scored_matches,
+    scores,
+    support,
+)
 from fmtorch.geometry import (
     five_point_kernels,
     refine_kernels,
@@ -44,7 +53,7 @@ WITH_FOCALS: tuple[Kernel[..., Any], ...] = (
     preselection.draw_by_prior,
     inliers.share_within,
     cameras.centre,
-    scores.pack,
+    scored_matches.pack,
     sampling.quantise,
     focal_search.posteriors,
     focal_search.distinct_models,

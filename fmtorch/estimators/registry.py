@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from fmtorch.estimators.families.fundamental import EightPoint, SevenPoint
+from fmtorch.estimators.families.homography import Homography
 from fmtorch.estimators.parts.degensac import Degensac
 from fmtorch.estimators.parts.final_fits import Adaptive, GaussNewton, LeastSquares, NoFit, UnweightedLeastSquares
 from fmtorch.estimators.parts.graph_cut import GraphCut
@@ -23,7 +24,7 @@ from fmtorch.estimators.parts.scores import InlierCount, Magsac, Msac
 DEFAULT_THRESHOLD_PX = 1.0
 
 PARTS: dict[str, dict[str, Callable[..., Any]]] = {
-    "solver": {"seven_point": SevenPoint, "eight_point": EightPoint},
+    "solver": {"seven_point": SevenPoint, "eight_point": EightPoint, "four_point": Homography},
     "sampler": {"uniform": Uniform, "prosac": Prosac, "prior": PriorWeighted},
     "score": {
         "inlier_count": InlierCount,

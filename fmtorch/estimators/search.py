@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import NamedTuple, Protocol
+from collections.abc import Callable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -12,10 +13,12 @@ from fmtorch.compiling.arrays import Array, F4x2, F8x1, I8x1
 from fmtorch.compiling.kernel import kernel
 from fmtorch.estimators.families.family import Family, Hypotheses
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.inliers import StoppingRule
 from fmtorch.estimators.parts.preselection import Preselection
 from fmtorch.estimators.parts.sampling import Sampler
 from fmtorch.geometry.rank2_kernels import assign
+
+Stop = Callable[[Array, int, Pair, int], bool]
+"""Whether the best model (9,), after so many draws of samples of this size, may be taken for the best there is."""
 
 
 @dataclasses.dataclass(eq=False)
@@ -58,10 +61,11 @@ class Verified(NamedTuple):
     score: Array
 
 
+@runtime_checkable
 class Degeneracy(Protocol):
     """Completes the best model of a round where its sample is degenerate."""
 
-    def __call__(self, made: Hypotheses, models: Verified, best: float, pair: Pair) -> Verified:
+    def __call__(self, hypotheses: Hypotheses, models: Verified, best: float, pair: Pair) -> Verified:
         """The models of a round with those completed. best: the score to beat."""
         ...
 
@@ -80,7 +84,7 @@ class Search:
     pool: int
     hypotheses: int
     round: int
-    stop: StoppingRule | None = None
+    stop: Stop | None = None
     degeneracy: Degeneracy | None = None
 
     def __call__(self, pair: Pair, start: int = 0) -> Pool:
@@ -89,10 +93,10 @@ class Search:
         while start < end:
             count = min(self.round, end - start)
             sample = self.sampler.draw(pair, start, count, self.family.size)
-            made = self.family.solve(pair, sample, start)
-            models = Verified(made.F, *self.preselection(made.F, pair))
+            hypotheses = self.family.solve(pair, sample, start)
+            models = Verified(hypotheses.F, *self.preselection(hypotheses.F, pair))
             if self.degeneracy is not None:
-                models = self.degeneracy(made, models, float(pool.score[0]), pair)
+                models = self.degeneracy(hypotheses, models, float(pool.score[0]), pair)
             start += count
             pool.merge(models)
             pool.draws = start

@@ -24,10 +24,12 @@ def panels(runs: Mapping[str, pa.Table]) -> dict[str, dict[str, NDArray[np.float
     """Title of a panel -> name of a run -> NSGD of its pairs: a panel of each family, and of all of several."""
     by_run = {name: _families(table) for name, table in runs.items()}
     families = dict.fromkeys(itertools.chain.from_iterable(by_run.values()))
-    found = {family: {run: parts[family] for run, parts in by_run.items() if family in parts} for family in families}
+    by_family = {
+        family: {run: parts[family] for run, parts in by_run.items() if family in parts} for family in families
+    }
     if len(families) < 2:
-        return found
-    return {ALL: {run: np.concatenate(list(parts.values())) for run, parts in by_run.items() if parts}, **found}
+        return by_family
+    return {ALL: {run: np.concatenate(list(parts.values())) for run, parts in by_run.items() if parts}, **by_family}
 
 
 def _families(table: pa.Table) -> dict[str, NDArray[np.float64]]:

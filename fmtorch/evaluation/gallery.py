@@ -19,7 +19,7 @@ from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.storage import RunFolder
 from fmtorch.storage.exchange.dataset import WITHOUT_GEOMETRY
 
-MOST_RUNS = 8  # whose pictures a pair has: each adds some 0.4 MB to the page
+MAX_RUNS = 8  # whose pictures a pair has: each adds some 0.4 MB to the page
 _NOT_BUILT = (ValueError, TypeError, AttributeError, ImportError, OSError)
 
 
@@ -61,16 +61,16 @@ def gallery(
         return [], [f"No pictures: {error}"]
     pairs = {dataset[i].identity: dataset[i] for i in range(len(dataset))}
     notes = []
-    if len(runs) > MOST_RUNS:
-        notes.append(f"Pictures are of the first {MOST_RUNS} of {len(runs)} runs.")
+    if len(runs) > MAX_RUNS:
+        notes.append(f"Pictures are of the first {MAX_RUNS} of {len(runs)} runs.")
     pipelines: dict[str, Pipeline | None] = {}
-    for r in runs[:MOST_RUNS]:
+    for r in runs[:MAX_RUNS]:
         try:
             pipelines[r.name] = rebuilt(r, options)
         except _NOT_BUILT as error:
             pipelines[r.name] = None
             notes.append(f"{r.name} is shown by the F that it stored, without its matches: {error}.")
-    shown = [shown_pair(pairs[name], runs[:MOST_RUNS], pipelines) for name in progress(wanted) if name in pairs]
+    shown = [shown_pair(pairs[name], runs[:MAX_RUNS], pipelines) for name in progress(wanted) if name in pairs]
     return shown, notes if shown else ["No pictures: the data set does not hold the pairs of the runs."]
 
 
@@ -135,7 +135,8 @@ def rebuilt(r: Run, options: Options) -> Pipeline:
     except ValueError as error:
         raise ValueError(f"made by an earlier version, {error}") from error
     cache = {"cache": options.cache, "cache_limit": options.cache_limit}
-    return presets.build_pipeline(OmegaConf.create({**composed, **cache}), options.device)
+    built: Pipeline = presets.build_pipeline(OmegaConf.create({**composed, **cache}), options.device)
+    return built
 
 
 def shown_pair(pair: ImagePair, runs: Sequence[Run], pipelines: Mapping[str, Pipeline | None]) -> ShownPair:

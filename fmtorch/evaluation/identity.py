@@ -14,7 +14,6 @@ from omegaconf import DictConfig
 
 from fmtorch import presets
 from fmtorch.compiling import switch
-from fmtorch.estimators.peers import PEERS
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
 from fmtorch.storage.code import code_digest, fmtorch_version
@@ -44,10 +43,10 @@ def run_identity(config: DictConfig, pipeline_name: str, pipeline: Pipeline, dat
         **{key: value for key, value in plain(config.dataset).items() if key not in PLACES},
         "digest": dataset_digest,
     }
-    peers = {PEERS[name] for target in presets.targets_of(stages) if (name := target.rpartition(".")[2]) in PEERS}
     return {
         "pipeline": pipeline_name, **stages, "seed": config.seed, "version": fmtorch_version(),
-        "libraries": libraries(sorted(peers)), "kernels": switch.identity(), "learned": _learned(stages, pipeline),
+        "libraries": libraries(presets.peer_packages(stages)), "kernels": switch.identity(),
+        "learned": _learned(stages, pipeline),
         "code": _code({"stages": stages, "dataset": dataset}), "dataset": dataset,
     }  # fmt: skip
 
@@ -58,13 +57,13 @@ def _learned(stages: Mapping[str, Any], pipeline: Pipeline) -> dict[str, list[st
     parts: dict[str, list[object]] = {
         "features": [extractor.extractor if isinstance(extractor, CachedFeatures) else extractor],
         "matcher": [pipeline.matcher], "estimator": [pipeline.estimator],
-        "pruner": [pruner for some in (pipeline.pruners, *pipeline.families.values()) for pruner in some.values()],
+        "pruner": [p for pruners in (pipeline.pruners, *pipeline.families.values()) for p in pruners.values()],
     }  # fmt: skip
     digests = {
         group: {*(digest for part in parts[group] for digest in learned(part)), *_files(stages.get(group))}
         for group in presets.STAGES
     }
-    return {group: sorted(found) for group, found in digests.items() if found}
+    return {group: sorted(digests_of_group) for group, digests_of_group in digests.items() if digests_of_group}
 
 
 def _files(config: object, option: str = "") -> Iterator[str]:

@@ -9,7 +9,7 @@ from typing import Any
 from fmtorch import presets
 from fmtorch.storage.runs import leaves
 
-MOST_OPTIONS = 3  # that a name tells of a stage; of more the identity's first digits do
+MAX_OPTIONS = 3  # that a name tells of a stage; of more the identity's first digits do
 _DIGITS = 6  # of an identity
 _LONG = re.compile(r"([0-9a-f]{7})[0-9a-f]+")  # a commit or a digest, whose first digits do
 
@@ -48,7 +48,7 @@ def run_names(
 
 def shared_settings(configs: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
     """What all runs have in common, which their names leave out: the pipeline, stages' presets, seed and version."""
-    found = []
+    settings = []
     for group in ("pipeline", *presets.STAGES, "seed", "version"):
         values = [config.get(group) for config in configs]
         if values[0] in (None, {}, []) or any(value != values[0] for value in values):
@@ -57,8 +57,8 @@ def shared_settings(configs: Sequence[Mapping[str, Any]]) -> list[tuple[str, str
             words = list(_pruners(values[0]))
         else:
             words = list(_stage(group, values[0], [])) if isinstance(values[0], Mapping) else [str(values[0])]
-        found.append((group, ", ".join(words)))
-    return found
+        settings.append((group, ", ".join(words)))
+    return settings
 
 
 def _details(config: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> Iterator[str]:
@@ -102,7 +102,7 @@ def _kind(group: str, value: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
 
 def _words(options: Mapping[str, str]) -> list[str]:
     words = [f"{key}={text.strip(chr(34))}" for key, text in options.items()]
-    return words if len(words) <= MOST_OPTIONS else []
+    return words if len(words) <= MAX_OPTIONS else []
 
 
 def _pruner_words(mine: Any, values: Sequence[Any]) -> Iterator[str]:

@@ -11,11 +11,6 @@ from fmtorch.core.types import Correspondences, Estimate, collate
 from fmtorch.pipeline.pipeline import Outcome
 
 
-def solved(outcome: Outcome) -> bool:
-    """Whether there is an F."""
-    return outcome.estimate is not None and bool(outcome.estimate.ok[0])
-
-
 def joined_correspondences(outcomes: Sequence[Outcome]) -> Correspondences:
     """Those of the outcomes that have some."""
     return collate([o.correspondences.to("cpu") for o in outcomes if o.correspondences is not None])

@@ -130,14 +130,14 @@ def _context(section: Section, names: Sequence[str]) -> dict[str, Any]:
     pairs = {table.num_rows for table in section.runs.values()}
     facts = f"{len(section.runs)} runs" if len(section.runs) > 1 else "One run"
     counts = f"{min(pairs):,}" + (f" to {max(pairs):,}" if len(pairs) > 1 else "")
-    made = (
+    optional_tables = (
         tables.merit(summaries), tables.families(summaries), tables.poses(summaries), tables.differences(section.runs),
     )  # fmt: skip
     return {
         "heading": section.heading,
         "facts": f"{facts}, {counts} pair{'s' * (pairs != {1})}{' each' * (len(section.runs) > 1)}.",
         "legend": caption(next(iter(summaries.values()))),
-        "tables": [*(table for table in made if table), tables.seconds(summaries)],
+        "tables": [*(table for table in optional_tables if table), tables.seconds(summaries)],
         "names": list(section.runs),
         "curves": [
             (title, Markup(curves.svg(title, panel, names))) for title, panel in curves.panels(section.runs).items()

@@ -113,10 +113,10 @@ def _corners(image: Image, clip: Callable[[Points], NDArray[np.float64]], F: Poi
     inner = np.zeros(grey.shape, np.uint8)  # the rims of undistorted images have corners of their own
     rows, columns = (slice(int(_RIM * size), size - int(_RIM * size)) for size in grey.shape)
     inner[rows, columns] = 255
-    found = cv2.goodFeaturesToTrack(grey, _CORNERS, 0.02, max(2.0, min(grey.shape) / 40), mask=inner)
-    if found is None:
+    detected = cv2.goodFeaturesToTrack(grey, _CORNERS, 0.02, max(2.0, min(grey.shape) / 40), mask=inner)
+    if detected is None:
         return np.zeros((0, 2))
-    corners = np.asarray(found, np.float64).reshape(-1, 2)
+    corners = np.asarray(detected, np.float64).reshape(-1, 2)
     seen = np.array([len(clip(F @ [x, y, 1.0])) > 0 for x, y in corners])
     corners = corners[seen] if seen.any() else corners
     return corners[spread(corners, count)]

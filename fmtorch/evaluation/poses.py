@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.data.pairs import ImagePair
-from fmtorch.evaluation.outcomes import joined_correspondences, joined_estimates, solved
+from fmtorch.evaluation.outcomes import joined_correspondences, joined_estimates
 from fmtorch.metrics import fundamental_pose_error
 from fmtorch.pipeline.pipeline import Outcome
 
@@ -32,19 +32,19 @@ def pose_errors(outcomes: Sequence[Outcome]) -> list[PairPose]:
     A pair without F, or whose F has no pose, has the largest errors and a reason; one whose calibration or motion is
     unknown has a reason only.
     """
-    found = [_without_estimate(outcome) for outcome in outcomes]
-    known = [i for i, o in enumerate(outcomes) if found[i].reason is None]
+    poses = [_without_estimate(outcome) for outcome in outcomes]
+    known = [i for i, o in enumerate(outcomes) if poses[i].reason is None]
     if known:
-        some = [outcomes[i] for i in known]
-        c, estimate = joined_correspondences(some), joined_estimates(some)
+        estimated = [outcomes[i] for i in known]
+        c, estimate = joined_correspondences(estimated), joined_estimates(estimated)
         K0, K1, R, t = (
-            _stacked([getattr(o.pair, name) for o in some]) for name in ("K0", "K1", "R", "t")
+            _stacked([getattr(o.pair, name) for o in estimated]) for name in ("K0", "K1", "R", "t")
         )  # fmt: skip
         error = fundamental_pose_error(estimate.F.double(), K0, K1, c.x0, c.x1, R, t, estimate.inliers & c.mask)
         for i, rotation, translation in zip(known, error.rotation.tolist(), error.translation.tolist(), strict=True):
             none = rotation >= LARGEST_ROTATION
-            found[i] = PairPose(rotation, translation, "no inlier in front of both cameras" if none else None)
-    return found
+            poses[i] = PairPose(rotation, translation, "no inlier in front of both cameras" if none else None)
+    return poses
 
 
 def _without_estimate(outcome: Outcome) -> PairPose:
@@ -52,7 +52,7 @@ def _without_estimate(outcome: Outcome) -> PairPose:
     missing = unknown(outcome.pair)
     if missing is not None:
         return PairPose(None, None, missing)
-    if not solved(outcome):
+    if not outcome.solved:
         return PairPose(LARGEST_ROTATION, LARGEST_TRANSLATION, "no F")
     return PairPose(None, None, None)
 

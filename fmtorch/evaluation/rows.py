@@ -10,7 +10,7 @@ from typing import cast
 from torch import Tensor
 
 from fmtorch import metrics
-from fmtorch.evaluation.outcomes import joined_correspondences, joined_estimates, joined_true, solved
+from fmtorch.evaluation.outcomes import joined_correspondences, joined_estimates, joined_true
 from fmtorch.evaluation.poses import PairPose, pose_errors
 from fmtorch.pipeline.pipeline import STAGES, Outcome
 from fmtorch.storage import PairRow
@@ -32,13 +32,13 @@ def evaluate(outcomes: Sequence[Outcome], seed: int = 0) -> list[PairRow]:
 def _distances(outcomes: Sequence[Outcome], seed: int) -> tuple[list[float], list[float]]:
     """NSGD in both forms."""
     nsgd, released = [1.0] * len(outcomes), [1.0] * len(outcomes)
-    known = [i for i, o in enumerate(outcomes) if solved(o)]
+    known = [i for i, o in enumerate(outcomes) if o.solved]
     if known:
-        some = [outcomes[i] for i in known]
-        c = joined_correspondences(some)
+        estimated = [outcomes[i] for i in known]
+        c = joined_correspondences(estimated)
         if c.size0 is None or c.size1 is None:
             raise ValueError("correspondences come without image sizes (size0, size1); the matcher must supply them")
-        arguments = (joined_true(some), joined_estimates(some).F, c.size0, c.size1)
+        arguments = (joined_true(estimated), joined_estimates(estimated).F, c.size0, c.size1)
         values = metrics.nsgd(*arguments, seed=seed, key=c.keys).tolist()
         values_released = metrics.nsgd_released(*arguments, seed=seed, key=c.keys).tolist()
         for i, a, b in zip(known, values, values_released, strict=True):
@@ -51,19 +51,21 @@ def _inlier_rates(outcomes: Sequence[Outcome]) -> tuple[list[float], list[float]
     before, after = [math.nan] * len(outcomes), [math.nan] * len(outcomes)
     matched = [i for i, o in enumerate(outcomes) if o.estimate is not None and o.correspondences is not None]
     if matched:
-        some = [outcomes[i] for i in matched]
-        c, estimate = joined_correspondences(some), joined_estimates(some)
+        with_matches = [outcomes[i] for i in matched]
+        c, estimate = joined_correspondences(with_matches), joined_estimates(with_matches)
         if c.size0 is None or c.size1 is None:
             raise ValueError("correspondences come without image sizes (size0, size1); the matcher must supply them")
-        rates = metrics.inlier_rate(joined_true(some), c.x0, c.x1, estimate.inliers, c.size0, c.size1, mask=c.mask)
+        rates = metrics.inlier_rate(
+            joined_true(with_matches), c.x0, c.x1, estimate.inliers, c.size0, c.size1, mask=c.mask
+        )
         for i, a, b in zip(matched, rates.before.tolist(), rates.after.tolist(), strict=True):
-            before[i], after[i] = a, b if solved(outcomes[i]) else math.nan
+            before[i], after[i] = a, b if outcomes[i].solved else math.nan
     return before, after
 
 
 def _row(outcome: Outcome, figures: dict[str, float], pose: PairPose, seconds: float) -> PairRow:
     pair, c, estimate = outcome.pair, outcome.correspondences, outcome.estimate
-    ok = solved(outcome)
+    ok = outcome.solved
     return PairRow(
         pair=pair.identity, key=pair.key, family=pair.family, scene=pair.scene, ok=ok, reason=outcome.reason,
         corrs=int(estimate.inliers.sum()) if estimate is not None else 0,

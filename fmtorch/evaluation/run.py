@@ -73,8 +73,8 @@ def evaluate_pairs(
             _features_ahead(team, pipeline.memory, pairs, first)
         todo = (list(pairs[i : i + batch]) for i in range(begun, len(pairs), batch))
         while True:
-            for some in todo:
-                waiting.add(team.submit(some, seed, journal))
+            for batch_of_pairs in todo:
+                waiting.add(team.submit(batch_of_pairs, seed, journal))
                 if len(waiting) > workers:
                     break
             if not waiting:

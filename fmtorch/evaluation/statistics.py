@@ -99,8 +99,8 @@ def difference(a: Values, b: Values, scenes: Sequence[str], scale: float = 1.0, 
     if not known.any():
         return None
     of = share_difference if share else mean_difference
-    found = of(a[known], b[known], _those(scenes, known))
-    return None if found is None else _scaled(found, scale)
+    unscaled = of(a[known], b[known], _those(scenes, known))
+    return None if unscaled is None else _scaled(unscaled, scale)
 
 
 def scene_names(families: Sequence[str], scenes: Sequence[str]) -> list[str]:
@@ -121,8 +121,8 @@ def unit(scenes: Sequence[str]) -> str:
 
 
 def _per_pair(values: torch.Tensor) -> Values:
-    found: Values = values.double().numpy()
-    return found.mean(0) if found.ndim > 1 else found
+    array: Values = values.double().numpy()
+    return array.mean(0) if array.ndim > 1 else array
 
 
 def _scaled(i: Interval, scale: float) -> Interval:
@@ -130,4 +130,4 @@ def _scaled(i: Interval, scale: float) -> Interval:
 
 
 def _those(scenes: Sequence[str], known: NDArray[np.bool_]) -> list[str]:
-    return [scene for scene, one in zip(scenes, known, strict=True) if one]
+    return [scene for scene, is_known in zip(scenes, known, strict=True) if is_known]

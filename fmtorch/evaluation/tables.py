@@ -114,16 +114,16 @@ def differences(runs: Mapping[str, pa.Table]) -> Table | None:
     first, *others = runs
     key, family, place = (runs[first][name].to_pylist() for name in ("key", "family", "scene"))
     scene = dict(zip(key, scene_names(family, place), strict=True))
-    found = {}
+    by_run = {}
     for other in others:
         two = {first: runs[first], other: runs[other]}
         a, b = common(two, "nsgd")
-        found[other] = (len(a), _ahead(a, b, [scene[key] for key in shared_keys(two)]))
-    ends = [abs(end) for _, cells in found.values() for _, i in cells if i for end in (i.low, i.high)]
+        by_run[other] = (len(a), _ahead(a, b, [scene[key] for key in shared_keys(two)]))
+    ends = [abs(end) for _, cells in by_run.values() for _, i in cells if i for end in (i.low, i.high)]
     widest = max(ends, default=1.0) or 1.0
     rows = {
         name: [Cell(f"{count:,}"), *(Cell(text, bar=_around_zero(i, widest)) for text, i in cells)]
-        for name, (count, cells) in found.items()
+        for name, (count, cells) in by_run.items()
     }
     head = ["run", "shared pairs", f"recall at {THRESHOLD}", f"at {FINE_THRESHOLD}", "AUC@0.05"]
     note = (
@@ -165,11 +165,11 @@ def shared_keys(runs: Mapping[str, pa.Table]) -> list[int]:
 def common(runs: Mapping[str, pa.Table], column: str) -> list[NDArray[np.float64]]:
     """A column of each run, of the pairs that all hold."""
     keys = shared_keys(runs)
-    found = []
+    columns = []
     for table in runs.values():
         values = dict(zip(table["key"].to_pylist(), table[column].to_pylist(), strict=True))
-        found.append(np.array([values[key] for key in keys], np.float64))
-    return found
+        columns.append(np.array([values[key] for key in keys], np.float64))
+    return columns
 
 
 def _ahead(a: NDArray[np.float64], b: NDArray[np.float64], scenes: Sequence[str]) -> list[tuple[str, Interval | None]]:
@@ -180,8 +180,8 @@ def _ahead(a: NDArray[np.float64], b: NDArray[np.float64], scenes: Sequence[str]
     parts = areas(a), areas(b)
     area = mean_difference(*parts, scenes)
     texts = [(_signed(i), i) for i in intervals]
-    few = f"{PERCENT * float((parts[0] - parts[1]).mean()):+.1f} (n too small)"
-    return [*texts, (few, None) if area is None else (_signed(area), area)]
+    difference = f"{PERCENT * float((parts[0] - parts[1]).mean()):+.1f} (n too small)"
+    return [*texts, (difference, None) if area is None else (_signed(area), area)]
 
 
 def _signed(i: Interval) -> str:

@@ -22,10 +22,10 @@ import torch
 
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.evaluation.rows import evaluate
+from fmtorch.pipeline.exporting import keep_outcomes
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.storage import PairRow
 from fmtorch.storage.exchange.journal import Journal
-from fmtorch.storage.exporting import keep_outcomes
 from fmtorch.storage.features import CachedFeatures
 
 Build = Callable[[], Pipeline]
@@ -115,6 +115,6 @@ def _in_process(pairs: list[ImagePair], seed: int, journal: Journal | None) -> W
     extractor = _mine.extractor
     if not isinstance(extractor, CachedFeatures):
         return _work(_mine, pairs, seed, journal)
-    computed, found = extractor.computed, extractor.found
+    computed, cached = extractor.computed, extractor.found
     rows = _work(_mine, pairs, seed, journal).rows
-    return Work(rows, extractor.computed - computed, extractor.found - found)
+    return Work(rows, extractor.computed - computed, extractor.found - cached)

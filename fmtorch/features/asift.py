@@ -41,17 +41,17 @@ class ASIFT(SIFT):
         an empty image.
         """
         grey = as_grey(image)
-        found = [super().__call__(grey)]
+        parts = [super().__call__(grey)]
         for tilt, angle in simulated_views(self.tilts)[1:]:
             view, to_view = simulate_view(grey, tilt, angle)
-            found.append(_mapped_back(super().__call__(view), to_view, grey.shape))
-        scores = torch.cat([f.scores for f in found])
+            parts.append(_mapped_back(super().__call__(view), to_view, grey.shape))
+        scores = torch.cat([f.scores for f in parts])
         kept = torch.from_numpy(strongest(scores.numpy(), self.max_features))
         return Features(
-            lafs=torch.cat([f.lafs for f in found])[kept],
+            lafs=torch.cat([f.lafs for f in parts])[kept],
             scores=scores[kept],
-            descriptors=torch.cat([f.descriptors for f in found])[kept],
-            image_size=found[0].image_size,
+            descriptors=torch.cat([f.descriptors for f in parts])[kept],
+            image_size=parts[0].image_size,
         )
 
 

@@ -51,13 +51,14 @@ class OpenCVFilters:
 
     def hessian_determinant(self, image: Float[Tensor, "1 h w"], out: Float[Tensor, "1 h w"]) -> None:
         pixels, result = image[0].numpy(), out[0].numpy()
-        one, first, second = (np.array(k, np.float32) for k in ([1], [-0.5, 0, 0.5], [1, -2, 1]))
+        identity, first, second = (np.array(k, np.float32) for k in ([1], [-0.5, 0, 0.5], [1, -2, 1]))
         h = len(pixels)
         for y in range(0, h, STRIP):
             top, bottom = max(y - 1, 0), min(y + STRIP + 1, h)
             strip = pixels[top:bottom]
             xx, yy, xy = (
-                cv2.sepFilter2D(strip, cv2.CV_32F, kx, ky) for kx, ky in ((second, one), (one, second), (first, first))
+                cv2.sepFilter2D(strip, cv2.CV_32F, kx, ky)
+                for kx, ky in ((second, identity), (identity, second), (first, first))
             )
             determinant = cv2.subtract(cv2.multiply(xx, yy, dst=xx), cv2.multiply(xy, xy, dst=xy), dst=xx)
             result[y : y + STRIP] = determinant[y - top : y - top + STRIP]
@@ -68,14 +69,14 @@ class OpenCVFilters:
         values = response[0].numpy()
         h = len(values)
         square = np.ones((3, 3), np.uint8)
-        found = []
+        by_strip = []
         for y in range(0, h, STRIP):
             top, bottom = max(y - 1, 0), min(y + STRIP + 1, h)
             largest = np.maximum(cv2.dilate(values[top:bottom], square)[y - top : y - top + STRIP], threshold)
             strip = values[y : y + STRIP]
             yx = np.argwhere((strip >= largest) & (strip > threshold))
-            found.append(yx + np.array([y, 0]))
-        places = torch.from_numpy(np.concatenate(found))
+            by_strip.append(yx + np.array([y, 0]))
+        places = torch.from_numpy(np.concatenate(by_strip))
         return torch.cat([torch.zeros_like(places[:, :1]), places], 1)
 
 

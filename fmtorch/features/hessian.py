@@ -59,7 +59,9 @@ class HessianDetector:
         return self._detect(images[:, 0], TorchFilters())
 
     def _detect(self, images: Tensor, filters: Filters) -> tuple[Tensor, Tensor, Tensor]:
-        found = [Peaks(images.new_zeros(0, dtype=torch.int64), images.new_zeros(0, 3).double(), images.new_zeros(0))]
+        by_octave = [
+            Peaks(images.new_zeros(0, dtype=torch.int64), images.new_zeros(0, 3).double(), images.new_zeros(0))
+        ]
         batch, height, width = images.shape
         spacing = 1.0  # of the octave's pixels in the image
         level = filters.blur(images, math.sqrt(self.sigma**2 - IMAGE_BLUR**2))
@@ -69,10 +71,10 @@ class HessianDetector:
             at = [torch.cat([p[:, :1], torch.full_like(p[:, :1], s + 1), p[:, 1:]], 1) for s, p in enumerate(seeds)]
             peaks = refined_maxima(responses, torch.cat(at), self.threshold)
             sigma = self.sigma * 2 ** (peaks.position[:, :1] / self.levels)
-            found.append(peaks._replace(position=spacing * torch.cat([sigma, peaks.position[:, 1:]], 1)))
+            by_octave.append(peaks._replace(position=spacing * torch.cat([sigma, peaks.position[:, 1:]], 1)))
             del responses
             spacing *= 2
-        index, position, scores = (torch.cat(parts) for parts in zip(*found, strict=True))
+        index, position, scores = (torch.cat(parts) for parts in zip(*by_octave, strict=True))
         sigma, y, x = position.unbind(1)
         nearest = torch.stack([x, y, width - 1 - x, height - 1 - y]).amin(0)
         inside = nearest >= self.border * sigma

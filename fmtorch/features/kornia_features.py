@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from fmtorch.core.resources import pretrained
+from fmtorch.core.pretrained import pretrained
 from fmtorch.core.types import Features
 from fmtorch.features.sift import strongest
 
@@ -89,8 +89,8 @@ class DISK(_NetworkFeatures):
 
     def _run(self, image: Float[Tensor, "1 3 h w"]) -> tuple[Tensor, Tensor, Tensor]:
         with torch.inference_mode():
-            (found,) = self.network(image, pad_if_not_divisible=True, **self._options)
-        return found.keypoints.clone(), found.detection_scores.clone(), found.descriptors.clone()
+            (detected,) = self.network(image, pad_if_not_divisible=True, **self._options)
+        return detected.keypoints.clone(), detected.detection_scores.clone(), detected.descriptors.clone()
 
 
 class ALIKED(_NetworkFeatures):
@@ -126,6 +126,10 @@ class ALIKED(_NetworkFeatures):
 
     def _run(self, image: Float[Tensor, "1 3 h w"]) -> tuple[Tensor, Tensor, Tensor]:
         with torch.inference_mode():
-            (found,) = self.network(image)
-        kept = torch.from_numpy(strongest(found.keypoint_scores.cpu().numpy(), self.max_features)).to(self.device)
-        return found.keypoints[kept].clone(), found.keypoint_scores[kept].clone(), found.descriptors[kept].clone()
+            (detected,) = self.network(image)
+        kept = torch.from_numpy(strongest(detected.keypoint_scores.cpu().numpy(), self.max_features)).to(self.device)
+        return (
+            detected.keypoints[kept].clone(),
+            detected.keypoint_scores[kept].clone(),
+            detected.descriptors[kept].clone(),
+        )

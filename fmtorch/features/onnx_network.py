@@ -99,9 +99,9 @@ def _session(path: Path, threads: int) -> tuple[Any, str, int]:
     shape = inputs[0].shape if len(inputs) == 1 else None
     fits = shape is not None and len(shape) == 4 and tuple(shape[1:]) == PATCH_SHAPE and not isinstance(shape[0], int)
     if not fits or inputs[0].type != "tensor(float)":
-        found = ", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)
+        actual = ", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)
         wanted = f"a patch network takes float (N, 1, 32, 32), N free: {_hint(path)}"
-        raise NetworkFileError(f"{path} takes {found}; {wanted}")
+        raise NetworkFileError(f"{path} takes {actual}; {wanted}")
     size = outputs[0].shape
     if len(outputs) != 1 or len(size) != 2 or not isinstance(size[1], int):
         wanted = f"a patch network gives (N, D): {_hint(path)}"

@@ -18,7 +18,7 @@ COARSEST = 8  # pixels, the least shorter side of a level
 # A level has a blur of about 0.7 of its pixels (the binomial filter's 0.58, and the interpolation's): samples up to
 # sqrt(2) of its pixels apart see it with a blur of half their distance, as an image's pixels see a scene.
 LARGEST_STEP = math.sqrt(2)
-MOST_SAMPLES = 8  # along an axis for one pixel of a patch
+MAX_SAMPLES = 8  # along an axis for one pixel of a patch
 
 
 class ImagePyramid:
@@ -59,7 +59,7 @@ def _plan(lafs: Tensor, levels: int, size: int) -> _Plan:
     finite = torch.isfinite(lafs).all(2).all(1)
     step = torch.where(finite[:, None], step, 1.0)
     level = (step.amin(1) / LARGEST_STEP).clamp(min=1e-6).log2().ceil().clamp(0, levels - 1)
-    samples = (step / (LARGEST_STEP * torch.exp2(level))[:, None]).ceil().clamp(1, MOST_SAMPLES)
+    samples = (step / (LARGEST_STEP * torch.exp2(level))[:, None]).ceil().clamp(1, MAX_SAMPLES)
     return _Plan(torch.where(finite, level, -1.0).long(), samples.long())
 
 

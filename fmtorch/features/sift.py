@@ -46,8 +46,8 @@ class SIFT:
         """
         grey = as_grey(image)
         seen = self._reduced(grey)
-        keypoints, found = self._opencv().detectAndCompute(seen, None)
-        descriptors = np.zeros((0, 128), np.float32) if found is None else found
+        keypoints, computed = self._opencv().detectAndCompute(seen, None)
+        descriptors = np.zeros((0, 128), np.float32) if computed is None else computed
         lafs, scores, kept = self._kept(keypoints, seen.shape, grey.shape)
         features = torch.from_numpy(descriptors[kept])
         return Features(

@@ -53,13 +53,13 @@ class VLFeatSIFT:
         size = torch.tensor(grey.shape, dtype=torch.int64)
         if min(grey.shape) < SMALLEST:
             return Features(torch.zeros(0, 2, 3), torch.zeros(0), torch.zeros(0, 128), size)
-        keypoints, found = self._extractor(grey.shape).extract_from_uint8_array(grey)
+        keypoints, computed = self._extractor(grey.shape).extract_from_uint8_array(grey)
         table = [(k.a11, k.a12, k.x, k.a21, k.a22, k.y) for k in keypoints]
         frames = torch.tensor(table, dtype=torch.float32).reshape(-1, 2, 3)
         sigma = frames[:, :, 0].norm(dim=1)
         order = torch.argsort(-sigma, stable=True)[: self.max_features].sort().values
         lafs = torch.cat([FRAME_SIGMAS * frames[..., :2], frames[..., 2:] - 0.5], -1)  # COLMAP's origin is the corner
-        descriptors = torch.from_numpy(np.array(found.data, np.float32).reshape(-1, 128))[order]
+        descriptors = torch.from_numpy(np.array(computed.data, np.float32).reshape(-1, 128))[order]
         return Features(lafs[order], sigma[order], root_sift(descriptors) if self.root else descriptors, size)
 
     def _extractor(self, shape: tuple[int, ...]) -> Any:

@@ -65,22 +65,6 @@ def outer_sum(a: Float[Tensor, " k *s"], b: Float[Tensor, " k *t"]) -> Tensor:
     return total
 
 
-def exact_sum(gain: Float[Tensor, "p m n"]) -> Float[Tensor, "p m"]:
-    """Sum over matches of gains in [0, 1], each first rounded, in place, so that the sum is exact."""
-    return rounded_to(gain, fractional_bits(gain.shape[-1], gain.dtype)).sum(-1)
-
-
-def fractional_bits(count: int, dtype: torch.dtype) -> int:
-    """Of so many numbers in [0, 1], for their sums to be exact: 10 (fewer beyond 2^14 numbers), 20 in float64."""
-    return 20 if dtype == torch.float64 else min(10, 24 - (count - 1).bit_length())
-
-
-def rounded_to(value: Tensor, bits: int) -> Tensor:
-    """Rounded to so many fractional bits b, in place: 1.5 * 2^(23 - b) is added to a float32 and subtracted again."""
-    magic = 1.5 * 2.0 ** ((52 if value.dtype == torch.float64 else 23) - bits)
-    return value.add_(magic).sub_(magic)
-
-
 def matmul3(a: Float[Tensor, "*batch 3 3"], b: Float[Tensor, "*batch2 3 3"]) -> Float[Tensor, "*batch3 3 3"]:
     """The product of 3 x 3 matrices, batched, in a fixed order of summation."""
     return a[..., :, 0:1] * b[..., 0:1, :] + a[..., :, 1:2] * b[..., 1:2, :] + a[..., :, 2:3] * b[..., 2:3, :]
@@ -161,15 +145,6 @@ def _sqrt(x: Tensor) -> Tensor:
     value = torch.empty_like(x)
     with np.errstate(invalid="ignore"):
         np.sqrt(x.detach().numpy(), out=value.numpy())
-    return value
-
-
-def exponential(x: Tensor) -> Tensor:
-    """exp(x) for |x| up to about 5 by arithmetic alone: library functions differ in the last bit with memory layout.
-
-    To rounding; written once for tensors and kernels.
-    """
-    value: Tensor = arithmetic_kernels.exponential(x)
     return value
 
 

@@ -6,28 +6,28 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fmtorch.compiling.arrays import Array, F4x2, F8x1, F8x2, I8x1, I8x2
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.lanes import LANES, absolute, fill, load, sqrt, store, where
+from fmtorch.compiling.scratch import matrix, vector
 from fmtorch.geometry.nullspace_kernels import equations, gather, null_space
 from fmtorch.geometry.orientation_kernels import consistently_oriented
 from fmtorch.geometry.rank2_kernels import EPS, nearest_rank2
 
-Array = NDArray[Any]
 WIDTH = 32  # partial sums over the matches: part of the last bits of a weighted fit
 SHIFT, RANK_TOLERANCE, SQUARINGS = 1e-14, 1e-12, 14  # as in `eigenvector`
 
 
-@kernel("f8[:, ::1], i8[:, ::1], f4[:, ::1], i8[::1]")
-def eight_point(points: Array, sample: Array, F: Array, draw: Array) -> int:
+@kernel
+def eight_point(points: F8x2, sample: I8x2, F: F4x2, draw: I8x1) -> int:
     """Consistently oriented models of samples (8, s) of points (4, n) -> F (s, 9), draw (s,); how many there are.
 
     As `minimal.eight_point_components`, in the order of the samples. Buffers are rows of LANES numbers, one a sample.
     """
-    X, N, A, B = np.empty((32, LANES)), np.empty((32, LANES)), np.empty((72, LANES)), np.empty((9, LANES))
-    work, there = np.empty((8, LANES)), np.empty((1, LANES), np.bool_)
-    centre, scale, f = np.empty((4, LANES)), np.empty((2, LANES)), np.empty(9)
+    X, N, A, B = matrix(32, LANES), matrix(32, LANES), matrix(72, LANES), matrix(9, LANES)
+    work, there = matrix(8, LANES), np.empty((1, LANES), np.bool_)
+    centre, scale, f = matrix(4, LANES), matrix(2, LANES), vector(9)
     models = 0
     for first in range(0, sample.shape[1], LANES):
         gather(points, sample, first, X)
@@ -92,8 +92,8 @@ def _denormalise(f: Array, image: int, s: float, cx: float, cy: float) -> None:
         f[c] -= f[a] * cx + f[b] * cy
 
 
-@kernel("f8[:, ::1], f8[::1], f8[::1]")
-def weighted_eight_point(points: Array, weight: Array, F: Array) -> bool:
+@kernel
+def weighted_eight_point(points: F8x2, weight: F8x1, F: F8x1) -> bool:
     """The F of least sum w (x1^T F x0)^2, made rank two, of unit norm, largest entry positive -> F (9,).
 
     `eight_point.eight_point` of points (4, n) and weights (n,), not negative: whether there is one.
@@ -105,7 +105,7 @@ def weighted_eight_point(points: Array, weight: Array, F: Array) -> bool:
         return False
     blocks = (n + WIDTH - 1) // WIDTH
     X, w = np.zeros((4, blocks * WIDTH)), np.zeros(blocks * WIDTH)
-    similarity = np.empty((2, 3))
+    similarity = matrix(2, 3)
     for i in range(n):
         w[i] = weight[i] / largest
         for k in range(4):
@@ -165,7 +165,7 @@ def _added(sums: Array) -> Any:
 @inner
 def _normal_matrix(X: Array, w: Array) -> Array:
     """The sum of w a a^T with a . vec(F) = x1^T F x0, (9, 9), of points (4, n), n a multiple of WIDTH."""
-    p, q, sums = np.empty((6, WIDTH)), np.empty((6, WIDTH)), np.zeros((36, WIDTH))
+    p, q, sums = matrix(6, WIDTH), matrix(6, WIDTH), np.zeros((36, WIDTH))
     for b in range(0, len(w), WIDTH):
         for i in range(WIDTH):
             x0, y0, x1, y1, v = X[0, b + i], X[1, b + i], X[2, b + i], X[3, b + i], w[b + i]
@@ -176,7 +176,7 @@ def _normal_matrix(X: Array, w: Array) -> Array:
             for c in range(6):
                 for i in range(WIDTH):
                     sums[6 * r + c, i] += q[r, i] * p[c, i]
-    M, product = np.empty((9, 9)), np.array(((0, 1, 3), (1, 2, 4), (3, 4, 5)))
+    M, product = matrix(9, 9), np.array(((0, 1, 3), (1, 2, 4), (3, 4, 5)))
     for i in range(9):
         for j in range(9):
             M[i, j] = _added(sums[6 * product[i // 3, j // 3] + product[i % 3, j % 3]])
@@ -191,8 +191,8 @@ def smallest_eigenvector(M: Array, v: Array) -> bool:
         trace += M[i, i]
     if not (trace > 0 and math.isfinite(trace)):
         return False
-    L, X, Y = np.eye(n), np.empty((n, n)), np.empty((n, n))
-    pivot = np.empty(n)
+    L, X, Y = np.eye(n), matrix(n, n), matrix(n, n)
+    pivot = vector(n)
     for i in range(n):
         for j in range(n):
             M[i, j] /= trace

@@ -1,7 +1,9 @@
 """The five-point algorithm on the samples of one pair, compiled; float64, LANES samples at a time, models in float32.
 
-As `five_point`: Nister (PAMI 2004), real roots by changes of sign on a grid. Buffers are rows of LANES numbers, one a
-sample.
+Nister, "An efficient solution to the five-point relative pose problem" (PAMI 2004). Real roots of the polynomial of
+degree ten are those across which it changes its sign between the points of a grid. Buffers are rows of LANES numbers,
+one a sample.
+E = x X + y Y + z Z + W; a monomial is a sorted triple of 0 to 3 for x, y, z, 1, in the order of the paper.
 """
 
 from __future__ import annotations
@@ -11,15 +13,15 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fmtorch.compiling.arrays import Array, F4x2, F8x1, F8x2, I8x1, I8x2
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.lanes import LANES, fill, load, sqrt, store, where
+from fmtorch.compiling.scratch import matrix
 from fmtorch.geometry.nullspace_kernels import equations, gather, null_space
 from fmtorch.geometry.orientation_kernels import consistently_oriented
 from fmtorch.geometry.real_roots_kernels import DEGREE, real_roots, room_for_roots
 
-Array = NDArray[Any]
 _MONOMIALS = (
     "000", "111", "001", "011", "002", "003", "112", "113", "012", "013",
     "022", "023", "033", "122", "123", "133", "222", "223", "233", "333",
@@ -29,17 +31,17 @@ FIRST, SECOND = (np.array([pair[k] for pair in _PAIRS]) for k in (0, 1))
 MONOMIAL = np.array([[_MONOMIALS.index("".join(map(str, sorted((*pair, c))))) for c in range(4)] for pair in _PAIRS])
 
 
-@kernel("f8[:, ::1], i8[:, ::1], f8[:, ::1], f8[::1], f4[:, ::1], i8[::1]")
-def five_point(points: Array, sample: Array, depth: Array, offset: Array, F: Array, draw: Array) -> int:
+@kernel
+def five_point(points: F8x2, sample: I8x2, depth: F8x2, offset: F8x1, F: F4x2, draw: I8x1) -> int:
     """Consistently oriented models of samples (5, s) of points (4, n) -> F (10 s, 9), draw (10 s,); their number.
 
     points: from the principal points. depth: (2, s), the focal lengths of each sample, in the unit of the points.
     offset: (4,), from the centre of the coordinates that F is for to the principal points. In the order of the samples.
     """
-    X, depths, A, e = np.empty((20, LANES)), np.empty((2, LANES)), np.empty((45, LANES)), np.empty((36, LANES))
-    scale, C, B, p = np.empty((5, LANES)), np.empty((200, LANES)), np.empty((45, LANES)), np.empty((11, LANES))
+    X, depths, A, e = matrix(20, LANES), matrix(2, LANES), matrix(45, LANES), matrix(36, LANES)
+    scale, C, B, p = matrix(5, LANES), matrix(200, LANES), matrix(45, LANES), matrix(11, LANES)
     roots, right = room_for_roots(), np.empty((DEGREE, LANES), np.bool_)
-    E, uncalibrated = np.empty((9, LANES)), np.empty((DEGREE, 9, LANES))
+    E, uncalibrated = matrix(9, LANES), np.empty((DEGREE, 9, LANES))
     models = 0
     for first in range(0, sample.shape[1], LANES):
         gather(points, sample, first, X)
@@ -75,7 +77,7 @@ def _constraints(e: Array, A: Array) -> None:
 
     e: (4 9, LANES), the basis X, Y, Z, W.
     """
-    Q, N, zero = np.empty((9, LANES)), np.empty((3, LANES)), fill(0.0)
+    Q, N, zero = matrix(9, LANES), matrix(3, LANES), fill(0.0)
     for r in range(200):
         store(A, r, zero)
     for pair in range(10):
@@ -155,7 +157,7 @@ def _polynomials(A: Array, B: Array) -> None:
 @inner
 def _determinant(B: Array, p: Array) -> None:
     """The determinant of B, a polynomial of degree ten -> p (11, LANES)."""
-    minor, zero = np.empty((7, LANES)), fill(0.0)
+    minor, zero = matrix(7, LANES), fill(0.0)
     for q in range(11):
         store(p, q, zero)
     for r in range(3):
@@ -179,7 +181,7 @@ def _multiply(a: Array, o: int, m: int, b: Array, q: int, n: int, sign: float, o
 @inner
 def _essential(B: Array, e: Array, far: Any, z: Any, E: Array) -> Any:
     """The essential matrix of a root of each sample, of unit norm -> E (9, LANES); a mask: whether there is one."""
-    m = np.empty((9, LANES))
+    m = matrix(9, LANES)
     for q in range(9):
         value = where(far, load(B, 5 * q + 4), load(B, 5 * q))
         for d in range(1, 5):

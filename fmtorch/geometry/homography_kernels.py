@@ -1,4 +1,7 @@
-"""`homography` for one model, compiled; matrices are (9,), row by row, points (4, n), float64."""
+"""Homographies and the planes they stand for: ``x1 ~ H x0``. Matrices are (9,), row by row, points (4, n), float64.
+
+Hartley & Zisserman (2004), Multiple View Geometry, chapters 4 and 13.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.compiling.kernel import inner
+from fmtorch.compiling.arrays import F8x1, F8x2
+from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.scratch import matrix, vector
 from fmtorch.geometry.eight_point_kernels import smallest_eigenvector
-from fmtorch.geometry.rank2_kernels import EPS
+from fmtorch.geometry.rank2_kernels import EPS, unit
 
 Array = NDArray[Any]
-ROUNDING = 16 * EPS  # as in `homography.plane_and_parallax`
+ROUNDING = 16 * EPS  # of cross products that should vanish, as of a match taken twice
 
 
 @inner
@@ -36,8 +41,8 @@ def maps(H: Array, x: float, y: float, u: float, v: float, limit: float) -> Any:
 
 @inner
 def near_plane(H: Array, points: Array, limit: float, out: Array) -> int:
-    """Which matches have a `homography.transfer_squared` up to the limit -> out (n,); how many."""
-    A, count = np.empty(9), 0
+    """Which matches H and its inverse map to within a squared distance of each other -> out (n,); how many."""
+    A, count = vector(9), 0
     adjugate(H, A)
     x0, y0, x1, y1 = points[0], points[1], points[2], points[3]
     for i in range(len(out)):
@@ -56,8 +61,12 @@ def cross_times(e: Array, A: Array, out: Array) -> None:
 
 @inner
 def plane_homography(F: Array, e1: Array, points: Array, triplet: Array, H: Array) -> bool:
-    """`homography.plane_homography` through the matches (3,) of a triplet -> H; whether it is determined."""
-    A, b, M = np.empty(9), np.empty(3), np.empty((3, 3))
+    """The homography of the plane through the matches (3,) of a triplet that satisfy F -> H; if it is determined.
+
+    ``H = A - e1 (M^-1 b)^T`` with ``A = [e1]_x F``, the rows of M the points in image 0, and
+    ``b_i = (x1_i x (A x0_i)) . (x1_i x e1) / |x1_i x e1|^2`` (result 13.6). e1: the epipole in image 1, ``F^T e1 = 0``.
+    """
+    A, b, M = vector(9), vector(3), matrix(3, 3)
     cross_times(e1, F, A)
     for k in range(3):
         i = triplet[k]
@@ -69,7 +78,7 @@ def plane_homography(F: Array, e1: Array, points: Array, triplet: Array, H: Arra
         if not length2 > 0:
             return False
         b[k] = ((y1 * r - q) * cx + (p - x1 * r) * cy + (x1 * q - y1 * p) * cz) / length2
-    determinant, v = 0.0, np.empty(3)
+    determinant, v = 0.0, vector(3)
     for c in range(3):  # Cramer's rule
         d, e = (c + 1) % 3, (c + 2) % 3
         qr, rp = M[1, d] * M[2, e] - M[1, e] * M[2, d], M[2, d] * M[0, e] - M[2, e] * M[0, d]
@@ -86,8 +95,11 @@ def plane_homography(F: Array, e1: Array, points: Array, triplet: Array, H: Arra
 
 @inner
 def plane_and_parallax(H: Array, points: Array, i: int, j: int, F: Array) -> bool:
-    """`homography.plane_and_parallax` of a plane and the matches i and j -> F; whether there is one."""
-    lines, e, size2 = np.empty((2, 3)), np.empty(3), 0.0
+    """The fundamental matrix of a plane's homography and matches i and j off it -> F, of unit norm; if there is one.
+
+    ``F = [e1]_x H``: the lines through x1 and H x0 of both matches meet in the epipole e1 (section 13.2).
+    """
+    lines, e, size2 = matrix(2, 3), vector(3), 0.0
     for k in range(9):
         size2 += H[k] * H[k]
     for k in range(2):
@@ -112,20 +124,23 @@ def plane_and_parallax(H: Array, points: Array, i: int, j: int, F: Array) -> boo
 
 
 @inner
-def least_squares_homography(points: Array, inside: Array, H: Array) -> bool:
-    """`homography.least_squares_homography` of the matches inside -> H; whether it is determined."""
-    T, S, M = np.empty((2, 3)), np.zeros((4, 3, 3)), np.zeros((9, 9))
+def least_squares_homography(points: Array, weight: Array, H: Array) -> bool:
+    """The normalised DLT of matches (n,) by their weights, or of those inside -> H; whether it is determined.
+
+    Hartley & Zisserman (2004), algorithm 4.2.
+    """
+    T, S, M = matrix(2, 3), np.zeros((4, 3, 3)), np.zeros((9, 9))
     for image in range(2):
-        if not _similarity(points[2 * image], points[2 * image + 1], inside, T[image]):
+        if not _similarity(points[2 * image], points[2 * image + 1], weight, T[image]):
             return False
     s0, s1, h = T[0, 0], T[1, 0], np.ones(3)
-    for i in range(len(inside)):
-        if inside[i]:
+    for i in range(len(weight)):
+        if weight[i] > 0:
             h[0], h[1] = (points[0, i] - T[0, 1]) * s0, (points[1, i] - T[0, 2]) * s0
             x, y = (points[2, i] - T[1, 1]) * s1, (points[3, i] - T[1, 2]) * s1
             for r in range(3):
                 for c in range(r, 3):
-                    product = h[r] * h[c]
+                    product = h[r] * h[c] * (1.0 * weight[i])
                     S[0, r, c] += product
                     S[1, r, c] -= x * product
                     S[2, r, c] -= y * product
@@ -149,21 +164,36 @@ def least_squares_homography(points: Array, inside: Array, H: Array) -> bool:
 
 
 @inner
-def _similarity(x: Array, y: Array, inside: Array, out: Array) -> bool:
-    """Scale and centre of the points inside, as `normalize_points` has them -> out (3,); False where there are none."""
+def _similarity(x: Array, y: Array, weight: Array, out: Array) -> bool:
+    """Scale and centre of the points of weight, as of `normalize_points` -> out (3,); False where there are none."""
     count, cx, cy, distance = 0, 0.0, 0.0, 0.0
-    for i in range(len(inside)):
-        if inside[i]:
+    for i in range(len(weight)):
+        if weight[i] > 0:
             count += 1
             cx += x[i]
             cy += y[i]
     if count == 0:
         return False
     cx, cy = cx / count, cy / count
-    for i in range(len(inside)):
-        if inside[i]:
+    for i in range(len(weight)):
+        if weight[i] > 0:
             distance += math.sqrt((x[i] - cx) * (x[i] - cx) + (y[i] - cy) * (y[i] - cy))
     distance /= count
     out[0] = 2**0.5 / distance if distance > 4 * EPS * max(abs(cx), abs(cy)) else 1.0
     out[1], out[2] = cx, cy
+    return True
+
+
+@kernel
+def weighted_homography(points: F8x2, weight: F8x1, H: F8x1) -> bool:
+    """`least_squares_homography`, positive at most of the weight -> H (9,); whether it is determined."""
+    if not least_squares_homography(points, weight, H):
+        return False
+    front, total = 0.0, 0.0
+    for i in range(len(weight)):
+        total += weight[i]
+        front += weight[i] if H[6] * points[0, i] + H[7] * points[1, i] + H[8] > 0 else 0.0
+    for q in range(9):
+        H[q] = -H[q] if 2 * front < total else H[q]
+    unit(H)
     return True

@@ -17,7 +17,7 @@ from fmtorch.geometry.normalized_matches import NormalizedMatches
 from fmtorch.geometry.rank2 import nearest_rank2
 from fmtorch.geometry.rank2_manifold import RANK_TWO, constant
 from fmtorch.geometry.residuals import homogeneous, linearise
-from fmtorch.geometry.robust_kernels import Kernel, named_kernel
+from fmtorch.geometry.robust_losses import Kernel, named_kernel
 
 Weigh = Callable[[Tensor | None, Tensor | None], Tensor]
 
@@ -50,7 +50,7 @@ def irls(
         F0: one matrix for each set of matches, or K of them, (*batch, K, 3, 3).
         weight: not negative, 1 by default.
         mask: False in slots to ignore; matches that are not finite are ignored too.
-        kernel: a name of `robust_kernels.KERNELS`.
+        kernel: a name of `robust_losses.KERNELS`.
         scale: of the kernel, in pixels (a number, or one per set).
         iterations: reweighted fits.
         gradient: "implicit", that of the fixed point F = fit(F, points, weights) by the implicit function theorem (see

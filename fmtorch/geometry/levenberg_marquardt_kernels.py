@@ -6,7 +6,7 @@ So a whole fit is one call, between whose steps nothing waits for Python.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,15 @@ from numpy.typing import NDArray
 from fmtorch.compiling.kernel import inner
 
 Array = NDArray[Any]
+
+
+class Schedule(NamedTuple):
+    """iterations: steps at most. damping: of the first. tolerance: a model is done once a step has lowered its cost by
+    no more than this share of it; 0: none is ever done."""
+
+    iterations: int
+    damping: float
+    tolerance: float
 
 
 def levenberg_marquardt(

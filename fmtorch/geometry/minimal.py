@@ -1,4 +1,4 @@
-"""Minimal solvers as component-first cores: the seven-point and the eight-point algorithm over many samples at once.
+"""The seven-point algorithm as a component-first core, over many samples at once.
 
 Points come as (4, n, *s): the rows x0, y0, x1, y1, then the points of a sample, then any sample axes. Every operation
 is element-wise over the samples, so a sample's result has the same bits whatever stands beside it. A sample that is
@@ -11,10 +11,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.geometry.arithmetic import component_sum, determinant, sqrt
+from fmtorch.geometry.arithmetic import determinant, sqrt
 from fmtorch.geometry.cubic import cubic_roots
 from fmtorch.geometry.nullspace import null_space
-from fmtorch.geometry.rank2 import rank2_components
 
 
 def seven_point_components(
@@ -34,23 +33,6 @@ def seven_point_components(
     valid = real & full_rank & finite
     F = a * F0[:, None] + b * F1[:, None]
     return torch.where(valid, F, 0.0), valid
-
-
-def eight_point_components(points: Float[Tensor, " 4 8 *s"]) -> tuple[Float[Tensor, " 9 *s"], Bool[Tensor, "*s"]]:
-    """The fundamental matrix of eight correspondences, unit Frobenius norm, and whether there is one.
-
-    Each sample is normalised (Hartley 1997), the null vector of its equations made rank two, and the normalisation
-    undone.
-    """
-    points, finite = _finite(points)
-    normalised, scale, centroid, spread = _hartley(points)
-    null, full_rank = null_space(_equations(normalised))
-    f = rank2_components(null[0]).to(torch.float64).reshape(3, 3, *null.shape[2:])
-    F = _denormalise(f, scale.to(f.dtype), centroid.to(f.dtype)).reshape(9, *null.shape[2:])
-    norm = component_sum(F * F)
-    valid = full_rank & finite & spread & (norm > 0)
-    F = F / sqrt(torch.where(valid, norm, 1.0))
-    return torch.where(valid, F, 0.0).to(points.dtype), valid
 
 
 def _finite(points: Tensor) -> tuple[Tensor, Tensor]:
@@ -89,26 +71,3 @@ def _cubic(basis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     c0, c3 = torch.where(exchanged, q1, q0), torch.where(exchanged, q0, q1)
     c2, c1 = (s + d) / 2 - c0, (s - d) / 2 - c3
     return F0, F1, torch.stack([c3, c2, c1, c0])
-
-
-def _hartley(points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Normalised points, and per image the scale (2, *s), the centroid (2, 2, *s); whether the points differ at all."""
-    x = points.reshape(2, 2, *points.shape[1:])
-    centroid = component_sum(x, 2) / x.shape[2]
-    centred = x - centroid[:, :, None]
-    d2 = component_sum(centred * centred, 1)
-    away = d2 > 0
-    distance = torch.where(away, sqrt(torch.where(away, d2, 1.0)), 0.0)
-    mean = component_sum(distance, 1) / x.shape[2]
-    spread = mean > 4 * torch.finfo(x.dtype).eps * centroid.detach().abs().amax(1)
-    scale = torch.where(spread, 2**0.5 / torch.where(spread, mean, 1.0), 1.0)
-    return (centred * scale[:, None, None]).reshape(points.shape), scale, centroid, spread.all(0)
-
-
-def _denormalise(F: Tensor, scale: Tensor, centroid: Tensor) -> Tensor:
-    """T1^T F T0 for T = [s, 0, -s cx; 0, s, -s cy; 0, 0, 1], component-first (3, 3, *s)."""
-    for image in (1, 0):  # F's rows belong to image 1, its columns to image 0: two passes, transposing in between
-        xy = F[:2] * scale[image]
-        last = F[2] - (xy[0] * centroid[image, 0] + xy[1] * centroid[image, 1])
-        F = torch.cat([xy, last[None]]).transpose(0, 1)
-    return F

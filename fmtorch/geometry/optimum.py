@@ -11,7 +11,7 @@ from torch import Tensor
 from fmtorch.geometry.arithmetic import as_rows, cofactors, component_sum, sqrt, stable_sum, unit
 from fmtorch.geometry.rank2_manifold import RANK_TWO, constant, start
 from fmtorch.geometry.residuals import homogeneous, linearise
-from fmtorch.geometry.robust_kernels import Kernel
+from fmtorch.geometry.robust_losses import Kernel
 from fmtorch.geometry.sampson_objective import SampsonObjective
 
 STEP_DAMPING = 1e-10  # of the attached step: bounds its gradient where the points leave a direction open

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.compiling.kernel import inner
+from fmtorch.compiling.scratch import vector
 
 Array = NDArray[Any]
 EPS = float(np.finfo(np.float64).eps)
@@ -60,7 +61,7 @@ def complement(v: Array, p: Array, q: Array) -> None:
 @inner
 def nearest_rank2(F: Array) -> None:
     """Makes F the nearest matrix of rank two, F - F v v^T, in place, as `rank2.rank2_components`."""
-    v = np.empty(3)
+    v = vector(3)
     last_right_singular_vector(F, v)
     for r in range(3):
         along = F[3 * r] * v[0] + F[3 * r + 1] * v[1] + F[3 * r + 2] * v[2]
@@ -71,7 +72,7 @@ def nearest_rank2(F: Array) -> None:
 @inner
 def last_right_singular_vector(F: Array, v: Array) -> None:
     """The unit right singular vector of the smallest singular value -> v, as `rank2.last_right_singular_vector`."""
-    G, C, K = np.empty(9), np.empty(9), np.empty(9)
+    G, C, K = vector(9), vector(9), vector(9)
     for i in range(9):
         G[i] = F[i]
     _scale(G)
@@ -124,7 +125,7 @@ def _longest(A: Array) -> tuple[int, float]:
 @inner
 def _across_longest(A: Array, v: Array) -> None:
     """A unit vector perpendicular to the longest row of A -> v."""
-    row, other = np.zeros(3), np.empty(3)
+    row, other = np.zeros(3), vector(3)
     best, length2 = _longest(A)
     for c in range(3):
         row[c] = A[3 * best + c] / math.sqrt(length2) if length2 > 0 else 0.0
@@ -142,7 +143,7 @@ def _largest_eigenvector(K: Array, v: Array) -> None:
     m = math.sqrt(squares / 6)
     for i in range(9):
         K[i] /= m if m > 0 else 1.0
-    C = np.empty(9)
+    C = vector(9)
     cofactors(K, C)
     determinant = min(max(K[0] * C[0] + K[1] * C[1] + K[2] * C[2], -2.0), 2.0)
     y = 2.0

@@ -7,6 +7,7 @@ import numpy as np
 from fmtorch.compiling.arrays import Array, F8x1, F8x2
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.lanes import LANES, load, store
+from fmtorch.compiling.scratch import matrix, vector
 from fmtorch.geometry.rank2_kernels import assign, cofactors, unit
 from fmtorch.geometry.sampson_objective_kernels import Weighted, evaluate
 
@@ -19,7 +20,7 @@ def start_one(F: Array, squarings: int, G: Array, e0: Array, e1: Array) -> None:
 
     squarings: of the matrix whose columns tend to the null vector; more for models that are farther from rank 2.
     """
-    C, K, P = np.empty(9), np.empty((3, 3)), np.empty((3, 3))
+    C, K, P = vector(9), matrix(3, 3), matrix(3, 3)
     for i in range(9):
         G[i] = F[i]
     unit(G)
@@ -60,9 +61,9 @@ def start_one(F: Array, squarings: int, G: Array, e0: Array, e1: Array) -> None:
 @kernel(holds_gil=True)
 def gauss_newton(F: F8x1, matches: Weighted, damping: float, out: F8x1) -> None:
     """One damped Gauss-Newton step of a model (9,) on the manifold -> out (9,), of unit norm."""
-    at, e0, e1 = np.empty((1, 9)), np.empty((1, 3)), np.empty((1, 3))
-    moved, g0, g1 = np.empty((1, 9)), np.empty((1, 3)), np.empty((1, 3))
-    products, cost = np.empty((1, 10, 10)), np.empty(1)
+    at, e0, e1 = matrix(1, 9), matrix(1, 3), matrix(1, 3)
+    moved, g0, g1 = matrix(1, 9), matrix(1, 3), matrix(1, 3)
+    products, cost = np.empty((1, 10, 10)), vector(1)
     start_one(F, SQUARINGS, at[0], e0[0], e1[0])
     evaluate(at, matches, True, products, cost)
     steps(products, at, e0, e1, np.full(1, damping), moved, g0, g1)
@@ -75,8 +76,8 @@ def response(F: F8x1, matches: Weighted, damping: float, out: F8x2) -> None:
 
     By the implicit function theorem, in the tangent space of the manifold, with Gauss and Newton's Hessian.
     """
-    at, e0, e1 = np.empty((1, 9)), np.empty((1, 3)), np.empty((1, 3))
-    products, cost, Q = np.empty((1, 10, 10)), np.empty(1), np.zeros((20, LANES))
+    at, e0, e1 = matrix(1, 9), matrix(1, 3), matrix(1, 3)
+    products, cost, Q = np.empty((1, 10, 10)), vector(1), np.zeros((20, LANES))
     start_one(F, SQUARINGS, at[0], e0[0], e1[0])
     evaluate(at, matches, True, products, cost)
     for j in range(9):
@@ -96,7 +97,7 @@ def steps(
 
     products: (k, 10, 10), of `sampson_objective_kernels.evaluate`. damping: (k,).
     """
-    Q, C = np.zeros((20, LANES)), np.empty(9)
+    Q, C = np.zeros((20, LANES)), vector(9)
     for k in range(len(F)):
         _system(products[k], F[k], e0[k], e1[k], damping[k], Q)
         for r in range(9):

@@ -1,6 +1,7 @@
 """Real roots of polynomials of degree ten, LANES samples at a time, compiled: signs on a grid, then Newton.
 
-As in `five_point`: the projective line in two charts. Buffers are rows of LANES numbers, one a sample.
+The projective line in two charts; two roots within one interval of the grid are not found, a tenth of all roots of the
+five-point algorithm. Buffers are rows of LANES numbers, one a sample.
 """
 
 from __future__ import annotations
@@ -13,9 +14,10 @@ from numpy.typing import NDArray
 
 from fmtorch.compiling.kernel import inner
 from fmtorch.compiling.lanes import LANES, absolute, any_lane, fill, load, store, where
+from fmtorch.compiling.scratch import matrix
 
 Array = NDArray[Any]
-KNOTS, POLISHING_STEPS = 33, 4  # of the grid in each of two charts; as in `five_point`
+KNOTS, POLISHING_STEPS = 33, 4  # of the grid in each of two charts; of Newton's method, from the secant
 DEGREE = 10
 
 
@@ -38,9 +40,9 @@ class Roots(NamedTuple):
 @inner
 def room_for_roots() -> Any:
     """Buffers for `real_roots`."""
-    z, far, found = np.empty((DEGREE, LANES)), np.empty((DEGREE, LANES), np.bool_), np.empty((DEGREE, LANES), np.bool_)
-    low, high = np.empty((DEGREE, LANES)), np.empty((DEGREE, LANES))
-    return Roots(z, far, found, low, high, np.empty((DEGREE, LANES)), np.empty((DEGREE, LANES)))
+    z, far, found = matrix(DEGREE, LANES), np.empty((DEGREE, LANES), np.bool_), np.empty((DEGREE, LANES), np.bool_)
+    low, high = matrix(DEGREE, LANES), matrix(DEGREE, LANES)
+    return Roots(z, far, found, low, high, matrix(DEGREE, LANES), matrix(DEGREE, LANES))
 
 
 @inner
@@ -54,7 +56,7 @@ def real_roots(p: Array, valid: Any, roots: Any) -> int:
         magnitude = absolute(load(p, d))
         size = where(magnitude <= size, size, magnitude)
     valid = valid & (size > 0.0) & (size < math.inf)
-    values, change, number = np.empty((KNOTS, LANES)), np.empty((1, LANES), np.bool_), np.zeros(LANES, np.int64)
+    values, change, number = matrix(KNOTS, LANES), np.empty((1, LANES), np.bool_), np.zeros(LANES, np.int64)
     for s in range(DEGREE):
         store(roots.found, s, size != size)
         store(roots.far, s, size != size)
@@ -78,7 +80,7 @@ def real_roots(p: Array, valid: Any, roots: Any) -> int:
                     roots.below[s, i], roots.above[s, i] = values[k, i], values[k + 1, i]
                     number[i] = s + 1
                     most = max(most, s + 1)
-    coefficients = np.empty((DEGREE + 1, LANES))
+    coefficients = matrix(DEGREE + 1, LANES)
     for s in range(most):
         _polish(p, s, roots, coefficients)
     return most

@@ -20,18 +20,16 @@ from fmtorch.geometry.optimum import STEP_DAMPING, Step, at_optimum, gradient_of
 from fmtorch.geometry.rank2_manifold import (
     RANK_TWO,
     RANK_TWO_EPIPOLE,
-    SQUARINGS,
     constant,
     constrained_solve,
     retract,
     solve,
     start,
 )
-from fmtorch.geometry.robust_kernels import named_kernel
+from fmtorch.geometry.robust_losses import named_kernel
 from fmtorch.geometry.sampson_objective import SampsonObjective
 
 DAMPING = Damping(1e-4, 1e-12, 1e6)
-RANK_TWO_ALREADY = 1  # squarings that suffice where the last singular value is but rounding of float32
 
 
 def refine_components(
@@ -42,8 +40,6 @@ def refine_components(
     scale: Float[Tensor, " p"] | Float[Tensor, "p slots"],
     iterations: int,
     tolerance: float = 0.0,
-    squarings: int = SQUARINGS,
-    damping: float = DAMPING.first,
     steps: list[Step] | None = None,
 ) -> tuple[Float[Tensor, "9 p k"], Float[Tensor, "p k"]]:
     """Refined models and their costs ``sum_i w_i rho(r_i^2)``, component by component, without gradients.
@@ -52,14 +48,14 @@ def refine_components(
     of about unit scale; finite. weight: 0 in padded slots. scale: of the kernel, in the unit of the points,
     one for all matches of a pair, (p,) or (p, 1), or one for each (p, n).
     iterations: at most. tolerance: a model is done once a step has lowered its cost by no more than this share of it.
-    squarings: of `start`. damping: of the first step. steps: where given, those taken are appended to it.
+    steps: where given, those taken are appended to it.
     The cost of a model never rises above that of its (rank-2) start; a model that cannot be improved is kept, one that
     is not finite comes back as it was, with infinite cost.
     """
     with torch.no_grad():
         sampson = SampsonObjective(points, weight, named_kernel(kernel), scale)
-        objective = _RankTwoObjective(sampson, DAMPING._replace(first=damping), tolerance or None, steps)
-        state = levenberg_marquardt(objective, start(F, squarings), iterations)
+        objective = _RankTwoObjective(sampson, DAMPING, tolerance or None, steps)
+        state = levenberg_marquardt(objective, start(F), iterations)
         kept = torch.isfinite(state.cost)
         return torch.where(kept, state.F, F), torch.where(kept, state.cost, torch.inf)
 
@@ -88,7 +84,7 @@ def refine(
         x1: their matches in image 1.
         weight: not negative, 1 by default.
         mask: False in slots to ignore, whatever they hold; a match that is not finite is ignored too.
-        kernel: a name of `robust_kernels.KERNELS`.
+        kernel: a name of `robust_losses.KERNELS`.
         scale: of the kernel, in pixels (a number, or one per set).
         iterations: Levenberg-Marquardt steps.
         gradient: "implicit", that of the optimum by the implicit function theorem, with the exact Hessian; there is

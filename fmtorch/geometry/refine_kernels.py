@@ -8,7 +8,8 @@ import numpy as np
 
 from fmtorch.compiling.arrays import Array, F8x1, F8x2
 from fmtorch.compiling.kernel import inner, kernel
-from fmtorch.geometry.levenberg_marquardt_kernels import levenberg_marquardt
+from fmtorch.compiling.scratch import matrix, vector
+from fmtorch.geometry.levenberg_marquardt_kernels import Schedule, levenberg_marquardt
 from fmtorch.geometry.rank2_kernels import assign, assign_rows
 from fmtorch.geometry.rank2_manifold_kernels import start_one, steps
 from fmtorch.geometry.sampson_objective_kernels import Weighted, evaluate
@@ -26,16 +27,6 @@ class _State(NamedTuple):
     cost: Array
 
 
-class Schedule(NamedTuple):
-    """iterations: steps at most. damping: of the first. tolerance: a model is done once a step has lowered its cost by
-    no more than this share of it; 0: none is ever done. squarings: of `start_one`."""
-
-    iterations: int
-    damping: float
-    tolerance: float
-    squarings: int
-
-
 class _Data(NamedTuple):
     """The matches; tolerance: of the schedule."""
 
@@ -44,14 +35,17 @@ class _Data(NamedTuple):
 
 
 @kernel
-def refine(F: F8x2, matches: Weighted, schedule: Schedule, out: F8x2, cost: F8x1) -> None:
-    """Models (k, 9) made rank 2 and refined -> out (k, 9), cost (k,); what cannot be is not finite, nor its cost."""
+def refine(F: F8x2, squarings: int, matches: Weighted, schedule: Schedule, out: F8x2, cost: F8x1) -> None:
+    """Models (k, 9) made rank 2 and refined -> out (k, 9), cost (k,); what cannot be is not finite, nor its cost.
+
+    squarings: of `start_one`.
+    """
     k = len(F)
-    state = _State(out, np.empty((k, 3)), np.empty((k, 3)), np.empty((k, 10, 10)), cost)
-    trial = _State(np.empty((k, 9)), np.empty((k, 3)), np.empty((k, 3)), np.empty((k, 10, 10)), np.empty(k))
+    state = _State(out, matrix(k, 3), matrix(k, 3), np.empty((k, 10, 10)), cost)
+    trial = _State(matrix(k, 9), matrix(k, 3), matrix(k, 3), np.empty((k, 10, 10)), vector(k))
     data = _Data(matches, schedule.tolerance)
     for i in range(k):
-        start_one(F[i], schedule.squarings, state.F[i], state.e0[i], state.e1[i])
+        start_one(F[i], squarings, state.F[i], state.e0[i], state.e1[i])
     _minimise(data, state, trial, np.full(k, schedule.damping), schedule.iterations, schedule.tolerance > 0)
 
 

@@ -1,4 +1,4 @@
-"""Sampson distances component by component: values alone for scores, and with derivatives for fits.
+"""Sampson distances component by component, with derivatives for fits.
 
 ``r = e / g`` with ``e = x1^T F x0`` and ``g^2`` the squared norm of the first two entries of ``F x0`` and ``F^T x1``
 together (Hartley & Zisserman 2004, equation 11.9). Element-wise, so that a distance has the same bits in any batch;
@@ -13,24 +13,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 TINY = 1e-30  # squared slope of the epipolar constraint below which it is taken for this, in fits
-
-
-def sampson_squared(F: Float[Tensor, "9 p m"], points: Float[Tensor, "4 p n"]) -> Float[Tensor, "p m n"]:
-    """Squared Sampson distances of every point to every model."""
-    return sampson_squared_of(F[..., None], points[:, :, None])
-
-
-def sampson_squared_of(F: Float[Tensor, " 9 *s"], points: Float[Tensor, " 4 *t"]) -> Tensor:
-    """The same of nine entries of models and four of points, which broadcast, in products of which torch makes few."""
-    x0, y0, x1, y1 = points
-    a0 = (F[0] * x0).addcmul_(F[1], y0).add_(F[2])  # F x0: the epipolar line in image 1
-    b0 = (F[3] * x0).addcmul_(F[4], y0).add_(F[5])
-    error = (F[6] * x0).addcmul_(F[7], y0).add_(F[8]).addcmul_(a0, x1).addcmul_(b0, y1)
-    a1 = (F[0] * x1).addcmul_(F[3], y1).add_(F[6])  # F^T x1: the epipolar line in image 0
-    b1 = (F[1] * x1).addcmul_(F[4], y1).add_(F[7])
-    slope: Tensor = a0.square_().addcmul_(b0, b0).addcmul_(a1, a1).addcmul_(b1, b1)
-    distance: Tensor = error.square_().div_(slope.clamp_min_(torch.finfo(slope.dtype).tiny))
-    return distance
 
 
 def homogeneous(points: Float[Tensor, " 4 *s"]) -> Float[Tensor, " 2 3 *s"]:

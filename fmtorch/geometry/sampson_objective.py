@@ -12,7 +12,7 @@ from torch import Tensor
 
 from fmtorch.geometry.arithmetic import component_sum, stable_sum
 from fmtorch.geometry.residuals import homogeneous, linearise
-from fmtorch.geometry.robust_kernels import Kernel
+from fmtorch.geometry.robust_losses import Kernel
 
 LANES = 64  # points are summed in blocks of so many, and these one by one: part of the result's last bits
 TILE_MODELS = 24  # models whose sums stay in the L2 cache together; changes no result

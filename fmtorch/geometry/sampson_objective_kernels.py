@@ -10,6 +10,7 @@ import numpy as np
 from fmtorch.compiling.arrays import Array, F8x1, F8x2, F8x3
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.lanes import LANES, added, fill, load, sqrt, store, where
+from fmtorch.compiling.scratch import matrix
 from fmtorch.geometry.arithmetic_kernels import logarithm_1p
 from fmtorch.geometry.magsac import LOSS_TABLE
 
@@ -44,7 +45,7 @@ class Weighted(NamedTuple):
 def evaluate(F: F8x2, weighted: Weighted, derivatives: bool, products: F8x3, cost: F8x1) -> None:
     """`SampsonObjective` of models (k, 9) -> products (k, 10, 10), if wanted; cost (k,)."""
     matches, loss, table = in_rows(weighted.points, weighted.weight, weighted.s2), weighted.loss, weighted.table
-    sums, J, scaled, work = np.empty((55, LANES)), np.empty((10, LANES)), np.empty((10, LANES)), np.empty((3, LANES))
+    sums, J, scaled, work = matrix(55, LANES), matrix(10, LANES), matrix(10, LANES), matrix(3, LANES)
     for k in range(len(F)):
         costs = fill(0.0)
         for q in range(55 if derivatives else 0):
@@ -54,7 +55,7 @@ def evaluate(F: F8x2, weighted: Weighted, derivatives: bool, products: F8x3, cos
             share, slope = robust(r2, load(matches, row + 5), loss, table, work)
             costs += share * load(matches, row + 4)
             if derivatives:
-                _add_products(J, inverse * (load(matches, row + 4) * slope), scaled, sums)
+                add_products(J, inverse * (load(matches, row + 4) * slope), scaled, sums)
         cost[k] = added(costs)
         q = 0
         for r in range(10 if derivatives else 0):
@@ -144,7 +145,7 @@ def _tabulated(table: Array, work: Array) -> None:
 
 
 @inner
-def _add_products(J: Array, factor: Any, weighted: Array, sums: Array) -> None:
+def add_products(J: Array, factor: Any, weighted: Array, sums: Array) -> None:
     """Adds the lower triangle of the weighted products of Jacobian and residual, row by row."""
     for r in range(10):
         store(weighted, r, load(J, r) * factor)

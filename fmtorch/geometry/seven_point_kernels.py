@@ -6,29 +6,28 @@ Buffers are rows of LANES numbers, one a sample.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fmtorch.compiling.arrays import Array, F4x2, F8x2, I8x1, I8x2
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.lanes import LANES, absolute, load, store
+from fmtorch.compiling.scratch import matrix, vector
 from fmtorch.geometry.cubic_kernels import cubic_roots
 from fmtorch.geometry.nullspace_kernels import equations, gather, null_space
 from fmtorch.geometry.orientation_kernels import consistently_oriented
 
-Array = NDArray[Any]
 HALF = 0.5**0.5
 
 
-@kernel("f8[:, ::1], i8[:, ::1], f4[:, ::1], i8[::1]")
-def seven_point(points: Array, sample: Array, F: Array, draw: Array) -> int:
+@kernel
+def seven_point(points: F8x2, sample: I8x2, F: F4x2, draw: I8x1) -> int:
     """Consistently oriented models of samples (7, s) of points (4, n) -> F (3 s, 9), draw (3 s,); how many there are.
 
     They stand in the order of the samples, and of one sample in that of `minimal.seven_point_components`.
     """
-    X, A, B, scale = np.empty((28, LANES)), np.empty((63, LANES)), np.empty((18, LANES)), np.empty((7, LANES))
-    p, mixed, there = np.empty((4, LANES)), np.empty((6, LANES)), np.empty((3, LANES), np.bool_)
+    X, A, B, scale = matrix(28, LANES), matrix(63, LANES), matrix(18, LANES), matrix(7, LANES)
+    p, mixed, there = matrix(4, LANES), matrix(6, LANES), np.empty((3, LANES), np.bool_)
     f, full_rank = np.empty((3, 9, LANES)), np.empty((1, LANES), np.bool_)
     models = 0
     for first in range(0, sample.shape[1], LANES):
@@ -59,7 +58,7 @@ def seven_point(points: Array, sample: Array, F: Array, draw: Array) -> int:
 @inner
 def _determinants(B: Array, p: Array) -> None:
     """det(a F0 + b F1) at (1, 0), (0, 1), and their sum and difference over the root of two -> p (4, LANES)."""
-    f = np.empty((9, LANES))
+    f = matrix(9, LANES)
     for k in range(4):
         a, b = (1.0 - k, float(k)) if k < 2 else (HALF, HALF if k == 2 else -HALF)
         for q in range(9):
@@ -73,7 +72,7 @@ def _determinants(B: Array, p: Array) -> None:
 @inner
 def _mixtures(p: Array, lane: int, full_rank: bool, mixed: Array, there: Array) -> None:
     """The singular matrices a F0 + b F1 of a sample -> a, b of each in two rows of mixed; whether there is one."""
-    c, roots, valid = np.empty(4), np.zeros(3), np.zeros(3, np.bool_)
+    c, roots, valid = vector(4), np.zeros(3), np.zeros(3, np.bool_)
     turned, exchanged = _coefficients(p, lane, c)
     if full_rank:
         cubic_roots(c, roots, valid)

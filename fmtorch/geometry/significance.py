@@ -94,7 +94,7 @@ def significance(
 def of_one_pair(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array) -> float:
     """`significance` of one pair by kernels; float64, sizes empty where unknown."""
     chance = np.empty(len(mask))
-    chance = chance[: compiled.counted_chances(F, x0, x1, mask, size0, size1, chance)]
+    chance = chance[: compiled.counted_chances(F, compiled.Matches(x0, x1, mask, size0, size1), chance)]
     chance.sort()
     return compiled.most_significant(chance, _log_factorials(_table_size(len(mask))))
 

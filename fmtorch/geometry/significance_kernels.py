@@ -3,28 +3,42 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fmtorch.compiling.arrays import Array, B1x1, F8x1, F8x2
 from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.scratch import matrix, vector
 from fmtorch.geometry.arithmetic_kernels import LOG10, logarithm
 from fmtorch.geometry.order_kernels import smallest_but
 
-Array = NDArray[Any]
 SAMPLE, MODELS, CELLS, LEAST_CHANCE, MOST_CELLS, FARTHEST = 7, 3, 64, 2.0**-13, 1 << 15, 1e100  # as in `significance`
 LOG_MODELS = 1.0986122886681098
 FREE = -1  # a place of no match: in a slot of the table that is not taken
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # spreads places over the table
 
 
-@kernel("f8[:, ::1], f8[:, ::1], f8[:, ::1], b1[::1], f8[::1], f8[::1], f8[::1]")
-def counted_chances(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array, out: Array) -> int:
-    """The chances of a pair's matches, the median one of each place, in no order -> out (m,); m, 0 without a model.
+class Matches(NamedTuple):
+    """All matches of one pair, x0, x1 (n, 2), and which are real, mask (n,).
 
-    F: (3, 3). x0, x1: (n, 2). size0, size1: (h, w) in pixels, empty where unknown.
+    size0, size1: (h, w) of the images, empty where unknown. All in pixels.
     """
+
+    x0: F8x2
+    x1: F8x2
+    mask: B1x1
+    size0: F8x1
+    size1: F8x1
+
+
+@kernel
+def counted_chances(F: F8x2, matches: Matches, out: F8x1) -> int:
+    """Of a model F (3, 3) the chances of the matches, the median one of each place, in no order -> out (m,); m.
+
+    Without a model m is 0.
+    """
+    x0, x1, mask, size0, size1 = matches
     n = len(mask)
     peak = 0.0
     for i in range(9):
@@ -34,7 +48,7 @@ def counted_chances(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, s
         peak = max(peak, abs(value))
     if peak == 0:
         return 0
-    point, count = np.empty((4, n)), 0
+    point, count = matrix(4, n), 0
     for i in range(n):
         a, b, c, d = x0[i, 0], x0[i, 1], x1[i, 0], x1[i, 1]
         if mask[i] and abs(a) < FARTHEST and abs(b) < FARTHEST and abs(c) < FARTHEST and abs(d) < FARTHEST:
@@ -107,7 +121,7 @@ def _median_of_places(chance: Array, place: Array, out: Array) -> int:
         begin[which[i] + 1] += 1
     for g in range(groups):
         begin[g + 1] += begin[g]
-    grouped, free = np.empty(n), begin.copy()
+    grouped, free = vector(n), begin.copy()
     for i in range(n):
         grouped[free[which[i]]] = chance[i]
         free[which[i]] += 1
@@ -116,8 +130,8 @@ def _median_of_places(chance: Array, place: Array, out: Array) -> int:
     return groups
 
 
-@kernel("f8[::1], f8[::1]", brief=True)
-def most_significant(chance: Array, factorial: Array) -> float:
+@kernel(holds_gil=True)
+def most_significant(chance: F8x1, factorial: F8x1) -> float:
     """-log10 of the least number of false alarms over k, of ascending chances; factorial: log i!, for i to n."""
     n, best = len(chance), -math.inf
     for k in range(SAMPLE + 1, n + 1):

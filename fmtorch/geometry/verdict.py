@@ -24,7 +24,7 @@ def judged(estimate: Estimate, c: Correspondences) -> Estimate:
     """
     given = cast(Tensor, estimate.significance)
     unknown = given.isnan()
-    if not bool(unknown.any()):
+    if estimate.model != "fundamental" or not bool(unknown.any()):
         return estimate
     with one_thread(c.mask.device):
         found = significance(estimate.F.detach(), c.x0.detach(), c.x1.detach(), c.mask, c.size0, c.size1)

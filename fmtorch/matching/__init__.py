@@ -1,15 +1,11 @@
 """Features x Features -> Correspondences."""
 
-from fmtorch.core.checks import public
+from fmtorch.core.checks import check_exported
 from fmtorch.matching.matcher import NearestNeighborMatcher
-from fmtorch.matching.nearest import Neighbors
-from fmtorch.matching.nearest import nearest_neighbors as _nearest_neighbors
-
-_public = public(__name__)
-nearest_neighbors = _public(_nearest_neighbors)
+from fmtorch.matching.nearest import Neighbors, nearest_neighbors
 
 __all__ = [
-    "NearestNeighborMatcher",
-    "Neighbors",
-    "nearest_neighbors",
-]
+    "NearestNeighborMatcher", "Neighbors", "nearest_neighbors",
+]  # fmt: skip
+
+check_exported(__name__)

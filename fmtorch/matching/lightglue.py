@@ -6,7 +6,7 @@ import kornia
 import torch
 from torch import Tensor, nn
 
-from fmtorch.core.resources import pretrained
+from fmtorch.core.pretrained import pretrained
 from fmtorch.core.types import Correspondences, Features
 
 FEATURES = ("aliked", "disk")  # those that need no more than positions and descriptors, and that this project reads
@@ -67,8 +67,8 @@ class LightGlue:
             return torch.zeros(0, 2, dtype=torch.int64, device=home), torch.zeros(0, device=home)
         images = {f"image{i}": self._input(features) for i, features in enumerate((features0, features1))}
         with torch.inference_mode():
-            found = self.network(images)
-        return found["matches"][0].to(home).clone(), found["scores"][0].to(home, torch.float32).clone()
+            output = self.network(images)
+        return output["matches"][0].to(home).clone(), output["scores"][0].to(home, torch.float32).clone()
 
     def _input(self, features: Features) -> dict[str, Tensor]:
         size = features.image_size.flip(0)[None]  # (w, h)

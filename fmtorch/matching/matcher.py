@@ -40,21 +40,21 @@ class NearestNeighborMatcher:
             )
         if len(shape0) == 2:
             features0, features1 = (f.replace(**_batch_of_one(f)) for f in (features0, features1))
-        found = nearest_neighbors(
+        neighbors = nearest_neighbors(
             features0.descriptors, features1.descriptors, features0.valid, features1.valid, chunk=self.chunk
         )
-        mask = found.nearest >= 0
-        lafs1 = _take(features1.lafs, found.nearest)
+        mask = neighbors.nearest >= 0
+        lafs1 = _take(features1.lafs, neighbors.nearest)
         return Correspondences(
             x0=features0.keypoints,
             x1=lafs1[..., 2],
-            mask=mask & found.mutual if self.mutual else mask,
-            quality=found.ratio.to(features0.lafs.dtype),
+            mask=mask & neighbors.mutual if self.mutual else mask,
+            quality=neighbors.ratio.to(features0.lafs.dtype),
             lafs0=features0.lafs,
             lafs1=lafs1,
             size0=features0.image_size,
             size1=features1.image_size,
-            mutual=found.mutual & mask,
+            mutual=neighbors.mutual & mask,
         )
 
 

@@ -74,11 +74,13 @@ def _nearest_neighbors(
     batch, (n0, n1) = descriptors0.shape[:-2], (descriptors0.shape[-2], descriptors1.shape[-2])
     flat0, flat1 = (d.reshape(math.prod(batch), *d.shape[-2:]) for d in (descriptors0, descriptors1))
     mask0, mask1 = _finite(flat0, mask0), _finite(flat1, mask1)
-    found = [_match_one_pair(*pair, chunk) for pair in zip(flat0, flat1, mask0, mask1, strict=True)]
-    if not found:
-        found = [_nothing(descriptors0, n0, n1)]
-        return Neighbors(*(column.expand(*batch, -1) for column in found[0]))
-    return Neighbors(*(torch.stack(column).reshape(*batch, column[0].shape[-1]) for column in zip(*found, strict=True)))
+    by_pair = [_match_one_pair(*pair, chunk) for pair in zip(flat0, flat1, mask0, mask1, strict=True)]
+    if not by_pair:
+        by_pair = [_nothing(descriptors0, n0, n1)]
+        return Neighbors(*(column.expand(*batch, -1) for column in by_pair[0]))
+    return Neighbors(
+        *(torch.stack(column).reshape(*batch, column[0].shape[-1]) for column in zip(*by_pair, strict=True))
+    )
 
 
 def _finite(flat: Tensor, mask: Tensor | None) -> Tensor:

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
+from fmtorch.core.checks import expect_sizes
 from fmtorch.core.random import uniform
 from fmtorch.core.streams import Stream
-from fmtorch.core.validation import expect_sizes
 from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.geometry.epipolar import inverse_root
 
@@ -71,7 +71,7 @@ def diagonal(size: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
 Draw = Callable[[Pairs, Tensor], tuple[Tensor, Tensor]]
 
 
-def mean_terms(pairs: Pairs, draw: Draw, *, samples: int, seed: int) -> tuple[Float[Tensor, " b"], Int[Tensor, " b"]]:
+def sum_of_draws(pairs: Pairs, draw: Draw, *, samples: int, seed: int) -> tuple[Float[Tensor, " b"], Int[Tensor, " b"]]:
     """Sum of the first `samples` accepted draws of each pair, and how many there are among 10 x `samples` tries.
 
     `draw` maps pairs and their uniform numbers (b, draws, 6) to values and accepted flags, both (b, draws).
@@ -79,7 +79,7 @@ def mean_terms(pairs: Pairs, draw: Draw, *, samples: int, seed: int) -> tuple[Fl
     expect_samples(samples)
     step = max(1, TILE // BLOCK)
     starts = range(0, max(1, len(pairs.key)), step)  # one empty tile for an empty batch
-    parts = [_tile_terms(pairs.take(slice(i, i + step)), draw, samples, seed) for i in starts]
+    parts = [_sum_of_tile(pairs.take(slice(i, i + step)), draw, samples, seed) for i in starts]
     return torch.cat([total for total, _ in parts]), torch.cat([count for _, count in parts])
 
 
@@ -89,8 +89,8 @@ def expect_samples(samples: int) -> None:
         raise ValueError(f"samples is {samples}; it must be at least 1")
 
 
-def _tile_terms(pairs: Pairs, draw: Draw, samples: int, seed: int) -> tuple[Tensor, Tensor]:
-    """`mean_terms` of one tile; pairs with enough accepted draws are left out of later blocks."""
+def _sum_of_tile(pairs: Pairs, draw: Draw, samples: int, seed: int) -> tuple[Tensor, Tensor]:
+    """`sum_of_draws` of one tile; pairs with enough accepted draws are left out of later blocks."""
     total, count = torch.zeros_like(pairs.size0[:, 0]), torch.zeros_like(pairs.key)
     active = torch.arange(len(count), device=count.device)
     for start in range(0, TRIES * samples, BLOCK):

@@ -8,8 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
-from fmtorch.core.checks import checked
-from fmtorch.core.validation import expect_sizes
+from fmtorch.core.checks import checked, expect_sizes
 from fmtorch.geometry.epipolar import epipolar_distances
 from fmtorch.metrics.draws import diagonal
 

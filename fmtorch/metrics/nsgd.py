@@ -20,13 +20,14 @@ import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
+from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.batches import for_each_pair, kernels_serve
 from fmtorch.core.checks import checked
 from fmtorch.core.streams import Stream, mixed_seed
 from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.geometry.epipolar import lines_through, residual_and_normals, unit_largest
 from fmtorch.metrics import nsgd_kernels as compiled
-from fmtorch.metrics.draws import Pairs, diagonal, expect_samples, mean_terms, segment_in_image
+from fmtorch.metrics.draws import Pairs, diagonal, expect_samples, segment_in_image, sum_of_draws
 
 BORDER = -0.5  # left and top edge of the first pixel
 NORMAL_FLOOR = 1e-12  # length of a normal, for F of unit size, that is as good as none: its line is at infinity
@@ -150,16 +151,16 @@ def _mean_distance(
         return (d0 / unit0[:, None] + d1 / unit1[:, None]) / 2, accepted
 
     if kernels_serve(pairs.F_gt, pairs.F_est, pairs.size0, pairs.size1):
-        total, count = _compiled_terms(unit, pairs, samples, seed)
+        total, count = _compiled_sums(unit, pairs, samples, seed)
     else:
-        total, count = mean_terms(pairs, draw, samples=samples, seed=seed)
+        total, count = sum_of_draws(pairs, draw, samples=samples, seed=seed)
     diagonal0, diagonal1 = diagonal(pairs.size0), diagonal(pairs.size1)
     worst = (diagonal0 / unit(diagonal0) + diagonal1 / unit(diagonal1)) / 2
     value = torch.where(count > 0, total / count.clamp(min=1), worst)
     return (torch.minimum(value, worst) if cap else value).reshape(shape).to(F_est.dtype)
 
 
-def _compiled_terms(
+def _compiled_sums(
     unit: Callable[[Tensor], Tensor], pairs: Pairs, samples: int, seed: int
 ) -> tuple[Float[Tensor, " b"], Float[Tensor, " b"]]:
     """Sum and number of the accepted draws of each pair, by the kernel."""
@@ -168,5 +169,11 @@ def _compiled_terms(
     tensors = (pairs.F_gt, pairs.F_est, pairs.size0, pairs.size1, units, pairs.key[:, None])
     constants = (mixed_seed(seed, Stream.METRIC), samples)
     out = torch.empty(len(units), 2, dtype=torch.float64)
-    terms = for_each_pair(compiled.accepted_draws, tensors, *constants, out=out, kind=torch.float64)
+    terms = for_each_pair(_into, tensors, *constants, out=out, kind=torch.float64)
     return terms[:, 0], terms[:, 1]
+
+
+def _into(
+    F_gt: Array, F_est: Array, size0: Array, size1: Array, unit: Array, key: Array, seed: int, samples: int, out: Array
+) -> None:
+    compiled.accepted_draws(compiled.Comparison(F_gt, F_est, size0, size1, unit), int(key[0]), seed, samples, out)

@@ -3,31 +3,39 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from fmtorch.compiling.arrays import Array, F8x1, F8x2
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.random_kernels import stream_state, uniform
+from fmtorch.compiling.scratch import vector
 
-Array = NDArray[Any]
 BLOCK, TRIES, COLUMNS, PARALLEL = 128, 10, 6, 1e-12  # as in `draws`
 BORDER, NORMAL_FLOOR = -0.5, 1e-12  # as in `nsgd`
 
 
-@kernel("f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], i8[::1], i8, i8, f8[::1]")
-def accepted_draws(
-    F_gt: Array, F_est: Array, size0: Array, size1: Array, unit: Array, key: Array, mixed_seed: int, samples: int,
-    out: Array,
-) -> None:  # fmt: skip
-    """`draws.mean_terms` of a pair: the sum of its accepted draws, and their number -> out (2,).
+class Comparison(NamedTuple):
+    """Two models of one pair, F_gt, F_est (3, 3), scaled to a largest element of 1.
 
-    F_gt, F_est: scaled to a largest element of 1. unit: by which distances in image 0 and 1 are divided. key: (1,).
-    mixed_seed: of the seed and the stream.
+    size0, size1: (h, w) of the images, pixels. unit: (2,), pixels by which distances in image 0 and 1 are divided.
     """
-    state = stream_state(mixed_seed, key[0])
-    u, values = np.empty(COLUMNS), np.empty(BLOCK)
+
+    F_gt: F8x2
+    F_est: F8x2
+    size0: F8x1
+    size1: F8x1
+    unit: F8x1
+
+
+@kernel
+def accepted_draws(pair: Comparison, key: int, mixed_seed: int, samples: int, out: F8x1) -> None:
+    """`draws.sum_of_draws` of a pair: the sum of its accepted draws, and their number -> out (2,).
+
+    mixed_seed: of the seed and the stream. samples: how many draws to accept.
+    """
+    F_gt, F_est, size0, size1, unit = pair
+    state = stream_state(mixed_seed, key)
+    u, values = vector(COLUMNS), vector(BLOCK)
     total, count = 0.0, 0
     for start in range(0, TRIES * samples, BLOCK):
         draws = min(BLOCK, TRIES * samples - start)

@@ -81,7 +81,7 @@ def pose_map(
     if not all(n > 0 and abs(n * bin - t) < 1e-9 * t for n, t in zip(counts, thresholds, strict=True)):
         raise ValueError(f"thresholds are {tuple(thresholds)}; they must be multiples of bin={bin}")
     ends = [[bin * (i + 1) for i in range(n)] for n in counts]
-    return torch.stack([_recalled(errors, some, strict=True).mean(-1) for some in ends], -1)
+    return torch.stack([_recalled(errors, thresholds_of_bin, strict=True).mean(-1) for thresholds_of_bin in ends], -1)
 
 
 @checked

@@ -13,26 +13,26 @@ from typing import Any
 from fmtorch.core.files import replacing
 from fmtorch.core.threads import available, one_thread
 from fmtorch.data.images import read_image
-from fmtorch.pipeline.photographs import Described, describe, relate
+from fmtorch.pipeline.exporting import keep_described, keep_match
 from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.pipeline.two_images import Described, describe, relate
 from fmtorch.storage.exchange.journal import Journal
-from fmtorch.storage.exporting import keep_described, keep_match
 from fmtorch.storage.runs import canonical
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 EXHAUSTIVE = "exhaustive"
 MEMORY = 64  # images whose features are kept for pairs to come
-MOST_THREADS = 8  # that describe images: each holds an image and its scale space
+MAX_THREADS = 8  # that describe images: each holds an image and its scale space
 
 
 def images_below(folder: Path) -> list[Path]:
     """The images of a folder, at any depth, by name. Raises ValueError where there are fewer than two."""
     if not folder.is_dir():
         raise ValueError(f"images={folder} is no folder")
-    found = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
-    if len(found) < 2:
-        raise ValueError(f"images={folder} holds {len(found)} images ({', '.join(SUFFIXES)}); a pair needs two")
-    return found
+    images = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+    if len(images) < 2:
+        raise ValueError(f"images={folder} holds {len(images)} images ({', '.join(SUFFIXES)}); a pair needs two")
+    return images
 
 
 def chosen_pairs(folder: Path, images: Sequence[Path], pairs: Path | None) -> list[tuple[Path, Path]]:
@@ -46,7 +46,7 @@ def chosen_pairs(folder: Path, images: Sequence[Path], pairs: Path | None) -> li
     if not pairs.is_file():
         raise ValueError(f"pairs={pairs}: no such file; it must be {EXHAUSTIVE}, or a file with two names a line")
     known = {path.relative_to(folder).as_posix(): path for path in images}
-    found: dict[frozenset[Path], tuple[Path, Path]] = {}
+    selected: dict[frozenset[Path], tuple[Path, Path]] = {}
     for number, line in enumerate(pairs.read_text(encoding="utf-8").splitlines(), start=1):
         names = line.split()
         if not names or names[0].startswith("#"):
@@ -58,10 +58,10 @@ def chosen_pairs(folder: Path, images: Sequence[Path], pairs: Path | None) -> li
         if missing:
             raise ValueError(f"{where}: no image {missing[0]} in {folder}")
         pair = known[names[0]], known[names[1]]
-        found.setdefault(frozenset(pair), pair)
-    if not found:
+        selected.setdefault(frozenset(pair), pair)
+    if not selected:
         raise ValueError(f"{pairs} names no pair")
-    return list(found.values())
+    return list(selected.values())
 
 
 def open_folder(output: Path, identity: Mapping[str, Any]) -> Path:
@@ -106,7 +106,7 @@ class FolderMatches:
 
     def each(self, pairs: Sequence[tuple[Path, Path]]) -> Iterator[None]:
         """Match the pairs, and yield after each; on a CPU images are described ahead, as many at a time as threads."""
-        threads = min(available(), MOST_THREADS) if self.pipeline.device.type == "cpu" else 1
+        threads = min(available(), MAX_THREADS) if self.pipeline.device.type == "cpu" else 1
         if threads == 1:
             for pair in pairs:
                 self.match(*pair)

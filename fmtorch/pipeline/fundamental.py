@@ -1,4 +1,4 @@
-"""The two-line replacement for `cv2.findFundamentalMat`."""
+"""The two-line replacements for `cv2.findFundamentalMat` and `cv2.findHomography`."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from fmtorch import presets
 from fmtorch.compiling import switch
 from fmtorch.compiling.together import compile_together
 from fmtorch.core.arguments import Arrays, correspondences, number
+from fmtorch.core.checks import expect_values
 from fmtorch.core.stages import Estimator, Pruner
 from fmtorch.core.threads import one_thread
-from fmtorch.core.types import Estimate
-from fmtorch.core.validation import expect_values
+from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.geometry.verdict import judged
 
 
@@ -83,18 +83,72 @@ def find_fundamental(
         x0, x1, mask=mask, quality=quality, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, size0=size0,
         size1=size1, key=key,
     )  # fmt: skip
+    return _estimated(c, estimator, config_dir, seed, options)
+
+
+def find_homography(
+    x0: Arrays,
+    x1: Arrays,
+    *,
+    estimator: str = "homography",
+    mask: Arrays | None = None,
+    quality: Arrays | None = None,
+    prior: Arrays | None = None,
+    lafs0: Arrays | None = None,
+    lafs1: Arrays | None = None,
+    noise: Arrays | None = None,
+    key: Arrays | int | None = None,
+    seed: int = 0,
+    config_dir: Path | str | None = None,
+    **options: Any,
+) -> Estimate:
+    """Robustly estimate homographies from matched points, ``x1 ~ H x0``: of a plane, or of a camera that turns.
+
+    Args:
+        x0, x1: matched points in pixels, as of `find_fundamental`. Gradients reach them through the final fit.
+        estimator: a preset of conf/estimator whose solver is `four_point`.
+        mask, quality, prior, lafs0, lafs1, noise, key, seed, config_dir: as of `find_fundamental`.
+        options: replace values of the preset (``inlier_threshold=1.5``).
+
+    Returns:
+        An `Estimate` whose `H` (B, 3, 3) has unit Frobenius norm and maps points that are seen to positive third
+        coordinates; inliers, ok, reason. Its significance is NaN: that is a test of fundamental matrices.
+
+    Raises:
+        ValueError, TypeError: as `find_fundamental`, and ValueError for an estimator of another model.
+
+    Example:
+        >>> import torch, fmtorch
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> x0 = 600 * torch.rand(60, 2, generator=generator, dtype=torch.float64)
+        >>> x1 = x0 @ torch.tensor([[0.9, 0.1], [-0.1, 0.9]], dtype=torch.float64) + 20
+        >>> x1[:20] = x1[:20].flip(0)                            # twenty wrong matches
+        >>> estimate = fmtorch.find_homography(x0, x1)
+        >>> bool(estimate.ok[0]), int(estimate.inliers[0, 20:].sum()), tuple(estimate.H.shape)
+        (True, 40, (1, 3, 3))
+    """
+    c = correspondences(x0, x1, mask=mask, quality=quality, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, key=key)
+    estimate = _estimated(c, estimator, config_dir, seed, options)
+    if estimate.model != "homography":
+        raise ValueError(f"estimator={estimator} gives {estimate.model} matrices; find_homography needs homographies")
+    return estimate
+
+
+def _estimated(
+    c: Correspondences, name: str, config_dir: Path | str | None, seed: int, options: Mapping[str, Any]
+) -> Estimate:
+    """The estimate of matches by a preset, with a prior of their consistency where it uses one and none is given."""
     expect_values(c)
     seed = int(number("seed", seed, whole=True))
-    chosen = _estimator(estimator, config_dir, options)
-    if prior is None and getattr(chosen, "uses_prior", False):
+    estimator = _estimator(name, config_dir, options)
+    if c.prior is None and getattr(estimator, "uses_prior", False):
         framed = c.lafs0 is not None and c.lafs1 is not None and c.quality is not None
-        name = "frame_consistency" if framed else "position_consistency"
-        pruner = _consistency(name)
+        pruner = _consistency("frame_consistency" if framed else "position_consistency")
         if switch.available():
-            compile_together([*getattr(pruner, "kernels", ()), *getattr(chosen, "kernels", ())])
+            compile_together([*getattr(pruner, "kernels", ()), *getattr(estimator, "kernels", ())])
         with one_thread(c.mask.device):
             c = pruner(c)
-    return judged(chosen(c, seed), c)
+    return judged(estimator(c, seed), c)
 
 
 def _estimator(name: str, config_dir: Path | str | None, options: Mapping[str, Any]) -> Estimator:

@@ -44,6 +44,11 @@ class Outcome:
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     reason: str = ""
 
+    @property
+    def solved(self) -> bool:
+        """Whether there is an F."""
+        return self.estimate is not None and bool(self.estimate.ok[0])
+
 
 class Pipeline:
     """Features, matcher, pruners in order, estimator. Safe to call from several threads.
@@ -103,13 +108,13 @@ class Pipeline:
         start = time.perf_counter()
         with one_thread(self.device):
             try:
-                made = function([outcomes[i] for i in matched]) if matched else []
+                results = function([outcomes[i] for i in matched]) if matched else []
             except Exception:  # whose fault it is shows pair by pair
-                made = [_alone(stage, function, outcomes[i]) for i in matched]
+                results = [_alone(stage, function, outcomes[i]) for i in matched]
         _synchronise(self.device)
         share = (time.perf_counter() - start) / max(len(matched), 1)
         result = list(outcomes)
-        for i, outcome in zip(matched, made, strict=True):
+        for i, outcome in zip(matched, results, strict=True):
             result[i] = dataclasses.replace(outcome, seconds={**outcome.seconds, stage: share})
         return result
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+import hydra.utils
 import torch
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
@@ -17,7 +18,6 @@ from omegaconf import DictConfig, OmegaConf
 from fmtorch import data
 from fmtorch.core.options import nearest
 from fmtorch.core.resources import conf_dir
-from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import hydra_source
 from fmtorch.presets.files import available
 from fmtorch.presets.objects import expect_buildable, instantiate, plain
@@ -25,6 +25,7 @@ from fmtorch.presets.pruners import build_pruners, expect_pruners, pruner_config
 from fmtorch.storage.features import cached
 
 STAGES = ("features", "matcher", "pruner", "estimator")  # groups that a pipeline chooses from
+PIPELINE = "fmtorch.pipeline.pipeline.Pipeline"  # by name, as the stages: presets know nothing of what they build
 _composing = threading.Lock()  # Hydra composes through a global
 hydra_source.register()
 
@@ -72,11 +73,11 @@ def expect_dataset(config: DictConfig) -> None:
         data.expect_loadable(**options)
 
 
-def build_pipeline(config: DictConfig, device: torch.device | str = "cpu") -> Pipeline:
-    """The pipeline that features (with cache), matcher, pruner and estimator of a composed config describe."""
+def build_pipeline(config: DictConfig, device: torch.device | str = "cpu") -> Any:
+    """The `Pipeline` that features (with cache), matcher, pruner and estimator of a composed config describe."""
     extractor = cached(instantiate(config.features, "features"), config.cache, config.cache_limit)
     pruners, for_families = build_pruners(config)
-    return Pipeline(
+    return hydra.utils.get_object(PIPELINE)(
         extractor,
         instantiate(config.matcher, "matcher"),
         pruners,
@@ -91,8 +92,8 @@ def pipeline(
     device: torch.device | str = "cpu",
     overrides: Sequence[str] = (),
     config_dir: Path | str | None = None,
-) -> Pipeline:
-    """The pipeline of ``conf/pipeline/<name>.yaml``, changed by `overrides` as on the command line.
+) -> Any:
+    """The `Pipeline` of ``conf/pipeline/<name>.yaml``, changed by `overrides` as on the command line.
 
     E.g. ``pipeline("sift_gms", overrides=["estimator=lmeds", "pruner.gms.with_scale=true"])``. Unlike the commands it
     keeps no features on disk unless asked to (``overrides=["cache=null"]``, or a folder).

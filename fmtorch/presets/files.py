@@ -49,11 +49,11 @@ def closest(group: str, config: Mapping[str, Any]) -> tuple[str, dict[str, Any]]
 
     None where no preset builds what the config does, or the options are not those of the preset.
     """
-    found = []
+    candidates = []
     for name, preset in _shipped(group).items():
         if preset.get("_target_") == config.get("_target_") and preset.keys() >= config.keys():
-            found.append((name, {key: value for key, value in config.items() if preset[key] != value}))
-    return min(found, key=lambda pair: len(pair[1]), default=None)
+            candidates.append((name, {key: value for key, value in config.items() if preset[key] != value}))
+    return min(candidates, key=lambda pair: len(pair[1]), default=None)
 
 
 @functools.cache
@@ -70,6 +70,12 @@ def targets_of(config: object) -> frozenset[str]:
     if isinstance(config, list):
         return frozenset().union(*(targets_of(value) for value in config))
     return frozenset()
+
+
+def peer_packages(config: object) -> list[str]:
+    """The packages of other libraries whose versions decide what the targets within a config compute, sorted."""
+    packages = {getattr(hydra.utils.get_object(target), "peer_package", None) for target in targets_of(config)}
+    return sorted(package for package in packages if package)
 
 
 def own_modules(config: object) -> dict[str, str]:

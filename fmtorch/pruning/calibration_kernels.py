@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from fmtorch.compiling.arrays import B1x1, F4x1
 from fmtorch.compiling.kernel import kernel
 
-Array = NDArray[Any]
 
-
-@kernel("f4[::1], f4[::1], b1[::1], f4[::1], f4[::1]")
-def calibrated(evidence: Array, quality: Array, mask: Array, numbers: Array, out: Array) -> None:
+@kernel
+def calibrated(evidence: F4x1, quality: F4x1, mask: B1x1, numbers: F4x1, out: F4x1) -> None:
     """P(inlier) of `Calibration` from evidence and ratio (n,) -> out (n,); zero where masked.
 
     quality: empty where unknown. numbers: constant, weights of evidence and ratio, largest log-odds, and 2^-10.

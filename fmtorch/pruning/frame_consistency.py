@@ -9,38 +9,25 @@ eighth of the time, and the same area under the ROC curve (measured on castle-P1
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.batches import for_each_pair, kernels_serve
 from fmtorch.core.records import ungraphed
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry.arithmetic import component_sum, sqrt
 from fmtorch.geometry.curves import curve_orders
 from fmtorch.pruning import frame_consistency_kernels as compiled
+from fmtorch.pruning.agreement import CURVES, MIN_SQUARE, MIN_VOTE, NOISE, SHARPNESS, WINDOW, WORST_RATIO
 
-Array = NDArray[Any]
-
-WINDOW = 8  # neighbours before and after each match along each curve
-CURVES = ((0.0, 0.0), (0.5, math.pi / 4))  # shift of the grid (in thirds of the extent) and rotation of each curve
-TOLERANCE = 0.25  # relative prediction error at which agreement falls to about 1/e
-NOISE = 4.0  # px, keeps close neighbours from being judged by their localisation noise
-WORST_RATIO, LEAST_VOTE = 0.85, 0.02  # a neighbour votes with WORST_RATIO - ratio, at least LEAST_VOTE
 TILE = 1 << 12  # matches looked at together: what a processor's cache holds; changes no result
 GPU_TILE = 1 << 17
-LEAST_SQUARE, LEAST_VOTES = 1e-12, float(np.finfo(np.float32).tiny)  # keep a root's gradient and a quotient finite
-
-# For the kernels: shift, cosine and sine of each curve; their other numbers.
-CURVE_TABLE = np.array([(shift, math.cos(angle), math.sin(angle)) for shift, angle in CURVES], np.float32)
-NUMBERS = (WORST_RATIO, LEAST_VOTE, NOISE, TOLERANCE**-2 / 8, LEAST_SQUARE, LEAST_VOTES)
-_NUMBERS = np.array(NUMBERS, np.float32)
 
 
 def frame_agreement(
@@ -60,14 +47,18 @@ def frame_agreement(
     if kernels_serve(x0, x1, lafs0, lafs1, quality):
         tensors = (x0, x1, lafs0, lafs1, quality, mask)
         out = torch.empty(mask.shape, dtype=torch.float32)
-        return for_each_pair(compiled.frame_agreement, tensors, CURVE_TABLE, _NUMBERS, out=out).to(x0.dtype)
+        return for_each_pair(_agreement_into, tensors, out=out).to(x0.dtype)
     S = frame_map(lafs0, lafs1)
-    vote = torch.ones_like(x0[..., 0]) if quality is None else (WORST_RATIO - quality).clamp_min(LEAST_VOTE)
+    vote = torch.ones_like(x0[..., 0]) if quality is None else (WORST_RATIO - quality).clamp_min(MIN_VOTE)
     scale = sqrt((S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]).abs())
     rows = torch.stack([*x0.unbind(-1), *x1.unbind(-1), *S.flatten(2).unbind(-1), scale, vote])
     mask = mask & torch.isfinite(rows).all(0)
     rows = torch.where(mask, rows, 0)
     return tiled(_agreement, rows, mask)
+
+
+def _agreement_into(x0: Array, x1: Array, lafs0: Array, lafs1: Array, quality: Array, mask: Array, out: Array) -> None:
+    compiled.frame_agreement(compiled.FramedMatches(x0, x1, lafs0, lafs1, quality, mask), out)
 
 
 def tiled(function: Callable[[Tensor, Tensor], Tensor], rows: Tensor, mask: Bool[Tensor, "b n"]) -> Tensor:
@@ -87,8 +78,8 @@ def _agreement(rows: Float[Tensor, "10 b n"], mask: Bool[Tensor, "b n"]) -> Floa
     orders = orders[..., : max(int(mask.sum(1).max()), 1)]  # masked slots stand last
     along = rows[:, None].expand(-1, len(orders), -1, -1).gather(3, orders.expand(len(rows), -1, -1, -1))
     sums = _along_curve(along.flatten(1, 2)).reshape(2, *orders.shape)
-    found = sums.new_zeros(*sums.shape[:3], mask.shape[1]).scatter(3, orders.expand(2, -1, -1, -1), sums)
-    agreement, votes = component_sum(found, 1)
+    in_slots = sums.new_zeros(*sums.shape[:3], mask.shape[1]).scatter(3, orders.expand(2, -1, -1, -1), sums)
+    agreement, votes = component_sum(in_slots, 1)
     return torch.where(mask, agreement / votes.clamp_min(torch.finfo(votes.dtype).tiny), 0)
 
 
@@ -110,12 +101,10 @@ def _along_curve(rows: Float[Tensor, "10 b n"]) -> Float[Tensor, "2 b n"]:
     dx, dy, ux, uy = near[:4] - rows[:4]
     error = torch.maximum(_prediction_error(rows[4:8], dx, dy, ux, uy), _prediction_error(near[4:8], dx, dy, ux, uy))
     length = (
-        sqrt(dx.square() + dy.square() + LEAST_SQUARE) * rows[8]
-        + sqrt(ux.square() + uy.square() + LEAST_SQUARE)
-        + NOISE
+        sqrt(dx.square() + dy.square() + MIN_SQUARE) * rows[8] + sqrt(ux.square() + uy.square() + MIN_SQUARE) + NOISE
     )
     # exp(-z) in arithmetic alone, whose last bits, unlike exp's, do not depend on where in memory a number stands
-    agree = (1 + error / length.square() * (TOLERANCE**-2 / 8)).square().square().square().reciprocal()
+    agree = (1 + error / length.square() * SHARPNESS).square().square().square().reciprocal()
     votes = torch.stack([agree * near[9], near[9]])
     votes[:, :, WINDOW] = 0
     return component_sum(votes, 2)
@@ -132,10 +121,14 @@ class FrameConsistency:
     The odds are ``odds (w + floor)^3 / (1 + slope ratio)^2`` with the agreement w: arithmetic alone, and a better fit
     on the tuning scenes than a logistic model of ln(w) and the ratio. Where matches have no frames or no quality the
     prior is left as it is. Linear memory: about 700 bytes a match.
+    kernels: worth compiling together with those of an estimator.
     """
+
+    kernels: ClassVar = (compiled.frame_agreement, compiled.frame_prior)
 
     def __init__(self, *, odds: float, floor: float, slope: float) -> None:
         self.odds, self.floor, self.slope = odds, floor, slope
+        self._numbers = np.array((odds, floor, slope), np.float32)
 
     def __call__(self, c: Correspondences) -> Correspondences:
         """The same matches with a prior; zero for one whose ratio is not finite."""
@@ -152,8 +145,8 @@ class FrameConsistency:
         self, x0: Array, x1: Array, lafs0: Array, lafs1: Array, ratio: Array, mask: Array, out: Array
     ) -> None:
         w = np.empty_like(out)
-        compiled.frame_agreement(x0, x1, lafs0, lafs1, ratio, mask, CURVE_TABLE, _NUMBERS, w)
-        compiled.frame_prior(w, ratio, mask, self.odds, self.floor, self.slope, out)
+        _agreement_into(x0, x1, lafs0, lafs1, ratio, mask, w)
+        compiled.frame_prior(w, ratio, mask, self._numbers, out)
 
     def _with_prior(self, c: Correspondences, lafs0: Tensor, lafs1: Tensor, ratio: Tensor) -> Correspondences:
         w = frame_agreement(c.x0, c.x1, lafs0, lafs1, ratio, c.mask) + self.floor

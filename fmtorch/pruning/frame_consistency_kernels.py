@@ -1,34 +1,45 @@
-"""`frame_consistency` for one pair, compiled: the same orders and the same sums.
-
-Arrays of a pair are in one floating type, float32 or float64. `numbers` are constants in that type:
-shift, cosine and sine of each curve, then what each kernel names.
-"""
+"""`frame_consistency` for one pair, compiled: the same orders and the same sums, in float32."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fmtorch.compiling.arrays import Array, B1x1, F4x1, F4x2, F4x3
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.geometry.curves_kernels import curve_order
+from fmtorch.pruning.agreement import (
+    CURVES32,
+    MIN_SQUARE32,
+    MIN_VOTE32,
+    MIN_VOTES32,
+    NOISE32,
+    SHARPNESS32,
+    WINDOW,
+    WORST_RATIO32,
+)
 
-Array = NDArray[Any]
-WINDOW = 8  # as in `frame_consistency`
 
+class FramedMatches(NamedTuple):
+    """The matches of one pair: points x0, x1 (n, 2), frames lafs0, lafs1 (n, 2, 3), pixels; which are real, mask (n,).
 
-@kernel("f4[:, ::1], f4[:, ::1], f4[:, :, ::1], f4[:, :, ::1], f4[::1], b1[::1], f4[:, ::1], f4[::1], f4[::1]")
-def frame_agreement(
-    x0: Array, x1: Array, lafs0: Array, lafs1: Array, quality: Array, mask: Array, curves: Array, numbers: Array,
-    out: Array,
-) -> None:  # fmt: skip
-    """`frame_consistency.frame_agreement` of x0, x1 (n, 2), lafs0, lafs1 (n, 2, 3), mask (n,) -> out (n,).
-
-    quality: (n,), empty where unknown. curves: (c, 3), shift of the grid, cosine and sine of the rotation.
-    numbers: of votes the worst ratio and the least, noise in pixels, TOLERANCE^-2 / 8, 1e-12, the least divisor.
+    quality: (n,), empty where unknown.
     """
+
+    x0: F4x2
+    x1: F4x2
+    lafs0: F4x3
+    lafs1: F4x3
+    quality: F4x1
+    mask: B1x1
+
+
+@kernel
+def frame_agreement(matches: FramedMatches, out: F4x1) -> None:
+    """`frame_consistency.frame_agreement` of n matches -> out (n,)."""
+    x0, x1, lafs0, lafs1, quality, mask = matches
     n, zero = len(mask), x0.dtype.type(0)
     rows, match = np.empty((10, n), x0.dtype), np.empty(n, np.int64)
     m = 0
@@ -42,7 +53,7 @@ def frame_agreement(
         rows[6, m] = (lafs1[i, 1, 0] * d + lafs1[i, 1, 1] * -c) / determinant
         rows[7, m] = (lafs1[i, 1, 0] * -b + lafs1[i, 1, 1] * a) / determinant
         rows[8, m] = math.sqrt(abs(rows[4, m] * rows[7, m] - rows[5, m] * rows[6, m]))
-        rows[9, m] = max(numbers[0] - quality[i], numbers[1]) if len(quality) else x0.dtype.type(1)
+        rows[9, m] = max(WORST_RATIO32 - quality[i], MIN_VOTE32) if len(quality) else x0.dtype.type(1)
         valid = mask[i] and not (len(quality) and math.isnan(quality[i]))
         for k in range(10):
             valid = valid and math.isfinite(rows[k, m])
@@ -52,29 +63,29 @@ def frame_agreement(
     agreement, votes = np.zeros(m, x0.dtype), np.zeros(m, x0.dtype)
     ahead, behind = np.empty((WINDOW, m), x0.dtype), np.empty((WINDOW, m), x0.dtype)
     for image in range(2):
-        for curve in range(len(curves)):
+        for curve in range(len(CURVES32)):
             curve_order(
                 rows[2 * image, :m],
                 rows[2 * image + 1, :m],
-                curves[curve, 0],
-                curves[curve, 1],
-                curves[curve, 2],
+                CURVES32[curve, 0],
+                CURVES32[curve, 1],
+                CURVES32[curve, 2],
                 order,
             )
             for k in range(10):
                 for i in range(m):
                     along[k, i] = rows[k, order[i]]
             for k in range(1, WINDOW + 1):
-                _frames_agree(along, k, numbers, ahead[k - 1], behind[k - 1])
+                _frames_agree(along, k, ahead[k - 1], behind[k - 1])
             _add_votes(along[9], ahead, behind, order, agreement, votes)
     for i in range(m):
-        out[match[i]] = agreement[i] / max(votes[i], numbers[5])
+        out[match[i]] = agreement[i] / max(votes[i], MIN_VOTES32)
 
 
 @inner
-def _frames_agree(along: Array, k: int, numbers: Array, ahead: Array, behind: Array) -> None:
+def _frames_agree(along: Array, k: int, ahead: Array, behind: Array) -> None:
     """For matches i and j = i + k: how well j agrees with i -> ahead[i], i with j -> behind[i]."""
-    noise, sharpness, tiny, one = numbers[2], numbers[3], numbers[4], along.dtype.type(1)
+    noise, sharpness, tiny, one = NOISE32, SHARPNESS32, MIN_SQUARE32, along.dtype.type(1)
     X0, Y0, X1, Y1, A, B, C, D, S = (
         along[0], along[1], along[2], along[3], along[4], along[5], along[6], along[7], along[8],
     )  # fmt: skip
@@ -123,11 +134,13 @@ def add_products(agree: Array, vote: Array, count: int, total: Array, votes: Arr
         votes[i] += vote[i]
 
 
-@kernel("f4[::1], f4[::1], b1[::1], f4, f4, f4, f4[::1]")
-def frame_prior(
-    agreement: Array, quality: Array, mask: Array, odds: Any, floor: Any, slope: Any, out: Array
-) -> None:  # fmt: skip
-    """P(inlier) of `FrameConsistency` from agreement and ratio (n,) -> out (n,); zero where masked or not finite."""
+@kernel
+def frame_prior(agreement: F4x1, quality: F4x1, mask: B1x1, numbers: F4x1, out: F4x1) -> None:
+    """P(inlier) of `FrameConsistency` from agreement and ratio (n,) -> out (n,); zero where masked or not finite.
+
+    numbers: odds, floor, slope.
+    """
+    odds, floor, slope = numbers[0], numbers[1], numbers[2]
     one = agreement.dtype.type(1)
     for i in range(len(mask)):
         w, divisor = agreement[i] + floor, one + slope * quality[i]

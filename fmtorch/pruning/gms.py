@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.batches import for_each_pair, kernels_serve
 from fmtorch.core.records import ungraphed
 from fmtorch.core.types import Correspondences
@@ -17,8 +18,6 @@ from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.pruning import gms_kernels as compiled
 from fmtorch.pruning.calibration import calibration_of
 from fmtorch.pruning.gms_table import GRIDS, Border, Moves, Surroundings, Table, give_back, moves_in_blocks, tabulated
-
-_HALF_SUPPORT = 1.5  # the score, in square roots of the mean, whose support is one half
 
 
 def gms(
@@ -50,7 +49,7 @@ def gms(
     if kernels_serve(x0.detach(), x1.detach()):
         out = torch.empty(x0.shape[:2], dtype=torch.bool)
         options = (np.array(grids), turns, threshold_factor, border == "authors")
-        return for_each_pair(compiled.gms, _per_pair(x0, x1, size0, size1, mask), *options, out=out, kind=torch.float64)
+        return for_each_pair(_gms_into, _per_pair(x0, x1, size0, size1, mask), *options, out=out, kind=torch.float64)
     kept = torch.zeros(x0.shape[:2], dtype=torch.bool, device=x0.device)
     for moves, place in moves_in_blocks(x0, x1, size0, size1, mask, grids, border):
         table = tabulated(moves)
@@ -84,9 +83,9 @@ def gms_support(
     grids, turns = GRIDS if with_scale else GRIDS[:1], 8 if with_rotation else 1
     if kernels_serve(x0.detach(), x1.detach()):
         out = torch.empty(x0.shape[:2], dtype=torch.float64)
-        options = (np.array(grids), turns, threshold_factor, border == "authors", _HALF_SUPPORT)
+        options = (np.array(grids), turns, threshold_factor, border == "authors")
         tensors = _per_pair(x0, x1, size0, size1, mask)
-        return for_each_pair(compiled.gms_support, tensors, *options, out=out, kind=torch.float64).to(x0.dtype)
+        return for_each_pair(_support_into, tensors, *options, out=out, kind=torch.float64).to(x0.dtype)
     support = torch.zeros(x0.shape[:2], dtype=x0.dtype, device=x0.device)
     for moves, place in moves_in_blocks(x0, x1, size0, size1, mask, grids, border):
         table = tabulated(moves)
@@ -95,7 +94,7 @@ def gms_support(
             winner = _winner(_standing(table, moves, turns, threshold_factor), moves, turns)
         z = _own_support(table, moves, winner, turns)
         give_back(table)
-        support.view(-1)[place] = (z / (z + _HALF_SUPPORT)).to(support.dtype)
+        support.view(-1)[place] = (z / (z + compiled.HALF_SUPPORT)).to(support.dtype)
     return support
 
 
@@ -103,6 +102,20 @@ def _per_pair(x0: Tensor, x1: Tensor, size0: Tensor, size1: Tensor, mask: Tensor
     """What the kernels are given of each pair."""
     mask = torch.ones_like(x0[..., 0], dtype=torch.bool) if mask is None else mask
     return x0, x1, size0.float(), size1.float(), mask
+
+
+def _gms_into(
+    x0: Array, x1: Array, size0: Array, size1: Array, mask: Array, sides: Array, turns: int, factor: float,
+    authors: bool, out: Array,
+) -> None:  # fmt: skip
+    compiled.gms(compiled.Matches(x0, x1, size0, size1, mask), sides, turns, factor, authors, out)
+
+
+def _support_into(
+    x0: Array, x1: Array, size0: Array, size1: Array, mask: Array, sides: Array, turns: int, factor: float,
+    authors: bool, out: Array,
+) -> None:  # fmt: skip
+    compiled.gms_support(compiled.Matches(x0, x1, size0, size1, mask), sides, turns, factor, authors, out)
 
 
 def _standing(table: Table, moves: Moves, turns: int, factor: float) -> UInt8[Tensor, "s m"]:

@@ -3,42 +3,46 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fmtorch.compiling.arrays import Array, B1x1, F8x1, F8x2, I8x1
 from fmtorch.compiling.kernel import inner, kernel
 
-Array = NDArray[Any]
 GRID = 20  # this and the ring as in `gms_table`
 CELLS = GRID * GRID
+HALF_SUPPORT = 1.5  # the score, in square roots of the mean, whose support is one half
 RING = np.array(((-1, -1), (0, -1), (1, -1), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0)))
 
 
-@kernel("f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], b1[::1], i8[::1], i8, f8, b1, b1[::1]")
-def gms(
-    x0: Array, x1: Array, size0: Array, size1: Array, mask: Array, sides: Array, turns: int, factor: float,
-    authors: bool, out: Array,
-) -> None:  # fmt: skip
-    """`gms.gms` of x0, x1 (n, 2), mask (n,) -> out (n,).
+class Matches(NamedTuple):
+    """The matches of one pair, x0, x1 (n, 2), which are real, mask (n,), and the images' (h, w); all in pixels."""
 
-    size0, size1: (h, w). sides: cells a side of the grids in image 1. authors: whose rule at the border holds.
+    x0: F8x2
+    x1: F8x2
+    size0: F8x1
+    size1: F8x1
+    mask: B1x1
+
+
+@kernel
+def gms(matches: Matches, sides: I8x1, turns: int, factor: float, authors: bool, out: B1x1) -> None:
+    """`gms.gms` of n matches -> out (n,).
+
+    sides: cells a side of the grids in image 1. authors: whose rule at the border holds.
     """
-    match, p0, p1 = _inside(x0, x1, size0, size1, mask)
+    match, p0, p1 = _inside(matches)
     bits, winner = _standing(p0, p1, sides, turns, factor, authors)
     out[:] = False
     for i in range(len(match)):
         out[match[i]] = (bits[winner // turns, i] >> (winner % turns)) & 1
 
 
-@kernel("f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], b1[::1], i8[::1], i8, f8, b1, f8, f8[::1]")
-def gms_support(
-    x0: Array, x1: Array, size0: Array, size1: Array, mask: Array, sides: Array, turns: int, factor: float,
-    authors: bool, half_support: float, out: Array,
-) -> None:  # fmt: skip
-    """`gms.gms_support` of x0, x1 (n, 2), mask (n,) -> out (n,); arguments as `gms`."""
-    match, p0, p1 = _inside(x0, x1, size0, size1, mask)
+@kernel
+def gms_support(matches: Matches, sides: I8x1, turns: int, factor: float, authors: bool, out: F8x1) -> None:
+    """`gms.gms_support` of n matches -> out (n,); arguments as `gms`."""
+    match, p0, p1 = _inside(matches)
     out[:] = 0
     m, winner = len(match), 0
     if len(sides) * turns > 1:
@@ -54,12 +58,13 @@ def gms_support(
                 z[i] += max(score - 1, 0) / math.sqrt(max(mean, 1.0)) / 4
         _clear(line, end, side, table)
     for i in range(m):
-        out[match[i]] = z[i] / (z[i] + half_support)
+        out[match[i]] = z[i] / (z[i] + HALF_SUPPORT)
 
 
 @inner
-def _inside(x0: Array, x1: Array, size0: Array, size1: Array, mask: Array) -> tuple[Array, Array, Array]:
+def _inside(matches: Matches) -> tuple[Array, Array, Array]:
     """The matches inside both images, (m,), and their points in units of the images, (m, 2), as float32 has them."""
+    x0, x1, size0, size1, mask = matches
     n, m = len(mask), 0
     match = np.empty(n, np.int64)
     p0, p1 = np.empty((n, 2), np.float32), np.empty((n, 2), np.float32)

@@ -120,9 +120,9 @@ def tabulated(moves: Moves) -> Table:
     ]
     counted = torch.int16 if len(moves.pair) < 2**15 else torch.int32
     table = _zeros(moves.origin(len(moves.grids)), counted, device)
-    one = torch.ones(line.numel(), dtype=counted, device=device)
-    for some in slot:
-        table.scatter_add_(0, some, one)
+    ones = torch.ones(line.numel(), dtype=counted, device=device)
+    for indices in slot:
+        table.scatter_add_(0, indices, ones)
     return Table(table, filled, slot)
 
 

@@ -24,13 +24,13 @@ def nearest_points(queries: Float[Tensor, "n 2"], points: Float[Tensor, "m 2"], 
     Exact in float64, except for ties within a few roundings. Memory linear in n + m. On a CPU by SciPy's k-d tree, with
     as many threads as torch has; elsewhere by packed leaves.
     """
-    found = torch.full((len(queries), count), -1, device=queries.device)
+    nearest = torch.full((len(queries), count), -1, device=queries.device)
     wanted = min(count, len(points))
     if wanted and len(queries):
         queries, points = _in_range(queries.detach().double(), points.detach().double())
         search = by_tree if queries.device.type == "cpu" else by_leaves
-        found[:, :wanted] = search(queries, points, wanted)
-    return found
+        nearest[:, :wanted] = search(queries, points, wanted)
+    return nearest
 
 
 def _in_range(queries: Float[Tensor, "n 2"], points: Float[Tensor, "m 2"]) -> tuple[Tensor, Tensor]:
@@ -50,23 +50,23 @@ def by_tree(queries: Float[Tensor, "n 2"], points: Float[Tensor, "m 2"], count: 
     """
     at, places = queries.numpy(), points.numpy()
     tree = KDTree(places)
-    found = np.empty((len(at), count), np.int64)
+    nearest = np.empty((len(at), count), np.int64)
     todo = np.arange(len(at))
     for asked in (min(count + 1, len(places)), min(_ATTEMPT * count, len(places))):
         unsettled = []
-        for some in np.array_split(todo, -(-len(todo) * asked // _DISTANCES_CPU)) if len(todo) else ():
-            index = tree.query(at[some], np.arange(1, asked + 1), workers=torch.get_num_threads())[1]
-            (dx, dy) = (places[index, i] - at[some, None, i] for i in (0, 1))
+        for rows in np.array_split(todo, -(-len(todo) * asked // _DISTANCES_CPU)) if len(todo) else ():
+            index = tree.query(at[rows], np.arange(1, asked + 1), workers=torch.get_num_threads())[1]
+            (dx, dy) = (places[index, i] - at[rows, None, i] for i in (0, 1))
             squared = dx * dx + dy * dy
             equal = np.flatnonzero((squared[:, 1:] <= squared[:, :-1]).any(1))
             order = np.lexsort((index[equal], squared[equal]))
             index[equal], squared[equal] = (np.take_along_axis(v[equal], order, 1) for v in (index, squared))
-            found[some] = index[:, :count]
+            nearest[rows] = index[:, :count]
             if asked < len(places):
-                unsettled.append(some[squared[:, -1] <= squared[:, count - 1] * _ROUNDING])
+                unsettled.append(rows[squared[:, -1] <= squared[:, count - 1] * _ROUNDING])
         todo = np.concatenate([np.empty(0, np.int64), *unsettled])
     rest = torch.from_numpy(todo)
-    result = torch.from_numpy(found)
+    result = torch.from_numpy(nearest)
     for part in torch.split(rest, max(1, _DISTANCES_CPU // len(places))):
         result[part] = _smallest(_squared(queries[part], points), count)[0]
     return result
@@ -79,7 +79,7 @@ def by_leaves(queries: Float[Tensor, "n 2"], points: Float[Tensor, "m 2"], count
     points of the nearest leaves are candidates, and settle a query when the last neighbour found is nearer than any
     other leaf can be; what is left is searched exhaustively.
     """
-    found = torch.full((len(queries), count), -1, device=queries.device)
+    neighbors = torch.full((len(queries), count), -1, device=queries.device)
     homes, leaves = _pack(queries), _pack(points)  # (H, 16), (L, 16), -1 for empty places
     boxes = _boxes(points, leaves)
     budget = _DISTANCES_CPU if queries.device.type == "cpu" else _DISTANCES_GPU
@@ -92,11 +92,11 @@ def by_leaves(queries: Float[Tensor, "n 2"], points: Float[Tensor, "m 2"], count
         columns, last = _smallest(squared, min(count, squared.shape[-1]))
         real = home >= 0
         index = candidates[:, None].expand(-1, _LEAF, -1).gather(2, columns)[real]
-        found[home[real], : index.shape[1]] = index
+        neighbors[home[real], : index.shape[1]] = index
         unsettled.append(home[real & ((last >= gap[:, None]) | (index.shape[1] < count))])
-    for some in torch.split(torch.cat(unsettled), max(1, budget // len(points))):
-        found[some] = _smallest(_squared(queries[some], points), count)[0]
-    return found
+    for rows in torch.split(torch.cat(unsettled), max(1, budget // len(points))):
+        neighbors[rows] = _smallest(_squared(queries[rows], points), count)[0]
+    return neighbors
 
 
 def _squared(a: Tensor, b: Tensor) -> Tensor:

@@ -6,17 +6,17 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fmtorch.compiling.arrays import Array, F8x2, I8x2
 from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.scratch import matrix, vector
 from fmtorch.geometry.order_kernels import smallest_but
 
-Array = NDArray[Any]
 _LEAF = 8  # points a leaf, at most
 
 
-@kernel("f8[:, ::1], f8[:, ::1], i8[:, ::1]")
-def nearest_points(queries: Array, points: Array, found: Array) -> None:
+@kernel
+def nearest_points(queries: F8x2, points: F8x2, found: I8x2) -> None:
     """`knn.nearest_points` of queries (n, 2) among points (m, 2) -> found (n, count); -1 for no more points."""
     search(queries, points, found)
 
@@ -37,7 +37,7 @@ def search(queries: Array, points: Array, found: Array) -> None:
     order = _order(points, depth)
     boxes, lowest = _boxes(points, order, depth)
     stack, distances = np.empty((depth + 2, 3), np.int64), np.empty(found.shape[1])
-    bounds = np.empty(depth + 2)
+    bounds = vector(depth + 2)
     for i in range(len(queries)):
         x, y = queries[i, 0], queries[i, 1]
         distances[:] = math.inf
@@ -132,7 +132,7 @@ def _split(points: Array, axis: int, order: Array, begin: int, end: int, middle:
 def _boxes(points: Array, order: Array, depth: int) -> tuple[Array, Array]:
     """Low and high corners (2^(depth + 1), 4) of the nodes and their lowest indices; node j of depth d at 2^d + j."""
     m, leaves = len(points), 1 << depth
-    boxes, lowest = np.empty((2 * leaves, 4)), np.empty(2 * leaves, np.int64)
+    boxes, lowest = matrix(2 * leaves, 4), np.empty(2 * leaves, np.int64)
     for node in range(2 * leaves - 1, 0, -1):
         if node < leaves:
             for k in range(2):

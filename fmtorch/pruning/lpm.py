@@ -75,9 +75,9 @@ def lpm_cost(
 def _compiled(x0: Tensor, x1: Tensor, mask: Tensor | None, passes: Sequence[Pass]) -> Float[Tensor, "b 2 n"]:
     """Of each match 1 if it is kept, and its cost, by the kernel."""
     mask = torch.ones_like(x0[..., 0], dtype=torch.bool) if mask is None else mask
-    options = [np.array(row, kind) for row, kind in zip(zip(*passes, strict=True), "dld", strict=True)]
+    rows = [np.array(row, kind) for row, kind in zip(zip(*passes, strict=True), (float, np.int64, float), strict=True)]
     out = torch.empty(len(x0), 2, x0.shape[1], dtype=torch.float64)
-    return for_each_pair(compiled.lpm, (x0, x1, mask), *options, out=out, kind=torch.float64)
+    return for_each_pair(compiled.lpm, (x0, x1, mask), compiled.Passes(*rows), out=out, kind=torch.float64)
 
 
 def _passes(thresholds: Sequence[float], neighbors: Sequence[int], taus: Sequence[float]) -> list[Pass]:

@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fmtorch.compiling.arrays import Array, B1x1, F8x1, F8x2, I8x1
 from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.scratch import vector
 from fmtorch.pruning.knn_kernels import search
 
-Array = NDArray[Any]
+
+class Passes(NamedTuple):
+    """Of each pass (p,) the cost up to which matches are kept, neighbours, and the agreement of motions that differ."""
+
+    thresholds: F8x1
+    neighbors: I8x1
+    taus: F8x1
 
 
-@kernel("f8[:, ::1], f8[:, ::1], b1[::1], f8[::1], i8[::1], f8[::1], f8[:, ::1]")
-def lpm(
-    x0: Array, x1: Array, mask: Array, thresholds: Array, neighbors: Array, taus: Array, out: Array
-) -> None:  # fmt: skip
+@kernel
+def lpm(x0: F8x2, x1: F8x2, mask: B1x1, passes: Passes, out: F8x2) -> None:
     """`lpm.lpm` of x0, x1 (n, 2), mask (n,) -> out[0] (n,), 1 for matches that are kept; `lpm.lpm_cost` -> out[1]."""
+    thresholds, neighbors, taus = passes
     n, m = len(mask), 0
     out[0], out[1] = 0, 1
     match, points = np.empty(n, np.int64), np.empty((2, n, 2))
@@ -29,12 +35,12 @@ def lpm(
             points[0, m, k], points[1, m, k] = x0[i, k], x1[i, k]
         m += mask[i] and finite and math.isfinite(x1[i, 0]) and math.isfinite(x1[i, 1])
     points0, points1 = points[0, :m], points[1, :m]
-    members, cost, total, passes = np.arange(m), np.empty(m), np.zeros(m), 0
+    members, cost, total, done = np.arange(m), vector(m), np.zeros(m), 0
     for k in range(len(thresholds)):
-        if passes > 0 and len(members) < neighbors[k] + 4:
+        if done > 0 and len(members) < neighbors[k] + 4:
             continue
         _cost(points0, points1, members, neighbors[k], taus[k], cost)
-        passes += 1
+        done += 1
         total += cost
         kept = 0
         members = np.empty(m, np.int64)
@@ -43,8 +49,8 @@ def lpm(
             kept += cost[i] <= thresholds[k]
         members = members[:kept]
     for i in range(m):
-        out[0, match[i]] = cost[i] <= thresholds[passes - 1]
-        out[1, match[i]] = total[i] / passes
+        out[0, match[i]] = cost[i] <= thresholds[done - 1]
+        out[1, match[i]] = total[i] / done
 
 
 @inner

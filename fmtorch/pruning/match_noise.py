@@ -9,14 +9,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.batches import for_each_pair, kernels_serve
 from fmtorch.core.records import ungraphed
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.pruning import match_noise_kernels as compiled
 
-LEAST_AREA = 1e-12  # square pixels: keeps the gradient of the scale finite
-LEAST_PRIOR = 0.02  # matches less likely than that are not taken for noisier
+MIN_AREA = 1e-12  # square pixels: keeps the gradient of the scale finite
+MIN_PRIOR = 0.02  # matches less likely than that are not taken for noisier
 
 
 def match_noise(
@@ -40,14 +41,14 @@ def match_noise(
     if quality is not None:
         noise = noise * (1 + slope * quality).square()
     if prior is not None:
-        noise = noise / sqrt(sqrt(prior.clamp_min(LEAST_PRIOR)))
+        noise = noise / sqrt(sqrt(prior.clamp_min(MIN_PRIOR)))
     return noise
 
 
 def _scale(lafs: Float[Tensor, "b n 2 3"]) -> Float[Tensor, "b n"]:
     """The square root of the area that a frame maps the unit square to, pixels."""
     (a, b), (c, d) = (row.unbind(-1) for row in lafs[..., :2].unbind(-2))
-    return sqrt((a * d - b * c).abs().clamp_min(LEAST_AREA))
+    return sqrt((a * d - b * c).abs().clamp_min(MIN_AREA))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,9 +70,9 @@ class MatchNoise:
         if lafs0 is None or lafs1 is None:
             return c
         if kernels_serve(lafs0, lafs1, c.quality, c.prior, floats=(torch.float32,)):
-            numbers = np.array((self.usual, self.radius, self.slope, LEAST_AREA, LEAST_PRIOR), np.float32)
+            numbers = np.array((self.usual, self.radius, self.slope, MIN_AREA, MIN_PRIOR), np.float32)
             tensors = (lafs0, lafs1, c.quality, c.prior, c.mask)
-            return c.derived(noise=for_each_pair(compiled.match_noise, tensors, numbers, out=torch.empty(c.mask.shape)))
+            return c.derived(noise=for_each_pair(_into, tensors, numbers, out=torch.empty(c.mask.shape)))
         return ungraphed(c, lambda: self._with_noise(c, lafs0, lafs1))
 
     def _with_noise(self, c: Correspondences, lafs0: Tensor, lafs1: Tensor) -> Correspondences:
@@ -85,3 +86,7 @@ class MatchNoise:
             usual=self.usual, radius=self.radius, slope=self.slope,
         )  # fmt: skip
         return c.derived(noise=torch.where(mask, noise, 1))
+
+
+def _into(lafs0: Array, lafs1: Array, quality: Array, prior: Array, mask: Array, numbers: Array, out: Array) -> None:
+    compiled.match_noise(compiled.FramedMatches(lafs0, lafs1, quality, prior, mask), numbers, out)

@@ -3,46 +3,58 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import NamedTuple
 
-from numpy.typing import NDArray
+import numpy as np
 
+from fmtorch.compiling.arrays import B1x1, F4x1, F4x3
 from fmtorch.compiling.kernel import inner, kernel
 
-Array = NDArray[Any]
 
+class FramedMatches(NamedTuple):
+    """The matches of one pair: frames lafs0, lafs1 (n, 2, 3), pixels, and which are real, mask (n,).
 
-@kernel("f4[:, :, ::1], f4[:, :, ::1], f4[::1], f4[::1], b1[::1], f4[::1], f4[::1]")
-def match_noise(
-    lafs0: Array, lafs1: Array, quality: Array, prior: Array, mask: Array, numbers: Array, out: Array
-) -> None:  # fmt: skip
-    """`MatchNoise` of frames (n, 2, 3) -> out (n,); one where masked or where it cannot be told.
-
-    quality, prior: (n,), empty where unknown. numbers: usual, radius, slope, least area, least prior.
+    quality, prior: (n,), empty where unknown.
     """
-    one = numbers.dtype.type(1)
+
+    lafs0: F4x3
+    lafs1: F4x3
+    quality: F4x1
+    prior: F4x1
+    mask: B1x1
+
+
+@kernel
+def match_noise(matches: FramedMatches, numbers: F4x1, out: F4x1) -> None:
+    """`MatchNoise` of n matches -> out (n,); one where masked or where it cannot be told.
+
+    numbers: usual, radius in pixels, slope, least area in square pixels, least prior.
+    """
+    lafs0, lafs1, quality, prior, mask = matches
+    usual, radius, slope, min_area, min_prior = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
+    one = np.float32(1)
     for i in range(len(mask)):
-        size = max(_scale(lafs0, i, numbers[3]), _scale(lafs1, i, numbers[3]))
-        noise = (one + size / numbers[1]) / numbers[0]
+        size = max(_scale(lafs0, i, min_area), _scale(lafs1, i, min_area))
+        noise = (one + size / radius) / usual
         valid = mask[i] and _finite(lafs0, i) and _finite(lafs1, i)
         if len(quality):
             valid = valid and math.isfinite(quality[i])
-            factor = one + numbers[2] * quality[i]
+            factor = one + slope * quality[i]
             noise *= factor * factor
         if len(prior):
             valid = valid and math.isfinite(prior[i])
-            noise /= math.sqrt(math.sqrt(max(prior[i], numbers[4])))
+            noise /= math.sqrt(math.sqrt(max(prior[i], min_prior)))
         out[i] = noise if valid else one
 
 
 @inner
-def _scale(lafs: Array, i: int, least: float) -> float:
+def _scale(lafs: F4x3, i: int, least: np.float32) -> float:
     """The square root of the area that frame i maps the unit square to."""
     return math.sqrt(max(abs(lafs[i, 0, 0] * lafs[i, 1, 1] - lafs[i, 0, 1] * lafs[i, 1, 0]), least))
 
 
 @inner
-def _finite(lafs: Array, i: int) -> bool:
+def _finite(lafs: F4x3, i: int) -> bool:
     """Whether all numbers of frame i are finite."""
     finite = True
     for row in range(2):

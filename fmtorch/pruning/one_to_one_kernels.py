@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fmtorch.compiling.arrays import Array, B1x1, F8x1, F8x2
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.random_kernels import mix
+from fmtorch.compiling.scratch import vector
 
-Array = NDArray[Any]
 
-
-@kernel("f8[:, ::1], f8[:, ::1], f8[::1], b1[::1], b1[::1]")
-def one_to_one(x0: Array, x1: Array, quality: Array, mask: Array, out: Array) -> None:
+@kernel
+def one_to_one(x0: F8x2, x1: F8x2, quality: F8x1, mask: B1x1, out: B1x1) -> None:
     """`one_to_one` of x0, x1 (n, 2), quality, mask (n,) -> out (n,)."""
     n = len(mask)
-    valid, rank = np.empty(n, np.bool_), np.empty(n)
+    valid, rank = np.empty(n, np.bool_), vector(n)
     for i in range(n):
         finite = math.isfinite(x0[i, 0]) and math.isfinite(x0[i, 1])
         valid[i] = mask[i] and finite and math.isfinite(x1[i, 0]) and math.isfinite(x1[i, 1])

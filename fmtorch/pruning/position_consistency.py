@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -21,37 +20,29 @@ from fmtorch.core.records import ungraphed
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry.arithmetic import component_sum, sqrt
 from fmtorch.geometry.curves import curve_orders
+from fmtorch.pruning import calibration_kernels
 from fmtorch.pruning import position_consistency_kernels as compiled
-from fmtorch.pruning.calibration import Calibration
-from fmtorch.pruning.frame_consistency import (
-    CURVE_TABLE,
+from fmtorch.pruning.agreement import (
+    ANGLES,
     CURVES,
-    LEAST_SQUARE,
-    LEAST_VOTE,
+    EDGES,
+    FARTHEST,
+    HALF_SECTOR,
+    IDENTITY,
+    MIN_SQUARE,
+    MIN_VOTE,
     NOISE,
-    NUMBERS,
-    TOLERANCE,
+    SCALES,
+    SHARPNESS,
+    TURNS,
+    TWO_SECTORS,
     WINDOW,
     WORST_RATIO,
-    tiled,
 )
+from fmtorch.pruning.calibration import Calibration
+from fmtorch.pruning.frame_consistency import tiled
 
-TURNS = 16  # hypotheses of the common turn
-SCALES = tuple(2.0 ** (k / 2) for k in range(-4, 5))  # hypotheses of the common change of scale
 _BINS = len(SCALES) * TURNS
-_IDENTITY = SCALES.index(1.0) * TURNS
-_EDGES = tuple(2.0 ** (k / 2) for k in range(-9, 11, 2))  # of squared scales, halfway between the hypotheses
-_FARTHEST = 1e15  # px; a match beyond is none: its squares could overflow
-_ANGLES = tuple(2 * math.pi * k / TURNS for k in range(TURNS))
-_HALF_SECTOR, _TWO_SECTORS = math.pi / TURNS, math.pi / 8
-
-# For the kernel: its numbers, the edges, and of each scale and turn the scaled cosine and sine and the scale.
-_NUMBERS = np.array(
-    (*NUMBERS, _FARTHEST, math.cos(_HALF_SECTOR), math.sin(_HALF_SECTOR), math.tan(_TWO_SECTORS), _IDENTITY), np.float32
-)
-_EDGE_TABLE, _SCALE_TABLE = np.array(_EDGES, np.float32), np.array(SCALES, np.float32)[:, None]
-_COSINES, _SINES = (np.array([f(angle) for angle in _ANGLES], np.float32) for f in (math.cos, math.sin))
-_MAPS = np.stack(np.broadcast_arrays(_SCALE_TABLE * _COSINES, _SCALE_TABLE * _SINES, _SCALE_TABLE), -1).copy()
 
 
 class Similarity(NamedTuple):
@@ -76,12 +67,11 @@ def position_agreement(
     and without gradients it is computed in float32, by a kernel.
     """
     if kernels_serve(x0, x1, quality):
-        constants = (CURVE_TABLE, _NUMBERS, _EDGE_TABLE, _MAPS)
         out = torch.empty(mask.shape, dtype=torch.float32)
-        return for_each_pair(compiled.position_agreement, (x0, x1, quality, mask), *constants, out=out).to(x0.dtype)
-    vote = torch.ones_like(x0[..., 0]) if quality is None else (WORST_RATIO - quality).clamp_min(LEAST_VOTE)
+        return for_each_pair(compiled.position_agreement, (x0, x1, quality, mask), out=out).to(x0.dtype)
+    vote = torch.ones_like(x0[..., 0]) if quality is None else (WORST_RATIO - quality).clamp_min(MIN_VOTE)
     rows = torch.stack([*x0.unbind(-1), *x1.unbind(-1), vote])
-    mask = mask & (rows.abs() < _FARTHEST).all(0)
+    mask = mask & (rows.abs() < FARTHEST).all(0)
     rows = torch.where(mask, rows, 0)
     return tiled(_agreement, rows, mask)
 
@@ -94,8 +84,8 @@ def _agreement(rows: Float[Tensor, "5 b n"], mask: Bool[Tensor, "b n"]) -> Float
     S = common_similarity(along[:, 0].detach(), along[:, len(CURVES)].detach(), mask.sum(1))
     S = Similarity(*(value.repeat(len(orders), 1) for value in S))
     sums = torch.stack(_along_curve(along.flatten(1, 2), S)).reshape(2, *orders.shape)
-    found = sums.new_zeros(*sums.shape[:3], mask.shape[1]).scatter(3, orders.expand(2, -1, -1, -1), sums)
-    agreement, votes = component_sum(found, 1)
+    in_slots = sums.new_zeros(*sums.shape[:3], mask.shape[1]).scatter(3, orders.expand(2, -1, -1, -1), sums)
+    agreement, votes = component_sum(in_slots, 1)
     return torch.where(mask, agreement / votes.clamp_min(torch.finfo(votes.dtype).tiny), 0)
 
 
@@ -111,10 +101,10 @@ def common_similarity(
     """
     merit = _histogram(along0, count) * _histogram(along1, count)
     index = torch.arange(_BINS, device=merit.device)
-    first = (_IDENTITY - index).remainder(_BINS)  # of equals the identity wins
+    first = (IDENTITY - index).remainder(_BINS)  # of equals the identity wins
     best = (merit * _BINS + (_BINS - 1 - first)).argmax(1, keepdim=True)
     scale = along0.new_tensor(SCALES)[best // TURNS]
-    cosine, sine = (along0.new_tensor([f(angle) for angle in _ANGLES])[best % TURNS] for f in (math.cos, math.sin))
+    cosine, sine = (along0.new_tensor([f(angle) for angle in ANGLES])[best % TURNS] for f in (math.cos, math.sin))
     return Similarity(scale * cosine, scale * sine, scale)
 
 
@@ -122,7 +112,7 @@ def _histogram(along: Float[Tensor, "5 b n"], count: Int[Tensor, " b"]) -> Int[T
     """Votes for each scale and turn, those of adjoining bins counted in part (1, 2, 1)."""
     dx, dy, ux, uy = along[:4, :, 1:] - along[:4, :, :-1]
     length0, length1 = dx.square() + dy.square(), ux.square() + uy.square()
-    level = torch.bucketize(length1 / length0, along.new_tensor(_EDGES)) - 1
+    level = torch.bucketize(length1 / length0, along.new_tensor(EDGES)) - 1
     valid = torch.arange(1, along.shape[2], device=along.device) < count[:, None]
     valid = valid & (length0 > 0) & (length1 > 0) & (level >= 0) & (level < len(SCALES))
     place = torch.where(valid, level * TURNS + _turn(dx * ux + dy * uy, dx * uy - dy * ux), _BINS)
@@ -135,7 +125,7 @@ def _histogram(along: Float[Tensor, "5 b n"], count: Int[Tensor, " b"]) -> Int[T
 
 def _turn(x: Tensor, y: Tensor) -> Int[Tensor, "b n"]:
     """Which of 16 sectors, centred on multiples of 22.5 degrees, the direction (x, y) is in; by comparisons alone."""
-    cosine, sine = math.cos(_HALF_SECTOR), math.sin(_HALF_SECTOR)
+    cosine, sine = math.cos(HALF_SECTOR), math.sin(HALF_SECTOR)
     x, y = cosine * x - sine * y, sine * x + cosine * y
     half = y < 0
     x, y = torch.where(half, -x, x), torch.where(half, -y, y)
@@ -143,7 +133,7 @@ def _turn(x: Tensor, y: Tensor) -> Int[Tensor, "b n"]:
     x, y = torch.where(quarter, y, x), torch.where(quarter, -x, y)
     eighth = y >= x
     x, y = torch.where(eighth, x + y, x), torch.where(eighth, y - x, y)
-    sixteenth = y >= math.tan(_TWO_SECTORS) * x
+    sixteenth = y >= math.tan(TWO_SECTORS) * x
     return 8 * half.long() + 4 * quarter.long() + 2 * eighth.long() + sixteenth.long()
 
 
@@ -162,11 +152,9 @@ def _along_curve(rows: Float[Tensor, "5 b n"], S: Similarity) -> tuple[Float[Ten
     dx, dy, ux, uy = later[:4] - rows[:4, None]
     error = (S.a * dx - S.b * dy - ux).square() + (S.b * dx + S.a * dy - uy).square()
     length = (
-        S.scale * sqrt(dx.square() + dy.square() + LEAST_SQUARE)
-        + sqrt(ux.square() + uy.square() + LEAST_SQUARE)
-        + NOISE
+        S.scale * sqrt(dx.square() + dy.square() + MIN_SQUARE) + sqrt(ux.square() + uy.square() + MIN_SQUARE) + NOISE
     )
-    agree = (1 + error / length.square() * (TOLERANCE**-2 / 8)).square().square().square().reciprocal()
+    agree = (1 + error / length.square() * SHARPNESS).square().square().square().reciprocal()
     # Added one by one: the order of a sum must not depend on the batch.
     forward, backward = agree * later[4], agree * rows[4]
     for k in range(1, reach + 1):
@@ -180,7 +168,10 @@ class PositionConsistency:
     """Supplies ``prior``: P(inlier) from the agreement of neighbours' motion and, where known, the ratio.
 
     Needs no frames, no sizes and no quality. Linear memory: about 600 bytes a match.
+    kernels: worth compiling together with those of an estimator.
     """
+
+    kernels: ClassVar = (compiled.position_agreement, calibration_kernels.calibrated)
 
     def __init__(self, *, calibration: Mapping[str, Mapping[str, float]]) -> None:
         self.calibration = Calibration(**calibration)

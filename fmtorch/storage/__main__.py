@@ -57,8 +57,8 @@ def _show(folder: Path, kind: str, sizes: Sizes) -> None:
     table = Table(title=f"{folder}: {sum(map(len, sizes.values()))} files, {_megabytes(sum(map(sum, sizes.values())))}")
     for name in (kind, "files", "size"):
         table.add_column(name, justify="left" if name == kind else "right")
-    for section, some in sorted(sizes.items()):
-        table.add_row(section, str(len(some)), _megabytes(sum(some)))
+    for section, sizes_of_section in sorted(sizes.items()):
+        table.add_row(section, str(len(sizes_of_section)), _megabytes(sum(sizes_of_section)))
     Console().print(table)
 
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fmtorch import __version__
+from fmtorch.core.version import __version__
 
 PACKAGE = Path(__file__).resolve().parents[1]
 DIGITS = 12  # of a commit or digest that a version shows
@@ -75,15 +75,15 @@ def _imported(file: Path, start: Path, own: bool) -> set[Path]:
 
     own: whether it is of fmtorch, whose imports are followed then, and not those of anybody else.
     """
-    found: set[Path] = set()
+    files: set[Path] = set()
     todo = [file]
     while todo:
         file = todo.pop()
-        if file in found:
+        if file in files:
             continue
-        found.add(file)
+        files.add(file)
         todo += [path for statement in _imports(file.read_bytes()) for path in _files_of(statement, file, start, own)]
-    return found
+    return files
 
 
 class _Import(NamedTuple):
@@ -114,14 +114,14 @@ def _imports(source: bytes) -> tuple[_Import, ...]:
 
 def _statements(tree: ast.Module) -> list[ast.AST]:
     """All statements of a file, wherever in it; much faster than a walk through its expressions, too."""
-    found: list[ast.AST] = []
+    statements: list[ast.AST] = []
     todo: list[ast.AST] = [tree]
     while todo:
         node = todo.pop()
-        found.append(node)
+        statements.append(node)
         for block in ("body", "orelse", "finalbody", "handlers", "cases"):
             todo += getattr(node, block, ())
-    return found
+    return statements
 
 
 def _files_of(statement: _Import, file: Path, start: Path, own: bool) -> Iterator[Path]:

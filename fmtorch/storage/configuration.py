@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 import torch
 
-from fmtorch import __version__
+from fmtorch.core.version import __version__
 from fmtorch.storage.code import code_digest, digest
 
 LIBRARIES = ("numpy", "torch", "kornia", "onnxruntime")  # and OpenCV, which has several names as a package

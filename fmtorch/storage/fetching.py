@@ -16,10 +16,10 @@ from pathlib import Path
 def expect_digest(url: str, path: Path, sha256: str) -> None:
     """Raises ValueError, and drops the file, where it is another one."""
     with path.open("rb") as file:
-        found = hashlib.file_digest(file, "sha256").hexdigest()
-    if found != sha256.lower():
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    if digest != sha256.lower():
         path.unlink()
-        raise ValueError(f"{url} has SHA-256 {found}, not {sha256}: it was not kept")
+        raise ValueError(f"{url} has SHA-256 {digest}, not {sha256}: it was not kept")
 
 
 def resume(url: str, path: Path, timeout: float | int = 60) -> None:
@@ -37,8 +37,8 @@ def resume(url: str, path: Path, timeout: float | int = 60) -> None:
         with urllib.request.urlopen(request, timeout=timeout) as response:
             begin = begin if response.status == 206 else 0  # else the server sends it from the beginning
             with part.open("ab" if begin else "wb") as file:
-                while some := response.read(1 << 20):
-                    file.write(some)
+                while chunk := response.read(1 << 20):
+                    file.write(chunk)
                 length = response.headers.get("Content-Length")
                 if length is not None and file.tell() != begin + int(length):
                     raise ConnectionError(f"{url} broke off after {file.tell()} of {begin + int(length)} bytes")
@@ -63,14 +63,14 @@ def unpack(archive: Path, folder: Path) -> list[Path]:
                 tar.extractall(temporary, filter="data")
         except (tarfile.TarError, EOFError, zlib.error, OSError) as error:
             raise ValueError(f"{archive}: cannot be unpacked ({error}); delete it and fetch it again") from error
-        made = []
+        unpacked = []
         for path in sorted(Path(temporary).iterdir()):
             if (folder / path.name).exists():
                 raise ValueError(f"{folder / path.name} is there already; name another folder or remove it")
         for path in sorted(Path(temporary).iterdir()):
             os.replace(path, folder / path.name)
-            made.append(folder / path.name)
-    return made
+            unpacked.append(folder / path.name)
+    return unpacked
 
 
 def download(url: str, path: Path, sha256: str | None, timeout: float | int = 60) -> str:
@@ -90,9 +90,9 @@ def download(url: str, path: Path, sha256: str | None, timeout: float | int = 60
             expected = response.headers.get("Content-Length")
             if expected is not None and file.tell() != int(expected):
                 raise ConnectionError(f"{url} broke off after {file.tell()} of {expected} bytes")
-        found = digest.hexdigest()
-        if sha256 is not None and found != sha256.lower():
-            raise ValueError(f"{url} has SHA-256 {found}, not {sha256}: it was not kept")
+        actual = digest.hexdigest()
+        if sha256 is not None and actual != sha256.lower():
+            raise ValueError(f"{url} has SHA-256 {actual}, not {sha256}: it was not kept")
         os.replace(unfinished, path)
     except urllib.error.URLError as error:
         raise ConnectionError(
@@ -100,4 +100,4 @@ def download(url: str, path: Path, sha256: str | None, timeout: float | int = 60
         ) from error
     finally:
         Path(unfinished).unlink(missing_ok=True)
-    return found
+    return actual

@@ -150,10 +150,10 @@ class RunFolder:
         Raises RunFolderError naming a part that cannot be read.
         """
         table = pa.concat_tables([PAIR_SCHEMA.empty_table(), *self._parts(PAIR_SCHEMA.names)])
-        found = table["key"].to_numpy()
-        _, first = np.unique(found, return_index=True)
+        stored_keys = table["key"].to_numpy()
+        _, first = np.unique(stored_keys, return_index=True)
         if keys is not None:
-            first = first[np.isin(found[first], np.fromiter(keys, np.int64, len(keys)))]
+            first = first[np.isin(stored_keys[first], np.fromiter(keys, np.int64, len(keys)))]
         return table.take(np.sort(first))
 
     def write_summary(self, summary: Mapping[str, Any], markdown: str) -> None:

@@ -62,16 +62,16 @@ def corresponding_patches(
     anchors: Keypoints = np.zeros((0, 4))
     for view in range(views):
         picture, H = _view(image, rng, limits, first=view == 0)
-        found = detect(picture, points if view == 0 else 4 * points)
-        in_reference = _transfer(found, np.asarray(np.linalg.inv(H), np.float64))
+        detected = detect(picture, points if view == 0 else 4 * points)
+        in_reference = _transfer(detected, np.asarray(np.linalg.inv(H), np.float64))
         if view == 0:
             kept = distinct(in_reference)
-            anchors, found = in_reference[kept], found[kept]
+            anchors, detected = in_reference[kept], detected[kept]
             owner = np.arange(len(anchors))
         else:
             owner = same_point(anchors, in_reference, tolerance)
         mine = np.flatnonzero(owner >= 0)
-        patches.append(cut_context(picture, found[mine]))
+        patches.append(cut_context(picture, detected[mine]))
         owners.append(owner[mine])
     return sorted_by_point(patches, owners)
 
@@ -156,11 +156,11 @@ def distinct(keypoints: Keypoints) -> NDArray[np.int64]:
     return np.flatnonzero(kept)
 
 
-def same_point(anchors: Keypoints, found: Keypoints, tolerance: Tolerance) -> NDArray[np.int64]:
+def same_point(anchors: Keypoints, detected: Keypoints, tolerance: Tolerance) -> NDArray[np.int64]:
     """For each found keypoint its anchor or -1; pairs are taken in the order of their cost, each keypoint once."""
-    owner = np.full(len(found), -1)
+    owner = np.full(len(detected), -1)
     taken = np.zeros(len(anchors), bool)
-    i, j, cost = near(anchors, found, tolerance)
+    i, j, cost = near(anchors, detected, tolerance)
     for k in np.argsort(cost, kind="stable"):
         if not taken[i[k]] and owner[j[k]] < 0:
             owner[j[k]], taken[i[k]] = i[k], True

@@ -18,8 +18,8 @@ WEAKEST = 1e-4  # response of the Hessian, for intensities in [0, 1]; below it i
 
 def dog_keypoints(image: Grey, count: int) -> Keypoints:
     """The strongest DoG keypoints with their dominant orientations (Lowe, IJCV 2004)."""
-    found = cv2.SIFT.create(nfeatures=count, contrastThreshold=0.02, enable_precise_upscale=True).detect(image, None)
-    table = np.array([(*k.pt, k.size / 2, math.radians(k.angle)) for k in found], np.float64)
+    detected = cv2.SIFT.create(nfeatures=count, contrastThreshold=0.02, enable_precise_upscale=True).detect(image, None)
+    table = np.array([(*k.pt, k.size / 2, math.radians(k.angle)) for k in detected], np.float64)
     return table.reshape(-1, 4)[:count]
 
 

@@ -145,12 +145,12 @@ class _Graph:
         reader.input[0] = f"{name}_whole"
 
     def _reader(self, name: str) -> Any:
-        (found,) = [node for node in self.graph.node if name in node.input]
-        return found
+        (reader,) = [node for node in self.graph.node if name in node.input]
+        return reader
 
     def _insert_before(self, node: Any, operator: str, inputs: list[str], output: str, **attributes: Any) -> None:
-        made = helper.make_node(operator, inputs, [output], f"{output}_{operator}", **attributes)
-        self.graph.node.insert(list(self.graph.node).index(node), made)
+        inserted = helper.make_node(operator, inputs, [output], f"{output}_{operator}", **attributes)
+        self.graph.node.insert(list(self.graph.node).index(node), inserted)
 
     def _constant(self, name: str, values: list[int]) -> str:
         self.graph.initializer.append(numpy_helper.from_array(np.array(values, np.int64), name))

@@ -58,10 +58,10 @@ class PatchStore:
         """Two different patches of each point in [0, 1], chosen by two random numbers in [0, 1)."""
         start = torch.from_numpy(self.first)[points]
         count = torch.from_numpy(self.first)[points + 1] - start
-        one = (draws[:, 0] * count).long()
+        first = (draws[:, 0] * count).long()
         other = (draws[:, 1] * (count - 1)).long()
-        other = other + (other >= one)
-        index = torch.stack([start + one, start + other]).numpy()
+        other = other + (other >= first)
+        index = torch.stack([start + first, start + other]).numpy()
         return torch.from_numpy(self.patches[index]).unsqueeze(2).float() / 255
 
 

@@ -36,21 +36,21 @@ def list_photographs(
     table = folder / "sources.txt"
     if table.is_file():
         rows = [line.split(maxsplit=4) for line in table.read_text().splitlines() if line and not line.startswith("#")]
-        found = [(folder / row[0], row[3], f"{row[3]}:{row[4]}") for row in rows]
+        photographs = [(folder / row[0], row[3], f"{row[3]}:{row[4]}") for row in rows]
     else:
         files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
         names = [path.relative_to(folder) for path in files]
-        found = [
+        photographs = [
             (path, str(name.parent if len(name.parts) > 1 else name), str(name))
             for path, name in zip(files, names, strict=True)
         ]
     kept = [
         Photograph(path, source)
-        for path, source, full in found
+        for path, source, full in photographs
         if (sources is None or source in sources) and not any(part in full for part in excluded)
     ]
     if not kept:
-        raise ValueError(f"{folder}: none of its {len(found)} photographs is left by sources and excluded")
+        raise ValueError(f"{folder}: none of its {len(photographs)} photographs is left by sources and excluded")
     return kept
 
 

@@ -26,7 +26,7 @@ from fmtorch.core.resources import cache_dir
 from fmtorch.data.cameras import relative_pose
 from fmtorch.data.images import read_image
 from fmtorch.data.pairs import ImagePair, ImageSource
-from fmtorch.data.rendered.cameras import Camera, calibration
+from fmtorch.data.rendered.pinhole import Camera, calibration
 from fmtorch.training.photographs import Photograph
 from fmtorch.training.warps import Matrix, change_camera, change_light, grey_of, warp
 

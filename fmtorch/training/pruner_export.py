@@ -104,8 +104,8 @@ class _OnePair(nn.Module):
 
 @torch.no_grad()
 def _check(network: nn.Module, alone: nn.Module, path: Path, x: Tensor) -> None:
-    found = OnnxBackbone(network, path, "")(x, Slots(torch.tensor([float(x.shape[2])]), None))
-    apart = float((found - alone(x)).abs().max())
+    exported = OnnxBackbone(network, path, "")(x, Slots(torch.tensor([float(x.shape[2])]), None))
+    apart = float((exported - alone(x)).abs().max())
     if not apart <= ATOL:
         raise ArithmeticError(f"{path}: ONNX Runtime differs from torch by {apart:.1e}, more than {ATOL:.0e}")
 

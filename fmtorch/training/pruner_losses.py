@@ -172,8 +172,8 @@ def _by_size(size: Real[Tensor, "b 2"]) -> Float[Tensor, "b 3 3"]:
     """From coordinates about the image's centre, in half longer sides, to pixels."""
     h, w = size.to(torch.float64).unbind(-1)
     half = torch.maximum(h, w) / 2
-    zero, one = torch.zeros_like(h), torch.ones_like(h)
-    rows = [half, zero, (w - 1) / 2, zero, half, (h - 1) / 2, zero, zero, one]
+    zero, ones = torch.zeros_like(h), torch.ones_like(h)
+    rows = [half, zero, (w - 1) / 2, zero, half, (h - 1) / 2, zero, zero, ones]
     return torch.stack(rows, -1).reshape(-1, 3, 3)
 
 

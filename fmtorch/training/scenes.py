@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.data.rendered.cameras import Camera
 from fmtorch.data.rendered.generate import FAMILIES, Plan, Task, build, draw, seeds
+from fmtorch.data.rendered.pinhole import Camera
 from fmtorch.data.rendered.raycast import Geometry
 from fmtorch.training.correspondences import (
     SAME_PLACE,

@@ -13,6 +13,7 @@ from scripts.benchmark import (
     estimators,
     features,
     gc_ransac,
+    homography,
     learned,
     matching,
     memory,
@@ -32,8 +33,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m scripts.benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     for module in (
-        curves, end_to_end, estimators, features, gc_ransac, learned, matching, memory, paper, paper_times, pipelines,
-        pruning, related, speed, stress, sweep, thresholds,
+        curves, end_to_end, estimators, features, gc_ransac, homography, learned, matching, memory, paper, paper_times,
+        pipelines, pruning, related, speed, stress, sweep, thresholds,
     ):  # fmt: skip
         module.add_arguments(commands)
     arguments = parser.parse_args()

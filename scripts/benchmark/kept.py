@@ -9,8 +9,7 @@ from typing import Any
 
 import hydra.utils
 
-from fmtorch.estimators.peers import PEERS
-from fmtorch.presets import load, targets_of
+from fmtorch.presets import load, peer_packages, targets_of
 from fmtorch.presets.objects import merged
 from fmtorch.storage import identity_digest
 from fmtorch.storage.code import code_digest
@@ -90,10 +89,9 @@ def identity(stages: Stages, *others: Any) -> str:
     configs = [merged(load(group, name), options) for group, name, options in stages]
     targets = sorted(targets_of(configs))
     modules = {target: str(hydra.utils.get_object(target).__module__) for target in targets}
-    peers = {PEERS[name] for target in targets if (name := target.rpartition(".")[2]) in PEERS}
     plain = [other if isinstance(other, bool | int | float | str | None) else learned(other) for other in others]
     made_with = {
         "stages": configs, "code": {target: code_digest(module) for target, module in modules.items()},
-        "libraries": libraries(sorted(peers)), "others": plain,
+        "libraries": libraries(peer_packages(configs)), "others": plain,
     }  # fmt: skip
     return identity_digest(made_with)[:DIGITS]

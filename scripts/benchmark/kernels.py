@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import os
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -93,3 +94,7 @@ def whole(group: str, names: Sequence[str], c: Correspondences) -> None:
 
         line(name, functools.partial(run, "on"), functools.partial(run, "off"))
     os.environ[switch.SWITCH] = "on"
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import itertools
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,15 +20,16 @@ from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data import ImagePair
 from fmtorch.evaluation.run import select
 from fmtorch.geometry.epipolar import symmetric_max
-from fmtorch.geometry.homography import least_squares_homography, transfer_squared
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pruning.one_to_one import one_to_one
 from scripts.benchmark.matched import console, sets_of
 
+Array = NDArray[Any]
 RATIO = 0.8
 RIGHT_PX, WRONG_PX = 3.0, 10.0  # from the true epipolar lines in both images, and in one of them
-LEAST_RIGHT = 15
+MIN_RIGHT = 15
 PLANE_PX = 3.0
+UNIT_PX = 300.0  # in which homographies are computed
 IMAGES = 256  # whose features are kept, some 5 MB each
 
 
@@ -79,7 +81,7 @@ def load(arguments: argparse.Namespace) -> Iterator[Case]:
         matches = front.match([pair])[0].correspondences
         if matches is not None:
             case = made(pair, matches)
-            if int(case.right.sum()) >= LEAST_RIGHT:
+            if int(case.right.sum()) >= MIN_RIGHT:
                 yield case
 
 
@@ -127,20 +129,49 @@ def parallax(case: Case) -> float:
 def on_plane(case: Case, samples: int = 500) -> Bool[Tensor, " n"]:
     """The right matches within PLANE_PX of the homography that holds for most of them, (n,)."""
     index = case.right.nonzero()[:, 0]
-    points = torch.cat([case.c.x0[0, index], case.c.x1[0, index]], -1).double().T[:, None]  # (4, 1, n)
-    drawn = torch.from_numpy(case.rng("plane").random((samples, len(index)))).argsort(-1)[:, :4]
-    H, _ = least_squares_homography(points[:, 0][:, drawn], torch.ones(samples, 4, dtype=torch.float64))
-    near = transfer_squared(H[:, None], points)[0] < PLANE_PX**2
+    points = torch.cat([case.c.x0[0, index], case.c.x1[0, index]], -1).double().numpy()
+    drawn = case.rng("plane").random((samples, len(index))).argsort(-1)[:, :4]
+    near = transfer_squared(homographies(points[drawn]), points) < PLANE_PX**2
     inside = near[near.sum(-1).argmax()]
     for _ in range(3):
-        H, _ = least_squares_homography(points, inside.double()[None])
-        refined = transfer_squared(H[:, :, None], points)[0, 0] < PLANE_PX**2
+        refined = transfer_squared(homographies(points[inside][None]), points)[0] < PLANE_PX**2
         if refined.sum() < inside.sum():
             break
         inside = refined
     found = torch.zeros_like(case.right)
-    found[index[inside]] = True
+    found[index[torch.from_numpy(inside)]] = True
     return found
+
+
+def homographies(points: Array) -> Array:
+    """Of least algebraic error, of k sets of n matches (k, n, 4): the normalised DLT (Hartley & Zisserman, 4.2)."""
+    centre = points.mean(1, keepdims=True)
+    h0, h1 = (np.insert(x, 2, 1.0, axis=-1) for x in np.split((points - centre) / UNIT_PX, 2, axis=-1))
+    zero = np.zeros_like(h0)
+    rows = [np.concatenate([zero, -h0, h1[..., 1:2] * h0], -1), np.concatenate([h0, zero, -h1[..., :1] * h0], -1)]
+    H = np.linalg.svd(np.concatenate(rows, 1))[2][:, -1].reshape(-1, 3, 3)
+    T0, T1 = (np.broadcast_to(np.eye(3), H.shape).copy() for _ in range(2))
+    T0[:, :2, 2], T1[:, :2, 2] = -centre[:, 0, :2], -centre[:, 0, 2:]
+    unit = np.diag([1 / UNIT_PX, 1 / UNIT_PX, 1])
+    result: Array = np.linalg.inv(unit @ T1) @ H @ (unit @ T0)
+    return result
+
+
+def transfer_squared(H: Array, points: Array) -> Array:
+    """The greater of the squared distances from H x0 to x1 and from H^-1 x1 to x0: (k, n), of points (n, 4)."""
+
+    def distance(H: Array, x: Array, y: Array) -> Array:
+        mapped = np.insert(x, 2, 1.0, axis=-1) @ H.transpose(0, 2, 1)
+        squared: Array = np.square(mapped[..., :2] / mapped[..., 2:] - y).sum(-1)
+        return squared
+
+    with np.errstate(all="ignore"):
+        there, back = (
+            distance(H, points[:, :2], points[:, 2:]),
+            distance(np.linalg.pinv(H).astype(np.float64), points[:, 2:], points[:, :2]),
+        )
+    greater: Array = np.maximum(there, back)
+    return greater
 
 
 def _no_estimator(c: Correspondences, seed: int = 0) -> Estimate:

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.core.types import Correspondences
-from scripts.benchmark.stress_cases import LEAST_RIGHT, Case, on_plane, taken
+from scripts.benchmark.stress_cases import MIN_RIGHT, Case, on_plane, taken
 
 Change = Callable[[Case], Case | None]
 
 INLIER_RATIOS = (0.05, 0.1, 0.2, 0.4, 0.7, 0.95)
-MOST_RIGHT = 150  # in the sweep of inlier ratios
+MAX_RIGHT = 150  # in the sweep of inlier ratios
 NOISES = (0.0, 0.5, 1.0, 2.0, 4.0)  # px
-MOST_MATCHES = 500  # in the sweep of noise
+MAX_MATCHES = 500  # in the sweep of noise
 COUNTS = (20, 50, 100, 300, 1000, 4000)
 OFF_PLANE = 0.1  # share of right matches that are left off the plane
 WINDOW = 0.6  # of width and height
@@ -33,15 +33,15 @@ ZOOM = 2.5
 def inlier_ratio(case: Case, ratio: float) -> Case | None:
     """The right matches with as many wrong ones as make this share of inliers; matches that are neither are left out.
 
-    Right ones are as many at every ratio, at most MOST_RIGHT. Wrong ones are first the pair's own, then wrong nearest
+    Right ones are as many at every ratio, at most MAX_RIGHT. Wrong ones are first the pair's own, then wrong nearest
     neighbours that the ratio test took away, with distance ratios drawn from those of the pair's own wrong matches.
     """
     rng, least = case.rng("inlier ratio"), min(INLIER_RATIOS)
     right, wrong = (rng.permutation(np.flatnonzero(mask.numpy())) for mask in (case.right, case.wrong))
     spare = rng.permutation(case.spare.mask.shape[1])
     most = int((len(wrong) + len(spare)) * least / (1 - least))
-    right = right[: min(MOST_RIGHT, most)]
-    if len(right) < LEAST_RIGHT or len(wrong) < 2:
+    right = right[: min(MAX_RIGHT, most)]
+    if len(right) < MIN_RIGHT or len(wrong) < 2:
         return None
     count = round(len(right) * (1 - ratio) / ratio)
     own, added = wrong[:count], spare[: max(0, count - len(wrong))]
@@ -56,9 +56,9 @@ def inlier_ratio(case: Case, ratio: float) -> Case | None:
 
 
 def noise(case: Case, sigma: float) -> Case | None:
-    """Gaussian noise of so many pixels added to every coordinate of the matches, of which at most MOST_MATCHES."""
+    """Gaussian noise of so many pixels added to every coordinate of the matches, of which at most MAX_MATCHES."""
     rng, n = case.rng("noise"), len(case.right)
-    case = case.subset(torch.from_numpy(np.sort(rng.permutation(n)[:MOST_MATCHES])))
+    case = case.subset(torch.from_numpy(np.sort(rng.permutation(n)[:MAX_MATCHES])))
     shift = [torch.from_numpy(rng.normal(0, 1, tuple(case.c.x0.shape)) * sigma).to(case.c.x0) for _ in range(2)]
     return dataclasses.replace(case, c=_placed(case.c, case.c.x0 + shift[0], case.c.x1 + shift[1]))
 
@@ -78,7 +78,7 @@ def plane(case: Case) -> Case | None:
     inside = on_plane(case)
     off = (case.right & ~inside).nonzero()[:, 0].numpy()
     most = int(inside.sum()) * OFF_PLANE / (1 - OFF_PLANE)
-    if int(inside.sum()) < LEAST_RIGHT:
+    if int(inside.sum()) < MIN_RIGHT:
         return None
     gone = case.rng("plane off").permutation(off)[round(most) :]
     keep = torch.ones_like(case.right)
@@ -155,7 +155,7 @@ def central(size: NDArray[np.float64], new: NDArray[np.float64]) -> Window:
 
 
 def seen(case: Case, window0: Window, window1: Window) -> Case | None:
-    """The matches inside both windows, in the windows' pixels, with F of these; None: fewer than LEAST_RIGHT right."""
+    """The matches inside both windows, in the windows' pixels, with F of these; None: fewer than MIN_RIGHT right."""
     moved, inverse = [], []
     inside = torch.ones_like(case.right)
     for x, (corner, new, scale) in ((case.c.x0, window0), (case.c.x1, window1)):
@@ -164,7 +164,7 @@ def seen(case: Case, window0: Window, window1: Window) -> Case | None:
         inside &= ((y > -0.5) & (y < torch.from_numpy(new[::-1].copy()) - 0.5)).all(-1)
         moved.append(y[None])
         inverse.append(np.array([[1 / scale, 0, -shift[0] / scale], [0, 1 / scale, -shift[1] / scale], [0, 0, 1]]))
-    if int((case.right & inside).sum()) < LEAST_RIGHT:
+    if int((case.right & inside).sum()) < MIN_RIGHT:
         return None
     c = _placed(case.c, moved[0], moved[1], window0[2], window1[2])
     shapes = [torch.from_numpy(window[1].astype(np.int64))[None] for window in (window0, window1)]

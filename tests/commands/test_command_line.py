@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import fmtorch.__main__
-from fmtorch.commands.words import hydra_words
+from fmtorch.commands.overrides import hydra_arguments
 from tests.conftest import own_cache
 from tests.pipeline.test_pipeline import draw
 
@@ -174,14 +174,14 @@ def test_any_folder_name_is_a_data_set(name: str, tmp_path: Path, monkeypatch: p
 def test_flags_and_sweeps_stay_what_they_are() -> None:
     paths, positional = ["image0", "run_dir"], ["image0", "image1"]
     words = ["a b.png", "seed=1,2", "-m", "--config-dir", "my conf", "it's.png", "~cache", "run_dir=null", "x=[1, 2]"]
-    assert hydra_words(words, paths, positional) == [
+    assert hydra_arguments(words, paths, positional) == [
         "-m", "--config-dir", "my conf", "image0='a b.png'", r"image1='it\'s.png'", "seed=1,2", "~cache",
         "run_dir=null", "x=[1, 2]",
     ]  # fmt: skip
-    assert hydra_words(["-m", "run_dir=a,b"], paths, []) == ["-m", "run_dir=a,b"]
-    assert hydra_words(["run_dir=a,b"], paths, []) == ["run_dir='a,b'"]
-    assert hydra_words(["run_dir='a,b'", "++cache=1"], paths, []) == ["run_dir='a,b'", "++cache=1"]
-    assert hydra_words(["runs/a (1)", "b"], [], ["runs..."]) == ["runs=['runs/a (1)','b']"]
+    assert hydra_arguments(["-m", "run_dir=a,b"], paths, []) == ["-m", "run_dir=a,b"]
+    assert hydra_arguments(["run_dir=a,b"], paths, []) == ["run_dir='a,b'"]
+    assert hydra_arguments(["run_dir='a,b'", "++cache=1"], paths, []) == ["run_dir='a,b'", "++cache=1"]
+    assert hydra_arguments(["runs/a (1)", "b"], [], ["runs..."]) == ["runs=['runs/a (1)','b']"]
 
 
 SMALL = ["dataset=fmbench", "dataset.root=Set", "features.max_features=300", "estimator.hypotheses=100"]

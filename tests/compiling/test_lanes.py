@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from fmtorch.compiling import switch
+from fmtorch.compiling.arrays import B1x2, F4x2, F8x1, F8x2
 from fmtorch.compiling.kernel import kernel
 from fmtorch.compiling.lanes import LANES, absolute, added, any_lane, copysign, fill, lanes, load, sqrt, store, where
 from fmtorch.geometry.five_point_kernels import five_point
@@ -13,8 +14,8 @@ SINGLES = 16
 load_singles, fill_singles = lanes(SINGLES)
 
 
-@kernel("f8[:, ::1], f8[:, ::1], b1[:, ::1], f8[::1]")
-def in_doubles(values, out, masks, sums):
+@kernel
+def in_doubles(values: F8x2, out: F8x2, masks: B1x2, sums: F8x1):
     """Every operator and function of lanes, of float64."""
     x, y, z = load(values, 0), load(values, 1), load(values, 2)
     total = fill(0.0)
@@ -37,8 +38,8 @@ def in_doubles(values, out, masks, sums):
     sums[0], sums[1], sums[2], sums[3] = added(y), added(x), any_lane(y != y), any_lane(x != x)
 
 
-@kernel("f4[:, ::1], f4[:, ::1], f8[::1]")
-def in_singles(values, out, sums):
+@kernel
+def in_singles(values: F4x2, out: F4x2, sums: F8x1):
     """Of float32, which stay so beside a number of float32."""
     x, y = load_singles(values, 0), load_singles(values, 1)
     store(out, 0, np.float32(0.1) * x + y / (x + np.float32(3)))
@@ -79,8 +80,8 @@ def test_float32_stays_float32() -> None:
 def test_lanes_of_different_kinds_do_not_mix() -> None:
     import numba
 
-    @kernel("f8[:, ::1], f4[:, ::1]")
-    def mixed(a, b):
+    @kernel
+    def mixed(a: F8x2, b: F4x2):
         store(a, 0, load(a, 0) + load_singles(b, 0))
 
     with pytest.raises(numba.TypingError, match="lanes"):

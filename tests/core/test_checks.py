@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pytest
@@ -14,7 +14,9 @@ from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
 from fmtorch import geometry, matching, metrics, pruning
-from fmtorch.core.checks import checked, expectation, public
+from fmtorch.core.annotations import Expected, Rule, arrays_of, expectation
+from fmtorch.core.checks import checked
+from fmtorch.core.types import Correspondences
 from tests.processes import run_command
 
 X = torch.rand(5, 2)
@@ -101,7 +103,7 @@ def test_what_can_be_converted_is() -> None:
     assert given["size"].tolist() == [480, 640]
     assert (given["steps"], given["scale"], given["taus"]) == (2, 0.5, (0.5, 0.7))
     assert checked(distance)(F, X.half())["x"].dtype == torch.float32
-    one = public("tests")(distance)(F.double(), X)
+    one = checked(distance, common_type=True)(F.double(), X)
     assert one["x"].dtype == torch.float64
     assert checked(distance)(F.double(), X)["x"].dtype == torch.float32
 
@@ -117,8 +119,17 @@ def test_models_are_one_a_set_of_matches_or_several() -> None:
 
 
 def test_annotations_are_read() -> None:
-    assert expectation(Float[Tensor, "*batch n 2"] | None) == ("Float", ("*batch", "n", "2"), True, (), False)
-    assert expectation(Any).kind == ""
+    assert expectation(Float[Tensor, "*batch n 2"] | None) == Expected(
+        "array", ("*batch", "n", "2"), "Float", optional=True
+    )
+    rule = Rule(lambda value: value > 0, "it is positive")
+    assert expectation(Annotated[Float[Tensor, " n"], rule] | None).bounds is rule
+    assert expectation(Literal["a", "b"]) == Expected("choice", choices=("a", "b"))
+    assert expectation(float | Tensor) == Expected("number or array", dtype="Float")
+    assert expectation(Any).kind == expectation(int | str).kind == ""
+    assert {name for name, field in arrays_of(Correspondences).items() if field.bounds} == {
+        "prior", "noise", "size0", "size1",
+    }  # fmt: skip
 
 
 def test_gradients_pass() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from fmtorch.core.files import replacing
-from fmtorch.core.terminal import told
+from fmtorch.core.terminal import error_line
 
 
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), OSError(errno.EIO, "I/O error")])
@@ -24,7 +24,7 @@ def test_a_failed_write_names_the_file_and_leaves_what_was_there(error: OSError,
     with pytest.raises(OSError, match=error.strerror) as caught:
         write()
     assert caught.value.errno == error.errno
-    assert told(caught.value) == f"{path}: {error.strerror}"
+    assert error_line(caught.value) == f"{path}: {error.strerror}"
     assert path.read_text() == "before"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -33,14 +33,14 @@ def test_a_folder_that_is_not_there_is_named_by_the_file() -> None:
     path = Path("/nowhere/at/all.txt")
     with pytest.raises(FileNotFoundError) as caught, replacing(path) as temporary:
         temporary.write_text("")
-    assert told(caught.value) == f"{path}: No such file or directory"
+    assert error_line(caught.value) == f"{path}: No such file or directory"
 
 
 def test_another_files_error_stays_its_own(tmp_path: Path) -> None:
     other = tmp_path / "image.png"
     with pytest.raises(FileNotFoundError) as caught, replacing(tmp_path / "out.json"):
         other.read_bytes()
-    assert told(caught.value) == f"{other}: No such file or directory"
+    assert error_line(caught.value) == f"{other}: No such file or directory"
 
 
 def test_a_device_that_is_full(tmp_path: Path) -> None:
@@ -54,4 +54,4 @@ def test_a_device_that_is_full(tmp_path: Path) -> None:
         full.open("wb") as file,
     ):
         file.write(b"x" * 100_000)
-    assert told(caught.value) == f"{tmp_path / 'out.json'}: No space left on device"
+    assert error_line(caught.value) == f"{tmp_path / 'out.json'}: No space left on device"

@@ -51,7 +51,7 @@ OBJECT = {"_target_": "any.Thing"}
         (Path | str | None, ["a", None], [3]),
         (Literal["x", 2], ["x", 2], ["y", 3, None]),
         (Annotated[int, Within(1, 5)], [1, 5], [0, 6, 2.0, "x"]),
-        (Annotated[float, Within(most=1)] | None, [None, -2, 1], [1.5, "x"]),
+        (Annotated[float, Within(maximum=1)] | None, [None, -2, 1], [1.5, "x"]),
         (list[int], [[], [1, 2]], [[1.5], 1, "12", {}]),
         (Sequence[str], [["a"], ("a",)], ["abc", [1], None]),
         (tuple[float, float], [[0, 1.5]], [[1], [1, 2, 3], ["a", "b"], 1]),

@@ -11,12 +11,10 @@ import torch
 
 import fmtorch
 from fmtorch import presets
-from fmtorch.compiling import switch
 from fmtorch.core.threads import available, mapped, one_thread
 from fmtorch.core.types import collate
 from fmtorch.data import read_image
-from fmtorch.estimators import batching
-from fmtorch.estimators.one_pair import batch as one_pair
+from fmtorch.estimators import batch
 from fmtorch.evaluation.run import evaluate_pairs
 from fmtorch.matching import nearest
 from fmtorch.pruning import position_consistency as consistency
@@ -54,8 +52,9 @@ def test_pruners_and_estimators_of_a_pipeline_have_one_thread(threads: int, tmp_
     assert torch.get_num_threads() == threads
 
 
-def test_matching_and_find_fundamental_have_one_thread(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(switch.SWITCH, "off")  # the tensor forms, which torch's threads would slow down
+def test_matching_and_the_prior_of_find_fundamental_have_one_thread(
+    threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     seen = []
 
     def watch(module: object, name: str) -> None:
@@ -67,17 +66,12 @@ def test_matching_and_find_fundamental_have_one_thread(threads: int, monkeypatch
 
         monkeypatch.setattr(module, name, watched)
 
-    for module, name in (
-        (nearest, "_finite"),
-        (nearest, "_two_nearest"),
-        (batching, "normalized_pairs"),
-        (consistency, "tiled"),
-    ):
+    for module, name in ((nearest, "_finite"), (nearest, "_two_nearest"), (consistency, "position_agreement")):
         watch(module, name)
     nearest.nearest_neighbors(torch.rand(30, 8), torch.rand(20, 8))
     c = scene(0, 60)
     assert bool(fmtorch.find_fundamental(c.x0, c.x1).ok)
-    assert seen == [1] * 5
+    assert seen == [1] * 4
     assert torch.get_num_threads() == threads
 
 
@@ -85,14 +79,11 @@ def test_an_error_leaves_threads_as_they_were(threads: int, monkeypatch: pytest.
     def fails(*_: object) -> None:
         raise RuntimeError("no")
 
-    monkeypatch.setattr(batching, "normalized_pairs", fails)
-    monkeypatch.setattr(one_pair, "opened", fails)
+    monkeypatch.setattr(batch, "normalize_pair", fails)
     built = presets.build("estimator", "msac", hypotheses=10)
-    for form in ("off", "on"):
-        monkeypatch.setenv(switch.SWITCH, form)
-        with pytest.raises(RuntimeError, match="no"):
-            built(collate([scene(0, 60), scene(1, 60)]))
-        assert torch.get_num_threads() == threads
+    with pytest.raises(RuntimeError, match="no"):
+        built(collate([scene(0, 60), scene(1, 60)]))
+    assert torch.get_num_threads() == threads
 
 
 def test_threads_that_torch_may_use_stay_known(threads: int) -> None:

@@ -10,10 +10,10 @@ import pytest
 from fmtorch.data import DepthDataset, load
 from fmtorch.data.rendered import Plan, RenderedPairs
 from fmtorch.data.rendered import depth as depth_module
-from fmtorch.data.rendered.cameras import Camera, calibration, look_at
 from fmtorch.data.rendered.depth import depth_at
 from fmtorch.data.rendered.generate import Task, build
 from fmtorch.data.rendered.light import Lens, Light
+from fmtorch.data.rendered.pinhole import Camera, calibration, look_at
 from fmtorch.data.rendered.scene import Scene, Shot
 from fmtorch.data.rendered.surfaces import Surfaces, vec
 from tests.reference.labels import first_hit

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from fmtorch.data.rendered.cameras import Camera, calibration, fundamental, look_at, relative_pose
 from fmtorch.data.rendered.generate import FAMILIES, Plan, Task, build
 from fmtorch.data.rendered.light import Light, Stage, points_seen
 from fmtorch.data.rendered.mipmap import TO_LINEAR, Texture, to_srgb
+from fmtorch.data.rendered.pinhole import Camera, calibration, fundamental, look_at, relative_pose
 from fmtorch.data.rendered.raycast import Geometry
 from fmtorch.data.rendered.surfaces import Surfaces, vec
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from fmtorch.compiling import switch
-from fmtorch.data.rendered.cameras import Camera, calibration, look_at
 from fmtorch.data.rendered.depth import depth_at
 from fmtorch.data.rendered.generate import FAMILIES, Plan, Task, build
 from fmtorch.data.rendered.light import Lens, Light, Stage, expose
 from fmtorch.data.rendered.patterns import fractal
+from fmtorch.data.rendered.pinhole import Camera, calibration, look_at
 from fmtorch.data.rendered.raycast import Geometry
 from fmtorch.data.rendered.surfaces import Surfaces, vec
 

@@ -46,7 +46,7 @@ def test_a_stage_s_options_are_replaced_by_name() -> None:
     estimator = presets.build("estimator", "cf_ransac", fine={"hypotheses": 77}, coarse={"threshold": 3.5})
     assert estimator.fine.search.hypotheses == 77
     assert estimator.fine.search.round == presets.build("estimator", "lmeds").search.round
-    assert estimator.coarse.tensor_form.inlier_rule.threshold == 3.5
+    assert estimator.coarse.inlier_rule.threshold == 3.5
     with pytest.raises(ValueError, match=r"estimator=cf_ransac\.fine: no option treshold; there are: "):
         presets.build("estimator", "cf_ransac", fine={"treshold": 1.0})
 

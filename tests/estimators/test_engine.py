@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import sys
+from types import FrameType
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 
 import fmtorch
 from fmtorch import presets
+from fmtorch.compiling.kernel import Kernel
 from fmtorch.core.types import collate
-from fmtorch.estimators import HypothesizeAndVerify, solvers
-from fmtorch.estimators.inliers import residuals_squared_px
-from fmtorch.estimators.pairs import NormalizedPairs, normalized_pairs
+from fmtorch.estimators import HypothesizeAndVerify
+from fmtorch.estimators.pair import Pair
+from fmtorch.estimators.parts.inliers import residuals_squared_px
 from scripts.benchmark.memory import OTHER_LIBRARIES
+from tests.estimators.pairs import pair_of
 from tests.laws import quick, scene, scenes
 
-OWN = [n for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES)]
+OWN = [n for n in presets.available("estimator") if not n.startswith((*OTHER_LIBRARIES, "homography"))]
 
 
 def _true_inlier_error(F: torch.Tensor, index: int, count: int) -> float:
@@ -44,15 +50,6 @@ def test_confidence_stops_early_and_null_never() -> None:
     easy = scene(0, 200, outliers=0.0, noise=0.1)
     assert int(HypothesizeAndVerify(hypotheses=1000, round=100)(easy).draws) == 100
     assert int(HypothesizeAndVerify(hypotheses=1000, round=100, confidence=None)(easy).draws) == 1000
-
-
-def test_chunks_of_pairs_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    estimator = HypothesizeAndVerify(hypotheses=200)
-    whole = estimator(scenes(), seed=3)
-    monkeypatch.setattr(solvers, "CPU_SAMPLES", 1)
-    chunked = estimator(scenes(), seed=3)
-    assert torch.equal(whole.F, chunked.F)
-    assert torch.equal(whole.inliers, chunked.inliers)
 
 
 def test_gradients_reach_the_points() -> None:
@@ -135,22 +132,86 @@ def test_find_fundamental_names_what_is_wrong() -> None:
 
 
 def test_the_pool_is_refined_on_matches_near_one_of_its_models() -> None:
-    (pairs,), _ = normalized_pairs(scene(3, 400, outliers=0.5, noise=0.3), 0, 7)
-    pool = HypothesizeAndVerify(pool=4).search(pairs)
-    r2 = [residuals_squared_px(f.T.reshape(1, 3, 3).double(), pairs) for f in pool.F.unbind(2)]
-    r = torch.stack(r2).amin(0).sqrt()
+    pair = pair_of(scene(3, 400, outliers=0.5, noise=0.3))
+    pool = HypothesizeAndVerify(pool=4).search(pair)
+    r = np.sqrt(np.min([residuals_squared_px(F, pair) for F in pool.models], 0))
 
-    def near(matches: int) -> NormalizedPairs:
+    def near(matches: int) -> Pair:
         refining = HypothesizeAndVerify(pool=4, refine={"kernel": "truncated", "scale": 1.5, "matches": matches})
-        found = refining.refine(pool, pairs).near
-        assert found is not None
-        return found
+        return refining.refine(pool, pair, refining.family).near
 
     few, every = near(150), near(1000)
-    assert few.count.tolist() == [150] == few.mask.sum(1).tolist()
-    assert len(set(few.slot[0].tolist())) == 150
-    assert (r[0, few.slot[0]] <= 6.0 + 1e-3).all()  # four times the scale
-    places = few.slot.expand(4, -1, -1)
-    assert torch.equal(few.points, pairs.points.gather(2, places))
-    assert every.count.tolist() == [int((r <= 6.0).sum())]
-    assert not every.points[:, ~every.mask].any()
+    assert every.count == np.count_nonzero(r <= 6.0)  # four times the scale
+    inside = {tuple(column) for column in pair.table[:, r <= 6.0].T}
+    assert {tuple(column) for column in every.table.T} == inside
+    assert few.count == 150
+    assert len({tuple(column) for column in few.table.T} & inside) == 150
+    assert np.array_equal(few.table, every.table[:, :150])  # in the order that the pair's key decides
+
+
+WAY = (
+    "estimators.search",  # all in a row
+    "estimators.parts.sampling",  # drawn
+    "estimators.families.fundamental",  # to its solver, and in the end refined
+    "geometry.seven_point_kernels",  # solved
+    "estimators.parts.preselection",  # here without options: hands all models on
+    "estimators.parts.scores",  # scored
+    "estimators.parts.scored_matches",  # on these matches
+    "estimators.parts.refinement",  # hands the best on
+    "geometry.refine_kernels",
+)
+
+
+def test_the_way_of_a_sample_of_seven(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The files that a sample passes from draw to refinement, each where it comes first: see `docs/architecture.md`."""
+    estimator = HypothesizeAndVerify(hypotheses=100, round=100, pool=2, preselect=None, refine={"kernel": "truncated"})
+    estimator.refine(estimator.search(pair_of(scene(0, 60))), pair_of(scene(0, 60)), estimator.family)  # compiled
+    pair, passed = pair_of(scene(0, 60)), dict[str, None]()
+
+    def called(kernel: Kernel[..., Any], *arguments: object) -> object:
+        passed[kernel.function.__module__.removeprefix("fmtorch.")] = None
+        return kernel.compiled()(*arguments)
+
+    def entered(frame: FrameType, event: str, argument: object) -> None:
+        module = frame.f_globals.get("__name__", "")
+        if module.startswith("fmtorch.estimators.") and module != "fmtorch.estimators.pair":
+            passed[module.removeprefix("fmtorch.")] = None
+
+    monkeypatch.setattr(Kernel, "__call__", called)
+    before = sys.gettrace()
+    sys.settrace(entered)
+    try:
+        estimator.refine(estimator.search(pair), pair, estimator.family)
+    finally:
+        sys.settrace(before)
+    assert tuple(passed) == WAY
+
+
+def test_the_kernels_that_are_compiled_together_are_those_that_are_called(monkeypatch: pytest.MonkeyPatch) -> None:
+    called: set[Kernel[..., Any]] = set()
+
+    def recorded(self: Kernel[..., Any], *arguments: object) -> object:
+        called.add(self)
+        return self.compiled()(*arguments)
+
+    monkeypatch.setattr(Kernel, "__call__", recorded)
+    estimator = presets.build("estimator", "fmtorch")
+    for c in (scene(0, 300), scene(0, 300, outliers=0.8).replace(size1=torch.tensor([[700, 900]]))):
+        estimator(c)
+    assert with_callees(called) == set(estimator.kernels)
+    for framed, name in ((False, "position_consistency"), (True, "frame_consistency")):
+        c = scene(0, 300)
+        frames = {"lafs0": c.lafs0, "lafs1": c.lafs1, "quality": c.quality} if framed else {}
+        called.clear()
+        fmtorch.find_fundamental(c.x0, c.x1, size0=c.size0, size1=c.size1, **frames)
+        pruner = presets.build("pruner", name)
+        assert with_callees(called) - set(estimator.kernels) == set(pruner.kernels)
+
+
+def with_callees(kernels: set[Kernel[..., Any]]) -> set[Kernel[..., Any]]:
+    """Kernels, and those that they call."""
+    found, new = set[Kernel[..., Any]](), kernels
+    while new:
+        found |= new
+        new = {callee for each in new for callee in each.calls} - found
+    return found

@@ -11,7 +11,6 @@ from torch import Tensor
 from fmtorch import presets
 from fmtorch.core.types import Correspondences, collate
 from scripts.benchmark.memory import OTHER_LIBRARIES
-from tests.geometry.test_irls_gradients import degenerate
 from tests.laws import quick, scene, scenes
 
 
@@ -58,22 +57,6 @@ def test_gradients_reach_the_prior(name: str) -> None:
     difference = (ends[1] - ends[0]) / (2 * h)
     # Of estimates of unit norm, rounded to 1e-12 by the condition of the scenes, with third derivatives of order 1e3.
     torch.testing.assert_close((gradient * move).sum(1), difference, rtol=1e-4, atol=1e-6)
-
-
-@pytest.mark.parametrize("name", names("least_squares"))
-def test_gradients_are_finite_and_bounded_beside_degenerate_pairs(name: str) -> None:
-    estimator = quick(name)
-    pairs = [scene(1), *degenerate().values(), scene(2)]
-    c, prior = attached_to_prior(collate([p.replace(x0=p.x0.double(), x1=p.x1.double()) for p in pairs]))
-    estimate = estimator(c, seed=5)
-    assert bool(estimate.F.isfinite().all())
-    (gradient,) = torch.autograd.grad(estimate.F.sum(), prior)
-    assert bool(gradient.isfinite().all())
-    # The gradient of an eigenvector is at most half over its gap, 1e-8 of the trace, where that is held off zero.
-    assert float(gradient.abs().max()) < 1e8
-    alone, its_prior = attached_to_prior(pairs[0])
-    (own,) = torch.autograd.grad(estimator(alone, seed=5).F.sum(), its_prior)
-    torch.testing.assert_close(gradient[:1, : own.shape[1]], own, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", names("least_squares"))

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from fmtorch import find_fundamental, presets
 from fmtorch.estimators import HypothesizeAndVerify
 from fmtorch.estimators.options import Focal, Preselect, Refine, Select, group
+from fmtorch.estimators.pair import Pair
+from fmtorch.estimators.parts.scored_matches import scored_matches
+from fmtorch.estimators.parts.scores import InlierCount, Msac, squared_residuals_of
 from fmtorch.estimators.registry import PARTS, part
-from fmtorch.estimators.scores import InlierCount, TruncatedSquares
 from tests.laws import scene
 
 MEDIAN = {"score": "median", "inliers": "lmeds", "confidence": None}
@@ -71,7 +73,7 @@ def test_thresholds_that_something_asks_for_are_taken(options: dict[str, object]
 
 def test_a_part_is_a_name_a_mapping_or_an_object() -> None:
     named = part("score", "msac", threshold=2.0)
-    assert isinstance(named, TruncatedSquares)
+    assert isinstance(named, Msac)
     assert (named.threshold, named.prior_weighted) == (2.0, False)
     weighted = part("score", {"name": "msac", "prior_weighted": True}, threshold=2.0)
     assert (weighted.threshold, weighted.prior_weighted) == (2.0, True)
@@ -96,7 +98,7 @@ def test_flat_and_nested_options_replace_those_of_a_preset() -> None:
     )  # fmt: skip
     built = presets.build("estimator", "fmtorch", hypotheses=500, preselect={"survivors": 30}, focal={"samples": 100})
     assert built.search.hypotheses == 500
-    assert built.search.verify.preselect == Preselect(64, 30)
+    assert built.search.preselection.options == Preselect(64, 30)
     assert built.focal.search.hypotheses == 100
     assert built.focal.search.pool == 24
     assert torch.equal(found.F, built(c.replace(key=None, quality=None)).F)
@@ -112,11 +114,10 @@ class Nearest:
     def __init__(self, rank: int) -> None:
         self.rank = rank
 
-    def __call__(self, F: Tensor, points: Tensor, weight: Tensor, scale: Tensor) -> Tensor:
-        from fmtorch.geometry.residuals import sampson_squared
-
-        r2 = sampson_squared(F, points).masked_fill_(weight[:, None] <= 0, torch.inf)
-        return -r2.kthvalue(self.rank, dim=-1).values
+    def __call__(self, F: np.ndarray, which: np.ndarray, pair: Pair) -> np.ndarray:
+        squared = np.empty((len(which), pair.count), np.float32)
+        squared_residuals_of(pair.residual)(F, which, scored_matches(pair, 1.0, False), squared)
+        return -np.partition(squared, self.rank, 1)[:, self.rank].astype(np.float64)
 
 
 def test_a_score_of_ones_own_in_a_preset_of_ones_own(tmp_path: Path) -> None:

@@ -13,10 +13,9 @@ import torch
 from fmtorch import geometry, presets
 from fmtorch.core.types import collate
 from fmtorch.estimators import PairwiseEstimator
-from fmtorch.estimators.peers import PEERS
 from fmtorch.estimators.peers.pairwise import Pair, Solution
 from scripts.benchmark.memory import OTHER_LIBRARIES
-from tests.laws import scene
+from tests.laws import PEERS, scene
 
 NAMES = [n for n in presets.available("estimator") if n.startswith(OTHER_LIBRARIES)]
 

@@ -1,95 +1,84 @@
-"""One search for every generator: models belong to their draws, the best are kept, and the earlier of equals."""
+"""One search for every family: models belong to their draws, the best are kept, and the earlier of equals."""
 
 from __future__ import annotations
 
-import pytest
-import torch
+from typing import Any
 
-from fmtorch.core.types import collate
-from fmtorch.estimators.models import Models, Pool
-from fmtorch.estimators.options import Preselect
-from fmtorch.estimators.pairs import NormalizedPairs, normalized_pairs
-from fmtorch.estimators.pool import Verifier
-from fmtorch.estimators.sampling import Prosac, Uniform
-from fmtorch.estimators.scores import TruncatedSquares
-from fmtorch.estimators.search import Search
-from fmtorch.estimators.solvers import EightPoint, MinimalSamples, SevenPoint, Solver
+import numpy as np
+import pytest
+
+from fmtorch.estimators.families.fundamental import EightPoint, SevenPoint
+from fmtorch.estimators.families.homography import Homography
+from fmtorch.estimators.pair import Pair
+from fmtorch.estimators.parts.preselection import Preselection
+from fmtorch.estimators.parts.sampling import PriorWeighted, Prosac, Uniform
+from fmtorch.estimators.parts.scores import Msac
+from fmtorch.estimators.search import Pool, Search, Verified
+from tests.estimators.pairs import pair_of
 from tests.laws import scene
 
 
-def _pairs() -> NormalizedPairs:
-    return normalized_pairs(collate([scene(i, 300) for i in range(3)]), 0, 8)[0][0]
+@pytest.mark.parametrize("family", [SevenPoint(), EightPoint(), Homography()])
+@pytest.mark.parametrize("sampler", [Uniform(), Prosac(), PriorWeighted()])
+def test_models_belong_to_the_samples_of_their_draws(family: Any, sampler: Any) -> None:
+    pair = pair_of(scene(1, 300))
+    sample = sampler.draw(pair, 40, 30, family.size)
+    hypotheses = family.solve(pair, sample, 40)
+    assert (np.diff(hypotheses.draw) >= 0).all()
+    assert set(hypotheses.draw) <= set(range(30))
+    for k in range(30):
+        alone = family.solve(pair, np.ascontiguousarray(sample[:, k : k + 1]), 40 + k)
+        np.testing.assert_array_equal(hypotheses.F[hypotheses.draw == k], alone.F)
 
 
-@pytest.mark.parametrize("solver", [SevenPoint(), EightPoint()])
-@pytest.mark.parametrize("sampler", [Uniform(), Prosac()])
-def test_models_belong_to_the_samples_of_their_draws(solver: Solver, sampler: Uniform | Prosac) -> None:
-    pairs = _pairs()
-    models = MinimalSamples(solver, sampler)(pairs, 40, 30)
-    assert int(models.valid.sum()) > 15
-    assert bool((models.draw >= 40).all() & (models.draw < 70).all())
-    for m in range(models.F.shape[2]):
-        sample = models.sample_of(models.draw[:, m])
-        points = torch.stack([pairs.points32.gather(2, i[:, None].expand(4, -1, 1)) for i in sample], 1)
-        again, _ = solver(points)
-        same = (again == models.F[..., m : m + 1]).all(0).any(1)
-        assert bool(same[models.valid[:, m]].all())
-
-
-def test_verified_models_keep_draws_and_samples() -> None:
-    pairs = _pairs()
-    models = MinimalSamples(SevenPoint(), Uniform())(pairs, 0, 200)
-    few = Verifier(TruncatedSquares(1.0), Preselect(matches=64, survivors=20))(models, pairs)
-    assert few.F.shape[2] == 20
-    assert few.score is not None
-    assert bool((few.draw.diff(dim=1) >= 0).all())
-    every = Verifier(TruncatedSquares(1.0), None)(models, pairs)
-    assert every.score is not None
-    for p in range(3):
-        for F, draw, score in zip(few.F[:, p].T, few.draw[p], few.score[p], strict=True):
-            same = (every.F[:, p].T == F).all(1) & (every.draw[p] == draw)
-            assert bool((every.score[p][same] == score).all())
-            assert bool(same.any())
+def offer(pool: Pool, scores: list[float], first: int) -> None:
+    F = np.repeat(np.arange(first, first + len(scores), dtype=np.float32)[:, None], 9, 1)
+    pool.merge(Verified(F, np.arange(len(scores)), np.array(scores)))
 
 
 def test_a_pool_keeps_the_best_and_the_earlier_of_equals() -> None:
-    pool = Pool.empty(1, 3, torch.device("cpu"))
-
-    def offer(scores: list[float], first: int) -> None:
-        F = torch.arange(first, first + len(scores)).float().expand(9, 1, -1).contiguous()
-        none = torch.zeros(7, 1, 1, dtype=torch.int64)
-        draw = torch.zeros(1, len(scores), dtype=torch.int64)
-        valid = torch.ones(1, len(scores), dtype=torch.bool)
-        pool.merge(torch.tensor([0]), Models(F, valid, draw, none, 0, torch.tensor([scores])))
-
-    offer([1.0, 3.0], 10)
-    assert pool.valid.tolist() == [[True, True, False]]
-    offer([3.0, 2.0, 0.0], 20)
-    assert pool.score.tolist() == [[3.0, 3.0, 2.0]]
-    assert pool.F[0].tolist() == [[11.0, 20.0, 21.0]]
+    pool = Pool.empty(3)
+    assert pool.valid.tolist() == [False]
+    offer(pool, [1.0, 3.0, -np.inf, np.nan], 10)
+    assert pool.valid.tolist() == [True, True]
+    offer(pool, [3.0, 2.0, 0.0], 20)
+    assert pool.score.tolist() == [3.0, 3.0, 2.0]
+    assert pool.F[:, 0].tolist() == [11.0, 20.0, 21.0]
 
 
-def test_pairs_that_are_confident_are_left_alone() -> None:
-    pairs = _pairs()
-    asked: list[int] = []
+class Stop:
+    """A rule that stops after some rounds, and remembers what it was asked."""
 
-    def confident(F: torch.Tensor, draws: torch.Tensor, some: NormalizedPairs) -> list[bool]:
-        asked.append(len(some))
-        return [int(row) == 1 for row in some.row]  # the second pair, at once
+    def __init__(self, after: int) -> None:
+        self.after, self.asked = after, list[int]()
 
-    generator, verify = MinimalSamples(SevenPoint(), Uniform()), Verifier(TruncatedSquares(1.0), None)
-    pool = Search(generator, verify, 4, 150, 50, confident)(pairs)
-    assert asked == [3, 2]
-    assert pool.draws.tolist() == [150, 50, 150]
-    whole = Search(generator, verify, 4, 150, 50)(pairs)
-    assert torch.equal(pool.F[:, [0, 2]], whole.F[:, [0, 2]])
+    def __call__(self, F: np.ndarray, draws: int, pair: Pair, size: int) -> bool:
+        self.asked.append(draws)
+        return len(self.asked) >= self.after
 
 
-def test_what_a_part_keeps_follows_the_pairs() -> None:
-    pairs = _pairs()
-    whole = pairs.once("hash", lambda: pairs.key[:, None] + pairs.slot)
-    some = pairs.only([0, 2])
-    assert torch.equal(some.once("hash", lambda: pytest.fail("computed again")), whole[[0, 2]])
-    assert pairs.only([0, 1, 2]) is pairs
-    near = pairs.take(torch.arange(5).expand(3, -1), pairs.mask)
-    assert not near.kept
+def search(hypotheses: int, stop: Any = None, pool: int = 4) -> Search:
+    return Search(SevenPoint(), Uniform(), Preselection(Msac(1.0), None), pool, hypotheses, 50, stop)
+
+
+def test_a_search_ends_where_its_rule_is_content() -> None:
+    pair, stop = pair_of(scene(1, 300)), Stop(2)
+    pool = search(220, stop)(pair)
+    assert stop.asked == [50, 100]
+    assert pool.draws == 100
+    np.testing.assert_array_equal(pool.F, search(100)(pair).F)
+
+
+def test_the_rule_is_not_asked_after_the_last_round() -> None:
+    stop = Stop(99)
+    assert search(120, stop)(pair_of(scene(1, 300))).draws == 120  # rounds of 50, 50, 20
+    assert stop.asked == [50, 100]
+
+
+def test_the_pool_holds_the_best_of_all_draws() -> None:
+    pair = pair_of(scene(1, 300))
+    pool = search(150, pool=5)(pair)
+    F = SevenPoint().solve(pair, Uniform().draw(pair, 0, 150, 7), 0).F
+    score = Msac(1.0)(F, np.arange(len(F)), pair)
+    np.testing.assert_array_equal(pool.score, np.sort(score)[::-1][:5])
+    assert search(150)(pair, start=150).draws == 300

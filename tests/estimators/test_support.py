@@ -12,21 +12,21 @@ import torch
 
 from fmtorch import find_fundamental, presets
 from fmtorch.core.types import Correspondences, Estimate, collate
-from fmtorch.estimators import degeneracy, final_fits, support
-from fmtorch.estimators.focal import posterior
-from fmtorch.estimators.graph_cut import GraphCut
-from fmtorch.estimators.peers import PEERS
-from fmtorch.estimators.support import lack_of_support
+from fmtorch.estimators.families import focals
+from fmtorch.estimators.families.family import FitScale
+from fmtorch.estimators.families.fundamental import Fundamental
+from fmtorch.estimators.families.homography import Homography
+from fmtorch.estimators.parts import degensac
+from fmtorch.estimators.parts.graph_cut import GraphCut
 from fmtorch.presets.objects import merged
 from scripts.benchmark.memory import OTHER_LIBRARIES
-from tests.laws import few, quick, scene, small
+from tests.laws import PEERS, few, quick, scene, small
 
 EVERY = presets.available("estimator")
 OWN = [name for name in EVERY if not name.startswith(OTHER_LIBRARIES)]
 PIXELS = [  # what is a distance in pixels and no option
-    (final_fits, "MIN_TRUNCATION_PX"), (final_fits, "MAX_TRUNCATION_PX"), (final_fits, "DEFAULT_TRUNCATION_PX"),
-    (degeneracy, "PLANE_THRESHOLD_PX"), (posterior, "INLIER_SIGMA_PX"), (posterior, "LOSS_SCALE_PX"),
-    (posterior, "PARALLEL_PX"), (GraphCut, "RADIUS_PX"),
+    (degensac, "PLANE_THRESHOLD_PX"), (focals, "INLIER_SIGMA_PX"), (focals, "LOSS_SCALE_PX"),
+    (focals, "PARALLEL_PX"), (GraphCut, "RADIUS_PX"), (Fundamental, "fit_scale"), (Homography, "fit_scale"),
 ]  # fmt: skip
 
 
@@ -46,7 +46,8 @@ def assert_supported(estimate: Estimate, c: Correspondences, what: str) -> None:
             assert not len(inside), what
             assert not bool(estimate.F[i].any()), what
             continue
-        assert len(np.unique(inside, axis=0)) >= 7, f"{what}, pair {i}"
+        minimal = 7 if estimate.model == "fundamental" else 4
+        assert len(np.unique(inside, axis=0)) >= minimal, f"{what}, pair {i}"
         for image in (inside[:, :2], inside[:, 2:]):
             spread = np.linalg.svd(image - image.mean(0), compute_uv=False)
             assert spread[1] > 1e-9 * spread[0], f"{what}, pair {i}"
@@ -97,19 +98,26 @@ def test_coordinates_sizes_and_thresholds_scaled_together_give_the_same_inliers(
     preset = presets.load("estimator", name)
     options = {} if name.startswith("irls") else few(preset)
     pixels = {(owner, constant): getattr(owner, constant) for owner, constant in PIXELS}
+
+    def in_pixels(value: Any, scale: float) -> Any:
+        if not isinstance(value, FitScale):
+            return value * scale
+        limits = {name: getattr(value, name) * scale for name in ("smallest_px", "largest_px", "default_px")}
+        return value._replace(**limits)
+
     inliers = {}
     for scale in (1.0, 1e-9, 1e-3, 1e3, 1e9):
         for (owner, constant), value in pixels.items():
-            monkeypatch.setattr(owner, constant, value * scale)
+            monkeypatch.setattr(owner, constant, in_pixels(value, scale))
         built = presets.build("estimator", name, **merged(options, scaled(preset, scale)))
         sizes = {"size0": c.size0 * scale, "size1": c.size1 * scale}
         estimate = built(c.replace(x0=c.x0 * scale, x1=c.x1 * scale, **sizes), 3)
-        assert bool(estimate.ok.all()) or name == "irls_huber", estimate.reason  # outliers carry that loss away
+        assert bool(estimate.ok.all()), estimate.reason
         inliers[scale] = estimate.inliers
     for scale, found in inliers.items():
-        assert torch.equal(found, inliers[1.0]), (
-            f"{name}: {int((found != inliers[1.0]).sum())} inliers differ at {scale}"
-        )
+        # Outliers carry the loss of Huber into a flat valley, and rounding decides how far along it the steps come.
+        allowed = 2 if name == "irls_huber" else 0
+        assert int((found != inliers[1.0]).sum()) <= allowed, f"{name}: other inliers at {scale}"
 
 
 @pytest.mark.parametrize("name", OWN)
@@ -130,39 +138,3 @@ def test_a_shift_changes_nothing(name: str) -> None:
     after = built(c.replace(x0=c.x0 + shift0, x1=c.x1 + shift1), 3)
     assert torch.equal(after.inliers, before.inliers)
     assert torch.equal(after.ok, before.ok)
-
-
-# the check itself
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("shift", [0.0, 3000.0])
-def test_points_of_a_line_are_told_from_points_near_one(dtype: torch.dtype, shift: float) -> None:
-    rng = np.random.default_rng(0)
-    for seed in range(20):
-        direction, start = rng.normal(size=2), rng.uniform(0, 500, 2) + shift
-        line = start + rng.uniform(-300, 300, (30, 1)) * direction / np.linalg.norm(direction)
-        near = line + rng.normal(0, 0.02, (30, 2))  # px: no detector is as exact
-        other = rng.uniform(0, 500, (30, 2))
-        for x0, x1, told in (
-            (line, other, "image 0"),
-            (other, line, "image 1"),
-            (line, line[::-1], "image 0 and image 1"),
-            (near, other, ""),
-        ):
-            points = torch.from_numpy(np.hstack([x0, x1])).to(dtype).to(torch.float64).T[:, None]
-            rounding = points.abs().amax((0, 2)) * support.relative_rounding(dtype)
-            (reason,) = lack_of_support(points, torch.ones(1, 30, dtype=torch.bool), 7, rounding)
-            assert reason == (f"the inliers of the best model lie on one line in {told}" if told else ""), seed
-
-
-def test_inliers_count_once_at_one_place_and_late_ones_are_seen() -> None:
-    rng = np.random.default_rng(1)
-    points = torch.from_numpy(rng.uniform(0, 500, (4, 3, 1000)))
-    inliers = torch.zeros(3, 1000, dtype=torch.bool)
-    inliers[0, [3, 900, 901, 902, 903, 904, 999]] = True
-    inliers[1, 300:320] = True
-    points[:, 1, 306:320] = points[:, 1, 305:306]  # 20 inliers at six places
-    inliers[2, 7] = True
-    reasons = lack_of_support(points, inliers, 7, torch.zeros(3, dtype=torch.float64))
-    assert [reason[:26] for reason in reasons] == ["", "the best model has 6 diffe", "the best model has 1 diffe"]

@@ -129,10 +129,10 @@ def test_each_data_set_is_found_in_its_own_root(tmp_path: Path) -> None:
 
 def test_many_runs_are_drawn_in_part_and_the_page_says_so(tmp_path: Path) -> None:
     root = distribution(tmp_path)
-    many = [run(f"r{i}", {"pipeline": f"r{i}"}, rows(root)) for i in range(module.MOST_RUNS + 2)]
+    many = [run(f"r{i}", {"pipeline": f"r{i}"}, rows(root)) for i in range(module.MAX_RUNS + 2)]
     shown, notes = gallery(many, Options(1, [root]))
-    assert notes[0] == f"Pictures are of the first {module.MOST_RUNS} of {len(many)} runs."
-    assert [len(pair.runs) for pair in shown] == [module.MOST_RUNS]
+    assert notes[0] == f"Pictures are of the first {module.MAX_RUNS} of {len(many)} runs."
+    assert [len(pair.runs) for pair in shown] == [module.MAX_RUNS]
 
 
 def test_no_pictures_are_explained(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from fmtorch.evaluation.page import Picture, Section, Shown, ShownPair, render
 from fmtorch.storage import PairRow, to_table
-from tests.browser import Page, find_chromium
+from tests.evaluation.browser import Page, find_chromium
 
 CHROMIUM = find_chromium()
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on the path or in $CHROMIUM")

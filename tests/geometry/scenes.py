@@ -48,3 +48,22 @@ def scenes(batch: tuple[int, ...], n: int, seed: int = 0, noise: float = 0.0) ->
     """x0, x1, F of independent scenes with any leading shape."""
     many = [scene(n, seed * 1000 + i, noise) for i in range(int(np.prod(batch, dtype=int)))]
     return tuple(torch.stack(list(a)).reshape(*batch, *a[0].shape) for a in list(zip(*many, strict=True))[:3])
+
+
+def unit_scene(
+    seed: int, n: int = 100, noise: float = 0.0, outliers: int = 0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """F and matches of about unit scale before two cameras."""
+    rng = np.random.default_rng(seed)
+    X = np.c_[rng.uniform(-2, 2, (n, 2)), rng.uniform(3, 7, n)]
+    a, b = rng.uniform(-0.3, 0.3, 2)
+    R = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+    R = R @ np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
+    t = rng.normal(size=3)
+    t /= np.linalg.norm(t)
+    F = _cross_matrix(t) @ R
+    Y = X @ R.T + t
+    x0, x1 = X[:, :2] / X[:, 2:], Y[:, :2] / Y[:, 2:]
+    x0, x1 = x0 + rng.normal(0, noise, x0.shape), x1 + rng.normal(0, noise, x1.shape)
+    x1[:outliers] = rng.uniform(-1, 1, (outliers, 2))
+    return F / np.linalg.norm(F), x0, x1

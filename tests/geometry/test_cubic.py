@@ -3,10 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from fmtorch.kernels import kernel
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from fmtorch.compiling.arrays import F8x1
+from fmtorch.compiling.kernel import kernel
 from fmtorch.geometry import cubic_kernels
 from fmtorch.geometry.cubic import cube_root, cubic_roots
 
@@ -102,8 +103,8 @@ def test_cube_root():
     torch.testing.assert_close(cube_root(x) ** 3, x, rtol=8 * torch.finfo(torch.float64).eps, atol=0)
 
 
-@kernel("f8[::1], f8[::1]")
-def cube_roots(x, out) -> None:
+@kernel
+def cube_roots(x: F8x1, out: F8x1) -> None:
     for i in range(len(x)):
         out[i] = cubic_kernels._cube_root(x[i])
 

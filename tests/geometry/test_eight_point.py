@@ -8,7 +8,6 @@ from kornia.geometry.epipolar import find_fundamental
 
 from fmtorch.geometry import canonical, eight_point
 from fmtorch.geometry.eigenvector import smallest_eigenvector
-from fmtorch.geometry.minimal import eight_point_components
 from tests.conftest import oracle
 from tests.geometry.scenes import scene, scenes
 from tests.reference import solvers as reference
@@ -28,10 +27,6 @@ FOUNTAIN_F = np.array(
      [-8.6271565107547618e-05, -5.3523033420740454e-03, 9.9997802856561435e-01]])  # fmt: skip
 
 
-def components(x0, x1):
-    return torch.cat([x0, x1], -1).movedim((-1, -2), (0, 1)).contiguous()
-
-
 def test_opencv_and_kornia_oracle():
     data = oracle("epipolar_8pt.npz")
     for i in range(len(data["names"])):
@@ -45,10 +40,6 @@ def test_opencv_and_kornia_oracle():
         assert (F - theirs["F_opencv"]).norm() < 4e-10
         assert (F - theirs["F_kornia"]).norm() < 4e-10
         assert (weighted - theirs["F_kornia_weighted"]).norm() < 4e-10
-        if case["X1"].shape[0] == 8:
-            F, valid = eight_point_components(components(case["X1"], case["X2"]))
-            assert valid
-            assert (canonical(F.reshape(3, 3)) - theirs["F_opencv"]).norm() < 4e-10
 
 
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
@@ -59,16 +50,12 @@ def test_reference_opencv_and_kornia_live(batch, n):
     F, valid = eight_point(x0, x1)
     W, _ = eight_point(x0, x1, w)
     assert valid.all()
-    minimal = eight_point_components(components(x0, x1))[0] if n == 8 else None
     for i in np.ndindex(batch):
         a, b = x0[i].numpy(), x1[i].numpy()
         theirs = torch.from_numpy(cv2.findFundamentalMat(a, b, cv2.FM_8POINT)[0])
         ones = torch.ones(1, n, dtype=torch.float64)
         kornia = find_fundamental(x0[i][None], x1[i][None], ones)[0]
-        ours = [(F[i], None), (W[i], w[i].numpy()), (theirs, None), (kornia, None)]
-        if minimal is not None:
-            ours.append((minimal[(..., *i)].reshape(3, 3), None))
-        for solution, weights in ours:
+        for solution, weights in ((F[i], None), (W[i], w[i].numpy()), (theirs, None), (kornia, None)):
             # M = A^T A is summed with a relative error of n eps, which moves its eigenvector by that over the gap; then
             # the undoing of the normalisation only shrinks: compared before it.
             expected = torch.from_numpy(reference.eight_point(a, b, weights))
@@ -105,12 +92,6 @@ def test_float32():
     # The input's rounding, 2^-15 px near 512 px, is noise of that size; 1e-3 px of noise gives errors in F (entries of
     # order 1e-3 and 1 together) below 1e-5 relative, so 3e-5 px stays far below 1e-4.
     assert (F - canonical(F_true).float()).norm(dim=(1, 2)).max() < 1e-4
-    points = components(*(a[:, :8] for a in (x0, x1)))
-    F8, valid = eight_point_components(points.float())
-    G8, _ = eight_point_components(points)
-    F8, G8 = (canonical(a.double().movedim(0, -1).reshape(-1, 3, 3)) for a in (F8, G8))
-    # eps = 1.2e-7 times the condition of eight random matches, of order 1e3 in the median.
-    assert (F8 - G8).norm(dim=(1, 2)).median() < 1e-3
 
 
 def test_weight_zero_is_masked_and_masked_is_absent():
@@ -139,12 +120,6 @@ def test_bits_do_not_depend_on_the_neighbours(dtype):
         assert torch.equal(eight_point(x0[part], x1[part], w[part])[0], F[part])
     for i in range(37):
         assert torch.equal(eight_point(x0[i], x1[i], w[i])[0], F[i])
-    points = torch.randn(4, 8, 203, dtype=dtype)
-    F, valid = eight_point_components(points)
-    for start, count in ((0, 1), (1, 2), (5, 17), (3, 200)):
-        part = eight_point_components(points[..., start : start + count].contiguous())
-        assert torch.equal(part[0], F[..., start : start + count])
-        assert torch.equal(part[1], valid[..., start : start + count])
 
 
 def degenerate(n, dtype=torch.float64):
@@ -173,10 +148,6 @@ def test_degenerate_sets_are_invalid_and_alone(n, dtype):
     assert valid.tolist() == [True] * 2 + [False] * 10
     assert not F[2:].any()
     assert torch.equal(F[:2], eight_point(x0[:2], x1[:2])[0])
-    if n == 8 and dtype == torch.float64:
-        F, valid = eight_point_components(components(x0, x1))
-        assert valid.tolist() == [True] * 2 + [False] * 10
-        assert not F[:, 2:].any()
 
 
 @pytest.mark.parametrize("n", [0, 1, 7])

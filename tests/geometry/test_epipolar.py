@@ -49,7 +49,7 @@ def cameras(seed: int, *batch: int) -> tuple[Tensor, ...]:
     return K[0], K[1], R, t
 
 
-def scene(seed: int, *batch: int, n: int = 7, noise: float = 3.0) -> tuple[Tensor, Tensor, Tensor]:
+def random_cameras(seed: int, *batch: int, n: int = 7, noise: float = 3.0) -> tuple[Tensor, Tensor, Tensor]:
     """F and matches of random cameras, with noise in image 0."""
     K0, K1, R, t = cameras(seed, *batch)
     t = t + torch.tensor([0.0, 0.0, 6.0])  # keeps the points in front of camera 1
@@ -93,7 +93,7 @@ def test_known_figures_of_a_real_pair() -> None:
 
 @pytest.mark.parametrize("batch", [(), (1,), (5,), (2, 3)])
 def test_matches_scalar_reference(batch: tuple[int, ...]) -> None:
-    F, x0, x1 = scene(3, *batch)
+    F, x0, x1 = random_cameras(3, *batch)
     d0, d1 = geometry.epipolar_distances(F, x0, x1)
     lines, sampson = geometry.epipolar_lines(F, x0), geometry.sampson(F, x0, x1)
     mean, largest = geometry.symmetric_mean(F, x0, x1), geometry.symmetric_max(F, x0, x1)
@@ -182,7 +182,7 @@ def test_distances_oracle() -> None:
 
 
 def test_agrees_with_opencv_and_kornia() -> None:
-    F, x0, x1 = scene(11, 4, n=30)
+    F, x0, x1 = random_cameras(11, 4, n=30)
     for f, p0, p1 in zip(F, x0, x1, strict=True):
         for which, points, matrix in ((1, p0, f), (2, p1, f.mT)):
             expected = cv2.computeCorrespondEpilines(points.numpy()[:, None], which, f.numpy())[:, 0]
@@ -196,7 +196,7 @@ def test_agrees_with_opencv_and_kornia() -> None:
 
 
 def test_algebraic_is_signed_and_scales_with_F() -> None:
-    F, x0, x1 = scene(2)
+    F, x0, x1 = random_cameras(2)
     e = geometry.algebraic(F, x0, x1)
     ones = torch.ones(len(x0), 1, dtype=torch.float64)
     expected = torch.einsum("ni,ij,nj->n", torch.cat([x1, ones], -1), F, torch.cat([x0, ones], -1))
@@ -207,7 +207,7 @@ def test_algebraic_is_signed_and_scales_with_F() -> None:
 @settings(max_examples=30, deadline=None)
 @given(exponent=st.floats(-30, 30), negative=st.booleans(), seed=st.integers(0, 100))
 def test_distances_ignore_scale_and_sign(exponent: float, negative: bool, seed: int) -> None:
-    F, x0, x1 = scene(seed)
+    F, x0, x1 = random_cameras(seed)
     scaled = F * 10**exponent * (-1 if negative else 1)
     for name in DISTANCES:
         function = getattr(geometry, name)
@@ -216,7 +216,7 @@ def test_distances_ignore_scale_and_sign(exponent: float, negative: bool, seed: 
 
 @pytest.mark.parametrize("name", DISTANCES)
 def test_transposition_exchanges_the_images(name: str) -> None:
-    F, x0, x1 = scene(4, 3)
+    F, x0, x1 = random_cameras(4, 3)
     function = getattr(geometry, name)
     torch.testing.assert_close(function(F, x0, x1), function(F.mT, x1, x0), rtol=1e-9, atol=1e-11)
 
@@ -257,7 +257,7 @@ def test_epipole_and_exact_matches_have_finite_values_and_gradients(dtype: torch
 
 def test_a_bad_pair_leaves_its_neighbours_alone() -> None:
     """Bit-equal alone, in a batch, and beside NaN, infinite and zero matrices; their gradients stay finite."""
-    F, x0, x1 = scene(8, 7, n=13)
+    F, x0, x1 = random_cameras(8, 7, n=13)
     bad = torch.stack([F[0] * torch.nan, F[0] * torch.inf, F[0] * 0])
     mixed = torch.cat([bad, F]).requires_grad_()
     points0, points1 = (torch.cat([x[:3], x]) for x in (x0, x1))
@@ -279,7 +279,7 @@ def test_a_bad_pair_leaves_its_neighbours_alone() -> None:
 
 def test_float32_distances() -> None:
     """An error of a few rounding units in every term of the residual and of the normal, and no more."""
-    F, x0, x1 = (v.float() for v in scene(9, 5, n=40))
+    F, x0, x1 = (v.float() for v in random_cameras(9, 5, n=40))
     _, single = geometry.epipolar_distances(F, x0, x1)
     F, x0, x1 = F.double(), x0.double(), x1.double()
     _, exact = geometry.epipolar_distances(F, x0, x1)

@@ -1,108 +1,86 @@
-"""Homographies equal their definitions, and stay where they are in any batch."""
+"""Homographies equal their definitions."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
-import torch
 
-from fmtorch.geometry.homography import (
-    least_squares_homography,
-    plane_and_parallax,
-    plane_homography,
-    transfer_squared,
-)
+from fmtorch.compiling.arrays import B1x1, F8x1, F8x2, I8x1
+from fmtorch.compiling.kernel import kernel
+from fmtorch.geometry import homography_kernels
 from tests.reference import homography as reference
+from tests.reference.solvers import skew
 
-BATCH = 12
-
-
-def _planar(n: int, noise: float = 0.0) -> tuple[torch.Tensor, np.ndarray]:
-    """Matches (4, BATCH, n) of about unit scale on a plane of their own each, and their homographies."""
-    rng = np.random.default_rng(n)
-    H = np.eye(3) + rng.uniform(-0.3, 0.3, (BATCH, 3, 3))
-    x0 = rng.uniform(-1, 1, (BATCH, n, 2))
-    y = np.concatenate([x0, np.ones((BATCH, n, 1))], -1) @ H.transpose(0, 2, 1)
-    x1 = y[..., :2] / y[..., 2:] + noise * rng.normal(size=x0.shape)
-    return torch.from_numpy(np.concatenate([x0, x1], -1)).permute(2, 0, 1).contiguous(), H
+PROBLEMS = 12
 
 
-def _matrix(H: torch.Tensor) -> np.ndarray:
-    return reference.unit(H.numpy().reshape(3, 3))
+@kernel
+def least_squares_homography(points: F8x2, inside: B1x1, H: F8x1) -> bool:
+    return homography_kernels.least_squares_homography(points, inside, H)
 
 
-def _pairs(points: torch.Tensor, i: int) -> tuple[np.ndarray, np.ndarray]:
-    return points[:2, i].T.numpy(), points[2:, i].T.numpy()
+@kernel
+def plane_homography(F: F8x1, e1: F8x1, points: F8x2, triplet: I8x1, H: F8x1) -> bool:
+    return homography_kernels.plane_homography(F, e1, points, triplet, H)
 
 
-def _skew(e: np.ndarray) -> np.ndarray:
-    return np.array([[0, -e[2], e[1]], [e[2], 0, -e[0]], [-e[1], e[0], 0]])
+@kernel
+def plane_and_parallax(H: F8x1, points: F8x2, i: int, j: int, F: F8x1) -> bool:
+    return homography_kernels.plane_and_parallax(H, points, i, j, F)
+
+
+@kernel
+def near_plane(H: F8x1, points: F8x2, limit: float, out: B1x1) -> int:
+    return homography_kernels.near_plane(H, points, limit, out)
+
+
+def planar(seed: int, n: int, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Matches (4, n) of about unit scale on a plane, and their homography."""
+    rng = np.random.default_rng([seed, n])
+    H = np.eye(3) + rng.uniform(-0.3, 0.3, (3, 3))
+    x0 = rng.uniform(-1, 1, (n, 2))
+    y = np.c_[x0, np.ones(n)] @ H.T
+    return np.ascontiguousarray(np.c_[x0, y[:, :2] / y[:, 2:] + noise * rng.normal(size=x0.shape)].T), H
 
 
 def test_least_squares() -> None:
-    points, _ = _planar(40, noise=0.01)
-    weight = torch.rand(BATCH, 40, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    weight[:, 30:] = 0
-    H, determined = least_squares_homography(points, weight)
-    assert bool(determined.all())
-    for i in range(BATCH):
+    for seed in range(PROBLEMS):
+        points, _ = planar(seed, 40, noise=0.01)
+        inside, H = np.arange(40) < 30, np.empty(9)
+        assert least_squares_homography(points, inside, H)
+        expected = reference.dlt(points[:2, :30].T, points[2:, :30].T)
         # M squares the condition of the equations (some 10): rounding of 40 sums times 1e2 over the gap.
-        np.testing.assert_allclose(_matrix(H[:, i]), reference.dlt(*_pairs(points, i), weight[i].numpy()), atol=1e-11)
-    alone = [least_squares_homography(points[:, i : i + 1], weight[i : i + 1])[0] for i in range(BATCH)]
-    assert torch.equal(torch.cat(alone, 1), H)
-    assert torch.equal(least_squares_homography(points[..., :30].contiguous(), weight[:, :30])[0], H)
-    assert not bool(least_squares_homography(points, torch.zeros_like(weight))[1].any())
+        np.testing.assert_allclose(reference.unit(H.reshape(3, 3)), expected, atol=1e-11)
+    assert not least_squares_homography(points, np.zeros(40, bool), H)
 
 
-def test_transfer_distance() -> None:
-    points, H = _planar(20, noise=0.05)
-    models = torch.from_numpy(H).flatten(1).T[..., None].contiguous()
-    squared = transfer_squared(models, points)[:, 0]
-    for i in range(BATCH):
-        expected = [reference.transfer(H[i], a, b) ** 2 for a, b in zip(*_pairs(points, i), strict=True)]
-        np.testing.assert_allclose(squared[i].numpy(), expected, rtol=1e-9)
-    assert bool(torch.isinf(transfer_squared(torch.zeros(9, BATCH, 1, dtype=torch.float64), points)).all())
+def test_matches_near_a_plane() -> None:
+    for seed in range(PROBLEMS):
+        points, H = planar(seed, 60, noise=0.05)
+        expected = [reference.transfer(H, x[:2], x[2:]) for x in points.T]
+        near = np.empty(60, bool)
+        assert near_plane(H.ravel().copy(), points, 0.1**2, near) == np.count_nonzero(near)
+        np.testing.assert_array_equal(near, np.array(expected) <= 0.1)
+    assert near_plane(np.zeros(9), points, 1.0, near) == 0
 
 
 def test_plane_through_three_matches_of_a_fundamental_matrix() -> None:
-    points, H = _planar(3)
-    e1 = np.random.default_rng(1).normal(size=(BATCH, 3))
-    F = np.stack([_skew(e) @ h for e, h in zip(e1, H, strict=True)])
-    found, valid = plane_homography(
-        torch.from_numpy(F).flatten(1).T.contiguous(), torch.from_numpy(e1).T.contiguous(),
-        points.transpose(1, 2).contiguous(),
-    )  # fmt: skip
-    assert bool(valid.all())
-    for i in range(BATCH):
-        np.testing.assert_allclose(_matrix(found[:, i]), reference.unit(H[i]), atol=1e-9)
-        np.testing.assert_allclose(_matrix(found[:, i]), reference.through_plane(F[i], *_pairs(points, i)), atol=1e-9)
+    for seed in range(PROBLEMS):
+        points, truth = planar(seed, 5)
+        e1, H = np.random.default_rng(seed).normal(size=3), np.empty(9)
+        F = skew(e1) @ truth
+        assert plane_homography(F.ravel(), e1, points, np.array([1, 4, 2]), H)
+        found = reference.unit(H.reshape(3, 3))
+        np.testing.assert_allclose(found, reference.unit(truth), atol=1e-9)
+        x0, x1 = points[:2, [1, 4, 2]].T, points[2:, [1, 4, 2]].T
+        np.testing.assert_allclose(found, reference.through_plane(F, x0, x1), atol=1e-9)
+    assert not plane_homography(F.ravel(), e1, points, np.array([1, 1, 2]), H)
 
 
 def test_plane_and_parallax() -> None:
-    _, H = _planar(4)
-    rng = np.random.default_rng(2)
-    points = torch.from_numpy(rng.uniform(-1, 1, (4, 2, BATCH)))
-    F, valid = plane_and_parallax(torch.from_numpy(H).flatten(1).T.contiguous(), points)
-    assert bool(valid.all())
-    for i in range(BATCH):
-        x0, x1 = points[:2, :, i].T.numpy(), points[2:, :, i].T.numpy()
-        np.testing.assert_allclose(_matrix(F[:, i]), reference.plane_and_parallax(H[i], x0, x1), atol=1e-10)
-    same = points.clone()
-    same[:, 1] = same[:, 0]
-    F, valid = plane_and_parallax(torch.from_numpy(H).flatten(1).T.contiguous(), same)
-    assert not bool(valid.any())
-    assert bool((F == 0).all())
-
-
-@pytest.mark.parametrize("position", [0, 5, 11])
-def test_neighbours_are_invisible(position: int) -> None:
-    points, H = _planar(4, noise=0.1)
-    samples = points.transpose(1, 2).contiguous()
-    one = slice(position, position + 1)
-    models = torch.from_numpy(H).flatten(1).T.contiguous()
-    e1 = torch.randn(3, BATCH, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
-    triplet, pair = samples[:, :3].contiguous(), samples[:, :2].contiguous()
-    whole = plane_homography(models, e1, triplet)[0][:, one]
-    assert torch.equal(whole, plane_homography(models[:, one], e1[:, one], triplet[..., one])[0])
-    whole = plane_and_parallax(models, pair)[0][:, one]
-    assert torch.equal(whole, plane_and_parallax(models[:, one], pair[..., one])[0])
+    for seed in range(PROBLEMS):
+        _, H = planar(seed, 4)
+        points, F = np.random.default_rng(seed).uniform(-1, 1, (4, 5)), np.empty(9)
+        assert plane_and_parallax(H.ravel(), points, 3, 1, F)
+        expected = reference.plane_and_parallax(H, points[:2, [3, 1]].T, points[2:, [3, 1]].T)
+        np.testing.assert_allclose(reference.unit(F.reshape(3, 3)), expected, atol=1e-10)
+        assert not plane_and_parallax(H.ravel(), points, 2, 2, F)

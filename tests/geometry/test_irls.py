@@ -7,14 +7,15 @@ from torch import Tensor
 
 from fmtorch.geometry.irls import irls
 from fmtorch.geometry.refine import refine
-from fmtorch.geometry.robust_kernels import KERNELS
+from fmtorch.geometry.robust_losses import KERNELS
 from tests.conftest import oracle
-from tests.geometry.test_refine import distance, scene
+from tests.geometry.scenes import unit_scene
+from tests.geometry.test_refine import distance
 from tests.reference import refine as reference
 
 
 def pair(seed: int, noise: float, outliers: int = 0) -> tuple[Tensor, Tensor, Tensor]:
-    F, x0, x1 = (torch.from_numpy(v) for v in scene(seed, 120, noise, outliers))
+    F, x0, x1 = (torch.from_numpy(v) for v in unit_scene(seed, 120, noise, outliers))
     return F, x0, x1
 
 

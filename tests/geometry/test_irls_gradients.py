@@ -11,9 +11,9 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.geometry import eight_point, irls, reweighted_fits
-from fmtorch.geometry.robust_kernels import KERNELS
+from fmtorch.geometry.robust_losses import KERNELS
 from tests import laws
-from tests.geometry.test_refine import scene
+from tests.geometry.scenes import unit_scene
 
 SCALE = 0.02
 GRADIENTS = ("implicit", "unrolled")
@@ -35,7 +35,7 @@ def tolerances(kernel: str) -> dict[str, float | bool]:
 
 def inputs(seed: int, n: int = 24, noise: float = 3e-3, outliers: int = 3) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Points of both images, a first model and weights."""
-    F, x0, x1 = (torch.from_numpy(v) for v in scene(seed, n, noise, outliers))
+    F, x0, x1 = (torch.from_numpy(v) for v in unit_scene(seed, n, noise, outliers))
     rng = np.random.default_rng(seed)
     near = F + 0.02 * torch.from_numpy(rng.normal(size=(3, 3)))
     return x0, x1, near, torch.from_numpy(rng.uniform(0.2, 1, n))

@@ -12,27 +12,11 @@ from fmtorch.geometry import sampson_objective
 from fmtorch.geometry.rank2_manifold import start
 from fmtorch.geometry.refine import attached_step, refine, refine_components
 from fmtorch.geometry.residuals import homogeneous, linearise
-from fmtorch.geometry.robust_kernels import KERNELS
+from fmtorch.geometry.robust_losses import KERNELS
 from fmtorch.geometry.sampson_objective import block_products
 from tests.conftest import oracle
+from tests.geometry.scenes import unit_scene
 from tests.reference import refine as reference
-
-
-def scene(seed: int, n: int = 100, noise: float = 0.0, outliers: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """F and matches of about unit scale before two cameras."""
-    rng = np.random.default_rng(seed)
-    X = np.c_[rng.uniform(-2, 2, (n, 2)), rng.uniform(3, 7, n)]
-    a, b = rng.uniform(-0.3, 0.3, 2)
-    R = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
-    R = R @ np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
-    t = rng.normal(size=3)
-    t /= np.linalg.norm(t)
-    F = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]]) @ R
-    Y = X @ R.T + t
-    x0, x1 = X[:, :2] / X[:, 2:], Y[:, :2] / Y[:, 2:]
-    x0, x1 = x0 + rng.normal(0, noise, x0.shape), x1 + rng.normal(0, noise, x1.shape)
-    x1[:outliers] = rng.uniform(-1, 1, (outliers, 2))
-    return F / np.linalg.norm(F), x0, x1
 
 
 def components(x0: np.ndarray, x1: np.ndarray) -> Tensor:
@@ -51,7 +35,7 @@ def distance(A: Tensor, B: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_jacobian_equals_autograd(seed: int) -> None:
-    F, x0, x1 = scene(seed, 40, noise=0.05)
+    F, x0, x1 = unit_scene(seed, 40, noise=0.05)
     f = models(F, 1, 0.1, seed)
 
     def residual(f: Tensor) -> Tensor:
@@ -91,7 +75,7 @@ def test_start_drops_the_smallest_singular_value() -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_least_squares_optimum_equals_scipy(seed: int) -> None:
-    F, x0, x1 = scene(seed, 80, noise=2e-3)
+    F, x0, x1 = unit_scene(seed, 80, noise=2e-3)
     weight = np.random.default_rng(seed).uniform(0.1, 1, 80)
     F0 = models(F, 3, 0.02, seed)
     infinite = torch.full((1,), torch.inf, dtype=torch.float64)
@@ -108,7 +92,7 @@ def test_least_squares_optimum_equals_scipy(seed: int) -> None:
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("seed", range(2))
 def test_robust_optimum_equals_scipy(kernel: str, seed: int) -> None:
-    F, x0, x1 = scene(seed, 120, noise=2e-3, outliers=30)
+    F, x0, x1 = unit_scene(seed, 120, noise=2e-3, outliers=30)
     scale = 0.01
     F0 = models(F, 1, 1e-3, seed)
     one = torch.ones(1, 120, dtype=torch.float64)
@@ -140,7 +124,7 @@ def test_real_pairs_reach_the_optimum_of_scipy() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_exact_matches_give_the_exact_matrix(seed: int) -> None:
-    F, x0, x1 = scene(seed)
+    F, x0, x1 = unit_scene(seed)
     found, cost = refine_components(
         models(F, 4, 0.01, seed), components(x0, x1), torch.ones(1, 100, dtype=torch.float64), "huber",
         torch.tensor([0.1], dtype=torch.float64), 15,
@@ -152,7 +136,7 @@ def test_exact_matches_give_the_exact_matrix(seed: int) -> None:
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_cost_never_rises(kernel: str) -> None:
-    F, x0, x1 = scene(7, 90, noise=5e-3, outliers=40)
+    F, x0, x1 = unit_scene(7, 90, noise=5e-3, outliers=40)
     F0 = torch.cat([models(F, 10, 0.05), models(F, 10, 1.0)], 2)
     weight = torch.from_numpy(np.random.default_rng(0).uniform(0, 1, (1, 90)))
     scale = torch.tensor([0.02], dtype=torch.float64)
@@ -163,7 +147,7 @@ def test_cost_never_rises(kernel: str) -> None:
 
 
 def test_same_bits_in_any_batch_pool_padding_and_tile(monkeypatch: pytest.MonkeyPatch) -> None:
-    pairs = [scene(i, 150, noise=3e-3, outliers=30) for i in range(5)]
+    pairs = [unit_scene(i, 150, noise=3e-3, outliers=30) for i in range(5)]
     points = torch.cat([components(x0, x1) for _, x0, x1 in pairs], 1)
     F0 = torch.cat([models(F, 13, 0.02, i) for i, (F, _, _) in enumerate(pairs)], 1)
     weight = torch.from_numpy(np.random.default_rng(1).uniform(0, 1, (5, 150)))
@@ -187,7 +171,7 @@ def test_same_bits_in_any_batch_pool_padding_and_tile(monkeypatch: pytest.Monkey
 
 
 def test_masked_slots_and_neighbours_are_invisible() -> None:
-    F, x0, x1 = (torch.from_numpy(v) for v in scene(3, 90, noise=2e-3))
+    F, x0, x1 = (torch.from_numpy(v) for v in unit_scene(3, 90, noise=2e-3))
     x0, x1 = 400 * x0 + 300, 400 * x1 + 200
     F0 = refine(F, x0, x1, scale=5.0, iterations=2)
     expected = refine(F0, x0, x1, scale=2.0)
@@ -207,7 +191,7 @@ def test_masked_slots_and_neighbours_are_invisible() -> None:
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_hopeless_problems_keep_their_model(kernel: str) -> None:
-    F, x0, x1 = scene(1, 60, noise=1e-3)
+    F, x0, x1 = unit_scene(1, 60, noise=1e-3)
     points = components(x0, x1).repeat(1, 5, 1)
     points[:, 1] = 0.0  # all matches coincide
     points[2:, 2] = points[:2, 2]  # identity
@@ -240,7 +224,7 @@ def test_empty_and_unknown() -> None:
 
 @pytest.mark.parametrize(("kernel", "outliers"), [*((name, 0) for name in KERNELS), ("truncated", 6)])
 def test_attached_step_has_the_gradient_of_the_optimum(kernel: str, outliers: int) -> None:
-    F, a, b = scene(2, 30, noise=1e-4, outliers=outliers)
+    F, a, b = unit_scene(2, 30, noise=1e-4, outliers=outliers)
     x0, x1 = torch.from_numpy(a), torch.from_numpy(b)
     rng = np.random.default_rng(0)
     weight = torch.from_numpy(rng.uniform(0.2, 1, 30))
@@ -269,7 +253,7 @@ def test_attached_step_has_the_gradient_of_the_optimum(kernel: str, outliers: in
 
 
 def test_attached_step_is_finite_everywhere() -> None:
-    F, a, b = scene(2, 30, noise=1e-3)
+    F, a, b = unit_scene(2, 30, noise=1e-3)
     x0, x1 = torch.from_numpy(a).repeat(6, 1, 1), torch.from_numpy(b).repeat(6, 1, 1)
     x0[1] = torch.nan
     x0[2], x1[2] = 0.1, 0.2
@@ -313,7 +297,7 @@ def test_block_products_have_the_same_bits_in_any_batch(threads: int) -> None:
 
 
 def test_element_by_element_refines_to_the_same_model(monkeypatch: pytest.MonkeyPatch) -> None:
-    F, x0, x1 = scene(3, 150, noise=1e-3, outliers=40)
+    F, x0, x1 = unit_scene(3, 150, noise=1e-3, outliers=40)
     arguments = (models(F, 5, 0.01), components(x0, x1), torch.ones(1, 150, dtype=torch.float64))
     refined = refine_components(*arguments, "truncated", torch.tensor([3e-3]).double(), 20)
     by_element = functools.partial(block_products, elementwise=True)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.geometry import refine
-from fmtorch.geometry.robust_kernels import KERNELS
+from fmtorch.geometry.robust_losses import KERNELS
 from tests import laws
 from tests.geometry.test_irls_gradients import GRADIENTS, SCALE, degenerate, first_model, inputs, tolerances
 

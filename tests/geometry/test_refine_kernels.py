@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.geometry import refine_kernels
+from fmtorch.geometry import irls_kernels, refine_kernels
+from fmtorch.geometry.irls import reweighted
+from fmtorch.geometry.levenberg_marquardt_kernels import Schedule
 from fmtorch.geometry.rank2_manifold import SQUARINGS
 from fmtorch.geometry.refine import DAMPING, refine_components
-from fmtorch.geometry.robust_kernels import KERNELS
+from fmtorch.geometry.robust_losses import KERNELS
 from fmtorch.geometry.sampson_objective import SampsonObjective
-from fmtorch.geometry.sampson_objective_kernels import LOSSES, evaluate
-from fmtorch.geometry.sigma_consensus import LOSS_TABLE
-
-pytest.importorskip("numba", reason="numba is not installed")
+from fmtorch.geometry.sampson_objective_kernels import LOSSES, Weighted, evaluate, loss_table
+from tests.estimators.pairs import apart
 
 SCALE = 0.02
 
@@ -41,7 +41,7 @@ def test_costs_and_normal_equations(loss: str, n: int) -> None:
     expected, expected_cost = SampsonObjective(tensors[1], tensors[2], KERNELS[loss], tensors[3])(tensors[0], True)
     for derivatives in (True, False):
         products, cost = np.zeros((5, 10, 10)), np.empty(5)
-        evaluate(F, points, weight, s2, LOSSES[loss], LOSS_TABLE, derivatives, products, cost)
+        evaluate(F, Weighted(points, weight, s2, LOSSES[loss], loss_table(loss)), derivatives, products, cost)
         np.testing.assert_allclose(cost, expected_cost[0].numpy(), rtol=1e-11)
         if derivatives:
             normal = expected[:, :, 0].permute(2, 0, 1).numpy()
@@ -51,13 +51,32 @@ def test_costs_and_normal_equations(loss: str, n: int) -> None:
             assert not products.any()
 
 
+@pytest.mark.parametrize("n", [8, 32, 300])
+@pytest.mark.parametrize("loss", LOSSES)
+def test_one_reweighted_fit(loss: str, n: int) -> None:
+    F, points, weight, _ = matches(n)
+    weight[:2] = [0, 1e-9]
+    tensors = (torch.from_numpy(a) for a in (F.T[:, None].copy(), points[:, None], weight[None]))
+    expected = reweighted(*tensors, KERNELS[loss], torch.tensor([SCALE], dtype=torch.float64))[:, 0].T.numpy()
+    found, s2 = F.copy(), np.full(n, SCALE**2)
+    irls_kernels.reweighted(found, Weighted(points, weight, s2, LOSSES[loss], loss_table(loss)))
+    for one, other in zip(found, expected, strict=True):
+        # Rounding of the sums over the gap of their eigenvalues, 1e-8 of the largest.
+        assert apart(one, other) < 1e-8
+    kept = F.copy()  # where the weights determine no model
+    none = np.where(np.arange(n) < 6, weight, 0)
+    irls_kernels.reweighted(kept, Weighted(points, none, s2, LOSSES[loss], loss_table(loss)))
+    np.testing.assert_array_equal(kept, F)
+
+
 def refined(
     F: np.ndarray, points: np.ndarray, weight: np.ndarray, s2: np.ndarray, loss: str, iterations: int, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """`refine_components` by the kernel."""
     found, cost = np.empty_like(F), np.empty(len(F))
-    data, damping = (points, weight, s2, LOSSES[loss], LOSS_TABLE), DAMPING.first
-    refine_kernels.refine(F, SQUARINGS, *data, iterations, damping, tolerance, found, cost)
+    schedule = Schedule(iterations, DAMPING.first, tolerance)
+    weighted = Weighted(points, weight, s2, LOSSES[loss], loss_table(loss))
+    refine_kernels.refine(F, SQUARINGS, weighted, schedule, found, cost)
     return found, cost
 
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from fmtorch.core.types import collate
 from fmtorch.geometry import eight_point, irls, reweighted_fits, sampson
-from fmtorch.geometry.robust_kernels import KERNELS, named_kernel
+from fmtorch.geometry.robust_losses import KERNELS, named_kernel
 from tests import laws
 from tests.geometry.test_irls_gradients import SCALE, degenerate, inputs
 from tests.geometry.test_refine import distance

@@ -1,4 +1,4 @@
-"""Minimal solvers and the weighted eight-point algorithm by kernels, against the tensor form."""
+"""Minimal solvers, the oriented constraint and the weighted eight-point algorithm by kernels, against definitions."""
 
 from __future__ import annotations
 
@@ -6,93 +6,93 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-import torch
 
-from fmtorch.estimators.pairs import NormalizedPairs, normalized_pairs
-from fmtorch.estimators.solvers import EightPoint, SevenPoint
-from fmtorch.geometry import eight_point
-from fmtorch.geometry.eight_point_kernels import eight_point as eight_point_kernel
-from fmtorch.geometry.eight_point_kernels import weighted_eight_point
-from fmtorch.geometry.seven_point_kernels import seven_point as seven_point_kernel
+from fmtorch.geometry.eight_point_kernels import eight_point, weighted_eight_point
+from fmtorch.geometry.seven_point_kernels import seven_point
+from tests.estimators.pairs import apart, normalized
 from tests.laws import degenerate, scene, small
-
-pytest.importorskip("numba", reason="numba is not installed")
+from tests.reference import solvers as reference
 
 Kernel = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], int]
-SOLVERS: dict[str, tuple[type[SevenPoint] | type[EightPoint], Kernel, int]] = {
-    "seven": (SevenPoint, seven_point_kernel, 3),
-    "eight": (EightPoint, eight_point_kernel, 1),
-}
+SOLVERS: dict[str, tuple[Kernel, int, int]] = {"seven": (seven_point, 7, 3), "eight": (eight_point, 8, 1)}
+DRAWS = 203  # not whole lanes
 
 
-def pairs() -> dict[str, NormalizedPairs]:
-    given = {"random": scene(1, 300), **degenerate(), **small()}
-    made = {name: normalized_pairs(c, 0, 7)[0] for name, c in given.items()}
-    return {name: some[0] for name, some in made.items() if some}
+def points_of() -> dict[str, np.ndarray]:
+    """Points (4, n) of pairs of many kinds, in normalised units."""
+    given = {"random": scene(1, 300), "right": scene(1, 300, outliers=0, noise=0), **degenerate(), **small()}
+    found = {name: normalized(c) for name, c in given.items()}
+    return {name: pair.points for name, pair in found.items() if pair is not None}
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_models_are_those_of_the_tensor_form(solver: str) -> None:
-    make, kernel, most = SOLVERS[solver]
-    compared = 0
-    for name, pair in pairs().items():
-        n = int(pair.count[0])
-        points = np.ascontiguousarray(pair.points[:, 0, :n].numpy())
-        rng = np.random.default_rng(0)
-        size = make.size
-        sample = np.stack([rng.permutation(max(n, size))[:size] % n for _ in range(203)], 1)  # 203: not whole lanes
-        F, draw = np.empty((most * 203, 9), np.float32), np.empty(most * 203, np.int64)
-        count = kernel(points, sample, F, draw)
-        expected, valid = make()(torch.from_numpy(points[:, sample])[:, :, None])
-        draws = np.repeat(np.arange(203), most)[valid[0].numpy()]
-        if name == "random":
-            np.testing.assert_array_equal(draw[:count], draws)
-            # float32 models; float64 solutions are exact to 1e-16 times their condition.
-            np.testing.assert_allclose(F[:count], expected[:, valid].T.numpy(), atol=2e-6, err_msg=name)
-            compared += count
-        assert np.isfinite(F[:count]).all()
-        np.testing.assert_allclose(np.linalg.norm(F[:count], axis=1), 1, atol=1e-5)
-        assert (np.diff(draw[:count]) >= 0).all()
-    assert compared > 20
-
-
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_models_explain_their_samples(solver: str) -> None:
-    make, kernel, most = SOLVERS[solver]
-    pair = pairs()["random"]
-    points = np.ascontiguousarray(pair.points[:, 0, :300].numpy())
-    rng = np.random.default_rng(1)
-    sample = np.stack([rng.permutation(300)[: make.size] for _ in range(500)], 1)
-    F, draw = np.empty((most * 500, 9), np.float32), np.empty(most * 500, np.int64)
+def solved(solver: str, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Models (m, 9) of random samples, of which draw each is, and the samples (size, DRAWS)."""
+    kernel, size, most = SOLVERS[solver]
+    rng, n = np.random.default_rng(0), points.shape[1]
+    sample = np.stack([rng.permutation(max(n, size))[:size] % n for _ in range(DRAWS)], 1)
+    F, draw = np.empty((most * DRAWS, 9), np.float32), np.empty(most * DRAWS, np.int64)
     count = kernel(points, sample, F, draw)
-    models = F[:count].astype(np.float64).reshape(-1, 3, 3)
-    x0, x1 = (
-        np.concatenate([p[:, sample[:, draw[:count]]], np.ones((1, make.size, count))])
-        for p in (points[:2], points[2:])
-    )
-    assert np.abs(np.linalg.det(models)).max() < 1e-6
-    if solver == "seven":
-        assert np.abs(np.einsum("isk,kij,jsk->ks", x1, models, x0)).max() < 1e-5
+    return F[:count].astype(np.float64), draw[:count], sample
 
 
-def test_weighted_fits_are_those_of_the_tensor_form() -> None:
-    compared = 0
-    for name, pair in pairs().items():
-        n = int(pair.count[0])
-        points = np.ascontiguousarray(pair.points[:, 0, :n].numpy())
-        for kind in ("ones", "random", "some", "none"):
-            rng = np.random.default_rng(2)
-            weight = {"ones": np.ones(n), "random": rng.random(n), "none": np.zeros(n)}.get(
-                kind, rng.random(n) * (rng.random(n) < 0.5)
-            )
-            F = np.empty(9)
-            found = weighted_eight_point(points, weight, F)
-            x0, x1 = (torch.from_numpy(p.T.copy()) for p in (points[:2], points[2:]))
-            expected, valid = eight_point(x0, x1, torch.from_numpy(weight))
-            if name == "random":
-                assert found == bool(valid), (name, kind)
-            if found and name in ("random", "all outliers"):
-                np.testing.assert_allclose(F, expected.flatten().numpy(), atol=1e-9, err_msg=f"{name}, {kind}")
-                compared += 1
-            assert not found or np.isfinite(F).all()
-    assert compared >= 5
+def expected(solver: str, x0: np.ndarray, x1: np.ndarray) -> list[np.ndarray]:
+    """The models of one sample, (9,) each, that are consistently oriented."""
+    models = [reference.eight_point(x0, x1)] if solver == "eight" else reference.seven_point(x0, x1)
+    return [F.ravel() for F in models if reference.consistently_oriented(F, x0, x1)]
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_models_are_those_of_the_definition(solver: str) -> None:
+    for name in ("random", "right"):
+        points = points_of()[name]
+        F, draw, sample = solved(solver, points)
+        same = 0
+        for d in range(DRAWS):
+            x = points[:, sample[:, d]].T
+            ours, theirs = F[draw == d], expected(solver, x[:, :2], x[:, 2:])
+            same += len(ours) == len(theirs) and all(min(apart(F, G) for G in theirs) < 1e-3 for F in ours)
+        # float32 models, exact to the condition of their samples, some 1e3; few cubics have a nearly double root.
+        assert same >= 0.97 * DRAWS, name
+        assert len(F) > 20
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_models_of_any_matches_are_sound_and_explain_their_samples(solver: str) -> None:
+    for name, points in points_of().items():
+        F, draw, sample = solved(solver, points)
+        assert np.isfinite(F).all()
+        assert (np.diff(draw) >= 0).all()
+        np.testing.assert_allclose(np.linalg.norm(F, axis=1), 1, atol=1e-5)
+        assert np.abs(np.linalg.det(F.reshape(-1, 3, 3))).max(initial=0) < 1e-6, name
+        own = np.concatenate([points[:, sample[:, draw]], np.ones((1, *sample[:, draw].shape))])
+        if solver == "seven":  # float32 models of points within 1
+            residual = np.einsum("isk,kij,jsk->ks", own[[2, 3, 4]], F.reshape(-1, 3, 3), own[[0, 1, 4]])
+            assert np.abs(residual).max(initial=0) < 1e-5, name
+
+
+def test_samples_of_right_matches_pass_the_oriented_constraint_and_most_others_fail() -> None:
+    right, random = points_of()["right"], normalized(scene(1, 300, outliers=1.0))
+    assert random is not None
+    _, draw, _ = solved("seven", right)
+    assert len(set(draw)) > 0.9 * DRAWS  # the rest magnifies the rounding of the points, which are float32
+    F, _, _ = solved("seven", random.points)
+    x = random.points
+    every = [len(reference.seven_point(x[:2, i : i + 7].T, x[2:, i : i + 7].T)) for i in range(0, 280, 7)]
+    assert len(F) / DRAWS < 0.2 * np.mean(every)
+
+
+@pytest.mark.parametrize("kind", ["ones", "random", "some", "none"])
+def test_weighted_fits_are_those_of_the_definition(kind: str) -> None:
+    for name, points in points_of().items():
+        rng, n = np.random.default_rng(2), points.shape[1]
+        some = rng.random(n) * (rng.random(n) < 0.5)
+        weight = {"ones": np.ones(n), "random": rng.random(n), "some": some, "none": np.zeros(n)}[kind]
+        F = np.empty(9)
+        found = weighted_eight_point(points, weight, F)
+        assert not found or np.isfinite(F).all()
+        if name in ("random", "right", "all outliers"):
+            assert found == (kind != "none")
+            if found:
+                theirs = reference.eight_point(points[:2].T, points[2:].T, weight).ravel()
+                # The sums of 300 products, each rounded, over the gap of the eigenvalues, some 1e-5.
+                np.testing.assert_allclose(F * np.sign(F @ theirs), theirs, atol=1e-8, err_msg=name)

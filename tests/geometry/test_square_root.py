@@ -5,18 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from fmtorch.kernels import kernel
-from fmtorch.lanes import LANES, load, store
-from fmtorch.lanes import sqrt as sqrt_of_lanes
 
+from fmtorch.compiling.arrays import F8x2
+from fmtorch.compiling.kernel import kernel
+from fmtorch.compiling.lanes import LANES, load, store
+from fmtorch.compiling.lanes import sqrt as sqrt_of_lanes
 from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.geometry.epipolar import inverse_root
 
 KINDS = {torch.float32: np.float32, torch.float64: np.float64}
 
 
-@kernel("f8[:, ::1], f8[:, ::1]")
-def roots_of_lanes(x, out) -> None:
+@kernel
+def roots_of_lanes(x: F8x2, out: F8x2) -> None:
     for row in range(len(x)):
         store(out, row, sqrt_of_lanes(load(x, row)))
 

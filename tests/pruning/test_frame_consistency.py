@@ -10,7 +10,7 @@ import fmtorch
 from fmtorch import presets
 from fmtorch.core.types import Correspondences
 from fmtorch.pruning import frame_agreement
-from fmtorch.pruning.frame_consistency import CURVES, LEAST_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO
+from fmtorch.pruning.agreement import CURVES, MIN_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO
 from tests.laws import scene
 from tests.reference import frame_consistency as reference
 
@@ -38,7 +38,7 @@ def test_equals_the_definition(count: int) -> None:
     assert c.lafs1 is not None
     assert c.quality is not None
     A0, A1 = c.lafs0[0, :, :, :2].double().numpy(), c.lafs1[0, :, :, :2].double().numpy()
-    vote = np.maximum(WORST_RATIO - c.quality[0].double().numpy(), LEAST_VOTE)
+    vote = np.maximum(WORST_RATIO - c.quality[0].double().numpy(), MIN_VOTE)
     expected = reference.agreement(
         c.x0[0].double().numpy(),
         c.x1[0].double().numpy(),

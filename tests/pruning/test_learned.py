@@ -40,7 +40,7 @@ def small(variant: str = "lc_f", seed: int = 0) -> nn.Module:
     return network
 
 
-def pairs() -> list[Correspondences]:
+def pairs_of_several_lengths() -> list[Correspondences]:
     """Pairs of several lengths, among them less than a minimal sample and none."""
     return [scene(i, count=n).replace(K0=K, K1=K) for i, n in enumerate((150, 3, 40, 1, 0, 97))]
 
@@ -67,7 +67,7 @@ def files(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 def test_files_give_the_networks_probabilities(files: tuple[nn.Module, Path], runtime: str) -> None:
     network, path = files
     other = small(path.name, seed=1)  # whose weights the file replaces
-    for c in pairs():
+    for c in pairs_of_several_lengths():
         found = LearnedPruner(other, file=path, runtime=runtime).probability(c)
         if not found.numel():
             continue
@@ -80,8 +80,8 @@ def test_files_give_the_networks_probabilities(files: tuple[nn.Module, Path], ru
 def test_padding_and_neighbours_are_invisible(files: tuple[nn.Module, Path], runtime: str) -> None:
     network, path = files
     pruner = LearnedPruner(network, file=path, runtime=runtime)
-    alone = [pruner.probability(c) for c in pairs()]
-    batch = collate(pairs())
+    alone = [pruner.probability(c) for c in pairs_of_several_lengths()]
+    batch = collate(pairs_of_several_lengths())
     nan = {"x0": torch.where(batch.mask[..., None], batch.x0, torch.nan),
            "quality": torch.where(batch.mask, batch.quality, torch.nan)}  # fmt: skip
     for c, order in ((batch, range(6)), (batch[[5, 2, 0]], (5, 2, 0)), (batch.replace(**nan), range(6))):
@@ -91,7 +91,7 @@ def test_padding_and_neighbours_are_invisible(files: tuple[nn.Module, Path], run
             assert torch.equal(together[row, :n], alone[i][0])
             assert not together[row, n:].any()
     spread = torch.arange(150) % 3 != 0  # the same matches with holes between them
-    c = pairs()[0]
+    c = pairs_of_several_lengths()[0]
     held = pruner.probability(c.keep(spread[None]))[0, spread]
     assert torch.equal(held, pruner.probability(c.keep(spread[None]).compact())[0])
 
@@ -150,14 +150,14 @@ def test_the_networks_own_state_is_left_alone() -> None:
 
 def test_temperature_of_the_option_comes_before_the_files(files: tuple[nn.Module, Path]) -> None:
     network, path = files
-    c = pairs()[0]
+    c = pairs_of_several_lengths()[0]
     stated, own = (LearnedPruner(network, file=path, temperature=t).probability(c) for t in (None, 1.0))
     torch.testing.assert_close(torch.logit(own), torch.logit(stated) * 2.5, rtol=1e-3, atol=1e-4)
 
 
 def test_auto_takes_onnx_where_there_is_one(files: tuple[nn.Module, Path], tmp_path: Path) -> None:
     network, path = files
-    c = pairs()[0]
+    c = pairs_of_several_lengths()[0]
     auto, onnx_only = (LearnedPruner(network, file=path, runtime=r).probability(c) for r in ("auto", "onnx"))
     assert torch.equal(auto, onnx_only)
     (tmp_path / "lc.safetensors").write_bytes(path.with_suffix(".safetensors").read_bytes())
@@ -172,8 +172,8 @@ def test_it_can_be_pickled_after_use(files: tuple[nn.Module, Path]) -> None:
     network, path = files
     for runtime in ("torch", "onnx"):
         pruner = LearnedPruner(network, file=path, runtime=runtime)
-        expected = pruner.probability(pairs()[0])
-        assert torch.equal(pickle.loads(pickle.dumps(pruner)).probability(pairs()[0]), expected)
+        expected = pruner.probability(pairs_of_several_lengths()[0])
+        assert torch.equal(pickle.loads(pickle.dumps(pruner)).probability(pairs_of_several_lengths()[0]), expected)
 
 
 def test_names_of_files() -> None:

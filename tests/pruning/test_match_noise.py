@@ -10,8 +10,7 @@ import torch
 
 from fmtorch import find_fundamental, metrics, presets
 from fmtorch.core.types import collate
-from fmtorch.estimators import scores
-from fmtorch.geometry import sampson, sampson_objective
+from fmtorch.geometry import sampson
 from fmtorch.geometry.refine import refine_components
 from fmtorch.pruning import match_noise
 from tests.laws import quick, scene
@@ -106,16 +105,10 @@ def _fit() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 
 
 @pytest.mark.parametrize("name", ["fmtorch", "fmtorch_fast", "fmtorch_max", "gc_ransac"])
-def test_tiles_change_nothing(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_estimators_take_it_into_account(name: str) -> None:
     estimator, stage = quick(name, 60, 30), presets.build("pruner", "match_noise")
     c = stage(collate([scene(i, 150 + 40 * i) for i in range(4)]))
-    whole = estimator(c, 5)
-    assert not torch.equal(whole.F, estimator(c.replace(noise=None), 5).F)
-    for module, constant, value in (
-        (scores, "CPU_TILE", 1000), (sampson_objective, "TILE_ELEMENTS", 1), (sampson_objective, "TILE_MODELS", 3),
-    ):  # fmt: skip
-        monkeypatch.setattr(module, constant, value)
-    assert torch.equal(whole.F, estimator(c, 5).F)
+    assert not torch.equal(estimator(c, 5).F, estimator(c.replace(noise=None), 5).F)
 
 
 def _noisy_pair(seed: int) -> tuple[torch.Tensor, ...]:

@@ -12,8 +12,7 @@ import fmtorch
 from fmtorch import presets
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.pruning import position_agreement
-from fmtorch.pruning.frame_consistency import CURVES, LEAST_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO
-from fmtorch.pruning.position_consistency import SCALES, TURNS
+from fmtorch.pruning.agreement import CURVES, MIN_VOTE, NOISE, SCALES, TOLERANCE, TURNS, WINDOW, WORST_RATIO
 from tests.laws import scene
 from tests.reference import position_consistency as reference
 
@@ -36,7 +35,7 @@ def test_equals_the_definition(count: int, angle: float, scale: float, ratios: b
     c = c if ratios else c.replace(quality=None)
     x0, x1 = c.x0[0].double().numpy(), c.x1[0].double().numpy()
     S = reference.similarity(x0, x1, CURVES, TURNS, SCALES)
-    vote = np.ones(count) if c.quality is None else np.maximum(WORST_RATIO - c.quality[0].double().numpy(), LEAST_VOTE)
+    vote = np.ones(count) if c.quality is None else np.maximum(WORST_RATIO - c.quality[0].double().numpy(), MIN_VOTE)
     expected = reference.agreement(x0, x1, S, vote, CURVES, WINDOW, TOLERANCE, NOISE)
     # float32: coordinates of 1e3 px are rounded to 6e-5 px, against lengths of at least 4 px
     np.testing.assert_allclose(agree(c)[0].numpy(), expected, rtol=1e-3, atol=1e-5)

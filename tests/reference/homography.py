@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.reference.solvers import hartley, homogeneous
+from tests.reference.solvers import hartley, homogeneous, skew
 
 
 def unit(H: np.ndarray) -> np.ndarray:
@@ -36,8 +36,7 @@ def through_plane(F: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:
     rows = []
     for a, b in [*zip(homogeneous(x0), homogeneous(x1), strict=True), (Vt[2], U[:, 2])]:
         a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
-        cross = np.array([[0, -b[2], b[1]], [b[2], 0, -b[0]], [-b[1], b[0], 0]])
-        rows.append(np.kron(cross, a))  # [b]_x H a = 0
+        rows.append(np.kron(skew(b), a))  # [b]_x H a = 0
     return unit(np.linalg.svd(np.vstack(rows))[2][-1].reshape(3, 3))
 
 
@@ -45,4 +44,4 @@ def plane_and_parallax(H: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndar
     """[e1]_x H with e1 where the lines through x1 and H x0 of two matches meet."""
     lines = [np.cross(b, H @ a) for a, b in zip(homogeneous(x0), homogeneous(x1), strict=True)]
     e = np.cross(lines[0], lines[1])
-    return unit(np.array([[0, -e[2], e[1]], [e[2], 0, -e[0]], [-e[1], e[0], 0]]) @ H)
+    return unit(skew(e) @ H)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from fmtorch.data.rendered.cameras import Camera
+from fmtorch.data.rendered.pinhole import Camera
 from fmtorch.data.rendered.surfaces import Surfaces
 
 

@@ -14,7 +14,7 @@ Points = NDArray[np.float64]
 CELLS = 64  # of a side of the grid in which places are told apart, to the diagonal of the image
 SAMPLE = 7
 MODELS = 3  # of a sample
-LEAST_CHANCE = 2.0**-13
+MIN_CHANCE = 2.0**-13
 
 
 def significance(
@@ -47,6 +47,6 @@ def significance(
     best = -math.inf
     for k in range(SAMPLE + 1, n + 1):
         tests = MODELS * (n - SAMPLE) * math.comb(n, k) * math.comb(k, SAMPLE)
-        alpha = max(counted[k - 1], LEAST_CHANCE)
+        alpha = max(counted[k - 1], MIN_CHANCE)
         best = max(best, -math.log10(tests) - (k - SAMPLE) * math.log10(alpha))
     return best

@@ -20,6 +20,11 @@ def hartley(x: Array, w: Array | None = None) -> Array:
     return np.array([[s, 0, -s * c[0]], [0, s, -s * c[1]], [0, 0, 1]])
 
 
+def skew(e: Array) -> Array:
+    """``[e]_x``."""
+    return np.array([[0, -e[2], e[1]], [e[2], 0, -e[0]], [-e[1], e[0], 0]])
+
+
 def unit(F: Array) -> Array:
     F = F / np.linalg.norm(F)
     return F * np.sign(F.flat[np.abs(F).argmax()])

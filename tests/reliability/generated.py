@@ -36,10 +36,9 @@ from torch import Tensor
 
 import fmtorch
 from fmtorch import geometry, matching, metrics, presets, pruning
-from fmtorch.core.checks import expectation
+from fmtorch.core.annotations import arguments_of, arrays_of
 from fmtorch.core.types import Correspondences, Estimate, Features, collate
-from fmtorch.estimators.peers import PEERS
-from tests.laws import calibrated, few, quick_pruner
+from tests.laws import PEERS, calibrated, few, quick_pruner
 from tests.reliability.arguments import KINDS, MISTAKES, NUMBERS, SEQUENCES, Scene, batches, scenes
 from tests.reliability.arguments import given as as_given
 
@@ -86,9 +85,8 @@ def mistaken(data: st.DataObject, arguments: dict[str, Any], numbers: dict[str, 
 
 def function_call(function: Callable[..., Any], data: st.DataObject) -> tuple[Call, set[str], Check]:
     """A call of a function by its annotations."""
-    hints = typing.get_type_hints(function)
     parameters = inspect.signature(function).parameters
-    wanted = {name: expectation(hints[name]) for name in parameters}
+    wanted = arguments_of(function)
     single = any("b" in want.shape for want in wanted.values())
     scene = data.draw(batches() if single else scenes(), label="scene")
     kind = data.draw(st.sampled_from(KINDS), label="kind")
@@ -97,15 +95,15 @@ def function_call(function: Callable[..., Any], data: st.DataObject) -> tuple[Ca
     for name, want in wanted.items():
         if name == "weigh":
             arguments[name] = functools.partial(_alike, np.shape(arguments["x0"])[:2])
-        elif want.kind in ("Float", "Bool", "Int", "Real") and not want.number:
+        elif want.kind == "array":
             if not want.optional or data.draw(st.booleans(), label=f"{name} is given"):
-                arguments[name] = as_given(scene.array(name, want.kind, want.shape), kind)
+                arguments[name] = as_given(scene.array(name, want.dtype, want.shape), kind)
             elif parameters[name].default is parameters[name].empty:
                 arguments[name] = None
         elif want.kind.endswith("numbers"):
             if data.draw(st.booleans(), label=f"{name} is given"):
                 arguments[name] = data.draw(st.sampled_from(SEQUENCES), label=name)
-        elif want.kind in ("int", "float", "str", "bool", "choice") or want.number:
+        elif want.kind in ("int", "float", "str", "bool", "choice", "number or array"):
             numbers[name] = None
             if parameters[name].default is parameters[name].empty:
                 arguments[name] = 2 if want.kind == "int" else 0.7
@@ -243,12 +241,10 @@ def record(kind: type, data: st.DataObject) -> tuple[Call, set[str], Check]:
     if kind is Correspondences:
         arguments = fields(data, scene, library)
     else:
-        hints = typing.get_type_hints(kind)
-        wanted = {name: expectation(hint) for name, hint in hints.items()}
         arguments = {
-            name: as_given(scene.array(name, want.kind, want.shape), library)
-            for name, want in wanted.items()
-            if want.shape and (not want.optional or data.draw(st.booleans(), label=name))
+            name: as_given(scene.array(name, want.dtype, want.shape), library)
+            for name, want in arrays_of(kind).items()
+            if not want.optional or data.draw(st.booleans(), label=name)
         }
         if kind is Estimate:
             arguments["reason"] = ("",) * len(arguments["F"])

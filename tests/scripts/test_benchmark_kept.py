@@ -15,7 +15,7 @@ from scripts.benchmark.kept import Kept, read
 from tests.laws import scene
 
 
-def pairs(count: int) -> list[ImagePair]:
+def unread_pairs(count: int) -> list[ImagePair]:
     image = ImageSource("none", Path("none.png"))  # not looked at
     return [ImagePair(f"orbit/{i}", "orbit", str(i), image, image, np.eye(3)) for i in range(count)]
 
@@ -54,7 +54,7 @@ def test_a_line_that_was_cut_off_goes_and_other_files_stay_as_they_are(tmp_path:
 
 
 def test_estimators_go_on_where_they_were_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    items = [(pair, scene(i, 60, outliers=0.3)) for i, pair in enumerate(pairs(3))]
+    items = [(pair, scene(i, 60, outliers=0.3)) for i, pair in enumerate(unread_pairs(3))]
     some, path = ["opencv_lmeds", "opencv_ransac@ratio_prior"], tmp_path / "rows.jsonl"
     whole = estimators.measure(some, items, 2)
     with monkeypatch.context() as patch:
@@ -85,7 +85,7 @@ def test_learned_goes_on_where_it_was_interrupted(tmp_path: Path, monkeypatch: p
                     yield {**about, "pair": pair.identity, "nsgd": 0.0}
 
     monkeypatch.setattr(learned, "rows_of", interrupted_at(1, rows_of))
-    monkeypatch.setattr(learned, "sets_of", lambda _: [pairs(3)])
+    monkeypatch.setattr(learned, "sets_of", lambda _: [unread_pairs(3)])
     arguments = argparse.Namespace(
         features="sift", methods=["ratio", "LPM"], ngransac=None, network=[], cache="off", limit=None,
         json=tmp_path / "rows.jsonl",

@@ -11,11 +11,11 @@ import torch
 
 from fmtorch.data import DepthDataset, ImagePair
 from fmtorch.data.images import ImageError
-from fmtorch.data.rendered.cameras import Camera
-from fmtorch.pipeline.matched import MatchedPairs, collate
+from fmtorch.data.rendered.pinhole import Camera
+from fmtorch.pipeline.labelled import MatchedPairs, collate
 from fmtorch.training.photographs import Photograph, package_photographs
 from fmtorch.training.planes import PlanePairs, PlaneViews, plane_depth, plane_homography, random_camera
-from tests.pipeline.matched.conftest import SIFT
+from tests.pipeline.labelled.conftest import SIFT
 
 SIZE = (300, 400)
 

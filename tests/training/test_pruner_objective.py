@@ -11,7 +11,7 @@ pytest.importorskip("lightning", reason="training needs the extra `train`")
 from fmtorch import presets
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry import eight_point
-from fmtorch.pipeline.matched import LabelledMatches, collate
+from fmtorch.pipeline.labelled import LabelledMatches, collate
 from fmtorch.pruning.networks import LC
 from fmtorch.pruning.networks.prediction import Prediction, predict
 from fmtorch.training.pruner_losses import classification_loss, geometric_loss

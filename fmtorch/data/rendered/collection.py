@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from fmtorch.data.rendered.cameras import calibration, look_at
 from fmtorch.data.rendered.drawings import sign
 from fmtorch.data.rendered.facade import Style, front, house
 from fmtorch.data.rendered.light import Lens, Light, sun
@@ -12,6 +11,7 @@ from fmtorch.data.rendered.mipmap import Real
 from fmtorch.data.rendered.orbit import ground
 from fmtorch.data.rendered.patterns import Rng, heaven, to_pixels
 from fmtorch.data.rendered.photographs import pictures
+from fmtorch.data.rendered.pinhole import calibration, look_at
 from fmtorch.data.rendered.props import ashlar, column, direction, foliage, marble, post, statue, tree, walker
 from fmtorch.data.rendered.scene import Scene, Shot
 from fmtorch.data.rendered.surfaces import Surfaces, vec
@@ -83,27 +83,33 @@ def scene(rng: Rng, split: str, shots: int, scale: Real) -> Scene:
     """A landmark with `shots` photographs by as many people; images are scaled by `scale`."""
     fixed = Surfaces()
     width = _landmark(fixed, rng, split)
-    ground(fixed, rng, split, 36)
-    leaf, bark = foliage(fixed, rng)
+    _surroundings(fixed, rng, split, width)
+    lights, surfaces = _times_of_day(fixed, rng, width)
+    taken = [_photograph(rng, width, scale, light=i % LIGHTS) for i in range(shots)]
+    pairs = [(i, j) for i in range(shots) for j in range(i + 1, shots)]
+    sky = heaven(rng, rng.uniform(-0.3, 0.7))
+    return Scene(surfaces, lights, sky, taken, [pairs[k] for k in rng.permutation(len(pairs))])
+
+
+def _surroundings(surfaces: Surfaces, rng: Rng, split: str, width: Real) -> None:
+    """Ground, houses, trees and lamp posts beside a landmark of this width."""
+    ground(surfaces, rng, split, 36)
+    leaf, bark = foliage(surfaces, rng)
     for side in (-1, 1):
         right = vec(1, 0, 0)
         foot = vec(side * (width / 2 + 3) - (12 if side < 0 else 0), 4, 0)
-        house(
-            fixed,
-            rng,
-            split,
-            foot,
-            right,
-            (12, 8, rng.uniform(7, 11)),
-            Style(density=30, same_windows=0.8),
-            sides="plain",
-        )
+        size = (12, 8, rng.uniform(7, 11))
+        house(surfaces, rng, split, foot, right, size, Style(density=30, same_windows=0.8), sides="plain")
         for _ in range(3):
             at = vec(side * rng.uniform(width / 2 - 3, width / 2 + 8), -rng.uniform(2, 10), 0)
-            tree(fixed, rng, at, rng.uniform(4, 7), leaf, bark)
-    metal = fixed.texture(np.full((16, 16, 3), 70, dtype=np.uint8))
+            tree(surfaces, rng, at, rng.uniform(4, 7), leaf, bark)
+    metal = surfaces.texture(np.full((16, 16, 3), 70, dtype=np.uint8))
     for x in np.linspace(-width / 2, width / 2, 4):
-        post(fixed, vec(x, -8, 0), 4.5, metal)
+        post(surfaces, vec(x, -8, 0), 4.5, metal)
+
+
+def _times_of_day(fixed: Surfaces, rng: Rng, width: Real) -> tuple[list[Light], list[Surfaces]]:
+    """The light at each time of day, and the surfaces then: what is fixed, and a crowd."""
     lights, surfaces = [], []
     azimuth = rng.uniform(200, 340)
     for k in range(LIGHTS):
@@ -119,29 +125,26 @@ def scene(rng: Rng, split: str, shots: int, scale: Real) -> Scene:
             at = vec(rng.normal(0, width / 3), -rng.uniform(3, 22), 0)
             walker(crowd, rng, at, rng.uniform(225, 315))
         surfaces.append(crowd)
-    taken = []
-    eyes = []
-    for i in range(shots):
-        h, w = SIZES[int(rng.integers(len(SIZES)))]
-        if rng.random() < 0.3:
-            h, w = w, h
-        size = (round(h * scale), round(w * scale))
-        zoom = float(np.exp(rng.uniform(0, np.log(3.5))))
-        K = calibration(0.85 * zoom * max(size), size)
-        angle = -90 + float(np.clip(rng.normal(0, 36), -65, 65))
-        distance = rng.uniform(14, 24) * (1 + 0.55 * (zoom - 1))
-        eye = direction(angle) * distance + vec(0, 0, rng.uniform(1.5, 2.2))
-        eye[1] = min(eye[1], -9.0)
-        at = vec(rng.normal(0, 0.14 * width), 0, rng.uniform(3.0, 5.5))
-        camera = look_at(K, size, eye.tolist(), at.tolist(), roll=float(rng.normal(0, 0.025)))
-        lens = Lens(
-            blur=rng.uniform(0.5, 1.2), exposure=rng.uniform(0.75, 1.4), contrast=rng.uniform(0.8, 1.3),
-            gamma=rng.uniform(0.75, 1.3), noise=rng.uniform(2, 7), vignette=rng.uniform(0, 0.25),
-            balance=(rng.uniform(0.9, 1.12), 1.0, rng.uniform(0.88, 1.12)),
-        )  # fmt: skip
-        taken.append(Shot(camera, lens, light=i % LIGHTS, jpeg=int(rng.integers(45, 92))))
-        eyes.append(eye)
-    pairs = [(i, j) for i in range(shots) for j in range(i + 1, shots)]
-    return Scene(
-        surfaces, lights, heaven(rng, rng.uniform(-0.3, 0.7)), taken, [pairs[k] for k in rng.permutation(len(pairs))]
-    )
+    return lights, surfaces
+
+
+def _photograph(rng: Rng, width: Real, scale: Real, light: int) -> Shot:
+    """What somebody takes of a landmark of this width, with a camera of their own."""
+    h, w = SIZES[int(rng.integers(len(SIZES)))]
+    if rng.random() < 0.3:
+        h, w = w, h
+    size = (round(h * scale), round(w * scale))
+    zoom = float(np.exp(rng.uniform(0, np.log(3.5))))
+    K = calibration(0.85 * zoom * max(size), size)
+    angle = -90 + float(np.clip(rng.normal(0, 36), -65, 65))
+    distance = rng.uniform(14, 24) * (1 + 0.55 * (zoom - 1))
+    eye = direction(angle) * distance + vec(0, 0, rng.uniform(1.5, 2.2))
+    eye[1] = min(eye[1], -9.0)
+    at = vec(rng.normal(0, 0.14 * width), 0, rng.uniform(3.0, 5.5))
+    camera = look_at(K, size, eye.tolist(), at.tolist(), roll=float(rng.normal(0, 0.025)))
+    lens = Lens(
+        blur=rng.uniform(0.5, 1.2), exposure=rng.uniform(0.75, 1.4), contrast=rng.uniform(0.8, 1.3),
+        gamma=rng.uniform(0.75, 1.3), noise=rng.uniform(2, 7), vignette=rng.uniform(0, 0.25),
+        balance=(rng.uniform(0.9, 1.12), 1.0, rng.uniform(0.88, 1.12)),
+    )  # fmt: skip
+    return Shot(camera, lens, light=light, jpeg=int(rng.integers(45, 92)))

@@ -12,9 +12,9 @@ from torch.utils.data import Dataset
 
 from fmtorch.core.resources import cache_dir
 from fmtorch.data.pairs import ImagePair, ImageSource
-from fmtorch.data.rendered.cameras import Camera, fundamental, relative_pose
 from fmtorch.data.rendered.depth import depth_at
 from fmtorch.data.rendered.generate import FAMILIES, PLANS, Plan, Task, digest, read
+from fmtorch.data.rendered.pinhole import Camera, fundamental, relative_pose
 from fmtorch.data.rendered.workers import Progress, generate_all
 
 

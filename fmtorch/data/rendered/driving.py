@@ -5,11 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from fmtorch.data.rendered.cameras import calibration, look_at
 from fmtorch.data.rendered.facade import Style, front
 from fmtorch.data.rendered.light import Lens, Light, sun
 from fmtorch.data.rendered.mipmap import Real
 from fmtorch.data.rendered.patterns import Rng, asphalt, cells, colour, heaven, masonry, meadow, rgb, to_pixels
+from fmtorch.data.rendered.pinhole import calibration, look_at
 from fmtorch.data.rendered.props import car, direction, foliage, post, tree, walker
 from fmtorch.data.rendered.scene import Scene, Shot
 from fmtorch.data.rendered.surfaces import Surfaces, vec

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -50,6 +50,42 @@ def wall_picture(rng: Rng, split: str, h: int, w: int, density: Real) -> Floats:
     return np.ascontiguousarray(out * stains[..., None], dtype=np.float32)
 
 
+Rectangle = tuple[float, float, float, float]
+"""Left, lower, right and upper edge on a front, in metres from its foot."""
+
+
+class Relief(NamedTuple):
+    """The surfaces of a front: rectangles of its picture, texture `number`, set off from its plane."""
+
+    surfaces: Surfaces
+    number: int
+    foot: Vector
+    right: Vector
+    width: Real
+    height: Real
+
+    def panel(self, x0: Real, z0: Real, x1: Real, z1: Real, depth: Real) -> None:
+        """A rectangle parallel to the wall, by so much in front of it."""
+        out, up = np.cross(self.right, vec(0, 0, 1)), vec(0, 0, 1)
+        corner = self.foot + self.right * x0 + up * z1 + out * depth
+        part = (x0 / self.width, 1 - z1 / self.height, x1 / self.width, 1 - z0 / self.height)
+        self.surfaces.quad(corner, self.right * (x1 - x0), up * (z0 - z1), self.number, part)
+
+    def block(self, x0: Real, z0: Real, x1: Real, z1: Real, depth: Real) -> None:
+        """A box set off from the wall (depth > 0) or a niche set back into it (depth < 0), with four sides."""
+        self.panel(x0, z0, x1, z1, depth)
+        right, quad, number = self.right, self.surfaces.quad, self.number
+        out, up = np.cross(right, vec(0, 0, 1)), vec(0, 0, 1)
+        near, reach = self.foot + out * depth, -out * depth
+        u0, u1, v0, v1 = x0 / self.width, x1 / self.width, 1 - z1 / self.height, 1 - z0 / self.height
+        thin = abs(depth) / self.width
+        upper_left, upper_right, lower_left = (near + right * x + up * z for x, z in ((x0, z1), (x1, z1), (x0, z0)))
+        quad(upper_right, reach, up * (z0 - z1), number, (u1, v0, u1 + thin, v1))
+        quad(upper_left + reach, -reach, up * (z0 - z1), number, (u0 - thin, v0, u0, v1))
+        quad(upper_left + reach, right * (x1 - x0), -reach, number, (u0, v0 - thin, u1, v0))
+        quad(lower_left, right * (x1 - x0), reach, number, (u0, v1, u1, v1 + thin))
+
+
 def front(
     surfaces: Surfaces, rng: Rng, split: str, foot: Vector, right: Vector, width: Real, height: Real, style: Style
 ) -> int:
@@ -57,27 +93,33 @@ def front(
 
     right: horizontal unit vector towards the viewer's right; the front faces right x up, away from the wall.
     """
-    d = style.density
-    h, w = int(height * d), int(width * d)
-    picture = wall_picture(rng, split, h, w, d)
-    out, up = np.cross(right, vec(0, 0, 1)), vec(0, 0, 1)
-    bays, storeys = max(1, int(width / style.bay)), max(1, int(height / style.storey))
+    picture = wall_picture(rng, split, int(height * style.density), int(width * style.density), style.density)
+    openings, boards = _paint_openings(picture, rng, width, height, style)
+    relief = Relief(surfaces, surfaces.texture(to_pixels(picture)), foot, right, width, height)
+    _set_back(relief, openings, style)
+    for board in boards:
+        relief.block(*board, 0.12)
+    _set_off(relief, style)
+    return relief.number
+
+
+def _grid(width: Real, height: Real, style: Style) -> tuple[int, int]:
+    """How many bays and storeys a front has."""
+    return max(1, int(width / style.bay)), max(1, int(height / style.storey))
+
+
+def _paint_openings(
+    picture: Floats, rng: Rng, width: Real, height: Real, style: Style
+) -> tuple[list[list[Rectangle]], list[Rectangle]]:
+    """Paints windows, doors and signs on the picture of a wall; where they are: openings by storey, and signs."""
+    d, (bays, storeys) = style.density, _grid(width, height, style)
     step_x, step_z = width / bays, height / storeys
     seed = int(rng.integers(2**31))
     win_w, win_h = step_x * rng.uniform(0.36, 0.55), step_z * rng.uniform(0.45, 0.62)
     glass = window(rng, int(win_h * d), int(win_w * d), np.random.SeedSequence(seed))
     entrance = int(rng.integers(bays))
-
-    def paint(picture_of: Floats, x: Real, z: Real) -> None:
-        """Pastes with its lower left corner at (x, z) metres."""
-        ph, pw = picture_of.shape[:2]
-        y0, x0 = h - int(z * d) - ph, int(x * d)
-        y1 = max(y0, 0)
-        part = picture[y1 : y0 + ph, x0 : x0 + pw]
-        part[:] = picture_of[y1 - y0 :][: part.shape[0], : part.shape[1]]
-
-    holes: list[list[tuple[float, float, float, float]]] = []
-    boards: list[tuple[float, float, float, float]] = []
+    openings: list[list[Rectangle]] = []
+    boards: list[Rectangle] = []
     for row in range(storeys):
         low = row * step_z + (0.25 * step_z if row else 0.05)
         high = low + win_h if row else low + 0.72 * step_z
@@ -86,67 +128,61 @@ def front(
             x0 = bay * step_x + (step_x - win_w) / 2
             size = (max(8, int((high - low) * d)), max(8, int(win_w * d)))
             if row == 0 and (bay == entrance or style.shop):
-                paint(door(rng, *size) if bay == entrance else window(rng, *size, np.random.SeedSequence(seed + bay)),
-                      x0, low)  # fmt: skip
+                pane = np.random.SeedSequence(seed + bay)
+                _paste(picture, door(rng, *size) if bay == entrance else window(rng, *size, pane), x0, low, d)
             elif rng.random() < style.same_windows:
-                paint(cv2.resize(glass, size[::-1]).astype(np.float32), x0, low)
+                _paste(picture, cv2.resize(glass, size[::-1]).astype(np.float32), x0, low, d)
             else:
                 glass = window(rng, *size, np.random.SeedSequence(seed))
-                paint(glass, x0, low)
+                _paste(picture, glass, x0, low, d)
             line.append((x0, low, x0 + win_w, high))
             if row == 0 and style.shop and rng.random() < 0.6:
                 board = (bay * step_x + 0.1 * step_x, high + 0.05, bay * step_x + 0.9 * step_x, high + 0.22 * step_z)
-                paint(sign(rng, int((board[3] - board[1]) * d), int((board[2] - board[0]) * d)), board[0], board[1])
+                letters = sign(rng, int((board[3] - board[1]) * d), int((board[2] - board[0]) * d))
+                _paste(picture, letters, board[0], board[1], d)
                 boards.append(board)
-        holes.append(line)
-    number = surfaces.texture(to_pixels(picture))
+        openings.append(line)
+    return openings, boards
 
-    def panel(x0: Real, z0: Real, x1: Real, z1: Real, depth: Real) -> None:
-        corner = foot + right * x0 + up * z1 + out * depth
-        surfaces.quad(
-            corner,
-            right * (x1 - x0),
-            up * (z0 - z1),
-            number,
-            (x0 / width, 1 - z1 / height, x1 / width, 1 - z0 / height),
-        )
 
-    def block(x0: Real, z0: Real, x1: Real, z1: Real, depth: Real) -> None:
-        """A box set off from the wall (depth > 0) or a niche set back into it (depth < 0), with four sides."""
-        panel(x0, z0, x1, z1, depth)
-        near, reach = foot + out * depth, -out * depth
-        u0, u1, v0, v1 = x0 / width, x1 / width, 1 - z1 / height, 1 - z0 / height
-        thin = abs(depth) / width
-        a, b, c, e = (near + right * x + up * z for x, z in ((x0, z1), (x1, z1), (x0, z0), (x1, z0)))
-        surfaces.quad(b, reach, up * (z0 - z1), number, (u1, v0, u1 + thin, v1))
-        surfaces.quad(a + reach, -reach, up * (z0 - z1), number, (u0 - thin, v0, u0, v1))
-        surfaces.quad(a + reach, right * (x1 - x0), -reach, number, (u0, v0 - thin, u1, v0))
-        surfaces.quad(c, right * (x1 - x0), reach, number, (u0, v1, u1, v1 + thin))
-        del e
+def _paste(picture: Floats, part: Floats, x: Real, z: Real, density: Real) -> None:
+    """Pastes a part with its lower left corner at (x, z) metres."""
+    h, w = part.shape[:2]
+    y0, x0 = len(picture) - int(z * density) - h, int(x * density)
+    y1 = max(y0, 0)
+    place = picture[y1 : y0 + h, x0 : x0 + w]
+    place[:] = part[y1 - y0 :][: place.shape[0], : place.shape[1]]
 
+
+def _set_back(relief: Relief, openings: list[list[Rectangle]], style: Style) -> None:
+    """The wall, with its openings set back into it, and a sill below each above the ground floor."""
     floor = 0.0
-    for line in holes:
+    for line in openings:
         low, high = line[0][1], line[0][3]
-        panel(0, floor, width, low, 0)
-        edges = [0.0, *[x for hole in line for x in (hole[0], hole[2])], width]
+        relief.panel(0, floor, relief.width, low, 0)
+        edges = [0.0, *[x for opening in line for x in (opening[0], opening[2])], relief.width]
         for x0, x1 in zip(edges[::2], edges[1::2], strict=True):
-            panel(x0, low, x1, high, 0)
+            relief.panel(x0, low, x1, high, 0)
         for x0, z0, x1, z1 in line:
-            block(x0, z0, x1, z1, -style.depth)
+            relief.block(x0, z0, x1, z1, -style.depth)
             if floor > 0:
-                block(x0 - 0.1, z0 - 0.14, x1 + 0.1, z0, 0.45 * style.depth)
+                relief.block(x0 - 0.1, z0 - 0.14, x1 + 0.1, z0, 0.45 * style.depth)
         floor = high
-    panel(0, floor, width, height, 0)
-    for board in boards:
-        block(*board, 0.12)
+    relief.panel(0, floor, relief.width, relief.height, 0)
+
+
+def _set_off(relief: Relief, style: Style) -> None:
+    """Cornices between storeys and at the top, and pilasters between bays."""
+    width, height = relief.width, relief.height
+    bays, storeys = _grid(width, height, style)
+    step_x, step_z = width / bays, height / storeys
     for row in range(1, storeys):
-        block(0, row * step_z - 0.1, width, row * step_z + 0.1, 0.5 * style.depth)
-    block(0, height - 0.45, width, height, 1.2 * style.depth)
+        relief.block(0, row * step_z - 0.1, width, row * step_z + 0.1, 0.5 * style.depth)
+    relief.block(0, height - 0.45, width, height, 1.2 * style.depth)
     if style.pilasters:
         for bay in range(bays + 1):
             x = min(max(bay * step_x, 0.2), width - 0.2)
-            block(x - 0.2, 0, x + 0.2, height - 0.45, 0.8 * style.depth)
-    return number
+            relief.block(x - 0.2, 0, x + 0.2, height - 0.45, 0.8 * style.depth)
 
 
 def house(

@@ -21,14 +21,14 @@ import cv2
 import numpy as np
 
 from fmtorch.data.rendered import collection, driving, indoor, orbit
-from fmtorch.data.rendered.cameras import Camera, fundamental
 from fmtorch.data.rendered.light import Stage, expose
 from fmtorch.data.rendered.light_kernels import affine, footprints, group_by_texture, shade
-from fmtorch.data.rendered.matchable import Keypoints, keypoints, matchable, recorded_pairs
 from fmtorch.data.rendered.mipmap import Pixels
 from fmtorch.data.rendered.noise_kernels import add_enlarged
+from fmtorch.data.rendered.pinhole import Camera, fundamental
 from fmtorch.data.rendered.raycast import Geometry
 from fmtorch.data.rendered.raycast_kernels import cast_pieces
+from fmtorch.data.rendered.recorded import Keypoints, keypoints, matchable, recorded_pairs
 from fmtorch.data.rendered.scene import Scene, Shot
 
 VERSION = 3  # of the generator: raised by every change that changes a picture or a pair

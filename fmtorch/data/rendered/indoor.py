@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from fmtorch.data.rendered.cameras import Camera, calibration, look_at
 from fmtorch.data.rendered.drawings import books, door, poster, window
 from fmtorch.data.rendered.light import Lens, Light
 from fmtorch.data.rendered.mipmap import Real
 from fmtorch.data.rendered.patterns import Rng, cloth, colour, fractal, masonry, plaster, rgb, to_pixels, wood
 from fmtorch.data.rendered.photographs import pictures
+from fmtorch.data.rendered.pinhole import Camera, calibration, look_at
 from fmtorch.data.rendered.props import direction, statue
 from fmtorch.data.rendered.scene import Scene, Shot
 from fmtorch.data.rendered.surfaces import Surfaces, Vector, vec

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.compiling import switch
-from fmtorch.data.rendered.cameras import Camera, Matrix
-from fmtorch.data.rendered.light_kernels import affine, footprints, group_by_texture, shade
-from fmtorch.data.rendered.mipmap import TO_LINEAR, Floats, Pixels, Real, bilinear, to_srgb
+from fmtorch.data.rendered import light_kernels as compiled
+from fmtorch.data.rendered.mipmap import TO_LINEAR, Floats, Pixels, Real, Texture, bilinear, to_srgb
+from fmtorch.data.rendered.pinhole import Camera, Matrix
 from fmtorch.data.rendered.raycast import Geometry, Hits
 
 # Four rays a pixel, one on each row and column of a 4 x 4 grid (rotated grid); their mean is the pixel centre.
@@ -83,8 +83,7 @@ class Stage:
         self.table[..., 7] = geometry.normals[..., 2]
         self.shadow: Floats = np.full((_SHADOW_MAP, _SHADOW_MAP), np.inf, dtype=np.float32)
         if switch.available():
-            piece, s, t = hits.flat()
-            affine(piece, s, t, self.table, 4, self.shadow.reshape(-1))
+            compiled.affine(compiled.Seen(*hits.flat(), self.table), 4, self.shadow.reshape(-1))
         else:
             met = self.table[hits.piece, :, 4]
             distance = met[..., 0] + hits.s * met[..., 1] + hits.t * met[..., 2]
@@ -104,28 +103,24 @@ class Stage:
 
     def _shade_compiled(self, hits: Hits, offset: tuple[Real, Real], out: Floats) -> None:
         """As `_shade`, with the same results: NumPy takes the transcendental functions here too."""
-        geometry, (piece, s, t) = self.geometry, hits.flat()
-        side, foot = np.ones(len(piece), dtype=np.float32), np.zeros(len(piece), dtype=np.float32)
+        geometry, seen = self.geometry, compiled.Seen(*hits.flat(), self.table)
+        footprint = compiled.Footprints(np.ones(len(seen.piece), np.float32), np.zeros(len(seen.piece), np.float32))
         count = np.zeros(len(geometry.textures), dtype=np.int64)
-        size = geometry.texture_size.astype(np.float32)
-        footprints(
-            piece, s, t, hits.piece.shape[1], self.table, self._homography(hits), size, geometry.texture, side, foot,
-            count,
-        )  # fmt: skip
-        np.log2(side, out=side)
-        np.exp(foot, out=foot)
+        mapping = compiled.Mapping(self._homography(hits), geometry.texture_size.astype(np.float32), geometry.texture)
+        compiled.footprints(seen, hits.piece.shape[1], mapping, footprint, count)
+        np.log2(footprint.span, out=footprint.span)
+        np.exp(footprint.foot, out=footprint.foot)
         end = np.cumsum(count)
         index = np.empty(end[-1], dtype=np.int32)
-        group_by_texture(piece, geometry.texture, end - count, index)
-        light = np.array([self.light.sun, self.light.sky], dtype=np.float32)
+        compiled.group_by_texture(seen.piece, geometry.texture, end - count, index)
+        lighting = compiled.Lighting(
+            np.array([self.light.sun, self.light.sky], dtype=np.float32), self.shadow, 2 * np.float32(offset[0]),
+            2 * np.float32(offset[1]), float(self._bias), np.float32(self.light.ground_shade),
+        )  # fmt: skip
         for i in np.flatnonzero(count).tolist():
-            texture = geometry.textures[i]
-            _, wide, channels = texture.atlas.shape
-            shade(
-                index[end[i] - count[i] : end[i]], piece, s, t, self.table, side, foot, texture.atlas.reshape(-1),
-                wide, channels, texture.origin, texture.scale, texture.coarsest, TO_LINEAR, self.shadow,
-                2 * np.float32(offset[0]), 2 * np.float32(offset[1]), self._bias, light, self.light.ground_shade, out,
-            )  # fmt: skip
+            compiled.shade(
+                index[end[i] - count[i] : end[i]], seen, footprint, _picture(geometry.textures[i]), lighting, out
+            )
 
     def _shade(self, hits: Hits, offset: tuple[Real, Real], out: Floats) -> None:
         index = np.flatnonzero(hits.piece.ravel() >= 0)
@@ -196,6 +191,12 @@ class Stage:
         elevation = np.arctan2(Z, np.hypot(X, Y)) * np.float32(2 / np.pi)
         coded = bilinear(self.sky, np.mod(azimuth, wide - 1), np.clip((1 - elevation) * (tall - 1), 0, tall - 1))
         return np.take(TO_LINEAR, coded)
+
+
+def _picture(texture: Texture) -> compiled.Picture:
+    _, wide, channels = texture.atlas.shape
+    atlas, coarsest = texture.atlas.reshape(-1), np.float32(texture.coarsest)
+    return compiled.Picture(atlas, wide, channels, texture.origin, texture.scale, coarsest, TO_LINEAR)
 
 
 def expose(stage: Stage, cameras: Sequence[Camera], lens: Lens, rng: np.random.Generator) -> Pixels:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.arrays import F4x1, F4x2, F4x3, I4x1, I8x1, U1x1
 from fmtorch.compiling.kernel import fused, inner, kernel
-from fmtorch.data.rendered.raycast_kernels import Floats, Index, Real
+from fmtorch.data.rendered.raycast_kernels import Index, Real
 
 Pixels = NDArray[np.uint8]
 
@@ -15,27 +18,89 @@ _MINOR, _QUARTER, _FINEST = np.float32(0.6), np.float32(0.25), np.float32(1e-6)
 _SKY, _UPWARD, _ROOF = np.float32(0.7), np.float32(0.3), np.float32(0.9)
 
 
-@kernel("i4[::1], f4[::1], f4[::1], f4[:, :, ::1], i8, f4[::1]")
-def affine(piece: NDArray[np.int32], s: Floats, t: Floats, table: Floats, column: Index, out: Floats) -> None:
-    """One column of `table` (n, 3, c), at the corner and its change along s and t, at each pixel (m,) that is met."""
+class Seen(NamedTuple):
+    """The surfaces that m pixels see: piece (m,), -1 for none, the place s, t (m,) on it, and the pieces' table.
+
+    table (n, 3, 8): what is affine in s and t, at the corner and its change along both: texture u, v, shadow map x, y
+    and distance, height, cosine to the sun, upwardness.
+    """
+
+    piece: I4x1
+    s: F4x1
+    t: F4x1
+    table: F4x3
+
+
+class Mapping(NamedTuple):
+    """How pictures lie on n pieces: from pixel to texel, homography (n, 7), without the constant column.
+
+    size (n, 2): of the piece's texture in texels. texture (n,): its number.
+    """
+
+    homography: F4x2
+    size: F4x2
+    texture: I4x1
+
+
+class Footprints(NamedTuple):
+    """Of each pixel (m,) the texels that its filter spans, then their binary logarithm, the pyramid level: `span`.
+
+    foot: -2 x the height above ground, then the exponential of that: how near the ground, from 1 on.
+    """
+
+    span: F4x1
+    foot: F4x1
+
+
+class Picture(NamedTuple):
+    """A texture's atlas in a row, see `Texture`, with its width, its channels, the origin and scale (levels, 2).
+
+    Levels end before `coarsest`. to_linear (256,): linear light of 8-bit codes.
+    """
+
+    atlas: U1x1
+    across: int
+    channels: int
+    origin: F4x2
+    scale: F4x2
+    coarsest: np.float32
+    to_linear: F4x1
+
+
+class Lighting(NamedTuple):
+    """Sun and sky: colours (2, 3), and a map of the distances that the sun reaches, shadow.
+
+    The map is looked up `shift` pixels beside; what is farther by less than `bias` is lit. ground_shade: how much
+    darker the foot of a wall is.
+    """
+
+    colours: F4x2
+    shadow: F4x2
+    shift_x: np.float32
+    shift_y: np.float32
+    bias: float
+    ground_shade: np.float32
+
+
+@kernel
+def affine(seen: Seen, column: int, out: F4x1) -> None:
+    """One column of the table at each pixel (m,) that sees a surface."""
+    piece, s, t, table = seen
     for p in range(len(piece)):
         i = piece[p]
         if i >= 0:
             out[p] = table[i, 0, column] + s[p] * table[i, 1, column] + t[p] * table[i, 2, column]
 
 
-@kernel("i4[::1], f4[::1], f4[::1], i8, f4[:, :, ::1], f4[:, ::1], f4[:, ::1], i4[::1], f4[::1], f4[::1], i8[::1]")
-def footprints(
-    piece: NDArray[np.int32], s: Floats, t: Floats, width: Index, table: Floats, homography: Floats, size: Floats,
-    texture: NDArray[np.int32], side: Floats, foot: Floats, count: NDArray[np.int64],
-) -> None:  # fmt: skip
-    """What is known of each pixel before transcendental functions are taken.
+@kernel
+def footprints(seen: Seen, width: int, mapping: Mapping, out: Footprints, count: I8x1) -> None:
+    """What is known of each pixel before transcendental functions are taken -> out.
 
-    piece, s, t (m,): what is met, rows of `width` pixels. table (n, 3, 8): see `Stage`. homography (n, 7): from pixel
-    to texel, without the constant column. size (n, 2): of the piece's texture in texels. texture (n,): its number.
-    side (m,): the texels that the pixel's filter spans; foot (m,): -2 x the height above ground; both out.
-    count: pixels of each texture, added to.
+    width: of the rows of pixels. count: pixels of each texture, added to.
     """
+    piece, s, t, table = seen
+    homography, size, texture = mapping
+    side, foot = out
     for p in range(len(piece)):
         i = piece[p]
         if i < 0:
@@ -57,10 +122,8 @@ def footprints(
         foot[p] = -max(height, _ZERO) * _TWO
 
 
-@kernel("i4[::1], i4[::1], i8[::1], i4[::1]")
-def group_by_texture(
-    piece: NDArray[np.int32], texture: NDArray[np.int32], begin: NDArray[np.int64], index: NDArray[np.int32]
-) -> None:
+@kernel
+def group_by_texture(piece: I4x1, texture: I4x1, begin: I8x1, index: I4x1) -> None:
     """Pixels that are met, ordered by texture: of each the numbers from `begin` on, which is moved to their end."""
     for p in range(len(piece)):
         i = piece[p]
@@ -83,23 +146,13 @@ def _code(atlas: Pixels, corner: Index, beside: Index, below: Index, right: Real
     return np.uint64(np.rint(fused(left, down, farther - left)))
 
 
-@kernel(
-    "i4[::1], i4[::1], f4[::1], f4[::1], f4[:, :, ::1], f4[::1], f4[::1], u1[::1], i8, i8, f4[:, ::1], f4[:, ::1], f4,"
-    "f4[::1], f4[:, ::1], f4, f4, f8, f4[:, ::1], f4, f4[:, ::1]"
-)
-def shade(
-    index: NDArray[np.int32], piece: NDArray[np.int32], s: Floats, t: Floats, table: Floats, detail: Floats,
-    foot: Floats, atlas: Pixels, across: Index, channels: Index, origin: Floats, scale: Floats, coarsest: Real,
-    to_linear: Floats, shadow: Floats, shift_x: Real, shift_y: Real, bias: Real, light: Floats,
-    ground_shade: Real, out: Floats,
-) -> None:  # fmt: skip
-    """Linear colour `out` (m, 3) of the pixels `index`, which all show one texture.
-
-    detail (m,): pyramid level. foot (m,): how near the ground, from 1 on. atlas: see `Texture`, in a row, with its
-    width, its channels, and the origin and scale of each level; levels end before `coarsest`. to_linear (256,): of
-    8-bit codes. shadow: map of the distances that the sun reaches, looked up `shift` beside, lit if farther by less
-    than `bias`. light (2, 3): sun and sky.
-    """
+@kernel
+def shade(index: I4x1, seen: Seen, footprint: Footprints, picture: Picture, lighting: Lighting, out: F4x2) -> None:
+    """Linear colour of the pixels `index`, which all show one picture -> out (m, 3)."""
+    piece, s, t, table = seen
+    detail, foot = footprint
+    atlas, across, channels, origin, scale, coarsest, to_linear = picture
+    light, shadow, shift_x, shift_y, bias, ground_shade = lighting
     last = np.float32(shadow.shape[0] - 1)
     wide, beside = np.uint64(across), np.uint64(channels)
     below = wide * beside

@@ -6,11 +6,10 @@ import functools
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from fmtorch.compiling import switch
 from fmtorch.data.rendered.mipmap import Floats
-from fmtorch.data.rendered.noise_kernels import add_enlarged
+from fmtorch.data.rendered.noise_kernels import Neighbours, add_enlarged
 
 BORDER = 2  # grid points beyond each side
 _COMPILED_FROM = 8  # times enlarged; below, little is computed that is not used, and cv2 rounds otherwise at the sides
@@ -41,7 +40,7 @@ def _add_compiled(total: Floats, grid: Floats, weight: float) -> bool:
     rows, columns = _neighbours(total.shape[0], grid.shape[0]), _neighbours(total.shape[1], grid.shape[1])
     if rows is None or columns is None:
         return False
-    add_enlarged(np.ascontiguousarray(grid), *columns, *rows, weight, total)
+    add_enlarged(np.ascontiguousarray(grid), columns, rows, np.float32(weight), total)
     return True
 
 
@@ -51,27 +50,26 @@ def _place(side: int, points: int) -> tuple[int, int]:
     return round(side / inner * points), round(BORDER * side / inner)
 
 
-def _neighbours(side: int, points: int) -> tuple[NDArray[np.int64], Floats] | None:
-    """Of each pixel the first of the four grid points that it is interpolated from, and their weights (4, side).
+def _neighbours(side: int, points: int) -> Neighbours | None:
+    """The neighbours of the pixels of a side; None if the pixels or their neighbours are not all there.
 
-    The weights are those of `cv2.resize`, which enlarges combs: points of one and of zero. None if the pixels or
-    their neighbours are not all there.
+    The weights are those of `cv2.resize`, which enlarges combs: points of one and of zero.
     """
     whole, begin = _place(side, points)
     comb = (np.arange(points) % _PERIOD == np.arange(_PERIOD)[:, None]).astype(np.float32)
-    found = cv2.resize(comb, (whole, _PERIOD), interpolation=cv2.INTER_CUBIC)[:, begin : begin + side]
+    kernel_weights = cv2.resize(comb, (whole, _PERIOD), interpolation=cv2.INTER_CUBIC)[:, begin : begin + side]
     pixel = np.arange(begin, begin + side)
     first = np.floor((pixel + 0.5) * (points / whole) - 0.5).astype(np.int64) - 1
-    if found.shape[1] < side or first.min() < 0 or first.max() + 4 > points:
+    if kernel_weights.shape[1] < side or first.min() < 0 or first.max() + 4 > points:
         return None
-    weights = found[(first + np.arange(_PERIOD)[:, None]) % _PERIOD, pixel - begin]
-    return (first, np.ascontiguousarray(weights[:4])) if not weights[4:].any() else None
+    weights = kernel_weights[(first + np.arange(_PERIOD)[:, None]) % _PERIOD, pixel - begin]
+    return Neighbours(first, np.ascontiguousarray(weights[:4])) if not weights[4:].any() else None
 
 
 @functools.cache
 def _same_bits() -> bool:
     """Whether both forms round alike on this processor; without Intel's library, or with another, they may not."""
     grid = np.random.default_rng(0).standard_normal((9, 13), dtype=np.float32)
-    one, other = np.zeros((2, 83, 151), dtype=np.float32)
-    _add(one, grid, 1.0)
-    return _add_compiled(other, grid, 1.0) and bool((one == other).all())
+    expected, compiled = np.zeros((2, 83, 151), dtype=np.float32)
+    _add(expected, grid, 1.0)
+    return _add_compiled(compiled, grid, 1.0) and bool((expected == compiled).all())

@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from typing import NamedTuple
 
+import numpy as np
+
+from fmtorch.compiling.arrays import F4x2, I8x1
 from fmtorch.compiling.kernel import fused, kernel
 
-Floats = NDArray[np.float32]
-Integers = NDArray[np.int64]
+
+class Neighbours(NamedTuple):
+    """Of each of n pixels the first of the four grid points that it is interpolated from (n,), their weights (4, n)."""
+
+    first: I8x1
+    weight: F4x2
 
 
-@kernel("f4[:, ::1], i8[::1], f4[:, ::1], i8[::1], f4[:, ::1], f4, f4[:, ::1]")
-def add_enlarged(
-    grid: Floats, left: Integers, across: Floats, top: Integers, down: Floats, weight: float, total: Floats
-) -> None:
+@kernel
+def add_enlarged(grid: F4x2, columns: Neighbours, rows: Neighbours, weight: np.float32, total: F4x2) -> None:
     """Adds `weight` x the grid (r, c), interpolated with four by four neighbours, to `total` (h, w).
 
-    left (w,): column of the leftmost neighbour; across (4, w): weights of the four. top (h,), down (4, h): likewise.
     Rounds as Intel's library does, which `cv2.resize` calls.
     """
+    (left, across), (top, down) = columns, rows
     wide = np.empty((grid.shape[0], total.shape[1]), np.float32)
     for r in range(grid.shape[0]):
         for x in range(total.shape[1]):

@@ -6,13 +6,13 @@ from typing import Literal
 
 import numpy as np
 
-from fmtorch.data.rendered.cameras import calibration, look_at
 from fmtorch.data.rendered.drawings import poster
 from fmtorch.data.rendered.facade import Style, house, wall_picture
 from fmtorch.data.rendered.light import Lens, Light, sun
 from fmtorch.data.rendered.mipmap import Real
 from fmtorch.data.rendered.patterns import Rng, cells, colour, heaven, heights, masonry, meadow, to_pixels
 from fmtorch.data.rendered.photographs import material, pictures
+from fmtorch.data.rendered.pinhole import calibration, look_at
 from fmtorch.data.rendered.props import ashlar, column, direction, foliage, marble, post, rock, statue, tree, walker
 from fmtorch.data.rendered.scene import Scene, Shot
 from fmtorch.data.rendered.surfaces import Surfaces, vec
@@ -92,23 +92,28 @@ def _structure(surfaces: Surfaces, rng: Rng, split: str) -> float:
         surfaces.lathe(vec(0, 0, base), profile, block, sides=16, repeat=(2, 1))
     else:
         statue(surfaces, rng, vec(0, 0, base), 2.2, stone)
+    _boards_and_rocks(surfaces, rng, split, 0.5 * np.hypot(width, depth), block)
+    return base
+
+
+def _boards_and_rocks(surfaces: Surfaces, rng: Rng, split: str, reach: Real, back: int) -> None:
+    """Painted boards and rocks round a structure that reaches so far; back: texture of the boards' other side."""
     paintings = [*pictures(split, rng, 2), to_pixels(poster(rng, 384, 288))]
-    for k, picture in enumerate(paintings):  # boards that stand round it
+    for k, picture in enumerate(paintings):
         angle = 120 * k + rng.uniform(-30, 30)
-        foot = direction(angle) * (0.5 * np.hypot(width, depth) + rng.uniform(0.8, 2.2))
+        foot = direction(angle) * (reach + rng.uniform(0.8, 2.2))
         right = direction(angle + 90 + rng.uniform(-30, 30))
         tall = 1.3
         wide = min(tall * picture.shape[1] / picture.shape[0], 2.0)
         number = surfaces.texture(picture)
         top = foot - right * wide / 2 + vec(0, 0, tall + 0.35)
         surfaces.quad(top, right * wide, vec(0, 0, -tall), number)
-        surfaces.quad(top + right * wide, -right * wide, vec(0, 0, -tall), block)
+        surfaces.quad(top + right * wide, -right * wide, vec(0, 0, -tall), back)
     relief = surfaces.texture(to_pixels(wall_picture(rng, split, 256, 256, 90)))
     for _ in range(6):
         angle = rng.uniform(0, 360)
-        foot = direction(angle) * (0.5 * np.hypot(width, depth) + rng.uniform(0.5, 2.5))
+        foot = direction(angle) * (reach + rng.uniform(0.5, 2.5))
         rock(surfaces, rng, foot, rng.uniform(0.25, 0.7), relief, detail=9)
-    return base
 
 
 def _mound(surfaces: Surfaces, rng: Rng, texture: int, at: tuple[Real, Real], side: Real, tall: Real) -> None:

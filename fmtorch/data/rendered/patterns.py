@@ -89,8 +89,8 @@ def cells(rng: Rng, h: int, w: int, size: int, tint: Floats, *, vary: Real = 0.1
     gy, gx = np.mgrid[size // 2 : h : size, size // 2 : w : size]
     jitter = rng.integers(-size // 3, size // 3 + 1, (2, *gy.shape))
     seeds[np.clip(gy + jitter[0], 0, h - 1), np.clip(gx + jitter[1], 0, w - 1)] = 0
-    distance, found = cv2.distanceTransformWithLabels(seeds, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    label = found.astype(np.int32)
+    distance, labels = cv2.distanceTransformWithLabels(seeds, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    label = labels.astype(np.int32)
     tones = 1 + vary * rng.standard_normal((int(label.max()) + 1, 1)).astype(np.float32)
     tones = tones * (1 + 0.3 * vary * rng.standard_normal((len(tones), 3)).astype(np.float32))
     border = cv2.morphologyEx(label.astype(np.float32), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.compiling import switch
-from fmtorch.data.rendered.cameras import Camera
 from fmtorch.data.rendered.mipmap import Floats, Pixels
-from fmtorch.data.rendered.raycast_kernels import cast_pieces
+from fmtorch.data.rendered.pinhole import Camera
+from fmtorch.data.rendered.raycast_kernels import Bounds, Cutouts, Met, Pieces, cast_pieces
 from fmtorch.data.rendered.surfaces import Surfaces
 
 Matrix = NDArray[np.float64]
@@ -37,17 +37,6 @@ class Hits:
     def flat(self) -> tuple[NDArray[np.int32], Floats, Floats]:
         """The piece, s and t of all pixels in a row."""
         return self.piece.reshape(-1), self.s.reshape(-1), self.t.reshape(-1)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Pieces:
-    """Pieces as one camera sees them: the order to cast them in, pixel boxes, linear forms, depths, nearest depths."""
-
-    order: NDArray[np.int64]
-    boxes: NDArray[np.int64]
-    forms: Floats
-    depth: Floats
-    closest: Floats
 
 
 class Geometry:
@@ -97,7 +86,7 @@ class Geometry:
         forms = exact.astype(np.float32)
         z_of = np.stack([self.U @ depth[:3], self.V @ depth[:3], self.O @ depth[:3] + depth[3]], 1).astype(np.float32)
         closest = np.where(nearest.min(1) > NEAR, 0.999 * nearest.min(1), -np.inf).astype(np.float32)
-        pieces = _Pieces(order, boxes, forms, z_of, closest)
+        pieces = Pieces(order, boxes, forms, z_of, closest, self.triangle)
         s, t = np.zeros((2, h, w), dtype=np.float32)
         hits = Hits(np.full((h, w), -1, dtype=np.int32), s, t, inverse)
         near = -np.inf if centre is None else NEAR
@@ -107,7 +96,7 @@ class Geometry:
             self._cast(pieces, hits, near)
         return hits
 
-    def _cast(self, pieces: _Pieces, hits: Hits, near: float) -> None:
+    def _cast(self, pieces: Pieces, hits: Hits, near: float) -> None:
         h, w = hits.piece.shape
         x_axis, y_axis = np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32)
         buffer = np.full((h, w), np.inf, dtype=np.float32)
@@ -140,14 +129,11 @@ class Geometry:
                 np.copyto(hits.s[view], s, where=hit)
                 np.copyto(hits.t[view], t, where=hit)
 
-    def _cast_compiled(self, pieces: _Pieces, hits: Hits, near: float) -> None:
+    def _cast_compiled(self, pieces: Pieces, hits: Hits, near: float) -> None:
         """As `_cast`, with the same results."""
-        cutout, window = self._cutouts(pieces.boxes)
-        cast_pieces(
-            pieces.order, pieces.boxes, pieces.forms, pieces.depth, pieces.closest, self.triangle, cutout, window,
-            self._opacity[0], -_SEAM, 1 + _SEAM, near, np.full(hits.piece.shape, np.inf, dtype=np.float32), hits.piece,
-            hits.s, hits.t,
-        )  # fmt: skip
+        bounds = Bounds(np.float32(-_SEAM), np.float32(1 + _SEAM), np.float32(near))
+        met = Met(np.full(hits.piece.shape, np.inf, dtype=np.float32), hits.piece, hits.s, hits.t)
+        cast_pieces(pieces, self._cutouts(pieces.boxes), bounds, met)
 
     @functools.cached_property
     def _opacity(self) -> tuple[Pixels, NDArray[np.int64]]:
@@ -156,17 +142,17 @@ class Geometry:
         end = np.cumsum([0, *map(len, planes)])
         return np.concatenate(planes), np.array([e if len(p) else -1 for p, e in zip(planes, end, strict=False)])
 
-    def _cutouts(self, boxes: NDArray[np.int64]) -> tuple[NDArray[np.int64], Floats]:
-        """For `cast_pieces`: of pieces (n,) with holes, where their picture is, and where they show it."""
-        cutout, window = np.full((len(boxes), 2), -1), np.zeros((len(boxes), 10), dtype=np.float32)
+    def _cutouts(self, boxes: NDArray[np.int64]) -> Cutouts:
+        """Of pieces (n,) with holes, where their picture is, and where they show it."""
+        place, window = np.full((len(boxes), 2), -1), np.zeros((len(boxes), 10), dtype=np.float32)
         start = self._opacity[1]
         for i in np.flatnonzero((start[self.texture] >= 0) & (boxes[:, :2] < boxes[:, 2:]).all(1)).tolist():
             x0, y0, x1, y1 = boxes[i].tolist()
             texture = self.textures[self.texture[i]]
             level = texture.level(self._detail(i, (x1 - x0, y1 - y0)))
-            cutout[i] = start[self.texture[i]], texture.atlas.shape[1]
+            place[i] = start[self.texture[i]], texture.atlas.shape[1]
             window[i] = *self.uv[i].T.ravel(), *texture.origin[level], *texture.scale[level]
-        return cutout, window
+        return Cutouts(place, window, self._opacity[0])
 
     def look(self, camera: Camera, offset: tuple[float, float] = (0.0, 0.0)) -> Hits:
         """The rays through the points `offset` (x, y) away from the pixel centres of a camera."""

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.compiling.arrays import B1x1, F4x1, F4x2, F4x3, I4x2, I8x1, I8x2, U1x1
 from fmtorch.compiling.kernel import fused, inner, kernel
 
 Floats = NDArray[np.float32]
-Integers = NDArray[np.int64]
 Booleans = NDArray[np.bool_]
 Real: TypeAlias = Any  # a number of Python's or NumPy's; in a compiled function each has one type
 Index: TypeAlias = Any
@@ -18,23 +18,57 @@ Index: TypeAlias = Any
 _OPAQUE_FROM = 128  # of 255
 
 
-@kernel(
-    "i8[::1], i8[:, ::1], f4[:, :, ::1], f4[:, ::1], f4[::1], b1[::1], i8[:, ::1], f4[:, ::1], u1[::1], f4, f4, f4,"
-    "f4[:, ::1], i4[:, ::1], f4[:, ::1], f4[:, ::1]"
-)
-def cast_pieces(
-    order: Integers, boxes: Integers, forms: Floats, depth: Floats, closest: Floats, triangle: Booleans,
-    cutout: Integers, window: Floats, opacity: NDArray[np.uint8], low: Real, high: Real, near: Real,
-    buffer: Floats, piece: NDArray[np.int32], s: Floats, t: Floats,
-) -> None:  # fmt: skip
-    """Casts rays against the pieces `order` (k,), nearest first.
+class Pieces(NamedTuple):
+    """n pieces as one camera sees them, and the order (k,) in which rays are cast against some of them, nearest first.
 
     boxes (n, 4): pixels x0, y0, x1, y1, end excluded. forms (n, 3, 3): of a pixel of the box, s z^-1, t z^-1, z^-1.
-    depth (n, 3): along U, along V, at O. closest (n,): no point is nearer. triangle (n,). cutout (n, 2): where the
-    picture with holes begins in `opacity`, and its row length; -1: without holes. window (n, 10): u at O, along U,
-    along V; v likewise; the picture's origin x, y and size x, y. low, high, near: bounds of s and t, and of depth.
-    buffer, piece, s, t (h, w): depth, number and place of what is met first so far, in and out.
+    depth (n, 3): along U, along V, at O. closest (n,): no point is nearer. triangle (n,).
     """
+
+    order: I8x1
+    boxes: I8x2
+    forms: F4x3
+    depth: F4x2
+    closest: F4x1
+    triangle: B1x1
+
+
+class Cutouts(NamedTuple):
+    """Where pieces have holes.
+
+    place (n, 2): where the picture with holes begins in `opacity`, and its row length; -1: without holes. window
+    (n, 10): u at O, along U, along V; v likewise; the picture's origin x, y and size x, y. opacity: of all pictures.
+    """
+
+    place: I8x2
+    window: F4x2
+    opacity: U1x1
+
+
+class Bounds(NamedTuple):
+    """Of s and t, exclusive, and of the depth."""
+
+    low: np.float32
+    high: np.float32
+    near: np.float32
+
+
+class Met(NamedTuple):
+    """What the ray of each pixel (h, w) meets first so far: its depth, the piece's number, s and t."""
+
+    depth: F4x2
+    piece: I4x2
+    s: F4x2
+    t: F4x2
+
+
+@kernel
+def cast_pieces(pieces: Pieces, cutouts: Cutouts, bounds: Bounds, met: Met) -> None:
+    """Casts rays against pieces; what they meet -> met."""
+    order, boxes, forms, depth, closest, triangle = pieces
+    cutout, window, opacity = cutouts
+    low, high, near = bounds
+    buffer, piece, s, t = met
     width = buffer.shape[1]
     axis = np.arange(width).astype(np.float32)
     row_s, row_t, row_z = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-from fmtorch.data.rendered.cameras import Camera
 from fmtorch.data.rendered.light import Lens, Light
 from fmtorch.data.rendered.mipmap import Pixels
+from fmtorch.data.rendered.pinhole import Camera
 from fmtorch.data.rendered.surfaces import Surfaces
 
 

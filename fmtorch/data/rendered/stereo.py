@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
 from fmtorch.data.pairs import ImagePair, ImageSource
-from fmtorch.data.rendered.cameras import Camera, calibration, fundamental, relative_pose
 from fmtorch.data.rendered.photographs import skimage_file
+from fmtorch.data.rendered.pinhole import Camera, calibration, fundamental, relative_pose
 
 _FILES = ("motorcycle_left.png", "motorcycle_right.png", "motorcycle_disp.npz")
 # Calibration of the pictures as shipped (a quarter of the published resolution); see skimage.data.stereo_motorcycle.

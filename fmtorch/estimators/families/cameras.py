@@ -13,6 +13,7 @@ import numpy as np
 
 from fmtorch.compiling.arrays import Array, F8x1, F8x2, F8x4
 from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.scratch import vector
 from fmtorch.estimators.families.focal_prior import LOG_USUAL
 from fmtorch.estimators.pair import Pair
 from fmtorch.geometry.arithmetic_kernels import exponential, logarithm
@@ -123,7 +124,7 @@ def nearest_cameras(F: F8x2, images: Images, cameras: Cameras) -> None:
     """Cameras near models (k, 9): those of their focal lengths, or of usual ones where these are implausible."""
     axes, focal, longest, shifted = cameras.axes, cameras.focal, images.longest, np.empty(F.shape)
     translate(F, -images.offset, shifted)
-    G, M, e0, e1 = np.empty(9), np.empty(9), np.empty(3), np.empty(3)
+    G, M, e0, e1 = vector(9), vector(9), vector(3), vector(3)
     for k in range(len(shifted)):
         start_one(shifted[k], SQUARINGS, G, e0, e1)
         first = _squared_focal(G, 1, 3, e1) / (longest[0] * longest[0])
@@ -147,7 +148,7 @@ def _nearest_axes(M: Array, e0: Array, e1: Array, axes: Array) -> None:
 
     In the planes across the epipoles M is 2 x 2; its nearest orthogonal matrix gives both singular values 1.
     """
-    p, q, a, b = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    p, q, a, b = vector(3), vector(3), vector(3), vector(3)
     complement(e0, p, q)
     complement(e1, a, b)
     m00, m01, m10, m11 = 0.0, 0.0, 0.0, 0.0

@@ -6,10 +6,11 @@ and stopping rule are written once; what differs is the family's: minimal sample
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 
 from fmtorch.compiling.arrays import Array
 from fmtorch.estimators.pair import Pair
+from fmtorch.geometry.residual_kernels import Residual
 
 
 class Hypotheses(NamedTuple):
@@ -24,14 +25,32 @@ class Hypotheses(NamedTuple):
     start: int
 
 
+@runtime_checkable
 class Family(Protocol):
     """A family of models. size: matches of a minimal sample."""
 
-    size: int
+    size: ClassVar[int]
 
     def solve(self, pair: Pair, sample: Array, start: int) -> Hypotheses:
         """The models of the samples (size, s), which are the draws start, start + 1, ..."""
         ...
+
+
+class FitScale(NamedTuple):
+    """The last fit, at a pair's own noise.
+
+    loss: its robust loss. sigmas_of_median: the standard deviation of a coordinate, in medians of inliers' residuals.
+    scale_sigmas: the scale of the loss in these; it is within smallest_px and largest_px, and default_px where too few
+    inliers tell the noise. by_prior: whether a match counts by its prior, too, not by its noise alone.
+    """
+
+    loss: str = "truncated"
+    sigmas_of_median: float = 1.4826
+    scale_sigmas: float = 2.0
+    smallest_px: float = 0.3
+    largest_px: float = 2.0
+    default_px: float = 1.5
+    by_prior: bool = True
 
 
 class Loss(NamedTuple):
@@ -50,8 +69,23 @@ class Steps(NamedTuple):
     tolerance: float | None = None
 
 
-class Refining(Family, Protocol):
+@runtime_checkable
+class Estimated(Protocol):
+    """What an estimate is. model: what it is called. residual: by which matches are judged."""
+
+    model: ClassVar[str]
+    residual: ClassVar[Residual]
+
+    def to_pixels(self, F: Array, pair: Pair, out: Array) -> bool:
+        """A model (9,) of normalised points as that of pixels, of unit norm -> out (3, 3); whether it is finite."""
+        ...
+
+
+@runtime_checkable
+class Refining(Family, Estimated, Protocol):
     """A family whose models can be refined and fitted on their own."""
+
+    fit_scale: ClassVar[FitScale]
 
     def refine(self, F: Array, pair: Pair, loss: Loss, steps: Steps) -> Array:
         """Models (k, 9) of least robust error nearby, on all matches by prior and noise; float64.

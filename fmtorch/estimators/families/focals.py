@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from statistics import NormalDist
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from fmtorch.compiling.arrays import Array, F8x1, F8x2
 from fmtorch.compiling.kernel import kernel
 from fmtorch.compiling.lanes import LANES
 from fmtorch.compiling.random_kernels import random_bits, stream_state
+from fmtorch.compiling.scratch import matrix, vector
 from fmtorch.core.streams import Stream
 from fmtorch.estimators.families.cameras import (
     Cameras,
@@ -68,7 +69,7 @@ class FocalFit(NamedTuple):
 class FundamentalWithFocals:
     """Square pixels, central principal points, usual focal lengths, of images whose sizes are known."""
 
-    size = 5
+    size: ClassVar[int] = 5
 
     def solve(self, pair: Pair, sample: Array, start: int) -> Hypotheses:
         """As `Family.solve`, with focal lengths drawn from their prior."""
@@ -125,15 +126,15 @@ def refine_with_prior(F: F8x2, subset: Subset, limits: Limits, cameras: Cameras,
     """`FundamentalWithFocals.refine` of models (k, 9) -> cameras, out."""
     table, images, k = subset.table, subset.images, len(F)
     centred_matches, optimum = (
-        np.empty((6, table.shape[1])),
-        Optimum(np.empty((k, 9)), np.empty(k), np.empty((k, 7)), np.empty((k, 7, 7))),
+        matrix(6, table.shape[1]),
+        Optimum(matrix(k, 9), vector(k), matrix(k, 7), np.empty((k, 7, 7))),
     )
     centre(table, images.offset, LOSS_SCALE_PX, centred_matches)
     points, s2, scale = centred_matches[:4], centred_matches[4], centred_matches[5]
     nearest_cameras(F, images, cameras)
-    minimise(cameras, Weighted(points, table[4], s2, GEMAN_MCCLURE, np.empty((2, 0))), images, limits, optimum)
+    minimise(cameras, Weighted(points, table[4], s2, GEMAN_MCCLURE, matrix(2, 0)), images, limits, optimum)
     translate(optimum.F, images.offset, out.models)
-    work = np.empty(4)
+    work = vector(4)
     for i in range(k):
         unit(out.models[i])
         out.cost[i] = focal_cost(cameras.focal[i], images.same_size, work)
@@ -142,7 +143,7 @@ def refine_with_prior(F: F8x2, subset: Subset, limits: Limits, cameras: Cameras,
             finite = finite and math.isfinite(out.models[i, q])
         if not finite:
             out.cost[i] = math.inf
-    support = Weighted(points, table[6], scale, GEMAN_MCCLURE, np.empty((2, 0)))
+    support = Weighted(points, table[6], scale, GEMAN_MCCLURE, matrix(2, 0))
     cheirality(cameras, images.longest, optimum.F, support, subset.parallel, out.share)
 
 
@@ -166,7 +167,7 @@ def draw_depths(normal: F8x1, images: Images, mixed_seed: int, key: int, start: 
 @kernel(holds_gil=True)
 def gain_without_prior(hessian: F8x2, gradient: F8x1, focal: F8x1, same_size: bool, out: F8x1) -> None:
     """What the logarithm of the likelihood would rise by at an optimum without prior -> out (1,)."""
-    Q, H, g, prior, total = np.empty((7, LANES)), np.empty((7, 7)), np.empty(7), np.empty(4), 0.0
+    Q, H, g, prior, total = matrix(7, LANES), matrix(7, 7), vector(7), vector(4), 0.0
     focal_cost(focal, same_size, prior)
     for i in range(7):
         g[i] = gradient[i] - (prior[i - 5] if i >= 5 else 0.0)

@@ -8,11 +8,13 @@ from typing import ClassVar
 import numpy as np
 
 from fmtorch.compiling.arrays import Array
-from fmtorch.estimators.families.family import Hypotheses, Loss, Steps
-from fmtorch.estimators.pair import Pair
+from fmtorch.estimators.families.family import FitScale, Hypotheses, Loss, Steps
+from fmtorch.estimators.pair import Pair, to_pixels
 from fmtorch.geometry.eight_point_kernels import eight_point, weighted_eight_point
+from fmtorch.geometry.levenberg_marquardt_kernels import Schedule
 from fmtorch.geometry.rank2_manifold_kernels import gauss_newton, response
-from fmtorch.geometry.refine_kernels import Schedule, refine
+from fmtorch.geometry.refine_kernels import refine
+from fmtorch.geometry.residual_kernels import SAMPSON, Residual
 from fmtorch.geometry.sampson_objective_kernels import LOSSES, NO_TABLE, Weighted, loss_table
 from fmtorch.geometry.seven_point_kernels import seven_point
 
@@ -23,6 +25,9 @@ STEP_DAMPING = 1e-10  # of a Gauss-Newton step at an optimum: bounds it where th
 class Fundamental:
     """Matrices of rank 2. size: matches of a minimal sample; solutions: models of one sample, at most."""
 
+    model: ClassVar[str] = "fundamental"
+    residual: ClassVar[Residual] = SAMPSON
+    fit_scale: ClassVar[FitScale] = FitScale()
     size: ClassVar[int]
     solutions: ClassVar[int]
     minimal: ClassVar[Callable[..., int]]
@@ -34,12 +39,17 @@ class Fundamental:
         count = type(self).minimal(pair.points, sample, F, draw)
         return Hypotheses(F[:count], draw[:count], sample, start)
 
+    def to_pixels(self, F: Array, pair: Pair, out: Array) -> bool:
+        """As `Estimated.to_pixels`, the entry of largest magnitude positive."""
+        return to_pixels(F, pair.centre, pair.pixels_per_unit, out)
+
     def refine(self, F: Array, pair: Pair, loss: Loss, steps: Steps) -> Array:
         """As `Refining.refine`."""
         s2 = np.square(loss.scale / pair.pixels_per_noise)
         refined, cost = np.empty_like(F), np.empty(len(F))
         matches = Weighted(pair.points, pair.weight, s2, LOSSES[loss.name], loss_table(loss.name))
-        refine(F, matches, Schedule(steps.iterations, steps.damping, steps.tolerance or 0.0, SQUARINGS), refined, cost)
+        schedule = Schedule(steps.iterations, steps.damping, steps.tolerance or 0.0)
+        refine(F, SQUARINGS, matches, schedule, refined, cost)
         return np.where(np.isfinite(cost)[:, None], refined, F)
 
     def least_squares(self, F: Array, pair: Pair, weight: Array) -> Array:

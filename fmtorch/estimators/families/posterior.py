@@ -13,6 +13,7 @@ import numpy as np
 from fmtorch.compiling.arrays import Array, F8x1, F8x2, F8x3
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.lanes import LANES, fill, load, store
+from fmtorch.compiling.scratch import matrix, vector
 from fmtorch.estimators.families.cameras import Cameras, Images
 from fmtorch.estimators.families.focal_prior import focal_cost
 from fmtorch.geometry.arithmetic_kernels import exponential
@@ -75,9 +76,7 @@ def minimise(cameras: Cameras, matches: Weighted, images: Images, limits: Limits
     """Cameras of least negative logarithm of the posterior near these, in place; what it is there -> out."""
     k = len(out.cost)
     state = _State(cameras.axes, cameras.focal, out.F, out.cost, out.gradient, out.hessian)
-    trial = _State(
-        np.empty((k, 2, 3, 3)), np.empty((k, 2)), np.empty((k, 9)), np.empty(k), np.empty((k, 7)), np.empty((k, 7, 7))
-    )
+    trial = _State(np.empty((k, 2, 3, 3)), matrix(k, 2), matrix(k, 9), vector(k), matrix(k, 7), np.empty((k, 7, 7)))
     data = _Data(matches, images, limits, np.zeros((k, 9, LANES)), np.empty((k, 10, 10)))
     _minimise(data, state, trial, np.full(k, FIRST_DAMPING), limits.iterations, limits.tolerance >= 0)
 
@@ -92,7 +91,7 @@ def tangents_of(cameras: Cameras, longest: F8x1, F: F8x2, out: F8x3) -> None:
 def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
     _models(state.axes, state.focal, data.images.longest, state.F, data.tangents)
     evaluate(state.F, data.matches, derivatives, data.products, state.cost)
-    work = np.empty(4)
+    work = vector(4)
     for k in range(len(state.cost)):
         prior = focal_cost(state.focal[k], data.images.same_size, work)
         state.cost[k] = state.cost[k] * data.limits.precision / 2 + prior
@@ -123,7 +122,7 @@ def _derivatives(
     products: Array, tangents: Array, prior: Array, precision: float, gradient: Array, hessian: Array
 ) -> None:  # fmt: skip
     """Of one candidate. products: (10, 10), of `evaluate`; tangents: (9, LANES); prior: (4,), of `focal_cost`."""
-    along, column = np.empty((10, LANES)), np.empty((1, LANES))
+    along, column = matrix(10, LANES), matrix(1, LANES)
     for j in range(10):
         total = fill(0.0)
         for q in range(9):
@@ -146,7 +145,7 @@ def _derivatives(
 
 @inner
 def _step(state: _State, damping: Array, trial: _State) -> None:
-    Q = np.empty((7, LANES))
+    Q = matrix(7, LANES)
     for k in range(len(damping)):
         damped_step(state.hessian[k], state.gradient[k], damping[k], Q)
         _rotate(state.axes[k, 0], Q[0, 7] / 2, Q[1, 7] / 2, Q[2, 7] / 2, trial.axes[k, 0])

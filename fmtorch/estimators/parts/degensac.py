@@ -7,6 +7,7 @@ import numpy as np
 from fmtorch.compiling.arrays import Array, B1x1, F4x2, F8x1, F8x2, I8x1, I8x2
 from fmtorch.compiling.kernel import kernel
 from fmtorch.compiling.random_kernels import random_bits, stream_state
+from fmtorch.compiling.scratch import vector
 from fmtorch.core.streams import Stream
 from fmtorch.estimators.families.family import Hypotheses
 from fmtorch.estimators.pair import Pair, squared
@@ -43,7 +44,7 @@ class Degensac:
     def __init__(self, score: Score) -> None:
         self.score, self.prior = score, PriorWeighted()
 
-    def __call__(self, made: Hypotheses, models: Verified, best: float, pair: Pair) -> Verified:
+    def __call__(self, hypotheses: Hypotheses, models: Verified, best: float, pair: Pair) -> Verified:
         """The verified models of a round, with those of plane and parallax. best: the score to beat."""
         if not len(models.score):  # no sample gave a model
             return models
@@ -51,11 +52,14 @@ class Degensac:
         if not models.score[first] > best:
             return models
         which = int(models.which[first])
-        sample = np.ascontiguousarray(pair.points[:, made.sample[:, made.draw[which]]])
+        sample = np.ascontiguousarray(pair.points[:, hypotheses.sample[:, hypotheses.draw[which]]])
         H = np.empty(9)
-        if plane_of_sample(made.F[which].astype(np.float64), sample, self.TRIPLETS, _limit(pair), H) < self.ON_PLANE:
+        if (
+            plane_of_sample(hypotheses.F[which].astype(np.float64), sample, self.TRIPLETS, _limit(pair), H)
+            < self.ON_PLANE
+        ):
             return models
-        F, score = self.completed(H, pair, made.start)
+        F, score = self.completed(H, pair, hypotheses.start)
         added = len(models.F) + np.arange(len(F))
         return Verified(
             np.concatenate([models.F, F]), np.concatenate([models.which, added]), np.concatenate([models.score, score])
@@ -88,24 +92,24 @@ def plane_of_sample(F: F8x1, sample: F8x2, triplets: I8x2, limit: float, H: F8x1
     sample: (4, 7), points. triplets: (t, 3), of the sample, through each of which one homography goes. limit: of
     squared transfer distances. Of equals the first is taken; without any H is zero.
     """
-    G, Ft, e1 = np.empty(9), np.empty(9), np.empty(3)
-    near, most = np.empty(sample.shape[1], np.bool_), 0
+    G, Ft, e1 = vector(9), vector(9), vector(3)
+    near, largest = np.empty(sample.shape[1], np.bool_), 0
     for i in range(9):
         Ft[i], H[i] = F[3 * (i % 3) + i // 3], 0.0
     last_right_singular_vector(Ft, e1)
     for t in range(len(triplets)):
         if plane_homography(F, e1, sample, triplets[t], G):
             members = near_plane(G, sample, limit, near)
-            if members > most:
-                most = members
+            if members > largest:
+                largest = members
                 assign(H, G)
-    return most
+    return largest
 
 
 @kernel
 def fit_plane(H: F8x1, points: F8x2, limit: float, fits: int, inside: B1x1) -> None:
     """H (9,), in place, fitted to the matches near it as long as these become more; those matches -> inside (n,)."""
-    G, others = np.empty(9), np.empty(len(inside), np.bool_)
+    G, others = vector(9), np.empty(len(inside), np.bool_)
     count = near_plane(H, points, limit, inside)
     for _ in range(fits):
         if not least_squares_homography(points, inside, G):
@@ -127,7 +131,7 @@ def parallax(H: F8x1, points: F8x2, table: I8x1, stream: I8x1, out: F4x2) -> int
     seed, the key, and the first of the random numbers, two a draw.
     """
     state, total = stream_state(stream[0], stream[1]), np.uint64(table[-1])
-    F, pair, models = np.empty(9), np.empty(2, np.int64), 0
+    F, pair, models = vector(9), np.empty(2, np.int64), 0
     for draw in range(len(out)):
         for k in range(2):
             word = random_bits(state, stream[2] + 2 * draw + k) >> np.uint64(31)

@@ -13,16 +13,13 @@ import numpy as np
 
 from fmtorch.compiling.arrays import Array
 from fmtorch.estimators.families.cameras import Cameras
-from fmtorch.estimators.families.family import Loss, Refining, Steps
+from fmtorch.estimators.families.family import FitScale, Loss, Refining, Steps
 from fmtorch.estimators.families.focals import FundamentalWithFocals
 from fmtorch.estimators.families.posterior import Limits
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.parts.inliers import lower_median, residuals_squared_px
 from fmtorch.estimators.parts.selection import Selection
 
-TRUNCATION_SIGMAS = 2.0  # robust standard deviations beyond which a match does not count
-MIN_TRUNCATION_PX, MAX_TRUNCATION_PX = 0.3, 2.0  # bounds of that distance
-DEFAULT_TRUNCATION_PX = 1.5  # that distance where too few matches tell the noise
 MIN_INLIERS_FOR_NOISE = 15  # matches that tell the noise
 MIN_PRIOR_FOR_NOISE = 0.3  # matches of a smaller prior do not tell the noise
 STEPS = Steps(iterations=8, damping=1e-6, tolerance=1e-4)  # small damping, since the start is near the optimum
@@ -34,9 +31,9 @@ FOCAL_TOLERANCE = 0.05  # of the logarithm of the posterior: a fifth of a standa
 class Fit(NamedTuple):
     """A fit's value, and what its gradient depends on.
 
-    F: (9,), the estimate. at: (9,), the model at which the gradient is taken. counted: (n,), the matches that count.
-    cameras: those assumed at the optimum. precision: one over the variance of an inlier's distance, in the unit of the
-    points, where cameras are assumed.
+    F: (9,), the estimate. at: (9,), the model at which the gradient is taken. counted: (n,), how much each match counts
+    there, between 0 and 1, by the loss. cameras: those assumed at the optimum. precision: one over the variance of an
+    inlier's distance, in the unit of the points, where cameras are assumed.
     """
 
     F: Array
@@ -69,7 +66,7 @@ class NoFit:
 
     def __call__(self, selection: Selection, pair: Pair, inliers: Array, family: Refining) -> Fit:
         """As `FinalFit`."""
-        return Fit(selection.F, selection.F, inliers)
+        return Fit(selection.F, selection.F, inliers.astype(np.float64))
 
 
 class LeastSquares:
@@ -87,7 +84,7 @@ class LeastSquares:
         """As `FinalFit`."""
         weighted = self.weighted and pair.prior is not None
         weight = np.where(inliers, pair.weight if weighted else 1.0, 0.0)
-        return Fit(family.least_squares(selection.F, pair, weight), selection.F, inliers)
+        return Fit(family.least_squares(selection.F, pair, weight), selection.F, inliers.astype(np.float64))
 
 
 class UnweightedLeastSquares(LeastSquares):
@@ -104,7 +101,7 @@ class GaussNewton:
     def __call__(self, selection: Selection, pair: Pair, inliers: Array, family: Refining) -> Fit:
         """As `FinalFit`."""
         weight = np.where(inliers, pair.weight, 0.0)
-        return Fit(family.step(selection.F, pair, weight), selection.F, inliers)
+        return Fit(family.step(selection.F, pair, weight), selection.F, inliers.astype(np.float64))
 
 
 class Adaptive:
@@ -115,8 +112,8 @@ class Adaptive:
     best: on rendered training scenes this fit raises AUC@0.05 from 66.8 to 74.2 (indoor) and from 78.2 to 85.3
     (driving) and changes nothing on castle-P19 and fox.
     Where cameras are assumed it maximises the posterior, unless the matches contradict the prior. The noise is 1.4826
-    times the median Sampson distance of the inliers (Rousseeuw & Leroy 1987), the truncation TRUNCATION_SIGMAS times
-    that.
+    times the median Sampson distance of the inliers (Rousseeuw & Leroy 1987), the truncation twice that; `FitScale`
+    says what they are of homographies.
     """
 
     gradient, weighted = "optimum", True
@@ -124,32 +121,37 @@ class Adaptive:
     def __call__(self, selection: Selection, pair: Pair, inliers: Array, family: Refining) -> Fit:
         """As `FinalFit`."""
         likely = inliers if pair.prior is None else inliers & (pair.prior > MIN_PRIOR_FOR_NOISE)
-        truncation = truncation_distance(squared_in_noises(selection.F, pair)[likely])
+        own = family.fit_scale
+        scale = fit_distance(squared_in_noises(selection.F, pair)[likely], own)
         if selection.cameras is not None:
-            precision = squared(pair.pixels_per_unit / (truncation / TRUNCATION_SIGMAS))
+            precision = squared(pair.pixels_per_unit / (scale / own.scale_sigmas))
             limits = Limits(precision, FOCAL_ITERATIONS, FOCAL_TOLERANCE)
-            fit = FundamentalWithFocals().fit(selection.cameras, pair, truncation, limits)
+            fit = FundamentalWithFocals().fit(selection.cameras, pair, scale, limits)
             if fit.gain <= PRIOR_CONFLICT_GAIN and all(map(math.isfinite, fit.F.tolist())):
-                return Fit(fit.F, fit.F, self._counted(fit.F, pair, truncation), fit.cameras, precision)
-        (F,) = family.refine(selection.F[None], pair, Loss("truncated", truncation), STEPS)
-        return Fit(F, F, self._counted(F, pair, truncation))
+                return Fit(fit.F, fit.F, counted(fit.F, pair, own.loss, scale), fit.cameras, precision)
+        (F,) = family.refine(selection.F[None], pair, Loss(own.loss, scale), STEPS)
+        return Fit(F, F, counted(F, pair, own.loss, scale))
 
-    @staticmethod
-    def _counted(F: Array, pair: Pair, truncation: float) -> Array:
-        """The matches (n,) within a distance that is in pixels for matches of usual noise."""
-        near: Array = squared_in_noises(F, pair) <= squared(truncation)
-        return near
+
+def counted(F: Array, pair: Pair, loss: str, scale: float) -> Array:
+    """How much each match (n,) counts in the curvature of a loss, whose scale is in pixels for usual noise."""
+    r2 = squared_in_noises(F, pair)
+    if loss == "cauchy":
+        share = squared(scale) / (squared(scale) + r2)
+        return np.maximum(share * (2 * share - 1), 0.0)
+    return (r2 <= squared(scale)).astype(np.float64)
 
 
 def squared_in_noises(F: Array, pair: Pair) -> Array:
-    """Squared Sampson distances (n,) in squared pixels, of matches of usual noise."""
+    """Squared residuals (n,) in squared pixels, of matches of usual noise."""
     r2 = residuals_squared_px(F, pair)
     return r2 if pair.noise is None else r2 / np.square(pair.noise)
 
 
-def truncation_distance(r2: Array) -> float:
-    """The distance in pixels up to which a match counts, from the squared distances of the inliers."""
+def fit_distance(r2: Array, own: FitScale) -> float:
+    """The scale of the loss in pixels, from the squared residuals of the inliers."""
     if len(r2) < MIN_INLIERS_FOR_NOISE:
-        return DEFAULT_TRUNCATION_PX
-    truncation = TRUNCATION_SIGMAS * 1.4826 * math.sqrt(lower_median(r2))
-    return min(max(truncation, MIN_TRUNCATION_PX), MAX_TRUNCATION_PX)
+        return own.default_px
+    return min(
+        max(own.scale_sigmas * own.sigmas_of_median * math.sqrt(lower_median(r2)), own.smallest_px), own.largest_px
+    )

@@ -7,6 +7,7 @@ import numpy as np
 from fmtorch.compiling.arrays import Array, B1x1, F8x2, I8x1
 from fmtorch.compiling.kernel import kernel
 from fmtorch.compiling.random_kernels import random_bits, stream_state
+from fmtorch.compiling.scratch import matrix
 from fmtorch.core.streams import Stream
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.parts.neighbours import Graph, label, neighbor_graph
@@ -79,7 +80,7 @@ def fit_samples(points: F8x2, labels: B1x1, stream: I8x1, size: int, out: F8x2) 
             total += 1
     if total == 0:
         return 0
-    models, whole, sample = 0, np.empty((4, total)), np.empty((4, size))
+    models, whole, sample = 0, matrix(4, total), matrix(4, size)
     for i in range(total):
         for k in range(4):
             whole[k, i] = points[k, inliers[i]]

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from fmtorch.compiling.arrays import Array, F8x1, F8x2, I8x1
-from fmtorch.compiling.kernel import kernel
+from fmtorch.compiling.kernel import Kernel, kernel
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.parts.sampling import Sampler
 from fmtorch.geometry.arithmetic_kernels import logarithm_1p
-
-TINY = float(np.finfo(np.float64).tiny)
+from fmtorch.geometry.residual_kernels import SAMPSON, Residual
 
 
 @runtime_checkable
@@ -72,9 +72,8 @@ class StoppingRule:
 
     def __call__(self, F: Array, draws: int, pair: Pair, size: int) -> bool:
         """Whether the best model (9,), after so many draws of `size` matches, may be taken for the best there is."""
-        factor, limit = squared(pair.pixels_per_unit), squared(self.threshold)
         weight = np.ones(pair.count, np.int64) if self.weight is None else self.weight(pair)
-        share = share_within(F.astype(np.float64), pair.points, factor, limit, weight)
+        share = share_within(residuals_squared_px(F.astype(np.float64), pair), squared(self.threshold), weight)
         all_inliers = share
         for _ in range(size - 1):  # a power would not have the same last bits everywhere
             all_inliers *= share
@@ -85,7 +84,7 @@ class StoppingRule:
 def residuals_squared_px(F: Array, pair: Pair) -> Array:
     """Squared Sampson distances (n,) to a model (9,) in squared pixels, float64."""
     out = np.empty(pair.count)
-    residuals_squared(F, pair.points, squared(pair.pixels_per_unit), out)
+    residuals_squared_of(pair.residual)(F, pair.points, squared(pair.pixels_per_unit), out)
     return out
 
 
@@ -97,25 +96,30 @@ def lower_median(values: Array) -> float:
     return float(ordered[rank])
 
 
-@kernel(holds_gil=True)
-def residuals_squared(F: F8x1, points: F8x2, factor: float, out: F8x1) -> None:
-    """Squared Sampson distances of points (4, n) to one model (9,), times a factor, in float64 -> out (n,)."""
-    x0, y0, x1, y1 = points[0], points[1], points[2], points[3]
-    f0, f1, f2, f3, f4, f5, f6, f7, f8 = F[0], F[1], F[2], F[3], F[4], F[5], F[6], F[7], F[8]
-    for i in range(len(out)):
-        a0, b0 = f0 * x0[i] + f1 * y0[i] + f2, f3 * x0[i] + f4 * y0[i] + f5
-        e = f6 * x0[i] + f7 * y0[i] + f8 + a0 * x1[i] + b0 * y1[i]
-        a1, b1 = f0 * x1[i] + f3 * y1[i] + f6, f1 * x1[i] + f4 * y1[i] + f7
-        slope = a0 * a0 + b0 * b0 + a1 * a1 + b1 * b1
-        out[i] = e * e / (slope if slope > TINY else TINY) * factor
+@functools.cache
+def residuals_squared_of(residual: Residual) -> Kernel[..., None]:
+    """The kernel of squared residuals for one model."""
+    of_match = residual.of_match
+
+    @kernel(holds_gil=True, name=f"residuals_squared_{residual.name}")
+    def residuals_squared(F: F8x1, points: F8x2, factor: float, out: F8x1) -> None:
+        """Squared residuals of points (4, n) under one model (9,), times a factor, in float64 -> out (n,)."""
+        x0, y0, x1, y1 = points[0], points[1], points[2], points[3]
+        f = (F[0], F[1], F[2], F[3], F[4], F[5], F[6], F[7], F[8])
+        for i in range(len(out)):
+            out[i] = of_match(f, x0[i], y0[i], x1[i], y1[i]) * factor
+
+    return residuals_squared
 
 
 @kernel(holds_gil=True)
-def share_within(F: F8x1, points: F8x2, factor: float, limit: float, weight: I8x1) -> float:
-    """The share of the matches' weights (n,) of those whose `residuals_squared` are within a limit."""
-    r2, total, within = np.empty(len(weight)), np.int64(0), np.int64(0)
-    residuals_squared(F, points, factor, r2)
+def share_within(r2: F8x1, limit: float, weight: I8x1) -> float:
+    """The share of the matches' weights (n,) of those whose squared residuals (n,) are within a limit."""
+    total, within = np.int64(0), np.int64(0)
     for i in range(len(weight)):
         total += weight[i]
         within += weight[i] if r2[i] <= limit else 0
     return within / total
+
+
+residuals_squared = residuals_squared_of(SAMPSON)

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
 import numpy as np
 
 from fmtorch.compiling.arrays import Array, F4x2, F8x1, I8x1
-from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.kernel import Kernel, inner, kernel
 from fmtorch.compiling.lanes import store
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.scores import MATCH, SINGLES, rows_of, squared
+from fmtorch.estimators.parts.scored_matches import rows_of
 from fmtorch.geometry.order_kernels import smallest_but
+from fmtorch.geometry.residual_kernels import MATCH, SINGLES, Residual
 
 BIN_SHIFT, BINS = 21, 1 << 10  # of a float32 the exponent and two bits more
 
@@ -25,7 +27,7 @@ class Median:
     def __call__(self, F: Array, which: Array, pair: Pair) -> Array:
         """As `Score`."""
         out = np.empty(len(which))
-        score_median(F, which, pair.cached("rows of ones", _rows), pair.count, out)
+        score_median_of(pair.residual)(F, which, pair.cached("rows of ones", _rows), pair.count, out)
         return out
 
 
@@ -46,15 +48,22 @@ def pack_points(points: F4x2, rows: F4x2) -> None:
         rows[row + 4, lane], rows[row + 5, lane] = 1.0, 1.0
 
 
-@kernel
-def score_median(F: F4x2, which: I8x1, rows: F4x2, count: int, out: F8x1) -> None:
-    """Minus the median squared residual of so many matches under the models F[which] -> out (k,)."""
-    values = np.empty(count + 1, np.float32)
-    r2, counts = np.empty((len(rows) // MATCH, SINGLES), np.float32), np.empty(BINS, np.int32)
-    for k in range(len(which)):
-        for row in range(0, len(rows), MATCH):
-            store(r2, row // MATCH, squared(F[which[k]], rows, row))
-        out[k] = -_smallest(r2.ravel()[:count], counts, values, (count + 1) // 2)
+@functools.cache
+def score_median_of(residual: Residual) -> Kernel[..., None]:
+    """The kernel of medians for a residual."""
+    of_row = residual.of_row
+
+    @kernel(name=f"score_median_{residual.name}")
+    def score_median(F: F4x2, which: I8x1, rows: F4x2, count: int, out: F8x1) -> None:
+        """Minus the median squared residual of so many matches under the models F[which] -> out (k,)."""
+        values = np.empty(count + 1, np.float32)
+        r2, counts = np.empty((len(rows) // MATCH, SINGLES), np.float32), np.empty(BINS, np.int32)
+        for k in range(len(which)):
+            for row in range(0, len(rows), MATCH):
+                store(r2, row // MATCH, of_row(F[which[k]], rows, row))
+            out[k] = -_smallest(r2.ravel()[:count], counts, values, (count + 1) // 2)
+
+    return score_median
 
 
 @inner

@@ -23,6 +23,7 @@ import numpy as np
 
 from fmtorch.compiling.arrays import Array, B1x1, F8x1, F8x2, I4x1, I4x2, I8x1, I8x2
 from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.scratch import vector
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.parts.inliers import residuals_squared
 
@@ -57,7 +58,7 @@ def neighbor_graph(pair: Pair, radius: float) -> Graph:
 @kernel
 def curve_codes(points: F8x2, shift: float, out: I8x1) -> None:
     """The places of points (4, n) along a curve (Z order of their cells, the grid shifted) -> out (n,)."""
-    low, extent = np.empty(4), 1e-6
+    low, extent = vector(4), 1e-6
     for k in range(4):
         high = points[k, 0]
         low[k] = high
@@ -132,7 +133,7 @@ def label(F: F8x1, points: F8x2, scale: float, graph: Graph, coherence: float, o
 @inner
 def _gaussian(F: Array, points: Array, scale: float, K: Array) -> None:
     """The kernel K of the squared Sampson distances, times a scale -> K (n,)."""
-    step, unit, r2 = np.float32(1 << HALVINGS), np.float32(UNIT), np.empty(len(K))
+    step, unit, r2 = np.float32(1 << HALVINGS), np.float32(UNIT), vector(len(K))
     residuals_squared(F, points, scale, r2)
     for i in range(len(K)):
         half = r2[i] / 2

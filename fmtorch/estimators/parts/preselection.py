@@ -7,6 +7,7 @@ import numpy as np
 from fmtorch.compiling.arrays import Array, F8x1, I8x1
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.random_kernels import random_bits, stream_state
+from fmtorch.compiling.scratch import vector
 from fmtorch.core.streams import Stream
 from fmtorch.estimators.options import Preselect
 from fmtorch.estimators.pair import Pair
@@ -87,7 +88,7 @@ def best(score: F8x1, out: I8x1) -> None:
 @kernel(holds_gil=True)
 def draw_by_prior(prior: F8x1, mixed_seed: int, key: int, out: I8x1) -> None:
     """The matches of the greatest prior / u -> out (k,), ascending; priors (n,)."""
-    priority, state = np.empty(len(prior)), stream_state(mixed_seed, key)
+    priority, state = vector(len(prior)), stream_state(mixed_seed, key)
     for i in range(len(prior)):
         priority[i] = prior[i] / (np.float64(random_bits(state, i)) + 1)
     best(priority, out)

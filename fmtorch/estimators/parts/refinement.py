@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from fmtorch.compiling.arrays import Array, F4x2, I8x1
-from fmtorch.compiling.kernel import kernel
+from fmtorch.compiling.kernel import Kernel, kernel
 from fmtorch.core.streams import Stream
 from fmtorch.estimators.families.family import Loss, Refining, Steps
 from fmtorch.estimators.options import Refine
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.parts.preselection import first_shuffled
 from fmtorch.estimators.search import Pool
+from fmtorch.geometry.residual_kernels import SAMPSON, Residual
 
 FIRST_DAMPING = 1e-4  # of Levenberg-Marquardt
 
@@ -56,7 +58,9 @@ class Refinement:
         limit = np.float32(squared(self.options.RADIUS * self.options.scale / pair.pixels_per_unit))
         index = np.empty(min(self.options.matches, pair.count), np.int64)
         seed = pair.mixed_seed(Stream.REFINEMENT)
-        return pair.take(index[: near(pool.F[: pool.filled], pair.points32, limit, seed, pair.key, index)])
+        return pair.take(
+            index[: near_of(pair.residual)(pool.F[: pool.filled], pair.points32, limit, seed, pair.key, index)]
+        )
 
     def __call__(self, pool: Pool, pair: Pair, family: Refining) -> Candidates:
         """The pool with refined models."""
@@ -69,25 +73,33 @@ class Refinement:
         return Candidates(F, pool.valid, near)
 
 
-@kernel
-def near(F: F4x2, points: F4x2, limit: np.float32, mixed_seed: int, key: int, out: I8x1) -> int:
-    """Points (4, n) within a squared Sampson distance of one of the models (k, 9), the first in a random order -> out.
+@functools.cache
+def near_of(residual: Residual) -> Kernel[..., int]:
+    """The kernel that looks for matches near models, for a residual."""
+    within = residual.within
 
-    How many they are. Nothing is near a model of zeros.
-    """
-    x0, y0, x1, y1 = points[0], points[1], points[2], points[3]
-    wanted = np.zeros(points.shape[1], np.bool_)
-    for k in range(len(F)):
-        f0, f1, f2, f3, f4 = F[k, 0], F[k, 1], F[k, 2], F[k, 3], F[k, 4]
-        f5, f6, f7, f8 = F[k, 5], F[k, 6], F[k, 7], F[k, 8]
-        zero = f0 == 0 and f1 == 0 and f2 == 0 and f3 == 0 and f4 == 0 and f5 == 0 and f6 == 0 and f7 == 0 and f8 == 0
-        for i in range(0 if zero else len(wanted)):
-            a0, b0 = f0 * x0[i] + f1 * y0[i] + f2, f3 * x0[i] + f4 * y0[i] + f5
-            e = f6 * x0[i] + f7 * y0[i] + f8 + a0 * x1[i] + b0 * y1[i]
-            a1, b1 = f0 * x1[i] + f3 * y1[i] + f6, f1 * x1[i] + f4 * y1[i] + f7
-            wanted[i] |= e * e <= limit * (a0 * a0 + b0 * b0 + a1 * a1 + b1 * b1)
-    index, count = np.empty(len(wanted), np.int64), 0
-    for i in range(len(wanted)):
-        index[count] = i
-        count += wanted[i]
-    return first_shuffled(index[:count], mixed_seed, key, out)
+    @kernel(name=f"near_{residual.name}")
+    def near(F: F4x2, points: F4x2, limit: np.float32, mixed_seed: int, key: int, out: I8x1) -> int:
+        """Points (4, n) within a squared residual of one of the models (k, 9), the first in a random order -> out.
+
+        How many they are. Nothing is near a model of zeros.
+        """
+        x0, y0, x1, y1 = points[0], points[1], points[2], points[3]
+        wanted = np.zeros(points.shape[1], np.bool_)
+        for k in range(len(F)):
+            f = (F[k, 0], F[k, 1], F[k, 2], F[k, 3], F[k, 4], F[k, 5], F[k, 6], F[k, 7], F[k, 8])
+            zero = True
+            for q in range(9):
+                zero = zero and F[k, q] == 0
+            for i in range(0 if zero else len(wanted)):
+                wanted[i] |= within(f, x0[i], y0[i], x1[i], y1[i], limit)
+        index, count = np.empty(len(wanted), np.int64), 0
+        for i in range(len(wanted)):
+            index[count] = i
+            count += wanted[i]
+        return first_shuffled(index[:count], mixed_seed, key, out)
+
+    return near
+
+
+near = near_of(SAMPSON)

@@ -132,19 +132,28 @@ def draw(draws: Draws, out: I8x2) -> None:
     A position is drawn in what is left and pushed past every drawn interval in ascending order; the table says whose
     interval it falls in. Without a table every interval has length one.
     """
-    count, drawn = out.shape[1], len(out) - (1 if len(draws.newest) else 0)
-    state, guide, shift = stream_state(draws.seed, draws.key), _guide(draws.table), _guide_shift(draws.table)
+    table, totals, newest, order, seed, key, start = draws
+    count, drawn = out.shape[1], len(out) - (1 if len(newest) else 0)
+    state, guide, shift = stream_state(seed, key), _guide(table), _guide_shift(table)
     begin, length = np.empty(drawn + 1, np.int64), np.empty(drawn + 1, np.int64)
     for d in range(count):
-        left = draws.totals[d]
+        left = totals[d]
         for j in range(drawn):
-            word = random_bits(state, (draws.start + d) * drawn + j) >> np.uint64(31)
+            word = random_bits(state, (start + d) * drawn + j) >> np.uint64(31)
             position = np.int64(word * np.uint64(left) >> np.uint64(32))
             for k in range(j):  # intervals chosen already, in ascending order
                 if position < begin[k]:
                     break
                 position += length[k]
-            index, first, weight = _interval(draws.table, guide, shift, position)
+            index: Any = position
+            first: Any = position
+            weight: Any = 1
+            if len(table):
+                index = guide[position >> shift]
+                while table[index] <= position:
+                    index += 1
+                first = table[index - 1] if index else 0
+                weight = table[index] - first
             out[j, d] = index
             left -= weight
             k = j
@@ -154,25 +163,10 @@ def draw(draws: Draws, out: I8x2) -> None:
             begin[k], length[k] = first, weight
     for j in range(drawn, len(out)):
         for d in range(count):
-            out[j, d] = draws.newest[d]
-    for j in range(len(out) if len(draws.order) else 0):
+            out[j, d] = newest[d]
+    for j in range(len(out) if len(order) else 0):
         for d in range(count):
-            out[j, d] = draws.order[out[j, d]]
-
-
-@inner
-def _interval(table: Array, guide: Array, shift: int, position: Any) -> tuple[Any, Any, Any]:
-    """The match whose interval of weights a position falls in; the interval's beginning and length."""
-    index: Any = position
-    first: Any = position
-    weight: Any = 1
-    if len(table):
-        index = guide[position >> shift]
-        while table[index] <= position:
-            index += 1
-        first = table[index - 1] if index else 0
-        weight = table[index] - first
-    return index, first, weight
+            out[j, d] = order[out[j, d]]
 
 
 @inner

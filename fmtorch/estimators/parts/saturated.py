@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
 
 from fmtorch.compiling.arrays import Array, F4x2, F8x1, F8x2, I4x2, I8x1
-from fmtorch.compiling.kernel import kernel
+from fmtorch.compiling.kernel import Kernel, kernel
 from fmtorch.compiling.lanes import added, sqrt, store
 from fmtorch.estimators.pair import Pair
+from fmtorch.estimators.parts.scored_matches import fractional_bits, scored_matches
 from fmtorch.estimators.parts.scores import (
-    MATCH,
-    SINGLES,
-    TINY,
     ZERO,
     GemanMcClure,
     check_threshold,
-    fill,
-    fractional_bits,
     geman_mcclure,
-    load,
     rounded,
-    scored_matches,
-    squared,
 )
+from fmtorch.geometry.residual_kernels import MATCH, SAMPSON, SINGLES, TINY32, Residual, fill, load
 
 GRID = 12  # cells along each side of each image
 CELL_ROWS = 2 * GRID * GRID // SINGLES
@@ -49,7 +44,7 @@ class SaturatedGains:
         """As `Score`."""
         rows, cells, bits = pair.cached(self, self._matches)
         out = np.empty(len(which))
-        score_saturated(F, which, rows, cells, bits, out)
+        score_saturated_of(pair.residual)(F, which, rows, cells, bits, out)
         return out
 
     def _matches(self, pair: Pair) -> tuple[Array, Array, int]:
@@ -63,28 +58,35 @@ class SaturatedGains:
         return cells
 
 
-@kernel
-def score_saturated(F: F4x2, which: I8x1, rows: F4x2, cells: I4x2, bits: int, out: F8x1) -> None:
-    """Sums over the cells of both images of roots of summed gains of Geman & McClure -> out (k,).
+@functools.cache
+def score_saturated_of(residual: Residual) -> Kernel[..., None]:
+    """The kernel of saturated gains for a residual."""
+    of_row = residual.of_row
 
-    rows: the matches. cells: of `saturated_cells`. bits: fractional, that gains and roots are rounded to.
-    """
-    shift = np.float32(1.5 * 2.0 ** (23 - bits))
-    gains, sums = np.empty((len(rows) // MATCH, SINGLES), np.float32), np.empty((CELL_ROWS, SINGLES), np.float32)
-    for k in range(len(which)):
-        for row in range(0, len(rows), MATCH):
-            g = geman_mcclure(squared(F[which[k]], rows, row))
-            store(gains, row // MATCH, rounded(g * load(rows, row + 5), shift))
-        for row in range(CELL_ROWS):
-            store(sums, row, fill(ZERO))
-        gain, of_cell = gains.ravel(), sums.ravel()
-        for i in range(cells.shape[1]):
-            of_cell[cells[0, i]] += gain[i]
-            of_cell[cells[1, i]] += gain[i]
-        total = fill(ZERO)
-        for row in range(CELL_ROWS):
-            total += rounded(sqrt(load(sums, row)), shift)
-        out[k] = added(total)
+    @kernel(name=f"score_saturated_{residual.name}")
+    def score_saturated(F: F4x2, which: I8x1, rows: F4x2, cells: I4x2, bits: int, out: F8x1) -> None:
+        """Sums over the cells of both images of roots of summed gains of Geman & McClure -> out (k,).
+
+        rows: the matches. cells: of `saturated_cells`. bits: fractional, that gains and roots are rounded to.
+        """
+        shift = np.float32(1.5 * 2.0 ** (23 - bits))
+        gains, sums = np.empty((len(rows) // MATCH, SINGLES), np.float32), np.empty((CELL_ROWS, SINGLES), np.float32)
+        for k in range(len(which)):
+            for row in range(0, len(rows), MATCH):
+                g = geman_mcclure(of_row(F[which[k]], rows, row))
+                store(gains, row // MATCH, rounded(g * load(rows, row + 5), shift))
+            for row in range(CELL_ROWS):
+                store(sums, row, fill(ZERO))
+            gain, of_cell = gains.ravel(), sums.ravel()
+            for i in range(cells.shape[1]):
+                of_cell[cells[0, i]] += gain[i]
+                of_cell[cells[1, i]] += gain[i]
+            total = fill(ZERO)
+            for row in range(CELL_ROWS):
+                total += rounded(sqrt(load(sums, row)), shift)
+            out[k] = added(total)
+
+    return score_saturated
 
 
 @kernel(holds_gil=True)
@@ -101,6 +103,9 @@ def saturated_cells(table: F8x2, weighted: bool, out: I4x2) -> None:
                 if not weighted or np.float32(table[6, i]) > ZERO:
                     low, high = min(low, x[i]), max(high, x[i])
             for i in range(len(x)):
-                share = (x[i] - low) / max(high - low, TINY) * np.float32(GRID)
+                share = (x[i] - low) / max(high - low, TINY32) * np.float32(GRID)
                 cell = np.int32(min(max(share, ZERO), np.float32(GRID - 1))) if math.isfinite(share) else np.int32(0)
                 out[image, i] += cell * (GRID if axis else 1)
+
+
+score_saturated = score_saturated_of(SAMPSON)

@@ -5,21 +5,21 @@ Per-match gains are rounded to few fractional bits, so that their sums are exact
 
 from __future__ import annotations
 
+import functools
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from fmtorch.compiling.arrays import Array, F4x1, F4x2, F8x1, F8x2, I8x1
+from fmtorch.compiling.arrays import Array, F4x1, F4x2, F8x1, I8x1
 from fmtorch.compiling.kernel import Kernel, inner, kernel
-from fmtorch.compiling.lanes import added, lanes, store, where
+from fmtorch.compiling.lanes import added, store, where
 from fmtorch.estimators.pair import Pair
+from fmtorch.estimators.parts.scored_matches import fractional_bits, scored_matches
 from fmtorch.geometry.magsac import GAIN_TABLE
+from fmtorch.geometry.residual_kernels import MATCH, SAMPSON, SINGLES, Residual, fill, load
 
-SINGLES = 16  # float32 numbers of a row
-load, fill = lanes(SINGLES)
-MATCH = 6  # rows of SINGLES matches: x0, y0, x1, y1, scale, weight
 COUNT, TRUNCATED_SQUARES, GEMAN_MCCLURE, TABLE = 0, 1, 2, 3  # gains
-ONE, ZERO, TINY = np.float32(1), np.float32(0), np.finfo(np.float32).tiny
+ONE, ZERO = np.float32(1), np.float32(0)
 REST = np.float32(1 / 26)  # of the gain of Geman & McClure at 5 scales, from which on it is zero
 STRETCH = np.float32(1 / (1 - 1 / 26))
 NO_TABLE = np.empty(0, np.float32)
@@ -72,7 +72,7 @@ class SummedGains:
         """As `Score`."""
         rows, bits = pair.cached(self, self._matches)
         squared = np.empty((len(which), pair.count), np.float32)
-        squared_residuals(F, which, rows, squared)
+        squared_residuals_of(pair.residual)(F, which, rows, squared)
         if self.gain_kernel is not None:
             gains = np.empty_like(squared)
             self.gain_kernel(squared, gains)
@@ -102,7 +102,7 @@ class CodedGains(SummedGains):
         """As `Score`."""
         rows, gain = pair.cached(self, self._coded)
         out = np.empty(len(which))
-        score_gains(F, which, rows, gain, out)
+        score_gains_of(pair.residual)(F, which, rows, gain, out)
         return out
 
     def _coded(self, pair: Pair) -> tuple[Array, Gain]:
@@ -151,74 +151,53 @@ def check_threshold(threshold: float) -> None:
         raise ValueError(f"threshold is {threshold}; it is a distance in pixels and must be positive")
 
 
-def fractional_bits(count: int) -> int:
-    """Of so many float32 numbers in [0, 1], for their sums to be exact: 10, fewer beyond 2^14 numbers."""
-    return min(10, 24 - (count - 1).bit_length())
+@functools.cache
+def score_gains_of(residual: Residual) -> Kernel[..., None]:
+    """The kernel of sums of gains for a residual."""
+    of_row = residual.of_row
+
+    @kernel(name=f"score_gains_{residual.name}")
+    def score_gains(F: F4x2, which: I8x1, rows: F4x2, gain: Gain, out: F8x1) -> None:
+        """Sums of gains of the models F[which] -> out (k,)."""
+        shift = np.float32(1.5 * 2.0 ** (23 - gain.bits))
+        gains = np.empty((len(rows) // MATCH, SINGLES), np.float32)
+        for k in range(len(which)):
+            total = fill(ZERO)
+            for row in range(0, len(rows), MATCH):
+                g = of_row(F[which[k]], rows, row)
+                if gain.code == COUNT:
+                    g = where(g <= ONE, fill(ONE), ZERO)
+                elif gain.code == TRUNCATED_SQUARES:
+                    g = ONE - g
+                elif gain.code == GEMAN_MCCLURE:
+                    g = geman_mcclure(g)
+                store(gains, row // MATCH, g)
+            if gain.code == TABLE:
+                _look_up(gains.ravel(), gain.table)
+            for row in range(len(gains)):
+                total += rounded(load(gains, row) * load(rows, MATCH * row + 5), shift)
+            out[k] = added(total)
+
+    return score_gains
 
 
-def scored_matches(pair: Pair, threshold: float, prior_weighted: bool) -> Array:
-    """The matches as kernels take them, for residuals in thresholds: (rows, SINGLES) float32."""
-    rows = np.empty((rows_of(pair.count), SINGLES), np.float32)
-    pack(pair.table, threshold, prior_weighted, rows)
-    return rows
+@functools.cache
+def squared_residuals_of(residual: Residual) -> Kernel[..., None]:
+    """The kernel of squared residuals in thresholds, for gains in NumPy."""
+    of_row = residual.of_row
 
+    @kernel(name=f"squared_residuals_{residual.name}")
+    def squared_residuals(F: F4x2, which: I8x1, rows: F4x2, out: F4x2) -> None:
+        """Squared residuals in thresholds of n matches under the models F[which] -> out (k, n)."""
+        lane = np.empty((1, SINGLES), np.float32)
+        for k in range(len(which)):
+            for row in range(0, len(rows), MATCH):
+                store(lane, 0, of_row(F[which[k]], rows, row))
+                first = row // MATCH * SINGLES
+                for i in range(min(SINGLES, out.shape[1] - first)):
+                    out[k, first + i] = lane[0, i]
 
-def rows_of(count: int) -> int:
-    """Rows of so many matches: MATCH for each SINGLES of them."""
-    return (count + SINGLES - 1) // SINGLES * MATCH
-
-
-@kernel(holds_gil=True)
-def pack(table: F8x2, threshold: float, weighted: bool, rows: F4x2) -> None:
-    """SINGLES matches in MATCH rows each -> rows; those that fill the last ones have no weight.
-
-    table: (9, n), of `Pair`. weighted: by the prior. The scale of a match is one over the square of its threshold.
-    """
-    n = table.shape[1]
-    for first in range(0, n, SINGLES):
-        row = first // SINGLES * MATCH
-        for i in range(SINGLES):
-            for k in range(4):
-                rows[row + k, i] = table[k, first + i] if first + i < n else 0.0
-            scale = table[5, first + i] / threshold if first + i < n else 0.0
-            rows[row + 4, i] = scale * scale
-            weight = table[6, first + i] if weighted and first + i < n else 1.0
-            rows[row + 5, i] = weight if first + i < n else 0.0
-
-
-@kernel
-def score_gains(F: F4x2, which: I8x1, rows: F4x2, gain: Gain, out: F8x1) -> None:
-    """Sums of gains of the models F[which] -> out (k,)."""
-    shift = np.float32(1.5 * 2.0 ** (23 - gain.bits))
-    gains = np.empty((len(rows) // MATCH, SINGLES), np.float32)
-    for k in range(len(which)):
-        total = fill(ZERO)
-        for row in range(0, len(rows), MATCH):
-            g = squared(F[which[k]], rows, row)
-            if gain.code == COUNT:
-                g = where(g <= ONE, fill(ONE), ZERO)
-            elif gain.code == TRUNCATED_SQUARES:
-                g = ONE - g
-            elif gain.code == GEMAN_MCCLURE:
-                g = geman_mcclure(g)
-            store(gains, row // MATCH, g)
-        if gain.code == TABLE:
-            _look_up(gains.ravel(), gain.table)
-        for row in range(len(gains)):
-            total += rounded(load(gains, row) * load(rows, MATCH * row + 5), shift)
-        out[k] = added(total)
-
-
-@kernel
-def squared_residuals(F: F4x2, which: I8x1, rows: F4x2, out: F4x2) -> None:
-    """Squared residuals in thresholds of n matches under the models F[which] -> out (k, n)."""
-    lane = np.empty((1, SINGLES), np.float32)
-    for k in range(len(which)):
-        for row in range(0, len(rows), MATCH):
-            store(lane, 0, squared(F[which[k]], rows, row))
-            first = row // MATCH * SINGLES
-            for i in range(min(SINGLES, out.shape[1] - first)):
-                out[k, first + i] = lane[0, i]
+    return squared_residuals
 
 
 @kernel
@@ -243,17 +222,6 @@ def _look_up(r2: Array, table: Array) -> None:
 
 
 @inner
-def squared(f: Array, rows: Array, row: int) -> Any:
-    """Squared Sampson distances of SINGLES matches, times their scale."""
-    x0, y0, x1, y1 = load(rows, row), load(rows, row + 1), load(rows, row + 2), load(rows, row + 3)
-    a0, b0 = f[0] * x0 + f[1] * y0 + f[2], f[3] * x0 + f[4] * y0 + f[5]
-    e = f[6] * x0 + f[7] * y0 + f[8] + a0 * x1 + b0 * y1
-    a1, b1 = f[0] * x1 + f[3] * y1 + f[6], f[1] * x1 + f[4] * y1 + f[7]
-    slope = a0 * a0 + b0 * b0 + a1 * a1 + b1 * b1
-    return e * e / where(slope > TINY, slope, TINY) * load(rows, row + 4)
-
-
-@inner
 def geman_mcclure(r2: Any) -> Any:
     """The gain of Geman & McClure of squared residuals."""
     g = ONE / (r2 + ONE) - REST
@@ -264,3 +232,6 @@ def geman_mcclure(r2: Any) -> Any:
 def rounded(gain: Any, shift: Any) -> Any:
     """Gains rounded to even multiples of what the shift, 1.5 2^(23 - bits), allows; what is not a number is zero."""
     return where(gain > ZERO, gain, ZERO) + shift - shift
+
+
+score_gains = score_gains_of(SAMPSON)

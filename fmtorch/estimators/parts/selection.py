@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -21,6 +21,7 @@ class Selection(NamedTuple):
     cameras: Cameras | None = None
 
 
+@runtime_checkable
 class Selector(Protocol):
     """Selects one model from a pool of refined ones."""
 

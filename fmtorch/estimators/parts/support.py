@@ -8,6 +8,7 @@ import numpy as np
 
 from fmtorch.compiling.arrays import Array, B1x1, F8x2
 from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.scratch import vector
 from fmtorch.estimators.pair import Pair
 
 ROUNDINGS = 4.0  # of coordinates, that exact points of a line may lie off it
@@ -53,7 +54,7 @@ def support(points: F8x2, inliers: B1x1, minimal: int, rounding: float, on_line:
     for i in range(len(inliers)):
         index[count] = i
         count += inliers[i]
-    places, different = np.empty(minimal), 0
+    places, different = vector(minimal), 0
     for i in range(count):
         if different == minimal:
             break

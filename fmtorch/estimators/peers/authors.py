@@ -7,7 +7,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from fmtorch.estimators.peers.pairwise import Pair, PairwiseEstimator, Solution, peer, solution, within
+from fmtorch.estimators.peers.pairwise import Pair, PairwiseEstimator, Solution, computed_by, peer, solution, within
 
 Part = TypeVar("Part", int, str)
 
@@ -23,6 +23,7 @@ SUPERANSAC_SAMPLERS = {
 SUPERANSAC_SCORES = {"ransac": "RANSAC", "msac": "MSAC", "magsac": "MAGSAC"}
 
 
+@computed_by("pymagsac")
 def magsac_cpp(
     *, threshold: float = 3.0, confidence: float = 0.9999, iterations: int = 10000, sampler: str = "adaptive"
 ) -> PairwiseEstimator:
@@ -54,6 +55,7 @@ def magsac_cpp(
     return PairwiseEstimator("MAGSAC++", solve, best_first=number in (1, 2))
 
 
+@computed_by("pygcransac")
 def gc_ransac_cpp(
     *,
     threshold: float = 1.0,
@@ -93,6 +95,7 @@ def gc_ransac_cpp(
     return PairwiseEstimator("GC-RANSAC", solve, best_first=number in (1, 2))
 
 
+@computed_by("pydegensac")
 def degensac_cpp(*, threshold: float = 0.5, confidence: float = 0.9999, iterations: int = 10000) -> PairwiseEstimator:
     """DEGENSAC by its authors (Chum et al., CVPR 2005; Mishkin et al., 2015).
 
@@ -118,6 +121,7 @@ def degensac_cpp(*, threshold: float = 0.5, confidence: float = 0.9999, iteratio
     return PairwiseEstimator("DEGENSAC", solve)
 
 
+@computed_by("pysuperansac")
 def superansac_cpp(
     *,
     threshold: float = 1.5,

@@ -6,7 +6,7 @@ import dataclasses
 import importlib
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -20,6 +20,7 @@ from fmtorch.geometry.epipolar import sampson
 from fmtorch.geometry.verdict import judged
 
 Points = NDArray[np.float64]
+Builder = TypeVar("Builder", bound=Callable[..., Any])
 Solution = tuple[Points | None, NDArray[np.bool_]]
 
 MIN_MATCHES = 8
@@ -101,6 +102,16 @@ class PairwiseEstimator:
         ok = torch.tensor([not reason for reason in reasons], dtype=torch.bool)
         draws = torch.zeros(b, dtype=torch.int64)  # not reported by these libraries
         return judged(Estimate(F, inliers, ok, tuple(reasons), draws).to(c.mask.device), c)
+
+
+def computed_by(package: str) -> Callable[[Builder], Builder]:
+    """A decorator: the function builds estimators whose results depend on the version of `package`, not here alone."""
+
+    def named(builder: Builder) -> Builder:
+        builder.peer_package = package  # type: ignore[attr-defined]  # which identities of results read
+        return builder
+
+    return named
 
 
 def peer(module: str, name: str) -> Any:

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.estimators.peers.pairwise import Pair, PairwiseEstimator, Solution, peer, solution
+from fmtorch.estimators.peers.pairwise import Pair, PairwiseEstimator, Solution, computed_by, peer, solution
 
 LOSSES = ("trivial", "truncated", "huber", "cauchy", "truncated_cauchy", "truncated_le_zach")
 """The robust losses of its refinement."""
 
 
+@computed_by("poselib")
 def poselib(
     *,
     threshold: float = 1.0,

@@ -62,9 +62,9 @@ class LikelihoodField:
         """Indices of the distinctive matches, in order; NaN is not distinctive unless nothing is."""
         if quality is None:
             return torch.arange(len(matches.p0), device=matches.p0.device)
-        found = (quality < self.ratio).nonzero()[:, 0]
-        if len(found) >= self.least_seeds:
-            return found
+        seeds = (quality < self.ratio).nonzero()[:, 0]
+        if len(seeds) >= self.least_seeds:
+            return seeds
         return quality.argsort(stable=True)[: self.least_seeds].sort().values
 
     def _basis(self, matches: MatchDomain, centres: MatchDomain, framed: bool) -> Float[Tensor, "n m"]:

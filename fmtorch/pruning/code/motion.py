@@ -13,7 +13,7 @@ from fmtorch.pruning.code.domain import MatchDomain, evenly, gaussians, spread_c
 from fmtorch.pruning.code.regression import huber_regression
 
 _FREE = 1e-3  # the common affine motion's share of the ridge
-LEAST_MATCHES = 8  # likely matches without which there is no motion
+MIN_MATCHES = 8  # likely matches without which there is no motion
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +40,7 @@ class SmoothMotion:
     def __call__(self, matches: MatchDomain, likely: Bool[Tensor, " n"]) -> Float[Tensor, " n"]:
         """Distance of every match's partner from where the motion puts it; infinite where too few are likely."""
         members = likely.nonzero()[:, 0]
-        if len(members) < LEAST_MATCHES:
+        if len(members) < MIN_MATCHES:
             return torch.full_like(matches.p0[:, 0], math.inf)
         fitted = matches.take(evenly(members, self.most_matches))
         centres = fitted.take(self._centres(fitted))

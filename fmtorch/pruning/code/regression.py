@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.geometry.robust_kernels import huber_weight
+from fmtorch.geometry.robust_losses import huber_weight
 
 
 def huber_regression(

@@ -15,7 +15,7 @@ from fmtorch.pruning.code.domain import finite_matches, match_domain
 from fmtorch.pruning.code.likelihood import LikelihoodField
 from fmtorch.pruning.code.motion import SmoothMotion
 
-LEAST_LIKELIHOOD, LARGEST_RESIDUAL = 0.5, 0.06
+MIN_LIKELIHOOD, LARGEST_RESIDUAL = 0.5, 0.06
 
 
 class Coherence(NamedTuple):
@@ -38,17 +38,17 @@ def code(
     quality: Float[Tensor, "b n"] | None = None,
     lafs0: Float[Tensor, "b n 2 3"] | None = None,
     lafs1: Float[Tensor, "b n 2 3"] | None = None,
-    least_likelihood: float = LEAST_LIKELIHOOD,
+    least_likelihood: float = MIN_LIKELIHOOD,
     largest_residual: float = LARGEST_RESIDUAL,
     likelihood: LikelihoodField | None = None,
     motion: SmoothMotion | None = None,
 ) -> Bool[Tensor, "b n"]:
     """True for matches that are likely and follow the smooth motion of the likely ones; see `coherence`."""
-    found = coherence(
+    result = coherence(
         x0, x1, mask=mask, quality=quality, lafs0=lafs0, lafs1=lafs1,
         least_likelihood=least_likelihood, likelihood=likelihood, motion=motion,
     )  # fmt: skip
-    return (found.likelihood > least_likelihood) & (found.residual < largest_residual)
+    return (result.likelihood > least_likelihood) & (result.residual < largest_residual)
 
 
 @torch.no_grad()
@@ -60,7 +60,7 @@ def coherence(
     quality: Float[Tensor, "b n"] | None = None,
     lafs0: Float[Tensor, "b n 2 3"] | None = None,
     lafs1: Float[Tensor, "b n 2 3"] | None = None,
-    least_likelihood: float = LEAST_LIKELIHOOD,
+    least_likelihood: float = MIN_LIKELIHOOD,
     likelihood: LikelihoodField | None = None,
     motion: SmoothMotion | None = None,
 ) -> Coherence:
@@ -75,17 +75,17 @@ def coherence(
     finite = finite_matches(x0, x1, lafs0, lafs1)
     mask = finite if mask is None else finite & mask
     likelihood, motion = likelihood or LikelihoodField(), motion or SmoothMotion()
-    found = Coherence(torch.zeros(mask.shape, device=x0.device), torch.full(mask.shape, math.inf, device=x0.device))
+    result = Coherence(torch.zeros(mask.shape, device=x0.device), torch.full(mask.shape, math.inf, device=x0.device))
     for pair, here in enumerate(mask):
         if not bool(here.any()):
             continue
         ratios, frames0, frames1 = (None if v is None else v[pair][here] for v in (quality, lafs0, lafs1))
         matches = match_domain(x0[pair][here], x1[pair][here], frames0, frames1)
-        found.likelihood[pair, here] = f = likelihood(
+        result.likelihood[pair, here] = f = likelihood(
             matches, ratios, framed=frames0 is not None and frames1 is not None
         )
-        found.residual[pair, here] = motion(matches, f > least_likelihood)
-    return found
+        result.residual[pair, here] = motion(matches, f > least_likelihood)
+    return result
 
 
 class CODE:
@@ -101,7 +101,7 @@ class CODE:
         odds: float,
         floor: float,
         reach: float,
-        least_likelihood: float = LEAST_LIKELIHOOD,
+        least_likelihood: float = MIN_LIKELIHOOD,
         largest_residual: float = LARGEST_RESIDUAL,
         prune: bool = True,
         likelihood: Mapping[str, Any] | None = None,
@@ -113,13 +113,13 @@ class CODE:
 
     def __call__(self, c: Correspondences) -> Correspondences:
         """The same matches, of which only the coherent ones survive, with a prior."""
-        found = coherence(
+        result = coherence(
             c.x0, c.x1, mask=c.mask, quality=c.quality, lafs0=c.lafs0, lafs1=c.lafs1,
             least_likelihood=self.least_likelihood, likelihood=self.likelihood, motion=self.motion,
         )  # fmt: skip
-        evidence = found.likelihood.clamp_min(0) + self.floor
-        odds = self.odds * evidence * evidence * evidence / (1 + (found.residual / self.reach).square())
+        evidence = result.likelihood.clamp_min(0) + self.floor
+        odds = self.odds * evidence * evidence * evidence / (1 + (result.residual / self.reach).square())
         c = c.replace(prior=(odds / (1 + odds)).to(c.x0.dtype))
         if not self.prune:
             return c
-        return c.keep((found.likelihood > self.least_likelihood) & (found.residual < self.largest_residual))
+        return c.keep((result.likelihood > self.least_likelihood) & (result.residual < self.largest_residual))

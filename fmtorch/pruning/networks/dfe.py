@@ -118,6 +118,6 @@ class DFE(nn.Module):
 
 def masked_softmax(logit: Float[Tensor, "b n"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b n"]:
     """Softmax over the matches of each pair; zero where masked, also where all are."""
-    least = torch.finfo(logit.dtype).min
-    weight = torch.softmax(torch.where(mask, logit, least), -1)
+    lowest = torch.finfo(logit.dtype).min
+    weight = torch.softmax(torch.where(mask, logit, lowest), -1)
     return torch.where(mask, weight, 0)

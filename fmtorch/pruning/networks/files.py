@@ -99,8 +99,8 @@ class OnnxBackbone:
         """Raises NetworkFileError for a file that is absent, cannot be run, or is of another network."""
         self.path, self.hint, self.threads = path, hint, threads
         session = self._session()
-        found = {"takes": session.get_inputs(), "gives": session.get_outputs()}
-        shapes = {verb: [(a.name, a.type, len(a.shape)) for a in arguments] for verb, arguments in found.items()}
+        by_verb = {"takes": session.get_inputs(), "gives": session.get_outputs()}
+        shapes = {verb: [(a.name, a.type, len(a.shape)) for a in arguments] for verb, arguments in by_verb.items()}
         if shapes != {"takes": [(INPUT, "tensor(float)", 3)], "gives": [(OUTPUT, "tensor(float)", 3)]}:
             wanted = f"a pruner's file takes float {INPUT} (1, channels, N) and gives {OUTPUT} (1, K, N): {hint}"
             raise NetworkFileError(f"{path} takes {shapes['takes']} and gives {shapes['gives']}; {wanted}")

@@ -13,7 +13,7 @@ from fmtorch.core.types import Correspondences
 from fmtorch.pruning.frame_consistency import frame_agreement, frame_map
 
 COORDINATES = ("size", "K")
-LEAST_AREA_RATIO = 1e-12  # of two frames; keeps the gradient of the logarithm finite
+MIN_AREA_RATIO = 1e-12  # of two frames; keeps the gradient of the logarithm finite
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,7 +134,7 @@ def _scale(c: Correspondences) -> list[Tensor]:
     if S is None:
         return [torch.zeros_like(c.x0[..., 0])]
     determinant = S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]
-    return [determinant.abs().clamp_min(LEAST_AREA_RATIO).log() / 2]
+    return [determinant.abs().clamp_min(MIN_AREA_RATIO).log() / 2]
 
 
 def _rotation(c: Correspondences) -> list[Tensor]:

@@ -117,16 +117,16 @@ def _one(folder: Path, name: str | None, kind: str) -> Path:
     if not folder.is_dir():
         raise DataError(f"{folder}: must be the folder that holds hloc's two files")
     # hloc names matches after the features: feats-sift_matches-NN.h5
-    found = [p for p in h5.files(folder) if ("match" in p.stem) == (kind == "matches")]
-    found = [p for p in found if kind == "matches" or "feat" in p.stem or "keypoint" in p.stem] or found
-    if len(found) != 1:
-        names = ", ".join(p.name for p in found) or "none"
+    files = [p for p in h5.files(folder) if ("match" in p.stem) == (kind == "matches")]
+    files = [p for p in files if kind == "matches" or "feat" in p.stem or "keypoint" in p.stem] or files
+    if len(files) != 1:
+        names = ", ".join(p.name for p in files) or "none"
         raise DataError(f"{folder}: which file holds the {kind}? ({names}); give dataset.{kind}=NAME")
-    return found[0]
+    return files[0]
 
 
 def _only(root: Path) -> Path:
-    found = h5.files(root)
-    if len(found) != 1:
-        raise DataError(f"{root}: holds {', '.join(p.name for p in found)}; give the file as root")
-    return found[0]
+    files = h5.files(root)
+    if len(files) != 1:
+        raise DataError(f"{root}: holds {', '.join(p.name for p in files)}; give the file as root")
+    return files[0]

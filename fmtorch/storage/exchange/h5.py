@@ -126,10 +126,10 @@ def files(root: Path) -> list[Path]:
     """The HDF5 file that root is, or those directly below it. Raises DataError where there are none."""
     if root.is_file():
         return [root]
-    found = sorted(path for suffix in SUFFIXES for path in root.glob(f"*{suffix}"))
-    if not found:
+    paths = sorted(path for suffix in SUFFIXES for path in root.glob(f"*{suffix}"))
+    if not paths:
         raise DataError(f"{root}: {'holds no' if root.is_dir() else 'no such'} file {' or '.join(SUFFIXES)}")
-    return found
+    return paths
 
 
 def _where(file: Any, key: str | None = None) -> str:

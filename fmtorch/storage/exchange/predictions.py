@@ -122,11 +122,11 @@ def hloc_pairs(truth: PairDataset, features: Path, matches: Path, origin: float)
                 yield _without(pair, f"{features}: no keypoints of image {missing[0].identity}")
                 continue
             name0, name1 = (str(name) for name in known)
-            found = next(((k, s) for k, s in hloc_keys(name0, name1) if h5.holds(m, f"{k}/matches0")), None)
-            if found is None:
+            key_and_swap = next(((k, s) for k, s in hloc_keys(name0, name1) if h5.holds(m, f"{k}/matches0")), None)
+            if key_and_swap is None:
                 yield _without(pair, f"{matches}: no matches0 of the pair {name0}, {name1}")
                 continue
-            stored = HLocMatches(features, matches, (name0, name1), *found, images, origin)
+            stored = HLocMatches(features, matches, (name0, name1), *key_and_swap, images, origin)
             yield dataclasses.replace(pair, matches=stored)
     _expect_distinct(names, features)
 
@@ -167,20 +167,20 @@ def _expect_distinct(names: dict[str, str | None], path: Path) -> None:
 
 def _groups(file: Any) -> list[str]:
     """The paths of the groups that hold a prediction."""
-    found: list[str] = []
+    groups: list[str] = []
 
     def visit(name: str) -> None:
         head, _, last = name.rpartition("/")
         if last in ("matches0", "matched_kpts0") and head:
-            found.append(head)
+            groups.append(head)
 
     try:
         file.visit(visit)
     except (OSError, RuntimeError) as error:
         raise DataError(f"{file.filename}: its keys cannot be read ({str(error).splitlines()[0]})") from error
-    if not found:
+    if not groups:
         raise DataError(f"{file.filename}: holds no group with matches0 or matched_kpts0")
-    return found
+    return groups
 
 
 def _read_indices(file: Any, path: Path, key: str) -> tuple[NDArray[np.int64], Array | None]:

@@ -66,10 +66,10 @@ def tutorial_pairs(root: Path, images: Path | None) -> Iterator[ImagePair]:
 
 def scenes(root: Path) -> list[Path]:
     """The folders that hold matches: root itself, or those below it."""
-    found = [root] if (root / MATCHES).is_file() else sorted(path.parent for path in root.glob(f"*/{MATCHES}"))
-    if not found:
+    folders = [root] if (root / MATCHES).is_file() else sorted(path.parent for path in root.glob(f"*/{MATCHES}"))
+    if not folders:
         raise DataError(f"{root}: neither {MATCHES} nor a sub-folder that holds one")
-    return found
+    return folders
 
 
 class _Cameras:

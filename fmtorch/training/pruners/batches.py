@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from torch.utils.data import DataLoader, Sampler
 
-from fmtorch.pipeline.matched import Draw, LabelledMatches, SimilarLengthBatches, StoredMatches, collate_trimmed
+from fmtorch.pipeline.labelled import Draw, LabelledMatches, SimilarLengthBatches, StoredMatches, collate_trimmed
 
 
 class EndlessBatches(Sampler[list[Draw]]):

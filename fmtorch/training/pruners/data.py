@@ -17,9 +17,9 @@ from fmtorch.data import ImagePair, PairDataset
 from fmtorch.data.matchable import ENOUGH
 from fmtorch.data.subset import subset
 from fmtorch.evaluation.run import select
-from fmtorch.pipeline.matched import Augmentation, LabelledMatches, MatchedPairs, StoredMatches
-from fmtorch.pipeline.matched.stored import last_scenes
-from fmtorch.pipeline.matched.transforms import keep_ratio
+from fmtorch.pipeline.labelled import Augmentation, LabelledMatches, MatchedPairs, StoredMatches
+from fmtorch.pipeline.labelled.stored import last_scenes
+from fmtorch.pipeline.labelled.transforms import keep_ratio
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
 from fmtorch.storage.features import cached
@@ -57,12 +57,12 @@ def labelled_matches(config: DictConfig, progress: Progress) -> Matches:
         real = data.load("fmbench", root=root)
         sets.append((real, list(range(len(real))), f"matches of {root}"))
     for source, indices, title in sets:
-        some = _limited(source, indices, config.validation.pairs)
-        if not some:
+        selected = _limited(source, indices, config.validation.pairs)
+        if not selected:
             continue
-        stored = _matched(config, source, some, front, progress, title)
+        stored = _matched(config, source, selected, front, progress, title)
         digests.append(stored.folder.name)
-        pairs = {source[i].key: source[i] for i in some}
+        pairs = {source[i].key: source[i] for i in selected}
         for i, about in enumerate(stored.pairs):
             matches = keep_ratio(stored.stored(i), config.validation.ratio).compact()
             validation.append((pairs[about["key"]], matches))
@@ -149,9 +149,9 @@ def _no_estimator(c: Any, seed: int = 0) -> Any:
 def _matched(
     config: DictConfig, dataset: PairDataset, indices: list[int], front: Pipeline, progress: Progress, title: str
 ) -> StoredMatches:
-    some = subset(dataset, indices) if len(indices) < len(dataset) else dataset
+    selected = subset(dataset, indices) if len(indices) < len(dataset) else dataset
     workers = config.workers or os.cpu_count() or 1
-    return MatchedPairs(some, front, workers=workers, progress=reporter(progress, title))
+    return MatchedPairs(selected, front, workers=workers, progress=reporter(progress, title))
 
 
 def _ranges(options: dict[str, Any]) -> dict[str, Any]:

@@ -57,12 +57,12 @@ def claim(folder: Path, identity: Mapping[str, Any]) -> None:
 
 def latest_checkpoint(folder: Path) -> tuple[Path | None, int]:
     """The checkpoint of most steps that can be read, and its steps; (None, 0) where there is none."""
-    found = []
+    checkpoints = []
     for path in (folder / CHECKPOINTS).glob("step=*.ckpt"):
         match = re.fullmatch(r"step=(\d+)", path.stem)
         if match:
-            found.append((int(match[1]), path))
-    for step, path in sorted(found, reverse=True):
+            checkpoints.append((int(match[1]), path))
+    for step, path in sorted(checkpoints, reverse=True):
         try:
             torch.load(path, map_location="cpu", weights_only=True)
         except Exception as error:  # torch.load raises nearly anything for damaged bytes; an older file may do

@@ -10,7 +10,7 @@ import lightning
 import torch
 from torch import Tensor, nn
 
-from fmtorch.pipeline.matched import LabelledMatches
+from fmtorch.pipeline.labelled import LabelledMatches
 from fmtorch.pruning.networks.prediction import predict
 from fmtorch.training.pruners.objective import Objective
 from fmtorch.training.pruners.validation import Evaluation, Validation

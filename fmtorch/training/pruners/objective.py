@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.geometry.eight_point import eight_point
-from fmtorch.pipeline.matched import LabelledMatches
+from fmtorch.pipeline.labelled import LabelledMatches
 from fmtorch.pruning.networks.prediction import Prediction
 from fmtorch.training.pruner_losses import classification_loss, geometric_loss, nsgd_loss
 

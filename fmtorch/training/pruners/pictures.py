@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fmtorch.data import ImagePair, read_image
 from fmtorch.evaluation.pictures import draw_matches
-from fmtorch.pipeline.matched import LabelledMatches
+from fmtorch.pipeline.labelled import LabelledMatches
 from fmtorch.pruning.networks.prediction import predict
 from fmtorch.training.pruners.module import PrunerTraining
 

@@ -13,10 +13,11 @@ import torch
 from lightning import Trainer
 from omegaconf import DictConfig
 
-from fmtorch import __version__, presets
+from fmtorch import presets
 from fmtorch.core.options import Within, expect_options
 from fmtorch.core.terminal import console, progress_bars
-from fmtorch.pipeline.matched import Augmentation
+from fmtorch.core.version import __version__
+from fmtorch.pipeline.labelled import Augmentation
 from fmtorch.presets import plain
 from fmtorch.presets.fields import Cache, Count, Gigabytes, Seed, read_fields
 from fmtorch.storage.runs import identity_digest

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from fmtorch import metrics
 from fmtorch.core.stages import Estimator
 from fmtorch.metrics.recall import FINE_THRESHOLD
-from fmtorch.pipeline.matched import LabelledMatches
+from fmtorch.pipeline.labelled import LabelledMatches
 from fmtorch.pruning.networks.prediction import predict
 from fmtorch.training.pruner_losses import classification_loss
 from fmtorch.training.reliability import reliability, temperature

@@ -19,9 +19,9 @@ from fmtorch import data
 from fmtorch.commands import eval as eval_command
 from fmtorch.commands import match as match_command
 from fmtorch.core.resources import conf_dir
+from fmtorch.pipeline import folder
 from fmtorch.pipeline.folder import chosen_pairs, images_below, open_folder
-from fmtorch.pipeline.photographs import Described
-from fmtorch.pipeline.pipeline import folder
+from fmtorch.pipeline.two_images import Described
 from fmtorch.storage import RunFolder
 from fmtorch.storage.exchange.export import DATABASE, FEATURES, MATCHES
 from tests.pipeline.test_pipeline import draw

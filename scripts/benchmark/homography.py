@@ -1,0 +1,213 @@
+"""Homographies of warped photographs: corner errors and milliseconds beside PoseLib and OpenCV, on the same matches.
+
+Each photograph is seen as a plane, tilted by 20 to 55 degrees over another photograph, with blur and noise; SIFT,
+ratio 0.8, one match a location, P(inlier) from frame consistency. Hard pairs keep at most 60 right matches and 70 %
+random ones. Every second photograph is for tuning (--tuning), the others for the claim.
+
+python -m scripts.benchmark homography --photographs DATA/photos --seeds 3
+python -m scripts.benchmark homography --photographs DATA/photos --tuning --methods ours:select.scale=0.5 poselib:2
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.progress import track
+from rich.table import Table
+
+from fmtorch import find_homography, match, presets
+from fmtorch.core.types import Correspondences
+from fmtorch.evaluation.bootstrap import bootstrap_mean, paired_bootstrap
+from scripts.benchmark.matched import console
+
+Array = NDArray[Any]
+Solver = Callable[[Correspondences, int], Array | None]
+SIDE = 640  # px, the longer side of the photographs
+THRESHOLDS = (1, 3, 5)  # px
+METHODS = ("ours", "poselib:2", "poselib:1", "usac_magsac:0.5", "usac_magsac:1", "usac_accurate:1")
+HARD_RIGHT, HARD_WRONG_SHARE = 60, 0.7
+
+
+class Warped(NamedTuple):
+    """A photograph, its picture as a tilted plane over another, the true homography, and the photograph's name."""
+
+    image0: Array
+    image1: Array
+    H: Array
+    name: str
+
+
+def add_arguments(commands: Any) -> None:
+    parser = commands.add_parser("homography", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--photographs", type=Path, required=True, help="a folder of photographs")
+    parser.add_argument("--tuning", action="store_true", help="the photographs for choosing constants")
+    parser.add_argument("--methods", nargs="+", default=METHODS, help="NAME:THRESHOLD or ours:KEY=VALUE,...")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--limit", type=int, help="photographs at most")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    paths = sorted(p for p in arguments.photographs.iterdir() if p.suffix in (".jpg", ".png"))
+    paths = paths[(0 if arguments.tuning else 1) :: 2][: arguments.limit]
+    pairs = [warped(path, paths[(i + 7) % len(paths)], i) for i, path in enumerate(paths)]
+    matches = [matched(pair) for pair in track(pairs, "matching", console=console)]
+    names = [pair.name for pair in pairs]
+    for kind in ("warped", "hard"):
+        kept = [hard(c, pair.H, i) for i, (pair, c) in enumerate(zip(pairs, matches, strict=True))]
+        cases = list(zip(pairs, kept if kind == "hard" else matches, strict=True))
+        report(kind, {m: measure(solver(m), cases, arguments.seeds) for m in arguments.methods}, names)
+
+
+def warped(path: Path, behind: Path, seed: int) -> Warped:
+    """A photograph as a plane before a pinhole camera that looks at it from the side."""
+    rng = np.random.default_rng(seed)
+    image, background = (_small(p) for p in (path, behind))
+    h, w = image.shape[:2]
+    tilt, direction, turn = np.deg2rad([rng.uniform(20, 55), rng.uniform(0, 360), rng.uniform(-20, 20)])
+    focal, centre = 1.2 * max(h, w), np.array([w / 2, h / 2])
+    R = (
+        cv2.Rodrigues(tilt * np.array([np.cos(direction), np.sin(direction), 0.0]))[0]
+        @ cv2.Rodrigues(np.array([0, 0, turn]))[0]
+    )
+    plane = np.array([[1, 0, -centre[0]], [0, 1, -centre[1]], [0, 0, 1.0]])  # its points, in the plane's own frame
+    camera = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1.0]])
+    H = camera @ np.c_[R[:, :2], [0, 0, focal * rng.uniform(1.0, 1.3)]] @ plane
+    view = cv2.warpPerspective(image, H, (w, h), flags=cv2.INTER_AREA)
+    inside = cv2.warpPerspective(np.ones((h, w), np.float32), H, (w, h))[..., None]
+    view = cv2.GaussianBlur(inside * view + (1 - inside) * cv2.resize(background, (w, h)), (0, 0), 0.6)
+    noisy = np.clip(view + rng.normal(0, 3, view.shape), 0, 255).astype(np.uint8)
+    return Warped(image, noisy, H / np.linalg.norm(H), path.stem)
+
+
+def _small(path: Path) -> Array:
+    """A photograph whose longer side is SIDE, BGR."""
+    image = cv2.imread(str(path))
+    if image is None:
+        raise SystemExit(f"error: {path} is no photograph that OpenCV reads")
+    scale = SIDE / max(image.shape[:2])
+    return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+
+
+def matched(pair: Warped) -> Correspondences:
+    images = [np.ascontiguousarray(image[..., ::-1]) for image in (pair.image0, pair.image1)]
+    return match(images[0], images[1], pipeline="sift_fmtorch").correspondences
+
+
+def hard(c: Correspondences, H: Array, seed: int) -> Correspondences:
+    """At most HARD_RIGHT right matches, and random ones beside them; no prior."""
+    rng = np.random.default_rng(seed)
+    x0, x1 = points(c)
+    right = np.flatnonzero(np.linalg.norm(mapped(H, x0) - x1, axis=1) < 2)
+    right = rng.permutation(right)[:HARD_RIGHT]
+    wrong = round(len(right) * HARD_WRONG_SHARE / (1 - HARD_WRONG_SHARE))
+    a = np.concatenate([x0[right], rng.uniform(x0.min(0), x0.max(0), (wrong, 2))])
+    b = np.concatenate([x1[right], rng.uniform(x1.min(0), x1.max(0), (wrong, 2))])
+    order = rng.permutation(len(a))
+    x = [torch.from_numpy(v[order][None]) for v in (a, b)]
+    return Correspondences(x[0], x[1], torch.ones(x[0].shape[:2], dtype=torch.bool), key=torch.tensor([seed]))
+
+
+def points(c: Correspondences) -> tuple[Array, Array]:
+    return tuple(x[0][c.mask[0]].double().numpy() for x in (c.x0, c.x1))  # type: ignore[return-value]
+
+
+def mapped(H: Array, x: Array) -> Array:
+    y = np.c_[x, np.ones(len(x))] @ H.T
+    return np.asarray(y[:, :2] / y[:, 2:])
+
+
+def solver(method: str) -> Solver:
+    name, _, setting = method.partition(":")
+    if name == "ours":
+        return functools.partial(_ours, options_of(setting))
+    if name == "poselib":
+        return functools.partial(_poselib, float(setting))
+    return functools.partial(_opencv, getattr(cv2, name.upper()), float(setting))
+
+
+def options_of(setting: str) -> dict[str, Any]:
+    """``select.scale=1.0,pool=6`` as ``{"select": {"scale": 1.0}, "pool": 6}``, into a preset's own mappings."""
+    options: dict[str, Any] = {}
+    for part in filter(None, setting.split(",")):
+        key, value = part.split("=")
+        group, _, option = key.rpartition(".")
+        if group and group not in options:
+            options[group] = dict(presets.load("estimator", "homography")[group])
+        (options[group] if group else options)[option] = _value(value)
+    return options
+
+
+def _value(text: str) -> Any:
+    """A number, or a name."""
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
+
+
+def _ours(options: dict[str, Any], c: Correspondences, seed: int) -> Array | None:
+    estimate = find_homography(
+        c.x0, c.x1, mask=c.mask, quality=c.quality, prior=c.prior, noise=c.noise, key=c.key, seed=seed, **options
+    )
+    return estimate.H[0].numpy() if bool(estimate.ok[0]) else None
+
+
+def _poselib(threshold: float, c: Correspondences, seed: int) -> Array | None:
+    import poselib
+
+    x0, x1 = points(c)
+    H, _ = poselib.estimate_homography(x0, x1, {"max_reproj_error": threshold, "seed": seed}, {})
+    return np.asarray(H)
+
+
+def _opencv(method: int, threshold: float, c: Correspondences, seed: int) -> Array | None:
+    cv2.setRNGSeed(seed)
+    x0, x1 = points(c)
+    H, _ = cv2.findHomography(x0, x1, method, threshold, maxIters=2000, confidence=0.9999)
+    return None if H is None else np.asarray(H)
+
+
+def measure(solve: Solver, cases: list[tuple[Warped, Correspondences]], seeds: int) -> tuple[Array, Array]:
+    """Mean corner errors in pixels, and milliseconds, (seeds, pairs)."""
+    solve(cases[0][1], 0)
+    errors, ms = np.full((seeds, len(cases)), np.inf), np.zeros((seeds, len(cases)))
+    for seed in range(seeds):
+        for i, (pair, c) in enumerate(cases):
+            start = time.process_time()
+            H = solve(c, seed)
+            ms[seed, i] = (time.process_time() - start) * 1e3
+            if H is not None:
+                errors[seed, i] = corner_error(H, pair)
+    return errors, ms
+
+
+def corner_error(H: Array, pair: Warped) -> float:
+    h, w = pair.image0.shape[:2]
+    corners = np.array([[0, 0], [w - 1, 0], [w - 1, h - 1], [0, h - 1]], float)
+    return float(np.linalg.norm(mapped(H, corners) - mapped(pair.H, corners), axis=1).mean())
+
+
+def report(kind: str, results: dict[str, tuple[Array, Array]], names: list[str]) -> None:
+    table = Table(title=f"{kind}: {len(names)} photographs, {len(next(iter(results.values()))[0])} seeds")
+    for column in ("method", *(f"AUC@{t} px" for t in THRESHOLDS), "first minus this at 1 px", "ms"):
+        table.add_column(column, justify="left" if column == "method" else "right")
+    areas = {m: [np.clip(1 - errors / t, 0, 1).mean(0) * 100 for t in THRESHOLDS] for m, (errors, _) in results.items()}
+    first = next(iter(areas.values()))
+    for method, of_thresholds in areas.items():
+        lead = paired_bootstrap(first[0], of_thresholds[0], names)
+        figures = [f"{bootstrap_mean(a, names).value:.1f}" for a in of_thresholds]
+        table.add_row(method, *figures, f"{lead:+.1f}", f"{np.median(results[method][1]):.2f}")
+    console.print(table)

@@ -1,0 +1,213 @@
+"""The search among plausible cameras: when rounds end, which candidates are one model, and which is the estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+
+from fmtorch import presets
+from fmtorch.core.types import Correspondences, collate
+from fmtorch.estimators import HypothesizeAndVerify, focal_search
+from fmtorch.estimators.families.cameras import Cameras, no_cameras
+from fmtorch.estimators.families.focals import FundamentalWithFocals, Refined
+from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
+from fmtorch.estimators.options import Focal
+from fmtorch.estimators.pair import Pair
+from fmtorch.estimators.parts.refinement import Candidates, Refinement
+from fmtorch.estimators.parts.saturated import SaturatedGains
+from tests.estimators.families.photographs import TALL, WIDE, photographs
+from tests.estimators.pairs import pair_of, to_units
+from tests.laws import scene, scenes
+from tests.reference import focal as reference
+
+ROUNDS = 6
+FOCAL = {"sampler": "prior", "select": {"scale": 1.0}, "threshold": 1.5}
+
+
+class Found(PlausibleCandidates):
+    """A round's candidates, which say what they are told to."""
+
+    def __init__(self, again: bool, one_model: bool) -> None:
+        super().__init__(np.ones((1, 9)), np.ones(1), no_cameras(1))
+        self.again, self.one_model = again, one_model
+
+    def confirmed(self, other: PlausibleCandidates) -> bool:
+        assert isinstance(other, Found)
+        return other.again
+
+    def joined(self, other: PlausibleCandidates) -> PlausibleCandidates:
+        return other
+
+    @property
+    def unique_optimum(self) -> bool:
+        return self.one_model
+
+
+@pytest.mark.parametrize("confirmations", [1, 2, 3])
+@pytest.mark.parametrize("least", [1, 3])
+def test_rounds_end_when_enough_of_them_confirm_the_best(
+    least: int, confirmations: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(confirmations)
+    again, one_model = rng.random((200, ROUNDS)) < 0.4, rng.random((200, ROUNDS)) < 0.05
+    content = rng.random((200, ROUNDS)) < 0.8  # the stopping rule
+    pair, made = pair_of(scene(0)), set()
+
+    def expected(i: int) -> int:
+        confirmed = 0
+        for turn in range(ROUNDS):
+            confirmed += bool(turn and again[i, turn])
+            agreed = one_model[i, turn] or confirmed >= confirmations
+            if turn + 1 >= least and agreed and content[i, turn]:
+                return turn + 1
+        return ROUNDS
+
+    for i in range(200):
+        rounds: Iterator[Found] = (Found(bool(a), bool(o)) for a, o in zip(again[i], one_model[i], strict=True))
+        monkeypatch.setattr(FocalSearch, "round", lambda self, pair, turn, r=rounds: (next(r), (turn + 1) * 10))
+        search = searching(rounds=ROUNDS, min_rounds=least, confirmations=confirmations)
+        object.__setattr__(search, "stop", lambda F, draws, pair, size, i=i: bool(content[i, draws // 10 - 1]))
+        result = search(pair)
+        assert result.draws == 10 * expected(i)
+        assert result.settled == content[i, expected(i) - 1]  # the images have one size
+        made.add(result.draws)
+    assert len(made) > 2
+
+
+def searching(iterations: int = 12, **options: int) -> FocalSearch:
+    """A search that only selects."""
+    focal = Focal(iterations=iterations, samples=0, **options)
+    return FocalSearch(focal, FundamentalWithFocals(), SaturatedGains(0.3), Refinement(None), None, None)
+
+
+def free(F: np.ndarray, pair: Pair, valid: np.ndarray | None = None) -> Candidates:
+    """Models (k, 9) that the other search has found."""
+    return Candidates(F, np.ones(len(F), bool) if valid is None else valid, pair)
+
+
+@pytest.mark.parametrize("posterior", [[5.0, 4.9], [5.0, 1.0], [4.9, 5.0]])
+@pytest.mark.parametrize("same", [False, True])
+def test_the_best_candidates_of_two_rounds_are_one_model_or_not(posterior: list[float], same: bool) -> None:
+    F = np.linalg.qr(np.random.default_rng(0).normal(size=(9, 2)))[0].T.copy()  # of cosine 0
+    models = np.stack([F[0], F[0] if same else F[1]])
+    found = PlausibleCandidates(models, np.array(posterior), no_cameras(2))
+    assert found.best == int(np.argmax(posterior))
+    assert found.unique_optimum == (same or min(posterior) < focal_search.RIVAL_GAIN_SHARE * max(posterior))
+    other = PlausibleCandidates(F[1:], np.ones(1), no_cameras(1))
+    assert found.confirmed(other) == bool(np.array_equal(models[found.best], F[1]))
+    assert found.joined(other).F.shape == (3, 9)
+    assert found.best_alone().posterior.tolist() == [max(posterior)]
+
+
+def test_without_candidates_there_is_no_selection() -> None:
+    nothing = PlausibleCandidates(np.ones((2, 9)), np.full(2, -np.inf), no_cameras(2))
+    assert not nothing.unique_optimum
+    assert not nothing.confirmed(nothing)
+    assert not nothing.selection.valid
+    assert nothing.selection.cameras is None
+
+
+def test_one_model_is_one_up_to_the_angle_between_them() -> None:
+    F = np.linalg.qr(np.random.default_rng(0).normal(size=(9, 2)))[0].T
+    for angle in (0.0, 0.01, 0.04, 0.1, 0.2, np.pi - 0.04):
+        G = np.cos(angle) * F[0] + np.sin(angle) * F[1]
+        for tolerance in (focal_search.SAME_MODEL, focal_search.SAME_CAMERAS):
+            assert focal_search.same_model(F[0].copy(), G, tolerance) == (1 - abs(np.cos(angle)) <= tolerance)
+
+
+def models(turn: float) -> tuple[Pair, np.ndarray, np.ndarray]:
+    """A pair of different sizes, its model (9,) and that of a camera turned by an angle."""
+    c, _, parameters = photographs(4, outliers=0.1)
+    pair, turned = pair_of(c), parameters + np.array([turn, 0, 0, 0, 0, 0, 0, 0])
+    right, other = (to_units(reference.fundamental(p, WIDE, TALL), pair) for p in (parameters, turned))
+    return pair, right, other
+
+
+def test_the_prior_is_asked_only_where_good_candidates_differ(monkeypatch: pytest.MonkeyPatch) -> None:
+    pair, right, other = models(0.3)
+    same, different, search = np.stack([right, right]), np.stack([right, other]), searching()
+    monkeypatch.setattr(focal_search, "RIVAL_GAIN_SHARE", 0.0)  # every candidate is a good one
+    assert np.array_equal(search.select(free(same, pair), pair, None).F, right)
+    _, refined = FundamentalWithFocals().refine(different, pair, 12)
+    selection = search.select(free(different, pair), pair, None)
+    assert any(np.array_equal(selection.F, refined.models[k]) for k in (0, 1))
+    assert selection.cameras is not None
+    monkeypatch.setattr(focal_search, "RIVAL_GAIN_SHARE", 2.0)  # none is
+    selection = search.select(free(different, pair), pair, None)
+    assert np.array_equal(selection.F, right)
+    assert selection.cameras is None
+
+
+def test_support_behind_a_camera_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    pair, right, other = models(5e-4)  # half a pixel
+    both, search, family = np.stack([right, other]), searching(iterations=0), FundamentalWithFocals()
+    cameras, refined = family.refine(both, pair, 0)
+    assert refined.share[0] > 0.9  # the scene is before both cameras; some wrong matches agree by chance
+    for name, value in (("RIVAL_GAIN_SHARE", 0.0), ("SAME_MODEL", 0.0), ("MIN_GAIN_SHARE", 0.0)):
+        monkeypatch.setattr(focal_search, name, value)  # all are good ones, and different
+    for share, best in ((1.0, 0), (0.01, 1)):
+
+        def refine(
+            self: FundamentalWithFocals, F: np.ndarray, pair: Pair, iterations: int, share: float = share
+        ) -> tuple[Cameras, Refined]:
+            return cameras, refined._replace(share=np.array([share, 1.0]))
+
+        monkeypatch.setattr(FundamentalWithFocals, "refine", refine)
+        assert np.array_equal(search.select(free(both, pair), pair, None).F, refined.models[best])
+
+
+def test_a_crop_keeps_the_model_without_prior() -> None:
+    c, truth, _ = photographs(3, outliers=0.0, noise=0.1)
+    T = np.array([[1, 0, -4000], [0, 1, 0], [0, 0, 1.0]])  # the principal point is far outside
+    pair = pair_of(c.replace(x0=c.x0 + torch.tensor([4000.0, 0])))
+    F = to_units(truth @ T, pair)
+    rival = to_units(truth @ T + 0.01 * truth.T, pair)
+    selection = searching().select(free(np.stack([F, rival]), pair), pair, None)
+    assert np.array_equal(selection.F, F)
+    assert selection.cameras is None
+
+
+def test_models_that_are_not_there_are_not_selected() -> None:
+    pair, right, _ = models(0.1)
+    bad = np.stack([np.full(9, np.nan), np.zeros(9), right])
+    selection = searching().select(free(bad, pair, np.array([False, False, True])), pair, None)
+    assert np.isfinite(selection.F).all()
+
+
+def test_rounds_go_on_where_the_search_is_not_settled() -> None:
+    """An easy pair has one round, random matches have all, and the other search besides; in a batch as alone."""
+    estimator = HypothesizeAndVerify(**FOCAL, focal={"samples": 40, "rounds": 3, "pool": 4}, hypotheses=20)  # type: ignore[arg-type]
+    pairs = [scene(1, 200, outliers=0.0), scene(2, 200, outliers=1.0)]
+    assert estimator(collate(pairs), seed=1).draws.tolist() == [40, 3 * 40 + 20]
+    assert [int(estimator(pair, seed=1).draws) for pair in pairs] == [40, 3 * 40 + 20]
+    patient = HypothesizeAndVerify(**FOCAL, focal={"samples": 40, "rounds": 3, "min_rounds": 2})  # type: ignore[arg-type]
+    assert int(patient(pairs[0], seed=1).draws) == 2 * 40
+
+
+def test_images_of_two_sizes_are_searched_without_assumptions_too() -> None:
+    easy = photographs(1, (WIDE, WIDE), (1.0, 1.0), 300, 0.5, 0.05).c
+    assert int(presets.build("estimator", "fmtorch")(easy, 0).draws) == 3 * 250
+    two = photographs(1, (WIDE, TALL), (1.0, 1.0), 300, 0.5, 0.05).c
+    assert int(presets.build("estimator", "fmtorch")(two, 0).draws) > 3 * 250
+
+
+def test_unknown_sizes_give_the_selection_without_prior() -> None:
+    c = scenes().replace(size0=None, size1=None)
+    options = {"hypotheses": 200, "pool": 8, "refine": {"kernel": "truncated"}, "select": {}, "final": "none"}
+    focal = HypothesizeAndVerify(focal={}, **options)(c)  # type: ignore[arg-type]
+    plain = HypothesizeAndVerify(**options)(c)  # type: ignore[arg-type]
+    assert torch.equal(focal.F, plain.F)
+
+
+@pytest.mark.parametrize("name", ["fmtorch", "fmtorch_max", "fmtorch_fast"])
+def test_presets_recover_pairs_of_one_size_of_two_and_of_none(name: str) -> None:
+    estimator = presets.build("estimator", name, focal={"rounds": 2, "min_rounds": 1})
+    c: Correspondences = collate([scene(i, 200, outliers=0.3) for i in range(3)])
+    for sizes in (((640, 960), (640, 960)), ((640, 960), (700, 900)), None):
+        size0, size1 = (None, None) if sizes is None else (torch.tensor(sizes[k]).expand(3, 2) for k in (0, 1))
+        estimate = estimator(c.replace(size0=size0, size1=size1))
+        assert bool(estimate.ok.all())
+        assert float(estimate.inliers.float().mean()) > 0.5

@@ -1,0 +1,135 @@
+"""Which room may import which, read from the syntax tree of every file, wherever in it an import stands."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import graphlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "fmtorch"
+ROOMS = sorted(path.parent.name for path in PACKAGE.glob("*/__init__.py"))
+GROUND = "core compiling geometry"
+MAY_IMPORT = {
+    "core": "",
+    "compiling": "core",
+    "geometry": "core compiling",
+    **dict.fromkeys(("metrics", "matching", "features", "pruning", "estimators"), GROUND),
+    "data": "core compiling",
+    "storage": GROUND + " data",
+    "presets": "core data storage",
+    "pipeline": GROUND + " data storage presets",
+    "evaluation": GROUND + " metrics data storage presets pipeline",
+    "training": " ".join(room for room in ROOMS if room != "commands"),
+    "commands": " ".join(ROOMS),
+}
+TORCH = {"torch", "torchvision", "torchmetrics", "kornia", "lightning"}  # the last four import the first
+NUMBA = {"numba", "llvmlite"}
+TENSORS_OF_ESTIMATORS = ("batch.py", "gradients.py", "irls.py", "coarse_to_fine.py", "peers/")
+
+
+def module_name(path: Path) -> str:
+    """``fmtorch.core.types`` of ``fmtorch/core/types.py``, ``fmtorch.data`` of ``fmtorch/data/__init__.py``."""
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+FILES = {module_name(path): path for path in sorted(PACKAGE.rglob("*.py"))}
+
+
+@functools.cache
+def tree(module: str) -> ast.Module:
+    return ast.parse(FILES[module].read_bytes())
+
+
+@functools.cache
+def imported(module: str) -> frozenset[str]:
+    """What a file imports, modules of fmtorch by their full names; not the packages on the way to them."""
+    names: set[str] = set()
+    for node in ast.walk(tree(module)):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{module} imports relatively"
+            members = {f"{node.module}.{alias.name}" for alias in node.names}
+            names |= members & FILES.keys() or {str(node.module)}
+            names |= {str(node.module)} if members - FILES.keys() else set()
+    return frozenset(names)
+
+
+def room(module: str) -> str:
+    """The room of a module of fmtorch; empty for the package itself and the commands' own modules at its top."""
+    name = f"{module}.".split(".")[1]
+    return name if name in ROOMS else ""
+
+
+def within(module: str) -> set[str]:
+    """The files of fmtorch that a file imports."""
+    return {name for name in imported(module) if name in FILES}
+
+
+def libraries(module: str) -> set[str]:
+    """The top-level packages that a file imports."""
+    return {name.partition(".")[0] for name in imported(module)}
+
+
+def kernels() -> Iterator[str]:
+    """The files that hold a function decorated as a kernel."""
+    for module in FILES:
+        for node in ast.walk(tree(module)):
+            if isinstance(node, ast.FunctionDef):
+                decorators = [d.func if isinstance(d, ast.Call) else d for d in node.decorator_list]
+                if any(isinstance(d, ast.Name) and d.id == "kernel" for d in decorators):
+                    yield module
+                    break
+
+
+def test_every_room_has_its_rule() -> None:
+    assert set(MAY_IMPORT) == set(ROOMS)
+
+
+def test_rooms_import_what_they_may() -> None:
+    astray = {
+        (module, name)
+        for module in FILES
+        if room(module)
+        for name in within(module)
+        if room(name) != room(module) and room(name) not in MAY_IMPORT[room(module)].split()
+    }
+    assert sorted(astray) == []
+
+
+def test_numba_is_imported_by_compiling_alone() -> None:
+    assert [m for m in FILES if libraries(m) & NUMBA and room(m) != "compiling"] == []
+
+
+def test_no_circle_between_files() -> None:
+    try:
+        list(graphlib.TopologicalSorter({module: within(module) - {module} for module in FILES}).static_order())
+    except graphlib.CycleError as error:
+        pytest.fail(" <- ".join(error.args[1]))
+
+
+def test_files_with_kernels_reach_no_torch() -> None:
+    """A process that compiles kernels then needs none, which saves it a second."""
+    reaching, holders = {}, list(kernels())
+    assert holders
+    for module in holders:
+        seen, todo = {module}, [module]
+        while todo:
+            name = todo.pop()
+            if libraries(name) & TORCH:
+                reaching[module] = name
+            todo += within(name) - seen
+            seen |= within(name)
+    assert reaching == {}
+
+
+def test_estimators_take_tensors_at_their_edges_alone() -> None:
+    root = PACKAGE / "estimators"
+    files = {m: path.relative_to(root).as_posix() for m, path in FILES.items() if room(m) == "estimators"}
+    tensors = [path for m, path in files.items() if libraries(m) & TORCH]
+    assert [path for path in tensors if not path.startswith(TENSORS_OF_ESTIMATORS)] == []
