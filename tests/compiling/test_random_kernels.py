@@ -1,24 +1,31 @@
-"""Random numbers of kernels: those of the tensor form, bit by bit, as their order tells."""
+"""Random numbers of kernels: those of the definition, and of tensors, bit by bit."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
-from fmtorch.estimators.pool_kernels import shuffled
 
-from fmtorch.core.random import bits
+from fmtorch.core.random import uniform
 from fmtorch.core.streams import Stream, mixed_seed
-
-pytest.importorskip("numba", reason="numba is not installed")
+from fmtorch.estimators.pair import uniforms
+from fmtorch.estimators.parts.preselection import shuffle
+from tests.reference.random import number
 
 
 @pytest.mark.parametrize("key", [0, 1, -1, 2**63 - 1, -(2**63)])
 @pytest.mark.parametrize("seed", [0, 5, -3, 2**62])
 def test_the_same_bits(seed: int, key: int) -> None:
     for stream in (Stream.SAMPLING, Stream.REFINEMENT):
-        words = bits(seed, torch.tensor([key]), stream, 0, 1000, 1)[0, :, 0]
+        for start in (0, 2**33):
+            out = np.empty((50, 3))
+            uniforms(mixed_seed(seed, stream), key, start, out)
+            words = [[number(seed, key, stream, start + i, j, 3) for j in range(3)] for i in range(50)]
+            assert out.tolist() == [[(word >> 10) / 2**53 for word in row] for row in words]
+            tensors = uniform(seed, torch.tensor([key]), stream, start, 50, 3)[0]
+            assert out.tolist() == tensors.tolist()
+        order = sorted(range(1000), key=lambda i: number(seed, key, stream, 0, i, 1))
         for most in (1, 17, 1000, 2000):
-            out = np.empty(most, np.int64)
-            count = shuffled(1000, mixed_seed(seed, stream), key, out)
-            np.testing.assert_array_equal(out[:count], words.argsort(stable=True)[:most].numpy())
+            index = np.empty(most, np.int64)
+            count = shuffle(1000, mixed_seed(seed, stream), key, index)
+            assert index[:count].tolist() == order[:most]
