@@ -68,4 +68,4 @@ def lower_median(values: Sequence[float]) -> float:
 
 def draws_for_confidence(inlier_ratio: float, size: int, confidence: float) -> float:
     """How many samples until one is all inliers with this probability."""
-    return math.log(1 - confidence) / math.log(1 - inlier_ratio**size)
+    return math.log1p(-confidence) / math.log1p(-(inlier_ratio**size))
