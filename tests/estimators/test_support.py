@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fmtorch.estimators.focal import posterior
-from fmtorch.estimators.graph_cut import GraphCut
-from fmtorch.estimators.support import lack_of_support
 
 from fmtorch import find_fundamental, presets
 from fmtorch.core.types import Correspondences, Estimate, collate
-from fmtorch.estimators import degeneracy, final_fits, support
+from fmtorch.estimators.families import focals
+from fmtorch.estimators.parts import degensac, final_fits
+from fmtorch.estimators.parts.graph_cut import GraphCut
 from fmtorch.presets.objects import merged
 from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.laws import PEERS, few, quick, scene, small
@@ -24,8 +23,8 @@ EVERY = presets.available("estimator")
 OWN = [name for name in EVERY if not name.startswith(OTHER_LIBRARIES)]
 PIXELS = [  # what is a distance in pixels and no option
     (final_fits, "MIN_TRUNCATION_PX"), (final_fits, "MAX_TRUNCATION_PX"), (final_fits, "DEFAULT_TRUNCATION_PX"),
-    (degeneracy, "PLANE_THRESHOLD_PX"), (posterior, "INLIER_SIGMA_PX"), (posterior, "LOSS_SCALE_PX"),
-    (posterior, "PARALLEL_PX"), (GraphCut, "RADIUS_PX"),
+    (degensac, "PLANE_THRESHOLD_PX"), (focals, "INLIER_SIGMA_PX"), (focals, "LOSS_SCALE_PX"), (focals, "PARALLEL_PX"),
+    (GraphCut, "RADIUS_PX"),
 ]  # fmt: skip
 
 
@@ -129,39 +128,3 @@ def test_a_shift_changes_nothing(name: str) -> None:
     after = built(c.replace(x0=c.x0 + shift0, x1=c.x1 + shift1), 3)
     assert torch.equal(after.inliers, before.inliers)
     assert torch.equal(after.ok, before.ok)
-
-
-# the check itself
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("shift", [0.0, 3000.0])
-def test_points_of_a_line_are_told_from_points_near_one(dtype: torch.dtype, shift: float) -> None:
-    rng = np.random.default_rng(0)
-    for seed in range(20):
-        direction, start = rng.normal(size=2), rng.uniform(0, 500, 2) + shift
-        line = start + rng.uniform(-300, 300, (30, 1)) * direction / np.linalg.norm(direction)
-        near = line + rng.normal(0, 0.02, (30, 2))  # px: no detector is as exact
-        other = rng.uniform(0, 500, (30, 2))
-        for x0, x1, told in (
-            (line, other, "image 0"),
-            (other, line, "image 1"),
-            (line, line[::-1], "image 0 and image 1"),
-            (near, other, ""),
-        ):
-            points = torch.from_numpy(np.hstack([x0, x1])).to(dtype).to(torch.float64).T[:, None]
-            rounding = points.abs().amax((0, 2)) * support.relative_rounding(dtype)
-            (reason,) = lack_of_support(points, torch.ones(1, 30, dtype=torch.bool), 7, rounding)
-            assert reason == (f"the inliers of the best model lie on one line in {told}" if told else ""), seed
-
-
-def test_inliers_count_once_at_one_place_and_late_ones_are_seen() -> None:
-    rng = np.random.default_rng(1)
-    points = torch.from_numpy(rng.uniform(0, 500, (4, 3, 1000)))
-    inliers = torch.zeros(3, 1000, dtype=torch.bool)
-    inliers[0, [3, 900, 901, 902, 903, 904, 999]] = True
-    inliers[1, 300:320] = True
-    points[:, 1, 306:320] = points[:, 1, 305:306]  # 20 inliers at six places
-    inliers[2, 7] = True
-    reasons = lack_of_support(points, inliers, 7, torch.zeros(3, dtype=torch.float64))
-    assert [reason[:26] for reason in reasons] == ["", "the best model has 6 diffe", "the best model has 1 diffe"]

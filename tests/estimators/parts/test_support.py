@@ -74,6 +74,6 @@ def test_lines_up_to_the_rounding_of_float32_coordinates() -> None:
     rng = np.random.default_rng(0)
     along = np.append(rng.uniform(-300, 300, 28), [-300, 300])
     other = rng.uniform(0, 500, (30, 2))
-    for off, on_line in ((EPS32 / 4, True), (500 * EPS32, False)):
+    for off, on_line in ((EPS32 / 16, True), (500 * EPS32, False)):  # of both sides, and of an extent from the middle
         line = np.stack([along, 600 * off * rng.choice([-1, 1], 30)], 1)
         assert ("line in image 0" in told(line, other)) == on_line
