@@ -96,13 +96,16 @@ def test_coordinates_sizes_and_thresholds_scaled_together_give_the_same_inliers(
     options = {} if name.startswith("irls") else few(preset)
     pixels = {(owner, constant): getattr(owner, constant) for owner, constant in PIXELS}
     inliers = {}
-    for scale in (1.0, 1e-9, 1e-3, 1e3, 1e9):
+    # Outliers carry Huber's loss away so far that its 30 steps do not end at an optimum; where they do depends on the unit
+    # of the points, which is the next power of two.
+    scales = (2.0**-30, 2.0**-10, 2.0**10, 2.0**30) if name == "irls_huber" else (1e-9, 1e-3, 1e3, 1e9)
+    for scale in (1.0, *scales):
         for (owner, constant), value in pixels.items():
             monkeypatch.setattr(owner, constant, value * scale)
         built = presets.build("estimator", name, **merged(options, scaled(preset, scale)))
         sizes = {"size0": c.size0 * scale, "size1": c.size1 * scale}
         estimate = built(c.replace(x0=c.x0 * scale, x1=c.x1 * scale, **sizes), 3)
-        assert bool(estimate.ok.all()) or name == "irls_huber", estimate.reason  # outliers carry that loss away
+        assert bool(estimate.ok.all()), estimate.reason
         inliers[scale] = estimate.inliers
     for scale, found in inliers.items():
         assert torch.equal(found, inliers[1.0]), (
