@@ -18,6 +18,7 @@ from fmtorch.estimators.search import Pool, Search
 from tests.estimators.pairs import pair_of
 from tests.laws import scene
 from tests.reference import sampling as reference
+from tests.reference.random import number
 
 
 def searched(pair: Pair, pool: int = 4) -> Pool:
@@ -34,7 +35,8 @@ def test_matches_near_a_model_of_the_pool_in_a_random_order(matches: int) -> Non
     # Those whose float32 residual may be on either side of the radius are left out of the comparison.
     unsure = np.abs(np.sqrt(r2) / (Refine.RADIUS * options.scale) - 1) < 1e-3
     assert not unsure.any()
-    expected = reference.shuffled(np.flatnonzero(inside).tolist(), 5, pair.key, Stream.REFINEMENT)[:matches]
+    numbers = [number(5, pair.key, Stream.REFINEMENT, 0, i, 1) for i in range(pair.count)]
+    expected = reference.shuffled(np.flatnonzero(inside).tolist(), numbers, matches)
     np.testing.assert_array_equal(near.points, pair.points[:, expected])
 
 
