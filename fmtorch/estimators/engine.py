@@ -175,7 +175,8 @@ class HypothesizeAndVerify:
         """The inliers (n,) of a model (9,)."""
         inliers = self.inlier_rule(residuals_squared_px(F, pair), pair)
         if getattr(inliers, "shape", None) != (pair.count,) or inliers.dtype != bool:
-            raise ValueError(f"the rule of inliers returns {inliers!r}; it must be an array ({pair.count},) of bool")
+            rule = type(self.inlier_rule).__name__
+            raise ValueError(f"{rule} returns {inliers!r}; it must be an array ({pair.count},) of bool")
         return inliers
 
 

@@ -106,8 +106,8 @@ def test_coordinates_sizes_and_thresholds_scaled_together_give_the_same_inliers(
         return value._replace(**limits)
 
     inliers = {}
-    # Outliers carry the loss of Huber into a flat valley, along which its steps come to no end; how far they come depends
-    # on the unit of the points, which is the next power of two.
+    # Outliers carry Huber's loss away so far that its 30 steps do not end at an optimum; where they do depends on the
+    # unit of the points, which is the next power of two.
     scales = (2.0**-30, 2.0**-10, 2.0**10, 2.0**30) if name == "irls_huber" else (1e-9, 1e-3, 1e3, 1e9)
     for scale in (1.0, *scales):
         for (owner, constant), value in pixels.items():

@@ -101,6 +101,9 @@ class PriorWeighted:
         return _drawn(pair, start, size, table, totals)
 
 
+BUILT_IN = (Uniform, Prosac, PriorWeighted)
+
+
 def largest_weight(bucket: int) -> int:
     """The weight of a prior of one in a bucket of so many slots."""
     return 1 << (TOTAL_BITS - (bucket - 1).bit_length())
