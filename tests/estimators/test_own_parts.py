@@ -144,17 +144,45 @@ def test_samples_that_are_none_are_refused(sampler: Draws, message: str) -> None
 
 
 @pytest.mark.parametrize(
-    "gains", [lambda squared: squared[:, :-1], lambda squared: squared.sum(1), lambda squared: 1.0]
+    ("gains", "returned"),
+    [
+        (lambda squared: squared[:, :-1], r"\(\d+, 63\) of float32"),
+        (lambda squared: squared.sum(1), r"\(\d+,\) of float32"),
+        (lambda squared: 1.0, r"\(\) of float64"),
+        (lambda squared: squared + 0j, r"\(\d+, 64\) of complex64"),
+        (lambda squared: [["one"] * 64] * len(squared), r"\(\d+, 64\) of <U3"),
+    ],
 )
-def test_gains_of_another_shape_are_refused(gains: Any) -> None:
+def test_gains_that_are_none_are_refused(gains: Any, returned: str) -> None:
     class Mine(SummedGains):
         def gain(self, squared: Any) -> Any:
             return gains(squared)
 
-    with pytest.raises(
-        ValueError, match=r"Mine.gain returns shape \(.*\); it must be that of its argument, \(\d+, 64\)"
-    ):
+    message = rf"Mine.gain returns shape {returned}; it must be the shape of its argument, \(\d+, 64\): .* of numbers"
+    with pytest.raises(ValueError, match=message):
         presets.build("estimator", "msac", score=Mine(1.0), preselect={"matches": 64, "survivors": 5})(scene(0))
+
+
+@pytest.mark.parametrize(
+    ("scores", "returned"),
+    [
+        (lambda k: np.zeros(k + 1), r"\(\d+,\) of float64"),
+        (lambda k: np.zeros((k, 1)), r"\(\d+, 1\) of float64"),
+        (lambda k: np.zeros(k, np.float32), r"\(\d+,\) of float32"),
+        (lambda k: [0.0] * k, "list"),
+        (lambda k: None, "NoneType"),
+    ],
+)
+@pytest.mark.parametrize("preselect", [None, {"matches": 64, "survivors": 5}])
+def test_scores_that_are_none_are_refused(scores: Any, returned: str, preselect: Any) -> None:
+    class Mine:
+        prior_weighted = False
+
+        def __call__(self, F: Any, which: Any, pair: Pair) -> Any:
+            return scores(len(which))
+
+    with pytest.raises(ValueError, match=rf"Mine returns {returned}; it must be an array \(\d+,\) of float64"):
+        presets.build("estimator", "msac", score=Mine(), threshold=None, preselect=preselect)(scene(0))
 
 
 @pytest.mark.parametrize("found", [np.ones(3, np.bool_), np.ones(150), None, [True] * 150])

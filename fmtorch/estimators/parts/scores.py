@@ -42,6 +42,15 @@ class Score(Protocol):
         ...
 
 
+def scores_by(score: Score, F: Array, which: Array, pair: Pair) -> Array:
+    """What `score` returns, C-contiguous; ValueError where these are no scores of the models (m, 9) of `which` (k,)."""
+    scores: object = score(F, which, pair)
+    if not isinstance(scores, np.ndarray) or scores.shape != which.shape or scores.dtype != np.float64:
+        returned = f"{scores.shape} of {scores.dtype}" if isinstance(scores, np.ndarray) else type(scores).__name__
+        raise ValueError(f"{type(score).__name__} returns {returned}; it must be an array {which.shape} of float64")
+    return np.ascontiguousarray(scores)
+
+
 class Gain(NamedTuple):
     """A gain as kernels take it. bits: fractional, that gains are rounded to. table: of TABLE, over the squared
     residual from 0 to the threshold; 0 at its end."""
@@ -78,10 +87,10 @@ class SummedGains:
             self.gain_kernel(squared, gains)
         else:
             gains = np.asarray(self.gain(squared))
-        if gains.shape != squared.shape:
+        if gains.shape != squared.shape or gains.dtype.kind not in "biuf":
             raise ValueError(
-                f"{type(self).__name__}.gain returns shape {gains.shape}; it must be that of its argument, "
-                f"{squared.shape}: (models, matches)"
+                f"{type(self).__name__}.gain returns shape {gains.shape} of {gains.dtype}; it must be the shape of its "
+                f"argument, {squared.shape}: (models, matches), of numbers"
             )
         out = np.empty(len(which))
         sum_gains(np.ascontiguousarray(gains, np.float32), rows, bits, out)
