@@ -13,6 +13,7 @@ import pytest
 
 from fmtorch import data
 from fmtorch.core.stages import Estimator, FeatureExtractor, Matcher, Pruner
+from tests.laws import scene
 from tests.processes import run_command
 
 SOURCE = Path(__file__).resolve().parents[2]
@@ -46,8 +47,22 @@ def test_every_part_is_evaluated(folder: Path) -> None:
         (row["reason"], row["corrs"], row["nsgd"]) for row in rows
     ]
     identity = (folder / "run" / "run.json").read_text()
-    for target in ("my_features.ORB", "my_matcher.MutualMatcher", "my_pruner.UsualMotion", "my_estimator.Refitted"):
+    for target in ("my_features.ORB", "my_matcher.MutualMatcher", "my_pruner.UsualMotion", "my_estimator.Welsch"):
         assert target in identity
+
+
+def test_the_compiled_gain_is_used(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from fmtorch import presets
+
+    monkeypatch.syspath_prepend(str(folder))
+    score = {"_target_": "my_estimator.CompiledBiweight", "threshold": 1.0}
+    estimate = presets.build("estimator", "mine", config_dir=folder / "my_conf", score=score)(scene(0))
+    assert bool(estimate.ok)
+    assert int(estimate.inliers.sum()) >= 60  # 60 % of 150 matches are right, nearly all within 2 px
+
+
+def test_the_page_is_short() -> None:
+    assert len(re.sub(r"```.*?```", "", PAGE, flags=re.DOTALL).split()) < 600
 
 
 @pytest.mark.parametrize(
