@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from fmtorch.compiling.kernel import kernel
 from fmtorch.estimators.families.family import Family, Hypotheses
 from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.parts.preselection import Preselection
-from fmtorch.estimators.parts.sampling import BUILT_IN, Sampler
+from fmtorch.estimators.parts.sampling import Sampler, drawn
 from fmtorch.geometry.rank2_kernels import assign
 
 Stop = Callable[[Array, int, Pair, int], bool]
@@ -92,9 +92,7 @@ class Search:
         pool, end = Pool.empty(self.pool), start + self.hypotheses
         while start < end:
             count = min(self.round, end - start)
-            sample = self.sampler.draw(pair, start, count, self.family.size)
-            if type(self.sampler) not in BUILT_IN:
-                sample = checked(sample, self.sampler, pair, count, self.family.size)
+            sample = drawn(self.sampler, pair, start, count, self.family.size)
             hypotheses = self.family.solve(pair, sample, start)
             models = Verified(hypotheses.F, *self.preselection(hypotheses.F, pair))
             if self.degeneracy is not None:
@@ -107,18 +105,6 @@ class Search:
             if self.stop(pool.F[0], start, pair, self.family.size):
                 break
         return pool
-
-
-def checked(sample: Any, sampler: Sampler, pair: Pair, count: int, size: int) -> Array:
-    """What a sampler of one's own has drawn, C-contiguous; ValueError where these are no samples of the pair."""
-    name = type(sampler).__name__
-    if not isinstance(sample, np.ndarray) or sample.shape != (size, count) or sample.dtype != np.int64:
-        found = f"{sample.shape} of {sample.dtype}" if isinstance(sample, np.ndarray) else type(sample).__name__
-        raise ValueError(f"{name}.draw returns {found}; it must be an array ({size}, {count}) of int64")
-    low, high = int(sample.min()), int(sample.max())
-    if low < 0 or high >= pair.count:
-        raise ValueError(f"{name}.draw returns indices from {low} to {high}; matches are 0 to {pair.count - 1}")
-    return np.ascontiguousarray(sample)
 
 
 @kernel(holds_gil=True)

@@ -4,7 +4,8 @@ The two equations of a match, ``e = (X - u W, Y - v W)`` with ``(X, Y, W) = H (x
 1, have the Jacobian J (2, 4) by x, y, u, v; the distance is that of the least correction of the four that makes them
 hold to first order, ``r^2 = e^T (J J^T)^-1 e`` (Hartley & Zisserman 2004, section 4.2.6). Both its numerator and its
 determinant are sums of squares here: nothing cancels. A match whose W is not positive is infinitely far: it would lie
-on the other side of the plane's horizon.
+on the other side of the plane's horizon. In a sum that is minimised it is `BEHIND` far: one wrong match there must not
+make the cost of an unbounded loss infinite, of which no step is an improvement.
 
 By a change of H, ``dr^2 = 2 l^T (de + dJ d)`` with the multipliers ``l = (J J^T)^-1 e`` and the correction
 ``d = -J^T l`` of the four coordinates. G, the derivative (2, 9) of the equations corrected by d, gives the gradient
@@ -31,6 +32,7 @@ from fmtorch.geometry.residual_kernels import TINY32, Residual
 from fmtorch.geometry.sampson_objective_kernels import MATCH, TINY, Weighted, add_products, in_rows, robust
 
 MIN_DAMPING, MAX_DAMPING = 1e-12, 1e6
+BEHIND = 1e12  # squared distance of a match behind the horizon in the units of the points, which extend to about one
 INFINITE, ZERO = np.float32(math.inf), np.float32(0)
 load32 = rows_of.load
 
@@ -116,7 +118,7 @@ def _linearise(h: Array, rows: Array, row: int, G: Array, first: Array, second: 
     """
     x, y, u, v = load(rows, row), load(rows, row + 1), load(rows, row + 2), load(rows, row + 3)
     w = h[6] * x + h[7] * y + h[8]
-    front = w > 0.0
+    front, behind = w > 0.0, where(w <= 0.0, fill(BEHIND), math.nan)
     w = where(front, w, 1.0)
     e, f = h[0] * x + h[1] * y + h[2] - u * w, h[3] * x + h[4] * y + h[5] - v * w
     a, b, c, d = h[0] - u * h[6], h[1] - u * h[7], h[3] - v * h[6], h[4] - v * h[7]
@@ -149,7 +151,7 @@ def _linearise(h: Array, rows: Array, row: int, G: Array, first: Array, second: 
         store(second, 6 + q, r11 * load(G, 15 + q))
     store(first, 9, r00 * e + r01 * f)
     store(second, 9, r11 * f)
-    return where(front, e * l0 + f * l1, math.inf)
+    return where(front, e * l0 + f * l1, behind)
 
 
 @kernel

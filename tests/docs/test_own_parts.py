@@ -47,22 +47,8 @@ def test_every_part_is_evaluated(folder: Path) -> None:
         (row["reason"], row["corrs"], row["nsgd"]) for row in rows
     ]
     identity = (folder / "run" / "run.json").read_text()
-    for target in ("my_features.ORB", "my_matcher.MutualMatcher", "my_pruner.UsualMotion", "my_estimator.Welsch"):
+    for target in ("my_features.ORB", "my_matcher.MutualMatcher", "my_pruner.UsualMotion", "my_estimator.Refitted"):
         assert target in identity
-
-
-def test_the_compiled_gain_is_used(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from fmtorch import presets
-
-    monkeypatch.syspath_prepend(str(folder))
-    score = {"_target_": "my_estimator.CompiledBiweight", "threshold": 1.0}
-    estimate = presets.build("estimator", "mine", config_dir=folder / "my_conf", score=score)(scene(0))
-    assert bool(estimate.ok)
-    assert int(estimate.inliers.sum()) >= 60  # 60 % of 150 matches are right, nearly all within 2 px
-
-
-def test_the_page_is_short() -> None:
-    assert len(re.sub(r"```.*?```", "", PAGE, flags=re.DOTALL).split()) < 600
 
 
 @pytest.mark.parametrize(
@@ -76,3 +62,16 @@ def test_each_is_built_by_name_in_python(
 
     monkeypatch.syspath_prepend(str(folder))
     assert isinstance(presets.build(group, "mine", config_dir=folder / "my_conf"), protocol)
+
+
+@pytest.mark.parametrize("score", ["Welsch", "Triweight"])
+def test_a_score_a_sampler_and_a_rule(score: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from fmtorch import find_fundamental
+
+    monkeypatch.syspath_prepend(str(folder))
+    preset = folder / "my_conf" / "estimator" / "robust.yaml"
+    preset.write_text(preset.read_text().replace("my_robust.Welsch", f"my_robust.{score}"))
+    c = scene(1, 300, outliers=0.3)
+    found = find_fundamental(c.x0, c.x1, quality=c.quality, estimator="robust", config_dir=folder / "my_conf")
+    assert bool(found.ok[0])
+    assert int(found.inliers.sum()) > 180  # of 210

@@ -1,46 +1,46 @@
-"""FMTORCH_KERNELS=off: the same functions interpreted by Python, for the debugger and for coverage."""
+"""FMTORCH_KERNELS=off: estimators run as plain Python, for debugging, and find the same."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from fmtorch import presets
-from fmtorch.compiling import switch
-from fmtorch.core.types import Estimate
+from fmtorch.compiling.switch import SWITCH
 from tests.laws import few, scene
-from tests.processes import run_command
+
+PROGRAM = """
+import sys
+import numpy as np
+from tests.estimators.test_interpreted import estimates
+np.savez(sys.argv[1], **estimates())
+"""
 
 
-def estimated(name: str) -> Estimate:
-    """Of 40 matches, by few samples."""
-    options = few(presets.load("estimator", name), hypotheses=20, round=10)
-    if "focal" in options:
-        options["focal"] = {"samples": 8, "rounds": 1, "min_rounds": 1, "pool": 4, "candidates": 4}
-    found: Estimate = presets.build("estimator", name, **options)(scene(0, 40))
-    return found
+def estimates() -> dict[str, np.ndarray]:
+    """F and inliers of a pair of few matches."""
+    c, arrays = scene(1, 40), {}
+    for name in ("msac", "fmtorch"):
+        estimate = presets.build("estimator", name, **few(presets.load("estimator", name), 40, 40))(c)
+        assert bool(estimate.ok[0])
+        arrays |= {f"{name}.F": estimate.F[0].numpy(), f"{name}.inliers": estimate.inliers[0].numpy()}
+    return arrays
 
 
-def save(name: str, path: str) -> None:
-    """The estimate in a file, and whether kernels were interpreted."""
-    estimate = estimated(name)
-    fields = {field: getattr(estimate, field).numpy() for field in ("F", "inliers", "ok", "draws")}
-    np.savez(path, off=switch.off(), **fields)
-
-
-@pytest.mark.parametrize("name", ["msac", "fmtorch"])
-def test_estimates_are_those_of_compiled_kernels(name: str, tmp_path: Path) -> None:
-    path, compiled = tmp_path / "interpreted.npz", estimated(name)
-    code = f"from {__name__} import save; save({name!r}, {str(path)!r})"
-    ended = run_command("-c", code, cwd=tmp_path, environment={switch.SWITCH: "off"})
+def test_the_same_without_compiling(tmp_path: Path) -> None:
+    file = tmp_path / "interpreted.npz"
+    environment = os.environ | {SWITCH: "off"}
+    ended = subprocess.run(
+        [sys.executable, "-c", PROGRAM, str(file)], env=environment, capture_output=True, text=True, check=False,
+        cwd=Path(__file__).parents[2],
+    )  # fmt: skip
     assert ended.returncode == 0, ended.stderr
-    assert "compiling" not in ended.stderr + ended.stdout
-    with np.load(path) as interpreted:
-        assert interpreted["off"]
-        assert compiled.ok.tolist() == interpreted["ok"].tolist() == [True]
-        assert compiled.draws.tolist() == interpreted["draws"].tolist()
-        np.testing.assert_array_equal(interpreted["inliers"], compiled.inliers)
-        # What is left apart: sums in lanes, and products that are fused. F has norm one.
-        np.testing.assert_allclose(interpreted["F"], compiled.F, rtol=0, atol=1e-9)
+    assert "compiling" not in ended.stderr
+    with np.load(file) as interpreted:
+        for name, value in estimates().items():
+            # Fused products round differently in the last bits, which refinement to convergence does not carry on.
+            np.testing.assert_allclose(interpreted[name], value, rtol=0, atol=1e-9, err_msg=name)

@@ -42,15 +42,6 @@ class Score(Protocol):
         ...
 
 
-def scores_by(score: Score, F: Array, which: Array, pair: Pair) -> Array:
-    """What `score` returns, C-contiguous; ValueError where these are no scores of the models (m, 9) of `which` (k,)."""
-    scores: object = score(F, which, pair)
-    if not isinstance(scores, np.ndarray) or scores.shape != which.shape or scores.dtype != np.float64:
-        returned = f"{scores.shape} of {scores.dtype}" if isinstance(scores, np.ndarray) else type(scores).__name__
-        raise ValueError(f"{type(score).__name__} returns {returned}; it must be an array {which.shape} of float64")
-    return np.ascontiguousarray(scores)
-
-
 class Gain(NamedTuple):
     """A gain as kernels take it. bits: fractional, that gains are rounded to. table: of TABLE, over the squared
     residual from 0 to the threshold; 0 at its end."""
@@ -152,6 +143,17 @@ class Magsac(CodedGains):
 
     def __init__(self, threshold: float) -> None:
         super().__init__(threshold)
+
+
+def scored(score: Score, F: Array, which: Array, pair: Pair) -> Array:
+    """What a score says of models F[which] (k,), float64; ValueError where that is not one number for each."""
+    scores = score(F, which, pair)
+    if not isinstance(scores, np.ndarray) or scores.shape != which.shape or scores.dtype != np.float64:
+        what = f"{scores.dtype} {scores.shape}" if isinstance(scores, np.ndarray) else type(scores).__name__
+        raise ValueError(
+            f"{type(score).__name__} returns {what}; it must be an array of float64 {which.shape}: one number a model"
+        )
+    return np.ascontiguousarray(scores)
 
 
 def check_threshold(threshold: float) -> None:
