@@ -18,6 +18,7 @@ from fmtorch.compiling.lanes import LANES
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.families.cameras import Cameras, centred, images_of, translate
 from fmtorch.estimators.families.family import Refining
+from fmtorch.estimators.families.fundamental import response_of
 from fmtorch.estimators.families.posterior import Limits, minimise, no_optimum, tangents_of
 from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair
 from fmtorch.estimators.parts.final_fits import FinalFit, Fit
@@ -96,29 +97,30 @@ class Attached:
     def _optimum(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
         """By the implicit function theorem: the optimum moves with the gradient of its cost."""
         device = matches.mask.device
-        at, response = (
-            torch.from_numpy(np.stack(values)).to(device)
-            for values in ([s.fit.at for s in solved], [self._response(s) for s in solved])
-        )
+        at = torch.from_numpy(np.stack([s.fit.at for s in solved])).to(device)
         counted = _padded([s.fit.counted for s in solved], matches.mask)
         weight = matches.weight if self.family.fit_scale.by_prior else matches.precision
         weight = torch.where(counted > 0, counted * weight, 0)
         if self.family.model == "homography":
-            gradient = homography_gradient(at, matches.points, weight)
+            scales = [s.fit.s2 for s in solved if s.fit.s2 is not None]  # of all fits, or of none
+            s2 = _padded(scales, matches.mask) if scales else None
+            gradient, response = homography_gradient(at, matches.points, weight, s2)
         else:
             unbounded = torch.full_like(at[:, 0], torch.inf)
             gradient = gradient_of_cost(at.T[..., None], matches.points, weight, KERNELS["truncated"], unbounded)[
                 ..., 0
             ].T
+            response = torch.from_numpy(np.stack([_response(s) for s in solved])).to(device)
         return (response * (gradient - gradient.detach())[:, None]).sum(-1)
 
-    def _response(self, solved: Solved) -> Array:
-        """How the fit of a pair moves with the gradient of its cost, (9, 9)."""
-        pair, fit = solved.pair, solved.fit
-        weight = fit.counted * (pair.weight if self.family.fit_scale.by_prior else 1 / np.square(pair.noises))
-        if fit.cameras is not None:
-            return camera_response(fit.cameras, pair, weight, fit.precision)
-        return self.family.response(fit.at, pair, weight)
+
+def _response(solved: Solved) -> Array:
+    """How the fit of a pair moves with the gradient of its cost, (9, 9)."""
+    pair, fit = solved.pair, solved.fit
+    weight = fit.counted * pair.weight
+    if fit.cameras is not None:
+        return camera_response(fit.cameras, pair, weight, fit.precision)
+    return response_of(fit.at, pair, weight)
 
 
 def with_gradients(estimate: Estimate, c: Correspondences, solved: dict[int, Solved], attach: Attach) -> Estimate:

@@ -177,23 +177,6 @@ def step_of_homography(H: F8x1, matches: Weighted, damping: float, out: F8x1) ->
     _stepped(products[0], at[0], damping, Q, out)
 
 
-@kernel(holds_gil=True)
-def response_of_homography(H: F8x1, matches: Weighted, damping: float, out: F8x2) -> None:
-    """How an optimum (9,) moves with the gradient of its cost by the nine entries -> out (9, 9)."""
-    at, products, cost, Q = matrix(1, 9), np.empty((1, 10, 10)), vector(1), matrix(18, LANES)
-    assign(at[0], H)
-    unit(at[0])
-    evaluate_homographies(at, matches, True, products, cost)
-    for j in range(9):
-        _system(products[0], at[0], damping, Q)
-        along = at[0, j]
-        for r in range(9):
-            Q[2 * r + 1, 9 - LANES] = along * at[0, r] - (1.0 if r == j else 0.0)
-        eliminate(Q, 9)
-        for i in range(9):
-            out[i, j] = Q[2 * i + 1, 9 - LANES]
-
-
 @inner
 def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
     evaluate_homographies(state.H, data.matches, derivatives, state.products, state.cost)

@@ -37,7 +37,7 @@ def numbers(pair: Pair, draw: int, columns: int) -> list[int]:
 
 
 @pytest.mark.parametrize("prior", ["given", "none", "zero", "one certain", "small"])
-@pytest.mark.parametrize("size", [5, 7, 8])
+@pytest.mark.parametrize("size", [4, 5, 7, 8])
 @pytest.mark.parametrize("count", [8, 9, 20, 40, 150, 700])
 def test_samples_by_weight_are_those_of_the_definition(count: int, size: int, prior: str) -> None:
     one = pair(count, prior)
@@ -54,7 +54,7 @@ def test_samples_by_weight_are_those_of_the_definition(count: int, size: int, pr
             ]
 
 
-@pytest.mark.parametrize("size", [5, 7, 8])
+@pytest.mark.parametrize("size", [4, 5, 7, 8])
 @pytest.mark.parametrize("count", [8, 9, 20, 40, 700])
 def test_samples_of_prosac_are_those_of_the_definition(count: int, size: int) -> None:
     one, sampler = pair(count), Prosac()
