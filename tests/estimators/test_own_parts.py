@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-import statistics
+import math
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 
 from fmtorch import presets
-from fmtorch.core.types import Correspondences, collate
+from fmtorch.core.types import collate
 from fmtorch.estimators import SummedGains
 from fmtorch.geometry import sampson
 from tests.estimators.own_parts import (
+    AllAlike,
     BestHalf,
     CompiledSquares,
     CompiledTriweight,
@@ -28,6 +31,7 @@ from tests.estimators.own_parts import (
 )
 from tests.estimators.pairs import pair_of
 from tests.laws import assert_same, few, scene, scenes
+from tests.processes import run_command
 
 PARTS: dict[str, dict[str, Any]] = {
     "score": {"score": Welsch(1.0)},
@@ -175,26 +179,33 @@ def test_wrong_inliers_are_refused_by_name(rule: Any, complaint: str) -> None:
         built("msac", {"inliers": rule})(scene(1, 150))
 
 
+def compared(preset: str) -> None:
+    """Prints the draws of a preset and of its like with parts in NumPy, and the CPU times: each the least of some."""
+    c = scene(1, 600, outliers=0.5)
+    # The gain of `fmtorch` differs, but not the work: as many draws from all matches, as many models preselected.
+    score = Squares(1.0) if preset == "msac" else Welsch(1.5, prior_weighted=True)
+    threshold = {} if preset == "msac" else {"threshold": None}
+    own = presets.build("estimator", preset, score=score, sampler=AllAlike(), inliers=Within2Px(), **threshold)
+    estimators = own, presets.build("estimator", preset)
+    draws, least = [int(estimator(c).draws) for estimator in estimators], [math.inf, math.inf]
+    for _ in range(20):
+        for k, estimator in enumerate(estimators):
+            start = time.process_time()
+            estimator(c)
+            least[k] = min(least[k], time.process_time() - start)
+    print(*draws, *least)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", PRESETS)
-def test_a_part_in_numpy_takes_at_most_three_times_as_long(preset: str) -> None:
-    """A score, a sampler and a rule in NumPy together against the built-in ones, 2,000 matches."""
-    c = scene(1, 2000, outliers=0.5)
-    threshold = {} if preset == "msac" else {"threshold": None}
-    own = presets.build("estimator", preset, score=Welsch(1.0), sampler=BestHalf(), inliers=Within2Px(), **threshold)
-    ratio = milliseconds(own, c) / milliseconds(presets.build("estimator", preset), c)
-    print(f"{preset}: {ratio:.2f} times as long")
-    assert ratio < 3
-
-
-def milliseconds(estimator: Any, c: Correspondences) -> float:
-    estimator(c)
-    times = []
-    for _ in range(9):
-        start = time.perf_counter()
-        estimator(c)
-        times.append(time.perf_counter() - start)
-    return 1000 * statistics.median(times)
+def test_parts_in_numpy_take_at_most_three_times_as_long(preset: str, tmp_path: Path) -> None:
+    """Score, sampler and rule together, at the same work, in a process whose calls are not checked, as a user's."""
+    ended = run_command("-c", f"from {__name__} import compared; compared({preset!r})", cwd=tmp_path)
+    assert ended.returncode == 0, ended.stderr
+    draws, builtin_draws, seconds, builtin = map(float, ended.stdout.split())
+    print(f"{preset}: {1000 * builtin:.2f} ms, with parts in NumPy {1000 * seconds:.2f} ms")
+    assert draws == builtin_draws
+    assert seconds < 3 * builtin
 
 
 def test_samples_of_ones_own_are_distinct_and_from_the_better_half() -> None:
@@ -204,3 +215,5 @@ def test_samples_of_ones_own_are_distinct_and_from_the_better_half() -> None:
     better = np.argsort(pair.quality, kind="stable")[:20]
     assert all(len(set(column)) == 7 for column in sample.T)
     assert set(sample.ravel()) == set(better)
+    counts = np.bincount(AllAlike().draw(pair, 0, 5000, 7)[6], minlength=41)
+    assert stats.chisquare(counts).pvalue > 1e-4
