@@ -25,12 +25,14 @@ from fmtorch.estimators.parts.degensac import (
     plane_of_sample,
 )
 from fmtorch.estimators.parts.preselection import Preselection
+from fmtorch.estimators.parts.sampling import largest_weight
 from fmtorch.estimators.parts.scores import Msac
 from fmtorch.estimators.search import Verified
 from tests.estimators.pairs import FEW, SCALES, models, named, pair_of, to_units
 from tests.laws import assert_same
 from tests.reference import homography as reference
 from tests.reference.random import number
+from tests.reference.sampling import quantised
 
 PAIRS = 64
 COUNT = 200
@@ -166,6 +168,35 @@ def test_models_of_plane_and_parallax_are_those_of_their_draws(name: str) -> Non
     assert len(F) == len(expected) > 40
     for found, model in zip(F, expected, strict=True):
         np.testing.assert_allclose(reference.unit(found.astype(np.float64).reshape(3, 3)), model, atol=1e-6)  # float32
+
+
+@pytest.mark.parametrize("turn", [0, 1, 500])
+def test_completed_models_are_the_best_of_plane_and_parallax(turn: int) -> None:
+    """Of the plane fitted to its matches and two matches off it, drawn by prior; each turn draws others."""
+    pair, part = pair_of(scene(0)[0], seed=2), Degensac(Msac(1.0))
+    pair.prior = pair.match_weight = pair.table[6]
+    pair.table[6] = np.random.default_rng(0).uniform(0.1, 1, pair.count)
+    H, inside, F = reference_plane(pair), np.empty(pair.count, np.bool_), np.empty((PARALLAX_DRAWS, 9), np.float32)
+    found, scores = part.completed(H.copy(), pair, turn)
+    fit_plane(H, pair.points, limit(pair), FITS, inside)
+    weight = np.where(inside, 0, quantised(pair.match_weight.tolist(), largest_weight(pair.bucket)))
+    state = pair.mixed_seed(Stream.PARALLAX), pair.key, 2 * turn * PARALLAX_DRAWS
+    F = F[: parallax(H, pair.points, np.cumsum(weight), np.array(state), F)]
+    every = Msac(1.0)(F, np.arange(len(F)), pair)
+    best = np.argsort(-every, kind="stable")[:KEPT]
+    np.testing.assert_array_equal(found, F[best])
+    np.testing.assert_array_equal(scores, every[best])
+
+
+def reference_plane(pair: Pair) -> np.ndarray:
+    """The plane of a degenerate sample of a pair."""
+    hypotheses, models = round_of(pair)
+    for k in np.argsort(-models.score, kind="stable"):
+        points, H = np.ascontiguousarray(pair.points[:, hypotheses.sample[:, hypotheses.draw[k]]]), np.empty(9)
+        F = models.F[k].astype(np.float64)
+        if plane_of_sample(F, points, Degensac.TRIPLETS, limit(pair), H) >= Degensac.ON_PLANE:
+            return H
+    raise AssertionError("no sample is degenerate")
 
 
 def test_a_better_degenerate_model_is_completed_and_others_are_left_alone() -> None:

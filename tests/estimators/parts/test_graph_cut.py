@@ -10,6 +10,7 @@ from fmtorch.estimators import HypothesizeAndVerify
 from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.parts.graph_cut import FIRST_DRAW, GraphCut
 from fmtorch.estimators.parts.inliers import residuals_squared_px
+from fmtorch.estimators.parts.neighbours import neighbor_graph
 from fmtorch.estimators.parts.scores import Msac
 from fmtorch.estimators.parts.selection import scores_of
 from tests.estimators.pairs import FEW, REAL, SCALES, models, named
@@ -56,6 +57,27 @@ def test_no_model_is_made_worse_and_most_are_made_better(name: str) -> None:
     before, after = (scores_of(score, x, pair) for x in (F, GraphCut(1.0, score)(F, pair)))
     assert (after >= before).all()
     assert (after > before).sum() >= 2
+
+
+def test_a_model_is_its_best_fit_as_long_as_the_score_rises() -> None:
+    """Algorithm 2 of the paper, with at most ITERATIONS rounds."""
+    rounds = []
+    for name in ("scene 100", "scene 300", *REAL):
+        pair, part = named(name), GraphCut(1.0, Msac(1.0))
+        graph, F = neighbor_graph(pair, part.RADIUS_PX), searched(pair)
+        F = np.vstack([F, part(F, pair)])  # those that are good already
+        for start, improved in zip(F, part(F, pair), strict=True):
+            path = [(scores_of(part.score, start[None], pair)[0], start)]
+            for iteration in range(part.ITERATIONS + 1):
+                models = part.fits(part.labels(path[-1][1], pair, graph), pair, iteration)
+                scores = scores_of(part.score, models, pair)
+                path.append((scores.max(), models[scores.argmax()]))
+                if path[-1][0] <= path[-2][0]:
+                    break
+            rising = [F for k, (score, F) in enumerate(path) if k == 0 or score > path[k - 1][0]]
+            rounds.append(len(rising) - 1)
+            np.testing.assert_array_equal(improved, rising[min(part.ITERATIONS, rounds[-1])])
+    assert min(rounds) < GraphCut.ITERATIONS < max(rounds)  # some stop by themselves, others could go on
 
 
 @pytest.mark.parametrize("scale", SCALES)

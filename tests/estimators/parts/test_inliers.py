@@ -53,6 +53,15 @@ def test_rules_are_those_of_the_definitions(count: int) -> None:
             assert rule(r**2, pair).tolist() == expected
 
 
+@pytest.mark.parametrize("count", [7, 8, 9, 20, 151])
+def test_two_and_a_half_robust_deviations(count: int) -> None:
+    """1.4826 (1 + 5 / (n - 7)) med |r|, of seven parameters; n - 7 is taken for one where it is less."""
+    limit = 2.5 * 1.4826 * (1 + 5 / {7: 1, 8: 1, 9: 2, 20: 13, 151: 144}[count])
+    r = np.ones(count)
+    r[0], r[1] = limit * (1 - 1e-9), limit * (1 + 1e-9)
+    assert RobustDeviations()(r**2, named(f"scene {count}")).tolist() == [True, False, *[True] * (count - 2)]
+
+
 def test_limits_belong_to_the_inliers_and_are_none_beyond_the_range_of_numbers() -> None:
     pair = named("scene 8")
     squared = np.array([0, 4, np.nextafter(4, 5), 1e300, np.inf, np.nan, 1, 2])

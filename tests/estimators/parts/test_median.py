@@ -32,7 +32,7 @@ def test_the_median_of_unusual_residuals(kind: str, count: int) -> None:
     pair = pair_of(known(count, "nothing"))
     apart = {
         "equal": np.full(count, 0.5), "tiny and huge": 10.0 ** np.linspace(-15, 15, count),
-        "some zero": np.arange(count) // (0.6 * count), "NaN": np.where(np.arange(count) < 3, np.nan, 0.25),
+        "some zero": np.arange(count) // (0.6 * count), "NaN": np.where(np.arange(count) < 3, np.nan, np.arange(count)),
     }[kind]  # fmt: skip
     pair.table[:4] = 0
     pair.table[3] = np.random.default_rng(0).permutation(apart)
