@@ -138,6 +138,14 @@ def test_wrong_scores_are_refused_by_name(scores: Any, complaint: str) -> None:
             built("msac", {"score": Scored(scores)})(scene(1, count))
 
 
+def test_scores_may_be_a_column() -> None:
+    """Of a larger array: its memory has gaps."""
+    column = Scored(lambda which: np.stack([which * 1.0, which * 0.0], 1)[:, 0])
+    assert torch.equal(
+        built("msac", {"score": column})(scene(1, 600)).F, built("msac", {"score": Scored(np.float64)})(scene(1, 600)).F
+    )
+
+
 @pytest.mark.parametrize(
     ("gain", "complaint"),
     [
