@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import subprocess
@@ -79,14 +78,11 @@ def other(x: float) -> float:
 
 
 def load(folder: Path, source: str) -> types.ModuleType:
-    path = folder / "some_module.py"
-    path.write_text(source)
-    spec = importlib.util.spec_from_file_location("some_module", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["some_module"] = module
-    spec.loader.exec_module(module)
+    """A module of this source, compiled here: bytecode on disk is only as new as a second and a file's size tell."""
+    module = types.ModuleType("kernels_of_a_test")
+    module.__file__ = str(folder / "kernels_of_a_test.py")
+    sys.modules["kernels_of_a_test"] = module
+    exec(compile(source, module.__file__, "exec"), vars(module))
     return module
 
 
@@ -132,8 +128,8 @@ def test_it_changes_with_what_is_named_by_its_module(tmp_path: Path) -> None:
     for scale, other in (("2.0", "1"), ("3.0", "1"), ("2.0", "2")):
         text = SOURCE.replace("= 2.0", f"= {scale}", 1).replace("x + 5", f"x + {other}")
         module = types.ModuleType("a_user")
-        vars(module)["some_module"] = load(tmp_path, text)
-        exec("def f(x):\n    return some_module.deepest(x)", vars(module))
+        vars(module)["kernels_of_a_test"] = load(tmp_path, text)
+        exec("def f(x):\n    return kernels_of_a_test.deepest(x)", vars(module))
         found[scale, other] = version(module.f)
     assert found["2.0", "1"] != found["3.0", "1"]
     assert found["2.0", "1"] == found["2.0", "2"]
@@ -170,7 +166,7 @@ def test_names_beyond_the_first_bytes(tmp_path: Path) -> None:
 @pytest.mark.parametrize("value", ["object()", "sys.modules['tests.conftest'].oracle"])
 def test_what_has_no_version_is_refused_by_name(tmp_path: Path, value: str) -> None:
     module = load(tmp_path, f"import sys\nLIMIT = {value}\ndef f():\n    return LIMIT\n")
-    with pytest.raises(TypeError, match=r"some_module\.f uses LIMIT: .*version"):
+    with pytest.raises(TypeError, match=r"kernels_of_a_test\.f uses LIMIT: .*version"):
         version(module.f)
 
 
