@@ -103,13 +103,9 @@ class Attached:
         counted = _padded([s.fit.counted for s in solved], matches.mask)
         weight = matches.weight if self.family.fit_scale.by_prior else matches.precision
         weight = torch.where(counted > 0, counted * weight, 0)
-        if self.family.model == "homography":
-            gradient = homography_gradient(at, matches.points, weight)
-        else:
-            unbounded = torch.full_like(at[:, 0], torch.inf)
-            gradient = gradient_of_cost(at.T[..., None], matches.points, weight, KERNELS["truncated"], unbounded)[
-                ..., 0
-            ].T
+        gradient_of = homography_gradient if self.family.model == "homography" else gradient_of_cost
+        unbounded = torch.full_like(at[:, 0], torch.inf)
+        gradient = gradient_of(at.T[..., None], matches.points, weight, KERNELS["truncated"], unbounded)[..., 0].T
         return (response * (gradient - gradient.detach())[:, None]).sum(-1)
 
     def _response(self, solved: Solved) -> Array:

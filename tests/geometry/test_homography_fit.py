@@ -13,7 +13,6 @@ import torch
 from fmtorch.compiling.arrays import F4x2, F8x1, F8x2
 from fmtorch.compiling.kernel import kernel
 from fmtorch.geometry import homography_objective_kernels as objective
-from fmtorch.geometry.homography_error import homography_sampson_squared
 from fmtorch.geometry.homography_kernels import weighted_homography
 from fmtorch.geometry.levenberg_marquardt_kernels import Schedule
 from fmtorch.geometry.residual_kernels import SINGLES
@@ -58,13 +57,9 @@ CASES: list[Callable[[int], tuple[np.ndarray, np.ndarray]]] = [lambda n: planar(
 def test_squared_distances(n: int, case: Callable[[int], tuple[np.ndarray, np.ndarray]]) -> None:
     points, H = case(n)
     expected = np.array([reference.sampson_squared(H, x[:2], x[2:]) for x in points.T])
-    single, tensor = (
-        np.empty(n),
-        homography_sampson_squared(torch.from_numpy(H.reshape(1, 9)), torch.from_numpy(points)[:, None]),
-    )
+    single = np.empty(n)
     of_matches(H.ravel().copy(), points, single)
     np.testing.assert_allclose(single, expected, rtol=1e-10)
-    np.testing.assert_allclose(tensor[0].numpy(), expected, rtol=1e-10)
     rows, scale = np.zeros((-(-n // SINGLES) * 6, SINGLES), np.float32), 7.0
     for i in range(n):
         rows[i // SINGLES * 6 :, i % SINGLES][:5] = [*points[:, i], scale]

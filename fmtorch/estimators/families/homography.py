@@ -32,7 +32,7 @@ class Homography:
     model: ClassVar[str] = "homography"
     residual: ClassVar[Residual] = HOMOGRAPHY
     size: ClassVar[int] = 4
-    fit_scale: ClassVar[FitScale] = FitScale("cauchy", 0.8493, 1.5, 0.1, 4.0, 1.0, by_prior=False)
+    fit_scale: ClassVar[FitScale] = FitScale("cauchy", 0.8493, 1.25, 0.1, 4.0, 1.0, by_prior=False)
 
     def solve(self, pair: Pair, sample: Array, start: int) -> Hypotheses:
         """As `Family.solve`."""
