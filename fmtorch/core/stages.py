@@ -68,3 +68,9 @@ class Estimator(Protocol):
     """Correspondences -> fundamental matrices."""
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate: ...
+
+
+def model_of(estimator: Estimator) -> str:
+    """What an estimator's matrices are, `Estimate.model`: fundamental, unless it says otherwise."""
+    model: str = getattr(estimator, "model", "fundamental")
+    return model

@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.kernel import Kernel
 from fmtorch.compiling.together import compile_together
@@ -131,6 +133,11 @@ class HypothesizeAndVerify:
             raise ValueError(f"{wrong[0]} is for fundamental matrices; the solver gives {self.family.model} matrices")
 
     @property
+    def model(self) -> str:
+        """What its matrices are, `Estimate.model`."""
+        return self.family.model
+
+    @property
     def kernels(self) -> tuple[Kernel[..., Any], ...]:
         """Those worth compiling together, before the first pair."""
         return WITH_FOCALS if self.focal is not None else ()
@@ -174,8 +181,12 @@ class HypothesizeAndVerify:
     def inliers(self, F: Array, pair: Pair) -> Array:
         """The inliers (n,) of a model (9,)."""
         inliers = self.inlier_rule(residuals_squared_px(F, pair), pair)
-        if getattr(inliers, "shape", None) != (pair.count,) or inliers.dtype != bool:
-            raise ValueError(f"the rule of inliers returns {inliers!r}; it must be an array ({pair.count},) of bool")
+        if not isinstance(inliers, np.ndarray) or inliers.shape != (pair.count,) or inliers.dtype != bool:
+            what = f"{inliers.dtype} {inliers.shape}" if isinstance(inliers, np.ndarray) else type(inliers).__name__
+            raise ValueError(
+                f"{type(self.inlier_rule).__name__} returns {what}; it must be an array of bool ({pair.count},): "
+                "whether each match is an inlier"
+            )
         return inliers
 
 

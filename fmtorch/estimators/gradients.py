@@ -18,11 +18,12 @@ from fmtorch.compiling.lanes import LANES
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.families.cameras import Cameras, centred, images_of, translate
 from fmtorch.estimators.families.family import Refining
+from fmtorch.estimators.families.fundamental import response_of
 from fmtorch.estimators.families.posterior import Limits, minimise, no_optimum, tangents_of
 from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair
 from fmtorch.estimators.parts.final_fits import FinalFit, Fit
 from fmtorch.geometry import canonical, eight_point, unit_frobenius
-from fmtorch.geometry.homography_error import homography_gradient
+from fmtorch.geometry.homography_refine import homography_at_optimum
 from fmtorch.geometry.optimum import STEP_DAMPING, gradient_of_cost
 from fmtorch.geometry.pixel_frame import PixelFrame
 from fmtorch.geometry.robust_losses import KERNELS
@@ -96,25 +97,38 @@ class Attached:
     def _optimum(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
         """By the implicit function theorem: the optimum moves with the gradient of its cost."""
         device = matches.mask.device
-        at, response = (
-            torch.from_numpy(np.stack(values)).to(device)
-            for values in ([s.fit.at for s in solved], [self._response(s) for s in solved])
-        )
+        at = torch.from_numpy(np.stack([s.fit.at for s in solved])).to(device)
         counted = _padded([s.fit.counted for s in solved], matches.mask)
         weight = matches.weight if self.family.fit_scale.by_prior else matches.precision
         weight = torch.where(counted > 0, counted * weight, 0)
-        gradient_of = homography_gradient if self.family.model == "homography" else gradient_of_cost
+        if self.family.model == "homography":
+            return _homographies_at_optimum(solved, at, matches, weight)
         unbounded = torch.full_like(at[:, 0], torch.inf)
-        gradient = gradient_of(at.T[..., None], matches.points, weight, KERNELS["truncated"], unbounded)[..., 0].T
+        gradient = gradient_of_cost(at.T[..., None], matches.points, weight, KERNELS["truncated"], unbounded)[..., 0].T
+        response = torch.from_numpy(np.stack([_response(s) for s in solved])).to(device)
         return (response * (gradient - gradient.detach())[:, None]).sum(-1)
 
-    def _response(self, solved: Solved) -> Array:
-        """How the fit of a pair moves with the gradient of its cost, (9, 9)."""
-        pair, fit = solved.pair, solved.fit
-        weight = fit.counted * (pair.weight if self.family.fit_scale.by_prior else 1 / np.square(pair.noises))
-        if fit.cameras is not None:
-            return camera_response(fit.cameras, pair, weight, fit.precision)
-        return self.family.response(fit.at, pair, weight)
+
+def _homographies_at_optimum(
+    solved: list[Solved], at: Float[Tensor, "p 9"], matches: GraphedMatches, weight: Float[Tensor, "p n"]
+) -> Float[Tensor, "p 9"]:
+    """As `Attach`, of homographies, by the loss of their fits."""
+    robust, s2 = KERNELS["truncated"], torch.full_like(at[:, :1], torch.inf)
+    scales = [s.fit.s2 for s in solved if s.fit.s2 is not None]  # of all fits, or of none
+    if scales:
+        robust, s2 = KERNELS["cauchy"], torch.where(matches.mask, _padded(scales, matches.mask), 1)
+    model = torch.nn.functional.normalize(at, dim=1).T[..., None]
+    attached = homography_at_optimum(model, matches.points, weight, robust, s2)[..., 0].T
+    return attached - attached.detach()
+
+
+def _response(solved: Solved) -> Array:
+    """How the fit of a pair moves with the gradient of its cost, (9, 9)."""
+    pair, fit = solved.pair, solved.fit
+    weight = fit.counted * pair.weight
+    if fit.cameras is not None:
+        return camera_response(fit.cameras, pair, weight, fit.precision)
+    return response_of(fit.at, pair, weight)
 
 
 def with_gradients(estimate: Estimate, c: Correspondences, solved: dict[int, Solved], attach: Attach) -> Estimate:

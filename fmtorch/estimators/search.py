@@ -14,7 +14,7 @@ from fmtorch.compiling.kernel import kernel
 from fmtorch.estimators.families.family import Family, Hypotheses
 from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.parts.preselection import Preselection
-from fmtorch.estimators.parts.sampling import Sampler
+from fmtorch.estimators.parts.sampling import Sampler, drawn
 from fmtorch.geometry.rank2_kernels import assign
 
 Stop = Callable[[Array, int, Pair, int], bool]
@@ -92,7 +92,7 @@ class Search:
         pool, end = Pool.empty(self.pool), start + self.hypotheses
         while start < end:
             count = min(self.round, end - start)
-            sample = self.sampler.draw(pair, start, count, self.family.size)
+            sample = drawn(self.sampler, pair, start, count, self.family.size)
             hypotheses = self.family.solve(pair, sample, start)
             models = Verified(hypotheses.F, *self.preselection(hypotheses.F, pair))
             if self.degeneracy is not None:

@@ -60,17 +60,19 @@ def homography_gradient(
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
     robust: Kernel,
-    scale: Float[Tensor, " p"],
+    s2: Float[Tensor, (p #n
+)],
 ) -> Float[Tensor, "9 p k"]:
     """Half the gradient of ``sum_i w_i rho(r_i^2)`` by the entries of H, ``G^T l``, attached to all inputs.
 
-    Matches of weight zero and those behind the horizon count nothing, wherever they are.
+    s2: squared scales of the loss. Matches of weight zero and those behind the horizon count nothing, wherever they
+    are.
     """
     counted = weight.detach() > 0
     matches = torch.where(counted, points, 0)[:, :, None]
     error = linearise_homography(H[..., None], matches)
     counted = counted[:, None] & error.front
-    slope = robust.weight(torch.where(counted, error.squared, 0), scale.square()[:, None, None])
+    slope = robust.weight(torch.where(counted, error.squared, 0), s2[:, None])
     influence = torch.where(counted, weight[:, None] * slope, 0)
     first, second = equations_slope(error, matches)
     l0, l1 = error.multipliers
@@ -82,14 +84,15 @@ def homography_curvature(
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
     robust: Kernel,
-    scale: Float[Tensor, " p"],
+    s2: Float[Tensor, (p #n
+)],
 ) -> Float[Tensor, "p k 9 9"]:
     """The Gauss-Newton matrix ``G^T (J J^T)^-1 G`` with the curvature of the loss; arguments as of the gradient."""
     counted = weight > 0
     matches = torch.where(counted, points, 0)[:, :, None]
     error = linearise_homography(H[..., None], matches)
     counted = counted[:, None] & error.front
-    slope = robust.curvature(torch.where(counted, error.squared, 0), scale.square()[:, None, None])
+    slope = robust.curvature(torch.where(counted, error.squared, 0), s2[:, None])
     influence = torch.where(counted, weight[:, None] * slope, 0)
     first, second = equations_slope(error, matches)
     i00, i01, i11 = error.inverse

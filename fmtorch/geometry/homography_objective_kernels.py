@@ -4,7 +4,8 @@ The two equations of a match, ``e = (X - u W, Y - v W)`` with ``(X, Y, W) = H (x
 1, have the Jacobian J (2, 4) by x, y, u, v; the distance is that of the least correction of the four that makes them
 hold to first order, ``r^2 = e^T (J J^T)^-1 e`` (Hartley & Zisserman 2004, section 4.2.6). Both its numerator and its
 determinant are sums of squares here: nothing cancels. A match whose W is not positive is infinitely far: it would lie
-on the other side of the plane's horizon.
+on the other side of the plane's horizon. In a sum that is minimised it is `BEHIND` far: one wrong match there must not
+make the cost of an unbounded loss infinite, of which no step is an improvement.
 
 By a change of H, ``dr^2 = 2 l^T (de + dJ d)`` with the multipliers ``l = (J J^T)^-1 e`` and the correction
 ``d = -J^T l`` of the four coordinates. G, the derivative (2, 9) of the equations corrected by d, gives the gradient
@@ -32,7 +33,7 @@ from fmtorch.geometry.sampson_objective_kernels import MATCH, TINY, Weighted, in
 
 MIN_DAMPING, MAX_DAMPING = 1e-12, 1e6
 INFINITE, ZERO = np.float32(math.inf), np.float32(0)
-FAR = 1e4  # squared distance behind the horizon, in units of the points: of a finite loss, so that a fit goes on
+BEHIND = 1e4  # squared distance of a match behind the horizon in the units of the points, which extend to about one
 SUMS = 52  # over the matches, of the normal equations
 load32 = rows_of.load
 
@@ -100,7 +101,7 @@ def evaluate_homographies(H: F8x2, weighted: Weighted, derivatives: bool, produc
             weight = load(rows, row + 4)
             costs += where(weight > 0.0, share * weight, 0.0)
             if derivatives:
-                counted = where((weight > 0.0) & (r2 < FAR), weight * slope, 0.0)
+                counted = where((weight > 0.0) & (r2 < BEHIND), weight * slope, 0.0)
                 _add_products(factors, counted, sums)
                 store(sums, SUMS - 1, load(sums, SUMS - 1) + counted * r2)
         cost[k] = added(costs)
@@ -141,7 +142,7 @@ def _linearise(h: Array, rows: Array, row: int, derivatives: bool, factors: Arra
         store(factors, 12, l0)
         store(factors, 13, l1)
     r2 = e * l0 + f * l1
-    return where(w > 0.0, r2, where(w == w, FAR, r2))  # what is not a number stays none
+    return where(w > 0.0, r2, where(w == w, BEHIND, r2))  # what is not a number stays none
 
 
 @inner
@@ -219,23 +220,6 @@ def step_of_homography(H: F8x1, matches: Weighted, damping: float, out: F8x1) ->
     unit(at[0])
     evaluate_homographies(at, matches, True, products, cost)
     _stepped(products[0], at[0], damping, Q, out)
-
-
-@kernel(holds_gil=True)
-def response_of_homography(H: F8x1, matches: Weighted, damping: float, out: F8x2) -> None:
-    """How an optimum (9,) moves with the gradient of its cost by the nine entries -> out (9, 9)."""
-    at, products, cost, Q = matrix(1, 9), np.empty((1, 10, 10)), vector(1), matrix(18, LANES)
-    assign(at[0], H)
-    unit(at[0])
-    evaluate_homographies(at, matches, True, products, cost)
-    for j in range(9):
-        _system(products[0], at[0], damping, Q)
-        along = at[0, j]
-        for r in range(9):
-            Q[2 * r + 1, 9 - LANES] = along * at[0, r] - (1.0 if r == j else 0.0)
-        eliminate(Q, 9)
-        for i in range(9):
-            out[i, j] = Q[2 * i + 1, 9 - LANES]
 
 
 @inner

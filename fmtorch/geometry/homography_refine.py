@@ -74,7 +74,9 @@ def refine_homography(
         matches = MatchesOfHomographies(x0, x1, weight, mask, H.detach(), scale)
         models = _refined(_seen_from_the_front(matches), matches, kernel, iterations)
         if wanted:
-            models = homography_at_optimum(models, matches.points, matches.weight, robust, matches.scale)
+            models = homography_at_optimum(
+                models, matches.points, matches.weight, robust, matches.scale.square()[:, None]
+            )
         return matches.to_pixels(models).reshape(H.shape)
 
 
@@ -83,27 +85,29 @@ def homography_at_optimum(
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
     robust: Kernel,
-    scale: Float[Tensor, " p"],
+    s2: Float[Tensor, (p #n
+)],
 ) -> Float[Tensor, "9 p k"]:
     """H, optima of unit norm on no graph, attached to the graph of points and weights by the implicit function theorem.
 
-    As `optimum.at_optimum`: the optimum moves by minus the inverse Hessian, across H, times the change of the gradient.
+    s2: squared scales of the loss. As `optimum.at_optimum`: the optimum moves by minus the inverse Hessian, across H,
+    times the change of the gradient.
     """
     valid = torch.isfinite(H).all(0) & (H != 0).any(0)
     model = torch.where(valid, H, torch.eye(3, dtype=H.dtype, device=H.device).reshape(9, 1, 1) / 3**0.5)
-    constants = points.detach(), weight.detach(), robust, scale.detach()
+    constants = points.detach(), weight.detach(), robust, s2.detach()
     exact = _hessian(model, *constants)
     inverse = inverse_hessian(exact, homography_curvature(model, *constants), model.movedim(0, -1)[..., None])
-    gradient = homography_gradient(model, points, weight, robust, scale)
+    gradient = homography_gradient(model, points, weight, robust, s2)
     moved = component_sum(inverse * (gradient - gradient.detach()), 1)
     return H - torch.where(valid, moved, 0)
 
 
-def _hessian(H: Tensor, points: Tensor, weight: Tensor, robust: Kernel, scale: Tensor) -> Float[Tensor, "p k 9 9"]:
+def _hessian(H: Tensor, points: Tensor, weight: Tensor, robust: Kernel, s2: Tensor) -> Float[Tensor, "p k 9 9"]:
     """Half the second derivative of the cost."""
     with torch.enable_grad():
         model = H.detach().clone().requires_grad_()
-        gradient = homography_gradient(model, points, weight, robust, scale)
+        gradient = homography_gradient(model, points, weight, robust, s2)
         rows = [torch.autograd.grad(gradient[i].sum(), model, retain_graph=True)[0] for i in range(9)]
     second = torch.stack(rows).movedim((0, 1), (-2, -1))
     return (second + second.mT) / 2

@@ -15,7 +15,7 @@ from fmtorch.compiling import switch
 from fmtorch.compiling.together import compile_together
 from fmtorch.core.arguments import Arrays, correspondences, number
 from fmtorch.core.checks import expect_values
-from fmtorch.core.stages import Estimator, Pruner
+from fmtorch.core.stages import Estimator, Pruner, model_of
 from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.geometry.verdict import judged
@@ -66,7 +66,7 @@ def find_fundamental(
 
     Raises:
         ValueError: for points of another shape, a prior outside [0, 1], a noise or an image size that is not positive,
-            the size of one image only, an unknown preset or an unknown option.
+            the size of one image only, an unknown preset or an unknown option, and an estimator of another model.
         TypeError: for what is no array of numbers.
 
     Example:
@@ -83,7 +83,7 @@ def find_fundamental(
         x0, x1, mask=mask, quality=quality, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, size0=size0,
         size1=size1, key=key,
     )  # fmt: skip
-    return _estimated(c, estimator, config_dir, seed, options)
+    return _estimated(c, "fundamental", estimator, config_dir, seed, options)
 
 
 def find_homography(
@@ -115,7 +115,7 @@ def find_homography(
         coordinates; inliers, ok, reason. Its significance is NaN: that is a test of fundamental matrices.
 
     Raises:
-        ValueError, TypeError: as `find_fundamental`, and ValueError for an estimator of another model.
+        ValueError, TypeError: as `find_fundamental`.
 
     Example:
         >>> import torch, fmtorch
@@ -128,19 +128,18 @@ def find_homography(
         (True, 40, (1, 3, 3))
     """
     c = correspondences(x0, x1, mask=mask, quality=quality, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, key=key)
-    estimate = _estimated(c, estimator, config_dir, seed, options)
-    if estimate.model != "homography":
-        raise ValueError(f"estimator={estimator} gives {estimate.model} matrices; find_homography needs homographies")
-    return estimate
+    return _estimated(c, "homography", estimator, config_dir, seed, options)
 
 
 def _estimated(
-    c: Correspondences, name: str, config_dir: Path | str | None, seed: int, options: Mapping[str, Any]
+    c: Correspondences, model: str, name: str, config_dir: Path | str | None, seed: int, options: Mapping[str, Any]
 ) -> Estimate:
     """The estimate of matches by a preset, with a prior of their consistency where it uses one and none is given."""
     expect_values(c)
     seed = int(number("seed", seed, whole=True))
     estimator = _estimator(name, config_dir, options)
+    if (gives := model_of(estimator)) != model:
+        raise ValueError(f"estimator={name} gives {gives} matrices; find_{model} needs one that gives {model} matrices")
     if c.prior is None and getattr(estimator, "uses_prior", False):
         framed = c.lafs0 is not None and c.lafs1 is not None and c.quality is not None
         pruner = _consistency("frame_consistency" if framed else "position_consistency")

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fmtorch.core.stages import Estimator, FeatureExtractor, Matcher, Pruner, TimedExtractor
+from fmtorch.core.stages import Estimator, FeatureExtractor, Matcher, Pruner, TimedExtractor, model_of
 from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Correspondences, Estimate, Features, collate
 from fmtorch.data.images import read_image
@@ -55,6 +55,7 @@ class Pipeline:
 
     memory: how many images' features are kept for pairs to come (about 5 MB an image at 8,000 SIFT features).
     families: by family, pruners that its pairs get in place of those of the same names.
+    Raises ValueError for an estimator of homographies.
     """
 
     def __init__(
@@ -68,6 +69,10 @@ class Pipeline:
         memory: int = 64,
         families: Mapping[str, Mapping[str, Pruner]] | None = None,
     ) -> None:
+        if (model := model_of(estimator)) != "fundamental":
+            raise ValueError(
+                f"the estimator gives {model} matrices; a pipeline needs one that gives fundamental matrices"
+            )
         self.extractor, self.matcher, self.pruners, self.estimator = features, matcher, dict(pruners), estimator
         self.families = dict(families or {})
         self.memory = memory

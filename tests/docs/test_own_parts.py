@@ -13,6 +13,7 @@ import pytest
 
 from fmtorch import data
 from fmtorch.core.stages import Estimator, FeatureExtractor, Matcher, Pruner
+from tests.laws import scene
 from tests.processes import run_command
 
 SOURCE = Path(__file__).resolve().parents[2]
@@ -61,3 +62,16 @@ def test_each_is_built_by_name_in_python(
 
     monkeypatch.syspath_prepend(str(folder))
     assert isinstance(presets.build(group, "mine", config_dir=folder / "my_conf"), protocol)
+
+
+@pytest.mark.parametrize("score", ["Welsch", "Triweight"])
+def test_a_score_a_sampler_and_a_rule(score: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from fmtorch import find_fundamental
+
+    monkeypatch.syspath_prepend(str(folder))
+    preset = folder / "my_conf" / "estimator" / "robust.yaml"
+    preset.write_text(preset.read_text().replace("my_robust.Welsch", f"my_robust.{score}"))
+    c = scene(1, 300, outliers=0.3)
+    found = find_fundamental(c.x0, c.x1, quality=c.quality, estimator="robust", config_dir=folder / "my_conf")
+    assert bool(found.ok[0])
+    assert int(found.inliers.sum()) > 180  # of 210

@@ -15,6 +15,7 @@ from fmtorch.geometry import (
 )
 from tests.geometry.test_homography import planar
 from tests.reference import homography as reference
+from tests.reference.homography_family import mapped, sampson_squared
 
 PX = 400.0  # of a unit of the points
 
@@ -41,7 +42,7 @@ def test_least_squares(batch: tuple[int, ...], n: int) -> None:
         assert bool(valid.all())
         for i in np.ndindex(batch):
             expected = reference.dlt(x0[i].numpy(), x1[i].numpy(), None if weight is None else weight[i].numpy())
-            there = reference.mapped(expected * np.sign(expected[2, 2]), x0[i].numpy())
+            there = mapped(expected, x0[i].numpy())
             # M squares the condition of the equations, some 30 here: 1e-16 * 1e3 in units, of 400 px.
             np.testing.assert_allclose(homography_points(H[i], x0[i]).numpy(), there, atol=1e-8)
     if n == 4:
@@ -102,8 +103,8 @@ def test_distances() -> None:
         a, b, h = x0[i].numpy(), x1[i].numpy(), H[i].numpy()
         expected = [reference.transfer(h, p, q) for p, q in zip(a, b, strict=True)]
         np.testing.assert_allclose(torch.maximum(d0, d1)[i].numpy(), expected, rtol=1e-9)
-        np.testing.assert_allclose(d1[i].numpy(), np.linalg.norm(reference.mapped(h, a) - b, axis=1), rtol=1e-9)
-        expected = [reference.sampson_squared(h, p, q) ** 0.5 for p, q in zip(a, b, strict=True)]
+        np.testing.assert_allclose(d1[i].numpy(), np.linalg.norm(mapped(h, a) - b, axis=1), rtol=1e-9)
+        expected = [np.sqrt(sampson_squared(h, np.append(p, q))) for p, q in zip(a, b, strict=True)]
         np.testing.assert_allclose(sampson[i].numpy(), expected, rtol=1e-8)
     for factor in (-1.0, 1e-200, 1e200):  # of any scale and sign
         for ours, scaled in zip((d0, d1), homography_transfer(H * factor, x0, x1), strict=True):

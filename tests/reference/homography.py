@@ -45,33 +45,3 @@ def plane_and_parallax(H: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndar
     lines = [np.cross(b, H @ a) for a, b in zip(homogeneous(x0), homogeneous(x1), strict=True)]
     e = np.cross(lines[0], lines[1])
     return unit(skew(e) @ H)
-
-
-def mapped(H: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Points (n, 2) under H; infinite on or behind its horizon, where the third coordinate is not positive."""
-    y = homogeneous(x) @ H.T
-    return np.where(y[:, 2:] > 0, y[:, :2] / np.where(y[:, 2:] == 0, 1, y[:, 2:]), np.inf)
-
-
-def areas(x: np.ndarray) -> np.ndarray:
-    """Twice the signed areas of the four triangles of four points."""
-    triangles = [homogeneous(np.delete(x, i, 0)) for i in range(4)]
-    return np.array([np.linalg.det(t - [*t[0][:2], 0]) for t in triangles])
-
-
-def four_point(x0: np.ndarray, x1: np.ndarray) -> np.ndarray | None:
-    """The homography of four matches, positive at their points; None where it turns one of their triangles over."""
-    if (areas(x0) * areas(x1) <= 0).any():
-        return None
-    H = dlt(x0, x1)
-    return H * np.sign((homogeneous(x0) @ H.T)[0, 2])
-
-
-def sampson_squared(H: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> float:
-    """e^T (J J^T)^-1 e of one match (Hartley & Zisserman 2004, section 4.2.6); infinite behind the horizon."""
-    X, Y, W = H @ np.append(x0, 1)
-    if W <= 0:
-        return float("inf")
-    e = np.array([X - x1[0] * W, Y - x1[1] * W])
-    J = np.column_stack([H[:2, :2] - np.outer(x1, H[2, :2]), -W * np.eye(2)])
-    return float(e @ np.linalg.solve(J @ J.T, e))

@@ -101,7 +101,3 @@ class Refining(Family, Estimated, Protocol):
     def step(self, F: Array, pair: Pair, weight: Array) -> Array:
         """The model (9,) after one Gauss-Newton step on weighted matches (n,); F (9,) where there is none."""
         ...
-
-    def response(self, F: Array, pair: Pair, weight: Array) -> Array:
-        """How the optimum F (9,) moves with the gradient of its cost, (9, 9): minus the inverse Hessian."""
-        ...

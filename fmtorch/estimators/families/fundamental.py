@@ -63,12 +63,6 @@ class Fundamental:
         gauss_newton(F, _squared_error(pair, weight), STEP_DAMPING, moved)
         return moved if np.isfinite(moved).all() else F
 
-    def response(self, F: Array, pair: Pair, weight: Array) -> Array:
-        """As `Refining.response`."""
-        inverse = np.empty((9, 9))
-        response(F, _squared_error(pair, weight), STEP_DAMPING, inverse)
-        return inverse if np.isfinite(inverse).all() else np.zeros((9, 9))
-
 
 class SevenPoint(Fundamental):
     """Up to three models from seven matches."""
@@ -85,3 +79,10 @@ class EightPoint(Fundamental):
 def _squared_error(pair: Pair, weight: Array) -> Weighted:
     """Weighted matches, whose errors are squared without bound."""
     return Weighted(pair.points, weight, np.full(pair.count, np.inf), LOSSES["truncated"], NO_TABLE)
+
+
+def response_of(F: Array, pair: Pair, weight: Array) -> Array:
+    """How the optimum F (9,) moves with the gradient of its cost, (9, 9): minus the inverse Hessian."""
+    inverse = np.empty((9, 9))
+    response(F, _squared_error(pair, weight), STEP_DAMPING, inverse)
+    return inverse if np.isfinite(inverse).all() else np.zeros((9, 9))

@@ -15,7 +15,6 @@ from fmtorch.geometry.homography_kernels import weighted_homography
 from fmtorch.geometry.homography_objective_kernels import (
     HOMOGRAPHY,
     refine_homographies,
-    response_of_homography,
     step_of_homography,
 )
 from fmtorch.geometry.levenberg_marquardt_kernels import Schedule
@@ -32,7 +31,7 @@ class Homography:
     model: ClassVar[str] = "homography"
     residual: ClassVar[Residual] = HOMOGRAPHY
     size: ClassVar[int] = 4
-    fit_scale: ClassVar[FitScale] = FitScale("cauchy", 0.8493, 1.25, 0.1, 4.0, 1.0, by_prior=False)
+    fit_scale: ClassVar[FitScale] = FitScale("cauchy", 0.8493, 1.5, 0.1, 4.0, 1.0, by_prior=False)
 
     def solve(self, pair: Pair, sample: Array, start: int) -> Hypotheses:
         """As `Family.solve`."""
@@ -70,12 +69,6 @@ class Homography:
         moved = np.empty(9)
         step_of_homography(F, _squared_error(pair, weight), STEP_DAMPING, moved)
         return moved if np.isfinite(moved).all() else F
-
-    def response(self, F: Array, pair: Pair, weight: Array) -> Array:
-        """As `Refining.response`."""
-        inverse = np.empty((9, 9))
-        response_of_homography(F, _squared_error(pair, weight), STEP_DAMPING, inverse)
-        return inverse if np.isfinite(inverse).all() else np.zeros((9, 9))
 
 
 def _squared_error(pair: Pair, weight: Array) -> Weighted:

@@ -32,8 +32,9 @@ class Fit(NamedTuple):
     """A fit's value, and what its gradient depends on.
 
     F: (9,), the estimate. at: (9,), the model at which the gradient is taken. counted: (n,), how much each match counts
-    there, between 0 and 1, by the loss. cameras: those assumed at the optimum. precision: one over the variance of an
-    inlier's distance, in the unit of the points, where cameras are assumed.
+    there: 1, or 0 beyond a truncated loss. cameras: those assumed at the optimum. precision: one over the variance of an
+    inlier's distance, in the unit of the points, where cameras are assumed. s2: (n,), squared scales of Cauchy's loss
+    in that unit, where it is the fit's.
     """
 
     F: Array
@@ -41,6 +42,7 @@ class Fit(NamedTuple):
     counted: Array
     cameras: Cameras | None = None
     precision: float = 0.0
+    s2: Array | None = None
 
 
 @runtime_checkable
@@ -128,18 +130,16 @@ class Adaptive:
             limits = Limits(precision, FOCAL_ITERATIONS, FOCAL_TOLERANCE)
             fit = FundamentalWithFocals().fit(selection.cameras, pair, scale, limits)
             if fit.gain <= PRIOR_CONFLICT_GAIN and all(map(math.isfinite, fit.F.tolist())):
-                return Fit(fit.F, fit.F, counted(fit.F, pair, own.loss, scale), fit.cameras, precision)
+                return Fit(fit.F, fit.F, within(fit.F, pair, scale), fit.cameras, precision)
         (F,) = family.refine(selection.F[None], pair, Loss(own.loss, scale), STEPS)
-        return Fit(F, F, counted(F, pair, own.loss, scale))
+        if own.loss == "cauchy":
+            return Fit(F, F, np.ones(pair.count), s2=np.square(scale / pair.pixels_per_noise))
+        return Fit(F, F, within(F, pair, scale))
 
 
-def counted(F: Array, pair: Pair, loss: str, scale: float) -> Array:
-    """How much each match (n,) counts in the curvature of a loss, whose scale is in pixels for usual noise."""
-    r2 = squared_in_noises(F, pair)
-    if loss == "cauchy":
-        share = squared(scale) / (squared(scale) + r2)
-        return np.maximum(share * (2 * share - 1), 0.0)
-    return (r2 <= squared(scale)).astype(np.float64)
+def within(F: Array, pair: Pair, scale: float) -> Array:
+    """One for each match (n,) within so many pixels, of matches of usual noise; zero beyond."""
+    return (squared_in_noises(F, pair) <= squared(scale)).astype(np.float64)
 
 
 def squared_in_noises(F: Array, pair: Pair) -> Array:

@@ -11,7 +11,7 @@ from fmtorch.compiling.scratch import vector
 from fmtorch.core.streams import Stream
 from fmtorch.estimators.options import Preselect
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.scores import Score
+from fmtorch.estimators.parts.scores import Score, scored
 from fmtorch.geometry.order_kernels import smallest_but, sort_by
 
 LAST_WORD = (1 << 63) - 1
@@ -34,10 +34,10 @@ class Preselection:
         if options is not None and len(F) > options.survivors:
             subset = self.subset(pair)
             if subset is not None:
-                first = self.first(F, which, subset)
+                first = scored(self.first, F, which, subset)
                 which = np.empty(options.survivors, np.int64)
                 best(first, which)
-        return which, self.score(F, which, pair)
+        return which, scored(self.score, F, which, pair)
 
     def subset(self, pair: Pair) -> Pair | None:
         """The pair with the few matches; None where there are not many more.

@@ -97,9 +97,31 @@ class PriorWeighted:
         return _drawn(pair, start, size, table, totals)
 
 
+def drawn(sampler: Sampler, pair: Pair, start: int, count: int, size: int) -> Array:
+    """What a sampler draws; ValueError where these are no samples of a pair's matches."""
+    sample, kind = sampler.draw(pair, start, count, size), type(sampler)
+    if kind in OWN:
+        return sample
+    if not isinstance(sample, np.ndarray) or sample.shape != (size, count) or sample.dtype.kind not in "iu":
+        what = f"{sample.dtype} {sample.shape}" if isinstance(sample, np.ndarray) else type(sample).__name__
+        raise ValueError(
+            f"{kind.__name__}.draw returns {what}; it must be an array of int64 {(size, count)}: "
+            f"{size} indices of matches for each of {count} draws"
+        )
+    if sample.min() < 0 or sample.max() >= pair.count:
+        raise ValueError(
+            f"{kind.__name__}.draw returns indices from {sample.min()} to {sample.max()}; they must be from 0 to "
+            f"{pair.count - 1}, of the {pair.count} matches of the pair"
+        )
+    return np.ascontiguousarray(sample, np.int64)
+
+
 def largest_weight(bucket: int) -> int:
     """The weight of a prior of one in a bucket of so many slots."""
     return 1 << (TOTAL_BITS - (bucket - 1).bit_length())
+
+
+OWN = (Uniform, Prosac, PriorWeighted)
 
 
 def _drawn(

@@ -145,6 +145,17 @@ class Magsac(CodedGains):
         super().__init__(threshold)
 
 
+def scored(score: Score, F: Array, which: Array, pair: Pair) -> Array:
+    """What a score says of models F[which] (k,), float64; ValueError where that is not one number for each."""
+    scores = score(F, which, pair)
+    if not isinstance(scores, np.ndarray) or scores.shape != which.shape or scores.dtype != np.float64:
+        what = f"{scores.dtype} {scores.shape}" if isinstance(scores, np.ndarray) else type(scores).__name__
+        raise ValueError(
+            f"{type(score).__name__} returns {what}; it must be an array of float64 {which.shape}: one number a model"
+        )
+    return scores
+
+
 def check_threshold(threshold: float) -> None:
     """Raise ValueError for what is no distance."""
     if not threshold > 0:

@@ -10,7 +10,7 @@ from fmtorch.compiling.arrays import Array
 from fmtorch.estimators.families.cameras import Cameras
 from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.parts.refinement import Candidates
-from fmtorch.estimators.parts.scores import Score
+from fmtorch.estimators.parts.scores import Score, scored
 
 
 class Selection(NamedTuple):
@@ -52,4 +52,4 @@ class BestScore:
 
 def scores_of(score: Score, F: Array, pair: Pair) -> Array:
     """Scores (k,) of models (k, 9), float64, on all matches."""
-    return score(F.astype(np.float32), np.arange(len(F)), pair)
+    return scored(score, F.astype(np.float32), np.arange(len(F)), pair)
