@@ -95,7 +95,8 @@ class FocalSearch:
             else:
                 confirmations += candidates.confirmed(new)
                 candidates = candidates.joined(new)
-            stop = self.stop is not None and self.stop(candidates.F[candidates.best], draws, pair, self.family.size)
+            best = candidates.F[candidates.best]
+            stop = self.stop is not None and candidates.valid and self.stop(best, draws, pair, self.family.size)
             agreed = candidates.unique_optimum or confirmations >= options.confirmations
             if turn + 1 >= options.min_rounds and agreed and stop:
                 break

@@ -100,7 +100,9 @@ class Search:
             start += count
             pool.merge(models)
             pool.draws = start
-            if self.stop is not None and start < end and self.stop(pool.F[0], start, pair, self.family.size):
+            if self.stop is None or not pool.filled or start == end:
+                continue
+            if self.stop(pool.F[0], start, pair, self.family.size):
                 break
         return pool
 

@@ -60,8 +60,12 @@ def homography_gradient(
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
     robust: Kernel,
-    s2: Float[Tensor, (p #n
-)],
+    s2: Float[
+        Tensor,
+        (
+            p  # n
+        ),
+    ],
 ) -> Float[Tensor, "9 p k"]:
     """Half the gradient of ``sum_i w_i rho(r_i^2)`` by the entries of H, ``G^T l``, attached to all inputs.
 
@@ -84,8 +88,12 @@ def homography_curvature(
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
     robust: Kernel,
-    s2: Float[Tensor, (p #n
-)],
+    s2: Float[
+        Tensor,
+        (
+            p  # n
+        ),
+    ],
 ) -> Float[Tensor, "p k 9 9"]:
     """The Gauss-Newton matrix ``G^T (J J^T)^-1 G`` with the curvature of the loss; arguments as of the gradient."""
     counted = weight > 0

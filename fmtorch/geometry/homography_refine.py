@@ -85,8 +85,12 @@ def homography_at_optimum(
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
     robust: Kernel,
-    s2: Float[Tensor, (p #n
-)],
+    s2: Float[
+        Tensor,
+        (
+            p  # n
+        ),
+    ],
 ) -> Float[Tensor, "9 p k"]:
     """H, optima of unit norm on no graph, attached to the graph of points and weights by the implicit function theorem.
 

@@ -69,7 +69,8 @@ def test_three_forms_of_the_error_equal_its_definition() -> None:
     for seed in range(20):
         p = behind(problem(seed))
         expected = np.array([reference.sampson_squared(p.h, match) for match in p.points.T])
-        assert np.isinf(expected[3]) and np.isfinite(np.delete(expected, 3)).all()
+        assert np.isinf(expected[3])
+        assert np.isfinite(np.delete(expected, 3)).all()
         error = linearise_homography(torch.from_numpy(p.h[:, None]), torch.from_numpy(p.points))
         tensors = torch.where(error.front, error.squared, torch.inf)
         one_by_one = [HOMOGRAPHY.of_match(p.h, *match) for match in p.points.T]
@@ -95,7 +96,8 @@ def test_exact_for_affinities_and_the_reprojection_distance_to_first_order_other
                 assert max(off) < 1e-10  # rounding of 1, over a distance of 1e-3
             else:
                 # c d + O(d^2): a tenth of the distance, a tenth of the error, but where c vanishes.
-                assert off[0] < 1e-2 and (off[1] < off[0] / 5 or off[0] < 1e-4)
+                assert off[0] < 1e-2
+                assert off[1] < off[0] / 5 or off[0] < 1e-4
 
 
 @pytest.mark.parametrize("loss", KINDS)
@@ -159,7 +161,8 @@ def test_a_model_that_is_no_number_has_no_cost() -> None:
     for loss in KINDS:
         p, out, cost = problem(0), np.empty((1, 9)), np.empty(1)
         refine_homographies(np.full((1, 9), np.nan), p.weighted(loss), Schedule(3, 1e-4, 0.0), out, cost)
-        assert np.isnan(cost[0]) and np.isnan(out).all()
+        assert np.isnan(cost[0])
+        assert np.isnan(out).all()
 
 
 def test_step_at_an_optimum() -> None:

@@ -54,7 +54,7 @@ def gradient(f: Callable[[np.ndarray], complex], h: np.ndarray) -> np.ndarray:
 
 
 def gauss_newton(h: np.ndarray, points: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """``sum_i w_i G^T (J J^T)^-1 G`` (9, 9), G the derivative of ``e + J d`` with the correction d of the match held."""
+    """``sum_i w_i G^T (J J^T)^-1 G`` (9, 9), G the derivative of ``e + J d`` with d, the correction, held."""
     total = np.zeros((9, 9))
     for match, w in zip(points.T, weight, strict=True):
         e, J = equations(h, match)

@@ -32,9 +32,9 @@ class Fit(NamedTuple):
     """A fit's value, and what its gradient depends on.
 
     F: (9,), the estimate. at: (9,), the model at which the gradient is taken. counted: (n,), how much each match counts
-    there: 1, or 0 beyond a truncated loss. cameras: those assumed at the optimum. precision: one over the variance of an
-    inlier's distance, in the unit of the points, where cameras are assumed. s2: (n,), squared scales of Cauchy's loss
-    in that unit, where it is the fit's.
+    there: 1, or 0 beyond a truncated loss. cameras: those assumed at the optimum. precision: one over the variance of
+    an inlier's distance, in the unit of the points, where cameras are assumed. s2: (n,), squared scales of Cauchy's
+    loss in that unit, where it is the fit's.
     """
 
     F: Array

@@ -61,7 +61,7 @@ class Prosac(Uniform):
 
     Matches are ranked by quality, smaller first, or by prior where there is no quality; without either all sets are
     equally likely, since the order of matches means nothing. Draw t takes the n(t)-th match and the others from those
-    before it, n(t) growing as the paper's equation 3 says for T_N draws.
+    before it, n(t) growing as the paper's equation 3 says for T_N draws; after these all sets are equally likely.
     """
 
     GROWTH = 200_000  # T_N: after so many draws PROSAC is RANSAC; the paper's value
@@ -71,8 +71,12 @@ class Prosac(Uniform):
         if pair.quality is None and pair.prior is None:
             return super().draw(pair, start, count, size)
         table = pair.cached(("growth", size), lambda pair: self.growth(pair.count, size))
-        newest = np.minimum(np.searchsorted(table, np.arange(start + 1, start + count + 1)), pair.count - 1)
-        return _drawn(pair, start, size, NONE, newest, newest, pair.cached("best matches first", _best_first))
+        ranked = min(max(int(table[-1]) - start, 0), count)
+        newest = np.searchsorted(table, np.arange(start + 1, start + ranked + 1))
+        sample = _drawn(pair, start, size, NONE, newest, newest, pair.cached("best matches first", _best_first))
+        if ranked == count:
+            return sample
+        return np.concatenate([sample, super().draw(pair, start + ranked, count - ranked, size)], 1)
 
     def growth(self, count: int, size: int) -> Array:
         """T'_n for n = 1 .. N: the last draw whose sample comes from the first n matches (equation 4), (n,) int64."""

@@ -69,15 +69,19 @@ def test_noise_and_wrong_matches() -> None:
     for seed in range(10):
         m = matches(seed)
         estimate = fmtorch.find_homography(m.x0, m.x1, seed=seed)
-        assert estimate.ok.tolist() == [True] and estimate.reason == ("",)
-        assert estimate.model == "homography" and estimate.significance.isnan().all()
+        assert estimate.ok.tolist() == [True]
+        assert estimate.reason == ("",)
+        assert estimate.model == "homography"
+        assert estimate.significance.isnan().all()
         assert torch.linalg.norm(estimate.H[0]) == pytest.approx(1, abs=1e-14)
         assert (torch.from_numpy(np.c_[m.x0, np.ones(200)][m.right]) @ estimate.H[0, 2] > 0).all()
-        # Twice: 8 degrees of freedom exceed it once in 1e4, a robust fit is some 10 % worse than least squares.
-        assert corner_error(estimate.H[0]) < 2 * expected_error(m, 0.5)
+        # Were all of it in one direction, a normal error would exceed 4 deviations (3.6 of a fit with an efficiency of
+        # 80 %) once in 3000 pairs.
+        assert corner_error(estimate.H[0]) < 4 * expected_error(m, 0.5)
         # Inliers lie within 5 standard deviations: P(|r| > 2.5 px) is 4e-6 for a right match, but for H's own error.
         inliers = estimate.inliers[0].numpy()
-        assert inliers[m.right].all() and inliers[~m.right].sum() <= 3
+        assert inliers[m.right].all()
+        assert inliers[~m.right].sum() <= 3
 
 
 def test_wrong_matches_beyond_the_horizon() -> None:
@@ -87,7 +91,8 @@ def test_wrong_matches_beyond_the_horizon() -> None:
         estimate = fmtorch.find_homography(m.x0, m.x1, seed=seed)
         below = Matches(m.x0[m.right], m.x1[m.right], m.right[m.right])
         alone = fmtorch.find_homography(*below[:2], seed=seed)
-        assert bool(estimate.ok) and bool(alone.ok)
+        assert bool(estimate.ok)
+        assert bool(alone.ok)
         # Cauchy's weight of a wrong match falls with the square of its distance: the two fits are nearer to each other
         # at the right matches than these are to them, 0.5 px.
         a, b = (reference.mapped(each.H[0].numpy(), below.x0) for each in (estimate, alone))
@@ -98,13 +103,10 @@ def test_four_exact_matches() -> None:
     for seed in range(10):
         m = matches(seed, 4, noise=0, wrong=0)
         estimate = fmtorch.find_homography(m.x0, m.x1)
-        if bool(estimate.ok):
-            np.testing.assert_allclose(
-                reference.mapped(estimate.H[0].numpy(), m.x0), m.x1, atol=1e-3
-            )  # samples are solved to float32, 6e-8 of 640 px, and refined
-            assert estimate.inliers.all()
-        else:
-            assert estimate.reason[0]
+        assert estimate.ok.tolist() == [True]
+        assert estimate.inliers.all()
+        # The fit is in float64: 1e-13 of 640 px, times the condition of four points, 1e3 or so.
+        assert corner_error(estimate.H[0]) < 1e-7
 
 
 def broken(kind: str) -> tuple[np.ndarray, np.ndarray]:
@@ -141,8 +143,11 @@ BROKEN = [
 def test_what_determines_no_homography_is_not_ok_with_a_reason(kind: str) -> None:
     x0, x1 = broken(kind)
     estimate = fmtorch.find_homography(x0, x1)
-    assert estimate.ok.tolist() == [False] and estimate.reason[0]
-    assert not estimate.H.any() and not estimate.inliers.any()
+    assert estimate.ok.tolist() == [False]
+    assert estimate.reason[0]
+    assert estimate.significance.tolist() == [-np.inf]
+    assert not estimate.H.any()
+    assert not estimate.inliers.any()
 
 
 def test_matches_that_are_not_finite_are_left_out() -> None:
@@ -150,8 +155,9 @@ def test_matches_that_are_not_finite_are_left_out() -> None:
     x0 = m.x0.copy()
     x0[150:160] = np.nan
     estimate = fmtorch.find_homography(x0, m.x1)
-    assert bool(estimate.ok) and not estimate.inliers[0, 150:160].any()
-    assert corner_error(estimate.H[0]) < 2 * expected_error(Matches(m.x0, m.x1, m.right & np.isfinite(x0[:, 0])), 0.5)
+    assert bool(estimate.ok)
+    assert not estimate.inliers[0, 150:160].any()
+    assert corner_error(estimate.H[0]) < 4 * expected_error(Matches(m.x0, m.x1, m.right & np.isfinite(x0[:, 0])), 0.5)
 
 
 def test_the_prior_chooses_between_two_planes() -> None:
@@ -161,7 +167,8 @@ def test_the_prior_chooses_between_two_planes() -> None:
     first = np.arange(200) < 100
     for chosen, truth in ((first, TRUTH), (~first, other)):
         estimate = fmtorch.find_homography(x0, x1, prior=np.where(chosen, 0.9, 0.05))
-        assert bool(estimate.ok) and corner_error(estimate.H[0], truth) < 3
+        assert bool(estimate.ok)
+        assert corner_error(estimate.H[0], truth) < 3
         assert estimate.inliers[0].numpy()[chosen].mean() > 0.95
     with pytest.raises(ValueError, match="prior"):
         fmtorch.find_homography(x0, x1, prior=np.full(200, 1.5))
@@ -188,11 +195,11 @@ def test_gradients_equal_finite_differences() -> None:
     assert (gradient[~m.right].abs() < 1e-3 * size).all()
 
 
-@pytest.mark.parametrize(("final", "tolerance"), [("gauss_newton", 0.03), ("adaptive", 0.05)])
+@pytest.mark.parametrize(("final", "tolerance"), [("gauss_newton", 0.03), ("adaptive", 0.1)])
 def test_gradients_under_noise_are_those_of_the_estimate(final: str, tolerance: float) -> None:
     """Against finite differences of the whole estimate, along random directions.
 
-    The scale of the adaptive fit is held, and both stop near the optimum.
+    The scale of the adaptive fit is held, though it changes with the residuals, and both stop near the optimum.
     """
     m = matches(2, 60, 0.3, 0.2)
     x0, x1 = (torch.from_numpy(x).requires_grad_() for x in (m.x0, m.x1))
@@ -222,23 +229,26 @@ def test_the_same_bits_alone_and_in_a_batch() -> None:
     assert together.ok.tolist() == [True, True, False, True]
     for i, m in enumerate(each):
         alone = fmtorch.find_homography(m.x0, m.x1, key=keys[i], seed=3)
-        assert torch.equal(alone.H[0], together.H[i]) and alone.reason[0] == together.reason[i]
+        assert torch.equal(alone.H[0], together.H[i])
+        assert alone.reason[0] == together.reason[i]
         assert torch.equal(alone.inliers[0], together.inliers[i, : len(m.x0)])
         assert not together.inliers[i, len(m.x0) :].any()
 
 
 @pytest.mark.parametrize("scale", [1e-9, 1e9])
-def test_any_unit_of_pixels_is_solved_without_an_exception(scale: float) -> None:
-    """Thresholds are in pixels: within 2.5 px of each other all are inliers, or none but exact ones."""
+def test_any_unit_of_pixels(scale: float) -> None:
+    """Thresholds are pixels: all matches are inliers of points within a pixel, only exact ones of huge images."""
     m = matches(10, noise=0, wrong=0.3)
     estimate = fmtorch.find_homography(scale * m.x0, scale * m.x1)
-    if bool(estimate.ok):
-        assert estimate.H.isfinite().all() and torch.linalg.norm(estimate.H[0]) == pytest.approx(1, abs=1e-12)
-        if scale > 1:
-            S = np.diag([scale, scale, 1])
-            assert corner_error(torch.from_numpy(np.linalg.inv(S) @ estimate.H[0].numpy() @ S)) < 1e-3
+    assert estimate.ok.tolist() == [True]
+    assert estimate.H.isfinite().all()
+    if scale > 1:
+        np.testing.assert_array_equal(estimate.inliers[0].numpy(), m.right)
+        S = np.diag([scale, scale, 1])
+        # Rounding grows with the points, so at the scale of the photograph it is that of exact matches above.
+        assert corner_error(torch.from_numpy(np.linalg.inv(S) @ estimate.H[0].numpy() @ S)) < 1e-7
     else:
-        assert estimate.reason[0]
+        assert estimate.inliers.all()
 
 
 def test_another_model_is_refused() -> None:
@@ -256,7 +266,8 @@ def test_a_warped_photograph() -> None:
     h, w = image.shape[:2]
     c = fmtorch.match(image, cv2.warpPerspective(image, TRUTH, (w, h)), pipeline="sift_fmtorch").correspondences
     estimate = fmtorch.find_homography(c.x0, c.x1, mask=c.mask, quality=c.quality, prior=c.prior, noise=c.noise)
-    assert bool(estimate.ok) and corner_error(estimate.H[0]) < 0.5  # half the error of a careless keypoint
+    assert bool(estimate.ok)
+    assert corner_error(estimate.H[0]) < 0.5
 
 
 def test_a_photographed_wall() -> None:
@@ -267,12 +278,13 @@ def test_a_photographed_wall() -> None:
     truth = np.array(str(text).split(), float).reshape(3, 3)
     c = fmtorch.match(a, b, pipeline="sift_fmtorch").correspondences
     estimate = fmtorch.find_homography(c.x0, c.x1, mask=c.mask, quality=c.quality, prior=c.prior, noise=c.noise)
-    assert bool(estimate.ok) and corner_error(estimate.H[0], truth) < 5
+    assert bool(estimate.ok)
+    assert corner_error(estimate.H[0], truth) < 5
 
 
 @pytest.mark.parametrize("options", [{"degeneracy": "degensac"}, {"local_optimization": "graph_cut"}, {"focal": {}}])
 def test_parts_for_fundamental_matrices_are_refused(options: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match="seven_point|is for fundamental matrices"):
+    with pytest.raises(ValueError, match=r"seven_point|is for fundamental matrices"):
         HypothesizeAndVerify(solver="four_point", **options)
 
 
