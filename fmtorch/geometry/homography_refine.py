@@ -99,12 +99,24 @@ def homography_at_optimum(
     """
     valid = torch.isfinite(H).all(0) & (H != 0).any(0)
     model = torch.where(valid, H, torch.eye(3, dtype=H.dtype, device=H.device).reshape(9, 1, 1) / 3**0.5)
-    constants = points.detach(), weight.detach(), robust, s2.detach()
-    exact = _hessian(model, *constants)
-    inverse = inverse_hessian(exact, homography_curvature(model, *constants), model.movedim(0, -1)[..., None])
+    inverse = inverse_hessian_of_homography(model, points.detach(), weight.detach(), robust, s2.detach())
     gradient = homography_gradient(model, points, weight, robust, s2)
     moved = component_sum(inverse * (gradient - gradient.detach()), 1)
     return H - torch.where(valid, moved, 0)
+
+
+def inverse_hessian_of_homography(
+    H: Float[Tensor, "9 p k"],
+    points: Float[Tensor, "4 p n"],
+    weight: Float[Tensor, "p n"],
+    robust: Kernel,
+    s2: Float[Tensor, (p #n
+)],
+) -> Float[Tensor, "9 9 p k"]:
+    """That of half the cost at optima of unit norm, across these; arguments as of `homography_at_optimum`."""
+    exact = _hessian(H, points, weight, robust, s2)
+    gauss_newton = homography_curvature(H, points, weight, robust, s2)
+    return inverse_hessian(exact, gauss_newton, H.movedim(0, -1)[..., None])
 
 
 def _hessian(H: Tensor, points: Tensor, weight: Tensor, robust: Kernel, s2: Tensor) -> Float[Tensor, "p k 9 9"]:

@@ -55,7 +55,6 @@ class Pipeline:
 
     memory: how many images' features are kept for pairs to come (about 5 MB an image at 8,000 SIFT features).
     families: by family, pruners that its pairs get in place of those of the same names.
-    Raises ValueError for an estimator of homographies.
     """
 
     def __init__(
@@ -70,9 +69,7 @@ class Pipeline:
         families: Mapping[str, Mapping[str, Pruner]] | None = None,
     ) -> None:
         if (model := model_of(estimator)) != "fundamental":
-            raise ValueError(
-                f"the estimator gives {model} matrices; a pipeline needs one that gives fundamental matrices"
-            )
+            raise ValueError(f"the estimator gives {model} matrices; a pipeline needs fundamental matrices")
         self.extractor, self.matcher, self.pruners, self.estimator = features, matcher, dict(pruners), estimator
         self.families = dict(families or {})
         self.memory = memory

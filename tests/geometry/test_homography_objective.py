@@ -15,6 +15,7 @@ from fmtorch.geometry.homography_objective_kernels import (
     refine_homographies,
     step_of_homography,
 )
+from fmtorch.geometry.homography_refine import inverse_hessian_of_homography
 from fmtorch.geometry.levenberg_marquardt_kernels import Schedule
 from fmtorch.geometry.robust_losses import KERNELS
 from fmtorch.geometry.sampson_objective_kernels import LOSSES, NO_TABLE, Weighted
@@ -165,13 +166,22 @@ def test_a_model_that_is_no_number_has_no_cost() -> None:
         assert np.isnan(out).all()
 
 
-def test_step_at_an_optimum() -> None:
+def test_step_at_an_optimum_and_inverse_hessian() -> None:
     for seed in range(5):
         p = problem(seed, n=60)
         out, moved = np.empty((1, 9)), np.empty(9)
         refine_homographies(p.h[None].copy(), p.unbounded(), Schedule(100, 1e-4, 0.0), out, np.empty(1))
         step_of_homography(out[0], p.unbounded(), 1e-10, moved)
         np.testing.assert_allclose(moved, out[0], atol=1e-7)  # sqrt(EPS) as above, times the condition
+        points, weight = torch.from_numpy(p.points[:, None].copy()), torch.from_numpy(p.weight[None])
+        at, unbounded = torch.from_numpy(out.T[..., None].copy()), torch.full((1, 1), torch.inf, dtype=torch.float64)
+        inverse = inverse_hessian_of_homography(at, points, weight, KERNELS["truncated"], unbounded)[..., 0, 0].numpy()
+        step = 1e-5
+        columns = [evaluated(out[0] + sign * step * e, p.unbounded())[0][9, :9] for e in np.eye(9) for sign in (1, -1)]
+        A = np.subtract(columns[::2], columns[1::2]).T / (2 * step)  # off by the third derivative times step^2
+        tangent = np.eye(9) - np.outer(out[0], out[0])
+        size = np.abs(A).max() * np.abs(inverse).max()
+        np.testing.assert_allclose(tangent @ A @ inverse, tangent, atol=1e-8 * size)
 
 
 @pytest.mark.parametrize("loss", KINDS)

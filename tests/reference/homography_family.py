@@ -38,7 +38,7 @@ def sampson_squared(h: np.ndarray, match: np.ndarray) -> complex:
     if (h.reshape(3, 3)[2] @ np.array([match[0], match[1], 1.0])).real <= 0:
         return np.inf
     e, J = equations(h, match)
-    return e @ np.linalg.solve(J @ J.T, e)
+    return np.sum(e * np.linalg.solve(J @ J.T, e))
 
 
 def robust_sum(h: np.ndarray, points: np.ndarray, weight: np.ndarray, s2: np.ndarray, loss: str) -> complex:

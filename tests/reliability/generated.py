@@ -176,7 +176,8 @@ def fields(data: st.DataObject, scene: Scene, kind: str) -> dict[str, Any]:
 
 
 def estimation(name: str, options: dict[str, Any], data: st.DataObject) -> tuple[Call, set[str], Check]:
-    """find_fundamental with a preset."""
+    """find_fundamental, or find_homography, with a preset."""
+    find = fmtorch.find_homography if name == "homography" else fmtorch.find_fundamental
     scene = data.draw(batches(), label="scene")
     arguments = fields(data, scene, data.draw(st.sampled_from(KINDS), label="kind"))
     if scene.batch == (1,) and data.draw(st.booleans(), label="without the batch dimension"):
@@ -184,9 +185,11 @@ def estimation(name: str, options: dict[str, Any], data: st.DataObject) -> tuple
     elif data.draw(st.sampled_from([False, False, True]), label="as lists"):
         per_match = [key for key in arguments if not key.startswith(("size", "key"))]
         arguments.update({key: list(arguments[key]) for key in per_match})
+    known = inspect.signature(find).parameters
+    arguments = {key: value for key, value in arguments.items() if key in known}
     mistaken(data, arguments, {"seed": None}, movable=False)
-    call = functools.partial(fmtorch.find_fundamental, **arguments, estimator=name, **options)
-    return call, {*inspect.signature(fmtorch.find_fundamental).parameters}, sound_estimate
+    call = functools.partial(find, **arguments, estimator=name, **options)
+    return call, {*known}, sound_estimate
 
 
 def sound_estimate(estimate: Any) -> None:
@@ -200,7 +203,8 @@ def sound_estimate(estimate: Any) -> None:
             assert reason[i] == "", f"ok with a reason: {reason[i]}"
             assert bool(F[i].isfinite().all()), "ok with an F that is not finite"
             assert math.isclose(float(F[i].norm()), 1, rel_tol=1e-4), f"ok with an F of norm {float(F[i].norm())}"
-            assert support >= MINIMAL_SAMPLE, f"ok with {support} inliers"
+            minimal = MINIMAL_SAMPLE if estimate.model == "fundamental" else 4
+            assert support >= minimal, f"ok with {support} inliers"
         else:
             assert reason[i], "not ok without a reason"
             assert not bool(F[i].any()), "not ok with an F"

@@ -63,12 +63,12 @@ def generate_all(
             done += 1
             report(done, total)
     finally:
-        for process in processes:
+        for worker in processes:
             if done < total:
-                process.terminate()
-            assert process.stdin is not None
-            process.stdin.close()
-            process.wait()
+                worker.terminate()
+            assert worker.stdin is not None
+            worker.stdin.close()
+            worker.wait()
 
 
 def _cores() -> int:

@@ -289,5 +289,5 @@ def test_parts_for_fundamental_matrices_are_refused(options: dict[str, object]) 
 
 
 def test_a_pipeline_needs_fundamental_matrices() -> None:
-    with pytest.raises(ValueError, match="the estimator gives homography matrices; a pipeline needs"):
+    with pytest.raises(ValueError, match="the estimator gives homography matrices; a pipeline needs fundamental"):
         fmtorch.presets.pipeline("sift_gms", overrides=["estimator=homography"])
