@@ -110,8 +110,12 @@ def inverse_hessian_of_homography(
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
     robust: Kernel,
-    s2: Float[Tensor, (p #n
-)],
+    s2: Float[
+        Tensor,
+        (
+            p  # n
+        ),
+    ],
 ) -> Float[Tensor, "9 9 p k"]:
     """That of half the cost at optima of unit norm, across these; arguments as of `homography_at_optimum`."""
     exact = _hessian(H, points, weight, robust, s2)

@@ -113,11 +113,11 @@ def warped(path: Path, behind: Path, seed: int) -> Case:
 
 def views(paths: list[Path], count: int) -> list[Case]:
     """So many pairs of views of each photograph, kept in the cache folder, that see a tenth of the grid in common."""
-    photographs = [Photograph(path, path.name) for path in paths]
     cases = []
     for seed in range(count):
-        planes = PlanePairs(photographs, PlaneViews(views=2), seed)
-        for path, pair in zip(track(paths, "views", console=console), planes, strict=True):
+        for path in track(paths, "views", console=console):
+            planes = PlanePairs([Photograph(path, path.name)], PlaneViews(views=2), seed)
+            (pair,) = planes
             images = [_read(image.path) for image in (pair.image0, pair.image1)]
             H, sizes = planes.homography(pair), [np.array(image.shape[1::-1]) for image in images]
             grid = np.stack(np.meshgrid(*(np.linspace(0, side - 1, GRID) for side in sizes[0])), -1).reshape(-1, 2)
