@@ -22,11 +22,12 @@ from pathlib import Path
 from typing import Any
 
 from fmtorch.compiling import calls
-from fmtorch.compiling.version import version_of
 from fmtorch.core.resources import cache_dir
 
 HERE = Path(__file__).resolve().parent
-_HOW = ("kernel.py", "inner.py", "calls.py", "lanes.py", "lane_types.py", "lane_functions.py")  # the files that say how
+_HOW = (  # the files that say how
+    "kernel.py", "fused.py", "inner.py", "calls.py", "version.py", "lanes.py", "lane_types.py", "lane_functions.py",
+)  # fmt: skip
 ABOUT = "about.json"  # in each folder; its time of change is when the folder was last used
 UNUSED_DAYS = 30  # after which a folder is removed
 _SETTINGS = ("BOUNDSCHECK", "CPU_FEATURES", "CPU_NAME", "DEBUGINFO_DEFAULT", "ENABLE_AVX", "LOOP_VECTORIZE", "OPT")
@@ -88,21 +89,22 @@ def _remove_unused(used: Path) -> None:
             continue  # not one of ours, or somebody else removed it
 
 
+def path(function: Callable[..., Any], version: str) -> Path | None:
+    """The file of a version of a kernel, which need not exist; None where there is no folder."""
+    where = folder()
+    return None if where is None else where / f"{function.__module__}.{function.__qualname__}-{version[:16]}.bin"
+
+
 class KernelFile:
-    """The file of one kernel and signature; what numba calls the cache of a function.
+    """The file of one version of a kernel; what numba calls the cache of a function.
 
     missing: called before the function is compiled, with words that say where it will be kept. calls: once loaded or
     saved, the kernels that the function calls.
     """
 
-    def __init__(self, function: Callable[..., Any], signature: Any, missing: Callable[[str], None]) -> None:
-        self.missing = missing
+    def __init__(self, path: Path | None, missing: Callable[[str], None]) -> None:
+        self.path, self.missing = path, missing
         self.calls: list[Any] = []
-        self.path: Path | None = None
-        where = folder()
-        if where is not None:
-            version = version_of(function, signature)
-            self.path = where / f"{function.__module__}.{function.__qualname__}-{version}.bin"
 
     @property
     def cache_path(self) -> str | None:

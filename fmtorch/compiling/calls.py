@@ -40,6 +40,21 @@ def called(machine_code: bytes) -> list[Any]:
     return [kernel_of(module, name) for module, name in places]
 
 
+def register(kernel: Any) -> None:
+    """Makes a kernel the one of its name, by which its callers find it.
+
+    Raises ValueError where a function has made another one of this name, from other values.
+    """
+    function = kernel.function
+    place = (function.__module__, function.__qualname__)
+    if place in KERNELS:
+        other = KERNELS[place].function
+        cells, others = ([each.cell_contents for each in f.__closure__ or ()] for f in (function, other))
+        if function.__code__ is other.__code__ and any(a is not b for a, b in zip(cells, others, strict=True)):
+            raise ValueError(f"two kernels are called {'.'.join(place)}: make each with a name=... of its own")
+    KERNELS[place] = kernel
+
+
 def kernel_of(module: str, name: str) -> Any:
     """The kernel of this name in a module, which is imported if need be."""
     importlib.import_module(module)
@@ -57,7 +72,7 @@ def callable_type(function: Callable[..., Any], signature: Any) -> Any:
     from numba.core.typing import signature as typed
     from numba.core.typing.templates import make_concrete_template
 
-    annotation = _returned(function)
+    annotation = returned(function)
     if annotation not in RETURNED:
         names = ", ".join(RETURNED)
         raise TypeError(f"{function.__qualname__} is called by a kernel: annotate what it returns as one of {names}")
@@ -88,15 +103,15 @@ def publish(function: Callable[..., Any], made: Any) -> None:
     """
     from numba.core import types
 
-    annotation = _returned(function)
-    returned = made.signature.return_type
-    if annotation in RETURNED and returned != getattr(types, RETURNED[annotation]):
-        raise TypeError(f"{function.__qualname__} is annotated to return {annotation}, but returns {returned}")
+    annotation = returned(function)
+    kind = made.signature.return_type
+    if annotation in RETURNED and kind != getattr(types, RETURNED[annotation]):
+        raise TypeError(f"{function.__qualname__} is annotated to return {annotation}, but returns {kind}")
     address = made.library.get_pointer_to_function(made.fndesc.llvm_func_name)
     cell(function.__module__, function.__qualname__).value = address
 
 
-def _returned(function: Callable[..., Any]) -> str:
+def returned(function: Callable[..., Any]) -> str:
     """The name of what a function says that it returns; empty where it does not say."""
     annotation = function.__annotations__.get("return", "")
     return annotation if isinstance(annotation, str) else getattr(annotation, "__name__", str(annotation))

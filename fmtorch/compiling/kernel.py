@@ -15,17 +15,15 @@ import contextlib
 import functools
 import gc
 import inspect
-import platform
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any, Generic, ParamSpec, TypeVar, overload
 
-import numpy as np
-
 from fmtorch.compiling import cache, calls, switch
 from fmtorch.compiling.inner import inner_compiler
-from fmtorch.compiling.signature import signature_of
+from fmtorch.compiling.signature import described, signature_of
+from fmtorch.compiling.version import named_by_version, version
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -55,13 +53,23 @@ class Kernel(Generic[P, R]):
         self.holds_gil = holds_gil
         self._compiled: Callable[P, R] | None = None
         self.calls: list[Kernel[..., Any]] = []  # those that it calls, once it is compiled
-        calls.KERNELS[self.function.__module__, self.function.__qualname__] = self
+        calls.register(self)
         self.__call__ = self._first_call
 
     @functools.cached_property
     def signature(self) -> Any:
         """The types of its arguments."""
         return signature_of(self.function)
+
+    @functools.cached_property
+    def version(self) -> str:
+        """What it is made of, in hexadecimal digits (`fmtorch.compiling.version`)."""
+        return version(self.function, described(self.signature), f"holds_gil={self.holds_gil}")
+
+    def described(self) -> tuple[str, None]:
+        """Its name and types, all that a kernel that calls it depends on."""
+        module, name = self.function.__module__, self.function.__qualname__
+        return f"kernel {module}.{name}({described(self.signature)}) -> {calls.returned(self.function)}", None
 
     def _first_call(self, *args: P.args, **kwargs: P.kwargs) -> R:
         if switch.off():
@@ -89,7 +97,7 @@ class Kernel(Generic[P, R]):
         """
         with _lock:
             if self._compiled is None:
-                self._compiled, self.calls = _compiled(self.function, self.signature, self.holds_gil, count)
+                self._compiled, self.calls = _compiled(self, count)
         return self._compiled
 
     @property
@@ -100,7 +108,7 @@ class Kernel(Generic[P, R]):
     @property
     def kept(self) -> bool:
         """Whether the cache folder holds it. Raises ImportError where numba cannot be imported."""
-        path = cache.KernelFile(self.function, self.signature, print).path
+        path = cache.path(self.function, self.version)
         return path is not None and path.is_file()
 
     @functools.cached_property
@@ -133,11 +141,16 @@ class Inner(Generic[P, R]):
         how: dict[str, Any] = {"inline": "always"} if self.inline else {}
         if (compiler := inner_compiler()) is not None:
             how["pipeline_class"] = compiler
-        return numba.njit(**OPTIONS, no_cpython_wrapper=True, **how)(self.function)
+        function = named_by_version(self.function, version(self.function))
+        return numba.njit(**OPTIONS, no_cpython_wrapper=True, **how)(function)
 
     @property
     def _numba_type_(self) -> Any:
         return _type_of(self._dispatcher)
+
+    def described(self) -> tuple[str, Callable[..., Any] | None]:
+        """How it is compiled, and its function, which is compiled into those that call it."""
+        return f"inner, inline={self.inline}", self.function
 
     def __reduce__(self) -> str:
         return str(self.__qualname__)  # type: ignore[attr-defined]  # the name to import it by
@@ -174,58 +187,25 @@ def inner(function: Callable[P, R] | None = None, *, inline: bool = False) -> An
     return Inner(function, inline) if function is not None else lambda f: Inner(f, inline)
 
 
-class _Fused(Inner[[Any, Any, Any], Any]):
-    """`fused`, compiled into one instruction where the processor has it."""
-
-    @functools.cached_property
-    def _dispatcher(self) -> Any:
-        import numba
-        from llvmlite import binding
-        from numba.extending import intrinsic
-
-        if not binding.get_host_cpu_features().get("fma", platform.machine() in ("arm64", "aarch64")):
-            return numba.njit(**OPTIONS, no_cpython_wrapper=True)(self.function)
-
-        @intrinsic  # type: ignore[untyped-decorator]
-        def instruction(context: Any, b: Any, c: Any, a: Any) -> Any:
-            def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-                return builder.fma(*values)
-
-            return numba.types.float32(*[numba.types.float32] * 3), code
-
-        def fused(a: Any, b: Any, c: Any) -> Any:
-            return instruction(b, c, a)
-
-        return numba.njit(**OPTIONS, no_cpython_wrapper=True)(inspect.unwrap(fused))
-
-
-def _fused(a: Any, b: Any, c: Any) -> Any:
-    """a + b c of float32 numbers, rounded once, to float32."""
-    return np.float32(np.float64(a) + np.float64(b) * np.float64(c))
-
-
-fused = _Fused(_fused, inline=False)
-
-
-def _compiled(
-    function: Callable[P, R], signature: Any, holds_gil: bool, count: str
-) -> tuple[Callable[P, R], list[Kernel[..., Any]]]:
-    """The compiled function, whose address its cell holds from now on, and the kernels that it calls."""
+def _compiled(made: Kernel[P, R], count: str) -> tuple[Callable[P, R], list[Kernel[..., Any]]]:
+    """The compiled function of a kernel, whose address its cell holds from now on, and the kernels that it calls."""
     import numba
 
-    dispatcher: Any = numba.njit(**(OPTIONS | {"nogil": not holds_gil}))(function)
+    function = made.function
+    how = OPTIONS | {"nogil": not made.holds_gil}
+    dispatcher: Any = numba.njit(**how)(named_by_version(function, made.version))
     if not hasattr(dispatcher, "compile"):
         return function, []  # NUMBA_DISABLE_JIT=1
 
     def tell(where: str) -> None:
         print(f"{count}compiling {function.__name__} {where}", file=sys.stderr, flush=True)
 
-    file = dispatcher._cache = cache.KernelFile(function, signature, tell)
+    file = dispatcher._cache = cache.KernelFile(cache.path(function, made.version), tell)
     with _no_garbage_collection():
-        dispatcher.compile(signature)
+        dispatcher.compile(made.signature)
     dispatcher.disable_compile()
-    (made,) = dispatcher.overloads.values()
-    calls.publish(function, made)
+    (result,) = dispatcher.overloads.values()
+    calls.publish(function, result)
     compiled: Callable[P, R] = dispatcher
     return compiled, file.calls
 

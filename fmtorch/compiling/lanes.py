@@ -40,6 +40,10 @@ class LaneFunction(Inner[..., Any]):
         super().__init__(function, inline=False)
         self.parameters = parameters
 
+    def described(self) -> tuple[str, None]:
+        """Its name and parameters: the files of lanes count into the version of every kernel."""
+        return f"lanes {self.function.__name__}{self.parameters}", None
+
     @functools.cached_property
     def _numba_type_(self) -> Any:  # asked by numba where a kernel calls this function
         from fmtorch.compiling import lane_functions

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -18,6 +18,16 @@ def signature_of(function: Callable[..., Any]) -> tuple[Any, ...]:
     hints = get_type_hints(function, include_extras=True)
     names = function.__code__.co_varnames[: function.__code__.co_argcount]
     return tuple(_type(hints.get(name), f"{function.__qualname__}: {name}") for name in names)
+
+
+def described(kinds: Iterable[Any]) -> str:
+    """Types of arguments in words: of groups also where the class is and how its members are called."""
+    return ", ".join(f"{_group(kind)}({described(kind)})" if hasattr(kind, "fields") else str(kind) for kind in kinds)
+
+
+def _group(kind: Any) -> str:
+    of = kind.instance_class
+    return f"{of.__module__}.{of.__qualname__} {' '.join(kind.fields)}"
 
 
 def _type(hint: Any, what: str) -> Any:

@@ -24,7 +24,9 @@ _lock = threading.Lock()
 def compile_together(kernels: Sequence[Kernel[..., Any]]) -> None:
     """Have kernels ready to be called; those that this machine has not compiled yet are compiled, with messages.
 
-    The slowest should come first. Raises ImportError where numba cannot be imported.
+    This process begins at the first, the other at the last. An inner function is compiled in each process that needs
+    it: kernels that share many should stand side by side, the slowest at both ends. Raises ImportError where numba
+    cannot be imported.
     """
     if switch.off() or all(each.ready for each in kernels):
         return
@@ -68,12 +70,12 @@ def _helper() -> subprocess.Popen[str] | None:
 
 
 def _feed(helper: subprocess.Popen[str], waiting: collections.deque[tuple[str, Kernel[..., Any]]]) -> None:
-    """Gives the other process one kernel after the other; ends when none waits or that process has ended."""
+    """Gives the other process one kernel after the other, from the last; ends when none waits or it has ended."""
     assert helper.stdin is not None
     assert helper.stdout is not None
     with contextlib.suppress(IndexError, OSError, ValueError):  # none waits, or the pipe is closed
         while helper.stdout.readline():  # it is ready for one
-            count, each = waiting.popleft()
+            count, each = waiting.pop()
             helper.stdin.write(f"{each.__module__} {each.__qualname__} {count}\n")  # type: ignore[attr-defined]
             helper.stdin.flush()
 

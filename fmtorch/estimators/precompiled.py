@@ -1,4 +1,4 @@
-"""Kernels of an estimator with the prior on focal lengths, the slowest to compile first."""
+"""Kernels of an estimator with the prior on focal lengths, by what they share, the slowest to compile at both ends."""
 
 from __future__ import annotations
 
@@ -26,36 +26,36 @@ from fmtorch.geometry import (
 )
 
 WITH_FOCALS: tuple[Kernel[..., Any], ...] = (
-    five_point_kernels.five_point,
-    sampson_objective_kernels.evaluate,  # called by `minimise` and `refine`
+    five_point_kernels.five_point,  # solvers, samples and scores
     seven_point_kernels.seven_point,
-    posterior.minimise,
-    refine_kernels.refine,
-    cameras.nearest_cameras,
     significance_kernels.counted_chances,
-    pair.normalize_pair,
+    refinement.near,
     sampling.draw,
-    cheirality.cheirality,
+    focals.draw_depths,
+    preselection.draw_by_prior,
+    preselection.best,
     scores.score_gains,
     saturated.score_saturated,
+    pair.normalize_pair,
     pair.to_pixels,
     support.support,
     inliers.residuals_squared,
-    preselection.best,
-    cameras.translate,
-    search.merge,
-    refinement.near,
-    focals.gain_without_prior,
-    saturated.saturated_cells,
-    focals.draw_depths,
-    focals.refine_with_prior,
-    significance_kernels.most_significant,
-    preselection.draw_by_prior,
     inliers.share_within,
-    cameras.centre,
+    search.merge,
+    saturated.saturated_cells,
     scored_matches.pack,
     sampling.quantise,
     focal_search.posteriors,
     focal_search.distinct_models,
     focal_search.same_model,
+    cameras.centre,  # cameras and fits
+    cameras.translate,
+    focals.gain_without_prior,
+    focals.refine_with_prior,
+    cheirality.cheirality,
+    significance_kernels.most_significant,
+    cameras.nearest_cameras,
+    sampson_objective_kernels.evaluate,  # called by `minimise` and `refine`
+    refine_kernels.refine,
+    posterior.minimise,
 )

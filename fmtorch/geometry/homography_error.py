@@ -60,16 +60,11 @@ def homography_gradient(
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
     robust: Kernel,
-    s2: Float[
-        Tensor,
-        (
-            p  # n
-        ),
-    ],
+    s2: Float[Tensor, "p slots"],
 ) -> Float[Tensor, "9 p k"]:
     """Half the gradient of ``sum_i w_i rho(r_i^2)`` by the entries of H, ``G^T l``, attached to all inputs.
 
-    s2: squared scales of the loss. Matches of weight zero and those behind the horizon count nothing, wherever they
+    s2: squared scales of the loss, one a pair or a match. Matches of weight zero and those behind the horizon count nothing, wherever they
     are.
     """
     counted = weight.detach() > 0
@@ -88,12 +83,7 @@ def homography_curvature(
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
     robust: Kernel,
-    s2: Float[
-        Tensor,
-        (
-            p  # n
-        ),
-    ],
+    s2: Float[Tensor, "p slots"],
 ) -> Float[Tensor, "p k 9 9"]:
     """The Gauss-Newton matrix ``G^T (J J^T)^-1 G`` with the curvature of the loss; arguments as of the gradient."""
     counted = weight > 0

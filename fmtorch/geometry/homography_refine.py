@@ -85,16 +85,11 @@ def homography_at_optimum(
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
     robust: Kernel,
-    s2: Float[
-        Tensor,
-        (
-            p  # n
-        ),
-    ],
+    s2: Float[Tensor, "p slots"],
 ) -> Float[Tensor, "9 p k"]:
     """H, optima of unit norm on no graph, attached to the graph of points and weights by the implicit function theorem.
 
-    s2: squared scales of the loss. As `optimum.at_optimum`: the optimum moves by minus the inverse Hessian, across H,
+    s2: squared scales of the loss, one a pair or a match. As `optimum.at_optimum`: the optimum moves by minus the inverse Hessian, across H,
     times the change of the gradient.
     """
     valid = torch.isfinite(H).all(0) & (H != 0).any(0)
@@ -110,12 +105,7 @@ def inverse_hessian_of_homography(
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
     robust: Kernel,
-    s2: Float[
-        Tensor,
-        (
-            p  # n
-        ),
-    ],
+    s2: Float[Tensor, "p slots"],
 ) -> Float[Tensor, "9 9 p k"]:
     """That of half the cost at optima of unit norm, across these; arguments as of `homography_at_optimum`."""
     exact = _hessian(H, points, weight, robust, s2)

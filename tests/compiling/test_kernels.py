@@ -19,8 +19,8 @@ import pytest
 
 from fmtorch.compiling import cache as files
 from fmtorch.compiling import switch, together
-from fmtorch.compiling.kernel import Inner, Kernel, fused, inner, kernel
-from fmtorch.compiling.version import version_of
+from fmtorch.compiling.fused import fused
+from fmtorch.compiling.kernel import Inner, Kernel, inner, kernel
 from tests.processes import run_command
 
 SOURCE = """
@@ -200,71 +200,6 @@ def test_the_other_process_compiles_what_it_is_told(module: types.ModuleType, tm
     assert module.rows.kept
 
 
-EDITS = """
-import numpy as np
-from fmtorch.compiling.kernel import inner, kernel
-
-{constant}
-TABLE = np.arange({length})
-
-@inner
-def reached(x):
-    "{doc}"
-    return x * FACTOR + TABLE[0]
-
-@kernel
-def callee(x: float) -> float:
-    return {callee}
-
-@kernel
-def caller(x: float) -> float:
-    return reached(x) + callee(x)
-
-@kernel
-def other(x: float) -> float:
-    return x
-"""
-PLAIN = {"constant": "FACTOR = 2.0", "length": 3, "doc": "One.", "callee": "x"}
-
-
-def versions(folder: Path, **changes: object) -> dict[str, str]:
-    module = load(folder, EDITS.format(**(PLAIN | changes)))
-    kernels = {name: getattr(module, name) for name in ("callee", "caller", "other")}
-    return {name: version_of(each.function, each.signature) for name, each in kernels.items()}
-
-
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        ({"constant": "FACTOR = 3.0"}, {"caller"}),
-        ({"length": 4}, {"caller"}),
-        ({"callee": "2 * x"}, {"callee"}),  # its caller finds it by its address
-        ({"doc": "Another docstring."}, set()),
-        ({"constant": "# a line more\nUNUSED = 1\nFACTOR = 2.0"}, set()),
-    ],
-)
-def test_an_edit_changes_the_kernels_that_reach_it(
-    change: dict[str, object], expected: set[str], tmp_path: Path
-) -> None:
-    before, after = versions(tmp_path), versions(tmp_path, **change)
-    assert {name for name in before if before[name] != after[name]} == expected
-
-
-def test_versions_are_the_same_in_every_process() -> None:
-    code = (
-        "from fmtorch.compiling.version import version_of; from fmtorch.estimators.precompiled import WITH_FOCALS;"
-        "print([version_of(each.function, each.signature) for each in WITH_FOCALS])"
-    )
-    outputs = {
-        subprocess.run(
-            [sys.executable, "-c", code], env={**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": str(REPOSITORY)},
-            capture_output=True, text=True, check=True,
-        ).stdout
-        for seed in ("1", "2")
-    }  # fmt: skip
-    assert len(outputs) == 1
-
-
 def test_the_folder_depends_on_what_decides_the_machine_code(monkeypatch: pytest.MonkeyPatch) -> None:
     before = files.folder()
     monkeypatch.setattr(numba, "__version__", "9.9.9")
@@ -275,7 +210,8 @@ def test_the_folder_depends_on_what_decides_the_machine_code(monkeypatch: pytest
 def test_fused_arithmetic_rounds_once_compiled_and_not(tmp_path: Path) -> None:
     source = """
 from fmtorch.compiling.arrays import F4x1
-from fmtorch.compiling.kernel import fused, kernel
+from fmtorch.compiling.fused import fused
+from fmtorch.compiling.kernel import kernel
 
 @kernel
 def all_fused(a: F4x1, b: F4x1, c: F4x1, out: F4x1):
@@ -292,6 +228,20 @@ def all_fused(a: F4x1, b: F4x1, c: F4x1, out: F4x1):
 def test_an_edited_kernel_outside_the_package_is_compiled_anew(tmp_path: Path) -> None:
     assert result(load(tmp_path)) == EXPECTED
     assert result(load(tmp_path, SOURCE.replace("x * x", "x * x * x"))) == [[2, 16], [54, 128]]
+
+
+def test_kernels_that_a_function_makes_have_names_of_their_own() -> None:
+    def made(by: float, **options: str) -> Kernel[..., float]:
+        @kernel(**options)
+        def scaled(x: float) -> float:
+            return x * by
+
+        return scaled
+
+    assert made(2.0, name="doubled")(1.0) == 2
+    assert made(3.0, name="tripled")(1.0) == 3
+    with pytest.raises(ValueError, match=r"two kernels are called .*doubled: make each with a name="):
+        made(4.0, name="doubled")
 
 
 def test_a_damaged_file_is_compiled_anew(tmp_path: Path, cache: Path) -> None:

@@ -6,6 +6,7 @@ So derivatives are exact: that of f by h in the direction v is ``Im f(h + i t v)
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import cast
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -38,7 +39,7 @@ def sampson_squared(h: np.ndarray, match: np.ndarray) -> complex:
     if (h.reshape(3, 3)[2] @ np.array([match[0], match[1], 1.0])).real <= 0:
         return np.inf
     e, J = equations(h, match)
-    return np.sum(e * np.linalg.solve(J @ J.T, e))
+    return cast(complex, e @ np.linalg.solve(J @ J.T, e))
 
 
 def robust_sum(h: np.ndarray, points: np.ndarray, weight: np.ndarray, s2: np.ndarray, loss: str) -> complex:

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.compiling.arrays import F4x1, F4x2, F4x3, I4x1, I8x1, U1x1
-from fmtorch.compiling.kernel import fused, inner, kernel
+from fmtorch.compiling.fused import fused
+from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.data.rendered.raycast_kernels import Index, Real
 
 Pixels = NDArray[np.uint8]

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from fmtorch.compiling.arrays import F4x2, I8x1
-from fmtorch.compiling.kernel import fused, kernel
+from fmtorch.compiling.fused import fused
+from fmtorch.compiling.kernel import kernel
 
 
 class Neighbours(NamedTuple):
