@@ -64,8 +64,8 @@ def homography_gradient(
 ) -> Float[Tensor, "9 p k"]:
     """Half the gradient of ``sum_i w_i rho(r_i^2)`` by the entries of H, ``G^T l``, attached to all inputs.
 
-    s2: squared scales of the loss, one a pair or a match. Matches of weight zero and those behind the horizon count nothing, wherever they
-    are.
+    s2: squared scales of the loss, one a pair or a match. Matches of weight zero and those behind the horizon count
+    nothing, wherever they are.
     """
     counted = weight.detach() > 0
     matches = torch.where(counted, points, 0)[:, :, None]

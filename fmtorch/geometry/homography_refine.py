@@ -89,8 +89,8 @@ def homography_at_optimum(
 ) -> Float[Tensor, "9 p k"]:
     """H, optima of unit norm on no graph, attached to the graph of points and weights by the implicit function theorem.
 
-    s2: squared scales of the loss, one a pair or a match. As `optimum.at_optimum`: the optimum moves by minus the inverse Hessian, across H,
-    times the change of the gradient.
+    s2: squared scales of the loss, one a pair or a match. As `optimum.at_optimum`: the optimum moves by minus the
+    inverse Hessian, across H, times the change of the gradient.
     """
     valid = torch.isfinite(H).all(0) & (H != 0).any(0)
     model = torch.where(valid, H, torch.eye(3, dtype=H.dtype, device=H.device).reshape(9, 1, 1) / 3**0.5)
