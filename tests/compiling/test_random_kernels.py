@@ -1,4 +1,4 @@
-"""Random numbers of kernels: those of the tensor form and of the definition, bit by bit."""
+"""Random numbers of kernels: those of the definition, and of tensors, bit by bit."""
 
 from __future__ import annotations
 
@@ -6,26 +6,26 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.compiling.arrays import I8x1
-from fmtorch.compiling.kernel import kernel
-from fmtorch.compiling.random_kernels import random_bits, stream_state
-from fmtorch.core.random import bits
+from fmtorch.core.random import uniform
 from fmtorch.core.streams import Stream, mixed_seed
+from fmtorch.estimators.pair import uniforms
+from fmtorch.estimators.parts.preselection import shuffle
 from tests.reference.random import number
-
-
-@kernel
-def numbers(mixed_seed: int, key: int, out: I8x1) -> None:
-    state = stream_state(mixed_seed, key)
-    for i in range(len(out)):
-        out[i] = np.int64(random_bits(state, i))
 
 
 @pytest.mark.parametrize("key", [0, 1, -1, 2**63 - 1, -(2**63)])
 @pytest.mark.parametrize("seed", [0, 5, -3, 2**62])
 def test_the_same_bits(seed: int, key: int) -> None:
     for stream in (Stream.SAMPLING, Stream.REFINEMENT):
-        out = np.empty(1000, np.int64)
-        numbers(mixed_seed(seed, stream), key, out)
-        np.testing.assert_array_equal(out, bits(seed, torch.tensor([key]), stream, 0, 1000, 1)[0, :, 0].numpy())
-        assert out[:5].tolist() == [number(seed, key, stream, i, 0, 1) for i in range(5)]
+        for start in (0, 2**33):
+            out = np.empty((50, 3))
+            uniforms(mixed_seed(seed, stream), key, start, out)
+            words = [[number(seed, key, stream, start + i, j, 3) for j in range(3)] for i in range(50)]
+            assert out.tolist() == [[(word >> 10) / 2**53 for word in row] for row in words]
+            tensors = uniform(seed, torch.tensor([key]), stream, start, 50, 3)[0]
+            assert out.tolist() == tensors.tolist()
+        order = sorted(range(1000), key=lambda i: number(seed, key, stream, 0, i, 1))
+        for most in (1, 17, 1000, 2000):
+            index = np.empty(most, np.int64)
+            count = shuffle(1000, mixed_seed(seed, stream), key, index)
+            assert index[:count].tolist() == order[:most]

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from fmtorch.estimators import F4x2, Pair, SummedGains, kernel
+from fmtorch.estimators.parts.sampling import Uniform
 
 Array = np.ndarray[Any, Any]
 
@@ -38,6 +39,31 @@ class CompiledTriweight(SummedGains):
     gain_kernel = triweight
 
 
+class Squares(SummedGains):
+    """The gain of MSAC; what is negative counts nothing."""
+
+    def gain(self, squared: Array) -> Array:
+        return 1 - squared
+
+
+@kernel
+def squares(squared: F4x2, out: F4x2) -> None:
+    for k in range(len(squared)):
+        for i in range(squared.shape[1]):
+            out[k, i] = max(1 - squared[k, i], 0)
+
+
+class CompiledSquares(SummedGains):
+    gain_kernel = squares
+
+
+class Same:
+    """The built-in uniform sampler under another name."""
+
+    def draw(self, pair: Pair, start: int, count: int, size: int) -> Array:
+        return Uniform().draw(pair, start, count, size)
+
+
 class BestHalf:
     """Samples from the better half of the matches."""
 
@@ -45,12 +71,26 @@ class BestHalf:
 
     def draw(self, pair: Pair, start: int, count: int, size: int) -> Array:
         best = np.argsort(pair.quality, kind="stable")[: max(size, pair.count // 2)]
-        left = len(best) - np.arange(size)  # of which the next match is drawn
-        index = (pair.uniform(start, count, size) * left).astype(np.int64).T
-        for j in range(1, size):  # past those drawn before
-            for drawn in np.sort(index[:j], axis=0):
-                index[j] += index[j] >= drawn
-        return best[index]
+        return best[different(pair, start, count, size, len(best))]
+
+
+class AllAlike:
+    """Samples from all matches, as the built-in uniform sampler draws them, in NumPy."""
+
+    uses_prior = False
+
+    def draw(self, pair: Pair, start: int, count: int, size: int) -> Array:
+        return different(pair, start, count, size, pair.count)
+
+
+def different(pair: Pair, start: int, count: int, size: int, among: int) -> Array:
+    """Different numbers below `among`, (size, count) int64."""
+    left = among - np.arange(size)  # of which the next one is drawn
+    index = (pair.uniform(start, count, size) * left).astype(np.int64).T
+    for j in range(1, size):  # past those drawn before
+        for drawn in np.sort(index[:j], axis=0):
+            index[j] += index[j] >= drawn
+    return index
 
 
 class Within2Px:

@@ -110,6 +110,16 @@ def test_without_candidates_there_is_no_selection() -> None:
     assert nothing.selection.cameras is None
 
 
+def test_rounds_without_candidates_settle_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All matches may be inliers of the zero model that stands for none."""
+    nothing = PlausibleCandidates(np.zeros((1, 9)), np.full(1, -np.inf), no_cameras(1))
+    monkeypatch.setattr(FocalSearch, "round", lambda self, pair, turn: (nothing, (turn + 1) * 10))
+    search = searching(rounds=3, min_rounds=1)
+    object.__setattr__(search, "stop", lambda F, draws, pair, size: True)
+    result = search(pair_of(scene(0)))  # of images of one size
+    assert (result.settled, result.draws) == (False, 30)
+
+
 def test_one_model_is_one_up_to_the_angle_between_them() -> None:
     F = np.linalg.qr(np.random.default_rng(0).normal(size=(9, 2)))[0].T
     for angle in (0.0, 0.01, 0.04, 0.1, 0.2, np.pi - 0.04):

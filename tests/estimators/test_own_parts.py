@@ -2,28 +2,36 @@
 
 from __future__ import annotations
 
-import statistics
+import math
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 
 from fmtorch import presets
-from fmtorch.core.types import Correspondences, collate
+from fmtorch.core.types import collate
+from fmtorch.estimators import SummedGains
 from fmtorch.geometry import sampson
 from tests.estimators.own_parts import (
+    AllAlike,
     BestHalf,
+    CompiledSquares,
     CompiledTriweight,
+    Same,
     Sampled,
     Scored,
+    Squares,
     Triweight,
     Welsch,
     Within2Px,
 )
 from tests.estimators.pairs import pair_of
-from tests.laws import assert_same, few, scene
+from tests.laws import assert_same, few, scene, scenes
+from tests.processes import run_command
 
 PARTS: dict[str, dict[str, Any]] = {
     "score": {"score": Welsch(1.0)},
@@ -32,6 +40,7 @@ PARTS: dict[str, dict[str, Any]] = {
     "rule": {"inliers": Within2Px()},
 }
 PRESETS = ("msac", "fmtorch")
+OWN_PARTS = "tests.estimators.own_parts"
 
 
 def built(preset: str, parts: dict[str, Any], **options: Any) -> Any:
@@ -63,6 +72,33 @@ def test_a_compiled_gain_is_that_in_numpy(preset: str) -> None:
     # Gains are rounded to 2^-10, which hides all but the rarest rounding of a float32.
     assert torch.equal(one.inliers, other.inliers)
     torch.testing.assert_close(one.F, other.F, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"score": Squares(1.0)},
+        {"score": CompiledSquares(1.0)},
+        {"sampler": Same()},
+        {"inliers": lambda squared_px, pair: squared_px <= 1.0},
+        {"score": CompiledSquares(1.0), "sampler": Same(), "inliers": lambda squared_px, pair: squared_px <= 1.0},
+    ],
+    ids=["score", "compiled score", "sampler", "rule", "all"],
+)
+def test_parts_that_do_as_the_built_in_ones_give_the_same_bits(parts: dict[str, Any]) -> None:
+    own, builtin = (
+        presets.build("estimator", "msac", **parts)(scenes(), 3),
+        presets.build("estimator", "msac")(scenes(), 3),
+    )
+    assert bool(builtin.ok.all())
+    assert_same(*({name: getattr(e, name) for name in ("F", "inliers", "ok", "draws")} for e in (own, builtin)), "msac")
+
+
+def test_parts_are_named_as_targets() -> None:
+    score = {"_target_": f"{OWN_PARTS}.Welsch", "threshold": 1.0}
+    named = presets.build("estimator", "msac", score=score, sampler={"_target_": f"{OWN_PARTS}.BestHalf"})
+    given = presets.build("estimator", "msac", score=Welsch(1.0), sampler=BestHalf())
+    assert torch.equal(named(scene(0)).F, given(scene(0)).F)
 
 
 def test_a_rule_decides_the_inliers() -> None:
@@ -102,15 +138,40 @@ def test_wrong_scores_are_refused_by_name(scores: Any, complaint: str) -> None:
             built("msac", {"score": Scored(scores)})(scene(1, count))
 
 
-def test_wrong_gains_are_refused_by_name() -> None:
-    class Short(Welsch):
-        def gain(self, squared: Any) -> Any:
-            return squared[:, :3]
+def test_scores_may_be_a_column() -> None:
+    """Of a larger array: its memory has gaps."""
+    column = Scored(lambda which: np.stack([which * 1.0, which * 0.0], 1)[:, 0])
+    assert torch.equal(
+        built("msac", {"score": column})(scene(1, 600)).F, built("msac", {"score": Scored(np.float64)})(scene(1, 600)).F
+    )
 
-    with pytest.raises(ValueError, match=r"Short.gain returns shape \(\d+, 3\); it must be that of its argument"):
-        built("msac", {"score": Short(1.0)})(scene(1, 60))
+
+@pytest.mark.parametrize(
+    ("gain", "complaint"),
+    [
+        (lambda squared: squared[:, :3], r"shape \(\d+, 3\) of float32"),
+        (lambda squared: squared.sum(1), r"shape \(\d+,\) of float32"),
+        (lambda squared: 1.0, r"shape \(\) of float64"),
+        (lambda squared: squared + 0j, r"shape \(\d+, 60\) of complex64"),
+        (lambda squared: [["one"] * 60] * len(squared), r"shape \(\d+, 60\) of <U3"),
+    ],
+)
+def test_wrong_gains_are_refused_by_name(gain: Any, complaint: str) -> None:
+    class Mine(SummedGains):
+        def gain(self, squared: Any) -> Any:
+            return gain(squared)
+
+    message = rf"Mine.gain returns {complaint}; it must be the shape of its argument, \(\d+, 60\): .* of numbers"
+    with pytest.raises(ValueError, match=message):
+        built("msac", {"score": Mine(1.0)})(scene(1, 60))
+
+
+def test_a_score_without_a_gain_is_refused_by_name() -> None:
+    class Bare(SummedGains):
+        pass
+
     with pytest.raises(NotImplementedError, match="Bare must override `gain` or name a `gain_kernel`"):
-        built("msac", {"score": type("Bare", (type(Welsch(1.0)).__bases__[0],), {})(1.0)})(scene(1, 60))
+        built("msac", {"score": Bare(1.0)})(scene(1, 60))
 
 
 @pytest.mark.parametrize(
@@ -126,26 +187,33 @@ def test_wrong_inliers_are_refused_by_name(rule: Any, complaint: str) -> None:
         built("msac", {"inliers": rule})(scene(1, 150))
 
 
+def compared(preset: str) -> None:
+    """Prints the draws of a preset and of its like with parts in NumPy, and the CPU times: each the least of some."""
+    c = scene(1, 600, outliers=0.5)
+    # The gain of `fmtorch` differs, but not the work: as many draws from all matches, as many models preselected.
+    score = Squares(1.0) if preset == "msac" else Welsch(1.5, prior_weighted=True)
+    threshold = {} if preset == "msac" else {"threshold": None}
+    own = presets.build("estimator", preset, score=score, sampler=AllAlike(), inliers=Within2Px(), **threshold)
+    estimators = own, presets.build("estimator", preset)
+    draws, least = [int(estimator(c).draws) for estimator in estimators], [math.inf, math.inf]
+    for _ in range(20):
+        for k, estimator in enumerate(estimators):
+            start = time.process_time()
+            estimator(c)
+            least[k] = min(least[k], time.process_time() - start)
+    print(*draws, *least)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", PRESETS)
-def test_a_part_in_numpy_takes_at_most_three_times_as_long(preset: str) -> None:
-    """A score, a sampler and a rule in NumPy together against the built-in ones, 2,000 matches."""
-    c = scene(1, 2000, outliers=0.5)
-    threshold = {} if preset == "msac" else {"threshold": None}
-    own = presets.build("estimator", preset, score=Welsch(1.0), sampler=BestHalf(), inliers=Within2Px(), **threshold)
-    ratio = milliseconds(own, c) / milliseconds(presets.build("estimator", preset), c)
-    print(f"{preset}: {ratio:.2f} times as long")
-    assert ratio < 3
-
-
-def milliseconds(estimator: Any, c: Correspondences) -> float:
-    estimator(c)
-    times = []
-    for _ in range(9):
-        start = time.perf_counter()
-        estimator(c)
-        times.append(time.perf_counter() - start)
-    return 1000 * statistics.median(times)
+def test_parts_in_numpy_take_at_most_three_times_as_long(preset: str, tmp_path: Path) -> None:
+    """Score, sampler and rule together, at the same work, in a process whose calls are not checked, as a user's."""
+    ended = run_command("-c", f"from {__name__} import compared; compared({preset!r})", cwd=tmp_path)
+    assert ended.returncode == 0, ended.stderr
+    draws, builtin_draws, seconds, builtin = map(float, ended.stdout.split())
+    print(f"{preset}: {1000 * builtin:.2f} ms, with parts in NumPy {1000 * seconds:.2f} ms")
+    assert draws == builtin_draws
+    assert seconds < 3 * builtin
 
 
 def test_samples_of_ones_own_are_distinct_and_from_the_better_half() -> None:
@@ -155,3 +223,5 @@ def test_samples_of_ones_own_are_distinct_and_from_the_better_half() -> None:
     better = np.argsort(pair.quality, kind="stable")[:20]
     assert all(len(set(column)) == 7 for column in sample.T)
     assert set(sample.ravel()) == set(better)
+    counts = np.bincount(AllAlike().draw(pair, 0, 5000, 7)[6], minlength=41)
+    assert stats.chisquare(counts).pvalue > 1e-4

@@ -1,134 +1,206 @@
-"""A pair: its usable matches in normalised units, the way back to pixels, and why it cannot be estimated."""
+"""From a batch to one pair: which matches are usable, in which units; and a model back in pixels."""
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from fmtorch.core.streams import Stream
 from fmtorch.core.types import Correspondences, collate
-from fmtorch.estimators.batch import Batch
-from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair, bucket, power_of_two, to_pixels
-from fmtorch.geometry.pixel_frame import PixelFrame
-from tests.estimators.pairs import pair_of
-from tests.laws import scene, with_padding
+from fmtorch.estimators.batch import Batch, relative_rounding
+from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair, bucket, to_pixels
+from tests.estimators.pairs import SCALES, known, named, pair_of, real
+from tests.laws import degenerate, scene, small, with_padding
 from tests.reference.random import number
+from tests.reference.solvers import unit as of_unit_norm
 
 
-def at_the_door(c: Correspondences, i: int = 0, minimal: int = 7) -> tuple[Pair, np.ndarray] | str:
+def normalized(c: Correspondences, i: int = 0, minimal: int = 7) -> tuple[Pair, Any] | str:
     batch = Batch.of(c)
-    return batch.normalized(batch.pair(i), i, 0, minimal)
+    with np.errstate(all="raise"):  # what overflows is no error of the caller's
+        return batch.normalized(batch.pair(i), i, 0, minimal)
 
 
-def test_usable_matches_come_first_in_units_of_a_power_of_two() -> None:
-    c = with_padding(collate([scene(0, 40), scene(1, 90)]), np.random.default_rng(1), float("nan"))
-    c = c.replace(noise=torch.linspace(1e-3, 40, c.mask.shape[1]).expand(len(c), -1).contiguous())
-    c.x0[0, 5] = torch.inf
-    normalized = at_the_door(c)
-    assert not isinstance(normalized, str)
-    pair, slot = normalized
-    usable = (c.mask[0] & c.x0[0].isfinite().all(-1)).nonzero()[:, 0].numpy()
-    np.testing.assert_array_equal(slot, usable)
-    pixels = torch.cat([c.x0[0], c.x1[0]], -1).double().numpy()[usable].T
-    np.testing.assert_array_equal(pair.points * pair.pixels_per_unit + pair.centre[:, None], pixels)
-    assert math.log2(pair.pixels_per_unit).is_integer()
-    assert 0.5 < np.abs(pair.points).max() <= 1
-    assert c.prior is not None
-    assert c.noise is not None
-    assert c.quality is not None
-    noise = c.noise[0].double().numpy()[usable].clip(MIN_NOISE, MAX_NOISE)
-    prior = c.prior[0].double().numpy()[usable]
-    for name, expected in (
-        ("weight", prior / noise**2), ("pixels_per_noise", pair.pixels_per_unit / noise), ("match_weight", prior),
-        ("noise", noise), ("quality", c.quality[0].double().numpy()[usable]),
-    ):  # fmt: skip
-        np.testing.assert_array_equal(getattr(pair, name), expected, err_msg=name)
+def told() -> Correspondences:
+    """Pairs of many sizes, with priors and noise on and beyond their bounds, with garbage in masked slots."""
+    c = collate([scene(i, 7 + 67 * i, noise=0.1 * i) for i in range(6)])
+    c = c.replace(noise=torch.linspace(1e-3, 40, c.mask.shape[1]).expand(len(c), -1))
+    return with_padding(c, np.random.default_rng(1), float("nan"))
 
 
-def test_what_is_not_known() -> None:
-    pair = pair_of(scene(0, 40).replace(prior=None, noise=None, quality=None, size0=None, size1=None))
-    assert (pair.prior, pair.noise, pair.quality, pair.sizes_known) == (None, None, None, False)
-    np.testing.assert_array_equal(pair.weight, np.ones(40))
-    np.testing.assert_array_equal(pair.match_weight, np.ones(40))
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("kind", ["all", "nothing", "real"])
+def test_a_pair_holds_its_usable_matches_in_order(kind: str, scale: float) -> None:
+    c = real(7) if kind == "real" else told()
+    c = c if kind == "all" else c.replace(prior=None, noise=None, quality=None, size0=None, size1=None)
+    c = c.replace(x0=scale * c.x0.double(), x1=scale * c.x1.double())
+    for i in range(len(c)):
+        found = normalized(c, i)
+        assert not isinstance(found, str)
+        pair, slot = found
+        mask = c.mask[i].numpy()
+        np.testing.assert_array_equal(slot, np.flatnonzero(mask))
+        pixels = torch.cat([c.x0, c.x1], -1)[i].numpy()[mask].T
+        low, high = pixels.min(1), pixels.max(1)
+        np.testing.assert_array_equal(pair.centre, (low + high) / 2)
+        half = ((high - low) / 2).max()
+        assert math.frexp(pair.pixels_per_unit)[0] == 0.5  # a power of two, the next one
+        assert pair.pixels_per_unit / 2 < half <= pair.pixels_per_unit
+        np.testing.assert_array_equal(pair.points, (pixels - pair.centre[:, None]) / pair.pixels_per_unit)
+        assert (pair.count, pair.key, pair.bucket) == (mask.sum(), int(c.keys[i]), bucket(int(mask.sum())))
+        values = {name: getattr(c, name) for name in ("prior", "noise", "quality")}
+        for name, value in values.items():
+            assert (getattr(pair, name) is None) == (value is None) == (kind != "all")
+        prior, noise, _ = (
+            np.ones(pair.count) if value is None else value[i].double().numpy()[mask] for value in values.values()
+        )
+        noise = np.clip(noise, MIN_NOISE, MAX_NOISE)
+        np.testing.assert_array_equal(pair.match_weight, prior)
+        np.testing.assert_array_equal(pair.weight, prior / (noise * noise))
+        np.testing.assert_array_equal(pair.pixels_per_noise, pair.pixels_per_unit / noise)
+        assert pair.sizes.tolist() == ([640, 960, 640, 960] if kind == "all" else [])
+        assert pair.sizes_known == (kind == "all")
+        assert pair.table.flags.c_contiguous
+        assert pair.table.dtype == np.float64
+
+
+def test_the_unit_is_the_next_power_of_two() -> None:
+    exact = [math.ldexp(1.0, e) for e in range(-300, 300, 7)]
+    for unit in exact:
+        for half, expected in (
+            (math.nextafter(unit, 0), unit),
+            (unit, unit),
+            (math.nextafter(unit, math.inf), 2 * unit),
+        ):
+            x0 = torch.zeros(1, 8, 2, dtype=torch.float64)
+            x0[0, 0, 0], x0[0, 1, 0] = half, -half
+            found = normalized(Correspondences(x0, torch.zeros_like(x0), torch.ones(1, 8, dtype=torch.bool)))
+            assert not isinstance(found, str)
+            assert found[0].pixels_per_unit == expected
 
 
 @pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        ({"prior": 1.5}, "prior of 1 match is wrong: it is P(inlier), within [0, 1]"),
-        ({"prior": torch.nan}, "prior of 1 match is wrong: it is P(inlier), within [0, 1]"),
-        ({"noise": 0.0}, "noise of 1 match is wrong: it is a standard deviation, positive"),
-        ({"size0": 0}, "size0 is wrong: image sizes (h, w) are positive"),
-    ],
-)
-def test_wrong_values_are_a_reason(change: dict[str, float], reason: str) -> None:
-    c = scene(0, 40)
-    c = c.replace(noise=torch.ones(1, 40))
-    ((name, value),) = change.items()
-    values = getattr(c, name).clone()
-    values[0, 3 if values.shape[1] > 2 else 0] = value
-    assert at_the_door(c.replace(**{name: values})) == reason
-
-
-def test_reasons_of_degenerate_pairs() -> None:
-    assert at_the_door(scene(0, 6)) == "6 matches; at least 7 are needed"
-    coincident = scene(0, 20)
-    assert at_the_door(coincident.replace(x0=coincident.x0 * 0, x1=coincident.x1 * 0)) == "all matches coincide"
-    far = coincident.replace(x0=coincident.x0.double() * 1e149)
-    assert at_the_door(far) == "0 matches; at least 7 are needed"
-
-
-@pytest.mark.parametrize(
-    ("count", "size"), [(1, 128), (128, 128), (129, 192), (192, 192), (193, 256), (760, 768), (769, 1024)]
+    ("count", "size"),
+    [(0, 128), (1, 128), (128, 128), (129, 192), (192, 192), (193, 256), (760, 768), (769, 1024), (100_000, 131_072)],
 )
 def test_buckets(count: int, size: int) -> None:
     assert bucket(count) == size
 
 
-@pytest.mark.parametrize("half", [1e-300, 0.3, 0.5, 1.0, 1.0000001, 1023.9, 1024.0, 3e100])
-def test_the_unit_is_the_next_power_of_two(half: float) -> None:
-    unit = float(power_of_two(half))
-    assert half <= unit < 2 * half
-    assert math.frexp(unit)[0] == 0.5
-    points = torch.tensor([[[0.0, 0, 0, 0], [2 * half, 0, 0, 0]]], dtype=torch.float64)
-    assert float(PixelFrame.around(points, torch.ones(1, 2, dtype=torch.bool)).pixels_per_unit) == unit
+@pytest.mark.parametrize("value", [1.5, -0.1, math.nan])
+def test_wrong_priors_are_told(value: float) -> None:
+    c = known(20)
+    assert c.prior is not None
+    prior = c.prior.clone()
+    prior[0, 3] = value
+    wrong = "prior of 1 match is wrong: it is P(inlier), within [0, 1]"
+    assert normalized(c.replace(prior=prior)) == wrong
+    hidden = c.replace(prior=prior, mask=torch.arange(20)[None] != 3)
+    assert not isinstance(normalized(hidden), str)
 
 
-@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
-def test_a_model_goes_back_to_pixels(scale: float) -> None:
-    c = scene(0, 30)
-    c = c.replace(x0=c.x0.double() * scale, x1=c.x1.double() * scale)
-    pair = pair_of(c)
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan])
+def test_wrong_noise_is_told(value: float) -> None:
+    c = known(20)
+    assert c.noise is not None
+    noise = c.noise.clone()
+    noise[0, 3] = value
+    assert normalized(c.replace(noise=noise)) == "noise of 1 match is wrong: it is a standard deviation, positive"
+
+
+@pytest.mark.parametrize("value", [0.0, -3.0, math.nan, math.inf])
+def test_wrong_sizes_are_told(value: float) -> None:
+    c = known(20)
+    wrong = "size0 is wrong: image sizes (h, w) are positive"
+    assert normalized(c.replace(size0=torch.tensor([[640.0, value]]))) == wrong
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e100, -1e300])
+def test_matches_that_are_no_numbers_are_none(value: float) -> None:
+    c = known(20)
+    x1 = c.x1.double().clone()
+    x1[0, 5, 1] = value
+    found = normalized(c.replace(x0=c.x0.double(), x1=x1))
+    assert not isinstance(found, str)
+    np.testing.assert_array_equal(found[1], np.delete(np.arange(20), 5))
+    few = normalized(c.replace(x0=c.x0.double(), x1=x1), minimal=20)
+    assert few == "19 matches; at least 20 are needed"
+
+
+def test_pairs_that_cannot_be_estimated_are_told_why() -> None:
+    reasons = {name: normalized(c) for name, c in {**degenerate(), **small()}.items()}
+    told = {name: reason for name, reason in reasons.items() if isinstance(reason, str)}
+    assert told == {
+        "empty": "0 matches; at least 7 are needed",
+        "one match": "1 matches; at least 7 are needed",
+        "all points equal": "all matches coincide",
+        "NaN": "0 matches; at least 7 are needed",
+        "infinite": "0 matches; at least 7 are needed",
+        "8 coincident": "all matches coincide",
+        "20 coincident": "all matches coincide",
+    }
+
+
+def test_a_pair_is_a_copy_and_its_neighbours_are_invisible() -> None:
+    many, batch = told(), Batch.of(told())
+    matches = batch.pair(3)
+    pair = batch.normalized(matches, 3, 0, 7)[0]
+    alone = normalized(many[[3]])[0]
+    assert isinstance(pair, Pair)
+    assert isinstance(alone, Pair)
+    np.testing.assert_array_equal(pair.table, alone.table)
+    before = matches.x0.copy()
+    pair.table[:] = 0
+    np.testing.assert_array_equal(matches.x0, before)
+
+
+def test_a_part_of_a_pair_keeps_its_frame() -> None:
+    pair = named("scene 40")
+    index = np.array([7, 3, 30])
+    some = pair.take(index)
+    np.testing.assert_array_equal(some.table, pair.table[:, index])
+    assert some.quality is not None
+    for name in ("bucket", "pixels_per_unit", "key", "seed", "centre", "sizes", "residual", "images"):
+        assert getattr(some, name) is getattr(pair, name), name
+    assert pair.cached("sum", lambda pair: float(pair.points.sum())) == pair.points.sum()
+    assert pair.cached("sum", lambda pair: pytest.fail("computed again")) == pair.points.sum()
+    assert some.cached("sum", lambda pair: float(pair.points.sum())) == some.points.sum()
+
+
+def test_numbers_of_a_pair_are_those_of_its_seed_key_and_draw() -> None:
+    pair = pair_of(scene(0, 20), seed=5)
+    expected = [[(number(5, pair.key, 1, d, j, 4) >> 10) / 2**53 for j in range(4)] for d in range(100, 130)]
+    assert pair.uniform(100, 30, 4).tolist() == expected
+
+
+@pytest.mark.parametrize("scale", [2.0**-30, 1.0, 2.0**30])
+def test_models_in_pixels(scale: float) -> None:
     rng = np.random.default_rng(0)
-    for _ in range(5):
-        F, out = rng.normal(size=9), np.empty((3, 3))
-        assert to_pixels(F, pair.centre, pair.pixels_per_unit, out)
-        points = np.concatenate([pair.points, np.ones((1, pair.count))])
-        unit_error = np.einsum("in,ij,jn->n", points[[2, 3, 4]], F.reshape(3, 3), points[[0, 1, 4]])
-        x0, x1 = (np.c_[x[0].numpy(), np.ones(30)] for x in (c.x0, c.x1))
-        error = np.einsum("ni,ij,nj->n", x1, out, x0)
-        ratio = error @ unit_error / (unit_error @ unit_error)
-        size = np.abs(x1) @ np.abs(out) * np.abs(x0)  # what an error cancels from
-        assert (np.abs(error - ratio * unit_error) <= 64 * 2**-53 * size.sum(1)).all()
-        assert abs(np.linalg.norm(out) - 1) < 1e-15 * 9
-        assert out.ravel()[np.abs(out).argmax()] > 0
-    assert not to_pixels(np.full(9, np.nan), pair.centre, pair.pixels_per_unit, np.empty((3, 3)))
+    centre, unit = scale * rng.uniform(-1000, 1000, 4), scale * 512
+    T0, T1 = (
+        np.array([[1 / unit, 0, -x / unit], [0, 1 / unit, -y / unit], [0, 0, 1]]) for x, y in (centre[:2], centre[2:])
+    )
+    for _ in range(50):
+        F, out = rng.normal(size=(3, 3)), np.empty((3, 3))
+        assert to_pixels(F.ravel(), centre, unit, out)
+        # Two products of three terms, a norm, and a division; entries of one column may cancel.
+        size = np.abs(T1).T @ np.abs(F) @ np.abs(T0)
+        norm = np.linalg.norm(T1.T @ F @ T0)
+        np.testing.assert_array_less(np.abs(out - of_unit_norm(T1.T @ F @ T0)), 40 * 2.0**-53 * (size.max() / norm + 1))
+        assert out.flat[np.abs(out).argmax()] > 0
 
 
-def test_uniform_numbers_are_those_of_the_definition() -> None:
-    pair = pair_of(scene(0, 30), 9)
-    expected = [[number(9, pair.key, Stream.SAMPLING, d, k, 3) >> 10 for k in range(3)] for d in range(50, 54)]
-    np.testing.assert_array_equal(pair.uniform(50, 4, 3), np.array(expected) * 2.0**-53)
+def test_models_that_are_not_finite_in_pixels_are_told() -> None:
+    out = np.empty((3, 3))
+    for F in (np.full(9, np.nan), np.full(9, np.inf)):
+        assert not to_pixels(F, np.zeros(4), 1.0, out)
+    assert not to_pixels(np.ones(9), np.full(4, 1e200), 1e-200, out)
 
 
-def test_what_a_part_computes_is_kept_with_the_matches() -> None:
-    pair = pair_of(scene(0, 30))
-    first = pair.cached("ones", lambda pair: np.ones(pair.count))
-    assert pair.cached("ones", lambda pair: pytest.fail("computed again")) is first
-    subset = pair.take(np.array([3, 1]))
-    assert len(subset.cached("ones", lambda pair: np.ones(pair.count))) == 2
-    np.testing.assert_array_equal(subset.points, pair.points[:, [3, 1]])
-    assert subset.bucket == pair.bucket
+def test_the_rounding_of_coordinates() -> None:
+    c = scene(0, 20)
+    assert relative_rounding(c) == 2.0**-23
+    assert relative_rounding(c.replace(x0=c.x0.double(), x1=c.x1.double())) == 2.0**-52

@@ -106,7 +106,10 @@ def test_coordinates_sizes_and_thresholds_scaled_together_give_the_same_inliers(
         return value._replace(**limits)
 
     inliers = {}
-    for scale in (1.0, 1e-9, 1e-3, 1e3, 1e9):
+    # Outliers carry Huber's loss away so far that its 30 steps do not end at an optimum; where they do depends on the
+    # unit of the points, which is the next power of two.
+    scales = (2.0**-30, 2.0**-10, 2.0**10, 2.0**30) if name == "irls_huber" else (1e-9, 1e-3, 1e3, 1e9)
+    for scale in (1.0, *scales):
         for (owner, constant), value in pixels.items():
             monkeypatch.setattr(owner, constant, in_pixels(value, scale))
         built = presets.build("estimator", name, **merged(options, scaled(preset, scale)))
@@ -115,9 +118,7 @@ def test_coordinates_sizes_and_thresholds_scaled_together_give_the_same_inliers(
         assert bool(estimate.ok.all()), estimate.reason
         inliers[scale] = estimate.inliers
     for scale, found in inliers.items():
-        # Outliers carry the loss of Huber into a flat valley, and rounding decides how far along it the steps come.
-        allowed = 2 if name == "irls_huber" else 0
-        assert int((found != inliers[1.0]).sum()) <= allowed, f"{name}: other inliers at {scale}"
+        assert torch.equal(found, inliers[1.0]), f"{name}: other inliers at {scale}"
 
 
 @pytest.mark.parametrize("name", OWN)

@@ -55,3 +55,23 @@ def least_cut(kernel: np.ndarray, edges: list[tuple[int, int]], coherence: float
     reaching = breadth_first_order(residual.T.tocsr(), sink, return_predecessors=False)
     labels[reaching[reaching < n]] = 1
     return labels
+
+
+def fixed_point(
+    kernel: np.ndarray, edges: list[tuple[int, int]], coherence: float, label: int, sweeps: int
+) -> np.ndarray:
+    """Labels of one kind, then, all at once, the best given their neighbours', an outlier where both are as good."""
+    n = len(kernel)
+    labels = np.full(n, label)
+    of = [[(p, q) for p, q in edges if i in (p, q)] for i in range(n)]
+    for _ in range(sweeps):
+        before = labels.copy()
+        for i in range(n):
+            costs = []
+            for value in (0, 1):
+                changed = before.copy()
+                changed[i] = value
+                others = sum(1 - kernel[j] if changed[j] else kernel[j] for j in range(n) if j != i)
+                costs.append(energy(changed, kernel, of[i], coherence) - others)
+            labels[i] = costs[1] < costs[0]
+    return labels

@@ -1,55 +1,71 @@
-"""Scores of one hypothesis, match by match, from the definitions."""
+"""Scores of one hypothesis, match by match, from the definitions; residuals are in thresholds."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
+
+from tests.reference.refine import magsac_loss
+
+REACH = 5  # scales, from which on the gain of Geman & McClure is zero
 
 
 def sampson(F: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> float:
     """The Sampson distance of one match (Hartley & Zisserman 2004, equation 11.9)."""
     h0, h1 = np.append(x0, 1.0), np.append(x1, 1.0)
     line1, line0 = F @ h0, F.T @ h1
-    return abs(h1 @ line1) / math.sqrt(line1[0] ** 2 + line1[1] ** 2 + line0[0] ** 2 + line0[1] ** 2)
+    return float(abs(h1 @ line1) / math.sqrt(line1[0] ** 2 + line1[1] ** 2 + line0[0] ** 2 + line0[1] ** 2))
 
 
-def msac(residuals: np.ndarray, threshold: float, prior: np.ndarray | None = None) -> float:
-    """Sum of 1 - r^2 / t^2 over the matches within t, times the prior."""
-    weights = np.ones(len(residuals)) if prior is None else prior
-    return sum(w * (1 - (r / threshold) ** 2) for r, w in zip(residuals, weights, strict=True) if r < threshold)
+def inlier(r: float) -> float:
+    """The gain of RANSAC."""
+    return 1.0 if r <= 1 else 0.0
 
 
-def geman_mcclure(residuals: np.ndarray, scale: float, reach: float, prior: np.ndarray | None = None) -> float:
-    """Sum of (1 / (1 + r^2 / s^2) - e) / (1 - e) over the matches within `reach` scales, e the value there."""
-    weights = np.ones(len(residuals)) if prior is None else prior
-    end = 1 / (1 + reach**2)
-    inside = [(r, w) for r, w in zip(residuals, weights, strict=True) if r < reach * scale]
-    return sum(w * (1 / (1 + (r / scale) ** 2) - end) / (1 - end) for r, w in inside)
+def truncated_square(r: float) -> float:
+    """The gain of MSAC."""
+    return 1 - r * r if r < 1 else 0.0
 
 
-def saturated(
-    residuals: np.ndarray, points: np.ndarray, scale: float, reach: float, cells: int, prior: np.ndarray
-) -> float:
-    """Over both images, the sum over the cells of a grid of the root of `geman_mcclure` of the matches in it.
+def geman_mcclure(r: float) -> float:
+    """(1 / (1 + r^2) - e) / (1 - e), e the value at REACH scales; beyond it zero."""
+    end = 1 / (1 + REACH**2)
+    return (1 / (1 + r * r) - end) / (1 - end) if r < REACH else 0.0
 
-    points: (4, n), x0, y0, x1, y1. The grid is that of the matches' bounding box.
-    """
-    low, extent = points.min(1, keepdims=True), np.ptp(points, axis=1, keepdims=True)
-    cell = np.clip((points - low) / extent * cells, 0, cells - 1).astype(int)
+
+def magsac(r: float) -> float:
+    """1 - rho(r) / rho(k sigma_max) of MAGSAC++."""
+    loss, whole = magsac_loss(np.array([min(r, 1.0) ** 2, 1.0]), 1.0)
+    return float(1 - loss / whole)
+
+
+def rounded(value: float, bits: int) -> float:
+    """The nearest multiple of 2^-bits."""
+    return round(value * 2**bits) / 2**bits
+
+
+def summed(gains: Sequence[float], weights: Sequence[float], bits: int) -> float:
+    """The sum of rounded gains times weights."""
+    return sum(rounded(g * w, bits) for g, w in zip(gains, weights, strict=True))
+
+
+def saturated(gains: Sequence[float], weights: Sequence[float], cells: np.ndarray, bits: int) -> float:
+    """Over both images and their cells, given for each match (2, n), the sum of the root of its matches' `summed`."""
     total = 0.0
-    for rows in ((0, 1), (2, 3)):
-        for where in {tuple(column) for column in cell[rows, :].T}:
-            inside = (where == cell[rows, :].T).all(1)
-            total += math.sqrt(geman_mcclure(residuals[inside], scale, reach, prior[inside]))
+    for cell in cells:
+        for one in set(cell.tolist()):
+            members = [i for i in range(len(gains)) if cell[i] == one]
+            total += rounded(math.sqrt(summed([gains[i] for i in members], [weights[i] for i in members], bits)), bits)
     return total
 
 
-def lower_median(values: np.ndarray) -> float:
+def lower_median(values: Sequence[float]) -> float:
     """The lower of the middle values."""
     return sorted(values)[(len(values) + 1) // 2 - 1]
 
 
 def draws_for_confidence(inlier_ratio: float, size: int, confidence: float) -> float:
     """How many samples until one is all inliers with this probability."""
-    return math.log(1 - confidence) / math.log(1 - inlier_ratio**size)
+    return math.log1p(-confidence) / math.log1p(-(inlier_ratio**size))

@@ -1,4 +1,4 @@
-"""Samples and subsets of matches, one number at a time, from the definitions."""
+"""Samples of matches from the definitions, one draw at a time, in Python's integers and fractions."""
 
 from __future__ import annotations
 
@@ -6,52 +6,51 @@ import math
 from collections.abc import Sequence
 from fractions import Fraction
 
-from tests.reference.random import number
 
-WORD_BITS = 31  # of a random number's 63, those that are left out
-
-
-def weighted_sample(weights: Sequence[int], size: int, seed: int, key: int, stream: int, draw: int) -> list[int]:
-    """`size` different matches, each drawn in proportion to the weights of those that are left."""
-    left, chosen = list(range(len(weights))), []
-    for j in range(size):
-        word = number(seed, key, stream, draw, j, size) >> WORD_BITS
-        position = word * sum(weights[i] for i in left) >> 32
+def weighted_sample(weights: Sequence[int], numbers: Sequence[int]) -> list[int]:
+    """A match a number of 63 bits, each drawn by weight from those not drawn yet, which lie side by side on a line."""
+    left, sample = list(range(len(weights))), []
+    for number in numbers:
+        position = (number >> 31) * sum(weights[i] for i in left) >> 32
         for i in left:
             if position < weights[i]:
                 break
             position -= weights[i]
-        chosen.append(i)
         left.remove(i)
-    return chosen
+        sample.append(i)
+    return sample
 
 
-def prosac_growth(count: int, size: int, draws: int) -> list[int]:
-    """T'_n for n = 1 .. count (Chum & Matas, CVPR 2005, equations 3 and 4), with exact fractions."""
+def quantised(prior: Sequence[float], largest: int) -> list[int]:
+    """Priors as whole numbers from 1 to the largest."""
+    return [max(round(p * largest), 1) for p in prior]
+
+
+def prosac_growth(total: int, size: int, draws: int) -> tuple[list[int], list[Fraction]]:
+    """T'_n for n = 1 .. N, and what T_n grew by (Chum & Matas, CVPR 2005, equations 3 and 4); T_N: `draws`."""
+    T = [
+        draws * math.prod((Fraction(max(n - i, 0), total - i) for i in range(size)), start=Fraction(1))
+        for n in range(total + 1)
+    ]
+    grown = [T[n] - T[n - 1] for n in range(1, total + 1)]
     table: list[int] = []
-    expected = Fraction(0)
-    for n in range(1, count + 1):
-        before, expected = expected, Fraction(draws)
-        for i in range(size):
-            expected *= Fraction(max(n - i, 0), count - i)
-        table.append(0 if n < size else 1 if n == size else table[-1] + math.ceil(expected - before))
-    return table
+    for n in range(1, total + 1):
+        table.append(0 if n < size else 1 if n == size else table[-1] + math.ceil(grown[n - 1]))
+    return table, grown
 
 
-def prosac_sample(
-    order: Sequence[int], newest: int, size: int, seed: int, key: int, stream: int, draw: int
-) -> list[int]:
-    """The match of rank `newest`, and `size` - 1 of those before it, all alike."""
-    others = weighted_sample([1] * newest, size - 1, seed, key, stream, draw)
-    return [order[i] for i in [*others, newest]]
+def prosac_sample(table: Sequence[int], t: int, numbers: Sequence[int]) -> list[int]:
+    """Ranks in the t-th sample, t from 1: m - 1 of those before the n-th, and that one, n the least with T'_n >= t."""
+    n = next(n for n, last in enumerate(table, 1) if last >= t)
+    return [*weighted_sample([1] * (n - 1), numbers), n - 1]
 
 
-def shuffled(indices: Sequence[int], seed: int, key: int, stream: int) -> list[int]:
-    """Matches by their random numbers."""
-    return sorted(indices, key=lambda i: number(seed, key, stream, i, 0, 1))
+def priority_sample(prior: Sequence[float], numbers: Sequence[int], count: int) -> list[int]:
+    """The matches of the greatest prior / (number + 1), ascending (Duffield, Lund & Thorup, J. ACM 2007)."""
+    order = sorted(range(len(prior)), key=lambda i: -Fraction(prior[i]) / (numbers[i] + 1))
+    return sorted(order[:count])
 
 
-def by_priority(prior: Sequence[float], seed: int, key: int, stream: int) -> list[int]:
-    """Matches by falling prior / u: priority sampling (Duffield, Lund & Thorup, J. ACM 2007)."""
-    u = [float(number(seed, key, stream, i, 0, 1)) + 1 for i in range(len(prior))]
-    return sorted(range(len(prior)), key=lambda i: -prior[i] / u[i])
+def shuffled(index: Sequence[int], numbers: Sequence[int], count: int) -> list[int]:
+    """The first matches in the order of their numbers."""
+    return sorted(index, key=lambda i: numbers[i])[:count]

@@ -12,7 +12,7 @@ from fmtorch.core.streams import Stream
 from fmtorch.estimators.families.family import Hypotheses
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.parts.sampling import PriorWeighted
-from fmtorch.estimators.parts.scores import Score
+from fmtorch.estimators.parts.scores import Score, scored
 from fmtorch.estimators.search import Verified
 from fmtorch.geometry.homography_kernels import (
     least_squares_homography,
@@ -75,7 +75,7 @@ class Degensac:
             return F[:0], np.empty(0)
         state = pair.mixed_seed(Stream.PARALLAX), pair.key, 2 * turn * PARALLAX_DRAWS
         F = F[: parallax(H, pair.points, np.cumsum(weight), np.array(state), F)]
-        score = self.score(F, np.arange(len(F)), pair)
+        score = scored(self.score, F, np.arange(len(F)), pair)
         kept = np.argsort(-score, kind="stable")[:KEPT]
         return F[kept], score[kept]
 

@@ -78,10 +78,10 @@ class SummedGains:
             self.gain_kernel(squared, gains)
         else:
             gains = np.asarray(self.gain(squared))
-        if gains.shape != squared.shape:
+        if gains.shape != squared.shape or gains.dtype.kind not in "biuf":
             raise ValueError(
-                f"{type(self).__name__}.gain returns shape {gains.shape}; it must be that of its argument, "
-                f"{squared.shape}: (models, matches)"
+                f"{type(self).__name__}.gain returns shape {gains.shape} of {gains.dtype}; it must be the shape of its "
+                f"argument, {squared.shape}: (models, matches), of numbers"
             )
         out = np.empty(len(which))
         sum_gains(np.ascontiguousarray(gains, np.float32), rows, bits, out)
@@ -153,7 +153,7 @@ def scored(score: Score, F: Array, which: Array, pair: Pair) -> Array:
         raise ValueError(
             f"{type(score).__name__} returns {what}; it must be an array of float64 {which.shape}: one number a model"
         )
-    return scores
+    return np.ascontiguousarray(scores)
 
 
 def check_threshold(threshold: float) -> None:

@@ -1,4 +1,4 @@
-"""Inlier rules and the stopping rule, from their definitions."""
+"""Residuals in pixels, rules of inliers and the stopping rule, against their definitions."""
 
 from __future__ import annotations
 
@@ -9,56 +9,101 @@ import pytest
 
 from fmtorch.estimators.parts.inliers import (
     BetterHalf,
+    InlierRule,
     RobustDeviations,
     StoppingRule,
     WithinThreshold,
-    lower_median,
     residuals_squared_px,
-    share_within,
 )
-from fmtorch.estimators.parts.sampling import PriorWeighted, Uniform
-from tests.estimators.pairs import pair_of
-from tests.laws import scene
+from fmtorch.estimators.parts.sampling import PriorWeighted, Prosac, Sampler, Uniform
+from tests.estimators.pairs import FEW, SCALES, models, named
+from tests.estimators.residuals import residuals
 from tests.reference import ransac as reference
 
 
-def test_residuals_are_sampson_distances() -> None:
-    pair = pair_of(scene(1, 100))
-    F = np.random.default_rng(0).normal(size=9)
-    r2 = residuals_squared_px(F, pair)
-    for i in range(100):
-        r = reference.sampson(F.reshape(3, 3), pair.points[:2, i], pair.points[2:, i]) * pair.pixels_per_unit
-        assert math.sqrt(r2[i]) == pytest.approx(r, rel=1e-9)
+@pytest.mark.parametrize("given", ["scene 150", "real 7", *FEW])
+def test_residuals_are_squared_sampson_distances_in_pixels(given: str) -> None:
+    for scale in SCALES if given in FEW else (1.0,):
+        pair = named(given, scale)
+        for F in models(pair, 8)[1:]:
+            found = residuals_squared_px(F, pair)
+            r = residuals(F, pair, 1.0, np.float64)  # per noise
+            noise = np.ones(pair.count) if pair.noise is None else pair.noise
+            low, high = r.low * noise, r.high * noise
+            assert ((low**2 * (1 - 1e-15) <= found) & (found <= high**2 * (1 + 1e-15))).all()
 
 
-@pytest.mark.parametrize("count", [8, 9, 300])
-def test_rules(count: int) -> None:
-    pair, r2 = pair_of(scene(1, count)), np.random.default_rng(count).gamma(1.0, 2.0, count)
-    np.testing.assert_array_equal(WithinThreshold(1.5)(r2, pair), np.sqrt(r2) <= 1.5)
-    median = sorted(r2)[(count + 1) // 2 - 1]
-    assert lower_median(r2) == median
-    np.testing.assert_array_equal(BetterHalf()(r2, pair), r2 <= median)
-    sigma = 1.4826 * (1 + 5 / (count - 7)) * math.sqrt(median)
-    np.testing.assert_array_equal(RobustDeviations()(r2, pair), np.sqrt(r2) <= 2.5 * sigma)
+@pytest.mark.parametrize("count", [7, 8, 9, 20, 151])
+def test_rules_are_those_of_the_definitions(count: int) -> None:
+    pair, rng = named(f"scene {count}"), np.random.default_rng(count)
+    for r in (
+        rng.uniform(0, 3, count),
+        rng.integers(0, 3, count) * 1.0,
+        np.zeros(count),
+        10.0 ** rng.uniform(-9, 9, count),
+    ):
+        median = reference.lower_median((r**2).tolist())
+        sigma = 1.4826 * (1 + 5 / max(count - 7, 1)) * math.sqrt(median)
+        rules: list[tuple[InlierRule, list[bool]]] = [
+            (WithinThreshold(1.5), [x <= 1.5**2 for x in r**2]),
+            (BetterHalf(), [x <= median for x in r**2]),
+            (RobustDeviations(), [x <= (2.5 * sigma) ** 2 for x in r**2]),
+        ]
+        for rule, expected in rules:
+            assert rule(r**2, pair).tolist() == expected
 
 
-def test_infinite_residuals_are_no_inliers() -> None:
-    pair = pair_of(scene(1, 9))
-    r2 = np.array([0.1] * 6 + [np.inf] * 3)
-    for rule in (WithinThreshold(1.0), BetterHalf(), RobustDeviations()):
-        np.testing.assert_array_equal(rule(r2, pair), [True] * 6 + [False] * 3)
+@pytest.mark.parametrize("count", [7, 8, 9, 20, 151])
+def test_two_and_a_half_robust_deviations(count: int) -> None:
+    """1.4826 (1 + 5 / (n - 7)) med |r|, of seven parameters; n - 7 is taken for one where it is less."""
+    limit = 2.5 * 1.4826 * (1 + 5 / {7: 1, 8: 1, 9: 2, 20: 13, 151: 144}[count])
+    r = np.ones(count)
+    r[0], r[1] = limit * (1 - 1e-9), limit * (1 + 1e-9)
+    assert RobustDeviations()(r**2, named(f"scene {count}")).tolist() == [True, False, *[True] * (count - 2)]
 
 
-@pytest.mark.parametrize("size", [4, 7, 8])
-@pytest.mark.parametrize("sampler", [Uniform(), PriorWeighted()])
-def test_stops_after_the_draws_that_confidence_asks_for(sampler: Uniform | PriorWeighted, size: int) -> None:
-    pair = pair_of(scene(3, 200, outliers=0.5))
-    F = np.random.default_rng(0).normal(size=9)
-    r2, weight = residuals_squared_px(F.astype(np.float32).astype(np.float64), pair), sampler.weight(pair)
-    threshold = math.sqrt(np.quantile(r2, 0.6))
-    share = share_within(r2, threshold * threshold, weight)
-    assert share == weight[r2 <= threshold * threshold].sum() / weight.sum()
-    rule = StoppingRule(0.99, threshold, sampler)
-    needed = reference.draws_for_confidence(share, size, 0.99)
-    assert not rule(F.astype(np.float32), math.floor(needed), pair, size)
-    assert rule(F.astype(np.float32), math.floor(needed) + 1, pair, size)
+def test_limits_belong_to_the_inliers_and_are_none_beyond_the_range_of_numbers() -> None:
+    pair = named("scene 8")
+    squared = np.array([0, 4, np.nextafter(4, 5), 1e300, np.inf, np.nan, 1, 2])
+    assert WithinThreshold(2.0)(squared, pair).tolist() == [True, True, False, False, False, False, True, True]
+    assert WithinThreshold(1e200)(squared, pair).sum() == 7
+    assert not WithinThreshold(1e-200)(squared, pair)[1:].any()
+
+
+@pytest.mark.parametrize("probability", [0.5, 0.99, 0.9999])
+@pytest.mark.parametrize("sampler", [Uniform(), Prosac(), PriorWeighted()])
+def test_a_search_stops_after_as_many_draws_as_it_takes(sampler: Sampler, probability: float) -> None:
+    pair = named("scene 150")
+    shares = set()
+    for F in models(pair, 12)[1:].astype(np.float32):
+        for threshold in (0.1, 1.0, 10.0, 100.0):
+            inside = residuals_squared_px(F.astype(np.float64), pair) <= threshold**2
+            weight = sampler.weight(pair)  # type: ignore[attr-defined]
+            share = float(weight[inside].sum() / weight.sum())
+            for size in (5, 7):
+                stop = StoppingRule(probability, threshold, sampler)
+                if share in (0, 1):
+                    assert stop(F, 10**9, pair, size) == (share == 1)
+                    continue
+                draws = reference.draws_for_confidence(share, size, probability)
+                assert stop(F, math.ceil(draws * (1 + 1e-9)), pair, size)
+                assert not stop(F, math.ceil(draws * (1 - 1e-9)) - 1, pair, size)
+                shares.add(share)
+    assert len(shares) > 10
+
+
+def test_matches_are_equally_likely_for_a_sampler_that_does_not_say() -> None:
+    class Mine:
+        def draw(self, pair: object, start: int, count: int, size: int) -> np.ndarray:
+            raise AssertionError
+
+    pair = named("scene 150")
+    for F in models(pair, 12)[1:].astype(np.float32):
+        for draws in (1, 30, 1000):
+            mine, uniform = (StoppingRule(0.99, 5.0, sampler)(F, draws, pair, 7) for sampler in (Mine(), Uniform()))
+            assert mine == uniform
+
+
+def test_a_model_of_all_matches_needs_one_sample() -> None:
+    pair = named("scene 40")
+    assert StoppingRule(0.9999, 1e9, Uniform())(models(pair, 2)[1].astype(np.float32), 1, pair, 7)

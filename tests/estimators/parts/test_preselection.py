@@ -1,81 +1,103 @@
-"""A round's models compared on few matches first: which matches, which models, and the scores of those that pass."""
+"""Which models are scored on all matches, and on which few matches they are compared before."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
 
 from fmtorch.core.streams import Stream
-from fmtorch.estimators.families.fundamental import SevenPoint
 from fmtorch.estimators.options import Preselect
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.preselection import Preselection, best
-from fmtorch.estimators.parts.sampling import Uniform
+from fmtorch.estimators.parts.preselection import (
+    Preselection,
+    best,
+    draw_by_prior,
+    drawn_by_prior,
+    shuffle,
+    shuffled_first,
+)
 from fmtorch.estimators.parts.saturated import SaturatedGains
-from fmtorch.estimators.parts.scores import Msac
-from tests.estimators.pairs import pair_of
-from tests.laws import scene
+from fmtorch.estimators.parts.scores import InlierCount, Magsac, Msac
+from tests.estimators.pairs import FEW, models, named
 from tests.reference import sampling as reference
+from tests.reference.random import number
+
+SEED = 3
 
 
-def hypotheses(pair: Pair, count: int = 100) -> np.ndarray:
-    return SevenPoint().solve(pair, Uniform().draw(pair, 0, count, 7), 0).F
+def numbers(pair: Pair) -> list[int]:
+    return [number(pair.seed, pair.key, Stream.PRESELECTION, 0, i, 1) for i in range(pair.count)]
 
 
-@pytest.mark.parametrize(("m", "k"), [(1, 1), (30, 7), (300, 300), (1000, 999), (5, 2)])
-def test_the_best_scores_and_of_equals_the_first(m: int, k: int) -> None:
-    score = np.random.default_rng(m).integers(0, 9, m).astype(float)
-    out = np.empty(k, np.int64)
-    best(score, out)
-    expected = sorted(sorted(range(m), key=lambda i: (-score[i], i))[:k])
-    assert out.tolist() == expected
-
-
-@pytest.mark.parametrize("count", [256, 300, 2000])
-def test_the_subset_of_a_score_that_knows_no_prior(count: int) -> None:
-    pair = pair_of(scene(1, count), 5)
-    subset = Preselection(Msac(1.0), Preselect(matches=64, survivors=9)).subset(pair)
-    assert subset is not None
-    expected = reference.shuffled(range(count), 5, pair.key, Stream.PRESELECTION)[:64]
-    np.testing.assert_array_equal(subset.points, pair.points[:, expected])
-
-
-def test_the_subset_of_a_score_that_weighs_by_the_prior() -> None:
-    c = scene(1, 300)
-    assert c.prior is not None
-    c.prior[0, :200] = 0
-    pair = pair_of(c, 5)
+@pytest.mark.parametrize("given", ["scene 40", "scene 129", "scene 700", "7 random", "20 collinear"])
+def test_few_matches_are_those_of_the_definitions(given: str) -> None:
+    pair = named(given, seed=SEED)
     assert pair.prior is not None
-    subset = Preselection(SaturatedGains(1.0), Preselect(matches=128, survivors=9)).subset(pair)
-    assert subset is not None
-    expected = sorted(reference.by_priority(pair.prior.tolist(), 5, pair.key, Stream.PRESELECTION)[:128])
-    np.testing.assert_array_equal(subset.points, pair.points[:, expected])
-    np.testing.assert_array_equal(subset.match_weight, pair.prior[expected] > 0)  # each counts as one
-    assert (pair.match_weight == pair.prior).all()  # the pair itself is as it was
+    n, words, prior = pair.count, numbers(pair), pair.prior.copy()
+    for count in (1, 5, n - 1, n, 2 * n):
+        any_few, likely = shuffled_first(pair, count), drawn_by_prior(pair, count)
+        np.testing.assert_array_equal(any_few.table, pair.table[:, reference.shuffled(range(n), words, count)])
+        drawn = reference.priority_sample(prior.tolist(), words, count)
+        np.testing.assert_array_equal(likely.points, pair.points[:, drawn])
+        np.testing.assert_array_equal(likely.match_weight, prior[drawn] > 0)
+    np.testing.assert_array_equal(pair.prior, prior)
 
 
-def test_no_subset_of_few_matches() -> None:
-    assert Preselection(Msac(1.0), Preselect(matches=128)).subset(pair_of(scene(1, 190))) is None
-    assert Preselection(Msac(1.0), None).subset(pair_of(scene(1, 1000))) is None
+def test_likely_matches_are_drawn_by_their_prior() -> None:
+    """Three times as many of the kind three times as likely, and none that have no prior."""
+    n, k, seen, keys = 900, 60, np.zeros(3), 300
+    prior = np.repeat([0.0, 0.2, 0.6], n // 3)
+    index = np.empty(k, np.int64)
+    for key in range(keys):
+        draw_by_prior(prior, 5, key, index)
+        assert len(set(index.tolist())) == k
+        seen += np.bincount(index // (n // 3), minlength=3)
+    assert seen[0] == 0
+    # 60 of 600 at a time: by their prior up to some 2 % (those drawn are missing later); 5 standard errors of a share.
+    assert seen[2] / seen.sum() == pytest.approx(0.75, abs=0.02 + 5 * np.sqrt(0.75 * 0.25 / (k * keys)))
+    draw_by_prior(np.zeros(n), 5, 0, index)
+    np.testing.assert_array_equal(index, np.arange(k))
 
 
-def test_survivors_are_the_best_on_few_matches_with_their_scores_on_all() -> None:
-    pair, score = pair_of(scene(1, 300)), Msac(1.0)
-    F = hypotheses(pair)
-    preselection = Preselection(score, Preselect(matches=64, survivors=20))
-    which, scores = preselection(F, pair)
-    subset = preselection.subset(pair)
-    assert subset is not None
-    every = np.arange(len(F))
-    first = score(F, every, subset)
-    assert which.tolist() == sorted(sorted(every, key=lambda i: (-first[i], i))[:20])
-    np.testing.assert_array_equal(scores, score(F, every, pair)[which])
+@pytest.mark.parametrize(("m", "k"), [(1, 1), (5, 5), (300, 96), (300, 1), (1000, 256)])
+def test_the_best_of_a_round_and_the_first_of_equals(m: int, k: int) -> None:
+    score = np.random.default_rng(m + k).integers(0, 40, m) / 8.0
+    score[::7] = -np.inf
+    which = np.empty(k, np.int64)
+    best(score, which)
+    np.testing.assert_array_equal(which, np.sort(np.argsort(-score, kind="stable")[:k]))
 
 
-@pytest.mark.parametrize("options", [None, Preselect(matches=64, survivors=10_000)])
-def test_all_survive_where_there_are_not_more(options: Preselect | None) -> None:
-    pair, score = pair_of(scene(1, 300)), Msac(1.0)
-    F = hypotheses(pair, 30)
-    which, scores = Preselection(score, options)(F, pair)
-    np.testing.assert_array_equal(which, np.arange(len(F)))
-    np.testing.assert_array_equal(scores, score(F, which, pair))
+@pytest.mark.parametrize("score", [InlierCount(1.5), Msac(1.5, True), Magsac(1.5), SaturatedGains(1.5)])
+@pytest.mark.parametrize("given", ["scene 700", "real 7"])
+def test_the_models_that_pass_are_the_best_on_few_matches(given: str, score: Any) -> None:
+    pair, options = named(given, seed=SEED), Preselect(matches=64, survivors=20)
+    F = models(pair, 120).astype(np.float32)
+    which, found = Preselection(score, options)(F, pair)
+    draw = drawn_by_prior if score.prior_weighted and pair.prior is not None else shuffled_first
+    first = getattr(score, "preselection", score)(F, np.arange(120), draw(pair, 64))
+    np.testing.assert_array_equal(which, np.sort(np.argsort(-first, kind="stable")[:20]))
+    np.testing.assert_array_equal(found, score(F, np.arange(120), pair)[which])
+
+
+@pytest.mark.parametrize("given", ["scene 700", *FEW])
+def test_all_models_are_scored_where_there_is_little_to_gain(given: str) -> None:
+    """Without preselection, for no more models than pass, and for matches that are few anyway."""
+    pair, score = named(given), Msac(1.5)
+    F = models(pair, 30).astype(np.float32)
+    few = None if pair.bucket >= 2 * 64 else Preselect(64, 20)
+    for options in (None, Preselect(64, 30), Preselect(512, 20), few):
+        which, found = Preselection(score, options)(F, pair)
+        np.testing.assert_array_equal(which, np.arange(30))
+        np.testing.assert_array_equal(found, score(F, np.arange(30), pair))
+
+
+def test_a_pair_is_asked_once_for_its_few_matches() -> None:
+    pair, preselection = named("scene 700"), Preselection(Msac(1.5), Preselect(64, 20))
+    assert preselection.subset(pair) is preselection.subset(pair)
+
+
+def test_shuffling_nothing() -> None:
+    assert shuffle(5, 0, 0, np.empty(0, np.int64)) == 0

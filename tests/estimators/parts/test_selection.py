@@ -5,28 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fmtorch.estimators import HypothesizeAndVerify, Pair
+from fmtorch.estimators import HypothesizeAndVerify
 from fmtorch.estimators.parts.refinement import Candidates
-from fmtorch.estimators.parts.saturated import SaturatedGains
 from fmtorch.estimators.parts.scores import Msac
 from fmtorch.estimators.parts.selection import BestOfSearch, BestScore, scores_of
 from tests.estimators.pairs import pair_of
 from tests.laws import scene
-
-
-def test_saturation_prefers_what_explains_the_whole_image() -> None:
-    """Of two models with as many inliers each, the one whose inliers lie in more cells scores higher."""
-    spread = np.linspace(-0.9, 0.9, 128)
-    crowd = np.where(np.arange(128) < 1, -0.9, 0.5)  # two in the corners span the same grid
-    crowd[1] = 0.9
-    vertical = np.zeros((1, 9))
-    vertical[0, 2], vertical[0, 6] = -1, 1  # x1 - x0 = 0
-    scores = []
-    for px in (spread, crowd):
-        table = np.vstack([np.stack([px] * 4), np.ones((5, 128))])
-        pair = Pair(table, (False, False, False), 128, 1.0, 1, 0, np.zeros(4), np.empty(0))
-        scores.append(float(scores_of(SaturatedGains(1.0), vertical, pair)[0]))
-    assert scores[0] > 2 * scores[1]
 
 
 def test_the_first_of_the_pool_or_the_best_score_of_what_is_valid() -> None:
