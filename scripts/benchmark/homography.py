@@ -220,6 +220,8 @@ def _poselib(threshold: float, c: Correspondences, seed: int) -> Array | None:
 def _opencv(method: int, threshold: float, c: Correspondences, seed: int) -> Array | None:
     cv2.setRNGSeed(seed)
     x0, x1 = points(c)
+    if len(x0) < 4:
+        return None
     H, _ = cv2.findHomography(x0, x1, method, threshold, maxIters=2000, confidence=0.9999)
     return None if H is None else np.asarray(H)
 
