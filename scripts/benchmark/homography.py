@@ -8,7 +8,7 @@ consistency. Every second photograph is for tuning (--tuning), the others for th
 The error of a pair is the mean distance of the true and the estimated image of the photograph's corners, or, of views,
 of the points of a grid that both see.
 
-python -m scripts.benchmark homography --photographs DATA/photos --seeds 3
+python -m scripts.benchmark homography --photographs DATA/photos --seeds 3 --warps 2
 python -m scripts.benchmark homography --photographs DATA/photos --tuning --methods ours:select.scale=0.5 poselib:2
 """
 
@@ -41,7 +41,7 @@ Solver = Callable[[Correspondences, int], Array | None]
 SIDE = 640  # px, the longer side of the photographs
 WARP = 1000  # between the seeds of two warps of a photograph
 THRESHOLDS = (1, 3, 5)  # px
-METHODS = ("ours", "poselib:2", "poselib:1", "usac_magsac:0.5", "usac_magsac:1", "usac_accurate:1")
+METHODS = ("ours", "poselib:1", "poselib:2", "poselib:3", "usac_accurate:1", "usac_magsac:0.5")
 KINDS = ("warped", "hard", "views")
 HARD_RIGHT, HARD_WRONG_SHARE = 60, 0.7
 GRID = 12  # points along each side of a view
