@@ -23,7 +23,7 @@ from fmtorch.estimators.families.posterior import Limits, minimise, no_optimum, 
 from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair
 from fmtorch.estimators.parts.final_fits import FinalFit, Fit
 from fmtorch.geometry import canonical, eight_point, unit_frobenius
-from fmtorch.geometry.homography_error import homography_gradient
+from fmtorch.geometry.homography_refine import homography_at_optimum
 from fmtorch.geometry.optimum import STEP_DAMPING, gradient_of_cost
 from fmtorch.geometry.pixel_frame import PixelFrame
 from fmtorch.geometry.robust_losses import KERNELS
@@ -102,16 +102,24 @@ class Attached:
         weight = matches.weight if self.family.fit_scale.by_prior else matches.precision
         weight = torch.where(counted > 0, counted * weight, 0)
         if self.family.model == "homography":
-            scales = [s.fit.s2 for s in solved if s.fit.s2 is not None]  # of all fits, or of none
-            s2 = _padded(scales, matches.mask) if scales else None
-            gradient, response = homography_gradient(at, matches.points, weight, s2)
-        else:
-            unbounded = torch.full_like(at[:, 0], torch.inf)
-            gradient = gradient_of_cost(at.T[..., None], matches.points, weight, KERNELS["truncated"], unbounded)[
-                ..., 0
-            ].T
-            response = torch.from_numpy(np.stack([_response(s) for s in solved])).to(device)
+            return _homographies_at_optimum(solved, at, matches, weight)
+        unbounded = torch.full_like(at[:, 0], torch.inf)
+        gradient = gradient_of_cost(at.T[..., None], matches.points, weight, KERNELS["truncated"], unbounded)[..., 0].T
+        response = torch.from_numpy(np.stack([_response(s) for s in solved])).to(device)
         return (response * (gradient - gradient.detach())[:, None]).sum(-1)
+
+
+def _homographies_at_optimum(
+    solved: list[Solved], at: Float[Tensor, "p 9"], matches: GraphedMatches, weight: Float[Tensor, "p n"]
+) -> Float[Tensor, "p 9"]:
+    """As `Attach`, of homographies, by the loss of their fits."""
+    robust, s2 = KERNELS["truncated"], torch.full_like(at[:, :1], torch.inf)
+    scales = [s.fit.s2 for s in solved if s.fit.s2 is not None]  # of all fits, or of none
+    if scales:
+        robust, s2 = KERNELS["cauchy"], torch.where(matches.mask, _padded(scales, matches.mask), 1)
+    model = torch.nn.functional.normalize(at, dim=1).T[..., None]
+    attached = homography_at_optimum(model, matches.points, weight, robust, s2)[..., 0].T
+    return attached - attached.detach()
 
 
 def _response(solved: Solved) -> Array:

@@ -15,6 +15,8 @@ from fmtorch.geometry.epipolar import (
     symmetric_squared,
     unit_frobenius,
 )
+from fmtorch.geometry.homography import homography, homography_points, homography_sampson, homography_transfer
+from fmtorch.geometry.homography_refine import refine_homography
 from fmtorch.geometry.irls import Fits, irls, reweighted_fits
 from fmtorch.geometry.normalize import canonical, denormalize_fundamental, normalize_pair, normalize_points
 from fmtorch.geometry.pose import Pose, pose_from_fundamental
@@ -27,8 +29,9 @@ from fmtorch.geometry.significance import significance
 __all__ = [
     "KERNELS", "Fits", "Pose", "algebraic", "attached_step", "canonical", "cross_matrix", "denormalize_fundamental",
     "eight_point", "epipolar_distances", "epipolar_lines", "fundamental_from_calibration",
-    "fundamental_from_projections", "irls", "nearest_rank2", "normalize_pair", "normalize_points", "point_to_line",
-    "pose_from_fundamental", "refine", "reweighted_fits", "sampson", "sampson_squared", "seven_point", "significance",
+    "fundamental_from_projections", "homography", "homography_points", "homography_sampson", "homography_transfer",
+    "irls", "nearest_rank2", "normalize_pair", "normalize_points", "point_to_line", "pose_from_fundamental", "refine",
+    "refine_homography", "reweighted_fits", "sampson", "sampson_squared", "seven_point", "significance",
     "symmetric_max", "symmetric_mean", "symmetric_squared", "unit_frobenius",
 ]  # fmt: skip
 

@@ -69,7 +69,7 @@ class NormalEquations(NamedTuple):
     @classmethod
     def of(cls, x0: Tensor, x1: Tensor, weight: Tensor | None = None, mask: Tensor | None = None) -> NormalEquations:
         """Arguments as of `eight_point`."""
-        x0d, x1d, w, valid = _door(x0, x1, weight, mask)
+        x0d, x1d, w, valid = finite_matches(x0, x1, weight, mask)
         x0n, T0 = normalize_points(x0d, weight=w)
         x1n, T1 = normalize_points(x1d, weight=w)
         return cls(normal_matrix(x0n, x1n, w), T0, T1, valid)
@@ -120,7 +120,9 @@ def _products(x: Tensor) -> Tensor:
     return torch.stack([x * x, x * y, y * y, x, y, torch.ones_like(x)], -2)
 
 
-def _door(x0: Tensor, x1: Tensor, weight: Tensor | None, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def finite_matches(
+    x0: Tensor, x1: Tensor, weight: Tensor | None, mask: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Points and weights in float64, zero where they do not count; False for a set in which one cannot be used."""
     w = torch.ones_like(x0[..., 0]) if weight is None else weight
     good = (x0.isfinite() & x1.isfinite()).all(-1) & w.isfinite() & (w >= 0)

@@ -2,54 +2,97 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.geometry.optimum import STEP_DAMPING
+from fmtorch.geometry.arithmetic import stable_sum
+from fmtorch.geometry.robust_losses import Kernel
 
 
-def homography_sampson_squared(H: Float[Tensor, "p 9"], points: Float[Tensor, "4 p n"]) -> Float[Tensor, "p n"]:
-    """Squared distances of matches x0, y0, x1, y1; see `homography_objective_kernels`. Infinite behind the horizon."""
+class HomographyError(NamedTuple):
+    """Of models and matches that broadcast to *s; see `homography_objective_kernels`.
+
+    squared: squared distances, infinite where undefined. front: whether the model's third coordinate at the match is
+    positive. equations: e. inverse: the three entries of ``(J J^T)^-1``. corrected: x and y, their corrections added,
+    and W times the multipliers l. multipliers: l.
+    """
+
+    squared: Float[Tensor, "*s"]
+    front: Bool[Tensor, "*s"]
+    inverse: tuple[Tensor, Tensor, Tensor]
+    multipliers: tuple[Tensor, Tensor]
+    corrected: tuple[Tensor, Tensor, Tensor, Tensor]
+
+
+def linearise_homography(h: Float[Tensor, " 9 *m"], points: Float[Tensor, " 4 *p"]) -> HomographyError:
+    """The error of matches x0, y0, x1, y1 under models of nine entries, row by row; the two broadcast."""
     x, y, u, v = points
-    h = H.T[..., None]
     w = h[6] * x + h[7] * y + h[8]
-    front = w > 0
-    w = torch.where(front, w, 1)
     e, f = h[0] * x + h[1] * y + h[2] - u * w, h[3] * x + h[4] * y + h[5] - v * w
     a, b, c, d = h[0] - u * h[6], h[1] - u * h[7], h[3] - v * h[6], h[4] - v * h[7]
-    p, q, area, w2 = c * e - a * f, d * e - b * f, a * d - b * c, w * w
+    area, w2 = a * d - b * c, w * w
     determinant = area * area + w2 * (a * a + b * b + c * c + d * d + w2)
-    return torch.where(front, (w2 * (e * e + f * f) + p * p + q * q) / determinant, torch.inf)
+    defined = determinant > 0
+    by = 1 / torch.where(defined, determinant, 1)
+    i00, i01, i11 = (c * c + d * d + w2) * by, -(a * c + b * d) * by, (a * a + b * b + w2) * by
+    l0, l1 = i00 * e + i01 * f, i01 * e + i11 * f
+    p, q = c * e - a * f, d * e - b * f
+    squared = torch.where(defined, (w2 * (e * e + f * f) + p * p + q * q) * by, torch.inf)
+    corrected = (x - (a * l0 + c * l1), y - (b * l0 + d * l1), w * l0, w * l1)
+    return HomographyError(squared, defined & (w > 0), (i00, i01, i11), (l0, l1), corrected)
+
+
+def equations_slope(error: HomographyError, points: Float[Tensor, " 4 *p"]) -> Float[Tensor, " 2 9 *s"]:
+    """G, the derivative of the two corrected equations of each match by the nine entries."""
+    X, Y, du, dv = error.corrected
+    x, y, u, v = (p.expand_as(X) for p in points)
+    one, zero = torch.ones_like(X), torch.zeros_like(X)
+    first = [X, Y, one, zero, zero, zero, -(u * X + x * du), -(u * Y + y * du), -(u + du)]
+    second = [zero, zero, zero, X, Y, one, -(v * X + x * dv), -(v * Y + y * dv), -(v + dv)]
+    return torch.stack([torch.stack(first), torch.stack(second)])
 
 
 def homography_gradient(
-    H: Float[Tensor, "p 9"],
+    H: Float[Tensor, "9 p k"],
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
-    s2: Float[Tensor, "p n"] | None = None,
-) -> tuple[Float[Tensor, "p 9"], Float[Tensor, "p 9 9"]]:
-    """Half the gradient of ``sum_i w_i rho(r_i^2)`` by the entries of H, attached to points and weights.
+    robust: Kernel,
+    s2: Float[Tensor, "p slots"],
+) -> Float[Tensor, "9 p k"]:
+    """Half the gradient of ``sum_i w_i rho(r_i^2)`` by the entries of H, ``G^T l``, attached to all inputs.
 
-    And how the optimum on the sphere of nine entries moves with that gradient, by the second derivatives there, without
-    gradient. rho is Cauchy's, ``s^2 log(1 + r^2 / s^2)``; without s2 the squared error. Matches of weight zero count
-    nothing, wherever they are, nor do those behind the horizon.
+    s2: squared scales of the loss, one a pair or a match. Matches of weight zero and those behind the horizon count
+    nothing, wherever they are.
     """
-    with torch.enable_grad():
-        model = H.detach().clone().requires_grad_()
-        squared = homography_sampson_squared(model, torch.where(weight.detach() > 0, points, 0))
-        counted = (weight.detach() > 0) & torch.isfinite(squared.detach())
-        squared = torch.where(counted, squared, 0)
-        s2 = None if s2 is None else torch.where(counted, s2, 1)
-        loss = squared if s2 is None else s2 * torch.log1p(squared / s2)
-        cost = torch.where(counted, weight * loss, 0).sum() / 2
-        (gradient,) = torch.autograd.grad(cost, model, create_graph=True)
-        rows = [torch.autograd.grad(gradient[:, i].sum(), model, retain_graph=True)[0] for i in range(9)]
-    at = torch.nn.functional.normalize(model.detach(), dim=1)
-    radial = at[:, :, None] * at[:, None, :]
-    curvature = torch.stack(rows, 1)
-    largest = curvature.diagonal(dim1=1, dim2=2).amax(1)[:, None, None]
-    tangent = torch.eye(9).to(at) - radial
-    solved, failed = torch.linalg.solve_ex(curvature + largest * (radial + STEP_DAMPING * torch.eye(9).to(at)), tangent)
-    valid = (failed == 0) & torch.isfinite(solved).flatten(1).all(1)
-    return gradient, torch.where(valid[:, None, None], -solved, 0)
+    counted = weight.detach() > 0
+    matches = torch.where(counted, points, 0)[:, :, None]
+    error = linearise_homography(H[..., None], matches)
+    counted = counted[:, None] & error.front
+    slope = robust.weight(torch.where(counted, error.squared, 0), s2[:, None])
+    influence = torch.where(counted, weight[:, None] * slope, 0)
+    first, second = equations_slope(error, matches)
+    l0, l1 = error.multipliers
+    return stable_sum((first * l0 + second * l1) * influence)
+
+
+def homography_curvature(
+    H: Float[Tensor, "9 p k"],
+    points: Float[Tensor, "4 p n"],
+    weight: Float[Tensor, "p n"],
+    robust: Kernel,
+    s2: Float[Tensor, "p slots"],
+) -> Float[Tensor, "p k 9 9"]:
+    """The Gauss-Newton matrix ``G^T (J J^T)^-1 G`` with the curvature of the loss; arguments as of the gradient."""
+    counted = weight > 0
+    matches = torch.where(counted, points, 0)[:, :, None]
+    error = linearise_homography(H[..., None], matches)
+    counted = counted[:, None] & error.front
+    slope = robust.curvature(torch.where(counted, error.squared, 0), s2[:, None])
+    influence = torch.where(counted, weight[:, None] * slope, 0)
+    first, second = equations_slope(error, matches)
+    i00, i01, i11 = error.inverse
+    rows = torch.stack([first * i00 + second * i01, first * i01 + second * i11]) * influence
+    return torch.einsum("eapkn,ebpkn->pkab", rows, torch.stack([first, second]))

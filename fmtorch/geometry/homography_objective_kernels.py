@@ -22,18 +22,19 @@ import numpy as np
 
 from fmtorch.compiling.arrays import Array, F8x1, F8x2, F8x3
 from fmtorch.compiling.kernel import inner, kernel
-from fmtorch.compiling.lanes import LANES, added, fill, load, sqrt, store, where
+from fmtorch.compiling.lanes import LANES, added, fill, load, store, where
 from fmtorch.compiling.scratch import matrix, vector
 from fmtorch.geometry import residual_kernels as rows_of
 from fmtorch.geometry.levenberg_marquardt_kernels import Schedule, levenberg_marquardt
 from fmtorch.geometry.rank2_kernels import assign, assign_rows, unit
 from fmtorch.geometry.rank2_manifold_kernels import eliminate
 from fmtorch.geometry.residual_kernels import TINY32, Residual
-from fmtorch.geometry.sampson_objective_kernels import MATCH, TINY, Weighted, add_products, in_rows, robust
+from fmtorch.geometry.sampson_objective_kernels import MATCH, TINY, Weighted, in_rows, robust
 
 MIN_DAMPING, MAX_DAMPING = 1e-12, 1e6
-BEHIND = 1e12  # squared distance of a match behind the horizon in the units of the points, which extend to about one
 INFINITE, ZERO = np.float32(math.inf), np.float32(0)
+BEHIND = 1e4  # squared distance of a match behind the horizon in the units of the points, which extend to about one
+SUMS = 52  # over the matches, of the normal equations
 load32 = rows_of.load
 
 
@@ -84,42 +85,39 @@ class _Data(NamedTuple):
 
 @kernel
 def evaluate_homographies(H: F8x2, weighted: Weighted, derivatives: bool, products: F8x3, cost: F8x1) -> None:
-    """The robust error of models (k, 9) -> cost (k,); the normal equations -> products (k, 10, 10), if wanted."""
+    """The robust error of models (k, 9) -> cost (k,); the normal equations -> products (k, 10, 10), if wanted.
+
+    These are ``G^T (J J^T)^-1 G``, the gradient and r^2, each times the weights of matches and loss, summed.
+    """
     rows, loss, table = in_rows(weighted.points, weighted.weight, weighted.s2), weighted.loss, weighted.table
-    sums, G, first, second = matrix(55, LANES), matrix(18, LANES), matrix(10, LANES), matrix(10, LANES)
-    scaled, work = matrix(10, LANES), matrix(3, LANES)
+    sums, factors, work = matrix(SUMS, LANES), matrix(14, LANES), matrix(3, LANES)
     for k in range(len(H)):
         costs = fill(0.0)
-        for q in range(55 if derivatives else 0):
+        for q in range(SUMS if derivatives else 0):
             store(sums, q, costs)
         for row in range(0, len(rows), MATCH):
-            r2 = _linearise(H[k], rows, row, G, first, second)
+            r2 = _linearise(H[k], rows, row, derivatives, factors)
             share, slope = robust(r2, load(rows, row + 5), loss, table, work)
             weight = load(rows, row + 4)
             costs += where(weight > 0.0, share * weight, 0.0)
             if derivatives:
-                factor = where(weight > 0.0, weight * slope, 0.0)
-                add_products(first, factor, scaled, sums)
-                add_products(second, factor, scaled, sums)
+                counted = where((weight > 0.0) & (r2 < BEHIND), weight * slope, 0.0)
+                _add_products(factors, counted, sums)
+                store(sums, SUMS - 1, load(sums, SUMS - 1) + counted * r2)
         cost[k] = added(costs)
-        q = 0
-        for r in range(10 if derivatives else 0):
-            for c in range(r + 1):
-                total = added(load(sums, q))
-                products[k, r, c], products[k, c, r] = total, total
-                q += 1
+        if derivatives:
+            _assemble(sums, products[k])
 
 
 @inner
-def _linearise(h: Array, rows: Array, row: int, G: Array, first: Array, second: Array) -> Any:
-    """Squared distances of LANES matches; the two whitened rows of G and e -> first, second (10, LANES).
+def _linearise(h: Array, rows: Array, row: int, derivatives: bool, factors: Array) -> Any:
+    """Squared distances of LANES matches; what their normal equations are made of -> factors (14, LANES), if wanted.
 
-    With ``(J J^T)^-1 = R^T R``, R upper triangular, these are R G and R e. G: (18, LANES), for the work.
+    G is (t, 0, c) and, in its second row, (0, t, d), in blocks of three entries: t, c, d, then the three entries of
+    ``(J J^T)^-1`` and the two of l.
     """
     x, y, u, v = load(rows, row), load(rows, row + 1), load(rows, row + 2), load(rows, row + 3)
     w = h[6] * x + h[7] * y + h[8]
-    front, behind = w > 0.0, where(w <= 0.0, fill(BEHIND), math.nan)
-    w = where(front, w, 1.0)
     e, f = h[0] * x + h[1] * y + h[2] - u * w, h[3] * x + h[4] * y + h[5] - v * w
     a, b, c, d = h[0] - u * h[6], h[1] - u * h[7], h[3] - v * h[6], h[4] - v * h[7]
     area, w2 = a * d - b * c, w * w
@@ -127,31 +125,78 @@ def _linearise(h: Array, rows: Array, row: int, G: Array, first: Array, second: 
     inverse = 1.0 / where(determinant > TINY, determinant, TINY)
     i00, i01, i11 = (c * c + d * d + w2) * inverse, (a * c + b * d) * inverse, (a * a + b * b + w2) * inverse
     l0, l1 = i00 * e - i01 * f, i11 * f - i01 * e
-    dx, dy, du, dv = 0.0 - (a * l0 + c * l1), 0.0 - (b * l0 + d * l1), w * l0, w * l1
-    r00 = sqrt(i00)
-    r01 = (0.0 - i01) / r00
-    r11 = sqrt(where(i11 - r01 * r01 > TINY, i11 - r01 * r01, TINY))
-    X, Y = x + dx, y + dy
-    store(G, 0, X)
-    store(G, 1, Y)
-    store(G, 2, fill(1.0))
-    store(G, 6, 0.0 - (u * X + x * du))
-    store(G, 7, 0.0 - (u * Y + y * du))
-    store(G, 8, 0.0 - (u + du))
-    store(G, 15, 0.0 - (v * X + x * dv))
-    store(G, 16, 0.0 - (v * Y + y * dv))
-    store(G, 17, 0.0 - (v + dv))
-    for q in range(3):
-        g = load(G, q)
-        store(first, q, r00 * g)
-        store(first, 3 + q, r01 * g)
-        store(second, q, fill(0.0))
-        store(second, 3 + q, r11 * g)
-        store(first, 6 + q, r00 * load(G, 6 + q) + r01 * load(G, 15 + q))
-        store(second, 6 + q, r11 * load(G, 15 + q))
-    store(first, 9, r00 * e + r01 * f)
-    store(second, 9, r11 * f)
-    return where(front, e * l0 + f * l1, behind)
+    if derivatives:
+        X, Y, du, dv = x - (a * l0 + c * l1), y - (b * l0 + d * l1), w * l0, w * l1
+        store(factors, 0, X)
+        store(factors, 1, Y)
+        store(factors, 2, fill(1.0))
+        store(factors, 3, 0.0 - (u * X + x * du))
+        store(factors, 4, 0.0 - (u * Y + y * du))
+        store(factors, 5, 0.0 - (u + du))
+        store(factors, 6, 0.0 - (v * X + x * dv))
+        store(factors, 7, 0.0 - (v * Y + y * dv))
+        store(factors, 8, 0.0 - (v + dv))
+        store(factors, 9, i00)
+        store(factors, 10, 0.0 - i01)
+        store(factors, 11, i11)
+        store(factors, 12, l0)
+        store(factors, 13, l1)
+    r2 = e * l0 + f * l1
+    return where(w > 0.0, r2, where(w == w, BEHIND, r2))  # what is not a number stays none
+
+
+@inner
+def _add_products(factors: Array, counted: Any, sums: Array) -> None:
+    """Adds the products of LANES matches, times what they count; factors: of `_linearise`.
+
+    The blocks share their factors, so there are 52 sums in place of the 55 of each row of G: those of t t^T with the
+    three entries of the inverse (6 each), of t with the rows of the last block (9 each), of that block (6), the
+    gradient (9); the caller adds that of r^2.
+    """
+    p, q, s = load(factors, 9) * counted, load(factors, 10) * counted, load(factors, 11) * counted
+    l0, l1 = load(factors, 12) * counted, load(factors, 13) * counted
+    place = 0
+    for r in range(3):
+        t, c, d = load(factors, r), load(factors, 3 + r), load(factors, 6 + r)
+        m, n = p * c + q * d, q * c + s * d
+        for k in range(3):
+            if k >= r:
+                both = t * load(factors, k)
+                store(sums, place, load(sums, place) + p * both)
+                store(sums, 6 + place, load(sums, 6 + place) + q * both)
+                store(sums, 12 + place, load(sums, 12 + place) + s * both)
+                last = m * load(factors, 3 + k) + n * load(factors, 6 + k)
+                store(sums, 36 + place, load(sums, 36 + place) + last)
+                place += 1
+            across = 18 + 3 * k + r
+            store(sums, across, load(sums, across) + load(factors, k) * m)
+            store(sums, across + 9, load(sums, across + 9) + load(factors, k) * n)
+        store(sums, 42 + r, load(sums, 42 + r) + t * l0)
+        store(sums, 45 + r, load(sums, 45 + r) + t * l1)
+        store(sums, 48 + r, load(sums, 48 + r) + (c * l0 + d * l1))
+
+
+@inner
+def _assemble(sums: Array, products: Array) -> None:
+    """The sums of `_add_products` -> products (10, 10)."""
+    place = 0
+    for r in range(3):
+        for c in range(r, 3):
+            p, q, s = added(load(sums, place)), added(load(sums, 6 + place)), added(load(sums, 12 + place))
+            last = added(load(sums, 36 + place))
+            products[r, c], products[c, r] = p, p
+            products[r, 3 + c], products[c, 3 + r], products[3 + r, c], products[3 + c, r] = q, q, q, q
+            products[3 + r, 3 + c], products[3 + c, 3 + r] = s, s
+            products[6 + r, 6 + c], products[6 + c, 6 + r] = last, last
+            place += 1
+    for r in range(3):
+        for c in range(3):
+            m, n = added(load(sums, 18 + 3 * r + c)), added(load(sums, 27 + 3 * r + c))
+            products[r, 6 + c], products[6 + c, r] = m, m
+            products[3 + r, 6 + c], products[6 + c, 3 + r] = n, n
+    for i in range(10):
+        total = added(load(sums, 42 + i))
+        products[i, 9], products[9, i] = total, total
 
 
 @kernel

@@ -47,7 +47,7 @@ class NormalizedMatches:
         is_model = (torch.isfinite(F).flatten(-2).all(-1) & (F != 0).flatten(-2).any(-1))[..., None, None]
         F = torch.where(is_model, F, F.detach())  # no gradient to what is zero or not finite
         matrices = F.to(torch.float64).reshape(p, math.prod(F.shape[x0.dim() - 2 : -2]), 3, 3)
-        self.models = as_components(_about_unit(self.frame.from_pixels(matrices)))
+        self.models = as_components(_about_unit(self._from_pixels(matrices)))
 
     def ordered(self, weight: Float[Tensor, "*batch n"]) -> Float[Tensor, "p n"]:
         """Values of matches in the caller's order in the order of `points`, 0 in padded slots; float64."""
@@ -56,7 +56,23 @@ class NormalizedMatches:
 
     def to_pixels(self, models: Float[Tensor, "9 p k"]) -> Float[Tensor, "p k 3 3"]:
         """Matrices in pixels, of unit norm."""
-        return as_matrices(unit(as_components(self.frame.to_pixels(as_matrices(models)))))
+        return as_matrices(unit(as_components(self._to_pixels(as_matrices(models)))))
+
+    def _from_pixels(self, F: Float[Tensor, "p k 3 3"]) -> Float[Tensor, "p k 3 3"]:
+        return self.frame.from_pixels(F)
+
+    def _to_pixels(self, F: Float[Tensor, "p k 3 3"]) -> Float[Tensor, "p k 3 3"]:
+        return self.frame.to_pixels(F)
+
+
+class MatchesOfHomographies(NormalizedMatches):
+    """The same with homographies as models."""
+
+    def _from_pixels(self, F: Float[Tensor, "p k 3 3"]) -> Float[Tensor, "p k 3 3"]:
+        return self.frame.homography_from_pixels(F)
+
+    def _to_pixels(self, F: Float[Tensor, "p k 3 3"]) -> Float[Tensor, "p k 3 3"]:
+        return self.frame.homography_to_pixels(F)
 
 
 def _about_unit(F: Float[Tensor, "p k 3 3"]) -> Float[Tensor, "p k 3 3"]:

@@ -65,21 +65,33 @@ def at_optimum(
         gauss_newton = SampsonObjective(points, weight, curved, scale)(model, True)[0][:9, :9].movedim((0, 1), (-2, -1))
         frame = torch.stack([model, normal], -1).movedim(0, -2)
     exact = _hessian(model, C, size, points.detach(), weight.detach(), robust, scale.detach())
-    with torch.no_grad():
-        across = torch.eye(9, dtype=F.dtype, device=F.device) - frame @ frame.mT
-        largest = gauss_newton.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None]
-        blocked = largest * (frame @ frame.mT)  # so that these directions do not look open
-        finite = torch.isfinite(exact).flatten(-2).all(-1)[..., None, None]
-        tangent = across @ torch.where(finite, exact, gauss_newton) @ across + blocked
-        strict = finite[..., 0, 0] & (torch.linalg.eigvalsh(tangent)[..., 0] > STEP_DAMPING * largest[..., 0, 0])
-        tangent = torch.where(strict[..., None, None], tangent, across @ gauss_newton @ across + blocked)
-        values, vectors = torch.linalg.eigh(tangent)
-        open_below = STEP_DAMPING * torch.where(largest > 0, largest, 1)[..., 0]
-        inverse = (vectors * (values / (values * values + open_below * open_below))[..., None, :]) @ vectors.mT
-        inverse = (across @ inverse @ across).movedim((-2, -1), (0, 1))
+    inverse = inverse_hessian(exact, gauss_newton, frame)
     gradient = gradient_of_cost(model, points, weight, robust, scale)
     moved = component_sum(inverse * (gradient - gradient.detach()), 1)
     return F - torch.where(valid, moved, 0)  # keeps the gradient of what is not finite out
+
+
+@torch.no_grad()
+def inverse_hessian(
+    exact: Float[Tensor, "p k 9 9"], gauss_newton: Float[Tensor, "p k 9 9"], frame: Float[Tensor, "p k 9 normals"]
+) -> Float[Tensor, "9 9 p k"]:
+    """The inverse of the exact Hessian across the orthonormal normals of a manifold, 0 along these.
+
+    Where it is not finite or not positive definite, at what is no strict minimum, Gauss and Newton's takes its place.
+    Directions that the points leave open are damped.
+    """
+    across = torch.eye(9, dtype=exact.dtype, device=exact.device) - frame @ frame.mT
+    largest = gauss_newton.diagonal(dim1=-2, dim2=-1).amax(-1)[..., None, None]
+    blocked = largest * (frame @ frame.mT)  # so that these directions do not look open
+    finite = torch.isfinite(exact).flatten(-2).all(-1)[..., None, None]
+    tangent = across @ torch.where(finite, exact, gauss_newton) @ across + blocked
+    strict = finite[..., 0, 0] & (torch.linalg.eigvalsh(tangent)[..., 0] > STEP_DAMPING * largest[..., 0, 0])
+    tangent = torch.where(strict[..., None, None], tangent, across @ gauss_newton @ across + blocked)
+    values, vectors = torch.linalg.eigh(tangent)
+    open_below = STEP_DAMPING * torch.where(largest > 0, largest, 1)[..., 0]
+    inverse = (vectors * (values / (values * values + open_below * open_below))[..., None, :]) @ vectors.mT
+    projected: Tensor = across @ inverse @ across
+    return projected.movedim((-2, -1), (0, 1))
 
 
 def _hessian(

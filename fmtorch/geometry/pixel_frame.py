@@ -56,6 +56,10 @@ class PixelFrame(NamedTuple):
         """Homographies of points in the frame as those of pixels, of any scale."""
         return matmul3(matmul3(self._to_pixels(2), H), self._from_pixels(0))
 
+    def homography_from_pixels(self, H: Float[Tensor, "p k 3 3"]) -> Float[Tensor, "p k 3 3"]:
+        """Homographies of pixels as those of points in the frame, of any scale."""
+        return matmul3(matmul3(self._from_pixels(2), H), self._to_pixels(0))
+
     def from_pixels(self, F: Float[Tensor, "p k 3 3"]) -> Float[Tensor, "p k 3 3"]:
         """Fundamental matrices of pixels as those of points in the frame, of any scale."""
         A0, A1 = self._to_pixels(0), self._to_pixels(2)

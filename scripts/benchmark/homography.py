@@ -1,10 +1,14 @@
-"""Homographies of warped photographs: corner errors and milliseconds beside PoseLib and OpenCV, on the same matches.
+"""Homographies of photographs as planes: errors and milliseconds beside PoseLib and OpenCV, on the same matches.
 
-Each photograph is seen as a plane, tilted by 20 to 55 degrees over another photograph, with blur and noise; SIFT,
-ratio 0.8, one match a location, P(inlier) from frame consistency. Hard pairs keep at most 60 right matches and 70 %
-random ones. Every second photograph is for tuning (--tuning), the others for the claim.
+Warped: each photograph is seen as a plane, tilted by 20 to 55 degrees over another photograph, with blur and noise.
+Hard pairs keep at most 60 of their right matches and 70 % random ones. Views: two pictures of the plane, each rendered
+by a camera and under light of its own (`training.planes`). SIFT, ratio 0.8, one match a location, P(inlier) from frame
+consistency. Every second photograph is for tuning (--tuning), the others for the claim; --warps pairs are made of each.
 
-python -m scripts.benchmark homography --photographs DATA/photos --seeds 3
+The error of a pair is the mean distance of the true and the estimated image of the photograph's corners, or, of views,
+of the points of a grid that both see.
+
+python -m scripts.benchmark homography --photographs DATA/photos --seeds 3 --warps 2
 python -m scripts.benchmark homography --photographs DATA/photos --tuning --methods ours:select.scale=0.5 poselib:2
 """
 
@@ -28,22 +32,30 @@ from rich.table import Table
 from fmtorch import find_homography, match, presets
 from fmtorch.core.types import Correspondences
 from fmtorch.evaluation.bootstrap import bootstrap_mean, paired_bootstrap
+from fmtorch.training.photographs import Photograph
+from fmtorch.training.planes import PlanePairs, PlaneViews
 from scripts.benchmark.matched import console
 
 Array = NDArray[Any]
 Solver = Callable[[Correspondences, int], Array | None]
 SIDE = 640  # px, the longer side of the photographs
+WARP = 1000  # between the seeds of two warps of a photograph
 THRESHOLDS = (1, 3, 5)  # px
-METHODS = ("ours", "poselib:2", "poselib:1", "usac_magsac:0.5", "usac_magsac:1", "usac_accurate:1")
+METHODS = ("ours", "poselib:1", "poselib:2", "poselib:3", "usac_accurate:1", "usac_magsac:0.5")
+KINDS = ("warped", "hard", "views")
 HARD_RIGHT, HARD_WRONG_SHARE = 60, 0.7
+GRID = 12  # points along each side of a view
 
 
-class Warped(NamedTuple):
-    """A photograph, its picture as a tilted plane over another, the true homography, and the photograph's name."""
+class Case(NamedTuple):
+    """Matches of two pictures of a plane and their true homography.
 
-    image0: Array
-    image1: Array
+    points: (n, 2), where the estimate is judged. name: of the photograph.
+    """
+
+    matches: Correspondences
     H: Array
+    points: Array
     name: str
 
 
@@ -52,6 +64,8 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument("--photographs", type=Path, required=True, help="a folder of photographs")
     parser.add_argument("--tuning", action="store_true", help="the photographs for choosing constants")
     parser.add_argument("--methods", nargs="+", default=METHODS, help="NAME:THRESHOLD or ours:KEY=VALUE,...")
+    parser.add_argument("--kinds", nargs="+", default=KINDS, choices=KINDS)
+    parser.add_argument("--warps", type=int, default=1, help="pairs of each kind and photograph")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--limit", type=int, help="photographs at most")
     parser.set_defaults(run=run)
@@ -62,17 +76,21 @@ def run(arguments: argparse.Namespace) -> None:
     cv2.setNumThreads(1)
     paths = sorted(p for p in arguments.photographs.iterdir() if p.suffix in (".jpg", ".png"))
     paths = paths[(0 if arguments.tuning else 1) :: 2][: arguments.limit]
-    pairs = [warped(path, paths[(i + 7) % len(paths)], i) for i, path in enumerate(paths)]
-    matches = [matched(pair) for pair in track(pairs, "matching", console=console)]
-    names = [pair.name for pair in pairs]
-    for kind in ("warped", "hard"):
-        kept = [hard(c, pair.H, i) for i, (pair, c) in enumerate(zip(pairs, matches, strict=True))]
-        cases = list(zip(pairs, kept if kind == "hard" else matches, strict=True))
-        report(kind, {m: measure(solver(m), cases, arguments.seeds) for m in arguments.methods}, names)
+    cases: dict[str, list[Case]] = {}
+    if {"warped", "hard"} & set(arguments.kinds):
+        numbered = [(i + WARP * k, path) for k in range(arguments.warps) for i, path in enumerate(paths)]
+        pairs = ((seed, path, paths[(seed % WARP + 7) % len(paths)]) for seed, path in numbered)
+        progress = track(pairs, "warping", len(numbered), console=console)
+        cases["warped"] = [warped(path, behind, seed) for seed, path, behind in progress]
+        cases["hard"] = [hard(case, seed) for case, (seed, _) in zip(cases["warped"], numbered, strict=True)]
+    if "views" in arguments.kinds:
+        cases["views"] = views(paths, arguments.warps)
+    for kind in arguments.kinds:
+        report(kind, {m: measure(solver(m), cases[kind], arguments.seeds) for m in arguments.methods}, cases[kind])
 
 
-def warped(path: Path, behind: Path, seed: int) -> Warped:
-    """A photograph as a plane before a pinhole camera that looks at it from the side."""
+def warped(path: Path, behind: Path, seed: int) -> Case:
+    """A photograph as a plane before a pinhole camera that looks at it from the side, over another photograph."""
     rng = np.random.default_rng(seed)
     image, background = (_small(p) for p in (path, behind))
     h, w = image.shape[:2]
@@ -89,35 +107,61 @@ def warped(path: Path, behind: Path, seed: int) -> Warped:
     inside = cv2.warpPerspective(np.ones((h, w), np.float32), H, (w, h))[..., None]
     view = cv2.GaussianBlur(inside * view + (1 - inside) * cv2.resize(background, (w, h)), (0, 0), 0.6)
     noisy = np.clip(view + rng.normal(0, 3, view.shape), 0, 255).astype(np.uint8)
-    return Warped(image, noisy, H / np.linalg.norm(H), path.stem)
+    corners = np.array([[0, 0], [w - 1, 0], [w - 1, h - 1], [0, h - 1]], float)
+    return Case(matched(image, noisy), H / np.linalg.norm(H), corners, path.stem)
+
+
+def views(paths: list[Path], count: int) -> list[Case]:
+    """So many pairs of views of each photograph, kept in the cache folder, that see a tenth of the grid in common."""
+    cases = []
+    for seed in range(count):
+        for path in track(paths, "views", console=console):
+            planes = PlanePairs([Photograph(path, path.name)], PlaneViews(views=2), seed)
+            (pair,) = planes
+            images = [_read(image.path) for image in (pair.image0, pair.image1)]
+            H, sizes = planes.homography(pair), [np.array(image.shape[1::-1]) for image in images]
+            grid = np.stack(np.meshgrid(*(np.linspace(0, side - 1, GRID) for side in sizes[0])), -1).reshape(-1, 2)
+            there = mapped(H, grid)
+            seen = (there >= 0).all(1) & (there < sizes[1]).all(1) & (grid @ H[2, :2] + H[2, 2] > 0)
+            if seen.mean() >= 0.1:
+                cases.append(Case(matched(*images), H, grid[seen], path.stem))
+    return cases
 
 
 def _small(path: Path) -> Array:
     """A photograph whose longer side is SIDE, BGR."""
-    image = cv2.imread(str(path))
-    if image is None:
-        raise SystemExit(f"error: {path} is no photograph that OpenCV reads")
+    image = _read(path)
     scale = SIDE / max(image.shape[:2])
     return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
 
 
-def matched(pair: Warped) -> Correspondences:
-    images = [np.ascontiguousarray(image[..., ::-1]) for image in (pair.image0, pair.image1)]
+def _read(path: Path) -> Array:
+    """A photograph, BGR."""
+    image = cv2.imread(str(path))
+    if image is None:
+        raise SystemExit(f"error: {path} is no photograph that OpenCV reads")
+    return np.asarray(image)
+
+
+def matched(image0: Array, image1: Array) -> Correspondences:
+    """Matches of two images, BGR."""
+    images = [np.ascontiguousarray(image[..., ::-1]) for image in (image0, image1)]
     return match(images[0], images[1], pipeline="sift_fmtorch").correspondences
 
 
-def hard(c: Correspondences, H: Array, seed: int) -> Correspondences:
+def hard(case: Case, seed: int) -> Case:
     """At most HARD_RIGHT right matches, and random ones beside them; no prior."""
     rng = np.random.default_rng(seed)
-    x0, x1 = points(c)
-    right = np.flatnonzero(np.linalg.norm(mapped(H, x0) - x1, axis=1) < 2)
+    x0, x1 = points(case.matches)
+    right = np.flatnonzero(np.linalg.norm(mapped(case.H, x0) - x1, axis=1) < 2)
     right = rng.permutation(right)[:HARD_RIGHT]
     wrong = round(len(right) * HARD_WRONG_SHARE / (1 - HARD_WRONG_SHARE))
     a = np.concatenate([x0[right], rng.uniform(x0.min(0), x0.max(0), (wrong, 2))])
     b = np.concatenate([x1[right], rng.uniform(x1.min(0), x1.max(0), (wrong, 2))])
     order = rng.permutation(len(a))
     x = [torch.from_numpy(v[order][None]) for v in (a, b)]
-    return Correspondences(x[0], x[1], torch.ones(x[0].shape[:2], dtype=torch.bool), key=torch.tensor([seed]))
+    mask = torch.ones(x[0].shape[:2], dtype=torch.bool)
+    return case._replace(matches=Correspondences(x[0], x[1], mask, key=torch.tensor([seed])))
 
 
 def points(c: Correspondences) -> tuple[Array, Array]:
@@ -176,32 +220,31 @@ def _poselib(threshold: float, c: Correspondences, seed: int) -> Array | None:
 def _opencv(method: int, threshold: float, c: Correspondences, seed: int) -> Array | None:
     cv2.setRNGSeed(seed)
     x0, x1 = points(c)
+    if len(x0) < 4:
+        return None
     H, _ = cv2.findHomography(x0, x1, method, threshold, maxIters=2000, confidence=0.9999)
     return None if H is None else np.asarray(H)
 
 
-def measure(solve: Solver, cases: list[tuple[Warped, Correspondences]], seeds: int) -> tuple[Array, Array]:
-    """Mean corner errors in pixels, and milliseconds, (seeds, pairs)."""
-    solve(cases[0][1], 0)
+def measure(solve: Solver, cases: list[Case], seeds: int) -> tuple[Array, Array]:
+    """Errors in pixels, and milliseconds, (seeds, pairs)."""
+    solve(cases[0].matches, 0)
     errors, ms = np.full((seeds, len(cases)), np.inf), np.zeros((seeds, len(cases)))
     for seed in range(seeds):
-        for i, (pair, c) in enumerate(cases):
+        for i, case in enumerate(cases):
             start = time.process_time()
-            H = solve(c, seed)
+            H = solve(case.matches, seed)
             ms[seed, i] = (time.process_time() - start) * 1e3
             if H is not None:
-                errors[seed, i] = corner_error(H, pair)
+                apart = np.linalg.norm(mapped(H, case.points) - mapped(case.H, case.points), axis=1)
+                errors[seed, i] = float(apart.mean())
     return errors, ms
 
 
-def corner_error(H: Array, pair: Warped) -> float:
-    h, w = pair.image0.shape[:2]
-    corners = np.array([[0, 0], [w - 1, 0], [w - 1, h - 1], [0, h - 1]], float)
-    return float(np.linalg.norm(mapped(H, corners) - mapped(pair.H, corners), axis=1).mean())
-
-
-def report(kind: str, results: dict[str, tuple[Array, Array]], names: list[str]) -> None:
-    table = Table(title=f"{kind}: {len(names)} photographs, {len(next(iter(results.values()))[0])} seeds")
+def report(kind: str, results: dict[str, tuple[Array, Array]], cases: list[Case]) -> None:
+    names = [case.name for case in cases]
+    seeds = len(next(iter(results.values()))[0])
+    table = Table(title=f"{kind}: {len(names)} pairs of {len(set(names))} photographs, {seeds} seeds")
     for column in ("method", *(f"AUC@{t} px" for t in THRESHOLDS), "first minus this at 1 px", "ms"):
         table.add_column(column, justify="left" if column == "method" else "right")
     areas = {m: [np.clip(1 - errors / t, 0, 1).mean(0) * 100 for t in THRESHOLDS] for m, (errors, _) in results.items()}

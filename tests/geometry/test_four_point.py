@@ -92,3 +92,17 @@ def test_values_that_are_not_finite_give_no_model(value: float) -> None:
         match = quadrilateral(1)
         match[place] = value
         assert len(alone(match)) == 0
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e9])
+def test_points_of_any_unit(scale: float) -> None:
+    """Also which samples are degenerate does not depend on it."""
+    for seed in range(20):
+        match = quadrilateral(seed)
+        h, D = reference.four_points(match)[0], np.diag([scale, scale, 1])
+        assert h is not None
+        expected = D @ h.reshape(3, 3) @ np.linalg.inv(D)
+        (found,) = alone(match * scale)
+        np.testing.assert_allclose(found, expected.ravel() / np.linalg.norm(expected), atol=2 * ROUNDING32)
+        match[2:, 3] = (match[2:, 0] + 2 * match[2:, 1]) / 3
+        assert len(alone(match * scale)) == 0

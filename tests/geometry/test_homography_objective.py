@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.geometry.homography_error import homography_gradient, homography_sampson_squared
+from fmtorch.geometry.homography_error import homography_curvature, homography_gradient, linearise_homography
 from fmtorch.geometry.homography_objective_kernels import (
     HOMOGRAPHY,
     evaluate_homographies,
     refine_homographies,
     step_of_homography,
 )
+from fmtorch.geometry.homography_refine import inverse_hessian_of_homography
 from fmtorch.geometry.levenberg_marquardt_kernels import Schedule
+from fmtorch.geometry.robust_losses import KERNELS
 from fmtorch.geometry.sampson_objective_kernels import LOSSES, NO_TABLE, Weighted
 from tests.reference import homography_family as reference
 
@@ -70,11 +72,12 @@ def test_three_forms_of_the_error_equal_its_definition() -> None:
         expected = np.array([reference.sampson_squared(p.h, match) for match in p.points.T])
         assert np.isinf(expected[3])
         assert np.isfinite(np.delete(expected, 3)).all()
-        tensors = homography_sampson_squared(torch.from_numpy(p.h[None]), torch.from_numpy(p.points[:, None]))
+        error = linearise_homography(torch.from_numpy(p.h[:, None]), torch.from_numpy(p.points))
+        tensors = torch.where(error.front, error.squared, torch.inf)
         one_by_one = [HOMOGRAPHY.of_match(p.h, *match) for match in p.points.T]
         # e cancels from terms of about 1, so r is exact to a few dozen roundings; r^2 to 2 r of these.
         atol = 100 * EPS * np.sqrt(expected.min()) + 1e4 * EPS**2
-        for found in (tensors[0].numpy(), np.array(one_by_one)):
+        for found in (tensors.numpy(), np.array(one_by_one)):
             np.testing.assert_allclose(found, expected, rtol=1e-11, atol=atol)
 
 
@@ -163,7 +166,7 @@ def test_a_model_that_is_no_number_has_no_cost() -> None:
         assert np.isnan(out).all()
 
 
-def test_step_at_an_optimum_and_response() -> None:
+def test_step_at_an_optimum_and_inverse_hessian() -> None:
     for seed in range(5):
         p = problem(seed, n=60)
         out, moved = np.empty((1, 9)), np.empty(9)
@@ -171,21 +174,33 @@ def test_step_at_an_optimum_and_response() -> None:
         step_of_homography(out[0], p.unbounded(), 1e-10, moved)
         np.testing.assert_allclose(moved, out[0], atol=1e-7)  # sqrt(EPS) as above, times the condition
         points, weight = torch.from_numpy(p.points[:, None].copy()), torch.from_numpy(p.weight[None])
-        response = homography_gradient(torch.from_numpy(out), points, weight)[1][0].numpy()
+        at, unbounded = torch.from_numpy(out.T[..., None].copy()), torch.full((1, 1), torch.inf, dtype=torch.float64)
+        inverse = inverse_hessian_of_homography(at, points, weight, KERNELS["truncated"], unbounded)[..., 0, 0].numpy()
         step = 1e-5
         columns = [evaluated(out[0] + sign * step * e, p.unbounded())[0][9, :9] for e in np.eye(9) for sign in (1, -1)]
         A = np.subtract(columns[::2], columns[1::2]).T / (2 * step)  # off by the third derivative times step^2
         tangent = np.eye(9) - np.outer(out[0], out[0])
-        size = np.abs(A).max() * np.abs(response).max()
-        np.testing.assert_allclose(tangent @ A @ response, -tangent, atol=1e-8 * size)
+        size = np.abs(A).max() * np.abs(inverse).max()
+        np.testing.assert_allclose(tangent @ A @ inverse, tangent, atol=1e-8 * size)
 
 
-def test_gradient_in_tensors_and_its_graph() -> None:
+@pytest.mark.parametrize("loss", KINDS)
+def test_gradient_in_tensors_and_its_graph(loss: str) -> None:
     p = behind(problem(3, n=12))
-    p.weight[3] = 0
-    h, points, weight = (torch.from_numpy(a) for a in (p.h[None], p.points[:, None].copy(), p.weight[None]))
-    expected, _ = evaluated(p.h, p.unbounded())
-    found, _ = homography_gradient(h, points, weight)
-    np.testing.assert_allclose(found[0].detach().numpy(), expected[9, :9], atol=1e-11 * np.abs(expected).max())
+    h, points, weight, s2 = (
+        torch.from_numpy(a) for a in (p.h[:, None, None], p.points[:, None].copy(), p.weight[None], p.s2[None])
+    )
+    expected, _ = evaluated(p.h, p.weighted(loss))
+    found = homography_gradient(h, points, weight, KERNELS[loss], s2)
+    np.testing.assert_allclose(found[:, 0, 0].numpy(), expected[9, :9], atol=1e-11 * np.abs(expected).max())
     points.requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: homography_gradient(h, x, weight)[0], points)
+    assert torch.autograd.gradcheck(lambda x: homography_gradient(h, x, weight, KERNELS[loss], s2), points)
+
+
+def test_gauss_newton_matrix_in_tensors() -> None:
+    p = problem(4)
+    h, points, weight = (torch.from_numpy(a) for a in (p.h[:, None, None], p.points[:, None].copy(), p.weight[None]))
+    unbounded = torch.full((1, 1), torch.inf, dtype=torch.float64)
+    found = homography_curvature(h, points, weight, KERNELS["truncated"], unbounded)[0, 0].numpy()
+    expected = reference.gauss_newton(p.h, p.points, p.weight)
+    np.testing.assert_allclose(found, expected, atol=1e-11 * np.abs(expected).max())

@@ -105,6 +105,16 @@ def test_matches_are_judged_by_the_homography(planes: PlanePairs, tmp_path: Path
     assert right > 100
 
 
+def test_the_homography_between_views_is_that_of_the_depths(planes: PlanePairs) -> None:
+    for pair in planes:
+        H = planes.homography(pair)
+        expected = between_views(planes, pair)  # of coordinates of float32
+        grid = np.array([[[x, y] for x in (60.0, 120, 190) for y in (60.0, 120, 190)]])
+        apart = cv2.perspectiveTransform(grid, H) - cv2.perspectiveTransform(grid, expected)
+        assert np.abs(apart).max() < 1e-2
+        assert (np.c_[grid[0], np.ones(9)] @ H[2] > 0).all()
+
+
 def between_views(planes: PlanePairs, pair: ImagePair) -> np.ndarray:
     """The homography from the first view to the second, through four of the first one's points in space."""
     x = np.array([[50.0, 50.0], [200.0, 50.0], [200.0, 200.0], [50.0, 200.0]])
