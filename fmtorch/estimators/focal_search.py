@@ -84,7 +84,8 @@ class FocalSearch:
 
     def __call__(self, pair: Pair) -> SearchResult:
         """Rounds until good candidates are one model, or enough rounds have confirmed the best one, and the stopping
-        rule is content. The pair is settled if that rule is content and its images have one size."""
+        rule is content. The pair is settled if that rule is content and its images have one size, or if anything is
+        known of its cameras."""
         options, confirmations, stop = self.options, 0, False
         candidates: PlausibleCandidates | None = None
         draws = 0
@@ -101,7 +102,7 @@ class FocalSearch:
             if turn + 1 >= options.min_rounds and agreed and stop:
                 break
         assert candidates is not None
-        return SearchResult(candidates, pair.same_size and stop, draws)
+        return SearchResult(candidates, pair.calibration is not None or (pair.same_size and stop), draws)
 
     def round(self, pair: Pair, turn: int) -> tuple[PlausibleCandidates, int]:
         """The candidates of a round, and the samples drawn until then."""

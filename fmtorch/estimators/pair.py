@@ -37,11 +37,12 @@ class Pair:
 
     def __init__(
         self, table: Array, known: tuple[bool, bool, bool], bucket: int, pixels_per_unit: float, key: int, seed: int,
-        centre: Array, sizes: Array, residual: Residual = SAMPSON, images: dict[Hashable, Any] | None = None,
+        centre: Array, sizes: Array, residual: Residual = SAMPSON, calibration: Calibration | None = None, images: dict[Hashable, Any] | None = None,
     ) -> None:  # fmt: skip
         """known: whether the caller has given a prior, noise, quality."""
         self.table, self.known, self.bucket, self.pixels_per_unit = table, known, bucket, pixels_per_unit
         self.key, self.seed, self.centre, self.sizes, self.residual = key, seed, centre, sizes, residual
+        self.calibration = calibration
         self.count = table.shape[1]
         self.points, self.weight = table[:4], table[4]
         self.pixels_per_noise, self.match_weight = table[5], table[6]
@@ -97,8 +98,17 @@ class Pair:
         """The same pair with the matches of these indices."""
         return Pair(
             self.table.take(index, 1), self.known, self.bucket, self.pixels_per_unit, self.key, self.seed, self.centre,
-            self.sizes, self.residual, self.images,
+            self.sizes, self.residual, self.calibration, self.images,
         )  # fmt: skip
+
+
+class Calibration(NamedTuple):
+    """What is known of the focal lengths of a pair. focals: px, of both images. deviations: relative ones; 0 of a
+    calibration, infinite where nothing is known. shared: whether one camera took both images."""
+
+    focals: tuple[float, float]
+    deviations: tuple[float, float]
+    shared: bool
 
 
 class PixelMatches(NamedTuple):

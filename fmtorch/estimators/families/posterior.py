@@ -91,9 +91,9 @@ def tangents_of(cameras: Cameras, longest: F8x1, F: F8x2, out: F8x3) -> None:
 def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
     _models(state.axes, state.focal, data.images.longest, state.F, data.tangents)
     evaluate(state.F, data.matches, derivatives, data.products, state.cost)
-    work = vector(4)
+    work = vector(5)
     for k in range(len(state.cost)):
-        prior = focal_cost(state.focal[k], data.images.same_size, work)
+        prior = focal_cost(state.focal[k], data.images.prior, work)
         state.cost[k] = state.cost[k] * data.limits.precision / 2 + prior
         if derivatives:
             _derivatives(
@@ -121,7 +121,7 @@ def _models(axes: Array, focal: Array, longest: Array, F: Array, tangents: Array
 def _derivatives(
     products: Array, tangents: Array, prior: Array, precision: float, gradient: Array, hessian: Array
 ) -> None:  # fmt: skip
-    """Of one candidate. products: (10, 10), of `evaluate`; tangents: (9, LANES); prior: (4,), of `focal_cost`."""
+    """Of one candidate. products: (10, 10), of `evaluate`; tangents: (9, LANES); prior: (5,), of `focal_cost`."""
     along, column = matrix(10, LANES), matrix(1, LANES)
     for j in range(10):
         total = fill(0.0)
@@ -140,7 +140,7 @@ def _derivatives(
     for i in range(2):
         gradient[5 + i] += prior[i]
         for j in range(2):
-            hessian[5 + i, 5 + j] += prior[2] if i == j else prior[3]
+            hessian[5 + i, 5 + j] += prior[2 + i] if i == j else prior[4]
 
 
 @inner
