@@ -72,12 +72,14 @@ class SearchResult(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class FocalSearch:
-    """The prior on focal lengths in a search. gain: by which candidates are compared. search: of one round; None: the
-    prior only selects. stop: the stopping rule for these samples; None: all rounds are made, and never suffice."""
+    """The prior on focal lengths in a search. gain: by which candidates are compared; exact_gain: where both focal
+    lengths are exactly known. search: of one round; None: the prior only selects. stop: the stopping rule for these
+    samples; None: all rounds are made, and never suffice."""
 
     options: Focal
     family: FundamentalWithFocals
     gain: Score
+    exact_gain: Score
     refinement: Refinement
     search: Search | None
     stop: Stop | None
@@ -113,8 +115,9 @@ class FocalSearch:
     def refined(self, F: Array, valid: Array, pair: Pair, near: Pair) -> PlausibleCandidates:
         """Candidates near models (k, 9), refined on some matches and judged on all."""
         cameras, refined = self.family.refine(F, near, self.options.iterations)
-        posterior = np.empty(len(F))
-        posteriors(scores_of(self.gain, refined.models, pair), refined.share, refined.cost, valid, posterior)
+        posterior, exact = np.empty(len(F)), pair.calibration is not None and pair.calibration.exact
+        gain = self.exact_gain if exact else self.gain
+        posteriors(scores_of(gain, refined.models, pair), refined.share, refined.cost, valid, posterior)
         return PlausibleCandidates(refined.models, posterior, cameras)
 
     def select(self, free: Candidates, pair: Pair, plausible: PlausibleCandidates | None) -> Selection:

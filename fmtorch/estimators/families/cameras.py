@@ -14,7 +14,8 @@ import numpy as np
 from fmtorch.compiling.arrays import Array, F8x1, F8x2, F8x4
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.scratch import vector
-from fmtorch.estimators.families.focal_prior import EXACT, LOG_USUAL, FocalPrior, focal_prior
+from fmtorch.estimators.calibration import EXACT
+from fmtorch.estimators.families.focal_prior import LOG_USUAL, FocalPrior, focal_prior
 from fmtorch.estimators.pair import Pair
 from fmtorch.geometry.arithmetic_kernels import exponential, logarithm
 from fmtorch.geometry.rank2_kernels import complement
@@ -73,9 +74,15 @@ def _images(pair: Pair) -> Images:
     offset = np.array([(x - (side - pixel) / 2) / unit for x, side in zip(pair.centre.tolist(), sides, strict=True)])
     prior = focal_prior(pair.same_size)
     if (known := pair.calibration) is not None:
-        measured = (math.log(known.focals[0] / max(h0, w0)), math.log(known.focals[1] / max(h1, w1)))
+        measured = known.logarithms((max(h0, w0), max(h1, w1)))
         prior = focal_prior(pair.same_size, known.shared, measured, known.deviations)
     return Images(offset, np.array([max(h0, w0) / unit, max(h1, w1) / unit]), prior)
+
+
+def focals_px(cameras: Cameras, pair: Pair) -> Array:
+    """The focal lengths (2,) of the first candidate, px."""
+    focals: Array = np.exp(cameras.focal[0]) * images_of(pair).longest * pair.pixels_per_unit
+    return focals
 
 
 class CentredMatches(NamedTuple):
@@ -125,7 +132,8 @@ def centre(table: F8x2, offset: F8x1, scale_px: float, out: F8x2) -> None:
 
 @kernel(holds_gil=True)
 def nearest_cameras(F: F8x2, images: Images, cameras: Cameras) -> None:
-    """Cameras near models (k, 9): those of their focal lengths, or of usual ones where these are implausible."""
+    """Cameras near models (k, 9): those of their focal lengths, or of usual or measured ones where these are
+    implausible; of exactly measured ones."""
     axes, focal, longest, shifted = cameras.axes, cameras.focal, images.longest, np.empty(F.shape)
     prior = images.prior
     measured = prior.precision[0] > 0 or prior.precision[1] > 0
@@ -142,7 +150,8 @@ def nearest_cameras(F: F8x2, images: Images, cameras: Cameras) -> None:
         focal[k, 0] = logarithm(first) / 2 if plausible0 else LOG_USUAL
         focal[k, 1] = logarithm(second) / 2 if plausible1 else LOG_USUAL
         for i in range(2):
-            if prior.precision[i] > 1 / EXACT**2:
+            plausible = plausible0 if i == 0 else plausible1
+            if prior.precision[i] > 1 / EXACT**2 or (prior.precision[i] > 0 and not plausible):
                 focal[k, i] = prior.measured[i]
         if prior.shared:
             focal[k, 0] = (focal[k, 0] + focal[k, 1]) / 2

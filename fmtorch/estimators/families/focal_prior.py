@@ -17,6 +17,7 @@ import numpy as np
 from fmtorch.compiling.arrays import Array, F8x1, F8x2
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.random_kernels import random_bits, stream_state
+from fmtorch.estimators.calibration import EXACT
 from fmtorch.geometry.arithmetic_kernels import exponential
 
 USUAL_FOCAL = 1.2  # median focal length in units of the longer image side
@@ -26,8 +27,7 @@ SAME_CAMERA_DEVIATION = 0.01  # width of the well for images of equal size
 SAME_CAMERA_GAIN = 5.0  # its depth, in logarithms of the likelihood
 SAME_CAMERA_SHARE = 0.7  # of the draws for images of equal size that have one focal length for both
 LOG_USUAL = 0.1823215567939546  # math.log(USUAL_FOCAL)
-EXACT = 0.02  # relative deviation below which a measurement is believed without a tail
-MAX_PRECISION = 1e10  # of an exact measurement, and of one focal length that both images share
+MAX_PRECISION = 1e10  # of an exact measurement
 TAIL_GAIN = 5.0  # what a measurement costs at most, in logarithms of the likelihood
 UNBELIEVED_SHARE = 0.2  # of the draws that leave out measurements with a tail
 QUANTILES = 1 << 10  # of the normal distribution, from which focal lengths are drawn
@@ -62,7 +62,7 @@ def focal_prior(
     m, s = np.array(measured), np.array(deviation)
     precision = np.minimum(1 / np.maximum(s, 1e-300) ** 2, MAX_PRECISION)
     tail = ((s >= EXACT) & np.isfinite(s)).astype(np.float64)
-    # In (mean, half of the difference) the prior is diagonal; of the two logarithms its covariance is `prior`.
+    # In (mean, half of the difference) the prior is diagonal; of the two logarithms its precision is p00, p01, p00.
     a, b = FOCAL_DEVIATION**2, RATIO_DEVIATION**2 / 4
     determinant = (a + b) * (a + b) - (a - b) * (a - b)
     p00, p01 = (a + b) / determinant, -(a - b) / determinant
@@ -75,9 +75,24 @@ def focal_prior(
     draw = np.array([c00 * r0 + c01 * r1, c01 * r0 + c11 * r1, l00, l10, math.sqrt(max(c11 - l10 * l10, 0.0))])
     total = 1 / a + precision.sum()
     one = np.array([(LOG_USUAL / a + float((precision * m).sum())) / total, total**-0.5])
-    apart = (m[0] - m[1]) / math.hypot(max(s[0], 0.01), max(s[1], 0.01)) if np.isfinite(s).all() else 0.0
-    share = 1.0 if shared else SAME_CAMERA_SHARE * math.exp(-0.5 * min(apart * apart, 1e3)) if same_size else 0.0
+    share = 1.0 if shared else same_camera_share(m[0] - m[1], s) if same_size else 0.0
     return FocalPrior(same_size, shared, m, precision, tail, normal_quantiles(), draw, one, share)
+
+
+def same_camera_share(difference: float, deviation: Array) -> float:
+    """The share of draws with one focal length for images of equal size: how likely one camera is by Bayes' rule.
+
+    difference: of the measured logarithms; deviation: (2,), of each.
+    """
+    if not np.isfinite(deviation).all():
+        return SAME_CAMERA_SHARE
+    if (deviation < EXACT).all():
+        return 0.0  # draws have the measured focal lengths
+    measured = float(np.square(deviation).sum())
+    one, two = measured + SAME_CAMERA_DEVIATION**2, measured + RATIO_DEVIATION**2
+    squared = difference * difference / 2
+    odds = SAME_CAMERA_SHARE / (1 - SAME_CAMERA_SHARE) * math.sqrt(two / one) * math.exp(squared / two - squared / one)
+    return odds / (1 + odds)
 
 
 @functools.cache
@@ -89,34 +104,37 @@ def normal_quantiles() -> Array:
 
 @inner
 def focal_cost(focal: Array, prior: FocalPrior, out: Array) -> Any:
-    """The cost of two log focal lengths; its gradient (2) and its Hessian (h00, h11, h01) -> out (5,)."""
+    """The cost of two log focal lengths; its gradient (2) and its Hessian (h00, h11, h01) -> out (5,).
+
+    Of a shared focal length the first is the only parameter and the second, which is equal, stays where it is put.
+    """
     difference = focal[0] - focal[1]
     squared = difference * difference
     mean = (focal[0] + focal[1]) * (0.5 / FOCAL_DEVIATION) - LOG_USUAL / FOCAL_DEVIATION
     well = (SAME_CAMERA_DEVIATION**2 if prior.same_size else 0.0) / (squared + SAME_CAMERA_DEVIATION**2)
     precision = 1 / RATIO_DEVIATION**2 + 2 * SAME_CAMERA_GAIN / SAME_CAMERA_DEVIATION**2 * well * well
-    if prior.shared:
-        precision = MAX_PRECISION
     b = 0.5 / FOCAL_DEVIATION
     pull = precision * difference
     out[0], out[1] = b * mean + pull, b * mean - pull
     out[2], out[3], out[4] = b * b + precision, b * b + precision, b * b - precision
     cost = mean * mean / 2 + squared / (2 * RATIO_DEVIATION**2) - SAME_CAMERA_GAIN * well
     if prior.shared:
-        cost = mean * mean / 2 + MAX_PRECISION / 2 * squared
+        cost = mean * mean / 2
+        out[0], out[1], out[2], out[3], out[4] = 2 * b * mean, 0.0, 4 * b * b, 1.0, 0.0
     for i in range(2):
+        j = 0 if prior.shared else i
         if prior.precision[i] > 0:
             away = focal[i] - prior.measured[i]
             z2 = prior.precision[i] * away * away
             if prior.tail[i] > 0:
                 rest = 2 * TAIL_GAIN / (z2 + 2 * TAIL_GAIN)
                 cost += TAIL_GAIN * z2 / (z2 + 2 * TAIL_GAIN)
-                out[i] += prior.precision[i] * away * rest * rest
-                out[2 + i] += prior.precision[i] * rest * rest
+                out[j] += prior.precision[i] * away * rest * rest
+                out[2 + j] += prior.precision[i] * rest * rest
             else:
                 cost += z2 / 2
-                out[i] += prior.precision[i] * away
-                out[2 + i] += prior.precision[i]
+                out[j] += prior.precision[i] * away
+                out[2 + j] += prior.precision[i]
     return cost
 
 

@@ -46,7 +46,10 @@ class Optimum(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Of k candidates, cameras, models (k, 9), costs (k,), and their derivatives (k, 7), (k, 7, 7)."""
+    """Of k candidates, cameras, models (k, 9), costs (k,), and their derivatives (k, 7), (k, 7, 7).
+
+    shared: whether the two focal lengths are one; the sixth parameter is then its logarithm and the seventh has none.
+    """
 
     axes: Array
     focal: Array
@@ -54,6 +57,7 @@ class _State(NamedTuple):
     cost: Array
     gradient: Array
     hessian: Array
+    shared: bool
 
 
 class _Data(NamedTuple):
@@ -74,9 +78,10 @@ def no_optimum(k: int) -> Optimum:
 @kernel
 def minimise(cameras: Cameras, matches: Weighted, images: Images, limits: Limits, out: Optimum) -> None:
     """Cameras of least negative logarithm of the posterior near these, in place; what it is there -> out."""
-    k = len(out.cost)
-    state = _State(cameras.axes, cameras.focal, out.F, out.cost, out.gradient, out.hessian)
-    trial = _State(np.empty((k, 2, 3, 3)), matrix(k, 2), matrix(k, 9), vector(k), matrix(k, 7), np.empty((k, 7, 7)))
+    k, shared = len(out.cost), images.prior.shared
+    state = _State(cameras.axes, cameras.focal, out.F, out.cost, out.gradient, out.hessian, shared)
+    axes, hessian = np.empty((k, 2, 3, 3)), np.empty((k, 7, 7))
+    trial = _State(axes, matrix(k, 2), matrix(k, 9), vector(k), matrix(k, 7), hessian, shared)
     data = _Data(matches, images, limits, np.zeros((k, 9, LANES)), np.empty((k, 10, 10)))
     _minimise(data, state, trial, np.full(k, FIRST_DAMPING), limits.iterations, limits.tolerance >= 0)
 
@@ -90,6 +95,8 @@ def tangents_of(cameras: Cameras, longest: F8x1, F: F8x2, out: F8x3) -> None:
 @inner
 def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
     _models(state.axes, state.focal, data.images.longest, state.F, data.tangents)
+    if state.shared:
+        _tie(data.tangents)
     evaluate(state.F, data.matches, derivatives, data.products, state.cost)
     work = vector(5)
     for k in range(len(state.cost)):
@@ -115,6 +122,15 @@ def _models(axes: Array, focal: Array, longest: Array, F: Array, tangents: Array
                 T[q, 2] = (U[r, 1] * V[c, 0] - U[r, 0] * V[c, 1]) * by
                 T[q, 3], T[q, 4] = U[r, 1] * V[c, 2] * by, -U[r, 0] * V[c, 2] * by
                 T[q, 5], T[q, 6] = F[k, q] if c == 2 else 0.0, F[k, q] if r == 2 else 0.0
+
+
+@inner
+def _tie(tangents: Array) -> None:
+    """One logarithm for both images: derivatives (k, 9, LANES) by the first are those by it, by the second zero."""
+    for k in range(len(tangents)):
+        for q in range(9):
+            tangents[k, q, 5] += tangents[k, q, 6]
+            tangents[k, q, 6] = 0.0
 
 
 @inner
@@ -151,7 +167,8 @@ def _step(state: _State, damping: Array, trial: _State) -> None:
         _rotate(state.axes[k, 0], Q[0, 7] / 2, Q[1, 7] / 2, Q[2, 7] / 2, trial.axes[k, 0])
         _rotate(state.axes[k, 1], Q[3, 7] / 2, Q[4, 7] / 2, 0.0, trial.axes[k, 1])
         for i in range(2):
-            trial.focal[k, i] = min(max(state.focal[k, i] + min(max(Q[5 + i, 7], -1.0), 1.0), -3.0), 3.0)
+            step = Q[5 if state.shared else 5 + i, 7]
+            trial.focal[k, i] = min(max(state.focal[k, i] + min(max(step, -1.0), 1.0), -3.0), 3.0)
 
 
 @inner
