@@ -107,8 +107,9 @@ def _unmapped(estimate: Estimate, square: Correspondences, camera0: Camera, came
         identity = torch.eye(3, dtype=F.dtype, device=F.device).expand_as(F)
         A0, A1 = (identity if each.map is None else each.map.to(F) for each in cameras)
         F = torch.where(ok[:, None, None], canonical(matmul3(matmul3(A1.mT, F), A0)), 0)
-    scale = torch.stack([_scale(each) for each in cameras], 1)
-    return estimate.derived(F=F, E=matmul3(cross_matrix(t), R), R=R, t=t, focals=focals * scale)
+    known, scale = focals.isfinite(), torch.stack([_scale(each) for each in cameras], 1)
+    focals = torch.where(known, torch.where(known, focals, 0) * scale, torch.nan)  # so that no gradient is NaN
+    return estimate.derived(F=F, E=matmul3(cross_matrix(t), R), R=R, t=t, focals=focals)
 
 
 def _pose(estimate: Estimate, square: Correspondences, focals: Tensor) -> tuple[Tensor, Tensor]:
