@@ -25,14 +25,15 @@ from fmtorch.geometry.refine import attached_step, refine
 from fmtorch.geometry.robust_losses import KERNELS
 from fmtorch.geometry.seven_point import seven_point
 from fmtorch.geometry.significance import significance
+from fmtorch.geometry.two_view_covariance import TwoViewCovariance, two_view_covariance
 
 __all__ = [
-    "KERNELS", "Fits", "Pose", "algebraic", "attached_step", "canonical", "cross_matrix", "denormalize_fundamental",
-    "eight_point", "epipolar_distances", "epipolar_lines", "fundamental_from_calibration",
+    "KERNELS", "Fits", "Pose", "TwoViewCovariance", "algebraic", "attached_step", "canonical", "cross_matrix",
+    "denormalize_fundamental", "eight_point", "epipolar_distances", "epipolar_lines", "fundamental_from_calibration",
     "fundamental_from_projections", "homography", "homography_points", "homography_sampson", "homography_transfer",
     "irls", "nearest_rank2", "normalize_pair", "normalize_points", "point_to_line", "pose_from_fundamental", "refine",
     "refine_homography", "reweighted_fits", "sampson", "sampson_squared", "seven_point", "significance",
-    "symmetric_max", "symmetric_mean", "symmetric_squared", "unit_frobenius",
+    "symmetric_max", "symmetric_mean", "symmetric_squared", "two_view_covariance", "unit_frobenius",
 ]  # fmt: skip
 
 check_exported(__name__)
