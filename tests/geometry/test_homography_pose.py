@@ -64,7 +64,10 @@ def test_opencv(seed: int) -> None:
     x1 = homography_points(*tensors(H, x0)).numpy()
     G = np.linalg.inv(K1) @ H @ K0
     _, rotations, translations, normals = cv2.decomposeHomographyMat(G, np.eye(3))
-    rays = [(np.c_[x, np.ones(len(x))] @ np.linalg.inv(K).T)[:, None, :2].astype(np.float32) for x, K in ((x0, K0), (x1, K1))]
+    rays = [
+        (np.c_[x, np.ones(len(x))] @ np.linalg.inv(K).T)[:, None, :2].astype(np.float32)
+        for x, K in ((x0, K0), (x1, K1))
+    ]
     possible = cv2.filterHomographyDecompByVisibleRefpoints(rotations, normals, *rays)
     poses = poses_from_homography(*tensors(H, K0, K1, x0, x1))
     found = [
