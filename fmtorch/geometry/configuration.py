@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Real
+from jaxtyping import Bool, Float, Int, Real
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -92,8 +92,9 @@ def configuration_evidence(
     rows = for_each_pair(_into, given, out=out, kind=torch.float64).to(F.device)
     columns = [rows[:, k] for k in (compiled.LINE, compiled.PLANE, compiled.BOTH, compiled.TURN, compiled.COPY)]
     columns += [rows[:, k] for k in (compiled.NOISE, compiled.MATCHES, compiled.ON_PLANE, compiled.ON_LINE)]
-    R = rows[:, compiled.ROTATION : compiled.SCALED].reshape(-1, 3, 3)
-    return Evidence(*columns, R, rows[:, compiled.FOCALS : compiled.ROTATION], rows[:, compiled.SCALED :])
+    columns += [rows[:, compiled.ROTATION : compiled.SCALED].reshape(-1, 3, 3)]
+    columns += [rows[:, compiled.FOCALS : compiled.ROTATION], rows[:, compiled.SCALED :]]
+    return Evidence(*columns)
 
 
 def _into(x0: Array, x1: Array, mask: Array, noise: Array, F: Array, H: Array, *known: Array) -> None:

@@ -62,13 +62,15 @@ def weigh(matches: Matches, models: Models, cameras: Cameras, out: F8x1) -> None
     side = _side(points, models.size0, models.size1)
     has_line, has_plane = np.any(models.F != 0), np.any(models.H != 0)
     line, plane, r = np.full(n, math.inf), np.full(n, math.inf), vector(n)
+    s = COARSEST * side
     if has_line:
         _distances(models.F.ravel(), points, noise, True, line)
+        s = min(s, _noise(line, side, 1))
     if has_plane:
         _distances(models.H.ravel(), points, noise, False, plane)
-    s = _noise(line, plane, side)
+        s = min(s, _noise(plane, side, 2))
     out[NOISE] = s
-    d, share = matrix(2, n), vector(3)
+    d, share = np.zeros((2, n)), np.zeros(3)
     _densities(line, s, side, 1, d[1])
     out[LINE] = _log_likelihood(d[1:], share)
     if not has_plane:
@@ -141,43 +143,42 @@ def _decay(z: float) -> float:
 
 
 @inner
-def _noise(line: Array, plane: Array, side: float) -> float:
-    """The noise of matches on the line, on the plane, and wrong, by expectation and maximisation."""
-    n, s = len(line), min(max(START * side, FINEST), COARSEST * side)
-    w0, w1, w2 = 1 / 3, 1 / 3, 1 / 3
+def _noise(r2: Array, side: float, dimensions: int) -> float:
+    """The noise of right matches beside wrong ones, by expectation and maximisation."""
+    n, s = len(r2), min(max(START * side, FINEST), COARSEST * side)
+    share = 0.5
     for _ in range(NOISE_STEPS):
-        wrong, on_plane, on_line, squares, count = 0.0, 0.0, 0.0, 0.0, 0.0
         near, far = 1 / (2 * s * s), 1 / (2 * TAIL * TAIL * s * s)
-        of_two, of_one = w1 / 2 * side * side / (4 * math.pi * s * s), w2 / 2 * side / (ROOT2 * ROOT2PI * s)
+        peak, tail = _peaks(s, side, dimensions)
+        right, squares, count = 0.0, 0.0, 0.0
         for i in range(n):
-            p = of_two * _decay(plane[i] * near)
-            q = of_two / (TAIL * TAIL) * _decay(plane[i] * far)
-            u, v = of_one * _decay(line[i] * near), of_one / TAIL * _decay(line[i] * far)
-            total = w0 + p + q + u + v
-            p, q, u, v = p / total, q / total, u / total, v / total
-            wrong += w0 / total
-            on_plane += p + q
-            on_line += u + v
-            count += 2 * (p + q) + u + v
-            if p + q > 0:
-                squares += plane[i] * (p + q / (TAIL * TAIL))
-            if u + v > 0:
-                squares += line[i] * (u + v / (TAIL * TAIL))
-        w0, w1 = (wrong + HALF) / (n + 3 * HALF), (on_plane + HALF) / (n + 3 * HALF)
-        w2 = (on_line + HALF) / (n + 3 * HALF)
+            if r2[i] * far < FARTHEST:
+                p, q = share * peak * _decay(r2[i] * near), share * tail * _decay(r2[i] * far)
+                total = 1 - share + p + q
+                p, q = p / total, q / total
+                right += p + q
+                count += dimensions * (p + q)
+                squares += r2[i] * (p + q / (TAIL * TAIL))
+        share = (right + HALF) / (n + 2 * HALF)
         s = min(max(math.sqrt(squares / max(count, 1e-9)), FINEST), COARSEST * side)
     return s
+
+
+@inner
+def _peaks(s: float, side: float, dimensions: int) -> tuple[float, float]:
+    """Half the densities of matches at distance zero over that of wrong ones, of usual noise and of TAIL times it."""
+    if dimensions == 1:
+        peak = side / (2 * ROOT2 * ROOT2PI * s)
+        return peak, peak / TAIL
+    peak = side * side / (8 * math.pi * s * s)
+    return peak, peak / (TAIL * TAIL)
 
 
 @inner
 def _densities(r2: Array, s: float, side: float, dimensions: int, out: Array) -> None:
     """Of right matches over that of wrong ones -> out (n,); of one dimension, near a line, or of two, near a point."""
     near, far = 1 / (2 * s * s), 1 / (2 * TAIL * TAIL * s * s)
-    if dimensions == 1:
-        peak, tail = side / (2 * ROOT2 * ROOT2PI * s), side / (2 * ROOT2 * ROOT2PI * s * TAIL)
-    else:
-        peak = side * side / (8 * math.pi * s * s)
-        tail = peak / (TAIL * TAIL)
+    peak, tail = _peaks(s, side, dimensions)
     for i in range(len(out)):
         out[i] = peak * _decay(r2[i] * near) + tail * _decay(r2[i] * far)
 

@@ -25,7 +25,7 @@ def test_against_the_definitions(kind: str, known: bool) -> None:
     found = configuration_evidence(**given)
     line = np.array([sampson(drawn.F, p, q) for p, q in zip(drawn.x0, drawn.x1, strict=True)]) / n
     plane = reference.plane_distances(drawn.H, drawn.x0, drawn.x1) / n
-    s = reference.noise(line, plane, SIDE)
+    s = min(reference.noise(line, 1, SIDE), reference.noise(plane, 2, SIDE))
     of_line, of_plane = reference.density(line, s, 1, SIDE), reference.density(plane, s, 2, SIDE)
     np.testing.assert_allclose(float(found.noise[0]), s, rtol=1e-6)
     both, shares = reference.log_likelihood(of_plane, of_line)
@@ -75,8 +75,8 @@ def test_without_cameras_a_rotation_is_planar() -> None:
 
 
 def test_no_unit_is_special() -> None:
-    """Images twice as large, noise and all, are of the same kinds by the same evidence; the noise floor apart."""
-    pairs = batch([draw(kind, 3, noise=0.5) for kind in KINDS])
+    """Images twice as large, noise and all, are of the same kinds by the same evidence."""
+    pairs = batch([draw(kind, 3, noise=0.5) for kind in KINDS if kind != "unrelated"])
     twice = dict(pairs)
     grow = torch.diag(torch.tensor([2.0, 2, 1], dtype=torch.float64))
     shrink = torch.linalg.inv(grow)

@@ -42,22 +42,20 @@ def log_likelihood(*densities: np.ndarray) -> tuple[float, np.ndarray]:
     return float(np.log((d * w).sum(1)).sum()), w
 
 
-def noise(r_line: np.ndarray, r_plane: np.ndarray, side: float) -> float:
-    """The noise of the mixture of wrong, on the plane and on the line, by expectation and maximisation."""
-    s, w, n = START * side, np.full(3, 1 / 3), len(r_line)
+def noise(r: np.ndarray, dimensions: int, side: float) -> float:
+    """The noise of the mixture of wrong and right matches, by expectation and maximisation."""
+    s, share, n = START * side, 0.5, len(r)
     for _ in range(15):
-        parts = [np.ones(n) * w[0]]
+        parts = [np.full(n, 1 - share)]
         for q in (s, TAIL * s):
-            parts.append(w[1] * 0.5 * np.exp(-(r_plane**2) / (2 * q * q)) / (2 * np.pi * q * q) * side**2 / 2)
-            parts.append(w[2] * 0.5 * np.exp(-(r_line**2) / (2 * q * q)) / (q * np.sqrt(2 * np.pi)) * side / np.sqrt(2))
+            normal = share * 0.5 * np.exp(-(r**2) / (2 * q**2))
+            in_one, in_two = side / np.sqrt(2) / (q * np.sqrt(2 * np.pi)), side**2 / 2 / (2 * np.pi * q**2)
+            parts.append(normal * (in_one if dimensions == 1 else in_two))
         g = np.stack(parts, 1)
-        g /= g.sum(1, keepdims=True)
-        far = np.array([1, TAIL**2])
-        squares = sum((g[:, 1 + 2 * k] * r_plane**2 + g[:, 2 + 2 * k] * r_line**2) / far[k] for k in range(2)).sum()
-        count = (2 * (g[:, 1] + g[:, 3]) + g[:, 2] + g[:, 4]).sum()
-        shares = np.array([g[:, 0].sum(), g[:, 1].sum() + g[:, 3].sum(), g[:, 2].sum() + g[:, 4].sum()])
-        w = (shares + 0.5) / (n + 1.5)
-        s = float(np.clip(np.sqrt(squares / max(count, 1e-9)), FINEST, COARSEST * side))
+        g = (g / g.sum(1, keepdims=True))[:, 1:]
+        share = (g.sum() + 0.5) / (n + 1)
+        squares = (np.where(g > 0, r[:, None] ** 2, 0) * g / [1, TAIL**2]).sum()
+        s = float(np.clip(np.sqrt(squares / max(dimensions * g.sum(), 1e-9)), FINEST, COARSEST * side))
     return s
 
 
