@@ -19,7 +19,9 @@ TAIL = 2.5  # noises of half of the right matches: keypoints err by more than th
 START, COARSEST = 1 / 640, 1 / 160  # noise that is tried first, and the largest, of the side of an image
 FINEST = 0.1  # px; no keypoint is found more exactly
 LOSS = 3.0  # noises; scale of the loss by which a rotation and a copy are fitted
-NOISE_STEPS, SHARE_STEPS, COPY_STEPS = 15, 20, 10
+STEPS, COPY_STEPS = 20, 8
+NOISE_TOLERANCE, SHARE_TOLERANCE = 0.01, 1e-3  # of the last step: relative, and of a share
+GROUP = 16  # densities of up to some millions, whose product is one of float64
 HALF = 0.5  # of a match that each component has beforehand
 FARTHEST = 40.0  # half squared noises, beyond which a density is zero
 ROOT2PI, ROOT2 = math.sqrt(2 * math.pi), math.sqrt(2)
@@ -61,22 +63,22 @@ def weigh(matches: Matches, models: Models, cameras: Cameras, out: F8x1) -> None
         return
     side = _side(points, models.size0, models.size1)
     has_line, has_plane = np.any(models.F != 0), np.any(models.H != 0)
-    line, plane, r = np.full(n, math.inf), np.full(n, math.inf), vector(n)
+    line, plane, r, work = np.full(n, math.inf), np.full(n, math.inf), vector(n), matrix(2, n)
     s = COARSEST * side
     if has_line:
         _distances(models.F.ravel(), points, noise, True, line)
-        s = min(s, _noise(line, side, 1))
+        s = min(s, _noise(line, side, 1, work))
     if has_plane:
         _distances(models.H.ravel(), points, noise, False, plane)
-        s = min(s, _noise(plane, side, 2))
+        s = min(s, _noise(plane, side, 2, work))
     out[NOISE] = s
     d, share = np.zeros((2, n)), np.zeros(3)
-    _densities(line, s, side, 1, d[1])
+    _densities(line, s, side, 1, work[0], d[1])
     out[LINE] = _log_likelihood(d[1:], share)
     if not has_plane:
         out[BOTH], out[ON_LINE] = out[LINE], share[1]
         return
-    _densities(plane, s, side, 2, d[0])
+    _densities(plane, s, side, 2, work[0], d[0])
     out[PLANE] = _log_likelihood(d[:1], share)
     out[BOTH] = _log_likelihood(d, share)
     out[ON_PLANE], out[ON_LINE] = share[1], share[2]
@@ -84,14 +86,14 @@ def weigh(matches: Matches, models: Models, cameras: Cameras, out: F8x1) -> None
     _fit_copy(points, noise, plane, s, H)
     out[SCALED], out[SCALED + 1], out[SCALED + 2] = H[0], H[2], H[5]
     _distances(H, points, noise, False, r)
-    _densities(r, s, side, 2, d[0])
+    _densities(r, s, side, 2, work[0], d[0])
     out[COPY] = _log_likelihood(d[:1], share)
     out[TURN] = -math.inf
     if cameras.K0[2, 2] != 0:
         cost = fit_rotation(points, noise, models.H.ravel(), cameras, s, out[FOCALS : ROTATION + 9], H)
         if math.isfinite(cost):
             _distances(H, points, noise, False, r)
-            _densities(r, s, side, 2, d[0])
+            _densities(r, s, side, 2, work[0], d[0])
             out[TURN] = _log_likelihood(d[:1], share) - cost
 
 
@@ -137,31 +139,34 @@ def _distances(model: Array, points: Array, noise: Array, line: bool, out: Array
 
 
 @inner
-def _decay(z: float) -> float:
-    """exp(-z)."""
-    return exponential(-z) if z < FARTHEST else 0.0
+def _noise(r2: Array, side: float, dimensions: int, work: Array) -> float:
+    """The noise of right matches beside wrong ones, by expectation and maximisation. work: (2, n)."""
+    n, s = len(r2), min(max(START * side, FINEST), COARSEST * side)
+    share = 0.5
+    for _ in range(STEPS):
+        peak, tail = _peaks(s, side, dimensions)
+        _decay(r2, 1 / (2 * s * s), share * peak, work[0])
+        _decay(r2, 1 / (2 * TAIL * TAIL * s * s), share * tail, work[1])
+        right, squares, limit = 0.0, 0.0, FARTHEST * 2 * TAIL * TAIL * s * s
+        for i in range(n):
+            if r2[i] < limit:
+                p, q = work[0, i], work[1, i]
+                inverse = 1 / (1 - share + p + q)
+                right += (p + q) * inverse
+                squares += r2[i] * (p + q / (TAIL * TAIL)) * inverse
+        share = (right + HALF) / (n + 2 * HALF)
+        last, s = s, min(max(math.sqrt(squares / max(dimensions * right, 1e-9)), FINEST), COARSEST * side)
+        if abs(s - last) < NOISE_TOLERANCE * last:
+            break
+    return s
 
 
 @inner
-def _noise(r2: Array, side: float, dimensions: int) -> float:
-    """The noise of right matches beside wrong ones, by expectation and maximisation."""
-    n, s = len(r2), min(max(START * side, FINEST), COARSEST * side)
-    share = 0.5
-    for _ in range(NOISE_STEPS):
-        near, far = 1 / (2 * s * s), 1 / (2 * TAIL * TAIL * s * s)
-        peak, tail = _peaks(s, side, dimensions)
-        right, squares, count = 0.0, 0.0, 0.0
-        for i in range(n):
-            if r2[i] * far < FARTHEST:
-                p, q = share * peak * _decay(r2[i] * near), share * tail * _decay(r2[i] * far)
-                total = 1 - share + p + q
-                p, q = p / total, q / total
-                right += p + q
-                count += dimensions * (p + q)
-                squares += r2[i] * (p + q / (TAIL * TAIL))
-        share = (right + HALF) / (n + 2 * HALF)
-        s = min(max(math.sqrt(squares / max(count, 1e-9)), FINEST), COARSEST * side)
-    return s
+def _decay(r2: Array, by: float, peak: float, out: Array) -> None:
+    """peak exp(-by r2) -> out (n,), as good as zero beyond FARTHEST."""
+    for i in range(len(out)):
+        z = r2[i] * by
+        out[i] = peak * exponential(-(z if z < FARTHEST else FARTHEST))
 
 
 @inner
@@ -175,35 +180,45 @@ def _peaks(s: float, side: float, dimensions: int) -> tuple[float, float]:
 
 
 @inner
-def _densities(r2: Array, s: float, side: float, dimensions: int, out: Array) -> None:
+def _densities(r2: Array, s: float, side: float, dimensions: int, work: Array, out: Array) -> None:
     """Of right matches over that of wrong ones -> out (n,); of one dimension, near a line, or of two, near a point."""
-    near, far = 1 / (2 * s * s), 1 / (2 * TAIL * TAIL * s * s)
     peak, tail = _peaks(s, side, dimensions)
+    _decay(r2, 1 / (2 * s * s), peak, out)
+    _decay(r2, 1 / (2 * TAIL * TAIL * s * s), tail, work)
     for i in range(len(out)):
-        out[i] = peak * _decay(r2[i] * near) + tail * _decay(r2[i] * far)
+        out[i] += work[i]
 
 
 @inner
 def _log_likelihood(d: Array, share: Array) -> float:
     """The maximum over the shares of wrong and right matches, d (j, n) -> share (j + 1,), of sum log sum w d."""
     j, n = d.shape
-    sums = vector(3)
-    for k in range(j + 1):
-        share[k] = 1 / (j + 1)
-    for _ in range(SHARE_STEPS):
-        sums[0], sums[1], sums[2] = 0.0, 0.0, 0.0
-        for i in range(n):
-            p, q = share[1] * d[0, i], share[2] * d[1, i] if j > 1 else 0.0
-            inverse = 1 / (share[0] + p + q)
-            sums[0] += share[0] * inverse
-            sums[1] += p * inverse
-            sums[2] += q * inverse
-        for k in range(j + 1):
-            share[k] = (sums[k] + HALF) / (n + HALF * (j + 1))
-    total = 0.0
+    share[0], share[1], share[2] = 1 / (j + 1), 1 / (j + 1), 1 / (j + 1) if j > 1 else 0.0
+    for _ in range(STEPS):
+        on_plane, on_line = 0.0, 0.0
+        if j > 1:
+            for i in range(n):
+                p, q = share[1] * d[0, i], share[2] * d[1, i]
+                inverse = 1 / (share[0] + p + q)
+                on_plane += p * inverse
+                on_line += q * inverse
+        else:
+            for i in range(n):
+                p = share[1] * d[0, i]
+                on_plane += p / (share[0] + p)
+        total, moved = n + HALF * (j + 1), 0.0
+        on_plane, on_line = (on_plane + HALF) / total, (on_line + HALF) / total if j > 1 else 0.0
+        moved = max(abs(on_plane - share[1]), abs(on_line - share[2]))
+        share[0], share[1], share[2] = 1 - on_plane - on_line, on_plane, on_line
+        if moved < SHARE_TOLERANCE:
+            break
+    value, product = 0.0, 1.0
     for i in range(n):
-        total += logarithm(share[0] + share[1] * d[0, i] + (share[2] * d[1, i] if j > 1 else 0.0))
-    return total
+        product *= share[0] + share[1] * d[0, i] + (share[2] * d[1, i] if j > 1 else 0.0)
+        if i % GROUP == GROUP - 1:
+            value += logarithm(product)
+            product = 1.0
+    return value + logarithm(product)
 
 
 @inner

@@ -38,14 +38,16 @@ def log_likelihood(*densities: np.ndarray) -> tuple[float, np.ndarray]:
     for _ in range(20):
         q = d * w
         q /= q.sum(1, keepdims=True)
-        w = (q.sum(0) + 0.5) / (n + 0.5 * J)
+        last, w = w, (q.sum(0) + 0.5) / (n + 0.5 * J)
+        if np.abs(w - last)[1:].max() < 1e-3:
+            break
     return float(np.log((d * w).sum(1)).sum()), w
 
 
 def noise(r: np.ndarray, dimensions: int, side: float) -> float:
     """The noise of the mixture of wrong and right matches, by expectation and maximisation."""
     s, share, n = START * side, 0.5, len(r)
-    for _ in range(15):
+    for _ in range(20):
         parts = [np.full(n, 1 - share)]
         for q in (s, TAIL * s):
             normal = share * 0.5 * np.exp(-(r**2) / (2 * q**2))
@@ -55,7 +57,9 @@ def noise(r: np.ndarray, dimensions: int, side: float) -> float:
         g = (g / g.sum(1, keepdims=True))[:, 1:]
         share = (g.sum() + 0.5) / (n + 1)
         squares = (np.where(g > 0, r[:, None] ** 2, 0) * g / [1, TAIL**2]).sum()
-        s = float(np.clip(np.sqrt(squares / max(dimensions * g.sum(), 1e-9)), FINEST, COARSEST * side))
+        last, s = s, float(np.clip(np.sqrt(squares / max(dimensions * g.sum(), 1e-9)), FINEST, COARSEST * side))
+        if abs(s - last) < 0.01 * last:
+            break
     return s
 
 
@@ -113,7 +117,7 @@ def rotation(
 
 def copy(r: np.ndarray, x0: np.ndarray, x1: np.ndarray, s: float, n: np.ndarray) -> np.ndarray:
     """The map x1 = a x0 + b of a copy or a crop, by reweighted least squares from distances r (n,) to a plane."""
-    for _ in range(10):
+    for _ in range(8):
         w = 1 / (1 + (r / (LOSS * s)) ** 2) ** 2 / n**2
         c0, c1 = (np.average(x, axis=0, weights=w) for x in (x0, x1))
         a = (w[:, None] * (x0 - c0) * (x1 - c1)).sum() / (w[:, None] * (x0 - c0) ** 2).sum()
