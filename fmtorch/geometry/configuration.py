@@ -84,10 +84,10 @@ def configuration_evidence(
     exact = torch.diag_embed(torch.full((len(F), 2), torch.inf, dtype=torch.float64, device=F.device))
     precision = exact if focal_precision is None else focal_precision
     cameras = (K0, K1) if K0 is not None and K1 is not None else (torch.zeros_like(F),) * 2
-    models = (torch.where(A.isfinite().flatten(1).all(1)[:, None, None], A, 0.0) for A in (F, H, *cameras))
-    F, H, K0, K1 = models
+    models = torch.stack([A.to(torch.float64) for A in (F, H, *cameras)], 1)
+    models = torch.where(models.isfinite().flatten(2).all(2)[..., None, None], models, 0.0)
     sizes = (None if size is None else size.to(torch.float64) for size in (size0, size1))
-    given = [None if a is None else a.cpu() for a in (x0, x1, mask, noise, F, H, *sizes, K0, K1, precision)]
+    given = [None if a is None else a.cpu() for a in (x0, x1, mask, noise, models, *sizes, precision)]
     out = torch.empty(len(F), compiled.COLUMNS, dtype=torch.float64)
     rows = for_each_pair(_into, given, out=out, kind=torch.float64).to(F.device)
     columns = [rows[:, k] for k in (compiled.LINE, compiled.PLANE, compiled.BOTH, compiled.TURN, compiled.COPY)]
@@ -97,8 +97,9 @@ def configuration_evidence(
     return Evidence(*columns)
 
 
-def _into(x0: Array, x1: Array, mask: Array, noise: Array, F: Array, H: Array, *known: Array) -> None:
-    size0, size1, K0, K1, precision, out = known
+def _into(x0: Array, x1: Array, mask: Array, noise: Array, models: Array, *known: Array) -> None:
+    size0, size1, precision, out = known
+    F, H, K0, K1 = models
     matches = compiled.Matches(x0, x1, mask, noise)
     compiled.weigh(matches, compiled.Models(F, H, size0, size1), Cameras(K0, K1, precision), out)
 

@@ -45,7 +45,7 @@ def classify(
     c: Correspondences,
     estimate: Estimate,
     *,
-    focal_deviation: float = FOCAL_DEVIATION,
+    focal_deviation: float | int = FOCAL_DEVIATION,
     seed: int = 0,
     **options: Any,
 ) -> Configuration:
@@ -99,7 +99,7 @@ def classify(
     return Configuration(torch.where(estimate.ok | H.ok, kind, UNRELATED), evidence, H)
 
 
-def _cameras(c: Correspondences, deviation: float) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+def _cameras(c: Correspondences, deviation: float | int) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
     """K0, K1 and the inverse covariance of the logarithms of their focal lengths; None where nothing is known."""
     if c.K0 is not None and c.K1 is not None:
         known = torch.full((len(c), 2), torch.inf if deviation == 0 else deviation**-2, dtype=torch.float64)
