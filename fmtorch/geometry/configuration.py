@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.compiling.batches import for_each_pair
+from fmtorch.core.estimate import CONFIGURATIONS
 from fmtorch.geometry import configuration_kernels as compiled
 from fmtorch.geometry.arithmetic import logarithm
 from fmtorch.geometry.rotation_kernels import Cameras
 
 Array = NDArray[Any]
 
-KINDS = ("general", "planar", "rotation", "identical", "unrelated")
-GENERAL, PLANAR, ROTATION, IDENTICAL, UNRELATED = range(len(KINDS))
+GENERAL, PLANAR, ROTATION, IDENTICAL, UNRELATED = range(len(CONFIGURATIONS))
 MIN_EVIDENCE = 60.0  # nats
 MIN_PARALLAX = 12.0  # nats
 PLANE_PARAMETERS, COPY_PARAMETERS = 8, 3  # of a homography, and of a similarity without rotation, or of a rotation
@@ -105,7 +105,7 @@ def _into(x0: Array, x1: Array, mask: Array, noise: Array, models: Array, *known
 
 
 def classified(evidence: Evidence, focal_known: Bool[Tensor, " b"] | None = None) -> Int[Tensor, " b"]:
-    """The kind of each pair, an index into `KINDS`.
+    """The kind of each pair, an index into `CONFIGURATIONS`.
 
     1. unrelated: neither F nor H explains more than `MIN_EVIDENCE` nats.
     2. general: matches off the plane support F, ``both - plane - log n > MIN_PARALLAX``: by the Bayesian information

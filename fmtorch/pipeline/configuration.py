@@ -5,24 +5,37 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from fmtorch.core.estimate import CONFIGURATIONS
 from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.geometry.configuration import GENERAL, KINDS, UNRELATED, Evidence, classified, configuration_evidence
-from fmtorch.pipeline.fundamental import find_homography
+from fmtorch.geometry.arithmetic import component_sum
+from fmtorch.geometry.configuration import (
+    GENERAL,
+    PLANAR,
+    ROTATION,
+    UNRELATED,
+    Evidence,
+    classified,
+    configuration_evidence,
+)
+from fmtorch.geometry.epipolar import inverse_root
+from fmtorch.geometry.homography_pose import PlanePoses, poses_from_homography
+from fmtorch.pipeline.estimation import estimated
 
 FOCAL_DEVIATION = 0.02
 """Of the focal lengths of a calibration, relative: what zoom and focus change between two days."""
 USUAL_FOCAL, USUAL_DEVIATION = 1.2, 0.4  # of photographs, in longer sides, and of its logarithm (the estimator's prior)
+SAME_POSE = 1e-3  # radians: two poses of a plane that differ less in rotation are one
 OTHER_CAMERA = 0.5  # deviation of the logarithm of the ratio of the focal lengths of images of different sizes
 
 
 class Configuration(NamedTuple):
     """Configurations of B pairs.
 
-    kind: indices into `fmtorch.geometry.configuration.KINDS`. evidence: for the kinds. homography: of the plane, or of
+    kind: indices into `fmtorch.core.estimate.CONFIGURATIONS`. evidence: for the kinds. homography: of the plane, or of
     the rotation.
     """
 
@@ -33,7 +46,7 @@ class Configuration(NamedTuple):
     @property
     def names(self) -> tuple[str, ...]:
         """The kinds in words: general, planar, rotation, identical or unrelated."""
-        return tuple(KINDS[i] for i in self.kind.tolist())
+        return tuple(CONFIGURATIONS[i] for i in self.kind.tolist())
 
     @property
     def determined(self) -> Bool[Tensor, " b"]:
@@ -85,10 +98,8 @@ def classify(
         raise ValueError(f"estimate is of {len(estimate)} pairs and c of {len(c)}; they must be of the same pairs")
     if not focal_deviation >= 0:
         raise ValueError(f"focal_deviation is {focal_deviation}; it must not be negative")
-    H = find_homography(
-        c.x0.detach(), c.x1.detach(), mask=c.mask, quality=c.quality, prior=c.prior, lafs0=c.lafs0, lafs1=c.lafs1,
-        noise=c.noise, key=c.key, seed=seed, **options,
-    )  # fmt: skip
+    matches = c.detach().derived(K0=None, K1=None, focal=None, shared_focal=None)
+    H = estimated(matches, "homography", "homography", None, seed, options)
     K0, K1, precision = _cameras(c, focal_deviation)
     with one_thread(c.mask.device):
         evidence = configuration_evidence(
@@ -120,3 +131,30 @@ def _usual(size: Tensor) -> Tensor:
     K[:, 0, 0] = K[:, 1, 1] = USUAL_FOCAL * size.amax(-1)
     K[:, 0, 2], K[:, 1, 2], K[:, 2, 2] = (size[:, 1] - 1) / 2, (size[:, 0] - 1) / 2, 1.0
     return K
+
+
+def with_configuration(estimate: Estimate, c: Correspondences, seed: int, **options: Any) -> Estimate:
+    """The estimate with the fields `configuration_index`, `homography`, `other_R`, `other_t`; c: all its matches."""
+    judged = classify(c.detach(), estimate.detach(), seed=seed, **options)
+    H, kind = judged.homography, judged.kind
+    flat = H.ok & ((kind == PLANAR) | (kind == ROTATION))
+    fields = {"configuration_index": kind, "homography": torch.where(flat[:, None, None], H.F, 0)}
+    if c.K0 is not None and c.K1 is not None and estimate.R is not None:
+        with one_thread(c.mask.device):
+            poses = poses_from_homography(H.F, c.K0, c.K1, c.x0, c.x1, H.inliers)
+            fields |= _other_pose(estimate.R, poses, flat & (kind == PLANAR))
+    return estimate.derived(**fields)
+
+
+def _other_pose(R: Float[Tensor, "b 3 3"], poses: PlanePoses, flat: Tensor) -> dict[str, Tensor]:
+    """The pose of a plane that is farther from R, as fields; NaN where both are one or the pair is not flat."""
+    trace = component_sum((poses.R * R[:, None].to(poses.R)).flatten(2), -1)
+    rows, other = torch.arange(len(R), device=R.device), trace.argmin(1)
+    apart = 1 - (trace[rows, other] - 1) / 2 > SAME_POSE**2 / 2
+    valid = flat & poses.valid.all(1) & apart
+    t = poses.t[rows, other]
+    t = t * inverse_root(component_sum(t * t, -1))[:, None]
+    return {
+        "other_R": torch.where(valid[:, None, None], poses.R[rows, other], torch.nan).to(R),
+        "other_t": torch.where(valid[:, None], t, torch.nan).to(R),
+    }

@@ -23,11 +23,13 @@ from fmtorch.pipeline.known_cameras import KnownCameras
 
 
 def estimated(
-    c: Correspondences, model: str, name: str, config_dir: Path | str | None, seed: int, options: Mapping[str, Any]
-) -> Estimate:
+    c: Correspondences, model: str, name: str, config_dir: Path | str | None, seed: int, options: Mapping[str, Any],
+    covariance: bool = False,
+) -> Estimate:  # fmt: skip
     """The estimate of matches by a preset, with a prior of their consistency where it uses one and none is given.
 
-    model: what the preset must estimate. What is known of cameras counts where `focal` or `shared_focal` is given.
+    model: what the preset must estimate. What is known of cameras counts where `focal` or `shared_focal` is given; then
+    the estimate may have a covariance.
     """
     expect_values(c)
     seed = int(number("seed", seed, whole=True))
@@ -36,7 +38,7 @@ def estimated(
         raise ValueError(f"estimator={name} gives {gives} matrices; find_{model} needs one that gives {model} matrices")
     if not c.asks_for_cameras:
         return _with_prior(c, seed, estimator=estimator)
-    return KnownCameras(functools.partial(_with_prior, estimator=estimator))(c, seed)
+    return KnownCameras(functools.partial(_with_prior, estimator=estimator), covariance)(c, seed)
 
 
 def _with_prior(c: Correspondences, seed: int = 0, *, estimator: Estimator) -> Estimate:

@@ -45,9 +45,9 @@ class KnownCameras:
 
     model = "fundamental"
 
-    def __init__(self, estimator: Estimator) -> None:
-        """estimator: of fundamental matrices."""
-        self.estimator = estimator
+    def __init__(self, estimator: Estimator, covariance: bool = False) -> None:
+        """estimator: of fundamental matrices. covariance: whether estimates have that."""
+        self.estimator, self.covariance = estimator, covariance
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the cameras of a batch of pairs; one whose K is wrong is `ok=False` with a reason."""

@@ -23,9 +23,9 @@ from rich.progress import track
 from rich.table import Table
 
 from fmtorch import presets
+from fmtorch.core.estimate import CONFIGURATIONS
 from fmtorch.core.files import replacing
 from fmtorch.core.types import Correspondences
-from fmtorch.geometry.configuration import KINDS
 from fmtorch.pipeline.configuration import classify
 from scripts.benchmark import matched
 from scripts.benchmark.configuration_pairs import Case, photographs
@@ -142,10 +142,10 @@ def report(cases: list[Case], verdicts: dict[str, list[str]]) -> None:
     groups = list(dict.fromkeys((case.group, case.truth) for case in cases))
     for name, kinds in verdicts.items():
         table = Table(title=name)
-        for column in ("pairs of", "truth", "pairs", *KINDS, "right, %"):
+        for column in ("pairs of", "truth", "pairs", *CONFIGURATIONS, "right, %"):
             table.add_column(column, justify="left" if column in ("pairs of", "truth") else "right")
         for group, truth in groups:
             own = [kind for kind, case in zip(kinds, cases, strict=True) if case.group == group]
             right = f"{100 * own.count(truth) / len(own):.1f}" if truth else ""
-            table.add_row(group, truth, str(len(own)), *(str(own.count(kind)) for kind in KINDS), right)
+            table.add_row(group, truth, str(len(own)), *(str(own.count(kind)) for kind in CONFIGURATIONS), right)
         console.print(table)

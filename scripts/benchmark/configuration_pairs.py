@@ -23,7 +23,7 @@ TURNED = 30.0  # px, least mean displacement of a rotation's matches
 class Case(NamedTuple):
     """Matches of one pair with cameras and sizes, and what it is.
 
-    truth: a name of `configuration.KINDS`, or empty where that is not known. group: the row of the table.
+    truth: a name of `core.estimate.CONFIGURATIONS`, or empty where that is not known. group: the row of the table.
     """
 
     matches: Correspondences

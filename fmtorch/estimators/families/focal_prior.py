@@ -28,8 +28,8 @@ SAME_CAMERA_GAIN = 5.0  # its depth, in logarithms of the likelihood
 SAME_CAMERA_SHARE = 0.7  # of the draws for images of equal size that have one focal length for both
 LOG_USUAL = 0.1823215567939546  # math.log(USUAL_FOCAL)
 MIN_DEVIATION = 1e-5  # that an exact measurement is taken to have
-TAIL_GAIN = 5.0  # what a measurement costs at most, in logarithms of the likelihood
-UNBELIEVED_SHARE = 0.2  # of the draws that leave out measurements with a tail
+TAIL_GAIN = 3.0  # what measurements that may be wrong cost at most together, in logarithms of the likelihood
+UNBELIEVED_SHARE = 0.6  # of the draws that leave out measurements with a tail
 QUANTILES = 1 << 10  # of the normal distribution, from which focal lengths are drawn
 
 
@@ -123,21 +123,31 @@ def focal_cost(focal: Array, prior: FocalPrior, out: Array) -> Any:
     if prior.shared:
         cost = mean * mean / 2
         out[0], out[1], out[2], out[3], out[4] = 2 * b * mean, 0.0, 4 * b * b, 1.0, 0.0
+    z2 = 0.0
+    for i in range(2):
+        if prior.tail[i] > 0:
+            away = focal[i] - prior.measured[i]
+            z2 += prior.precision[i] * away * away
+    rest = 2 * TAIL_GAIN / (z2 + 2 * TAIL_GAIN)
+    cost += TAIL_GAIN * z2 / (z2 + 2 * TAIL_GAIN)
     for i in range(2):
         j = 0 if prior.shared else i
         if prior.precision[i] > 0:
             away = focal[i] - prior.measured[i]
-            z2 = prior.precision[i] * away * away
             if prior.tail[i] > 0:
-                rest = 2 * TAIL_GAIN / (z2 + 2 * TAIL_GAIN)
-                cost += TAIL_GAIN * z2 / (z2 + 2 * TAIL_GAIN)
                 out[j] += prior.precision[i] * away * rest * rest
                 out[2 + j] += prior.precision[i] * rest * rest
             else:
-                cost += z2 / 2
+                cost += prior.precision[i] * away * away / 2
                 out[j] += prior.precision[i] * away
                 out[2 + j] += prior.precision[i]
     return cost
+
+
+@kernel(holds_gil=True)
+def prior_slopes(focal: F8x1, prior: FocalPrior, out: F8x1) -> None:
+    """The first and second derivatives of the cost of two log focal lengths (2,) -> out (5,), as `focal_cost`."""
+    focal_cost(focal, prior, out)
 
 
 @kernel(holds_gil=True)
