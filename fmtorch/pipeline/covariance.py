@@ -14,35 +14,35 @@ from fmtorch.geometry.two_view_covariance import two_view_covariance
 
 @torch.no_grad()
 def covariance_fields(
-    estimate: Estimate, c: Correspondences, focals: Float[Tensor, "b 2"], maps: tuple[Tensor, Tensor]
+    estimate: Estimate, c: Correspondences, maps: Float[Tensor, "b 2 3 3"] | None, focals: Float[Tensor, "b 2"]
 ) -> dict[str, Tensor]:
     """The fields `covariance`, `tangents`, `covariance_F` of an estimate with a pose; NaN where there is none.
 
-    c: its matches, in images of square pixels and central principal points. focals: of these. maps: (B, 3, 3) each,
-    from the coordinates that F is of to those of c.
+    c: its matches, in images of square pixels and central principal points. maps: from the coordinates that F is of to
+    those of c, None where these are the same. focals: of c.
     """
-    assert estimate.R is not None
-    assert estimate.t is not None
-    assert estimate.fit_scale is not None
-    centres = [torch.zeros_like(focals) if s is None else (s.flip(-1) - 1.0) / 2 for s in (c.size0, c.size1)]
+    R, t, scale, sizes = estimate.R, estimate.t, estimate.fit_scale, (c.size0, c.size1)
+    if R is None or t is None or scale is None or sizes[0] is None or sizes[1] is None:
+        shapes = {"covariance": (7, 7), "tangents": (3, 2), "covariance_F": (9, 9)}
+        return {name: focals.new_full((len(c), *shape), torch.nan) for name, shape in shapes.items()}
+    centre0, centre1 = ((size.to(focals).flip(-1) - 1) / 2 for size in sizes)
     computed = two_view_covariance(
-        c.x0, c.x1, estimate.R, estimate.t, focals, *centres, estimate.fit_scale, c.prior, c.noise,
-        c.mask & estimate.ok[:, None], estimate.focal_precision, c.shared_focal,
+        c.x0, c.x1, R, t, focals, centre0, centre1, scale, c.prior, c.noise, c.mask & estimate.ok[:, None],
+        estimate.focal_precision, c.shared_focal,
     )  # fmt: skip
+    of_F = computed.fundamental
+    if maps is not None:
+        of_F = _mapped(of_F, estimate.F.to(focals), *maps.to(focals).unbind(1))
+    fields = {"covariance": computed.covariance, "tangents": computed.tangent, "covariance_F": of_F}
     valid = (estimate.ok & computed.valid)[:, None, None]
-    fields = {
-        "covariance": computed.covariance, "tangents": computed.tangent,
-        "covariance_F": _mapped(computed.fundamental, estimate.F.to(focals), *maps),
-    }  # fmt: skip
     return {name: torch.where(valid, value, torch.nan) for name, value in fields.items()}
 
 
 def _mapped(C: Float[Tensor, "b 9 9"], F: Float[Tensor, "b 3 3"], A0: Tensor, A1: Tensor) -> Float[Tensor, "b 9 9"]:
     """The covariance of F, which is A1^T G A0 at unit norm, from that of G at unit norm."""
     G = matmul3(matmul3(_inverse(A1).mT, F), _inverse(A0)).flatten(1)
-    M = (A1.mT[:, :, None, :, None] * A0.mT[:, None, :, None, :]).flatten(3).flatten(1, 2) / _inverse_norm(G)[
-        :, None, None
-    ]
+    M = (A1.mT[:, :, None, :, None] * A0.mT[:, None, :, None, :]).flatten(3).flatten(1, 2)
+    M = M / _inverse_norm(G)[:, None, None]
     f = F.flatten(1)
     J = M - f[:, :, None] * component_sum(f[:, :, None] * M, 1)[:, None]
     return _product(_product(J, C), J.mT)

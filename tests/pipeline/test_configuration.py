@@ -7,8 +7,8 @@ import torch
 
 import fmtorch
 from fmtorch import presets
+from fmtorch.core.estimate import CONFIGURATIONS
 from fmtorch.core.types import Correspondences, Estimate, collate
-from fmtorch.geometry.configuration import KINDS
 from fmtorch.pipeline.configuration import classify
 from tests.geometry.kinds import batch, draw
 
@@ -25,7 +25,7 @@ def estimated(c: Correspondences) -> Estimate:
 
 
 @pytest.mark.parametrize("known", [True, False])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", CONFIGURATIONS)
 def test_kinds(kind: str, known: bool) -> None:
     """Of estimated models, with calibrations and by image sizes alone, the cameras being usual ones."""
     c = collate([pair(kind, seed) for seed in range(20)])
@@ -46,10 +46,10 @@ def test_a_rotation_needs_cameras_or_sizes() -> None:
 
 def test_laws() -> None:
     few = pair("general", 9, 5)
-    pairs = [pair(kind, i, 60 + 31 * i) for i, kind in enumerate(KINDS)]
+    pairs = [pair(kind, i, 60 + 31 * i) for i, kind in enumerate(CONFIGURATIONS)]
     c = collate([*pairs[:3], few, *pairs[3:]])
     found = classify(c, estimated(c))
-    assert found.names == (*KINDS[:3], "unrelated", *KINDS[3:])
+    assert found.names == (*CONFIGURATIONS[:3], "unrelated", *CONFIGURATIONS[3:])
     for i, one in enumerate([*pairs[:3], few, *pairs[3:]]):
         alone = classify(one, estimated(one))
         for a, b in zip((alone.kind, *alone.evidence), (found.kind, *found.evidence), strict=True):
