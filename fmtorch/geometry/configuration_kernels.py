@@ -11,8 +11,7 @@ from fmtorch.compiling.arrays import Array, B1x1, F8x1, F8x2
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.scratch import matrix, vector
 from fmtorch.geometry.arithmetic_kernels import logarithm
-from fmtorch.geometry.homography_objective_kernels import HOMOGRAPHY
-from fmtorch.geometry.residual_kernels import SAMPSON
+from fmtorch.geometry.residual_kernels import HOMOGRAPHY, SAMPSON
 from fmtorch.geometry.rotation_kernels import Cameras, fit_rotation
 
 FREEDOM = 3.0  # degrees, of Student's law: keypoints err by more than the normal one says

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.geometry.arithmetic import cofactors, component_sum, determinant, matmul3
+from fmtorch.geometry.arithmetic import cofactors, component_sum, determinant, matmul3, sqrt
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.two_view_covariance import two_view_covariance
 
@@ -21,14 +21,18 @@ def covariance_fields(
     c: its matches, in images of square pixels and central principal points. maps: from the coordinates that F is of to
     those of c, None where these are the same. focals: of c.
     """
-    R, t, scale, sizes = estimate.R, estimate.t, estimate.fit_scale, (c.size0, c.size1)
-    if R is None or t is None or scale is None or sizes[0] is None or sizes[1] is None:
+    R, t, scale = estimate.R, estimate.t, estimate.fit_scale
+    if R is None or t is None or scale is None or c.size0 is None or c.size1 is None:
         shapes = {"covariance": (7, 7), "tangents": (3, 2), "covariance_F": (9, 9)}
         return {name: focals.new_full((len(c), *shape), torch.nan) for name, shape in shapes.items()}
-    centre0, centre1 = ((size.to(focals).flip(-1) - 1) / 2 for size in sizes)
+    centre0, centre1 = ((size.to(focals).flip(-1) - 1) / 2 for size in (c.size0, c.size1))
+    weight, precision = c.prior, estimate.focal_precision
+    if weight is not None and precision is not None:  # as fits with exactly known focal lengths count it
+        exact = precision.diagonal(dim1=-2, dim2=-1).isinf().all(1)[:, None]
+        weight = torch.where(exact, sqrt(weight.double().clamp_min(0)), weight.double())
     computed = two_view_covariance(
-        c.x0, c.x1, R, t, focals, centre0, centre1, scale, c.prior, c.noise, c.mask & estimate.ok[:, None],
-        estimate.focal_precision, c.shared_focal,
+        c.x0, c.x1, R, t, focals, centre0, centre1, scale, weight, c.noise, c.mask & estimate.ok[:, None],
+        precision, c.shared_focal,
     )  # fmt: skip
     of_F = computed.fundamental
     if maps is not None:

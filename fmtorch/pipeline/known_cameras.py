@@ -38,7 +38,7 @@ class KnownCameras:
     model = "fundamental"
 
     def __init__(self, estimator: Estimator, pruner: Pruner | None = None, covariance: bool = False) -> None:
-        """estimator: of fundamental matrices. pruner: before it, in square pixels. covariance: whether to compute it."""
+        """estimator: of fundamental matrices. pruner: before it. covariance: whether to compute it."""
         self.estimator, self.pruner, self.covariance = estimator, pruner, covariance
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:

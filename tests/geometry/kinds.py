@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from fmtorch.geometry.configuration import KINDS
+from fmtorch.core.estimate import CONFIGURATIONS
 
 K = np.array([[768.0, 0, 319.5], [0, 768, 239.5], [0, 0, 1]])
 SIZE = (480, 640)
@@ -30,7 +30,7 @@ def cross_matrix(t: np.ndarray) -> np.ndarray:
 
 def draw(kind: str, seed: int, n: int = 200, wrong: float = 0.3, noise: float = 0.5, off_plane: int = 0) -> Drawn:
     """A pair of a kind; off_plane: matches of a planar one that are not on the plane."""
-    rng = np.random.default_rng([seed, KINDS.index(kind)])
+    rng = np.random.default_rng([seed, CONFIGURATIONS.index(kind)])
     X = np.c_[rng.uniform(-2, 2, (n, 2)), rng.uniform(4, 8, n)]
     R = Rotation.from_rotvec(rng.normal(size=3) * 0.1).as_matrix()
     t = np.array([0.6, 0.1, 0.1])

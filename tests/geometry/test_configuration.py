@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.geometry.configuration import KINDS, Evidence, classified, configuration_evidence
+from fmtorch.core.estimate import CONFIGURATIONS
+from fmtorch.geometry.configuration import Evidence, classified, configuration_evidence
 from tests.geometry.kinds import SIZE, K, batch, draw
 from tests.reference import configuration as reference
 from tests.reference.epipolar import sampson
@@ -14,7 +15,7 @@ from tests.reference.epipolar import sampson
 SIDE = float(np.sqrt(SIZE[0] * SIZE[1]))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", CONFIGURATIONS)
 @pytest.mark.parametrize("known", [False, True])
 def test_against_the_definitions(kind: str, known: bool) -> None:
     drawn = draw(kind, 0, 80)
@@ -53,34 +54,34 @@ def test_against_the_definitions(kind: str, known: bool) -> None:
         assert known == bool((found.log_focal == 0).all())
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", CONFIGURATIONS)
 def test_kinds_of_synthetic_pairs(kind: str) -> None:
     """Of perfect models, at three levels of noise and of wrong matches, 40 pairs each."""
     for noise in (0.2, 0.5, 1.5):
         for wrong in (0.0, 0.3, 0.6):
             pairs = batch([draw(kind, seed, 150, wrong, noise) for seed in range(40)])
             kinds = classified(configuration_evidence(**pairs))
-            right = int((kinds == KINDS.index(kind)).sum())
-            assert right >= 39, (noise, wrong, [KINDS[i] for i in kinds.tolist()])
+            right = int((kinds == CONFIGURATIONS.index(kind)).sum())
+            assert right >= 39, (noise, wrong, [CONFIGURATIONS[i] for i in kinds.tolist()])
 
 
 def test_some_matches_off_the_plane_make_a_pair_general() -> None:
     planar = classified(configuration_evidence(**batch([draw("planar", seed) for seed in range(30)])))
     general = classified(configuration_evidence(**batch([draw("planar", seed, off_plane=30) for seed in range(30)])))
-    assert [KINDS[i] for i in planar.tolist()].count("planar") >= 29
-    assert [KINDS[i] for i in general.tolist()].count("general") >= 29
+    assert [CONFIGURATIONS[i] for i in planar.tolist()].count("planar") >= 29
+    assert [CONFIGURATIONS[i] for i in general.tolist()].count("general") >= 29
 
 
 def test_without_cameras_a_rotation_is_planar() -> None:
     pairs = batch([draw("rotation", seed) for seed in range(10)])
     evidence = configuration_evidence(**{k: v for k, v in pairs.items() if k not in ("K0", "K1", "focal_precision")})
     assert bool((evidence.rotation == -torch.inf).all())
-    assert classified(evidence).tolist() == [KINDS.index("planar")] * 10
+    assert classified(evidence).tolist() == [CONFIGURATIONS.index("planar")] * 10
 
 
 def test_no_unit_is_special() -> None:
     """Images twice as large, noise and all, are of the same kinds by the same evidence."""
-    pairs = batch([draw(kind, 3, noise=0.5) for kind in KINDS if kind != "unrelated"])
+    pairs = batch([draw(kind, 3, noise=0.5) for kind in CONFIGURATIONS if kind != "unrelated"])
     twice = dict(pairs)
     grow = torch.diag(torch.tensor([2.0, 2, 1], dtype=torch.float64))
     shrink = torch.linalg.inv(grow)
@@ -101,11 +102,11 @@ def assert_same(a: Evidence, b: Evidence) -> None:
 
 
 def test_padding_and_neighbours_are_invisible() -> None:
-    drawn = [draw(kind, i, 40 + 37 * i) for i, kind in enumerate(KINDS)]
+    drawn = [draw(kind, i, 40 + 37 * i) for i, kind in enumerate(CONFIGURATIONS)]
     together = configuration_evidence(**batch(drawn))
     for i, one in enumerate(drawn):
         assert_same(configuration_evidence(**batch([one])), Evidence(*(v[i : i + 1] for v in together)))
-    many = [draw(KINDS[i % 5], i, 60) for i in range(40)]
+    many = [draw(CONFIGURATIONS[i % 5], i, 60) for i in range(40)]
     threads = torch.get_num_threads()
     torch.set_num_threads(3)
     try:
@@ -127,7 +128,7 @@ def test_no_pair_takes_its_batch_down() -> None:
     assert_same(Evidence(*(v[8:] for v in found)), Evidence(*(v[8:] for v in good)))
     for value in found:
         assert not bool(value.isnan().any())
-    kinds = [KINDS[i] for i in classified(found).tolist()]
+    kinds = [CONFIGURATIONS[i] for i in classified(found).tolist()]
     assert kinds[2] == "unrelated"
     assert kinds[1] == kinds[4] == kinds[5] == kinds[7] == kinds[8] == "general"
     none = configuration_evidence(**{k: v[:0] for k, v in pairs.items()})
