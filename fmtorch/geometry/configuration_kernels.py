@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -182,7 +182,7 @@ def _densities(r2: Array, s: float, side: float, dimensions: int, out: Array) ->
 
 
 @inner
-def _log_likelihood(d: Array, prior: Array, share: Array) -> float:
+def _log_likelihood(d: Array, prior: Array, share: Array) -> Any:
     """The maximum over the shares of sum log L -> share (j + 1,), d (j, n) being the densities of right matches.
 
     A match that the prior takes to be right belongs to one of the j components by their shares, and else is wrong like
