@@ -22,10 +22,10 @@ from rich.progress import track
 from rich.table import Table
 
 from fmtorch import find_homography, metrics, presets
+from fmtorch.core.estimate import CONFIGURATIONS
 from fmtorch.core.files import replacing
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry import poses_from_homography
-from fmtorch.core.estimate import CONFIGURATIONS
 from fmtorch.pipeline.configuration import classify
 from scripts.benchmark import matched
 from scripts.benchmark.configuration_pairs import Case, photographs

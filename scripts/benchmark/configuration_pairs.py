@@ -23,7 +23,7 @@ TURNED = 30.0  # px, least mean displacement of a rotation's matches
 class Case(NamedTuple):
     """Matches of one pair with cameras and sizes, and what it is.
 
-    truth: a name of `core.estimate.CONFIGURATIONS`, or empty where that is not known. group: the row of the table. motion: the
+    truth: a name of `CONFIGURATIONS`, or empty where that is not known. group: the row of the table. motion: the
     true R (3, 3) and t (3,), where they are known.
     """
 
