@@ -12,7 +12,8 @@ from tests.reference.focal import Measured, cross_matrix
 from tests.reference.refine import sampson
 
 SIZE = (480, 640)
-Sizes, Cameras = tuple[tuple[int, int], tuple[int, int]], tuple[np.ndarray, np.ndarray]
+Sizes = tuple[tuple[int, int], tuple[int, int]]
+Cameras = tuple[np.ndarray, np.ndarray]
 UNMEASURED = ((1.0, np.inf), (1.0, np.inf))
 K0 = np.array([[500, 2, 310], [0, 520, 250], [0, 0, 1.0]])
 K1 = np.array([[600, -1, 330], [0, 590, 230], [0, 0, 1.0]])
