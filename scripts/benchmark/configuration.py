@@ -135,6 +135,7 @@ def _colmap(threshold: float) -> Verdict:
         assert c.size1 is not None
         options = pycolmap.TwoViewGeometryOptions()
         options.ransac.max_error, options.ransac.random_seed = threshold, seed
+        options.compute_relative_pose = True  # by which it tells rotations from planes
         x0, x1 = (x[0][c.mask[0]].double().numpy() + 0.5 for x in (c.x0, c.x1))
         cameras = [
             pycolmap.Camera(
