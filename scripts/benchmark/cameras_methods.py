@@ -96,11 +96,10 @@ def _arguments(settings: dict[str, Any], c: Correspondences, seed: int) -> dict[
 
 def _ours(settings: dict[str, Any], c: Correspondences, given: Knowledge, seed: int) -> Answer:
     """What this project makes of a pair by what is known of its cameras."""
-    cameras: dict[str, Any] = {"K0": given.K0, "K1": given.K1}
-    if given.one_camera:
-        cameras["focal"] = "shared"
-    elif given.deviation:
-        cameras["focal"] = given.deviation
+    focal: str | float | None = given.deviation or None
+    if given.K0 is None and given.K1 is None:
+        focal = "shared" if given.one_camera else "unknown"
+    cameras: dict[str, Any] = {"K0": given.K0, "K1": given.K1, "focal": focal}
     estimate = fmtorch.find_fundamental(c.x0, c.x1, **cameras, **_arguments(settings, c, seed))
     if not bool(estimate.ok[0]):
         return NOTHING
