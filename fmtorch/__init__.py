@@ -10,6 +10,7 @@ from fmtorch.core.version import __version__
 
 if TYPE_CHECKING:
     from fmtorch.core.types import Correspondences, Estimate, Features
+    from fmtorch.pipeline.essential import find_essential
     from fmtorch.pipeline.fundamental import find_fundamental, find_homography
     from fmtorch.pipeline.pipeline import Pipeline
     from fmtorch.pipeline.two_images import MatchResult, match
@@ -21,6 +22,7 @@ __all__ = [
     "MatchResult",
     "Pipeline",
     "__version__",
+    "find_essential",
     "find_fundamental",
     "find_homography",
     "match",
@@ -29,7 +31,8 @@ __all__ = [
 _MODULES = {
     "Correspondences": "core.types", "Estimate": "core.types", "Features": "core.types",
     "MatchResult": "pipeline.two_images", "Pipeline": "pipeline.pipeline", "match": "pipeline.two_images",
-    "find_fundamental": "pipeline.fundamental", "find_homography": "pipeline.fundamental",
+    "find_essential": "pipeline.essential", "find_fundamental": "pipeline.fundamental",
+    "find_homography": "pipeline.fundamental",
 }  # fmt: skip
 
 

@@ -18,7 +18,8 @@ from torch import Tensor
 
 from fmtorch.core.annotations import WHOLE, Expected, arguments_of, numbers_of
 from fmtorch.core.arguments import as_tensor, number
-from fmtorch.core.types import SIZE, Correspondences
+from fmtorch.core.rules import FOCAL, SIZE
+from fmtorch.core.types import Correspondences
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -183,7 +184,7 @@ def _readable(shape: tuple[str, ...]) -> str:
 
 
 PER_MATCH = {name: rule for name in Correspondences.per_slot if (rule := Correspondences.declared[name].bounds)}
-RULES = {**PER_MATCH, "size0": SIZE, "size1": SIZE}
+RULES = {**PER_MATCH, "size0": SIZE, "size1": SIZE, "focal": FOCAL}
 """The rules for values, in a tensor or an array. NaN is never right."""
 
 
@@ -217,6 +218,9 @@ def expect_values(c: Correspondences) -> None:
             value = getattr(c, name)[pair, match].item()
             raise ValueError(f"{name} of match {match} of pair {pair} is {value}; {rule.text}")
     expect_sizes(size0=c.size0, size1=c.size1)
+    if c.focal is not None and not bool(FOCAL.holds(c.focal).all()):
+        pair, image = (~FOCAL.holds(c.focal)).nonzero()[0].tolist()
+        raise ValueError(f"focal of image {image} of pair {pair} is {c.focal[pair, image].tolist()}; {FOCAL.text}")
 
 
 def expect_sizes(**sizes: Tensor | None) -> None:

@@ -16,15 +16,11 @@ import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
-from fmtorch.core.annotations import Rule
 from fmtorch.core.records import Index, Record, as_index, expect_fields, gathered, padded, slotted
+from fmtorch.core.rules import DEVIATION, FOCAL, PROBABILITY, SIZE
 
 RELATED = 1.0
 """The significance from which on two images are called related; chosen on tuning pairs (docs/related.md)."""
-
-PROBABILITY = Rule(lambda prior: (prior >= 0) & (prior <= 1), "it is P(inlier), within [0, 1]")
-DEVIATION = Rule(lambda noise: noise > 0, "it is a standard deviation, positive")
-SIZE = Rule(lambda size: (size > 0) & (size < torch.inf), "image sizes (h, w) are positive")
 
 
 def pair_key(identity: str) -> int:
@@ -86,6 +82,10 @@ class Correspondences(Record):
     lafs0, lafs1: local affine frames (B, N, 2, 3) where known. size0, size1: image sizes (B, 2) as (h, w).
     K0, K1: calibration matrices (B, 3, 3) where known. key: (B,) int64, see `pair_key`; 0 when not given.
     mutual: (B, N), True where the match is also the best one of its partner, where the matcher knows.
+    focal: what estimators may take for known of the focal lengths of image 0 and 1, (B, 2, 2): px, and the relative
+    standard deviation, 0 of a calibration, infinite where unknown; for square pixels and central principal points.
+    shared_focal: (B,), True where both images have one focal length in units of their longer sides. Where neither is
+    given an estimate is of fundamental matrices alone, whatever K0 and K1 are.
     """
 
     x0: Float[Tensor, "b n 2"]
@@ -102,6 +102,8 @@ class Correspondences(Record):
     key: Int[Tensor, " b"] | None = None
     mutual: Bool[Tensor, "b n"] | None = None
     noise: Annotated[Float[Tensor, "b n"], DEVIATION] | None = None
+    focal: Annotated[Float[Tensor, "b 2 2"], FOCAL] | None = None
+    shared_focal: Bool[Tensor, " b"] | None = None
 
     def __post_init__(self) -> None:
         expect_fields(self)
@@ -151,6 +153,9 @@ class Estimate(Record):
     number of models with as much support that are expected among images that show nothing in common; -inf where `ok`
     is False, NaN where nobody has computed it; never None. model: what `F` is, "fundamental", or "homography" for
     `x1 ~ F x0`, which is positive where the plane is seen; then `H` is another name for it.
+    Of pairs whose cameras are known, or estimated with the models, NaN where they are not determined, None where nobody
+    asks: focals, the focal lengths of both images (B, 2), px; R (B, 3, 3) and t (B, 3) of unit length, X1 = R X0 + t of
+    points in the frames of the cameras, in front of which the inliers are; E = [t]_x R (B, 3, 3).
     """
 
     F: Float[Tensor, "b 3 3"]
@@ -160,6 +165,10 @@ class Estimate(Record):
     draws: Int[Tensor, " b"]
     significance: Float[Tensor, " b"] | None = None
     model: str = "fundamental"
+    E: Float[Tensor, "b 3 3"] | None = None
+    R: Float[Tensor, "b 3 3"] | None = None
+    t: Float[Tensor, "b 3"] | None = None
+    focals: Float[Tensor, "b 2"] | None = None
 
     def __post_init__(self) -> None:
         expect_fields(self)

@@ -16,8 +16,11 @@ from torch import Tensor
 from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.batches import as_array
 from fmtorch.core.checks import PER_MATCH, reason
+from fmtorch.core.rules import FOCAL, SIZE
 from fmtorch.core.threads import available, mapped
-from fmtorch.core.types import SIZE, Correspondences, Estimate
+from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.estimators.calibration import EXACT, calibration_of
+from fmtorch.estimators.families.cameras import focals_px
 from fmtorch.estimators.families.family import Estimated
 from fmtorch.estimators.gradients import Attach, Solved, with_gradients
 from fmtorch.estimators.pair import Pair, PixelMatches, bucket, normalize_pair
@@ -54,6 +57,7 @@ def estimated(
     rounding = relative_rounding(c)
     F, inliers, ok = np.zeros((b, 3, 3)), np.zeros((b, n), np.bool_), np.zeros(b, np.bool_)
     draws, significance, reasons = np.zeros(b, np.int64), np.full(b, -np.inf), [""] * b
+    focals = np.full((b, 2), np.nan)
     keep = torch.is_grad_enabled() and c.requires_grad
     solved: dict[int, Solved] = {}
 
@@ -76,6 +80,8 @@ def estimated(
         inliers[i, slot] = solution.inliers
         significance[i] = _significance(F[i], matches) if family.model == "fundamental" else np.nan
         ok[i] = True
+        if solution.fit.cameras is not None:
+            focals[i] = focals_px(solution.fit.cameras, pair)
         if keep:
             solved[i] = Solved(pair, slot, solution.fit)
         return ""
@@ -87,6 +93,8 @@ def estimated(
 
     mapped(estimate_all, [part.tolist() for part in shared_out(host)] if b > 1 and available() > 1 else [range(b)])
     fields = {"F": F, "inliers": inliers, "ok": ok, "draws": draws, "significance": significance}
+    if c.focal is not None or c.shared_focal is not None:
+        fields["focals"] = focals
     tensors = {name: torch.from_numpy(value).to(c.mask.device) for name, value in fields.items()}
     estimates = Estimate.made(reason=tuple(reasons), model=family.model, **tensors)
     return with_gradients(estimates, c, solved, attach) if keep else estimates
@@ -95,6 +103,15 @@ def estimated(
 def _significance(F: Array, matches: PixelMatches) -> float:
     """How far the support of a fundamental matrix (3, 3) is beyond chance."""
     return of_one_pair(F, matches.x0, matches.x1, matches.mask, matches.sizes[:2], matches.sizes[2:])
+
+
+def flattened_prior(c: Correspondences, power: float) -> Correspondences:
+    """The same with P^power in place of P for pairs both of whose focal lengths are exactly known."""
+    if c.focal is None or c.prior is None or power == 1:
+        return c
+    exact, positive = (c.focal.detach()[..., 1] < EXACT).all(1), c.prior > 0
+    flattened = torch.where(positive, torch.where(positive, c.prior, 1) ** power, c.prior)
+    return c.derived(prior=torch.where(exact[:, None], flattened, c.prior))
 
 
 def relative_rounding(c: Correspondences) -> float:
@@ -111,7 +128,10 @@ def shared_out(c: Correspondences) -> list[Tensor]:
 
 
 class Batch(NamedTuple):
-    """The tensors of a batch on the host as arrays, one row a pair; sizes: (b, 4), h, w, h, w, empty where unknown."""
+    """The tensors of a batch on the host as arrays, one row a pair; sizes: (b, 4), h, w, h, w, empty where unknown.
+
+    focal: (b, 2, 2); shared: (b,), whether both focal lengths are one.
+    """
 
     x0: Array
     x1: Array
@@ -121,6 +141,8 @@ class Batch(NamedTuple):
     quality: Array | None
     sizes: Array
     keys: list[int]
+    focal: Array | None
+    shared: Array
 
     @staticmethod
     def of(c: Correspondences) -> Batch:
@@ -130,7 +152,11 @@ class Batch(NamedTuple):
         sizes = np.empty((len(keys), 0 if c.size0 is None else 4))
         if c.size0 is not None and c.size1 is not None:
             sizes[:, :2], sizes[:, 2:] = _array(c.size0), _array(c.size1)
-        return Batch(_array(c.x0), _array(c.x1), c.mask.numpy(), prior, noise, quality, sizes, keys)
+        shared = np.zeros(len(keys), np.bool_) if c.shared_focal is None else c.shared_focal.numpy()
+        focal = None if c.focal is None else np.asarray(_array(c.focal), np.float64)
+        if focal is None and shared.any():
+            focal = np.full((len(keys), 2, 2), np.inf)
+        return Batch(_array(c.x0), _array(c.x1), c.mask.numpy(), prior, noise, quality, sizes, keys, focal, shared)
 
     def pair(self, i: int) -> PixelMatches:
         """One row, in float64."""
@@ -150,18 +176,25 @@ class Batch(NamedTuple):
         slot, table, (unit, right) = slots[:count], flat[: 9 * count].reshape(9, count), frame[4:].tolist()
         if count < minimal:
             return f"{count} matches; at least {minimal} are needed"
-        if not right:
-            return _wrong_values(matches, slot)
+        focal = None if self.focal is None else self.focal[i]
+        if not right or (focal is not None and not FOCAL.holds(focal).all()):
+            return _wrong_values(matches, slot, focal)
         if not unit:
             return "all matches coincide"
-        return Pair(table, known, bucket(count), unit, self.keys[i], seed, frame[:4], matches.sizes, residual), slot
+        calibration = None if focal is None else calibration_of(focal, bool(self.shared[i]))
+        pair = Pair(
+            table, known, bucket(count), unit, self.keys[i], seed, frame[:4], matches.sizes, residual, calibration
+        )
+        return pair, slot
 
 
-def _wrong_values(matches: PixelMatches, slot: Array) -> str:
+def _wrong_values(matches: PixelMatches, slot: Array, focal: Array | None) -> str:
     """Why a pair whose matches have such values cannot be estimated."""
     values = {"prior": matches.prior, "noise": matches.noise}
     right = {name: PER_MATCH[name].holds(v[slot]) for name, v in values.items() if len(v)}
     right |= {"size0": SIZE.holds(matches.sizes[:2]), "size1": SIZE.holds(matches.sizes[2:])}
+    if focal is not None:
+        right["focal"] = FOCAL.holds(focal)
     return reason({name: len(each) - int(np.count_nonzero(each)) for name, each in right.items()})
 
 

@@ -16,7 +16,7 @@ from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.kernel import Kernel
 from fmtorch.compiling.together import compile_together
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.estimators.batch import NOT_SOLVED, Solution, estimated
+from fmtorch.estimators.batch import NOT_SOLVED, Solution, estimated, flattened_prior
 from fmtorch.estimators.families.family import Refining
 from fmtorch.estimators.families.focals import FundamentalWithFocals
 from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
@@ -63,7 +63,7 @@ class HypothesizeAndVerify:
             Models of five matches and drawn focal lengths are searched first, in rounds, until all good candidates are
             one model or enough rounds confirm the best one, and the stopping rule is content. They suffice for a pair
             whose images have one size, if that rule is content; other pairs are searched without assumptions, too, and
-            both kinds compared. Needs `select`.
+            both kinds compared. Where a focal length is known, they suffice. Needs `select`.
         inliers: `threshold`, `lmeds` (2.5 robust standard deviations) or `median` (the better half).
         inlier_threshold: of the inliers reported and of the stopping rule, Sampson distance in pixels; None: the
             threshold.
@@ -150,6 +150,8 @@ class HypothesizeAndVerify:
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
         compile_together(self.kernels)
+        if self.focal is not None and self.focal.options.exact is not None:
+            c = flattened_prior(c, self.focal.options.exact.prior_power)
         return estimated(c, seed, self.family.size, self.family, self.estimate, Attached(self.final, self.family))
 
     def estimate(self, pair: Pair) -> Solution:
@@ -209,4 +211,5 @@ def _focal_search(
     family, own = FundamentalWithFocals(), None
     if options.samples:
         own = Search(family, search.sampler, search.preselection, options.pool, options.samples, FOCAL_ROUND)
-    return FocalSearch(options, family, select.score, refinement, own, search.stop)
+    exact = select.score if options.exact is None else part("score", choice.score, threshold=options.exact.scale)
+    return FocalSearch(options, family, select.score, exact, refinement, own, search.stop)

@@ -72,19 +72,22 @@ class SearchResult(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class FocalSearch:
-    """The prior on focal lengths in a search. gain: by which candidates are compared. search: of one round; None: the
-    prior only selects. stop: the stopping rule for these samples; None: all rounds are made, and never suffice."""
+    """The prior on focal lengths in a search. gain: by which candidates are compared; exact_gain: where both focal
+    lengths are exactly known. search: of one round; None: the prior only selects. stop: the stopping rule for these
+    samples; None: all rounds are made, and never suffice."""
 
     options: Focal
     family: FundamentalWithFocals
     gain: Score
+    exact_gain: Score
     refinement: Refinement
     search: Search | None
     stop: Stop | None
 
     def __call__(self, pair: Pair) -> SearchResult:
         """Rounds until good candidates are one model, or enough rounds have confirmed the best one, and the stopping
-        rule is content. The pair is settled if that rule is content and its images have one size."""
+        rule is content. The pair is settled if that rule is content and its images have one size, or if anything is
+        known of its cameras."""
         options, confirmations, stop = self.options, 0, False
         candidates: PlausibleCandidates | None = None
         draws = 0
@@ -101,7 +104,7 @@ class FocalSearch:
             if turn + 1 >= options.min_rounds and agreed and stop:
                 break
         assert candidates is not None
-        return SearchResult(candidates, pair.same_size and stop, draws)
+        return SearchResult(candidates, pair.calibration is not None or (pair.same_size and stop), draws)
 
     def round(self, pair: Pair, turn: int) -> tuple[PlausibleCandidates, int]:
         """The candidates of a round, and the samples drawn until then."""
@@ -112,8 +115,9 @@ class FocalSearch:
     def refined(self, F: Array, valid: Array, pair: Pair, near: Pair) -> PlausibleCandidates:
         """Candidates near models (k, 9), refined on some matches and judged on all."""
         cameras, refined = self.family.refine(F, near, self.options.iterations)
-        posterior = np.empty(len(F))
-        posteriors(scores_of(self.gain, refined.models, pair), refined.share, refined.cost, valid, posterior)
+        posterior, exact = np.empty(len(F)), pair.calibration is not None and pair.calibration.exact
+        gain = self.exact_gain if exact else self.gain
+        posteriors(scores_of(gain, refined.models, pair), refined.share, refined.cost, valid, posterior)
         return PlausibleCandidates(refined.models, posterior, cameras)
 
     def select(self, free: Candidates, pair: Pair, plausible: PlausibleCandidates | None) -> Selection:

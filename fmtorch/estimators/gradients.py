@@ -65,8 +65,9 @@ class GraphedMatches(NamedTuple):
 class Attach(Protocol):
     """Gives fits their gradients."""
 
-    def __call__(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
-        """A zero with the gradients of the fits, models of normalised points."""
+    def __call__(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p m"]:
+        """A zero with the gradients of the fits, models (9) of normalised points; perhaps of the logarithms of two
+        focal lengths, too."""
         ...
 
 
@@ -82,7 +83,7 @@ class Attached:
             kind = "optimum"  # of the Sampson error, near that of least squares
         self._attach = own or kinds[kind]
 
-    def __call__(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
+    def __call__(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p m"]:
         """As `Attach`."""
         return self._attach(solved, matches)
 
@@ -94,7 +95,7 @@ class Attached:
         fitted = torch.where(valid[:, None, None], fitted, 0).flatten(1)
         return fitted - fitted.detach()
 
-    def _optimum(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p 9"]:
+    def _optimum(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p m"]:
         """By the implicit function theorem: the optimum moves with the gradient of its cost."""
         device = matches.mask.device
         at = torch.from_numpy(np.stack([s.fit.at for s in solved])).to(device)
@@ -123,12 +124,12 @@ def _homographies_at_optimum(
 
 
 def _response(solved: Solved) -> Array:
-    """How the fit of a pair moves with the gradient of its cost, (9, 9)."""
+    """How the fit of a pair, and the logarithms of its focal lengths, move with the gradient of its cost, (11, 9)."""
     pair, fit = solved.pair, solved.fit
     weight = fit.counted * pair.weight
     if fit.cameras is not None:
         return camera_response(fit.cameras, pair, weight, fit.precision)
-    return response_of(fit.at, pair, weight)
+    return np.concatenate([response_of(fit.at, pair, weight), np.zeros((2, 9))])
 
 
 def with_gradients(estimate: Estimate, c: Correspondences, solved: dict[int, Solved], attach: Attach) -> Estimate:
@@ -142,12 +143,15 @@ def with_gradients(estimate: Estimate, c: Correspondences, solved: dict[int, Sol
     centre = torch.from_numpy(np.stack([pair.centre for pair in pairs])).to(zero)
     unit = torch.tensor([pair.pixels_per_unit for pair in pairs]).to(zero)
     frame = PixelFrame(centre, unit, torch.ones_like(rows, dtype=torch.bool))
-    models = (F + zero).reshape(-1, 1, 3, 3)
+    models = (F + zero[:, :9]).reshape(-1, 1, 3, 3)
     if estimate.model == "homography":
         G = unit_frobenius(frame.homography_to_pixels(models)[:, 0])
     else:
         G = canonical(frame.to_pixels(models)[:, 0])
-    return estimate.derived(F=estimate.F.index_add(0, rows, G - G.detach()))
+    attached = {"F": estimate.F.index_add(0, rows, G - G.detach())}
+    if estimate.focals is not None and zero.shape[1] > 9:
+        attached["focals"] = estimate.focals.index_add(0, rows, estimate.focals.detach()[rows] * zero[:, 9:])
+    return estimate.derived(**attached)
 
 
 def graphed_matches(c: Correspondences, solved: dict[int, Solved]) -> GraphedMatches:
@@ -176,7 +180,8 @@ def graphed_matches(c: Correspondences, solved: dict[int, Solved]) -> GraphedMat
 
 
 def camera_response(cameras: Cameras, pair: Pair, weight: Array, precision: float) -> Array:
-    """How the optimum of the posterior moves with the gradient of its cost by the nine entries, (9, 9).
+    """How the optimum of the posterior moves with the gradient of its cost by the nine entries, (11, 9): its model and
+    the logarithms of its focal lengths.
 
     weight: (n,), of the matches that count. precision: one over the variance of an inlier's distance.
     """
@@ -184,14 +189,16 @@ def camera_response(cameras: Cameras, pair: Pair, weight: Array, precision: floa
     matches = Weighted(centred(pair).points, weight, np.full(pair.count, np.inf), LOSSES["truncated"], NO_TABLE)
     minimise(cameras.copy(), matches, images, Limits(precision, 0, 0.0), optimum)
     tangents_of(cameras, images.longest, optimum.F, tangents)
-    moves, hessian = np.empty((7, 9)), optimum.hessian[0]
+    moves, hessian, by_focal = np.empty((7, 9)), optimum.hessian[0], np.eye(7, 2, -5)
     translate(np.ascontiguousarray(tangents[0, :, :7].T), images.offset, moves)
+    if images.prior.shared:  # one parameter for both
+        moves[5], moves[6], by_focal[5], by_focal[6] = moves[5] + moves[6], 0, 1, 0
     try:
         steps = np.linalg.solve(hessian + STEP_DAMPING * np.diag(np.diag(hessian)), moves)
     except np.linalg.LinAlgError:
-        return np.zeros((9, 9))
-    response: Array = -precision * moves.T @ steps
-    return response if np.isfinite(response).all() else np.zeros((9, 9))
+        return np.zeros((11, 9))
+    response: Array = -precision * np.concatenate([moves, by_focal], 1).T @ steps
+    return response if np.isfinite(response).all() else np.zeros((11, 9))
 
 
 def _nothing(c: Correspondences) -> Tensor:

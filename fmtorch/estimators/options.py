@@ -77,6 +77,20 @@ class Select:
 
 
 @dataclasses.dataclass(frozen=True)
+class ExactFocals:
+    """What is different where both focal lengths are exactly known: fewer models fit by accident.
+
+    scale: of the selecting score, Sampson distance, px. prior_power: P(inlier) to this power stands for it throughout.
+    """
+
+    scale: float
+    prior_power: float = 1.0
+
+    def __post_init__(self) -> None:
+        _positive(**{"focal.exact.scale": self.scale, "focal.exact.prior_power": self.prior_power})
+
+
+@dataclasses.dataclass(frozen=True)
 class Focal:
     """The prior on focal lengths, for whole photographs of known size.
 
@@ -84,7 +98,8 @@ class Focal:
     min_rounds: of so many samples, at most and at least; in between a pair goes on while its good candidates differ or
     the stopping rule asks for more. confirmations: rounds that find the best candidate of those before them again,
     after which it does not matter that others differ. pool: the best models of a round, which are refined with the
-    prior. candidates: models of the other search that are, too. iterations: steps of that refinement.
+    prior. candidates: models of the other search that are, too. iterations: steps of that refinement. exact:
+    `ExactFocals`; None: nothing is different.
     """
 
     samples: int = 250
@@ -94,8 +109,10 @@ class Focal:
     pool: int = 12
     candidates: int = 12
     iterations: int = 12
+    exact: ExactFocals | None = None
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "exact", group("focal.exact", self.exact, ExactFocals))
         if self.min_rounds > self.rounds:
             raise ValueError(f"focal.min_rounds is {self.min_rounds}; it must be at most focal.rounds, {self.rounds}")
         _at_least(0, **{"focal.samples": self.samples, "focal.iterations": self.iterations})

@@ -13,6 +13,7 @@ from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.random_kernels import stream_state, uniform
 from fmtorch.compiling.scratch import matrix
 from fmtorch.core.streams import Stream, mixed_seed
+from fmtorch.estimators.calibration import Calibration
 from fmtorch.geometry.residual_kernels import SAMPSON, Residual
 
 T = TypeVar("T")
@@ -31,17 +32,20 @@ class Pair:
     the caller has none; noise is between MIN_NOISE and MAX_NOISE. bucket: of the number of matches of the whole
     pair, which decides how priors are quantised and whether models are preselected. pixels_per_unit: a power of
     two. centre: (4,), of the points, pixels. sizes: (4,), of the images as h, w, h, w, pixels; empty where unknown.
-    key, seed: of every random choice. residual: of the family of models, by which matches are judged. images: what
-    families compute of the images, for all subsets of the matches.
+    key, seed: of every random choice. residual: of the family of models, by which matches are judged. calibration:
+    what is known of the focal lengths, of a pair whose sizes are known. images: what families compute of the images,
+    for all subsets of the matches.
     """
 
     def __init__(
         self, table: Array, known: tuple[bool, bool, bool], bucket: int, pixels_per_unit: float, key: int, seed: int,
-        centre: Array, sizes: Array, residual: Residual = SAMPSON, images: dict[Hashable, Any] | None = None,
+        centre: Array, sizes: Array, residual: Residual = SAMPSON, calibration: Calibration | None = None,
+        images: dict[Hashable, Any] | None = None,
     ) -> None:  # fmt: skip
         """known: whether the caller has given a prior, noise, quality."""
         self.table, self.known, self.bucket, self.pixels_per_unit = table, known, bucket, pixels_per_unit
         self.key, self.seed, self.centre, self.sizes, self.residual = key, seed, centre, sizes, residual
+        self.calibration = calibration
         self.count = table.shape[1]
         self.points, self.weight = table[:4], table[4]
         self.pixels_per_noise, self.match_weight = table[5], table[6]
@@ -97,7 +101,7 @@ class Pair:
         """The same pair with the matches of these indices."""
         return Pair(
             self.table.take(index, 1), self.known, self.bucket, self.pixels_per_unit, self.key, self.seed, self.centre,
-            self.sizes, self.residual, self.images,
+            self.sizes, self.residual, self.calibration, self.images,
         )  # fmt: skip
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from fmtorch.compiling.kernel import Kernel
 from fmtorch.estimators import focal_search, pair, search
-from fmtorch.estimators.families import cameras, cheirality, focals, posterior
+from fmtorch.estimators.families import cameras, cheirality, focal_prior, focals, posterior
 from fmtorch.estimators.parts import (
     inliers,
     preselection,
@@ -31,7 +31,7 @@ WITH_FOCALS: tuple[Kernel[..., Any], ...] = (
     significance_kernels.counted_chances,
     refinement.near,
     sampling.draw,
-    focals.draw_depths,
+    focal_prior.draw_depths,
     preselection.draw_by_prior,
     preselection.best,
     scores.score_gains,

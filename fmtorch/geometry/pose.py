@@ -31,6 +31,7 @@ def pose_from_fundamental(
     x0: Float[Tensor, "*batch n 2"],
     x1: Float[Tensor, "*batch n 2"],
     mask: Bool[Tensor, "*batch n"] | None = None,
+    weight: Float[Tensor, "*batch n"] | None = None,
 ) -> Pose:
     """Rotation and direction of translation from E = K1^T F K0, of the four decompositions the one with most points
     of positive depth in both cameras.
@@ -47,6 +48,7 @@ def pose_from_fundamental(
         x0: points in image 0, (..., N, 2), px.
         x1: their matches in image 1, (..., N, 2), px.
         mask: (..., N), True for the matches that decide; all by default.
+        weight: (..., N), in [0, 1], by which matches count in that decision; all alike by default.
 
     Returns:
         A `Pose`.
@@ -65,8 +67,9 @@ def pose_from_fundamental(
     keep = mask & (x0.isfinite() & x1.isfinite()).all(-1)
     with torch.no_grad():
         ray0, ray1 = (_rays(K, torch.where(keep[..., None], x, 0.0)) for K, x in ((inverse0, x0), (inverse1, x1)))
-        count = (_in_front(R, t, ray0, ray1) & keep).sum(-1)  # (4, *batch)
-        best = count.argmax(0)
+        front = _in_front(R, t, ray0, ray1) & keep
+        count = front.sum(-1)  # (4, *batch)
+        best = (count if weight is None else _support(front, weight)).argmax(0)
     n_in_front = torch.gather(count, 0, best[None])[0]
     valid = finite & regular0 & regular1 & two & (n_in_front > 0)
     R = torch.gather(R, 2, best[None, None, None].expand(3, 3, 1, *best.shape))[:, :, 0].movedim((0, 1), (-2, -1))
@@ -108,6 +111,12 @@ def _in_front(R: Tensor, t: Tensor, ray0: Tensor, ray1: Tensor) -> Tensor:
     depth0 = component_sum(normal * cross(ray1, shift))
     depth1 = component_sum(normal * cross(rotated, shift))
     return (depth0 > 0) & (depth1 > 0)
+
+
+def _support(front: Tensor, weight: Tensor) -> Tensor:
+    """The sum of the weights of points in front, (4, *batch), as whole numbers: the same in any order."""
+    whole = (torch.where(front.any(0), weight.detach(), 0.0).clamp(0, 1).double() * 2.0**20).round().to(torch.int64)
+    return torch.where(front, whole, 0).sum(-1)
 
 
 def _rays(inverse: Tensor, x: Tensor) -> Tensor:

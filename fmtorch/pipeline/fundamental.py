@@ -2,23 +2,13 @@
 
 from __future__ import annotations
 
-import functools
-import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from fmtorch import presets
-from fmtorch.compiling import switch
-from fmtorch.compiling.together import compile_together
-from fmtorch.core.arguments import Arrays, correspondences, number
-from fmtorch.core.checks import expect_values
-from fmtorch.core.stages import Estimator, Pruner, model_of
-from fmtorch.core.threads import one_thread
-from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.geometry.verdict import judged
+from fmtorch.core.arguments import Arrays, correspondences
+from fmtorch.core.types import Estimate
+from fmtorch.pipeline.camera_arguments import Focal, camera_fields, expect_calibrations
+from fmtorch.pipeline.estimation import estimated
 
 
 def find_fundamental(
@@ -34,6 +24,9 @@ def find_fundamental(
     noise: Arrays | None = None,
     size0: Arrays | None = None,
     size1: Arrays | None = None,
+    K0: Arrays | None = None,
+    K1: Arrays | None = None,
+    focal: Focal = None,
     key: Arrays | int | None = None,
     seed: int = 0,
     config_dir: Path | str | None = None,
@@ -54,6 +47,22 @@ def find_fundamental(
         noise: (B, N), each match's standard deviation relative to a usual one's (`fmtorch.pruning.MatchNoise` derives
             it from frames).
         size0, size1: image sizes (h, w), one for all pairs or (B, 2).
+        K0, K1: calibration matrices, px, (3, 3) for all pairs or (B, 3, 3), of both images or of one. Gradients reach
+            them.
+        focal: what else is known of the focal lengths, for square pixels and a central principal point where there is
+            no K, and with `size0` and `size1` there:
+
+            ================================  ======================================================================
+            None                              K0 and K1 are exact; without them usual focal lengths are likely
+            "unknown"                         the same estimate, with its cameras and pose
+            "shared"                          one unknown focal length for both images (in units of the longer side)
+            (f, s)                            f px for both images, up to a relative standard deviation s
+            ((f0, s0), (f1, s1))              the same for each image, None in place of what is unknown; (B, 2, 2)
+            s, (s0, s1) or (B, 2), with K     how well the focal lengths of K0 and K1 are known
+            ================================  ======================================================================
+
+            A deviation of 0 is exact and an infinite one nothing; 0.05 suits EXIF. From 0.02 on measurements may be
+            wrong altogether.
         key: (B,) int64, selects each pair's random numbers.
         seed: of the random numbers.
         config_dir: a folder with presets of your own, ``<config_dir>/estimator/<name>.yaml``, which come first.
@@ -62,11 +71,13 @@ def find_fundamental(
     Returns:
         An `Estimate` of B pairs (of one pair for (N, 2) points, of none for an empty list), with F of unit Frobenius
         norm, inliers, ok, reason, significance. A pair that cannot be solved is ``ok=False``, never an exception. An F
-        that is ok may be of images that show nothing in common: `related` tells.
+        that is ok may be of images that show nothing in common: `related` tells. With K0, K1 or `focal` also focals,
+        E, R and t, NaN where they are not determined.
 
     Raises:
         ValueError: for points of another shape, a prior outside [0, 1], a noise or an image size that is not positive,
-            the size of one image only, an unknown preset or an unknown option, and an estimator of another model.
+            the size of one image only, an unknown preset or an unknown option, and an estimator of another model; for a
+            K that is no calibration matrix of the image, of a single pair (of a batch that pair is ``ok=False``).
         TypeError: for what is no array of numbers.
 
     Example:
@@ -81,9 +92,10 @@ def find_fundamental(
     """
     c = correspondences(
         x0, x1, mask=mask, quality=quality, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, size0=size0,
-        size1=size1, key=key,
+        size1=size1, key=key, **camera_fields(K0, K1, focal, size0 is not None),
     )  # fmt: skip
-    return _estimated(c, "fundamental", estimator, config_dir, seed, options)
+    expect_calibrations(c)
+    return estimated(c, "fundamental", estimator, config_dir, seed, options)
 
 
 def find_homography(
@@ -128,58 +140,4 @@ def find_homography(
         (True, 40, (1, 3, 3))
     """
     c = correspondences(x0, x1, mask=mask, quality=quality, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, key=key)
-    return _estimated(c, "homography", estimator, config_dir, seed, options)
-
-
-def _estimated(
-    c: Correspondences, model: str, name: str, config_dir: Path | str | None, seed: int, options: Mapping[str, Any]
-) -> Estimate:
-    """The estimate of matches by a preset, with a prior of their consistency where it uses one and none is given."""
-    expect_values(c)
-    seed = int(number("seed", seed, whole=True))
-    estimator = _estimator(name, config_dir, options)
-    if (gives := model_of(estimator)) != model:
-        raise ValueError(f"estimator={name} gives {gives} matrices; find_{model} needs one that gives {model} matrices")
-    if c.prior is None and getattr(estimator, "uses_prior", False):
-        framed = c.lafs0 is not None and c.lafs1 is not None and c.quality is not None
-        pruner = _consistency("frame_consistency" if framed else "position_consistency")
-        if switch.available():
-            compile_together([*getattr(pruner, "kernels", ()), *getattr(estimator, "kernels", ())])
-        with one_thread(c.mask.device):
-            c = pruner(c)
-    return judged(estimator(c, seed), c)
-
-
-def _estimator(name: str, config_dir: Path | str | None, options: Mapping[str, Any]) -> Estimator:
-    """The estimator of a preset, built but once where its options are plain values and its file is not a user's."""
-    plain = _plain(options)
-    if config_dir is None:
-        try:
-            return _built(name, json.dumps(plain, sort_keys=True))
-        except TypeError:  # an option is an object of some kind
-            pass
-    built: Estimator = presets.build("estimator", name, config_dir, **plain)
-    return built
-
-
-@functools.lru_cache(maxsize=64)
-def _built(name: str, options: str) -> Estimator:
-    built: Estimator = presets.build("estimator", name, **json.loads(options))
-    return built
-
-
-def _plain(value: Any) -> Any:
-    """The value with numbers of NumPy as Python's, at any depth."""
-    if isinstance(value, np.generic | np.ndarray):
-        return value.tolist()
-    if isinstance(value, Mapping):
-        return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    return value
-
-
-@functools.lru_cache(maxsize=2)
-def _consistency(name: str) -> Pruner:
-    built: Pruner = presets.build("pruner", name)
-    return built
+    return estimated(c, "homography", estimator, config_dir, seed, options)

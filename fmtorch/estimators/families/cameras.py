@@ -14,7 +14,8 @@ import numpy as np
 from fmtorch.compiling.arrays import Array, F8x1, F8x2, F8x4
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.scratch import vector
-from fmtorch.estimators.families.focal_prior import LOG_USUAL
+from fmtorch.estimators.calibration import EXACT
+from fmtorch.estimators.families.focal_prior import LOG_USUAL, FocalPrior, focal_prior
 from fmtorch.estimators.pair import Pair
 from fmtorch.geometry.arithmetic_kernels import exponential, logarithm
 from fmtorch.geometry.rank2_kernels import complement
@@ -50,11 +51,11 @@ def no_cameras(k: int) -> Cameras:
 
 class Images(NamedTuple):
     """Two images in normalised units. offset: (4,), from the points to those from the principal points. longest: (2,),
-    the longer sides."""
+    the longer sides. prior: on the focal lengths."""
 
     offset: F8x1
     longest: F8x1
-    same_size: bool
+    prior: FocalPrior
 
 
 def images_of(pair: Pair) -> Images:
@@ -71,7 +72,17 @@ def _images(pair: Pair) -> Images:
     # Half a pixel, of images in pixels; of sizes in another unit nobody knows what it is, and it is small.
     pixel = 0.0 if max(sides) < MIN_IMAGE_SIDE_PX else 1.0
     offset = np.array([(x - (side - pixel) / 2) / unit for x, side in zip(pair.centre.tolist(), sides, strict=True)])
-    return Images(offset, np.array([max(h0, w0) / unit, max(h1, w1) / unit]), pair.same_size)
+    prior = focal_prior(pair.same_size)
+    if (known := pair.calibration) is not None:
+        measured = known.logarithms((max(h0, w0), max(h1, w1)))
+        prior = focal_prior(pair.same_size, known.shared, measured, known.deviations)
+    return Images(offset, np.array([max(h0, w0) / unit, max(h1, w1) / unit]), prior)
+
+
+def focals_px(cameras: Cameras, pair: Pair) -> Array:
+    """The focal lengths (2,) of the first candidate, px."""
+    focals: Array = np.exp(cameras.focal[0]) * images_of(pair).longest * pair.pixels_per_unit
+    return focals
 
 
 class CentredMatches(NamedTuple):
@@ -121,17 +132,30 @@ def centre(table: F8x2, offset: F8x1, scale_px: float, out: F8x2) -> None:
 
 @kernel(holds_gil=True)
 def nearest_cameras(F: F8x2, images: Images, cameras: Cameras) -> None:
-    """Cameras near models (k, 9): those of their focal lengths, or of usual ones where these are implausible."""
+    """Cameras near models (k, 9): those of their focal lengths, or of usual or measured ones where these are
+    implausible; of exactly measured ones."""
     axes, focal, longest, shifted = cameras.axes, cameras.focal, images.longest, np.empty(F.shape)
+    prior = images.prior
+    measured = prior.precision[0] > 0 or prior.precision[1] > 0
     translate(F, -images.offset, shifted)
     G, M, e0, e1 = vector(9), vector(9), vector(3), vector(3)
     for k in range(len(shifted)):
         start_one(shifted[k], SQUARINGS, G, e0, e1)
         first = _squared_focal(G, 1, 3, e1) / (longest[0] * longest[0])
         second = _squared_focal(G, 3, 1, e0) / (longest[1] * longest[1])
-        plausible = MIN_FOCAL**2 < first < MAX_FOCAL**2 and MIN_FOCAL**2 < second < MAX_FOCAL**2
-        focal[k, 0] = logarithm(first) / 2 if plausible else LOG_USUAL
-        focal[k, 1] = logarithm(second) / 2 if plausible else LOG_USUAL
+        plausible0, plausible1 = MIN_FOCAL**2 < first < MAX_FOCAL**2, MIN_FOCAL**2 < second < MAX_FOCAL**2
+        if not measured:  # one implausible focal length speaks against the other
+            plausible0 = plausible0 and plausible1
+            plausible1 = plausible0
+        focal[k, 0] = logarithm(first) / 2 if plausible0 else LOG_USUAL
+        focal[k, 1] = logarithm(second) / 2 if plausible1 else LOG_USUAL
+        for i in range(2):
+            plausible = plausible0 if i == 0 else plausible1
+            if prior.precision[i] > 1 / EXACT**2 or (prior.precision[i] > 0 and not plausible):
+                focal[k, i] = prior.measured[i]
+        if prior.shared:
+            focal[k, 0] = (focal[k, 0] + focal[k, 1]) / 2
+            focal[k, 1] = focal[k, 0]
         d0 = 1 / (exponential(focal[k, 0]) * longest[0])
         d1 = 1 / (exponential(focal[k, 1]) * longest[1])
         for r in range(3):

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import functools
 import math
-from statistics import NormalDist
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -12,7 +10,6 @@ import numpy as np
 from fmtorch.compiling.arrays import Array, F8x1, F8x2
 from fmtorch.compiling.kernel import kernel
 from fmtorch.compiling.lanes import LANES
-from fmtorch.compiling.random_kernels import random_bits, stream_state
 from fmtorch.compiling.scratch import matrix, vector
 from fmtorch.core.streams import Stream
 from fmtorch.estimators.families.cameras import (
@@ -27,22 +24,14 @@ from fmtorch.estimators.families.cameras import (
 )
 from fmtorch.estimators.families.cheirality import cheirality
 from fmtorch.estimators.families.family import Hypotheses
-from fmtorch.estimators.families.focal_prior import (
-    FOCAL_DEVIATION,
-    LOG_USUAL,
-    RATIO_DEVIATION,
-    SAME_CAMERA_SHARE,
-    focal_cost,
-)
+from fmtorch.estimators.families.focal_prior import FocalPrior, draw_depths, focal_cost
 from fmtorch.estimators.families.posterior import Limits, Optimum, damped_step, minimise, no_optimum
 from fmtorch.estimators.pair import Pair, squared
-from fmtorch.geometry.arithmetic_kernels import exponential
 from fmtorch.geometry.five_point_kernels import five_point
 from fmtorch.geometry.rank2_kernels import unit
 from fmtorch.geometry.sampson_objective_kernels import LOSSES, NO_TABLE, Weighted
 
 SOLUTIONS = 10  # of five matches, at most
-QUANTILES = 1 << 10  # of the normal distribution, from which focal lengths are drawn
 INLIER_SIGMA_PX = 0.3  # standard deviation of an inlier's Sampson distance
 LOSS_SCALE_PX = 0.7  # Sampson distance at which an inlier's cost is half of what a squared one would be
 PARALLEL_PX = 4.0  # in image 1: rays that differ less do not tell on which side of the cameras they meet
@@ -76,7 +65,7 @@ class FundamentalWithFocals:
         count, images = sample.shape[1], images_of(pair)
         depth, F = np.empty((2, count)), np.empty((SOLUTIONS * count, 9), np.float32)
         draw = np.empty(len(F), np.int64)
-        draw_depths(normal_quantiles(), images, pair.mixed_seed(Stream.FOCAL), pair.key, start, depth)
+        draw_depths(images.prior, images.longest, pair.mixed_seed(Stream.FOCAL), pair.key, start, depth)
         models = five_point(centred(pair).points, sample, depth, images.offset, F, draw)
         return Hypotheses(F[:models], draw[:models], sample, start)
 
@@ -97,20 +86,13 @@ class FundamentalWithFocals:
         cameras, images, out, F, gain = start.copy(), images_of(pair), no_optimum(1), np.empty((1, 9)), np.empty(1)
         minimise(cameras, _truncated(pair, truncation), images, limits, out)
         translate(out.F, images.offset, F)
-        gain_without_prior(out.hessian[0], out.gradient[0], cameras.focal[0], images.same_size, gain)
+        gain_without_prior(out.hessian[0], out.gradient[0], cameras.focal[0], images.prior, gain)
         return FocalFit(F[0], cameras, float(gain[0]))
 
 
 def _truncated(pair: Pair, truncation: float) -> Weighted:
     matches = centred(pair, truncation)
     return Weighted(matches.points, pair.weight, matches.s2, TRUNCATED, NO_TABLE)
-
-
-@functools.cache
-def normal_quantiles() -> Array:
-    """QUANTILES quantiles of the normal distribution, rounded so that the last bits of a library's log do not count."""
-    normal = NormalDist()
-    return np.rint([normal.inv_cdf((i + 0.5) / QUANTILES) * 2.0**40 for i in range(QUANTILES)]) / 2.0**40
 
 
 class Subset(NamedTuple):
@@ -134,10 +116,10 @@ def refine_with_prior(F: F8x2, subset: Subset, limits: Limits, cameras: Cameras,
     nearest_cameras(F, images, cameras)
     minimise(cameras, Weighted(points, table[4], s2, GEMAN_MCCLURE, matrix(2, 0)), images, limits, optimum)
     translate(optimum.F, images.offset, out.models)
-    work = vector(4)
+    work = vector(5)
     for i in range(k):
         unit(out.models[i])
-        out.cost[i] = focal_cost(cameras.focal[i], images.same_size, work)
+        out.cost[i] = focal_cost(cameras.focal[i], images.prior, work)
         finite = math.isfinite(optimum.cost[i])
         for q in range(9):
             finite = finite and math.isfinite(out.models[i, q])
@@ -148,32 +130,17 @@ def refine_with_prior(F: F8x2, subset: Subset, limits: Limits, cameras: Cameras,
 
 
 @kernel(holds_gil=True)
-def draw_depths(normal: F8x1, images: Images, mixed_seed: int, key: int, start: int, out: F8x2) -> None:
-    """Focal lengths of both images for the draws start, start + 1, ..., in the unit of the points -> out (2, count).
-
-    normal: (2^k,), quantiles of the normal distribution. mixed_seed: of the seed and the stream.
-    """
-    state, mask = stream_state(mixed_seed, key), np.uint64(len(normal) - 1)
-    for d in range(out.shape[1]):
-        first = (start + d) * 3
-        mean = LOG_USUAL + FOCAL_DEVIATION * normal[random_bits(state, first) & mask]
-        half = RATIO_DEVIATION / 2 * normal[random_bits(state, first + 1) & mask]
-        if images.same_size and np.int64(random_bits(state, first + 2) & mask) < SAME_CAMERA_SHARE * len(normal):
-            half = 0.0
-        out[0, d] = exponential(mean + half) * images.longest[0]
-        out[1, d] = exponential(mean - half) * images.longest[1]
-
-
-@kernel(holds_gil=True)
-def gain_without_prior(hessian: F8x2, gradient: F8x1, focal: F8x1, same_size: bool, out: F8x1) -> None:
+def gain_without_prior(hessian: F8x2, gradient: F8x1, focal: F8x1, prior: FocalPrior, out: F8x1) -> None:
     """What the logarithm of the likelihood would rise by at an optimum without prior -> out (1,)."""
-    Q, H, g, prior, total = matrix(7, LANES), matrix(7, 7), vector(7), vector(4), 0.0
-    focal_cost(focal, same_size, prior)
+    Q, H, g, work, total = matrix(7, LANES), matrix(7, 7), vector(7), vector(5), 0.0
+    focal_cost(focal, prior, work)
     for i in range(7):
-        g[i] = gradient[i] - (prior[i - 5] if i >= 5 else 0.0)
+        g[i] = gradient[i] - (work[i - 5] if i >= 5 else 0.0)
         for j in range(7):
-            own = prior[2] if i == j else prior[3]
-            H[i, j] = hessian[i, j] - (own if i >= 5 and j >= 5 else 0.0)
+            own = 0.0
+            if i >= 5 and j >= 5:
+                own = work[i - 3] if i == j else work[4]
+            H[i, j] = hessian[i, j] - own
     damped_step(H, g, STEP_DAMPING, Q)
     for i in range(7):
         total += g[i] * Q[i, 7]

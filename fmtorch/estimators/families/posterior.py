@@ -46,7 +46,10 @@ class Optimum(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Of k candidates, cameras, models (k, 9), costs (k,), and their derivatives (k, 7), (k, 7, 7)."""
+    """Of k candidates, cameras, models (k, 9), costs (k,), and their derivatives (k, 7), (k, 7, 7).
+
+    shared: whether the two focal lengths are one; the sixth parameter is then its logarithm and the seventh has none.
+    """
 
     axes: Array
     focal: Array
@@ -54,6 +57,7 @@ class _State(NamedTuple):
     cost: Array
     gradient: Array
     hessian: Array
+    shared: bool
 
 
 class _Data(NamedTuple):
@@ -74,9 +78,10 @@ def no_optimum(k: int) -> Optimum:
 @kernel
 def minimise(cameras: Cameras, matches: Weighted, images: Images, limits: Limits, out: Optimum) -> None:
     """Cameras of least negative logarithm of the posterior near these, in place; what it is there -> out."""
-    k = len(out.cost)
-    state = _State(cameras.axes, cameras.focal, out.F, out.cost, out.gradient, out.hessian)
-    trial = _State(np.empty((k, 2, 3, 3)), matrix(k, 2), matrix(k, 9), vector(k), matrix(k, 7), np.empty((k, 7, 7)))
+    k, shared = len(out.cost), images.prior.shared
+    state = _State(cameras.axes, cameras.focal, out.F, out.cost, out.gradient, out.hessian, shared)
+    axes, hessian = np.empty((k, 2, 3, 3)), np.empty((k, 7, 7))
+    trial = _State(axes, matrix(k, 2), matrix(k, 9), vector(k), matrix(k, 7), hessian, shared)
     data = _Data(matches, images, limits, np.zeros((k, 9, LANES)), np.empty((k, 10, 10)))
     _minimise(data, state, trial, np.full(k, FIRST_DAMPING), limits.iterations, limits.tolerance >= 0)
 
@@ -90,10 +95,12 @@ def tangents_of(cameras: Cameras, longest: F8x1, F: F8x2, out: F8x3) -> None:
 @inner
 def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
     _models(state.axes, state.focal, data.images.longest, state.F, data.tangents)
+    if state.shared:
+        _tie(data.tangents)
     evaluate(state.F, data.matches, derivatives, data.products, state.cost)
-    work = vector(4)
+    work = vector(5)
     for k in range(len(state.cost)):
-        prior = focal_cost(state.focal[k], data.images.same_size, work)
+        prior = focal_cost(state.focal[k], data.images.prior, work)
         state.cost[k] = state.cost[k] * data.limits.precision / 2 + prior
         if derivatives:
             _derivatives(
@@ -118,10 +125,19 @@ def _models(axes: Array, focal: Array, longest: Array, F: Array, tangents: Array
 
 
 @inner
+def _tie(tangents: Array) -> None:
+    """One logarithm for both images: derivatives (k, 9, LANES) by the first are those by it, by the second zero."""
+    for k in range(len(tangents)):
+        for q in range(9):
+            tangents[k, q, 5] += tangents[k, q, 6]
+            tangents[k, q, 6] = 0.0
+
+
+@inner
 def _derivatives(
     products: Array, tangents: Array, prior: Array, precision: float, gradient: Array, hessian: Array
 ) -> None:  # fmt: skip
-    """Of one candidate. products: (10, 10), of `evaluate`; tangents: (9, LANES); prior: (4,), of `focal_cost`."""
+    """Of one candidate. products: (10, 10), of `evaluate`; tangents: (9, LANES); prior: (5,), of `focal_cost`."""
     along, column = matrix(10, LANES), matrix(1, LANES)
     for j in range(10):
         total = fill(0.0)
@@ -140,7 +156,7 @@ def _derivatives(
     for i in range(2):
         gradient[5 + i] += prior[i]
         for j in range(2):
-            hessian[5 + i, 5 + j] += prior[2] if i == j else prior[3]
+            hessian[5 + i, 5 + j] += prior[2 + i] if i == j else prior[4]
 
 
 @inner
@@ -151,7 +167,8 @@ def _step(state: _State, damping: Array, trial: _State) -> None:
         _rotate(state.axes[k, 0], Q[0, 7] / 2, Q[1, 7] / 2, Q[2, 7] / 2, trial.axes[k, 0])
         _rotate(state.axes[k, 1], Q[3, 7] / 2, Q[4, 7] / 2, 0.0, trial.axes[k, 1])
         for i in range(2):
-            trial.focal[k, i] = min(max(state.focal[k, i] + min(max(Q[5 + i, 7], -1.0), 1.0), -3.0), 3.0)
+            step = Q[5 if state.shared else 5 + i, 7]
+            trial.focal[k, i] = min(max(state.focal[k, i] + min(max(step, -1.0), 1.0), -3.0), 3.0)
 
 
 @inner

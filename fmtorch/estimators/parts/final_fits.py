@@ -129,7 +129,8 @@ class Adaptive:
             precision = squared(pair.pixels_per_unit / (scale / own.scale_sigmas))
             limits = Limits(precision, FOCAL_ITERATIONS, FOCAL_TOLERANCE)
             fit = FundamentalWithFocals().fit(selection.cameras, pair, scale, limits)
-            if fit.gain <= PRIOR_CONFLICT_GAIN and all(map(math.isfinite, fit.F.tolist())):
+            agreed = pair.calibration is not None or fit.gain <= PRIOR_CONFLICT_GAIN
+            if agreed and all(map(math.isfinite, fit.F.tolist())):
                 return Fit(fit.F, fit.F, within(fit.F, pair, scale), fit.cameras, precision)
         (F,) = family.refine(selection.F[None], pair, Loss(own.loss, scale), STEPS)
         if own.loss == "cauchy":

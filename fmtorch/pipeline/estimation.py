@@ -1,0 +1,86 @@
+"""One estimator call as the public functions make it: preset, prior, cameras, verdict."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fmtorch import presets
+from fmtorch.compiling import switch
+from fmtorch.compiling.together import compile_together
+from fmtorch.core.arguments import number
+from fmtorch.core.checks import expect_values
+from fmtorch.core.stages import Estimator, Pruner, model_of
+from fmtorch.core.threads import one_thread
+from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.geometry.verdict import judged
+from fmtorch.pipeline.known_cameras import KnownCameras
+
+
+def estimated(
+    c: Correspondences, model: str, name: str, config_dir: Path | str | None, seed: int, options: Mapping[str, Any]
+) -> Estimate:
+    """The estimate of matches by a preset, with a prior of their consistency where it uses one and none is given.
+
+    model: what the preset must estimate. What is known of cameras counts where `focal` or `shared_focal` is given.
+    """
+    expect_values(c)
+    seed = int(number("seed", seed, whole=True))
+    estimator = _estimator(name, config_dir, options)
+    if (gives := model_of(estimator)) != model:
+        raise ValueError(f"estimator={name} gives {gives} matrices; find_{model} needs one that gives {model} matrices")
+    if c.focal is None and c.shared_focal is None:
+        return _with_prior(c, seed, estimator=estimator)
+    return KnownCameras(functools.partial(_with_prior, estimator=estimator))(c, seed)
+
+
+def _with_prior(c: Correspondences, seed: int = 0, *, estimator: Estimator) -> Estimate:
+    """The estimate of matches, with a prior of their consistency where it uses one and none is given."""
+    if c.prior is None and getattr(estimator, "uses_prior", False):
+        framed = c.lafs0 is not None and c.lafs1 is not None and c.quality is not None
+        pruner = _consistency("frame_consistency" if framed else "position_consistency")
+        if switch.available():
+            compile_together([*getattr(pruner, "kernels", ()), *getattr(estimator, "kernels", ())])
+        with one_thread(c.mask.device):
+            c = pruner(c)
+    return judged(estimator(c, seed), c)
+
+
+def _estimator(name: str, config_dir: Path | str | None, options: Mapping[str, Any]) -> Estimator:
+    """The estimator of a preset, built but once where its options are plain values and its file is not a user's."""
+    plain = _plain(options)
+    if config_dir is None:
+        try:
+            return _built(name, json.dumps(plain, sort_keys=True))
+        except TypeError:  # an option is an object of some kind
+            pass
+    built: Estimator = presets.build("estimator", name, config_dir, **plain)
+    return built
+
+
+@functools.lru_cache(maxsize=64)
+def _built(name: str, options: str) -> Estimator:
+    built: Estimator = presets.build("estimator", name, **json.loads(options))
+    return built
+
+
+def _plain(value: Any) -> Any:
+    """The value with numbers of NumPy as Python's, at any depth."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    return value
+
+
+@functools.lru_cache(maxsize=2)
+def _consistency(name: str) -> Pruner:
+    built: Pruner = presets.build("pruner", name)
+    return built
