@@ -103,9 +103,11 @@ def _ours(settings: dict[str, Any], c: Correspondences, given: Knowledge, seed: 
     estimate = fmtorch.find_fundamental(c.x0, c.x1, **cameras, **_arguments(settings, c, seed))
     if not bool(estimate.ok[0]):
         return NOTHING
-    F, R, t = (value[0].double().numpy() for value in (estimate.F, estimate.R, estimate.t))
-    exact = given.K0 is not None and given.K1 is not None and not given.deviation
-    return Answer(F, R, t, None if exact else estimate.focals[0].double().numpy())
+    assert estimate.R is not None
+    assert estimate.t is not None
+    assert estimate.focals is not None
+    F, R, t, focals = (value[0].double().numpy() for value in (estimate.F, estimate.R, estimate.t, estimate.focals))
+    return Answer(F, R, t, focals)
 
 
 def _fundamental(settings: dict[str, Any], c: Correspondences, given: Knowledge, seed: int) -> Answer:
