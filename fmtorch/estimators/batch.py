@@ -26,6 +26,7 @@ from fmtorch.estimators.gradients import Attach, Solved, with_gradients
 from fmtorch.estimators.pair import Pair, PixelMatches, bucket, normalize_pair
 from fmtorch.estimators.parts.final_fits import Fit
 from fmtorch.estimators.parts.support import degenerate_support
+from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.geometry.residual_kernels import SAMPSON, Residual
 from fmtorch.geometry.significance import of_one_pair
 
@@ -105,13 +106,13 @@ def _significance(F: Array, matches: PixelMatches) -> float:
     return of_one_pair(F, matches.x0, matches.x1, matches.mask, matches.sizes[:2], matches.sizes[2:])
 
 
-def flattened_prior(c: Correspondences, power: float) -> Correspondences:
-    """The same with P^power in place of P for pairs both of whose focal lengths are exactly known."""
-    if c.focal is None or c.prior is None or power == 1:
+def with_sqrt_prior(c: Correspondences) -> Correspondences:
+    """The same with the root of P(inlier) in its place for pairs both of whose focal lengths are exactly known."""
+    if c.focal is None or c.prior is None:
         return c
-    exact, positive = (c.focal.detach()[..., 1] < EXACT).all(1), c.prior > 0
-    flattened = torch.where(positive, torch.where(positive, c.prior, 1) ** power, c.prior)
-    return c.derived(prior=torch.where(exact[:, None], flattened, c.prior))
+    exact = (c.focal.detach()[..., 1] < EXACT).all(1)[:, None] & (c.prior >= 0)  # others are named as they are
+    root = sqrt(torch.where(exact, c.prior, 0))
+    return c.derived(prior=torch.where(exact, root, c.prior))
 
 
 def relative_rounding(c: Correspondences) -> float:

@@ -6,6 +6,7 @@ import math
 from typing import NamedTuple
 
 from fmtorch.compiling.arrays import Array
+from fmtorch.geometry.arithmetic_kernels import logarithm
 
 EXACT = 0.02  # relative deviation below which a focal length counts as exactly known
 
@@ -29,7 +30,7 @@ class Calibration(NamedTuple):
     def logarithms(self, longest: tuple[float, float]) -> tuple[float, float]:
         """Of the focal lengths in units of the longer sides (px); 0 of unknown ones."""
         f0, f1 = (
-            math.log(f / side) if math.isfinite(s) else 0.0
+            float(logarithm(f / side)) if math.isfinite(s) else 0.0
             for f, s, side in zip(self.focals, self.deviations, longest, strict=True)
         )
         return f0, f1

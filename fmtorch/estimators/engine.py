@@ -16,7 +16,7 @@ from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.kernel import Kernel
 from fmtorch.compiling.together import compile_together
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.estimators.batch import NOT_SOLVED, Solution, estimated, flattened_prior
+from fmtorch.estimators.batch import NOT_SOLVED, Solution, estimated, with_sqrt_prior
 from fmtorch.estimators.families.family import Refining
 from fmtorch.estimators.families.focals import FundamentalWithFocals
 from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
@@ -150,8 +150,8 @@ class HypothesizeAndVerify:
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
         compile_together(self.kernels)
-        if self.focal is not None and self.focal.options.exact is not None:
-            c = flattened_prior(c, self.focal.options.exact.prior_power)
+        if self.focal is not None and self.focal.options.exact is not None and self.focal.options.exact.sqrt_prior:
+            c = with_sqrt_prior(c)
         return estimated(c, seed, self.family.size, self.family, self.estimate, Attached(self.final, self.family))
 
     def estimate(self, pair: Pair) -> Solution:

@@ -124,19 +124,22 @@ class FocalSearch:
         """One of the models searched without assumptions, or of plausible cameras near them, or of those before.
 
         Plausible cameras are taken where their gain minus the cost of the prior is nearly the best gain without one;
-        they are tried where good models differ, or where some were there before.
+        they are tried where good models differ, or where some were there before. Where anything is known of the cameras
+        they are tried and taken.
         """
+        known = pair.calibration is not None
         gain = np.where(free.valid, scores_of(self.gain, free.F, pair), -np.inf)
         order = np.argsort(-gain, kind="stable")
         models, gain = free.F[order], gain[order]
         selection = Selection(models[0], bool(free.valid[0]))
-        if plausible is None and not distinct_models(models, gain, 0, RIVAL_GAIN_SHARE, SAME_MODEL):
+        if plausible is None and not known and not distinct_models(models, gain, 0, RIVAL_GAIN_SHARE, SAME_MODEL):
             return selection
         tried = slice(self.options.candidates)
         candidates = self.refined(models[tried], np.isfinite(gain[tried]), pair, free.near)
         if plausible is not None:
             candidates = candidates.joined(plausible)
-        if not candidates.posterior[candidates.best] >= MIN_GAIN_SHARE * gain[0]:
+        believed = candidates.posterior[candidates.best] >= MIN_GAIN_SHARE * gain[0]
+        if not (believed or (known and candidates.valid)):
             return selection
         return selection._replace(F=candidates.F[candidates.best], cameras=candidates.cameras.of(candidates.best))
 

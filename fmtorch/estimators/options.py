@@ -80,14 +80,15 @@ class Select:
 class ExactFocals:
     """What is different where both focal lengths are exactly known: fewer models fit by accident.
 
-    scale: of the selecting score, Sampson distance, px. prior_power: P(inlier) to this power stands for it throughout.
+    scale: of the selecting score, Sampson distance, px. sqrt_prior: whether the square root of P(inlier)
+    stands for it throughout.
     """
 
     scale: float
-    prior_power: float = 1.0
+    sqrt_prior: bool = False
 
     def __post_init__(self) -> None:
-        _positive(**{"focal.exact.scale": self.scale, "focal.exact.prior_power": self.prior_power})
+        _positive(**{"focal.exact.scale": self.scale})
 
 
 @dataclasses.dataclass(frozen=True)

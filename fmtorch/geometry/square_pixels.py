@@ -13,6 +13,8 @@ from jaxtyping import Bool, Float, Real
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.geometry.arithmetic import sqrt
+
 MIN_FOCAL, MAX_FOCAL = 0.1, 10.0  # in units of the longer side; K of other focal lengths is of another unit or image
 MIN_SIDE_PX = 16.0  # longer side, or focal length, of coordinates that are pixels; others are normalised
 NOMINAL_FOCAL_PX = 1000.0  # of the image that normalised points are mapped to
@@ -63,7 +65,7 @@ def square_pixels(
 
 def _image(K: Tensor, size: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """Focal lengths and sizes in the unit of K, and whether these are normalised coordinates."""
-    focal = (K[:, 0, 0] * K[:, 1, 1]).sqrt()
+    focal = sqrt(K[:, 0, 0] * K[:, 1, 1])
     if size is not None:
         image = size.to(torch.float64)
         return focal, image, image.amax(1) < MIN_SIDE_PX

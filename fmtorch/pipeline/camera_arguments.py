@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import torch
@@ -12,7 +13,7 @@ from fmtorch.core.arguments import Arrays, as_tensor
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry.square_pixels import calibration_problems
 
-Focal = Literal["shared", "unknown"] | float | Arrays | None
+Focal = Literal["shared", "unknown"] | float | Arrays | Mapping[str, Any] | None
 FORMS = "None, 'unknown', 'shared', (px, deviation) or ((px, deviation), (px, deviation))"
 FORMS_WITH_K = "None, or the relative deviation of the focal lengths of K0 and K1: one number, two, or (B, 2)"
 UNKNOWN = (1.0, math.inf)  # px, relative deviation
@@ -23,7 +24,7 @@ def camera_fields(K0: Arrays | None, K1: Arrays | None, focal: Focal, sizes_know
 
     Raises ValueError or TypeError, naming the argument.
     """
-    if K0 is None and K1 is None and focal is None:
+    if K0 is None and K1 is None and (focal is None or isinstance(focal, Mapping)):
         return {}
     if not sizes_known and (K0 is None or K1 is None):
         missing = "focal" if K0 is None and K1 is None else "K1 alone" if K0 is None else "K0 alone"
@@ -69,7 +70,7 @@ def _deviations(focal: Any, known0: bool, known1: bool) -> Tensor:
     """Deviations of the focal lengths of K, in the place where they stand beside px: (2, 2) or (B, 2, 2)."""
     if isinstance(focal, str):
         raise ValueError(f"focal is {focal!r}; with K0 or K1 it must be {FORMS_WITH_K}")
-    values = _floating(0.0 if focal is None else focal, "focal")
+    values = _floating(0.0 if focal is None or isinstance(focal, Mapping) else focal, "focal")
     values = values.expand(2) if values.shape in ((), (1,)) else values
     if values.dim() > 2 or values.shape[-1] != 2:
         raise ValueError(f"focal has shape {tuple(values.shape)}; with K0 or K1 it must be {FORMS_WITH_K}")

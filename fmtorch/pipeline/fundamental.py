@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,7 @@ def find_fundamental(
             ================================  ======================================================================
 
             A deviation of 0 is exact and an infinite one nothing; 0.05 suits EXIF. From 0.02 on measurements may be
-            wrong altogether.
+            wrong altogether. A mapping says nothing of cameras: it holds options of the preset's stage of that name.
         key: (B,) int64, selects each pair's random numbers.
         seed: of the random numbers.
         config_dir: a folder with presets of your own, ``<config_dir>/estimator/<name>.yaml``, which come first.
@@ -95,6 +96,8 @@ def find_fundamental(
         size1=size1, key=key, **camera_fields(K0, K1, focal, size0 is not None),
     )  # fmt: skip
     expect_calibrations(c)
+    if isinstance(focal, Mapping):
+        options["focal"] = focal
     return estimated(c, "fundamental", estimator, config_dir, seed, options)
 
 

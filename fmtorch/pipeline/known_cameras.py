@@ -11,7 +11,7 @@ from torch import Tensor
 from fmtorch.core.stages import Estimator
 from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.geometry.arithmetic import matmul3
+from fmtorch.geometry.arithmetic import matmul3, sqrt
 from fmtorch.geometry.cameras import cross_matrix
 from fmtorch.geometry.normalize import canonical
 from fmtorch.geometry.pose import pose_from_fundamental
@@ -136,7 +136,7 @@ def _scale(camera: Camera) -> Tensor:
     if camera.K is None:
         return torch.ones_like(camera.focal)
     K = camera.K.double() / camera.K[:, 2:, 2:]
-    return (K[:, 0, 0] * K[:, 1, 1]).sqrt() / camera.focal
+    return sqrt(K[:, 0, 0] * K[:, 1, 1]) / camera.focal
 
 
 def _with_reasons(estimate: Estimate, *problems: tuple[str, ...]) -> Estimate:

@@ -3,7 +3,8 @@
 Parameters: a rotation vector, the direction of the translation and two log focal lengths; with ``K = [f 0 cx; 0 f cy;
 0 0 1]`` the model is ``F = K1^-T [t]x R K0^-1``. Minimises
 ``sum P rho(r) / (2 sigma^2) + ((ln f0 - ln f1) / s1)^2 / 2 + ((mean ln f - ln usual) / s2)^2 / 2``, for images of one
-size less ``A / (1 + (ln f0 - ln f1)^2 / s3^2)``.
+size less ``A / (1 + (ln f0 - ln f1)^2 / s3^2)``; for each measured focal length plus ``z^2 / 2``, or
+``5 z^2 / (z^2 + 10)`` where its deviation s is 0.02 or more, of ``z = (ln f - ln measured) / s``.
 """
 
 from __future__ import annotations
@@ -52,11 +53,22 @@ def parameters_of(F: np.ndarray, size0: tuple[int, int], size1: tuple[int, int])
     return np.concatenate([Rotation.from_matrix(R).as_rotvec(), U[:, 2], np.log([f0, f1])])
 
 
-def prior_cost(log_f0: float, log_f1: float, same_size: bool = False) -> float:
-    """What the two focal lengths cost; less where images of equal size may be of one camera."""
+Measured = tuple[tuple[float, float], tuple[float, float]]
+UNMEASURED = ((0.0, np.inf), (0.0, np.inf))
+
+
+def prior_cost(log_f0: float, log_f1: float, same_size: bool = False, measured: Measured = UNMEASURED) -> float:
+    """What the two focal lengths cost; less where images of equal size may be of one camera.
+
+    measured: logarithm and deviation of each; an infinite deviation is no measurement.
+    """
     difference = log_f0 - log_f1
     well = 5 * 0.01**2 / (0.01**2 + difference**2) if same_size else 0.0
-    return (difference / 0.5) ** 2 / 2 + (((log_f0 + log_f1) / 2 - np.log(1.2)) / 0.4) ** 2 / 2 - well
+    cost = (difference / 0.5) ** 2 / 2 + (((log_f0 + log_f1) / 2 - np.log(1.2)) / 0.4) ** 2 / 2 - well
+    for log_f, (mean, deviation) in zip((log_f0, log_f1), measured, strict=True):
+        z2 = ((log_f - mean) / max(deviation, 1e-5)) ** 2
+        cost += z2 / 2 if deviation < 0.02 else 5 * z2 / (z2 + 10)
+    return cost
 
 
 def loss(r: np.ndarray, scale: float) -> np.ndarray:

@@ -81,8 +81,8 @@ def _images(pair: Pair) -> Images:
 
 def focals_px(cameras: Cameras, pair: Pair) -> Array:
     """The focal lengths (2,) of the first candidate, px."""
-    focals: Array = np.exp(cameras.focal[0]) * images_of(pair).longest * pair.pixels_per_unit
-    return focals
+    f0, f1 = cameras.focal[0].tolist()
+    return np.array([exponential(f0), exponential(f1)]) * images_of(pair).longest * pair.pixels_per_unit
 
 
 class CentredMatches(NamedTuple):

@@ -27,7 +27,7 @@ SAME_CAMERA_DEVIATION = 0.01  # width of the well for images of equal size
 SAME_CAMERA_GAIN = 5.0  # its depth, in logarithms of the likelihood
 SAME_CAMERA_SHARE = 0.7  # of the draws for images of equal size that have one focal length for both
 LOG_USUAL = 0.1823215567939546  # math.log(USUAL_FOCAL)
-MAX_PRECISION = 1e10  # of an exact measurement
+MIN_DEVIATION = 1e-5  # that an exact measurement is taken to have
 TAIL_GAIN = 5.0  # what a measurement costs at most, in logarithms of the likelihood
 UNBELIEVED_SHARE = 0.2  # of the draws that leave out measurements with a tail
 QUANTILES = 1 << 10  # of the normal distribution, from which focal lengths are drawn
@@ -60,7 +60,7 @@ def focal_prior(
 ) -> FocalPrior:  # fmt: skip
     """The prior of a pair. measured: logarithms of focal lengths; deviation: of these, infinite where there is none."""
     m, s = np.array(measured), np.array(deviation)
-    precision = np.minimum(1 / np.maximum(s, 1e-300) ** 2, MAX_PRECISION)
+    precision = 1 / np.maximum(s, MIN_DEVIATION) ** 2
     tail = ((s >= EXACT) & np.isfinite(s)).astype(np.float64)
     # In (mean, half of the difference) the prior is diagonal; of the two logarithms its precision is p00, p01, p00.
     a, b = FOCAL_DEVIATION**2, RATIO_DEVIATION**2 / 4
@@ -74,7 +74,7 @@ def focal_prior(
     l10 = c01 / l00
     draw = np.array([c00 * r0 + c01 * r1, c01 * r0 + c11 * r1, l00, l10, math.sqrt(max(c11 - l10 * l10, 0.0))])
     total = 1 / a + precision.sum()
-    one = np.array([(LOG_USUAL / a + float((precision * m).sum())) / total, total**-0.5])
+    one = np.array([(LOG_USUAL / a + float((precision * m).sum())) / total, math.sqrt(1 / total)])
     share = 1.0 if shared else same_camera_share(m[0] - m[1], s) if same_size else 0.0
     return FocalPrior(same_size, shared, m, precision, tail, normal_quantiles(), draw, one, share)
 
@@ -90,8 +90,10 @@ def same_camera_share(difference: float, deviation: Array) -> float:
         return 0.0  # draws have the measured focal lengths
     measured = float(np.square(deviation).sum())
     one, two = measured + SAME_CAMERA_DEVIATION**2, measured + RATIO_DEVIATION**2
-    squared = difference * difference / 2
-    odds = SAME_CAMERA_SHARE / (1 - SAME_CAMERA_SHARE) * math.sqrt(two / one) * math.exp(squared / two - squared / one)
+    exponent = max(difference * difference / 2 * (1 / two - 1 / one), -40.0)
+    odds = SAME_CAMERA_SHARE / (1 - SAME_CAMERA_SHARE) * math.sqrt(two / one)
+    for _ in range(8):
+        odds *= exponential(exponent / 8)
     return odds / (1 + odds)
 
 

@@ -13,17 +13,18 @@ from fmtorch.core.streams import Stream
 from fmtorch.estimators.families.cameras import images_of
 from fmtorch.estimators.families.focal_prior import (
     FOCAL_DEVIATION,
+    QUANTILES,
     RATIO_DEVIATION,
     SAME_CAMERA_SHARE,
     USUAL_FOCAL,
-    focal_cost,
+    draw_depths,
+    normal_quantiles,
 )
-from fmtorch.estimators.families.focals import QUANTILES, FundamentalWithFocals, draw_depths, normal_quantiles
+from fmtorch.estimators.families.focals import FundamentalWithFocals
 from fmtorch.geometry import sampson
 from fmtorch.metrics import nsgd
 from tests.estimators.families.photographs import TALL, WIDE, Photographs, Sizes, photographs
 from tests.estimators.pairs import pair_of
-from tests.reference import focal as reference
 from tests.reference import random
 
 SIZES = [(WIDE, WIDE), (WIDE, TALL)]
@@ -38,11 +39,11 @@ def error(F: torch.Tensor, pair: Photographs) -> float:
 def test_drawn_focal_lengths_are_functions_of_the_draw_that_follow_the_prior(sizes: Sizes) -> None:
     pair, seed, start, count = pair_of(photographs(0, sizes).c, 3), 3, 100, 4000
     images, depth, normal = images_of(pair), np.empty((2, count)), normal_quantiles()
-    draw_depths(normal, images, pair.mixed_seed(Stream.FOCAL), pair.key, start, depth)
+    draw_depths(images.prior, images.longest, pair.mixed_seed(Stream.FOCAL), pair.key, start, depth)
     ratios = np.log(depth / images.longest[:, None])
     for d in range(20):
         words = [random.number(seed, pair.key, Stream.FOCAL, start + d, k, 3) % QUANTILES for k in range(3)]
-        half = 0.0 if images.same_size and words[2] < SAME_CAMERA_SHARE * QUANTILES else normal[words[1]]
+        half = 0.0 if pair.same_size and words[2] < SAME_CAMERA_SHARE * QUANTILES else normal[words[1]]
         mean = math.log(USUAL_FOCAL) + FOCAL_DEVIATION * normal[words[0]]
         expected = [mean + RATIO_DEVIATION / 2 * half, mean - RATIO_DEVIATION / 2 * half]
         np.testing.assert_allclose(ratios[:, d], expected, atol=1e-12)
@@ -51,7 +52,7 @@ def test_drawn_focal_lengths_are_functions_of_the_draw_that_follow_the_prior(siz
     assert mean.mean() == pytest.approx(math.log(1.2), abs=4 * 0.4 / math.sqrt(count))
     assert mean.std() == pytest.approx(0.4, abs=4 * 0.4 / math.sqrt(2 * count))
     equal = float((np.abs(difference) < 1e-12).mean())  # of a normal ratio one draw in 1e12
-    assert equal == pytest.approx(0.7 if images.same_size else 0.0, abs=4 * math.sqrt(0.7 * 0.3 / count))
+    assert equal == pytest.approx(0.7 if pair.same_size else 0.0, abs=4 * math.sqrt(0.7 * 0.3 / count))
     other = difference[np.abs(difference) >= 1e-12]
     assert other.std() == pytest.approx(0.5, abs=4 * 0.5 / math.sqrt(2 * len(other)))
 
@@ -60,19 +61,6 @@ def test_quantiles_are_those_of_the_normal_distribution() -> None:
     normal = normal_quantiles()
     shares = [0.5 * math.erfc(-q / math.sqrt(2)) for q in normal.tolist()]
     np.testing.assert_allclose(shares, (np.arange(QUANTILES) + 0.5) / QUANTILES, atol=2.0**-40)
-
-
-@pytest.mark.parametrize("same", [True, False])
-def test_the_cost_of_focal_lengths_and_its_gradient(same: bool) -> None:
-    rng, out, h = np.random.default_rng(0), np.empty(4), 1e-6
-    for _ in range(20):
-        focal = rng.normal(0.2, 0.4) + rng.normal(0, 0.01 if same else 0.5, 2)
-        cost = focal_cost(focal, same, out)
-        assert cost == pytest.approx(reference.prior_cost(*focal, same_size=same), rel=1e-9, abs=1e-9)
-        for i, step in enumerate(h * np.eye(2)):
-            ends = [reference.prior_cost(*(focal + sign * step), same_size=same) for sign in (-1, 1)]
-            # The well, 0.01 wide and 5 deep, has third derivatives of up to 1e8: h^2 of these.
-            assert out[i] == pytest.approx((ends[1] - ends[0]) / (2 * h), rel=1e-6, abs=1e-3)
 
 
 def test_hypotheses_pass_through_their_five_matches() -> None:

@@ -1,0 +1,363 @@
+"""Estimates of known, half-known and unknown cameras: one posterior, its poses, focal lengths and gradients."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import fmtorch
+from fmtorch import presets
+from fmtorch.core.types import Correspondences, Estimate, collate
+from fmtorch.estimators.parts import final_fits
+from fmtorch.geometry import fundamental_from_calibration, square_pixels
+from fmtorch.pipeline.known_cameras import KnownCameras
+from tests.laws import (
+    Result,
+    assert_same,
+    calibrated,
+    degenerate,
+    live_values,
+    quick,
+    scene,
+    scenes,
+    small,
+    with_padding,
+)
+from tests.reference import known_cameras as reference
+from tests.reference import solvers
+
+CAMERAS = {"K0": torch.from_numpy(reference.K0), "K1": torch.from_numpy(reference.K1)}
+SIZES = {"size0": reference.SIZE, "size1": reference.SIZE}
+CENTRAL = tuple(np.array([[f, 0, 319.5], [0, f, 239.5], [0, 0, 1.0]]) for f in (650.0, 650.0))
+ZOOMED = (CENTRAL[0], np.array([[820.0, 0, 319.5], [0, 820, 239.5], [0, 0, 1.0]]))
+
+
+def error(e: Estimate, s: reference.Scene) -> float:
+    """Of the pose of one pair, degrees."""
+    assert e.R is not None
+    assert e.t is not None
+    return reference.pose_error(e.R[0].numpy(), e.t[0].numpy(), s)
+
+
+# Exactness
+
+
+@pytest.mark.parametrize("estimator", ["fmtorch", "msac"])
+@pytest.mark.parametrize("sizes", [{}, SIZES], ids=["sizes unknown", "sizes known"])
+def test_exact_matches_give_the_exact_pose(estimator: str, sizes: dict[str, Any]) -> None:
+    for seed in range(4):
+        s = reference.scene(seed)
+        e = fmtorch.find_essential(s.x0, s.x1, **CAMERAS, **sizes, estimator=estimator)
+        assert error(e, s) < 1e-4
+        F = reference.fundamental(s.R, s.t)
+        assert min(float(np.abs(e.F[0].numpy() - sign * F).max()) for sign in (-1, 1)) < 1e-6
+        assert e.focals is not None
+        np.testing.assert_allclose(e.focals[0], [np.sqrt(500 * 520), np.sqrt(600 * 590)], rtol=1e-6)
+        assert int(e.inliers[0].numpy()[s.right].sum()) == s.right.sum()
+
+
+def test_normalised_points_give_the_pose_of_pixels() -> None:
+    s = reference.scene(1)
+    x0, x1 = (
+        (np.c_[x, np.ones(len(x))] @ np.linalg.inv(K).T)[:, :2] for x, K in ((s.x0, reference.K0), (s.x1, reference.K1))
+    )
+    e = fmtorch.find_essential(x0, x1, torch.eye(3), torch.eye(3))
+    assert error(e, s) < 1e-4
+    assert e.E is not None
+    assert e.focals is not None
+    torch.testing.assert_close(e.focals, torch.ones(1, 2, dtype=torch.float64))
+    E = e.E[0] / e.E[0].norm()
+    assert float(torch.minimum((e.F[0] - E).abs().max(), (e.F[0] + E).abs().max())) < 1e-6  # K is the identity
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e9])
+def test_the_unit_of_points_and_calibration_does_not_matter(scale: float) -> None:
+    """Exact matches: of points in other units than pixels thresholds let more or fewer pass."""
+    s = reference.scene(2, outliers=0.0)
+    scaled = [np.diag([scale, scale, 1]) @ K for K in (reference.K0, reference.K1)]
+    e = fmtorch.find_essential(scale * s.x0, scale * s.x1, *scaled)
+    assert error(e, s) < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("cameras", "known", "tolerance"),
+    [
+        (ZOOMED, {"focal": ((650.0, 0.0), None)}, 0.02),
+        (ZOOMED, {"focal": ((640.0, 0.05), (840.0, 0.05))}, 0.02),
+        (CENTRAL, {"focal": "shared"}, 0.01),
+        (CENTRAL, {"focal": (650.0, 0.0)}, 1e-6),
+        (ZOOMED, {"K0": ZOOMED[0]}, 0.02),
+        (ZOOMED, {"K0": ZOOMED[0], "K1": 0.95 * (ZOOMED[1] - np.eye(3)) + np.eye(3), "focal": (0.0, 0.05)}, 0.02),
+    ],
+    ids=["one", "both roughly", "shared", "both", "one K", "one K exact, the other rough"],
+)
+def test_focal_lengths_are_recovered(cameras: tuple, known: dict[str, Any], tolerance: float) -> None:
+    """From exact matches of pairs that determine them; the prior pulls a little."""
+    if "K1" in known:
+        known["K1"][:2, 2] = ZOOMED[1][:2, 2]
+    for seed in range(4):
+        s = reference.scene(seed, cameras=cameras)
+        e = fmtorch.find_fundamental(s.x0, s.x1, **SIZES, **known)
+        assert e.focals is not None
+        np.testing.assert_allclose(e.focals[0], [K[0, 0] for K in cameras], rtol=tolerance)
+        assert error(e, s) < 20 * tolerance + 1e-4
+
+
+def test_the_fit_is_the_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the Sampson error of right matches, by SciPy."""
+    monkeypatch.setattr(final_fits, "FOCAL_ITERATIONS", 30)
+    monkeypatch.setattr(final_fits, "FOCAL_TOLERANCE", 0.0)
+    s = reference.scene(3, noise=0.3, outliers=0.0)
+    weight = np.random.default_rng(0).uniform(0.5, 1, 150)
+    e = fmtorch.find_essential(s.x0, s.x1, **CAMERAS, **SIZES, prior=weight)
+    A0, A1 = (np.linalg.inv(reference.square(K, reference.SIZE)[0]) for K in (reference.K0, reference.K1))
+    F = A1.T @ e.F[0].numpy() @ A0
+    x0, x1 = ((np.c_[x, np.ones(150)] @ np.linalg.inv(A).T)[:, :2] for x, A in ((s.x0, A0), (s.x1, A1)))
+    r = np.abs(reference.sampson(F, x0, x1))
+    scale = 2 * 1.4826 * np.sort(r[e.inliers[0].numpy()])[int((e.inliers.sum() - 1) // 2)]
+    gap = np.abs(r / scale - 1).min()
+    counted = r <= scale
+    R, t = reference.best_pose(s, np.sqrt(weight) * counted)  # P^(1/2), as where both focal lengths are exact
+    assert gap > 1e-3  # no match is at the truncation
+    assert e.R is not None
+    assert e.t is not None
+    assert reference.angle(e.R[0].numpy(), R) < 1e-3
+    assert reference.angle(np.eye(3), np.eye(3)) == 0
+    assert float(np.degrees(np.linalg.norm(np.cross(e.t[0].numpy(), t)))) < 1e-2
+
+
+@pytest.mark.parametrize("known", [CAMERAS, {"focal": "shared"}, {"focal": (560.0, 0.1)}])
+def test_pose_and_essential_matrix_are_those_of_the_fundamental_matrix(known: dict[str, Any]) -> None:
+    """By a singular value decomposition and triangulation, with the estimated focal lengths."""
+    for seed in range(4):
+        s = reference.scene(seed, noise=0.5)
+        e = fmtorch.find_fundamental(s.x0, s.x1, **SIZES, **known)
+        assert e.E is not None
+        assert e.R is not None
+        assert e.t is not None
+        assert e.focals is not None
+        K0, K1 = (np.array([[f, 0, 319.5], [0, f, 239.5], [0, 0, 1]]) for f in e.focals[0].tolist())
+        if known is CAMERAS:
+            K0, K1 = reference.K0, reference.K1
+        right = e.inliers[0].numpy()
+        R, t, _ = solvers.pose(e.F[0].numpy(), K0, K1, s.x0[right], s.x1[right])
+        np.testing.assert_allclose(e.R[0], R, atol=1e-6)
+        np.testing.assert_allclose(e.t[0], t, atol=1e-6)
+        np.testing.assert_allclose(e.E[0], solvers_cross(t) @ R, atol=1e-6)
+        assert float(e.t.norm()) == pytest.approx(1)
+        F = fundamental_from_calibration(*map(torch.from_numpy, (K0, K1)), e.R, e.t)
+        assert min(float((e.F - sign * F).abs().max()) for sign in (-1, 1)) < 1e-6
+
+
+def solvers_cross(t: np.ndarray) -> np.ndarray:
+    return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+
+
+# Knowledge helps
+
+
+def test_the_more_is_known_the_better_the_pose() -> None:
+    """Unknown, rough and exact focal lengths, over noisy scenes of a narrow view."""
+    errors: dict[str, list[float]] = {"unknown": [], "rough": [], "exact": []}
+    for seed in range(16):
+        s = reference.scene(seed, 80, noise=1.0, outliers=0.4, cameras=ZOOMED)
+        known: dict[str, Any] = {"unknown": "unknown", "rough": ((660.0, 0.05), (800.0, 0.05))}
+        known["exact"] = ((650.0, 0.0), (820.0, 0.0))
+        for name, focal in known.items():
+            e = fmtorch.find_fundamental(s.x0, s.x1, **SIZES, focal=focal)
+            errors[name].append(min(error(e, s), 90.0) if bool(e.t.isfinite().all()) else 90.0)  # type: ignore[union-attr]
+    mean = {name: float(np.mean(each)) for name, each in errors.items()}
+    assert mean["exact"] < mean["rough"] < mean["unknown"]
+
+
+def test_a_wrong_measurement_is_not_believed_for_long() -> None:
+    """It has a tail: far from where the matches are, it no longer pulls."""
+    s = reference.scene(5, 300, noise=0.1, outliers=0.1, cameras=CENTRAL)
+    e = fmtorch.find_fundamental(s.x0, s.x1, **SIZES, focal=((2000.0, 0.02), (2000.0, 0.02)))
+    assert e.focals is not None
+    np.testing.assert_allclose(e.focals[0], [650, 650], rtol=0.05)
+
+
+# Laws
+
+
+KNOWLEDGE: dict[str, Any] = {"exact": (0.0, 0.0), "rough": (0.05, 0.05), "one": (0.0, float("inf")), "shared": None}
+
+
+@functools.cache
+def _quick(name: str) -> KnownCameras:
+    return KnownCameras(quick(name))
+
+
+def known(c: Correspondences, name: str) -> Correspondences:
+    """The same with the calibration of `scene`, as far as it is known."""
+    if name == "shared":
+        return c.replace(shared_focal=torch.ones(len(c), dtype=torch.bool))
+    focal = torch.tensor([[[1.0, s] for s in KNOWLEDGE[name]]]).expand(len(c), 2, 2)
+    c = calibrated(c).replace(focal=focal)
+    return c.replace(K1=None) if name == "one" else c
+
+
+def run(c: Correspondences, name: str, estimator: str = "fmtorch") -> Result:
+    e = _quick(estimator)(known(c, name), seed=5)
+    fields = {"F": e.F, "inliers": e.inliers, "ok": e.ok, "draws": e.draws, "significance": e.significance}
+    return {**fields, "E": e.E, "R": e.R, "t": e.t, "focals": e.focals}  # type: ignore[dict-item]
+
+
+everything = pytest.mark.parametrize(
+    ("name", "estimator"), [*((name, "fmtorch") for name in KNOWLEDGE), ("exact", "msac")]
+)
+
+
+@everything
+def test_padding_is_invisible(name: str, estimator: str) -> None:
+    garbage = (float("nan"), 1e30, -7.0, float("nan"), 1e30)
+    padded = collate([with_padding(scenes()[i], np.random.default_rng(i), kind) for i, kind in enumerate(garbage)])
+    found, expected = run(padded, name, estimator), run(scenes(), name, estimator)
+    per_match = {"inliers"}
+    for i in range(len(garbage)):
+        rows = [{k: v[i : i + 1] for k, v in each.items()} for each in (found, expected)]
+        a, b = (
+            {**row, **live_values({k: row[k] for k in per_match}, c[i])}
+            for row, c in zip(rows, (padded, scenes()), strict=True)
+        )
+        assert_same(a, b, f"pair {i}")
+
+
+@everything
+def test_neighbours_are_invisible_and_no_pair_takes_its_batch_down(name: str, estimator: str) -> None:
+    pairs = [scene(1), *degenerate().values(), *small().values(), scene(2, 60)]
+    together = run(collate(pairs), name, estimator)
+    for i, pair in enumerate(pairs):
+        n = pair.mask.shape[1]
+        alone = run(pair, name, estimator)
+        assert_same(
+            alone, {k: v[i : i + 1, :n] if k == "inliers" else v[i : i + 1] for k, v in together.items()}, str(i)
+        )
+    assert bool(together["ok"][[0, -1]].all())
+    assert bool(together["F"].isfinite().all())
+    for field in ("E", "R", "t"):  # all or nothing
+        finite = together[field].flatten(1).isfinite()
+        assert bool((finite.all(1) | ~finite.any(1)).all())
+        assert not bool(finite[~together["ok"]].any())
+    if name == "exact":
+        assert bool(together["t"][together["ok"]].isfinite().any(1).float().mean() > 0.5)
+
+
+def test_a_wrong_calibration_is_a_reason_and_no_more() -> None:
+    c = known(collate([scene(i) for i in range(5)]), "exact")
+    assert c.K0 is not None
+    assert c.K1 is not None
+    K0, K1 = c.K0.clone(), c.K1.clone()
+    K0[1], K1[2, 0, 0], K0[3, :2] = torch.nan, 0.0, K0[3, :2] / 800
+    K0.requires_grad_()
+    e = _quick("fmtorch")(c.replace(K0=K0, K1=K1), seed=5)
+    alone = _quick("fmtorch")(c[[0, 4]], seed=5)
+    assert e.ok.tolist() == [True, False, False, False, True]
+    assert [reason.split(" ")[0] for reason in e.reason] == ["", "K0", "K1", "K0", ""]
+    assert torch.equal(e.F[[0, 4]], alone.F)
+    assert e.t is not None
+    assert e.focals is not None
+    (gradient,) = torch.autograd.grad(e.F.sum() + e.t[[0, 4]].sum() + e.focals[[0, 4]].sum(), K0)
+    assert bool(gradient.isfinite().all())
+    assert bool(gradient[[0, 4]].any())
+    assert not bool(gradient[1:4].any())
+
+
+def test_wrong_focal_lengths_are_a_reason() -> None:
+    c = collate([scene(i) for i in range(3)])
+    focal = torch.tensor([[[800.0, 0.0], [800, 0]], [[-1, 0.1], [800, 0]], [[800, 0], [800, float("nan")]]])
+    e = quick("fmtorch")(c.replace(focal=focal), seed=5)
+    assert e.ok.tolist() == [True, False, False]
+    assert all(reason.startswith("focal is wrong") for reason in e.reason[1:])
+
+
+def test_without_cameras_nothing_changes() -> None:
+    """Not even where data sets know them: neither K0 and K1, nor that nothing is known, count."""
+    c = scenes()
+    plain, calibrations = quick("fmtorch")(c, seed=5), quick("fmtorch")(calibrated(c), seed=5)
+    nothing = torch.full((len(c), 2, 2), torch.inf)
+    asked = quick("fmtorch")(c.replace(focal=nothing), seed=5)
+    for other in (calibrations, asked):
+        for field in ("F", "inliers", "ok", "draws", "significance"):
+            assert torch.equal(getattr(plain, field), getattr(other, field))
+    assert plain.focals is None
+    assert asked.focals is not None
+    assert bool(asked.focals.isfinite().any())
+    assert plain.E is None
+
+
+def test_estimates_are_collated_indexed_and_moved() -> None:
+    e = _quick("fmtorch")(known(scenes(), "exact"), seed=5)
+    parts = collate([e[i] for i in range(len(e))])
+    for field in ("E", "R", "t", "focals"):
+        assert torch.equal(getattr(parts, field).nan_to_num(), getattr(e, field).nan_to_num())
+        assert getattr(e.to("cpu"), field).shape[0] == len(e)
+    assert collate([e, quick("fmtorch")(scenes(), seed=5)]).R is None
+
+
+# Gradients
+
+
+VARIABLES = ("x0", "x1", "prior", "noise", "K0", "K1")
+
+
+@pytest.mark.parametrize("field", ["F", "E", "R", "t", "focals"])
+@pytest.mark.parametrize("focal", [(0.0, 0.0), (0.05, 0.05), "shared"], ids=["exact", "rough", "shared"])
+def test_gradients_are_the_differences_of_estimates(
+    field: str, focal: tuple[float, float] | str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At a converged fit of 14 inliers, too few to tell the noise, of which the scale of the fit would depend. The
+    image of square pixels is a constant."""
+    monkeypatch.setattr(final_fits, "FOCAL_ITERATIONS", 60)
+    monkeypatch.setattr(final_fits, "FOCAL_TOLERANCE", 0.0)
+    given = _differentiable()
+    fixed = {name: square_pixels._image(given[name], torch.tensor([reference.SIZE])) for name in ("K0", "K1")}
+    monkeypatch.setattr(square_pixels, "_image", lambda K, size: fixed["K0" if K[0, 0, 0] < 550 else "K1"])
+    rng, names = np.random.default_rng(0), VARIABLES if focal != "shared" else VARIABLES[:4]
+    weights = torch.from_numpy(rng.normal(size=(3, 3)))
+
+    def value(values: dict[str, Tensor]) -> Tensor:
+        known = {"focal": focal} | ({name: values[name] for name in ("K0", "K1")} if focal != "shared" else {})
+        rest = {name: values[name] for name in VARIABLES[:4]}
+        e = fmtorch.find_fundamental(**rest, **known, **SIZES, inlier_threshold=3.0)  # type: ignore[arg-type]
+        found = getattr(e, field)[0]
+        if field == "F":
+            D = torch.diag(torch.tensor([300.0, 300, 1]).double())
+            found = D @ found @ D
+            found = found / found.norm()
+        return (found * weights.flatten()[: found.numel()].reshape(found.shape)).sum()
+
+    attached = {name: given[name].clone().requires_grad_() for name in names}
+    gradients = torch.autograd.grad(value(given | attached), list(attached.values()), allow_unused=True)
+    for name, gradient in zip(names, gradients, strict=True):
+        step = torch.from_numpy(rng.normal(size=tuple(given[name].shape)))
+        if name in ("K0", "K1"):
+            step = step * torch.tensor([[1.0, 1, 1], [0, 1, 1], [0, 0, 0]])
+        h = 1e-3 if name in ("K0", "K1") else 1e-4
+        ends = [float(value(given | {name: given[name] + sign * h * step})) for sign in (-1, 1)]
+        numeric = (ends[1] - ends[0]) / (2 * h)
+        found = 0.0 if gradient is None else float((gradient * step).sum())
+        assert found == pytest.approx(numeric, rel=1e-2, abs=1e-7), name
+
+
+def _differentiable() -> dict[str, Tensor]:
+    """Points, priors, noises and calibrations of 14 matches, nearly exact."""
+    s, rng = reference.scene(4, 14, noise=1e-3, outliers=0.0), np.random.default_rng(1)
+    values = {"x0": s.x0, "x1": s.x1, "prior": rng.uniform(0.5, 0.9, 14), "noise": rng.uniform(0.5, 2, 14)}
+    return {name: torch.from_numpy(value)[None] for name, value in values.items()} | {
+        name: K[None] for name, K in CAMERAS.items()
+    }
+
+
+# Real pairs
+
+
+def test_the_preset_has_constants_for_exact_focal_lengths() -> None:
+    exact = presets.load("estimator", "fmtorch")["focal"]["exact"]
+    assert exact == {"scale": 0.5, "sqrt_prior": True}

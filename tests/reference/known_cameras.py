@@ -1,0 +1,83 @@
+"""Pairs of known cameras: scenes, images of square pixels, and the pose of least error, one pair at a time."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from tests.reference.focal import cross_matrix
+from tests.reference.refine import sampson
+
+SIZE = (480, 640)
+K0 = np.array([[500, 2, 310], [0, 520, 250], [0, 0, 1.0]])
+K1 = np.array([[600, -1, 330], [0, 590, 230], [0, 0, 1.0]])
+
+
+class Scene(NamedTuple):
+    """Matches (n, 2) in pixels, whether they are right, and the motion, X1 = R X0 + t."""
+
+    x0: np.ndarray
+    x1: np.ndarray
+    right: np.ndarray
+    R: np.ndarray
+    t: np.ndarray
+
+
+def scene(
+    seed: int, count: int = 150, noise: float = 0.0, outliers: float = 0.3, cameras: tuple = (K0, K1)
+) -> Scene:  # fmt: skip
+    """A cloud of points from two sides, all in front of both cameras."""
+    rng = np.random.default_rng(seed)
+    X = np.c_[rng.uniform(-1.2, 1.2, (count, 2)), rng.uniform(4, 6, count)]
+    R = Rotation.from_rotvec(np.array([0.02, 0.3, 0.05]) + rng.uniform(-0.05, 0.05, 3)).as_matrix()
+    t = np.array([-1.5, 0.2, 0.4]) + rng.uniform(-0.1, 0.1, 3)
+    seen = zip((X, X @ R.T + t), cameras, strict=True)
+    x0, x1 = ((Y / Y[:, 2:] @ K.T)[:, :2] + rng.normal(0, noise, (count, 2)) for Y, K in seen)
+    right = rng.random(count) >= outliers
+    x1[~right] = rng.uniform([0, 0], SIZE[::-1], ((~right).sum(), 2))
+    return Scene(x0, x1, right, R, t / np.linalg.norm(t))
+
+
+def square(K: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """The map from pixels of K to square ones about the image centre, and their K."""
+    h, w = size
+    f = np.sqrt(K[0, 0] * K[1, 1])
+    new = np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1]])
+    return new @ np.linalg.inv(K), new
+
+
+def fundamental(R: np.ndarray, t: np.ndarray, cameras: tuple = (K0, K1)) -> np.ndarray:
+    """F = K1^-T [t]x R K0^-1 of unit norm."""
+    F = np.linalg.inv(cameras[1]).T @ cross_matrix(t) @ R @ np.linalg.inv(cameras[0])
+    return F / np.linalg.norm(F)
+
+
+def best_pose(s: Scene, weight: np.ndarray, cameras: tuple = (K0, K1)) -> tuple[np.ndarray, np.ndarray]:
+    """R, t of least weighted squared Sampson error in the images of square pixels, near the true ones."""
+    (A0, C0), (A1, C1) = (square(K, SIZE) for K in cameras)
+    x0, x1 = ((np.c_[x, np.ones(len(x))] @ A.T)[:, :2] for x, A in ((s.x0, A0), (s.x1, A1)))
+
+    def pose(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        t = s.t + p[3] * a + p[4] * b
+        return Rotation.from_rotvec(p[:3]).as_matrix() @ s.R, t / np.linalg.norm(t)
+
+    a, b = np.linalg.svd(s.t[None])[2][1:]
+    fit = least_squares(
+        lambda p: np.sqrt(weight) * sampson(fundamental(*pose(p), (C0, C1)), x0, x1), np.zeros(5),
+        jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15,
+    )  # fmt: skip
+    return pose(fit.x)
+
+
+def angle(R: np.ndarray, S: np.ndarray) -> float:
+    """Between two rotations, degrees."""
+    return float(np.degrees(np.linalg.norm(Rotation.from_matrix(R @ S.T).as_rotvec())))
+
+
+def pose_error(R: np.ndarray, t: np.ndarray, s: Scene) -> float:
+    """The larger of the angles of rotation and translation, degrees."""
+    sine, cosine = np.linalg.norm(np.cross(t, s.t)), t @ s.t
+    return max(angle(R, s.R), float(np.degrees(np.arctan2(sine, cosine))))
