@@ -88,12 +88,12 @@ def test_a_run_with_cameras_is_another_run(tmp_path: Path) -> None:
     arguments = ["pipeline=sift_fmtorch", "dataset=fmbench", f"dataset.root={shared_path('data/Strecha_train')}"]
     arguments += ["limit=2", "workers=1"]
     errors = {}
-    for word in ("null", "known"):
-        done = run_command("eval", *arguments, f"cameras={word}", f"run_dir={word}", cwd=tmp_path)
+    for word, name in (("null", "without"), ("known", "known")):
+        done = run_command("eval", *arguments, f"cameras={word}", f"run_dir={name}", cwd=tmp_path)
         assert done.returncode == 0, done.stderr
-        identity = json.loads((tmp_path / word / "run.json").read_text())
+        identity = json.loads((tmp_path / name / "run.json").read_text())["config"]
         assert identity.get("cameras") == (None if word == "null" else word)
-        summary = json.loads((tmp_path / word / "summary.json").read_text())
+        summary = json.loads((tmp_path / name / "summary.json").read_text())
         errors[word] = max(summary["all"]["pose"]["rotation"], summary["all"]["pose"]["translation"])
     assert errors["known"] < 0.5
     refused = run_command("eval", *arguments, "cameras=shared", "run_dir=known", cwd=tmp_path)
