@@ -58,7 +58,8 @@ SLOW = (
 
 PEERS = {"poselib": "poselib", "poselib_shared_focal": "poselib", "degensac_cpp": "pydegensac",
          "gc_ransac_cpp": "pygcransac", "magsac_cpp": "pymagsac", "superansac_cpp": "pysuperansac",
-         "poselib_f": "poselib", "colmap": "pycolmap", "colmap_f": "pycolmap", "superansac": "pysuperansac"}  # fmt: skip
+         "poselib_f": "poselib", "colmap": "pycolmap", "colmap_f": "pycolmap", "superansac": "pysuperansac",
+}  # fmt: skip
 
 TINY = ["features.max_features=500"]
 DATASET = ["dataset=fmbench", "dataset.root=DATA/Strecha", "limit=1"]

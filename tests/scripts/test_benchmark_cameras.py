@@ -34,10 +34,12 @@ def item(seed: int = 0, K0: np.ndarray = K, family: str = "orbit", scene: str = 
     name = f"{family}/{scene}/{seed}"
     pair = ImagePair(name, family, scene, image, image, fundamental(K0, K, R, T), K0, K, R, T)
     ratio = torch.linspace(0.3, 0.8, 250)[None]
-    sizes = torch.from_numpy(SIZES)
+    sizes, frames = torch.from_numpy(SIZES), [torch.diag(torch.tensor([4.0, 4])).expand(1, 250, 2, 2)] * 2
+    points = [torch.from_numpy(x)[None].float() for x in (x0, x1)]
+    lafs0, lafs1 = (torch.cat([A, x[..., None]], -1) for A, x in zip(frames, points, strict=True))
     matches = Correspondences(
-        torch.from_numpy(x0)[None].float(), torch.from_numpy(x1)[None].float(), torch.ones(1, 250, dtype=torch.bool),
-        quality=ratio, size0=sizes[:1], size1=sizes[1:], key=torch.tensor([pair.key]),
+        *points, torch.ones(1, 250, dtype=torch.bool), quality=ratio, lafs0=lafs0, lafs1=lafs1, size0=sizes[:1],
+        size1=sizes[1:], key=torch.tensor([pair.key]),
     )  # fmt: skip
     return pair, matches
 
@@ -111,6 +113,19 @@ def test_every_peer_solves_an_easy_pair_at_each_level_that_it_takes(name: str, l
         assert row["translation"] < bound
         assert row["nsgd"] < 0.01
         assert all(error < 0.1 for error in focals)  # the usual focal length is off by a quarter
+
+
+@pytest.mark.parametrize("method", [f"fmtorch:{level}" for level in cameras_knowledge.LEVELS] + ["fmtorch_f:known"])
+def test_our_own_methods_solve_an_easy_pair(method: str) -> None:
+    pair, matches = item()
+    given = knowledge(cameras_methods.read(method).level, pair, SIZES, 0)
+    row = cameras.judge(cameras_methods.build(method), (pair, matches), given, 0)
+    assert row["posed"]
+    assert row["rotation"] < 1
+    assert row["translation"] < 1
+    assert row["nsgd"] < 0.01
+    assert all(error < 0.05 for error in row.get("focals", ()))
+    assert len(row.get("focals", ())) == {"known": 0, "one_sided": 1}.get(cameras_methods.read(method).level, 2)
 
 
 def test_a_peer_that_refuses_or_has_too_few_matches_gives_nothing() -> None:
