@@ -76,16 +76,14 @@ class Correspondences(Record):
 
     x0, x1: matched points (B, N, 2) in pixels. mask: (B, N).
     quality: the matcher's own figure (B, N), for nearest neighbours the distance ratio; smaller is better.
-    prior: P(inlier) in [0, 1], (B, N), where something supplies it.
-    noise: standard deviation of each match's distance to its epipolar line, relative to that of a usual match, (B, N),
-    where something supplies it.
+    prior: P(inlier) in [0, 1], (B, N), where something supplies it. noise: standard deviation of each match's distance
+    to its epipolar line, relative to that of a usual match, (B, N), where something supplies it.
     lafs0, lafs1: local affine frames (B, N, 2, 3) where known. size0, size1: image sizes (B, 2) as (h, w).
     K0, K1: calibration matrices (B, 3, 3) where known. key: (B,) int64, see `pair_key`; 0 when not given.
     mutual: (B, N), True where the match is also the best one of its partner, where the matcher knows.
-    focal: what estimators may take for known of the focal lengths of image 0 and 1, (B, 2, 2): px, and the relative
-    standard deviation, 0 of a calibration, infinite where unknown; for square pixels and central principal points.
-    shared_focal: (B,), True where both images have one focal length in units of their longer sides. Where neither is
-    given an estimate is of fundamental matrices alone, whatever K0 and K1 are.
+    focal: what estimators may take for known of the focal lengths of both images, (B, 2, 2): px and relative standard
+    deviation (0 exact, infinite unknown), for square pixels and central principal points. shared_focal: (B,), whether
+    both are one in units of the longer sides. Without these estimates are of F alone, whatever K0 and K1 are.
     """
 
     x0: Float[Tensor, "b n 2"]
@@ -117,6 +115,11 @@ class Correspondences(Record):
     def keys(self) -> Int[Tensor, " b"]:
         """The pairs' keys, never None."""
         return cast(Tensor, self.key)
+
+    @property
+    def asks_for_cameras(self) -> bool:
+        """Whether estimates have focal lengths."""
+        return self.focal is not None or self.shared_focal is not None
 
     def __len__(self) -> int:
         """Number of pairs."""
@@ -153,9 +156,7 @@ class Estimate(Record):
     number of models with as much support that are expected among images that show nothing in common; -inf where `ok`
     is False, NaN where nobody has computed it; never None. model: what `F` is, "fundamental", or "homography" for
     `x1 ~ F x0`, which is positive where the plane is seen; then `H` is another name for it.
-    Of pairs whose cameras are known, or estimated with the models, NaN where they are not determined, None where nobody
-    asks: focals, the focal lengths of both images (B, 2), px; R (B, 3, 3) and t (B, 3) of unit length, X1 = R X0 + t of
-    points in the frames of the cameras, in front of which the inliers are; E = [t]_x R (B, 3, 3).
+    Where cameras are known or asked for, NaN if not determined: focals (B, 2), px; X1 = R X0 + t; E = [t]_x R.
     """
 
     F: Float[Tensor, "b 3 3"]

@@ -20,7 +20,7 @@ from fmtorch.core.rules import FOCAL, SIZE
 from fmtorch.core.threads import available, mapped
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.calibration import EXACT, calibration_of
-from fmtorch.estimators.families.cameras import focals_px
+from fmtorch.estimators.families.cameras import focals_near, focals_px
 from fmtorch.estimators.families.family import Estimated
 from fmtorch.estimators.gradients import Attach, Solved, with_gradients
 from fmtorch.estimators.pair import Pair, PixelMatches, bucket, normalize_pair
@@ -58,7 +58,7 @@ def estimated(
     rounding = relative_rounding(c)
     F, inliers, ok = np.zeros((b, 3, 3)), np.zeros((b, n), np.bool_), np.zeros(b, np.bool_)
     draws, significance, reasons = np.zeros(b, np.int64), np.full(b, -np.inf), [""] * b
-    focals = np.full((b, 2), np.nan)
+    focals, asked = np.full((b, 2), np.nan), family.model == "fundamental" and c.asks_for_cameras
     keep = torch.is_grad_enabled() and c.requires_grad
     solved: dict[int, Solved] = {}
 
@@ -81,8 +81,9 @@ def estimated(
         inliers[i, slot] = solution.inliers
         significance[i] = _significance(F[i], matches) if family.model == "fundamental" else np.nan
         ok[i] = True
-        if solution.fit.cameras is not None:
-            focals[i] = focals_px(solution.fit.cameras, pair)
+        if asked and pair.sizes_known:
+            cameras = solution.fit.cameras
+            focals[i] = focals_near(solution.fit.F, pair) if cameras is None else focals_px(cameras, pair)
         if keep:
             solved[i] = Solved(pair, slot, solution.fit)
         return ""
@@ -94,7 +95,7 @@ def estimated(
 
     mapped(estimate_all, [part.tolist() for part in shared_out(host)] if b > 1 and available() > 1 else [range(b)])
     fields = {"F": F, "inliers": inliers, "ok": ok, "draws": draws, "significance": significance}
-    if c.focal is not None or c.shared_focal is not None:
+    if asked:
         fields["focals"] = focals
     tensors = {name: torch.from_numpy(value).to(c.mask.device) for name, value in fields.items()}
     estimates = Estimate.made(reason=tuple(reasons), model=family.model, **tensors)

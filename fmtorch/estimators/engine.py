@@ -150,7 +150,8 @@ class HypothesizeAndVerify:
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
         compile_together(self.kernels)
-        if self.focal is not None and self.focal.options.exact is not None and self.focal.options.exact.sqrt_prior:
+        exact = None if self.focal is None else self.focal.options.exact_focals
+        if exact is not None and exact.sqrt_prior:
             c = with_sqrt_prior(c)
         return estimated(c, seed, self.family.size, self.family, self.estimate, Attached(self.final, self.family))
 
@@ -211,5 +212,6 @@ def _focal_search(
     family, own = FundamentalWithFocals(), None
     if options.samples:
         own = Search(family, search.sampler, search.preselection, options.pool, options.samples, FOCAL_ROUND)
-    exact = select.score if options.exact is None else part("score", choice.score, threshold=options.exact.scale)
-    return FocalSearch(options, family, select.score, exact, refinement, own, search.stop)
+    exact = options.exact_focals
+    exact_gain = select.score if exact is None else part("score", choice.score, threshold=exact.scale)
+    return FocalSearch(options, family, select.score, exact_gain, refinement, own, search.stop)

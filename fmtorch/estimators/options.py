@@ -110,10 +110,10 @@ class Focal:
     pool: int = 12
     candidates: int = 12
     iterations: int = 12
-    exact: ExactFocals | None = None
+    exact: ExactFocals | Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "exact", group("focal.exact", self.exact, ExactFocals))
+        group("focal.exact", self.exact, ExactFocals)
         if self.min_rounds > self.rounds:
             raise ValueError(f"focal.min_rounds is {self.min_rounds}; it must be at most focal.rounds, {self.rounds}")
         _at_least(0, **{"focal.samples": self.samples, "focal.iterations": self.iterations})
@@ -127,6 +127,11 @@ class Focal:
                 "focal.candidates": self.candidates,
             },
         )
+
+    @property
+    def exact_focals(self) -> ExactFocals | None:
+        """The options of `exact`."""
+        return group("focal.exact", self.exact, ExactFocals)
 
 
 def at_least_one(**values: int) -> None:

@@ -16,8 +16,8 @@ from torch import Tensor
 from fmtorch.geometry.arithmetic import sqrt
 
 MIN_FOCAL, MAX_FOCAL = 0.1, 10.0  # in units of the longer side; K of other focal lengths is of another unit or image
-MIN_SIDE_PX = 16.0  # longer side, or focal length, of coordinates that are pixels; others are normalised
-NOMINAL_FOCAL_PX = 1000.0  # of the image that normalised points are mapped to
+MIN_SIDE_PX, MAX_SIDE_PX = 16.0, 1e6  # longer sides, or focal lengths, of coordinates that are pixels
+NOMINAL_FOCAL_PX = 1000.0  # of the image that points of another unit, such as normalised ones, are mapped to
 USUAL_FOCAL = 1.2  # in units of the longer side, where neither size nor principal point tells that
 
 
@@ -46,14 +46,14 @@ def square_pixels(
         valid: (B,), where `calibration_problems` has nothing to say.
 
     Returns:
-        `SquarePixels`. Normalised coordinates, with a longer side (or, if that is not known, a focal length) below
-        MIN_SIDE_PX, are mapped to an image of a focal length of NOMINAL_FOCAL_PX.
+        `SquarePixels`. Where the longer side (or, if that is not known, the focal length) is not within MIN_SIDE_PX and
+        MAX_SIDE_PX, the unit is not a pixel, and points are mapped to an image of a focal length of NOMINAL_FOCAL_PX.
     """
     K = torch.where(valid[:, None, None], K.to(torch.float64), torch.eye(3, dtype=torch.float64, device=K.device))
     K = K / K[:, 2:, 2:]
     fx, skew, cx, fy, cy = K[:, 0, 0], K[:, 0, 1], K[:, 0, 2], K[:, 1, 1], K[:, 1, 2]
-    focal, image, small = _image(K.detach(), size)
-    scale = torch.where(small, NOMINAL_FOCAL_PX / focal, 1.0)
+    focal, image, in_pixels = _image(K.detach(), size)
+    scale = torch.where(~in_pixels, NOMINAL_FOCAL_PX / focal, 1.0)
     f, image = focal * scale, image * scale[:, None]
     x, y = (image[:, 1] - 1) / 2, (image[:, 0] - 1) / 2
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
@@ -64,16 +64,17 @@ def square_pixels(
 
 
 def _image(K: Tensor, size: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Focal lengths and sizes in the unit of K, and whether these are normalised coordinates."""
+    """Focal lengths and sizes in the unit of K, and whether that is a pixel."""
     focal = sqrt(K[:, 0, 0] * K[:, 1, 1])
     if size is not None:
         image = size.to(torch.float64)
-        return focal, image, image.amax(1) < MIN_SIDE_PX
+        return focal, image, (image.amax(1) >= MIN_SIDE_PX) & (image.amax(1) <= MAX_SIDE_PX)
     centre = K[:, [1, 0], 2]
     longest = centre.amax(1) * 2 + 1
     central = (centre > 0).all(1) & (longest * MIN_FOCAL < focal) & (focal < longest * MAX_FOCAL)
     square = (focal / USUAL_FOCAL)[:, None].expand(-1, 2)
-    return focal, torch.where(central[:, None], 2 * centre + 1, square), focal < MIN_SIDE_PX
+    in_pixels = (focal >= MIN_SIDE_PX) & (focal <= MAX_SIDE_PX)
+    return focal, torch.where(central[:, None], 2 * centre + 1, square), in_pixels
 
 
 def calibration_problems(

@@ -34,7 +34,7 @@ def estimated(
     estimator = _estimator(name, config_dir, options)
     if (gives := model_of(estimator)) != model:
         raise ValueError(f"estimator={name} gives {gives} matrices; find_{model} needs one that gives {model} matrices")
-    if c.focal is None and c.shared_focal is None:
+    if not c.asks_for_cameras:
         return _with_prior(c, seed, estimator=estimator)
     return KnownCameras(functools.partial(_with_prior, estimator=estimator))(c, seed)
 

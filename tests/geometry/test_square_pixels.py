@@ -35,15 +35,15 @@ def test_an_image_of_unknown_size_is_central() -> None:
     torch.testing.assert_close(middle, torch.tensor([[[310.0, 250.0]]], dtype=torch.float64))
 
 
-@pytest.mark.parametrize("scale", [1e-9, 1e-3, 1.0, 1e9])
+@pytest.mark.parametrize("scale", [1e-9, 1e-3, 1.0, 1e3, 1e9])
 @pytest.mark.parametrize("central", [True, False])
 def test_the_unit_of_normalised_points_does_not_matter(scale: float, central: bool) -> None:
-    """They are mapped to an image of 1000 px of focal length; others keep their own unit."""
+    """They are mapped to an image of 1000 px of focal length; pixels keep their unit."""
     K = torch.diag(torch.tensor([1.5, 1.5, 1.0], dtype=torch.float64))
     K[:2, 2] = torch.tensor([0.5, 0.4]) if central else 0.0
     K[:2] *= scale
     found = square_pixels(K[None], None, RIGHT)
-    assert float(found.focal) == pytest.approx(1000.0 if scale <= 1 else 1.5 * scale)
+    assert float(found.focal) == pytest.approx(1500.0 if scale == 1e3 else 1000.0)
     point = K[:2, 2] + K[0, 0] * torch.tensor([0.3, -0.2])
     (at,) = mapped(point[None, None], found.map)[0]
     centre = (found.size[0].flip(0) - 1) / 2

@@ -85,6 +85,14 @@ def focals_px(cameras: Cameras, pair: Pair) -> Array:
     return np.array([exponential(f0), exponential(f1)]) * images_of(pair).longest * pair.pixels_per_unit
 
 
+def focals_near(F: Array, pair: Pair) -> Array:
+    """The focal lengths (2,) near a model (9,), px, by Bougnoux's formula; NaN of those that are measured."""
+    cameras, calibration = no_cameras(1), pair.calibration
+    nearest_cameras(F[None], images_of(pair), cameras)
+    focals = focals_px(cameras, pair)
+    return focals if calibration is None else np.where(np.isinf(calibration.deviations), focals, np.nan)
+
+
 class CentredMatches(NamedTuple):
     """Points (4, n) from the principal points; s2 (n,), squared scales of a loss in the unit of the points; precision
     (n,), one over these."""
