@@ -205,11 +205,14 @@ def _kornia(
     return _of_essential(E.double().numpy(), mask.numpy(), x, given)
 
 
-def _superansac(x: Points, given: Knowledge, seed: int, *, threshold: float = 1.5, iterations: int = 5000) -> Answer:
+def _superansac(
+    x: Points, given: Knowledge, seed: int, *, threshold: float = 1.5, iterations: int = 5000, sampler: str = "PROSAC",
+    score: str = "MAGSAC",
+) -> Answer:  # fmt: skip
     library = importlib.import_module("pysuperansac")
     K0, K1 = _both(given)
     settings = library.RANSACSettings()
-    settings.sampler, settings.scoring = library.SamplerType.PROSAC, library.ScoringType.MAGSAC
+    settings.sampler, settings.scoring = getattr(library.SamplerType, sampler), getattr(library.ScoringType, score)
     settings.inlier_threshold, settings.confidence = threshold, 0.9999
     settings.min_iterations, settings.max_iterations = min(1000, iterations), iterations
     sizes = [float(2 * v) for K in (K0, K1) for v in K[:2, 2]]
