@@ -59,12 +59,12 @@ def find_essential(
         >>> generator = torch.Generator().manual_seed(0)
         >>> X = torch.rand(80, 3, generator=generator, dtype=torch.float64) + torch.tensor([0.0, 0.0, 2.0])
         >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=torch.float64)
-        >>> x0, x1 = (Y @ K.T for Y in (X, X + torch.tensor([-0.6, 0.0, 0.8])))
+        >>> x0, x1 = (Y @ K.T for Y in (X, X + torch.tensor([-0.64, 0.48, 0.6])))
         >>> x0, x1 = x0[:, :2] / x0[:, 2:], x1[:, :2] / x1[:, 2:]
         >>> x1[:20] = x1[:20].flip(0)                            # twenty wrong matches
         >>> estimate = fmtorch.find_essential(x0, x1, K, K)
         >>> bool(estimate.ok[0]), [round(value, 3) for value in estimate.t[0].tolist()]
-        (True, [-0.6, 0.0, 0.8])
+        (True, [-0.64, 0.48, 0.6])
     """
     for name, K in (("K0", K0), ("K1", K1)):
         if K is None:
