@@ -18,6 +18,7 @@ from fmtorch.commands.main import job, run_command
 from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.data import ImagePair, PairDataset
 from fmtorch.evaluation.identity import run_identity
+from fmtorch.evaluation.pair_cameras import Cameras, built_with, cameras_of
 from fmtorch.evaluation.plots import plot_recall_curves
 from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import ALL, Group, summarize
@@ -41,6 +42,7 @@ class Fields:
 
     limit: Count | None = None
     seed: Seed = 0
+    cameras: Cameras | None = None
     device: Device = "auto"
     batch: Count = 16
     workers: Count | None = None
@@ -64,7 +66,7 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
     with progress_bars() as progress:
         pipeline: Pipeline = presets.build_pipeline(config, device)
         dataset = _load(config.dataset, progress)
-        folder = _open_folder(config, fields.run_dir, pipeline_name, pipeline, dataset)
+        folder = _open_folder(config, fields, pipeline_name, pipeline, dataset)
         pairs = select([dataset[i] for i in range(len(dataset))], fields.limit)
         journal = _journal(folder.path, pairs) if exports else None
         todo = _missing(pairs, folder, journal)
@@ -91,12 +93,12 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
 
 
 def _open_folder(
-    config: DictConfig, run_dir: Path | None, pipeline_name: str, pipeline: Pipeline, dataset: PairDataset
+    config: DictConfig, fields: Fields, pipeline_name: str, pipeline: Pipeline, dataset: PairDataset
 ) -> RunFolder:
-    """The folder of the run with this identity, `run_dir` if given, new or to be continued."""
-    identity = run_identity(config, pipeline_name, pipeline, dataset.digest)
+    """The folder of the run with this identity, its `run_dir` if given, new or to be continued."""
+    identity = run_identity(config, pipeline_name, pipeline, dataset.digest, fields.cameras)
     name = f"{pipeline_name}-{identity_digest(identity)[:8]}"
-    return RunFolder.open(run_dir or Path(f"runs/{dataset.name}/{name}"), identity)
+    return RunFolder.open(fields.run_dir or Path(f"runs/{dataset.name}/{name}"), identity)
 
 
 def _missing(pairs: Sequence[ImagePair], folder: RunFolder, journal: Journal | None) -> list[ImagePair]:
@@ -115,6 +117,10 @@ def _evaluated(
     processes = processes and device.type == "cpu"
     workers = fields.workers or (1 if device.type != "cpu" else min(cores, MAX_PROCESSES) if processes else cores)
     build = functools.partial(presets.build_pipeline, config, device) if processes and workers > 1 else None
+    if fields.cameras is not None:
+        cameras = cameras_of(pairs, fields.cameras)
+        build = None if build is None else functools.partial(built_with, build, cameras)
+        pipeline = built_with(lambda: pipeline, cameras)
     return evaluate_pairs(
         pipeline, pairs, seed=fields.seed, batch=fields.batch, workers=workers, store=folder.append, build=build,
         journal=journal,

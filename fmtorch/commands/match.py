@@ -20,23 +20,24 @@ from rich.table import Table
 
 from fmtorch import presets
 from fmtorch.commands.main import job, run_command
+from fmtorch.commands.match_cameras import CameraFields, photographs, pose_line, pose_report
 from fmtorch.commands.match_folder import FolderFields, match_folder
 from fmtorch.core.files import replacing
 from fmtorch.core.terminal import console
 from fmtorch.core.types import RELATED
 from fmtorch.core.version import __version__
-from fmtorch.data import read_image
 from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_matches
 from fmtorch.metrics import nsgd
 from fmtorch.pipeline.folder import EXHAUSTIVE
 from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.pipeline.two_images import Image, MatchResult, match
+from fmtorch.pipeline.reduced_images import Image
+from fmtorch.pipeline.two_images import MatchResult, match
 from fmtorch.presets.fields import Cache, Gigabytes, path_fields, read_fields
 from fmtorch.storage.features import CachedFeatures
 
 
 @dataclasses.dataclass(frozen=True)
-class Fields(FolderFields):
+class Fields(CameraFields, FolderFields):
     """What the command takes beside stages; ``conf/match.yaml`` says what each is."""
 
     image0: Path | None = None
@@ -55,19 +56,24 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     if fields.images is not None:
         if fields.image0 is not None or fields.image1 is not None or fields.truth is not None:
             raise ValueError("images takes a folder; image0, image1 and truth are of a single pair")
+        if fields.cameras is not None or fields.K is not None:
+            raise ValueError("cameras and K are of a single pair; a folder of images takes neither")
         return match_folder(config, fields, pipeline_name, overrides)
     if fields.export is not None or str(fields.pairs or EXHAUSTIVE) != EXHAUSTIVE:
         raise ValueError("export and pairs are of a folder of images: give images=FOLDER")
     paths = [_given(fields.image0, "image0"), _given(fields.image1, "image1")]
     presets.expect_stages(config)
     truth = None if fields.truth is None else read_matrix(fields.truth)
-    image0, image1 = (read_image(path, orient=fields.orient) for path in paths)
+    given = photographs(paths, fields.cameras, fields.K, fields.orient)
+    image0, image1 = given.images
     pipeline: Pipeline = presets.build_pipeline(config, presets.resolve_device(fields.device))
-    result = match(image0, image1, pipeline=pipeline, longest_side=fields.longest_side, seed=fields.seed)
+    result = match(
+        image0, image1, pipeline=pipeline, longest_side=fields.longest_side, seed=fields.seed, **given.knowledge
+    )
     report = {
         "version": __version__, "pipeline": pipeline_name, "overrides": list(overrides), "seed": fields.seed,
         "image0": str(paths[0]), "image1": str(paths[1]),
-        **_report(result, image0, image1, truth),
+        **_report(result, image0, image1, truth), **pose_report(result),
     }  # fmt: skip
     folder = fields.output or Path(f"matches/{paths[0].stem}-{paths[1].stem}")
     folder.mkdir(parents=True, exist_ok=True)
@@ -79,7 +85,9 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     console.print(_table(result))
     if "nsgd" in report:
         console.print(f"NSGD to the true F: {report['nsgd']:.4f}", highlight=False)
-    for trouble in _troubles(result):
+    if line := pose_line(result):
+        console.print(line, highlight=False)
+    for trouble in (*given.notes, *_troubles(result)):
         Console(stderr=True).print(f"[bold]{trouble}[/bold]", highlight=False, soft_wrap=True)
     console.print(f"[dim]{folder}: {', '.join(written)}[/dim]", highlight=False)
     if isinstance(pipeline.extractor, CachedFeatures):
@@ -188,4 +196,4 @@ def task(config: DictConfig) -> None:
 
 def main() -> None:
     """The command."""
-    run_command("match", task, paths=[*path_fields(Fields), "export"], positional=("image0", "image1"))
+    run_command("match", task, paths=[*path_fields(Fields), "export", "K"], positional=("image0", "image1"))

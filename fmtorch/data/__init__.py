@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from fmtorch.core.options import expect_options
+from fmtorch.data.exif import ExifFocal, exif_focal
 from fmtorch.data.fmbench import FMBenchPairs
 from fmtorch.data.images import ImageError, read_image, to_grey
 from fmtorch.data.pairs import DepthDataset, ImagePair, ImageSource, PairDataset
@@ -23,6 +24,7 @@ __all__ = [
     "SCENE_SETS",
     "DataError",
     "DepthDataset",
+    "ExifFocal",
     "FMBenchPairs",
     "ImageError",
     "ImagePair",
@@ -30,6 +32,7 @@ __all__ = [
     "PairBatch",
     "PairDataset",
     "collate",
+    "exif_focal",
     "expect_loadable",
     "load",
     "read_image",

@@ -21,10 +21,11 @@ _POINTS = "a line of X Y POINT3D_ID for each point, which may be empty"
 def read_text(folder: Path, points: bool = True) -> Model:
     """The model in a folder's text files. points: read which points each image sees."""
     files = (folder / "cameras.txt", folder / "images.txt")
-    return assembled(_cameras(files[0]), _images(files[1], points), files)
+    return assembled(read_cameras(files[0]), _images(files[1], points), files)
 
 
-def _cameras(path: Path) -> dict[int, ModelCamera]:
+def read_cameras(path: Path) -> dict[int, ModelCamera]:
+    """The cameras of a file cameras.txt by their numbers. Raises DataError, naming file and line."""
     cameras = {}
     for number, line in numbered(path):
         words, place = line.split(), f"{path}, line {number}"

@@ -23,7 +23,9 @@ from fmtorch.storage.features import CachedFeatures
 PLACES = ("root", "truth", "images")  # options of data sets that say where things lie; the digest says what they are
 
 
-def run_identity(config: DictConfig, pipeline_name: str, pipeline: Pipeline, dataset_digest: str) -> dict[str, Any]:
+def run_identity(
+    config: DictConfig, pipeline_name: str, pipeline: Pipeline, dataset_digest: str, cameras: str | None = None
+) -> dict[str, Any]:
     """The identity of a run, as plain values.
 
     Args:
@@ -31,12 +33,13 @@ def run_identity(config: DictConfig, pipeline_name: str, pipeline: Pipeline, dat
         pipeline_name: the preset that it began with.
         pipeline: what was built of the config.
         dataset_digest: of the contents of the data set.
+        cameras: what the estimator is given of the cameras; None: nothing.
 
     Returns:
         `pipeline`, each stage's config (pruners as a list), `seed`; `version` of fmtorch, in a checkout its commit;
         `libraries`: their versions; `kernels`: by which numba, or off; `learned`: digests of each stage's learned
         files; `code`: digests of the sources of parts of the user's own; `dataset`: its config, without where it lies,
-        and its digest.
+        and its digest; `cameras`, where they are given.
     """
     stages = presets.stages(config)
     dataset = {
@@ -48,6 +51,7 @@ def run_identity(config: DictConfig, pipeline_name: str, pipeline: Pipeline, dat
         "libraries": libraries(presets.peer_packages(stages)), "kernels": switch.identity(),
         "learned": _learned(stages, pipeline),
         "code": _code({"stages": stages, "dataset": dataset}), "dataset": dataset,
+        **({} if cameras is None else {"cameras": cameras}),
     }  # fmt: skip
 
 

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from fmtorch.data.pairs import ImagePair
 from fmtorch.evaluation.outcomes import joined_correspondences, joined_estimates
-from fmtorch.metrics import fundamental_pose_error
+from fmtorch.metrics import fundamental_pose_error, pose_error
+from fmtorch.metrics.pose import PoseError
 from fmtorch.pipeline.pipeline import Outcome
 
 LARGEST_ROTATION, LARGEST_TRANSLATION = 180.0, 90.0  # degrees: what a failed pair counts as
@@ -27,24 +28,37 @@ class PairPose(NamedTuple):
 
 
 def pose_errors(outcomes: Sequence[Outcome]) -> list[PairPose]:
-    """The pose error of each pair by its F, K0, K1 and the estimator's inliers, see `fundamental_pose_error`.
+    """The pose error of each pair: of the estimate's R and t, or else of its F, K0, K1 and the estimator's inliers.
 
-    A pair without F, or whose F has no pose, has the largest errors and a reason; one whose calibration or motion is
-    unknown has a reason only.
+    See `pose_error` and `fundamental_pose_error`. A pair without F, or without a pose, has the largest errors and a
+    reason; one whose calibration or motion is unknown has a reason only.
     """
     poses = [_without_estimate(outcome) for outcome in outcomes]
     known = [i for i, o in enumerate(outcomes) if poses[i].reason is None]
-    if known:
-        estimated = [outcomes[i] for i in known]
-        c, estimate = joined_correspondences(estimated), joined_estimates(estimated)
-        K0, K1, R, t = (
-            _stacked([getattr(o.pair, name) for o in estimated]) for name in ("K0", "K1", "R", "t")
-        )  # fmt: skip
-        error = fundamental_pose_error(estimate.F.double(), K0, K1, c.x0, c.x1, R, t, estimate.inliers & c.mask)
-        for i, rotation, translation in zip(known, error.rotation.tolist(), error.translation.tolist(), strict=True):
-            none = rotation >= LARGEST_ROTATION
-            poses[i] = PairPose(rotation, translation, "no inlier in front of both cameras" if none else None)
+    for estimated, error_of, reason in (
+        (True, _of_pose, "the pose is not determined"), (False, _of_fundamental, "no inlier in front of both cameras"),
+    ):  # fmt: skip
+        own = [i for i in known if _has_pose(outcomes[i]) == estimated]
+        error = error_of([outcomes[i] for i in own]) if own else PoseError(torch.zeros(0), torch.zeros(0))
+        for i, rotation, translation in zip(own, error.rotation.tolist(), error.translation.tolist(), strict=True):
+            poses[i] = PairPose(rotation, translation, reason if rotation >= LARGEST_ROTATION else None)
     return poses
+
+
+def _has_pose(outcome: Outcome) -> bool:
+    """Whether the estimator gives a pose, which may not be determined."""
+    return outcome.estimate is not None and outcome.estimate.R is not None
+
+
+def _of_pose(outcomes: Sequence[Outcome]) -> PoseError:
+    estimate, (R, t) = joined_estimates(outcomes), _truth(outcomes, "R", "t")
+    return pose_error(cast(Tensor, estimate.R).double(), cast(Tensor, estimate.t).double(), R, t)
+
+
+def _of_fundamental(outcomes: Sequence[Outcome]) -> PoseError:
+    c, estimate = joined_correspondences(outcomes), joined_estimates(outcomes)
+    K0, K1, R, t = _truth(outcomes, "K0", "K1", "R", "t")
+    return fundamental_pose_error(estimate.F.double(), K0, K1, c.x0, c.x1, R, t, estimate.inliers & c.mask)
 
 
 def _without_estimate(outcome: Outcome) -> PairPose:
@@ -67,5 +81,7 @@ def unknown(pair: ImagePair) -> str | None:
     return f"{', '.join(broken)} not finite" if broken else None
 
 
-def _stacked(values: Sequence[NDArray[np.float64] | None]) -> Tensor:
-    return torch.stack([torch.from_numpy(np.asarray(value, np.float64)) for value in values])
+def _truth(outcomes: Sequence[Outcome], *names: str) -> list[Tensor]:
+    """What is true of each pair, by its names in `ImagePair`, float64."""
+    values = ([np.asarray(getattr(o.pair, name), np.float64) for o in outcomes] for name in names)
+    return [torch.from_numpy(np.stack(each)) for each in values]

@@ -1,6 +1,9 @@
-"""Images reduced for matching, and what was found in them in pixels of the originals."""
+"""Images as they are given, reduced for matching, and what was found in them in pixels of the originals."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,9 +12,23 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.data.images import read_image
 from fmtorch.geometry.epipolar import unit_frobenius
+from fmtorch.geometry.square_pixels import calibration_problems
 
 Image = NDArray[np.uint8]
+
+
+def given_image(image: Path | str | Image, name: str) -> Image:
+    """The pixels of a file, turned as its EXIF orientation says, or of an array; see `fmtorch.match`."""
+    if isinstance(image, Path | str):
+        return read_image(image, orient=True)
+    if not isinstance(image, np.ndarray):
+        raise TypeError(f"{name} is a {type(image).__name__}; it must be a file's path or a uint8 array of NumPy")
+    colour = image.ndim == 3 and image.shape[2] == 3
+    if image.dtype != np.uint8 or image.size == 0 or not (image.ndim == 2 or colour):
+        raise ValueError(f"{name} is {image.dtype} {image.shape}; it must be non-empty uint8, (H, W) or RGB (H, W, 3)")
+    return image
 
 
 def reduced_image(image: Image, longest_side: int) -> tuple[Image, Float[Tensor, " xy"]]:
@@ -36,11 +53,37 @@ def frames_to_original(lafs: Float[Tensor, "*batch 2 3"] | None, s: Tensor) -> F
     return torch.cat([lafs[..., :2] / s[:, None], to_original(lafs[..., 2:].mT, s).mT], -1)
 
 
+def reduced_cameras(
+    fields: Mapping[str, Tensor], scales: Sequence[Tensor], sizes: Sequence[tuple[int, int]]
+) -> dict[str, Tensor]:
+    """What is known of the cameras of two images as they were reduced, of a batch of one.
+
+    fields: of `camera_fields`, for the originals. scales: of both images in x and y. sizes: (h, w) of the originals.
+    Raises ValueError, naming it, for a K that is no calibration matrix of its image, and for a focal of several pairs.
+    """
+    if "focal" in fields and fields["focal"].shape != (2, 2):
+        raise ValueError(f"focal has shape {tuple(fields['focal'].shape)}; it must be of one pair of images")
+    reduced = {name: value[None].clone() for name, value in fields.items()}
+    for i, (s, size) in enumerate(zip(scales, sizes, strict=True)):
+        if f"K{i}" in reduced:
+            K = reduced[f"K{i}"].to(torch.float64)
+            if K.shape != (1, 3, 3):
+                raise ValueError(f"K{i} has shape {tuple(K.shape[1:])}; it must be (3, 3)")
+            if problem := calibration_problems(K, torch.tensor([size]), f"K{i}")[0]:
+                raise ValueError(problem)
+            reduced[f"K{i}"] = _reduction(s) @ K
+        if "focal" in reduced:
+            reduced["focal"][:, i, 0] *= s.prod().sqrt().item()
+    return reduced
+
+
+def _reduction(s: Tensor) -> Tensor:
+    """The map (3, 3) from pixels of the original to those of the reduced image."""
+    # (0, 0) is the centre of the first pixel, so x_reduced + 1/2 = s (x + 1/2).
+    return torch.tensor([[s[0], 0, (s[0] - 1) / 2], [0, s[1], (s[1] - 1) / 2], [0, 0, 1]], dtype=torch.float64)
+
+
 def fundamental_to_original(F: Float[Tensor, "3 3"], s0: Tensor, s1: Tensor) -> Float[Tensor, "3 3"]:
     """F between two reduced images in pixels of the originals, of unit Frobenius norm."""
-    # (0, 0) is the centre of the first pixel, so x_reduced + 1/2 = s (x + 1/2).
-    A0, A1 = (
-        torch.tensor([[s[0], 0, (s[0] - 1) / 2], [0, s[1], (s[1] - 1) / 2], [0, 0, 1]], dtype=torch.float64).to(F)
-        for s in (s0, s1)
-    )
+    A0, A1 = (_reduction(s).to(F) for s in (s0, s1))
     return unit_frobenius(A1.T @ F @ A0)

@@ -5,25 +5,34 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import cast
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch import presets
+from fmtorch.core.arguments import Arrays
 from fmtorch.core.threads import mapped, one_thread
 from fmtorch.core.types import RELATED, Correspondences, Estimate, Features
-from fmtorch.data.images import read_image
 from fmtorch.geometry.verdict import judged
+from fmtorch.pipeline.camera_arguments import Focal, camera_fields
+from fmtorch.pipeline.clock import Clock
+from fmtorch.pipeline.known_cameras import KnownCameras
 from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.pipeline.reduced_images import frames_to_original, fundamental_to_original, reduced_image, to_original
+from fmtorch.pipeline.reduced_images import (
+    Image,
+    frames_to_original,
+    fundamental_to_original,
+    given_image,
+    reduced_cameras,
+    reduced_image,
+    to_original,
+)
 
-Image = NDArray[np.uint8]
+NOTHING_KNOWN: Mapping[str, Tensor] = {}
 STILL = 0.1  # px of the images as matched: a median motion below it is none
 
 
@@ -38,6 +47,8 @@ class MatchResult:
     significance: how far the support of F is beyond chance (`fmtorch.geometry.significance`); -inf where there is no F.
     warning: why F, though found, means little; mostly empty. counts: matches after each step, in order. seconds: of
     each step, cached features with those they took when they were computed.
+    R (3, 3), t (3,), focals (2,): X1 = R X0 + t with a t of unit length, and focal lengths in pixels of the
+    photographs, where cameras were asked for; NaN where they are not determined.
     """
 
     keypoints0: Float[Tensor, "n0 2"]
@@ -52,6 +63,9 @@ class MatchResult:
     counts: dict[str, int] = dataclasses.field(default_factory=dict)
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     significance: float = -math.inf
+    R: Float[Tensor, "3 3"] | None = None
+    t: Float[Tensor, " 3"] | None = None
+    focals: Float[Tensor, " 2"] | None = None
 
     @property
     def related(self) -> bool:
@@ -72,6 +86,9 @@ def match(
     device: torch.device | str | None = None,
     longest_side: int = 1600,
     seed: int = 0,
+    K0: Arrays | None = None,
+    K1: Arrays | None = None,
+    focal: Focal = None,
 ) -> MatchResult:
     """Match two photographs and estimate their fundamental matrix.
 
@@ -82,15 +99,17 @@ def match(
         longest_side: larger images are reduced to it for matching, and thresholds are in pixels of the reduced images;
             the results are always in pixels of the originals.
         seed: of sampling.
+        K0, K1, focal: what is known of the cameras, in pixels of the photographs, as of `find_fundamental`.
 
     Returns:
         Matches, F and inliers in pixels of the originals. Photographs that cannot be related are no error: `related` is
-        False, and mostly `ok` is True, since some F is found all the same.
+        False, and mostly `ok` is True, since some F is found all the same. With K0, K1 or focal also the pose.
 
     Raises:
         ImageError: for a file that is no sound image.
         TypeError: for what is neither a path nor an array.
-        ValueError: for an array of another type or shape, an unknown pipeline, or a device that is not there.
+        ValueError: for an array of another type or shape, an unknown pipeline, a device that is not there, and for
+            cameras as `find_fundamental`.
 
     Example:
         >>> import fmtorch, skimage.data
@@ -107,11 +126,12 @@ def match(
         raise TypeError(f"pipeline is a {type(pipeline).__name__}; it must be the name of a preset or a Pipeline")
     elif device is not None and torch.device(device) != pipeline.device:
         raise ValueError(f"device={device}, but the pipeline was built for {pipeline.device}; leave one of them out")
-    images = [_image(image, name) for image, name in ((image0, "image0"), (image1, "image1"))]
+    images = [given_image(image, name) for image, name in ((image0, "image0"), (image1, "image1"))]
+    cameras = camera_fields(K0, K1, focal, sizes_known=True)
     describing = functools.partial(describe, pipeline, longest_side=longest_side)
     at_once = functools.partial(mapped, share=True) if pipeline.device.type == "cpu" else map
     described0, described1 = at_once(describing, images)
-    return relate(pipeline, described0, described1, seed)
+    return relate(pipeline, described0, described1, seed, cameras)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -139,13 +159,19 @@ def describe(pipeline: Pipeline, image: Image, longest_side: int) -> Described:
     return Described(features, scale, (image.shape[0], image.shape[1]), seconds)
 
 
-def relate(pipeline: Pipeline, described0: Described, described1: Described, seed: int = 0) -> MatchResult:
-    """What `match` finds of two photographs that are described already."""
-    clock = _Clock(pipeline.device)
+def relate(
+    pipeline: Pipeline, described0: Described, described1: Described, seed: int = 0,
+    cameras: Mapping[str, Tensor] = NOTHING_KNOWN,
+) -> MatchResult:  # fmt: skip
+    """What `match` finds of two photographs that are described already. cameras: of `camera_fields`."""
+    clock = Clock(pipeline.device)
     clock("features", described0.seconds + described1.seconds)
-    result = _relate(pipeline, described0.features, described1.features, seed, clock)
+    scales = [described0.scale, described1.scale]
+    known = reduced_cameras(cameras, scales, [described0.size, described1.size])
+    known = {name: value.to(pipeline.device) for name, value in known.items()}
+    result = _relate(pipeline, described0.features, described1.features, seed, clock, known)
     sizes = [torch.tensor([d.size], device=pipeline.device) for d in (described0, described1)]
-    return _restored(result, [described0.scale, described1.scale], sizes)
+    return _restored(result, scales, sizes)
 
 
 @functools.lru_cache(maxsize=8)
@@ -154,18 +180,9 @@ def _pipeline(name: str, device: str) -> Pipeline:
     return built
 
 
-def _image(image: Path | str | Image, name: str) -> Image:
-    if isinstance(image, Path | str):
-        return read_image(image, orient=True)
-    if not isinstance(image, np.ndarray):
-        raise TypeError(f"{name} is a {type(image).__name__}; it must be a file's path or a uint8 array of NumPy")
-    colour = image.ndim == 3 and image.shape[2] == 3
-    if image.dtype != np.uint8 or image.size == 0 or not (image.ndim == 2 or colour):
-        raise ValueError(f"{name} is {image.dtype} {image.shape}; it must be non-empty uint8, (H, W) or RGB (H, W, 3)")
-    return image
-
-
-def _relate(pipeline: Pipeline, features0: Features, features1: Features, seed: int, clock: _Clock) -> MatchResult:
+def _relate(
+    pipeline: Pipeline, features0: Features, features1: Features, seed: int, clock: Clock, cameras: dict[str, Tensor]
+) -> MatchResult:
     """Matching, pruning and estimation, in pixels of the images as they were described."""
     ends = features0.keypoints, features1.keypoints
     nothing = Correspondences(ends[0][None, :0], ends[1][None, :0], features0.valid[None, :0])
@@ -187,13 +204,15 @@ def _relate(pipeline: Pipeline, features0: Features, features1: Features, seed: 
         clock(name)
         counts[name] = len(slots)
     kept = torch.zeros_like(putative.mask[0]).index_fill(0, slots, True)
-    estimate: Estimate = judged(pipeline.estimator(c, seed).detach(), c)
+    estimator = KnownCameras(pipeline.estimator) if cameras else pipeline.estimator
+    estimate: Estimate = judged(estimator(c.replace(**cameras), seed).detach(), c)
     clock("estimation")
     inliers = estimate.inliers[0]
     counts["estimation"] = int(inliers.sum())
     return MatchResult(
         *ends, putative, kept, c, inliers, estimate.F[0].to(torch.float64), estimate.reason[0], _still(c, inliers),
         counts, clock.seconds, float(cast(Tensor, estimate.significance)[0]),
+        *(None if value is None else value[0] for value in (estimate.R, estimate.t, estimate.focals)),
     )  # fmt: skip
 
 
@@ -222,20 +241,5 @@ def _restored(result: MatchResult, scales: list[Tensor], sizes: list[Tensor]) ->
         keypoints0=to_original(result.keypoints0, s0), keypoints1=to_original(result.keypoints1, s1),
         putative=matches(result.putative), correspondences=matches(result.correspondences),
         F=fundamental_to_original(result.F, *scales),
+        focals=None if result.focals is None else result.focals / torch.stack(scales).prod(1).sqrt().to(result.focals),
     )  # fmt: skip
-
-
-class _Clock:
-    """The seconds between its calls."""
-
-    def __init__(self, device: torch.device) -> None:
-        self._device, self._last = device, time.perf_counter()
-        self.seconds: dict[str, float] = {}
-
-    def __call__(self, step: str, seconds: float | None = None) -> None:
-        """The time since the last call was spent on `step`, which counts for `seconds` where they are given."""
-        if self._device.type == "cuda":
-            torch.cuda.synchronize(self._device)
-        now = time.perf_counter()
-        self.seconds[step] = now - self._last if seconds is None else seconds
-        self._last = now

@@ -57,7 +57,9 @@ SLOW = (
 )
 
 PEERS = {"poselib": "poselib", "poselib_shared_focal": "poselib", "degensac_cpp": "pydegensac",
-         "gc_ransac_cpp": "pygcransac", "magsac_cpp": "pymagsac", "superansac_cpp": "pysuperansac"}  # fmt: skip
+         "gc_ransac_cpp": "pygcransac", "magsac_cpp": "pymagsac", "superansac_cpp": "pysuperansac",
+         "poselib_f": "poselib", "colmap": "pycolmap", "colmap_f": "pycolmap", "superansac": "pysuperansac",
+}  # fmt: skip
 
 TINY = ["features.max_features=500"]
 DATASET = ["dataset=fmbench", "dataset.root=DATA/Strecha", "limit=1"]
@@ -78,6 +80,7 @@ APPENDED = {
     "fmtorch.pairs": ["dataset.root=DATA/Strecha", "workers=1"],
     "fmtorch.report": ["pictures=1", "root=DATA/Strecha"],
     "estimators": ["--limit", "1", "--seeds", "1"],
+    "cameras": ["--limit", "1", "--seeds", "1"],
     "curves": ["--limit", "1", "--specs", "curves.txt"],
     "thresholds": ["--limit", "1", "--seeds", "1", "--values", "0.5", "0.75"],
     "pipelines": ["--limit", "1", "--seeds", "1", "--cache", "kept"],

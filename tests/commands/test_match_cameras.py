@@ -1,0 +1,179 @@
+"""`fmtorch.match` and its command with what is known of the cameras: poses of real photographs."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import ExifTags, Image
+
+import fmtorch
+from fmtorch import presets
+from fmtorch.commands.match_cameras import photographs, pose_line, pose_report
+from fmtorch.data import ImageError, ImagePair, load
+from fmtorch.metrics import pose_error
+from fmtorch.pipeline.pipeline import Pipeline
+from tests.conftest import shared_path
+from tests.processes import run_command
+
+SIDE = 768  # px, to which photographs are reduced for matching
+
+
+@pytest.fixture(scope="module")
+def pair() -> ImagePair:
+    return load("fmbench", root=shared_path("data/Strecha_train"))[0]
+
+
+@pytest.fixture(scope="module")
+def pipeline() -> Pipeline:
+    return presets.pipeline("sift_fmtorch")
+
+
+def matched(pair: ImagePair, pipeline: Pipeline, **cameras: object) -> fmtorch.MatchResult:
+    return fmtorch.match(pair.image0.path, pair.image1.path, pipeline=pipeline, longest_side=SIDE, **cameras)
+
+
+def error(result: fmtorch.MatchResult, pair: ImagePair) -> float:
+    """The larger angle of the pose error, with the sign of t, in degrees."""
+    assert result.R is not None
+    assert result.t is not None
+    R, t = (torch.from_numpy(np.array(value)) for value in (pair.R, pair.t))
+    return float(pose_error(result.R.double(), result.t.double(), R, t, up_to_sign=False).worst)
+
+
+def test_the_pose_of_reduced_photographs_by_what_is_known(pair: ImagePair, pipeline: Pipeline) -> None:
+    assert pair.K0 is not None
+    focal = math.sqrt(pair.K0[0, 0] * pair.K0[1, 1])
+    plain = matched(pair, pipeline)
+    assert plain.R is plain.t is plain.focals is None
+    known = matched(pair, pipeline, K0=pair.K0, K1=pair.K1)
+    assert known.R is not None
+    assert error(known, pair) < 0.5
+    assert known.focals.tolist() == pytest.approx([focal, focal], rel=1e-6)  # in pixels of the photographs
+    assert known.R.double() @ known.R.double().T == pytest.approx(np.eye(3), abs=1e-6)
+    for cameras in (
+        {"focal": (1.05 * focal, 0.06)}, {"focal": "shared"}, {"focal": [(focal, 0.0), None]},
+        {"K0": pair.K0}, {"K0": pair.K0, "K1": pair.K1, "focal": 0.1},
+    ):  # fmt: skip
+        result = matched(pair, pipeline, **cameras)
+        assert error(result, pair) < 3, cameras
+        assert result.focals.tolist() == pytest.approx([focal, focal], rel=0.1), cameras
+    unknown = matched(pair, pipeline, focal="unknown")
+    assert torch.equal(unknown.F, plain.F)
+
+
+def test_calibrations_follow_the_reduction(pair: ImagePair, pipeline: Pipeline) -> None:
+    """Reduced by hand, with K scaled by hand, everything is the same."""
+    assert pair.K0 is not None
+    assert pair.K1 is not None
+    images = [fmtorch.data.read_image(image) for image in (pair.image0, pair.image1)]
+    small = [cv2.resize(image, (768, 512), interpolation=cv2.INTER_AREA) for image in images]
+    half = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
+    by_hand = fmtorch.match(*small, pipeline=pipeline, K0=half @ pair.K0, K1=half @ pair.K1)
+    reduced = fmtorch.match(*images, pipeline=pipeline, longest_side=768, K0=pair.K0, K1=pair.K1)
+    assert torch.equal(by_hand.R, reduced.R)
+    assert torch.equal(by_hand.t, reduced.t)
+    assert (2 * by_hand.focals).tolist() == pytest.approx(reduced.focals.tolist(), rel=1e-9)
+
+
+@pytest.mark.parametrize(("cameras", "told"), [
+    ({"K0": np.eye(3)}, r"K0 has a focal length of 1 for an image of 1536 x 1024 pixels; it must be in pixels"),
+    ({"K0": np.diag([1500, 1500, 1.0])[None]}, r"K0 has shape \(1, 3, 3\); it must be \(3, 3\)"),
+    ({"focal": "some"}, "focal is 'some'"), ({"focal": np.ones((1, 2, 2))}, r"focal has shape \(1, 2, 2\)"),
+])  # fmt: skip
+def test_what_no_camera_is(cameras: dict[str, object], told: str, pair: ImagePair, pipeline: Pipeline) -> None:
+    with pytest.raises(ValueError, match=told):
+        matched(pair, pipeline, **cameras)
+
+
+def with_exif(folder: Path, name: str, **tags: int) -> Path:
+    """A picture of 60 x 40 px with these tags."""
+    exif = Image.Exif()
+    exif.get_ifd(ExifTags.IFD.Exif).update({ExifTags.Base[key]: value for key, value in tags.items()})
+    Image.new("RGB", (60, 40)).save(folder / name, exif=exif)
+    return folder / name
+
+
+def test_words_files_and_numbers_as_arguments(tmp_path: Path) -> None:
+    paths = [with_exif(tmp_path, "a.jpg", FocalLengthIn35mmFilm=36), with_exif(tmp_path, "b.jpg")]
+    assert photographs(paths, None, None, True).knowledge == {}
+    for word in ("shared", "unknown"):
+        assert photographs(paths, Path(word), None, True).knowledge == {"focal": word}
+    exif = photographs(paths, Path("exif"), None, True)
+    focal, nothing = exif.knowledge["focal"]
+    assert focal == pytest.approx((60, math.hypot(0.06, 1 / math.sqrt(12) / 36)))
+    assert nothing is None
+    assert exif.notes == ("b.jpg: focal length not known: no EXIF data",)
+    neither = photographs([paths[1], paths[1]], Path("exif"), None, True)
+    assert neither.knowledge == {"focal": "unknown"}
+    for K in ("70,71,30,20", [70, 71, 30, 20], "[70, 71, 30, 20]"):
+        given = photographs(paths, None, K, True).knowledge
+        assert given["K0"].tolist() == given["K1"].tolist() == [[70, 0, 30], [0, 71, 20], [0, 0, 1]]
+    file = tmp_path / "k.json"
+    file.write_text(json.dumps({"a.jpg": [70, 71, 30, 20], "b.jpg": None}))
+    given = photographs(paths, file, None, True).knowledge
+    assert given["K0"].tolist() == [[70, 0, 30], [0, 71, 20], [0, 0, 1]]
+    assert given["K1"] is None
+    file.write_text(json.dumps({"a.jpg": None, "b.jpg": None}))
+    assert photographs(paths, file, None, True).knowledge == {"K0": None, "K1": None, "focal": "unknown"}
+
+
+def test_distortion_is_taken_out_and_sizes_must_fit(tmp_path: Path) -> None:
+    paths = [with_exif(tmp_path, name) for name in ("a.jpg", "b.jpg")]
+    (tmp_path / "cameras.txt").write_text("1 SIMPLE_RADIAL 60 40 50 30 20 0.2\n")
+    bent = photographs(paths, tmp_path / "cameras.txt", None, True)
+    assert bent.knowledge["K0"].tolist() == [[50, 0, 29.5], [0, 50, 19.5], [0, 0, 1]]
+    assert "b.jpg: points and F are of the image without the distortion of its SIMPLE_RADIAL lens" in bent.notes
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 50 40 50 50 30 20\n")
+    with pytest.raises(ImageError, match=r"a\.jpg: 60 x 40 px, but its camera is of 50 x 40"):
+        photographs(paths, tmp_path / "cameras.txt", None, True)
+
+
+@pytest.mark.parametrize(("cameras", "K", "told"), [
+    (Path("none.json"), None, "cameras=none.json: no such file; it must be unknown, shared, exif"),
+    (Path("exif"), "1,2,3,4", "cameras and K are given"), (None, "1,2,3", "K=1,2,3; it must be fx,fy,cx,cy"),
+    (None, "0,1,2,3", "it must be fx"), (None, "a,b,c,d", "it must be fx"), (None, [1.0, 2.0, 3.0], "it must be fx"),
+])  # fmt: skip
+def test_what_is_no_camera_of_a_command(cameras: Path | None, K: object, told: str, tmp_path: Path) -> None:
+    path = with_exif(tmp_path, "a.jpg")
+    with pytest.raises(ValueError, match=told):
+        photographs([path, path], cameras, K, True)  # type: ignore[arg-type]
+
+
+def test_a_pose_that_is_not_determined_is_said(pair: ImagePair, pipeline: Pipeline) -> None:
+    image = np.random.default_rng(0).integers(0, 255, (300, 400, 3)).astype(np.uint8)
+    K = np.array([[400.0, 0, 199.5], [0, 400, 149.5], [0, 0, 1]])
+    nothing = fmtorch.match(image, np.full((300, 400, 3), 9, np.uint8), pipeline=pipeline, K0=K, K1=K)
+    assert not nothing.ok
+    assert pose_line(nothing) == ""
+    assert pose_report(nothing) == {}
+    known = matched(pair, pipeline, K0=pair.K0, K1=pair.K1)
+    assert pose_report(known)["R"] == known.R.tolist()
+    assert pair.R is not None
+    angle = math.degrees(math.acos((np.trace(pair.R) - 1) / 2))
+    shown = pose_line(known)
+    assert float(shown.split()[1].rstrip("°,")) == pytest.approx(angle, abs=0.5)
+    assert "focal lengths 1381, 1381 px" in shown
+
+
+def test_the_command(pair: ImagePair, tmp_path: Path) -> None:
+    assert pair.K0 is not None
+    fx, fy, cx, cy = pair.K0[[0, 1, 0, 1], [0, 1, 2, 2]]
+    arguments = (str(pair.image0.path), str(pair.image1.path), "pipeline=sift_fmtorch", f"longest_side={SIDE}")
+    K = f"K={fx},{fy},{cx},{cy}"
+    done = run_command("match", *arguments, K, "output=out", cwd=tmp_path, environment={"CUDA_VISIBLE_DEVICES": ""})
+    assert done.returncode == 0, done.stderr
+    assert "rotation " in done.stdout
+    assert "translation (" in done.stdout
+    report = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert report["focals"] == pytest.approx([math.sqrt(fx * fy)] * 2)
+    assert np.shape(report["R"]) == (3, 3)
+    assert np.linalg.norm(report["t"]) == pytest.approx(1)
+    refused = run_command("match", "images=.", "cameras=exif", cwd=tmp_path, environment={"CUDA_VISIBLE_DEVICES": ""})
+    assert refused.returncode == 1
+    assert "cameras and K are of a single pair" in refused.stderr
