@@ -10,9 +10,11 @@ distance (Hartley & Zisserman 2004, 11.4.3), with three corrections:
    expectations are for the truncated square, the information is m / A of J^T W J.
 2. The noise s is estimated anew from the distances below 2.5 s, consistent at normal noise: the scale of a robust fit
    is biased by its own limits and by the parameters that were fitted.
-3. The derivatives by t hold noise, as if it were parallax; its expected share of the information is taken away. Without
-   that a camera that only turns seems to have a direction of translation, known to some ten degrees. (The bias of
-   matrices of moments: Kanatani 1996, Statistical Optimization for Geometric Computation, chapter 9.)
+3. The derivatives by t hold noise, as if it were parallax; its expected share of their squares is taken from the
+   information about the direction of translation. Without that a camera that only turns seems to have one, known to some
+   ten degrees. (The bias of matrices of moments: Kanatani 1996, Statistical Optimization for Geometric Computation,
+   chapter 9. The noise itself is not subtracted: where other parameters leave little, the difference of two estimates
+   says that nothing is known where errors are a few degrees.)
 
 Weights that are no inverse variances, such as P(inlier), count by ``sum w / sum w^2`` (Kish 1965). Independent noise
 is assumed; on real pairs neighbours err alike, and deviations come out too small.
@@ -135,7 +137,9 @@ def two_view_covariance(
     used = _directions(known, shared)
     s = noise_of(r.detach(), w, T, used.amax(0).sum(0))
     information, from_noise = information_of(r, J, in_slopes, w, T, s)
-    C = _without(_covariance(information, Pi.movedim(0, -1), used), from_noise)
+    by_direction = information[3, 3] + information[4, 4]
+    share = (from_noise[0, 0] + from_noise[1, 1]) / torch.where(by_direction > 0, by_direction, 1.0)
+    C = _without(_covariance(information, Pi.movedim(0, -1), used), share.clamp(0, 1))
     V = _of_fundamental(C, F, slopes, p0.movedim(0, -1), p1.movedim(0, -1))
     return TwoViewCovariance(C.movedim(-1, 0), basis.movedim(-1, 0), V.movedim(-1, 0), s, valid)
 
@@ -180,15 +184,15 @@ def _covariance(information: Tensor, Pi: Tensor, used: Tensor) -> Tensor:
     return (C + C.transpose(0, 1)) / 2
 
 
-def _without(C: Tensor, from_noise: Tensor) -> Tensor:
-    """The covariance (7, 7, b) with information (2, 2, b) about the direction of translation taken away.
+def _without(C: Tensor, share: Tensor) -> Tensor:
+    """The covariance (7, 7, b) with a share (b,) of the information about the direction of translation taken away.
 
     The other parameters keep their distribution given that direction, whose own covariance becomes larger. What
     `DIFFUSE` knows of it stays.
     """
     S, eye = _inverse(C[3:5, 3:5]), torch.eye(2, dtype=C.dtype, device=C.device)[..., None]
     least = eye * DIFFUSE[3] ** -2
-    grown = _inverse(_positive_part(S - from_noise - least) + least)
+    grown = _inverse(_positive_part(S * (1 - share) - least) + least)
     by_direction = _product(C[:, 3:5], S)
     C = C + _product(by_direction, _product(grown - C[3:5, 3:5], by_direction.transpose(0, 1)))
     return (C + C.transpose(0, 1)) / 2

@@ -36,8 +36,10 @@ class Case(NamedTuple):
 
 def photographs(paths: Sequence[Path]) -> Iterator[Case]:
     """Of each photograph a plane, a rotation, a copy, a crop and an unrelated pair."""
+    if len(paths) < 2:
+        raise SystemExit("error: two photographs at least are needed, of which one is behind the other")
     for seed, path in enumerate(paths):
-        behind = paths[(seed + 7) % len(paths)]
+        behind = paths[(seed + min(7, len(paths) - 1)) % len(paths)]
         case = warped(path, behind, seed)
         yield _case(case.matches, "planar", "warped photographs", path)
         for group, make in MAKERS.items():

@@ -143,11 +143,13 @@ def covariance(
     information = factor * (J.T * v) @ J / s**2
     information += np.diag(np.array([1.33, 1.33, 1.33, 1.21, 1.21, 2.3, 2.3]) ** -2.0)
     information[5:, 5:] += precision
-    # The marginal information about the direction of t, less what noise gives, with at least that of 1.21 radians.
+    # The marginal information about the direction of t, less the share of its derivatives that is noise, with at least
+    # that of 1.21 radians.
     free = basis.T @ information @ basis
     S = np.linalg.inv(np.linalg.inv(free)[3:5, 3:5])
     least = np.eye(2) / 1.21**2
-    values, vectors = np.linalg.eigh(S - factor * np.einsum("n,nij->ij", v, in_slopes) - least)
+    share = np.trace(np.einsum("n,nij->ij", v, in_slopes)) / np.trace((J[:, 3:5].T * v) @ J[:, 3:5] / s**2)
+    values, vectors = np.linalg.eigh(S * (1 - min(share, 1)) - least)
     free[3:5, 3:5] += vectors @ np.diag(np.maximum(values, 0)) @ vectors.T + least - S
     C = basis @ np.linalg.inv(free) @ basis.T
     G = slopes(lambda c: c.fundamental().ravel(), cameras)
