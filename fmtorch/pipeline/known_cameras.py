@@ -173,6 +173,6 @@ def _pose(estimate: Estimate, square: Correspondences, focals: Tensor, known: Te
 
 def _calibration(focal: Tensor, size: Tensor) -> Tensor:
     """K (B, 3, 3) of square pixels and central principal points."""
-    zero, one = torch.zeros_like(focal), torch.ones_like(focal)
+    zero, ones = torch.zeros_like(focal), torch.ones_like(focal)
     x, y = (size[:, 1].to(focal) - 1) / 2, (size[:, 0].to(focal) - 1) / 2
-    return torch.stack([focal, zero, x, zero, focal, y, zero, zero, one], -1).reshape(-1, 3, 3)
+    return torch.stack([focal, zero, x, zero, focal, y, zero, zero, ones], -1).reshape(-1, 3, 3)
