@@ -12,9 +12,9 @@ distance (Hartley & Zisserman 2004, 11.4.3), with three corrections:
    is biased by its own limits and by the parameters that were fitted.
 3. The derivatives by t hold noise, as if it were parallax; its expected share of their squares is taken from the
    information about the direction of translation. Without that a camera that only turns seems to have one, known to
-   some ten degrees. (The bias of matrices of moments: Kanatani 1996, Statistical Optimization for Geometric Computation,
-   chapter 9. The noise itself is not subtracted: where other parameters leave little, the difference of two estimates
-   says that nothing is known where errors are a few degrees.)
+   some ten degrees. (The bias of matrices of moments: Kanatani 1996, Statistical Optimization for Geometric
+   Computation, chapter 9. The noise itself is not subtracted: where other parameters leave little, the difference of
+   two estimates says that nothing is known where errors are a few degrees.)
 
 Weights that are no inverse variances, such as P(inlier), count by ``sum w / sum w^2`` (Kish 1965). Independent noise
 is assumed; on real pairs neighbours err alike, and deviations come out too small.

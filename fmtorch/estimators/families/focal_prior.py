@@ -31,9 +31,9 @@ LOG_USUAL = 0.1823215567939546  # math.log(USUAL_FOCAL)
 MIN_DEVIATION = 1e-5  # that an exact measurement is taken to have
 TAIL_GAIN = 3.0  # what measurements that may be wrong cost at most together, in logarithms of the likelihood
 UNBELIEVED_SHARE = 0.6  # of the draws that leave out measurements with a tail
-# On castle-P19 and fox focal lengths 1.5 times too long, given as 6 % off, have pose AUCs at 5 degrees of 59 and 30; of 39
-# and 20 with a tail of 5 for each image and a share of 0.2; of 63 and 36 if nothing is given. Right ones within 10 % have
-# 74 and 57, and 76 and 57.
+# On castle-P19 and fox focal lengths 1.5 times too long, given as 6 % off, have pose AUCs at 5 degrees of 59 and 30; of
+# 39 and 20 with a tail of 5 for each image and a share of 0.2; of 63 and 36 if nothing is given. Right ones within 10 %
+# have 74 and 57, and 76 and 57.
 QUANTILES = 1 << 10  # of the normal distribution, from which focal lengths are drawn
 
 
