@@ -30,8 +30,8 @@ LOG_USUAL = 0.1823215567939546  # math.log(USUAL_FOCAL)
 MIN_DEVIATION = 1e-5  # that an exact measurement is taken to have
 TAIL_GAIN = 5.0  # what a measurement costs at most, in logarithms of the likelihood
 UNBELIEVED_SHARE = 0.4  # of the draws that leave out measurements with a tail
-# On castle-P19 and fox focal lengths 1.5 times too long, given as 6 % off, have a pose AUC at 5 degrees of 41; of 30 with
-# a tail for each image and a share of 0.2; of 49 if nothing is given. Right ones have 72, and 73.
+# On castle-P19 and fox, focal lengths 1.5 times too long and given as 6 % off have a pose AUC at 5 degrees of 41; of 30
+# with a tail for each image and a share of 0.2; of 49 if not given. Right ones have 72, and 73.
 QUANTILES = 1 << 10  # of the normal distribution, from which focal lengths are drawn
 
 
