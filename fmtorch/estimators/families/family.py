@@ -6,18 +6,11 @@ and stopping rule are written once; what differs is the family's: minimal sample
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
-
-import numpy as np
 
 from fmtorch.compiling.arrays import Array
 from fmtorch.estimators.pair import Pair
-from fmtorch.geometry.levenberg_marquardt_kernels import Schedule
 from fmtorch.geometry.residual_kernels import Residual
-from fmtorch.geometry.sampson_objective_kernels import LOSSES, NO_TABLE, Weighted, loss_table
-
-STEP_DAMPING = 1e-10  # of a Gauss-Newton step at an optimum: bounds it where the points leave a direction open
 
 
 class Hypotheses(NamedTuple):
@@ -108,56 +101,3 @@ class Refining(Family, Estimated, Protocol):
     def step(self, F: Array, pair: Pair, weight: Array) -> Array:
         """The model (9,) after one Gauss-Newton step on weighted matches (n,); F (9,) where there is none."""
         ...
-
-
-class Matrices:
-    """What the families share whose models are matrices of a minimal sample, each by its kernels.
-
-    size, solutions: matches of a minimal sample, and its models at most. minimal: samples -> models. linear: weighted
-    matches -> the model of least squares. gauss_newton: a model -> the model after one step.
-    """
-
-    size: ClassVar[int]
-    solutions: ClassVar[int]
-    minimal: ClassVar[Callable[..., int]]
-    linear: ClassVar[Callable[..., bool]]
-    gauss_newton: ClassVar[Callable[..., None]]
-
-    def solve(self, pair: Pair, sample: Array, start: int) -> Hypotheses:
-        """As `Family.solve`."""
-        F = np.empty((sample.shape[1] * self.solutions, 9), np.float32)
-        draw = np.empty(len(F), np.int64)
-        count = self.minimal(pair.points, sample, F, draw)
-        return Hypotheses(F[:count], draw[:count], sample, start)
-
-    def weight(self, pair: Pair) -> Array:
-        """What each match (n,) counts in `refine`."""
-        return pair.weight
-
-    def minimise(self, F: Array, matches: Weighted, schedule: Schedule, out: Array, cost: Array) -> None:
-        """Models (k, 9) of least robust error near F -> out (k, 9), and their costs (k,)."""
-        raise NotImplementedError
-
-    def refine(self, F: Array, pair: Pair, loss: Loss, steps: Steps) -> Array:
-        """As `Refining.refine`."""
-        s2 = np.square(loss.scale / pair.pixels_per_noise)
-        matches = Weighted(pair.points, self.weight(pair), s2, LOSSES[loss.name], loss_table(loss.name))
-        refined, cost = np.empty_like(F), np.empty(len(F))
-        self.minimise(F, matches, Schedule(steps.iterations, steps.damping, steps.tolerance or 0.0), refined, cost)
-        return np.where(np.isfinite(cost)[:, None], refined, F)
-
-    def least_squares(self, F: Array, pair: Pair, weight: Array) -> Array:
-        """As `Refining.least_squares`."""
-        fitted = np.empty(9)
-        return fitted if self.linear(pair.points, weight, fitted) else F
-
-    def step(self, F: Array, pair: Pair, weight: Array) -> Array:
-        """As `Refining.step`."""
-        moved = np.empty(9)
-        self.gauss_newton(F, squared_error(pair, weight), STEP_DAMPING, moved)
-        return moved if np.isfinite(moved).all() else F
-
-
-def squared_error(pair: Pair, weight: Array) -> Weighted:
-    """Weighted matches, whose errors are squared without bound."""
-    return Weighted(pair.points, weight, np.full(pair.count, np.inf), LOSSES["truncated"], NO_TABLE)

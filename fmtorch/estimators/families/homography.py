@@ -8,7 +8,8 @@ import numpy as np
 
 from fmtorch.compiling.arrays import Array, F8x1, F8x2
 from fmtorch.compiling.kernel import kernel
-from fmtorch.estimators.families.family import FitScale, Matrices
+from fmtorch.estimators.families.family import FitScale
+from fmtorch.estimators.families.fundamental import Matrices
 from fmtorch.estimators.pair import Pair
 from fmtorch.geometry.four_point_kernels import four_point
 from fmtorch.geometry.homography_kernels import weighted_homography
