@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fmtorch.data.rendered.generate import FAMILIES, Plan, Task, build
-from fmtorch.data.rendered.light import Light, Stage, points_seen
+from fmtorch.data.rendered.light import Light, Stage
 from fmtorch.data.rendered.mipmap import TO_LINEAR, Texture, to_srgb
 from fmtorch.data.rendered.pinhole import Camera, calibration, fundamental, look_at, relative_pose
 from fmtorch.data.rendered.raycast import Geometry
@@ -38,6 +38,15 @@ def smooth_texture(seed: int = 0) -> np.ndarray:
     noise = cv2.GaussianBlur(noise, (0, 0), 8, borderType=cv2.BORDER_REFLECT)
     noise = (noise - noise.min()) / np.ptp(noise)
     return (noise * 255).astype(np.uint8)
+
+
+def points_seen(geometry: Geometry, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (n, 2) whose ray meets a surface, and the world points (n, 3) that they see, exactly."""
+    depth = geometry.depth_map(camera)
+    y, x = np.nonzero(np.isfinite(depth))
+    pixel = np.stack([x, y], -1).astype(np.float64)
+    rays = np.column_stack([pixel, np.ones(len(pixel))]) @ np.linalg.inv(camera.K).T
+    return pixel, (rays * depth[y, x, None] - camera.t) @ camera.R
 
 
 def test_look_at_is_a_rotation_that_centres_its_target() -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fmtorch.data.rendered import light_kernels as compiled
 from fmtorch.data.rendered.mipmap import TO_LINEAR, Floats, Pixels, Real, Texture, bilinear, to_srgb
-from fmtorch.data.rendered.pinhole import Camera, Matrix
+from fmtorch.data.rendered.pinhole import Camera
 from fmtorch.data.rendered.raycast import Geometry, Hits
 
 # Four rays a pixel, one on each row and column of a 4 x 4 grid (rotated grid); their mean is the pixel centre.
@@ -176,12 +176,3 @@ def sun(azimuth: Real, elevation: Real) -> tuple[float, float, float]:
     """The unit direction at an azimuth and elevation in degrees."""
     a, e = np.radians(azimuth), np.radians(elevation)
     return float(np.cos(a) * np.cos(e)), float(np.sin(a) * np.cos(e)), float(np.sin(e))
-
-
-def points_seen(geometry: Geometry, camera: Camera) -> tuple[Matrix, Matrix]:
-    """Pixels (n, 2) whose ray meets a surface, and the world points (n, 3) that they see, exactly."""
-    depth = geometry.depth_map(camera)
-    y, x = np.nonzero(np.isfinite(depth))
-    pixel = np.stack([x, y], -1).astype(np.float64)
-    rays = np.column_stack([pixel, np.ones(len(pixel))]) @ np.linalg.inv(camera.K).T
-    return pixel, (rays * depth[y, x, None] - camera.t) @ camera.R
