@@ -10,7 +10,7 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences
 from fmtorch.pruning import LPM, lpm
-from fmtorch.pruning.knn import nearest_points
+from fmtorch.pruning.lpm import nearest_points
 from tests.conftest import oracle
 from tests.reference.lpm import lpm as reference
 from tests.reference.lpm import nearest
