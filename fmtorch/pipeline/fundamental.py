@@ -112,7 +112,7 @@ def find_homography(
 
     Returns:
         An `Estimate` whose `H` (B, 3, 3) has unit Frobenius norm and maps points that are seen to positive third
-        coordinates; inliers, ok, reason. Its significance is NaN: that is a test of fundamental matrices.
+        coordinates; inliers, ok, reason. Its significance is NaN where `ok`: that is a test of fundamental matrices.
 
     Raises:
         ValueError, TypeError: as `find_fundamental`.
