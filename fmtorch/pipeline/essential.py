@@ -40,7 +40,8 @@ def find_essential(
         K0, K1: calibration matrices in the unit of the points, (3, 3) for all pairs or (B, 3, 3). Pixels need not be
             square nor principal points central; lenses must not distort.
         focal: how well the focal lengths of K0 and K1 are known: None for exactly, or their relative standard
-            deviation, one number, (s0, s1) or (B, 2); 0.05 suits EXIF. What is not exact is estimated.
+            deviation, one number, (s0, s1) or (B, 2); 0.05 suits EXIF; "shared" or "unknown" where K tells principal
+            points and the shape of pixels alone. What is not exact is estimated.
         size0, size1: image sizes (h, w), one for all pairs or (B, 2). Twice the principal point when not given.
         estimator, mask, quality, prior, lafs0, lafs1, noise, key, seed, config_dir: as of `find_fundamental`.
         options: replace values of the preset (``inlier_threshold=1.0``).
