@@ -71,9 +71,8 @@ def photographs(
 def _with_lenses(paths: Sequence[Path], cameras: Path, orient: bool) -> Photographs:
     """The photographs without the distortion of their lenses."""
     if not cameras.exists():
-        raise ValueError(
-            f"cameras={cameras}: no such file; it must be {', '.join(WORDS)}, a COLMAP model or a JSON file"
-        )
+        known_words = f"it must be {', '.join(WORDS)}, a COLMAP model or a JSON file"
+        raise ValueError(f"cameras={cameras}: no such file; {known_words}. One calibration is K=fx,fy,cx,cy")
     known = ImageCameras(cameras)
     images, knowledge, notes = list[Image](), dict[str, Any](), list[str]()
     for i, path in enumerate(paths):
