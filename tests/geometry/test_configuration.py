@@ -99,7 +99,7 @@ def test_no_unit_is_special() -> None:
 @pytest.mark.parametrize("factor", [1e-9, 1e9])
 def test_points_of_any_scale_are_weighed(factor: float) -> None:
     """Without sizes, as large as their boxes; nothing overflows."""
-    pairs = batch([draw(kind, 3) for kind in KINDS])
+    pairs = batch([draw(kind, 3) for kind in CONFIGURATIONS])
     given = {name: pairs[name] for name in ("F", "H", "x0", "x1", "mask")}
     grow = torch.diag(torch.tensor([factor, factor, 1], dtype=torch.float64))
     shrink = torch.linalg.inv(grow)
