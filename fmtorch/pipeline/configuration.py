@@ -1,0 +1,122 @@
+"""Which configuration each pair of an estimate is in: what its fundamental matrix is worth."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from fmtorch.core.threads import one_thread
+from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.geometry.configuration import GENERAL, KINDS, UNRELATED, Evidence, classified, configuration_evidence
+from fmtorch.pipeline.fundamental import find_homography
+
+FOCAL_DEVIATION = 0.02
+"""Of the focal lengths of a calibration, relative: what zoom and focus change between two days."""
+USUAL_FOCAL, USUAL_DEVIATION = 1.2, 0.4  # of photographs, in longer sides, and of its logarithm (the estimator's prior)
+OTHER_CAMERA = 0.5  # deviation of the logarithm of the ratio of the focal lengths of images of different sizes
+
+
+class Configuration(NamedTuple):
+    """Configurations of B pairs.
+
+    kind: indices into `fmtorch.geometry.configuration.KINDS`. evidence: for the kinds. homography: of the plane, or of
+    the rotation.
+    """
+
+    kind: Int[Tensor, " b"]
+    evidence: Evidence
+    homography: Estimate
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The kinds in words: general, planar, rotation, identical or unrelated."""
+        return tuple(KINDS[i] for i in self.kind.tolist())
+
+    @property
+    def determined(self) -> Bool[Tensor, " b"]:
+        """Whether the matches determine F: of the general pairs alone."""
+        return self.kind == GENERAL
+
+
+def classify(
+    c: Correspondences,
+    estimate: Estimate,
+    *,
+    focal_deviation: float | int = FOCAL_DEVIATION,
+    seed: int = 0,
+    **options: Any,
+) -> Configuration:
+    """The configuration of each pair, by the evidence of its F, of a homography, a rotation and a copy.
+
+    No threshold is in pixels: likelihoods are compared at the noise that the pair itself shows. Where `c` has both
+    calibrations these decide on rotations, else image sizes, by the prior on usual focal lengths; without either a
+    rotation is called planar.
+
+    Args:
+        c: all matches that were given to the estimator.
+        estimate: their fundamental matrices.
+        focal_deviation: relative deviation of the focal lengths of `c.K0` and `c.K1`; 0 where they are exact.
+        seed: of the homography's random numbers.
+        options: of `find_homography`.
+
+    Returns:
+        A `Configuration`. A pair without F and without H is unrelated.
+
+    Raises:
+        ValueError: for an estimate of another model or of other pairs, or a negative deviation.
+
+    Example:
+        >>> import torch, fmtorch
+        >>> from fmtorch.pipeline.configuration import classify
+        >>> x0 = 600 * torch.rand(100, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        >>> H = torch.tensor([[0.9, 0.1, 20], [-0.1, 1.0, 5], [1e-4, 2e-4, 1]], dtype=torch.float64)
+        >>> x1 = fmtorch.geometry.homography_points(H, x0)                       # one plane
+        >>> mask = torch.ones(1, 100, dtype=torch.bool)
+        >>> c = fmtorch.Correspondences(x0[None], x1[None], mask)
+        >>> classify(c, fmtorch.find_fundamental(x0, x1)).names
+        ('planar',)
+    """
+    if estimate.model != "fundamental":
+        raise ValueError(f"estimate is of {estimate.model} matrices; it must be of fundamental matrices")
+    if len(estimate) != len(c):
+        raise ValueError(f"estimate is of {len(estimate)} pairs and c of {len(c)}; they must be of the same pairs")
+    if not focal_deviation >= 0:
+        raise ValueError(f"focal_deviation is {focal_deviation}; it must not be negative")
+    H = find_homography(
+        c.x0.detach(), c.x1.detach(), mask=c.mask, quality=c.quality, prior=c.prior, lafs0=c.lafs0, lafs1=c.lafs1,
+        noise=c.noise, key=c.key, seed=seed, **options,
+    )  # fmt: skip
+    K0, K1, precision = _cameras(c, focal_deviation)
+    with one_thread(c.mask.device):
+        evidence = configuration_evidence(
+            estimate.F, H.F, c.x0, c.x1, c.mask, c.noise, c.size0, c.size1, K0, K1, precision
+        )
+    exact = None if precision is None else precision.diagonal(dim1=-2, dim2=-1).isinf().all(-1)
+    kind = classified(evidence, exact)
+    return Configuration(torch.where(estimate.ok | H.ok, kind, UNRELATED), evidence, H)
+
+
+def _cameras(c: Correspondences, deviation: float | int) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+    """K0, K1 and the inverse covariance of the logarithms of their focal lengths; None where nothing is known."""
+    if c.K0 is not None and c.K1 is not None:
+        known = torch.full((len(c), 2), torch.inf if deviation == 0 else deviation**-2, dtype=torch.float64)
+        return c.K0, c.K1, torch.diag_embed(known).to(c.K0.device)
+    if c.size0 is None or c.size1 is None:
+        return None, None, None
+    sizes = [size.to(torch.float64) for size in (c.size0, c.size1)]
+    K0, K1 = (_usual(size) for size in sizes)
+    one_camera = (sizes[0] == sizes[1]).all(-1)
+    apart = torch.where(one_camera, FOCAL_DEVIATION, OTHER_CAMERA)[:, None, None] ** -2
+    mean = torch.full((2, 2), 1 / 4 / USUAL_DEVIATION**2, dtype=torch.float64, device=K0.device)
+    return K0, K1, mean + apart * mean.new_tensor([[1.0, -1.0], [-1.0, 1.0]])
+
+
+def _usual(size: Tensor) -> Tensor:
+    """Calibrations (b, 3, 3) of square pixels, a central principal point and the usual focal length."""
+    K = torch.zeros(len(size), 3, 3, dtype=torch.float64, device=size.device)
+    K[:, 0, 0] = K[:, 1, 1] = USUAL_FOCAL * size.amax(-1)
+    K[:, 0, 2], K[:, 1, 2], K[:, 2, 2] = (size[:, 1] - 1) / 2, (size[:, 0] - 1) / 2, 1.0
+    return K
