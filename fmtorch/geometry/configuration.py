@@ -18,8 +18,8 @@ Array = NDArray[Any]
 
 KINDS = ("general", "planar", "rotation", "identical", "unrelated")
 GENERAL, PLANAR, ROTATION, IDENTICAL, UNRELATED = range(len(KINDS))
-MIN_EVIDENCE = 60.0  # nats
-MIN_PARALLAX = 12.0  # nats
+MIN_EVIDENCE = 80.0  # nats; unrelated photographs reach 50, related ones have 170 at least (the tuning pairs)
+MIN_PARALLAX = 12.0  # nats; planes, rotations and copies reach 6, wide scenes have 74 at least (the tuning pairs)
 PLANE_PARAMETERS, COPY_PARAMETERS = 8, 3  # of a homography, and of a similarity without rotation, or of a rotation
 
 
@@ -54,6 +54,7 @@ def configuration_evidence(
     x0: Float[Tensor, "b n 2"],
     x1: Float[Tensor, "b n 2"],
     mask: Bool[Tensor, "b n"] | None = None,
+    prior: Float[Tensor, "b n"] | None = None,
     noise: Float[Tensor, "b n"] | None = None,
     size0: Real[Tensor, "b 2"] | None = None,
     size1: Real[Tensor, "b 2"] | None = None,
@@ -69,6 +70,7 @@ def configuration_evidence(
         x0: all matches that were given to both estimators, right and wrong, px.
         x1: their points in image 1.
         mask: which are real; all by default.
+        prior: P(inlier) of each match, in [0, 1]; 1 by default: all shares are found in the matches.
         noise: of each match, relative to a usual one's; 1 by default.
         size0: size (h, w) of image 0, px; by default that of the box of its matches.
         size1: that of image 1.
@@ -87,7 +89,7 @@ def configuration_evidence(
     models = torch.stack([A.to(torch.float64) for A in (F, H, *cameras)], 1)
     models = torch.where(models.isfinite().flatten(2).all(2)[..., None, None], models, 0.0)
     sizes = (None if size is None else size.to(torch.float64) for size in (size0, size1))
-    given = [None if a is None else a.cpu() for a in (x0, x1, mask, noise, models, *sizes, precision)]
+    given = [None if a is None else a.cpu() for a in (x0, x1, mask, prior, noise, models, *sizes, precision)]
     out = torch.empty(len(F), compiled.COLUMNS, dtype=torch.float64)
     rows = for_each_pair(_into, given, out=out, kind=torch.float64).to(F.device)
     columns = [rows[:, k] for k in (compiled.LINE, compiled.PLANE, compiled.BOTH, compiled.TURN, compiled.COPY)]
@@ -97,10 +99,10 @@ def configuration_evidence(
     return Evidence(*columns)
 
 
-def _into(x0: Array, x1: Array, mask: Array, noise: Array, models: Array, *known: Array) -> None:
-    size0, size1, precision, out = known
+def _into(x0: Array, x1: Array, mask: Array, prior: Array, noise: Array, *known: Array) -> None:
+    models, size0, size1, precision, out = known
     F, H, K0, K1 = models
-    matches = compiled.Matches(x0, x1, mask, noise)
+    matches = compiled.Matches(x0, x1, mask, prior, noise)
     compiled.weigh(matches, compiled.Models(F, H, size0, size1), Cameras(K0, K1, precision), out)
 
 

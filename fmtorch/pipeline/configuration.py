@@ -16,7 +16,7 @@ from fmtorch.pipeline.fundamental import find_homography
 FOCAL_DEVIATION = 0.02
 """Of the focal lengths of a calibration, relative: what zoom and focus change between two days."""
 USUAL_FOCAL, USUAL_DEVIATION = 1.2, 0.4  # of photographs, in longer sides, and of its logarithm (the estimator's prior)
-OTHER_CAMERA = 0.5  # deviation of the logarithm of the ratio of the focal lengths of images of different sizes
+OTHER_CAMERA = 0.5  # deviation of the logarithm of the ratio of both focal lengths (likewise)
 
 
 class Configuration(NamedTuple):
@@ -92,7 +92,7 @@ def classify(
     K0, K1, precision = _cameras(c, focal_deviation)
     with one_thread(c.mask.device):
         evidence = configuration_evidence(
-            estimate.F, H.F, c.x0, c.x1, c.mask, c.noise, c.size0, c.size1, K0, K1, precision
+            estimate.F, H.F, c.x0, c.x1, c.mask, c.prior, c.noise, c.size0, c.size1, K0, K1, precision
         )
     exact = None if precision is None else precision.diagonal(dim1=-2, dim2=-1).isinf().all(-1)
     kind = classified(evidence, exact)
@@ -108,10 +108,9 @@ def _cameras(c: Correspondences, deviation: float | int) -> tuple[Tensor | None,
         return None, None, None
     sizes = [size.to(torch.float64) for size in (c.size0, c.size1)]
     K0, K1 = (_usual(size) for size in sizes)
-    one_camera = (sizes[0] == sizes[1]).all(-1)
-    apart = torch.where(one_camera, FOCAL_DEVIATION, OTHER_CAMERA)[:, None, None] ** -2
     mean = torch.full((2, 2), 1 / 4 / USUAL_DEVIATION**2, dtype=torch.float64, device=K0.device)
-    return K0, K1, mean + apart * mean.new_tensor([[1.0, -1.0], [-1.0, 1.0]])
+    prior = mean + OTHER_CAMERA**-2 * mean.new_tensor([[1.0, -1.0], [-1.0, 1.0]])
+    return K0, K1, prior.expand(len(c), 2, 2)
 
 
 def _usual(size: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """The evidence for kinds of image pairs from its definitions, one pair at a time.
 
 Matches are mixtures of wrong ones, uniform, and of right ones: near their epipolar lines (in one dimension) or near
-where a homography takes them (in two), with normal noise, half of them of TAIL times the noise.
+where a homography takes them (in two), with noise by Student's law of FREEDOM degrees.
 """
 
 from __future__ import annotations
@@ -9,54 +9,48 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from scipy.stats import multivariate_t, t
 
 from tests.reference.homography_family import equations
 
-TAIL = 2.5
-START, FINEST, COARSEST = 1 / 640, 0.1, 1 / 160
+FREEDOM = 3.0
+START, FINEST, COARSEST = 1 / 1500, 0.1, 1 / 300
 LOSS = 3.0
 
 
 def density(r: np.ndarray, s: float, dimensions: int, side: float) -> np.ndarray:
     """Of right matches over that of wrong ones, of Sampson distances (n,); side: of a square image as large."""
-    d = np.zeros(len(r))
-    for q in (s, TAIL * s):
-        normal = np.exp(-(r**2) / (2 * q**2))
-        d += 0.5 * (
-            normal / (q * np.sqrt(2 * np.pi)) * side / np.sqrt(2)
-            if dimensions == 1
-            else normal / (2 * np.pi * q**2) * side**2 / 2
-        )
-    return d
+    if dimensions == 1:
+        return t.pdf(r, FREEDOM, scale=s) * side / np.sqrt(2)
+    law = multivariate_t(np.zeros(2), s**2 * np.eye(2), FREEDOM)
+    return np.array([law.pdf([each, 0]) if np.isfinite(each) else 0.0 for each in r]) * side**2 / 2
 
 
-def log_likelihood(*densities: np.ndarray) -> tuple[float, np.ndarray]:
-    """The maximum over the shares of the components, of sum log sum w d, the first being the wrong ones' (1)."""
+def log_likelihood(P: np.ndarray, *densities: np.ndarray) -> tuple[float, np.ndarray]:
+    """The maximum over the shares w of the components, of the sum of ``log(1 - P + P sum w d)``.
+
+    P (n,): whether a match is right, beforehand; the first component is that of wrong ones all the same, of density 1.
+    """
     d = np.stack([np.ones(len(densities[0])), *densities], 1)
-    n, J = d.shape
-    w = np.full(J, 1 / J)
+    w = np.full(d.shape[1], 1 / d.shape[1])
     for _ in range(20):
-        q = d * w
-        q /= q.sum(1, keepdims=True)
-        last, w = w, (q.sum(0) + 0.5) / (n + 0.5 * J)
+        q = P[:, None] * d * w / (1 - P + P * (d @ w))[:, None]
+        last, w = w, (q.sum(0) + 0.5) / (q.sum() + 0.5 * len(w))
         if np.abs(w - last)[1:].max() < 1e-3:
             break
-    return float(np.log((d * w).sum(1)).sum()), w
+    return float(np.log(1 - P + P * (d @ w)).sum()), w
 
 
-def noise(r: np.ndarray, dimensions: int, side: float) -> float:
+def noise(P: np.ndarray, r: np.ndarray, dimensions: int, side: float) -> float:
     """The noise of the mixture of wrong and right matches, by expectation and maximisation."""
-    s, share, n = START * side, 0.5, len(r)
+    s, share = START * side, 0.5
     for _ in range(20):
-        parts = [np.full(n, 1 - share)]
-        for q in (s, TAIL * s):
-            normal = share * 0.5 * np.exp(-(r**2) / (2 * q**2))
-            in_one, in_two = side / np.sqrt(2) / (q * np.sqrt(2 * np.pi)), side**2 / 2 / (2 * np.pi * q**2)
-            parts.append(normal * (in_one if dimensions == 1 else in_two))
-        g = np.stack(parts, 1)
-        g = (g / g.sum(1, keepdims=True))[:, 1:]
-        share = (g.sum() + 0.5) / (n + 1)
-        squares = (np.where(g > 0, r[:, None] ** 2, 0) * g / [1, TAIL**2]).sum()
+        g = share * P * density(r, s, dimensions, side)
+        total = 1 - share * P + g
+        g, spare = g / total, (P * (1 - share) / total).sum()
+        share = (g.sum() + 0.5) / (g.sum() + spare + 1)
+        near = np.isfinite(r)
+        squares = (g * r**2 * (FREEDOM + dimensions) / (FREEDOM + r**2 / s**2))[near].sum()
         last, s = s, float(np.clip(np.sqrt(squares / max(dimensions * g.sum(), 1e-9)), FINEST, COARSEST * side))
         if abs(s - last) < 0.01 * last:
             break
