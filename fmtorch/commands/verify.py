@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
@@ -38,10 +40,10 @@ def run(config: DictConfig, estimator: str) -> Verification:
     if fields.database is None:
         raise ValueError("database is missing; give the database of a COLMAP project: fmtorch verify database.db")
     built = presets.instantiate(config.estimator, "estimator")
-    with progress_bars() as progress:
+    with _begun_by_reports(estimator) as report:
         result = verify_by(
             built, {"estimator": plain(config.estimator)}, fields.database, fields.output, fields.cameras,
-            fields.force, fields.seed, reporter(progress, estimator),
+            fields.force, fields.seed, report,
         )  # fmt: skip
     for problem in result.problems[:MAX_PROBLEMS]:
         Console(stderr=True).print(problem, style="bold", markup=False, highlight=False, soft_wrap=True)
@@ -50,6 +52,20 @@ def run(config: DictConfig, estimator: str) -> Verification:
     console.print(_table(result))
     console.print(f"[dim]{result.path}[/dim]", highlight=False)
     return result
+
+
+@contextlib.contextmanager
+def _begun_by_reports(description: str) -> Iterator[Callable[[int, int], None]]:
+    """A function of (done, total) that shows a progress bar from its first call on; errors before it stand alone."""
+    with contextlib.ExitStack() as stack:
+        shown: list[Callable[[int, int], None]] = []
+
+        def report(done: int, total: int) -> None:
+            if not shown:
+                shown.append(reporter(stack.enter_context(progress_bars()), description))
+            shown[0](done, total)
+
+        yield report
 
 
 def _table(result: Verification) -> Table:

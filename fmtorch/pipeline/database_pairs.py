@@ -137,7 +137,7 @@ def _configurations(c: Correspondences, estimate: Estimate, seed: int) -> tuple[
         rows = torch.nonzero(deviation == value)[:, 0]
         some = c[rows]
         some = some.derived(K0=None, K1=None) if math.isinf(value) else some
-        configuration = classify(some, estimate[rows], focal_deviation=max(value, FOCAL_DEVIATION), seed=seed)
+        configuration = classify(some, estimate[rows], focal_deviation=value, seed=seed)
         kind[rows], rotation[rows] = configuration.kind, configuration.evidence.R
         parts.append(configuration.homography)
         order += rows.tolist()

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 from fmtorch import presets
 from fmtorch.core.arguments import number
@@ -19,7 +18,14 @@ from fmtorch.core.version import __version__
 from fmtorch.pipeline.database_pairs import Cameras, DatabasePair, as_correspondences, geometries
 from fmtorch.pipeline.estimation import estimated_by
 from fmtorch.storage.exchange.colmap import imported
-from fmtorch.storage.exchange.database import Ids, MatchDatabase, copy_database, expect_database, remove_database
+from fmtorch.storage.exchange.database import (
+    Ids,
+    MatchDatabase,
+    copy_database,
+    expect_database,
+    move_database,
+    remove_database,
+)
 from fmtorch.storage.exchange.verification_log import VerificationLog
 
 BATCH = 64  # pairs in memory
@@ -51,7 +57,7 @@ def verify(
     path: Path | str,
     *,
     output: Path | str | None = None,
-    cameras: Cameras = "stored",
+    cameras: str = "stored",
     estimator: str = "fmtorch",
     force: bool = False,
     seed: int = 0,
@@ -76,7 +82,7 @@ def verify(
         force: estimate pairs that have a geometry as well, and replace an existing `output`.
         seed: of the random numbers.
         config_dir: a folder with presets of your own, as of `find_fundamental`.
-        report: called with the pairs done and their number after each batch.
+        report: called with the pairs done and their number, at the start and after each batch.
         options: replace values of the preset (``inlier_threshold=1.0``).
 
     Returns:
@@ -96,7 +102,7 @@ def verify(
 
 
 def verify_by(
-    estimator: Estimator, settings: Mapping[str, Any], path: Path, output: Path | None, cameras: Cameras, force: bool,
+    estimator: Estimator, settings: Mapping[str, Any], path: Path, output: Path | None, cameras: str, force: bool,
     seed: int, report: Callable[[int, int], None] | None,
 ) -> Verification:  # fmt: skip
     """The same by an estimator that is built; an interrupted run is continued by one of the same `settings`."""
@@ -104,6 +110,7 @@ def verify_by(
     seed = int(number("seed", seed, whole=True))
     if cameras not in get_args(Cameras):
         raise ValueError(f"cameras is {cameras!r}; it must be one of {', '.join(get_args(Cameras))}")
+    known: Cameras = cast(Cameras, cameras)
     if (gives := model_of(estimator)) != "fundamental":
         raise ValueError(f"estimator gives {gives} matrices; verify needs one that gives fundamental matrices")
     imported()
@@ -111,11 +118,10 @@ def verify_by(
     settings = {**settings, "version": __version__, "cameras": cameras, "seed": seed, "force": force}
     work, log = _opened(path, output, settings, force)
     with MatchDatabase(work) as database:
-        run = _Run(database, cameras, seed, estimator, log if force else None)
+        run = _Run(database, known, seed, estimator, log if force else None)
         run.each_batch(report)
     if output is not None:
-        remove_database(output)
-        os.replace(work, output)
+        move_database(work, output)
     if log is not None:
         log.remove()
     return run.result(output or path, time.perf_counter() - begin)
@@ -160,6 +166,8 @@ class _Run:
         """Estimate and write the pairs that are not done, batch by batch."""
         todo = [pair for pair in self.pairs if not self._done(pair)]
         self.kept = len(self.pairs) - len(todo)
+        if report is not None and todo:
+            report(0, len(todo))
         for start in range(0, len(todo), BATCH):
             batch = todo[start : start + BATCH]
             self._verify(batch)

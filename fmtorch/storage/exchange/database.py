@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import os
 import sqlite3
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.core.files import replacing
 from fmtorch.storage.exchange.colmap import imported
 from fmtorch.storage.exchange.database_images import DatabaseImage, database_image
 from fmtorch.storage.exchange.two_view import PairGeometry, two_view_geometry
@@ -134,10 +136,26 @@ def copy_database(path: Path, copy: Path) -> None:
         source.backup(target)
 
 
+def move_database(path: Path, end: Path) -> None:
+    """Give a database that nobody writes to another name, in place of what has it."""
+    if _beside(path, "wal").exists():  # somebody reads it, and SQLite could not put what was written last into the file
+        with replacing(end) as temporary:
+            copy_database(path, temporary)
+            remove_database(end)
+        remove_database(path)
+    else:
+        remove_database(end)
+        os.replace(path, end)
+
+
 def remove_database(path: Path) -> None:
     """Remove a database and the files that SQLite keeps beside an open one."""
-    for name in (path.name, f"{path.name}-wal", f"{path.name}-shm"):
-        path.with_name(name).unlink(missing_ok=True)
+    for name in (path, _beside(path, "wal"), _beside(path, "shm")):
+        name.unlink(missing_ok=True)
+
+
+def _beside(path: Path, kind: str) -> Path:
+    return path.with_name(f"{path.name}-{kind}")
 
 
 def _tables(path: Path) -> Iterator[str]:
@@ -153,7 +171,7 @@ def _tables(path: Path) -> Iterator[str]:
 def _reading(path: Path) -> Iterator[sqlite3.Connection]:
     """A connection that only reads; of a folder that cannot be written to as well."""
     address = path.absolute().as_uri()
-    waiting = path.with_name(f"{path.name}-wal").exists()
+    waiting = _beside(path, "wal").exists()
     with contextlib.closing(
         sqlite3.connect(f"{address}?mode=ro{'' if waiting else '&immutable=1'}", uri=True)
     ) as open_:
