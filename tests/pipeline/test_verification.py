@@ -339,6 +339,20 @@ def test_what_is_no_database_to_verify(damage: Any, said: str, tmp_path: Path) -
         fmtorch.verify(path)
 
 
+def test_a_database_that_another_process_writes_to(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    write(path, scene(2))
+    code = f"import sqlite3, time\nc = sqlite3.connect({str(path)!r})\nc.execute('BEGIN IMMEDIATE')\n"
+    held = "open('held', 'w').close()\ntime.sleep(60)"
+    command = starter().start(tmp_path, "-c", code + held)
+    while not (tmp_path / "held").exists():
+        assert command.runs(), command.said()
+    with pytest.raises(OSError, match=re.escape(f"{path} cannot be written: ")):
+        fmtorch.verify(path)
+    assert command.kill()
+    assert fmtorch.verify(path).verified == 1
+
+
 def test_wrong_arguments(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
     write(path, scene(2))

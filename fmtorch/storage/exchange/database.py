@@ -20,7 +20,6 @@ from fmtorch.storage.exchange.database_images import DatabaseImage, database_ima
 from fmtorch.storage.exchange.two_view import PairGeometry, two_view_geometry
 
 MAGIC = b"SQLite format 3\0"
-VERSION = slice(60, 64)  # of the header: SQLite's user_version, in which COLMAP writes its own
 TABLES = {"cameras", "images", "keypoints", "matches", "two_view_geometries"}
 BLOCK = 64  # images: pairs are sorted by blocks of both images, so that keypoints are read seldom
 MEMORY = 2 * BLOCK + 1  # images whose keypoints are kept
@@ -31,13 +30,16 @@ Ids = tuple[int, int]
 class MatchDatabase:
     """An open database. Its images are read when they are needed, and few of them are kept.
 
-    Raises what `expect_database` raises, and ValueError where there are no keypoints or no matches.
+    Raises what `expect_database` raises, and ValueError where there are no keypoints or no matches; OSError where the
+    disk is full or another process holds the database.
     """
 
     def __init__(self, path: Path) -> None:
         self._pycolmap = imported()
         expect_database(path)
-        self._database = self._pycolmap.Database.open(path)
+        self._path = path
+        with _naming(path):
+            self._database = self._pycolmap.Database.open(path)
         self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
         for count, what, step in (
             (self._database.num_keypoints(), "keypoints", "extract features (colmap feature_extractor)"),
@@ -83,7 +85,7 @@ class MatchDatabase:
 
     def write(self, geometries: Iterable[tuple[Ids, PairGeometry]]) -> None:
         """Write geometries of pairs, in place of those that they have, all of them or, killed within, none."""
-        with self._pycolmap.DatabaseTransaction(self._database):
+        with _naming(self._path), self._pycolmap.DatabaseTransaction(self._database):
             for pair, geometry in geometries:
                 written = two_view_geometry(self._pycolmap, geometry)
                 if self.has_geometry(pair):
@@ -109,6 +111,18 @@ class MatchDatabase:
         return database_image(str(image.name), camera, np.asarray(self._database.read_keypoints(image_id)))
 
 
+@contextlib.contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Raises OSError naming the database for what SQLite says of disks and locks."""
+    try:
+        yield
+    except RuntimeError as error:
+        said = str(error).partition("SQLite error: ")[2]
+        raise OSError(
+            f"{path} cannot be written: {said or 'another process holds it, or its disk is full or read-only'}"
+        ) from error
+
+
 def expect_database(path: Path) -> None:
     """Raises FileNotFoundError or ValueError, saying what would be right, for what is no database that can be read."""
     if not path.exists():
@@ -116,18 +130,17 @@ def expect_database(path: Path) -> None:
     if path.is_dir():
         raise ValueError(f"{path} is a folder; give the database file in it: {path / 'database.db'}")
     with path.open("rb") as file:
-        header = file.read(VERSION.stop)
-    if not header.startswith(MAGIC) or len(header) < VERSION.stop:
-        raise ValueError(f"{path} is not a COLMAP database; give the database.db of a COLMAP project")
-    version, newest = int.from_bytes(header[VERSION], "big"), _newest_version()
-    if version > newest:
+        if file.read(len(MAGIC)) != MAGIC:
+            raise ValueError(f"{path} is not a COLMAP database; give the database.db of a COLMAP project")
+    version, tables = _schema(path)
+    missing = TABLES - tables
+    if missing:
+        raise ValueError(f"{path} is a database, but none of COLMAP's: it has no table {', '.join(sorted(missing))}")
+    if version > (newest := _newest_version()):
         raise ValueError(
             f"{path} was written by a newer COLMAP (schema {version}; this pycolmap {imported().__version__} "
             f"reads up to {newest}); pip install --upgrade pycolmap"
         )
-    missing = TABLES - set(_tables(path))
-    if missing:
-        raise ValueError(f"{path} is a database, but none of COLMAP's: it has no table {', '.join(sorted(missing))}")
 
 
 def copy_database(path: Path, copy: Path) -> None:
@@ -158,11 +171,13 @@ def _beside(path: Path, kind: str) -> Path:
     return path.with_name(f"{path.name}-{kind}")
 
 
-def _tables(path: Path) -> Iterator[str]:
+def _schema(path: Path) -> tuple[int, set[str]]:
+    """The version that COLMAP wrote, and the names of the tables; pycolmap tells neither."""
     try:
         with _reading(path) as connection:
-            for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall():
-                yield str(name)
+            (version,) = connection.execute("PRAGMA user_version").fetchone()
+            tables = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
+            return int(version), {str(name) for (name,) in tables}
     except sqlite3.DatabaseError as error:
         raise ValueError(f"{path} cannot be read as a COLMAP database: {error}") from error
 
@@ -185,4 +200,4 @@ def _newest_version() -> int:
         path = Path(folder) / "empty.db"
         opened: Any = imported().Database.open(path)
         opened.close()
-        return int.from_bytes(path.read_bytes()[VERSION], "big")
+        return _schema(path)[0]
