@@ -135,7 +135,7 @@ COUNT = "it must be a whole number of at least 1"
         ("verify no.db cameras=known", "cameras=known; it must be"),
         ("verify no.db force=2", "force=2; it must be true or false"),
         ("verify no.db more.db", "more.db: only database may stand without NAME="),
-        ("verify no.db estimator.hypotheses=few", "estimator: hypotheses=few; it must be a whole number"),
+        ("verify no.db estimator.hypotheses=few", "estimator.hypotheses=few; it must be a whole number"),
         ("train batch=0", f"batch=0; {COUNT}"),
         ("train limit=three", f"limit=three; {COUNT} or null"),
         ("train optimisation.steps=some", "optimisation.steps=some; it must be a whole number"),

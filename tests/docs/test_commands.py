@@ -27,6 +27,7 @@ from fmtorch import data
 from fmtorch.data import read_image
 from tests.conftest import own_cache
 from tests.processes import run_command
+from tests.pipeline import databases
 from tests.storage.exchange import writers
 
 SOURCE = Path(__file__).resolve().parents[2]
@@ -76,6 +77,7 @@ APPENDED = {
         *TINY,
     ],
     "fmtorch.pairs": ["dataset.root=DATA/Strecha", "workers=1"],
+    "fmtorch.verify": ["estimator.focal.rounds=3"],
     "fmtorch.report": ["pictures=1", "root=DATA/Strecha"],
     "estimators": ["--limit", "1", "--seeds", "1"],
     "curves": ["--limit", "1", "--specs", "curves.txt"],
@@ -89,6 +91,7 @@ APPENDED = {
     "related": ["--limit", "1", "--unrelated", "1"],
     "learned": ["--limit", "1", "--cache", "kept", "--methods", "ratio", "LC, F", "DFE"],
     "stress": ["--limit", "1", "--only", "noise"],
+    "verify": ["--scenes", "DATA/Strecha/a", "--repeats", "1", "--no-mapper"],
     "speed": ["--pairs", "2", "--batch", "2", "--repeats", "1", "--matches", "200"],
     "memory": ["--pairs", "1", "--matches", "200", "--estimators", "ransac"],
     "end_to_end": ["--limit", "1", "--pipelines", "sift_lmeds"],
@@ -187,6 +190,7 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for layout in ("posebench", "hloc", "oanet"):
         writers.WRITERS[layout](folder / "FILES" / layout)
     writers.truth(folder / "SET")
+    databases.write(folder / "database.db", databases.scene(3))
     (folder / "my_conf" / "estimator").mkdir(parents=True)
     yaml = re.findall(
         r"```yaml\n# my_conf/estimator/mine.yaml\n(.*?)```", (SOURCE / "README.md").read_text(), re.DOTALL
