@@ -93,6 +93,17 @@ def verify(
         ValueError: for another file, a database of a newer COLMAP, without keypoints or without matches; for an
             `output` that exists, an unknown preset, option or kind of cameras.
         ImportError: without pycolmap.
+
+    Example:
+        >>> import tempfile, fmtorch, pycolmap
+        >>> path = tempfile.mkdtemp() + "/database.db"
+        >>> options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=3)
+        >>> with pycolmap.Database.open(path) as database:
+        ...     model = pycolmap.synthesize_dataset(options, database)
+        ...     database.clear_two_view_geometries()
+        >>> result = fmtorch.verify(path)
+        >>> result.pairs, result.verified
+        (3, 3)
     """
     built = presets.build("estimator", estimator, config_dir, **options)
     settings = {"estimator": estimator, "options": repr(sorted(options.items()))}

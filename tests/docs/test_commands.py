@@ -26,8 +26,8 @@ from hydra.core.global_hydra import GlobalHydra
 from fmtorch import data
 from fmtorch.data import read_image
 from tests.conftest import own_cache
-from tests.processes import run_command
 from tests.pipeline import databases
+from tests.processes import run_command
 from tests.storage.exchange import writers
 
 SOURCE = Path(__file__).resolve().parents[2]

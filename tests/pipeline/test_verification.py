@@ -188,6 +188,20 @@ def test_one_photograph_twice_and_two_of_different_places(tmp_path: Path) -> Non
     assert geometry.F is None
 
 
+def test_a_focal_length_that_the_matches_contradict_is_no_calibration(tmp_path: Path) -> None:
+    """EXIF of another lens: the pose is that of the focal length that the matches show."""
+    path, cameras = tmp_path / "database.db", scene(2, count=400)
+    write(path, cameras, "SIMPLE_PINHOLE", noise=0.1)
+    assert fmtorch.verify(path).configurations == {"calibrated": 1}
+    with pycolmap.Database.open(path) as database:
+        camera = database.read_camera(1)
+        camera.params = [1500, 320, 240]
+        database.update_camera(camera)
+    assert fmtorch.verify(path, force=True).configurations == {"uncalibrated": 1}
+    (geometry,) = read(path).values()
+    assert angle(cameras.relative(0, 1)[0].T @ geometry.cam2_from_cam1.rotation.matrix()) < 1
+
+
 def test_geometries_are_kept_unless_forced(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
     write(path, scene(3))
