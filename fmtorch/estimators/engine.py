@@ -213,5 +213,5 @@ def _focal_search(
     if options.samples:
         own = Search(family, search.sampler, search.preselection, options.pool, options.samples, FOCAL_ROUND)
     exact = options.exact_focals
-    exact_gain = select.score if exact is None else part("score", choice.score, threshold=exact.scale)
-    return FocalSearch(options, family, select.score, exact_gain, refinement, own, search.stop)
+    exact_gain = None if exact is None else part("score", choice.score, threshold=exact.scale)
+    return FocalSearch(options, family, select.score, refinement, own, search.stop, exact_gain)

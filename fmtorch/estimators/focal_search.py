@@ -79,10 +79,10 @@ class FocalSearch:
     options: Focal
     family: FundamentalWithFocals
     gain: Score
-    exact_gain: Score
     refinement: Refinement
     search: Search | None
     stop: Stop | None
+    exact_gain: Score | None = None
 
     def __call__(self, pair: Pair) -> SearchResult:
         """Rounds until good candidates are one model, or enough rounds have confirmed the best one, and the stopping
@@ -116,7 +116,7 @@ class FocalSearch:
         """Candidates near models (k, 9), refined on some matches and judged on all."""
         cameras, refined = self.family.refine(F, near, self.options.iterations)
         posterior, exact = np.empty(len(F)), pair.calibration is not None and pair.calibration.exact
-        gain = self.exact_gain if exact else self.gain
+        gain = self.exact_gain if exact and self.exact_gain is not None else self.gain
         posteriors(scores_of(gain, refined.models, pair), refined.share, refined.cost, valid, posterior)
         return PlausibleCandidates(refined.models, posterior, cameras)
 

@@ -15,7 +15,6 @@ step is orthogonal to it.
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,48 +23,14 @@ from fmtorch.compiling.arrays import Array, F8x1, F8x2, F8x3
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.lanes import LANES, added, fill, load, store, where
 from fmtorch.compiling.scratch import matrix, vector
-from fmtorch.geometry import residual_kernels as rows_of
 from fmtorch.geometry.levenberg_marquardt_kernels import Schedule, levenberg_marquardt
 from fmtorch.geometry.rank2_kernels import assign, assign_rows, unit
 from fmtorch.geometry.rank2_manifold_kernels import eliminate
-from fmtorch.geometry.residual_kernels import TINY32, Residual
 from fmtorch.geometry.sampson_objective_kernels import MATCH, TINY, Weighted, in_rows, robust
 
 MIN_DAMPING, MAX_DAMPING = 1e-12, 1e6
-INFINITE, ZERO = np.float32(math.inf), np.float32(0)
 BEHIND = 1e4  # squared distance of a match behind the horizon in the units of the points, which extend to about one
 SUMS = 52  # over the matches, of the normal equations
-load32 = rows_of.load
-
-
-@inner
-def _of_row(h: Array, rows: Array, row: int) -> Any:
-    x, y, u, v = load32(rows, row), load32(rows, row + 1), load32(rows, row + 2), load32(rows, row + 3)
-    w = h[6] * x + h[7] * y + h[8]
-    e, f = h[0] * x + h[1] * y + h[2] - u * w, h[3] * x + h[4] * y + h[5] - v * w
-    a, b, c, d = h[0] - u * h[6], h[1] - u * h[7], h[3] - v * h[6], h[4] - v * h[7]
-    p, q, area, w2 = c * e - a * f, d * e - b * f, a * d - b * c, w * w
-    determinant = area * area + w2 * (a * a + b * b + c * c + d * d + w2)
-    r2 = (w2 * (e * e + f * f) + p * p + q * q) / where(determinant > TINY32, determinant, TINY32)
-    return where(w > ZERO, r2 * load32(rows, row + 4), INFINITE)
-
-
-@inner
-def _of_match(h: Array, x: Any, y: Any, u: Any, v: Any) -> Any:
-    w = h[6] * x + h[7] * y + h[8]
-    e, f = h[0] * x + h[1] * y + h[2] - u * w, h[3] * x + h[4] * y + h[5] - v * w
-    a, b, c, d = h[0] - u * h[6], h[1] - u * h[7], h[3] - v * h[6], h[4] - v * h[7]
-    p, q, area, w2 = c * e - a * f, d * e - b * f, a * d - b * c, w * w
-    determinant = area * area + w2 * (a * a + b * b + c * c + d * d + w2)
-    return (w2 * (e * e + f * f) + p * p + q * q) / determinant if w > 0 else w - w + math.inf
-
-
-@inner
-def _within(h: Array, x: Any, y: Any, u: Any, v: Any, limit: Any) -> Any:
-    return _of_match(h, x, y, u, v) <= limit
-
-
-HOMOGRAPHY = Residual("homography", _of_row, _of_match, _within)
 
 
 class _State(NamedTuple):

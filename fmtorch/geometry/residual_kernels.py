@@ -6,6 +6,7 @@ row by row, and act on points in normalised units.
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ SINGLES = 16  # float32 numbers of a row
 load, fill = lanes(SINGLES)
 MATCH = 6  # rows of SINGLES matches: x0, y0, x1, y1, scale, weight
 TINY32, TINY = np.finfo(np.float32).tiny, float(np.finfo(np.float64).tiny)
+ZERO32, INFINITE32 = np.float32(0), np.float32(math.inf)
 
 
 class Residual(NamedTuple):
@@ -66,3 +68,34 @@ def _sampson_within(f: Array, x0: Any, y0: Any, x1: Any, y1: Any, limit: Any) ->
 
 SAMPSON = Residual("sampson", _sampson_of_row, _sampson_of_match, _sampson_within)
 """The Sampson distance of a fundamental matrix (Hartley & Zisserman 2004, 11.4.3)."""
+
+
+@inner
+def _homography_of_row(h: Array, rows: Array, row: int) -> Any:
+    x, y, u, v = load(rows, row), load(rows, row + 1), load(rows, row + 2), load(rows, row + 3)
+    w = h[6] * x + h[7] * y + h[8]
+    e, f = h[0] * x + h[1] * y + h[2] - u * w, h[3] * x + h[4] * y + h[5] - v * w
+    a, b, c, d = h[0] - u * h[6], h[1] - u * h[7], h[3] - v * h[6], h[4] - v * h[7]
+    p, q, area, w2 = c * e - a * f, d * e - b * f, a * d - b * c, w * w
+    determinant = area * area + w2 * (a * a + b * b + c * c + d * d + w2)
+    r2 = (w2 * (e * e + f * f) + p * p + q * q) / where(determinant > TINY32, determinant, TINY32)
+    return where(w > ZERO32, r2 * load(rows, row + 4), INFINITE32)
+
+
+@inner
+def _homography_of_match(h: Array, x: Any, y: Any, u: Any, v: Any) -> Any:
+    w = h[6] * x + h[7] * y + h[8]
+    e, f = h[0] * x + h[1] * y + h[2] - u * w, h[3] * x + h[4] * y + h[5] - v * w
+    a, b, c, d = h[0] - u * h[6], h[1] - u * h[7], h[3] - v * h[6], h[4] - v * h[7]
+    p, q, area, w2 = c * e - a * f, d * e - b * f, a * d - b * c, w * w
+    determinant = area * area + w2 * (a * a + b * b + c * c + d * d + w2)
+    return (w2 * (e * e + f * f) + p * p + q * q) / determinant if w > 0 else w - w + math.inf
+
+
+@inner
+def _homography_within(h: Array, x: Any, y: Any, u: Any, v: Any, limit: Any) -> Any:
+    return _homography_of_match(h, x, y, u, v) <= limit
+
+
+HOMOGRAPHY = Residual("homography", _homography_of_row, _homography_of_match, _homography_within)
+"""The Sampson distance of a homography, see `homography_objective_kernels`; infinite behind the plane's horizon."""

@@ -25,13 +25,13 @@ class SquarePixels(NamedTuple):
     """The images that B images are mapped to.
 
     map: from coordinates of K to those of K', attached to K; that of a faulty K is the identity. focal: of K', px,
-    constant. size: (h, w), px. valid: whether K is a calibration matrix of the image.
+    constant. size: (h, w), px. unit: the focal length of K in that of K', attached.
     """
 
     map: Float[Tensor, "b 3 3"]
     focal: Float[Tensor, " b"]
     size: Float[Tensor, "b 2"]
-    valid: Bool[Tensor, " b"]
+    unit: Float[Tensor, " b"]
 
 
 def square_pixels(
@@ -56,11 +56,11 @@ def square_pixels(
     scale = torch.where(~in_pixels, NOMINAL_FOCAL_PX / focal, 1.0)
     f, image = focal * scale, image * scale[:, None]
     x, y = (image[:, 1] - 1) / 2, (image[:, 0] - 1) / 2
-    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+    zero, ones = torch.zeros_like(fx), torch.ones_like(fx)
     across = -f * skew / (fx * fy)
-    rows = [f / fx, across, x - f / fx * cx - across * cy, zero, f / fy, y - f / fy * cy, zero, zero, one]
+    rows = [f / fx, across, x - f / fx * cx - across * cy, zero, f / fy, y - f / fy * cy, zero, zero, ones]
     A = torch.where(valid[:, None], torch.stack(rows, -1), torch.eye(3, dtype=K.dtype, device=K.device).flatten())
-    return SquarePixels(A.reshape(-1, 3, 3), f, image, valid)
+    return SquarePixels(A.reshape(-1, 3, 3), f, image, sqrt(fx * fy) / f)
 
 
 def _image(K: Tensor, size: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
@@ -114,7 +114,7 @@ def _problem(K: NDArray[np.float64], size: NDArray[np.float64] | None, name: str
     return ""
 
 
-def mapped(x: Float[Tensor, "b n 2"], A: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b n 2"]:
-    """Points (B, N, 2) by affine maps (B, 3, 3), in the points' type."""
-    rows = A[:, None, :2]
+def mapped(x: Float[Tensor, "*batch n 2"], A: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch n 2"]:
+    """Points (..., N, 2) by affine maps (..., 3, 3), in the points' type."""
+    rows = A[..., None, :2, :]
     return (rows[..., 0] * x[..., :1] + rows[..., 1] * x[..., 1:] + rows[..., 2]).to(x.dtype)

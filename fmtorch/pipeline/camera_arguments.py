@@ -15,7 +15,7 @@ from fmtorch.geometry.square_pixels import calibration_problems
 
 Focal = Literal["shared", "unknown"] | float | Arrays | Mapping[str, Any] | None
 FORMS = "None, 'unknown', 'shared', (px, deviation) or ((px, deviation), (px, deviation))"
-FORMS_WITH_K = "None, or the relative deviation of the focal lengths of K0 and K1: one number, two, or (B, 2)"
+FORMS_WITH_K = "None, 'unknown', 'shared', or the relative deviations of the focal lengths of K: one, two, or (B, 2)"
 UNKNOWN = (1.0, math.inf)  # px, relative deviation
 
 
@@ -29,12 +29,10 @@ def camera_fields(K0: Arrays | None, K1: Arrays | None, focal: Focal, sizes_know
     if not sizes_known and (K0 is None or K1 is None):
         missing = "focal" if K0 is None and K1 is None else "K1 alone" if K0 is None else "K0 alone"
         raise ValueError(f"{missing} needs the image sizes: give size0 and size1")
-    if K0 is None and K1 is None:
-        if isinstance(focal, str):
-            return _named(focal)
-        return {"focal": _measured(focal)}
     fields: dict[str, Any] = {name: _floating(K, name) for name, K in (("K0", K0), ("K1", K1)) if K is not None}
-    return fields | {"focal": _deviations(focal, K0 is not None, K1 is not None)}
+    if isinstance(focal, str):
+        return fields | _named(focal)
+    return fields | {"focal": _deviations(focal, K0 is not None, K1 is not None) if fields else _measured(focal)}
 
 
 def expect_calibrations(c: Correspondences) -> None:
@@ -68,8 +66,6 @@ def _measured(focal: Any) -> Tensor:
 
 def _deviations(focal: Any, known0: bool, known1: bool) -> Tensor:
     """Deviations of the focal lengths of K, in the place where they stand beside px: (2, 2) or (B, 2, 2)."""
-    if isinstance(focal, str):
-        raise ValueError(f"focal is {focal!r}; with K0 or K1 it must be {FORMS_WITH_K}")
     values = _floating(0.0 if focal is None or isinstance(focal, Mapping) else focal, "focal")
     values = values.expand(2) if values.shape in ((), (1,)) else values
     if values.dim() > 2 or values.shape[-1] != 2:

@@ -40,7 +40,8 @@ def find_essential(
         K0, K1: calibration matrices in the unit of the points, (3, 3) for all pairs or (B, 3, 3). Pixels need not be
             square nor principal points central; lenses must not distort.
         focal: how well the focal lengths of K0 and K1 are known: None for exactly, or their relative standard
-            deviation, one number, (s0, s1) or (B, 2); 0.05 suits EXIF. What is not exact is estimated.
+            deviation, one number, (s0, s1) or (B, 2); 0.05 suits EXIF; "shared" or "unknown" where K tells principal
+            points and the shape of pixels alone. What is not exact is estimated.
         size0, size1: image sizes (h, w), one for all pairs or (B, 2). Twice the principal point when not given.
         estimator, mask, quality, prior, lafs0, lafs1, noise, key, seed, config_dir: as of `find_fundamental`.
         options: replace values of the preset (``inlier_threshold=1.0``).
@@ -59,12 +60,12 @@ def find_essential(
         >>> generator = torch.Generator().manual_seed(0)
         >>> X = torch.rand(80, 3, generator=generator, dtype=torch.float64) + torch.tensor([0.0, 0.0, 2.0])
         >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=torch.float64)
-        >>> x0, x1 = (Y @ K.T for Y in (X, X + torch.tensor([-0.6, 0.0, 0.8])))
+        >>> x0, x1 = (Y @ K.T for Y in (X, X + torch.tensor([-0.64, 0.48, 0.6])))
         >>> x0, x1 = x0[:, :2] / x0[:, 2:], x1[:, :2] / x1[:, 2:]
         >>> x1[:20] = x1[:20].flip(0)                            # twenty wrong matches
         >>> estimate = fmtorch.find_essential(x0, x1, K, K)
         >>> bool(estimate.ok[0]), [round(value, 3) for value in estimate.t[0].tolist()]
-        (True, [-0.6, 0.0, 0.8])
+        (True, [-0.64, 0.48, 0.6])
     """
     for name, K in (("K0", K0), ("K1", K1)):
         if K is None:

@@ -59,7 +59,8 @@ def find_fundamental(
             "shared"                          one unknown focal length for both images (in units of the longer side)
             (f, s)                            f px for both images, up to a relative standard deviation s
             ((f0, s0), (f1, s1))              the same for each image, None in place of what is unknown; (B, 2, 2)
-            s, (s0, s1) or (B, 2), with K     how well the focal lengths of K0 and K1 are known
+            s, (s0, s1) or (B, 2), with K     how well the focal lengths of K0 and K1 are known; with "unknown" and
+                                              "shared" K tells principal points and the shape of pixels alone
             ================================  ======================================================================
 
             A deviation of 0 is exact and an infinite one nothing; 0.05 suits EXIF. From 0.02 on measurements may be
@@ -127,7 +128,7 @@ def find_homography(
 
     Returns:
         An `Estimate` whose `H` (B, 3, 3) has unit Frobenius norm and maps points that are seen to positive third
-        coordinates; inliers, ok, reason. Its significance is NaN: that is a test of fundamental matrices.
+        coordinates; inliers, ok, reason. Its significance is NaN where `ok`: that is a test of fundamental matrices.
 
     Raises:
         ValueError, TypeError: as `find_fundamental`.

@@ -43,6 +43,8 @@ def matches(b: int = 4, n: int = 6, seed: int = 0) -> Correspondences:
         key=torch.arange(b) + 100 * seed,
         mutual=torch.rand(b, n, generator=g) < 0.5,
         noise=torch.rand(b, n, generator=g),
+        focal=torch.rand(b, 2, 2, generator=g),
+        shared_focal=torch.rand(b, generator=g) < 0.5,
     )
 
 
@@ -56,6 +58,10 @@ def estimate(b: int = 4, n: int = 6, seed: int = 0) -> Estimate:
         reason=tuple("" if good else f"reason {i}" for i, good in enumerate(ok.tolist())),
         draws=torch.arange(b) + seed,
         significance=torch.where(ok, torch.rand(b, generator=g, dtype=torch.float64), -torch.inf),
+        E=torch.rand(b, 3, 3, generator=g),
+        R=torch.rand(b, 3, 3, generator=g),
+        t=torch.rand(b, 3, generator=g),
+        focals=torch.rand(b, 2, generator=g),
     )
 
 

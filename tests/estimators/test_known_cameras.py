@@ -13,9 +13,13 @@ from torch import Tensor
 import fmtorch
 from fmtorch import presets
 from fmtorch.core.types import Correspondences, Estimate, collate
+from fmtorch.data import ImagePair, load
 from fmtorch.estimators.parts import final_fits
 from fmtorch.geometry import fundamental_from_calibration, square_pixels
+from fmtorch.metrics import pose_error
 from fmtorch.pipeline.known_cameras import KnownCameras
+from fmtorch.pipeline.pipeline import Pipeline
+from tests.conftest import shared_path
 from tests.laws import (
     Result,
     assert_same,
@@ -131,6 +135,30 @@ def test_the_fit_is_the_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
     assert reference.angle(e.R[0].numpy(), R) < 1e-4
     assert float(np.degrees(np.linalg.norm(np.cross(e.t[0].numpy(), t)))) < 1e-3
     assert error(e, s) > 1e-2  # it is not the truth
+
+
+@pytest.mark.usefixtures("converging")
+@pytest.mark.parametrize("known", ["rough", "one", "shared", "unknown"])
+def test_the_fit_is_the_maximum_of_the_posterior(known: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over pose and focal lengths, by SciPy; of images of two sizes, which the well of one camera is not for."""
+    monkeypatch.setattr(final_fits, "MIN_INLIERS_FOR_NOISE", 1000)  # the loss is truncated at 1.5 px, two deviations
+    sizes, inf = ((480, 640), (600, 800)), float("inf")
+    nothing = (1.0, inf)
+    measured = {"rough": ((640.0, 0.05), (900.0, 0.1)), "one": ((660.0, 0.03), nothing)}.get(known, (nothing, nothing))
+    cameras = tuple(
+        np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1]])
+        for f, (h, w) in zip((650.0, 820.0), sizes, strict=True)
+    )
+    s = reference.scene(3, noise=0.2, outliers=0.0, cameras=cameras)
+    focal: Any = known if known in ("shared", "unknown") else torch.tensor(measured, dtype=torch.float64)
+    e = fmtorch.find_fundamental(s.x0, s.x1, size0=sizes[0], size1=sizes[1], focal=focal, prior=np.ones(150))
+    R, t, focals = reference.best_cameras(s, sizes, 0.75, measured, known == "shared")
+    assert e.focals is not None
+    assert e.R is not None
+    assert e.t is not None
+    np.testing.assert_allclose(e.focals[0], focals, rtol=1e-4)
+    assert reference.angle(e.R[0].numpy(), R) < 1e-2
+    assert float(np.degrees(np.linalg.norm(np.cross(e.t[0].numpy(), t)))) < 1e-2
 
 
 @pytest.mark.parametrize("known", [CAMERAS, {"focal": "shared"}, {"focal": (560.0, 0.1)}])
@@ -319,11 +347,8 @@ def test_gradients_are_the_differences_of_estimates(
     image of square pixels is a constant. Focal lengths are usual and equal ones, so that the prior does not pull: Gauss
     and Newton's Hessian leaves out the curvature of residuals."""
     given = _differentiable()
-    fixed = {
-        name: square_pixels._image(given[name], torch.tensor([SIZES[size]]))
-        for name, size in (("K0", "size0"), ("K1", "size1"))
-    }
-    monkeypatch.setattr(square_pixels, "_image", lambda K, size: fixed["K0" if K[0, 0, 1] > 0 else "K1"])
+    fixed = square_pixels._image(torch.cat([given["K0"], given["K1"]]), torch.tensor([reference.SIZE] * 2))
+    monkeypatch.setattr(square_pixels, "_image", lambda K, size: fixed)
     rng, names = np.random.default_rng(0), VARIABLES if focal != "shared" else VARIABLES[:4]
     weights = torch.from_numpy(rng.normal(size=(3, 3)))
 
@@ -354,7 +379,7 @@ def test_gradients_are_the_differences_of_estimates(
 def _differentiable() -> dict[str, Tensor]:
     """Points, priors, noises and calibrations of 14 matches, nearly exact."""
     f = 1.2 * 640
-    cameras = tuple(np.array([[f, skew, 319.5], [0, f, 239.5], [0, 0, 1]]) for skew in (1e-3, -1e-3))
+    cameras = tuple(np.array([[f, skew, 319.5], [0, f, 239.5], [0, 0, 1]]) for skew in (1.0, -1.0))
     s, rng = reference.scene(4, 14, noise=1e-3, outliers=0.0, cameras=cameras), np.random.default_rng(1)
     values = {"x0": s.x0, "x1": s.x1, "prior": rng.uniform(0.5, 0.9, 14), "noise": rng.uniform(0.5, 2, 14)}
     return {name: torch.from_numpy(value)[None] for name, value in values.items()} | {
@@ -363,6 +388,35 @@ def _differentiable() -> dict[str, Tensor]:
 
 
 # Real pairs
+
+
+@functools.cache
+def castle() -> list[tuple[ImagePair, Correspondences]]:
+    """Eight pairs of castle-P19 with SIFT matches, P(inlier) and noise."""
+    pairs = load("fmbench", root=shared_path("data/Strecha_train"))
+    pruners = {
+        name: presets.build("pruner", name) for name in ("ratio", "one_to_one", "frame_consistency", "match_noise")
+    }
+    front = Pipeline(presets.build("features", "sift"), presets.build("matcher", "nearest"), pruners, quick("msac"))
+    chosen = sorted((pairs[i] for i in range(len(pairs))), key=lambda pair: pair.identity)[::10]
+    return [(pair, c) for pair in chosen if (c := front.match([pair])[0].correspondences) is not None]
+
+
+def test_real_pairs_keep_the_order_of_knowledge() -> None:
+    """Exact calibration, 6 % of focal lengths, nothing."""
+    errors: dict[str, list[float]] = {"exact": [], "rough": [], "unknown": []}
+    for pair, c in castle():
+        given = {name: getattr(c, name) for name in ("mask", "quality", "prior", "noise", "size0", "size1", "key")}
+        K = {"K0": pair.K0, "K1": pair.K1}
+        knowledge: dict[str, Any] = {"exact": K, "rough": K | {"focal": 0.06}, "unknown": {"focal": "unknown"}}
+        for name, known in knowledge.items():
+            e = fmtorch.find_fundamental(c.x0, c.x1, **given, **known)
+            assert pair.R is not None
+            assert pair.t is not None
+            errors[name].append(float(pose_error(e.R, e.t, pair.R[None], pair.t[None]).worst))  # type: ignore[arg-type]
+    assert len(errors["exact"]) == 8
+    assert max(errors["exact"]) < 2  # degrees
+    assert np.mean(errors["exact"]) < np.mean(errors["rough"]) < np.mean(errors["unknown"])
 
 
 def test_the_preset_has_constants_for_exact_focal_lengths() -> None:

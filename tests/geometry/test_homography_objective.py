@@ -10,13 +10,13 @@ import torch
 
 from fmtorch.geometry.homography_error import homography_curvature, homography_gradient, linearise_homography
 from fmtorch.geometry.homography_objective_kernels import (
-    HOMOGRAPHY,
     evaluate_homographies,
     refine_homographies,
     step_of_homography,
 )
 from fmtorch.geometry.homography_refine import inverse_hessian_of_homography
 from fmtorch.geometry.levenberg_marquardt_kernels import Schedule
+from fmtorch.geometry.residual_kernels import HOMOGRAPHY
 from fmtorch.geometry.robust_losses import KERNELS
 from fmtorch.geometry.sampson_objective_kernels import LOSSES, NO_TABLE, Weighted
 from tests.reference import homography_family as reference

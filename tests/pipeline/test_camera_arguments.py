@@ -33,6 +33,7 @@ SIZES = {"size0": reference.SIZE, "size1": reference.SIZE}
         ({"K0": K, "K1": K, "focal": np.full((3, 2), 0.1)}, [[[1, 0.1], [1, 0.1]]] * 3),
         ({"K0": K}, [[1, 0], [1, INF]]),
         ({"K1": K, "focal": 0.1}, [[1, INF], [1, 0.1]]),
+        ({"K0": K, "K1": K, "focal": "shared"}, [[1, INF], [1, INF]]),
     ],
 )
 def test_forms_of_what_is_known(arguments: dict[str, Any], focal: list[Any]) -> None:
@@ -53,7 +54,6 @@ def test_forms_of_what_is_known(arguments: dict[str, Any], focal: list[Any]) -> 
         ({"focal": (800.0, float("nan"))}, "focal of image 0"),
         ({"focal": (800.0, 0.1), "size0": None, "size1": None}, "focal needs the image sizes"),
         ({"K0": K, "size0": None, "size1": None}, "K0 alone needs the image sizes"),
-        ({"K0": K, "K1": K, "focal": "shared"}, "focal is 'shared'; with K0 or K1"),
         ({"K0": K, "K1": K, "focal": (800, 0.1, 2)}, "focal has shape"),
         ({"K0": K, "K1": K, "focal": -0.1}, "a relative deviation is not negative"),
         ({"K0": torch.eye(2), "K1": K}, "K0 has shape"),

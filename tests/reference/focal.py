@@ -4,7 +4,8 @@ Parameters: a rotation vector, the direction of the translation and two log foca
 0 0 1]`` the model is ``F = K1^-T [t]x R K0^-1``. Minimises
 ``sum P rho(r) / (2 sigma^2) + ((ln f0 - ln f1) / s1)^2 / 2 + ((mean ln f - ln usual) / s2)^2 / 2``, for images of one
 size less ``A / (1 + (ln f0 - ln f1)^2 / s3^2)``; for each measured focal length plus ``z^2 / 2``, or
-``5 z^2 / (z^2 + 10)`` where its deviation s is 0.02 or more, of ``z = (ln f - ln measured) / s``.
+``5 z^2 / (z^2 + 10)`` where its deviation s is 0.02 or more, of ``z = (ln f - ln measured) / s``; of
+the sum of both ``z^2`` where both have such a tail and the images one size.
 """
 
 from __future__ import annotations
@@ -65,10 +66,11 @@ def prior_cost(log_f0: float, log_f1: float, same_size: bool = False, measured: 
     difference = log_f0 - log_f1
     well = 5 * 0.01**2 / (0.01**2 + difference**2) if same_size else 0.0
     cost = (difference / 0.5) ** 2 / 2 + (((log_f0 + log_f1) / 2 - np.log(1.2)) / 0.4) ** 2 / 2 - well
-    for log_f, (mean, deviation) in zip((log_f0, log_f1), measured, strict=True):
-        z2 = ((log_f - mean) / max(deviation, 1e-5)) ** 2
-        cost += z2 / 2 if deviation < 0.02 else 5 * z2 / (z2 + 10)
-    return cost
+    squared = [((f - m) / max(s, 1e-5)) ** 2 for f, (m, s) in zip((log_f0, log_f1), measured, strict=True)]
+    tails = [0.02 <= s < np.inf for _, s in measured]
+    if all(tails) and same_size:
+        return cost + 5 * sum(squared) / (sum(squared) + 10)
+    return cost + sum(5 * z2 / (z2 + 10) if tail else z2 / 2 for z2, tail in zip(squared, tails, strict=True))
 
 
 def loss(r: np.ndarray, scale: float) -> np.ndarray:

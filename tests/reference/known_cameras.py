@@ -81,3 +81,38 @@ def pose_error(R: np.ndarray, t: np.ndarray, s: Scene) -> float:
     """The larger of the angles of rotation and translation, degrees."""
     sine, cosine = np.linalg.norm(np.cross(t, s.t)), t @ s.t
     return max(angle(R, s.R), float(np.degrees(np.arctan2(sine, cosine))))
+
+
+def best_cameras(
+    s: Scene, sizes: tuple, sigma: float, measured: tuple = ((1.0, np.inf), (1.0, np.inf)), shared: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """R, t and focal lengths (px) of greatest posterior near the true pose, of images of two sizes (h, w).
+
+    sigma: standard deviation of Sampson distances, px. measured: focal lengths, px, and their deviations, of at least
+    0.02. shared: whether both are one in units of the longer sides.
+    """
+    longest = [max(size) for size in sizes]
+    a, b = np.linalg.svd(s.t[None])[2][1:]
+
+    def unpacked(p: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        t = s.t + p[3] * a + p[4] * b
+        phi = np.array([p[5], p[5] if shared else p[6]])
+        return Rotation.from_rotvec(p[:3]).as_matrix() @ s.R, t / np.linalg.norm(t), phi
+
+    def residuals(p: np.ndarray) -> np.ndarray:
+        R, t, phi = unpacked(p)
+        cameras = [
+            np.array([[np.exp(f) * side, 0, (w - 1) / 2], [0, np.exp(f) * side, (h - 1) / 2], [0, 0, 1]])
+            for f, side, (h, w) in zip(phi, longest, sizes, strict=True)
+        ]
+        prior = [(phi.mean() - np.log(1.2)) / 0.4, 0.0 if shared else (phi[0] - phi[1]) / 0.5]
+        for f, side, (px, deviation) in zip(phi, longest, measured, strict=True):
+            z = (f - np.log(px / side)) / deviation
+            prior.append(z * np.sqrt(10 / (z * z + 10)))  # half its square is the tail's cost
+        return np.concatenate([sampson(fundamental(R, t, tuple(cameras)), s.x0, s.x1) / sigma, prior])
+
+    start = np.zeros(7 - shared)
+    start[5:] = 0.1
+    fit = least_squares(residuals, start, jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=1000)
+    R, t, phi = unpacked(fit.x)
+    return R, t, np.exp(phi) * longest

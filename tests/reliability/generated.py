@@ -175,19 +175,44 @@ def fields(data: st.DataObject, scene: Scene, kind: str) -> dict[str, Any]:
     return values
 
 
+FOCALS = (
+    None,
+    None,
+    None,
+    "shared",
+    "unknown",
+    0.05,
+    (0, 0.1),
+    (800.0, 0.1),
+    ((800, 0), None),
+    -1.0,
+    "same",
+    np.nan,
+    [],
+)
+"""What may be said of focal lengths, and what may not."""
+
+
 def estimation(name: str, options: dict[str, Any], data: st.DataObject) -> tuple[Call, set[str], Check]:
     """find_fundamental, or find_homography, with a preset."""
     find = fmtorch.find_homography if name == "homography" else fmtorch.find_fundamental
     scene = data.draw(batches(), label="scene")
-    arguments = fields(data, scene, data.draw(st.sampled_from(KINDS), label="kind"))
+    kind = data.draw(st.sampled_from(KINDS), label="kind")
+    arguments = fields(data, scene, kind)
+    if find is fmtorch.find_fundamental:
+        for camera in ("K0", "K1"):
+            if data.draw(st.booleans(), label=camera):
+                arguments[camera] = as_given(scene.array(camera, "Float", ("b", "3", "3")), kind)
     if scene.batch == (1,) and data.draw(st.booleans(), label="without the batch dimension"):
         arguments = {key: value[0] for key, value in arguments.items()}
     elif data.draw(st.sampled_from([False, False, True]), label="as lists"):
-        per_match = [key for key in arguments if not key.startswith(("size", "key"))]
+        per_match = [key for key in arguments if not key.startswith(("size", "key", "K"))]
         arguments.update({key: list(arguments[key]) for key in per_match})
     known = inspect.signature(find).parameters
     arguments = {key: value for key, value in arguments.items() if key in known}
     mistaken(data, arguments, {"seed": None}, movable=False)
+    if find is fmtorch.find_fundamental and (focal := data.draw(st.sampled_from(FOCALS), label="focal")) is not None:
+        options = {key: value for key, value in options.items() if key != "focal"} | {"focal": focal}
     call = functools.partial(find, **arguments, estimator=name, **options)
     return call, {*known}, sound_estimate
 
@@ -205,10 +230,24 @@ def sound_estimate(estimate: Any) -> None:
             assert math.isclose(float(F[i].norm()), 1, rel_tol=1e-4), f"ok with an F of norm {float(F[i].norm())}"
             minimal = MINIMAL_SAMPLE if estimate.model == "fundamental" else 4
             assert support >= minimal, f"ok with {support} inliers"
+            if estimate.R is not None:
+                sound_pose(estimate.R[i].detach(), estimate.t[i].detach(), estimate.E[i].detach())
         else:
             assert reason[i], "not ok without a reason"
             assert not bool(F[i].any()), "not ok with an F"
             assert support == 0, f"not ok with {support} inliers"
+
+
+def sound_pose(R: Tensor, t: Tensor, E: Tensor) -> None:
+    """A rotation, a unit vector, and what they make; or NaN throughout."""
+    finite = {bool(value.isfinite().all()) for value in (R, t, E)}
+    assert len(finite) == 1, "a pose of which a part is not finite"
+    if finite == {True}:
+        identity = torch.eye(3, dtype=R.dtype)
+        torch.testing.assert_close(R @ R.mT, identity, rtol=0, atol=1e-9)
+        assert float(torch.linalg.det(R)) > 0, "a reflection for a rotation"
+        assert math.isclose(float(t.norm()), 1, rel_tol=1e-9)
+        torch.testing.assert_close(E, torch.linalg.cross(t.expand(3, 3), R.mT).mT, rtol=0, atol=1e-9)
 
 
 def stage(name: str, built: Any, data: st.DataObject) -> tuple[Call, set[str], Check]:

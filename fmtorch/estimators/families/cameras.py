@@ -6,7 +6,6 @@ longer sides of the images.
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +17,7 @@ from fmtorch.estimators.calibration import EXACT
 from fmtorch.estimators.families.focal_prior import LOG_USUAL, FocalPrior, focal_prior
 from fmtorch.estimators.pair import Pair
 from fmtorch.geometry.arithmetic_kernels import exponential, logarithm
-from fmtorch.geometry.rank2_kernels import complement
+from fmtorch.geometry.pose_kernels import nearest_axes
 from fmtorch.geometry.rank2_manifold_kernels import SQUARINGS, start_one
 
 MIN_IMAGE_SIDE_PX = 16.0  # longer side of both images below which sizes are taken for those of another unit than pixels
@@ -171,31 +170,7 @@ def nearest_cameras(F: F8x2, images: Images, cameras: Cameras) -> None:
         for c in range(3):
             G[6 + c] *= d1
         start_one(G, 0, M, e0, e1)
-        _nearest_axes(M, e0, e1, axes[k])
-
-
-@inner
-def _nearest_axes(M: Array, e0: Array, e1: Array, axes: Array) -> None:
-    """U and V of the essential matrix nearest to M (9,), whose epipoles are e0, e1 -> axes (2, 3, 3).
-
-    In the planes across the epipoles M is 2 x 2; its nearest orthogonal matrix gives both singular values 1.
-    """
-    p, q, a, b = vector(3), vector(3), vector(3), vector(3)
-    complement(e0, p, q)
-    complement(e1, a, b)
-    m00, m01, m10, m11 = 0.0, 0.0, 0.0, 0.0
-    for r in range(3):
-        Mp = M[3 * r] * p[0] + M[3 * r + 1] * p[1] + M[3 * r + 2] * p[2]
-        Mq = M[3 * r] * q[0] + M[3 * r + 1] * q[1] + M[3 * r + 2] * q[2]
-        m00, m01, m10, m11 = m00 + a[r] * Mp, m01 + a[r] * Mq, m10 + b[r] * Mp, m11 + b[r] * Mq
-    sign = 1.0 if m00 * m11 >= m01 * m10 else -1.0
-    cosine, sine = m00 + sign * m11, m10 - sign * m01
-    norm = math.sqrt(cosine * cosine + sine * sine)
-    cosine, sine = cosine / norm, sine / norm
-    for r in range(3):
-        axes[0, r, 0], axes[0, r, 1] = a[r] * cosine + b[r] * sine, sign * (b[r] * cosine - a[r] * sine)
-        axes[1, r, 0], axes[1, r, 1] = p[r], q[r]
-        axes[0, r, 2], axes[1, r, 2] = e1[r], e0[r]
+        nearest_axes(M, e0, e1, axes[k, 0], axes[k, 1])
 
 
 @inner

@@ -12,14 +12,10 @@ from fmtorch.estimators.families.family import FitScale, Hypotheses, Loss, Steps
 from fmtorch.estimators.pair import Pair
 from fmtorch.geometry.four_point_kernels import four_point
 from fmtorch.geometry.homography_kernels import weighted_homography
-from fmtorch.geometry.homography_objective_kernels import (
-    HOMOGRAPHY,
-    refine_homographies,
-    step_of_homography,
-)
+from fmtorch.geometry.homography_objective_kernels import refine_homographies, step_of_homography
 from fmtorch.geometry.levenberg_marquardt_kernels import Schedule
 from fmtorch.geometry.rank2_kernels import unit
-from fmtorch.geometry.residual_kernels import Residual
+from fmtorch.geometry.residual_kernels import HOMOGRAPHY, Residual
 from fmtorch.geometry.sampson_objective_kernels import LOSSES, NO_TABLE, Weighted, loss_table
 
 STEP_DAMPING = 1e-10  # of a Gauss-Newton step at an optimum: bounds it where the points leave a direction open

@@ -11,9 +11,8 @@ from scipy import integrate
 from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.parts.scored_matches import fractional_bits
 from fmtorch.estimators.parts.scores import GemanMcClure, InlierCount, Magsac, Msac, Score, SummedGains
-from fmtorch.geometry.homography_objective_kernels import HOMOGRAPHY
 from fmtorch.geometry.magsac import ENTRIES, QUANTILE
-from fmtorch.geometry.residual_kernels import SAMPSON
+from fmtorch.geometry.residual_kernels import HOMOGRAPHY, SAMPSON
 from tests.estimators.pairs import FEW, REAL, SCALES, known, models, named, pair_of
 from tests.estimators.residuals import residuals
 from tests.reference import ransac as reference
