@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,8 +11,7 @@ from fmtorch.compiling.arrays import Array, B1x1, F8x1, F8x2
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.scratch import matrix, vector
 from fmtorch.geometry.arithmetic_kernels import logarithm
-from fmtorch.geometry.homography_objective_kernels import HOMOGRAPHY
-from fmtorch.geometry.residual_kernels import SAMPSON
+from fmtorch.geometry.residual_kernels import HOMOGRAPHY, SAMPSON
 from fmtorch.geometry.rotation_kernels import Cameras, fit_rotation
 
 FREEDOM = 3.0  # degrees, of Student's law: keypoints err by more than the normal one says
@@ -183,7 +182,7 @@ def _densities(r2: Array, s: float, side: float, dimensions: int, out: Array) ->
 
 
 @inner
-def _log_likelihood(d: Array, prior: Array, share: Array) -> float:
+def _log_likelihood(d: Array, prior: Array, share: Array) -> Any:
     """The maximum over the shares of sum log L -> share (j + 1,), d (j, n) being the densities of right matches.
 
     A match that the prior takes to be right belongs to one of the j components by their shares, and else is wrong like

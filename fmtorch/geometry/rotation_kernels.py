@@ -12,12 +12,13 @@ from fmtorch.compiling.kernel import inner
 from fmtorch.compiling.scratch import matrix, vector
 from fmtorch.geometry.arithmetic_kernels import exponential
 from fmtorch.geometry.homography_objective_kernels import evaluate_homographies
-from fmtorch.geometry.rank2_kernels import assign, cofactors
+from fmtorch.geometry.matrix_kernels import invert, multiply, orthogonal_factor
+from fmtorch.geometry.rank2_kernels import assign
 from fmtorch.geometry.sampson_objective_kernels import GEMAN_MCCLURE, Weighted
 
 PARAMETERS = 5  # three of the rotation, the logarithms of two focal lengths
 LOSS = 3.0  # noises; scale of the loss
-STEPS, POLAR_STEPS = 12, 10
+STEPS = 12
 DAMPING, MAX_DAMPING = 1e-6, 1e6
 TOLERANCE = 1e-4  # nats that a step must gain
 
@@ -49,10 +50,14 @@ def fit_rotation(
     """
     n, unit_px = len(noise), math.sqrt(abs(cameras.K0[0, 0] * cameras.K1[0, 0]))
     A0, A1, back = vector(9), vector(9), vector(9)
-    _centred(cameras.K0, unit_px, A0)
     _centred(cameras.K1, unit_px, A1)
     turn = _Turn(vector(9), np.zeros(2), matrix(1, 9))
-    if not (unit_px > 0 and _inverted(A0, back) and _nearest(H, cameras, turn.R)):
+    if not (unit_px > 0 and invert(cameras.K1.ravel(), A0)):
+        return math.inf
+    multiply(A0, H, back)
+    multiply(back, cameras.K0.ravel(), turn.R)
+    _centred(cameras.K0, unit_px, A0)
+    if not (orthogonal_factor(turn.R) and invert(A0, back)):
         return math.inf
     x, weight, s2, unit_s = matrix(4, n), vector(n), vector(n), s / unit_px
     for i in range(n):
@@ -63,27 +68,33 @@ def fit_rotation(
         weight[i] = 1 / (noise[i] * noise[i])
         s2[i] = (LOSS * unit_s * noise[i]) * (LOSS * unit_s * noise[i])
     matches = Weighted(x, weight, s2, GEMAN_MCCLURE, matrix(2, 0))
-    prior = _minimise(turn, A1, back, matches, unit_s, cameras.precision)
+    prior, free = np.zeros((2, 2)), np.zeros(2)
+    for a in range(2):
+        free[a] = cameras.precision[a, a] < math.inf
+    for a in range(2):
+        for b in range(2):
+            prior[a, b] = cameras.precision[a, b] if free[a] * free[b] > 0 else 0.0
+    _minimise(turn, A1, back, matches, unit_s, prior, free)
     assign(found[:2], turn.focal)
     assign(found[2:], turn.R)
     _in_pixels(turn.H[0], cameras, unit_px, fitted)
-    return prior
+    return _cost(turn.focal, prior)
 
 
 @inner
-def _minimise(turn: _Turn, A1: Array, back: Array, matches: Weighted, s: float, precision: Array) -> float:
-    """Levenberg and Marquardt's steps from a turn, in place; the prior's cost there."""
+def _minimise(turn: _Turn, A1: Array, back: Array, matches: Weighted, s: float, prior: Array, free: Array) -> None:
+    """Levenberg and Marquardt's steps from a turn, in place. free (2,): 1 for a focal length that is not known."""
     trial = _Turn(vector(9), vector(2), matrix(1, 9))
     T, products, cost, step = matrix(9, PARAMETERS), np.empty((1, 10, 10)), vector(1), vector(PARAMETERS)
-    _model(turn, A1, back, T)
+    _model(turn, A1, back, free, T)
     evaluate_homographies(turn.H, matches, True, products, cost)
-    best, damping = cost[0] / (2 * s * s) + _prior(turn.focal, precision), DAMPING
+    best, damping = cost[0] / (2 * s * s) + _cost(turn.focal, prior), DAMPING
     for _ in range(STEPS):
-        _step(products[0], T, turn.focal, s, precision, damping, step)
+        _step(products[0], T, turn.focal, s, prior, free, damping, step)
         _moved(turn, step, trial)
-        _model(trial, A1, back, T)
+        _model(trial, A1, back, free, T)
         evaluate_homographies(trial.H, matches, True, products, cost)
-        value = cost[0] / (2 * s * s) + _prior(trial.focal, precision)
+        value = cost[0] / (2 * s * s) + _cost(trial.focal, prior)
         gain = best - value
         if gain > 0:
             damping, best = damping / 10, value
@@ -96,14 +107,15 @@ def _minimise(turn: _Turn, A1: Array, back: Array, matches: Weighted, s: float, 
             damping *= 100
             if not damping < MAX_DAMPING or abs(gain) < TOLERANCE:
                 break
-            _model(turn, A1, back, T)
+            _model(turn, A1, back, free, T)
             evaluate_homographies(turn.H, matches, True, products, cost)
-    return _prior(turn.focal, precision)
 
 
 @inner
-def _step(products: Array, T: Array, focal: Array, s: float, precision: Array, damping: float, out: Array) -> None:
-    """The damped Gauss-Newton step (5,): ``(T^T P T / s^2 + prior) step = -gradient``; zero along what is known."""
+def _step(
+    products: Array, T: Array, focal: Array, s: float, prior: Array, free: Array, damping: float, out: Array
+) -> None:
+    """The damped Gauss-Newton step (5,): ``(T^T P T / s^2 + prior) step = -gradient``."""
     M = matrix(PARAMETERS, PARAMETERS + 1)
     for a in range(PARAMETERS):
         for b in range(PARAMETERS + 1):
@@ -116,17 +128,10 @@ def _step(products: Array, T: Array, focal: Array, s: float, precision: Array, d
                         total += T[i, a] * products[i, k] * T[k, b]
             M[a, b] = total / (s * s)
     for a in range(2):
-        known = not precision[a, a] < math.inf
         for b in range(2):
-            if not known and precision[b, b] < math.inf:
-                M[3 + a, 3 + b] += precision[a, b]
-                M[3 + a, PARAMETERS] -= precision[a, b] * focal[b]
-        if known:
-            for b in range(PARAMETERS + 1):
-                M[3 + a, b] = 0.0
-                if b < PARAMETERS:
-                    M[b, 3 + a] = 0.0
-            M[3 + a, 3 + a] = 1.0
+            M[3 + a, 3 + b] += prior[a, b]
+            M[3 + a, PARAMETERS] -= prior[a, b] * focal[b]
+        M[3 + a, 3 + a] += 1 - free[a]
     for a in range(PARAMETERS):
         M[a, a] += damping * M[a, a] + 1e-300
     for a in range(PARAMETERS):  # Gauss and Jordan, of a positive definite matrix
@@ -143,13 +148,12 @@ def _step(products: Array, T: Array, focal: Array, s: float, precision: Array, d
 
 
 @inner
-def _prior(focal: Array, precision: Array) -> float:
-    """Half the squared deviation of what is not known."""
+def _cost(focal: Array, prior: Array) -> float:
+    """Half the squared deviation of the logarithms of the focal lengths."""
     total = 0.0
     for a in range(2):
         for b in range(2):
-            if precision[a, a] < math.inf and precision[b, b] < math.inf:
-                total += focal[a] * precision[a, b] * focal[b] / 2
+            total += focal[a] * prior[a, b] * focal[b] / 2
     return total
 
 
@@ -161,12 +165,12 @@ def _moved(turn: _Turn, step: Array, out: _Turn) -> None:
     X[0], X[1], X[2] = 1 - by * (y * y + z * z), by * (x * y - z), by * (x * z + y)
     X[3], X[4], X[5] = by * (x * y + z), 1 - by * (x * x + z * z), by * (y * z - x)
     X[6], X[7], X[8] = by * (x * z - y), by * (y * z + x), 1 - by * (x * x + y * y)
-    _multiply(X, turn.R, out.R)
+    multiply(X, turn.R, out.R)
     out.focal[0], out.focal[1] = turn.focal[0] + step[3], turn.focal[1] + step[4]
 
 
 @inner
-def _model(turn: _Turn, A1: Array, back: Array, T: Array) -> None:
+def _model(turn: _Turn, A1: Array, back: Array, free: Array, T: Array) -> None:
     """H = A1 E1 R E0^-1 back -> turn.H, E = diag(e, e, 1) with e = exp(focal); its derivatives -> T (9, 5)."""
     left, right, X, Y = vector(9), vector(9), vector(9), vector(9)
     e0, e1 = exponential(turn.focal[0]), exponential(turn.focal[1])
@@ -185,32 +189,13 @@ def _model(turn: _Turn, A1: Array, back: Array, T: Array) -> None:
                 X[3 * i], X[3 * i + 1], X[3 * i + 2] = -X[3 * i], -X[3 * i + 1], 0.0
             elif k == 4:
                 X[6 + i] = 0.0
-        _multiply(left, X, Y)
-        _multiply(Y, right, X)
+        multiply(left, X, Y)
+        multiply(Y, right, X)
         for i in range(9):
             if k < PARAMETERS:
-                T[i, k] = X[i]
+                T[i, k] = X[i] * (free[k - 3] if k >= 3 else 1.0)
             else:
                 turn.H[0, i] = X[i]
-
-
-@inner
-def _multiply(A: Array, B: Array, out: Array) -> None:
-    for r in range(3):
-        for c in range(3):
-            out[3 * r + c] = A[3 * r] * B[c] + A[3 * r + 1] * B[3 + c] + A[3 * r + 2] * B[6 + c]
-
-
-@inner
-def _inverted(A: Array, out: Array) -> bool:
-    """A^-1 -> out; False where there is none."""
-    C = vector(9)
-    cofactors(A, C)
-    determinant = A[0] * C[0] + A[1] * C[1] + A[2] * C[2]
-    for r in range(3):
-        for c in range(3):
-            out[3 * r + c] = C[3 * c + r] / determinant
-    return determinant != 0 and math.isfinite(determinant)
 
 
 @inner
@@ -219,30 +204,6 @@ def _centred(K: Array, unit_px: float, out: Array) -> None:
     for k in range(9):
         out[k] = 0.0
     out[0], out[1], out[4], out[8] = K[0, 0] / unit_px, K[0, 1] / unit_px, K[1, 1] / unit_px, 1.0
-
-
-@inner
-def _nearest(H: Array, cameras: Cameras, R: Array) -> bool:
-    """The orthogonal factor of K1^-1 H K0, by Newton's iteration (Higham 1986) -> R; whether there is one."""
-    back, X, C = vector(9), vector(9), vector(9)
-    if not _inverted(cameras.K1.ravel(), back):
-        return False
-    _multiply(back, H, X)
-    _multiply(X, cameras.K0.ravel(), R)
-    for _ in range(POLAR_STEPS):
-        cofactors(R, C)
-        determinant = R[0] * C[0] + R[1] * C[1] + R[2] * C[2]
-        if not (determinant != 0 and math.isfinite(determinant)):
-            return False
-        squares, inverse = 0.0, 0.0
-        for k in range(9):
-            squares += R[k] * R[k]
-            inverse += C[k] * C[k] / (determinant * determinant)
-        scale = math.sqrt(math.sqrt(inverse / squares))
-        scale = scale if determinant > 0 else -scale
-        for k in range(9):
-            R[k] = (scale * R[k] + C[k] / (determinant * scale)) / 2
-    return True
 
 
 @inner

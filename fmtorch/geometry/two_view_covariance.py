@@ -20,19 +20,21 @@ is assumed; on real pairs neighbours err alike, and deviations come out too smal
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.compiling.batches import for_each_pair, kernels_serve
+from fmtorch.geometry import two_view_covariance_kernels as compiled
 from fmtorch.geometry.arithmetic import component_sum, sqrt
 from fmtorch.geometry.epipolar import inverse_root
-from fmtorch.geometry.two_view_information import PARAMETERS, information_of, noise_of, residual_slopes, tangents
+from fmtorch.geometry.two_view_information import information_of, noise_of, residual_slopes, tangents
+from fmtorch.geometry.two_view_posterior import covariance_of, directions, product_of, without
 
-DIFFUSE = (1.33, 1.33, 1.33, 1.21, 1.21, 2.3, 2.3)
-"""Deviations that no parameter exceeds: of a rotation and a direction drawn uniformly (radians, each axis), and a
-factor of ten in a focal length. They enter as independent information, which is nothing beside that of matches."""
+Array = NDArray[Any]
 
 
 class TwoViewCovariance(NamedTuple):
@@ -78,8 +80,8 @@ def two_view_covariance(
 ) -> TwoViewCovariance:
     """The covariance of pose, focal lengths and F at the optimum of a robust fit, in closed form.
 
-    Nothing is NaN: what the matches leave open has a deviation of up to `DIFFUSE`. A local covariance knows nothing of
-    another optimum: see `significance`. Float64.
+    Nothing is NaN: what the matches leave open has a deviation of up to `two_view_posterior.DIFFUSE`. A local covariance
+    knows nothing of another optimum: see `significance`. Float64; differentiable.
 
     Args:
         x0: points of image 0, px.
@@ -120,22 +122,48 @@ def two_view_covariance(
     open_prior = torch.zeros(len(R), 2, 2, dtype=kind, device=R.device)
     Pi = open_prior if focal_precision is None else focal_precision.to(kind)
     shared = torch.zeros_like(Pi[:, 0, 0], dtype=torch.bool) if shared_focal is None else shared_focal
+    real = torch.ones_like(x0[..., 0], dtype=torch.bool) if mask is None else mask
+    if kernels_serve(x0, x1, R, t, focal, principal0, principal1, truncation, weight, noise, Pi):
+        principal = torch.stack([principal0, principal1], 1)
+        given = (x0, x1, real, weight, noise, R, t, focal, principal, truncation[:, None], Pi, shared[:, None])
+        out = torch.empty(len(R), compiled.COLUMNS, dtype=kind)
+        return _unpacked(for_each_pair(_into, given, out=out, kind=kind))
+    return _of_tensors(x0, x1, real, weight, noise, (R, t, focal, principal0, principal1, truncation, Pi), shared)
+
+
+def _into(x0: Array, x1: Array, mask: Array, weight: Array, noise: Array, *given: Array) -> None:
+    *cameras, out = given
+    compiled.covariance_of_pair(compiled.Matches(x0, x1, mask, weight, noise), compiled.Cameras(*cameras), out)
+
+
+def _unpacked(rows: Tensor) -> TwoViewCovariance:
+    """The results of kernels, (b, COLUMNS)."""
+    C, tangent = rows[:, : compiled.TANGENT], rows[:, compiled.TANGENT : compiled.OF_F]
+    V, s, valid = rows[:, compiled.OF_F : compiled.NOISE], rows[:, compiled.NOISE], rows[:, compiled.VALID] > 0
+    return TwoViewCovariance(C.reshape(-1, 7, 7), tangent.reshape(-1, 3, 2), V.reshape(-1, 9, 9), s, valid)
+
+
+def _of_tensors(
+    x0: Tensor, x1: Tensor, real: Tensor, weight: Tensor | None, noise: Tensor | None,
+    cameras: tuple[Tensor, ...], shared: Tensor,
+) -> TwoViewCovariance:  # fmt: skip
+    """The same in tensors, for gradients and other devices."""
+    *cameras_, Pi = cameras
     known = Pi.diagonal(dim1=-2, dim2=-1) == torch.inf
     Pi = torch.where(known[:, :, None] | known[:, None, :], 0.0, Pi)
-    valid, (R, t, f, p0, p1, T, Pi) = _valid(R, t, focal, principal0, principal1, truncation, Pi)
+    valid, (R, t, f, p0, p1, T, Pi) = _valid(*cameras_, Pi)
     t = t * inverse_root(component_sum(t * t, -1))[:, None]
-    real = torch.ones_like(x0[..., 0], dtype=torch.bool) if mask is None else mask
     w, n = (torch.ones_like(x0[..., 0]) if a is None else a for a in (weight, noise))
     real = real & valid[:, None] & (x0.isfinite() & x1.isfinite()).all(-1) & (w > 0) & (n > 0) & (w + n).isfinite()
     a0, a1 = (torch.where(real[..., None], x - p[:, None], 0.0).movedim(-1, 0) for x, p in ((x0, p0), (x1, p1)))
-    w, n = torch.where(real, w, 0.0).to(kind), torch.where(real, n, 1.0).to(kind)
+    w, n = torch.where(real, w, 0.0).to(T.dtype), torch.where(real, n, 1.0).to(T.dtype)
     F, slopes, basis = tangents(R.movedim(0, -1), t.movedim(0, -1), f.movedim(0, -1))
     r, J, in_slopes = residual_slopes(F, slopes, a0, a1)
     r, J = (r / n).abs(), J / n
-    used = _directions(known, shared)
+    used = directions(known, shared)
     s = noise_of(r.detach(), w, T, used.amax(0).sum(0))
     information, from_noise = information_of(r, J, in_slopes, w, T, s)
-    C = _without(_covariance(information, Pi.movedim(0, -1), used), from_noise)
+    C = without(covariance_of(information, Pi.movedim(0, -1), used), from_noise)
     V = _of_fundamental(C, F, slopes, p0.movedim(0, -1), p1.movedim(0, -1))
     return TwoViewCovariance(C.movedim(-1, 0), basis.movedim(-1, 0), V.movedim(-1, 0), s, valid)
 
@@ -154,63 +182,6 @@ def _valid(*given: Tensor) -> tuple[Tensor, list[Tensor]]:
     return valid, [torch.where(keep, a, place) for keep, a, place in zip(kept, given, places, strict=True)]
 
 
-def _directions(known: Tensor, shared: Tensor) -> Tensor:
-    """How the parameters move (7, 7, b), by the columns: a known one never, shared ones together by the first's."""
-    b = len(known)
-    used = torch.eye(PARAMETERS, dtype=torch.float64, device=known.device)[..., None].repeat(1, 1, b)
-    any_known, together = known.any(-1), shared & ~known.any(-1)
-    used[5, 5] = (~(known[:, 0] | (shared & any_known))).to(used.dtype)
-    used[6, 6] = (~(known[:, 1] | shared)).to(used.dtype)
-    used[6, 5] = together.to(used.dtype)
-    return used
-
-
-def _covariance(information: Tensor, Pi: Tensor, used: Tensor) -> Tensor:
-    """The inverse (7, 7, b) of information, prior and `DIFFUSE` in the directions that are used; zero in others."""
-    total = information + torch.diag(information.new_tensor(DIFFUSE) ** -2)[..., None]
-    prior = torch.nn.functional.pad(_positive_part(Pi).movedim(-1, 0), (5, 0, 5, 0)).movedim(0, -1)
-    reduced = _product(used.transpose(0, 1), _product(total + prior, used))
-    idle = 1 - used.amax(0)
-    eye = torch.eye(PARAMETERS, dtype=total.dtype, device=total.device)[..., None]
-    M = torch.cat([reduced + eye * idle, eye.expand_as(reduced)], 1)
-    for k in range(PARAMETERS):  # Gauss and Jordan, of a positive definite matrix without pivots
-        M = M - (M[:, k] - eye[:, k])[:, None] * (M[k] / M[k, k])[None]
-    inverse = M[:, PARAMETERS:] * (1 - idle) * (1 - idle)[:, None]
-    C = _product(used, _product(inverse, used.transpose(0, 1)))
-    return (C + C.transpose(0, 1)) / 2
-
-
-def _without(C: Tensor, from_noise: Tensor) -> Tensor:
-    """The covariance (7, 7, b) with information (2, 2, b) about the direction of translation taken away.
-
-    The other parameters keep their distribution given that direction, whose own covariance becomes larger. What
-    `DIFFUSE` knows of it stays.
-    """
-    S, eye = _inverse(C[3:5, 3:5]), torch.eye(2, dtype=C.dtype, device=C.device)[..., None]
-    least = eye * DIFFUSE[3] ** -2
-    grown = _inverse(_positive_part(S - from_noise - least) + least)
-    by_direction = _product(C[:, 3:5], S)
-    C = C + _product(by_direction, _product(grown - C[3:5, 3:5], by_direction.transpose(0, 1)))
-    return (C + C.transpose(0, 1)) / 2
-
-
-def _inverse(A: Tensor) -> Tensor:
-    """Of symmetric matrices (2, 2, b)."""
-    adjugate = torch.stack([torch.stack([A[1, 1], -A[0, 1]]), torch.stack([-A[0, 1], A[0, 0]])])
-    return adjugate / (A[0, 0] * A[1, 1] - A[0, 1] * A[0, 1])
-
-
-def _positive_part(Pi: Tensor) -> Tensor:
-    """Symmetric matrices (2, 2, b) with their negative eigenvalues set to zero."""
-    a, b, c = Pi[0, 0], (Pi[0, 1] + Pi[1, 0]) / 2, Pi[1, 1]
-    mean, half = (a + c) / 2, (a - c) / 2
-    radius = sqrt(half * half + b * b)
-    high, low = (mean + radius).clamp_min(0), (mean - radius).clamp_min(0)
-    turn = torch.where(radius > 0, 1 / torch.where(radius > 0, radius, 1.0), 0.0)
-    middle, part = (high + low) / 2, (high - low) / 2 * turn
-    return torch.stack([torch.stack([middle + part * half, part * b]), torch.stack([part * b, middle - part * half])])
-
-
 def _of_fundamental(C: Tensor, F: Tensor, slopes: Tensor, p0: Tensor, p1: Tensor) -> Tensor:
     """The covariance (9, 9, b) of F in pixels at unit norm, of that of the parameters."""
     pixels = torch.stack([_uncentred(A, p0, p1) for A in (F, *slopes.unbind(2))])
@@ -218,7 +189,7 @@ def _of_fundamental(C: Tensor, F: Tensor, slopes: Tensor, p0: Tensor, p1: Tensor
     f = entries[0] * inverse_root(component_sum(entries[0] * entries[0]))
     J = entries[1:] * inverse_root(component_sum(entries[0] * entries[0]))
     J = J - component_sum(J * f, 1)[:, None] * f
-    V = _product(J.transpose(0, 1), _product(C, J))
+    V = product_of(J.transpose(0, 1), product_of(C, J))
     return (V + V.transpose(0, 1)) / 2
 
 
@@ -226,8 +197,3 @@ def _uncentred(A: Tensor, p0: Tensor, p1: Tensor) -> Tensor:
     """``T1^T A T0`` (3, 3, b): a matrix between centred pixels as one between pixels."""
     A = torch.stack([A[:, 0], A[:, 1], A[:, 2] - A[:, 0] * p0[0] - A[:, 1] * p0[1]], 1)
     return torch.stack([A[0], A[1], A[2] - A[0] * p1[0] - A[1] * p1[1]])
-
-
-def _product(A: Tensor, B: Tensor) -> Tensor:
-    """``A B`` of component-first matrices of any size."""
-    return component_sum(A[:, :, None] * B[None], 1)

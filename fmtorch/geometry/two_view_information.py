@@ -14,7 +14,8 @@ from fmtorch.geometry.rank2 import complement
 
 PARAMETERS = 7
 WINDOW = 2.5  # noises within which distances are taken to be those of right matches
-ITERATIONS = 10  # of the noise; each leaves a quarter of the error (the slope of `_kept_share` at WINDOW)
+WINDOW_SHARE = 0.911256360935392  # `kept_share` of WINDOW
+ITERATIONS = 8  # of the noise; each leaves a quarter of the error (by the slope of `kept_share` at WINDOW)
 MIN_NOISE_PX = 1e-3  # float32 coordinates of large images are no finer
 MIN_SPARE_MATCHES = 3  # beyond the parameters, from which on the noise is estimated
 TERMS, WIDEST = 64, 6.0  # of the series of `kept_share`, and from where on it is one to 1e-7
@@ -67,13 +68,10 @@ def residual_slopes(F: Tensor, slopes: Tensor, a0: Tensor, a1: Tensor) -> tuple[
 
 
 def kept_share(c: Tensor) -> Tensor:
-    """m / A of a limit c: ``1 - 1 / S`` with ``S = sum_k c^2k / (2 k + 1)!!``, the series of the normal integral."""
+    """m / A of limits c (b,): ``1 - 1 / S``, ``S = sum_k c^2k / (2 k + 1)!!``, by the series of the normal integral."""
     square = c.clamp_max(WIDEST) * c.clamp_max(WIDEST)
-    term, total = torch.ones_like(square), torch.ones_like(square)
-    for k in range(1, TERMS):
-        term = term * square / (2 * k + 1)
-        total = total + term
-    return 1 - 1 / total
+    ratios = square[..., None] / torch.arange(3.0, 2 * TERMS + 3, 2, dtype=c.dtype, device=c.device)
+    return 1 - 1 / (1 + component_sum(ratios.cumprod(-1), -1))
 
 
 def noise_of(r: Tensor, w: Tensor, T: Tensor, parameters: Tensor) -> Tensor:
@@ -82,19 +80,17 @@ def noise_of(r: Tensor, w: Tensor, T: Tensor, parameters: Tensor) -> Tensor:
     Within a window the share m / A of the variance is left; p parameters have taken theirs of that. At most T. Without
     a limit it is started at the root mean square; of fewer matches than parameters it is not estimated.
     """
-    share = kept_share(torch.full_like(T, WINDOW))
-    mean_square = stable_sum(w * r * r) / stable_sum(w).clamp_min(1e-300)
-    start = torch.where(T.isfinite(), 0.6 * T, sqrt(mean_square)).clamp_min(MIN_NOISE_PX)
-    s = start
+    # Of each match: its count, weight, squared weight, weighted square of the distance.
+    summands = torch.stack([(w > 0).to(r.dtype), w, w * w, w * r * r])
+    _, total, _, square = stable_sum(summands)
+    start = torch.where(T.isfinite(), 0.6 * T, sqrt(square / total.clamp_min(1e-300)))
+    s = start.clamp_min(MIN_NOISE_PX)
     for _ in range(ITERATIONS):
-        near = (r < WINDOW * s[:, None]) & (w > 0)
-        inside = torch.where(near, w, 0.0)
-        total, squares = stable_sum(inside), stable_sum(inside * inside)
-        some = stable_sum(near.to(r.dtype)) >= parameters + MIN_SPARE_MATCHES
-        total = torch.where(some, total, 1.0)
-        spare = share * (total - parameters * share * squares / total)
-        variance = stable_sum(inside * r * r) / torch.where(spare > 0, spare, 1.0)
-        s = torch.where(some & (spare > 0), sqrt(variance).clamp_min(MIN_NOISE_PX).minimum(T), s)
+        count, total, squares, square = stable_sum(torch.where(r < WINDOW * s[:, None], summands, 0.0))
+        spare = WINDOW_SHARE * (total - parameters * WINDOW_SHARE * squares / total.clamp_min(1e-300))
+        enough = (count >= parameters + MIN_SPARE_MATCHES) & (spare > 0)
+        estimate = sqrt(square / torch.where(spare > 0, spare, 1.0)).clamp_min(MIN_NOISE_PX)
+        s = torch.where(enough, estimate.minimum(T), s)
     return s
 
 

@@ -10,7 +10,6 @@ python -m scripts.benchmark configuration --photographs DATA/photos --root DATA/
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,9 +21,10 @@ from numpy.typing import NDArray
 from rich.progress import track
 from rich.table import Table
 
-from fmtorch import presets
+from fmtorch import find_homography, metrics, presets
 from fmtorch.core.files import replacing
 from fmtorch.core.types import Correspondences
+from fmtorch.geometry import poses_from_homography
 from fmtorch.geometry.configuration import KINDS
 from fmtorch.pipeline.configuration import classify
 from scripts.benchmark import matched
@@ -33,7 +33,15 @@ from scripts.benchmark.matched import console
 
 Array = NDArray[Any]
 Verdict = Callable[[Case, int], str]
-GENERAL = ("castle-P19", "fountain-P11", "Herz-Jesus-P8", "sacre_coeur", "00")  # real scenes with depth and baseline
+GENERAL = (
+    "castle-P19",
+    "fountain-P11",
+    "Herz-Jesus-P8",
+    "sacre_coeur",
+    "00",
+    "driving",
+    "orbit",
+)  # scenes, and rendered families, whose depth and baseline every pair sees
 COLMAP = {
     "CALIBRATED": "general", "UNCALIBRATED": "general", "PLANAR": "planar", "PANORAMIC": "rotation",
     "PLANAR_OR_PANORAMIC": "planar", "WATERMARK": "identical", "DEGENERATE": "unrelated", "UNDEFINED": "unrelated",
@@ -65,7 +73,11 @@ def run(arguments: argparse.Namespace) -> None:
         cases += _kept(arguments.folder, name, lambda: real(arguments))
     methods: dict[str, Verdict] = {"fmtorch": Ours(not arguments.unknown)}
     methods |= {f"COLMAP, {px:g} px": _colmap(px) for px in arguments.colmap}
-    report(cases, {name: [verdict(case, 0) for case in cases] for name, verdict in methods.items()})
+    verdicts = {
+        name: [verdict(case, 0) for case in track(cases, name, console=console)] for name, verdict in methods.items()
+    }
+    report(cases, verdicts)
+    pose_report(cases, verdicts["fmtorch"])
 
 
 def _kept(folder: Path | None, name: str, make: Callable[[], list[Case]]) -> list[Case]:
@@ -88,25 +100,25 @@ def real(arguments: argparse.Namespace) -> list[Case]:
         if pair.K0 is None or pair.K1 is None:
             continue
         K = [torch.from_numpy(k)[None] for k in (pair.K0, pair.K1)]
-        truth = "general" if pair.scene in GENERAL or arguments.rendered else ""
-        cases.append(Case(c.replace(K0=K[0], K1=K[1]), truth, f"{pair.family}/{pair.scene}", pair.identity))
+        known = pair.scene in GENERAL or pair.family in GENERAL
+        group = pair.family if arguments.rendered else f"{pair.family}/{pair.scene}"
+        motion = None if pair.R is None or pair.t is None else (pair.R, pair.t)
+        truth = "general" if known else ""
+        cases.append(Case(c.replace(K0=K[0], K1=K[1]), truth, group, pair.identity, motion))
     return cases
 
 
 class Ours:
-    """`classify` after F, with milliseconds beyond F."""
+    """`classify` after F."""
 
     def __init__(self, known: bool, **options: Any) -> None:
-        self.known, self.options, self.ms = known, options, list[float]()
+        self.known, self.options = known, options
         self.estimator = presets.build("estimator", "fmtorch")
 
     def __call__(self, case: Case, seed: int) -> str:
         c = case.matches if self.known else case.matches.replace(K0=None, K1=None)
         estimate = self.estimator(c, seed)
-        start = time.process_time()
-        kind = classify(c, estimate, seed=seed, **self.options).names[0]
-        self.ms.append((time.process_time() - start) * 1e3)
-        return kind
+        return classify(c, estimate, seed=seed, **self.options).names[0]
 
 
 def _colmap(threshold: float) -> Verdict:
@@ -123,6 +135,7 @@ def _colmap(threshold: float) -> Verdict:
         assert c.size1 is not None
         options = pycolmap.TwoViewGeometryOptions()
         options.ransac.max_error, options.ransac.random_seed = threshold, seed
+        options.compute_relative_pose = True  # by which it tells rotations from planes
         x0, x1 = (x[0][c.mask[0]].double().numpy() + 0.5 for x in (c.x0, c.x1))
         cameras = [
             pycolmap.Camera(
@@ -149,3 +162,32 @@ def report(cases: list[Case], verdicts: dict[str, list[str]]) -> None:
             right = f"{100 * own.count(truth) / len(own):.1f}" if truth else ""
             table.add_row(group, truth, str(len(own)), *(str(own.count(kind)) for kind in KINDS), right)
         console.print(table)
+
+
+def pose_report(cases: list[Case], kinds: list[str]) -> None:
+    """AUC of the pose error with known cameras, of pairs called general and of others, from F and from H."""
+    table = Table(title="pose AUC@5/10/20 degrees, %")
+    for column in ("pairs of", "kind", "pairs", "from F", "from H, the first pose", "from H, the better one"):
+        table.add_column(column, justify="left" if column in ("pairs of", "kind") else "right")
+    keys = [(case.group, kind) for case, kind in zip(cases, kinds, strict=True) if case.motion is not None]
+    for group, kind in dict.fromkeys(keys):
+        own = [case for case, k in zip(cases, kinds, strict=True) if (case.group, k) == (group, kind)]
+        areas = 100 * metrics.pose_auc(torch.from_numpy(np.stack([_pose_errors(case) for case in own], 1)))
+        table.add_row(group, kind, str(len(own)), *("/".join(f"{area:.1f}" for area in row) for row in areas.tolist()))
+    console.print(table)
+
+
+def _pose_errors(case: Case) -> Array:
+    """Degrees (3,): of F's pose, of the first pose of H, and of the better one of both."""
+    c, motion = case.matches, case.motion
+    assert c.K0 is not None
+    assert c.K1 is not None
+    assert motion is not None
+    R, t = (torch.from_numpy(a)[None] for a in motion)
+    estimate = presets.build("estimator", "fmtorch")(c, 0)
+    from_F = metrics.fundamental_pose_error(estimate.F, c.K0, c.K1, c.x0, c.x1, R, t, estimate.inliers)
+    H = find_homography(c.x0, c.x1, mask=c.mask, quality=c.quality, prior=c.prior, noise=c.noise, key=c.key)
+    poses = poses_from_homography(H.F, c.K0, c.K1, c.x0.double(), c.x1.double(), H.inliers)
+    seen = torch.where(poses.valid[..., None, None], poses.R, torch.nan)
+    from_H = metrics.pose_error(seen, poses.t, R[:, None], t[:, None]).worst[0].nan_to_num(180.0)
+    return np.array([float(from_F.worst), float(from_H[0]), float(from_H.min())])

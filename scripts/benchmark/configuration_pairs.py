@@ -23,19 +23,23 @@ TURNED = 30.0  # px, least mean displacement of a rotation's matches
 class Case(NamedTuple):
     """Matches of one pair with cameras and sizes, and what it is.
 
-    truth: a name of `configuration.KINDS`, or empty where that is not known. group: the row of the table.
+    truth: a name of `configuration.KINDS`, or empty where that is not known. group: the row of the table. motion: the
+    true R (3, 3) and t (3,), where they are known.
     """
 
     matches: Correspondences
     truth: str
     group: str
     name: str
+    motion: tuple[Array, Array] | None = None
 
 
 def photographs(paths: Sequence[Path]) -> Iterator[Case]:
     """Of each photograph a plane, a rotation, a copy, a crop and an unrelated pair."""
+    if len(paths) < 2:
+        raise SystemExit("error: two photographs at least are needed, of which one is behind the other")
     for seed, path in enumerate(paths):
-        behind = paths[(seed + 7) % len(paths)]
+        behind = paths[(seed + min(7, len(paths) - 1)) % len(paths)]
         case = warped(path, behind, seed)
         yield _case(case.matches, "planar", "warped photographs", path)
         for group, make in MAKERS.items():

@@ -16,12 +16,14 @@ SIZE = (480, 640)
 
 
 class Drawn(NamedTuple):
-    """Matches (n, 2) in pixels, and the F and H that a perfect estimator would give."""
+    """Matches (n, 2) in pixels, the F and H that a perfect estimator would give, and the motion."""
 
     x0: np.ndarray
     x1: np.ndarray
     F: np.ndarray
     H: np.ndarray
+    R: np.ndarray
+    t: np.ndarray
 
 
 def cross_matrix(t: np.ndarray) -> np.ndarray:
@@ -55,7 +57,7 @@ def draw(kind: str, seed: int, n: int = 200, wrong: float = 0.3, noise: float = 
     x0, x1 = x0 + rng.normal(0, noise, x0.shape), x1 + rng.normal(0, noise, x1.shape)
     k = n if kind == "unrelated" else round(wrong * n)
     x1[n - k :] = rng.uniform([0, 0], SIZE[::-1], (k, 2))
-    return Drawn(x0, x1, F / np.linalg.norm(F), H / np.linalg.norm(H))
+    return Drawn(x0, x1, F / np.linalg.norm(F), H / np.linalg.norm(H), R, t)
 
 
 def batch(drawn: list[Drawn]) -> dict[str, Tensor]:
