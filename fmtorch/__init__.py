@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from fmtorch.pipeline.fundamental import find_fundamental, find_homography
     from fmtorch.pipeline.pipeline import Pipeline
     from fmtorch.pipeline.two_images import MatchResult, match
-    from fmtorch.pipeline.verification import Verification, verify
+    from fmtorch.pipeline.verification import verify
+    from fmtorch.pipeline.verification_run import Verification
 
 __all__ = [
     "Correspondences",
@@ -35,7 +36,7 @@ _MODULES = {
     "Correspondences": "core.types", "Estimate": "core.types", "Features": "core.types",
     "MatchResult": "pipeline.two_images", "Pipeline": "pipeline.pipeline", "match": "pipeline.two_images",
     "find_essential": "pipeline.essential", "find_fundamental": "pipeline.fundamental",
-    "find_homography": "pipeline.fundamental", "Verification": "pipeline.verification",
+    "find_homography": "pipeline.fundamental", "Verification": "pipeline.verification_run",
     "verify": "pipeline.verification",
 }  # fmt: skip
 

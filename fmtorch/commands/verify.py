@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import re
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -16,7 +18,8 @@ from fmtorch import presets
 from fmtorch.commands.main import job, run_command
 from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.pipeline.database_pairs import Cameras
-from fmtorch.pipeline.verification import Verification, verify_by
+from fmtorch.pipeline.verification import Places, verify_by
+from fmtorch.pipeline.verification_run import Verification
 from fmtorch.presets import plain
 from fmtorch.presets.fields import Seed, path_fields, read_fields
 
@@ -28,6 +31,8 @@ class Fields:
     """What the command takes beside the estimator; ``conf/verify.yaml`` says what each is."""
 
     database: Path | None = None
+    features_file: Path | None = None
+    matches: Path | None = None
     output: Path | None = None
     cameras: Cameras = "stored"
     force: bool = False
@@ -37,14 +42,11 @@ class Fields:
 def run(config: DictConfig, estimator: str) -> Verification:
     """Verify the database of a composed config, by a preset whose options are those of the config."""
     fields = read_fields(Fields, config)
-    if fields.database is None:
-        raise ValueError("database is missing; give the database of a COLMAP project: fmtorch verify database.db")
     built = presets.instantiate(config.estimator, "estimator")
     with _begun_by_reports(estimator) as report:
-        result = verify_by(
-            built, {"estimator": plain(config.estimator)}, fields.database, fields.output, fields.cameras,
-            fields.force, fields.seed, report,
-        )  # fmt: skip
+        places = Places(fields.database, fields.features_file, fields.matches, fields.output)
+        settings = {"estimator": plain(config.estimator)}
+        result = verify_by(built, settings, places, fields.cameras, fields.force, fields.seed, report)
     for problem in result.problems[:MAX_PROBLEMS]:
         Console(stderr=True).print(problem, style="bold", markup=False, highlight=False, soft_wrap=True)
     if len(result.problems) > MAX_PROBLEMS:
@@ -94,5 +96,6 @@ def task(config: DictConfig) -> None:
 
 def main() -> None:
     """The command."""
+    sys.argv[1:] = [re.sub("^features=", "features_file=", word) for word in sys.argv[1:]]  # no preset of conf/features
     said = "interrupted; the same command continues"
     run_command("verify", task, paths=path_fields(Fields), positional=("database",), interrupted=said)

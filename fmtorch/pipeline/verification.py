@@ -1,61 +1,37 @@
-"""Two-view geometries of a COLMAP database whose matches anyone made."""
+"""Two-view geometries of a COLMAP database, or of hloc's files, whose matches anyone made."""
 
 from __future__ import annotations
 
-import dataclasses
+import shutil
 import time
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, NamedTuple, cast, get_args
 
 from fmtorch import presets
 from fmtorch.core.arguments import number
 from fmtorch.core.files import replacing
 from fmtorch.core.stages import Estimator, model_of
-from fmtorch.core.types import collate
 from fmtorch.core.version import __version__
-from fmtorch.pipeline.database_pairs import Cameras, DatabasePair, as_correspondences, geometries
-from fmtorch.pipeline.estimation import estimated_by
+from fmtorch.pipeline.database_pairs import Cameras
+from fmtorch.pipeline.verification_run import Verification, VerificationRun
 from fmtorch.storage.exchange.colmap import imported
 from fmtorch.storage.exchange.database import (
-    Ids,
     MatchDatabase,
     copy_database,
     expect_database,
     move_database,
     remove_database,
 )
+from fmtorch.storage.exchange.hloc_matches import HlocMatches
 from fmtorch.storage.exchange.verification_log import VerificationLog
-
-BATCH = 64  # pairs in memory
-
-
-@dataclasses.dataclass(frozen=True)
-class Verification:
-    """What `verify` did with a database.
-
-    path: of the database with the geometries. pairs: that have matches. kept: of these, that had a geometry before or
-    were finished by an interrupted run. configurations: of the others, how many of each of COLMAP's kinds. problems:
-    why pairs could not be read, a line each; the next run tries them again. seconds: of the whole.
-    """
-
-    path: Path
-    pairs: int
-    kept: int
-    configurations: Mapping[str, int]
-    problems: tuple[str, ...]
-    seconds: float
-
-    @property
-    def verified(self) -> int:
-        """How many pairs were given a geometry: all but the degenerate ones."""
-        return sum(count for kind, count in self.configurations.items() if kind != "degenerate")
 
 
 def verify(
-    path: Path | str,
+    path: Path | str | None = None,
     *,
+    features: Path | str | None = None,
+    matches: Path | str | None = None,
     output: Path | str | None = None,
     cameras: str = "stored",
     estimator: str = "fmtorch",
@@ -73,7 +49,9 @@ def verify(
 
     Args:
         path: the database, of COLMAP 3 or 4, with keypoints of 2, 4 or 6 columns and cameras of any model with a lens.
-        output: a new database to write to instead; it gets this name once it is complete.
+        features, matches: hloc's two files in place of a database. They know no cameras; "stored" is "unknown" then.
+        output: a new database to write to instead; it gets this name once it is complete. Of hloc's files a new file of
+            matches, those that are inliers, with the matrices as attributes.
         cameras: "stored": points are undistorted, focal lengths are exact where the camera was calibrated, known within
             5 % where they have a prior and nothing else is known of the camera (EXIF), and unknown where they are
             COLMAP's guess; images of one camera share theirs. "shared": all images have one unknown focal length in
@@ -107,14 +85,22 @@ def verify(
     """
     built = presets.build("estimator", estimator, config_dir, **options)
     settings = {"estimator": estimator, "options": repr(sorted(options.items()))}
-    return verify_by(
-        built, settings, Path(path), None if output is None else Path(output), cameras, force, seed, report
-    )
+    places = Places(*(None if place is None else Path(place) for place in (path, features, matches, output)))
+    return verify_by(built, settings, places, cameras, force, seed, report)
+
+
+class Places(NamedTuple):
+    """Where matches are, in a database or in hloc's two files, and where geometries go."""
+
+    database: Path | None
+    features: Path | None
+    matches: Path | None
+    output: Path | None
 
 
 def verify_by(
-    estimator: Estimator, settings: Mapping[str, Any], path: Path, output: Path | None, cameras: str, force: bool,
-    seed: int, report: Callable[[int, int], None] | None,
+    estimator: Estimator, settings: Mapping[str, Any], places: Places, cameras: str, force: bool, seed: int,
+    report: Callable[[int, int], None] | None,
 ) -> Verification:  # fmt: skip
     """The same by an estimator that is built; an interrupted run is continued by one of the same `settings`."""
     begin = time.perf_counter()
@@ -124,12 +110,25 @@ def verify_by(
     known: Cameras = cast(Cameras, cameras)
     if (gives := model_of(estimator)) != "fundamental":
         raise ValueError(f"estimator gives {gives} matrices; verify needs one that gives fundamental matrices")
+    settings = {**settings, "version": __version__, "cameras": cameras, "seed": seed, "force": force}
+    path, features, matches, output = places
+    if features is not None or matches is not None:
+        if path is not None or features is None or matches is None or output is None:
+            raise ValueError("hloc's files need features=F.h5 matches=M.h5 output=VERIFIED.h5, and no database")
+        store = _opened_hloc(features, matches, output, settings, force)
+        with store:
+            run = VerificationRun(store, "unknown" if known == "stored" else known, seed, estimator)
+            run.each_batch(report)
+            store.finish(output)
+        _log_of(output).unlink(missing_ok=True)
+        return run.result(output, time.perf_counter() - begin)
+    if path is None:
+        raise ValueError("database is missing; give the database of a COLMAP project: fmtorch verify database.db")
     imported()
     expect_database(path)
-    settings = {**settings, "version": __version__, "cameras": cameras, "seed": seed, "force": force}
     work, log = _opened(path, output, settings, force)
     with MatchDatabase(work) as database:
-        run = _Run(database, known, seed, estimator, log if force else None)
+        run = VerificationRun(database, known, seed, estimator, log if force else None)
         run.each_batch(report)
     if output is not None:
         move_database(work, output)
@@ -143,16 +142,16 @@ def _opened(
 ) -> tuple[Path, VerificationLog | None]:
     """The database to write to, and the log of the pairs that are done in it: of a copy, or where all are forced."""
     if output is None:
-        return path, VerificationLog(path.with_name(f"{path.name}.verification"), settings) if force else None
+        if not force:
+            return path, None
+        with MatchDatabase(path) as database:
+            settings = {**settings, **database.counts()}
+        return path, VerificationLog(_log_of(path), settings)
     if output.exists() and output.samefile(path):
         raise ValueError(f"output={output} is the database itself; leave output out to write into it")
-    if output.exists() and not force:
-        raise ValueError(f"output={output} exists; name another file, or replace it with force=true")
-    if not output.parent.is_dir():
-        raise FileNotFoundError(f"there is no folder {output.parent}; output={output} cannot be written")
-    work, state = output.with_name(f"{output.name}.partial"), path.stat()
-    source = {"source": str(path.absolute()), "size": state.st_size, "time": state.st_mtime_ns}
-    log = VerificationLog(output.with_name(f"{output.name}.verification"), {**settings, **source})
+    _expect_new(output, force)
+    work = _work_of(output)
+    log = VerificationLog(_log_of(output), {**settings, **_states(path)})
     if not (log.continued and work.exists()):
         remove_database(work)
         log.done.clear()
@@ -161,56 +160,36 @@ def _opened(
     return work, log
 
 
-class _Run:
-    """The pairs of one database. log: of the pairs that count as done, those with a geometry where it is None."""
+def _opened_hloc(features: Path, matches: Path, output: Path, settings: Mapping[str, Any], force: bool) -> HlocMatches:
+    """hloc's files, with what an interrupted run of the same settings found of them."""
+    for path in (features, matches):
+        if not path.exists():
+            raise FileNotFoundError(f"there is no file {path}; give hloc's files: features=F.h5 matches=M.h5")
+        if output.exists() and output.samefile(path):
+            raise ValueError(f"output={output} is one of the files that are read; name another")
+    _expect_new(output, force)
+    log = VerificationLog(_log_of(output), {**settings, **_states(features, matches)})
+    if not log.continued:
+        shutil.rmtree(_work_of(output), ignore_errors=True)
+    return HlocMatches(features, matches, _work_of(output))
 
-    def __init__(
-        self, database: MatchDatabase, cameras: Cameras, seed: int, estimator: Estimator, log: VerificationLog | None
-    ) -> None:
-        self.database, self.cameras, self.seed, self.estimator, self.log = database, cameras, seed, estimator, log
-        self.pairs = database.pairs()
-        self.configurations: Counter[str] = Counter()
-        self.problems: list[str] = []
-        self.kept = 0
 
-    def each_batch(self, report: Callable[[int, int], None] | None) -> None:
-        """Estimate and write the pairs that are not done, batch by batch."""
-        todo = [pair for pair in self.pairs if not self._done(pair)]
-        self.kept = len(self.pairs) - len(todo)
-        if report is not None and todo:
-            report(0, len(todo))
-        for start in range(0, len(todo), BATCH):
-            batch = todo[start : start + BATCH]
-            self._verify(batch)
-            if report is not None:
-                report(start + len(batch), len(todo))
+def _expect_new(output: Path, force: bool) -> None:
+    if output.exists() and not force:
+        raise ValueError(f"output={output} exists; name another file, or replace it with force=true")
+    if not output.parent.is_dir():
+        raise FileNotFoundError(f"there is no folder {output.parent}; output={output} cannot be written")
 
-    def result(self, path: Path, seconds: float) -> Verification:
-        """The summary."""
-        counts = dict(self.configurations)
-        return Verification(path, len(self.pairs), self.kept, counts, tuple(self.problems), seconds)
 
-    def _done(self, pair: Ids) -> bool:
-        return self.database.has_geometry(pair) if self.log is None else pair in self.log.done
+def _work_of(output: Path) -> Path:
+    return output.with_name(f"{output.name}.partial")
 
-    def _verify(self, batch: Sequence[Ids]) -> None:
-        """Estimate a batch of pairs and write what is found."""
-        ids, pairs, given = [], [], []
-        for pair in batch:
-            try:
-                matches = self.database.matches(pair)
-                pairs.append(DatabasePair(self.database.image(pair[0]), self.database.image(pair[1]), matches))
-                given.append(as_correspondences(pairs[-1], self.cameras))
-                ids.append(pair)
-            except Exception as error:  # one pair does not end the work on the others
-                del pairs[len(ids) :]
-                names = ", ".join(self.database.name(image) for image in pair)
-                self.problems.append(f"{names}: {error}".splitlines()[0])
-        if not ids:
-            return
-        c = collate(given)
-        results = geometries(pairs, c, estimated_by(self.estimator, c, self.seed), self.seed)
-        self.database.write(zip(ids, results, strict=True))
-        if self.log is not None:
-            self.log.add(ids)
-        self.configurations.update(result.kind for result in results)
+
+def _log_of(path: Path) -> Path:
+    return path.with_name(f"{path.name}.verification")
+
+
+def _states(*paths: Path) -> dict[str, Any]:
+    """What tells whether files have changed."""
+    states = [(str(path.absolute()), path.stat().st_size, path.stat().st_mtime_ns) for path in paths]
+    return {"sources": [list(state) for state in states]}

@@ -17,7 +17,7 @@ import pytest
 import fmtorch
 from fmtorch.core.types import pair_key
 from fmtorch.data.lenses import MODELS
-from fmtorch.pipeline import verification
+from fmtorch.pipeline import verification_run
 from fmtorch.storage.exchange.database import MatchDatabase
 from fmtorch.storage.exchange.database_images import EXIF_DEVIATION, database_image
 from tests.conftest import shared_path
@@ -404,7 +404,7 @@ def test_keypoints_are_read_for_many_images_in_blocks(tmp_path: Path, monkeypatc
     write(path, scene(6))
     write(other, scene(6))
     fmtorch.verify(path)
-    monkeypatch.setattr(verification, "BATCH", 2)
+    monkeypatch.setattr(verification_run, "BATCH", 2)
     monkeypatch.setattr("fmtorch.storage.exchange.database.BLOCK", 2)
     monkeypatch.setattr("fmtorch.storage.exchange.database.MEMORY", 3)
     with MatchDatabase(other) as database:
@@ -423,7 +423,7 @@ def finished(path: Path) -> int:
         return 0
 
 
-SLOWLY = "import time, fmtorch.pipeline.verification as v\nv.BATCH = 2\n"
+SLOWLY = "import time, fmtorch.pipeline.verification_run as v\nv.BATCH = 2\n"
 
 
 @pytest.mark.parametrize("way", ["in place", "copy", "forced", "forced copy"])
