@@ -33,15 +33,8 @@ from scripts.benchmark.matched import console
 
 Array = NDArray[Any]
 Verdict = Callable[[Case, int], str]
-GENERAL = (
-    "castle-P19",
-    "fountain-P11",
-    "Herz-Jesus-P8",
-    "sacre_coeur",
-    "00",
-    "driving",
-    "orbit",
-)  # scenes, and rendered families, whose depth and baseline every pair sees
+# Scenes, and rendered families, whose depth and baseline every pair sees.
+GENERAL = {"castle-P19", "fountain-P11", "Herz-Jesus-P8", "sacre_coeur", "00", "driving", "orbit"}
 COLMAP = {
     "CALIBRATED": "general", "UNCALIBRATED": "general", "PLANAR": "planar", "PANORAMIC": "rotation",
     "PLANAR_OR_PANORAMIC": "planar", "WATERMARK": "identical", "DEGENERATE": "unrelated", "UNDEFINED": "unrelated",
