@@ -18,8 +18,8 @@ Array = NDArray[Any]
 
 KINDS = ("general", "planar", "rotation", "identical", "unrelated")
 GENERAL, PLANAR, ROTATION, IDENTICAL, UNRELATED = range(len(KINDS))
-MIN_EVIDENCE = 80.0  # nats; unrelated photographs reach 50, related ones have 170 at least (the tuning pairs)
-MIN_PARALLAX = 12.0  # nats; planes, rotations and copies reach 6, wide scenes have 74 at least (the tuning pairs)
+MIN_EVIDENCE = 80.0  # nats; of the tuning pairs, unrelated ones reach 50 and related ones have 176 or more
+MIN_PARALLAX = 12.0  # nats; of the tuning pairs, planes, rotations and copies reach 6 (one 39), wide scenes have 74
 PLANE_PARAMETERS, COPY_PARAMETERS = 8, 3  # of a homography, and of a similarity without rotation, or of a rotation
 
 

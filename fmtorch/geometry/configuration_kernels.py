@@ -17,11 +17,11 @@ from fmtorch.geometry.rotation_kernels import Cameras, fit_rotation
 FREEDOM = 3.0  # degrees, of Student's law: keypoints err by more than the normal one says
 PEAK = 0.36755259694786135  # of that law: 2 / (pi sqrt(3))
 START, COARSEST = 1 / 1500, 1 / 300  # noise that is tried first, and the largest, of the side of an image
-FINEST = 0.1  # px; no keypoint is found more exactly
+FINEST, FINEST_SHARE = 0.1, 1e-5  # smallest noise, px and of the side: keypoints, and float32, are no more exact
 LOSS = 3.0  # noises; scale of the loss by which a rotation and a copy are fitted
 STEPS, COPY_STEPS = 20, 8
 NOISE_TOLERANCE, SHARE_TOLERANCE = 0.01, 1e-3  # of the last step: relative, and of a share
-GROUP = 16  # densities of up to some millions, whose product is one of float64
+GROUP = 16  # densities of up to 1e10 (by FINEST_SHARE) whose product float64 holds
 HALF = 0.5  # of a match that each component has beforehand
 ROOT2 = math.sqrt(2)
 MATCHES, NOISE, LINE, PLANE, BOTH, TURN, COPY, ON_PLANE, ON_LINE, FOCALS, ROTATION, SCALED = (
@@ -53,9 +53,10 @@ class Models(NamedTuple):
 @kernel
 def weigh(matches: Matches, models: Models, cameras: Cameras, out: F8x1) -> None:
     """The log likelihoods of the kinds, and what was fitted for them -> out (COLUMNS,), by the names above."""
-    points, told = matrix(4, len(matches.mask)), matrix(2, len(matches.mask))
-    n = _gather(matches, points, told)
-    points, prior, noise = points[:, :n], told[0, :n], told[1, :n]
+    n = len(matches.mask)
+    points, prior, noise = matrix(4, n), vector(n), vector(n)
+    n = _gather(matches, points, prior, noise)
+    points, prior, noise = points[:, :n], prior[:n], noise[:n]
     for k in range(COLUMNS):
         out[k] = 0.0
     out[MATCHES] = n
@@ -98,17 +99,18 @@ def weigh(matches: Matches, models: Models, cameras: Cameras, out: F8x1) -> None
 
 
 @inner
-def _gather(matches: Matches, points: Array, told: Array) -> int:
-    """The real matches with finite coordinates -> points (4, n), told (2, n): P(inlier) and noise; how many."""
-    x0, x1, mask, prior, noise = matches
+def _gather(matches: Matches, points: Array, prior: Array, noise: Array) -> int:
+    """The real matches with finite coordinates -> points (4, n), prior, noise (n,); how many."""
+    x0, x1, mask = matches.x0, matches.x1, matches.mask
     count = 0
     for i in range(len(mask)):
-        relative, right = noise[i] if len(noise) else 1.0, prior[i] if len(prior) else 1.0
+        relative = matches.noise[i] if len(matches.noise) else 1.0
+        right = matches.prior[i] if len(matches.prior) else 1.0
         total = x0[i, 0] + x0[i, 1] + x1[i, 0] + x1[i, 1]
         if mask[i] and math.isfinite(total) and math.isfinite(relative) and relative > 0 and 0 <= right <= 1:
             points[0, count], points[1, count] = x0[i, 0], x0[i, 1]
             points[2, count], points[3, count] = x1[i, 0], x1[i, 1]
-            told[0, count], told[1, count] = right, relative
+            prior[count], noise[count] = right, relative
             count += 1
     return count
 
@@ -141,8 +143,8 @@ def _distances(model: Array, points: Array, noise: Array, line: bool, out: Array
 @inner
 def _noise(r2: Array, prior: Array, side: float, dimensions: int, work: Array) -> float:
     """The noise of right matches beside wrong ones, by expectation and maximisation. work: (n,)."""
-    n, s = len(r2), min(max(START * side, FINEST), COARSEST * side)
-    share = 0.5
+    finest, coarsest, share = max(FINEST, FINEST_SHARE * side), COARSEST * side, 0.5
+    n, s = len(r2), min(max(START * side, finest), coarsest)
     for _ in range(STEPS):
         _densities(r2, s, side, dimensions, work)
         right, spare, squares = 0.0, 0.0, 0.0
@@ -155,7 +157,7 @@ def _noise(r2: Array, prior: Array, side: float, dimensions: int, work: Array) -
                 right += p
                 squares += p * r2[i] * (FREEDOM + dimensions) / (FREEDOM + r2[i] / (s * s))
         share = (right + HALF) / (right + spare + 2 * HALF)
-        last, s = s, min(max(math.sqrt(squares / max(dimensions * right, 1e-9)), FINEST), COARSEST * side)
+        last, s = s, min(max(math.sqrt(squares / max(dimensions * right, 1e-9)), finest), coarsest)
         if abs(s - last) < NOISE_TOLERANCE * last:
             break
     return s

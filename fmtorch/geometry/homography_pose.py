@@ -116,8 +116,8 @@ def rotation_from_homography(
     block = G + G.transpose(0, 1) - eye * trace
     K = torch.cat([torch.cat([trace[None], turn])[None], torch.cat([turn[:, None], block], 1)])
     bound = 2 * component_sum(component_sum(G.abs()))
-    least = (torch.eye(4, dtype=G.dtype, device=G.device).reshape(4, 4, *[1] * trace.dim()) * bound - K).contiguous()
-    q, determined = smallest_eigenvector(least.movedim((0, 1), (-2, -1)))
+    shifted = (torch.eye(4, dtype=G.dtype, device=G.device).reshape(4, 4, *[1] * trace.dim()) * bound - K).contiguous()
+    q, determined = smallest_eigenvector(shifted.movedim((0, 1), (-2, -1)))
     R = _of_quaternion(q.movedim(-1, 0))
     valid = regular & determined
     return torch.where(valid, R, eye).movedim((0, 1), (-2, -1)).to(H.dtype), valid

@@ -41,9 +41,9 @@ class _Turn(NamedTuple):
 
 @inner
 def fit_rotation(
-    points: Array, noise: Array, H: Array, cameras: Cameras, s: float, found: Array, fitted: Array
+    points: Array, noise: Array, H: Array, cameras: Cameras, s: float, parameters: Array, fitted: Array
 ) -> float:
-    """R and focal lengths of least robust cost -> found (11,): logarithms, R row by row; K1 R K0^-1 -> fitted (9,).
+    """R and focal lengths of least robust cost -> parameters (11,): logarithms, R; K1 R K0^-1 -> fitted (9,).
 
     Starts at the rotation nearest to K1^-1 H K0. points (4, n) and s in pixels. Returns the cost of the prior, infinite
     where a calibration is singular.
@@ -75,8 +75,8 @@ def fit_rotation(
         for b in range(2):
             prior[a, b] = cameras.precision[a, b] if free[a] * free[b] > 0 else 0.0
     _minimise(turn, A1, back, matches, unit_s, prior, free)
-    assign(found[:2], turn.focal)
-    assign(found[2:], turn.R)
+    assign(parameters[:2], turn.focal)
+    assign(parameters[2:], turn.R)
     _in_pixels(turn.H[0], cameras, unit_px, fitted)
     return _cost(turn.focal, prior)
 

@@ -80,8 +80,8 @@ def two_view_covariance(
 ) -> TwoViewCovariance:
     """The covariance of pose, focal lengths and F at the optimum of a robust fit, in closed form.
 
-    Nothing is NaN: what the matches leave open has a deviation of up to `two_view_posterior.DIFFUSE`. A local covariance
-    knows nothing of another optimum: see `significance`. Float64; differentiable.
+    Nothing is NaN: what the matches leave open has a deviation of up to `two_view_posterior.DIFFUSE`. A local
+    covariance knows nothing of another optimum: see `significance`. Float64; differentiable.
 
     Args:
         x0: points of image 0, px.
@@ -111,11 +111,11 @@ def two_view_covariance(
         >>> x0, x1 = (600 * Y[:, :2] / Y[:, 2:] for Y in (X, X + torch.tensor([-1.0, 0, 0])))
         >>> x1 = x1 + 0.5 * torch.randn(x1.shape, generator=torch.Generator().manual_seed(1))
         >>> known = torch.diag(torch.full((2,), torch.inf))[None]
-        >>> found = two_view_covariance(
+        >>> result = two_view_covariance(
         ...     x0[None], x1[None], torch.eye(3)[None], torch.tensor([[-1.0, 0, 0]]), torch.full((1, 2), 600.0),
         ...     torch.zeros(1, 2), torch.zeros(1, 2), torch.tensor([1.0]), focal_precision=known,
         ... )
-        >>> bool((found.deviation_degrees < 0.5).all()), round(float(found.noise[0]), 1)
+        >>> bool((result.deviation_degrees < 0.5).all()), round(float(result.noise[0]), 1)
         (True, 0.4)
     """
     kind = torch.float64
@@ -176,8 +176,8 @@ def _valid(*given: Tensor) -> tuple[Tensor, list[Tensor]]:
     R, t, focal, _, _, truncation, _ = given = tuple(a.to(torch.float64) for a in given)
     finite = [a.isfinite().flatten(1).all(1) for a in given if a is not truncation]
     valid = torch.stack([*finite, (t != 0).any(-1), (focal > 0).all(-1), truncation > 0]).all(0)
-    zero, one = torch.zeros_like(truncation[:1]), torch.ones_like(truncation[:1])
-    places = (torch.eye(3, dtype=R.dtype, device=R.device), t.new_tensor([0.0, 0, 1]), one, zero, zero, one, zero)
+    zeros, ones = torch.zeros_like(truncation[:1]), torch.ones_like(truncation[:1])
+    places = (torch.eye(3, dtype=R.dtype, device=R.device), t.new_tensor([0.0, 0, 1]), ones, zeros, zeros, ones, zeros)
     kept = (valid.reshape(-1, *[1] * (a.dim() - 1)) for a in given)
     return valid, [torch.where(keep, a, place) for keep, a, place in zip(kept, given, places, strict=True)]
 

@@ -113,10 +113,10 @@ def _prior_information(prior: Array, free: Array, together: bool, slopes: Array)
     for k in range(5):
         M[k, k] = 1 / (ROTATION * ROTATION) if k < 3 else 1 / (DIRECTION * DIRECTION)
     a, b, c = _positive(a, b, c)
-    least = 1 / (FOCAL * FOCAL)
-    M[5, 5], M[5, 6], M[6, 5], M[6, 6] = a + least, b, b, c + least
+    floor = 1 / (FOCAL * FOCAL)
+    M[5, 5], M[5, 6], M[6, 5], M[6, 6] = a + floor, b, b, c + floor
     if together:
-        M[5, 5] = a + 2 * b + c + 2 * least
+        M[5, 5] = a + 2 * b + c + 2 * floor
         for q in range(9):
             slopes[5, q] += slopes[6, q]
     for k in range(2):
@@ -185,11 +185,11 @@ def _positive(a: float, b: float, c: float) -> tuple[float, float, float]:
 @inner
 def _remove(C: Array, noise: Array) -> None:
     """Takes information (2, 2) about the direction of translation away from a covariance, in place."""
-    a, b, c, least = C[3, 3], C[3, 4], C[4, 4], 1 / (DIRECTION * DIRECTION)
+    a, b, c, floor = C[3, 3], C[3, 4], C[4, 4], 1 / (DIRECTION * DIRECTION)
     area = a * c - b * b
     p, q, r = c / area, -b / area, a / area
-    u, v, w = _positive(p - noise[0, 0] - least, q - (noise[0, 1] + noise[1, 0]) / 2, r - noise[1, 1] - least)
-    u, w = u + least, w + least
+    u, v, w = _positive(p - noise[0, 0] - floor, q - (noise[0, 1] + noise[1, 0]) / 2, r - noise[1, 1] - floor)
+    u, w = u + floor, w + floor
     area = u * w - v * v
     da, db, dc = w / area - a, -v / area - b, u / area - c
     by = matrix(PARAMETERS, 2)

@@ -50,13 +50,13 @@ def residual_slopes(F: Tensor, slopes: Tensor, a0: Tensor, a1: Tensor) -> tuple[
     covariances (2, 2, b, n) of the derivatives by the direction of translation, in squared noises of a point: where the
     images have no parallax these derivatives are nothing but noise, in the three directions that are not corrected.
     """
-    one = torch.ones_like(a0[:1])
-    line1 = component_sum(F[..., None] * torch.cat([a0, one])[None], 1)
-    line0 = component_sum(F[..., None] * torch.cat([a1, one])[:, None], 0)
+    ones = torch.ones_like(a0[:1])
+    line1 = component_sum(F[..., None] * torch.cat([a0, ones])[None], 1)
+    line0 = component_sum(F[..., None] * torch.cat([a1, ones])[:, None], 0)
     root = inverse_root(component_sum(line1[:2] * line1[:2]) + component_sum(line0[:2] * line0[:2]))
-    r = component_sum(torch.cat([a1, one]) * line1) * root
+    r = component_sum(torch.cat([a1, ones]) * line1) * root
     normal = torch.cat([line0[:2], line1[:2]]) * root
-    h0, h1 = torch.cat([a0 - r * normal[:2], one]), torch.cat([a1 - r * normal[2:], one])
+    h0, h1 = torch.cat([a0 - r * normal[:2], ones]), torch.cat([a1 - r * normal[2:], ones])
     by_entry = h1[:, None] * h0[None] * root
     J = component_sum((by_entry[:, :, None] * slopes[..., None]).flatten(0, 1))
     shifted = slopes[:, :, 3:5, :, None]

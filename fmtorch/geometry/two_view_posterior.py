@@ -49,8 +49,8 @@ def without(C: Tensor, from_noise: Tensor) -> Tensor:
     `DIFFUSE` knows of it stays.
     """
     S, eye = _inverse(C[3:5, 3:5]), torch.eye(2, dtype=C.dtype, device=C.device)[..., None]
-    least = eye * DIFFUSE[3] ** -2
-    grown = _inverse(_positive_part(S - from_noise - least) + least)
+    floor = eye * DIFFUSE[3] ** -2
+    grown = _inverse(_positive_part(S - from_noise - floor) + floor)
     by_direction = product_of(C[:, 3:5], S)
     C = C + product_of(by_direction, product_of(grown - C[3:5, 3:5], by_direction.transpose(0, 1)))
     return (C + C.transpose(0, 1)) / 2

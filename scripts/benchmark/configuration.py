@@ -10,6 +10,7 @@ python -m scripts.benchmark configuration --photographs DATA/photos --root DATA/
 from __future__ import annotations
 
 import argparse
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from rich.table import Table
 
 from fmtorch import find_homography, metrics, presets
 from fmtorch.core.files import replacing
-from fmtorch.core.types import Correspondences
+from fmtorch.core.types import Correspondences, collate
 from fmtorch.geometry import poses_from_homography
 from fmtorch.geometry.configuration import KINDS
 from fmtorch.pipeline.configuration import classify
@@ -33,15 +34,9 @@ from scripts.benchmark.matched import console
 
 Array = NDArray[Any]
 Verdict = Callable[[Case, int], str]
-GENERAL = (
-    "castle-P19",
-    "fountain-P11",
-    "Herz-Jesus-P8",
-    "sacre_coeur",
-    "00",
-    "driving",
-    "orbit",
-)  # scenes, and rendered families, whose depth and baseline every pair sees
+# Scenes, and rendered families, whose depth and baseline every pair sees.
+GENERAL = {"castle-P19", "fountain-P11", "Herz-Jesus-P8", "sacre_coeur", "00", "driving", "orbit"}
+TIMED_FIELDS = ("x0", "x1", "mask", "quality", "prior", "noise", "key", "size0", "size1", "K0", "K1")
 COLMAP = {
     "CALIBRATED": "general", "UNCALIBRATED": "general", "PLANAR": "planar", "PANORAMIC": "rotation",
     "PLANAR_OR_PANORAMIC": "planar", "WATERMARK": "identical", "DEGENERATE": "unrelated", "UNDEFINED": "unrelated",
@@ -78,6 +73,7 @@ def run(arguments: argparse.Namespace) -> None:
     }
     report(cases, verdicts)
     pose_report(cases, verdicts["fmtorch"])
+    time_report(cases)
 
 
 def _kept(folder: Path | None, name: str, make: Callable[[], list[Case]]) -> list[Case]:
@@ -191,3 +187,19 @@ def _pose_errors(case: Case) -> Array:
     seen = torch.where(poses.valid[..., None, None], poses.R, torch.nan)
     from_H = metrics.pose_error(seen, poses.t, R[:, None], t[:, None]).worst[0].nan_to_num(180.0)
     return np.array([float(from_F.worst), float(from_H[0]), float(from_H.min())])
+
+
+def time_report(cases: list[Case]) -> None:
+    """Milliseconds of processor time a pair, in one batch, of F and of `classify` beyond it."""
+    fields = [{name: getattr(case.matches, name) for name in TIMED_FIELDS} for case in cases[:: -(-len(cases) // 64)]]
+    c = collate([Correspondences(**each) for each in fields])
+    estimator = presets.build("estimator", "fmtorch")
+    estimate = estimator(c, 0)
+    milliseconds = []
+    for function in (lambda: estimator(c, 0), lambda: classify(c, estimate)):
+        function()
+        start = time.process_time()
+        function()
+        milliseconds.append((time.process_time() - start) / len(c) * 1e3)
+    count = int(c.count().median())
+    console.print(f"{len(c)} pairs, median {count} matches: F {milliseconds[0]:.2f} ms, kinds {milliseconds[1]:.2f} ms")

@@ -95,6 +95,22 @@ def test_no_unit_is_special() -> None:
     assert torch.equal(classified(one), classified(two))
 
 
+@pytest.mark.parametrize("factor", [1e-9, 1e9])
+def test_points_of_any_scale_are_weighed(factor: float) -> None:
+    """Without sizes, as large as their boxes; nothing overflows."""
+    pairs = batch([draw(kind, 3) for kind in KINDS])
+    given = {name: pairs[name] for name in ("F", "H", "x0", "x1", "mask")}
+    grow = torch.diag(torch.tensor([factor, factor, 1], dtype=torch.float64))
+    shrink = torch.linalg.inv(grow)
+    given |= {"x0": factor * given["x0"], "x1": factor * given["x1"]}
+    given |= {"F": shrink @ given["F"] @ shrink, "H": grow @ given["H"] @ shrink}
+    evidence = configuration_evidence(**given)
+    for name in ("line", "plane", "both", "copy", "noise"):
+        assert bool(getattr(evidence, name).isfinite().all()), name
+    if factor > 1:
+        assert classified(evidence).tolist()[:2] == [0, 1]
+
+
 def assert_same(a: Evidence, b: Evidence) -> None:
     for x, y in zip(a, b, strict=True):
         assert torch.equal(x, y)

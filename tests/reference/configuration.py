@@ -14,7 +14,7 @@ from scipy.stats import multivariate_t, t
 from tests.reference.homography_family import equations
 
 FREEDOM = 3.0
-START, FINEST, COARSEST = 1 / 1500, 0.1, 1 / 300
+START, FINEST, COARSEST = 1 / 1500, 0.1, 1 / 300  # of side, px, of side
 LOSS = 3.0
 
 
