@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from fmtorch.pipeline.fundamental import find_fundamental, find_homography
     from fmtorch.pipeline.pipeline import Pipeline
     from fmtorch.pipeline.two_images import MatchResult, match
+    from fmtorch.pipeline.verification import verify
+    from fmtorch.pipeline.verification_run import Verification
 
 __all__ = [
     "Correspondences",
@@ -21,18 +23,21 @@ __all__ = [
     "Features",
     "MatchResult",
     "Pipeline",
+    "Verification",
     "__version__",
     "find_essential",
     "find_fundamental",
     "find_homography",
     "match",
+    "verify",
 ]
 
 _MODULES = {
     "Correspondences": "core.types", "Estimate": "core.types", "Features": "core.types",
     "MatchResult": "pipeline.two_images", "Pipeline": "pipeline.pipeline", "match": "pipeline.two_images",
     "find_essential": "pipeline.essential", "find_fundamental": "pipeline.fundamental",
-    "find_homography": "pipeline.fundamental",
+    "find_homography": "pipeline.fundamental", "Verification": "pipeline.verification_run",
+    "verify": "pipeline.verification",
 }  # fmt: skip
 
 
@@ -53,7 +58,7 @@ def __dir__() -> list[str]:
 
 
 class _Package(ModuleType):
-    """The package, in which `match` is the function.
+    """The package, in which `match` and `verify` are the functions.
 
     Python makes each submodule that is imported an attribute of its package, `fmtorch.match` too, which runs the
     command of that name; it stays ``sys.modules["fmtorch.match"]`` alone. Nothing shorter does: a module that puts the
@@ -62,7 +67,7 @@ class _Package(ModuleType):
     """
 
     def __setattr__(self, name: str, value: object) -> None:
-        if not (name == "match" and isinstance(value, ModuleType)):
+        if not (name in ("match", "verify") and isinstance(value, ModuleType)):
             super().__setattr__(name, value)
 
 

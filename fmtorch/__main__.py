@@ -14,6 +14,7 @@ COMMANDS = {
     "pairs": "which pairs of images with known cameras can be matched, as a data set",
     "report": "compare runs of eval on one HTML page",
     "train": "train a learned pruner on labelled matches of a data set",
+    "verify": "two-view geometries of the matches in a COLMAP database, or hloc's files",
 }
 HELP = f"""fmtorch {__version__}: two-view geometry
 

@@ -24,7 +24,7 @@ LIBRARIES = (
     "skimage.io", "rich.progress", "scipy.spatial", "numba", "onnxruntime", "lightning", "lightning.pytorch.loggers",
     "torch.utils.tensorboard", "antlr4", "jinja2", "h5py",
     "fmtorch.commands.eval", "fmtorch.commands.match", "fmtorch.commands.pairs", "fmtorch.commands.report",
-    "fmtorch.estimators", "fmtorch.features", "fmtorch.pruning", "fmtorch.matching",
+    "fmtorch.commands.verify", "fmtorch.estimators", "fmtorch.features", "fmtorch.pruning", "fmtorch.matching",
 )  # fmt: skip
 
 

@@ -32,7 +32,8 @@ def test_help_lists_the_commands_without_torch() -> None:
         "from fmtorch.__main__ import main\n"
         "sys.argv = ['fmtorch', '--help']\n"
         "with contextlib.redirect_stdout(io.StringIO()) as told: main()\n"
-        "assert all(f'  {name} ' in told.getvalue() for name in ('eval', 'match', 'pairs', 'report', 'train'))\n"
+        "names = ('eval', 'match', 'pairs', 'report', 'train', 'verify')\n"
+        "assert all(f'  {name} ' in told.getvalue() for name in names)\n"
         "assert not {'torch', 'hydra', 'numpy'} & set(sys.modules)"
     )
 
@@ -50,7 +51,8 @@ def test_a_subcommand_runs_as_its_module_does(tmp_path: Path, monkeypatch: pytes
     options = {"run_name": "__main__", "alter_sys": True}
     assert called == [(("fmtorch.eval",), options, ["/usr/bin/fmtorch", "-m", "seed=1,2"], str(tmp_path))]
     monkeypatch.setattr(sys, "argv", ["fmtorch", "evaluate"])
-    with pytest.raises(SystemExit, match="error: no command 'evaluate'; there are: eval, match, pairs, report, train"):
+    there = "eval, match, pairs, report, train, verify"
+    with pytest.raises(SystemExit, match=f"error: no command 'evaluate'; there are: {there}"):
         fmtorch.__main__.main()
 
 
@@ -65,6 +67,8 @@ def test_match_is_the_function_and_its_command_can_be_imported() -> None:
         "del sys.modules['fmtorch.match']\n"
         "import fmtorch.match\n"  # and after it
         "assert fmtorch.match is match and inspect.ismodule(sys.modules['fmtorch.match'])\n"
+        "import fmtorch.verify\n"
+        "assert inspect.isfunction(fmtorch.verify) and inspect.ismodule(sys.modules['fmtorch.verify'])\n"
         "assert fmtorch.Pipeline.__module__ == 'fmtorch.pipeline.pipeline'\n"
         "assert set(fmtorch.__all__) <= set(dir(fmtorch)) and fmtorch.geometry.sampson\n"
         "assert not hasattr(fmtorch, 'nothing')\n"
@@ -126,6 +130,12 @@ COUNT = "it must be a whole number of at least 1"
         ("match a.png b.png truth=F.txt", "F.txt: No such file or directory"),
         ("report pictures=-1", "pictures=-1; it must be a whole number of at least 0"),
         ("report nowhere", "nowhere holds no run"),
+        ("verify", "database is missing; give the database of a COLMAP project: fmtorch verify database.db"),
+        ("verify no.db", "there is no file no.db; give the database of a COLMAP project"),
+        ("verify no.db cameras=known", "cameras=known; it must be"),
+        ("verify no.db force=2", "force=2; it must be true or false"),
+        ("verify no.db more.db", "more.db: only database may stand without NAME="),
+        ("verify no.db estimator.hypotheses=few", "estimator.hypotheses=few; it must be a whole number"),
         ("train batch=0", f"batch=0; {COUNT}"),
         ("train limit=three", f"limit=three; {COUNT} or null"),
         ("train optimisation.steps=some", "optimisation.steps=some; it must be a whole number"),

@@ -26,6 +26,7 @@ from hydra.core.global_hydra import GlobalHydra
 from fmtorch import data
 from fmtorch.data import read_image
 from tests.conftest import own_cache
+from tests.pipeline import databases, test_verification_hloc
 from tests.processes import run_command
 from tests.storage.exchange import writers
 
@@ -79,6 +80,7 @@ APPENDED = {
         *TINY,
     ],
     "fmtorch.pairs": ["dataset.root=DATA/Strecha", "workers=1"],
+    "fmtorch.verify": ["estimator.focal.rounds=3"],
     "fmtorch.report": ["pictures=1", "root=DATA/Strecha"],
     "estimators": ["--limit", "1", "--seeds", "1"],
     "cameras": ["--limit", "1", "--seeds", "1"],
@@ -93,6 +95,7 @@ APPENDED = {
     "related": ["--limit", "1", "--unrelated", "1"],
     "learned": ["--limit", "1", "--cache", "kept", "--methods", "ratio", "LC, F", "DFE"],
     "stress": ["--limit", "1", "--only", "noise"],
+    "verify": ["--scenes", "DATA/Strecha/a", "--repeats", "1", "--no-mapper"],
     "speed": ["--pairs", "2", "--batch", "2", "--repeats", "1", "--matches", "200"],
     "memory": ["--pairs", "1", "--matches", "200", "--estimators", "ransac"],
     "end_to_end": ["--limit", "1", "--pipelines", "sift_lmeds"],
@@ -191,6 +194,8 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for layout in ("posebench", "hloc", "oanet"):
         writers.WRITERS[layout](folder / "FILES" / layout)
     writers.truth(folder / "SET")
+    databases.write(folder / "database.db", databases.scene(3))
+    test_verification_hloc.write(folder, databases.scene(3))
     (folder / "my_conf" / "estimator").mkdir(parents=True)
     yaml = re.findall(
         r"```yaml\n# my_conf/estimator/mine.yaml\n(.*?)```", (SOURCE / "README.md").read_text(), re.DOTALL

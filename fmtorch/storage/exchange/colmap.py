@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.storage.exchange.journal import ExportedImage, ExportedPair
+from fmtorch.storage.exchange.two_view import ORIGIN, PairGeometry, two_view_geometry
 
-ORIGIN = 0.5  # px: COLMAP's coordinates of the first pixel's centre
 FOCAL_LENGTH = 1.2  # of the longer side, where it is unknown: COLMAP's own default
 
 
@@ -86,17 +86,10 @@ def _camera(pycolmap: Any, database: Any, cameras: dict[object, int], image: Exp
 def _geometry(
     pycolmap: Any, pair: ExportedPair, inliers: NDArray[np.int32], known: dict[str, NDArray[np.float64] | None]
 ) -> Any:
-    move = np.array([[1.0, 0, -ORIGIN], [0, 1, -ORIGIN], [0, 0, 1]])
-    F = move.T @ pair.F @ move
-    geometry = pycolmap.TwoViewGeometry()
-    geometry.F, geometry.inlier_matches = F, np.ascontiguousarray(inliers, np.uint32)
-    geometry.config = pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
     K0, K1 = known[pair.name0], known[pair.name1]
-    if K0 is not None and K1 is not None:
-        E = K1.T @ pair.F @ K0
-        geometry.E = E / np.linalg.norm(E)
-        geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
-    return geometry
+    if K0 is None or K1 is None:
+        return two_view_geometry(pycolmap, PairGeometry("uncalibrated", inliers, pair.F))
+    return two_view_geometry(pycolmap, PairGeometry("calibrated", inliers, pair.F, K1.T @ pair.F @ K0))
 
 
 def _one_to_one(pair: ExportedPair) -> NDArray[np.bool_]:

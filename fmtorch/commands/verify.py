@@ -1,0 +1,101 @@
+"""`python -m fmtorch.verify DATABASE`: two-view geometries of the matches in a COLMAP database."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import re
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.table import Table
+
+from fmtorch import presets
+from fmtorch.commands.main import job, run_command
+from fmtorch.core.terminal import console, progress_bars, reporter
+from fmtorch.pipeline.database_pairs import Cameras
+from fmtorch.pipeline.verification import Places, verify_by
+from fmtorch.pipeline.verification_run import Verification
+from fmtorch.presets import plain
+from fmtorch.presets.fields import Seed, path_fields, read_fields
+
+MAX_PROBLEMS = 20  # that are printed
+
+
+@dataclasses.dataclass(frozen=True)
+class Fields:
+    """What the command takes beside the estimator; ``conf/verify.yaml`` says what each is."""
+
+    database: Path | None = None
+    features_file: Path | None = None
+    matches: Path | None = None
+    output: Path | None = None
+    cameras: Cameras = "stored"
+    force: bool = False
+    seed: Seed = 0
+
+
+def run(config: DictConfig, estimator: str) -> Verification:
+    """Verify the database of a composed config, by a preset whose options are those of the config."""
+    fields = read_fields(Fields, config)
+    built = presets.instantiate(config.estimator, "estimator")
+    with _begun_by_reports(estimator) as report:
+        places = Places(fields.database, fields.features_file, fields.matches, fields.output)
+        settings = {"estimator": plain(config.estimator)}
+        result = verify_by(built, settings, places, fields.cameras, fields.force, fields.seed, report)
+    for problem in result.problems[:MAX_PROBLEMS]:
+        Console(stderr=True).print(problem, style="bold", markup=False, highlight=False, soft_wrap=True)
+    if len(result.problems) > MAX_PROBLEMS:
+        Console(stderr=True).print(f"and {len(result.problems) - MAX_PROBLEMS} more", highlight=False)
+    console.print(_table(result))
+    console.print(f"[dim]{result.path}[/dim]", highlight=False)
+    return result
+
+
+@contextlib.contextmanager
+def _begun_by_reports(description: str) -> Iterator[Callable[[int, int], None]]:
+    """A function of (done, total) that shows a progress bar from its first call on; errors before it stand alone."""
+    with contextlib.ExitStack() as stack:
+        shown: list[Callable[[int, int], None]] = []
+
+        def report(done: int, total: int) -> None:
+            if not shown:
+                shown.append(reporter(stack.enter_context(progress_bars()), description))
+            shown[0](done, total)
+
+        yield report
+
+
+def _table(result: Verification) -> Table:
+    """Counts of pairs, and how long they took."""
+    table = Table()
+    table.add_column("pairs")
+    table.add_column("", justify="right")
+    table.add_row("with matches", f"{result.pairs:,}")
+    if result.kept:
+        table.add_row("had a geometry", f"{result.kept:,}")
+    table.add_row("verified", f"{result.verified:,}")
+    for kind, count in sorted(result.configurations.items(), key=lambda entry: -entry[1]):
+        table.add_row(f"  {kind.replace('_', ' ')}", f"{count:,}")
+    if result.problems:
+        table.add_row("could not be read", f"{len(result.problems):,}")
+    table.add_row("seconds", f"{result.seconds:.1f}")
+    table.add_row("a second", f"{sum(result.configurations.values()) / result.seconds:.1f}")
+    return table
+
+
+@job
+def task(config: DictConfig) -> None:
+    """What Hydra runs."""
+    run(config, str(HydraConfig.get().runtime.choices["estimator"]))
+
+
+def main() -> None:
+    """The command."""
+    sys.argv[1:] = [re.sub("^features=", "features_file=", word) for word in sys.argv[1:]]  # no preset of conf/features
+    said = "interrupted; the same command continues"
+    run_command("verify", task, paths=path_fields(Fields), positional=("database",), interrupted=said)
