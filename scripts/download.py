@@ -17,14 +17,21 @@ Then: python scripts/export_onnx.py checkpoint=weights/AffNet.pth architecture=a
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import http.client
+import os
 import re
+import tarfile
+import tempfile
+import urllib.error
+import urllib.request
+import zlib
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 
 from fmtorch.core.terminal import console, exits_with_message
-from fmtorch.storage.fetching import download, expect_digest, resume, unpack
 
 DEFAULTS = {
     "weights": None, "dataset": None, "files": None, "sha256": None, "folder": None, "url": None, "timeout": 60,
@@ -111,6 +118,82 @@ DATASETS = {
 }  # fmt: skip
 
 
+def resume(url: str, path: Path, timeout: float | int = 60) -> None:
+    """Fetch `url` into `path`, beside which an unfinished part is kept, and continued where the server can.
+
+    Raises ConnectionError where it cannot be fetched whole; the same call then goes on.
+    """
+    if path.is_file():
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".part")
+    begin = part.stat().st_size if part.is_file() else 0
+    request = urllib.request.Request(url, headers={"Range": f"bytes={begin}-"} if begin else {})
+    try:
+        with urllib.request.urlopen(request, timeout=timeout) as response:
+            begin = begin if response.status == 206 else 0  # else the server sends it from the beginning
+            with part.open("ab" if begin else "wb") as file:
+                while chunk := response.read(1 << 20):
+                    file.write(chunk)
+                length = response.headers.get("Content-Length")
+                if length is not None and file.tell() != begin + int(length):
+                    raise ConnectionError(f"{url} broke off after {file.tell()} of {begin + int(length)} bytes")
+    except urllib.error.HTTPError as error:
+        if error.code != 416:  # nothing is left to send
+            raise ConnectionError(f"{url} cannot be fetched ({error.code} {error.reason})") from error
+    except (urllib.error.URLError, http.client.HTTPException, TimeoutError) as error:
+        raise ConnectionError(f"{url} broke off or cannot be fetched ({error}); the same command goes on") from error
+    os.replace(part, path)
+
+
+def expect_digest(url: str, path: Path, sha256: str | None) -> str:
+    """The file's SHA-256. Raises ValueError, and drops the file, where it is another one; None accepts any."""
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    if sha256 is not None and digest != sha256.lower():
+        path.unlink()
+        raise ValueError(f"{url} has SHA-256 {digest}, not {sha256}: it was not kept")
+    return digest
+
+
+def download(url: str, path: Path, sha256: str | None, timeout: float | int = 60) -> str:
+    """Fetch `url` into `path`, which appears only when the file is complete and verified; returns its SHA-256.
+
+    sha256: what it must be; None accepts what comes. Raises ConnectionError where the file cannot be fetched,
+    ValueError where it is another one.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}") as folder:
+        fresh = Path(folder) / path.name
+        resume(url, fresh, timeout)
+        digest = expect_digest(url, fresh, sha256)
+        os.replace(fresh, path)
+    return digest
+
+
+def unpack(archive: Path, folder: Path) -> list[Path]:
+    """Unpack a tar archive; its files and folders appear in `folder` when all are there. Returns them.
+
+    Raises ValueError for a damaged archive, for members that would leave the folder, and for links and devices.
+    """
+    if not hasattr(tarfile, "data_filter"):
+        raise ValueError("unpacking safely needs Python 3.11.4 or newer")
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".unpacking") as temporary:
+        try:
+            with tarfile.open(archive) as tar:
+                tar.extractall(temporary, filter="data")
+        except (tarfile.TarError, EOFError, zlib.error, OSError) as error:
+            raise ValueError(f"{archive}: cannot be unpacked ({error}); delete it and fetch it again") from error
+        unpacked = []
+        for path in sorted(Path(temporary).iterdir()):
+            if (folder / path.name).exists():
+                raise ValueError(f"{folder / path.name} is there already; name another folder or remove it")
+        for path in sorted(Path(temporary).iterdir()):
+            os.replace(path, folder / path.name)
+            unpacked.append(folder / path.name)
+    return unpacked
+
+
 def fetch_dataset(config: DictConfig) -> list[Path]:
     """Fetch and unpack a data set's archives; those whose folders are there are skipped."""
     if config.dataset not in DATASETS:
@@ -128,8 +211,7 @@ def fetch_dataset(config: DictConfig) -> list[Path]:
             console.print(f"{file} is there", highlight=False)
             continue
         resume(url, target, config.timeout)
-        if config.sha256 is not None and config.sha256 != "any":
-            expect_digest(url, target, config.sha256)
+        expect_digest(url, target, None if config.sha256 == "any" else config.sha256)
         made += unpack(target, folder)
         (folder / f".{file}.complete").touch()
         target.unlink()

@@ -11,8 +11,7 @@ import argparse
 import json
 from pathlib import Path
 
-from fmtorch.data.rendered.generate import FAMILIES, PLANS, SPLITS, digest
-from fmtorch.data.rendered.recorded import RECORD, recorded_pairs
+from fmtorch.data.rendered.generate import FAMILIES, PLANS, RECORD, SPLITS, digest, recorded_pairs
 
 
 def main() -> None:

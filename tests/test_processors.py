@@ -20,7 +20,7 @@ import torch
 from fmtorch import geometry, presets
 from fmtorch.compiling import switch
 from fmtorch.estimators.families.focal_prior import normal_quantiles
-from fmtorch.geometry.sigma_consensus import LOSS_TABLE
+from fmtorch.geometry.magsac import LOSS_TABLE
 from fmtorch.matching import nearest_neighbors
 from fmtorch.metrics import nsgd
 from tests.laws import degenerate, scene, scenes

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import itertools
 import multiprocessing
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
+from hydra.core.utils import env_override
 from omegaconf import DictConfig
 from rich.progress import Progress
 
@@ -141,7 +141,7 @@ class _Team:
         waiting: list[Future[Any]] = []
         todo = iter(arguments)
         try:
-            with _environment(_ONE_THREAD):  # of the processes, which the first calls start
+            with env_override(_ONE_THREAD):  # of the processes, which the first calls start
                 for given in todo:
                     waiting.append(self.executor.submit(_in_process, method, given))
                     if len(waiting) > 2 * self.workers:
@@ -173,21 +173,6 @@ def _begin(construction: Construction) -> None:
 def _in_process(method: str, given: tuple[object, ...]) -> Any:
     assert _construction is not None
     return getattr(_construction, method)(*given)
-
-
-@contextlib.contextmanager
-def _environment(values: dict[str, str]) -> Iterator[None]:
-    """Environment variables for processes that start within it."""
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
 
 
 def _tell(construction: Construction, summary: dict[str, int], problems: list[str], seconds: float) -> None:

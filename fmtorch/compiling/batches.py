@@ -33,18 +33,20 @@ def for_each_pair(
     *constants: Any,
     out: Tensor,
     kind: torch.dtype = torch.float32,
+    group: Callable[..., Any] | None = None,
 ) -> Tensor:
     """`out` (B, ...) after function(row of each tensor, constants, row of out) for each of B pairs.
 
-    Rows are C-contiguous arrays, floating ones of type `kind`; of what is not known (None) an empty one. Pairs are
-    shared out among threads.
+    Rows are C-contiguous arrays, floating ones of type `kind`; of what is not known (None) an empty one. group: the
+    NamedTuple in which the function takes the rows. Pairs are shared out among threads.
     """
     results = out.numpy()
     arrays = [_array(t, kind, len(results)) for t in tensors]
 
     def some(pairs: range) -> None:
         for pair in pairs:
-            function(*[array[pair] for array in arrays], *constants, results[pair])
+            rows = [array[pair] for array in arrays]
+            function(*(rows if group is None else [group(*rows)]), *constants, results[pair])
 
     parts = max(1, min(available(), len(results) // PAIRS_OF_A_THREAD))
     mapped(some, [range(first, len(results), parts) for first in range(parts)])

@@ -20,6 +20,8 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any, Generic, ParamSpec, TypeVar, overload
 
+import numpy as np
+
 from fmtorch.compiling import cache, calls, switch
 from fmtorch.compiling.inner import inner_compiler
 from fmtorch.compiling.signature import described, signature_of
@@ -45,12 +47,12 @@ class Kernel(Generic[P, R]):
     __slots__ = ("__call__", "__dict__")  # so that to call a kernel is to call what is compiled, with nothing between
     __call__: Callable[P, R]
 
-    def __init__(self, function: Callable[P, R], holds_gil: bool = False) -> None:
+    def __init__(self, function: Callable[P, R], holds_gil: bool = False, always_compiled: bool = False) -> None:
         self.function: Callable[P, R] = inspect.unwrap(
             function
         )  # without the checks that tests wrap around every function
         functools.update_wrapper(self, self.function)
-        self.holds_gil = holds_gil
+        self.holds_gil, self.always_compiled = holds_gil, always_compiled
         self._compiled: Callable[P, R] | None = None
         self.calls: list[Kernel[..., Any]] = []  # those that it calls, once it is compiled
         calls.register(self)
@@ -72,8 +74,9 @@ class Kernel(Generic[P, R]):
         return f"kernel {module}.{name}({described(self.signature)}) -> {calls.returned(self.function)}", None
 
     def _first_call(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        if switch.off():
-            return self.function(*args, **kwargs)
+        if switch.off() and not self.always_compiled:
+            with np.errstate(all="ignore"):  # as compiled: numbers wrap round, and may become infinite or NaN
+                return self.function(*args, **kwargs)
         return self.compiled()(*args, **kwargs)
 
     def compiled(self) -> Callable[P, R]:
@@ -159,12 +162,17 @@ class Inner(Generic[P, R]):
 @overload
 def kernel(function: Callable[P, R]) -> Kernel[P, R]: ...
 @overload
-def kernel(*, holds_gil: bool = False, name: str = "") -> Callable[[Callable[P, R]], Kernel[P, R]]: ...
-def kernel(function: Callable[P, R] | None = None, *, holds_gil: bool = False, name: str = "") -> Any:
+def kernel(
+    *, holds_gil: bool = False, always_compiled: bool = False, name: str = ""
+) -> Callable[[Callable[P, R]], Kernel[P, R]]: ...
+def kernel(
+    function: Callable[P, R] | None = None, *, holds_gil: bool = False, always_compiled: bool = False, name: str = ""
+) -> Any:
     """Makes a function a `Kernel` of the types of its annotations.
 
     Arrays must be writable. holds_gil: of some microseconds, for which it keeps Python's lock: a thread that waits for
-    it would wake too late to use them. name: of one that a function makes for some other function, unique in its file.
+    it would wake too late to use them. always_compiled: also with FMTORCH_KERNELS=off, since Python would take hours.
+    name: of one that a function makes for some other function, unique in its file.
     """
     if function is not None:
         return Kernel(function)
@@ -173,7 +181,7 @@ def kernel(function: Callable[P, R] | None = None, *, holds_gil: bool = False, n
         if name:
             function = inspect.unwrap(function)
             function.__name__ = function.__qualname__ = name
-        return Kernel(function, holds_gil)
+        return Kernel(function, holds_gil, always_compiled)
 
     return named
 

@@ -40,14 +40,10 @@ class _Model(models.PrimitiveModel):  # type: ignore[misc]
         super().__init__(manager, lanes, ir.VectorType(bits[lanes.dtype], lanes.count))
 
 
-def _is_number(kind: Any) -> bool:
-    return isinstance(kind, (types.Float, types.Integer))
-
-
 def operands(args: tuple[Any, ...]) -> LanesType | None:
     """The type of lanes that both operands have or become; None where there is none."""
     found = {kind for kind in args if isinstance(kind, LanesType)}
-    if len(found) != 1 or not all(kind in found or _is_number(kind) for kind in args):
+    if len(found) != 1 or not all(kind in found or isinstance(kind, (types.Float, types.Integer)) for kind in args):
         return None
     (kind,) = found
     return None if kind.dtype == types.boolean else kind

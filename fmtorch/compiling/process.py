@@ -16,6 +16,11 @@ from pathlib import Path
 HOME = Path(__file__).resolve().parents[2]
 
 
+def cores() -> int:
+    """How many processor cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def start(module: str, **environment: str) -> subprocess.Popen[str]:
     """A Python process that runs the `main` of a module, with pipes for its standard input and output.
 

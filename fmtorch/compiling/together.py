@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import collections
 import contextlib
-import os
 import subprocess
 import sys
 import threading
@@ -34,7 +33,7 @@ def compile_together(kernels: Sequence[Kernel[..., Any]]) -> None:
         absent = [each for each in kernels if not (each.ready or each.kept)]
         jobs = [(f"{number} of {len(absent)}: ", each) for number, each in enumerate(absent, start=1)]
         waiting = collections.deque(jobs)
-        helper = _helper() if len(absent) > 1 and _cores() > 1 and cache.folder() is not None else None
+        helper = _helper() if len(absent) > 1 and process.cores() > 1 and cache.folder() is not None else None
         try:
             if helper is not None:
                 threading.Thread(target=_feed, args=(helper, waiting), daemon=True).start()
@@ -55,10 +54,6 @@ def compile_together(kernels: Sequence[Kernel[..., Any]]) -> None:
                 helper.wait()
         for each in kernels:
             each.compiled()
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _helper() -> subprocess.Popen[str] | None:

@@ -16,11 +16,10 @@ import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
+from fmtorch.core.estimate import RELATED as RELATED
+from fmtorch.core.estimate import Estimate as Estimate
 from fmtorch.core.records import Index, Record, as_index, expect_fields, gathered, padded, slotted
 from fmtorch.core.rules import DEVIATION, FOCAL, PROBABILITY, SIZE
-
-RELATED = 1.0
-"""The significance from which on two images are called related; chosen on tuning pairs (docs/related.md)."""
 
 
 def pair_key(identity: str) -> int:
@@ -144,69 +143,6 @@ class Correspondences(Record):
         n = -(-longest // multiple) * multiple
         order = torch.argsort(self.mask.logical_not().to(torch.uint8), dim=-1, stable=True)[:, :n]
         return self.derived(**{name: padded(gathered(v, order), 1, n) for name, v in slotted(self).items()})
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Estimate(Record):
-    """Fundamental matrices of B pairs.
-
-    F: (B, 3, 3) with unit Frobenius norm, zero where `ok` is False. inliers: (B, N), within the mask; none where `ok`
-    is False. ok: (B,). reason: why a pair failed, empty where it did not. draws: minimal samples drawn, (B,).
-    significance: (B,), how far the support of F is beyond chance, see `fmtorch.geometry.significance`: -log10 of the
-    number of models with as much support that are expected among images that show nothing in common; -inf where `ok`
-    is False, NaN where nobody has computed it; never None. model: what `F` is, "fundamental", or "homography" for
-    `x1 ~ F x0`, which is positive where the plane is seen; then `H` is another name for it.
-    Where cameras are known or asked for, NaN if not determined: focals (B, 2), px; X1 = R X0 + t; E = [t]_x R.
-    """
-
-    F: Float[Tensor, "b 3 3"]
-    inliers: Bool[Tensor, "b n"]
-    ok: Bool[Tensor, " b"]
-    reason: tuple[str, ...]
-    draws: Int[Tensor, " b"]
-    significance: Float[Tensor, " b"] | None = None
-    model: str = "fundamental"
-    E: Float[Tensor, "b 3 3"] | None = None
-    R: Float[Tensor, "b 3 3"] | None = None
-    t: Float[Tensor, "b 3"] | None = None
-    focals: Float[Tensor, "b 2"] | None = None
-
-    def __post_init__(self) -> None:
-        expect_fields(self)
-        b = len(self)
-        if self.significance is None:
-            unknown = torch.full((b,), torch.nan, dtype=torch.float64, device=self.F.device)
-            object.__setattr__(self, "significance", unknown)
-        if not isinstance(self.reason, tuple | list) or not all(isinstance(entry, str) for entry in self.reason):
-            raise TypeError(f"reason is a {type(self.reason).__name__}; it must be a tuple of strings")
-        object.__setattr__(self, "reason", tuple(self.reason))
-        if len(self.reason) != b:
-            raise ValueError(f"reason has {len(self.reason)} entries; it must have one for each of the {b} pairs")
-
-    @property
-    def H(self) -> Float[Tensor, "b 3 3"]:
-        """The homographies. Raises AttributeError where the estimate is of another model."""
-        if self.model != "homography":
-            raise AttributeError(f"these are {self.model} matrices; find_homography gives homographies")
-        return self.F
-
-    @property
-    def related(self) -> Bool[Tensor, " b"]:
-        """Whether the two images are taken to show one scene: ok, with a significance of at least `RELATED`.
-
-        Recall and all other figures are of `ok` alone; this tells whom to believe.
-        """
-        return self.ok & (cast(Tensor, self.significance) >= RELATED)
-
-    def __len__(self) -> int:
-        """Number of pairs."""
-        return int(self.F.shape[0])
-
-    def __getitem__(self, index: Index) -> Estimate:
-        """The selected pairs, always as a batch."""
-        i = as_index(index, len(self))
-        picked = torch.arange(len(self), device=self.ok.device)[i].tolist()
-        return self._map(lambda value: value[i], reason=tuple(self.reason[j] for j in picked))
 
 
 Item = TypeVar("Item", Features, Correspondences, Estimate)

@@ -6,45 +6,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from fmtorch.data.candidates import MIN_SHARED, AllPairs, Candidates, sharing_points
 from fmtorch.data.colmap_binary import read_binary
 from fmtorch.data.colmap_model import Model
 from fmtorch.data.colmap_text import read_text
 from fmtorch.data.depth_images import DepthImages, read_colmap
 from fmtorch.data.pairs import ImageSource
-from fmtorch.data.scenes import Scene, ScenePairs, View, folders
+from fmtorch.data.scenes import DepthScenePairs, Scene, ScenePairs, View, folders
 from fmtorch.data.splits import chosen
 from fmtorch.data.text_files import DataError
 
 _MODELS = ("sparse/0", "sparse", "dense/sparse", ".")  # below a scene's folder, in the order in which they are tried
 _FILES = ("cameras.bin", "cameras.txt")
-
-
-class ColmapPairs(ScenePairs):
-    """Pairs of the images of COLMAP models, one folder a scene; see `colmap_pairs`."""
-
-    def __init__(
-        self,
-        scenes: Sequence[Scene],
-        files: list[tuple[str, Path]],
-        options: tuple[str | int, ...],
-        pairs: int | None,
-        seed: int,
-    ) -> None:
-        super().__init__("colmap", scenes, files, options, pairs, seed)
-
-
-class ColmapDepthPairs(ColmapPairs):
-    """The same where each scene has depth maps."""
-
-    depth_images: DepthImages
-
-    def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Depth (n,) in the model's unit, along the optical axis at points (n, 2) of an image; NaN where unknown."""
-        return self.depth_images.at(image, points)
 
 
 def colmap_pairs(
@@ -59,7 +32,7 @@ def colmap_pairs(
     seed: int = 0,
     family: str | None = None,
     depth: bool = True,
-) -> ColmapPairs:
+) -> ScenePairs:
     """Pairs of the images of COLMAP models, text or binary, one folder a scene.
 
     Args:
@@ -88,8 +61,8 @@ def colmap_pairs(
         files += [(f"{folder.name}/{path.name}", path) for path in reconstruction.files]
     options = (candidates, shared, family or home.name)
     if not depth or not all(_depth_folder(folder / images).is_dir() for folder in model_folders):
-        return ColmapPairs(scenes, files, options, pairs, seed)
-    dataset = ColmapDepthPairs(scenes, files, (*options, "depth"), pairs, seed)
+        return ScenePairs("colmap", scenes, files, options, pairs, seed)
+    dataset = DepthScenePairs("colmap", scenes, files, (*options, "depth"), pairs, seed)
     paths = [_depth_paths(folder / images, scene) for folder, scene in zip(model_folders, scenes, strict=True)]
     by_image = {key: path for by_identity in paths for key, path in by_identity.items()}
     dataset.depth_images = DepthImages(by_image, 1.0, read_colmap, reduced=True)

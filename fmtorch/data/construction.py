@@ -96,7 +96,7 @@ class Construction:
 
     def judge(self, block: int, ranks: Sequence[int]) -> Verdicts:
         """Judge the candidates of a block and keep the verdicts; what was judged before is read."""
-        file = self._verdicts(block)
+        file = self.work / "verdicts" / f"{block:08d}.json"
         if file.is_file():
             return Verdicts(**json.loads(file.read_text(encoding="utf-8")))
         kept, problems = [], list[str]()
@@ -169,9 +169,6 @@ class Construction:
         source = self.dataset.scenes[scene].views[number].image
         suffix = source.path.suffix if _as_it_is(source) else SUFFIXES[0]
         return self.folder / self.dataset.scenes[scene].name / IMAGES / f"{number:08d}{suffix}"
-
-    def _verdicts(self, block: int) -> Path:
-        return self.work / "verdicts" / f"{block:08d}.json"
 
     def _keypoints(self, image: ImageSource) -> Keypoints:
         """SIFT of an image, from the work folder where it is there; descriptors are whole numbers up to 255."""

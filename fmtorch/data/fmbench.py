@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fmtorch.data.camera_files import COLUMNS
 from fmtorch.data.cameras import Camera, relative_pose
-from fmtorch.data.pairs import ImagePair, ImageSource
+from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset
 from fmtorch.data.text_files import DataError, read_lines, read_numbers
 
 _PAIRS, _SUBSETS, _CAMERAS = "pairs_with_gt.txt", "pairs_which_dataset.txt", "Camera.txt"
@@ -23,7 +23,7 @@ _PAIR_COLUMNS = "l r F11 F12 F13 F21 F22 F23 F31 F32 F33"
 _LAYOUT = f"the layout is <set>/{_PAIRS} and <set>/{_SUBSETS}"
 
 
-class FMBenchPairs:
+class FMBenchPairs(PairDataset):
     """The pairs of one or several sets in the authors' distribution layout.
 
     root: one set's folder, which holds ``pairs_with_gt.txt``, or a folder of such sets.
@@ -67,9 +67,6 @@ class FMBenchPairs:
 
     def __getitem__(self, index: int) -> ImagePair:
         return self._pairs[index]
-
-    def __iter__(self) -> Iterator[ImagePair]:
-        return iter(self._pairs)
 
     def _read_set(self, folder: Path) -> None:
         table = read_numbers(folder / _PAIRS, _PAIR_COLUMNS, 11, _LAYOUT)

@@ -83,7 +83,8 @@ class PairDataset(Protocol):
 
     def __getitem__(self, index: int) -> ImagePair: ...
 
-    def __iter__(self) -> Iterator[ImagePair]: ...
+    def __iter__(self) -> Iterator[ImagePair]:
+        return (self[index] for index in range(len(self)))
 
 
 @runtime_checkable

@@ -6,14 +6,16 @@ import bisect
 import dataclasses
 import hashlib
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fmtorch.data.cameras import Matrix, fundamental, relative_pose, share_centre
 from fmtorch.data.candidates import Candidates, drawn
-from fmtorch.data.pairs import ImagePair, ImageSource
+from fmtorch.data.depth_images import DepthImages
+from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset
 from fmtorch.data.text_files import DataError
 
 
@@ -46,7 +48,7 @@ class Scene:
     candidates: Candidates
 
 
-class ScenePairs:
+class ScenePairs(PairDataset):
     """Pairs of the views of scenes: some of all candidates, drawn by a seed.
 
     name: of the data set. scenes: read from disk. sources: what defines the cameras, by a name that holds no path.
@@ -79,9 +81,6 @@ class ScenePairs:
         scene, i, j = self.candidate(int(self._ranks[index]))
         return image_pair(self.scenes[scene], i, j)
 
-    def __iter__(self) -> Iterator[ImagePair]:
-        return (self[index] for index in range(len(self)))
-
     @property
     def candidates(self) -> int:
         """How many candidates the scenes have."""
@@ -92,6 +91,16 @@ class ScenePairs:
         scene = bisect.bisect_right(self._starts, rank) - 1
         ((i, j),) = self.scenes[scene].candidates.at(np.array([rank - self._starts[scene]]))
         return scene, int(i), int(j)
+
+
+class DepthScenePairs(ScenePairs):
+    """The same where the views have depth images."""
+
+    depth_images: DepthImages
+
+    def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Depth (n,) along the optical axis at points (n, 2) of an image, in the unit of t; NaN where unknown."""
+        return self.depth_images.at(image, points)
 
 
 def image_pair(scene: Scene, i: int, j: int) -> ImagePair:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fmtorch.data.pairs import DepthDataset, ImagePair, ImageSource, PairDataset
 
 
-class PairSubset:
+class PairSubset(PairDataset):
     """The pairs of these indices, in this order. `subset` keeps what the data set knows of depth."""
 
     def __init__(self, dataset: PairDataset, indices: Sequence[int]) -> None:
@@ -24,9 +24,6 @@ class PairSubset:
 
     def __getitem__(self, index: int) -> ImagePair:
         return self.dataset[self.indices[index]]
-
-    def __iter__(self) -> Iterator[ImagePair]:
-        return (self[i] for i in range(len(self)))
 
 
 class _DepthSubset(PairSubset):

@@ -13,7 +13,7 @@ from fmtorch.data.candidates import WINDOW, following
 from fmtorch.data.depth_images import DepthImages, read_grey
 from fmtorch.data.lenses import Lens
 from fmtorch.data.pairs import ImageSource
-from fmtorch.data.scenes import Scene, ScenePairs, View, folders
+from fmtorch.data.scenes import DepthScenePairs, Scene, ScenePairs, View, folders
 from fmtorch.data.splits import chosen
 from fmtorch.data.text_files import DataError, numbered, to_finite
 
@@ -32,25 +32,6 @@ _LISTED = "timestamp filename"
 _POSE = "timestamp tx ty tz qx qy qz qw"
 
 
-class TumPairs(ScenePairs):
-    """Pairs of frames at most a window apart; see `tum_pairs`."""
-
-    def __init__(
-        self, scenes: Sequence[Scene], files: list[tuple[str, Path]], window: int | float, pairs: int | None, seed: int
-    ) -> None:
-        super().__init__("tum", scenes, files, (window,), pairs, seed)
-
-
-class TumDepthPairs(TumPairs):
-    """The same where each sequence has ``depth.txt``."""
-
-    depth_images: DepthImages
-
-    def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Depth (n,) in metres along the optical axis at points (n, 2) of an undistorted image; NaN where unknown."""
-        return self.depth_images.at(image, points)
-
-
 def tum_pairs(
     root: str | Path,
     split: str = "test",
@@ -60,7 +41,7 @@ def tum_pairs(
     pairs: int | None = 1000,
     seed: int = 0,
     depth: bool = True,
-) -> TumPairs:
+) -> ScenePairs:
     """Pairs of frames at most `window` seconds apart.
 
     Args:
@@ -69,7 +50,7 @@ def tum_pairs(
         sequences: names of folders to take instead.
         camera: freiburg1, freiburg2 or freiburg3; None: as the name of each sequence says.
         pairs, seed: as in `ScenePairs`.
-        depth: know the depth of points, for labels, where every sequence has ``depth.txt``.
+        depth: know the depth of points in metres, for labels, where every sequence has ``depth.txt``.
 
     The images of freiburg1 and freiburg2 are undistorted when they are read; those of freiburg3 are so already. The
     pose of a frame is interpolated between the two around it (linearly, and along the great circle); frames farther
@@ -82,9 +63,9 @@ def tum_pairs(
     scenes = [_scene(folder, _lens(folder, camera), window) for folder in sequence_folders]
     files = [(folder.name, folder / name) for folder in sequence_folders for name in ("rgb.txt", "groundtruth.txt")]
     if not depth or not all((folder / "depth.txt").is_file() for folder in sequence_folders):
-        return TumPairs(scenes, files, window, pairs, seed)
+        return ScenePairs("tum", scenes, files, (window,), pairs, seed)
     files += [(folder.name, folder / "depth.txt") for folder in sequence_folders]
-    dataset = TumDepthPairs(scenes, files, window, pairs, seed)
+    dataset = DepthScenePairs("tum", scenes, files, (window,), pairs, seed)
     paths = [_depth_paths(folder, scene) for folder, scene in zip(sequence_folders, scenes, strict=True)]
     by_image = {key: path for by_identity in paths for key, path in by_identity.items()}
     dataset.depth_images = DepthImages(by_image, DEPTH_SCALE, read_grey)

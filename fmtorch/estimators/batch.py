@@ -20,11 +20,11 @@ from fmtorch.core.rules import FOCAL, SIZE
 from fmtorch.core.threads import available, mapped
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.calibration import EXACT, calibration_of
-from fmtorch.estimators.families.cameras import focals_near, focals_px
+from fmtorch.estimators.families.cameras import focal_precision, focals_near, focals_px
 from fmtorch.estimators.families.family import Estimated
 from fmtorch.estimators.gradients import Attach, Solved, with_gradients
 from fmtorch.estimators.pair import Pair, PixelMatches, bucket, normalize_pair
-from fmtorch.estimators.parts.final_fits import Fit
+from fmtorch.estimators.parts.final_fits import Fit, scale_of
 from fmtorch.estimators.parts.support import degenerate_support
 from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.geometry.residual_kernels import SAMPSON, Residual
@@ -45,6 +45,20 @@ class Solution(NamedTuple):
     reason: str = ""
 
 
+class CameraRows(NamedTuple):
+    """Of b pairs, fields of `Estimate`: focals (b, 2), fit_scale (b,), focal_precision (b, 2, 2)."""
+
+    focals: Array
+    fit_scale: Array
+    focal_precision: Array
+
+    def fill(self, i: int, fit: Fit, pair: Pair) -> None:
+        """Those of one pair whose image sizes are known."""
+        self.focals[i] = focals_near(fit.F, pair) if fit.cameras is None else focals_px(fit.cameras, pair)
+        self.fit_scale[i] = scale_of(fit, pair)
+        self.focal_precision[i] = focal_precision(self.focals[i], pair)
+
+
 def estimated(
     c: Correspondences, seed: int, minimal: int, family: Estimated, solve: Callable[[Pair], Solution], attach: Attach
 ) -> Estimate:
@@ -58,7 +72,8 @@ def estimated(
     rounding = relative_rounding(c)
     F, inliers, ok = np.zeros((b, 3, 3)), np.zeros((b, n), np.bool_), np.zeros(b, np.bool_)
     draws, significance, reasons = np.zeros(b, np.int64), np.full(b, -np.inf), [""] * b
-    focals, asked = np.full((b, 2), np.nan), family.model == "fundamental" and c.asks_for_cameras
+    asked = family.model == "fundamental" and c.asks_for_cameras
+    cameras = CameraRows(np.full((b, 2), np.nan), np.full(b, np.nan), np.full((b, 2, 2), np.nan))
     keep = torch.is_grad_enabled() and c.requires_grad
     solved: dict[int, Solved] = {}
 
@@ -82,8 +97,7 @@ def estimated(
         significance[i] = _significance(F[i], matches) if family.model == "fundamental" else np.nan
         ok[i] = True
         if asked and pair.sizes_known:
-            cameras = solution.fit.cameras
-            focals[i] = focals_near(solution.fit.F, pair) if cameras is None else focals_px(cameras, pair)
+            cameras.fill(i, solution.fit, pair)
         if keep:
             solved[i] = Solved(pair, slot, solution.fit)
         return ""
@@ -96,7 +110,7 @@ def estimated(
     mapped(estimate_all, [part.tolist() for part in shared_out(host)] if b > 1 and available() > 1 else [range(b)])
     fields = {"F": F, "inliers": inliers, "ok": ok, "draws": draws, "significance": significance}
     if asked:
-        fields["focals"] = focals
+        fields |= cameras._asdict()
     tensors = {name: torch.from_numpy(value).to(c.mask.device) for name, value in fields.items()}
     estimates = Estimate.made(reason=tuple(reasons), model=family.model, **tensors)
     return with_gradients(estimates, c, solved, attach) if keep else estimates

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import itertools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -22,20 +21,22 @@ _STEPS = 400  # of the threshold
 
 def panels(runs: Mapping[str, pa.Table]) -> dict[str, dict[str, NDArray[np.float64]]]:
     """Title of a panel -> name of a run -> NSGD of its pairs: a panel of each family, and of all of several."""
-    by_run = {name: _families(table) for name, table in runs.items()}
-    families = dict.fromkeys(itertools.chain.from_iterable(by_run.values()))
-    by_family = {
-        family: {run: parts[family] for run, parts in by_run.items() if family in parts} for family in families
-    }
+    families = by_family(runs)
     if len(families) < 2:
-        return by_family
-    return {ALL: {run: np.concatenate(list(parts.values())) for run, parts in by_run.items() if parts}, **by_family}
+        return families
+    whole = {name: table["nsgd"].to_numpy().astype(np.float64) for name, table in runs.items() if len(table)}
+    return {ALL: whole, **families}
 
 
-def _families(table: pa.Table) -> dict[str, NDArray[np.float64]]:
-    family = np.asarray(table["family"].to_pylist(), dtype=object)
-    nsgd = table["nsgd"].to_numpy().astype(np.float64)
-    return {str(name): nsgd[family == name] for name in dict.fromkeys(family)}
+def by_family(runs: Mapping[str, pa.Table]) -> dict[str, dict[str, NDArray[np.float64]]]:
+    """Family -> name of a run -> NSGD of its pairs."""
+    out: dict[str, dict[str, NDArray[np.float64]]] = {}
+    for name, table in runs.items():
+        family = np.asarray(table["family"].to_pylist(), dtype=object)
+        nsgd = table["nsgd"].to_numpy().astype(np.float64)
+        for each in dict.fromkeys(family):
+            out.setdefault(str(each), {})[name] = nsgd[family == each]
+    return out
 
 
 def style(number: int) -> tuple[str, str]:

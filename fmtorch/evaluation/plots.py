@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from fmtorch import metrics
+from fmtorch.evaluation.curves import MAXIMUM, by_family
 from fmtorch.evaluation.statistics import THRESHOLD, recalled
 from fmtorch.evaluation.summary import ALL
 from fmtorch.storage import replacing
@@ -21,7 +22,6 @@ from fmtorch.storage import replacing
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MAXIMUM = 0.2  # the last NSGD threshold, the paper's
 TICKS = (0, 0.05, 0.1, 0.15, 0.2)
 # Okabe and Ito's palette, which people with any colour vision can tell apart; dashes repeat it.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -60,20 +60,12 @@ def plot_recall_curves(runs: Mapping[str, pa.Table], path: Path) -> None:
 
 def _panels(runs: Mapping[str, pa.Table]) -> dict[str, dict[str, NDArray[np.float64]]]:
     """Panel title -> curve name -> NSGD of its pairs."""
-    by_run = {run: _families(table) for run, table in runs.items()}
-    if len(runs) == 1:
-        ((name, families),) = by_run.items()
-        if len(families) > 1:
-            families = {**families, ALL: np.concatenate(list(families.values()))}
-        return {name: families}
-    names = dict.fromkeys(itertools.chain.from_iterable(by_run.values()))
-    return {family: {run: parts[family] for run, parts in by_run.items() if family in parts} for family in names}
-
-
-def _families(table: pa.Table) -> dict[str, NDArray[np.float64]]:
-    family = np.asarray(table["family"].to_pylist(), dtype=object)
-    nsgd = table["nsgd"].to_numpy().astype(np.float64)
-    return {str(name): nsgd[family == name] for name in dict.fromkeys(family)}
+    families = by_family(runs)
+    if len(runs) > 1:
+        return families
+    (name,) = runs
+    curves = {family: of_runs[name] for family, of_runs in families.items()}
+    return {name: {**curves, ALL: np.concatenate(list(curves.values()))} if len(curves) > 1 else curves}
 
 
 def _draw(ax: Axes, title: str, curves: Mapping[str, NDArray[np.float64]]) -> None:

@@ -13,35 +13,30 @@ from fmtorch.evaluation.summary import ALL, STAGES, Group
 
 RECALL = "%Recall [interval]"  # the column that has an interval
 _DASH = "–"
+Columns = Mapping[str, Callable[[Group], str]]
 
 
 def summary_table(summary: Mapping[str, Group], title: str) -> Table:
     """The main figures, for a terminal of 80 columns."""
-    shown = Table(
-        title=title, title_style="bold", caption=caption(summary), caption_justify="left", caption_style="dim",
-        box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True,
-    )  # fmt: skip
-    for i, heading in enumerate(_TERMINAL):
-        shown.add_column(heading, justify="right" if i else "left", no_wrap=i > 0, overflow="fold")
-    for name, group in _rows(summary):
-        shown.add_row(*_cells(_TERMINAL, name, group), style="bold" if name == ALL else "")
-    return shown
+    return _shown(title, caption(summary), _TERMINAL, _rows(summary))
 
 
 def pose_table(summary: Mapping[str, Group]) -> Table | None:
     """The figures of poses, for a terminal of 80 columns; None where no pair has known cameras."""
+    columns = {heading: column for heading, column in POSE_COLUMNS.items() if "mAP" not in heading}
     rows = _pose_rows(summary)
-    if not rows:
-        return None
+    return _shown("Relative pose", POSE_CAPTION, columns, rows) if rows else None
+
+
+def _shown(title: str, caption: str, columns: Columns, rows: list[tuple[str, Group]]) -> Table:
     shown = Table(
-        title="Relative pose", title_style="bold", caption=POSE_CAPTION, caption_justify="left", caption_style="dim",
+        title=title, title_style="bold", caption=caption, caption_justify="left", caption_style="dim",
         box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True,
     )  # fmt: skip
-    columns = {heading: column for heading, column in POSE_COLUMNS.items() if "mAP" not in heading}
     for i, heading in enumerate(columns):
         shown.add_column(heading, justify="right" if i else "left", no_wrap=i > 0, overflow="fold")
-    for name, figures in rows:
-        shown.add_row(*_cells(columns, name, figures), style="bold" if name == ALL else "")
+    for name, group in rows:
+        shown.add_row(*_cells(columns, name, group), style="bold" if name == ALL else "")
     return shown
 
 
@@ -78,7 +73,7 @@ def _pose_rows(summary: Mapping[str, Group]) -> list[tuple[str, Group]]:
     return [(name, group["pose"]) for name, group in _rows(summary) if group["pose"] is not None]
 
 
-def _cells(columns: Mapping[str, Callable[[Group], str]], name: str, group: Group) -> list[str]:
+def _cells(columns: Columns, name: str, group: Group) -> list[str]:
     return [name, *(column(group) for heading, column in columns.items() if heading)]
 
 
@@ -117,10 +112,6 @@ def _recall(group: Group) -> str:
     return f"{100 * group['recall']:.1f} [{100 * low:.0f}, {100 * high:.0f}]"
 
 
-def _inliers(group: Group) -> str:
-    return f"{_percent('inlier_rate')(group)} ({_percent('inlier_rate_before')(group)})"
-
-
 def _corrs(group: Group) -> str:
     return f"{_number(group['corrs'], '{:.0f}')} ({_number(group['corrs_before'], '{:.0f}')})"
 
@@ -129,16 +120,16 @@ def _failures(group: Group) -> str:
     return f"{group['failures']} ({_number(group['failure_share'], '{:.1%}')})" if group["failures"] else "0"
 
 
-_TERMINAL: dict[str, Callable[[Group], str]] = {
+_TERMINAL: Columns = {
     "": lambda group: "",
     "Pairs": lambda group: str(group["pairs"]),
     "%Recall": _recall,
     "AUC@0.05": _percent("auc_05"),
-    "%Inlier (-m)": _inliers,
+    "%Inlier (-m)": lambda group: f"{_percent('inlier_rate')(group)} ({_percent('inlier_rate_before')(group)})",
     "#Corrs (-m)": _corrs,
     "Failed": lambda group: str(group["failures"]),
 }
-MARKDOWN_COLUMNS: dict[str, Callable[[Group], str]] = {
+MARKDOWN_COLUMNS: Columns = {
     "": lambda group: "",
     "Pairs": lambda group: str(group["pairs"]),
     "Scenes": lambda group: str(group["scenes"]),
@@ -154,7 +145,7 @@ MARKDOWN_COLUMNS: dict[str, Callable[[Group], str]] = {
 }
 
 
-POSE_COLUMNS: dict[str, Callable[[Group], str]] = {
+POSE_COLUMNS: Columns = {
     "": lambda group: "",
     "Pairs": lambda group: str(group["pairs"]),
     **{f"AUC@{t}°": _percent(f"auc_{t}") for t in POSE_THRESHOLDS},

@@ -9,23 +9,17 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-_BITS = 15  # of each coordinate; four coordinates make a code of 60 bits
-_AFTER_ALL = 1 << 61  # a code beyond those of all points
-_SPREADING = (
-    (16, 0x0000FFFF0000FFFF),
-    (8, 0x00FF00FF00FF00FF),
-    (4, 0x0F0F0F0F0F0F0F0F),
-    (2, 0x3333333333333333),
-    (1, 0x5555555555555555),
-)
+_BITS = 15  # of each coordinate
+_AFTER_ALL = 1 << 31  # a code beyond those of all points
+_SPREADING = ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555))
 
 
 def curve_order(
-    points: Float[Tensor, "d b n"], mask: Bool[Tensor, "b n"], shift: float | Float[Tensor, "b 1"]
+    points: Float[Tensor, "2 b n"], mask: Bool[Tensor, "b n"], shift: float | Float[Tensor, "b 1"]
 ) -> Int[Tensor, "b n"]:
     """The order of the points in the mask along a Morton curve over a shifted grid; the others last.
 
-    points: of 2 or 4 coordinates. shift: of the grid, between 0 and 1, in thirds of the curve's extent, which is 1.5
+    shift: of the grid, between 0 and 1, in thirds of the curve's extent, which is 1.5
     times that of the points along the axis on which they extend furthest.
     """
     if mask.shape[-1] == 0:
@@ -33,7 +27,8 @@ def curve_order(
     low = torch.where(mask, points, torch.inf).amin(-1, keepdim=True)
     extent = (torch.where(mask, points, -torch.inf).amax(-1, keepdim=True) - low).amax(0).clamp_min(1e-6)
     cell = (torch.where(mask, (points - low) / extent, 0) * 2 + shift) / 3 * ((1 << _BITS) - 1)
-    code = torch.where(mask, _interleaved(cell.to(torch.int64)), _AFTER_ALL)
+    column, row = _spread(cell.to(torch.int64))
+    code = torch.where(mask, column | (row << 1), _AFTER_ALL)
     return torch.argsort(code, dim=-1, stable=True)
 
 
@@ -56,15 +51,8 @@ def rotated(points: Float[Tensor, "2 b n"], angle: float) -> Float[Tensor, "2 b 
     return torch.stack([math.cos(angle) * x - math.sin(angle) * y, math.sin(angle) * x + math.cos(angle) * y])
 
 
-def _interleaved(cell: Int[Tensor, "d b n"]) -> Int[Tensor, "b n"]:
-    """Bit i of coordinate k at position d i + k, for a power of two d."""
-    if len(cell) == 1:
-        return cell[0]
-    return _spread(_interleaved(cell[0::2])) | (_spread(_interleaved(cell[1::2])) << 1)
-
-
-def _spread(v: Int[Tensor, "b n"]) -> Int[Tensor, "b n"]:
-    """The bits of a 32-bit number moved to the even positions."""
+def _spread(v: Int[Tensor, "2 b n"]) -> Int[Tensor, "2 b n"]:
+    """The bits of numbers moved to the even positions."""
     for step, pattern in _SPREADING:
         v = (v | (v << step)) & pattern
     return v

@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.kernel import inner
 
-Array = NDArray[Any]
 _BITS = 15  # of each coordinate: a code of 30 bits
 _CELLS = (1 << _BITS) - 1
 _DIGIT = 10  # bits sorted by at a time

@@ -9,15 +9,13 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fmtorch.compiling.arrays import F8x1, F8x2
+from fmtorch.compiling.arrays import Array, F8x1, F8x2
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.scratch import matrix, vector
 from fmtorch.geometry.eight_point_kernels import smallest_eigenvector
 from fmtorch.geometry.rank2_kernels import EPS, unit
 
-Array = NDArray[Any]
 ROUNDING = 16 * EPS  # of cross products that should vanish, as of a match taken twice
 
 

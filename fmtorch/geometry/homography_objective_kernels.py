@@ -23,12 +23,11 @@ from fmtorch.compiling.arrays import Array, F8x1, F8x2, F8x3
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.lanes import LANES, added, fill, load, store, where
 from fmtorch.compiling.scratch import matrix, vector
-from fmtorch.geometry.levenberg_marquardt_kernels import Schedule, levenberg_marquardt
+from fmtorch.geometry.levenberg_marquardt_kernels import Problem, Schedule, accepting, levenberg_marquardt
 from fmtorch.geometry.rank2_kernels import assign, assign_rows, unit
 from fmtorch.geometry.rank2_manifold_kernels import eliminate
 from fmtorch.geometry.sampson_objective_kernels import MATCH, TINY, Weighted, in_rows, robust
 
-MIN_DAMPING, MAX_DAMPING = 1e-12, 1e6
 BEHIND = 1e4  # squared distance of a match behind the horizon in the units of the points, which extend to about one
 SUMS = 52  # over the matches, of the normal equations
 
@@ -39,13 +38,6 @@ class _State(NamedTuple):
     H: Array
     products: Array
     cost: Array
-
-
-class _Data(NamedTuple):
-    """The matches; tolerance: of the schedule."""
-
-    matches: Weighted
-    tolerance: float
 
 
 @kernel
@@ -173,8 +165,8 @@ def refine_homographies(H: F8x2, matches: Weighted, schedule: Schedule, out: F8x
     for i in range(k):
         assign(out[i], H[i])
         unit(out[i])
-    damping = np.full(k, schedule.damping)
-    _minimise(_Data(matches, schedule.tolerance), state, trial, damping, schedule.iterations, schedule.tolerance > 0)
+    problem = Problem(matches, schedule.tolerance)
+    _minimise(problem, state, trial, np.full(k, schedule.damping), schedule.iterations, schedule.tolerance > 0)
 
 
 @kernel(holds_gil=True)
@@ -188,8 +180,8 @@ def step_of_homography(H: F8x1, matches: Weighted, damping: float, out: F8x1) ->
 
 
 @inner
-def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
-    evaluate_homographies(state.H, data.matches, derivatives, state.products, state.cost)
+def _evaluate(state: _State, problem: Problem, derivatives: bool) -> None:
+    evaluate_homographies(state.H, problem.matches, derivatives, state.products, state.cost)
 
 
 @inner
@@ -224,18 +216,9 @@ def _system(products: Array, h: Array, damping: float, Q: Array) -> None:
 
 
 @inner
-def _accept(state: _State, trial: _State, damping: Array, done: Array, data: _Data) -> bool:
-    everything = True
-    for k in range(len(damping)):
-        better = trial.cost[k] < state.cost[k] and not done[k]
-        damping[k] = min(max(damping[k] / 10 if better else damping[k] * 10, MIN_DAMPING), MAX_DAMPING)
-        if better:
-            done[k] |= data.tolerance > 0 and state.cost[k] - trial.cost[k] <= data.tolerance * state.cost[k]
-            state.cost[k] = trial.cost[k]
-            assign(state.H[k], trial.H[k])
-            assign_rows(state.products[k], trial.products[k])
-        everything = everything and done[k]
-    return everything
+def _take(state: _State, trial: _State, k: int) -> None:
+    assign(state.H[k], trial.H[k])
+    assign_rows(state.products[k], trial.products[k])
 
 
-_minimise = levenberg_marquardt(_evaluate, _step, _accept)
+_minimise = levenberg_marquardt(_evaluate, _step, accepting(_take))

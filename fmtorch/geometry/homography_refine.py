@@ -6,7 +6,6 @@ graph of points and weights. A model is refined to the same bits in any batch.
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -15,13 +14,10 @@ from fmtorch.geometry.arithmetic import component_sum, stable_sum
 from fmtorch.geometry.fixed_point import gradient_wanted
 from fmtorch.geometry.homography_error import homography_curvature, homography_gradient
 from fmtorch.geometry.homography_objective_kernels import refine_homographies
-from fmtorch.geometry.levenberg_marquardt_kernels import Schedule
-from fmtorch.geometry.normalized_matches import MatchesOfHomographies
+from fmtorch.geometry.levenberg_marquardt_kernels import FIRST_DAMPING, Schedule
+from fmtorch.geometry.normalized_matches import NormalizedMatches, fitted_by
 from fmtorch.geometry.optimum import inverse_hessian
 from fmtorch.geometry.robust_losses import Kernel, named_kernel
-from fmtorch.geometry.sampson_objective_kernels import LOSSES, Weighted, loss_table
-
-FIRST_DAMPING = 1e-4  # as in `refine`
 
 
 def refine_homography(
@@ -68,15 +64,17 @@ def refine_homography(
         >>> bool(((refined / refined[2, 2] - H).abs() < 1e-6).all())
         True
     """
-    robust = named_kernel(kernel)
+    robust, schedule = named_kernel(kernel), Schedule(iterations, FIRST_DAMPING, 0.0)
     wanted = gradient_wanted("implicit", x0, x1, weight)
     with torch.set_grad_enabled(wanted):
-        matches = MatchesOfHomographies(x0, x1, weight, mask, H.detach(), scale)
-        models = _refined(_seen_from_the_front(matches), matches, kernel, iterations)
+        matches = NormalizedMatches(x0, x1, weight, mask, H.detach(), scale, homographies=True)
+        shared, s2 = (matches.points, matches.weight), matches.scale.square()[:, None]
+        models, _ = fitted_by(
+            lambda models, data, out, cost: refine_homographies(models, data, schedule, out, cost),
+            _seen_from_the_front(matches), *shared, s2, kernel,
+        )  # fmt: skip
         if wanted:
-            models = homography_at_optimum(
-                models, matches.points, matches.weight, robust, matches.scale.square()[:, None]
-            )
+            models = homography_at_optimum(models, *shared, robust, s2)
         return matches.to_pixels(models).reshape(H.shape)
 
 
@@ -123,26 +121,10 @@ def _hessian(H: Tensor, points: Tensor, weight: Tensor, robust: Kernel, s2: Tens
     return (second + second.mT) / 2
 
 
-def _seen_from_the_front(matches: MatchesOfHomographies) -> Float[Tensor, "9 p k"]:
+def _seen_from_the_front(matches: NormalizedMatches) -> Float[Tensor, "9 p k"]:
     """The models with a sign that makes the third coordinate positive at most of the matches' weight."""
     H, weight = matches.models.detach(), matches.weight.detach()[:, None]
     x, y, _, _ = matches.points.detach()[:, :, None]
     depth = H[6, ..., None] * x + H[7, ..., None] * y + H[8, ..., None]
     side = stable_sum(torch.where(depth > 0, weight, -weight))
     return torch.where(side < 0, -H, H)
-
-
-@torch.no_grad()
-def _refined(
-    H: Float[Tensor, "9 p k"], matches: MatchesOfHomographies, kernel: str, iterations: int
-) -> Float[Tensor, "9 p k"]:
-    """The models refined, of unit norm; as they were where they cannot be."""
-    points, weight, scale = (t.detach().cpu().numpy() for t in (matches.points, matches.weight, matches.scale))
-    models = np.ascontiguousarray(H.permute(1, 2, 0).cpu().numpy())
-    for p, start in enumerate(models):
-        s2 = np.full(weight.shape[1], scale[p] ** 2)
-        data = Weighted(np.ascontiguousarray(points[:, p]), weight[p], s2, LOSSES[kernel], loss_table(kernel))
-        refined, cost = np.empty_like(start), np.empty(len(start))
-        refine_homographies(start, data, Schedule(iterations, FIRST_DAMPING, 0.0), refined, cost)
-        models[p] = np.where(np.isfinite(cost)[:, None], refined, start)
-    return torch.from_numpy(models).to(H.device).permute(2, 0, 1).contiguous()

@@ -1,17 +1,19 @@
-"""`nullspace` for LANES samples at a time, compiled: buffers of rows of LANES numbers, one a sample."""
+"""The null space of wide matrices by Householder reflections, LANES samples at a time.
+
+Buffers are rows of LANES numbers, one a sample.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.kernel import inner
 from fmtorch.compiling.lanes import LANES, copysign, fill, load, sqrt, store, where
 
-Array = NDArray[Any]
-RANK_TOLERANCE2 = float((64 * np.finfo(np.float64).eps) ** 2)  # as in `nullspace`, of squared lengths
+RANK_TOLERANCE2 = float((64 * np.finfo(np.float64).eps) ** 2)  # of a row's squared length: what is left is rounding
 
 
 @inner
@@ -46,7 +48,9 @@ def equations(X: Array, size: int, A: Array) -> None:
 def null_space(A: Array, m: int, B: Array, scale: Array) -> Any:
     """An orthonormal basis of the null space of A (m 9, LANES), which is overwritten -> B ((9 - m) 9, LANES).
 
-    Returns a mask: whether each matrix has rank m. scale: (m, LANES), for the work.
+    The last columns of Q in A^T = Q R (Golub and Van Loan, Matrix Computations, section 5.2); A^T A, whose condition is
+    squared, is never formed. Not scaled against overflow: entries should be of about unit size. Returns a mask: whether
+    each matrix has rank m, without which its basis is finite but means nothing. scale: (m, LANES), for the work.
     """
     zero = fill(0.0)
     full_rank = zero == 0.0

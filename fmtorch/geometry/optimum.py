@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from fmtorch.geometry.arithmetic import as_rows, cofactors, component_sum, sqrt, stable_sum, unit
+from fmtorch.geometry.levenberg_marquardt_kernels import FIRST_DAMPING, MAX_DAMPING, MIN_DAMPING
 from fmtorch.geometry.rank2_manifold import RANK_TWO, constant, start
 from fmtorch.geometry.residuals import homogeneous, linearise
 from fmtorch.geometry.robust_losses import Kernel
-from fmtorch.geometry.sampson_objective import SampsonObjective
 
 STEP_DAMPING = 1e-10  # of the attached step: bounds its gradient where the points leave a direction open
-
-
-class Step(NamedTuple):
-    """A Levenberg-Marquardt step: the models it started from, its damping, and which models it improved."""
-
-    F: Float[Tensor, "9 p k"]
-    damping: Float[Tensor, "p k"]
-    accepted: Bool[Tensor, "p k"]
 
 
 def gradient_of_cost(
@@ -36,6 +26,20 @@ def gradient_of_cost(
     J, e, inverse, r2 = linearise(F, homogeneous(points[:, None, :, None]))
     influence = weight[:, None] * robust.weight(r2, scale.square()[:, None, None]) * inverse * e
     return stable_sum(J.flatten(0, 1) * influence)[:, 0]
+
+
+def curvature_of_cost(
+    F: Float[Tensor, "9 p k"],
+    points: Float[Tensor, "4 p n"],
+    weight: Float[Tensor, "p n"],
+    robust: Kernel,
+    scale: Float[Tensor, " p"],
+) -> Float[Tensor, "9 9 p k"]:
+    """The Gauss-Newton matrix ``J^T W J`` with Newton's weights, those of the loss's curvature, not those of IRLS."""
+    J, _, inverse, r2 = linearise(F, homogeneous(points[:, None, :, None]))
+    J = J.flatten(0, 1)[:, 0]
+    weighted = J * (weight[:, None] * robust.curvature(r2, scale.square()[:, None, None]) * inverse)[0]
+    return torch.stack([stable_sum(weighted * column) for column in J], 1)
 
 
 def at_optimum(
@@ -61,8 +65,7 @@ def at_optimum(
         size = component_sum(C * C)
         valid = valid & (size > 0)
         normal = C / sqrt(torch.where(size > 0, size, 1))
-        curved = robust._replace(weight=robust.curvature)  # Newton's weights of J^T J, not those of IRLS
-        gauss_newton = SampsonObjective(points, weight, curved, scale)(model, True)[0][:9, :9].movedim((0, 1), (-2, -1))
+        gauss_newton = curvature_of_cost(model, points, weight, robust, scale).movedim((0, 1), (-2, -1))
         frame = torch.stack([model, normal], -1).movedim(0, -2)
     exact = _hessian(model, C, size, points.detach(), weight.detach(), robust, scale.detach())
     inverse = inverse_hessian(exact, gauss_newton, frame)
@@ -111,34 +114,42 @@ def _hessian(
 def through_steps(
     F: Float[Tensor, "9 p k"],
     F0: Float[Tensor, "9 p k"],
-    steps: list[Step],
+    iterations: int,
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
     robust: Kernel,
     scale: Float[Tensor, " p"],
 ) -> Float[Tensor, "9 p k"]:
-    """F, to which these steps led from F0, attached to the graph of F0, points and weights through each of them.
+    """F, to which so many steps led from F0, attached to the graph of F0, points and weights through each of them.
 
-    Damping and the choice of the steps that are accepted are constants. Arguments as of `gradient_of_cost`. Returns the
-    same values.
+    The steps are taken once more, in tensors. Damping and the choice of the steps that are accepted are constants.
+    Arguments as of `gradient_of_cost`. Returns the same values.
     """
+    shared = (points, weight, robust, scale)
     valid = torch.isfinite(F).all(0) & (F != 0).any(0)
     current = start(torch.where(valid, F0, constant(F, RANK_TWO)))[0]
-    for before, damping, accepted in steps:
-        accepted = accepted & valid
-        if not bool(accepted.any()):
-            continue
-        known = torch.where(valid, before, constant(F, RANK_TWO))
-        current = known + torch.where(valid, current - current.detach(), 0)
-        moved = _step(current, points, weight, robust, scale, torch.where(accepted, damping, 1))
-        current = torch.where(accepted, moved, current)
+    cost, damping = _cost(current, *shared), torch.full_like(F[0].detach(), FIRST_DAMPING)
+    for _ in range(iterations):
+        with torch.no_grad():
+            trial_cost = _cost(_step(current, *shared, damping), *shared)
+        accepted = valid & (trial_cost < cost)
+        moved = _step(current, *shared, torch.where(accepted, damping, 1))
+        current, cost = torch.where(accepted, moved, current), torch.where(accepted, trial_cost, cost)
+        damping = torch.where(accepted, damping / 10, damping * 10).clamp(MIN_DAMPING, MAX_DAMPING)
     return F + torch.where(valid, current - current.detach(), 0)
+
+
+@torch.no_grad()
+def _cost(F: Tensor, points: Tensor, weight: Tensor, robust: Kernel, scale: Tensor) -> Float[Tensor, "p k"]:
+    """The robust costs of models of rank 2."""
+    r2 = linearise(F, homogeneous(points[:, None, :, None]), derivatives=False)[3][0]
+    return stable_sum(weight[:, None] * robust.loss(r2, scale.square()[:, None, None]))
 
 
 def _step(
     F: Tensor, points: Tensor, weight: Tensor, robust: Kernel, scale: Tensor, damping: Tensor
 ) -> Float[Tensor, "9 p k"]:
-    """The model after one damped step of Gauss and Newton, as `solve` and `retract` take it, attached to all inputs."""
+    """The model after one damped step of Gauss and Newton on the manifold, attached to all inputs."""
     J, e, inverse, r2 = linearise(F, homogeneous(points[:, None, :, None]))
     J, e = J.flatten(0, 1)[:, 0], e[0]
     influence = (weight[:, None] * robust.weight(r2, scale.square()[:, None, None]) * inverse)[0]
@@ -153,7 +164,7 @@ def _step(
     last = torch.cat([normal, torch.zeros_like(normal[..., :1])], -1)
     Q = torch.cat([Q, last[..., None, :]], -2)
     right = torch.cat([-gradient, torch.zeros_like(gradient[..., :1])], -1)
-    step = torch.linalg.solve(Q, right[..., None])[..., :9, 0]
+    step = torch.linalg.solve_ex(Q, right[..., None])[0][..., :9, 0]
     G = F + step.movedim(-1, 0)
     C, n = cofactors(as_rows(G)).flatten(0, 1), unit(cofactors(as_rows(F)).flatten(0, 1))
     determinant = component_sum(C[:3] * G[:3])

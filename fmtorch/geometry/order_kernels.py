@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from numpy.typing import NDArray
-
+from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.kernel import inner
-
-Array = NDArray[Any]
 
 
 @inner

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from numpy.typing import NDArray
-
+from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.kernel import inner
 from fmtorch.compiling.lanes import fill, load
-
-Array = NDArray[Any]
 
 
 @inner

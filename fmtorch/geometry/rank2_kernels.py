@@ -6,12 +6,11 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.kernel import inner
 from fmtorch.compiling.scratch import vector
 
-Array = NDArray[Any]
 EPS = float(np.finfo(np.float64).eps)
 
 

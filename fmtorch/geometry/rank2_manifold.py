@@ -14,19 +14,7 @@ from torch import Tensor
 from fmtorch.geometry.arithmetic import as_rows, cofactors, component_sum, unit
 
 RANK_TWO, RANK_TWO_EPIPOLE = (0.5**0.5, 0.0, 0.0, 0.0, 0.5**0.5, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
-
-
 SQUARINGS = 5  # enough for any matrix whose last two singular values differ by half
-
-
-def solve(
-    products: Float[Tensor, "10 10 p k"], F: Tensor, e0: Tensor, e1: Tensor, damping: Tensor
-) -> Float[Tensor, "9 p k"]:
-    """The damped Gauss-Newton step in the tangent space: the least ``s^T (H + damping c I) s / 2 + s^T gradient``.
-
-    c is the greatest diagonal entry of H.
-    """
-    return constrained_solve(products[:9, :9], F, e0, e1, damping, -products[:9, 9:])[:, 0]
 
 
 def constrained_solve(

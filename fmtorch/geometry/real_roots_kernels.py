@@ -10,13 +10,12 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.kernel import inner
 from fmtorch.compiling.lanes import LANES, absolute, any_lane, fill, load, store, where
 from fmtorch.compiling.scratch import matrix
 
-Array = NDArray[Any]
 KNOTS, POLISHING_STEPS = 33, 4  # of the grid in each of two charts; of Newton's method, from the secant
 DEGREE = 10
 

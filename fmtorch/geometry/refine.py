@@ -1,12 +1,11 @@
 """Non-linear refinement of fundamental matrices: Levenberg-Marquardt of the robust Sampson error.
 
 Minimises ``sum_i w_i rho(r_i^2)``, r the Sampson distance, over the 7-dimensional manifold of 3 x 3 matrices of rank 2
-and unit norm (see `rank2_manifold`). A model is refined to the same bits in any batch (see `sampson_objective`).
+and unit norm (see `rank2_manifold`), by kernels, and attaches the optimum to the graph of points and weights. A model
+is refined to the same bits in any batch.
 """
 
 from __future__ import annotations
-
-import dataclasses
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,22 +13,13 @@ from torch import Tensor
 
 from fmtorch.geometry.arithmetic import component_sum
 from fmtorch.geometry.fixed_point import gradient_wanted
-from fmtorch.geometry.levenberg_marquardt import Damping, TensorObjective, TensorState, levenberg_marquardt
-from fmtorch.geometry.normalized_matches import NormalizedMatches
-from fmtorch.geometry.optimum import STEP_DAMPING, Step, at_optimum, gradient_of_cost, through_steps
-from fmtorch.geometry.rank2_manifold import (
-    RANK_TWO,
-    RANK_TWO_EPIPOLE,
-    constant,
-    constrained_solve,
-    retract,
-    solve,
-    start,
-)
+from fmtorch.geometry.levenberg_marquardt_kernels import FIRST_DAMPING, Schedule
+from fmtorch.geometry.normalized_matches import NormalizedMatches, fitted_by
+from fmtorch.geometry.optimum import STEP_DAMPING, at_optimum, curvature_of_cost, gradient_of_cost, through_steps
+from fmtorch.geometry.rank2_manifold import RANK_TWO, RANK_TWO_EPIPOLE, constant, constrained_solve, retract, start
+from fmtorch.geometry.rank2_manifold_kernels import SQUARINGS
+from fmtorch.geometry.refine_kernels import refine as refine_pair
 from fmtorch.geometry.robust_losses import named_kernel
-from fmtorch.geometry.sampson_objective import SampsonObjective
-
-DAMPING = Damping(1e-4, 1e-12, 1e6)
 
 
 def refine_components(
@@ -40,7 +30,6 @@ def refine_components(
     scale: Float[Tensor, " p"] | Float[Tensor, "p slots"],
     iterations: int,
     tolerance: float = 0.0,
-    steps: list[Step] | None = None,
 ) -> tuple[Float[Tensor, "9 p k"], Float[Tensor, "p k"]]:
     """Refined models and their costs ``sum_i w_i rho(r_i^2)``, component by component, without gradients.
 
@@ -48,16 +37,15 @@ def refine_components(
     of about unit scale; finite. weight: 0 in padded slots. scale: of the kernel, in the unit of the points,
     one for all matches of a pair, (p,) or (p, 1), or one for each (p, n).
     iterations: at most. tolerance: a model is done once a step has lowered its cost by no more than this share of it.
-    steps: where given, those taken are appended to it.
     The cost of a model never rises above that of its (rank-2) start; a model that cannot be improved is kept, one that
     is not finite comes back as it was, with infinite cost.
     """
-    with torch.no_grad():
-        sampson = SampsonObjective(points, weight, named_kernel(kernel), scale)
-        objective = _RankTwoObjective(sampson, DAMPING, tolerance or None, steps)
-        state = levenberg_marquardt(objective, start(F), iterations)
-        kept = torch.isfinite(state.cost)
-        return torch.where(kept, state.F, F), torch.where(kept, state.cost, torch.inf)
+    schedule = Schedule(iterations, FIRST_DAMPING, tolerance)
+    scale = scale if scale.dim() > 1 else scale[:, None]
+    return fitted_by(
+        lambda models, matches, out, cost: refine_pair(models, SQUARINGS, matches, schedule, out, cost),
+        F, points, weight, scale.square(), kernel,
+    )  # fmt: skip
 
 
 def refine(
@@ -105,10 +93,9 @@ def refine(
     with torch.set_grad_enabled(wanted):
         matches = NormalizedMatches(x0, x1, weight, mask, F, scale)
         shared = (matches.points, matches.weight)
-        steps: list[Step] | None = [] if wanted and gradient == "unrolled" else None
-        models, _ = refine_components(matches.models, *shared, kernel, matches.scale, iterations, steps=steps)
-        if steps is not None:
-            models = through_steps(models, matches.models, steps, *shared, robust, matches.scale)
+        models, _ = refine_components(matches.models, *shared, kernel, matches.scale, iterations)
+        if wanted and gradient == "unrolled":
+            models = through_steps(models, matches.models, iterations, *shared, robust, matches.scale)
         elif wanted:
             models = at_optimum(models, *shared, robust, matches.scale)
         return matches.to_pixels(models).reshape(F.shape)
@@ -145,8 +132,7 @@ def attached_step(
     with torch.no_grad():
         model, e0, e1 = start(matches.models)
         robust = named_kernel(kernel)
-        curved = robust._replace(weight=robust.curvature)  # Newton's weights of J^T J, not those of IRLS
-        H = SampsonObjective(matches.points, matches.weight, curved, matches.scale)(model, True)[0][:9, :9]
+        H = curvature_of_cost(model, matches.points, matches.weight, robust, matches.scale)
         identity = torch.eye(9, dtype=H.dtype, device=H.device)[:, :, None, None].expand_as(H)
         inverse = constrained_solve(H, model, e0, e1, torch.full_like(H[0, 0], STEP_DAMPING), identity)
         valid = torch.isfinite(inverse).flatten(0, 1).all(0)
@@ -158,48 +144,3 @@ def attached_step(
     step = -component_sum((inverse * gradient).transpose(0, 1))
     moved, _, _ = retract(model, step, e0, e1)
     return matches.to_pixels(torch.where(valid, moved, matches.models)).reshape(F.shape)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _State(TensorState):
-    """A rank-2 model, its epipoles and cost, and the normal equations there."""
-
-    F: Float[Tensor, "9 p k"]
-    e0: Float[Tensor, "3 p k"]
-    e1: Float[Tensor, "3 p k"]
-    products: Float[Tensor, "rows columns p k"]
-
-
-class _RankTwoObjective(TensorObjective[_State]):
-    """The robust Sampson error on the manifold of rank 2 and unit norm, with steps in its tangent space.
-
-    tolerance: the share of its cost by which a step must lower it, if the fit is to go on. steps: where given, those
-    taken are appended to it.
-    """
-
-    def __init__(
-        self, sampson: SampsonObjective, damping: Damping, tolerance: float | None, steps: list[Step] | None
-    ) -> None:
-        self.sampson, self.damping, self.tolerance, self.steps = sampson, damping, tolerance, steps
-
-    def evaluate(self, parameters: tuple[Tensor, Tensor, Tensor], derivatives: bool) -> _State:
-        """As `Objective.evaluate`; parameters: the model and its epipoles."""
-        F, e0, e1 = parameters
-        products, cost = self.sampson(F, derivatives)
-        return _State(cost, F, e0, e1, products)
-
-    def step(self, state: _State, damping: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """As `Objective.step`."""
-        moved = solve(state.products, state.F, state.e0, state.e1, damping)
-        return retract(state.F, moved, state.e0, state.e1)
-
-    def accept(self, state: _State, trial: _State, damping: Tensor, done: Tensor) -> tuple[_State, Tensor, Tensor]:
-        """As `Objective.accept`."""
-        if self.steps is not None:
-            self.steps.append(Step(state.F, damping, (trial.cost < state.cost) & ~done))
-        return super().accept(state, trial, damping, done)
-
-    def negligible(self, decrease: Tensor, state: _State) -> Bool[Tensor, "p k"]:
-        """As `TensorObjective.negligible`."""
-        assert self.tolerance is not None
-        return decrease <= self.tolerance * state.cost

@@ -1,4 +1,4 @@
-"""`refine.refine_components` for the models of one pair, compiled: one call for a whole fit."""
+"""Levenberg-Marquardt of the robust Sampson error on the manifold of rank 2 and unit norm, for the models of a pair."""
 
 from __future__ import annotations
 
@@ -9,12 +9,10 @@ import numpy as np
 from fmtorch.compiling.arrays import Array, F8x1, F8x2
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.scratch import matrix, vector
-from fmtorch.geometry.levenberg_marquardt_kernels import Schedule, levenberg_marquardt
+from fmtorch.geometry.levenberg_marquardt_kernels import Problem, Schedule, accepting, levenberg_marquardt
 from fmtorch.geometry.rank2_kernels import assign, assign_rows
 from fmtorch.geometry.rank2_manifold_kernels import start_one, steps
 from fmtorch.geometry.sampson_objective_kernels import Weighted, evaluate
-
-MIN_DAMPING, MAX_DAMPING = 1e-12, 1e6  # as in `refine`
 
 
 class _State(NamedTuple):
@@ -27,13 +25,6 @@ class _State(NamedTuple):
     cost: Array
 
 
-class _Data(NamedTuple):
-    """The matches; tolerance: of the schedule."""
-
-    matches: Weighted
-    tolerance: float
-
-
 @kernel
 def refine(F: F8x2, squarings: int, matches: Weighted, schedule: Schedule, out: F8x2, cost: F8x1) -> None:
     """Models (k, 9) made rank 2 and refined -> out (k, 9), cost (k,); what cannot be is not finite, nor its cost.
@@ -43,15 +34,15 @@ def refine(F: F8x2, squarings: int, matches: Weighted, schedule: Schedule, out: 
     k = len(F)
     state = _State(out, matrix(k, 3), matrix(k, 3), np.empty((k, 10, 10)), cost)
     trial = _State(matrix(k, 9), matrix(k, 3), matrix(k, 3), np.empty((k, 10, 10)), vector(k))
-    data = _Data(matches, schedule.tolerance)
+    problem = Problem(matches, schedule.tolerance)
     for i in range(k):
         start_one(F[i], squarings, state.F[i], state.e0[i], state.e1[i])
-    _minimise(data, state, trial, np.full(k, schedule.damping), schedule.iterations, schedule.tolerance > 0)
+    _minimise(problem, state, trial, np.full(k, schedule.damping), schedule.iterations, schedule.tolerance > 0)
 
 
 @inner
-def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
-    evaluate(state.F, data.matches, derivatives, state.products, state.cost)
+def _evaluate(state: _State, problem: Problem, derivatives: bool) -> None:
+    evaluate(state.F, problem.matches, derivatives, state.products, state.cost)
 
 
 @inner
@@ -60,20 +51,11 @@ def _step(state: _State, damping: Array, trial: _State) -> None:
 
 
 @inner
-def _accept(state: _State, trial: _State, damping: Array, done: Array, data: _Data) -> bool:
-    everything = True
-    for k in range(len(damping)):
-        better = trial.cost[k] < state.cost[k] and not done[k]
-        damping[k] = min(max(damping[k] / 10 if better else damping[k] * 10, MIN_DAMPING), MAX_DAMPING)
-        if better:
-            done[k] |= data.tolerance > 0 and state.cost[k] - trial.cost[k] <= data.tolerance * state.cost[k]
-            state.cost[k] = trial.cost[k]
-            assign(state.F[k], trial.F[k])
-            assign(state.e0[k], trial.e0[k])
-            assign(state.e1[k], trial.e1[k])
-            assign_rows(state.products[k], trial.products[k])
-        everything = everything and done[k]
-    return everything
+def _take(state: _State, trial: _State, k: int) -> None:
+    assign(state.F[k], trial.F[k])
+    assign(state.e0[k], trial.e0[k])
+    assign(state.e1[k], trial.e1[k])
+    assign_rows(state.products[k], trial.products[k])
 
 
-_minimise = levenberg_marquardt(_evaluate, _step, _accept)
+_minimise = levenberg_marquardt(_evaluate, _step, accepting(_take))

@@ -1,4 +1,4 @@
-"""`significance` for the matches of one pair, compiled: the same operations, in float64."""
+"""`significance` for the matches of one pair, in float64."""
 
 from __future__ import annotations
 
@@ -13,8 +13,12 @@ from fmtorch.compiling.scratch import matrix, vector
 from fmtorch.geometry.arithmetic_kernels import LOG10, logarithm
 from fmtorch.geometry.order_kernels import smallest_but
 
-SAMPLE, MODELS, CELLS, LEAST_CHANCE, MOST_CELLS, FARTHEST = 7, 3, 64, 2.0**-13, 1 << 15, 1e100  # as in `significance`
-LOG_MODELS = 1.0986122886681098
+SAMPLE = 7  # matches that determine a model
+LOG_MODELS = 1.0986122886681098  # of 3, the models of a minimal sample at most
+CELLS = 64  # of a grid to the diagonal of an image: matches that join the same two cells are one
+LEAST_CHANCE = 2.0**-13  # that a point is near a line: some 0.05 px, beyond which no keypoint is exact
+MOST_CELLS = 1 << 15  # of a row or column: a match's four cells make one number of 60 bits
+FARTHEST = 1e100  # px; a match beyond is none: numbers made of its coordinates would overflow
 FREE = -1  # a place of no match: in a slot of the table that is not taken
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # spreads places over the table
 

@@ -56,9 +56,9 @@ def square_pixels(
     scale = torch.where(~in_pixels, NOMINAL_FOCAL_PX / focal, 1.0)
     f, image = focal * scale, image * scale[:, None]
     x, y = (image[:, 1] - 1) / 2, (image[:, 0] - 1) / 2
-    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+    zero, ones = torch.zeros_like(fx), torch.ones_like(fx)
     across = -f * skew / (fx * fy)
-    rows = [f / fx, across, x - f / fx * cx - across * cy, zero, f / fy, y - f / fy * cy, zero, zero, one]
+    rows = [f / fx, across, x - f / fx * cx - across * cy, zero, f / fy, y - f / fy * cy, zero, zero, ones]
     A = torch.where(valid[:, None], torch.stack(rows, -1), torch.eye(3, dtype=K.dtype, device=K.device).flatten())
     return SquarePixels(A.reshape(-1, 3, 3), f, image, sqrt(fx * fy) / f)
 

@@ -27,6 +27,8 @@ def find_essential(
     noise: Arrays | None = None,
     size0: Arrays | None = None,
     size1: Arrays | None = None,
+    covariance: bool = False,
+    configuration: bool = False,
     key: Arrays | int | None = None,
     seed: int = 0,
     config_dir: Path | str | None = None,
@@ -43,7 +45,8 @@ def find_essential(
             deviation, one number, (s0, s1) or (B, 2); 0.05 suits EXIF; "shared" or "unknown" where K tells principal
             points and the shape of pixels alone. What is not exact is estimated.
         size0, size1: image sizes (h, w), one for all pairs or (B, 2). Twice the principal point when not given.
-        estimator, mask, quality, prior, lafs0, lafs1, noise, key, seed, config_dir: as of `find_fundamental`.
+        estimator, mask, quality, prior, lafs0, lafs1, noise, covariance, configuration, key, seed, config_dir: as of
+            `find_fundamental`.
         options: replace values of the preset (``inlier_threshold=1.0``).
 
     Returns:
@@ -72,5 +75,6 @@ def find_essential(
             raise ValueError(f"{name} is None; find_fundamental estimates pairs of which one camera or none is known")
     return find_fundamental(
         x0, x1, estimator=estimator, mask=mask, quality=quality, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise,
-        size0=size0, size1=size1, K0=K0, K1=K1, focal=focal, key=key, seed=seed, config_dir=config_dir, **options,
+        size0=size0, size1=size1, K0=K0, K1=K1, focal=focal, covariance=covariance, configuration=configuration,
+        key=key, seed=seed, config_dir=config_dir, **options,
     )  # fmt: skip

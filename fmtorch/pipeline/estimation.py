@@ -23,11 +23,13 @@ from fmtorch.pipeline.known_cameras import KnownCameras
 
 
 def estimated(
-    c: Correspondences, model: str, name: str, config_dir: Path | str | None, seed: int, options: Mapping[str, Any]
-) -> Estimate:
+    c: Correspondences, model: str, name: str, config_dir: Path | str | None, seed: int, options: Mapping[str, Any],
+    covariance: bool = False,
+) -> Estimate:  # fmt: skip
     """The estimate of matches by a preset, with a prior of their consistency where it uses one and none is given.
 
-    model: what the preset must estimate. What is known of cameras counts where `focal` or `shared_focal` is given.
+    model: what the preset must estimate. What is known of cameras counts where `focal` or `shared_focal` is given; then
+    the estimate may have a covariance.
     """
     expect_values(c)
     seed = int(number("seed", seed, whole=True))
@@ -35,20 +37,21 @@ def estimated(
     if (gives := model_of(estimator)) != model:
         raise ValueError(f"estimator={name} gives {gives} matrices; find_{model} needs one that gives {model} matrices")
     if not c.asks_for_cameras:
-        return _with_prior(c, seed, estimator=estimator)
-    return KnownCameras(functools.partial(_with_prior, estimator=estimator))(c, seed)
+        c = _with_prior(c, estimator)
+        return judged(estimator(c, seed), c)
+    return KnownCameras(estimator, functools.partial(_with_prior, estimator=estimator), covariance)(c, seed)
 
 
-def _with_prior(c: Correspondences, seed: int = 0, *, estimator: Estimator) -> Estimate:
-    """The estimate of matches, with a prior of their consistency where it uses one and none is given."""
+def _with_prior(c: Correspondences, estimator: Estimator) -> Correspondences:
+    """The matches with a prior of their consistency where the estimator uses one and none is given."""
     if c.prior is None and getattr(estimator, "uses_prior", False):
         framed = c.lafs0 is not None and c.lafs1 is not None and c.quality is not None
         pruner = _consistency("frame_consistency" if framed else "position_consistency")
         if switch.available():
             compile_together([*getattr(pruner, "kernels", ()), *getattr(estimator, "kernels", ())])
         with one_thread(c.mask.device):
-            c = pruner(c)
-    return judged(estimator(c, seed), c)
+            return pruner(c)
+    return c
 
 
 def _estimator(name: str, config_dir: Path | str | None, options: Mapping[str, Any]) -> Estimator:

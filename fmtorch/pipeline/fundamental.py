@@ -9,6 +9,7 @@ from typing import Any
 from fmtorch.core.arguments import Arrays, correspondences
 from fmtorch.core.types import Estimate
 from fmtorch.pipeline.camera_arguments import Focal, camera_fields, expect_calibrations
+from fmtorch.pipeline.configuration import with_configuration
 from fmtorch.pipeline.estimation import estimated
 
 
@@ -28,6 +29,8 @@ def find_fundamental(
     K0: Arrays | None = None,
     K1: Arrays | None = None,
     focal: Focal = None,
+    covariance: bool = False,
+    configuration: bool = False,
     key: Arrays | int | None = None,
     seed: int = 0,
     config_dir: Path | str | None = None,
@@ -65,6 +68,9 @@ def find_fundamental(
 
             A deviation of 0 is exact and an infinite one nothing; 0.05 suits EXIF. From 0.02 on measurements may be
             wrong altogether. A mapping says nothing of cameras: it holds options of the preset's stage of that name.
+        covariance: whether the estimate has its covariance, which needs K0 and K1 or the image sizes. Where nothing is
+            said of the cameras these are as of ``focal="unknown"``.
+        configuration: whether it has the configuration of each pair: general, planar, rotation, identical, unrelated.
         key: (B,) int64, selects each pair's random numbers.
         seed: of the random numbers.
         config_dir: a folder with presets of your own, ``<config_dir>/estimator/<name>.yaml``, which come first.
@@ -74,7 +80,8 @@ def find_fundamental(
         An `Estimate` of B pairs (of one pair for (N, 2) points, of none for an empty list), with F of unit Frobenius
         norm, inliers, ok, reason, significance. A pair that cannot be solved is ``ok=False``, never an exception. An F
         that is ok may be of images that show nothing in common: `related` tells. With K0, K1 or `focal` also focals,
-        E, R and t, NaN where they are not determined.
+        E, R and t, NaN where they are not determined; `deviation_degrees` says how far these may be off and `warning`
+        what the configuration leaves open.
 
     Raises:
         ValueError: for points of another shape, a prior outside [0, 1], a noise or an image size that is not positive,
@@ -92,6 +99,8 @@ def find_fundamental(
         >>> bool(estimate.ok[0]), int(estimate.inliers[0, 20:].sum())
         (True, 60)
     """
+    if covariance and K0 is None and K1 is None and focal is None:
+        focal = "unknown"
     c = correspondences(
         x0, x1, mask=mask, quality=quality, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, size0=size0,
         size1=size1, key=key, **camera_fields(K0, K1, focal, size0 is not None),
@@ -99,7 +108,8 @@ def find_fundamental(
     expect_calibrations(c)
     if isinstance(focal, Mapping):
         options["focal"] = focal
-    return estimated(c, "fundamental", estimator, config_dir, seed, options)
+    estimate = estimated(c, "fundamental", estimator, config_dir, seed, options, covariance)
+    return with_configuration(estimate, c, seed) if configuration else estimate
 
 
 def find_homography(

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from fmtorch.compiling.batches import for_each_pair
 from fmtorch.core.records import ungraphed
-from fmtorch.core.stages import Estimator
+from fmtorch.core.stages import Estimator, Pruner
 from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.geometry.arithmetic import matmul3, sqrt
@@ -20,6 +20,7 @@ from fmtorch.geometry.pose import pose_from_fundamental
 from fmtorch.geometry.pose_kernels import pose
 from fmtorch.geometry.square_pixels import calibration_problems, mapped, square_pixels
 from fmtorch.geometry.verdict import judged
+from fmtorch.pipeline.covariance import covariance_fields
 
 
 class KnownCameras:
@@ -36,9 +37,9 @@ class KnownCameras:
 
     model = "fundamental"
 
-    def __init__(self, estimator: Estimator) -> None:
-        """estimator: of fundamental matrices."""
-        self.estimator = estimator
+    def __init__(self, estimator: Estimator, pruner: Pruner | None = None, covariance: bool = False) -> None:
+        """estimator: of fundamental matrices. pruner: before it. covariance: whether to compute it."""
+        self.estimator, self.pruner, self.covariance = estimator, pruner, covariance
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the cameras of a batch of pairs; one whose K is wrong is `ok=False` with a reason."""
@@ -48,9 +49,10 @@ class KnownCameras:
         with one_thread(c.mask.device):
             images = _images(_completed(c))
             square = _square(c, images)
+        square = square if self.pruner is None else self.pruner(square)
         estimate = judged(self.estimator(square, seed), square)
         with one_thread(c.mask.device):
-            return _with_cameras(estimate, square, images)
+            return _with_cameras(estimate, square, images, self.covariance)
 
 
 class Images(NamedTuple):
@@ -128,21 +130,26 @@ def _mapped_frames(lafs: Tensor, A: Tensor) -> Tensor:
     return torch.stack([*columns[:2], columns[2] + A[:, None, :2, 2]], -1).to(lafs.dtype)
 
 
-def _with_cameras(estimate: Estimate, square: Correspondences, images: Images) -> Estimate:
+def _with_cameras(estimate: Estimate, square: Correspondences, images: Images, covariance: bool) -> Estimate:
     """The estimate for the points as they were, with the pose of its cameras."""
     F, ok, focals = estimate.F, estimate.ok, estimate.focals
     measured = torch.where(images.measured[..., 1] < torch.inf, images.measured[..., 0], torch.nan)
     focals = measured if focals is None else torch.where(focals.isnan(), measured, focals)
     known = ok[:, None] & focals.isfinite()
     focals = torch.where(known, focals, 1.0)  # so that no gradient is NaN
+    square_focals = focals
     R, t = _pose(estimate, square, focals, known.all(1))
     if images.map is not None and images.unit is not None:
         A = images.map.to(F)
         F = torch.where(ok[:, None, None], canonical(matmul3(matmul3(A[:, 1].mT, F), A[:, 0])), 0)
         focals = focals * images.unit
+    fields = {}
+    if covariance:
+        at = estimate.derived(F=F, R=R, t=t).detach()
+        fields = covariance_fields(at, square, images.map, torch.where(known, square_focals, torch.nan).detach())
     reasons = tuple(problem or reason for problem, reason in zip(images.problems, estimate.reason, strict=True))
     focals = torch.where(known, focals, torch.nan)
-    return estimate.derived(F=F, E=matmul3(cross_matrix(t), R), R=R, t=t, focals=focals, reason=reasons)
+    return estimate.derived(F=F, E=matmul3(cross_matrix(t), R), R=R, t=t, focals=focals, reason=reasons, **fields)
 
 
 def _pose(estimate: Estimate, square: Correspondences, focals: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
@@ -166,6 +173,6 @@ def _pose(estimate: Estimate, square: Correspondences, focals: Tensor, known: Te
 
 def _calibration(focal: Tensor, size: Tensor) -> Tensor:
     """K (B, 3, 3) of square pixels and central principal points."""
-    zero, one = torch.zeros_like(focal), torch.ones_like(focal)
+    zero, ones = torch.zeros_like(focal), torch.ones_like(focal)
     x, y = (size[:, 1].to(focal) - 1) / 2, (size[:, 0].to(focal) - 1) / 2
-    return torch.stack([focal, zero, x, zero, focal, y, zero, zero, one], -1).reshape(-1, 3, 3)
+    return torch.stack([focal, zero, x, zero, focal, y, zero, zero, ones], -1).reshape(-1, 3, 3)

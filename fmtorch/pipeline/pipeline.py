@@ -152,7 +152,9 @@ class Pipeline:
 
     def _told(self, pair: ImagePair, c: Correspondences) -> Correspondences:
         """The matches with the pair's key and calibrations."""
-        K0, K1 = (_calibration(K, self.device) for K in (pair.K0, pair.K1))
+        K0, K1 = (
+            None if K is None else torch.from_numpy(K).to(self.device, torch.float64)[None] for K in (pair.K0, pair.K1)
+        )
         return c.replace(key=torch.tensor([pair.key], device=self.device), K0=K0, K1=K1)
 
     def pruners_of(self, family: str) -> dict[str, Pruner]:
@@ -208,10 +210,6 @@ def _alone(stage: str, function: Callable[[list[Outcome]], list[Outcome]], outco
 
 def _describe(stage: str, error: Exception) -> str:
     return f"{stage}: {type(error).__name__}: {error}".splitlines()[0]
-
-
-def _calibration(K: NDArray[np.float64] | None, device: torch.device) -> torch.Tensor | None:
-    return None if K is None else torch.from_numpy(K).to(torch.float64).to(device)[None]
 
 
 def _synchronise(device: torch.device) -> None:

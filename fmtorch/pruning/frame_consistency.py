@@ -47,7 +47,7 @@ def frame_agreement(
     if kernels_serve(x0, x1, lafs0, lafs1, quality):
         tensors = (x0, x1, lafs0, lafs1, quality, mask)
         out = torch.empty(mask.shape, dtype=torch.float32)
-        return for_each_pair(_agreement_into, tensors, out=out).to(x0.dtype)
+        return for_each_pair(compiled.frame_agreement, tensors, out=out, group=compiled.FramedMatches).to(x0.dtype)
     S = frame_map(lafs0, lafs1)
     vote = torch.ones_like(x0[..., 0]) if quality is None else (WORST_RATIO - quality).clamp_min(MIN_VOTE)
     scale = sqrt((S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]).abs())
@@ -55,10 +55,6 @@ def frame_agreement(
     mask = mask & torch.isfinite(rows).all(0)
     rows = torch.where(mask, rows, 0)
     return tiled(_agreement, rows, mask)
-
-
-def _agreement_into(x0: Array, x1: Array, lafs0: Array, lafs1: Array, quality: Array, mask: Array, out: Array) -> None:
-    compiled.frame_agreement(compiled.FramedMatches(x0, x1, lafs0, lafs1, quality, mask), out)
 
 
 def tiled(function: Callable[[Tensor, Tensor], Tensor], rows: Tensor, mask: Bool[Tensor, "b n"]) -> Tensor:
@@ -137,16 +133,15 @@ class FrameConsistency:
         frames0, frames1, ratio = c.lafs0, c.lafs1, c.quality
         if kernels_serve(c.x0, c.x1, frames0, frames1, ratio):
             tensors = (c.x0, c.x1, frames0, frames1, ratio, c.mask)
-            prior = for_each_pair(self._of_one_pair, tensors, out=torch.empty(c.mask.shape, dtype=torch.float32))
+            prior = torch.empty(c.mask.shape, dtype=torch.float32)
+            for_each_pair(self._of_one_pair, tensors, out=prior, group=compiled.FramedMatches)
             return c.derived(prior=prior.to(c.x0.dtype))
         return ungraphed(c, lambda: self._with_prior(c, frames0, frames1, ratio))
 
-    def _of_one_pair(
-        self, x0: Array, x1: Array, lafs0: Array, lafs1: Array, ratio: Array, mask: Array, out: Array
-    ) -> None:
+    def _of_one_pair(self, matches: compiled.FramedMatches, out: Array) -> None:
         w = np.empty_like(out)
-        _agreement_into(x0, x1, lafs0, lafs1, ratio, mask, w)
-        compiled.frame_prior(w, ratio, mask, self._numbers, out)
+        compiled.frame_agreement(matches, w)
+        compiled.frame_prior(w, matches.quality, matches.mask, self._numbers, out)
 
     def _with_prior(self, c: Correspondences, lafs0: Tensor, lafs1: Tensor, ratio: Tensor) -> Correspondences:
         w = frame_agreement(c.x0, c.x1, lafs0, lafs1, ratio, c.mask) + self.floor

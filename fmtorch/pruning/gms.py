@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.batches import for_each_pair, kernels_serve
 from fmtorch.core.records import ungraphed
 from fmtorch.core.types import Correspondences
@@ -49,7 +48,8 @@ def gms(
     if kernels_serve(x0.detach(), x1.detach()):
         out = torch.empty(x0.shape[:2], dtype=torch.bool)
         options = (np.array(grids), turns, threshold_factor, border == "authors")
-        return for_each_pair(_gms_into, _per_pair(x0, x1, size0, size1, mask), *options, out=out, kind=torch.float64)
+        tensors = _per_pair(x0, x1, size0, size1, mask)
+        return for_each_pair(compiled.gms, tensors, *options, out=out, kind=torch.float64, group=compiled.Matches)
     kept = torch.zeros(x0.shape[:2], dtype=torch.bool, device=x0.device)
     for moves, place in moves_in_blocks(x0, x1, size0, size1, mask, grids, border):
         table = tabulated(moves)
@@ -85,7 +85,8 @@ def gms_support(
         out = torch.empty(x0.shape[:2], dtype=torch.float64)
         options = (np.array(grids), turns, threshold_factor, border == "authors")
         tensors = _per_pair(x0, x1, size0, size1, mask)
-        return for_each_pair(_support_into, tensors, *options, out=out, kind=torch.float64).to(x0.dtype)
+        for_each_pair(compiled.gms_support, tensors, *options, out=out, kind=torch.float64, group=compiled.Matches)
+        return out.to(x0.dtype)
     support = torch.zeros(x0.shape[:2], dtype=x0.dtype, device=x0.device)
     for moves, place in moves_in_blocks(x0, x1, size0, size1, mask, grids, border):
         table = tabulated(moves)
@@ -102,20 +103,6 @@ def _per_pair(x0: Tensor, x1: Tensor, size0: Tensor, size1: Tensor, mask: Tensor
     """What the kernels are given of each pair."""
     mask = torch.ones_like(x0[..., 0], dtype=torch.bool) if mask is None else mask
     return x0, x1, size0.float(), size1.float(), mask
-
-
-def _gms_into(
-    x0: Array, x1: Array, size0: Array, size1: Array, mask: Array, sides: Array, turns: int, factor: float,
-    authors: bool, out: Array,
-) -> None:  # fmt: skip
-    compiled.gms(compiled.Matches(x0, x1, size0, size1, mask), sides, turns, factor, authors, out)
-
-
-def _support_into(
-    x0: Array, x1: Array, size0: Array, size1: Array, mask: Array, sides: Array, turns: int, factor: float,
-    authors: bool, out: Array,
-) -> None:  # fmt: skip
-    compiled.gms_support(compiled.Matches(x0, x1, size0, size1, mask), sides, turns, factor, authors, out)
 
 
 def _standing(table: Table, moves: Moves, turns: int, factor: float) -> UInt8[Tensor, "s m"]:

@@ -1,4 +1,4 @@
-"""`knn`, compiled: a balanced k-d tree whose nodes are known by arithmetic."""
+"""Exact nearest neighbours in the plane, compiled: a balanced k-d tree whose nodes are known by arithmetic."""
 
 from __future__ import annotations
 
@@ -7,24 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from fmtorch.compiling.arrays import Array, F8x2, I8x2
-from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.arrays import Array
+from fmtorch.compiling.kernel import inner
 from fmtorch.compiling.scratch import matrix, vector
 from fmtorch.geometry.order_kernels import smallest_but
 
 _LEAF = 8  # points a leaf, at most
 
 
-@kernel
-def nearest_points(queries: F8x2, points: F8x2, found: I8x2) -> None:
-    """`knn.nearest_points` of queries (n, 2) among points (m, 2) -> found (n, count); -1 for no more points."""
-    search(queries, points, found)
-
-
 @inner
 def search(queries: Array, points: Array, found: Array) -> None:
-    """`nearest_points`. Squared distances in float64, ties by index, exactly as an exhaustive search finds them.
+    """`knn.nearest_points` of queries (n, 2) among points (m, 2) -> found (n, count); -1 for no more points.
 
+    Squared distances in float64, ties by index, exactly as an exhaustive search finds them.
     Node j of depth d holds the places from (j m) >> d on in an order of the points, its box and their lowest index.
     """
     m = len(points)

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.batches import for_each_pair, kernels_serve
 from fmtorch.core.records import ungraphed
 from fmtorch.core.types import Correspondences
@@ -72,7 +71,9 @@ class MatchNoise:
         if kernels_serve(lafs0, lafs1, c.quality, c.prior, floats=(torch.float32,)):
             numbers = np.array((self.usual, self.radius, self.slope, MIN_AREA, MIN_PRIOR), np.float32)
             tensors = (lafs0, lafs1, c.quality, c.prior, c.mask)
-            return c.derived(noise=for_each_pair(_into, tensors, numbers, out=torch.empty(c.mask.shape)))
+            noise = torch.empty(c.mask.shape)
+            for_each_pair(compiled.match_noise, tensors, numbers, out=noise, group=compiled.FramedMatches)
+            return c.derived(noise=noise)
         return ungraphed(c, lambda: self._with_noise(c, lafs0, lafs1))
 
     def _with_noise(self, c: Correspondences, lafs0: Tensor, lafs1: Tensor) -> Correspondences:
@@ -86,7 +87,3 @@ class MatchNoise:
             usual=self.usual, radius=self.radius, slope=self.slope,
         )  # fmt: skip
         return c.derived(noise=torch.where(mask, noise, 1))
-
-
-def _into(lafs0: Array, lafs1: Array, quality: Array, prior: Array, mask: Array, numbers: Array, out: Array) -> None:
-    compiled.match_noise(compiled.FramedMatches(lafs0, lafs1, quality, prior, mask), numbers, out)

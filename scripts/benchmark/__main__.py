@@ -9,6 +9,7 @@ if not __package__:
 
 from scripts.benchmark import (
     cameras,
+    configuration,
     curves,
     end_to_end,
     estimators,
@@ -34,8 +35,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m scripts.benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     for module in (
-        cameras, curves, end_to_end, estimators, features, gc_ransac, homography, learned, matching, memory, paper,
-        paper_times, pipelines, pruning, related, speed, stress, sweep, thresholds,
+        cameras, configuration, curves, end_to_end, estimators, features, gc_ransac, homography, learned, matching,
+        memory, paper, paper_times, pipelines, pruning, related, speed, stress, sweep, thresholds,
     ):  # fmt: skip
         module.add_arguments(commands)
     arguments = parser.parse_args()

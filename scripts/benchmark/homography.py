@@ -92,7 +92,7 @@ def run(arguments: argparse.Namespace) -> None:
 def warped(path: Path, behind: Path, seed: int) -> Case:
     """A photograph as a plane before a pinhole camera that looks at it from the side, over another photograph."""
     rng = np.random.default_rng(seed)
-    image, background = (_small(p) for p in (path, behind))
+    image, background = (small(p) for p in (path, behind))
     h, w = image.shape[:2]
     tilt, direction, turn = np.deg2rad([rng.uniform(20, 55), rng.uniform(0, 360), rng.uniform(-20, 20)])
     focal, centre = 1.2 * max(h, w), np.array([w / 2, h / 2])
@@ -128,7 +128,7 @@ def views(paths: list[Path], count: int) -> list[Case]:
     return cases
 
 
-def _small(path: Path) -> Array:
+def small(path: Path) -> Array:
     """A photograph whose longer side is SIDE, BGR."""
     image = _read(path)
     scale = SIDE / max(image.shape[:2])

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from fmtorch.compiling import cache as files
-from fmtorch.compiling import switch, together
+from fmtorch.compiling import process, switch, together
 from fmtorch.compiling.fused import fused
 from fmtorch.compiling.kernel import Inner, Kernel, inner, kernel
 from tests.processes import run_command
@@ -177,7 +177,7 @@ def test_two_processes_compile_together(
 ) -> None:
     """What the other process cannot compile is compiled here."""
     monkeypatch.setenv("PYTHONPATH", str(tmp_path) if importable else "")
-    monkeypatch.setattr(together, "_cores", lambda: 2)
+    monkeypatch.setattr(process, "cores", lambda: 2)
     both = [module.rows, module.scaled_squares]
     assert not any(each.ready or each.kept for each in both)
     together.compile_together(both)

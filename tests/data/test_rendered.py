@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 import pytest
 
+from fmtorch.data.matchable import Keypoints, keypoints, matchable
 from fmtorch.data.rendered import Plan, RenderedPairs
 from fmtorch.data.rendered import generate as generation
-from fmtorch.data.rendered.generate import FAMILIES, PLANS, Task, build, generate, read, seeds
+from fmtorch.data.rendered.generate import FAMILIES, PLANS, Task, build, generate, read, recorded_pairs, seeds
 from fmtorch.data.rendered.photographs import MATERIALS, PICTURES
 from fmtorch.data.rendered.pinhole import fundamental
-from fmtorch.data.rendered.recorded import Keypoints, keypoints, matchable, recorded_pairs
 from fmtorch.data.rendered.scene import Scene
 
 TINY = Plan(scenes=1, shots=3, pairs=2, scale=0.25)

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from fmtorch.data.rendered.generate import FAMILIES, Plan, Task, build
-from fmtorch.data.rendered.light import Light, Stage, points_seen
+from fmtorch.data.rendered.light import Light, Stage
 from fmtorch.data.rendered.mipmap import TO_LINEAR, Texture, to_srgb
 from fmtorch.data.rendered.pinhole import Camera, calibration, fundamental, look_at, relative_pose
 from fmtorch.data.rendered.raycast import Geometry
 from fmtorch.data.rendered.surfaces import Surfaces, vec
+from tests.reference.rendering import colour
 
 SIZE = (120, 160)
 
@@ -37,6 +38,15 @@ def smooth_texture(seed: int = 0) -> np.ndarray:
     noise = cv2.GaussianBlur(noise, (0, 0), 8, borderType=cv2.BORDER_REFLECT)
     noise = (noise - noise.min()) / np.ptp(noise)
     return (noise * 255).astype(np.uint8)
+
+
+def points_seen(geometry: Geometry, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (n, 2) whose ray meets a surface, and the world points (n, 3) that they see, exactly."""
+    depth = geometry.depth_map(camera)
+    y, x = np.nonzero(np.isfinite(depth))
+    pixel = np.stack([x, y], -1).astype(np.float64)
+    rays = np.column_stack([pixel, np.ones(len(pixel))]) @ np.linalg.inv(camera.K).T
+    return pixel, (rays * depth[y, x, None] - camera.t) @ camera.R
 
 
 def test_look_at_is_a_rotation_that_centres_its_target() -> None:
@@ -159,7 +169,7 @@ def test_textures_keep_their_mean_when_they_shrink_and_do_not_alias() -> None:
     picture[:, ::2] = 255  # the finest stripes
     texture = Texture(picture)
     u = np.random.default_rng(0).random(500).astype(np.float32)
-    far = texture(u, u[::-1].copy(), np.full(500, 5.0, np.float32))
+    far = colour(texture, u, u[::-1].copy(), np.full(500, 5.0, np.float32))
     assert far.mean() == pytest.approx(0.5, abs=0.01)
     assert far.std() < 0.01
 
@@ -168,7 +178,7 @@ def test_textures_repeat() -> None:
     texture = Texture(smooth_texture())
     u, v = np.random.default_rng(0).random((2, 100)).astype(np.float32)
     lod = np.full(100, 1.3, np.float32)
-    np.testing.assert_allclose(texture(u, v, lod), texture(u + 3, v - 2, lod), atol=2e-3)
+    np.testing.assert_allclose(colour(texture, u, v, lod), colour(texture, u + 3, v - 2, lod), atol=2e-3)
 
 
 def test_transfer_curve_and_its_inverse() -> None:

@@ -1,51 +1,69 @@
-"""The compiled form of the ray-caster and of light draws the same pictures as the NumPy form, to the last bit."""
+"""The ray-caster and light draw the same pictures as their definitions in NumPy, to the last bit."""
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 import pytest
 
-from fmtorch.compiling import switch
+from fmtorch.data.rendered import raycast
 from fmtorch.data.rendered.depth import depth_at
 from fmtorch.data.rendered.generate import FAMILIES, Plan, Task, build
 from fmtorch.data.rendered.light import Lens, Light, Stage, expose
-from fmtorch.data.rendered.patterns import fractal
 from fmtorch.data.rendered.pinhole import Camera, calibration, look_at
 from fmtorch.data.rendered.raycast import Geometry
 from fmtorch.data.rendered.surfaces import Surfaces, vec
+from tests.reference import rendering as reference
 
-pytestmark = pytest.mark.skipif(not switch.available(), reason="numba is not installed, or kernels are off")
-FORMS = ("on", "off")
 SIZE = (90, 120)
 
 
+def take_reference(patch: pytest.MonkeyPatch) -> None:
+    """NumPy's forms in place of the kernels."""
+    geometries = list[Geometry]()
+    cast = Geometry.cast
+
+    def remembered(self: Geometry, *arguments: Any) -> raycast.Hits:
+        geometries.append(self)
+        return cast(self, *arguments)
+
+    patch.setattr(Geometry, "cast", remembered)
+    patch.setattr(raycast, "cast_pieces", lambda pieces, _, *rest: reference.cast(geometries[-1], pieces, *rest))
+    patch.setattr(Stage, "_shade", reference.shade)
+
+
 def stages(surfaces: Surfaces, light: Light, sky: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> list[Stage]:
-    made = []
-    for form in FORMS:
-        monkeypatch.setenv(switch.SWITCH, form)
+    made = [Stage(Geometry(surfaces), light, sky)]
+    with monkeypatch.context() as patch:
+        take_reference(patch)
         made.append(Stage(Geometry(surfaces), light, sky))
     np.testing.assert_array_equal(made[0].shadow, made[1].shadow)
     return made
 
 
 def assert_equal_views(pair: list[Stage], camera: Camera, monkeypatch: pytest.MonkeyPatch) -> np.ndarray:
-    """Both forms meet the same pieces at the same places, and draw the same picture; returns the pieces."""
-    offset = (0.125, -0.375)
-    seen = []
-    for form, stage in zip(FORMS, pair, strict=True):
-        monkeypatch.setenv(switch.SWITCH, form)
-        hits = stage.geometry.look(camera, offset)
-        picture = expose(stage, [camera], Lens(), np.random.default_rng(0))
-        seen.append((hits.piece, hits.s, hits.t, stage.radiance(camera, offset), picture))
-    for compiled, reference in zip(*seen, strict=True):
-        np.testing.assert_array_equal(compiled, reference)
+    """Kernels and definitions meet the same pieces in the same places and draw the same picture; returns the pieces."""
+    seen = [view(pair[0], camera)]
+    with monkeypatch.context() as patch:
+        take_reference(patch)
+        seen.append(view(pair[1], camera))
+    for compiled, expected in zip(*seen, strict=True):
+        np.testing.assert_array_equal(compiled, expected)
     return seen[0][0]
 
 
+def view(stage: Stage, camera: Camera) -> tuple[np.ndarray, ...]:
+    """The pieces and places that the pixels see, their colours, and the photograph."""
+    offset = (0.125, -0.375)
+    hits = stage.geometry.look(camera, offset)
+    picture = expose(stage, [camera], Lens(), np.random.default_rng(0))
+    return hits.piece, hits.s, hits.t, stage.radiance(camera, offset), picture
+
+
 @pytest.mark.parametrize("family", FAMILIES)
-def test_both_forms_draw_the_same_scenes(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_forms_draw_the_same_scenes(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = build(Task(family, "train", 1, 5, Plan(1, 3, 2, 0.3)))
     shots = [scene.shots[0], scene.shots[-1]]
     for light in {shot.light for shot in shots}:
@@ -74,7 +92,7 @@ def random_world(rng: np.random.Generator) -> Surfaces:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_both_forms_draw_the_same_random_worlds(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_forms_draw_the_same_random_worlds(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(seed)
     sky = rng.integers(0, 256, (16, 32, 3), dtype=np.uint8)
     light = Light((0.3, -0.5, 0.8), through_walls=bool(seed % 2))
@@ -84,7 +102,7 @@ def test_both_forms_draw_the_same_random_worlds(seed: int, monkeypatch: pytest.M
         assert_equal_views(pair, look_at(calibration(80.0, SIZE), SIZE, eye.tolist(), target.tolist()), monkeypatch)
 
 
-def test_both_forms_draw_an_empty_view(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_forms_draw_an_empty_view(monkeypatch: pytest.MonkeyPatch) -> None:
     surfaces = Surfaces()
     surfaces.quad(vec(0, 0, 0), vec(1, 0, 0), vec(0, 1, 0), surfaces.texture(np.zeros((8, 8, 3), np.uint8)))
     pair = stages(surfaces, Light((0.3, -0.5, 0.8)), np.full((8, 16, 3), 90, np.uint8), monkeypatch)
@@ -92,27 +110,19 @@ def test_both_forms_draw_an_empty_view(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (assert_equal_views(pair, camera, monkeypatch) == -1).all()
 
 
-def test_both_forms_give_the_same_depth(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_forms_give_the_same_depth(monkeypatch: pytest.MonkeyPatch) -> None:
     task = Task("orbit", "train", 0, 3, Plan(1, 3, 2, 0.2))
     points = np.random.default_rng(0).uniform(0, 100, (500, 2))
-    depths = []
-    for form in FORMS:
-        monkeypatch.setenv(switch.SWITCH, form)
+
+    def depth() -> np.ndarray:
         with ThreadPoolExecutor(1) as thread:  # each thread remembers its own views
-            depths.append(thread.submit(depth_at, task, 1, points).result())
+            return thread.submit(depth_at, task, 1, points).result()
+
+    depths = [depth()]
+    take_reference(monkeypatch)
+    depths.append(depth())
     np.testing.assert_array_equal(*depths)
     assert np.isfinite(depths[0]).any()
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_both_forms_draw_the_same_noise(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    sizes = np.random.default_rng(seed).integers(9, 400, (20, 2)).tolist()
-    drawn = []
-    for form in FORMS:
-        monkeypatch.setenv(switch.SWITCH, form)
-        drawn.append([fractal(np.random.default_rng(seed), h, w, coarsest=64 << (h % 3)) for h, w in sizes])
-    for compiled, reference in zip(*drawn, strict=True):
-        np.testing.assert_array_equal(compiled, reference)
 
 
 def test_textures_too_small_to_shrink_are_refused() -> None:

@@ -19,9 +19,9 @@ def test_the_examples_of_a_page_run(page: str) -> None:
 
 
 @pytest.mark.parametrize("module", [
-    "data", "geometry.eight_point", "geometry.epipolar", "geometry.homography", "geometry.homography_refine",
-    "geometry.seven_point", "metrics.nsgd", "metrics.recall", "pipeline.essential", "pipeline.fundamental",
-    "pipeline.two_images",
+    "data", "geometry.eight_point", "geometry.epipolar", "geometry.homography", "geometry.homography_pose",
+    "geometry.homography_refine", "geometry.seven_point", "geometry.two_view_covariance", "metrics.nsgd",
+    "metrics.recall", "pipeline.configuration", "pipeline.essential", "pipeline.fundamental", "pipeline.two_images",
 ])  # fmt: skip
 def test_the_examples_of_docstrings_run(module: str) -> None:
     failed, attempted = doctest.testmod(importlib.import_module(f"fmtorch.{module}"))

@@ -8,8 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fmtorch.evaluation.canvas import BAD, GOOD, HEIGHT, WIDTH, Place
-from fmtorch.evaluation.pictures import COLOURS, draw_epipolar_lines, draw_epipolar_lines_of_corners, draw_matches
-from fmtorch.evaluation.sparse import spread, thinned
+from fmtorch.evaluation.pictures import (
+    COLOURS,
+    draw_epipolar_lines,
+    draw_epipolar_lines_of_corners,
+    draw_matches,
+    spread,
+    thinned,
+)
 
 ROWS = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # a sideways camera: epipolar lines are rows
 NONE = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, bool)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from fmtorch.evaluation.reasons import common_reasons
+from fmtorch.evaluation.summary import common_reasons
 
 
 @pytest.mark.parametrize(

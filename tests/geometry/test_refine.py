@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import functools
 import itertools
 
 import numpy as np
@@ -8,12 +7,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from fmtorch.geometry import sampson_objective
 from fmtorch.geometry.rank2_manifold import start
 from fmtorch.geometry.refine import attached_step, refine, refine_components
 from fmtorch.geometry.residuals import homogeneous, linearise
 from fmtorch.geometry.robust_losses import KERNELS
-from fmtorch.geometry.sampson_objective import block_products
 from tests.conftest import oracle
 from tests.geometry.scenes import unit_scene
 from tests.reference import refine as reference
@@ -146,7 +143,7 @@ def test_cost_never_rises(kernel: str) -> None:
     assert bool((costs[-1] < costs[0])[:, :10].any())
 
 
-def test_same_bits_in_any_batch_pool_padding_and_tile(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_same_bits_in_any_batch_pool_and_padding() -> None:
     pairs = [unit_scene(i, 150, noise=3e-3, outliers=30) for i in range(5)]
     points = torch.cat([components(x0, x1) for _, x0, x1 in pairs], 1)
     F0 = torch.cat([models(F, 13, 0.02, i) for i, (F, _, _) in enumerate(pairs)], 1)
@@ -163,11 +160,6 @@ def test_same_bits_in_any_batch_pool_padding_and_tile(monkeypatch: pytest.Monkey
     more, more_cost = refine_components(F0, *padded, "cauchy", scale, 4)
     assert torch.equal(more, F)
     assert torch.equal(more_cost, cost)
-    monkeypatch.setattr(sampson_objective, "TILE_MODELS", 3)
-    monkeypatch.setattr(sampson_objective, "TILE_ELEMENTS", 64)
-    tiled, tiled_cost = refine_components(F0, points, weight, "cauchy", scale, 4)
-    assert torch.equal(tiled, F)
-    assert torch.equal(tiled_cost, cost)
 
 
 def test_masked_slots_and_neighbours_are_invisible() -> None:
@@ -272,36 +264,3 @@ def test_attached_step_is_finite_everywhere() -> None:
     alone = attached_step(Fs[0], x0[0], x1[0], weight[0], scale=1.0)
     assert torch.equal(alone, stepped[0])
     assert bool((torch.autograd.grad(attached_step(Fs, x0, x1, weight)[5].sum(), x0)[0][:5] == 0).all())
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_block_products_have_the_same_bits_in_any_batch(threads: int) -> None:
-    generator = torch.Generator().manual_seed(0)
-    a = torch.randn(10, 5, 3, 24, sampson_objective.LANES, dtype=torch.float64, generator=generator)
-    b = torch.randn(10, 5, 3, 24, sampson_objective.LANES, dtype=torch.float64, generator=generator)
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        for rows in (1, 10):  # costs, normal equations
-            c = b[:rows]
-            whole = block_products(a[:rows], c)
-            assert torch.allclose(whole, block_products(a[:rows], c, elementwise=True), rtol=0, atol=1e-12)
-            for m, p, k in itertools.product((1, 2, 5), (1, 3), (1, 2, 7, 24)):
-                part = slice(5 - m, 5), slice(3 - p, 3), slice(24 - k, 24)
-                expected = whole[part[0], :, :, part[1], part[2]]
-                assert torch.equal(block_products(a[:rows, *part], c[:, *part]), expected)
-                copied = block_products(a[:rows, *part].contiguous(), c[:, *part].contiguous())
-                assert torch.equal(copied, expected)
-    finally:
-        torch.set_num_threads(before)
-
-
-def test_element_by_element_refines_to_the_same_model(monkeypatch: pytest.MonkeyPatch) -> None:
-    F, x0, x1 = unit_scene(3, 150, noise=1e-3, outliers=40)
-    arguments = (models(F, 5, 0.01), components(x0, x1), torch.ones(1, 150, dtype=torch.float64))
-    refined = refine_components(*arguments, "truncated", torch.tensor([3e-3]).double(), 20)
-    by_element = functools.partial(block_products, elementwise=True)
-    monkeypatch.setattr(sampson_objective, "block_products", by_element)
-    expected = refine_components(*arguments, "truncated", torch.tensor([3e-3]).double(), 20)
-    assert distance(refined[0], expected[0]).max() < 1e-7
-    assert torch.allclose(refined[1], expected[1], rtol=1e-9, atol=0)

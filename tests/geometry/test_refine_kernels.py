@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt on the manifold of rank 2 by kernels, against the tensor form."""
+"""Levenberg-Marquardt on the manifold of rank 2 by kernels, against its definition."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.geometry import irls_kernels, refine_kernels
+from fmtorch.geometry import irls_kernels
 from fmtorch.geometry.irls import reweighted
-from fmtorch.geometry.levenberg_marquardt_kernels import Schedule
-from fmtorch.geometry.rank2_manifold import SQUARINGS
-from fmtorch.geometry.refine import DAMPING, refine_components
+from fmtorch.geometry.levenberg_marquardt_kernels import FIRST_DAMPING, Schedule
+from fmtorch.geometry.rank2_manifold_kernels import SQUARINGS
+from fmtorch.geometry.refine_kernels import refine
 from fmtorch.geometry.robust_losses import KERNELS
-from fmtorch.geometry.sampson_objective import SampsonObjective
 from fmtorch.geometry.sampson_objective_kernels import LOSSES, Weighted, evaluate, loss_table
 from tests.estimators.pairs import apart
+from tests.reference import refine as reference
 
 SCALE = 0.02
 
@@ -37,14 +37,12 @@ def matches(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
 @pytest.mark.parametrize("loss", LOSSES)
 def test_costs_and_normal_equations(loss: str, n: int) -> None:
     F, points, weight, s2 = matches(n)
-    tensors = [torch.from_numpy(a) for a in (F.T[:, None].copy(), points[:, None], weight[None], np.sqrt(s2)[None])]
-    expected, expected_cost = SampsonObjective(tensors[1], tensors[2], KERNELS[loss], tensors[3])(tensors[0], True)
+    normal, expected_cost = zip(*(reference.normal_equations(f, points, weight, s2, loss) for f in F), strict=True)
     for derivatives in (True, False):
         products, cost = np.zeros((5, 10, 10)), np.empty(5)
         evaluate(F, Weighted(points, weight, s2, LOSSES[loss], loss_table(loss)), derivatives, products, cost)
-        np.testing.assert_allclose(cost, expected_cost[0].numpy(), rtol=1e-11)
+        np.testing.assert_allclose(cost, expected_cost, rtol=1e-11)
         if derivatives:
-            normal = expected[:, :, 0].permute(2, 0, 1).numpy()
             size = np.sqrt(np.einsum("kii,kjj->kij", normal, normal))  # what the sums of an entry cancel from, at most
             assert (np.abs(products - normal) <= 1e-12 * size + 1e-300).all()
         else:
@@ -72,30 +70,25 @@ def test_one_reweighted_fit(loss: str, n: int) -> None:
 def refined(
     F: np.ndarray, points: np.ndarray, weight: np.ndarray, s2: np.ndarray, loss: str, iterations: int, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`refine_components` by the kernel."""
+    """Models and costs by the kernel."""
     found, cost = np.empty_like(F), np.empty(len(F))
-    schedule = Schedule(iterations, DAMPING.first, tolerance)
     weighted = Weighted(points, weight, s2, LOSSES[loss], loss_table(loss))
-    refine_kernels.refine(F, SQUARINGS, weighted, schedule, found, cost)
+    refine(F, SQUARINGS, weighted, Schedule(iterations, FIRST_DAMPING, tolerance), found, cost)
     return found, cost
-
-
-def test_bounds_of_the_damping_are_those_of_the_tensor_form() -> None:
-    assert DAMPING[1:] == (refine_kernels.MIN_DAMPING, refine_kernels.MAX_DAMPING)
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 1e-3])
 @pytest.mark.parametrize("loss", LOSSES)
 def test_refinement(loss: str, tolerance: float) -> None:
     F, points, weight, s2 = matches(200)
-    tensors = [torch.from_numpy(a) for a in (F.T[:, None].copy(), points[:, None], weight[None])]
     for iterations in (0, 1, 3, 8):
-        expected, expected_cost = refine_components(
-            *tensors, loss, torch.from_numpy(np.sqrt(s2)[None]), iterations, tolerance
-        )
         found, cost = refined(F, points, weight, s2, loss, iterations, tolerance)
-        np.testing.assert_allclose(cost, expected_cost[0].numpy(), rtol=1e-9)
-        np.testing.assert_allclose(found, expected[:, 0].T.numpy(), atol=1e-8)
+        for i, start in enumerate(F):
+            expected, expected_cost = reference.levenberg_marquardt(
+                start, points, weight, s2, loss, iterations, FIRST_DAMPING, tolerance
+            )
+            assert cost[i] == pytest.approx(expected_cost, rel=1e-9)
+            assert apart(found[i], expected) < 1e-8
         assert np.abs(np.linalg.det(found.reshape(-1, 3, 3))).max() < 1e-14
 
 

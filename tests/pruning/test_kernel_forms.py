@@ -11,6 +11,8 @@ from torch import Tensor
 
 from fmtorch import presets
 from fmtorch.compiling import switch
+from fmtorch.compiling.arrays import F8x2, I8x2
+from fmtorch.compiling.kernel import kernel
 from fmtorch.core.types import Correspondences
 from fmtorch.pruning import knn_kernels
 from tests.laws import degenerate, scene, scenes, small, with_padding
@@ -102,6 +104,11 @@ def test_gradients_take_the_tensor_form() -> None:
             assert not stage(c.replace(x0=x0)).prior.requires_grad
 
 
+@kernel
+def nearest_points(queries: F8x2, points: F8x2, found: I8x2) -> None:
+    knn_kernels.search(queries, points, found)
+
+
 @pytest.mark.parametrize("kind", ["random", "clustered", "integers", "one point", "a line"])
 def test_nearest_points_are_those_of_an_exhaustive_search(kind: str) -> None:
     rng = np.random.default_rng(0)
@@ -116,7 +123,7 @@ def test_nearest_points_are_those_of_an_exhaustive_search(kind: str) -> None:
         if kind == "a line":
             points[:, 1], queries[:, 1] = points[:, 0] / 2, 0.25
         found = np.empty((n, count), np.int64)
-        knn_kernels.nearest_points(queries, points, found)
+        nearest_points(queries, points, found)
         squared = (points[None, :, 0] - queries[:, None, 0]) ** 2 + (points[None, :, 1] - queries[:, None, 1]) ** 2
         expected = np.full((n, count), -1)
         nearest = np.argsort(squared, 1, kind="stable")[:, :count]

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 import torch
@@ -12,12 +10,10 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences
 from fmtorch.pruning import LPM, lpm
-from fmtorch.pruning.knn import by_leaves, by_tree, nearest_points
+from fmtorch.pruning.lpm import nearest_points
 from tests.conftest import oracle
 from tests.reference.lpm import lpm as reference
 from tests.reference.lpm import nearest
-
-Search = Callable[[Tensor, Tensor, int], Tensor]
 
 
 def moving(seed: int, n: int, outliers: float = 0.4) -> tuple[Tensor, Tensor]:
@@ -45,13 +41,10 @@ def test_nearest_points_equal_the_definition(seed: int, n: int, m: int, count: i
     for query, row in zip(queries, found.tolist(), strict=True):
         expected = nearest(query, points, list(range(m)), count)
         assert row == expected + [-1] * (count - len(expected))
-    if n and m:
-        torch.testing.assert_close(by_leaves(queries_, points_, min(count, m)), found[:, :m], rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("search", [by_tree, by_leaves])
 @pytest.mark.parametrize("kind", ["uniform", "clusters", "line", "grid", "one place"])
-def test_nearest_points_of_many(kind: str, search: Search) -> None:
+def test_nearest_points_of_many(kind: str) -> None:
     rng = np.random.default_rng(1)
     n = 1500
     points = {
@@ -62,7 +55,7 @@ def test_nearest_points_of_many(kind: str, search: Search) -> None:
         "one place": np.full((n, 2), 7.0),
     }[kind]
     queries = np.concatenate([points[:400], rng.uniform(-200, 1200, (100, 2))])
-    found = search(torch.from_numpy(queries), torch.from_numpy(points), 9).numpy()
+    found = nearest_points(torch.from_numpy(queries), torch.from_numpy(points), 9).numpy()
     expected = cKDTree(points).query(queries, 9)[0]
     distances = np.linalg.norm(points[found] - queries[:, None], axis=-1)
     np.testing.assert_allclose(distances, expected, rtol=1e-14, atol=1e-14)  # a few roundings of float64

@@ -65,10 +65,11 @@ def prior_cost(log_f0: float, log_f1: float, same_size: bool = False, measured: 
     difference = log_f0 - log_f1
     well = 5 * 0.01**2 / (0.01**2 + difference**2) if same_size else 0.0
     cost = (difference / 0.5) ** 2 / 2 + (((log_f0 + log_f1) / 2 - np.log(1.2)) / 0.4) ** 2 / 2 - well
+    z2 = 0.0  # of measurements that may both be wrong
     for log_f, (mean, deviation) in zip((log_f0, log_f1), measured, strict=True):
-        z2 = ((log_f - mean) / max(deviation, 1e-5)) ** 2
-        cost += z2 / 2 if deviation < 0.02 else 5 * z2 / (z2 + 10)
-    return cost
+        squared = ((log_f - mean) / max(deviation, 1e-5)) ** 2
+        cost, z2 = (cost + squared / 2, z2) if deviation < 0.02 else (cost, z2 + squared)
+    return cost + 3 * z2 / (z2 + 6)
 
 
 def loss(r: np.ndarray, scale: float) -> np.ndarray:

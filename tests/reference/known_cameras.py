@@ -8,10 +8,13 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from tests.reference.focal import cross_matrix
+from tests.reference.focal import Measured, cross_matrix
 from tests.reference.refine import sampson
 
 SIZE = (480, 640)
+Sizes = tuple[tuple[int, int], tuple[int, int]]
+Cameras = tuple[np.ndarray, np.ndarray]
+UNMEASURED = ((1.0, np.inf), (1.0, np.inf))
 K0 = np.array([[500, 2, 310], [0, 520, 250], [0, 0, 1.0]])
 K1 = np.array([[600, -1, 330], [0, 590, 230], [0, 0, 1.0]])
 
@@ -27,7 +30,7 @@ class Scene(NamedTuple):
 
 
 def scene(
-    seed: int, count: int = 150, noise: float = 0.0, outliers: float = 0.3, cameras: tuple = (K0, K1)
+    seed: int, count: int = 150, noise: float = 0.0, outliers: float = 0.3, cameras: Cameras = (K0, K1)
 ) -> Scene:  # fmt: skip
     """A cloud of points from two sides, all in front of both cameras."""
     rng = np.random.default_rng(seed)
@@ -49,13 +52,13 @@ def square(K: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray
     return new @ np.linalg.inv(K), new
 
 
-def fundamental(R: np.ndarray, t: np.ndarray, cameras: tuple = (K0, K1)) -> np.ndarray:
+def fundamental(R: np.ndarray, t: np.ndarray, cameras: Cameras = (K0, K1)) -> np.ndarray:
     """F = K1^-T [t]x R K0^-1 of unit norm."""
     F = np.linalg.inv(cameras[1]).T @ cross_matrix(t) @ R @ np.linalg.inv(cameras[0])
     return F / np.linalg.norm(F)
 
 
-def best_pose(s: Scene, weight: np.ndarray, cameras: tuple = (K0, K1)) -> tuple[np.ndarray, np.ndarray]:
+def best_pose(s: Scene, weight: np.ndarray, cameras: Cameras = (K0, K1)) -> tuple[np.ndarray, np.ndarray]:
     """R, t of least weighted squared Sampson error in the images of square pixels, near the true ones."""
     (A0, C0), (A1, C1) = (square(K, SIZE) for K in cameras)
     x0, x1 = ((np.c_[x, np.ones(len(x))] @ A.T)[:, :2] for x, A in ((s.x0, A0), (s.x1, A1)))
@@ -84,7 +87,11 @@ def pose_error(R: np.ndarray, t: np.ndarray, s: Scene) -> float:
 
 
 def best_cameras(
-    s: Scene, sizes: tuple, sigma: float, measured: tuple = ((1.0, np.inf), (1.0, np.inf)), shared: bool = False
+    s: Scene,
+    sizes: Sizes,
+    sigma: float,
+    measured: Measured = UNMEASURED,
+    shared: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """R, t and focal lengths (px) of greatest posterior near the true pose, of images of two sizes (h, w).
 
@@ -101,15 +108,15 @@ def best_cameras(
 
     def residuals(p: np.ndarray) -> np.ndarray:
         R, t, phi = unpacked(p)
-        cameras = [
+        camera0, camera1 = (
             np.array([[np.exp(f) * side, 0, (w - 1) / 2], [0, np.exp(f) * side, (h - 1) / 2], [0, 0, 1]])
             for f, side, (h, w) in zip(phi, longest, sizes, strict=True)
-        ]
+        )
         prior = [(phi.mean() - np.log(1.2)) / 0.4, 0.0 if shared else (phi[0] - phi[1]) / 0.5]
-        for f, side, (px, deviation) in zip(phi, longest, measured, strict=True):
-            z = (f - np.log(px / side)) / deviation
-            prior.append(z * np.sqrt(10 / (z * z + 10)))  # half its square is the tail's cost
-        return np.concatenate([sampson(fundamental(R, t, tuple(cameras)), s.x0, s.x1) / sigma, prior])
+        z = [(f - np.log(px / side)) / s for f, side, (px, s) in zip(phi, longest, measured, strict=True)]
+        z2 = float(np.square(z).sum())
+        prior.append(np.sqrt(6 * z2 / (z2 + 6)))  # half its square is the cost of measurements with a tail
+        return np.concatenate([sampson(fundamental(R, t, (camera0, camera1)), s.x0, s.x1) / sigma, prior])
 
     start = np.zeros(7 - shared)
     start[5:] = 0.1

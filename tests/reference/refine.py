@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 from scipy.optimize import least_squares, minimize
 from scipy.spatial.transform import Rotation
 from scipy.special import gamma, gammainc, gammaincc
+
+from fmtorch.geometry.robust_losses import KERNELS
 
 
 def sampson(F: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:
@@ -68,3 +71,52 @@ def optimum(
         for _ in range(3):
             theta = minimize(cost, theta, method="BFGS", options={"gtol": 1e-14, "maxiter": 500}).x
     return matrix(theta), cost(theta)
+
+
+def normal_equations(
+    f: np.ndarray, points: np.ndarray, weight: np.ndarray, s2: np.ndarray, kernel: str
+) -> tuple[np.ndarray, float]:
+    """``[J r]^T W [J r]`` (10, 10) of a model (9,), by the derivative of the residual, and the cost; points (4, n)."""
+    x0, x1 = points[:2].T, points[2:].T
+    h0, h1 = np.c_[x0, np.ones(len(x0))], np.c_[x1, np.ones(len(x1))]
+    F = f.reshape(3, 3)
+    line1, line0 = h0 @ F.T, h1 @ F
+    e, g2 = (h1 * line1).sum(1), (line1[:, :2] ** 2).sum(1) + (line0[:, :2] ** 2).sum(1)
+    rows = []
+    for match in range(len(x0)):
+        for_e = np.outer(h1[match], h0[match])
+        for_g2 = 2 * np.outer(line1[match] * [1, 1, 0], h0[match]) + 2 * np.outer(h1[match], line0[match] * [1, 1, 0])
+        slope = for_e / np.sqrt(g2[match]) - e[match] * for_g2 / (2 * g2[match] ** 1.5)
+        rows.append(np.append(slope.ravel(), e[match] / np.sqrt(g2[match])))
+    A = np.array(rows)
+    r2 = e**2 / g2
+    robust, R2, S2 = KERNELS[kernel], torch.from_numpy(r2), torch.from_numpy(s2)
+    return A.T @ (A * (weight * robust.weight(R2, S2).numpy())[:, None]), float(weight @ robust.loss(R2, S2).numpy())
+
+
+def levenberg_marquardt(
+    f: np.ndarray, points: np.ndarray, weight: np.ndarray, s2: np.ndarray, kernel: str, iterations: int, damping: float,
+    tolerance: float,
+) -> tuple[np.ndarray, float]:  # fmt: skip
+    """The model (9,) and its cost after damped steps across F and ``e1 e0^T``, each made rank 2 along the second."""
+    U, s, Vt = np.linalg.svd(f.reshape(3, 3))
+    F = U @ np.diag([s[0], s[1], 0]) @ Vt / np.hypot(s[0], s[1])
+    products, cost = normal_equations(F.ravel(), points, weight, s2, kernel)
+    for _ in range(iterations):
+        U, _, Vt = np.linalg.svd(F)
+        normal = np.outer(U[:, 2], Vt[2])
+        frame = np.linalg.svd(np.stack([F.ravel(), normal.ravel()]))[2][2:]  # (7, 9), an orthonormal tangent basis
+        H = frame @ (products[:9, :9] + damping * products[:9, :9].diagonal().max() * np.eye(9)) @ frame.T
+        G = F - (frame.T @ np.linalg.solve(H, frame @ products[:9, 9])).reshape(3, 3)
+        cofactors = np.stack([np.cross(G[1], G[2]), np.cross(G[2], G[0]), np.cross(G[0], G[1])])
+        G = G - np.linalg.det(G) / (cofactors * normal).sum() * normal
+        G /= np.linalg.norm(G)
+        trial, trial_cost = normal_equations(G.ravel(), points, weight, s2, kernel)
+        better, gain = trial_cost < cost, cost - trial_cost
+        damping = min(max(damping / 10 if better else damping * 10, 1e-12), 1e6)
+        if better:
+            done = gain <= tolerance * cost and tolerance > 0
+            F, products, cost = G, trial, trial_cost
+            if done:
+                break
+    return F.ravel(), cost

@@ -7,6 +7,7 @@ renamed when complete, so that an interrupted generation goes on where it stoppe
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import itertools
 import json
@@ -20,22 +21,22 @@ from typing import Any
 import cv2
 import numpy as np
 
+from fmtorch.data.matchable import Keypoints, keypoints, matchable
 from fmtorch.data.rendered import collection, driving, indoor, orbit
 from fmtorch.data.rendered.light import Stage, expose
 from fmtorch.data.rendered.light_kernels import affine, footprints, group_by_texture, shade
 from fmtorch.data.rendered.mipmap import Pixels
-from fmtorch.data.rendered.noise_kernels import add_enlarged
 from fmtorch.data.rendered.pinhole import Camera, fundamental
 from fmtorch.data.rendered.raycast import Geometry
 from fmtorch.data.rendered.raycast_kernels import cast_pieces
-from fmtorch.data.rendered.recorded import Keypoints, keypoints, matchable, recorded_pairs
 from fmtorch.data.rendered.scene import Scene, Shot
 
 VERSION = 3  # of the generator: raised by every change that changes a picture or a pair
 FAMILIES = {"indoor": indoor.scene, "driving": driving.scene, "orbit": orbit.scene, "collection": collection.scene}
 SPLITS = ("test", "train")
+RECORD = Path(__file__).with_name("pairs.json")
 
-KERNELS = (cast_pieces, shade, footprints, add_enlarged, affine, group_by_texture)  # that drawing calls, slowest first
+KERNELS = (cast_pieces, shade, footprints, affine, group_by_texture)  # that drawing calls, slowest first
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,6 +91,17 @@ def digest(family: str, split: str, seed: int, plan: Plan) -> str:
     release = ".".join(cv2.__version__.split(".")[:2])
     parts = [VERSION, release, family, split, seed, dataclasses.asdict(plan)]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+@functools.cache
+def recorded_pairs() -> dict[str, dict[str, dict[str, Any]]]:
+    """What the rule for pairs has decided: by digest and scene the number of photographs and the pairs.
+
+    Drawn and judged once by ``scripts/record_rendered_pairs.py``; with other versions of the generator or of OpenCV,
+    whose digests are not here, it is judged anew.
+    """
+    record: dict[str, dict[str, dict[str, Any]]] = json.loads(RECORD.read_text(encoding="utf-8"))
+    return record
 
 
 def seeds(task: Task) -> np.random.SeedSequence:

@@ -9,16 +9,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.compiling import switch
 from fmtorch.data.rendered import light_kernels as compiled
 from fmtorch.data.rendered.mipmap import TO_LINEAR, Floats, Pixels, Real, Texture, bilinear, to_srgb
-from fmtorch.data.rendered.pinhole import Camera, Matrix
+from fmtorch.data.rendered.pinhole import Camera
 from fmtorch.data.rendered.raycast import Geometry, Hits
 
 # Four rays a pixel, one on each row and column of a 4 x 4 grid (rotated grid); their mean is the pixel centre.
 SAMPLES = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))
-_SHADOW_MAP = 1400  # pixels
-_ANISOTROPY = 4.0  # the four rays share a footprint's long side, so each filters only a quarter of it
+SHADOW_MAP = 1400  # pixels
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,8 +58,8 @@ class Stage:
         side /= np.linalg.norm(side)
         axes = np.stack([side, np.cross(toward, side), -toward])
         low, high = (points @ axes.T).min(0), (points @ axes.T).max(0)
-        scale = (_SHADOW_MAP - 1) / (high - low)[:2].max()
-        self._bias = 2.0 / scale + 0.01
+        scale = (SHADOW_MAP - 1) / (high - low)[:2].max()
+        self.bias = 2.0 / scale + 0.01
         P = np.zeros((3, 4))
         P[:2, :3] = axes[:2] * scale
         P[:2, 3] = -low[:2] * scale
@@ -69,7 +67,7 @@ class Stage:
         depth = np.append(axes[2], -low[2])
         lit_from_behind = geometry.normal @ toward <= 0
         skip = lit_from_behind & ~geometry.both_sides if light.through_walls else None
-        hits = geometry.cast(P, depth, (_SHADOW_MAP, _SHADOW_MAP), None, skip)
+        hits = geometry.cast(P, depth, (SHADOW_MAP, SHADOW_MAP), None, skip)
         # Per piece: texture u v, shadow map x y and depth, height, cosine to the sun, upwardness; affine in (s, t).
         self.table = np.zeros((len(geometry.O), 3, 8), dtype=np.float32)
         self.table[..., :2] = geometry.uv
@@ -81,13 +79,8 @@ class Stage:
         self.table[..., 5] = world[..., 2]
         self.table[..., 6] = geometry.normals @ toward
         self.table[..., 7] = geometry.normals[..., 2]
-        self.shadow: Floats = np.full((_SHADOW_MAP, _SHADOW_MAP), np.inf, dtype=np.float32)
-        if switch.available():
-            compiled.affine(compiled.Seen(*hits.flat(), self.table), 4, self.shadow.reshape(-1))
-        else:
-            met = self.table[hits.piece, :, 4]
-            distance = met[..., 0] + hits.s * met[..., 1] + hits.t * met[..., 2]
-            np.copyto(self.shadow, distance, where=hits.piece >= 0)
+        self.shadow: Floats = np.full((SHADOW_MAP, SHADOW_MAP), np.inf, dtype=np.float32)
+        compiled.affine(compiled.Seen(*hits.flat(), self.table), 4, self.shadow.reshape(-1))
 
     def radiance(self, camera: Camera, offset: tuple[Real, Real]) -> Floats:
         """Linear colour (h, w, 3) along the rays `offset` away from the pixel centres."""
@@ -95,18 +88,15 @@ class Stage:
         out = np.empty((*camera.size, 3), dtype=np.float32)
         beyond = np.flatnonzero(hits.piece.reshape(-1) < 0)
         out.reshape(-1, 3)[beyond] = self._background(camera, offset, beyond)
-        if switch.available():
-            self._shade_compiled(hits, offset, out.reshape(-1, 3))
-        else:
-            self._shade(hits, offset, out.reshape(-1, 3))
+        self._shade(hits, offset, out.reshape(-1, 3))
         return out
 
-    def _shade_compiled(self, hits: Hits, offset: tuple[Real, Real], out: Floats) -> None:
-        """As `_shade`, with the same results: NumPy takes the transcendental functions here too."""
+    def _shade(self, hits: Hits, offset: tuple[Real, Real], out: Floats) -> None:
+        """Linear colour of the pixels (h w, 3) that see a surface; NumPy takes the transcendental functions."""
         geometry, seen = self.geometry, compiled.Seen(*hits.flat(), self.table)
         footprint = compiled.Footprints(np.ones(len(seen.piece), np.float32), np.zeros(len(seen.piece), np.float32))
         count = np.zeros(len(geometry.textures), dtype=np.int64)
-        mapping = compiled.Mapping(self._homography(hits), geometry.texture_size.astype(np.float32), geometry.texture)
+        mapping = compiled.Mapping(self.homography(hits), geometry.texture_size.astype(np.float32), geometry.texture)
         compiled.footprints(seen, hits.piece.shape[1], mapping, footprint, count)
         np.log2(footprint.span, out=footprint.span)
         np.exp(footprint.foot, out=footprint.foot)
@@ -115,69 +105,18 @@ class Stage:
         compiled.group_by_texture(seen.piece, geometry.texture, end - count, index)
         lighting = compiled.Lighting(
             np.array([self.light.sun, self.light.sky], dtype=np.float32), self.shadow, 2 * np.float32(offset[0]),
-            2 * np.float32(offset[1]), float(self._bias), np.float32(self.light.ground_shade),
+            2 * np.float32(offset[1]), float(self.bias), np.float32(self.light.ground_shade),
         )  # fmt: skip
         for i in np.flatnonzero(count).tolist():
             compiled.shade(
                 index[end[i] - count[i] : end[i]], seen, footprint, _picture(geometry.textures[i]), lighting, out
             )
 
-    def _shade(self, hits: Hits, offset: tuple[Real, Real], out: Floats) -> None:
-        index = np.flatnonzero(hits.piece.ravel() >= 0)
-        piece = hits.piece.ravel()[index]
-        order = np.argsort(self.geometry.texture[piece], kind="stable")
-        index, piece = index[order], piece[order]
-        s, t = hits.s.ravel()[index], hits.t.ravel()[index]
-        value = self.table[piece, 0]
-        value += s[:, None] * self.table[piece, 1]
-        value += t[:, None] * self.table[piece, 2]
-        colour = self._albedo(hits, index, piece, s, t, value)
-        colour *= self._irradiance(value, offset)
-        out[index] = colour
-
-    def _albedo(
-        self, hits: Hits, index: NDArray[np.int64], piece: NDArray[np.int32], s: Floats, t: Floats, value: Floats
-    ) -> Floats:
-        """Filtered texture colour (n, 3); level of detail from the pixel's footprint in texels."""
-        geometry = self.geometry
-        rows = self._homography(hits)[piece]
-        w = hits.piece.shape[1]
-        y, x = (index // w).astype(np.float32), (index % w).astype(np.float32)
-        z = 1 / (rows[:, 4] * x + rows[:, 5] * y + rows[:, 6])
-        texel = value[:, :2] * geometry.texture_size.astype(np.float32)[piece]
-        ux, vx = (rows[:, 0] - texel[:, 0] * rows[:, 4]) * z, (rows[:, 2] - texel[:, 1] * rows[:, 4]) * z
-        uy, vy = (rows[:, 1] - texel[:, 0] * rows[:, 5]) * z, (rows[:, 3] - texel[:, 1] * rows[:, 5]) * z
-        a, b, c = ux * ux + uy * uy, ux * vx + uy * vy, vx * vx + vy * vy
-        half = np.sqrt(np.square((a - c) / 2) + b * b)
-        major = np.sqrt((a + c) / 2 + half)
-        minor = np.sqrt(np.maximum((a + c) / 2 - half, 0))
-        lod = np.log2(np.maximum(np.maximum(minor * np.float32(0.6), major / np.float32(_ANISOTROPY)), 1e-6))
-        bounds = np.searchsorted(geometry.texture[piece], np.arange(len(geometry.textures) + 1))
-        colour = np.empty((len(piece), 3), dtype=np.float32)
-        for i, texture in enumerate(geometry.textures):
-            part = slice(bounds[i], bounds[i + 1])
-            if bounds[i] < bounds[i + 1]:
-                colour[part] = texture(value[part, 0], value[part, 1], lod[part])
-        return colour
-
-    def _homography(self, hits: Hits) -> Floats:
+    def homography(self, hits: Hits) -> Floats:
         """From pixel to texel, of each piece (n, 7): rows (2, 2) of the numerator, and G^-1's last, the denominator."""
         uv = self.geometry.uv * self.geometry.texture_size[:, None]
         numerator = np.einsum("nki,nkj->nij", uv[:, [1, 2, 0]], hits.inverse)
         return np.concatenate([numerator[:, :, :2].reshape(-1, 4), hits.inverse[:, 2]], axis=1).astype(np.float32)
-
-    def _irradiance(self, value: Floats, offset: tuple[Real, Real]) -> Floats:
-        """Light (n, 3): the sun where it is not shadowed, and the sky, less towards the ground and near it."""
-        last = _SHADOW_MAP - 1
-        x = np.clip(value[:, 2] + 2 * np.float32(offset[0]) + 0.5, 0, last).astype(np.int32)
-        y = np.clip(value[:, 3] + 2 * np.float32(offset[1]) + 0.5, 0, last).astype(np.int32)
-        lit = value[:, 4] - self.shadow.ravel()[y * _SHADOW_MAP + x] < self._bias
-        sun = np.maximum(value[:, 6], 0) * lit
-        foot = 1 - np.float32(self.light.ground_shade) * np.exp(-np.maximum(value[:, 5], 0) / 0.5)
-        sky = (0.7 + 0.3 * value[:, 7]) * np.where(value[:, 7] > 0.9, 1, foot)
-        light: Floats = sun[:, None] * np.array(self.light.sun, dtype=np.float32)
-        light += sky[:, None] * np.array(self.light.sky, dtype=np.float32)
-        return light
 
     def _background(self, camera: Camera, offset: tuple[Real, Real], index: NDArray[np.int64]) -> Floats:
         """The sky (n, 3) at pixels (n,), at infinity: looked up by azimuth (once round) and elevation."""
@@ -237,12 +176,3 @@ def sun(azimuth: Real, elevation: Real) -> tuple[float, float, float]:
     """The unit direction at an azimuth and elevation in degrees."""
     a, e = np.radians(azimuth), np.radians(elevation)
     return float(np.cos(a) * np.cos(e)), float(np.sin(a) * np.cos(e)), float(np.sin(e))
-
-
-def points_seen(geometry: Geometry, camera: Camera) -> tuple[Matrix, Matrix]:
-    """Pixels (n, 2) whose ray meets a surface, and the world points (n, 3) that they see, exactly."""
-    depth = geometry.depth_map(camera)
-    y, x = np.nonzero(np.isfinite(depth))
-    pixel = np.stack([x, y], -1).astype(np.float64)
-    rays = np.column_stack([pixel, np.ones(len(pixel))]) @ np.linalg.inv(camera.K).T
-    return pixel, (rays * depth[y, x, None] - camera.t) @ camera.R

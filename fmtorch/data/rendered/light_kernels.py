@@ -15,6 +15,7 @@ from fmtorch.data.rendered.raycast_kernels import Index, Real
 Pixels = NDArray[np.uint8]
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
+# The four rays of a pixel share a footprint's long side, so that each filters only a quarter of it.
 _MINOR, _QUARTER, _FINEST = np.float32(0.6), np.float32(0.25), np.float32(1e-6)
 _SKY, _UPWARD, _ROOF = np.float32(0.7), np.float32(0.3), np.float32(0.9)
 
@@ -83,7 +84,7 @@ class Lighting(NamedTuple):
     ground_shade: np.float32
 
 
-@kernel
+@kernel(always_compiled=True)
 def affine(seen: Seen, column: int, out: F4x1) -> None:
     """One column of the table at each pixel (m,) that sees a surface."""
     piece, s, t, table = seen
@@ -93,7 +94,7 @@ def affine(seen: Seen, column: int, out: F4x1) -> None:
             out[p] = table[i, 0, column] + s[p] * table[i, 1, column] + t[p] * table[i, 2, column]
 
 
-@kernel
+@kernel(always_compiled=True)
 def footprints(seen: Seen, width: int, mapping: Mapping, out: Footprints, count: I8x1) -> None:
     """What is known of each pixel before transcendental functions are taken -> out.
 
@@ -123,7 +124,7 @@ def footprints(seen: Seen, width: int, mapping: Mapping, out: Footprints, count:
         foot[p] = -max(height, _ZERO) * _TWO
 
 
-@kernel
+@kernel(always_compiled=True)
 def group_by_texture(piece: I4x1, texture: I4x1, begin: I8x1, index: I4x1) -> None:
     """Pixels that are met, ordered by texture: of each the numbers from `begin` on, which is moved to their end."""
     for p in range(len(piece)):
@@ -147,7 +148,7 @@ def _code(atlas: Pixels, corner: Index, beside: Index, below: Index, right: Real
     return np.uint64(np.rint(fused(left, down, farther - left)))
 
 
-@kernel
+@kernel(always_compiled=True)
 def shade(index: I4x1, seen: Seen, footprint: Footprints, picture: Picture, lighting: Lighting, out: F4x2) -> None:
     """Linear colour of the pixels `index`, which all show one picture -> out (m, 3)."""
     piece, s, t, table = seen

@@ -64,35 +64,9 @@ class Texture:
             self.origin[i] = x + _BORDER - 0.5, y + _BORDER - 0.5
             y += level8.shape[0]
 
-    def __call__(self, u: Floats, v: Floats, lod: Floats) -> Floats:
-        """Linear colour (n, 3) at u, v (1 = the whole picture, any real number) and pyramid level `lod` (n,)."""
-        lod = np.clip(lod, 0.0, self.coarsest)
-        low = lod.astype(np.int32)
-        u, v = u - np.floor(u), v - np.floor(v)
-        fine, coarse = self._at(u, v, low), self._at(u, v, low + 1)
-        coarse -= fine
-        coarse *= (lod - low.astype(np.float32))[:, None]
-        fine += coarse
-        return fine
-
-    def opacity(self, u: Floats, v: Floats, lod: float) -> Floats:
-        """Opacity (n,) in [0, 1], at one pyramid level for all."""
-        level = np.full(u.shape, self.level(lod), dtype=np.int32)
-        return self._lookup(u - np.floor(u), v - np.floor(v), level)[:, 3] * np.float32(1 / 255)
-
     def level(self, lod: float) -> int:
-        """The pyramid level that `opacity` takes."""
+        """The pyramid level at which opacity is looked up."""
         return min(max(int(lod), 0), self.levels - 1)
-
-    def _at(self, u: Floats, v: Floats, level: NDArray[np.int32]) -> Floats:
-        coded = self._lookup(u, v, level)[:, :3]
-        linear: Floats = np.take(TO_LINEAR, coded)
-        return linear
-
-    def _lookup(self, u: Floats, v: Floats, level: NDArray[np.int32]) -> Pixels:
-        x = np.take(self.origin[:, 0], level) + u * np.take(self.scale[:, 0], level)
-        y = np.take(self.origin[:, 1], level) + v * np.take(self.scale[:, 1], level)
-        return bilinear(self.atlas, x, y)
 
 
 def bilinear(picture: Pixels, x: Floats, y: Floats) -> Pixels:

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.data.rendered.mipmap import Floats, Pixels, Real
-from fmtorch.data.rendered.noise import BORDER, add_octave
 
 Rng = np.random.Generator
+_BORDER = 2  # points of a grid of noise beyond each side
 
 
 def rgb(red: Real, green: Real, blue: Real) -> Floats:
@@ -37,14 +37,24 @@ def fractal(rng: Rng, h: int, w: int, coarsest: int = 256, finest: int = 1, roug
         rows, cols = max(1, round(h / step)), max(1, round(w / step))
         grid = rng.standard_normal((rows, cols), dtype=np.float32)
         if step > 1:
-            grid = np.pad(grid, BORDER, mode="wrap" if min(rows, cols) > 1 else "edge")
-            add_octave(total, grid, weight)
-        else:
-            total += np.float32(weight) * grid
+            grid = np.pad(grid, _BORDER, mode="wrap" if min(rows, cols) > 1 else "edge")
+            grid = _enlarged(grid, h, w)
+        total += np.float32(weight) * grid
         weight *= roughness
         step //= 2
     total -= total.mean()
     return total / max(float(total.std()), 1e-6)
+
+
+def _enlarged(grid: Floats, h: int, w: int) -> Floats:
+    """The grid by cubic interpolation, so that its part within the borders has h x w pixels; that part."""
+    (tall, y), (wide, x) = (
+        (round(side / (points - 2 * _BORDER) * points), round(_BORDER * side / (points - 2 * _BORDER)))
+        for side, points in zip((h, w), grid.shape, strict=True)
+    )
+    big = cv2.resize(grid, (wide, tall), interpolation=cv2.INTER_CUBIC)
+    part = big[y : y + h, x : x + w].astype(np.float32)
+    return part if part.shape == (h, w) else cv2.resize(part, (w, h)).astype(np.float32)
 
 
 def plaster(rng: Rng, h: int, w: int, tint: Floats, strength: Real = 1.0) -> Floats:

@@ -13,7 +13,6 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.compiling import switch
 from fmtorch.data.rendered.mipmap import Floats, Pixels
 from fmtorch.data.rendered.pinhole import Camera
 from fmtorch.data.rendered.raycast_kernels import Bounds, Cutouts, Met, Pieces, cast_pieces
@@ -22,7 +21,7 @@ from fmtorch.data.rendered.surfaces import Surfaces
 Matrix = NDArray[np.float64]
 
 NEAR = 0.05  # metres
-_SEAM = 1e-4  # pieces reach this much (of their own extent) beyond their edges, so that neighbours leave no gap
+SEAM = 1e-4  # pieces reach this much (of their own extent) beyond their edges, so that neighbours leave no gap
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -90,50 +89,10 @@ class Geometry:
         s, t = np.zeros((2, h, w), dtype=np.float32)
         hits = Hits(np.full((h, w), -1, dtype=np.int32), s, t, inverse)
         near = -np.inf if centre is None else NEAR
-        if switch.available():
-            self._cast_compiled(pieces, hits, near)
-        else:
-            self._cast(pieces, hits, near)
-        return hits
-
-    def _cast(self, pieces: Pieces, hits: Hits, near: float) -> None:
-        h, w = hits.piece.shape
-        x_axis, y_axis = np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32)
-        buffer = np.full((h, w), np.inf, dtype=np.float32)
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            for i in pieces.order.tolist():
-                x0, y0, x1, y1 = pieces.boxes[i].tolist()
-                view = np.s_[y0:y1, x0:x1]
-                before = buffer[view]
-                if before.max() < pieces.closest[i]:
-                    continue
-                A = pieces.forms[i]
-                rows = A[:, 1:2] * y_axis[: y1 - y0] + A[:, 2:]
-                stq = A[:, 0, None, None] * x_axis[: x1 - x0] + rows[:, :, None]
-                st = stq[:2]
-                st /= stq[2]
-                s, t = st
-                z_s, z_t, z_0 = pieces.depth[i]
-                z = z_s * s + (z_t * t + z_0)
-                hit = (s > -_SEAM) & (t > -_SEAM) & (z < before) & (z > near)
-                if self.triangle[i]:
-                    hit &= s + t < 1 + _SEAM
-                else:
-                    hit &= (s < 1 + _SEAM) & (t < 1 + _SEAM)
-                if not hit.any():
-                    continue
-                if not self.textures[self.texture[i]].opaque:
-                    hit[hit] = self._solid(i, s[hit], t[hit], (x1 - x0, y1 - y0))
-                np.copyto(before, z, where=hit)
-                np.copyto(hits.piece[view], np.int32(i), where=hit)
-                np.copyto(hits.s[view], s, where=hit)
-                np.copyto(hits.t[view], t, where=hit)
-
-    def _cast_compiled(self, pieces: Pieces, hits: Hits, near: float) -> None:
-        """As `_cast`, with the same results."""
-        bounds = Bounds(np.float32(-_SEAM), np.float32(1 + _SEAM), np.float32(near))
+        bounds = Bounds(np.float32(-SEAM), np.float32(1 + SEAM), np.float32(near))
         met = Met(np.full(hits.piece.shape, np.inf, dtype=np.float32), hits.piece, hits.s, hits.t)
         cast_pieces(pieces, self._cutouts(pieces.boxes), bounds, met)
+        return hits
 
     @functools.cached_property
     def _opacity(self) -> tuple[Pixels, NDArray[np.int64]]:
@@ -149,7 +108,7 @@ class Geometry:
         for i in np.flatnonzero((start[self.texture] >= 0) & (boxes[:, :2] < boxes[:, 2:]).all(1)).tolist():
             x0, y0, x1, y1 = boxes[i].tolist()
             texture = self.textures[self.texture[i]]
-            level = texture.level(self._detail(i, (x1 - x0, y1 - y0)))
+            level = texture.level(self.detail(i, (x1 - x0, y1 - y0)))
             place[i] = start[self.texture[i]], texture.atlas.shape[1]
             window[i] = *self.uv[i].T.ravel(), *texture.origin[level], *texture.scale[level]
         return Cutouts(place, window, self._opacity[0])
@@ -171,12 +130,7 @@ class Geometry:
             depth: Matrix = 1.0 / inverse_depth
         return depth
 
-    def _solid(self, i: int, s: Floats, t: Floats, box: tuple[int, int]) -> NDArray[np.bool_]:
-        u, v = (_fused(_fused(a, b, s), c, t) for a, b, c in self.uv[i].T.astype(np.float32))
-        solid: NDArray[np.bool_] = self.textures[self.texture[i]].opacity(u, v, self._detail(i, box)) > 0.5
-        return solid
-
-    def _detail(self, i: int, box: tuple[int, int]) -> float:
+    def detail(self, i: int, box: tuple[int, int]) -> float:
         """The pyramid level at which the opacity of a piece is looked up, whose bounding box has these sides."""
         texels = np.abs(self.uv[i, 1:]).max(0) * self.textures[self.texture[i]].size
         return float(np.log2(max(1.0, (texels / np.array(box)).max())))
@@ -197,12 +151,6 @@ class Geometry:
         boxes[:, :2] = np.floor(boxes[:, :2])
         boxes[:, 2:] = np.ceil(boxes[:, 2:]) + 1
         return np.clip(np.nan_to_num(boxes), 0, [w, h, w, h]).astype(np.int64)
-
-
-def _fused(a: Floats | np.float32, b: np.float32, c: Floats) -> Floats:
-    """a + b c, rounded once to float32."""
-    fused: Floats = (a + b.astype(np.float64) * c).astype(np.float32)
-    return fused
 
 
 def _clip(X: Matrix) -> Matrix:

@@ -63,7 +63,7 @@ class Met(NamedTuple):
     t: F4x2
 
 
-@kernel
+@kernel(always_compiled=True)
 def cast_pieces(pieces: Pieces, cutouts: Cutouts, bounds: Bounds, met: Met) -> None:
     """Casts rays against pieces; what they meet -> met."""
     order, boxes, forms, depth, closest, triangle = pieces

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from fmtorch.data.rendered.mipmap import Pixels, Real, Texture
 
 Vector = NDArray[np.float64]
-VectorLike = Vector | Sequence[Real]
 
 
 def vec(*v: Real) -> Vector:

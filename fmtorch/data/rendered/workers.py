@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import queue
 import subprocess
 import sys
@@ -16,7 +15,7 @@ import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from fmtorch.compiling import process, switch
+from fmtorch.compiling import process
 from fmtorch.compiling.together import compile_together
 from fmtorch.data.rendered.generate import KERNELS, Task, generate
 
@@ -38,7 +37,7 @@ def generate_all(
     done = total - len(missing)
     report = progress or (lambda done, total: None)
     report(done, total)
-    count = min(workers or min(_cores(), _MOST), len(missing))
+    count = min(workers or min(process.cores(), _MOST), len(missing))
     if count <= 1:
         for task, folder in missing:
             generate(task, folder)
@@ -52,8 +51,7 @@ def generate_all(
     processes = [process.start("fmtorch.data.rendered.workers", **_ONE_THREAD) for _ in range(count)]
     threads = [threading.Thread(target=_feed, args=(p, waiting, finished), daemon=True) for p in processes]
     try:
-        if switch.available():  # once, while the workers start, rather than in each of them
-            compile_together(KERNELS)
+        compile_together(KERNELS)  # once, while the workers start, rather than in each of them
         for thread in threads:
             thread.start()
         for _ in missing:
@@ -69,10 +67,6 @@ def generate_all(
             assert worker.stdin is not None
             worker.stdin.close()
             worker.wait()
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _feed(

@@ -14,7 +14,7 @@ from fmtorch.compiling.arrays import Array, F8x1, F8x2, F8x4
 from fmtorch.compiling.kernel import inner, kernel
 from fmtorch.compiling.scratch import vector
 from fmtorch.estimators.calibration import EXACT
-from fmtorch.estimators.families.focal_prior import LOG_USUAL, FocalPrior, focal_prior
+from fmtorch.estimators.families.focal_prior import LOG_USUAL, FocalPrior, focal_prior, prior_slopes
 from fmtorch.estimators.pair import Pair
 from fmtorch.geometry.arithmetic_kernels import exponential, logarithm
 from fmtorch.geometry.pose_kernels import nearest_axes
@@ -90,6 +90,24 @@ def focals_near(F: Array, pair: Pair) -> Array:
     nearest_cameras(F[None], images_of(pair), cameras)
     focals = focals_px(cameras, pair)
     return focals if calibration is None else np.where(np.isinf(calibration.deviations), focals, np.nan)
+
+
+def focal_precision(focals: Array, pair: Pair) -> Array:
+    """The second derivatives (2, 2) of the prior's cost by the logarithms of the focal lengths (2,), px.
+
+    Infinite on the diagonal where a focal length is exactly known; one parameter that both share has the first place.
+    """
+    images, work = images_of(pair), np.empty(5)
+    if pair.calibration is not None:
+        focals = np.where(np.isnan(focals), pair.calibration.focals, focals)
+    f0, f1 = (focals / (images.longest * pair.pixels_per_unit)).tolist()
+    logarithms = np.array([logarithm(f0), logarithm(f1)])
+    prior_slopes(logarithms, images.prior, work)
+    precision = np.array([[work[2], work[4]], [work[4], 0.0 if images.prior.shared else work[3]]])
+    if pair.calibration is not None:
+        exact = np.array(pair.calibration.deviations) < EXACT
+        np.fill_diagonal(precision, np.where(exact, np.inf, precision.diagonal()))
+    return precision
 
 
 class CentredMatches(NamedTuple):

@@ -18,50 +18,80 @@ from fmtorch.geometry.residual_kernels import SAMPSON, Residual
 from fmtorch.geometry.sampson_objective_kernels import LOSSES, NO_TABLE, Weighted, loss_table
 from fmtorch.geometry.seven_point_kernels import seven_point
 
-SQUARINGS = 1  # by which models are made rank 2, whose last singular value is but rounding of float32
 STEP_DAMPING = 1e-10  # of a Gauss-Newton step at an optimum: bounds it where the points leave a direction open
+SQUARINGS = 1  # by which models are made rank 2, whose last singular value is but rounding of float32
 
 
-class Fundamental:
-    """Matrices of rank 2. size: matches of a minimal sample; solutions: models of one sample, at most."""
+class Matrices:
+    """What the families share whose models are matrices of a minimal sample, each by its kernels.
 
-    model: ClassVar[str] = "fundamental"
-    residual: ClassVar[Residual] = SAMPSON
-    fit_scale: ClassVar[FitScale] = FitScale()
+    size, solutions: matches of a minimal sample, and its models at most. minimal: samples -> models. linear: weighted
+    matches -> the model of least squares. gauss_newton: a model -> the model after one step.
+    """
+
     size: ClassVar[int]
     solutions: ClassVar[int]
     minimal: ClassVar[Callable[..., int]]
+    linear: ClassVar[Callable[..., bool]]
+    gauss_newton: ClassVar[Callable[..., None]]
 
     def solve(self, pair: Pair, sample: Array, start: int) -> Hypotheses:
         """As `Family.solve`."""
         F = np.empty((sample.shape[1] * self.solutions, 9), np.float32)
         draw = np.empty(len(F), np.int64)
-        count = type(self).minimal(pair.points, sample, F, draw)
+        count = self.minimal(pair.points, sample, F, draw)
         return Hypotheses(F[:count], draw[:count], sample, start)
+
+    def weight(self, pair: Pair) -> Array:
+        """What each match (n,) counts in `refine`."""
+        weight: Array = pair.weight
+        return weight
+
+    def minimise(self, F: Array, matches: Weighted, schedule: Schedule, out: Array, cost: Array) -> None:
+        """Models (k, 9) of least robust error near F -> out (k, 9), and their costs (k,)."""
+        raise NotImplementedError
+
+    def refine(self, F: Array, pair: Pair, loss: Loss, steps: Steps) -> Array:
+        """As `Refining.refine`."""
+        s2 = np.square(loss.scale / pair.pixels_per_noise)
+        matches = Weighted(pair.points, self.weight(pair), s2, LOSSES[loss.name], loss_table(loss.name))
+        refined, cost = np.empty_like(F), np.empty(len(F))
+        self.minimise(F, matches, Schedule(steps.iterations, steps.damping, steps.tolerance or 0.0), refined, cost)
+        np.copyto(refined, F, where=~np.isfinite(cost)[:, None])
+        return refined
+
+    def least_squares(self, F: Array, pair: Pair, weight: Array) -> Array:
+        """As `Refining.least_squares`."""
+        fitted = np.empty(9)
+        return fitted if self.linear(pair.points, weight, fitted) else F
+
+    def step(self, F: Array, pair: Pair, weight: Array) -> Array:
+        """As `Refining.step`."""
+        moved = np.empty(9)
+        self.gauss_newton(F, squared_error(pair, weight), STEP_DAMPING, moved)
+        return moved if np.isfinite(moved).all() else F
+
+
+def squared_error(pair: Pair, weight: Array) -> Weighted:
+    """Weighted matches, whose errors are squared without bound."""
+    return Weighted(pair.points, weight, np.full(pair.count, np.inf), LOSSES["truncated"], NO_TABLE)
+
+
+class Fundamental(Matrices):
+    """Matrices of rank 2."""
+
+    model: ClassVar[str] = "fundamental"
+    residual: ClassVar[Residual] = SAMPSON
+    fit_scale: ClassVar[FitScale] = FitScale()
+    linear, gauss_newton = weighted_eight_point, gauss_newton
 
     def to_pixels(self, F: Array, pair: Pair, out: Array) -> bool:
         """As `Estimated.to_pixels`, the entry of largest magnitude positive."""
         return to_pixels(F, pair.centre, pair.pixels_per_unit, out)
 
-    def refine(self, F: Array, pair: Pair, loss: Loss, steps: Steps) -> Array:
-        """As `Refining.refine`."""
-        s2 = np.square(loss.scale / pair.pixels_per_noise)
-        refined, cost = np.empty_like(F), np.empty(len(F))
-        matches = Weighted(pair.points, pair.weight, s2, LOSSES[loss.name], loss_table(loss.name))
-        schedule = Schedule(steps.iterations, steps.damping, steps.tolerance or 0.0)
-        refine(F, SQUARINGS, matches, schedule, refined, cost)
-        return np.where(np.isfinite(cost)[:, None], refined, F)
-
-    def least_squares(self, F: Array, pair: Pair, weight: Array) -> Array:
-        """As `Refining.least_squares`: the normalised 8-point algorithm."""
-        fitted = np.empty(9)
-        return fitted if weighted_eight_point(pair.points, weight, fitted) else F
-
-    def step(self, F: Array, pair: Pair, weight: Array) -> Array:
-        """As `Refining.step`."""
-        moved = np.empty(9)
-        gauss_newton(F, _squared_error(pair, weight), STEP_DAMPING, moved)
-        return moved if np.isfinite(moved).all() else F
+    def minimise(self, F: Array, matches: Weighted, schedule: Schedule, out: Array, cost: Array) -> None:
+        """As `Matrices.minimise`."""
+        refine(F, SQUARINGS, matches, schedule, out, cost)
 
 
 class SevenPoint(Fundamental):
@@ -76,13 +106,8 @@ class EightPoint(Fundamental):
     size, solutions, minimal = 8, 1, eight_point
 
 
-def _squared_error(pair: Pair, weight: Array) -> Weighted:
-    """Weighted matches, whose errors are squared without bound."""
-    return Weighted(pair.points, weight, np.full(pair.count, np.inf), LOSSES["truncated"], NO_TABLE)
-
-
 def response_of(F: Array, pair: Pair, weight: Array) -> Array:
     """How the optimum F (9,) moves with the gradient of its cost, (9, 9): minus the inverse Hessian."""
     inverse = np.empty((9, 9))
-    response(F, _squared_error(pair, weight), STEP_DAMPING, inverse)
+    response(F, squared_error(pair, weight), STEP_DAMPING, inverse)
     return inverse if np.isfinite(inverse).all() else np.zeros((9, 9))

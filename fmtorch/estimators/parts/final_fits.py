@@ -143,6 +143,14 @@ def within(F: Array, pair: Pair, scale: float) -> Array:
     return (squared_in_noises(F, pair) <= squared(scale)).astype(np.float64)
 
 
+def scale_of(fit: Fit, pair: Pair) -> float:
+    """The Sampson distance of a match of usual noise from which on it did not count in a fit, px."""
+    if fit.cameras is not None:
+        return FitScale().scale_sigmas * pair.pixels_per_unit / math.sqrt(fit.precision)
+    r2 = squared_in_noises(fit.F, pair)[fit.counted > 0]
+    return math.sqrt(float(r2.max())) if len(r2) else math.nan
+
+
 def squared_in_noises(F: Array, pair: Pair) -> Array:
     """Squared residuals (n,) in squared pixels, of matches of usual noise."""
     r2 = residuals_squared_px(F, pair)

@@ -135,7 +135,7 @@ class GemanMcClure(CodedGains):
 class Magsac(CodedGains):
     """MAGSAC++: the likelihood marginalised over the noise scale (Barath et al., CVPR 2020, section 3.2).
 
-    The gain is ``1 - rho(r) / rho(k sigma_max)``, rho as in `sigma_consensus`, tabulated over r^2 as the authors do.
+    The gain is ``1 - rho(r) / rho(k sigma_max)``, rho as in `magsac`, tabulated over r^2 as the authors do.
     threshold: k sigma_max, Sampson distance, px.
     """
 

@@ -42,7 +42,7 @@ def magsac_cpp(
         ImportError: where `pymagsac` is not installed.
         ValueError: for another sampler.
     """
-    number, library = _sampler(sampler), peer("pymagsac", "MAGSAC++")
+    number, library = _named("sampler", sampler, SAMPLERS), peer("pymagsac", "MAGSAC++")
 
     def solve(pair: Pair) -> Solution:
         (h0, w0), (h1, w1) = pair.size0, pair.size1
@@ -82,7 +82,7 @@ def gc_ransac_cpp(
         ImportError: where `pygcransac` is not installed.
         ValueError: for another sampler.
     """
-    number, library = _sampler(sampler), peer("pygcransac", "GC-RANSAC")
+    number, library = _named("sampler", sampler, SAMPLERS), peer("pygcransac", "GC-RANSAC")
 
     def solve(pair: Pair) -> Solution:
         weights = pair.likelihood.tolist() if number > 2 else []
@@ -167,11 +167,6 @@ def superansac_cpp(
         return solution(F, inliers)
 
     return PairwiseEstimator("SupeRANSAC", solve, best_first=sampler == "prosac")
-
-
-def _sampler(name: str) -> int:
-    """The number of a sampler of `SAMPLERS`; raises ValueError for any other name."""
-    return _named("sampler", name, SAMPLERS)
 
 
 def _named(option: str, name: str, choices: Mapping[str, Part]) -> Part:

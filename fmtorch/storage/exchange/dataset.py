@@ -25,7 +25,7 @@ WITHOUT_GEOMETRY = {"hloc": 0.0, "glue_factory": CORNER, "vismatch": 0.0}
 LAYOUTS = (*WITHOUT_GEOMETRY, *WITH_GEOMETRY)
 
 
-class H5Pairs:
+class H5Pairs(PairDataset):
     """Pairs with given matches, which take the place of features and matcher.
 
     Args:
@@ -88,9 +88,6 @@ class H5Pairs:
 
     def __getitem__(self, index: int) -> ImagePair:
         return self._pairs[index]
-
-    def __iter__(self) -> Iterator[ImagePair]:
-        return iter(self._pairs)
 
 
 def _truth(layout: str, truth: str | Path | None) -> PairDataset:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 from fmtorch.data.pairs import ImagePair, ImageSource
 
@@ -42,12 +42,6 @@ def hloc_keys(name0: str, name1: str) -> Iterator[tuple[str, bool]]:
 def pair_key_of(name0: str, name1: str) -> str:
     """hloc's key of a pair."""
     return next(_keys(name0, name1))
-
-
-def first(names: Iterable[str], stored: Iterable[str]) -> str | None:
-    """The first of the names that is among those stored."""
-    known = stored if isinstance(stored, set | frozenset | dict) else set(stored)
-    return next((name for name in names if name in known), None)
 
 
 def _keys(name0: str, name1: str) -> Iterator[str]:

@@ -17,7 +17,7 @@ from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource, PairDataset
 from fmtorch.data.text_files import DataError
 from fmtorch.storage.exchange import h5
 from fmtorch.storage.exchange.given import Array, Size, given, size_of
-from fmtorch.storage.exchange.names import first, hloc_keys, names_of, pair_keys
+from fmtorch.storage.exchange.names import hloc_keys, names_of, pair_keys
 
 NO_MATCH = -1
 
@@ -136,18 +136,13 @@ def predicted_pairs(truth: PairDataset, path: Path, origin: float) -> Iterator[I
     with h5.opened(path) as file:
         stored = set(_groups(file))
     for pair in truth:
-        keys = dict(reversed(list(pair_keys(pair))))
-        key = first([k for k, _ in pair_keys(pair)] + names_of_pair(pair), stored)
-        if key is None:
-            yield _without(pair, f"{path}: no prediction for the pair {pair.identity}")
+        images = pair.image0, pair.image1
+        for key, swapped in (*pair_keys(pair), (pair.identity, False)):
+            if key in stored:
+                yield dataclasses.replace(pair, matches=PairPrediction(path, key, swapped, images, origin))
+                break
         else:
-            images = pair.image0, pair.image1
-            yield dataclasses.replace(pair, matches=PairPrediction(path, key, keys.get(key, False), images, origin))
-
-
-def names_of_pair(pair: ImagePair) -> list[str]:
-    """Names of a pair as a whole: its identity."""
-    return [pair.identity]
+            yield _without(pair, f"{path}: no prediction for the pair {pair.identity}")
 
 
 def _without(pair: ImagePair, problem: str) -> ImagePair:

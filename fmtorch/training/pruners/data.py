@@ -42,7 +42,9 @@ def labelled_matches(config: DictConfig, progress: Progress) -> Matches:
 
     Raises ValueError where there is nothing to train on or to validate on.
     """
-    photographs = [] if config.planes.photographs is None else _photographs(config)
+    photographs, given = list[Photograph](), config.photographs
+    if config.planes.photographs is not None:
+        photographs = list_photographs(config.planes.photographs, given.sources, given.excluded)
     views = _views(config)
     dataset = _dataset(config, progress)
     training, held_out = _split(dataset, config.validation.scenes)
@@ -95,10 +97,6 @@ def _dataset(config: DictConfig, progress: Progress) -> PairDataset:
         dataset: PairDataset = presets.instantiate(options, "dataset")
         return dataset
     return data.load(**options, progress=reporter(progress, "drawing scenes"))
-
-
-def _photographs(config: DictConfig) -> list[Photograph]:
-    return list_photographs(config.planes.photographs, config.photographs.sources, config.photographs.excluded)
 
 
 def _views(config: DictConfig) -> PlaneViews:

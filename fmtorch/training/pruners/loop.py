@@ -15,12 +15,13 @@ import lightning
 import torch
 from lightning.pytorch.callbacks import Callback, EarlyStopping, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
+from rich.progress import Progress, TaskID
 from torch.utils.data import DataLoader, Dataset
 
 from fmtorch.core.files import replacing
+from fmtorch.core.terminal import progress_bars
 from fmtorch.storage.runs import identity_digest
 from fmtorch.training.pruners.module import PrunerTraining
-from fmtorch.training.pruners.progress import TrainingBar
 
 CHECKPOINTS, BEST, LOGS = "checkpoints", "best.ckpt", "logs"
 SMALLER_IS_BETTER = ("log_loss", "calibration_error")  # figures of validation; of the others larger is
@@ -112,7 +113,7 @@ def train(
             max_steps=total, max_epochs=1, val_check_interval=every, check_val_every_n_epoch=None,
             num_sanity_val_steps=0, log_every_n_steps=min(10, every), default_root_dir=folder,
             logger=TensorBoardLogger(folder, name=LOGS, version=""), use_distributed_sampler=False,
-            callbacks=[best, kept, *stop, TrainingBar(total, monitor), *callbacks],
+            callbacks=[best, kept, *stop, _TrainingBar(total, monitor), *callbacks],
             enable_progress_bar=False, enable_model_summary=False, deterministic=True, **trainer,
         )  # fmt: skip
         if step < total:
@@ -171,3 +172,44 @@ def _quiet() -> Iterator[None]:
     finally:
         for logger, level in zip(loggers, before, strict=True):
             logger.setLevel(level)
+
+
+class _TrainingBar(Callback):
+    """The progress bar of a training, earlier attempts included: steps, loss, and the best figure of validation so far.
+
+    total: steps in all. monitor: the figure of validation that is shown.
+    """
+
+    def __init__(self, total: int, monitor: str) -> None:
+        self.total, self.monitor = total, monitor
+        self._progress: Progress | None = None
+        self._bar: TaskID | None = None
+        self._figure = ""
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Opens the bar, on rank zero."""
+        if trainer.is_global_zero:
+            self._progress = progress_bars()
+            self._progress.start()
+            self._bar = self._progress.add_task("training", total=self.total, completed=trainer.global_step)
+
+    def on_train_batch_end(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Moves the bar."""
+        if self._progress is not None and self._bar is not None:
+            loss = outputs["loss"] if isinstance(outputs, dict) else outputs
+            text = f"training: loss {float(loss):.3f}{self._figure}"
+            self._progress.update(self._bar, completed=trainer.global_step, description=text)
+
+    def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Takes the latest figure into the bar's text."""
+        value = trainer.callback_metrics.get(f"validation/{self.monitor}")
+        if value is not None:
+            self._figure = f", {self.monitor} {float(value):.3f}"
+
+    def teardown(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
+        """Closes the bar, however the training ended."""
+        if self._progress is not None:
+            self._progress.stop()
+            self._progress = None

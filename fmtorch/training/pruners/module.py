@@ -74,7 +74,8 @@ class PrunerTraining(lightning.LightningModule):
         prediction = predict(self.network, batch.correspondences)
         terms = self.objective(prediction, batch, self.global_step)
         if not bool(torch.isfinite(terms["loss"])):
-            raise FloatingPointError(f"the loss of step {self.global_step} is not finite: {_plain(terms)}")
+            values = {name: float(value) for name, value in terms.items()}
+            raise FloatingPointError(f"the loss of step {self.global_step} is not finite: {values}")
         self.log_dict({f"train/{name}": value.detach() for name, value in terms.items()}, batch_size=len(batch))
         return terms["loss"]
 
@@ -101,7 +102,3 @@ class PrunerTraining(lightning.LightningModule):
         adam = torch.optim.Adam(self.network.parameters(), lr=o.learning_rate, weight_decay=o.weight_decay)
         schedule = torch.optim.lr_scheduler.LambdaLR(adam, lambda step: o.factor(step))
         return {"optimizer": adam, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
-
-
-def _plain(terms: dict[str, Tensor]) -> dict[str, float]:
-    return {name: float(value) for name, value in terms.items()}

@@ -30,9 +30,7 @@ class Result:
     temperature: float
 
 
-def write_result(
-    folder: Path, name: str, module: PrunerTraining, facts: Mapping[str, Any], checkpoint: Path | None = None
-) -> Result:
+def write_result(folder: Path, name: str, module: PrunerTraining, facts: Mapping[str, Any]) -> Result:
     """Evaluate the best weights of a training and write them into its folder.
 
     The files are `name` with .safetensors, .md and, where the network can be exported and the extra `export` is
@@ -41,15 +39,14 @@ def write_result(
     Args:
         folder: of the training. name: of the files. module: of the training; takes the best weights.
         facts: what the card says of the training: `data`, `seconds`, `steps`, `processor`, and the identity.
-        checkpoint: whose weights to take instead of the best ones.
 
     Returns:
         What was written.
 
     Raises:
-        FileNotFoundError: there is no such checkpoint.
+        FileNotFoundError: the training has left no weights.
     """
-    best = torch.load(checkpoint or folder / CHECKPOINTS / BEST, map_location="cpu", weights_only=True)
+    best = torch.load(folder / CHECKPOINTS / BEST, map_location="cpu", weights_only=True)
     module.load_state_dict(best["state_dict"])
     network = module.network.to("cpu").eval()
     evaluation = module.validation(network)

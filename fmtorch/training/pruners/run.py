@@ -5,24 +5,31 @@ from __future__ import annotations
 import dataclasses
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import torch
 from lightning import Trainer
 from omegaconf import DictConfig
+from torch.utils.data import DataLoader, Sampler
 
 from fmtorch import presets
 from fmtorch.core.options import Within, expect_options
 from fmtorch.core.terminal import console, progress_bars
 from fmtorch.core.version import __version__
-from fmtorch.pipeline.labelled import Augmentation
+from fmtorch.pipeline.labelled import (
+    Augmentation,
+    Draw,
+    LabelledMatches,
+    SimilarLengthBatches,
+    StoredMatches,
+    collate_trimmed,
+)
 from fmtorch.presets import plain
 from fmtorch.presets.fields import Cache, Count, Gigabytes, Seed, read_fields
 from fmtorch.storage.runs import identity_digest
 from fmtorch.training.planes import PlaneViews
-from fmtorch.training.pruners.batches import training_batches
 from fmtorch.training.pruners.data import labelled_matches
 from fmtorch.training.pruners.loop import claim, train
 from fmtorch.training.pruners.module import Optimisation, PrunerTraining
@@ -162,3 +169,36 @@ def use_of(name: str, options: Mapping[str, Any]) -> Use:
     if unknown or "estimator" not in options:
         raise ValueError(f"validation.uses.{name}: it has `estimator` and may have `threshold`, no {unknown}")
     return Use(presets.build("estimator", str(options["estimator"])), options.get("threshold"))
+
+
+class EndlessBatches(Sampler[list[Draw]]):
+    """Epoch after epoch of `batches`, from the batch of a given step on."""
+
+    def __init__(self, batches: SimilarLengthBatches, step: int) -> None:
+        self.batches, self.step = batches, step
+
+    def __iter__(self) -> Iterator[list[Draw]]:
+        self.batches.set_epoch(0)
+        epoch, start = divmod(self.step, len(self.batches))
+        while True:
+            self.batches.set_epoch(epoch, start)
+            yield from self.batches
+            epoch, start = epoch + 1, 0
+
+
+def training_batches(
+    matches: StoredMatches, batch: int, seed: int, step: int, rank: int = 0, processes: int = 1, *, workers: int = 0
+) -> DataLoader[LabelledMatches]:
+    """A loader of augmented batches from `step` on, which never ends.
+
+    Args:
+        matches: with the augmentation of the training.
+        batch: pairs in a batch of one process. seed: selects batches and augmentation. step: steps done so far.
+        rank, processes: of a distributed training. workers: processes that load; 0: this one.
+    """
+    lengths = None if matches.augmentation is None else matches.augmentation.matches
+    similar = SimilarLengthBatches(matches, batch, seed=seed, matches=lengths, rank=rank, world_size=processes)
+    return DataLoader(
+        matches, batch_sampler=EndlessBatches(similar, step), collate_fn=collate_trimmed, num_workers=workers,
+        persistent_workers=workers > 0,
+    )  # fmt: skip

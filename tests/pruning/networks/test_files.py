@@ -13,7 +13,7 @@ import torch
 from fmtorch.core.types import Correspondences
 from fmtorch.pruning import LearnedPruner
 from fmtorch.pruning.networks import LC
-from fmtorch.pruning.networks.published import ngransac_state
+from scripts.convert_ngransac import ngransac_state
 from tests.conftest import oracle, shared_path
 
 SCRIPT = Path(__file__).resolve().parents[3] / "scripts" / "convert_ngransac.py"

@@ -1,0 +1,243 @@
+"""Evidence for the kinds of an image pair, compiled; see `configuration`. Matches are those of one pair, in pixels."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fmtorch.compiling.arrays import Array, B1x1, F8x1, F8x2
+from fmtorch.compiling.kernel import inner, kernel
+from fmtorch.compiling.scratch import matrix, vector
+from fmtorch.geometry.arithmetic_kernels import logarithm
+from fmtorch.geometry.residual_kernels import HOMOGRAPHY, SAMPSON
+from fmtorch.geometry.rotation_kernels import Cameras, fit_rotation
+
+FREEDOM = 3.0  # degrees, of Student's law: keypoints err by more than the normal one says
+PEAK = 0.36755259694786135  # of that law: 2 / (pi sqrt(3))
+START, COARSEST = 1 / 1500, 1 / 300  # noise that is tried first, and the largest, of the side of an image
+FINEST = 0.1  # px; no keypoint is found more exactly
+LOSS = 3.0  # noises; scale of the loss by which a rotation and a copy are fitted
+STEPS, COPY_STEPS = 20, 8
+NOISE_TOLERANCE, SHARE_TOLERANCE = 0.01, 1e-3  # of the last step: relative, and of a share
+GROUP = 16  # densities of up to some millions, whose product is one of float64
+HALF = 0.5  # of a match that each component has beforehand
+ROOT2 = math.sqrt(2)
+MATCHES, NOISE, LINE, PLANE, BOTH, TURN, COPY, ON_PLANE, ON_LINE, FOCALS, ROTATION, SCALED = (
+    0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 20,
+)  # fmt: skip
+COLUMNS = 23
+of_line, of_plane = SAMPSON.of_match, HOMOGRAPHY.of_match
+
+
+class Matches(NamedTuple):
+    """x0, x1 (n, 2), which are real, mask (n,); P(inlier) and relative noise (n,), empty where unknown."""
+
+    x0: F8x2
+    x1: F8x2
+    mask: B1x1
+    prior: F8x1
+    noise: F8x1
+
+
+class Models(NamedTuple):
+    """F, H (3, 3), zero where there is none; size0, size1: (h, w), empty where unknown."""
+
+    F: F8x2
+    H: F8x2
+    size0: F8x1
+    size1: F8x1
+
+
+@kernel
+def weigh(matches: Matches, models: Models, cameras: Cameras, out: F8x1) -> None:
+    """The log likelihoods of the kinds, and what was fitted for them -> out (COLUMNS,), by the names above."""
+    points, told = matrix(4, len(matches.mask)), matrix(2, len(matches.mask))
+    n = _gather(matches, points, told)
+    points, prior, noise = points[:, :n], told[0, :n], told[1, :n]
+    for k in range(COLUMNS):
+        out[k] = 0.0
+    out[MATCHES] = n
+    if n == 0:
+        return
+    side = _side(points, models.size0, models.size1)
+    has_line, has_plane = np.any(models.F != 0), np.any(models.H != 0)
+    line, plane, r, work = np.full(n, math.inf), np.full(n, math.inf), vector(n), vector(n)
+    s = COARSEST * side
+    if has_line:
+        _distances(models.F.ravel(), points, noise, True, line)
+        s = min(s, _noise(line, prior, side, 1, work))
+    if has_plane:
+        _distances(models.H.ravel(), points, noise, False, plane)
+        s = min(s, _noise(plane, prior, side, 2, work))
+    out[NOISE] = s
+    d, share = np.zeros((2, n)), np.zeros(3)
+    _densities(line, s, side, 1, d[1])
+    out[LINE] = _log_likelihood(d[1:], prior, share)
+    if not has_plane:
+        out[BOTH], out[ON_LINE] = out[LINE], share[1]
+        return
+    _densities(plane, s, side, 2, d[0])
+    out[PLANE] = _log_likelihood(d[:1], prior, share)
+    out[BOTH] = _log_likelihood(d, prior, share)
+    out[ON_PLANE], out[ON_LINE] = share[1], share[2]
+    H = vector(9)
+    _fit_copy(points, noise, plane, s, H)
+    out[SCALED], out[SCALED + 1], out[SCALED + 2] = H[0], H[2], H[5]
+    _distances(H, points, noise, False, r)
+    _densities(r, s, side, 2, d[0])
+    out[COPY] = _log_likelihood(d[:1], prior, share)
+    out[TURN] = -math.inf
+    if cameras.K0[2, 2] != 0:
+        cost = fit_rotation(points, noise, models.H.ravel(), cameras, s, out[FOCALS : ROTATION + 9], H)
+        if math.isfinite(cost):
+            _distances(H, points, noise, False, r)
+            _densities(r, s, side, 2, d[0])
+            out[TURN] = _log_likelihood(d[:1], prior, share) - cost
+
+
+@inner
+def _gather(matches: Matches, points: Array, told: Array) -> int:
+    """The real matches with finite coordinates -> points (4, n), told (2, n): P(inlier) and noise; how many."""
+    x0, x1, mask, prior, noise = matches
+    count = 0
+    for i in range(len(mask)):
+        relative, right = noise[i] if len(noise) else 1.0, prior[i] if len(prior) else 1.0
+        total = x0[i, 0] + x0[i, 1] + x1[i, 0] + x1[i, 1]
+        if mask[i] and math.isfinite(total) and math.isfinite(relative) and relative > 0 and 0 <= right <= 1:
+            points[0, count], points[1, count] = x0[i, 0], x0[i, 1]
+            points[2, count], points[3, count] = x1[i, 0], x1[i, 1]
+            told[0, count], told[1, count] = right, relative
+            count += 1
+    return count
+
+
+@inner
+def _side(points: Array, size0: Array, size1: Array) -> float:
+    """The side of a square as large as the images, in the geometric mean; without sizes, as their matches' boxes."""
+    area = 1.0
+    for image in range(2):
+        size = size0 if image == 0 else size1
+        if len(size):
+            area *= size[0] * size[1]
+        else:
+            for axis in range(2):
+                x = points[2 * image + axis]
+                area *= max(np.max(x) - np.min(x), 1.0)
+    return math.sqrt(math.sqrt(area))
+
+
+@inner
+def _distances(model: Array, points: Array, noise: Array, line: bool, out: Array) -> None:
+    """Squared Sampson distances in squared noises of each match -> out (n,); infinite where there is none."""
+    for i in range(len(out)):
+        x, y, u, v = points[0, i], points[1, i], points[2, i], points[3, i]
+        r2 = of_line(model, x, y, u, v) if line else of_plane(model, x, y, u, v)
+        r2 /= noise[i] * noise[i]
+        out[i] = r2 if r2 < math.inf else math.inf  # what is not a number, too
+
+
+@inner
+def _noise(r2: Array, prior: Array, side: float, dimensions: int, work: Array) -> float:
+    """The noise of right matches beside wrong ones, by expectation and maximisation. work: (n,)."""
+    n, s = len(r2), min(max(START * side, FINEST), COARSEST * side)
+    share = 0.5
+    for _ in range(STEPS):
+        _densities(r2, s, side, dimensions, work)
+        right, spare, squares = 0.0, 0.0, 0.0
+        for i in range(n):
+            p, most = share * prior[i] * work[i], share * prior[i]
+            inverse = 1 / (1 - most + p)
+            spare += (prior[i] - most) * inverse
+            if r2[i] < math.inf:
+                p *= inverse
+                right += p
+                squares += p * r2[i] * (FREEDOM + dimensions) / (FREEDOM + r2[i] / (s * s))
+        share = (right + HALF) / (right + spare + 2 * HALF)
+        last, s = s, min(max(math.sqrt(squares / max(dimensions * right, 1e-9)), FINEST), COARSEST * side)
+        if abs(s - last) < NOISE_TOLERANCE * last:
+            break
+    return s
+
+
+@inner
+def _densities(r2: Array, s: float, side: float, dimensions: int, out: Array) -> None:
+    """Of right matches over that of wrong ones -> out (n,), by Student's law of FREEDOM = 3 degrees.
+
+    Of one dimension, the distance from a line, or of two, from a point; the Sampson distance being that of four
+    coordinates, both are wider across than it by a root of two.
+    """
+    by = 1 / (FREEDOM * s * s)
+    if dimensions == 1:
+        peak = side / ROOT2 * PEAK / s
+        for i in range(len(out)):
+            z = 1 + r2[i] * by
+            out[i] = peak / (z * z)
+    else:
+        peak = side * side / (4 * math.pi * s * s)
+        for i in range(len(out)):
+            z = 1 + r2[i] * by
+            out[i] = peak / (z * z * math.sqrt(z))
+
+
+@inner
+def _log_likelihood(d: Array, prior: Array, share: Array) -> Any:
+    """The maximum over the shares of sum log L -> share (j + 1,), d (j, n) being the densities of right matches.
+
+    A match that the prior takes to be right belongs to one of the j components by their shares, and else is wrong like
+    the others: ``L = 1 - P (w_1 + w_2) + P (w_1 d_1 + w_2 d_2)``.
+    """
+    j, n = d.shape
+    share[0], share[1], share[2] = 1 / (j + 1), 1 / (j + 1), 1 / (j + 1) if j > 1 else 0.0
+    for _ in range(STEPS):
+        spare, on_plane, on_line = 0.0, 0.0, 0.0
+        for i in range(n):
+            p = prior[i] * share[1] * d[0, i]
+            q = prior[i] * share[2] * d[1, i] if j > 1 else 0.0
+            inverse = 1 / (1 - prior[i] * (share[1] + share[2]) + p + q)
+            spare += prior[i] * share[0] * inverse
+            on_plane += p * inverse
+            on_line += q * inverse
+        total = spare + on_plane + on_line + HALF * (j + 1)
+        on_plane, on_line = (on_plane + HALF) / total, (on_line + HALF) / total if j > 1 else 0.0
+        moved = max(abs(on_plane - share[1]), abs(on_line - share[2]))
+        share[0], share[1], share[2] = 1 - on_plane - on_line, on_plane, on_line
+        if moved < SHARE_TOLERANCE:
+            break
+    value, product = 0.0, 1.0
+    for i in range(n):
+        right = share[1] * d[0, i] + (share[2] * d[1, i] if j > 1 else 0.0)
+        product *= 1 - prior[i] * (share[1] + share[2]) + prior[i] * right
+        if i % GROUP == GROUP - 1:
+            value += logarithm(product)
+            product = 1.0
+    return value + logarithm(product)
+
+
+@inner
+def _fit_copy(points: Array, noise: Array, plane: Array, s: float, H: Array) -> None:
+    """x1 = a x0 + b by reweighted least squares of Geman and McClure's loss, from distances to a plane -> H (9,)."""
+    n, limit = len(noise), (LOSS * s) * (LOSS * s)
+    r2 = plane.copy()
+    for k in range(9):
+        H[k] = 0.0
+    H[0], H[4], H[8] = 1.0, 1.0, 1.0
+    for _ in range(COPY_STEPS):
+        total, x, y, u, v = 0.0, 0.0, 0.0, 0.0, 0.0
+        for i in range(n):
+            w = limit / (limit + r2[i]) * (limit / (limit + r2[i])) / (noise[i] * noise[i]) if r2[i] < math.inf else 0.0
+            total += w
+            x, y, u, v = x + w * points[0, i], y + w * points[1, i], u + w * points[2, i], v + w * points[3, i]
+        if not total > 0:
+            return
+        x, y, u, v = x / total, y / total, u / total, v / total
+        across, along = 0.0, 0.0
+        for i in range(n):
+            w = limit / (limit + r2[i]) * (limit / (limit + r2[i])) / (noise[i] * noise[i]) if r2[i] < math.inf else 0.0
+            dx, dy = points[0, i] - x, points[1, i] - y
+            across += w * (dx * (points[2, i] - u) + dy * (points[3, i] - v))
+            along += w * (dx * dx + dy * dy)
+        a = across / along if along > 0 and across > 0 else 1.0
+        H[0], H[4], H[2], H[5] = a, a, u - a * x, v - a * y
+        _distances(H, points, noise, False, r2)

@@ -1,0 +1,159 @@
+"""Which configuration each pair of an estimate is in: what its fundamental matrix is worth."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from fmtorch.core.estimate import CONFIGURATIONS
+from fmtorch.core.threads import one_thread
+from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.geometry.arithmetic import component_sum
+from fmtorch.geometry.configuration import (
+    GENERAL,
+    PLANAR,
+    ROTATION,
+    UNRELATED,
+    Evidence,
+    classified,
+    configuration_evidence,
+)
+from fmtorch.geometry.epipolar import inverse_root
+from fmtorch.geometry.homography_pose import PlanePoses, poses_from_homography
+from fmtorch.pipeline.estimation import estimated
+
+FOCAL_DEVIATION = 0.02
+"""Of the focal lengths of a calibration, relative: what zoom and focus change between two days."""
+USUAL_FOCAL, USUAL_DEVIATION = 1.2, 0.4  # of photographs, in longer sides, and of its logarithm (the estimator's prior)
+SAME_POSE = 1e-3  # radians: two poses of a plane that differ less in rotation are one
+OTHER_CAMERA = 0.5  # deviation of the logarithm of the ratio of both focal lengths (likewise)
+
+
+class Configuration(NamedTuple):
+    """Configurations of B pairs.
+
+    kind: indices into `fmtorch.core.estimate.CONFIGURATIONS`. evidence: for the kinds. homography: of the plane, or of
+    the rotation.
+    """
+
+    kind: Int[Tensor, " b"]
+    evidence: Evidence
+    homography: Estimate
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The kinds in words: general, planar, rotation, identical or unrelated."""
+        return tuple(CONFIGURATIONS[i] for i in self.kind.tolist())
+
+    @property
+    def determined(self) -> Bool[Tensor, " b"]:
+        """Whether the matches determine F: of the general pairs alone."""
+        return self.kind == GENERAL
+
+
+def classify(
+    c: Correspondences,
+    estimate: Estimate,
+    *,
+    focal_deviation: float | int = FOCAL_DEVIATION,
+    seed: int = 0,
+    **options: Any,
+) -> Configuration:
+    """The configuration of each pair, by the evidence of its F, of a homography, a rotation and a copy.
+
+    No threshold is in pixels: likelihoods are compared at the noise that the pair itself shows. Where `c` has both
+    calibrations these decide on rotations, else image sizes, by the prior on usual focal lengths; without either a
+    rotation is called planar.
+
+    Args:
+        c: all matches that were given to the estimator.
+        estimate: their fundamental matrices.
+        focal_deviation: relative deviation of the focal lengths of `c.K0` and `c.K1`; 0 where they are exact.
+        seed: of the homography's random numbers.
+        options: of `find_homography`.
+
+    Returns:
+        A `Configuration`. A pair without F and without H is unrelated.
+
+    Raises:
+        ValueError: for an estimate of another model or of other pairs, or a negative deviation.
+
+    Example:
+        >>> import torch, fmtorch
+        >>> from fmtorch.pipeline.configuration import classify
+        >>> x0 = 600 * torch.rand(100, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        >>> H = torch.tensor([[0.9, 0.1, 20], [-0.1, 1.0, 5], [1e-4, 2e-4, 1]], dtype=torch.float64)
+        >>> x1 = fmtorch.geometry.homography_points(H, x0)                       # one plane
+        >>> mask = torch.ones(1, 100, dtype=torch.bool)
+        >>> c = fmtorch.Correspondences(x0[None], x1[None], mask)
+        >>> classify(c, fmtorch.find_fundamental(x0, x1)).names
+        ('planar',)
+    """
+    if estimate.model != "fundamental":
+        raise ValueError(f"estimate is of {estimate.model} matrices; it must be of fundamental matrices")
+    if len(estimate) != len(c):
+        raise ValueError(f"estimate is of {len(estimate)} pairs and c of {len(c)}; they must be of the same pairs")
+    if not focal_deviation >= 0:
+        raise ValueError(f"focal_deviation is {focal_deviation}; it must not be negative")
+    matches = c.detach().derived(K0=None, K1=None, focal=None, shared_focal=None)
+    H = estimated(matches, "homography", "homography", None, seed, options)
+    K0, K1, precision = _cameras(c, focal_deviation)
+    with one_thread(c.mask.device):
+        evidence = configuration_evidence(
+            estimate.F, H.F, c.x0, c.x1, c.mask, c.prior, c.noise, c.size0, c.size1, K0, K1, precision
+        )
+    exact = None if precision is None else precision.diagonal(dim1=-2, dim2=-1).isinf().all(-1)
+    kind = classified(evidence, exact)
+    return Configuration(torch.where(estimate.ok | H.ok, kind, UNRELATED), evidence, H)
+
+
+def _cameras(c: Correspondences, deviation: float | int) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+    """K0, K1 and the inverse covariance of the logarithms of their focal lengths; None where nothing is known."""
+    if c.K0 is not None and c.K1 is not None:
+        known = torch.full((len(c), 2), torch.inf if deviation == 0 else deviation**-2, dtype=torch.float64)
+        return c.K0, c.K1, torch.diag_embed(known).to(c.K0.device)
+    if c.size0 is None or c.size1 is None:
+        return None, None, None
+    sizes = [size.to(torch.float64) for size in (c.size0, c.size1)]
+    K0, K1 = (_usual(size) for size in sizes)
+    mean = torch.full((2, 2), 1 / 4 / USUAL_DEVIATION**2, dtype=torch.float64, device=K0.device)
+    prior = mean + OTHER_CAMERA**-2 * mean.new_tensor([[1.0, -1.0], [-1.0, 1.0]])
+    return K0, K1, prior.expand(len(c), 2, 2)
+
+
+def _usual(size: Tensor) -> Tensor:
+    """Calibrations (b, 3, 3) of square pixels, a central principal point and the usual focal length."""
+    K = torch.zeros(len(size), 3, 3, dtype=torch.float64, device=size.device)
+    K[:, 0, 0] = K[:, 1, 1] = USUAL_FOCAL * size.amax(-1)
+    K[:, 0, 2], K[:, 1, 2], K[:, 2, 2] = (size[:, 1] - 1) / 2, (size[:, 0] - 1) / 2, 1.0
+    return K
+
+
+def with_configuration(estimate: Estimate, c: Correspondences, seed: int, **options: Any) -> Estimate:
+    """The estimate with the fields `configuration_index`, `homography`, `other_R`, `other_t`; c: all its matches."""
+    judged = classify(c.detach(), estimate.detach(), seed=seed, **options)
+    H, kind = judged.homography, judged.kind
+    flat = H.ok & ((kind == PLANAR) | (kind == ROTATION))
+    fields = {"configuration_index": kind, "homography": torch.where(flat[:, None, None], H.F, 0)}
+    if c.K0 is not None and c.K1 is not None and estimate.R is not None:
+        with one_thread(c.mask.device):
+            poses = poses_from_homography(H.F, c.K0, c.K1, c.x0, c.x1, H.inliers)
+            fields |= _other_pose(estimate.R, poses, flat & (kind == PLANAR))
+    return estimate.derived(**fields)
+
+
+def _other_pose(R: Float[Tensor, "b 3 3"], poses: PlanePoses, flat: Tensor) -> dict[str, Tensor]:
+    """The pose of a plane that is farther from R, as fields; NaN where both are one or the pair is not flat."""
+    trace = component_sum((poses.R * R[:, None].to(poses.R)).flatten(2), -1)
+    rows, other = torch.arange(len(R), device=R.device), trace.argmin(1)
+    apart = 1 - (trace[rows, other] - 1) / 2 > SAME_POSE**2 / 2
+    valid = flat & poses.valid.all(1) & apart
+    t = poses.t[rows, other]
+    t = t * inverse_root(component_sum(t * t, -1))[:, None]
+    return {
+        "other_R": torch.where(valid[:, None, None], poses.R[rows, other], torch.nan).to(R),
+        "other_t": torch.where(valid[:, None], t, torch.nan).to(R),
+    }

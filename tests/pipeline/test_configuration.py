@@ -1,0 +1,67 @@
+"""Configurations of estimated pairs: synthetic ones of each kind, known and unknown cameras, the laws, arguments."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import fmtorch
+from fmtorch import presets
+from fmtorch.core.estimate import CONFIGURATIONS
+from fmtorch.core.types import Correspondences, Estimate, collate
+from fmtorch.pipeline.configuration import classify
+from tests.geometry.kinds import batch, draw
+
+
+def pair(kind: str, seed: int, n: int = 150, **options: float) -> Correspondences:
+    given = batch([draw(kind, seed, n, **options)])  # type: ignore[arg-type]
+    fields = {name: given[name] for name in ("x0", "x1", "mask", "size0", "size1", "K0", "K1")}
+    return Correspondences(**fields, key=torch.tensor([seed]))
+
+
+def estimated(c: Correspondences) -> Estimate:
+    estimate: Estimate = presets.build("estimator", "fmtorch")(c, 0)
+    return estimate
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("kind", CONFIGURATIONS)
+def test_kinds(kind: str, known: bool) -> None:
+    """Of estimated models, with calibrations and by image sizes alone, the cameras being usual ones."""
+    c = collate([pair(kind, seed) for seed in range(20)])
+    c = c if known else c.replace(K0=None, K1=None)
+    found = classify(c, estimated(c))
+    assert found.names.count(kind) >= 19, found.names
+    assert torch.equal(found.determined, torch.tensor([name == "general" for name in found.names]))
+    exact = classify(c, estimated(c), focal_deviation=0)
+    assert exact.names.count(kind) >= 19, exact.names
+
+
+def test_a_rotation_needs_cameras_or_sizes() -> None:
+    c = pair("rotation", 0)
+    assert classify(c, estimated(c)).names == ("rotation",)
+    c = c.replace(K0=None, K1=None, size0=None, size1=None)
+    assert classify(c, estimated(c)).names == ("planar",)
+
+
+def test_laws() -> None:
+    few = pair("general", 9, 5)
+    pairs = [pair(kind, i, 60 + 31 * i) for i, kind in enumerate(CONFIGURATIONS)]
+    c = collate([*pairs[:3], few, *pairs[3:]])
+    found = classify(c, estimated(c))
+    assert found.names == (*CONFIGURATIONS[:3], "unrelated", *CONFIGURATIONS[3:])
+    for i, one in enumerate([*pairs[:3], few, *pairs[3:]]):
+        alone = classify(one, estimated(one))
+        for a, b in zip((alone.kind, *alone.evidence), (found.kind, *found.evidence), strict=True):
+            assert torch.equal(a[0], b[i])
+
+
+def test_wrong_arguments() -> None:
+    c = pair("general", 0)
+    estimate = estimated(c)
+    with pytest.raises(ValueError, match=r"estimate is of homography matrices"):
+        classify(c, fmtorch.find_homography(c.x0, c.x1))
+    with pytest.raises(ValueError, match=r"estimate is of 0 pairs and c of 1"):
+        classify(c, estimate[:0])
+    with pytest.raises(ValueError, match=r"focal_deviation is -1"):
+        classify(c, estimate, focal_deviation=-1)
