@@ -36,10 +36,10 @@ def estimated(
     estimator = _estimator(name, config_dir, options)
     if (gives := model_of(estimator)) != model:
         raise ValueError(f"estimator={name} gives {gives} matrices; find_{model} needs one that gives {model} matrices")
-    return estimated_by(estimator, c, seed)
+    return estimated_by(estimator, c, seed, covariance)
 
 
-def estimated_by(estimator: Estimator, c: Correspondences, seed: int) -> Estimate:
+def estimated_by(estimator: Estimator, c: Correspondences, seed: int, covariance: bool = False) -> Estimate:
     """The same of an estimator that is built, and of values that are known to be right."""
     if not c.asks_for_cameras:
         c = _with_prior(c, estimator)
