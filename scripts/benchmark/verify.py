@@ -31,6 +31,7 @@ from scripts.benchmark.matched import console
 
 METHODS = ("colmap:4", "colmap:1", "ours:stored")
 THRESHOLDS = (1, 5, 10)  # degrees
+RIGHT, WRONG = 5, 10  # degrees, of the pose of a pair
 FEATURES = 4096
 MIN_MODEL = 3  # images
 
@@ -89,7 +90,19 @@ def run(arguments: argparse.Namespace) -> None:
 
 def cells(rows: list[dict[str, Any]]) -> list[str]:
     """The means of the seeds."""
-    digits = {"pairs": 0, "verified": 0, "ms": 2, "rate": 0, "registered": 1, "points": 0, "track": 2, "error": 3}
+    digits = {
+        "pairs": 0,
+        "verified": 0,
+        "ms": 2,
+        "rate": 0,
+        "poses": 0,
+        "right": 0,
+        "wrong": 0,
+        "registered": 1,
+        "points": 0,
+        "track": 2,
+        "error": 3,
+    }
     digits |= {f"auc{limit}": 1 for limit in THRESHOLDS} | {"mapper": 1}
     means = {name: float(np.mean([row.get(name, math.nan) for row in rows])) for name in digits}
     return ["" if math.isnan(means[name]) else f"{means[name]:,.{n}f}" for name, n in digits.items()]
@@ -134,6 +147,7 @@ def measured(
         seconds = min(seconds, verified_by(method, path, seed))
     pairs, verified = counts(path)
     row = {"pairs": pairs, "verified": verified, "ms": 1000 * seconds / pairs, "rate": pairs / seconds}
+    row |= {} if truth is None else two_view_poses(path, truth)
     return row if arguments.no_mapper else row | mapped(path, images, truth, seed)
 
 
@@ -162,6 +176,21 @@ def counts(path: Path) -> tuple[int, int]:
         return len(database.read_num_matches()[0]), len(database.read_two_view_geometry_num_inliers()[0])
 
 
+def two_view_poses(path: Path, truth: Poses) -> dict[str, int]:
+    """How many pairs have a relative pose, and how many of them are right within 5 degrees, or off by more than 10."""
+    import pycolmap
+
+    with pycolmap.Database.open(path) as database:
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        ends = [pycolmap.pair_id_to_image_pair(pair) for pair in database.read_two_view_geometries()[0]]
+        poses = [database.read_two_view_geometry(*pair).cam2_from_cam1 for pair in ends]
+    errors = np.array([
+        _error(pose, truth, names[pair[0]], names[pair[1]])
+        for pose, pair in zip(poses, ends, strict=True) if pose is not None
+    ])  # fmt: skip
+    return {"poses": len(errors), "right": int((errors < RIGHT).sum()), "wrong": int((errors > WRONG).sum())}
+
+
 def mapped(path: Path, images: Path, truth: Poses | None, seed: int) -> dict[str, Any]:
     """The largest model of COLMAP's incremental mapper."""
     import pycolmap
@@ -188,15 +217,15 @@ def accuracy(model: Any, truth: Poses) -> dict[str, float]:
     """AUC, per cent, of the errors of all relative poses: the larger of both angles."""
     poses = {image.name: image.cam_from_world() for image in model.images.values() if image.has_pose}
     errors = [
-        _error(poses[a], poses[b], truth, a, b) if a in poses and b in poses else 180.0
+        _error(poses[b] * poses[a].inverse(), truth, a, b) if a in poses and b in poses else 180.0
         for a, b in itertools.combinations(sorted(truth.R), 2)
     ]
     areas = pose_auc(torch.tensor(errors, dtype=torch.float64), THRESHOLDS).tolist()
     return {f"auc{limit}": 100 * area for limit, area in zip(THRESHOLDS, areas, strict=True)}
 
 
-def _error(first: Any, second: Any, truth: Poses, a: str, b: str) -> float:
-    relative = second * first.inverse()
+def _error(relative: Any, truth: Poses, a: str, b: str) -> float:
+    """The larger of the errors of rotation and direction of translation, in degrees."""
     R = truth.R[b] @ truth.R[a].T
     t = truth.t[b] - R @ truth.t[a]
     given = [torch.tensor(np.array(value)) for value in (relative.rotation.matrix(), relative.translation, R, t)]
