@@ -62,6 +62,15 @@ def estimate(b: int = 4, n: int = 6, seed: int = 0) -> Estimate:
         R=torch.rand(b, 3, 3, generator=g),
         t=torch.rand(b, 3, generator=g),
         focals=torch.rand(b, 2, generator=g),
+        fit_scale=torch.rand(b, generator=g),
+        focal_precision=torch.rand(b, 2, 2, generator=g),
+        covariance=torch.rand(b, 7, 7, generator=g),
+        tangents=torch.rand(b, 3, 2, generator=g),
+        covariance_F=torch.rand(b, 9, 9, generator=g),
+        configuration_index=torch.arange(b) % 5,
+        homography=torch.rand(b, 3, 3, generator=g),
+        other_R=torch.rand(b, 3, 3, generator=g),
+        other_t=torch.rand(b, 3, generator=g),
     )
 
 
