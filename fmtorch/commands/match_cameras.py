@@ -122,7 +122,7 @@ def pose_report(result: MatchResult) -> dict[str, Any]:
     determined = result.ok and bool(torch.isfinite(result.R).all())
     focals = [focal if math.isfinite(focal) else None for focal in result.focals.tolist()]
     R, t = (value.tolist() if determined else None for value in (result.R, result.t))
-    return {"R": R, "t": t, "focals": focals}
+    return {"R": R, "t": t, "focals": focals, "configuration": result.configuration}
 
 
 def pose_line(result: MatchResult) -> str:

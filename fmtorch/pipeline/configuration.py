@@ -145,6 +145,12 @@ def with_configuration(estimate: Estimate, c: Correspondences, seed: int, **opti
     return estimate.derived(**fields)
 
 
+def name_and_warning(estimate: Estimate, c: Correspondences, seed: int) -> tuple[str, str]:
+    """The configuration of a single pair, and what that leaves open."""
+    examined = with_configuration(estimate, c, seed)
+    return examined.configuration[0], examined.warning[0]
+
+
 def _other_pose(R: Float[Tensor, "b 3 3"], poses: PlanePoses, flat: Tensor) -> dict[str, Tensor]:
     """The pose of a plane that is farther from R, as fields; NaN where both are one or the pair is not flat."""
     trace = component_sum((poses.R * R[:, None].to(poses.R)).flatten(2), -1)

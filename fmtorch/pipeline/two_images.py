@@ -20,6 +20,7 @@ from fmtorch.core.types import RELATED, Correspondences, Estimate, Features
 from fmtorch.geometry.verdict import judged
 from fmtorch.pipeline.camera_arguments import Focal, camera_fields
 from fmtorch.pipeline.clock import Clock
+from fmtorch.pipeline.configuration import name_and_warning
 from fmtorch.pipeline.known_cameras import KnownCameras
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pipeline.reduced_images import (
@@ -48,7 +49,7 @@ class MatchResult:
     warning: why F, though found, means little; mostly empty. counts: matches after each step, in order. seconds: of
     each step, cached features with those they took when they were computed.
     R (3, 3), t (3,), focals (2,): X1 = R X0 + t with a t of unit length, and focal lengths in pixels of the
-    photographs, where cameras were asked for; NaN where they are not determined.
+    photographs, where cameras were asked for; NaN where not determined. configuration: then one of `CONFIGURATIONS`.
     """
 
     keypoints0: Float[Tensor, "n0 2"]
@@ -66,6 +67,7 @@ class MatchResult:
     R: Float[Tensor, "3 3"] | None = None
     t: Float[Tensor, " 3"] | None = None
     focals: Float[Tensor, " 2"] | None = None
+    configuration: str = ""
 
     @property
     def related(self) -> bool:
@@ -205,14 +207,17 @@ def _relate(
         counts[name] = len(slots)
     kept = torch.zeros_like(putative.mask[0]).index_fill(0, slots, True)
     estimator = KnownCameras(pipeline.estimator) if cameras else pipeline.estimator
-    estimate: Estimate = judged(estimator(c.replace(**cameras), seed).detach(), c)
+    given = c.replace(**cameras)
+    estimate: Estimate = judged(estimator(given, seed).detach(), c)
     clock("estimation")
+    configuration, warning = name_and_warning(estimate, given, seed) if cameras else ("", "")
     inliers = estimate.inliers[0]
     counts["estimation"] = int(inliers.sum())
+    R, t, focals = (None if value is None else value[0] for value in (estimate.R, estimate.t, estimate.focals))
     return MatchResult(
-        *ends, putative, kept, c, inliers, estimate.F[0].to(torch.float64), estimate.reason[0], _still(c, inliers),
-        counts, clock.seconds, float(cast(Tensor, estimate.significance)[0]),
-        *(None if value is None else value[0] for value in (estimate.R, estimate.t, estimate.focals)),
+        *ends, putative, kept, c, inliers, estimate.F[0].to(torch.float64), estimate.reason[0],
+        _still(c, inliers) or warning, counts, clock.seconds, float(cast(Tensor, estimate.significance)[0]),
+        R, t, focals, configuration,
     )  # fmt: skip
 
 
