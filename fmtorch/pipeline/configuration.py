@@ -11,7 +11,7 @@ from torch import Tensor
 from fmtorch.core.estimate import CONFIGURATIONS
 from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.geometry.arithmetic import component_sum
+from fmtorch.geometry.arithmetic import component_sum, sqrt
 from fmtorch.geometry.configuration import (
     GENERAL,
     PLANAR,
@@ -64,14 +64,15 @@ def classify(
 ) -> Configuration:
     """The configuration of each pair, by the evidence of its F, of a homography, a rotation and a copy.
 
-    No threshold is in pixels: likelihoods are compared at the noise that the pair itself shows. Where `c` has both
-    calibrations these decide on rotations, else image sizes, by the prior on usual focal lengths; without either a
+    No threshold is in pixels: likelihoods are compared at the noise that the pair itself shows. Calibrations
+    and measured focal lengths decide on rotations, else image sizes, by the prior on usual focal lengths; without any a
     rotation is called planar.
 
     Args:
         c: all matches that were given to the estimator.
         estimate: their fundamental matrices.
-        focal_deviation: relative deviation of the focal lengths of `c.K0` and `c.K1`; 0 where they are exact.
+        focal_deviation: relative deviation of the focal lengths of `c.K0` and `c.K1`; 0 where they are exact. Where
+            `c.focal` has a larger one, that counts, and an infinite one is of an unknown focal length.
         seed: of the homography's random numbers.
         options: of `find_homography`.
 
@@ -112,16 +113,36 @@ def classify(
 
 def _cameras(c: Correspondences, deviation: float | int) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
     """K0, K1 and the inverse covariance of the logarithms of their focal lengths; None where nothing is known."""
-    if c.K0 is not None and c.K1 is not None:
-        known = torch.full((len(c), 2), torch.inf if deviation == 0 else deviation**-2, dtype=torch.float64)
-        return c.K0, c.K1, torch.diag_embed(known).to(c.K0.device)
-    if c.size0 is None or c.size1 is None:
+    calibrations, sizes = (c.K0, c.K1), (c.size0, c.size1)
+    if any(K is None and size is None for K, size in zip(calibrations, sizes, strict=True)):
         return None, None, None
-    sizes = [size.to(torch.float64) for size in (c.size0, c.size1)]
-    K0, K1 = (_usual(size) for size in sizes)
-    mean = torch.full((2, 2), 1 / 4 / USUAL_DEVIATION**2, dtype=torch.float64, device=K0.device)
-    prior = mean + OTHER_CAMERA**-2 * mean.new_tensor([[1.0, -1.0], [-1.0, 1.0]])
-    return K0, K1, prior.expand(len(c), 2, 2)
+    device, b = c.mask.device, len(c)
+    deviations = torch.full((b, 2), deviation, dtype=torch.float64, device=device)
+    measured = torch.zeros(b, 2, 2, dtype=torch.float64, device=device) if c.focal is None else c.focal.double()
+    deviations = torch.maximum(deviations, measured[..., 1])
+    cameras = []
+    for i, (K, size) in enumerate(zip(calibrations, sizes, strict=True)):
+        if K is None and c.focal is None:
+            deviations[:, i] = torch.inf
+        cameras.append(_camera(K, size, measured[:, i, 0], deviations[:, i].isfinite()))
+    known = torch.diag_embed(deviations**-2)
+    mean = torch.full((2, 2), 1 / 4 / USUAL_DEVIATION**2, dtype=torch.float64, device=device)
+    usual = mean + OTHER_CAMERA**-2 * mean.new_tensor([[1.0, -1.0], [-1.0, 1.0]])
+    return cameras[0], cameras[1], known + torch.where(deviations.isinf().any(1)[:, None, None], usual, 0.0)
+
+
+def _camera(K: Tensor | None, size: Tensor | None, focal: Tensor, known: Tensor) -> Tensor:
+    """K (b, 3, 3), or that of an image of this size (b, 2) and focal length (b,), px, usual where it is not known."""
+    if K is None:
+        assert size is not None
+        A = _usual(size.to(torch.float64))
+        scale = torch.where(known, focal / A[:, 0, 0], 1.0)
+    else:
+        A = K.to(torch.float64)
+        A = A / A[:, 2:, 2:]
+        longest = (2 * A[:, :2, 2] + 1 if size is None else size.to(A)).amax(1)
+        scale = torch.where(known, 1.0, USUAL_FOCAL * longest / sqrt(A[:, 0, 0] * A[:, 1, 1]))
+    return A * torch.stack([scale, scale, torch.ones_like(scale)], -1)[:, None]
 
 
 def _usual(size: Tensor) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -11,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.core.types import Correspondences, Estimate, collate, pair_key
+from fmtorch.core.types import Correspondences, Estimate, pair_key
 from fmtorch.geometry.configuration import GENERAL, IDENTICAL, PLANAR, ROTATION
 from fmtorch.pipeline.camera_arguments import UNKNOWN
 from fmtorch.pipeline.configuration import FOCAL_DEVIATION, classify
@@ -82,7 +81,8 @@ def geometries(
     assert estimate.R is not None
     known = c.focal[..., 1].isfinite().all(1)
     calibrated = known & estimate.R.isfinite().flatten(1).all(1) & ~_conflicting(c, estimate)
-    kind, homography, rotation = _configurations(c, estimate, seed)
+    configuration = classify(c, estimate, focal_deviation=0, seed=seed)
+    kind, homography, rotation = configuration.kind, configuration.homography, configuration.evidence.R
     kinds = np.where(kind != GENERAL, kind, torch.where(estimate.related, GENERAL, -1))
     results = []
     for i, (pair, what) in enumerate(zip(pairs, kinds.tolist(), strict=True)):
@@ -124,22 +124,3 @@ def _conflicting(c: Correspondences, estimate: Estimate) -> Tensor:
     stored = torch.stack([torch.sqrt(K[:, 0, 0] * K[:, 1, 1]) for K in (c.K0, c.K1)], 1)
     apart = (estimate.focals / stored).log().abs()
     return (apart > MAX_CONFLICT * c.focal[..., 1].clamp_min(FOCAL_DEVIATION)).any(1)
-
-
-def _configurations(c: Correspondences, estimate: Estimate, seed: int) -> tuple[Tensor, Estimate, Tensor]:
-    """Kinds (b,), homographies and rotations (b, 3, 3), pairs being classified by what is known of their cameras."""
-    assert c.focal is not None
-    deviation = c.focal[..., 1].amax(1)
-    kind = torch.zeros(len(c), dtype=torch.int64)
-    rotation = torch.zeros(len(c), 3, 3, dtype=torch.float64)
-    parts, order = [], []
-    for value in sorted(set(deviation.tolist())):
-        rows = torch.nonzero(deviation == value)[:, 0]
-        some = c[rows]
-        some = some.derived(K0=None, K1=None) if math.isinf(value) else some
-        configuration = classify(some, estimate[rows], focal_deviation=value, seed=seed)
-        kind[rows], rotation[rows] = configuration.kind, configuration.evidence.R
-        parts.append(configuration.homography)
-        order += rows.tolist()
-    back = torch.tensor(order).argsort()
-    return kind, collate(parts)[back], rotation

@@ -37,6 +37,22 @@ def test_kinds(kind: str, known: bool) -> None:
     assert exact.names.count(kind) >= 19, exact.names
 
 
+def test_a_focal_length_that_is_not_known_is_that_of_no_calibration() -> None:
+    """Rotations with K whose focal lengths are three times too long, and with measured ones but no K."""
+    pairs = [pair("rotation", seed) for seed in range(10)]
+    c = collate(pairs)
+    assert c.K0 is not None
+    assert c.K1 is not None
+    long = torch.tensor([3.0, 3.0, 1.0])
+    wrong, estimate = c.replace(K0=c.K0 * long, K1=c.K1 * long), estimated(c)
+    assert classify(wrong, estimate).names.count("rotation") <= 2
+    unknown = wrong.replace(focal=torch.tensor([1.0, torch.inf]).expand(len(c), 2, 2).clone())
+    assert classify(unknown, estimate).names.count("rotation") >= 8
+    px = torch.stack([c.K0[:, 0, 0], c.K1[:, 0, 0]], 1)
+    measured = torch.stack([px, torch.full_like(px, 0.01)], -1)
+    assert classify(c.replace(K0=None, K1=None, focal=measured), estimate).names.count("rotation") >= 9
+
+
 def test_a_rotation_needs_cameras_or_sizes() -> None:
     c = pair("rotation", 0)
     assert classify(c, estimated(c)).names == ("rotation",)
