@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from fmtorch.core.types import Correspondences
-from scripts.benchmark.homography import matched, small, warped
+from scripts.benchmark.homography_pairs import matched, small, warped
 
 Array = NDArray[Any]
 FOCAL = 1.2  # of the longer side: of warped photographs, and of the cameras given for copies
