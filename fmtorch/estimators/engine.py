@@ -36,6 +36,7 @@ from fmtorch.estimators.registry import part, thresholds
 from fmtorch.estimators.search import Search
 
 FOCAL_ROUND = 500  # samples of five matches at a time
+CALIBRATED_MATCHES = 6  # that a pair of calibrated cameras needs: five of them have up to ten solutions
 DEFAULT_PRESELECT = Preselect()
 
 
@@ -153,7 +154,9 @@ class HypothesizeAndVerify:
         exact = None if self.focal is None else self.focal.options.exact_focals
         if exact is not None and exact.sqrt_prior:
             c = with_sqrt_prior(c)
-        return estimated(c, seed, self.family.size, self.family, self.estimate, Attached(self.final, self.family))
+        size, attached = self.family.size, Attached(self.final, self.family)
+        calibrated = None if self.focal is None else CALIBRATED_MATCHES
+        return estimated(c, seed, size, self.family, self.estimate, attached, calibrated)
 
     def estimate(self, pair: Pair) -> Solution:
         """Search to fit of one pair."""
