@@ -35,15 +35,15 @@ PRESETS_HEAD = """# Presets
 
 Each preset is a YAML file of `conf/`, with the unit and the source of every value in its comments. A value is replaced
 on the command line, `estimator.threshold=0.5`, or in Python,
-`fmtorch.presets.build("estimator", "msac", threshold=0.5)`. Presets of your own stand in a folder of yours ([Your own parts](../guides/own_parts.md)). This page is written by
-`python scripts/draw_reference.py`.
+`fmtorch.presets.build("estimator", "msac", threshold=0.5)`. Presets of your own stand in a folder of yours
+([Your own parts](../guides/own_parts.md)). This page is written by `python scripts/draw_reference.py`.
 """
 COMMANDS_HEAD = """# Command line
 
 `fmtorch COMMAND` is the same as `python -m fmtorch.COMMAND`. Options are `NAME=VALUE`; groups, such as
-`estimator=lmeds`, take a [preset](presets.md), and their values are set by path, `estimator.threshold=0.5`. `-m` runs a sweep over values
-that are separated by commas; `--config-dir FOLDER` adds presets of your own. A value of `null` is none. This page is
-written by `python scripts/draw_reference.py`.
+`estimator=lmeds`, take a [preset](presets.md), and their values are set by path, `estimator.threshold=0.5`. `-m` runs a
+sweep over values that are separated by commas; `--config-dir FOLDER` adds presets of your own. A value of `null` is
+none. This page is written by `python scripts/draw_reference.py`.
 """
 
 
