@@ -2,7 +2,7 @@
 
 python scripts/download.py                                        lists what there is
 python scripts/download.py dataset=tum folder=TUM                 the paper's test sequences, unpacked; can be continued
-python scripts/download.py dataset=tum files=[freiburg1_xyz]      others; docs/data.md says what each set is
+python scripts/download.py dataset=tum files=[freiburg1_xyz]      others; docs/guides/data.md says what each set is
 python scripts/download.py dataset=kitti                          what to do where a form must be filled in
 python scripts/download.py weights=affnet                         -> weights/AffNet.pth
 python scripts/download.py weights=hardnet++ sha256=HEX           for a file whose SHA-256 is not pinned here

@@ -28,7 +28,7 @@ ALLOWED: dict[tuple[str, str], str] = {}
 """(file, name): the reason why it may stay."""
 PEERS = "estimators/peers/"  # others' estimators
 ROOMS = ("estimators", "geometry", "matching", "metrics", "pruning")
-NETWORKS = ("pruning/networks/", "pruning/code/")  # values that agree to rounding only, docs/conventions.md
+NETWORKS = ("pruning/networks/", "pruning/code/")  # values that agree to rounding only, docs/concepts/conventions.md
 
 
 def trees() -> Iterator[tuple[str, ast.Module]]:

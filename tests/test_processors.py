@@ -1,7 +1,7 @@
 """The same bits on an older processor: code for one with AVX2 and FMA but without AVX-512, in kernels and libraries.
 
 The other process compiles kernels for Haswell, into a cache of its own, and has torch, MKL and NumPy take their code
-for AVX2. docs/conventions.md says what is promised.
+for AVX2. docs/concepts/conventions.md says what is promised.
 """
 
 from __future__ import annotations

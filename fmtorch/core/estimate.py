@@ -12,7 +12,7 @@ from torch import Tensor
 from fmtorch.core.records import Index, Record, as_index, expect_fields
 
 RELATED = 1.0
-"""The significance from which on two images are called related; chosen on tuning pairs (docs/related.md)."""
+"""The significance from which on two images are called related; chosen on tuning pairs (docs/concepts/related.md)."""
 
 CONFIGURATIONS = ("general", "planar", "rotation", "identical", "unrelated")
 WARNINGS = {

@@ -5,8 +5,8 @@ chosen on tuning data, and marked on the curves of test data.
 
 python -m scripts.benchmark curves --root DATA/Strecha_train --root DATA/TanksLike --rendered full --split train \\
     --limit 60 --json tuning.json
-python -m scripts.benchmark curves --root DATA/Strecha --root DATA/KITTI --knees tuning.json --svg docs/curves.svg \\
-    --update docs/estimators.md
+python -m scripts.benchmark curves --root DATA/Strecha --root DATA/KITTI --knees tuning.json \\
+    --svg docs/appendix/estimators_curves.svg --update docs/appendix/estimators.md
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Whole pipelines by stage against the same stages written with OpenCV's and kornia's calls, one thread each.
 
-python -m scripts.benchmark end_to_end --root DATA/Strecha --limit 6 --markdown docs/features.md
+python -m scripts.benchmark end_to_end --root DATA/Strecha --limit 6 --markdown docs/appendix/features.md
 
 Ours and the peer take turns at each pair; medians of processor time are shown. The peer of `hesaffnet_gms` has kornia's
 Hessian detector, AffNet and HardNet (the same networks with random weights, which cost the same) for as many features

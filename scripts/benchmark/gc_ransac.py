@@ -1,6 +1,6 @@
 """What GC-RANSAC the paper ran: variants on the same matches, beside its figures.
 
-python -m scripts.benchmark gc_ransac --root DATA/KITTI --root DATA/TUM --limit 24 --markdown docs/paper.md
+python -m scripts.benchmark gc_ransac --root DATA/KITTI --root DATA/TUM --limit 24 --markdown docs/appendix/paper.md
 
 Matches are those of VLFeat's SIFT with the ratio test at 0.8. The releases of the authors' software differ in which
 matches count at a threshold t: those of a residual below 3.72 t in the first (its weight exp(-r^2 / 2t^2) is above

@@ -2,7 +2,7 @@
 
 python -m scripts.benchmark learned --root DATA/Strecha --root DATA/KITTI --json FILE.jsonl
 python -m scripts.benchmark learned --rendered full --limit 50 --json FILE.jsonl
-python -m scripts.benchmark learned --from FILE.jsonl FILE.jsonl --markdown docs/learned.md
+python -m scripts.benchmark learned --from FILE.jsonl FILE.jsonl --markdown docs/appendix/learned.md
 python -m scripts.benchmark learned --ngransac FILE.safetensors ...  # also NG-RANSAC's published weights, as a prior
 python -m scripts.benchmark learned --network "seed 1=FILE.safetensors" ...      # also other trainings of `lc`
 

@@ -2,7 +2,7 @@
 
 python -m scripts.benchmark paper --root DATA/KITTI --root DATA/TUM --root DATA/Strecha --json paper.jsonl
 python -m scripts.benchmark paper --rendered small --json paper.jsonl
-python -m scripts.benchmark paper --from paper.jsonl --markdown docs/paper.md
+python -m scripts.benchmark paper --from paper.jsonl --markdown docs/appendix/paper.md
 
 All get the same matches: VLFeat's SIFT, as in the paper, with a ratio test at 0.8; RANSAC also gets OpenCV's SIFT, to
 compare the matches. --json is appended to batch by batch: started again, the command goes on where it was interrupted.

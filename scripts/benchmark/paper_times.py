@@ -1,6 +1,6 @@
 """The runtime table of the paper's supplement: ours on this processor, one thread, beside its figures.
 
-python -m scripts.benchmark paper_times --root DATA/KITTI --limit 20 --markdown docs/paper.md
+python -m scripts.benchmark paper_times --root DATA/KITTI --limit 20 --markdown docs/appendix/paper.md
 
 Features: of one image, detection included. Pruners and estimators: of the matches of one pair (VLFeat's SIFT, ratio
 test at 0.8), one pair a call. Methods of a stage take turns; the medians of processor time are shown.

@@ -2,7 +2,7 @@
 
 python -m scripts.benchmark pipelines --root DATA/Strecha --root DATA/PhotoTourism --json features.jsonl
 python -m scripts.benchmark pipelines --rendered full --limit 40 --json features.jsonl
-python -m scripts.benchmark pipelines --from features.jsonl --markdown docs/features.md
+python -m scripts.benchmark pipelines --from features.jsonl --markdown docs/appendix/features.md
 
 --json is appended to batch by batch: started again, the command goes on where it was interrupted. A row counts only
 for the learned files and options that it was made with.

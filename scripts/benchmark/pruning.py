@@ -1,7 +1,7 @@
 """Pruners on the same matches with RANSAC: recall, inlier rates and counts before and after estimation.
 
 python -m scripts.benchmark pruning --root DATA/Strecha --root DATA/KITTI --rendered small --json FILE
-python -m scripts.benchmark pruning --from FILE FILE --markdown docs/pruning.md
+python -m scripts.benchmark pruning --from FILE FILE --markdown docs/appendix/pruning.md
 python -m scripts.benchmark pruning --contrib-python ENVIRONMENT/bin/python      # also times GMS against OpenCV's
 
 ASIFT features take a minute a pair: --asift-limit pairs of each family have them, by default 10.

@@ -1,8 +1,9 @@
 """The verdict on pairs of one scene and of different scenes: shares accepted and rejected, and ROC.
 
 python -m scripts.benchmark related --root DATA/Strecha --root DATA/PhotoTourism --root DATA/KITTI --root DATA/TUM \
-    --folder related/test --update docs/related.md
-python -m scripts.benchmark related --folder related/test --update docs/related.md --figure docs/related.svg
+    --folder related/test --update docs/appendix/related.md
+python -m scripts.benchmark related --folder related/test --update docs/appendix/related.md \
+    --figure docs/appendix/related.svg
 
 The second line shows what the folder holds. It keeps features, matches and rows: started again, the command goes on
 where it was interrupted. Take another folder for other code or other options.

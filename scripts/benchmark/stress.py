@@ -1,8 +1,8 @@
 """Where estimators fail: sweeps of inlier ratio, noise and number of matches, and conditions that hurt.
 
 python -m scripts.benchmark stress --root DATA/Strecha --root DATA/PhotoTourism --root DATA/KITTI --root DATA/TUM \\
-    --rendered full --json stress.jsonl --update docs/stress.md
-python -m scripts.benchmark stress --from stress.jsonl --update docs/stress.md
+    --rendered full --json stress.jsonl --update docs/appendix/stress.md
+python -m scripts.benchmark stress --from stress.jsonl --update docs/appendix/stress.md
 
 --json is appended to pair by pair: started again, the command goes on where it was interrupted, and measures what more
 seeds need. A row counts only for the code, options and learned files that it was made with. `sizeless` among an

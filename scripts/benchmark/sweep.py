@@ -1,6 +1,6 @@
 """Runs of `fmtorch.eval` in one table: a line for each family and pipeline, of pairs that all runs of a data set have.
 
-python -m scripts.benchmark sweep runs --against code_lmeds sift_code_lmeds --markdown docs/paper.md
+python -m scripts.benchmark sweep runs --against code_lmeds sift_code_lmeds --markdown docs/appendix/paper.md
 
 --against adds the differences of all other pipelines to these, on the pairs that both have.
 """

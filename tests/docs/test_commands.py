@@ -31,7 +31,11 @@ from tests.processes import run_command
 from tests.storage.exchange import writers
 
 SOURCE = Path(__file__).resolve().parents[2]
-PAGES = ["README.md", "CONTRIBUTING.md", *(f"docs/{path.name}" for path in sorted((SOURCE / "docs").glob("*.md")))]
+PAGES = [
+    "README.md",
+    "CONTRIBUTING.md",
+    *(path.relative_to(SOURCE).as_posix() for path in sorted((SOURCE / "docs").rglob("*.md"))),
+]
 SETS = ("Strecha", "PhotoTourism", "KITTI", "TUM", "Strecha_train", "TanksLike")
 
 ELSEWHERE = {

@@ -1,4 +1,4 @@
-"""The parts of docs/own_parts.md, saved in an empty folder, are evaluated by the page's command, together and alone."""
+"""The parts of docs/guides/own_parts.md, saved in an empty folder, are evaluated by its command, together and alone."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.laws import scene
 from tests.processes import run_command
 
 SOURCE = Path(__file__).resolve().parents[2]
-PAGE = (SOURCE / "docs" / "own_parts.md").read_text(encoding="utf-8")
+PAGE = (SOURCE / "docs" / "guides" / "own_parts.md").read_text(encoding="utf-8")
 
 
 @pytest.fixture

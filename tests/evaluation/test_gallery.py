@@ -21,7 +21,7 @@ from fmtorch.presets.composition import compose
 from fmtorch.storage import PairRow, RunFolder, to_table
 from tests.pipeline.test_pipeline import draw
 
-DOCS = Path(__file__).resolve().parents[2] / "docs" / "report.md"
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "guides" / "reports.md"
 F = np.array([0, 0, 0, 0, 0, -1, 0, 1, 0]) / np.sqrt(2)
 
 

@@ -52,8 +52,8 @@ def root(tmp_path: Path) -> Path:
 
 
 def documented(title: str) -> list[str]:
-    """The code blocks of a section of docs/training.md."""
-    page = (Path(__file__).resolve().parents[2] / "docs" / "training.md").read_text()
+    """The code blocks of a section of docs/guides/training.md."""
+    page = (Path(__file__).resolve().parents[2] / "docs" / "guides" / "training.md").read_text()
     section = re.split(r"^## ", page.partition(f"## {title}\n")[2], flags=re.MULTILINE)[0]
     return re.findall(r"```\w+\n(.*?)```", section, flags=re.DOTALL)
 

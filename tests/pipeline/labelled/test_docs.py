@@ -13,7 +13,7 @@ from fmtorch.data.rendered import RenderedPairs
 from fmtorch.data.rendered import dataset as rendered_dataset
 from tests.pipeline.labelled.conftest import FAMILY, TINY
 
-PAGE = Path(__file__).resolve().parents[3] / "docs" / "training.md"
+PAGE = Path(__file__).resolve().parents[3] / "docs" / "guides" / "training.md"
 
 
 @pytest.mark.skipif(not PAGE.is_file(), reason="the documentation is in a checkout only")
