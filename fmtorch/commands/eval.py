@@ -77,13 +77,13 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
         earlier = f"{len(pairs) - len(todo)} of {len(pairs)} pairs taken from an earlier run in {folder.path}"
         console.print(earlier, markup=False, highlight=False)
     table = folder.read({pair.key for pair in pairs})
-    summary = _summarize(table, folder, pipeline_name, dataset.name)
+    summary = _summarize(table, folder, f"{pipeline_name} on {dataset.name}")
     if journal is not None:
         ends = [(p.image0.path, p.image1.path) for p in pairs if exportable(p)]
         written = write_exports(journal, ends, exports, folder.path)
-        console.print(f"[dim]{folder.path}: {', '.join(written)}; names of images are below {journal.root}[/dim]")
+        console.print(f"{folder.path}: {', '.join(written)}; names of images are below {journal.root}", style="dim")
     if isinstance(pipeline.extractor, CachedFeatures):
-        console.print(f"[dim]{pipeline.extractor.report()}[/dim]")
+        console.print(pipeline.extractor.report(), style="dim")
     if pairs and summary[ALL]["failures"] == len(pairs):
         reason = next(iter(table["reason"].to_pylist()))
         raise ValueError(
@@ -127,16 +127,19 @@ def _evaluated(
     )  # fmt: skip
 
 
-def _summarize(table: pa.Table, folder: RunFolder, pipeline_name: str, dataset_name: str) -> dict[str, Group]:
-    """The summary of a run's rows, written to its folder with the recall curve, and shown."""
-    title = f"{pipeline_name} on {dataset_name}"
+def _summarize(table: pa.Table, folder: RunFolder, title: str) -> dict[str, Group]:
+    """The summary of the rows asked for, which is shown; that of all rows of the run goes to its folder."""
+    whole = folder.read()
     summary = summarize(table)
-    folder.write_summary(summary, summary_markdown(summary, title=title))
-    plot_recall_curves({pipeline_name: table}, folder.path / "recall.png")
-    console.print(summary_table(summary, title=title))
+    all_rows = summary if len(whole) == len(table) else summarize(whole)
+    folder.write_summary(all_rows, summary_markdown(all_rows, title=title))
+    plot_recall_curves({title.partition(" ")[0]: whole}, folder.path / "recall.png")
+    part = "" if len(whole) == len(table) else f", {len(table)} of the {len(whole)} pairs of the run"
+    console.print(summary_table(summary, title=f"{title}{part}"))
     if (poses := pose_table(summary)) is not None:
         console.print(poses)
-    console.print(f"[dim]{folder.path}: pairs/, summary.json, summary.md, recall.png[/dim]")
+    about = f"; of all {len(whole)} pairs" if part else ""
+    console.print(f"{folder.path}: pairs/, summary.json, summary.md, recall.png{about}", style="dim")
     return summary
 
 

@@ -15,15 +15,14 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from numpy.typing import NDArray
 from omegaconf import DictConfig
-from rich.console import Console
 from rich.table import Table
 
 from fmtorch import presets
 from fmtorch.commands.main import job, run_command
 from fmtorch.commands.match_cameras import CameraFields, photographs, pose_line, pose_report
 from fmtorch.commands.match_folder import FolderFields, match_folder
-from fmtorch.core.files import replacing
-from fmtorch.core.terminal import console
+from fmtorch.core.files import expect_writable, replacing
+from fmtorch.core.terminal import console, errors
 from fmtorch.core.types import RELATED
 from fmtorch.core.version import __version__
 from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_matches
@@ -34,6 +33,8 @@ from fmtorch.pipeline.reduced_images import Image
 from fmtorch.pipeline.two_images import MatchResult, match
 from fmtorch.presets.fields import Cache, Gigabytes, path_fields, read_fields
 from fmtorch.storage.features import CachedFeatures
+
+MAX_RANK3 = 0.01  # third singular value of a true F over the second one: its numbers may be rounded
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +67,8 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     truth = None if fields.truth is None else read_matrix(fields.truth)
     given = photographs(paths, fields.cameras, fields.K, fields.orient)
     image0, image1 = given.images
+    folder = fields.output or Path(f"matches/{paths[0].stem}-{paths[1].stem}")
+    expect_writable(folder)
     pipeline: Pipeline = presets.build_pipeline(config, presets.resolve_device(fields.device))
     result = match(
         image0, image1, pipeline=pipeline, longest_side=fields.longest_side, seed=fields.seed, **given.knowledge
@@ -75,8 +78,6 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
         "image0": str(paths[0]), "image1": str(paths[1]),
         **_report(result, image0, image1, truth), **pose_report(result),
     }  # fmt: skip
-    folder = fields.output or Path(f"matches/{paths[0].stem}-{paths[1].stem}")
-    folder.mkdir(parents=True, exist_ok=True)
     with replacing(folder / "result.json") as path:
         path.write_text(json.dumps(report) + "\n")
     written = ["result.json", *_draw(folder, result, image0, image1, truth)]
@@ -88,10 +89,10 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     if line := pose_line(result):
         console.print(line, highlight=False)
     for trouble in (*given.notes, *_troubles(result)):
-        Console(stderr=True).print(f"[bold]{trouble}[/bold]", highlight=False, soft_wrap=True)
-    console.print(f"[dim]{folder}: {', '.join(written)}[/dim]", highlight=False)
+        errors.print(trouble, style="bold", highlight=False, soft_wrap=True)
+    console.print(f"{folder}: {', '.join(written)}", style="dim", highlight=False)
     if isinstance(pipeline.extractor, CachedFeatures):
-        console.print(f"[dim]{pipeline.extractor.report()}[/dim]", highlight=False)
+        console.print(pipeline.extractor.report(), style="dim", highlight=False)
     return folder
 
 
@@ -107,7 +108,11 @@ def read_matrix(path: Path) -> NDArray[np.float64]:
         raise ValueError(f"{path}: {error}; it must hold nine numbers, F row by row") from error
     if numbers.shape != (9,) or not np.isfinite(numbers).all() or not numbers.any():
         raise ValueError(f"{path}: holds {len(words)} numbers; it must hold nine finite ones, F row by row")
-    return numbers.reshape(3, 3)
+    F = numbers.reshape(3, 3)
+    singular = np.linalg.svd(F, compute_uv=False)
+    if singular[2] > MAX_RANK3 * singular[1]:
+        raise ValueError(f"{path}: a matrix of rank three (its determinant is not 0); F has rank two")
+    return F
 
 
 def _given(path: Path | None, name: str) -> Path:

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Literal
 
 from omegaconf import DictConfig
-from rich.console import Console
 
 from fmtorch import presets
-from fmtorch.core.terminal import console, progress_bars
+from fmtorch.core.terminal import console, errors, progress_bars
 from fmtorch.pipeline.folder import FolderMatches, chosen_pairs, images_below, open_folder
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets.fields import Count, Device, Seed
@@ -60,14 +59,14 @@ def match_folder(config: DictConfig, fields: FolderFields, pipeline_name: str, o
         for _ in work.each(pairs):
             progress.advance(bar)
     for trouble in work.troubles:
-        Console(stderr=True).print(trouble, style="bold", markup=False, highlight=False, soft_wrap=True)
+        errors.print(trouble, style="bold", markup=False, highlight=False, soft_wrap=True)
     if work.taken:
         console.print(f"{work.taken} of {len(pairs)} pairs taken from an earlier run", highlight=False)
     if work.troubles and not work.done + work.taken:
         raise ValueError(f"no pair could be matched, the first because: {work.troubles[0]}")
     console.print(f"{work.related} of {len(pairs)} pairs show one scene", highlight=False)
     written = ["export.json", *write_exports(journal, pairs, kinds, output, fields.camera == "shared")]
-    console.print(f"[dim]{output}: {', '.join(written)}[/dim]", highlight=False)
+    console.print(f"{output}: {', '.join(written)}", style="dim", highlight=False)
     if isinstance(pipeline.extractor, CachedFeatures):
-        console.print(f"[dim]{pipeline.extractor.report()}[/dim]", highlight=False)
+        console.print(pipeline.extractor.report(), style="dim", highlight=False)
     return output

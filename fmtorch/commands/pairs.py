@@ -186,7 +186,7 @@ def _tell(construction: Construction, summary: dict[str, int], problems: list[st
             f"{len(problems)} candidates or images cannot be used{_first(problems)}", markup=False, highlight=False
         )
     console.print(
-        f"[dim]python -m fmtorch.eval dataset=fmbench dataset.root={construction.folder}[/dim]", highlight=False
+        f"python -m fmtorch.eval dataset=fmbench dataset.root={construction.folder}", style="dim", highlight=False
     )
 
 

@@ -11,12 +11,11 @@ from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-from rich.console import Console
 from rich.table import Table
 
 from fmtorch import presets
 from fmtorch.commands.main import job, run_command
-from fmtorch.core.terminal import console, progress_bars, reporter
+from fmtorch.core.terminal import console, errors, progress_bars, reporter
 from fmtorch.pipeline.database_pairs import Cameras
 from fmtorch.pipeline.verification import Places, verify_by
 from fmtorch.pipeline.verification_run import Verification
@@ -48,11 +47,11 @@ def run(config: DictConfig, estimator: str) -> Verification:
         settings = {"estimator": plain(config.estimator)}
         result = verify_by(built, settings, places, fields.cameras, fields.force, fields.seed, report)
     for problem in result.problems[:MAX_PROBLEMS]:
-        Console(stderr=True).print(problem, style="bold", markup=False, highlight=False, soft_wrap=True)
+        errors.print(problem, style="bold", markup=False, highlight=False, soft_wrap=True)
     if len(result.problems) > MAX_PROBLEMS:
-        Console(stderr=True).print(f"and {len(result.problems) - MAX_PROBLEMS} more", highlight=False)
+        errors.print(f"and {len(result.problems) - MAX_PROBLEMS} more", highlight=False)
     console.print(_table(result))
-    console.print(f"[dim]{result.path}[/dim]", highlight=False)
+    console.print(str(result.path), style="dim", highlight=False)
     return result
 
 

@@ -58,6 +58,8 @@ def read_image(source: ImageSource | Path | str, *, orient: bool = False) -> NDA
 def _decoded(path: Path, orient: bool) -> NDArray[np.uint8]:
     """The pixels of a file."""
     try:
+        if path.exists() and not (path.is_file() or path.is_dir()):  # a pipe waits, a device never ends
+            raise ImageError(f"{path}: no regular file; it must be an image file")
         data = path.read_bytes()
     except OSError as error:
         raise ImageError(f"{path}: cannot be read ({error.strerror}); it must be an image file") from error

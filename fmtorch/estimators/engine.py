@@ -144,6 +144,11 @@ class HypothesizeAndVerify:
         return WITH_FOCALS if self.focal is not None else ()
 
     @property
+    def gradients_reach(self) -> tuple[str, ...]:
+        """The fields of `Correspondences` that gradients of the estimate reach."""
+        return Attached(self.final, self.family).reached
+
+    @property
     def uses_prior(self) -> bool:
         """Whether a prior makes a difference to the search."""
         return getattr(self.sampler, "uses_prior", False) or getattr(self.score, "prior_weighted", False)
