@@ -26,11 +26,15 @@ import pyarrow.parquet as pq
 from fmtorch.core.files import naming, replacing, sync, temporary_name
 from fmtorch.storage.rows import PAIR_SCHEMA, PairRow, to_table
 
-FORMAT = 3  # of the folder; to be raised when the schema changes, or what the identity tells
-READABLE = (1, 2, FORMAT)  # formats that `load` reads; 1 lost the order of the pruners, 2 had no errors of poses
-_LACKS = {1: "the order of the pruners and the errors of poses", 2: "the errors of poses"}
-_ADDED = ("rotation_error", "translation_error", "pose_reason")  # columns that formats before the third lack
-_OLDER_SCHEMA = pa.schema([field for field in PAIR_SCHEMA if field.name not in _ADDED])
+FORMAT = 4  # of the folder; to be raised when the schema changes, or what the identity tells
+READABLE = (1, 2, 3, FORMAT)  # formats that `load` reads
+_POSES = ("rotation_error", "translation_error", "pose_reason")  # columns that formats before the third lack
+_KINDS = ("configuration", "warning", "focal_error0", "focal_error1", "focal_log_ratio0", "focal_log_ratio1")
+_MISSING = {1: (*_POSES, *_KINDS), 2: (*_POSES, *_KINDS), 3: _KINDS}
+_LACKS = {
+    1: "the order of the pruners, the errors of poses and configurations",
+    2: "the errors of poses and configurations", 3: "configurations",
+}  # fmt: skip
 _SHOWN = 5  # differing fields shown in an error
 
 
@@ -165,6 +169,8 @@ class RunFolder:
 
     def _parts(self, columns: list[str]) -> Iterator[pa.Table]:
         """The parts in the order they were written; of a part's columns only those asked for."""
+        missing = _MISSING.get(self.format, ())
+        earlier = pa.schema([field for field in PAIR_SCHEMA if field.name not in missing])
         for file in sorted((self.path / "pairs").glob("part-*.parquet")):
             try:
                 data = file.read_bytes()
@@ -172,11 +178,11 @@ class RunFolder:
                 if digest and digest != [_content_digest(data)]:
                     raise pa.ArrowInvalid("it is not what was written there")
                 with pq.ParquetFile(pa.BufferReader(data)) as parquet:
-                    older = self.format < FORMAT and parquet.schema_arrow.equals(_OLDER_SCHEMA)
+                    older = self.format < FORMAT and parquet.schema_arrow.equals(earlier)
                     if not older and not parquet.schema_arrow.equals(PAIR_SCHEMA):
                         raise pa.ArrowInvalid("its columns are not those of this version")
-                    part = parquet.read(columns=[name for name in columns if not older or name not in _ADDED])
-                for name in _ADDED:
+                    part = parquet.read(columns=[name for name in columns if not older or name not in missing])
+                for name in missing:
                     if older and name in columns:
                         field = PAIR_SCHEMA.field(name)
                         part = part.append_column(field, pa.nulls(len(part), field.type))
