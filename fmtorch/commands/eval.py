@@ -22,7 +22,7 @@ from fmtorch.evaluation.pair_cameras import Cameras, built_with, cameras_of
 from fmtorch.evaluation.plots import plot_recall_curves
 from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import ALL, Group, summarize
-from fmtorch.evaluation.summary_tables import pose_table, summary_markdown, summary_table
+from fmtorch.evaluation.summary_tables import further_tables, pose_table, summary_markdown, summary_table
 from fmtorch.pipeline.exporting import exportable
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
@@ -138,6 +138,8 @@ def _summarize(table: pa.Table, folder: RunFolder, title: str) -> dict[str, Grou
     console.print(summary_table(summary, title=f"{title}{part}"))
     if (poses := pose_table(summary)) is not None:
         console.print(poses)
+    for further in further_tables(summary):
+        console.print(further)
     about = f"; of all {len(whole)} pairs" if part else ""
     console.print(f"{folder.path}: pairs/, summary.json, summary.md, recall.png{about}", style="dim")
     return summary

@@ -19,7 +19,7 @@ from rich.table import Table
 
 from fmtorch import presets
 from fmtorch.commands.main import job, run_command
-from fmtorch.commands.match_cameras import CameraFields, photographs, pose_line, pose_report
+from fmtorch.commands.match_cameras import CameraFields, Photographs, photographs, pose_line, pose_report
 from fmtorch.commands.match_folder import FolderFields, match_folder
 from fmtorch.core.files import expect_writable, replacing
 from fmtorch.core.terminal import console, errors
@@ -28,6 +28,7 @@ from fmtorch.core.version import __version__
 from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_matches
 from fmtorch.metrics import nsgd
 from fmtorch.pipeline.folder import EXHAUSTIVE
+from fmtorch.pipeline.photograph_cameras import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pipeline.reduced_images import Image
 from fmtorch.pipeline.two_images import MatchResult, match
@@ -57,9 +58,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     if fields.images is not None:
         if fields.image0 is not None or fields.image1 is not None or fields.truth is not None:
             raise ValueError("images takes a folder; image0, image1 and truth are of a single pair")
-        if fields.cameras is not None or fields.K is not None:
-            raise ValueError("cameras and K are of a single pair; a folder of images takes neither")
-        return match_folder(config, fields, pipeline_name, overrides)
+        return match_folder(config, fields, PhotographCameras(fields.cameras, fields.K), pipeline_name, overrides)
     if fields.export is not None or str(fields.pairs or EXHAUSTIVE) != EXHAUSTIVE:
         raise ValueError("export and pairs are of a folder of images: give images=FOLDER")
     paths = [_given(fields.image0, "image0"), _given(fields.image1, "image1")]
@@ -80,7 +79,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     }  # fmt: skip
     with replacing(folder / "result.json") as path:
         path.write_text(json.dumps(report) + "\n")
-    written = ["result.json", *_draw(folder, result, image0, image1, truth)]
+    written = ["result.json", *_draw(folder, result, given, truth)]
     heading = f"{' '.join([pipeline_name, *overrides])}: {paths[0].name}, {paths[1].name}"
     console.print(heading, style="italic", markup=False, highlight=False)
     console.print(_table(result))
@@ -127,22 +126,25 @@ def _report(result: MatchResult, image0: Image, image1: Image, truth: NDArray[np
     report: dict[str, Any] = {
         "size0": image0.shape[:2], "size1": image1.shape[:2],
         "F": result.F.tolist() if result.ok else None, "reason": result.reason, "warning": result.warning,
+        "configuration": result.configuration or None,
+        "homography": None if result.homography is None else result.homography.tolist(),
         "related": result.related, "significance": result.significance if math.isfinite(result.significance) else None,
         "features": [len(result.keypoints0), len(result.keypoints1)],
         "matches": result.counts, "seconds": result.seconds,
         "x0": c.x0[0].tolist(), "x1": c.x1[0].tolist(), "inliers": result.inliers.tolist(),
         "ratio": None if c.quality is None else c.quality[0].tolist(),
     }  # fmt: skip
+    if (pinhole := result.undistorted) is not None:
+        report |= {"undistorted_x0": pinhole.x0[0].tolist(), "undistorted_x1": pinhole.x1[0].tolist()}
     if truth is not None and result.ok:
         sizes = (torch.tensor([image.shape[:2]]) for image in (image0, image1))
         report["nsgd"] = float(nsgd(torch.from_numpy(truth)[None], result.F.cpu()[None], *sizes)[0])
     return report
 
 
-def _draw(
-    folder: Path, result: MatchResult, image0: Image, image1: Image, truth: NDArray[np.float64] | None
-) -> list[str]:
-    """Draw the pictures into the folder; the names of those there are."""
+def _draw(folder: Path, result: MatchResult, given: Photographs, truth: NDArray[np.float64] | None) -> list[str]:
+    """Draw the pictures into the folder, matches in the photographs and epipolar lines in pinholes; their names."""
+    image0, image1 = given.images
     x0, x1 = (x[0].cpu().numpy().astype(np.float64) for x in (result.putative.x0, result.putative.x1))
     kept = result.kept.cpu().numpy()
     good = kept.copy()
@@ -159,7 +161,12 @@ def _draw(
     F = result.F.cpu().numpy() if result.ok else truth
     if F is not None:
         dashed = truth if result.ok else None
-        pictures["epipolar.png"] = draw_epipolar_lines(image0, image1, x0[good], x1[good], F, truth=dashed)
+        if (c := result.undistorted) is None:
+            ends = x0[good], x1[good]
+        else:
+            seen = (result.inliers if result.ok else c.mask[0]).cpu()
+            ends = c.x0[0].cpu()[seen].double().numpy(), c.x1[0].cpu()[seen].double().numpy()
+        pictures["epipolar.png"] = draw_epipolar_lines(*given.pinholes, *ends, F, truth=dashed)
     for name, picture in pictures.items():
         with replacing(folder / name) as path:
             path.write_bytes(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
@@ -170,13 +177,14 @@ def _draw(
 
 def _troubles(result: MatchResult) -> list[str]:
     """What is said of a result that is not to be relied on."""
+    warning = result.warning if result.related or result.configuration != "unrelated" else ""  # which is said already
     if not result.ok:
-        return list(filter(None, (f"no F: {result.reason}", result.warning)))
+        return list(filter(None, (f"no F: {result.reason}", warning)))
     chance = (
         "probably not the same scene: so much support is no surprise by chance alone "
         f"(significance {result.significance:.1f}; related from {RELATED:g} on)"
     )
-    return list(filter(None, ("" if result.related else chance, result.warning)))
+    return list(filter(None, ("" if result.related else chance, warning)))
 
 
 def _table(result: MatchResult) -> Table:
@@ -185,9 +193,12 @@ def _table(result: MatchResult) -> Table:
     table.add_column("left", justify="right")
     table.add_column("seconds", justify="right")
     for step, seconds in result.seconds.items():
-        counts = [len(result.keypoints0), len(result.keypoints1)] if step == "features" else [result.counts[step]]
+        counts = (
+            [len(result.keypoints0), len(result.keypoints1)] if step == "features" else [result.counts.get(step, 0)]
+        )
         unit = {"features": "keypoints", "estimation": "inliers"}.get(step, "matches")
-        table.add_row(step, f"{' + '.join(f'{count:,}' for count in counts)} {unit}", f"{seconds:.3f}")
+        left = f"{' + '.join(f'{count:,}' for count in counts)} {unit}"
+        table.add_row(step, result.configuration if step == "configuration" else left, f"{seconds:.3f}")
     return table
 
 

@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 from fmtorch import presets
 from fmtorch.core.terminal import console, errors, progress_bars
 from fmtorch.pipeline.folder import FolderMatches, chosen_pairs, images_below, open_folder
+from fmtorch.pipeline.photograph_cameras import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets.fields import Count, Device, Seed
 from fmtorch.storage.code import fmtorch_version
@@ -35,7 +36,9 @@ class FolderFields:
     device: Device = "auto"
 
 
-def match_folder(config: DictConfig, fields: FolderFields, pipeline_name: str, overrides: Sequence[str]) -> Path:
+def match_folder(
+    config: DictConfig, fields: FolderFields, cameras: PhotographCameras, pipeline_name: str, overrides: Sequence[str]
+) -> Path:
     """Match the pairs of a folder of images, write what is to be exported and return the folder with it.
 
     Raises ValueError for what the options cannot mean, and where no pair could be matched.
@@ -49,11 +52,11 @@ def match_folder(config: DictConfig, fields: FolderFields, pipeline_name: str, o
     output = fields.output or Path(f"matches/{folder.absolute().name}")
     identity = {
         "version": fmtorch_version(), **presets.stages(config), "seed": fields.seed, "orient": fields.orient,
-        "longest_side": fields.longest_side,
+        "longest_side": fields.longest_side, **cameras.identity,
     }  # fmt: skip
     journal = Journal(open_folder(output, identity), folder)
     console.print(f"{' '.join([pipeline_name, *overrides])}: {folder}", style="italic", markup=False, highlight=False)
-    work = FolderMatches(pipeline, journal, fields.longest_side, fields.orient, fields.seed)
+    work = FolderMatches(pipeline, journal, fields.longest_side, fields.orient, fields.seed, cameras)
     with progress_bars() as progress:
         bar = progress.add_task(pipeline_name, total=len(pairs))
         for _ in work.each(pairs):
@@ -65,7 +68,8 @@ def match_folder(config: DictConfig, fields: FolderFields, pipeline_name: str, o
     if work.troubles and not work.done + work.taken:
         raise ValueError(f"no pair could be matched, the first because: {work.troubles[0]}")
     console.print(f"{work.related} of {len(pairs)} pairs show one scene", highlight=False)
-    written = ["export.json", *write_exports(journal, pairs, kinds, output, fields.camera == "shared")]
+    shared = fields.camera == "shared" or cameras.word == "shared"
+    written = ["export.json", *write_exports(journal, pairs, kinds, output, shared)]
     console.print(f"{output}: {', '.join(written)}", style="dim", highlight=False)
     if isinstance(pipeline.extractor, CachedFeatures):
         console.print(pipeline.extractor.report(), style="dim", highlight=False)

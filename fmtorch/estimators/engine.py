@@ -31,7 +31,7 @@ from fmtorch.estimators.parts.refinement import LocalOptimization, Refinement
 from fmtorch.estimators.parts.sampling import Sampler
 from fmtorch.estimators.parts.scores import Score
 from fmtorch.estimators.parts.selection import BestOfSearch, BestScore, Selection, Selector
-from fmtorch.estimators.precompiled import WITH_FOCALS
+from fmtorch.estimators.precompiled import OF_HOMOGRAPHIES, WITH_FOCALS
 from fmtorch.estimators.registry import part, thresholds
 from fmtorch.estimators.search import Search
 
@@ -141,7 +141,9 @@ class HypothesizeAndVerify:
     @property
     def kernels(self) -> tuple[Kernel[..., Any], ...]:
         """Those worth compiling together, before the first pair."""
-        return WITH_FOCALS if self.focal is not None else ()
+        if self.focal is not None:
+            return WITH_FOCALS
+        return OF_HOMOGRAPHIES if self.family.model == "homography" else ()
 
     @property
     def gradients_reach(self) -> tuple[str, ...]:

@@ -21,7 +21,10 @@ import cv2
 import torch
 
 from fmtorch.data.pairs import ImagePair, ImageSource
+from fmtorch.evaluation.pair_cameras import WithPairCameras
 from fmtorch.evaluation.rows import evaluate
+from fmtorch.pipeline.configuration import compile_with
+from fmtorch.pipeline.examination import examined
 from fmtorch.pipeline.exporting import keep_outcomes
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.storage import PairRow
@@ -74,7 +77,9 @@ class Workers:
 
 
 def _work(pipeline: Pipeline, pairs: list[ImagePair], seed: int, journal: Journal | None) -> Work:
-    outcomes = pipeline.run(pairs, seed)
+    compile_with([*pipeline.pruners.values(), pipeline.estimator])
+    knowledge = pipeline.estimator.given if isinstance(pipeline.estimator, WithPairCameras) else None
+    outcomes = examined(pipeline, pipeline.run(pairs, seed), seed, knowledge)
     if journal is not None:
         keep_outcomes(journal, pipeline, outcomes)
     return Work(evaluate(outcomes, seed))

@@ -34,7 +34,7 @@ def estimated(
     """
     expect_values(c)
     seed = int(number("seed", seed, whole=True))
-    estimator = _estimator(name, config_dir, options)
+    estimator = estimator_of(name, config_dir, options)
     _expect_gradients(c, estimator, name)
     if (gives := model_of(estimator)) != model:
         raise ValueError(f"estimator={name} gives {gives} matrices; find_{model} needs one that gives {model} matrices")
@@ -75,7 +75,7 @@ def _with_prior(c: Correspondences, estimator: Estimator) -> Correspondences:
     return c
 
 
-def _estimator(name: str, config_dir: Path | str | None, options: Mapping[str, Any]) -> Estimator:
+def estimator_of(name: str, config_dir: Path | str | None, options: Mapping[str, Any]) -> Estimator:
     """The estimator of a preset, built but once where its options are plain values and its file is not a user's."""
     plain = _plain(options)
     if config_dir is None:

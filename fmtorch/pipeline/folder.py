@@ -12,8 +12,8 @@ from typing import Any
 
 from fmtorch.core.files import replacing
 from fmtorch.core.threads import available, one_thread
-from fmtorch.data.images import read_image
 from fmtorch.pipeline.exporting import keep_described, keep_match
+from fmtorch.pipeline.photograph_cameras import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pipeline.two_images import Described, describe, relate
 from fmtorch.storage.exchange.journal import Journal
@@ -96,8 +96,11 @@ class FolderMatches:
     what went wrong with images or pairs, which are tried again the next time.
     """
 
-    def __init__(self, pipeline: Pipeline, journal: Journal, longest_side: int, orient: bool, seed: int) -> None:
-        self.pipeline, self.journal = pipeline, journal
+    def __init__(
+        self, pipeline: Pipeline, journal: Journal, longest_side: int, orient: bool, seed: int,
+        cameras: PhotographCameras | None = None,
+    ) -> None:  # fmt: skip
+        self.pipeline, self.journal, self.cameras = pipeline, journal, cameras or PhotographCameras()
         self.longest_side, self.orient, self.seed = longest_side, orient, seed
         self.done = self.taken = self.related = 0
         self.troubles: list[str] = []
@@ -132,7 +135,8 @@ class FolderMatches:
             if ends[0] is None or ends[1] is None:
                 return
             try:
-                result = relate(self.pipeline, ends[0], ends[1], self.seed)
+                known = self.cameras.given((image0, image1), (ends[0].size, ends[1].size))
+                result = relate(self.pipeline, ends[0], ends[1], self.seed, **known)
                 keep_match(self.journal, (image0, image1), result)
             except Exception as error:  # one pair does not end the work on the others
                 names = f"{self.journal.name(image0)}, {self.journal.name(image1)}"
@@ -149,7 +153,7 @@ class FolderMatches:
                 value: Described | None = self._computed(image) if begun is None else begun.result()
                 assert value is not None
                 if not self.journal.has_image(image):
-                    keep_described(self.journal, image, value)
+                    keep_described(self.journal, image, value, self.cameras.of(image, value.size))
             except Exception as error:  # nor does one image
                 self.troubles.append(f"{type(error).__name__}: {error}".splitlines()[0])
                 value = None
@@ -170,7 +174,7 @@ class FolderMatches:
                         yield image
 
     def _computed(self, image: Path) -> Described:
-        return describe(self.pipeline, read_image(image, orient=self.orient), self.longest_side)
+        return describe(self.pipeline, self.cameras.read(image, self.orient), self.longest_side)
 
     def _computed_alone(self, image: Path) -> Described:
         with one_thread(self.pipeline.device):

@@ -23,6 +23,7 @@ from fmtorch.data.images import read_image
 from fmtorch.data.lenses import Lens
 from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
 from fmtorch.geometry.verdict import judged
+from fmtorch.pipeline.configuration import Configuration
 
 STAGES = ("features", "matching", "pruning", "estimation")
 
@@ -34,7 +35,8 @@ class Outcome:
     correspondences, estimate: batches of one; None where the pair failed before that stage.
     features: how many each image has. seconds: per stage; a batched stage is shared out evenly, and features count in
     full for each pair that uses them, cached ones with the seconds they took when they were computed.
-    reason: why the pair failed, empty where it did not.
+    reason: why the pair failed, empty where it did not. configuration: of this pair alone, where it was asked for
+    (`fmtorch.pipeline.examination`).
     """
 
     pair: ImagePair
@@ -43,6 +45,7 @@ class Outcome:
     estimate: Estimate | None = None
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     reason: str = ""
+    configuration: Configuration | None = None
 
     @property
     def solved(self) -> bool:

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from fmtorch.core.stages import Estimator
 from fmtorch.core.types import collate
-from fmtorch.pipeline.database_pairs import Cameras, DatabasePair, as_correspondences, geometries
+from fmtorch.pipeline.configuration import classify
+from fmtorch.pipeline.database_pairs import Cameras, DatabasePair, as_correspondences
 from fmtorch.pipeline.estimation import estimated_by
+from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.storage.exchange.database_images import DatabaseImage
 from fmtorch.storage.exchange.two_view import PairGeometry
 from fmtorch.storage.exchange.verification_log import VerificationLog
@@ -118,7 +120,9 @@ class VerificationRun:
         if not ids:
             return
         c = collate(given)
-        results = geometries(pairs, c, estimated_by(self.estimator, c, self.seed), self.seed)
+        estimate = estimated_by(self.estimator, c, self.seed)
+        configuration = classify(c, estimate, focal_deviation=0, seed=self.seed)
+        results = pair_geometries([pair.matches for pair in pairs], c, estimate, configuration)
         self.database.write(zip(ids, results, strict=True))
         if self.log is not None:
             self.log.add(ids)

@@ -24,13 +24,14 @@ import pyarrow.parquet as pq
 
 from fmtorch.core.files import naming, replacing, sync, temporary_name
 from fmtorch.storage.parts import PartWriter, part_bytes, part_files
-from fmtorch.storage.rows import PAIR_SCHEMA, PairRow, to_table
+from fmtorch.storage.rows import MISSING_COLUMNS, PAIR_SCHEMA, PairRow, to_table
 
-FORMAT = 3  # of the folder; to be raised when the schema changes, or what the identity tells
-READABLE = (1, 2, FORMAT)  # formats that `load` reads; 1 lost the order of the pruners, 2 had no errors of poses
-_LACKS = {1: "the order of the pruners and the errors of poses", 2: "the errors of poses"}
-_ADDED = ("rotation_error", "translation_error", "pose_reason")  # columns that formats before the third lack
-_OLDER_SCHEMA = pa.schema([field for field in PAIR_SCHEMA if field.name not in _ADDED])
+FORMAT = 4  # of the folder; to be raised when the schema changes, or what the identity tells
+READABLE = (1, 2, 3, FORMAT)  # formats that `load` reads
+_LACKS = {
+    1: "the order of the pruners, the errors of poses and configurations",
+    2: "the errors of poses and configurations", 3: "configurations",
+}  # fmt: skip
 _LISTINGS = 20  # at most, until parts are those that were listed
 _SHOWN = 5  # differing fields shown in an error
 
@@ -178,16 +179,16 @@ class RunFolder:
         return parts
 
     def _part(self, file: Path, columns: list[str]) -> pa.Table:
+        missing = MISSING_COLUMNS.get(self.format, ())
+        earlier = pa.schema([field for field in PAIR_SCHEMA if field.name not in missing])
         try:
             with pq.ParquetFile(part_bytes(file)) as parquet:
-                older = self.format < FORMAT and parquet.schema_arrow.equals(_OLDER_SCHEMA)
+                older = self.format < FORMAT and parquet.schema_arrow.equals(earlier)
                 if not older and not parquet.schema_arrow.equals(PAIR_SCHEMA):
                     raise pa.ArrowInvalid("its columns are not those of this version")
-                part = parquet.read(columns=[name for name in columns if not older or name not in _ADDED])
-            for name in _ADDED:
-                if older and name in columns:
-                    field = PAIR_SCHEMA.field(name)
-                    part = part.append_column(field, pa.nulls(len(part), field.type))
+                part = parquet.read(columns=[name for name in columns if not older or name not in missing])
+            for field in (PAIR_SCHEMA.field(name) for name in missing if older and name in columns):
+                part = part.append_column(field, pa.nulls(len(part), field.type))
             return part
         except FileNotFoundError:
             raise

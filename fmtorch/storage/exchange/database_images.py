@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from typing import Any
 
@@ -11,11 +12,11 @@ import torch
 from numpy.typing import NDArray
 
 from fmtorch.data.lenses import MODELS, Lens
+from fmtorch.data.undistort_points import undistorted_frames
 from fmtorch.geometry.square_pixels import calibration_problems
 from fmtorch.storage.exchange.two_view import ORIGIN
 
 EXIF_DEVIATION = 0.05  # relative, of focal lengths by EXIF (docs/cameras.md)
-STEP = 0.5  # px: a frame's columns are moved by the lens as short steps of that length
 
 Array = NDArray[np.float64]
 
@@ -61,7 +62,10 @@ def database_image(name: str, camera: Any, keypoints: NDArray[np.float32]) -> Da
     if problem or not lens.bends:
         return DatabaseImage(name, camera.camera_id, size, K, deviation, points, points, frames, frames, problem)
     pinhole = _undistorted(camera, K, keypoints[:, :2])
-    bent = None if frames is None else _undistorted_frames(camera, K, keypoints[:, :2], frames, pinhole)
+    bent = None
+    if frames is not None:
+        to_pinhole = functools.partial(_undistorted, camera, K)
+        bent = undistorted_frames(to_pinhole, keypoints[:, :2], frames).astype(np.float32)
     return DatabaseImage(
         name, camera.camera_id, size, K, deviation, points, pinhole.astype(np.float32), frames, bent, problem
     )
@@ -91,12 +95,3 @@ def _undistorted(camera: Any, K: Array, points: NDArray[Any]) -> Array:
     """Pixels (n, 2) of a pinhole for COLMAP's pixels (n, 2) of the photograph."""
     rays = np.asarray(camera.cam_from_img(np.ascontiguousarray(points, np.float64)), np.float64).reshape(-1, 2)
     return np.asarray(rays @ K[:2, :2].T + K[:2, 2])
-
-
-def _undistorted_frames(
-    camera: Any, K: Array, points: NDArray[Any], frames: NDArray[np.float32], pinhole: Array
-) -> NDArray[np.float32]:
-    """Frames (n, 2, 2) of the undistorted image, by the lens's derivatives at the points."""
-    steps = STEP * np.eye(2)
-    moved = [_undistorted(camera, K, points + step) - pinhole for step in steps]
-    return np.asarray(np.stack(moved, -1) / STEP @ frames, np.float32)

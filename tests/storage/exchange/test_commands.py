@@ -200,7 +200,17 @@ def test_an_evaluation_and_its_way_back(tmp_path: Path) -> None:
     with pycolmap.Database.open(path / DATABASE) as file:
         assert (file.num_images(), file.num_cameras(), file.num_matched_image_pairs()) == (3, 1, 3)
         assert file.read_camera(1).has_prior_focal_length
-        assert file.read_two_view_geometry(1, 2).config == int(pycolmap.TwoViewGeometryConfiguration.CALIBRATED)
+        geometry = file.read_two_view_geometry(1, 2)
+    assert geometry.config == int(
+        pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC
+    )  # pictures that are shifted
+    np.testing.assert_allclose(geometry.H / geometry.H[2, 2], [[1, 0, -9], [0, 1, 0], [0, 0, 1]], atol=0.2)
+    with h5py.File(path / MATCHES) as file:
+        group = file["00000000.png/00000001.png"]
+        assert group.attrs["configuration"] == "planar_or_panoramic"
+        np.testing.assert_allclose(
+            group.attrs["H"] / group.attrs["H"][2, 2], np.array([[1, 0, -9], [0, 1, 0], [0, 0, 1]]), atol=0.2
+        )
     kept = sorted((path / "export").rglob("*.npz"))
     assert len(kept) == 6
     changed = [file.stat().st_mtime_ns for file in kept]
