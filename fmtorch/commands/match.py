@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import hashlib
 import json
 import math
 from collections.abc import Sequence
@@ -28,7 +30,7 @@ from fmtorch.core.types import RELATED
 from fmtorch.core.version import __version__
 from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_matches
 from fmtorch.metrics import nsgd
-from fmtorch.pipeline.folder import EXHAUSTIVE
+from fmtorch.pipeline.folder_images import EXHAUSTIVE
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pipeline.reduced_images import Image
 from fmtorch.pipeline.two_images import MatchResult, match
@@ -75,7 +77,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
         "image0": str(paths[0]), "image1": str(paths[1]),
         **_report(result, image0, image1, truth), **pose_report(result),
     }  # fmt: skip
-    folder = fields.output or Path(f"matches/{paths[0].stem}-{paths[1].stem}")
+    folder = fields.output or _default_output(paths)
     folder.mkdir(parents=True, exist_ok=True)
     with replacing(folder / "result.json") as path:
         path.write_text(json.dumps(report) + "\n")
@@ -114,6 +116,17 @@ def _given(path: Path | None, name: str) -> Path:
     if path is None:
         raise ValueError(f"{name} is missing; give two image files: fmtorch match a.jpg b.jpg")
     return path
+
+
+def _default_output(paths: Sequence[Path]) -> Path:
+    """``matches/NAME0-NAME1``, with some digits behind where that holds what was found of others of these names."""
+    folder = Path(f"matches/{paths[0].stem}-{paths[1].stem}")
+    with contextlib.suppress(OSError, ValueError, KeyError):
+        earlier = json.loads((folder / "result.json").read_text())
+        if [Path(earlier[name]).absolute() for name in ("image0", "image1")] != [path.absolute() for path in paths]:
+            identity = "\0".join(str(path.absolute()) for path in paths)
+            return folder.with_name(f"{folder.name}-{hashlib.blake2b(identity.encode(), digest_size=4).hexdigest()}")
+    return folder
 
 
 def _report(result: MatchResult, image0: Image, image1: Image, truth: NDArray[np.float64] | None) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 ::
 
     images/<digest>.npz   keypoints, scores, size, K of an image; the digest is of its name and its file's bytes
-    pairs/<digest>.npz    indices of matched keypoints, their scores, F and its inliers; of the two images' digests
+    pairs/<digest>.npz    matched keypoints and their scores, F, its inliers and significance; of both images' digests
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+import math
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from fmtorch.core.files import replacing
 
 Array = NDArray[np.float64]
-_PAIR = ("matches", "scores", "inliers", "F", "related")
+_PAIR = ("matches", "scores", "inliers", "F", "related", "significance", "configuration")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -37,7 +38,8 @@ class ExportedImage:
 class ExportedPair:
     """The matches given to the estimator, (m, 2) indices of points; scores (m,) in [0, 1]; inliers (m,) of F (3, 3).
 
-    F is zero where there is none. related: whether its support is beyond chance.
+    F is zero where there is none. related: whether its support is beyond chance. significance: how far, -inf without F
+    and NaN where it was not computed. configuration: of the cameras and the scene; empty where it is not known.
     """
 
     name0: str
@@ -47,6 +49,8 @@ class ExportedPair:
     inliers: NDArray[np.bool_]
     F: Array
     related: bool = True
+    significance: float = math.nan
+    configuration: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,9 +84,9 @@ class Journal:
 
     def pair(self, image0: Path, image1: Path) -> ExportedPair:
         with np.load(self._pair(image0, image1)) as stored:
-            matches, scores, inliers, F, related = (stored[name] for name in _PAIR)
-        names = self.name(image0), self.name(image1)
-        return ExportedPair(*names, matches, scores, inliers, F, bool(related))
+            values = {name: stored[name] for name in _PAIR}
+        values |= {name: values[name].item() for name in ("related", "significance", "configuration")}
+        return ExportedPair(self.name(image0), self.name(image1), **values)
 
     def _image(self, image: Path) -> Path:
         return self.folder / "images" / f"{self._digest(image)}.npz"
