@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import hashlib
 import json
 import math
 from collections.abc import Sequence
@@ -27,7 +29,7 @@ from fmtorch.core.types import RELATED
 from fmtorch.core.version import __version__
 from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_matches
 from fmtorch.metrics import nsgd
-from fmtorch.pipeline.folder import EXHAUSTIVE
+from fmtorch.pipeline.folder_images import EXHAUSTIVE
 from fmtorch.pipeline.photograph_cameras import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pipeline.reduced_images import Image
@@ -66,7 +68,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     truth = None if fields.truth is None else read_matrix(fields.truth)
     given = photographs(paths, fields.cameras, fields.K, fields.orient)
     image0, image1 = given.images
-    folder = fields.output or Path(f"matches/{paths[0].stem}-{paths[1].stem}")
+    folder = fields.output or _default_output(paths)
     expect_writable(folder)
     pipeline: Pipeline = presets.build_pipeline(config, presets.resolve_device(fields.device))
     result = match(
@@ -118,6 +120,17 @@ def _given(path: Path | None, name: str) -> Path:
     if path is None:
         raise ValueError(f"{name} is missing; give two image files: fmtorch match a.jpg b.jpg")
     return path
+
+
+def _default_output(paths: Sequence[Path]) -> Path:
+    """``matches/NAME0-NAME1``, with some digits behind where that holds what was found of others of these names."""
+    folder = Path(f"matches/{paths[0].stem}-{paths[1].stem}")
+    with contextlib.suppress(OSError, ValueError, KeyError):
+        earlier = json.loads((folder / "result.json").read_text())
+        if [Path(earlier[name]).absolute() for name in ("image0", "image1")] != [path.absolute() for path in paths]:
+            identity = "\0".join(str(path.absolute()) for path in paths)
+            return folder.with_name(f"{folder.name}-{hashlib.blake2b(identity.encode(), digest_size=4).hexdigest()}")
+    return folder
 
 
 def _report(result: MatchResult, image0: Image, image1: Image, truth: NDArray[np.float64] | None) -> dict[str, Any]:

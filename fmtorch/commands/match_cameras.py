@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from fmtorch.data.images import read_image
 from fmtorch.data.undistort import undistorted
 from fmtorch.pipeline.photograph_cameras import PhotographCameras
 from fmtorch.pipeline.reduced_images import Image
@@ -57,7 +58,7 @@ def photographs(
         ImageError: for a file that is no image, or is not of its camera's size.
     """
     known = PhotographCameras(cameras, K)
-    image0, image1 = (known.read(path, orient) for path in paths)
+    image0, image1 = (read_image(known.source(path), orient=orient) for path in paths)
     ends = zip(paths, (image0, image1), strict=True)
     camera0, camera1 = (known.of(path, (image.shape[0], image.shape[1])) for path, image in ends)
     notes = tuple(filter(None, (camera0.note, camera1.note)))

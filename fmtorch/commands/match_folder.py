@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -11,14 +12,16 @@ from omegaconf import DictConfig
 
 from fmtorch import presets
 from fmtorch.core.terminal import console, errors, progress_bars
-from fmtorch.pipeline.folder import FolderMatches, chosen_pairs, images_below, open_folder
+from fmtorch.pipeline.folder import MEMORY, FolderMatches
+from fmtorch.pipeline.folder_images import chosen_pairs, images_below
+from fmtorch.pipeline.folder_output import default_output, open_folder
 from fmtorch.pipeline.photograph_cameras import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets.fields import Count, Device, Seed
 from fmtorch.storage.code import fmtorch_version
 from fmtorch.storage.exchange.export import export_kinds, write_exports
 from fmtorch.storage.exchange.journal import Journal
-from fmtorch.storage.features import CachedFeatures
+from fmtorch.storage.features import CachedFeatures, cached
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,6 +35,7 @@ class FolderFields:
     output: Path | None = None
     orient: bool = True
     longest_side: Count = 1600
+    workers: Count | None = None
     seed: Seed = 0
     device: Device = "auto"
 
@@ -46,21 +50,28 @@ def match_folder(
     folder = fields.images
     assert folder is not None
     kinds = export_kinds(fields.export)
-    pairs = chosen_pairs(folder, images_below(folder), fields.pairs)
+    images = images_below(folder)
+    pairs = chosen_pairs(folder, images, fields.pairs)
     presets.expect_stages(config)
     pipeline: Pipeline = presets.build_pipeline(config, presets.resolve_device(fields.device))
-    output = fields.output or Path(f"matches/{folder.absolute().name}")
+    output = fields.output or default_output(folder)
     identity = {
-        "version": fmtorch_version(), **presets.stages(config), "seed": fields.seed, "orient": fields.orient,
-        "longest_side": fields.longest_side, **cameras.identity,
+        "version": fmtorch_version(), "images": str(folder.absolute()), **presets.stages(config), "seed": fields.seed,
+        "orient": fields.orient, "longest_side": fields.longest_side, **cameras.identity,
     }  # fmt: skip
     journal = Journal(open_folder(output, identity), folder)
+    scratch = journal.folder / "features"
+    if len(images) > MEMORY and not isinstance(pipeline.extractor, CachedFeatures):  # none is computed twice
+        pipeline.extractor = cached(pipeline.extractor, scratch)
     console.print(f"{' '.join([pipeline_name, *overrides])}: {folder}", style="italic", markup=False, highlight=False)
-    work = FolderMatches(pipeline, journal, fields.longest_side, fields.orient, fields.seed, cameras)
+    work = FolderMatches(
+        pipeline, journal, fields.longest_side, fields.orient, fields.seed, workers=fields.workers, cameras=cameras
+    )
     with progress_bars() as progress:
         bar = progress.add_task(pipeline_name, total=len(pairs))
         for _ in work.each(pairs):
             progress.advance(bar)
+    shutil.rmtree(scratch, ignore_errors=True)
     for trouble in work.troubles:
         errors.print(trouble, style="bold", markup=False, highlight=False, soft_wrap=True)
     if work.taken:
@@ -71,6 +82,6 @@ def match_folder(
     shared = fields.camera == "shared" or cameras.word == "shared"
     written = ["export.json", *write_exports(journal, pairs, kinds, output, shared)]
     console.print(f"{output}: {', '.join(written)}", style="dim", highlight=False)
-    if isinstance(pipeline.extractor, CachedFeatures):
+    if isinstance(pipeline.extractor, CachedFeatures) and pipeline.extractor.cache.folder != scratch:
         console.print(pipeline.extractor.report(), style="dim", highlight=False)
     return output

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -36,7 +35,9 @@ def keep_outcomes(journal: Journal, pipeline: Pipeline, outcomes: Sequence[Outco
         for image, K in ((pair.image0, pair.K0), (pair.image1, pair.K1)):
             _keep_image(journal, pipeline, image, K)
         F = estimate.F[0] if outcome.solved else torch.zeros(3, 3)
-        kept = _pair(journal, ends, c, F, estimate.inliers[0], bool(estimate.related[0]))
+        names = journal.name(ends[0]), journal.name(ends[1])
+        points = journal.image(ends[0]).points, journal.image(ends[1]).points
+        kept = _pair(names, points, c, F, estimate.inliers[0], bool(estimate.related[0]))
         if outcome.configuration is not None:
             kept = dataclasses.replace(kept, geometry=_geometry(kept.matches, c, estimate, outcome.configuration))
         journal.add_pair(*ends, kept)
@@ -66,24 +67,29 @@ def exportable(pair: ImagePair) -> bool:
     return pair.problem is None and pair.matches is None
 
 
-def keep_described(journal: Journal, image: Path, described: Described, camera: PhotographCamera | None = None) -> None:
-    """Add a photograph's keypoints to a journal, with what is known of its camera."""
+def exported_image(name: str, described: Described, camera: PhotographCamera | None = None) -> ExportedImage:
+    """A photograph's keypoints, with what is known of its camera, as a journal keeps them."""
     scores = described.features.scores.detach().cpu().float().numpy()
-    points = described.points.detach().cpu().float().numpy()
     lens = None if camera is None else camera.lens
     focal = None if camera is None or camera.focal is None else camera.focal[0]
     bends = lens is not None and lens.bends
     K = None if lens is None or bends else lens.K
-    name = journal.name(image)
-    journal.add_image(image, ExportedImage(name, points, scores, described.size, K, lens if bends else None, focal))
+    return ExportedImage(name, _points(described), scores, described.size, K, lens if bends else None, focal)
 
 
-def keep_match(journal: Journal, ends: tuple[Path, Path], result: MatchResult) -> None:
-    """Add what was found of two photographs, whose keypoints the journal has."""
-    pair = _pair(journal, ends, result.correspondences, result.F, result.inliers, result.related)
+def exported_match(names: tuple[str, str], described: tuple[Described, Described], result: MatchResult) -> ExportedPair:
+    """What was found of two photographs, as a journal keeps it."""
+    points = _points(described[0]), _points(described[1])
+    pair = _pair(names, points, result.correspondences, result.F, result.inliers, result.related)
     if (geometry := result.geometry) is not None:
         geometry = geometry._replace(inliers=pair.matches[geometry.inliers[:, 0]])
-    journal.add_pair(*ends, dataclasses.replace(pair, geometry=geometry))
+    return dataclasses.replace(
+        pair, geometry=geometry, significance=result.significance, configuration=result.configuration
+    )
+
+
+def _points(described: Described) -> NDArray[np.float32]:
+    return described.points.detach().cpu().float().numpy()
 
 
 def _keep_image(journal: Journal, pipeline: Pipeline, image: ImageSource, K: NDArray[np.float64] | None) -> None:
@@ -96,8 +102,9 @@ def _keep_image(journal: Journal, pipeline: Pipeline, image: ImageSource, K: NDA
 
 
 def _pair(
-    journal: Journal, ends: tuple[Path, Path], c: Correspondences, F: Tensor, inliers: Tensor, related: bool
-) -> ExportedPair:
+    names: tuple[str, str], points: tuple[NDArray[np.float32], NDArray[np.float32]],
+    c: Correspondences, F: Tensor, inliers: Tensor, related: bool,
+) -> ExportedPair:  # fmt: skip
     """The surviving matches of one pair as indices of the images' points.
 
     Scores are one less the matcher's figure, a ratio, and 1 where there is none. Raises ValueError for matches that are
@@ -105,13 +112,11 @@ def _pair(
     """
     mask = c.mask[0].cpu()
     index = [
-        indices(journal.image(end).points, x[0].detach().cpu().float()[mask].numpy())
-        for end, x in zip(ends, (c.x0, c.x1), strict=True)
+        indices(those, x[0].detach().cpu().float()[mask].numpy()) for those, x in zip(points, (c.x0, c.x1), strict=True)
     ]
     quality = torch.zeros(len(mask)) if c.quality is None else c.quality[0].detach().cpu().float()
     scores = (1 - quality[mask]).nan_to_num(0.0).clamp(0.0, 1.0)
-    name0, name1 = (journal.name(end) for end in ends)
     return ExportedPair(
-        name0, name1, np.stack(index, -1).astype(np.int32), scores.numpy(), inliers.cpu()[mask].numpy(),
+        *names, np.stack(index, -1).astype(np.int32), scores.numpy(), inliers.cpu()[mask].numpy(),
         F.detach().cpu().double().numpy(), related,
     )  # fmt: skip

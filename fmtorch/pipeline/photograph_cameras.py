@@ -9,11 +9,9 @@ from typing import Any, NamedTuple
 
 from fmtorch.data.exif import exif_focal
 from fmtorch.data.image_cameras import ImageCameras
-from fmtorch.data.images import read_image
 from fmtorch.data.lenses import Lens
 from fmtorch.data.pairs import ImageSource
 from fmtorch.pipeline.camera_arguments import camera_fields
-from fmtorch.pipeline.reduced_images import Image
 from fmtorch.storage.configuration import file_digest
 
 WORDS = ("unknown", "shared", "exif")
@@ -69,10 +67,9 @@ class PhotographCameras:
             return {"cameras": {"K": [lens.fx, lens.fy, lens.cx, lens.cy]}}
         return {} if self.word is None else {"cameras": self.word}
 
-    def read(self, path: Path, orient: bool) -> Image:
-        """The pixels of a photograph. Raises ImageError for one that is not of its camera's size."""
-        size = None if self._stored is None else self._stored.of(path).size
-        return read_image(ImageSource(path.name, path, size), orient=orient)
+    def source(self, path: Path) -> ImageSource:
+        """A photograph for `read_image`, which raises ImageError for one that is not of its camera's size."""
+        return ImageSource(path.name, path, None if self._stored is None else self._stored.of(path).size)
 
     def of(self, path: Path, size: tuple[int, int]) -> PhotographCamera:
         """The camera of a photograph of that size (h, w)."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -19,6 +20,7 @@ from PIL import Image
 
 import fmtorch
 from fmtorch import presets
+from fmtorch.commands import match as match_command
 from fmtorch.core.resources import conf_dir
 from fmtorch.core.types import RELATED
 from fmtorch.data import ImageError, read_image
@@ -345,3 +347,18 @@ def test_on_a_real_pair() -> None:
         result = fmtorch.match(images / "00000002.jpg", images / "00000006.jpg", pipeline=name, longest_side=800)
         sizes = result.correspondences.size0, result.correspondences.size1
         assert float(nsgd(torch.from_numpy(truth)[None], result.F[None], *sizes)[0]) < 0.01
+
+
+def test_others_of_the_same_names_overwrite_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    paths = [Path("x/a.jpg"), Path("x/b.jpg")]
+    others = [Path("y/a.jpg"), Path("y/b.jpg")]
+    folder = match_command._default_output(paths)
+    assert folder == Path("matches/a-b")
+    folder.mkdir(parents=True)
+    (folder / "result.json").write_text(json.dumps({"image0": "x/a.jpg", "image1": "x/b.jpg"}))
+    assert match_command._default_output(paths) == folder
+    assert match_command._default_output([path.absolute() for path in paths]) == folder
+    elsewhere = match_command._default_output(others)
+    assert re.fullmatch(r"a-b-[0-9a-f]{8}", elsewhere.name)
+    assert match_command._default_output(others) == elsewhere

@@ -66,7 +66,7 @@ def test_matching_and_the_prior_of_find_fundamental_have_one_thread(
 
         monkeypatch.setattr(module, name, watched)
 
-    for module, name in ((nearest, "_finite"), (nearest, "_two_nearest"), (consistency, "position_agreement")):
+    for module, name in ((nearest, "_finite"), (nearest, "_match_one_pair"), (consistency, "position_agreement")):
         watch(module, name)
     nearest.nearest_neighbors(torch.rand(30, 8), torch.rand(20, 8))
     c = scene(0, 60)

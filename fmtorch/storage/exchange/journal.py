@@ -3,8 +3,8 @@
 ::
 
     images/<digest>.npz   keypoints, scores, size, camera of an image; the digest is of its name and its file's bytes
-    pairs/<digest>.npz    indices of matched keypoints, their scores, F and its inliers, and the two-view geometry for
-                          COLMAP; the digest is of the two images' digests
+    pairs/<digest>.npz    indices of matched keypoints, their scores, F, its inliers and significance, and the two-view
+                          geometry for COLMAP; the digest is of the two images' digests
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+import math
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,7 +24,7 @@ from fmtorch.data.lenses import Lens
 from fmtorch.storage.exchange.two_view import Kind, PairGeometry
 
 Array = NDArray[np.float64]
-_PAIR = ("matches", "scores", "inliers", "F", "related")
+_PAIR = ("matches", "scores", "inliers", "F", "related", "significance", "configuration")
 _GEOMETRY = ("F", "E", "H", "R", "t")  # matrices of a geometry, of those that there are
 
 
@@ -47,8 +48,9 @@ class ExportedImage:
 class ExportedPair:
     """The matches given to the estimator, (m, 2) indices of points; scores (m,) in [0, 1]; inliers (m,) of F (3, 3).
 
-    F is zero where there is none. related: whether its support is beyond chance. geometry: of the pair, for COLMAP;
-    None where nobody has looked at its configuration.
+    F is zero where there is none. related: whether its support is beyond chance. significance: how far, -inf without F
+    and NaN where it was not computed. configuration: of the cameras and the scene; empty where it is not known, and
+    geometry, for COLMAP, None.
     """
 
     name0: str
@@ -59,6 +61,8 @@ class ExportedPair:
     F: Array
     related: bool = True
     geometry: PairGeometry | None = None
+    significance: float = math.nan
+    configuration: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,13 +113,13 @@ class Journal:
 
     def pair(self, image0: Path, image1: Path) -> ExportedPair:
         with np.load(self._pair(image0, image1)) as stored:
-            matches, scores, inliers, F, related = (stored[name] for name in _PAIR)
+            values = {name: stored[name] for name in _PAIR}
             geometry = None
             if "kind" in stored:
                 matrices = [stored.get(f"geometry_{name}") for name in _GEOMETRY]
                 geometry = PairGeometry(cast(Kind, str(stored["kind"])), stored["geometry_inliers"], *matrices)
-        names = self.name(image0), self.name(image1)
-        return ExportedPair(*names, matches, scores, inliers, F, bool(related), geometry)
+        values |= {name: values[name].item() for name in ("related", "significance", "configuration")}
+        return ExportedPair(self.name(image0), self.name(image1), geometry=geometry, **values)
 
     def _image(self, image: Path) -> Path:
         return self.folder / "images" / f"{self._digest(image)}.npz"

@@ -20,7 +20,8 @@ from fmtorch.commands import eval as eval_command
 from fmtorch.commands import match as match_command
 from fmtorch.core.resources import conf_dir
 from fmtorch.pipeline import folder
-from fmtorch.pipeline.folder import chosen_pairs, images_below, open_folder
+from fmtorch.pipeline.folder_images import chosen_pairs, images_below
+from fmtorch.pipeline.folder_output import open_folder
 from fmtorch.pipeline.two_images import Described
 from fmtorch.storage import RunFolder
 from fmtorch.storage.exchange.export import DATABASE, FEATURES, MATCHES
@@ -151,7 +152,9 @@ def test_lists_of_pairs(images: Path, tmp_path: Path) -> None:
     (tmp_path / "pairs.txt").write_text("b.png a.png\n# again\na.png b.png\na.png other.png\n")
     chosen = chosen_pairs(images, found, tmp_path / "pairs.txt")
     assert [(a.name, b.name) for a, b in chosen] == [("b.png", "a.png"), ("a.png", "other.png")]
-    with pytest.raises(ValueError, match=r"list\.txt: no such file; it must be exhaustive, or a file"):
+    with pytest.raises(
+        ValueError, match=r"list\.txt: no such file; it must be exhaustive, sequential:N, .*, or a file"
+    ):
         chosen_pairs(images, found, tmp_path / "list.txt")
 
 
