@@ -110,12 +110,12 @@ def relate(
     cameras: Mapping[str, Tensor] = NOTHING_KNOWN, lenses: Lenses = (None, None),
 ) -> MatchResult:  # fmt: skip
     """What `match` finds of two photographs that are described already. cameras: of `camera_fields`."""
+    compile_with([*pipeline.pruners.values(), pipeline.estimator])
     clock = Clock(pipeline.device)
     clock("features", described0.seconds + described1.seconds)
     scales = [described0.scale, described1.scale]
     known = reduced_cameras(cameras, scales, [described0.size, described1.size])
     known = {name: value.to(pipeline.device) for name, value in known.items()}
-    compile_with([*pipeline.pruners.values(), pipeline.estimator])
     result = _matched(pipeline, described0.features, described1.features, clock)
     if not result.reason:
         c = result.correspondences
