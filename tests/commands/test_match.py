@@ -68,7 +68,8 @@ def test_matches_and_fundamental_matrix_of_arrays(pipeline: fmtorch.pipeline.pip
     assert torch.equal(result.putative.x0[:, result.kept], c.x0)
     assert torch.equal(result.putative.x1[:, result.kept], c.x1)
     assert list(result.counts) == ["matching", "ratio", "one_to_one", "gms", "estimation"]
-    assert list(result.seconds) == ["features", "matching", "ratio", "one_to_one", "gms", "estimation"]
+    steps = ["features", "matching", "ratio", "one_to_one", "gms", "estimation", "configuration"]
+    assert list(result.seconds) == steps
     assert result.counts["estimation"] == int(result.inliers.sum()) > 100
     assert sorted(result.counts.values(), reverse=True) == list(result.counts.values())
     assert result.F.norm() == pytest.approx(1)
