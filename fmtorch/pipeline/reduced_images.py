@@ -116,6 +116,26 @@ def _reduced_pinhole(lens: Lens, scale: Array, points: Array) -> Array:
     return (undistorted_points(lens, (points + 0.5) / scale - 0.5) + 0.5) * scale - 0.5
 
 
+def evenly_reduced(
+    c: Correspondences, F: Float[Tensor, "b 3 3"], scales: Sequence[Tensor]
+) -> tuple[Correspondences, Float[Tensor, "b 3 3"], list[Tensor]]:
+    """Matches, F and scales of images reduced alike in x and y, which whole pixels seldom are.
+
+    A crop of a photograph is otherwise stretched beside it by more than its noise, as no copy is.
+    """
+    even = [s.prod().sqrt().expand(2) for s in scales]
+    ratios = [(s / each).to(c.x0.device) for s, each in zip(scales, even, strict=True)]
+    maps = [_reduction(1 / ratio.cpu()).to(F) for ratio in ratios]
+    fields: dict[str, Tensor | None] = {}
+    ends = (c.x0, c.lafs0, c.K0), (c.x1, c.lafs1, c.K1)
+    for i, ((x, lafs, K), ratio, A) in enumerate(zip(ends, ratios, maps, strict=True)):
+        fields[f"x{i}"] = to_original(x.double(), ratio)
+        fields[f"lafs{i}"] = frames_to_original(lafs, ratio.to(x))
+        fields[f"K{i}"] = None if K is None else A.to(K) @ K
+    back0, back1 = (torch.linalg.inv(A) for A in maps)
+    return c.derived(**fields), unit_frobenius(back1.T @ F @ back0), even
+
+
 def geometry_to_original(geometry: PairGeometry, s0: Tensor, s1: Tensor) -> PairGeometry:
     """The geometry of two reduced images in pixels of the originals."""
     A0, A1 = (_reduction(s).numpy() for s in (s0.cpu(), s1.cpu()))

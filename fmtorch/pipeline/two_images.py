@@ -29,6 +29,7 @@ from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pipeline.reduced_images import (
     Image,
+    evenly_reduced,
     frames_to_original,
     fundamental_to_original,
     geometry_to_original,
@@ -110,16 +111,17 @@ def relate(
     cameras: Mapping[str, Tensor] = NOTHING_KNOWN, lenses: Lenses = (None, None),
 ) -> MatchResult:  # fmt: skip
     """What `match` finds of two photographs that are described already. cameras: of `camera_fields`."""
+    compile_with([*pipeline.pruners.values(), pipeline.estimator])
     clock = Clock(pipeline.device)
     clock("features", described0.seconds + described1.seconds)
     scales = [described0.scale, described1.scale]
     known = reduced_cameras(cameras, scales, [described0.size, described1.size])
     known = {name: value.to(pipeline.device) for name, value in known.items()}
-    compile_with([*pipeline.pruners.values(), pipeline.estimator])
     result = _matched(pipeline, described0.features, described1.features, clock)
     if not result.reason:
         c = result.correspondences
-        result = _estimated(pipeline, result, undistorted_matches(c, lenses, scales).replace(**known), seed, clock)
+        c = undistorted_matches(c, lenses, scales).replace(**known)
+        result = _estimated(pipeline, result, c, scales, seed, clock)
     if not any(lens is not None and lens.bends for lens in lenses):
         result = dataclasses.replace(result, undistorted=None)
     sizes = [torch.tensor([d.size], device=pipeline.device) for d in (described0, described1)]
@@ -157,15 +159,18 @@ def _matched(pipeline: Pipeline, features0: Features, features1: Features, clock
     return dataclasses.replace(nothing_found, putative=putative, kept=kept, correspondences=c, counts=counts)
 
 
-def _estimated(pipeline: Pipeline, matched: MatchResult, c: Correspondences, seed: int, clock: Clock) -> MatchResult:
+def _estimated(
+    pipeline: Pipeline, matched: MatchResult, c: Correspondences, scales: list[Tensor], seed: int, clock: Clock
+) -> MatchResult:
     """The result with an estimate. c: the matches as pinholes have them, with what is known of the cameras."""
     estimator = KnownCameras(pipeline.estimator) if c.asks_for_cameras else pipeline.estimator
     estimate: Estimate = judged(estimator(c, seed).detach(), c)
     clock("estimation")
-    configuration = classify(c, estimate, seed=seed)
+    even, F, even_scales = evenly_reduced(c, estimate.F, scales)
+    configuration = classify(even, estimate.derived(F=F), seed=seed)
     clock("configuration")
     index = np.arange(c.mask.shape[1]).repeat(2).reshape(-1, 2)
-    (geometry,) = pair_geometries([index], c, estimate, configuration)
+    (geometry,) = pair_geometries([index], even, estimate.derived(F=F), configuration)
     inliers = estimate.inliers[0]
     R, t, focals = (None if value is None else value[0] for value in (estimate.R, estimate.t, estimate.focals))
     return dataclasses.replace(
@@ -173,7 +178,7 @@ def _estimated(pipeline: Pipeline, matched: MatchResult, c: Correspondences, see
         warning=_still(matched.correspondences, inliers) or configuration.warnings[0],
         counts={**matched.counts, "estimation": int(inliers.sum())}, seconds=clock.seconds,
         significance=float(cast(Tensor, estimate.significance)[0]), R=R, t=t, focals=focals,
-        configuration=configuration.names[0], geometry=geometry, undistorted=c,
+        configuration=configuration.names[0], geometry=geometry_to_original(geometry, *even_scales), undistorted=c,
     )  # fmt: skip
 
 
@@ -204,5 +209,4 @@ def _restored(result: MatchResult, scales: list[Tensor], sizes: list[Tensor]) ->
         putative=matches(result.putative), correspondences=matches(result.correspondences), undistorted=undistorted,
         F=fundamental_to_original(result.F, *scales),
         focals=None if result.focals is None else result.focals / torch.stack(scales).prod(1).sqrt().to(result.focals),
-        geometry=None if result.geometry is None else geometry_to_original(result.geometry, *scales),
     )  # fmt: skip
