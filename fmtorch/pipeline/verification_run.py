@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.core.stages import Estimator
-from fmtorch.core.types import collate
+from fmtorch.core.types import Correspondences, collate
 from fmtorch.pipeline.database_pairs import Cameras, DatabasePair, as_correspondences, geometries
 from fmtorch.pipeline.estimation import estimated_by
 from fmtorch.storage.exchange.database_images import DatabaseImage
@@ -117,9 +117,24 @@ class VerificationRun:
                 self.problems.append(f"{names}: {error}".splitlines()[0])
         if not ids:
             return
-        c = collate(given)
-        results = geometries(pairs, c, estimated_by(self.estimator, c, self.seed), self.seed)
-        self.database.write(zip(ids, results, strict=True))
+        results: list[PairGeometry | None] = [None] * len(ids)
+        for alike in _alike(given):
+            c = collate([given[i] for i in alike])
+            of_these = [pairs[i] for i in alike]
+            found = geometries(of_these, c, estimated_by(self.estimator, c, self.seed), self.seed)
+            for i, geometry in zip(alike, found, strict=True):
+                results[i] = geometry
+        written = [(pair, result) for pair, result in zip(ids, results, strict=True) if result is not None]
+        self.database.write(written)
         if self.log is not None:
             self.log.add(ids)
-        self.configurations.update(result.kind for result in results)
+        self.configurations.update(result.kind for _, result in written)
+
+
+def _alike(given: Sequence[Correspondences]) -> list[list[int]]:
+    """Indices of pairs of which the same is known: in one batch a pair would lose what another lacks."""
+    groups: dict[tuple[bool, ...], list[int]] = {}
+    for i, c in enumerate(given):
+        known = tuple(getattr(c, field.name) is not None for field in dataclasses.fields(c))
+        groups.setdefault(known, []).append(i)
+    return list(groups.values())
