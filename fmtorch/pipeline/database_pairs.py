@@ -27,7 +27,8 @@ class DatabasePair(NamedTuple):
 def as_correspondences(pair: DatabasePair, cameras: Cameras) -> Correspondences:
     """The pair as a batch of one, with what is known of its cameras; of pinholes where these are those stored.
 
-    Raises ValueError where a stored camera is none that there can be.
+    Without image sizes nothing is asked of cameras. Raises ValueError where a stored camera is none that there can be,
+    or where the size of one image alone is known.
     """
     images, stored = (pair.image0, pair.image1), cameras == "stored"
     problem = next((image.problem for image in images if image.problem), "") if stored else ""
@@ -35,24 +36,21 @@ def as_correspondences(pair: DatabasePair, cameras: Cameras) -> Correspondences:
         raise ValueError(problem)
     fields: dict[str, Any] = {}
     for i, image in enumerate(images):
-        index = pair.matches[:, i]
-        points = (image.pinhole if stored else image.points)[index]
-        frames = image.pinhole_frames if stored else image.frames
+        points = (image.pinhole if stored else image.points)[pair.matches[:, i]]
         fields[f"x{i}"] = torch.from_numpy(points)[None]
-        fields[f"size{i}"] = torch.tensor([image.size])
-        if frames is not None:
-            fields[f"lafs{i}"] = torch.from_numpy(np.concatenate([frames[index], points[..., None]], -1))[None]
-        if stored:
+        if image.size is not None:
+            fields[f"size{i}"] = torch.tensor([image.size])
+        if stored and image.K is not None:
             fields[f"K{i}"] = torch.from_numpy(image.K)[None]
-    if "lafs0" not in fields or "lafs1" not in fields:
-        fields = {name: value for name, value in fields.items() if not name.startswith("lafs")}
     mask = torch.isfinite(fields["x0"]).all(-1) & torch.isfinite(fields["x1"]).all(-1)
-    focal = [(1.0, image.deviation) for image in images] if stored else [UNKNOWN, UNKNOWN]
+    if any(image.size is not None for image in images):
+        focal = [(1.0, image.deviation) for image in images] if stored else [UNKNOWN, UNKNOWN]
+        fields["focal"] = torch.tensor([focal], dtype=torch.float64)
+        fields["shared_focal"] = torch.tensor([_shared(*images, cameras)])
+    elif cameras == "shared":
+        raise ValueError("cameras=shared needs the image sizes: size0 and size1, or K0 and K1")
     key = torch.tensor([pair_key(f"{images[0].name} {images[1].name}")])
-    return Correspondences(
-        mask=mask, key=key, focal=torch.tensor([focal], dtype=torch.float64),
-        shared_focal=torch.tensor([_shared(*images, cameras)]), **fields,
-    )  # fmt: skip
+    return Correspondences(mask=mask, key=key, **fields)
 
 
 def _shared(image0: DatabaseImage, image1: DatabaseImage, cameras: Cameras) -> bool:

@@ -1,12 +1,12 @@
-"""Two-view geometries of a COLMAP database, or of hloc's files, whose matches anyone made."""
+"""Two-view geometries of a COLMAP database, of hloc's files, or of matches alone, whoever made them."""
 
 from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast, get_args
+from typing import Any, NamedTuple, TypeVar, cast, get_args
 
 from fmtorch import presets
 from fmtorch.core.arguments import number
@@ -24,7 +24,14 @@ from fmtorch.storage.exchange.database import (
     remove_database,
 )
 from fmtorch.storage.exchange.hloc_matches import HlocMatches
+from fmtorch.storage.exchange.match_file import MatchFile, expect_suffix
 from fmtorch.storage.exchange.verification_log import VerificationLog
+
+Store = TypeVar("Store", HlocMatches, MatchFile)
+HLOC_NEEDS = "hloc's files need features=F.h5 matches=M.h5 output=VERIFIED.h5, and no database"
+MATCHES_NEED = (
+    "matches alone need an output: matches=FILE.npz output=VERIFIED.npz, with features=F.h5 where they are hloc's"
+)
 
 
 def verify(
@@ -50,8 +57,11 @@ def verify(
     Args:
         path: the database, of COLMAP 3 or 4, with keypoints of 2, 4 or 6 columns and cameras of any model with a lens.
         features, matches: hloc's two files in place of a database. They know no cameras; "stored" is "unknown" then.
+            matches alone: an npz or HDF5 file of x0, x1 (n, 2), pixels, and perhaps K0, K1 (3, 3), size0, size1 (h, w),
+            of one pair or of each pair below its name (``a/x0``). Without K and sizes a pair has F and H, but no pose.
         output: a new database to write to instead; it gets this name once it is complete. Of hloc's files a new file of
-            matches, those that are inliers, with the matrices as attributes.
+            matches, those that are inliers, with the matrices as attributes. Of matches alone an npz or HDF5 file of
+            each pair's `configuration`, `inliers` (n,), and F, E, H, R, t as far as it has them.
         cameras: "stored": points are undistorted, focal lengths are exact where the camera was calibrated, known within
             5 % where they have a prior and nothing else is known of the camera (EXIF), and unknown where they are
             COLMAP's guess; images of one camera share theirs. "shared": all images have one unknown focal length in
@@ -90,7 +100,7 @@ def verify(
 
 
 class Places(NamedTuple):
-    """Where matches are, in a database or in hloc's two files, and where geometries go."""
+    """Where matches are, in a database, in hloc's two files or in one of matches alone, and where geometries go."""
 
     database: Path | None
     features: Path | None
@@ -113,11 +123,16 @@ def verify_by(
     settings = {**settings, "version": __version__, "cameras": cameras, "seed": seed, "force": force}
     path, features, matches, output = places
     if features is not None or matches is not None:
-        if path is not None or features is None or matches is None or output is None:
-            raise ValueError("hloc's files need features=F.h5 matches=M.h5 output=VERIFIED.h5, and no database")
-        store = _opened_hloc(features, matches, output, settings, force)
+        if path is not None or matches is None or output is None:
+            raise ValueError(HLOC_NEEDS if features is not None or path is not None else MATCHES_NEED)
+        store: HlocMatches | MatchFile
+        if features is None:
+            store = _opened_matches(matches, output, settings, force)
+        else:
+            store = _opened_hloc(features, matches, output, settings, force)
+            known = "unknown" if known == "stored" else known
         with store:
-            run = VerificationRun(store, "unknown" if known == "stored" else known, seed, estimator)
+            run = VerificationRun(store, known, seed, estimator)
             run.each_batch(report)
             store.finish(output)
         _log_of(output).unlink(missing_ok=True)
@@ -162,16 +177,41 @@ def _opened(
 
 def _opened_hloc(features: Path, matches: Path, output: Path, settings: Mapping[str, Any], force: bool) -> HlocMatches:
     """hloc's files, with what an interrupted run of the same settings found of them."""
-    for path in (features, matches):
+    sources = (features, matches)
+    _expect_sources(sources, output, "give hloc's files: features=F.h5 matches=M.h5")
+    return _with_parts(HlocMatches, sources, output, settings, force)
+
+
+def _opened_matches(matches: Path, output: Path, settings: Mapping[str, Any], force: bool) -> MatchFile:
+    """A file of matches alone, likewise."""
+    expect_suffix("matches", matches)
+    expect_suffix("output", output)
+    _expect_sources((matches,), output, "give matches alone: matches=FILE.npz")
+    return _with_parts(MatchFile, (matches,), output, settings, force)
+
+
+def _expect_sources(paths: Sequence[Path], output: Path, wanted: str) -> None:
+    for path in paths:
         if not path.exists():
-            raise FileNotFoundError(f"there is no file {path}; give hloc's files: features=F.h5 matches=M.h5")
+            raise FileNotFoundError(f"there is no file {path}; {wanted}")
         if output.exists() and output.samefile(path):
             raise ValueError(f"output={output} is one of the files that are read; name another")
+
+
+def _with_parts(
+    kind: Callable[..., Store], sources: Sequence[Path], output: Path, settings: Mapping[str, Any], force: bool
+) -> Store:
+    """Files and the folder of what is found of them, which is emptied unless a run of the same settings ended early."""
     _expect_new(output, force)
-    log = VerificationLog(_log_of(output), {**settings, **_states(features, matches)})
+    parts, log = _work_of(output), VerificationLog(_log_of(output), {**settings, **_states(*sources)})
     if not log.continued:
-        shutil.rmtree(_work_of(output), ignore_errors=True)
-    return HlocMatches(features, matches, _work_of(output))
+        shutil.rmtree(parts, ignore_errors=True)
+    try:
+        return kind(*sources, parts)
+    except ValueError:
+        if not parts.exists():
+            log.remove()
+        raise
 
 
 def _expect_new(output: Path, force: bool) -> None:

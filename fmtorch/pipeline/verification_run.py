@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.core.stages import Estimator
-from fmtorch.core.types import collate
+from fmtorch.core.types import Correspondences, collate
 from fmtorch.pipeline.configuration import classify
 from fmtorch.pipeline.database_pairs import Cameras, DatabasePair, as_correspondences
 from fmtorch.pipeline.estimation import estimated_by
@@ -119,11 +119,25 @@ class VerificationRun:
                 self.problems.append(f"{names}: {error}".splitlines()[0])
         if not ids:
             return
-        c = collate(given)
-        estimate = estimated_by(self.estimator, c, self.seed)
-        configuration = classify(c, estimate, focal_deviation=0, seed=self.seed)
-        results = pair_geometries([pair.matches for pair in pairs], c, estimate, configuration)
-        self.database.write(zip(ids, results, strict=True))
+        results: list[PairGeometry | None] = [None] * len(ids)
+        for alike in _alike(given):
+            c = collate([given[i] for i in alike])
+            estimate = estimated_by(self.estimator, c, self.seed)
+            configuration = classify(c, estimate, focal_deviation=0, seed=self.seed)
+            found = pair_geometries([pairs[i].matches for i in alike], c, estimate, configuration)
+            for i, geometry in zip(alike, found, strict=True):
+                results[i] = geometry
+        written = [(pair, result) for pair, result in zip(ids, results, strict=True) if result is not None]
+        self.database.write(written)
         if self.log is not None:
             self.log.add(ids)
-        self.configurations.update(result.kind for result in results)
+        self.configurations.update(result.kind for _, result in written)
+
+
+def _alike(given: Sequence[Correspondences]) -> list[list[int]]:
+    """Indices of pairs of which the same is known: in one batch a pair would lose what another lacks."""
+    groups: dict[tuple[bool, ...], list[int]] = {}
+    for i, c in enumerate(given):
+        known = tuple(getattr(c, field.name) is not None for field in dataclasses.fields(c))
+        groups.setdefault(known, []).append(i)
+    return list(groups.values())

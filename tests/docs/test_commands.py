@@ -99,7 +99,7 @@ APPENDED = {
     "related": ["--limit", "1", "--unrelated", "1"],
     "learned": ["--limit", "1", "--cache", "kept", "--methods", "ratio", "LC, F", "DFE"],
     "stress": ["--limit", "1", "--only", "noise"],
-    "verify": ["--scenes", "DATA/Strecha/a", "--repeats", "1", "--no-mapper"],
+    "verify": ["--root", "DATA", "--scenes", "Strecha/a", "--features", "colmap", "--seeds", "1", "--mappers"],
     "speed": ["--pairs", "2", "--batch", "2", "--repeats", "1", "--matches", "200"],
     "memory": ["--pairs", "1", "--matches", "200", "--estimators", "ransac"],
     "end_to_end": ["--limit", "1", "--pipelines", "sift_lmeds"],

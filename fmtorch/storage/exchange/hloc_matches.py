@@ -125,7 +125,7 @@ class HlocMatches:
         points = h5.numbers(self._features, f"{name}/keypoints", None, 2).astype(np.float32)
         width, height = h5.reshaped(self._features, f"{name}/image_size", 2)
         size = int(height), int(width)
-        return DatabaseImage(name, -1, size, np.eye(3), np.inf, points, points, None, None)
+        return DatabaseImage(name, -1, size, np.eye(3), np.inf, points, points)
 
 
 def write_geometry(group: Any, geometry: PairGeometry) -> None:
