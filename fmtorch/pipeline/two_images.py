@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import cast
 
@@ -15,12 +15,15 @@ from torch import Tensor
 
 from fmtorch import presets
 from fmtorch.core.arguments import Arrays
+from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
+from fmtorch.core.stages import PairImages, pruned
 from fmtorch.core.threads import mapped, one_thread
 from fmtorch.core.types import RELATED, Correspondences, Estimate, Features
+from fmtorch.data.images import to_grey
 from fmtorch.geometry.verdict import judged
 from fmtorch.pipeline.camera_arguments import Focal, camera_fields
 from fmtorch.pipeline.clock import Clock
-from fmtorch.pipeline.configuration import name_and_warning
+from fmtorch.pipeline.configuration import name_and_warning, still_warning
 from fmtorch.pipeline.known_cameras import KnownCameras
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pipeline.reduced_images import (
@@ -34,7 +37,6 @@ from fmtorch.pipeline.reduced_images import (
 )
 
 NOTHING_KNOWN: Mapping[str, Tensor] = {}
-STILL = 0.1  # px of the images as matched: a median motion below it is none
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -140,13 +142,14 @@ def match(
 class Described:
     """A photograph's features in pixels of it as it was reduced, the scale of that in x and y, and its size (h, w).
 
-    seconds: that describing it takes or took.
+    seconds: that describing it takes or took. pyramid: its grey levels, for pruners that look at them.
     """
 
     features: Features
     scale: Float[Tensor, " xy"]
     size: tuple[int, int]
     seconds: float
+    pyramid: GreyPyramid | None = None
 
     @property
     def points(self) -> Float[Tensor, "n 2"]:
@@ -158,7 +161,8 @@ def describe(pipeline: Pipeline, image: Image, longest_side: int) -> Described:
     """The features of a photograph, for `relate`; see `match`."""
     reduced, scale = reduced_image(image, longest_side)
     features, seconds = pipeline.extract(reduced)
-    return Described(features, scale, (image.shape[0], image.shape[1]), seconds)
+    pyramid = grey_pyramid(to_grey(reduced)) if pipeline.looks_at_images else None
+    return Described(features, scale, (image.shape[0], image.shape[1]), seconds, pyramid)
 
 
 def relate(
@@ -171,7 +175,7 @@ def relate(
     scales = [described0.scale, described1.scale]
     known = reduced_cameras(cameras, scales, [described0.size, described1.size])
     known = {name: value.to(pipeline.device) for name, value in known.items()}
-    result = _relate(pipeline, described0.features, described1.features, seed, clock, known)
+    result = _relate(pipeline, (described0, described1), seed, clock, known)
     sizes = [torch.tensor([d.size], device=pipeline.device) for d in (described0, described1)]
     return _restored(result, scales, sizes)
 
@@ -183,9 +187,11 @@ def _pipeline(name: str, device: str) -> Pipeline:
 
 
 def _relate(
-    pipeline: Pipeline, features0: Features, features1: Features, seed: int, clock: Clock, cameras: dict[str, Tensor]
+    pipeline: Pipeline, described: Sequence[Described], seed: int, clock: Clock, cameras: dict[str, Tensor]
 ) -> MatchResult:
     """Matching, pruning and estimation, in pixels of the images as they were described."""
+    features0, features1 = (each.features for each in described)
+    images = cast(PairImages, tuple(each.pyramid for each in described))
     ends = features0.keypoints, features1.keypoints
     nothing = Correspondences(ends[0][None, :0], ends[1][None, :0], features0.valid[None, :0])
     nothing_found = MatchResult(
@@ -201,7 +207,7 @@ def _relate(
     slots = torch.arange(c.mask.shape[1], device=c.mask.device)
     for name, pruner in pipeline.pruners.items():
         with one_thread(pipeline.device):
-            c = pruner(c)
+            c = pruned(pruner, c, lambda _: images)
         slots, c = slots[c.mask[0]], c.compact()
         clock(name)
         counts[name] = len(slots)
@@ -216,18 +222,9 @@ def _relate(
     R, t, focals = (None if value is None else value[0] for value in (estimate.R, estimate.t, estimate.focals))
     return MatchResult(
         *ends, putative, kept, c, inliers, estimate.F[0].to(torch.float64), estimate.reason[0],
-        _still(c, inliers) or warning, counts, clock.seconds, float(cast(Tensor, estimate.significance)[0]),
+        still_warning(c, inliers) or warning, counts, clock.seconds, float(cast(Tensor, estimate.significance)[0]),
         R, t, focals, configuration,
     )  # fmt: skip
-
-
-def _still(c: Correspondences, inliers: Tensor) -> str:
-    """A warning where the inliers, or without any all matches, do not move between the images."""
-    motion = (c.x1 - c.x0)[0].norm(dim=-1)
-    motion = motion[inliers] if inliers.any() else motion
-    if len(motion) == 0 or motion.median() > STILL:
-        return ""
-    return "the images show no motion, as if they were one: infinitely many F agree with all matches"
 
 
 def _restored(result: MatchResult, scales: list[Tensor], sizes: list[Tensor]) -> MatchResult:

@@ -16,6 +16,7 @@ from fmtorch.core.stages import PairImages
 from fmtorch.core.threads import mapped
 from fmtorch.core.types import Correspondences
 from fmtorch.pruning import refine_matches_kernels as compiled
+from fmtorch.pruning.window_kernels import Pyramid
 
 MIN_PRIOR = 0.02  # matches less likely than that are not taken for less exact, as in `match_noise`
 
@@ -105,7 +106,7 @@ class RefineMatches:
         out = compiled.Refined(
             np.empty((n, 2)), np.empty((n, 2, 2)), np.empty((n, 3)), np.empty(n), np.empty(n, np.bool_)
         )
-        compiled.refine_windows(windows, compiled.Pyramid(*image0), compiled.Pyramid(*image1), fit, out)
+        compiled.refine_windows(windows, Pyramid(*image0), Pyramid(*image1), fit, out)
         return out
 
     def _noise(self, out: compiled.Refined) -> Array:

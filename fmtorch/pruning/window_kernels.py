@@ -78,7 +78,7 @@ def level_for(image: Pyramid, spacing: float) -> int:
 @inner
 def _inside(image: Pyramid, level: int, x: float, y: float) -> bool:
     """Whether a point has four pixels of the level around it; no point that is not finite has."""
-    return 0.0 <= x < image.levels[level, 1] - 1 and 0.0 <= y < image.levels[level, 0] - 1
+    return bool(0.0 <= x < image.levels[level, 1] - 1 and 0.0 <= y < image.levels[level, 0] - 1)
 
 
 @inner
@@ -240,4 +240,4 @@ def covariance(L: Array, best: Array, variance: float, out: Array) -> None:
 def largest_variance(covariance: Array) -> float:
     """The larger eigenvalue of a covariance xx, xy, yy."""
     half = (covariance[0] - covariance[2]) / 2.0
-    return (covariance[0] + covariance[2]) / 2.0 + math.hypot(half, covariance[1])
+    return float((covariance[0] + covariance[2]) / 2.0 + math.hypot(half, covariance[1]))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -15,6 +14,7 @@ from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
 from fmtorch.core.stages import ImagePruner
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.pruning import refine_matches_kernels as compiled
+from fmtorch.pruning.window_kernels import Pyramid
 from tests.reference import refine_matches as reference
 
 MAP = np.array([[1.1, -0.2], [0.15, 0.95]])
@@ -85,7 +85,7 @@ def test_kernel_is_the_slow_form(spacing: float, radius: int) -> None:
     affine = np.tile(MAP * 1.05, (n, 1, 1))
     windows = compiled.Windows(x0, x1, affine, np.full(n, spacing), np.ones(n, bool))
     out = compiled.Refined(np.empty((n, 2)), np.empty((n, 2, 2)), np.empty((n, 3)), np.empty(n), np.empty(n, bool))
-    groups = compiled.Pyramid(*first), compiled.Pyramid(*second)
+    groups = Pyramid(*first), Pyramid(*second)
     compiled.refine_windows(windows, *groups, compiled.Fit(radius, 6, 0.8, 2.0, 1.0), out)
     refined = 0
     for i in range(n):
