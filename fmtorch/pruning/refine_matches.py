@@ -137,7 +137,7 @@ def _array(tensor: Tensor) -> Array:
 
 def _finite(*arrays: Array) -> Array:
     """Of which matches (n,) all numbers are finite."""
-    finite: Array = np.all([np.isfinite(array).reshape(len(array), -1).all(1) for array in arrays], 0)
+    finite: Array = np.all([np.isfinite(array).all(tuple(range(1, array.ndim))) for array in arrays], 0)
     return finite
 
 
