@@ -32,6 +32,7 @@ from fmtorch.pipeline.estimation import estimated, estimator_of
 
 FOCAL_DEVIATION = 0.02
 """Of the focal lengths of a calibration, relative: what zoom and focus change between two days."""
+STILL = 0.1  # px of the images as matched: a median motion below it is none
 USUAL_FOCAL, USUAL_DEVIATION = 1.2, 0.4  # of photographs, in longer sides, and of its logarithm (the estimator's prior)
 SAME_POSE = 1e-3  # radians: two poses of a plane that differ less in rotation are one
 OTHER_CAMERA = 0.5  # deviation of the logarithm of the ratio of both focal lengths (likewise)
@@ -205,3 +206,12 @@ def _other_pose(R: Float[Tensor, "b 3 3"], poses: PlanePoses, flat: Tensor) -> d
         "other_R": torch.where(valid[:, None, None], poses.R[rows, other], torch.nan).to(R),
         "other_t": torch.where(valid[:, None], t, torch.nan).to(R),
     }
+
+
+def still_warning(c: Correspondences, inliers: Tensor) -> str:
+    """A warning where the inliers, or without any all matches, do not move between the images."""
+    motion = (c.x1 - c.x0)[0].norm(dim=-1)
+    motion = motion[inliers] if inliers.any() else motion
+    if len(motion) == 0 or motion.median() > STILL:
+        return ""
+    return "the images show no motion, as if they were one: infinitely many F agree with all matches"

@@ -7,7 +7,9 @@ import dataclasses
 from jaxtyping import Float
 from torch import Tensor
 
+from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
 from fmtorch.core.types import Features
+from fmtorch.data.images import to_grey
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pipeline.reduced_images import Image, reduced_image, to_original
 
@@ -16,13 +18,14 @@ from fmtorch.pipeline.reduced_images import Image, reduced_image, to_original
 class Described:
     """A photograph's features in pixels of it as it was reduced, the scale of that in x and y, and its size (h, w).
 
-    seconds: that describing it takes or took.
+    seconds: that describing it takes or took. pyramid: its grey levels, for pruners that look at them.
     """
 
     features: Features
     scale: Float[Tensor, " xy"]
     size: tuple[int, int]
     seconds: float
+    pyramid: GreyPyramid | None = None
 
     @property
     def points(self) -> Float[Tensor, "n 2"]:
@@ -34,4 +37,5 @@ def describe(pipeline: Pipeline, image: Image, longest_side: int) -> Described:
     """The features of a photograph, for `relate`; see `match`."""
     reduced, scale = reduced_image(image, longest_side)
     features, seconds = pipeline.extract(reduced)
-    return Described(features, scale, (image.shape[0], image.shape[1]), seconds)
+    pyramid = grey_pyramid(to_grey(reduced)) if pipeline.looks_at_images else None
+    return Described(features, scale, (image.shape[0], image.shape[1]), seconds, pyramid)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import cast
 
@@ -14,13 +14,14 @@ from torch import Tensor
 
 from fmtorch import presets
 from fmtorch.core.arguments import Arrays
+from fmtorch.core.stages import PairImages, pruned
 from fmtorch.core.threads import mapped, one_thread
-from fmtorch.core.types import Correspondences, Estimate, Features
+from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data.lenses import Lens
 from fmtorch.geometry.verdict import judged
 from fmtorch.pipeline.camera_arguments import Focal, camera_fields
 from fmtorch.pipeline.clock import Clock
-from fmtorch.pipeline.configuration import classify, compile_with
+from fmtorch.pipeline.configuration import classify, compile_with, still_warning
 from fmtorch.pipeline.described import Described as Described
 from fmtorch.pipeline.described import describe as describe
 from fmtorch.pipeline.known_cameras import KnownCameras
@@ -42,7 +43,6 @@ from fmtorch.pipeline.reduced_images import (
 NOTHING_KNOWN: Mapping[str, Tensor] = {}
 NO_CAMERAS: Mapping[str, None] = dict.fromkeys(("K0", "K1", "focal", "shared_focal"))  # of the reduced images
 Lenses = tuple[Lens | None, Lens | None]
-STILL = 0.1  # px of the images as matched: a median motion below it is none
 
 
 def match(
@@ -117,7 +117,7 @@ def relate(
     scales = [described0.scale, described1.scale]
     known = reduced_cameras(cameras, scales, [described0.size, described1.size])
     known = {name: value.to(pipeline.device) for name, value in known.items()}
-    result = _matched(pipeline, described0.features, described1.features, clock)
+    result = _matched(pipeline, (described0, described1), clock)
     if not result.reason:
         c = result.correspondences
         c = undistorted_matches(c, lenses, scales).replace(**known)
@@ -134,8 +134,10 @@ def _pipeline(name: str, device: str) -> Pipeline:
     return built
 
 
-def _matched(pipeline: Pipeline, features0: Features, features1: Features, clock: Clock) -> MatchResult:
+def _matched(pipeline: Pipeline, described: Sequence[Described], clock: Clock) -> MatchResult:
     """Matching and pruning, in pixels of the images as they were described; a reason where there are no keypoints."""
+    features0, features1 = (each.features for each in described)
+    images = cast(PairImages, tuple(each.pyramid for each in described))
     ends = features0.keypoints, features1.keypoints
     nothing = Correspondences(ends[0][None, :0], ends[1][None, :0], features0.valid[None, :0])
     nothing_found = MatchResult(
@@ -151,7 +153,7 @@ def _matched(pipeline: Pipeline, features0: Features, features1: Features, clock
     slots = torch.arange(c.mask.shape[1], device=c.mask.device)
     for name, pruner in pipeline.pruners.items():
         with one_thread(pipeline.device):
-            c = pruner(c)
+            c = pruned(pruner, c, lambda _: images)
         slots, c = slots[c.mask[0]], c.compact()
         clock(name)
         counts[name] = len(slots)
@@ -175,20 +177,11 @@ def _estimated(
     R, t, focals = (None if value is None else value[0] for value in (estimate.R, estimate.t, estimate.focals))
     return dataclasses.replace(
         matched, inliers=inliers, F=estimate.F[0].to(torch.float64), reason=estimate.reason[0],
-        warning=_still(matched.correspondences, inliers) or configuration.warnings[0],
+        warning=still_warning(matched.correspondences, inliers) or configuration.warnings[0],
         counts={**matched.counts, "estimation": int(inliers.sum())}, seconds=clock.seconds,
         significance=float(cast(Tensor, estimate.significance)[0]), R=R, t=t, focals=focals,
         configuration=configuration.names[0], geometry=geometry_to_original(geometry, *even_scales), undistorted=c,
     )  # fmt: skip
-
-
-def _still(c: Correspondences, inliers: Tensor) -> str:
-    """A warning where the inliers, or without any all matches, do not move between the images."""
-    motion = (c.x1 - c.x0)[0].norm(dim=-1)
-    motion = motion[inliers] if inliers.any() else motion
-    if len(motion) == 0 or motion.median() > STILL:
-        return ""
-    return "the images show no motion, as if they were one: infinitely many F agree with all matches"
 
 
 def _restored(result: MatchResult, scales: list[Tensor], sizes: list[Tensor]) -> MatchResult:
