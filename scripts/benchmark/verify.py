@@ -6,7 +6,7 @@ method begins with the same database without geometries, on one thread, reading 
 a prior focal length. Then the incremental and the global mapper, whose poses are compared with the true ones; images
 that are not registered count as wrong. Rows are kept in --work: an interrupted run goes on where it stopped.
 
-python -m scripts.benchmark verify --root DATA --work runs/verify --write docs/verify.md
+python -m scripts.benchmark verify --root DATA --work runs/verify --markdown docs/verify.md
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument("--cameras", nargs="+", default=CAMERA_KINDS, choices=CAMERA_KINDS)
     parser.add_argument("--mappers", nargs="*", default=MAPPERS, choices=MAPPERS)
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--write", type=Path, help="a Markdown file whose tables are replaced")
+    parser.add_argument("--markdown", type=Path, help="put the tables between the marks of this file")
     parser.set_defaults(run=run)
 
 
@@ -65,8 +65,8 @@ def run(arguments: argparse.Namespace) -> None:
     tables = sheets(kept.rows, arguments.methods)
     for table in tables:
         console.print(table.terminal())
-    if arguments.write is not None:
-        put(arguments.write, tables)
+    if arguments.markdown is not None:
+        put(arguments.markdown, tables)
 
 
 def measure(scene: Scene, database: Path, key: tuple[Any, ...], mappers: list[str], kept: Kept) -> None:

@@ -11,8 +11,12 @@ from scripts.benchmark.sheet import MISSING, Sheet
 from scripts.benchmark.verify_mappers import MAPPERS, THRESHOLDS
 
 FEATURES = {"colmap": "COLMAP's SIFT", "ours": "our features"}
-AUC5 = "auc5"
 Figure = tuple[str, Callable[[Row], float], int]  # column, value of a row, digits
+
+
+def _field(name: str) -> Callable[[Row], float]:
+    return lambda row: float(row.get(name, np.nan))
+
 
 VERIFICATION: tuple[Figure, ...] = (
     ("pairs", lambda row: row["pairs"], 0),
@@ -25,11 +29,11 @@ VERIFICATION: tuple[Figure, ...] = (
 )
 MODEL: tuple[Figure, ...] = (
     ("registered", lambda row: row["registered"], 1),
-    ("points", lambda row: row.get("points", np.nan), 0),
-    ("track", lambda row: row.get("track", np.nan), 2),
-    ("error, px", lambda row: row.get("error", np.nan), 2),
-    *((f"AUC@{limit}", lambda row, name=f"auc{limit}": row[name], 1) for limit in THRESHOLDS),
-    *((f"centres@{limit}", lambda row, name=f"centre{limit}": row[name], 1) for limit in THRESHOLDS),
+    ("points", _field("points"), 0),
+    ("track", _field("track"), 2),
+    ("error, px", _field("error"), 2),
+    *((f"AUC@{limit}", _field(f"auc{limit}"), 1) for limit in THRESHOLDS),
+    *((f"centres@{limit}", _field(f"centre{limit}"), 1) for limit in THRESHOLDS),
     ("s", lambda row: row["seconds"], 1),
 )
 
@@ -74,21 +78,23 @@ def _mean(values: Iterable[float], digits: int) -> str:
 
 
 def _summary(rows: Sequence[Row], methods: Sequence[str], kinds: Sequence[tuple[str, str]]) -> Sheet:
-    """Means over the scenes that all methods have: registered images, AUC at 5 degrees, pairs a second."""
+    """Means over the scenes: pairs a second, and of each mapper registered images and AUC of relative poses."""
     lines = []
     for features, cameras in kinds:
         of_kind = [row for row in rows if (row["features"], row["cameras"]) == (features, cameras)]
         for method in methods:
             mine = [row for row in of_kind if row["method"] == method]
-            rates = _by_scene([row for row in mine if not row["mapper"]], lambda row: row["pairs"] / row["seconds"])
-            cells = [_mean(rates, 0)]
+            of_each: list[Row] = [row for row in mine if not row["mapper"]]
+            pairs, seconds = (sum(row[name] for row in of_each) for name in ("pairs", "seconds"))
+            cells = [f"{pairs / seconds:,.0f}" if seconds else MISSING]
             for mapper in MAPPERS:
                 models = [row for row in mine if row["mapper"] == mapper]
                 cells += [
                     _mean(_by_scene(models, lambda row: 100 * row["registered"] / row["images"]), 1),
-                    *(_mean(_by_scene(models, lambda row, name=f"auc{n}": row[name]), 1) for n in THRESHOLDS),
+                    *(_mean(_by_scene(models, _field(f"auc{n}")), 1) for n in THRESHOLDS),
                 ]
-            lines.append([FEATURES[features], cameras, method_name(method), *cells])
+            if mine:
+                lines.append([FEATURES[features], cameras, method_name(method), *cells])
     columns = [f"{mapper}: {name}" for mapper in MAPPERS for name in ("registered, %", *(f"@{n}" for n in THRESHOLDS))]
     title = "Means of the scenes: AUC of relative poses at 1, 5 and 10 degrees"
     return Sheet(title, ["features", "intrinsics", "verified by", "pairs a second", *columns], lines)

@@ -26,7 +26,7 @@ from hydra.core.global_hydra import GlobalHydra
 from fmtorch import data
 from fmtorch.data import read_image
 from tests.conftest import own_cache
-from tests.pipeline import databases, test_verification_hloc
+from tests.pipeline import databases, test_verification_hloc, test_verification_matches
 from tests.processes import run_command
 from tests.storage.exchange import writers
 
@@ -200,6 +200,7 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     writers.truth(folder / "SET")
     databases.write(folder / "database.db", databases.scene(3))
     test_verification_hloc.write(folder, databases.scene(3))
+    np.savez(folder / "matches.npz", **dict(zip(("x0", "x1"), test_verification_matches.points()[0], strict=True)))
     (folder / "my_conf" / "estimator").mkdir(parents=True)
     yaml = re.findall(
         r"```yaml\n# my_conf/estimator/mine.yaml\n(.*?)```", (SOURCE / "README.md").read_text(), re.DOTALL
