@@ -14,6 +14,7 @@ from omegaconf import DictConfig
 from rich.progress import Progress
 
 from fmtorch import data, presets
+from fmtorch.commands.executor import execution_of
 from fmtorch.commands.main import job, run_command
 from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.data import ImagePair, PairDataset
@@ -33,7 +34,6 @@ from fmtorch.storage.exchange.journal import Journal
 from fmtorch.storage.features import CachedFeatures
 
 MIN_PAIRS_FOR_PROCESSES = 500  # below which processes are not worth their start
-MAX_PROCESSES = 8  # unless more are asked for: each holds the networks of the pipeline and some 0.5 GB
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,6 +59,7 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
     Raises ValueError, before anything is computed or written, where an option is not what it may be.
     """
     fields = read_fields(Fields, config)
+    execution_of(config, fields.workers, fields.processes)
     device = presets.resolve_device(fields.device)
     exports = export_kinds(fields.export)
     presets.expect_dataset(config.dataset)
@@ -112,18 +113,19 @@ def _evaluated(
     journal: Journal | None,
 ) -> Iterator[int]:  # fmt: skip
     """Evaluates pairs into the folder and the journal; yields how many were done since."""
-    device, cores = pipeline.device, os.cpu_count() or 1
-    processes = len(pairs) >= MIN_PAIRS_FOR_PROCESSES if fields.processes is None else fields.processes
-    processes = processes and device.type == "cpu"
-    workers = fields.workers or (1 if device.type != "cpu" else min(cores, MAX_PROCESSES) if processes else cores)
-    build = functools.partial(presets.build_pipeline, config, device) if processes and workers > 1 else None
+    parallel = len(pairs) >= MIN_PAIRS_FOR_PROCESSES and pipeline.device.type == "cpu" and (os.cpu_count() or 1) > 1
+    execution = execution_of(config, fields.workers, fields.processes).decided(parallel)
+    if execution.shared and execution.workers is None and pipeline.device.type != "cpu":
+        execution = dataclasses.replace(execution, workers=1)
+    build = None if execution.shared else functools.partial(presets.build_pipeline, config, pipeline.device)
+    cameras = None
     if fields.cameras is not None:
         cameras = cameras_of(pairs, fields.cameras)
-        build = None if build is None else functools.partial(built_with, build, cameras)
+        build = None if build is None else functools.partial(built_with, build, {})
         pipeline = built_with(lambda: pipeline, cameras)
     return evaluate_pairs(
-        pipeline, pairs, seed=fields.seed, batch=fields.batch, workers=workers, store=folder.append, build=build,
-        journal=journal,
+        pipeline, pairs, seed=fields.seed, batch=fields.batch, execution=execution, store=folder.append, build=build,
+        cameras=cameras, journal=journal,
     )  # fmt: skip
 
 

@@ -21,11 +21,11 @@ from rich.progress import Progress
 
 from fmtorch import data, presets
 from fmtorch.commands.main import job, run_command
+from fmtorch.core.executors import end_with_parent
 from fmtorch.core.options import Within
 from fmtorch.core.terminal import console, progress_bars
 from fmtorch.data.construction import BLOCK, Construction, blocks
 from fmtorch.data.scenes import ScenePairs
-from fmtorch.evaluation.workers import end_with_parent
 from fmtorch.presets import plain
 from fmtorch.presets.fields import Count, Seed, path_fields, read_fields
 
