@@ -14,8 +14,8 @@ from omegaconf import DictConfig
 from rich.progress import Progress
 
 from fmtorch import data, presets
-from fmtorch.commands.executor import execution_of
 from fmtorch.commands.main import job, run_command
+from fmtorch.core.shards import shard_of
 from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.data import ImagePair, PairDataset
 from fmtorch.evaluation.identity import run_identity
@@ -27,6 +27,7 @@ from fmtorch.evaluation.summary_tables import pose_table, summary_markdown, summ
 from fmtorch.pipeline.exporting import exportable
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
+from fmtorch.presets.executors import execution_of
 from fmtorch.presets.fields import Cache, Count, Device, Gigabytes, Seed, path_fields, read_fields
 from fmtorch.storage import RunFolder, identity_digest
 from fmtorch.storage.exchange.export import export_kinds, write_exports
@@ -47,6 +48,7 @@ class Fields:
     batch: Count = 16
     workers: Count | None = None
     processes: bool | None = None
+    shard: str | None = None
     run_dir: Path | None = None
     cache: Cache = None
     cache_limit: Gigabytes | None = 20
@@ -60,6 +62,7 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
     """
     fields = read_fields(Fields, config)
     execution_of(config, fields.workers, fields.processes)
+    shard = shard_of(fields.shard)
     device = presets.resolve_device(fields.device)
     exports = export_kinds(fields.export)
     presets.expect_dataset(config.dataset)
@@ -70,16 +73,21 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
         folder = _open_folder(config, fields, pipeline_name, pipeline, dataset)
         pairs = select([dataset[i] for i in range(len(dataset))], fields.limit)
         journal = _journal(folder.path, pairs) if exports else None
-        todo = _missing(pairs, folder, journal)
-        bar = progress.add_task(pipeline_name, total=len(pairs), completed=len(pairs) - len(todo))
+        own = pairs if shard is None else shard.of(pairs)
+        todo = _missing(own, folder, journal)
+        bar = progress.add_task(pipeline_name, total=len(own), completed=len(own) - len(todo))
         for count in _evaluated(config, fields, pipeline, todo, folder, journal):
             progress.advance(bar, count)
-    if len(todo) < len(pairs):
-        earlier = f"{len(pairs) - len(todo)} of {len(pairs)} pairs taken from an earlier run in {folder.path}"
+    if len(todo) < len(own):
+        earlier = f"{len(own) - len(todo)} of {len(own)} pairs taken from an earlier run in {folder.path}"
         console.print(earlier, markup=False, highlight=False)
     table = folder.read({pair.key for pair in pairs})
+    if shard is not None and len(table) < len(pairs):
+        console.print(f"{len(table)} of {len(pairs)} pairs have rows; other shards have the rest", highlight=False)
+    if shard is not None and not len(table):  # of an empty shard, before the others
+        return folder.path
     summary = _summarize(table, folder, pipeline_name, dataset.name)
-    if journal is not None:
+    if journal is not None and len(table) == len(pairs):
         ends = [(p.image0.path, p.image1.path) for p in pairs if exportable(p)]
         written = write_exports(journal, ends, exports, folder.path)
         console.print(f"[dim]{folder.path}: {', '.join(written)}; names of images are below {journal.root}[/dim]")

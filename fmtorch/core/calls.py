@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
 from typing import Any, Generic, TypeVar
 
@@ -36,7 +36,7 @@ class Calls(Generic[Job]):
         self.waiting: dict[Future[Any], Job] = {}
         self._succeeded = False
 
-    def each(self, jobs: Iterable[Job]) -> Iterator[Job]:
+    def each(self, jobs: Iterable[Job]) -> Generator[Job, None, None]:
         """Have the jobs done, and yield each once its result is kept.
 
         Interrupted, it waits for what is under way and keeps it. What a call raises is raised here. Raises WorkersLost

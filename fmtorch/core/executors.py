@@ -62,7 +62,9 @@ class Team:
     preload: modules that processes import before they are forked.
     """
 
-    def __init__(self, execution: Execution, preload: Sequence[str] = (), most: int | None = None) -> None:
+    def __init__(
+        self, execution: Execution, preload: Sequence[str] = ("fmtorch.core.calls",), most: int | None = None
+    ) -> None:
         self.execution, self.preload = execution, preload
         cores = os.cpu_count() or 1
         count = execution.workers or (min(cores, MAX_PROCESSES) if execution.kind == "processes" else cores)

@@ -9,10 +9,9 @@ from typing import cast
 
 from omegaconf import DictConfig
 
-from fmtorch import presets
 from fmtorch.core.executors import Execution
-from fmtorch.presets import plain
 from fmtorch.presets.fields import Count, read_fields
+from fmtorch.presets.objects import expect_buildable, instantiate, plain
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,8 +37,8 @@ def execution_of(config: DictConfig, workers: int | None = None, processes: bool
     count = workers or fields.workers
     if "_target_" in options:
         made = {key: value for key, value in options.items() if key not in ExecutorFields.__dataclass_fields__}
-        presets.expect_buildable(made, "executor")
-        make = functools.partial(presets.instantiate, made, "executor")
+        expect_buildable(made, "executor")
+        make = functools.partial(instantiate, made, "executor")
         return Execution("threads", count, None, fields.send_images, cast("functools.partial[Executor]", make))
     kind = fields.name
     if processes is not None:
