@@ -14,10 +14,20 @@ from pathlib import Path
 
 import numpy as np
 
-from fmtorch.data.pairs import GivenMatches, ImagePair
+from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
 from fmtorch.data.text_files import DataError
 from fmtorch.storage.exchange import h5
-from fmtorch.storage.exchange.given import Array, Size, broken, calibrated, given, image, size_by_centre, size_of
+from fmtorch.storage.exchange.given import (
+    Array,
+    Size,
+    broken,
+    calibrated,
+    expect_size,
+    given,
+    image,
+    size_by_centre,
+    size_of,
+)
 
 MATCHES, RATIOS, CALIBRATIONS, ROTATIONS, TRANSLATIONS, TRUTH = (
     f"{name}.h5" for name in ("matches", "match_conf", "K1_K2", "R", "T", "Fgt")
@@ -104,6 +114,8 @@ class _Cameras:
     def calibration(self, key: str) -> tuple[Array, Array]:
         with h5.opened(self.folder / CALIBRATIONS) as file:
             K = h5.reshaped(file, key, 2, 3, 3)
+        if not np.linalg.det(K).all():
+            raise DataError(f"{self.folder / CALIBRATIONS}: {key!r}: a calibration matrix is singular")
         return K[0], K[1]
 
     def truth(self, key: str) -> Array:
@@ -113,6 +125,14 @@ class _Cameras:
             )
         with h5.opened(self.folder / TRUTH) as file:
             return h5.reshaped(file, key, 3, 3)
+
+
+def _size(source: ImageSource, K: Array) -> Size:
+    """(h, w) of an image, by its principal point where there is no file. Raises DataError where the two disagree."""
+    by_centre, size = size_by_centre(K), size_of(source)
+    if size is not None:
+        expect_size(source, size, K)
+    return size or by_centre
 
 
 def _pair(family: str, folder: Path, key: str, cameras: _Cameras, images: Path | None) -> ImagePair:
@@ -125,7 +145,7 @@ def _pair(family: str, folder: Path, key: str, cameras: _Cameras, images: Path |
             if name in cameras.problems:
                 raise DataError(cameras.problems[name])
         K0, K1 = cameras.calibration(key)
-        sizes = size_of(sources[0]) or size_by_centre(K0), size_of(sources[1]) or size_by_centre(K1)
+        sizes = _size(sources[0], K0), _size(sources[1], K1)
         if cameras.by_image:
             (R0, t0), (R1, t1) = cameras.by_image[name0], cameras.by_image[name1]
             R = R1 @ R0.T
