@@ -53,8 +53,10 @@ class Fields:
     export: str | list[str] | None = None
 
 
-def run(config: DictConfig, pipeline_name: str) -> Path:
+def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -> Path:
     """Evaluate one composed config and return the run folder.
+
+    overrides: what the command line changed of the pipeline of that name; said beside it.
 
     Raises ValueError, before anything is computed or written, where an option is not what it may be.
     """
@@ -77,7 +79,7 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
         earlier = f"{len(pairs) - len(todo)} of {len(pairs)} pairs taken from an earlier run in {folder.path}"
         console.print(earlier, markup=False, highlight=False)
     table = folder.read({pair.key for pair in pairs})
-    summary = _summarize(table, folder, f"{pipeline_name} on {dataset.name}")
+    summary = _summarize(table, folder, f"{' '.join([pipeline_name, *overrides])} on {dataset.name}")
     if journal is not None:
         ends = [(p.image0.path, p.image1.path) for p in pairs if exportable(p)]
         written = write_exports(journal, ends, exports, folder.path)
@@ -169,7 +171,9 @@ def _load(config: DictConfig, progress: Progress) -> PairDataset:
 @job
 def task(config: DictConfig) -> None:
     """What Hydra runs."""
-    run(config, str(HydraConfig.get().runtime.choices["pipeline"]))
+    hydra_config = HydraConfig.get()
+    changed = [o for o in hydra_config.overrides.task if o.lstrip("+~").startswith(presets.STAGES)]
+    run(config, str(hydra_config.runtime.choices["pipeline"]), changed)
 
 
 def main() -> None:
