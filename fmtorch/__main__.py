@@ -15,12 +15,13 @@ COMMANDS = {
     "report": "compare runs of eval on one HTML page",
     "train": "train a learned pruner on labelled matches of a data set",
     "verify": "two-view geometries of the matches in a COLMAP database, or hloc's files",
+    "warm-up": "compile all kernels now, for images and containers",
 }
 HELP = f"""fmtorch {__version__}: two-view geometry
 
 usage: fmtorch COMMAND [NAME=VALUE ...]
 
-{chr(10).join(f"  {name:8}{what}" for name, what in COMMANDS.items())}
+{chr(10).join(f"  {name:9}{what}" for name, what in COMMANDS.items())}
 
 `fmtorch COMMAND --help` lists what a command takes; `python -m fmtorch.COMMAND` is the same command."""
 
@@ -36,7 +37,9 @@ def main() -> None:
         sys.argv[1:] = rest
         if sys.path[0] != os.getcwd():  # where a user's own parts are found, as by `python -m`
             sys.path.insert(0, os.getcwd())
-        runpy.run_module(f"fmtorch.{name}", run_name="__main__", alter_sys=True)  # as the process's own main module
+        module = f"fmtorch.{name.replace('-', '_')}"
+        module = f"fmtorch.{name.replace('-', '_')}"
+        runpy.run_module(module, run_name="__main__", alter_sys=True)  # as the process's own main module
     else:
         sys.exit(f"error: no command {name!r}; there are: {', '.join(COMMANDS)}")
 

@@ -55,8 +55,10 @@ class Fields:
     export: str | list[str] | None = None
 
 
-def run(config: DictConfig, pipeline_name: str) -> Path:
+def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -> Path:
     """Evaluate one composed config and return the run folder.
+
+    overrides: what the command line changed of the pipeline of that name; said beside it.
 
     Raises ValueError, before anything is computed or written, where an option is not what it may be.
     """
@@ -86,7 +88,7 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
         console.print(f"{len(table)} of {len(pairs)} pairs have rows; other shards have the rest", highlight=False)
     if shard is not None and not len(table):  # of an empty shard, before the others
         return folder.path
-    summary = _summarize(table, folder, f"{pipeline_name} on {dataset.name}")
+    summary = _summarize(table, folder, f"{' '.join([pipeline_name, *overrides])} on {dataset.name}")
     if journal is not None and len(table) == len(pairs):
         ends = [(p.image0.path, p.image1.path) for p in pairs if exportable(p)]
         written = write_exports(journal, ends, exports, folder.path)
@@ -181,7 +183,9 @@ def _load(config: DictConfig, progress: Progress) -> PairDataset:
 @job
 def task(config: DictConfig) -> None:
     """What Hydra runs."""
-    run(config, str(HydraConfig.get().runtime.choices["pipeline"]))
+    hydra_config = HydraConfig.get()
+    changed = [o for o in hydra_config.overrides.task if o.lstrip("+~").startswith(presets.STAGES)]
+    run(config, str(hydra_config.runtime.choices["pipeline"]), changed)
 
 
 def main() -> None:

@@ -15,10 +15,12 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import GrammarParseError, OmegaConfBaseException
 
+from fmtorch.commands.help import help_text
 from fmtorch.commands.overrides import hydra_arguments
 from fmtorch.core.options import nearest
 from fmtorch.core.resources import conf_dir
 from fmtorch.core.terminal import MISTAKES, error_line, exits_with_message
+from fmtorch.core.version import __version__
 from fmtorch.presets import available, top_level_names
 from fmtorch.presets.pruners import with_explicit
 
@@ -61,6 +63,12 @@ def run_command(
         paths, positional: fields that hold paths, and those that need no name, see `hydra_arguments`.
         interrupted: what is said where the user stops it.
     """
+    if {"--version"} & set(sys.argv[1:]):
+        print(__version__)
+        return
+    if {"--help", "-h"} & set(sys.argv[1:]):
+        print(help_text(name, tuple(positional)))
+        return
     with exits_with_message(interrupted):
         sys.argv[1:] = hydra_arguments(sys.argv[1:], paths, positional)
         try:

@@ -84,7 +84,8 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     written = ["result.json", *_draw(folder, result, given, truth)]
     heading = f"{' '.join([pipeline_name, *overrides])}: {paths[0].name}, {paths[1].name}"
     console.print(heading, style="italic", markup=False, highlight=False)
-    console.print(_table(result))
+    extractor = pipeline.extractor
+    console.print(_table(result, isinstance(extractor, CachedFeatures) and not extractor.computed))
     if "nsgd" in report:
         console.print(f"NSGD to the true F: {report['nsgd']:.4f}", highlight=False)
     if line := pose_line(result):
@@ -200,7 +201,8 @@ def _troubles(result: MatchResult) -> list[str]:
     return list(filter(None, ("" if result.related else chance, warning)))
 
 
-def _table(result: MatchResult) -> Table:
+def _table(result: MatchResult, cached: bool) -> Table:
+    """What each step left and took; cached: the features were computed by an earlier run, which took the seconds."""
     table = Table()
     table.add_column("step")
     table.add_column("left", justify="right")
@@ -211,7 +213,10 @@ def _table(result: MatchResult) -> Table:
         )
         unit = {"features": "keypoints", "estimation": "inliers"}.get(step, "matches")
         left = f"{' + '.join(f'{count:,}' for count in counts)} {unit}"
-        table.add_row(step, result.configuration if step == "configuration" else left, f"{seconds:.3f}")
+        table.add_row(
+            step, result.configuration if step == "configuration" else left,
+            "cached" if cached and step == "features" else f"{seconds:.3f}",
+        )  # fmt: skip
     return table
 
 

@@ -15,14 +15,13 @@ import contextlib
 import functools
 import gc
 import inspect
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any, Generic, ParamSpec, TypeVar, overload
 
 import numpy as np
 
-from fmtorch.compiling import cache, calls, switch
+from fmtorch.compiling import cache, calls, messages, switch
 from fmtorch.compiling.inner import inner_compiler
 from fmtorch.compiling.signature import described, signature_of
 from fmtorch.compiling.version import named_by_version, version
@@ -205,12 +204,17 @@ def _compiled(made: Kernel[P, R], count: str) -> tuple[Callable[P, R], list[Kern
     if not hasattr(dispatcher, "compile"):
         return function, []  # NUMBA_DISABLE_JIT=1
 
+    told: list[str] = []
+
     def tell(where: str) -> None:
-        print(f"{count}compiling {function.__name__} {where}", file=sys.stderr, flush=True)
+        messages.begun(function.__name__, where, count)
+        told.append(where)
 
     file = dispatcher._cache = cache.KernelFile(cache.path(function, made.version), tell)
     with _no_garbage_collection():
         dispatcher.compile(made.signature)
+    if told:
+        messages.ended()
     dispatcher.disable_compile()
     (result,) = dispatcher.overloads.values()
     calls.publish(function, result)

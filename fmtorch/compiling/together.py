@@ -14,7 +14,7 @@ import threading
 from collections.abc import Sequence
 from typing import Any
 
-from fmtorch.compiling import cache, calls, process, switch
+from fmtorch.compiling import cache, calls, messages, process, switch
 from fmtorch.compiling.kernel import Kernel
 
 _lock = threading.Lock()
@@ -59,7 +59,7 @@ def compile_together(kernels: Sequence[Kernel[..., Any]]) -> None:
 def _helper() -> subprocess.Popen[str] | None:
     """The other process; None where it cannot be started."""
     try:
-        return process.start("fmtorch.compiling.together")
+        return process.start("fmtorch.compiling.together", **{messages.QUIET: "1"})
     except OSError:
         return None
 

@@ -129,7 +129,7 @@ def classify(
         raise ValueError(f"focal_deviation is {focal_deviation}; it must not be negative")
     compile_with(())
     matches = c.detach().derived(K0=None, K1=None, focal=None, shared_focal=None)
-    H = estimated(matches, "homography", "homography", None, seed, options)
+    H = estimated(matches, "homography", "homography", None, seed, options, in_pixels=False)
     K0, K1, precision = _cameras(c, focal_deviation)
     with one_thread(c.mask.device):
         evidence = configuration_evidence(

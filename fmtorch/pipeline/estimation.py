@@ -21,16 +21,17 @@ from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.geometry.verdict import judged
 from fmtorch.pipeline.known_cameras import KnownCameras
+from fmtorch.pipeline.units import expect_pixels
 
 
 def estimated(
     c: Correspondences, model: str, name: str, config_dir: Path | str | None, seed: int, options: Mapping[str, Any],
-    covariance: bool = False,
+    covariance: bool = False, in_pixels: bool = True,
 ) -> Estimate:  # fmt: skip
     """The estimate of matches by a preset, with a prior of their consistency where it uses one and none is given.
 
     model: what the preset must estimate. What is known of cameras counts where `focal` or `shared_focal` is given; then
-    the estimate may have a covariance.
+    the estimate may have a covariance. in_pixels: refuse points that obviously are not.
     """
     expect_values(c)
     seed = int(number("seed", seed, whole=True))
@@ -38,6 +39,8 @@ def estimated(
     _expect_gradients(c, estimator, name)
     if (gives := model_of(estimator)) != model:
         raise ValueError(f"estimator={name} gives {gives} matrices; find_{model} needs one that gives {model} matrices")
+    if in_pixels:
+        expect_pixels(c)
     return estimated_by(estimator, c, seed, covariance)
 
 

@@ -84,9 +84,10 @@ def find_fundamental(
         what the configuration leaves open.
 
     Raises:
-        ValueError: for points of another shape, a prior outside [0, 1], a noise or an image size that is not positive,
-            the size of one image only, an unknown preset or an unknown option, and an estimator of another model; for a
-            K that is no calibration matrix of the image, of a single pair (of a batch that pair is ``ok=False``).
+        ValueError: for points of another shape, points that are no pixels or outside images of these sizes, a prior
+            outside [0, 1], a noise or an image size that is not positive, the size of one image only, an unknown preset
+            or option, and an estimator of another model; for a K that is no calibration matrix of the image, of a
+            single pair (of a batch that pair is ``ok=False``).
         TypeError: for what is no array of numbers.
 
     Example:

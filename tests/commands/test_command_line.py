@@ -12,7 +12,9 @@ from pathlib import Path
 import pytest
 
 import fmtorch.__main__
+from fmtorch.commands import warm_up
 from fmtorch.commands.overrides import hydra_arguments
+from fmtorch.presets import top_level_names
 from tests.conftest import own_cache
 from tests.pipeline.test_pipeline import draw
 
@@ -32,7 +34,7 @@ def test_help_lists_the_commands_without_torch() -> None:
         "from fmtorch.__main__ import main\n"
         "sys.argv = ['fmtorch', '--help']\n"
         "with contextlib.redirect_stdout(io.StringIO()) as told: main()\n"
-        "names = ('eval', 'match', 'pairs', 'report', 'train', 'verify')\n"
+        "names = ('eval', 'match', 'pairs', 'report', 'train', 'verify', 'warm-up')\n"
         "assert all(f'  {name} ' in told.getvalue() for name in names)\n"
         "assert not {'torch', 'hydra', 'numpy'} & set(sys.modules)"
     )
@@ -51,7 +53,7 @@ def test_a_subcommand_runs_as_its_module_does(tmp_path: Path, monkeypatch: pytes
     options = {"run_name": "__main__", "alter_sys": True}
     assert called == [(("fmtorch.eval",), options, ["/usr/bin/fmtorch", "-m", "seed=1,2"], str(tmp_path))]
     monkeypatch.setattr(sys, "argv", ["fmtorch", "evaluate"])
-    there = "eval, match, pairs, report, train, verify"
+    there = "eval, match, pairs, report, train, verify, warm-up"
     with pytest.raises(SystemExit, match=f"error: no command 'evaluate'; there are: {there}"):
         fmtorch.__main__.main()
 
@@ -231,3 +233,37 @@ def test_a_sweep_runs_in_processes_of_a_launcher(
     assert ended(monkeypatch, data_set, "eval", *words) == f"error: limit=0; {COUNT} or null", capfd.readouterr().err
     assert (data_set / "out" / "summary.md").is_file()
     assert "Traceback" not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["eval", "match", "pairs", "report", "train", "verify"])
+def test_help_is_ours_and_fits_a_page(
+    command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A command's own options with a line each come first; Hydra's page is at --hydra-help."""
+    monkeypatch.setattr(sys, "argv", [command, "--help"])
+    importlib.import_module(f"fmtorch.commands.{command}").main()
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith(f"usage: fmtorch {command}")
+    assert len(lines) < 60
+    fields = [name for name in top_level_names(command) if name != "hydra"]
+    assert all(any(line.startswith(f"  {name}=") for line in lines) for name in fields)
+    monkeypatch.setattr(sys, "argv", [command, "--version"])
+    importlib.import_module(f"fmtorch.commands.{command}").main()
+    assert capsys.readouterr().out.strip() == fmtorch.__version__
+
+
+def test_warm_up_compiles_what_is_registered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    compiled: list[str] = []
+    monkeypatch.setattr(
+        warm_up, "compile_together", lambda kernels: compiled.extend(kernel.__module__ for kernel in kernels)
+    )
+    monkeypatch.setattr(sys, "argv", ["fmtorch warm-up"])
+    warm_up.main()
+    assert f"{len(compiled)} kernels for " in capsys.readouterr().out
+    rooms = {name.split(".")[1] for name in compiled}
+    assert {"estimators", "geometry", "pruning", "data", "metrics"} <= rooms
+    monkeypatch.setenv("FMTORCH_KERNELS", "off")
+    with pytest.raises(SystemExit, match="kernels are switched off"):
+        warm_up.main()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 from pathlib import Path
 
 import cv2
@@ -104,3 +105,24 @@ def test_the_report_is_refused_before_it_is_drawn(monkeypatch: pytest.MonkeyPatc
     (run / "run.json").write_text(json.dumps({"format": 1, "config": {}}))
     end = ended(monkeypatch, tmp_path, "report", "runs=run", "output=run")
     assert end == "error: output=run is a folder; it must name a file"
+
+
+def test_cached_features_take_no_seconds_and_changed_stages_are_named(photographs: Path) -> None:
+    first, second = (run_command("match", "a.png", "b.png", *SIFT, cwd=photographs) for _ in range(2))
+    rows = [next(line for line in done.stdout.splitlines() if "keypoints" in line) for done in (first, second)]
+    assert "cached" not in rows[0]
+    assert "cached" in rows[1]
+    assert "estimator.hypotheses=100" in second.stdout.splitlines()[0]
+
+
+@pytest.mark.parametrize("words", [("--config-dir", "my conf"), ("--config-dir=my conf",)])
+def test_a_training_says_how_its_file_is_used(words: tuple[str, ...]) -> None:
+    """As a prior, with the presets that the training had."""
+    pytest.importorskip("lightning")
+    from fmtorch.training.pruners.run import use_line
+
+    said = use_line("mine", Path("runs/a b.onnx"), ["pruner=mine", *words])
+    assert shlex.split(said) == [
+        "python", "-m", "fmtorch.eval", "--config-dir", "my conf", "pipeline=sift_ratio", "estimator=fmtorch",
+        "pruner=[ratio,one_to_one,mine]", "pruner.mine.file=runs/a b.onnx", "pruner.mine.threshold=null",
+    ]  # fmt: skip

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from fmtorch.compiling import cache as files
-from fmtorch.compiling import process, switch, together
+from fmtorch.compiling import messages, process, switch, together
 from fmtorch.compiling.fused import fused
 from fmtorch.compiling.kernel import Inner, Kernel, inner, kernel
 from tests.processes import run_command
@@ -64,6 +64,7 @@ numba = pytest.importorskip("numba", reason="numba is not installed")
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setenv("FMTORCH_CACHE", str(tmp_path / "cache"))
     monkeypatch.delenv(switch.SWITCH, raising=False)
+    monkeypatch.setitem(messages._state, "told", False)
     files.folder.cache_clear()
     yield tmp_path / "cache" / "kernels"
     files.folder.cache_clear()
@@ -163,12 +164,27 @@ def test_what_was_compiled_is_kept_and_told_once(
 ) -> None:
     assert result(load(tmp_path)) == EXPECTED
     told = capsys.readouterr().err
-    assert [line.split(" for ")[0] for line in told.splitlines()] == ["compiling rows", "compiling scaled_squares"]
+    assert [line.split(" for ")[0] for line in told.splitlines()] == ["compiling rows and what else is missing"]
     files = {path: path.stat().st_ino for path in cache.rglob("*.bin")}
     assert len(files) == 2
     assert result(load(tmp_path)) == EXPECTED
     assert capsys.readouterr().err == ""
     assert {path: path.stat().st_ino for path in cache.rglob("*.bin")} == files
+
+
+def test_a_log_gets_one_line_and_a_terminal_a_passing_one(
+    module: types.ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for each in (module.rows, module.scaled_squares):
+        each.compiled()
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    messages.begun("rows", "for this machine", "3 of 40: ")
+    messages.ended()
+    assert capsys.readouterr().err == "\r\x1b[K3 of 40: compiling rows for this machine\r\x1b[K"
+    monkeypatch.setenv(messages.QUIET, "1")
+    messages.begun("rows", "for this machine")
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("importable", [True, False])
@@ -260,7 +276,7 @@ def test_without_a_writable_cache_kernels_are_compiled_and_say_so(
     monkeypatch.setenv("FMTORCH_CACHE", str(tmp_path / "file"))
     with pytest.warns(UserWarning, match="compiled kernels are not kept"):
         assert result(module) == EXPECTED
-    assert "compiling rows for this process" in capsys.readouterr().err
+    assert "compiling rows and what else is missing for this process" in capsys.readouterr().err
 
 
 def test_a_cache_that_can_only_be_read_is_used(

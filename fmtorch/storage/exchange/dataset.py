@@ -63,7 +63,11 @@ class H5Pairs(PairDataset):
         if layout in WITH_GEOMETRY:
             _expect_unset(layout, truth=truth, features=features, matches=matches, origin=origin)
             where = None if images is None else Path(images).expanduser()
+            if where is not None and not where.is_dir():
+                raise DataError(f"images={images}: no such folder; it must hold the images that the layout names")
             self._pairs = list(WITH_GEOMETRY[layout](folder, where))
+            if where is not None:
+                _expect_distinct(self._pairs, where)
             files = tutorial_files(folder) if layout == "ransac_tutorial" else h5.files(folder)
         else:
             _expect_unset(layout, images=images)
@@ -96,6 +100,18 @@ def _truth(layout: str, truth: str | Path | None) -> PairDataset:
             f"layout {layout} holds no geometry: give dataset.truth=DIR, the `fmbench` set that it was computed on"
         )
     return FMBenchPairs(truth)
+
+
+def _expect_distinct(pairs: list[ImagePair], folder: Path) -> None:
+    """Raises DataError where one file would stand for images of two scenes."""
+    seen: dict[Path, str] = {}
+    for pair in pairs:
+        for image in (pair.image0, pair.image1):
+            if image.path.exists() and seen.setdefault(image.path, pair.scene) != pair.scene:
+                raise DataError(
+                    f"{image.path} would stand for images of the scenes {seen[image.path]} and {pair.scene}: give each "
+                    f"a folder, {folder / seen[image.path]} and {folder / pair.scene}"
+                )
 
 
 def _expect_unset(layout: str, **options: Any) -> None:

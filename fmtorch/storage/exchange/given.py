@@ -18,6 +18,7 @@ from fmtorch.geometry.cameras import fundamental_from_projections
 
 Array = NDArray[np.float64]
 Size = tuple[int, int]  # (h, w)
+MAX_OFF_CENTRE = 0.1  # of a principal point, in units of the side: those of reduced images are farther off
 
 
 def given(
@@ -90,8 +91,11 @@ def broken(identity: str, family: str, scene: str, images: tuple[ImageSource, Im
 
 
 def image(family: str, scene: str, name: str, folder: Path | None) -> ImageSource:
-    """An image of which only the name is known, in a folder where one is given."""
-    return ImageSource(f"{family}/{scene}/{name}", (folder or Path()) / name)
+    """An image of which only the name is known, in a folder, or its sub-folder of the scene, where one is given."""
+    path = Path(name)
+    if folder is not None:
+        path = folder / scene / name if (folder / scene).is_dir() else folder / name
+    return ImageSource(f"{family}/{scene}/{name}", path)
 
 
 def size_of(source: ImageSource) -> Size | None:
@@ -101,6 +105,16 @@ def size_of(source: ImageSource) -> Size | None:
             return picture.height, picture.width
     except OSError:
         return None
+
+
+def expect_size(source: ImageSource, size: Size, K: Array) -> None:
+    """Raises DataError where an image's size (h, w) contradicts its camera: a copy that was reduced or cropped."""
+    h, w = size
+    if max(abs(K[0, 2] / w - 0.5), abs(K[1, 2] / h - 0.5)) > MAX_OFF_CENTRE:
+        raise DataError(
+            f"{source.path}: {w} x {h} px, but its camera's principal point is ({K[0, 2]:g}, {K[1, 2]:g}); it must be "
+            "the image as it was when its camera was determined"
+        )
 
 
 def size_by_centre(K: Array) -> Size:

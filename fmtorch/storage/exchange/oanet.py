@@ -77,4 +77,6 @@ def _pair(file: Any, path: Path, family: str, key: str, images: Path | None) -> 
 def _calibration(file: Any, key: str, which: int) -> Array:
     cx, cy = (h5.reshaped(file, f"{name}{which}s/{key}", 1)[0] for name in ("cx", "cy"))
     fx, fy = h5.reshaped(file, f"f{which}s/{key}", 2)
+    if fx == 0 or fy == 0:
+        raise DataError(f"{file.filename}: 'f{which}s/{key}' holds a focal length of zero")
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])

@@ -41,7 +41,7 @@ class HLocMatches:
     def __call__(self) -> GivenMatches:
         """Read them. Raises DataError naming file and key."""
         with h5.opened(self.features) as file:
-            points = [h5.numbers(file, f"{name}/keypoints", None, None)[:, :2] - self.origin for name in self.names]
+            points = [_keypoints(file, self.features, name) - self.origin for name in self.names]
             sizes = tuple(
                 _size(file, f"{name}/image_size", image) for name, image in zip(self.names, self.images, strict=True)
             )
@@ -200,6 +200,14 @@ def _indices(chosen: NDArray[np.int64], counts: list[int], where: str) -> tuple[
         raise DataError(f"{where} names keypoint {chosen.max()}, but the second image has {counts[1]}")
     i = np.flatnonzero(chosen != NO_MATCH)
     return i, chosen[i]
+
+
+def _keypoints(file: Any, path: Path, name: str) -> Array:
+    """x and y of an image's keypoints, which may come with scales. Raises DataError for fewer columns."""
+    points = h5.numbers(file, f"{name}/keypoints", None, None)
+    if points.shape[1] < 2:
+        raise DataError(f"{path}: {name + '/keypoints'!r} has shape {points.shape}; it must be (n, 2) or wider")
+    return points[:, :2]
 
 
 def _size(file: Any, key: str, image: ImageSource) -> Size:

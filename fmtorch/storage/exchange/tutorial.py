@@ -23,6 +23,7 @@ from fmtorch.storage.exchange.given import (
     Array,
     Size,
     broken,
+    expect_size,
     given,
     image,
     posed,
@@ -124,6 +125,8 @@ class _Cameras:
 
     def calibration(self, key: str) -> tuple[Array, Array]:
         K = h5.reshaped(self._file(CALIBRATIONS), key, 2, 3, 3)
+        if not np.linalg.det(K).all():
+            raise DataError(f"{self.folder / CALIBRATIONS}: {key!r}: a calibration matrix is singular")
         return K[0], K[1]
 
     def truth(self, key: str) -> Array:
@@ -140,6 +143,14 @@ class _Cameras:
         return self._open[name]
 
 
+def _size(source: ImageSource, K: Array, images: Path | None) -> Size:
+    """(h, w) of an image, by its principal point where there is no file. Raises DataError where the two disagree."""
+    by_centre, size = size_by_centre(K), size_of(source) if images else None
+    if size is not None:
+        expect_size(source, size, K)
+    return size or by_centre
+
+
 def _pair(family: str, folder: Path, key: str, cameras: _Cameras, images: Path | None) -> ImagePair:
     scene, identity = folder.name, f"{family}/{folder.name}/{key}"
     sources: tuple[ImageSource, ImageSource] | None = None
@@ -150,8 +161,7 @@ def _pair(family: str, folder: Path, key: str, cameras: _Cameras, images: Path |
             if name in cameras.problems:
                 raise DataError(cameras.problems[name])
         K0, K1 = cameras.calibration(key)
-        known = (size_of(source) if images else None for source in sources)
-        sizes = next(known) or size_by_centre(K0), next(known) or size_by_centre(K1)
+        sizes = _size(sources[0], K0, images), _size(sources[1], K1, images)
         if cameras.by_image:
             (R0, t0), (R1, t1) = cameras.by_image[name0], cameras.by_image[name1]
             R = R1 @ R0.T

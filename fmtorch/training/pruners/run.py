@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import os
 import platform
-from collections.abc import Iterator, Mapping
+import shlex
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -145,10 +148,18 @@ def report(result: Result, name: str) -> None:
     """Say on the terminal what came out and how to use it."""
     for key, value in result.evaluation.figures.items():
         console.print(f"{key:32} {value:.4f}", highlight=False)
-    stages = f"'pruner=[ratio,one_to_one,{name}]' pruner.{name}.file={result.files[0]}"
-    use = f"python -m fmtorch.eval pipeline=sift_ratio {stages}"
+    use = use_line(name, result.files[0], sys.argv[1:])
     for line in (", ".join(str(path) for path in result.files), f"use it: {use}"):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def use_line(name: str, file: Path, words: Sequence[str]) -> str:
+    """The command that uses a learned file as a prior, by which it serves best. words: of the training's command."""
+    folders = [shlex.quote(b) for a, b in itertools.pairwise(words) if a in ("--config-dir", "-cd")]
+    folders += [shlex.quote(word.partition("=")[2]) for word in words if word.startswith("--config-dir=")]
+    stages = f"'pruner=[ratio,one_to_one,{name}]' pruner.{name}.file={shlex.quote(str(file))}"
+    start = " ".join(["python -m fmtorch.eval", *(f"--config-dir {folder}" for folder in folders)])
+    return f"{start} pipeline=sift_ratio estimator=fmtorch {stages} pruner.{name}.threshold=null"
 
 
 def network_of(config: DictConfig, name: str) -> dict[str, Any]:

@@ -11,6 +11,8 @@ import pytest
 import torch
 
 import fmtorch
+from fmtorch import presets
+from fmtorch.core.arguments import correspondences
 from fmtorch.estimators import HypothesizeAndVerify
 from tests.conftest import shared_path
 from tests.reference import homography_family as reference
@@ -239,7 +241,8 @@ def test_the_same_bits_alone_and_in_a_batch() -> None:
 def test_any_unit_of_pixels(scale: float) -> None:
     """Thresholds are pixels: all matches are inliers of points within a pixel, only exact ones of huge images."""
     m = matches(10, noise=0, wrong=0.3)
-    estimate = fmtorch.find_homography(scale * m.x0, scale * m.x1)
+    # Behind the door, which refuses points within a pixel.
+    estimate = presets.build("estimator", "homography")(correspondences(scale * m.x0, scale * m.x1))
     assert estimate.ok.tolist() == [True]
     assert estimate.H.isfinite().all()
     if scale > 1:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import pickle
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import h5py
 import numpy as np
 import pytest
 import torch
 
+import fmtorch
 from fmtorch import data, presets
 from fmtorch.data import DataError, ImagePair
 from fmtorch.evaluation.gallery import Options, find_dataset
@@ -155,6 +158,8 @@ TUTORIAL = "img_1a-img_1b-1"
 DAMAGE: list[tuple[str, str, str, Callable[[np.ndarray], Any] | None, str]] = [
     ("hloc", "feats-sift.h5", "s1/Images/00000001.png/keypoints", None, "no keypoints of image Truth/s1/00000001"),
     ("hloc", "feats-sift.h5", "s1/Images/00000001.png/keypoints", lambda v: v[:, 0], r"keypoints' has shape \(65,\)"),
+    ("hloc", "feats-sift.h5", FIRST, lambda v: v[:, :1], r"keypoints' has shape \(67, 1\); it must be"),
+    ("ransac_tutorial", "church/K1_K2.h5", TUTORIAL, lambda v: 0 * v, "K1_K2.h5: .*: a calibration matrix is singular"),
     ("hloc", HLOC, f"{PAIR}/matches0", None, "no matches0 of the pair s1/Images"),
     ("hloc", HLOC, f"{PAIR}/matches0", lambda v: v[:-3], r"matching_scores0' has shape \(67,\); it must be \(64\)"),
     ("hloc", "feats-sift.h5", FIRST, lambda v: v[:9], "67 entries, but the first image has 9"),
@@ -283,3 +288,49 @@ def test_a_report_finds_it(layout: str, roots: list[str], tmp_path: Path) -> Non
     assert find_dataset({**stored, "digest": dataset.digest}, options).digest == dataset.digest
     with pytest.raises(DataError, match="has changed since the run"):
         find_dataset({**stored, "digest": "another"}, options)
+
+
+def test_the_pipeline_of_given_matches_estimates_as_the_function_does(tmp_path: Path) -> None:
+    """With the prior that `find_fundamental` derives from the same points."""
+    pair = load("oanet", tmp_path)[0]
+    assert pair.matches is not None
+    c, _ = pair.matches()
+    (outcome,) = presets.pipeline("given_fmtorch").run([pair], seed=3)
+    alone = fmtorch.find_fundamental(
+        c.x0, c.x1, mask=c.mask, quality=c.quality, size0=c.size0, size1=c.size1, key=pair.key, seed=3
+    )
+    assert outcome.estimate is not None
+    assert torch.equal(outcome.estimate.F, alone.F)
+
+
+def tutorial_with_images(tmp_path: Path, shape: tuple[int, ...], *, flat: bool) -> tuple[Path, Path]:
+    """A data set of two scenes with the same names of images, and a folder of images of all names."""
+    root, images = writers.WRITERS["ransac_tutorial"](tmp_path / "ransac_tutorial"), tmp_path / "images"
+    shutil.copytree(root / "church", root / "temple")
+    names = {image.path.name for pair in reload("ransac_tutorial", root) for image in (pair.image0, pair.image1)}
+    for folder in (images,) if flat else (images / "church", images / "temple"):
+        folder.mkdir(parents=True)
+        for name in names:
+            cv2.imwrite(str(folder / f"{name}.png"), np.zeros(shape, np.uint8))
+            (folder / f"{name}.png").rename(folder / name)
+    return root, images
+
+
+def test_images_are_checked_against_their_cameras(tmp_path: Path) -> None:
+    root, images = tutorial_with_images(tmp_path, writers.SIZE, flat=False)
+    sound = reload("ransac_tutorial", root, images=images)
+    assert all(pair.problem is None for pair in sound)
+    assert {pair.image0.path.parent.name for pair in sound} == {"church", "temple"}
+    for path in images.rglob("*img*"):
+        cv2.imwrite(str(path.with_suffix(".png")), np.zeros((400, 500), np.uint8))
+        path.with_suffix(".png").rename(path)
+    for pair in reload("ransac_tutorial", root, images=images):
+        assert "500 x 400 px, but its camera's principal point is" in str(pair.problem)
+
+
+def test_one_file_is_no_image_of_two_scenes(tmp_path: Path) -> None:
+    root, images = tutorial_with_images(tmp_path, writers.SIZE, flat=True)
+    with pytest.raises(DataError, match="would stand for images of the scenes church and temple: give each a folder"):
+        reload("ransac_tutorial", root, images=images)
+    with pytest.raises(DataError, match=r"images=.*nowhere: no such folder"):
+        reload("ransac_tutorial", root, images=images / "nowhere")

@@ -1,0 +1,52 @@
+"""`fmtorch warm-up`: compile all kernels now, for machines and containers on which no first call shall wait."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import sys
+import time
+
+from fmtorch.compiling import cache, calls, switch
+from fmtorch.compiling.process import HOME
+from fmtorch.compiling.together import compile_together
+from fmtorch.core.terminal import console, exits_with_message
+
+USAGE = """fmtorch warm-up: compile all kernels now
+
+usage: fmtorch warm-up
+
+The compiled kernels are kept in $FMTORCH_CACHE/kernels (~/.cache/fmtorch/kernels). A container may hold that folder: it
+serves machines with the processor, Python, numba and version of fmtorch that it was made with (about.json in it says
+which); any other compiles its own."""
+WITH_KERNELS = ("fmtorch.estimators.", "fmtorch.data.rendered.")  # beside files *_kernels
+
+
+def warm_up() -> int:
+    """Compile the kernels of all modules that this machine has not compiled yet; how many there are.
+
+    Raises ValueError where kernels are switched off or cannot be kept.
+    """
+    if not switch.available():
+        raise ValueError(f"kernels are switched off ({switch.SWITCH}=off), or numba cannot be imported")
+    if cache.folder() is None:
+        raise ValueError(f"{cache.kernels_dir()} cannot be written; set FMTORCH_CACHE to a folder that can")
+    for module in pkgutil.walk_packages([str(HOME / "fmtorch")], "fmtorch."):
+        if module.name.endswith("_kernels") or module.name.startswith(WITH_KERNELS):
+            importlib.import_module(module.name)
+    kernels = [kernel for (name, _), kernel in sorted(calls.KERNELS.items()) if name.startswith("fmtorch.")]
+    compile_together(kernels)
+    return len(kernels)
+
+
+def main() -> None:
+    """The command."""
+    if sys.argv[1:]:
+        print(USAGE)
+        sys.exit(0 if sys.argv[1:] in (["--help"], ["-h"]) else 1)
+    with exits_with_message():
+        start = time.perf_counter()
+        count = warm_up()
+        seconds, processor = time.perf_counter() - start, cache.versions()["processor"]
+        kept = f"{count} kernels for {processor} in {seconds:.0f} s: {cache.folder()}"
+        console.print(kept, highlight=False, soft_wrap=True)

@@ -1,0 +1,222 @@
+"""OpenCV's functions of two views with this project's estimators: ``from fmtorch import cv2``.
+
+`findFundamentalMat`, `findEssentialMat`, `findHomography` and `recoverPose` have OpenCV's signatures and return values;
+every other name of this module is OpenCV's own. Flags stand for presets, see `PRESETS`. What OpenCV computes from all
+points (FM_7POINT, FM_8POINT, method 0 of homographies) it computes here, too.
+
+Thresholds decide which matches the mask holds, as OpenCV's do; by which distances models are searched and fitted is the
+presets' own. `confidence` and `maxIters` where they are not given are the presets', too. Image sizes, cameras of two
+kinds, priors and gradients have no place in these signatures: `fmtorch.find_fundamental` takes them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2 as opencv
+import numpy as np
+from numpy.typing import NDArray
+
+from fmtorch.core.types import Estimate
+from fmtorch.pipeline.essential import find_essential
+from fmtorch.pipeline.fundamental import find_fundamental, find_homography
+from fmtorch.pipeline.opencv_arguments import calibrated, points_of
+from fmtorch.pipeline.units import MIN_PIXELS
+
+Matrix = NDArray[np.float64]
+Mask = NDArray[np.uint8]
+
+PRESETS = {
+    opencv.RANSAC: "fmtorch",
+    opencv.LMEDS: "lmeds",
+    opencv.USAC_DEFAULT: "fmtorch",
+    opencv.USAC_PARALLEL: "fmtorch",
+    opencv.USAC_FM_8PTS: "ransac_eight_point",
+    opencv.USAC_FAST: "fmtorch_fast",
+    opencv.USAC_ACCURATE: "gc_ransac",
+    opencv.USAC_PROSAC: "usac",
+    opencv.USAC_MAGSAC: "magsac",
+}
+"""The presets of fundamental and essential matrices by OpenCV's flags (FM_RANSAC is RANSAC, FM_LMEDS is LMEDS)."""
+OF_ALL_POINTS = (opencv.FM_7POINT, opencv.FM_8POINT)
+UNIT_FOCAL = 1000.0  # px, of the camera that normalised points are scaled to
+MIN_H = 4  # matches of a homography
+
+
+def findFundamentalMat(  # OpenCV's name, as all of this module
+    points1: Any, points2: Any, method: Any = opencv.FM_RANSAC, ransacReprojThreshold: float | int = 3.0,
+    confidence: float | int | None = None, maxIters: Any = None, mask: Mask | None = None,
+) -> tuple[Matrix | None, Mask | None]:  # fmt: skip
+    """The fundamental matrix of matched points, ``p2^T F p1 = 0``, as `cv2.findFundamentalMat` returns it.
+
+    Args:
+        points1, points2: (N, 2), (N, 1, 2) or (1, N, 2), in pixels.
+        method: FM_RANSAC, FM_LMEDS or USAC_*, see `PRESETS`; FM_7POINT and FM_8POINT are OpenCV's own.
+        ransacReprojThreshold: largest Sampson distance of an inlier, px; LMedS takes none.
+        confidence: of having drawn a sample without an outlier, at which the search ends; None: the preset's.
+        maxIters: samples at most; None: the preset's. A mask may stand here, as in OpenCV's shorter form.
+        mask: written to, if given.
+
+    Returns:
+        F (3, 3), of which the last entry is 1, and the mask (N, 1) of inliers, uint8; (None, None) where there is no F.
+
+    Raises:
+        ValueError: for another method, and as `fmtorch.find_fundamental`.
+
+    Example:
+        >>> import numpy as np
+        >>> from fmtorch import cv2
+        >>> rng = np.random.default_rng(0)
+        >>> X = rng.random((80, 3)) + [0, 0, 2]
+        >>> p1, p2 = (500 * Y[:, :2] / Y[:, 2:] for Y in (X, X + [-0.5, 0, 0.2]))
+        >>> F, mask = cv2.findFundamentalMat(p1, p2, cv2.FM_RANSAC, 3.0, 0.99)
+        >>> F.shape, mask.shape, int(mask.sum())
+        ((3, 3), (80, 1), 80)
+    """
+    if method in OF_ALL_POINTS:
+        return opencv.findFundamentalMat(points1, points2, method)
+    if isinstance(maxIters, np.ndarray):
+        maxIters, mask = None, maxIters
+    name, options = _preset(method, ransacReprojThreshold, confidence, maxIters)
+    estimate = find_fundamental(points_of(points1, "points1"), points_of(points2, "points2"), estimator=name, **options)
+    return _result(estimate, estimate.F, mask)
+
+
+def findHomography(
+    srcPoints: Any, dstPoints: Any, method: Any = 0, ransacReprojThreshold: float | int = 3.0, mask: Mask | None = None,
+    maxIters: int | None = None, confidence: float | int | None = None,
+) -> tuple[Matrix | None, Mask | None]:  # fmt: skip
+    """The homography of matched points, ``p2 ~ H p1``, as `cv2.findHomography` returns it.
+
+    Args:
+        srcPoints: (N, 2), (N, 1, 2) or (1, N, 2), in pixels or in the unit of a plane.
+        dstPoints: the same number, in pixels.
+        method: RANSAC, LMEDS, RHO or USAC_*: the preset `homography`; 0, of all points, is OpenCV's own.
+        ransacReprojThreshold: largest Sampson distance of an inlier, px.
+        mask, maxIters, confidence: as of `findFundamentalMat`.
+
+    Returns:
+        H (3, 3), of which the last entry is 1, and the mask (N, 1) of inliers, uint8; None and a mask of zeros where
+        there is no H.
+
+    Raises:
+        ValueError: as `fmtorch.find_homography`. cv2.error: for fewer than four points.
+    """
+    src, dst = points_of(srcPoints, "srcPoints"), points_of(dstPoints, "dstPoints")
+    if method == 0 or len(src) < MIN_H:
+        return opencv.findHomography(src, dst, method)  # type: ignore[return-value]
+    _, options = _preset(opencv.RANSAC if method == opencv.RHO else method, ransacReprojThreshold, confidence, maxIters)
+    options["inlier_threshold"] = ransacReprojThreshold
+    S = _similarity(src, dst)
+    estimate = find_homography(src * S[0, 0] + S[:2, 2], dst, **options)
+    H, inliers = _result(estimate, estimate.F.cpu().numpy() @ S, mask)
+    return H, np.zeros((len(src), 1), np.uint8) if inliers is None else inliers
+
+
+def findEssentialMat(points1: Any, points2: Any, *arguments: Any, **named: Any) -> tuple[Matrix | None, Mask | None]:
+    """The essential matrix of matched points, as `cv2.findEssentialMat` returns it, in its three forms.
+
+    ``(points1, points2, cameraMatrix[, method[, prob[, threshold[, maxIters[, mask]]]]])``,
+    ``(points1, points2[, focal[, pp[, method[, prob[, threshold[, maxIters[, mask]]]]]]])``,
+    ``(points1, points2, cameraMatrix1, distCoeffs1, cameraMatrix2, distCoeffs2[, method[, prob[, threshold[,
+    mask]]]])``.
+
+    Args:
+        points1, points2: (N, 2), (N, 1, 2) or (1, N, 2), in the unit of the camera matrices.
+        method, prob, threshold, maxIters, mask: as of `findFundamentalMat`; threshold is 1 by default.
+
+    Returns:
+        E (3, 3) and the mask (N, 1) of inliers, uint8; (None, None) where there is no E.
+
+    Raises:
+        ValueError, TypeError: for another form, and as `fmtorch.find_essential`.
+    """
+    x1, x2, K1, K2, rest = calibrated(points_of(points1, "points1"), points_of(points2, "points2"), arguments, named)
+    focal = float(np.abs([K1[0, 0], K1[1, 1], K2[0, 0], K2[1, 1]]).max())
+    scale = UNIT_FOCAL / focal if focal < MIN_PIXELS else 1.0  # thresholds are in the unit of the points
+    S = np.diag([scale, scale, 1])
+    prob, threshold = rest.get("prob"), rest.get("threshold", 1.0)
+    name, options = _preset(rest.get("method", opencv.RANSAC), scale * threshold, prob, rest.get("maxIters"))
+    estimate = find_essential(scale * x1, scale * x2, S @ K1, S @ K2, estimator=name, **options)
+    found = bool(estimate.ok[0]) and estimate.E is not None and bool(estimate.E.isfinite().all())
+    if not found or estimate.E is None:
+        return None, None
+    return estimate.E[0].cpu().numpy(), _mask(estimate, rest.get("mask"))
+
+
+def recoverPose(*arguments: Any, **named: Any) -> Any:
+    """The pose of an essential matrix, by OpenCV's own function, as `cv2.recoverPose` returns it.
+
+    In the form ``(points1, points2, cameraMatrix1, distCoeffs1, cameraMatrix2, distCoeffs2, ...)``, without a matrix,
+    that is of `findEssentialMat` above: ``retval, E, R, t, mask``. Raises ValueError where there is none.
+    """
+    if "cameraMatrix2" not in named and np.shape(arguments[0]) == (3, 3) and np.shape(arguments[1]) != (3, 3):
+        return opencv.recoverPose(*arguments, **named)
+    names = ("points1", "points2", "cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2", "E", "R", "t")
+    given = {**dict(zip((*names, "method", "prob", "threshold", "mask"), arguments, strict=False)), **named}
+    kept = {name: given[name] for name in ("method", "prob", "threshold") if given.get(name) is not None}
+    E, inliers = findEssentialMat(*(given[name] for name in names[:6]), **kept)
+    if E is None or inliers is None:
+        raise ValueError("no essential matrix agrees with the points")
+    x1, x2, *_ = calibrated(
+        points_of(given["points1"], "points1"), points_of(given["points2"], "points2"),
+        tuple(given[name] for name in names[2:6]), {},
+    )  # fmt: skip
+    y1, y2 = (
+        opencv.undistortPoints(x[:, None], np.asarray(given[f"cameraMatrix{i}"], float), None)
+        for i, x in ((1, x1), (2, x2))
+    )
+    retval, R, t, mask = opencv.recoverPose(E, y1, y2, np.eye(3), mask=inliers)
+    return retval, E, R, t, mask
+
+
+def _preset(
+    method: Any, threshold: float | int, confidence: float | int | None, iterations: int | None
+) -> tuple[str, dict[str, Any]]:
+    """The preset of a flag and its options. Raises TypeError or ValueError where there is none."""
+    if not isinstance(method, int | np.integer):
+        raise TypeError(
+            f"method is a {type(method).__name__}; UsacParams are of OpenCV's own search: call its function"
+        )
+    method = int(method)
+    if method not in PRESETS:
+        raise ValueError(f"method is {method}; it must be one of {sorted(PRESETS)}, OpenCV's RANSAC, LMEDS and USAC_*")
+    options: dict[str, Any] = {} if PRESETS[method] == "lmeds" else {"inlier_threshold": float(threshold)}
+    if confidence is not None:
+        options["confidence"] = float(confidence)
+    if iterations is not None:
+        options["hypotheses"] = int(iterations)
+    return PRESETS[method], options
+
+
+def _similarity(src: Matrix, dst: Matrix) -> Matrix:
+    """The map of points in the unit of a plane to about the pixels that they are seen at; of pixels the identity."""
+    finite = src[np.isfinite(src).all(1)]
+    reach = float(np.abs(finite).max()) if len(finite) else 0.0
+    if reach >= MIN_PIXELS or reach == 0:
+        return np.eye(3)
+    seen = dst[np.isfinite(dst).all(1)]
+    scale = float(np.ptp(seen, axis=0).max() / max(np.ptp(finite, axis=0).max(), 1e-300)) if len(seen) else 1.0
+    return np.diag([scale or 1.0, scale or 1.0, 1.0])
+
+
+def _result(estimate: Estimate, matrix: Any, mask: Mask | None) -> tuple[Matrix | None, Mask | None]:
+    """A matrix whose last entry is 1, if it is not 0, and the mask."""
+    if not bool(estimate.ok[0]):
+        return None, None
+    M = np.asarray(matrix, np.float64).reshape(3, 3)
+    last = M[2, 2] if abs(M[2, 2]) > np.finfo(float).eps * np.abs(M).max() else 1.0
+    return M / last, _mask(estimate, mask)
+
+
+def _mask(estimate: Estimate, out: Mask | None) -> Mask:
+    """The inliers (N, 1), also written to what the caller gave."""
+    mask = estimate.inliers[0].cpu().numpy().astype(np.uint8)[:, None]
+    if isinstance(out, np.ndarray) and out.size == mask.size:
+        out[...] = mask.reshape(out.shape)
+    return mask
+
+
+def __getattr__(name: str) -> Any:
+    """All else is OpenCV's."""
+    return getattr(opencv, name)
