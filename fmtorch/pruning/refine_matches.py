@@ -16,6 +16,7 @@ from fmtorch.core.stages import PairImages
 from fmtorch.core.threads import mapped
 from fmtorch.core.types import Correspondences
 from fmtorch.pruning import refine_matches_kernels as compiled
+from fmtorch.pruning.neighbour_maps_kernels import neighbour_maps
 from fmtorch.pruning.window_kernels import Pyramid
 
 MIN_PRIOR = 0.02  # matches less likely than that are not taken for less exact, as in `match_noise`
@@ -26,12 +27,12 @@ class RefineMatches:
     """Moves the point of image 1 to where the image looks most like image 0 around its partner; prunes nothing.
 
     Least-squares matching (Lucas and Kanade, IJCAI 1981; Gruen, 1985): a window of image 0 is fitted to image 1 by an
-    affine map, gain and offset, from the map between the two local affine frames. A match stays as it is where a window
+    affine map, gain and offset, from the map between the two local affine frames, or without frames from a similarity
+    that neighbouring matches agree on. A match stays as it is where a window
     reaches over the border, where the fit lowers the correlation or ends below `min_correlation` or too far away, and
     where the image does not determine the point in all directions (no texture, an edge). A match that is refined gets
     the frame of its affine map and a `noise` from its own normal equations, relative to that of an unrefined match with
-    noise one; others keep theirs. Gradients do not pass: refined points are constants. Matches without frames are left
-    as they are.
+    noise one; others keep theirs. Gradients do not pass: refined points are constants.
 
     radius: samples from the centre of a window to its sides. iterations: at most. spacing: between samples, at
     least, px. share: the same, of the half side of the match's frame. min_correlation, max_shift (in samples),
@@ -51,7 +52,7 @@ class RefineMatches:
     slope: float
     usual: float
 
-    kernels: ClassVar = (compiled.refine_windows,)
+    kernels: ClassVar = (compiled.refine_windows, neighbour_maps)
 
     def __post_init__(self) -> None:
         """Raises ValueError for a window or a number of steps that is none."""
@@ -67,22 +68,24 @@ class RefineMatches:
 
     def with_images(self, c: Correspondences, images: Callable[[int], PairImages]) -> Correspondences:
         """The same matches refined. images: of pair i, asked for where it has matches."""
-        if c.lafs0 is None or c.lafs1 is None:
-            return c
-        x1, lafs1 = c.x1.detach().clone(), c.lafs1.detach().clone()
+        x1, lafs1 = c.x1.detach().clone(), None if c.lafs1 is None else c.lafs1.detach().clone()
         noise = torch.ones_like(c.x0[..., 0]) if c.noise is None else c.noise.detach().clone()
+        fields = {"x0": c.x0, "x1": c.x1}
+        if c.lafs0 is not None and c.lafs1 is not None:
+            fields |= {"lafs0": c.lafs0, "lafs1": c.lafs1}
 
         def refine(pair: int) -> None:
-            arrays = {name: _array(getattr(c, name)[pair]) for name in ("x0", "x1", "lafs0", "lafs1", "mask")}
-            live = np.flatnonzero(arrays["mask"] & _finite(*(arrays[name] for name in arrays if name != "mask")))
+            arrays = {name: _array(tensor[pair]) for name, tensor in fields.items()}
+            live = np.flatnonzero(_array(c.mask[pair]) & _finite(*arrays.values()))
             if not len(live):
                 return
             rows = {name: array[live] for name, array in arrays.items()}
             out = self._refined(rows, *images(pair))
             index = torch.from_numpy(live[out.refined]).to(x1.device)
             x1[pair, index] = _like(out.x1[out.refined], x1)
-            frames = np.concatenate([out.affine @ rows["lafs0"][:, :, :2], out.x1[:, :, None]], 2)
-            lafs1[pair, index] = _like(frames[out.refined], lafs1)
+            if lafs1 is not None and "lafs0" in rows:
+                frames = np.concatenate([out.affine @ rows["lafs0"][:, :, :2], out.x1[:, :, None]], 2)
+                lafs1[pair, index] = _like(frames[out.refined], lafs1)
             noise[pair, index] = _like(self._noise(out), noise) * self._doubt(c.prior, pair, index)
 
         mapped(refine, range(len(c)))
@@ -90,16 +93,16 @@ class RefineMatches:
 
     def _refined(self, rows: dict[str, Array], image0: GreyPyramid, image1: GreyPyramid) -> compiled.Refined:
         """The matches of one pair, all of them finite, refined."""
-        n, A0 = len(rows["x0"]), rows["lafs0"][:, :, :2]
-        determinant = A0[:, 0, 0] * A0[:, 1, 1] - A0[:, 0, 1] * A0[:, 1, 0]
-        adjugate = np.stack([A0[:, 1, 1], -A0[:, 0, 1], -A0[:, 1, 0], A0[:, 0, 0]], 1).reshape(n, 2, 2)
-        with np.errstate(all="ignore"):  # a frame without area: the kernel leaves what is not finite
-            affine = rows["lafs1"][:, :, :2] @ adjugate / determinant[:, None, None]
+        n = len(rows["x0"])
+        affine, side = (
+            _frame_maps(rows["lafs0"], rows["lafs1"]) if "lafs0" in rows else (np.empty((n, 2, 2)), np.zeros(n))
+        )
+        if "lafs0" not in rows:
+            neighbour_maps(rows["x0"], rows["x1"], affine)
+        with np.errstate(all="ignore"):  # maps that are none: the kernel leaves what is not finite
             scale = np.sqrt(np.abs(affine[:, 0, 0] * affine[:, 1, 1] - affine[:, 0, 1] * affine[:, 1, 0]))
-            spacing = np.maximum(
-                np.maximum(self.spacing, self.spacing / scale), self.share * np.sqrt(np.abs(determinant))
-            )
-        windows = compiled.Windows(rows["x0"], rows["x1"], np.ascontiguousarray(affine), spacing, np.ones(n, np.bool_))
+            spacing = np.maximum(np.maximum(self.spacing, self.spacing / scale), self.share * side)
+        windows = compiled.Windows(rows["x0"], rows["x1"], affine, spacing, np.ones(n, np.bool_))
         fit = compiled.Fit(
             self.radius, self.iterations, float(self.min_correlation), float(self.max_shift), float(self.max_deviation)
         )
@@ -127,6 +130,16 @@ class RefineMatches:
             return 1.0
         P = prior.detach()[pair, index]
         return torch.where(torch.isfinite(P), P, 1).clamp_min(MIN_PRIOR).sqrt().sqrt().reciprocal()
+
+
+def _frame_maps(lafs0: Array, lafs1: Array) -> tuple[Array, Array]:
+    """The affine maps (n, 2, 2) from frames of image 0 to those of image 1, and the half sides (n,) of the former."""
+    (a, b), (c, d) = lafs0[:, 0, :2].T, lafs0[:, 1, :2].T
+    determinant = a * d - b * c
+    with np.errstate(all="ignore"):  # of a frame without area there is none
+        inverse = np.stack([d, -b, -c, a], 1).reshape(-1, 2, 2) / determinant[:, None, None]
+        maps = np.ascontiguousarray(lafs1[:, :, :2] @ inverse)
+    return maps, np.sqrt(np.abs(determinant))
 
 
 def _array(tensor: Tensor) -> Array:

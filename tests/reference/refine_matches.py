@@ -36,6 +36,19 @@ def level_for(levels: list[np.ndarray], spacing: float) -> int:
     return next((k for k in range(len(levels)) if spacing / 2**k < PITCH), len(levels) - 1)
 
 
+def neighbour_map(x0: np.ndarray, x1: np.ndarray, i: int) -> np.ndarray | None:
+    """The similarity (2, 2) on which most of the 16 nearest neighbours of match i agree, of those fitted to it."""
+    order = sorted(range(len(x0)), key=lambda j: (((x0[j] - x0[i]) ** 2).sum(), j))[:17]
+    d0, d1 = ((x[order] - x[i]) @ [1, 1j] for x in (x0, x1))
+    d0, d1 = d0[abs(d0) > 0], d1[abs(d0) > 0]
+    supports = [abs(s * d0 - d1) <= 0.15 * abs(s * d0) + 1 for s in d1 / d0]
+    best = max(supports, key=sum, default=np.zeros(0, bool))
+    if best.sum() < 3:
+        return None
+    s = np.vdot(d0[best], d1[best]) / np.vdot(d0[best], d0[best]).real
+    return np.array([[s.real, -s.imag], [s.imag, s.real]])
+
+
 def refined(
     levels0: list[np.ndarray], levels1: list[np.ndarray], x0: np.ndarray, x1: np.ndarray, affine: np.ndarray,
     spacing: float, radius: int, iterations: int,
