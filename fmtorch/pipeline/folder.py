@@ -17,6 +17,7 @@ from torch import Tensor
 from fmtorch.core.files import replacing
 from fmtorch.core.threads import available, one_thread
 from fmtorch.data.images import read_image
+from fmtorch.pipeline.build import Build, pipeline_of
 from fmtorch.pipeline.exporting import exported_image, exported_match
 from fmtorch.pipeline.folder_images import Pair, in_blocks
 from fmtorch.pipeline.pipeline import Pipeline
@@ -32,17 +33,19 @@ MAX_WORKERS = 8  # by default: each holds an image and its scale space
 Cameras = Callable[[Path, Path], Mapping[str, Tensor]]
 
 
-def described_image(pipeline: Pipeline, image: Path, longest_side: int, orient: bool) -> Described:
+def described_image(source: Pipeline | Build, image: Path, longest_side: int, orient: bool) -> Described:
     """The features of an image file, by one thread."""
+    pipeline = pipeline_of(source)
     with one_thread(pipeline.device):
         return describe(pipeline, read_image(image, orient=orient), longest_side)
 
 
 def matched_pair(
-    pipeline: Pipeline, described0: Described, described1: Described, names: tuple[str, str], seed: int = 0,
+    source: Pipeline | Build, described0: Described, described1: Described, names: tuple[str, str], seed: int = 0,
     cameras: Mapping[str, Tensor] = NOTHING_KNOWN,
 ) -> ExportedPair:  # fmt: skip
     """What a journal keeps of two images under these names, by one thread. cameras: of `camera_fields`."""
+    pipeline = pipeline_of(source)
     with one_thread(pipeline.device):
         result = relate(pipeline, described0, described1, seed, cameras)
     return exported_match(names, (described0, described1), result)
@@ -110,7 +113,8 @@ class FolderMatches:
     """Matches pairs of images into a journal, which this process alone writes; what that has already is taken.
 
     executor: a `concurrent.futures.Executor` that does the work, not closed at the end; None: threads. workers: its
-    size; None: one a core, one for a GPU. cameras: what is known of the cameras of two images, as of `camera_fields`.
+    size; None: one a core, one for a GPU. build: makes the pipeline in the executor's processes; None: it has the same
+    one. cameras: what is known of the cameras of two images, as of `camera_fields`.
 
     done, taken, related: pairs matched now, taken from the journal, and of either those that show one scene. troubles:
     what went wrong with images or pairs, which are tried again the next time.
@@ -118,11 +122,12 @@ class FolderMatches:
 
     def __init__(
         self, pipeline: Pipeline, journal: Journal, longest_side: int, orient: bool, seed: int, *,
-        executor: Executor | None = None, workers: int | None = None, cameras: Cameras | None = None,
+        executor: Executor | None = None, workers: int | None = None, build: Build | None = None,
+        cameras: Cameras | None = None,
     ) -> None:  # fmt: skip
         self.pipeline, self.journal = pipeline, journal
         self.longest_side, self.orient, self.seed, self.cameras = longest_side, orient, seed, cameras
-        self.executor = executor
+        self.executor, self.source = executor, build or pipeline
         usual = min(available(), MAX_WORKERS) if pipeline.device.type == "cpu" else 1
         self.workers = usual if workers is None else workers
         self.done = self.taken = self.related = 0
@@ -193,7 +198,7 @@ class FolderMatches:
                     names = self.journal.name(each.pair[0]), self.journal.name(each.pair[1])
                     cameras = NOTHING_KNOWN if self.cameras is None else self.cameras(*each.pair)
                     ends = each.ends[0].result(), each.ends[1].result()
-                    each.match = executor.submit(matched_pair, self.pipeline, *ends, names, self.seed, cameras)
+                    each.match = executor.submit(matched_pair, self.source, *ends, names, self.seed, cameras)
             if begun[0].failed or not begun[0].under_way:
                 return
             wait({future for each in begun for future in each.under_way}, return_when=FIRST_COMPLETED)
@@ -201,7 +206,7 @@ class FolderMatches:
     def _image(self, executor: Executor, image: Path) -> Future[Described]:
         """An image's features, begun unless they are there."""
         if image not in self._described:
-            arguments = self.pipeline, image, self.longest_side, self.orient
+            arguments = self.source, image, self.longest_side, self.orient
             self._described[image] = executor.submit(described_image, *arguments)
         self._described.move_to_end(image)
         while len(self._described) > MEMORY:
