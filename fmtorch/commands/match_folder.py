@@ -3,24 +3,33 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from omegaconf import DictConfig
 
 from fmtorch import presets
+from fmtorch.core.files import replacing
 from fmtorch.core.terminal import console, errors, progress_bars
+from fmtorch.data.images import read_image
+from fmtorch.evaluation.view_graph_picture import view_graph_svg
+from fmtorch.features.vlad import descriptor_kind, image_vector
 from fmtorch.pipeline.folder import MEMORY, FolderMatches
-from fmtorch.pipeline.folder_images import chosen_pairs, images_below
+from fmtorch.pipeline.folder_images import SIMILAR, chosen_pairs, count_of, images_below
 from fmtorch.pipeline.folder_output import default_output, open_folder
 from fmtorch.pipeline.photograph_cameras import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.pipeline.similar import similar_pairs, vectors_of
 from fmtorch.presets.fields import Count, Device, Seed
 from fmtorch.storage.code import fmtorch_version
 from fmtorch.storage.exchange.export import export_kinds, write_exports
 from fmtorch.storage.exchange.journal import Journal
+from fmtorch.storage.exchange.view_graph import ViewGraph, view_graph, write_view_graph
 from fmtorch.storage.features import CachedFeatures, cached
 
 
@@ -51,12 +60,15 @@ def match_folder(
     assert folder is not None
     kinds = export_kinds(fields.export)
     images = images_below(folder)
-    pairs = chosen_pairs(folder, images, fields.pairs)
+    similar = count_of(fields.pairs, SIMILAR)
+    pairs = [] if similar else chosen_pairs(folder, images, fields.pairs)
     presets.expect_stages(config)
+    stages = presets.stages(config)
+    vector = functools.partial(image_vector, kind=descriptor_kind(stages["features"])) if similar else None
     pipeline: Pipeline = presets.build_pipeline(config, presets.resolve_device(fields.device))
     output = fields.output or default_output(folder)
     identity = {
-        "version": fmtorch_version(), "images": str(folder.absolute()), **presets.stages(config), "seed": fields.seed,
+        "version": fmtorch_version(), "images": str(folder.absolute()), **stages, "seed": fields.seed,
         "orient": fields.orient, "longest_side": fields.longest_side, **cameras.identity,
     }  # fmt: skip
     journal = Journal(open_folder(output, identity), folder)
@@ -68,20 +80,52 @@ def match_folder(
         pipeline, journal, fields.longest_side, fields.orient, fields.seed, workers=fields.workers, cameras=cameras
     )
     with progress_bars() as progress:
-        bar = progress.add_task(pipeline_name, total=len(pairs))
-        for _ in work.each(pairs):
-            progress.advance(bar)
+        if similar and vector is not None:
+            seen = progress.track(work.images(images), len(images), description="images")
+            pairs = similar_pairs(images, vectors_of(seen, vector), similar)
+        for _ in progress.track(work.each(pairs), len(pairs), description=pipeline_name):
+            pass
     shutil.rmtree(scratch, ignore_errors=True)
+    _expect_some(work, len(pairs))
+    graph = view_graph(journal, images, pairs)
+    shared = fields.camera == "shared" or cameras.word == "shared"
+    written = ["export.json", *write_exports(journal, pairs, kinds, output, shared)]
+    written += [*write_view_graph(graph, output), _draw(graph, folder, fields.orient, output)]
+    _say(work, graph, len(pairs))
+    console.print(f"{output}: {', '.join(written)}", style="dim", markup=False, highlight=False)
+    if isinstance(pipeline.extractor, CachedFeatures) and pipeline.extractor.cache.folder != scratch:
+        console.print(pipeline.extractor.report(), style="dim", markup=False, highlight=False)
+    return output
+
+
+def _expect_some(work: FolderMatches, pairs: int) -> None:
+    """Say what went wrong with images and pairs, and raise ValueError where no pair could be matched."""
     for trouble in work.troubles:
         errors.print(trouble, style="bold", markup=False, highlight=False, soft_wrap=True)
     if work.taken:
-        console.print(f"{work.taken} of {len(pairs)} pairs taken from an earlier run", highlight=False)
+        console.print(f"{work.taken} of {pairs} pairs taken from an earlier run", highlight=False)
     if work.troubles and not work.done + work.taken:
         raise ValueError(f"no pair could be matched, the first because: {work.troubles[0]}")
-    console.print(f"{work.related} of {len(pairs)} pairs show one scene", highlight=False)
-    shared = fields.camera == "shared" or cameras.word == "shared"
-    written = ["export.json", *write_exports(journal, pairs, kinds, output, shared)]
-    console.print(f"{output}: {', '.join(written)}", style="dim", highlight=False)
-    if isinstance(pipeline.extractor, CachedFeatures) and pipeline.extractor.cache.folder != scratch:
-        console.print(pipeline.extractor.report(), style="dim", highlight=False)
-    return output
+
+
+def _say(work: FolderMatches, graph: ViewGraph, pairs: int) -> None:
+    sizes = [len(part) for part in graph.components() if len(part) > 1]
+    apart = len(graph.images) - sum(sizes)
+    console.print(f"{work.related} of {pairs} pairs show one scene", highlight=False)
+    if sizes:
+        others = f"; {apart} images are in no related pair" if apart else ""
+        console.print(f"connected images: {', '.join(map(str, sizes))}{others}", highlight=False)
+
+
+def _draw(graph: ViewGraph, folder: Path, orient: bool, output: Path) -> str:
+    """Draw the graph; the name of the picture."""
+
+    def read(name: str) -> NDArray[np.uint8] | None:
+        try:
+            return read_image(folder / name, orient=orient)
+        except (OSError, ValueError):
+            return None
+
+    with replacing(output / "graph.svg") as path:
+        path.write_text(view_graph_svg(graph, read), encoding="utf-8")
+    return "graph.svg"

@@ -51,8 +51,8 @@ def project(
 
 
 def learn_projection(
-    descriptors: Float[Tensor, "n 128"], dimensions: int = DIMENSIONS
-) -> tuple[Float[Tensor, 128], Float[Tensor, "128 d"]]:
+    descriptors: Float[Tensor, "n D"], dimensions: int = DIMENSIONS
+) -> tuple[Float[Tensor, " D"], Float[Tensor, "D d"]]:
     """Mean and the `dimensions` principal axes of descriptors, largest variance first; the largest entry positive."""
     x = descriptors.double()
     mean = x.mean(0)

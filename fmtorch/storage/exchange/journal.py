@@ -138,11 +138,20 @@ def indices(points: NDArray[np.float32], x: NDArray[np.float32]) -> NDArray[np.i
 
     Raises ValueError where x holds a point that is none of them: a matcher that moves points cannot be exported so.
     """
-    place = {tuple(point): i for i, point in reversed(list(enumerate(points.tolist())))}
-    try:
-        return np.array([place[tuple(point)] for point in x.tolist()], np.int32)
-    except KeyError as error:
-        raise ValueError(f"the match at {error.args[0]} is at no keypoint; such matches cannot be exported") from None
+    keys, wanted = _keys(points), _keys(x)
+    order = np.argsort(keys, kind="stable")
+    place = np.searchsorted(keys, wanted, sorter=order)
+    index = order[np.minimum(place, len(order) - 1)] if len(order) else np.zeros(len(wanted), np.int64)
+    absent = np.ones(len(wanted), bool) if not len(order) else keys[index] != wanted
+    if absent.any():
+        point = tuple(x[absent.argmax()].tolist())
+        raise ValueError(f"the match at {point} is at no keypoint; such matches cannot be exported")
+    return index.astype(np.int32)
+
+
+def _keys(points: NDArray[np.float32]) -> NDArray[np.int64]:
+    """The bits of both coordinates of each point, (n,); 0 and -0 are one."""
+    return np.ascontiguousarray(points + np.float32(0), np.float32).view(np.int64)[:, 0]
 
 
 @functools.lru_cache(maxsize=100_000)

@@ -165,6 +165,16 @@ def test_keypoints_are_found_again() -> None:
     assert indices(points, points[:0]).shape == (0,)
     with pytest.raises(ValueError, match=r"the match at \(1.5, 2.0\) is at no keypoint"):
         indices(points, np.array([[1.5, 2.0]], np.float32))
+    with pytest.raises(ValueError, match=r"the match at \(1.0, 2.0\) is at no keypoint"):
+        indices(points[:0], points[:1])
+
+
+def test_keypoints_are_found_as_a_dictionary_finds_them() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.choice(np.array([-1.5, -0.0, 0.0, 0.25, 7], np.float32), (60, 2))
+    x = points[rng.integers(0, 60, 200)] * np.float32([1, -1]) * np.float32([1, -1])
+    place = {tuple(point): i for i, point in reversed(list(enumerate(points.tolist())))}
+    assert indices(points, x).tolist() == [place[tuple(point)] for point in x.tolist()]
 
 
 def journal(folder: Path, circle: Circle) -> tuple[Journal, list[tuple[Path, Path]]]:
