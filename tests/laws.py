@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -16,7 +17,8 @@ import torch
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.core.stages import Estimator, Pruner
+from fmtorch.core.grey_pyramid import grey_pyramid
+from fmtorch.core.stages import Estimator, ImagePruner, PairImages, Pruner
 from fmtorch.core.types import Correspondences, collate
 
 PEERS = {
@@ -67,8 +69,21 @@ def quick_pruner(name: str) -> Pruner:
     network = presets.load("pruner", name).get("network")
     torch.manual_seed(7)  # with which about half of the matches have P > 0.5
     small: dict[str, Any] = {} if network is None else {"file": None, "network": SMALL_NETWORKS[network["_target_"]]}
+    if name == "refine_matches":
+        small = {"min_correlation": -1.0, "max_deviation": 100.0}  # scenes' points are anywhere in the images
     built: Pruner = presets.build("pruner", name, **small)
-    return built
+    return shown(built)
+
+
+def shown(pruner: Pruner) -> Pruner:
+    """A pruner that gets two images of random grey levels where it looks at them, of the size of a `scene`."""
+    return (lambda c: pruner.with_images(c, lambda pair: _images())) if isinstance(pruner, ImagePruner) else pruner
+
+
+@functools.cache
+def _images() -> PairImages:
+    first, second = np.random.default_rng(0).integers(0, 256, (2, 160, 240)).astype(np.uint8).repeat(4, 1).repeat(4, 2)
+    return grey_pyramid(first), grey_pyramid(second)
 
 
 def calibrated(c: Correspondences) -> Correspondences:

@@ -15,6 +15,7 @@ from rich.progress import Progress
 
 from fmtorch import data, presets
 from fmtorch.commands.main import job, run_command
+from fmtorch.core.shards import shard_of
 from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.data import ImagePair, PairDataset
 from fmtorch.evaluation.identity import run_identity
@@ -22,10 +23,11 @@ from fmtorch.evaluation.pair_cameras import Cameras, built_with, cameras_of
 from fmtorch.evaluation.plots import plot_recall_curves
 from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import ALL, Group, summarize
-from fmtorch.evaluation.summary_tables import pose_table, summary_markdown, summary_table
+from fmtorch.evaluation.summary_tables import further_tables, pose_table, summary_markdown, summary_table
 from fmtorch.pipeline.exporting import exportable
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
+from fmtorch.presets.executors import execution_of
 from fmtorch.presets.fields import Cache, Count, Device, Gigabytes, Seed, path_fields, read_fields
 from fmtorch.storage import RunFolder, identity_digest
 from fmtorch.storage.exchange.export import export_kinds, write_exports
@@ -33,7 +35,6 @@ from fmtorch.storage.exchange.journal import Journal
 from fmtorch.storage.features import CachedFeatures
 
 MIN_PAIRS_FOR_PROCESSES = 500  # below which processes are not worth their start
-MAX_PROCESSES = 8  # unless more are asked for: each holds the networks of the pipeline and some 0.5 GB
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,6 +48,7 @@ class Fields:
     batch: Count = 16
     workers: Count | None = None
     processes: bool | None = None
+    shard: str | None = None
     run_dir: Path | None = None
     cache: Cache = None
     cache_limit: Gigabytes | None = 20
@@ -59,6 +61,8 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
     Raises ValueError, before anything is computed or written, where an option is not what it may be.
     """
     fields = read_fields(Fields, config)
+    execution_of(config, fields.workers, fields.processes)
+    shard = shard_of(fields.shard)
     device = presets.resolve_device(fields.device)
     exports = export_kinds(fields.export)
     presets.expect_dataset(config.dataset)
@@ -69,21 +73,26 @@ def run(config: DictConfig, pipeline_name: str) -> Path:
         folder = _open_folder(config, fields, pipeline_name, pipeline, dataset)
         pairs = select([dataset[i] for i in range(len(dataset))], fields.limit)
         journal = _journal(folder.path, pairs) if exports else None
-        todo = _missing(pairs, folder, journal)
-        bar = progress.add_task(pipeline_name, total=len(pairs), completed=len(pairs) - len(todo))
+        own = pairs if shard is None else shard.of(pairs)
+        todo = _missing(own, folder, journal)
+        bar = progress.add_task(pipeline_name, total=len(own), completed=len(own) - len(todo))
         for count in _evaluated(config, fields, pipeline, todo, folder, journal):
             progress.advance(bar, count)
-    if len(todo) < len(pairs):
-        earlier = f"{len(pairs) - len(todo)} of {len(pairs)} pairs taken from an earlier run in {folder.path}"
+    if len(todo) < len(own):
+        earlier = f"{len(own) - len(todo)} of {len(own)} pairs taken from an earlier run in {folder.path}"
         console.print(earlier, markup=False, highlight=False)
     table = folder.read({pair.key for pair in pairs})
-    summary = _summarize(table, folder, pipeline_name, dataset.name)
-    if journal is not None:
+    if shard is not None and len(table) < len(pairs):
+        console.print(f"{len(table)} of {len(pairs)} pairs have rows; other shards have the rest", highlight=False)
+    if shard is not None and not len(table):  # of an empty shard, before the others
+        return folder.path
+    summary = _summarize(table, folder, f"{pipeline_name} on {dataset.name}")
+    if journal is not None and len(table) == len(pairs):
         ends = [(p.image0.path, p.image1.path) for p in pairs if exportable(p)]
         written = write_exports(journal, ends, exports, folder.path)
-        console.print(f"[dim]{folder.path}: {', '.join(written)}; names of images are below {journal.root}[/dim]")
+        console.print(f"{folder.path}: {', '.join(written)}; names of images are below {journal.root}", style="dim")
     if isinstance(pipeline.extractor, CachedFeatures):
-        console.print(f"[dim]{pipeline.extractor.report()}[/dim]")
+        console.print(pipeline.extractor.report(), style="dim")
     if pairs and summary[ALL]["failures"] == len(pairs):
         reason = next(iter(table["reason"].to_pylist()))
         raise ValueError(
@@ -112,31 +121,37 @@ def _evaluated(
     journal: Journal | None,
 ) -> Iterator[int]:  # fmt: skip
     """Evaluates pairs into the folder and the journal; yields how many were done since."""
-    device, cores = pipeline.device, os.cpu_count() or 1
-    processes = len(pairs) >= MIN_PAIRS_FOR_PROCESSES if fields.processes is None else fields.processes
-    processes = processes and device.type == "cpu"
-    workers = fields.workers or (1 if device.type != "cpu" else min(cores, MAX_PROCESSES) if processes else cores)
-    build = functools.partial(presets.build_pipeline, config, device) if processes and workers > 1 else None
+    parallel = len(pairs) >= MIN_PAIRS_FOR_PROCESSES and pipeline.device.type == "cpu" and (os.cpu_count() or 1) > 1
+    execution = execution_of(config, fields.workers, fields.processes).decided(parallel)
+    if execution.shared and execution.workers is None and pipeline.device.type != "cpu":
+        execution = dataclasses.replace(execution, workers=1)
+    build = None if execution.shared else functools.partial(presets.build_pipeline, config, pipeline.device)
+    cameras = None
     if fields.cameras is not None:
         cameras = cameras_of(pairs, fields.cameras)
-        build = None if build is None else functools.partial(built_with, build, cameras)
+        build = None if build is None else functools.partial(built_with, build, {})
         pipeline = built_with(lambda: pipeline, cameras)
     return evaluate_pairs(
-        pipeline, pairs, seed=fields.seed, batch=fields.batch, workers=workers, store=folder.append, build=build,
-        journal=journal,
+        pipeline, pairs, seed=fields.seed, batch=fields.batch, execution=execution, store=folder.append, build=build,
+        cameras=cameras, journal=journal,
     )  # fmt: skip
 
 
-def _summarize(table: pa.Table, folder: RunFolder, pipeline_name: str, dataset_name: str) -> dict[str, Group]:
-    """The summary of a run's rows, written to its folder with the recall curve, and shown."""
-    title = f"{pipeline_name} on {dataset_name}"
+def _summarize(table: pa.Table, folder: RunFolder, title: str) -> dict[str, Group]:
+    """The summary of the rows asked for, which is shown; that of all rows of the run goes to its folder."""
+    whole = folder.read()
     summary = summarize(table)
-    folder.write_summary(summary, summary_markdown(summary, title=title))
-    plot_recall_curves({pipeline_name: table}, folder.path / "recall.png")
-    console.print(summary_table(summary, title=title))
+    all_rows = summary if len(whole) == len(table) else summarize(whole)
+    folder.write_summary(all_rows, summary_markdown(all_rows, title=title))
+    plot_recall_curves({title.partition(" ")[0]: whole}, folder.path / "recall.png")
+    part = "" if len(whole) == len(table) else f", {len(table)} of the {len(whole)} pairs of the run"
+    console.print(summary_table(summary, title=f"{title}{part}"))
     if (poses := pose_table(summary)) is not None:
         console.print(poses)
-    console.print(f"[dim]{folder.path}: pairs/, summary.json, summary.md, recall.png[/dim]")
+    for further in further_tables(summary):
+        console.print(further)
+    about = f"; of all {len(whole)} pairs" if part else ""
+    console.print(f"{folder.path}: pairs/, summary.json, summary.md, recall.png{about}", style="dim")
     return summary
 
 

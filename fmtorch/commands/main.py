@@ -13,7 +13,7 @@ from hydra.core.utils import env_override
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import GrammarParseError, OmegaConfBaseException
 
 from fmtorch.commands.overrides import hydra_arguments
 from fmtorch.core.options import nearest
@@ -35,6 +35,7 @@ def job(task: Task) -> Task:
     @functools.wraps(task)
     def wrapped(config: DictConfig) -> None:
         try:
+            _expect_known(HydraConfig.get().overrides.task)
             task(with_explicit(config, HydraConfig.get().overrides.task))
         except MISTAKES as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
@@ -69,6 +70,16 @@ def run_command(
             sys.exit(f"error: {explained(error, name)}")
 
 
+def _expect_known(overrides: Sequence[str]) -> None:
+    """Raise ValueError for a field that is added (`+limti=2`) and that no command takes."""
+    job_config = HydraConfig.get()
+    known = [*top_level_names(str(job_config.job.config_name)), *map(str, job_config.runtime.choices)]
+    for word in overrides:
+        name = word.lstrip("+").partition("=")[0]
+        if word.startswith("+") and re.fullmatch(r"\w+", name) and name not in known:
+            raise ValueError(f"no option {name}; there are: {nearest(name, known[: -len(job_config.runtime.choices)])}")
+
+
 def explained(error: HydraException | OmegaConfBaseException, command: str) -> str:
     """One line for an error of Hydra's composition of the config of a command."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
@@ -81,6 +92,8 @@ def explained(error: HydraException | OmegaConfBaseException, command: str) -> s
     while isinstance(cause.__cause__, HydraException | OmegaConfBaseException):
         cause = cause.__cause__
     parent = getattr(cause, "parent_node", None)
+    if isinstance(cause, GrammarParseError):
+        return f"{cause.full_key}: {_line(str(cause.msg))}"
     if isinstance(cause, OmegaConfBaseException) and cause.full_key:
         names = [str(key) for key in parent] if isinstance(parent, DictConfig) else []
         if parent is not None and cause.key is not None and str(cause.key) not in names:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import hashlib
 import json
 import math
 from collections.abc import Sequence
@@ -15,25 +17,27 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from numpy.typing import NDArray
 from omegaconf import DictConfig
-from rich.console import Console
 from rich.table import Table
 
 from fmtorch import presets
 from fmtorch.commands.main import job, run_command
-from fmtorch.commands.match_cameras import CameraFields, photographs, pose_line, pose_report
+from fmtorch.commands.match_cameras import CameraFields, Photographs, photographs, pose_line, pose_report
 from fmtorch.commands.match_folder import FolderFields, match_folder
-from fmtorch.core.files import replacing
-from fmtorch.core.terminal import console
+from fmtorch.core.files import expect_writable, replacing
+from fmtorch.core.terminal import console, errors
 from fmtorch.core.types import RELATED
 from fmtorch.core.version import __version__
 from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_matches
 from fmtorch.metrics import nsgd
-from fmtorch.pipeline.folder import EXHAUSTIVE
+from fmtorch.pipeline.folder_images import EXHAUSTIVE
+from fmtorch.pipeline.photograph_cameras import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pipeline.reduced_images import Image
 from fmtorch.pipeline.two_images import MatchResult, match
 from fmtorch.presets.fields import Cache, Gigabytes, path_fields, read_fields
 from fmtorch.storage.features import CachedFeatures
+
+MAX_RANK3 = 0.01  # third singular value of a true F over the second one: its numbers may be rounded
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,9 +60,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     if fields.images is not None:
         if fields.image0 is not None or fields.image1 is not None or fields.truth is not None:
             raise ValueError("images takes a folder; image0, image1 and truth are of a single pair")
-        if fields.cameras is not None or fields.K is not None:
-            raise ValueError("cameras and K are of a single pair; a folder of images takes neither")
-        return match_folder(config, fields, pipeline_name, overrides)
+        return match_folder(config, fields, PhotographCameras(fields.cameras, fields.K), pipeline_name, overrides)
     if fields.export is not None or str(fields.pairs or EXHAUSTIVE) != EXHAUSTIVE:
         raise ValueError("export and pairs are of a folder of images: give images=FOLDER")
     paths = [_given(fields.image0, "image0"), _given(fields.image1, "image1")]
@@ -66,6 +68,8 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     truth = None if fields.truth is None else read_matrix(fields.truth)
     given = photographs(paths, fields.cameras, fields.K, fields.orient)
     image0, image1 = given.images
+    folder = fields.output or _default_output(paths)
+    expect_writable(folder)
     pipeline: Pipeline = presets.build_pipeline(config, presets.resolve_device(fields.device))
     result = match(
         image0, image1, pipeline=pipeline, longest_side=fields.longest_side, seed=fields.seed, **given.knowledge
@@ -75,11 +79,9 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
         "image0": str(paths[0]), "image1": str(paths[1]),
         **_report(result, image0, image1, truth), **pose_report(result),
     }  # fmt: skip
-    folder = fields.output or Path(f"matches/{paths[0].stem}-{paths[1].stem}")
-    folder.mkdir(parents=True, exist_ok=True)
     with replacing(folder / "result.json") as path:
         path.write_text(json.dumps(report) + "\n")
-    written = ["result.json", *_draw(folder, result, image0, image1, truth)]
+    written = ["result.json", *_draw(folder, result, given, truth)]
     heading = f"{' '.join([pipeline_name, *overrides])}: {paths[0].name}, {paths[1].name}"
     console.print(heading, style="italic", markup=False, highlight=False)
     console.print(_table(result))
@@ -88,10 +90,10 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     if line := pose_line(result):
         console.print(line, highlight=False)
     for trouble in (*given.notes, *_troubles(result)):
-        Console(stderr=True).print(f"[bold]{trouble}[/bold]", highlight=False, soft_wrap=True)
-    console.print(f"[dim]{folder}: {', '.join(written)}[/dim]", highlight=False)
+        errors.print(trouble, style="bold", highlight=False, soft_wrap=True)
+    console.print(f"{folder}: {', '.join(written)}", style="dim", highlight=False)
     if isinstance(pipeline.extractor, CachedFeatures):
-        console.print(f"[dim]{pipeline.extractor.report()}[/dim]", highlight=False)
+        console.print(pipeline.extractor.report(), style="dim", highlight=False)
     return folder
 
 
@@ -107,7 +109,11 @@ def read_matrix(path: Path) -> NDArray[np.float64]:
         raise ValueError(f"{path}: {error}; it must hold nine numbers, F row by row") from error
     if numbers.shape != (9,) or not np.isfinite(numbers).all() or not numbers.any():
         raise ValueError(f"{path}: holds {len(words)} numbers; it must hold nine finite ones, F row by row")
-    return numbers.reshape(3, 3)
+    F = numbers.reshape(3, 3)
+    singular = np.linalg.svd(F, compute_uv=False)
+    if singular[2] > MAX_RANK3 * singular[1]:
+        raise ValueError(f"{path}: a matrix of rank three (its determinant is not 0); F has rank two")
+    return F
 
 
 def _given(path: Path | None, name: str) -> Path:
@@ -116,28 +122,42 @@ def _given(path: Path | None, name: str) -> Path:
     return path
 
 
+def _default_output(paths: Sequence[Path]) -> Path:
+    """``matches/NAME0-NAME1``, with some digits behind where that holds what was found of others of these names."""
+    folder = Path(f"matches/{paths[0].stem}-{paths[1].stem}")
+    with contextlib.suppress(OSError, ValueError, KeyError):
+        earlier = json.loads((folder / "result.json").read_text())
+        if [Path(earlier[name]).absolute() for name in ("image0", "image1")] != [path.absolute() for path in paths]:
+            identity = "\0".join(str(path.absolute()) for path in paths)
+            return folder.with_name(f"{folder.name}-{hashlib.blake2b(identity.encode(), digest_size=4).hexdigest()}")
+    return folder
+
+
 def _report(result: MatchResult, image0: Image, image1: Image, truth: NDArray[np.float64] | None) -> dict[str, Any]:
     """What result.json holds of a result; points in pixels of the images."""
     c = result.correspondences
     report: dict[str, Any] = {
         "size0": image0.shape[:2], "size1": image1.shape[:2],
         "F": result.F.tolist() if result.ok else None, "reason": result.reason, "warning": result.warning,
+        "configuration": result.configuration or None,
+        "homography": None if result.homography is None else result.homography.tolist(),
         "related": result.related, "significance": result.significance if math.isfinite(result.significance) else None,
         "features": [len(result.keypoints0), len(result.keypoints1)],
         "matches": result.counts, "seconds": result.seconds,
         "x0": c.x0[0].tolist(), "x1": c.x1[0].tolist(), "inliers": result.inliers.tolist(),
         "ratio": None if c.quality is None else c.quality[0].tolist(),
     }  # fmt: skip
+    if (pinhole := result.undistorted) is not None:
+        report |= {"undistorted_x0": pinhole.x0[0].tolist(), "undistorted_x1": pinhole.x1[0].tolist()}
     if truth is not None and result.ok:
         sizes = (torch.tensor([image.shape[:2]]) for image in (image0, image1))
         report["nsgd"] = float(nsgd(torch.from_numpy(truth)[None], result.F.cpu()[None], *sizes)[0])
     return report
 
 
-def _draw(
-    folder: Path, result: MatchResult, image0: Image, image1: Image, truth: NDArray[np.float64] | None
-) -> list[str]:
-    """Draw the pictures into the folder; the names of those there are."""
+def _draw(folder: Path, result: MatchResult, given: Photographs, truth: NDArray[np.float64] | None) -> list[str]:
+    """Draw the pictures into the folder, matches in the photographs and epipolar lines in pinholes; their names."""
+    image0, image1 = given.images
     x0, x1 = (x[0].cpu().numpy().astype(np.float64) for x in (result.putative.x0, result.putative.x1))
     kept = result.kept.cpu().numpy()
     good = kept.copy()
@@ -154,7 +174,12 @@ def _draw(
     F = result.F.cpu().numpy() if result.ok else truth
     if F is not None:
         dashed = truth if result.ok else None
-        pictures["epipolar.png"] = draw_epipolar_lines(image0, image1, x0[good], x1[good], F, truth=dashed)
+        if (c := result.undistorted) is None:
+            ends = x0[good], x1[good]
+        else:
+            seen = (result.inliers if result.ok else c.mask[0]).cpu()
+            ends = c.x0[0].cpu()[seen].double().numpy(), c.x1[0].cpu()[seen].double().numpy()
+        pictures["epipolar.png"] = draw_epipolar_lines(*given.pinholes, *ends, F, truth=dashed)
     for name, picture in pictures.items():
         with replacing(folder / name) as path:
             path.write_bytes(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
@@ -165,13 +190,14 @@ def _draw(
 
 def _troubles(result: MatchResult) -> list[str]:
     """What is said of a result that is not to be relied on."""
+    warning = result.warning if result.related or result.configuration != "unrelated" else ""  # which is said already
     if not result.ok:
-        return list(filter(None, (f"no F: {result.reason}", result.warning)))
+        return list(filter(None, (f"no F: {result.reason}", warning)))
     chance = (
         "probably not the same scene: so much support is no surprise by chance alone "
         f"(significance {result.significance:.1f}; related from {RELATED:g} on)"
     )
-    return list(filter(None, ("" if result.related else chance, result.warning)))
+    return list(filter(None, ("" if result.related else chance, warning)))
 
 
 def _table(result: MatchResult) -> Table:
@@ -180,9 +206,12 @@ def _table(result: MatchResult) -> Table:
     table.add_column("left", justify="right")
     table.add_column("seconds", justify="right")
     for step, seconds in result.seconds.items():
-        counts = [len(result.keypoints0), len(result.keypoints1)] if step == "features" else [result.counts[step]]
+        counts = (
+            [len(result.keypoints0), len(result.keypoints1)] if step == "features" else [result.counts.get(step, 0)]
+        )
         unit = {"features": "keypoints", "estimation": "inliers"}.get(step, "matches")
-        table.add_row(step, f"{' + '.join(f'{count:,}' for count in counts)} {unit}", f"{seconds:.3f}")
+        left = f"{' + '.join(f'{count:,}' for count in counts)} {unit}"
+        table.add_row(step, result.configuration if step == "configuration" else left, f"{seconds:.3f}")
     return table
 
 

@@ -2,36 +2,33 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import functools
 import itertools
-import multiprocessing
-import os
-import signal
 import time
 from collections.abc import Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Annotated, Any
 
-import cv2
-from hydra.core.utils import env_override
 from omegaconf import DictConfig
 from rich.progress import Progress
 
 from fmtorch import data, presets
 from fmtorch.commands.main import job, run_command
+from fmtorch.core.calls import Calls
+from fmtorch.core.executors import Execution, Team
 from fmtorch.core.options import Within
+from fmtorch.core.recipes import Here, Recipe, Source
 from fmtorch.core.terminal import console, progress_bars
 from fmtorch.data.construction import BLOCK, Construction, blocks
 from fmtorch.data.scenes import ScenePairs
-from fmtorch.evaluation.workers import end_with_parent
 from fmtorch.presets import plain
+from fmtorch.presets.executors import execution_of
 from fmtorch.presets.fields import Count, Seed, path_fields, read_fields
 
-MAX_PROCESSES = 8  # unless more are asked for
 MIN_CANDIDATES_FOR_PROCESSES = 4 * BLOCK + 1  # below which processes are not worth their start
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+PRELOADED = ("fmtorch.data.construction",)  # by the process that workers are forked of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,13 +59,13 @@ def run(config: DictConfig) -> Path:
         )
         return construction.folder
     many = dataset.candidates >= MIN_CANDIDATES_FOR_PROCESSES
-    workers = fields.workers or (min(os.cpu_count() or 1, MAX_PROCESSES) if many else 1)
+    execution = _execution(config, fields, many)
     start = time.monotonic()
-    with progress_bars() as progress, _Team(construction, workers) as team:
-        kept, judged, problems = _select(construction, team, progress)
+    with progress_bars() as progress:
+        kept, judged, problems = _select(construction, execution, progress)
         images = construction.used(kept)
         bar = progress.add_task("writing images", total=len(images))
-        for _ in team.each("write_image", images):
+        for _ in _each(construction, execution, "write_image", images):
             progress.advance(bar)
     summary = {"candidates": dataset.candidates, "judged": judged, "kept": len(kept), "images": len(images)}
     if not kept:
@@ -78,6 +75,13 @@ def run(config: DictConfig) -> Path:
     construction.finish(kept, summary)
     _tell(construction, summary, problems, time.monotonic() - start)
     return construction.folder
+
+
+def _execution(config: DictConfig, fields: Fields, many: bool) -> Execution:
+    """By whom candidates are judged: with nothing said, by processes where there are many, else here."""
+    asked = execution_of(config, fields.workers)
+    execution = asked.decided(many if asked.workers is None else asked.workers > 1)
+    return dataclasses.replace(execution, workers=1) if execution.shared and asked.workers is None else execution
 
 
 def _load(config: DictConfig) -> ScenePairs:
@@ -95,14 +99,14 @@ def _load(config: DictConfig) -> ScenePairs:
     )
 
 
-def _select(construction: Construction, team: _Team, progress: Progress) -> tuple[list[int], int, list[str]]:
+def _select(construction: Construction, execution: Execution, progress: Progress) -> tuple[list[int], int, list[str]]:
     """The candidates that make pairs, how many were judged for that, and what was wrong with images."""
     order = construction.order()
     total = len(order) if construction.count is None else min(construction.count, len(order))
     bar = progress.add_task("judging candidates" if construction.count is None else "finding pairs", total=total)
     kept, judged, problems = list[int](), 0, dict[str, None]()
     here, there = itertools.tee(blocks(order))
-    for (_, ranks), verdicts in zip(here, team.each("judge", there), strict=False):
+    for (_, ranks), verdicts in zip(here, _each(construction, execution, "judge", there), strict=False):
         passed = [rank for rank, good in zip(ranks, verdicts.kept, strict=True) if good]
         kept += passed
         judged += len(ranks)
@@ -113,66 +117,31 @@ def _select(construction: Construction, team: _Team, progress: Progress) -> tupl
     return kept[: construction.count], judged, list(problems)
 
 
-class _Team:
-    """Calls methods of a construction with many arguments, here or by several processes; results come in order."""
-
-    def __init__(self, construction: Construction, workers: int) -> None:
-        self.construction, self.workers = construction, workers
-        self.executor: ProcessPoolExecutor | None = None
-
-    def __enter__(self) -> _Team:
-        if self.workers > 1:
-            context = multiprocessing.get_context("spawn")
-            self.executor = ProcessPoolExecutor(
-                self.workers, context, initializer=_begin, initargs=(self.construction,)
-            )
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self.executor is not None:
-            self.executor.shutdown(wait=True, cancel_futures=True)
-
-    def each(self, method: str, arguments: Iterable[tuple[object, ...]]) -> Iterator[Any]:
-        """The results, some of them computed ahead."""
-        if self.executor is None:
-            for given in arguments:
-                yield getattr(self.construction, method)(*given)
-            return
-        waiting: list[Future[Any]] = []
-        todo = iter(arguments)
-        try:
-            with env_override(_ONE_THREAD):  # of the processes, which the first calls start
-                for given in todo:
-                    waiting.append(self.executor.submit(_in_process, method, given))
-                    if len(waiting) > 2 * self.workers:
-                        yield waiting.pop(0).result()
-                while waiting:
-                    yield waiting.pop(0).result()
-        except BrokenProcessPool as error:
-            raise RuntimeError(
-                "a worker process ended before its time, perhaps for want of memory: the same command goes on from "
-                "there; fewer workers need less of it"
-            ) from error
-        finally:
-            for future in waiting:
-                future.cancel()
+def _each(
+    construction: Construction, execution: Execution, method: str, arguments: Iterable[tuple[object, ...]]
+) -> Iterator[Any]:
+    """The results of a method of the construction, in order, some of them computed ahead by workers."""
+    results: dict[int, Any] = {}
+    source: Source[Construction] = (
+        Here(construction) if execution.shared else Recipe(functools.partial(_same, construction))
+    )
+    jobs = ((number, method, given) for number, given in enumerate(arguments))
+    calls = Calls(Team(execution, PRELOADED), source, _call, lambda job, result: results.update({job[0]: result}))
+    following = 0
+    with contextlib.closing(calls.each(jobs)) as done:
+        for _ in done:
+            while following in results:
+                yield results.pop(following)
+                following += 1
 
 
-_construction: Construction | None = None  # of a process that works for another
+def _same(construction: Construction) -> Construction:
+    return construction
 
 
-def _begin(construction: Construction) -> None:
-    """The start of a process: an interrupt is for the one that asked, which waits for what is under way."""
-    global _construction
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
-    cv2.setNumThreads(1)
-    _construction = construction
-
-
-def _in_process(method: str, given: tuple[object, ...]) -> Any:
-    assert _construction is not None
-    return getattr(_construction, method)(*given)
+def _call(construction: Construction, job: tuple[int, str, tuple[object, ...]]) -> Any:
+    _, method, given = job
+    return getattr(construction, method)(*given)
 
 
 def _tell(construction: Construction, summary: dict[str, int], problems: list[str], seconds: float) -> None:
@@ -186,7 +155,7 @@ def _tell(construction: Construction, summary: dict[str, int], problems: list[st
             f"{len(problems)} candidates or images cannot be used{_first(problems)}", markup=False, highlight=False
         )
     console.print(
-        f"[dim]python -m fmtorch.eval dataset=fmbench dataset.root={construction.folder}[/dim]", highlight=False
+        f"python -m fmtorch.eval dataset=fmbench dataset.root={construction.folder}", style="dim", highlight=False
     )
 
 

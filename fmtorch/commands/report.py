@@ -14,7 +14,7 @@ from rich.progress import track
 
 from fmtorch import presets
 from fmtorch.commands.main import job, run_command
-from fmtorch.core.files import replacing
+from fmtorch.core.files import expect_writable, replacing
 from fmtorch.core.options import Within
 from fmtorch.core.terminal import console
 from fmtorch.evaluation.gallery import Options, Run, gallery
@@ -53,6 +53,10 @@ def run(config: DictConfig) -> Path:
         fields.pictures, [Path(root) for root in roots], fields.own_code, presets.resolve_device(fields.device),
         config.cache, fields.cache_limit,
     )  # fmt: skip
+    output = fields.output
+    expect_writable(output.parent)
+    if output.is_dir():
+        raise ValueError(f"output={output} is a folder; it must name a file")
     sections, by_dataset = [], _by_dataset(runs)
     for heading, group in by_dataset.items():
         bar = functools.partial(track, description="drawing pairs", console=console, transient=True)
@@ -63,15 +67,13 @@ def run(config: DictConfig) -> Path:
          str(r.folder.path)]
         for heading, group in by_dataset.items() for r in group
     ]  # fmt: skip
-    output = fields.output
-    output.parent.mkdir(parents=True, exist_ok=True)
     page = render(str(config.title), sections, rows, shared_settings([r.folder.config for r in runs]))
     with replacing(output) as temporary:
         temporary.write_text(page, encoding="utf-8")
     for section in sections:
         for note in section.notes:
             console.print(f"{section.heading}: {note}", markup=False, highlight=False)
-    console.print(f"[dim]{output}: {len(runs)} runs, {output.stat().st_size / 2**20:.1f} MB[/dim]", highlight=False)
+    console.print(f"{output}: {len(runs)} runs, {output.stat().st_size / 2**20:.1f} MB", style="dim", highlight=False)
     return output
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import re
 import sys
 from collections.abc import Callable, Iterator
@@ -11,16 +12,18 @@ from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-from rich.console import Console
 from rich.table import Table
 
 from fmtorch import presets
 from fmtorch.commands.main import job, run_command
-from fmtorch.core.terminal import console, progress_bars, reporter
+from fmtorch.core.shards import shard_of
+from fmtorch.core.terminal import console, errors, progress_bars, reporter
 from fmtorch.pipeline.database_pairs import Cameras
-from fmtorch.pipeline.verification import Places, verify_by
+from fmtorch.pipeline.verification import ONE_THREAD, How, verify_by
+from fmtorch.pipeline.verification_places import Places
 from fmtorch.pipeline.verification_run import Verification
 from fmtorch.presets import plain
+from fmtorch.presets.executors import execution_of
 from fmtorch.presets.fields import Seed, path_fields, read_fields
 
 MAX_PROBLEMS = 20  # that are printed
@@ -37,22 +40,28 @@ class Fields:
     cameras: Cameras = "stored"
     force: bool = False
     seed: Seed = 0
+    shard: str | None = None
 
 
 def run(config: DictConfig, estimator: str) -> Verification:
     """Verify the database of a composed config, by a preset whose options are those of the config."""
     fields = read_fields(Fields, config)
-    built = presets.instantiate(config.estimator, "estimator")
+    presets.expect_buildable(plain(config.estimator), "estimator")
+    make = functools.partial(presets.instantiate, plain(config.estimator), "estimator")
+    execution = execution_of(config).decided(False)
+    if execution.shared and execution.workers is None:
+        execution = ONE_THREAD
+    how = How(fields.cameras, fields.force, fields.seed, execution, shard_of(fields.shard))
     with _begun_by_reports(estimator) as report:
         places = Places(fields.database, fields.features_file, fields.matches, fields.output)
         settings = {"estimator": plain(config.estimator)}
-        result = verify_by(built, settings, places, fields.cameras, fields.force, fields.seed, report)
+        result = verify_by(make, settings, places, how, report)
     for problem in result.problems[:MAX_PROBLEMS]:
-        Console(stderr=True).print(problem, style="bold", markup=False, highlight=False, soft_wrap=True)
+        errors.print(problem, style="bold", markup=False, highlight=False, soft_wrap=True)
     if len(result.problems) > MAX_PROBLEMS:
-        Console(stderr=True).print(f"and {len(result.problems) - MAX_PROBLEMS} more", highlight=False)
+        errors.print(f"and {len(result.problems) - MAX_PROBLEMS} more", highlight=False)
     console.print(_table(result))
-    console.print(f"[dim]{result.path}[/dim]", highlight=False)
+    console.print(str(result.path), style="dim", highlight=False)
     return result
 
 

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from fmtorch.compiling import calls
+from fmtorch.compiling.lock import FileLock
 from fmtorch.core.resources import cache_dir
 
 HERE = Path(__file__).resolve().parent
@@ -105,6 +106,7 @@ class KernelFile:
     def __init__(self, path: Path | None, missing: Callable[[str], None]) -> None:
         self.path, self.missing = path, missing
         self.calls: list[Any] = []
+        self._lock = None if path is None else FileLock(path)
 
     @property
     def cache_path(self) -> str | None:
@@ -113,9 +115,20 @@ class KernelFile:
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """The compiled function of the file; None where there is none, with a warning if it is damaged."""
+        target_context.refresh()
+        if (loaded := self._loaded(signature, target_context)) is not None:
+            return loaded
+        locked = self._lock is not None and self._lock.acquire()
+        if locked and (loaded := self._loaded(signature, target_context)) is not None:
+            self._release()
+            return loaded  # another process has just compiled it
+        kept = "for this process" if self.path is None else f"for this machine, once (kept in {self.path.parent})"
+        self.missing(kept)
+        return None
+
+    def _loaded(self, signature: Any, target_context: Any) -> Any:
         from numba.core.compiler import CompileResult
 
-        target_context.refresh()
         try:
             if self.path is not None:
                 written = self.path.read_bytes()
@@ -126,34 +139,45 @@ class KernelFile:
                     self.calls = calls.called(data)
                     return _of(signature, CompileResult._rebuild(target_context, *pickle.loads(data)))
                 warnings.warn(f"{self.path} is damaged; it is compiled anew", stacklevel=2)
+                with contextlib.suppress(OSError):
+                    self.path.unlink(missing_ok=True)
         except FileNotFoundError:
             pass
         except OSError as error:
             warnings.warn(f"{self.path} cannot be read ({error}); it is compiled anew", stacklevel=2)
-        kept = "for this process" if self.path is None else f"for this machine, once (kept in {self.path.parent})"
-        self.missing(kept)
         return None
 
     def save_overload(self, signature: Any, result: Any) -> None:
         """Write a compiled function; where that fails, it is not kept, with a warning."""
         from numba.core.serialize import dumps
 
-        data = dumps(result._reduce())
-        self.calls = calls.called(data)
-        if self.path is None or result._asdict()["library"].has_dynamic_globals:
-            return
-        from fmtorch.core.files import replacing
-
         try:
-            with replacing(self.path) as temporary:
-                temporary.write_bytes(_signature(data) + data)
-        except OSError as error:
-            warnings.warn(f"compiled kernels are not kept: {error}", stacklevel=2)
+            data = dumps(result._reduce())
+            self.calls = calls.called(data)
+            if self.path is not None and not result._asdict()["library"].has_dynamic_globals:
+                _write(self.path, _signature(data) + data)
+        finally:
+            self._release()
+
+    def _release(self) -> None:
+        """Let other processes that wait for the file have it."""
+        if self._lock is not None:
+            self._lock.release()
 
     def flush(self) -> None:
         """Remove the file."""
         if self.path is not None:
             self.path.unlink(missing_ok=True)
+
+
+def _write(path: Path, data: bytes) -> None:
+    from fmtorch.core.files import replacing
+
+    try:
+        with replacing(path) as temporary:
+            temporary.write_bytes(data)
+    except OSError as error:
+        warnings.warn(f"compiled kernels are not kept: {error}", stacklevel=3)
 
 
 def _of(signature: Any, made: Any) -> Any:

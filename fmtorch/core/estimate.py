@@ -46,8 +46,8 @@ class Estimate(Record):
     covariance_F (B, 9, 9), of F row by row. See `fmtorch.geometry.two_view_covariance`.
 
     Where the configuration is asked for: configuration_index (B,), into `CONFIGURATIONS`; homography (B, 3, 3), of the
-    plane or the rotation, zero where there is none; other_R, other_t, the second pose that explains a plane, NaN where
-    there is none.
+    plane, the rotation or the copy, zero where there is none; other_R, other_t, the second pose that explains a plane,
+    NaN where there is none.
     """
 
     F: Float[Tensor, "b 3 3"]

@@ -27,6 +27,15 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def expect_writable(folder: Path) -> None:
+    """Make a folder, and raise OSError where no file can be written to it: before the work, not after."""
+    folder.mkdir(parents=True, exist_ok=True)
+    temporary = temporary_name(folder / "write")
+    with naming(folder, temporary):
+        temporary.touch()
+        temporary.unlink()
+
+
 @contextlib.contextmanager
 def naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
     """Within it an OSError that names no file, or the temporary one for it, names `path`: what a full disk says."""

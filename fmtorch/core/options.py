@@ -27,16 +27,13 @@ class Within:
 
     def __call__(self, value: Any) -> bool:
         """Whether a number is in bounds."""
-        return bool(self.minimum <= value <= self.maximum)
+        return isinstance(value, int | float) and self.minimum <= value <= self.maximum
 
     def __str__(self) -> str:
+        low, high = (str(bound) if isinstance(bound, int) else f"{bound:g}" for bound in (self.minimum, self.maximum))
         if self.maximum == math.inf:
-            return f"of at least {self.minimum:g}"
-        return (
-            f"of at most {self.maximum:g}"
-            if self.minimum == -math.inf
-            else f"from {self.minimum:g} to {self.maximum:g}"
-        )
+            return f"of at least {low}"
+        return f"of at most {high}" if self.minimum == -math.inf else f"from {low} to {high}"
 
 
 def expect_options(
@@ -87,6 +84,8 @@ def fits(value: Any, annotation: Any) -> bool:
     if annotation in (None, type(None)):
         return value is None
     if annotation in (bool, int, float, str):
+        if isinstance(value, float) and math.isnan(value):
+            return False
         number = annotation is float and isinstance(value, int) and not isinstance(value, bool)
         return number or (isinstance(value, annotation) and isinstance(value, bool) is (annotation is bool))
     kind = origin or annotation

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable
+from typing import Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.core.grey_pyramid import GreyPyramid
 from fmtorch.core.types import Correspondences, Estimate, Features
+
+PairImages: TypeAlias = tuple[GreyPyramid, GreyPyramid]
 
 
 @runtime_checkable
@@ -61,6 +65,20 @@ class Pruner(Protocol):
     """Correspondences -> the same, fewer of them surviving, or with a prior."""
 
     def __call__(self, c: Correspondences) -> Correspondences: ...
+
+
+@runtime_checkable
+class ImagePruner(Pruner, Protocol):
+    """A pruner that looks at the images, and that refuses to be called without them."""
+
+    def with_images(self, c: Correspondences, images: Callable[[int], PairImages]) -> Correspondences:
+        """images: of pair i of the batch, read when they are asked for."""
+        ...
+
+
+def pruned(pruner: Pruner, c: Correspondences, images: Callable[[int], PairImages]) -> Correspondences:
+    """What a pruner makes of correspondences, with the images where it looks at them."""
+    return pruner.with_images(c, images) if isinstance(pruner, ImagePruner) else pruner(c)
 
 
 @runtime_checkable

@@ -17,20 +17,21 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-console = Console()
+console = Console(markup=False)  # paths and names may hold brackets; styles are given by style=...
+errors = Console(stderr=True, markup=False)
 MISTAKES = (ValueError, OSError, ImportError)  # what a user can put right
 
 
 def progress_bars() -> Progress:
     """Progress bars on the terminal's error stream, as all commands show them; a context manager."""
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    return Progress(*columns, console=Console(stderr=True))
+    return Progress(*columns, console=errors)
 
 
 def reporter(progress: Progress, description: str) -> Callable[[int, int], None]:

@@ -45,7 +45,7 @@ def read_image(source: ImageSource | Path | str, *, orient: bool = False) -> NDA
     """
     if not isinstance(source, ImageSource):
         return _decoded(Path(source), orient)
-    image = _decoded(source.path, orient)
+    image = _decoded(source.path, orient, source.data)
     if source.size is not None and image.shape[:2] != source.size:
         (h, w), (height, width) = image.shape[:2], source.size
         raise ImageError(
@@ -55,10 +55,13 @@ def read_image(source: ImageSource | Path | str, *, orient: bool = False) -> NDA
     return image if source.lens is None else undistorted(image, source.lens)
 
 
-def _decoded(path: Path, orient: bool) -> NDArray[np.uint8]:
-    """The pixels of a file."""
+def _decoded(path: Path, orient: bool, data: bytes | None = None) -> NDArray[np.uint8]:
+    """The pixels of a file, of which `data` are the bytes where they are known."""
     try:
-        data = path.read_bytes()
+        if data is None:
+            if path.exists() and not (path.is_file() or path.is_dir()):  # a pipe waits, a device never ends
+                raise ImageError(f"{path}: no regular file; it must be an image file")
+            data = path.read_bytes()
     except OSError as error:
         raise ImageError(f"{path}: cannot be read ({error.strerror}); it must be an image file") from error
     if not data:

@@ -21,12 +21,14 @@ class ImageSource:
     identity: names it within its data set.
     size: (h, w) that the file must have, where the data set says so: cameras hold for one size alone.
     lens: whose distortion `read_image` takes out; None for an image without.
+    data: the bytes of the file, for a worker that does not see it; None: they are read from `path`.
     """
 
     identity: str
     path: Path
     size: tuple[int, int] | None = None
     lens: Lens | None = None
+    data: bytes | None = dataclasses.field(default=None, repr=False, compare=False)
 
 
 class GivenMatches(NamedTuple):

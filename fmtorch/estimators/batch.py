@@ -60,11 +60,13 @@ class CameraRows(NamedTuple):
 
 
 def estimated(
-    c: Correspondences, seed: int, minimal: int, family: Estimated, solve: Callable[[Pair], Solution], attach: Attach
-) -> Estimate:
+    c: Correspondences, seed: int, minimal: int, family: Estimated, solve: Callable[[Pair], Solution], attach: Attach,
+    calibrated: int | None = None,
+) -> Estimate:  # fmt: skip
     """Estimate the models of a batch of pairs; a pair that cannot be solved is `ok=False` with a reason.
 
     minimal: matches below which a pair is not tried, and inliers below which a model is none. family: of the models.
+    calibrated: the same as minimal for a pair whose focal lengths are exactly known; None: no difference.
     """
     host = c if c.mask.device.type == "cpu" else c.detach().to("cpu")
     b, n = c.mask.shape
@@ -80,7 +82,8 @@ def estimated(
     def estimate(i: int) -> str:
         """Why there is no estimate of a pair; empty where there is one."""
         matches = batch.pair(i)
-        normalized = batch.normalized(matches, i, seed, minimal, family.residual)
+        needed = calibrated if calibrated is not None and batch.calibrated(i) else minimal
+        normalized = batch.normalized(matches, i, seed, needed, family.residual)
         if isinstance(normalized, str):
             return normalized
         pair, slot = normalized
@@ -88,7 +91,7 @@ def estimated(
         draws[i] = solution.draws
         if solution.fit is None or solution.inliers is None:
             return solution.reason
-        if degenerate := degenerate_support(pair, solution.inliers, minimal, rounding):
+        if degenerate := degenerate_support(pair, solution.inliers, needed, rounding):
             return degenerate
         if not family.to_pixels(solution.fit.F, pair, F[i]):
             F[i] = 0
@@ -180,6 +183,11 @@ class Batch(NamedTuple):
             _row(self.x0, i), _row(self.x1, i), np.ascontiguousarray(self.mask[i]), _row(self.prior, i),
             _row(self.noise, i), _row(self.quality, i), self.sizes[i],
         )  # fmt: skip
+
+    def calibrated(self, i: int) -> bool:
+        """Whether image sizes and both focal lengths of a row are exactly known."""
+        calibration = None if self.focal is None else calibration_of(self.focal[i], bool(self.shared[i]))
+        return calibration is not None and calibration.exact and self.sizes.shape[1] > 0
 
     def normalized(
         self, matches: PixelMatches, i: int, seed: int, minimal: int, residual: Residual = SAMPSON

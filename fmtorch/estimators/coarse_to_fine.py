@@ -27,6 +27,12 @@ class CoarseToFine:
         """Whether a prior makes a difference to one of the two."""
         return any(getattr(stage, "uses_prior", False) for stage in (self.coarse, self.fine))
 
+    @property
+    def gradients_reach(self) -> tuple[str, ...]:
+        """Those of the fine estimator."""
+        every = ("x0", "x1", "prior", "noise")
+        return tuple(getattr(self.fine, "gradients_reach", every))
+
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs."""
         coarse = self.coarse(c.detach(), seed)

@@ -31,11 +31,12 @@ from fmtorch.estimators.parts.refinement import LocalOptimization, Refinement
 from fmtorch.estimators.parts.sampling import Sampler
 from fmtorch.estimators.parts.scores import Score
 from fmtorch.estimators.parts.selection import BestOfSearch, BestScore, Selection, Selector
-from fmtorch.estimators.precompiled import WITH_FOCALS
+from fmtorch.estimators.precompiled import OF_HOMOGRAPHIES, WITH_FOCALS
 from fmtorch.estimators.registry import part, thresholds
 from fmtorch.estimators.search import Search
 
 FOCAL_ROUND = 500  # samples of five matches at a time
+CALIBRATED_MATCHES = 6  # that a pair of calibrated cameras needs: five of them have up to ten solutions
 DEFAULT_PRESELECT = Preselect()
 
 
@@ -140,7 +141,14 @@ class HypothesizeAndVerify:
     @property
     def kernels(self) -> tuple[Kernel[..., Any], ...]:
         """Those worth compiling together, before the first pair."""
-        return WITH_FOCALS if self.focal is not None else ()
+        if self.focal is not None:
+            return WITH_FOCALS
+        return OF_HOMOGRAPHIES if self.family.model == "homography" else ()
+
+    @property
+    def gradients_reach(self) -> tuple[str, ...]:
+        """The fields of `Correspondences` that gradients of the estimate reach."""
+        return Attached(self.final, self.family).reached
 
     @property
     def uses_prior(self) -> bool:
@@ -153,7 +161,9 @@ class HypothesizeAndVerify:
         exact = None if self.focal is None else self.focal.options.exact_focals
         if exact is not None and exact.sqrt_prior:
             c = with_sqrt_prior(c)
-        return estimated(c, seed, self.family.size, self.family, self.estimate, Attached(self.final, self.family))
+        size, attached = self.family.size, Attached(self.final, self.family)
+        calibrated = None if self.focal is None else CALIBRATED_MATCHES
+        return estimated(c, seed, size, self.family, self.estimate, attached, calibrated)
 
     def estimate(self, pair: Pair) -> Solution:
         """Search to fit of one pair."""

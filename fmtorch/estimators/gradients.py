@@ -83,6 +83,18 @@ class Attached:
             kind = "optimum"  # of the Sampson error, near that of least squares
         self._attach = own or kinds[kind]
 
+    @property
+    def reached(self) -> tuple[str, ...]:
+        """The fields of `Correspondences` that gradients reach; all of a fit that has its own `attached`."""
+        if hasattr(self.final, "attached"):
+            return ("x0", "x1", "prior", "noise")
+        kind = getattr(self.final, "gradient", "none")
+        if kind == "none":
+            return ()
+        if kind == "least_squares" and not self.final.weighted:
+            return ("x0", "x1")
+        return ("x0", "x1", "noise", *(("prior",) if self.family.fit_scale.by_prior else ()))
+
     def __call__(self, solved: list[Solved], matches: GraphedMatches) -> Float[Tensor, "p m"]:
         """As `Attach`."""
         return self._attach(solved, matches)

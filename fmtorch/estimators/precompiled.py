@@ -1,4 +1,4 @@
-"""Kernels of an estimator with the prior on focal lengths, by what they share, the slowest to compile at both ends."""
+"""Kernels that two processes compile side by side, by what they share, the slowest to compile at both ends."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 from fmtorch.compiling.kernel import Kernel
 from fmtorch.estimators import focal_search, pair, search
-from fmtorch.estimators.families import cameras, cheirality, focal_prior, focals, posterior
+from fmtorch.estimators.families import cameras, cheirality, focal_prior, focals, homography, posterior
 from fmtorch.estimators.parts import (
     inliers,
     preselection,
@@ -19,6 +19,8 @@ from fmtorch.estimators.parts import (
 )
 from fmtorch.geometry import (
     five_point_kernels,
+    four_point_kernels,
+    homography_objective_kernels,
     refine_kernels,
     sampson_objective_kernels,
     seven_point_kernels,
@@ -59,3 +61,16 @@ WITH_FOCALS: tuple[Kernel[..., Any], ...] = (
     refine_kernels.refine,
     posterior.minimise,
 )
+"""Of an estimator of fundamental matrices with the prior on focal lengths."""
+
+OF_HOMOGRAPHIES: tuple[Kernel[..., Any], ...] = (
+    homography_objective_kernels.refine_homographies,
+    homography_objective_kernels.evaluate_homographies,
+    four_point_kernels.four_point,
+    homography.homography_to_pixels,
+    inliers.residuals_squared_homography,
+    refinement.near_homography,
+    scores.score_gains_homography,
+    saturated.score_saturated_homography,
+)
+"""Of an estimator of homographies, beside those that the former has too."""

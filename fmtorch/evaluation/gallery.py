@@ -156,5 +156,6 @@ def shown_pair(pair: ImagePair, runs: Sequence[Run], pipelines: Mapping[str, Pip
             notes += [f"{r.name} {note}"] if note else []
             pictures = drawn(pair, images, stored, outcome, r.name)
         pictures = pictures or from_stored(pair, images, stored, r.name)
-        seen.append(Shown(r.name, float(stored["nsgd"]) if stored["ok"] else None, str(stored["reason"]), pictures))
+        nsgd = float(stored["nsgd"]) if stored["ok"] else None
+        seen.append(Shown(r.name, nsgd, str(stored["reason"]), pictures, stored["configuration"] or ""))
     return ShownPair(pair.identity, seen, notes)

@@ -36,12 +36,19 @@ class Picture:
 
 @dataclasses.dataclass(frozen=True)
 class Shown:
-    """A pair as one run sees it. nsgd: None where it failed, with the reason."""
+    """A pair as one run sees it. nsgd: None where it failed, with the reason. configuration: empty where unknown."""
 
     run: str
     nsgd: float | None
     reason: str = ""
     pictures: Sequence[Picture] = ()
+    configuration: str = ""
+
+    @property
+    def result(self) -> str:
+        """What is said of it."""
+        result = f"failed: {self.reason}" if self.nsgd is None else f"NSGD {self.nsgd:.4f}"
+        return f"{result}, {self.configuration}" if self.configuration not in ("", "general") else result
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,7 +138,8 @@ def _context(section: Section, names: Sequence[str]) -> dict[str, Any]:
     facts = f"{len(section.runs)} runs" if len(section.runs) > 1 else "One run"
     counts = f"{min(pairs):,}" + (f" to {max(pairs):,}" if len(pairs) > 1 else "")
     optional_tables = (
-        tables.merit(summaries), tables.families(summaries), tables.poses(summaries), tables.differences(section.runs),
+        tables.merit(summaries), tables.families(summaries), tables.poses(summaries), tables.focals(summaries),
+        tables.configurations(summaries), tables.differences(section.runs),
     )  # fmt: skip
     return {
         "heading": section.heading,
@@ -154,7 +162,7 @@ def _pair(pair: ShownPair) -> dict[str, Any]:
         "runs": [
             {
                 "name": shown.run,
-                "result": f"failed: {shown.reason}" if shown.nsgd is None else f"NSGD {shown.nsgd:.4f}",
+                "result": shown.result,
                 "good": shown.nsgd is not None and shown.nsgd < THRESHOLD,
                 "pictures": [_encoded(picture) for picture in shown.pictures],
             }

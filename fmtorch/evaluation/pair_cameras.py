@@ -70,16 +70,25 @@ class WithPairCameras:
     model = "fundamental"
 
     def __init__(self, estimator: Estimator, cameras: Mapping[int, PairCameras]) -> None:
-        """cameras: of `cameras_of`, of all pairs that will come."""
-        self._estimator, self._cameras = KnownCameras(estimator), cameras
+        """cameras: of `cameras_of`, of all pairs that will come; or they are added before their pairs come."""
+        self._estimator, self.cameras = KnownCameras(estimator), dict(cameras)
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate F, focal lengths and pose of each pair."""
-        own = [self._cameras[key] for key in c.keys.tolist()]
+        return self._estimator(self.given(c), seed)
+
+    @property
+    def kernels(self) -> Sequence[object]:
+        """Those of the estimator worth compiling together."""
+        return getattr(self._estimator.estimator, "kernels", ())
+
+    def given(self, c: Correspondences) -> Correspondences:
+        """The matches with what is known of their cameras."""
+        own = [self.cameras[key] for key in c.keys.tolist()]
         K0, K1 = (_stacked(K, c.mask.device) for K in ([each.K0 for each in own], [each.K1 for each in own]))
         focal = torch.stack([each.focal for each in own]).to(c.mask.device)
         shared = torch.tensor([each.shared_focal for each in own], device=c.mask.device)
-        return self._estimator(c.derived(K0=K0, K1=K1, focal=focal, shared_focal=shared), seed)
+        return c.derived(K0=K0, K1=K1, focal=focal, shared_focal=shared)
 
 
 def _stacked(K: Sequence[Tensor | None], device: torch.device) -> Tensor | None:

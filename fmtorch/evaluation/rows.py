@@ -10,6 +10,7 @@ from typing import cast
 from torch import Tensor
 
 from fmtorch import metrics
+from fmtorch.evaluation.focals import focal_errors
 from fmtorch.evaluation.outcomes import joined_correspondences, joined_estimates, joined_true
 from fmtorch.evaluation.poses import PairPose, pose_errors
 from fmtorch.pipeline.pipeline import STAGES, Outcome
@@ -65,7 +66,7 @@ def _inlier_rates(outcomes: Sequence[Outcome]) -> tuple[list[float], list[float]
 
 def _row(outcome: Outcome, figures: dict[str, float], pose: PairPose, seconds: float) -> PairRow:
     pair, c, estimate = outcome.pair, outcome.correspondences, outcome.estimate
-    ok = outcome.solved
+    ok, configuration, focals = outcome.solved, outcome.configuration, focal_errors(outcome)
     return PairRow(
         pair=pair.identity, key=pair.key, family=pair.family, scene=pair.scene, ok=ok, reason=outcome.reason,
         corrs=int(estimate.inliers.sum()) if estimate is not None else 0,
@@ -77,4 +78,8 @@ def _row(outcome: Outcome, figures: dict[str, float], pose: PairPose, seconds: f
         significance=float(cast(Tensor, estimate.significance)[0]) if estimate is not None and ok else None,
         related=bool(estimate.related[0]) if estimate is not None else False, **figures,
         rotation_error=pose.rotation, translation_error=pose.translation, pose_reason=pose.reason,
+        configuration=None if configuration is None else configuration.names[0],
+        warning=None if configuration is None else configuration.warnings[0],
+        focal_error0=focals.error[0], focal_error1=focals.error[1],
+        focal_log_ratio0=focals.log_ratio[0], focal_log_ratio1=focals.log_ratio[1],
     )  # fmt: skip

@@ -3,21 +3,35 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
 import torch
 
+from fmtorch.core.calls import Calls
+from fmtorch.core.executors import Execution, Team
+from fmtorch.core.recipes import Here, Recipe, Source
 from fmtorch.data.pairs import ImagePair, ImageSource
-from fmtorch.evaluation.workers import Build, Work, Workers
+from fmtorch.evaluation.pair_cameras import PairCameras
+from fmtorch.evaluation.workers import (
+    Batch,
+    Build,
+    Work,
+    batch_contents,
+    compute_features,
+    divided,
+    evaluate_batch,
+    failed,
+)
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.storage import PairRow
+from fmtorch.storage.exchange.collected import CollectedJournal
 from fmtorch.storage.exchange.journal import Journal
 from fmtorch.storage.features import CachedFeatures
 
 BATCHES_OF_A_WORKER = 4  # at least, where there are pairs enough
+PRELOADED = ("fmtorch.evaluation.workers",)  # by the process that workers are forked of
 
 
 def select(pairs: Sequence[ImagePair], limit: int | None) -> list[ImagePair]:
@@ -40,71 +54,61 @@ def evaluate_pairs(
     *,
     seed: int,
     batch: int,
-    workers: int,
+    execution: Execution,
     store: Callable[[list[PairRow]], None],
     build: Build | None = None,
+    cameras: Mapping[int, PairCameras] | None = None,
     journal: Journal | None = None,
 ) -> Iterator[int]:
     """Run and evaluate the pairs, hand each batch's rows to `store`, and yield how many pairs it held.
 
-    build: makes the same pipeline in another process: workers are then processes, otherwise threads (see `Workers`).
+    execution: by which workers. build: makes the same pipeline in another process, where these are no threads.
+    cameras: what a pipeline that `build` makes is given of the pairs' cameras, see `built_with`.
     journal: keeps keypoints, matches and F for an export.
-    Results do not depend on `batch`, `workers` or `build`. Raises RuntimeError where a process dies.
+    Rows and journal are written here. Results do not depend on `batch` or `execution`. Raises WorkersLost where workers
+    die whatever they do, or a scheduler is gone.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
-    batch = _shared_out(len(pairs), batch, workers)
-    team = Workers(pipeline, max(1, min(workers, -(-len(pairs) // batch))), build)
-    waiting: set[Future[Work]] = set()
+    team = Team(execution, PRELOADED, most=max(1, len(pairs)))
+    batch = _shared_out(len(pairs), batch, team.size)
+    source: Source[Pipeline] = Here(pipeline) if execution.shared or build is None else Recipe(build)
 
-    def kept(future: Future[Work]) -> int:
-        work = future.result()
+    def given(members: Sequence[ImagePair]) -> Batch:
+        own = None if cameras is None or source.shared else {p.key: cameras[p.key] for p in members if p.key in cameras}
+        sent = batch_contents(list(members)) if execution.send_images and not source.shared else list(members)
+        return Batch(sent, seed, own, None if journal is None else CollectedJournal.of(journal), not source.shared)
+
+    def keep(done: Batch, work: Work) -> None:
+        if journal is not None and work.journal is not None:
+            work.journal.write(journal)
         store(work.rows)
         if isinstance(pipeline.extractor, CachedFeatures):
             pipeline.extractor.computed += work.computed
             pipeline.extractor.found += work.found
-        return len(work.rows)
 
+    calls = Calls(team, source, evaluate_batch, keep, lambda done, reason: store(failed(done, reason)), divided)
     try:
         begun = 0
-        if build is None and team.size > 1:
+        if source.shared and team.size > 1 and pairs:
             begun = 1  # alone: where its stages compile kernels, others would wait for them
-            waiting.add(first := team.submit([pairs[0]], seed, journal))
-            _features_ahead(team, pipeline.memory, pairs, first)
-        todo = (list(pairs[i : i + batch]) for i in range(begun, len(pairs), batch))
-        while True:
-            for batch_of_pairs in todo:
-                waiting.add(team.submit(batch_of_pairs, seed, journal))
-                if len(waiting) > workers:
-                    break
-            if not waiting:
-                return
-            finished, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-            for future in finished:
-                yield kept(future)
-    except BrokenProcessPool as error:
-        raise RuntimeError(
-            "a worker process ended before its time, perhaps for want of memory: the same command goes on from here; "
-            "workers=1 or processes=false need less of it"
-        ) from error
-    finally:  # interrupted: what is under way is finished and kept
-        team.close()
-        for future in waiting:
-            if not future.cancelled() and future.exception() is None:
-                kept(future)
+            _features_ahead(team, pipeline, pairs, calls.begin(given(pairs[:1])))
+        for done in calls.each(given(pairs[i : i + batch]) for i in range(begun, len(pairs), batch)):
+            yield len(done.pairs)
+    finally:
         torch.set_num_threads(before)
 
 
-def _features_ahead(team: Workers, memory: int, pairs: Sequence[ImagePair], first: Future[Work]) -> None:
+def _features_ahead(team: Team, pipeline: Pipeline, pairs: Sequence[ImagePair], first: Future[Work]) -> None:
     """While a worker is at the first pair, the others compute features of those that follow, as many as are kept."""
     computing: set[Future[None]] = set()
-    for image in itertools.islice(_images_after_the_first(pairs), memory):
+    for image in itertools.islice(_images_after_the_first(pairs), pipeline.memory):
         while len(computing) >= team.size - 1 and not first.done():
             wait(list[Future[Any]]([first, *computing]), return_when=FIRST_COMPLETED)
             computing = {future for future in computing if not future.done()}
         if first.done():
             return
-        computing.add(team.submit_features(image))
+        computing.add(team.executor.submit(compute_features, pipeline, image))
 
 
 def _images_after_the_first(pairs: Sequence[ImagePair]) -> Iterator[ImageSource]:

@@ -21,6 +21,7 @@ from fmtorch.metrics.recall import FINE_THRESHOLD as FINE_THRESHOLD
 from fmtorch.metrics.recall import THRESHOLD as THRESHOLD
 
 POSE_THRESHOLDS = (5, 10, 20)  # degrees
+FOCAL_THRESHOLDS = (5, 10)  # percent
 PERCENT = 100.0
 Values = NDArray[np.float64]
 
@@ -75,6 +76,30 @@ def pose_figures(rotation: Values, translation: Values) -> dict[str, float | int
         **{f"map_{t}": value for t, value in zip(POSE_THRESHOLDS, means, strict=True)},
         "rotation": float(np.median(rotation[known])), "translation": float(np.median(translation[known])),
     }  # fmt: skip
+
+
+def focal_figures(errors: Values, log_ratios: Values, ok: NDArray[np.bool_]) -> dict[str, float | int | None] | None:
+    """Accuracy of estimated focal lengths, of pairs (n, 2) by image; None where none was estimated.
+
+    errors: relative, infinite where a focal length is not determined; NaN where none was to be estimated. log_ratios:
+    log(f / f_true), NaN where there is none. ok: (n,), the others are misses.
+
+    - images: how many focal lengths were to be estimated, those of failed pairs with them.
+    - error: their median relative error, None where that is infinite; ratio: median f / f_true of those determined.
+    - within_5, within_10: shares with a relative error of at most 5 and 10 %.
+    """
+    asked = ~np.isnan(errors)
+    if not asked.any():
+        return None
+    failed = np.broadcast_to(~ok[:, None], errors.shape)
+    values = np.where(failed, np.inf, errors)[asked | failed]
+    median, ratios = float(np.median(values)), log_ratios[~np.isnan(log_ratios)]
+    return {
+        "images": len(values),
+        "error": median if np.isfinite(median) else None,
+        "ratio": float(np.exp(np.median(ratios))) if len(ratios) else None,
+        **{f"within_{p}": float((values <= p / PERCENT).mean()) for p in FOCAL_THRESHOLDS},
+    }
 
 
 def interval(values: Values, scenes: Sequence[str], scale: float = 1.0, share: bool = False) -> Interval | None:

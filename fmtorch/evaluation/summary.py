@@ -12,8 +12,9 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from fmtorch.core.estimate import CONFIGURATIONS
 from fmtorch.evaluation.intervals import share_interval
-from fmtorch.evaluation.statistics import MERITS, THRESHOLD, pose_figures, recalled, scene_names
+from fmtorch.evaluation.statistics import MERITS, THRESHOLD, focal_figures, pose_figures, recalled, scene_names
 from fmtorch.storage import PAIR_SCHEMA
 
 ALL = "all"
@@ -41,6 +42,8 @@ def summarize(table: pa.Table) -> dict[str, Group]:
     - failures, failure_share, reasons: the commonest reasons and how often; reasons that differ in numbers alone are
       one, with the range of these.
     - pose: of the pairs whose cameras are known, see `pose_figures`; None where there are none.
+    - configurations: how many pairs are in each of `CONFIGURATIONS`; None where none is known.
+    - focals: of the focal lengths that were estimated, see `focal_figures`; None where there are none.
     - seconds: median per pair for each stage, and ``total``.
     """
     families = table["family"].to_pylist()
@@ -72,6 +75,11 @@ def _group(table: pa.Table) -> Group:
         group[name] = _mean(_column(table, name)[ok])
 
     group["pose"] = pose_figures(_column(table, "rotation_error"), _column(table, "translation_error"))
+    kinds = Counter(kind for kind in table["configuration"].to_pylist() if kind is not None)
+    group["configurations"] = {name: kinds[name] for name in CONFIGURATIONS} if kinds else None
+    columns = ("focal_error0", "focal_error1"), ("focal_log_ratio0", "focal_log_ratio1")
+    errors, ratios = (np.stack([_column(table, name) for name in names], 1) for names in columns)
+    group["focals"] = focal_figures(errors, ratios, ok)
     failures = int((~ok).sum())
     group |= {
         "failures": failures, "failure_share": failures / len(ok) if len(ok) else None,

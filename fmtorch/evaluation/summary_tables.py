@@ -7,8 +7,9 @@ from collections.abc import Callable, Mapping
 from rich import box
 from rich.table import Table
 
+from fmtorch.core.estimate import CONFIGURATIONS
 from fmtorch.evaluation.bootstrap import LEVEL
-from fmtorch.evaluation.statistics import FINE_THRESHOLD, POSE_THRESHOLDS, THRESHOLD
+from fmtorch.evaluation.statistics import FINE_THRESHOLD, FOCAL_THRESHOLDS, POSE_THRESHOLDS, THRESHOLD
 from fmtorch.evaluation.summary import ALL, STAGES, Group
 
 RECALL = "%Recall [interval]"  # the column that has an interval
@@ -26,6 +27,20 @@ def pose_table(summary: Mapping[str, Group]) -> Table | None:
     columns = {heading: column for heading, column in POSE_COLUMNS.items() if "mAP" not in heading}
     rows = _pose_rows(summary)
     return _shown("Relative pose", POSE_CAPTION, columns, rows) if rows else None
+
+
+def further_tables(summary: Mapping[str, Group]) -> list[Table]:
+    """Focal lengths where some were estimated, and configurations where a pair is not general, for a terminal."""
+    return [_shown(heading, note, columns, rows) for heading, note, columns, rows in _further(summary)]
+
+
+def _further(summary: Mapping[str, Group]) -> list[tuple[str, str, Columns, list[tuple[str, Group]]]]:
+    focals = [(name, group["focals"]) for name, group in _rows(summary) if group["focals"] is not None]
+    kinds = [(name, group["configurations"]) for name, group in _rows(summary) if group["configurations"] is not None]
+    tables = [("Focal lengths", FOCAL_CAPTION, FOCAL_COLUMNS, focals)] if focals else []
+    if any(count for _, group in kinds for name, count in group.items() if name != "general"):
+        tables.append(("Configurations", CONFIGURATION_CAPTION, CONFIGURATION_COLUMNS, kinds))
+    return tables
 
 
 def _shown(title: str, caption: str, columns: Columns, rows: list[tuple[str, Group]]) -> Table:
@@ -57,6 +72,9 @@ def summary_markdown(summary: Mapping[str, Group], title: str) -> str:
     if poses := _pose_rows(summary):
         head = [["Relative pose", *list(POSE_COLUMNS)[1:]], ["---", *["---:"] * (len(POSE_COLUMNS) - 1)]]
         parts += [_lines([*head, *(_cells(POSE_COLUMNS, name, group) for name, group in poses)]), POSE_CAPTION_BINNED]
+    for heading, note, columns, groups in _further(summary):
+        head = [[heading, *list(columns)[1:]], ["---", *["---:"] * (len(columns) - 1)]]
+        parts += [_lines([*head, *(_cells(columns, name, group) for name, group in groups)]), note]
     parts.append(_lines(stages))
     if failures:
         parts += ["Commonest reasons of failure, with the number of pairs:", "\n".join(failures)]
@@ -152,11 +170,31 @@ POSE_COLUMNS: Columns = {
     "mAA(10°)": _percent("maa_10"),
     **{f"mAP@{t}°": _percent(f"map_{t}") for t in POSE_THRESHOLDS},
     "R error": lambda group: f"{group['rotation']:.2f}°",
-    "t error": lambda group: f"{group['translation']:.2f}°",
+    "t error, folded": lambda group: f"{group['translation']:.2f}°",
 }
 POSE_CAPTION = (
-    "Of the pairs with known cameras, by the larger of the angles of rotation and of translation (up to sign); "
-    "failures count as 180° and 90°. AUC: area under the recall curve; mAA(10°): mean of recall at 1°, ..., 10°; "
-    "R error, t error: medians."
+    "Of the pairs with known cameras, by the larger of the angles of rotation and of translation, which is folded: its "
+    "sign does not count. Failures count as 180° and 90°. AUC: area under the recall curve; mAA(10°): mean of recall "
+    "at 1°, ..., 10°; R error, t error: medians."
 )
 POSE_CAPTION_BINNED = f"{POSE_CAPTION} mAP: mean of recall at 5°, 10°, ..., as in papers before 2020."
+
+FOCAL_COLUMNS: Columns = {
+    "": lambda group: "",
+    "Images": lambda group: str(group["images"]),
+    "error": lambda group: _number(None if group["error"] is None else 100 * group["error"], "{:.1f} %"),
+    "f / true f": lambda group: _number(group["ratio"], "{:.3f}"),
+    **{f"%within {p} %": _percent(f"within_{p}") for p in FOCAL_THRESHOLDS},
+}
+FOCAL_CAPTION = (
+    "Of the estimated focal lengths of known cameras: median relative error, median ratio, and shares within an error; "
+    "those of failed pairs, and those that are not determined, are misses."
+)
+CONFIGURATION_COLUMNS: Columns = {
+    "": lambda group: "",
+    **{name: (lambda group, name=name: str(group[name])) for name in CONFIGURATIONS},  # type: ignore[misc]
+}
+CONFIGURATION_CAPTION = (
+    "Number of pairs by what their matches show. Those of one plane, of a camera that only turns, or of one photograph "
+    "twice do not determine F: recall of such pairs is luck."
+)

@@ -14,7 +14,17 @@ from fmtorch.evaluation.bootstrap import LEVEL, Interval
 from fmtorch.evaluation.intervals import MIN_UNITS, mean_difference, share_difference
 from fmtorch.evaluation.statistics import FINE_THRESHOLD, PERCENT, POSE_THRESHOLDS, THRESHOLD, areas, scene_names
 from fmtorch.evaluation.summary import ALL, STAGES
-from fmtorch.evaluation.summary_tables import MARKDOWN_COLUMNS, POSE_CAPTION_BINNED, POSE_COLUMNS, RECALL
+from fmtorch.evaluation.summary_tables import (
+    CONFIGURATION_CAPTION,
+    CONFIGURATION_COLUMNS,
+    FOCAL_CAPTION,
+    FOCAL_COLUMNS,
+    MARKDOWN_COLUMNS,
+    POSE_CAPTION_BINNED,
+    POSE_COLUMNS,
+    RECALL,
+    Columns,
+)
 
 DASH = "–"
 Summaries = Mapping[str, Mapping[str, Any]]  # of `summarize`, by the runs' names
@@ -86,6 +96,29 @@ def poses(summaries: Summaries) -> Table | None:
         for name in summaries
     }
     return Table("Relative pose", ["run", *columns], rows, POSE_CAPTION_BINNED)
+
+
+def focals(summaries: Summaries) -> Table | None:
+    """Accuracy of estimated focal lengths over all pairs; None where none were estimated."""
+    return _of_field(summaries, "focals", "Focal lengths", FOCAL_COLUMNS, FOCAL_CAPTION)
+
+
+def configurations(summaries: Summaries) -> Table | None:
+    """How many pairs are in which configuration; None where nobody has looked, as in runs of earlier versions."""
+    return _of_field(summaries, "configurations", "Configurations", CONFIGURATION_COLUMNS, CONFIGURATION_CAPTION)
+
+
+def _of_field(summaries: Summaries, field: str, heading: str, columns: Columns, note: str) -> Table | None:
+    """The figures of a field over all pairs, a row a run."""
+    known = {name: summary[ALL][field] for name, summary in summaries.items() if summary[ALL][field] is not None}
+    if not known:
+        return None
+    shown = {name: column for name, column in columns.items() if name}
+    rows = {
+        name: [Cell(column(known[name])) if name in known else Cell(DASH) for column in shown.values()]
+        for name in summaries
+    }
+    return Table(heading, ["run", *shown], rows, note)
 
 
 def families(summaries: Summaries) -> Table | None:

@@ -1,120 +1,123 @@
-"""What works on batches of pairs: threads of this process, or processes of their own.
+"""What a worker does with a batch of pairs: it runs a pipeline and evaluates its outcomes.
 
 Threads share features and networks and start at once, but only one of them issues torch operations at a time: enough
 where detectors, networks and OpenCV do the work. Processes use all cores for estimators too, at some seconds and some
-hundred megabytes each.
+hundred megabytes each. Rows and exports come back to the caller, who alone writes.
 """
 
 from __future__ import annotations
 
 import contextlib
-import multiprocessing
-import multiprocessing.connection
-import os
-import signal
-import threading
-from collections.abc import Callable
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
-from dataclasses import dataclass
+import dataclasses
+from collections.abc import Callable, Mapping
+from pathlib import Path
 
-import cv2
-import torch
-
-from fmtorch.data.pairs import ImagePair, ImageSource
+from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
+from fmtorch.evaluation.pair_cameras import PairCameras, WithPairCameras
 from fmtorch.evaluation.rows import evaluate
+from fmtorch.pipeline.configuration import compile_with
+from fmtorch.pipeline.examination import examined
 from fmtorch.pipeline.exporting import keep_outcomes
-from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.storage import PairRow
-from fmtorch.storage.exchange.journal import Journal
+from fmtorch.storage.exchange.collected import CollectedJournal
 from fmtorch.storage.features import CachedFeatures
 
 Build = Callable[[], Pipeline]
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
+class Batch:
+    """Pairs to evaluate.
+
+    cameras: of their keys, for a pipeline that was built without them. journal: an empty one, where keypoints, matches
+    and F are to be exported. counted: whether the worker counts the images that it computed.
+    """
+
+    pairs: list[ImagePair]
+    seed: int
+    cameras: Mapping[int, PairCameras] | None = None
+    journal: CollectedJournal | None = None
+    counted: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
 class Work:
     """The rows of a batch; computed, found: images whose features a process computed or took from the cache for it."""
 
     rows: list[PairRow]
     computed: int = 0
     found: int = 0
+    journal: CollectedJournal | None = None
 
 
-class Workers:
-    """Evaluate batches of pairs, several at a time. One thread of torch's own each: contended ones collapse.
-
-    build: makes the pipeline anew in each process; it is pickled. None: threads, which share `pipeline`.
-    """
-
-    def __init__(self, pipeline: Pipeline, workers: int, build: Build | None = None) -> None:
-        self.size = workers
-        self.pipeline = None if build else pipeline
-        self.executor: Executor
-        if build is None:
-            self.executor = ThreadPoolExecutor(workers)
-        else:
-            self.executor = ProcessPoolExecutor(
-                workers, multiprocessing.get_context("spawn"), initializer=_begin, initargs=(build,)
-            )
-
-    def submit(self, pairs: list[ImagePair], seed: int, journal: Journal | None = None) -> Future[Work]:
-        """The rows of these pairs, some time. journal: keeps keypoints, matches and F of them too."""
-        if self.pipeline is None:
-            return self.executor.submit(_in_process, pairs, seed, journal)
-        return self.executor.submit(_work, self.pipeline, pairs, seed, journal)
-
-    def submit_features(self, image: ImageSource) -> Future[None]:
-        """Have a thread compute an image's features, for the pipeline to keep; its pairs will tell what that raises."""
-        assert self.pipeline is not None, "processes share no features"
-        return self.executor.submit(_keep_features, self.pipeline, image)
-
-    def close(self) -> None:
-        """Wait for what is under way; what has not begun is dropped."""
-        self.executor.shutdown(wait=True, cancel_futures=True)
+def evaluate_batch(pipeline: Pipeline, batch: Batch) -> Work:
+    """The rows of a batch, and what is to be exported of it."""
+    cache = pipeline.extractor if batch.counted and isinstance(pipeline.extractor, CachedFeatures) else None
+    computed, found = (cache.computed, cache.found) if cache else (0, 0)
+    if batch.cameras is not None:
+        assert isinstance(pipeline.estimator, WithPairCameras)
+        pipeline.estimator.cameras |= batch.cameras
+    compile_with([*pipeline.pruners.values(), pipeline.estimator])
+    knowledge = pipeline.estimator.given if isinstance(pipeline.estimator, WithPairCameras) else None
+    outcomes = examined(pipeline, pipeline.run(batch.pairs, batch.seed), batch.seed, knowledge)
+    if batch.journal is not None:
+        keep_outcomes(batch.journal, pipeline, outcomes)
+    rows = evaluate(outcomes, batch.seed)
+    if batch.cameras is not None and isinstance(pipeline.estimator, WithPairCameras):
+        for key in batch.cameras:
+            pipeline.estimator.cameras.pop(key, None)
+    counts = (cache.computed - computed, cache.found - found) if cache else (0, 0)
+    return Work(rows, *counts, batch.journal)
 
 
-def _work(pipeline: Pipeline, pairs: list[ImagePair], seed: int, journal: Journal | None) -> Work:
-    outcomes = pipeline.run(pairs, seed)
-    if journal is not None:
-        keep_outcomes(journal, pipeline, outcomes)
-    return Work(evaluate(outcomes, seed))
+def divided(batch: Batch) -> list[Batch]:
+    """The pairs of a batch in batches of their own."""
+    return [dataclasses.replace(batch, pairs=[pair]) for pair in batch.pairs]
 
 
-def _keep_features(pipeline: Pipeline, image: ImageSource) -> None:
+def failed(batch: Batch, reason: str) -> list[PairRow]:
+    """The rows of pairs that no worker lives to evaluate."""
+    return evaluate([Outcome(pair, reason=reason) for pair in batch.pairs], batch.seed)
+
+
+def compute_features(pipeline: Pipeline, image: ImageSource) -> None:
+    """Have an image's features computed for the pipeline to keep; its pairs will tell what that raises."""
     with contextlib.suppress(Exception):
         pipeline.features(image)
 
 
-def end_with_parent() -> None:
-    """Have this process end when the one that started it does, however that does: a worker would wait forever."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def wait() -> None:
-        multiprocessing.connection.wait([parent.sentinel])
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
-
-
-_mine: Pipeline | None = None  # of a process that works for another
+def with_contents(pair: ImagePair) -> ImagePair:
+    """The pair with its images as bytes, or its given matches read; what cannot be read the worker will tell."""
+    if pair.problem is not None:
+        return pair
+    with contextlib.suppress(Exception):
+        if pair.matches is not None:
+            return dataclasses.replace(pair, matches=_Read(pair.matches()))
+        images = (dataclasses.replace(image, data=image.path.read_bytes()) for image in (pair.image0, pair.image1))
+        return dataclasses.replace(pair, image0=next(images), image1=next(images))
+    return pair
 
 
-def _begin(build: Build) -> None:
-    """The start of a process: an interrupt is for the one that asked, which waits for what is under way."""
-    global _mine
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-    _mine = build()
+@dataclasses.dataclass(frozen=True)
+class _Read:
+    """Given matches that are read already."""
+
+    matches: GivenMatches
+
+    def __call__(self) -> GivenMatches:
+        return self.matches
 
 
-def _in_process(pairs: list[ImagePair], seed: int, journal: Journal | None) -> Work:
-    assert _mine is not None
-    extractor = _mine.extractor
-    if not isinstance(extractor, CachedFeatures):
-        return _work(_mine, pairs, seed, journal)
-    computed, cached = extractor.computed, extractor.found
-    rows = _work(_mine, pairs, seed, journal).rows
-    return Work(rows, extractor.computed - computed, extractor.found - cached)
+def batch_contents(pairs: list[ImagePair]) -> list[ImagePair]:
+    """`with_contents` of each pair; an image that several show is read, and sent, once."""
+    held: dict[Path, bytes | None] = {}
+    result = []
+    for pair in pairs:
+        own = with_contents(pair)
+        images = [
+            image if image.data is None else dataclasses.replace(image, data=held.setdefault(image.path, image.data))
+            for image in (own.image0, own.image1)
+        ]
+        result.append(dataclasses.replace(own, image0=images[0], image1=images[1]))
+    return result

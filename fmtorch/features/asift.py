@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.core.options import Within
 from fmtorch.core.types import Features
 from fmtorch.features.sift import SIFT, as_grey, strongest
 
@@ -30,7 +32,7 @@ class ASIFT(SIFT):
     max_features: the strongest kept over all views. The other options are those of `SIFT` in each view.
     """
 
-    max_features: int = 30000
+    max_features: Annotated[int, Within(1)] = 30000
     tilts: int = 6
 
     def __call__(self, image: NDArray[np.uint8]) -> Features:

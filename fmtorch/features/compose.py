@@ -5,8 +5,9 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
+from fmtorch.core.options import Within
 from fmtorch.features.affine_shape import NetworkShape
 from fmtorch.features.hessian import HessianDetector
 from fmtorch.features.local_feature import Descriptor, Detector, FrameStep, LocalFeature, NetworkDescriptor
@@ -26,7 +27,7 @@ def local_feature(
     descriptor: Choice,
     shape: Choice | None = None,
     orientation: Choice | None = None,
-    max_features: int = 8000,
+    max_features: Annotated[int, Within(1)] = 8000,
     precision: str = "fp32",
     threads: int = 1,
     device: str = "cpu",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -11,6 +12,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.core.options import Within
 from fmtorch.features.extrema import Peaks, refined_maxima
 from fmtorch.features.filters import Filters, OpenCVFilters, TorchFilters
 from fmtorch.features.frames import upright_frames
@@ -33,7 +35,7 @@ class HessianDetector:
     ``sigma 2^(1 / (2 levels))``. border: a keypoint closer to the image's border than `border` sigma is dropped.
     """
 
-    max_features: int = 2048
+    max_features: Annotated[int, Within(1)] = 2048
     threshold: float = 1e-4
     levels: int = 3
     sigma: float = 1.6

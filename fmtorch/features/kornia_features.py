@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import kornia
 import numpy as np
@@ -11,6 +11,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from fmtorch.core.options import Within
 from fmtorch.core.pretrained import pretrained
 from fmtorch.core.types import Features
 from fmtorch.features.sift import strongest
@@ -71,7 +72,7 @@ class DISK(_NetworkFeatures):
     def __init__(
         self,
         weights: str = "depth",
-        max_features: int = 2048,
+        max_features: Annotated[int, Within(1)] = 2048,
         window: int = 5,
         score_threshold: float = 0.0,
         device: str = "auto",
@@ -106,7 +107,7 @@ class ALIKED(_NetworkFeatures):
     def __init__(
         self,
         weights: str = "aliked-n16",
-        max_features: int = 2048,
+        max_features: Annotated[int, Within(1)] = 2048,
         score_threshold: float = 0.2,
         radius: int = 2,
         device: str = "auto",

@@ -80,6 +80,10 @@ class PatchNetwork:
             raise NetworkFileError(f"{self.path} does not exist: {_hint(self.path)}")
         return {"file": self.path, "batch": self.batch}
 
+    def open_file(self, device: torch.device) -> None:
+        """Open the file now. Raises NetworkFileError where it cannot be used."""
+        _session(self.path, self.threads)
+
     @property
     def outputs(self) -> int:
         """D, the length of an output; opens the file."""

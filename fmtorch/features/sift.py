@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import Annotated
 
 import cv2
 import kornia
@@ -14,6 +15,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.core.options import Within
 from fmtorch.core.types import Features
 from fmtorch.features.frames import FRAME_SIGMAS
 
@@ -30,7 +32,7 @@ class SIFT:
     root: RootSIFT, the square root of the L1-normalised descriptor (Arandjelovic and Zisserman, CVPR 2012).
     """
 
-    max_features: int = 8000
+    max_features: Annotated[int, Within(1)] = 8000
     contrast_threshold: float = 0.04
     edge_threshold: float = 10.0
     sigma: float = 1.6

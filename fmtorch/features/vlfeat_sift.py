@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import math
 from types import ModuleType
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from fmtorch.core.options import Within
 from fmtorch.core.types import Features
 from fmtorch.features.frames import FRAME_SIGMAS
 from fmtorch.features.sift import as_grey, root_sift
@@ -33,7 +34,7 @@ class VLFeatSIFT:
     root: RootSIFT instead.
     """
 
-    max_features: int = 20000
+    max_features: Annotated[int, Within(1)] = 20000
     first_octave: int = 0
     peak_threshold: float = 0.0
     edge_threshold: float = 10.0

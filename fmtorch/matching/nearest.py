@@ -1,4 +1,8 @@
-"""Exhaustive two-nearest-neighbour matching in row blocks, exact and reproducible to the bit."""
+"""Exhaustive two-nearest-neighbour matching in row blocks, exact and reproducible to the bit.
+
+On a CPU, kernels compute the exact distances of the few that may be neighbours by their 8-bit products (`eight_bit`);
+elsewhere, and where those tell too few apart, all distances are computed. The result is the same.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +13,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from fmtorch.compiling.batches import kernels_serve
 from fmtorch.core.threads import one_thread
 from fmtorch.geometry.arithmetic import sqrt, stable_sum
+from fmtorch.matching import eight_bit
 
 _GROUP = 32  # columns whose minimum is taken together; a group is searched only where it can hold a neighbour
 _FLOAT32_NORM = 2.0**11  # integer vectors no longer than this have squared distances up to 2^24: exact in float32
+_ROUNDING = 1e-9  # relative, of a float64 norm; a generous bound
 _FLOAT64_NORM = 2.0**25  # likewise 2^52 in float64
 
 
@@ -85,7 +92,7 @@ def _nearest_neighbors(
 
 def _finite(flat: Tensor, mask: Tensor | None) -> Tensor:
     """The mask of the descriptors that are finite."""
-    finite = torch.isfinite(flat).all(-1)
+    finite = flat.abs().amax(-1) < math.inf if flat.shape[-1] else torch.isfinite(flat).all(-1)
     return finite if mask is None else finite & mask.reshape(finite.shape)
 
 
@@ -102,7 +109,7 @@ def _match_one_pair(d0: Tensor, d1: Tensor, mask0: Tensor, mask1: Tensor, chunk:
     if len(slots0) == 0 or len(slots1) == 0:
         return result
     rows, columns, unit = _integers(d0[slots0], d1[slots1])
-    nearest, reverse = _two_nearest(rows, columns, chunk)
+    nearest, reverse = _compiled(rows, columns) or _two_nearest(rows, columns, chunk)
     result.nearest[slots0] = slots1[nearest.column]
     result.distance[slots0] = (sqrt(nearest.squared.double()) * unit).float()
     result.second[slots0] = (sqrt(nearest.second_squared.double()) * unit).float()
@@ -110,15 +117,30 @@ def _match_one_pair(d0: Tensor, d1: Tensor, mask0: Tensor, mask1: Tensor, chunk:
     return result
 
 
+def _compiled(rows: Tensor, columns: Tensor) -> tuple[_Nearest, Tensor] | None:
+    """`_two_nearest` by kernels, None where they do not serve."""
+    found = eight_bit.two_nearest(rows, columns) if kernels_serve(rows, columns) else None
+    if found is None:
+        return None
+    tensors = (torch.from_numpy(value) for value in (found.nearest, found.squared, found.second_squared))
+    return _Nearest(*tensors), torch.from_numpy(found.reverse)
+
+
 def _integers(d0: Tensor, d1: Tensor) -> tuple[Tensor, Tensor, float]:
     """Both sets as integer-valued vectors in a type in which their squared distances are exact, and their unit."""
-    longest = max(float(sqrt(stable_sum(d.double().square())).max()) for d in (d0, d1))
+    longest = max(_longest(d0), _longest(d1))
     whole = bool((d0 == d0.round()).all() and (d1 == d1.round()).all())
     if whole and longest <= _FLOAT32_NORM:
         return d0.float(), d1.float(), 1.0
     exponent = math.frexp(_FLOAT64_NORM / longest)[1] - 1  # a power of two, so that scaling is exact
     scale = 2.0 ** min(exponent, 1000)
     return (d0.double() * scale).round(), (d1.double() * scale).round(), 1.0 / scale
+
+
+def _longest(d: Tensor) -> float:
+    """The largest norm, to the bit; exact arithmetic is left to those that are the largest up to rounding."""
+    norms = torch.linalg.vector_norm(d, dim=-1, dtype=torch.float64)
+    return float(sqrt(stable_sum(d[norms >= norms.max() * (1 - _ROUNDING)].double().square())).max())
 
 
 class _Nearest(NamedTuple):

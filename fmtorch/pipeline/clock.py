@@ -16,8 +16,13 @@ class Clock:
 
     def __call__(self, step: str, seconds: float | None = None) -> None:
         """The time since the last call was spent on `step`, which counts for `seconds` where they are given."""
-        if self._device.type == "cuda":
-            torch.cuda.synchronize(self._device)
+        synchronise(self._device)
         now = time.perf_counter()
         self.seconds[step] = now - self._last if seconds is None else seconds
         self._last = now
+
+
+def synchronise(device: torch.device) -> None:
+    """Wait for what a GPU is still doing."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fmtorch.core.estimate import CONFIGURATIONS
+from fmtorch.compiling import switch
+from fmtorch.compiling.together import compile_together
+from fmtorch.core.estimate import CONFIGURATIONS, WARNINGS
 from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.geometry.arithmetic import component_sum, sqrt
 from fmtorch.geometry.configuration import (
     GENERAL,
+    IDENTICAL,
     PLANAR,
     ROTATION,
     UNRELATED,
@@ -21,12 +25,14 @@ from fmtorch.geometry.configuration import (
     classified,
     configuration_evidence,
 )
+from fmtorch.geometry.configuration_kernels import weigh
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.homography_pose import PlanePoses, poses_from_homography
-from fmtorch.pipeline.estimation import estimated
+from fmtorch.pipeline.estimation import estimated, estimator_of
 
 FOCAL_DEVIATION = 0.02
 """Of the focal lengths of a calibration, relative: what zoom and focus change between two days."""
+STILL = 0.1  # px of the images as matched: a median motion below it is none
 USUAL_FOCAL, USUAL_DEVIATION = 1.2, 0.4  # of photographs, in longer sides, and of its logarithm (the estimator's prior)
 SAME_POSE = 1e-3  # radians: two poses of a plane that differ less in rotation are one
 OTHER_CAMERA = 0.5  # deviation of the logarithm of the ratio of both focal lengths (likewise)
@@ -49,9 +55,31 @@ class Configuration(NamedTuple):
         return tuple(CONFIGURATIONS[i] for i in self.kind.tolist())
 
     @property
+    def warnings(self) -> tuple[str, ...]:
+        """What each kind leaves open, empty where nothing."""
+        return tuple(WARNINGS[name] for name in self.names)
+
+    @property
+    def flat(self) -> Bool[Tensor, " b"]:
+        """Whether a homography explains all matches: of planes, rotations and copies."""
+        flat = (self.kind == PLANAR) | (self.kind == ROTATION) | (self.kind == IDENTICAL)
+        return self.homography.ok & flat
+
+    def of_pair(self, i: int) -> Configuration:
+        """That of the i-th pair alone."""
+        return Configuration(self.kind[i : i + 1], Evidence(*(v[i : i + 1] for v in self.evidence)), self.homography[i])
+
+    @property
     def determined(self) -> Bool[Tensor, " b"]:
         """Whether the matches determine F: of the general pairs alone."""
         return self.kind == GENERAL
+
+
+def compile_with(stages: Iterable[object]) -> None:
+    """Have the kernels of these stages and of `classify` ready; two processes compile those that are new."""
+    if switch.available():
+        stages = (estimator_of("homography", None, {}), *stages)
+        compile_together([weigh, *(each for stage in stages for each in getattr(stage, "kernels", ()))])
 
 
 def classify(
@@ -99,6 +127,7 @@ def classify(
         raise ValueError(f"estimate is of {len(estimate)} pairs and c of {len(c)}; they must be of the same pairs")
     if not focal_deviation >= 0:
         raise ValueError(f"focal_deviation is {focal_deviation}; it must not be negative")
+    compile_with(())
     matches = c.detach().derived(K0=None, K1=None, focal=None, shared_focal=None)
     H = estimated(matches, "homography", "homography", None, seed, options)
     K0, K1, precision = _cameras(c, focal_deviation)
@@ -156,20 +185,13 @@ def _usual(size: Tensor) -> Tensor:
 def with_configuration(estimate: Estimate, c: Correspondences, seed: int, **options: Any) -> Estimate:
     """The estimate with the fields `configuration_index`, `homography`, `other_R`, `other_t`; c: all its matches."""
     judged = classify(c.detach(), estimate.detach(), seed=seed, **options)
-    H, kind = judged.homography, judged.kind
-    flat = H.ok & ((kind == PLANAR) | (kind == ROTATION))
+    H, kind, flat = judged.homography, judged.kind, judged.flat
     fields = {"configuration_index": kind, "homography": torch.where(flat[:, None, None], H.F, 0)}
     if c.K0 is not None and c.K1 is not None and estimate.R is not None:
         with one_thread(c.mask.device):
             poses = poses_from_homography(H.F, c.K0, c.K1, c.x0, c.x1, H.inliers)
             fields |= _other_pose(estimate.R, poses, flat & (kind == PLANAR))
     return estimate.derived(**fields)
-
-
-def name_and_warning(estimate: Estimate, c: Correspondences, seed: int) -> tuple[str, str]:
-    """The configuration of a single pair, and what that leaves open."""
-    examined = with_configuration(estimate, c, seed)
-    return examined.configuration[0], examined.warning[0]
 
 
 def _other_pose(R: Float[Tensor, "b 3 3"], poses: PlanePoses, flat: Tensor) -> dict[str, Tensor]:
@@ -184,3 +206,12 @@ def _other_pose(R: Float[Tensor, "b 3 3"], poses: PlanePoses, flat: Tensor) -> d
         "other_R": torch.where(valid[:, None, None], poses.R[rows, other], torch.nan).to(R),
         "other_t": torch.where(valid[:, None], t, torch.nan).to(R),
     }
+
+
+def still_warning(c: Correspondences, inliers: Tensor) -> str:
+    """A warning where the inliers, or without any all matches, do not move between the images."""
+    motion = (c.x1 - c.x0)[0].norm(dim=-1)
+    motion = motion[inliers] if inliers.any() else motion
+    if len(motion) == 0 or motion.median() > STILL:
+        return ""
+    return "the images show no motion, as if they were one: infinitely many F agree with all matches"

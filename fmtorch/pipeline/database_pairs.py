@@ -1,26 +1,19 @@
-"""Pairs of a COLMAP database as correspondences, and their estimates as its two-view geometries."""
+"""Pairs of a COLMAP database as correspondences."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from fmtorch.core.types import Correspondences, Estimate, pair_key
-from fmtorch.geometry.configuration import GENERAL, IDENTICAL, PLANAR, ROTATION
+from fmtorch.core.types import Correspondences, pair_key
 from fmtorch.pipeline.camera_arguments import UNKNOWN
-from fmtorch.pipeline.configuration import FOCAL_DEVIATION, classify
 from fmtorch.storage.exchange.database_images import DatabaseImage
-from fmtorch.storage.exchange.two_view import Kind, PairGeometry
 
 Cameras = Literal["stored", "shared", "unknown"]
 """What is taken for known: the cameras of the database, that both images have one focal length, or nothing."""
-KINDS: dict[int, Kind] = {PLANAR: "planar", ROTATION: "panoramic", IDENTICAL: "planar_or_panoramic"}
-MAX_CONFLICT = 3.0  # deviations, of an estimated focal length from that of a camera that counts as calibrated
 
 
 class DatabasePair(NamedTuple):
@@ -34,7 +27,8 @@ class DatabasePair(NamedTuple):
 def as_correspondences(pair: DatabasePair, cameras: Cameras) -> Correspondences:
     """The pair as a batch of one, with what is known of its cameras; of pinholes where these are those stored.
 
-    Raises ValueError where a stored camera is none that there can be.
+    Without image sizes nothing is asked of cameras. Raises ValueError where a stored camera is none that there can be,
+    or where the size of one image alone is known.
     """
     images, stored = (pair.image0, pair.image1), cameras == "stored"
     problem = next((image.problem for image in images if image.problem), "") if stored else ""
@@ -42,24 +36,21 @@ def as_correspondences(pair: DatabasePair, cameras: Cameras) -> Correspondences:
         raise ValueError(problem)
     fields: dict[str, Any] = {}
     for i, image in enumerate(images):
-        index = pair.matches[:, i]
-        points = (image.pinhole if stored else image.points)[index]
-        frames = image.pinhole_frames if stored else image.frames
+        points = (image.pinhole if stored else image.points)[pair.matches[:, i]]
         fields[f"x{i}"] = torch.from_numpy(points)[None]
-        fields[f"size{i}"] = torch.tensor([image.size])
-        if frames is not None:
-            fields[f"lafs{i}"] = torch.from_numpy(np.concatenate([frames[index], points[..., None]], -1))[None]
-        if stored:
+        if image.size is not None:
+            fields[f"size{i}"] = torch.tensor([image.size])
+        if stored and image.K is not None:
             fields[f"K{i}"] = torch.from_numpy(image.K)[None]
-    if "lafs0" not in fields or "lafs1" not in fields:
-        fields = {name: value for name, value in fields.items() if not name.startswith("lafs")}
     mask = torch.isfinite(fields["x0"]).all(-1) & torch.isfinite(fields["x1"]).all(-1)
-    focal = [(1.0, image.deviation) for image in images] if stored else [UNKNOWN, UNKNOWN]
+    if any(image.size is not None for image in images):
+        focal = [(1.0, image.deviation) for image in images] if stored else [UNKNOWN, UNKNOWN]
+        fields["focal"] = torch.tensor([focal], dtype=torch.float64)
+        fields["shared_focal"] = torch.tensor([_shared(*images, cameras)])
+    elif cameras == "shared":
+        raise ValueError("cameras=shared needs the image sizes: size0 and size1, or K0 and K1")
     key = torch.tensor([pair_key(f"{images[0].name} {images[1].name}")])
-    return Correspondences(
-        mask=mask, key=key, focal=torch.tensor([focal], dtype=torch.float64),
-        shared_focal=torch.tensor([_shared(*images, cameras)]), **fields,
-    )  # fmt: skip
+    return Correspondences(mask=mask, key=key, **fields)
 
 
 def _shared(image0: DatabaseImage, image1: DatabaseImage, cameras: Cameras) -> bool:
@@ -67,60 +58,3 @@ def _shared(image0: DatabaseImage, image1: DatabaseImage, cameras: Cameras) -> b
     return cameras == "shared" or (
         cameras == "stored" and image0.camera_id == image1.camera_id and image0.deviation > 0
     )
-
-
-def geometries(
-    pairs: Sequence[DatabasePair], c: Correspondences, estimate: Estimate, seed: int = 0
-) -> list[PairGeometry]:
-    """What the database gets to know of a batch of pairs.
-
-    Of general pairs F, its inliers, E and the pose; of others the homography and its inliers, and the pose where the
-    cameras are known or only turn. A pair is calibrated where both focal lengths are known and the matches agree.
-    """
-    assert c.focal is not None
-    assert estimate.R is not None
-    known = c.focal[..., 1].isfinite().all(1)
-    calibrated = known & estimate.R.isfinite().flatten(1).all(1) & ~_conflicting(c, estimate)
-    configuration = classify(c, estimate, focal_deviation=0, seed=seed)
-    kind, homography, rotation = configuration.kind, configuration.homography, configuration.evidence.R
-    kinds = np.where(kind != GENERAL, kind, torch.where(estimate.related, GENERAL, -1))
-    results = []
-    for i, (pair, what) in enumerate(zip(pairs, kinds.tolist(), strict=True)):
-        n = len(pair.matches)
-        of_lines = what == GENERAL or (what == PLANAR and bool(calibrated[i]))
-        inliers = pair.matches[(estimate if of_lines else homography).inliers[i, :n].numpy()]
-        H = _known(homography.F[i], homography.ok[i])
-        if what == GENERAL:
-            name: Kind = "calibrated" if calibrated[i] else "uncalibrated"
-            results.append(_general(name, inliers, estimate, i, H))
-        elif of_lines:
-            results.append(_general("planar", inliers, estimate, i, H))
-        elif what not in KINDS:
-            results.append(PairGeometry("degenerate", pair.matches[:0]))
-        elif what == ROTATION:
-            results.append(PairGeometry("panoramic", inliers, H=H, R=rotation[i].numpy(), t=np.zeros(3)))
-        else:
-            results.append(PairGeometry(KINDS[what], inliers, H=H))
-    return results
-
-
-def _general(kind: Kind, inliers: NDArray[np.int64], estimate: Estimate, i: int, H: Any) -> PairGeometry:
-    """A geometry with F, and the pose where there is one."""
-    assert estimate.E is not None
-    assert estimate.R is not None
-    assert estimate.t is not None
-    E, R, t = (_known(value[i], value[i].isfinite().all()) for value in (estimate.E, estimate.R, estimate.t))
-    return PairGeometry(kind, inliers, estimate.F[i].double().numpy(), E, H, R, t)
-
-
-def _known(value: Tensor, known: Tensor) -> NDArray[np.float64] | None:
-    return value.double().numpy() if known else None
-
-
-def _conflicting(c: Correspondences, estimate: Estimate) -> Tensor:
-    """Whether an estimated focal length contradicts the known one of K: (b,)."""
-    if c.K0 is None or c.K1 is None or c.focal is None or estimate.focals is None:
-        return torch.zeros(len(c), dtype=torch.bool)
-    stored = torch.stack([torch.sqrt(K[:, 0, 0] * K[:, 1, 1]) for K in (c.K0, c.K1)], 1)
-    apart = (estimate.focals / stored).log().abs()
-    return (apart > MAX_CONFLICT * c.focal[..., 1].clamp_min(FOCAL_DEVIATION)).any(1)

@@ -52,6 +52,7 @@ def find_essential(
     Returns:
         An `Estimate` with R (B, 3, 3), t (B, 3) of unit length with the inliers in front of both cameras, E (B, 3, 3),
         focals (B, 2) and F. NaN where there is no pose. Gradients of all reach the points, prior, noise, K0 and K1.
+        Six matches are enough where K0 and K1 are exact, otherwise seven.
 
     Raises:
         ValueError: as `find_fundamental`; for a K0 or K1 of a single pair that is singular, not in pixels, or whose

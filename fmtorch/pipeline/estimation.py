@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from fmtorch import presets
 from fmtorch.compiling import switch
@@ -33,7 +34,8 @@ def estimated(
     """
     expect_values(c)
     seed = int(number("seed", seed, whole=True))
-    estimator = _estimator(name, config_dir, options)
+    estimator = estimator_of(name, config_dir, options)
+    _expect_gradients(c, estimator, name)
     if (gives := model_of(estimator)) != model:
         raise ValueError(f"estimator={name} gives {gives} matrices; find_{model} needs one that gives {model} matrices")
     return estimated_by(estimator, c, seed, covariance)
@@ -45,6 +47,20 @@ def estimated_by(estimator: Estimator, c: Correspondences, seed: int, covariance
         c = _with_prior(c, estimator)
         return judged(estimator(c, seed), c)
     return KnownCameras(estimator, functools.partial(_with_prior, estimator=estimator), covariance)(c, seed)
+
+
+def _expect_gradients(c: Correspondences, estimator: Estimator, name: str) -> None:
+    """Raise ValueError naming a field that requires a gradient which the estimator does not give."""
+    reached = getattr(estimator, "gradients_reach", None)
+    if reached is None or not (torch.is_grad_enabled() and c.requires_grad):
+        return
+    for field in ("x0", "x1", "prior", "noise"):
+        value = getattr(c, field)
+        if value is not None and value.requires_grad and field not in reached:
+            raise ValueError(
+                f"{field} requires a gradient, and the final fit of estimator={name} passes none to it: "
+                f"give {field}.detach(), or take another (estimator=fmtorch, or the option final=gauss_newton)"
+            )
 
 
 def _with_prior(c: Correspondences, estimator: Estimator) -> Correspondences:
@@ -59,7 +75,7 @@ def _with_prior(c: Correspondences, estimator: Estimator) -> Correspondences:
     return c
 
 
-def _estimator(name: str, config_dir: Path | str | None, options: Mapping[str, Any]) -> Estimator:
+def estimator_of(name: str, config_dir: Path | str | None, options: Mapping[str, Any]) -> Estimator:
     """The estimator of a preset, built but once where its options are plain values and its file is not a user's."""
     plain = _plain(options)
     if config_dir is None:

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.core.types import Correspondences
+from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data.pairs import ImagePair, ImageSource
+from fmtorch.geometry.cameras import cross_matrix
+from fmtorch.geometry.pose import pose_from_fundamental
+from fmtorch.pipeline.configuration import Configuration
+from fmtorch.pipeline.pair_geometries import pair_geometries
+from fmtorch.pipeline.photograph_cameras import PhotographCamera
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.pipeline.two_images import Described, MatchResult
 from fmtorch.storage.exchange.journal import ExportedImage, ExportedPair, Journal, indices
+from fmtorch.storage.exchange.two_view import PairGeometry
+
+EXACT = (1.0, 0.0)  # px, relative deviation; K stands for the pixels
 
 
 def keep_outcomes(journal: Journal, pipeline: Pipeline, outcomes: Sequence[Outcome]) -> None:
@@ -27,7 +35,31 @@ def keep_outcomes(journal: Journal, pipeline: Pipeline, outcomes: Sequence[Outco
         for image, K in ((pair.image0, pair.K0), (pair.image1, pair.K1)):
             _keep_image(journal, pipeline, image, K)
         F = estimate.F[0] if outcome.solved else torch.zeros(3, 3)
-        journal.add_pair(*ends, _pair(journal, ends, c, F, estimate.inliers[0], bool(estimate.related[0])))
+        names = journal.name(ends[0]), journal.name(ends[1])
+        points = journal.image(ends[0]).points, journal.image(ends[1]).points
+        kept = _pair(names, points, c, F, estimate.inliers[0], bool(estimate.related[0]))
+        if outcome.configuration is not None:
+            kept = dataclasses.replace(kept, geometry=_geometry(kept.matches, c, estimate, outcome.configuration))
+        journal.add_pair(*ends, kept)
+
+
+def _geometry(
+    matches: NDArray[np.int32], c: Correspondences, estimate: Estimate, configuration: Configuration
+) -> PairGeometry:
+    """The geometry of one pair for COLMAP, whose surviving matches are these keypoints, (m, 2).
+
+    Where the estimator was given nothing of cameras that are known, and F is determined, the pose is that of F.
+    """
+    if not c.asks_for_cameras and c.K0 is not None and c.K1 is not None and bool(configuration.determined[0]):
+        ends = estimate.F.double(), c.K0.double(), c.K1.double(), c.x0.double(), c.x1.double()
+        pose = pose_from_fundamental(*ends, estimate.inliers & c.mask)
+        E = cross_matrix(pose.t) @ pose.R
+        estimate = estimate.derived(E=E, R=pose.R, t=pose.t)
+        c = c.derived(focal=torch.tensor([[EXACT, EXACT]], dtype=torch.float64, device=c.mask.device))
+    index = np.zeros((c.mask.shape[1], 2), np.int32)
+    index[c.mask[0].cpu().numpy()] = matches
+    (geometry,) = pair_geometries([index], c, estimate, configuration)
+    return geometry
 
 
 def exportable(pair: ImagePair) -> bool:
@@ -35,17 +67,29 @@ def exportable(pair: ImagePair) -> bool:
     return pair.problem is None and pair.matches is None
 
 
-def keep_described(journal: Journal, image: Path, described: Described) -> None:
-    """Add a photograph's keypoints to a journal."""
+def exported_image(name: str, described: Described, camera: PhotographCamera | None = None) -> ExportedImage:
+    """A photograph's keypoints, with what is known of its camera, as a journal keeps them."""
     scores = described.features.scores.detach().cpu().float().numpy()
-    points = described.points.detach().cpu().float().numpy()
-    journal.add_image(image, ExportedImage(journal.name(image), points, scores, described.size))
+    lens = None if camera is None else camera.lens
+    focal = None if camera is None or camera.focal is None else camera.focal[0]
+    bends = lens is not None and lens.bends
+    K = None if lens is None or bends else lens.K
+    return ExportedImage(name, _points(described), scores, described.size, K, lens if bends else None, focal)
 
 
-def keep_match(journal: Journal, ends: tuple[Path, Path], result: MatchResult) -> None:
-    """Add what was found of two photographs, whose keypoints the journal has."""
-    pair = _pair(journal, ends, result.correspondences, result.F, result.inliers, result.related)
-    journal.add_pair(*ends, pair)
+def exported_match(names: tuple[str, str], described: tuple[Described, Described], result: MatchResult) -> ExportedPair:
+    """What was found of two photographs, as a journal keeps it."""
+    points = _points(described[0]), _points(described[1])
+    pair = _pair(names, points, result.correspondences, result.F, result.inliers, result.related)
+    if (geometry := result.geometry) is not None:
+        geometry = geometry._replace(inliers=pair.matches[geometry.inliers[:, 0]])
+    return dataclasses.replace(
+        pair, geometry=geometry, significance=result.significance, configuration=result.configuration
+    )
+
+
+def _points(described: Described) -> NDArray[np.float32]:
+    return described.points.detach().cpu().float().numpy()
 
 
 def _keep_image(journal: Journal, pipeline: Pipeline, image: ImageSource, K: NDArray[np.float64] | None) -> None:
@@ -58,8 +102,9 @@ def _keep_image(journal: Journal, pipeline: Pipeline, image: ImageSource, K: NDA
 
 
 def _pair(
-    journal: Journal, ends: tuple[Path, Path], c: Correspondences, F: Tensor, inliers: Tensor, related: bool
-) -> ExportedPair:
+    names: tuple[str, str], points: tuple[NDArray[np.float32], NDArray[np.float32]],
+    c: Correspondences, F: Tensor, inliers: Tensor, related: bool,
+) -> ExportedPair:  # fmt: skip
     """The surviving matches of one pair as indices of the images' points.
 
     Scores are one less the matcher's figure, a ratio, and 1 where there is none. Raises ValueError for matches that are
@@ -67,13 +112,11 @@ def _pair(
     """
     mask = c.mask[0].cpu()
     index = [
-        indices(journal.image(end).points, x[0].detach().cpu().float()[mask].numpy())
-        for end, x in zip(ends, (c.x0, c.x1), strict=True)
+        indices(those, x[0].detach().cpu().float()[mask].numpy()) for those, x in zip(points, (c.x0, c.x1), strict=True)
     ]
     quality = torch.zeros(len(mask)) if c.quality is None else c.quality[0].detach().cpu().float()
     scores = (1 - quality[mask]).nan_to_num(0.0).clamp(0.0, 1.0)
-    name0, name1 = (journal.name(end) for end in ends)
     return ExportedPair(
-        name0, name1, np.stack(index, -1).astype(np.int32), scores.numpy(), inliers.cpu()[mask].numpy(),
+        *names, np.stack(index, -1).astype(np.int32), scores.numpy(), inliers.cpu()[mask].numpy(),
         F.detach().cpu().double().numpy(), related,
     )  # fmt: skip

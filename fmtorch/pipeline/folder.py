@@ -1,177 +1,214 @@
-"""A folder of images: which pairs of them to match, and the work that can be resumed."""
+"""A folder of images: the work on its images and pairs, by any executor, that can be resumed."""
 
 from __future__ import annotations
 
-import itertools
-import json
-from collections import OrderedDict
+import contextlib
+import dataclasses
+from collections import OrderedDict, deque
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
-from fmtorch.core.files import replacing
 from fmtorch.core.threads import available, one_thread
 from fmtorch.data.images import read_image
-from fmtorch.pipeline.exporting import keep_described, keep_match
+from fmtorch.data.pairs import ImageSource
+from fmtorch.data.text_files import DataError
+from fmtorch.pipeline.exporting import exported_image, exported_match
+from fmtorch.pipeline.folder_images import Pair, in_blocks
+from fmtorch.pipeline.photograph_cameras import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pipeline.two_images import Described, describe, relate
-from fmtorch.storage.exchange.journal import Journal
-from fmtorch.storage.runs import canonical
+from fmtorch.storage.exchange.journal import ExportedPair, Journal
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
-EXHAUSTIVE = "exhaustive"
 MEMORY = 64  # images whose features are kept for pairs to come
-MAX_THREADS = 8  # that describe images: each holds an image and its scale space
+AHEAD = 4  # pairs a worker that are begun before the first of them has ended
+MAX_WORKERS = 8  # by default: each holds an image and its scale space
 
 
-def images_below(folder: Path) -> list[Path]:
-    """The images of a folder, at any depth, by name. Raises ValueError where there are fewer than two."""
-    if not folder.is_dir():
-        raise ValueError(f"images={folder} is no folder")
-    images = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
-    if len(images) < 2:
-        raise ValueError(f"images={folder} holds {len(images)} images ({', '.join(SUFFIXES)}); a pair needs two")
-    return images
+def described_image(pipeline: Pipeline, image: ImageSource, longest_side: int, orient: bool) -> Described:
+    """The features of an image file, by one thread."""
+    with one_thread(pipeline.device):
+        return describe(pipeline, read_image(image, orient=orient), longest_side)
 
 
-def chosen_pairs(folder: Path, images: Sequence[Path], pairs: Path | None) -> list[tuple[Path, Path]]:
-    """All pairs of the images, or those of a file with the names of two images a line, below the folder.
-
-    An empty line and one that begins with # is left out, and a pair that stands there again. Raises ValueError naming
-    file and line for what is no pair.
-    """
-    if pairs is None or str(pairs) == EXHAUSTIVE:
-        return list(itertools.combinations(images, 2))
-    if not pairs.is_file():
-        raise ValueError(f"pairs={pairs}: no such file; it must be {EXHAUSTIVE}, or a file with two names a line")
-    known = {path.relative_to(folder).as_posix(): path for path in images}
-    selected: dict[frozenset[Path], tuple[Path, Path]] = {}
-    for number, line in enumerate(pairs.read_text(encoding="utf-8").splitlines(), start=1):
-        names = line.split()
-        if not names or names[0].startswith("#"):
-            continue
-        where = f"{pairs}, line {number}"
-        if len(names) != 2 or names[0] == names[1]:
-            raise ValueError(f"{where}: {line.strip()!r}; it must be the names of two images")
-        missing = [name for name in names if name not in known]
-        if missing:
-            raise ValueError(f"{where}: no image {missing[0]} in {folder}")
-        pair = known[names[0]], known[names[1]]
-        selected.setdefault(frozenset(pair), pair)
-    if not selected:
-        raise ValueError(f"{pairs} names no pair")
-    return list(selected.values())
+def matched_pair(
+    pipeline: Pipeline, described0: Described, described1: Described, names: tuple[str, str], seed: int,
+    known: Mapping[str, Any],
+) -> ExportedPair:  # fmt: skip
+    """What a journal keeps of two images under these names, by one thread. known: `PhotographCameras.given`."""
+    with one_thread(pipeline.device):
+        result = relate(pipeline, described0, described1, seed, **known)
+    return exported_match(names, (described0, described1), result)
 
 
-def open_folder(output: Path, identity: Mapping[str, Any]) -> Path:
-    """The folder for what is found of pairs, in `output`; the identity is kept beside it.
+@dataclasses.dataclass(eq=False)
+class _Begun:
+    """A pair under way: its images' features, and what is found of it, once they are there."""
 
-    Raises ValueError where the output holds results of another identity.
-    """
-    output.mkdir(parents=True, exist_ok=True)
-    file = output / "export.json"
-    wanted = json.loads(canonical(identity))
-    if file.exists():
-        try:
-            stored = json.loads(file.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise ValueError(f"{file} is not valid JSON ({error}); delete {output} and run again") from error
-        if stored != wanted:
-            differing = [key for key in {**stored, **wanted} if stored.get(key) != wanted.get(key)]
-            raise ValueError(
-                f"{output} holds matches of other settings ({', '.join(sorted(differing))} differ); "
-                "choose another output, or delete the folder"
-            )
-    else:
-        with replacing(file) as temporary:
-            temporary.write_text(json.dumps(wanted, indent=2) + "\n", encoding="utf-8")
-    return output / "export"
+    pair: Pair
+    ends: tuple[Future[Described], Future[Described]]
+    match: Future[ExportedPair] | None = None
+
+    @property
+    def described(self) -> bool:
+        return all(end.done() for end in self.ends)
+
+    @property
+    def failed(self) -> bool:
+        return any(end.done() and end.exception() is not None for end in self.ends)
+
+    @property
+    def under_way(self) -> list[Future[Any]]:
+        futures: list[Future[Any]] = [*self.ends] if self.match is None else [self.match]
+        return [future for future in futures if not future.done()]
+
+
+def _failed(error: Exception) -> Future[Any]:
+    future: Future[Any] = Future()
+    future.set_exception(error)
+    return future
 
 
 class FolderMatches:
-    """Matches pairs of images one after another, into a journal; what it has already is taken from there.
+    """Matches pairs of images into a journal, which this process alone writes; what that has already is taken.
+
+    executor: a `concurrent.futures.Executor` that does the work, not closed at the end; None: threads. workers: its
+    size; None: one a core, one for a GPU. cameras: of the images.
 
     done, taken, related: pairs matched now, taken from the journal, and of either those that show one scene. troubles:
     what went wrong with images or pairs, which are tried again the next time.
     """
 
-    def __init__(self, pipeline: Pipeline, journal: Journal, longest_side: int, orient: bool, seed: int) -> None:
-        self.pipeline, self.journal = pipeline, journal
+    def __init__(
+        self, pipeline: Pipeline, journal: Journal, longest_side: int, orient: bool, seed: int, *,
+        executor: Executor | None = None, workers: int | None = None, cameras: PhotographCameras | None = None,
+    ) -> None:  # fmt: skip
+        self.pipeline, self.journal, self.cameras = pipeline, journal, cameras or PhotographCameras()
         self.longest_side, self.orient, self.seed = longest_side, orient, seed
+        self.executor = executor
+        usual = min(available(), MAX_WORKERS) if pipeline.device.type == "cpu" else 1
+        self.workers = usual if workers is None else workers
         self.done = self.taken = self.related = 0
         self.troubles: list[str] = []
-        self._described: OrderedDict[Path, Described | None] = OrderedDict()
-        self._begun: dict[Path, Future[Described]] = {}
+        self._described: OrderedDict[Path, Future[Described]] = OrderedDict()
+        self._kept: set[Path] = set()
 
-    def each(self, pairs: Sequence[tuple[Path, Path]]) -> Iterator[None]:
-        """Match the pairs, and yield after each; on a CPU images are described ahead, as many at a time as threads."""
-        threads = min(available(), MAX_THREADS) if self.pipeline.device.type == "cpu" else 1
-        if threads == 1:
-            for pair in pairs:
-                self.match(*pair)
-                yield
-            return
-        ahead = self._images_ahead(pairs)
-        with ThreadPoolExecutor(threads) as pool:
+    def images(self, images: Sequence[Path]) -> Iterator[Described | None]:
+        """The features of images, in their order; None of one that cannot be read, which is said once."""
+        with self._running() as executor:
+            ahead: deque[tuple[Path, Future[Described]]] = deque()
+            todo = iter(images)
+            while True:
+                for image in todo:
+                    ahead.append((image, self._image(executor, image)))
+                    if len(ahead) > AHEAD * self.workers:
+                        break
+                if not ahead:
+                    return
+                yield self._finished(*ahead.popleft())
+
+    def each(self, pairs: Sequence[Pair]) -> Iterator[None]:
+        """Match the pairs, and yield after each; they are kept, and troubles told, in an order that is always the same.
+
+        Raises BrokenExecutor where the executor's workers have died.
+        """
+        todo = iter(in_blocks(pairs, MEMORY // 2))
+        begun: deque[_Begun] = deque()
+        with self._running() as executor:
             try:
-                for pair in pairs:
-                    for image in itertools.islice(ahead, threads + 1 - len(self._begun)):
-                        self._begun[image] = pool.submit(self._computed_alone, image)
-                    self.match(*pair)
-                    yield
+                while True:
+                    for pair in todo:
+                        if self.journal.has_pair(*pair):
+                            self.taken += 1
+                            self.related += self.journal.pair(*pair).related
+                            yield
+                            continue
+                        begun.append(_Begun(pair, (self._image(executor, pair[0]), self._image(executor, pair[1]))))
+                        if len(begun) >= AHEAD * self.workers:
+                            break
+                    if not begun:
+                        return
+                    self._advance(executor, begun)
+                    if begun[0].failed or (begun[0].match is not None and begun[0].match.done()):
+                        self._keep(begun.popleft())
+                        yield
             finally:
-                pool.shutdown(wait=True, cancel_futures=True)
+                for each in begun:
+                    for future in each.under_way:
+                        future.cancel()
 
-    def match(self, image0: Path, image1: Path) -> None:
-        """Match one pair."""
-        if self.journal.has_pair(image0, image1):
-            self.taken += 1
-        else:
-            ends = self._describe(image0), self._describe(image1)
-            if ends[0] is None or ends[1] is None:
-                return
+    @contextlib.contextmanager
+    def _running(self) -> Iterator[Executor]:
+        if self.executor is not None:
+            yield self.executor
+            return
+        with ThreadPoolExecutor(self.workers) as threads:
             try:
-                result = relate(self.pipeline, ends[0], ends[1], self.seed)
-                keep_match(self.journal, (image0, image1), result)
-            except Exception as error:  # one pair does not end the work on the others
-                names = f"{self.journal.name(image0)}, {self.journal.name(image1)}"
-                self.troubles.append(f"{names}: {type(error).__name__}: {error}".splitlines()[0])
-                return
-            self.done += 1
-        self.related += self.journal.pair(image0, image1).related
+                yield threads
+            finally:
+                threads.shutdown(wait=True, cancel_futures=True)
 
-    def _describe(self, image: Path) -> Described | None:
-        """An image's features, which the journal then has too; None where it cannot be read, which is said once."""
+    def _advance(self, executor: Executor, begun: deque[_Begun]) -> None:
+        """Wait until something has ended, and have pairs matched whose images are described."""
+        while True:
+            for each in begun:
+                if each.match is None and each.described and not each.failed:
+                    each.match = self._match(executor, each)
+            if begun[0].failed or not begun[0].under_way:
+                return
+            wait({future for each in begun for future in each.under_way}, return_when=FIRST_COMPLETED)
+
+    def _match(self, executor: Executor, begun: _Begun) -> Future[ExportedPair]:
+        names = self.journal.name(begun.pair[0]), self.journal.name(begun.pair[1])
+        ends = begun.ends[0].result(), begun.ends[1].result()
+        try:
+            known = self.cameras.given(begun.pair, [end.size for end in ends])
+        except Exception as error:
+            return _failed(error)
+        return executor.submit(matched_pair, self.pipeline, *ends, names, self.seed, known)
+
+    def _image(self, executor: Executor, image: Path) -> Future[Described]:
+        """An image's features, begun unless they are there."""
         if image not in self._described:
-            begun = self._begun.pop(image, None)
             try:
-                value: Described | None = self._computed(image) if begun is None else begun.result()
-                assert value is not None
-                if not self.journal.has_image(image):
-                    keep_described(self.journal, image, value)
-            except Exception as error:  # nor does one image
-                self.troubles.append(f"{type(error).__name__}: {error}".splitlines()[0])
-                value = None
-            self._described[image] = value
+                arguments = self.pipeline, self.cameras.source(image), self.longest_side, self.orient
+                self._described[image] = executor.submit(described_image, *arguments)
+            except DataError as error:  # no camera
+                self._described[image] = _failed(error)
         self._described.move_to_end(image)
         while len(self._described) > MEMORY:
             self._described.popitem(last=False)
         return self._described[image]
 
-    def _images_ahead(self, pairs: Sequence[tuple[Path, Path]]) -> Iterator[Path]:
-        """The images of pairs that are to be matched, each once, in the order in which they are needed."""
-        seen: set[Path] = set()
-        for pair in pairs:
-            if not self.journal.has_pair(*pair):
-                for image in pair:
-                    if image not in seen:
-                        seen.add(image)
-                        yield image
+    def _finished(self, image: Path, future: Future[Described]) -> Described | None:
+        """An image's features, which the journal then has too; None where it cannot be read, which is said once."""
+        try:
+            described = future.result()
+            if image not in self._kept and not self.journal.has_image(image):
+                camera = self.cameras.of(image, described.size)
+                self.journal.add_image(image, exported_image(self.journal.name(image), described, camera))
+        except BrokenExecutor:
+            raise
+        except Exception as error:  # one image does not end the work on the others
+            if image not in self._kept:
+                self.troubles.append(f"{type(error).__name__}: {error}".splitlines()[0])
+            described = None
+        self._kept.add(image)
+        return described
 
-    def _computed(self, image: Path) -> Described:
-        return describe(self.pipeline, read_image(image, orient=self.orient), self.longest_side)
-
-    def _computed_alone(self, image: Path) -> Described:
-        with one_thread(self.pipeline.device):
-            return self._computed(image)
+    def _keep(self, begun: _Begun) -> None:
+        ends = [self._finished(image, end) for image, end in zip(begun.pair, begun.ends, strict=True)]
+        if begun.match is None or None in ends:
+            return
+        try:
+            pair = begun.match.result()
+            self.journal.add_pair(*begun.pair, pair)
+        except BrokenExecutor:
+            raise
+        except Exception as error:  # nor does one pair
+            names = f"{self.journal.name(begun.pair[0])}, {self.journal.name(begun.pair[1])}"
+            self.troubles.append(f"{names}: {type(error).__name__}: {error}".splitlines()[0])
+            return
+        self.done += 1
+        self.related += pair.related

@@ -4,25 +4,35 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import threading
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
 from pathlib import Path
-from typing import Generic, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fmtorch.core.stages import Estimator, FeatureExtractor, Matcher, Pruner, TimedExtractor, model_of
+from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
+from fmtorch.core.stages import (
+    Estimator,
+    FeatureExtractor,
+    ImagePruner,
+    Matcher,
+    PairImages,
+    Pruner,
+    TimedExtractor,
+    model_of,
+    pruned,
+)
 from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Correspondences, Estimate, Features, collate
-from fmtorch.data.images import read_image
+from fmtorch.data.images import read_image, to_grey
 from fmtorch.data.lenses import Lens
 from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
 from fmtorch.geometry.verdict import judged
+from fmtorch.pipeline.clock import synchronise
+from fmtorch.pipeline.configuration import Configuration
+from fmtorch.pipeline.memo import Memo
 
 STAGES = ("features", "matching", "pruning", "estimation")
 
@@ -34,7 +44,8 @@ class Outcome:
     correspondences, estimate: batches of one; None where the pair failed before that stage.
     features: how many each image has. seconds: per stage; a batched stage is shared out evenly, and features count in
     full for each pair that uses them, cached ones with the seconds they took when they were computed.
-    reason: why the pair failed, empty where it did not.
+    reason: why the pair failed, empty where it did not. configuration: of this pair alone, where it was asked for
+    (`fmtorch.pipeline.examination`). images: for pruners that look at them, until these have run.
     """
 
     pair: ImagePair
@@ -43,6 +54,8 @@ class Outcome:
     estimate: Estimate | None = None
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     reason: str = ""
+    configuration: Configuration | None = None
+    images: PairImages | None = None
 
     @property
     def solved(self) -> bool:
@@ -53,7 +66,8 @@ class Outcome:
 class Pipeline:
     """Features, matcher, pruners in order, estimator. Safe to call from several threads.
 
-    memory: how many images' features are kept for pairs to come (about 5 MB an image at 8,000 SIFT features).
+    memory: how many images' features are kept for pairs to come (about 5 MB an image at 8,000 SIFT features), and their
+    grey levels where a pruner looks at them.
     families: by family, pruners that its pairs get in place of those of the same names.
     """
 
@@ -74,11 +88,28 @@ class Pipeline:
         self.families = dict(families or {})
         self.memory = memory
         self.device = torch.device(device)
-        self._memo: _Memo[tuple[Path, Lens | None], tuple[Features, float]] = _Memo(memory)
+        self._memo: Memo[tuple[Path, Lens | None], tuple[Features, float]] = Memo(memory)
+        self._pyramids: Memo[tuple[Path, Lens | None], GreyPyramid] = Memo(memory)
+        every = [self.pruners, *self.families.values()]
+        self.looks_at_images = any(isinstance(pruner, ImagePruner) for some in every for pruner in some.values())
 
     def features(self, image: ImageSource) -> tuple[Features, float]:
         """The features of an image and the seconds they took, kept for the next pair that shows the image."""
-        return self._memo.get((image.path, image.lens), lambda: self.extract(read_image(image)))
+        return self._memo.get((image.path, image.lens), lambda: self.extract(self._pixels(image)))
+
+    def images(self, pair: ImagePair) -> PairImages:
+        """The grey levels of a pair's images, read where they are not kept since the features were computed."""
+        return self._pyramid(pair.image0), self._pyramid(pair.image1)
+
+    def _pyramid(self, image: ImageSource) -> GreyPyramid:
+        return self._pyramids.get((image.path, image.lens), lambda: grey_pyramid(to_grey(read_image(image))))
+
+    def _pixels(self, image: ImageSource) -> NDArray[np.uint8]:
+        """An image's pixels for its features, whose grey levels are kept where a pruner will look at them."""
+        pixels = read_image(image)
+        if self.looks_at_images:
+            self._pyramids.get((image.path, image.lens), lambda: grey_pyramid(to_grey(pixels)))
+        return pixels
 
     def extract(self, image: NDArray[np.uint8]) -> tuple[Features, float]:
         """The features of pixels on the pipeline's device, and the seconds that computing them takes or took."""
@@ -87,7 +118,7 @@ class Pipeline:
             return features.to(self.device), seconds
         start = time.perf_counter()
         features = self.extractor(image).to(self.device)
-        _synchronise(self.device)
+        synchronise(self.device)
         return features, time.perf_counter() - start
 
     def match(self, pairs: Sequence[ImagePair]) -> list[Outcome]:
@@ -113,7 +144,7 @@ class Pipeline:
                 results = function([outcomes[i] for i in matched]) if matched else []
             except Exception:  # whose fault it is shows pair by pair
                 results = [_alone(stage, function, outcomes[i]) for i in matched]
-        _synchronise(self.device)
+        synchronise(self.device)
         share = (time.perf_counter() - start) / max(len(matched), 1)
         result = list(outcomes)
         for i, outcome in zip(matched, results, strict=True):
@@ -140,7 +171,8 @@ class Pipeline:
         except Exception as error:
             return Outcome(pair, counts, seconds=seconds, reason=_describe("matching", error))
         seconds["matching"] = time.perf_counter() - start
-        return Outcome(pair, counts, self._told(pair, c), None, seconds)
+        images = self.images(pair) if self.looks_at_images else None
+        return Outcome(pair, counts, self._told(pair, c), None, seconds, images=images)
 
     def _given(self, pair: ImagePair, matches: Callable[[], GivenMatches]) -> Outcome:
         """The matches that come with a pair, in place of the first two stages."""
@@ -167,11 +199,16 @@ class Pipeline:
         for family in [None, *sorted(others)]:  # None: all that have no pruners of their own
             own = [i for i, o in enumerate(outcomes) if (o.pair.family if o.pair.family in others else None) == family]
             if own:
-                c = _collated([outcomes[i] for i in own])
+                some = [outcomes[i] for i in own]
+                c = _collated(some)
+
+                def images(i: int, some: list[Outcome] = some) -> PairImages:
+                    return some[i].images or self.images(some[i].pair)
+
                 for pruner in self.pruners_of(family or "").values():
-                    c = pruner(c).compact()
+                    c = pruned(pruner, c, images).compact()
                 for place, i in enumerate(own):
-                    result[i] = dataclasses.replace(outcomes[i], correspondences=c[place])
+                    result[i] = dataclasses.replace(outcomes[i], correspondences=c[place], images=None)
         return result
 
     def _estimate(self, outcomes: list[Outcome], seed: int) -> list[Outcome]:
@@ -205,43 +242,8 @@ def _alone(stage: str, function: Callable[[list[Outcome]], list[Outcome]], outco
     try:
         return function([outcome])[0]
     except Exception as error:
-        return dataclasses.replace(outcome, correspondences=None, reason=_describe(stage, error))
+        return dataclasses.replace(outcome, correspondences=None, images=None, reason=_describe(stage, error))
 
 
 def _describe(stage: str, error: Exception) -> str:
     return f"{stage}: {type(error).__name__}: {error}".splitlines()[0]
-
-
-def _synchronise(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-
-
-Key = TypeVar("Key")
-Value = TypeVar("Value")
-
-
-class _Memo(Generic[Key, Value]):
-    """Keeps the most recently used results; threads that ask for the same one share one computation."""
-
-    def __init__(self, capacity: int) -> None:
-        self._capacity = capacity
-        self._futures: OrderedDict[Key, Future[Value]] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def get(self, key: Key, compute: Callable[[], Value]) -> Value:
-        """The value of `key`, computed if it is not there; an exception is kept and raised again."""
-        with self._lock:
-            future = self._futures.get(key)
-            mine = future is None
-            if future is None:
-                future = self._futures[key] = Future()
-            self._futures.move_to_end(key)
-            while len(self._futures) > self._capacity:
-                self._futures.popitem(last=False)
-        if mine:
-            try:
-                future.set_result(compute())
-            except BaseException as error:
-                future.set_exception(error)
-        return future.result()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -12,11 +13,16 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.core.types import Correspondences
 from fmtorch.data.images import read_image
+from fmtorch.data.lenses import Lens
+from fmtorch.data.undistort_points import undistorted_frames, undistorted_points
 from fmtorch.geometry.epipolar import unit_frobenius
 from fmtorch.geometry.square_pixels import calibration_problems
+from fmtorch.storage.exchange.two_view import PairGeometry
 
 Image = NDArray[np.uint8]
+Array = NDArray[np.float64]
 
 
 def given_image(image: Path | str | Image, name: str) -> Image:
@@ -81,6 +87,66 @@ def _reduction(s: Tensor) -> Tensor:
     """The map (3, 3) from pixels of the original to those of the reduced image."""
     # (0, 0) is the centre of the first pixel, so x_reduced + 1/2 = s (x + 1/2).
     return torch.tensor([[s[0], 0, (s[0] - 1) / 2], [0, s[1], (s[1] - 1) / 2], [0, 0, 1]], dtype=torch.float64)
+
+
+def undistorted_matches(c: Correspondences, lenses: Sequence[Lens | None], scales: Sequence[Tensor]) -> Correspondences:
+    """Matches of two reduced photographs as pinholes of the same K would have them, in pixels of the reduced images.
+
+    lenses: of the originals, None where nothing is distorted. A match that a pinhole does not see is masked.
+    """
+    fields: dict[str, Tensor] = {"mask": c.mask}
+    for i, (lens, scale, x, lafs) in enumerate(zip(lenses, scales, (c.x0, c.x1), (c.lafs0, c.lafs1), strict=True)):
+        if lens is None or not lens.bends:
+            continue
+        points = x[0].detach().cpu().double().numpy()
+        to_pinhole = functools.partial(_reduced_pinhole, lens, scale.cpu().numpy())
+        there = torch.from_numpy(to_pinhole(points))
+        seen = there.isfinite().all(-1)
+        fields["mask"] = fields["mask"] & seen.to(c.mask.device)
+        fields[f"x{i}"] = torch.where(seen[:, None], there, 0)[None].to(x)
+        if lafs is not None:
+            frames = undistorted_frames(to_pinhole, points, lafs[0, ..., :2].detach().cpu().double().numpy())
+            moved = torch.cat([torch.from_numpy(frames).nan_to_num(0), there.nan_to_num(0)[..., None]], -1)
+            fields[f"lafs{i}"] = moved[None].to(lafs)
+    return c.replace(**fields)
+
+
+def _reduced_pinhole(lens: Lens, scale: Array, points: Array) -> Array:
+    """Pixels of a reduced photograph (n, 2) in its pinhole's image, reduced likewise."""
+    return (undistorted_points(lens, (points + 0.5) / scale - 0.5) + 0.5) * scale - 0.5
+
+
+def evenly_reduced(
+    c: Correspondences, F: Float[Tensor, "b 3 3"], scales: Sequence[Tensor]
+) -> tuple[Correspondences, Float[Tensor, "b 3 3"], list[Tensor]]:
+    """Matches, F and scales of images reduced alike in x and y, which whole pixels seldom are.
+
+    A crop of a photograph is otherwise stretched beside it by more than its noise, as no copy is.
+    """
+    even = [s.prod().sqrt().expand(2) for s in scales]
+    ratios = [(s / each).to(c.x0.device) for s, each in zip(scales, even, strict=True)]
+    maps = [_reduction(1 / ratio.cpu()).to(F) for ratio in ratios]
+    fields: dict[str, Tensor | None] = {}
+    ends = (c.x0, c.lafs0, c.K0), (c.x1, c.lafs1, c.K1)
+    for i, ((x, lafs, K), ratio, A) in enumerate(zip(ends, ratios, maps, strict=True)):
+        fields[f"x{i}"] = to_original(x.double(), ratio)
+        fields[f"lafs{i}"] = frames_to_original(lafs, ratio.to(x))
+        fields[f"K{i}"] = None if K is None else A.to(K) @ K
+    back0, back1 = (torch.linalg.inv(A) for A in maps)
+    return c.derived(**fields), unit_frobenius(back1.T @ F @ back0), even
+
+
+def geometry_to_original(geometry: PairGeometry, s0: Tensor, s1: Tensor) -> PairGeometry:
+    """The geometry of two reduced images in pixels of the originals."""
+    A0, A1 = (_reduction(s).numpy() for s in (s0.cpu(), s1.cpu()))
+    F, H = geometry.F, geometry.H
+    if F is not None:
+        F = A1.T @ F @ A0
+        F = F / np.linalg.norm(F)
+    if H is not None:
+        H = np.linalg.inv(A1) @ H @ A0
+        H = H / np.linalg.norm(H)
+    return geometry._replace(F=F, H=H)
 
 
 def fundamental_to_original(F: Float[Tensor, "3 3"], s0: Tensor, s1: Tensor) -> Float[Tensor, "3 3"]:

@@ -4,80 +4,45 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import cast
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch import presets
 from fmtorch.core.arguments import Arrays
+from fmtorch.core.stages import PairImages, pruned
 from fmtorch.core.threads import mapped, one_thread
-from fmtorch.core.types import RELATED, Correspondences, Estimate, Features
+from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.data.lenses import Lens
 from fmtorch.geometry.verdict import judged
 from fmtorch.pipeline.camera_arguments import Focal, camera_fields
 from fmtorch.pipeline.clock import Clock
-from fmtorch.pipeline.configuration import name_and_warning
+from fmtorch.pipeline.configuration import classify, compile_with, still_warning
+from fmtorch.pipeline.described import Described as Described
+from fmtorch.pipeline.described import describe as describe
 from fmtorch.pipeline.known_cameras import KnownCameras
+from fmtorch.pipeline.match_result import MatchResult as MatchResult
+from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pipeline.reduced_images import (
     Image,
+    evenly_reduced,
     frames_to_original,
     fundamental_to_original,
+    geometry_to_original,
     given_image,
     reduced_cameras,
-    reduced_image,
     to_original,
+    undistorted_matches,
 )
 
 NOTHING_KNOWN: Mapping[str, Tensor] = {}
-STILL = 0.1  # px of the images as matched: a median motion below it is none
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class MatchResult:
-    """The matches of two photographs and their fundamental matrix, ``x1^T F x0 = 0``, in pixels of the photographs.
-
-    keypoints0, keypoints1: all that were detected, (N0, 2) and (N1, 2).
-    putative: the matcher's matches, a batch of one. kept: which of them the pruners kept, (M,).
-    correspondences: the kept ones, a batch of one. inliers: which of those agree with F, (K,).
-    F: (3, 3) float64 of unit Frobenius norm; zero where there is none, and `reason` then says why.
-    significance: how far the support of F is beyond chance (`fmtorch.geometry.significance`); -inf where there is no F.
-    warning: why F, though found, means little; mostly empty. counts: matches after each step, in order. seconds: of
-    each step, cached features with those they took when they were computed.
-    R (3, 3), t (3,), focals (2,): X1 = R X0 + t with a t of unit length, and focal lengths in pixels of the
-    photographs, where cameras were asked for; NaN where not determined. configuration: then one of `CONFIGURATIONS`.
-    """
-
-    keypoints0: Float[Tensor, "n0 2"]
-    keypoints1: Float[Tensor, "n1 2"]
-    putative: Correspondences
-    kept: Bool[Tensor, " m"]
-    correspondences: Correspondences
-    inliers: Bool[Tensor, " k"]
-    F: Float[Tensor, "3 3"]
-    reason: str = ""
-    warning: str = ""
-    counts: dict[str, int] = dataclasses.field(default_factory=dict)
-    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
-    significance: float = -math.inf
-    R: Float[Tensor, "3 3"] | None = None
-    t: Float[Tensor, " 3"] | None = None
-    focals: Float[Tensor, " 2"] | None = None
-    configuration: str = ""
-
-    @property
-    def related(self) -> bool:
-        """Whether the photographs are taken to show one scene: F was found, and its support is beyond chance."""
-        return self.ok and self.significance >= RELATED
-
-    @property
-    def ok(self) -> bool:
-        """Whether a fundamental matrix was found."""
-        return not self.reason
+NO_CAMERAS: Mapping[str, None] = dict.fromkeys(("K0", "K1", "focal", "shared_focal"))  # of the reduced images
+Lenses = tuple[Lens | None, Lens | None]
 
 
 def match(
@@ -91,6 +56,8 @@ def match(
     K0: Arrays | None = None,
     K1: Arrays | None = None,
     focal: Focal = None,
+    lens0: Lens | None = None,
+    lens1: Lens | None = None,
 ) -> MatchResult:
     """Match two photographs and estimate their fundamental matrix.
 
@@ -102,6 +69,8 @@ def match(
             the results are always in pixels of the originals.
         seed: of sampling.
         K0, K1, focal: what is known of the cameras, in pixels of the photographs, as of `find_fundamental`.
+        lens0, lens1: lenses that distort, whose calibrations stand for K0 and K1. Features are those of the
+            photographs; matches are undistorted before the estimator, and F relates undistorted points.
 
     Returns:
         Matches, F and inliers in pixels of the originals. Photographs that cannot be related are no error: `related` is
@@ -129,49 +98,32 @@ def match(
     elif device is not None and torch.device(device) != pipeline.device:
         raise ValueError(f"device={device}, but the pipeline was built for {pipeline.device}; leave one of them out")
     images = [given_image(image, name) for image, name in ((image0, "image0"), (image1, "image1"))]
+    K0, K1 = (K if lens is None else lens.K for K, lens in ((K0, lens0), (K1, lens1)))
     cameras = camera_fields(K0, K1, focal, sizes_known=True)
     describing = functools.partial(describe, pipeline, longest_side=longest_side)
     at_once = functools.partial(mapped, share=True) if pipeline.device.type == "cpu" else map
     described0, described1 = at_once(describing, images)
-    return relate(pipeline, described0, described1, seed, cameras)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Described:
-    """A photograph's features in pixels of it as it was reduced, the scale of that in x and y, and its size (h, w).
-
-    seconds: that describing it takes or took.
-    """
-
-    features: Features
-    scale: Float[Tensor, " xy"]
-    size: tuple[int, int]
-    seconds: float
-
-    @property
-    def points(self) -> Float[Tensor, "n 2"]:
-        """The keypoints in pixels of the photograph."""
-        return to_original(self.features.keypoints, self.scale.to(self.features.keypoints))
-
-
-def describe(pipeline: Pipeline, image: Image, longest_side: int) -> Described:
-    """The features of a photograph, for `relate`; see `match`."""
-    reduced, scale = reduced_image(image, longest_side)
-    features, seconds = pipeline.extract(reduced)
-    return Described(features, scale, (image.shape[0], image.shape[1]), seconds)
+    return relate(pipeline, described0, described1, seed, cameras, (lens0, lens1))
 
 
 def relate(
     pipeline: Pipeline, described0: Described, described1: Described, seed: int = 0,
-    cameras: Mapping[str, Tensor] = NOTHING_KNOWN,
+    cameras: Mapping[str, Tensor] = NOTHING_KNOWN, lenses: Lenses = (None, None),
 ) -> MatchResult:  # fmt: skip
     """What `match` finds of two photographs that are described already. cameras: of `camera_fields`."""
+    compile_with([*pipeline.pruners.values(), pipeline.estimator])
     clock = Clock(pipeline.device)
     clock("features", described0.seconds + described1.seconds)
     scales = [described0.scale, described1.scale]
     known = reduced_cameras(cameras, scales, [described0.size, described1.size])
     known = {name: value.to(pipeline.device) for name, value in known.items()}
-    result = _relate(pipeline, described0.features, described1.features, seed, clock, known)
+    result = _matched(pipeline, (described0, described1), clock)
+    if not result.reason:
+        c = result.correspondences
+        c = undistorted_matches(c, lenses, scales).replace(**known)
+        result = _estimated(pipeline, result, c, scales, seed, clock)
+    if not any(lens is not None and lens.bends for lens in lenses):
+        result = dataclasses.replace(result, undistorted=None)
     sizes = [torch.tensor([d.size], device=pipeline.device) for d in (described0, described1)]
     return _restored(result, scales, sizes)
 
@@ -182,10 +134,10 @@ def _pipeline(name: str, device: str) -> Pipeline:
     return built
 
 
-def _relate(
-    pipeline: Pipeline, features0: Features, features1: Features, seed: int, clock: Clock, cameras: dict[str, Tensor]
-) -> MatchResult:
-    """Matching, pruning and estimation, in pixels of the images as they were described."""
+def _matched(pipeline: Pipeline, described: Sequence[Described], clock: Clock) -> MatchResult:
+    """Matching and pruning, in pixels of the images as they were described; a reason where there are no keypoints."""
+    features0, features1 = (each.features for each in described)
+    images = cast(PairImages, tuple(each.pyramid for each in described))
     ends = features0.keypoints, features1.keypoints
     nothing = Correspondences(ends[0][None, :0], ends[1][None, :0], features0.valid[None, :0])
     nothing_found = MatchResult(
@@ -201,33 +153,35 @@ def _relate(
     slots = torch.arange(c.mask.shape[1], device=c.mask.device)
     for name, pruner in pipeline.pruners.items():
         with one_thread(pipeline.device):
-            c = pruner(c)
+            c = pruned(pruner, c, lambda _: images)
         slots, c = slots[c.mask[0]], c.compact()
         clock(name)
         counts[name] = len(slots)
     kept = torch.zeros_like(putative.mask[0]).index_fill(0, slots, True)
-    estimator = KnownCameras(pipeline.estimator) if cameras else pipeline.estimator
-    given = c.replace(**cameras)
-    estimate: Estimate = judged(estimator(given, seed).detach(), c)
+    return dataclasses.replace(nothing_found, putative=putative, kept=kept, correspondences=c, counts=counts)
+
+
+def _estimated(
+    pipeline: Pipeline, matched: MatchResult, c: Correspondences, scales: list[Tensor], seed: int, clock: Clock
+) -> MatchResult:
+    """The result with an estimate. c: the matches as pinholes have them, with what is known of the cameras."""
+    estimator = KnownCameras(pipeline.estimator) if c.asks_for_cameras else pipeline.estimator
+    estimate: Estimate = judged(estimator(c, seed).detach(), c)
     clock("estimation")
-    configuration, warning = name_and_warning(estimate, given, seed) if cameras else ("", "")
+    even, F, even_scales = evenly_reduced(c, estimate.F, scales)
+    configuration = classify(even, estimate.derived(F=F), seed=seed)
+    clock("configuration")
+    index = np.arange(c.mask.shape[1]).repeat(2).reshape(-1, 2)
+    (geometry,) = pair_geometries([index], even, estimate.derived(F=F), configuration)
     inliers = estimate.inliers[0]
-    counts["estimation"] = int(inliers.sum())
     R, t, focals = (None if value is None else value[0] for value in (estimate.R, estimate.t, estimate.focals))
-    return MatchResult(
-        *ends, putative, kept, c, inliers, estimate.F[0].to(torch.float64), estimate.reason[0],
-        _still(c, inliers) or warning, counts, clock.seconds, float(cast(Tensor, estimate.significance)[0]),
-        R, t, focals, configuration,
+    return dataclasses.replace(
+        matched, inliers=inliers, F=estimate.F[0].to(torch.float64), reason=estimate.reason[0],
+        warning=still_warning(matched.correspondences, inliers) or configuration.warnings[0],
+        counts={**matched.counts, "estimation": int(inliers.sum())}, seconds=clock.seconds,
+        significance=float(cast(Tensor, estimate.significance)[0]), R=R, t=t, focals=focals,
+        configuration=configuration.names[0], geometry=geometry_to_original(geometry, *even_scales), undistorted=c,
     )  # fmt: skip
-
-
-def _still(c: Correspondences, inliers: Tensor) -> str:
-    """A warning where the inliers, or without any all matches, do not move between the images."""
-    motion = (c.x1 - c.x0)[0].norm(dim=-1)
-    motion = motion[inliers] if inliers.any() else motion
-    if len(motion) == 0 or motion.median() > STILL:
-        return ""
-    return "the images show no motion, as if they were one: infinitely many F agree with all matches"
 
 
 def _restored(result: MatchResult, scales: list[Tensor], sizes: list[Tensor]) -> MatchResult:
@@ -241,10 +195,11 @@ def _restored(result: MatchResult, scales: list[Tensor], sizes: list[Tensor]) ->
             size0=sizes[0], size1=sizes[1],
         )  # fmt: skip
 
+    undistorted = None if result.undistorted is None else matches(result.undistorted).derived(**NO_CAMERAS)
     return dataclasses.replace(
         result,
         keypoints0=to_original(result.keypoints0, s0), keypoints1=to_original(result.keypoints1, s1),
-        putative=matches(result.putative), correspondences=matches(result.correspondences),
+        putative=matches(result.putative), correspondences=matches(result.correspondences), undistorted=undistorted,
         F=fundamental_to_original(result.F, *scales),
         focals=None if result.focals is None else result.focals / torch.stack(scales).prod(1).sqrt().to(result.focals),
     )  # fmt: skip

@@ -1,30 +1,33 @@
-"""Two-view geometries of a COLMAP database, or of hloc's files, whose matches anyone made."""
+"""Two-view geometries of a COLMAP database, of hloc's files, or of matches alone, whoever made them."""
 
 from __future__ import annotations
 
-import shutil
+import dataclasses
+import functools
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, cast, get_args
+from typing import Any, cast, get_args
 
 from fmtorch import presets
 from fmtorch.core.arguments import number
-from fmtorch.core.files import replacing
+from fmtorch.core.executors import Execution
+from fmtorch.core.shards import Shard, shard_of
 from fmtorch.core.stages import Estimator, model_of
 from fmtorch.core.version import __version__
 from fmtorch.pipeline.database_pairs import Cameras
-from fmtorch.pipeline.verification_run import Verification, VerificationRun
+from fmtorch.pipeline.verification_places import Places, log_of, opened, opened_files, parts_of
+from fmtorch.pipeline.verification_run import Estimation, Verification, VerificationRun
 from fmtorch.storage.exchange.colmap import imported
-from fmtorch.storage.exchange.database import (
-    MatchDatabase,
-    copy_database,
-    expect_database,
-    move_database,
-    remove_database,
+from fmtorch.storage.exchange.database import MatchDatabase, expect_database, move_database
+from fmtorch.storage.exchange.geometry_parts import GeometryParts
+
+ONE_THREAD = Execution("threads", 1)  # that calls an estimator, which uses as many as torch may
+
+HLOC_NEEDS = "hloc's files need features=F.h5 matches=M.h5 output=VERIFIED.h5, and no database"
+MATCHES_NEED = (
+    "matches alone need an output: matches=FILE.npz output=VERIFIED.npz, with features=F.h5 where they are hloc's"
 )
-from fmtorch.storage.exchange.hloc_matches import HlocMatches
-from fmtorch.storage.exchange.verification_log import VerificationLog
 
 
 def verify(
@@ -39,6 +42,8 @@ def verify(
     seed: int = 0,
     config_dir: Path | str | None = None,
     report: Callable[[int, int], None] | None = None,
+    execution: Execution | None = None,
+    shard: str | None = None,
     **options: Any,
 ) -> Verification:
     """Estimate the two-view geometry of every pair with matches in a COLMAP database, as its mappers read it.
@@ -50,8 +55,11 @@ def verify(
     Args:
         path: the database, of COLMAP 3 or 4, with keypoints of 2, 4 or 6 columns and cameras of any model with a lens.
         features, matches: hloc's two files in place of a database. They know no cameras; "stored" is "unknown" then.
+            matches alone: an npz or HDF5 file of x0, x1 (n, 2), pixels, and perhaps K0, K1 (3, 3), size0, size1 (h, w),
+            of one pair or of each pair below its name (``a/x0``). Without K and sizes a pair has F and H, but no pose.
         output: a new database to write to instead; it gets this name once it is complete. Of hloc's files a new file of
-            matches, those that are inliers, with the matrices as attributes.
+            matches, those that are inliers, with the matrices as attributes. Of matches alone an npz or HDF5 file of
+            each pair's `configuration`, `inliers` (n,), and F, E, H, R, t as far as it has them.
         cameras: "stored": points are undistorted, focal lengths are exact where the camera was calibrated, known within
             5 % where they have a prior and nothing else is known of the camera (EXIF), and unknown where they are
             COLMAP's guess; images of one camera share theirs. "shared": all images have one unknown focal length in
@@ -61,6 +69,10 @@ def verify(
         seed: of the random numbers.
         config_dir: a folder with presets of your own, as of `find_fundamental`.
         report: called with the pairs done and their number, at the start and after each batch.
+        execution: by which workers, ``fmtorch.core.executors.Execution("processes", 4)`` say; None: threads of the
+            estimator. All that is written this process writes.
+        shard: "2/8" for the second eighth of the pairs. Geometries go to a folder beside the database, whence a call
+            without `shard` merges them and estimates what is missing.
         options: replace values of the preset (``inlier_threshold=1.0``).
 
     Returns:
@@ -83,113 +95,84 @@ def verify(
         >>> result.pairs, result.verified
         (3, 3)
     """
-    built = presets.build("estimator", estimator, config_dir, **options)
+    make = functools.partial(presets.build, "estimator", estimator, config_dir, **options)
     settings = {"estimator": estimator, "options": repr(sorted(options.items()))}
     places = Places(*(None if place is None else Path(place) for place in (path, features, matches, output)))
-    return verify_by(built, settings, places, cameras, force, seed, report)
+    how = How(cameras, force, seed, execution or ONE_THREAD, shard_of(shard))
+    return verify_by(make, settings, places, how, report)
 
 
-class Places(NamedTuple):
-    """Where matches are, in a database or in hloc's two files, and where geometries go."""
+@dataclasses.dataclass(frozen=True)
+class How:
+    """How pairs are verified: what is taken for known of cameras, what is replaced, by whom, and which pairs."""
 
-    database: Path | None
-    features: Path | None
-    matches: Path | None
-    output: Path | None
+    cameras: str = "stored"
+    force: bool = False
+    seed: int = 0
+    execution: Execution = ONE_THREAD
+    shard: Shard | None = None
 
 
 def verify_by(
-    estimator: Estimator, settings: Mapping[str, Any], places: Places, cameras: str, force: bool, seed: int,
+    make: Callable[[], Estimator], settings: Mapping[str, Any], places: Places, how: How,
     report: Callable[[int, int], None] | None,
 ) -> Verification:  # fmt: skip
-    """The same by an estimator that is built; an interrupted run is continued by one of the same `settings`."""
+    """The same by any estimator, which `make` builds; an interrupted run is continued by one of the same `settings`."""
     begin = time.perf_counter()
-    seed = int(number("seed", seed, whole=True))
-    if cameras not in get_args(Cameras):
-        raise ValueError(f"cameras is {cameras!r}; it must be one of {', '.join(get_args(Cameras))}")
-    known: Cameras = cast(Cameras, cameras)
+    seed = int(number("seed", how.seed, whole=True))
+    if how.cameras not in get_args(Cameras):
+        raise ValueError(f"cameras is {how.cameras!r}; it must be one of {', '.join(get_args(Cameras))}")
+    estimator = make()
     if (gives := model_of(estimator)) != "fundamental":
         raise ValueError(f"estimator gives {gives} matrices; verify needs one that gives fundamental matrices")
-    settings = {**settings, "version": __version__, "cameras": cameras, "seed": seed, "force": force}
+    settings = {**settings, "version": __version__, "cameras": how.cameras, "seed": seed, "force": how.force}
     path, features, matches, output = places
+    known = cast(Cameras, how.cameras)
+    if how.execution.shared:
+        make = functools.partial(_same, estimator)
     if features is not None or matches is not None:
-        if path is not None or features is None or matches is None or output is None:
-            raise ValueError("hloc's files need features=F.h5 matches=M.h5 output=VERIFIED.h5, and no database")
-        store = _opened_hloc(features, matches, output, settings, force)
-        with store:
-            run = VerificationRun(store, "unknown" if known == "stored" else known, seed, estimator)
-            run.each_batch(report)
-            store.finish(output)
-        _log_of(output).unlink(missing_ok=True)
-        return run.result(output, time.perf_counter() - begin)
+        if path is not None or matches is None or output is None:
+            raise ValueError(HLOC_NEEDS if features is not None or path is not None else MATCHES_NEED)
+        known = "unknown" if features is not None and known == "stored" else known
+        with opened_files(features, matches, output, settings, how.force, how.shard) as store:
+            parts = parts_of(output, {**settings, "pairs": len(store.pairs())}, how.shard)
+            run = VerificationRun(store, None, how.shard, parts)
+            run.each_batch(functools.partial(_estimation, make, known, seed), how.execution, report)
+            if how.shard is None:
+                store.finish(output)
+        if how.shard is None:
+            log_of(output).unlink(missing_ok=True)
+        return _finished(run, parts, output, how.shard, begin)
+    estimation = functools.partial(_estimation, make, known, seed)
     if path is None:
         raise ValueError("database is missing; give the database of a COLMAP project: fmtorch verify database.db")
     imported()
     expect_database(path)
-    work, log = _opened(path, output, settings, force)
+    work, log = (path, None) if how.shard else opened(path, output, settings, how.force)
     with MatchDatabase(work) as database:
-        run = VerificationRun(database, known, seed, estimator, log if force else None)
-        run.each_batch(report)
-    if output is not None:
+        parts = parts_of(output or path, {**settings, **database.counts()}, how.shard)
+        run = VerificationRun(database, log if how.force else None, how.shard, parts, again=how.force)
+        run.each_batch(estimation, how.execution, report)
+    if output is not None and how.shard is None:
         move_database(work, output)
     if log is not None:
         log.remove()
-    return run.result(output or path, time.perf_counter() - begin)
+    return _finished(run, parts, output or path, how.shard, begin)
 
 
-def _opened(
-    path: Path, output: Path | None, settings: Mapping[str, Any], force: bool
-) -> tuple[Path, VerificationLog | None]:
-    """The database to write to, and the log of the pairs that are done in it: of a copy, or where all are forced."""
-    if output is None:
-        if not force:
-            return path, None
-        with MatchDatabase(path) as database:
-            settings = {**settings, **database.counts()}
-        return path, VerificationLog(_log_of(path), settings)
-    if output.exists() and output.samefile(path):
-        raise ValueError(f"output={output} is the database itself; leave output out to write into it")
-    _expect_new(output, force)
-    work = _work_of(output)
-    log = VerificationLog(_log_of(output), {**settings, **_states(path)})
-    if not (log.continued and work.exists()):
-        remove_database(work)
-        log.done.clear()
-        with replacing(work) as temporary:
-            copy_database(path, temporary)
-    return work, log
+def _same(estimator: Estimator) -> Estimator:
+    return estimator
 
 
-def _opened_hloc(features: Path, matches: Path, output: Path, settings: Mapping[str, Any], force: bool) -> HlocMatches:
-    """hloc's files, with what an interrupted run of the same settings found of them."""
-    for path in (features, matches):
-        if not path.exists():
-            raise FileNotFoundError(f"there is no file {path}; give hloc's files: features=F.h5 matches=M.h5")
-        if output.exists() and output.samefile(path):
-            raise ValueError(f"output={output} is one of the files that are read; name another")
-    _expect_new(output, force)
-    log = VerificationLog(_log_of(output), {**settings, **_states(features, matches)})
-    if not log.continued:
-        shutil.rmtree(_work_of(output), ignore_errors=True)
-    return HlocMatches(features, matches, _work_of(output))
+def _estimation(make: Callable[[], Estimator], cameras: Cameras, seed: int) -> Estimation:
+    return Estimation(make(), cameras, seed)
 
 
-def _expect_new(output: Path, force: bool) -> None:
-    if output.exists() and not force:
-        raise ValueError(f"output={output} exists; name another file, or replace it with force=true")
-    if not output.parent.is_dir():
-        raise FileNotFoundError(f"there is no folder {output.parent}; output={output} cannot be written")
-
-
-def _work_of(output: Path) -> Path:
-    return output.with_name(f"{output.name}.partial")
-
-
-def _log_of(path: Path) -> Path:
-    return path.with_name(f"{path.name}.verification")
-
-
-def _states(*paths: Path) -> dict[str, Any]:
-    """What tells whether files have changed."""
-    states = [(str(path.absolute()), path.stat().st_size, path.stat().st_mtime_ns) for path in paths]
-    return {"sources": [list(state) for state in states]}
+def _finished(
+    run: VerificationRun, parts: GeometryParts | None, path: Path, shard: Shard | None, begin: float
+) -> Verification:
+    """The summary; the folder of shards goes once it is merged."""
+    if parts is not None and shard is None:
+        parts.remove()
+    where = parts.folder if parts is not None and shard is not None else path
+    return run.result(where, time.perf_counter() - begin)

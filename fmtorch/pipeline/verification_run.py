@@ -6,20 +6,28 @@ import dataclasses
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.core.calls import Calls
+from fmtorch.core.executors import Execution, Team
+from fmtorch.core.recipes import Here, Recipe, Source
+from fmtorch.core.shards import Shard
 from fmtorch.core.stages import Estimator
-from fmtorch.core.types import collate
-from fmtorch.pipeline.database_pairs import Cameras, DatabasePair, as_correspondences, geometries
+from fmtorch.core.types import Correspondences, collate
+from fmtorch.pipeline.configuration import classify
+from fmtorch.pipeline.database_pairs import Cameras, DatabasePair, as_correspondences
 from fmtorch.pipeline.estimation import estimated_by
+from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.storage.exchange.database_images import DatabaseImage
+from fmtorch.storage.exchange.geometry_parts import GeometryParts
 from fmtorch.storage.exchange.two_view import PairGeometry
 from fmtorch.storage.exchange.verification_log import VerificationLog
 
-BATCH = 64  # pairs in memory
+BATCH = 64  # pairs that are read, and written, at a time
+PRELOADED = ("fmtorch.pipeline.verification_run",)  # by the process that workers are forked of
 
 Ids = tuple[Any, Any]
 
@@ -69,30 +77,104 @@ class Verification:
         return sum(count for kind, count in self.configurations.items() if kind != "degenerate")
 
 
+class Estimation(NamedTuple):
+    """What estimates batches of pairs."""
+
+    estimator: Estimator
+    cameras: Cameras
+    seed: int
+
+
+class Batch(NamedTuple):
+    """Pairs that were read; the problems of those that could not be, or not be estimated."""
+
+    ids: list[Ids]
+    pairs: list[DatabasePair]
+    problems: list[tuple[Ids, str]]
+
+
+class Geometries(NamedTuple):
+    """The geometries of a batch's pairs; the problems of the others."""
+
+    ids: list[Ids]
+    geometries: list[PairGeometry]
+    problems: list[tuple[Ids, str]]
+
+
+def estimate_batch(how: Estimation, batch: Batch) -> Geometries:
+    """What a worker does."""
+    ids, pairs, given, problems = [], [], [], list[tuple[Ids, str]]()
+    for own, pair in zip(batch.ids, batch.pairs, strict=True):
+        try:
+            given.append(as_correspondences(pair, how.cameras))
+            ids.append(own)
+            pairs.append(pair)
+        except Exception as error:  # one pair does not end the work on the others
+            problems.append((own, _first_line(error)))
+    if not ids:
+        return Geometries([], [], problems)
+    results: dict[int, PairGeometry] = {}
+    for alike in _alike(given):
+        c = collate([given[i] for i in alike])
+        estimate = estimated_by(how.estimator, c, how.seed)
+        configuration = classify(c, estimate, focal_deviation=0, seed=how.seed)
+        of_these = pair_geometries([pairs[i].matches for i in alike], c, estimate, configuration)
+        results |= zip(alike, of_these, strict=True)
+    return Geometries(ids, [results[i] for i in range(len(ids))], problems)
+
+
+def _alike(given: Sequence[Correspondences]) -> list[list[int]]:
+    """Indices of pairs of which the same is known: in one batch a pair would lose what another lacks."""
+    groups: dict[tuple[bool, ...], list[int]] = {}
+    for i, c in enumerate(given):
+        known = tuple(getattr(c, field.name) is not None for field in dataclasses.fields(c))
+        groups.setdefault(known, []).append(i)
+    return list(groups.values())
+
+
+def divided(batch: Batch) -> list[Batch]:
+    """The pairs of a batch in batches of their own."""
+    return [Batch([ids], [pair], []) for ids, pair in zip(batch.ids, batch.pairs, strict=True)]
+
+
 class VerificationRun:
-    """The pairs of one store of matches. log: of the pairs that count as done, else those with a geometry."""
+    """The pairs of one store of matches.
+
+    log: of the pairs that count as done, else those with a geometry. shard, parts: only these pairs, and where their
+    geometries go instead; without a shard, whence they come. again: whether a shard does pairs that have a geometry.
+    """
 
     def __init__(
-        self, database: MatchStore, cameras: Cameras, seed: int, estimator: Estimator,
-        log: VerificationLog | None = None,
+        self, database: MatchStore, log: VerificationLog | None = None, shard: Shard | None = None,
+        parts: GeometryParts | None = None, again: bool = False,
     ) -> None:  # fmt: skip
-        self.database, self.cameras, self.seed, self.estimator, self.log = database, cameras, seed, estimator, log
-        self.pairs = database.pairs()
+        self.database, self.log, self.again = database, log, again
+        self.parts = parts if shard is not None else None
+        self._merged = set[Ids]()
+        pairs = database.pairs()
+        self.pairs = pairs if shard is None else list(shard.of(pairs))
         self.configurations: Counter[str] = Counter()
         self.problems: list[str] = []
         self.kept = 0
+        if parts is not None and shard is None:
+            self._merge(parts)
 
-    def each_batch(self, report: Callable[[int, int], None] | None) -> None:
-        """Estimate and write the pairs that are not done, batch by batch."""
+    def each_batch(
+        self, make: Callable[[], Estimation], execution: Execution, report: Callable[[int, int], None] | None
+    ) -> None:
+        """Estimate and write the pairs that are not done, batch by batch; `make` is pickled for workers elsewhere."""
         todo = [pair for pair in self.pairs if not self._done(pair)]
         self.kept = len(self.pairs) - len(todo)
         if report is not None and todo:
             report(0, len(todo))
-        for start in range(0, len(todo), BATCH):
-            batch = todo[start : start + BATCH]
-            self._verify(batch)
+        source: Source[Estimation] = Here(make()) if execution.shared else Recipe(make)
+        team = Team(execution, PRELOADED)
+        batches = (self._read(todo[start : start + BATCH]) for start in range(0, len(todo), BATCH))
+        done = 0
+        for batch in Calls(team, source, estimate_batch, self._keep, self._give_up, divided).each(batches):
+            done += len(batch.ids) + len(batch.problems)
             if report is not None:
-                report(start + len(batch), len(todo))
+                report(done, len(todo))
 
     def result(self, path: Path, seconds: float) -> Verification:
         """The summary."""
@@ -100,26 +182,50 @@ class VerificationRun:
         return Verification(path, len(self.pairs), self.kept, counts, tuple(self.problems), seconds)
 
     def _done(self, pair: Ids) -> bool:
+        if pair in self._merged:
+            return True
+        if self.parts is not None:
+            return pair in self.parts.done or (not self.again and self.database.has_geometry(pair))
         return self.database.has_geometry(pair) if self.log is None else pair in self.log.done
 
-    def _verify(self, batch: Sequence[Ids]) -> None:
-        """Estimate a batch of pairs and write what is found."""
-        ids, pairs, given = [], [], []
-        for pair in batch:
+    def _read(self, pairs: Sequence[Ids]) -> Batch:
+        batch = Batch([], [], [])
+        for pair in pairs:
             try:
                 matches = self.database.matches(pair)
-                pairs.append(DatabasePair(self.database.image(pair[0]), self.database.image(pair[1]), matches))
-                given.append(as_correspondences(pairs[-1], self.cameras))
-                ids.append(pair)
+                batch.pairs.append(DatabasePair(self.database.image(pair[0]), self.database.image(pair[1]), matches))
+                batch.ids.append(pair)
             except Exception as error:  # one pair does not end the work on the others
-                del pairs[len(ids) :]
-                names = ", ".join(self.database.name(image) for image in pair)
-                self.problems.append(f"{names}: {error}".splitlines()[0])
+                batch.problems.append((pair, _first_line(error)))
+        return batch
+
+    def _keep(self, batch: Batch, result: Geometries) -> None:
+        self._note([*batch.problems, *result.problems])
+        self._write(result.ids, result.geometries)
+
+    def _write(self, ids: Sequence[Ids], results: Sequence[PairGeometry]) -> None:
         if not ids:
             return
-        c = collate(given)
-        results = geometries(pairs, c, estimated_by(self.estimator, c, self.seed), self.seed)
-        self.database.write(zip(ids, results, strict=True))
-        if self.log is not None:
+        store = self.database if self.parts is None else self.parts
+        store.write(zip(ids, results, strict=True))
+        if self.log is not None and self.parts is None:
             self.log.add(ids)
         self.configurations.update(result.kind for result in results)
+
+    def _merge(self, parts: GeometryParts) -> None:
+        """Write what shards found."""
+        for part in parts.read():
+            new = [(ids, geometry) for ids, geometry in part if not self._done(ids)]
+            self._write([ids for ids, _ in new], [geometry for _, geometry in new])
+            self._merged.update(ids for ids, _ in part)
+
+    def _give_up(self, batch: Batch, reason: str) -> None:
+        self._note([*batch.problems, *((ids, reason) for ids in batch.ids)])
+
+    def _note(self, problems: Iterable[tuple[Ids, str]]) -> None:
+        for pair, problem in problems:
+            self.problems.append(f"{', '.join(self.database.name(image) for image in pair)}: {problem}")
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [""])[0]

@@ -20,7 +20,7 @@ from fmtorch.core.options import nearest
 from fmtorch.core.resources import conf_dir
 from fmtorch.presets import hydra_source
 from fmtorch.presets.files import available
-from fmtorch.presets.objects import expect_buildable, instantiate, plain
+from fmtorch.presets.objects import expect_buildable, instantiate, open_files, plain
 from fmtorch.presets.pruners import build_pruners, expect_pruners, pruner_configs, with_explicit
 from fmtorch.storage.features import cached
 
@@ -77,6 +77,7 @@ def build_pipeline(config: DictConfig, device: torch.device | str = "cpu") -> An
     """The `Pipeline` that features (with cache), matcher, pruner and estimator of a composed config describe."""
     extractor = cached(instantiate(config.features, "features"), config.cache, config.cache_limit)
     pruners, for_families = build_pruners(config)
+    open_files([extractor, pruners, for_families], torch.device(device))  # a damaged one is no failure of each pair
     return hydra.utils.get_object(PIPELINE)(
         extractor,
         instantiate(config.matcher, "matcher"),

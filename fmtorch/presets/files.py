@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import hydra.utils
+import yaml  # type: ignore[import-untyped]
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from fmtorch.core.options import nearest
 from fmtorch.core.resources import conf_dir
@@ -30,11 +33,27 @@ def load(group: str, name: str, config_dir: Path | str | None = None) -> dict[st
     for folder in [*folders, conf_dir()]:
         path = folder / group / f"{name}.yaml"
         if path.is_file():
-            values = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
+            with naming_file(path):
+                values = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
             if not isinstance(values, dict):
                 raise ValueError(f"{path}: a preset is a mapping with a `_target_`, the dotted name of what it builds")
             return {str(key): value for key, value in values.items()}
     raise ValueError(f"no preset {name!r} in conf/{group}; there are: {nearest(name, available(group, config_dir))}")
+
+
+@contextlib.contextmanager
+def naming_file(path: Path | str) -> Iterator[None]:
+    """Raises ValueError that begins with the file's path where reading it as YAML fails."""
+    try:
+        yield
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        line = "" if mark is None else f"line {mark.line + 1}, column {mark.column + 1}: "
+        raise ValueError(f"{path}: {line}{error.problem or error.context}; a preset is a mapping in YAML") from error
+    except OmegaConfBaseException as error:
+        raise ValueError(f"{path}: {str(error).partition(chr(10))[0]}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: no text in UTF-8; a preset is a mapping in YAML") from error
 
 
 @functools.cache

@@ -7,12 +7,14 @@ alone, is read as if it had it.
 
 from __future__ import annotations
 
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 
 from hydra._internal.core_plugins import file_config_source
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult
+
+from fmtorch.presets.files import naming_file
 
 SEVERAL = ("pruner",)  # groups of which several presets are chosen at once
 
@@ -26,7 +28,8 @@ class FileConfigSource(file_config_source.FileConfigSource):
 
     def load_config(self, config_path: str) -> ConfigResult:
         """A file and its header."""
-        result = super().load_config(config_path)
+        with naming_file(Path(self.path) / self._normalize_file_name(config_path)):
+            result = super().load_config(config_path)
         path = PurePosixPath(config_path)
         group = str(path.parent)
         if group in SEVERAL and result.header.get("package") in (None, "_group_", group):

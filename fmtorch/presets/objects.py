@@ -95,3 +95,17 @@ def resolve_device(name: str) -> torch.device:
     if device.type == "cuda" and not torch.cuda.is_available():
         raise ValueError(f"device={name}: this installation of torch sees no CUDA device; use device=cpu")
     return device
+
+
+def open_files(part: Any, device: torch.device) -> None:
+    """Have this project's parts read their learned files now, at any depth, where they have an `open_file`.
+
+    Raises ValueError, naming the file, where one cannot be used.
+    """
+    if hasattr(part, "open_file"):
+        part.open_file(device)
+    elif isinstance(part, Mapping | list | tuple):
+        for each in part.values() if isinstance(part, Mapping) else part:
+            open_files(each, device)
+    elif type(part).__module__.partition(".")[0] == "fmtorch" and not isinstance(part, torch.nn.Module):
+        open_files(list(getattr(part, "__dict__", {}).values()), device)

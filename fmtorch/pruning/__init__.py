@@ -13,12 +13,13 @@ from fmtorch.pruning.mutual import MutualCheck, mutual
 from fmtorch.pruning.one_to_one import OneToOne, one_to_one
 from fmtorch.pruning.position_consistency import PositionConsistency, position_agreement
 from fmtorch.pruning.ratio import RatioTest, ratio_test
+from fmtorch.pruning.refine_matches import RefineMatches
 
 __all__ = [
     "CODE", "GMS", "LPM", "Calibration", "Coherence", "FrameConsistency", "LearnedPruner", "LikelihoodField",
     "Likely", "MatchNoise", "MutualCheck", "OneToOne", "PositionConsistency", "RatioPrior", "RatioTest",
-    "SmoothMotion", "code", "coherence", "frame_agreement", "gms", "gms_support", "lpm", "lpm_cost", "match_noise",
-    "mutual", "one_to_one", "position_agreement", "ratio_test",
+    "RefineMatches", "SmoothMotion", "code", "coherence", "frame_agreement", "gms", "gms_support", "lpm", "lpm_cost",
+    "match_noise", "mutual", "one_to_one", "position_agreement", "ratio_test",
 ]  # fmt: skip
 
 check_exported(__name__)

@@ -83,6 +83,11 @@ class LearnedPruner:
             c = c.replace(prior=p)
         return c if self.threshold is None else c.keep(p >= self.threshold)
 
+    def open_file(self, device: torch.device) -> None:
+        """Read the learned file now. Raises NetworkFileError where it cannot be used."""
+        if self.file is not None:
+            self._prepared(self._runtime(device), device)
+
     @torch.no_grad()
     def probability(self, c: Correspondences) -> Float[Tensor, "b n"]:
         """P(inlier) of each match, in the type of x0; zero where masked."""

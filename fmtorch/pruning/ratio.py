@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Annotated
 
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fmtorch.core.options import Within
 from fmtorch.core.types import Correspondences
 
 
@@ -25,7 +27,7 @@ def ratio_test(
 class RatioTest:
     """`ratio_test` as a stage. Raises ValueError for correspondences without `quality`."""
 
-    threshold: float = 0.8
+    threshold: Annotated[float, Within(0)] = 0.8
 
     def __call__(self, correspondences: Correspondences) -> Correspondences:
         """The same matches, of which only distinctive ones survive."""

@@ -59,7 +59,7 @@ def _show(folder: Path, kind: str, sizes: Sizes) -> None:
         table.add_column(name, justify="left" if name == kind else "right")
     for section, sizes_of_section in sorted(sizes.items()):
         table.add_row(section, str(len(sizes_of_section)), _megabytes(sum(sizes_of_section)))
-    Console().print(table)
+    Console(markup=False).print(table)
 
 
 def _megabytes(size: int) -> str:

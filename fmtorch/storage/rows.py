@@ -36,8 +36,18 @@ PAIR_SCHEMA = pa.schema(
         pa.field("rotation_error", pa.float64()),
         pa.field("translation_error", pa.float64()),
         pa.field("pose_reason", pa.string()),
+        pa.field("configuration", pa.string()),
+        pa.field("warning", pa.string()),
+        pa.field("focal_error0", pa.float64()),
+        pa.field("focal_error1", pa.float64()),
+        pa.field("focal_log_ratio0", pa.float64()),
+        pa.field("focal_log_ratio1", pa.float64()),
     ]
 )
+_POSES = ("rotation_error", "translation_error", "pose_reason")
+_KINDS = ("configuration", "warning", "focal_error0", "focal_error1", "focal_log_ratio0", "focal_log_ratio1")
+MISSING_COLUMNS = {1: (*_POSES, *_KINDS), 2: (*_POSES, *_KINDS), 3: _KINDS}
+"""Of the rows of run folders of these earlier formats."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,6 +84,12 @@ class PairRow:
     rotation_error: float | None = None  # degrees, in [0, 180]; 180 where the pair failed; None without a true pose
     translation_error: float | None = None  # degrees between directions up to sign, in [0, 90]; 90 where it failed
     pose_reason: str | None = None  # why there is no pose error, or no pose; None where there is
+    configuration: str | None = None  # of `CONFIGURATIONS`; None where there are no matches to tell it by
+    warning: str | None = None  # what the configuration leaves open, empty where nothing
+    focal_error0: float | None = None  # |f - f_true| / f_true of image 0 where f is estimated; infinite where it is
+    focal_error1: float | None = None  # not determined; None where it is given exactly, or the true one is unknown
+    focal_log_ratio0: float | None = None  # log(f / f_true); None where it is not determined, too
+    focal_log_ratio1: float | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.nsgd <= 1.0:

@@ -3,18 +3,17 @@
 ::
 
     run.json               the identity; written first, never changed
-    pairs/part-*.parquet   rows of `PAIR_SCHEMA`; any number of processes may add parts; a name ends with a digest
+    pairs/part-*.parquet   rows of `PAIR_SCHEMA`; any number of processes may add parts (`fmtorch.storage.parts`)
     summary.json, summary.md
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import os
-import time
-import uuid
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,13 +23,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fmtorch.core.files import naming, replacing, sync, temporary_name
-from fmtorch.storage.rows import PAIR_SCHEMA, PairRow, to_table
+from fmtorch.storage.parts import PartWriter, part_bytes, part_files
+from fmtorch.storage.rows import MISSING_COLUMNS, PAIR_SCHEMA, PairRow, to_table
 
-FORMAT = 3  # of the folder; to be raised when the schema changes, or what the identity tells
-READABLE = (1, 2, FORMAT)  # formats that `load` reads; 1 lost the order of the pruners, 2 had no errors of poses
-_LACKS = {1: "the order of the pruners and the errors of poses", 2: "the errors of poses"}
-_ADDED = ("rotation_error", "translation_error", "pose_reason")  # columns that formats before the third lack
-_OLDER_SCHEMA = pa.schema([field for field in PAIR_SCHEMA if field.name not in _ADDED])
+FORMAT = 4  # of the folder; to be raised when the schema changes, or what the identity tells
+READABLE = (1, 2, 3, FORMAT)  # formats that `load` reads
+_LACKS = {
+    1: "the order of the pruners, the errors of poses and configurations",
+    2: "the errors of poses and configurations", 3: "configurations",
+}  # fmt: skip
+_LISTINGS = 20  # at most, until parts are those that were listed
 _SHOWN = 5  # differing fields shown in an error
 
 
@@ -128,16 +130,10 @@ class RunFolder:
         return identity_digest(self.config)
 
     def append(self, rows: Sequence[PairRow]) -> None:
-        """Add results, as a new part that is either whole or absent. Safe with several processes."""
+        """Add results, as a new part that is either whole or absent; parts are merged. Safe with several processes."""
         if not rows:
             return
-        sink = pa.BufferOutputStream()
-        pq.write_table(to_table(rows), sink)
-        data = sink.getvalue().to_pybytes()
-        # Parts sort by the time they were written; the second half keeps simultaneous writers apart.
-        name = f"part-{time.time_ns():020d}-{uuid.uuid4().hex[:8]}-{_content_digest(data)}.parquet"
-        with replacing(self.path / "pairs" / name) as temporary:
-            temporary.write_bytes(data)
+        self._writer.add(to_table(rows))
 
     def done(self) -> set[int]:
         """The keys of the pairs that have a result."""
@@ -163,33 +159,43 @@ class RunFolder:
             with replacing(self.path / name) as temporary:
                 temporary.write_text(content, encoding="utf-8")
 
-    def _parts(self, columns: list[str]) -> Iterator[pa.Table]:
+    @functools.cached_property
+    def _writer(self) -> PartWriter:
+        return PartWriter(self.path / "pairs")
+
+    def _parts(self, columns: list[str]) -> list[pa.Table]:
         """The parts in the order they were written; of a part's columns only those asked for."""
-        for file in sorted((self.path / "pairs").glob("part-*.parquet")):
+        parts: list[pa.Table] | None = None
+        for _ in range(_LISTINGS):  # another process may merge parts while they are read
+            files = part_files(self.path / "pairs")
             try:
-                data = file.read_bytes()
-                digest = file.stem.split("-")[3:]  # those of earlier versions tell none
-                if digest and digest != [_content_digest(data)]:
-                    raise pa.ArrowInvalid("it is not what was written there")
-                with pq.ParquetFile(pa.BufferReader(data)) as parquet:
-                    older = self.format < FORMAT and parquet.schema_arrow.equals(_OLDER_SCHEMA)
-                    if not older and not parquet.schema_arrow.equals(PAIR_SCHEMA):
-                        raise pa.ArrowInvalid("its columns are not those of this version")
-                    part = parquet.read(columns=[name for name in columns if not older or name not in _ADDED])
-                for name in _ADDED:
-                    if older and name in columns:
-                        field = PAIR_SCHEMA.field(name)
-                        part = part.append_column(field, pa.nulls(len(part), field.type))
-                yield part
-            except (pa.ArrowException, OSError) as error:
-                raise RunFolderError(
-                    f"{file} cannot be read ({error}); delete it and start the run again, which computes its pairs anew"
-                ) from error
+                parts = [self._part(file, columns) for file in files]
+            except FileNotFoundError:
+                continue
+            if part_files(self.path / "pairs") == files:
+                return parts
+        if parts is None:
+            raise RunFolderError(f"{self.path}: its parts cannot be read while others merge them; try again")
+        return parts
 
-
-def _content_digest(data: bytes) -> str:
-    """Hex digest (blake2b, 64 bits) of a part, which its name ends with."""
-    return hashlib.blake2b(data, digest_size=8).hexdigest()
+    def _part(self, file: Path, columns: list[str]) -> pa.Table:
+        missing = MISSING_COLUMNS.get(self.format, ())
+        earlier = pa.schema([field for field in PAIR_SCHEMA if field.name not in missing])
+        try:
+            with pq.ParquetFile(part_bytes(file)) as parquet:
+                older = self.format < FORMAT and parquet.schema_arrow.equals(earlier)
+                if not older and not parquet.schema_arrow.equals(PAIR_SCHEMA):
+                    raise pa.ArrowInvalid("its columns are not those of this version")
+                part = parquet.read(columns=[name for name in columns if not older or name not in missing])
+            for field in (PAIR_SCHEMA.field(name) for name in missing if older and name in columns):
+                part = part.append_column(field, pa.nulls(len(part), field.type))
+            return part
+        except FileNotFoundError:
+            raise
+        except (pa.ArrowException, OSError) as error:
+            raise RunFolderError(
+                f"{file} cannot be read ({error}); delete it and start the run again, which computes its pairs anew"
+            ) from error
 
 
 def _claim(file: Path, config: dict[str, Any]) -> None:

@@ -86,7 +86,7 @@ def _kept(folder: Path | None, name: str, make: Callable[[], list[Case]]) -> lis
         plain = [({k: v for k, v in vars(c.matches).items() if v is not None}, *c[1:]) for c in make()]
         with replacing(path) as temporary:
             torch.save(plain, temporary)
-    return [Case(Correspondences(**fields), *rest) for fields, *rest in torch.load(path, weights_only=False)]
+    return [Case(Correspondences(**fields), *rest) for fields, *rest in torch.load(path, weights_only=True)]
 
 
 def real(arguments: argparse.Namespace) -> list[Case]:
@@ -98,7 +98,7 @@ def real(arguments: argparse.Namespace) -> list[Case]:
         K = [torch.from_numpy(k)[None] for k in (pair.K0, pair.K1)]
         known = pair.scene in GENERAL or pair.family in GENERAL
         group = pair.family if arguments.rendered else f"{pair.family}/{pair.scene}"
-        motion = None if pair.R is None or pair.t is None else (pair.R, pair.t)
+        motion = None if pair.R is None or pair.t is None else (torch.from_numpy(pair.R), torch.from_numpy(pair.t))
         truth = "general" if known else ""
         cases.append(Case(c.replace(K0=K[0], K1=K[1]), truth, group, pair.identity, motion))
     return cases
@@ -179,7 +179,7 @@ def _pose_errors(case: Case) -> Array:
     assert c.K0 is not None
     assert c.K1 is not None
     assert motion is not None
-    R, t = (torch.from_numpy(a)[None] for a in motion)
+    R, t = (a[None] for a in motion)
     estimate = presets.build("estimator", "fmtorch")(c, 0)
     from_F = metrics.fundamental_pose_error(estimate.F, c.K0, c.K1, c.x0, c.x1, R, t, estimate.inliers)
     H = find_homography(c.x0, c.x1, mask=c.mask, quality=c.quality, prior=c.prior, noise=c.noise, key=c.key)

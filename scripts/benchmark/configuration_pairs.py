@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from fmtorch.core.types import Correspondences
 from scripts.benchmark.homography_pairs import matched, small, warped
@@ -30,7 +31,7 @@ class Case(NamedTuple):
     truth: str
     group: str
     name: str
-    motion: tuple[Array, Array] | None = None
+    motion: tuple[Tensor, Tensor] | None = None
 
 
 def photographs(paths: Sequence[Path]) -> Iterator[Case]:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from fmtorch import presets
+from fmtorch.core.stages import pruned
 from fmtorch.data import ImagePair, read_image
 from fmtorch.data.images import to_grey
 from fmtorch.evaluation.run import select
@@ -102,7 +103,7 @@ def own(pipeline: Pipeline, pair: ImagePair, image0: Image, image1: Image) -> tu
     c = pipeline.matcher(features0, features1)
     clock.stage("matching")
     for pruner in pipeline.pruners_of(pair.family).values():
-        c = pruner(c).compact()
+        c = pruned(pruner, c, lambda _: pipeline.images(pair)).compact()
     clock.stage("pruning")
     pipeline.estimator(c, 0)
     clock.stage("estimation")

@@ -126,7 +126,8 @@ def rows_of(
         outcomes: list[Outcome] = []
         for outcome in matched:
             stages = pipeline.pruners_of(outcome.pair.family)
-            outcomes.append(pruned_by(outcome, [stage for key, stage in stages.items() if key not in front.pruners]))
+            own = [stage for key, stage in stages.items() if key not in front.pruners]
+            outcomes.append(pruned_by(outcome, own, pipeline))
         runs = [evaluate(pipeline.estimate(outcomes, seed), seed) for seed in range(seeds)]
         for same in zip(*runs, strict=True):
             row = {field: getattr(same[0], field) for field in ("pair", "family", "scene", "features0", "features1")}

@@ -23,6 +23,7 @@ from rich.console import Console
 from rich.progress import track
 
 from fmtorch import presets
+from fmtorch.core.stages import pruned
 from fmtorch.data import ImagePair
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.run import select
@@ -113,13 +114,14 @@ def stage(spec: str) -> Any:
 def rows(front: Pipeline, pair: ImagePair, methods: dict[str, list[Any]]) -> Iterator[dict[str, Any]]:
     matched = front.match([pair])[0]
     for name, pruners in methods.items():
-        row = evaluate(front.estimate([pruned_by(matched, pruners)]))[0]
+        row = evaluate(front.estimate([pruned_by(matched, pruners, front)]))[0]
         kept = ("pair", "family", "scene", "ok", "nsgd", "inlier_rate", "inlier_rate_before", "corrs", "corrs_before")
         yield {"method": name, **{field: getattr(row, field) for field in kept}}
 
 
-def pruned_by(outcome: Outcome, pruners: list[Any]) -> Outcome:
+def pruned_by(outcome: Outcome, pruners: list[Any], pipeline: Pipeline) -> Outcome:
+    """The outcome after more pruners; those that look at images ask the pipeline for them."""
     c = outcome.correspondences
     for pruner in pruners if c is not None else []:
-        c = pruner(c).compact()
+        c = pruned(pruner, c, lambda _: pipeline.images(outcome.pair)).compact()
     return dataclasses.replace(outcome, correspondences=c)

@@ -24,6 +24,7 @@ from rich.progress import track
 
 from fmtorch import metrics, presets
 from fmtorch.core.files import replacing
+from fmtorch.core.stages import pruned
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.data import ImagePair
 from fmtorch.pipeline.pipeline import Pipeline
@@ -130,7 +131,7 @@ def judge(name: str, batch: str, pairs: Sequence[ImagePair], c: Correspondences,
     path.parent.mkdir(parents=True, exist_ok=True)
     pipeline = presets.pipeline(name)
     for pruner in [stage for key, stage in pipeline.pruners.items() if key not in SHARED]:
-        c = pruner(c).compact()
+        c = pruned(pruner, c, lambda i: pipeline.images(pairs[i])).compact()
     estimate = pipeline.estimator(c, 0).detach()
     significance = estimate.significance
     assert significance is not None

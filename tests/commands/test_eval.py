@@ -71,6 +71,14 @@ def test_a_run_from_start_to_end(root: Path, tmp_path: Path) -> None:
     assert (run_dir / "recall.png").read_bytes().startswith(b"\x89PNG")
     assert not (tmp_path / "outputs").exists()  # Hydra leaves nothing of its own
 
+    # The folder's summary is of all its rows, also where a command asks for fewer.
+    third = evaluate(*arguments, "limit=2", cwd=tmp_path)
+    assert third.returncode == 0, third.stderr
+    assert json.loads((run_dir / "summary.json").read_text()) == summary
+    shown = " ".join(third.stdout.split())
+    assert "2 of the 5 pairs of the run" in shown
+    assert "of all 5 pairs" in shown
+
     # Refused for another identity, which is told.
     other = evaluate(*arguments, "seed=1", cwd=tmp_path)
     assert other.returncode == 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -19,10 +20,12 @@ from PIL import Image
 
 import fmtorch
 from fmtorch import presets
+from fmtorch.commands import match as match_command
+from fmtorch.core.estimate import WARNINGS
 from fmtorch.core.resources import conf_dir
 from fmtorch.core.types import RELATED
 from fmtorch.data import ImageError, read_image
-from fmtorch.geometry import sampson
+from fmtorch.geometry import homography_points, sampson
 from fmtorch.metrics import nsgd
 from tests.conftest import own_cache, shared_path
 from tests.processes import run_command
@@ -67,7 +70,8 @@ def test_matches_and_fundamental_matrix_of_arrays(pipeline: fmtorch.pipeline.pip
     assert torch.equal(result.putative.x0[:, result.kept], c.x0)
     assert torch.equal(result.putative.x1[:, result.kept], c.x1)
     assert list(result.counts) == ["matching", "ratio", "one_to_one", "gms", "estimation"]
-    assert list(result.seconds) == ["features", "matching", "ratio", "one_to_one", "gms", "estimation"]
+    steps = ["features", "matching", "ratio", "one_to_one", "gms", "estimation", "configuration"]
+    assert list(result.seconds) == steps
     assert result.counts["estimation"] == int(result.inliers.sum()) > 100
     assert sorted(result.counts.values(), reverse=True) == list(result.counts.values())
     assert result.F.norm() == pytest.approx(1)
@@ -189,6 +193,35 @@ def test_photographs_that_cannot_be_related(pipeline: fmtorch.pipeline.pipeline.
     assert "no motion" in same.warning
 
 
+def test_photographs_that_determine_no_f(pipeline: fmtorch.pipeline.pipeline.Pipeline) -> None:
+    """A turned camera, a plane, a crop and a recompressed copy, made of a photograph, with H; not so with depth."""
+    image = read_image(shared_path("data/Strecha/fountain-P11/Images/00000002.jpg"))
+    h, w = image.shape[:2]
+    f, angle = 1.2 * w, math.radians(6)
+    K = np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1]])
+    R = np.array([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
+    R = R @ np.array([[1, 0, 0], [0, math.cos(angle), -math.sin(angle)], [0, math.sin(angle), math.cos(angle)]])
+    turned = K @ R @ np.linalg.inv(K)
+    leaning = K @ (R + np.outer([0.4, 0.1, 0.2], [0.3, 0.1, 1])) @ np.linalg.inv(K)  # of a plane, seen from elsewhere
+    crop = np.array([[1.0, 0, -100], [0, 1, -60], [0, 0, 1]])
+    copy = cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 40])[1], cv2.IMREAD_COLOR)
+    for kind, second, H in (
+        ("rotation", cv2.warpPerspective(image, turned, (w, h)), turned),
+        ("planar", cv2.warpPerspective(image, leaning, (w, h)), leaning),
+        ("identical", np.ascontiguousarray(image[60:, 100:]), crop), ("identical", copy, np.eye(3)),
+    ):  # fmt: skip
+        result = fmtorch.match(image, second, pipeline=pipeline, longest_side=800)
+        assert result.configuration == kind
+        assert result.warning == WARNINGS[kind] or "no motion" in result.warning
+        assert result.homography is not None
+        corners = torch.tensor([[0.0, 0], [w, 0], [w, h], [0, h]], dtype=torch.float64)
+        off = homography_points(result.homography, corners) - homography_points(torch.from_numpy(H), corners)
+        assert off.abs().max() < 6  # px of 1536 x 1024
+    other = read_image(shared_path("data/Strecha/fountain-P11/Images/00000004.jpg"))
+    general = fmtorch.match(image, other, pipeline=pipeline, longest_side=800)
+    assert (general.configuration, general.warning, general.homography) == ("general", "", None)
+
+
 def test_an_f_of_photographs_with_nothing_in_common() -> None:
     """Some F is found, and the verdict tells that it means nothing."""
     lenient = presets.pipeline("sift_lmeds", overrides=["features.max_features=1500", "pruner.ratio.threshold=0.95"])
@@ -197,6 +230,7 @@ def test_an_f_of_photographs_with_nothing_in_common() -> None:
     assert result.ok
     assert not result.related
     assert result.significance < RELATED
+    assert (result.configuration, result.homography) == ("unrelated", None)
     good = fmtorch.match(*stereo(), pipeline=lenient)
     assert good.related
     assert good.significance > 10
@@ -311,6 +345,16 @@ def test_the_command(tmp_path: Path) -> None:
     assert np.shape(report["F"]) == (3, 3)
     assert report["related"] is False
     assert report["significance"] < RELATED
+    assert (report["configuration"], report["homography"]) == ("unrelated", None)
+    assert done.stderr.count("nothing in common") == 0  # which is said already
+
+    # One photograph twice: the table and a warning say it.
+    done = run_python("-m", "fmtorch.match", "image0=a.png", "image1=a.png", "output=same", cwd=tmp_path)
+    assert "identical" in done.stdout
+    assert "no motion" in done.stderr
+    report = json.loads((tmp_path / "same" / "result.json").read_text())
+    assert report["configuration"] == "identical"
+    np.testing.assert_allclose(np.array(report["homography"]) / report["homography"][2][2], np.eye(3), atol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -345,3 +389,18 @@ def test_on_a_real_pair() -> None:
         result = fmtorch.match(images / "00000002.jpg", images / "00000006.jpg", pipeline=name, longest_side=800)
         sizes = result.correspondences.size0, result.correspondences.size1
         assert float(nsgd(torch.from_numpy(truth)[None], result.F[None], *sizes)[0]) < 0.01
+
+
+def test_others_of_the_same_names_overwrite_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    paths = [Path("x/a.jpg"), Path("x/b.jpg")]
+    others = [Path("y/a.jpg"), Path("y/b.jpg")]
+    folder = match_command._default_output(paths)
+    assert folder == Path("matches/a-b")
+    folder.mkdir(parents=True)
+    (folder / "result.json").write_text(json.dumps({"image0": "x/a.jpg", "image1": "x/b.jpg"}))
+    assert match_command._default_output(paths) == folder
+    assert match_command._default_output([path.absolute() for path in paths]) == folder
+    elsewhere = match_command._default_output(others)
+    assert re.fullmatch(r"a-b-[0-9a-f]{8}", elsewhere.name)
+    assert match_command._default_output(others) == elsewhere

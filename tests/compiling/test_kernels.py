@@ -337,6 +337,20 @@ def test_a_kernel_may_keep_the_lock_that_others_leave_to_other_threads(tmp_path:
     thread.join()
 
 
+def test_several_processes_compile_each_kernel_once(tmp_path: Path, cache: Path) -> None:
+    (tmp_path / "some_kernels.py").write_text(SOURCE)
+    code = "import numpy as np, some_kernels as k; x = np.ones((1, 3), 'f4'); k.rows(x, x); print(x.tolist())"
+    path = os.pathsep.join([str(REPOSITORY), str(tmp_path)])
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    environment = {**os.environ, "PYTHONPATH": path}
+    processes = [subprocess.Popen([sys.executable, "-c", code], env=environment, **pipes) for _ in range(3)]
+    outputs = [process.communicate(timeout=300) for process in processes]
+    assert [out.strip() for out, _ in outputs] == ["[[2.0, 2.0, 2.0]]"] * 3
+    told = " ".join(error for _, error in outputs)
+    assert told.count("compiling rows") == told.count("compiling scaled_squares") == 1
+    assert not list(cache.rglob("*.lock"))
+
+
 def test_several_processes_share_the_folder(tmp_path: Path, cache: Path) -> None:
     (tmp_path / "some_kernels.py").write_text(SOURCE)
     code = "import numpy as np, some_kernels as k; x = np.ones((1, 3), 'f4'); k.rows(x, x); print(x.tolist())"

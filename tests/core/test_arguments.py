@@ -15,7 +15,7 @@ from fmtorch.data import ImageSource
 from fmtorch.evaluation.rows import evaluate
 from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.commands.test_match import run_python
-from tests.laws import quick, scene
+from tests.laws import quick, scene, shown
 from tests.pipeline.test_pipeline import draw, pair, pipeline
 
 EVERY = [n for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES[1:])]
@@ -155,7 +155,7 @@ def test_an_empty_batch_gives_an_empty_result(shape: tuple[int, int]) -> None:
         assert estimate.F.shape == (b, 3, 3), name
         assert not bool(estimate.ok.any()), name
     for name in presets.available("pruner"):
-        assert presets.build("pruner", name)(c).compact().mask.shape == (b, 0), name
+        assert shown(presets.build("pruner", name))(c).compact().mask.shape == (b, 0), name
     assert len(fmtorch.find_fundamental(c.x0, c.x1)) == b
     assert len(fmtorch.find_fundamental([], [])) == 0
     F = torch.zeros(b, 3, 3)

@@ -43,7 +43,7 @@ OBJECT = {"_target_": "any.Thing"}
     ("annotation", "right", "wrong"),
     [
         (int, [0, -3], [True, 1.0, "1", None, [1], {}]),
-        (float, [1, 0.5, float("nan")], [True, "high", None, [0.5]]),
+        (float, [1, 0.5, float("inf")], [True, "high", None, [0.5], float("nan")]),
         (bool, [True], [0, 1, "yes", None]),
         (str, ["", "1"], [1, None, True, ["a"]]),
         (int | None, [None, 3], ["none", 2.5]),

@@ -11,6 +11,7 @@ import torch
 
 import fmtorch
 from fmtorch import presets
+from fmtorch.core.executors import Execution
 from fmtorch.core.threads import available, mapped, one_thread
 from fmtorch.core.types import collate
 from fmtorch.data import read_image
@@ -66,7 +67,7 @@ def test_matching_and_the_prior_of_find_fundamental_have_one_thread(
 
         monkeypatch.setattr(module, name, watched)
 
-    for module, name in ((nearest, "_finite"), (nearest, "_two_nearest"), (consistency, "position_agreement")):
+    for module, name in ((nearest, "_finite"), (nearest, "_match_one_pair"), (consistency, "position_agreement")):
         watch(module, name)
     nearest.nearest_neighbors(torch.rand(30, 8), torch.rand(20, 8))
     c = scene(0, 60)
@@ -191,6 +192,6 @@ def test_workers_of_an_evaluation_share_no_threads(threads: int, tmp_path: Path)
 
     built.estimator = watched  # type: ignore[assignment]
     pairs = [pair(str(i), draw(tmp_path / f"{i}a.png", i), draw(tmp_path / f"{i}b.png", i, shift=12)) for i in range(4)]
-    for _ in evaluate_pairs(built, pairs, seed=0, batch=1, workers=2, store=lambda rows: None):
+    for _ in evaluate_pairs(built, pairs, seed=0, batch=1, execution=Execution("threads", 2), store=lambda rows: None):
         pass
     assert seen == [1] * 4

@@ -26,7 +26,7 @@ from hydra.core.global_hydra import GlobalHydra
 from fmtorch import data
 from fmtorch.data import read_image
 from tests.conftest import own_cache
-from tests.pipeline import databases, test_verification_hloc
+from tests.pipeline import databases, test_verification_hloc, test_verification_matches
 from tests.processes import run_command
 from tests.storage.exchange import writers
 
@@ -99,7 +99,7 @@ APPENDED = {
     "related": ["--limit", "1", "--unrelated", "1"],
     "learned": ["--limit", "1", "--cache", "kept", "--methods", "ratio", "LC, F", "DFE"],
     "stress": ["--limit", "1", "--only", "noise"],
-    "verify": ["--scenes", "DATA/Strecha/a", "--repeats", "1", "--no-mapper"],
+    "verify": ["--root", "DATA", "--scenes", "Strecha/a", "--features", "colmap", "--seeds", "1", "--mappers"],
     "speed": ["--pairs", "2", "--batch", "2", "--repeats", "1", "--matches", "200"],
     "memory": ["--pairs", "1", "--matches", "200", "--estimators", "ransac"],
     "end_to_end": ["--limit", "1", "--pipelines", "sift_lmeds"],
@@ -200,6 +200,7 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     writers.truth(folder / "SET")
     databases.write(folder / "database.db", databases.scene(3))
     test_verification_hloc.write(folder, databases.scene(3))
+    np.savez(folder / "matches.npz", **dict(zip(("x0", "x1"), test_verification_matches.points()[0], strict=True)))
     (folder / "my_conf" / "estimator").mkdir(parents=True)
     yaml = re.findall(
         r"```yaml\n# my_conf/estimator/mine.yaml\n(.*?)```", (SOURCE / "README.md").read_text(), re.DOTALL

@@ -74,6 +74,19 @@ def test_exact_matches_give_the_exact_pose(estimator: str, sizes: dict[str, Any]
 
 
 @pytest.mark.usefixtures("converging")
+def test_calibrated_cameras_need_six_matches() -> None:
+    for seed in range(8):
+        s = reference.scene(seed)
+        x0, x1 = s.x0[s.right], s.x1[s.right]
+        e = fmtorch.find_essential(x0[:6], x1[:6], **CAMERAS, **SIZES)
+        assert error(e, s) < 1e-6
+        five = fmtorch.find_essential(x0[:5], x1[:5], **CAMERAS, **SIZES)
+        assert (bool(five.ok[0]), five.reason[0]) == (False, "5 matches; at least 6 are needed")
+    fewer = fmtorch.find_essential(x0[:6], x1[:6], **CAMERAS, **SIZES, focal=0.05)
+    assert fewer.reason[0] == "6 matches; at least 7 are needed"  # two focal lengths more are to be estimated
+
+
+@pytest.mark.usefixtures("converging")
 def test_normalised_points_give_the_pose_of_pixels() -> None:
     s = reference.scene(1)
     x0, x1 = (

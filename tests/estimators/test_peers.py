@@ -156,3 +156,17 @@ def test_what_another_library_raises_becomes_the_pairs_reason() -> None:
     assert estimate.reason == ("It failed: (-215:Assertion failed) !model.empty()", "")
     assert not estimate.F[0].any()
     assert not estimate.inliers[0].any()
+
+
+@pytest.mark.parametrize("name", ["degensac_cpp", "gc_ransac_cpp", "magsac_cpp"])
+def test_a_binding_gets_whole_numbers_that_it_takes(name: str) -> None:
+    """Seeds of 64 bits are welcome; points beyond its integers are a pair's failure, and never the batch's."""
+    pytest.importorskip(PEERS[name])
+    good = scene(0, 300, outliers=0.3, noise=0.1)
+    huge = good.replace(x0=1e12 * good.x0.double(), x1=1e12 * good.x1.double(), size0=None, size1=None)
+    for seed in (2**31, -(2**40)):
+        estimate = presets.build("estimator", name)(collate([good.replace(size0=None, size1=None), huge]), seed)
+        assert bool(estimate.ok[0])
+        assert estimate.reason[1] == "" or "pybind" not in estimate.reason[1]
+    with pytest.raises(ValueError, match="must be a whole number from 1 to 2147483647"):
+        presets.build("estimator", name, iterations=2**31)

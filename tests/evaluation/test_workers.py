@@ -15,11 +15,14 @@ import pytest
 from numpy.typing import NDArray
 
 from fmtorch import presets
+from fmtorch.core.executors import Execution, WorkersLost
 from fmtorch.core.types import Correspondences, Estimate, Features
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.evaluation.run import _shared_out, evaluate_pairs
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.storage import PairRow
+
+ONE, TWO = (Execution("threads", count) for count in (1, 2))
 
 
 def _ends() -> Pipeline:
@@ -31,16 +34,17 @@ def test_a_process_that_ends_is_told() -> None:
     pairs = [ImagePair(f"scene/0-{i}", "family", "scene", images[0], images[i], np.eye(3)) for i in (1, 2)]
     rows: list[PairRow] = []
     run = evaluate_pairs(
-        presets.pipeline("sift_ratio"), pairs, seed=0, batch=1, workers=2, store=rows.extend, build=_ends
-    )
-    with pytest.raises(RuntimeError, match="the same command goes on"):
+        presets.pipeline("sift_ratio"), pairs, seed=0, batch=1, execution=Execution("processes", 2),
+        store=rows.extend, build=_ends,
+    )  # fmt: skip
+    with pytest.raises(WorkersLost, match="the same command goes on"):
         list(run)
     assert rows == []
 
 
 WORKER = """
 import multiprocessing, time
-from fmtorch.evaluation.workers import end_with_parent
+from fmtorch.core.executors import end_with_parent
 def work():
     end_with_parent()
     print(multiprocessing.current_process().pid, flush=True)
@@ -115,10 +119,19 @@ def test_features_are_computed_while_the_first_pair_is_worked_on(tmp_path: Path)
     pairs = [ImagePair(f"scene/0-{i}", "family", "scene", images[0], images[i], np.eye(3)) for i in range(1, 7)]
     pairs.insert(2, ImagePair("scene/0-bad", "family", "scene", images[0], bad, np.eye(3)))
     expected: list[PairRow] = []
-    list(evaluate_pairs(presets.pipeline("sift_ratio"), pairs, seed=0, batch=2, workers=1, store=expected.extend))
+    list(
+        evaluate_pairs(
+            presets.pipeline("sift_ratio"),
+            pairs,
+            seed=0,
+            batch=2,
+            execution=Execution("threads", 1),
+            store=expected.extend,
+        )
+    )
     pipeline, rows = presets.pipeline("sift_ratio"), list[PairRow]()
     watched = Watched(pipeline, len(images))
-    counts = list(evaluate_pairs(pipeline, pairs, seed=0, batch=2, workers=2, store=rows.extend))
+    counts = list(evaluate_pairs(pipeline, pairs, seed=0, batch=2, execution=TWO, store=rows.extend))
     assert watched.at_first_estimate == len(images)  # all of them, while the first pair waited
     assert len(watched.extracted) == len(set(watched.extracted)) == len(images)  # each once
     assert sum(counts) == len(pairs)

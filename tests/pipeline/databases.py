@@ -80,7 +80,8 @@ def write(
             ids.append(image.image_id)
             points = camera.img_from_cam(np.ascontiguousarray(scene.X @ R.T + t))
             points = points + rng.normal(0, noise, points.shape)
-            rest = rng.uniform(1, 4, (len(points), columns - 2)) * np.array([1, 0.1, -0.1, 1][: columns - 2])
+            rest = np.random.default_rng(i).uniform(1, 4, (len(points), columns - 2))
+            rest *= np.array([1, 0.1, -0.1, 1][: columns - 2])
             database.write_keypoints(image.image_id, np.concatenate([points, rest], 1).astype(np.float32))
         wanted = pairs or [(i, j) for i in range(len(ids)) for j in range(i + 1, len(ids))]
         for i, j in wanted:

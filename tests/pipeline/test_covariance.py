@@ -135,7 +135,7 @@ def test_configurations(kind: str) -> None:
     assert e.configuration == (kind,)
     assert e.warning == (WARNINGS[kind],)
     assert e.homography is not None
-    assert bool(e.homography.any()) == (kind in ("planar", "rotation"))
+    assert bool(e.homography.any()) == (kind in ("planar", "rotation", "identical"))
     assert e.other_R is not None
     assert bool(e.other_R.isfinite().all()) == (kind == "planar")
 

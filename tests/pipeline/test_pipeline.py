@@ -14,7 +14,8 @@ import torch
 from fmtorch import presets
 from fmtorch.core.types import Correspondences, Estimate, Features
 from fmtorch.data import ImagePair, ImageSource
-from fmtorch.pipeline.pipeline import Pipeline, _Memo
+from fmtorch.pipeline.memo import Memo
+from fmtorch.pipeline.pipeline import Pipeline
 
 
 def draw(path: Path, seed: int, shift: int = 0) -> ImageSource:
@@ -152,7 +153,7 @@ def test_a_stage_that_raises_fails_only_the_culprit(pairs: list[ImagePair], stag
 
 
 def test_memo_computes_once_among_threads_and_forgets_the_oldest() -> None:
-    memo: _Memo[int, int] = _Memo(2)
+    memo: Memo[int, int] = Memo(2)
     calls: list[int] = []
     started, release = threading.Event(), threading.Event()
 

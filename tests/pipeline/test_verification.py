@@ -112,27 +112,20 @@ def test_points_are_undistorted_by_every_lens(model: str, tmp_path: Path) -> Non
     assert set(np.flatnonzero(right)) <= set(geometry.inlier_matches[:, 0].tolist())
 
 
-@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"])
 @pytest.mark.parametrize("columns", [4, 6])
-def test_frames_follow_the_lens(model: str, columns: int) -> None:
-    """The lens takes a short step along a column of the undistorted frame to one along that of the stored one."""
-    camera = pycolmap.Camera(model=model, width=640, height=480, params=databases.PARAMS[model])
-    rng = np.random.default_rng(0)
-    keypoints = rng.uniform(20, 460, (30, columns)).astype(np.float32)
-    keypoints[:, 2:] = rng.uniform(0.5, 3, (30, columns - 2))
-    image = database_image("a.jpg", camera, keypoints)
-    assert image.frames is not None
-    assert image.pinhole_frames is not None
-    shapes = keypoints[:, 2:].reshape(-1, 2, 2)
-    if columns == 4:
-        shapes = np.array([[[k.a11, k.a12], [k.a21, k.a22]] for k in pycolmap.keypoints_from_matrix(keypoints)])
-    np.testing.assert_allclose(image.frames, shapes, rtol=1e-5, atol=1e-6)
-    lens = MODELS[model].lens(model, np.array(camera.params) - np.isin(np.arange(len(camera.params)), (2, 3)) * 0.5)
-    points = image.pinhole.astype(np.float64)
-    np.testing.assert_allclose(lens.distort(points), keypoints[:, :2] - 0.5, atol=1e-3)
-    for j in range(2):
-        moved = lens.distort(points + 0.1 * image.pinhole_frames[..., j]) - lens.distort(points)
-        np.testing.assert_allclose(moved / 0.1, image.frames[..., j], rtol=0.01, atol=0.01)
+def test_scales_and_shapes_of_keypoints_change_nothing(columns: int, tmp_path: Path) -> None:
+    paths = [tmp_path / "points.db", tmp_path / "frames.db"]
+    for path, n in zip(paths, (2, columns), strict=True):
+        write(path, scene(2), columns=n, noise=0)
+        fmtorch.verify(path)
+    assert plain(read(paths[0])) == plain(read(paths[1]))
+
+
+@pytest.mark.parametrize("columns", [1, 3, 5])
+def test_keypoints_of_other_columns(columns: int) -> None:
+    camera = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=databases.PARAMS["PINHOLE"])
+    with pytest.raises(ValueError, match=f"the keypoints of a have {columns} columns; they must have 2, 4 or 6"):
+        database_image("a", camera, np.zeros((3, columns), np.float32))
 
 
 def test_what_a_camera_is_known_for() -> None:

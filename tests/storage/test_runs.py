@@ -145,22 +145,31 @@ def test_a_folder_of_the_first_format_is_read_but_not_continued(tmp_path: Path) 
         RunFolder.open(tmp_path, CONFIG)
 
 
-def test_a_folder_from_before_errors_of_poses_is_read_but_not_continued(tmp_path: Path) -> None:
+POSES = ["rotation_error", "translation_error", "pose_reason"]
+KINDS = ["configuration", "warning", "focal_error0", "focal_error1", "focal_log_ratio0", "focal_log_ratio1"]
+
+
+@pytest.mark.parametrize(("version", "lacks", "told"), [
+    (2, [*POSES, *KINDS], "the errors of poses and configurations"), (3, KINDS, "configurations"),
+])  # fmt: skip
+def test_a_folder_of_fewer_columns_is_read_but_not_continued(
+    version: int, lacks: list[str], told: str, tmp_path: Path
+) -> None:
     run = RunFolder.open(tmp_path, CONFIG)
     run.append([row("a")])
     part = next((tmp_path / "pairs").iterdir())
-    old = pq.read_table(part).drop_columns(["rotation_error", "translation_error", "pose_reason"])
+    old = pq.read_table(part).drop_columns(lacks)
     pq.write_table(old, part.with_name("part-0.parquet"))
     part.unlink()
     with pytest.raises(RunFolderError, match="columns are not those"):
         run.read()
     stored = json.loads((tmp_path / "run.json").read_text())
-    (tmp_path / "run.json").write_text(json.dumps({**stored, "format": 2}))
+    (tmp_path / "run.json").write_text(json.dumps({**stored, "format": version}))
     table = RunFolder.load(tmp_path).read()
     assert table.schema == PAIR_SCHEMA
-    assert table["rotation_error"].to_pylist() == [None]
+    assert [table[name].to_pylist() for name in lacks] == [[None]] * len(lacks)
     assert RunFolder.load(tmp_path).done() == {pair_key("a")}
-    with pytest.raises(RunFolderError, match=r"format 2, which lacks the errors of poses.*Choose another run_dir"):
+    with pytest.raises(RunFolderError, match=rf"format {version}, which lacks {told};.*Choose another run_dir"):
         RunFolder.open(tmp_path, CONFIG)
 
 

@@ -13,7 +13,7 @@ from fmtorch.compiling.kernel import Kernel, kernel
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.parts.sampling import Sampler
 from fmtorch.geometry.arithmetic_kernels import logarithm_1p
-from fmtorch.geometry.residual_kernels import SAMPSON, Residual
+from fmtorch.geometry.residual_kernels import HOMOGRAPHY, SAMPSON, Residual
 
 
 @runtime_checkable
@@ -123,3 +123,4 @@ def share_within(r2: F8x1, limit: float, weight: I8x1) -> float:
 
 
 residuals_squared = residuals_squared_of(SAMPSON)
+residuals_squared_homography = residuals_squared_of(HOMOGRAPHY)

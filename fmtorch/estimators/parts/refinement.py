@@ -16,7 +16,7 @@ from fmtorch.estimators.options import Refine
 from fmtorch.estimators.pair import Pair, squared
 from fmtorch.estimators.parts.preselection import first_shuffled
 from fmtorch.estimators.search import Pool
-from fmtorch.geometry.residual_kernels import SAMPSON, Residual
+from fmtorch.geometry.residual_kernels import HOMOGRAPHY, SAMPSON, Residual
 
 FIRST_DAMPING = 1e-4  # of Levenberg-Marquardt
 
@@ -103,3 +103,4 @@ def near_of(residual: Residual) -> Kernel[..., int]:
 
 
 near = near_of(SAMPSON)
+near_homography = near_of(HOMOGRAPHY)

@@ -19,7 +19,7 @@ from fmtorch.estimators.parts.scores import (
     geman_mcclure,
     rounded,
 )
-from fmtorch.geometry.residual_kernels import MATCH, SAMPSON, SINGLES, TINY32, Residual, fill, load
+from fmtorch.geometry.residual_kernels import HOMOGRAPHY, MATCH, SAMPSON, SINGLES, TINY32, Residual, fill, load
 
 GRID = 12  # cells along each side of each image
 CELL_ROWS = 2 * GRID * GRID // SINGLES
@@ -109,3 +109,4 @@ def saturated_cells(table: F8x2, weighted: bool, out: I4x2) -> None:
 
 
 score_saturated = score_saturated_of(SAMPSON)
+score_saturated_homography = score_saturated_of(HOMOGRAPHY)

@@ -16,7 +16,7 @@ from fmtorch.compiling.lanes import added, store, where
 from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.parts.scored_matches import fractional_bits, scored_matches
 from fmtorch.geometry.magsac import GAIN_TABLE
-from fmtorch.geometry.residual_kernels import MATCH, SAMPSON, SINGLES, Residual, fill, load
+from fmtorch.geometry.residual_kernels import HOMOGRAPHY, MATCH, SAMPSON, SINGLES, Residual, fill, load
 
 COUNT, TRUNCATED_SQUARES, GEMAN_MCCLURE, TABLE = 0, 1, 2, 3  # gains
 ONE, ZERO = np.float32(1), np.float32(0)
@@ -246,3 +246,4 @@ def rounded(gain: Any, shift: Any) -> Any:
 
 
 score_gains = score_gains_of(SAMPSON)
+score_gains_homography = score_gains_of(HOMOGRAPHY)

@@ -7,11 +7,22 @@ from typing import TypeVar
 
 import numpy as np
 
-from fmtorch.estimators.peers.pairwise import Pair, PairwiseEstimator, Solution, computed_by, peer, solution, within
+from fmtorch.estimators.peers.pairwise import (
+    Confidence,
+    Iterations,
+    Pair,
+    PairwiseEstimator,
+    Solution,
+    computed_by,
+    peer,
+    solution,
+    within,
+)
 
 Part = TypeVar("Part", int, str)
 
 # The numbers of the samplers in the authors' bindings of MAGSAC++ and GC-RANSAC.
+MAX_SEED = 2**31 - 1  # of 32 bits, as DEGENSAC takes them
 SAMPLERS = {"uniform": 0, "prosac": 1, "progressive_napsac": 2, "importance": 3, "adaptive": 4}
 # The names of the parts in the binding of SupeRANSAC.
 SUPERANSAC_SAMPLERS = {
@@ -25,7 +36,11 @@ SUPERANSAC_SCORES = {"ransac": "RANSAC", "msac": "MSAC", "magsac": "MAGSAC"}
 
 @computed_by("pymagsac")
 def magsac_cpp(
-    *, threshold: float = 3.0, confidence: float = 0.9999, iterations: int = 10000, sampler: str = "adaptive"
+    *,
+    threshold: float = 3.0,
+    confidence: Confidence = 0.9999,
+    iterations: Iterations = 10000,
+    sampler: str = "adaptive",
 ) -> PairwiseEstimator:
     """MAGSAC++ by its authors (Barath et al., CVPR 2020), which draws its own random seed.
 
@@ -59,8 +74,8 @@ def magsac_cpp(
 def gc_ransac_cpp(
     *,
     threshold: float = 1.0,
-    confidence: float = 0.9999,
-    iterations: int = 10000,
+    confidence: Confidence = 0.9999,
+    iterations: Iterations = 10000,
     sampler: str = "prosac",
     coherence: float = 0.975,
 ) -> PairwiseEstimator:
@@ -96,7 +111,9 @@ def gc_ransac_cpp(
 
 
 @computed_by("pydegensac")
-def degensac_cpp(*, threshold: float = 0.5, confidence: float = 0.9999, iterations: int = 10000) -> PairwiseEstimator:
+def degensac_cpp(
+    *, threshold: float = 0.5, confidence: Confidence = 0.9999, iterations: Iterations = 10000
+) -> PairwiseEstimator:
     """DEGENSAC by its authors (Chum et al., CVPR 2005; Mishkin et al., 2015).
 
     Args:
@@ -114,7 +131,7 @@ def degensac_cpp(*, threshold: float = 0.5, confidence: float = 0.9999, iteratio
 
     def solve(pair: Pair) -> Solution:
         F, inside = library.findFundamentalMatrix(
-            pair.x0, pair.x1, threshold, confidence, iterations, seed=pair.seed + 1
+            pair.x0, pair.x1, threshold, confidence, iterations, seed=pair.seed % (MAX_SEED - 1) + 1
         )
         return solution(F, inside)
 
@@ -125,8 +142,8 @@ def degensac_cpp(*, threshold: float = 0.5, confidence: float = 0.9999, iteratio
 def superansac_cpp(
     *,
     threshold: float = 1.5,
-    confidence: float = 0.9999,
-    iterations: int = 10000,
+    confidence: Confidence = 0.9999,
+    iterations: Iterations = 10000,
     sampler: str = "prosac",
     score: str = "magsac",
 ) -> PairwiseEstimator:

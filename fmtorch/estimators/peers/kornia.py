@@ -6,11 +6,16 @@ import kornia
 import numpy as np
 import torch
 
-from fmtorch.estimators.peers.pairwise import Pair, PairwiseEstimator, Solution
+from fmtorch.estimators.peers.pairwise import Confidence, Pair, PairwiseEstimator, Solution
 
 
 def kornia_ransac(
-    *, threshold: float = 1.0, confidence: float = 0.9999, batch_size: int = 2048, rounds: int = 10, prosac: bool = True
+    *,
+    threshold: float = 1.0,
+    confidence: Confidence = 0.9999,
+    batch_size: int = 2048,
+    rounds: int = 10,
+    prosac: bool = True,
 ) -> PairwiseEstimator:
     """`kornia.geometry.RANSAC` with MSAC scores.
 

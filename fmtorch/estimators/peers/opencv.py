@@ -5,11 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from fmtorch.estimators.peers.pairwise import Pair, PairwiseEstimator, Solution
+from fmtorch.estimators.peers.pairwise import Confidence, Iterations, Pair, PairwiseEstimator, Solution
 
 
 def opencv(
-    *, method: str, threshold: float = 1.0, confidence: float = 0.999, iterations: int = 2000
+    *, method: str, threshold: float = 1.0, confidence: Confidence = 0.999, iterations: Iterations = 2000
 ) -> PairwiseEstimator:
     """`cv2.findFundamentalMat` with one of its robust methods.
 

@@ -6,13 +6,14 @@ import dataclasses
 import importlib
 import math
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from fmtorch.core.options import Within
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.batch import Batch, relative_rounding
 from fmtorch.estimators.parts.support import degenerate_support
@@ -25,7 +26,7 @@ Solution = tuple[Points | None, NDArray[np.bool_]]
 
 MIN_MATCHES = 8
 MINIMAL_SAMPLE = 7  # inliers below which a model is none
-FAILURES = (cv2.error, RuntimeError, ValueError)  # how these libraries say that they cannot solve a pair
+FAILURES = (cv2.error, RuntimeError, ValueError, TypeError)  # how these libraries say that they cannot solve a pair
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +90,7 @@ class PairwiseEstimator:
             try:
                 estimate, inside[order] = self._solve(Pair(x0, x1, likelihood[order], size0, size1, seed))
             except FAILURES as failure:  # OpenCV's USAC asserts what some matches do not fulfil
-                reasons[i] = f"{self.name} failed: {' '.join(str(failure).split())}"
+                reasons[i] = f"{self.name} failed: {_said(failure)}"
                 continue
             if estimate is None or estimate.shape != (3, 3) or not np.isfinite(estimate).all() or not np.any(estimate):
                 reasons[i] = f"{self.name} found no fundamental matrix"
@@ -102,6 +103,17 @@ class PairwiseEstimator:
         ok = torch.tensor([not reason for reason in reasons], dtype=torch.bool)
         draws = torch.zeros(b, dtype=torch.int64)  # not reported by these libraries
         return judged(Estimate(F, inliers, ok, tuple(reasons), draws).to(c.mask.device), c)
+
+
+def _said(failure: Exception) -> str:
+    """What a library says, in one line; of arguments that a binding cannot convert it lists pages."""
+    if isinstance(failure, TypeError):
+        return "its binding takes no such sizes or options; whole numbers must be below 2^31"
+    return " ".join(str(failure).split())
+
+
+Iterations = Annotated[int, Within(1, 2**31 - 1)]
+Confidence = Annotated[float, Within(0, 1)]
 
 
 def computed_by(package: str) -> Callable[[Builder], Builder]:

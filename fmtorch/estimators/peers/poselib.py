@@ -7,7 +7,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.estimators.peers.pairwise import Pair, PairwiseEstimator, Solution, computed_by, peer, solution
+from fmtorch.estimators.peers.pairwise import (
+    Confidence,
+    Iterations,
+    Pair,
+    PairwiseEstimator,
+    Solution,
+    computed_by,
+    peer,
+    solution,
+)
 
 LOSSES = ("trivial", "truncated", "huber", "cauchy", "truncated_cauchy", "truncated_le_zach")
 """The robust losses of its refinement."""
@@ -17,8 +26,8 @@ LOSSES = ("trivial", "truncated", "huber", "cauchy", "truncated_cauchy", "trunca
 def poselib(
     *,
     threshold: float = 1.0,
-    confidence: float = 0.9999,
-    iterations: int = 10000,
+    confidence: Confidence = 0.9999,
+    iterations: Iterations = 10000,
     min_iterations: int = 1000,
     prosac: bool = False,
     loss: str | None = None,

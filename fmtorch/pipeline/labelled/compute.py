@@ -1,16 +1,19 @@
-"""Labelled matches of a data set's pairs, a shard at a time, by several threads."""
+"""Labelled matches of a data set's pairs, a shard at a time, by several workers."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
 
+from fmtorch.core.calls import Calls
+from fmtorch.core.executors import Execution, Team
+from fmtorch.core.recipes import Here, Recipe, Source
 from fmtorch.core.types import Correspondences
 from fmtorch.data.pairs import ImagePair, PairDataset
 from fmtorch.pipeline.labelled.labels import label
@@ -19,6 +22,7 @@ from fmtorch.pipeline.pipeline import Outcome, Pipeline
 
 Progress = Callable[[int, int], None]  # called with (pairs done, pairs in all)
 SHARD = 32  # pairs in a file, all of one scene: what an interruption can cost; a change is one of shards.FORMAT
+PRELOADED = ("fmtorch.pipeline.labelled.compute",)  # by the process that workers are forked of
 _IMAGES = 64  # whose features each worker may need again
 _FLOATS = ("quality", "prior", "noise")
 _FRAMES = ("lafs0", "lafs1")
@@ -36,37 +40,63 @@ def partition(pairs: Sequence[ImagePair]) -> list[list[int]]:
     return shards
 
 
+class Matching(NamedTuple):
+    """What pairs are matched and labelled by.
+
+    dataset: where they are from. pipeline: its stages before estimation are run. most: matches kept of a pair, the best
+    by quality.
+    """
+
+    dataset: PairDataset
+    pipeline: Pipeline
+    most: int
+
+
+class Job(NamedTuple):
+    """A shard to compute: its file and its pairs."""
+
+    path: Path
+    pairs: list[ImagePair]
+
+
+def matching(dataset: PairDataset, build: Callable[[], Pipeline], most: int, images: int) -> Matching:
+    """The matching by a pipeline that `build` makes, with the features of so many images kept."""
+    made = build()
+    pipeline = Pipeline(
+        made.extractor, made.matcher, made.pruners, made.estimator,
+        device=made.device, memory=images, families=made.families,
+    )  # fmt: skip
+    return Matching(dataset, pipeline, most)
+
+
 def compute_shards(
-    dataset: PairDataset, pipeline: Pipeline, jobs: Sequence[tuple[Path, list[ImagePair]]], *, most: int, workers: int
+    dataset: PairDataset, build: Callable[[], Pipeline], jobs: Sequence[Job], *, most: int, execution: Execution
 ) -> Iterator[int]:
     """Write each job's shard; yields the number of its pairs when it is written.
 
     Args:
-        dataset: where the pairs are from. pipeline: its stages before estimation are run. jobs: files and their pairs.
-        most: matches kept of a pair, the best by quality. workers: threads, each with one thread of the libraries.
+        dataset: where the pairs are from. build: makes the pipeline whose stages before estimation are run; pickled
+        where workers are no threads. jobs: files and their pairs. most: matches kept of a pair, the best by quality.
+        execution: by which workers, each with one thread of the libraries.
     """
-    pipeline = Pipeline(
-        pipeline.extractor, pipeline.matcher, pipeline.pruners, pipeline.estimator,
-        device=pipeline.device, memory=_IMAGES * workers, families=pipeline.families,
-    )  # fmt: skip
-
-    def work(path: Path, pairs: list[ImagePair]) -> int:
-        write_shard(path, [_row(dataset, pipeline.match([pair])[0], most) for pair in pairs])
-        return len(pairs)
-
+    team = Team(execution, PRELOADED)
+    images = _IMAGES * team.size if execution.shared else _IMAGES
+    make = functools.partial(matching, dataset, build, most, images)
+    source: Source[Matching] = Here(make()) if execution.shared else Recipe(make)
     threads = torch.get_num_threads(), cv2.getNumThreads()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    executor = ThreadPoolExecutor(workers)
     try:
-        waiting: set[Future[int]] = {executor.submit(work, *job) for job in jobs}
-        while waiting:
-            finished, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-            yield from (future.result() for future in finished)
+        for job in Calls(team, source, matched_rows, lambda job, rows: write_shard(job.path, rows)).each(jobs):
+            yield len(job.pairs)
     finally:  # interrupted: what is under way is finished and kept
-        executor.shutdown(wait=True, cancel_futures=True)
         torch.set_num_threads(threads[0])
         cv2.setNumThreads(threads[1])
+
+
+def matched_rows(how: Matching, job: Job) -> list[dict[str, Any]]:
+    """The rows of a shard."""
+    return [_row(how.dataset, how.pipeline.match([pair])[0], how.most) for pair in job.pairs]
 
 
 def _row(dataset: PairDataset, outcome: Outcome, most: int) -> dict[str, Any]:

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 import json
-import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from fmtorch.core.executors import Execution
 from fmtorch.core.files import replacing
 from fmtorch.core.resources import cache_dir
 from fmtorch.data.pairs import DepthDataset, PairDataset
 from fmtorch.pipeline.labelled import labels
 from fmtorch.pipeline.labelled.augmentation import Augmentation
-from fmtorch.pipeline.labelled.compute import Progress, compute_shards, partition
+from fmtorch.pipeline.labelled.compute import Job, Progress, compute_shards, partition
 from fmtorch.pipeline.labelled.shards import FORMAT, Shard, ShardError
 from fmtorch.pipeline.labelled.stored import StoredMatches
 from fmtorch.pipeline.pipeline import Pipeline
@@ -42,6 +43,8 @@ class MatchedPairs(StoredMatches):
         workers: threads, by default one a core. progress: called with (pairs done, pairs in all).
         most: matches kept of a pair, the best by quality.
         augmentation, seed: as of `StoredMatches`.
+        execution: other workers than these threads. build: makes the pipeline in other processes, where it is given as
+            an object; pickled, as is the data set.
 
     Raises ValueError for an unknown pipeline, for one whose stages do not say what defines their results, for an empty
     data set, for `most` below 1, and where every pair fails.
@@ -67,6 +70,8 @@ class MatchedPairs(StoredMatches):
         most: int = MAX_MATCHES,
         augmentation: Augmentation | None = None,
         seed: int = 0,
+        execution: Execution | None = None,
+        build: Callable[[], Pipeline] | None = None,
     ) -> None:
         if most < 1:
             raise ValueError(f"most is {most}; at least 1 match of a pair must be kept")
@@ -82,12 +87,18 @@ class MatchedPairs(StoredMatches):
                 temporary.write_text(json.dumps(json.loads(canonical(identity)), indent=2) + "\n", encoding="utf-8")
         pairs = [dataset[i] for i in range(len(dataset))]
         shards = [[pairs[i] for i in members] for members in partition(pairs)]
-        jobs = [(folder / f"shard-{number:05d}.arrow", members) for number, members in enumerate(shards)]
-        missing = [job for job in jobs if not _sound(job[0], len(job[1]))]
-        done, total = len(pairs) - sum(len(members) for _, members in missing), len(pairs)
+        jobs = [Job(folder / f"shard-{number:05d}.arrow", members) for number, members in enumerate(shards)]
+        missing = [job for job in jobs if not _sound(job.path, len(job.pairs))]
+        done, total = len(pairs) - sum(len(job.pairs) for job in missing), len(pairs)
         report = progress or (lambda done, total: None)
         report(done, total)
-        for count in compute_shards(dataset, stages, missing, most=most, workers=workers or os.cpu_count() or 1):
+        execution = execution or Execution("threads", workers)
+        build = build or (_build(pipeline, overrides) if isinstance(pipeline, str) else None)
+        if execution.shared:
+            build = functools.partial(_pipeline, stages, ())
+        elif build is None:
+            raise ValueError("other processes need to make the pipeline: give its name, or `build`")
+        for count in compute_shards(dataset, build, missing, most=most, execution=execution):
             done += count
             report(done, total)
         super().__init__(folder, augmentation=augmentation, seed=seed)
@@ -110,6 +121,10 @@ def _identity(dataset: PairDataset, stages: Pipeline, most: int) -> dict[str, An
         "labels": [labels.VERSION, "depth" if isinstance(dataset, DepthDataset) else "lines", *rules],
         "stages": parts, "environment": environment(),
     }  # fmt: skip
+
+
+def _build(name: str, overrides: Sequence[str]) -> Callable[[], Pipeline]:
+    return functools.partial(_pipeline, name, tuple(overrides))
 
 
 def _pipeline(pipeline: Pipeline | str, overrides: Sequence[str]) -> Pipeline:

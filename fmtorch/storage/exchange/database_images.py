@@ -1,4 +1,4 @@
-"""Images of a COLMAP database: keypoints as of an ideal pinhole, local affine frames, what is known of cameras."""
+"""Images of a COLMAP database: keypoints as of an ideal pinhole, and what is known of cameras."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from fmtorch.geometry.square_pixels import calibration_problems
 from fmtorch.storage.exchange.two_view import ORIGIN
 
 EXIF_DEVIATION = 0.05  # relative, of focal lengths by EXIF (docs/cameras.md)
-STEP = 0.5  # px: a frame's columns are moved by the lens as short steps of that length
 
 Array = NDArray[np.float64]
 
@@ -24,21 +23,20 @@ Array = NDArray[np.float64]
 class DatabaseImage:
     """An image with its keypoints, px, with (0, 0) at the centre of the first pixel.
 
-    size: (h, w). points: (n, 2) as stored; pinhole: (n, 2), where a pinhole of calibration K would have put them, NaN
-    where it sees nothing. frames: local affine frames (n, 2, 2) by columns, of keypoints that have them, and
-    pinhole_frames likewise. deviation: relative, of the focal length of K: 0 where it was calibrated, infinite where it
-    is COLMAP's guess. problem: what is wrong with the camera.
+    size: (h, w), and K, None where unknown. points: (n, 2) as stored; pinhole: (n, 2), where a pinhole of calibration K
+    would have put them, NaN where it sees nothing. deviation: relative, of the focal length of K: 0 where it was
+    calibrated, infinite where it is COLMAP's guess. problem: what is wrong with the camera.
+
+    Scales, orientations and affine shapes of keypoints are not used: docs/verify.md says what they were worth.
     """
 
     name: str
     camera_id: int
-    size: tuple[int, int]
-    K: Array
+    size: tuple[int, int] | None
+    K: Array | None
     deviation: float
     points: NDArray[np.float32]
     pinhole: NDArray[np.float32]
-    frames: NDArray[np.float32] | None
-    pinhole_frames: NDArray[np.float32] | None
     problem: str = ""
 
 
@@ -47,7 +45,7 @@ def database_image(name: str, camera: Any, keypoints: NDArray[np.float32]) -> Da
     size, columns = (int(camera.height), int(camera.width)), keypoints.shape[1]
     if columns not in (2, 4, 6):
         raise ValueError(f"the keypoints of {name} have {columns} columns; they must have 2, 4 or 6")
-    points, frames = keypoints[:, :2] - np.float32(ORIGIN), _frames(keypoints)
+    points = keypoints[:, :2] - np.float32(ORIGIN)
     model = str(camera.model_name)
     problem, K, deviation = "", np.eye(3), math.inf
     if model not in MODELS:
@@ -59,12 +57,9 @@ def database_image(name: str, camera: Any, keypoints: NDArray[np.float32]) -> Da
         problem = f"camera {camera.camera_id} of {name}: {wrong}" if wrong else ""
         deviation = _deviation(camera, lens, K)
     if problem or not lens.bends:
-        return DatabaseImage(name, camera.camera_id, size, K, deviation, points, points, frames, frames, problem)
+        return DatabaseImage(name, camera.camera_id, size, K, deviation, points, points, problem)
     pinhole = _undistorted(camera, K, keypoints[:, :2])
-    bent = None if frames is None else _undistorted_frames(camera, K, keypoints[:, :2], frames, pinhole)
-    return DatabaseImage(
-        name, camera.camera_id, size, K, deviation, points, pinhole.astype(np.float32), frames, bent, problem
-    )
+    return DatabaseImage(name, camera.camera_id, size, K, deviation, points, pinhole.astype(np.float32), problem)
 
 
 def _deviation(camera: Any, lens: Lens, K: Array) -> float:
@@ -76,27 +71,7 @@ def _deviation(camera: Any, lens: Lens, K: Array) -> float:
     return EXIF_DEVIATION if usual else 0.0
 
 
-def _frames(keypoints: NDArray[np.float32]) -> NDArray[np.float32] | None:
-    """Local affine frames (n, 2, 2) of scale and orientation, or of the four numbers that COLMAP calls a shape."""
-    if keypoints.shape[1] == 6:
-        return np.ascontiguousarray(keypoints[:, 2:].reshape(-1, 2, 2))
-    if keypoints.shape[1] != 4:
-        return None
-    scale, angle = keypoints[:, 2].astype(np.float64), keypoints[:, 3].astype(np.float64)
-    across, along = scale * np.cos(angle), scale * np.sin(angle)
-    return np.stack([across, -along, along, across], -1).reshape(-1, 2, 2).astype(np.float32)
-
-
 def _undistorted(camera: Any, K: Array, points: NDArray[Any]) -> Array:
     """Pixels (n, 2) of a pinhole for COLMAP's pixels (n, 2) of the photograph."""
     rays = np.asarray(camera.cam_from_img(np.ascontiguousarray(points, np.float64)), np.float64).reshape(-1, 2)
     return np.asarray(rays @ K[:2, :2].T + K[:2, 2])
-
-
-def _undistorted_frames(
-    camera: Any, K: Array, points: NDArray[Any], frames: NDArray[np.float32], pinhole: Array
-) -> NDArray[np.float32]:
-    """Frames (n, 2, 2) of the undistorted image, by the lens's derivatives at the points."""
-    steps = STEP * np.eye(2)
-    moved = [_undistorted(camera, K, points + step) - pinhole for step in steps]
-    return np.asarray(np.stack(moved, -1) / STEP @ frames, np.float32)

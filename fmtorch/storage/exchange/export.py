@@ -9,6 +9,7 @@ import numpy as np
 
 from fmtorch.core.files import replacing
 from fmtorch.storage.exchange import colmap, h5
+from fmtorch.storage.exchange.hloc_matches import write_geometry
 from fmtorch.storage.exchange.journal import ExportedImage, ExportedPair, Journal
 from fmtorch.storage.exchange.names import pair_key_of
 
@@ -61,8 +62,8 @@ def write_hloc(
     """hloc's features and matches, float32 and int32.
 
     hloc itself writes float16 and int16, of which the second overflows beyond 32,767 keypoints. Each pair holds beside
-    ``matches0`` and ``matching_scores0``, which hloc knows, ``inliers0`` (bool), and F and
-    `related` as attributes.
+    ``matches0`` and ``matching_scores0``, which hloc knows, ``inliers0`` (bool), and F, `related` and, where its
+    geometry is known, `configuration`, E, H, R and t as attributes.
     """
     h5py = h5.imported()
     counts: dict[str, int] = {}
@@ -78,6 +79,8 @@ def write_hloc(
             for name, values in _by_keypoint(pair, counts[pair.name0]):
                 group[name] = values
             group.attrs["F"], group.attrs["related"] = pair.F, pair.related
+            if pair.geometry is not None:
+                write_geometry(group, pair.geometry)
 
 
 def _by_keypoint(pair: ExportedPair, count: int) -> Iterator[tuple[str, np.ndarray]]:

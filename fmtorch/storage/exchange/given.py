@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -48,8 +50,14 @@ def calibrated(
     R: Array, t: Array,
 ) -> ImagePair:  # fmt: skip
     """A pair of cameras with X1 = R X0 + t, and the F of these; a problem where they define none."""
-    P0 = K[0] @ np.eye(3, 4)
-    P1 = K[1] @ np.column_stack([R, t])
+    return with_fundamentals([posed(identity, family, scene, images, K, R, t)])[0]
+
+
+def posed(
+    identity: str, family: str, scene: str, images: tuple[ImageSource, ImageSource], K: tuple[Array, Array],
+    R: Array, t: Array,
+) -> ImagePair:  # fmt: skip
+    """The same without F, which `with_fundamentals` adds."""
     problem = None
     if abs(np.linalg.det(K[0])) == 0 or abs(np.linalg.det(K[1])) == 0:
         problem = "a calibration matrix is singular"
@@ -57,10 +65,23 @@ def calibrated(
         problem = "R is no rotation"
     elif not t.any():
         problem = "the cameras did not move apart (t is zero), which leaves no F"
-    F = np.zeros((3, 3))
-    if problem is None:
-        F = fundamental_from_projections(torch.from_numpy(P0), torch.from_numpy(P1)).numpy()
-    return ImagePair(identity, family, scene, *images, F, *K, R, t, problem)
+    return ImagePair(identity, family, scene, *images, np.zeros((3, 3)), *K, R, t, problem)
+
+
+def with_fundamentals(pairs: Sequence[ImagePair]) -> list[ImagePair]:
+    """The pairs with the F of their cameras, all at once; those with a problem, or without a pose, as they are."""
+    result = list(pairs)
+    places, first, second = list[int](), list[Array](), list[Array]()
+    for place, pair in enumerate(pairs):
+        if pair.problem is None and not (pair.K0 is None or pair.K1 is None or pair.R is None or pair.t is None):
+            places.append(place)
+            first.append(pair.K0 @ np.eye(3, 4))
+            second.append(pair.K1 @ np.column_stack([pair.R, pair.t]))
+    if places:
+        F = fundamental_from_projections(*(torch.from_numpy(np.stack(P)) for P in (first, second))).numpy()
+        for place, own in zip(places, F, strict=True):
+            result[place] = dataclasses.replace(pairs[place], F=own)
+    return result
 
 
 def broken(identity: str, family: str, scene: str, images: tuple[ImageSource, ImageSource], problem: str) -> ImagePair:

@@ -85,11 +85,7 @@ class HlocMatches:
                 scores = self._scores(pair)
                 if scores is not None:
                     group["matching_scores0"] = np.where(second == NO_MATCH, 0, scores).astype(np.float32)
-                group.attrs["configuration"] = geometry.kind
-                for name in ("F", "E", "H", "R", "t"):
-                    value = getattr(geometry, name)
-                    if value is not None:
-                        group.attrs[name] = value
+                write_geometry(group, geometry)
 
     def name(self, image_id: str) -> str:
         """The name itself."""
@@ -129,7 +125,16 @@ class HlocMatches:
         points = h5.numbers(self._features, f"{name}/keypoints", None, 2).astype(np.float32)
         width, height = h5.reshaped(self._features, f"{name}/image_size", 2)
         size = int(height), int(width)
-        return DatabaseImage(name, -1, size, np.eye(3), np.inf, points, points, None, None)
+        return DatabaseImage(name, -1, size, np.eye(3), np.inf, points, points)
+
+
+def write_geometry(group: Any, geometry: PairGeometry) -> None:
+    """The configuration and the matrices of a pair as attributes of its group."""
+    group.attrs["configuration"] = geometry.kind
+    for name in ("F", "E", "H", "R", "t"):
+        value = getattr(geometry, name)
+        if value is not None:
+            group.attrs[name] = value
 
 
 def _below(file: Any, last: str) -> list[str]:

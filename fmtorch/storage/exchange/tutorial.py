@@ -8,16 +8,28 @@ used instead.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from fmtorch.data.pairs import GivenMatches, ImagePair
+from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
 from fmtorch.data.text_files import DataError
 from fmtorch.storage.exchange import h5
-from fmtorch.storage.exchange.given import Array, Size, broken, calibrated, given, image, size_by_centre, size_of
+from fmtorch.storage.exchange.given import (
+    Array,
+    Size,
+    broken,
+    given,
+    image,
+    posed,
+    size_by_centre,
+    size_of,
+    with_fundamentals,
+)
 
 MATCHES, RATIOS, CALIBRATIONS, ROTATIONS, TRANSLATIONS, TRUTH = (
     f"{name}.h5" for name in ("matches", "match_conf", "K1_K2", "R", "T", "Fgt")
@@ -55,13 +67,14 @@ def tutorial_files(root: Path) -> list[Path]:
 
 
 def tutorial_pairs(root: Path, images: Path | None) -> Iterator[ImagePair]:
-    """The pairs of every scene."""
+    """The pairs of every scene; of each file one opening, and one computation of F."""
     for folder in scenes(root):
         with h5.opened(folder / MATCHES) as file:
             names = h5.keys(file)
-        cameras = _Cameras(folder)
-        for key in names:
-            yield _pair(root.name, folder, key, cameras, images)
+        with contextlib.ExitStack() as files:
+            cameras = _Cameras(folder, files)
+            pairs = [_pair(root.name, folder, key, cameras, images) for key in names]
+        yield from with_fundamentals(pairs) if cameras.by_image else pairs
 
 
 def scenes(root: Path) -> list[Path]:
@@ -73,10 +86,12 @@ def scenes(root: Path) -> list[Path]:
 
 
 class _Cameras:
-    """What a scene's files say of its cameras."""
+    """What a scene's files say of its cameras; files: closes those that are read pair by pair."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, files: contextlib.ExitStack) -> None:
         self.folder = folder
+        self._files, self._open = files, dict[str, Any]()
+        self._images: dict[str, ImageSource] = {}
         self.by_image: dict[str, tuple[Array, Array]] = {}
         self.problems: dict[str, str] = {}
         rotations, translations = folder / ROTATIONS, folder / TRANSLATIONS
@@ -87,6 +102,12 @@ class _Cameras:
                         self.by_image[name] = h5.reshaped(R, name, 3, 3), h5.reshaped(T, name, 3)
                     except DataError as error:
                         self.problems[name] = str(error)
+
+    def image(self, family: str, name: str, images: Path | None) -> ImageSource:
+        """An image of the scene, the same object for all pairs that show it."""
+        if name not in self._images:
+            self._images[name] = image(family, self.folder.name, name, images)
+        return self._images[name]
 
     def split(self, key: str) -> tuple[str, str]:
         """The two images of a pair; their names may hold hyphens too."""
@@ -102,8 +123,7 @@ class _Cameras:
         raise DataError(f"{self.folder / MATCHES}: {key!r} {missing}")
 
     def calibration(self, key: str) -> tuple[Array, Array]:
-        with h5.opened(self.folder / CALIBRATIONS) as file:
-            K = h5.reshaped(file, key, 2, 3, 3)
+        K = h5.reshaped(self._file(CALIBRATIONS), key, 2, 3, 3)
         return K[0], K[1]
 
     def truth(self, key: str) -> Array:
@@ -111,30 +131,37 @@ class _Cameras:
             raise DataError(
                 f"{self.folder}: neither {ROTATIONS} and {TRANSLATIONS} nor {TRUTH}: the test split has no ground truth"
             )
-        with h5.opened(self.folder / TRUTH) as file:
-            return h5.reshaped(file, key, 3, 3)
+        return h5.reshaped(self._file(TRUTH), key, 3, 3)
+
+    def _file(self, name: str) -> Any:
+        """A file of the scene, opened once: opening takes longer than reading a pair, and grows with the file."""
+        if name not in self._open:
+            self._open[name] = self._files.enter_context(h5.opened(self.folder / name))
+        return self._open[name]
 
 
 def _pair(family: str, folder: Path, key: str, cameras: _Cameras, images: Path | None) -> ImagePair:
     scene, identity = folder.name, f"{family}/{folder.name}/{key}"
-    sources = image(family, scene, key, images), image(family, scene, key, images)
+    sources: tuple[ImageSource, ImageSource] | None = None
     try:
         name0, name1 = cameras.split(key)
-        sources = image(family, scene, name0, images), image(family, scene, name1, images)
+        sources = cameras.image(family, name0, images), cameras.image(family, name1, images)
         for name in (name0, name1):
             if name in cameras.problems:
                 raise DataError(cameras.problems[name])
         K0, K1 = cameras.calibration(key)
-        sizes = size_of(sources[0]) or size_by_centre(K0), size_of(sources[1]) or size_by_centre(K1)
+        known = (size_of(source) if images else None for source in sources)
+        sizes = next(known) or size_by_centre(K0), next(known) or size_by_centre(K1)
         if cameras.by_image:
             (R0, t0), (R1, t1) = cameras.by_image[name0], cameras.by_image[name1]
             R = R1 @ R0.T
-            pair = calibrated(identity, family, scene, sources, (K0, K1), R, t1 - R @ t0)
+            pair = posed(identity, family, scene, sources, (K0, K1), R, t1 - R @ t0)
         else:
             F = cameras.truth(key)
             norm = float(np.linalg.norm(F))
             problem = None if norm else f"{folder / TRUTH}: {key!r} is zero"
             pair = ImagePair(identity, family, scene, *sources, F / (norm or 1.0), K0, K1, problem=problem)
     except DataError as error:
-        return broken(identity, family, scene, sources, str(error))
+        unnamed = image(family, scene, key, images)
+        return broken(identity, family, scene, sources or (unnamed, unnamed), str(error))
     return dataclasses.replace(pair, matches=TutorialMatches(folder, key, sizes))

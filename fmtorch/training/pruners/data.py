@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import os
 from collections import Counter
@@ -22,6 +23,7 @@ from fmtorch.pipeline.labelled.stored import last_scenes
 from fmtorch.pipeline.labelled.transforms import keep_ratio
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
+from fmtorch.presets.executors import execution_of
 from fmtorch.storage.features import cached
 from fmtorch.training.photographs import Photograph, list_photographs
 from fmtorch.training.planes import PlanePairs, PlaneViews
@@ -148,8 +150,14 @@ def _matched(
     config: DictConfig, dataset: PairDataset, indices: list[int], front: Pipeline, progress: Progress, title: str
 ) -> StoredMatches:
     selected = subset(dataset, indices) if len(indices) < len(dataset) else dataset
-    workers = config.workers or os.cpu_count() or 1
-    return MatchedPairs(selected, front, workers=workers, progress=reporter(progress, title))
+    execution = execution_of(config, config.workers).decided(False)
+    return MatchedPairs(
+        selected,
+        front,
+        execution=execution,
+        build=functools.partial(_front, config),
+        progress=reporter(progress, title),
+    )
 
 
 def _ranges(options: dict[str, Any]) -> dict[str, Any]:

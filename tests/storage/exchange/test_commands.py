@@ -20,7 +20,8 @@ from fmtorch.commands import eval as eval_command
 from fmtorch.commands import match as match_command
 from fmtorch.core.resources import conf_dir
 from fmtorch.pipeline import folder
-from fmtorch.pipeline.folder import chosen_pairs, images_below, open_folder
+from fmtorch.pipeline.folder_images import chosen_pairs, images_below
+from fmtorch.pipeline.folder_output import open_folder
 from fmtorch.pipeline.two_images import Described
 from fmtorch.storage import RunFolder
 from fmtorch.storage.exchange.export import DATABASE, FEATURES, MATCHES
@@ -151,7 +152,9 @@ def test_lists_of_pairs(images: Path, tmp_path: Path) -> None:
     (tmp_path / "pairs.txt").write_text("b.png a.png\n# again\na.png b.png\na.png other.png\n")
     chosen = chosen_pairs(images, found, tmp_path / "pairs.txt")
     assert [(a.name, b.name) for a, b in chosen] == [("b.png", "a.png"), ("a.png", "other.png")]
-    with pytest.raises(ValueError, match=r"list\.txt: no such file; it must be exhaustive, or a file"):
+    with pytest.raises(
+        ValueError, match=r"list\.txt: no such file; it must be exhaustive, sequential:N, .*, or a file"
+    ):
         chosen_pairs(images, found, tmp_path / "list.txt")
 
 
@@ -200,7 +203,17 @@ def test_an_evaluation_and_its_way_back(tmp_path: Path) -> None:
     with pycolmap.Database.open(path / DATABASE) as file:
         assert (file.num_images(), file.num_cameras(), file.num_matched_image_pairs()) == (3, 1, 3)
         assert file.read_camera(1).has_prior_focal_length
-        assert file.read_two_view_geometry(1, 2).config == int(pycolmap.TwoViewGeometryConfiguration.CALIBRATED)
+        geometry = file.read_two_view_geometry(1, 2)
+    assert geometry.config == int(
+        pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC
+    )  # pictures that are shifted
+    np.testing.assert_allclose(geometry.H / geometry.H[2, 2], [[1, 0, -9], [0, 1, 0], [0, 0, 1]], atol=0.2)
+    with h5py.File(path / MATCHES) as file:
+        group = file["00000000.png/00000001.png"]
+        assert group.attrs["configuration"] == "planar_or_panoramic"
+        np.testing.assert_allclose(
+            group.attrs["H"] / group.attrs["H"][2, 2], [[1, 0, -9], [0, 1, 0], [0, 0, 1]], atol=0.2
+        )
     kept = sorted((path / "export").rglob("*.npz"))
     assert len(kept) == 6
     changed = [file.stat().st_mtime_ns for file in kept]

@@ -16,7 +16,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fmtorch import presets
-from fmtorch.pipeline.folder import FolderMatches, chosen_pairs, images_below
+from fmtorch.pipeline.folder import FolderMatches
+from fmtorch.pipeline.folder_images import chosen_pairs, images_below
 from fmtorch.storage.exchange.colmap import ORIGIN, write_database
 from fmtorch.storage.exchange.export import DATABASE, export_kinds, write_exports
 from fmtorch.storage.exchange.journal import ExportedImage, ExportedPair, Journal, indices
@@ -258,8 +259,7 @@ def test_a_real_scene_is_reconstructed(tmp_path: Path) -> None:
     kept = Journal(tmp_path / "export", images)
     pairs = chosen_pairs(images, images_below(images), None)
     work = FolderMatches(pipeline, kept, 1600, True, 0)
-    for pair in pairs:
-        work.match(*pair)
+    assert len(list(work.each(pairs))) == len(pairs)
     assert not work.troubles
     write_exports(kept, pairs, ("colmap",), tmp_path, shared_camera=True)
     model = mapped(tmp_path / DATABASE, tmp_path)

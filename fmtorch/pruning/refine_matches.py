@@ -1,0 +1,145 @@
+"""Matches refined by what the images show around them, and how exact each then is."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fmtorch.compiling.arrays import Array
+from fmtorch.core.grey_pyramid import GreyPyramid
+from fmtorch.core.stages import PairImages
+from fmtorch.core.threads import mapped
+from fmtorch.core.types import Correspondences
+from fmtorch.pruning import refine_matches_kernels as compiled
+from fmtorch.pruning.window_kernels import Pyramid
+
+MIN_PRIOR = 0.02  # matches less likely than that are not taken for less exact, as in `match_noise`
+
+
+@dataclasses.dataclass(frozen=True)
+class RefineMatches:
+    """Moves the point of image 1 to where the image looks most like image 0 around its partner; prunes nothing.
+
+    Least-squares matching (Lucas and Kanade, IJCAI 1981; Gruen, 1985): a window of image 0 is fitted to image 1 by an
+    affine map, gain and offset, from the map between the two local affine frames. A match stays as it is where a window
+    reaches over the border, where the fit lowers the correlation or ends below `min_correlation` or too far away, and
+    where the image does not determine the point in all directions (no texture, an edge). A match that is refined gets
+    the frame of its affine map and a `noise` from its own normal equations, relative to that of an unrefined match with
+    noise one; others keep theirs. Gradients do not pass: refined points are constants. Matches without frames are left
+    as they are.
+
+    radius: samples from the centre of a window to its sides. iterations: at most. spacing: between samples, at
+    least, px. share: the same, of the half side of the match's frame. min_correlation, max_shift (in samples),
+    max_deviation (px): see above. floor, slope: the expected distance to the epipolar line of a refined match is
+    ``sqrt(floor^2 + (slope s)^2)`` px with s the standard deviation by the normal equations, unexplained: its residuals
+    are not independent. usual: that of an unrefined match of noise one, px. Noise grows with P^(-1/4).
+    """
+
+    radius: int
+    iterations: int
+    spacing: float
+    share: float
+    min_correlation: float
+    max_shift: float
+    max_deviation: float
+    floor: float
+    slope: float
+    usual: float
+
+    kernels: ClassVar = (compiled.refine_windows,)
+
+    def __post_init__(self) -> None:
+        """Raises ValueError for a window or a number of steps that is none."""
+        if self.radius < 1 or self.iterations < 1 or not self.spacing > 0:
+            raise ValueError(
+                f"radius={self.radius}, iterations={self.iterations}, spacing={self.spacing}; radius and iterations "
+                "must be at least 1, spacing above 0 px"
+            )
+
+    def __call__(self, c: Correspondences) -> Correspondences:
+        """Raises ValueError: matches alone do not say what the images show."""
+        raise ValueError("refine_matches needs the images: put it into a pipeline, or call with_images(c, images)")
+
+    def with_images(self, c: Correspondences, images: Callable[[int], PairImages]) -> Correspondences:
+        """The same matches refined. images: of pair i, asked for where it has matches."""
+        if c.lafs0 is None or c.lafs1 is None:
+            return c
+        x1, lafs1 = c.x1.detach().clone(), c.lafs1.detach().clone()
+        noise = torch.ones_like(c.x0[..., 0]) if c.noise is None else c.noise.detach().clone()
+
+        def refine(pair: int) -> None:
+            arrays = {name: _array(getattr(c, name)[pair]) for name in ("x0", "x1", "lafs0", "lafs1", "mask")}
+            live = np.flatnonzero(arrays["mask"] & _finite(*(arrays[name] for name in arrays if name != "mask")))
+            if not len(live):
+                return
+            rows = {name: array[live] for name, array in arrays.items()}
+            out = self._refined(rows, *images(pair))
+            index = torch.from_numpy(live[out.refined]).to(x1.device)
+            x1[pair, index] = _like(out.x1[out.refined], x1)
+            frames = np.concatenate([out.affine @ rows["lafs0"][:, :, :2], out.x1[:, :, None]], 2)
+            lafs1[pair, index] = _like(frames[out.refined], lafs1)
+            noise[pair, index] = _like(self._noise(out), noise) * self._doubt(c.prior, pair, index)
+
+        mapped(refine, range(len(c)))
+        return c.derived(x1=x1, lafs1=lafs1, noise=noise)
+
+    def _refined(self, rows: dict[str, Array], image0: GreyPyramid, image1: GreyPyramid) -> compiled.Refined:
+        """The matches of one pair, all of them finite, refined."""
+        n, A0 = len(rows["x0"]), rows["lafs0"][:, :, :2]
+        determinant = A0[:, 0, 0] * A0[:, 1, 1] - A0[:, 0, 1] * A0[:, 1, 0]
+        adjugate = np.stack([A0[:, 1, 1], -A0[:, 0, 1], -A0[:, 1, 0], A0[:, 0, 0]], 1).reshape(n, 2, 2)
+        with np.errstate(all="ignore"):  # a frame without area: the kernel leaves what is not finite
+            affine = rows["lafs1"][:, :, :2] @ adjugate / determinant[:, None, None]
+            scale = np.sqrt(np.abs(affine[:, 0, 0] * affine[:, 1, 1] - affine[:, 0, 1] * affine[:, 1, 0]))
+            spacing = np.maximum(
+                np.maximum(self.spacing, self.spacing / scale), self.share * np.sqrt(np.abs(determinant))
+            )
+        windows = compiled.Windows(rows["x0"], rows["x1"], np.ascontiguousarray(affine), spacing, np.ones(n, np.bool_))
+        fit = compiled.Fit(
+            self.radius, self.iterations, float(self.min_correlation), float(self.max_shift), float(self.max_deviation)
+        )
+        out = compiled.Refined(
+            np.empty((n, 2)), np.empty((n, 2, 2)), np.empty((n, 3)), np.empty(n), np.empty(n, np.bool_)
+        )
+        compiled.refine_windows(windows, Pyramid(*image0), Pyramid(*image1), fit, out)
+        return out
+
+    def _noise(self, out: compiled.Refined) -> Array:
+        """Of those refined: the expected distance to the epipolar line, in that of a usual match.
+
+        The point's covariance counts as if both points shared it: an error e of image 1 moves the Sampson distance by
+        at most ``e / sqrt(1 + s^2)``, s the change of scale.
+        """
+        (xx, _, yy), affine = out.covariance[out.refined].T, out.affine[out.refined]
+        area = np.abs(affine[:, 0, 0] * affine[:, 1, 1] - affine[:, 0, 1] * affine[:, 1, 0])
+        variance = (xx + yy) / (1 + area)
+        noise: Array = np.sqrt(self.floor * self.floor + self.slope * self.slope * variance) / self.usual
+        return noise
+
+    def _doubt(self, prior: Tensor | None, pair: int, index: Tensor) -> Any:
+        """P^(-1/4) of these matches."""
+        if prior is None:
+            return 1.0
+        P = prior.detach()[pair, index]
+        return torch.where(torch.isfinite(P), P, 1).clamp_min(MIN_PRIOR).sqrt().sqrt().reciprocal()
+
+
+def _array(tensor: Tensor) -> Array:
+    tensor = tensor.detach().cpu()
+    array: Array = (tensor.to(torch.float64) if tensor.is_floating_point() else tensor).contiguous().numpy()
+    return array
+
+
+def _finite(*arrays: Array) -> Array:
+    """Of which matches (n,) all numbers are finite."""
+    finite: Array = np.all([np.isfinite(array).all(tuple(range(1, array.ndim))) for array in arrays], 0)
+    return finite
+
+
+def _like(array: Array, tensor: Tensor) -> Tensor:
+    return torch.from_numpy(array).to(tensor)

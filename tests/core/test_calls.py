@@ -1,0 +1,165 @@
+"""Calls by workers that share what they need or make it, and of which some die."""
+
+from __future__ import annotations
+
+import functools
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fmtorch.core import recipes
+from fmtorch.core.calls import DEATH, MAX_DEATHS, Calls
+from fmtorch.core.executors import Execution, Team, WorkersLost
+from fmtorch.core.recipes import Here, Recipe
+
+PROCESSES = Execution("processes", 2)
+
+
+def made(folder: Path, size: int = 0) -> tuple[Path, bytes]:
+    """What workers need; each process that makes it leaves a file."""
+    (folder / f"made-{os.getpid()}-{time.monotonic_ns()}").touch()
+    return folder, bytes(size)
+
+
+def squares(needed: tuple[Path, bytes], numbers: list[int]) -> list[int]:
+    """The squares; a negative number ends the process, after it has left a file."""
+    folder = needed[0]
+    for number in numbers:
+        if number < 0:
+            (folder / f"died-{time.monotonic_ns()}").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+    return [number * number for number in numbers]
+
+
+def ends(folder: Path) -> Any:
+    """A recipe that ends the process."""
+    os._exit(3)
+
+
+def parts(numbers: list[int]) -> list[list[int]]:
+    return [[number] for number in numbers]
+
+
+def calls(
+    make: Callable[[], Any], execution: Execution, jobs: list[list[int]], **options: Any
+) -> tuple[dict[int, int], dict[int, str], list[list[int]]]:
+    """The results by number, why some have none, and the jobs that were yielded."""
+    results, reasons = dict[int, int](), dict[int, str]()
+
+    def keep(job: list[int], result: list[int]) -> None:
+        results.update(zip(job, result, strict=True))
+
+    def give_up(job: list[int], reason: str) -> None:
+        reasons.update(dict.fromkeys(job, reason))
+
+    team = Team(execution)
+    source: Any = Here(make()) if execution.shared else Recipe(make)
+    options = {"give_up": give_up, "split": parts, **options}
+    yielded = list(Calls(team, source, squares, keep, **options).each(jobs))
+    return results, reasons, yielded
+
+
+@pytest.mark.parametrize("kind", ["threads", "processes"])
+def test_results_of_each_job(kind: str, tmp_path: Path) -> None:
+    jobs = [[i, i + 100] for i in range(20)]
+    results, reasons, yielded = calls(functools.partial(made, tmp_path), Execution(kind, 2), jobs)
+    assert results == {i: i * i for job in jobs for i in job}
+    assert reasons == {}
+    assert sorted(yielded) == jobs
+    assert len(list(tmp_path.glob("made-*"))) <= (1 if kind == "threads" else 2)  # once in each process
+
+
+def test_a_long_recipe_is_sent_to_workers_that_have_it_not(tmp_path: Path) -> None:
+    size = 20 * recipes.SENT_ALONG
+    results, _, _ = calls(functools.partial(made, tmp_path, size), PROCESSES, [[i] for i in range(30)])
+    assert results == {i: i * i for i in range(30)}
+    assert len(list(tmp_path.glob("made-*"))) <= 2
+
+
+def test_what_ends_its_workers_is_known_and_others_are_done(tmp_path: Path) -> None:
+    jobs = [[1, 2], [3, -4, 5], [6, 7], [8], [-9], [10]]
+    results, reasons, yielded = calls(functools.partial(made, tmp_path), PROCESSES, jobs)
+    assert results == {i: i * i for i in (1, 2, 3, 5, 6, 7, 8, 10)}
+    assert reasons == {-4: DEATH, -9: DEATH}
+    assert sorted(i for job in yielded for i in job) == sorted(i for job in jobs for i in job)
+    assert len(list(tmp_path.glob("died-*"))) <= 2 * (MAX_DEATHS + 2)  # bounded: with its neighbours, its batch, alone
+
+
+def test_a_lone_job_that_ends_its_workers(tmp_path: Path) -> None:
+    assert calls(functools.partial(made, tmp_path), PROCESSES, [[-1]])[:2] == ({}, {-1: DEATH})
+
+
+def test_workers_that_cannot_begin_are_no_pairs_fault(tmp_path: Path) -> None:
+    with pytest.raises(WorkersLost, match="the same command goes on"):
+        calls(functools.partial(ends, tmp_path), PROCESSES, [[1], [2], [3]])
+
+
+def test_without_a_reason_to_give_workers_that_die_are_an_error(tmp_path: Path) -> None:
+    with pytest.raises(WorkersLost, match="fewer workers"):
+        calls(functools.partial(made, tmp_path), PROCESSES, [[1], [-2]], give_up=None)
+
+
+def fails(needed: object, job: int) -> int:
+    raise ValueError(f"job {job} is wrong")
+
+
+@pytest.mark.parametrize("kind", ["threads", "processes"])
+def test_what_a_call_raises_is_raised_here(kind: str, tmp_path: Path) -> None:
+    execution = Execution(kind, 2)
+    source: Any = Here(None) if execution.shared else Recipe(functools.partial(made, tmp_path))
+    with pytest.raises(ValueError, match=r"job \d is wrong"):
+        list(Calls(Team(execution), source, fails, lambda job, result: None).each([1, 2, 3]))
+
+
+def slow(event: threading.Event, job: int) -> int:
+    if job:
+        event.wait(60)
+    return job
+
+
+def test_interrupted_what_is_under_way_is_kept() -> None:
+    event, kept = threading.Event(), list[int]()
+    run = Calls(Team(Execution("threads", 2)), Here(event), slow, lambda job, result: kept.append(job)).each(range(100))
+    next(run)
+    threading.Timer(0.2, event.set).start()
+    run.close()
+    assert kept[0] == 0
+    assert 1 in kept
+    assert len(kept) < 10
+
+
+def test_another_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recipe = Recipe(functools.partial(made, tmp_path))
+    monkeypatch.setattr(recipes, "__version__", "9.9")
+    with pytest.raises(ValueError, match=r"a worker has fmtorch 9\.9"):
+        recipe.call(squares, whole=True)([1])
+
+
+class Own(ThreadPoolExecutor):
+    """Anybody's executor, which breaks off after some calls."""
+
+
+def test_an_executor_of_ones_own(tmp_path: Path) -> None:
+    execution = Execution(make=functools.partial(Own, 3))
+    team = Team(execution)
+    results: list[int] = []
+    source = Recipe(functools.partial(made, tmp_path))
+    list(Calls(team, source, squares, lambda job, result: results.extend(result)).each([[i] for i in range(9)]))
+    assert sorted(results) == [i * i for i in range(9)]
+    assert team.size == 3
+    with pytest.raises(ValueError, match=r"executor: dict is no concurrent\.futures\.Executor"):
+        Team(Execution(make=dict)).executor  # noqa: B018
+
+
+def test_what_an_execution_may_be() -> None:
+    with pytest.raises(ValueError, match="executor=mpi; it must be one of auto, threads, processes, dask"):
+        Execution("mpi")
+    with pytest.raises(ValueError, match="give executor=dask"):
+        Execution("threads", address="tcp://localhost:8786")

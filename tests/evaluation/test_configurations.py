@@ -1,0 +1,185 @@
+"""Rows, summaries and reports with configurations, warnings and the errors of focal lengths."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+
+from fmtorch import presets
+from fmtorch.core.estimate import CONFIGURATIONS, WARNINGS
+from fmtorch.core.types import Correspondences
+from fmtorch.data import ImagePair, ImageSource
+from fmtorch.data.pairs import GivenMatches
+from fmtorch.evaluation import tables
+from fmtorch.evaluation.focals import focal_errors
+from fmtorch.evaluation.pair_cameras import WithPairCameras, built_with, cameras_of
+from fmtorch.evaluation.rows import evaluate
+from fmtorch.evaluation.statistics import focal_figures
+from fmtorch.evaluation.summary import summarize
+from fmtorch.evaluation.summary_tables import further_tables, summary_markdown
+from fmtorch.pipeline.examination import examined
+from fmtorch.pipeline.pipeline import Outcome, Pipeline
+from fmtorch.storage import PairRow, to_table
+from fmtorch.storage.exchange.dataset import H5Pairs
+from tests.geometry.kinds import K, batch, draw
+from tests.storage.exchange import writers
+
+
+def unused(*_: object) -> None:
+    raise AssertionError("features and matcher have nothing to do")
+
+
+def pipeline() -> Pipeline:
+    return Pipeline(unused, unused, {}, presets.build("estimator", "fmtorch"))  # type: ignore[arg-type]
+
+
+def given(c: Correspondences) -> Callable[[], GivenMatches]:
+    return lambda: GivenMatches(c, (c.mask.shape[1],) * 2)
+
+
+def pair(kind: str, n: int = 150) -> ImagePair:
+    drawn = draw(kind, 1, n)
+    fields = batch([drawn])
+    c = Correspondences(**{name: fields[name] for name in ("x0", "x1", "mask", "size0", "size1")})
+    image = ImageSource(kind, Path(kind))
+    return ImagePair(kind, "family", kind, image, image, drawn.F, K, K, drawn.R, drawn.t, matches=given(c))
+
+
+def rows(pairs: list[ImagePair], word: str | None) -> list[PairRow]:
+    made = pipeline()
+    if word is not None:
+        made = built_with(lambda: made, cameras_of(pairs, word))  # type: ignore[arg-type]
+    knowledge = made.estimator.given if isinstance(made.estimator, WithPairCameras) else None
+    return evaluate(examined(made, made.run(pairs), 0, knowledge))
+
+
+@pytest.mark.parametrize("word", [None, "known", "unknown"])
+def test_rows_say_which_configuration_and_neighbours_change_nothing(word: str | None) -> None:
+    pairs = [pair(kind, 150 + 10 * i) for i, kind in enumerate(CONFIGURATIONS)]
+    lost = dataclasses.replace(pairs[0], identity="lost", problem="no image")
+    together = rows([*pairs, lost], word)
+    assert [row.configuration for row in together] == [*CONFIGURATIONS, None]
+    assert [row.warning for row in together] == [*(WARNINGS[kind] for kind in CONFIGURATIONS), None]
+    for each, row in zip(pairs, together, strict=False):
+        (alone,) = rows([each], word)
+        assert (alone.F, alone.configuration) == (row.F, row.configuration)
+        assert alone.focal_log_ratio0 == row.focal_log_ratio0
+
+
+def test_a_pair_that_cannot_be_examined_harms_no_other() -> None:
+    made = pipeline()
+    outcomes = made.run([pair("general"), pair("planar")])
+    assert outcomes[0].estimate is not None
+    broken = dataclasses.replace(outcomes[0], estimate=outcomes[0].estimate.replace(model="homography"))
+    assert [o.configuration is None for o in examined(made, [broken, outcomes[1]])] == [True, False]
+
+
+def test_calibrations_count_only_where_the_estimator_was_given_them() -> None:
+    """A camera whose true focal length is far from a usual one: by image sizes its rotation is not seen to be one."""
+    long = np.diag([8.0, 8.0, 1.0]) @ K
+    long[:2, 2] = K[:2, 2]
+    turned = pair("rotation")
+    assert turned.matches is not None
+    c, _ = turned.matches()
+    angle = 0.05
+    R = np.array([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
+    R = R @ np.array([[math.cos(0.4), -math.sin(0.4), 0], [math.sin(0.4), math.cos(0.4), 0], [0, 0, 1]])
+    H = torch.from_numpy(long @ R @ np.linalg.inv(long))
+    x = torch.cat([c.x0.double(), torch.ones(1, c.mask.shape[1], 1, dtype=torch.float64)], -1) @ H.T
+    x1 = (x[..., :2] / x[..., 2:] + torch.randn(x[..., :2].shape, generator=torch.Generator().manual_seed(0))).to(c.x1)
+    turned = dataclasses.replace(turned, K0=long, K1=long, matches=given(c.replace(x1=x1)))
+    assert rows([turned], "known")[0].configuration == "rotation"
+    assert rows([turned], None)[0].configuration in ("planar", "rotation")  # by the usual focal lengths alone
+
+
+def estimated(c: Correspondences, focals: list[float], true: tuple[np.ndarray | None, np.ndarray | None]) -> Outcome:
+    source = pair("general")
+    made = pipeline().run([source])[0]
+    assert made.estimate is not None
+    estimate = made.estimate.replace(focals=torch.tensor([focals], dtype=torch.float64))
+    return dataclasses.replace(
+        made, pair=dataclasses.replace(source, K0=true[0], K1=true[1]), correspondences=c, estimate=estimate
+    )
+
+
+def test_errors_of_focal_lengths() -> None:
+    """Known answers: 10 % too long, not determined, given exactly, without truth, of pixels that are not square."""
+    source = pair("general")
+    assert source.matches is not None
+    c, _ = source.matches()
+    asked = c.replace(focal=torch.tensor([[[1.0, torch.inf], [1.0, torch.inf]]], dtype=torch.float64))
+    found = focal_errors(estimated(asked, [1.1 * 768, math.nan], (K, K)))
+    assert found.error[0] == pytest.approx(0.1)
+    assert found.log_ratio[0] == pytest.approx(math.log(1.1))
+    assert (found.error[1], found.log_ratio[1]) == (math.inf, None)
+    exact = asked.replace(focal=torch.tensor([[[768.0, 0.0], [768.0, 0.05]]], dtype=torch.float64))
+    wide = np.diag([4.0, 1.0, 1.0]) @ K
+    found = focal_errors(estimated(exact, [768.0, 768.0], (K, wide)))
+    assert found.error == (None, pytest.approx(0.5))
+    assert focal_errors(estimated(asked, [768.0, 768.0], (None, K))).error == (None, 0)
+    assert focal_errors(estimated(c, [768.0, 768.0], (K, K))).error == (None, None)  # nobody asked
+
+
+def test_figures_of_focal_lengths() -> None:
+    errors = np.array([[0.02, 0.08], [0.3, np.inf], [np.nan, np.nan], [np.nan, np.nan]])
+    ratios = np.log(np.array([[1.02, 0.92], [1.3, np.nan], [np.nan, np.nan], [np.nan, np.nan]]))
+    figures = focal_figures(errors, ratios, np.array([True, True, True, False]))
+    assert figures is not None
+    assert figures["images"] == 6  # two of a failed pair
+    assert figures["error"] is None  # more than half are misses
+    assert (figures["within_5"], figures["within_10"]) == (1 / 6, 2 / 6)
+    assert figures["ratio"] == pytest.approx(1.02)
+    assert focal_figures(np.full((2, 2), np.nan), ratios[:2], np.array([True, False])) is None
+
+
+def test_summaries_and_reports_show_them() -> None:
+    pairs = [pair(kind) for kind in ("general", "planar")]
+    table = to_table(rows(pairs, "unknown"))
+    summary = summarize(table)
+    assert summary["all"]["configurations"] == {**dict.fromkeys(CONFIGURATIONS, 0), "general": 1, "planar": 1}
+    assert summary["all"]["focals"]["images"] == 4
+    console = Console(width=80, record=True)
+    for each in further_tables(summary):
+        console.print(each)
+    shown = console.export_text()
+    assert "Focal lengths" in shown
+    assert "do not determine F" in shown
+    page = summary_markdown(summary, "run")
+    assert "| family | 1 | 1 | 0 | 0 | 0 |" in page
+    assert "folded" in page
+    of_report = tables.configurations({"run": summary})
+    assert of_report is not None
+    assert [cell.text for cell in of_report.rows["run"]] == ["1", "1", "0", "0", "0"]
+    focals = tables.focals({"run": summary})
+    assert focals is not None
+    assert focals.rows["run"][0].text == "4"
+    nobody = to_table([dataclasses.replace(row, configuration=None) for row in rows(pairs[:1], None)])
+    assert tables.configurations({"run": summarize(nobody)}) is None
+    assert further_tables(summarize(to_table(rows(pairs[:1], None)))) == []  # all general: nothing to say
+
+
+@pytest.mark.parametrize("layout", writers.WRITERS)
+def test_layouts_with_cameras_give_them_to_the_estimator(layout: str, tmp_path: Path) -> None:
+    """Others' matches by `cameras=known`: with their calibrations, the pose is that of an essential matrix."""
+    root = writers.WRITERS[layout](tmp_path / layout)
+    needs = layout in ("hloc", "glue_factory", "vismatch")
+    options = {"truth": writers.truth(tmp_path / "Truth")} if needs else {}
+    pairs = list(H5Pairs(root, layout, **options))
+    for row, each in zip(rows(pairs, "known"), pairs, strict=True):
+        assert row.ok, row.reason
+        assert row.pose_reason is None
+        assert row.rotation_error is not None
+        assert row.rotation_error < 1
+        assert row.configuration == "general"
+        assert row.focal_error0 is row.focal_error1 is None  # which were given exactly
+        F, true = np.array(row.F), each.F.ravel()
+        assert min(np.abs(F - true).max(), np.abs(F + true).max()) < 0.05
+    unknown = rows(pairs, "unknown")
+    assert all(row.focal_error0 is not None for row in unknown)

@@ -1,0 +1,46 @@
+"""Estimators that would drop a gradient in silence are refused where somebody asks for it."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import fmtorch
+from fmtorch import presets
+from tests.laws import scene
+
+OWN = [
+    name for name in presets.available("estimator")
+    if hasattr(presets.build("estimator", name), "gradients_reach") and name != "homography"
+]  # fmt: skip
+C = scene(1, 60, outliers=0.2)
+
+
+REFUSED = {
+    "usac_paper": ("x0", "prior"),
+    **dict.fromkeys((name for name in OWN if name.endswith("_paper") and name != "usac_paper"), ("prior",)),
+}
+"""Gradients that the final fit takes no account of: that of usac_paper is none, those of the others are unweighted."""
+
+
+@pytest.mark.parametrize("name", OWN)
+@pytest.mark.parametrize("field", ["x0", "prior"])
+def test_a_gradient_arrives_or_is_refused(name: str, field: str) -> None:
+    values = {key: getattr(C, key).double() for key in ("x0", "x1", "prior")}
+    asked = values[field].requires_grad_()
+    if field in REFUSED.get(name, ()):
+        said = f"{field} requires a gradient, and the final fit of estimator={name} passes none"
+        with pytest.raises(ValueError, match=said):
+            fmtorch.find_fundamental(**values, estimator=name, key=C.key)
+        return
+    estimate = fmtorch.find_fundamental(**values, estimator=name, key=C.key)
+    (gradient,) = torch.autograd.grad(estimate.F.square().sum() + estimate.F.sum(), asked)
+    assert bool(gradient.any())
+
+
+@pytest.mark.parametrize("name", ["usac_paper", "cf_ransac_paper"])
+def test_without_a_gradient_they_go_on(name: str) -> None:
+    x0 = C.x0.double().requires_grad_()
+    with torch.no_grad():
+        assert bool(fmtorch.find_fundamental(x0, C.x1, prior=C.prior, estimator=name).ok)
+    assert bool(fmtorch.find_fundamental(x0.detach(), C.x1, prior=C.prior, estimator=name).ok)
