@@ -68,8 +68,8 @@ def _sheet(title: str, rows: Sequence[Row], methods: Sequence[str], figures: Ite
             mine = [row for row in rows if (row["scene"], row["method"]) == (scene, method)]
             if mine:
                 cells = [_mean((value(row) for row in mine), digits) for _, value, digits in figures]
-                lines.append([scene, method_name(method), *cells])
-    return Sheet(title, ["scene", "verified by", *(name for name, _, _ in figures)], lines)
+                lines.append([scene, method_name(method), str(len(mine)), *cells])
+    return Sheet(title, ["scene", "verified by", "seeds", *(name for name, _, _ in figures)], lines)
 
 
 def _mean(values: Iterable[float], digits: int) -> str:
@@ -85,8 +85,8 @@ def _summary(rows: Sequence[Row], methods: Sequence[str], kinds: Sequence[tuple[
         for method in methods:
             mine = [row for row in of_kind if row["method"] == method]
             of_each: list[Row] = [row for row in mine if not row["mapper"]]
-            pairs, seconds = (sum(row[name] for row in of_each) for name in ("pairs", "seconds"))
-            cells = [f"{pairs / seconds:,.0f}" if seconds else MISSING]
+            pairs, seconds = (sum(_by_scene(of_each, _field(name))) for name in ("pairs", "seconds"))
+            cells = [str(len({row["scene"] for row in mine})), f"{pairs / seconds:,.0f}" if seconds else MISSING]
             for mapper in MAPPERS:
                 models = [row for row in mine if row["mapper"] == mapper]
                 cells += [
@@ -97,7 +97,7 @@ def _summary(rows: Sequence[Row], methods: Sequence[str], kinds: Sequence[tuple[
                 lines.append([FEATURES[features], cameras, method_name(method), *cells])
     columns = [f"{mapper}: {name}" for mapper in MAPPERS for name in ("registered, %", *(f"@{n}" for n in THRESHOLDS))]
     title = "Means of the scenes: AUC of relative poses at 1, 5 and 10 degrees"
-    return Sheet(title, ["features", "intrinsics", "verified by", "pairs a second", *columns], lines)
+    return Sheet(title, ["features", "intrinsics", "verified by", "scenes", "pairs a second", *columns], lines)
 
 
 def _by_scene(rows: Sequence[Row], value: Callable[[Row], float]) -> list[float]:

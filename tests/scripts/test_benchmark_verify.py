@@ -87,8 +87,9 @@ def test_an_interrupted_run_measures_what_is_missing(tmp_path: Path, monkeypatch
     assert [path.name for path in tmp_path.glob("*.db*")] == ["walk.db"]
     summary, pairs, incremental, _ = sheets(kept.rows, ["colmap:4", "ours"])
     assert summary.rows[0][:3] == ["COLMAP's SIFT", "known", "`fmtorch verify`"]
-    assert pairs.rows[0][:4] == ["walk", "`fmtorch verify`", "3", "3"]
-    assert incremental.rows[0][2] == "3.0"
+    assert summary.rows[0][3] == "1"
+    assert pairs.rows[0][:5] == ["walk", "`fmtorch verify`", "1", "3", "3"]
+    assert incremental.rows[0][3] == "3.0"
 
 
 AREAS = [f"{name}{limit}" for name in ("auc", "centre") for limit in (1, 5, 10)]
