@@ -3,8 +3,8 @@
 python -m scripts.benchmark refinement --root DATA/Strecha --root DATA/PhotoTourism --cache FOLDER
 python -m scripts.benchmark refinement --root DATA/KITTI --rendered small --markdown docs/refinement.md
 
-Of each pipeline with the stage: the same with it taken out, with both estimators. "distance" is the median Sampson
-distance to the true F of the matches within 2 px of it, a mean over pairs; ms are of processor time.
+The stage is put behind the pruners of each pipeline, and each estimator gets both kinds of matches. "distance" is the
+median Sampson distance to the true F of the matches within 2 px of it, a mean over pairs; ms are of processor time.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Measured(NamedTuple):
 def add_arguments(commands: Any) -> None:
     parser = commands.add_parser("refinement", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_set_arguments(parser, "pairs of each family at most, chosen by hash")
-    parser.add_argument("--pipelines", nargs="*", default=list(PIPELINES), help="presets that end with the stage")
+    parser.add_argument("--pipelines", nargs="*", default=list(PIPELINES), help="presets")
     parser.add_argument("--estimators", nargs="*", default=["fmtorch", "poselib"])
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--cache", default="null", help="folder of features; null: the user's")
@@ -81,17 +81,14 @@ def stages(
     whole: Pipeline, pairs: Sequence[ImagePair], name: str
 ) -> tuple[list[ImagePair], list[Outcome], list[Outcome], NDArray[np.float64]]:
     """The pairs with matches, their outcomes before estimation without and with the stage, and its milliseconds."""
-    stage = whole.pruners[STAGE]
-    front = Pipeline(
-        whole.extractor, whole.matcher, {key: p for key, p in whole.pruners.items() if key != STAGE}, whole.estimator
-    )
+    stage = presets.build("pruner", STAGE)
     before, after, ms = [], [], []
     for pair in track(pairs, name, console=console, transient=True):
-        outcome = front.match([pair])[0]
+        outcome = whole.match([pair])[0]
         c = outcome.correspondences
         if c is None or not int(c.count()):
             continue
-        images = front.images(pair)
+        images = whole.images(pair)
         start = time.process_time()
         refined = pruned(stage, c, lambda _, images=images: images)
         ms.append((time.process_time() - start) * 5e5 / int(c.count()))
