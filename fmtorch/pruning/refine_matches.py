@@ -84,7 +84,7 @@ class RefineMatches:
             index = torch.from_numpy(live[out.refined]).to(x1.device)
             x1[pair, index] = _like(out.x1[out.refined], x1)
             if lafs1 is not None and "lafs0" in rows:
-                frames = np.concatenate([out.affine @ rows["lafs0"][:, :, :2], out.x1[:, :, None]], 2)
+                frames = np.concatenate([_product(out.affine, rows["lafs0"][:, :, :2]), out.x1[:, :, None]], 2)
                 lafs1[pair, index] = _like(frames[out.refined], lafs1)
             noise[pair, index] = _like(self._noise(out), noise) * self._doubt(c.prior, pair, index)
 
@@ -138,8 +138,14 @@ def _frame_maps(lafs0: Array, lafs1: Array) -> tuple[Array, Array]:
     determinant = a * d - b * c
     with np.errstate(all="ignore"):  # of a frame without area there is none
         inverse = np.stack([d, -b, -c, a], 1).reshape(-1, 2, 2) / determinant[:, None, None]
-        maps = np.ascontiguousarray(lafs1[:, :, :2] @ inverse)
+        maps = np.ascontiguousarray(_product(lafs1[:, :, :2], inverse))
     return maps, np.sqrt(np.abs(determinant))
+
+
+def _product(a: Array, b: Array) -> Array:
+    """Matrix products (n, 2, 2), in one order of sums."""
+    product: Array = a[:, :, :1] * b[:, :1, :] + a[:, :, 1:] * b[:, 1:, :]
+    return product
 
 
 def _array(tensor: Tensor) -> Array:

@@ -83,8 +83,8 @@ def refine_windows(windows: Windows, image0: Pyramid, image1: Pyramid, fit: Fit,
             place[k] = windows.x1[i, k] / size1
             place[2 + k], place[4 + k] = step * affine[0, k], step * affine[1, k]
         first, correlation, variance = search(image1, level1, template, place, fit.iterations, best)
-        shift = math.hypot(best[0] - place[0], best[1] - place[1])
-        if not (correlation >= max(first, fit.min_correlation) and shift <= fit.max_shift * scale * step):
+        dx, dy, limit = best[0] - place[0], best[1] - place[1], fit.max_shift * scale * step
+        if not (correlation >= max(first, fit.min_correlation) and dx * dx + dy * dy <= limit * limit):
             continue
         for k in range(2, 6):
             best[k] *= size1  # px of image 1 in a step

@@ -58,7 +58,10 @@ def grid(radius: int) -> tuple[Array, Array, float]:
     for i in range(side * side):
         samples[i, 0], samples[i, 1] = i % side - radius, i // side - radius
         r2 = (samples[i, 0] * samples[i, 0] + samples[i, 1] * samples[i, 1]) / (radius * radius)
-        weight[i] = math.exp(-r2 / (2.0 * WINDOW_SIGMA * WINDOW_SIGMA))
+        t = 1.0 + r2 / (16.0 * WINDOW_SIGMA * WINDOW_SIGMA)  # t^-8, nearly a Gaussian, has the same bits everywhere
+        t *= t
+        t *= t
+        weight[i] = 1.0 / (t * t)
         total += weight[i]
     for i in range(side * side):
         weight[i] /= total
@@ -240,4 +243,4 @@ def covariance(L: Array, best: Array, variance: float, out: Array) -> None:
 def largest_variance(covariance: Array) -> float:
     """The larger eigenvalue of a covariance xx, xy, yy."""
     half = (covariance[0] - covariance[2]) / 2.0
-    return float((covariance[0] + covariance[2]) / 2.0 + math.hypot(half, covariance[1]))
+    return float((covariance[0] + covariance[2]) / 2.0 + math.sqrt(half * half + covariance[1] * covariance[1]))

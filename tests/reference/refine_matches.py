@@ -60,7 +60,7 @@ def refined(
     k0 = level_for(levels0, spacing)
     k1 = level_for(levels1, spacing * math.sqrt(abs(np.linalg.det(affine))))
     grid = np.array([(u, v) for v in range(-radius, radius + 1) for u in range(-radius, radius + 1)], float)
-    w = np.exp(-(grid**2).sum(1) / (2 * (0.8 * radius) ** 2))
+    w = (1 + (grid**2).sum(1) / (2 * (0.8 * radius) ** 2) / 8) ** -8.0
     w /= w.sum()
     rows = []
     for u, v in grid:

@@ -1,0 +1,93 @@
+"""Pruners that look at images: what pipelines hand them, and how often files are read for it."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from fmtorch import data, match, presets
+from fmtorch.core.stages import ImagePruner
+from fmtorch.data import read_image
+from fmtorch.data.pairs import GivenMatches
+from fmtorch.geometry import sampson
+from fmtorch.pipeline import pipeline as module
+from fmtorch.pipeline.pipeline import Pipeline
+from tests.conftest import shared_path
+
+PRUNERS = "pruner=[ratio,one_to_one,frame_consistency,match_noise,refine_matches]"
+
+
+def built(cache: str = "off") -> Pipeline:
+    pipeline: Pipeline = presets.pipeline(
+        "sift_fmtorch", overrides=[PRUNERS, f"cache={cache}", "features.max_features=1500"]
+    )
+    return pipeline
+
+
+@pytest.fixture
+def reads(monkeypatch: pytest.MonkeyPatch) -> collections.Counter[Any]:
+    """How often each file is read."""
+    counts: collections.Counter[Any] = collections.Counter()
+
+    def counted(source: Any) -> Any:
+        counts[source.path] += 1
+        return read_image(source)
+
+    monkeypatch.setattr(module, "read_image", counted)
+    return counts
+
+
+def test_files_are_read_once_and_matches_are_refined(reads: collections.Counter[Any], tmp_path: Any) -> None:
+    """Also where features are in the cache, and where matches come with the pair."""
+    dataset = data.load("fmbench", root=shared_path("data/Strecha_train"))
+    pairs = [dataset[i] for i in range(4)]
+    for _ in range(2):  # the second run finds its features in the cache
+        reads.clear()
+        pipeline = built(str(tmp_path))
+        outcomes = pipeline.match(pairs)
+        assert set(reads.values()) == {1}
+        assert all(outcome.images is None for outcome in outcomes)
+    plain = presets.pipeline("sift_fmtorch", overrides=[f"cache={tmp_path}", "features.max_features=1500"])
+    before = plain.match(pairs)
+    gains = []
+    for old, new in zip(before, outcomes, strict=True):
+        F = torch.from_numpy(new.pair.F)[None]
+        assert old.correspondences is not None
+        assert new.correspondences is not None
+        first, second = (
+            sampson(F, c.x0.double(), c.x1.double()).abs()[0] for c in (old.correspondences, new.correspondences)
+        )
+        right = first < 1
+        gains.append(float(second[right].median() / first[right].median()))
+    assert np.median(gains) < 0.85
+    c = before[0].correspondences
+    given = dataclasses.replace(pairs[0], matches=lambda: GivenMatches(c, (1500, 1500)))
+    reads.clear()
+    fresh = Pipeline(pipeline.extractor, pipeline.matcher, {"refine": refiner()}, pipeline.estimator)
+    refined = fresh.match([given])[0].correspondences
+    expected = outcomes[0].correspondences
+    assert reads == {pairs[0].image0.path: 1, pairs[0].image1.path: 1}
+    assert refined is not None
+    assert expected is not None
+    assert bool((refined.x1 == expected.x1).all())
+
+
+def refiner() -> ImagePruner:
+    stage: ImagePruner = presets.build("pruner", "refine_matches")
+    return stage
+
+
+def test_two_photographs_are_refined_in_their_reduced_pixels() -> None:
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 256, (60, 80)).astype(np.uint8).repeat(8, 0).repeat(8, 1)
+    image = np.ascontiguousarray(noise[:440, :600]), np.ascontiguousarray(noise[13:453, 21:621])
+    result = match(*image, pipeline=built(), longest_side=500)
+    assert "refine_matches" in result.counts
+    c = result.correspondences
+    motion = (c.x0 - c.x1)[0]
+    assert float((motion - torch.tensor([21.0, 13.0])).norm(dim=-1).median()) < 0.1
