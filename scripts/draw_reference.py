@@ -20,6 +20,7 @@ GROUPS = {
     "pruner": "Pruners and priors, in the order in which they are named: `'pruner=[NAME,NAME]'`.",
     "estimator": "Robust estimators, `estimator=NAME`, and `find_fundamental(x0, x1, estimator=NAME)`.",
     "dataset": "Data sets, `dataset=NAME`.",
+    "executor": "Where commands run batches of pairs, `executor=NAME`.",
     "trainer": "Where `fmtorch train` runs, `trainer=NAME`.",
     "photographs": "Which photographs `fmtorch train` takes as planes, `photographs=NAME`.",
 }
