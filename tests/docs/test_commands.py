@@ -94,6 +94,7 @@ APPENDED = {
     "pruning": ["--limit", "1", "--asift-limit", "0", "--cache", "kept"],
     "related": ["--limit", "1", "--unrelated", "1"],
     "learned": ["--limit", "1", "--cache", "kept", "--methods", "ratio", "LC, F", "DFE"],
+    "similar": ["--root", "DATA/Strecha"],
     "stress": ["--limit", "1", "--only", "noise"],
     "verify": ["--scenes", "DATA/Strecha/a", "--repeats", "1", "--no-mapper"],
     "speed": ["--pairs", "2", "--batch", "2", "--repeats", "1", "--matches", "200"],
