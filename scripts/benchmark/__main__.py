@@ -39,7 +39,8 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     for module in (
         cameras, configuration, curves, end_to_end, estimators, features, gc_ransac, homography, learned, matching,
-        memory, paper, paper_times, pipelines, pruning, refinement, related, similar, speed, stress, sweep, thresholds, verify,
+        memory, paper, paper_times, pipelines, pruning, refinement, related, similar, speed, stress, sweep,
+        thresholds, verify,
     ):  # fmt: skip
         module.add_arguments(commands)
     arguments = parser.parse_args()

@@ -31,13 +31,18 @@ def add_arguments(commands: Any) -> None:
     parser.set_defaults(run=run)
 
 
+def images_of(root: Path) -> dict[tuple[str, int], Path]:
+    """The images of a set, by scene and number."""
+    return {(path.parents[1].name, int(path.stem)): path for path in sorted(root.glob("*/Images/*"))}
+
+
 def overlapping(root: Path) -> Iterator[tuple[str, Pair]]:
     """The pairs of a set with a true F, with their scene: those that `fmtorch pairs` would keep."""
+    images = images_of(root)
     scenes = (root / "pairs_which_dataset.txt").read_text().split()
     lines = (root / "pairs_with_gt.txt").read_text().splitlines()
-    for scene, line in zip(scenes, lines, strict=True):
-        images = root / scene / "Images"
-        yield f"{root.name}/{scene.strip('/')}", frozenset(images / f"{int(i):08d}.jpg" for i in line.split()[:2])
+    for scene, line in zip((scene.strip("/") for scene in scenes), lines, strict=True):
+        yield f"{root.name}/{scene}", frozenset(images[scene, int(number)] for number in line.split()[:2])
 
 
 def vectors_of(
@@ -59,7 +64,7 @@ def run(arguments: argparse.Namespace) -> None:
     torch.set_num_threads(1)
     console = Console()
     pairs = {pair: scene for root in arguments.root for scene, pair in overlapping(root)}
-    images = sorted(path for root in arguments.root for path in root.glob("*/Images/*.jpg"))
+    images = [path for root in sorted(arguments.root) for path in images_of(root).values()]
     pipeline: Pipeline = presets.pipeline(arguments.pipeline)
     options = (presets.pipeline_stages(arguments.pipeline) or {})["features"]
     book = None if arguments.codebook is None else load_codebook(arguments.codebook)

@@ -110,6 +110,7 @@ APPENDED = {
     ],
     "related": ["--limit", "1", "--unrelated", "1"],
     "learned": ["--limit", "1", "--cache", "kept", "--methods", "ratio", "LC, F", "DFE"],
+    "similar": ["--root", "DATA/Strecha"],
     "stress": ["--limit", "1", "--only", "noise"],
     "verify": ["--root", "DATA", "--scenes", "Strecha/a", "--features", "colmap", "--seeds", "1", "--mappers"],
     "speed": ["--pairs", "2", "--batch", "2", "--repeats", "1", "--matches", "200"],
