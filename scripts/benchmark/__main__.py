@@ -24,6 +24,7 @@ from scripts.benchmark import (
     pipelines,
     pruning,
     related,
+    scale,
     speed,
     stress,
     sweep,
@@ -37,7 +38,7 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     for module in (
         cameras, configuration, curves, end_to_end, estimators, features, gc_ransac, homography, learned, matching,
-        memory, paper, paper_times, pipelines, pruning, related, speed, stress, sweep, thresholds, verify,
+        memory, paper, paper_times, pipelines, pruning, related, scale, speed, stress, sweep, thresholds, verify,
     ):  # fmt: skip
         module.add_arguments(commands)
     arguments = parser.parse_args()
