@@ -83,7 +83,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     if len(todo) < len(own):
         earlier = f"{len(own) - len(todo)} of {len(own)} pairs taken from an earlier run in {folder.path}"
         console.print(earlier, markup=False, highlight=False)
-    table = folder.read({pair.key for pair in pairs})
+    table = folder.read({pair.key for pair in pairs}, without=("pair", "F"))
     if shard is not None and len(table) < len(pairs):
         console.print(f"{len(table)} of {len(pairs)} pairs have rows; other shards have the rest", highlight=False)
     if shard is not None and not len(table):  # of an empty shard, before the others

@@ -121,6 +121,10 @@ def _each(
     construction: Construction, execution: Execution, method: str, arguments: Iterable[tuple[object, ...]]
 ) -> Iterator[Any]:
     """The results of a method of the construction, in order, some of them computed ahead by workers."""
+    if execution.shared and execution.workers == 1:  # here, and none ahead
+        for given in arguments:
+            yield getattr(construction, method)(*given)
+        return
     results: dict[int, Any] = {}
     source: Source[Construction] = (
         Here(construction) if execution.shared else Recipe(functools.partial(_same, construction))

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+import pyarrow as pa
 from omegaconf import DictConfig
 from rich.progress import track
 
@@ -90,12 +91,29 @@ def run_folders(paths: Iterable[Path]) -> list[Path]:
 
 def named(folders: Sequence[RunFolder]) -> list[Run]:
     """The runs that hold results, under short names."""
-    held = [(folder, table) for folder in folders if (table := folder.read()).num_rows]
+    held = _merged([(folder, table) for folder in folders if (table := folder.read()).num_rows])
     if not held:
         raise RunFolderError("no run holds results yet; the command that began one continues it")
     configs = [{"pipeline": folder.path.name, **folder.config} for folder, _ in held]
     names = run_names(configs, [folder.identity for folder, _ in held], [_dataset(folder) for folder, _ in held])
     return [Run(name, folder, table) for name, (folder, table) in zip(names, held, strict=True)]
+
+
+def _merged(held: Sequence[tuple[RunFolder, pa.Table]]) -> list[tuple[RunFolder, pa.Table]]:
+    """Runs, with shards of one run, which have no pair in common, as one."""
+    runs: list[tuple[RunFolder, pa.Table]] = []
+    keys: list[set[int]] = []
+    for folder, table in held:
+        own = set(table["key"].to_pylist())
+        for i, (other, rows) in enumerate(runs):
+            if other.identity == folder.identity and not keys[i] & own:
+                runs[i] = other, pa.concat_tables([rows, table])
+                keys[i] |= own
+                break
+        else:
+            runs.append((folder, table))
+            keys.append(own)
+    return runs
 
 
 def _order(order: str | None, paths: Sequence[Path]) -> str:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
+import tempfile
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -19,7 +21,7 @@ from fmtorch.pipeline.database_pairs import Cameras
 from fmtorch.pipeline.verification_places import Places, log_of, opened, opened_files, parts_of
 from fmtorch.pipeline.verification_run import Estimation, Verification, VerificationRun
 from fmtorch.storage.exchange.colmap import imported
-from fmtorch.storage.exchange.database import MatchDatabase, expect_database, move_database
+from fmtorch.storage.exchange.database import MatchDatabase, copy_database, expect_database, move_database
 from fmtorch.storage.exchange.geometry_parts import GeometryParts
 
 ONE_THREAD = Execution("threads", 1)  # that calls an estimator, which uses as many as torch may
@@ -148,8 +150,13 @@ def verify_by(
         raise ValueError("database is missing; give the database of a COLMAP project: fmtorch verify database.db")
     imported()
     expect_database(path)
-    work, log = (path, None) if how.shard else opened(path, output, settings, how.force)
-    with MatchDatabase(work) as database:
+    with contextlib.ExitStack() as stack:
+        if how.shard is None:
+            work, log = opened(path, output, settings, how.force)
+        else:  # many machines may read it, and SQLite writes to what it opens
+            work, log = Path(stack.enter_context(tempfile.TemporaryDirectory())) / path.name, None
+            copy_database(path, work)
+        database = stack.enter_context(MatchDatabase(work))
         parts = parts_of(output or path, {**settings, **database.counts()}, how.shard)
         run = VerificationRun(database, log if how.force else None, how.shard, parts, again=how.force)
         run.each_batch(estimation, how.execution, report)

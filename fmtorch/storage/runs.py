@@ -139,13 +139,13 @@ class RunFolder:
         """The keys of the pairs that have a result."""
         return {int(key) for part in self._parts(["key"]) for key in part["key"].to_numpy()}
 
-    def read(self, keys: Collection[int] | None = None) -> pa.Table:
-        """The results, a row of `PAIR_SCHEMA` per pair: all of them, or those of the pairs with the given keys.
+    def read(self, keys: Collection[int] | None = None, without: Collection[str] = ()) -> pa.Table:
+        """The results, a row of `PAIR_SCHEMA` per pair, without some columns: all, or those of the given keys.
 
-        Of several rows of one pair the first written counts.
-        Raises RunFolderError naming a part that cannot be read.
+        Of several rows of one pair the first written counts. Raises RunFolderError naming a part that cannot be read.
         """
-        table = pa.concat_tables([PAIR_SCHEMA.empty_table(), *self._parts(PAIR_SCHEMA.names)])
+        names = [name for name in PAIR_SCHEMA.names if name not in without]
+        table = pa.concat_tables([PAIR_SCHEMA.empty_table().select(names), *self._parts(names)])
         stored_keys = table["key"].to_numpy()
         _, first = np.unique(stored_keys, return_index=True)
         if keys is not None:

@@ -25,6 +25,7 @@ from scripts.benchmark import (
     pruning,
     refinement,
     related,
+    scale,
     similar,
     speed,
     stress,
@@ -39,7 +40,7 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     for module in (
         cameras, configuration, curves, end_to_end, estimators, features, gc_ransac, homography, learned, matching,
-        memory, paper, paper_times, pipelines, pruning, refinement, related, similar, speed, stress, sweep,
+        memory, paper, paper_times, pipelines, pruning, refinement, related, scale, similar, speed, stress, sweep,
         thresholds, verify,
     ):  # fmt: skip
         module.add_arguments(commands)

@@ -107,6 +107,36 @@ def test_batch_and_workers_change_no_row(root: Path, tmp_path: Path) -> None:
     assert 4 <= int(computed[1]) <= 6  # two processes may come upon the same image at the same time
 
 
+def test_shards_are_one_run(root: Path, tmp_path: Path) -> None:
+    arguments = ["dataset=fmbench", f"dataset.root={root}", *OPTIONS, "workers=1"]
+    assert evaluate(*arguments, f"run_dir={tmp_path / 'whole'}", cwd=tmp_path).returncode == 0
+    first = evaluate(*arguments, f"run_dir={tmp_path / 'run'}", "shard=1/2", cwd=tmp_path)
+    assert first.returncode == 0, first.stderr
+    assert "2 of 5 pairs have rows; other shards have the rest" in first.stdout
+    second = evaluate(*arguments, f"run_dir={tmp_path / 'run'}", "shard=2/2", cwd=tmp_path)
+    assert "other shards" not in second.stdout
+    whole, merged = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("whole", "run"))
+    for group in (*whole.values(), *merged.values()):
+        del group["seconds"]
+    assert merged == whole
+    wrong = evaluate(*arguments, "shard=3/2", cwd=tmp_path)
+    assert wrong.stderr.strip() == "error: shard=3/2; it must be i/n with i from 1 to n: shard=2/8"
+
+
+def test_an_executor_of_ones_own_by_config_dir(root: Path, tmp_path: Path) -> None:
+    own = tmp_path / "my_conf" / "executor"
+    own.mkdir(parents=True)
+    (own / "mine.yaml").write_text("_target_: concurrent.futures.ThreadPoolExecutor\nmax_workers: 2\n")
+    arguments = ["--config-dir", str(tmp_path / "my_conf"), "dataset=fmbench", f"dataset.root={root}", *OPTIONS]
+    run = evaluate(*arguments, "executor=mine", f"run_dir={tmp_path / 'run'}", cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
+    assert len(rows(tmp_path / "run")) == 5
+    wrong = evaluate(*arguments, "executor=mine", "executor.max_workers=two", cwd=tmp_path)
+    assert wrong.returncode == 1
+    assert wrong.stderr.startswith("error: executor")
+    assert len(wrong.stderr.splitlines()) == 1
+
+
 def test_the_order_of_pruners_is_part_of_the_run(root: Path, tmp_path: Path) -> None:
     arguments = ["dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"run_dir={tmp_path / 'run'}", "limit=1"]
     first = evaluate(*arguments, "pruner=[one_to_one,ratio]", cwd=tmp_path)
