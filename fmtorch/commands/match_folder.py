@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from omegaconf import DictConfig
 
 from fmtorch import presets
+from fmtorch.core.executors import Team, WorkersLost
 from fmtorch.core.files import replacing
 from fmtorch.core.terminal import console, errors, progress_bars
 from fmtorch.data.images import read_image
@@ -25,6 +28,7 @@ from fmtorch.pipeline.folder_output import default_output, open_folder
 from fmtorch.pipeline.photograph_cameras import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pipeline.similar import similar_pairs, vectors_of
+from fmtorch.presets.executors import execution_of
 from fmtorch.presets.fields import Count, Device, Seed
 from fmtorch.storage.code import fmtorch_version
 from fmtorch.storage.exchange.export import export_kinds, write_exports
@@ -76,10 +80,10 @@ def match_folder(
     if len(images) > MEMORY and not isinstance(pipeline.extractor, CachedFeatures):  # none is computed twice
         pipeline.extractor = cached(pipeline.extractor, scratch)
     console.print(f"{' '.join([pipeline_name, *overrides])}: {folder}", style="italic", markup=False, highlight=False)
-    work = FolderMatches(
-        pipeline, journal, fields.longest_side, fields.orient, fields.seed, workers=fields.workers, cameras=cameras
-    )
-    with progress_bars() as progress:
+    with _team(config, fields, pipeline) as team, progress_bars() as progress:
+        work = FolderMatches(
+            pipeline, journal, fields.longest_side, fields.orient, fields.seed, **team, cameras=cameras
+        )
         if similar and vector is not None:
             seen = progress.track(work.images(images), len(images), description="images")
             pairs = similar_pairs(images, vectors_of(seen, vector), similar)
@@ -96,6 +100,31 @@ def match_folder(
     if isinstance(pipeline.extractor, CachedFeatures) and pipeline.extractor.cache.folder != scratch:
         console.print(pipeline.extractor.report(), style="dim", markup=False, highlight=False)
     return output
+
+
+@contextlib.contextmanager
+def _team(config: DictConfig, fields: FolderFields, pipeline: Pipeline) -> Iterator[dict[str, Any]]:
+    """Who does the work, as `FolderMatches` takes it. Raises WorkersLost where workers die or the scheduler is lost."""
+    execution = execution_of(config, fields.workers).decided(processes=False)
+    if execution.shared:
+        yield {"workers": execution.workers}
+        return
+    team = Team(execution, ("fmtorch.pipeline.folder",))
+    try:
+        executor = team.executor  # which tells how many workers it has
+        build = functools.partial(presets.build_pipeline, config, pipeline.device)
+        yield {"executor": executor, "workers": team.size, "build": build, "send_images": execution.send_images}
+    except BrokenExecutor as error:
+        raise WorkersLost(
+            "a worker process died, perhaps for want of memory: the same command goes on from here; fewer workers, or "
+            "executor=threads, need less of it"
+        ) from error
+    except Exception as error:
+        if (lost := team.lost(error)) is not None:
+            raise lost from error
+        raise
+    finally:
+        team.close()
 
 
 def _expect_some(work: FolderMatches, pairs: int) -> None:

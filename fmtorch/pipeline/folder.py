@@ -5,16 +5,16 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections import OrderedDict, deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+from fmtorch.core.recipes import Here, Recipe, Source
 from fmtorch.core.threads import available, one_thread
 from fmtorch.data.images import read_image
 from fmtorch.data.pairs import ImageSource
 from fmtorch.data.text_files import DataError
-from fmtorch.pipeline.build import Build, pipeline_of
 from fmtorch.pipeline.exporting import exported_image, exported_match
 from fmtorch.pipeline.folder_images import Pair, in_blocks
 from fmtorch.pipeline.photograph_cameras import PhotographCameras
@@ -27,22 +27,34 @@ AHEAD = 4  # pairs a worker that are begun before the first of them has ended
 MAX_WORKERS = 8  # by default: each holds an image and its scale space
 
 
-def described_image(source: Pipeline | Build, image: ImageSource, longest_side: int, orient: bool) -> Described:
+class Photograph(NamedTuple):
+    """An image to describe, as `read_image` and `describe` take it."""
+
+    image: ImageSource
+    longest_side: int
+    orient: bool
+
+
+class DescribedPair(NamedTuple):
+    """Two described images to match. names: of them, in the journal. known: `PhotographCameras.given`."""
+
+    ends: tuple[Described, Described]
+    names: tuple[str, str]
+    seed: int
+    known: Mapping[str, Any]
+
+
+def described_image(pipeline: Pipeline, photograph: Photograph) -> Described:
     """The features of an image file, by one thread."""
-    pipeline = pipeline_of(source)
     with one_thread(pipeline.device):
-        return describe(pipeline, read_image(image, orient=orient), longest_side)
+        return describe(pipeline, read_image(photograph.image, orient=photograph.orient), photograph.longest_side)
 
 
-def matched_pair(
-    source: Pipeline | Build, described0: Described, described1: Described, names: tuple[str, str], seed: int,
-    known: Mapping[str, Any],
-) -> ExportedPair:  # fmt: skip
-    """What a journal keeps of two images under these names, by one thread. known: `PhotographCameras.given`."""
-    pipeline = pipeline_of(source)
+def matched_pair(pipeline: Pipeline, pair: DescribedPair) -> ExportedPair:
+    """What a journal keeps of two images, by one thread."""
     with one_thread(pipeline.device):
-        result = relate(pipeline, described0, described1, seed, **known)
-    return exported_match(names, (described0, described1), result)
+        result = relate(pipeline, *pair.ends, pair.seed, **pair.known)
+    return exported_match(pair.names, pair.ends, result)
 
 
 @dataclasses.dataclass(eq=False)
@@ -77,8 +89,8 @@ class FolderMatches:
     """Matches pairs of images into a journal, which this process alone writes; what that has already is taken.
 
     executor: a `concurrent.futures.Executor` that does the work, not closed at the end; None: threads. workers: its
-    size; None: one a core, one for a GPU. build: makes the pipeline in the executor's processes; None: it has the same
-    one. cameras: of the images.
+    size; None: one a core, one for a GPU. build: makes the pipeline in other processes; None: threads share it.
+    send_images: as bytes, to workers that do not see the files. cameras: of the images.
 
     done, taken, related: pairs matched now, taken from the journal, and of either those that show one scene. troubles:
     what went wrong with images or pairs, which are tried again the next time.
@@ -86,12 +98,13 @@ class FolderMatches:
 
     def __init__(
         self, pipeline: Pipeline, journal: Journal, longest_side: int, orient: bool, seed: int, *,
-        executor: Executor | None = None, workers: int | None = None, build: Build | None = None,
-        cameras: PhotographCameras | None = None,
+        executor: Executor | None = None, workers: int | None = None, build: Callable[[], Pipeline] | None = None,
+        send_images: bool = False, cameras: PhotographCameras | None = None,
     ) -> None:  # fmt: skip
         self.pipeline, self.journal, self.cameras = pipeline, journal, cameras or PhotographCameras()
         self.longest_side, self.orient, self.seed = longest_side, orient, seed
-        self.executor, self.source = executor, build or pipeline
+        self.executor, self.send_images = executor, send_images
+        self.source: Source[Pipeline] = Here(pipeline) if build is None else Recipe(build)
         usual = min(available(), MAX_WORKERS) if pipeline.device.type == "cpu" else 1
         self.workers = usual if workers is None else workers
         self.done = self.taken = self.related = 0
@@ -171,15 +184,19 @@ class FolderMatches:
             known = self.cameras.given(begun.pair, [end.size for end in ends])
         except Exception as error:
             return _failed(error)
-        return executor.submit(matched_pair, self.source, *ends, names, self.seed, known)
+        pair = DescribedPair(ends, names, self.seed, known)
+        return executor.submit(self.source.call(matched_pair, True), pair)
 
     def _image(self, executor: Executor, image: Path) -> Future[Described]:
         """An image's features, begun unless they are there."""
         if image not in self._described:
             try:
-                arguments = self.source, self.cameras.source(image), self.longest_side, self.orient
-                self._described[image] = executor.submit(described_image, *arguments)
-            except DataError as error:  # no camera
+                source = self.cameras.source(image)
+                if self.send_images:
+                    source = dataclasses.replace(source, data=image.read_bytes())
+                photograph = Photograph(source, self.longest_side, self.orient)
+                self._described[image] = executor.submit(self.source.call(described_image, True), photograph)
+            except (DataError, OSError) as error:  # no camera, or no file
                 self._described[image] = _failed(error)
         self._described.move_to_end(image)
         while len(self._described) > MEMORY:

@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from fmtorch import presets
+from fmtorch.core.executors import Execution, Team
 from fmtorch.data.pairs import ImageSource
 from fmtorch.pipeline import folder
 from fmtorch.pipeline.folder import FolderMatches
@@ -30,7 +31,7 @@ class Recorded(Executor):
         self.error = error
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        self.calls.append(fn.__name__)
+        self.calls.append(fn.func.__name__)
         future: Future[Any] = Future()
         try:
             if self.error is not None:
@@ -41,10 +42,14 @@ class Recorded(Executor):
         return future
 
 
-@pytest.fixture
-def pipeline() -> Pipeline:
+def built() -> Pipeline:
     options = ["features.max_features=300", "estimator=lmeds", "estimator.hypotheses=30"]
     return presets.pipeline("sift_ratio", overrides=options)
+
+
+@pytest.fixture
+def pipeline() -> Pipeline:
+    return built()
 
 
 @pytest.fixture
@@ -86,6 +91,25 @@ def test_any_number_of_workers_and_any_executor_keep_the_same(
         for file, arrays in expected.items():
             for key, value in arrays.items():
                 np.testing.assert_array_equal(found[file][key], value)
+
+
+@pytest.mark.parametrize("send", [False, True])
+def test_processes_keep_the_same(pipeline: Pipeline, images: list[Path], tmp_path: Path, send: bool) -> None:
+    pairs = list(itertools.combinations(images[:4], 2))
+    list(work(pipeline, images, tmp_path / "threads").each(pairs))
+    team = Team(Execution("processes", 2), ("fmtorch.pipeline.folder",))
+    try:
+        options = {"executor": team.executor, "workers": 2, "build": built, "send_images": send}
+        matches = work(pipeline, images, tmp_path / "processes", **options)
+        list(matches.each(pairs))
+    finally:
+        team.close()
+    assert (matches.done, matches.troubles) == (6, [])
+    expected, found = kept(tmp_path / "threads"), kept(tmp_path / "processes")
+    assert found.keys() == expected.keys()
+    for file, arrays in expected.items():
+        for key, value in arrays.items():
+            np.testing.assert_array_equal(found[file][key], value)
 
 
 def test_no_image_is_described_twice(
