@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from fmtorch.geometry.cameras import fundamental_from_projections
 Array = NDArray[np.float64]
 Size = tuple[int, int]  # (h, w)
 MAX_OFF_CENTRE = 0.1  # of a principal point, in units of the side: those of reduced images are farther off
+_ZERO = np.zeros((3, 3))  # where there is no F
 
 
 def given(
@@ -56,32 +57,32 @@ def calibrated(
 
 def posed(
     identity: str, family: str, scene: str, images: tuple[ImageSource, ImageSource], K: tuple[Array, Array],
-    R: Array, t: Array,
+    R: Array, t: Array, matches: Callable[[], GivenMatches] | None = None,
 ) -> ImagePair:  # fmt: skip
-    """The same without F, which `with_fundamentals` adds."""
-    problem = None
-    if abs(np.linalg.det(K[0])) == 0 or abs(np.linalg.det(K[1])) == 0:
-        problem = "a calibration matrix is singular"
-    elif np.abs(R @ R.T - np.eye(3)).max() > 1e-2:
-        problem = "R is no rotation"
-    elif not t.any():
-        problem = "the cameras did not move apart (t is zero), which leaves no F"
-    return ImagePair(identity, family, scene, *images, np.zeros((3, 3)), *K, R, t, problem)
+    """The same, of which `with_fundamentals` finds F or the problem."""
+    return ImagePair(identity, family, scene, *images, _ZERO, *K, R, t, None, matches)
 
 
 def with_fundamentals(pairs: Sequence[ImagePair]) -> list[ImagePair]:
     """The pairs with the F of their cameras, all at once; those with a problem, or without a pose, as they are."""
     result = list(pairs)
-    places, first, second = list[int](), list[Array](), list[Array]()
-    for place, pair in enumerate(pairs):
-        if pair.problem is None and not (pair.K0 is None or pair.K1 is None or pair.R is None or pair.t is None):
-            places.append(place)
-            first.append(pair.K0 @ np.eye(3, 4))
-            second.append(pair.K1 @ np.column_stack([pair.R, pair.t]))
-    if places:
-        F = fundamental_from_projections(*(torch.from_numpy(np.stack(P)) for P in (first, second))).numpy()
-        for place, own in zip(places, F, strict=True):
-            result[place] = dataclasses.replace(pairs[place], F=own)
+    places = [i for i, p in enumerate(pairs) if p.problem is None and p.R is not None]
+    if not places:
+        return result
+    K0, K1, R, t = (np.stack([getattr(pairs[i], name) for i in places]) for name in ("K0", "K1", "R", "t"))
+    wrong = {
+        "the cameras did not move apart (t is zero), which leaves no F": ~t.any(1),
+        "R is no rotation": np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) > 1e-2,
+        "a calibration matrix is singular": (np.linalg.det(K0) == 0) | (np.linalg.det(K1) == 0),
+    }
+    problems: list[str | None] = [None] * len(places)
+    for problem, where in wrong.items():  # the last that holds counts
+        for i in np.flatnonzero(where):
+            problems[i] = problem
+    P0, P1 = K0 @ np.eye(3, 4), K1 @ np.concatenate([R, t[..., None]], -1)
+    F = fundamental_from_projections(torch.from_numpy(P0), torch.from_numpy(P1)).numpy()
+    for place, own, wrongly in zip(places, F, problems, strict=True):
+        result[place] = dataclasses.replace(pairs[place], F=own if wrongly is None else _ZERO, problem=wrongly)
     return result
 
 

@@ -64,8 +64,6 @@ def array(file: Any, key: str, *shape: int | None) -> NDArray[Any]:
 
     Raises DataError, naming file and key, where it is missing, damaged or of another shape.
     """
-    if not holds(file, key):
-        raise DataError(f"{_where(file, key)} is missing")
     try:
         entry = file[key]
         if not hasattr(entry, "shape"):
@@ -74,6 +72,8 @@ def array(file: Any, key: str, *shape: int | None) -> NDArray[Any]:
     except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
         if isinstance(error, DataError):
             raise
+        if not holds(file, key):
+            raise DataError(f"{_where(file, key)} is missing") from None
         raise DataError(f"{_where(file, key)} cannot be read ({_first_line(error)})") from error
     fits = len(values.shape) == len(shape) and all(
         want in (None, got) for want, got in zip(shape, values.shape, strict=True)

@@ -165,12 +165,12 @@ def _pair(family: str, folder: Path, key: str, cameras: _Cameras, images: Path |
         if cameras.by_image:
             (R0, t0), (R1, t1) = cameras.by_image[name0], cameras.by_image[name1]
             R = R1 @ R0.T
-            pair = posed(identity, family, scene, sources, (K0, K1), R, t1 - R @ t0)
-        else:
-            F = cameras.truth(key)
-            norm = float(np.linalg.norm(F))
-            problem = None if norm else f"{folder / TRUTH}: {key!r} is zero"
-            pair = ImagePair(identity, family, scene, *sources, F / (norm or 1.0), K0, K1, problem=problem)
+            matches = TutorialMatches(folder, key, sizes)
+            return posed(identity, family, scene, sources, (K0, K1), R, t1 - R @ t0, matches)
+        F = cameras.truth(key)
+        norm = float(np.linalg.norm(F))
+        problem = None if norm else f"{folder / TRUTH}: {key!r} is zero"
+        pair = ImagePair(identity, family, scene, *sources, F / (norm or 1.0), K0, K1, problem=problem)
     except DataError as error:
         unnamed = image(family, scene, key, images)
         return broken(identity, family, scene, sources or (unnamed, unnamed), str(error))
