@@ -17,16 +17,19 @@ from fmtorch.matching import nearest_kernels as compiled
 BLOCK = 128  # rows whose products with all columns exist at a time: 4 MB at 8,000 columns
 MAX_COMPUTED = 256  # exact distances a descriptor, beyond which rounding does not help: nearly equal ones
 MAX_LENGTH = 1 << 10  # of a descriptor: products stay below 2^24, exact in float32, and squared distances below FAR
+MAX_NORM = 2.0**25  # of a descriptor: differences fit 32 bits
 _RANGE = 255  # between the least and the largest 8-bit integer
 
 
 def two_nearest(rows: Tensor, columns: Tensor, block: int = BLOCK) -> compiled.Nearest | None:
     """Of integer-valued descriptors (n0, d), (n1, d), at most 2^25 in norm; None where rounding tells too few apart."""
     (n0, length), n1 = rows.shape, len(columns)
-    if length > MAX_LENGTH:
+    if not 1 <= length <= MAX_LENGTH:
         return None
     bounds = [value.item() for each in (rows, columns) for value in each.aminmax()]
     low, high = min(bounds), max(bounds)
+    if not max(-low, high) <= MAX_NORM:  # squares that overflow leave no sound scale
+        return None
     whole = high - low <= _RANGE
     center, step = (low + 128, 1.0) if whole else ((low + high) / 2, (high - low) / _RANGE)
     padded = -(-n1 // compiled.GROUP) * compiled.GROUP

@@ -132,7 +132,8 @@ def _integers(d0: Tensor, d1: Tensor) -> tuple[Tensor, Tensor, float]:
     whole = bool((d0 == d0.round()).all() and (d1 == d1.round()).all())
     if whole and longest <= _FLOAT32_NORM:
         return d0.float(), d1.float(), 1.0
-    exponent = math.frexp(_FLOAT64_NORM / longest)[1] - 1  # a power of two, so that scaling is exact
+    ratio = _FLOAT64_NORM / longest if longest > 0 else 1.0  # squares below 1e-323 are zero, and so is all that is left
+    exponent = math.frexp(ratio)[1] - 1  # a power of two, so that scaling is exact
     scale = 2.0 ** min(exponent, 1000)
     return (d0.double() * scale).round(), (d1.double() * scale).round(), 1.0 / scale
 

@@ -83,3 +83,15 @@ def test_long_descriptors_are_left_to_floating_point() -> None:
     rows, columns, _ = nearest._integers(d, d)
     assert eight_bit.two_nearest(rows, columns) is None
     assert nearest_neighbors(d, d).nearest.tolist() == list(range(20))
+
+
+@pytest.mark.parametrize("scale", [1e-200, 1e100, 1e200, 1e300])
+def test_values_whose_squares_overflow_harm_nothing(scale: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    d0, d1 = scale * unit(1, 90).double(), scale * unit(2, 80).double()
+    assert torch.equal(nearest_neighbors(d0, d1).nearest, without_rounding(monkeypatch, d0, d1).nearest)
+
+
+def test_descriptors_without_components_are_equal() -> None:
+    found = nearest_neighbors(torch.zeros(3, 0), torch.zeros(2, 0))
+    assert found.nearest.tolist() == [0, 0, 0]
+    assert found.reverse.tolist() == [0, 0]
