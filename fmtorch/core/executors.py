@@ -109,7 +109,10 @@ class Team:
     def _started(self) -> Executor:
         execution = self.execution
         if execution.make is not None:
-            made = execution.make()
+            try:
+                made = execution.make()
+            except Exception as error:  # of anybody's code
+                raise ValueError(f"executor: it cannot be made ({type(error).__name__}: {error})") from error
             if not isinstance(made, Executor):
                 raise ValueError(f"executor: {type(made).__name__} is no concurrent.futures.Executor")
             self.size = execution.workers or int(getattr(made, "_max_workers", 0)) or self.size
