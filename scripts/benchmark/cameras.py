@@ -7,7 +7,7 @@ methods get the same SIFT matches; P(inlier) and noise from the keypoints' frame
 thread; the methods take turns at each pair.
 
 python -m scripts.benchmark cameras --root DATA/Strecha --root DATA/PhotoTourism --root DATA/KITTI --root DATA/TUM \\
-    --specs scripts/benchmark/cameras.txt --seeds 3 --rows rows.jsonl --update docs/cameras_benchmark.md
+    --specs scripts/benchmark/cameras.txt --seeds 3 --rows rows.jsonl --update docs/appendix/cameras.md
 python -m scripts.benchmark cameras --root DATA/Strecha_train --root DATA/TanksLike --methods fmtorch:known
 
 The second command is of the scenes that thresholds are chosen on. --rows is appended to pair by pair: started again,

@@ -6,7 +6,7 @@ method begins with the same database without geometries, on one thread, reading 
 a prior focal length. Then the incremental and the global mapper, whose poses are compared with the true ones; images
 that are not registered count as wrong. Rows are kept in --work: an interrupted run goes on where it stopped.
 
-python -m scripts.benchmark verify --root DATA --work runs/verify --markdown docs/verify.md
+python -m scripts.benchmark verify --root DATA --work runs/verify --markdown docs/appendix/verify.md
 """
 
 from __future__ import annotations
