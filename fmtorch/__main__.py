@@ -10,6 +10,7 @@ from fmtorch.core.version import __version__
 
 COMMANDS = {
     "eval": "run a pipeline over a data set of image pairs and evaluate it",
+    "list": "the presets there are, of all groups or of one: fmtorch list estimator",
     "match": "the fundamental matrix of two photographs, with pictures: fmtorch match a.jpg b.jpg",
     "pairs": "which pairs of images with known cameras can be matched, as a data set",
     "report": "compare runs of eval on one HTML page",
@@ -37,7 +38,6 @@ def main() -> None:
         sys.argv[1:] = rest
         if sys.path[0] != os.getcwd():  # where a user's own parts are found, as by `python -m`
             sys.path.insert(0, os.getcwd())
-        module = f"fmtorch.{name.replace('-', '_')}"
         module = f"fmtorch.{name.replace('-', '_')}"
         runpy.run_module(module, run_name="__main__", alter_sys=True)  # as the process's own main module
     else:

@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from fmtorch.presets.files import summary
+
 ROOT = Path(__file__).resolve().parents[1]
 CONF, PAGES = ROOT / "conf", ROOT / "docs" / "reference"
 
@@ -65,17 +67,6 @@ def default(option: Option) -> str:
     if option.default == "???":
         return "to be given"
     return f"`{option.default}`" if option.default else ""
-
-
-def summary(path: Path) -> str:
-    """The first sentence of the comment at the top of a preset."""
-    lines = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        if not line.startswith("#"):
-            break
-        if not line.startswith("# @package"):
-            lines.append(line.removeprefix("#").strip())
-    return re.split(r"(?<!al)\.(?=\s|$)", " ".join(lines))[0]
 
 
 def sentence(words: str) -> str:

@@ -24,6 +24,22 @@ def available(group: str, config_dir: Path | str | None = None) -> list[str]:
     return sorted({path.stem for folder in [*folders, conf_dir() / group] for path in folder.glob("*.yaml")})
 
 
+def groups() -> list[str]:
+    """Names of the groups of presets."""
+    return sorted(path.name for path in conf_dir().iterdir() if any(path.glob("*.yaml")) and path.name != "hydra")
+
+
+def summary(path: Path) -> str:
+    """The first sentence of the comment at the top of a preset file."""
+    lines = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if not line.startswith("#"):
+            break
+        if not line.startswith("# @package"):
+            lines.append(line.removeprefix("#").strip())
+    return re.split(r"(?<!al)\.(?=\s|$)", " ".join(lines))[0]
+
+
 def load(group: str, name: str, config_dir: Path | str | None = None) -> dict[str, Any]:
     """The contents of one preset file; files in `config_dir` come before the project's own.
 

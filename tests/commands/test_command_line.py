@@ -12,9 +12,10 @@ from pathlib import Path
 import pytest
 
 import fmtorch.__main__
+from fmtorch.commands import list as list_presets
 from fmtorch.commands import warm_up
 from fmtorch.commands.overrides import hydra_arguments
-from fmtorch.presets import top_level_names
+from fmtorch.presets import available, top_level_names
 from tests.conftest import own_cache
 from tests.pipeline.test_pipeline import draw
 
@@ -34,7 +35,7 @@ def test_help_lists_the_commands_without_torch() -> None:
         "from fmtorch.__main__ import main\n"
         "sys.argv = ['fmtorch', '--help']\n"
         "with contextlib.redirect_stdout(io.StringIO()) as told: main()\n"
-        "names = ('eval', 'match', 'pairs', 'report', 'train', 'verify', 'warm-up')\n"
+        "names = ('eval', 'list', 'match', 'pairs', 'report', 'train', 'verify', 'warm-up')\n"
         "assert all(f'  {name} ' in told.getvalue() for name in names)\n"
         "assert not {'torch', 'hydra', 'numpy'} & set(sys.modules)"
     )
@@ -53,7 +54,7 @@ def test_a_subcommand_runs_as_its_module_does(tmp_path: Path, monkeypatch: pytes
     options = {"run_name": "__main__", "alter_sys": True}
     assert called == [(("fmtorch.eval",), options, ["/usr/bin/fmtorch", "-m", "seed=1,2"], str(tmp_path))]
     monkeypatch.setattr(sys, "argv", ["fmtorch", "evaluate"])
-    there = "eval, match, pairs, report, train, verify, warm-up"
+    there = "eval, list, match, pairs, report, train, verify, warm-up"
     with pytest.raises(SystemExit, match=f"error: no command 'evaluate'; there are: {there}"):
         fmtorch.__main__.main()
 
@@ -272,3 +273,16 @@ def test_warm_up_compiles_what_is_registered(
     monkeypatch.setenv("FMTORCH_KERNELS", "off")
     with pytest.raises(SystemExit, match="kernels are switched off"):
         warm_up.main()
+
+
+def test_list_names_every_preset_with_what_it_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["fmtorch list", "estimator", "pruner"])
+    list_presets.main()
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]
+    assert [line.split()[0] for line in lines] == [*available("estimator"), *available("pruner")]
+    assert all(len(line.split()) > 2 for line in lines)
+    monkeypatch.setattr(sys, "argv", ["fmtorch list", "estimators"])
+    with pytest.raises(SystemExit, match="error: no group 'estimators'; there are: estimator"):
+        list_presets.main()

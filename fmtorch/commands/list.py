@@ -1,0 +1,38 @@
+"""`fmtorch list [GROUP ...]`: the presets that there are, with what each is."""
+
+from __future__ import annotations
+
+import sys
+
+from fmtorch.core.options import nearest
+from fmtorch.core.resources import conf_dir
+from fmtorch.core.terminal import console, exits_with_message
+from fmtorch.presets.files import available, groups, summary
+
+USAGE = """fmtorch list: the presets of all groups, or of some
+
+usage: fmtorch list [GROUP ...]
+
+groups: """
+
+
+def listed(group: str) -> list[str]:
+    """A line for each preset of a group: name, and the first sentence of its file. Raises ValueError for no group."""
+    if group not in groups():
+        raise ValueError(f"no group {group!r}; there are: {nearest(group, groups())}")
+    names = available(group)
+    width = max(map(len, names))
+    return [f"  {name:{width}}  {summary(conf_dir() / group / f'{name}.yaml')}" for name in names]
+
+
+def main() -> None:
+    """The command."""
+    if {"--help", "-h"} & set(sys.argv[1:]):
+        print(USAGE + ", ".join(groups()))
+        return
+    with exits_with_message():
+        for group in sys.argv[1:] or groups():
+            lines = listed(group)
+            console.print(group, style="bold", highlight=False)
+            for line in lines:
+                console.print(line, highlight=False, soft_wrap=True)
