@@ -22,6 +22,7 @@ from torch import Tensor
 
 from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.batches import for_each_pair, kernels_serve
+from fmtorch.compiling.kernel import Kernel
 from fmtorch.core.checks import checked
 from fmtorch.core.streams import Stream, mixed_seed
 from fmtorch.geometry.arithmetic import sqrt
@@ -151,7 +152,7 @@ def _mean_distance(
         return (d0 / unit0[:, None] + d1 / unit1[:, None]) / 2, accepted
 
     if kernels_serve(pairs.F_gt, pairs.F_est, pairs.size0, pairs.size1):
-        total, count = _compiled_sums(unit, pairs, samples, seed)
+        total, count = compiled_sums(compiled.accepted_draws, unit, pairs, samples, seed)
     else:
         total, count = sum_of_draws(pairs, draw, samples=samples, seed=seed)
     diagonal0, diagonal1 = diagonal(pairs.size0), diagonal(pairs.size1)
@@ -160,20 +161,21 @@ def _mean_distance(
     return (torch.minimum(value, worst) if cap else value).reshape(shape).to(F_est.dtype)
 
 
-def _compiled_sums(
-    unit: Callable[[Tensor], Tensor], pairs: Pairs, samples: int, seed: int
+def compiled_sums(
+    draws: Kernel[..., None], unit: Callable[[Tensor], Tensor], pairs: Pairs, samples: int, seed: int
 ) -> tuple[Float[Tensor, " b"], Float[Tensor, " b"]]:
-    """Sum and number of the accepted draws of each pair, by the kernel."""
+    """Sum and number of the accepted draws of each pair, by a kernel of `nsgd_kernels`."""
     expect_samples(samples)
     units = torch.stack([unit(diagonal(size)) for size in (pairs.size0, pairs.size1)], -1)
     tensors = (pairs.F_gt, pairs.F_est, pairs.size0, pairs.size1, units, pairs.key[:, None])
-    constants = (mixed_seed(seed, Stream.METRIC), samples)
+    constants = (draws, mixed_seed(seed, Stream.METRIC), samples)
     out = torch.empty(len(units), 2, dtype=torch.float64)
     terms = for_each_pair(_into, tensors, *constants, out=out, kind=torch.float64)
     return terms[:, 0], terms[:, 1]
 
 
 def _into(
-    F_gt: Array, F_est: Array, size0: Array, size1: Array, unit: Array, key: Array, seed: int, samples: int, out: Array
-) -> None:
-    compiled.accepted_draws(compiled.Comparison(F_gt, F_est, size0, size1, unit), int(key[0]), seed, samples, out)
+    F_gt: Array, F_est: Array, size0: Array, size1: Array, unit: Array, key: Array, draws: Kernel[..., None], seed: int,
+    samples: int, out: Array,
+) -> None:  # fmt: skip
+    draws(compiled.Comparison(F_gt, F_est, size0, size1, unit), int(key[0]), seed, samples, out)

@@ -1,4 +1,4 @@
-"""`nsgd` for one pair, compiled: the same draws and the same sums."""
+"""`nsgd` and `nsgd_released` for one pair, compiled: the same draws and the same sums."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from fmtorch.compiling.scratch import vector
 
 BLOCK, TRIES, COLUMNS, PARALLEL = 128, 10, 6, 1e-12  # as in `draws`
 BORDER, NORMAL_FLOOR = -0.5, 1e-12  # as in `nsgd`
+RELEASED_BORDER, NORMAL_OFFSET = 0.5, 1e-10  # as in `nsgd_released`
 
 
 class Comparison(NamedTuple):
@@ -53,13 +54,54 @@ def accepted_draws(pair: Comparison, key: int, mixed_seed: int, samples: int, ou
     out[0], out[1] = total, count
 
 
+@kernel
+def released_draws(pair: Comparison, key: int, mixed_seed: int, samples: int, out: F8x1) -> None:
+    """`draws.sum_of_draws` of a pair with the draws of `nsgd_released` -> out (2,); unit: the diagonals, pixels."""
+    F_gt, F_est, size0, size1, unit = pair
+    state = stream_state(mixed_seed, key)
+    u, values = vector(COLUMNS), vector(BLOCK)
+    total, count = 0.0, 0
+    for start in range(0, TRIES * samples, BLOCK):
+        draws = min(BLOCK, TRIES * samples - start)
+        for draw in range(draws):
+            for column in range(COLUMNS):
+                u[column] = uniform(state, (start + draw) * COLUMNS + column)
+            a0, a1, hits_a = _released_half(F_gt, F_est, size0, size1, u[:3])
+            b1, b0, hits_b = _released_half(F_est, F_gt, size1, size0, u[3:])
+            taken = hits_a and hits_b and count < samples
+            first, second = (a0 / unit[0] + a1 / unit[1]) / 2, (b1 / unit[1] + b0 / unit[0]) / 2
+            values[draw] = (first + second) / 2 if taken else 0.0
+            count += taken
+        total += _tree_sum(values, draws)
+        if count >= samples:
+            break
+    out[0], out[1] = total, count
+
+
+@inner
+def _released_half(F: Array, other: Array, size0: Array, size1: Array, u: Array) -> tuple[float, float, bool]:
+    """`_half_draw` as the released evaluator has it."""
+    x0, y0 = float(round(u[0] * size0[1])), float(round(u[1] * size0[0]))
+    a, b = F[0, 0] * x0 + F[0, 1] * y0 + F[0, 2], F[1, 0] * x0 + F[1, 1] * y0 + F[1, 2]
+    c = F[2, 0] * x0 + F[2, 1] * y0 + F[2, 2]
+    left, _, right, _, hits = _segment_in_image(a, b, c, size1, RELEASED_BORDER)
+    x1 = left + u[2] * (right - left)
+    y1 = -(a * x1 + c) / b
+    a1, b1 = other[0, 0] * x0 + other[0, 1] * y0 + other[0, 2], other[1, 0] * x0 + other[1, 1] * y0 + other[1, 2]
+    c1 = other[2, 0] * x0 + other[2, 1] * y0 + other[2, 2]
+    a0, b0 = other[0, 0] * x1 + other[1, 0] * y1 + other[2, 0], other[0, 1] * x1 + other[1, 1] * y1 + other[2, 1]
+    c0 = other[0, 2] * x1 + other[1, 2] * y1 + other[2, 2]
+    d0 = abs(a0 * x0 + b0 * y0 + c0) / (math.sqrt(a0 * a0 + b0 * b0) + NORMAL_OFFSET)
+    return d0, abs(a1 * x1 + b1 * y1 + c1) / (math.sqrt(a1 * a1 + b1 * b1) + NORMAL_OFFSET), hits
+
+
 @inner
 def _half_draw(F: Array, other: Array, size0: Array, size1: Array, u: Array) -> tuple[float, float, bool]:
     """A match exact for F, its distances from the other matrix's lines in images 0 and 1, and whether it counts."""
     x0, y0 = u[0] * size0[1] + BORDER, u[1] * size0[0] + BORDER
     a, b = F[0, 0] * x0 + F[0, 1] * y0 + F[0, 2], F[1, 0] * x0 + F[1, 1] * y0 + F[1, 2]
     c = F[2, 0] * x0 + F[2, 1] * y0 + F[2, 2]
-    left, top, right, bottom, hits = _segment_in_image(a, b, c, size1)
+    left, top, right, bottom, hits = _segment_in_image(a, b, c, size1, BORDER)
     x1, y1 = left + u[2] * (right - left), top + u[2] * (bottom - top)
     a1, b1 = other[0, 0] * x0 + other[0, 1] * y0 + other[0, 2], other[1, 0] * x0 + other[1, 1] * y0 + other[1, 2]
     c1 = other[2, 0] * x0 + other[2, 1] * y0 + other[2, 2]
@@ -69,10 +111,12 @@ def _half_draw(F: Array, other: Array, size0: Array, size1: Array, u: Array) -> 
 
 
 @inner
-def _segment_in_image(a: float, b: float, c: float, size: Array) -> tuple[float, float, float, float, bool]:
+def _segment_in_image(
+    a: float, b: float, c: float, size: Array, border: float
+) -> tuple[float, float, float, float, bool]:
     """`draws.segment_in_image` of a line: x and y of its end points, and whether there are any."""
     half_h, half_w = size[0] / 2, size[1] / 2
-    centre_x, centre_y = half_w + BORDER, half_h + BORDER
+    centre_x, centre_y = half_w + border, half_h + border
     squared = a * a + b * b
     scale = 1 / math.sqrt(squared) if squared != 0 else 0.0
     if a > 0 if abs(b * scale) < PARALLEL else b < 0:

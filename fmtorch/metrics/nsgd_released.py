@@ -16,10 +16,13 @@ import torch
 from jaxtyping import Float, Int, Real
 from torch import Tensor
 
+from fmtorch.compiling.batches import kernels_serve
 from fmtorch.core.checks import checked
 from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.geometry.epipolar import lines_through
+from fmtorch.metrics import nsgd_kernels as compiled
 from fmtorch.metrics.draws import Pairs, diagonal, segment_in_image, sum_of_draws
+from fmtorch.metrics.nsgd import compiled_sums
 
 BORDER = 0.5  # left and top edge of the first pixel where pixels count from 1
 NORMAL_OFFSET = 1e-10
@@ -43,7 +46,10 @@ def nsgd_released(
     the evaluator never measures those and counts them as misses. Not differentiable; `nsgd` is.
     """
     pairs, shape = Pairs.flatten(F_gt, F_est, size0, size1, key)
-    total, _ = sum_of_draws(pairs, released_draw, samples=samples, seed=seed)
+    if kernels_serve(pairs.F_gt, pairs.F_est, pairs.size0, pairs.size1):
+        total, _ = compiled_sums(compiled.released_draws, torch.clone, pairs, samples, seed)
+    else:
+        total, _ = sum_of_draws(pairs, released_draw, samples=samples, seed=seed)
     value = (total / samples).clamp(max=1.0)
     failed = ~pairs.F_est.isfinite().all(-1).all(-1) | (pairs.F_est == 0).all(-1).all(-1)
     return torch.where(failed | value.isnan(), 1.0, value).reshape(shape).to(F_est.dtype)

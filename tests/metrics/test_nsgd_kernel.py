@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from fmtorch.compiling import switch
-from fmtorch.metrics import nsgd, sgd
+from fmtorch.metrics import nsgd, nsgd_released, sgd
 from tests.metrics.test_nsgd import HD, VGA, columns_shifted, random_pairs, rows_shifted
 
 pytest.importorskip("numba", reason="numba is not installed")
@@ -38,6 +38,18 @@ def test_both_forms_are_alike(samples: int, cap: bool, monkeypatch: pytest.Monke
             # The same sums of the same terms, but torch's roots of float64 are not always correctly rounded. Distances
             # of 1e3 px are differences of terms of 1e3; those below are rounding of such.
             torch.testing.assert_close(compiled, tensors, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("samples", [1, 100, 1000])
+def test_both_forms_of_the_released_figure_are_alike(samples: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    F_gt, F_est = matrices()
+    key = torch.arange(len(F_gt)) * 77 - 500
+    for sizes in ((HD, HD), (VGA, HD)):
+        monkeypatch.setenv(switch.SWITCH, "on")
+        compiled = nsgd_released(F_gt, F_est, *sizes, samples=samples, seed=3, key=key)
+        monkeypatch.setenv(switch.SWITCH, "off")
+        tensors = nsgd_released(F_gt, F_est, *sizes, samples=samples, seed=3, key=key)
+        torch.testing.assert_close(compiled, tensors, rtol=1e-9, atol=1e-12)
 
 
 def test_gradients_take_the_tensor_form() -> None:
