@@ -15,6 +15,7 @@ from fmtorch.core.grey_pyramid import GreyPyramid
 from fmtorch.core.stages import PairImages
 from fmtorch.core.threads import mapped
 from fmtorch.core.types import Correspondences
+from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.pruning import refine_matches_kernels as compiled
 from fmtorch.pruning.neighbour_maps_kernels import neighbour_maps
 from fmtorch.pruning.window_kernels import Pyramid
@@ -129,7 +130,7 @@ class RefineMatches:
         if prior is None:
             return 1.0
         P = prior.detach()[pair, index]
-        return torch.where(torch.isfinite(P), P, 1).clamp_min(MIN_PRIOR).sqrt().sqrt().reciprocal()
+        return sqrt(sqrt(torch.where(torch.isfinite(P), P, 1).clamp_min(MIN_PRIOR))).reciprocal()
 
 
 def _frame_maps(lafs0: Array, lafs1: Array) -> tuple[Array, Array]:

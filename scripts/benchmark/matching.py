@@ -42,13 +42,13 @@ def sift_like(seed: int, n: int) -> Descriptors:
 def rootsift_like(seed: int, n: int) -> Descriptors:
     """Square roots of histograms."""
     values = sift_like(seed, n)
-    return np.sqrt(values / values.sum(1, keepdims=True))
+    return np.asarray(np.sqrt(values / values.sum(1, keepdims=True)))
 
 
 def unit(seed: int, n: int) -> Descriptors:
     """Directions at random, as far from one another as a network's descriptors ever are."""
     values = np.random.default_rng(seed).normal(size=(n, 128)).astype(np.float32)
-    return values / np.linalg.norm(values, axis=1, keepdims=True)
+    return np.asarray(values / np.linalg.norm(values, axis=1, keepdims=True))
 
 
 KINDS = {"SIFT-like": sift_like, "RootSIFT-like": rootsift_like, "unit vectors": unit}

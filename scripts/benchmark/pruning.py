@@ -122,6 +122,8 @@ def rows(front: Pipeline, pair: ImagePair, methods: dict[str, list[Any]]) -> Ite
 def pruned_by(outcome: Outcome, pruners: list[Any], pipeline: Pipeline) -> Outcome:
     """The outcome after more pruners; those that look at images ask the pipeline for them."""
     c = outcome.correspondences
-    for pruner in pruners if c is not None else []:
+    if c is None:
+        return outcome
+    for pruner in pruners:
         c = pruned(pruner, c, lambda _: pipeline.images(outcome.pair)).compact()
     return dataclasses.replace(outcome, correspondences=c)

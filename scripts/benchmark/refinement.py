@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from fmtorch import presets
-from fmtorch.core.stages import pruned
+from fmtorch.core.stages import PairImages, pruned
 from fmtorch.data import ImagePair
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.run import select
@@ -69,8 +70,8 @@ def run(arguments: argparse.Namespace) -> None:
         distance = np.array([[exactness(o) for o in some] for some in (before, after)]).T
         for estimator in arguments.estimators:
             whole.estimator = presets.build("estimator", estimator)
-            figures = [np.array([nsgd(whole, o, seed) for seed in range(arguments.seeds)]) for o in (before, after)]
-            lines += rows(f"`{name}`, {estimator}", kept, Measured(*figures, distance, ms))
+            without, refined = (np.array([nsgd(whole, o, i) for i in range(arguments.seeds)]) for o in (before, after))
+            lines += rows(f"`{name}`, {estimator}", kept, Measured(without, refined, distance, ms))
     sheet = Sheet(f"With {STAGE} and without, {arguments.seeds} seeds", COLUMNS, lines)
     console.print(sheet.terminal())
     if arguments.markdown:
@@ -90,11 +91,15 @@ def stages(
             continue
         images = whole.images(pair)
         start = time.process_time()
-        refined = pruned(stage, c, lambda _, images=images: images)
+        refined = pruned(stage, c, functools.partial(_same, images))
         ms.append((time.process_time() - start) * 5e5 / int(c.count()))
         before.append(outcome)
         after.append(dataclasses.replace(outcome, correspondences=refined))
     return [outcome.pair for outcome in before], before, after, np.array(ms)
+
+
+def _same(images: PairImages, _: int) -> PairImages:
+    return images
 
 
 def exactness(outcome: Outcome) -> float:

@@ -101,7 +101,7 @@ COUNT = "it must be a whole number of at least 1"
         ("eval batch=0", f"batch=0; {COUNT}"),
         ("eval batch=true", f"batch=true; {COUNT}"),
         ("eval workers=-2", f"workers=-2; {COUNT} or null"),
-        ("eval executor=mpi", "no preset 'mpi' in executor; there are: auto, dask, processes, threads"),
+        ("eval executor=mpi", "no preset 'mpi' in executor; there are: "),
         ("eval executor=dask processes=true", "processes=true and executor=dask differ; give one of them"),
         ("eval executor.workers=2 workers=3", "workers=3 and executor.workers=2 differ; give one of them"),
         ("eval executor=dask executor.workers=0", f"executor.workers=0; {COUNT} or null"),

@@ -69,7 +69,7 @@ def test_poses_are_shown_where_a_run_has_them() -> None:
     figures = dict(zip(table.head[1:], (cell.text for cell in table.rows["with"]), strict=True))
     # To 4 degrees a triangle up to the first of the four pairs, then 6 at 1.
     assert figures["AUC@10°"] == "65.0"
-    assert (figures["mAA(10°)"], figures["mAP@10°"], figures["t error"]) == ("70.0", "100.0", "4.00°")
+    assert (figures["mAA(10°)"], figures["mAP@10°"], figures["t error, folded"]) == ("70.0", "100.0", "4.00°")
     assert {cell.text for cell in table.rows["without"]} == {"–"}
     page = render("Poses", [Section("set", runs)], [])
     assert "Relative pose" in page

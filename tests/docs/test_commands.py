@@ -45,7 +45,7 @@ ELSEWHERE = {
     r"convert_ngransac": "needs the authors' weights; tests/pruning/networks/test_files.py runs it on others",
     r"benchmark homography": "needs a folder of photographs; tests/estimators/families/test_homography.py warps one",
     r"benchmark configuration": "needs photographs; tests/scripts/test_benchmark_configuration.py runs it on some",
-    r"^dask (scheduler|worker)": "tests/evaluation/test_executors.py runs a cluster",
+    r"\bdask (scheduler|worker)\b": "tests/evaluation/test_executors.py runs a cluster",
     r"--contrib-python": "needs a Python with opencv-contrib",
     r"--config-dir my_conf (pruner|pipeline)=": "tests/training/test_train_command.py runs these files and commands",
     r"dataset=(tum|kitti|colmap|bundler|fmbench dataset\.root=KITTI)": "tests/data runs these on data of their layout",

@@ -82,7 +82,8 @@ def refined(
         low, high = corners.min(0), corners.max(0)
         if sample(levels1[k1], *low) is None or sample(levels1[k1], *high) is None:
             break
-        V = np.array([sample(levels1[k1], *(point + M @ g))[0] for g in grid])
+        samples = [sample(levels1[k1], *(point + M @ g)) for g in grid]
+        V = np.array([value[0] for value in samples if value is not None])
         T, dV = J[:, 1] - mean, V - w @ V
         correlation = (w @ (T * dV)) / math.sqrt(w @ T**2) / max(math.sqrt(w @ dV**2), MIN_CONTRAST)
         b = J.T @ (w * V)
@@ -100,4 +101,4 @@ def refined(
         M = M @ np.linalg.inv(B)
         point = point - M @ d
         short = iteration > 0 and abs(d).sum() < CONVERGED
-    return None if first is None else (first, best)
+    return None if first is None or best is None else (first, best)

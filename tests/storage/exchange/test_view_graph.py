@@ -27,10 +27,11 @@ def test_of_a_journal(tmp_path: Path) -> None:
         image.write_text(image.name)
     journal = Journal(tmp_path / "export", tmp_path)
     matches, scores, inliers = np.zeros((3, 2), np.int32), np.ones(3, np.float32), np.array([True, True, False])
-    given = ExportedPair("a.png", "b.png", matches, scores, inliers, np.eye(3), True, 12.5, "planar")
+    found = {"significance": 12.5, "configuration": "planar"}
+    given = ExportedPair("a.png", "b.png", matches, scores, inliers, np.eye(3), **found)
     journal.add_pair(*images[:2], given)
     journal.add_pair(images[0], images[2], ExportedPair(
-        "a.png", "c.png", matches, scores, ~inliers, np.zeros((3, 3)), False, -math.inf))  # fmt: skip
+        "a.png", "c.png", matches, scores, ~inliers, np.zeros((3, 3)), False, significance=-math.inf))  # fmt: skip
     pairs = [(images[0], images[1]), (images[0], images[2]), (images[1], images[2])]
     graph = view_graph(journal, images, pairs)
     assert graph.images == ("a.png", "b.png", "c.png")
