@@ -34,7 +34,7 @@ from fmtorch.storage.exchange.export import export_kinds, write_exports
 from fmtorch.storage.exchange.journal import Journal
 from fmtorch.storage.features import CachedFeatures
 
-MIN_PAIRS_FOR_PROCESSES = 500  # below which processes are not worth their start
+MIN_PAIRS_FOR_PROCESSES = 1000  # of given matches: 11.3 s by one thread, 10.6 by two processes, start included
 
 
 @dataclasses.dataclass(frozen=True)
