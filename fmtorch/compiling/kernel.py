@@ -204,16 +204,16 @@ def _compiled(made: Kernel[P, R], count: str) -> tuple[Callable[P, R], list[Kern
     if not hasattr(dispatcher, "compile"):
         return function, []  # NUMBA_DISABLE_JIT=1
 
-    told: list[str] = []
+    announced: list[str] = []
 
     def tell(where: str) -> None:
         messages.begun(function.__name__, where, count)
-        told.append(where)
+        announced.append(where)
 
     file = dispatcher._cache = cache.KernelFile(cache.path(function, made.version), tell)
     with _no_garbage_collection():
         dispatcher.compile(made.signature)
-    if told:
+    if announced:
         messages.ended()
     dispatcher.disable_compile()
     (result,) = dispatcher.overloads.values()

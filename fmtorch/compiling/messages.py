@@ -10,7 +10,7 @@ import sys
 
 QUIET = "FMTORCH_COMPILES_QUIETLY"  # set for a process that helps another one, which speaks for both
 _CLEAR = "\r\x1b[K"
-_state = {"told": False}
+_state = {"announced": False}
 
 
 def begun(name: str, where: str, count: str = "") -> None:
@@ -19,9 +19,9 @@ def begun(name: str, where: str, count: str = "") -> None:
         return
     if sys.stderr.isatty():
         print(f"{_CLEAR}{count}compiling {name} {where}", end="", file=sys.stderr, flush=True)
-    elif not _state["told"]:
+    elif not _state["announced"]:
         print(f"{count}compiling {name} and what else is missing {where}", file=sys.stderr, flush=True)
-    _state["told"] = True
+    _state["announced"] = True
 
 
 def ended() -> None:

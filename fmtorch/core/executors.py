@@ -11,7 +11,7 @@ import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import torch
@@ -110,19 +110,18 @@ class Team:
         execution = self.execution
         if execution.make is not None:
             try:
-                made = execution.make()
+                executor = execution.make()
             except Exception as error:  # of anybody's code
                 raise ValueError(f"executor: it cannot be made ({type(error).__name__}: {error})") from error
-            if not isinstance(made, Executor):
-                raise ValueError(f"executor: {type(made).__name__} is no concurrent.futures.Executor")
-            self.size = execution.workers or int(getattr(made, "_max_workers", 0)) or self.size
-            return made
+            if not isinstance(executor, Executor):
+                raise ValueError(f"executor: {type(executor).__name__} is no concurrent.futures.Executor")
+            self.size = execution.workers or int(getattr(executor, "_max_workers", 0)) or self.size
+            return executor
         if execution.kind == "dask":
             from fmtorch.core.cluster import Cluster
 
             self._cluster = Cluster(execution.address, self.size)
-            executor: Executor = self._cluster.executor
-            return executor
+            return cast(Executor, self._cluster.executor)
         return self._processes() if execution.kind == "processes" else ThreadPoolExecutor(self.size)
 
     def _processes(self) -> Executor:

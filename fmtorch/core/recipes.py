@@ -63,20 +63,20 @@ class VersionError(ValueError):
     """Workers of another version of fmtorch, whose results would differ."""
 
 
-_made: OrderedDict[str, Any] = OrderedDict()
+_values: OrderedDict[str, Any] = OrderedDict()
 _lock = threading.Lock()
 
 
 def _called(digest: str, recipe: bytes | None, function: Callable[[Any, Any], Any], argument: Any) -> Any:
     with _lock:
-        if digest not in _made:
+        if digest not in _values:
             if recipe is None:
                 return NotMade()
-            _made[digest] = _make(recipe)
-        _made.move_to_end(digest)
-        while len(_made) > KEPT:
-            _made.popitem(last=False)
-        value = _made[digest]
+            _values[digest] = _make(recipe)
+        _values.move_to_end(digest)
+        while len(_values) > KEPT:
+            _values.popitem(last=False)
+        value = _values[digest]
     return function(value, argument)
 
 

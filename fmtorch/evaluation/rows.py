@@ -79,7 +79,7 @@ def _row(outcome: Outcome, figures: dict[str, float], pose: PairPose, seconds: f
         related=bool(estimate.related[0]) if estimate is not None else False, **figures,
         rotation_error=pose.rotation, translation_error=pose.translation, pose_reason=pose.reason,
         configuration=None if configuration is None else configuration.names[0],
-        warning=None if configuration is None else configuration.warnings[0],
+        warning=outcome.not_examined or None if configuration is None else configuration.warnings[0],
         focal_error0=focals.error[0], focal_error1=focals.error[1],
         focal_log_ratio0=focals.log_ratio[0], focal_log_ratio1=focals.log_ratio[1],
     )  # fmt: skip

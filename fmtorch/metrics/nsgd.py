@@ -22,7 +22,6 @@ from torch import Tensor
 
 from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.batches import for_each_pair, kernels_serve
-from fmtorch.compiling.kernel import Kernel
 from fmtorch.core.checks import checked
 from fmtorch.core.streams import Stream, mixed_seed
 from fmtorch.geometry.arithmetic import sqrt
@@ -152,7 +151,7 @@ def _mean_distance(
         return (d0 / unit0[:, None] + d1 / unit1[:, None]) / 2, accepted
 
     if kernels_serve(pairs.F_gt, pairs.F_est, pairs.size0, pairs.size1):
-        total, count = compiled_sums(compiled.accepted_draws, unit, pairs, samples, seed)
+        total, count = compiled_sums(unit, pairs, samples, seed)
     else:
         total, count = sum_of_draws(pairs, draw, samples=samples, seed=seed)
     diagonal0, diagonal1 = diagonal(pairs.size0), diagonal(pairs.size1)
@@ -162,20 +161,22 @@ def _mean_distance(
 
 
 def compiled_sums(
-    draws: Kernel[..., None], unit: Callable[[Tensor], Tensor], pairs: Pairs, samples: int, seed: int
+    unit: Callable[[Tensor], Tensor], pairs: Pairs, samples: int, seed: int, released: bool = False
 ) -> tuple[Float[Tensor, " b"], Float[Tensor, " b"]]:
-    """Sum and number of the accepted draws of each pair, by a kernel of `nsgd_kernels`."""
+    """Sum and number of the accepted draws of each pair, by the kernel. released: draws of `nsgd_released`."""
     expect_samples(samples)
     units = torch.stack([unit(diagonal(size)) for size in (pairs.size0, pairs.size1)], -1)
     tensors = (pairs.F_gt, pairs.F_est, pairs.size0, pairs.size1, units, pairs.key[:, None])
-    constants = (draws, mixed_seed(seed, Stream.METRIC), samples)
+    constants = (released, mixed_seed(seed, Stream.METRIC), samples)
     out = torch.empty(len(units), 2, dtype=torch.float64)
     terms = for_each_pair(_into, tensors, *constants, out=out, kind=torch.float64)
     return terms[:, 0], terms[:, 1]
 
 
 def _into(
-    F_gt: Array, F_est: Array, size0: Array, size1: Array, unit: Array, key: Array, draws: Kernel[..., None], seed: int,
+    F_gt: Array, F_est: Array, size0: Array, size1: Array, unit: Array, key: Array, released: bool, seed: int,
     samples: int, out: Array,
 ) -> None:  # fmt: skip
-    draws(compiled.Comparison(F_gt, F_est, size0, size1, unit), int(key[0]), seed, samples, out)
+    compiled.accepted_draws(
+        compiled.Comparison(F_gt, F_est, size0, size1, unit, released), int(key[0]), seed, samples, out
+    )

@@ -19,6 +19,7 @@ class Comparison(NamedTuple):
     """Two models of one pair, F_gt, F_est (3, 3), scaled to a largest element of 1.
 
     size0, size1: (h, w) of the images, pixels. unit: (2,), pixels by which distances in image 0 and 1 are divided.
+    released: whether draws are those of `nsgd_released`; F_gt, F_est are then as they were given.
     """
 
     F_gt: F8x2
@@ -26,6 +27,7 @@ class Comparison(NamedTuple):
     size0: F8x1
     size1: F8x1
     unit: F8x1
+    released: bool
 
 
 @kernel
@@ -34,7 +36,6 @@ def accepted_draws(pair: Comparison, key: int, mixed_seed: int, samples: int, ou
 
     mixed_seed: of the seed and the stream. samples: how many draws to accept.
     """
-    F_gt, F_est, size0, size1, unit = pair
     state = stream_state(mixed_seed, key)
     u, values = vector(COLUMNS), vector(BLOCK)
     total, count = 0.0, 0
@@ -43,10 +44,9 @@ def accepted_draws(pair: Comparison, key: int, mixed_seed: int, samples: int, ou
         for draw in range(draws):
             for column in range(COLUMNS):
                 u[column] = uniform(state, (start + draw) * COLUMNS + column)
-            a0, a1, hits_a = _half_draw(F_gt, F_est, size0, size1, u[:3])
-            b0, b1, hits_b = _half_draw(F_est, F_gt, size0, size1, u[3:])
-            taken = hits_a and hits_b and count < samples
-            values[draw] = ((a0 + b0) / 2 / unit[0] + (a1 + b1) / 2 / unit[1]) / 2 if taken else 0.0
+            value, hits = _released_draw(pair, u) if pair.released else _draw(pair, u)
+            taken = hits and count < samples
+            values[draw] = value if taken else 0.0
             count += taken
         total += _tree_sum(values, draws)
         if count >= samples:
@@ -54,28 +54,22 @@ def accepted_draws(pair: Comparison, key: int, mixed_seed: int, samples: int, ou
     out[0], out[1] = total, count
 
 
-@kernel
-def released_draws(pair: Comparison, key: int, mixed_seed: int, samples: int, out: F8x1) -> None:
-    """`draws.sum_of_draws` of a pair with the draws of `nsgd_released` -> out (2,); unit: the diagonals, pixels."""
-    F_gt, F_est, size0, size1, unit = pair
-    state = stream_state(mixed_seed, key)
-    u, values = vector(COLUMNS), vector(BLOCK)
-    total, count = 0.0, 0
-    for start in range(0, TRIES * samples, BLOCK):
-        draws = min(BLOCK, TRIES * samples - start)
-        for draw in range(draws):
-            for column in range(COLUMNS):
-                u[column] = uniform(state, (start + draw) * COLUMNS + column)
-            a0, a1, hits_a = _released_half(F_gt, F_est, size0, size1, u[:3])
-            b1, b0, hits_b = _released_half(F_est, F_gt, size1, size0, u[3:])
-            taken = hits_a and hits_b and count < samples
-            first, second = (a0 / unit[0] + a1 / unit[1]) / 2, (b1 / unit[1] + b0 / unit[0]) / 2
-            values[draw] = (first + second) / 2 if taken else 0.0
-            count += taken
-        total += _tree_sum(values, draws)
-        if count >= samples:
-            break
-    out[0], out[1] = total, count
+@inner
+def _draw(pair: Comparison, u: Array) -> tuple[float, bool]:
+    """The value of a draw, and whether it counts."""
+    unit = pair.unit
+    a0, a1, hits_a = _half_draw(pair.F_gt, pair.F_est, pair.size0, pair.size1, u[:3])
+    b0, b1, hits_b = _half_draw(pair.F_est, pair.F_gt, pair.size0, pair.size1, u[3:])
+    return ((a0 + b0) / 2 / unit[0] + (a1 + b1) / 2 / unit[1]) / 2, hits_a and hits_b
+
+
+@inner
+def _released_draw(pair: Comparison, u: Array) -> tuple[float, bool]:
+    """`_draw` as the released evaluator has it."""
+    unit = pair.unit
+    a0, a1, hits_a = _released_half(pair.F_gt, pair.F_est, pair.size0, pair.size1, u[:3])
+    b1, b0, hits_b = _released_half(pair.F_est, pair.F_gt, pair.size1, pair.size0, u[3:])
+    return ((a0 / unit[0] + a1 / unit[1]) / 2 + (b1 / unit[1] + b0 / unit[0]) / 2) / 2, hits_a and hits_b
 
 
 @inner

@@ -20,7 +20,6 @@ from fmtorch.compiling.batches import kernels_serve
 from fmtorch.core.checks import checked
 from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.geometry.epipolar import lines_through
-from fmtorch.metrics import nsgd_kernels as compiled
 from fmtorch.metrics.draws import Pairs, diagonal, segment_in_image, sum_of_draws
 from fmtorch.metrics.nsgd import compiled_sums
 
@@ -47,7 +46,7 @@ def nsgd_released(
     """
     pairs, shape = Pairs.flatten(F_gt, F_est, size0, size1, key)
     if kernels_serve(pairs.F_gt, pairs.F_est, pairs.size0, pairs.size1):
-        total, _ = compiled_sums(compiled.released_draws, torch.clone, pairs, samples, seed)
+        total, _ = compiled_sums(torch.clone, pairs, samples, seed, released=True)
     else:
         total, _ = sum_of_draws(pairs, released_draw, samples=samples, seed=seed)
     value = (total / samples).clamp(max=1.0)

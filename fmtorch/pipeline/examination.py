@@ -50,5 +50,6 @@ def _examined(outcomes: Sequence[Outcome], seed: int, knowledge: Knowledge | Non
 def _alone(outcome: Outcome, seed: int, knowledge: Knowledge | None) -> Outcome:
     try:
         return _examined([outcome], seed, knowledge)[0]
-    except Exception:  # what it is in stays unknown
-        return outcome
+    except Exception as error:  # what it is in stays unknown, and the row says why
+        reason = f"not examined: {type(error).__name__}: {error}".splitlines()[0]
+        return dataclasses.replace(outcome, not_examined=reason)

@@ -44,8 +44,8 @@ class Outcome:
     correspondences, estimate: batches of one; None where the pair failed before that stage.
     features: how many each image has. seconds: per stage; a batched stage is shared out evenly, and features count in
     full for each pair that uses them, cached ones with the seconds they took when they were computed.
-    reason: why the pair failed, empty where it did not. configuration: of this pair alone, where it was asked for
-    (`fmtorch.pipeline.examination`). images: for pruners that look at them, until these have run.
+    reason: why the pair failed, empty where it did not. configuration, not_examined: of this pair alone, or why there
+    is none, where it was asked for (`fmtorch.pipeline.examination`). images: for pruners that look at them.
     """
 
     pair: ImagePair
@@ -55,6 +55,7 @@ class Outcome:
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     reason: str = ""
     configuration: Configuration | None = None
+    not_examined: str = ""
     images: PairImages | None = None
 
     @property

@@ -36,9 +36,9 @@ def execution_of(config: DictConfig, workers: int | None = None, processes: bool
         raise ValueError(f"workers={workers} and executor.workers={fields.workers} differ; give one of them")
     count = workers or fields.workers
     if "_target_" in options:
-        made = {key: value for key, value in options.items() if key not in ExecutorFields.__dataclass_fields__}
-        expect_buildable(made, "executor")
-        make = functools.partial(instantiate, made, "executor")
+        target = {key: value for key, value in options.items() if key not in ExecutorFields.__dataclass_fields__}
+        expect_buildable(target, "executor")
+        make = functools.partial(instantiate, target, "executor")
         return Execution("threads", count, None, fields.send_images, cast("functools.partial[Executor]", make))
     kind = fields.name
     if processes is not None:

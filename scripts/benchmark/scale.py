@@ -88,7 +88,11 @@ def stage_table(folder: Path, count: int) -> tuple[list[str], float]:
     size = 0.0
     for name, pipeline in PIPELINES.items():
         given = name == "given matches"
-        source = given_pairs(folder / "given", count, MATCHES) if given else list(RenderedPairs("test", size="small"))
+        source = (
+            given_pairs(folder / "given", count, MATCHES, outliers=0.5)
+            if given
+            else list(RenderedPairs("test", size="small"))
+        )
         pairs = select(source, None)[: count if given else max(count // 10, 1)]
         run = RunFolder.open(folder / pipeline, {"pipeline": pipeline})
         built = presets.pipeline(pipeline)

@@ -11,8 +11,8 @@ from fmtorch.data.pairs import ImagePair
 from fmtorch.storage.exchange.dataset import H5Pairs
 
 
-def given_pairs(root: Path, pairs: int, matches: int = 60, seed: int = 0) -> list[ImagePair]:
-    """So many pairs of one camera that moves along a random path, with noise of half a pixel and half outliers."""
+def given_pairs(root: Path, pairs: int, matches: int = 60, seed: int = 0, outliers: float = 0.0) -> list[ImagePair]:
+    """So many pairs of one camera that moves along a random path; noise of half a pixel. outliers: their share."""
     rng = np.random.default_rng(seed)
     K = np.array([[800.0, 0, 319.5], [0, 800, 239.5], [0, 0, 1]])
     root.mkdir()
@@ -25,7 +25,7 @@ def given_pairs(root: Path, pairs: int, matches: int = 60, seed: int = 0) -> lis
             X = np.column_stack([rng.uniform(-2, 2, (matches, 2)), rng.uniform(5, 9, matches)])
             x = [(X + places[image]) @ K.T for image in (pair, pair + 1)]
             x = [each[:, :2] / each[:, 2:] + rng.normal(size=(matches, 2)) * 0.5 for each in x]
-            wrong = rng.random(matches) < 0.5
+            wrong = np.arange(matches) < outliers * matches
             x[1][wrong] = rng.uniform([0, 0], [640, 480], (wrong.sum(), 2))
             key = f"im{pair:05d}-im{pair + 1:05d}"
             points[key], ratios[key] = np.column_stack(x), rng.uniform(0.3, 0.9, matches)

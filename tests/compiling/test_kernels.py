@@ -64,7 +64,7 @@ numba = pytest.importorskip("numba", reason="numba is not installed")
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setenv("FMTORCH_CACHE", str(tmp_path / "cache"))
     monkeypatch.delenv(switch.SWITCH, raising=False)
-    monkeypatch.setitem(messages._state, "told", False)
+    monkeypatch.setitem(messages._state, "announced", False)
     files.folder.cache_clear()
     yield tmp_path / "cache" / "kernels"
     files.folder.cache_clear()

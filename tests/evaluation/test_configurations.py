@@ -78,7 +78,12 @@ def test_a_pair_that_cannot_be_examined_harms_no_other() -> None:
     outcomes = made.run([pair("general"), pair("planar")])
     assert outcomes[0].estimate is not None
     broken = dataclasses.replace(outcomes[0], estimate=outcomes[0].estimate.replace(model="homography"))
-    assert [o.configuration is None for o in examined(made, [broken, outcomes[1]])] == [True, False]
+    results = examined(made, [broken, outcomes[1]])
+    assert [o.configuration is None for o in results] == [True, False]
+    first, second = evaluate([dataclasses.replace(results[0], estimate=outcomes[0].estimate), results[1]])
+    assert first.warning is not None
+    assert first.warning.startswith("not examined: ValueError: estimate is of homography matrices")
+    assert second.configuration == "planar"
 
 
 def test_calibrations_count_only_where_the_estimator_was_given_them() -> None:

@@ -25,7 +25,7 @@ from fmtorch.data.pairs import ImagePair
 from fmtorch.evaluation.run import evaluate_pairs
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.storage import PairRow
-from tests.evaluation.given_matches import given_pairs
+from scripts.benchmark.scale_pairs import given_pairs
 
 PAIRS = 96
 SLOW_SECONDS = 0.3  # of each batch of a slow pipeline, so that there is time to kill its workers
