@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -123,3 +124,34 @@ def test_a_sample_has_the_same_bits_alone_and_degenerate_ones_have_no_solution()
     found, left = solved(bad)
     np.testing.assert_array_equal(left, draw[others])
     np.testing.assert_array_equal(found, E[others])
+
+
+@pytest.mark.parametrize("peer", ["poselib", "opencv"])
+def test_peers_solve_the_same_samples_alike(peer: str) -> None:
+    """Our solutions are among those that PoseLib and OpenCV give before both cameras; some of theirs are missed."""
+    points, _ = scene(3)
+    if peer == "poselib":
+        solve = pytest.importorskip("poselib").essential_matrix_5pt
+    else:
+        solve = by_opencv
+    E, draw = solved(points)
+    common = total = spurious = 0
+    for s in range(SAMPLES):
+        rays = points[:, 5 * s : 5 * s + 5].T
+        x0, x1 = rays[:, :2], rays[:, 2:]
+        given = [np.c_[x, np.ones(5)] / np.linalg.norm(np.c_[x, np.ones(5)], axis=1)[:, None] for x in (x0, x1)]
+        theirs = np.array([M.ravel() for M in solve(*given) if consistently_oriented(M, x0, x1)]).reshape(-1, 9)
+        distance = apart(E[draw == s], theirs)
+        common += int((distance.min(0, initial=9) < 1e-3).sum())
+        spurious += int((distance.min(1, initial=9) > 0.1).sum())
+        total += len(theirs)
+    assert total > SAMPLES
+    assert common > 0.85 * total  # two roots within one interval of the grid are missed
+    assert spurious < 0.01 * len(E)
+
+
+def by_opencv(x0: np.ndarray, x1: np.ndarray) -> list[np.ndarray]:
+    """OpenCV's solutions of five rays (5, 3), one below the other."""
+    pixels = [np.ascontiguousarray(x[:, :2] / x[:, 2:]) for x in (x0, x1)]
+    E, _ = cv2.findEssentialMat(*pixels, np.eye(3), cv2.RANSAC, 0.999, 1e-6)
+    return [] if E is None else list(E.reshape(-1, 3, 3))
