@@ -161,7 +161,7 @@ def _journal(folder: Path, pairs: Sequence[ImagePair]) -> Journal:
     """Where what is to be exported is kept. Raises ValueError where no pair has images to name."""
     parents = {str(image.path.absolute().parent) for p in pairs if exportable(p) for image in (p.image0, p.image1)}
     if not parents:
-        raise ValueError("export: no pair has images in which a pipeline finds keypoints")
+        raise ValueError("export: no pair has images in which a pipeline finds keypoints, as they are stored")
     return Journal(folder / "export", Path(os.path.commonpath(sorted(parents))))
 
 
@@ -190,5 +190,5 @@ def task(config: DictConfig) -> None:
 
 def main() -> None:
     """The command."""
-    paths = [*path_fields(Fields), "dataset.root", "dataset.truth", "dataset.images", "export"]
+    paths = [*path_fields(Fields), "dataset.root", "dataset.file", "dataset.truth", "dataset.images", "export"]
     run_command("eval", task, paths=paths, interrupted="interrupted; the same command continues the run")

@@ -48,6 +48,7 @@ _CLASSES = {
     "colmap": ("fmtorch.data.colmap", "colmap_pairs"),
     "bundler": ("fmtorch.data.bundler", "BundlerPairs"),
     "cameras": ("fmtorch.data.camera_files", "CameraFilePairs"),
+    "pair_list": ("fmtorch.data.pair_list", "PairList"),
     "h5": ("fmtorch.storage.exchange.dataset", "H5Pairs"),
 }
 NEEDS_ROOT = {
@@ -57,12 +58,13 @@ NEEDS_ROOT = {
     "colmap": "a folder of scenes with a COLMAP model each, or one such scene",
     "bundler": "a folder of scenes with list.txt and a Bundler file each, or one such scene",
     "cameras": "a folder of scenes with Camera.txt and Images/ each, or one such scene",
+    "pair_list": "the folder of the images of dataset.file, the list",
     "h5": "the file, or the folder of the files, that hold the matches",
 }
 """What `root` must be, by the names of the data sets that cannot do without."""
 SCENE_SETS = ("tum", "kitti", "colmap", "bundler", "cameras")
 """The data sets of scenes with cameras, whose candidates `fmtorch pairs` judges."""
-_WITHOUT_SPLIT = frozenset(("stereo", "h5"))
+_WITHOUT_SPLIT = frozenset(("stereo", "pair_list", "h5"))
 _GENERATED = frozenset(("rendered",))
 
 
@@ -76,7 +78,7 @@ def load(
     """The data set `name`: an indexable of `ImagePair`, as torch's DataLoader takes it.
 
     Args:
-        name: of the set: rendered, stereo, fmbench, tum, kitti, colmap, bundler, cameras, h5.
+        name: of the set: rendered, stereo, fmbench, tum, kitti, colmap, bundler, cameras, pair_list, h5.
         split: `test` or `train`.
         root: where it lies, or for generated sets where they are kept.
         progress: called with (done, total) while a generated set is drawn for the first time.

@@ -37,7 +37,7 @@ def read_image(source: ImageSource | Path | str, *, orient: bool = False) -> NDA
     """The image at `source` as uint8, (H, W) when the file is grey and RGB (H, W, 3) when it has colour.
 
     Any format OpenCV decodes; 16 bits are reduced to 8, transparency is dropped.
-    An `ImageSource` with a lens gives the undistorted image (`undistorted`).
+    An `ImageSource` with a lens gives the undistorted image (`undistorted`), one with a resampling that of it.
     orient: turn the image as its EXIF orientation says. Off by default: ground truth is given for the pixels as stored.
     Raises ImageError for a file that is missing, empty, truncated, corrupt, no image, of more than `MAX_PIXELS`, or of
     another size than its source says: OpenCV alone makes up what is missing or damaged and says nothing, or but a line
@@ -52,7 +52,8 @@ def read_image(source: ImageSource | Path | str, *, orient: bool = False) -> NDA
             f"{source.path}: {w} x {h} px, but its camera is of {width} x {height} px; it must be the image as it was "
             "when its camera was determined"
         )
-    return image if source.lens is None else undistorted(image, source.lens)
+    image = image if source.lens is None else undistorted(image, source.lens)
+    return image if source.resampling is None else source.resampling(image)
 
 
 def _decoded(path: Path, orient: bool, data: bytes | None = None) -> NDArray[np.uint8]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from fmtorch.core.types import Correspondences, pair_key
 from fmtorch.data.lenses import Lens
+from fmtorch.data.resampling import Resampling
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,6 +22,7 @@ class ImageSource:
     identity: names it within its data set.
     size: (h, w) that the file must have, where the data set says so: cameras hold for one size alone.
     lens: whose distortion `read_image` takes out; None for an image without.
+    resampling: how `read_image` then resizes and turns it; None: not at all.
     data: the bytes of the file, for a worker that does not see it; None: they are read from `path`.
     """
 
@@ -29,6 +31,12 @@ class ImageSource:
     size: tuple[int, int] | None = None
     lens: Lens | None = None
     data: bytes | None = dataclasses.field(default=None, repr=False, compare=False)
+    resampling: Resampling | None = None
+
+    @property
+    def pixels(self) -> tuple[Path, Lens | None, Resampling | None]:
+        """What decides the pixels that `read_image` gives."""
+        return self.path, self.lens, self.resampling
 
 
 class GivenMatches(NamedTuple):

@@ -99,6 +99,8 @@ def find_dataset(stored: Mapping[str, Any], options: Options) -> PairDataset:
 
 def _places(known: Mapping[str, Any], roots: Sequence[Path]) -> list[dict[str, Any]]:
     """The options that say where a data set, and what it needs beside itself, may lie."""
+    if known.get("name") == "pair_list":
+        return [{"root": r, "file": f} for r in roots if r.is_dir() for f in roots if f.is_file()] or [{"root": None}]
     if known.get("name") != "h5":
         return [{"root": root} for root in _roots(known, roots)]
     other = "truth" if known.get("layout") in WITHOUT_GEOMETRY else "images"

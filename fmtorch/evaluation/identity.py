@@ -20,7 +20,8 @@ from fmtorch.storage.code import code_digest, fmtorch_version
 from fmtorch.storage.configuration import file_digest, learned, libraries
 from fmtorch.storage.features import CachedFeatures
 
-PLACES = ("root", "truth", "images")  # options of data sets that say where things lie; the digest says what they are
+PLACES = ("root", "file", "truth", "images")
+"""Options of data sets that say where things lie; the digest says what they are."""
 
 
 def run_identity(

@@ -113,12 +113,12 @@ def _features_ahead(team: Team, pipeline: Pipeline, pairs: Sequence[ImagePair], 
 
 def _images_after_the_first(pairs: Sequence[ImagePair]) -> Iterator[ImageSource]:
     """The images that pairs show, each once, without those of the first pair."""
-    seen = {pairs[0].image0.path, pairs[0].image1.path}
+    seen = {pairs[0].image0.pixels, pairs[0].image1.pixels}
     for pair in pairs[1:]:
         if pair.problem is None and pair.matches is None:
             for image in (pair.image0, pair.image1):
-                if image.path not in seen:
-                    seen.add(image.path)
+                if image.pixels not in seen:
+                    seen.add(image.pixels)
                     yield image
 
 

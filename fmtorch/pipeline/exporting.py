@@ -63,8 +63,10 @@ def _geometry(
 
 
 def exportable(pair: ImagePair) -> bool:
-    """Whether a pair has images that a pipeline finds keypoints in: not of a broken one, nor of given matches."""
-    return pair.problem is None and pair.matches is None
+    """Whether a pair has images, as stored, that a pipeline finds keypoints in: not of a broken one, nor of given
+    matches, nor where images are resized or turned when read."""
+    resampled = pair.image0.resampling is not None or pair.image1.resampling is not None
+    return pair.problem is None and pair.matches is None and not resampled
 
 
 def exported_image(name: str, described: Described, camera: PhotographCamera | None = None) -> ExportedImage:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Hashable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -27,7 +26,6 @@ from fmtorch.core.stages import (
 from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Correspondences, Estimate, Features, collate
 from fmtorch.data.images import read_image, to_grey
-from fmtorch.data.lenses import Lens
 from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
 from fmtorch.geometry.verdict import judged
 from fmtorch.pipeline.clock import synchronise
@@ -89,27 +87,27 @@ class Pipeline:
         self.families = dict(families or {})
         self.memory = memory
         self.device = torch.device(device)
-        self._memo: Memo[tuple[Path, Lens | None], tuple[Features, float]] = Memo(memory)
-        self._pyramids: Memo[tuple[Path, Lens | None], GreyPyramid] = Memo(memory)
+        self._memo: Memo[Hashable, tuple[Features, float]] = Memo(memory)
+        self._pyramids: Memo[Hashable, GreyPyramid] = Memo(memory)
         every = [self.pruners, *self.families.values()]
         self.looks_at_images = any(isinstance(pruner, ImagePruner) for some in every for pruner in some.values())
 
     def features(self, image: ImageSource) -> tuple[Features, float]:
         """The features of an image and the seconds they took, kept for the next pair that shows the image."""
-        return self._memo.get((image.path, image.lens), lambda: self.extract(self._pixels(image)))
+        return self._memo.get(image.pixels, lambda: self.extract(self._pixels(image)))
 
     def images(self, pair: ImagePair) -> PairImages:
         """The grey levels of a pair's images, read where they are not kept since the features were computed."""
         return self._pyramid(pair.image0), self._pyramid(pair.image1)
 
     def _pyramid(self, image: ImageSource) -> GreyPyramid:
-        return self._pyramids.get((image.path, image.lens), lambda: grey_pyramid(to_grey(read_image(image))))
+        return self._pyramids.get(image.pixels, lambda: grey_pyramid(to_grey(read_image(image))))
 
     def _pixels(self, image: ImageSource) -> NDArray[np.uint8]:
         """An image's pixels for its features, whose grey levels are kept where a pruner will look at them."""
         pixels = read_image(image)
         if self.looks_at_images:
-            self._pyramids.get((image.path, image.lens), lambda: grey_pyramid(to_grey(pixels)))
+            self._pyramids.get(image.pixels, lambda: grey_pyramid(to_grey(pixels)))
         return pixels
 
     def extract(self, image: NDArray[np.uint8]) -> tuple[Features, float]:

@@ -1,0 +1,269 @@
+"""Lists of pairs of others: true F, K and pose of each form, what is refused, and what one bad pair becomes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from fmtorch.data import DataError, load, read_image
+from tests.data import lists
+
+PAIRS = ((0, 1), (2, 3), (1, 5))
+
+
+def true_f(i: int, j: int) -> np.ndarray:
+    """Of the scene's cameras, by the formula."""
+    (K0, _, _), (K1, _, _) = lists.cameras()[i], lists.cameras()[j]
+    T = lists.motion(lists.cameras()[i], lists.cameras()[j])
+    x, y, z = T[:3, 3]
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    F = np.linalg.inv(K1).T @ cross @ T[:3, :3] @ np.linalg.inv(K0)
+    return F / np.linalg.norm(F)
+
+
+def expect_same(F: np.ndarray, expected: np.ndarray, atol: float = 1e-9) -> None:
+    expected = expected / np.linalg.norm(expected)
+    np.testing.assert_allclose(F * np.sign((F * expected).sum()), expected, atol=atol)
+
+
+FORMS: dict[str, Callable[[Path], Path]] = {
+    "superglue": lambda folder: lists.write(
+        folder / "list.txt", ["# a comment", *(lists.superglue(*p) for p in PAIRS)]
+    ),
+    "glue_factory": lambda folder: lists.write(folder / "list.txt", [lists.glue_factory(*p) for p in PAIRS]),
+    "glue_factory_4x4": lambda folder: lists.write(folder / "list.txt", [lists.glue_factory(*p, True) for p in PAIRS]),
+    "loftr": lambda folder: lists.loftr(folder / "list.npz", PAIRS),
+    "loftr_several": lambda folder: lists.write(
+        folder / "list.txt", [lists.loftr(folder / f"{i}.npz", [p]).name for i, p in enumerate(PAIRS)]
+    ),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_cameras_are_those_of_the_list(form: str, tmp_path: Path) -> None:
+    dataset = load("pair_list", root=lists.images(), file=FORMS[form](tmp_path))
+    assert len(dataset) == len(PAIRS)
+    for pair, (i, j) in zip(dataset, PAIRS, strict=True):
+        K0, K1, T = lists.cameras()[i][0], lists.cameras()[j][0], lists.motion(lists.cameras()[i], lists.cameras()[j])
+        assert pair.problem is None
+        assert pair.K0 is not None
+        assert pair.K1 is not None
+        assert pair.R is not None
+        assert pair.t is not None
+        np.testing.assert_allclose(pair.K0, K0, atol=1e-9)
+        np.testing.assert_allclose(pair.K1, K1, atol=1e-9)
+        np.testing.assert_allclose(pair.R, T[:3, :3], atol=1e-6)  # the cameras' own rotations are rounded
+        np.testing.assert_allclose(pair.t, T[:3, 3], atol=1e-9)
+        expect_same(pair.F, true_f(i, j), atol=1e-6)
+        assert (pair.family, pair.scene) == ("list", "list")
+        assert read_image(pair.image0).shape[:2] == cv2.imread(str(lists.images() / lists.name(i))).shape[:2]
+
+
+@pytest.mark.parametrize("turns", [(1, 0), (2, 3), (3, 1)])
+def test_f_relates_the_images_as_they_are_read(turns: tuple[int, int], tmp_path: Path) -> None:
+    """Resized and turned: F is that of the originals seen through both maps, and is that of K, R and t."""
+    file = lists.write(tmp_path / "list.txt", [lists.superglue(0, 1, turns)])
+    (pair,) = load("pair_list", root=lists.images(), file=file, resize=400)
+    shapes = [cv2.imread(str(lists.images() / lists.name(i))).shape[:2] for i in (0, 1)]
+    for image, shape, turn in zip((pair.image0, pair.image1), shapes, turns, strict=True):
+        pixels = read_image(image)
+        assert max(pixels.shape[:2]) == 400
+        assert image.size == shape
+        assert (pixels.shape[0] > pixels.shape[1]) == ((shape[0] > shape[1]) ^ (turn % 2 == 1))
+    A0, A1 = (
+        image.resampling.matrix(shape)
+        for image, shape in zip((pair.image0, pair.image1), shapes, strict=True)
+        if image.resampling is not None
+    )
+    (plain,) = load("pair_list", root=lists.images(), file=lists.write(tmp_path / "plain.txt", [lists.superglue(0, 1)]))
+    expect_same(pair.F, np.linalg.inv(A1).T @ plain.F @ np.linalg.inv(A0))
+
+
+def test_matches_of_the_turned_images_obey_f(tmp_path: Path) -> None:
+    """SIFT does not care how an image is turned; its matches of what is read are near the lines of F."""
+    file = lists.write(tmp_path / "list.txt", [lists.superglue(1, 5, (1, 2))])
+    (pair,) = load("pair_list", root=lists.images(), file=file, resize=800)
+    sift = cv2.SIFT_create(4000)
+    (k0, d0), (k1, d1) = (sift.detectAndCompute(read_image(image), None) for image in (pair.image0, pair.image1))
+    good = [m for m, n in cv2.BFMatcher().knnMatch(d0, d1, k=2) if m.distance < 0.8 * n.distance]
+    x0 = np.array([[*k0[m.queryIdx].pt, 1] for m in good])
+    x1 = np.array([[*k1[m.trainIdx].pt, 1] for m in good])
+    lines = x0 @ pair.F.T
+    distance = np.abs((x1 * lines).sum(1)) / np.hypot(lines[:, 0], lines[:, 1])
+    assert (distance < 2).mean() > 0.3
+    assert len(good) > 50
+
+
+def test_resizing_by_one_number_and_by_two(tmp_path: Path) -> None:
+    file = lists.write(tmp_path / "list.txt", [lists.glue_factory(0, 1)])
+    stored, small, fixed = (
+        load("pair_list", root=lists.images(), file=file, resize=resize) for resize in (None, 320, [160, 120])
+    )
+    assert len({stored.digest, small.digest, fixed.digest}) == 3
+    assert read_image(fixed[0].image0).shape[:2] == read_image(fixed[0].image1).shape[:2] == (120, 160)
+    assert max(read_image(small[0].image1).shape) == 320
+    h, w = read_image(stored[0].image0).shape[:2]
+    K, K_fixed = stored[0].K0, fixed[0].K0
+    assert K is not None
+    assert K_fixed is not None
+    np.testing.assert_allclose(K_fixed[0, 0] / K[0, 0], 160 / w)
+    np.testing.assert_allclose((K_fixed[1, 2] + 0.5) / (K[1, 2] + 0.5), 120 / h)
+
+
+def test_origin_moves_the_principal_point(tmp_path: Path) -> None:
+    file = lists.write(tmp_path / "list.txt", [lists.glue_factory(0, 1, corner=0.0)])
+    (pair,) = load("pair_list", root=lists.images(), file=file, origin=0.0)
+    assert pair.K0 is not None
+    np.testing.assert_allclose(pair.K0, lists.cameras()[0][0])
+
+
+def scannet(folder: Path, with_motion: bool, with_intrinsics: bool) -> tuple[Path, Path]:
+    """ScanNet in LoFTR's layout, of two images of the shared scene: the images' folder and the list."""
+    root, (a, b) = folder / "scans", lists.cameras()[:2]
+    scene = root / "scene0707_00"
+    for part in ("color", "pose", "intrinsic"):
+        (scene / part).mkdir(parents=True)
+    for frame, (i, (_, R, t)) in zip((15, 300), enumerate((a, b)), strict=True):
+        image = cv2.imread(str(lists.images() / lists.name(i)))
+        assert cv2.imwrite(str(scene / "color" / f"{frame}.jpg"), cv2.resize(image, (1296, 968)))
+        world = np.linalg.inv(np.vstack([np.column_stack([R, t]), [0, 0, 0, 1]]))
+        np.savetxt(scene / "pose" / f"{frame}.txt", world, fmt="%.17g")
+    K = np.array([[1170, 0, 647.5], [0, 1170, 483.5], [0, 0, 1.0]])
+    np.savetxt(scene / "intrinsic" / "intrinsic_color.txt", np.pad(K, (0, 1)), fmt="%.17g")
+    arrays = {"name": np.array([[707, 0, 15, 300]], np.int32), "score": np.array([0.5])}
+    if with_motion:
+        arrays["rel_pose"] = lists.motion(a, b)[:3].reshape(1, 12)
+    if with_intrinsics:
+        np.savez(folder / "intrinsics.npz", scene0707_00=np.diag([577.0, 578.0, 1.0]) + np.eye(3, k=2) * 319.5)
+    np.savez(folder / "test.npz", **arrays)  # type: ignore[arg-type]
+    return root, folder / "test.npz"
+
+
+@pytest.mark.parametrize("with_motion", [True, False])
+def test_scannet_by_numbers(tmp_path: Path, with_motion: bool) -> None:
+    root, file = scannet(tmp_path, with_motion, with_intrinsics=True)
+    (pair,) = load("pair_list", root=root, file=file)
+    T = lists.motion(*lists.cameras()[:2])
+    assert pair.R is not None
+    assert pair.t is not None
+    assert pair.K0 is not None
+    np.testing.assert_allclose(pair.R, T[:3, :3], atol=1e-6)
+    np.testing.assert_allclose(pair.t, T[:3, 3], atol=1e-6)
+    assert read_image(pair.image0).shape[:2] == (480, 640)  # to which K belongs
+    assert pair.K0[0, 0] == 577
+    assert pair.scene == "test"
+    (larger,) = load("pair_list", root=root, file=file, resize=[1280, 960])
+    assert larger.K0 is not None
+    assert larger.K0[0, 0] == pytest.approx(2 * 577)
+
+
+def test_scannet_by_the_scenes_own_calibration(tmp_path: Path) -> None:
+    root, file = scannet(tmp_path, True, with_intrinsics=False)
+    (stored,), (small,) = (load("pair_list", root=root, file=file, resize=size) for size in (None, [648, 484]))
+    assert stored.K0 is not None
+    assert small.K0 is not None
+    assert read_image(stored.image0).shape[:2] == (968, 1296)
+    assert stored.K0[0, 0] == 1170
+    assert small.K0[0, 0] == pytest.approx(585)
+    assert small.K0[0, 2] == pytest.approx(323.5)
+    (root / "scene0707_00/intrinsic/intrinsic_color.txt").unlink()
+    with pytest.raises(DataError, match=r"intrinsic_color\.txt: no such file, nor intrinsics\.npz beside the list"):
+        load("pair_list", root=root, file=file)
+
+
+def test_infinite_poses_are_one_pairs_problem(tmp_path: Path) -> None:
+    root, file = scannet(tmp_path, False, with_intrinsics=True)
+    np.savetxt(root / "scene0707_00/pose/15.txt", np.full((4, 4), -np.inf))
+    (pair,) = load("pair_list", root=root, file=file)
+    assert pair.problem == f"{file}, pair 0: the pose is not finite"
+
+
+def test_scenes_are_the_first_folder_that_differs(tmp_path: Path) -> None:
+    names = ["Undistorted_SfM/0015/images/a.jpg", "Undistorted_SfM/0022/images/b.jpg"]
+    line = lists.glue_factory(0, 1).split(" ", 2)[2]
+    file = lists.write(tmp_path / "megadepth.txt", [f"{name} {name} {line}" for name in names])
+    assert [pair.scene for pair in load("pair_list", root=tmp_path, file=file)] == ["0015", "0022"]
+    flat = lists.write(tmp_path / "scannet.txt", [f"scene0711_00_frame-001680.jpg scene0711_00_frame-2.jpg {line}"])
+    assert [pair.scene for pair in load("pair_list", root=tmp_path, file=flat)] == ["scene0711_00"]
+
+
+def changed(line: str, at: int, word: str) -> str:
+    words = line.split()
+    return " ".join([*words[:at], word, *words[at + 1 :]])
+
+
+@pytest.mark.parametrize(
+    ("line", "problem"),
+    [
+        (lambda: changed(lists.superglue(0, 1), 0, "absent.jpg"), r"list\.txt, line 2: no image .*absent\.jpg"),
+        (lambda: changed(lists.superglue(0, 1), 8, "nan"), r"list\.txt, line 2: K is \[.*nan.*it must be finite"),
+        (lambda: changed(lists.superglue(0, 1), 25, "inf"), r"list\.txt, line 2: the pose is not finite"),
+        (lambda: changed(lists.superglue(0, 1), 22, "2"), r"list\.txt, line 2: the matrix is no rotation"),
+        (lambda: lists.superglue(0, 0), r"list\.txt, line 2: t is zero"),
+    ],
+)
+def test_one_bad_pair_has_a_problem(line: Callable[[], str], problem: str, tmp_path: Path) -> None:
+    file = lists.write(tmp_path / "list.txt", [lists.superglue(0, 1), line(), lists.superglue(0, 1)])
+    first, second, third = load("pair_list", root=lists.images(), file=file, resize=200)
+    assert first.problem is None
+    assert third.problem is None
+    assert third.identity.startswith(f"{first.identity}#")
+    assert second.problem is not None
+    assert re.search(problem, second.problem), second.problem
+
+
+@pytest.mark.parametrize(
+    ("line", "error"),
+    [
+        ("a.jpg b.jpg", r"list\.txt, line 2: 2 columns without cameras; it must have 38: name0 name1 turns0 turns1 K0"),
+        ("a.jpg b.jpg 0 0", r"line 2: 4 columns without cameras"),
+        ("a b " + "1 " * 31, r"line 2: 33 columns; it must have 38: .*; 32: .*; 36: "),
+        ("a b " + "1 " * 29 + "x", r"line 2: could not convert string to float: 'x'"),
+        ("a b 0 4 " + "1 " * 34, r"line 2: 4 quarter turns; it must be 0, 1, 2 or 3"),
+        ("a b 0 x " + "1 " * 34, r"line 2: the number of quarter turns is 'x'"),
+    ],
+)
+def test_lines_that_cannot_be_read_are_named(line: str, error: str, tmp_path: Path) -> None:
+    file = lists.write(tmp_path / "list.txt", [lists.superglue(0, 1), line])
+    with pytest.raises(DataError, match=error) as raised:
+        load("pair_list", root=lists.images(), file=file)
+    assert "\n" not in str(raised.value)
+
+
+def test_lists_of_another_kind_are_refused(tmp_path: Path) -> None:
+    root, other = lists.images(), tmp_path / "pairs.h5"
+    other.write_text("x")
+    np.savez(tmp_path / "other.npz", x=np.zeros(3))
+    np.savez(tmp_path / "wide.npz", name=np.zeros((3, 5), int))
+    lists.write(tmp_path / "several.txt", ["absent.npz"])
+    lists.write(tmp_path / "empty.txt", ["# nothing"])
+    for file, error in {
+        other: r"pairs\.h5: a list must be a text file \(\.txt\) or an \.npz; this one ends in \.h5",
+        tmp_path
+        / "other.npz": r"other\.npz: neither pair_infos \(MegaDepth\) nor name \(ScanNet\) among its arrays, x",
+        tmp_path / "wide.npz": r"wide\.npz: 'name' is int64 \(3, 5\); it must hold four whole numbers a pair",
+        tmp_path / "several.txt": r"several\.txt, line 1: no file .*absent\.npz",
+        tmp_path / "empty.txt": r"empty\.txt: holds no pairs",
+        tmp_path / "absent.txt": r"absent\.txt: no such file; dataset\.file must be the list of pairs",
+        None: r"pair_list needs file: dataset\.file=FILE",
+    }.items():
+        with pytest.raises(DataError, match=error):
+            load("pair_list", root=root, file=file)
+    with pytest.raises(DataError, match=r"no such folder; dataset\.root must be the folder of the images"):
+        load("pair_list", root=tmp_path / "absent", file=lists.write(tmp_path / "a.txt", [lists.superglue(0, 1)]))
+    with pytest.raises(DataError, match=r"resize=\[1, 2, 3\]; it must be one length of the longer side, or"):
+        load("pair_list", root=root, file=lists.write(tmp_path / "a.txt", [lists.superglue(0, 1)]), resize=[1, 2, 3])
+
+
+def test_pairs_of_megadepth_that_do_not_fit_are_named(tmp_path: Path) -> None:
+    file = lists.loftr(tmp_path / "a.npz", [(0, 99)])
+    with pytest.raises(DataError, match=r"a\.npz, pair 0: images 1 and 100; there are 11"):
+        load("pair_list", root=lists.images(), file=file)
+    (pair,) = load("pair_list", root=lists.images(), file=lists.loftr(tmp_path / "b.npz", [(0, -1)]))
+    assert pair.problem is not None
+    assert pair.problem.startswith(f"{tmp_path / 'b.npz'}, pair 0: no image")
