@@ -18,6 +18,7 @@ from omegaconf import DictConfig
 from fmtorch import presets
 from fmtorch.core.executors import Team, WorkersLost
 from fmtorch.core.files import replacing
+from fmtorch.core.stages import ImageMatcher
 from fmtorch.core.terminal import console, errors, progress_bars
 from fmtorch.data.images import read_image
 from fmtorch.evaluation.view_graph_picture import view_graph_svg
@@ -70,6 +71,8 @@ def match_folder(
     stages = presets.stages(config)
     vector = functools.partial(image_vector, kind=descriptor_kind(stages["features"])) if similar else None
     pipeline: Pipeline = presets.build_pipeline(config, presets.resolve_device(fields.device))
+    if isinstance(pipeline.matcher, ImageMatcher):
+        raise ValueError("images: a folder is matched by keypoints of each image; this matcher takes pairs of images")
     output = fields.output or default_output(folder)
     identity = {
         "version": fmtorch_version(), "images": str(folder.absolute()), **stages, "seed": fields.seed,

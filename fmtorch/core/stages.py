@@ -61,6 +61,15 @@ class Matcher(Protocol):
 
 
 @runtime_checkable
+class ImageMatcher(Matcher, Protocol):
+    """A matcher that takes the images themselves, and that refuses to be called with their features."""
+
+    def match_images(self, image0: NDArray[np.uint8], image1: NDArray[np.uint8]) -> Correspondences:
+        """Images (H, W) or RGB (H, W, 3), uint8 -> putative correspondences of that one pair, with image sizes."""
+        ...
+
+
+@runtime_checkable
 class Pruner(Protocol):
     """Correspondences -> the same, fewer of them surviving, or with a prior."""
 

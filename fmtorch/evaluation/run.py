@@ -12,6 +12,7 @@ import torch
 from fmtorch.core.calls import Calls
 from fmtorch.core.executors import Execution, Team
 from fmtorch.core.recipes import Here, Recipe, Source
+from fmtorch.core.stages import ImageMatcher
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.evaluation.pair_cameras import PairCameras
 from fmtorch.evaluation.workers import (
@@ -90,7 +91,7 @@ def evaluate_pairs(
     calls = Calls(team, source, evaluate_batch, keep, lambda done, reason: store(failed(done, reason)), divided)
     try:
         begun = 0
-        if source.shared and team.size > 1 and pairs:
+        if source.shared and team.size > 1 and pairs and not isinstance(pipeline.matcher, ImageMatcher):
             begun = 1  # alone: where its stages compile kernels, others would wait for them
             _features_ahead(team, pipeline, pairs, calls.begin(given(pairs[:1])))
         for done in calls.each(given(pairs[i : i + batch]) for i in range(begun, len(pairs), batch)):

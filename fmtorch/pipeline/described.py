@@ -8,6 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
+from fmtorch.core.no_features import NoFeatures
+from fmtorch.core.stages import ImageMatcher
 from fmtorch.core.types import Features
 from fmtorch.data.images import to_grey
 from fmtorch.pipeline.pipeline import Pipeline
@@ -18,7 +20,8 @@ from fmtorch.pipeline.reduced_images import Image, reduced_image, to_original
 class Described:
     """A photograph's features in pixels of it as it was reduced, the scale of that in x and y, and its size (h, w).
 
-    seconds: that describing it takes or took. pyramid: its grey levels, for pruners that look at them.
+    seconds: that describing it takes or took. pyramid: its grey levels, for pruners that look at them. image: reduced,
+    for a matcher that takes the images themselves, and has no features.
     """
 
     features: Features
@@ -26,6 +29,7 @@ class Described:
     size: tuple[int, int]
     seconds: float
     pyramid: GreyPyramid | None = None
+    image: Image | None = None
 
     @property
     def points(self) -> Float[Tensor, "n 2"]:
@@ -36,6 +40,7 @@ class Described:
 def describe(pipeline: Pipeline, image: Image, longest_side: int) -> Described:
     """The features of a photograph, for `relate`; see `match`."""
     reduced, scale = reduced_image(image, longest_side)
-    features, seconds = pipeline.extract(reduced)
+    itself = isinstance(pipeline.matcher, ImageMatcher)
+    features, seconds = (NoFeatures()(reduced), 0.0) if itself else pipeline.extract(reduced)
     pyramid = grey_pyramid(to_grey(reduced)) if pipeline.looks_at_images else None
-    return Described(features, scale, (image.shape[0], image.shape[1]), seconds, pyramid)
+    return Described(features, scale, (image.shape[0], image.shape[1]), seconds, pyramid, reduced if itself else None)

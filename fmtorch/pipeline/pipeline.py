@@ -15,6 +15,7 @@ from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
 from fmtorch.core.stages import (
     Estimator,
     FeatureExtractor,
+    ImageMatcher,
     ImagePruner,
     Matcher,
     PairImages,
@@ -24,42 +25,16 @@ from fmtorch.core.stages import (
     pruned,
 )
 from fmtorch.core.threads import one_thread
-from fmtorch.core.types import Correspondences, Estimate, Features, collate
+from fmtorch.core.types import Correspondences, Features
 from fmtorch.data.images import read_image, to_grey
 from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
 from fmtorch.geometry.verdict import judged
 from fmtorch.pipeline.clock import synchronise
-from fmtorch.pipeline.configuration import Configuration
 from fmtorch.pipeline.memo import Memo
+from fmtorch.pipeline.outcome import Outcome as Outcome
+from fmtorch.pipeline.outcome import collated, described, expect_finite
 
 STAGES = ("features", "matching", "pruning", "estimation")
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Outcome:
-    """What a pipeline made of one pair.
-
-    correspondences, estimate: batches of one; None where the pair failed before that stage.
-    features: how many each image has. seconds: per stage; a batched stage is shared out evenly, and features count in
-    full for each pair that uses them, cached ones with the seconds they took when they were computed.
-    reason: why the pair failed, empty where it did not. configuration, not_examined: of this pair alone, or why there
-    is none, where it was asked for (`fmtorch.pipeline.examination`). images: for pruners that look at them.
-    """
-
-    pair: ImagePair
-    features: tuple[int, int] = (0, 0)
-    correspondences: Correspondences | None = None
-    estimate: Estimate | None = None
-    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
-    reason: str = ""
-    configuration: Configuration | None = None
-    not_examined: str = ""
-    images: PairImages | None = None
-
-    @property
-    def solved(self) -> bool:
-        """Whether there is an F."""
-        return self.estimate is not None and bool(self.estimate.ok[0])
 
 
 class Pipeline:
@@ -155,10 +130,12 @@ class Pipeline:
             return Outcome(pair, reason=pair.problem)
         if pair.matches is not None:
             return self._given(pair, pair.matches)
+        if isinstance(self.matcher, ImageMatcher):
+            return self._match_images(pair, self.matcher)
         try:
             (features0, seconds0), (features1, seconds1) = self.features(pair.image0), self.features(pair.image1)
         except Exception as error:  # a pair that fails becomes a row with this reason
-            return Outcome(pair, reason=_describe("features", error))
+            return Outcome(pair, reason=described("features", error))
         seconds = {"features": seconds0 + seconds1}
         counts = (len(features0), len(features1))
         if min(counts) == 0:
@@ -168,17 +145,33 @@ class Pipeline:
         try:
             c = self.matcher(features0, features1)
         except Exception as error:
-            return Outcome(pair, counts, seconds=seconds, reason=_describe("matching", error))
+            return Outcome(pair, counts, seconds=seconds, reason=described("matching", error))
         seconds["matching"] = time.perf_counter() - start
         images = self.images(pair) if self.looks_at_images else None
         return Outcome(pair, counts, self._told(pair, c), None, seconds, images=images)
+
+    def _match_images(self, pair: ImagePair, matcher: ImageMatcher) -> Outcome:
+        """The matches of a matcher that takes the images themselves, in place of the first two stages."""
+        try:
+            images = read_image(pair.image0), read_image(pair.image1)
+        except Exception as error:
+            return Outcome(pair, reason=described("images", error))
+        start = time.perf_counter()
+        try:
+            c = matcher.match_images(*images).to(self.device)
+        except Exception as error:
+            return Outcome(pair, reason=described("matching", error))
+        seconds = {"matching": time.perf_counter() - start}
+        count = int(c.count())
+        pyramids = self.images(pair) if self.looks_at_images else None
+        return Outcome(pair, (count, count), self._told(pair, c), None, seconds, images=pyramids)
 
     def _given(self, pair: ImagePair, matches: Callable[[], GivenMatches]) -> Outcome:
         """The matches that come with a pair, in place of the first two stages."""
         try:
             c, counts = matches()
         except Exception as error:  # a pair that cannot be read becomes a row with this reason
-            return Outcome(pair, reason=_describe("matches", error))
+            return Outcome(pair, reason=described("matches", error))
         return Outcome(pair, counts, self._told(pair, c.to(self.device)))
 
     def _told(self, pair: ImagePair, c: Correspondences) -> Correspondences:
@@ -199,7 +192,7 @@ class Pipeline:
             own = [i for i, o in enumerate(outcomes) if (o.pair.family if o.pair.family in others else None) == family]
             if own:
                 some = [outcomes[i] for i in own]
-                c = _collated(some)
+                c = collated(some)
 
                 def images(i: int, some: list[Outcome] = some) -> PairImages:
                     return some[i].images or self.images(some[i].pair)
@@ -211,29 +204,12 @@ class Pipeline:
         return result
 
     def _estimate(self, outcomes: list[Outcome], seed: int) -> list[Outcome]:
-        c = _collated(outcomes)
-        estimate = judged(_expect_finite(self.estimator(c, seed).detach()), c)
+        c = collated(outcomes)
+        estimate = judged(expect_finite(self.estimator(c, seed).detach()), c)
         return [
             dataclasses.replace(outcome, estimate=estimate[i], reason=estimate.reason[i])
             for i, outcome in enumerate(outcomes)
         ]
-
-
-def _expect_finite(estimate: Estimate) -> Estimate:
-    """The estimate, whose pairs are not ok where F is no matrix: anybody's estimator may have made it."""
-    valid = torch.isfinite(estimate.F).flatten(1).all(1) & (estimate.F != 0).flatten(1).any(1)
-    wrong = (estimate.ok & ~valid).tolist()
-    if not any(wrong):
-        return estimate
-    said = "estimation: F is zero or not finite, though the estimator calls it ok"
-    reason = tuple(said if bad else old for bad, old in zip(wrong, estimate.reason, strict=True))
-    keep = valid[:, None]
-    F, inliers = torch.where(keep[..., None], estimate.F, 0), estimate.inliers & keep
-    return estimate.replace(F=F, inliers=inliers, ok=estimate.ok & valid, reason=reason, significance=None)
-
-
-def _collated(outcomes: list[Outcome]) -> Correspondences:
-    return collate([outcome.correspondences for outcome in outcomes if outcome.correspondences is not None])
 
 
 def _alone(stage: str, function: Callable[[list[Outcome]], list[Outcome]], outcome: Outcome) -> Outcome:
@@ -241,8 +217,4 @@ def _alone(stage: str, function: Callable[[list[Outcome]], list[Outcome]], outco
     try:
         return function([outcome])[0]
     except Exception as error:
-        return dataclasses.replace(outcome, correspondences=None, images=None, reason=_describe(stage, error))
-
-
-def _describe(stage: str, error: Exception) -> str:
-    return f"{stage}: {type(error).__name__}: {error}".splitlines()[0]
+        return dataclasses.replace(outcome, correspondences=None, images=None, reason=described(stage, error))

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from fmtorch import presets
 from fmtorch.core.arguments import Arrays
-from fmtorch.core.stages import PairImages, pruned
+from fmtorch.core.stages import ImageMatcher, PairImages, pruned
 from fmtorch.core.threads import mapped, one_thread
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data.lenses import Lens
@@ -137,17 +137,24 @@ def _pipeline(name: str, device: str) -> Pipeline:
 def _matched(pipeline: Pipeline, described: Sequence[Described], clock: Clock) -> MatchResult:
     """Matching and pruning, in pixels of the images as they were described; a reason where there are no keypoints."""
     features0, features1 = (each.features for each in described)
+    putative = _of_images(pipeline, described)
     images = cast(PairImages, tuple(each.pyramid for each in described))
     ends = features0.keypoints, features1.keypoints
-    nothing = Correspondences(ends[0][None, :0], ends[1][None, :0], features0.valid[None, :0])
+    if putative is not None:
+        ends = putative.x0[0][putative.mask[0]], putative.x1[0][putative.mask[0]]
+    none = torch.zeros(1, 0, dtype=torch.bool, device=ends[0].device)
+    nothing = Correspondences(ends[0][None, :0], ends[1][None, :0], none)
     nothing_found = MatchResult(
         *ends, nothing, nothing.mask[0], nothing, nothing.mask[0], ends[0].new_zeros(3, 3, dtype=torch.float64)
     )
     empty = [f"image{i}" for i in (0, 1) if len(ends[i]) == 0]
     if empty:
         reason = f"no keypoints in {' and '.join(empty)}: too small, or without texture"
+        reason = reason if putative is None else "the matcher finds no matches"
         return dataclasses.replace(nothing_found, reason=reason, seconds=clock.seconds)
-    putative = c = pipeline.matcher(features0, features1)
+    if putative is None:
+        putative = pipeline.matcher(features0, features1)
+    c = putative
     clock("matching")
     counts = {"matching": int(c.count())}
     slots = torch.arange(c.mask.shape[1], device=c.mask.device)
@@ -159,6 +166,14 @@ def _matched(pipeline: Pipeline, described: Sequence[Described], clock: Clock) -
         counts[name] = len(slots)
     kept = torch.zeros_like(putative.mask[0]).index_fill(0, slots, True)
     return dataclasses.replace(nothing_found, putative=putative, kept=kept, correspondences=c, counts=counts)
+
+
+def _of_images(pipeline: Pipeline, described: Sequence[Described]) -> Correspondences | None:
+    """The matches of a matcher that takes the images themselves; None for any other."""
+    image0, image1 = (each.image for each in described)
+    if not isinstance(pipeline.matcher, ImageMatcher) or image0 is None or image1 is None:
+        return None
+    return pipeline.matcher.match_images(image0, image1).to(pipeline.device)
 
 
 def _estimated(

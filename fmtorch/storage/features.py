@@ -105,7 +105,7 @@ def cached(
     limit: GB, see `ArrayCache`. An extractor that does not say what defines it, or whose files cannot be read, stays as
     it is, with a warning.
     """
-    if cache is False or str(cache) in OFF:
+    if cache is False or str(cache) in OFF or not getattr(extractor, "keep", True):
         return extractor
     folder = cache_dir() / "features" if cache is None else Path(str(cache)).expanduser()
     try:
