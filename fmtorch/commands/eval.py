@@ -8,6 +8,7 @@ import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import hydra.utils
 import pyarrow as pa
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
@@ -69,8 +70,11 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     exports = export_kinds(fields.export)
     presets.expect_dataset(config.dataset)
     presets.expect_stages(config)
+    model = _model(config.dataset)
+    if model != "fundamental" and (exports or fields.cameras is not None):
+        raise ValueError(f"the data set has {model} matrices, which take no export= and no cameras=: leave them out")
     with progress_bars() as progress:
-        pipeline: Pipeline = presets.build_pipeline(config, device)
+        pipeline: Pipeline = presets.build_pipeline(config, device, model)
         dataset = _load(config.dataset, progress)
         folder = _open_folder(config, fields, pipeline_name, pipeline, dataset)
         pairs = select([dataset[i] for i in range(len(dataset))], fields.limit)
@@ -127,7 +131,7 @@ def _evaluated(
     execution = execution_of(config, fields.workers, fields.processes).decided(parallel)
     if execution.shared and execution.workers is None and pipeline.device.type != "cpu":
         execution = dataclasses.replace(execution, workers=1)
-    build = None if execution.shared else functools.partial(presets.build_pipeline, config, pipeline.device)
+    build = None if execution.shared else functools.partial(presets.build_pipeline, config, pipeline.device, None)
     cameras = None
     if fields.cameras is not None:
         cameras = cameras_of(pairs, fields.cameras)
@@ -169,6 +173,15 @@ def _to_export(journal: Journal, pair: ImagePair) -> bool:
     """Whether a pair's matches are not in the journal yet, and its images are there."""
     ends = pair.image0.path, pair.image1.path
     return exportable(pair) and all(path.is_file() for path in ends) and not journal.has_pair(*ends)
+
+
+def _model(config: DictConfig) -> str:
+    """What relates the pairs of a data set: fundamental, or homography."""
+    options = plain(config)
+    if "_target_" not in options:
+        return data.model_of(str(options.get("name")))
+    model: str = getattr(hydra.utils.get_object(str(options["_target_"])), "model", "fundamental")
+    return model
 
 
 def _load(config: DictConfig, progress: Progress) -> PairDataset:

@@ -18,10 +18,10 @@ from fmtorch.commands.main import job, run_command
 from fmtorch.core.files import expect_writable, replacing
 from fmtorch.core.options import Within
 from fmtorch.core.terminal import console
+from fmtorch.evaluation.curves import axis_of
 from fmtorch.evaluation.gallery import Options, Run, gallery
 from fmtorch.evaluation.names import run_names, shared_settings
 from fmtorch.evaluation.page import Section, render
-from fmtorch.evaluation.statistics import recalled
 from fmtorch.presets.fields import Cache, Device, Gigabytes, path_fields, read_fields
 from fmtorch.storage import RunFolder, RunFolderError
 
@@ -48,7 +48,7 @@ def run(config: DictConfig) -> Path:
     paths = [Path(path) for path in ([fields.runs] if isinstance(fields.runs, str) else fields.runs)]
     runs = named([RunFolder.load(path) for path in run_folders(paths)])
     if _order(fields.order, paths) == "recall":
-        runs.sort(key=lambda r: -recalled(np.array(r.table["nsgd"].to_pylist())).mean())
+        runs.sort(key=lambda r: -_recall(r.table))
     roots = [fields.root] if isinstance(fields.root, str) else fields.root or []
     options = Options(
         fields.pictures, [Path(root) for root in roots], fields.own_code, presets.resolve_device(fields.device),
@@ -76,6 +76,12 @@ def run(config: DictConfig) -> Path:
             console.print(f"{section.heading}: {note}", markup=False, highlight=False)
     console.print(f"{output}: {len(runs)} runs, {output.stat().st_size / 2**20:.1f} MB", style="dim", highlight=False)
     return output
+
+
+def _recall(table: pa.Table) -> float:
+    """The recall of a run at the threshold of its kind, NSGD or corner error."""
+    axis = axis_of({"": table})
+    return axis.below(table[axis.column].to_numpy().astype(np.float64), axis.mark)
 
 
 def run_folders(paths: Iterable[Path]) -> list[Path]:

@@ -35,6 +35,7 @@ __all__ = [
     "exif_focal",
     "expect_loadable",
     "load",
+    "model_of",
     "read_image",
     "to_grey",
 ]
@@ -49,6 +50,7 @@ _CLASSES = {
     "bundler": ("fmtorch.data.bundler", "BundlerPairs"),
     "cameras": ("fmtorch.data.camera_files", "CameraFilePairs"),
     "pair_list": ("fmtorch.data.pair_list", "PairList"),
+    "hpatches": ("fmtorch.data.hpatches", "HPatchesPairs"),
     "h5": ("fmtorch.storage.exchange.dataset", "H5Pairs"),
 }
 NEEDS_ROOT = {
@@ -59,12 +61,13 @@ NEEDS_ROOT = {
     "bundler": "a folder of scenes with list.txt and a Bundler file each, or one such scene",
     "cameras": "a folder of scenes with Camera.txt and Images/ each, or one such scene",
     "pair_list": "the folder of the images of dataset.file, the list",
+    "hpatches": "the folder of the sequences, i_* and v_*",
     "h5": "the file, or the folder of the files, that hold the matches",
 }
 """What `root` must be, by the names of the data sets that cannot do without."""
 SCENE_SETS = ("tum", "kitti", "colmap", "bundler", "cameras")
 """The data sets of scenes with cameras, whose candidates `fmtorch pairs` judges."""
-_WITHOUT_SPLIT = frozenset(("stereo", "pair_list", "h5"))
+_WITHOUT_SPLIT = frozenset(("stereo", "pair_list", "hpatches", "h5"))
 _GENERATED = frozenset(("rendered",))
 
 
@@ -78,7 +81,7 @@ def load(
     """The data set `name`: an indexable of `ImagePair`, as torch's DataLoader takes it.
 
     Args:
-        name: of the set: rendered, stereo, fmbench, tum, kitti, colmap, bundler, cameras, pair_list, h5.
+        name: of the set: rendered, stereo, fmbench, tum, kitti, colmap, bundler, cameras, pair_list, hpatches, h5.
         split: `test` or `train`.
         root: where it lies, or for generated sets where they are kept.
         progress: called with (done, total) while a generated set is drawn for the first time.
@@ -113,6 +116,14 @@ def expect_loadable(name: str, **options: Any) -> None:
         options.pop("split", None)
     given = {key: value for key, value in options.items() if not (key == "root" and value is None)}
     expect_options(_class(name), given, "dataset", given=("root",))
+
+
+def model_of(name: str) -> str:
+    """What the pairs of a data set are related by: fundamental, or homography. Raises DataError for an unknown name."""
+    if name not in _CLASSES:
+        raise DataError(f"no data set {name!r}; there are {', '.join(_CLASSES)}")
+    model: str = getattr(_class(name), "model", "fundamental")
+    return model
 
 
 def _class(name: str) -> Callable[..., PairDataset]:

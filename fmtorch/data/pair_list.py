@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from fmtorch.data.cameras import Camera, Matrix, fundamental, nearest_rotation
+from fmtorch.data.image_sizes import stored_size
 from fmtorch.data.listed_pairs import ListedPair, text_pairs
 from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset
 from fmtorch.data.resampling import Resampling, Size, longer_side
@@ -110,13 +110,9 @@ class PairList(PairDataset):
         return ImageSource(identity, path, own, resampling=Resampling(target, turns))
 
     def _size(self, path: Path) -> Size | None:
-        """(h, w) of an image, of its header; None where it has none."""
+        """(h, w) of an image, read once; None where it has no header."""
         if path not in self._sizes:
-            try:
-                with Image.open(path) as image:
-                    self._sizes[path] = image.height, image.width
-            except (OSError, ValueError, Image.DecompressionBombError):
-                self._sizes[path] = None
+            self._sizes[path] = stored_size(path)
         return self._sizes[path]
 
     def _camera(self, K: Matrix, image: ImageSource, listed: ListedPair) -> Matrix:

@@ -57,6 +57,7 @@ class ImagePair:
     K0, K1: (3, 3), R: (3, 3), t: (3,) with ``X1 = R X0 + t``, where known.
     problem: why this pair cannot be used (a bad line of a pairs file, say); None for a sound pair.
     matches: reads the matches that come with the pair, in place of features and matcher; can be sent between processes.
+    H: (3, 3) float64 with ``x1 ~ H x0`` in pixels, of a data set of homographies, whose F is zero; None for any other.
     """
 
     identity: str
@@ -71,6 +72,7 @@ class ImagePair:
     t: NDArray[np.float64] | None = None
     problem: str | None = None
     matches: Callable[[], GivenMatches] | None = None
+    H: NDArray[np.float64] | None = None
 
     @property
     def key(self) -> int:
@@ -83,7 +85,8 @@ class PairDataset(Protocol):
     """A sequence of image pairs.
 
     name: e.g. ``fmbench``. digest: hex digest of what defines the pairs (contents of pairs files, or the generator's
-    version and parameters; never an absolute path), part of a run's identity.
+    version and parameters; never an absolute path), part of a run's identity. One whose pairs have homographies in
+    place of F says so by an attribute `model`, "homography".
     """
 
     name: str

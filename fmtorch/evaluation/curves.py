@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import html
 from collections.abc import Mapping, Sequence
 
@@ -13,29 +14,57 @@ from fmtorch.evaluation.statistics import THRESHOLD
 from fmtorch.evaluation.summary import ALL
 
 MAXIMUM = 0.2  # the last NSGD threshold, the paper's
+MAX_CORNER_ERROR = 10.0  # px, the last of SuperGlue's and LoFTR's thresholds
 COLOURS, DASHES = 7, ("", "7 4", "2 3", "9 3 2 3")  # the style sheet has classes c0 to c6; dashes repeat them
 _WIDTH, _HEIGHT = 340, 250  # of a panel, in units that are CSS pixels at its usual size
 _LEFT, _RIGHT, _TOP, _BOTTOM = 36, 12, 10, 38  # margins
 _STEPS = 400  # of the threshold
 
 
+@dataclasses.dataclass(frozen=True)
+class Axis:
+    """What recall is drawn against: a column of the rows, up to a maximum, with ticks of which one is marked."""
+
+    column: str
+    maximum: float
+    mark: float
+    ticks: tuple[float, ...]
+    label: str
+
+    def below(self, values: NDArray[np.float64], threshold: float) -> float:
+        """The share of values below a threshold; NaN is above any."""
+        return float((values < threshold).mean()) if len(values) else 0.0
+
+
+NSGD = Axis("nsgd", MAXIMUM, THRESHOLD, (0.0, 0.05, 0.1, 0.15, 0.2), "NSGD threshold")
+CORNERS = Axis("corner_error", MAX_CORNER_ERROR, 3.0, (0.0, 1.0, 3.0, 5.0, 10.0), "corner error threshold [px]")
+
+
+def axis_of(runs: Mapping[str, pa.Table]) -> Axis:
+    """By corner errors where runs are of homographies, otherwise by NSGD."""
+    planar = [table["corner_error"].null_count < len(table) for table in runs.values() if len(table)]
+    return CORNERS if planar and all(planar) else NSGD
+
+
 def panels(runs: Mapping[str, pa.Table]) -> dict[str, dict[str, NDArray[np.float64]]]:
-    """Title of a panel -> name of a run -> NSGD of its pairs: a panel of each family, and of all of several."""
+    """Title of a panel -> name of a run -> errors of its pairs: a panel of each family, and of all of several."""
     families = by_family(runs)
     if len(families) < 2:
         return families
-    whole = {name: table["nsgd"].to_numpy().astype(np.float64) for name, table in runs.items() if len(table)}
+    column = axis_of(runs).column
+    whole = {name: table[column].to_numpy().astype(np.float64) for name, table in runs.items() if len(table)}
     return {ALL: whole, **families}
 
 
 def by_family(runs: Mapping[str, pa.Table]) -> dict[str, dict[str, NDArray[np.float64]]]:
-    """Family -> name of a run -> NSGD of its pairs."""
+    """Family -> name of a run -> errors of its pairs, of `axis_of`."""
+    column = axis_of(runs).column
     out: dict[str, dict[str, NDArray[np.float64]]] = {}
     for name, table in runs.items():
         family = np.asarray(table["family"].to_pylist(), dtype=object)
-        nsgd = table["nsgd"].to_numpy().astype(np.float64)
+        errors = table[column].to_numpy().astype(np.float64)
         for each in dict.fromkeys(family):
-            out.setdefault(str(each), {})[name] = nsgd[family == each]
+            out.setdefault(str(each), {})[name] = errors[family == each]
     return out
 
 
@@ -51,10 +80,10 @@ def swatch(number: int) -> str:
     return f'<svg class="swatch {colour}" viewBox="0 0 26 8" aria-hidden="true">{line}</svg>'
 
 
-def svg(title: str, curves: Mapping[str, NDArray[np.float64]], order: Sequence[str]) -> str:
+def svg(title: str, curves: Mapping[str, NDArray[np.float64]], order: Sequence[str], axis: Axis = NSGD) -> str:
     """A panel. order: the names of all runs of the page, whose places decide the styles; the first is drawn on top."""
     parts = [
-        f'<svg class="plot" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="recall by NSGD threshold, '
+        f'<svg class="plot" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="recall by {axis.label}, '
         f'{html.escape(title)}">'
     ]
     for percent in range(0, 101, 20):
@@ -62,37 +91,36 @@ def svg(title: str, curves: Mapping[str, NDArray[np.float64]], order: Sequence[s
         parts.append(f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>')
         parts.append(f'<text x="{_LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{percent}</text>')
     parts += [
-        f'<text x="{_x(tick):.1f}" y="{_HEIGHT - 22}" text-anchor="middle">{tick:g}</text>'
-        for tick in (0.0, 0.05, 0.1, 0.15, 0.2)
+        f'<text x="{_x(tick / axis.maximum):.1f}" y="{_HEIGHT - 22}" text-anchor="middle">{tick:g}</text>'
+        for tick in axis.ticks
     ]
     parts.append(
-        f'<text x="{(_LEFT + _WIDTH - _RIGHT) / 2:.0f}" y="{_HEIGHT - 5}" text-anchor="middle">NSGD threshold</text>'
+        f'<text x="{(_LEFT + _WIDTH - _RIGHT) / 2:.0f}" y="{_HEIGHT - 5}" text-anchor="middle">{axis.label}</text>'
     )
-    parts.append(
-        f'<line class="mark" x1="{_x(THRESHOLD):.1f}" x2="{_x(THRESHOLD):.1f}" y1="{_y(1.0):.1f}" y2="{_y(0.0):.1f}"/>'
-    )
+    x = _x(axis.mark / axis.maximum)
+    parts.append(f'<line class="mark" x1="{x:.1f}" x2="{x:.1f}" y1="{_y(1.0):.1f}" y2="{_y(0.0):.1f}"/>')
     for name in reversed(list(curves)):
         colour, dash = style(order.index(name))
-        quoted = html.escape(name, quote=True)
+        quoted, line = html.escape(name, quote=True), _path(curves[name] / axis.maximum)
         parts.append(
-            f'<path class="curve {colour}" data-run="{quoted}" stroke-dasharray="{dash}" d="{_path(curves[name])}">'
+            f'<path class="curve {colour}" data-run="{quoted}" stroke-dasharray="{dash}" d="{line}">'
             f"<title>{quoted}</title></path>"
         )
     return "".join([*parts, "</svg>"])
 
 
-def _path(nsgd: NDArray[np.float64]) -> str:
-    """The share of pairs below each threshold, as a line that leaves out what lies on its straight pieces."""
-    thresholds = np.linspace(0, MAXIMUM, _STEPS + 1)
-    share = np.searchsorted(np.sort(nsgd), thresholds, side="left") / max(len(nsgd), 1)
+def _path(errors: NDArray[np.float64]) -> str:
+    """The share of pairs below each threshold from 0 to 1, as a line without what lies on its straight pieces."""
+    thresholds = np.linspace(0, 1, _STEPS + 1)
+    share = np.searchsorted(np.sort(errors), thresholds, side="left") / max(len(errors), 1)
     change = np.diff(share) != 0
     keep = np.concatenate([[True], change]) | np.concatenate([change, [True]])
     points = [f"{_x(t):.1f},{_y(s):.1f}" for t, s in zip(thresholds[keep], share[keep], strict=True)]
     return "M" + "L".join(points)
 
 
-def _x(threshold: float) -> float:
-    return _LEFT + (_WIDTH - _LEFT - _RIGHT) * threshold / MAXIMUM
+def _x(share: float) -> float:
+    return _LEFT + (_WIDTH - _LEFT - _RIGHT) * share
 
 
 def _y(share: float) -> float:

@@ -137,7 +137,7 @@ def rebuilt(r: Run, options: Options) -> Pipeline:
     except ValueError as error:
         raise ValueError(f"made by an earlier version, {error}") from error
     cache = {"cache": options.cache, "cache_limit": options.cache_limit}
-    built: Pipeline = presets.build_pipeline(OmegaConf.create({**composed, **cache}), options.device)
+    built: Pipeline = presets.build_pipeline(OmegaConf.create({**composed, **cache}), options.device, None)
     return built
 
 
@@ -159,5 +159,6 @@ def shown_pair(pair: ImagePair, runs: Sequence[Run], pipelines: Mapping[str, Pip
             pictures = drawn(pair, images, stored, outcome, r.name)
         pictures = pictures or from_stored(pair, images, stored, r.name)
         nsgd = float(stored["nsgd"]) if stored["ok"] else None
-        seen.append(Shown(r.name, nsgd, str(stored["reason"]), pictures, stored["configuration"] or ""))
+        kind = stored["configuration"] or ""
+        seen.append(Shown(r.name, nsgd, str(stored["reason"]), pictures, kind, stored["corner_error"]))
     return ShownPair(pair.identity, seen, notes)

@@ -17,6 +17,7 @@ from markupsafe import Markup
 
 from fmtorch.evaluation import curves, tables
 from fmtorch.evaluation.canvas import Image
+from fmtorch.evaluation.differences import differences
 from fmtorch.evaluation.statistics import THRESHOLD
 from fmtorch.evaluation.summary import summarize
 from fmtorch.evaluation.summary_tables import caption
@@ -36,17 +37,30 @@ class Picture:
 
 @dataclasses.dataclass(frozen=True)
 class Shown:
-    """A pair as one run sees it. nsgd: None where it failed, with the reason. configuration: empty where unknown."""
+    """A pair as one run sees it. nsgd: None where it failed, with the reason. configuration: empty where unknown.
+
+    corner_error: px, in place of NSGD where the pair has a homography.
+    """
 
     run: str
     nsgd: float | None
     reason: str = ""
     pictures: Sequence[Picture] = ()
     configuration: str = ""
+    corner_error: float | None = None
+
+    @property
+    def good(self) -> bool:
+        """Whether its error is below the threshold that is marked in the curves."""
+        if self.corner_error is not None:
+            return self.corner_error < curves.CORNERS.mark
+        return self.nsgd is not None and self.nsgd < THRESHOLD
 
     @property
     def result(self) -> str:
         """What is said of it."""
+        if self.corner_error is not None:
+            return f"failed: {self.reason}" if self.reason else f"corner error {self.corner_error:.2f} px"
         result = f"failed: {self.reason}" if self.nsgd is None else f"NSGD {self.nsgd:.4f}"
         return f"{result}, {self.configuration}" if self.configuration not in ("", "general") else result
 
@@ -100,7 +114,9 @@ def differing_pairs(runs: Mapping[str, pa.Table], count: int) -> list[str]:
 
     Of a single run: from its best pair to its worst, in equal steps.
     """
-    nsgd = np.stack([np.minimum(v, DISAGREEMENT) for v in tables.common(runs, "nsgd")])
+    axis = curves.axis_of(runs)
+    most = DISAGREEMENT if axis is curves.NSGD else axis.maximum
+    nsgd = np.stack([np.minimum(v, most) for v in tables.common(runs, axis.column)])
     first = next(iter(runs.values()))
     at = {key: i for i, key in enumerate(first["key"].to_pylist())}
     rows = [at[key] for key in tables.shared_keys(runs)]
@@ -134,12 +150,13 @@ def _resource(name: str) -> str:
 
 def _context(section: Section, names: Sequence[str]) -> dict[str, Any]:
     summaries = {name: summarize(table) for name, table in section.runs.items()}
+    axis = curves.axis_of(section.runs)
     pairs = {table.num_rows for table in section.runs.values()}
     facts = f"{len(section.runs)} runs" if len(section.runs) > 1 else "One run"
     counts = f"{min(pairs):,}" + (f" to {max(pairs):,}" if len(pairs) > 1 else "")
     optional_tables = (
-        tables.merit(summaries), tables.families(summaries), tables.poses(summaries), tables.focals(summaries),
-        tables.configurations(summaries), tables.differences(section.runs),
+        tables.merit(summaries), tables.families(summaries), tables.homographies(summaries), tables.poses(summaries),
+        tables.focals(summaries), tables.configurations(summaries), differences(section.runs),
     )  # fmt: skip
     return {
         "heading": section.heading,
@@ -147,8 +164,10 @@ def _context(section: Section, names: Sequence[str]) -> dict[str, Any]:
         "legend": caption(next(iter(summaries.values()))),
         "tables": [*(table for table in optional_tables if table), tables.seconds(summaries)],
         "names": list(section.runs),
+        "axis": axis.label,
         "curves": [
-            (title, Markup(curves.svg(title, panel, names))) for title, panel in curves.panels(section.runs).items()
+            (title, Markup(curves.svg(title, panel, names, axis)))
+            for title, panel in curves.panels(section.runs).items()
         ],
         "pairs": [_pair(pair) for pair in section.pairs],
         "notes": section.notes,
@@ -163,7 +182,7 @@ def _pair(pair: ShownPair) -> dict[str, Any]:
             {
                 "name": shown.run,
                 "result": shown.result,
-                "good": shown.nsgd is not None and shown.nsgd < THRESHOLD,
+                "good": shown.good,
                 "pictures": [_encoded(picture) for picture in shown.pictures],
             }
             for shown in pair.runs

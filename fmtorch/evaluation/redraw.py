@@ -12,16 +12,19 @@ from fmtorch.data import ImagePair
 from fmtorch.evaluation.canvas import Image
 from fmtorch.evaluation.page import Picture
 from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_epipolar_lines_of_corners, draw_matches
-from fmtorch.metrics import nsgd
+from fmtorch.metrics import corner_error, nsgd
 from fmtorch.pipeline.pipeline import Outcome
 
 SAME_F = 1e-12  # difference of any element, of unit Frobenius norm, within which two F are the same
+SAME_CORNERS = 0.01  # px, corner error up to which two homographies are the same: what captions show
 SAME_NSGD = 1e-4  # between the F of a run and the one drawn again, up to which they are the same: what captions show
 
 
 def difference(pair: ImagePair, images: Sequence[Image], stored: Mapping[str, Any], outcome: Outcome) -> str:
     """What differs between the row of a pair and what its pipeline makes of it now; empty where nothing does."""
     again, reason = outcome.estimate, outcome.reason
+    if pair.H is not None:
+        return _difference_of_homographies(pair, images, stored, outcome)
     if again is None or not bool(again.ok[0]):
         return f"gives no F when it is drawn again ({reason}), unlike in its run" if stored["ok"] else ""
     run = torch.tensor(stored["F"], dtype=torch.float64) if stored["ok"] else None
@@ -44,6 +47,23 @@ def difference(pair: ImagePair, images: Sequence[Image], stored: Mapping[str, An
     )
 
 
+def _difference_of_homographies(
+    pair: ImagePair, images: Sequence[Image], stored: Mapping[str, Any], outcome: Outcome
+) -> str:
+    """The same of a homography, by its corner error."""
+    again = outcome.estimate
+    if again is None or not bool(again.ok[0]) or not stored["ok"]:
+        found = again is not None and bool(again.ok[0])
+        return (
+            ""
+            if found == bool(stored["ok"])
+            else f"{'gives a' if found else 'gives no'} homography now, unlike in its run"
+        )
+    size, H = torch.tensor([images[0].shape[:2]]), torch.tensor(stored["H"], dtype=torch.float64).reshape(1, 3, 3)
+    apart = float(corner_error(again.F.cpu(), H, size)[0])
+    return "" if apart <= SAME_CORNERS else f"gives another homography when it is drawn again, {apart:.2f} px apart"
+
+
 def drawn(
     pair: ImagePair, images: Sequence[Image], stored: Mapping[str, Any], outcome: Outcome, name: str
 ) -> list[Picture]:
@@ -57,9 +77,10 @@ def drawn(
     x0, x1 = (x[0].cpu().numpy().astype(np.float64) for x in (c.x0, c.x1))
     inliers = estimate.inliers[0].cpu().numpy() & bool(stored["ok"])
     matches = draw_matches(images[0], images[1], x0, x1, inliers)
-    said = f"{int(inliers.sum())} inliers of F (green) of {len(inliers)} matches; a sample of either is drawn"
+    matrix = "F" if pair.H is None else "H"
+    said = f"{int(inliers.sum())} inliers of {matrix} (green) of {len(inliers)} matches; a sample of either is drawn"
     pictures = [Picture(matches, f"matches of {name}", said)]
-    if stored["ok"]:
+    if stored["ok"] and pair.H is None:
         F = np.array(stored["F"]).reshape(3, 3)
         lines = draw_epipolar_lines(images[0], images[1], x0[inliers], x1[inliers], F, truth=pair.F)
         said = "Epipolar lines of some inliers; the true ones dashed in white"
@@ -69,7 +90,7 @@ def drawn(
 
 def from_stored(pair: ImagePair, images: Sequence[Image], stored: Mapping[str, Any], name: str) -> list[Picture]:
     """The epipolar lines of the F that a run stored, of corners of the images; nothing of a pair without F."""
-    if not stored["ok"]:
+    if not stored["ok"] or pair.H is not None:
         return []
     F = np.array(stored["F"]).reshape(3, 3)
     lines = draw_epipolar_lines_of_corners(images[0], images[1], F, truth=pair.F)

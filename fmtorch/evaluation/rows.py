@@ -12,6 +12,7 @@ from torch import Tensor
 from fmtorch import metrics
 from fmtorch.evaluation.focals import focal_errors
 from fmtorch.evaluation.outcomes import joined_correspondences, joined_estimates, joined_true
+from fmtorch.evaluation.planes import plane_figures
 from fmtorch.evaluation.poses import PairPose, pose_errors
 from fmtorch.pipeline.pipeline import STAGES, Outcome
 from fmtorch.storage import PairRow
@@ -19,6 +20,11 @@ from fmtorch.storage import PairRow
 
 def evaluate(outcomes: Sequence[Outcome], seed: int = 0) -> list[PairRow]:
     """One row a pair. NSGD is 1 where the pipeline failed; an inlier rate is NaN where it is not defined."""
+    planar = [outcome.pair.H is not None for outcome in outcomes]
+    if any(planar):
+        of_planes = iter(_of_homographies([o for o, own in zip(outcomes, planar, strict=True) if own]))
+        others = iter(evaluate([o for o, own in zip(outcomes, planar, strict=True) if not own], seed))
+        return [next(of_planes if own else others) for own in planar]
     start = time.perf_counter()
     nsgd, released = _distances(outcomes, seed)
     before, after = _inlier_rates(outcomes)
@@ -28,6 +34,17 @@ def evaluate(outcomes: Sequence[Outcome], seed: int = 0) -> list[PairRow]:
         _row(outcome, {"nsgd": a, "nsgd_released": b, "inlier_rate_before": c, "inlier_rate": d}, pose, seconds)
         for outcome, a, b, c, d, pose in zip(outcomes, nsgd, released, before, after, poses, strict=True)
     ]
+
+
+def _of_homographies(outcomes: Sequence[Outcome]) -> list[PairRow]:
+    """The rows of pairs of known homographies, which have corner errors in place of NSGD and poses."""
+    start = time.perf_counter()
+    figures = plane_figures(outcomes)
+    seconds = (time.perf_counter() - start) / max(len(outcomes), 1)
+    unknown = PairPose(None, None, None)
+    rates = ({"nsgd": math.nan, "inlier_rate_before": f.before, "inlier_rate": f.after} for f in figures)
+    rows = zip(outcomes, rates, figures, strict=True)
+    return [_row(outcome, own, unknown, seconds, f.corner_error) for outcome, own, f in rows]
 
 
 def _distances(outcomes: Sequence[Outcome], seed: int) -> tuple[list[float], list[float]]:
@@ -64,9 +81,12 @@ def _inlier_rates(outcomes: Sequence[Outcome]) -> tuple[list[float], list[float]
     return before, after
 
 
-def _row(outcome: Outcome, figures: dict[str, float], pose: PairPose, seconds: float) -> PairRow:
+def _row(
+    outcome: Outcome, figures: dict[str, float], pose: PairPose, seconds: float, corner_error: float | None = None
+) -> PairRow:
     pair, c, estimate = outcome.pair, outcome.correspondences, outcome.estimate
     ok, configuration, focals = outcome.solved, outcome.configuration, focal_errors(outcome)
+    matrix = estimate.F[0].flatten().tolist() if estimate is not None and ok else None
     return PairRow(
         pair=pair.identity, key=pair.key, family=pair.family, scene=pair.scene, ok=ok, reason=outcome.reason,
         corrs=int(estimate.inliers.sum()) if estimate is not None else 0,
@@ -74,7 +94,8 @@ def _row(outcome: Outcome, figures: dict[str, float], pose: PairPose, seconds: f
         features0=outcome.features[0], features1=outcome.features[1],
         draws=int(estimate.draws[0]) if estimate is not None else 0,
         **{f"seconds_{stage}": outcome.seconds.get(stage, math.nan) for stage in STAGES}, seconds_metrics=seconds,
-        F=estimate.F[0].flatten().tolist() if estimate is not None and ok else None,
+        F=matrix if corner_error is None else None, H=None if corner_error is None else matrix,
+        corner_error=corner_error,
         significance=float(cast(Tensor, estimate.significance)[0]) if estimate is not None and ok else None,
         related=bool(estimate.related[0]) if estimate is not None else False, **figures,
         rotation_error=pose.rotation, translation_error=pose.translation, pose_reason=pose.reason,

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from fmtorch.core.estimate import CONFIGURATIONS
 from fmtorch.evaluation.intervals import share_interval
+from fmtorch.evaluation.planes import homography_figures
 from fmtorch.evaluation.statistics import MERITS, THRESHOLD, focal_figures, pose_figures, recalled, scene_names
 from fmtorch.storage import PAIR_SCHEMA
 
@@ -41,6 +42,8 @@ def summarize(table: pa.Table) -> dict[str, Group]:
     - corrs, corrs_before: number of inliers and of matches given to the estimator; means over pairs that did not fail.
     - failures, failure_share, reasons: the commonest reasons and how often; reasons that differ in numbers alone are
       one, with the range of these.
+    - homography: of the pairs whose true homography is known, which have no NSGD and no recall, see
+      `homography_figures`; None where there are none.
     - pose: of the pairs whose cameras are known, see `pose_figures`; None where there are none.
     - configurations: how many pairs are in each of `CONFIGURATIONS`; None where none is known.
     - focals: of the focal lengths that were estimated, see `focal_figures`; None where there are none.
@@ -58,14 +61,15 @@ def _group(table: pa.Table) -> Group:
     group: Group = {"pairs": len(ok), "scenes": len(set(scenes))}
 
     group |= {"recall": None, "recall_interval": None, "interval_over": None, "recall_fine": None, "auc_05": None}
-    if len(ok):
+    if len(ok) and not np.isnan(nsgd).all():
         interval = share_interval(nsgd < THRESHOLD, scenes)
         group |= {
             "recall": interval.value, "recall_interval": [interval.low, interval.high], "interval_over": interval.over,
             "recall_fine": float(MERITS["recall_01"](nsgd).mean()), "auc_05": float(MERITS["auc_05"](nsgd).mean()),
         }  # fmt: skip
     released = np.where(ok, _column(table, "nsgd_released"), 1.0)
-    group["recall_released"] = float(recalled(released).mean()) if len(ok) and not np.isnan(released).any() else None
+    known = group["recall"] is not None and not np.isnan(released).any()
+    group["recall_released"] = float(recalled(released).mean()) if known else None
 
     for name in ("inlier_rate", "inlier_rate_before"):
         rate = _column(table, name)
@@ -75,6 +79,7 @@ def _group(table: pa.Table) -> Group:
         group[name] = _mean(_column(table, name)[ok])
 
     group["pose"] = pose_figures(_column(table, "rotation_error"), _column(table, "translation_error"))
+    group["homography"] = homography_figures(_column(table, "corner_error"))
     kinds = Counter(kind for kind in table["configuration"].to_pylist() if kind is not None)
     group["configurations"] = {name: kinds[name] for name in CONFIGURATIONS} if kinds else None
     columns = ("focal_error0", "focal_error1"), ("focal_log_ratio0", "focal_log_ratio1")

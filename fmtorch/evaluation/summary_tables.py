@@ -9,17 +9,26 @@ from rich.table import Table
 
 from fmtorch.core.estimate import CONFIGURATIONS
 from fmtorch.evaluation.bootstrap import LEVEL
+from fmtorch.evaluation.planes import THRESHOLDS
 from fmtorch.evaluation.statistics import FINE_THRESHOLD, FOCAL_THRESHOLDS, POSE_THRESHOLDS, THRESHOLD
 from fmtorch.evaluation.summary import ALL, STAGES, Group
 
 RECALL = "%Recall [interval]"  # the column that has an interval
 _DASH = "–"
+_OF_RECALL = ("%Recall", RECALL, f"at {FINE_THRESHOLD}", "AUC@0.05", "%Recall (released NSGD)")
 Columns = Mapping[str, Callable[[Group], str]]
 
 
 def summary_table(summary: Mapping[str, Group], title: str) -> Table:
     """The main figures, for a terminal of 80 columns."""
-    return _shown(title, caption(summary), _TERMINAL, _rows(summary))
+    return _shown(title, caption(summary), known_columns(_TERMINAL, summary), _rows(summary))
+
+
+def known_columns(columns: Columns, summary: Mapping[str, Group]) -> Columns:
+    """The columns without those of recall where no group has any: homographies have none."""
+    if any(group["recall"] is not None or not group["pairs"] for group in summary.values()):
+        return columns
+    return {heading: column for heading, column in columns.items() if heading not in _OF_RECALL}
 
 
 def pose_table(summary: Mapping[str, Group]) -> Table | None:
@@ -30,14 +39,16 @@ def pose_table(summary: Mapping[str, Group]) -> Table | None:
 
 
 def further_tables(summary: Mapping[str, Group]) -> list[Table]:
-    """Focal lengths where some were estimated, and configurations where a pair is not general, for a terminal."""
+    """Homographies and focal lengths where some were estimated, and configurations where a pair is not general."""
     return [_shown(heading, note, columns, rows) for heading, note, columns, rows in _further(summary)]
 
 
 def _further(summary: Mapping[str, Group]) -> list[tuple[str, str, Columns, list[tuple[str, Group]]]]:
     focals = [(name, group["focals"]) for name, group in _rows(summary) if group["focals"] is not None]
     kinds = [(name, group["configurations"]) for name, group in _rows(summary) if group["configurations"] is not None]
-    tables = [("Focal lengths", FOCAL_CAPTION, FOCAL_COLUMNS, focals)] if focals else []
+    planes = [(name, group["homography"]) for name, group in _rows(summary) if group["homography"] is not None]
+    tables = [("Homography", HOMOGRAPHY_CAPTION, HOMOGRAPHY_COLUMNS, planes)] if planes else []
+    tables += [("Focal lengths", FOCAL_CAPTION, FOCAL_COLUMNS, focals)] if focals else []
     if any(count for _, group in kinds for name, count in group.items() if name != "general"):
         tables.append(("Configurations", CONFIGURATION_CAPTION, CONFIGURATION_COLUMNS, kinds))
     return tables
@@ -57,8 +68,9 @@ def _shown(title: str, caption: str, columns: Columns, rows: list[tuple[str, Gro
 
 def summary_markdown(summary: Mapping[str, Group], title: str) -> str:
     """All figures as a Markdown page."""
-    rows = [list(MARKDOWN_COLUMNS), ["---", *["---:"] * (len(MARKDOWN_COLUMNS) - 1)]]
-    rows += [_cells(MARKDOWN_COLUMNS, name, group) for name, group in _rows(summary)]
+    shown = known_columns(MARKDOWN_COLUMNS, summary)
+    rows = [list(shown), ["---", *["---:"] * (len(shown) - 1)]]
+    rows += [_cells(shown, name, group) for name, group in _rows(summary)]
     stages = [["seconds (median per pair)", *STAGES, "total"], ["---", *["---:"] * (len(STAGES) + 1)]]
     for name, group in _rows(summary):
         stages.append([name, *(_number(group["seconds"][stage], "{:.3f}") for stage in (*STAGES, "total"))])
@@ -100,6 +112,11 @@ def caption(summary: Mapping[str, Group]) -> str:
     overs = dict.fromkeys(group["interval_over"] for _, group in _rows(summary) if group["interval_over"])
     where = {over: [name for name, g in _rows(summary) if g["interval_over"] == over] for over in overs}
     over = "; ".join(f"{o}s" + (f" ({', '.join(names)})" if len(where) > 1 else "") for o, names in where.items())
+    if any(group["homography"] is not None for _, group in _rows(summary)):
+        return (
+            "%Inlier: right matches, within 3 px of the true homography, and #Corrs, after estimation, -m: before; "
+            "means over the pairs that did not fail."
+        )
     return (
         f"%Recall: NSGD < {THRESHOLD}, failures are misses; [{LEVEL:.0%} Wilson interval; independent units: "
         f"{over or 'pairs'}]. AUC@0.05: area under the recall curve to NSGD {THRESHOLD}. "
@@ -179,6 +196,16 @@ POSE_CAPTION = (
 )
 POSE_CAPTION_BINNED = f"{POSE_CAPTION} mAP: mean of recall at 5°, 10°, ..., as in papers before 2020."
 
+HOMOGRAPHY_COLUMNS: Columns = {
+    "": lambda group: "",
+    "Pairs": lambda group: str(group["pairs"]),
+    **{f"AUC@{t} px": _percent(f"auc_{t}px") for t in THRESHOLDS},
+    "corner error": lambda group: _number(group["corner_error"], "{:.2f} px"),
+}
+HOMOGRAPHY_CAPTION = (
+    "By the mean distance, in image 1, between the corners of image 0 as the true and the estimated homography map "
+    "them; failures are misses. AUC: area under the recall curve; corner error: median."
+)
 FOCAL_COLUMNS: Columns = {
     "": lambda group: "",
     "Images": lambda group: str(group["images"]),

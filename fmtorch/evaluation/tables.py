@@ -10,20 +10,22 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from fmtorch.evaluation.bootstrap import LEVEL, Interval
-from fmtorch.evaluation.intervals import MIN_UNITS, mean_difference, share_difference
-from fmtorch.evaluation.statistics import FINE_THRESHOLD, PERCENT, POSE_THRESHOLDS, THRESHOLD, areas, scene_names
+from fmtorch.evaluation.bootstrap import LEVEL
+from fmtorch.evaluation.statistics import FINE_THRESHOLD, POSE_THRESHOLDS, THRESHOLD
 from fmtorch.evaluation.summary import ALL, STAGES
 from fmtorch.evaluation.summary_tables import (
     CONFIGURATION_CAPTION,
     CONFIGURATION_COLUMNS,
     FOCAL_CAPTION,
     FOCAL_COLUMNS,
+    HOMOGRAPHY_CAPTION,
+    HOMOGRAPHY_COLUMNS,
     MARKDOWN_COLUMNS,
     POSE_CAPTION_BINNED,
     POSE_COLUMNS,
     RECALL,
     Columns,
+    known_columns,
 )
 
 DASH = "–"
@@ -64,7 +66,8 @@ class Table:
 def merit(summaries: Summaries) -> Table:
     """All figures over all pairs, a row a run."""
     counts = ("Pairs", "Scenes")  # which stand last: recall is what is looked for
-    columns = {heading: column for heading, column in MARKDOWN_COLUMNS.items() if heading and heading not in counts}
+    known = known_columns(MARKDOWN_COLUMNS, {name: summary[ALL] for name, summary in summaries.items()})
+    columns = {heading: column for heading, column in known.items() if heading and heading not in counts}
     columns |= {heading: MARKDOWN_COLUMNS[heading] for heading in counts}
     ranked = {RECALL: "recall", f"at {FINE_THRESHOLD}": "recall_fine", "AUC@0.05": "auc_05"}
     best = {heading: _best({n: s[ALL][field] for n, s in summaries.items()}) for heading, field in ranked.items()}
@@ -98,6 +101,11 @@ def poses(summaries: Summaries) -> Table | None:
     return Table("Relative pose", ["run", *columns], rows, POSE_CAPTION_BINNED)
 
 
+def homographies(summaries: Summaries) -> Table | None:
+    """Accuracy of homographies over all pairs; None where none is known."""
+    return _of_field(summaries, "homography", "Homography", HOMOGRAPHY_COLUMNS, HOMOGRAPHY_CAPTION)
+
+
 def focals(summaries: Summaries) -> Table | None:
     """Accuracy of estimated focal lengths over all pairs; None where none were estimated."""
     return _of_field(summaries, "focals", "Focal lengths", FOCAL_COLUMNS, FOCAL_CAPTION)
@@ -124,7 +132,7 @@ def _of_field(summaries: Summaries, field: str, heading: str, columns: Columns, 
 def families(summaries: Summaries) -> Table | None:
     """Recall with its interval, and AUC@0.05, by family; None where there is but one."""
     names = list(dict.fromkeys(family for summary in summaries.values() for family in summary if family != ALL))
-    if len(names) < 2:
+    if len(names) < 2 or any(group["recall"] is None for summary in summaries.values() for group in summary.values()):
         return None
     best = {f: _best({n: s[f]["auc_05"] for n, s in summaries.items() if f in s}) for f in names}
     rows = {
@@ -138,33 +146,6 @@ def families(summaries: Summaries) -> Table | None:
     }
     note = f"Bars: the {LEVEL:.0%} Wilson interval of recall, from 0 to 100 %. Bold: the largest AUC@0.05."
     return Table(f"By family: %Recall at {THRESHOLD} / AUC@0.05", ["run", *names], rows, note)
-
-
-def differences(runs: Mapping[str, pa.Table]) -> Table | None:
-    """The first run minus each other one, on the pairs that the two share; None of a single run."""
-    if len(runs) < 2:
-        return None
-    first, *others = runs
-    key, family, place = (runs[first][name].to_pylist() for name in ("key", "family", "scene"))
-    scene = dict(zip(key, scene_names(family, place), strict=True))
-    by_run = {}
-    for other in others:
-        two = {first: runs[first], other: runs[other]}
-        a, b = common(two, "nsgd")
-        by_run[other] = (len(a), _ahead(a, b, [scene[key] for key in shared_keys(two)]))
-    ends = [abs(end) for _, cells in by_run.values() for _, i in cells if i for end in (i.low, i.high)]
-    widest = max(ends, default=1.0) or 1.0
-    rows = {
-        name: [Cell(f"{count:,}"), *(Cell(text, bar=_around_zero(i, widest)) for text, i in cells)]
-        for name, (count, cells) in by_run.items()
-    }
-    head = ["run", "shared pairs", f"recall at {THRESHOLD}", f"at {FINE_THRESHOLD}", "AUC@0.05"]
-    note = (
-        f"In points; positive where {first} is ahead of the row's run. In brackets the paired {LEVEL:.0%} interval "
-        f"(Bonett and Price's for recall, a bootstrap for AUC@0.05 from {MIN_UNITS} scenes or pairs on): a difference "
-        "whose interval holds 0 may be chance."
-    )
-    return Table(f"{first} minus each other run, pair by pair", head, rows, note)
 
 
 def seconds(summaries: Summaries) -> Table:
@@ -205,34 +186,11 @@ def common(runs: Mapping[str, pa.Table], column: str) -> list[NDArray[np.float64
     return columns
 
 
-def _ahead(a: NDArray[np.float64], b: NDArray[np.float64], scenes: Sequence[str]) -> list[tuple[str, Interval | None]]:
-    """Differences of recall at both thresholds and of AUC@0.05, with intervals, of NSGD of the same pairs."""
-    if not len(a):
-        return [(DASH, None)] * 3
-    intervals = [share_difference(a < t, b < t, scenes) for t in (THRESHOLD, FINE_THRESHOLD)]
-    parts = areas(a), areas(b)
-    area = mean_difference(*parts, scenes)
-    texts = [(_signed(i), i) for i in intervals]
-    difference = f"{PERCENT * float((parts[0] - parts[1]).mean()):+.1f} (n too small)"
-    return [*texts, (difference, None) if area is None else (_signed(area), area)]
-
-
-def _signed(i: Interval) -> str:
-    return f"{100 * i.value:+.1f} [{100 * i.low:+.1f}, {100 * i.high:+.1f}]"
-
-
 def _share(group: Mapping[str, Any]) -> Bar | None:
     if group["recall"] is None:
         return None
     low, high = group["recall_interval"]
     return Bar(100 * low, 100 * group["recall"], 100 * high)
-
-
-def _around_zero(i: Interval | None, widest: float) -> Bar | None:
-    if i is None:
-        return None
-    low, value, high = (50 + 50 * end / widest for end in (i.low, i.value, i.high))
-    return Bar(low, value, high, zero=50.0)
 
 
 def _best(values: Mapping[str, float | None]) -> set[str]:

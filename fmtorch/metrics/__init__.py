@@ -4,6 +4,7 @@ Their results are tensors; sizes may also be tuples (h, w).
 `fmtorch.metrics.torchmetrics` has thin classes over them that accumulate over batches and processes.
 """
 
+from fmtorch.metrics.homography import corner_error, right_of_homography
 from fmtorch.metrics.inlier_rate import InlierRate, ground_truth_inliers, inlier_rate
 from fmtorch.metrics.nsgd import nsgd, sgd
 from fmtorch.metrics.nsgd_released import nsgd_released
@@ -14,6 +15,7 @@ from fmtorch.metrics.recall import mean_recall, recall, recall_curve
 __all__ = [
     "InlierRate",
     "PoseError",
+    "corner_error",
     "fundamental_pose_error",
     "ground_truth_inliers",
     "inlier_rate",
@@ -26,5 +28,6 @@ __all__ = [
     "pose_map",
     "recall",
     "recall_curve",
+    "right_of_homography",
     "sgd",
 ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 
+from fmtorch.core.stages import model_of
 from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.pipeline.configuration import classify
@@ -19,8 +20,10 @@ def examined(
     """The outcomes of a run with their configurations; a pair that cannot be examined has none and harms no other.
 
     knowledge: gives correspondences what the estimator was given of their cameras; None: nothing, and their K counts
-    for nothing here. Matches of the results have what it gives.
+    for nothing here. Matches of the results have what it gives. Of homographies nothing is asked.
     """
+    if model_of(pipeline.estimator) != "fundamental":
+        return list(outcomes)
     matched = [i for i, o in enumerate(outcomes) if o.correspondences is not None and o.estimate is not None]
     results = list(outcomes)
     with one_thread(pipeline.device):

@@ -43,6 +43,7 @@ class Pipeline:
     memory: how many images' features are kept for pairs to come (about 5 MB an image at 8,000 SIFT features), and their
     grey levels where a pruner looks at them.
     families: by family, pruners that its pairs get in place of those of the same names.
+    model: what the estimator must give, "fundamental" or "homography" (`Estimate.model`); None: either.
     """
 
     def __init__(
@@ -55,9 +56,11 @@ class Pipeline:
         device: torch.device | str = "cpu",
         memory: int = 64,
         families: Mapping[str, Mapping[str, Pruner]] | None = None,
+        model: str | None = "fundamental",
     ) -> None:
-        if (model := model_of(estimator)) != "fundamental":
-            raise ValueError(f"the estimator gives {model} matrices; a pipeline needs fundamental matrices")
+        if model is not None and (gives := model_of(estimator)) != model:
+            hint = ": estimator=homography" if model == "homography" else ""
+            raise ValueError(f"the estimator gives {gives} matrices; a pipeline needs {model} matrices here{hint}")
         self.extractor, self.matcher, self.pruners, self.estimator = features, matcher, dict(pruners), estimator
         self.families = dict(families or {})
         self.memory = memory

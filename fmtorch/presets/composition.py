@@ -73,8 +73,11 @@ def expect_dataset(config: DictConfig) -> None:
         data.expect_loadable(**options)
 
 
-def build_pipeline(config: DictConfig, device: torch.device | str = "cpu") -> Any:
-    """The `Pipeline` that features (with cache), matcher, pruner and estimator of a composed config describe."""
+def build_pipeline(config: DictConfig, device: torch.device | str = "cpu", model: str | None = "fundamental") -> Any:
+    """The `Pipeline` that features (with cache), matcher, pruner and estimator of a composed config describe.
+
+    model: what the estimator must give, "fundamental" or "homography"; None: either.
+    """
     extractor = cached(instantiate(config.features, "features"), config.cache, config.cache_limit)
     pruners, for_families = build_pruners(config)
     open_files([extractor, pruners, for_families], torch.device(device))  # a damaged one is no failure of each pair
@@ -85,6 +88,7 @@ def build_pipeline(config: DictConfig, device: torch.device | str = "cpu") -> An
         instantiate(config.estimator, "estimator"),
         device=device,
         families=for_families,
+        model=model,
     )
 
 

@@ -42,11 +42,16 @@ PAIR_SCHEMA = pa.schema(
         pa.field("focal_error1", pa.float64()),
         pa.field("focal_log_ratio0", pa.float64()),
         pa.field("focal_log_ratio1", pa.float64()),
+        pa.field("H", pa.list_(pa.float64(), 9)),
+        pa.field("corner_error", pa.float64()),
     ]
 )
 _POSES = ("rotation_error", "translation_error", "pose_reason")
 _KINDS = ("configuration", "warning", "focal_error0", "focal_error1", "focal_log_ratio0", "focal_log_ratio1")
-MISSING_COLUMNS = {1: (*_POSES, *_KINDS), 2: (*_POSES, *_KINDS), 3: _KINDS}
+_PLANES = ("H", "corner_error")
+MISSING_COLUMNS = {
+    1: (*_POSES, *_KINDS, *_PLANES), 2: (*_POSES, *_KINDS, *_PLANES), 3: (*_KINDS, *_PLANES), 4: _PLANES,
+}  # fmt: skip
 """Of the rows of run folders of these earlier formats."""
 
 
@@ -54,8 +59,10 @@ MISSING_COLUMNS = {1: (*_POSES, *_KINDS), 2: (*_POSES, *_KINDS), 3: _KINDS}
 class PairRow:
     """The result of one image pair. What could not be computed is None or NaN, and null in the table.
 
+    A pair of a known homography has a corner error, infinite where it failed, and H in place of F; its NSGD is NaN.
+
     Raises ValueError for a row that contradicts itself: a failed pair has a reason, NSGD 1 and no F; a sound one has no
-    reason and nine finite elements of F; NSGD is in [0, 1]; there are both angles of a pose error or neither.
+    reason and nine finite elements of F or H; NSGD is in [0, 1]; there are both angles of a pose error or neither.
     """
 
     pair: str  # the pair's identity within its data set
@@ -90,8 +97,13 @@ class PairRow:
     focal_error1: float | None = None  # not determined; None where it is given exactly, or the true one is unknown
     focal_log_ratio0: float | None = None  # log(f / f_true); None where it is not determined, too
     focal_log_ratio1: float | None = None
+    H: Sequence[float] | None = None  # row by row, x1 ~ H x0 in pixels, unit Frobenius norm
+    corner_error: float | None = None  # px in image 1, of the corners of image 0; infinite where the pair failed
 
     def __post_init__(self) -> None:
+        if self.corner_error is not None:
+            _expect_homography(self)
+            return
         if not 0.0 <= self.nsgd <= 1.0:
             raise ValueError(f"pair {self.pair!r}: nsgd is {self.nsgd}; it must be in [0, 1]")
         angles = [a for a in (self.rotation_error, self.translation_error) if a is not None and not math.isnan(a)]
@@ -114,9 +126,26 @@ class PairRow:
             )
 
 
+def _expect_homography(row: PairRow) -> None:
+    """Raises ValueError for a row of a pair of a known homography that contradicts itself."""
+    error, H = row.corner_error, row.H
+    if error is None or not error >= 0.0 or not math.isnan(row.nsgd) or row.F is not None:
+        raise ValueError(
+            f"pair {row.pair!r} has a homography: it needs a corner error of at least 0, NSGD NaN and no F, but has "
+            f"corner_error={error}, nsgd={row.nsgd}, F={row.F}"
+        )
+    found = H is not None and len(H) == 9 and all(map(math.isfinite, H))
+    if row.ok != found or row.ok == bool(row.reason) or (not row.ok and math.isfinite(error)):
+        raise ValueError(
+            f"pair {row.pair!r} has a homography: it needs nine finite numbers of H and no reason, or a reason, no H "
+            f"and an infinite corner error, but has H={H}, reason={row.reason!r}, corner_error={error}"
+        )
+
+
 def to_table(rows: Sequence[PairRow]) -> pa.Table:
     """The rows as a table of `PAIR_SCHEMA`; NaN becomes null."""
     columns = {name: [_plain(getattr(row, name)) for row in rows] for name in PAIR_SCHEMA.names}
+    columns["nsgd"] = [row.nsgd for row in rows]  # NaN where there is no F
     return pa.table(columns, schema=PAIR_SCHEMA)
 
 

@@ -26,11 +26,11 @@ from fmtorch.core.files import naming, replacing, sync, temporary_name
 from fmtorch.storage.parts import PartWriter, part_bytes, part_files
 from fmtorch.storage.rows import MISSING_COLUMNS, PAIR_SCHEMA, PairRow, to_table
 
-FORMAT = 4  # of the folder; to be raised when the schema changes, or what the identity tells
-READABLE = (1, 2, 3, FORMAT)  # formats that `load` reads
+FORMAT = 5  # of the folder; to be raised when the schema changes, or what the identity tells
+READABLE = (1, 2, 3, 4, FORMAT)  # formats that `load` reads
 _LACKS = {
     1: "the order of the pruners, the errors of poses and configurations",
-    2: "the errors of poses and configurations", 3: "configurations",
+    2: "the errors of poses and configurations", 3: "configurations", 4: "homographies",
 }  # fmt: skip
 _LISTINGS = 20  # at most, until parts are those that were listed
 _SHOWN = 5  # differing fields shown in an error

@@ -147,10 +147,12 @@ def test_a_folder_of_the_first_format_is_read_but_not_continued(tmp_path: Path) 
 
 POSES = ["rotation_error", "translation_error", "pose_reason"]
 KINDS = ["configuration", "warning", "focal_error0", "focal_error1", "focal_log_ratio0", "focal_log_ratio1"]
+PLANES = ["H", "corner_error"]
 
 
 @pytest.mark.parametrize(("version", "lacks", "told"), [
-    (2, [*POSES, *KINDS], "the errors of poses and configurations"), (3, KINDS, "configurations"),
+    (2, [*POSES, *KINDS, *PLANES], "the errors of poses and configurations"), (3, [*KINDS, *PLANES], "configurations"),
+    (4, PLANES, "homographies"),
 ])  # fmt: skip
 def test_a_folder_of_fewer_columns_is_read_but_not_continued(
     version: int, lacks: list[str], told: str, tmp_path: Path
@@ -241,6 +243,14 @@ def test_every_column_has_a_field() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"corner_error": 1.0, "F": None}, "needs a corner error of at least 0, NSGD NaN and no F"),
+        ({"corner_error": 1.0, "nsgd": float("nan")}, "NSGD NaN and no F"),
+        ({"corner_error": -1.0, "nsgd": float("nan"), "F": None, "H": F}, "a corner error of at least 0"),
+        ({"corner_error": 1.0, "nsgd": float("nan"), "F": None}, "nine finite numbers of H"),
+        (
+            {"corner_error": 1.0, "nsgd": float("nan"), "F": None, "H": F, "ok": False, "reason": "x"},
+            "an infinite corner",
+        ),
         ({"nsgd": float("nan")}, "nsgd"),
         ({"nsgd": 1.5}, "nsgd"),
         ({"reason": "x"}, "has a reason"),

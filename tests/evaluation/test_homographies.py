@@ -1,0 +1,109 @@
+"""Runs of homographies: rows, summary, report, and what does not go together."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from fmtorch.commands import eval as eval_command
+from fmtorch.commands import report as report_command
+from fmtorch.data import load
+from fmtorch.evaluation.planes import homography_figures
+from fmtorch.metrics import corner_error, pose_auc
+from fmtorch.presets.composition import compose
+from fmtorch.storage import RunFolder
+from tests.data import planes
+
+
+def run(root: Path, folder: Path, *words: str, pipeline: str = "sift_ratio") -> Path:
+    fixed = ("dataset=hpatches", f"dataset.root={root}", "dataset.short_side=200", "cache=off", f"run_dir={folder}")
+    config = compose("eval", (f"pipeline={pipeline}", "estimator=homography", *fixed, *words))
+    return eval_command.run(config, pipeline, ["estimator=homography"])
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two runs on two sequences, one image of which is missing."""
+    folder = tmp_path_factory.mktemp("runs")
+    root = planes.write_hpatches(folder / "hpatches")
+    (root / "v_view/6.ppm").unlink()
+    run(root, folder / "runs/a")
+    run(root, folder / "runs/b", "estimator.hypotheses=250", "executor=processes", "workers=2")
+    return folder
+
+
+def test_rows_hold_homographies_and_corner_errors(runs: Path) -> None:
+    dataset = load("hpatches", root=runs / "hpatches", short_side=200)
+    pairs = {pair.identity: pair for pair in dataset}
+    rows = RunFolder.load(runs / "runs/a").read().to_pylist()
+    assert len(rows) == 10
+    for row in rows:
+        pair = pairs[row["pair"]]
+        assert row["F"] is None
+        assert math.isnan(row["nsgd"])
+        assert row["rotation_error"] is None
+        if pair.problem is not None:
+            assert (row["ok"], row["corner_error"], row["reason"]) == (False, math.inf, pair.problem)
+            continue
+        H, true = (torch.tensor(np.reshape(m, (3, 3))) for m in (row["H"], pair.H))
+        assert row["corner_error"] == pytest.approx(float(corner_error(H, true, torch.tensor([200, 300]))))
+        assert row["corner_error"] < 1
+        assert row["inlier_rate"] > 0.9
+    assert sum(not row["ok"] for row in rows) == 1
+
+
+def test_the_summary_is_of_corner_errors(runs: Path) -> None:
+    summary = json.loads((runs / "runs/a/summary.json").read_text())
+    errors = torch.tensor(RunFolder.load(runs / "runs/a").read()["corner_error"].to_pylist(), dtype=torch.float64)
+    whole = summary["all"]["homography"]
+    assert whole["pairs"] == 10
+    assert [whole[f"auc_{t}px"] for t in (1, 3, 5)] == pytest.approx(pose_auc(errors, (1, 3, 5)).tolist())
+    assert summary["viewpoint"]["failures"] == 1
+    assert summary["all"]["recall"] is summary["all"]["pose"] is None
+    page = (runs / "runs/a/summary.md").read_text()
+    assert "AUC@1 px" in page
+    assert "%Recall" not in page
+    assert (runs / "runs/a/recall.png").stat().st_size > 0
+
+
+def test_the_report_compares_corner_errors(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(runs)
+    words = (f"runs=[{runs / 'runs'}]", f"root={runs / 'hpatches'}", f"output={runs / 'report.html'}", "pictures=2")
+    page = report_command.run(compose("report", words)).read_text()
+    for part in ("AUC@3 px", "corner error threshold [px]", "inliers of H", "minus each other run", "corner error 0."):
+        assert part in page
+    assert "NSGD" not in page.partition("<h2>Runs")[0].partition("</style>")[2]
+
+
+def test_figures_of_known_errors() -> None:
+    figures = homography_figures(np.array([0.5, 2.0, np.inf, np.nan]))
+    assert figures is not None
+    # To 1: a triangle to (0.5, 1/3), then 0.5 at 1/3.
+    assert figures["auc_1px"] == pytest.approx(0.5 / 6 + 0.5 / 3)
+    assert (figures["pairs"], figures["corner_error"]) == (3, 2.0)
+    assert homography_figures(np.array([np.nan])) is None
+    failed = homography_figures(np.array([np.inf, np.inf, 1.0]))
+    assert failed is not None
+    assert failed["corner_error"] is None
+
+
+def test_what_does_not_go_together_is_refused(runs: Path, tmp_path: Path) -> None:
+    root = runs / "hpatches"
+    for words, error in {
+        (
+            "estimator=lmeds",
+        ): r"gives fundamental matrices; a pipeline needs homography matrices here: estimator=homography",
+        ("cameras=unknown",): r"the data set has homography matrices, which take no export= and no cameras=",
+        ("export=h5",): r"take no export=",
+    }.items():
+        with pytest.raises(ValueError, match=error):
+            run(root, tmp_path / "run", *words)
+    config = compose("eval", ("pipeline=sift_ratio", "estimator=homography", "dataset=stereo", "cache=off"))
+    with pytest.raises(ValueError, match="gives homography matrices; a pipeline needs fundamental matrices here"):
+        eval_command.run(config, "sift_ratio")
+    assert not (tmp_path / "run").exists()
