@@ -78,7 +78,7 @@ class PairList(PairDataset):
         return self._pairs[index]
 
     def _pair(self, listed: ListedPair, scene: str) -> ImagePair:
-        identity = f"{self._family}/{listed.names[0]}-{listed.names[1]}"
+        identity = f"{self.name}/{listed.names[0]}-{listed.names[1]}"  # draws do not follow the name of the list
         self._seen[identity] += 1
         if self._seen[identity] > 1:  # the same pair on a second line is a second pair
             identity += f"#{self._seen[identity]}"
@@ -101,7 +101,7 @@ class PairList(PairDataset):
         """The image of a name as it is read. size: of the images that the list's K are of, where it says so."""
         path = self._home / name
         own = self._size(path) if self._resize is not None or turns or size is not None else None
-        identity = f"{self._family}/{name}"
+        identity = f"{self.name}/{name}"
         if own is None:
             return ImageSource(identity, path)
         target = size if self._resize is None else self._resize
