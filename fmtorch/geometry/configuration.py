@@ -112,7 +112,8 @@ def classified(evidence: Evidence, focal_known: Bool[Tensor, " b"] | None = None
 
     1. unrelated: neither F nor H explains more than `MIN_EVIDENCE` nats.
     2. general: matches off the plane support F, ``both - plane - log n > MIN_PARALLAX``: by the Bayesian information
-       criterion (Schwarz 1978), F has two parameters beyond those of its plane. `MIN_TRANSLATION` where 3. explains most.
+       criterion (Schwarz 1978), F has two parameters beyond those of its plane. `MIN_TRANSLATION` where 3. explains
+       most matches.
     3. identical or rotation: ``x1 = a x0 + b``, with three parameters, or K1 R K0^-1, with three and those of the focal
        lengths, is as good as H with eight by the same criterion; of both the better one.
     4. planar.

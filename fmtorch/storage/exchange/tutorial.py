@@ -120,8 +120,8 @@ class _Cameras:
                 return a, b
         if len(ways) == 1 and not self._known:
             return ways[0]
-        missing = f"names no two images of {ROTATIONS} and {TRANSLATIONS}" if self._known else "does not name two images"
-        raise DataError(f"{self.folder / MATCHES}: {key!r} {missing}")
+        lack = f"names no two images of {ROTATIONS} and {TRANSLATIONS}" if self._known else "does not name two images"
+        raise DataError(f"{self.folder / MATCHES}: {key!r} {lack}")
 
     def calibration(self, key: str) -> tuple[Array, Array]:
         K = h5.reshaped(self._file(CALIBRATIONS), key, 2, 3, 3)
