@@ -19,6 +19,7 @@ from fmtorch.evaluation.gallery import Options, Run, find_dataset, gallery
 from fmtorch.evaluation.page import Section, ShownPair, render
 from fmtorch.presets.composition import compose
 from fmtorch.storage import PairRow, RunFolder, to_table
+from tests.data import lists
 from tests.pipeline.test_pipeline import draw
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "guides" / "reports.md"
@@ -145,3 +146,13 @@ def test_no_pictures_are_explained(tmp_path: Path) -> None:
     assert gallery([run("a", {}, table)], Options(3, [other])) == (
         [], ["No pictures: the data set does not hold the pairs of the runs."],
     )  # fmt: skip
+
+
+def test_the_list_of_pairs_lies_beside_the_folder_of_its_images(tmp_path: Path) -> None:
+    file = lists.write(tmp_path / "list.txt", [lists.superglue(1, 5)])
+    stored = {"name": "pair_list", "resize": 200, "origin": None}
+    stored["digest"] = data.load("pair_list", root=lists.images(), file=file, resize=200).digest
+    found = find_dataset(stored, Options(1, [lists.images(), file]))
+    assert found[0].image0.path == lists.images() / lists.name(1)
+    with pytest.raises(DataError, match="needs root"):
+        find_dataset(stored, Options(1, [lists.images()]))

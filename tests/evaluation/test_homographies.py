@@ -15,6 +15,7 @@ from fmtorch.commands import report as report_command
 from fmtorch.data import load
 from fmtorch.evaluation.planes import homography_figures
 from fmtorch.metrics import corner_error, pose_auc
+from fmtorch.pipeline.labelled import MatchedPairs
 from fmtorch.presets.composition import compose
 from fmtorch.storage import RunFolder
 from tests.data import planes
@@ -107,3 +108,8 @@ def test_what_does_not_go_together_is_refused(runs: Path, tmp_path: Path) -> Non
     with pytest.raises(ValueError, match="gives homography matrices; a pipeline needs fundamental matrices here"):
         eval_command.run(config, "sift_ratio")
     assert not (tmp_path / "run").exists()
+
+
+def test_matches_are_not_labelled_by_homographies(runs: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="the data set hpatches has homography matrices; matches are labelled by"):
+        MatchedPairs(load("hpatches", root=runs / "hpatches"), "sift_ratio", root=tmp_path)

@@ -169,3 +169,13 @@ def test_the_command_evaluates_it(tmp_path: Path) -> None:
     summary = json.loads((folder / "summary.json").read_text())["all"]
     assert (summary["pairs"], summary["failures"], summary["pose"]["pairs"]) == (2, 0, 2)
     assert summary["seconds"]["features"] is None
+
+
+def test_a_folder_is_refused(tmp_path: Path) -> None:
+    from fmtorch.commands.match import run
+    from fmtorch.presets.composition import compose
+
+    for i in (0, 1):
+        draw(tmp_path / f"{i}.png", i)
+    with pytest.raises(ValueError, match="a folder is matched by keypoints of each image; this matcher takes pairs"):
+        run(compose("match", ("pipeline=vismatch", "matcher.name=sift-nn", f"images={tmp_path}")), "vismatch")

@@ -77,6 +77,10 @@ class MatchedPairs(StoredMatches):
             raise ValueError(f"most is {most}; at least 1 match of a pair must be kept")
         if not len(dataset):
             raise ValueError(f"the data set {dataset.name} has no pairs")
+        if (model := getattr(dataset, "model", "fundamental")) != "fundamental":
+            raise ValueError(
+                f"the data set {dataset.name} has {model} matrices; matches are labelled by fundamental ones"
+            )
         stages = _pipeline(pipeline, overrides)
         home = Path(root).expanduser() if root is not None else cache_dir() / "matched"
         identity = _identity(dataset, stages, most)
