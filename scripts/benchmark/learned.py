@@ -55,14 +55,14 @@ HARD = {
 PRIOR = {
     "none": "ratio one_to_one",
     "ratio": "ratio one_to_one ratio_prior",
-    "GMS": "ratio one_to_one gms_soft",
-    "LPM": "ratio one_to_one lpm_soft",
-    "CODE": "code_soft one_to_one ratio",
+    "GMS": "ratio one_to_one gms:soft=true",
+    "LPM": "ratio one_to_one lpm:soft=true",
+    "CODE": "code:soft=true one_to_one ratio",
     "frame consistency": "ratio one_to_one frame_consistency",
-    "LC, F": "ratio one_to_one lc_soft",
-    "LC, E": "ratio one_to_one lc_e_soft",
-    "LC, F, side information": "ratio one_to_one lc_side_soft",
-    "DFE": "ratio one_to_one dfe_soft",
+    "LC, F": "ratio one_to_one lc:soft=true",
+    "LC, E": "ratio one_to_one lc_e:soft=true",
+    "LC, F, side information": "ratio one_to_one lc_side:soft=true",
+    "DFE": "ratio one_to_one dfe:soft=true",
 }
 USES = {"hard": (HARD, ("ransac_eight_point", "lmeds_eight_point")), "prior": (PRIOR, ("fmtorch",))}
 GIVEN = frozenset(("ratio", "one_to_one"))  # what every method has, and what is not counted into its time
@@ -159,8 +159,8 @@ def chains(arguments: argparse.Namespace) -> Chains:
     if arguments.ngransac:
         built["prior"]["NG-RANSAC's network"] = [*before, ("lc", ngransac(arguments.ngransac))]
     for name, network, file in arguments.network:
-        for use, preset in (("hard", network), ("prior", f"{network}_soft")):
-            built[use][name] = [*before, (preset, presets.build("pruner", preset, file=file))]
+        for use in ("hard", "prior"):
+            built[use][name] = [*before, (network, presets.build("pruner", network, file=file, soft=use == "prior"))]
     return built
 
 
