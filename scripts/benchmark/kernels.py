@@ -22,8 +22,8 @@ import torch
 from fmtorch import presets
 from fmtorch.compiling import switch
 from fmtorch.core.types import Correspondences
+from scripts.benchmark.matched import pruner
 from scripts.benchmark.pruning_speed import correspondences
-from scripts.benchmark.specs import pruner
 
 COUNT = 600  # matches of the pair
 REPEATS = 15

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -16,7 +15,7 @@ from fmtorch.data import ImagePair
 from fmtorch.geometry import refine
 from fmtorch.pipeline.pipeline import Pipeline
 from scripts.benchmark import kept
-from scripts.benchmark.matched import options
+from scripts.benchmark.matched import pruner, split
 
 Stage = Callable[[Correspondences], Correspondences]
 Method = Callable[[ImagePair, Correspondences, int], Estimate]
@@ -33,12 +32,6 @@ def read_specs(path: Path) -> list[str]:
 def stages_of(spec: str) -> list[str]:
     """The pruners of `PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]`."""
     return [stage for stage in spec.partition("@")[2].split("+") if stage]
-
-
-def split(word: str) -> tuple[str, dict[str, Any]]:
-    """The preset of `PRESET[:KEY=VALUE,...]` and its changed options."""
-    name, _, rest = word.partition(":")
-    return name, options(rest)
 
 
 def pipeline_of(words: str, *overrides: str) -> Pipeline:
@@ -77,13 +70,6 @@ def pruning(spec: str, extra: Mapping[str, Stage] = NONE) -> Stage:
     """The pruners of a spec, in order; of nothing, the matches as they are."""
     pruners = [extra[stage] if stage in extra else pruner(stage) for stage in stages_of(spec)]
     return lambda c: functools.reduce(lambda kept, pruner: pruner(kept), pruners, c)
-
-
-def pruner(word: str) -> Stage:
-    """The stage of `PRUNER[:KEY=VALUE,...]`."""
-    name, changed = split(word)
-    stage: Stage = presets.build("pruner", name, **changed)
-    return stage
 
 
 def ngransac(file: Path) -> Stage:
