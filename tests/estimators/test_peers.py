@@ -41,7 +41,8 @@ def test_recovers_the_geometry_in_a_batch(name: str) -> None:
 @pytest.mark.parametrize("name", PEERS)
 def test_a_missing_library_is_named(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, PEERS[name], None)
-    with pytest.raises(ImportError, match=rf"{PEERS[name]}.*fmtorch\[peers\]"):
+    extra = "colmap" if name == "colmap" else "peers"
+    with pytest.raises(ImportError, match=rf"{PEERS[name]}.*fmtorch\[{extra}\]"):
         presets.build("estimator", name)
 
 

@@ -22,10 +22,11 @@ from fmtorch.geometry.verdict import judged
 
 Points = NDArray[np.float64]
 Builder = TypeVar("Builder", bound=Callable[..., Any])
-Solution = tuple[Points | None, NDArray[np.bool_]]
+Solution = tuple[Points | None, NDArray[np.bool_]] | tuple[Points | None, NDArray[np.bool_], Points | None]
+"""A model (3, 3), the inliers (n,), and the focal lengths (2,) in pixels where they are estimated, NaN if unknown."""
 
 MIN_MATCHES = 8
-MINIMAL_SAMPLE = 7  # inliers below which a model is none
+MINIMAL_SAMPLES = {"fundamental": 7, "homography": 4}  # inliers below which a model is none
 FAILURES = (cv2.error, RuntimeError, ValueError, TypeError)  # how these libraries say that they cannot solve a pair
 
 
@@ -34,6 +35,8 @@ class Pair:
     """A pair's matches as these libraries take them: x0, x1 (N, 2) in pixels, likelihood (N,), sizes (h, w).
 
     likelihood: the prior where there is one, else 1 - quality, else 1; matches are in its descending order if asked.
+    calibrations: where cameras are asked for, K0 and K1 (3, 3), None for an unknown focal length; shared_focal: whether
+    both unknown ones are one.
     """
 
     x0: Points
@@ -42,6 +45,8 @@ class Pair:
     size0: tuple[int, int]
     size1: tuple[int, int]
     seed: int
+    calibrations: tuple[Points | None, Points | None] | None = None
+    shared_focal: bool = False
 
     @property
     def joined(self) -> Points:
@@ -56,10 +61,13 @@ class PairwiseEstimator:
         name: what it is called in reasons.
         solve: the function; what it raises of `FAILURES` becomes the pair's reason.
         best_first: order the matches by likelihood.
+        model: of what the matrices are, fundamental or homography.
     """
 
-    def __init__(self, name: str, solve: Callable[[Pair], Solution], best_first: bool = False) -> None:
-        self.name, self._solve, self._best_first = name, solve, best_first
+    def __init__(
+        self, name: str, solve: Callable[[Pair], Solution], best_first: bool = False, model: str = "fundamental"
+    ) -> None:
+        self.name, self.model, self._solve, self._best_first = name, model, solve, best_first
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate each pair in turn; a pair without a solution is `ok=False` with a reason.
@@ -74,6 +82,7 @@ class PairwiseEstimator:
         b, n = c.mask.shape
         F = torch.zeros(b, 3, 3, dtype=torch.float64)
         inliers = torch.zeros(b, n, dtype=torch.bool)
+        focals: list[Points | None] = [None] * b
         reasons, batch = [""] * b, Batch.of(c.to("cpu"))
         for i in range(b):
             matches = batch.pair(i)
@@ -85,24 +94,45 @@ class PairwiseEstimator:
             likelihood = _likelihood(c, i)[slot].numpy()
             order = np.argsort(-likelihood, kind="stable") if self._best_first else np.arange(len(slot))
             x0, x1 = matches.x0[slot[order]], matches.x1[slot[order]]
-            size0, size1 = _size(c.size0, x0, i), _size(c.size1, x1, i)
+            sizes = _size(c.size0, x0, i), _size(c.size1, x1, i)
+            given = Pair(x0, x1, likelihood[order], *sizes, seed, *_cameras(batch, i))
             inside = np.zeros(len(slot), np.bool_)
             try:
-                estimate, inside[order] = self._solve(Pair(x0, x1, likelihood[order], size0, size1, seed))
+                estimate, inside[order], *rest = self._solve(given)
             except FAILURES as failure:  # OpenCV's USAC asserts what some matches do not fulfil
                 reasons[i] = f"{self.name} failed: {_said(failure)}"
                 continue
             if estimate is None or estimate.shape != (3, 3) or not np.isfinite(estimate).all() or not np.any(estimate):
-                reasons[i] = f"{self.name} found no fundamental matrix"
+                reasons[i] = f"{self.name} found no {self.model}{' matrix' * (self.model == 'fundamental')}"
                 continue
-            reasons[i] = degenerate_support(pair, inside, MINIMAL_SAMPLE, relative_rounding(c))
+            reasons[i] = degenerate_support(pair, inside, MINIMAL_SAMPLES[self.model], relative_rounding(c))
             if reasons[i]:
                 continue
             F[i] = torch.from_numpy(estimate / np.linalg.norm(estimate))
             inliers[i, torch.from_numpy(slot[inside])] = True
+            focals[i] = rest[0] if rest else None
         ok = torch.tensor([not reason for reason in reasons], dtype=torch.bool)
         draws = torch.zeros(b, dtype=torch.int64)  # not reported by these libraries
-        return judged(Estimate(F, inliers, ok, tuple(reasons), draws).to(c.mask.device), c)
+        found = Estimate(F, inliers, ok, tuple(reasons), draws, model=self.model, focals=_stacked(focals))
+        return judged(found.to(c.mask.device), c)
+
+
+def _cameras(batch: Batch, i: int) -> tuple[tuple[Points | None, Points | None] | None, bool]:
+    """Calibrations of a pair whose cameras are asked for, and whether their unknown focal lengths are one."""
+    if batch.focal is None or batch.sizes.shape[1] == 0:
+        return None, False
+    known = []
+    for (f, deviation), (h, w) in zip(batch.focal[i], batch.sizes[i].reshape(2, 2), strict=True):
+        K = np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1]])
+        known.append(K if deviation < np.inf else None)
+    return (known[0], known[1]), bool(batch.shared[i])
+
+
+def _stacked(focals: list[Points | None]) -> torch.Tensor | None:
+    """The focal lengths (B, 2) in pixels where some were estimated, NaN for those of other pairs."""
+    if all(each is None for each in focals):
+        return None
+    return torch.from_numpy(np.stack([np.full(2, np.nan) if each is None else each for each in focals]))
 
 
 def _said(failure: Exception) -> str:
@@ -126,12 +156,12 @@ def computed_by(package: str) -> Callable[[Builder], Builder]:
     return named
 
 
-def peer(module: str, name: str) -> Any:
-    """The module of a library of the extra `peers`. Raises ImportError with a hint where it is not installed."""
+def peer(module: str, name: str, extra: str = "peers") -> Any:
+    """The module of a library of an extra. Raises ImportError with a hint where it is not installed."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise ImportError(f"{name} ({module}) is not installed: pip install 'fmtorch[peers]'") from error
+        raise ImportError(f"{name} ({module}) is not installed: pip install 'fmtorch[{extra}]'") from error
 
 
 def solution(F: Any, inliers: Any) -> Solution:
