@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from rich import box
 from rich.table import Table
@@ -15,6 +16,7 @@ from fmtorch.evaluation.summary import ALL, STAGES, Group
 RECALL = "%Recall [interval]"  # the column that has an interval
 _DASH = "–"
 Columns = Mapping[str, Callable[[Group], str]]
+PoseRows = Sequence[tuple[str, Mapping[str, Any]]]  # names, and figures of `pose_figures`
 
 
 def summary_table(summary: Mapping[str, Group], title: str) -> Table:
@@ -24,9 +26,9 @@ def summary_table(summary: Mapping[str, Group], title: str) -> Table:
 
 def pose_table(summary: Mapping[str, Group]) -> Table | None:
     """The figures of poses, for a terminal of 80 columns; None where no pair has known cameras."""
-    columns = {heading: column for heading, column in POSE_COLUMNS.items() if "mAP" not in heading}
     rows = _pose_rows(summary)
-    return _shown("Relative pose", POSE_CAPTION, columns, rows) if rows else None
+    columns = {heading: column for heading, column in pose_columns(rows).items() if "mAP" not in heading}
+    return _shown("Relative pose", pose_caption(rows), columns, rows) if rows else None
 
 
 def further_tables(summary: Mapping[str, Group]) -> list[Table]:
@@ -70,8 +72,12 @@ def summary_markdown(summary: Mapping[str, Group], title: str) -> str:
     ]
     parts = [f"# {title}", _lines(rows), caption(summary)]
     if poses := _pose_rows(summary):
-        head = [["Relative pose", *list(POSE_COLUMNS)[1:]], ["---", *["---:"] * (len(POSE_COLUMNS) - 1)]]
-        parts += [_lines([*head, *(_cells(POSE_COLUMNS, name, group) for name, group in poses)]), POSE_CAPTION_BINNED]
+        columns = pose_columns(poses)
+        head = [["Relative pose", *list(columns)[1:]], ["---", *["---:"] * (len(columns) - 1)]]
+        parts += [
+            _lines([*head, *(_cells(columns, name, group) for name, group in poses)]),
+            pose_caption(poses, binned=True),
+        ]
     for heading, note, columns, groups in _further(summary):
         head = [[heading, *list(columns)[1:]], ["---", *["---:"] * (len(columns) - 1)]]
         parts += [_lines([*head, *(_cells(columns, name, group) for name, group in groups)]), note]
@@ -170,14 +176,36 @@ POSE_COLUMNS: Columns = {
     "mAA(10°)": _percent("maa_10"),
     **{f"mAP@{t}°": _percent(f"map_{t}") for t in POSE_THRESHOLDS},
     "R error": lambda group: f"{group['rotation']:.2f}°",
-    "t error, folded": lambda group: f"{group['translation']:.2f}°",
+    "t error": lambda group: f"{group['translation']:.2f}°",
 }
 POSE_CAPTION = (
     "Of the pairs with known cameras, by the larger of the angles of rotation and of translation, which is folded: its "
     "sign does not count. Failures count as 180° and 90°. AUC: area under the recall curve; mAA(10°): mean of recall "
     "at 1°, ..., 10°; R error, t error: medians."
 )
-POSE_CAPTION_BINNED = f"{POSE_CAPTION} mAP: mean of recall at 5°, 10°, ..., as in papers before 2020."
+SIGNED_POSE_CAPTION = (
+    "Of the pairs with known cameras, by the larger of the angles of rotation and of translation, whose sign counts "
+    "(pose.signed=true); of an F without cameras, of the best of its four poses, as PoseBench. Failures count as 180°. "
+    "AUC: area under the recall curve; mAA(10°): mean of recall at 1°, ..., 10°; R error, t error: medians."
+)
+BINNED = "mAP: mean of recall at 5°, 10°, ..., as in papers before 2020."
+
+
+def pose_columns(rows: PoseRows) -> Columns:
+    """The columns of poses; the last one says whether translations are folded or signed, where all are alike."""
+    signs = {group.get("signed", False) for _, group in rows}
+    suffix = {False: ", folded", True: ", signed"}[signs.pop()] if len(signs) == 1 else ""
+    return {f"{heading}{suffix * (heading == 't error')}": column for heading, column in POSE_COLUMNS.items()}
+
+
+def pose_caption(rows: PoseRows, binned: bool = False) -> str:
+    """What the columns of poses mean, for rows of one kind or, with their names, of both; binned: mAP is among them."""
+    names = {signed: [name for name, group in rows if group.get("signed", False) == signed] for signed in (False, True)}
+    captions = {False: POSE_CAPTION, True: SIGNED_POSE_CAPTION}
+    said = [(captions[signed], ", ".join(each)) for signed, each in names.items() if each]
+    text = " ".join(caption if len(said) == 1 else f"{which}: {caption}" for caption, which in said)
+    return f"{text} {BINNED}" if binned else text
+
 
 FOCAL_COLUMNS: Columns = {
     "": lambda group: "",

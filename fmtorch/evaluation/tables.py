@@ -20,10 +20,10 @@ from fmtorch.evaluation.summary_tables import (
     FOCAL_CAPTION,
     FOCAL_COLUMNS,
     MARKDOWN_COLUMNS,
-    POSE_CAPTION_BINNED,
-    POSE_COLUMNS,
     RECALL,
     Columns,
+    pose_caption,
+    pose_columns,
 )
 
 DASH = "–"
@@ -85,7 +85,7 @@ def poses(summaries: Summaries) -> Table | None:
     known = {name: summary[ALL]["pose"] for name, summary in summaries.items() if summary[ALL]["pose"] is not None}
     if not known:
         return None
-    columns = {heading: column for heading, column in POSE_COLUMNS.items() if heading}
+    columns = {heading: column for heading, column in pose_columns(list(known.items())).items() if heading}
     ranked = {f"AUC@{t}°": f"auc_{t}" for t in POSE_THRESHOLDS} | {"mAA(10°)": "maa_10"}
     best = {heading: _best({n: figures[field] for n, figures in known.items()}) for heading, field in ranked.items()}
     rows = {
@@ -95,7 +95,7 @@ def poses(summaries: Summaries) -> Table | None:
         ]
         for name in summaries
     }
-    return Table("Relative pose", ["run", *columns], rows, POSE_CAPTION_BINNED)
+    return Table("Relative pose", ["run", *columns], rows, pose_caption(list(known.items()), binned=True))
 
 
 def focals(summaries: Summaries) -> Table | None:
