@@ -13,10 +13,11 @@ from fmtorch.estimators.peers.pairwise import (
     Pair,
     PairwiseEstimator,
     Points,
+    Posed,
     Solution,
     computed_by,
+    fundamental_of_pose,
     peer,
-    solution,
 )
 
 USUAL_FOCAL = 1.2  # in units of the longer side, of a camera without a prior: COLMAP's default
@@ -59,8 +60,8 @@ def colmap(
 ) -> PairwiseEstimator:
     """COLMAP's estimators (Schoenberger & Frahm, CVPR 2016) with the defaults of its verification of matches.
 
-    Where both focal lengths are known (`find_essential`, `cameras=known`) the model is an essential matrix. Known focal
-    lengths count as exact, whatever their deviation.
+    Where both focal lengths are known (`find_essential`, `cameras=known`) the model is an essential matrix. COLMAP's
+    verification takes those that are known roughly for exact.
 
     Args:
         threshold: pixels, Sampson distance; of homographies the distance in image 1.
@@ -90,19 +91,21 @@ def colmap(
         cameras = None if pair.calibrations is None else _cameras(pair)
         if two_view:
             found = two_view_geometry(pair.x0, pair.x1, cameras or _cameras(pair), settings(pair))
+            if cameras is None:
+                return found.F, found.inliers
             focals = np.array([np.nan if K is None else K[0, 0] for K in (found.K0, found.K1)])
-            return found.F, found.inliers, focals if cameras else None
+            return Posed(found.F, found.inliers, focals, found.R, found.t)
         ransac = settings(pair).ransac
-        if cameras and all(camera.known for camera in cameras):
-            return essential_matrix(pair.x0, pair.x1, cameras, ransac)[:2]
+        if cameras is not None and pair.exact:
+            F, inliers, R, t = essential_matrix(pair.x0, pair.x1, cameras, ransac)
+            return Posed(F, inliers, None, R, t)
         return fundamental_matrix(pair.x0, pair.x1, ransac)
 
     def homography(pair: Pair) -> Solution:
         found = library.estimate_homography_matrix(pair.x0, pair.x1, settings(pair).ransac)
         if found is None:
             return None, np.zeros(len(pair.x0), np.bool_)
-        H, inliers = solution(found["H"], found["inlier_mask"])[:2]
-        assert H is not None
+        H, inliers = np.asarray(found["H"], np.float64), np.asarray(found["inlier_mask"], np.bool_)
         depth = pair.x0[inliers] @ H[2, :2] + H[2, 2]
         return (-H if np.count_nonzero(depth < 0) > np.count_nonzero(depth > 0) else H), inliers
 
@@ -134,7 +137,7 @@ def two_view_geometry(x0: Points, x1: Points, cameras: tuple[Camera, Camera], op
         return TwoView(configuration, F, None, None, K0, K1, inliers)
     R, t = np.asarray(found.cam2_from_cam1.rotation.matrix()), np.asarray(found.cam2_from_cam1.translation)
     if configuration != "UNCALIBRATED" and np.any(t):
-        F = _of_pose(K0, K1, R, t)
+        F = fundamental_of_pose(K0, K1, R, t)
     return TwoView(configuration, F, R, t, K0, K1, inliers)
 
 
@@ -179,10 +182,3 @@ def _pinhole(library: Any, camera: Camera) -> Any:
     made = library.Camera(camera_id=camera.number, model="PINHOLE", width=w, height=h, params=params)
     made.has_prior_focal_length = camera.known
     return made
-
-
-def _of_pose(K0: Points, K1: Points, R: Points, t: Points) -> Points:
-    """K1^-T [t]x R K0^-1."""
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    F: Points = np.linalg.inv(K1).T @ cross @ R @ np.linalg.inv(K0)
-    return F

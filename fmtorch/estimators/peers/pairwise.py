@@ -6,7 +6,7 @@ import dataclasses
 import importlib
 import math
 from collections.abc import Callable
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -22,12 +22,28 @@ from fmtorch.geometry.verdict import judged
 
 Points = NDArray[np.float64]
 Builder = TypeVar("Builder", bound=Callable[..., Any])
-Solution = tuple[Points | None, NDArray[np.bool_]] | tuple[Points | None, NDArray[np.bool_], Points | None]
-"""A model (3, 3), the inliers (n,), and the focal lengths (2,) in pixels where they are estimated, NaN if unknown."""
 
 MIN_MATCHES = 8
 MINIMAL_SAMPLES = {"fundamental": 7, "homography": 4}  # inliers below which a model is none
 FAILURES = (cv2.error, RuntimeError, ValueError, TypeError)  # how these libraries say that they cannot solve a pair
+
+
+class Posed(NamedTuple):
+    """A solution of pairs whose cameras are asked for.
+
+    F: (3, 3), px. inliers: (n,). focals: (2,), px, NaN where unknown. R, t: X1 = R X0 + t, None where the pose is to be
+    taken from F.
+    """
+
+    F: Points | None
+    inliers: NDArray[np.bool_]
+    focals: Points | None = None
+    R: Points | None = None
+    t: Points | None = None
+
+
+Solution = tuple[Points | None, NDArray[np.bool_]] | Posed
+"""A model (3, 3), None where there is none, and its inliers (n,)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,8 +51,8 @@ class Pair:
     """A pair's matches as these libraries take them: x0, x1 (N, 2) in pixels, likelihood (N,), sizes (h, w).
 
     likelihood: the prior where there is one, else 1 - quality, else 1; matches are in its descending order if asked.
-    calibrations: where cameras are asked for, K0 and K1 (3, 3), None for an unknown focal length; shared_focal: whether
-    both unknown ones are one.
+    calibrations: where cameras are asked for, K0 and K1 (3, 3), None for an unknown focal length; calibrated: whether
+    both are exact; shared_focal: whether both unknown focal lengths are one.
     """
 
     x0: Points
@@ -46,7 +62,14 @@ class Pair:
     size1: tuple[int, int]
     seed: int
     calibrations: tuple[Points | None, Points | None] | None = None
+    calibrated: bool = False
     shared_focal: bool = False
+
+    @property
+    def exact(self) -> tuple[Points, Points] | None:
+        """K0 and K1 where both are exactly known."""
+        K0, K1 = self.calibrations or (None, None)
+        return (K0, K1) if self.calibrated and K0 is not None and K1 is not None else None
 
     @property
     def joined(self) -> Points:
@@ -82,7 +105,7 @@ class PairwiseEstimator:
         b, n = c.mask.shape
         F = torch.zeros(b, 3, 3, dtype=torch.float64)
         inliers = torch.zeros(b, n, dtype=torch.bool)
-        focals: list[Points | None] = [None] * b
+        posed: list[Posed | None] = [None] * b
         reasons, batch = [""] * b, Batch.of(c.to("cpu"))
         for i in range(b):
             matches = batch.pair(i)
@@ -98,7 +121,8 @@ class PairwiseEstimator:
             given = Pair(x0, x1, likelihood[order], *sizes, seed, *_cameras(batch, i))
             inside = np.zeros(len(slot), np.bool_)
             try:
-                estimate, inside[order], *rest = self._solve(given)
+                solved = self._solve(given)
+                estimate, inside[order] = solved[:2]
             except FAILURES as failure:  # OpenCV's USAC asserts what some matches do not fulfil
                 reasons[i] = f"{self.name} failed: {_said(failure)}"
                 continue
@@ -110,29 +134,34 @@ class PairwiseEstimator:
                 continue
             F[i] = torch.from_numpy(estimate / np.linalg.norm(estimate))
             inliers[i, torch.from_numpy(slot[inside])] = True
-            focals[i] = rest[0] if rest else None
+            posed[i] = solved if isinstance(solved, Posed) else None
         ok = torch.tensor([not reason for reason in reasons], dtype=torch.bool)
         draws = torch.zeros(b, dtype=torch.int64)  # not reported by these libraries
-        found = Estimate(F, inliers, ok, tuple(reasons), draws, model=self.model, focals=_stacked(focals))
+        found = Estimate(F, inliers, ok, tuple(reasons), draws, model=self.model, **_cameras_found(posed))
         return judged(found.to(c.mask.device), c)
 
 
-def _cameras(batch: Batch, i: int) -> tuple[tuple[Points | None, Points | None] | None, bool]:
-    """Calibrations of a pair whose cameras are asked for, and whether their unknown focal lengths are one."""
+def _cameras(batch: Batch, i: int) -> tuple[tuple[Points | None, Points | None] | None, bool, bool]:
+    """`Pair.calibrations`, `calibrated` and `shared_focal` of a row."""
     if batch.focal is None or batch.sizes.shape[1] == 0:
-        return None, False
+        return None, False, False
     known = []
     for (f, deviation), (h, w) in zip(batch.focal[i], batch.sizes[i].reshape(2, 2), strict=True):
         K = np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1]])
         known.append(K if deviation < np.inf else None)
-    return (known[0], known[1]), bool(batch.shared[i])
+    return (known[0], known[1]), batch.calibrated(i), bool(batch.shared[i])
 
 
-def _stacked(focals: list[Points | None]) -> torch.Tensor | None:
-    """The focal lengths (B, 2) in pixels where some were estimated, NaN for those of other pairs."""
-    if all(each is None for each in focals):
-        return None
-    return torch.from_numpy(np.stack([np.full(2, np.nan) if each is None else each for each in focals]))
+def _cameras_found(posed: list[Posed | None]) -> dict[str, torch.Tensor]:
+    """Focal lengths and poses where some were estimated, NaN for those of other pairs; t of unit length."""
+    fields = {}
+    for name, shape in (("focals", (2,)), ("R", (3, 3)), ("t", (3,))):
+        own = [None if each is None else getattr(each, name) for each in posed]
+        if any(value is not None for value in own):
+            fields[name] = torch.from_numpy(np.stack([np.full(shape, np.nan) if v is None else v for v in own]))
+    if "t" in fields:
+        fields["t"] = fields["t"] / fields["t"].norm(dim=-1, keepdim=True)
+    return fields
 
 
 def _said(failure: Exception) -> str:
@@ -174,6 +203,12 @@ def within(F: Any, pair: Pair, threshold: float) -> NDArray[np.bool_]:
     matrix, x0, x1 = (torch.from_numpy(np.asarray(value, np.float64)) for value in (F, pair.x0, pair.x1))
     inside: NDArray[np.bool_] = (sampson(matrix, x0, x1) <= threshold).numpy()
     return inside
+
+
+def fundamental_of_pose(K0: Points, K1: Points, R: Points, t: Points) -> Points:
+    """F of two calibrated cameras, K1^-T [t]x R K0^-1."""
+    F: Points = np.linalg.inv(K1).T @ np.cross(np.eye(3), t).T @ R @ np.linalg.inv(K0)
+    return F
 
 
 def _likelihood(c: Correspondences, i: int) -> torch.Tensor:

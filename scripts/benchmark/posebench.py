@@ -1,0 +1,209 @@
+"""PoseBench's relative poses (github.com/PoseLib/posebench) by its protocol, beside its published figures.
+
+FOLDER is the folder `relative` of its data, or one file of it. Of each pair the error is the larger of the angles of
+rotation and of translation, whose sign counts; of a fundamental matrix the best of its four poses is taken. AUC at 5,
+10 and 20 degrees, and means over the sets. Each set has its threshold; at most 1,000 samples, at least 100. Sets of
+other names need --threshold; pairs whose cameras have distortion (fisheye_*) are left out and counted.
+
+python -m scripts.benchmark posebench FOLDER
+python -m scripts.benchmark posebench FOLDER --every 10 --methods E:fmtorch E:fmtorch:scaled=false E:poselib E:colmap
+
+--rows is appended to pair by pair: started again, the command measures what is missing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from rich.progress import track
+
+from fmtorch import data, metrics
+from fmtorch.data import DataError, ImagePair
+from fmtorch.storage.exchange import h5
+from scripts.benchmark import posebench_methods as methods_of
+from scripts.benchmark.kept import Kept, Row
+from scripts.benchmark.matched import console
+from scripts.benchmark.sheet import MISSING, Sheet, put
+
+PUBLISHED = Path(__file__).resolve().parent / "posebench.csv"  # PoseLib 2.0.5; results/baseline.2_0_5.json there
+METHODS = ("E:fmtorch", "E:poselib", "E:colmap", "F:fmtorch", "F:poselib", "F:colmap")
+THRESHOLDS = (5, 10, 20)  # degrees
+MISSED = {"rotation": 180.0, "translation": 180.0}
+Figures = dict[str, dict[str, tuple[float, ...]]]  # method -> data set -> AUC in per cent
+
+
+class Set(NamedTuple):
+    """A file of pairs. name: without suffix. threshold: px."""
+
+    name: str
+    path: Path
+    threshold: float
+
+
+def add_arguments(commands: Any) -> None:
+    parser = commands.add_parser("posebench", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="the folder `relative` of PoseBench's data, or one file")
+    parser.add_argument("--methods", nargs="+", default=METHODS, help="KIND:PRESET[:KEY=VALUE,...], KIND being E or F")
+    parser.add_argument("--threshold", type=float, help="px, of sets that are not PoseBench's")
+    parser.add_argument("--every", type=int, default=1, help="every so many-th pair of each set; the protocol has all")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--rows", type=Path, help="keep what each method makes of each pair here, one line each")
+    parser.add_argument("--markdown", type=Path, help="put the tables between the marks `posebench` of this file")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    torch.set_num_threads(1)
+    published = read_published()
+    sets = sets_of(arguments.folder, published, arguments.threshold)
+    for text in arguments.methods:
+        methods_of.read(text)
+    rows: dict[str, list[Row]] = {}
+    kept = Kept(arguments.rows)
+    for each in sets:
+        found = measured(each, arguments, kept)
+        if found:
+            rows[each.name] = found
+    if not rows:
+        raise SystemExit(f"{arguments.folder}: no pair of pinhole cameras")
+    tables = sheets(rows, arguments.methods, published)
+    for table in tables:
+        console.print(table.terminal())
+    if arguments.markdown is not None:
+        put(arguments.markdown, tables, "posebench")
+
+
+def read_published() -> tuple[dict[str, float], Figures]:
+    """The threshold of each of PoseBench's sets in pixels, and its published figures."""
+    thresholds: dict[str, float] = {}
+    figures: Figures = {}
+    with PUBLISHED.open(encoding="utf-8") as file:
+        for line in csv.DictReader(file):
+            thresholds[line["dataset"]] = float(line["threshold"])
+            values = tuple(float(line[f"auc{t}"]) for t in THRESHOLDS)
+            figures.setdefault(line["method"], {})[line["dataset"]] = values
+    return thresholds, figures
+
+
+def sets_of(folder: Path, published: tuple[dict[str, float], Figures], threshold: float | None) -> list[Set]:
+    """The sets of a folder with their thresholds. Raises SystemExit where there are none, or one has none."""
+    root = folder / "relative" if (folder / "relative").is_dir() else folder
+    try:
+        paths = h5.files(root)
+    except DataError as error:
+        raise SystemExit(f"{error}; give the folder `relative` of PoseBench's data") from error
+    sets = []
+    for path in paths:
+        own = published[0].get(path.stem, threshold)
+        if path.stem.startswith("fisheye_") and own is None:
+            console.print(f"{path.name}: left out, its cameras are no pinholes", style="dim", highlight=False)
+        elif own is None:
+            raise SystemExit(f"{path.name} is none of PoseBench's sets: give its threshold in pixels, --threshold PX")
+        else:
+            sets.append(Set(path.stem, path, own))
+    return sets
+
+
+def measured(of: Set, arguments: argparse.Namespace, kept: Kept) -> list[Row]:
+    """The rows of a set's pairs by all methods. Raises SystemExit where its file cannot be read."""
+    try:
+        dataset = data.load("h5", root=of.path, layout="posebench")
+    except DataError as error:
+        raise SystemExit(str(error)) from error
+    pairs = [dataset[i] for i in range(0, len(dataset), arguments.every)]
+    usable = [pair for pair in pairs if pair.problem is None]
+    done = kept.by("pair", "seed", "threshold", "method", "identity", "matches")
+    made_with = {text: (text, methods_of.identity(text), dataset.digest) for text in arguments.methods}
+    found: list[Row] = []
+    for pair in track(usable, of.name, console=console, transient=True):
+        new = []
+        for text in arguments.methods:
+            row = done.get((pair.identity, arguments.seed, of.threshold, *made_with[text]))
+            if row is None:
+                row = judged(methods_of.read(text), pair, of.threshold, arguments.seed)
+                row |= dict(zip(("method", "identity", "matches"), made_with[text], strict=True))
+                new.append(row)
+            found.append(row)
+        kept.add(new)
+    _say_what_is_missing(of, pairs, found)
+    return found
+
+
+def judged(method: methods_of.Method, pair: ImagePair, threshold: float, seed: int) -> Row:
+    """What one method makes of a pair: angles in degrees, 180 where it has no pose, and milliseconds."""
+    row: Row = {"pair": pair.identity, "seed": seed, "threshold": threshold, "ms": 0.0, "reason": "", **MISSED}
+    assert pair.matches is not None
+    start = time.process_time()
+    try:
+        c = pair.matches().correspondences
+        start = time.process_time()
+        estimate = methods_of.estimated(method, pair, c, threshold, seed)
+    except (ValueError, DataError) as error:
+        return row | {"reason": str(error), "ms": 1e3 * (time.process_time() - start)}
+    row["ms"] = 1e3 * (time.process_time() - start)
+    if not bool(estimate.ok[0]):
+        return row | {"reason": estimate.reason[0]}
+    angles = methods_of.error(method, estimate, pair)
+    return row | {"rotation": float(angles.rotation), "translation": float(angles.translation)}
+
+
+def _say_what_is_missing(of: Set, pairs: list[ImagePair], rows: list[Row]) -> None:
+    """Pairs that are left out, with the commonest reason, and those that a method has no pose for."""
+    reasons = Counter(pair.problem for pair in pairs if pair.problem is not None)
+    if reasons:
+        left, (reason, _) = sum(reasons.values()), reasons.most_common(1)[0]
+        console.print(f"{of.name}: {left} of {len(pairs)} pairs left out: {reason}", style="dim", highlight=False)
+    failed = Counter(row["method"] for row in rows if row["reason"])
+    for method, count in failed.items():
+        reason = next(row["reason"] for row in rows if row["method"] == method and row["reason"])
+        console.print(f"{of.name}, {method}: {count} misses, such as: {reason}", style="dim", highlight=False)
+
+
+def sheets(
+    rows: dict[str, list[Row]], methods: Sequence[str], published: tuple[dict[str, float], Figures]
+) -> tuple[Sheet, Sheet]:
+    """Means over the sets, with milliseconds, and the figures of each set, beside those that are published."""
+    thresholds, theirs = published
+    whole, each = [], []
+    for method in methods:
+        own = {name: [row for row in of_set if row["method"] == method] for name, of_set in rows.items()}
+        ours = {name: areas(of_set) for name, of_set in own.items()}
+        same = theirs.get(method, {})
+        said = mean([same[name] for name in rows]) if all(name in same for name in rows) else None
+        ms = np.median([row["ms"] for of_set in own.values() for row in of_set])
+        whole.append([method, shown(mean(list(ours.values()))), shown(said), f"{ms:.1f}"])
+    for name, of_set in rows.items():
+        for method in methods:
+            own_rows = [row for row in of_set if row["method"] == method]
+            px = f"{own_rows[0]['threshold']:g}"
+            theirs_here = theirs.get(method, {}).get(name)
+            each.append([name, method, px, str(len(own_rows)), shown(areas(own_rows)), shown(theirs_here)])
+    count = f"{len(rows)} set{'s' * (len(rows) != 1)}, {sum(len(r) for r in rows.values()) // len(methods):,} pairs"
+    complete = " (all of the protocol)" if set(rows) == set(thresholds) else f" of PoseBench's {len(thresholds)}"
+    heading = "AUC@5/10/20°, translations signed"
+    return (
+        Sheet(f"PoseBench: means of {count}{complete}", ["method", heading, "published", "ms, median"], whole),
+        Sheet("PoseBench: each set", ["set", "method", "px", "pairs", heading, "published"], each),
+    )
+
+
+def areas(rows: list[Row]) -> tuple[float, ...]:
+    """AUC in per cent at each of the thresholds."""
+    worst = torch.tensor([max(row["rotation"], row["translation"]) for row in rows], dtype=torch.float64)
+    return tuple((100 * metrics.pose_auc(worst, THRESHOLDS)).tolist())
+
+
+def mean(figures: list[tuple[float, ...]]) -> tuple[float, ...]:
+    return tuple(np.mean(figures, 0).tolist())
+
+
+def shown(figures: tuple[float, ...] | None) -> str:
+    return MISSING if figures is None else " / ".join(f"{value:.1f}" for value in figures)
