@@ -25,6 +25,7 @@ from fmtorch.presets import available, top_level_names
 from fmtorch.presets.pruners import with_explicit
 
 Task = Callable[[DictConfig], None]
+SUBMITTED = "jobs run in other processes; what each prints: .submitit/JOB/JOB_0_log.out below hydra.sweep.dir (runs)"
 
 
 class Mistake(ValueError):
@@ -71,6 +72,8 @@ def run_command(
         return
     with exits_with_message(interrupted):
         sys.argv[1:] = hydra_arguments(sys.argv[1:], paths, positional)
+        if any(word.startswith("hydra/launcher=submitit") for word in sys.argv):
+            print(SUBMITTED, flush=True)
         try:
             with env_override({"HYDRA_FULL_ERROR": "1"}):  # Hydra then leaves errors to us
                 hydra.main(version_base=None, config_path=str(conf_dir()), config_name=name)(task)()

@@ -238,7 +238,12 @@ def test_a_sweep_runs_in_processes_of_a_launcher(
     words = ["-m", *SMALL, f"hydra/launcher={launcher}", *jobs, "limit=1,0", "run_dir=out"]
     assert ended(monkeypatch, data_set, "eval", *words) == f"error: limit=0; {COUNT} or null", capfd.readouterr().err
     assert (data_set / "out" / "summary.md").is_file()
-    assert "Traceback" not in capfd.readouterr().err
+    printed = capfd.readouterr()
+    assert "Traceback" not in printed.err
+    if launcher == "submitit_local":  # whose jobs print into files
+        assert ".submitit/JOB/JOB_0_log.out" in printed.out
+        logs = list((data_set / "runs" / ".submitit").glob("*/*_log.out"))
+        assert any("summary.md" in log.read_text(encoding="utf-8") for log in logs)
 
 
 @pytest.mark.parametrize("command", ["eval", "match", "pairs", "report", "train", "verify"])

@@ -103,6 +103,7 @@ class _Cameras:
                         self.by_image[name] = h5.reshaped(R, name, 3, 3), h5.reshaped(T, name, 3)
                     except DataError as error:
                         self.problems[name] = str(error)
+        self._known = {*self.by_image, *self.problems}
 
     def image(self, family: str, name: str, images: Path | None) -> ImageSource:
         """An image of the scene, the same object for all pairs that show it."""
@@ -114,13 +115,12 @@ class _Cameras:
         """The two images of a pair; their names may hold hyphens too."""
         parts = key.split("-")
         ways = [("-".join(parts[:i]), "-".join(parts[i:])) for i in range(1, len(parts))]
-        known = {*self.by_image, *self.problems}
         for a, b in ways:
-            if a in known and b in known:
+            if a in self._known and b in self._known:
                 return a, b
-        if len(ways) == 1 and not known:
+        if len(ways) == 1 and not self._known:
             return ways[0]
-        missing = f"names no two images of {ROTATIONS} and {TRANSLATIONS}" if known else "does not name two images"
+        missing = f"names no two images of {ROTATIONS} and {TRANSLATIONS}" if self._known else "does not name two images"
         raise DataError(f"{self.folder / MATCHES}: {key!r} {missing}")
 
     def calibration(self, key: str) -> tuple[Array, Array]:
