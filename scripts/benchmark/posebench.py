@@ -1,12 +1,12 @@
 """PoseBench's relative poses (github.com/PoseLib/posebench) by its protocol, beside its published figures.
 
-FOLDER is the folder `relative` of its data, or one file of it. Of each pair the error is the larger of the angles of
+FILES is the folder `relative` of its data, or one file of it. Of each pair the error is the larger of the angles of
 rotation and of translation, whose sign counts; of a fundamental matrix the best of its four poses is taken. AUC at 5,
 10 and 20 degrees, and means over the sets. Each set has its threshold; at most 1,000 samples, at least 100. Sets of
 other names need --threshold; pairs whose cameras have distortion (fisheye_*) are left out and counted.
 
-python -m scripts.benchmark posebench FOLDER
-python -m scripts.benchmark posebench FOLDER --every 10 --methods E:fmtorch E:fmtorch:scaled=false E:poselib E:colmap
+python -m scripts.benchmark posebench FILES
+python -m scripts.benchmark posebench FILES --every 10 --methods E:fmtorch E:fmtorch:scaled=false E:poselib E:colmap
 
 --rows is appended to pair by pair: started again, the command measures what is missing.
 """
@@ -50,7 +50,7 @@ class Set(NamedTuple):
 
 def add_arguments(commands: Any) -> None:
     parser = commands.add_parser("posebench", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="the folder `relative` of PoseBench's data, or one file")
+    parser.add_argument("files", type=Path, help="the folder `relative` of PoseBench's data, or one file")
     parser.add_argument("--methods", nargs="+", default=METHODS, help="KIND:PRESET[:KEY=VALUE,...], KIND being E or F")
     parser.add_argument("--threshold", type=float, help="px, of sets that are not PoseBench's")
     parser.add_argument("--every", type=int, default=1, help="every so many-th pair of each set; the protocol has all")
@@ -63,7 +63,7 @@ def add_arguments(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> None:
     torch.set_num_threads(1)
     published = read_published()
-    sets = sets_of(arguments.folder, published, arguments.threshold)
+    sets = sets_of(arguments.files, published, arguments.threshold)
     for text in arguments.methods:
         methods_of.read(text)
     rows: dict[str, list[Row]] = {}
@@ -73,7 +73,7 @@ def run(arguments: argparse.Namespace) -> None:
         if found:
             rows[each.name] = found
     if not rows:
-        raise SystemExit(f"{arguments.folder}: no pair of pinhole cameras")
+        raise SystemExit(f"{arguments.files}: no pair of pinhole cameras")
     tables = sheets(rows, arguments.methods, published)
     for table in tables:
         console.print(table.terminal())
