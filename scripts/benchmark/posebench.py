@@ -1,11 +1,13 @@
 """PoseBench's relative poses (github.com/PoseLib/posebench) by its protocol, beside its published figures.
 
-FILES is the folder `relative` of its data, or one file of it. Of each pair the error is the larger of the angles of
+FILES is the folder `relative` of its data, or one file of it; --root judges pairs in FM-Bench's layout in the same way,
+by SIFT matches and --threshold. Of each pair the error is the larger of the angles of
 rotation and of translation, whose sign counts; of a fundamental matrix the best of its four poses is taken. AUC at 5,
 10 and 20 degrees, and means over the sets. Each set has its threshold; at most 1,000 samples, at least 100. Sets of
 other names need --threshold; pairs whose cameras have distortion (fisheye_*) are left out and counted.
 
 python -m scripts.benchmark posebench FILES
+python -m scripts.benchmark posebench --root DATA/Strecha --root DATA/KITTI --threshold 1
 python -m scripts.benchmark posebench FILES --every 10 --methods E:fmtorch E:fmtorch:scaled=false E:poselib E:colmap
 
 --rows is appended to pair by pair: started again, the command measures what is missing.
@@ -14,43 +16,33 @@ python -m scripts.benchmark posebench FILES --every 10 --methods E:fmtorch E:fmt
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from rich.progress import track
 
-from fmtorch import data, metrics
+from fmtorch import metrics, presets
 from fmtorch.data import DataError, ImagePair
-from fmtorch.storage.exchange import h5
+from scripts.benchmark import matched
 from scripts.benchmark import posebench_methods as methods_of
 from scripts.benchmark.kept import Kept, Row
 from scripts.benchmark.matched import console
+from scripts.benchmark.posebench_sets import THRESHOLDS, Figures, Set, read_published, sets_of
 from scripts.benchmark.sheet import MISSING, Sheet, put
 
-PUBLISHED = Path(__file__).resolve().parent / "posebench.csv"  # PoseLib 2.0.5; results/baseline.2_0_5.json there
 METHODS = ("E:fmtorch", "E:poselib", "E:colmap", "F:fmtorch", "F:poselib", "F:colmap")
-THRESHOLDS = (5, 10, 20)  # degrees
 MISSED = {"rotation": 180.0, "translation": 180.0}
-Figures = dict[str, dict[str, tuple[float, ...]]]  # method -> data set -> AUC in per cent
-
-
-class Set(NamedTuple):
-    """A file of pairs. name: without suffix. threshold: px."""
-
-    name: str
-    path: Path
-    threshold: float
 
 
 def add_arguments(commands: Any) -> None:
     parser = commands.add_parser("posebench", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("files", type=Path, help="the folder `relative` of PoseBench's data, or one file")
+    parser.add_argument("files", nargs="?", type=Path, help="the folder `relative` of PoseBench's data, or one file")
+    matched.add_arguments(parser)
     parser.add_argument("--methods", nargs="+", default=METHODS, help="KIND:PRESET[:KEY=VALUE,...], KIND being E or F")
     parser.add_argument("--threshold", type=float, help="px, of sets that are not PoseBench's")
     parser.add_argument("--every", type=int, default=1, help="every so many-th pair of each set; the protocol has all")
@@ -63,17 +55,15 @@ def add_arguments(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> None:
     torch.set_num_threads(1)
     published = read_published()
-    sets = sets_of(arguments.files, published, arguments.threshold)
-    for text in arguments.methods:
-        methods_of.read(text)
+    arguments.methods = installed(arguments.methods)
     rows: dict[str, list[Row]] = {}
     kept = Kept(arguments.rows)
-    for each in sets:
+    for each in sets_of(arguments, published[0]):
         found = measured(each, arguments, kept)
         if found:
             rows[each.name] = found
     if not rows:
-        raise SystemExit(f"{arguments.files}: no pair of pinhole cameras")
+        raise SystemExit("no pair of pinhole cameras")
     tables = sheets(rows, arguments.methods, published)
     for table in tables:
         console.print(table.terminal())
@@ -81,47 +71,26 @@ def run(arguments: argparse.Namespace) -> None:
         put(arguments.markdown, tables, "posebench")
 
 
-def read_published() -> tuple[dict[str, float], Figures]:
-    """The threshold of each of PoseBench's sets in pixels, and its published figures."""
-    thresholds: dict[str, float] = {}
-    figures: Figures = {}
-    with PUBLISHED.open(encoding="utf-8") as file:
-        for line in csv.DictReader(file):
-            thresholds[line["dataset"]] = float(line["threshold"])
-            values = tuple(float(line[f"auc{t}"]) for t in THRESHOLDS)
-            figures.setdefault(line["method"], {})[line["dataset"]] = values
-    return thresholds, figures
-
-
-def sets_of(folder: Path, published: tuple[dict[str, float], Figures], threshold: float | None) -> list[Set]:
-    """The sets of a folder with their thresholds. Raises SystemExit where there are none, or one has none."""
-    root = folder / "relative" if (folder / "relative").is_dir() else folder
-    try:
-        paths = h5.files(root)
-    except DataError as error:
-        raise SystemExit(f"{error}; give the folder `relative` of PoseBench's data") from error
-    sets = []
-    for path in paths:
-        own = published[0].get(path.stem, threshold)
-        if path.stem.startswith("fisheye_") and own is None:
-            console.print(f"{path.name}: left out, its cameras are no pinholes", style="dim", highlight=False)
-        elif own is None:
-            raise SystemExit(f"{path.name} is none of PoseBench's sets: give its threshold in pixels, --threshold PX")
-        else:
-            sets.append(Set(path.stem, path, own))
-    return sets
+def installed(methods: Sequence[str]) -> list[str]:
+    """The methods whose packages are there; of those that are named, all must be. Raises SystemExit for another."""
+    found = []
+    for text in methods:
+        try:
+            presets.build("estimator", methods_of.read(text).preset)
+            found.append(text)
+        except ImportError as error:
+            if methods is not METHODS:
+                raise SystemExit(f"{text}: {error}") from error
+            console.print(f"{text} is left out: {error}", style="dim", highlight=False, markup=False)
+    return found
 
 
 def measured(of: Set, arguments: argparse.Namespace, kept: Kept) -> list[Row]:
-    """The rows of a set's pairs by all methods. Raises SystemExit where its file cannot be read."""
-    try:
-        dataset = data.load("h5", root=of.path, layout="posebench")
-    except DataError as error:
-        raise SystemExit(str(error)) from error
-    pairs = [dataset[i] for i in range(0, len(dataset), arguments.every)]
+    """The rows of a set's pairs by all methods."""
+    pairs = of.pairs[:: arguments.every]
     usable = [pair for pair in pairs if pair.problem is None]
     done = kept.by("pair", "seed", "threshold", "method", "identity", "matches")
-    made_with = {text: (text, methods_of.identity(text), dataset.digest) for text in arguments.methods}
+    made_with = {text: (text, methods_of.identity(text), of.digest) for text in arguments.methods}
     found: list[Row] = []
     for pair in track(usable, of.name, console=console, transient=True):
         new = []
@@ -155,7 +124,7 @@ def judged(method: methods_of.Method, pair: ImagePair, threshold: float, seed: i
     return row | {"rotation": float(angles.rotation), "translation": float(angles.translation)}
 
 
-def _say_what_is_missing(of: Set, pairs: list[ImagePair], rows: list[Row]) -> None:
+def _say_what_is_missing(of: Set, pairs: Sequence[ImagePair], rows: list[Row]) -> None:
     """Pairs that are left out, with the commonest reason, and those that a method has no pose for."""
     reasons = Counter(pair.problem for pair in pairs if pair.problem is not None)
     if reasons:

@@ -206,6 +206,32 @@ def test_what_is_not_posebenchs_is_named(
         run(capsys, monkeypatch, tmp_path / "fisheye")
 
 
+def test_a_library_that_is_missing_is_left_out_or_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    folder = sample(tmp_path / "relative")
+    with pytest.raises(SystemExit, match=r"E:colmap: COLMAP .pycolmap. is not installed: pip install 'fmtorch\[co"):
+        run(capsys, monkeypatch, folder, "--methods", "E:colmap")
+    printed = " ".join(run(capsys, monkeypatch, folder, "--every", PAIRS).split())
+    assert "F:colmap is left out: COLMAP (pycolmap) is not installed: pip install 'fmtorch[colmap]'" in printed
+    assert "F:fmtorch" in printed
+
+
+def test_pairs_of_other_sets_are_judged_alike(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = shared_path("data/PhotoTourism")
+    printed = run(
+        capsys, monkeypatch, "--root", root, "--limit", 2, "--threshold", THRESHOLD, "--methods", "F:opencv_lmeds"
+    )
+    assert "means of 1 set, 2 pairs of PoseBench's 20" in " ".join(printed.split())
+    with pytest.raises(SystemExit, match="--root: give the threshold in pixels"):
+        run(capsys, monkeypatch, "--root", root)
+    with pytest.raises(SystemExit, match="name FILES, the folder `relative`"):
+        run(capsys, monkeypatch)
+
+
 def test_pairs_with_distortion_are_left_out_and_said(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
