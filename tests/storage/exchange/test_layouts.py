@@ -304,7 +304,7 @@ def test_the_digest_is_of_the_contents(tmp_path: Path) -> None:
     assert reload("posebench", a).digest != reload("posebench", b).digest
 
 
-@pytest.mark.parametrize("layout", ["ransac_tutorial", "oanet"])
+@pytest.mark.parametrize("layout", ["ransac_tutorial", "oanet", "posebench"])
 def test_the_name_of_the_folder_decides_nothing(layout: str, tmp_path: Path) -> None:
     """Draws follow from a pair's key."""
     roots = [writers.WRITERS[layout](tmp_path / name) for name in ("first", "second")]
