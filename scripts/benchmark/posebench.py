@@ -1,10 +1,11 @@
 """PoseBench's relative poses (github.com/PoseLib/posebench) by its protocol, beside its published figures.
 
 FILES is the folder `relative` of its data, or one file of it; --root judges pairs in FM-Bench's layout in the same way,
-by SIFT matches and --threshold. Of each pair the error is the larger of the angles of
-rotation and of translation, whose sign counts; of a fundamental matrix the best of its four poses is taken. AUC at 5,
-10 and 20 degrees, and means over the sets. Each set has its threshold; at most 1,000 samples, at least 100. Sets of
-other names need --threshold; pairs whose cameras have distortion (fisheye_*) are left out and counted.
+by SIFT matches and --threshold. Of each pair the error is the larger of the angles of rotation and of translation,
+whose sign counts; of a fundamental matrix the best of its four poses is taken. AUC at 5, 10 and 20 degrees, and means
+over the sets; intervals of differences are over scenes, or over pairs of fewer than five. Each set has its threshold;
+at most 1,000 samples, at least 100. Sets of other names need --threshold; pairs whose cameras have distortion
+(fisheye_*) are left out and counted.
 
 python -m scripts.benchmark posebench FILES
 python -m scripts.benchmark posebench --root DATA/Strecha --root DATA/KITTI --threshold 1
@@ -28,7 +29,8 @@ from rich.progress import track
 
 from fmtorch import metrics, presets
 from fmtorch.data import DataError, ImagePair
-from scripts.benchmark import matched
+from fmtorch.evaluation.statistics import PERCENT, difference
+from scripts.benchmark import matched, sheet
 from scripts.benchmark import posebench_methods as methods_of
 from scripts.benchmark.kept import Kept, Row
 from scripts.benchmark.matched import console
@@ -100,7 +102,7 @@ def measured(of: Set, arguments: argparse.Namespace, kept: Kept) -> list[Row]:
                 row = judged(methods_of.read(text), pair, of.threshold, arguments.seed)
                 row |= dict(zip(("method", "identity", "matches"), made_with[text], strict=True))
                 new.append(row)
-            found.append(row)
+            found.append({**row, "scene": f"{of.name}/{pair.scene}"})
         kept.add(new)
     _say_what_is_missing(of, pairs, found)
     return found
@@ -139,29 +141,49 @@ def _say_what_is_missing(of: Set, pairs: Sequence[ImagePair], rows: list[Row]) -
 def sheets(
     rows: dict[str, list[Row]], methods: Sequence[str], published: tuple[dict[str, float], Figures]
 ) -> tuple[Sheet, Sheet]:
-    """Means over the sets, with milliseconds, and the figures of each set, beside those that are published."""
+    """Means over the sets, and the figures of each set, with published ones, also of methods that were not run."""
     thresholds, theirs = published
+    own = {m: {name: [row for row in of if row["method"] == m] for name, of in rows.items()} for m in methods}
+    known = [name for name in rows if name in thresholds]
+    others = [method for method in theirs if method not in methods and known]
     whole, each = [], []
-    for method in methods:
-        own = {name: [row for row in of_set if row["method"] == method] for name, of_set in rows.items()}
-        ours = {name: areas(of_set) for name, of_set in own.items()}
-        same = theirs.get(method, {})
-        said = mean([same[name] for name in rows]) if all(name in same for name in rows) else None
-        ms = np.median([row["ms"] for of_set in own.values() for row in of_set])
-        whole.append([method, shown(mean(list(ours.values()))), shown(said), f"{ms:.1f}"])
-    for name, of_set in rows.items():
-        for method in methods:
-            own_rows = [row for row in of_set if row["method"] == method]
-            px = f"{own_rows[0]['threshold']:g}"
-            theirs_here = theirs.get(method, {}).get(name)
-            each.append([name, method, px, str(len(own_rows)), shown(areas(own_rows)), shown(theirs_here)])
-    count = f"{len(rows)} set{'s' * (len(rows) != 1)}, {sum(len(r) for r in rows.values()) // len(methods):,} pairs"
-    complete = " (all of the protocol)" if set(rows) == set(thresholds) else f" of PoseBench's {len(thresholds)}"
-    heading = "AUC@5/10/20°, translations signed"
+    for method in (*methods, *others):
+        of_sets = own.get(method, {})
+        ours = mean([areas(of) for of in of_sets.values()]) if of_sets else None
+        said = mean([theirs[method][name] for name in rows]) if method in theirs and len(known) == len(rows) else None
+        ms = f"{np.median([row['ms'] for of in of_sets.values() for row in of]):.1f}" if of_sets else MISSING
+        whole.append([method, shown(ours), shown(said), lead(own, method), ms])
+    for name in rows:
+        px = f"{rows[name][0]['threshold']:g}"
+        for method in (*methods, *(others if name in known else ())):
+            of = own.get(method, {}).get(name)
+            told = shown(theirs.get(method, {}).get(name))
+            each.append([name, method, px, *([str(len(of)), shown(areas(of))] if of else [MISSING] * 2), told])
+    count = sum(len(of) for of in own[methods[0]].values())
+    part = f", {len(known)} of PoseBench's {len(thresholds)}" if known else ""
+    title = f"PoseBench's protocol: means of {len(rows)} set{'s' * (len(rows) != 1)}{part}; {count:,} pairs"
+    heading = "AUC@5/10/20°, signed"
     return (
-        Sheet(f"PoseBench: means of {count}{complete}", ["method", heading, "published", "ms, median"], whole),
-        Sheet("PoseBench: each set", ["set", "method", "px", "pairs", heading, "published"], each),
+        Sheet(title, ["method", heading, "published", "first of its kind minus this, @5°", "ms, median"], whole),
+        Sheet("Each set", ["set", "method", "px", "pairs", heading, "published"], each),
     )
+
+
+def lead(own: dict[str, dict[str, list[Row]]], method: str) -> str:
+    """AUC@5 of the first method of a kind minus that of another, every set counting alike, with its 95 % interval."""
+    first = next((name for name in own if name[0] == method[0]), method)
+    if method == first or method not in own:
+        return ""
+    scenes = [row["scene"] for of in own[method].values() for row in of]
+    share = np.concatenate([np.full(len(of), len(scenes) / len(own[method]) / len(of)) for of in own[method].values()])
+    a, b = (share * np.array([_below(row) for of in own[name].values() for row in of]) for name in (first, method))
+    return sheet.shown(difference(a, b, scenes, PERCENT), "+.1f")
+
+
+def _below(row: Row) -> float:
+    """The share of thresholds up to 5 degrees above the error."""
+    error: float = max(row["rotation"], row["translation"])
+    return max(0.0, 1 - error / THRESHOLDS[0])
 
 
 def areas(rows: list[Row]) -> tuple[float, ...]:

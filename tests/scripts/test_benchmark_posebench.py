@@ -136,7 +136,9 @@ def test_our_estimators_run_by_the_protocol_and_a_run_goes_on_where_it_stopped(
     rows, methods = tmp_path / "rows.jsonl", ["E:fmtorch", "F:fmtorch", "E:fmtorch:scaled=false"]
     arguments = [sample(tmp_path / "relative").parent, "--methods", *methods, "--rows", rows]
     printed = run(capsys, monkeypatch, *arguments, "--every", 3)
-    assert "means of 1 set, 2 pairs of PoseBench's 20" in " ".join(printed.split())
+    printed = " ".join(printed.split())
+    assert "means of 1 set, 1 of PoseBench's 20; 2 pairs" in printed
+    assert "E:colmap │ – │ 45.0 / 61.4 / 75.4" in printed  # published, not run
     first = rows.read_text().splitlines()
     assert len(first) == 2 * len(methods)
     page = tmp_path / "page.md"
@@ -206,6 +208,18 @@ def test_what_is_not_posebenchs_is_named(
         run(capsys, monkeypatch, tmp_path / "fisheye")
 
 
+def test_a_lead_is_the_difference_of_the_means_of_sets() -> None:
+    def rows(errors: list[float]) -> list[dict[str, Any]]:
+        return [{"rotation": e, "translation": 0.0, "scene": f"s/{i}"} for i, e in enumerate(errors)]
+
+    own = {
+        "E:a": {"one": rows([0.0, 0.0] * 9), "two": rows([5.0, 2.5, 180.0, 0.0] * 9)},
+        "E:b": {"one": rows([5.0, 0.0] * 9), "two": rows([180.0] * 36)}, "F:c": {},
+    }  # fmt: skip
+    assert posebench.lead(own, "E:a") == posebench.lead(own, "F:c") == ""
+    assert posebench.lead(own, "E:b").startswith(f"{100 * ((1 + 1.5 / 4) / 2 - (0.5 + 0) / 2):+.1f} [")
+
+
 def test_a_library_that_is_missing_is_left_out_or_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -225,7 +239,7 @@ def test_pairs_of_other_sets_are_judged_alike(
     printed = run(
         capsys, monkeypatch, "--root", root, "--limit", 2, "--threshold", THRESHOLD, "--methods", "F:opencv_lmeds"
     )
-    assert "means of 1 set, 2 pairs of PoseBench's 20" in " ".join(printed.split())
+    assert "means of 1 set; 2 pairs" in " ".join(printed.split())
     with pytest.raises(SystemExit, match="--root: give the threshold in pixels"):
         run(capsys, monkeypatch, "--root", root)
     with pytest.raises(SystemExit, match="name FILES, the folder `relative`"):
@@ -241,7 +255,7 @@ def test_pairs_with_distortion_are_left_out_and_said(
         file["001/camera1/model"] = np.array(["OPENCV_FISHEYE"], dtype=h5py.string_dtype())
     printed = " ".join(run(capsys, monkeypatch, folder, "--methods", "F:opencv_lmeds").split())
     assert f"1 of {PAIRS} pairs left out" in printed
-    assert f"means of 1 set, {PAIRS - 1} pairs" in printed
+    assert f"means of 1 set, 1 of PoseBench's 20; {PAIRS - 1} pairs" in printed
 
 
 def test_cameras_without_sizes_have_the_same_poses(
