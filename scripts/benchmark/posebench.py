@@ -3,7 +3,7 @@
 FILES is the folder `relative` of its data, or one file of it; --root judges pairs in FM-Bench's layout in the same way,
 by SIFT matches and --threshold. Of each pair the error is the larger of the angles of rotation and of translation,
 whose sign counts; of a fundamental matrix the best of its four poses is taken. AUC at 5, 10 and 20 degrees, and means
-over the sets; intervals of differences are over scenes, or over pairs of fewer than five. Each set has its threshold;
+over the sets; intervals of differences are over scenes, or over pairs of fewer than ten. Each set has its threshold;
 at most 1,000 samples, at least 100. Sets of other names need --threshold; pairs whose cameras have distortion
 (fisheye_*) are left out and counted.
 
@@ -29,6 +29,7 @@ from rich.progress import track
 
 from fmtorch import metrics, presets
 from fmtorch.data import DataError, ImagePair
+from fmtorch.evaluation.intervals import MIN_UNITS
 from fmtorch.evaluation.statistics import PERCENT, difference
 from scripts.benchmark import matched, sheet
 from scripts.benchmark import posebench_methods as methods_of
@@ -175,6 +176,8 @@ def lead(own: dict[str, dict[str, list[Row]]], method: str) -> str:
     if method == first or method not in own:
         return ""
     scenes = [row["scene"] for of in own[method].values() for row in of]
+    if len(set(scenes)) < MIN_UNITS:
+        scenes = [str(i) for i in range(len(scenes))]
     share = np.concatenate([np.full(len(of), len(scenes) / len(own[method]) / len(of)) for of in own[method].values()])
     a, b = (share * np.array([_below(row) for of in own[name].values() for row in of]) for name in (first, method))
     return sheet.shown(difference(a, b, scenes, PERCENT), "+.1f")
