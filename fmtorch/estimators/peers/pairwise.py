@@ -118,7 +118,7 @@ class PairwiseEstimator:
             order = np.argsort(-likelihood, kind="stable") if self._best_first else np.arange(len(slot))
             x0, x1 = matches.x0[slot[order]], matches.x1[slot[order]]
             sizes = _size(c.size0, x0, i), _size(c.size1, x1, i)
-            given = Pair(x0, x1, likelihood[order], *sizes, seed, *_cameras(batch, i))
+            given = _with_cameras(Pair(x0, x1, likelihood[order], *sizes, seed), batch, i)
             inside = np.zeros(len(slot), np.bool_)
             try:
                 solved = self._solve(given)
@@ -141,15 +141,16 @@ class PairwiseEstimator:
         return judged(found.to(c.mask.device), c)
 
 
-def _cameras(batch: Batch, i: int) -> tuple[tuple[Points | None, Points | None] | None, bool, bool]:
-    """`Pair.calibrations`, `calibrated` and `shared_focal` of a row."""
+def _with_cameras(pair: Pair, batch: Batch, i: int) -> Pair:
+    """The pair with what is known of its cameras, where they are asked for."""
     if batch.focal is None or batch.sizes.shape[1] == 0:
-        return None, False, False
-    known = []
+        return pair
+    known: list[Points | None] = []
     for (f, deviation), (h, w) in zip(batch.focal[i], batch.sizes[i].reshape(2, 2), strict=True):
         K = np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1]])
         known.append(K if deviation < np.inf else None)
-    return (known[0], known[1]), batch.calibrated(i), bool(batch.shared[i])
+    shared, exact = bool(batch.shared[i]), batch.calibrated(i)
+    return dataclasses.replace(pair, calibrations=(known[0], known[1]), calibrated=exact, shared_focal=shared)
 
 
 def _cameras_found(posed: list[Posed | None]) -> dict[str, torch.Tensor]:
