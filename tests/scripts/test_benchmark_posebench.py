@@ -198,7 +198,7 @@ def test_what_is_not_posebenchs_is_named(
     own = sample(tmp_path / "own", "mine")
     with pytest.raises(SystemExit, match=r"mine\.h5 is none of PoseBench's sets: give its threshold in pixels"):
         run(capsys, monkeypatch, own)
-    printed = run(capsys, monkeypatch, own, "--threshold", 1, "--methods", "F:opencv_lmeds")
+    printed = run(capsys, monkeypatch, own, "--threshold", 1, "--methods", "F:opencv:method=lmeds")
     assert MISSING in printed
     with pytest.raises(SystemExit, match=r"holds no file \.h5 or \.hdf5; give the folder `relative`"):
         run(capsys, monkeypatch, tmp_path)
@@ -237,7 +237,7 @@ def test_pairs_of_other_sets_are_judged_alike(
 ) -> None:
     root = shared_path("data/PhotoTourism")
     printed = run(
-        capsys, monkeypatch, "--root", root, "--limit", 2, "--threshold", THRESHOLD, "--methods", "F:opencv_lmeds"
+        capsys, monkeypatch, "--root", root, "--limit", 2, "--threshold", THRESHOLD, "--methods", "F:opencv:method=lmeds"
     )
     assert "means of 1 set; 2 pairs" in " ".join(printed.split())
     with pytest.raises(SystemExit, match="--root: give the threshold in pixels"):
@@ -253,7 +253,7 @@ def test_pairs_with_distortion_are_left_out_and_said(
     with h5py.File(folder / f"{SET}.h5", "r+") as file:
         del file["001/camera1/model"]
         file["001/camera1/model"] = np.array(["OPENCV_FISHEYE"], dtype=h5py.string_dtype())
-    printed = " ".join(run(capsys, monkeypatch, folder, "--methods", "F:opencv_lmeds").split())
+    printed = " ".join(run(capsys, monkeypatch, folder, "--methods", "F:opencv:method=lmeds").split())
     assert f"1 of {PAIRS} pairs left out" in printed
     assert f"means of 1 set, 1 of PoseBench's 20; {PAIRS - 1} pairs" in printed
 
