@@ -11,6 +11,7 @@ from scripts.benchmark.matched import options
 METHODS = ("lmeds", "usac_default", "usac_fast", "usac_accurate", "usac_prosac", "usac_magsac")
 OPTIONS = {
     "estimator": {
+        "colmap": ["two_view=false"],
         "irls": [f"kernel={kernel}" for kernel in ("cauchy", "geman_mcclure", "huber", "truncated")],
         "opencv": [f"method={method}" for method in METHODS],
         "poselib": ["shared_focal=true"],

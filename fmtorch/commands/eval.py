@@ -39,12 +39,20 @@ MIN_PAIRS_FOR_PROCESSES = 1000  # of given matches: 11.3 s by one thread, 10.6 b
 
 
 @dataclasses.dataclass(frozen=True)
+class PoseFields:
+    """How poses are judged."""
+
+    signed: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
 class Fields:
     """What the command takes beside stages and the data set; ``conf/eval.yaml`` says what each is."""
 
     limit: Count | None = None
     seed: Seed = 0
     cameras: Cameras | None = None
+    pose: PoseFields = PoseFields()
     device: Device = "auto"
     batch: Count = 16
     workers: Count | None = None
@@ -92,7 +100,8 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
         console.print(f"{len(table)} of {len(pairs)} pairs have rows; other shards have the rest", highlight=False)
     if shard is not None and not len(table):  # of an empty shard, before the others
         return folder.path
-    summary = _summarize(table, folder, f"{' '.join([pipeline_name, *overrides])} on {dataset.name}")
+    title = f"{' '.join([pipeline_name, *overrides])} on {dataset.name}"
+    summary = _summarize(table, folder, title, fields.pose.signed)
     if journal is not None and len(table) == len(pairs):
         ends = [(p.image0.path, p.image1.path) for p in pairs if exportable(p)]
         written = write_exports(journal, ends, exports, folder.path)
@@ -111,7 +120,7 @@ def _open_folder(
     config: DictConfig, fields: Fields, pipeline_name: str, pipeline: Pipeline, dataset: PairDataset
 ) -> RunFolder:
     """The folder of the run with this identity, its `run_dir` if given, new or to be continued."""
-    identity = run_identity(config, pipeline_name, pipeline, dataset.digest, fields.cameras)
+    identity = run_identity(config, pipeline_name, pipeline, dataset.digest, fields.cameras, fields.pose.signed)
     name = f"{pipeline_name.replace('/', '-')}-{identity_digest(identity)[:8]}"
     return RunFolder.open(fields.run_dir or Path(f"runs/{dataset.name}/{name}"), identity)
 
@@ -139,15 +148,15 @@ def _evaluated(
         pipeline = built_with(lambda: pipeline, cameras)
     return evaluate_pairs(
         pipeline, pairs, seed=fields.seed, batch=fields.batch, execution=execution, store=folder.append, build=build,
-        cameras=cameras, journal=journal,
+        cameras=cameras, journal=journal, signed=fields.pose.signed,
     )  # fmt: skip
 
 
-def _summarize(table: pa.Table, folder: RunFolder, title: str) -> dict[str, Group]:
+def _summarize(table: pa.Table, folder: RunFolder, title: str, signed: bool) -> dict[str, Group]:
     """The summary of the rows asked for, which is shown; that of all rows of the run goes to its folder."""
     whole = folder.read()
-    summary = summarize(table)
-    all_rows = summary if len(whole) == len(table) else summarize(whole)
+    summary = summarize(table, signed)
+    all_rows = summary if len(whole) == len(table) else summarize(whole, signed)
     folder.write_summary(all_rows, summary_markdown(all_rows, title=title))
     plot_recall_curves({title.partition(" ")[0]: whole}, folder.path / "recall.png")
     part = "" if len(whole) == len(table) else f", {len(table)} of the {len(whole)} pairs of the run"

@@ -62,7 +62,8 @@ def run(config: DictConfig) -> Path:
     for heading, group in by_dataset.items():
         bar = functools.partial(track, description="drawing pairs", console=console, transient=True)
         pairs, notes = gallery(group, options, bar)
-        sections.append(Section(heading, {r.name: r.table for r in group}, pairs, notes))
+        signed = [r.name for r in group if r.folder.config.get("pose") is not None]
+        sections.append(Section(heading, {r.name: r.table for r in group}, pairs, notes, signed))
     rows = [
         [r.name, heading, r.folder.identity[:8], *(str(r.folder.config.get(k)) for k in ("version", "seed")),
          str(r.folder.path)]

@@ -63,7 +63,7 @@ def expect_options(
     for key, value in values.items():
         annotation = annotations.get(str(key), Any)
         place = f"{where}: {key}" if "=" in where else f"{where}.{key}" if where else str(key)
-        nested = _dataclass_in(annotation)
+        nested = dataclass_in(annotation)
         if isinstance(value, Mapping) and "_target_" not in value and nested is not None:
             expect_options(nested, value, place)
         elif not fits(value, annotation):
@@ -155,7 +155,7 @@ def nearest(name: str, names: Iterable[str]) -> str:
     return ", ".join(ordered[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
-def _dataclass_in(annotation: Any) -> type | None:
+def dataclass_in(annotation: Any) -> type | None:
     """The dataclass that an annotation allows, if it is one."""
     options = typing.get_args(annotation) if typing.get_origin(annotation) in UNIONS else ()
     kinds = [kind for kind in (annotation, *options) if isinstance(kind, type) and dataclasses.is_dataclass(kind)]

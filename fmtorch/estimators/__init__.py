@@ -8,6 +8,7 @@ from fmtorch.estimators.irls import IterativelyReweighted
 from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.parts.scores import SummedGains
 from fmtorch.estimators.peers.authors import degensac_cpp, gc_ransac_cpp, magsac_cpp, superansac_cpp
+from fmtorch.estimators.peers.colmap import colmap
 from fmtorch.estimators.peers.kornia import kornia_ransac
 from fmtorch.estimators.peers.opencv import opencv
 from fmtorch.estimators.peers.pairwise import PairwiseEstimator
@@ -26,6 +27,7 @@ __all__ = [
     "Pair",
     "PairwiseEstimator",
     "SummedGains",
+    "colmap",
     "degensac_cpp",
     "gc_ransac_cpp",
     "kernel",

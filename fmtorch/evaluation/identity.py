@@ -25,7 +25,12 @@ PLACES = ("root", "file", "truth", "images")
 
 
 def run_identity(
-    config: DictConfig, pipeline_name: str, pipeline: Pipeline, dataset_digest: str, cameras: str | None = None
+    config: DictConfig,
+    pipeline_name: str,
+    pipeline: Pipeline,
+    dataset_digest: str,
+    cameras: str | None = None,
+    signed: bool = False,
 ) -> dict[str, Any]:
     """The identity of a run, as plain values.
 
@@ -35,12 +40,13 @@ def run_identity(
         pipeline: what was built of the config.
         dataset_digest: of the contents of the data set.
         cameras: what the estimator is given of the cameras; None: nothing.
+        signed: whether the sign of a translation counts.
 
     Returns:
         `pipeline`, each stage's config (pruners as a list), `seed`; `version` of fmtorch, in a checkout its commit;
         `libraries`: their versions; `kernels`: by which numba, or off; `learned`: digests of each stage's learned
         files; `code`: digests of the sources of parts of the user's own; `dataset`: its config, without where it lies,
-        and its digest; `cameras`, where they are given.
+        and its digest; `cameras`, where they are given; `pose`, where translations are signed.
     """
     stages = presets.stages(config)
     dataset = {
@@ -52,7 +58,7 @@ def run_identity(
         "libraries": libraries(presets.peer_packages(stages)), "kernels": switch.identity(),
         "learned": _learned(stages, pipeline),
         "code": _code({"stages": stages, "dataset": dataset}), "dataset": dataset,
-        **({} if cameras is None else {"cameras": cameras}),
+        **({} if cameras is None else {"cameras": cameras}), **({"pose": {"signed": True}} if signed else {}),
     }  # fmt: skip
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from importlib import resources
 from typing import Any
 
@@ -78,13 +78,15 @@ class ShownPair:
 class Section:
     """The runs on one data set: tables of `PAIR_SCHEMA` by the runs' names, the first is what others differ from.
 
-    notes: what the reader should know of the pictures of pairs, or why there are none.
+    notes: what the reader should know of the pictures of pairs, or why there are none. signed: the runs in which the
+    sign of a translation counts.
     """
 
     heading: str
     runs: Mapping[str, pa.Table]
     pairs: Sequence[ShownPair] = ()
     notes: Sequence[str] = ()
+    signed: Collection[str] = ()
 
 
 def render(
@@ -149,7 +151,7 @@ def _resource(name: str) -> str:
 
 
 def _context(section: Section, names: Sequence[str]) -> dict[str, Any]:
-    summaries = {name: summarize(table) for name, table in section.runs.items()}
+    summaries = {name: summarize(table, name in section.signed) for name, table in section.runs.items()}
     axis = curves.axis_of(section.runs)
     pairs = {table.num_rows for table in section.runs.values()}
     facts = f"{len(section.runs)} runs" if len(section.runs) > 1 else "One run"

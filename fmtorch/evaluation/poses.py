@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple, cast
 
@@ -12,11 +13,11 @@ from torch import Tensor
 
 from fmtorch.data.pairs import ImagePair
 from fmtorch.evaluation.outcomes import joined_correspondences, joined_estimates
-from fmtorch.metrics import fundamental_pose_error, pose_error
+from fmtorch.metrics import closest_pose_error, fundamental_pose_error, pose_error
 from fmtorch.metrics.pose import PoseError
 from fmtorch.pipeline.pipeline import Outcome
 
-LARGEST_ROTATION, LARGEST_TRANSLATION = 180.0, 90.0  # degrees: what a failed pair counts as
+LARGEST_ROTATION, LARGEST_TRANSLATION = 180.0, 90.0  # degrees: what a failed pair counts as, 180 with the sign of t
 
 
 class PairPose(NamedTuple):
@@ -27,16 +28,20 @@ class PairPose(NamedTuple):
     reason: str | None
 
 
-def pose_errors(outcomes: Sequence[Outcome]) -> list[PairPose]:
+def pose_errors(outcomes: Sequence[Outcome], signed: bool = False) -> list[PairPose]:
     """The pose error of each pair: of the estimate's R and t, or else of its F, K0, K1 and the estimator's inliers.
 
     See `pose_error` and `fundamental_pose_error`. A pair without F, or without a pose, has the largest errors and a
     reason; one whose calibration or motion is unknown has a reason only.
+
+    signed: the sign of the translation counts, and of the four poses of F the best one: `closest_pose_error`.
     """
-    poses = [_without_estimate(outcome) for outcome in outcomes]
+    poses = [_without_estimate(outcome, signed) for outcome in outcomes]
     known = [i for i, o in enumerate(outcomes) if poses[i].reason is None]
     for estimated, error_of, reason in (
-        (True, _of_pose, "the pose is not determined"), (False, _of_fundamental, "no inlier in front of both cameras"),
+        (True, functools.partial(_of_pose, up_to_sign=not signed), "the pose is not determined"),
+        (False, _closest, "F has no pose") if signed else
+        (False, _of_fundamental, "no inlier in front of both cameras"),
     ):  # fmt: skip
         own = [i for i in known if _has_pose(outcomes[i]) == estimated]
         error = error_of([outcomes[i] for i in own]) if own else PoseError(torch.zeros(0), torch.zeros(0))
@@ -50,9 +55,10 @@ def _has_pose(outcome: Outcome) -> bool:
     return outcome.estimate is not None and outcome.estimate.R is not None
 
 
-def _of_pose(outcomes: Sequence[Outcome]) -> PoseError:
+def _of_pose(outcomes: Sequence[Outcome], up_to_sign: bool) -> PoseError:
     estimate, (R, t) = joined_estimates(outcomes), _truth(outcomes, "R", "t")
-    return pose_error(cast(Tensor, estimate.R).double(), cast(Tensor, estimate.t).double(), R, t)
+    own = cast(Tensor, estimate.R).double(), cast(Tensor, estimate.t).double()
+    return pose_error(*own, R, t, up_to_sign=up_to_sign)
 
 
 def _of_fundamental(outcomes: Sequence[Outcome]) -> PoseError:
@@ -61,13 +67,17 @@ def _of_fundamental(outcomes: Sequence[Outcome]) -> PoseError:
     return fundamental_pose_error(estimate.F.double(), K0, K1, c.x0, c.x1, R, t, estimate.inliers & c.mask)
 
 
-def _without_estimate(outcome: Outcome) -> PairPose:
+def _closest(outcomes: Sequence[Outcome]) -> PoseError:
+    return closest_pose_error(joined_estimates(outcomes).F.double(), *_truth(outcomes, "K0", "K1", "R", "t"))
+
+
+def _without_estimate(outcome: Outcome, signed: bool) -> PairPose:
     """What is known before F is looked at."""
     missing = unknown(outcome.pair)
     if missing is not None:
         return PairPose(None, None, missing)
     if not outcome.solved:
-        return PairPose(LARGEST_ROTATION, LARGEST_TRANSLATION, "no F")
+        return PairPose(LARGEST_ROTATION, LARGEST_ROTATION if signed else LARGEST_TRANSLATION, "no F")
     return PairPose(None, None, None)
 
 

@@ -18,17 +18,20 @@ from fmtorch.pipeline.pipeline import STAGES, Outcome
 from fmtorch.storage import PairRow
 
 
-def evaluate(outcomes: Sequence[Outcome], seed: int = 0) -> list[PairRow]:
-    """One row a pair. NSGD is 1 where the pipeline failed; an inlier rate is NaN where it is not defined."""
+def evaluate(outcomes: Sequence[Outcome], seed: int = 0, signed: bool = False) -> list[PairRow]:
+    """One row a pair. NSGD is 1 where the pipeline failed; an inlier rate is NaN where it is not defined.
+
+    signed: of `pose_errors`.
+    """
     planar = [outcome.pair.H is not None for outcome in outcomes]
     if any(planar):
         of_planes = iter(_of_homographies([o for o, own in zip(outcomes, planar, strict=True) if own]))
-        others = iter(evaluate([o for o, own in zip(outcomes, planar, strict=True) if not own], seed))
+        others = iter(evaluate([o for o, own in zip(outcomes, planar, strict=True) if not own], seed, signed))
         return [next(of_planes if own else others) for own in planar]
     start = time.perf_counter()
     nsgd, released = _distances(outcomes, seed)
     before, after = _inlier_rates(outcomes)
-    poses = pose_errors(outcomes)
+    poses = pose_errors(outcomes, signed)
     seconds = (time.perf_counter() - start) / max(len(outcomes), 1)
     return [
         _row(outcome, {"nsgd": a, "nsgd_released": b, "inlier_rate_before": c, "inlier_rate": d}, pose, seconds)

@@ -60,12 +60,13 @@ def evaluate_pairs(
     build: Build | None = None,
     cameras: Mapping[int, PairCameras] | None = None,
     journal: Journal | None = None,
+    signed: bool = False,
 ) -> Iterator[int]:
     """Run and evaluate the pairs, hand each batch's rows to `store`, and yield how many pairs it held.
 
     execution: by which workers. build: makes the same pipeline in another process, where these are no threads.
     cameras: what a pipeline that `build` makes is given of the pairs' cameras, see `built_with`.
-    journal: keeps keypoints, matches and F for an export.
+    journal: keeps keypoints, matches and F for an export. signed: of `pose_errors`.
     Rows and journal are written here. Results do not depend on `batch` or `execution`. Raises WorkersLost where workers
     die whatever they do, or a scheduler is gone.
     """
@@ -78,7 +79,8 @@ def evaluate_pairs(
     def given(members: Sequence[ImagePair]) -> Batch:
         own = None if cameras is None or source.shared else {p.key: cameras[p.key] for p in members if p.key in cameras}
         sent = batch_contents(list(members)) if execution.send_images and not source.shared else list(members)
-        return Batch(sent, seed, own, None if journal is None else CollectedJournal.of(journal), not source.shared)
+        kept = None if journal is None else CollectedJournal.of(journal)
+        return Batch(sent, seed, own, kept, not source.shared, signed)
 
     def keep(done: Batch, work: Work) -> None:
         if journal is not None and work.journal is not None:

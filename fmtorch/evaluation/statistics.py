@@ -54,7 +54,7 @@ SHARES = ("recall_05", "recall_01")
 """Those of them that are shares of pairs."""
 
 
-def pose_figures(rotation: Values, translation: Values) -> dict[str, float | int] | None:
+def pose_figures(rotation: Values, translation: Values, signed: bool = False) -> dict[str, float | int] | None:
     """Accuracy of poses over the pairs whose true pose is known; None where there is none.
 
     rotation, translation: angles in degrees of each pair, (n,); NaN where the true pose is unknown.
@@ -62,7 +62,7 @@ def pose_figures(rotation: Values, translation: Values) -> dict[str, float | int
     - pairs: how many are known.
     - auc_5, auc_10, auc_20: `fmtorch.metrics.pose_auc` of the larger of the two angles; map_5, map_10, map_20: its
       binned mAP, `pose_map`; maa_10: `pose_maa`.
-    - rotation, translation: median angles.
+    - rotation, translation: median angles. signed: whether the sign of a translation counts, as it was told.
     """
     known = ~(np.isnan(rotation) | np.isnan(translation))
     if not known.any():
@@ -75,6 +75,7 @@ def pose_figures(rotation: Values, translation: Values) -> dict[str, float | int
         "maa_10": float(metrics.pose_maa(errors)),
         **{f"map_{t}": value for t, value in zip(POSE_THRESHOLDS, means, strict=True)},
         "rotation": float(np.median(rotation[known])), "translation": float(np.median(translation[known])),
+        "signed": signed,
     }  # fmt: skip
 
 

@@ -26,8 +26,10 @@ _NUMBER = re.compile(r"(\d+(?:\.\d+)?)([;,:.]?)")
 Group = dict[str, Any]
 
 
-def summarize(table: pa.Table) -> dict[str, Group]:
+def summarize(table: pa.Table, signed: bool = False) -> dict[str, Group]:
     """Figures of merit of a table of `PAIR_SCHEMA`: for each family, and for ``all`` pairs.
+
+    signed: whether the sign of a translation counts in its rows, of `pose_errors`.
 
     All shares are in [0, 1]; a figure that is not defined is None. Of each group:
 
@@ -51,10 +53,10 @@ def summarize(table: pa.Table) -> dict[str, Group]:
     """
     families = table["family"].to_pylist()
     groups = {name: table.filter(pa.array([f == name for f in families])) for name in dict.fromkeys(families)}
-    return {name: _group(part) for name, part in {**groups, ALL: table}.items()}
+    return {name: _group(part, signed) for name, part in {**groups, ALL: table}.items()}
 
 
-def _group(table: pa.Table) -> Group:
+def _group(table: pa.Table, signed: bool) -> Group:
     ok = table["ok"].to_numpy().astype(bool)
     nsgd = _column(table, "nsgd")
     scenes = scene_names(table["family"].to_pylist(), table["scene"].to_pylist())
@@ -78,7 +80,7 @@ def _group(table: pa.Table) -> Group:
     for name in ("corrs", "corrs_before"):
         group[name] = _mean(_column(table, name)[ok])
 
-    group["pose"] = pose_figures(_column(table, "rotation_error"), _column(table, "translation_error"))
+    group["pose"] = pose_figures(_column(table, "rotation_error"), _column(table, "translation_error"), signed)
     group["homography"] = homography_figures(_column(table, "corner_error"))
     kinds = Counter(kind for kind in table["configuration"].to_pylist() if kind is not None)
     group["configurations"] = {name: kinds[name] for name in CONFIGURATIONS} if kinds else None

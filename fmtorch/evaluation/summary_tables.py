@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from rich import box
 from rich.table import Table
 
 from fmtorch.core.estimate import CONFIGURATIONS
 from fmtorch.evaluation.bootstrap import LEVEL
-from fmtorch.evaluation.planes import THRESHOLDS
+from fmtorch.evaluation.planes import CAPTION, INLIERS, THRESHOLDS
 from fmtorch.evaluation.statistics import FINE_THRESHOLD, FOCAL_THRESHOLDS, POSE_THRESHOLDS, THRESHOLD
 from fmtorch.evaluation.summary import ALL, STAGES, Group
 
@@ -17,6 +18,7 @@ RECALL = "%Recall [interval]"  # the column that has an interval
 _DASH = "–"
 _OF_RECALL = ("%Recall", RECALL, f"at {FINE_THRESHOLD}", "AUC@0.05", "%Recall (released NSGD)")
 Columns = Mapping[str, Callable[[Group], str]]
+PoseRows = Sequence[tuple[str, Mapping[str, Any]]]  # names, and figures of `pose_figures`
 
 
 def summary_table(summary: Mapping[str, Group], title: str) -> Table:
@@ -33,9 +35,9 @@ def known_columns(columns: Columns, summary: Mapping[str, Group]) -> Columns:
 
 def pose_table(summary: Mapping[str, Group]) -> Table | None:
     """The figures of poses, for a terminal of 80 columns; None where no pair has known cameras."""
-    columns = {heading: column for heading, column in POSE_COLUMNS.items() if "mAP" not in heading}
     rows = _pose_rows(summary)
-    return _shown("Relative pose", POSE_CAPTION, columns, rows) if rows else None
+    columns = {heading: column for heading, column in pose_columns(rows).items() if "mAP" not in heading}
+    return _shown("Relative pose", pose_caption(rows), columns, rows) if rows else None
 
 
 def further_tables(summary: Mapping[str, Group]) -> list[Table]:
@@ -47,7 +49,7 @@ def _further(summary: Mapping[str, Group]) -> list[tuple[str, str, Columns, list
     focals = [(name, group["focals"]) for name, group in _rows(summary) if group["focals"] is not None]
     kinds = [(name, group["configurations"]) for name, group in _rows(summary) if group["configurations"] is not None]
     planes = [(name, group["homography"]) for name, group in _rows(summary) if group["homography"] is not None]
-    tables = [("Homography", HOMOGRAPHY_CAPTION, HOMOGRAPHY_COLUMNS, planes)] if planes else []
+    tables = [("Homography", CAPTION, HOMOGRAPHY_COLUMNS, planes)] if planes else []
     tables += [("Focal lengths", FOCAL_CAPTION, FOCAL_COLUMNS, focals)] if focals else []
     if any(count for _, group in kinds for name, count in group.items() if name != "general"):
         tables.append(("Configurations", CONFIGURATION_CAPTION, CONFIGURATION_COLUMNS, kinds))
@@ -82,8 +84,12 @@ def summary_markdown(summary: Mapping[str, Group], title: str) -> str:
     ]
     parts = [f"# {title}", _lines(rows), caption(summary)]
     if poses := _pose_rows(summary):
-        head = [["Relative pose", *list(POSE_COLUMNS)[1:]], ["---", *["---:"] * (len(POSE_COLUMNS) - 1)]]
-        parts += [_lines([*head, *(_cells(POSE_COLUMNS, name, group) for name, group in poses)]), POSE_CAPTION_BINNED]
+        columns = pose_columns(poses)
+        head = [["Relative pose", *list(columns)[1:]], ["---", *["---:"] * (len(columns) - 1)]]
+        parts += [
+            _lines([*head, *(_cells(columns, name, group) for name, group in poses)]),
+            pose_caption(poses, binned=True),
+        ]
     for heading, note, columns, groups in _further(summary):
         head = [[heading, *list(columns)[1:]], ["---", *["---:"] * (len(columns) - 1)]]
         parts += [_lines([*head, *(_cells(columns, name, group) for name, group in groups)]), note]
@@ -113,10 +119,7 @@ def caption(summary: Mapping[str, Group]) -> str:
     where = {over: [name for name, g in _rows(summary) if g["interval_over"] == over] for over in overs}
     over = "; ".join(f"{o}s" + (f" ({', '.join(names)})" if len(where) > 1 else "") for o, names in where.items())
     if any(group["homography"] is not None for _, group in _rows(summary)):
-        return (
-            "%Inlier: right matches, within 3 px of the true homography, and #Corrs, after estimation, -m: before; "
-            "means over the pairs that did not fail."
-        )
+        return INLIERS
     return (
         f"%Recall: NSGD < {THRESHOLD}, failures are misses; [{LEVEL:.0%} Wilson interval; independent units: "
         f"{over or 'pairs'}]. AUC@0.05: area under the recall curve to NSGD {THRESHOLD}. "
@@ -187,14 +190,36 @@ POSE_COLUMNS: Columns = {
     "mAA(10°)": _percent("maa_10"),
     **{f"mAP@{t}°": _percent(f"map_{t}") for t in POSE_THRESHOLDS},
     "R error": lambda group: f"{group['rotation']:.2f}°",
-    "t error, folded": lambda group: f"{group['translation']:.2f}°",
+    "t error": lambda group: f"{group['translation']:.2f}°",
 }
 POSE_CAPTION = (
     "Of the pairs with known cameras, by the larger of the angles of rotation and of translation, which is folded: its "
     "sign does not count. Failures count as 180° and 90°. AUC: area under the recall curve; mAA(10°): mean of recall "
     "at 1°, ..., 10°; R error, t error: medians."
 )
-POSE_CAPTION_BINNED = f"{POSE_CAPTION} mAP: mean of recall at 5°, 10°, ..., as in papers before 2020."
+SIGNED_POSE_CAPTION = (
+    "Of the pairs with known cameras, by the larger of the angles of rotation and of translation, whose sign counts "
+    "(pose.signed=true); of an F without cameras, of the best of its four poses, as PoseBench. Failures count as 180°. "
+    "AUC: area under the recall curve; mAA(10°): mean of recall at 1°, ..., 10°; R error, t error: medians."
+)
+BINNED = "mAP: mean of recall at 5°, 10°, ..., as in papers before 2020."
+
+
+def pose_columns(rows: PoseRows) -> Columns:
+    """The columns of poses; the last one says whether translations are folded or signed, where all are alike."""
+    signs = {group.get("signed", False) for _, group in rows}
+    suffix = {False: ", folded", True: ", signed"}[signs.pop()] if len(signs) == 1 else ""
+    return {f"{heading}{suffix * (heading == 't error')}": column for heading, column in POSE_COLUMNS.items()}
+
+
+def pose_caption(rows: PoseRows, binned: bool = False) -> str:
+    """What the columns of poses mean, for rows of one kind or, with their names, of both; binned: mAP is among them."""
+    names = {signed: [name for name, group in rows if group.get("signed", False) == signed] for signed in (False, True)}
+    captions = {False: POSE_CAPTION, True: SIGNED_POSE_CAPTION}
+    said = [(captions[signed], ", ".join(each)) for signed, each in names.items() if each]
+    text = " ".join(caption if len(said) == 1 else f"{which}: {caption}" for caption, which in said)
+    return f"{text} {BINNED}" if binned else text
+
 
 HOMOGRAPHY_COLUMNS: Columns = {
     "": lambda group: "",
@@ -202,10 +227,6 @@ HOMOGRAPHY_COLUMNS: Columns = {
     **{f"AUC@{t} px": _percent(f"auc_{t}px") for t in THRESHOLDS},
     "corner error": lambda group: _number(group["corner_error"], "{:.2f} px"),
 }
-HOMOGRAPHY_CAPTION = (
-    "By the mean distance, in image 1, between the corners of image 0 as the true and the estimated homography map "
-    "them; failures are misses. AUC: area under the recall curve; corner error: median."
-)
 FOCAL_COLUMNS: Columns = {
     "": lambda group: "",
     "Images": lambda group: str(group["images"]),

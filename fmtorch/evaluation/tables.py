@@ -11,6 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fmtorch.evaluation.bootstrap import LEVEL
+from fmtorch.evaluation.planes import CAPTION
 from fmtorch.evaluation.statistics import FINE_THRESHOLD, POSE_THRESHOLDS, THRESHOLD
 from fmtorch.evaluation.summary import ALL, STAGES
 from fmtorch.evaluation.summary_tables import (
@@ -18,14 +19,13 @@ from fmtorch.evaluation.summary_tables import (
     CONFIGURATION_COLUMNS,
     FOCAL_CAPTION,
     FOCAL_COLUMNS,
-    HOMOGRAPHY_CAPTION,
     HOMOGRAPHY_COLUMNS,
     MARKDOWN_COLUMNS,
-    POSE_CAPTION_BINNED,
-    POSE_COLUMNS,
     RECALL,
     Columns,
     known_columns,
+    pose_caption,
+    pose_columns,
 )
 
 DASH = "–"
@@ -88,7 +88,7 @@ def poses(summaries: Summaries) -> Table | None:
     known = {name: summary[ALL]["pose"] for name, summary in summaries.items() if summary[ALL]["pose"] is not None}
     if not known:
         return None
-    columns = {heading: column for heading, column in POSE_COLUMNS.items() if heading}
+    columns = {heading: column for heading, column in pose_columns(list(known.items())).items() if heading}
     ranked = {f"AUC@{t}°": f"auc_{t}" for t in POSE_THRESHOLDS} | {"mAA(10°)": "maa_10"}
     best = {heading: _best({n: figures[field] for n, figures in known.items()}) for heading, field in ranked.items()}
     rows = {
@@ -98,12 +98,12 @@ def poses(summaries: Summaries) -> Table | None:
         ]
         for name in summaries
     }
-    return Table("Relative pose", ["run", *columns], rows, POSE_CAPTION_BINNED)
+    return Table("Relative pose", ["run", *columns], rows, pose_caption(list(known.items()), binned=True))
 
 
 def homographies(summaries: Summaries) -> Table | None:
     """Accuracy of homographies over all pairs; None where none is known."""
-    return _of_field(summaries, "homography", "Homography", HOMOGRAPHY_COLUMNS, HOMOGRAPHY_CAPTION)
+    return _of_field(summaries, "homography", "Homography", HOMOGRAPHY_COLUMNS, CAPTION)
 
 
 def focals(summaries: Summaries) -> Table | None:

@@ -31,7 +31,7 @@ class Batch:
     """Pairs to evaluate.
 
     cameras: of their keys, for a pipeline that was built without them. journal: an empty one, where keypoints, matches
-    and F are to be exported. counted: whether the worker counts the images that it computed.
+    and F are to be exported. counted: whether the worker counts the images that it computed. signed: of `pose_errors`.
     """
 
     pairs: list[ImagePair]
@@ -39,6 +39,7 @@ class Batch:
     cameras: Mapping[int, PairCameras] | None = None
     journal: CollectedJournal | None = None
     counted: bool = False
+    signed: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +64,7 @@ def evaluate_batch(pipeline: Pipeline, batch: Batch) -> Work:
     outcomes = examined(pipeline, pipeline.run(batch.pairs, batch.seed), batch.seed, knowledge)
     if batch.journal is not None:
         keep_outcomes(batch.journal, pipeline, outcomes)
-    rows = evaluate(outcomes, batch.seed)
+    rows = evaluate(outcomes, batch.seed, batch.signed)
     if batch.cameras is not None and isinstance(pipeline.estimator, WithPairCameras):
         for key in batch.cameras:
             pipeline.estimator.cameras.pop(key, None)
@@ -78,7 +79,7 @@ def divided(batch: Batch) -> list[Batch]:
 
 def failed(batch: Batch, reason: str) -> list[PairRow]:
     """The rows of pairs that no worker lives to evaluate."""
-    return evaluate([Outcome(pair, reason=reason) for pair in batch.pairs], batch.seed)
+    return evaluate([Outcome(pair, reason=reason) for pair in batch.pairs], batch.seed, batch.signed)
 
 
 def compute_features(pipeline: Pipeline, image: ImageSource) -> None:

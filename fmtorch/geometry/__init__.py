@@ -20,7 +20,7 @@ from fmtorch.geometry.homography_pose import PlanePoses, poses_from_homography, 
 from fmtorch.geometry.homography_refine import refine_homography
 from fmtorch.geometry.irls import Fits, irls, reweighted_fits
 from fmtorch.geometry.normalize import canonical, denormalize_fundamental, normalize_pair, normalize_points
-from fmtorch.geometry.pose import Pose, pose_from_fundamental
+from fmtorch.geometry.pose import FourPoses, Pose, pose_from_fundamental, poses_from_fundamental
 from fmtorch.geometry.rank2 import nearest_rank2
 from fmtorch.geometry.refine import attached_step, refine
 from fmtorch.geometry.robust_losses import KERNELS
@@ -29,13 +29,13 @@ from fmtorch.geometry.significance import significance
 from fmtorch.geometry.two_view_covariance import TwoViewCovariance, two_view_covariance
 
 __all__ = [
-    "KERNELS", "Fits", "PlanePoses", "Pose", "TwoViewCovariance", "algebraic", "attached_step", "canonical",
-    "cross_matrix", "denormalize_fundamental", "eight_point", "epipolar_distances", "epipolar_lines",
+    "KERNELS", "Fits", "FourPoses", "PlanePoses", "Pose", "TwoViewCovariance", "algebraic", "attached_step",
+    "canonical", "cross_matrix", "denormalize_fundamental", "eight_point", "epipolar_distances", "epipolar_lines",
     "fundamental_from_calibration", "fundamental_from_projections", "homography", "homography_points",
     "homography_sampson", "homography_transfer", "irls", "nearest_rank2", "normalize_pair", "normalize_points",
-    "point_to_line", "pose_from_fundamental", "poses_from_homography", "refine", "refine_homography",
-    "reweighted_fits", "rotation_from_homography", "sampson", "sampson_squared", "seven_point", "significance",
-    "symmetric_max", "symmetric_mean", "symmetric_squared", "two_view_covariance", "unit_frobenius",
+    "point_to_line", "pose_from_fundamental", "poses_from_fundamental", "poses_from_homography", "refine",
+    "refine_homography", "reweighted_fits", "rotation_from_homography", "sampson", "sampson_squared", "seven_point",
+    "significance", "symmetric_max", "symmetric_mean", "symmetric_squared", "two_view_covariance", "unit_frobenius",
 ]  # fmt: skip
 
 check_exported(__name__)

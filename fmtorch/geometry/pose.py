@@ -24,6 +24,48 @@ class Pose(NamedTuple):
     valid: Bool[Tensor, "*batch"]
 
 
+class FourPoses(NamedTuple):
+    """The four motions X1 = R X0 + t, t of unit length, that an essential matrix has; False where it has none.
+
+    Where `valid` is False, R is the identity and t is zero.
+    """
+
+    R: Float[Tensor, "*batch 4 3 3"]
+    t: Float[Tensor, "*batch 4 3"]
+    valid: Bool[Tensor, "*batch"]
+
+
+class _Decomposition(NamedTuple):
+    """R (3, 3, 4, *batch), t (3, 4, *batch), the inverse calibrations, and where all of them are determined."""
+
+    R: Tensor
+    t: Tensor
+    inverses: tuple[Tensor, Tensor]
+    valid: Tensor
+
+
+def poses_from_fundamental(
+    F: Float[Tensor, "*batch 3 3"], K0: Float[Tensor, "*batch 3 3"], K1: Float[Tensor, "*batch 3 3"]
+) -> FourPoses:
+    """The four decompositions of E = K1^T F K0, in no order of merit; matches tell which one is right.
+
+    Hartley and Zisserman, Multiple View Geometry, 9.6.2. Float64 inside, F's type outside; differentiable.
+
+    Args:
+        F: fundamental matrices (..., 3, 3), of any scale and sign.
+        K0: calibration matrices (..., 3, 3) of image 0.
+        K1: those of image 1.
+
+    Returns:
+        `FourPoses`.
+    """
+    R, t, _, valid = _decomposed(F, K0, K1)
+    R, t = R.movedim((2, 0, 1), (-3, -2, -1)), t.movedim((1, 0), (-2, -1))
+    R = torch.where(valid[..., None, None, None], R, torch.eye(3, dtype=R.dtype, device=R.device))
+    t = torch.where(valid[..., None, None], t, 0.0)
+    return FourPoses(R.to(F.dtype), t.to(F.dtype), valid)
+
+
 def pose_from_fundamental(
     F: Float[Tensor, "*batch 3 3"],
     K0: Float[Tensor, "*batch 3 3"],
@@ -54,6 +96,24 @@ def pose_from_fundamental(
         A `Pose`.
     """
     mask = torch.ones_like(x0[..., 0], dtype=torch.bool) if mask is None else mask
+    R, t, (inverse0, inverse1), regular = _decomposed(F, K0, K1)
+    keep = mask & (x0.isfinite() & x1.isfinite()).all(-1)
+    with torch.no_grad():
+        ray0, ray1 = (_rays(K, torch.where(keep[..., None], x, 0.0)) for K, x in ((inverse0, x0), (inverse1, x1)))
+        front = _in_front(R, t, ray0, ray1) & keep
+        count = front.sum(-1)  # (4, *batch)
+        best = (count if weight is None else _support(front, weight)).argmax(0)
+    n_in_front = torch.gather(count, 0, best[None])[0]
+    valid = regular & (n_in_front > 0)
+    R = torch.gather(R, 2, best[None, None, None].expand(3, 3, 1, *best.shape))[:, :, 0].movedim((0, 1), (-2, -1))
+    t = torch.gather(t, 1, best[None, None].expand(3, 1, *best.shape))[:, 0].movedim(0, -1)
+    R = torch.where(valid[..., None, None], R, torch.eye(3, dtype=R.dtype, device=R.device))
+    t = torch.where(valid[..., None], t, 0.0)
+    return Pose(R.to(F.dtype), t.to(F.dtype), torch.where(valid, n_in_front, 0), valid)
+
+
+def _decomposed(F: Tensor, K0: Tensor, K1: Tensor) -> _Decomposition:
+    """The four motions of E = K1^T F K0, in float64."""
     F_, K0_, K1_ = (A.to(torch.float64).movedim((-2, -1), (0, 1)) for A in (F, K0, K1))
     finite = torch.stack([A.isfinite().all(0).all(0) for A in (F_, K0_, K1_)]).all(0)
     F_, K0_, K1_ = (torch.where(finite, A, 0.0) for A in (F_, K0_, K1_))
@@ -64,19 +124,7 @@ def pose_from_fundamental(
     straight, turned = cofactors(E), _cross_matrix_product(t, E)
     R = torch.stack([straight - turned, straight + turned, straight - turned, straight + turned], 2)
     t = torch.stack([t, t, -t, -t], 1)
-    keep = mask & (x0.isfinite() & x1.isfinite()).all(-1)
-    with torch.no_grad():
-        ray0, ray1 = (_rays(K, torch.where(keep[..., None], x, 0.0)) for K, x in ((inverse0, x0), (inverse1, x1)))
-        front = _in_front(R, t, ray0, ray1) & keep
-        count = front.sum(-1)  # (4, *batch)
-        best = (count if weight is None else _support(front, weight)).argmax(0)
-    n_in_front = torch.gather(count, 0, best[None])[0]
-    valid = finite & regular0 & regular1 & two & (n_in_front > 0)
-    R = torch.gather(R, 2, best[None, None, None].expand(3, 3, 1, *best.shape))[:, :, 0].movedim((0, 1), (-2, -1))
-    t = torch.gather(t, 1, best[None, None].expand(3, 1, *best.shape))[:, 0].movedim(0, -1)
-    R = torch.where(valid[..., None, None], R, torch.eye(3, dtype=R.dtype, device=R.device))
-    t = torch.where(valid[..., None], t, 0.0)
-    return Pose(R.to(F.dtype), t.to(F.dtype), torch.where(valid, n_in_front, 0), valid)
+    return _Decomposition(R, t, (inverse0, inverse1), finite & regular0 & regular1 & two)
 
 
 def _essential(E: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from fmtorch.core.checks import checked
 from fmtorch.geometry.epipolar import inverse_root
-from fmtorch.geometry.pose import pose_from_fundamental
+from fmtorch.geometry.pose import pose_from_fundamental, poses_from_fundamental
 
 
 class PoseError(NamedTuple):
@@ -106,6 +106,34 @@ def fundamental_pose_error(
     pose = pose_from_fundamental(F, K0, K1, x0, x1, mask)
     R = torch.where(pose.valid[..., None, None], pose.R, torch.nan)
     return pose_error(R, pose.t, R_gt.to(R.dtype), t_gt.to(R.dtype), up_to_sign=up_to_sign)
+
+
+@checked
+def closest_pose_error(
+    F: Float[Tensor, "*batch 3 3"],
+    K0: Float[Tensor, "*batch 3 3"],
+    K1: Float[Tensor, "*batch 3 3"],
+    R_gt: Float[Tensor, "*batch 3 3"],
+    t_gt: Float[Tensor, "*batch 3"],
+) -> PoseError:
+    """Error of the best of the four poses that F has with known calibrations: that of the smallest sum of both angles.
+
+    As PoseBench (github.com/PoseLib/posebench) judges fundamental matrices. The sign of t counts, no match decides.
+
+    Args:
+        F: estimated fundamental matrices, x1^T F x0 = 0 in pixels.
+        K0, K1: calibration matrices.
+        R_gt, t_gt: the true motion, X1 = R X0 + t; the length of t does not count.
+
+    Returns:
+        Angles in degrees, at most 180 each, and both 180 where there is no pose. Differentiable in F, K0 and K1.
+    """
+    four = poses_from_fundamental(F, K0, K1)
+    R, t = R_gt.to(F.dtype)[..., None, :, :], t_gt.to(F.dtype)[..., None, :]
+    errors = pose_error(four.R, four.t, R, t, up_to_sign=False)
+    best = (errors.rotation + errors.translation).detach().argmin(-1, keepdim=True)
+    rotation, translation = (angle.gather(-1, best)[..., 0] for angle in errors)
+    return PoseError(torch.where(four.valid, rotation, 180.0), torch.where(four.valid, translation, 180.0))
 
 
 def _angle(sine: Tensor, cosine: Tensor) -> Tensor:

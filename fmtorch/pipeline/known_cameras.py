@@ -139,6 +139,9 @@ def _with_cameras(estimate: Estimate, square: Correspondences, images: Images, c
     focals = torch.where(known, focals, 1.0)  # so that no gradient is NaN
     square_focals = focals
     R, t = _pose(estimate, square, focals, known.all(1))
+    if estimate.R is not None and estimate.t is not None:  # another library's own
+        own = known.all(1) & estimate.R.isfinite().all(-1).all(-1) & estimate.t.isfinite().all(-1)
+        R, t = torch.where(own[:, None, None], estimate.R.to(R), R), torch.where(own[:, None], estimate.t.to(t), t)
     if images.map is not None and images.unit is not None:
         A = images.map.to(F)
         F = torch.where(ok[:, None, None], canonical(matmul3(matmul3(A[:, 1].mT, F), A[:, 0])), 0)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 from omegaconf import DictConfig, OmegaConf
 
-from fmtorch.core.options import Within, expect_options
+from fmtorch.core.options import Within, dataclass_in, expect_options
 
 
 class DeviceName:
@@ -45,6 +45,11 @@ def read_fields(fields: type[Fields], config: DictConfig, where: str = "") -> Fi
     paths = set(path_fields(fields))
     values = {name: str(v) if name in paths and type(v) in (int, float) else v for name, v in values.items()}
     expect_options(fields, values, where)
+    nested = {name: dataclass_in(hint) for name, hint in get_type_hints(fields).items()}
+    values = {
+        name: kind(**v) if isinstance(v, dict) and (kind := nested[name]) is not None else v
+        for name, v in values.items()
+    }
     return fields(**{name: Path(v) if name in paths and isinstance(v, str) else v for name, v in values.items()})
 
 

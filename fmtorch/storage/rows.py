@@ -89,7 +89,7 @@ class PairRow:
     significance: float | None = None  # how far the support of F is beyond chance
     related: bool = False  # whether the images are therefore taken to show one scene; recall does not ask
     rotation_error: float | None = None  # degrees, in [0, 180]; 180 where the pair failed; None without a true pose
-    translation_error: float | None = None  # degrees between directions up to sign, in [0, 90]; 90 where it failed
+    translation_error: float | None = None  # of directions up to sign, in [0, 90], 90 where it failed; signed: to 180
     pose_reason: str | None = None  # why there is no pose error, or no pose; None where there is
     configuration: str | None = None  # of `CONFIGURATIONS`; None where there are no matches to tell it by
     warning: str | None = None  # what the configuration leaves open, empty where nothing

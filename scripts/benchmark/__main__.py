@@ -22,6 +22,7 @@ from scripts.benchmark import (
     paper,
     paper_times,
     pipelines,
+    posebench,
     pruning,
     refinement,
     related,
@@ -40,8 +41,8 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     for module in (
         cameras, configuration, curves, end_to_end, estimators, features, gc_ransac, homography, learned, matching,
-        memory, paper, paper_times, pipelines, pruning, refinement, related, scale, similar, speed, stress, sweep,
-        thresholds, verify,
+        memory, paper, paper_times, pipelines, posebench, pruning, refinement, related, scale, similar, speed, stress,
+        sweep, thresholds, verify,
     ):  # fmt: skip
         module.add_arguments(commands)
     arguments = parser.parse_args()

@@ -66,6 +66,7 @@ def identity(text: str) -> str:
         return kept.identity(stages + [("pruner", name, {}) for name in PRUNERS], spec.name, spec.level, code)
     files = [Path(cameras_peers.__file__), Path(cameras_peers.__file__).with_name("cameras_knowledge.py")]
     code = hashlib.blake2b(b"".join(file.read_bytes() for file in files)).hexdigest()
+    code += code_digest("fmtorch.estimators.peers.colmap") if spec.name.startswith("colmap") else ""
     return kept.identity([], text, cameras_peers.version(spec.name), code)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from fmtorch.estimators.peers import colmap
 from scripts.benchmark.cameras_knowledge import (
     NOTHING,
     USUAL,
@@ -129,57 +130,22 @@ def _poselib_f(
 
 def _colmap(x: Points, given: Knowledge, seed: int, *, threshold: float = 4.0) -> Answer:
     """COLMAP's two-view geometry: E for two calibrations, one focal length for one or none, F where it prefers that."""
-    import pycolmap
-
-    options = pycolmap.TwoViewGeometryOptions(compute_relative_pose=True)
-    options.ransac.max_error, options.ransac.random_seed = threshold, seed
-    found = _colmap_geometry(x, given, options)
-    inliers = np.zeros(len(x[0]), np.bool_)
-    inliers[np.asarray(found.inlier_matches, np.int64).reshape(-1, 2)[:, 0]] = True
-    focals, (K0, K1) = _colmap_focals(found, given)
-    F = None if found.F is None else np.asarray(found.F)
-    if K0 is None or K1 is None or found.cam2_from_cam1 is None:
-        return answer(F, given, x, inliers)
-    R, t = np.asarray(found.cam2_from_cam1.rotation.matrix()), np.asarray(found.cam2_from_cam1.translation)
-    if found.config != pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED and np.any(t):
-        F = fundamental(K0, K1, R, t)
-    return Answer(F, R, t, focals)
-
-
-def _colmap_geometry(x: Points, given: Knowledge, options: Any) -> Any:
-    """Cameras of one number share their focal length; those without a prior one start at COLMAP's default."""
-    import pycolmap
-
-    usual, cameras = given.calibrations(USUAL * given.longest), []
-    for i, K in enumerate((given.K0, given.K1)):
-        k = usual[i] if K is None else K
-        camera = pycolmap.Camera(
-            camera_id=1 if given.one_camera else i + 1, model="PINHOLE", width=int(2 * k[0, 2]) + 1,
-            height=int(2 * k[1, 2]) + 1, params=[k[0, 0], k[1, 1], k[0, 2], k[1, 2]],
-        )  # fmt: skip
-        camera.has_prior_focal_length = K is not None
-        cameras.append(camera)
-    matches = np.repeat(np.arange(len(x[0]), dtype=np.uint32)[:, None], 2, 1)
-    return pycolmap.estimate_two_view_geometry(cameras[0], x[0], cameras[1], x[1], matches, options)
-
-
-def _colmap_focals(found: Any, given: Knowledge) -> tuple[Array | None, list[Array | None]]:
-    """The focal lengths where COLMAP estimated one, and the calibrations that its pose is of."""
-    K = [given.K0, given.K1]
-    for i, camera in enumerate((found.camera1, found.camera2)):
-        if K[i] is None and camera is not None:
-            K[i] = np.asarray(camera.calibration_matrix())
-    if given.K0 is not None and given.K1 is not None:
-        return None, K
-    return (None if any(k is None for k in K) else np.array([k[0, 0] for k in K if k is not None])), K
+    usual = given.calibrations(USUAL * given.longest)  # cameras without a prior start at COLMAP's default
+    cameras = [
+        colmap.Camera(usual[i] if K is None else K, K is not None, 1 if given.one_camera else i + 1)
+        for i, K in enumerate((given.K0, given.K1))
+    ]
+    found = colmap.two_view_geometry(*x, (cameras[0], cameras[1]), colmap.two_view_options(threshold, seed))
+    if found.R is None or found.K0 is None or found.K1 is None:
+        return answer(found.F, given, x, found.inliers)
+    exact = given.K0 is not None and given.K1 is not None
+    return Answer(found.F, found.R, found.t, None if exact else np.array([found.K0[0, 0], found.K1[0, 0]]))
 
 
 def _colmap_f(x: Points, given: Knowledge, seed: int, *, threshold: float = 4.0) -> Answer:
-    import pycolmap
-
-    options = pycolmap.RANSACOptions(max_error=threshold, random_seed=seed)
-    found = pycolmap.estimate_fundamental_matrix(*x, options)
-    return NOTHING if found is None else answer(np.asarray(found["F"]), given, x, np.asarray(found["inlier_mask"]))
+    options = importlib.import_module("pycolmap").RANSACOptions(max_error=threshold, random_seed=seed)
+    F, inliers = colmap.fundamental_matrix(*x, options)
+    return answer(F, given, x, inliers)
 
 
 def _opencv(

@@ -26,6 +26,7 @@ from fmtorch import find_homography, metrics, presets
 from fmtorch.core.estimate import CONFIGURATIONS
 from fmtorch.core.files import replacing
 from fmtorch.core.types import Correspondences, collate
+from fmtorch.estimators.peers import colmap
 from fmtorch.evaluation.pair_cameras import EXACT
 from fmtorch.geometry import poses_from_homography
 from fmtorch.pipeline.configuration import classify
@@ -130,22 +131,15 @@ def _colmap(threshold: float) -> Verdict:
         c = case.matches
         assert c.K0 is not None
         assert c.K1 is not None
+        x0, x1 = (x[0][c.mask[0]].double().numpy() for x in (c.x0, c.x1))
         assert c.size0 is not None
         assert c.size1 is not None
-        options = pycolmap.TwoViewGeometryOptions()
-        options.ransac.max_error, options.ransac.random_seed = threshold, seed
-        options.compute_relative_pose = True  # by which it tells rotations from planes
-        x0, x1 = (x[0][c.mask[0]].double().numpy() + 0.5 for x in (c.x0, c.x1))
-        cameras = [
-            pycolmap.Camera(
-                model="PINHOLE", width=int(size[0, 1]), height=int(size[0, 0]), has_prior_focal_length=True,
-                params=[float(v) for v in (K[0, 0, 0], K[0, 1, 1], K[0, 0, 2] + 0.5, K[0, 1, 2] + 0.5)],
-            )
-            for K, size in ((c.K0, c.size0), (c.K1, c.size1))
-        ]  # fmt: skip
-        both = np.stack([np.arange(len(x0))] * 2, 1).astype(np.uint32)
-        geometry = pycolmap.estimate_two_view_geometry(cameras[0], x0, cameras[1], x1, both, options)
-        return COLMAP[pycolmap.TwoViewGeometryConfiguration(geometry.config).name]
+        first, second = (
+            colmap.Camera(K[0].double().numpy(), number=i, size=(int(size[0, 0]), int(size[0, 1])))
+            for i, (K, size) in enumerate(((c.K0, c.size0), (c.K1, c.size1)))
+        )
+        found = colmap.two_view_geometry(x0, x1, (first, second), colmap.two_view_options(threshold, seed))
+        return COLMAP[found.configuration]
 
     return verdict
 

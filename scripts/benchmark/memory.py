@@ -25,6 +25,7 @@ from scripts.benchmark.synthetic import synthetic_pair
 OTHER_LIBRARIES = (
     "opencv",
     "poselib",
+    "colmap",
     "kornia_ransac",
     "magsac_cpp",
     "gc_ransac_cpp",

@@ -21,6 +21,7 @@ from typing import Any
 import torch
 
 import fmtorch
+from fmtorch.estimators.peers import colmap
 from scripts.benchmark.kept import Kept, Row
 from scripts.benchmark.matched import console
 from scripts.benchmark.sheet import put
@@ -109,8 +110,7 @@ def verified_by(method: str, path: Path, seed: int) -> Row:
         fmtorch.verify(path, seed=seed)
         seconds = time.process_time() - start
     else:
-        options = pycolmap.TwoViewGeometryOptions(compute_relative_pose=True)
-        options.ransac.max_error, options.ransac.random_seed = float(threshold), seed
+        options = colmap.two_view_options(float(threshold), seed)
         verifier = pycolmap.GeometricVerifierOptions(num_threads=1)
         start = time.process_time()
         pycolmap.geometric_verification(path, verifier_options=verifier, two_view_geometry_options=options)

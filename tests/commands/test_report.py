@@ -76,6 +76,25 @@ def test_poses_are_shown_where_a_run_has_them() -> None:
     assert "Relative pose" not in render("None", [Section("set", {"without": runs["without"]})], [])
 
 
+def test_signed_translations_are_said_and_told_apart_from_folded_ones() -> None:
+    posed = [dataclasses.replace(r, rotation_error=2.0, translation_error=170.0) for r in results([0.01] * 4)]
+    folded = [dataclasses.replace(r, rotation_error=2.0, translation_error=10.0) for r in results([0.01] * 4)]
+    runs = {"a": to_table(posed), "b": to_table(folded)}
+    summaries = {name: summarize(rows, name == "a") for name, rows in runs.items()}
+    alone, both = tables.poses({"a": summaries["a"]}), tables.poses(summaries)
+    assert alone is not None
+    assert both is not None
+    assert alone.head[-1] == "t error, signed"
+    assert "whose sign counts" in alone.note
+    assert "folded" not in alone.note
+    assert both.head[-1] == "t error"
+    assert "b: Of the pairs" in both.note
+    assert "a: Of the pairs" in both.note
+    page = render("Poses", [Section("set", runs, signed=["a"])], [])
+    assert "pose.signed=true" in page
+    assert "pose.signed=true" not in render("Poses", [Section("set", {"b": runs["b"]})], [])
+
+
 def test_one_run_is_ahead_of_none() -> None:
     page = render("One", [Section("set", {"one": to_table(results([0.01, 0.2]))})], [])
     assert "minus each other" not in page

@@ -49,6 +49,8 @@ ELSEWHERE = {
     r"--contrib-python": "needs a Python with opencv-contrib",
     r"--config-dir my_conf (pruner|pipeline)=": "tests/training/test_train_command.py runs these files and commands",
     r"dataset=(tum|kitti|colmap|bundler|fmbench dataset\.root=KITTI)": "tests/data runs these on data of their layout",
+    r"pipeline=vismatch|(dataset=|runs/)pair_list": "tests/matching/test_vismatch.py runs a stand-in on lists of pairs",
+    r"dataset=hpatches": "tests/evaluation/test_homographies.py runs these on sequences of its own",
     r"--config-dir my_conf features=": "tests/docs/test_own_parts.py runs this page",
 }
 """Commands that are not run here, and why."""
@@ -109,6 +111,7 @@ APPENDED = {
         "--estimators",
         "fmtorch",
     ],
+    "posebench": ["--threshold", "1", "--methods", "E:fmtorch", "F:fmtorch"],
     "related": ["--limit", "1", "--unrelated", "1"],
     "learned": ["--limit", "1", "--cache", "kept", "--methods", "ratio", "LC, F", "DFE"],
     "similar": ["--root", "DATA/Strecha"],
@@ -143,6 +146,7 @@ def smaller(command: str) -> list[str]:
         (r" '?dataset\.sets=\[\S*\]'?", ""),
         (r"FOLDER", "kept"),
         (r"(dataset\.layout=(\w+) dataset\.root=)FILES", r"\1FILES/\2"),
+        (r"benchmark posebench FILES", "benchmark posebench FILES/posebench"),
         (r" root=DIR", ""),
         (r" d\.json", ""),
         (r"runs=\[runs/a,runs/b\]|runs/a runs/b", "runs=[runs/fmbench]"),

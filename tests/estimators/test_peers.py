@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch import geometry, presets
-from fmtorch.core.types import collate
+from fmtorch import find_essential, geometry, presets
+from fmtorch.core.types import Correspondences, collate
 from fmtorch.estimators import PairwiseEstimator
 from fmtorch.estimators.peers.pairwise import Pair, Solution
+from fmtorch.pipeline.known_cameras import KnownCameras
 from scripts.benchmark.memory import OTHER_LIBRARIES
+from tests.geometry.scenes import scene as matched_scene
 from tests.laws import PEERS, scene
 from tests.variants import built, variants
 
@@ -42,7 +44,8 @@ def test_recovers_the_geometry_in_a_batch(name: str) -> None:
 @pytest.mark.parametrize("name", PEERS)
 def test_a_missing_library_is_named(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, PEERS[name], None)
-    with pytest.raises(ImportError, match=rf"{PEERS[name]}.*fmtorch\[peers\]"):
+    extra = "colmap" if name.startswith("colmap") else "peers"
+    with pytest.raises(ImportError, match=rf"{PEERS[name]}.*fmtorch\[{extra}\]"):
         built("estimator", name)
 
 
@@ -86,6 +89,48 @@ def test_the_check_of_focal_lengths_leaves_pixels_as_they_are() -> None:
     c, clean = scene(0, 200, outliers=0.2, noise=0.1), scene(0, 200, outliers=0.0, noise=0.0)
     estimate = presets.build("estimator", "poselib", real_focal_check=True)(c)
     assert float(geometry.sampson(estimate.F, clean.x0.double(), clean.x1.double()).median()) < 0.5
+
+
+def test_poselib_estimates_the_pose_of_exactly_known_cameras() -> None:
+    """Its own pose, sign included; roughly known focal lengths leave a fundamental matrix."""
+    poselib = pytest.importorskip("poselib")
+    s = matched_scene(300, 1, noise=0.1)
+    K = s.K0.numpy(), s.K1.numpy()
+    size = [(round(2 * float(k[1, 2]) + 1), round(2 * float(k[0, 2]) + 1)) for k in K]
+    cameras = [
+        {"model": "PINHOLE", "width": w, "height": h, "params": [k[0, 0], k[1, 1], k[0, 2], k[1, 2]]}
+        for k, (h, w) in zip(K, size, strict=True)
+    ]
+    options = {"max_epipolar_error": 1.0, "max_iterations": 10000, "min_iterations": 1000, "success_prob": 0.9999}
+    pose, info = poselib.estimate_relative_pose(s.x0.numpy(), s.x1.numpy(), *cameras, {**options, "seed": 3}, {})
+    estimate = find_essential(s.x0, s.x1, s.K0, s.K1, estimator="poselib", seed=3)
+    assert estimate.R is not None
+    assert estimate.t is not None
+    # pixels are mapped to those of a central principal point: 1e-13 px, times the condition of the fit
+    assert estimate.R[0].numpy() == pytest.approx(pose.R, abs=1e-6)
+    assert estimate.t[0].numpy() == pytest.approx(pose.t / np.linalg.norm(pose.t), abs=1e-6)
+    assert int(estimate.inliers.sum()) == info["num_inliers"]
+
+
+def test_roughly_known_cameras_are_not_exact_for_peers() -> None:
+    given: list[Pair] = []
+
+    def solve(pair: Pair) -> Solution:
+        given.append(pair)
+        return None, np.zeros(len(pair.x0), np.bool_)
+
+    s, find = matched_scene(40, 1), KnownCameras(PairwiseEstimator("It", solve))
+    c = Correspondences(s.x0[None], s.x1[None], torch.ones(1, 40, dtype=torch.bool), K0=s.K0[None], K1=s.K1[None])
+    for deviation in (0.0, 0.05, np.inf):
+        find(c.replace(focal=torch.tensor([[[1.0, deviation], [1.0, deviation]]], dtype=torch.float64)), 3)
+    exact, rough, unknown = given
+    assert exact.exact is not None
+    f = [float(torch.sqrt(K[0, 0] * K[1, 1])) for K in (s.K0, s.K1)]
+    assert [K[0, 0] for K in exact.exact] == pytest.approx(f)
+    assert rough.exact is None
+    assert rough.calibrations is not None
+    assert rough.calibrations[0] is not None
+    assert unknown.calibrations == (None, None)
 
 
 def test_superansac_does_the_same_at_every_call() -> None:

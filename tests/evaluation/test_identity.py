@@ -66,6 +66,14 @@ def test_what_changes_speed_alone_is_no_part_of_it() -> None:
         assert identity_digest(identity(change)) != identity_digest(plain), change
 
 
+def test_signed_translations_are_part_of_it_and_folded_ones_change_no_earlier_identity() -> None:
+    config = compose("eval", ("pipeline=sift_ratio", "cache=off"))
+    pipeline = presets.build_pipeline(config)
+    folded, signed = (run_identity(config, "sift_ratio", pipeline, "abc", signed=s) for s in (False, True))
+    assert "pose" not in folded
+    assert signed == {**folded, "pose": {"signed": True}}
+
+
 def test_versions_of_libraries_are_part_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
     assert {"torch", "opencv", "onnxruntime", "numpy"} <= set(libraries())
     assert identity()["libraries"]["torch"] == torch.__version__.partition("+")[0]  # not for which device it was built

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from fmtorch.geometry import cross_matrix
-from fmtorch.metrics import fundamental_pose_error, pose_error
+from fmtorch.metrics import closest_pose_error, fundamental_pose_error, pose_error
 from tests.geometry.scenes import scene
 from tests.reference import metrics as reference
 from tests.reference import solvers
@@ -141,3 +141,37 @@ def test_gradient_of_a_fundamental_matrix() -> None:
         return tuple(fundamental_pose_error(F, K0, K1, x0 / 500, x1 / 500, R, t))
 
     assert torch.autograd.gradcheck(angles, leaves)
+
+
+def test_the_closest_pose_of_a_fundamental_matrix_is_the_reference() -> None:
+    """Of random matrices, and of nearly right ones, whose best pose is the true one."""
+    g = torch.Generator().manual_seed(4)
+    F, K0, K1, _, _, R_gt, t_gt = perturbed(10)
+    F = torch.cat([F, torch.randn(30, 3, 3, generator=g, dtype=torch.float64)])
+    K0, K1, R_gt, t_gt = (torch.cat([v, v, v, v]) for v in (K0, K1, R_gt, t_gt))
+    K0[10:], K1[10:] = torch.eye(3, dtype=torch.float64), torch.eye(3, dtype=torch.float64)
+    error = closest_pose_error(F, K0, K1, R_gt, t_gt)
+    for i in range(len(F)):
+        four = solvers.poses((K1[i].T @ F[i] @ K0[i]).numpy())
+        expected = reference.closest_pose_error(four, R_gt[i].numpy(), t_gt[i].numpy())
+        assert (error.rotation[i].item(), error.translation[i].item()) == pytest.approx(expected, abs=1e-6)
+    assert float(error.worst[:10].max()) < 20
+    assert float(error.worst[10:].max()) > 90
+
+
+def test_the_closest_pose_needs_no_match_and_keeps_the_three_laws() -> None:
+    F, K0, K1, _, _, R_gt, t_gt = perturbed(5)
+    good = closest_pose_error(F, K0, K1, R_gt, t_gt)
+    back = closest_pose_error(F, K0, K1, R_gt, -t_gt)  # another of the four points backwards
+    assert torch.allclose(good.worst, back.worst, atol=1e-6)
+    F[1], K0[2] = torch.nan, 0.0
+    leaves = [a.requires_grad_() for a in (F, K0, K1)]
+    error = closest_pose_error(*leaves, R_gt, t_gt)
+    assert error.rotation[[1, 2]].tolist() == error.translation[[1, 2]].tolist() == [180, 180]
+    for i in (0, 3, 4):
+        alone = closest_pose_error(F[i], K0[i], K1[i], R_gt[i], t_gt[i])
+        assert torch.equal(alone.rotation, error.rotation[i])
+        assert torch.equal(alone.rotation, good.rotation[i])
+        assert torch.equal(alone.translation, error.translation[i])
+    for value in torch.autograd.grad(error.worst.sum(), leaves):
+        assert value.isfinite().all()

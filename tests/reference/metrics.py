@@ -143,6 +143,23 @@ def direction_angle(t0: np.ndarray, t1: np.ndarray) -> float:
     return min(angle, 180 - angle)
 
 
+def signed_direction_angle(t0: np.ndarray, t1: np.ndarray) -> float:
+    """Degrees, at most 180, as PoseBench computes it."""
+    return float(np.rad2deg(np.arccos(np.clip(t0 @ t1 / (np.linalg.norm(t0) * np.linalg.norm(t1)), -1.0, 1.0))))
+
+
+def closest_pose_error(
+    poses: list[tuple[np.ndarray, np.ndarray]], R_gt: np.ndarray, t_gt: np.ndarray
+) -> tuple[float, float]:
+    """Angles of the pose with the smallest sum of both, as PoseBench judges fundamental matrices; 180 each at most."""
+    best = 180.0, 180.0
+    for R, t in poses:
+        angles = rotation_angle(R, R_gt), signed_direction_angle(t, t_gt)
+        if sum(angles) < sum(best):
+            best = angles
+    return best
+
+
 def pose_auc(errors: list[float], thresholds: tuple[float, ...]) -> list[float]:
     """The recall curve's area as SuperGlue's published evaluation computes it."""
     ordered = [0.0, *sorted(errors)]

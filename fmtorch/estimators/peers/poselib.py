@@ -12,8 +12,10 @@ from fmtorch.estimators.peers.pairwise import (
     Iterations,
     Pair,
     PairwiseEstimator,
+    Posed,
     Solution,
     computed_by,
+    fundamental_of_pose,
     peer,
     solution,
 )
@@ -36,6 +38,8 @@ def poselib(
     shared_focal: bool = False,
 ) -> PairwiseEstimator:
     """PoseLib's LO-RANSAC for fundamental matrices, or for two cameras of one unknown focal length (Larsson 2020).
+
+    Where both focal lengths are exactly known (`find_essential`, `cameras=known`) it estimates a relative pose.
 
     Args:
         threshold: pixels, Sampson distance.
@@ -72,6 +76,8 @@ def poselib(
 
     def solve(pair: Pair) -> Solution:
         seeded = {**options, "seed": pair.seed}
+        if pair.exact is not None:
+            return _relative_pose(library, pair, seeded, refinement)
         if shared_focal and pair.size0 == pair.size1:
             return _shared_focal(library, pair, seeded, refinement)
         centres = [_centre(size) * real_focal_check for size in (pair.size0, pair.size1)]
@@ -81,6 +87,19 @@ def poselib(
 
     name = "PoseLib, shared focal length" if shared_focal else "PoseLib"
     return PairwiseEstimator(name, solve, best_first=prosac)
+
+
+def _relative_pose(library: Any, pair: Pair, options: dict[str, Any], refinement: dict[str, Any]) -> Solution:
+    """The relative pose of two calibrated cameras; their lenses have no distortion."""
+    assert pair.exact is not None
+    cameras = [
+        {"model": "PINHOLE", "width": w, "height": h, "params": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]}
+        for K, (h, w) in zip(pair.exact, (pair.size0, pair.size1), strict=True)
+    ]
+    pose, info = library.estimate_relative_pose(pair.x0, pair.x1, *cameras, options, refinement)
+    R, t = np.asarray(pose.R, np.float64), np.asarray(pose.t, np.float64)
+    inliers = np.asarray(info["inliers"], np.bool_)
+    return Posed(fundamental_of_pose(*pair.exact, R, t), inliers, None, R, t)
 
 
 def _shared_focal(library: Any, pair: Pair, options: dict[str, Any], refinement: dict[str, Any]) -> Solution:

@@ -118,6 +118,13 @@ def expect_size(source: ImageSource, size: Size, K: Array) -> None:
         )
 
 
+def size_by_points(K: Array, x: Array) -> Size:
+    """(h, w) of an image of unknown size: its principal point is the centre, and it holds all of the points (n, 2)."""
+    bound = x[np.isfinite(x).all(-1)].max(0, initial=0.0)
+    width, height = (max(2 * float(c) + 1, np.ceil(b) + 1) for c, b in zip(K[:2, 2], bound, strict=True))
+    return round(height), round(width)
+
+
 def size_by_centre(K: Array) -> Size:
     """(h, w) of an image whose principal point is its centre: the best guess where nothing else tells it."""
     width, height = 2 * K[0, 2] + 1, 2 * K[1, 2] + 1

@@ -228,6 +228,37 @@ def test_points_that_are_not_finite_do_not_count(tmp_path: Path) -> None:
     assert c.x1.isfinite().all()
 
 
+@pytest.mark.parametrize("missing", ["zero", "negative", "absent"])
+def test_a_camera_without_a_size_has_that_of_its_image_or_of_principal_point_and_points(
+    missing: str, tmp_path: Path
+) -> None:
+    root = writers.write_posebench(tmp_path / "posebench")
+    change = {"zero": lambda v: 0 * v, "negative": lambda v: 0 * v - 1, "absent": None}[missing]
+    for camera in ("camera1", "camera2"):
+        edit(root, POSE, f"pair1/{camera}/width", change)
+    edit(root, POSE, "pair1/x2", lambda v: np.where(np.arange(len(v))[:, None] == 0, [1200.25, 3], v))
+    s = writers.scenes()[1]
+    centre = [tuple(round(2 * float(v) + 1) for v in K[[1, 0], 2]) for K in (s.K0, s.K1)]
+    known, unknown = given(reload("posebench", root)[0])[0], given(reload("posebench", root)[1])[0]
+    assert tuple(known.size0[0].tolist()) == writers.SIZE
+    farthest = [int(np.ceil(bound)) + 1 for bound in s.x0.max(0).values.tolist()[::-1]]
+    assert unknown.size0[0].tolist() == [max(sides) for sides in zip(centre[0], farthest, strict=True)]
+    assert unknown.size1[0, 1].item() == 1202  # the point farthest out lies in the image
+    images = tmp_path / "images" / "imc_church" / "pair1"
+    images.mkdir(parents=True)
+    cv2.imwrite(str(images / "1.png"), np.zeros((810, 1010), np.uint8))
+    shown = images / "1"
+    (images / "1.png").rename(shown)
+    beside = given(reload("posebench", root, images=tmp_path / "images")[1])[0]
+    assert tuple(beside.size0[0].tolist()) == (810, 1010)
+    assert torch.equal(beside.size1, unknown.size1)
+    cv2.imwrite(str(images / "1.png"), np.zeros((81, 101), np.uint8))
+    (images / "1.png").rename(shown)
+    reduced = reload("posebench", root, images=tmp_path / "images")[1]
+    assert reduced.problem is not None
+    assert "101 x 81 px, but its camera's principal point" in reduced.problem
+
+
 def test_names_must_tell_images_apart(tmp_path: Path) -> None:
     root = tmp_path / "hloc"
     root.mkdir()
@@ -273,7 +304,7 @@ def test_the_digest_is_of_the_contents(tmp_path: Path) -> None:
     assert reload("posebench", a).digest != reload("posebench", b).digest
 
 
-@pytest.mark.parametrize("layout", ["ransac_tutorial", "oanet"])
+@pytest.mark.parametrize("layout", ["ransac_tutorial", "oanet", "posebench"])
 def test_the_name_of_the_folder_decides_nothing(layout: str, tmp_path: Path) -> None:
     """Draws follow from a pair's key."""
     roots = [writers.WRITERS[layout](tmp_path / name) for name in ("first", "second")]

@@ -134,14 +134,24 @@ def write_posebench(folder: Path) -> Path:
     folder.mkdir(parents=True)
     with h5py.File(folder / "imc_church.h5", "w") as file:
         for i, s in enumerate(scenes()):
-            group = file.create_group(f"pair{i}")
-            group["x1"], group["x2"], group["R"], group["t"] = s.x0.numpy(), s.x1.numpy(), s.R.numpy(), s.t.numpy()
-            for name, K in (("camera1", s.K0.numpy()), ("camera2", s.K1.numpy())):
-                camera = group.create_group(name)
-                camera["model"] = np.array(["PINHOLE"], dtype=h5py.string_dtype())
-                camera["width"], camera["height"] = np.array([SIZE[1]]), np.array([SIZE[0]])
-                camera["params"] = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
+            K, x = (s.K0.numpy(), s.K1.numpy()), (s.x0.numpy(), s.x1.numpy())
+            posebench_group(file, f"pair{i}", x, K, (s.R.numpy(), s.t.numpy()), (SIZE, SIZE))
     return folder
+
+
+def posebench_group(
+    file: h5py.File, key: str, x: tuple[np.ndarray, np.ndarray], K: tuple[np.ndarray, np.ndarray],
+    motion: tuple[np.ndarray, np.ndarray], sizes: tuple[tuple[int, int], tuple[int, int]],
+) -> None:  # fmt: skip
+    """A pair of PINHOLE cameras; each entry of a camera is an array, also what is a single value."""
+    group = file.create_group(key)
+    group["x1"], group["x2"] = x
+    group["R"], group["t"] = motion
+    for name, k, (h, w) in zip(("camera1", "camera2"), K, sizes, strict=True):
+        camera = group.create_group(name)
+        camera["model"] = np.array(["PINHOLE"], dtype=h5py.string_dtype())
+        camera["width"], camera["height"] = np.array([w]), np.array([h])
+        camera["params"] = np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2]])
 
 
 def write_oanet(folder: Path) -> Path:

@@ -1,0 +1,280 @@
+"""PoseBench by its protocol, on samples of its layout from real matches, beside a run written from its definitions."""
+
+from __future__ import annotations
+
+import functools
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from fmtorch import data, presets
+from fmtorch.core.types import Correspondences
+from fmtorch.data import ImagePair
+from scripts.benchmark import __main__, posebench, posebench_methods
+from scripts.benchmark.sheet import MISSING
+from tests.conftest import shared_path
+from tests.reference import metrics as reference
+from tests.reference import solvers
+from tests.storage.exchange.writers import posebench_group
+
+SET, THRESHOLD = "imc_london_bridge", 0.75
+PAIRS = 6
+PROTOCOL = {"max_epipolar_error": THRESHOLD, "max_iterations": 1000, "min_iterations": 100, "success_prob": 0.9999}
+
+
+@functools.cache
+def real() -> list[tuple[ImagePair, Correspondences]]:
+    """Some real pairs and their matches."""
+    dataset = data.load("fmbench", root=shared_path("data/PhotoTourism"))
+    outcomes = presets.pipeline("sift_ratio").match([dataset[i] for i in range(PAIRS)])
+    return [(o.pair, o.correspondences) for o in outcomes if o.correspondences is not None]
+
+
+def matched(c: Correspondences) -> tuple[np.ndarray, np.ndarray]:
+    x0, x1 = (np.ascontiguousarray(x[0][c.mask[0]].double().numpy()) for x in (c.x0, c.x1))
+    return x0, x1
+
+
+def sample(folder: Path, name: str = SET, sized: bool = True) -> Path:
+    """The real pairs as one of PoseBench's files, the last of them with three matches."""
+    folder.mkdir(parents=True)
+    with h5py.File(folder / f"{name}.h5", "w") as file:
+        for i, (pair, c) in enumerate(real()):
+            x = matched(c) if i < PAIRS - 1 else tuple(v[:3] for v in matched(c))
+            sizes = [tuple(int(v) for v in s[0]) if sized else (0, -1) for s in (c.size0, c.size1)]
+            posebench_group(file, f"{i:03d}", x, (pair.K0, pair.K1), (pair.R, pair.t), tuple(sizes))
+    return folder
+
+
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: object) -> str:
+    monkeypatch.setattr(sys, "argv", ["benchmark", "posebench", *map(str, arguments)])
+    __main__.main()
+    return capsys.readouterr().out
+
+
+def direct(method: str) -> list[float]:
+    """The larger angle of each pair: the libraries called as PoseBench calls them, judged by its definitions."""
+    errors = []
+    for i, (pair, c) in enumerate(real()):
+        if i == PAIRS - 1:
+            errors.append(180.0)  # three matches
+            continue
+        x, motion = matched(c), (pair.R, pair.t)
+        cameras = [
+            {"model": "PINHOLE", "width": int(s[0, 1]), "height": int(s[0, 0]),
+             "params": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]}
+            for K, s in ((pair.K0, c.size0), (pair.K1, c.size1))
+        ]  # fmt: skip
+        F, R, t = CALLS[method](x, cameras)
+        if F is not None:
+            angles = reference.closest_pose_error(solvers.poses(pair.K1.T @ F @ pair.K0), *motion)
+        else:
+            angles = reference.rotation_angle(R, pair.R), reference.signed_direction_angle(t, pair.t)
+        errors.append(max(angles))
+    return errors
+
+
+def _poselib_e(x: Any, cameras: Any) -> Any:
+    poselib = pytest.importorskip("poselib")
+    pose, _ = poselib.estimate_relative_pose(*x, *cameras, {**PROTOCOL, "seed": 0}, {})
+    return None, np.asarray(pose.R), np.asarray(pose.t)
+
+
+def _poselib_f(x: Any, cameras: Any) -> Any:
+    poselib = pytest.importorskip("poselib")
+    return np.asarray(poselib.estimate_fundamental(*x, {**PROTOCOL, "seed": 0}, {})[0]), None, None
+
+
+def _colmap_options() -> Any:
+    pycolmap = pytest.importorskip("pycolmap")
+    return pycolmap, pycolmap.RANSACOptions(
+        max_error=THRESHOLD, max_num_trials=1000, min_num_trials=100, confidence=0.9999, random_seed=0
+    )
+
+
+def _colmap_e(x: Any, cameras: Any) -> Any:
+    pycolmap, options = _colmap_options()
+    found = pycolmap.estimate_essential_matrix(*x, *(pycolmap.Camera(camera) for camera in cameras), options)
+    return None, found["cam2_from_cam1"].rotation.matrix(), found["cam2_from_cam1"].translation
+
+
+def _colmap_f(x: Any, cameras: Any) -> Any:
+    pycolmap, options = _colmap_options()
+    return np.asarray(pycolmap.estimate_fundamental_matrix(*x, options)["F"]), None, None
+
+
+CALLS = {"E:poselib": _poselib_e, "F:poselib": _poselib_f, "E:colmap": _colmap_e, "F:colmap": _colmap_f}
+
+
+@pytest.mark.parametrize("method", CALLS)
+def test_peers_have_the_figures_of_posebenchs_own_protocol(
+    method: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = direct(method)
+    rows = tmp_path / "rows.jsonl"
+    printed = run(capsys, monkeypatch, sample(tmp_path / "relative"), "--methods", method, "--rows", rows)
+    found = [json.loads(line) for line in rows.read_text().splitlines()]
+    # arccos at a cosine near 1 is exact to the root of its rounding; pixels with a central principal point, to 1e-7
+    assert [max(row["rotation"], row["translation"]) for row in found] == pytest.approx(expected, abs=1e-3)
+    areas = [100 * area for area in reference.pose_auc(expected, (5.0, 10.0, 20.0))]
+    assert posebench.areas(found) == pytest.approx(areas, abs=0.02)
+    assert " / ".join(f"{value:.1f}" for value in posebench.areas(found)) in printed
+    published = {"E:poselib": "56.6 / 70.7 / 81.1", "F:colmap": "33.0 / 45.1 / 55.7"}  # of the whole set
+    assert published.get(method, "") in printed
+    assert [row["reason"] != "" for row in found] == [False] * (PAIRS - 1) + [True]
+
+
+def test_our_estimators_run_by_the_protocol_and_a_run_goes_on_where_it_stopped(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows, methods = tmp_path / "rows.jsonl", ["E:fmtorch", "F:fmtorch", "E:fmtorch:scaled=false"]
+    arguments = [sample(tmp_path / "relative").parent, "--methods", *methods, "--rows", rows]
+    printed = run(capsys, monkeypatch, *arguments, "--every", 3)
+    printed = " ".join(printed.split())
+    assert "means of 1 set, 1 of PoseBench's 20; 2 pairs" in printed
+    assert "E:colmap │ – │ 45.0 / 61.4 / 75.4" in printed  # published, not run
+    first = rows.read_text().splitlines()
+    assert len(first) == 2 * len(methods)
+    page = tmp_path / "page.md"
+    page.write_text("a\n<!-- posebench -->\n<!-- end of posebench -->\nz\n")
+    run(capsys, monkeypatch, *arguments, "--markdown", page)
+    lines = rows.read_text().splitlines()
+    assert len(lines) == PAIRS * len(methods)
+    assert lines[: len(first)] == first
+    posed = [row for row in map(json.loads, lines) if not row["reason"]]
+    assert len(posed) >= (PAIRS - 1) * len(methods) - 1
+    assert np.median([max(row["rotation"], row["translation"]) for row in posed]) < 5
+    text = page.read_text()
+    assert text.startswith("a\n")
+    assert text.endswith("z\n")
+    assert re.search(rf"\| {SET} \| E:fmtorch \| 0\.75 \| {PAIRS} \| \d", text)
+
+
+def test_the_protocol_gives_each_estimator_its_options() -> None:
+    read, protocol = posebench_methods.read, posebench_methods.protocol
+    assert protocol(read("F:poselib"), 2.5) == {
+        "threshold": 2.5, "iterations": 1000, "min_iterations": 100, "confidence": 0.9999,
+    }  # fmt: skip
+    assert protocol(read("E:colmap:two_view=true"), 1.5)["two_view"] is True
+    assert protocol(read("E:colmap"), 1.5)["two_view"] is False
+    preset = presets.load("estimator", "fmtorch")
+    own = protocol(read("E:fmtorch"), 2.0)
+    assert own["threshold"] == 2 * preset["threshold"]
+    assert own["select"]["scale"] == 2 * preset["select"]["scale"]
+    assert own["focal"]["exact"]["scale"] == 2 * preset["focal"]["exact"]["scale"]
+    assert (own["hypotheses"], own["focal"]["rounds"] * preset["focal"]["samples"]) == (1000, 1000)
+    kept = protocol(read("E:fmtorch:scaled=false,focal.rounds=12"), 2.0)
+    assert "threshold" not in kept
+    assert kept["focal"] == {"rounds": 12}
+    presets.build("estimator", "fmtorch", **own)
+    for wrong in ("fmtorch", "H:fmtorch", "E:nobody"):
+        with pytest.raises(SystemExit, match="write KIND:PRESET"):
+            read(wrong)
+
+
+def test_the_published_figures_are_those_of_the_twenty_pinhole_sets() -> None:
+    thresholds, figures = posebench.read_published()
+    assert len(thresholds) == 20
+    assert {name.partition("_")[0]: px for name, px in thresholds.items() if "scannet" not in name} == {
+        "megadepth1500": 1.0, "imc": 0.75,
+    }  # fmt: skip
+    means = {method: posebench.shown(posebench.mean(list(sets.values()))) for method, sets in figures.items()}
+    assert means == {
+        "E:poselib": "49.1 / 63.5 / 74.7", "E:colmap": "42.3 / 58.6 / 71.7", "F:poselib": "34.0 / 47.9 / 60.5",
+        "F:colmap": "29.4 / 43.1 / 56.5",
+    }  # fmt: skip
+    assert all(set(sets) == set(thresholds) for sets in figures.values())
+
+
+def test_what_is_not_posebenchs_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = sample(tmp_path / "own", "mine")
+    with pytest.raises(SystemExit, match=r"mine\.h5 is none of PoseBench's sets: give its threshold in pixels"):
+        run(capsys, monkeypatch, own)
+    printed = run(capsys, monkeypatch, own, "--threshold", 1, "--methods", "F:opencv:method=lmeds")
+    assert MISSING in printed
+    with pytest.raises(SystemExit, match=r"holds no file \.h5 or \.hdf5; give the folder `relative`"):
+        run(capsys, monkeypatch, tmp_path)
+    (tmp_path / "fisheye").mkdir()
+    (own / "mine.h5").rename(tmp_path / "fisheye" / "fisheye_church.h5")
+    with pytest.raises(SystemExit, match="no pair of pinhole cameras"):
+        run(capsys, monkeypatch, tmp_path / "fisheye")
+
+
+def test_a_lead_is_the_difference_of_the_means_of_sets() -> None:
+    def rows(errors: list[float]) -> list[dict[str, Any]]:
+        return [{"rotation": e, "translation": 0.0, "scene": f"s/{i}"} for i, e in enumerate(errors)]
+
+    own = {
+        "E:a": {"one": rows([0.0, 0.0] * 9), "two": rows([5.0, 2.5, 180.0, 0.0] * 9)},
+        "E:b": {"one": rows([5.0, 0.0] * 9), "two": rows([180.0] * 36)}, "F:c": {},
+    }  # fmt: skip
+    assert posebench.lead(own, "E:a") == posebench.lead(own, "F:c") == ""
+    assert posebench.lead(own, "E:b").startswith(f"{100 * ((1 + 1.5 / 4) / 2 - (0.5 + 0) / 2):+.1f} [")
+
+
+def test_a_library_that_is_missing_is_left_out_or_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    folder = sample(tmp_path / "relative")
+    with pytest.raises(SystemExit, match=r"E:colmap: COLMAP .pycolmap. is not installed: pip install 'fmtorch\[co"):
+        run(capsys, monkeypatch, folder, "--methods", "E:colmap")
+    printed = " ".join(run(capsys, monkeypatch, folder, "--every", PAIRS).split())
+    assert "F:colmap is left out: COLMAP (pycolmap) is not installed: pip install 'fmtorch[colmap]'" in printed
+    assert "F:fmtorch" in printed
+
+
+def test_pairs_of_other_sets_are_judged_alike(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = shared_path("data/PhotoTourism")
+    printed = run(
+        capsys,
+        monkeypatch,
+        "--root",
+        root,
+        "--limit",
+        2,
+        "--threshold",
+        THRESHOLD,
+        "--methods",
+        "F:opencv:method=lmeds",
+    )
+    assert "means of 1 set; 2 pairs" in " ".join(printed.split())
+    with pytest.raises(SystemExit, match="--root: give the threshold in pixels"):
+        run(capsys, monkeypatch, "--root", root)
+    with pytest.raises(SystemExit, match="name FILES, the folder `relative`"):
+        run(capsys, monkeypatch)
+
+
+def test_pairs_with_distortion_are_left_out_and_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = sample(tmp_path / "relative")
+    with h5py.File(folder / f"{SET}.h5", "r+") as file:
+        del file["001/camera1/model"]
+        file["001/camera1/model"] = np.array(["OPENCV_FISHEYE"], dtype=h5py.string_dtype())
+    printed = " ".join(run(capsys, monkeypatch, folder, "--methods", "F:opencv:method=lmeds").split())
+    assert f"1 of {PAIRS} pairs left out" in printed
+    assert f"means of 1 set, 1 of PoseBench's 20; {PAIRS - 1} pairs" in printed
+
+
+def test_cameras_without_sizes_have_the_same_poses(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A pose of known cameras does not depend on sizes: these only bound where points may lie."""
+    errors = []
+    for sized in (True, False):
+        rows = tmp_path / f"{sized}.jsonl"
+        folder = sample(tmp_path / str(sized), sized=sized)
+        run(capsys, monkeypatch, folder, "--methods", "E:poselib", "--rows", rows)
+        errors.append([json.loads(line)["rotation"] for line in rows.read_text().splitlines()])
+    assert errors[0] == pytest.approx(errors[1], abs=1e-3)
