@@ -21,6 +21,8 @@ CALLS: dict[str, tuple[Any, ...]] = {
     "pose_error": (R, T, R[::-1], T[::-1]), "pose_auc": (T[:, 0],), "recall": (T,), "recall_curve": (T, T[0]),
     "mean_recall": (T,), "pose_map": (T[:, 0],), "pose_maa": (T,),
     "fundamental_pose_error": (F0, np.eye(3) + 0 * R, np.eye(3) + 0 * R, X0, X1, R, T),
+    "closest_pose_error": (F0, np.eye(3) + 0 * R, np.eye(3) + 0 * R, R, T),
+    "corner_error": (F0, F1, SIZES), "right_of_homography": (F0, X0, X1),
 }  # fmt: skip
 
 
