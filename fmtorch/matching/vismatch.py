@@ -90,7 +90,7 @@ class VisMatch:
         Raises ValueError, naming the matcher, where it fails or gives something else than it says.
         """
         sizes = [(image.shape[0], image.shape[1]) for image in (image0, image1)]
-        with self._turn, torch.random.fork_rng():
+        with self._turn, torch.random.fork_rng(devices=range(torch.cuda.device_count())):
             torch.manual_seed(0)
             try:
                 result = self._matcher(*(_tensor(image).to(self.device) for image in (image0, image1)))
