@@ -38,7 +38,9 @@ def estimated(
     estimator = estimator_of(name, config_dir, options)
     _expect_gradients(c, estimator, name)
     if (gives := model_of(estimator)) != model:
-        raise ValueError(f"estimator={name} gives {gives} matrices; find_{model} needs one that gives {model} matrices")
+        option = f" (here by model={model})" if "model" in presets.load("estimator", name, config_dir) else ""
+        needed = f"find_{model} needs one that gives {model} matrices{option}"
+        raise ValueError(f"estimator={name} gives {gives} matrices; {needed}")
     if in_pixels:
         expect_pixels(c)
     return estimated_by(estimator, c, seed, covariance)

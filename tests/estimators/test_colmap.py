@@ -158,6 +158,9 @@ def test_a_pair_of_few_matches_harms_no_other() -> None:
 
 def test_a_homography_is_not_taken_for_a_fundamental_matrix() -> None:
     c = scene(0, 100)
+    said = r"colmap gives fundamental matrices; find_homography needs one that gives .* \(here by model=homography\)"
+    with pytest.raises(ValueError, match=said):
+        fmtorch.find_homography(c.x0, c.x1, estimator="colmap")
     with pytest.raises(ValueError, match="estimator=colmap gives homography matrices"):
         fmtorch.find_fundamental(c.x0, c.x1, estimator="colmap", model="homography")
     with pytest.raises(ValueError, match="model=line; it must be one of: fundamental, homography"):

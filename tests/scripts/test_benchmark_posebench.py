@@ -236,18 +236,8 @@ def test_pairs_of_other_sets_are_judged_alike(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root = shared_path("data/PhotoTourism")
-    printed = run(
-        capsys,
-        monkeypatch,
-        "--root",
-        root,
-        "--limit",
-        2,
-        "--threshold",
-        THRESHOLD,
-        "--methods",
-        "F:opencv:method=lmeds",
-    )
+    arguments = ["--root", root, "--limit", 2, "--threshold", THRESHOLD, "--methods", "F:opencv:method=lmeds"]
+    printed = run(capsys, monkeypatch, *arguments)
     assert "means of 1 set; 2 pairs" in " ".join(printed.split())
     with pytest.raises(SystemExit, match="--root: give the threshold in pixels"):
         run(capsys, monkeypatch, "--root", root)

@@ -208,7 +208,7 @@ def within(F: Any, pair: Pair, threshold: float) -> NDArray[np.bool_]:
 
 def fundamental_of_pose(K0: Points, K1: Points, R: Points, t: Points) -> Points:
     """F of two calibrated cameras, K1^-T [t]x R K0^-1."""
-    F: Points = np.linalg.inv(K1).T @ np.cross(np.eye(3), t).T @ R @ np.linalg.inv(K0)
+    F: Points = np.linalg.inv(K1).T @ np.cross(t, np.eye(3)).T @ R @ np.linalg.inv(K0)
     return F
 
 
