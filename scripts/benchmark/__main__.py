@@ -16,6 +16,7 @@ from scripts.benchmark import (
     features,
     gc_ransac,
     homography,
+    known_models,
     learned,
     matching,
     memory,
@@ -39,9 +40,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m scripts.benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     for module in (
-        cameras, configuration, curves, end_to_end, estimators, features, gc_ransac, homography, learned, matching,
-        memory, paper, paper_times, pipelines, pruning, refinement, related, scale, similar, speed, stress, sweep,
-        thresholds, verify,
+        cameras, configuration, curves, end_to_end, estimators, features, gc_ransac, homography, known_models, learned,
+        matching, memory, paper, paper_times, pipelines, pruning, refinement, related, scale, similar, speed, stress,
+        sweep, thresholds, verify,
     ):  # fmt: skip
         module.add_arguments(commands)
     arguments = parser.parse_args()
