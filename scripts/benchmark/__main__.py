@@ -15,6 +15,7 @@ from scripts.benchmark import (
     estimators,
     features,
     gc_ransac,
+    hard,
     homography,
     known_models,
     learned,
@@ -40,9 +41,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m scripts.benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     for module in (
-        cameras, configuration, curves, end_to_end, estimators, features, gc_ransac, homography, known_models, learned,
-        matching, memory, paper, paper_times, pipelines, pruning, refinement, related, scale, similar, speed, stress,
-        sweep, thresholds, verify,
+        cameras, configuration, curves, end_to_end, estimators, features, gc_ransac, hard, homography, known_models,
+        learned, matching, memory, paper, paper_times, pipelines, pruning, refinement, related, scale, similar, speed,
+        stress, sweep, thresholds, verify,
     ):  # fmt: skip
         module.add_arguments(commands)
     arguments = parser.parse_args()
