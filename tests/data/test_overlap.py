@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import json
+import pickle
 import sys
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from hydra.core.global_hydra import GlobalHydra
 from fmtorch.commands import pairs as command
 from fmtorch.data import load
 from fmtorch.data.candidates import incidence
+from fmtorch.data.construction import Construction
 from fmtorch.data.overlap import (
     STEP,
     TOLERANCE,
@@ -195,6 +197,14 @@ def test_the_command_selects_from_rendered_scenes(
             rendered[rank] for rank, (s, i, j) in enumerate(places) if pair.identity == f"Made/{names[s]}/{i}-{j}"
         )
         assert min(np.abs(pair.F - source.F).max(), np.abs(pair.F + source.F).max()) < 1e-12
+
+
+def test_other_processes_judge_the_same(rendered: RenderedScenePairs, tmp_path: Path) -> None:
+    here = Construction(rendered, tmp_path / "Made", overlap=(0.1, 0.6))
+    assert here.identity["rule"] == {"overlap": [0.1, 0.6], "by": "depth", "step_px": STEP, "tolerance": TOLERANCE}
+    there: Construction = pickle.loads(pickle.dumps(here))
+    places = [rendered.candidate(rank) for rank in range(4)]
+    assert [there.overlaps.of(place) for place in places] == [here.overlaps.of(place) for place in places]
 
 
 @pytest.mark.parametrize(
