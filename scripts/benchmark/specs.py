@@ -1,4 +1,4 @@
-"""Estimators that are named in one word: PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]."""
+"""Estimators that are named in one word: PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]; a pruner may have options, too."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from fmtorch.core.stages import Estimator, Pruner, pruned
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data import ImagePair, ImageSource, read_image, to_grey
 from fmtorch.geometry import refine
+from fmtorch.pipeline.pipeline import Pipeline
 from scripts.benchmark import kept
-from scripts.benchmark.matched import options
+from scripts.benchmark.matched import pruner, split
 
 Stage = Pruner
 Method = Callable[[ImagePair, Correspondences, int], Estimate]
@@ -34,13 +35,20 @@ def stages_of(spec: str) -> list[str]:
     return [stage for stage in spec.partition("@")[2].split("+") if stage]
 
 
+def pipeline_of(words: str, *overrides: str) -> Pipeline:
+    """The pipeline of ``PRESET[ NAME=VALUE...]``, such as ``sift_ratio estimator=msac``, with further overrides."""
+    name, *own = words.split()
+    pipeline: Pipeline = presets.pipeline(name, overrides=[*own, *overrides])
+    return pipeline
+
+
 def identity(spec: str, extra: Mapping[str, Stage] = NONE) -> str:
     """The digest of what an estimator's results depend on: options, code, learned files, versions of peers."""
-    name, _, rest = spec.partition("@")[0].partition(":")
-    stages: kept.Stages = [] if name == TRUTH else [("estimator", name, options(rest))]
-    stages += [("pruner", stage, {}) for stage in stages_of(spec) if stage not in extra]
+    name, changed = split(spec.partition("@")[0])
+    stages: kept.Stages = [] if name == TRUTH else [("estimator", name, changed)]
+    stages += [("pruner", *split(stage)) for stage in stages_of(spec) if stage not in extra]
     own = [part for stage in stages_of(spec) if stage in extra for part in (stage, extra[stage])]
-    built = [presets.build("pruner", name) for group, name, _ in stages if group == "pruner"]
+    built = [presets.build("pruner", name, **changed) for group, name, changed in stages if group == "pruner"]
     return kept.identity(stages, name, *own, *built)
 
 
@@ -52,7 +60,7 @@ def build(spec: str, extra: Mapping[str, Stage] = NONE) -> Estimator:
     estimator, pruners = estimator_of(spec), pruners_of(spec, extra)
 
     def call(c: Correspondences, seed: int = 0) -> Estimate:
-        estimate: Estimate = estimator(functools.reduce(lambda kept, pruner: pruner(kept), pruners, c), seed)
+        estimate: Estimate = estimator(functools.reduce(lambda kept, stage: stage(kept), pruners, c), seed)
         return estimate
 
     return call
@@ -60,14 +68,14 @@ def build(spec: str, extra: Mapping[str, Stage] = NONE) -> Estimator:
 
 def estimator_of(spec: str) -> Estimator:
     """The estimator of a spec, without its pruners."""
-    name, _, rest = spec.partition("@")[0].partition(":")
-    estimator: Estimator = presets.build("estimator", name, **options(rest))
+    name, changed = split(spec.partition("@")[0])
+    estimator: Estimator = presets.build("estimator", name, **changed)
     return estimator
 
 
 def pruners_of(spec: str, extra: Mapping[str, Stage] = NONE) -> list[Stage]:
     """The pruners of a spec, in order."""
-    return [extra[stage] if stage in extra else presets.build("pruner", stage) for stage in stages_of(spec)]
+    return [extra[stage] if stage in extra else pruner(stage) for stage in stages_of(spec)]
 
 
 @functools.lru_cache(maxsize=2)  # of a pair the images are asked for by each method
@@ -78,8 +86,8 @@ def pyramid_of(image: ImageSource) -> GreyPyramid:
 
 def pruned_by(pruners: Sequence[Stage], pair: ImagePair, c: Correspondences) -> Correspondences:
     """The matches of a pair, a batch of one, after pruners; those that look at images are given the pair's."""
-    for pruner in pruners:
-        c = pruned(pruner, c, lambda _: (pyramid_of(pair.image0), pyramid_of(pair.image1)))
+    for stage in pruners:
+        c = pruned(stage, c, lambda _: (pyramid_of(pair.image0), pyramid_of(pair.image1)))
     return c
 
 
@@ -88,7 +96,7 @@ def ngransac(file: Path) -> Stage:
     if not file.is_file():
         raise SystemExit(f"--ngransac {file}: no such file; scripts/convert_ngransac.py makes it")
     network = {"_target_": "fmtorch.pruning.networks.LC", "side": ["ratio"]}
-    stage: Stage = presets.build("pruner", "lc_soft", network=network, file=str(file))
+    stage: Stage = presets.build("pruner", "lc", soft=True, network=network, file=str(file))
     return stage
 
 
