@@ -49,7 +49,7 @@ DIFFERENCES = [
     ("sift_fmtorch", "sift_ratio"), ("hardnet_ratio int8", "sift_ratio"), ("hesaffnet_ratio", "hardnet_ratio int8"),
     ("hesaffnet_gms", "hesaffnet_ratio"), ("rootsiftpca_ratio with fmtorch", "sift_fmtorch"),
     ("hardnet_fmtorch int8", "sift_fmtorch"), ("hesaffnet_fmtorch", "hardnet_fmtorch int8"),
-    ("hesaffnet_fmtorch", "hesaffnet_ratio"),
+    ("hesaffnet_fmtorch", "sift_fmtorch"), ("hesaffnet_fmtorch", "hesaffnet_ratio"),
 ]  # fmt: skip
 
 
