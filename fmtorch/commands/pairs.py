@@ -20,7 +20,7 @@ from fmtorch.core.calls import Calls
 from fmtorch.core.executors import Execution, Team
 from fmtorch.core.options import Within
 from fmtorch.core.recipes import Here, Recipe, Source
-from fmtorch.core.terminal import console, progress_bars
+from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.data.construction import BLOCK, Construction, blocks
 from fmtorch.data.scenes import ScenePairs
 from fmtorch.presets import plain
@@ -29,6 +29,17 @@ from fmtorch.presets.fields import Count, Seed, path_fields, read_fields
 
 MIN_CANDIDATES_FOR_PROCESSES = 4 * BLOCK + 1  # below which processes are not worth their start
 PRELOADED = ("fmtorch.data.construction",)  # by the process that workers are forked of
+
+
+class LeastAndGreatest:
+    """A rule for lists: two shares, of which the first is not the greater."""
+
+    def __call__(self, value: Any) -> bool:
+        """Whether it is such a list."""
+        return len(value) == 2 and 0 <= value[0] <= value[1] <= 1
+
+    def __str__(self) -> str:
+        return "from 0 to 1: least and greatest share, as [0.1,0.4],"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +51,7 @@ class Fields:
     seed: Seed = 0
     workers: Count | None = None
     quality: Annotated[int, Within(1, 100)] = 95
+    overlap: Annotated[list[int | float], LeastAndGreatest()] | None = None
 
 
 def run(config: DictConfig) -> Path:
@@ -51,7 +63,8 @@ def run(config: DictConfig) -> Path:
     if fields.output is None:
         raise ValueError("output is missing; it names the folder of the set that is made: output=KITTI")
     dataset = _load(config.dataset)
-    construction = Construction(dataset, fields.output, fields.count, fields.seed, fields.quality)
+    overlap = None if fields.overlap is None else (float(fields.overlap[0]), float(fields.overlap[1]))
+    construction = Construction(dataset, fields.output, fields.count, fields.seed, fields.quality, overlap)
     construction.begin()
     if construction.complete:
         console.print(
@@ -89,13 +102,20 @@ def _load(config: DictConfig) -> ScenePairs:
     presets.expect_dataset(config)
     options = plain(config)
     own = "_target_" in options
+    if options.get("name") == "rendered":
+        from fmtorch.data.rendered import RenderedPairs
+
+        with progress_bars() as progress:
+            drawn = data.load(**options, progress=reporter(progress, "drawing scenes"))
+        assert isinstance(drawn, RenderedPairs)
+        return drawn.scene_pairs()
     if own or options["name"] in data.SCENE_SETS:
         dataset = presets.instantiate(options, "dataset") if own else data.load(**options)
         if isinstance(dataset, ScenePairs):
             return dataset
     raise ValueError(
         f"dataset={options.get('name', options.get('_target_'))} has no candidates to judge; it must be one of "
-        f"{', '.join(data.SCENE_SETS)}, or a `ScenePairs` of your own"
+        f"{', '.join(data.SCENE_SETS)}, rendered, or a `ScenePairs` of your own"
     )
 
 

@@ -5,6 +5,7 @@ Format: Bundler's manual, "Output format and scene representation", file version
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -61,6 +62,7 @@ class BundlerPairs(ScenePairs):
         ]
         sources = [(f.name, path) for f, file in zip(scene_folders, files, strict=True) for path in (file, f / _LIST)]
         super().__init__("bundler", scenes, sources, (candidates, shared, family or home.name), pairs, seed)
+        self.points = [functools.partial(_points, file) for file in files]
 
 
 def _bundle(folder: Path) -> Path:
@@ -97,6 +99,14 @@ def _scene(folder: Path, file: Path, candidates: Literal["all", "points"], share
     if candidates == "points":
         pairs = sharing_points(_seen(file, lines, cameras, points, numbers), shared)
     return Scene(folder.name, family, views, pairs)
+
+
+def _points(file: Path) -> list[NDArray[np.int64]]:
+    """The points that each registered camera of a file sees; the file was read before."""
+    lines = read_lines(file)
+    cameras, points = _counts(file, lines)
+    registered = [i for i in range(cameras) if float(lines[2 + _LINES * i].split()[0]) != 0]
+    return _seen(file, lines, cameras, points, {i: number for number, i in enumerate(registered)})
 
 
 def _counts(file: Path, lines: list[str]) -> tuple[int, int]:

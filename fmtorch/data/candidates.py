@@ -75,21 +75,25 @@ def sharing_points(points: Sequence[NDArray[np.int64]], minimum: int = MIN_SHARE
     Memory is that of the pairs found; a reconstruction of n images with a mean track of m images has, in all, about
     m / 2 such pairs for each point, most of them the same ones over and over.
     """
-    seen = [np.unique(p) for p in points]
-    _, columns = np.unique(np.concatenate([*seen, np.zeros(0, np.int64)]), return_inverse=True)
-    starts = np.cumsum([0, *map(len, seen)])
-    sees = scipy.sparse.csr_array(
-        (np.ones(len(columns), np.int32), columns.astype(np.int64), starts),
-        shape=(len(seen), int(columns.max(initial=-1)) + 1),
-    )
+    sees = incidence(points)
     blocks = []
-    for begin in range(0, len(seen), _AT_ONCE):
+    for begin in range(0, len(points), _AT_ONCE):
         shared = (sees[begin : begin + _AT_ONCE] @ sees.T).tocoo()
         first, second = shared.row.astype(np.int64) + begin, shared.col.astype(np.int64)
         kept = (shared.data >= minimum) & (first < second)
         pairs = np.stack([first[kept], second[kept]], -1)
         blocks.append(pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))])
     return ListedPairs(np.concatenate([*blocks, np.zeros((0, 2), np.int64)]))
+
+
+def incidence(points: Sequence[Indices]) -> scipy.sparse.csr_array:
+    """Which image sees which point, (images, points) of ones; points: of each image the numbers it sees."""
+    seen = [np.unique(p) for p in points]
+    _, columns = np.unique(np.concatenate([*seen, np.zeros(0, np.int64)]), return_inverse=True)
+    return scipy.sparse.csr_array(
+        (np.ones(len(columns), np.int32), columns.astype(np.int64), np.cumsum([0, *map(len, seen)])),
+        shape=(len(seen), int(columns.max(initial=-1)) + 1),
+    )
 
 
 def drawn(total: int, count: int | None, seed: int) -> Sequence[int] | Indices:

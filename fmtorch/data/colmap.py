@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 from fmtorch.data.candidates import MIN_SHARED, AllPairs, Candidates, sharing_points
 from fmtorch.data.colmap_binary import read_binary
@@ -60,8 +64,11 @@ def colmap_pairs(
         scenes.append(_scene(folder, reconstruction, images, candidates, shared, family or home.name))
         files += [(f"{folder.name}/{path.name}", path) for path in reconstruction.files]
     options = (candidates, shared, family or home.name)
+    dataset: ScenePairs
     if not depth or not all(_depth_folder(folder / images).is_dir() for folder in model_folders):
-        return ScenePairs("colmap", scenes, files, options, pairs, seed)
+        dataset = ScenePairs("colmap", scenes, files, options, pairs, seed)
+        dataset.points = [functools.partial(_points, _model_folder(folder, model)) for folder in model_folders]
+        return dataset
     dataset = DepthScenePairs("colmap", scenes, files, (*options, "depth"), pairs, seed)
     paths = [_depth_paths(folder / images, scene) for folder, scene in zip(model_folders, scenes, strict=True)]
     by_image = {key: path for by_identity in paths for key, path in by_identity.items()}
@@ -85,6 +92,11 @@ def _depth_paths(images: Path, scene: Scene) -> dict[str, Path]:
                 paths[view.image.identity] = path
                 break
     return paths
+
+
+def _points(folder: Path) -> list[NDArray[np.int64]]:
+    """The points that each image of a model sees."""
+    return [image.points for image in read_model(folder).images]
 
 
 def read_model(folder: Path, points: bool = True) -> Model:

@@ -1,4 +1,4 @@
-"""Which candidates of a data set make pairs by the paper's rule, and the FM-Bench layout that holds them.
+"""Which candidates of a data set make pairs, by the paper's rule or by overlap, and FM-Bench's layout of these pairs.
 
 Candidates are judged in blocks, each a file once it is done, so that an interrupted construction goes on from there.
 With a count, candidates come in an order drawn by the seed until so many pass: as if drawn among all that pass.
@@ -7,6 +7,7 @@ With a count, candidates come in an order drawn by the seed until so many pass: 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,6 +22,7 @@ from fmtorch.core.files import replacing
 from fmtorch.data.camera_files import CAMERAS, IMAGES, SUFFIXES
 from fmtorch.data.images import ImageError, read_image, to_grey
 from fmtorch.data.matchable import ENOUGH, NEAR_LINE, RATIO, SIFT_FEATURES, Keypoints, keypoints, matchable
+from fmtorch.data.overlap import DepthOverlap, PointOverlap, overlap_of
 from fmtorch.data.pairs import ImageSource
 from fmtorch.data.scenes import ScenePairs, image_pair
 
@@ -44,6 +46,8 @@ class Construction:
 
     dataset: with the candidates. folder: of the set that is made; its name is the set's. count: how many pairs, drawn
     at random by `seed`; None: all. quality: of JPEG images that are written because they were undistorted.
+    overlap: the least and the greatest overlap of pairs (`fmtorch.data.overlap`); None: the paper's rule. Raises
+    ValueError, when its `rule` is first asked for, where the data set's overlaps are not known.
     """
 
     dataset: ScenePairs
@@ -51,13 +55,24 @@ class Construction:
     count: int | None = None
     seed: int = 0
     quality: int = 95
+    overlap: tuple[float, float] | None = None
+
+    @functools.cached_property
+    def overlaps(self) -> DepthOverlap | PointOverlap:
+        """The overlaps of the data set's pairs."""
+        return overlap_of(self.dataset)
+
+    @property
+    def rule(self) -> dict[str, Any]:
+        """What makes a candidate a pair."""
+        return RULE if self.overlap is None else {"overlap": list(self.overlap), **self.overlaps.record}
 
     @property
     def identity(self) -> dict[str, Any]:
         """What defines the pairs and the images."""
         return {
             "version": _VERSION, "opencv": ".".join(cv2.__version__.split(".")[:2]), "dataset": self.dataset.name,
-            "cameras": self.dataset.cameras_digest, "rule": RULE, "count": self.count, "seed": self.seed,
+            "cameras": self.dataset.cameras_digest, "rule": self.rule, "count": self.count, "seed": self.seed,
             "quality": self.quality,
         }  # fmt: skip
 
@@ -73,19 +88,19 @@ class Construction:
 
     def begin(self) -> None:
         """Make the folder, or go on with it. Raises ValueError where it holds another set, or anything else."""
-        record = self.folder / "pairs.json"
+        record, identity = self.folder / "pairs.json", self.identity
         if record.is_file():
             there = json.loads(record.read_text(encoding="utf-8"))["identity"]
-            differing = [key for key, value in self.identity.items() if there.get(key) != value]
+            differing = [key for key, value in identity.items() if there.get(key) != value]
             if differing:
-                said = ", ".join(f"{key} {there.get(key)} there, {self.identity[key]} now" for key in differing)
+                said = ", ".join(f"{key} {there.get(key)} there, {identity[key]} now" for key in differing)
                 raise ValueError(f"output={self.folder} holds pairs that differ in {said}; name another folder")
         elif self.folder.is_dir() and any(self.folder.iterdir()):
             raise ValueError(f"output={self.folder} holds something else; name a new folder")
         else:
             self.work.mkdir(parents=True)
             with replacing(record) as path:
-                path.write_text(json.dumps({"identity": self.identity}, indent=1) + "\n", encoding="utf-8")
+                path.write_text(json.dumps({"identity": identity}, indent=1) + "\n", encoding="utf-8")
 
     def order(self) -> Sequence[int] | NDArray[np.int64]:
         """The candidates in the order in which they are judged."""
@@ -99,22 +114,33 @@ class Construction:
         file = self.work / "verdicts" / f"{block:08d}.json"
         if file.is_file():
             return Verdicts(**json.loads(file.read_text(encoding="utf-8")))
-        kept, problems = [], list[str]()
-        for rank in ranks:
-            scene, i, j = self.dataset.candidate(rank)
-            pair = image_pair(self.dataset.scenes[scene], i, j)
+        kept, problems = [False] * len(ranks), list[str]()
+        places = [self.dataset.candidate(rank) for rank in ranks]
+        for k in sorted(range(len(places)), key=places.__getitem__):  # scene by scene: what is known of one is kept
             try:
-                if pair.problem is not None:
-                    raise ImageError(pair.problem)
-                kept.append(matchable(self._keypoints(pair.image0), self._keypoints(pair.image1), pair.F))
+                kept[k] = self._passes(places[k])
             except ImageError as error:
-                kept.append(False)
                 problems.append(str(error))
         verdicts = Verdicts(kept, sorted(set(problems)))
         file.parent.mkdir(exist_ok=True)
         with replacing(file) as path:
             path.write_text(json.dumps(dataclasses.asdict(verdicts)), encoding="utf-8")
         return verdicts
+
+    def _passes(self, place: tuple[int, int, int]) -> bool:
+        """Whether a candidate passes the rule. Raises ImageError where that cannot be said."""
+        scene, i, j = place
+        pair = image_pair(self.dataset.scenes[scene], i, j)
+        if pair.problem is not None:
+            raise ImageError(pair.problem)
+        if self.overlap is None:
+            return matchable(self._keypoints(pair.image0), self._keypoints(pair.image1), pair.F)
+        low, high = self.overlap
+        if not low <= self.overlaps.of(place) <= high:
+            return False
+        for image in (pair.image0, pair.image1):
+            read_image(image)
+        return True
 
     def write_image(self, scene: int, number: int) -> None:
         """Write one image of a scene unless it is there: the file itself, or as JPEG what was undistorted."""

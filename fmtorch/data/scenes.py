@@ -6,7 +6,7 @@ import bisect
 import dataclasses
 import hashlib
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -55,9 +55,14 @@ class ScenePairs(PairDataset):
     options: what else defines them, such as the window of a video.
     pairs: how many, drawn at random from the candidates of all scenes; None: all. seed: of that draw.
 
+    points: of each scene a function that reads which points of its reconstruction each view sees, by their numbers;
+    None where there is no reconstruction.
+
     A pair whose image is missing, or whose two cameras are at one place, has a `problem`. Which pairs can be matched
     at all is not asked here (`fmtorch pairs`).
     """
+
+    points: Sequence[Callable[[], Sequence[NDArray[np.int64]]]] | None = None
 
     def __init__(
         self,

@@ -15,7 +15,9 @@ from scripts.benchmark import (
     estimators,
     features,
     gc_ransac,
+    hard,
     homography,
+    known_models,
     learned,
     matching,
     memory,
@@ -40,9 +42,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m scripts.benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
     for module in (
-        cameras, configuration, curves, end_to_end, estimators, features, gc_ransac, homography, learned, matching,
-        memory, paper, paper_times, pipelines, posebench, pruning, refinement, related, scale, similar, speed, stress,
-        sweep, thresholds, verify,
+        cameras, configuration, curves, end_to_end, estimators, features, gc_ransac, hard, homography, known_models,
+        learned, matching, memory, paper, paper_times, pipelines, posebench, pruning, refinement, related, scale,
+        similar, speed, stress, sweep, thresholds, verify,
     ):  # fmt: skip
         module.add_arguments(commands)
     arguments = parser.parse_args()

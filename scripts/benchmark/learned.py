@@ -26,6 +26,7 @@ from rich.console import Console
 from rich.progress import track
 
 from fmtorch import presets
+from fmtorch.core.stages import pruned
 from fmtorch.data import ImagePair
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.run import select
@@ -181,7 +182,7 @@ def rows_of(
     matched = front.match([pair])[0]
     for use, methods in built.items():
         for name, pruners in methods.items():
-            outcome, seconds = pruned(matched, pruners)
+            outcome, seconds = timed(matched, pruners, front)
             for estimator in USES[use][1]:
                 front.estimator = estimators[estimator]
                 row = evaluate(front.estimate([outcome]))[0]
@@ -191,11 +192,13 @@ def rows_of(
                 yield {**about, **values, "ms": 1e3 * seconds, "ms_estimator": 1e3 * row.seconds_estimation}
 
 
-def pruned(outcome: Outcome, pruners: Chain) -> tuple[Outcome, float]:
-    """The outcome after the pruners, and the seconds of those that are not in every chain."""
+def timed(outcome: Outcome, pruners: Chain, front: Pipeline) -> tuple[Outcome, float]:
+    """The outcome after the pruners, and the seconds of those that are not in every chain; front: has the images."""
     c, seconds = outcome.correspondences, 0.0
-    for name, stage in pruners if c is not None else []:
+    if c is None:
+        return outcome, seconds
+    for name, stage in pruners:
         start = time.process_time()
-        c = stage(c).compact()
+        c = pruned(stage, c, lambda _: front.images(outcome.pair)).compact()
         seconds += (time.process_time() - start) * (name not in GIVEN)
     return dataclasses.replace(outcome, correspondences=c), seconds

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import torch
 
 from fmtorch import presets
-from fmtorch.core.stages import Estimator
+from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
+from fmtorch.core.stages import Estimator, Pruner, pruned
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.data import ImagePair
+from fmtorch.data import ImagePair, ImageSource, read_image, to_grey
 from fmtorch.geometry import refine
 from fmtorch.pipeline.pipeline import Pipeline
 from scripts.benchmark import kept
 from scripts.benchmark.matched import pruner, split
 
-Stage = Callable[[Correspondences], Correspondences]
+Stage = Pruner
 Method = Callable[[ImagePair, Correspondences, int], Estimate]
 NGRANSAC = "ngransac"
 TRUTH = "truth"
@@ -54,22 +55,40 @@ def identity(spec: str, extra: Mapping[str, Stage] = NONE) -> str:
 def build(spec: str, extra: Mapping[str, Stage] = NONE) -> Estimator:
     """The function of `PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]`: pruners in order, then the estimator.
 
-    extra: pruners that are no presets.
+    extra: pruners that are no presets. Pruners that look at images need `informed`.
     """
-    name, changed = split(spec.partition("@")[0])
-    estimator, prune = presets.build("estimator", name, **changed), pruning(spec, extra)
+    estimator, pruners = estimator_of(spec), pruners_of(spec, extra)
 
     def call(c: Correspondences, seed: int = 0) -> Estimate:
-        estimate: Estimate = estimator(prune(c), seed)
+        estimate: Estimate = estimator(functools.reduce(lambda kept, stage: stage(kept), pruners, c), seed)
         return estimate
 
     return call
 
 
-def pruning(spec: str, extra: Mapping[str, Stage] = NONE) -> Stage:
-    """The pruners of a spec, in order; of nothing, the matches as they are."""
-    pruners = [extra[stage] if stage in extra else pruner(stage) for stage in stages_of(spec)]
-    return lambda c: functools.reduce(lambda kept, pruner: pruner(kept), pruners, c)
+def estimator_of(spec: str) -> Estimator:
+    """The estimator of a spec, without its pruners."""
+    name, changed = split(spec.partition("@")[0])
+    estimator: Estimator = presets.build("estimator", name, **changed)
+    return estimator
+
+
+def pruners_of(spec: str, extra: Mapping[str, Stage] = NONE) -> list[Stage]:
+    """The pruners of a spec, in order."""
+    return [extra[stage] if stage in extra else pruner(stage) for stage in stages_of(spec)]
+
+
+@functools.lru_cache(maxsize=2)  # of a pair the images are asked for by each method
+def pyramid_of(image: ImageSource) -> GreyPyramid:
+    """The grey levels of an image."""
+    return grey_pyramid(to_grey(read_image(image)))
+
+
+def pruned_by(pruners: Sequence[Stage], pair: ImagePair, c: Correspondences) -> Correspondences:
+    """The matches of a pair, a batch of one, after pruners; those that look at images are given the pair's."""
+    for stage in pruners:
+        c = pruned(stage, c, lambda _: (pyramid_of(pair.image0), pyramid_of(pair.image1)))
+    return c
 
 
 def ngransac(file: Path) -> Stage:
@@ -82,12 +101,12 @@ def ngransac(file: Path) -> Stage:
 
 
 def informed(spec: str, extra: Mapping[str, Stage] = NONE) -> Method:
-    """As `build`, of methods that are told the pair: only `truth` looks at it."""
+    """As `build`, of methods that are given the pair: `truth` looks at its F, and some pruners at its images."""
+    pruners = pruners_of(spec, extra)
     if spec.partition("@")[0] == TRUTH:
-        prune = pruning(spec, extra)
-        return lambda pair, c, seed: from_truth(pair, prune(c))
-    method = build(spec, extra)
-    return lambda pair, c, seed: method(c, seed)
+        return lambda pair, c, seed: from_truth(pair, pruned_by(pruners, pair, c))
+    estimator = estimator_of(spec)
+    return lambda pair, c, seed: estimator(pruned_by(pruners, pair, c), seed)
 
 
 def from_truth(pair: ImagePair, c: Correspondences) -> Estimate:

@@ -63,7 +63,7 @@ def database_of(scene: Scene, features: str, cameras: str, work: Path) -> Path:
     begun.unlink(missing_ok=True)
     if cameras == "known":
         shutil.copy(database_of(scene, features, "unknown", work), begun)
-        _calibrate(begun, scene.truth)
+        calibrate(begun, scene.truth)
     elif features == "colmap":
         _match_by_colmap(scene, begun)
     else:
@@ -74,13 +74,21 @@ def database_of(scene: Scene, features: str, cameras: str, work: Path) -> Path:
 def _match_by_colmap(scene: Scene, path: Path) -> None:
     import pycolmap
 
+    matching = pycolmap.FeatureMatchingOptions(num_threads=1, skip_geometric_verification=True)
+    extract(scene, path)
+    pycolmap.match_exhaustive(path, matching_options=matching, device=pycolmap.Device.cpu)
+
+
+def extract(scene: Scene, path: Path) -> None:
+    """COLMAP's SIFT of a scene's images, in a new database."""
+    import pycolmap
+
     extraction = pycolmap.FeatureExtractionOptions(num_threads=1)
     extraction.sift.max_num_features = FEATURES
-    matching = pycolmap.FeatureMatchingOptions(num_threads=1, skip_geometric_verification=True)
     mode = pycolmap.CameraMode.SINGLE if scene.single else pycolmap.CameraMode.PER_IMAGE
-    cpu = pycolmap.Device.cpu
-    pycolmap.extract_features(path, scene.images, camera_mode=mode, extraction_options=extraction, device=cpu)
-    pycolmap.match_exhaustive(path, matching_options=matching, device=cpu)
+    pycolmap.extract_features(
+        path, scene.images, camera_mode=mode, extraction_options=extraction, device=pycolmap.Device.cpu
+    )
 
 
 def _match_by_ours(scene: Scene, path: Path, work: Path) -> None:
@@ -96,7 +104,7 @@ def _match_by_ours(scene: Scene, path: Path, work: Path) -> None:
         database.clear_two_view_geometries()
 
 
-def _calibrate(path: Path, truth: Truth) -> None:
+def calibrate(path: Path, truth: Truth) -> None:
     """Replace the database's cameras by the true ones."""
     import pycolmap
 

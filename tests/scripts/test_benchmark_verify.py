@@ -12,7 +12,7 @@ import pytest
 from scripts.benchmark import verify
 from scripts.benchmark.kept import Kept
 from scripts.benchmark.verify_mappers import accuracy, centre_errors
-from scripts.benchmark.verify_scenes import Scene, Truth, _calibrate
+from scripts.benchmark.verify_scenes import Scene, Truth, calibrate
 from scripts.benchmark.verify_table import sheets
 from tests.pipeline import databases
 
@@ -55,7 +55,7 @@ def test_known_cameras_are_the_true_ones(tmp_path: Path) -> None:
     """In COLMAP's pixels, and with a prior."""
     path = tmp_path / "database.db"
     databases.write(path, databases.scene(5), prior=False)
-    _calibrate(path, scene()[0].truth)
+    calibrate(path, scene()[0].truth)
     with pycolmap.Database.open(path) as database:
         (camera,) = database.read_all_cameras()
     assert (camera.model_name, camera.has_prior_focal_length) == ("PINHOLE", True)

@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
 from fmtorch.core.resources import cache_dir
+from fmtorch.data.candidates import AllPairs
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.data.rendered.depth import depth_at
 from fmtorch.data.rendered.generate import FAMILIES, PLANS, Plan, Task, digest, read
 from fmtorch.data.rendered.pinhole import Camera, fundamental, relative_pose
 from fmtorch.data.rendered.workers import Progress, generate_all
+from fmtorch.data.scenes import Scene, ScenePairs, View
 
 
 class RenderedPairs(Dataset[ImagePair]):
@@ -98,5 +100,28 @@ class RenderedPairs(Dataset[ImagePair]):
         scene, _, number = image.identity.rpartition("/")
         return depth_at(self._tasks[scene], int(number), points)
 
+    def scene_pairs(self) -> RenderedScenePairs:
+        """All pairs of the photographs of each scene, as candidates to select from."""
+        scenes = []
+        for name, views in self._views.items():
+            drawn = [
+                View(ImageSource(f"{name}/{i}", path, camera.size), camera.K, camera.R, camera.t, f"{name}/{path.name}")
+                for i, (path, camera) in enumerate(views)
+            ]
+            scenes.append(Scene(name, self._tasks[name].family, drawn, AllPairs(len(drawn))))
+        return RenderedScenePairs(self, scenes)
+
     def __iter__(self) -> Iterator[ImagePair]:
         return (self[index] for index in range(len(self)))
+
+
+class RenderedScenePairs(ScenePairs):
+    """All pairs of the photographs of rendered scenes; drawn: these scenes as a data set, which knows the depth."""
+
+    def __init__(self, drawn: RenderedPairs, scenes: Sequence[Scene]) -> None:
+        super().__init__("rendered", scenes, (), (drawn.digest,))
+        self.drawn = drawn
+
+    def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """As `RenderedPairs.depth`."""
+        return self.drawn.depth(image, points)

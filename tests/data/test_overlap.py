@@ -1,0 +1,235 @@
+"""Overlap by depth and by points, against slow counting; pairs selected by it."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import json
+import pickle
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+
+from fmtorch.commands import pairs as command
+from fmtorch.data import load
+from fmtorch.data.candidates import incidence
+from fmtorch.data.construction import Construction
+from fmtorch.data.overlap import (
+    STEP,
+    TOLERANCE,
+    DepthOverlap,
+    PointOverlap,
+    Seen,
+    overlap_of,
+    seen_share,
+    shared_points,
+)
+from fmtorch.data.pairs import ImageSource
+from fmtorch.data.rendered import Plan, RenderedPairs
+from fmtorch.data.rendered.dataset import RenderedScenePairs
+from fmtorch.data.scenes import ScenePairs
+from tests.conftest import shared_path
+from tests.data.native import write_bundler, write_colmap, write_kitti
+from tests.reference import overlap as reference
+
+PLAN = Plan(scenes=1, shots=4, pairs=4, scale=0.15)
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> RenderedScenePairs:
+    """All pairs of four photographs each of three families; cameras of the collection have other sizes."""
+    root = tmp_path_factory.mktemp("rendered")
+    families = ["indoor", "orbit", "collection"]
+    return RenderedPairs(families=families, root=root, plan=PLAN, workers=1).scene_pairs()
+
+
+def one_by_one(dataset: RenderedScenePairs, scene: int, i: int, j: int) -> float:
+    """The overlap of a pair by the reference."""
+    a, b = (dataset.scenes[scene].views[k] for k in (i, j))
+
+    def depth(image: ImageSource, x: float, y: float) -> float:
+        return float(dataset.depth(image, np.array([[x, y]], np.float64))[0])
+
+    shares = []
+    for first, second in ((a, b), (b, a)):
+        assert first.image.size is not None
+        assert second.image.size is not None
+        R = second.R @ first.R.T
+        shares.append(
+            reference.share(
+                functools.partial(depth, first.image),
+                functools.partial(depth, second.image),
+                first.K,
+                second.K,
+                (first.image.size, second.image.size),
+                R,
+                second.t - R @ first.t,
+                STEP,
+                TOLERANCE,
+            )
+        )
+    return min(shares)
+
+
+def test_overlap_of_rendered_pairs_is_that_counted_pixel_by_pixel(rendered: RenderedScenePairs) -> None:
+    overlaps = overlap_of(rendered)
+    assert isinstance(overlaps, DepthOverlap)
+    places = [rendered.candidate(rank) for rank in range(rendered.candidates)]
+    assert len(places) == 3 * 6
+    found = [overlaps.of(place) for place in places]
+    assert found == [one_by_one(rendered, *place) for place in places]
+    assert min(found) < 0.4 < 0.6 < max(found)
+
+
+def test_a_grid_of_pixels_stands_for_all_of_them(rendered: RenderedScenePairs) -> None:
+    scene, i, j = rendered.candidate(0)
+    overlaps = DepthOverlap(rendered)
+    a, b = (overlaps._seen(rendered.scenes[scene].views[k]) for k in (i, j))
+    pair = rendered[0]
+    assert pair.R is not None
+    assert pair.t is not None
+    # A share of n pixels has a standard error of at most 0.5 / sqrt(n) where they are drawn; a grid's is smaller.
+    error = 0.5 / np.sqrt(a.size[0] * a.size[1] / STEP**2)
+    assert abs(seen_share(a, b, pair.R, pair.t) - seen_share(a, b, pair.R, pair.t, step=1)) < 2 * error
+
+
+@pytest.mark.parametrize(
+    ("other", "expected"),
+    [
+        (2.0, 0.5),  # the same wall, of which the other camera sees the right half
+        (2.0 * (1 + 0.9 * TOLERANCE), 0.5),
+        (2.0 / (1 - 1.1 * TOLERANCE), 0.0),  # another wall, behind
+        (1.5, 0.0),  # hidden
+        (np.nan, 0.0),  # what is within the other image is unknown, all else is outside
+    ],
+)
+def test_a_wall_of_which_half_is_seen(other: float, expected: float) -> None:
+    K = np.array([[40.0, 0.0, 19.5], [0.0, 40.0, 9.5], [0.0, 0.0, 1.0]])
+    sees = [Seen(K, (20, 40), lambda x, z=z: np.full(len(x), z)) for z in (2.0, other)]  # type: ignore[misc]
+    assert seen_share(*sees, np.eye(3), np.array([-1.0, 0.0, 0.0]), step=1) == expected
+    assert seen_share(*sees, np.eye(3), np.array([0.0, 0.0, -5.0])) == 0  # all of it is behind the other camera
+
+
+def test_overlap_by_points_is_that_counted_point_by_point() -> None:
+    rng = np.random.default_rng(2)
+    points = [rng.integers(0, 60, rng.integers(0, 40)) for _ in range(30)]
+    points[3] = np.zeros(0, np.int64)
+    pairs = np.array(list(itertools.combinations(range(30), 2)))
+    expected = [reference.by_points(points[i].tolist(), points[j].tolist()) for i, j in pairs]
+    np.testing.assert_allclose(shared_points(incidence(points), pairs), expected, rtol=0, atol=1e-15)
+    assert len(shared_points(incidence(points), pairs[:0])) == 0
+
+
+def test_overlap_by_the_points_of_a_real_model() -> None:
+    dataset = load("colmap", root=shared_path("data/native/colmap_sacre_coeur"), pairs=None)
+    assert isinstance(dataset, ScenePairs)
+    overlaps = overlap_of(dataset)
+    assert isinstance(overlaps, PointOverlap)
+    lines = [
+        line
+        for line in shared_path("data/native/colmap_sacre_coeur/sparse/images.txt").read_text().splitlines()
+        if not line.startswith("#")
+    ]
+    names = [line.split()[9] for line in lines[::2]]
+    seen = {
+        name: [int(p) for p in line.split()[2::3] if p != "-1"] for name, line in zip(names, lines[1::2], strict=True)
+    }
+    views = [view.image.path.name for view in dataset.scenes[0].views]
+    places = [dataset.candidate(rank) for rank in range(dataset.candidates)]
+    assert len(places) == 45
+    for scene, i, j in places:
+        assert overlaps.of((scene, i, j)) == pytest.approx(
+            reference.by_points(seen[views[i]], seen[views[j]]), abs=1e-15
+        )
+
+
+def test_a_bundler_file_knows_the_points_of_registered_cameras(tmp_path: Path) -> None:
+    """Cameras 0, 1, 2 see 12, 9 and 6 points, of which they share those of the later one; camera 4 sees none."""
+    folder, _ = write_bundler(tmp_path / "Set/a")
+    dataset = load("bundler", root=folder, pairs=None)
+    assert isinstance(dataset, ScenePairs)
+    overlaps = overlap_of(dataset)
+    found = {(i, j): overlaps.of((0, i, j)) for i, j in itertools.combinations(range(4), 2)}
+    assert found == {(0, 1): 9 / 12, (0, 2): 6 / 12, (1, 2): 6 / 9, (0, 3): 0, (1, 3): 0, (2, 3): 0}
+
+
+def run(folder: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "argv", ["pairs", "output=Made", "count=null", "workers=1", *words])
+    try:
+        command.main()
+    finally:
+        GlobalHydra.instance().clear()
+
+
+def test_the_command_selects_by_overlap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neighbours share four of five points, the first and the last image, which is number 1 by name, three of five."""
+    write_colmap(tmp_path / "Set/a")
+    words = ["dataset=colmap", "dataset.root=Set", "dataset.sequences=[a]"]
+    run(tmp_path, monkeypatch, *words, "overlap=[0.7,0.9]")
+    made = load("fmbench", root=tmp_path / "Made")
+    assert [pair.identity for pair in made] == ["Made/a/0-2", "Made/a/1-2"]
+    rule = json.loads((tmp_path / "Made/pairs.json").read_text())["identity"]["rule"]
+    assert rule == {"overlap": [0.7, 0.9], "by": "points"}
+    with pytest.raises(SystemExit, match=r"holds pairs that differ in rule .*name another folder"):
+        run(tmp_path, monkeypatch, *words, "overlap=[0.6,0.9]")
+    run(tmp_path, monkeypatch, *words, "overlap=[0.6,0.6]", "output=Other")
+    assert [pair.identity for pair in load("fmbench", root=tmp_path / "Other")] == ["Other/a/0-1"]
+
+
+def test_the_command_selects_from_rendered_scenes(
+    rendered: RenderedScenePairs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fmtorch.data.load", lambda **_: rendered.drawn)
+    run(tmp_path, monkeypatch, "dataset=rendered", "overlap=[0.1,0.6]")
+    monkeypatch.undo()
+    overlaps = overlap_of(rendered)
+    places = [rendered.candidate(rank) for rank in range(rendered.candidates)]
+    expected = [(s, i, j) for s, i, j in places if 0.1 <= overlaps.of((s, i, j)) <= 0.6]
+    made = load("fmbench", root=tmp_path / "Made")
+    names = [scene.name for scene in rendered.scenes]
+    assert sorted(pair.identity for pair in made) == sorted(f"Made/{names[s]}/{i}-{j}" for s, i, j in expected)
+    for pair in made:
+        (source,) = (
+            rendered[rank] for rank, (s, i, j) in enumerate(places) if pair.identity == f"Made/{names[s]}/{i}-{j}"
+        )
+        assert min(np.abs(pair.F - source.F).max(), np.abs(pair.F + source.F).max()) < 1e-12
+
+
+def test_other_processes_judge_the_same(rendered: RenderedScenePairs, tmp_path: Path) -> None:
+    here = Construction(rendered, tmp_path / "Made", overlap=(0.1, 0.6))
+    assert here.identity["rule"] == {"overlap": [0.1, 0.6], "by": "depth", "step_px": STEP, "tolerance": TOLERANCE}
+    there: Construction = pickle.loads(pickle.dumps(here))
+    places = [rendered.candidate(rank) for rank in range(4)]
+    assert [there.overlaps.of(place) for place in places] == [here.overlaps.of(place) for place in places]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["overlap=[0.4,0.1]"], "overlap=[0.4, 0.1]; it must be a list, each a number from 0 to 1: least and greatest"),
+        (["overlap=[0.1,1.5]"], "as [0.1,0.4], or null"),
+        (["overlap=[0.1]"], "overlap=[0.1]; it must be"),
+        (["overlap=0.3"], "overlap=0.3; it must be"),
+        (["overlap=0.1..0.4"], "overlap=0.1..0.4; it must be"),
+        (["overlap=[0.1,0.4]"], "overlap needs depth or the points of a reconstruction and dataset=kitti has neither"),
+    ],
+)
+def test_what_is_no_overlap_is_refused_and_nothing_written(
+    words: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_kitti(tmp_path / "kitti")
+    with pytest.raises(SystemExit, match=r"^error: ") as end:
+        run(tmp_path, monkeypatch, "dataset=kitti", "dataset.root=kitti", "dataset.sequences=['06']", *words)
+    assert message in str(end.value.code)
+    assert [path.name for path in tmp_path.iterdir()] == ["kitti"]
+
+
+def test_a_damaged_image_loses_its_own_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_colmap(tmp_path / "Set/a")
+    (tmp_path / "Set/a/images/00.png").write_text("no image")
+    run(tmp_path, monkeypatch, "dataset=colmap", "dataset.root=Set", "dataset.sequences=[a]", "overlap=[0.1,1]")
+    assert [pair.identity for pair in load("fmbench", root=tmp_path / "Made")] == ["Made/a/1-2"]
