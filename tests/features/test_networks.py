@@ -129,5 +129,5 @@ def test_files_that_do_not_fit_are_named(tmp_path: Path) -> None:
         load_weights(HardNet(), tmp_path / "list.pth")
     with pytest.raises(FileNotFoundError, match=r"absent\.pth does not exist"):
         load_weights(HardNet(), tmp_path / "absent.pth")
-    with pytest.raises(ValueError, match="there are: hardnet, l2net, affnet, orinet"):
+    with pytest.raises(ValueError, match="there are: hardnet, l2net, geodesc, affnet, orinet"):
         build("siftnet")
