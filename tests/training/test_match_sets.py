@@ -12,10 +12,12 @@ import torch
 from fmtorch.data.rendered.generate import Plan, Task
 from fmtorch.data.rendered.photographs import photograph
 from fmtorch.features.networks import GeoDesc
+from fmtorch.features.networks.checkpoints import read_checkpoint
 from fmtorch.training.correspondences import Tolerance
 from fmtorch.training.geodesc_loss import geodesc
 from fmtorch.training.match_set_training import MatchSetTraining
 from fmtorch.training.match_sets import Tracks, match_sets
+from fmtorch.training.model_card import model_card
 from fmtorch.training.patch_loop import TrainingOptions
 from fmtorch.training.patch_metrics import validation_pairs
 from fmtorch.training.planes import PlaneViews
@@ -132,7 +134,8 @@ def store() -> TrackStore:
     patches, point, columns = tracks_of_views(views, Tolerance())
     first = np.r_[0, np.cumsum(np.bincount(point))]
     tracks = Tracks(first, columns["view"], columns["rays"], columns["incidence"])
-    return TrackStore(patches, first, {"photographs": {"scikit-image": 1}, "points": len(first) - 1}, tracks)
+    return TrackStore(patches, first, {"photographs": {"scikit-image": 1}, "points": len(first) - 1,
+                                      "patches": len(patches), "views": 4, "limits": {}}, tracks)  # fmt: skip
 
 
 def test_tracks_of_a_plane_show_the_same_point_under_its_angles(store: TrackStore) -> None:
@@ -147,10 +150,10 @@ def test_tracks_of_a_plane_show_the_same_point_under_its_angles(store: TrackStor
     np.testing.assert_allclose(store.tracks.incidence, angles, atol=0.02)  # float32 rays: eps / sin
 
 
-def training(store: TrackStore, **changed: float) -> MatchSetTraining:
+def training(store: TrackStore, batch: int = 32) -> MatchSetTraining:
     torch.manual_seed(0)
-    options = TrainingOptions(**{"batch": 32, "steps": 20, "learning_rate": 3e-4, "bf16": False, "checkpoint_steps": 1000, **changed})  # type: ignore[arg-type]
-    description = {"architecture": "geodesc", "match_sets": {"matches": 16}}
+    options = TrainingOptions(batch=batch, steps=20, learning_rate=3e-4, bf16=False, checkpoint_steps=1000)
+    description = {"architecture": "geodesc", "loss": {"name": "geodesc"}, "match_sets": {"matches": 16}}
     return MatchSetTraining(GeoDesc(), geodesc, store, options, description, matches=16, max_similarity=1.0)
 
 
@@ -160,6 +163,10 @@ def test_training_on_match_sets_lowers_the_loss_and_resumes(store: TrackStore, t
     whole.run()
     assert sum(whole.losses[-4:]) < 0.7 * sum(whole.losses[:4])
     assert whole.objective.evaluate(whole.network.eval(), validation_pairs(store, 100))["map"] > before["map"]
+    whole.save(tmp_path / "whole.pt")
+    card = model_card(tmp_path / "whole.pt", "geodesc", "fp32", read_checkpoint(tmp_path / "whole.pt"))
+    assert "| match sets | matches 16 |" in card
+    assert "the authors' weights are not" in card
     first = training(store)
     first.run(until=3, checkpoint=tmp_path / "run.pt")
     second = training(store)
