@@ -1,4 +1,8 @@
-"""GeoDesc's loss on the descriptors of match sets (Luo et al., ECCV 2018, section 3.5)."""
+"""GeoDesc's loss on the descriptors of match sets (Luo et al., ECCV 2018, arXiv 1807.06294, section 3.5).
+
+The authors' released training code (lzx551402/tfmatch) has another loss, so that no implementation of theirs stands
+beside this one.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +11,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 MARGINS = ((0.5, 0.7), (0.2, 0.5), (0.0, 0.2))
-"""Of the geometric loss (eq. 4): from this S_patch on, the cosine similarity that a match should reach."""
+"""Of the geometric loss: from this S_patch on, the cosine similarity that a match should reach."""
 
 
 def structured(a: Float[Tensor, "*s n d"], b: Float[Tensor, "*s n d"], *, ratio: float = 0.4) -> Float[Tensor, ""]:
-    """The structured loss E_1 (eq. 3) of match sets, the mean over the sets.
+    """The structured loss E_1 of match sets, the mean over the sets.
 
     With S = A B^T and L = S - ratio diag(S), the sum over i and j of max(0, l_ij - l_ii) + max(0, l_ij - l_jj) by
     n (n - 1): no patch of the other photograph should be as similar as 1 - `ratio` of its own match. All of them count,
@@ -32,7 +36,7 @@ def structured(a: Float[Tensor, "*s n d"], b: Float[Tensor, "*s n d"], *, ratio:
 def geometric(
     a: Float[Tensor, "*s n d"], b: Float[Tensor, "*s n d"], similarity: Float[Tensor, "*s n"]
 ) -> Float[Tensor, ""]:
-    """The geometric loss E_2 (eq. 4): max(0, margin - cosine similarity) of each match, the mean.
+    """The geometric loss E_2: max(0, margin - cosine similarity) of each match, the mean.
 
     The margin is 0.7 where S_patch >= 0.5, 0.5 where it is >= 0.2 and else 0.2: patches that geometry makes hard to
     match need not be as similar. The mean in place of the sum keeps the weight of the loss independent of n.
@@ -44,7 +48,7 @@ def geometric(
 
 
 def margins(similarity: Float[Tensor, "*s"]) -> Float[Tensor, "*s"]:
-    """The margin that eq. 4 gives each S_patch."""
+    """The margin of the geometric loss for each S_patch."""
     margin = torch.zeros_like(similarity)
     for threshold, value in reversed(MARGINS):
         margin = torch.where(similarity >= threshold, value, margin)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from fmtorch.training.keypoints import Keypoints, Matrix
 from fmtorch.training.scenes import View, local_depth
 
-INTERSECTION_SIGMA = 15.0  # degrees, sigma_1 of eq. 2
-INCIDENCE_SIGMA = 20.0  # degrees, sigma_2 of eq. 2
+INTERSECTION_SIGMA = 15.0  # degrees, sigma_1 of section 3.3
+INCIDENCE_SIGMA = 20.0  # degrees, sigma_2 of section 3.3
 
 Real = NDArray[np.floating]
 
@@ -40,7 +40,7 @@ def rays_and_incidence(keypoints: Keypoints, view: View) -> tuple[Matrix, Matrix
 
 
 def patch_similarity(rays0: Real, rays1: Real, incidence0: Real, incidence1: Real) -> Matrix:
-    """S_patch (eq. 2): g(intersection angle, 15 degrees) g(difference of incidence angles, 20 degrees).
+    """S_patch (section 3.3): g(intersection angle, 15 degrees) g(difference of incidence angles, 20 degrees).
 
     g(a, s) = exp(-a^2 / (2 s^2)). The intersection angle is that between the two viewing rays at the point, the
     incidence angles are those between ray and surface normal.
@@ -60,5 +60,5 @@ def patch_similarity(rays0: Real, rays1: Real, incidence0: Real, incidence1: Rea
 
 
 def _closeness(angle: Real, sigma: float) -> Matrix:
-    """g of eq. 2, of angles in degrees."""
+    """g of section 3.3, of angles in degrees."""
     return np.exp(-(np.asarray(angle, np.float64) ** 2) / (2 * sigma**2))

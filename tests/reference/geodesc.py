@@ -20,7 +20,7 @@ def angle(a: Vector, b: Vector) -> float:
 
 
 def patch_similarity(point: Vector, normal: Vector, centre0: Vector, centre1: Vector) -> float:
-    """Eq. 2, of a world point with its normal, seen from two camera centres."""
+    """Section 3.3: S_patch of a world point with its normal, seen from two camera centres."""
     to0, to1 = ([c - p for c, p in zip(centre, point, strict=True)] for centre in (centre0, centre1))
     intersection = angle(to0, to1)
     incidence = angle(to0, normal) - angle(to1, normal)
@@ -47,7 +47,7 @@ def match_sets(
 
 
 def structured(a: Vectors, b: Vectors, ratio: float) -> float:
-    """E_1, eq. 3, of one match set."""
+    """E_1, section 3.5, of one match set."""
     n, total = len(a), 0.0
     s = [[dot(x, y) for y in b] for x in a]
     level = [[s[i][j] - (ratio * s[i][i] if i == j else 0.0) for j in range(n)] for i in range(n)]
@@ -58,7 +58,7 @@ def structured(a: Vectors, b: Vectors, ratio: float) -> float:
 
 
 def geometric(a: Vectors, b: Vectors, similarity: Vector) -> float:
-    """E_2, eq. 4, by the number of matches."""
+    """E_2, section 3.5, by the number of matches."""
     total = 0.0
     for x, y, s in zip(a, b, similarity, strict=True):
         margin = 0.7 if s >= 0.5 else 0.5 if s >= 0.2 else 0.2
