@@ -26,7 +26,7 @@ from fmtorch.core.types import Correspondences
 from fmtorch.geometry import sampson
 from fmtorch.pipeline.pipeline import Pipeline
 
-STAGES = ("ratio_prior", "gms_soft", "lpm_soft", "position_consistency", "frame_consistency", "code_soft")
+STAGES = ("ratio_prior", "gms", "lpm", "position_consistency", "frame_consistency", "code")
 NEWTON_STEPS = 30
 Array = NDArray[np.float64]
 console = Console(width=None if sys.stdout.isatty() else 140)
@@ -53,7 +53,8 @@ def main() -> None:
     pairs = matched(arguments)
     console.print(f"{len(pairs)} pairs, {np.mean([len(p.right) for p in pairs]):.0f} matches each on average")
     for name in arguments.stages:
-        report(name, presets.build("pruner", name), pairs)
+        soft = {"soft": True} if "soft" in presets.load("pruner", name) else {}
+        report(name, presets.build("pruner", name, **soft), pairs)
 
 
 def matched(arguments: argparse.Namespace) -> list[Pair]:

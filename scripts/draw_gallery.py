@@ -22,7 +22,7 @@ from fmtorch.data import ImagePair
 from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_matches
 
 WIDTH, QUALITY = 1200, 80
-PIPELINE, PEER = "sift_fmtorch", "opencv_usac_magsac"
+PIPELINE, PEER = "sift_fmtorch", ("opencv", {"method": "usac_magsac"})
 
 
 Points = NDArray[np.float64]
@@ -52,7 +52,7 @@ class Gallery:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
         self.pipeline = presets.pipeline(PIPELINE)
-        self.peer = presets.build("estimator", PEER)
+        self.peer = presets.build("estimator", PEER[0], **PEER[1])
 
     def save(self, name: str, picture: NDArray[np.uint8]) -> None:
         height = round(picture.shape[0] * WIDTH / picture.shape[1])
@@ -96,7 +96,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     gallery.epipolar("right", row, row.ours)
     right, wrong = row.errors
     count = int(row.matches.count())
-    print(f"{row.pair.identity}: {count} matches; NSGD {right:.4f} of fmtorch, {wrong:.4f} of {PEER}")
+    print(f"{row.pair.identity}: {count} matches; NSGD {right:.4f} of fmtorch, {wrong:.4f} of {PEER[1]['method']}")
 
     orbits = [pairs[i] for i in range(len(pairs)) if pairs[i].family == "orbit"]
     first, second = orbits[0].image0, orbits[-1].image0

@@ -5,12 +5,14 @@ python scripts/draw_reference.py
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from fmtorch.presets.files import summary
+from fmtorch.commands.list import HEADINGS
+from fmtorch.presets.files import available, summary
 
 ROOT = Path(__file__).resolve().parents[1]
 CONF, PAGES = ROOT / "conf", ROOT / "docs" / "reference"
@@ -96,12 +98,13 @@ def options(path: Path) -> Iterator[Option]:
 def presets_page() -> str:
     parts = [PRESETS_HEAD]
     for group, title in GROUPS.items():
-        files = {path.relative_to(CONF).as_posix(): path for path in sorted((CONF / group).rglob("*.yaml"))}
-        rows = [
-            f"| [`{name.removeprefix(f'{group}/').removesuffix('.yaml')}`](../../conf/{name}) | {text(summary(path))} |"
-            for name, path in files.items()
-        ]
-        parts.append("\n".join([f"## {group}\n", f"{title}\n", "| name | what it is |", "| --- | --- |", *rows]) + "\n")
+        for folder, names in itertools.groupby(available(group), lambda name: name.rpartition("/")[0]):
+            rows = [
+                f"| [`{name}`](../../conf/{group}/{name}.yaml) | {text(summary(CONF / group / f'{name}.yaml'))} |"
+                for name in names
+            ]
+            head = f"### {group}: {HEADINGS[folder]}\n" if folder else f"## {group}\n\n{title}\n"
+            parts.append("\n".join([head, "| name | what it is |", "| --- | --- |", *rows]) + "\n")
     return "\n".join(parts)
 
 

@@ -20,11 +20,10 @@ from fmtorch import presets
 from fmtorch.core.grey_pyramid import grey_pyramid
 from fmtorch.core.stages import Estimator, ImagePruner, PairImages, Pruner
 from fmtorch.core.types import Correspondences, collate
+from tests.variants import built, loaded, variants
 
 PEERS = {
-    name: package
-    for name in presets.available("estimator")
-    for package in presets.peer_packages(presets.load("estimator", name))
+    name: package for name in variants("estimator") for package in presets.peer_packages(loaded("estimator", name))
 }
 """The packages of the extra `peers` that presets of estimators need, by the presets' names."""
 SMALL_KINDS = ("collinear", "collinear in image 1", "planar", "coincident", "half coincident")
@@ -54,8 +53,8 @@ def few(config: Mapping[str, Any], hypotheses: int = 200, round: int = 100) -> d
 
 def quick(name: str, hypotheses: int = 200, round: int = 100) -> Estimator:
     """An estimator preset that does little in each of its stages: the laws do not depend on how much."""
-    built: Estimator = presets.build("estimator", name, **few(presets.load("estimator", name), hypotheses, round))
-    return built
+    estimator: Estimator = built("estimator", name, **few(loaded("estimator", name), hypotheses, round))
+    return estimator
 
 
 SMALL_NETWORKS = {
@@ -66,13 +65,13 @@ SMALL_NETWORKS = {
 
 def quick_pruner(name: str) -> Pruner:
     """A pruner preset; a learned one with a small untrained network, on which the laws do not depend."""
-    network = presets.load("pruner", name).get("network")
+    network = loaded("pruner", name).get("network")
     torch.manual_seed(7)  # with which about half of the matches have P > 0.5
     small: dict[str, Any] = {} if network is None else {"file": None, "network": SMALL_NETWORKS[network["_target_"]]}
     if name == "refine_matches":
         small = {"min_correlation": -1.0, "max_deviation": 100.0}  # scenes' points are anywhere in the images
-    built: Pruner = presets.build("pruner", name, **small)
-    return shown(built)
+    pruner: Pruner = built("pruner", name, **small)
+    return shown(pruner)
 
 
 def shown(pruner: Pruner) -> Pruner:

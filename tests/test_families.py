@@ -54,7 +54,7 @@ def qualities(pipeline: Pipeline, some: list[ImagePair]) -> list[torch.Tensor]:
 
 def test_each_pair_of_a_batch_gets_the_options_of_its_family() -> None:
     options = ["pruner.ratio.threshold=0.5", f"+{RATIO}.wide.threshold=0.7", f"+{RATIO}.CPC.threshold=0.9"]
-    pipeline = presets.pipeline("sift_ratio_paper", overrides=options)
+    pipeline = presets.pipeline("paper/sift_ratio", overrides=options)
     some = pairs_of_families("KITTI", "orbit", "CPC", "mine", "Strecha")
     limits = (0.5, 0.7, 0.9, 0.5, 0.7)
     for pair, kept, limit in zip(some, qualities(pipeline, some), limits, strict=True):
@@ -65,7 +65,7 @@ def test_each_pair_of_a_batch_gets_the_options_of_its_family() -> None:
 
 
 def test_gms_tries_scales_on_wide_baselines_alone() -> None:
-    for name in ("sift_gms", "hesaffnet_gms_paper"):
+    for name in ("sift_gms", "paper/hesaffnet_gms"):
         pipeline = presets.pipeline(name, overrides=["+pruner.gms.families.mine.with_scale=true"])
         scale = {family: pipeline.pruners_of(family)["gms"].with_scale for family in ("TUM", "CPC", "mine", "other")}  # type: ignore[attr-defined]
         assert scale == {"TUM": False, "CPC": True, "mine": True, "other": False}
@@ -116,7 +116,7 @@ def test_those_of_a_pruner_that_others_replace_go_with_it() -> None:
 
 
 def test_they_are_part_of_the_stages_of_a_run_and_come_back_from_them() -> None:
-    config = compose("match", ("pipeline=sift_gms_paper",))
+    config = compose("match", ("pipeline=paper/sift_gms",))
     stages = presets.stages(config)
     assert stages["pruner"][1]["gms"]["families"] == {"wide": {"with_scale": True}}
     assert presets.composed(stages)["pruner"]["gms"]["families"] == {"wide": {"with_scale": True}}
@@ -133,4 +133,4 @@ def test_they_are_part_of_the_stages_of_a_run_and_come_back_from_them() -> None:
 )
 def test_what_is_wrong_with_them_is_said(override: str, said: str) -> None:
     with pytest.raises(ValueError, match=said):
-        presets.expect_stages(compose("match", ("pipeline=sift_ratio_paper", override)))
+        presets.expect_stages(compose("match", ("pipeline=paper/sift_ratio", override)))

@@ -26,12 +26,14 @@ from tests.laws import (
     small,
     with_padding,
 )
+from tests.variants import variants
 
-OWN = [n for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES)]
+OWN = [n for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES)]
 PER_MATCH = ("inliers", "kept", "prior", "noise")
-NOISY = ("fmtorch", "fmtorch_fast", "fmtorch_max", "gc_ransac", "msac")  # are also told the noise of matches
+NOISY = ("fmtorch", "fmtorch_fast", "gc_ransac", "msac")  # are also told the noise of matches
 COMPILED = (  # pruners of two forms: a kernel, and tensors
-    "frame_consistency", "gms", "gms_soft", "lpm", "lpm_soft", "match_noise", "one_to_one", "position_consistency",
+    "frame_consistency", "gms", "gms:soft=true", "lpm", "lpm:soft=true", "match_noise", "one_to_one",
+    "position_consistency",
 )  # fmt: skip
 
 
@@ -66,8 +68,8 @@ def _noisy(name: str) -> Subject:
 
 def _subjects() -> list[Subject]:
     """Every preset of these groups: a new file in conf/ joins by being there."""
-    estimators = [_estimator(n) for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES[1:])]
-    pruners = [*(_pruner(n) for n in presets.available("pruner")), *(_pruner(n, kernel=False) for n in COMPILED)]
+    estimators = [_estimator(n) for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES[1:])]
+    pruners = [*(_pruner(n) for n in variants("pruner")), *(_pruner(n, kernel=False) for n in COMPILED)]
     return [*estimators, *pruners, *(_noisy(n) for n in NOISY)]
 
 

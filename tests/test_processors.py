@@ -17,19 +17,20 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch import geometry, presets
+from fmtorch import geometry
 from fmtorch.compiling import switch
 from fmtorch.estimators.families.focal_prior import normal_quantiles
 from fmtorch.geometry.magsac import LOSS_TABLE
 from fmtorch.matching import nearest_neighbors
 from fmtorch.metrics import nsgd
 from tests.laws import degenerate, scene, scenes
+from tests.variants import built
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-ESTIMATORS = ("fmtorch", "irls_cauchy", "irls_magsac", "msac", "usac")
+ESTIMATORS = ("fmtorch", "irls:kernel=cauchy", "irls", "msac", "usac")
 PRUNERS = (
-    "frame_consistency", "gms", "gms_soft", "lpm", "lpm_soft", "match_noise", "one_to_one", "position_consistency",
-    "ratio_prior",
+    "frame_consistency", "gms", "gms:soft=true", "lpm", "lpm:soft=true", "match_noise", "one_to_one",
+    "position_consistency", "ratio_prior",
 )  # fmt: skip
 HASWELL = (
     "64bit", "avx", "avx2", "bmi", "bmi2", "cmov", "cx16", "cx8", "f16c", "fma", "fsgsbase", "fxsr", "invpcid", "lzcnt",
@@ -67,11 +68,11 @@ def results(given: dict[str, Any]) -> dict[str, np.ndarray]:
     found = {name: torch.from_numpy(table) for name, table in tables.items()}
     for what, c in given["pairs"].items():
         for name in ESTIMATORS:
-            estimate = presets.build("estimator", name)(c, 1)
+            estimate = built("estimator", name)(c, 1)
             for field in ("F", "inliers", "ok", "draws", "significance"):
                 found[f"{name} of {what}: {field}"] = getattr(estimate, field)
     for name in PRUNERS:
-        c = presets.build("pruner", name)(given["many"])
+        c = built("pruner", name)(given["many"])
         found |= {f"{name}: {field}": getattr(c, field) for field in ("mask", "prior", "noise")}
     x0, x1, weight, size = given["geometry"]
     F, other = geometry.eight_point(x0, x1, weight)[0], geometry.eight_point(x0[:, :20], x1[:, :20])[0]

@@ -108,7 +108,7 @@ def _open_folder(
 ) -> RunFolder:
     """The folder of the run with this identity, its `run_dir` if given, new or to be continued."""
     identity = run_identity(config, pipeline_name, pipeline, dataset.digest, fields.cameras)
-    name = f"{pipeline_name}-{identity_digest(identity)[:8]}"
+    name = f"{pipeline_name.replace('/', '-')}-{identity_digest(identity)[:8]}"
     return RunFolder.open(fields.run_dir or Path(f"runs/{dataset.name}/{name}"), identity)
 
 

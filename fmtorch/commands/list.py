@@ -9,20 +9,32 @@ from fmtorch.core.resources import conf_dir
 from fmtorch.core.terminal import console, exits_with_message
 from fmtorch.presets.files import available, groups, summary
 
-USAGE = """fmtorch list: the presets of all groups, or of some
+USAGE = """fmtorch list: the presets of all groups, or of some; those of FM-Bench's paper, paper/NAME, last
 
 usage: fmtorch list [GROUP ...]
 
 groups: """
 
 
+HEADINGS = {"paper": "as in FM-Bench's paper"}  # of the folders within groups
+
+
 def listed(group: str) -> list[str]:
-    """A line for each preset of a group: name, and the first sentence of its file. Raises ValueError for no group."""
+    """A line for each preset of a group: name, and the first sentence of its file; then, under headings, its folders'.
+
+    Raises ValueError for no group.
+    """
     if group not in groups():
         raise ValueError(f"no group {group!r}; there are: {nearest(group, groups())}")
     names = available(group)
     width = max(map(len, names))
-    return [f"  {name:{width}}  {summary(conf_dir() / group / f'{name}.yaml')}" for name in names]
+    lines, folder = [], ""
+    for name in names:
+        if (inside := name.rpartition("/")[0]) != folder:
+            folder = inside
+            lines.append(f"  {HEADINGS.get(folder, folder)}:")
+        lines.append(f"  {name:{width}}  {summary(conf_dir() / group / f'{name}.yaml')}")
+    return lines
 
 
 def main() -> None:

@@ -22,9 +22,12 @@ from fmtorch.core.resources import conf_dir
 from fmtorch.core.terminal import MISTAKES, error_line, exits_with_message
 from fmtorch.core.version import __version__
 from fmtorch.presets import available, top_level_names
+from fmtorch.presets.files import groups
+from fmtorch.presets.former import moved
 from fmtorch.presets.pruners import with_explicit
 
 Task = Callable[[DictConfig], None]
+SUBMITTED = "jobs run in other processes; what each prints: .submitit/JOB/JOB_0_log.out below hydra.sweep.dir (runs)"
 
 
 class Mistake(ValueError):
@@ -71,6 +74,8 @@ def run_command(
         return
     with exits_with_message(interrupted):
         sys.argv[1:] = hydra_arguments(sys.argv[1:], paths, positional)
+        if any(word.startswith("hydra/launcher=submitit") for word in sys.argv):
+            print(SUBMITTED, flush=True)
         try:
             with env_override({"HYDRA_FULL_ERROR": "1"}):  # Hydra then leaves errors to us
                 hydra.main(version_base=None, config_path=str(conf_dir()), config_name=name)(task)()
@@ -91,9 +96,7 @@ def _expect_known(overrides: Sequence[str]) -> None:
 def explained(error: HydraException | OmegaConfBaseException, command: str) -> str:
     """One line for an error of Hydra's composition of the config of a command."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
-        group, _, name = str(error.missing_cfg_file).rpartition("/")
-        names = error.options or available(group)
-        return f"no preset {name!r} in {group}; there are: {nearest(name, names) or 'none'}"
+        return _missing(str(error.missing_cfg_file), error.options or ())
     if isinstance(error, OverrideParseException):
         return f"{error.override} cannot be read; a value with special characters stands in quotes: \"NAME='VALUE'\""
     cause = error
@@ -112,6 +115,15 @@ def explained(error: HydraException | OmegaConfBaseException, command: str) -> s
     if isinstance(error, ConfigCompositionException) and unknown:
         return f"no option {unknown[1]}; there are: {nearest(unknown[1], top_level_names(command))}"
     return _line(str(error))
+
+
+def _missing(file: str, options: Sequence[str]) -> str:
+    """One line for a preset that there is not; options: those that Hydra found in its folder."""
+    group, _, name = file.partition("/")
+    if group not in groups():
+        group, _, name = file.rpartition("/")
+    there_are = nearest(name, {*(options if "/" not in name else ()), *available(group)})
+    return moved(group, name, command=True) or f"no preset {name!r} in {group}; there are: {there_are or 'none'}"
 
 
 def _line(text: str) -> str:

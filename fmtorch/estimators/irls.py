@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -45,7 +45,7 @@ class IterativelyReweighted:
 
     Args:
         kernel: a name of `geometry.KERNELS`.
-        threshold: its scale, Sampson distance, px.
+        threshold: its scale, Sampson distance, px; a number, or one of each kernel by its name.
         starts: powers of w, integers, at least 0.
         iterations: reweighted fits.
         start_scale: the kernel's first scale, in robust standard deviations of the residuals under a first model, the
@@ -54,7 +54,8 @@ class IterativelyReweighted:
         inlier_threshold: of the inliers reported, Sampson distance, px; null: the threshold.
 
     Raises:
-        ValueError: for a threshold that is not positive, for no starts or a negative one, and for an unknown kernel.
+        ValueError: for a threshold that is not positive, for no starts or a negative one, for an unknown kernel, and
+            for one without a threshold.
     """
 
     uses_prior = True
@@ -64,18 +65,22 @@ class IterativelyReweighted:
         self,
         *,
         kernel: str,
-        threshold: float,
+        threshold: float | Mapping[str, float],
         starts: Sequence[int] = (0, 1, 2, 4, 8, 16),
         iterations: int = 12,
         start_scale: float = 0.75,
         refine_iterations: int = 30,
         inlier_threshold: float | None = None,
     ) -> None:
+        named_kernel(kernel)
+        if isinstance(threshold, Mapping):
+            if kernel not in threshold:
+                raise ValueError(f"threshold has no entry for kernel={kernel}; there are: {', '.join(threshold)}")
+            threshold = threshold[kernel]
         if not threshold > 0:
             raise ValueError(f"threshold is {threshold}; it must be positive")
         if not starts or min(starts) < 0:
             raise ValueError(f"starts is {starts}; it must be a list of integers, each at least 0")
-        named_kernel(kernel)
         self.kernel, self.threshold, self.starts = kernel, threshold, sorted(set(starts))
         self.iterations, self.start_scale, self.refine_iterations = iterations, start_scale, refine_iterations
         self.inlier_rule = WithinThreshold(threshold if inlier_threshold is None else inlier_threshold)

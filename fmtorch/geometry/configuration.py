@@ -19,7 +19,8 @@ Array = NDArray[Any]
 
 GENERAL, PLANAR, ROTATION, IDENTICAL, UNRELATED = range(len(CONFIGURATIONS))
 MIN_EVIDENCE = 80.0  # nats; of the tuning pairs, unrelated ones reach 50 and related ones have 176 or more
-MIN_PARALLAX = 12.0  # nats; of the tuning pairs, planes, rotations and copies reach 6 (one 39), wide scenes have 74
+MIN_PARALLAX = 12.0  # nats; of the tuning pairs, planes reach 6, and wide scenes have 70
+MIN_TRANSLATION = 50.0  # nats; rotations reach 25 and copies 39: wrong matches may choose the translation they lack
 PLANE_PARAMETERS, COPY_PARAMETERS = 8, 3  # of a homography, and of a similarity without rotation, or of a rotation
 
 
@@ -111,7 +112,8 @@ def classified(evidence: Evidence, focal_known: Bool[Tensor, " b"] | None = None
 
     1. unrelated: neither F nor H explains more than `MIN_EVIDENCE` nats.
     2. general: matches off the plane support F, ``both - plane - log n > MIN_PARALLAX``: by the Bayesian information
-       criterion (Schwarz 1978), F has two parameters beyond those of its plane.
+       criterion (Schwarz 1978), F has two parameters beyond those of its plane. `MIN_TRANSLATION` where 3. explains
+       most matches.
     3. identical or rotation: ``x1 = a x0 + b``, with three parameters, or K1 R K0^-1, with three and those of the focal
        lengths, is as good as H with eight by the same criterion; of both the better one.
     4. planar.
@@ -128,5 +130,7 @@ def classified(evidence: Evidence, focal_known: Bool[Tensor, " b"] | None = None
     turned = evidence.rotation - (COPY_PARAMETERS + torch.where(known, 0.0, 2.0)) / 2 * log_n
     kind = torch.where(turned >= plane, ROTATION, kind)
     kind = torch.where((copy >= plane) & (copy >= turned), IDENTICAL, kind)
-    kind = torch.where(evidence.both - evidence.plane - log_n > MIN_PARALLAX, GENERAL, kind)
+    still = (kind != PLANAR) & (evidence.on_plane > evidence.on_line)
+    needed = torch.where(still, MIN_TRANSLATION, MIN_PARALLAX)
+    kind = torch.where(evidence.both - evidence.plane - log_n > needed, GENERAL, kind)
     return torch.where(torch.maximum(evidence.line, evidence.plane) > MIN_EVIDENCE, kind, UNRELATED)

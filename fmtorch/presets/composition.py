@@ -16,10 +16,10 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from fmtorch import data
-from fmtorch.core.options import nearest
 from fmtorch.core.resources import conf_dir
 from fmtorch.presets import hydra_source
-from fmtorch.presets.files import available
+from fmtorch.presets.files import available, unknown
+from fmtorch.presets.former import FORMER, Now
 from fmtorch.presets.objects import expect_buildable, instantiate, open_files, plain
 from fmtorch.presets.pruners import build_pruners, expect_pruners, pruner_configs, with_explicit
 from fmtorch.storage.features import cached
@@ -42,8 +42,10 @@ def stages(config: DictConfig) -> dict[str, Any]:
 
 @functools.cache
 def pipeline_stages(name: str) -> dict[str, Any] | None:
-    """The `stages` of the project's own pipeline `name`, unchanged; None where it has no such pipeline."""
-    return stages(compose("match", (f"pipeline={name}",))) if name in available("pipeline") else None
+    """The `stages` of the project's own pipeline `name`, unchanged; None where it has, and had, no such pipeline."""
+    now = FORMER["pipeline"].get(name, Now(name))
+    known = now.name in available("pipeline")
+    return stages(compose("match", (f"pipeline={now.name}", *now.overrides))) if known else None
 
 
 def composed(stages: Mapping[str, Any]) -> dict[str, Any]:
@@ -53,7 +55,14 @@ def composed(stages: Mapping[str, Any]) -> dict[str, Any]:
         if len(pruners) > 1:
             raise ValueError(f"the order of its pruners ({', '.join(pruners)}) is not known; evaluate it again")
         pruners = [pruners]
-    return {**stages, "pruner": {name: value for entry in pruners for name, value in entry.items()}}
+    return {**stages, "pruner": {name: _of_now(value) for entry in pruners for name, value in entry.items()}}
+
+
+def _of_now(pruner: Any) -> Any:
+    """A pruner's options with those renamed that earlier versions called otherwise."""
+    if not isinstance(pruner, Mapping) or "prune" not in pruner:
+        return pruner
+    return {**{key: value for key, value in pruner.items() if key != "prune"}, "soft": not pruner["prune"]}
 
 
 def expect_stages(config: DictConfig) -> None:
@@ -111,9 +120,8 @@ def pipeline(
     """
     if config_dir is not None and not Path(config_dir).is_dir():
         raise ValueError(f"config_dir={config_dir} is no folder")
-    known = available("pipeline", config_dir)
-    if name not in known:
-        raise ValueError(f"no preset {name!r} in conf/pipeline; there are: {nearest(name, known)}")
+    if name not in available("pipeline", config_dir):
+        raise ValueError(unknown("pipeline", name, config_dir))
     words = (f"pipeline={name}", "cache=off", *overrides)
     try:
         config = compose("match", words) if config_dir is None else _composed("match", words, Path(config_dir))

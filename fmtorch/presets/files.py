@@ -16,12 +16,14 @@ from omegaconf.errors import OmegaConfBaseException
 
 from fmtorch.core.options import nearest
 from fmtorch.core.resources import conf_dir
+from fmtorch.presets.former import moved
 
 
 def available(group: str, config_dir: Path | str | None = None) -> list[str]:
-    """Names of the presets of a group, e.g. ``available("estimator")``."""
+    """Names of the presets of a group, e.g. ``available("estimator")``: ``paper/usac`` and the like last."""
     folders = [Path(config_dir) / group] if config_dir is not None else []
-    return sorted({path.stem for folder in [*folders, conf_dir() / group] for path in folder.glob("*.yaml")})
+    found = [path.relative_to(f).with_suffix("") for f in [*folders, conf_dir() / group] for path in f.rglob("*.yaml")]
+    return sorted({path.as_posix() for path in found}, key=lambda name: (name.count("/"), name))
 
 
 def groups() -> list[str]:
@@ -54,7 +56,13 @@ def load(group: str, name: str, config_dir: Path | str | None = None) -> dict[st
             if not isinstance(values, dict):
                 raise ValueError(f"{path}: a preset is a mapping with a `_target_`, the dotted name of what it builds")
             return {str(key): value for key, value in values.items()}
-    raise ValueError(f"no preset {name!r} in conf/{group}; there are: {nearest(name, available(group, config_dir))}")
+    raise ValueError(unknown(group, name, config_dir))
+
+
+def unknown(group: str, name: str, config_dir: Path | str | None = None) -> str:
+    """What is said of a preset that there is not: where it went, or which there are."""
+    there_are = nearest(name, available(group, config_dir))
+    return moved(group, name) or f"no preset {name!r} in conf/{group}; there are: {there_are}"
 
 
 @contextlib.contextmanager
@@ -75,7 +83,7 @@ def naming_file(path: Path | str) -> Iterator[None]:
 @functools.cache
 def known_targets() -> frozenset[str]:
     """What the project's own presets build: dotted names that are safe to take from a file."""
-    texts = [path.read_text(encoding="utf-8") for path in conf_dir().glob("*/*.yaml")]
+    texts = [path.read_text(encoding="utf-8") for path in conf_dir().glob("*/**/*.yaml")]
     return frozenset(name for text in texts for name in re.findall(r"\b_target_: *([\w.]+)", text))
 
 

@@ -13,6 +13,7 @@ from fmtorch.data.baselines import WIDE
 from fmtorch.presets.objects import expect_buildable, instantiate
 
 FAMILIES = "families"  # among a pruner's options: family -> options that its pairs get instead
+OF_PIPELINES = frozenset({FAMILIES, "soft"})  # options that pipelines' presets set, of pruners that may be replaced
 WIDE_FAMILIES = "wide"  # stands there for every family of wide baselines
 
 
@@ -35,7 +36,7 @@ def pruner_configs(config: DictConfig) -> dict[str, Any]:
 
 def _left_over(value: Any) -> bool:
     """Whether a pipeline's preset says this of a pruner that others have taken the place of."""
-    return isinstance(value, Mapping) and set(value) == {FAMILIES}
+    return isinstance(value, Mapping) and bool(value) and OF_PIPELINES.issuperset(value)
 
 
 def expect_pruners(config: DictConfig) -> None:

@@ -59,14 +59,14 @@ class Calibration:
 
 
 def calibration_of(
-    pruner: str, prune: bool, calibration: Mapping[str, Mapping[str, float]] | None
+    pruner: str, soft: bool, calibration: Mapping[str, Mapping[str, float]] | None
 ) -> Calibration | None:
-    """The calibration that a stage's options describe. Raises ValueError for a stage that would do nothing."""
-    if calibration is not None:
-        return Calibration(**calibration)
-    if not prune:
-        raise ValueError(f"{pruner} with prune=False needs `calibration`, to supply a prior; it would do nothing")
-    return None
+    """The calibration of a stage that is `soft`; None of one that prunes. Raises ValueError where it is missing."""
+    if not soft:
+        return None
+    if calibration is None:
+        raise ValueError(f"{pruner} with soft=true needs `calibration`, to supply a prior; it would do nothing")
+    return Calibration(**calibration)
 
 
 class RatioPrior:

@@ -160,11 +160,10 @@ def _own_support(table: Table, moves: Moves, winner: Int[Tensor, " pairs"], turn
 
 
 class GMS:
-    """`gms` as a stage, which may also supply ``prior``: P(inlier) from `gms_support`.
+    """`gms` as a stage; or, `soft`, a stage that keeps every match and supplies ``prior``: P(inlier) by `gms_support`.
 
-    calibration: of the support, see `Calibration`; None: no prior. prune: False keeps every match and gives the prior
-    only; raises ValueError where there is no calibration then. The other options are those of `gms`. Raises ValueError
-    for correspondences without image sizes.
+    calibration: of the support, see `Calibration`; needed by the soft form alone. The other options are those of `gms`.
+    Raises ValueError for the soft form without a calibration, and for correspondences without image sizes.
     """
 
     def __init__(
@@ -174,21 +173,19 @@ class GMS:
         with_scale: bool = False,
         threshold_factor: float = 6.0,
         border: Border = "opencv",
-        prune: bool = True,
+        soft: bool = False,
         calibration: Mapping[str, Mapping[str, float]] | None = None,
     ) -> None:
         self.with_rotation, self.with_scale = with_rotation, with_scale
         self.threshold_factor, self.border = threshold_factor, border
-        self.prune = prune
-        self.calibration = calibration_of("GMS", prune, calibration)
+        self.calibration = calibration_of("GMS", soft, calibration)
 
     def __call__(self, c: Correspondences) -> Correspondences:
         """The same matches, of which only those survive that move with their neighbours, or with a prior."""
         return ungraphed(c, lambda: self._pruned(c))
 
     def _pruned(self, c: Correspondences) -> Correspondences:
-        soft = c if self.calibration is None else self.calibration(c, self.evidence(c))
-        return soft.keep(gms(**self._arguments(c))) if self.prune else soft
+        return self.calibration(c, self.evidence(c)) if self.calibration else c.keep(gms(**self._arguments(c)))
 
     def evidence(self, c: Correspondences) -> Float[Tensor, "b n"]:
         """What the prior is calibrated from: `gms_support`."""

@@ -34,6 +34,7 @@ class LearnedPruner:
             file.
         threshold: least P of a match that survives. None: all do.
         prior: whether to supply the prior.
+        soft: in place of the two: supply the prior and drop nothing.
         temperature: by which log-odds are divided; None: as the file says, or 1.
         threads: of ONNX Runtime.
         command: what makes the file, said where it is missing.
@@ -51,12 +52,14 @@ class LearnedPruner:
         runtime: str = "auto",
         threshold: float | None = None,
         prior: bool = True,
+        soft: bool = False,
         temperature: float | None = None,
         threads: int = 1,
         command: str = COMMAND,
     ) -> None:
         if runtime not in RUNTIMES:
             raise ValueError(f"runtime={runtime}; there are: {', '.join(RUNTIMES)}")
+        threshold, prior = (None, True) if soft else (threshold, prior)
         if threshold is None and not prior:
             raise ValueError("a learned pruner with threshold=None and prior=False would do nothing")
         if threshold is not None and not 0 <= threshold <= 1:

@@ -141,11 +141,10 @@ def _differs(motion: Float[Tensor, "n 2"], near: Int[Tensor, "n k"], tau: float)
 
 
 class LPM:
-    """`lpm` as a stage, which may also supply ``prior``: P(inlier) from `lpm_cost`.
+    """`lpm` as a stage; or, `soft`, a stage that keeps every match and supplies ``prior``: P(inlier) by `lpm_cost`.
 
     `thresholds`, `neighbors`, `taus` hold one value for each of the two passes. calibration: of one minus the cost, see
-    `Calibration`; None: no prior. prune: False keeps every match and gives the prior only; raises ValueError where
-    there is no calibration then.
+    `Calibration`; needed by the soft form alone, which raises ValueError without it.
     """
 
     def __init__(
@@ -154,17 +153,17 @@ class LPM:
         thresholds: Sequence[float] = (0.8, 0.5),
         neighbors: Sequence[int] = (6, 6),
         taus: Sequence[float] = (0.2, 0.2),
-        prune: bool = True,
+        soft: bool = False,
         calibration: Mapping[str, Mapping[str, float]] | None = None,
     ) -> None:
         self._options: dict[str, Any] = {"thresholds": thresholds, "neighbors": neighbors, "taus": taus}
-        self.prune = prune
-        self.calibration = calibration_of("LPM", prune, calibration)
+        self.calibration = calibration_of("LPM", soft, calibration)
 
     def __call__(self, c: Correspondences) -> Correspondences:
         """The same matches, of which only those survive that keep their neighbourhoods, or with a prior."""
-        soft = c if self.calibration is None else self.calibration(c, self.evidence(c))
-        return soft.keep(lpm(c.x0, c.x1, mask=c.mask, **self._options)) if self.prune else soft
+        if self.calibration is not None:
+            return self.calibration(c, self.evidence(c))
+        return c.keep(lpm(c.x0, c.x1, mask=c.mask, **self._options))
 
     def evidence(self, c: Correspondences) -> Float[Tensor, "b n"]:
         """What the prior is calibrated from: one minus the cost."""

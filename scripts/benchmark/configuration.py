@@ -26,8 +26,10 @@ from fmtorch import find_homography, metrics, presets
 from fmtorch.core.estimate import CONFIGURATIONS
 from fmtorch.core.files import replacing
 from fmtorch.core.types import Correspondences, collate
+from fmtorch.evaluation.pair_cameras import EXACT
 from fmtorch.geometry import poses_from_homography
 from fmtorch.pipeline.configuration import classify
+from fmtorch.pipeline.known_cameras import KnownCameras
 from scripts.benchmark import matched
 from scripts.benchmark.configuration_pairs import Case, photographs
 from scripts.benchmark.matched import console
@@ -105,16 +107,17 @@ def real(arguments: argparse.Namespace) -> list[Case]:
 
 
 class Ours:
-    """`classify` after F."""
+    """`classify` after F, which has the exact cameras where they are known."""
 
     def __init__(self, known: bool, **options: Any) -> None:
         self.known, self.options = known, options
-        self.estimator = presets.build("estimator", "fmtorch")
+        estimator = presets.build("estimator", "fmtorch")
+        self.estimator = KnownCameras(estimator) if known else estimator
 
     def __call__(self, case: Case, seed: int) -> str:
-        c = case.matches if self.known else case.matches.replace(K0=None, K1=None)
-        estimate = self.estimator(c, seed)
-        return classify(c, estimate, seed=seed, **self.options).names[0]
+        c = case.matches
+        c = c.replace(focal=torch.tensor([[EXACT, EXACT]]).double()) if self.known else c.replace(K0=None, K1=None)
+        return classify(c, self.estimator(c, seed), seed=seed, **self.options).names[0]
 
 
 def _colmap(threshold: float) -> Verdict:

@@ -22,7 +22,6 @@ import torch
 from numpy.typing import NDArray
 from rich.progress import track
 
-from fmtorch import presets
 from fmtorch.core.stages import pruned
 from fmtorch.data import ImagePair, read_image
 from fmtorch.data.images import to_grey
@@ -31,6 +30,7 @@ from fmtorch.pipeline.pipeline import STAGES, Pipeline
 from scripts.benchmark.features import kornia_hesaffnet
 from scripts.benchmark.matched import add_set_arguments, console, sets_of
 from scripts.benchmark.sheet import Sheet, put
+from scripts.benchmark.specs import pipeline_of
 
 MARKER = "end to end"
 RATIO = 0.8
@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> None:
     lines: list[list[str]] = []
     for name in arguments.pipelines:
         title, peer = PEERS[name]
-        ours, theirs = measured(presets.pipeline(name, overrides=["cache=off"]), peer, pairs)
+        ours, theirs = measured(pipeline_of(name, "cache=off"), peer, pairs)
         lines += [row(f"`{name}`", ours), row(title, theirs)]
         ratio = np.median([sum(b.values()) / sum(a.values()) for a, b in zip(ours, theirs, strict=True)])
         lines[-1].append(f"{ratio:.1f}")
@@ -154,7 +154,7 @@ def row(name: str, seconds: list[Seconds]) -> list[str]:
 
 
 PEERS: dict[str, tuple[str, Peer]] = {
-    "sift_lmeds": ("OpenCV: SIFT, BFMatcher, FM_LMEDS", opencv(cv2.FM_LMEDS, 1.0)),
+    "sift_ratio estimator=lmeds_eight_point": ("OpenCV: SIFT, BFMatcher, FM_LMEDS", opencv(cv2.FM_LMEDS, 1.0)),
     "sift_fmtorch": ("OpenCV: SIFT, BFMatcher, USAC_MAGSAC", opencv(cv2.USAC_MAGSAC, 0.25)),
     "hesaffnet_gms": ("kornia: HesAffNet, match_snn; OpenCV: FM_LMEDS", kornia),
 }

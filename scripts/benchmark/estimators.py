@@ -5,7 +5,7 @@ An estimator is named as PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]; the pruners 
 the network of --ngransac; without it, estimators that name it are left out.
 
 python -m scripts.benchmark estimators --root DATA/Strecha --root DATA/PhotoTourism --seeds 5 \\
-    --estimators fmtorch@frame_consistency opencv_usac_magsac:threshold=1.0 poselib:threshold=0.5,prosac=true
+    --estimators fmtorch@frame_consistency opencv:method=usac_magsac,threshold=1.0 poselib:threshold=0.5,prosac=true
 python -m scripts.benchmark estimators --rendered full --specs scripts/benchmark/estimators.txt --json figures.json \\
     --rows rows.jsonl
 

@@ -24,17 +24,18 @@ from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.run import select
 from fmtorch.evaluation.statistics import PERCENT
 from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.presets import build, load, pipeline
+from fmtorch.presets import build, load
 from fmtorch.storage import PairRow
 from scripts.benchmark.early_gc_ransac import EarlyGCRansac
 from scripts.benchmark.matched import add_set_arguments, console, sets_of
 from scripts.benchmark.paper_table import PAPER
 from scripts.benchmark.pruning_table import KIN
 from scripts.benchmark.sheet import MISSING, Sheet, published, put
+from scripts.benchmark.specs import pipeline_of
 
 ARTICLE, EXAMPLE = (0.31, 0.95), (2.0, 0.99)  # threshold in px, confidence
 FIRST, NEXT = math.sqrt(2 * math.log(1000)), 1.5  # residual up to which a match counts, in thresholds
-METHOD = "sift_gcransac_paper"
+METHOD = "paper/sift_ratio estimator=paper/gc_ransac"
 MARKER = "gc_ransac"
 
 
@@ -51,11 +52,11 @@ def variants() -> dict[str, Estimator]:
     found: dict[str, Estimator] = {}
     for threshold in (0.31, 2.0, 3.0):
         options = article(threshold)
-        found[f"`gc_ransac_paper` as in the article, {threshold:g} px"] = build(
-            "estimator", "gc_ransac_paper", **options
+        found[f"`paper/gc_ransac` as in the article, {threshold:g} px"] = build(
+            "estimator", "paper/gc_ransac", **options
         )
-    found["`gc_ransac_paper`, MSAC's score"] = build("estimator", "gc_ransac_paper", score="msac")
-    found["`gc_ransac_paper`"] = build("estimator", "gc_ransac_paper")
+    found["`paper/gc_ransac`, MSAC's score"] = build("estimator", "paper/gc_ransac", score="msac")
+    found["`paper/gc_ransac`"] = build("estimator", "paper/gc_ransac")
     for release, factor in (("next", NEXT), ("first", FIRST)):
         for source, (threshold, confidence) in (("article", ARTICLE), ("example", EXAMPLE)):
             within = factor * threshold
@@ -63,10 +64,10 @@ def variants() -> dict[str, Estimator]:
                 fit = ", normalised last fit" if normalized else ""
                 name = f"{release} release, t of the {source}: below {within:.2f} px{fit}"
                 found[name] = EarlyGCRansac(within, confidence, normalized=normalized).estimator()
-    found["`lmeds_paper`"] = build("estimator", "lmeds_paper")
-    coarse = {**load("estimator", "cf_ransac_paper")["coarse"], **article(ARTICLE[0])}
-    found["`cf_ransac_paper`, coarse stage as in the article"] = build("estimator", "cf_ransac_paper", coarse=coarse)
-    found["`cf_ransac_paper`"] = build("estimator", "cf_ransac_paper")
+    found["`paper/lmeds`"] = build("estimator", "paper/lmeds")
+    coarse = {**load("estimator", "paper/cf_ransac")["coarse"], **article(ARTICLE[0])}
+    found["`paper/cf_ransac`, coarse stage as in the article"] = build("estimator", "paper/cf_ransac", coarse=coarse)
+    found["`paper/cf_ransac`"] = build("estimator", "paper/cf_ransac")
     return found
 
 
@@ -79,8 +80,7 @@ def run(arguments: argparse.Namespace) -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     pairs = select([dataset[i] for dataset in sets_of(arguments) for i in range(len(dataset))], arguments.limit)
-    overrides = ["features=sift_vlfeat", f"cache={arguments.cache}"]
-    front = pipeline(METHOD, overrides=overrides)
+    front = pipeline_of(METHOD, "features=sift_vlfeat", f"cache={arguments.cache}")
     matched = [front.match([pair])[0] for pair in track(pairs, "matching", console=console, transient=True)]
     rows: dict[str, list[PairRow]] = {}
     for name, estimator in variants().items():

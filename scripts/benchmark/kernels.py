@@ -22,16 +22,18 @@ import torch
 from fmtorch import presets
 from fmtorch.compiling import switch
 from fmtorch.core.types import Correspondences
+from scripts.benchmark.matched import pruner
 from scripts.benchmark.pruning_speed import correspondences
 
 COUNT = 600  # matches of the pair
 REPEATS = 15
 PRUNERS = (
-    "frame_consistency", "position_consistency", "match_noise", "ratio_prior", "one_to_one", "gms", "gms_soft", "lpm",
+    "frame_consistency", "position_consistency", "match_noise", "ratio_prior", "one_to_one", "gms", "gms:soft=true",
+    "lpm",
 )  # fmt: skip
 ESTIMATORS = (
-    "fmtorch", "fmtorch_fast", "fmtorch_max", "ransac", "msac", "lmeds", "usac", "magsac", "gc_ransac", "cf_ransac",
-    "irls_magsac",
+    "fmtorch", "fmtorch_fast", "ransac", "msac", "lmeds", "usac", "magsac", "gc_ransac", "cf_ransac",
+    "irls",
 )  # fmt: skip
 
 
@@ -74,7 +76,7 @@ def framed(c: Correspondences) -> Correspondences:
 
 def pruning(c: Correspondences) -> None:
     """Pruners as stages."""
-    whole("pruner", PRUNERS, c)
+    whole(PRUNERS, c)
 
 
 def estimators(c: Correspondences) -> None:
@@ -83,10 +85,10 @@ def estimators(c: Correspondences) -> None:
         line(name, functools.partial(presets.build("estimator", name), c), None)
 
 
-def whole(group: str, names: Sequence[str], c: Correspondences) -> None:
-    """Presets of a group, called with kernels and without."""
+def whole(names: Sequence[str], c: Correspondences) -> None:
+    """Pruners, called with kernels and without."""
     for name in names:
-        stage = presets.build(group, name)
+        stage = pruner(name)
 
         def run(form: str, stage: Any = stage) -> None:
             os.environ[switch.SWITCH] = form

@@ -33,8 +33,7 @@ from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.storage.features import cached
 from scripts.benchmark import learned_table
 from scripts.benchmark.kept import Kept, Row, Stages, identity, read
-from scripts.benchmark.matched import add_set_arguments, options, sets_of
-from scripts.benchmark.pruning import stage
+from scripts.benchmark.matched import add_set_arguments, options, pruner, sets_of
 from scripts.benchmark.sheet import put
 from scripts.benchmark.specs import ngransac
 
@@ -55,14 +54,14 @@ HARD = {
 PRIOR = {
     "none": "ratio one_to_one",
     "ratio": "ratio one_to_one ratio_prior",
-    "GMS": "ratio one_to_one gms_soft",
-    "LPM": "ratio one_to_one lpm_soft",
-    "CODE": "code_soft one_to_one ratio",
+    "GMS": "ratio one_to_one gms:soft=true",
+    "LPM": "ratio one_to_one lpm:soft=true",
+    "CODE": "code:soft=true one_to_one ratio",
     "frame consistency": "ratio one_to_one frame_consistency",
-    "LC, F": "ratio one_to_one lc_soft",
-    "LC, E": "ratio one_to_one lc_e_soft",
-    "LC, F, side information": "ratio one_to_one lc_side_soft",
-    "DFE": "ratio one_to_one dfe_soft",
+    "LC, F": "ratio one_to_one lc:soft=true",
+    "LC, E": "ratio one_to_one lc_e:soft=true",
+    "LC, F, side information": "ratio one_to_one lc_side:soft=true",
+    "DFE": "ratio one_to_one dfe:soft=true",
 }
 USES = {"hard": (HARD, ("ransac_eight_point", "lmeds_eight_point")), "prior": (PRIOR, ("fmtorch",))}
 GIVEN = frozenset(("ratio", "one_to_one"))  # what every method has, and what is not counted into its time
@@ -151,16 +150,16 @@ def _presets(chain: Chain) -> Stages:
 def chains(arguments: argparse.Namespace) -> Chains:
     """The pruners of each method that is asked for, by use and name."""
     built = {
-        use: {name: [(spec, stage(spec)) for spec in chain.split()] for name, chain in methods.items()
+        use: {name: [(spec, pruner(spec)) for spec in chain.split()] for name, chain in methods.items()
               if name in arguments.methods}
         for use, (methods, _) in USES.items()
     }  # fmt: skip
-    before = [(name, stage(name)) for name in sorted(GIVEN, reverse=True)]
+    before = [(name, pruner(name)) for name in sorted(GIVEN, reverse=True)]
     if arguments.ngransac:
         built["prior"]["NG-RANSAC's network"] = [*before, ("lc", ngransac(arguments.ngransac))]
     for name, network, file in arguments.network:
-        for use, preset in (("hard", network), ("prior", f"{network}_soft")):
-            built[use][name] = [*before, (preset, presets.build("pruner", preset, file=file))]
+        for use, word in (("hard", network), ("prior", f"{network}:soft=true")):
+            built[use][name] = [*before, (word, presets.build("pruner", network, file=file, soft=use == "prior"))]
     return built
 
 
@@ -195,8 +194,8 @@ def rows_of(
 def pruned(outcome: Outcome, pruners: Chain) -> tuple[Outcome, float]:
     """The outcome after the pruners, and the seconds of those that are not in every chain."""
     c, seconds = outcome.correspondences, 0.0
-    for name, pruner in pruners if c is not None else []:
+    for name, stage in pruners if c is not None else []:
         start = time.process_time()
-        c = pruner(c).compact()
+        c = stage(c).compact()
         seconds += (time.process_time() - start) * (name not in GIVEN)
     return dataclasses.replace(outcome, correspondences=c), seconds

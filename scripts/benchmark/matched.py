@@ -59,6 +59,18 @@ def options(text: str) -> dict[str, Any]:
     return found
 
 
+def split(word: str) -> tuple[str, dict[str, Any]]:
+    """The preset of `PRESET[:KEY=VALUE,...]` and its changed options."""
+    name, _, rest = word.partition(":")
+    return name, options(rest)
+
+
+def pruner(word: str) -> Any:
+    """The stage of `PRUNER[:KEY=VALUE,...]`."""
+    name, changed = split(word)
+    return presets.build("pruner", name, **changed)
+
+
 def parsed(value: str) -> Any:
     """A number, true, false or null; anything else is text."""
     try:
@@ -78,8 +90,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def identity(arguments: argparse.Namespace) -> str:
     """The digest of what the matches of `load` depend on, but for the images."""
     stages: kept.Stages = [("features", arguments.features, {}), ("matcher", "nearest", {})]
-    stages += [("pruner", name, {}) for name in arguments.pruners]
-    return kept.identity(stages, *(presets.build(group, name) for group, name, _ in stages))
+    stages += [("pruner", *split(word)) for word in arguments.pruners]
+    return kept.identity(stages, *(presets.build(group, name, **changed) for group, name, changed in stages))
 
 
 def load(arguments: argparse.Namespace) -> list[Item]:
@@ -89,7 +101,7 @@ def load(arguments: argparse.Namespace) -> list[Item]:
         whole = sorted((dataset[i] for i in range(len(dataset))), key=lambda pair: pair.key)
         pairs += whole[: arguments.limit]
     pairs.sort(key=lambda pair: pair.identity)
-    pruners: dict[str, Any] = {name: presets.build("pruner", name) for name in arguments.pruners}
+    pruners: dict[str, Any] = {word: pruner(word) for word in arguments.pruners}
     front = Pipeline(
         cached(presets.build("features", arguments.features), arguments.cache),
         presets.build("matcher", "nearest"), pruners, _no_estimator,

@@ -23,7 +23,7 @@ from scripts.benchmark.specs import build
 from scripts.benchmark.synthetic import synthetic_pair
 
 OTHER_LIBRARIES = (
-    "opencv_",
+    "opencv",
     "poselib",
     "kornia_ransac",
     "magsac_cpp",

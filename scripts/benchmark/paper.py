@@ -1,4 +1,4 @@
-"""The paper's comparison of robust estimators with its own settings (`*_paper`), beside its figures.
+"""The paper's comparison of robust estimators with its own settings (`paper/*`), beside its figures.
 
 python -m scripts.benchmark paper --root DATA/KITTI --root DATA/TUM --root DATA/Strecha --json paper.jsonl
 python -m scripts.benchmark paper --rendered small --json paper.jsonl
@@ -27,7 +27,13 @@ OPENCV = METHODS[:1]  # what gets OpenCV's matches, too
 def add_arguments(commands: Any) -> None:
     parser = commands.add_parser("paper", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_set_arguments(parser, "pairs of each family at most, chosen by hash")
-    parser.add_argument("--estimators", nargs="*", default=METHODS, choices=METHODS, help="pipelines to measure")
+    parser.add_argument(
+        "--estimators",
+        nargs="*",
+        default=METHODS,
+        choices=METHODS,
+        help="pipelines to measure, each one word in quotes",
+    )
     pipelines.add_measure_arguments(parser, seeds=3)
     parser.set_defaults(run=run)
 

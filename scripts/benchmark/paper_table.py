@@ -17,8 +17,10 @@ from scripts.benchmark.sheet import MISSING, Published, Sheet, published, shown
 VLFEAT = " vlfeat"  # follows the name of a method whose matches are of VLFeat's SIFT
 PAPER = Path(__file__).resolve().parent / "paper_estimators.csv"  # Bian et al., BMVC 2019, tables of robust estimators
 METHODS = {
-    "sift_ratio_paper": "RANSAC", "sift_lmeds_paper": "LMedS", "sift_msac_paper": "MSAC", "sift_usac_paper": "USAC",
-    "sift_gcransac_paper": "GC-RANSAC", "sift_cfransac_paper": "CF-RANSAC",
+    "paper/sift_ratio": "RANSAC", "paper/sift_ratio estimator=paper/lmeds": "LMedS",
+    "paper/sift_ratio estimator=paper/msac": "MSAC", "paper/sift_ratio estimator=paper/usac": "USAC",
+    "paper/sift_ratio estimator=paper/gc_ransac": "GC-RANSAC",
+    "paper/sift_ratio estimator=paper/cf_ransac": "CF-RANSAC",
 }  # fmt: skip
 """Pipelines by the paper's names for their estimators, in its order."""
 CLAIMS = (

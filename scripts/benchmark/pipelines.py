@@ -32,6 +32,7 @@ from scripts.benchmark.kept import Kept, read
 from scripts.benchmark.matched import add_set_arguments, console, sets_of
 from scripts.benchmark.pruning import pruned_by
 from scripts.benchmark.sheet import put
+from scripts.benchmark.specs import pipeline_of
 
 FEATURES = ("sift", "dspsift", "rootsiftpca", "l2net", "geodesc", "hardnet", "hesaffnet")
 SYSTEMS = ("rootsiftpca", "hardnet", "hesaffnet")
@@ -43,7 +44,9 @@ FIGURES = ("nsgd", "inlier_rate", "inlier_rate_before", "corrs", "corrs_before",
 def add_arguments(commands: Any) -> None:
     parser = commands.add_parser("pipelines", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_set_arguments(parser, "pairs of each family at most, chosen by hash")
-    parser.add_argument("--pipelines", nargs="*", default=PIPELINES, help="names of presets in conf/pipeline")
+    parser.add_argument(
+        "--pipelines", nargs="*", default=PIPELINES, help="PRESET of conf/pipeline, or 'PRESET NAME=VALUE ...'"
+    )
     parser.add_argument("--overrides", nargs="*", default=[], help="of each pipeline, e.g. features.precision=int8")
     parser.add_argument("--label", default="", help="appended to the pipelines' names in the tables")
     add_measure_arguments(parser, seeds=5)
@@ -103,11 +106,13 @@ def by_features(arguments: argparse.Namespace) -> Iterator[dict[str, tuple[Pipel
     """
     groups: dict[str, dict[str, tuple[Pipeline, str]]] = {}
     for name in arguments.pipelines:
-        pipeline = presets.pipeline(name, overrides=[f"cache={arguments.cache}", *arguments.overrides])
+        preset, *own = name.split()
+        overrides = [*own, *arguments.overrides]
+        pipeline = pipeline_of(preset, f"cache={arguments.cache}", *overrides)
         extractor = pipeline.extractor
         features = extractor.extractor if isinstance(extractor, CachedFeatures) else extractor
-        made_with = {"features": configuration(features), "stages": presets.pipeline_stages(name),
-                     "overrides": arguments.overrides, "seeds": arguments.seeds}  # fmt: skip
+        made_with = {"features": configuration(features), "stages": presets.pipeline_stages(preset),
+                     "overrides": overrides, "seeds": arguments.seeds}  # fmt: skip
         label = name + arguments.label
         groups.setdefault(name.split("_")[0], {})[label] = pipeline, identity_digest(made_with)[:16]
     yield from groups.values()

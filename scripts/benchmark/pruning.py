@@ -30,7 +30,7 @@ from fmtorch.evaluation.run import select
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.storage.features import cached
 from scripts.benchmark import pruning_speed, pruning_table
-from scripts.benchmark.matched import add_set_arguments, options, sets_of
+from scripts.benchmark.matched import add_set_arguments, pruner, sets_of
 from scripts.benchmark.sheet import put
 
 console = Console(width=None if sys.stdout.isatty() else 160)
@@ -100,15 +100,9 @@ def measure(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
             continue
         features = cached(presets.build("features", extractor), arguments.cache)
         front = Pipeline(features, presets.build("matcher", "nearest"), {}, estimator)
-        pruners = {name: [stage(spec) for spec in chain.split()] for name, chain in chosen.items()}
+        pruners = {name: [pruner(spec) for spec in chain.split()] for name, chain in chosen.items()}
         for pair in track(select(select(pairs, arguments.limit), limit), extractor, console=console):
             yield from rows(front, pair, pruners)
-
-
-def stage(spec: str) -> Any:
-    """A pruner from `name` or `name:key=value,key=value`."""
-    name, _, rest = spec.partition(":")
-    return presets.build("pruner", name, **options(rest))
 
 
 def rows(front: Pipeline, pair: ImagePair, methods: dict[str, list[Any]]) -> Iterator[dict[str, Any]]:
@@ -124,6 +118,6 @@ def pruned_by(outcome: Outcome, pruners: list[Any], pipeline: Pipeline) -> Outco
     c = outcome.correspondences
     if c is None:
         return outcome
-    for pruner in pruners:
-        c = pruned(pruner, c, lambda _: pipeline.images(outcome.pair)).compact()
+    for stage in pruners:
+        c = pruned(stage, c, lambda _: pipeline.images(outcome.pair)).compact()
     return dataclasses.replace(outcome, correspondences=c)

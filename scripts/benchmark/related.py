@@ -32,8 +32,12 @@ from scripts.benchmark import related_figure, related_table
 from scripts.benchmark.estimators_table import replaced
 from scripts.benchmark.matched import add_set_arguments, console, sets_of
 from scripts.benchmark.related_pairs import UNRELATED, in_order, unrelated_pairs
+from scripts.benchmark.specs import pipeline_of
 
-PIPELINES = ["sift_fmtorch", "sift_gms", "sift_lmeds", "hardnet_fmtorch", "hesaffnet_fmtorch", "hesaffnet_gms"]
+PIPELINES = [
+    "sift_fmtorch", "sift_gms", "sift_ratio estimator=lmeds_eight_point", "hardnet_fmtorch", "hesaffnet_fmtorch",
+    "hesaffnet_gms",
+]  # fmt: skip
 SHARED = ("ratio", "one_to_one")  # pruners that come first in all of them: matches are kept behind these
 BATCH = 32  # pairs that are kept together
 FIELDS = ("x0", "x1", "mask", "quality", "lafs0", "lafs1", "size0", "size1", "key")
@@ -42,7 +46,9 @@ FIELDS = ("x0", "x1", "mask", "quality", "lafs0", "lafs1", "size0", "size1", "ke
 def add_arguments(commands: Any) -> None:
     parser = commands.add_parser("related", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_set_arguments(parser, "related pairs of each family at most, chosen by hash; others are of their photographs")
-    parser.add_argument("--pipelines", nargs="*", default=PIPELINES, help="presets of conf/pipeline")
+    parser.add_argument(
+        "--pipelines", nargs="*", default=PIPELINES, help="PRESET of conf/pipeline, or 'PRESET NAME=VALUE ...'"
+    )
     parser.add_argument("--unrelated", type=int, default=300, help="pairs of each two scenes at most, chosen by hash")
     parser.add_argument("--folder", type=Path, default=Path("related"), help="keeps features, matches and rows")
     parser.add_argument("--update", type=Path, help="put the tables between the marks of this file")
@@ -129,7 +135,7 @@ def judge(name: str, batch: str, pairs: Sequence[ImagePair], c: Correspondences,
     if path.exists():
         return
     path.parent.mkdir(parents=True, exist_ok=True)
-    pipeline = presets.pipeline(name)
+    pipeline = pipeline_of(name)
     for pruner in [stage for key, stage in pipeline.pruners.items() if key not in SHARED]:
         c = pruned(pruner, c, lambda i: pipeline.images(pairs[i])).compact()
     estimate = pipeline.estimator(c, 0).detach()

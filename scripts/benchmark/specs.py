@@ -1,4 +1,4 @@
-"""Estimators that are named in one word: PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]."""
+"""Estimators that are named in one word: PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]; a pruner may have options, too."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from fmtorch.core.stages import Estimator
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data import ImagePair
 from fmtorch.geometry import refine
+from fmtorch.pipeline.pipeline import Pipeline
 from scripts.benchmark import kept
-from scripts.benchmark.matched import options
+from scripts.benchmark.matched import pruner, split
 
 Stage = Callable[[Correspondences], Correspondences]
 Method = Callable[[ImagePair, Correspondences, int], Estimate]
@@ -33,13 +34,20 @@ def stages_of(spec: str) -> list[str]:
     return [stage for stage in spec.partition("@")[2].split("+") if stage]
 
 
+def pipeline_of(words: str, *overrides: str) -> Pipeline:
+    """The pipeline of ``PRESET[ NAME=VALUE...]``, such as ``sift_ratio estimator=msac``, with further overrides."""
+    name, *own = words.split()
+    pipeline: Pipeline = presets.pipeline(name, overrides=[*own, *overrides])
+    return pipeline
+
+
 def identity(spec: str, extra: Mapping[str, Stage] = NONE) -> str:
     """The digest of what an estimator's results depend on: options, code, learned files, versions of peers."""
-    name, _, rest = spec.partition("@")[0].partition(":")
-    stages: kept.Stages = [] if name == TRUTH else [("estimator", name, options(rest))]
-    stages += [("pruner", stage, {}) for stage in stages_of(spec) if stage not in extra]
+    name, changed = split(spec.partition("@")[0])
+    stages: kept.Stages = [] if name == TRUTH else [("estimator", name, changed)]
+    stages += [("pruner", *split(stage)) for stage in stages_of(spec) if stage not in extra]
     own = [part for stage in stages_of(spec) if stage in extra for part in (stage, extra[stage])]
-    built = [presets.build("pruner", name) for group, name, _ in stages if group == "pruner"]
+    built = [presets.build("pruner", name, **changed) for group, name, changed in stages if group == "pruner"]
     return kept.identity(stages, name, *own, *built)
 
 
@@ -48,8 +56,8 @@ def build(spec: str, extra: Mapping[str, Stage] = NONE) -> Estimator:
 
     extra: pruners that are no presets.
     """
-    name, _, rest = spec.partition("@")[0].partition(":")
-    estimator, prune = presets.build("estimator", name, **options(rest)), pruning(spec, extra)
+    name, changed = split(spec.partition("@")[0])
+    estimator, prune = presets.build("estimator", name, **changed), pruning(spec, extra)
 
     def call(c: Correspondences, seed: int = 0) -> Estimate:
         estimate: Estimate = estimator(prune(c), seed)
@@ -60,7 +68,7 @@ def build(spec: str, extra: Mapping[str, Stage] = NONE) -> Estimator:
 
 def pruning(spec: str, extra: Mapping[str, Stage] = NONE) -> Stage:
     """The pruners of a spec, in order; of nothing, the matches as they are."""
-    pruners = [extra[stage] if stage in extra else presets.build("pruner", stage) for stage in stages_of(spec)]
+    pruners = [extra[stage] if stage in extra else pruner(stage) for stage in stages_of(spec)]
     return lambda c: functools.reduce(lambda kept, pruner: pruner(kept), pruners, c)
 
 
@@ -69,7 +77,7 @@ def ngransac(file: Path) -> Stage:
     if not file.is_file():
         raise SystemExit(f"--ngransac {file}: no such file; scripts/convert_ngransac.py makes it")
     network = {"_target_": "fmtorch.pruning.networks.LC", "side": ["ratio"]}
-    stage: Stage = presets.build("pruner", "lc_soft", network=network, file=str(file))
+    stage: Stage = presets.build("pruner", "lc", soft=True, network=network, file=str(file))
     return stage
 
 

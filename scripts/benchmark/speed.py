@@ -1,6 +1,6 @@
 """Milliseconds a pair of robust estimators, one thread: one pair a call and many, peers interleaved, prior included.
 
-python -m scripts.benchmark speed --estimators fmtorch msac:confidence=null --peers poselib opencv_usac_magsac
+python -m scripts.benchmark speed --estimators fmtorch msac:confidence=null --peers poselib opencv:method=usac_magsac
 python -m scripts.benchmark speed --device cuda --batch 4000 --pairs 4000 --peers --estimators msac:confidence=null
 """
 
@@ -40,7 +40,9 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument(
         "--estimators", nargs="+", default=["fmtorch@frame_consistency"], help="PRESET[:KEY=VALUE,...][@PRUNER...]"
     )
-    parser.add_argument("--peers", nargs="*", default=["poselib", "opencv_usac_magsac"], help="the ratios' reference")
+    parser.add_argument(
+        "--peers", nargs="*", default=["poselib", "opencv:method=usac_magsac"], help="the ratios' reference"
+    )
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument(

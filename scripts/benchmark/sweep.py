@@ -1,6 +1,7 @@
 """Runs of `fmtorch.eval` in one table: a line for each family and pipeline, of pairs that all runs of a data set have.
 
-python -m scripts.benchmark sweep runs --against code_lmeds sift_code_lmeds --markdown docs/appendix/paper.md
+python -m scripts.benchmark sweep runs --against 'code estimator=lmeds_eight_point' sift_code_lmeds \\
+    --markdown docs/appendix/paper.md
 
 --against adds the differences of all other pipelines to these, on the pairs that both have.
 """
@@ -15,10 +16,12 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from fmtorch import presets
 from fmtorch.commands.report import run_folders
 from fmtorch.data.baselines import WIDE
 from fmtorch.evaluation.statistics import MERITS, PERCENT, SHARES, described, difference, scene_names
 from fmtorch.evaluation.summary import ALL, summarize
+from fmtorch.presets.former import FORMER
 from fmtorch.storage import RunFolder
 from scripts.benchmark.matched import console
 from scripts.benchmark.pipelines_table import PAPER, REAL
@@ -49,7 +52,7 @@ def run(arguments: argparse.Namespace) -> None:
     for folder in folders:
         alike = [other for other in folders if other.config["dataset"] == folder.config["dataset"]]
         table = folder.read(set.intersection(*(other.done() for other in alike)))
-        name = folder.config["pipeline"]
+        name = method_of(folder.config)
         groups |= {(family, name): group for family, group in summarize(table).items() if family != ALL}
         families = np.array(table["family"].to_pylist())
         rows |= {(family, name): table.filter(pa.array(families == family)) for family in np.unique(families)}
@@ -60,6 +63,16 @@ def run(arguments: argparse.Namespace) -> None:
         console.print(sheet.terminal())
     if arguments.markdown:
         put(arguments.markdown, sheets, MARKER)
+
+
+def method_of(config: Mapping[str, Any]) -> str:
+    """The pipeline of a run and, where it is not the pipeline's own, its estimator: ``code estimator=lmeds``."""
+    name = str(config["pipeline"])
+    if (now := FORMER["pipeline"].get(name)) is not None:
+        return " ".join((now.name, *now.overrides))
+    estimator, usual = config.get("estimator"), presets.pipeline_stages(name)
+    close = presets.closest("estimator", estimator) if usual and estimator and estimator != usual["estimator"] else None
+    return name if close is None else f"{name} estimator={close[0]}"
 
 
 def _order(places: Mapping[Place, Any]) -> list[Place]:

@@ -1,7 +1,7 @@
 """The best threshold of each estimator on tuning data: AUC@0.05 averaged over the families, so each counts alike.
 
 python -m scripts.benchmark thresholds --root DATA/castle --root DATA/fox --rendered small --split train \\
-    --values 0.35 0.5 0.75 1 1.5 2 3 --estimators poselib:prosac=true opencv_usac_magsac
+    --values 0.35 0.5 0.75 1 1.5 2 3 --estimators poselib:prosac=true opencv:method=usac_magsac
 """
 
 from __future__ import annotations

@@ -150,11 +150,11 @@ def test_the_order_of_pruners_is_part_of_the_run(root: Path, tmp_path: Path) -> 
 
 def test_sweep_gives_each_job_a_folder(root: Path, tmp_path: Path) -> None:
     run = evaluate(
-        "-m", "pipeline=sift_ratio,sift_lmeds", "dataset=fmbench", f"dataset.root={root}", "limit=1", cwd=tmp_path
+        "-m", "pipeline=sift_ratio,paper/sift_ratio", "dataset=fmbench", f"dataset.root={root}", "limit=1", cwd=tmp_path
     )
     assert run.returncode == 0, run.stderr
     folders = sorted(path.parent.name for path in (tmp_path / "runs").glob("*/*/run.json"))
-    assert [name.rsplit("-", 1)[0] for name in folders] == ["sift_lmeds", "sift_ratio"]
+    assert [name.rsplit("-", 1)[0] for name in folders] == ["paper-sift_ratio", "sift_ratio"]
 
 
 def test_a_users_own_estimator_by_config_dir(root: Path, tmp_path: Path) -> None:

@@ -222,9 +222,13 @@ def test_photographs_that_determine_no_f(pipeline: fmtorch.pipeline.pipeline.Pip
     assert (general.configuration, general.warning, general.homography) == ("general", "", None)
 
 
+LMEDS = ("estimator=lmeds_eight_point",)
+
+
 def test_an_f_of_photographs_with_nothing_in_common() -> None:
     """Some F is found, and the verdict tells that it means nothing."""
-    lenient = presets.pipeline("sift_lmeds", overrides=["features.max_features=1500", "pruner.ratio.threshold=0.95"])
+    overrides = [*LMEDS, "features.max_features=1500", "pruner.ratio.threshold=0.95"]
+    lenient = presets.pipeline("sift_ratio", overrides=overrides)
     images = stereo()[0], stereo(seed=1)[0]
     result = fmtorch.match(*images, pipeline=lenient)
     assert result.ok
@@ -265,7 +269,7 @@ def test_every_pipeline_composes_by_name(name: str, monkeypatch: pytest.MonkeyPa
 def test_overrides_and_a_callers_own_hydra() -> None:
     with initialize_config_dir(str(conf_dir()), version_base=None):
         before = GlobalHydra.instance().hydra
-        built = presets.pipeline("sift_gms_paper", overrides=["pruner.gms.with_scale=true"])
+        built = presets.pipeline("paper/sift_gms", overrides=["pruner.gms.with_scale=true"])
         assert GlobalHydra.instance().hydra is before
         assert compose("match").longest_side == 1600
     assert list(built.pruners) == ["ratio", "gms"]
@@ -337,7 +341,7 @@ def test_the_command(tmp_path: Path) -> None:
 
     # With F, of photographs that show nothing in common.
     Image.fromarray(stereo(240, 320, seed=1)[0]).save(tmp_path / "other.png")
-    other = ("image1=other.png", f"output={folder}", "pipeline=sift_lmeds", "pruner.ratio.threshold=0.95")
+    other = ("image1=other.png", f"output={folder}", "pipeline=sift_ratio", *LMEDS, "pruner.ratio.threshold=0.95")
     done = run_python("-m", "fmtorch.match", "image0=a.png", *other, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "probably not the same scene" in done.stderr

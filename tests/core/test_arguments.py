@@ -17,8 +17,9 @@ from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.commands.test_match import run_python
 from tests.laws import quick, scene, shown
 from tests.pipeline.test_pipeline import draw, pair, pipeline
+from tests.variants import built, keywords, variants
 
-EVERY = [n for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES[1:])]
+EVERY = [n for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES[1:])]
 PAIRS = [scene(i, count) for i, count in enumerate((60, 90, 40))]
 FAST = {"estimator": "msac", "hypotheses": 100}
 
@@ -151,11 +152,11 @@ def test_an_empty_batch_gives_an_empty_result(shape: tuple[int, int]) -> None:
         size0=sizes, size1=sizes, mutual=yes, noise=numbers,
     )  # fmt: skip
     for name in EVERY:
-        estimate = (quick(name) if "opencv" not in name else presets.build("estimator", name))(c)
+        estimate = (quick(name) if "opencv" not in name else built("estimator", name))(c)
         assert estimate.F.shape == (b, 3, 3), name
         assert not bool(estimate.ok.any()), name
-    for name in presets.available("pruner"):
-        assert shown(presets.build("pruner", name))(c).compact().mask.shape == (b, 0), name
+    for name in variants("pruner"):
+        assert shown(built("pruner", name))(c).compact().mask.shape == (b, 0), name
     assert len(fmtorch.find_fundamental(c.x0, c.x1)) == b
     assert len(fmtorch.find_fundamental([], [])) == 0
     F = torch.zeros(b, 3, 3)
@@ -163,14 +164,14 @@ def test_an_empty_batch_gives_an_empty_result(shape: tuple[int, int]) -> None:
     assert metrics.inlier_rate(F, c.x0, c.x1, yes, sizes, sizes).after.shape == (b,)
 
 
-@pytest.mark.parametrize("name", [n for n in presets.available("estimator") if n.startswith(("opencv", "kornia"))])
+@pytest.mark.parametrize("name", [n for n in variants("estimator") if n.startswith(("opencv", "kornia"))])
 def test_estimators_without_gradients_say_so(name: str) -> None:
     x0, x1 = PAIRS[0].x0[0].double(), PAIRS[0].x1[0].double()
-    assert bool(fmtorch.find_fundamental(x0, x1, estimator=name).ok)
+    assert bool(fmtorch.find_fundamental(x0, x1, **keywords(name)).ok)
     with pytest.raises(ValueError, match="passes no gradient on"):
-        fmtorch.find_fundamental(x0.requires_grad_(), x1, estimator=name)
+        fmtorch.find_fundamental(x0.requires_grad_(), x1, **keywords(name))
     with torch.no_grad():
-        assert bool(fmtorch.find_fundamental(x0, x1, estimator=name).ok)
+        assert bool(fmtorch.find_fundamental(x0, x1, **keywords(name)).ok)
 
 
 @pytest.mark.parametrize("wrong", [float("nan"), float("inf"), 0.0])

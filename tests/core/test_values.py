@@ -11,8 +11,9 @@ from fmtorch import metrics, presets
 from fmtorch.core.types import Correspondences, collate
 from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.laws import quick, scene
+from tests.variants import variants
 
-OWN = [n for n in presets.available("estimator") if not n.startswith(OTHER_LIBRARIES)]
+OWN = [n for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES)]
 WRONG = [
     ("prior", 1.5, r"prior of match 3 of pair 1 is 1\.5; it is P\(inlier\), within \[0, 1\]"),
     ("prior", -0.1, "prior of match 3 of pair 1 is -0.1"),
@@ -47,7 +48,7 @@ def test_wrong_values_are_named_to_who_gives_them(name: str, value: float, messa
 
 
 @pytest.mark.parametrize(("name", "value", "message"), WRONG)
-@pytest.mark.parametrize("estimator", ["msac", "irls_truncated", "cf_ransac", "opencv_ransac"])
+@pytest.mark.parametrize("estimator", ["msac", "irls:kernel=truncated", "cf_ransac", "opencv"])
 def test_wrong_values_of_one_pair_are_its_reason(estimator: str, name: str, value: float, message: str) -> None:
     built = quick(estimator) if estimator in OWN else presets.build("estimator", estimator)
     estimate = built(with_wrong(name, value), 0)

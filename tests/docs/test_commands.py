@@ -63,7 +63,7 @@ SLOW = (
     r"benchmark (paper|gc_ransac|sweep)",
 )
 
-PEERS = {"poselib": "poselib", "poselib_shared_focal": "poselib", "degensac_cpp": "pydegensac",
+PEERS = {"poselib": "poselib", "degensac_cpp": "pydegensac",
          "gc_ransac_cpp": "pygcransac", "magsac_cpp": "pymagsac", "superansac_cpp": "pysuperansac",
          "poselib_f": "poselib", "colmap": "pycolmap", "colmap_f": "pycolmap", "superansac": "pysuperansac",
 }  # fmt: skip
@@ -116,7 +116,7 @@ APPENDED = {
     "verify": ["--root", "DATA", "--scenes", "Strecha/a", "--features", "colmap", "--seeds", "1", "--mappers"],
     "speed": ["--pairs", "2", "--batch", "2", "--repeats", "1", "--matches", "200"],
     "memory": ["--pairs", "1", "--matches", "200", "--estimators", "ransac"],
-    "end_to_end": ["--limit", "1", "--pipelines", "sift_lmeds"],
+    "end_to_end": ["--limit", "1", "--pipelines", "sift_ratio estimator=lmeds_eight_point"],
     "features": ["--features", "100", "--repeats", "1", "--size", "120", "160"],
     "matching": ["--features", "200", "--repeats", "1"],
 }
@@ -162,7 +162,7 @@ def smaller(command: str) -> list[str]:
     elif name == "pipelines" and "--overrides" not in words:
         added = [*added, "--overrides", *TINY]
     if name == "speed" and importlib.util.find_spec("poselib") is None:
-        added = [*added, "--peers", "opencv_usac_magsac"]
+        added = [*added, "--peers", "opencv:method=usac_magsac"]
     return [*(word for word in words if _installed(word)), *added]
 
 

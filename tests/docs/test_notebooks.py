@@ -52,7 +52,7 @@ def test_estimate_and_draw(run: Any) -> None:
 
 def test_compare_your_estimator(run: Any) -> None:
     names = run("compare_your_estimator")
-    assert set(names["errors"]) == {"mine", "lmeds", "opencv_usac_magsac", "fmtorch"}
+    assert set(names["errors"]) == {"mine", "lmeds", "USAC_MAGSAC", "fmtorch"}
     assert all(len(errors) == len(names["pairs"]) == 8 for errors in names["errors"].values())
     assert float(np.mean(names["auc"]["fmtorch"])) > 0.2
 

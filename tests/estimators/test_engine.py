@@ -20,8 +20,9 @@ from fmtorch.estimators.parts.inliers import residuals_squared_px
 from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.estimators.pairs import pair_of
 from tests.laws import quick, scene, scenes
+from tests.variants import built, variants
 
-OWN = [n for n in presets.available("estimator") if not n.startswith((*OTHER_LIBRARIES, "homography"))]
+OWN = [n for n in variants("estimator") if not n.startswith((*OTHER_LIBRARIES, "homography"))]
 
 
 def _true_inlier_error(F: torch.Tensor, index: int, count: int) -> float:
@@ -36,9 +37,9 @@ def _true_inlier_error(F: torch.Tensor, index: int, count: int) -> float:
 @pytest.mark.parametrize("name", OWN)
 def test_recovers_the_geometry(name: str) -> None:
     # M-estimators without samples break down earlier, Huber's, whose loss is unbounded, at once.
-    outliers = 0.02 if name == "irls_huber" else 0.1 if name.startswith("irls_") else 0.3
+    outliers = 0.02 if name == "irls:kernel=huber" else 0.1 if name.startswith("irls") else 0.3
     pairs = [scene(i, 300, outliers=outliers, noise=0.2) for i in range(4)]
-    estimate = presets.build("estimator", name)(collate(pairs))
+    estimate = built("estimator", name)(collate(pairs))
     assert bool(estimate.ok.all()), estimate.reason
     for i, F in enumerate(estimate.F):
         assert _true_inlier_error(F, i, 300) < 1.0

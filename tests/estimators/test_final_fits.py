@@ -32,8 +32,8 @@ def test_which_presets_are_weighted() -> None:
     """Those of the paper are not, whatever a pruner before them supplies."""
     weighted, unweighted = names("least_squares"), names("unweighted_least_squares")
     assert {"ransac", "msac", "lmeds", "cf_ransac", "cf_ransac_usac"} <= set(weighted)
-    assert not any(n.endswith("_paper") for n in weighted)
-    assert {"ransac_paper", "msac_paper", "lmeds_paper", "cf_ransac_paper", "gc_ransac_paper"} <= set(unweighted)
+    assert not any(n.startswith("paper/") for n in weighted)
+    assert {f"paper/{name}" for name in ("ransac", "msac", "lmeds", "cf_ransac", "gc_ransac")} <= set(unweighted)
 
 
 @pytest.mark.parametrize("name", names("least_squares"))

@@ -212,7 +212,7 @@ def test_unknown_sizes_give_the_selection_without_prior() -> None:
     assert torch.equal(focal.F, plain.F)
 
 
-@pytest.mark.parametrize("name", ["fmtorch", "fmtorch_max", "fmtorch_fast"])
+@pytest.mark.parametrize("name", ["fmtorch", "fmtorch_fast"])
 def test_presets_recover_pairs_of_one_size_of_two_and_of_none(name: str) -> None:
     estimator = presets.build("estimator", name, focal={"rounds": 2, "min_rounds": 1})
     c: Correspondences = collate([scene(i, 200, outliers=0.3) for i in range(3)])

@@ -27,14 +27,14 @@ FITS: Mapping[str, Mapping[str, object]] = {
     "adaptive": {"final": "adaptive", **REFINED},
     CAMERAS: {"final": "adaptive", **REFINED, "focal": {"samples": 100, "pool": 8}},
 }
-UNMOVED = {"unweighted_least_squares": ("prior", "noise"), **{f"irls_{name}": ("noise",) for name in KERNELS}}
+UNMOVED = {"unweighted_least_squares": ("prior", "noise"), **{f"irls {name}": ("noise",) for name in KERNELS}}
 """What a fit takes no account of."""
 
 
 def estimator(name: str) -> HypothesizeAndVerify | IterativelyReweighted:
     """One whose fits converge."""
-    if name.startswith("irls_"):
-        return IterativelyReweighted(kernel=name.removeprefix("irls_"), threshold=2.0, refine_iterations=60)
+    if name.startswith("irls "):
+        return IterativelyReweighted(kernel=name.removeprefix("irls "), threshold=2.0, refine_iterations=60)
     return HypothesizeAndVerify(**(SEARCH | FITS[name]))  # type: ignore[arg-type]
 
 
@@ -58,7 +58,7 @@ def converging(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("converging")
 @pytest.mark.parametrize("same", [False, True])
-@pytest.mark.parametrize("name", [*FITS, *(f"irls_{kernel}" for kernel in KERNELS)])
+@pytest.mark.parametrize("name", [*FITS, *(f"irls {kernel}" for kernel in KERNELS)])
 def test_they_are_the_differences_of_estimates(name: str, same: bool) -> None:
     """Where residuals are small against the image: Gauss and Newton's Hessian leaves out their curvature."""
     given, built = inputs(7, 1e-3, same), estimator(name)
@@ -94,7 +94,7 @@ def told(c: Correspondences) -> Correspondences:
     return c.replace(x0=c.x0.double(), x1=c.x1.double(), noise=noise)
 
 
-@pytest.mark.parametrize("name", ["least_squares", "irls_cauchy"])
+@pytest.mark.parametrize("name", ["least_squares", "irls cauchy"])
 @pytest.mark.parametrize("kind", ["empty", "seven matches", "all points equal"])
 def test_a_batch_that_fails_can_be_differentiated(name: str, kind: str) -> None:
     """So that no batch stops a training."""
@@ -106,7 +106,7 @@ def test_a_batch_that_fails_can_be_differentiated(name: str, kind: str) -> None:
     assert not bool(gradient.any())
 
 
-@pytest.mark.parametrize("name", [*FITS, "irls_cauchy", "irls_magsac"])
+@pytest.mark.parametrize("name", [*FITS, "irls cauchy", "irls magsac"])
 def test_failed_pairs_have_none_and_change_no_other(name: str) -> None:
     """Among degenerate pairs, as alone."""
     good, built = [told(scene(1)), told(scene(2, 60))], estimator(name)

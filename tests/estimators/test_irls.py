@@ -19,7 +19,7 @@ from tests.reference import refine as reference
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_presets_name_their_kernel(kernel: str) -> None:
-    estimator = presets.build("estimator", f"irls_{kernel}")
+    estimator = presets.build("estimator", "irls", kernel=kernel)
     assert isinstance(estimator, IterativelyReweighted)
     assert estimator.kernel == kernel
 

@@ -16,8 +16,9 @@ from fmtorch.estimators import PairwiseEstimator
 from fmtorch.estimators.peers.pairwise import Pair, Solution
 from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.laws import PEERS, scene
+from tests.variants import built, variants
 
-NAMES = [n for n in presets.available("estimator") if n.startswith(OTHER_LIBRARIES)]
+NAMES = [n for n in variants("estimator") if n.startswith(OTHER_LIBRARIES)]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -27,7 +28,7 @@ def test_recovers_the_geometry_in_a_batch(name: str) -> None:
     pairs = [scene(0, 300, outliers=0.3, noise=0.1), scene(1, 5), scene(2, 200, outliers=0.2, noise=0.1)]
     batch = collate(pairs)
     options = {"rounds": 2} if name == "kornia_ransac" else {}
-    estimate = presets.build("estimator", name, **options)(batch)
+    estimate = built("estimator", name, **options)(batch)
     assert estimate.ok.tolist() == [True, False, True]
     assert "5 matches" in estimate.reason[1]
     for i in (0, 2):
@@ -42,10 +43,10 @@ def test_recovers_the_geometry_in_a_batch(name: str) -> None:
 def test_a_missing_library_is_named(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, PEERS[name], None)
     with pytest.raises(ImportError, match=rf"{PEERS[name]}.*fmtorch\[peers\]"):
-        presets.build("estimator", name)
+        built("estimator", name)
 
 
-@pytest.mark.parametrize("name", ["poselib", "poselib_shared_focal"])
+@pytest.mark.parametrize("name", ["poselib", "poselib:shared_focal=true"])
 def test_poselib_gets_the_options_that_are_named(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[tuple[np.ndarray, dict[str, object], dict[str, object]]] = []
 
@@ -60,24 +61,24 @@ def test_poselib_gets_the_options_that_are_named(name: str, monkeypatch: pytest.
     monkeypatch.setitem(sys.modules, "poselib", known)
     c = scene(0, 40)
     named = {"threshold": 0.5, "iterations": 500, "prosac": True, "loss": "huber", "loss_scale": 0.3}
-    presets.build("estimator", name, **named)(c, 7)
+    built("estimator", name, **named)(c, 7)
     x0, options, refinement = seen.pop()
     expected = {"max_epipolar_error": 0.5, "success_prob": 0.9999, "max_iterations": 500, "min_iterations": 500}
     assert options == expected | {"progressive_sampling": True, "seed": 7}
     assert refinement == {"loss_type": "HUBER", "loss_scale": 0.3}
     with pytest.raises(ValueError, match="loss is 'l3'; it must be one of: trivial, truncated"):
-        presets.build("estimator", name, loss="l3")
-    if name == "poselib_shared_focal":
+        built("estimator", name, loss="l3")
+    if name == "poselib:shared_focal=true":
         with pytest.raises(ValueError, match="real_focal_check is of fundamental matrices alone"):
-            presets.build("estimator", name, real_focal_check=True)
+            built("estimator", name, real_focal_check=True)
     else:
-        presets.build("estimator", name, real_focal_check=True, prosac=True)(c)
+        built("estimator", name, real_focal_check=True, prosac=True)(c)
         centred, options, _ = seen.pop()
         assert options["real_focal_check"] is True
         assert np.allclose(x0 - centred, [(c.size0[0, 1] - 1) / 2, (c.size0[0, 0] - 1) / 2])
         monkeypatch.setattr(known, "RansacOptions", dict)
         with pytest.raises(ValueError, match="no real_focal_check"):
-            presets.build("estimator", name, real_focal_check=True)
+            built("estimator", name, real_focal_check=True)
 
 
 def test_the_check_of_focal_lengths_leaves_pixels_as_they_are() -> None:
@@ -106,7 +107,7 @@ def test_unknown_parts_of_superansac_are_refused_with_the_choices() -> None:
 @pytest.mark.parametrize("name", ["magsac_cpp", "gc_ransac_cpp"])
 def test_an_unknown_sampler_is_refused_with_the_choices(name: str) -> None:
     with pytest.raises(ValueError, match="sampler is 'napsac'; it must be one of: uniform, prosac, progressive_napsac"):
-        presets.build("estimator", name, sampler="napsac")
+        built("estimator", name, sampler="napsac")
 
 
 @pytest.mark.parametrize("flags", [0, 1])
@@ -165,8 +166,8 @@ def test_a_binding_gets_whole_numbers_that_it_takes(name: str) -> None:
     good = scene(0, 300, outliers=0.3, noise=0.1)
     huge = good.replace(x0=1e12 * good.x0.double(), x1=1e12 * good.x1.double(), size0=None, size1=None)
     for seed in (2**31, -(2**40)):
-        estimate = presets.build("estimator", name)(collate([good.replace(size0=None, size1=None), huge]), seed)
+        estimate = built("estimator", name)(collate([good.replace(size0=None, size1=None), huge]), seed)
         assert bool(estimate.ok[0])
         assert estimate.reason[1] == "" or "pybind" not in estimate.reason[1]
     with pytest.raises(ValueError, match="must be a whole number from 1 to 2147483647"):
-        presets.build("estimator", name, iterations=2**31)
+        built("estimator", name, iterations=2**31)

@@ -135,10 +135,10 @@ def test_unknown_parts_and_options(options: dict[str, object], told: str) -> Non
         local_feature(**options)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("name", [f"{p}_{s}" for p in PIPELINES for s in ("ratio", "ratio_paper")])
+@pytest.mark.parametrize("name", [f"{s}{p}_ratio" for p in PIPELINES for s in ("", "paper/")])
 def test_pipelines_of_the_features_table(name: str) -> None:
     pipeline = presets.pipeline(name)
-    paper = name.endswith("_paper")
+    paper = name.startswith("paper/")
     assert list(pipeline.pruners) == (["ratio"] if paper else ["ratio", "one_to_one"])
     assert pipeline.pruners["ratio"].threshold == 0.8  # type: ignore[attr-defined]
     detector = HessianDetector if "hesaff" in name else SIFT
@@ -146,7 +146,7 @@ def test_pipelines_of_the_features_table(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", [f"{p}_{s}" for p in ("rootsiftpca", "hardnet", "hesaffnet") for s in ("gms", "gms_paper")]
+    "name", [f"{s}{p}_gms" for p in ("rootsiftpca", "hardnet", "hesaffnet") for s in ("", "paper/")]
 )
 def test_pipelines_of_the_systems_table(name: str) -> None:
     pipeline = presets.pipeline(name)

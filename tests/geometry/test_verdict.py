@@ -10,15 +10,15 @@ import pytest
 import torch
 
 import fmtorch
-from fmtorch import presets
 from fmtorch.core.stages import Estimator
 from fmtorch.core.types import RELATED, Correspondences, Estimate, collate
 from fmtorch.geometry import significance
 from fmtorch.geometry.verdict import judged
 from tests.laws import degenerate, quick, scene
+from tests.variants import variants
 
-ESTIMATORS = [n for n in presets.available("estimator") if "_cpp" not in n and n != "homography"]
-NOT_ROBUST = ("irls_huber", "irls_cauchy")  # against three wrong matches in ten
+ESTIMATORS = [n for n in variants("estimator") if "_cpp" not in n and n != "homography"]
+NOT_ROBUST = ("irls:kernel=huber", "irls:kernel=cauchy")  # against three wrong matches in ten
 
 
 @functools.cache

@@ -6,27 +6,27 @@ import pytest
 import torch
 
 import fmtorch
-from fmtorch import presets
 from tests.laws import scene
+from tests.variants import built, keywords, variants
 
 
 def says_what_gradients_reach(name: str) -> bool:
     """Whether a preset is of our own; peers may not be installed."""
     try:
-        return hasattr(presets.build("estimator", name), "gradients_reach")
+        return hasattr(built("estimator", name), "gradients_reach")
     except ImportError:
         return False
 
 
-OWN = [name for name in presets.available("estimator") if says_what_gradients_reach(name) and name != "homography"]
+OWN = [name for name in variants("estimator") if says_what_gradients_reach(name) and name != "homography"]
 C = scene(1, 60, outliers=0.2)
 
 
 REFUSED = {
-    "usac_paper": ("x0", "prior"),
-    **dict.fromkeys((name for name in OWN if name.endswith("_paper") and name != "usac_paper"), ("prior",)),
+    "paper/usac": ("x0", "prior"),
+    **dict.fromkeys((name for name in OWN if name.startswith("paper/") and name != "paper/usac"), ("prior",)),
 }
-"""Gradients that the final fit takes no account of: that of usac_paper is none, those of the others are unweighted."""
+"""Gradients that the final fit takes no account of: that of paper/usac is none, those of the others are unweighted."""
 
 
 @pytest.mark.parametrize("name", OWN)
@@ -35,16 +35,16 @@ def test_a_gradient_arrives_or_is_refused(name: str, field: str) -> None:
     values = {key: getattr(C, key).double() for key in ("x0", "x1", "prior")}
     asked = values[field].requires_grad_()
     if field in REFUSED.get(name, ()):
-        said = f"{field} requires a gradient, and the final fit of estimator={name} passes none"
+        said = f"{field} requires a gradient, and the final fit of estimator={name.partition(':')[0]} passes none"
         with pytest.raises(ValueError, match=said):
-            fmtorch.find_fundamental(**values, estimator=name, key=C.key)
+            fmtorch.find_fundamental(**values, **keywords(name), key=C.key)
         return
-    estimate = fmtorch.find_fundamental(**values, estimator=name, key=C.key)
+    estimate = fmtorch.find_fundamental(**values, **keywords(name), key=C.key)
     (gradient,) = torch.autograd.grad(estimate.F.square().sum() + estimate.F.sum(), asked)
     assert bool(gradient.any())
 
 
-@pytest.mark.parametrize("name", ["usac_paper", "cf_ransac_paper"])
+@pytest.mark.parametrize("name", ["paper/usac", "paper/cf_ransac"])
 def test_without_a_gradient_they_go_on(name: str) -> None:
     x0 = C.x0.double().requires_grad_()
     with torch.no_grad():

@@ -220,7 +220,7 @@ def test_matches_that_are_none_are_dropped() -> None:
 
 def test_prior_is_higher_for_right_matches_and_can_stand_alone() -> None:
     c, right = warped(12, 1000, 0.6)
-    soft, hard = presets.build("pruner", "code", prune=False)(c), presets.build("pruner", "code")(c)
+    soft, hard = presets.build("pruner", "code", soft=True)(c), presets.build("pruner", "code")(c)
     assert torch.equal(soft.mask, c.mask)
     assert torch.equal(soft.prior, hard.prior)
     assert ((soft.prior >= 0) & (soft.prior <= 1)).all()

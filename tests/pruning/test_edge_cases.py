@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from fmtorch import presets
 from fmtorch.core.types import Correspondences
 from tests.laws import calibrated, quick_pruner, scene
+from tests.variants import built, variants
 
-PRUNERS = presets.available("pruner")
+PRUNERS = variants("pruner")
 PER_MATCH = ("x0", "x1", "quality", "prior", "lafs0", "lafs1", "mutual")
 H, W = 640, 960
 
@@ -55,16 +55,16 @@ def test_edge_case(name: str, case: str) -> None:
         assert not pruned.prior[~c.mask].any()
 
 
-@pytest.mark.parametrize("name", ["gms", "lpm", "gms_soft", "lpm_soft", "position_consistency"])
+@pytest.mark.parametrize("name", ["gms", "lpm", "gms:soft=true", "lpm:soft=true", "position_consistency"])
 def test_matches_that_all_move_alike_in_one_cell_are_kept(name: str) -> None:
     c = edge_cases()["one cell"].replace(quality=None, lafs0=None, lafs1=None, prior=None)
-    pruned = presets.build("pruner", name)(c)
+    pruned = built("pruner", name)(c)
     assert pruned.mask.all()
     if name not in ("gms", "lpm"):
         assert pruned.prior.min() > 0.5
 
 
-MOST = [name for name in PRUNERS if name != "code"]  # code_soft does the same work, tests/pruning/test_code.py the rest
+MOST = [name for name in PRUNERS if name != "code"]  # its soft form does the same work; test_code.py does the rest
 MANY = """
 import sys, torch
 from tests.laws import calibrated, quick_pruner, scene

@@ -16,12 +16,13 @@ from fmtorch.compiling.kernel import kernel
 from fmtorch.core.types import Correspondences
 from fmtorch.pruning import knn_kernels
 from tests.laws import degenerate, scene, scenes, small, with_padding
+from tests.variants import built
 
 pytest.importorskip("numba", reason="numba is not installed")
 
 PRUNERS = (
-    "frame_consistency", "gms", "gms_soft", "lpm", "lpm_soft", "match_noise", "one_to_one", "position_consistency",
-    "ratio_prior",
+    "frame_consistency", "gms", "gms:soft=true", "lpm", "lpm:soft=true", "match_noise", "one_to_one",
+    "position_consistency", "ratio_prior",
 )  # fmt: skip
 SEARCHED = {"with_rotation": True, "with_scale": True}
 
@@ -29,7 +30,7 @@ SEARCHED = {"with_rotation": True, "with_scale": True}
 def both_forms(
     c: Correspondences, name: str, monkeypatch: pytest.MonkeyPatch, **options: object
 ) -> tuple[Correspondences, Correspondences]:
-    stage = presets.build("pruner", name, **options)
+    stage = built("pruner", name, **options)
     monkeypatch.setenv(switch.SWITCH, "on")
     compiled = stage(c)
     monkeypatch.setenv(switch.SWITCH, "off")
@@ -72,7 +73,7 @@ def test_both_forms_are_alike(name: str, monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_gms_that_searches_rotations_and_scales(monkeypatch: pytest.MonkeyPatch) -> None:
     for what, c in inputs():
-        for name in ("gms", "gms_soft"):
+        for name in ("gms", "gms:soft=true"):
             assert_alike(both_forms(c, name, monkeypatch, **SEARCHED, border="authors"), what)
 
 
@@ -84,7 +85,7 @@ def test_both_forms_are_alike_on_real_matches(
         assert_alike(both_forms(c, name, monkeypatch), f"pair {i}")
 
 
-@pytest.mark.parametrize("name", ["position_consistency", "gms_soft", "lpm_soft", "gms", "lpm", "one_to_one"])
+@pytest.mark.parametrize("name", ["position_consistency", "gms:soft=true", "lpm:soft=true", "gms", "lpm", "one_to_one"])
 def test_double_precision_is_served(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """GMS and LPM decide alike; agreement is computed in float32, in which points of a curve's cell are rounded."""
     c = scene(3, 300)

@@ -17,8 +17,9 @@ from tests.pruning.test_gms import moving as moving_on_grids
 from tests.pruning.test_lpm import moving
 from tests.reference.gms import SCALES, normalised, run, support
 from tests.reference.lpm import passes
+from tests.variants import built
 
-SOFT = ("gms_soft", "lpm_soft", "code_soft", "ratio_prior", "position_consistency", "frame_consistency")
+SOFT = ("gms:soft=true", "lpm:soft=true", "code:soft=true", "ratio_prior", "position_consistency", "frame_consistency")
 
 
 def test_logistic() -> None:
@@ -77,11 +78,11 @@ def test_soft_stages_keep_every_match_and_tell_right_from_wrong(name: str) -> No
     c = scene(5, 600).replace(prior=None)
     n = c.mask.shape[1]
     mask = torch.arange(n)[None] % 7 != 0
-    soft = presets.build("pruner", name)(c.replace(mask=mask))
+    soft = built("pruner", name)(c.replace(mask=mask))
     assert torch.equal(soft.mask, mask)
     assert ((soft.prior >= 0) & (soft.prior <= 1)).all()
     assert not soft.prior[~mask].any()
-    if name not in ("code_soft", "frame_consistency"):  # the scene's frames are random, and tell nothing
+    if name not in ("code:soft=true", "frame_consistency"):  # the scene's frames are random, and tell nothing
         assert 0.05 < float(soft.prior[mask].mean()) < 0.95
 
 
@@ -90,22 +91,22 @@ def test_priors_follow_the_right_matches_of_a_common_motion() -> None:
     turn = torch.tensor([[0.95, 0.2], [-0.2, 0.95]])
     right = (x1 - x0 @ turn - torch.tensor([30.0, 10.0])).norm(dim=-1)[0] < 3
     c = scene(0, 1000).replace(x0=x0, x1=x1, quality=None, lafs0=None, lafs1=None, prior=None)
-    for name in ("gms_soft", "lpm_soft", "position_consistency", "code_soft"):
-        prior = presets.build("pruner", name)(c).prior[0]
+    for name in ("gms:soft=true", "lpm:soft=true", "position_consistency", "code:soft=true"):
+        prior = built("pruner", name)(c).prior[0]
         area = (prior[right][:, None] > prior[~right][None]).double().mean()
         assert area > 0.9, name
         assert prior[right].median() > 0.5, name
         assert prior[~right].median() < 0.2, name
 
 
-@pytest.mark.parametrize("name", ["gms", "lpm", "code"])
-def test_hard_and_soft_form_agree(name: str) -> None:
-    c = scene(6, 500).replace(prior=None)
-    soft = presets.build("pruner", f"{name}_soft")(c)
-    options = presets.load("pruner", f"{name}_soft")
-    both = presets.build("pruner", name, **{k: v for k, v in options.items() if k == "calibration"})(c)
-    assert torch.equal(both.prior, soft.prior)
-    assert torch.equal(both.mask, presets.build("pruner", name)(c).mask)
+@pytest.mark.parametrize("name", ["gms", "lpm"])
+def test_the_hard_form_leaves_the_prior_and_the_soft_form_the_matches(name: str) -> None:
+    c = scene(6, 500)
+    hard, soft = presets.build("pruner", name)(c), presets.build("pruner", name, soft=True)(c)
+    assert torch.equal(hard.prior, c.prior)
+    assert not torch.equal(hard.mask, c.mask)
+    assert torch.equal(soft.mask, c.mask)
+    assert not torch.equal(soft.prior, c.prior)
 
 
 def test_likely_makes_a_filter_of_a_prior() -> None:
@@ -119,4 +120,4 @@ def test_likely_makes_a_filter_of_a_prior() -> None:
 def test_a_stage_that_would_do_nothing_is_refused() -> None:
     for stage in (GMS, LPM):
         with pytest.raises(ValueError, match="calibration"):
-            stage(prune=False)
+            stage(soft=True)

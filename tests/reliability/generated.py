@@ -38,9 +38,11 @@ import fmtorch
 from fmtorch import geometry, matching, metrics, presets, pruning
 from fmtorch.core.annotations import arguments_of, arrays_of
 from fmtorch.core.types import Correspondences, Estimate, Features, collate
+from fmtorch.presets.objects import merged
 from tests.laws import PEERS, calibrated, few, quick_pruner
 from tests.reliability.arguments import KINDS, MISTAKES, NUMBERS, SEQUENCES, Scene, batches, scenes
 from tests.reliability.arguments import given as as_given
+from tests.variants import keywords, loaded, variants
 
 HOME = str(Path(fmtorch.__file__).parent)
 MINIMAL_SAMPLE = 7
@@ -213,7 +215,7 @@ def estimation(name: str, options: dict[str, Any], data: st.DataObject) -> tuple
     mistaken(data, arguments, {"seed": None}, movable=False)
     if find is fmtorch.find_fundamental and (focal := data.draw(st.sampled_from(FOCALS), label="focal")) is not None:
         options = {key: value for key, value in options.items() if key != "focal"} | {"focal": focal}
-    call = functools.partial(find, **arguments, estimator=name, **options)
+    call = functools.partial(find, **arguments, estimator=name.partition(":")[0], **options)
     return call, {*known}, sound_estimate
 
 
@@ -341,7 +343,7 @@ def sound_match(result: Any) -> None:
 
 def installed_estimators() -> list[str]:
     """The presets whose library is there: those of peers need an extra."""
-    return [n for n in presets.available("estimator") if n not in PEERS or importlib.util.find_spec(PEERS[n])]
+    return [n for n in variants("estimator") if n not in PEERS or importlib.util.find_spec(PEERS[n])]
 
 
 def subjects(names: list[str]) -> list[Subject]:
@@ -354,9 +356,10 @@ def subjects(names: list[str]) -> list[Subject]:
     for kind in (Correspondences, Features, Estimate):
         made[f"types.{kind.__name__}"] = functools.partial(functools.partial, record, kind)
     for name in installed_estimators():
-        options = few(presets.load("estimator", name), 200, 100)
+        options = merged(keywords(name), few(loaded("estimator", name), 200, 100))
+        del options["estimator"]
         made[f"find_fundamental.{name}"] = functools.partial(functools.partial, estimation, name, options)
-    for name in presets.available("pruner"):
+    for name in variants("pruner"):
         made[f"pruner.{name}"] = functools.partial(_stage, name)
     made["fmtorch.match"] = lambda: functools.partial(photographs, {name: _pipeline(name) for name in PIPELINES})
     return [Subject(name, draw()) for name, draw in made.items() if not names or name.startswith(tuple(names))]

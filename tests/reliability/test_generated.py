@@ -9,9 +9,10 @@ from typing import Any
 
 import pytest
 
-from fmtorch import geometry, matching, metrics, presets, pruning
+from fmtorch import geometry, matching, metrics, pruning
 from tests.processes import run_command
 from tests.reliability.generated import installed_estimators
+from tests.variants import variants
 
 BOUNDED = 4  # calls of each subject
 WHOLE = {
@@ -38,7 +39,7 @@ def test_some_calls_of_everything(tmp_path: Path) -> None:
         names = {name for name in module.__all__ if name.islower()}
         assert {f"{module.__name__.removeprefix('fmtorch.')}.{name}" for name in names} <= called
     assert {f"find_fundamental.{name}" for name in installed_estimators()} <= called
-    assert {f"pruner.{name}" for name in presets.available("pruner")} <= called
+    assert {f"pruner.{name}" for name in variants("pruner")} <= called
     assert sum(line.get("sound", 0) for line in found) > len(found)
 
 

@@ -35,7 +35,7 @@ def test_tables_stand_between_their_markers(tmp_path: Path) -> None:
         for i, family in enumerate(families)
     ]
     items = [(pair, scene(i, 60, outliers=0.1)) for i, pair in enumerate(pairs)]
-    specs = ["ransac:hypotheses=50", "opencv_ransac", "fmtorch@position_consistency"]
+    specs = ["ransac:hypotheses=50", "opencv", "fmtorch@position_consistency"]
     results = estimators.measure(specs, items, 2)
     assert all((r["ms"] > 0).all() and r["nsgd"].shape == (2, 4) for r in results.values())
     assert (results[specs[0]]["nsgd"] > 0.01).all()  # the "true" matrices have nothing to do with the matches

@@ -55,7 +55,7 @@ def test_a_line_that_was_cut_off_goes_and_other_files_stay_as_they_are(tmp_path:
 
 def test_estimators_go_on_where_they_were_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     items = [(pair, scene(i, 60, outliers=0.3)) for i, pair in enumerate(unread_pairs(3))]
-    some, path = ["opencv_lmeds", "opencv_ransac@ratio_prior"], tmp_path / "rows.jsonl"
+    some, path = ["opencv:method=lmeds", "opencv@ratio_prior"], tmp_path / "rows.jsonl"
     whole = estimators.measure(some, items, 2)
     with monkeypatch.context() as patch:
         patch.setattr(estimators, "_row", interrupted_at(5, estimators._row))
@@ -68,7 +68,7 @@ def test_estimators_go_on_where_they_were_interrupted(tmp_path: Path, monkeypatc
     monkeypatch.setattr(estimators, "_row", interrupted_at(0, estimators._row))
     again = estimators.measure(some, items, 2, kept=Kept(path))  # measures nothing
     assert all(np.array_equal(again[spec][name], first[spec][name]) for spec in some for name in ("nsgd", "ms"))
-    for other in ({"specs": ["opencv_lmeds:confidence=0.9"]}, {"seeds": 3}, {"matches": "others"}):
+    for other in ({"specs": ["opencv:method=lmeds,confidence=0.9"]}, {"seeds": 3}, {"matches": "others"}):
         with pytest.raises(KeyboardInterrupt):
             estimators.measure(**({"specs": some, "items": items, "seeds": 2, "kept": Kept(path)} | other))
 
@@ -107,7 +107,7 @@ def test_what_a_row_was_made_with_is_options_code_and_learned_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(kept, "libraries", lambda others: dict.fromkeys(others, "1"))  # PoseLib may be absent
-    names = ["usac", "usac:threshold=0.7", "usac@ratio_prior", "poselib", "truth", "truth@lc_soft"]
+    names = ["usac", "usac:threshold=0.7", "usac@ratio_prior", "poselib", "truth", "truth@lc:soft=true"]
     before = [specs.identity(name) for name in names]
     assert len(set(before)) == len(names)
     assert [specs.identity(name) for name in names] == before

@@ -26,8 +26,8 @@ def test_tables_put_each_figure_beside_the_papers() -> None:
     rows = []
     for family in ("TUM", "orbit"):
         for pair in range(12):
-            rows += [row("sift_ratio_paper", family, pair, 0.2), row("sift_ratio_paper vlfeat", family, pair, 0.2)]
-            rows.append(row("sift_lmeds_paper vlfeat", family, pair, 0.01 if pair % 4 else 0.2))
+            rows += [row("paper/sift_ratio", family, pair, 0.2), row("paper/sift_ratio vlfeat", family, pair, 0.2)]
+            rows.append(row("paper/sift_ratio estimator=paper/lmeds vlfeat", family, pair, 0.01 if pair % 4 else 0.2))
     sheets = paper_table.tables(rows)
     assert [sheet.title.split(":")[0] for sheet in sheets] == [
         "Matches before estimation", "TUM", "orbit", "Differences of %Recall, real pairs",
@@ -53,13 +53,13 @@ def test_systems_are_compared_on_the_pairs_that_both_have() -> None:
 
     rows = {
         ("TUM", "hesaffnet_gms"): table(range(30), 0.2),
-        ("TUM", "code_lmeds"): table(range(10, 50), 0.0),
+        ("TUM", "code estimator=lmeds_eight_point"): table(range(10, 50), 0.0),
         ("TUM", "sift_ratio"): table(range(50, 60), 0.0),
         ("orbit", "hesaffnet_gms"): table(range(30), 0.0),
     }
-    sheet = sweep.differences(rows, ["code_lmeds"])
-    assert [line[0] for line in sheet.rows] == ["TUM: `hesaffnet_gms` - `code_lmeds`"]  # no pair in common: left out
-    (line,) = sheet.rows
+    sheet = sweep.differences(rows, ["code estimator=lmeds_eight_point"])
+    (line,) = sheet.rows  # no pair in common: left out
+    assert line[0] == "TUM: `hesaffnet_gms` - `code estimator=lmeds_eight_point`"
     assert line[1] == "20 pairs of 1 scene, intervals over pairs"
     assert [cell.split(" ")[0] for cell in line[2:]] == ["-100.0", "-100.0", "-100.0", "-1.1"]  # 66.4 - 67.5
 

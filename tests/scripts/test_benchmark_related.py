@@ -91,6 +91,9 @@ def test_roc_goes_from_all_to_none_and_is_drawn_the_same_every_time(tmp_path: Pa
     assert {"sift_a", "sift_b (along the axes)", "unrelated pairs accepted, %", "right pairs rejected, %"} <= set(texts)
 
 
+LMEDS = "sift_ratio estimator=lmeds_eight_point"
+
+
 def test_an_interrupted_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for seed, scene in enumerate(("a", "b")):
         images = tmp_path / "Set" / scene / "Images"
@@ -102,20 +105,20 @@ def test_an_interrupted_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     page = tmp_path / "page.md"
     page.write_text("<!-- related -->\n<!-- end related -->\n")
     arguments = argparse.Namespace(
-        root=[str(tmp_path / "Set")], rendered=None, split="test", limit=None, pipelines=["sift_lmeds", "sift_gms"],
+        root=[str(tmp_path / "Set")], rendered=None, split="test", limit=None, pipelines=[LMEDS, "sift_gms"],
         unrelated=3, folder=tmp_path / "kept", update=page, marker="related",
         figure=tmp_path / "roc.svg",
     )  # fmt: skip
     monkeypatch.setattr(related, "BATCH", 2)
     related.run(arguments)
     rows = related.read(arguments.folder, arguments.pipelines)
-    assert {name: len(found) for name, found in rows.items()} == {"sift_lmeds": 5, "sift_gms": 5}
-    assert [r["true"] for r in sorted(rows["sift_lmeds"], key=lambda r: r["pair"])].count(True) == 2
-    assert all(r["significance"] > RELATED for r in rows["sift_lmeds"] if r["true"])
-    assert not any(r["significance"] >= RELATED for r in rows["sift_lmeds"] if not r["true"])
+    assert {name: len(found) for name, found in rows.items()} == {LMEDS: 5, "sift_gms": 5}
+    assert [r["true"] for r in sorted(rows[LMEDS], key=lambda r: r["pair"])].count(True) == 2
+    assert all(r["significance"] > RELATED for r in rows[LMEDS] if r["true"])
+    assert not any(r["significance"] >= RELATED for r in rows[LMEDS] if not r["true"])
     text = page.read_text()
     assert "sift_gms" in text
-    assert "sift_lmeds" in arguments.figure.read_text()
+    assert LMEDS in arguments.figure.read_text()
 
     next((tmp_path / "kept" / "rows" / "sift_gms").iterdir()).unlink()
     monkeypatch.setattr(related.Pipeline, "match", lambda *_: pytest.fail("matches are kept"))

@@ -132,7 +132,7 @@ def test_an_interrupted_run_goes_on_and_its_tables_stand_in_the_page(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     specs = tmp_path / "specs.txt"
-    specs.write_text("opencv_lmeds\n(opencv_lmeds@ratio_prior+sizeless)\n")
+    specs.write_text("opencv:method=lmeds\n(opencv:method=lmeds@ratio_prior+sizeless)\n")
     page = tmp_path / "page.md"
     names = [f"stress {sweep}" for sweep in ("noise", "conditions")]
     page.write_text("".join(f"<!-- {name} -->\n<!-- end {name} -->\n" for name in names))
@@ -152,8 +152,8 @@ def test_an_interrupted_run_goes_on_and_its_tables_stand_in_the_page(
     assert rows[: len(first)] == first
     assert len(rows) == 2 * len(first)
     text = page.read_text()
-    assert "| opencv_lmeds |" in text
-    assert "opencv_lmeds, no sizes" in text
+    assert "| opencv, method=lmeds |" in text
+    assert "opencv, method=lmeds, no sizes" in text
     assert "as they are (2)" in text
     ElementTree.parse(tmp_path / "stress_noise.svg")
     assert "stress_noise.svg" in text

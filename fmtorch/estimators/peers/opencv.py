@@ -16,8 +16,8 @@ def opencv(
     USAC_PROSAC gets the matches best first, as it expects.
 
     Args:
-        method: name of OpenCV's constant, e.g. FM_RANSAC, FM_LMEDS, USAC_MAGSAC.
-        threshold: pixels, point to epipolar line (FM_RANSAC) or Sampson distance (USAC_*).
+        method: name of OpenCV's constant in any case, ransac, lmeds or usac_*; FM_RANSAC and FM_LMEDS as well.
+        threshold: pixels, point to epipolar line (ransac) or Sampson distance (usac_*).
         confidence: of having drawn a sample without an outlier, at which the search ends.
         iterations: samples at most.
 
@@ -27,9 +27,11 @@ def opencv(
     Raises:
         ValueError: for a name that is no such constant.
     """
-    code = getattr(cv2, method, None)
-    if code is None or not method.startswith(("FM_", "USAC_")):
-        raise ValueError(f"method is {method!r}; it must name one of cv2's constants FM_* or USAC_*")
+    name = method.upper()
+    name = f"FM_{name}" if name in ("RANSAC", "LMEDS") else name
+    code = getattr(cv2, name, None)
+    if code is None or not name.startswith(("FM_", "USAC_")):
+        raise ValueError(f"method is {method!r}; it must be ransac, lmeds, or one of cv2's constants USAC_* or FM_*")
 
     def solve(pair: Pair) -> Solution:
         F, mask = cv2.findFundamentalMat(pair.x0, pair.x1, int(code), threshold, confidence, iterations)
@@ -37,4 +39,4 @@ def opencv(
             return None, np.zeros(len(pair.x0), dtype=np.bool_)
         return F.astype(np.float64), mask.ravel().astype(np.bool_)
 
-    return PairwiseEstimator(f"OpenCV {method}", solve, best_first=method == "USAC_PROSAC")
+    return PairwiseEstimator(f"OpenCV {name}", solve, best_first=name == "USAC_PROSAC")

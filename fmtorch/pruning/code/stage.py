@@ -91,7 +91,7 @@ def coherence(
 class CODE:
     """`code` as a stage, which also supplies ``prior``: P(inlier).
 
-    The odds are ``odds (max(likelihood, 0) + floor)^3 / (1 + (residual / reach)^2)``. prune: False keeps every match
+    The odds are ``odds (max(likelihood, 0) + floor)^3 / (1 + (residual / reach)^2)``. soft: True keeps every match
     and gives the prior only. likelihood, motion: options of `LikelihoodField` and `SmoothMotion`.
     """
 
@@ -103,11 +103,11 @@ class CODE:
         reach: float,
         least_likelihood: float = MIN_LIKELIHOOD,
         largest_residual: float = LARGEST_RESIDUAL,
-        prune: bool = True,
+        soft: bool = False,
         likelihood: Mapping[str, Any] | None = None,
         motion: Mapping[str, Any] | None = None,
     ) -> None:
-        self.odds, self.floor, self.reach, self.prune = odds, floor, reach, prune
+        self.odds, self.floor, self.reach, self.soft = odds, floor, reach, soft
         self.least_likelihood, self.largest_residual = least_likelihood, largest_residual
         self.likelihood, self.motion = LikelihoodField(**(likelihood or {})), SmoothMotion(**(motion or {}))
 
@@ -120,6 +120,6 @@ class CODE:
         evidence = result.likelihood.clamp_min(0) + self.floor
         odds = self.odds * evidence * evidence * evidence / (1 + (result.residual / self.reach).square())
         c = c.replace(prior=(odds / (1 + odds)).to(c.x0.dtype))
-        if not self.prune:
+        if self.soft:
             return c
         return c.keep((result.likelihood > self.least_likelihood) & (result.residual < self.largest_residual))

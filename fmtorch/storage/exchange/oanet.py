@@ -62,7 +62,7 @@ def oanet_pairs(root: Path, images: Path | None) -> Iterator[ImagePair]:
 
 
 def _pair(file: Any, path: Path, family: str, key: str, images: Path | None) -> ImagePair:
-    scene, identity = path.stem, f"{family}/{path.stem}/{key}"
+    scene, identity = path.stem, f"{path.stem}/{key}"
     sources = image(family, scene, f"{key}/1", images), image(family, scene, f"{key}/2", images)
     try:
         K = _calibration(file, key, 1), _calibration(file, key, 2)

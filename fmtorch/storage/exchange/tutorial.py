@@ -74,7 +74,7 @@ def tutorial_pairs(root: Path, images: Path | None) -> Iterator[ImagePair]:
             names = h5.keys(file)
         with contextlib.ExitStack() as files:
             cameras = _Cameras(folder, files)
-            pairs = [_pair(root.name, folder, key, cameras, images) for key in names]
+            pairs = [_pair(root, folder, key, cameras, images) for key in names]
         yield from with_fundamentals(pairs) if cameras.by_image else pairs
 
 
@@ -103,6 +103,7 @@ class _Cameras:
                         self.by_image[name] = h5.reshaped(R, name, 3, 3), h5.reshaped(T, name, 3)
                     except DataError as error:
                         self.problems[name] = str(error)
+        self._known = {*self.by_image, *self.problems}
 
     def image(self, family: str, name: str, images: Path | None) -> ImageSource:
         """An image of the scene, the same object for all pairs that show it."""
@@ -114,14 +115,13 @@ class _Cameras:
         """The two images of a pair; their names may hold hyphens too."""
         parts = key.split("-")
         ways = [("-".join(parts[:i]), "-".join(parts[i:])) for i in range(1, len(parts))]
-        known = {*self.by_image, *self.problems}
         for a, b in ways:
-            if a in known and b in known:
+            if a in self._known and b in self._known:
                 return a, b
-        if len(ways) == 1 and not known:
+        if len(ways) == 1 and not self._known:
             return ways[0]
-        missing = f"names no two images of {ROTATIONS} and {TRANSLATIONS}" if known else "does not name two images"
-        raise DataError(f"{self.folder / MATCHES}: {key!r} {missing}")
+        lack = f"names no two images of {ROTATIONS} and {TRANSLATIONS}" if self._known else "does not name two images"
+        raise DataError(f"{self.folder / MATCHES}: {key!r} {lack}")
 
     def calibration(self, key: str) -> tuple[Array, Array]:
         K = h5.reshaped(self._file(CALIBRATIONS), key, 2, 3, 3)
@@ -151,8 +151,9 @@ def _size(source: ImageSource, K: Array, images: Path | None) -> Size:
     return size or by_centre
 
 
-def _pair(family: str, folder: Path, key: str, cameras: _Cameras, images: Path | None) -> ImagePair:
-    scene, identity = folder.name, f"{family}/{folder.name}/{key}"
+def _pair(root: Path, folder: Path, key: str, cameras: _Cameras, images: Path | None) -> ImagePair:
+    family, scene = root.name, folder.name
+    identity = key if folder == root else f"{scene}/{key}"  # whatever the folder is called: draws follow from it
     sources: tuple[ImageSource, ImageSource] | None = None
     try:
         name0, name1 = cameras.split(key)

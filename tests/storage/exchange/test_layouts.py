@@ -273,6 +273,18 @@ def test_the_digest_is_of_the_contents(tmp_path: Path) -> None:
     assert reload("posebench", a).digest != reload("posebench", b).digest
 
 
+@pytest.mark.parametrize("layout", ["ransac_tutorial", "oanet"])
+def test_the_name_of_the_folder_decides_nothing(layout: str, tmp_path: Path) -> None:
+    """Draws follow from a pair's key."""
+    roots = [writers.WRITERS[layout](tmp_path / name) for name in ("first", "second")]
+    if layout == "ransac_tutorial":  # its scene alone, under another name
+        roots = [root / "church" for root in roots]
+        roots[1] = roots[1].rename(tmp_path / "chapel")
+    keys = [[pair.key for pair in reload(layout, root)] for root in roots]
+    assert len(set(keys[0])) == writers.PAIRS
+    assert keys[0] == keys[1]
+
+
 def test_says_which_extra_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root = writers.write_posebench(tmp_path / "posebench")
     monkeypatch.setitem(sys.modules, "h5py", None)

@@ -1,0 +1,43 @@
+"""Presets, and other methods that an option makes of them, by one word each: ``irls``, ``irls:kernel=huber``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fmtorch import presets
+from fmtorch.presets.objects import instantiate, merged
+from scripts.benchmark.matched import options
+
+METHODS = ("lmeds", "usac_default", "usac_fast", "usac_accurate", "usac_prosac", "usac_magsac")
+OPTIONS = {
+    "estimator": {
+        "irls": [f"kernel={kernel}" for kernel in ("cauchy", "geman_mcclure", "huber", "truncated")],
+        "opencv": [f"method={method}" for method in METHODS],
+        "poselib": ["shared_focal=true"],
+    },
+    "pruner": {name: ["soft=true"] for name in ("code", "dfe", "gms", "lc", "lc_e", "lc_side", "lpm")},
+}
+"""By preset, beside what its file says."""
+
+
+def variants(group: str) -> list[str]:
+    """Every preset of a group, and after it its variants: a new file in conf/ joins by being there."""
+    names = presets.available(group)
+    return [word for name in names for word in (name, *(f"{name}:{o}" for o in OPTIONS[group].get(name, ())))]
+
+
+def loaded(group: str, word: str) -> dict[str, Any]:
+    """The config of a preset or variant."""
+    name, _, rest = word.partition(":")
+    return merged(presets.load(group, name), options(rest))
+
+
+def keywords(word: str) -> dict[str, Any]:
+    """An estimator as keywords of `find_fundamental`."""
+    name, _, rest = word.partition(":")
+    return {"estimator": name, **options(rest)}
+
+
+def built(group: str, word: str, **changed: Any) -> Any:
+    """What it builds, with further options."""
+    return instantiate(merged(loaded(group, word), changed), f"{group}={word}")
