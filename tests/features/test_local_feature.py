@@ -146,7 +146,7 @@ def test_pipelines_of_the_features_table(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", [f"{s}{p}_gms" for p in ("rootsiftpca", "hardnet", "hesaffnet") for s in ("", "paper/")]
+    "name", [f"{s}{p}_gms" for p in ("rootsiftpca", "geodesc", "hardnet", "hesaffnet") for s in ("", "paper/")]
 )
 def test_pipelines_of_the_systems_table(name: str) -> None:
     pipeline = presets.pipeline(name)
