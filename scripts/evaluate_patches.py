@@ -61,7 +61,7 @@ def evaluate(config: DictConfig) -> dict[str, dict[str, float]]:
     projected = project(rooted.flatten(0, 1), *load_projection(models_dir() / "rootsift_pca.npz"), power=0.5)
     classic = {"SIFT": sift(pairs, root=False), "RootSIFT": rooted, "RootSIFT-PCA": projected.unflatten(0, (2, -1))}
     describers: dict[str, Describe] = {}
-    for name in ("hardnet", "l2net"):
+    for name in ("hardnet", "l2net", "geodesc"):
         torch.manual_seed(config.seed)
         describers[f"{name}, untrained"] = build(name).eval()
     describers |= {Path(path).name: descriptor_of(Path(path)) for path in config.networks}

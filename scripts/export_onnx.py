@@ -66,7 +66,7 @@ def main() -> None:
                 patches = calibration_patches(config.calibration, config.calibration_patches, config.seed)
                 quantize(Path(temporary) / "fp32.onnx", path, patches)
         figures = None
-        if config.validation is not None and architecture in ("hardnet", "l2net"):
+        if config.validation is not None and architecture in ("hardnet", "l2net", "geodesc"):
             pairs = validation_pairs(PatchStore.open(config.validation), config.pairs)
             figures = evaluate_descriptor(PatchNetwork(path), pairs)
         card = path.with_suffix(".md")

@@ -36,8 +36,9 @@ def local_feature(
 
     detector: `dog` (options of `SIFT`) or `hessian` (options of `HessianDetector`), at most `max_features` of them.
     shape: None or `affnet`. orientation: None for the detector's, `dominant_gradient` or `orinet`.
-    descriptor: `sift`, `rootsift`, `dspsift` (options of `PatchSIFT`), `rootsiftpca` (of `RootSIFTPCA`), `l2net` or
-    `hardnet`. A part that is a network takes the option `network`, the path of another ONNX file than the shipped one.
+    descriptor: `sift`, `rootsift`, `dspsift` (options of `PatchSIFT`), `rootsiftpca` (of `RootSIFTPCA`), `l2net`,
+    `geodesc` or `hardnet`. A part that is a network takes the option `network`, the path of another ONNX file than the
+    shipped one.
     precision: of the networks, fp32 or int8. threads: of each network. device: for torch, see `LocalFeature`.
 
     Raises ValueError for an unknown name or option, naming those there are. Networks are read when first used.
@@ -64,6 +65,7 @@ def local_feature(
         "dspsift": PatchSIFT,
         "rootsiftpca": RootSIFTPCA,
         "l2net": by(NetworkDescriptor, "l2net"),
+        "geodesc": by(NetworkDescriptor, "geodesc"),
         "hardnet": by(NetworkDescriptor, "hardnet"),
     }
     return LocalFeature(

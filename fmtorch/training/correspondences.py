@@ -80,11 +80,16 @@ def sorted_by_point(
     patches: Sequence[NDArray[np.uint8]], points: Sequence[NDArray[np.int64]]
 ) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
     """The patches of points that have two or more, point after point, and the point of each, numbered anew."""
-    point, patch = np.concatenate(points), np.concatenate(patches)
+    order, point = in_order_of_points(np.concatenate(points))
+    return np.concatenate(patches)[order], point
+
+
+def in_order_of_points(point: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Indices of what shows points that are shown twice or more, point after point, and the points, numbered anew."""
     several = np.bincount(point) >= 2
-    chosen = np.flatnonzero(several[point])
-    order = chosen[np.argsort(point[chosen], kind="stable")]
-    return patch[order], (np.cumsum(several) - 1)[point[order]]
+    kept = np.flatnonzero(several[point])
+    order = kept[np.argsort(point[kept], kind="stable")]
+    return order, (np.cumsum(several) - 1)[point[order]]
 
 
 def cut_context(image: Grey, keypoints: Keypoints) -> NDArray[np.uint8]:

@@ -10,6 +10,7 @@ from typing import Any
 TITLES = {
     "hardnet": "HardNet (Mishchuk, Mishkin, Radenovic, Matas, NIPS 2017)",
     "l2net": "L2-Net (Tian, Fan, Wu, CVPR 2017)",
+    "geodesc": "GeoDesc (Luo, Shen, Zhou, Zhu, Zhang, Yao, Fang, Quan, ECCV 2018)",
     "affnet": "AffNet (Mishkin, Radenovic, Matas, ECCV 2018)",
     "orinet": "OriNet (Mishkin, Radenovic, Matas, ECCV 2018)",
 }
@@ -27,8 +28,12 @@ OTHER_LOSS = {
     "patches; it is the option training.loss.name=hard_negative_constant.",
     ("l2net", "hardest_triplet"): "The loss is HardNet's: L2-Net's own, the option "
     "training.loss.name=relative_distance, learns far more slowly in so short a run.",
+    ("geodesc", "geodesc"): "The method is GeoDesc's; the authors' weights are not. In place of their reconstructions, "
+    "photographs seen as planes and rendered scenes give matches with known angles. A batch has fewer pairs of "
+    "photographs than theirs (12), the optimiser is Adam instead of SGD, and the two patches of a match are not turned "
+    "at random by up to 90 degrees each, which the authors' later code limits to 5 (lzx551402/tfmatch).",
 }
-"""Said of an architecture that was trained with another loss than that of its paper."""
+"""What a card says of an architecture and loss: how its training differs from that of its paper."""
 OWN_LICENCE = "Apache-2.0, as this project"
 
 
@@ -78,6 +83,7 @@ def _training(checkpoint: Mapping[str, Any]) -> list[str]:
     )
     loss = ", ".join(f"{k} {Path(v).name if k == 'descriptor' else v}" for k, v in checkpoint["loss"].items())
     last = losses[-100:]
+    match_sets = [checkpoint["match_sets"]] if "match_sets" in checkpoint else []
     limits = ", ".join(f"{k} {v}" for k, v in data["limits"].items())
     scenes = ", ".join(f"{count} of {family}" for family, count in data.get("scenes", {}).items())
     return [
@@ -87,6 +93,7 @@ def _training(checkpoint: Mapping[str, Any]) -> list[str]:
         f" {data['views']} random views of each photograph ({limits}) with changes of light, blur, noise and JPEG"
         f"{f', and in as many photographs of each rendered scene ({scenes})' if scenes else ''} |",
         f"| loss | {loss} |",
+        *(f"| match sets | {', '.join(f'{k} {v}' for k, v in sets.items())} |" for sets in match_sets),
         f"| run | {checkpoint['step']} steps of {o['batch']} points, {checkpoint['seconds'] / 60:.0f} minutes, "
         f"{o['optimizer']}, learning rate {o['learning_rate']} falling linearly to zero, seed {o['seed']}, "
         f"{'bfloat16 autocast' if o['bf16'] else 'float32'} |",

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from fmtorch.core import random
@@ -114,14 +114,18 @@ class PatchTraining:
         o = self.options
         key = torch.tensor([self.step])
         draws = random.uniform(o.seed, key, Stream.TRAINING, 0, o.batch, DRAWS + 2)[0].float()
-        pairs = self.store.views(self._points(), draws[:, DRAWS:])
         torch.manual_seed(int(random.bits(o.seed, key, Stream.TRAINING, o.batch, 1, DRAWS + 2)[0, 0, 0]))  # dropout
         with torch.autocast(self.device.type, torch.bfloat16, enabled=o.bf16):
-            loss = self.objective.loss(self.network, pairs.to(self.device), draws.to(self.device))
+            loss = self._loss(draws)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimizer.step()
         return loss.detach()
+
+    def _loss(self, draws: Float[Tensor, "b k"]) -> Tensor:
+        """The loss of this step's patches; `draws` are `DRAWS` random numbers of each point and two more."""
+        pairs = self.store.views(self._points(), draws[:, DRAWS:])
+        return self.objective.loss(self.network, pairs.to(self.device), draws.to(self.device))
 
     def _points(self) -> Int[Tensor, " b"]:
         """This step's points: each epoch is a random order of all."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import itertools
 import json
 import multiprocessing
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -90,37 +91,56 @@ def build_store(
     options = {"views": views, "points": points, "limits": limits, "tolerance": tolerance}
     photograph_jobs = [(photograph.path, (seed, i), longest_side, options) for i, photograph in enumerate(photographs)]
     scene_jobs = [(task, (seed, len(photographs) + i), points, tolerance) for i, task in enumerate(scenes)]
+    with multiprocessing.get_context("spawn").Pool(workers) as pool:
+        cutting = itertools.chain(pool.imap(_patches_of, photograph_jobs), pool.imap(draw_patches, scene_jobs))
+        description = {
+            "photographs": count_by(photograph.source for photograph in photographs),
+            "scenes": count_by(task.family for task in scenes), "seed": seed, "views": views,
+            "limits": dataclasses.asdict(limits), "tolerance": dataclasses.asdict(tolerance),
+        }  # fmt: skip
+        write_store(folder, ((patches, point, {}) for patches, point in cutting), description)
+    return PatchStore.open(folder)
+
+
+def write_store(
+    folder: Path,
+    parts: Iterable[tuple[NDArray[np.uint8], NDArray[np.int64], Mapping[str, NDArray[Any]]]],
+    description: Mapping[str, Any],
+) -> None:
+    """Write a store into `folder`, which appears once it is complete.
+
+    parts: patches, the point that each shows (ascending, each twice or more), and further arrays of one row a patch,
+    which become files of their names. The numbers of points and of patches are added to the description.
+    """
     unfinished = folder.with_name(f"{folder.name}.{os.getpid()}.tmp")
     unfinished.mkdir(parents=True)
     try:
         first, total = [np.zeros(1, np.int64)], 0
-        with open(unfinished / "patches.raw", "wb") as raw, multiprocessing.get_context("spawn").Pool(workers) as pool:
-            cutting = pool.imap(_patches_of, photograph_jobs), pool.imap(draw_patches, scene_jobs)
-            for patches, point in itertools.chain(*cutting):
+        columns: dict[str, list[NDArray[Any]]] = {}
+        with open(unfinished / "patches.raw", "wb") as raw:
+            for patches, point, more in parts:
                 raw.write(patches.tobytes())
                 first.append(total + np.cumsum(np.bincount(point)) if len(point) else np.zeros(0, np.int64))
                 total += len(patches)
+                for name, column in more.items():
+                    columns.setdefault(name, []).append(column)
         np.save(unfinished / "first.npy", np.concatenate(first))
+        for name, column_parts in columns.items():
+            np.save(unfinished / f"{name}.npy", np.concatenate(column_parts))
         raw_patches = np.memmap(unfinished / "patches.raw", np.uint8, "r", shape=(total, CONTEXT_SIZE, CONTEXT_SIZE))
         np.save(unfinished / "patches.npy", raw_patches)
         (unfinished / "patches.raw").unlink()
-        sources: dict[str, int] = {}
-        for photograph in photographs:
-            sources[photograph.source] = sources.get(photograph.source, 0) + 1
-        families: dict[str, int] = {}
-        for task in scenes:
-            families[task.family] = families.get(task.family, 0) + 1
-        description = {
-            "points": sum(len(f) for f in first) - 1, "patches": total, "photographs": sources, "scenes": families,
-            "seed": seed, "views": views,
-            "limits": dataclasses.asdict(limits), "tolerance": dataclasses.asdict(tolerance),
-        }  # fmt: skip
-        (unfinished / "store.json").write_text(json.dumps(description, indent=1))
+        counts = {"points": sum(len(f) for f in first) - 1, "patches": total}
+        (unfinished / "store.json").write_text(json.dumps({**counts, **description}, indent=1))
         unfinished.rename(folder)
     except BaseException:
         shutil.rmtree(unfinished)
         raise
-    return PatchStore.open(folder)
+
+
+def count_by(names: Iterable[str]) -> dict[str, int]:
+    """How often each name occurs, in the order of first occurrence."""
+    return dict(collections.Counter(names))
 
 
 def _patches_of(

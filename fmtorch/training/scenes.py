@@ -53,6 +53,14 @@ def patches_of_scene(
     task: Task, rng: np.random.Generator, *, points: int, tolerance: Tolerance
 ) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
     """As `corresponding_patches`, of the photographs of a scene: patches and the point that each shows."""
+    views = views_of_scene(task, rng, points=points)
+    owners = linked(views, tolerance)
+    patches = [cut_context(view.image, view.keypoints[o >= 0]) for view, o in zip(views, owners, strict=True)]
+    return sorted_by_point(patches, [owner[owner >= 0] for owner in owners])
+
+
+def views_of_scene(task: Task, rng: np.random.Generator, *, points: int) -> list[View]:
+    """The photographs of a scene in changed light, with their depth and the strongest `points` of each detector."""
     scene = build(task)
     shots = scene.shots[: task.plan.shots]
     geometry = [Geometry(surfaces) for surfaces in scene.surfaces]
@@ -62,9 +70,7 @@ def patches_of_scene(
         with np.errstate(divide="ignore"):
             inverse_depth = 1 / geometry[shot.light].depth_map(shot.camera)
         views.append(View(image, shot.camera, inverse_depth, detect(image, points)))
-    owners = linked(views, tolerance)
-    patches = [cut_context(view.image, view.keypoints[o >= 0]) for view, o in zip(views, owners, strict=True)]
-    return sorted_by_point(patches, [owner[owner >= 0] for owner in owners])
+    return views
 
 
 def linked(views: Sequence[View], tolerance: Tolerance) -> list[NDArray[np.int64]]:
@@ -100,23 +106,12 @@ def transferred(keypoints: Keypoints, source: View, target: View) -> tuple[Keypo
 
     Not seen is what lies on an edge of depth, outside the other photograph, or behind what it shows.
     """
-    x, inverse = keypoints[:, :2], source.inverse_depth
-    h, w = inverse.shape
-    column, row = (np.clip(np.round(x[:, i]).astype(int), 0, side - 1) for i, side in ((0, w), (1, h)))
-    reach = np.ceil(keypoints[:, 2]).astype(int)
-    sides = [
-        inverse[np.clip(row + dy * reach, 0, h - 1), np.clip(column + dx * reach, 0, w - 1)]
-        for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1))
-    ]
-    middle = inverse[row, column]
-    slope = np.stack([(sides[1] - sides[0]) / (2 * reach), (sides[3] - sides[2]) / (2 * reach)], 1)
-    bend = np.maximum(np.abs(sides[0] + sides[1] - 2 * middle), np.abs(sides[2] + sides[3] - 2 * middle))
-    inside = (np.minimum(x[:, 0], x[:, 1]) >= reach) & (x[:, 0] < w - reach) & (x[:, 1] < h - reach)
-    seen = inside & (middle > 0) & (bend <= FLAT * middle)
+    x = keypoints[:, :2]
+    pixel, middle, slope, seen = local_depth(keypoints, source)
 
     def there(shift: tuple[float, float]) -> tuple[Matrix, Matrix]:
         moved = x + np.array(shift)
-        depth = 1 / np.where(seen, middle + (slope * (moved - np.c_[column, row])).sum(1), 1.0)
+        depth = 1 / np.where(seen, middle + (slope * (moved - pixel)).sum(1), 1.0)
         rays = np.c_[moved, np.ones(len(x))] @ np.linalg.inv(source.camera.K).T
         return target.camera.project((rays * depth[:, None] - source.camera.t) @ source.camera.R)
 
@@ -133,6 +128,27 @@ def transferred(keypoints: Keypoints, source: View, target: View) -> tuple[Keypo
     direction = A @ np.stack([np.cos(keypoints[:, 3]), np.sin(keypoints[:, 3])], -1)[..., None]
     sigma = keypoints[:, 2] * np.sqrt(np.abs(np.linalg.det(A)))
     return np.c_[centre, sigma, np.arctan2(direction[:, 1, 0], direction[:, 0, 0])], seen
+
+
+def local_depth(keypoints: Keypoints, view: View) -> tuple[NDArray[np.int64], Matrix, Matrix, NDArray[np.bool_]]:
+    """The plane that a view shows about each keypoint, as the linear form of its inverse depth.
+
+    Returns the nearest pixels (n, 2), the inverse depth there (n,), its slope (n, 2), and which keypoints lie on a
+    plane at all (n,): not those on an edge of depth, near the border or where nothing is.
+    """
+    x, inverse = keypoints[:, :2], view.inverse_depth
+    h, w = inverse.shape
+    column, row = (np.clip(np.round(x[:, i]).astype(int), 0, side - 1) for i, side in ((0, w), (1, h)))
+    reach = np.ceil(keypoints[:, 2]).astype(int)
+    sides = [
+        inverse[np.clip(row + dy * reach, 0, h - 1), np.clip(column + dx * reach, 0, w - 1)]
+        for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1))
+    ]
+    middle = inverse[row, column]
+    slope = np.stack([(sides[1] - sides[0]) / (2 * reach), (sides[3] - sides[2]) / (2 * reach)], 1)
+    bend = np.maximum(np.abs(sides[0] + sides[1] - 2 * middle), np.abs(sides[2] + sides[3] - 2 * middle))
+    inside = (np.minimum(x[:, 0], x[:, 1]) >= reach) & (x[:, 0] < w - reach) & (x[:, 1] < h - reach)
+    return np.c_[column, row], middle, slope, inside & (middle > 0) & (bend <= FLAT * middle)
 
 
 def draw_patches(job: tuple[Task, tuple[int, int], int, Tolerance]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:

@@ -34,7 +34,7 @@ from scripts.benchmark.pruning import pruned_by
 from scripts.benchmark.sheet import put
 from scripts.benchmark.specs import pipeline_of
 
-FEATURES = ("sift", "dspsift", "rootsiftpca", "l2net", "hardnet", "hesaffnet")
+FEATURES = ("sift", "dspsift", "rootsiftpca", "l2net", "geodesc", "hardnet", "hesaffnet")
 SYSTEMS = ("rootsiftpca", "hardnet", "hesaffnet")
 PIPELINES = [*(f"{name}_ratio" for name in FEATURES), *(f"{name}_gms" for name in SYSTEMS)]
 BATCH = 8  # pairs that are kept together

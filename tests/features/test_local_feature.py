@@ -26,7 +26,7 @@ from fmtorch.storage.features import CachedFeatures
 from tests.features.scenes import texture
 
 WITHOUT_NETWORK = ("rootsift", "dspsift", "rootsiftpca")
-PIPELINES = ("dspsift", "rootsiftpca", "l2net", "hardnet", "hesaffnet")
+PIPELINES = ("dspsift", "rootsiftpca", "l2net", "geodesc", "hardnet", "hesaffnet")
 
 
 def random_network(seed: int, outputs: int) -> torch.nn.Module:
@@ -146,7 +146,7 @@ def test_pipelines_of_the_features_table(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", [f"{s}{p}_gms" for p in ("rootsiftpca", "hardnet", "hesaffnet") for s in ("", "paper/")]
+    "name", [f"{s}{p}_gms" for p in ("rootsiftpca", "geodesc", "hardnet", "hesaffnet") for s in ("", "paper/")]
 )
 def test_pipelines_of_the_systems_table(name: str) -> None:
     pipeline = presets.pipeline(name)
@@ -213,7 +213,7 @@ def test_large_images_are_reduced_for_opencv() -> None:
     assert torch.equal(SIFT(max_pixels=300 * 401)(image).lafs, a.lafs)
 
 
-@pytest.mark.parametrize("name", ["l2net", "hardnet", "hesaffnet"])
+@pytest.mark.parametrize("name", ["l2net", "geodesc", "hardnet", "hesaffnet"])
 @pytest.mark.parametrize("shape", [(1, 300), (20, 31), (40, 45)])
 def test_shipped_networks_on_small_images(name: str, shape: tuple[int, int]) -> None:
     image = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)

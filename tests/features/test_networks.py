@@ -100,7 +100,7 @@ def test_l2net_subtracts_the_mean_patch() -> None:
     torch.testing.assert_close(network(x + network.pixel_mean).detach(), expected, atol=RTOL, rtol=0)
 
 
-@pytest.mark.parametrize("name", ["hardnet", "l2net"])
+@pytest.mark.parametrize("name", ["hardnet", "l2net", "geodesc"])
 def test_descriptors_have_unit_length_and_ignore_light(name: str, patches: Tensor) -> None:
     network = randomized(build(name))
     found = network(patches)
@@ -129,5 +129,5 @@ def test_files_that_do_not_fit_are_named(tmp_path: Path) -> None:
         load_weights(HardNet(), tmp_path / "list.pth")
     with pytest.raises(FileNotFoundError, match=r"absent\.pth does not exist"):
         load_weights(HardNet(), tmp_path / "absent.pth")
-    with pytest.raises(ValueError, match="there are: hardnet, l2net, affnet, orinet"):
+    with pytest.raises(ValueError, match="there are: hardnet, l2net, geodesc, affnet, orinet"):
         build("siftnet")

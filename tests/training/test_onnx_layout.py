@@ -18,7 +18,9 @@ from fmtorch.training.onnx_export import export, quantize
 from fmtorch.training.onnx_layout import laid_out
 from tests.features.test_networks import randomized
 
-SHIPPED = [f"{name}{precision}.onnx" for name in ("hardnet", "l2net", "affnet") for precision in ("", ".int8")]
+SHIPPED = [
+    f"{name}{precision}.onnx" for name in ("hardnet", "l2net", "geodesc", "affnet") for precision in ("", ".int8")
+]
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ Their state_dicts are those of the authors' and kornia's releases, see `load_wei
 """
 
 from fmtorch.features.networks.checkpoints import ARCHITECTURES, build, load_weights
-from fmtorch.features.networks.descriptors import HardNet, L2Net
+from fmtorch.features.networks.descriptors import GeoDesc, HardNet, L2Net
 from fmtorch.features.networks.geometry import AffNet, OriNet
 
-__all__ = ["ARCHITECTURES", "AffNet", "HardNet", "L2Net", "OriNet", "build", "load_weights"]
+__all__ = ["ARCHITECTURES", "AffNet", "GeoDesc", "HardNet", "L2Net", "OriNet", "build", "load_weights"]

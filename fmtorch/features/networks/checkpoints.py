@@ -12,10 +12,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from fmtorch.features.networks.descriptors import HardNet, L2Net
+from fmtorch.features.networks.descriptors import GeoDesc, HardNet, L2Net
 from fmtorch.features.networks.geometry import AffNet, OriNet
 
-ARCHITECTURES: dict[str, type[nn.Module]] = {"hardnet": HardNet, "l2net": L2Net, "affnet": AffNet, "orinet": OriNet}
+ARCHITECTURES: dict[str, type[nn.Module]] = {
+    "hardnet": HardNet, "l2net": L2Net, "geodesc": GeoDesc, "affnet": AffNet, "orinet": OriNet,
+}  # fmt: skip
 
 
 def build(architecture: str, **options: Any) -> nn.Module:

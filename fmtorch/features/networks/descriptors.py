@@ -1,4 +1,4 @@
-"""HardNet and L2-Net: grey patches to descriptors of 128 numbers and unit length."""
+"""HardNet, L2-Net and GeoDesc: grey patches to descriptors of 128 numbers and unit length."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class HardNet(nn.Module):
 
 
 class L2Net(nn.Module):
-    """L2-Net (Tian, Fan, Wu, CVPR 2017), which is also GeoDesc's layout.
+    """L2-Net (Tian, Fan, Wu, CVPR 2017).
 
     Unlike HardNet's, its input loses the mean patch of the training set (`pixel_mean`) before each patch is
     standardised, and its output passes local response normalisation over all channels, that is division by the length.
@@ -46,3 +46,22 @@ class L2Net(nn.Module):
     def forward(self, patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n 128"]:
         """Descriptors of unit length (the release's normalisation with kappa 0, alpha 1 and beta 1/2)."""
         return unit_length(as_float32(self.features, standardize(patches - self.pixel_mean, eps=1e-12)))
+
+
+class GeoDesc(nn.Module):
+    """GeoDesc (Luo et al., ECCV 2018): L2-Net's layout without a batch norm after the last convolution.
+
+    Each patch is standardised by itself, as in the authors' training code (lzx551402/tfmatch, cnn_wrapper/descnet.py);
+    there is no dropout.
+    """
+
+    outputs = 128
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.features = nn.Sequential(*trunk(32, 0.0, self.outputs))
+        orthogonal_(self.features)
+
+    def forward(self, patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n 128"]:
+        """Descriptors of unit length."""
+        return unit_length(as_float32(self.features, standardize(patches, eps=1e-6)))
