@@ -43,6 +43,7 @@ def refined_maxima(volume: Float[Tensor, "b s h w"], seeds: Int[Tensor, "m 4"], 
 
 def _refine(volume: Tensor, at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The samples (K, 4), offsets (K, 3) and values (K,) of the seeds that are maxima and settle."""
+    at = at[_exceeds_levels(volume, at)]
     at = at[_is_maximum(_samples(volume, at))]
     last = torch.tensor(volume.shape[1:], device=volume.device) - 2
     offset, value, peaked = _quadratic(_samples(volume, at))
@@ -70,6 +71,14 @@ def _samples(volume: Tensor, at: Tensor) -> Float[Tensor, "27 m"]:
     _, _, h, w = volume.shape
     steps = NEIGHBOURS.to(volume.device) @ torch.tensor([h * w, w, 1], device=volume.device)
     return volume.reshape(-1)[_linear(volume, at) + steps[:, None]]
+
+
+def _exceeds_levels(volume: Tensor, at: Tensor) -> Tensor:
+    """Whether inner samples (M, 4) can be maxima by the samples before and after them: most seeds are not."""
+    _, _, h, w = volume.shape
+    values, place = volume.reshape(-1), _linear(volume, at)
+    centre = values[place]
+    return (centre > values[place - h * w]) & (centre >= values[place + h * w])
 
 
 def _is_maximum(v: Float[Tensor, "27 m"]) -> Tensor:

@@ -26,8 +26,8 @@ class Filters(Protocol):
     def blur(self, image: Float[Tensor, "b h w"], sigma: float) -> Float[Tensor, "b h w"]:
         """The image convolved with a Gaussian."""
 
-    def hessian_determinant(self, image: Float[Tensor, "b h w"], out: Float[Tensor, "b h w"]) -> None:
-        """Writes Ixx Iyy - Ixy^2 by central differences; 0 on the outermost pixels."""
+    def hessian_determinant(self, image: Float[Tensor, "b h w"], scale: float, out: Float[Tensor, "b h w"]) -> None:
+        """Writes scale (Ixx Iyy - Ixy^2) by central differences; 0 on the outermost pixels."""
 
     def maxima(self, response: Float[Tensor, "b h w"], threshold: float) -> Int[Tensor, "m 3"]:
         """(b, y, x) of the pixels that no neighbour exceeds and that are above `threshold`, in this order."""
@@ -49,7 +49,7 @@ class OpenCVFilters:
         blurred = cv2.sepFilter2D(image[0].numpy(), cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
         return torch.from_numpy(np.asarray(blurred))[None]
 
-    def hessian_determinant(self, image: Float[Tensor, "1 h w"], out: Float[Tensor, "1 h w"]) -> None:
+    def hessian_determinant(self, image: Float[Tensor, "1 h w"], scale: float, out: Float[Tensor, "1 h w"]) -> None:
         pixels, result = image[0].numpy(), out[0].numpy()
         identity, first, second = (np.array(k, np.float32) for k in ([1], [-0.5, 0, 0.5], [1, -2, 1]))
         h = len(pixels)
@@ -61,23 +61,24 @@ class OpenCVFilters:
                 for kx, ky in ((second, identity), (identity, second), (first, first))
             )
             determinant = cv2.subtract(cv2.multiply(xx, yy, dst=xx), cv2.multiply(xy, xy, dst=xy), dst=xx)
-            result[y : y + STRIP] = determinant[y - top : y - top + STRIP]
+            np.multiply(determinant[y - top : y - top + STRIP], np.float32(scale), out=result[y : y + STRIP])
         result[[0, -1]] = 0
         result[:, [0, -1]] = 0
 
     def maxima(self, response: Float[Tensor, "1 h w"], threshold: float) -> Int[Tensor, "m 3"]:
         values = response[0].numpy()
-        h = len(values)
+        h, width = values.shape
         square = np.ones((3, 3), np.uint8)
         by_strip = []
         for y in range(0, h, STRIP):
             top, bottom = max(y - 1, 0), min(y + STRIP + 1, h)
-            largest = np.maximum(cv2.dilate(values[top:bottom], square)[y - top : y - top + STRIP], threshold)
+            largest = cv2.dilate(values[top:bottom], square)[y - top : y - top + STRIP]
             strip = values[y : y + STRIP]
-            yx = np.argwhere((strip >= largest) & (strip > threshold))
-            by_strip.append(yx + np.array([y, 0]))
-        places = torch.from_numpy(np.concatenate(by_strip))
-        return torch.cat([torch.zeros_like(places[:, :1]), places], 1)
+            maximal = strip >= largest
+            maximal &= strip > threshold
+            by_strip.append(np.flatnonzero(maximal) + y * width)
+        place = torch.from_numpy(np.concatenate(by_strip))
+        return torch.stack([torch.zeros_like(place), place // width, place % width], 1)
 
 
 class TorchFilters:
@@ -92,13 +93,13 @@ class TorchFilters:
         padded = F.pad(rows[:, None], (0, 0, radius, radius), mode="replicate")[:, 0]
         return sum((k * padded[:, i : i + h] for i, k in enumerate(kernel)), torch.zeros_like(image))
 
-    def hessian_determinant(self, image: Float[Tensor, "b h w"], out: Float[Tensor, "b h w"]) -> None:
+    def hessian_determinant(self, image: Float[Tensor, "b h w"], scale: float, out: Float[Tensor, "b h w"]) -> None:
         middle = image[:, 1:-1, 1:-1]
         xx = image[:, 1:-1, 2:] - 2 * middle + image[:, 1:-1, :-2]
         yy = image[:, 2:, 1:-1] - 2 * middle + image[:, :-2, 1:-1]
         xy = 0.25 * (image[:, 2:, 2:] - image[:, 2:, :-2] - image[:, :-2, 2:] + image[:, :-2, :-2])
         out.zero_()
-        out[:, 1:-1, 1:-1] = xx * yy - xy * xy
+        out[:, 1:-1, 1:-1] = scale * (xx * yy - xy * xy)
 
     def maxima(self, response: Float[Tensor, "b h w"], threshold: float) -> Int[Tensor, "m 3"]:
         largest = F.max_pool2d(response, 3, stride=1, padding=1)

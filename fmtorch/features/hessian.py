@@ -94,8 +94,7 @@ class HessianDetector:
                 level = filters.blur(level, math.sqrt(blur**2 - before**2))
             if s == self.levels:
                 following = level[:, ::2, ::2].contiguous()
-            filters.hessian_determinant(level, out=volume[:, s])
-            volume[:, s] *= blur**4
+            filters.hessian_determinant(level, blur**4, out=volume[:, s])
         return volume, following
 
 

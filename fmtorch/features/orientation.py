@@ -72,15 +72,16 @@ def _histogram(patches: Float[Tensor, "n 1 p p"]) -> Float[Tensor, "n k"]:
     """Votes for the directions -pi, -pi + 2 pi / BINS, ..., clockwise on the screen."""
     n, size = patches.shape[0], patches.shape[-1]
     gy, gx = _sobel(patches)
-    magnitude = (gx * gx + gy * gy).sqrt() * _window(size, patches.device)
-    position = (torch.atan2(gy, gx) + math.pi) * (BINS / (2 * math.pi))
+    position = torch.atan2(gy, gx).add_(math.pi).mul_(BINS / (2 * math.pi))
+    magnitude = gx.square_().add_(gy.square_()).sqrt_().mul_(_window(size, patches.device))
     lower = position.floor()
-    upper_weight = (position - lower) * magnitude
+    upper_weight = position.sub_(lower).mul_(magnitude)
     # BINS + 2 places: pi, where a direction ends up that is -pi, and the place above it.
-    place = lower.long() + (BINS + 2) * torch.arange(n, device=patches.device)[:, None, None]
+    start = (BINS + 2) * torch.arange(n, device=patches.device)
+    place = lower.long().add_(start[:, None, None]).flatten()
     votes = patches.new_zeros(n * (BINS + 2))
-    votes.scatter_add_(0, place.flatten(), (magnitude - upper_weight).flatten())
-    votes.scatter_add_(0, place.flatten() + 1, upper_weight.flatten())
+    votes.scatter_add_(0, place, magnitude.sub_(upper_weight).flatten())
+    votes[1:].scatter_add_(0, place, upper_weight.flatten())
     histogram = votes.reshape(n, BINS + 2)
     histogram[:, :2] += histogram[:, BINS:]
     return histogram[:, :BINS]
@@ -89,9 +90,9 @@ def _histogram(patches: Float[Tensor, "n 1 p p"]) -> Float[Tensor, "n k"]:
 def _sobel(patches: Tensor) -> tuple[Tensor, Tensor]:
     """Derivatives along y and x (N, P, P); the border is continued."""
     padded = F.pad(patches, (1, 1, 1, 1), mode="replicate")[:, 0]
-    rows = padded[:, :-2] + 2 * padded[:, 1:-1] + padded[:, 2:]
-    columns = padded[:, :, :-2] + 2 * padded[:, :, 1:-1] + padded[:, :, 2:]
-    return (columns[:, 2:] - columns[:, :-2]) / 8, (rows[:, :, 2:] - rows[:, :, :-2]) / 8
+    rows = torch.add(padded[:, :-2], padded[:, 1:-1], alpha=2).add_(padded[:, 2:])
+    columns = torch.add(padded[:, :, :-2], padded[:, :, 1:-1], alpha=2).add_(padded[:, :, 2:])
+    return (columns[:, 2:] - columns[:, :-2]).div_(8), (rows[:, :, 2:] - rows[:, :, :-2]).div_(8)
 
 
 def _smoothed(histogram: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
