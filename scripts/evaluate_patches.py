@@ -20,7 +20,7 @@ from torch import Tensor
 
 from fmtorch.core.resources import models_dir
 from fmtorch.core.terminal import console, exits_with_message
-from fmtorch.features.networks import build, load_weights
+from fmtorch.features.networks import DESCRIPTORS, build, load_weights
 from fmtorch.features.networks.checkpoints import read_checkpoint
 from fmtorch.features.onnx_network import PatchNetwork
 from fmtorch.features.patch_sift import EXTENT, sift_of_patches
@@ -61,7 +61,7 @@ def evaluate(config: DictConfig) -> dict[str, dict[str, float]]:
     projected = project(rooted.flatten(0, 1), *load_projection(models_dir() / "rootsift_pca.npz"), power=0.5)
     classic = {"SIFT": sift(pairs, root=False), "RootSIFT": rooted, "RootSIFT-PCA": projected.unflatten(0, (2, -1))}
     describers: dict[str, Describe] = {}
-    for name in ("hardnet", "l2net", "geodesc"):
+    for name in DESCRIPTORS:
         torch.manual_seed(config.seed)
         describers[f"{name}, untrained"] = build(name).eval()
     describers |= {Path(path).name: descriptor_of(Path(path)) for path in config.networks}

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from fmtorch.core.resources import models_dir
 from fmtorch.core.terminal import console, exits_with_message
-from fmtorch.features.networks import build, load_weights
+from fmtorch.features.networks import DESCRIPTORS, build, load_weights
 from fmtorch.features.networks.checkpoints import read_checkpoint
 from fmtorch.features.onnx_network import PatchNetwork, network_file
 from fmtorch.training.model_card import model_card
@@ -66,7 +66,7 @@ def main() -> None:
                 patches = calibration_patches(config.calibration, config.calibration_patches, config.seed)
                 quantize(Path(temporary) / "fp32.onnx", path, patches)
         figures = None
-        if config.validation is not None and architecture in ("hardnet", "l2net", "geodesc"):
+        if config.validation is not None and architecture in DESCRIPTORS:
             pairs = validation_pairs(PatchStore.open(config.validation), config.pairs)
             figures = evaluate_descriptor(PatchNetwork(path), pairs)
         card = path.with_suffix(".md")

@@ -25,6 +25,7 @@ from fmtorch.core.resources import conf_dir
 from fmtorch.core.terminal import console, exits_with_message
 from fmtorch.features.networks import build, load_weights
 from fmtorch.features.networks.layers import PATCH_SIZE
+from fmtorch.features.onnx_network import PatchNetwork, network_file
 from fmtorch.presets import plain
 from fmtorch.training.correspondences import Tolerance
 from fmtorch.training.geodesc_loss import geodesc
@@ -88,17 +89,26 @@ def objective_of(config: DictConfig, device: torch.device) -> Objective:
     """The loss of a config: on descriptors, or on shapes as a trained descriptor sees them."""
     loss = plain(config.training.loss)
     name = loss.pop("name")
+    taught = teacher_of(config)
     if name == "hard_negative_constant":
         descriptor = build("hardnet").to(device).eval().requires_grad_(False)
         load_weights(descriptor, loss.pop("descriptor"))
         return ShapeObjective(descriptor, **loss)
     if name == "affine_covariance":
-        return CovarianceObjective(**loss)
+        return CovarianceObjective(**loss, **taught)
     if name not in LOSSES:
         raise ValueError(
             f"training.loss.name={name}; there are: {', '.join(LOSSES)}, hard_negative_constant, affine_covariance"
         )
-    return DescriptorObjective(functools.partial(LOSSES[name], **loss))
+    return DescriptorObjective(functools.partial(LOSSES[name], **loss), **taught)
+
+
+def teacher_of(config: DictConfig) -> dict[str, Any]:
+    """The options of an objective that has a teacher; none without one."""
+    if "teacher" not in config.training:
+        return {}
+    teacher = config.training.teacher
+    return {"teacher": PatchNetwork(network_file(teacher.network, teacher.precision)), "weight": teacher.weight}
 
 
 def training_of(
@@ -140,6 +150,8 @@ def main(config: DictConfig) -> None:
             "architecture": training["architecture"], "network": training["network"], "loss": training["loss"],
             "validation_data": validation.description, "licences": plain(config.photographs.sources),
         }  # fmt: skip
+        if "teacher" in training:
+            description["teacher"] = training["teacher"]
         checkpoint = Path(config.out) / f"{config.name}.pt"
         run = training_of(config, network, train, description, device)
         if config.resume:

@@ -12,6 +12,8 @@ TITLES = {
     "l2net": "L2-Net (Tian, Fan, Wu, CVPR 2017)",
     "geodesc": "GeoDesc (Luo, Shen, Zhou, Zhu, Zhang, Yao, Fang, Quan, ECCV 2018)",
     "affnet": "AffNet (Mishkin, Radenovic, Matas, ECCV 2018)",
+    "hardnet_fast": "HardNet (Mishchuk, Mishkin, Radenovic, Matas, NIPS 2017) in a smaller layout",
+    "affnet_fast": "AffNet (Mishkin, Radenovic, Matas, ECCV 2018) in a smaller layout",
     "orinet": "OriNet (Mishkin, Radenovic, Matas, ECCV 2018)",
 }
 RATIO = "residual_tilt"
@@ -26,6 +28,10 @@ OTHER_LOSS = {
     "known ways should be rectified alike (fmtorch.training.patch_objectives.CovarianceObjective). The published hard "
     "negative-constant loss, with a HardNet that is itself robust to tilt, ended after 20 minutes in one shape for all "
     "patches; it is the option training.loss.name=hard_negative_constant.",
+    (
+        "affnet_fast",
+        "affine_covariance",
+    ): "The loss is that of this project's AffNet (affnet.md), and the departure from its shapes.",
     ("l2net", "hardest_triplet"): "The loss is HardNet's: L2-Net's own, the option "
     "training.loss.name=relative_distance, learns far more slowly in so short a run.",
     ("geodesc", "geodesc"): "The method is GeoDesc's; the authors' weights are not. In place of their reconstructions, "
@@ -83,6 +89,7 @@ def _training(checkpoint: Mapping[str, Any]) -> list[str]:
     )
     loss = ", ".join(f"{k} {Path(v).name if k == 'descriptor' else v}" for k, v in checkpoint["loss"].items())
     last = losses[-100:]
+    teacher = checkpoint.get("teacher")
     match_sets = [checkpoint["match_sets"]] if "match_sets" in checkpoint else []
     limits = ", ".join(f"{k} {v}" for k, v in data["limits"].items())
     scenes = ", ".join(f"{count} of {family}" for family, count in data.get("scenes", {}).items())
@@ -93,12 +100,19 @@ def _training(checkpoint: Mapping[str, Any]) -> list[str]:
         f" {data['views']} random views of each photograph ({limits}) with changes of light, blur, noise and JPEG"
         f"{f', and in as many photographs of each rendered scene ({scenes})' if scenes else ''} |",
         f"| loss | {loss} |",
+        *([f"| teacher | {_teacher(teacher)} |"] if teacher else []),
         *(f"| match sets | {', '.join(f'{k} {v}' for k, v in sets.items())} |" for sets in match_sets),
         f"| run | {checkpoint['step']} steps of {o['batch']} points, {checkpoint['seconds'] / 60:.0f} minutes, "
         f"{o['optimizer']}, learning rate {o['learning_rate']} falling linearly to zero, seed {o['seed']}, "
         f"{'bfloat16 autocast' if o['bf16'] else 'float32'} |",
         f"| loss of the last {len(last)} steps | {sum(last) / len(last):.4f} |",
     ]
+
+
+def _teacher(teacher: Mapping[str, Any]) -> str:
+    """The network whose outputs were imitated, and how much that counts."""
+    name, precision = Path(teacher["network"]).name, teacher["precision"]
+    return f"{name} ({precision}), whose outputs for the same patches are imitated with weight {teacher['weight']}"
 
 
 def _quality(rows: Mapping[str, Mapping[str, float]], checkpoint: Mapping[str, Any]) -> list[str]:

@@ -14,6 +14,7 @@ from torch.nn import functional
 
 from fmtorch.core import random
 from fmtorch.core.streams import Stream
+from fmtorch.features.orientation import PatchFunction
 from fmtorch.training.patch_losses import hard_negative_constant
 from fmtorch.training.patch_metrics import evaluate_descriptor, middle, patch_quality
 
@@ -36,9 +37,15 @@ class Objective(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class DescriptorObjective:
-    """Descriptors of a point's two patches should be nearer than those of different points: `criterion` says how."""
+    """Descriptors of a point's two patches should be nearer than those of different points: `criterion` says how.
+
+    teacher: a trained network that stays as it is; each descriptor should also be its descriptor of the same patch
+    (FitNets' hints on the output, Romero et al., ICLR 2015). weight: of their squared distance in the loss.
+    """
 
     criterion: Callable[[Tensor, Tensor], Tensor]
+    teacher: PatchFunction | None = None
+    weight: float = 1.0
 
     def loss(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"], draws: Float[Tensor, "n k"]) -> Tensor:
         """The criterion on both patches of each point, mirrored and turned alike at random."""
@@ -46,9 +53,14 @@ class DescriptorObjective:
         left, up, over = (draws[:, column, None, None, None] < 0.5 for column in range(3))
         patches = torch.where(left, patches.flip(-1), patches)
         patches = torch.where(up, patches.flip(-2), patches)
-        patches = torch.where(over, patches.mT, patches)
-        a, b = network(patches.flatten(0, 1)).chunk(2)
-        return self.criterion(a, b)
+        patches = torch.where(over, patches.mT, patches).flatten(0, 1)
+        described = network(patches)
+        loss = self.criterion(*described.chunk(2))
+        if self.teacher is not None:
+            with torch.no_grad():
+                target = self.teacher(patches)
+            loss = loss + self.weight * (described - target).square().sum(1).mean()
+        return loss
 
     def evaluate(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"]) -> dict[str, float]:
         """`patch_quality` of the descriptors."""
@@ -106,36 +118,52 @@ class CovarianceObjective:
     A patch is turned and stretched in two ways T1 and T2, up to `tilt` each. With the shapes A1 and A2 found then,
     T1 A1 and T2 A2 rectify the same patch, so (T1 A1)^-1 T2 A2 should be a rotation. Unlike the loss on descriptors it
     cannot be met by one shape for all patches, and needs no descriptor.
+
+    teacher: a trained network that stays as it is; each shape should also be its shape of the same patch. weight: of
+    that part of the loss, which is measured alike.
     """
 
     tilt: float = 2.5
+    teacher: PatchFunction | None = None
+    weight: float = 1.0
 
     def loss(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"], draws: Float[Tensor, "n k"]) -> Tensor:
         """Mean of log((s^2 + s^-2) / 2) for singular values s and 1 / s of what should be a rotation: 0 where it is."""
-        _, after = self._relative(network, pairs.flatten(0, 1), torch.cat([draws, draws]))
-        return (after.square().sum((1, 2)) / 2).log().mean()
+        (T1, T2), seen = self._stretched(pairs.flatten(0, 1), torch.cat([draws, draws]))
+        shapes = shape_matrix(network(seen))
+        A1, A2 = shapes.chunk(2)
+        loss = _departure(_inverse(T1 @ A1) @ T2 @ A2)
+        if self.teacher is not None:
+            with torch.no_grad():
+                target = shape_matrix(self.teacher(seen))
+            loss = loss + self.weight * _departure(_inverse(target) @ shapes)
+        return loss
 
     @torch.no_grad()
     def evaluate(self, network: nn.Module, pairs: Float[Tensor, "2 n 1 h w"]) -> dict[str, float]:
         """Median ratio of axes that is left between the two rectified patches, and without shapes (1: none)."""
         patches = pairs[0]
         draws = random.uniform(0, torch.zeros(1, dtype=torch.int64), Stream.TRAINING, 0, len(patches), DRAWS)[0]
-        both = self._relative(network, patches, draws.to(patches))
-        values = [torch.linalg.svdvals(m.cpu()) for m in both]
+        (T1, T2), seen = self._stretched(patches, draws.to(patches))
+        A1, A2 = shape_matrix(network(seen)).chunk(2)
+        values = [torch.linalg.svdvals(m.cpu()) for m in (_inverse(T1) @ T2, _inverse(T1 @ A1) @ T2 @ A2)]
         before, after = (float((s[:, 0] / s[:, 1]).median()) for s in values)
         return {"residual_tilt": after, "circle_residual_tilt": before}
 
-    def _relative(
-        self, network: nn.Module, patches: Float[Tensor, "n 1 h w"], draws: Float[Tensor, "n k"]
-    ) -> tuple[Tensor, Tensor]:
-        """(T1)^-1 T2 and (T1 A1)^-1 T2 A2, matrices of determinant 1."""
+    def _stretched(
+        self, patches: Float[Tensor, "n 1 h w"], draws: Float[Tensor, "n k"]
+    ) -> tuple[tuple[Tensor, Tensor], Float[Tensor, "m 1 s s"]]:
+        """T1 and T2 of each patch, and the patches through T1, then through T2."""
         T1, T2 = (
             _rotation(2 * math.pi * draws[:, i]) @ _stretch(self.tilt ** draws[:, i + 1], math.pi * draws[:, i + 2])
             for i in (0, 3)
         )
-        seen = torch.cat([sample(patches, T1), sample(patches, T2)])
-        A1, A2 = shape_matrix(network(seen)).chunk(2)
-        return _inverse(T1) @ T2, _inverse(T1 @ A1) @ T2 @ A2
+        return (T1, T2), torch.cat([sample(patches, T1), sample(patches, T2)])
+
+
+def _departure(matrix: Float[Tensor, "n 2 2"]) -> Float[Tensor, ""]:
+    """Mean of log((s^2 + s^-2) / 2) of matrices of determinant 1: how far they are from rotations."""
+    return (matrix.square().sum((1, 2)) / 2).log().mean()
 
 
 def shape_matrix(x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 2 2"]:

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from fmtorch.features.networks import ARCHITECTURES, AffNet, HardNet, L2Net, OriNet, build, load_weights
+from fmtorch.features.networks import ARCHITECTURES, DESCRIPTORS, AffNet, HardNet, L2Net, OriNet, build, load_weights
 from tests.conftest import oracle, shared_path
 
 RTOL = 1e-4  # of unit outputs: float32 sums of up to 8,192 terms in another order
@@ -100,7 +100,7 @@ def test_l2net_subtracts_the_mean_patch() -> None:
     torch.testing.assert_close(network(x + network.pixel_mean).detach(), expected, atol=RTOL, rtol=0)
 
 
-@pytest.mark.parametrize("name", ["hardnet", "l2net", "geodesc"])
+@pytest.mark.parametrize("name", DESCRIPTORS)
 def test_descriptors_have_unit_length_and_ignore_light(name: str, patches: Tensor) -> None:
     network = randomized(build(name))
     found = network(patches)
@@ -129,5 +129,7 @@ def test_files_that_do_not_fit_are_named(tmp_path: Path) -> None:
         load_weights(HardNet(), tmp_path / "list.pth")
     with pytest.raises(FileNotFoundError, match=r"absent\.pth does not exist"):
         load_weights(HardNet(), tmp_path / "absent.pth")
-    with pytest.raises(ValueError, match="there are: hardnet, l2net, geodesc, affnet, orinet"):
+    with pytest.raises(
+        ValueError, match="there are: hardnet, hardnet_fast, l2net, geodesc, affnet, affnet_fast, orinet"
+    ):
         build("siftnet")

@@ -11,11 +11,13 @@ from omegaconf import DictConfig
 
 from fmtorch.core.resources import conf_dir
 from fmtorch.features.networks import build
+from fmtorch.features.onnx_network import PatchNetwork
 from fmtorch.training.match_set_training import MatchSetTraining
+from fmtorch.training.patch_objectives import CovarianceObjective, DescriptorObjective
 from fmtorch.training.patch_store import PatchStore
 from fmtorch.training.photographs import package_photographs
 from fmtorch.training.track_store import TrackStore
-from scripts.train_patch_network import cut_tracks, training_of
+from scripts.train_patch_network import cut_tracks, objective_of, training_of
 
 SMALL = (
     "training.tracks.points=80", "training.tracks.planes.views=3", "training.tracks.planes.tilt=10",
@@ -33,6 +35,16 @@ def test_the_preset_has_the_values_of_the_paper() -> None:
     training = config().training
     assert training.match_sets == {"matches": 64, "max_similarity": 0.85}
     assert training.loss == {"name": "geodesc", "ratio": 0.4, "geometric_weight": 0.2}
+
+
+@pytest.mark.parametrize(("name", "teacher"), [("hardnet_fast", "hardnet.int8.onnx"), ("affnet_fast", "affnet.onnx")])
+def test_fast_networks_have_teachers(name: str, teacher: str) -> None:
+    objective = objective_of(config(f"training={name}"), torch.device("cpu"))
+    assert isinstance(objective, DescriptorObjective | CovarianceObjective)
+    assert isinstance(objective.teacher, PatchNetwork)
+    assert objective.teacher.path.name == teacher
+    with_none = objective_of(config(f"training={name}", "~training.teacher"), torch.device("cpu"))
+    assert with_none.teacher is None  # type: ignore[attr-defined]
 
 
 def test_photographs_become_tracks_and_a_step_of_training(tmp_path: Path) -> None:

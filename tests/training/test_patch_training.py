@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor
 
 from fmtorch.data.rendered.photographs import photograph
-from fmtorch.features.networks import AffNet, HardNet, build, load_weights
+from fmtorch.features.networks import AffNet, AffNetFast, HardNet, build, load_weights
 from fmtorch.training.correspondences import Tolerance, corresponding_patches
 from fmtorch.training.model_card import model_card, sha256
 from fmtorch.training.patch_loop import PatchTraining, TrainingOptions
@@ -181,6 +182,37 @@ def test_a_checkpoint_gives_the_network_and_its_card(store: PatchStore, tmp_path
     other = model_card(tmp_path / "hardnet.onnx", "affnet", "int8", {**content, "loss": {"name": "affine_covariance"}})
     assert "own, not AffNet's" in other
     assert "own, not" not in card
+
+
+def test_a_teacher_adds_the_distance_to_its_descriptors(store: PatchStore) -> None:
+    torch.manual_seed(0)
+    network, teacher = HardNet(dropout=0.0).eval(), HardNet().eval().requires_grad_(False)
+    pairs, draws = validation_pairs(store, 12), torch.full((12, DRAWS), 0.9)  # neither mirrored nor turned
+    plain = DescriptorObjective(hardest_triplet).loss(network, pairs, draws)
+    itself = DescriptorObjective(hardest_triplet, network, weight=2.0).loss(network, pairs, draws)
+    torch.testing.assert_close(itself, plain)
+    taught = DescriptorObjective(hardest_triplet, teacher, weight=2.0).loss(network, pairs, draws)
+    patches = middle(pairs).flatten(0, 1)
+    apart = (network(patches) - teacher(patches)).square().sum(1).mean()
+    torch.testing.assert_close(taught, plain + 2 * apart)
+
+
+def test_a_teacher_adds_the_departure_from_its_shapes(store: PatchStore) -> None:
+    torch.manual_seed(0)
+    network, draws = AffNetFast(dropout=0.0).eval(), torch.rand(12, DRAWS)
+    pairs = validation_pairs(store, 12)
+    plain = CovarianceObjective().loss(network, pairs, draws)
+    itself = CovarianceObjective(teacher=network, weight=2.0).loss(network, pairs, draws)
+    torch.testing.assert_close(itself, plain, atol=1e-6, rtol=0)
+
+    def stretching(patches: Tensor) -> Tensor:
+        """The network's shapes, stretched by 1.2 in x and by 1 / 1.2 in y."""
+        x = network(patches)
+        return torch.stack([1.2 * (1 + x[:, 0]) - 1, x[:, 1] / 1.2, (1 + x[:, 2]) / 1.2 - 1], 1)
+
+    taught = CovarianceObjective(teacher=stretching, weight=2.0).loss(network, pairs, draws)
+    # (S A)^-1 A with S the stretch: at least S's own singular values are left
+    assert float((taught - plain).detach()) > 2 * math.log((1.44 + 1 / 1.44) / 2) - 1e-5
 
 
 def stretched(store: PatchStore, matrix: Tensor) -> tuple[Tensor, Tensor]:

@@ -12,12 +12,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from fmtorch.features.networks.descriptors import GeoDesc, HardNet, L2Net
-from fmtorch.features.networks.geometry import AffNet, OriNet
+from fmtorch.features.networks.descriptors import GeoDesc, HardNet, HardNetFast, L2Net
+from fmtorch.features.networks.geometry import AffNet, AffNetFast, OriNet
 
 ARCHITECTURES: dict[str, type[nn.Module]] = {
-    "hardnet": HardNet, "l2net": L2Net, "geodesc": GeoDesc, "affnet": AffNet, "orinet": OriNet,
+    "hardnet": HardNet, "hardnet_fast": HardNetFast, "l2net": L2Net, "geodesc": GeoDesc,
+    "affnet": AffNet, "affnet_fast": AffNetFast, "orinet": OriNet,
 }  # fmt: skip
+DESCRIPTORS = ("hardnet", "hardnet_fast", "l2net", "geodesc")
 
 
 def build(architecture: str, **options: Any) -> nn.Module:

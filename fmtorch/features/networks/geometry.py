@@ -5,7 +5,7 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from fmtorch.features.networks.layers import as_float32, orthogonal_, standardize, trunk
+from fmtorch.features.networks.layers import Layout, as_float32, l2net_layout, orthogonal_, standardize, trunk
 
 
 class AffNet(nn.Module):
@@ -16,13 +16,14 @@ class AffNet(nn.Module):
     """
 
     outputs = 3
+    layout: Layout = l2net_layout(16)
 
     def __init__(self, dropout: float = 0.25) -> None:
         super().__init__()
         tail = (nn.Tanh(), nn.AdaptiveAvgPool2d(1))
-        self.features = nn.Sequential(*trunk(16, dropout, self.outputs, bias=True), *tail)
+        self.features = nn.Sequential(*trunk(self.layout, dropout, self.outputs, bias=True), *tail)
         orthogonal_(self.features)
-        last = self.features[19]
+        last = self.features[-1 - len(tail)]
         assert isinstance(last, nn.Conv2d)
         assert last.bias is not None
         nn.init.zeros_(last.bias)
@@ -30,6 +31,15 @@ class AffNet(nn.Module):
     def forward(self, patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n 3"]:
         """The three numbers of each patch."""
         return as_float32(self.features, standardize(patches, eps=1e-6))
+
+
+class AffNetFast(AffNet):
+    """AffNet with a quarter of its multiplications.
+
+    The first convolution has stride 2 already, the widest has 32 channels.
+    """
+
+    layout: Layout = ((16, 2), (16, 1), (32, 2), (32, 1))
 
 
 class OriNet(nn.Module):
@@ -43,7 +53,7 @@ class OriNet(nn.Module):
     def __init__(self, dropout: float = 0.25) -> None:
         super().__init__()
         tail = (nn.Tanh(), nn.AdaptiveAvgPool2d(1))
-        layers = trunk(16, dropout, self.outputs, bias=True)
+        layers = trunk(l2net_layout(16), dropout, self.outputs, bias=True)
         last = layers[-1]
         assert isinstance(last, nn.Conv2d)
         last.padding = (1, 1)  # nine positions, whose tanh is averaged

@@ -1,12 +1,26 @@
-"""What the patch networks share: the trunk of seven convolutions and the normalisation of patches."""
+"""What the patch networks share: the trunk of convolutions and the normalisation of patches."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 PATCH_SIZE = 32
+Layout = Sequence[tuple[int, int]]
+"""Channels and stride of each 3 x 3 convolution before the last."""
+
+
+def l2net_layout(width: int) -> Layout:
+    """L2-Net's six 3 x 3 convolutions (Tian, Fan, Wu, CVPR 2017, fig. 2).
+
+    width: channels of the first pair of convolutions; the second has twice, the third four times as many, and each of
+    these two begins with stride 2.
+    """
+    return (width, 1), (width, 1), (2 * width, 2), (2 * width, 1), (4 * width, 2), (4 * width, 1)
 
 
 def standardize(patches: Float[Tensor, "n 1 h w"], eps: float) -> Float[Tensor, "n 1 h w"]:
@@ -21,22 +35,22 @@ def standardize(patches: Float[Tensor, "n 1 h w"], eps: float) -> Float[Tensor, 
     return centred / (std + eps)
 
 
-def trunk(width: int, dropout: float, outputs: int, *, bias: bool = False) -> list[nn.Module]:
-    """L2-Net's layout (Tian, Fan, Wu, CVPR 2017, fig. 2): six 3 x 3 convolutions, then one over the 8 x 8 that is left.
+def trunk(layout: Layout, dropout: float, outputs: int, *, bias: bool = False) -> list[nn.Module]:
+    """Convolutions of 3 x 3 with batch norm and ReLU, then one over the whole of what is left.
 
-    width: channels of the first pair of convolutions; the second has twice, the third four times as many, and each of
-    these two begins with stride 2. Batch norms have no learned scale or shift. bias: of the last convolution.
+    Batch norms have no learned scale or shift. bias: of the last convolution.
     """
     layers: list[nn.Module] = []
     channels = 1
-    for out, stride in ((width, 1), (width, 1), (2 * width, 2), (2 * width, 1), (4 * width, 2), (4 * width, 1)):
+    for out, stride in layout:
         layers += [
             nn.Conv2d(channels, out, kernel_size=3, stride=stride, padding=1, bias=False),
             nn.BatchNorm2d(out, affine=False),
             nn.ReLU(inplace=True),
         ]
         channels = out
-    return [*layers, nn.Dropout(dropout), nn.Conv2d(channels, outputs, kernel_size=8, bias=bias)]
+    side = PATCH_SIZE // math.prod(stride for _, stride in layout)
+    return [*layers, nn.Dropout(dropout), nn.Conv2d(channels, outputs, kernel_size=side, bias=bias)]
 
 
 def orthogonal_(features: nn.Module, gain: float = 0.6) -> None:
