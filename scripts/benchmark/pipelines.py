@@ -32,7 +32,7 @@ from scripts.benchmark.kept import Kept, read
 from scripts.benchmark.matched import add_set_arguments, console, sets_of
 from scripts.benchmark.pruning import pruned_by
 from scripts.benchmark.sheet import put
-from scripts.benchmark.specs import pipeline_of
+from scripts.benchmark.specs import features_of, pipeline_of
 
 FEATURES = ("sift", "dspsift", "rootsiftpca", "l2net", "geodesc", "hardnet", "hesaffnet")
 SYSTEMS = ("rootsiftpca", "hardnet", "hesaffnet")
@@ -114,7 +114,7 @@ def by_features(arguments: argparse.Namespace) -> Iterator[dict[str, tuple[Pipel
         made_with = {"features": configuration(features), "stages": presets.pipeline_stages(preset),
                      "overrides": overrides, "seeds": arguments.seeds}  # fmt: skip
         label = name + arguments.label
-        groups.setdefault(name.split("_")[0], {})[label] = pipeline, identity_digest(made_with)[:16]
+        groups.setdefault(features_of(name), {})[label] = pipeline, identity_digest(made_with)[:16]
     yield from groups.values()
 
 

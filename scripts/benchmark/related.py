@@ -32,7 +32,7 @@ from scripts.benchmark import related_figure, related_table
 from scripts.benchmark.estimators_table import replaced
 from scripts.benchmark.matched import add_set_arguments, console, sets_of
 from scripts.benchmark.related_pairs import UNRELATED, in_order, unrelated_pairs
-from scripts.benchmark.specs import pipeline_of
+from scripts.benchmark.specs import features_of, pipeline_of
 
 PIPELINES = [
     "sift_fmtorch", "sift_gms", "sift_ratio estimator=lmeds_eight_point", "hardnet_fmtorch", "hesaffnet_fmtorch",
@@ -63,8 +63,8 @@ def run(arguments: argparse.Namespace) -> None:
         pairs = chosen_pairs(arguments)
         unrelated = sum(pair.family.startswith(UNRELATED) for pair in pairs)
         console.print(f"{len(pairs) - unrelated} related pairs, {unrelated} unrelated ones")
-        for feature in dict.fromkeys(name.split("_")[0] for name in arguments.pipelines):
-            names = [name for name in arguments.pipelines if name.split("_")[0] == feature]
+        for feature in dict.fromkeys(map(features_of, arguments.pipelines)):
+            names = [name for name in arguments.pipelines if features_of(name) == feature]
             for name, some, c in matches(feature, pairs, arguments.folder):
                 for pipeline in names:
                     judge(pipeline, name, some, c, arguments.folder)

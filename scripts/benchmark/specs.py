@@ -42,6 +42,11 @@ def pipeline_of(words: str, *overrides: str) -> Pipeline:
     return pipeline
 
 
+def features_of(name: str) -> str:
+    """What the name of a pipeline, with overrides or not, says of its features: ``hesaffnet`` of ``hesaffnet_gms``."""
+    return name.split()[0].rpartition("_")[0]
+
+
 def identity(spec: str, extra: Mapping[str, Stage] = NONE) -> str:
     """The digest of what an estimator's results depend on: options, code, learned files, versions of peers."""
     name, changed = split(spec.partition("@")[0])

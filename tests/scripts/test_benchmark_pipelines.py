@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from scripts.benchmark.specs import features_of
 from tests.pipeline.test_pipeline import draw
 from tests.processes import run_command
 
@@ -15,6 +16,11 @@ def benchmark(*arguments: str, cwd: Path) -> str:
     result = run_command("scripts.benchmark", "pipelines", *arguments, cwd=cwd)
     assert result.returncode == 0, result.stderr
     return result.stdout
+
+
+def test_names_of_features_that_begin_alike_are_apart() -> None:
+    names = ["hesaffnet_fmtorch", "hesaffnet_fast_fmtorch", "hesaffnet_gms estimator=lmeds_eight_point"]
+    assert [features_of(name) for name in names] == ["hesaffnet", "hesaffnet_fast", "hesaffnet"]
 
 
 def test_an_interrupted_run_goes_on(tmp_path: Path) -> None:
