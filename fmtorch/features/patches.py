@@ -18,6 +18,7 @@ COARSEST = 8  # pixels, the least shorter side of a level
 # A level has a blur of about 0.7 of its pixels (the binomial filter's 0.58, and the interpolation's): samples up to
 # sqrt(2) of its pixels apart see it with a blur of half their distance, as an image's pixels see a scene.
 LARGEST_STEP = math.sqrt(2)
+BAND = 32.0  # pixels of the image, rows whose frames are sampled together
 MAX_SAMPLES = 8  # along an axis for one pixel of a patch
 
 
@@ -79,10 +80,10 @@ def _sample_opencv(levels: list[Tensor], lafs: Tensor, plan: _Plan, size: int) -
     images = [level.numpy() for level in levels]
     out = np.zeros((len(lafs), size, size), np.float32)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    maps = _maps(lafs, plan, size).numpy()
-    for patch, matrix, level, (nx, ny) in zip(out, maps, plan.level.tolist(), plan.samples.tolist(), strict=True):
-        if level < 0:
-            continue
+    order = _by_place(lafs, plan)
+    maps, places = _maps(lafs, plan, size)[order].numpy(), zip(*(a[order].tolist() for a in plan), strict=True)
+    for i, matrix, (level, (nx, ny)) in zip(order.tolist(), maps, places, strict=True):
+        patch = out[i]
         dense = patch if nx == ny == 1 else None
         samples = cv2.warpAffine(
             images[level], matrix, (size * nx, size * ny), dst=dense, flags=flags, borderMode=cv2.BORDER_REPLICATE
@@ -90,6 +91,15 @@ def _sample_opencv(levels: list[Tensor], lafs: Tensor, plan: _Plan, size: int) -
         if dense is None:
             cv2.resize(samples, (size, size), dst=patch, interpolation=cv2.INTER_AREA)
     return torch.from_numpy(out)[:, None]
+
+
+def _by_place(lafs: Float[Tensor, "n 2 3"], plan: _Plan) -> Int[Tensor, " m"]:
+    """The finite frames, neighbours in the image after one another: what they see is then in the cache already."""
+    finite = torch.nonzero(plan.level >= 0)[:, 0]
+    x, y = lafs[finite, 0, 2], lafs[finite, 1, 2]
+    by_column = x.argsort()
+    by_band = (y[by_column] / BAND).floor().argsort(stable=True)
+    return finite[by_column[by_band]]
 
 
 def _halve_torch(image: Tensor) -> Tensor:
