@@ -31,6 +31,7 @@ from scripts.benchmark import (
     scale,
     similar,
     speed,
+    stages,
     stress,
     sweep,
     thresholds,
@@ -44,7 +45,7 @@ def main() -> None:
     for module in (
         cameras, configuration, curves, end_to_end, estimators, features, gc_ransac, hard, homography, known_models,
         learned, matching, memory, paper, paper_times, pipelines, posebench, pruning, refinement, related, scale,
-        similar, speed, stress, sweep, thresholds, verify,
+        similar, speed, stages, stress, sweep, thresholds, verify,
     ):  # fmt: skip
         module.add_arguments(commands)
     arguments = parser.parse_args()

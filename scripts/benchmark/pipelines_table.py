@@ -21,6 +21,8 @@ ORDER = (
     ("hesaffnet_gms", "sift_ratio"),
 )  # fmt: skip
 """Pairs of pipelines of which the paper has the first above the second on wide baselines."""
+FASTER = (("hesaffnet_fast_fmtorch", "hesaffnet_fmtorch"),)
+"""A pipeline of smaller networks, and that of their teachers."""
 REAL = ("Strecha", "PhotoTourism", "CPC", "Tanks_and_Temples", "TanksLike", "KITTI", "TUM")
 METHODS = [method for dataset, method in published(PAPER) if dataset == "CPC"]
 
@@ -97,7 +99,7 @@ def _order(rows: list[Row], families: list[str]) -> Sheet:
     labelled = sorted((name, name.split()[0]) for name in by_method if " " in name)
     lines = []
     for group, members in groups.items():
-        for better, worse in [*ORDER, *labelled]:
+        for better, worse in [*ORDER, *FASTER, *labelled]:
             first, second = by_method.get(better, {}), by_method.get(worse, {})
             common = [pair for pair in first if pair in second and first[pair]["family"] in members]
             if not common or (len(members) < 2 and group not in families):

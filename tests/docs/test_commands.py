@@ -120,6 +120,7 @@ APPENDED = {
     "speed": ["--pairs", "2", "--batch", "2", "--repeats", "1", "--matches", "200"],
     "memory": ["--pairs", "1", "--matches", "200", "--estimators", "ransac"],
     "end_to_end": ["--limit", "1", "--pipelines", "sift_ratio estimator=lmeds_eight_point"],
+    "stages": ["--size", "120", "160", "--repeats", "1"],
     "features": ["--features", "100", "--repeats", "1", "--size", "120", "160"],
     "matching": ["--features", "200", "--repeats", "1"],
 }
