@@ -35,10 +35,10 @@ def local_feature(
     """A `LocalFeature` of named parts.
 
     detector: `dog` (options of `SIFT`) or `hessian` (options of `HessianDetector`), at most `max_features` of them.
-    shape: None or `affnet`. orientation: None for the detector's, `dominant_gradient` or `orinet`.
+    shape: None, `affnet` or `affnet_fast`. orientation: None for the detector's, `dominant_gradient` or `orinet`.
     descriptor: `sift`, `rootsift`, `dspsift` (options of `PatchSIFT`), `rootsiftpca` (of `RootSIFTPCA`), `l2net`,
-    `geodesc` or `hardnet`. A part that is a network takes the option `network`, the path of another ONNX file than the
-    shipped one.
+    `geodesc`, `hardnet` or `hardnet_fast`. A part that is a network takes the option `network`, the path of another
+    ONNX file than the shipped one.
     precision: of the networks, fp32 or int8. threads: of each network. device: for torch, see `LocalFeature`.
 
     Raises ValueError for an unknown name or option, naming those there are. Networks are read when first used.
@@ -54,7 +54,7 @@ def local_feature(
         "dog": functools.partial(SIFT, max_features=max_features),
         "hessian": functools.partial(HessianDetector, max_features=max_features),
     }
-    shapes: dict[str, Callable[..., FrameStep]] = {"affnet": by(NetworkShape, "affnet")}
+    shapes: dict[str, Callable[..., FrameStep]] = {name: by(NetworkShape, name) for name in ("affnet", "affnet_fast")}
     orientations: dict[str, Callable[..., FrameStep]] = {
         "dominant_gradient": DominantGradient,
         "orinet": by(NetworkOrientation, "orinet"),
@@ -64,9 +64,7 @@ def local_feature(
         "rootsift": functools.partial(PatchSIFT, root=True),
         "dspsift": PatchSIFT,
         "rootsiftpca": RootSIFTPCA,
-        "l2net": by(NetworkDescriptor, "l2net"),
-        "geodesc": by(NetworkDescriptor, "geodesc"),
-        "hardnet": by(NetworkDescriptor, "hardnet"),
+        **{name: by(NetworkDescriptor, name) for name in ("l2net", "geodesc", "hardnet", "hardnet_fast")},
     }
     return LocalFeature(
         detector=_part("detector", detector, detectors),

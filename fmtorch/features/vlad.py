@@ -25,7 +25,8 @@ Kind = Literal["sift", "rootsiftpca", "hardnet"]
 POWER = 0.5  # of RootSIFT-PCA's entries, as `features=rootsiftpca` has it
 _SIFT_CLASSES = ("SIFT", "ASIFT", "VLFeatSIFT")
 _KINDS: Mapping[str, Kind] = {
-    **dict.fromkeys(("sift", "rootsift", "dspsift"), "sift"), "rootsiftpca": "rootsiftpca", "hardnet": "hardnet",
+    **dict.fromkeys(("sift", "rootsift", "dspsift"), "sift"), "rootsiftpca": "rootsiftpca",
+    **dict.fromkeys(("hardnet", "hardnet_fast"), "hardnet"),  # the latter was taught to give the former's descriptors
 }  # fmt: skip
 
 

@@ -28,10 +28,7 @@ OTHER_LOSS = {
     "known ways should be rectified alike (fmtorch.training.patch_objectives.CovarianceObjective). The published hard "
     "negative-constant loss, with a HardNet that is itself robust to tilt, ended after 20 minutes in one shape for all "
     "patches; it is the option training.loss.name=hard_negative_constant.",
-    (
-        "affnet_fast",
-        "affine_covariance",
-    ): "The loss is that of this project's AffNet (affnet.md), and the departure from its shapes.",
+    ("affnet_fast", "affine_covariance"): "The loss is that of affnet.md, plus the departure from its shapes.",
     ("l2net", "hardest_triplet"): "The loss is HardNet's: L2-Net's own, the option "
     "training.loss.name=relative_distance, learns far more slowly in so short a run.",
     ("geodesc", "geodesc"): "The method is GeoDesc's; the authors' weights are not. In place of their reconstructions, "

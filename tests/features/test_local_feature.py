@@ -213,7 +213,7 @@ def test_large_images_are_reduced_for_opencv() -> None:
     assert torch.equal(SIFT(max_pixels=300 * 401)(image).lafs, a.lafs)
 
 
-@pytest.mark.parametrize("name", ["l2net", "geodesc", "hardnet", "hesaffnet"])
+@pytest.mark.parametrize("name", ["l2net", "geodesc", "hardnet", "hesaffnet", "hesaffnet_fast"])
 @pytest.mark.parametrize("shape", [(1, 300), (20, 31), (40, 45)])
 def test_shipped_networks_on_small_images(name: str, shape: tuple[int, int]) -> None:
     image = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)

@@ -67,7 +67,7 @@ def test_sift_of_any_scale_is_one_descriptor() -> None:
     ("pipeline", "kind"),
     [
         ("sift_fmtorch", "sift"), ("dspsift_ratio", "sift"), ("rootsiftpca_gms", "rootsiftpca"),
-        ("hesaffnet_fmtorch", "hardnet"), ("hardnet_gms", "hardnet"),
+        ("hesaffnet_fmtorch", "hardnet"), ("hesaffnet_fast_fmtorch", "hardnet"), ("hardnet_gms", "hardnet"),
     ],
 )  # fmt: skip
 def test_pipelines_and_their_codebooks(pipeline: str, kind: str) -> None:

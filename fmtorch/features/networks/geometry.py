@@ -34,12 +34,12 @@ class AffNet(nn.Module):
 
 
 class AffNetFast(AffNet):
-    """AffNet with a quarter of its multiplications.
+    """AffNet with less than a quarter of its multiplications.
 
     The first convolution has stride 2 already, the widest has 32 channels.
     """
 
-    layout: Layout = ((16, 2), (16, 1), (32, 2), (32, 1))
+    layout: Layout = ((16, 2), (16, 1), (32, 2), (32, 1), (32, 1))
 
 
 class OriNet(nn.Module):
