@@ -260,6 +260,8 @@ def test_errors(arguments: tuple[object, ...], options: dict[str, object], error
 
 @pytest.mark.parametrize("name", presets.available("pipeline"))
 def test_every_pipeline_composes_by_name(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if name == "vismatch":
+        pytest.importorskip("vismatch", reason="pipeline=vismatch needs the extra vismatch")
     for module in ("features.kornia_features", "matching.lightglue"):  # without fetching others' weights
         monkeypatch.setattr(f"fmtorch.{module}.pretrained", lambda load, *_: torch.nn.Identity())
     built = presets.pipeline(name)

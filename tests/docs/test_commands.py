@@ -51,6 +51,8 @@ ELSEWHERE = {
     r"dataset=(tum|kitti|colmap|bundler|fmbench dataset\.root=KITTI)": "tests/data runs these on data of their layout",
     r"pipeline=vismatch|(dataset=|runs/)pair_list": "tests/matching/test_vismatch.py runs a stand-in on lists of pairs",
     r"dataset=hpatches": "tests/evaluation/test_homographies.py runs these on sequences of its own",
+    r"'overlap=|HARD/": "tests/data/test_overlap.py, tests/scripts/test_benchmark_hard.py run these",
+    r"benchmark known_models": "needs the images of a scene; tests/scripts/test_benchmark_known_models.py has some",
     r"--config-dir my_conf features=": "tests/docs/test_own_parts.py runs this page",
 }
 """Commands that are not run here, and why."""

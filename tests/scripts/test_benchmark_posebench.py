@@ -265,6 +265,6 @@ def test_cameras_without_sizes_have_the_same_poses(
     for sized in (True, False):
         rows = tmp_path / f"{sized}.jsonl"
         folder = sample(tmp_path / str(sized), sized=sized)
-        run(capsys, monkeypatch, folder, "--methods", "E:poselib", "--rows", rows)
+        run(capsys, monkeypatch, folder, "--methods", "E:fmtorch", "--rows", rows)
         errors.append([json.loads(line)["rotation"] for line in rows.read_text().splitlines()])
     assert errors[0] == pytest.approx(errors[1], abs=1e-3)

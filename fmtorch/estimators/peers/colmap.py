@@ -112,7 +112,7 @@ def colmap(
     return PairwiseEstimator("COLMAP", fundamental if model == "fundamental" else homography, model=model)
 
 
-def two_view_options(threshold: float | int, seed: int) -> Any:
+def two_view_options(threshold: float, seed: int) -> Any:
     """`pycolmap.TwoViewGeometryOptions` at a threshold in pixels, with relative poses."""
     options = peer("pycolmap", "COLMAP", extra="colmap").TwoViewGeometryOptions(compute_relative_pose=True)
     options.ransac.max_error, options.ransac.random_seed = threshold, seed % MAX_SEED
