@@ -143,7 +143,7 @@ def _begin(environment: Mapping[str, str]) -> None:
     os.environ.update(environment)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    torch.multiprocessing.set_sharing_strategy(SHARED_BY)
+    torch.multiprocessing.set_sharing_strategy(SHARED_BY)  # type: ignore[no-untyped-call]
 
 
 def end_with_parent() -> None:
