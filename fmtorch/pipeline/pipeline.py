@@ -195,15 +195,19 @@ class Pipeline:
             own = [i for i, o in enumerate(outcomes) if (o.pair.family if o.pair.family in others else None) == family]
             if own:
                 some = [outcomes[i] for i in own]
-                c = collated(some)
+                c = keypoints = collated(some)
 
                 def images(i: int, some: list[Outcome] = some) -> PairImages:
                     return some[i].images or self.images(some[i].pair)
 
                 for pruner in self.pruners_of(family or "").values():
-                    c = pruned(pruner, c, images).compact()
+                    c = pruned(pruner, c, images)
+                    if self.looks_at_images:
+                        keypoints = keypoints.derived(mask=c.mask).compact()
+                    c = c.compact()
                 for place, i in enumerate(own):
-                    result[i] = dataclasses.replace(outcomes[i], correspondences=c[place], images=None)
+                    ends = keypoints[place] if self.looks_at_images else None
+                    result[i] = dataclasses.replace(outcomes[i], correspondences=c[place], images=None, keypoints=ends)
         return result
 
     def _estimate(self, outcomes: list[Outcome], seed: int) -> list[Outcome]:
