@@ -111,7 +111,7 @@ def test_the_hard_form_leaves_the_prior_and_the_soft_form_the_matches(name: str)
 
 def test_likely_makes_a_filter_of_a_prior() -> None:
     c = presets.build("pruner", "frame_consistency")(scene(0, 200))
-    kept = presets.build("pruner", "likely", least=0.3)(c)
+    kept = presets.build("pruner", "likely", min_probability=0.3)(c)
     assert torch.equal(kept.mask, c.prior >= 0.3)
     with pytest.raises(ValueError, match="prior"):
         presets.build("pruner", "likely")(c.replace(prior=None))
