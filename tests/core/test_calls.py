@@ -139,7 +139,7 @@ def test_another_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     recipe = Recipe(functools.partial(made, tmp_path))
     monkeypatch.setattr(recipes, "__version__", "9.9")
     with pytest.raises(ValueError, match=r"a worker has fmtorch 9\.9"):
-        recipe.call(squares, whole=True)([1])
+        recipe.call(squares, with_recipe=True)([1])
 
 
 class Own(ThreadPoolExecutor):
