@@ -47,7 +47,7 @@ def case(index: int = 0, turn: float = 0.1, t: tuple[float, float, float] = (-1.
     F = fundamental_from_calibration(*(torch.from_numpy(np.asarray(a, np.float64)) for a in (K, K, R, t))).numpy()
     image = ImageSource("none", Path("none.png"))
     pair = ImagePair(f"orbit/a/{index}", "orbit", "a", image, image, F, K, K, R, np.array(t))
-    return stress_cases.made(pair, nearest(pair, rng, right=150, flat=60, wrong=600))
+    return stress_cases.case_of(pair, nearest(pair, rng, right=150, flat=60, wrong=600))
 
 
 def test_right_and_wrong_are_told_by_the_true_matrix() -> None:
