@@ -37,7 +37,7 @@ def test_the_truth_stays_true(epoch: int) -> None:
     assert singular[2] < 1e-9 * singular[0]
     assert torch.equal(c.lafs0[..., 2], c.x0)
     assert torch.equal(c.lafs1[..., 2], c.x1)
-    assert c.mask.all()  # no empty slot
+    assert c.mask.all()
     # Every match is one of before, with its label: the quality says which.
     old = {float(q): int(v) for q, v in zip(before.correspondences.quality[0], before.label[0], strict=True)}
     assert [old[float(q)] for q in c.quality[0]] == after.label[0].tolist()
