@@ -156,18 +156,18 @@ def _evaluated(
 
 def _summarize(table: pa.Table, folder: RunFolder, title: str, signed: bool) -> dict[str, Group]:
     """The summary of the rows asked for, which is shown; that of all rows of the run goes to its folder."""
-    whole = folder.read()
+    run_table = folder.read()
     summary = summarize(table, signed)
-    all_rows = summary if len(whole) == len(table) else summarize(whole, signed)
+    all_rows = summary if len(run_table) == len(table) else summarize(run_table, signed)
     folder.write_summary(all_rows, summary_markdown(all_rows, title=title))
-    plot_recall_curves({title.partition(" ")[0]: whole}, folder.path / "recall.png")
-    part = "" if len(whole) == len(table) else f", {len(table)} of the {len(whole)} pairs of the run"
+    plot_recall_curves({title.partition(" ")[0]: run_table}, folder.path / "recall.png")
+    part = "" if len(run_table) == len(table) else f", {len(table)} of the {len(run_table)} pairs of the run"
     console.print(summary_table(summary, title=f"{title}{part}"))
     if (poses := pose_table(summary)) is not None:
         console.print(poses)
     for further in further_tables(summary):
         console.print(further)
-    about = f"; of all {len(whole)} pairs" if part else ""
+    about = f"; of all {len(run_table)} pairs" if part else ""
     console.print(f"{folder.path}: pairs/, summary.json, summary.md, recall.png{about}", style="dim")
     return summary
 

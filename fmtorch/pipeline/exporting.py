@@ -116,7 +116,8 @@ def _pair(
     """
     mask = c.mask[0].cpu()
     index = [
-        indices(those, x[0].detach().cpu().float()[mask].numpy()) for those, x in zip(points, (c.x0, c.x1), strict=True)
+        indices(keypoints, x[0].detach().cpu().float()[mask].numpy())
+        for keypoints, x in zip(points, (c.x0, c.x1), strict=True)
     ]
     quality = torch.zeros(len(mask)) if c.quality is None else c.quality[0].detach().cpu().float()
     scores = (1 - quality[mask]).nan_to_num(0.0).clamp(0.0, 1.0)
