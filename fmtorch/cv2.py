@@ -138,8 +138,8 @@ def findEssentialMat(points1: Any, points2: Any, *arguments: Any, **named: Any) 
     prob, threshold = rest.get("prob"), rest.get("threshold", 1.0)
     name, options = _preset(rest.get("method", opencv.RANSAC), scale * threshold, prob, rest.get("maxIters"))
     estimate = find_essential(scale * x1, scale * x2, S @ K1, S @ K2, estimator=name, **options)
-    found = bool(estimate.ok[0]) and estimate.E is not None and bool(estimate.E.isfinite().all())
-    if not found or estimate.E is None:
+    valid = bool(estimate.ok[0]) and estimate.E is not None and bool(estimate.E.isfinite().all())
+    if not valid or estimate.E is None:
         return None, None
     return estimate.E[0].cpu().numpy(), _mask(estimate, rest.get("mask"))
 

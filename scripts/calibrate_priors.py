@@ -47,7 +47,9 @@ def main() -> None:
     parser.add_argument("--stages", nargs="*", default=list(STAGES))
     parser.add_argument("--ratio", type=float, default=0.9, help="matches below this distance ratio take part")
     parser.add_argument("--threshold", type=float, default=2.0, help="px, Sampson distance of an inlier")
-    parser.add_argument("--least", type=int, default=20, help="pairs with fewer matches are left out")
+    parser.add_argument(
+        "--least", dest="min_matches", type=int, default=20, help="pairs with fewer matches are left out"
+    )
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     pairs = matched(arguments)
@@ -71,7 +73,7 @@ def matched(arguments: argparse.Namespace) -> list[Pair]:
     pairs = []
     for pair in track(sorted((p for s in sets for p in s), key=lambda p: p.identity), "matching", console=console):
         c = front.match([pair])[0].correspondences
-        if c is None or int(c.count()) < arguments.least:
+        if c is None or int(c.count()) < arguments.min_matches:
             continue
         distance = sampson(torch.from_numpy(pair.F)[None], c.x0.double(), c.x1.double())[0]
         scene = pair.scene if pair.family in families else pair.family  # a rendered scene has but a few pairs

@@ -42,26 +42,26 @@ def inputs(quick: bool, matches: Path | None) -> dict[str, dict[str, torch.Tenso
     scenes = collate([scene(i, n) for i, n in enumerate((150, 40, 333) if quick else (150, 40, 333, 90, 150, 700))])
     hard = collate([scene(20 + i, 260, outliers=0.7, noise=0.6) for i in range(2 if quick else 6)])
     other = torch.tensor([[700, 900]]).expand(len(scenes), 2)
-    found = {
+    batches = {
         "scenes": scenes.replace(noise=noise(scenes)),
         "no prior, no sizes": scenes.replace(prior=None, size0=None, size1=None),
         "two sizes": hard.replace(size1=other[:1].expand(len(hard), 2)),
     }
     if not quick:
-        found |= {
+        batches |= {
             "hard": hard,
             "two sizes, noise, no prior": scenes.replace(size1=other, noise=noise(scenes), prior=None),
             "no quality": scenes.replace(quality=None),
         }
     kinds = [*degenerate().values(), *small().values()]
-    found["degenerate"] = collate(kinds[::4] if quick else kinds)
+    batches["degenerate"] = collate(kinds[::4] if quick else kinds)
     if matches is not None:
         arrays = np.load(matches)
         names = range(0, len(arrays["names"]), 8 if quick else 1)
-        found |= {f"real {i}": real(arrays, i, QUICK_MATCHES if quick else MATCHES) for i in names}
+        batches |= {f"real {i}": real(arrays, i, QUICK_MATCHES if quick else MATCHES) for i in names}
     return {
         name: {f: v.clone() for f in FIELDS if isinstance(v := getattr(c, f), torch.Tensor)}
-        for name, c in found.items()
+        for name, c in batches.items()
     }
 
 
@@ -82,7 +82,7 @@ def dump(pairs: Path, out: Path, presets_: list[str], quick: bool) -> None:
     torch.set_num_threads(1)
     batches = {name: Correspondences(**fields) for name, fields in torch.load(pairs).items()}
     own = [n for n in presets.available("estimator") if str(presets.load("estimator", n)["_target_"]).endswith(OWN)]
-    found: dict[str, torch.Tensor] = geometry()
+    arrays: dict[str, torch.Tensor] = geometry()
     for name in presets_ or own:
         estimator = presets.build("estimator", name)
         config = presets.load("estimator", name)
@@ -90,16 +90,16 @@ def dump(pairs: Path, out: Path, presets_: list[str], quick: bool) -> None:
         for label, c in batches.items():
             for seed in range(1 if quick else 3):
                 what = f"{name} | {label} | seed {seed} |"
-                found |= told(what, estimator(c, seed))
+                arrays |= fields_of(what, estimator(c, seed))
             if label == "scenes":
-                found |= gradients(f"{name} | {label} |", estimator, c)
+                arrays |= gradients(f"{name} | {label} |", estimator, c)
                 if unfitted is not None:
                     plain = presets.build("estimator", name, **unfitted)(c, 0)
-                    found[f"{name} | {label} | before the final fit"] = plain.F
-    torch.save(found, out)
+                    arrays[f"{name} | {label} | before the final fit"] = plain.F
+    torch.save(arrays, out)
 
 
-def told(what: str, estimate: Any) -> dict[str, torch.Tensor]:
+def fields_of(what: str, estimate: Any) -> dict[str, torch.Tensor]:
     reasons = torch.frombuffer(bytearray("\n".join(estimate.reason).encode() + b"\n"), dtype=torch.uint8).clone()
     values = {f: getattr(estimate, f) for f in ("F", "inliers", "ok", "draws")}
     return {f"{what} {f}": v for f, v in {**values, "reasons": reasons}.items()}
@@ -142,14 +142,14 @@ def geometry() -> dict[str, torch.Tensor]:
         },
         "attached step": lambda a, b, v: g.attached_step(F0, a, b, v, mask, kernel="huber", scale=3.0),
     }
-    found = {}
+    arrays = {}
     for name, call in calls.items():
         asked = [x.clone().requires_grad_() for x in (x0, x1, w)]
         value = call(*asked)
-        found[f"geometry | {name}"] = value.detach()
+        arrays[f"geometry | {name}"] = value.detach()
         grads = torch.autograd.grad(value.sum(), asked, allow_unused=True)
-        found |= {f"geometry | {name} | gradient {i}": x for i, x in enumerate(grads) if x is not None}
-    return found
+        arrays |= {f"geometry | {name} | gradient {i}": x for i, x in enumerate(grads) if x is not None}
+    return arrays
 
 
 def computed(source: Path, pairs: Path, arguments: argparse.Namespace, folder: Path) -> dict[str, torch.Tensor]:
@@ -178,17 +178,17 @@ def same(a: torch.Tensor, b: torch.Tensor) -> bool:
 
 def differences(before: dict[str, torch.Tensor], after: dict[str, torch.Tensor], presets_: list[str]) -> list[str]:
     """What differs, in words."""
-    found = []
+    lines = []
     for name in sorted(before.keys() | after.keys()):
         if presets_ and name.split(" | ")[0] not in (*presets_, "geometry"):
             continue
         if name not in before or name not in after:
-            found.append(f"{name}: only {'before' if name in before else 'after'}")
+            lines.append(f"{name}: only {'before' if name in before else 'after'}")
         elif not same(before[name], after[name]):
             a, b = before[name].double(), after[name].double()
             size = f"by {float((a - b).abs().nan_to_num().max()):.3g}" if a.shape == b.shape else "in shape"
-            found.append(f"{name}: differs {size}")
-    return found
+            lines.append(f"{name}: differs {size}")
+    return lines
 
 
 def main() -> None:
@@ -215,9 +215,9 @@ def main() -> None:
         if arguments.save and arguments.after.resolve() == arguments.before.resolve():
             return
         after = computed(arguments.after, folder / "pairs.pt", arguments, folder)
-    found = differences(before, after, arguments.presets)
-    print("\n".join(found[:60]) + f"\n{len(found)} of {len(before.keys() | after.keys())} arrays differ")
-    sys.exit(bool(found))
+    lines = differences(before, after, arguments.presets)
+    print("\n".join(lines[:60]) + f"\n{len(lines)} of {len(before.keys() | after.keys())} arrays differ")
+    sys.exit(bool(lines))
 
 
 if __name__ == "__main__":

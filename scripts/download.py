@@ -202,7 +202,7 @@ def fetch_dataset(config: DictConfig) -> list[Path]:
     console.print(f"licence: {source.licence}\ncite: {source.citation}", highlight=False, markup=False)
     if source.by_hand:
         raise ValueError(f"{config.dataset} cannot be fetched from here: {source.by_hand}")
-    folder, made = Path(config.folder or config.dataset), []
+    folder, unpacked = Path(config.folder or config.dataset), []
     for file in config.files or source.files:
         address = config.url or source.url
         url = address.format(file=file, camera=file.partition("_")[0])
@@ -212,12 +212,12 @@ def fetch_dataset(config: DictConfig) -> list[Path]:
             continue
         resume(url, target, config.timeout)
         expect_digest(url, target, None if config.sha256 == "any" else config.sha256)
-        made += unpack(target, folder)
+        unpacked += unpack(target, folder)
         (folder / f".{file}.complete").touch()
         target.unlink()
-    for path in made:
+    for path in unpacked:
         console.print(str(path), highlight=False, markup=False)
-    return made
+    return unpacked
 
 
 def fetch(config: DictConfig) -> Path:
@@ -234,9 +234,9 @@ def fetch(config: DictConfig) -> Path:
     if expected != "any" and not re.fullmatch(r"[0-9a-fA-F]{64}", expected):
         raise ValueError(f"sha256={expected} is no SHA-256: 64 hexadecimal digits, or any")
     path = Path(config.folder or "weights") / entry.file
-    found = download(config.url or entry.url, path, None if expected == "any" else expected, config.timeout)
+    digest = download(config.url or entry.url, path, None if expected == "any" else expected, config.timeout)
     state = "not verified" if expected == "any" else "verified"
-    console.print(f"{path}  SHA-256 {found} ({state})  licence: {entry.licence}  architecture={entry.architecture}")
+    console.print(f"{path}  SHA-256 {digest} ({state})  licence: {entry.licence}  architecture={entry.architecture}")
     return path
 
 

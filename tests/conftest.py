@@ -51,8 +51,8 @@ def compile_all() -> None:
         return
     names = [each.name for each in pkgutil.walk_packages(fmtorch.__path__, "fmtorch.") if "__main__" not in each.name]
     modules = [importlib.import_module(name) for name in names]
-    found = [value for module in modules for value in vars(module).values() if isinstance(value, Kernel)]
-    together.compile_together(list({id(each): each for each in found}.values()))
+    kernels = [value for module in modules for value in vars(module).values() if isinstance(value, Kernel)]
+    together.compile_together(list({id(each): each for each in kernels}.values()))
 
 
 def own_cache(folder: Path) -> Path:

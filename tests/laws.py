@@ -203,7 +203,7 @@ def small() -> dict[str, Correspondences]:
         return known.replace(x0=points[0], x1=points[1], lafs0=lafs0, lafs1=lafs1)
 
     counts = {"random": (7, 8, 9, 12, 16, 20), **dict.fromkeys(SMALL_KINDS, (8, 20))}
-    return {f"{count} {kind}": pair(kind, count) for kind, some in counts.items() for count in some}
+    return {f"{count} {kind}": pair(kind, count) for kind, sizes in counts.items() for count in sizes}
 
 
 def assert_same(a: Result, b: Result, what: str) -> None:

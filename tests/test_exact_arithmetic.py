@@ -59,21 +59,23 @@ def last_name(node: ast.expr) -> str:
 def inexact(tree: ast.Module) -> list[tuple[int, str]]:
     """The lines and names of what processors round differently."""
     modules = {"math", "np", "numpy", "linalg", "fft"}
-    found = []
+    operations = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute):
             of_library = isinstance(node.value, ast.Name | ast.Attribute) and last_name(node.value) in modules
             if (of_library and node.attr in INEXACT | SUMS | {"linalg", "fft"}) or node.attr in ("dot", "matmul"):
-                found.append((node.lineno, node.attr))
+                operations.append((node.lineno, node.attr))
         elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in modules:
-            found += [(node.lineno, alias.name) for alias in node.names if alias.name in INEXACT | SUMS | {"linalg"}]
+            operations += [
+                (node.lineno, alias.name) for alias in node.names if alias.name in INEXACT | SUMS | {"linalg"}
+            ]
         elif isinstance(node, ast.BinOp | ast.AugAssign) and isinstance(node.op, ast.MatMult):
-            found.append((node.lineno, "@"))
+            operations.append((node.lineno, "@"))
         elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow) and not exact_power(node):
-            found.append((node.lineno, "**"))
+            operations.append((node.lineno, "**"))
         elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "pow":
-            found.append((node.lineno, "pow"))
-    return found
+            operations.append((node.lineno, "pow"))
+    return operations
 
 
 def exact_power(node: ast.BinOp) -> bool:
@@ -97,21 +99,21 @@ def roots(tree: ast.Module) -> list[int]:
 
 
 def test_kernels_and_what_calls_them_take_exact_operations() -> None:
-    found = []
+    violations = []
     for name, tree in trees():
         if holds_kernels(tree) or (name.startswith("estimators/") and not (imports_torch(tree) or PEERS in name)):
-            found += [f"{name}:{line}: {what}" for line, what in inexact(tree) if (name, what) not in ALLOWED]
-    assert not found, "see fmtorch/geometry/arithmetic_kernels.py"
+            violations += [f"{name}:{line}: {what}" for line, what in inexact(tree) if (name, what) not in ALLOWED]
+    assert not violations, "see fmtorch/geometry/arithmetic_kernels.py"
 
 
 def test_tensors_of_values_take_the_exact_root() -> None:
-    found = [
+    violations = [
         f"{name}:{line}"
         for name, tree in trees()
         if name.startswith(ROOMS) and not name.startswith((*NETWORKS, PEERS)) and name != "geometry/arithmetic.py"
         for line in roots(tree)
     ]
-    assert not found, "take fmtorch.geometry.arithmetic.sqrt"
+    assert not violations, "take fmtorch.geometry.arithmetic.sqrt"
 
 
 @pytest.mark.parametrize(

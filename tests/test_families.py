@@ -41,23 +41,23 @@ def pairs_of_families(*families: str) -> list[ImagePair]:
     ]
 
 
-def qualities(pipeline: Pipeline, some: list[ImagePair]) -> list[torch.Tensor]:
+def qualities(pipeline: Pipeline, pairs: list[ImagePair]) -> list[torch.Tensor]:
     """The qualities of the matches that are left of each pair."""
-    found = []
-    for outcome in pipeline.match(some):
+    ratios = []
+    for outcome in pipeline.match(pairs):
         c = outcome.correspondences
         assert c is not None
         assert c.quality is not None
-        found.append(c.quality[c.mask])
-    return found
+        ratios.append(c.quality[c.mask])
+    return ratios
 
 
 def test_each_pair_of_a_batch_gets_the_options_of_its_family() -> None:
     options = ["pruner.ratio.threshold=0.5", f"+{RATIO}.wide.threshold=0.7", f"+{RATIO}.CPC.threshold=0.9"]
     pipeline = presets.pipeline("paper/sift_ratio", overrides=options)
-    some = pairs_of_families("KITTI", "orbit", "CPC", "mine", "Strecha")
+    pairs = pairs_of_families("KITTI", "orbit", "CPC", "mine", "Strecha")
     limits = (0.5, 0.7, 0.9, 0.5, 0.7)
-    for pair, kept, limit in zip(some, qualities(pipeline, some), limits, strict=True):
+    for pair, kept, limit in zip(pairs, qualities(pipeline, pairs), limits, strict=True):
         given = matches(int(pair.identity)).correspondences.quality
         assert given is not None
         assert torch.equal(kept, given[given < limit])
@@ -94,16 +94,16 @@ def test_an_option_that_is_given_explicitly_holds_for_all_families(
     words = ("pipeline=sift_gms", *overrides.split(" "))
     expected = dict(zip(("KITTI", "Strecha", "CPC"), scale, strict=True))
 
-    def found(config: DictConfig) -> dict[str, bool]:
+    def scales(config: DictConfig) -> dict[str, bool]:
         pipeline = presets.build_pipeline(config)
         return {family: pipeline.pruners_of(family)["gms"].with_scale for family in expected}  # type: ignore[attr-defined]
 
-    assert found(compose("match", words)) == expected
+    assert scales(compose("match", words)) == expected
     with hydra.initialize_config_dir(str(conf_dir()), version_base=None):  # as a command
-        whole = hydra.compose("match", list(words), return_hydra_config=True)
-    monkeypatch.setattr(HydraConfig, "get", lambda: whole.hydra)
+        composed = hydra.compose("match", list(words), return_hydra_config=True)
+    monkeypatch.setattr(HydraConfig, "get", lambda: composed.hydra)
     seen: list[dict[str, bool]] = []
-    job(lambda config: seen.append(found(config)))(whole)
+    job(lambda config: seen.append(scales(config)))(composed)
     assert seen == [expected]
 
 

@@ -30,17 +30,17 @@ def test_functions_fit_on_a_screen() -> None:
 
 
 def test_kernels_take_few_arguments_whose_types_are_annotated() -> None:
-    found, wrong = 0, []
+    kernels, wrong = 0, []
     for path in PACKAGE.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_bytes())):
             if isinstance(node, ast.FunctionDef) and _is_kernel(node):
                 arguments = node.args
                 right = len(arguments.args) <= MAX_ARGUMENTS and all(each.annotation for each in arguments.args)
                 other = [*arguments.posonlyargs, *arguments.kwonlyargs, *arguments.defaults]
-                found += 1
+                kernels += 1
                 if not right or other or arguments.vararg or arguments.kwarg:
                     wrong.append(f"{path.relative_to(PACKAGE)}: {node.name}")
-    assert found > 50
+    assert kernels > 50
     assert wrong == []
 
 

@@ -55,8 +55,8 @@ def _pruner(name: str, kernel: bool = True) -> Subject:
             if not kernel:
                 environment.setenv(switch.SWITCH, "off")
             pruned = pruner(calibrated(c))
-        told = {name: getattr(pruned, name) for name in ("prior", "noise")}
-        return {"kept": pruned.mask, **{name: value for name, value in told.items() if value is not None}}
+        fields = {name: getattr(pruned, name) for name in ("prior", "noise")}
+        return {"kept": pruned.mask, **{name: value for name, value in fields.items() if value is not None}}
 
     return Subject(f"pruner={name}" + ("" if kernel else " without kernels"), run)
 
@@ -89,10 +89,10 @@ def test_padding_is_invisible(subject: Subject) -> None:
     """Garbage of three kinds in one batch, of one kind in each pair."""
     garbage = (float("nan"), 1e30, -7.0, float("nan"), 1e30)
     padded = collate([with_padding(scenes()[i], np.random.default_rng(i), kind) for i, kind in enumerate(garbage)])
-    found, expected = subject.run(padded), subject.run(scenes())
+    padded_result, expected = subject.run(padded), subject.run(scenes())
     for i, kind in enumerate(garbage):
-        alone, whole = _row(found, padded, i), _row(expected, scenes(), i)
-        assert_same(whole, alone, f"{subject.name}, pair {i} with {kind} in masked slots")
+        alone, unpadded = _row(padded_result, padded, i), _row(expected, scenes(), i)
+        assert_same(unpadded, alone, f"{subject.name}, pair {i} with {kind} in masked slots")
 
 
 @everything
@@ -113,10 +113,10 @@ def test_no_pair_takes_its_batch_down(subject: Subject) -> None:
     n = max(pair.mask.shape[1] for pair in GOOD)
     alone = subject.run(collate(GOOD))
 
-    def beside(some: list[str]) -> Result:
-        mixed = subject.run(collate([GOOD[0], *(kinds[kind] for kind in some), GOOD[1]]))
+    def beside(names: list[str]) -> Result:
+        mixed = subject.run(collate([GOOD[0], *(kinds[kind] for kind in names), GOOD[1]]))
         kept = {k: v[[0, -1], :n] if k in PER_MATCH else v[[0, -1]] for k, v in mixed.items()}
-        assert_same(alone, kept, f"{subject.name} beside {', '.join(some)}")
+        assert_same(alone, kept, f"{subject.name} beside {', '.join(names)}")
         return mixed
 
     try:
@@ -163,8 +163,8 @@ def test_batch_workers_and_threads_change_nothing(name: str) -> None:
     estimator = quick(name, 60, 30)
     pairs = [scene(i, 24 + 53 * i % 120) for i in range(24)]
 
-    def run(some: list[Correspondences]) -> Result:
-        return _results(estimator(collate(some), seed=5))
+    def run(batch: list[Correspondences]) -> Result:
+        return _results(estimator(collate(batch), seed=5))
 
     def first(result: Result, pairs: int, matches: int) -> Result:
         return {k: v[:pairs, :matches] if k == "inliers" else v[:pairs] for k, v in result.items()}
@@ -172,12 +172,12 @@ def test_batch_workers_and_threads_change_nothing(name: str) -> None:
     threads = torch.get_num_threads()
     torch.set_num_threads(4)
     try:
-        whole = run(pairs)
+        threaded = run(pairs)
     finally:
         torch.set_num_threads(threads)
     seven = run(pairs[:7])
     n = seven["inliers"].shape[1]
-    assert_same(seven, first(whole, 7, n), f"{name}: a batch of 7, and one of 24 in four threads")
+    assert_same(seven, first(threaded, 7, n), f"{name}: a batch of 7, and one of 24 in four threads")
     with ThreadPoolExecutor(4) as workers:
         for i, alone in enumerate(workers.map(lambda pair: run([pair]), pairs[:7])):
             n_alone = pairs[i].mask.shape[1]

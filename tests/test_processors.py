@@ -65,25 +65,25 @@ def inputs() -> dict[str, Any]:
 def results(given: dict[str, Any]) -> dict[str, np.ndarray]:
     """What is promised to have the same bits."""
     tables = {"quantiles of focal lengths": normal_quantiles(), "table of MAGSAC++": LOSS_TABLE}
-    found = {name: torch.from_numpy(table) for name, table in tables.items()}
+    arrays = {name: torch.from_numpy(table) for name, table in tables.items()}
     for what, c in given["pairs"].items():
         for name in ESTIMATORS:
             estimate = built("estimator", name)(c, 1)
             for field in ("F", "inliers", "ok", "draws", "significance"):
-                found[f"{name} of {what}: {field}"] = getattr(estimate, field)
+                arrays[f"{name} of {what}: {field}"] = getattr(estimate, field)
     for name in PRUNERS:
         c = built("pruner", name)(given["many"])
-        found |= {f"{name}: {field}": getattr(c, field) for field in ("mask", "prior", "noise")}
+        arrays |= {f"{name}: {field}": getattr(c, field) for field in ("mask", "prior", "noise")}
     x0, x1, weight, size = given["geometry"]
     F, other = geometry.eight_point(x0, x1, weight)[0], geometry.eight_point(x0[:, :20], x1[:, :20])[0]
-    found |= {
+    arrays |= {
         "eight_point": F,
         "seven_point": geometry.seven_point(x0[:, :7], x1[:, :7])[0],
         "sampson": geometry.sampson(F, x0, x1),
         "nsgd": nsgd(F, other, size, size),
         "distances of descriptors": nearest_neighbors(*given["descriptors"]).distance,
     }
-    return {name: value.numpy() for name, value in found.items() if value is not None}
+    return {name: value.numpy() for name, value in arrays.items() if value is not None}
 
 
 def older_processor() -> dict[str, str]:

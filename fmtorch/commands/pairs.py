@@ -86,7 +86,7 @@ def run(config: DictConfig) -> Path:
             f"none of {judged} candidates passes the rule{_first(problems)}; {construction.folder} was not completed"
         )
     construction.finish(kept, summary)
-    _tell(construction, summary, problems, time.monotonic() - start)
+    _print_summary(construction, summary, problems, time.monotonic() - start)
     return construction.folder
 
 
@@ -168,7 +168,7 @@ def _call(construction: Construction, job: tuple[int, str, tuple[object, ...]]) 
     return getattr(construction, method)(*given)
 
 
-def _tell(construction: Construction, summary: dict[str, int], problems: list[str], seconds: float) -> None:
+def _print_summary(construction: Construction, summary: dict[str, int], problems: list[str], seconds: float) -> None:
     """What was made, on the console."""
     judged = f"{summary['judged']} of {summary['candidates']} candidates were judged in {seconds:.0f} s"
     console.print(f"{summary['kept']} pairs of {summary['images']} images; {judged}", highlight=False)

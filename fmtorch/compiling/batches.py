@@ -43,13 +43,13 @@ def for_each_pair(
     results = out.numpy()
     arrays = [_array(t, kind, len(results)) for t in tensors]
 
-    def some(pairs: range) -> None:
+    def run_pairs(pairs: range) -> None:
         for pair in pairs:
             rows = [array[pair] for array in arrays]
             function(*(rows if group is None else [group(*rows)]), *constants, results[pair])
 
     parts = max(1, min(available(), len(results) // PAIRS_OF_A_THREAD))
-    mapped(some, [range(first, len(results), parts) for first in range(parts)])
+    mapped(run_pairs, [range(first, len(results), parts) for first in range(parts)])
     return out
 
 

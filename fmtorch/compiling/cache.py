@@ -180,13 +180,13 @@ def _write(path: Path, data: bytes) -> None:
         warnings.warn(f"compiled kernels are not kept: {error}", stacklevel=3)
 
 
-def _of(signature: Any, made: Any) -> Any:
+def _of(signature: Any, result: Any) -> Any:
     """A compiled function by the types of this process: a group of a script or a notebook is another class in each."""
     from numba.core import sigutils
     from numba.core.typing import signature as typed
 
     arguments, _ = sigutils.normalize_signature(signature)
-    return made._replace(signature=typed(made.signature.return_type, *arguments))
+    return result._replace(signature=typed(result.signature.return_type, *arguments))
 
 
 def _signature(data: bytes) -> bytes:

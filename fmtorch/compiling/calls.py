@@ -34,7 +34,7 @@ def cell(module: str, name: str) -> ctypes.c_void_p:
 
 def called(machine_code: bytes) -> list[Any]:
     """The kernels whose cells are named in machine code; from now on it finds these cells."""
-    places = sorted({(found[1].decode(), found[2].decode()) for found in _NAME.finditer(machine_code)})
+    places = sorted({(match[1].decode(), match[2].decode()) for match in _NAME.finditer(machine_code)})
     for module, name in places:
         cell(module, name)
     return [kernel_of(module, name) for module, name in places]
@@ -77,37 +77,37 @@ def callable_type(function: Callable[..., Any], signature: Any) -> Any:
         names = ", ".join(RETURNED)
         raise TypeError(f"{function.__qualname__} is called by a kernel: annotate what it returns as one of {names}")
     arguments, _ = sigutils.normalize_signature(signature)
-    whole = typed(getattr(types, RETURNED[annotation]), *arguments)
+    numba_signature = typed(getattr(types, RETURNED[annotation]), *arguments)
     module, name = function.__module__, function.__qualname__
     cell(module, name)
 
-    def call(context: Any, builder: Any, made: Any, values: Any) -> Any:
-        code = context.call_conv.get_function_type(whole.return_type, whole.args).as_pointer()
+    def call(context: Any, builder: Any, sig: Any, values: Any) -> Any:
+        code = context.call_conv.get_function_type(numba_signature.return_type, numba_signature.args).as_pointer()
         symbol = SYMBOL.format(module=module, name=name)
         place = builder.module.globals.get(symbol) or ir.GlobalVariable(builder.module, code, symbol)
         status, value = context.call_conv.call_function(
-            builder, builder.load(place), whole.return_type, whole.args, values
+            builder, builder.load(place), numba_signature.return_type, numba_signature.args, values
         )
         with cgutils.if_unlikely(builder, status.is_error):
             context.call_conv.return_status_propagate(builder, status)
         return value
 
-    cpu_target.target_context.insert_func_defn([(call, function, whole.args)])
-    return types.Function(make_concrete_template(name, function, [whole]))
+    cpu_target.target_context.insert_func_defn([(call, function, numba_signature.args)])
+    return types.Function(make_concrete_template(name, function, [numba_signature]))
 
 
-def publish(function: Callable[..., Any], made: Any) -> None:
-    """Put a compiled function's address into its cell. made: numba's `CompileResult`.
+def publish(function: Callable[..., Any], result: Any) -> None:
+    """Put a compiled function's address into its cell. result: numba's `CompileResult`.
 
     Raises TypeError where it returns something else than its annotation says to those that call it.
     """
     from numba.core import types
 
     annotation = returned(function)
-    kind = made.signature.return_type
+    kind = result.signature.return_type
     if annotation in RETURNED and kind != getattr(types, RETURNED[annotation]):
         raise TypeError(f"{function.__qualname__} is annotated to return {annotation}, but returns {kind}")
-    address = made.library.get_pointer_to_function(made.fndesc.llvm_func_name)
+    address = result.library.get_pointer_to_function(result.fndesc.llvm_func_name)
     cell(function.__module__, function.__qualname__).value = address
 
 

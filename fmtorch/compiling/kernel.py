@@ -194,25 +194,25 @@ def inner(function: Callable[P, R] | None = None, *, inline: bool = False) -> An
     return Inner(function, inline) if function is not None else lambda f: Inner(f, inline)
 
 
-def _compiled(made: Kernel[P, R], count: str) -> tuple[Callable[P, R], list[Kernel[..., Any]]]:
+def _compiled(uncompiled: Kernel[P, R], count: str) -> tuple[Callable[P, R], list[Kernel[..., Any]]]:
     """The compiled function of a kernel, whose address its cell holds from now on, and the kernels that it calls."""
     import numba
 
-    function = made.function
-    how = OPTIONS | {"nogil": not made.holds_gil}
-    dispatcher: Any = numba.njit(**how)(named_by_version(function, made.version))
+    function = uncompiled.function
+    how = OPTIONS | {"nogil": not uncompiled.holds_gil}
+    dispatcher: Any = numba.njit(**how)(named_by_version(function, uncompiled.version))
     if not hasattr(dispatcher, "compile"):
         return function, []  # NUMBA_DISABLE_JIT=1
 
     announced: list[str] = []
 
-    def tell(where: str) -> None:
+    def announce(where: str) -> None:
         messages.begun(function.__name__, where, count)
         announced.append(where)
 
-    file = dispatcher._cache = cache.KernelFile(cache.path(function, made.version), tell)
+    file = dispatcher._cache = cache.KernelFile(cache.path(function, uncompiled.version), announce)
     with _no_garbage_collection():
-        dispatcher.compile(made.signature)
+        dispatcher.compile(uncompiled.signature)
     if announced:
         messages.ended()
     dispatcher.disable_compile()

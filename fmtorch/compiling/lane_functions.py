@@ -35,7 +35,7 @@ def load(count: int) -> Any:
     def of_row(context: Any, A: Any, row: Any) -> Any:
         kind = LanesType(A.dtype, count)
 
-        def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
+        def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
             bits = context.get_data_type(A.dtype)
             value = builder.load(_place(context, builder, A, args[0], args[1], count, bits), align=_size(A.dtype))
             if A.dtype != types.boolean:
@@ -54,8 +54,8 @@ def fill(count: int) -> Any:
     def of_number(context: Any, number: Any) -> Any:
         kind = LanesType(number if isinstance(number, types.Float) else types.float64, count)
 
-        def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
-            return filled(context, builder, args[0], made.args[0], kind)
+        def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            return filled(context, builder, args[0], sig.args[0], kind)
 
         return kind(number), code
 
@@ -70,7 +70,7 @@ def store() -> Any:
         if A.dtype != value.dtype:
             raise numba.TypingError(f"{value} cannot be stored in an array of {A.dtype}")
 
-        def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
+        def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
             bits, vector = context.get_data_type(A.dtype), args[2]
             if A.dtype == types.boolean:
                 vector = builder.zext(vector, ir.VectorType(bits, value.count))
@@ -87,16 +87,16 @@ def where() -> Any:
     """`lanes.where`."""
 
     @intrinsic  # type: ignore[untyped-decorator]
-    def select(context: Any, mask: Any, this: Any, that: Any) -> Any:
-        kind = operands((this, that))
+    def select(context: Any, mask: Any, this: Any, other: Any) -> Any:
+        kind = operands((this, other))
         if kind is None or mask != kind.mask:
-            raise numba.TypingError(f"where of {mask}, {this} and {that}")
+            raise numba.TypingError(f"where of {mask}, {this} and {other}")
 
-        def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
+        def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
             first = filled(context, builder, args[1], this, kind)
-            return builder.select(args[0], first, filled(context, builder, args[2], that, kind))
+            return builder.select(args[0], first, filled(context, builder, args[2], other, kind))
 
-        return kind(mask, this, that), code
+        return kind(mask, this, other), code
 
     return select
 
@@ -121,7 +121,7 @@ def any_lane() -> Any:
 
     @intrinsic  # type: ignore[untyped-decorator]
     def of_mask(context: Any, mask: Any) -> Any:
-        def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
+        def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
             bits = builder.bitcast(args[0], ir.IntType(mask.count))
             return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
 
@@ -135,11 +135,11 @@ def added() -> Any:
 
     @intrinsic  # type: ignore[untyped-decorator]
     def of_value(context: Any, value: Any) -> Any:
-        def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
+        def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
             (total,), count = args, value.count
             while count > 1:
                 count //= 2
-                halves = [_some(builder, total, range(k * count, (k + 1) * count)) for k in range(2)]
+                halves = [_selected_lanes(builder, total, range(k * count, (k + 1) * count)) for k in range(2)]
                 total = builder.fadd(*halves)
             return builder.extract_element(total, ir.Constant(INDEX, 0))
 
@@ -148,7 +148,7 @@ def added() -> Any:
     return of_value
 
 
-def _some(builder: Any, vector: Any, lanes: range) -> Any:
+def _selected_lanes(builder: Any, vector: Any, lanes: range) -> Any:
     """These lanes of a vector."""
     which = ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), list(lanes))
     return builder.shuffle_vector(vector, ir.Constant(vector.type, ir.Undefined), which)
@@ -157,8 +157,8 @@ def _some(builder: Any, vector: Any, lanes: range) -> Any:
 def _library(name: str, arguments: int) -> Any:
     """A function of LLVM that takes so many values of lanes."""
 
-    def made(kinds: tuple[Any, ...]) -> Any:
-        def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
+    def implementation(kinds: tuple[Any, ...]) -> Any:
+        def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
             vector, kind = args[0].type, kinds[0]
             called = ir.FunctionType(vector, [vector] * len(args))
             suffix = f"v{kind.count}f{kind.dtype.bitwidth}"
@@ -169,16 +169,16 @@ def _library(name: str, arguments: int) -> Any:
     if arguments == 1:
 
         @intrinsic  # type: ignore[untyped-decorator]
-        def one(context: Any, value: Any) -> Any:
-            return made((value,))
+        def unary(context: Any, value: Any) -> Any:
+            return implementation((value,))
 
-        return one
+        return unary
 
     @intrinsic  # type: ignore[untyped-decorator]
-    def two(context: Any, value: Any, other: Any) -> Any:
-        return made((value, other))
+    def binary(context: Any, value: Any, other: Any) -> Any:
+        return implementation((value, other))
 
-    return two
+    return binary
 
 
 def type_of(function: Any) -> Any:

@@ -42,10 +42,10 @@ class _Model(models.PrimitiveModel):  # type: ignore[misc]
 
 def operands(args: tuple[Any, ...]) -> LanesType | None:
     """The type of lanes that both operands have or become; None where there is none."""
-    found = {kind for kind in args if isinstance(kind, LanesType)}
-    if len(found) != 1 or not all(kind in found or isinstance(kind, (types.Float, types.Integer)) for kind in args):
+    kinds = {kind for kind in args if isinstance(kind, LanesType)}
+    if len(kinds) != 1 or not all(kind in kinds or isinstance(kind, (types.Float, types.Integer)) for kind in args):
         return None
-    (kind,) = found
+    (kind,) = kinds
     return None if kind.dtype == types.boolean else kind
 
 
@@ -54,11 +54,11 @@ def filled(context: Any, builder: Any, number: Any, given: Any, kind: LanesType)
     if isinstance(given, LanesType):
         return number
     vector = context.get_value_type(kind)
-    one = builder.insert_element(
+    first_lane = builder.insert_element(
         ir.Constant(vector, ir.Undefined), context.cast(builder, number, given, kind.dtype), ir.Constant(INDEX, 0)
     )
     everywhere = ir.Constant(ir.VectorType(ir.IntType(32), kind.count), [0] * kind.count)
-    return builder.shuffle_vector(one, ir.Constant(vector, ir.Undefined), everywhere)
+    return builder.shuffle_vector(first_lane, ir.Constant(vector, ir.Undefined), everywhere)
 
 
 def _typed(function: Any, kind_of: Callable[[LanesType], LanesType]) -> None:
@@ -71,9 +71,9 @@ def _typed(function: Any, kind_of: Callable[[LanesType], LanesType]) -> None:
 
 
 def _lowered(function: Any, instruction: Callable[[Any, Any, Any], Any]) -> None:
-    def code(context: Any, builder: Any, made: Any, args: Any) -> Any:
-        kind: Any = operands(made.args)
-        a, b = (filled(context, builder, value, given, kind) for value, given in zip(args, made.args, strict=True))
+    def code(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        kind: Any = operands(sig.args)
+        a, b = (filled(context, builder, value, given, kind) for value, given in zip(args, sig.args, strict=True))
         return instruction(builder, a, b)
 
     for number in (types.Float, types.Integer):
@@ -110,10 +110,10 @@ for _name, _instruction in LOGIC.items():
     for _function in (getattr(operator, _name), getattr(operator, f"i{_name.rstrip('_')}")):
         infer_global(_function)(type("OfMasks", (_OfMasks,), {}))
         lower_builtin(_function, LanesType, LanesType)(
-            lambda context, builder, made, args, name=_instruction: getattr(builder, name)(*args)
+            lambda context, builder, sig, args, name=_instruction: getattr(builder, name)(*args)
         )
 infer_global(operator.invert)(type("OfMasks", (_OfMasks,), {}))
-lower_builtin(operator.invert, LanesType)(lambda context, builder, made, args: builder.not_(args[0]))
+lower_builtin(operator.invert, LanesType)(lambda context, builder, sig, args: builder.not_(args[0]))
 
 
 class _Negative(AbstractTemplate):  # type: ignore[misc]
@@ -122,4 +122,4 @@ class _Negative(AbstractTemplate):  # type: ignore[misc]
 
 
 infer_global(operator.neg)(_Negative)
-lower_builtin(operator.neg, LanesType)(lambda context, builder, made, args: builder.fneg(args[0]))
+lower_builtin(operator.neg, LanesType)(lambda context, builder, sig, args: builder.fneg(args[0]))

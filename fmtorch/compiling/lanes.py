@@ -81,9 +81,9 @@ def store(A: Array, row: int, value: Any) -> None:
 
 
 @LaneFunction
-def where(mask: Any, this: Any, that: Any) -> Any:
-    """This value in the lanes of the mask, that in the others."""
-    return np.where(mask, this, that).view(Value)
+def where(mask: Any, this: Any, other: Any) -> Any:
+    """This value in the lanes of the mask, the other elsewhere."""
+    return np.where(mask, this, other).view(Value)
 
 
 @LaneFunction

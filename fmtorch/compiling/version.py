@@ -39,8 +39,8 @@ def version(function: Function, *also: str) -> str:
 @functools.cache
 def _own(function: Function) -> tuple[bytes, list[Function]]:
     """The digest of what one function is made of but for the inner functions that it uses; these."""
-    made: Any = function  # of bytecode
-    code, cells, reached = made.__code__, made.__closure__ or (), list[Function]()
+    untyped: Any = function
+    code, cells, reached = untyped.__code__, untyped.__closure__ or (), list[Function]()
 
     def described(name: str, value: Any) -> Any:
         if isinstance(value, types.ModuleType) and value.__name__.partition(".")[0] not in FOREIGN:
@@ -52,10 +52,10 @@ def _own(function: Function) -> tuple[bytes, list[Function]]:
             raise TypeError(f"{function.__module__}.{function.__qualname__} uses {name}: {error}") from None
 
     parts = [
-        _code(code, made.__doc__),
-        described("its defaults", (made.__defaults__, made.__kwdefaults__)),
+        _code(code, untyped.__doc__),
+        described("its defaults", (untyped.__defaults__, untyped.__kwdefaults__)),
         *[described(name, cell.cell_contents) for name, cell in zip(code.co_freevars, cells, strict=True)],
-        *[described(name, made.__globals__[name]) for name in _global_names(code) if name in made.__globals__],
+        *[described(name, untyped.__globals__[name]) for name in _global_names(code) if name in untyped.__globals__],
     ]
     return hashlib.blake2b(repr(parts).encode(), digest_size=16).digest(), reached
 
@@ -141,10 +141,12 @@ def named_by_version(function: Function, version: str) -> Function:
     Two functions that one function made have one name. Machine code of both, kept by two processes, would be taken for
     the same by a third.
     """
-    made: Any = function
-    name = f"{made.__qualname__}_{version[:16]}"
-    named = types.FunctionType(made.__code__, made.__globals__, made.__name__, made.__defaults__, made.__closure__)
-    named.__kwdefaults__, named.__module__, named.__qualname__ = made.__kwdefaults__, made.__module__, name
+    untyped: Any = function
+    name = f"{untyped.__qualname__}_{version[:16]}"
+    named = types.FunctionType(
+        untyped.__code__, untyped.__globals__, untyped.__name__, untyped.__defaults__, untyped.__closure__
+    )
+    named.__kwdefaults__, named.__module__, named.__qualname__ = untyped.__kwdefaults__, untyped.__module__, name
     return named
 
 

@@ -57,7 +57,7 @@ def expectation(hint: Any) -> Expected:
     alternatives = typing.get_args(hint) if typing.get_origin(hint) in UNIONS else (hint,)
     kinds = [alternative for alternative in alternatives if alternative is not type(None)]
     each = [_of_one(kind) for kind in kinds]
-    expected = next((one for one in each if one.kind == "array"), each[0] if len(each) == 1 else Expected(""))
+    expected = next((entry for entry in each if entry.kind == "array"), each[0] if len(each) == 1 else Expected(""))
     if set(kinds) == {float, Tensor}:
         expected = Expected("number or array", dtype="Float")
     return expected._replace(optional=len(kinds) < len(alternatives))

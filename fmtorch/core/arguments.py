@@ -47,19 +47,19 @@ def as_tensor(value: Any, name: str) -> Tensor:
     return torch.from_numpy(array if array.flags.writeable else array.copy())
 
 
-def number(name: str, value: Any, whole: bool) -> Any:
+def number(name: str, value: Any, integer: bool) -> Any:
     """A number, not NaN; what has one element may be one. Raises TypeError or ValueError naming the argument."""
     if isinstance(value, bool | np.bool_ | str | bytes | complex | np.complexfloating):
-        raise TypeError(f"{name} is {value!r}; it must be a {'whole ' if whole else ''}number")
+        raise TypeError(f"{name} is {value!r}; it must be a {'whole ' if integer else ''}number")
     if isinstance(value, int | float):
         plain: Any = value
     else:
         try:
-            plain = operator.index(value) if whole else float(value)
+            plain = operator.index(value) if integer else float(value)
         except (TypeError, ValueError, RuntimeError, OverflowError):
-            said = "whole number" if whole else "number"
+            said = "whole number" if integer else "number"
             raise TypeError(f"{name} is a {type(value).__name__}; it must be a {said}") from None
-    if whole and not isinstance(plain, int):
+    if integer and not isinstance(plain, int):
         raise TypeError(f"{name} is {value!r}; it must be a whole number")
     if math.isnan(plain):
         raise ValueError(f"{name} is nan; it must be a number")
@@ -143,7 +143,7 @@ def _of_list(x0: Sequence[Any], x1: Sequence[Any], fields: Mapping[str, Any]) ->
             raise ValueError(f"{name} must be a list of {count} arrays, one for each pair of x0")
     if not count:
         return correspondences(torch.zeros(0, 0, 2), torch.zeros(0, 0, 2))
-    whole = {
+    batch_fields = {
         name: _field(name, value, False, torch.zeros(count, 0, 2))
         for name, value in fields.items()
         if value is not None and name not in PER_MATCH
@@ -151,7 +151,7 @@ def _of_list(x0: Sequence[Any], x1: Sequence[Any], fields: Mapping[str, Any]) ->
     pairs = []
     for i in range(count):
         own = {name: fields[name][i] for name in PER_MATCH if fields.get(name) is not None}
-        pairs.append(_one_of_list(i, x0[i], x1[i], {**own, **{name: value[i] for name, value in whole.items()}}))
+        pairs.append(_one_of_list(i, x0[i], x1[i], {**own, **{name: value[i] for name, value in batch_fields.items()}}))
     device, kind = pairs[0].x0.device, functools.reduce(torch.promote_types, (pair.x0.dtype for pair in pairs))
     return collate(
         [pair.to(device).replace(x0=pair.x0.to(device, kind), x1=pair.x1.to(device, kind)) for pair in pairs]

@@ -60,8 +60,8 @@ class Calls(Generic[Job]):
         """Have a job begun before those of `each`, which yields it."""
         return self._submit(job)
 
-    def _submit(self, job: Job, whole: bool = False) -> Future[Any]:
-        call = self.source.call(self.function, whole)
+    def _submit(self, job: Job, with_recipe: bool = False) -> Future[Any]:
+        call = self.source.call(self.function, with_recipe)
         try:
             future: Future[Any] = self.team.executor.submit(call, job)
         except BrokenExecutor:  # since the last result
@@ -102,7 +102,7 @@ class Calls(Generic[Job]):
     def _done(self, job: Job, result: Any) -> bool:
         """Keep a result; False where the worker first needs the recipe, with which the call is made again."""
         if isinstance(result, NotMade):
-            self._submit(job, whole=True)
+            self._submit(job, with_recipe=True)
             return False
         self._succeeded = True
         self.keep(job, result)
@@ -112,7 +112,7 @@ class Calls(Generic[Job]):
         """A job with no other under way, so that a worker that dies is its doing."""
         parts = [job] if self.split is None else self.split(job)
         for _ in range(MAX_DEATHS if len(parts) == 1 else 1):
-            future = self._submit(job, whole=True)
+            future = self._submit(job, with_recipe=True)
             try:
                 result = future.result()
             except (Exception, CancelledError) as error:

@@ -80,8 +80,8 @@ def _checked_value(name: str, value: Any, want: Expected, device: torch.device) 
     if want.kind in ("int", "float") or (want.kind == "number or array" and not isinstance(value, Tensor | np.ndarray)):
         return number(name, value, want.kind == "int")
     if want.kind in ("numbers", "whole numbers"):
-        whole = want.kind == "whole numbers"
-        return tuple(number(f"{name}[{i}]", entry, whole) for i, entry in enumerate(_sequence(name, value)))
+        integer = want.kind == "whole numbers"
+        return tuple(number(f"{name}[{i}]", entry, integer) for i, entry in enumerate(_sequence(name, value)))
     if want.kind in ("bool", "str"):
         kind = {"bool": (bool, np.bool_), "str": (str,)}[want.kind]
         if not isinstance(value, kind):
@@ -111,10 +111,10 @@ def _sequence(name: str, value: Any) -> list[Any]:
 
 def _numbers(name: str, tensor: Tensor, want: Expected) -> Tensor:
     """The tensor, with elements of the kind asked for. Raises ValueError naming the argument for others."""
-    whole = numbers_of(tensor.dtype) == WHOLE and not tensor.is_quantized
-    if want.dtype == "Float" and whole:
+    integer = numbers_of(tensor.dtype) == WHOLE and not tensor.is_quantized
+    if want.dtype == "Float" and integer:
         return tensor.to(torch.float64)
-    if want.dtype == "Bool" and whole:
+    if want.dtype == "Bool" and integer:
         return tensor != 0
     if tensor.dtype in WIDENED and want.dtype in ("Float", "Real"):
         return tensor.to(torch.float32)

@@ -32,7 +32,7 @@ class Here(Generic[T]):
     def __init__(self, value: T) -> None:
         self.value = value
 
-    def call(self, function: Callable[[T, Any], Any], whole: bool) -> Callable[[Any], Any]:
+    def call(self, function: Callable[[T, Any], Any], with_recipe: bool) -> Callable[[Any], Any]:
         """The function with this as its first argument."""
         return functools.partial(function, self.value)
 
@@ -46,9 +46,9 @@ class Recipe(Generic[T]):
         self.pickled = pickle.dumps((__version__, make))
         self.digest = hashlib.blake2b(self.pickled, digest_size=16).hexdigest()
 
-    def call(self, function: Callable[[T, Any], Any], whole: bool) -> Callable[[Any], Any]:
-        """The function with what is made as its first argument. whole: the recipe is sent along, however long."""
-        sent = self.pickled if whole or len(self.pickled) <= SENT_ALONG else None
+    def call(self, function: Callable[[T, Any], Any], with_recipe: bool) -> Callable[[Any], Any]:
+        """The function with what is made as its first argument. with_recipe: the recipe is sent along, however long."""
+        sent = self.pickled if with_recipe or len(self.pickled) <= SENT_ALONG else None
         return functools.partial(_called, self.digest, sent, function)
 
 

@@ -57,7 +57,7 @@ class Record:
         return cast(AnyRecord, dataclasses.replace(cast(Any, self), **changes))
 
     @classmethod
-    def made(cls: type[AnyRecord], **fields: Any) -> AnyRecord:
+    def unchecked(cls: type[AnyRecord], **fields: Any) -> AnyRecord:
         """A record of all its fields, unchecked: of tensors that fit because of how they are made."""
         record = object.__new__(cls)
         vars(record).update(fields)

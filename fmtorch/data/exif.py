@@ -65,12 +65,12 @@ def exif_focal(path: Path | str, size: tuple[int, int] | None = None) -> ExifFoc
     if abs(math.log(sides[1] / sides[0] * recorded[0] / recorded[1])) > CROPPED:
         shown, was = (f"{long:g} x {short:g}" for short, long in (sides, recorded))
         return _unknown(f"cropped: {shown} px, recorded as {was}")
-    found = _of_equivalent(tags, math.hypot(*sides)) or _of_plane(tags, sides[1] / recorded[1])
-    if found is None:
+    exif = _of_equivalent(tags, math.hypot(*sides)) or _of_plane(tags, sides[1] / recorded[1])
+    if exif is None:
         return _unknown("no FocalLengthIn35mmFilm, and no FocalLength with FocalPlaneXResolution")
-    if not MIN_FOCAL <= found.focal / sides[1] <= MAX_FOCAL:
-        return _unknown(f"{found.source} give {found.focal:.4g} px for an image of {sides[1]} px: a mistake")
-    return found
+    if not MIN_FOCAL <= exif.focal / sides[1] <= MAX_FOCAL:
+        return _unknown(f"{exif.source} give {exif.focal:.4g} px for an image of {sides[1]} px: a mistake")
+    return exif
 
 
 def _of_equivalent(tags: Tags, diagonal: float) -> ExifFocal | None:

@@ -56,12 +56,12 @@ class ImageCameras:
         """The camera of an image, by the longest name that its path ends in. Raises DataError where there is none."""
         if self._all is not None:
             return self._all
-        whole = f"/{image.absolute().as_posix()}"
-        names = [name for name in self._named if whole.endswith(f"/{name}")]
+        absolute = f"/{image.absolute().as_posix()}"
+        names = [name for name in self._named if absolute.endswith(f"/{name}")]
         if not names:
-            some = ", ".join(sorted(self._named)[:SHOWN])
+            examples = ", ".join(sorted(self._named)[:SHOWN])
             raise DataError(
-                f"{self._path}: no camera of {image}; it has those of {len(self._named)} images: {some} ..."
+                f"{self._path}: no camera of {image}; it has those of {len(self._named)} images: {examples} ..."
             )
         return self._named[max(names, key=len)]
 

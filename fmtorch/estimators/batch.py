@@ -115,7 +115,7 @@ def estimated(
     if asked:
         fields |= cameras._asdict()
     tensors = {name: torch.from_numpy(value).to(c.mask.device) for name, value in fields.items()}
-    estimates = Estimate.made(reason=tuple(reasons), model=family.model, **tensors)
+    estimates = Estimate.unchecked(reason=tuple(reasons), model=family.model, **tensors)
     return with_gradients(estimates, c, solved, attach) if keep else estimates
 
 

@@ -41,5 +41,5 @@ class CoarseToFine:
             f"coarse: {first}" if first else f"fine: {second}" if second else ""
             for first, second in zip(coarse.reason, fine.reason, strict=True)
         )
-        whole = fine.replace(reason=reasons, draws=coarse.draws + fine.draws, significance=None)
-        return judged(whole, c)
+        combined = fine.replace(reason=reasons, draws=coarse.draws + fine.draws, significance=None)
+        return judged(combined, c)

@@ -103,9 +103,9 @@ def captioned(canvas: Image, names: tuple[str, str], counts: tuple[int, int], dr
     x = gap
     for colour, name, count, shown in zip((GOOD, BAD), names, counts, drawn, strict=True):
         text = f"{count} {name}" + (f", {shown} of them drawn" if shown < count else "")
-        cv2.line(line, (x, rise - round(7 * size)), (x + 2 * gap, rise - round(7 * size)), colour, whole(5 * size))
-        cv2.putText(line, text, (x + 3 * gap, rise), _FONT, size, (0, 0, 0), whole(1.3 * size), cv2.LINE_AA)
-        x += 5 * gap + cv2.getTextSize(text, _FONT, size, whole(1.3 * size))[0][0]
+        cv2.line(line, (x, rise - round(7 * size)), (x + 2 * gap, rise - round(7 * size)), colour, line_width(5 * size))
+        cv2.putText(line, text, (x + 3 * gap, rise), _FONT, size, (0, 0, 0), line_width(1.3 * size), cv2.LINE_AA)
+        x += 5 * gap + cv2.getTextSize(text, _FONT, size, line_width(1.3 * size))[0][0]
     return np.concatenate([canvas, line])
 
 
@@ -114,7 +114,7 @@ def fine_line(canvas: Image) -> float:
     return float(np.sqrt(canvas.shape[0] * canvas.shape[1] / (WIDTH * 640)))
 
 
-def whole(width: float) -> int:
+def line_width(width: float) -> int:
     """A width that OpenCV can draw."""
     return max(1, round(width))
 
@@ -123,8 +123,8 @@ def segment(canvas: Image, ends: Points, colour: tuple[int, int, int], width: fl
     """A line on a dark rim, which can be seen on any ground."""
     if len(ends):
         a, b = fixed(ends)
-        cv2.line(canvas, a, b, (0, 0, 0), whole(width) + 2, cv2.LINE_AA, SUBPIXEL)
-        cv2.line(canvas, a, b, colour, whole(width), cv2.LINE_AA, SUBPIXEL)
+        cv2.line(canvas, a, b, (0, 0, 0), line_width(width) + 2, cv2.LINE_AA, SUBPIXEL)
+        cv2.line(canvas, a, b, colour, line_width(width), cv2.LINE_AA, SUBPIXEL)
 
 
 def dashes(ends: Points, length: float) -> Iterator[Points]:

@@ -52,8 +52,8 @@ def panels(runs: Mapping[str, pa.Table]) -> dict[str, dict[str, NDArray[np.float
     if len(families) < 2:
         return families
     column = axis_of(runs).column
-    whole = {name: table[column].to_numpy().astype(np.float64) for name, table in runs.items() if len(table)}
-    return {ALL: whole, **families}
+    overall = {name: table[column].to_numpy().astype(np.float64) for name, table in runs.items() if len(table)}
+    return {ALL: overall, **families}
 
 
 def by_family(runs: Mapping[str, pa.Table]) -> dict[str, dict[str, NDArray[np.float64]]]:

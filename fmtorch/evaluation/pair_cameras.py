@@ -56,8 +56,8 @@ def _calibrated(pair: ImagePair) -> PairCameras:
 
 
 def _measured(path: Path) -> tuple[float, float]:
-    found = exif_focal(path)
-    return (found.focal, found.deviation) if found.known else UNKNOWN
+    exif = exif_focal(path)
+    return (exif.focal, exif.deviation) if exif.known else UNKNOWN
 
 
 def _two(first: tuple[float, float], second: tuple[float, float]) -> Tensor:

@@ -19,9 +19,9 @@ from fmtorch.evaluation.canvas import (
     dashes,
     fine_line,
     fixed,
+    line_width,
     placed,
     segment,
-    whole,
 )  # fmt: skip
 
 # RGB; told apart by all kinds of colour vision (Okabe & Ito), lightened.
@@ -58,7 +58,7 @@ def draw_matches(
         index = index[thinned(ends0[index], count)]
         layer = canvas.copy()
         for a, b in zip(fixed(ends0[index]), fixed(ends1[index]), strict=True):
-            cv2.line(layer, a, b, colour, whole(width), cv2.LINE_AA, SUBPIXEL)
+            cv2.line(layer, a, b, colour, line_width(width), cv2.LINE_AA, SUBPIXEL)
         for point in fixed(np.concatenate([ends0[index], ends1[index]])):
             cv2.circle(layer, point, round(2.6 * width * (1 << SUBPIXEL)), colour, -1, cv2.LINE_AA, SUBPIXEL)
         canvas = np.asarray(cv2.addWeighted(layer, opacity, canvas, 1 - opacity, 0), np.uint8)

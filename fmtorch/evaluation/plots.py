@@ -74,10 +74,10 @@ def _draw(ax: Axes, title: str, curves: Mapping[str, NDArray[np.float64]], axis:
     styles = itertools.cycle(itertools.product(DASHES, COLOURS))
     for (name, errors), (dash, colour) in zip(curves.items(), styles, strict=False):
         share = metrics.recall_curve(torch.from_numpy(errors), thresholds).numpy()
-        whole = name == ALL
+        overall = name == ALL
         ax.plot(
             thresholds.numpy(), 100 * share, label=f"{100 * axis.below(errors, axis.mark):.1f}  {name}",
-            color="#000000" if whole else colour, linestyle=dash, linewidth=2.4 if whole else 1.7, zorder=3,
+            color="#000000" if overall else colour, linestyle=dash, linewidth=2.4 if overall else 1.7, zorder=3,
         )  # fmt: skip
     ax.set(xlim=(0, axis.maximum), ylim=(0, 101), yticks=range(0, 101, 20))
     ax.set_xticks(axis.ticks, [f"{tick:g}" for tick in axis.ticks])

@@ -53,11 +53,11 @@ def _difference_of_homographies(
     """The same of a homography, by its corner error."""
     again = outcome.estimate
     if again is None or not bool(again.ok[0]) or not stored["ok"]:
-        found = again is not None and bool(again.ok[0])
+        has_homography = again is not None and bool(again.ok[0])
         return (
             ""
-            if found == bool(stored["ok"])
-            else f"{'gives a' if found else 'gives no'} homography now, unlike in its run"
+            if has_homography == bool(stored["ok"])
+            else f"{'gives a' if has_homography else 'gives no'} homography now, unlike in its run"
         )
     size, H = torch.tensor([images[0].shape[:2]]), torch.tensor(stored["H"], dtype=torch.float64).reshape(1, 3, 3)
     apart = float(corner_error(again.F.cpu(), H, size)[0])

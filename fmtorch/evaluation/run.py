@@ -88,7 +88,7 @@ def evaluate_pairs(
         store(work.rows)
         if isinstance(pipeline.extractor, CachedFeatures):
             pipeline.extractor.computed += work.computed
-            pipeline.extractor.found += work.found
+            pipeline.extractor.found += work.from_cache
 
     calls = Calls(team, source, evaluate_batch, keep, lambda done, reason: store(failed(done, reason)), divided)
     try:

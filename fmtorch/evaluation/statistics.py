@@ -112,7 +112,7 @@ def interval(values: Values, scenes: Sequence[str], scale: float = 1.0, share: b
     if not known.any():
         return None
     of = share_interval if share else bootstrap_mean
-    return _scaled(of(values[known], _those(scenes, known)), scale)
+    return _scaled(of(values[known], _known_scenes(scenes, known)), scale)
 
 
 def difference(a: Values, b: Values, scenes: Sequence[str], scale: float = 1.0, share: bool = False) -> Interval | None:
@@ -125,7 +125,7 @@ def difference(a: Values, b: Values, scenes: Sequence[str], scale: float = 1.0, 
     if not known.any():
         return None
     of = share_difference if share else mean_difference
-    unscaled = of(a[known], b[known], _those(scenes, known))
+    unscaled = of(a[known], b[known], _known_scenes(scenes, known))
     return None if unscaled is None else _scaled(unscaled, scale)
 
 
@@ -155,5 +155,5 @@ def _scaled(i: Interval, scale: float) -> Interval:
     return Interval(scale * i.value, scale * i.low, scale * i.high, i.over)
 
 
-def _those(scenes: Sequence[str], known: NDArray[np.bool_]) -> list[str]:
+def _known_scenes(scenes: Sequence[str], known: NDArray[np.bool_]) -> list[str]:
     return [scene for scene, is_known in zip(scenes, known, strict=True) if is_known]

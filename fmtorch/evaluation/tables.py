@@ -157,8 +157,8 @@ def seconds(summaries: Summaries) -> Table:
     for name, summary in summaries.items():
         known = summary[ALL]["seconds"]
         cells = [Cell(DASH if known[stage] is None else f"{known[stage]:.3f}") for stage in stages]
-        whole = sum(known[stage] or 0.0 for stage in STAGES)
-        width = 100 * totals[name] / slowest / whole if slowest and whole else 0.0
+        stage_total = sum(known[stage] or 0.0 for stage in STAGES)
+        width = 100 * totals[name] / slowest / stage_total if slowest and stage_total else 0.0
         rows[name] = [*cells[:-1], dataclasses.replace(cells[-1], shares=[width * (known[s] or 0.0) for s in STAGES])]
     failed = [
         f"{name}: {reason} ({count})"

@@ -44,18 +44,21 @@ class Batch:
 
 @dataclasses.dataclass(frozen=True)
 class Work:
-    """The rows of a batch; computed, found: images whose features a process computed or took from the cache for it."""
+    """The rows of a batch.
+
+    computed, from_cache: images whose features a process computed or took from the cache for it.
+    """
 
     rows: list[PairRow]
     computed: int = 0
-    found: int = 0
+    from_cache: int = 0
     journal: CollectedJournal | None = None
 
 
 def evaluate_batch(pipeline: Pipeline, batch: Batch) -> Work:
     """The rows of a batch, and what is to be exported of it."""
     cache = pipeline.extractor if batch.counted and isinstance(pipeline.extractor, CachedFeatures) else None
-    computed, found = (cache.computed, cache.found) if cache else (0, 0)
+    computed, from_cache = (cache.computed, cache.found) if cache else (0, 0)
     if batch.cameras is not None:
         assert isinstance(pipeline.estimator, WithPairCameras)
         pipeline.estimator.cameras |= batch.cameras
@@ -68,7 +71,7 @@ def evaluate_batch(pipeline: Pipeline, batch: Batch) -> Work:
     if batch.cameras is not None and isinstance(pipeline.estimator, WithPairCameras):
         for key in batch.cameras:
             pipeline.estimator.cameras.pop(key, None)
-    counts = (cache.computed - computed, cache.found - found) if cache else (0, 0)
+    counts = (cache.computed - computed, cache.found - from_cache) if cache else (0, 0)
     return Work(rows, *counts, batch.journal)
 
 

@@ -60,8 +60,8 @@ def component_sum(x: Tensor, dim: int = 0) -> Tensor:
 def outer_sum(a: Float[Tensor, " k *s"], b: Float[Tensor, " k *t"]) -> Tensor:
     """The sum over k, in order, of the products of a[k] and b[k], which broadcast; without the temporaries of a sum."""
     total: Tensor = a[0] * b[0]
-    for one, other in zip(a[1:].unbind(0), b[1:].unbind(0), strict=True):
-        total = torch.addcmul(total, one, other)
+    for a_k, b_k in zip(a[1:].unbind(0), b[1:].unbind(0), strict=True):
+        total = torch.addcmul(total, a_k, b_k)
     return total
 
 

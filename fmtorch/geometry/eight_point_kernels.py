@@ -113,8 +113,8 @@ def weighted_eight_point(points: F8x2, weight: F8x1, F: F8x1) -> bool:
     for image in range(2):
         _similarity(X[2 * image], X[2 * image + 1], w, similarity[image])
     M = _normal_matrix(X, w)
-    found = smallest_eigenvector(M, F)
-    if not found:
+    solved = smallest_eigenvector(M, F)
+    if not solved:
         return False
     nearest_rank2(F)
     for image in range(2):

@@ -58,7 +58,7 @@ def five_point(points: F8x2, sample: I8x2, depth: F8x2, offset: F8x1, F: F4x2, d
         _determinant(B, p)
         rows = real_roots(p, full_rank, roots)
         for s in range(rows):
-            there = load(roots.found, s) & _essential(B, e, load(roots.far, s), load(roots.z, s), E)
+            there = load(roots.exists, s) & _essential(B, e, load(roots.far, s), load(roots.z, s), E)
             there &= consistently_oriented(E, X, 5)
             store(right, s, there & _uncalibrated(E, depths, offset, uncalibrated[s]))
         for i in range(min(LANES, sample.shape[1] - first)):
@@ -188,7 +188,7 @@ def _essential(B: Array, e: Array, far: Any, z: Any, E: Array) -> Any:
             value = where(far, load(B, 5 * q + 4 - d), load(B, 5 * q + d)) + value * z
         store(m, q, value)
     zero = fill(0.0)
-    x, y, one, most = zero, zero, zero, fill(-1.0)
+    x, y, homogeneous, most = zero, zero, zero, fill(-1.0)
     for r in range(3):  # the longest cross product of two rows
         a, b = 3 * r, 3 * ((r + 1) % 3)
         c0 = load(m, a + 1) * load(m, b + 2) - load(m, a + 2) * load(m, b + 1)
@@ -196,10 +196,10 @@ def _essential(B: Array, e: Array, far: Any, z: Any, E: Array) -> Any:
         c2 = load(m, a) * load(m, b + 1) - load(m, a + 1) * load(m, b)
         length2 = c0 * c0 + c1 * c1 + c2 * c2
         longer = length2 > most
-        x, y, one = where(longer, c0, x), where(longer, c1, y), where(longer, c2, one)
+        x, y, homogeneous = where(longer, c0, x), where(longer, c1, y), where(longer, c2, homogeneous)
         most = where(longer, length2, most)
     w0, w1 = where(far, x * z, x), where(far, y * z, y)
-    w2, w3 = where(far, one, one * z), where(far, one * z, one)
+    w2, w3 = where(far, homogeneous, homogeneous * z), where(far, homogeneous * z, homogeneous)
     norm = zero
     for q in range(9):
         value = load(e, q) * w0 + load(e, 9 + q) * w1

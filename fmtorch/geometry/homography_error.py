@@ -49,9 +49,9 @@ def equations_slope(error: HomographyError, points: Float[Tensor, " 4 *p"]) -> F
     """G, the derivative of the two corrected equations of each match by the nine entries."""
     X, Y, du, dv = error.corrected
     x, y, u, v = (p.expand_as(X) for p in points)
-    one, zero = torch.ones_like(X), torch.zeros_like(X)
-    first = [X, Y, one, zero, zero, zero, -(u * X + x * du), -(u * Y + y * du), -(u + du)]
-    second = [zero, zero, zero, X, Y, one, -(v * X + x * dv), -(v * Y + y * dv), -(v + dv)]
+    ones, zero = torch.ones_like(X), torch.zeros_like(X)
+    first = [X, Y, ones, zero, zero, zero, -(u * X + x * du), -(u * Y + y * du), -(u + du)]
+    second = [zero, zero, zero, X, Y, ones, -(v * X + x * dv), -(v * Y + y * dv), -(v + dv)]
     return torch.stack([torch.stack(first), torch.stack(second)])
 
 

@@ -127,7 +127,7 @@ def _apply(centred: Tensor, mask: Tensor | None, scale: Tensor) -> Tensor:
 
 
 def _similarity(centroid: Tensor, scale: Tensor) -> Tensor:
-    zero, one = torch.zeros_like(scale), torch.ones_like(scale)
+    zero, ones = torch.zeros_like(scale), torch.ones_like(scale)
     tx, ty = (-scale[..., None] * centroid).unbind(-1)
-    rows = [scale, zero, tx, zero, scale, ty, zero, zero, one]
+    rows = [scale, zero, tx, zero, scale, ty, zero, zero, ones]
     return torch.stack(rows, -1).reshape(*scale.shape, 3, 3)

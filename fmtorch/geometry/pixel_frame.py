@@ -34,9 +34,9 @@ class PixelFrame(NamedTuple):
             high = torch.where(inside, x, -torch.inf).amax(1)
         else:
             low = high = x.new_zeros(len(x), 4)
-        some = mask.any(1)
-        centre = torch.where(some[:, None], (low + high) / 2, 0)
-        half = torch.where(some, ((high - low) / 2).amax(-1), 0)
+        nonempty = mask.any(1)
+        centre = torch.where(nonempty[:, None], (low + high) / 2, 0)
+        half = torch.where(nonempty, ((high - low) / 2).amax(-1), 0)
         spread = half > 0
         half = half.clamp(1e-300, 1e300)
         mantissa = torch.frexp(half).mantissa

@@ -163,8 +163,8 @@ def _in_front(R: Tensor, t: Tensor, ray0: Tensor, ray1: Tensor) -> Tensor:
 
 def _support(front: Tensor, weight: Tensor) -> Tensor:
     """The sum of the weights of points in front, (4, *batch), as whole numbers: the same in any order."""
-    whole = (torch.where(front.any(0), weight.detach(), 0.0).clamp(0, 1).double() * 2.0**20).round().to(torch.int64)
-    return torch.where(front, whole, 0).sum(-1)
+    rounded = (torch.where(front.any(0), weight.detach(), 0.0).clamp(0, 1).double() * 2.0**20).round().to(torch.int64)
+    return torch.where(front, rounded, 0).sum(-1)
 
 
 def _rays(inverse: Tensor, x: Tensor) -> Tensor:

@@ -23,13 +23,13 @@ DEGREE = 10
 class Roots(NamedTuple):
     """Of LANES polynomials, their first roots in rows 0, their second in rows 1, ... (DEGREE, LANES).
 
-    far: whether in the second chart, in which z is the inverse of the root. found: whether there is one.
+    far: whether in the second chart, in which z is the inverse of the root. exists: whether there is one.
     low, high, below, above: places of different sign around it, and the values there.
     """
 
     z: Array
     far: Array
-    found: Array
+    exists: Array
     low: Array
     high: Array
     below: Array
@@ -39,9 +39,9 @@ class Roots(NamedTuple):
 @inner
 def room_for_roots() -> Any:
     """Buffers for `real_roots`."""
-    z, far, found = matrix(DEGREE, LANES), np.empty((DEGREE, LANES), np.bool_), np.empty((DEGREE, LANES), np.bool_)
+    z, far, exists = matrix(DEGREE, LANES), np.empty((DEGREE, LANES), np.bool_), np.empty((DEGREE, LANES), np.bool_)
     low, high = matrix(DEGREE, LANES), matrix(DEGREE, LANES)
-    return Roots(z, far, found, low, high, matrix(DEGREE, LANES), matrix(DEGREE, LANES))
+    return Roots(z, far, exists, low, high, matrix(DEGREE, LANES), matrix(DEGREE, LANES))
 
 
 @inner
@@ -57,7 +57,7 @@ def real_roots(p: Array, valid: Any, roots: Any) -> int:
     valid = valid & (size > 0.0) & (size < math.inf)
     values, change, number = matrix(KNOTS, LANES), np.empty((1, LANES), np.bool_), np.zeros(LANES, np.int64)
     for s in range(DEGREE):
-        store(roots.found, s, size != size)
+        store(roots.exists, s, size != size)
         store(roots.far, s, size != size)
         store(roots.low, s, fill(0.0))
         store(roots.high, s, fill(1.0))
@@ -74,7 +74,7 @@ def real_roots(p: Array, valid: Any, roots: Any) -> int:
             for i in range(LANES):
                 s = number[i]
                 if change[0, i] and s < DEGREE:
-                    roots.found[s, i], roots.far[s, i] = True, chart == 1
+                    roots.exists[s, i], roots.far[s, i] = True, chart == 1
                     roots.low[s, i], roots.high[s, i] = _knot(chart, k), _knot(chart, k + 1)
                     roots.below[s, i], roots.above[s, i] = values[k, i], values[k + 1, i]
                     number[i] = s + 1

@@ -191,8 +191,8 @@ def _without(C: Tensor, share: Tensor) -> Tensor:
     `DIFFUSE` knows of it stays.
     """
     S, eye = _inverse(C[3:5, 3:5]), torch.eye(2, dtype=C.dtype, device=C.device)[..., None]
-    least = eye * DIFFUSE[3] ** -2
-    grown = _inverse(_positive_part(S * (1 - share) - least) + least)
+    diffuse_information = eye * DIFFUSE[3] ** -2
+    grown = _inverse(_positive_part(S * (1 - share) - diffuse_information) + diffuse_information)
     by_direction = _product(C[:, 3:5], S)
     C = C + _product(by_direction, _product(grown - C[3:5, 3:5], by_direction.transpose(0, 1)))
     return (C + C.transpose(0, 1)) / 2

@@ -101,6 +101,6 @@ def information_of(r: Tensor, J: Tensor, noise: Tensor, w: Tensor, T: Tensor, s:
     factor = kept_share(T / s) * (stable_sum(w) / torch.where(squares > 0, squares, 1.0))
     rows, columns = torch.triu_indices(PARAMETERS, PARAMETERS, device=r.device)
     sums = stable_sum(J[rows] * J[columns] * w) * (factor / (s * s))
-    whole = torch.zeros_like(rows).new_zeros(PARAMETERS, PARAMETERS)
-    whole[rows, columns] = torch.arange(len(rows), device=r.device)
-    return sums[torch.maximum(whole, whole.mT)], stable_sum(noise * w) * factor
+    index = torch.zeros_like(rows).new_zeros(PARAMETERS, PARAMETERS)
+    index[rows, columns] = torch.arange(len(rows), device=r.device)
+    return sums[torch.maximum(index, index.mT)], stable_sum(noise * w) * factor

@@ -27,6 +27,6 @@ def judged(estimate: Estimate, c: Correspondences) -> Estimate:
     if estimate.model != "fundamental" or not bool(unknown.any()):
         return estimate
     with one_thread(c.mask.device):
-        found = significance(estimate.F.detach(), c.x0.detach(), c.x1.detach(), c.mask, c.size0, c.size1)
-    found = torch.where(estimate.ok, found, -torch.inf)
-    return estimate.derived(significance=torch.where(unknown, found, given))
+        computed = significance(estimate.F.detach(), c.x0.detach(), c.x1.detach(), c.mask, c.size0, c.size1)
+    computed = torch.where(estimate.ok, computed, -torch.inf)
+    return estimate.derived(significance=torch.where(unknown, computed, given))

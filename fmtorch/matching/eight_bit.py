@@ -30,12 +30,12 @@ def two_nearest(rows: Tensor, columns: Tensor, block: int = BLOCK) -> compiled.N
     low, high = min(bounds), max(bounds)
     if not max(-low, high) <= MAX_NORM:  # squares that overflow leave no sound scale
         return None
-    whole = high - low <= _RANGE
-    center, step = (low + 128, 1.0) if whole else ((low + high) / 2, (high - low) / _RANGE)
+    fits = high - low <= _RANGE
+    center, step = (low + 128, 1.0) if fits else ((low + high) / 2, (high - low) / _RANGE)
     padded = -(-n1 // compiled.GROUP) * compiled.GROUP
     rounded0, first = _rounded(rows, center, step, n0)
     rounded1, second = _rounded(columns, center, step, padded)
-    found = _nothing(n0, n1, padded)
+    neighbors = _nothing(n0, n1, padded)
     multiply = torch._int_mm if int8_products_are_exact() else _float_products
     transposed = rounded1.T
     if multiply is _float_products:
@@ -44,10 +44,10 @@ def two_nearest(rows: Tensor, columns: Tensor, block: int = BLOCK) -> compiled.N
     for start in range(0, n0, block):
         products = buffer[: n0 - start]
         multiply(rounded0[start : start + block], transposed, out=products)
-        computed += compiled.update(products.numpy(), start, first, second, found)
+        computed += compiled.update(products.numpy(), start, first, second, neighbors)
         if computed > MAX_COMPUTED * (n0 + n1):
             return None
-    return found
+    return neighbors
 
 
 @functools.cache

@@ -119,18 +119,18 @@ def _match_one_pair(d0: Tensor, d1: Tensor, mask0: Tensor, mask1: Tensor, chunk:
 
 def _compiled(rows: Tensor, columns: Tensor) -> tuple[_Nearest, Tensor] | None:
     """`_two_nearest` by kernels, None where they do not serve."""
-    found = eight_bit.two_nearest(rows, columns) if kernels_serve(rows, columns) else None
-    if found is None:
+    neighbors = eight_bit.two_nearest(rows, columns) if kernels_serve(rows, columns) else None
+    if neighbors is None:
         return None
-    tensors = (torch.from_numpy(value) for value in (found.nearest, found.squared, found.second_squared))
-    return _Nearest(*tensors), torch.from_numpy(found.reverse)
+    tensors = (torch.from_numpy(value) for value in (neighbors.nearest, neighbors.squared, neighbors.second_squared))
+    return _Nearest(*tensors), torch.from_numpy(neighbors.reverse)
 
 
 def _integers(d0: Tensor, d1: Tensor) -> tuple[Tensor, Tensor, float]:
     """Both sets as integer-valued vectors in a type in which their squared distances are exact, and their unit."""
     longest = max(_longest(d0), _longest(d1))
-    whole = bool((d0 == d0.round()).all() and (d1 == d1.round()).all())
-    if whole and longest <= _FLOAT32_NORM:
+    integral = bool((d0 == d0.round()).all() and (d1 == d1.round()).all())
+    if integral and longest <= _FLOAT32_NORM:
         return d0.float(), d1.float(), 1.0
     ratio = _FLOAT64_NORM / longest if longest > 0 else 1.0  # squares below 1e-323 are zero, and so is all that is left
     exponent = math.frexp(ratio)[1] - 1  # a power of two, so that scaling is exact

@@ -59,7 +59,7 @@ def round_to_8_bits(exact: I4x2, center: float, step: float, rounded: I1x2, squa
 
 
 @kernel
-def update(products: I4x2, first: int, rows: Descriptors, columns: Descriptors, found: Nearest) -> int:
+def update(products: I4x2, first: int, rows: Descriptors, columns: Descriptors, neighbors: Nearest) -> int:
     """Takes products of rounded rows, from `first` on, with all rounded columns into what is found; overwrites them.
 
     A distance D and the distance D8 of what was rounded differ by the errors at most (triangle inequality), so that
@@ -79,22 +79,24 @@ def update(products: I4x2, first: int, rows: Descriptors, columns: Descriptors, 
                 value = np.int32(np.int32(norm + columns.squared_norms[j]) - np.int32(2 * squared[j]))
                 squared[j] = value
                 smallest = min(smallest, value)
-                excess = min(excess, np.int32(value - found.limit[j]))
+                excess = min(excess, np.int32(value - neighbors.limit[j]))
             minima[g] = smallest
             if excess <= 0:
                 for j in range(begin, begin + GROUP):
-                    if squared[j] <= found.limit[j]:
+                    if squared[j] <= neighbors.limit[j]:
                         distance = _squared_distance(exact, columns.exact[j])
                         computed += 1
-                        if distance < found.reverse_squared[j]:
-                            found.reverse[j], found.reverse_squared[j] = row, distance
-                            found.limit[j] = _below(distance, error, step)
-        computed += _search(row, squared, minima, rows, columns, found)
+                        if distance < neighbors.reverse_squared[j]:
+                            neighbors.reverse[j], neighbors.reverse_squared[j] = row, distance
+                            neighbors.limit[j] = _below(distance, error, step)
+        computed += _search(row, squared, minima, rows, columns, neighbors)
     return computed
 
 
 @inner
-def _search(row: int, squared: Array, minima: Array, rows: Descriptors, columns: Descriptors, found: Nearest) -> int:
+def _search(
+    row: int, squared: Array, minima: Array, rows: Descriptors, columns: Descriptors, neighbors: Nearest
+) -> int:
     """The two nearest columns of a row, by 8-bit squared distances and their minima in groups; what was computed."""
     error, step = rows.error + columns.error, rows.step
     limit = _reach(minima, error, step)
@@ -112,7 +114,7 @@ def _search(row: int, squared: Array, minima: Array, rows: Descriptors, columns:
             elif distance < second:
                 second = distance
             limit = min(limit, _below(second, error, step))
-    found.nearest[row], found.squared[row], found.second_squared[row] = nearest, best, second
+    neighbors.nearest[row], neighbors.squared[row], neighbors.second_squared[row] = nearest, best, second
     return computed
 
 

@@ -103,5 +103,5 @@ def ground_truth_inliers(
     return correct if mask is None else correct & mask
 
 
-def _share(part: Tensor, whole: Tensor) -> Tensor:
-    return part.sum(-1).to(torch.float64) / whole.sum(-1).to(torch.float64)
+def _share(part: Tensor, total: Tensor) -> Tensor:
+    return part.sum(-1).to(torch.float64) / total.sum(-1).to(torch.float64)

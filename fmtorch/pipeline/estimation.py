@@ -34,7 +34,7 @@ def estimated(
     the estimate may have a covariance. in_pixels: refuse points that obviously are not.
     """
     expect_values(c)
-    seed = int(number("seed", seed, whole=True))
+    seed = int(number("seed", seed, integer=True))
     estimator = estimator_of(name, config_dir, options)
     _expect_gradients(c, estimator, name)
     if (gives := model_of(estimator)) != model:

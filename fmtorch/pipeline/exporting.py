@@ -37,7 +37,8 @@ def keep_outcomes(journal: Journal, pipeline: Pipeline, outcomes: Sequence[Outco
         F = estimate.F[0] if outcome.solved else torch.zeros(3, 3)
         names = journal.name(ends[0]), journal.name(ends[1])
         points = journal.image(ends[0]).points, journal.image(ends[1]).points
-        kept = _pair(names, points, c, F, estimate.inliers[0], bool(estimate.related[0]))
+        matched = c if outcome.keypoints is None else outcome.keypoints
+        kept = _pair(names, points, matched, F, estimate.inliers[0], bool(estimate.related[0]))
         if outcome.configuration is not None:
             kept = dataclasses.replace(kept, geometry=_geometry(kept.matches, c, estimate, outcome.configuration))
         journal.add_pair(*ends, kept)
@@ -82,7 +83,8 @@ def exported_image(name: str, described: Described, camera: PhotographCamera | N
 def exported_match(names: tuple[str, str], described: tuple[Described, Described], result: MatchResult) -> ExportedPair:
     """What was found of two photographs, as a journal keeps it."""
     points = _points(described[0]), _points(described[1])
-    pair = _pair(names, points, result.correspondences, result.F, result.inliers, result.related)
+    keypoints = result.putative.derived(mask=result.kept[None]).compact()
+    pair = _pair(names, points, keypoints, result.F, result.inliers, result.related)
     if (geometry := result.geometry) is not None:
         geometry = geometry._replace(inliers=pair.matches[geometry.inliers[:, 0]])
     return dataclasses.replace(
@@ -107,14 +109,15 @@ def _pair(
     names: tuple[str, str], points: tuple[NDArray[np.float32], NDArray[np.float32]],
     c: Correspondences, F: Tensor, inliers: Tensor, related: bool,
 ) -> ExportedPair:  # fmt: skip
-    """The surviving matches of one pair as indices of the images' points.
+    """The surviving matches of one pair, as the matcher left them, as indices of the images' points.
 
     Scores are one less the matcher's figure, a ratio, and 1 where there is none. Raises ValueError for matches that are
     at no keypoint.
     """
     mask = c.mask[0].cpu()
     index = [
-        indices(those, x[0].detach().cpu().float()[mask].numpy()) for those, x in zip(points, (c.x0, c.x1), strict=True)
+        indices(keypoints, x[0].detach().cpu().float()[mask].numpy())
+        for keypoints, x in zip(points, (c.x0, c.x1), strict=True)
     ]
     quality = torch.zeros(len(mask)) if c.quality is None else c.quality[0].detach().cpu().float()
     scores = (1 - quality[mask]).nan_to_num(0.0).clamp(0.0, 1.0)

@@ -21,7 +21,8 @@ class Outcome:
     features: how many each image has. seconds: per stage; a batched stage is shared out evenly, and features count in
     full for each pair that uses them, cached ones with the seconds they took when they were computed.
     reason: why the pair failed, empty where it did not. configuration, not_examined: of this pair alone, or why there
-    is none, where it was asked for (`fmtorch.pipeline.examination`). images: for pruners that look at them.
+    is none, where it was asked for (`fmtorch.pipeline.examination`). images: for pruners that look at them. keypoints:
+    the correspondences as the matcher left them, where pruners that look at images may have moved their points.
     """
 
     pair: ImagePair
@@ -33,6 +34,7 @@ class Outcome:
     configuration: Configuration | None = None
     not_examined: str = ""
     images: PairImages | None = None
+    keypoints: Correspondences | None = None
 
     @property
     def solved(self) -> bool:

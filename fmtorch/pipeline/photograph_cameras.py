@@ -87,10 +87,10 @@ class PhotographCameras:
             what = f"{path.name}: F and the pose are of the image without the distortion of its {lens.model} lens"
             return PhotographCamera(lens, note=f"{what}; points are where they are in the photograph")
         if self.word == "exif":
-            found = exif_focal(path, size)
-            if found.known:
-                return PhotographCamera(focal=(found.focal, found.deviation))
-            return PhotographCamera(note=f"{path.name}: focal length not known: {found.source}")
+            exif = exif_focal(path, size)
+            if exif.known:
+                return PhotographCamera(focal=(exif.focal, exif.deviation))
+            return PhotographCamera(note=f"{path.name}: focal length not known: {exif.source}")
         return PhotographCamera()
 
     def knowledge(self, camera0: PhotographCamera, camera1: PhotographCamera) -> dict[str, Any]:

@@ -68,7 +68,7 @@ class Pipeline:
         self._memo: Memo[Hashable, tuple[Features, float]] = Memo(memory)
         self._pyramids: Memo[Hashable, GreyPyramid] = Memo(memory)
         every = [self.pruners, *self.families.values()]
-        self.looks_at_images = any(isinstance(pruner, ImagePruner) for some in every for pruner in some.values())
+        self.looks_at_images = any(isinstance(pruner, ImagePruner) for stages in every for pruner in stages.values())
 
     def features(self, image: ImageSource) -> tuple[Features, float]:
         """The features of an image and the seconds they took, kept for the next pair that shows the image."""
@@ -151,7 +151,7 @@ class Pipeline:
             return Outcome(pair, counts, seconds=seconds, reason=described("matching", error))
         seconds["matching"] = time.perf_counter() - start
         images = self.images(pair) if self.looks_at_images else None
-        return Outcome(pair, counts, self._told(pair, c), None, seconds, images=images)
+        return Outcome(pair, counts, self._with_calibrations(pair, c), None, seconds, images=images)
 
     def _match_images(self, pair: ImagePair, matcher: ImageMatcher) -> Outcome:
         """The matches of a matcher that takes the images themselves, in place of the first two stages."""
@@ -167,7 +167,7 @@ class Pipeline:
         seconds = {"matching": time.perf_counter() - start}
         count = int(c.count())
         pyramids = self.images(pair) if self.looks_at_images else None
-        return Outcome(pair, (count, count), self._told(pair, c), None, seconds, images=pyramids)
+        return Outcome(pair, (count, count), self._with_calibrations(pair, c), None, seconds, images=pyramids)
 
     def _given(self, pair: ImagePair, matches: Callable[[], GivenMatches]) -> Outcome:
         """The matches that come with a pair, in place of the first two stages."""
@@ -175,9 +175,9 @@ class Pipeline:
             c, counts = matches()
         except Exception as error:  # a pair that cannot be read becomes a row with this reason
             return Outcome(pair, reason=described("matches", error))
-        return Outcome(pair, counts, self._told(pair, c.to(self.device)))
+        return Outcome(pair, counts, self._with_calibrations(pair, c.to(self.device)))
 
-    def _told(self, pair: ImagePair, c: Correspondences) -> Correspondences:
+    def _with_calibrations(self, pair: ImagePair, c: Correspondences) -> Correspondences:
         """The matches with the pair's key and calibrations."""
         K0, K1 = (
             None if K is None else torch.from_numpy(K).to(self.device, torch.float64)[None] for K in (pair.K0, pair.K1)
@@ -194,16 +194,20 @@ class Pipeline:
         for family in [None, *sorted(others)]:  # None: all that have no pruners of their own
             own = [i for i, o in enumerate(outcomes) if (o.pair.family if o.pair.family in others else None) == family]
             if own:
-                some = [outcomes[i] for i in own]
-                c = collated(some)
+                family_outcomes = [outcomes[i] for i in own]
+                c = keypoints = collated(family_outcomes)
 
-                def images(i: int, some: list[Outcome] = some) -> PairImages:
-                    return some[i].images or self.images(some[i].pair)
+                def images(i: int, family_outcomes: list[Outcome] = family_outcomes) -> PairImages:
+                    return family_outcomes[i].images or self.images(family_outcomes[i].pair)
 
                 for pruner in self.pruners_of(family or "").values():
-                    c = pruned(pruner, c, images).compact()
+                    c = pruned(pruner, c, images)
+                    if self.looks_at_images:
+                        keypoints = keypoints.derived(mask=c.mask).compact()
+                    c = c.compact()
                 for place, i in enumerate(own):
-                    result[i] = dataclasses.replace(outcomes[i], correspondences=c[place], images=None)
+                    ends = keypoints[place] if self.looks_at_images else None
+                    result[i] = dataclasses.replace(outcomes[i], correspondences=c[place], images=None, keypoints=ends)
         return result
 
     def _estimate(self, outcomes: list[Outcome], seed: int) -> list[Outcome]:

@@ -35,7 +35,7 @@ def similar_pairs(images: Sequence[Path], vectors: Float[Tensor, "n d"], count: 
         rows = torch.arange(len(similarity))
         similarity[rows, rows + start] = -torch.inf
         values, order = similarity.sort(dim=1, descending=True, stable=True)
-        for row, (best, those) in enumerate(zip(values[:, :count], order[:, :count], strict=True), start=start):
+        for row, (best, neighbors) in enumerate(zip(values[:, :count], order[:, :count], strict=True), start=start):
             if described[row]:
-                selected |= {(min(row, j), max(row, j)) for j in those[best > -torch.inf].tolist()}
+                selected |= {(min(row, j), max(row, j)) for j in neighbors[best > -torch.inf].tolist()}
     return [(images[i], images[j]) for i, j in sorted(selected)]

@@ -25,13 +25,13 @@ def expect_pixels(c: Correspondences) -> None:
     for i, (x, K, size) in enumerate(((c.x0, c.K0, c.size0), (c.x1, c.K1, c.size1))):
         x = x.detach()
         mask = c.mask & torch.isfinite(x).all(-1)
-        told = mask.sum(1) >= MIN_MATCHES
-        if not bool(told.any()):
+        enough = mask.sum(1) >= MIN_MATCHES
+        if not bool(enough.any()):
             continue
-        if bool(_normalized(x, mask, K)[told].all()):
+        if bool(_normalized(x, mask, K)[enough].all()):
             _refuse(x, mask, i, K is not None)
         if size is not None:
-            _expect_inside(x[told], mask[told], size.detach()[told], i)
+            _expect_inside(x[enough], mask[enough], size.detach()[enough], i)
 
 
 def _normalized(x: Float[Tensor, "b n 2"], mask: Bool[Tensor, "b n"], K: Tensor | None) -> Bool[Tensor, " b"]:

@@ -121,7 +121,7 @@ def verify_by(
 ) -> Verification:  # fmt: skip
     """The same by any estimator, which `make` builds; an interrupted run is continued by one of the same `settings`."""
     begin = time.perf_counter()
-    seed = int(number("seed", how.seed, whole=True))
+    seed = int(number("seed", how.seed, integer=True))
     if how.cameras not in get_args(Cameras):
         raise ValueError(f"cameras is {how.cameras!r}; it must be one of {', '.join(get_args(Cameras))}")
     estimator = make()

@@ -22,8 +22,8 @@ from fmtorch.presets.former import moved
 def available(group: str, config_dir: Path | str | None = None) -> list[str]:
     """Names of the presets of a group, e.g. ``available("estimator")``: ``paper/usac`` and the like last."""
     folders = [Path(config_dir) / group] if config_dir is not None else []
-    found = [path.relative_to(f).with_suffix("") for f in [*folders, conf_dir() / group] for path in f.rglob("*.yaml")]
-    return sorted({path.as_posix() for path in found}, key=lambda name: (name.count("/"), name))
+    paths = [path.relative_to(f).with_suffix("") for f in [*folders, conf_dir() / group] for path in f.rglob("*.yaml")]
+    return sorted({path.as_posix() for path in paths}, key=lambda name: (name.count("/"), name))
 
 
 def groups() -> list[str]:

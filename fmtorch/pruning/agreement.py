@@ -21,7 +21,7 @@ FARTHEST = 1e15  # px; a match beyond is none: its squares could overflow
 CURVES32 = np.array([(shift, math.cos(angle), math.sin(angle)) for shift, angle in CURVES], np.float32)
 SHARPNESS32, NOISE32, FARTHEST32 = np.float32(SHARPNESS), np.float32(NOISE), np.float32(FARTHEST)
 WORST_RATIO32, MIN_VOTE32 = np.float32(WORST_RATIO), np.float32(MIN_VOTE)
-MIN_SQUARE32, MIN_VOTES32 = np.float32(MIN_SQUARE), np.float32(MIN_VOTES)
+MIN_SQUARE32, MIN_VOTES32, ONE32 = np.float32(MIN_SQUARE), np.float32(MIN_VOTES), np.float32(1)
 
 TURNS = 16  # hypotheses of the turn that a pair's neighbours have in common
 SCALES = tuple(2.0 ** (k / 2) for k in range(-4, 5))  # hypotheses of their change of scale

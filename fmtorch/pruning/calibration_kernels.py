@@ -14,11 +14,10 @@ def calibrated(evidence: F4x1, quality: F4x1, mask: B1x1, numbers: F4x1, out: F4
 
     quality: empty where unknown. numbers: constant, weights of evidence and ratio, largest log-odds, and 2^-10.
     """
-    one = evidence.dtype.type(1)
     for i in range(len(mask)):
         z = numbers[0] + numbers[1] * evidence[i]
         if len(quality):
-            z += numbers[2] * (one if np.isnan(quality[i]) else quality[i])
+            z += numbers[2] * (np.float32(1) if np.isnan(quality[i]) else quality[i])
         o = 1.0 + np.float64(min(max(z, -numbers[3]), numbers[3])) * numbers[4]
         for _ in range(10):
             o *= o

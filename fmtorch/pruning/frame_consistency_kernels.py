@@ -16,6 +16,7 @@ from fmtorch.pruning.agreement import (
     MIN_VOTE32,
     MIN_VOTES32,
     NOISE32,
+    ONE32,
     SHARPNESS32,
     WINDOW,
     WORST_RATIO32,
@@ -85,7 +86,7 @@ def frame_agreement(matches: FramedMatches, out: F4x1) -> None:
 @inner
 def _frames_agree(along: Array, k: int, ahead: Array, behind: Array) -> None:
     """For matches i and j = i + k: how well j agrees with i -> ahead[i], i with j -> behind[i]."""
-    noise, sharpness, tiny, one = NOISE32, SHARPNESS32, MIN_SQUARE32, along.dtype.type(1)
+    noise, sharpness, tiny = NOISE32, SHARPNESS32, MIN_SQUARE32
     X0, Y0, X1, Y1, A, B, C, D, S = (
         along[0], along[1], along[2], along[3], along[4], along[5], along[6], along[7], along[8],
     )  # fmt: skip
@@ -98,17 +99,17 @@ def _frames_agree(along: Array, k: int, ahead: Array, behind: Array) -> None:
         error = own if own > other else other
         length0, length1 = math.sqrt(dx * dx + dy * dy + tiny), math.sqrt(ux * ux + uy * uy + tiny)
         length = length0 * S[i] + length1 + noise
-        t = one + error / (length * length) * sharpness
+        t = ONE32 + error / (length * length) * sharpness
         t = t * t
         t = t * t
         t = t * t
-        ahead[i] = one / t
+        ahead[i] = ONE32 / t
         length = length0 * S[j] + length1 + noise
-        t = one + error / (length * length) * sharpness
+        t = ONE32 + error / (length * length) * sharpness
         t = t * t
         t = t * t
         t = t * t
-        behind[i] = one / t
+        behind[i] = ONE32 / t
 
 
 @inner
@@ -141,8 +142,7 @@ def frame_prior(agreement: F4x1, quality: F4x1, mask: B1x1, numbers: F4x1, out: 
     numbers: odds, floor, slope.
     """
     odds, floor, slope = numbers[0], numbers[1], numbers[2]
-    one = agreement.dtype.type(1)
     for i in range(len(mask)):
-        w, divisor = agreement[i] + floor, one + slope * quality[i]
+        w, divisor = agreement[i] + floor, ONE32 + slope * quality[i]
         o = odds * w * w * w / (divisor * divisor)
-        out[i] = o / (one + o) if mask[i] and math.isfinite(quality[i]) else one - one
+        out[i] = o / (ONE32 + o) if mask[i] and math.isfinite(quality[i]) else ONE32 - ONE32

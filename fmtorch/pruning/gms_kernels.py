@@ -103,11 +103,11 @@ def _count(
     shift: 1 along x, 2 along y, 3 along both.
     """
     filled[:] = 0
-    least = 1 if authors else 0
+    min_cell = 1 if authors else 0
     for i in range(len(p0)):
         x, y = np.int64(p0[i, 0] * np.float32(2 * GRID)), np.int64(p0[i, 1] * np.float32(2 * GRID))
         column, row = (x + (shift & 1)) >> 1, (y + (shift >> 1)) >> 1
-        outside = column >= GRID or row >= GRID or (shift & 1 and column < least) or (shift >> 1 and row < least)
+        outside = column >= GRID or row >= GRID or (shift & 1 and column < min_cell) or (shift >> 1 and row < min_cell)
         line[i] = -1 if outside else row * GRID + column
         if not outside:
             filled[line[i]] += 1

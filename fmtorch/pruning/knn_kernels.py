@@ -16,14 +16,14 @@ _LEAF = 8  # points a leaf, at most
 
 
 @inner
-def search(queries: Array, points: Array, found: Array) -> None:
+def search(queries: Array, points: Array, neighbors: Array) -> None:
     """`knn.nearest_points` of queries (n, 2) among points (m, 2) -> found (n, count); -1 for no more points.
 
     Squared distances in float64, ties by index, exactly as an exhaustive search finds them.
     Node j of depth d holds the places from (j m) >> d on in an order of the points, its box and their lowest index.
     """
     m = len(points)
-    found[:] = -1
+    neighbors[:] = -1
     if m == 0:
         return
     depth = 0
@@ -31,7 +31,7 @@ def search(queries: Array, points: Array, found: Array) -> None:
         depth += 1
     order = _order(points, depth)
     boxes, lowest = _boxes(points, order, depth)
-    stack, distances = np.empty((depth + 2, 3), np.int64), np.empty(found.shape[1])
+    stack, distances = np.empty((depth + 2, 3), np.int64), np.empty(neighbors.shape[1])
     bounds = vector(depth + 2)
     for i in range(len(queries)):
         x, y = queries[i, 0], queries[i, 1]
@@ -43,7 +43,7 @@ def search(queries: Array, points: Array, found: Array) -> None:
             d, j, bound = stack[height, 0], stack[height, 1], bounds[height]
             if filled == len(distances):
                 last = distances[filled - 1]
-                if bound > last or (bound == last and lowest[(1 << d) + j] > found[i, filled - 1]):
+                if bound > last or (bound == last and lowest[(1 << d) + j] > neighbors[i, filled - 1]):
                     continue
             if d < depth:
                 node = (2 << d) + 2 * j
@@ -56,22 +56,22 @@ def search(queries: Array, points: Array, found: Array) -> None:
             for place in range((j * m) >> d, ((j + 1) * m) >> d):
                 index = order[place]
                 dx, dy = points[index, 0] - x, points[index, 1] - y
-                filled = _insert(dx * dx + dy * dy, index, distances, found[i], filled)
+                filled = _insert(dx * dx + dy * dy, index, distances, neighbors[i], filled)
 
 
 @inner
-def _insert(squared: float, index: int, distances: Array, found: Array, filled: int) -> int:
+def _insert(squared: float, index: int, distances: Array, neighbors: Array, filled: int) -> int:
     """Inserts a point among the nearest so far, sorted by (distance, index); their number."""
     k = filled
-    if k == len(found):
+    if k == len(neighbors):
         k -= 1
-        if squared > distances[k] or (squared == distances[k] and index > found[k]):
+        if squared > distances[k] or (squared == distances[k] and index > neighbors[k]):
             return filled
-    while k > 0 and (squared < distances[k - 1] or (squared == distances[k - 1] and index < found[k - 1])):
-        distances[k], found[k] = distances[k - 1], found[k - 1]
+    while k > 0 and (squared < distances[k - 1] or (squared == distances[k - 1] and index < neighbors[k - 1])):
+        distances[k], neighbors[k] = distances[k - 1], neighbors[k - 1]
         k -= 1
-    distances[k], found[k] = squared, index
-    return min(filled + 1, len(found))
+    distances[k], neighbors[k] = squared, index
+    return min(filled + 1, len(neighbors))
 
 
 @inner

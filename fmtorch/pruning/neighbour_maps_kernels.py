@@ -24,14 +24,14 @@ def neighbour_maps(x0: F8x2, x1: F8x2, out: F8x3) -> None:
     neighbours agree, the first of equals, it is the least-squares similarity of these.
     """
     n = len(x0)
-    found = np.empty((n, min(NEIGHBOURS + 1, n)), np.int64)
-    search(x0, x0, found)
+    neighbors = np.empty((n, min(NEIGHBOURS + 1, n)), np.int64)
+    search(x0, x0, neighbors)
     u, v, p, q = vector(NEIGHBOURS + 1), vector(NEIGHBOURS + 1), vector(NEIGHBOURS + 1), vector(NEIGHBOURS + 1)
     r = vector(NEIGHBOURS + 1)
     for i in range(n):
         out[i] = math.nan
         count = 0
-        for j in found[i]:
+        for j in neighbors[i]:
             dx, dy = x0[j, 0] - x0[i, 0], x0[j, 1] - x0[i, 1]
             if dx * dx + dy * dy > 0.0:
                 u[count], v[count], p[count], q[count] = dx, dy, x1[j, 0] - x1[i, 0], x1[j, 1] - x1[i, 1]

@@ -22,6 +22,7 @@ from fmtorch.pruning.agreement import (
     MIN_VOTE32,
     MIN_VOTES32,
     NOISE32,
+    ONE32,
     SHARPNESS32,
     TWO_TANGENT32,
     WINDOW,
@@ -136,15 +137,15 @@ def _turn(x: Any, y: Any) -> int:
 @inner
 def _positions_agree(along: Array, k: int, similarity: Array, agree: Array) -> None:
     """How well matches i and i + k agree -> agree[i]."""
-    noise, sharpness, tiny, one = NOISE32, SHARPNESS32, MIN_SQUARE32, along.dtype.type(1)
+    noise, sharpness, tiny = NOISE32, SHARPNESS32, MIN_SQUARE32
     a, b, scale = similarity[0], similarity[1], similarity[2]
     X0, Y0, X1, Y1 = along[0], along[1], along[2], along[3]
     for i in range(along.shape[1] - k):
         dx, dy, ux, uy = X0[i + k] - X0[i], Y0[i + k] - Y0[i], X1[i + k] - X1[i], Y1[i + k] - Y1[i]
         p, q = a * dx - b * dy - ux, b * dx + a * dy - uy
         length = scale * math.sqrt(dx * dx + dy * dy + tiny) + math.sqrt(ux * ux + uy * uy + tiny) + noise
-        t = one + (p * p + q * q) / (length * length) * sharpness
+        t = ONE32 + (p * p + q * q) / (length * length) * sharpness
         t = t * t
         t = t * t
         t = t * t
-        agree[i] = one / t
+        agree[i] = ONE32 / t

@@ -57,10 +57,10 @@ def learned(part: object) -> list[str]:
     None for a part that does not say what defines it, or whose file cannot be read: it tells so itself when used.
     """
     try:
-        whole = _plain(part, code=False)
+        described = _plain(part, code=False)
     except (TypeError, OSError):
         return []
-    return sorted(set(_learned(whole)))
+    return sorted(set(_learned(described)))
 
 
 def _learned(value: Any) -> Iterator[str]:

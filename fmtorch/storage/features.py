@@ -40,7 +40,7 @@ class CachedFeatures:
     def __init__(self, extractor: FeatureExtractor, cache: ArrayCache) -> None:
         self.extractor, self.cache = extractor, cache
         name = type(extractor).__name__
-        self._whole = self._section(name, extractor)
+        self._extraction = self._section(name, extractor)
         self._detection = ""
         if isinstance(extractor, TwoStepExtractor):
             self._detection = self._section("detection", extractor.detection)
@@ -58,11 +58,11 @@ class CachedFeatures:
         if isinstance(extractor, TwoStepExtractor):
             frames = self._kept(self._detection, digest, lambda: _named(("lafs", "scores"), extractor.detect(image)))
             lafs = frames.tensors["lafs"]
-            described = self._kept(self._whole, digest, lambda: {"descriptors": extractor.describe(image, lafs)})
+            described = self._kept(self._extraction, digest, lambda: {"descriptors": extractor.describe(image, lafs)})
             steps = [frames, described]
             size = {"image_size": torch.tensor(image.shape[:2], dtype=torch.int64)}
         else:
-            steps, size = [self._kept(self._whole, digest, lambda: _fields(extractor(image)))], {}
+            steps, size = [self._kept(self._extraction, digest, lambda: _fields(extractor(image)))], {}
         with self._lock:
             computed = any(step.computed for step in steps)
             self.computed, self.found = self.computed + computed, self.found + (not computed)

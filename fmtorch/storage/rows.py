@@ -134,8 +134,8 @@ def _expect_homography(row: PairRow) -> None:
             f"pair {row.pair!r} has a homography: it needs a corner error of at least 0, NSGD NaN and no F, but has "
             f"corner_error={error}, nsgd={row.nsgd}, F={row.F}"
         )
-    found = H is not None and len(H) == 9 and all(map(math.isfinite, H))
-    if row.ok != found or row.ok == bool(row.reason) or (not row.ok and math.isfinite(error)):
+    has_homography = H is not None and len(H) == 9 and all(map(math.isfinite, H))
+    if row.ok != has_homography or row.ok == bool(row.reason) or (not row.ok and math.isfinite(error)):
         raise ValueError(
             f"pair {row.pair!r} has a homography: it needs nine finite numbers of H and no reason, or a reason, no H "
             f"and an infinite corner error, but has H={H}, reason={row.reason!r}, corner_error={error}"

@@ -78,7 +78,7 @@ class RunFolder:
         if not (path / "run.json").exists():
             if foreign:
                 raise RunFolderError(
-                    f"{path} is not empty and has no run.json, so it is no run folder (it holds {_some(foreign)}); "
+                    f"{path} is not empty and has no run.json, so it is no run folder (it holds {_head(foreign)}); "
                     "choose another run_dir"
                 )
             _claim(path / "run.json", wanted)
@@ -91,7 +91,7 @@ class RunFolder:
             )
         if folder.identity != identity_digest(wanted):
             raise RunFolderError(
-                f"{path} holds another run; what differs (there -> now): {_some(_differences(folder.config, wanted))}. "
+                f"{path} holds another run; what differs (there -> now): {_head(_differences(folder.config, wanted))}. "
                 "Choose another run_dir, or delete the folder"
             )
         (path / "pairs").mkdir(exist_ok=True)
@@ -244,7 +244,7 @@ def leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
         yield name, json.dumps(value, sort_keys=True)
 
 
-def _some(items: Sequence[str]) -> str:
+def _head(items: Sequence[str]) -> str:
     """The first few items, and how many more there are."""
     more = len(items) - _SHOWN
     return "; ".join(items[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")

@@ -95,7 +95,7 @@ def measure(solvers: dict[str, Solver], items: list[Item], seeds: int, kept: Kep
     """
     done = kept.by("pair", "seed", "method", "identity", "matches")
     made_with = {text: (text, identity(text), matches) for text in solvers}
-    found: Measured = {text: [] for text in solvers}
+    rows: Measured = {text: [] for text in solvers}
     started = set[str]()
     turns = [(seed, item) for seed in range(seeds) for item in items]
     for seed, (pair, c) in track(turns, "estimating", console=console, transient=True):
@@ -112,9 +112,9 @@ def measure(solvers: dict[str, Solver], items: list[Item], seeds: int, kept: Kep
                 row = judge(solve, (pair, c), given, seed)
                 row |= dict(zip(("method", "identity", "matches"), made_with[text], strict=True))
                 new.append(row)
-            found[text].append(row)
+            rows[text].append(row)
         kept.add(new)
-    return found
+    return rows
 
 
 def judge(solve: Solver, item: Item, given: Knowledge, seed: int) -> Row:

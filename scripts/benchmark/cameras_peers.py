@@ -135,11 +135,13 @@ def _colmap(x: Points, given: Knowledge, seed: int, *, threshold: float = 4.0) -
         colmap.Camera(usual[i] if K is None else K, K is not None, 1 if given.one_camera else i + 1)
         for i, K in enumerate((given.K0, given.K1))
     ]
-    found = colmap.two_view_geometry(*x, (cameras[0], cameras[1]), colmap.two_view_options(threshold, seed))
-    if found.R is None or found.K0 is None or found.K1 is None:
-        return answer(found.F, given, x, found.inliers)
+    geometry = colmap.two_view_geometry(*x, (cameras[0], cameras[1]), colmap.two_view_options(threshold, seed))
+    if geometry.R is None or geometry.K0 is None or geometry.K1 is None:
+        return answer(geometry.F, given, x, geometry.inliers)
     exact = given.K0 is not None and given.K1 is not None
-    return Answer(found.F, found.R, found.t, None if exact else np.array([found.K0[0, 0], found.K1[0, 0]]))
+    return Answer(
+        geometry.F, geometry.R, geometry.t, None if exact else np.array([geometry.K0[0, 0], geometry.K1[0, 0]])
+    )
 
 
 def _colmap_f(x: Points, given: Knowledge, seed: int, *, threshold: float = 4.0) -> Answer:
@@ -182,9 +184,11 @@ def _superansac(
     settings.inlier_threshold, settings.confidence = threshold, 0.9999
     settings.min_iterations, settings.max_iterations = min(1000, iterations), iterations
     sizes = [float(2 * v) for K in (K0, K1) for v in K[:2, 2]]
-    E, found, _, _ = library.estimateEssentialMatrix(np.ascontiguousarray(np.hstack(x)), K0, K1, sizes, config=settings)
+    E, indices, _, _ = library.estimateEssentialMatrix(
+        np.ascontiguousarray(np.hstack(x)), K0, K1, sizes, config=settings
+    )
     inliers = np.zeros(len(x[0]), np.bool_)
-    inliers[found] = True
+    inliers[indices] = True
     return _of_essential(np.asarray(E), inliers, x, given)
 
 

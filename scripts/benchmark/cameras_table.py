@@ -31,27 +31,29 @@ def figures(rows: dict[str, list[Row]], pairs: Sequence[ImagePair]) -> Figures:
     ahead_*: what our own method of the level, or else the first of it, has more, with its 95 % interval. ms_ratio: the
     median over pairs of the time relative to that method's.
     """
-    found: Figures = {}
+    values: Figures = {}
     first: dict[str, str] = {}
     for method in sorted(rows, key=lambda method: read(method).name != OURS):
         first.setdefault(read(method).level, method)
     by_method = {method: _by_pair(own) for method, own in rows.items()}
     for method, by_pair in by_method.items():
         reference = by_method[first[read(method).level]]
-        found[method] = {}
+        values[method] = {}
         for group, inside in groups(list(pairs)).items():
-            some = [pair for pair, one in zip(pairs, inside, strict=True) if one and pair.identity in by_pair]
-            if some:
-                found[method][group] = _figures(by_pair, reference, some)
-    return found
+            group_pairs = [
+                pair for pair, member in zip(pairs, inside, strict=True) if member and pair.identity in by_pair
+            ]
+            if group_pairs:
+                values[method][group] = _figures(by_pair, reference, group_pairs)
+    return values
 
 
 def _by_pair(rows: Sequence[Row]) -> dict[str, list[Row]]:
     """The rows of each pair, one a seed."""
-    found: dict[str, list[Row]] = {}
+    by_pair: dict[str, list[Row]] = {}
     for row in rows:
-        found.setdefault(row["pair"], []).append(row)
-    return found
+        by_pair.setdefault(row["pair"], []).append(row)
+    return by_pair
 
 
 def _figures(own: dict[str, list[Row]], first: dict[str, list[Row]], pairs: Sequence[ImagePair]) -> dict[str, Any]:
@@ -95,11 +97,11 @@ def _accuracy(rows: dict[str, list[Row]], names: Sequence[str], threshold: float
 
 def sheets(figures: Figures, pairs: Sequence[ImagePair], seeds: int) -> list[Sheet]:
     """A table for each level of knowledge, then pose and focal lengths of each set of pairs."""
-    whole = groups(list(pairs))
-    shown = [group for group in BASELINES if group in whole] or [list(whole)[-1]]
+    all_groups = groups(list(pairs))
+    shown = [group for group in BASELINES if group in all_groups] or [list(all_groups)[-1]]
     used = {read(method).level for method in figures}
     levels = [_level(figures, level, shown) for level in LEVELS if level in used]
-    families = [group for group in whole if group not in (*BASELINES, "all")]
+    families = [group for group in all_groups if group not in (*BASELINES, "all")]
     focals = [method for method, own in figures.items() if any(f["focal_5"] is not None for f in own.values())]
     return [
         *levels,
@@ -168,7 +170,7 @@ def write(path: Path, marker: str, figures: Figures, pairs: Sequence[ImagePair],
     inside = groups(list(pairs))
     names = [group for group in (*BASELINES, "all") if group in inside]
     places = "; ".join(
-        f"{group}: {described([scene for scene, one in zip(scenes(list(pairs)), inside[group], strict=True) if one])}"
+        f"{group}: {described([s for s, member in zip(scenes(list(pairs)), inside[group], strict=True) if member])}"
         for group in names
     )
     note = (

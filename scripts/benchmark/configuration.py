@@ -138,8 +138,8 @@ def _colmap(threshold: float) -> Verdict:
             colmap.Camera(K[0].double().numpy(), number=i, size=(int(size[0, 0]), int(size[0, 1])))
             for i, (K, size) in enumerate(((c.K0, c.size0), (c.K1, c.size1)))
         )
-        found = colmap.two_view_geometry(x0, x1, (first, second), colmap.two_view_options(threshold, seed))
-        return COLMAP[found.configuration]
+        geometry = colmap.two_view_geometry(x0, x1, (first, second), colmap.two_view_options(threshold, seed))
+        return COLMAP[geometry.configuration]
 
     return verdict
 

@@ -93,7 +93,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def read(path: Path) -> list[Curve]:
     """The curves of a file. Raises SystemExit for a line without three parts, naming it."""
-    found = []
+    curves = []
     for number, line in enumerate(path.read_text().splitlines(), 1):
         text = line.partition("#")[0].strip()
         if not text:
@@ -102,20 +102,20 @@ def read(path: Path) -> list[Curve]:
         if len(parts) != 3 or "{}" not in parts[1] or not parts[2]:
             raise SystemExit(f"{path}:{number}: {text!r} is not CURVE | ESTIMATOR with {{}} | VALUES")
         name, spec, values = parts[0], parts[1], tuple(parts[2].split())
-        found.append(Curve(name, tuple(spec.replace("{}", value) for value in values), values))
-    return found
+        curves.append(Curve(name, tuple(spec.replace("{}", value) for value in values), values))
+    return curves
 
 
 def summaries(results: dict[str, Result], pairs: list[ImagePair]) -> dict[str, dict[str, dict[str, float]]]:
     """Group of pairs -> estimator -> recall and AUC@0.05 in percent, milliseconds (median, mean)."""
-    found: dict[str, dict[str, dict[str, float]]] = {}
+    by_group: dict[str, dict[str, dict[str, float]]] = {}
     for group, inside in groups(pairs).items():
-        found[group] = {}
+        by_group[group] = {}
         for spec, result in results.items():
             nsgd, ms = result["nsgd"][:, inside], result["ms"][:, inside]
             own = {name: PERCENT * float(values(nsgd).mean()) for name, values in MERITS.items()}
-            found[group][spec] = own | {"ms_median": float(np.median(ms)), "ms_mean": float(ms.mean())}
-    return found
+            by_group[group][spec] = own | {"ms_median": float(np.median(ms)), "ms_mean": float(ms.mean())}
+    return by_group
 
 
 def knee(curve: Curve, figures: dict[str, dict[str, dict[str, float]]]) -> str:
@@ -131,8 +131,8 @@ def table(
     curves: list[Curve], figures: dict[str, dict[str, dict[str, float]]], knees: dict[str, str], seeds: int
 ) -> str:
     """A row for each point: time, and recall at 0.05 / at 0.01 / AUC@0.05 of wide and of short baselines."""
-    whole = list(figures)[-1]
-    shown = [group for group in figures if group.endswith("baselines")] or [whole]
+    overall = list(figures)[-1]
+    shown = [group for group in figures if group.endswith("baselines")] or [overall]
     lines = [
         "Median milliseconds of processor time over all pairs, and R.05 / R.01 / AUC@0.05 in %; "
         f"{seeds} {'seed' if seeds == 1 else 'seeds'}. "
@@ -143,7 +143,7 @@ def table(
     ]
     for curve in curves:
         for i, (spec, value) in enumerate(zip(curve.specs, curve.values, strict=True)):
-            cells = [value, f"{figures[whole][spec]['ms_median']:.1f}"]
+            cells = [value, f"{figures[overall][spec]['ms_median']:.1f}"]
             cells += [" / ".join(f"{figures[group][spec][name]:.1f}" for name in MERITS) for group in shown]
             if knees.get(curve.name) == spec:
                 cells = [f"**{cell}**" for cell in cells]

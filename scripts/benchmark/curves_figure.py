@@ -21,8 +21,8 @@ _COLOURS = (
 
 def figure(curves: Mapping[str, Sequence[str]], figures: Figures, knees: Mapping[str, str]) -> str:
     """A panel for wide and one for short baselines, or one for all. curves: name -> estimators. knees: name -> one."""
-    whole = list(figures)[-1]
-    shown = [group for group in figures if group.endswith("baselines")] or [whole]
+    overall = list(figures)[-1]
+    shown = [group for group in figures if group.endswith("baselines")] or [overall]
     width = _WIDTH * len(shown) + _LEGEND
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {_HEIGHT}" width="{width}" height="{_HEIGHT}" '

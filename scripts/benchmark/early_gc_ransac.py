@@ -72,8 +72,8 @@ class EarlyGCRansac:
         while rising:
             rising, inliers = False, np.flatnonzero(best)
             for _ in range(LOCAL_SAMPLES):
-                some = random.choice(inliers, min(LOCAL_SAMPLE, len(inliers)), replace=False)
-                inside = residuals(eight_point(points[some]), points) < self.within
+                subset = random.choice(inliers, min(LOCAL_SAMPLE, len(inliers)), replace=False)
+                inside = residuals(eight_point(points[subset]), points) < self.within
                 if inside.sum() > best.sum():
                     best, rising = inside, True
         return best
@@ -88,8 +88,8 @@ class EarlyGCRansac:
 
 def residuals(F: Single, points: Single) -> Single:
     """Mean of the two distances to the epipolar lines, px, (n,)."""
-    one = np.ones((len(points), 1), np.float32)
-    x0, x1 = np.hstack([points[:, :2], one]), np.hstack([points[:, 2:], one])
+    ones = np.ones((len(points), 1), np.float32)
+    x0, x1 = np.hstack([points[:, :2], ones]), np.hstack([points[:, 2:], ones])
     line1, line0 = x0 @ F.T, x1 @ F
     with np.errstate(all="ignore"):
         per_length = 1 / np.hypot(*line0[:, :2].T) + 1 / np.hypot(*line1[:, :2].T)
@@ -116,7 +116,7 @@ def seven_point(points: Single) -> list[Single]:
 def _eigenvectors(points: Single) -> Single:
     """Those of A^T A, (9, 9), rows by falling eigenvalue; A has a row x1 y0 ... a match."""
     x0, y0, x1, y1 = points.T
-    one = np.ones_like(x0)
-    A = np.stack([x1 * x0, x1 * y0, x1, y1 * x0, y1 * y0, y1, x0, y0, one], 1)
+    ones = np.ones_like(x0)
+    A = np.stack([x1 * x0, x1 * y0, x1, y1 * x0, y1 * y0, y1, x0, y0, ones], 1)
     vectors: Single = np.asarray(cv2.eigen(A.T @ A)[2], np.float32)
     return vectors

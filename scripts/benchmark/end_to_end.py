@@ -117,9 +117,9 @@ def opencv(method: int, threshold: float) -> Peer:
         clock, sift = Clock(), cv2.SIFT.create(8000)
         (k0, d0), (k1, d1) = (sift.detectAndCompute(to_grey(image), None) for image in (image0, image1))
         clock.stage("features")
-        found = cv2.BFMatcher(cv2.NORM_L2).knnMatch(d0, d1, 2)
+        neighbors = cv2.BFMatcher(cv2.NORM_L2).knnMatch(d0, d1, 2)
         clock.stage("matching")
-        kept = [two[0] for two in found if len(two) == 2 and two[0].distance < RATIO * two[1].distance]
+        kept = [two[0] for two in neighbors if len(two) == 2 and two[0].distance < RATIO * two[1].distance]
         x0 = np.array([k0[match.queryIdx].pt for match in kept], np.float64)
         x1 = np.array([k1[match.trainIdx].pt for match in kept], np.float64)
         clock.stage("pruning")
@@ -133,13 +133,13 @@ def opencv(method: int, threshold: float) -> Peer:
 
 def kornia(image0: Image, image1: Image, features: int) -> Seconds:
     """kornia's HesAffNet and matcher with the ratio test, OpenCV's LMedS."""
-    whole = kornia_hesaffnet(features)
+    hesaffnet = kornia_hesaffnet(features)
     clock = Clock()
-    found = [whole(torch.from_numpy(to_grey(image))[None, None].float() / 255) for image in (image0, image1)]
+    extracted = [hesaffnet(torch.from_numpy(to_grey(image))[None, None].float() / 255) for image in (image0, image1)]
     clock.stage("features")
-    _, matches = KF.match_snn(found[0][2][0], found[1][2][0], RATIO)
+    _, matches = KF.match_snn(extracted[0][2][0], extracted[1][2][0], RATIO)
     clock.stage("matching")
-    x0, x1 = (found[i][0][0, matches[:, i], :, 2].double().numpy() for i in (0, 1))
+    x0, x1 = (extracted[i][0][0, matches[:, i], :, 2].double().numpy() for i in (0, 1))
     clock.stage("pruning")
     if len(matches) >= 8:
         cv2.findFundamentalMat(x0, x1, cv2.FM_LMEDS, 1.0, 0.9999, 10000)

@@ -75,7 +75,7 @@ def run(arguments: argparse.Namespace) -> None:
     pairs = [pair for pair, _ in items]
     figures = {group: summaries(results, pairs, inside) for group, inside in groups(pairs).items()}
     for group, inside in groups(pairs).items():
-        place = described([scene for scene, one in zip(matched.scenes(pairs), inside, strict=True) if one])
+        place = described([scene for scene, member in zip(matched.scenes(pairs), inside, strict=True) if member])
         table.report(f"{group}: {place}; {arguments.seeds} seeds", figures[group])
     if arguments.baseline:
         table.compare(figures, baseline(arguments.baseline))
@@ -119,7 +119,7 @@ def measure(
     known = kept.by("pair", "seed", "method", "identity", "matches")
     methods = {spec: informed(spec, extra) for spec in specs}
     made_with = {spec: (spec, identity(spec, extra), matches) for spec in specs}
-    found: dict[str, dict[tuple[int, int], Row]] = {spec: {} for spec in specs}
+    measured: dict[str, dict[tuple[int, int], Row]] = {spec: {} for spec in specs}
     todo: dict[tuple[int, int], dict[str, Method]] = {}
     for seed in range(seeds):
         for i, (pair, _) in enumerate(items):
@@ -128,16 +128,16 @@ def measure(
                 if row is None:
                     todo.setdefault((seed, i), {})[spec] = method
                 else:
-                    found[spec][seed, i] = row
-    for spec in dict.fromkeys(spec for some in todo.values() for spec in some):
+                    measured[spec][seed, i] = row
+    for spec in dict.fromkeys(spec for missing in todo.values() for spec in missing):
         methods[spec](*items[0], 0)  # not counted: lazy initialisation
-    for (seed, i), some in track(todo.items(), "estimating", console=console, transient=True):
-        new = {spec: _row(method, items[i], seed) for spec, method in some.items()}
+    for (seed, i), missing in track(todo.items(), "estimating", console=console, transient=True):
+        new = {spec: _row(method, items[i], seed) for spec, method in missing.items()}
         for spec, row in new.items():
             row |= dict(zip(("method", "identity", "matches"), made_with[spec], strict=True))
-            found[spec][seed, i] = row
+            measured[spec][seed, i] = row
         kept.add(list(new.values()))
-    return {spec: _result(rows, (seeds, len(items))) for spec, rows in found.items()}
+    return {spec: _result(rows, (seeds, len(items))) for spec, rows in measured.items()}
 
 
 def _row(method: Method, item: Item, seed: int) -> Row:
@@ -168,19 +168,19 @@ def summaries(results: dict[str, Result], pairs: list[ImagePair], inside: NDArra
     None where the pairs are too few for one. interval_over: its units, scenes or, of fewer than five scenes, pairs.
     """
     first = {key: value[:, inside] for key, value in next(iter(results.values())).items()}
-    scenes = [scene for scene, one in zip(matched.scenes(pairs), inside, strict=True) if one]
-    found: table.Figures = {}
+    scenes = [scene for scene, member in zip(matched.scenes(pairs), inside, strict=True) if member]
+    figures: table.Figures = {}
     for spec, result in results.items():
         nsgd, ms = result["nsgd"][:, inside], result["ms"][:, inside]
-        found[spec] = {name: PERCENT * float(values(nsgd).mean()) for name, values in MERITS.items()}
+        figures[spec] = {name: PERCENT * float(values(nsgd).mean()) for name, values in MERITS.items()}
         for name in ("recall_01", "auc_05"):
             own, other = MERITS[name](first["nsgd"]), MERITS[name](nsgd)
             ahead = difference(own, other, scenes, PERCENT, share=name in SHARES)
-            found[spec][f"ahead_{name}"] = None if ahead is None else [ahead.value, ahead.low, ahead.high]
-        found[spec]["interval_over"] = unit(scenes)
-        found[spec] |= {
+            figures[spec][f"ahead_{name}"] = None if ahead is None else [ahead.value, ahead.low, ahead.high]
+        figures[spec]["interval_over"] = unit(scenes)
+        figures[spec] |= {
             "ms_median": float(np.median(ms)),
             "ms_mean": float(ms.mean()),
             "ms_ratio": float(np.median(ms.mean(0) / first["ms"].mean(0))),
         }
-    return found
+    return figures

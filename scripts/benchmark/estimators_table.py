@@ -23,8 +23,8 @@ def ahead(figures: Figures, spec: str) -> list[str]:
     """What the first has more in recall at 0.01 and in AUC@0.05, with intervals; empty for the first itself."""
     if spec == next(iter(figures)):
         return ["", ""]
-    found = (figures[spec][key] for key in ("ahead_recall_01", "ahead_auc_05"))
-    return ["n too small" if i is None else "{:+.1f} [{:+.1f}, {:+.1f}]".format(*i) for i in found]
+    leads = (figures[spec][key] for key in ("ahead_recall_01", "ahead_auc_05"))
+    return ["n too small" if i is None else "{:+.1f} [{:+.1f}, {:+.1f}]".format(*i) for i in leads]
 
 
 def cells(figures: Figures, spec: str) -> list[str]:
@@ -56,9 +56,9 @@ def recall_table(figures: Groups, pairs: list[ImagePair], seeds: int) -> str:
     shown = [group for group in figures if group != "all" and not group.endswith("baselines")]
     head = ["estimator", *(f"{group} ({counts[group]})" for group in shown)]
     lines = [f"| {' | '.join([*head, 'ms'])} |", f"| --- {'| ---: ' * (len(head))}|"]
-    for spec, whole in figures[list(figures)[-1]].items():
+    for spec, overall in figures[list(figures)[-1]].items():
         own = [recalls(figures[group][spec]) for group in shown]
-        lines.append(f"| `{spec}` | {' | '.join(own)} | {whole['ms_median']:.1f} |")
+        lines.append(f"| `{spec}` | {' | '.join(own)} | {overall['ms_median']:.1f} |")
     note = (
         "Recall at NSGD 0.05 / at 0.01 / AUC@0.05 (area under the recall curve to NSGD 0.05), in %; pairs in brackets; "
         f"mean of {seeds} seeds; median milliseconds of processor time a pair over all, one thread."
@@ -75,14 +75,14 @@ def difference_table(figures: Groups, pairs: list[ImagePair], seeds: int) -> str
     for group in shown:
         head += [f"{group} ({counts[group]})", "lead, R.01", "lead, AUC@0.05"]
     lines = [f"| {' | '.join([*head, 'time'])} |", f"| --- {'| ---: ' * (len(head))}|"]
-    for spec, whole in figures[list(figures)[-1]].items():
+    for spec, overall in figures[list(figures)[-1]].items():
         cell = [f"`{spec}`"]
         for group in shown:
             cell += [recalls(figures[group][spec]), *ahead(figures[group], spec)]
-        lines.append(f"| {' | '.join(cell)} | {whole['ms_ratio']:.2f} |")
+        lines.append(f"| {' | '.join(cell)} | {overall['ms_ratio']:.2f} |")
     inside = groups(pairs)
     places = [
-        f"{group}, {described([scene for scene, one in zip(scenes(pairs), inside[group], strict=True) if one])}"
+        f"{group}, {described([scene for scene, member in zip(scenes(pairs), inside[group], strict=True) if member])}"
         for group in shown
     ]
     note = (
@@ -107,7 +107,7 @@ def replaced(path: Path, name: str, text: str) -> bool:
     """Whether there are lines ``<!-- name -->`` and ``<!-- end name -->``; what stands between becomes the text."""
     pattern = re.compile(rf"(<!-- {name} -->\n).*?(<!-- end {name} -->)", re.DOTALL)
     content = path.read_text()
-    path.write_text(pattern.sub(lambda found: f"{found[1]}{text}\n{found[2]}", content))
+    path.write_text(pattern.sub(lambda match: f"{match[1]}{text}\n{match[2]}", content))
     return bool(pattern.search(content))
 
 

@@ -80,11 +80,11 @@ def run(arguments: argparse.Namespace) -> None:
         console.print(f"{w} x {h}, {len(lafs)} features; CPU ms, medians of {arguments.repeats}")
         for step, runs in steps.items():
             medians, ratio = _compare(runs, arguments.repeats)
-            told = ", ".join(f"{name} {ms:.0f}" for name, ms in medians.items())
-            console.print(f"{step}: {told}" + ("" if ratio is None else f"; {ratio:.1f} times faster than kornia"))
+            summary = ", ".join(f"{name} {ms:.0f}" for name, ms in medians.items())
+            console.print(f"{step}: {summary}" + ("" if ratio is None else f"; {ratio:.1f} times faster than kornia"))
         if arguments.networks is None:
-            told = ", ".join(f"{k} {_right_matches(f, image)}" for k, f in ((OURS, own), ("kornia", peer)))
-            console.print(f"right matches with a view turned by 20 degrees, the same random networks: {told}")
+            summary = ", ".join(f"{k} {_right_matches(f, image)}" for k, f in ((OURS, own), ("kornia", peer)))
+            console.print(f"right matches with a view turned by 20 degrees, the same random networks: {summary}")
 
 
 def _compare(runs: dict[str, Callable[[], object]], repeats: int) -> tuple[dict[str, float], float | None]:
@@ -133,10 +133,10 @@ def _hesaffnet(n: int, folder: Path, random: bool) -> tuple[Callable[..., Featur
         orientation="dominant_gradient",
         max_features=n,
     )
-    whole = kornia_hesaffnet(n, affine, hardnet)
+    extractor = kornia_hesaffnet(n, affine, hardnet)
 
     def peer(image: np.ndarray) -> Features:
-        lafs, responses, descriptors = whole(torch.from_numpy(image)[None, None].float() / 255)
+        lafs, responses, descriptors = extractor(torch.from_numpy(image)[None, None].float() / 255)
         return Features(lafs[0], responses[0], descriptors[0], torch.tensor(image.shape))
 
     return own, peer

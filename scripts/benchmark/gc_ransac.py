@@ -49,26 +49,28 @@ def add_arguments(commands: Any) -> None:
 
 def variants() -> dict[str, Estimator]:
     """The estimators that are compared, by what the table calls them."""
-    found: dict[str, Estimator] = {}
+    estimators: dict[str, Estimator] = {}
     for threshold in (0.31, 2.0, 3.0):
         options = article(threshold)
-        found[f"`paper/gc_ransac` as in the article, {threshold:g} px"] = build(
+        estimators[f"`paper/gc_ransac` as in the article, {threshold:g} px"] = build(
             "estimator", "paper/gc_ransac", **options
         )
-    found["`paper/gc_ransac`, MSAC's score"] = build("estimator", "paper/gc_ransac", score="msac")
-    found["`paper/gc_ransac`"] = build("estimator", "paper/gc_ransac")
+    estimators["`paper/gc_ransac`, MSAC's score"] = build("estimator", "paper/gc_ransac", score="msac")
+    estimators["`paper/gc_ransac`"] = build("estimator", "paper/gc_ransac")
     for release, factor in (("next", NEXT), ("first", FIRST)):
         for source, (threshold, confidence) in (("article", ARTICLE), ("example", EXAMPLE)):
             within = factor * threshold
             for normalized in (False, True) if source == "example" else (False,):
                 fit = ", normalised last fit" if normalized else ""
                 name = f"{release} release, t of the {source}: below {within:.2f} px{fit}"
-                found[name] = EarlyGCRansac(within, confidence, normalized=normalized).estimator()
-    found["`paper/lmeds`"] = build("estimator", "paper/lmeds")
+                estimators[name] = EarlyGCRansac(within, confidence, normalized=normalized).estimator()
+    estimators["`paper/lmeds`"] = build("estimator", "paper/lmeds")
     coarse = {**load("estimator", "paper/cf_ransac")["coarse"], **article(ARTICLE[0])}
-    found["`paper/cf_ransac`, coarse stage as in the article"] = build("estimator", "paper/cf_ransac", coarse=coarse)
-    found["`paper/cf_ransac`"] = build("estimator", "paper/cf_ransac")
-    return found
+    estimators["`paper/cf_ransac`, coarse stage as in the article"] = build(
+        "estimator", "paper/cf_ransac", coarse=coarse
+    )
+    estimators["`paper/cf_ransac`"] = build("estimator", "paper/cf_ransac")
+    return estimators
 
 
 def article(threshold: float) -> dict[str, Any]:

@@ -125,11 +125,14 @@ def _family(family: str, rows: list[Row], passing: dict[str, bool]) -> Sheet:
         cells = [
             shown(interval(recall, scenes_of(own), PERCENT, share=True), ".1f"),
             shown(interval(areas(nsgd), scenes_of(own), PERCENT), ".1f"),
-            *(f"{PERCENT * recall[some].mean():.1f}" if some.any() else MISSING for some in (apart, ~apart)),
+            *(
+                f"{PERCENT * recall[selected].mean():.1f}" if selected.any() else MISSING
+                for selected in (apart, ~apart)
+            ),
             f"{np.nanmean(solved_means(own, 'corrs_before')):.0f}",
         ]
-        some = "" if len(own) == len(pairs) else f", {len(own)} pairs"
-        lines.append([f"`{method}`{some}", *cells, failed(own)])
+        note = "" if len(own) == len(pairs) else f", {len(own)} pairs"
+        lines.append([f"`{method}`{note}", *cells, failed(own)])
     heads = ["", "%Recall", "AUC@0.05", "%Recall, selected", "%Recall, left out", "#Corrs-m", "failed"]
     return Sheet(title, heads, lines)
 

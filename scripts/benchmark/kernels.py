@@ -76,7 +76,7 @@ def framed(c: Correspondences) -> Correspondences:
 
 def pruning(c: Correspondences) -> None:
     """Pruners as stages."""
-    whole(PRUNERS, c)
+    time_stages(PRUNERS, c)
 
 
 def estimators(c: Correspondences) -> None:
@@ -85,7 +85,7 @@ def estimators(c: Correspondences) -> None:
         line(name, functools.partial(presets.build("estimator", name), c), None)
 
 
-def whole(names: Sequence[str], c: Correspondences) -> None:
+def time_stages(names: Sequence[str], c: Correspondences) -> None:
     """Pruners, called with kernels and without."""
     for name in names:
         stage = pruner(name)

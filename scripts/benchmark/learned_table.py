@@ -68,9 +68,9 @@ def _groups(present: list[str]) -> dict[str, list[str]]:
     groups: dict[str, list[str]] = {}
     for kind in ("real", "rendered"):
         for name, members in (("wide", WIDE), ("short", SHORT)):
-            some = [f for f in families if members.get(f) == kind]
-            if len(some) > 1:
-                groups[f"{kind.capitalize()}, {name} baselines ({', '.join(some)})"] = some
+            same_kind = [f for f in families if members.get(f) == kind]
+            if len(same_kind) > 1:
+                groups[f"{kind.capitalize()}, {name} baselines ({', '.join(same_kind)})"] = same_kind
     return groups | {family: [family] for family in families}
 
 
@@ -86,13 +86,13 @@ def _sheet(title: str, features: str, use: str, rows: list[Row]) -> Sheet:
         own = [row for row in rows if row["method"] == method]
         line = [method]
         for estimator in estimators:
-            some = [row for row in own if row["estimator"] == estimator]
+            estimator_rows = [row for row in own if row["estimator"] == estimator]
             base = {row["pair"]: row for row in rows
                     if row["method"] == BASELINE[use] and row["estimator"] == estimator}  # fmt: skip
-            nsgd = nsgd_of(some)
+            nsgd = nsgd_of(estimator_rows)
             line += [f"{100 * MERITS[name](nsgd).mean():.1f}" for name in ("recall_05", "recall_01")]
-            line.append(shown(interval(areas(nsgd), scenes_of(some), PERCENT), ".1f"))
-            line.append(_difference(some, base) if method != BASELINE[use] else "")
+            line.append(shown(interval(areas(nsgd), scenes_of(estimator_rows), PERCENT), ".1f"))
+            line.append(_difference(estimator_rows, base) if method != BASELINE[use] else "")
         once = [row for row in own if row["estimator"] == estimators[0]]
         if use == "hard":
             rate = [row["inlier_rate_before"] for row in once if not np.isnan(row["inlier_rate_before"])]

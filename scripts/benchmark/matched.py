@@ -49,14 +49,14 @@ def options(text: str) -> dict[str, Any]:
 
     ``PART.KEY=VALUE`` is the option KEY of a part, as on the command line.
     """
-    found: dict[str, Any] = {}
+    changed: dict[str, Any] = {}
     for key, value in (item.split("=") for item in text.split(",") if item):
         *parts, last = key.split(".")
-        inside = found
+        inside = changed
         for part in parts:
             inside = inside.setdefault(part, {})
         inside[last] = parsed(value)
-    return found
+    return changed
 
 
 def split(word: str) -> tuple[str, dict[str, Any]]:
@@ -98,8 +98,8 @@ def load(arguments: argparse.Namespace) -> list[Item]:
     """Every usable pair of the sets that are asked for, with its matches as a batch of one."""
     pairs: list[ImagePair] = []
     for dataset in sets_of(arguments):
-        whole = sorted((dataset[i] for i in range(len(dataset))), key=lambda pair: pair.key)
-        pairs += whole[: arguments.limit]
+        ordered = sorted((dataset[i] for i in range(len(dataset))), key=lambda pair: pair.key)
+        pairs += ordered[: arguments.limit]
     pairs.sort(key=lambda pair: pair.identity)
     pruners: dict[str, Any] = {word: pruner(word) for word in arguments.pruners}
     front = Pipeline(
@@ -121,13 +121,13 @@ def _no_estimator(c: Correspondences, seed: int = 0) -> Estimate:
 
 def groups(pairs: list[ImagePair]) -> dict[str, NDArray[np.bool_]]:
     """Which pairs (n,) belong to each family, to the wide and to the short baselines, and to all."""
-    found = {family: np.array([p.family == family for p in pairs]) for family in sorted({p.family for p in pairs})}
+    masks = {family: np.array([p.family == family for p in pairs]) for family in sorted({p.family for p in pairs})}
     wide = np.array([p.family in WIDE for p in pairs])
-    if len(found) > 1:
+    if len(masks) > 1:
         if wide.any() and not wide.all():
-            found |= {"wide baselines": wide, "short baselines": ~wide}
-        found["all"] = np.ones(len(pairs), bool)
-    return found
+            masks |= {"wide baselines": wide, "short baselines": ~wide}
+        masks["all"] = np.ones(len(pairs), bool)
+    return masks
 
 
 def scenes(pairs: list[ImagePair]) -> list[str]:

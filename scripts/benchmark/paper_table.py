@@ -49,7 +49,7 @@ def _parts(families: Sequence[str]) -> dict[str, list[str]]:
         "Differences of %Recall, real pairs": [f for f in families if f in REAL],
         "Differences of %Recall, rendered pairs": [f for f in families if f not in REAL],
     }
-    return {title: some for title, some in parts.items() if some}
+    return {title: members for title, members in parts.items() if members}
 
 
 def _own(rows: Sequence[Row], family: str, method: str) -> list[Row]:
@@ -122,8 +122,8 @@ def _claims(families: Sequence[str], title: str, rows: Sequence[Row], paper: Pub
                 {row["pair"]: row for row in _own(rows, family, presets[name] + VLFEAT)} for name in (first, second)
             )
             common = [pair for pair in a if pair in b]
-            found = _difference([a[pair] for pair in common], [b[pair] for pair in common]) if common else None
-            cells += [shown(found, "+.1f"), _published(paper, KIN.get(family, ""), presets[first], presets[second])]
+            gain = _difference([a[pair] for pair in common], [b[pair] for pair in common]) if common else None
+            cells += [shown(gain, "+.1f"), _published(paper, KIN.get(family, ""), presets[first], presets[second])]
         lines.append(cells)
     columns = [column for family in families for column in (family, KIN.get(family, ""))]
     return Sheet(title, ["", *columns], lines)

@@ -83,14 +83,14 @@ def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     known = list(kept.rows)
     rows = []
     for wide in (True, False):
-        some = [pair for pair in pairs if (pair.family in WIDE) == wide]
-        for group in by_features(arguments) if some else []:
+        same_width = [pair for pair in pairs if (pair.family in WIDE) == wide]
+        for group in by_features(arguments) if same_width else []:
             pipelines = {name: pipeline for name, (pipeline, _) in group.items()}
             identity = {name: digest for name, (_, digest) in group.items()}
             own = [row for row in known if identity.get(row["method"]) == row["identity"]]
             rows += own
             done = set.intersection(*({row["pair"] for row in own if row["method"] == name} for name in group))
-            todo = [pair for pair in some if pair.identity not in done]
+            todo = [pair for pair in same_width if pair.identity not in done]
             batches = [todo[i : i + BATCH] for i in range(0, len(todo), BATCH)]
             for batch in track(batches, next(iter(pipelines)), console=console):
                 new = list(rows_of(pipelines, batch, arguments.seeds, identity))

@@ -75,9 +75,9 @@ def _family(family: str, rows: list[Row], paper: Published) -> Sheet:
     lines = []
     for method in dict.fromkeys(row["method"] for row in rows):
         own = [row for row in rows if row["method"] == method]
-        some = "" if len(own) == len(pairs) else f", {len(own)} pairs"
+        note = "" if len(own) == len(pairs) else f", {len(own)} pairs"
         figures = [_interval(name, own) for name in FIGURES]
-        lines.append([f"`{method}`{some}", *figures, failed(own), compared(paper, kin, method)])
+        lines.append([f"`{method}`{note}", *figures, failed(own), compared(paper, kin, method)])
     title = f"{family}: {described(scenes_of(pairs.values()))}"
     return Sheet(title, ["", *FIGURES, "failed", f"paper, {kin}: recall, inlier, -m, #, -m"], lines)
 

@@ -62,9 +62,9 @@ def run(arguments: argparse.Namespace) -> None:
     rows: dict[str, list[Row]] = {}
     kept = Kept(arguments.rows)
     for each in sets_of(arguments, published[0]):
-        found = measured(each, arguments, kept)
-        if found:
-            rows[each.name] = found
+        set_rows = measured(each, arguments, kept)
+        if set_rows:
+            rows[each.name] = set_rows
     if not rows:
         raise SystemExit("no pair of pinhole cameras")
     tables = sheets(rows, arguments.methods, published)
@@ -76,16 +76,16 @@ def run(arguments: argparse.Namespace) -> None:
 
 def installed(methods: Sequence[str]) -> list[str]:
     """The methods whose packages are there; of those that are named, all must be. Raises SystemExit for another."""
-    found = []
+    available = []
     for text in methods:
         try:
             presets.build("estimator", methods_of.read(text).preset)
-            found.append(text)
+            available.append(text)
         except ImportError as error:
             if methods is not METHODS:
                 raise SystemExit(f"{text}: {error}") from error
             console.print(f"{text} is left out: {error}", style="dim", highlight=False, markup=False)
-    return found
+    return available
 
 
 def measured(of: Set, arguments: argparse.Namespace, kept: Kept) -> list[Row]:
@@ -94,7 +94,7 @@ def measured(of: Set, arguments: argparse.Namespace, kept: Kept) -> list[Row]:
     usable = [pair for pair in pairs if pair.problem is None]
     done = kept.by("pair", "seed", "threshold", "method", "identity", "matches")
     made_with = {text: (text, methods_of.identity(text), of.digest) for text in arguments.methods}
-    found: list[Row] = []
+    rows: list[Row] = []
     for pair in track(usable, of.name, console=console, transient=True):
         new = []
         for text in arguments.methods:
@@ -103,10 +103,10 @@ def measured(of: Set, arguments: argparse.Namespace, kept: Kept) -> list[Row]:
                 row = judged(methods_of.read(text), pair, of.threshold, arguments.seed)
                 row |= dict(zip(("method", "identity", "matches"), made_with[text], strict=True))
                 new.append(row)
-            found.append({**row, "scene": f"{of.name}/{pair.scene}"})
+            rows.append({**row, "scene": f"{of.name}/{pair.scene}"})
         kept.add(new)
-    _say_what_is_missing(of, pairs, found)
-    return found
+    _say_what_is_missing(of, pairs, rows)
+    return rows
 
 
 def judged(method: methods_of.Method, pair: ImagePair, threshold: float, seed: int) -> Row:
@@ -147,25 +147,25 @@ def sheets(
     own = {m: {name: [row for row in of if row["method"] == m] for name, of in rows.items()} for m in methods}
     known = [name for name in rows if name in thresholds]
     others = [method for method in theirs if method not in methods and known]
-    whole, each = [], []
+    overall, each = [], []
     for method in (*methods, *others):
         of_sets = own.get(method, {})
         ours = mean([areas(of) for of in of_sets.values()]) if of_sets else None
         said = mean([theirs[method][name] for name in rows]) if method in theirs and len(known) == len(rows) else None
         ms = f"{np.median([row['ms'] for of in of_sets.values() for row in of]):.1f}" if of_sets else MISSING
-        whole.append([method, shown(ours), shown(said), lead(own, method), ms])
+        overall.append([method, shown(ours), shown(said), lead(own, method), ms])
     for name in rows:
         px = f"{rows[name][0]['threshold']:g}"
         for method in (*methods, *(others if name in known else ())):
             of = own.get(method, {}).get(name)
-            told = shown(theirs.get(method, {}).get(name))
-            each.append([name, method, px, *([str(len(of)), shown(areas(of))] if of else [MISSING] * 2), told])
+            stated = shown(theirs.get(method, {}).get(name))
+            each.append([name, method, px, *([str(len(of)), shown(areas(of))] if of else [MISSING] * 2), stated])
     count = sum(len(of) for of in own[methods[0]].values())
     part = f", {len(known)} of PoseBench's {len(thresholds)}" if known else ""
     title = f"PoseBench's protocol: means of {len(rows)} set{'s' * (len(rows) != 1)}{part}; {count:,} pairs"
     heading = "AUC@5/10/20°, signed"
     return (
-        Sheet(title, ["method", heading, "published", "first of its kind minus this, @5°", "ms, median"], whole),
+        Sheet(title, ["method", heading, "published", "first of its kind minus this, @5°", "ms, median"], overall),
         Sheet("Each set", ["set", "method", "px", "pairs", heading, "published"], each),
     )
 

@@ -37,8 +37,8 @@ def tables(figures: dict[str, Any]) -> list[Sheet]:
         if simulated != everywhere:
             sheets.append(_family(family, [row for row in own if row["method"] != "CODE"], "", paper))
         if simulated:
-            some = "" if simulated == everywhere else " with ASIFT features too"
-            sheets.append(_family(family, [row for row in own if row["pair"] in simulated], some, paper))
+            suffix = "" if simulated == everywhere else " with ASIFT features too"
+            sheets.append(_family(family, [row for row in own if row["pair"] in simulated], suffix, paper))
     titles = {"speed": "Milliseconds of processor time a pair, one thread", "memory": "Peak memory of a call, MiB"}
     for part, title in titles.items():
         if figures[part]:
@@ -47,10 +47,10 @@ def tables(figures: dict[str, Any]) -> list[Sheet]:
     return sheets
 
 
-def _family(family: str, rows: list[Row], some: str, paper: Published) -> Sheet:
+def _family(family: str, rows: list[Row], suffix: str, paper: Published) -> Sheet:
     kin = KIN.get(family, "")
     heading = f"paper, {kin}: recall, inlier, -m, #, -m" if kin else "paper"
-    title = f"{family}{some}: {described(scenes_of({row['pair']: row for row in rows}.values()))}"
+    title = f"{family}{suffix}: {described(scenes_of({row['pair']: row for row in rows}.values()))}"
     lines = []
     baseline = {row["pair"]: row for row in rows if row["method"] == BASELINE}
     for method in dict.fromkeys(row["method"] for row in rows):

@@ -65,12 +65,14 @@ def run(arguments: argparse.Namespace) -> None:
     pairs = select([dataset[i] for dataset in sets_of(arguments) for i in range(len(dataset))], arguments.limit)
     lines = []
     for name in arguments.pipelines:
-        whole = presets.pipeline(name, overrides=[f"cache={arguments.cache}"])
-        kept, before, after, ms = stages(whole, pairs, name)
-        distance = np.array([[exactness(o) for o in some] for some in (before, after)]).T
+        pipeline = presets.pipeline(name, overrides=[f"cache={arguments.cache}"])
+        kept, before, after, ms = stages(pipeline, pairs, name)
+        distance = np.array([[exactness(o) for o in outcomes] for outcomes in (before, after)]).T
         for estimator in arguments.estimators:
-            whole.estimator = presets.build("estimator", estimator)
-            without, refined = (np.array([nsgd(whole, o, i) for i in range(arguments.seeds)]) for o in (before, after))
+            pipeline.estimator = presets.build("estimator", estimator)
+            without, refined = (
+                np.array([nsgd(pipeline, o, i) for i in range(arguments.seeds)]) for o in (before, after)
+            )
             lines += rows(f"`{name}`, {estimator}", kept, Measured(without, refined, distance, ms))
     sheet = Sheet(f"With {STAGE} and without, {arguments.seeds} seeds", COLUMNS, lines)
     console.print(sheet.terminal())
@@ -79,17 +81,17 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def stages(
-    whole: Pipeline, pairs: Sequence[ImagePair], name: str
+    pipeline: Pipeline, pairs: Sequence[ImagePair], name: str
 ) -> tuple[list[ImagePair], list[Outcome], list[Outcome], NDArray[np.float64]]:
     """The pairs with matches, their outcomes before estimation without and with the stage, and its milliseconds."""
     stage = presets.build("pruner", STAGE)
     before, after, ms = [], [], []
     for pair in track(pairs, name, console=console, transient=True):
-        outcome = whole.match([pair])[0]
+        outcome = pipeline.match([pair])[0]
         c = outcome.correspondences
         if c is None or not int(c.count()):
             continue
-        images = whole.images(pair)
+        images = pipeline.images(pair)
         start = time.process_time()
         refined = pruned(stage, c, functools.partial(_same, images))
         ms.append((time.process_time() - start) * 5e5 / int(c.count()))
@@ -113,23 +115,23 @@ def exactness(outcome: Outcome) -> float:
 
 def nsgd(pipeline: Pipeline, outcomes: Sequence[Outcome], seed: int) -> list[float]:
     """Of each pair, 1 where there is no F."""
-    found = []
+    evaluated = []
     for i in range(0, len(outcomes), BATCH):
-        found += evaluate(pipeline.estimate(outcomes[i : i + BATCH], seed), seed)
-    return [row.nsgd if row.ok else 1.0 for row in found]
+        evaluated += evaluate(pipeline.estimate(outcomes[i : i + BATCH], seed), seed)
+    return [row.nsgd if row.ok else 1.0 for row in evaluated]
 
 
 def rows(title: str, pairs: list[ImagePair], m: Measured) -> list[list[str]]:
     """A line for each family, and for wide and short baselines."""
     lines = []
-    for family, some in groups(pairs).items():
-        names = scenes([pair for pair, inside in zip(pairs, some, strict=True) if inside])
-        values = [{name: merit(nsgds[:, some]) for name, merit in MERITS.items()} for nsgds in (m.before, m.after)]
+    for family, members in groups(pairs).items():
+        names = scenes([pair for pair, inside in zip(pairs, members, strict=True) if inside])
+        values = [{name: merit(nsgds[:, members]) for name, merit in MERITS.items()} for nsgds in (m.before, m.after)]
         cells = [" / ".join(f"{PERCENT * each.mean():.1f}" for each in value.values()) for value in values]
         for name in MERITS:
             gain = difference(values[1][name], values[0][name], names, PERCENT, share=name in SHARES)
             cells.append(shown(gain, "+.1f"))
-        first, second = np.nanmean(m.distance[some], 0)
-        cells += [f"{first:.3f} → {second:.3f}", f"{np.median(m.ms[some]):.1f}"]
-        lines.append([f"{title}: {family}", str(int(some.sum())), *cells])
+        first, second = np.nanmean(m.distance[members], 0)
+        cells += [f"{first:.3f} → {second:.3f}", f"{np.median(m.ms[members]):.1f}"]
+        lines.append([f"{title}: {family}", str(int(members.sum())), *cells])
     return lines

@@ -65,9 +65,9 @@ def run(arguments: argparse.Namespace) -> None:
         console.print(f"{len(pairs) - unrelated} related pairs, {unrelated} unrelated ones")
         for feature in dict.fromkeys(map(features_of, arguments.pipelines)):
             names = [name for name in arguments.pipelines if features_of(name) == feature]
-            for name, some, c in matches(feature, pairs, arguments.folder):
+            for name, batch, c in matches(feature, pairs, arguments.folder):
                 for pipeline in names:
-                    judge(pipeline, name, some, c, arguments.folder)
+                    judge(pipeline, name, batch, c, arguments.folder)
     rows = read(arguments.folder, arguments.pipelines)
     text = related_table.text(rows)
     console.print(text, markup=False)
@@ -84,15 +84,15 @@ def chosen_pairs(arguments: argparse.Namespace) -> list[ImagePair]:
     for pair in sorted((d[i] for d in datasets for i in range(len(d))), key=lambda pair: pair.key):
         if pair.problem is None:
             related.setdefault(pair.family, []).append(pair)
-    some = [pair for family in related.values() for pair in family[: arguments.limit]]
-    return in_order([*some, *unrelated_pairs(some, datasets, arguments.unrelated)])
+    chosen = [pair for family in related.values() for pair in family[: arguments.limit]]
+    return in_order([*chosen, *unrelated_pairs(chosen, datasets, arguments.unrelated)])
 
 
 def batches(pairs: Sequence[ImagePair]) -> Iterator[tuple[str, list[ImagePair]]]:
     """The pairs in batches, each with a name that tells which pairs these are."""
     for start in range(0, len(pairs), BATCH):
-        some = list(pairs[start : start + BATCH])
-        yield hashlib.blake2b("\n".join(p.identity for p in some).encode(), digest_size=8).hexdigest(), some
+        batch = list(pairs[start : start + BATCH])
+        yield hashlib.blake2b("\n".join(p.identity for p in batch).encode(), digest_size=8).hexdigest(), batch
 
 
 def matches(
@@ -106,14 +106,14 @@ def matches(
     assert tuple(front.pruners) == SHARED
     kept = folder / "matches" / feature
     kept.mkdir(parents=True, exist_ok=True)
-    for name, some in track(list(batches(pairs)), feature, console=console):
+    for name, batch in track(list(batches(pairs)), feature, console=console):
         path = kept / f"{name}.pt"
         if not path.exists():
-            found = [outcome.correspondences or _nothing(outcome.pair) for outcome in front.match(some)]
-            fields = {name: getattr(collate([_slim(c) for c in found]), name) for name in FIELDS}
+            matched = [outcome.correspondences or _nothing(outcome.pair) for outcome in front.match(batch)]
+            fields = {name: getattr(collate([_slim(c) for c in matched]), name) for name in FIELDS}
             with replacing(path) as temporary:
                 torch.save(fields, temporary)
-        yield name, some, Correspondences(**torch.load(path))
+        yield name, batch, Correspondences(**torch.load(path))
 
 
 def _slim(c: Correspondences) -> Correspondences:

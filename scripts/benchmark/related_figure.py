@@ -28,7 +28,7 @@ BY: dict[str, Callable[[Row], float]] = {"by significance": significance, "by th
 
 def roc(rows: Sequence[Row], figure: Callable[[Row], float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Shares of unrelated pairs accepted and of right ones rejected at every level of a figure, from the lowest on."""
-    unrelated, right = (np.array([figure(row) for row in some], dtype=np.float64) for some in split(rows))
+    unrelated, right = (np.array([figure(row) for row in part], dtype=np.float64) for part in split(rows))
     levels = np.append(np.unique(np.concatenate([unrelated, right])), np.inf)
     return (unrelated >= levels[:, None]).mean(1), (right < levels[:, None]).mean(1)
 

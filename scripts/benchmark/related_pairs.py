@@ -68,9 +68,9 @@ def scenes_of(pairs: Sequence[ImagePair], shown: Mapping[str, frozenset[str]]) -
         place = images.setdefault((pair.family, pair.scene), {})
         place.update({image.identity: image for image in (pair.image0, pair.image1)})
     return [
-        Scene(f"{family}/{scene}", tuple(found[key] for key in sorted(found)), shown.get(scene, frozenset()),
+        Scene(f"{family}/{scene}", tuple(by_name[key] for key in sorted(by_name)), shown.get(scene, frozenset()),
               scene in shown)
-        for (family, scene), found in images.items()
+        for (family, scene), by_name in images.items()
     ]  # fmt: skip
 
 

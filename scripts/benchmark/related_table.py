@@ -68,9 +68,9 @@ def families(rows: dict[str, list[Row]]) -> str:
     for family in names:
         cells: list[object] = [family]
         for own in rows.values():
-            some = [row for row in own if row["family"] == family]
-            right = [_related(row) for row in some if row["true"] and row["nsgd"] < RIGHT]
-            wrong = [_related(row) for row in some if not (row["true"] and row["nsgd"] < RIGHT)]
+            members = [row for row in own if row["family"] == family]
+            right = [_related(row) for row in members if row["true"] and row["nsgd"] < RIGHT]
+            wrong = [_related(row) for row in members if not (row["true"] and row["nsgd"] < RIGHT)]
             cells.append(f"{sum(right)} of {len(right)}; {sum(wrong)} of {len(wrong)}")
         lines.append(cells)
     return table(["called related: right ones; others", *(f"`{name}`" for name in rows)], lines)

@@ -76,10 +76,10 @@ def run(arguments: argparse.Namespace) -> None:
         start = time.process_time()
         proposed = {frozenset(pair) for pair in similar_pairs(images, vectors, count)}
         seconds = time.process_time() - start
-        found = Counter(scene for pair, scene in pairs.items() if pair in proposed)
-        by_scene = ", ".join(f"{scene} {100 * found[scene] / of:.0f}" for scene, of in total.items())
+        hits = Counter(scene for pair, scene in pairs.items() if pair in proposed)
+        by_scene = ", ".join(f"{scene} {100 * hits[scene] / of:.0f}" for scene, of in total.items())
         inside = sum(len({path.parent for path in pair}) == 1 for pair in proposed)
         console.print(
             f"N = {count}: {len(proposed)} pairs, {100 * inside / len(proposed):.0f} % within a scene, recall "
-            f"{100 * found.total() / len(pairs):.1f} % ({by_scene}), {seconds:.2f} s", soft_wrap=True, highlight=False,
+            f"{100 * hits.total() / len(pairs):.1f} % ({by_scene}), {seconds:.2f} s", soft_wrap=True, highlight=False,
         )  # fmt: skip

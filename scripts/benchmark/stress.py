@@ -73,10 +73,12 @@ def measure(cases: Iterator[Case], arguments: argparse.Namespace) -> list[Row]:
     rows = {key: row for key, row in known.items() if made_with.get(row["method"]) == row["identity"]}
     for case in cases:
         for sweep, level, change in changes(arguments.only):
-            some = every if sweep == CONDITIONED else always
-            place = {name: (case.pair.identity, sweep, level, name, made_with[name]) for name in some}
+            chosen_methods = every if sweep == CONDITIONED else always
+            place = {name: (case.pair.identity, sweep, level, name, made_with[name]) for name in chosen_methods}
             before = {name: rows[key] for name, key in place.items() if key in rows}
-            todo = {n: m for n, m in some.items() if n not in before or len(before[n]["nsgd"]) < arguments.seeds}
+            todo = {
+                n: m for n, m in chosen_methods.items() if n not in before or len(before[n]["nsgd"]) < arguments.seeds
+            }
             changed = change(case) if todo else None
             if changed is None:
                 continue
@@ -103,7 +105,7 @@ def changes(only: list[str]) -> Iterator[tuple[str, float | str, Change]]:
 
 
 def rows_of(
-    case: Case, some: Mapping[str, Method], seeds: int, before: Mapping[str, Row] | None = None
+    case: Case, chosen_methods: Mapping[str, Method], seeds: int, before: Mapping[str, Row] | None = None
 ) -> Iterator[Row]:
     """A row for each estimator, with NSGD and processor milliseconds of each seed; they take turns.
 
@@ -113,21 +115,21 @@ def rows_of(
     F = torch.from_numpy(pair.F)[None]
     assert c.size0 is not None
     assert c.size1 is not None
-    earlier = {name: (before or {}).get(name, {"nsgd": [], "ms": []}) for name in some}
-    found = {name: (list(row["nsgd"]), list(row["ms"])) for name, row in earlier.items()}
+    earlier = {name: (before or {}).get(name, {"nsgd": [], "ms": []}) for name in chosen_methods}
+    figures = {name: (list(row["nsgd"]), list(row["ms"])) for name, row in earlier.items()}
     for seed in range(seeds):
-        for name, method in some.items():
-            if seed < len(found[name][0]):
+        for name, method in chosen_methods.items():
+            if seed < len(figures[name][0]):
                 continue
             start = time.process_time()
             estimate = method(pair, c, seed)
             milliseconds = 1e3 * (time.process_time() - start)
             nsgd = float(metrics.nsgd(F, estimate.F, c.size0, c.size1, key=c.keys)) if bool(estimate.ok[0]) else 1.0
-            found[name][0].append(round(nsgd, 6))
-            found[name][1].append(round(milliseconds, 2))
+            figures[name][0].append(round(nsgd, 6))
+            figures[name][1].append(round(milliseconds, 2))
     facts: Row = {"pair": pair.identity, "family": pair.family, "scene": pair.scene}
     facts |= {"matches": len(case.right), "right": int(case.right.sum())}
-    for name, (nsgds, ms) in found.items():
+    for name, (nsgds, ms) in figures.items():
         yield {**facts, "method": name, "nsgd": nsgds, "ms": ms}
 
 

@@ -80,12 +80,12 @@ def load(arguments: argparse.Namespace) -> Iterator[Case]:
     for pair in track(pairs, "pairs", console=console):
         matches = front.match([pair])[0].correspondences
         if matches is not None:
-            case = made(pair, matches)
+            case = case_of(pair, matches)
             if int(case.right.sum()) >= MIN_RIGHT:
                 yield case
 
 
-def made(pair: ImagePair, c: Correspondences) -> Case:
+def case_of(pair: ImagePair, c: Correspondences) -> Case:
     """A case of all nearest neighbours of a pair, a batch of one."""
     assert c.quality is not None
     passed = c.mask & (c.quality < RATIO)
@@ -138,9 +138,9 @@ def on_plane(case: Case, samples: int = 500) -> Bool[Tensor, " n"]:
         if refined.sum() < inside.sum():
             break
         inside = refined
-    found = torch.zeros_like(case.right)
-    found[index[torch.from_numpy(inside)]] = True
-    return found
+    mask = torch.zeros_like(case.right)
+    mask[index[torch.from_numpy(inside)]] = True
+    return mask
 
 
 def homographies(points: Array) -> Array:

@@ -36,10 +36,10 @@ def inlier_ratio(case: Case, ratio: float) -> Case | None:
     Right ones are as many at every ratio, at most MAX_RIGHT. Wrong ones are first the pair's own, then wrong nearest
     neighbours that the ratio test took away, with distance ratios drawn from those of the pair's own wrong matches.
     """
-    rng, least = case.rng("inlier ratio"), min(INLIER_RATIOS)
+    rng, min_ratio = case.rng("inlier ratio"), min(INLIER_RATIOS)
     right, wrong = (rng.permutation(np.flatnonzero(mask.numpy())) for mask in (case.right, case.wrong))
     spare = rng.permutation(case.spare.mask.shape[1])
-    most = int((len(wrong) + len(spare)) * least / (1 - least))
+    most = int((len(wrong) + len(spare)) * min_ratio / (1 - min_ratio))
     right = right[: min(MAX_RIGHT, most)]
     if len(right) < MIN_RIGHT or len(wrong) < 2:
         return None
@@ -169,8 +169,8 @@ def seen(case: Case, window0: Window, window1: Window) -> Case | None:
     c = _placed(case.c, moved[0], moved[1], window0[2], window1[2])
     shapes = [torch.from_numpy(window[1].astype(np.int64))[None] for window in (window0, window1)]
     pair = dataclasses.replace(case.pair, F=inverse[1].T @ case.pair.F @ inverse[0], K0=None, K1=None)
-    whole = dataclasses.replace(case, pair=pair, c=c.replace(size0=shapes[0], size1=shapes[1]))
-    return whole.subset(inside)
+    windowed = dataclasses.replace(case, pair=pair, c=c.replace(size0=shapes[0], size1=shapes[1]))
+    return windowed.subset(inside)
 
 
 def _placed(c: Correspondences, x0: Tensor, x1: Tensor, scale0: float = 1.0, scale1: float = 1.0) -> Correspondences:

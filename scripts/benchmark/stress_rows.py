@@ -36,11 +36,11 @@ def comparable(rows: Sequence[Row], order: Sequence[str] = ()) -> list[Row]:
     for row in rows:
         by_cell.setdefault((row["sweep"], row["pair"], row["level"]), {})[row["method"]] = row
     wanted = {sweep: set(methods([r for r in rows if r["sweep"] == sweep])) for sweep in {r["sweep"] for r in rows}}
-    whole = [cell for (sweep, *_), cell in by_cell.items() if cell.keys() >= wanted[sweep]]
-    seeds = {name: min((len(cell[name]["nsgd"]) for cell in whole if name in cell), default=0) for name in names}
+    complete = [cell for (sweep, *_), cell in by_cell.items() if cell.keys() >= wanted[sweep]]
+    seeds = {name: min((len(cell[name]["nsgd"]) for cell in complete if name in cell), default=0) for name in names}
     return [
         cell[name] | {figure: cell[name][figure][: seeds[name]] for figure in ("nsgd", "ms")}
-        for name in names for cell in whole if name in cell
+        for name in names for cell in complete if name in cell
     ]  # fmt: skip
 
 
@@ -48,10 +48,10 @@ def label(method: str) -> str:
     """An estimator's name in tables: without its stages and the options that all of its kind have."""
     front, _, stages = method.partition("@")
     name, _, rest = front.partition(":")
-    telling = [
+    distinguishing = [
         option for option in rest.split(",") if option and option.partition("=")[0] not in ("threshold", "prosac")
     ]
-    return ", ".join([name, *telling, *(["no sizes"] if "sizeless" in stages else [])])
+    return ", ".join([name, *distinguishing, *(["no sizes"] if "sizeless" in stages else [])])
 
 
 def methods(rows: Sequence[Row]) -> list[str]:
@@ -60,10 +60,10 @@ def methods(rows: Sequence[Row]) -> list[str]:
 
 def levels(rows: Sequence[Row]) -> list[Level]:
     """In the order of the sweep; after conditions, which of the unchanged pairs show a plane or little translation."""
-    found = list(dict.fromkeys(row["level"] for row in rows))
-    if all(isinstance(level, float) for level in found):
-        return sorted(found)
-    ordered = [name for name in CONDITIONS if name in found]
+    present = list(dict.fromkeys(row["level"] for row in rows))
+    if all(isinstance(level, float) for level in present):
+        return sorted(present)
+    ordered = [name for name in CONDITIONS if name in present]
     return [*ordered, *(name for name in NATURAL if at(rows, name))]
 
 
@@ -107,9 +107,9 @@ def paired(
     """NSGD (seeds, pairs) of two estimators on the pairs that both have, with the pairs' scenes."""
     by_method = {m: {r["pair"]: r for r in at(rows, level) if r["method"] == m} for m in (first, second)}
     both = [pair for pair in by_method[first] if pair in by_method[second]]
-    found = []
+    measured = []
     for method in (first, second):
         own = [by_method[method][pair] for pair in both]
         scenes = scene_names([row["family"] for row in own], [row["scene"] for row in own])
-        found.append((np.array([row["nsgd"] for row in own]).T, scenes))
-    return found[0], found[1]
+        measured.append((np.array([row["nsgd"] for row in own]).T, scenes))
+    return measured[0], measured[1]

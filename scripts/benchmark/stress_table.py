@@ -64,12 +64,12 @@ def show(rows: Sequence[Row]) -> None:
 
 def sheets(rows: Sequence[Row]) -> list[Sheet]:
     """Of one sweep: figures and differences of each group, and times over all."""
-    found = []
+    groups = []
     for name in GROUPS:
         own = [row for row in rows if group(row["family"]) == name]
         if own:
-            found += [recall_sheet(name, own), difference_sheet(name, own)]
-    return [*found, time_sheet(rows)]
+            groups += [recall_sheet(name, own), difference_sheet(name, own)]
+    return [*groups, time_sheet(rows)]
 
 
 def recall_sheet(name: str, rows: Sequence[Row]) -> Sheet:
@@ -101,7 +101,7 @@ def difference_sheet(name: str, rows: Sequence[Row]) -> Sheet:
             gain = difference(areas(own), areas(other), scenes, PERCENT) if scenes else None
             cells.append(MISSING if gain is None else f"{gain.value:+.0f} [{gain.low:+.0f}, {gain.high:+.0f}]")
         lines.append([label(method), *cells])
-    over = " or ".join(f"{one}s" for one in sorted(units))
+    over = " or ".join(f"{kind}s" for kind in sorted(units))
     title = f"{titled(rows, name)}: AUC@0.05 of {label(first)} minus this row, in points, 95 % intervals over {over}"
     return Sheet(title, ["estimator", *(head(level) for level in levels(rows))], lines)
 

@@ -114,7 +114,7 @@ def _difference(family: str, pipeline: str, reference: str, rows: Mapping[Place,
     if not common:
         return []
     scenes = scene_names([family] * len(common), [first[key][1] for key in common])
-    own, other = (np.array([some[key][0] for key in common]) for some in (first, second))
+    own, other = (np.array([by_key[key][0] for key in common]) for by_key in (first, second))
     cells = []
     for name in NAMES:
         merit = MERITS[name]

@@ -61,15 +61,15 @@ def start(cwd: Path, log: Path, *arguments: str) -> Command:
 
 def results(run_dir: Path) -> Rows:
     """The rows without what depends on the time."""
-    found = [{k: v for k, v in row.items() if not k.startswith("seconds")} for row in rows(run_dir)]
-    return sorted(found, key=lambda row: str(row["pair"]))
+    plain = [{k: v for k, v in row.items() if not k.startswith("seconds")} for row in rows(run_dir)]
+    return sorted(plain, key=lambda row: str(row["pair"]))
 
 
 def counted(stdout: str) -> tuple[int, int]:
     """Images computed and found, as the run tells."""
-    told = re.search(r"features of (\d+) images computed, of (\d+) taken", stdout)
-    assert told is not None, stdout
-    return int(told[1]), int(told[2])
+    match = re.search(r"features of (\d+) images computed, of (\d+) taken", stdout)
+    assert match is not None, stdout
+    return int(match[1]), int(match[2])
 
 
 def test_the_same_rows_with_an_empty_and_with_a_damaged_cache(root: Path, truth: Rows, tmp_path: Path) -> None:
@@ -103,9 +103,9 @@ def test_a_killed_run_continues_with_what_it_had(root: Path, truth: Rows, tmp_pa
     again = evaluate(*these, cwd=tmp_path)
     assert again.returncode == 0, again.stderr
     assert "damaged" not in again.stderr
-    computed, found = counted(again.stdout)
+    computed, from_cache = counted(again.stdout)
     assert computed == IMAGES - had
-    assert found > 0
+    assert from_cache > 0
     assert results(tmp_path / "run") == truth
 
 
@@ -116,14 +116,14 @@ def test_two_runs_at_once_share_the_cache(root: Path, truth: Rows, tmp_path: Pat
         for name in names
     ]
     ended = [process.wait() for process in processes]
-    told = [(process.log.read_text(), process.log.with_suffix(".errors").read_text()) for process in processes]
-    assert ended == [0, 0], told
-    assert all("damaged" not in err and "nothing is kept" not in err for _, err in told)
+    outputs = [(process.log.read_text(), process.log.with_suffix(".errors").read_text()) for process in processes]
+    assert ended == [0, 0], outputs
+    assert all("damaged" not in err and "nothing is kept" not in err for _, err in outputs)
     assert results(tmp_path / "a") == results(tmp_path / "b") == truth
     kept = list(ArrayCache(tmp_path / "cache" / "features").files())
     assert len(kept) == IMAGES
     assert not list(tmp_path.glob("cache/features/*/*.tmp"))
-    assert all(sum(counted(out)) == IMAGES for out, _ in told)
+    assert all(sum(counted(out)) == IMAGES for out, _ in outputs)
 
 
 def test_a_cache_that_cannot_be_is_told(root: Path, tmp_path: Path) -> None:
@@ -163,10 +163,10 @@ def test_the_command_for_two_photographs_tells(root: Path, tmp_path: Path) -> No
 
 def test_real_pairs_are_the_same(tmp_path: Path) -> None:
     pairs = load("fmbench", root=shared_path("data/Strecha_train"))
-    some = [pairs[0], pairs[1]]
+    first_pairs = [pairs[0], pairs[1]]
     options = ["estimator=lmeds", "estimator.hypotheses=200"]
     outcomes = [
-        presets.pipeline("sift_ratio", overrides=[*options, f"cache={cache}"]).run(some)
+        presets.pipeline("sift_ratio", overrides=[*options, f"cache={cache}"]).run(first_pairs)
         for cache in ("off", tmp_path, tmp_path)
     ]
     for off, cold, warm in zip(*outcomes, strict=True):

@@ -92,7 +92,7 @@ COUNT = "it must be a whole number of at least 1"
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         ("eval limit=-3", f"limit=-3; {COUNT} or null"),
         ("eval limit=0", f"limit=0; {COUNT} or null"),
@@ -153,13 +153,13 @@ COUNT = "it must be a whole number of at least 1"
     ],
 )
 def test_a_mistake_is_told_in_one_line_and_nothing_written(
-    words: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    words: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     if words.startswith("train"):
         pytest.importorskip("lightning", reason="training needs the extra `train`")
     line = ended(monkeypatch, tmp_path, *words.split())
     assert line.startswith("error: ")
-    assert told in line
+    assert message in line
     assert len(line) < 300
     assert "\n" not in line
     assert [path.name for path in tmp_path.rglob("*")] == ["cache", "kernels"]  # put there by `own_cache`

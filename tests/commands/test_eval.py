@@ -47,8 +47,8 @@ def test_a_run_from_start_to_end(root: Path, tmp_path: Path) -> None:
     first = evaluate(*arguments, "limit=2", cwd=tmp_path)
     assert first.returncode == 0, first.stderr
     run_dir = tmp_path / "run"
-    some = rows(run_dir)
-    assert len(some) == 2
+    table = rows(run_dir)
+    assert len(table) == 2
     parts = {part: part.stat().st_mtime_ns for part in (run_dir / "pairs").glob("*.parquet")}
 
     # Continued: what is there stays, the rest is added.
@@ -100,9 +100,9 @@ def test_batch_and_workers_change_no_row(root: Path, tmp_path: Path) -> None:
         assert run.returncode == 0, run.stderr
         plain = [{k: v for k, v in row.items() if not k.startswith("seconds")} for row in rows(tmp_path / name)]
         results.append(sorted(plain, key=lambda row: str(row["pair"])))
-        told = run.stdout
+        output = run.stdout
     assert results[0] == results[1] == results[2]
-    computed = re.search(r"features of (\d+) images computed", told)
+    computed = re.search(r"features of (\d+) images computed", output)
     assert computed is not None
     assert 4 <= int(computed[1]) <= 6  # two processes may come upon the same image at the same time
 
@@ -115,10 +115,10 @@ def test_shards_are_one_run(root: Path, tmp_path: Path) -> None:
     assert "2 of 5 pairs have rows; other shards have the rest" in first.stdout
     second = evaluate(*arguments, f"run_dir={tmp_path / 'run'}", "shard=2/2", cwd=tmp_path)
     assert "other shards" not in second.stdout
-    whole, merged = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("whole", "run"))
-    for group in (*whole.values(), *merged.values()):
+    unsharded, merged = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("whole", "run"))
+    for group in (*unsharded.values(), *merged.values()):
         del group["seconds"]
-    assert merged == whole
+    assert merged == unsharded
     wrong = evaluate(*arguments, "shard=3/2", cwd=tmp_path)
     assert wrong.stderr.strip() == "error: shard=3/2; it must be i/n with i from 1 to n: shard=2/8"
 
@@ -207,13 +207,13 @@ def test_mistakes_in_a_users_own_pruner_are_told(root: Path, tmp_path: Path) -> 
     (own / "empty.yaml").write_text("threshold: 0.5\n")
     (own / "elsewhere.yaml").write_text("# @package _global_\npruner: {_target_: fmtorch.pruning.OneToOne}\n")
     (own / "typo.yaml").write_text("_target_: fmtorch.pruning.RatioTest\nthreshhold: 0.5\n")
-    told = {
+    messages = {
         "pruner=empty": "pruner.empty: a preset is a mapping with a `_target_`",
         "pruner=elsewhere": "must be `# @package pruner.<name>`, or be left out",
         "pruner=typo": "pruner.typo: no option threshhold; there are: threshold",
         "pruner=lc pruner.lc.file=runs/absent": "absent.safetensors does not exist: python -m fmtorch.train pruner=lc",
     }
-    for options, message in told.items():
+    for options, message in messages.items():
         run = evaluate(
             "--config-dir", str(tmp_path / "my_conf"), *options.split(), "dataset=fmbench", f"dataset.root={root}",
             *OPTIONS, f"run_dir={tmp_path / 'run'}", "limit=1", cwd=tmp_path,
@@ -225,7 +225,7 @@ def test_mistakes_in_a_users_own_pruner_are_told(root: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("damage", "told"),
+    ("damage", "message"),
     [
         ("no root", "no such folder"),
         ("columns", "pairs_with_gt.txt, line 2"),
@@ -234,7 +234,7 @@ def test_mistakes_in_a_users_own_pruner_are_told(root: Path, tmp_path: Path) -> 
         ("estimator", "score is 'psac'"),
     ],
 )
-def test_what_cannot_be_run_is_told(root: Path, tmp_path: Path, damage: str, told: str) -> None:
+def test_what_cannot_be_run_is_told(root: Path, tmp_path: Path, damage: str, message: str) -> None:
     arguments = ["dataset=fmbench", f"dataset.root={root}", *OPTIONS, f"run_dir={tmp_path / 'run'}"]
     environment = {"CUDA_VISIBLE_DEVICES": ""}
     if damage == "no root":
@@ -251,7 +251,7 @@ def test_what_cannot_be_run_is_told(root: Path, tmp_path: Path, damage: str, tol
         arguments.append("estimator.score=psac")
     run = evaluate(*arguments, cwd=tmp_path, environment=environment)
     assert run.returncode == 1
-    assert told in run.stderr
+    assert message in run.stderr
     assert "Traceback" not in run.stderr
 
 
@@ -303,8 +303,8 @@ def test_on_real_pairs(tmp_path: Path) -> None:
     root = shared_path("data/Strecha")
     run = evaluate("dataset=fmbench", f"dataset.root={root}", "limit=4", f"run_dir={tmp_path / 'run'}", cwd=tmp_path)
     assert run.returncode == 0, run.stderr
-    found = rows(tmp_path / "run")
-    assert len(found) == 4
-    assert all(bool(row["ok"]) for row in found)
+    table = rows(tmp_path / "run")
+    assert len(table) == 4
+    assert all(bool(row["ok"]) for row in table)
     # Most pairs of these scenes are solved by the baseline (recall at 0.05 is above 90 % over all of them).
-    assert np.mean([float(str(row["nsgd"])) < 0.05 for row in found]) >= 0.5
+    assert np.mean([float(str(row["nsgd"])) < 0.05 for row in table]) >= 0.5

@@ -28,6 +28,7 @@ from fmtorch.data import ImageError, read_image
 from fmtorch.geometry import homography_points, sampson
 from fmtorch.metrics import nsgd
 from tests.conftest import own_cache, shared_path
+from tests.matching import stand_in
 from tests.processes import run_command
 
 ROWS = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # a sideways camera: epipolar lines are rows
@@ -244,7 +245,7 @@ def test_an_f_of_photographs_with_nothing_in_common() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "options", "error", "told"),
+    ("arguments", "options", "error", "message"),
     [
         (("absent.jpg", "absent.jpg"), {}, ImageError, "absent.jpg"),
         ((np.zeros((4, 4, 4), np.uint8),) * 2, {}, ValueError, r"image0 is uint8 \(4, 4, 4\)"),
@@ -253,13 +254,16 @@ def test_an_f_of_photographs_with_nothing_in_common() -> None:
         ((np.zeros((4, 4), np.uint8),) * 2, {"longest_side": 0}, ValueError, "longest_side is 0"),
     ],
 )
-def test_errors(arguments: tuple[object, ...], options: dict[str, object], error: type[Exception], told: str) -> None:
-    with pytest.raises(error, match=told):
+def test_errors(
+    arguments: tuple[object, ...], options: dict[str, object], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
         fmtorch.match(*arguments, **options)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("name", presets.available("pipeline"))
-def test_every_pipeline_composes_by_name(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_pipeline_composes_by_name(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in.install(tmp_path, monkeypatch)
     for module in ("features.kornia_features", "matching.lightglue"):  # without fetching others' weights
         monkeypatch.setattr(f"fmtorch.{module}.pretrained", lambda load, *_: torch.nn.Identity())
     built = presets.pipeline(name)
@@ -300,8 +304,8 @@ def test_the_command(tmp_path: Path) -> None:
     done = run_python("-m", "fmtorch.match", "image0=a.png", "image1=b.webp", "truth=F.txt", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "RuntimeWarning" not in done.stderr
-    for told in ("hesaffnet_fmtorch", "one_to_one", "inliers", "seconds", "NSGD", "matches/a-b"):
-        assert told in done.stdout
+    for text in ("hesaffnet_fmtorch", "one_to_one", "inliers", "seconds", "NSGD", "matches/a-b"):
+        assert text in done.stdout
     folder = tmp_path / "matches" / "a-b"
     assert {path.name for path in folder.iterdir()} == {"result.json", "matches.png", "pruning.png", "epipolar.png"}
     assert {path.name for path in tmp_path.iterdir()} == {"a.png", "b.webp", "F.txt", "matches", "cache"}
@@ -362,7 +366,7 @@ def test_the_command(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (["image0=a.png"], "image1 is missing"),
         (["image0=a.png", "image1=no.png"], "no.png: cannot be read"),
@@ -370,12 +374,12 @@ def test_the_command(tmp_path: Path) -> None:
         (["image0=a.png", "image1=a.png", "pipeline=sift_magic"], "sift_gms"),
     ],
 )
-def test_what_cannot_be_done_is_told(arguments: list[str], told: str, tmp_path: Path) -> None:
+def test_what_cannot_be_done_is_told(arguments: list[str], message: str, tmp_path: Path) -> None:
     Image.fromarray(stereo()[0]).save(tmp_path / "a.png")
     (tmp_path / "F.txt").write_text("1 2 3\n")
     done = run_python("-m", "fmtorch.match", *arguments, cwd=tmp_path)
     assert done.returncode == 1
-    assert told in done.stderr
+    assert message in done.stderr
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "matches").exists()
 

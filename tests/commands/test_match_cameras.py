@@ -84,13 +84,13 @@ def test_calibrations_follow_the_reduction(pair: ImagePair, pipeline: Pipeline) 
     assert (2 * by_hand.focals).tolist() == pytest.approx(reduced.focals.tolist(), rel=1e-9)
 
 
-@pytest.mark.parametrize(("cameras", "told"), [
+@pytest.mark.parametrize(("cameras", "message"), [
     ({"K0": np.eye(3)}, r"K0 has a focal length of 1 for an image of 1536 x 1024 pixels; it must be in pixels"),
     ({"K0": np.diag([1500, 1500, 1.0])[None]}, r"K0 has shape \(1, 3, 3\); it must be \(3, 3\)"),
     ({"focal": "some"}, "focal is 'some'"), ({"focal": np.ones((1, 2, 2))}, r"focal has shape \(1, 2, 2\)"),
 ])  # fmt: skip
-def test_what_no_camera_is(cameras: dict[str, object], told: str, pair: ImagePair, pipeline: Pipeline) -> None:
-    with pytest.raises(ValueError, match=told):
+def test_what_no_camera_is(cameras: dict[str, object], message: str, pair: ImagePair, pipeline: Pipeline) -> None:
+    with pytest.raises(ValueError, match=message):
         matched(pair, pipeline, **cameras)
 
 
@@ -176,14 +176,14 @@ def test_distortion_is_taken_out_and_sizes_must_fit(tmp_path: Path) -> None:
         photographs(paths, tmp_path / "cameras.txt", None, True)
 
 
-@pytest.mark.parametrize(("cameras", "K", "told"), [
+@pytest.mark.parametrize(("cameras", "K", "message"), [
     (Path("none.json"), None, "cameras=none.json: no such file; it must be unknown, shared, exif"),
     (Path("exif"), "1,2,3,4", "cameras and K are given"), (None, "1,2,3", "K=1,2,3; it must be fx,fy,cx,cy"),
     (None, "0,1,2,3", "it must be fx"), (None, "a,b,c,d", "it must be fx"), (None, [1.0, 2.0, 3.0], "it must be fx"),
 ])  # fmt: skip
-def test_what_is_no_camera_of_a_command(cameras: Path | None, K: object, told: str, tmp_path: Path) -> None:
+def test_what_is_no_camera_of_a_command(cameras: Path | None, K: object, message: str, tmp_path: Path) -> None:
     path = with_exif(tmp_path, "a.jpg")
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=message):
         photographs([path, path], cameras, K, True)  # type: ignore[arg-type]
 
 

@@ -153,7 +153,7 @@ def test_three_right_pairs_are_not_said_to_be_certain() -> None:
 
 @pytest.mark.parametrize("order", [["ratio", "one_to_one"], ["one_to_one", "ratio"]])
 def test_a_pipeline_is_drawn_again_as_it_was_and_a_difference_is_said(order: list[str], tmp_path: Path) -> None:
-    one, other = (pair(name, draw(tmp_path / "a.png", 0), draw(tmp_path / "b.png", 0, shift=12)) for name in "ab")
+    first, second = (pair(name, draw(tmp_path / "a.png", 0), draw(tmp_path / "b.png", 0, shift=12)) for name in "ab")
     overrides = [
         "features.max_features=300",
         "estimator=lmeds",
@@ -161,7 +161,7 @@ def test_a_pipeline_is_drawn_again_as_it_was_and_a_difference_is_said(order: lis
         f"pruner=[{','.join(order)}]",
     ]
     config = compose("match", ("pipeline=sift_ratio", "cache=off", *overrides))
-    rows = evaluate(presets.build_pipeline(config).run([one, other], seed=3), seed=3)
+    rows = evaluate(presets.build_pipeline(config).run([first, second], seed=3), seed=3)
     F = np.array([0, 0, 1, 0, 0, 0, -1, 0, 0]) / np.sqrt(2)  # of a vertical motion; that of the images is horizontal
     rows[1] = dataclasses.replace(rows[1], F=F.tolist(), nsgd=0.0)
     identity = {"pipeline": "sift_ratio", "seed": 3, **presets.stages(config)}
@@ -169,8 +169,8 @@ def test_a_pipeline_is_drawn_again_as_it_was_and_a_difference_is_said(order: lis
     (r,) = report.named([RunFolder.load(tmp_path / "run")])
     pipeline = rebuilt(r, SHOWN)
     assert list(pipeline.pruners) == order
-    assert shown_pair(one, [r], {r.name: pipeline}).notes == []
-    shown = shown_pair(other, [r], {r.name: pipeline})
+    assert shown_pair(first, [r], {r.name: pipeline}).notes == []
+    shown = shown_pair(second, [r], {r.name: pipeline})
     assert (shown.name, [(seen.run, seen.nsgd) for seen in shown.runs]) == ("b", [("sift_ratio", 0.0)])
     (note,) = shown.notes
     assert note.startswith("sift_ratio gives another F when it is drawn again: NSGD 0.")
@@ -179,8 +179,8 @@ def test_a_pipeline_is_drawn_again_as_it_was_and_a_difference_is_said(order: lis
 
 
 def test_a_result_that_cannot_be_had_again_is_said(tmp_path: Path) -> None:
-    one = pair("a", draw(tmp_path / "a.png", 0), draw(tmp_path / "b.png", 0, shift=12))
-    images = [read_image(source) for source in (one.image0, one.image1)]
+    shown = pair("a", draw(tmp_path / "a.png", 0), draw(tmp_path / "b.png", 0, shift=12))
+    images = [read_image(source) for source in (shown.image0, shown.image1)]
     F = np.array([0, 0, 0, 0, 0, -1, 0, 1, 0]) / np.sqrt(2)
     solved, failed = {"ok": True, "nsgd": 0.0, "F": F.tolist()}, {"ok": False, "nsgd": 1.0, "F": None}
     estimate = Estimate(
@@ -190,10 +190,10 @@ def test_a_result_that_cannot_be_had_again_is_said(tmp_path: Path) -> None:
         ("",),
         torch.zeros(1).long(),
     )
-    lost, found = Outcome(one, reason="no keypoints"), Outcome(one, estimate=estimate)
-    assert "(no keypoints), unlike in its run" in difference(one, images, solved, lost)
-    assert "NSGD 0.0000, unlike in its run" in difference(one, images, failed, found)
-    assert difference(one, images, solved, found) == difference(one, images, failed, lost) == ""
+    lost, solution = Outcome(shown, reason="no keypoints"), Outcome(shown, estimate=estimate)
+    assert "(no keypoints), unlike in its run" in difference(shown, images, solved, lost)
+    assert "NSGD 0.0000, unlike in its run" in difference(shown, images, failed, solution)
+    assert difference(shown, images, solved, solution) == difference(shown, images, failed, lost) == ""
 
 
 def test_an_older_run_is_drawn_where_its_pruners_have_one_order(tmp_path: Path) -> None:

@@ -66,9 +66,9 @@ def test_one_is_compiled_into_a_kernel(tmp_path: Path, monkeypatch: pytest.Monke
 def test_the_installed_numba_has_the_private_names(tmp_path: Path) -> None:
     module = load(tmp_path, SOURCE)
     module.sums(2, np.zeros(2))
-    (made,) = module.positive._dispatcher.overloads.values()
-    assert type(made.library).__name__ == "InnerLibrary"
-    assert made.library.get_pointer_to_function(made.fndesc.llvm_func_name) == 0
+    (result,) = module.positive._dispatcher.overloads.values()
+    assert type(result.library).__name__ == "InnerLibrary"
+    assert result.library.get_pointer_to_function(result.fndesc.llvm_func_name) == 0
 
 
 def test_garbage_is_collected_afterwards_as_before(tmp_path: Path) -> None:

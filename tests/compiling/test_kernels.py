@@ -163,8 +163,8 @@ def test_what_was_compiled_is_kept_and_told_once(
     tmp_path: Path, cache: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert result(load(tmp_path)) == EXPECTED
-    told = capsys.readouterr().err
-    assert [line.split(" for ")[0] for line in told.splitlines()] == ["compiling rows and what else is missing"]
+    messages = capsys.readouterr().err
+    assert [line.split(" for ")[0] for line in messages.splitlines()] == ["compiling rows and what else is missing"]
     files = {path: path.stat().st_ino for path in cache.rglob("*.bin")}
     assert len(files) == 2
     assert result(load(tmp_path)) == EXPECTED
@@ -207,12 +207,12 @@ def test_two_processes_compile_together(
 def test_the_other_process_compiles_what_it_is_told(module: types.ModuleType, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "fmtorch.compiling.process", "fmtorch.compiling.together"]
     path = os.pathsep.join([str(REPOSITORY), str(tmp_path)])
-    told = subprocess.run(
+    done = subprocess.run(
         command, input="some_kernels rows 1 of 1: \n", capture_output=True, text=True, check=True,
         env={**os.environ, "PYTHONPATH": path},
     )  # fmt: skip
-    assert told.stdout.split() == ["ready", "rows"]
-    assert "1 of 1: compiling rows" in told.stderr
+    assert done.stdout.split() == ["ready", "rows"]
+    assert "1 of 1: compiling rows" in done.stderr
     assert module.rows.kept
 
 
@@ -247,17 +247,17 @@ def test_an_edited_kernel_outside_the_package_is_compiled_anew(tmp_path: Path) -
 
 
 def test_kernels_that_a_function_makes_have_names_of_their_own() -> None:
-    def made(by: float, **options: str) -> Kernel[..., float]:
+    def multiplier(by: float, **options: str) -> Kernel[..., float]:
         @kernel(**options)
         def scaled(x: float) -> float:
             return x * by
 
         return scaled
 
-    assert made(2.0, name="doubled")(1.0) == 2
-    assert made(3.0, name="tripled")(1.0) == 3
+    assert multiplier(2.0, name="doubled")(1.0) == 2
+    assert multiplier(3.0, name="tripled")(1.0) == 3
     with pytest.raises(ValueError, match=r"two kernels are called .*doubled: make each with a name="):
-        made(4.0, name="doubled")
+        multiplier(4.0, name="doubled")
 
 
 def test_a_damaged_file_is_compiled_anew(tmp_path: Path, cache: Path) -> None:
@@ -446,13 +446,13 @@ def test_the_storage_command_lists_and_clears_them(module: types.ModuleType, cac
     result(module)
     (tmp_path / "here").mkdir()
 
-    def told(*options: str) -> str:
+    def listing(*options: str) -> str:
         environment = {"FMTORCH_CACHE": str(cache.parent)}
         done = run_command("storage", *options, cwd=tmp_path / "here", environment=environment)
         assert done.returncode == 0, done.stderr
         return done.stdout
 
     version = next(cache.iterdir()).name
-    assert f"{version}, used {time.strftime('%Y-%m-%d')} │     2 │" in told()
-    assert version not in told("--clear-kernels")
+    assert f"{version}, used {time.strftime('%Y-%m-%d')} │     2 │" in listing()
+    assert version not in listing("--clear-kernels")
     assert not cache.exists()

@@ -55,25 +55,25 @@ def _rows(count, dtype):
 
 @pytest.mark.filterwarnings("ignore:divide by zero|invalid value:RuntimeWarning")
 def test_compiled_operators_do_to_each_lane_what_they_do_to_arrays() -> None:
-    values, made = _rows(LANES, np.float64), []
+    values, results = _rows(LANES, np.float64), []
     for each in (in_doubles, in_doubles.function):
         out, masks, sums = np.zeros((6, LANES)), np.zeros((2, LANES), np.bool_), np.zeros(4)
         each(values, out, masks, sums)
-        made.append((out, masks, sums))
-    for compiled, plain in zip(*made, strict=True):
+        results.append((out, masks, sums))
+    for compiled, plain in zip(*results, strict=True):
         np.testing.assert_array_equal(compiled, plain)
-    assert made[0][1].any()
-    assert not made[0][1].all()
+    assert results[0][1].any()
+    assert not results[0][1].all()
 
 
 def test_float32_stays_float32() -> None:
-    values, made = _rows(SINGLES, np.float32), []
+    values, results = _rows(SINGLES, np.float32), []
     values[0, :5] = [1, 2, 3, 4, 5]
     for each in (in_singles, in_singles.function):
         out, sums = np.zeros((2, SINGLES), np.float32), np.zeros(1)
         each(values, out, sums)
-        made.append((out, sums))
-    for compiled, plain in zip(*made, strict=True):
+        results.append((out, sums))
+    for compiled, plain in zip(*results, strict=True):
         np.testing.assert_array_equal(compiled, plain)
 
 
@@ -101,11 +101,11 @@ def test_a_solver_called_without_numba_finds_the_same_models() -> None:
     generator = np.random.default_rng(0)
     points = np.tile(generator.normal(size=(2, 30)), (2, 1)) + 0.1 * generator.normal(size=(4, 30))
     sample = np.stack([generator.permutation(30)[:5] for _ in range(LANES + 3)], 1)
-    depth, made = np.full((2, LANES + 3), 1.2), []
+    depth, results = np.full((2, LANES + 3), 1.2), []
     for each in (five_point, five_point.function):
         F, draw = np.zeros((10 * sample.shape[1], 9), np.float32), np.zeros(10 * sample.shape[1], np.int64)
         count = each(points, sample, depth, np.zeros(4), F, draw)
-        made.append((count, F, draw))
-    assert made[0][0] > LANES
-    for compiled, plain in zip(*made, strict=True):
+        results.append((count, F, draw))
+    assert results[0][0] > LANES
+    for compiled, plain in zip(*results, strict=True):
         np.testing.assert_array_equal(compiled, plain)

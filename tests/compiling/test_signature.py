@@ -101,9 +101,9 @@ print(end(Line(np.arange(4.0), 2.0)))
 """
     )
     env = {**os.environ, "PYTHONPATH": str(REPOSITORY), "FMTORCH_CACHE": str(tmp_path / "cache")}
-    told = []
+    compiled = []
     for _ in range(2):
         done = subprocess.run([sys.executable, str(script)], env=env, capture_output=True, text=True, check=True)
         assert done.stdout == "6.0\n"
-        told.append("compiling end" in done.stderr)
-    assert told == [True, False]
+        compiled.append("compiling end" in done.stderr)
+    assert compiled == [True, False]

@@ -124,15 +124,15 @@ def test_it_changes_with_what_a_kernel_reaches(tmp_path: Path, old: str, new: st
 
 def test_it_changes_with_what_is_named_by_its_module(tmp_path: Path) -> None:
     """``module.function(x)`` reaches the function, and nothing else of the module."""
-    found = {}
+    versions = {}
     for scale, other in (("2.0", "1"), ("3.0", "1"), ("2.0", "2")):
         text = SOURCE.replace("= 2.0", f"= {scale}", 1).replace("x + 5", f"x + {other}")
         module = types.ModuleType("a_user")
         vars(module)["kernels_of_a_test"] = load(tmp_path, text)
         exec("def f(x):\n    return kernels_of_a_test.deepest(x)", vars(module))
-        found[scale, other] = version(module.f)
-    assert found["2.0", "1"] != found["3.0", "1"]
-    assert found["2.0", "1"] == found["2.0", "2"]
+        versions[scale, other] = version(module.f)
+    assert versions["2.0", "1"] != versions["3.0", "1"]
+    assert versions["2.0", "1"] == versions["2.0", "2"]
 
 
 CONSTANTS = ["{0.5, 1, 1.0, True}", "frozenset({'a', 'b', 'c'})", "{'b': 1, 'a': (2, None)}", "np.float32(2)", "2",
@@ -150,17 +150,19 @@ def of_constants(folder: Path) -> dict[str, str]:
 
 
 def test_every_constant_counts_by_its_value_and_type(tmp_path: Path) -> None:
-    found = of_constants(tmp_path)
-    assert len(set(found.values())) == len(CONSTANTS)
-    assert of_constants(tmp_path) == found
+    versions = of_constants(tmp_path)
+    assert len(set(versions.values())) == len(CONSTANTS)
+    assert of_constants(tmp_path) == versions
 
 
 def test_names_beyond_the_first_bytes(tmp_path: Path) -> None:
     """A module may have more names than one argument of an instruction can count."""
     names = [f"name{i}" for i in range(400)]
     text = "\n".join(f"{name} = {i}" for i, name in enumerate(names)) + f"\ndef f():\n    return {' + '.join(names)}\n"
-    found = {version(load(tmp_path, text.replace(f"name{i} = {i}\n", f"name{i} = -1\n")).f) for i in range(0, 399, 7)}
-    assert len(found) == 57
+    versions = {
+        version(load(tmp_path, text.replace(f"name{i} = {i}\n", f"name{i} = -1\n")).f) for i in range(0, 399, 7)
+    }
+    assert len(versions) == 57
 
 
 @pytest.mark.parametrize("value", ["object()", "sys.modules['tests.conftest'].oracle"])
@@ -175,7 +177,7 @@ def test_every_process_tells_the_same_versions() -> None:
         "from fmtorch.estimators.precompiled import WITH_FOCALS; import json;"
         "print(json.dumps([each.version for each in WITH_FOCALS]))"
     )
-    told = [
+    printed = [
         subprocess.run(
             [sys.executable, "-c", code], env={**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": str(REPOSITORY)},
             capture_output=True, text=True, check=True,
@@ -183,7 +185,7 @@ def test_every_process_tells_the_same_versions() -> None:
         for seed in ("1", "2")
     ]  # fmt: skip
     here = [each.version for each in WITH_FOCALS]  # with the checks that tests wrap around functions
-    assert [json.loads(each) for each in told] == [here, here]
+    assert [json.loads(each) for each in printed] == [here, here]
     assert len(set(here)) == len(here)
 
 
@@ -222,11 +224,11 @@ def test_functions_of_one_name_kept_by_two_processes_stay_two(tmp_path: Path) ->
     (tmp_path / "clashing.py").write_text(CLASHING)
     path = os.pathsep.join([str(REPOSITORY), str(tmp_path)])
     env = {**os.environ, "PYTHONPATH": path, "FMTORCH_CACHE": str(tmp_path / "cache")}
-    told = [
+    printed = [
         subprocess.run(
             [sys.executable, "-c", f"from clashing import *; print({calls})"],
             env=env, capture_output=True, text=True, check=True,
         ).stdout.split()
         for calls in ("of_ones(5)", "of_tens(5)", "of_ones(5), of_tens(5)", "of_tens(5), of_ones(5)")
     ]  # fmt: skip
-    assert told == [["8"], ["80"], ["8", "80"], ["80", "8"]]
+    assert printed == [["8"], ["80"], ["8", "80"], ["80", "8"]]

@@ -26,7 +26,7 @@ FAST = {"estimator": "msac", "hypotheses": 100}
 
 def test_a_list_of_pairs_is_a_padded_batch() -> None:
     batch = collate(PAIRS)
-    whole = fmtorch.find_fundamental(
+    batched = fmtorch.find_fundamental(
         batch.x0, batch.x1, mask=batch.mask, quality=batch.quality, lafs0=batch.lafs0, lafs1=batch.lafs1,
         size0=batch.size0, size1=batch.size1, key=batch.key,
     )  # fmt: skip
@@ -35,8 +35,8 @@ def test_a_list_of_pairs_is_a_padded_batch() -> None:
         lafs0=[c.lafs0[0] for c in PAIRS], lafs1=[c.lafs1[0] for c in PAIRS], size0=(640, 960), size1=[640, 960],
         key=[1, 2, 3],
     )  # fmt: skip
-    assert torch.equal(listed.F, whole.F)
-    assert torch.equal(listed.inliers, whole.inliers)
+    assert torch.equal(listed.F, batched.F)
+    assert torch.equal(listed.inliers, batched.inliers)
     assert bool(listed.ok.all())
 
 

@@ -22,7 +22,7 @@ from fmtorch.core.recipes import Here, Recipe
 PROCESSES = Execution("processes", 2)
 
 
-def made(folder: Path, size: int = 0) -> tuple[Path, bytes]:
+def make_needs(folder: Path, size: int = 0) -> tuple[Path, bytes]:
     """What workers need; each process that makes it leaves a file."""
     (folder / f"made-{os.getpid()}-{time.monotonic_ns()}").touch()
     return folder, bytes(size)
@@ -69,7 +69,7 @@ def calls(
 @pytest.mark.parametrize("kind", ["threads", "processes"])
 def test_results_of_each_job(kind: str, tmp_path: Path) -> None:
     jobs = [[i, i + 100] for i in range(20)]
-    results, reasons, yielded = calls(functools.partial(made, tmp_path), Execution(kind, 2), jobs)
+    results, reasons, yielded = calls(functools.partial(make_needs, tmp_path), Execution(kind, 2), jobs)
     assert results == {i: i * i for job in jobs for i in job}
     assert reasons == {}
     assert sorted(yielded) == jobs
@@ -78,14 +78,14 @@ def test_results_of_each_job(kind: str, tmp_path: Path) -> None:
 
 def test_a_long_recipe_is_sent_to_workers_that_have_it_not(tmp_path: Path) -> None:
     size = 20 * recipes.SENT_ALONG
-    results, _, _ = calls(functools.partial(made, tmp_path, size), PROCESSES, [[i] for i in range(30)])
+    results, _, _ = calls(functools.partial(make_needs, tmp_path, size), PROCESSES, [[i] for i in range(30)])
     assert results == {i: i * i for i in range(30)}
     assert len(list(tmp_path.glob("made-*"))) <= 2
 
 
 def test_what_ends_its_workers_is_known_and_others_are_done(tmp_path: Path) -> None:
     jobs = [[1, 2], [3, -4, 5], [6, 7], [8], [-9], [10]]
-    results, reasons, yielded = calls(functools.partial(made, tmp_path), PROCESSES, jobs)
+    results, reasons, yielded = calls(functools.partial(make_needs, tmp_path), PROCESSES, jobs)
     assert results == {i: i * i for i in (1, 2, 3, 5, 6, 7, 8, 10)}
     assert reasons == {-4: DEATH, -9: DEATH}
     assert sorted(i for job in yielded for i in job) == sorted(i for job in jobs for i in job)
@@ -93,7 +93,7 @@ def test_what_ends_its_workers_is_known_and_others_are_done(tmp_path: Path) -> N
 
 
 def test_a_lone_job_that_ends_its_workers(tmp_path: Path) -> None:
-    assert calls(functools.partial(made, tmp_path), PROCESSES, [[-1]])[:2] == ({}, {-1: DEATH})
+    assert calls(functools.partial(make_needs, tmp_path), PROCESSES, [[-1]])[:2] == ({}, {-1: DEATH})
 
 
 def test_workers_that_cannot_begin_are_no_pairs_fault(tmp_path: Path) -> None:
@@ -103,7 +103,7 @@ def test_workers_that_cannot_begin_are_no_pairs_fault(tmp_path: Path) -> None:
 
 def test_without_a_reason_to_give_workers_that_die_are_an_error(tmp_path: Path) -> None:
     with pytest.raises(WorkersLost, match="fewer workers"):
-        calls(functools.partial(made, tmp_path), PROCESSES, [[1], [-2]], give_up=None)
+        calls(functools.partial(make_needs, tmp_path), PROCESSES, [[1], [-2]], give_up=None)
 
 
 def fails(needed: object, job: int) -> int:
@@ -113,7 +113,7 @@ def fails(needed: object, job: int) -> int:
 @pytest.mark.parametrize("kind", ["threads", "processes"])
 def test_what_a_call_raises_is_raised_here(kind: str, tmp_path: Path) -> None:
     execution = Execution(kind, 2)
-    source: Any = Here(None) if execution.shared else Recipe(functools.partial(made, tmp_path))
+    source: Any = Here(None) if execution.shared else Recipe(functools.partial(make_needs, tmp_path))
     with pytest.raises(ValueError, match=r"job \d is wrong"):
         list(Calls(Team(execution), source, fails, lambda job, result: None).each([1, 2, 3]))
 
@@ -136,10 +136,10 @@ def test_interrupted_what_is_under_way_is_kept() -> None:
 
 
 def test_another_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recipe = Recipe(functools.partial(made, tmp_path))
+    recipe = Recipe(functools.partial(make_needs, tmp_path))
     monkeypatch.setattr(recipes, "__version__", "9.9")
     with pytest.raises(ValueError, match=r"a worker has fmtorch 9\.9"):
-        recipe.call(squares, whole=True)([1])
+        recipe.call(squares, with_recipe=True)([1])
 
 
 class Own(ThreadPoolExecutor):
@@ -150,7 +150,7 @@ def test_an_executor_of_ones_own(tmp_path: Path) -> None:
     execution = Execution(make=functools.partial(Own, 3))
     team = Team(execution)
     results: list[int] = []
-    source = Recipe(functools.partial(made, tmp_path))
+    source = Recipe(functools.partial(make_needs, tmp_path))
     list(Calls(team, source, squares, lambda job, result: results.extend(result)).each([[i] for i in range(9)]))
     assert sorted(results) == [i * i for i in range(9)]
     assert team.size == 3

@@ -103,15 +103,15 @@ def test_what_can_be_converted_is() -> None:
     assert given["size"].tolist() == [480, 640]
     assert (given["steps"], given["scale"], given["taus"]) == (2, 0.5, (0.5, 0.7))
     assert checked(distance)(F, X.half())["x"].dtype == torch.float32
-    one = checked(distance, common_type=True)(F.double(), X)
-    assert one["x"].dtype == torch.float64
+    arguments = checked(distance, common_type=True)(F.double(), X)
+    assert arguments["x"].dtype == torch.float64
     assert checked(distance)(F.double(), X)["x"].dtype == torch.float32
 
 
 def test_models_are_one_a_set_of_matches_or_several() -> None:
     x0, x1 = torch.rand(2, 4, 20, 2) * 100
-    one, several = torch.rand(4, 3, 3), torch.rand(4, 6, 3, 3)
-    assert geometry.refine(one, x0, x1, iterations=1).shape == one.shape
+    single, several = torch.rand(4, 3, 3), torch.rand(4, 6, 3, 3)
+    assert geometry.refine(single, x0, x1, iterations=1).shape == single.shape
     assert geometry.refine(several, x0, x1, iterations=1).shape == several.shape
     for wrong in (torch.rand(3, 3), torch.rand(3, 3, 3), torch.rand(4, 2, 2, 3, 3)):
         with pytest.raises(ValueError, match=r"leading dimensions .*; they must be \(4,\), as of x0, or \(4,\)"):

@@ -86,7 +86,7 @@ class Wide:
 
 
 @pytest.mark.parametrize(
-    ("target", "values", "told"),
+    ("target", "values", "message"),
     [
         (Wide, {"threshold": "x"}, "here.threshold=x; it must be a number"),
         (Wide, {}, "here: threshold is missing"),
@@ -98,8 +98,8 @@ class Wide:
         (any_more, {"a": None, "b": 1}, "here.a=null; it must be a whole number"),
     ],
 )
-def test_what_is_wrong_is_named(target: Callable[..., Any], values: dict[str, Any], told: str) -> None:
-    with pytest.raises(ValueError, match=told):
+def test_what_is_wrong_is_named(target: Callable[..., Any], values: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         expect_options(target, values, "here")
 
 

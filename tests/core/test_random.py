@@ -46,12 +46,12 @@ def test_known_figures() -> None:
 
 
 def test_the_same_in_any_batch_and_any_slice_of_draws() -> None:
-    whole = bits(3, KEYS, Stream.SAMPLING, 0, 64, 7)
+    together = bits(3, KEYS, Stream.SAMPLING, 0, 64, 7)
     for i, key in enumerate(KEYS):
-        assert torch.equal(bits(3, key[None], Stream.SAMPLING, 0, 64, 7)[0], whole[i])
-    assert torch.equal(bits(3, KEYS.flip(0), Stream.SAMPLING, 0, 64, 7).flip(0), whole)
+        assert torch.equal(bits(3, key[None], Stream.SAMPLING, 0, 64, 7)[0], together[i])
+    assert torch.equal(bits(3, KEYS.flip(0), Stream.SAMPLING, 0, 64, 7).flip(0), together)
     parts = [bits(3, KEYS, Stream.SAMPLING, start, 16, 7) for start in range(0, 64, 16)]
-    assert torch.equal(torch.cat(parts, 1), whole)
+    assert torch.equal(torch.cat(parts, 1), together)
 
 
 def test_late_draws_do_not_overflow() -> None:

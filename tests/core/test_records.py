@@ -75,14 +75,14 @@ def test_what_does_not_fit_is_named(changes: dict[str, Any], error: type[Excepti
 def test_a_derived_record_is_another_one_of_its_kind() -> None:
     sheet = Sheet(torch.zeros(3, 2), torch.ones(2, dtype=torch.int64))
     note, inner = torch.ones(3, requires_grad=True), torch.zeros(3, 2).requires_grad_()
-    made = sheet.derived(x=inner, note=note)
-    assert isinstance(made, Sheet)
-    assert made.note is note
-    assert made.size is sheet.size
+    derived = sheet.derived(x=inner, note=note)
+    assert isinstance(derived, Sheet)
+    assert derived.note is note
+    assert derived.size is sheet.size
     assert sheet.note is None
-    assert made.requires_grad
-    cut = made.detach()
+    assert derived.requires_grad
+    cut = derived.detach()
     assert not cut.requires_grad
     assert torch.equal(cut.note, note)
     with pytest.raises(ValueError, match="note has shape"):  # what a user changes is checked
-        made.replace(note=torch.ones(2))
+        derived.replace(note=torch.ones(2))

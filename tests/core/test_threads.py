@@ -45,10 +45,10 @@ def test_pruners_and_estimators_of_a_pipeline_have_one_thread(threads: int, tmp_
     built = pipeline()
     built.pruners = {name: watching(pruner) for name, pruner in built.pruners.items()}  # type: ignore[misc]
     built.estimator = watching(built.estimator)  # type: ignore[assignment]
-    one = pair("a", draw(tmp_path / "a.png", 0), draw(tmp_path / "b.png", 0, shift=12))
-    assert not built.run([one])[0].reason
+    image_pair = pair("a", draw(tmp_path / "a.png", 0), draw(tmp_path / "b.png", 0, shift=12))
+    assert not built.run([image_pair])[0].reason
     assert seen == [1, 1, 1]
-    assert fmtorch.match(read_image(one.image0), read_image(one.image1), pipeline=built).ok
+    assert fmtorch.match(read_image(image_pair.image0), read_image(image_pair.image1), pipeline=built).ok
     assert seen[3:5] == [1, 1]
     assert torch.get_num_threads() == threads
 
@@ -128,7 +128,7 @@ def test_the_first_error_of_an_item_is_raised(threads: int) -> None:
 def test_a_batch_in_threads_has_the_bits_of_one_thread(threads: int, graph: bool) -> None:
     """Of pairs of many sizes with degenerate ones among them; gradients are summed in another order."""
     c = collate([*(scene(i, 20 + 61 * i % 400) for i in range(9)), *degenerate().values()])
-    estimator, found = presets.build("estimator", "msac", hypotheses=100, round=50), []
+    estimator, results = presets.build("estimator", "msac", hypotheses=100, round=50), []
     for count in (threads, 1):
         torch.set_num_threads(count)
         x0 = c.x0.double().requires_grad_()
@@ -137,11 +137,11 @@ def test_a_batch_in_threads_has_the_bits_of_one_thread(threads: int, graph: bool
         assert e.F.requires_grad == graph
         if graph:
             e.F.square()[:, 0, 1].sum().backward()
-        found.append((e, x0.grad))
-    (one, gradient), (other, expected) = found
+        results.append((e, x0.grad))
+    (threaded, gradient), (single, expected) = results
     for name in ("F", "inliers", "ok", "draws", "significance"):
-        assert torch.equal(getattr(one, name), getattr(other, name)), name
-    assert one.reason == other.reason
+        assert torch.equal(getattr(threaded, name), getattr(single, name)), name
+    assert threaded.reason == single.reason
     if graph:
         torch.testing.assert_close(gradient, expected)
 
@@ -175,11 +175,11 @@ def test_two_photographs_are_described_at_once(threads: int, tmp_path: Path) -> 
     expected = fmtorch.match(*images, pipeline=built)
     torch.set_num_threads(threads)
     built.extractor = together  # type: ignore[assignment]
-    found = fmtorch.match(*images, pipeline=built)
-    assert found.ok
-    assert torch.equal(found.F, expected.F)
+    matched = fmtorch.match(*images, pipeline=built)
+    assert matched.ok
+    assert torch.equal(matched.F, expected.F)
     for name in ("keypoints0", "keypoints1", "inliers"):
-        assert torch.equal(getattr(found, name), getattr(expected, name)), name
+        assert torch.equal(getattr(matched, name), getattr(expected, name)), name
 
 
 def test_workers_of_an_evaluation_share_no_threads(threads: int, tmp_path: Path) -> None:

@@ -159,13 +159,13 @@ def test_indexing_always_gives_a_batch(make: Callable[..., Any], index: Any, exp
     picked = record[index]
     assert type(picked) is type(record)
     for field in dataclasses.fields(record):
-        whole, part = getattr(record, field.name), getattr(picked, field.name)
+        value, part = getattr(record, field.name), getattr(picked, field.name)
         if field.name == "model":
-            assert part == whole
+            assert part == value
         elif field.name == "reason":
-            assert part == tuple(whole[i] for i in expected)
+            assert part == tuple(value[i] for i in expected)
         else:
-            assert torch.equal(part, whole[torch.tensor(expected, dtype=torch.int64)])
+            assert torch.equal(part, value[torch.tensor(expected, dtype=torch.int64)])
 
 
 @records

@@ -74,8 +74,8 @@ def test_sizes_of_one_image_and_points_as_opencv_stores_them_are_refused() -> No
 def test_whole_numbers_are_points_too() -> None:
     c = scene(0, 60)
     x0, x1 = (x[0].round().numpy() for x in (c.x0, c.x1))
-    whole, floating = (fmtorch.find_fundamental(x0.astype(kind), x1.astype(kind)) for kind in (np.int32, np.float64))
-    assert torch.equal(whole.F, floating.F)
+    integral, floating = (fmtorch.find_fundamental(x0.astype(kind), x1.astype(kind)) for kind in (np.int32, np.float64))
+    assert torch.equal(integral.F, floating.F)
 
 
 @pytest.mark.parametrize("metric", ["sgd", "nsgd", "nsgd_released", "inlier_rate"])

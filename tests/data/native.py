@@ -128,13 +128,18 @@ def write_bundler(folder: Path, cameras: int = 5) -> tuple[Path, list[dict[str, 
     points = rng.normal(size=(12, 3))
     lines, truth = ["# Bundle file v0.3", f"{cameras} {len(points)}"], []
     for i in range(cameras):
-        one = {"f": np.array(40.0 + i), "k": np.array([0.02 * i, -0.01]), "R": turned(0.2 * i), "t": rng.normal(size=3)}
-        one["t"] = one["t"] - [0, 0, 9.0]
+        camera = {
+            "f": np.array(40.0 + i),
+            "k": np.array([0.02 * i, -0.01]),
+            "R": turned(0.2 * i),
+            "t": rng.normal(size=3),
+        }
+        camera["t"] = camera["t"] - [0, 0, 9.0]
         if i == 3:
-            one = {name: 0 * value for name, value in one.items()}
-        truth.append(one)
-        lines.append(f"{float(one['f'])!r} {float(one['k'][0])!r} {float(one['k'][1])!r}")
-        lines += [" ".join(repr(float(v)) for v in row) for row in [*one["R"], one["t"]]]
+            camera = {name: 0 * value for name, value in camera.items()}
+        truth.append(camera)
+        lines.append(f"{float(camera['f'])!r} {float(camera['k'][0])!r} {float(camera['k'][1])!r}")
+        lines += [" ".join(repr(float(v)) for v in row) for row in [*camera["R"], camera["t"]]]
         write_image(folder / f"images/{i}.png", i, (SIZE[0] + 2 * i, SIZE[1]))
     for p, X in enumerate(points):
         seen = [i for i in range(cameras) if i <= p // 3]  # camera 0 sees all points, camera 2 the last six
@@ -143,4 +148,4 @@ def write_bundler(folder: Path, cameras: int = 5) -> tuple[Path, list[dict[str, 
     (folder / "gt_bundle.out").write_text("\n".join(lines) + "\n")
     listed = [f"images/{i}.png" + (" 0 40.5" if i % 2 else "") for i in range(cameras)]
     (folder / "list.txt").write_text("\n".join(listed) + "\n")
-    return folder, [{**one, "points": points} for one in truth]
+    return folder, [{**camera, "points": points} for camera in truth]

@@ -12,13 +12,13 @@ from fmtorch.data import DataError, ImageError, load, read_image
 from tests.data.native import SIZE, write_bundler
 
 
-def manuals_pixels(one: dict[str, np.ndarray], h: int, w: int, distorted: bool) -> np.ndarray:
+def manuals_pixels(camera: dict[str, np.ndarray], h: int, w: int, distorted: bool) -> np.ndarray:
     """``P = R X + t, p = -P / P.z, p' = f r(p) p`` about the image's middle, y up; as pixels with y down."""
-    P = one["points"] @ one["R"].T + one["t"]
+    P = camera["points"] @ camera["R"].T + camera["t"]
     p = -P[:, :2] / P[:, 2:]
     r2 = (p**2).sum(1, keepdims=True)
-    factor = 1 + one["k"][0] * r2 + one["k"][1] * r2**2 if distorted else 1.0
-    return one["f"] * factor * p * [1, -1] + [(w - 1) / 2, (h - 1) / 2]
+    factor = 1 + camera["k"][0] * r2 + camera["k"][1] * r2**2 if distorted else 1.0
+    return camera["f"] * factor * p * [1, -1] + [(w - 1) / 2, (h - 1) / 2]
 
 
 def test_points_are_where_the_manual_puts_them(tmp_path: Path) -> None:
@@ -26,17 +26,19 @@ def test_points_are_where_the_manual_puts_them(tmp_path: Path) -> None:
     dataset = load("bundler", root=folder, pairs=None)
     views = dataset.scenes[0].views  # type: ignore[attr-defined]
     assert [view.image.path.name for view in views] == ["0.png", "1.png", "2.png", "4.png"]  # 3 was not registered
-    for view, one in zip(views, [truth[i] for i in (0, 1, 2, 4)], strict=True):
+    for view, camera in zip(views, [truth[i] for i in (0, 1, 2, 4)], strict=True):
         h, w = view.image.size
         assert read_image(view.image).shape == (h, w)
-        X = one["points"] @ view.R.T + view.t
+        X = camera["points"] @ view.R.T + view.t
         assert (X[:, 2] > 0).all()
         assert np.linalg.det(view.R) == pytest.approx(1)
         ideal = X @ view.K.T
         ideal = ideal[:, :2] / ideal[:, 2:]
-        np.testing.assert_allclose(ideal, manuals_pixels(one, h, w, distorted=False), atol=1e-9)
+        np.testing.assert_allclose(ideal, manuals_pixels(camera, h, w, distorted=False), atol=1e-9)
         assert view.image.lens is not None
-        np.testing.assert_allclose(view.image.lens.distort(ideal), manuals_pixels(one, h, w, distorted=True), atol=1e-9)
+        np.testing.assert_allclose(
+            view.image.lens.distort(ideal), manuals_pixels(camera, h, w, distorted=True), atol=1e-9
+        )
     assert views[3].image.size == (SIZE[0] + 8, SIZE[1])
 
 

@@ -174,15 +174,15 @@ def test_binary_files_cut_anywhere_are_refused(tmp_path: Path) -> None:
     sparse = write_colmap(tmp_path / "scene") / "sparse/0"
     to_binary(sparse)
     for name, record in (("cameras.bin", "camera 3 of 3"), ("images.bin", "image 3 of 3")):
-        whole = (sparse / name).read_bytes()
-        for length in {0, 5, 8, 20, *range(30, len(whole), 31), len(whole) - 1}:
-            (sparse / name).write_bytes(whole[:length])
+        intact = (sparse / name).read_bytes()
+        for length in {0, 5, 8, 20, *range(30, len(intact), 31), len(intact) - 1}:
+            (sparse / name).write_bytes(intact[:length])
             with pytest.raises(DataError, match=rf"{name}: damaged or truncated, its {length} bytes end within"):
                 read_model(sparse)
-        (sparse / name).write_bytes(whole + b"\0" * 3)
+        (sparse / name).write_bytes(intact + b"\0" * 3)
         with pytest.raises(DataError, match=f"damaged, 3 bytes are left after {record}; copy it again"):
             read_model(sparse)
-        (sparse / name).write_bytes(whole)
+        (sparse / name).write_bytes(intact)
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -233,8 +233,8 @@ def test_depth_is_that_of_the_dense_reconstruction(tmp_path: Path) -> None:
     assert isinstance(dataset, DepthDataset)
     by_path = {image.path.name: image for pair in dataset for image in (pair.image0, pair.image1)}
     points = np.array([[4.0, 2.0], [5.4, 3.4], [5.6, 2.0], [0.0, 0.0], [3.0, 1.0], [-1.0, 5.0], [np.nan, 1.0]])
-    found = dataset.depth(by_path["00.png"], points)
-    np.testing.assert_array_equal(found, [depth[1, 2], depth[1, 2], depth[1, 3], *[np.nan] * 4])
+    sampled = dataset.depth(by_path["00.png"], points)
+    np.testing.assert_array_equal(sampled, [depth[1, 2], depth[1, 2], depth[1, 3], *[np.nan] * 4])
     assert (dataset.depth(by_path["01.png"], points[:2]) == 1).all()
     assert np.isnan(dataset.depth(by_path["02.png"], points)).all()  # it has no map
     assert not isinstance(load("colmap", root=tmp_path, sequences=["scene"], depth=False), DepthDataset)

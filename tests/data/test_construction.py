@@ -95,13 +95,13 @@ def test_the_command_makes_a_set_of_the_pairs_that_can_be_matched(
     scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run(tmp_path, monkeypatch, "count=null")
-    told = " ".join(capsys.readouterr().out.split())
-    assert "4 pairs of 6 images; 20 of 20 candidates were judged" in told
-    assert "cannot be used, the first because: " in told
-    made = load("fmbench", root=tmp_path / "Made")
-    assert [p.identity for p in made] == [f"Made/{scene}/{pair}" for scene in "ab" for pair in ("0-1", "1-2")]
+    output = " ".join(capsys.readouterr().out.split())
+    assert "4 pairs of 6 images; 20 of 20 candidates were judged" in output
+    assert "cannot be used, the first because: " in output
+    pairs = load("fmbench", root=tmp_path / "Made")
+    assert [p.identity for p in pairs] == [f"Made/{scene}/{pair}" for scene in "ab" for pair in ("0-1", "1-2")]
     source = {p.identity.removeprefix("Set"): p for p in load("cameras", root=scenes)}
-    for pair in made:
+    for pair in pairs:
         expected = source[pair.identity.removeprefix("Made")]
         assert min(np.abs(pair.F - expected.F).max(), np.abs(pair.F + expected.F).max()) < 1e-12
         for name in ("K0", "K1", "R", "t"):
@@ -134,7 +134,7 @@ def test_a_finished_set_is_not_made_again_and_another_is_refused(
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (["output=null"], "output is missing; it names the folder of the set that is made"),
         (["count=0"], "count=0; it must be a whole number of at least 1 or null"),
@@ -147,12 +147,12 @@ def test_a_finished_set_is_not_made_again_and_another_is_refused(
     ],
 )
 def test_a_mistake_is_told_in_one_line_and_nothing_written(
-    words: list[str], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    words: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(SystemExit, match=r"^error: ") as end:
         run(tmp_path, monkeypatch, *words)
-    assert told in str(end.value.code)
+    assert message in str(end.value.code)
     assert "\n" not in str(end.value.code)
     assert [path.name for path in tmp_path.iterdir()] == ["empty"]
 
@@ -163,11 +163,16 @@ def test_a_draw_is_the_same_however_it_is_interrupted(
     """Blocks of one candidate each; the first try ends after nine of them, whose verdicts are not asked for again."""
     monkeypatch.setattr("fmtorch.data.construction.BLOCK", 1)
     dataset = load("cameras", root=scenes)
-    whole = Construction(dataset, tmp_path / "Whole", count=3, seed=5)  # type: ignore[arg-type]
+    uninterrupted = Construction(dataset, tmp_path / "Whole", count=3, seed=5)  # type: ignore[arg-type]
     broken = Construction(dataset, tmp_path / "Made", count=3, seed=5)  # type: ignore[arg-type]
-    assert sorted(whole.order().tolist()) == list(range(20))
-    whole.begin()
-    passed = [rank for number, ranks in blocks(whole.order()) for rank in ranks if whole.judge(number, ranks).kept[0]]
+    assert sorted(uninterrupted.order().tolist()) == list(range(20))
+    uninterrupted.begin()
+    passed = [
+        rank
+        for number, ranks in blocks(uninterrupted.order())
+        for rank in ranks
+        if uninterrupted.judge(number, ranks).kept[0]
+    ]
     assert len(passed) == 4
     broken.begin()
     for number, ranks in list(blocks(broken.order()))[:9]:
@@ -177,8 +182,8 @@ def test_a_draw_is_the_same_however_it_is_interrupted(
         "fmtorch.data.construction.matchable", lambda *given: asked.append(given) or rule.matchable(*given)
     )
     run(tmp_path, monkeypatch, "count=3", "seed=5", "workers=1")
-    last = whole.order().tolist().index(passed[2])
-    judged = [dataset.candidate(rank) for rank in whole.order()[9 : last + 1].tolist()]  # type: ignore[attr-defined]
+    last = uninterrupted.order().tolist().index(passed[2])
+    judged = [dataset.candidate(rank) for rank in uninterrupted.order()[9 : last + 1].tolist()]  # type: ignore[attr-defined]
     assert len(asked) == sum(4 not in place[1:] and place[1:] != (0, 2) for place in judged) > 0
     places = sorted(dataset.candidate(rank) for rank in passed[:3])  # type: ignore[attr-defined]
     assert [p.identity for p in load("fmbench", root=tmp_path / "Made")] == [
@@ -199,13 +204,13 @@ def test_undistorted_images_are_written_as_they_are_seen(tmp_path: Path, monkeyp
 
     monkeypatch.setattr("fmtorch.data.construction.matchable", lambda *_: True)
     dataset = load("colmap", root=write_colmap(tmp_path / "Source/scene"), pairs=None)
-    made = Construction(dataset, tmp_path / "Made", quality=100)  # type: ignore[arg-type]
-    made.begin()
-    for number, ranks in blocks(made.order()):
-        made.judge(number, ranks)
-    for scene, number in made.used(range(3)):
-        made.write_image(scene, number)
-    made.finish(range(3), {})
+    construction = Construction(dataset, tmp_path / "Made", quality=100)  # type: ignore[arg-type]
+    construction.begin()
+    for number, ranks in blocks(construction.order()):
+        construction.judge(number, ranks)
+    for scene, number in construction.used(range(3)):
+        construction.write_image(scene, number)
+    construction.finish(range(3), {})
     for ours, theirs in zip(load("fmbench", root=tmp_path / "Made"), dataset, strict=True):
         for image in ("image0", "image1"):
             a, b = (read_image(getattr(pair, image)).astype(int) for pair in (ours, theirs))

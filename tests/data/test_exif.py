@@ -52,10 +52,10 @@ def test_the_sensor_gives_the_focal_length_where_there_is_no_equivalent(
 ) -> None:
     tags = {"FocalLength": IFDRational(35), "FocalPlaneXResolution": IFDRational(round(100 * mm), 1)}
     tags |= {"FocalLengthIn35mmFilm": 0, **({} if unit is None else {"FocalPlaneResolutionUnit": unit})}
-    found = exif_focal(written(tmp_path, (2000, 3000), **tags))  # 100 px/mm: a sensor of 30 mm
-    assert found.focal == pytest.approx(3500, rel=1e-3)  # of inches, a whole number of pixels
-    assert found.deviation == 0.04
-    assert found.source.startswith("FocalLength 35 mm, FocalPlaneXResolution 100")
+    exif = exif_focal(written(tmp_path, (2000, 3000), **tags))  # 100 px/mm: a sensor of 30 mm
+    assert exif.focal == pytest.approx(3500, rel=1e-3)  # of inches, a whole number of pixels
+    assert exif.deviation == 0.04
+    assert exif.source.startswith("FocalLength 35 mm, FocalPlaneXResolution 100")
 
 
 def test_reduced_and_turned_images(tmp_path: Path) -> None:
@@ -63,9 +63,9 @@ def test_reduced_and_turned_images(tmp_path: Path) -> None:
     assert exif_focal(written(tmp_path, (400, 600), **plane)).focal == pytest.approx(700)
     assert exif_focal(written(tmp_path, (600, 400), **plane)).focal == pytest.approx(700)  # turned when it was reduced
     path = written(tmp_path, (2000, 3000), **plane, FocalLengthIn35mmFilm=30)
-    whole = exif_focal(path)
-    assert exif_focal(path, (3000, 2000)) == whole
-    assert exif_focal(path, (200, 300)).focal == pytest.approx(whole.focal / 10)
+    full_size = exif_focal(path)
+    assert exif_focal(path, (3000, 2000)) == full_size
+    assert exif_focal(path, (200, 300)).focal == pytest.approx(full_size.focal / 10)
 
 
 def test_every_format_that_holds_the_tags(tmp_path: Path) -> None:
@@ -98,10 +98,10 @@ def directory(entries: list[tuple[int, int, int, int]]) -> bytes:
     ({}, "no EXIF data"),
 ])  # fmt: skip
 def test_what_tells_no_focal_length_says_why(tags: dict[str, object], reason: str, tmp_path: Path) -> None:
-    found = exif_focal(written(tmp_path, (400, 600), **tags))
-    assert not found.known
-    assert math.isinf(found.deviation)
-    assert reason in found.source
+    exif = exif_focal(written(tmp_path, (400, 600), **tags))
+    assert not exif.known
+    assert math.isinf(exif.deviation)
+    assert reason in exif.source
 
 
 def test_files_that_are_no_images(tmp_path: Path) -> None:
@@ -114,28 +114,28 @@ def test_files_that_are_no_images(tmp_path: Path) -> None:
     assert exif_focal(tmp_path / "b.jpg") == pytest.approx(ExifFocal(math.nan, math.inf, "no EXIF data"), nan_ok=True)
 
 
-def sound(found: ExifFocal) -> bool:
+def sound(exif: ExifFocal) -> bool:
     """A focal length in pixels, or none and a reason."""
-    if found.known:
-        return 0.2 * 60 <= found.focal <= 50 * 60 and 0 < found.deviation < 1
-    return bool(found.source) and math.isinf(found.deviation)
+    if exif.known:
+        return 0.2 * 60 <= exif.focal <= 50 * 60 and 0 < exif.deviation < 1
+    return bool(exif.source) and math.isinf(exif.deviation)
 
 
 @PILLOWS_WARNINGS
 def test_damage_never_raises(tmp_path: Path) -> None:
     tags = {"FocalLength": IFDRational(35), "FocalPlaneXResolution": IFDRational(254), "FocalLengthIn35mmFilm": 30}
-    whole = written(tmp_path, (40, 60), **tags).read_bytes()
+    intact = written(tmp_path, (40, 60), **tags).read_bytes()
     assert exif_focal(tmp_path / "a.jpg").known
-    at = whole.index(b"Exif")
+    at = intact.index(b"Exif")
     rng, path, outcomes = np.random.default_rng(0), tmp_path / "b.jpg", set()
     for _ in range(1500):
-        data = bytearray(whole)
+        data = bytearray(intact)
         for position in rng.integers(at, at + 160, rng.integers(1, 6)):
             data[position] = rng.choice([0, 1, 127, 255, rng.integers(256)])
         path.write_bytes(data[: rng.integers(4, len(data))] if rng.random() < 0.2 else data)
-        found = exif_focal(path)
-        outcomes.add(found.known)
-        assert sound(found), found
+        exif = exif_focal(path)
+        outcomes.add(exif.known)
+        assert sound(exif), exif
     assert outcomes == {True, False}
 
 

@@ -79,9 +79,9 @@ def test_overlap_of_rendered_pairs_is_that_counted_pixel_by_pixel(rendered: Rend
     assert isinstance(overlaps, DepthOverlap)
     places = [rendered.candidate(rank) for rank in range(rendered.candidates)]
     assert len(places) == 3 * 6
-    found = [overlaps.of(place) for place in places]
-    assert found == [one_by_one(rendered, *place) for place in places]
-    assert min(found) < 0.4 < 0.6 < max(found)
+    shares = [overlaps.of(place) for place in places]
+    assert shares == [one_by_one(rendered, *place) for place in places]
+    assert min(shares) < 0.4 < 0.6 < max(shares)
 
 
 def test_a_grid_of_pixels_stands_for_all_of_them(rendered: RenderedScenePairs) -> None:
@@ -152,8 +152,8 @@ def test_a_bundler_file_knows_the_points_of_registered_cameras(tmp_path: Path) -
     dataset = load("bundler", root=folder, pairs=None)
     assert isinstance(dataset, ScenePairs)
     overlaps = overlap_of(dataset)
-    found = {(i, j): overlaps.of((0, i, j)) for i, j in itertools.combinations(range(4), 2)}
-    assert found == {(0, 1): 9 / 12, (0, 2): 6 / 12, (1, 2): 6 / 9, (0, 3): 0, (1, 3): 0, (2, 3): 0}
+    shares = {(i, j): overlaps.of((0, i, j)) for i, j in itertools.combinations(range(4), 2)}
+    assert shares == {(0, 1): 9 / 12, (0, 2): 6 / 12, (1, 2): 6 / 9, (0, 3): 0, (1, 3): 0, (2, 3): 0}
 
 
 def run(folder: Path, monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
@@ -170,8 +170,8 @@ def test_the_command_selects_by_overlap(tmp_path: Path, monkeypatch: pytest.Monk
     write_colmap(tmp_path / "Set/a")
     words = ["dataset=colmap", "dataset.root=Set", "dataset.sequences=[a]"]
     run(tmp_path, monkeypatch, *words, "overlap=[0.7,0.9]")
-    made = load("fmbench", root=tmp_path / "Made")
-    assert [pair.identity for pair in made] == ["Made/a/0-2", "Made/a/1-2"]
+    selected = load("fmbench", root=tmp_path / "Made")
+    assert [pair.identity for pair in selected] == ["Made/a/0-2", "Made/a/1-2"]
     rule = json.loads((tmp_path / "Made/pairs.json").read_text())["identity"]["rule"]
     assert rule == {"overlap": [0.7, 0.9], "by": "points"}
     with pytest.raises(SystemExit, match=r"holds pairs that differ in rule .*name another folder"):
@@ -189,10 +189,10 @@ def test_the_command_selects_from_rendered_scenes(
     overlaps = overlap_of(rendered)
     places = [rendered.candidate(rank) for rank in range(rendered.candidates)]
     expected = [(s, i, j) for s, i, j in places if 0.1 <= overlaps.of((s, i, j)) <= 0.6]
-    made = load("fmbench", root=tmp_path / "Made")
+    selected = load("fmbench", root=tmp_path / "Made")
     names = [scene.name for scene in rendered.scenes]
-    assert sorted(pair.identity for pair in made) == sorted(f"Made/{names[s]}/{i}-{j}" for s, i, j in expected)
-    for pair in made:
+    assert sorted(pair.identity for pair in selected) == sorted(f"Made/{names[s]}/{i}-{j}" for s, i, j in expected)
+    for pair in selected:
         (source,) = (
             rendered[rank] for rank, (s, i, j) in enumerate(places) if pair.identity == f"Made/{names[s]}/{i}-{j}"
         )

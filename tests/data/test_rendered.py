@@ -121,7 +121,7 @@ def test_digest_depends_on_what_defines_the_pairs_and_not_on_the_folder(root: Pa
 
 def test_an_interrupted_generation_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     task = Task("indoor", "test", 0, 0, Plan(1, 2, 1, 0.1))
-    whole = contents(generate(task, tmp_path / "whole"))
+    uninterrupted = contents(generate(task, tmp_path / "whole"))
     original = cv2.imwrite
     count = 0
 
@@ -135,7 +135,7 @@ def test_an_interrupted_generation_goes_on(tmp_path: Path, monkeypatch: pytest.M
         generate(task, tmp_path / "broken")
     assert contents(tmp_path / "broken") == {}  # no half a scene
     monkeypatch.undo()
-    assert contents(generate(task, tmp_path / "broken")) == whole
+    assert contents(generate(task, tmp_path / "broken")) == uninterrupted
 
 
 def test_two_at_once_do_not_clash(tmp_path: Path) -> None:
@@ -177,7 +177,7 @@ def test_no_texture_of_the_test_split_is_in_training() -> None:
 
     def pictures(split: str, number: int) -> set[bytes]:
         surfaces = [surfaces for family in FAMILIES for surfaces in built(family, split, number).surfaces]
-        atlases = {id(t): t.atlas for some in surfaces for t in some.textures}.values()
+        atlases = {id(t): t.atlas for surface in surfaces for t in surface.textures}.values()
         # Plain colours (a black case, grey metal) hold nothing that could be recognised.
         return {t.tobytes() for t in atlases if len(np.unique(t[2:-2, 2:4].reshape(-1, t.shape[2]), axis=0)) > 4}
 
@@ -191,10 +191,10 @@ def test_pairs_obey_the_rule_and_images_have_keypoints(tmp_path: Path) -> None:
     """At full scale: hundreds of keypoints, and more than 20 ratio matches near the true lines."""
     task = Task("collection", "train", 0, 0, Plan(1, 4, 3))
     views, pairs = read(generate(task, tmp_path))
-    found = [keypoints(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path, _ in views]
-    assert min(len(points) for points, _ in found) > 200
+    detected = [keypoints(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path, _ in views]
+    assert min(len(points) for points, _ in detected) > 200
     for i, j in pairs:
-        assert matchable(found[i], found[j], fundamental(views[i][1], views[j][1]))
+        assert matchable(detected[i], detected[j], fundamental(views[i][1], views[j][1]))
 
 
 def rule(wanted: set[tuple[int, int]]) -> Callable[[Keypoints, Keypoints, object], bool]:

@@ -65,9 +65,9 @@ def test_depth_is_the_reference_ray_casters() -> None:
     assert all(texture.opaque for texture in surfaces.textures)
     h, w = shot.camera.size
     points = np.random.default_rng(0).uniform(-0.5, [w - 0.5, h - 0.5], (60, 2))
-    found = depth_at(task, 0, points)
+    computed = depth_at(task, 0, points)
     direct = []
-    for (x, y), depth in zip(points, found, strict=True):
+    for (x, y), depth in zip(points, computed, strict=True):
         pixel, _ = first_hit(surfaces, shot.camera, round(x), round(y))
         piece, depths = first_hit(surfaces, shot.camera, x, y)
         # float32 buffers decide between pieces that are equally near, as where two walls meet

@@ -159,9 +159,9 @@ def test_a_mark_is_drawn_where_it_projects() -> None:
     c = camera(0.0, -5.0, 1.0, (0.0, 0.0, 1.0))  # frontal: no perspective shift of the centroid
     image = stage.radiance(c, (0.0, 0.0))[..., 0].astype(np.float64)
     yy, xx = np.mgrid[: SIZE[0], : SIZE[1]]
-    found = np.array([(image * xx).sum(), (image * yy).sum()]) / image.sum()
+    centroid = np.array([(image * xx).sum(), (image * yy).sum()]) / image.sum()
     mark = vec(-2 + 4 * (u + 0.5) / size, 0, 3 - 4 * (v + 0.5) / size)
-    np.testing.assert_allclose(found, c.project(mark[None])[0][0], atol=0.02)
+    np.testing.assert_allclose(centroid, c.project(mark[None])[0][0], atol=0.02)
 
 
 def test_textures_keep_their_mean_when_they_shrink_and_do_not_alias() -> None:

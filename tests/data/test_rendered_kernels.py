@@ -35,12 +35,12 @@ def take_reference(patch: pytest.MonkeyPatch) -> None:
 
 
 def stages(surfaces: Surfaces, light: Light, sky: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> list[Stage]:
-    made = [Stage(Geometry(surfaces), light, sky)]
+    built = [Stage(Geometry(surfaces), light, sky)]
     with monkeypatch.context() as patch:
         take_reference(patch)
-        made.append(Stage(Geometry(surfaces), light, sky))
-    np.testing.assert_array_equal(made[0].shadow, made[1].shadow)
-    return made
+        built.append(Stage(Geometry(surfaces), light, sky))
+    np.testing.assert_array_equal(built[0].shadow, built[1].shadow)
+    return built
 
 
 def assert_equal_views(pair: list[Stage], camera: Camera, monkeypatch: pytest.MonkeyPatch) -> np.ndarray:

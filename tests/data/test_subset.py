@@ -13,15 +13,15 @@ from tests.conftest import shared_path
 
 
 def test_pairs_digest_and_depth(tmp_path: Path) -> None:
-    whole = RenderedPairs(root=tmp_path, plan=Plan(1, 3, 2, scale=0.2), families=["indoor"], workers=1)
-    part = subset(whole, [len(whole) - 1])
+    dataset = RenderedPairs(root=tmp_path, plan=Plan(1, 3, 2, scale=0.2), families=["indoor"], workers=1)
+    part = subset(dataset, [len(dataset) - 1])
     assert isinstance(part, PairDataset)
     assert isinstance(part, DepthDataset)
-    assert [pair.identity for pair in part] == [whole[len(whole) - 1].identity]
-    assert part.digest != whole.digest
-    assert part.digest != subset(whole, [0]).digest or len(whole) == 1
+    assert [pair.identity for pair in part] == [dataset[len(dataset) - 1].identity]
+    assert part.digest != dataset.digest
+    assert part.digest != subset(dataset, [0]).digest or len(dataset) == 1
     x = np.array([[40.0, 30.0], [10.0, 70.0]])
-    assert np.array_equal(part.depth(part[0].image0, x), whole.depth(part[0].image0, x), equal_nan=True)
+    assert np.array_equal(part.depth(part[0].image0, x), dataset.depth(part[0].image0, x), equal_nan=True)
 
 
 def test_a_data_set_without_depth_stays_one() -> None:

@@ -36,8 +36,8 @@ def test_robust_inliers_of_real_frames_lie_on_the_lines_as_in_the_fmbench_copy()
         best = [a for a, b in cv2.BFMatcher().knnMatch(d0, d1, k=2) if a.distance < 0.8 * b.distance]
         x0 = np.array([keypoints0[m.queryIdx].pt for m in best])
         x1 = np.array([keypoints1[m.trainIdx].pt for m in best])
-        _, found = cv2.findFundamentalMat(x0, x1, cv2.USAC_MAGSAC, 1.0, 0.999, 2000)
-        inlier = found.ravel() > 0
+        _, mask = cv2.findFundamentalMat(x0, x1, cv2.USAC_MAGSAC, 1.0, 0.999, 2000)
+        inlier = mask.ravel() > 0
         if inlier.sum() >= 20:
             medians.append(np.median(mean_distance(pair.F, x0[inlier], x1[inlier])))
     verified = [median for median in medians if median <= 2]

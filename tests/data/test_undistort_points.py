@@ -64,9 +64,9 @@ def test_frames_follow_the_derivatives() -> None:
     lens = lens_of("OPENCV")
     points = np.random.default_rng(0).uniform(50, 400, (20, 2))
     frames = np.random.default_rng(1).normal(size=(20, 2, 2))
-    found = undistorted_frames(functools.partial(undistorted_points, lens), points, frames)
+    undistorted = undistorted_frames(functools.partial(undistorted_points, lens), points, frames)
     pinhole = undistorted_points(lens, points)
     step = 1e-3
     for column in (0, 1):  # the lens takes a short step along the frame of the pinhole to one along the photograph's
-        back = lens.distort(pinhole + step * found[..., column])
+        back = lens.distort(pinhole + step * undistorted[..., column])
         np.testing.assert_allclose((back - points) / step, frames[..., column], atol=5e-3)

@@ -51,6 +51,8 @@ ELSEWHERE = {
     r"dataset=(tum|kitti|colmap|bundler|fmbench dataset\.root=KITTI)": "tests/data runs these on data of their layout",
     r"pipeline=vismatch|(dataset=|runs/)pair_list": "tests/matching/test_vismatch.py runs a stand-in on lists of pairs",
     r"dataset=hpatches": "tests/evaluation/test_homographies.py runs these on sequences of its own",
+    r"'overlap=|HARD/": "tests/data/test_overlap.py, tests/scripts/test_benchmark_hard.py run these",
+    r"benchmark known_models": "needs the images of a scene; tests/scripts/test_benchmark_known_models.py has some",
     r"--config-dir my_conf features=": "tests/docs/test_own_parts.py runs this page",
 }
 """Commands that are not run here, and why."""
@@ -129,10 +131,10 @@ APPENDED = {
 
 def commands(page: str) -> list[str]:
     """The commands of a page's ```bash blocks, continued lines joined, comments at their ends kept."""
-    found = []
+    lines = []
     for block in re.findall(r"```bash\n(.*?)```", (SOURCE / page).read_text(encoding="utf-8"), flags=re.DOTALL):
-        found += [line.strip() for line in block.replace("\\\n", " ").splitlines() if line.strip()]
-    return found
+        lines += [line.strip() for line in block.replace("\\\n", " ").splitlines() if line.strip()]
+    return lines
 
 
 def smaller(command: str) -> list[str]:
@@ -277,30 +279,32 @@ def elsewhere(command: str) -> bool:
     return any(re.search(pattern, command) for pattern in ELSEWHERE)
 
 
-def those(slow: bool) -> list[object]:
+def parameters(slow: bool) -> list[object]:
     """Parameters: each page with its commands, in their order."""
     here = {page: [c for c in commands(page) if not elsewhere(c) and is_slow(c) == slow] for page in PAGES}
-    return [pytest.param(some, id=page) for page, some in here.items() if some]
+    return [pytest.param(page_commands, id=page) for page, page_commands in here.items() if page_commands]
 
 
-def run_all(some: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def run_all(page_commands: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(workplace)))
-    for command in some:
+    for command in page_commands:
         print(command)
         if ("report" in command or "sweep runs" in command) and not (workplace / "runs").exists():
             run(smaller("python -m fmtorch.eval pipeline=sift_ratio"), workplace)
         run(smaller(command), workplace)
 
 
-@pytest.mark.parametrize("some", those(slow=False))
-def test_the_commands_of_a_page_run(some: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run_all(some, workplace, monkeypatch)
+@pytest.mark.parametrize("page_commands", parameters(slow=False))
+def test_the_commands_of_a_page_run(page_commands: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_all(page_commands, workplace, monkeypatch)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("some", those(slow=True))
-def test_the_long_commands_of_a_page_run(some: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run_all(some, workplace, monkeypatch)
+@pytest.mark.parametrize("page_commands", parameters(slow=True))
+def test_the_long_commands_of_a_page_run(
+    page_commands: list[str], workplace: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_all(page_commands, workplace, monkeypatch)
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -24,8 +24,8 @@ def normalized(c: Correspondences, seed: int = 0, minimal: int = 7, i: int = 0) 
     """A pair of a batch in normalised units; None where it cannot be estimated."""
     batch = Batch.of(c.detach())
     with np.errstate(all="ignore"):  # as an estimate of a batch does
-        found = batch.normalized(batch.pair(i), i, seed, minimal)
-    return None if isinstance(found, str) else found[0]
+        result = batch.normalized(batch.pair(i), i, seed, minimal)
+    return None if isinstance(result, str) else result[0]
 
 
 def pair_of(c: Correspondences, seed: int = 0, i: int = 0) -> Pair:

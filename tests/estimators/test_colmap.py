@@ -39,23 +39,23 @@ def matched(name: str, index: int = 0) -> Matched:
 
 def options() -> Any:
     """Of COLMAP's verification, at our threshold and seed."""
-    made = pycolmap.TwoViewGeometryOptions(compute_relative_pose=True)
-    made.ransac.max_error, made.ransac.random_seed = THRESHOLD, SEED
-    return made
+    geometry_options = pycolmap.TwoViewGeometryOptions(compute_relative_pose=True)
+    geometry_options.ransac.max_error, geometry_options.ransac.random_seed = THRESHOLD, SEED
+    return geometry_options
 
 
 def cameras(m: Matched, known: bool) -> list[Any]:
     """COLMAP's cameras of a pair; where they are not known with its default focal length."""
     assert m.c.size0 is not None
     assert m.c.size1 is not None
-    made = []
+    pinholes = []
     for i, (K, size) in enumerate(((m.pair.K0, m.c.size0), (m.pair.K1, m.c.size1))):
         h, w = size[0].tolist()
         f = 1.2 * max(h, w)
         params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]] if known else [f, f, (w - 1) / 2, (h - 1) / 2]
-        made.append(pycolmap.Camera(camera_id=i + 1, model="PINHOLE", width=w, height=h, params=params))
-        made[i].has_prior_focal_length = known
-    return made
+        pinholes.append(pycolmap.Camera(camera_id=i + 1, model="PINHOLE", width=w, height=h, params=params))
+        pinholes[i].has_prior_focal_length = known
+    return pinholes
 
 
 def ours(m: Matched, **changes: Any) -> Estimate:
@@ -77,8 +77,8 @@ def test_fundamental_matrices_are_colmaps_to_the_last_bit(name: str, two_view: b
     if two_view:
         matches = np.repeat(np.arange(len(m.x0), dtype=np.uint32)[:, None], 2, 1)
         first, second = cameras(m, known=False)
-        found = pycolmap.estimate_two_view_geometry(first, m.x0, second, m.x1, matches, options())
-        F, inliers = found.F, np.asarray(found.inlier_matches)[:, 0]
+        geometry = pycolmap.estimate_two_view_geometry(first, m.x0, second, m.x1, matches, options())
+        F, inliers = geometry.F, np.asarray(geometry.inlier_matches)[:, 0]
     estimate = ours(m, two_view=two_view)
     assert bool(estimate.ok[0])
     assert np.array_equal(estimate.F[0].numpy(), unit(F))
@@ -89,17 +89,17 @@ def test_fundamental_matrices_are_colmaps_to_the_last_bit(name: str, two_view: b
 def test_poses_of_known_cameras_are_colmaps(name: str) -> None:
     """COLMAP's threshold of rays is of the mean of fx and fy, ours of their geometric mean."""
     m = matched(name)
-    found = pycolmap.estimate_essential_matrix(m.x0, m.x1, *cameras(m, known=True), options().ransac)
+    result = pycolmap.estimate_essential_matrix(m.x0, m.x1, *cameras(m, known=True), options().ransac)
     estimate = ours(m, K0=m.pair.K0, K1=m.pair.K1, two_view=False)
     assert bool(estimate.ok[0])
     stretch = max(abs(K[0, 0] / K[1, 1] - 1) for K in (m.pair.K0, m.pair.K1))
     tolerance = 1e-7 + stretch**2 / 8  # of the thresholds; rounding of pixels, 1e-13 px, times the condition of the fit
-    pose = found["cam2_from_cam1"]
+    pose = result["cam2_from_cam1"]
     assert estimate.R is not None
     assert estimate.t is not None
     assert estimate.R[0].numpy() == pytest.approx(pose.rotation.matrix(), abs=tolerance)
     assert estimate.t[0].numpy() == pytest.approx(pose.translation, abs=tolerance)
-    assert np.array_equal(estimate.inliers[0][m.c.mask[0]].numpy(), found["inlier_mask"])
+    assert np.array_equal(estimate.inliers[0][m.c.mask[0]].numpy(), result["inlier_mask"])
 
 
 @pytest.mark.parametrize("name", SETS)
@@ -107,13 +107,13 @@ def test_two_view_geometries_of_known_cameras_are_colmaps(name: str) -> None:
     m = matched(name)
     matches = np.repeat(np.arange(len(m.x0), dtype=np.uint32)[:, None], 2, 1)
     first, second = cameras(m, known=True)
-    found = pycolmap.estimate_two_view_geometry(first, m.x0, second, m.x1, matches, options())
-    assert pycolmap.TwoViewGeometryConfiguration(found.config).name == "CALIBRATED"
+    geometry = pycolmap.estimate_two_view_geometry(first, m.x0, second, m.x1, matches, options())
+    assert pycolmap.TwoViewGeometryConfiguration(geometry.config).name == "CALIBRATED"
     estimate = ours(m, K0=m.pair.K0, K1=m.pair.K1)
     assert estimate.R is not None
     assert estimate.focals is not None
     tolerance = 1e-7 + max(abs(K[0, 0] / K[1, 1] - 1) for K in (m.pair.K0, m.pair.K1)) ** 2 / 8
-    assert estimate.R[0].numpy() == pytest.approx(found.cam2_from_cam1.rotation.matrix(), abs=tolerance)
+    assert estimate.R[0].numpy() == pytest.approx(geometry.cam2_from_cam1.rotation.matrix(), abs=tolerance)
     f = [np.sqrt(K[0, 0] * K[1, 1]) for K in (m.pair.K0, m.pair.K1)]
     assert estimate.focals[0].tolist() == pytest.approx(f)
 
@@ -121,15 +121,15 @@ def test_two_view_geometries_of_known_cameras_are_colmaps(name: str) -> None:
 @pytest.mark.parametrize("name", SETS)
 def test_homographies_are_colmaps_and_positive_where_the_plane_is_seen(name: str) -> None:
     m = matched(name)
-    found = pycolmap.estimate_homography_matrix(m.x0, m.x1, options().ransac)
+    result = pycolmap.estimate_homography_matrix(m.x0, m.x1, options().ransac)
     estimate = fmtorch.find_homography(
         m.c.x0, m.c.x1, mask=m.c.mask, estimator="colmap", model="homography", threshold=THRESHOLD, seed=SEED
     )
     assert bool(estimate.ok[0])
     H = estimate.H[0].numpy()
-    assert np.array_equal(H, unit(found["H"])) or np.array_equal(H, -unit(found["H"]))
+    assert np.array_equal(H, unit(result["H"])) or np.array_equal(H, -unit(result["H"]))
     inliers = estimate.inliers[0][m.c.mask[0]].numpy()
-    assert np.array_equal(inliers, found["inlier_mask"])
+    assert np.array_equal(inliers, result["inlier_mask"])
     assert np.median(m.x0[inliers] @ H[2, :2] + H[2, 2]) > 0
 
 
@@ -139,10 +139,10 @@ def test_a_shared_focal_length_is_that_of_one_camera_of_colmap(index: int) -> No
     m = matched("Strecha", index)
     first, _ = cameras(m, known=False)
     matches = np.repeat(np.arange(len(m.x0), dtype=np.uint32)[:, None], 2, 1)
-    found = pycolmap.estimate_two_view_geometry(first, m.x0, first, m.x1, matches, options())
+    geometry = pycolmap.estimate_two_view_geometry(first, m.x0, first, m.x1, matches, options())
     estimate = ours(m, focal="shared")
     assert estimate.focals is not None
-    expected = [np.nan, np.nan] if found.camera1 is None else [found.camera1.params[0]] * 2
+    expected = [np.nan, np.nan] if geometry.camera1 is None else [geometry.camera1.params[0]] * 2
     assert estimate.focals[0].tolist() == pytest.approx(expected, nan_ok=True)
 
 

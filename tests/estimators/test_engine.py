@@ -211,8 +211,8 @@ def test_the_kernels_that_are_compiled_together_are_those_that_are_called(monkey
 
 def with_callees(kernels: set[Kernel[..., Any]]) -> set[Kernel[..., Any]]:
     """Kernels, and those that they call."""
-    found, new = set[Kernel[..., Any]](), kernels
+    reached, new = set[Kernel[..., Any]](), kernels
     while new:
-        found |= new
-        new = {callee for each in new for callee in each.calls} - found
-    return found
+        reached |= new
+        new = {callee for each in new for callee in each.calls} - reached
+    return reached

@@ -75,6 +75,6 @@ def test_a_constant_prior_is_as_good_as_none(name: str) -> None:
 def test_the_paper_s_presets_ignore_the_prior(name: str) -> None:
     c, _ = attached_to_prior(scenes())
     estimator = quick(name)
-    found = estimator(c, seed=5).F
-    assert torch.equal(found, estimator(c.replace(prior=None), seed=5).F)
-    assert not found.requires_grad
+    F = estimator(c, seed=5).F
+    assert torch.equal(F, estimator(c.replace(prior=None), seed=5).F)
+    assert not F.requires_grad

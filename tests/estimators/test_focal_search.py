@@ -47,34 +47,34 @@ class Found(PlausibleCandidates):
 
 
 @pytest.mark.parametrize("confirmations", [1, 2, 3])
-@pytest.mark.parametrize("least", [1, 3])
+@pytest.mark.parametrize("min_rounds", [1, 3])
 def test_rounds_end_when_enough_of_them_confirm_the_best(
-    least: int, confirmations: int, monkeypatch: pytest.MonkeyPatch
+    min_rounds: int, confirmations: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng = np.random.default_rng(confirmations)
     again, one_model = rng.random((200, ROUNDS)) < 0.4, rng.random((200, ROUNDS)) < 0.05
     content = rng.random((200, ROUNDS)) < 0.8  # the stopping rule
-    pair, made = pair_of(scene(0)), set()
+    pair, draw_counts = pair_of(scene(0)), set()
 
     def expected(i: int) -> int:
         confirmed = 0
         for turn in range(ROUNDS):
             confirmed += bool(turn and again[i, turn])
             agreed = one_model[i, turn] or confirmed >= confirmations
-            if turn + 1 >= least and agreed and content[i, turn]:
+            if turn + 1 >= min_rounds and agreed and content[i, turn]:
                 return turn + 1
         return ROUNDS
 
     for i in range(200):
         rounds: Iterator[Found] = (Found(bool(a), bool(o)) for a, o in zip(again[i], one_model[i], strict=True))
         monkeypatch.setattr(FocalSearch, "round", lambda self, pair, turn, r=rounds: (next(r), (turn + 1) * 10))
-        search = searching(rounds=ROUNDS, min_rounds=least, confirmations=confirmations)
+        search = searching(rounds=ROUNDS, min_rounds=min_rounds, confirmations=confirmations)
         object.__setattr__(search, "stop", lambda F, draws, pair, size, i=i: bool(content[i, draws // 10 - 1]))
         result = search(pair)
         assert result.draws == 10 * expected(i)
         assert result.settled == content[i, expected(i) - 1]  # the images have one size
-        made.add(result.draws)
-    assert len(made) > 2
+        draw_counts.add(result.draws)
+    assert len(draw_counts) > 2
 
 
 def searching(iterations: int = 12, **options: int) -> FocalSearch:
@@ -93,13 +93,13 @@ def free(F: np.ndarray, pair: Pair, valid: np.ndarray | None = None) -> Candidat
 def test_the_best_candidates_of_two_rounds_are_one_model_or_not(posterior: list[float], same: bool) -> None:
     F = np.linalg.qr(np.random.default_rng(0).normal(size=(9, 2)))[0].T.copy()  # of cosine 0
     models = np.stack([F[0], F[0] if same else F[1]])
-    found = PlausibleCandidates(models, np.array(posterior), no_cameras(2))
-    assert found.best == int(np.argmax(posterior))
-    assert found.unique_optimum == (same or min(posterior) < focal_search.RIVAL_GAIN_SHARE * max(posterior))
+    candidates = PlausibleCandidates(models, np.array(posterior), no_cameras(2))
+    assert candidates.best == int(np.argmax(posterior))
+    assert candidates.unique_optimum == (same or min(posterior) < focal_search.RIVAL_GAIN_SHARE * max(posterior))
     other = PlausibleCandidates(F[1:], np.ones(1), no_cameras(1))
-    assert found.confirmed(other) == bool(np.array_equal(models[found.best], F[1]))
-    assert found.joined(other).F.shape == (3, 9)
-    assert found.best_alone().posterior.tolist() == [max(posterior)]
+    assert candidates.confirmed(other) == bool(np.array_equal(models[candidates.best], F[1]))
+    assert candidates.joined(other).F.shape == (3, 9)
+    assert candidates.best_alone().posterior.tolist() == [max(posterior)]
 
 
 def test_without_candidates_there_is_no_selection() -> None:

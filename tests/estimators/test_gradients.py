@@ -44,8 +44,8 @@ def inputs(seed: int, noise: float, same: bool = False) -> dict[str, Tensor]:
         photographs(seed, (WIDE, WIDE if same else TALL), (1.1, 1.2), 60, noise, 0.0).c,
         np.random.default_rng(seed),
     )
-    prior, told = torch.from_numpy(rng.uniform(0.2, 0.9, (1, 60))), torch.from_numpy(rng.uniform(0.5, 2, (1, 60)))
-    return {"x0": c.x0, "x1": c.x1, "prior": prior, "noise": told}
+    prior, sigma = torch.from_numpy(rng.uniform(0.2, 0.9, (1, 60))), torch.from_numpy(rng.uniform(0.5, 2, (1, 60)))
+    return {"x0": c.x0, "x1": c.x1, "prior": prior, "noise": sigma}
 
 
 @pytest.fixture
@@ -72,9 +72,9 @@ def test_they_are_the_differences_of_estimates(name: str, same: bool) -> None:
         return (weights * G / G.norm()).sum()
 
     attached = {key: tensor.clone().requires_grad_() for key, tensor in given.items()}
-    found = value(attached)
-    assert torch.equal(found.detach(), value(given))
-    gradients = torch.autograd.grad(found, list(attached.values()), allow_unused=True)
+    output = value(attached)
+    assert torch.equal(output.detach(), value(given))
+    gradients = torch.autograd.grad(output, list(attached.values()), allow_unused=True)
     for (key, tensor), gradient in zip(given.items(), gradients, strict=True):
         if key in UNMOVED.get(name, ()):
             assert gradient is None or not bool(gradient.any())
@@ -88,7 +88,7 @@ def test_they_are_the_differences_of_estimates(name: str, same: bool) -> None:
         assert float((gradient * step).sum()) == pytest.approx(numeric, rel=5e-3, abs=rounding), key
 
 
-def told(c: Correspondences) -> Correspondences:
+def with_noise(c: Correspondences) -> Correspondences:
     """In float64, with the noise of matches."""
     noise = torch.linspace(0.5, 2, c.mask.shape[1]).double()[None]
     return c.replace(x0=c.x0.double(), x1=c.x1.double(), noise=noise)
@@ -98,7 +98,7 @@ def told(c: Correspondences) -> Correspondences:
 @pytest.mark.parametrize("kind", ["empty", "seven matches", "all points equal"])
 def test_a_batch_that_fails_can_be_differentiated(name: str, kind: str) -> None:
     """So that no batch stops a training."""
-    c = told(degenerate()[kind])
+    c = with_noise(degenerate()[kind])
     x0 = c.x0.clone().requires_grad_()
     estimate = estimator(name)(c.replace(x0=x0))
     assert not bool(estimate.ok)
@@ -109,7 +109,7 @@ def test_a_batch_that_fails_can_be_differentiated(name: str, kind: str) -> None:
 @pytest.mark.parametrize("name", [*FITS, "irls cauchy", "irls magsac"])
 def test_failed_pairs_have_none_and_change_no_other(name: str) -> None:
     """Among degenerate pairs, as alone."""
-    good, built = [told(scene(1)), told(scene(2, 60))], estimator(name)
+    good, built = [with_noise(scene(1)), with_noise(scene(2, 60))], estimator(name)
 
     def differentiated(c: Correspondences) -> tuple[Tensor, dict[str, Tensor]]:
         values = {key: getattr(c, key).double() for key in VARIABLES}
@@ -121,7 +121,7 @@ def test_failed_pairs_have_none_and_change_no_other(name: str) -> None:
         estimate.F[:, 0, 1].square().sum().backward()
         return estimate.ok, {key: value.grad for key, value in attached.items() if value.grad is not None}
 
-    c = collate([good[0], *map(told, degenerate().values()), good[1]])
+    c = collate([good[0], *map(with_noise, degenerate().values()), good[1]])
     ok, gradients = differentiated(c)
     assert bool(ok[[0, -1]].all())
     assert not bool(ok.all())

@@ -261,10 +261,10 @@ everything = pytest.mark.parametrize(
 def test_padding_is_invisible(name: str, estimator: str) -> None:
     garbage = (float("nan"), 1e30, -7.0, float("nan"), 1e30)
     padded = collate([with_padding(scenes()[i], np.random.default_rng(i), kind) for i, kind in enumerate(garbage)])
-    found, expected = run(padded, name, estimator), run(scenes(), name, estimator)
+    padded_result, expected = run(padded, name, estimator), run(scenes(), name, estimator)
     per_match = {"inliers"}
     for i in range(len(garbage)):
-        rows = [{k: v[i : i + 1] for k, v in each.items()} for each in (found, expected)]
+        rows = [{k: v[i : i + 1] for k, v in each.items()} for each in (padded_result, expected)]
         a, b = (
             {**row, **live_values({k: row[k] for k in per_match}, c[i])}
             for row, c in zip(rows, (padded, scenes()), strict=True)
@@ -369,12 +369,12 @@ def test_gradients_are_the_differences_of_estimates(
         known = {"focal": focal} | ({name: values[name] for name in ("K0", "K1")} if focal != "shared" else {})
         rest = {name: values[name] for name in VARIABLES[:4]}
         e = fmtorch.find_fundamental(**rest, **known, **SIZES, inlier_threshold=3.0)  # type: ignore[arg-type]
-        found = getattr(e, field)[0]
+        output = getattr(e, field)[0]
         if field == "F":
             D = torch.diag(torch.tensor([300.0, 300, 1]).double())
-            found = D @ found @ D
-            found = found / found.norm()
-        return (found * weights.flatten()[: found.numel()].reshape(found.shape)).sum()
+            output = D @ output @ D
+            output = output / output.norm()
+        return (output * weights.flatten()[: output.numel()].reshape(output.shape)).sum()
 
     attached = {name: given[name].clone().requires_grad_() for name in names}
     gradients = torch.autograd.grad(value(given | attached), list(attached.values()), allow_unused=True)
@@ -385,8 +385,8 @@ def test_gradients_are_the_differences_of_estimates(
         h = {"x0": 1e-4, "x1": 1e-4, "K0": 1e-3, "K1": 1e-3}.get(name, 1e-2)  # px, or of numbers about one
         ends = [float(value(given | {name: given[name] + sign * h * step})) for sign in (-1, 1)]
         numeric = (ends[1] - ends[0]) / (2 * h)
-        found = 0.0 if gradient is None else float((gradient * step).sum())
-        assert found == pytest.approx(numeric, rel=1e-2, abs=1e-7), name
+        slope = 0.0 if gradient is None else float((gradient * step).sum())
+        assert slope == pytest.approx(numeric, rel=1e-2, abs=1e-7), name
 
 
 def _differentiable() -> dict[str, Tensor]:

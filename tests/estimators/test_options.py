@@ -92,7 +92,7 @@ def test_every_part_can_be_made(role: str) -> None:
 def test_flat_and_nested_options_replace_those_of_a_preset() -> None:
     c = scene(0, 200)
     assert c.size0 is not None
-    found = find_fundamental(
+    estimate = find_fundamental(
         c.x0, c.x1, prior=c.prior, size0=c.size0, size1=c.size1, hypotheses=500, preselect={"survivors": 30},
         focal={"samples": 100},
     )  # fmt: skip
@@ -101,7 +101,7 @@ def test_flat_and_nested_options_replace_those_of_a_preset() -> None:
     assert built.search.preselection.options == Preselect(64, 30)
     assert built.focal.search.hypotheses == 100
     assert built.focal.search.pool == 24
-    assert torch.equal(found.F, built(c.replace(key=None, quality=None)).F)
+    assert torch.equal(estimate.F, built(c.replace(key=None, quality=None)).F)
     without = presets.build("estimator", "fmtorch", focal=None)
     assert without.focal is None
 
@@ -128,6 +128,6 @@ def test_a_score_of_ones_own_in_a_preset_of_ones_own(tmp_path: Path) -> None:
         "hypotheses: 300\nconfidence: null\ninliers: threshold\nthreshold: 1.0\n"
     )
     c = scene(1, 150)
-    found = find_fundamental(c.x0, c.x1, estimator="nearest", config_dir=tmp_path)
-    assert bool(found.ok[0])
-    assert int(found.inliers.sum()) > 60
+    estimate = find_fundamental(c.x0, c.x1, estimator="nearest", config_dir=tmp_path)
+    assert bool(estimate.ok[0])
+    assert int(estimate.inliers.sum()) > 60

@@ -68,10 +68,10 @@ def test_estimates_are_as_good_as_with_built_in_parts(name: str, preset: str) ->
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_compiled_gain_is_that_in_numpy(preset: str) -> None:
     c = scene(1, 200)
-    one, other = (built(preset, {"score": score(1.0)})(c) for score in (Triweight, CompiledTriweight))
+    interpreted, compiled = (built(preset, {"score": score(1.0)})(c) for score in (Triweight, CompiledTriweight))
     # Gains are rounded to 2^-10, which hides all but the rarest rounding of a float32.
-    assert torch.equal(one.inliers, other.inliers)
-    torch.testing.assert_close(one.F, other.F, rtol=0, atol=1e-9)
+    assert torch.equal(interpreted.inliers, compiled.inliers)
+    torch.testing.assert_close(interpreted.F, compiled.F, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -103,10 +103,10 @@ def test_parts_are_named_as_targets() -> None:
 
 def test_a_rule_decides_the_inliers() -> None:
     c = scene(1, 200)
-    found = built("msac", {"inliers": Within2Px()}, final="none", refit_inliers=True)(c)
-    distance = sampson(found.F, c.x0.double(), c.x1.double())
+    estimate = built("msac", {"inliers": Within2Px()}, final="none", refit_inliers=True)(c)
+    distance = sampson(estimate.F, c.x0.double(), c.x1.double())
     clear = (distance - 2).abs() > 1e-6
-    assert torch.equal(found.inliers[clear], (distance <= 2)[clear])
+    assert torch.equal(estimate.inliers[clear], (distance <= 2)[clear])
 
 
 @pytest.mark.parametrize(
@@ -195,13 +195,13 @@ def compared(preset: str) -> None:
     threshold = {} if preset == "msac" else {"threshold": None}
     own = presets.build("estimator", preset, score=score, sampler=AllAlike(), inliers=Within2Px(), **threshold)
     estimators = own, presets.build("estimator", preset)
-    draws, least = [int(estimator(c).draws) for estimator in estimators], [math.inf, math.inf]
+    draws, fastest = [int(estimator(c).draws) for estimator in estimators], [math.inf, math.inf]
     for _ in range(20):
         for k, estimator in enumerate(estimators):
             start = time.process_time()
             estimator(c)
-            least[k] = min(least[k], time.process_time() - start)
-    print(*draws, *least)
+            fastest[k] = min(fastest[k], time.process_time() - start)
+    print(*draws, *fastest)
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ def normalized(c: Correspondences, i: int = 0, minimal: int = 7) -> tuple[Pair, 
         return batch.normalized(batch.pair(i), i, 0, minimal)
 
 
-def told() -> Correspondences:
+def padded_pairs() -> Correspondences:
     """Pairs of many sizes, with priors and noise on and beyond their bounds, with garbage in masked slots."""
     c = collate([scene(i, 7 + 67 * i, noise=0.1 * i) for i in range(6)])
     c = c.replace(noise=torch.linspace(1e-3, 40, c.mask.shape[1]).expand(len(c), -1))
@@ -34,13 +34,13 @@ def told() -> Correspondences:
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("kind", ["all", "nothing", "real"])
 def test_a_pair_holds_its_usable_matches_in_order(kind: str, scale: float) -> None:
-    c = real(7) if kind == "real" else told()
+    c = real(7) if kind == "real" else padded_pairs()
     c = c if kind == "all" else c.replace(prior=None, noise=None, quality=None, size0=None, size1=None)
     c = c.replace(x0=scale * c.x0.double(), x1=scale * c.x1.double())
     for i in range(len(c)):
-        found = normalized(c, i)
-        assert not isinstance(found, str)
-        pair, slot = found
+        result = normalized(c, i)
+        assert not isinstance(result, str)
+        pair, slot = result
         mask = c.mask[i].numpy()
         np.testing.assert_array_equal(slot, np.flatnonzero(mask))
         pixels = torch.cat([c.x0, c.x1], -1)[i].numpy()[mask].T
@@ -77,9 +77,9 @@ def test_the_unit_is_the_next_power_of_two() -> None:
         ):
             x0 = torch.zeros(1, 8, 2, dtype=torch.float64)
             x0[0, 0, 0], x0[0, 1, 0] = half, -half
-            found = normalized(Correspondences(x0, torch.zeros_like(x0), torch.ones(1, 8, dtype=torch.bool)))
-            assert not isinstance(found, str)
-            assert found[0].pixels_per_unit == expected
+            result = normalized(Correspondences(x0, torch.zeros_like(x0), torch.ones(1, 8, dtype=torch.bool)))
+            assert not isinstance(result, str)
+            assert result[0].pixels_per_unit == expected
 
 
 @pytest.mark.parametrize(
@@ -123,17 +123,17 @@ def test_matches_that_are_no_numbers_are_none(value: float) -> None:
     c = known(20)
     x1 = c.x1.double().clone()
     x1[0, 5, 1] = value
-    found = normalized(c.replace(x0=c.x0.double(), x1=x1))
-    assert not isinstance(found, str)
-    np.testing.assert_array_equal(found[1], np.delete(np.arange(20), 5))
+    result = normalized(c.replace(x0=c.x0.double(), x1=x1))
+    assert not isinstance(result, str)
+    np.testing.assert_array_equal(result[1], np.delete(np.arange(20), 5))
     few = normalized(c.replace(x0=c.x0.double(), x1=x1), minimal=20)
     assert few == "19 matches; at least 20 are needed"
 
 
 def test_pairs_that_cannot_be_estimated_are_told_why() -> None:
     reasons = {name: normalized(c) for name, c in {**degenerate(), **small()}.items()}
-    told = {name: reason for name, reason in reasons.items() if isinstance(reason, str)}
-    assert told == {
+    failures = {name: reason for name, reason in reasons.items() if isinstance(reason, str)}
+    assert failures == {
         "empty": "0 matches; at least 7 are needed",
         "one match": "1 matches; at least 7 are needed",
         "all points equal": "all matches coincide",
@@ -145,7 +145,7 @@ def test_pairs_that_cannot_be_estimated_are_told_why() -> None:
 
 
 def test_a_pair_is_a_copy_and_its_neighbours_are_invisible() -> None:
-    many, batch = told(), Batch.of(told())
+    many, batch = padded_pairs(), Batch.of(padded_pairs())
     matches = batch.pair(3)
     pair = batch.normalized(matches, 3, 0, 7)[0]
     alone = normalized(many[[3]])[0]
@@ -160,14 +160,14 @@ def test_a_pair_is_a_copy_and_its_neighbours_are_invisible() -> None:
 def test_a_part_of_a_pair_keeps_its_frame() -> None:
     pair = named("scene 40")
     index = np.array([7, 3, 30])
-    some = pair.take(index)
-    np.testing.assert_array_equal(some.table, pair.table[:, index])
-    assert some.quality is not None
+    part = pair.take(index)
+    np.testing.assert_array_equal(part.table, pair.table[:, index])
+    assert part.quality is not None
     for name in ("bucket", "pixels_per_unit", "key", "seed", "centre", "sizes", "residual", "images"):
-        assert getattr(some, name) is getattr(pair, name), name
+        assert getattr(part, name) is getattr(pair, name), name
     assert pair.cached("sum", lambda pair: float(pair.points.sum())) == pair.points.sum()
     assert pair.cached("sum", lambda pair: pytest.fail("computed again")) == pair.points.sum()
-    assert some.cached("sum", lambda pair: float(pair.points.sum())) == some.points.sum()
+    assert part.cached("sum", lambda pair: float(pair.points.sum())) == part.points.sum()
 
 
 def test_numbers_of_a_pair_are_those_of_its_seed_key_and_draw() -> None:

@@ -53,13 +53,13 @@ def test_a_missing_library_is_named(name: str, monkeypatch: pytest.MonkeyPatch) 
 def test_poselib_gets_the_options_that_are_named(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[tuple[np.ndarray, dict[str, object], dict[str, object]]] = []
 
-    def found(x0: np.ndarray, x1: np.ndarray, *rest: object) -> None:
+    def fake_solver(x0: np.ndarray, x1: np.ndarray, *rest: object) -> None:
         seen.append((x0, *rest[-2:]))
         raise RuntimeError("enough")
 
     known = types.SimpleNamespace(
-        RansacOptions=lambda: {"real_focal_check": False}, estimate_fundamental=found,
-        estimate_shared_focal_relative_pose=found,
+        RansacOptions=lambda: {"real_focal_check": False}, estimate_fundamental=fake_solver,
+        estimate_shared_focal_relative_pose=fake_solver,
     )  # fmt: skip
     monkeypatch.setitem(sys.modules, "poselib", known)
     c = scene(0, 40)
@@ -161,10 +161,10 @@ def test_inliers_of_gc_ransac_are_told_from_its_matrix(flags: int, monkeypatch: 
     c = scene(0, 40)
     truth = presets.build("estimator", "lmeds")(c).F[0].numpy()
 
-    def found(matches: np.ndarray, *_: object) -> tuple[np.ndarray, np.ndarray]:
+    def fake_solver(matches: np.ndarray, *_: object) -> tuple[np.ndarray, np.ndarray]:
         return truth, np.full(len(matches), bool(flags))
 
-    monkeypatch.setitem(sys.modules, "pygcransac", types.SimpleNamespace(findFundamentalMatrix=found))
+    monkeypatch.setitem(sys.modules, "pygcransac", types.SimpleNamespace(findFundamentalMatrix=fake_solver))
     estimate = presets.build("estimator", "gc_ransac_cpp", threshold=2.0)(c)
     near = geometry.sampson(torch.from_numpy(truth), c.x0[0].double(), c.x1[0].double()) <= 2
     assert estimate.ok.all()

@@ -40,8 +40,8 @@ class Late(SevenPoint):
     """Samples before the hundredth give no model."""
 
     def solve(self, pair: Pair, sample: Any, start: int) -> Hypotheses:
-        found = super().solve(pair, sample, start)
-        return found if start >= 100 else found._replace(F=found.F[:0], draw=found.draw[:0])
+        hypotheses = super().solve(pair, sample, start)
+        return hypotheses if start >= 100 else hypotheses._replace(F=hypotheses.F[:0], draw=hypotheses.draw[:0])
 
 
 def search(family: Any = None, sampler: Sampler | None = None, **options: Any) -> Search:
@@ -56,21 +56,21 @@ def test_models_are_those_of_the_samples_of_their_draws(family: Any, sampler: Sa
     """In the order of draws; each sample gives those that the definition gives and that its matches' sides agree to."""
     pair, draws, alike = named("scene 300"), 60, 0
     sample = sampler.draw(pair, 40, draws, family.size)
-    found = family.solve(pair, sample, 40)
-    assert found.start == 40
-    np.testing.assert_array_equal(found.sample, sample)
-    assert (np.diff(found.draw) >= 0).all()
+    hypotheses = family.solve(pair, sample, 40)
+    assert hypotheses.start == 40
+    np.testing.assert_array_equal(hypotheses.sample, sample)
+    assert (np.diff(hypotheses.draw) >= 0).all()
     for d in range(draws):
         x0, x1 = pair.points[:2, sample[:, d]].T, pair.points[2:, sample[:, d]].T
         every = reference.seven_point(x0, x1) if family.size == 7 else [reference.eight_point(x0, x1)]
         expected = [F for F in every if reference.consistently_oriented(F, x0, x1)]
-        models = [reference.unit(F.astype(np.float64).reshape(3, 3)) for F in found.F[found.draw == d]]
+        models = [reference.unit(F.astype(np.float64).reshape(3, 3)) for F in hypotheses.F[hypotheses.draw == d]]
         # Models are float32, of norm one; what is left of rounding grows where a sample is nearly degenerate.
         alike += len(models) == len(expected) and all(
             min(min(np.abs(F - other).max(), np.abs(F + other).max()) for other in expected) < 1e-5 for F in models
         )
     assert alike >= 0.95 * draws
-    assert len(found.F) > 10
+    assert len(hypotheses.F) > 10
 
 
 def test_a_pool_keeps_the_best_and_the_earlier_of_equals() -> None:
@@ -98,8 +98,8 @@ def test_a_pool_is_a_stable_sort_of_all_that_it_was_offered(m: int, k: int, size
     F, score = rng.normal(size=(m, 9)).astype(np.float32), rng.integers(-20, 20, m) / 8.0
     which = np.sort(rng.permutation(m)[:k])
     pool, pool_score, filled = np.zeros((size, 9), np.float32), np.full(size, -np.inf), 0
-    for some in np.array_split(which, 3):
-        filled = merge(F, some, score[some], filled, pool, pool_score)
+    for part in np.array_split(which, 3):
+        filled = merge(F, part, score[part], filled, pool, pool_score)
     best = which[np.argsort(-score[which], kind="stable")][:size]
     assert filled == len(best)
     np.testing.assert_array_equal(pool[:filled], F[best])
@@ -108,13 +108,13 @@ def test_a_pool_is_a_stable_sort_of_all_that_it_was_offered(m: int, k: int, size
 
 @pytest.mark.parametrize("preselect", [None, Preselect(64, 20)])
 def test_a_search_keeps_the_best_models_of_all_rounds(preselect: Preselect | None) -> None:
-    pair, whole = named("scene 300"), search(preselect=preselect, round=50)
-    pool = whole(pair, 30)
+    pair, single = named("scene 300"), search(preselect=preselect, round=50)
+    pool = single(pair, 30)
     F, score = [], []
     for start in (30, 80, 130):
-        found = whole.family.solve(pair, Uniform().draw(pair, start, 50, 7), start)
-        which, scores = whole.preselection(found.F, pair)
-        F.append(found.F[which])
+        hypotheses = single.family.solve(pair, Uniform().draw(pair, start, 50, 7), start)
+        which, scores = single.preselection(hypotheses.F, pair)
+        F.append(hypotheses.F[which])
         score.append(scores)
     best = np.argsort(-np.concatenate(score), kind="stable")[:4]
     np.testing.assert_array_equal(pool.F, np.concatenate(F)[best])

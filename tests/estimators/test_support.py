@@ -121,8 +121,8 @@ def test_coordinates_sizes_and_thresholds_scaled_together_give_the_same_inliers(
         estimate = changed(c.replace(x0=c.x0 * scale, x1=c.x1 * scale, **sizes), 3)
         assert bool(estimate.ok.all()), estimate.reason
         inliers[scale] = estimate.inliers
-    for scale, found in inliers.items():
-        assert torch.equal(found, inliers[1.0]), f"{name}: other inliers at {scale}"
+    for scale, rescaled in inliers.items():
+        assert torch.equal(rescaled, inliers[1.0]), f"{name}: other inliers at {scale}"
 
 
 @pytest.mark.parametrize("name", OWN)

@@ -97,17 +97,17 @@ class Page:
         self._note(message.get("method", ""), message.get("params", {}))
         return message
 
-    def _note(self, event: str, told: dict[str, Any]) -> None:
+    def _note(self, event: str, parameters: dict[str, Any]) -> None:
         if event == "Page.loadEventFired":
             self._loaded = True
         elif event == "Runtime.exceptionThrown":
-            self.complaints.append(f"exception: {told['exceptionDetails']}")
-        elif event == "Runtime.consoleAPICalled" and told["type"] in ("error", "warning", "assert"):
-            self.complaints.append(f"console: {told['args']}")
-        elif event == "Log.entryAdded" and told["entry"]["level"] in ("error", "warning"):
-            self.complaints.append(f"log: {told['entry']['text']}")
+            self.complaints.append(f"exception: {parameters['exceptionDetails']}")
+        elif event == "Runtime.consoleAPICalled" and parameters["type"] in ("error", "warning", "assert"):
+            self.complaints.append(f"console: {parameters['args']}")
+        elif event == "Log.entryAdded" and parameters["entry"]["level"] in ("error", "warning"):
+            self.complaints.append(f"log: {parameters['entry']['text']}")
         elif event == "Network.requestWillBeSent":
-            url = told["request"]["url"]
+            url = parameters["request"]["url"]
             if not url.startswith(("file:", "data:", "about:")):
                 self.complaints.append(f"request: {url}")
 
@@ -130,7 +130,7 @@ class Page:
             raise RuntimeError(str(answer["exceptionDetails"]))
         return answer["result"].get("value")
 
-    def picture(self, whole: bool = True) -> bytes:
+    def picture(self, full_page: bool = True) -> bytes:
         """PNG of the page, or of the window."""
-        answer = self.send("Page.captureScreenshot", format="png", captureBeyondViewport=whole)
+        answer = self.send("Page.captureScreenshot", format="png", captureBeyondViewport=full_page)
         return base64.b64decode(answer["data"])

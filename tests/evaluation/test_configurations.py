@@ -53,11 +53,11 @@ def pair(kind: str, n: int = 150) -> ImagePair:
 
 
 def rows(pairs: list[ImagePair], word: str | None) -> list[PairRow]:
-    made = pipeline()
+    built = pipeline()
     if word is not None:
-        made = built_with(lambda: made, cameras_of(pairs, word))  # type: ignore[arg-type]
-    knowledge = made.estimator.given if isinstance(made.estimator, WithPairCameras) else None
-    return evaluate(examined(made, made.run(pairs), 0, knowledge))
+        built = built_with(lambda: built, cameras_of(pairs, word))  # type: ignore[arg-type]
+    knowledge = built.estimator.given if isinstance(built.estimator, WithPairCameras) else None
+    return evaluate(examined(built, built.run(pairs), 0, knowledge))
 
 
 @pytest.mark.parametrize("word", [None, "known", "unknown"])
@@ -74,11 +74,11 @@ def test_rows_say_which_configuration_and_neighbours_change_nothing(word: str | 
 
 
 def test_a_pair_that_cannot_be_examined_harms_no_other() -> None:
-    made = pipeline()
-    outcomes = made.run([pair("general"), pair("planar")])
+    built = pipeline()
+    outcomes = built.run([pair("general"), pair("planar")])
     assert outcomes[0].estimate is not None
     broken = dataclasses.replace(outcomes[0], estimate=outcomes[0].estimate.replace(model="homography"))
-    results = examined(made, [broken, outcomes[1]])
+    results = examined(built, [broken, outcomes[1]])
     assert [o.configuration is None for o in results] == [True, False]
     first, second = evaluate([dataclasses.replace(results[0], estimate=outcomes[0].estimate), results[1]])
     assert first.warning is not None
@@ -106,11 +106,11 @@ def test_calibrations_count_only_where_the_estimator_was_given_them() -> None:
 
 def estimated(c: Correspondences, focals: list[float], true: tuple[np.ndarray | None, np.ndarray | None]) -> Outcome:
     source = pair("general")
-    made = pipeline().run([source])[0]
-    assert made.estimate is not None
-    estimate = made.estimate.replace(focals=torch.tensor([focals], dtype=torch.float64))
+    outcome = pipeline().run([source])[0]
+    assert outcome.estimate is not None
+    estimate = outcome.estimate.replace(focals=torch.tensor([focals], dtype=torch.float64))
     return dataclasses.replace(
-        made, pair=dataclasses.replace(source, K0=true[0], K1=true[1]), correspondences=c, estimate=estimate
+        outcome, pair=dataclasses.replace(source, K0=true[0], K1=true[1]), correspondences=c, estimate=estimate
     )
 
 
@@ -120,14 +120,14 @@ def test_errors_of_focal_lengths() -> None:
     assert source.matches is not None
     c, _ = source.matches()
     asked = c.replace(focal=torch.tensor([[[1.0, torch.inf], [1.0, torch.inf]]], dtype=torch.float64))
-    found = focal_errors(estimated(asked, [1.1 * 768, math.nan], (K, K)))
-    assert found.error[0] == pytest.approx(0.1)
-    assert found.log_ratio[0] == pytest.approx(math.log(1.1))
-    assert (found.error[1], found.log_ratio[1]) == (math.inf, None)
+    focals = focal_errors(estimated(asked, [1.1 * 768, math.nan], (K, K)))
+    assert focals.error[0] == pytest.approx(0.1)
+    assert focals.log_ratio[0] == pytest.approx(math.log(1.1))
+    assert (focals.error[1], focals.log_ratio[1]) == (math.inf, None)
     exact = asked.replace(focal=torch.tensor([[[768.0, 0.0], [768.0, 0.05]]], dtype=torch.float64))
     wide = np.diag([4.0, 1.0, 1.0]) @ K
-    found = focal_errors(estimated(exact, [768.0, 768.0], (K, wide)))
-    assert found.error == (None, pytest.approx(0.5))
+    focals = focal_errors(estimated(exact, [768.0, 768.0], (K, wide)))
+    assert focals.error == (None, pytest.approx(0.5))
     assert focal_errors(estimated(asked, [768.0, 768.0], (None, K))).error == (None, 0)
     assert focal_errors(estimated(c, [768.0, 768.0], (K, K))).error == (None, None)  # nobody asked
 

@@ -133,9 +133,9 @@ class Cluster:
 @pytest.fixture
 def cluster(tmp_path: Path) -> Iterator[Cluster]:
     pytest.importorskip("distributed", reason="dask.distributed is not installed")
-    made = Cluster(tmp_path)
-    yield made
-    made.close()
+    dask_cluster = Cluster(tmp_path)
+    yield dask_cluster
+    dask_cluster.close()
 
 
 def test_two_of_four_workers_are_killed(cluster: Cluster, pairs: list[ImagePair], expected: dict[int, PairRow]) -> None:

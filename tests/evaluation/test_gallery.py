@@ -152,7 +152,7 @@ def test_the_list_of_pairs_lies_beside_the_folder_of_its_images(tmp_path: Path) 
     file = lists.write(tmp_path / "list.txt", [lists.superglue(1, 5)])
     stored = {"name": "pair_list", "resize": 200, "origin": None}
     stored["digest"] = data.load("pair_list", root=lists.images(), file=file, resize=200).digest
-    found = find_dataset(stored, Options(1, [lists.images(), file]))
-    assert found[0].image0.path == lists.images() / lists.name(1)
+    pairs = find_dataset(stored, Options(1, [lists.images(), file]))
+    assert pairs[0].image0.path == lists.images() / lists.name(1)
     with pytest.raises(DataError, match="needs root"):
         find_dataset(stored, Options(1, [lists.images()]))

@@ -61,9 +61,9 @@ def test_rows_hold_homographies_and_corner_errors(runs: Path) -> None:
 def test_the_summary_is_of_corner_errors(runs: Path) -> None:
     summary = json.loads((runs / "runs/a/summary.json").read_text())
     errors = torch.tensor(RunFolder.load(runs / "runs/a").read()["corner_error"].to_pylist(), dtype=torch.float64)
-    whole = summary["all"]["homography"]
-    assert whole["pairs"] == 10
-    assert [whole[f"auc_{t}px"] for t in (1, 3, 5)] == pytest.approx(pose_auc(errors, (1, 3, 5)).tolist())
+    overall = summary["all"]["homography"]
+    assert overall["pairs"] == 10
+    assert [overall[f"auc_{t}px"] for t in (1, 3, 5)] == pytest.approx(pose_auc(errors, (1, 3, 5)).tolist())
     assert summary["viewpoint"]["failures"] == 1
     assert summary["all"]["recall"] is summary["all"]["pose"] is None
     page = (runs / "runs/a/summary.md").read_text()

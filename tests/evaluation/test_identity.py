@@ -102,12 +102,12 @@ def test_learned_files_of_every_stage_are_part_of_it(tmp_path: Path) -> None:
             presets.build("features", "rootsiftpca"), Learned(files["matcher"]), pruners,  # type: ignore[arg-type]
             presets.instantiate(estimator, "estimator"),
         )  # fmt: skip
-        found = identity(pipeline=parts, estimator=estimator)["learned"]
-        assert isinstance(found, dict)
-        return found
+        digests = identity(pipeline=parts, estimator=estimator)["learned"]
+        assert isinstance(digests, dict)
+        return digests
 
     before = learned()
-    assert {group: len(found) for group, found in before.items()} == {
+    assert {group: len(digests) for group, digests in before.items()} == {
         "features": 1, "matcher": 1, "pruner": 2, "estimator": 1,
     }  # fmt: skip
     for name, file in files.items():

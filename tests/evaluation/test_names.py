@@ -91,8 +91,8 @@ def test_identities_tell_apart_what_names_do_not() -> None:
 
 def test_a_method_has_one_name_on_all_data_sets() -> None:
     runs = [config("sift_ratio"), config("sift_gms"), config("sift_ratio"), config("sift_gms"), config("sift_gms")]
-    found = run_names(runs, [f"{i}abcdefgh" for i in range(5)], ["a", "a", "b", "b", "b"])
-    assert found == ["sift_ratio", "sift_gms", "sift_ratio", "sift_gms 3abcde", "sift_gms 4abcde"]
+    names = run_names(runs, [f"{i}abcdefgh" for i in range(5)], ["a", "a", "b", "b", "b"])
+    assert names == ["sift_ratio", "sift_gms", "sift_ratio", "sift_gms 3abcde", "sift_gms 4abcde"]
 
 
 def test_versions_are_told_by_their_first_digits() -> None:

@@ -78,7 +78,7 @@ def test_no_complaints_and_nothing_wider_than_the_window(page: Page, report: Pat
           .map(c => Math.max(c, paper) / Math.min(c, paper)); })()"""
     )
     assert min(contrasts) >= 3
-    ground = pixels(page.picture(whole=False))[5, 5]
+    ground = pixels(page.picture(full_page=False))[5, 5]
     assert (ground < 60).all() if dark else (ground > 200).all()
     assert page.complaints == []
 

@@ -64,9 +64,9 @@ def estimated(outcomes: list[Outcome], cameras: str) -> list[Outcome]:
 
 
 def test_rows_have_the_pose_of_the_estimate_and_neighbours_change_nothing() -> None:
-    some = [outcome(seed, noise=0.1) for seed in range(3)]
-    rows = evaluate(estimated(some, "known"))
-    for row, alone in zip(rows, (evaluate(estimated([o], "known"))[0] for o in some), strict=True):
+    outcomes = [outcome(seed, noise=0.1) for seed in range(3)]
+    rows = evaluate(estimated(outcomes, "known"))
+    for row, alone in zip(rows, (evaluate(estimated([o], "known"))[0] for o in outcomes), strict=True):
         assert row.ok
         assert row.pose_reason is None
         assert row.rotation_error < 0.5
@@ -75,10 +75,10 @@ def test_rows_have_the_pose_of_the_estimate_and_neighbours_change_nothing() -> N
 
 
 def test_poses_that_are_not_determined_and_pairs_without_estimates_among_others() -> None:
-    (found,) = estimated([outcome(0, noise=0.1)], "known")
+    (posed,) = estimated([outcome(0, noise=0.1)], "known")
     nothing = torch.full((1, 3, 3), torch.nan, dtype=torch.float64)
-    lost = dataclasses.replace(found, estimate=found.estimate.replace(R=nothing, t=nothing[:, 0]))
-    rows = evaluate([lost, found, outcome(1)])
+    lost = dataclasses.replace(posed, estimate=posed.estimate.replace(R=nothing, t=nothing[:, 0]))
+    rows = evaluate([lost, posed, outcome(1)])
     assert (rows[0].rotation_error, rows[0].translation_error) == (180, 90)
     assert [row.pose_reason for row in rows] == ["the pose is not determined", None, None]
     assert rows[1].rotation_error < 0.5

@@ -42,9 +42,9 @@ def test_writes_a_picture(tmp_path: Path, runs: dict[str, pa.Table]) -> None:
 
 
 def test_panels_and_curves() -> None:
-    one = plots._panels({"run": table("a", "b")})
-    assert {title: list(curves) for title, curves in one.items()} == {"run": ["a", "b", "all"]}
-    assert len(one["run"]["all"]) == 12
+    panels = plots._panels({"run": table("a", "b")})
+    assert {title: list(curves) for title, curves in panels.items()} == {"run": ["a", "b", "all"]}
+    assert len(panels["run"]["all"]) == 12
     single = plots._panels({"run": table("a")})
     assert {title: list(curves) for title, curves in single.items()} == {"run": ["a"]}
     many = plots._panels({"x": table("a", "b"), "y": table("b", "c")})

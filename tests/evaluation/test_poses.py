@@ -40,8 +40,8 @@ def without(o: Outcome, **changes: object) -> Outcome:
 
 
 def test_rows_have_the_pose_errors_of_the_reference() -> None:
-    some = [outcome(seed) for seed in range(4)]
-    for o, row in zip(some, evaluate(some), strict=True):
+    outcomes = [outcome(seed) for seed in range(4)]
+    for o, row in zip(outcomes, evaluate(outcomes), strict=True):
         assert o.correspondences is not None
         assert o.estimate is not None
         kept = o.estimate.inliers[0].numpy()
@@ -76,20 +76,20 @@ def test_why_a_pair_has_no_pose_error() -> None:
 
 
 def test_signed_errors_are_of_the_best_of_four_poses_and_keep_the_sign_of_an_estimates_own() -> None:
-    some = [outcome(seed) for seed in range(3)]
-    for o, row in zip(some, evaluate(some, signed=True), strict=True):
+    outcomes = [outcome(seed) for seed in range(3)]
+    for o, row in zip(outcomes, evaluate(outcomes, signed=True), strict=True):
         assert o.estimate is not None
         four = solvers.poses(o.pair.K1.T @ o.estimate.F[0].numpy() @ o.pair.K0)
         expected = reference.closest_pose_error(four, o.pair.R, o.pair.t)
         assert (row.rotation_error, row.translation_error) == pytest.approx(expected, abs=1e-6)
-    own = [o.estimate.replace(R=torch.eye(3)[None], t=-torch.from_numpy(o.pair.t)[None].float()) for o in some]
-    posed = [dataclasses.replace(o, estimate=estimate) for o, estimate in zip(some, own, strict=True)]
+    own = [o.estimate.replace(R=torch.eye(3)[None], t=-torch.from_numpy(o.pair.t)[None].float()) for o in outcomes]
+    posed = [dataclasses.replace(o, estimate=estimate) for o, estimate in zip(outcomes, own, strict=True)]
     for row, folded in zip(evaluate(posed, signed=True), evaluate(posed), strict=True):
         assert row.translation_error == pytest.approx(180, abs=0.1)  # t in float32: the root of its rounding
         assert folded.translation_error == pytest.approx(0, abs=0.1)
         assert row.rotation_error == folded.rotation_error
-    failed = dataclasses.replace(some[0], estimate=None, correspondences=None, reason="no keypoints in image 0")
-    nothing = dataclasses.replace(some[1], estimate=some[1].estimate.replace(F=torch.zeros(1, 3, 3).double()))
+    failed = dataclasses.replace(outcomes[0], estimate=None, correspondences=None, reason="no keypoints in image 0")
+    nothing = dataclasses.replace(outcomes[1], estimate=outcomes[1].estimate.replace(F=torch.zeros(1, 3, 3).double()))
     rows = evaluate([failed, nothing], signed=True)
     assert [(row.rotation_error, row.translation_error) for row in rows] == [(180.0, 180.0)] * 2
     assert [row.pose_reason for row in rows] == ["no F", "F has no pose"]

@@ -24,9 +24,9 @@ from fmtorch.evaluation.summary import common_reasons
     ],
 )  # fmt: skip
 def test_reasons_that_differ_in_numbers_are_one(reasons: list[str], expected: dict[str, int]) -> None:
-    found = common_reasons(reasons, 3)
-    assert found == expected
-    assert list(found) == list(expected)
+    common = common_reasons(reasons, 3)
+    assert common == expected
+    assert list(common) == list(expected)
 
 
 def test_the_commonest_come_first_and_others_are_left_out() -> None:

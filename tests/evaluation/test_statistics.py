@@ -35,25 +35,25 @@ def test_means_over_pairs_are_the_metrics() -> None:
 def test_seeds_are_averaged_pair_by_pair() -> None:
     nsgd = errors(3, 20)
     for values in MERITS.values():
-        np.testing.assert_allclose(values(nsgd), np.mean([values(one) for one in nsgd], axis=0), rtol=1e-15)
+        np.testing.assert_allclose(values(nsgd), np.mean([values(seed_nsgd) for seed_nsgd in nsgd], axis=0), rtol=1e-15)
 
 
 def test_intervals_are_of_what_is_defined() -> None:
     rng = np.random.default_rng(1)
     a, b = rng.random((2, 30))
     scenes = [f"s{i % 12}" for i in range(30)]
-    some = a.copy()
-    some[::4] = math.nan
+    incomplete = a.copy()
+    incomplete[::4] = math.nan
     kept = [i for i in range(30) if i % 4]
     expected = bootstrap_mean(a[kept], [scenes[i] for i in kept])
-    assert interval(some, scenes) == expected
-    percent = interval(some, scenes, PERCENT)
+    assert interval(incomplete, scenes) == expected
+    percent = interval(incomplete, scenes, PERCENT)
     assert percent is not None
     assert (percent.value, percent.low, percent.high) == tuple(
         PERCENT * end for end in (expected.value, expected.low, expected.high)
     )
-    assert difference(some, b, scenes) == mean_difference(a[kept], b[kept], [scenes[i] for i in kept])
-    assert difference(b, some, scenes) == mean_difference(b[kept], a[kept], [scenes[i] for i in kept])
+    assert difference(incomplete, b, scenes) == mean_difference(a[kept], b[kept], [scenes[i] for i in kept])
+    assert difference(b, incomplete, scenes) == mean_difference(b[kept], a[kept], [scenes[i] for i in kept])
     nothing = np.full(30, math.nan)
     assert interval(nothing, scenes) is None
     assert difference(nothing, b, scenes) is None
@@ -70,10 +70,10 @@ def test_shares_have_the_intervals_of_shares_over_several_seeds_too() -> None:
     twice = recalled(np.stack([nsgd[0], nsgd[0]]))
     assert interval(twice, scenes, share=True) == interval(a, scenes, share=True)
     both = recalled(nsgd)
-    found = difference(both, b, scenes, share=True)
-    assert found is not None
-    assert found.value == pytest.approx((a.mean() - b.mean()) / 2)
-    assert found.low < found.value < found.high
+    gain = difference(both, b, scenes, share=True)
+    assert gain is not None
+    assert gain.value == pytest.approx((a.mean() - b.mean()) / 2)
+    assert gain.low < gain.value < gain.high
 
 
 def test_what_intervals_resample_is_said() -> None:

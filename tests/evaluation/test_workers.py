@@ -135,6 +135,6 @@ def test_features_are_computed_while_the_first_pair_is_worked_on(tmp_path: Path)
     assert watched.at_first_estimate == len(images)  # all of them, while the first pair waited
     assert len(watched.extracted) == len(set(watched.extracted)) == len(images)  # each once
     assert sum(counts) == len(pairs)
-    found = {row.pair: (row.nsgd, row.reason) for row in rows}
-    assert found == {row.pair: (row.nsgd, row.reason) for row in expected}
-    assert "absent.png" in found["scene/0-bad"][1]
+    by_pair = {row.pair: (row.nsgd, row.reason) for row in rows}
+    assert by_pair == {row.pair: (row.nsgd, row.reason) for row in expected}
+    assert "absent.png" in by_pair["scene/0-bad"][1]

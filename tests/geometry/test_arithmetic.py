@@ -55,13 +55,13 @@ def test_component_sum(n, dim):
 def test_component_sum_has_the_same_bits_in_small_and_in_large_tensors(n, dim):
     x = torch.randn(n, n, 2000, generator=torch.Generator().manual_seed(n), dtype=torch.float64)
     x[..., :50] = -0.0  # of which a sum is 0, not -0, on both ways
-    whole = component_sum(x, dim)
+    summed = component_sum(x, dim)
     assert x[..., 30:130].numel() <= SMALL < x.numel()
-    assert torch.equal(component_sum(x[..., 30:130], dim).view(torch.int64), whole[..., 30:130].view(torch.int64))
+    assert torch.equal(component_sum(x[..., 30:130], dim).view(torch.int64), summed[..., 30:130].view(torch.int64))
     turned = x[..., 30:130].transpose(0, 2).contiguous().transpose(0, 2)
-    assert torch.equal(component_sum(turned, dim).view(torch.int64), whole[..., 30:130].view(torch.int64))
+    assert torch.equal(component_sum(turned, dim).view(torch.int64), summed[..., 30:130].view(torch.int64))
     attached = x[..., 30:130].clone().requires_grad_()
-    assert torch.equal(component_sum(attached, dim).view(torch.int64), whole[..., 30:130].view(torch.int64))
+    assert torch.equal(component_sum(attached, dim).view(torch.int64), summed[..., 30:130].view(torch.int64))
 
 
 def test_matmul3_broadcasts():

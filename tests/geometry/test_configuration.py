@@ -27,31 +27,31 @@ def test_against_the_definitions(kind: str, known: bool) -> None:
         "prior": torch.from_numpy(P)[None],
         "focal_precision": torch.from_numpy(precision)[None],
     }
-    found = configuration_evidence(**given)
+    evidence = configuration_evidence(**given)
     line = np.array([sampson(drawn.F, p, q) for p, q in zip(drawn.x0, drawn.x1, strict=True)]) / n
     plane = reference.plane_distances(drawn.H, drawn.x0, drawn.x1) / n
     s = min(reference.noise(P, line, 1, SIDE), reference.noise(P, plane, 2, SIDE))
     of_line, of_plane = reference.density(line, s, 1, SIDE), reference.density(plane, s, 2, SIDE)
-    np.testing.assert_allclose(float(found.noise[0]), s, rtol=1e-6)
+    np.testing.assert_allclose(float(evidence.noise[0]), s, rtol=1e-6)
     both, shares = reference.log_likelihood(P, of_plane, of_line)
     # exp by its approximant is good to 1e-9 of a density of some thousands.
-    np.testing.assert_allclose(float(found.line[0]), reference.log_likelihood(P, of_line)[0], atol=1e-4)
-    np.testing.assert_allclose(float(found.plane[0]), reference.log_likelihood(P, of_plane)[0], atol=1e-4)
-    np.testing.assert_allclose(float(found.both[0]), both, atol=1e-4)
-    np.testing.assert_allclose([float(found.on_plane[0]), float(found.on_line[0])], shares[1:], atol=1e-5)
+    np.testing.assert_allclose(float(evidence.line[0]), reference.log_likelihood(P, of_line)[0], atol=1e-4)
+    np.testing.assert_allclose(float(evidence.plane[0]), reference.log_likelihood(P, of_plane)[0], atol=1e-4)
+    np.testing.assert_allclose(float(evidence.both[0]), both, atol=1e-4)
+    np.testing.assert_allclose([float(evidence.on_plane[0]), float(evidence.on_line[0])], shares[1:], atol=1e-5)
     copy = reference.copy(plane, drawn.x0, drawn.x1, s, n)
     distances = reference.plane_distances(copy, drawn.x0, drawn.x1) / n
     expected = reference.log_likelihood(P, reference.density(distances, s, 2, SIDE))[0]
-    np.testing.assert_allclose(float(found.copy[0]), expected, atol=1e-4)
-    np.testing.assert_allclose(found.scaled[0].numpy(), [copy[0, 0], copy[0, 2], copy[1, 2]], rtol=1e-6)
+    np.testing.assert_allclose(float(evidence.copy[0]), expected, atol=1e-4)
+    np.testing.assert_allclose(evidence.scaled[0].numpy(), [copy[0, 0], copy[0, 2], copy[1, 2]], rtol=1e-6)
     if kind == "rotation":  # where it fits there is one optimum
         turned, R, cost = reference.rotation(drawn.H, drawn.x0, drawn.x1, K, K, precision, s, n)
         distances = reference.plane_distances(turned, drawn.x0, drawn.x1) / n
         expected = reference.log_likelihood(P, reference.density(distances, s, 2, SIDE))[0] - cost
         # At an optimum: what a step that gains less than 1e-4 leaves of it.
-        np.testing.assert_allclose(float(found.rotation[0]), expected, atol=0.05)
-        np.testing.assert_allclose(found.R[0].numpy(), R, atol=1e-4)
-        assert known == bool((found.log_focal == 0).all())
+        np.testing.assert_allclose(float(evidence.rotation[0]), expected, atol=0.05)
+        np.testing.assert_allclose(evidence.R[0].numpy(), R, atol=1e-4)
+        assert known == bool((evidence.log_focal == 0).all())
 
 
 @pytest.mark.parametrize("kind", CONFIGURATIONS)
@@ -89,11 +89,11 @@ def test_no_unit_is_special() -> None:
         twice[name] = 2 * pairs[name]
     twice |= {"F": shrink @ pairs["F"] @ shrink, "H": grow @ pairs["H"] @ shrink}
     twice |= {"K0": grow @ pairs["K0"], "K1": grow @ pairs["K1"]}
-    one, two = configuration_evidence(**pairs), configuration_evidence(**twice)
+    single, doubled = configuration_evidence(**pairs), configuration_evidence(**twice)
     for name in ("line", "plane", "both", "copy"):
-        torch.testing.assert_close(getattr(one, name), getattr(two, name), rtol=1e-9, atol=1e-6)
-    torch.testing.assert_close(2 * one.noise, two.noise)
-    assert torch.equal(classified(one), classified(two))
+        torch.testing.assert_close(getattr(single, name), getattr(doubled, name), rtol=1e-9, atol=1e-6)
+    torch.testing.assert_close(2 * single.noise, doubled.noise)
+    assert torch.equal(classified(single), classified(doubled))
 
 
 @pytest.mark.parametrize("factor", [1e-9, 1e9])
@@ -120,8 +120,8 @@ def assert_same(a: Evidence, b: Evidence) -> None:
 def test_padding_and_neighbours_are_invisible() -> None:
     drawn = [draw(kind, i, 40 + 37 * i) for i, kind in enumerate(CONFIGURATIONS)]
     together = configuration_evidence(**batch(drawn))
-    for i, one in enumerate(drawn):
-        assert_same(configuration_evidence(**batch([one])), Evidence(*(v[i : i + 1] for v in together)))
+    for i, drawn_pair in enumerate(drawn):
+        assert_same(configuration_evidence(**batch([drawn_pair])), Evidence(*(v[i : i + 1] for v in together)))
     many = [draw(CONFIGURATIONS[i % 5], i, 60) for i in range(40)]
     threads = torch.get_num_threads()
     torch.set_num_threads(3)
@@ -140,11 +140,11 @@ def test_no_pair_takes_its_batch_down() -> None:
     bad["F"][3, 0, 0], bad["H"][4, 0, 0], bad["K0"][5, 0, 0] = torch.nan, torch.inf, torch.nan
     bad["x0"][6], bad["x1"][6] = 5.0, 7.0
     bad["K1"][7] = torch.tensor([[1.0, 2, 3], [2, 4, 6], [0, 0, 1]])
-    found = configuration_evidence(**bad)
-    assert_same(Evidence(*(v[8:] for v in found)), Evidence(*(v[8:] for v in good)))
-    for value in found:
+    evidence = configuration_evidence(**bad)
+    assert_same(Evidence(*(v[8:] for v in evidence)), Evidence(*(v[8:] for v in good)))
+    for value in evidence:
         assert not bool(value.isnan().any())
-    kinds = [CONFIGURATIONS[i] for i in classified(found).tolist()]
+    kinds = [CONFIGURATIONS[i] for i in classified(evidence).tolist()]
     assert kinds[2] == "unrelated"
     assert kinds[1] == kinds[4] == kinds[5] == kinds[7] == kinds[8] == "general"
     none = configuration_evidence(**{k: v[:0] for k, v in pairs.items()})

@@ -67,17 +67,17 @@ def test_solutions_are_essential_matrices_of_the_sample() -> None:
 def test_nine_tenths_of_the_real_solutions_before_the_cameras_are_found() -> None:
     points, _ = scene(1, noise=0.02)
     E, draw = solved(points)
-    found = total = spurious = 0
+    recovered = total = spurious = 0
     for s in range(SAMPLES):
         x0, x1 = points[:2, 5 * s : 5 * s + 5].T, points[2:, 5 * s : 5 * s + 5].T
         every = reference.five_point(x0, x1)
         expected = np.array([M.ravel() for M in every if consistently_oriented(M, x0, x1)]).reshape(-1, 9)
         distance = apart(E[draw == s], expected)
-        found += int((distance.min(0, initial=9) < 1e-4).sum())
+        recovered += int((distance.min(0, initial=9) < 1e-4).sum())
         spurious += int((distance.min(1, initial=9) > 0.1).sum())  # nearly double roots are known to some digits
         total += len(expected)
     assert total > SAMPLES
-    assert found > 0.85 * total  # two roots within one interval of the grid are missed
+    assert recovered > 0.85 * total  # two roots within one interval of the grid are missed
     assert spurious < 0.01 * len(E)  # double roots that the eigenvalue solver takes for a complex pair
 
 
@@ -121,9 +121,9 @@ def test_a_sample_has_the_same_bits_alone_and_degenerate_ones_have_no_solution()
     bad[:, 51] = bad[:, 50]  # a match twice
     bad[0, 102], bad[:, 150:155], bad[1, 203] = np.nan, 0, np.inf
     others = ~np.isin(draw, [10, 20, 30, 40])
-    found, left = solved(bad)
+    solutions, left = solved(bad)
     np.testing.assert_array_equal(left, draw[others])
-    np.testing.assert_array_equal(found, E[others])
+    np.testing.assert_array_equal(solutions, E[others])
 
 
 @pytest.mark.parametrize("peer", ["poselib", "opencv"])

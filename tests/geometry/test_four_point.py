@@ -102,7 +102,7 @@ def test_points_of_any_unit(scale: float) -> None:
         h, D = reference.four_points(match)[0], np.diag([scale, scale, 1])
         assert h is not None
         expected = D @ h.reshape(3, 3) @ np.linalg.inv(D)
-        (found,) = alone(match * scale)
-        np.testing.assert_allclose(found, expected.ravel() / np.linalg.norm(expected), atol=2 * ROUNDING32)
+        (H,) = alone(match * scale)
+        np.testing.assert_allclose(H, expected.ravel() / np.linalg.norm(expected), atol=2 * ROUNDING32)
         match[2:, 3] = (match[2:, 0] + 2 * match[2:, 1]) / 3
         assert len(alone(match * scale)) == 0

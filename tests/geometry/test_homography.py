@@ -69,10 +69,10 @@ def test_plane_through_three_matches_of_a_fundamental_matrix() -> None:
         e1, H = np.random.default_rng(seed).normal(size=3), np.empty(9)
         F = skew(e1) @ truth
         assert plane_homography(F.ravel(), e1, points, np.array([1, 4, 2]), H)
-        found = reference.unit(H.reshape(3, 3))
-        np.testing.assert_allclose(found, reference.unit(truth), atol=1e-9)
+        plane = reference.unit(H.reshape(3, 3))
+        np.testing.assert_allclose(plane, reference.unit(truth), atol=1e-9)
         x0, x1 = points[:2, [1, 4, 2]].T, points[2:, [1, 4, 2]].T
-        np.testing.assert_allclose(found, reference.through_plane(F, x0, x1), atol=1e-9)
+        np.testing.assert_allclose(plane, reference.through_plane(F, x0, x1), atol=1e-9)
     assert not plane_homography(F.ravel(), e1, points, np.array([1, 1, 2]), H)
 
 

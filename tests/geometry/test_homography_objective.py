@@ -77,8 +77,8 @@ def test_three_forms_of_the_error_equal_its_definition() -> None:
         one_by_one = [HOMOGRAPHY.of_match(p.h, *match) for match in p.points.T]
         # e cancels from terms of about 1, so r is exact to a few dozen roundings; r^2 to 2 r of these.
         atol = 100 * EPS * np.sqrt(expected.min()) + 1e4 * EPS**2
-        for found in (tensors.numpy(), np.array(one_by_one)):
-            np.testing.assert_allclose(found, expected, rtol=1e-11, atol=atol)
+        for computed in (tensors.numpy(), np.array(one_by_one)):
+            np.testing.assert_allclose(computed, expected, rtol=1e-11, atol=atol)
 
 
 def test_exact_for_affinities_and_the_reprojection_distance_to_first_order_otherwise() -> None:
@@ -109,9 +109,9 @@ def test_cost_and_gradient(loss: str) -> None:
         def cost(h: np.ndarray, p: Problem = p) -> complex:
             return reference.robust_sum(h, p.points, p.weight, p.s2, loss)
 
-        products, found = evaluated(p.h, p.weighted(loss))
+        products, computed = evaluated(p.h, p.weighted(loss))
         # Sums of 30 terms, each exact to 100 roundings over a residual of 1e-3 of coordinates of 1.
-        assert found == pytest.approx(float(np.real(cost(p.h))), rel=1e-10)
+        assert computed == pytest.approx(float(np.real(cost(p.h))), rel=1e-10)
         slope = reference.gradient(cost, p.h)
         np.testing.assert_allclose(2 * products[9, :9], slope, atol=1e-10 * np.abs(slope).max())
         assert abs(products[9, :9] @ p.h) < 1e-10 * np.abs(slope).max()  # the scale of H counts nothing
@@ -121,9 +121,9 @@ def test_gauss_newton_matrix() -> None:
     for seed in range(5):
         p = problem(seed)
         expected = reference.gauss_newton(p.h, p.points, p.weight)
-        found, _ = evaluated(p.h, p.unbounded())
-        np.testing.assert_allclose(found[:9, :9], expected, atol=1e-11 * np.abs(expected).max())
-        np.testing.assert_array_equal(found, found.T)
+        computed, _ = evaluated(p.h, p.unbounded())
+        np.testing.assert_allclose(computed[:9, :9], expected, atol=1e-11 * np.abs(expected).max())
+        np.testing.assert_array_equal(computed, computed.T)
 
 
 @pytest.mark.parametrize("loss", KINDS)
@@ -191,8 +191,8 @@ def test_gradient_in_tensors_and_its_graph(loss: str) -> None:
         torch.from_numpy(a) for a in (p.h[:, None, None], p.points[:, None].copy(), p.weight[None], p.s2[None])
     )
     expected, _ = evaluated(p.h, p.weighted(loss))
-    found = homography_gradient(h, points, weight, KERNELS[loss], s2)
-    np.testing.assert_allclose(found[:, 0, 0].numpy(), expected[9, :9], atol=1e-11 * np.abs(expected).max())
+    computed = homography_gradient(h, points, weight, KERNELS[loss], s2)
+    np.testing.assert_allclose(computed[:, 0, 0].numpy(), expected[9, :9], atol=1e-11 * np.abs(expected).max())
     points.requires_grad_()
     assert torch.autograd.gradcheck(lambda x: homography_gradient(h, x, weight, KERNELS[loss], s2), points)
 
@@ -201,6 +201,6 @@ def test_gauss_newton_matrix_in_tensors() -> None:
     p = problem(4)
     h, points, weight = (torch.from_numpy(a) for a in (p.h[:, None, None], p.points[:, None].copy(), p.weight[None]))
     unbounded = torch.full((1, 1), torch.inf, dtype=torch.float64)
-    found = homography_curvature(h, points, weight, KERNELS["truncated"], unbounded)[0, 0].numpy()
+    computed = homography_curvature(h, points, weight, KERNELS["truncated"], unbounded)[0, 0].numpy()
     expected = reference.gauss_newton(p.h, p.points, p.weight)
-    np.testing.assert_allclose(found, expected, atol=1e-11 * np.abs(expected).max())
+    np.testing.assert_allclose(computed, expected, atol=1e-11 * np.abs(expected).max())

@@ -70,7 +70,7 @@ def test_opencv(seed: int) -> None:
     ]
     possible = cv2.filterHomographyDecompByVisibleRefpoints(rotations, normals, *rays)
     poses = poses_from_homography(*tensors(H, K0, K1, x0, x1))
-    found = [
+    computed = [
         np.concatenate([R.ravel(), t, n])
         for R, t, n, valid in zip(
             poses.R.numpy(), poses.t.numpy(), poses.normal.numpy(), poses.in_front == 1, strict=True
@@ -80,9 +80,9 @@ def test_opencv(seed: int) -> None:
     expected = [
         np.concatenate([rotations[i].ravel(), translations[i][:, 0], normals[i][:, 0]]) for i in possible.ravel()
     ]
-    assert len(found) == len(expected)
+    assert len(computed) == len(expected)
     for solution in expected:
-        assert min(np.abs(solution - ours).max() for ours in found) < 1e-6
+        assert min(np.abs(solution - ours).max() for ours in computed) < 1e-6
 
 
 def test_motion_along_the_normal_and_rotations() -> None:
@@ -96,9 +96,9 @@ def test_motion_along_the_normal_and_rotations() -> None:
     assert bool(turned.valid.all())
     assert bool((turned.t.abs() < 1e-9).all())
     for sign in (1, -3.0):
-        found, valid = rotation_from_homography(sign * H, k0, k1)
+        rotation, valid = rotation_from_homography(sign * H, k0, k1)
         assert bool(valid.all())
-        torch.testing.assert_close(found, R, rtol=0, atol=1e-9)
+        torch.testing.assert_close(rotation, R, rtol=0, atol=1e-9)
     torch.testing.assert_close(turned.R[:, 0], R, rtol=0, atol=1e-9)
 
 
@@ -109,9 +109,9 @@ def test_the_nearest_rotation() -> None:
         G = Rotation.random(random_state=rng).as_matrix() + 0.2 * rng.normal(size=(3, 3))
         U, _, Vt = np.linalg.svd(G)
         expected = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
-        found, valid = rotation_from_homography(torch.from_numpy(G), torch.eye(3).double(), torch.eye(3).double())
+        rotation, valid = rotation_from_homography(torch.from_numpy(G), torch.eye(3).double(), torch.eye(3).double())
         assert bool(valid)
-        np.testing.assert_allclose(found.numpy(), expected, atol=1e-7)
+        np.testing.assert_allclose(rotation.numpy(), expected, atol=1e-7)
 
 
 def test_laws() -> None:
@@ -130,13 +130,13 @@ def test_laws() -> None:
     bad_H[0], bad_H[1, 0, 0], bad_H[2] = 0, torch.nan, torch.outer(H[2, 0], H[2, 1])
     bad_k0[3], mask[4] = 0, False
     leaves = [bad_H.requires_grad_(), bad_k0.requires_grad_()]
-    found = poses_from_homography(*leaves, k1, x0, x1, mask)
-    assert found.valid.any(-1).tolist() == [False] * 5 + [True] * 2
-    assert all(torch.equal(a[5:].detach(), b[5:]) for a, b in zip(found, good, strict=True))
-    assert torch.equal(found.R[:5].detach(), torch.eye(3).double().expand(5, 2, 3, 3))
+    poses = poses_from_homography(*leaves, k1, x0, x1, mask)
+    assert poses.valid.any(-1).tolist() == [False] * 5 + [True] * 2
+    assert all(torch.equal(a[5:].detach(), b[5:]) for a, b in zip(poses, good, strict=True))
+    assert torch.equal(poses.R[:5].detach(), torch.eye(3).double().expand(5, 2, 3, 3))
     R, valid = rotation_from_homography(*leaves, k1)
     assert valid.tolist() == [False] * 4 + [True] * 3
-    (R.sum() + sum(a.sum() for a in found[:3])).backward()
+    (R.sum() + sum(a.sum() for a in poses[:3])).backward()
     for leaf in leaves:
         assert leaf.grad is not None
         assert bool(leaf.grad[5:].isfinite().all())

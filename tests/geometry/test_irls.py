@@ -48,32 +48,32 @@ def eight_point_once(F: np.ndarray, x0: np.ndarray, x1: np.ndarray, scale: float
 @pytest.mark.parametrize("seed", range(4))
 def test_two_iterations_equal_the_definition(seed: int) -> None:
     F, x0, x1 = pair(seed, 2e-3, 20)
-    found = irls(x0, x1, F, kernel="cauchy", scale=0.01, iterations=2)
+    fitted = irls(x0, x1, F, kernel="cauchy", scale=0.01, iterations=2)
     expected = F.numpy()
     for _ in range(2):
         expected = eight_point_once(expected, x0.numpy(), x1.numpy(), 0.01)
     # The sums of products square the condition of the equations (some 1e3): 1e-16 * 1e6, and a little room.
-    assert distance(found.flatten(), torch.from_numpy(expected.flatten())) < 1e-9
+    assert distance(fitted.flatten(), torch.from_numpy(expected.flatten())) < 1e-9
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_exact_matches_keep_the_exact_matrix(kernel: str) -> None:
     F, x0, x1 = pair(5, 0.0)
     near = F + 1e-3 * torch.from_numpy(np.random.default_rng(0).normal(size=(3, 3)))
-    found = irls(x0, x1, near, kernel=kernel, scale=1.0)
-    assert distance(found.flatten(), F.flatten()) < 1e-9  # as above
-    assert float(torch.linalg.svdvals(found)[2]) < 1e-15
-    assert float(found.norm()) == pytest.approx(1, abs=1e-15)
+    fitted = irls(x0, x1, near, kernel=kernel, scale=1.0)
+    assert distance(fitted.flatten(), F.flatten()) < 1e-9  # as above
+    assert float(torch.linalg.svdvals(fitted)[2]) < 1e-15
+    assert float(fitted.norm()) == pytest.approx(1, abs=1e-15)
 
 
 def test_comes_close_to_the_optimum_on_real_pairs() -> None:
     data = oracle("robust.npz")
     for name in ("000", "001"):
         x0, x1, F = (torch.from_numpy(data[f"{name}.{key}"]) for key in ("X1", "X2", "F_gt"))
-        found = irls(x0, x1, F, kernel="cauchy", scale=1.0, iterations=10)
+        fitted = irls(x0, x1, F, kernel="cauchy", scale=1.0, iterations=10)
         best = refine(F, x0, x1, kernel="cauchy", scale=1.0, iterations=30)
-        start, end, least = (cost(m, x0, x1, "cauchy", 1.0) for m in (F, found, best))
-        assert least <= end < start
+        start, end, optimum = (cost(m, x0, x1, "cauchy", 1.0) for m in (F, fitted, best))
+        assert optimum <= end < start
 
 
 def test_same_bits_in_any_batch_pool_and_padding() -> None:
@@ -81,13 +81,13 @@ def test_same_bits_in_any_batch_pool_and_padding() -> None:
     F, x0, x1 = (torch.stack(v) for v in zip(*pairs, strict=True))
     pool = F[:, None] + 1e-2 * torch.from_numpy(np.random.default_rng(1).normal(size=(4, 5, 3, 3)))
     scale = torch.linspace(0.01, 0.02, 4, dtype=torch.float64)
-    found = irls(x0, x1, pool, scale=scale, iterations=3)
-    assert found.shape == pool.shape
-    one = irls(x0[2], x1[2], pool[2, 3], scale=float(scale[2]), iterations=3)
-    assert torch.equal(one, found[2, 3])
+    fitted = irls(x0, x1, pool, scale=scale, iterations=3)
+    assert fitted.shape == pool.shape
+    single = irls(x0[2], x1[2], pool[2, 3], scale=float(scale[2]), iterations=3)
+    assert torch.equal(single, fitted[2, 3])
     y0, y1 = (torch.nn.functional.pad(v, (0, 0, 0, 77), value=torch.nan) for v in (x0, x1))
     mask = (torch.arange(197) < 120).expand(4, -1)
-    assert torch.equal(irls(y0, y1, pool, mask=mask, scale=scale, iterations=3), found)
+    assert torch.equal(irls(y0, y1, pool, mask=mask, scale=scale, iterations=3), fitted)
 
 
 def test_hopeless_problems_keep_their_model() -> None:
@@ -98,11 +98,11 @@ def test_hopeless_problems_keep_their_model() -> None:
     points1 = torch.stack([x1, torch.full_like(x1, 0.25), x1, line, x1])
     F0 = F.repeat(5, 1, 1)
     F0[4] = torch.nan
-    found = irls(points0, points1, F0, scale=0.01)
-    assert bool(torch.isfinite(found[:4]).all())
-    assert bool((distance(found[1:4].flatten(1).T, F0[1:4].flatten(1).T) < 1e-14).all())
-    assert bool(torch.isnan(found[4]).all())
-    assert torch.equal(found[0], irls(x0, x1, F, scale=0.01))
+    fitted = irls(points0, points1, F0, scale=0.01)
+    assert bool(torch.isfinite(fitted[:4]).all())
+    assert bool((distance(fitted[1:4].flatten(1).T, F0[1:4].flatten(1).T) < 1e-14).all())
+    assert bool(torch.isnan(fitted[4]).all())
+    assert torch.equal(fitted[0], irls(x0, x1, F, scale=0.01))
 
 
 def test_unknown_kernel() -> None:

@@ -71,9 +71,9 @@ def test_implicit_gradients_are_those_of_the_fixed_point(kernel: str) -> None:
     assert torch.autograd.gradcheck(implicit, attached, **tolerances(kernel))
     direction = torch.from_numpy(np.random.default_rng(0).normal(size=(3, 3)))
     both = [torch.autograd.grad((function(*attached, kind, 40) * direction).sum(), attached) for kind in GRADIENTS]
-    for one, other in zip(*both, strict=True):
+    for by_implicit, by_unrolled in zip(*both, strict=True):
         # The eigenvector's gradient knows gaps of some 1e-3 of the trace to rounding: 1e-13, times the sum over fits.
-        torch.testing.assert_close(one, other, rtol=1e-8, atol=1e-8 * float(other.abs().max()))
+        torch.testing.assert_close(by_implicit, by_unrolled, rtol=1e-8, atol=1e-8 * float(by_unrolled.abs().max()))
 
 
 def test_models_of_a_pool_have_their_own_gradients() -> None:
@@ -81,10 +81,12 @@ def test_models_of_a_pool_have_their_own_gradients() -> None:
     pool = torch.stack([F0, F0 + 0.01, -F0])
     for gradient in GRADIENTS:
         w = weight.clone().requires_grad_()
-        found = irls(x0, x1, pool, w, scale=SCALE, gradient=gradient)
+        fitted = irls(x0, x1, pool, w, scale=SCALE, gradient=gradient)
         for i in range(3):
             alone = irls(x0, x1, pool[i], w, scale=SCALE, gradient=gradient)
-            pooled, own = (torch.autograd.grad(F.square()[0].sum(), w, retain_graph=True)[0] for F in (found[i], alone))
+            pooled, own = (
+                torch.autograd.grad(F.square()[0].sum(), w, retain_graph=True)[0] for F in (fitted[i], alone)
+            )
             torch.testing.assert_close(pooled, own, rtol=1e-10, atol=1e-12)
 
 
@@ -98,9 +100,9 @@ def test_nothing_is_recorded_without_need() -> None:
     first = F0.clone().requires_grad_()
     assert not irls(x0, x1, first, weight, scale=SCALE, gradient="implicit").requires_grad
     for gradient in GRADIENTS:
-        found = irls(*attached[:2], first, attached[2], scale=SCALE, gradient=gradient)
-        assert found.requires_grad
-        assert torch.equal(found, plain)
+        fitted = irls(*attached[:2], first, attached[2], scale=SCALE, gradient=gradient)
+        assert fitted.requires_grad
+        assert torch.equal(fitted, plain)
     with pytest.raises(ValueError, match="gradient is 'none'"):
         irls(x0, x1, F0, gradient="none")
 
@@ -170,13 +172,13 @@ def test_what_is_no_model_has_no_gradient(gradient: str) -> None:
     x0, x1, F0, weight = inputs(3)
     pool = torch.stack([F0, F0 * torch.nan]).requires_grad_()
     attached = [v.clone().requires_grad_() for v in (x0, x1, weight)]
-    found = irls(*attached[:2], pool, attached[2], scale=SCALE, gradient=gradient)
+    fitted = irls(*attached[:2], pool, attached[2], scale=SCALE, gradient=gradient)
     alone = irls(*attached[:2], F0, attached[2], scale=SCALE, gradient=gradient)
-    sums = [torch.autograd.grad(f.sum(), attached, retain_graph=True) for f in (found, alone)]
+    sums = [torch.autograd.grad(f.sum(), attached, retain_graph=True) for f in (fitted, alone)]
     for g, own in zip(*sums, strict=True):
         torch.testing.assert_close(g, own, rtol=1e-8, atol=1e-8 * float(own.abs().max()))
     if gradient == "unrolled":
-        (to_pool,) = torch.autograd.grad(found.sum(), pool)
+        (to_pool,) = torch.autograd.grad(fitted.sum(), pool)
         assert bool((to_pool[1:] == 0).all())
         assert bool(to_pool.isfinite().all())
 

@@ -76,14 +76,15 @@ def test_least_squares_optimum_equals_scipy(seed: int) -> None:
     weight = np.random.default_rng(seed).uniform(0.1, 1, 80)
     F0 = models(F, 3, 0.02, seed)
     infinite = torch.full((1,), torch.inf, dtype=torch.float64)
-    found, cost = refine_components(F0, components(x0, x1), torch.from_numpy(weight)[None], "truncated", infinite, 40)
+    fitted, cost = refine_components(F0, components(x0, x1), torch.from_numpy(weight)[None], "truncated", infinite, 40)
     for i in range(3):
-        expected, least = reference.optimum(F0[:, 0, i].reshape(3, 3).numpy(), x0, x1, weight)
-        assert cost[0, i].item() <= least * (1 + 1e-8)
-        direct = (weight * reference.sampson(found[:, 0, i].reshape(3, 3).numpy(), x0, x1) ** 2).sum()
+        expected, min_cost = reference.optimum(F0[:, 0, i].reshape(3, 3).numpy(), x0, x1, weight)
+        assert cost[0, i].item() <= min_cost * (1 + 1e-8)
+        direct = (weight * reference.sampson(fitted[:, 0, i].reshape(3, 3).numpy(), x0, x1) ** 2).sum()
         assert cost[0, i].item() == pytest.approx(direct, rel=1e-12)
-        if abs(cost[0, i].item() / least - 1) < 1e-8:  # same basin: the same matrix, to the square root of 1e-8 or so
-            assert distance(found[:, 0, i], torch.from_numpy(expected.flatten())) < 1e-4
+        # same basin: the same matrix, to the square root of 1e-8 or so
+        if abs(cost[0, i].item() / min_cost - 1) < 1e-8:
+            assert distance(fitted[:, 0, i], torch.from_numpy(expected.flatten())) < 1e-4
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -92,14 +93,16 @@ def test_robust_optimum_equals_scipy(kernel: str, seed: int) -> None:
     F, x0, x1 = unit_scene(seed, 120, noise=2e-3, outliers=30)
     scale = 0.01
     F0 = models(F, 1, 1e-3, seed)
-    one = torch.ones(1, 120, dtype=torch.float64)
-    found, cost = refine_components(F0, components(x0, x1), one, kernel, torch.tensor([scale], dtype=torch.float64), 60)
+    ones = torch.ones(1, 120, dtype=torch.float64)
+    fitted, cost = refine_components(
+        F0, components(x0, x1), ones, kernel, torch.tensor([scale], dtype=torch.float64), 60
+    )
     # From our optimum SciPy, which knows another parametrisation and numerical gradients, cannot get lower.
-    _, least = reference.optimum(found[:, 0, 0].reshape(3, 3).numpy(), x0, x1, np.ones(120), kernel, scale)
+    _, min_cost = reference.optimum(fitted[:, 0, 0].reshape(3, 3).numpy(), x0, x1, np.ones(120), kernel, scale)
     # The tabulated kernel is linear between its entries, whose integral is off by up to 1e-7.
-    assert cost.item() == pytest.approx(least, rel=1e-6 if kernel == "magsac" else 1e-8)
+    assert cost.item() == pytest.approx(min_cost, rel=1e-6 if kernel == "magsac" else 1e-8)
     if kernel in ("geman_mcclure", "truncated"):  # bounded losses; the others let a quarter of outliers move F far
-        assert distance(found[:, 0, 0], torch.from_numpy(F.flatten())) < 0.05
+        assert distance(fitted[:, 0, 0], torch.from_numpy(F.flatten())) < 0.05
 
 
 def test_real_pairs_reach_the_optimum_of_scipy() -> None:
@@ -109,26 +112,26 @@ def test_real_pairs_reach_the_optimum_of_scipy() -> None:
         near = np.abs(reference.sampson(F, x0, x1)) < 2
         x0, x1 = x0[near], x1[near]
         assert len(x0) > 50
-        found = refine(
+        fitted = refine(
             torch.from_numpy(F), torch.from_numpy(x0), torch.from_numpy(x1), scale=float("inf"), iterations=40
         )
-        cost = (reference.sampson(found.numpy(), x0, x1) ** 2).sum()
+        cost = (reference.sampson(fitted.numpy(), x0, x1) ** 2).sum()
         centre0, centre1, size = x0.mean(0), x1.mean(0), np.abs(x0 - x0.mean(0)).max()
         A0, A1 = (np.array([[size, 0, c[0]], [0, size, c[1]], [0, 0, 1]]) for c in (centre0, centre1))
-        _, least = reference.optimum(A1.T @ F @ A0, (x0 - centre0) / size, (x1 - centre1) / size, np.ones(len(x0)))
-        assert cost <= least * size**2 * (1 + 1e-8)
+        _, min_cost = reference.optimum(A1.T @ F @ A0, (x0 - centre0) / size, (x1 - centre1) / size, np.ones(len(x0)))
+        assert cost <= min_cost * size**2 * (1 + 1e-8)
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_exact_matches_give_the_exact_matrix(seed: int) -> None:
     F, x0, x1 = unit_scene(seed)
-    found, cost = refine_components(
+    fitted, cost = refine_components(
         models(F, 4, 0.01, seed), components(x0, x1), torch.ones(1, 100, dtype=torch.float64), "huber",
         torch.tensor([0.1], dtype=torch.float64), 15,
     )  # fmt: skip
     assert bool((cost < 1e-28).all())
     # Rounding of 1e-16 times the condition of the scene (at most some 1e4)
-    assert bool((distance(found, torch.from_numpy(F.reshape(9, 1, 1))) < 1e-11).all())
+    assert bool((distance(fitted, torch.from_numpy(F.reshape(9, 1, 1))) < 1e-11).all())
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -151,10 +154,10 @@ def test_same_bits_in_any_batch_pool_and_padding() -> None:
     scale = torch.linspace(0.01, 0.03, 5, dtype=torch.float64)
     F, cost = refine_components(F0, points, weight, "cauchy", scale, 4)
     for i, j in ((0, 0), (3, 7), (4, 12)):
-        one, its_cost = refine_components(
+        single, its_cost = refine_components(
             F0[:, i : i + 1, j : j + 1], points[:, i : i + 1], weight[i : i + 1], "cauchy", scale[i : i + 1], 4
         )
-        assert torch.equal(one[:, 0, 0], F[:, i, j])
+        assert torch.equal(single[:, 0, 0], F[:, i, j])
         assert torch.equal(its_cost[0, 0], cost[i, j])
     padded = torch.nn.functional.pad(points, (0, 300)), torch.nn.functional.pad(weight, (0, 300))
     more, more_cost = refine_components(F0, *padded, "cauchy", scale, 4)
@@ -195,15 +198,15 @@ def test_hopeless_problems_keep_their_model(kernel: str) -> None:
     F0[:, :, 2] = 0
     F0[:, :, 3] = torch.tensor([1.0, 2, 3, 2, 4, 6, 3, 6, 9], dtype=torch.float64)[:, None]  # rank 1
     scale = torch.full((5,), 0.01, dtype=torch.float64)
-    found, cost = refine_components(F0, points, weight, kernel, scale, 6)
-    assert bool(torch.isfinite(found[:, :, 0]).all())
+    fitted, cost = refine_components(F0, points, weight, kernel, scale, 6)
+    assert bool(torch.isfinite(fitted[:, :, 0]).all())
     assert bool(torch.isfinite(cost[:, 0]).all())
-    assert bool(torch.isnan(found[:, :, 1]).all())
+    assert bool(torch.isnan(fitted[:, :, 1]).all())
     assert bool(torch.isinf(cost[:, 1:3]).all())
-    assert bool((found[:, :, 2] == 0).all())
+    assert bool((fitted[:, :, 2] == 0).all())
     assert not bool(torch.isnan(cost).any())
     alone, _ = refine_components(F0[:, :1, :1], points[:, :1], weight[:1], kernel, scale[:1], 6)
-    assert torch.equal(alone[:, 0, 0], found[:, 0, 0])
+    assert torch.equal(alone[:, 0, 0], fitted[:, 0, 0])
 
 
 def test_empty_and_unknown() -> None:

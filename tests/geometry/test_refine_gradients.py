@@ -55,9 +55,9 @@ def test_implicit_gradients_are_those_of_the_optimum(kernel: str) -> None:
     assert torch.autograd.gradcheck(functools.partial(function, gradient="implicit"), attached, **options)
     direction = torch.from_numpy(np.random.default_rng(0).normal(size=(3, 3)))
     both = [torch.autograd.grad((function(*attached, kind, F) * direction).sum(), attached) for kind in GRADIENTS]
-    for one, other in zip(*both, strict=True):
+    for by_implicit, by_unrolled in zip(*both, strict=True):
         # Both are at 1e-8 from the optimum, as above, times the third derivatives, some 1e2.
-        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5 * float(other.abs().max()))
+        torch.testing.assert_close(by_implicit, by_unrolled, rtol=1e-5, atol=1e-5 * float(by_unrolled.abs().max()))
 
 
 def test_nothing_is_recorded_without_need() -> None:
@@ -70,9 +70,9 @@ def test_nothing_is_recorded_without_need() -> None:
     with torch.no_grad():
         assert not refine(first, *attached, scale=SCALE).requires_grad
     for gradient in GRADIENTS:
-        found = refine(first, *attached, scale=SCALE, gradient=gradient)
-        assert found.requires_grad
-        assert torch.equal(found, plain)
+        fitted = refine(first, *attached, scale=SCALE, gradient=gradient)
+        assert fitted.requires_grad
+        assert torch.equal(fitted, plain)
     with pytest.raises(ValueError, match="gradient is 'none'"):
         refine(F, x0, x1, gradient="none")
 
@@ -116,15 +116,15 @@ def test_what_is_no_model_has_no_gradient(gradient: str) -> None:
     x0, x1, F, weight = inputs(3)
     pool = torch.stack([F, F * torch.nan, F * 0, torch.ones_like(F)]).requires_grad_()
     attached = [v.clone().requires_grad_() for v in (x0, x1, weight)]
-    found = refine(pool, *attached, scale=SCALE, gradient=gradient)
+    fitted = refine(pool, *attached, scale=SCALE, gradient=gradient)
     # The last one may be refined to something; the two before it add nothing.
-    for g in torch.autograd.grad(found.sum(), attached, retain_graph=True):
+    for g in torch.autograd.grad(fitted.sum(), attached, retain_graph=True):
         assert bool(g.isfinite().all())
     alone = refine(F, *attached, scale=SCALE, gradient=gradient)
-    sums = [torch.autograd.grad(f.sum(), attached, retain_graph=True) for f in (found[:3], alone)]
+    sums = [torch.autograd.grad(f.sum(), attached, retain_graph=True) for f in (fitted[:3], alone)]
     for g, own in zip(*sums, strict=True):
         torch.testing.assert_close(g, own, rtol=1e-8, atol=1e-8 * float(own.abs().max()))
     if gradient == "unrolled":
-        (to_pool,) = torch.autograd.grad(found.sum(), pool)
+        (to_pool,) = torch.autograd.grad(fitted.sum(), pool)
         assert bool(to_pool.isfinite().all())
         assert bool((to_pool[1:3] == 0).all())

@@ -56,11 +56,11 @@ def test_one_reweighted_fit(loss: str, n: int) -> None:
     weight[:2] = [0, 1e-9]
     tensors = (torch.from_numpy(a) for a in (F.T[:, None].copy(), points[:, None], weight[None]))
     expected = reweighted(*tensors, KERNELS[loss], torch.tensor([SCALE], dtype=torch.float64))[:, 0].T.numpy()
-    found, s2 = F.copy(), np.full(n, SCALE**2)
-    irls_kernels.reweighted(found, Weighted(points, weight, s2, LOSSES[loss], loss_table(loss)))
-    for one, other in zip(found, expected, strict=True):
+    fitted, s2 = F.copy(), np.full(n, SCALE**2)
+    irls_kernels.reweighted(fitted, Weighted(points, weight, s2, LOSSES[loss], loss_table(loss)))
+    for fit, other in zip(fitted, expected, strict=True):
         # Rounding of the sums over the gap of their eigenvalues, 1e-8 of the largest.
-        assert apart(one, other) < 1e-8
+        assert apart(fit, other) < 1e-8
     kept = F.copy()  # where the weights determine no model
     none = np.where(np.arange(n) < 6, weight, 0)
     irls_kernels.reweighted(kept, Weighted(points, none, s2, LOSSES[loss], loss_table(loss)))
@@ -71,10 +71,10 @@ def refined(
     F: np.ndarray, points: np.ndarray, weight: np.ndarray, s2: np.ndarray, loss: str, iterations: int, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Models and costs by the kernel."""
-    found, cost = np.empty_like(F), np.empty(len(F))
+    fitted, cost = np.empty_like(F), np.empty(len(F))
     weighted = Weighted(points, weight, s2, LOSSES[loss], loss_table(loss))
-    refine(F, SQUARINGS, weighted, Schedule(iterations, FIRST_DAMPING, tolerance), found, cost)
-    return found, cost
+    refine(F, SQUARINGS, weighted, Schedule(iterations, FIRST_DAMPING, tolerance), fitted, cost)
+    return fitted, cost
 
 
 @pytest.mark.parametrize("tolerance", [0.0, 1e-3])
@@ -82,21 +82,21 @@ def refined(
 def test_refinement(loss: str, tolerance: float) -> None:
     F, points, weight, s2 = matches(200)
     for iterations in (0, 1, 3, 8):
-        found, cost = refined(F, points, weight, s2, loss, iterations, tolerance)
+        fitted, cost = refined(F, points, weight, s2, loss, iterations, tolerance)
         for i, start in enumerate(F):
             expected, expected_cost = reference.levenberg_marquardt(
                 start, points, weight, s2, loss, iterations, FIRST_DAMPING, tolerance
             )
             assert cost[i] == pytest.approx(expected_cost, rel=1e-9)
-            assert apart(found[i], expected) < 1e-8
-        assert np.abs(np.linalg.det(found.reshape(-1, 3, 3))).max() < 1e-14
+            assert apart(fitted[i], expected) < 1e-8
+        assert np.abs(np.linalg.det(fitted.reshape(-1, 3, 3))).max() < 1e-14
 
 
 def test_what_cannot_be_refined_is_told() -> None:
     F, points, weight, s2 = matches(50)
     F[1], F[2] = 0, np.nan
-    found, cost = refined(F, points, weight, s2, "truncated", 3, 0.0)
+    fitted, cost = refined(F, points, weight, s2, "truncated", 3, 0.0)
     assert np.isfinite(cost).tolist() == [True, False, False, True, True]
     alone, alone_cost = refined(F[3:4].copy(), points, weight, s2, "truncated", 3, 0.0)
-    np.testing.assert_array_equal(alone[0], found[3])
+    np.testing.assert_array_equal(alone[0], fitted[3])
     assert alone_cost[0] == cost[3]

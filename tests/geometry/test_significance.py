@@ -114,9 +114,9 @@ def test_matches_of_one_spot_are_no_evidence() -> None:
 )
 def test_no_model_is_not_significant(F: Tensor) -> None:
     good, x0, x1 = pair(50)
-    found = significance(torch.stack([F.double(), good[0]]), x0.expand(2, -1, -1), x1.expand(2, -1, -1))
-    assert found[0] == -math.inf
-    assert found[1] == significance(good, x0, x1)[0]
+    values = significance(torch.stack([F.double(), good[0]]), x0.expand(2, -1, -1), x1.expand(2, -1, -1))
+    assert values[0] == -math.inf
+    assert values[1] == significance(good, x0, x1)[0]
 
 
 def test_matches_without_extent_are_not_significant() -> None:
@@ -149,11 +149,11 @@ def test_few_inliers_of_many_are_chance_and_many_are_not() -> None:
 
 def assert_same_in_both_forms(monkeypatch: pytest.MonkeyPatch, F: Tensor, *c: Tensor | None) -> None:
     """Within rounding: sums of up to a hundred thousand logarithms of factorials, of which each form rounds one."""
-    found = []
+    values = []
     for state in ("on", "off"):
         monkeypatch.setenv(switch.SWITCH, state)
-        found.append(significance(F, *c))
-    torch.testing.assert_close(*found, rtol=1e-12, atol=1e-9)
+        values.append(significance(F, *c))
+    torch.testing.assert_close(*values, rtol=1e-12, atol=1e-9)
 
 
 @pytest.mark.parametrize("sizes", [False, True])

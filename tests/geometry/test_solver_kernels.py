@@ -21,8 +21,8 @@ DRAWS = 203  # not whole lanes
 def points_of() -> dict[str, np.ndarray]:
     """Points (4, n) of pairs of many kinds, in normalised units."""
     given = {"random": scene(1, 300), "right": scene(1, 300, outliers=0, noise=0), **degenerate(), **small()}
-    found = {name: normalized(c) for name, c in given.items()}
-    return {name: pair.points for name, pair in found.items() if pair is not None}
+    pairs = {name: normalized(c) for name, c in given.items()}
+    return {name: pair.points for name, pair in pairs.items() if pair is not None}
 
 
 def solved(solver: str, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -85,14 +85,14 @@ def test_samples_of_right_matches_pass_the_oriented_constraint_and_most_others_f
 def test_weighted_fits_are_those_of_the_definition(kind: str) -> None:
     for name, points in points_of().items():
         rng, n = np.random.default_rng(2), points.shape[1]
-        some = rng.random(n) * (rng.random(n) < 0.5)
-        weight = {"ones": np.ones(n), "random": rng.random(n), "some": some, "none": np.zeros(n)}[kind]
+        sparse = rng.random(n) * (rng.random(n) < 0.5)
+        weight = {"ones": np.ones(n), "random": rng.random(n), "some": sparse, "none": np.zeros(n)}[kind]
         F = np.empty(9)
-        found = weighted_eight_point(points, weight, F)
-        assert not found or np.isfinite(F).all()
+        solved = weighted_eight_point(points, weight, F)
+        assert not solved or np.isfinite(F).all()
         if name in ("random", "right", "all outliers"):
-            assert found == (kind != "none")
-            if found:
+            assert solved == (kind != "none")
+            if solved:
                 theirs = reference.eight_point(points[:2].T, points[2:].T, weight).ravel()
                 # The sums of 300 products, each rounded, over the gap of the eigenvalues, some 1e-5.
                 np.testing.assert_allclose(F * np.sign(F @ theirs), theirs, atol=1e-8, err_msg=name)

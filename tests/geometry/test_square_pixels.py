@@ -20,18 +20,18 @@ def test_they_are_those_of_the_definition() -> None:
         K = np.array([[rng.uniform(300, 900), rng.normal(0, 5), 320], [0, rng.uniform(300, 900), 240], [0, 0, 1]])
         A, square = reference.square(K, (480, 640))
         for scale in (1.0, -2.0):  # K is homogeneous
-            found = square_pixels(torch.from_numpy(scale * K)[None], SIZE, RIGHT)
-            np.testing.assert_allclose(found.map[0], A, rtol=1e-12, atol=1e-9)
-            assert float(found.focal) == pytest.approx(square[0, 0], rel=1e-12)
+            square_map = square_pixels(torch.from_numpy(scale * K)[None], SIZE, RIGHT)
+            np.testing.assert_allclose(square_map.map[0], A, rtol=1e-12, atol=1e-9)
+            assert float(square_map.focal) == pytest.approx(square[0, 0], rel=1e-12)
         x = rng.uniform(0, 600, (1, 50, 2))
         expected = np.c_[x[0], np.ones(50)] @ A.T
-        np.testing.assert_allclose(mapped(torch.from_numpy(x), found.map)[0], expected[:, :2], atol=1e-9)
+        np.testing.assert_allclose(mapped(torch.from_numpy(x), square_map.map)[0], expected[:, :2], atol=1e-9)
 
 
 def test_an_image_of_unknown_size_is_central() -> None:
-    found = square_pixels(GOOD, None, RIGHT)
-    assert found.size.tolist() == [[501.0, 621.0]]
-    middle = mapped(torch.tensor([[[310.0, 250.0]]], dtype=torch.float64), found.map)
+    square_map = square_pixels(GOOD, None, RIGHT)
+    assert square_map.size.tolist() == [[501.0, 621.0]]
+    middle = mapped(torch.tensor([[[310.0, 250.0]]], dtype=torch.float64), square_map.map)
     torch.testing.assert_close(middle, torch.tensor([[[310.0, 250.0]]], dtype=torch.float64))
 
 
@@ -42,12 +42,12 @@ def test_the_unit_of_normalised_points_does_not_matter(scale: float, central: bo
     K = torch.diag(torch.tensor([1.5, 1.5, 1.0], dtype=torch.float64))
     K[:2, 2] = torch.tensor([0.5, 0.4]) if central else 0.0
     K[:2] *= scale
-    found = square_pixels(K[None], None, RIGHT)
-    assert float(found.focal) == pytest.approx(1500.0 if scale == 1e3 else 1000.0)
+    square_map = square_pixels(K[None], None, RIGHT)
+    assert float(square_map.focal) == pytest.approx(1500.0 if scale == 1e3 else 1000.0)
     point = K[:2, 2] + K[0, 0] * torch.tensor([0.3, -0.2])
-    (at,) = mapped(point[None, None], found.map)[0]
-    centre = (found.size[0].flip(0) - 1) / 2
-    torch.testing.assert_close((at - centre) / found.focal, torch.tensor([0.3, -0.2], dtype=torch.float64))
+    (at,) = mapped(point[None, None], square_map.map)[0]
+    centre = (square_map.size[0].flip(0) - 1) / 2
+    torch.testing.assert_close((at - centre) / square_map.focal, torch.tensor([0.3, -0.2], dtype=torch.float64))
 
 
 def test_gradients_reach_the_calibration_and_are_those_of_a_constant_image() -> None:

@@ -49,17 +49,17 @@ def arguments(*cameras: Cameras) -> dict[str, Tensor]:
 
 def batch(sizes: tuple[int, ...], noise: float = 0.5) -> dict[str, Tensor]:
     """Pairs of different numbers of matches, with weights and noise, padded by what is not a number."""
-    made = [problem(i, n, noise) for i, n in enumerate(sizes)]
+    problems = [problem(i, n, noise) for i, n in enumerate(sizes)]
     longest, rng = max(sizes), np.random.default_rng(0)
 
     def padded(values: list[np.ndarray]) -> Tensor:
-        whole = np.full((len(values), longest, *values[0].shape[1:]), np.nan)
-        for row, value in zip(whole, values, strict=True):
+        filled = np.full((len(values), longest, *values[0].shape[1:]), np.nan)
+        for row, value in zip(filled, values, strict=True):
             row[: len(value)] = value
-        return torch.from_numpy(whole)
+        return torch.from_numpy(filled)
 
-    return arguments(*(m[0] for m in made)) | {
-        "x0": padded([m[1] for m in made]), "x1": padded([m[2] for m in made]),
+    return arguments(*(m[0] for m in problems)) | {
+        "x0": padded([m[1] for m in problems]), "x1": padded([m[2] for m in problems]),
         "weight": padded([rng.uniform(0.2, 1, n) for n in sizes]),
         "noise": padded([rng.uniform(0.5, 2, n) for n in sizes]),
         "mask": torch.arange(longest) < torch.tensor(sizes)[:, None],
@@ -76,7 +76,7 @@ def test_against_the_definitions(kind: str) -> None:
         "focal_precision": torch.from_numpy(precision).expand(3, 2, 2),
         "shared_focal": torch.tensor([shared]).expand(3),
     }
-    found = two_view_covariance(**given)
+    result = two_view_covariance(**given)
     finite = np.where(np.isinf(precision), 0, precision)
     basis = reference.directions(np.isinf(np.diag(precision)), shared)
     for i, n in enumerate((40, 60, 90)):
@@ -84,18 +84,18 @@ def test_against_the_definitions(kind: str) -> None:
         x0, x1, w, noise = (given[name][i, :n].numpy() for name in ("x0", "x1", "weight", "noise"))
         C, V, s = reference.covariance(cameras, x0, x1, w, noise, 4.0, finite, basis)
         turn = np.eye(7)  # tangents are any basis of a plane
-        turn[3:5, 3:5] = found.tangent[i].numpy().T @ cameras.basis
+        turn[3:5, 3:5] = result.tangent[i].numpy().T @ cameras.basis
         scale = np.sqrt(np.diag(turn @ C @ turn.T)) + 1e-12
         # Central differences of step 1e-6 are good to 1e-9 or so, and the noise ends within a quarter to the tenth.
-        np.testing.assert_allclose(found.noise[i], s, rtol=1e-5)
+        np.testing.assert_allclose(result.noise[i], s, rtol=1e-5)
         np.testing.assert_allclose(
-            found.covariance[i].numpy() / np.outer(scale, scale), turn @ C @ turn.T / np.outer(scale, scale), atol=3e-5
+            result.covariance[i].numpy() / np.outer(scale, scale), turn @ C @ turn.T / np.outer(scale, scale), atol=3e-5
         )
-        np.testing.assert_allclose(found.fundamental[i].numpy(), V, atol=3e-5 * V.max())
+        np.testing.assert_allclose(result.fundamental[i].numpy(), V, atol=3e-5 * V.max())
         known = np.isinf(np.diag(precision)) | (shared and np.isinf(precision).any())
-        assert not bool(found.covariance[i][5:][known].any())
-    degrees = torch.rad2deg(found.covariance.diagonal(dim1=1, dim2=2)[:, :5].split([3, 2], 1)[0].sum(1).sqrt())
-    torch.testing.assert_close(found.deviation_degrees[:, 0], degrees)
+        assert not bool(result.covariance[i][5:][known].any())
+    degrees = torch.rad2deg(result.covariance.diagonal(dim1=1, dim2=2)[:, :5].split([3, 2], 1)[0].sum(1).sqrt())
+    torch.testing.assert_close(result.deviation_degrees[:, 0], degrees)
 
 
 def test_derivatives_are_those_of_autograd() -> None:
@@ -118,8 +118,8 @@ def test_derivatives_are_those_of_autograd() -> None:
         zero = torch.zeros_like(a)
         E = torch.stack([zero, -c, b, c, zero, -a, -b, a, zero]).reshape(3, 3) @ turned
         f0, f1 = f[:, 0] * torch.exp(by[5:])
-        one = torch.ones_like(f0)
-        E = torch.stack([1 / f1, 1 / f1, one])[:, None] * E * torch.stack([1 / f0, 1 / f0, one])
+        ones = torch.ones_like(f0)
+        E = torch.stack([1 / f1, 1 / f1, ones])[:, None] * E * torch.stack([1 / f0, 1 / f0, ones])
         h0, h1 = (torch.cat([a[:, 0], torch.ones_like(a[:1, 0])]) for a in (a0, a1))
         l1, l0 = E @ h0, E.T @ h1
         return (h1 * l1).sum(0) / (l1[:2].square().sum(0) + l0[:2].square().sum(0)).sqrt()
@@ -133,7 +133,7 @@ def test_derivatives_are_those_of_autograd() -> None:
 def test_padding_and_neighbours_are_invisible() -> None:
     sizes = (60, 8, 33, 120)
     given = batch(sizes)
-    found = two_view_covariance(**given)
+    result = two_view_covariance(**given)
     for i, n in enumerate(sizes):
         alone = two_view_covariance(
             **{
@@ -141,7 +141,7 @@ def test_padding_and_neighbours_are_invisible() -> None:
                 for k, v in given.items()
             }
         )
-        for a, b in zip(alone, found, strict=True):
+        for a, b in zip(alone, result, strict=True):
             assert torch.equal(a[0], b[i])
 
 
@@ -159,20 +159,20 @@ def test_no_pair_takes_its_batch_down() -> None:
     bad["x0"][6], bad["x1"][6] = 7.0, 9.0
     bad["focal_precision"][7] = torch.tensor([[-1e9, 0.0], [0.0, -1e9]])  # a prior that is no maximum adds nothing
     bad = {k: v.requires_grad_(v.is_floating_point()) for k, v in bad.items()}
-    found = two_view_covariance(**bad)
-    assert found.valid.tolist() == [False] * 5 + [True] * 4
-    for value in found:
+    result = two_view_covariance(**bad)
+    assert result.valid.tolist() == [False] * 5 + [True] * 4
+    for value in result:
         assert not bool(value.isnan().any())
         assert (
-            torch.equal(value[8], good[good.index(value) if False else found.index(value) if False else 0][8]) or True
+            torch.equal(value[8], good[good.index(value) if False else result.index(value) if False else 0][8]) or True
         )
-    for a, b in zip(found, good, strict=True):
+    for a, b in zip(result, good, strict=True):
         assert torch.equal(a[8].detach(), b[8])
     nothing_known = torch.tensor([math.degrees(1.33 * 3**0.5), math.degrees(1.21 * 2**0.5)], dtype=torch.float64)
-    torch.testing.assert_close(found.deviation_degrees[:6].detach(), nothing_known.expand(6, 2))
-    assert bool((found.deviation_degrees[6] > 60).all())
-    assert bool((found.covariance.diagonal(dim1=1, dim2=2) >= 0).all())
-    found.covariance.sum().backward()
+    torch.testing.assert_close(result.deviation_degrees[:6].detach(), nothing_known.expand(6, 2))
+    assert bool((result.deviation_degrees[6] > 60).all())
+    assert bool((result.covariance.diagonal(dim1=1, dim2=2) >= 0).all())
+    result.covariance.sum().backward()
     for name, value in bad.items():
         if value.grad is not None:
             assert bool(value.grad[8].isfinite().all()), name
@@ -188,11 +188,11 @@ def test_what_is_not_determined_is_uncertain() -> None:
         Y = X @ R.T + t
         x0, x1 = (900 * Z[:, :2] / Z[:, 2:] + principal[0] + rng.normal(0, 0.5, (300, 2)) for Z in (X, Y))
         assumed = Cameras.of(R, t if t.any() else np.array([1.0, 0, 0]), np.array([900.0, 900]), principal)
-        found = two_view_covariance(
+        result = two_view_covariance(
             torch.from_numpy(x0)[None], torch.from_numpy(x1)[None], **arguments(assumed),
             truncation=torch.tensor([1.5]), focal_precision=torch.from_numpy(precision)[None],
         )  # fmt: skip
-        return found.deviation_degrees[0], found.covariance[0].diagonal()[5:].sqrt()
+        return result.deviation_degrees[0], result.covariance[0].diagonal()[5:].sqrt()
 
     turned = reference.Rotation.from_rotvec([0.05, 0.2, 0.02]).as_matrix()
     known = np.diag([INF, INF])
@@ -229,13 +229,13 @@ def test_ellipsoids_hold_simulated_noise(n: int, kind: str) -> None:
         fits.append(reference.fit(truth, x0, x1, 2 * sigma, basis, mean, precision, sigma))
         truths.append(truth)
         points.append((x0, x1))
-    found = two_view_covariance(
+    result = two_view_covariance(
         *(torch.from_numpy(np.stack(x)) for x in zip(*points, strict=True)), **arguments(*fits),
         truncation=torch.full((trials,), 2 * sigma, dtype=torch.float64),
         focal_precision=torch.from_numpy(np.diag([INF, INF]) if known else precision).expand(trials, 2, 2),
         shared_focal=torch.full((trials,), shared),
     )  # fmt: skip
-    C, tangent = found.covariance.numpy(), found.tangent.numpy()
+    C, tangent = result.covariance.numpy(), result.tangent.numpy()
     held = np.zeros((trials, 2), bool)
     for i, (truth, fit) in enumerate(zip(truths, fits, strict=True)):
         by = fit.difference(truth)

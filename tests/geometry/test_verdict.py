@@ -78,9 +78,9 @@ def test_what_an_estimator_does_not_say_is_said_by_the_caller() -> None:
     without = silent(c)
     assert bool(without.significance.isnan().all())
     assert not bool(without.related.any())
-    told = judged(without, c)
-    assert torch.equal(told.significance, quick("ransac", 200, 100)(c).significance)
-    assert bool(told.related.all())
+    with_significance = judged(without, c)
+    assert torch.equal(with_significance.significance, quick("ransac", 200, 100)(c).significance)
+    assert bool(with_significance.related.all())
     own = without.replace(significance=torch.full((len(c),), 7.0, dtype=torch.float64))
     assert judged(own, c) is own
 

@@ -9,7 +9,7 @@ import pytest
 
 PACKAGE = '''
 import cv2, numpy as np, torch
-available_models = ["sift-nn", "silent", "broken", "no-download", "random", "uneven", "romav2"]
+available_models = ["sift-nn", "superpoint-lightglue", "silent", "broken", "no-download", "random", "uneven", "romav2"]
 calls = []
 
 
@@ -93,4 +93,5 @@ def install(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (folder / "vismatch-9.9.dist-info").mkdir()
     (folder / "vismatch-9.9.dist-info" / "METADATA").write_text("Name: vismatch\nVersion: 9.9\n")
     monkeypatch.syspath_prepend(str(folder))
-    monkeypatch.delitem(sys.modules, "vismatch", raising=False)
+    monkeypatch.setitem(sys.modules, "vismatch", None)  # whose end takes away what the test has imported since
+    del sys.modules["vismatch"]

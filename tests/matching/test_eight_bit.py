@@ -53,11 +53,11 @@ def test_a_wide_range_of_whole_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("value", [0.0, 1.0, 0.1])
 def test_equal_descriptors_go_to_the_lowest_index(value: float) -> None:
-    found = nearest_neighbors(torch.full((500, 128), value), torch.full((400, 128), value))
-    assert (found.nearest == 0).all()
-    assert (found.reverse == 0).all()
-    assert (found.distance == 0).all()
-    assert (found.second == 0).all()
+    neighbors = nearest_neighbors(torch.full((500, 128), value), torch.full((400, 128), value))
+    assert (neighbors.nearest == 0).all()
+    assert (neighbors.reverse == 0).all()
+    assert (neighbors.distance == 0).all()
+    assert (neighbors.second == 0).all()
 
 
 def test_what_rounding_does_not_tell_apart_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -72,9 +72,9 @@ def test_blocks_change_nothing() -> None:
     expected = eight_bit.two_nearest(rows, columns)
     assert expected is not None
     for block in (1, 7, 1000):
-        found = eight_bit.two_nearest(rows, columns, block)
-        assert found is not None
-        for a, b in zip(found[:5], expected[:5], strict=True):
+        neighbors = eight_bit.two_nearest(rows, columns, block)
+        assert neighbors is not None
+        for a, b in zip(neighbors[:5], expected[:5], strict=True):
             assert (a == b).all()
 
 
@@ -92,6 +92,6 @@ def test_values_whose_squares_overflow_harm_nothing(scale: float, monkeypatch: p
 
 
 def test_descriptors_without_components_are_equal() -> None:
-    found = nearest_neighbors(torch.zeros(3, 0), torch.zeros(2, 0))
-    assert found.nearest.tolist() == [0, 0, 0]
-    assert found.reverse.tolist() == [0, 0]
+    neighbors = nearest_neighbors(torch.zeros(3, 0), torch.zeros(2, 0))
+    assert neighbors.nearest.tolist() == [0, 0, 0]
+    assert neighbors.reverse.tolist() == [0, 0]

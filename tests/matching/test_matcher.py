@@ -19,12 +19,12 @@ def features(seed: int, n: int) -> Features:
 
 def test_slots_are_the_features_of_image_0() -> None:
     f0, f1 = features(1, 9), features(2, 7)
-    found = nearest_neighbors(f0.descriptors, f1.descriptors)
+    neighbors = nearest_neighbors(f0.descriptors, f1.descriptors)
     matches = NearestNeighborMatcher()(f0, f1)
     assert torch.equal(matches.x0[0], f0.keypoints)
-    assert torch.equal(matches.x1[0], f1.keypoints[found.nearest])
-    assert torch.equal(matches.lafs1[0], f1.lafs[found.nearest])
-    assert torch.equal(matches.quality[0], found.ratio)
+    assert torch.equal(matches.x1[0], f1.keypoints[neighbors.nearest])
+    assert torch.equal(matches.lafs1[0], f1.lafs[neighbors.nearest])
+    assert torch.equal(matches.quality[0], neighbors.ratio)
     assert matches.mask.all()
     assert matches.size0.tolist() == [[101, 200]]
     assert matches.size1.tolist() == [[102, 200]]
@@ -32,8 +32,8 @@ def test_slots_are_the_features_of_image_0() -> None:
 
 def test_mutual_masks_one_sided_matches() -> None:
     f0, f1 = features(1, 30), features(2, 20)
-    found = nearest_neighbors(f0.descriptors, f1.descriptors)
-    assert torch.equal(NearestNeighborMatcher(mutual=True)(f0, f1).mask[0], found.mutual)
+    neighbors = nearest_neighbors(f0.descriptors, f1.descriptors)
+    assert torch.equal(NearestNeighborMatcher(mutual=True)(f0, f1).mask[0], neighbors.mutual)
 
 
 @pytest.mark.parametrize("mutual", [False, True])

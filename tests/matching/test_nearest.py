@@ -30,13 +30,13 @@ def assert_same(a: Neighbors, b: Neighbors) -> None:
         assert torch.equal(left, right)
 
 
-def assert_is_reference(found: Neighbors, d0: Tensor, d1: Tensor, tolerance: float) -> None:
+def assert_is_reference(neighbors: Neighbors, d0: Tensor, d1: Tensor, tolerance: float) -> None:
     index, first, second = two_nearest(d0.numpy(), d1.numpy())
     reverse = two_nearest(d1.numpy(), d0.numpy())[0]
-    np.testing.assert_array_equal(found.nearest.numpy(), index)
-    np.testing.assert_array_equal(found.reverse.numpy(), reverse)
-    np.testing.assert_allclose(found.distance.numpy(), first, rtol=tolerance, atol=tolerance)
-    np.testing.assert_allclose(found.second.numpy(), second, rtol=tolerance, atol=tolerance)
+    np.testing.assert_array_equal(neighbors.nearest.numpy(), index)
+    np.testing.assert_array_equal(neighbors.reverse.numpy(), reverse)
+    np.testing.assert_allclose(neighbors.distance.numpy(), first, rtol=tolerance, atol=tolerance)
+    np.testing.assert_allclose(neighbors.second.numpy(), second, rtol=tolerance, atol=tolerance)
 
 
 # Distances are rounded once to float32 (2^-24); real-valued unit vectors lie on a grid of 2^-25, which moves a
@@ -51,10 +51,10 @@ def test_equals_the_definition_on_whole_numbers(n0: int, n1: int) -> None:
 def test_equals_the_definition_on_real_numbers(scale: float) -> None:
     d0, d1 = scale * unit(3, 90), scale * unit(4, 75)
     index, first, second = two_nearest(d0.numpy(), d1.numpy())
-    found = nearest_neighbors(d0, d1)
-    np.testing.assert_array_equal(found.nearest.numpy(), index)
-    np.testing.assert_allclose(found.distance.numpy() / scale, first / scale, atol=5e-7)
-    np.testing.assert_allclose(found.second.numpy() / scale, second / scale, atol=5e-7)
+    neighbors = nearest_neighbors(d0, d1)
+    np.testing.assert_array_equal(neighbors.nearest.numpy(), index)
+    np.testing.assert_allclose(neighbors.distance.numpy() / scale, first / scale, atol=5e-7)
+    np.testing.assert_allclose(neighbors.second.numpy() / scale, second / scale, atol=5e-7)
 
 
 @settings(max_examples=60, deadline=None)
@@ -97,20 +97,20 @@ def test_chunk_batch_and_padding_are_invisible(make: object) -> None:
 
 def test_leading_dimensions() -> None:
     d0, d1 = sift_like(1, 6 * 10).reshape(2, 3, 10, 128), sift_like(2, 6 * 11).reshape(2, 3, 11, 128)
-    found = nearest_neighbors(d0, d1)
-    assert found.nearest.shape == (2, 3, 10)
-    assert found.reverse.shape == (2, 3, 11)
-    assert torch.equal(found.nearest[1, 2], nearest_neighbors(d0[1, 2], d1[1, 2]).nearest)
+    neighbors = nearest_neighbors(d0, d1)
+    assert neighbors.nearest.shape == (2, 3, 10)
+    assert neighbors.reverse.shape == (2, 3, 11)
+    assert torch.equal(neighbors.nearest[1, 2], nearest_neighbors(d0[1, 2], d1[1, 2]).nearest)
     assert nearest_neighbors(d0[:0], d1[:0]).nearest.shape == (0, 3, 10)
 
 
 def test_a_descriptor_that_is_not_finite_has_no_neighbour_and_is_none() -> None:
     d0, d1 = sift_like(1, 5), sift_like(2, 5)
     d0[2, 7], d1[int(nearest_neighbors(d0, d1).nearest[0])] = math.nan, math.inf
-    found = nearest_neighbors(d0, d1)
-    assert found.nearest[2] == -1
-    assert torch.isfinite(found.distance[[0, 1, 3, 4]]).all()
-    assert not (found.reverse == 2).any()
+    neighbors = nearest_neighbors(d0, d1)
+    assert neighbors.nearest[2] == -1
+    assert torch.isfinite(neighbors.distance[[0, 1, 3, 4]]).all()
+    assert not (neighbors.reverse == 2).any()
 
 
 def test_ratio_says_nothing_where_there_is_nothing_to_compare() -> None:
@@ -134,12 +134,12 @@ def test_equals_opencv_on_real_descriptors() -> None:
     file = oracle("sift.npz")
     d0, d1 = file["000.default.desc"].astype(np.float32), file["001.default.desc"].astype(np.float32)
     expected = cv2.BFMatcher(cv2.NORM_L2).knnMatch(d0, d1, 2)
-    found = nearest_neighbors(torch.from_numpy(d0), torch.from_numpy(d1))
-    assert found.nearest.tolist() == [m[0].trainIdx for m in expected]
-    np.testing.assert_array_equal(found.distance, np.float32([m[0].distance for m in expected]))
-    np.testing.assert_array_equal(found.second, np.float32([m[1].distance for m in expected]))
+    neighbors = nearest_neighbors(torch.from_numpy(d0), torch.from_numpy(d1))
+    assert neighbors.nearest.tolist() == [m[0].trainIdx for m in expected]
+    np.testing.assert_array_equal(neighbors.distance, np.float32([m[0].distance for m in expected]))
+    np.testing.assert_array_equal(neighbors.second, np.float32([m[1].distance for m in expected]))
     crossed = {(m.queryIdx, m.trainIdx) for m in cv2.BFMatcher(cv2.NORM_L2, crossCheck=True).match(d0, d1)}
-    assert crossed == {(i, int(found.nearest[i])) for i in found.mutual.nonzero()[:, 0].tolist()}
+    assert crossed == {(i, int(neighbors.nearest[i])) for i in neighbors.mutual.nonzero()[:, 0].tolist()}
 
 
 def test_chunk_must_be_positive() -> None:

@@ -35,9 +35,9 @@ def test_points_and_confidences_are_the_matchers(tmp_path: Path) -> None:
     a, b = pictures(tmp_path)
     c = VisMatch("sift-nn", max_features=500).match_images(a, b)
     (k0, _), (k1, _) = (cv2.SIFT_create(500).detectAndCompute(i, None) for i in (a, b))
-    found = {k.pt for k in k0}, {k.pt for k in k1}
+    keypoints = {k.pt for k in k0}, {k.pt for k in k1}
     assert int(c.count()) > 50
-    for x, known in zip((c.x0, c.x1), found, strict=True):
+    for x, known in zip((c.x0, c.x1), keypoints, strict=True):
         assert {tuple(point) for point in x[0].tolist()} <= {tuple(np.float32(p).tolist()) for p in known}
     assert ((c.x0 - c.x1)[0, :, 0] - 12).abs().median() < 0.5
     assert c.quality is not None

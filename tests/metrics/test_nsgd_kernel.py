@@ -15,7 +15,7 @@ pytest.importorskip("numba", reason="numba is not installed")
 def matrices() -> tuple[torch.Tensor, torch.Tensor]:
     """Random pairs, and ones whose lines are vertical, horizontal, far outside, at infinity, or none."""
     pairs = [random_pairs(seed, 1, spread=spread) for seed, spread in enumerate((0.0, 0.001, 0.05, 0.5, 2.0))]
-    F_gt, F_est = (torch.cat(some) for some in zip(*pairs, strict=True))
+    F_gt, F_est = (torch.cat(batch) for batch in zip(*pairs, strict=True))
     special = [rows_shifted(0.0), rows_shifted(700.0), rows_shifted(5000.0), columns_shifted(0.0), columns_shifted(9.0)]
     affine = torch.zeros(3, 3, dtype=torch.float64)
     affine[2, 2] = 1

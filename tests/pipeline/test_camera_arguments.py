@@ -81,5 +81,5 @@ def test_calibrations_come_in_any_form() -> None:
     for other in (both, batch):
         assert torch.equal(other.R[:1], alone.R)
         assert other.focals.shape == (2, 2)
-    whole = fmtorch.find_essential(x0, x1, [[500, 2, 310], [0, 520, 250], [0, 0, 1]], reference.K1)
-    assert torch.equal(whole.R, alone.R)
+    as_lists = fmtorch.find_essential(x0, x1, [[500, 2, 310], [0, 520, 250], [0, 0, 1]], reference.K1)
+    assert torch.equal(as_lists.R, alone.R)

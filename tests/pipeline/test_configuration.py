@@ -30,9 +30,9 @@ def test_kinds(kind: str, known: bool) -> None:
     """Of estimated models, with calibrations and by image sizes alone, the cameras being usual ones."""
     c = collate([pair(kind, seed) for seed in range(20)])
     c = c if known else c.replace(K0=None, K1=None)
-    found = classify(c, estimated(c))
-    assert found.names.count(kind) >= 19, found.names
-    assert torch.equal(found.determined, torch.tensor([name == "general" for name in found.names]))
+    classified = classify(c, estimated(c))
+    assert classified.names.count(kind) >= 19, classified.names
+    assert torch.equal(classified.determined, torch.tensor([name == "general" for name in classified.names]))
     exact = classify(c, estimated(c), focal_deviation=0)
     assert exact.names.count(kind) >= 19, exact.names
 
@@ -64,11 +64,11 @@ def test_laws() -> None:
     few = pair("general", 9, 5)
     pairs = [pair(kind, i, 60 + 31 * i) for i, kind in enumerate(CONFIGURATIONS)]
     c = collate([*pairs[:3], few, *pairs[3:]])
-    found = classify(c, estimated(c))
-    assert found.names == (*CONFIGURATIONS[:3], "unrelated", *CONFIGURATIONS[3:])
-    for i, one in enumerate([*pairs[:3], few, *pairs[3:]]):
-        alone = classify(one, estimated(one))
-        for a, b in zip((alone.kind, *alone.evidence), (found.kind, *found.evidence), strict=True):
+    classified = classify(c, estimated(c))
+    assert classified.names == (*CONFIGURATIONS[:3], "unrelated", *CONFIGURATIONS[3:])
+    for i, single in enumerate([*pairs[:3], few, *pairs[3:]]):
+        alone = classify(single, estimated(single))
+        for a, b in zip((alone.kind, *alone.evidence), (classified.kind, *classified.evidence), strict=True):
             assert torch.equal(a[0], b[i])
 
 

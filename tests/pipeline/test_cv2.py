@@ -122,9 +122,9 @@ def test_a_plane_in_metres() -> None:
     """Homographies map boards in metres to pixels, too; the threshold is in pixels."""
     x, y, H = homography_points()
     D = np.diag([1000, 1000, 1])
-    found, mask = cv2.findHomography(x / 1000, y, cv2.RANSAC, 3.0)
+    homography, mask = cv2.findHomography(x / 1000, y, cv2.RANSAC, 3.0)
     expected = H @ D
-    np.testing.assert_allclose(found, expected / expected[2, 2], rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(homography, expected / expected[2, 2], rtol=1e-3, atol=1e-4)
     assert mask.ravel().tolist() == cv2.findHomography(x, y, cv2.RANSAC, 3.0)[1].ravel().tolist()
 
 

@@ -86,11 +86,11 @@ def test_any_number_of_workers_and_any_executor_keep_the_same(
     expected = kept(tmp_path / "one")
     assert len(expected) == 21
     for name in ("three", "own"):
-        found = kept(tmp_path / name)
-        assert found.keys() == expected.keys()
+        stored = kept(tmp_path / name)
+        assert stored.keys() == expected.keys()
         for file, arrays in expected.items():
             for key, value in arrays.items():
-                np.testing.assert_array_equal(found[file][key], value)
+                np.testing.assert_array_equal(stored[file][key], value)
 
 
 @pytest.mark.parametrize("send", [False, True])
@@ -105,11 +105,11 @@ def test_processes_keep_the_same(pipeline: Pipeline, images: list[Path], tmp_pat
     finally:
         team.close()
     assert (matches.done, matches.troubles) == (6, [])
-    expected, found = kept(tmp_path / "threads"), kept(tmp_path / "processes")
-    assert found.keys() == expected.keys()
+    expected, stored = kept(tmp_path / "threads"), kept(tmp_path / "processes")
+    assert stored.keys() == expected.keys()
     for file, arrays in expected.items():
         for key, value in arrays.items():
-            np.testing.assert_array_equal(found[file][key], value)
+            np.testing.assert_array_equal(stored[file][key], value)
 
 
 def test_no_image_is_described_twice(

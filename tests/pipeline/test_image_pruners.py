@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,10 @@ from fmtorch.data import read_image
 from fmtorch.data.pairs import GivenMatches
 from fmtorch.geometry import sampson
 from fmtorch.pipeline import pipeline as module
+from fmtorch.pipeline.exporting import keep_outcomes
+from fmtorch.pipeline.folder import FolderMatches
 from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.storage.exchange.journal import Journal
 from tests.conftest import shared_path
 
 PRUNERS = "pruner=[ratio,one_to_one,frame_consistency,match_noise,refine_matches]"
@@ -91,3 +95,21 @@ def test_two_photographs_are_refined_in_their_reduced_pixels() -> None:
     c = result.correspondences
     motion = (c.x0 - c.x1)[0]
     assert float((motion - torch.tensor([21.0, 13.0])).norm(dim=-1).median()) < 0.1
+
+
+def test_refined_matches_are_exported_as_matches_of_keypoints(tmp_path: Path) -> None:
+    """They are at no keypoint any more; those of a run and of a folder are the same as without refinement."""
+    dataset = data.load("fmbench", root=shared_path("data/Strecha_train"))
+    pair = dataset[0]
+    ends = pair.image0.path, pair.image1.path
+    journals = []
+    for i, overrides in enumerate(([PRUNERS], [])):
+        pipeline = presets.pipeline("sift_fmtorch", overrides=[*overrides, "cache=off", "features.max_features=500"])
+        run, folder = Journal(tmp_path / f"run{i}", ends[0].parent), Journal(tmp_path / f"folder{i}", ends[0].parent)
+        keep_outcomes(run, pipeline, pipeline.run([pair]))
+        for _ in FolderMatches(pipeline, folder, 4000, True, 0).each([ends]):
+            pass
+        journals += [run, folder]
+    matches = [journal.pair(*ends).matches for journal in journals]
+    assert len(matches[0]) > 50
+    assert all(np.array_equal(matches[0], other) for other in matches[1:])

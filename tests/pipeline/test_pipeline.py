@@ -90,8 +90,8 @@ def test_an_estimator_that_says_nothing_of_significance_is_judged(pairs: list[Im
 
 def test_batches_change_nothing(pairs: list[ImagePair]) -> None:
     together = pipeline().run(pairs, seed=3)
-    for one, outcome in zip(pairs, together, strict=True):
-        (alone,) = pipeline().run([one], seed=3)
+    for pair, outcome in zip(pairs, together, strict=True):
+        (alone,) = pipeline().run([pair], seed=3)
         assert alone.reason == outcome.reason
         if alone.estimate is not None and outcome.estimate is not None:
             assert torch.equal(alone.estimate.F, outcome.estimate.F)

@@ -41,16 +41,16 @@ def write(folder: Path, cameras: Scene) -> list[tuple[str, str]]:
 
 def contents(path: Path) -> dict[str, object]:
     """All arrays and attributes of a file."""
-    found: dict[str, object] = {}
+    entries: dict[str, object] = {}
 
     def visit(name: str, entry: h5py.HLObject) -> None:
-        found[name] = {key: np.asarray(value).tolist() for key, value in entry.attrs.items()}
+        entries[name] = {key: np.asarray(value).tolist() for key, value in entry.attrs.items()}
         if isinstance(entry, h5py.Dataset):
-            found[name] = entry[()].tolist()
+            entries[name] = entry[()].tolist()
 
     with h5py.File(path) as file:
         file.visititems(visit)
-    return found
+    return entries
 
 
 def test_inliers_and_matrices_are_those_of_find_fundamental(tmp_path: Path) -> None:

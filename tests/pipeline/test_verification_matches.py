@@ -31,8 +31,8 @@ def points(count: int = 2, kind: str = "general") -> list[tuple[np.ndarray, np.n
         X = (cameras.X @ R.T + t) @ K.T
         images.append(X[:, :2] / X[:, 2:] + rng.normal(0, 0.3, (len(X), 2)))
     pairs = [(i, j) for i in range(count) for j in range(i + 1, count)]
-    found = [(matches(len(cameras.X), rng).astype(int), *pair) for pair in pairs]
-    return [(images[i][m[:, 0]], images[j][m[:, 1]]) for m, i, j in found]
+    matched = [(matches(len(cameras.X), rng).astype(int), *pair) for pair in pairs]
+    return [(images[i][m[:, 0]], images[j][m[:, 1]]) for m, i, j in matched]
 
 
 def save(path: Path, arrays: dict[str, Any]) -> Path:
@@ -51,18 +51,18 @@ def load(path: Path) -> dict[str, Any]:
     if path.suffix == ".npz":
         with np.load(path) as file:
             return {key: value.tolist() for key, value in file.items()}
-    found: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
 
     def visit(name: str, entry: h5py.HLObject) -> None:
         start = f"{name}/" if name else ""
-        found.update({f"{start}{key}": np.asarray(value).tolist() for key, value in entry.attrs.items()})
+        entries.update({f"{start}{key}": np.asarray(value).tolist() for key, value in entry.attrs.items()})
         if isinstance(entry, h5py.Dataset):
-            found[name] = entry[()].tolist()
+            entries[name] = entry[()].tolist()
 
     with h5py.File(path) as file:
         visit("", file)
         file.visititems(visit)
-    return found
+    return entries
 
 
 @pytest.mark.parametrize("known", [{}, SIZES, CALIBRATIONS, {**SIZES, **CALIBRATIONS}, {**SIZES, "K0": K}])

@@ -34,10 +34,10 @@ def test_processes_find_what_threads_find(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("output", [False, True])
 def test_shards_are_merged(output: bool, tmp_path: Path) -> None:
-    path, whole = tmp_path / "database.db", tmp_path / "whole.db"
+    path, unsharded = tmp_path / "database.db", tmp_path / "whole.db"
     write(path, scene(5))
-    shutil.copy(path, whole)
-    fmtorch.verify(whole)
+    shutil.copy(path, unsharded)
+    fmtorch.verify(unsharded)
     before = path.read_bytes()
     end = {"output": tmp_path / "verified.db"} if output else {}
     results = [fmtorch.verify(path, shard=f"{i}/3", **end) for i in (1, 3)]
@@ -47,7 +47,7 @@ def test_shards_are_merged(output: bool, tmp_path: Path) -> None:
     assert (again.kept, again.verified) == (4, 0)
     merged = fmtorch.verify(path, **end)  # the second shard was never run
     assert (merged.pairs, merged.verified, merged.kept) == (10, 10, 7)
-    assert plain(read(merged.path)) == plain(read(whole))
+    assert plain(read(merged.path)) == plain(read(unsharded))
     assert not results[0].path.exists()
 
 
@@ -64,10 +64,10 @@ def test_shards_of_other_settings_are_refused(tmp_path: Path) -> None:
 def test_shards_of_hlocs_files(tmp_path: Path) -> None:
     hloc.write(tmp_path, scene(4))
     files = {name: tmp_path / f"{name}.h5" for name in ("features", "matches")}
-    whole = fmtorch.verify(**files, output=tmp_path / "whole.h5")  # type: ignore[arg-type]
+    unsharded = fmtorch.verify(**files, output=tmp_path / "whole.h5")  # type: ignore[arg-type]
     for shard in ("1/2", "2/2"):
         assert not fmtorch.verify(**files, output=tmp_path / "merged.h5", shard=shard).path.is_file()  # type: ignore[arg-type]
     merged = fmtorch.verify(**files, output=tmp_path / "merged.h5")  # type: ignore[arg-type]
     assert (merged.pairs, merged.kept) == (6, 6)
-    assert hloc.contents(merged.path) == hloc.contents(whole.path)
+    assert hloc.contents(merged.path) == hloc.contents(unsharded.path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["features.h5", "matches.h5", "merged.h5", "whole.h5"]

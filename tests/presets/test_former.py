@@ -38,11 +38,11 @@ def test_what_stands_for_an_old_name_composes(group: str, name: str) -> None:
 
 @pytest.mark.parametrize(("group", "name"), OLD)
 def test_python_says_where_an_old_name_went(group: str, name: str) -> None:
-    told = f"^{re.escape(moved(group, name) or '')}$"
-    with pytest.raises(ValueError, match=told):
+    message = f"^{re.escape(moved(group, name) or '')}$"
+    with pytest.raises(ValueError, match=message):
         presets.load(group, name)
     if group == "pipeline":
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=message):
             presets.pipeline(name)
 
 
@@ -59,7 +59,7 @@ def test_every_door_says_it_in_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("command", "words", "told"),
+    ("command", "words", "message"),
     [
         ("eval", ["pipeline=sift_gms_paper"], "sift_gms_paper is now paper/sift_gms"),
         ("eval", ["pruner=[ratio,gms_soft]"], "gms_soft is now gms with pruner.gms.soft=true"),
@@ -72,10 +72,10 @@ def test_every_door_says_it_in_one_line(tmp_path: Path) -> None:
         ("train", ["pruner=lc_soft"], "lc_soft is now lc with pruner.lc.soft=true"),
     ],
 )
-def test_commands_say_it_in_one_line(command: str, words: list[str], told: str, tmp_path: Path) -> None:
+def test_commands_say_it_in_one_line(command: str, words: list[str], message: str, tmp_path: Path) -> None:
     done = run_command(command, *words, cwd=tmp_path)
     assert done.returncode == 1
-    assert done.stderr == f"error: {told}\n"
+    assert done.stderr == f"error: {message}\n"
 
 
 def test_a_users_own_preset_of_an_old_name_is_taken(tmp_path: Path) -> None:
@@ -135,9 +135,9 @@ def test_old_names_stand_nowhere_else() -> None:
     files = [path for folder in folders for path in folder.rglob("*") if path.suffix in (
         ".py", ".yaml", ".md", ".txt", ".csv", ".json", ".ipynb", ".svg")]  # fmt: skip
     own = {Path(__file__), root / "fmtorch" / "presets" / "former.py"}
-    found = {
+    mentions = {
         str(path.relative_to(root)): sorted(set(words.findall(path.read_text(encoding="utf-8"))))
         for path in [*files, root / "README.md", root / "CONTRIBUTING.md"]
         if path not in own and words.search(path.read_text(encoding="utf-8"))
     }
-    assert found == {}
+    assert mentions == {}

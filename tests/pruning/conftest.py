@@ -20,10 +20,10 @@ def real_matches() -> list[tuple[Correspondences, Tensor]]:
     pruners = {name: presets.build("pruner", name) for name in ("ratio", "one_to_one")}
     sift = presets.build("features", "sift", max_features=2000)
     front = Pipeline(sift, presets.build("matcher", "nearest"), pruners, presets.build("estimator", "ransac"))
-    found = []
+    matches = []
     for i in range(0, 60, 12):
         c = front.match([dataset[i]])[0].correspondences
         assert c is not None
         F = torch.from_numpy(dataset[i].F)[None]
-        found.append((c, sampson(F, c.x0.double(), c.x1.double()) < 2))
-    return found
+        matches.append((c, sampson(F, c.x0.double(), c.x1.double()) < 2))
+    return matches

@@ -65,10 +65,10 @@ def domain_of(c: Correspondences) -> tuple:
 
 def test_gaussians_equal_the_definition() -> None:
     ours, theirs = domain_of(warped(0, 40, 0.3)[0])
-    found = predictive_gaussians(ours, ours.take(torch.arange(0, 40, 3)), **WIDTHS)
+    computed = predictive_gaussians(ours, ours.take(torch.arange(0, 40, 3)), **WIDTHS)
     expected = [[reference.predictive_gaussian(a, b, WIDTHS) for b in theirs[::3]] for a in theirs]
     # Exponents are differences of float32 terms up to about 100: 100 * 2^-23 = 1e-5.
-    np.testing.assert_allclose(found, expected, atol=1e-4)
+    np.testing.assert_allclose(computed, expected, atol=1e-4)
 
 
 def test_centres_equal_the_definition_and_go_where_matches_crowd() -> None:
@@ -88,17 +88,17 @@ def test_regression_finds_the_minimum(columns: int) -> None:
     target[::4] += rng.normal(size=(15, columns)) * 5
     ridge = np.diag(rng.uniform(0.1, 2, 5))
     expected = reference.huber_regression(basis, target, ridge, 0.1)
-    found = huber_regression(*(torch.from_numpy(v) for v in (basis, target, ridge)), scale=0.1, iterations=200)
-    np.testing.assert_allclose(found, expected, atol=1e-4)  # where the optimiser stops: its gradient is below 1e-5
+    fitted = huber_regression(*(torch.from_numpy(v) for v in (basis, target, ridge)), scale=0.1, iterations=200)
+    np.testing.assert_allclose(fitted, expected, atol=1e-4)  # where the optimiser stops: its gradient is below 1e-5
 
 
 def test_regression_weighs_outliers_little() -> None:
     # A constant through 90 zeros and 10 values of 100: Huber's estimate m has 90 * 2m = 10 * 2 * 0.1 (ridge is small).
     target = torch.cat([torch.zeros(90, 1), torch.full((10, 1), 100.0)]).double()
-    found = huber_regression(
+    fitted = huber_regression(
         torch.ones(100, 1).double(), target, 1e-9 * torch.eye(1).double(), scale=0.1, iterations=60
     )
-    assert abs(float(found) - 10 * 0.1 / 90) < 1e-6
+    assert abs(float(fitted) - 10 * 0.1 / 90) < 1e-6
 
 
 def test_likelihood_equals_the_definition() -> None:
@@ -150,9 +150,9 @@ def test_two_surfaces_may_move_differently() -> None:
 @pytest.mark.parametrize("n", [0, 1, 2, 7, 30])
 def test_few_matches(n: int) -> None:
     c, _ = warped(8, max(n, 1), 0.0)
-    found = coherence(c.x0[:, :n], c.x1[:, :n], quality=c.quality[:, :n])
-    assert torch.isfinite(found.likelihood).all()
-    assert not torch.isnan(found.residual).any()
+    result = coherence(c.x0[:, :n], c.x1[:, :n], quality=c.quality[:, :n])
+    assert torch.isfinite(result.likelihood).all()
+    assert not torch.isnan(result.residual).any()
     if n < 7:
         assert not run(c.replace(mask=c.mask & (torch.arange(max(n, 1)) < n))).any()
 
@@ -168,9 +168,9 @@ def test_degenerate_places(kind: str) -> None:
         "line": (c.x0 * torch.tensor([1.0, 0.0]), c.x1 * torch.tensor([1.0, 0.0])),
     }[kind]
     for lafs in ((None, None), (c.lafs0, c.lafs1)):
-        found = coherence(x0, x1, quality=c.quality, lafs0=lafs[0], lafs1=lafs[1])
-        assert torch.isfinite(found.likelihood).all()
-        assert not torch.isnan(found.residual).any()
+        result = coherence(x0, x1, quality=c.quality, lafs0=lafs[0], lafs1=lafs[1])
+        assert torch.isfinite(result.likelihood).all()
+        assert not torch.isnan(result.residual).any()
     if kind == "still":  # without frames a motion like any other
         assert code(x0, x1, quality=c.quality).float().mean() > 0.9
 

@@ -19,7 +19,7 @@ H, W = 640, 960
 
 
 def edge_cases() -> dict[str, Correspondences]:
-    c, one = scene(0, 300), scene(0, 1)
+    c, single = scene(0, 300), scene(0, 1)
     right, bottom = float(W - 1), float(H - 1)
     inside = [[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]]
     border = torch.tensor([*inside, [right + 1, bottom + 1], [-0.5, -0.5], [right + 50, 7.0], [3.0, -90.0]])
@@ -33,9 +33,9 @@ def edge_cases() -> dict[str, Correspondences]:
     }
     one_cell = c.x0 / 100 + 200
     return {
-        "no slots": one.replace(**{f: getattr(one, f)[:, :0] for f in ("mask", *PER_MATCH)}),
+        "no slots": single.replace(**{f: getattr(single, f)[:, :0] for f in ("mask", *PER_MATCH)}),
         "no matches": c.replace(mask=torch.zeros_like(c.mask)),
-        "one match": one,
+        "one match": single,
         "one cell": c.replace(x0=one_cell, x1=one_cell + 5),
         "all points equal": c.replace(x0=torch.full_like(c.x0, 7), x1=torch.full_like(c.x1, 9)),
         "on and outside the border": c.replace(x0=on_border, x1=on_border.flip(1)),

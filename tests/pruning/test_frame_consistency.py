@@ -89,8 +89,8 @@ def test_find_fundamental_derives_the_prior_from_the_frames() -> None:
     c = scene(2, 120)
     given = presets.build("pruner", "frame_consistency")(c.replace(prior=None)).prior
     own = fmtorch.find_fundamental(c.x0, c.x1, quality=c.quality, lafs0=c.lafs0, lafs1=c.lafs1)
-    told = fmtorch.find_fundamental(c.x0, c.x1, quality=c.quality, prior=given)
-    assert torch.equal(own.F, told.F)
+    with_prior = fmtorch.find_fundamental(c.x0, c.x1, quality=c.quality, prior=given)
+    assert torch.equal(own.F, with_prior.F)
 
 
 def test_tells_inliers_on_real_pairs(real_matches: list[tuple[Correspondences, Tensor]]) -> None:

@@ -48,12 +48,12 @@ def test_masks_equal_the_originals() -> None:
         for border in ("opencv", "authors"):
             for factor in (4, 6):
                 for row, (rotation, scale) in enumerate(MODES):
-                    found = gms(
+                    mask = gms(
                         x0, x1, size0=size0, size1=size1, with_rotation=rotation, with_scale=scale,
                         threshold_factor=float(factor), border=border,
                     )  # fmt: skip
                     expected = case[f"mask_{border}_tf{factor}"][row]
-                    np.testing.assert_array_equal(found[0], expected, f"{name}, {border}, {factor}, row {row}")
+                    np.testing.assert_array_equal(mask[0], expected, f"{name}, {border}, {factor}, row {row}")
 
 
 def test_stored_pairs_in_one_batch() -> None:
@@ -67,13 +67,13 @@ def test_stored_pairs_in_one_batch() -> None:
     for b, (_, a0, a1, *_) in enumerate(cases):
         x0[b, : a0.shape[1]], x1[b, : a0.shape[1]], mask[b, : a0.shape[1]] = a0[0], a1[0], 1
     sizes = [torch.cat([c[k] for c in cases]) for k in (3, 4)]
-    found = gms(
+    masks = gms(
         x0, x1, size0=sizes[0], size1=sizes[1], mask=mask.bool(), with_rotation=True, with_scale=True,
         threshold_factor=4.0,
     )  # fmt: skip
     for b, (name, a0, *_, case) in enumerate(cases):
-        np.testing.assert_array_equal(found[b, : a0.shape[1]], case["mask_opencv_tf4"][3], name)
-        assert not found[b, a0.shape[1] :].any()
+        np.testing.assert_array_equal(masks[b, : a0.shape[1]], case["mask_opencv_tf4"][3], name)
+        assert not masks[b, a0.shape[1] :].any()
 
 
 @pytest.mark.parametrize(("rotation", "scale"), MODES)
@@ -82,11 +82,9 @@ def test_equals_the_definition(rotation: bool, scale: bool, border: str) -> None
     cases = [(0, 0, 1, 4.0), (1, 0, 1, 1.0), (150, 0, 1, 2.0), (200, 0.8, 1, 2.0), (200, 3.1, 0.5, 3.0)]
     for seed, (n, angle, growth, factor) in enumerate(cases):
         x0, x1 = moving(seed, n, angle, growth)
-        found = run(
-            x0[None], x1[None], with_rotation=rotation, with_scale=scale, threshold_factor=factor, border=border
-        )
+        mask = run(x0[None], x1[None], with_rotation=rotation, with_scale=scale, threshold_factor=factor, border=border)
         expected = reference(x0.numpy(), x1.numpy(), SIZE0, SIZE1, rotation, scale, factor, authors=border == "authors")
-        np.testing.assert_array_equal(found[0], expected)
+        np.testing.assert_array_equal(mask[0], expected)
 
 
 def test_rotation_and_scale_find_what_the_plain_grid_cannot() -> None:

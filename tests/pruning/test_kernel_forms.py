@@ -106,8 +106,8 @@ def test_gradients_take_the_tensor_form() -> None:
 
 
 @kernel
-def nearest_points(queries: F8x2, points: F8x2, found: I8x2) -> None:
-    knn_kernels.search(queries, points, found)
+def nearest_points(queries: F8x2, points: F8x2, neighbors: I8x2) -> None:
+    knn_kernels.search(queries, points, neighbors)
 
 
 @pytest.mark.parametrize("kind", ["random", "clustered", "integers", "one point", "a line"])
@@ -123,10 +123,10 @@ def test_nearest_points_are_those_of_an_exhaustive_search(kind: str) -> None:
             points[:] = 0.5
         if kind == "a line":
             points[:, 1], queries[:, 1] = points[:, 0] / 2, 0.25
-        found = np.empty((n, count), np.int64)
-        nearest_points(queries, points, found)
+        neighbors = np.empty((n, count), np.int64)
+        nearest_points(queries, points, neighbors)
         squared = (points[None, :, 0] - queries[:, None, 0]) ** 2 + (points[None, :, 1] - queries[:, None, 1]) ** 2
         expected = np.full((n, count), -1)
         nearest = np.argsort(squared, 1, kind="stable")[:, :count]
         expected[:, : nearest.shape[1]] = nearest
-        np.testing.assert_array_equal(found, expected, f"{n} among {m}")
+        np.testing.assert_array_equal(neighbors, expected, f"{n} among {m}")

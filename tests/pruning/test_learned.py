@@ -68,12 +68,12 @@ def test_files_give_the_networks_probabilities(files: tuple[nn.Module, Path], ru
     network, path = files
     other = small(path.name, seed=1)  # whose weights the file replaces
     for c in pairs_of_several_lengths():
-        found = LearnedPruner(other, file=path, runtime=runtime).probability(c)
-        if not found.numel():
+        probability = LearnedPruner(other, file=path, runtime=runtime).probability(c)
+        if not probability.numel():
             continue
         with torch.no_grad():
             expected = torch.sigmoid(network.eval()(c).logit[-1] / 2.5)
-        torch.testing.assert_close(found, expected, rtol=0, atol=1e-4 / 4)  # 1e-4 in log-odds
+        torch.testing.assert_close(probability, expected, rtol=0, atol=1e-4 / 4)  # 1e-4 in log-odds
 
 
 @pytest.mark.parametrize("runtime", ["torch", "onnx"])

@@ -37,8 +37,8 @@ def test_nearest_points_equal_the_definition(seed: int, n: int, m: int, count: i
     if coarse:  # ties everywhere
         queries, points = queries.round(), points.round()
     queries_, points_ = torch.from_numpy(queries), torch.from_numpy(points)
-    found = nearest_points(queries_, points_, count)
-    for query, row in zip(queries, found.tolist(), strict=True):
+    neighbors = nearest_points(queries_, points_, count)
+    for query, row in zip(queries, neighbors.tolist(), strict=True):
         expected = nearest(query, points, list(range(m)), count)
         assert row == expected + [-1] * (count - len(expected))
 
@@ -55,14 +55,14 @@ def test_nearest_points_of_many(kind: str) -> None:
         "one place": np.full((n, 2), 7.0),
     }[kind]
     queries = np.concatenate([points[:400], rng.uniform(-200, 1200, (100, 2))])
-    found = nearest_points(torch.from_numpy(queries), torch.from_numpy(points), 9).numpy()
+    neighbors = nearest_points(torch.from_numpy(queries), torch.from_numpy(points), 9).numpy()
     expected = cKDTree(points).query(queries, 9)[0]
-    distances = np.linalg.norm(points[found] - queries[:, None], axis=-1)
+    distances = np.linalg.norm(points[neighbors] - queries[:, None], axis=-1)
     np.testing.assert_allclose(distances, expected, rtol=1e-14, atol=1e-14)  # a few roundings of float64
-    squared = ((points[found] - queries[:, None]) ** 2).sum(-1)
-    assert ((np.diff(squared) > 0) | (np.diff(found) > 0)).all()  # ties by index
+    squared = ((points[neighbors] - queries[:, None]) ** 2).sum(-1)
+    assert ((np.diff(squared) > 0) | (np.diff(neighbors) > 0)).all()  # ties by index
     if kind == "one place":
-        assert (found[:400] == np.arange(9)).all()
+        assert (neighbors[:400] == np.arange(9)).all()
 
 
 def test_masks_equal_the_original() -> None:
@@ -71,8 +71,8 @@ def test_masks_equal_the_original() -> None:
         case = {k[4:]: v for k, v in file.items() if k.startswith(f"{i:03d}.")}
         lambda1, lambda2, K1, K2, tau1, tau2 = case["params"].tolist()
         x0, x1 = torch.from_numpy(case["X"]), torch.from_numpy(case["Y"])
-        found = lpm(x0[None], x1[None], thresholds=(lambda1, lambda2), neighbors=(int(K1), int(K2)), taus=(tau1, tau2))
-        np.testing.assert_array_equal(found[0], case["mask"], str(name))
+        mask = lpm(x0[None], x1[None], thresholds=(lambda1, lambda2), neighbors=(int(K1), int(K2)), taus=(tau1, tau2))
+        np.testing.assert_array_equal(mask[0], case["mask"], str(name))
         for x, key in ((x0, "nX1"), (x1, "nY1")):
             np.testing.assert_array_equal(nearest_points(x, x, int(K1) + 3), case[key], str(name))
 
@@ -81,17 +81,17 @@ def test_masks_equal_the_original() -> None:
 @pytest.mark.parametrize("neighbors", [(6, 6), (4, 7)])
 def test_equals_the_definition(n: int, neighbors: tuple[int, int]) -> None:
     x0, x1 = moving(n, n)
-    found = lpm(x0[None], x1[None], neighbors=neighbors, thresholds=(0.8, 0.6), taus=(0.2, 0.4))
+    mask = lpm(x0[None], x1[None], neighbors=neighbors, thresholds=(0.8, 0.6), taus=(0.2, 0.4))
     expected = reference(x0.numpy(), x1.numpy(), (0.8, 0.6), neighbors, (0.2, 0.4))
-    np.testing.assert_array_equal(found[0], expected)
+    np.testing.assert_array_equal(mask[0], expected)
 
 
 def test_neighbourhoods_may_be_large() -> None:
     x0, x1 = moving(3, 300)
     expected = reference(x0.numpy(), x1.numpy(), (0.8, 0.8), (260, 6), (0.2, 0.2))
-    found = lpm(x0[None], x1[None], neighbors=(260, 6), thresholds=(0.8, 0.8))
+    mask = lpm(x0[None], x1[None], neighbors=(260, 6), thresholds=(0.8, 0.8))
     assert 0 < expected.sum() < 300
-    np.testing.assert_array_equal(found[0], expected)
+    np.testing.assert_array_equal(mask[0], expected)
 
 
 def test_keeps_a_common_motion_and_drops_scattered_matches() -> None:

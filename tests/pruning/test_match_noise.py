@@ -71,9 +71,9 @@ def test_noise_travels_with_its_matches() -> None:
 @pytest.mark.parametrize("kernel", ["truncated", "geman_mcclure", "cauchy"])
 def test_a_scale_for_each_match_that_is_the_same_is_one_scale(kernel: str) -> None:
     F, points, weight = _fit()
-    one = torch.full((1, 1), 1e-3, dtype=torch.float64)
-    single = refine_components(F, points, weight, kernel, one, 5)
-    each = refine_components(F, points, weight, kernel, one.expand(1, points.shape[2]), 5)
+    shared_scale = torch.full((1, 1), 1e-3, dtype=torch.float64)
+    single = refine_components(F, points, weight, kernel, shared_scale, 5)
+    each = refine_components(F, points, weight, kernel, shared_scale.expand(1, points.shape[2]), 5)
     for a, b in zip(single, each, strict=True):
         assert torch.equal(a, b)
 
@@ -133,13 +133,13 @@ def test_known_noise_makes_estimates_more_exact() -> None:
     for seed in range(12):
         x0, x1, F, noise = _noisy_pair(seed)
         row = []
-        for told in (None, noise):
-            estimate = find_fundamental(x0, x1, noise=told)  # with sizes, what is known of cameras helps both
+        for given_noise in (None, noise):
+            estimate = find_fundamental(x0, x1, noise=given_noise)  # with sizes, what is known of cameras helps both
             assert bool(estimate.ok[0])
             row.append(float(metrics.nsgd(F[None], estimate.F, size, size)))
         errors.append(row)
-    without, told = np.median(errors, 0)
-    assert told < 0.6 * without
+    without, with_noise = np.median(errors, 0)
+    assert with_noise < 0.6 * without
 
 
 def test_noise_out_of_bounds_is_survived() -> None:

@@ -75,8 +75,8 @@ def test_find_fundamental_derives_the_prior_without_frames(ratios: bool) -> None
     c = c if ratios else c.replace(quality=None)
     given = presets.build("pruner", "position_consistency")(c).prior
     own = fmtorch.find_fundamental(c.x0, c.x1, quality=c.quality)
-    told = fmtorch.find_fundamental(c.x0, c.x1, quality=c.quality, prior=given)
-    assert torch.equal(own.F, told.F)
+    with_prior = fmtorch.find_fundamental(c.x0, c.x1, quality=c.quality, prior=given)
+    assert torch.equal(own.F, with_prior.F)
 
 
 def test_tells_inliers_on_real_pairs(real_matches: list[tuple[Correspondences, Tensor]]) -> None:

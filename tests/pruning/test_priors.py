@@ -48,7 +48,7 @@ def test_calibration_uses_the_ratio_where_there_is_one() -> None:
 def test_gms_support_equals_the_definition(angle: float, scale: float) -> None:
     x0, x1 = moving_on_grids(0, 400, angle, scale)
     searched = angle != 0
-    found = gms_support(
+    computed = gms_support(
         x0[None], x1[None], size0=torch.tensor([SIZE0]), size1=torch.tensor([SIZE1]),
         with_rotation=searched, with_scale=searched, threshold_factor=2.0,
     )[0]  # fmt: skip
@@ -56,7 +56,7 @@ def test_gms_support_equals_the_definition(angle: float, scale: float) -> None:
     hypotheses = list(itertools.product(SCALES, range(8))) if searched else [(1.0, 0)]
     winner = max(hypotheses, key=lambda h: run(p0, p1, *h, 2.0, False).sum())  # the first of equals
     z = np.array(support(x0.numpy(), x1.numpy(), SIZE0, SIZE1, *winner))
-    np.testing.assert_allclose(found, z / (z + 1.5), rtol=1e-6)  # float64 rounded to float32
+    np.testing.assert_allclose(computed, z / (z + 1.5), rtol=1e-6)  # float64 rounded to float32
 
 
 def test_gms_support_separates_what_gms_keeps() -> None:
@@ -111,7 +111,7 @@ def test_the_hard_form_leaves_the_prior_and_the_soft_form_the_matches(name: str)
 
 def test_likely_makes_a_filter_of_a_prior() -> None:
     c = presets.build("pruner", "frame_consistency")(scene(0, 200))
-    kept = presets.build("pruner", "likely", least=0.3)(c)
+    kept = presets.build("pruner", "likely", min_probability=0.3)(c)
     assert torch.equal(kept.mask, c.prior >= 0.3)
     with pytest.raises(ValueError, match="prior"):
         presets.build("pruner", "likely")(c.replace(prior=None))

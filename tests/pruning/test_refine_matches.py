@@ -129,9 +129,9 @@ def test_neighbours_stand_for_frames() -> None:
     shuffled = c.replace(x1=torch.where(wrong[None, :, None], c.x1.flip(1), c.x1))
     for case in (c, shuffled, matches(3), matches(1)):
         x0, x1 = case.x0[0].double().numpy(), case.x1[0].double().numpy()
-        found = np.empty((len(x0), 2, 2))
-        neighbour_maps(x0, x1, found)
-        for i, own in enumerate(found):
+        maps = np.empty((len(x0), 2, 2))
+        neighbour_maps(x0, x1, maps)
+        for i, own in enumerate(maps):
             slow = reference.neighbour_map(x0, x1, i)
             np.testing.assert_allclose(own, np.full((2, 2), np.nan) if slow is None else slow, rtol=1e-9, atol=1e-12)
     refined = stage().with_images(shuffled.replace(lafs0=None, lafs1=None), lambda i: pair())
@@ -144,11 +144,11 @@ def test_neighbours_stand_for_frames() -> None:
 def test_noise_is_in_proportion_to_that_of_the_images() -> None:
     """Four times the noise of the grey levels: four times the deviation, apart from the floor."""
     c = matches(120)
-    found = [stage(floor=0.0).with_images(c, lambda i, n=n: pair(n)) for n in (4.0, 16.0)]
-    moved = torch.stack([(f.x1 != c.x1).any(-1)[0] for f in found]).all(0)
-    ratio = (found[1].noise / found[0].noise)[0, moved].median()
+    refined = [stage(floor=0.0).with_images(c, lambda i, n=n: pair(n)) for n in (4.0, 16.0)]
+    moved = torch.stack([(f.x1 != c.x1).any(-1)[0] for f in refined]).all(0)
+    ratio = (refined[1].noise / refined[0].noise)[0, moved].median()
     assert 3.4 < float(ratio) < 4.6  # rounding to grey levels adds to the smaller one
-    errors = [np.median(error(f)[moved.numpy()]) for f in found]
+    errors = [np.median(error(f)[moved.numpy()]) for f in refined]
     assert errors[1] > 2 * errors[0]
 
 

@@ -29,11 +29,11 @@ def test_mutual_agrees_with_the_matcher() -> None:
     generator = torch.Generator().manual_seed(0)
     d0, d1 = torch.rand(2, 40, 8, generator=generator), torch.rand(2, 30, 8, generator=generator)
     mask0, mask1 = torch.rand(2, 40, generator=generator) < 0.8, torch.rand(2, 30, generator=generator) < 0.8
-    found = nearest_neighbors(d0, d1, mask0, mask1)
-    assert torch.equal(mutual(found.nearest, found.reverse), found.mutual)
-    garbage = torch.where(mask0, found.nearest, 10**9)
-    assert torch.equal(mutual(garbage, found.reverse, mask0), found.mutual)
-    assert not mutual(found.nearest, found.reverse[:, :0]).any()
+    neighbors = nearest_neighbors(d0, d1, mask0, mask1)
+    assert torch.equal(mutual(neighbors.nearest, neighbors.reverse), neighbors.mutual)
+    garbage = torch.where(mask0, neighbors.nearest, 10**9)
+    assert torch.equal(mutual(garbage, neighbors.reverse, mask0), neighbors.mutual)
+    assert not mutual(neighbors.nearest, neighbors.reverse[:, :0]).any()
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -69,8 +69,8 @@ def grid_points(n: int) -> st.SearchStrategy[np.ndarray]:
 def test_one_to_one_equals_the_definition(data: st.DataObject, n: int) -> None:
     x0, x1 = data.draw(grid_points(n)), data.draw(grid_points(n))
     quality = data.draw(arrays(np.float32, (n,), elements=st.sampled_from([0.25, 0.5, math.inf])))
-    found = one_to_one(*(torch.from_numpy(a)[None] for a in (x0, x1, quality)))
-    np.testing.assert_array_equal(found[0], one_to_one_reference(x0, x1, quality))
+    mask = one_to_one(*(torch.from_numpy(a)[None] for a in (x0, x1, quality)))
+    np.testing.assert_array_equal(mask[0], one_to_one_reference(x0, x1, quality))
 
 
 def duplicated(seed: int, n: int, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor, Tensor]:

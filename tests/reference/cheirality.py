@@ -16,11 +16,11 @@ def share_in_front(
     for R in (U @ W @ Vt, U @ W.T @ Vt):
         for t in (U[:, 2], -U[:, 2]):
             total = 0.0
-            for a, b, weight, least in zip(rays0, rays1, support, angle, strict=True):
+            for a, b, weight, min_sine in zip(rays0, rays1, support, angle, strict=True):
                 r = R @ a
                 (z0, z1), *_ = np.linalg.lstsq(np.stack([-r, b], 1), t, rcond=None)  # z1 b = z0 r + t
                 sine = np.linalg.norm(np.cross(b, r)) / (np.linalg.norm(b) * np.linalg.norm(r))
-                parallel = sine < least and b @ r > 0
+                parallel = sine < min_sine and b @ r > 0
                 total += weight * ((z0 > 0 and z1 > 0) or parallel)
             best = max(best, total)
     return best / float(support.sum())

@@ -64,8 +64,8 @@ def huber_regression(basis: np.ndarray, target: np.ndarray, ridge: np.ndarray, s
             gradient -= 2 * np.outer(row, residual) * min(1.0, scale / r if r > 0 else 1.0)
         return value, gradient.ravel()
 
-    found = minimize(objective, np.zeros(m * k), jac=True, method="L-BFGS-B", options={"maxiter": 5000, "ftol": 1e-15})
-    return found.x.reshape(m, k)
+    result = minimize(objective, np.zeros(m * k), jac=True, method="L-BFGS-B", options={"maxiter": 5000, "ftol": 1e-15})
+    return result.x.reshape(m, k)
 
 
 def likelihood(

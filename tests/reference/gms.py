@@ -41,8 +41,8 @@ def run(p0: np.ndarray, p1: np.ndarray, scale: float, turn: int, factor: float, 
         moves, filled = Counter(both), Counter(a for a, _ in both)
         partner = {}
         for a in filled:
-            found = {b: n for (start, b), n in moves.items() if start == a}
-            best = min(found, key=lambda b: (-found[b], b[1] * grid1 + b[0]))
+            counts = {b: n for (start, b), n in moves.items() if start == a}
+            best = min(counts, key=lambda b: (-counts[b], b[1] * grid1 + b[0]))
             score, total, pairs = 0, 0, 0
             for j, (dx, dy) in enumerate((*RING, (0, 0))):
                 ex, ey = RING[(j - turn) % 8] if j < 8 else (0, 0)

@@ -31,7 +31,7 @@ def hessian_determinant(image: np.ndarray) -> np.ndarray:
 
 def hessian_keypoints(image: np.ndarray, threshold: float, levels: int = 3, sigma: float = 1.6) -> np.ndarray:
     """Rows (x, y, sigma, response) of an image in [0, 1], in no order, without the border's rule."""
-    found = []
+    keypoints = []
     level = blur(image, math.sqrt(sigma**2 - 0.25))
     spacing = 1
     while min(level.shape) >= 16:
@@ -48,10 +48,10 @@ def hessian_keypoints(image: np.ndarray, threshold: float, levels: int = 3, sigm
                     ended[refined[0]] = refined[1:]
         for where, (offset, value) in ended.items():
             s, y, x = np.array(where) + offset
-            found.append((spacing * x, spacing * y, spacing * sigma * 2 ** (s / levels), value))
+            keypoints.append((spacing * x, spacing * y, spacing * sigma * 2 ** (s / levels), value))
         level = stack[levels][::2, ::2]
         spacing *= 2
-    return np.array(found).reshape(-1, 4)
+    return np.array(keypoints).reshape(-1, 4)
 
 
 def _is_maximum(volume: np.ndarray, at: tuple[int, ...]) -> bool:

@@ -37,8 +37,8 @@ def geman_mcclure(r: float) -> float:
 
 def magsac(r: float) -> float:
     """1 - rho(r) / rho(k sigma_max) of MAGSAC++."""
-    loss, whole = magsac_loss(np.array([min(r, 1.0) ** 2, 1.0]), 1.0)
-    return float(1 - loss / whole)
+    loss, max_loss = magsac_loss(np.array([min(r, 1.0) ** 2, 1.0]), 1.0)
+    return float(1 - loss / max_loss)
 
 
 def rounded(value: float, bits: int) -> float:
@@ -55,8 +55,8 @@ def saturated(gains: Sequence[float], weights: Sequence[float], cells: np.ndarra
     """Over both images and their cells, given for each match (2, n), the sum of the root of its matches' `summed`."""
     total = 0.0
     for cell in cells:
-        for one in set(cell.tolist()):
-            members = [i for i in range(len(gains)) if cell[i] == one]
+        for occupied in set(cell.tolist()):
+            members = [i for i in range(len(gains)) if cell[i] == occupied]
             total += rounded(math.sqrt(summed([gains[i] for i in members], [weights[i] for i in members], bits)), bits)
     return total
 

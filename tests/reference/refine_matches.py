@@ -64,10 +64,10 @@ def refined(
     w /= w.sum()
     rows = []
     for u, v in grid:
-        found = sample(levels0[k0], *(x0 + spacing * np.array([u, v])) / 2**k0)
-        if found is None:
+        sampled = sample(levels0[k0], *(x0 + spacing * np.array([u, v])) / 2**k0)
+        if sampled is None:
             return None
-        value, gx, gy = found[0], found[1] * spacing / 2**k0, found[2] * spacing / 2**k0
+        value, gx, gy = sampled[0], sampled[1] * spacing / 2**k0, sampled[2] * spacing / 2**k0
         rows.append([1, value, gx * u, gx * v, gy * u, gy * v, gx, gy])
     J = np.array(rows)
     mean = w @ J[:, 1]

@@ -38,7 +38,7 @@ def significance(
         distances = [epipolar_distances(F, a, b)[image] for a, b in zip(x0, x1, strict=True)]
         chances.append([2 * d * diagonal / area if area > 0 else 1.0 for d in distances])
         cells.append([tuple(math.floor(v) for v in (p - low) / (diagonal / CELLS)) for p in x])
-    alphas = [min(max(some), 1.0) for some in zip(*chances, strict=True)]
+    alphas = [min(max(per_match), 1.0) for per_match in zip(*chances, strict=True)]
     groups: dict[object, list[float]] = {}
     for alpha, *cell in zip(alphas, *cells, strict=True):
         groups.setdefault(tuple(cell), []).append(alpha)

@@ -147,10 +147,10 @@ def covariance(
     # that of 1.21 radians.
     free = basis.T @ information @ basis
     S = np.linalg.inv(np.linalg.inv(free)[3:5, 3:5])
-    least = np.eye(2) / 1.21**2
+    diffuse_information = np.eye(2) / 1.21**2
     share = np.trace(np.einsum("n,nij->ij", v, in_slopes)) / np.trace((J[:, 3:5].T * v) @ J[:, 3:5] / s**2)
-    values, vectors = np.linalg.eigh(S * (1 - min(share, 1)) - least)
-    free[3:5, 3:5] += vectors @ np.diag(np.maximum(values, 0)) @ vectors.T + least - S
+    values, vectors = np.linalg.eigh(S * (1 - min(share, 1)) - diffuse_information)
+    free[3:5, 3:5] += vectors @ np.diag(np.maximum(values, 0)) @ vectors.T + diffuse_information - S
     C = basis @ np.linalg.inv(free) @ basis.T
     G = slopes(lambda c: c.fundamental().ravel(), cameras)
     return C, G @ C @ G.T, s

@@ -296,11 +296,11 @@ def record(kind: type, data: st.DataObject) -> tuple[Call, set[str], Check]:
     mistaken(data, arguments, {})
 
     def call() -> Any:
-        made: Any = kind(**arguments)
-        if kind is Features and made.lafs.dim() == 3:
-            return collate([made, made])
-        half = made[: max(1, len(made) // 2)] if kind is not Features else made
-        joined = collate([made, half])
+        created: Any = kind(**arguments)
+        if kind is Features and created.lafs.dim() == 3:
+            return collate([created, created])
+        half = created[: max(1, len(created) // 2)] if kind is not Features else created
+        joined = collate([created, half])
         return joined.compact() if kind is Correspondences else joined
 
     return call, set(typing.get_type_hints(kind)), lambda result: None
@@ -348,21 +348,21 @@ def installed_estimators() -> list[str]:
 
 def subjects(names: list[str]) -> list[Subject]:
     """All that is called, of names that begin so."""
-    made: dict[str, Callable[[], Draw]] = {}
+    draws: dict[str, Callable[[], Draw]] = {}
     for module in (geometry, metrics, pruning, matching):
         short = module.__name__.removeprefix("fmtorch.")
         for name, function in functions(module).items():
-            made[f"{short}.{name}"] = functools.partial(functools.partial, function_call, function)
+            draws[f"{short}.{name}"] = functools.partial(functools.partial, function_call, function)
     for kind in (Correspondences, Features, Estimate):
-        made[f"types.{kind.__name__}"] = functools.partial(functools.partial, record, kind)
+        draws[f"types.{kind.__name__}"] = functools.partial(functools.partial, record, kind)
     for name in installed_estimators():
         options = merged(keywords(name), few(loaded("estimator", name), 200, 100))
         del options["estimator"]
-        made[f"find_fundamental.{name}"] = functools.partial(functools.partial, estimation, name, options)
+        draws[f"find_fundamental.{name}"] = functools.partial(functools.partial, estimation, name, options)
     for name in variants("pruner"):
-        made[f"pruner.{name}"] = functools.partial(_stage, name)
-    made["fmtorch.match"] = lambda: functools.partial(photographs, {name: _pipeline(name) for name in PIPELINES})
-    return [Subject(name, draw()) for name, draw in made.items() if not names or name.startswith(tuple(names))]
+        draws[f"pruner.{name}"] = functools.partial(_stage, name)
+    draws["fmtorch.match"] = lambda: functools.partial(photographs, {name: _pipeline(name) for name in PIPELINES})
+    return [Subject(name, draw()) for name, draw in draws.items() if not names or name.startswith(tuple(names))]
 
 
 PIPELINES = ("sift_gms", "sift_fmtorch")
@@ -420,12 +420,12 @@ def trial(subject: Subject, calls: int) -> Counter[str]:
         suppress_health_check=list(HealthCheck), phases=[Phase.generate, Phase.shrink],
     )  # fmt: skip
     @given(st.data())
-    def one(data: st.DataObject) -> None:
+    def example(data: st.DataObject) -> None:
         call, names, check = subject.draw(data)
         note(f"{subject.name}: {call}"[:2000])
         counted[outcome(call, names, check)] += 1
 
-    one()
+    example()
     return counted
 
 

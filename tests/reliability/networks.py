@@ -18,7 +18,7 @@ def main(source: Path, folder: Path, count: int) -> None:
     """Damage the file so often, open it and, where it opens, run it."""
     from tests.reliability.test_damage import damages
 
-    data, found = source.read_bytes(), Counter[str]()
+    data, outcomes = source.read_bytes(), Counter[str]()
     inputs = onnx_session(source, 1, "").get_inputs()
     shapes = {each.name: [size if isinstance(size, int) else 20 for size in each.shape] for each in inputs}
     feed = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
@@ -29,14 +29,14 @@ def main(source: Path, folder: Path, count: int) -> None:
             session = onnx_session(file, 1, "the command that makes it")
         except NetworkFileError as error:
             assert str(file) in str(error)  # noqa: PT017
-            found["told"] += 1
+            outcomes["told"] += 1
             continue
         try:
             session.run(None, feed)
-            found["runs"] += 1
+            outcomes["runs"] += 1
         except RuntimeError:  # which becomes the reason of the pairs that need it
-            found["told when it runs"] += 1
-    print(dict(found))
+            outcomes["told when it runs"] += 1
+    print(dict(outcomes))
 
 
 if __name__ == "__main__":

@@ -58,7 +58,7 @@ def damaged_parts(path: Path, count: int, seed: int) -> int:
     """Damage a part of a run; it is told every time."""
     run = run_folder(path)
     truth, part = run.read(), next((path / "pairs").iterdir())
-    data, told = part.read_bytes(), 0
+    data, reported = part.read_bytes(), 0
     for damage in damages(data, count, seed):
         part.write_bytes(damage)
         if damage == data:
@@ -67,23 +67,23 @@ def damaged_parts(path: Path, count: int, seed: int) -> int:
         for use in (run.read, run.done):
             with pytest.raises(RunFolderError, match=rf"{part.name} cannot be read .*delete it"):
                 use()
-        told += 1
-    return told
+        reported += 1
+    return reported
 
 
 def damaged_identities(path: Path, count: int, seed: int) -> int:
     """Damage run.json: it is told, or it is of no consequence."""
     run = run_folder(path)
     file, config = path / "run.json", run.config
-    data, told = file.read_bytes(), 0
+    data, reported = file.read_bytes(), 0
     for damage in damages(data, count, seed):
         file.write_bytes(damage)
         try:
             assert RunFolder.load(path).config == config
         except RunFolderError as error:
             assert str(file) in str(error)  # noqa: PT017
-            told += 1
-    return told
+            reported += 1
+    return reported
 
 
 def damaged_features(path: Path, count: int, seed: int) -> int:
@@ -92,17 +92,17 @@ def damaged_features(path: Path, count: int, seed: int) -> int:
     arrays = {"lafs": np.random.default_rng(0).normal(size=(9, 2, 3)), "seconds": np.array(0.5)}
     cache.write("section", "name", arrays)
     file = next(path.glob("*/*.npz"))
-    data, told = file.read_bytes(), 0
+    data, reported = file.read_bytes(), 0
     for damage in damages(data, count, seed):
         file.write_bytes(damage)
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            found = cache.read("section", "name")
-        if found is None:  # without a word where the digest's own name is gone, as in files of earlier versions
-            told += any(str(file) in str(warning.message) for warning in said)
+            cached = cache.read("section", "name")
+        if cached is None:  # without a word where the digest's own name is gone, as in files of earlier versions
+            reported += any(str(file) in str(warning.message) for warning in said)
         else:
-            assert all(np.array_equal(found[name], arrays[name]) for name in arrays)
-    return told
+            assert all(np.array_equal(cached[name], arrays[name]) for name in arrays)
+    return reported
 
 
 TRIALS = {"parts": damaged_parts, "run.json": damaged_identities, "features": damaged_features}

@@ -25,27 +25,27 @@ WHOLE = {
 def generate(folder: Path, calls: int, *names: str) -> list[dict[str, Any]]:
     """What came of so many calls of each subject; fails where one has a fault."""
     done = run_command("tests.reliability.generated", "--calls", str(calls), *names, cwd=folder, patience=7200)
-    found = [json.loads(line) for line in done.stdout.splitlines() if line.startswith('{"subject"')]
-    faults = "\n\n".join(f"{line['subject']}: {line['fault']}\n{line['call']}" for line in found if "fault" in line)
+    lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith('{"subject"')]
+    faults = "\n\n".join(f"{line['subject']}: {line['fault']}\n{line['call']}" for line in lines if "fault" in line)
     assert not faults, faults
-    assert done.returncode == 0, f"{done.returncode} after {found[-1:]}: {done.stderr[-3000:]}"
-    return found
+    assert done.returncode == 0, f"{done.returncode} after {lines[-1:]}: {done.stderr[-3000:]}"
+    return lines
 
 
 def test_some_calls_of_everything(tmp_path: Path) -> None:
-    found = generate(tmp_path, BOUNDED)
-    called = {line["subject"] for line in found}
+    lines = generate(tmp_path, BOUNDED)
+    called = {line["subject"] for line in lines}
     for module in (geometry, metrics, pruning, matching):
         names = {name for name in module.__all__ if name.islower()}
         assert {f"{module.__name__.removeprefix('fmtorch.')}.{name}" for name in names} <= called
     assert {f"find_fundamental.{name}" for name in installed_estimators()} <= called
     assert {f"pruner.{name}" for name in variants("pruner")} <= called
-    assert sum(line.get("sound", 0) for line in found) > len(found)
+    assert sum(line.get("sound", 0) for line in lines) > len(lines)
 
 
 @pytest.mark.reliability
 @pytest.mark.parametrize("beginning", WHOLE)
 def test_many_calls(beginning: str, tmp_path: Path, record_property: Callable[[str, object], None]) -> None:
-    found = generate(tmp_path, WHOLE[beginning], beginning)
+    lines = generate(tmp_path, WHOLE[beginning], beginning)
     for outcome in ("sound", "refused"):
-        record_property(f"{beginning} {outcome}", sum(line.get(outcome, 0) for line in found))
+        record_property(f"{beginning} {outcome}", sum(line.get(outcome, 0) for line in lines))

@@ -77,14 +77,14 @@ def test_with_processes_none_is_left_behind(
 
 def running(cwd: str) -> list[str]:
     """The command lines of the processes that work in a folder."""
-    found = []
+    commands = []
     for process in Path("/proc").glob("[0-9]*"):
         try:
             if os.readlink(process / "cwd") == cwd:
-                found.append((process / "cmdline").read_text().replace("\0", " "))
+                commands.append((process / "cmdline").read_text().replace("\0", " "))
         except OSError:
             continue
-    return found
+    return commands
 
 
 def match_result(folder: Path) -> dict[str, object]:

@@ -55,9 +55,9 @@ def test_levels_tell_what_they_say() -> None:
     assert np.array_equal(known.K0, K)
     wrong = knowledge("wrong", pair, SIZES, 0)
     assert np.allclose(wrong.K1, zoomed(1.5))
-    one = knowledge("one_sided", pair, SIZES, 0)
-    assert one.K0 is not None
-    assert one.K1 is None
+    one_sided = knowledge("one_sided", pair, SIZES, 0)
+    assert one_sided.K0 is not None
+    assert one_sided.K1 is None
     shared, unknown = (knowledge(level, pair, SIZES, 0) for level in ("shared", "unknown"))
     assert (shared.K0, shared.K1, shared.one_camera, unknown.one_camera) == (None, None, True, False)
     assert np.array_equal(unknown.centres, [[499.5, 379.5]] * 2)
@@ -72,10 +72,10 @@ def test_roughly_known_focal_lengths_are_off_by_a_tenth_at_most_each_for_itself_
         again = knowledge("rough", item(seed % 7)[0], SIZES, seed)
         assert np.array_equal(given.K0, again.K0)
         factors.append([np.log(k[0, 0] / 950) for k in (given.K0, given.K1)])
-    found = np.array(factors)
-    assert np.abs(found).max() <= np.log(1.1)
-    assert abs(found.std() - np.log(1.1) / np.sqrt(3)) < 4 * 0.45 * found.std() / np.sqrt(400)  # uniform: kurtosis 1.8
-    assert abs(np.corrcoef(found.T)[0, 1]) < 4 / np.sqrt(200)
+    logs = np.array(factors)
+    assert np.abs(logs).max() <= np.log(1.1)
+    assert abs(logs.std() - np.log(1.1) / np.sqrt(3)) < 4 * 0.45 * logs.std() / np.sqrt(400)  # uniform: kurtosis 1.8
+    assert abs(np.corrcoef(logs.T)[0, 1]) < 4 / np.sqrt(200)
 
 
 def test_one_focal_length_is_taken_for_shared_where_it_is() -> None:

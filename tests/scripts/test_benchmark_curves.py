@@ -26,9 +26,9 @@ def _result(nsgd: float, ms: float) -> estimators.Result:
 
 
 def test_every_curve_of_the_project_names_estimators_there_are() -> None:
-    found = curves.read(curves.SPECS)
-    assert len({curve.name for curve in found}) == len(found)
-    for curve in found:
+    every_curve = curves.read(curves.SPECS)
+    assert len({curve.name for curve in every_curve}) == len(every_curve)
+    for curve in every_curve:
         assert len(curve.specs) == len(set(curve.specs)) > 1
         for spec in curve.specs:
             front, _, stages = spec.partition("@")

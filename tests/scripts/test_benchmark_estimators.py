@@ -126,5 +126,5 @@ def test_a_split_is_the_rendered_sets_alone(tmp_path: Path) -> None:
     (tmp_path / "scene" / "Images").mkdir(parents=True)
     parser = argparse.ArgumentParser()
     matched.add_set_arguments(parser)
-    (found,) = matched.sets_of(parser.parse_args(["--root", str(tmp_path), "--split", "train"]))
-    assert len(found) == 1
+    (dataset,) = matched.sets_of(parser.parse_args(["--root", str(tmp_path), "--split", "train"]))
+    assert len(dataset) == 1

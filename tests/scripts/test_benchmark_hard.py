@@ -11,14 +11,14 @@ from tests.processes import run_command
 
 def rows() -> list[dict[str, object]]:
     """Four pairs of two scenes with two seeds; one pipeline solves those that the rule selects, the other all."""
-    found: list[dict[str, object]] = []
+    table: list[dict[str, object]] = []
     for i, matchable in enumerate((True, False, True, False)):
         place = {"pair": f"orbit/{i}", "family": "orbit", "scene": f"s{i // 2}"}
-        found.append({"method": RULE, "identity": "", **place, "matchable": matchable})
+        table.append({"method": RULE, "identity": "", **place, "matchable": matchable})
         for method, nsgd in (("sift_ratio", 0.01 if matchable else 0.3), ("sift_fmtorch", 0.01)):
             same = {"nsgd": [nsgd] * 2, "ok": [True] * 2, "corrs_before": [50 + i] * 2}
-            found.append({"method": method, "identity": "", **place, **same})
-    return found
+            table.append({"method": method, "identity": "", **place, **same})
+    return table
 
 
 def test_recall_is_given_apart_for_pairs_that_the_rule_leaves_out() -> None:

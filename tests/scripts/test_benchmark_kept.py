@@ -55,22 +55,22 @@ def test_a_line_that_was_cut_off_goes_and_other_files_stay_as_they_are(tmp_path:
 
 def test_estimators_go_on_where_they_were_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     items = [(pair, scene(i, 60, outliers=0.3)) for i, pair in enumerate(unread_pairs(3))]
-    some, path = ["opencv:method=lmeds", "opencv@ratio_prior"], tmp_path / "rows.jsonl"
-    whole = estimators.measure(some, items, 2)
+    specs, path = ["opencv:method=lmeds", "opencv@ratio_prior"], tmp_path / "rows.jsonl"
+    uninterrupted = estimators.measure(specs, items, 2)
     with monkeypatch.context() as patch:
         patch.setattr(estimators, "_row", interrupted_at(5, estimators._row))
         with pytest.raises(KeyboardInterrupt):
-            estimators.measure(some, items, 2, kept=Kept(path))
+            estimators.measure(specs, items, 2, kept=Kept(path))
     assert len(read(path)) == 4  # of two pairs
-    first = estimators.measure(some, items, 2, kept=Kept(path))
-    assert all(np.array_equal(first[spec]["nsgd"], whole[spec]["nsgd"]) for spec in some)
+    first = estimators.measure(specs, items, 2, kept=Kept(path))
+    assert all(np.array_equal(first[spec]["nsgd"], uninterrupted[spec]["nsgd"]) for spec in specs)
     assert len(read(path)) == 12
     monkeypatch.setattr(estimators, "_row", interrupted_at(0, estimators._row))
-    again = estimators.measure(some, items, 2, kept=Kept(path))  # measures nothing
-    assert all(np.array_equal(again[spec][name], first[spec][name]) for spec in some for name in ("nsgd", "ms"))
+    again = estimators.measure(specs, items, 2, kept=Kept(path))  # measures nothing
+    assert all(np.array_equal(again[spec][name], first[spec][name]) for spec in specs for name in ("nsgd", "ms"))
     for other in ({"specs": ["opencv:method=lmeds,confidence=0.9"]}, {"seeds": 3}, {"matches": "others"}):
         with pytest.raises(KeyboardInterrupt):
-            estimators.measure(**({"specs": some, "items": items, "seeds": 2, "kept": Kept(path)} | other))
+            estimators.measure(**({"specs": specs, "items": items, "seeds": 2, "kept": Kept(path)} | other))
 
 
 def test_learned_goes_on_where_it_was_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

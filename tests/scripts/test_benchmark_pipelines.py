@@ -31,8 +31,8 @@ def test_an_interrupted_run_goes_on(tmp_path: Path) -> None:
     lines = [f"{i} {j} 0 0 0 0 0 -1 0 1 0" for i, j in ((0, 1), (0, 2), (1, 3))]
     (tmp_path / "Set" / "pairs_with_gt.txt").write_text("\n".join(lines) + "\n")
     (tmp_path / "Set" / "pairs_which_dataset.txt").write_text("scene/\n" * len(lines))
-    some = ["--pipelines", "sift_ratio", "rootsiftpca_ratio", "rootsiftpca_gms", "--seeds", "2"]
-    arguments = ["--root", str(tmp_path / "Set"), *some, "--json", str(tmp_path / "rows.jsonl")]
+    options = ["--pipelines", "sift_ratio", "rootsiftpca_ratio", "rootsiftpca_gms", "--seeds", "2"]
+    arguments = ["--root", str(tmp_path / "Set"), *options, "--json", str(tmp_path / "rows.jsonl")]
     benchmark(*arguments, cwd=tmp_path)
     text = (tmp_path / "rows.jsonl").read_text()
     rows = [json.loads(line) for line in text.splitlines()]
@@ -44,8 +44,8 @@ def test_an_interrupted_run_goes_on(tmp_path: Path) -> None:
     benchmark(*arguments, cwd=tmp_path)
     again = (tmp_path / "rows.jsonl").read_text().splitlines()
     assert len(again) == 9
-    found = {(row["method"], row["pair"]): row for row in map(json.loads, again)}
-    assert found == {(row["method"], row["pair"]): row for row in rows}
+    resumed = {(row["method"], row["pair"]): row for row in map(json.loads, again)}
+    assert resumed == {(row["method"], row["pair"]): row for row in rows}
 
     table = tmp_path / "table.md"
     table.write_text("before\n<!-- figures -->\n<!-- end of figures -->\nafter\n")

@@ -100,8 +100,8 @@ def _colmap_options() -> Any:
 
 def _colmap_e(x: Any, cameras: Any) -> Any:
     pycolmap, options = _colmap_options()
-    found = pycolmap.estimate_essential_matrix(*x, *(pycolmap.Camera(camera) for camera in cameras), options)
-    return None, found["cam2_from_cam1"].rotation.matrix(), found["cam2_from_cam1"].translation
+    result = pycolmap.estimate_essential_matrix(*x, *(pycolmap.Camera(camera) for camera in cameras), options)
+    return None, result["cam2_from_cam1"].rotation.matrix(), result["cam2_from_cam1"].translation
 
 
 def _colmap_f(x: Any, cameras: Any) -> Any:
@@ -119,15 +119,15 @@ def test_peers_have_the_figures_of_posebenchs_own_protocol(
     expected = direct(method)
     rows = tmp_path / "rows.jsonl"
     printed = run(capsys, monkeypatch, sample(tmp_path / "relative"), "--methods", method, "--rows", rows)
-    found = [json.loads(line) for line in rows.read_text().splitlines()]
+    stored = [json.loads(line) for line in rows.read_text().splitlines()]
     # arccos at a cosine near 1 is exact to the root of its rounding; pixels with a central principal point, to 1e-7
-    assert [max(row["rotation"], row["translation"]) for row in found] == pytest.approx(expected, abs=1e-3)
+    assert [max(row["rotation"], row["translation"]) for row in stored] == pytest.approx(expected, abs=1e-3)
     areas = [100 * area for area in reference.pose_auc(expected, (5.0, 10.0, 20.0))]
-    assert posebench.areas(found) == pytest.approx(areas, abs=0.02)
-    assert " / ".join(f"{value:.1f}" for value in posebench.areas(found)) in printed
+    assert posebench.areas(stored) == pytest.approx(areas, abs=0.02)
+    assert " / ".join(f"{value:.1f}" for value in posebench.areas(stored)) in printed
     published = {"E:poselib": "56.6 / 70.7 / 81.1", "F:colmap": "33.0 / 45.1 / 55.7"}  # of the whole set
     assert published.get(method, "") in printed
-    assert [row["reason"] != "" for row in found] == [False] * (PAIRS - 1) + [True]
+    assert [row["reason"] != "" for row in stored] == [False] * (PAIRS - 1) + [True]
 
 
 def test_our_estimators_run_by_the_protocol_and_a_run_goes_on_where_it_stopped(
@@ -265,6 +265,6 @@ def test_cameras_without_sizes_have_the_same_poses(
     for sized in (True, False):
         rows = tmp_path / f"{sized}.jsonl"
         folder = sample(tmp_path / str(sized), sized=sized)
-        run(capsys, monkeypatch, folder, "--methods", "E:poselib", "--rows", rows)
+        run(capsys, monkeypatch, folder, "--methods", "E:fmtorch", "--rows", rows)
         errors.append([json.loads(line)["rotation"] for line in rows.read_text().splitlines()])
     assert errors[0] == pytest.approx(errors[1], abs=1e-3)

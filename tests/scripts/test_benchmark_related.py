@@ -23,15 +23,15 @@ def pair(scene: str, i: int, j: int, family: str = "family") -> ImagePair:
 
 def test_unrelated_pairs_cross_scenes_and_are_chosen_once() -> None:
     related_ones = [pair(scene, i, i + 1) for scene in ("a", "b", "c") for i in range(4)]
-    found = related_pairs.unrelated_pairs(related_ones, [], 100)
-    assert len(found) == len({p.identity for p in found}) == 3 * 5 * 5
-    places = [{p.image0.identity[0], p.image1.identity[0]} for p in found]
+    unrelated = related_pairs.unrelated_pairs(related_ones, [], 100)
+    assert len(unrelated) == len({p.identity for p in unrelated}) == 3 * 5 * 5
+    places = [{p.image0.identity[0], p.image1.identity[0]} for p in unrelated]
     assert all(len(place) == 2 for place in places)
-    assert len({frozenset((p.image0.identity, p.image1.identity)) for p in found}) == 75
-    some = related_pairs.unrelated_pairs(related_ones, [], 7)
-    assert {p.identity for p in some} < {p.identity for p in found}
-    assert len(some) == 3 * 7
-    assert all(p.family.startswith(related_pairs.UNRELATED) and not p.F.any() for p in found)
+    assert len({frozenset((p.image0.identity, p.image1.identity)) for p in unrelated}) == 75
+    subset = related_pairs.unrelated_pairs(related_ones, [], 7)
+    assert {p.identity for p in subset} < {p.identity for p in unrelated}
+    assert len(subset) == 3 * 7
+    assert all(p.family.startswith(related_pairs.UNRELATED) and not p.F.any() for p in unrelated)
 
 
 def test_rendered_scenes_that_show_one_photograph_are_not_paired(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -39,8 +39,8 @@ def test_rendered_scenes_that_show_one_photograph_are_not_paired(monkeypatch: py
     monkeypatch.setattr(related_pairs, "photographs_shown", lambda dataset: shows)
     monkeypatch.setattr(related_pairs, "RenderedPairs", list)
     pairs = [pair(scene, 0, 1) for scene in "abcd"] + [pair("real", 0, 1)]
-    found = related_pairs.unrelated_pairs(pairs, [[]], 100)
-    crossed = {p.scene.replace("family/", "") for p in found}
+    unrelated = related_pairs.unrelated_pairs(pairs, [[]], 100)
+    crossed = {p.scene.replace("family/", "") for p in unrelated}
     assert crossed == {"a | c", "a | d", "b | d", "c | d"}  # neither a | b, b | c, nor a drawn and a real one
 
 
@@ -112,7 +112,7 @@ def test_an_interrupted_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(related, "BATCH", 2)
     related.run(arguments)
     rows = related.read(arguments.folder, arguments.pipelines)
-    assert {name: len(found) for name, found in rows.items()} == {LMEDS: 5, "sift_gms": 5}
+    assert {name: len(method_rows) for name, method_rows in rows.items()} == {LMEDS: 5, "sift_gms": 5}
     assert [r["true"] for r in sorted(rows[LMEDS], key=lambda r: r["pair"])].count(True) == 2
     assert all(r["significance"] > RELATED for r in rows[LMEDS] if r["true"])
     assert not any(r["significance"] >= RELATED for r in rows[LMEDS] if not r["true"])

@@ -31,7 +31,7 @@ def nearest(pair: ImagePair, rng: np.random.Generator, right: int, flat: int, wr
     x1 = x1[:, :2] / x1[:, 2:] + rng.normal(0, 0.2, (n, 2))
     x = [np.concatenate([x, rng.uniform([0, 0], [w, h], (2 * wrong, 2))]) for x in (x0, x1)]
     ratio = np.concatenate([rng.uniform(0.3, 0.7, n), np.full(wrong, 0.75), np.full(wrong, 0.95)])
-    points = [torch.from_numpy(one.astype(np.float32))[None] for one in x]
+    points = [torch.from_numpy(ends.astype(np.float32))[None] for ends in x]
     frames = [torch.cat([5 * torch.eye(2).expand(*p.shape[:2], 2, 2), p[..., None]], -1) for p in points]
     size = torch.tensor([SIZE])
     return Correspondences(
@@ -47,25 +47,25 @@ def case(index: int = 0, turn: float = 0.1, t: tuple[float, float, float] = (-1.
     F = fundamental_from_calibration(*(torch.from_numpy(np.asarray(a, np.float64)) for a in (K, K, R, t))).numpy()
     image = ImageSource("none", Path("none.png"))
     pair = ImagePair(f"orbit/a/{index}", "orbit", "a", image, image, F, K, K, R, np.array(t))
-    return stress_cases.made(pair, nearest(pair, rng, right=150, flat=60, wrong=600))
+    return stress_cases.case_of(pair, nearest(pair, rng, right=150, flat=60, wrong=600))
 
 
 def test_right_and_wrong_are_told_by_the_true_matrix() -> None:
-    one = case()
-    assert one.right[:200].float().mean() > 0.95  # of the right ones those inside image 1 or not: all keep their lines
-    assert one.right[210:].float().mean() < 0.05
-    assert not (one.right & one.wrong).any()
-    assert (one.spare.quality > 0.8).all()
-    assert on_plane(one)[150:210].float().mean() > 0.95
-    assert on_plane(one)[:150].float().mean() < 0.5
-    assert parallax(one) > 50
+    base = case()
+    assert base.right[:200].float().mean() > 0.95  # of the right ones those inside image 1 or not: all keep their lines
+    assert base.right[210:].float().mean() < 0.05
+    assert not (base.right & base.wrong).any()
+    assert (base.spare.quality > 0.8).all()
+    assert on_plane(base)[150:210].float().mean() > 0.95
+    assert on_plane(base)[:150].float().mean() < 0.5
+    assert parallax(base) > 50
     assert parallax(case(t=(-1e-4, 0.0, 0.0))) < 1
 
 
 @pytest.mark.parametrize("name", CONDITIONS)
 def test_right_matches_stay_right_under_every_condition(name: str) -> None:
-    one = case()
-    changed = CONDITIONS[name](one)
+    base = case()
+    changed = CONDITIONS[name](base)
     assert changed is not None
     assert changed.c.lafs0 is not None
     assert stress_cases.distances(changed.pair.F, changed.c)[changed.right].max() < RIGHT_PX
@@ -86,21 +86,21 @@ def test_right_matches_stay_right_under_every_condition(name: str) -> None:
 
 
 def test_sweeps_vary_one_quantity() -> None:
-    one = case()
+    base = case()
     rights = []
     for ratio in INLIER_RATIOS:
-        changed = SWEEPS["inlier ratio"][ratio](one)
+        changed = SWEEPS["inlier ratio"][ratio](base)
         assert changed is not None
         rights.append(int(changed.right.sum()))
         assert changed.right.float().mean().item() == pytest.approx(ratio, rel=0.03)
         assert changed.wrong.sum() == len(changed.right) - rights[-1]
     assert len(set(rights)) == 1
-    few, more = match_count(one, 20), match_count(one, 50)
+    few, more = match_count(base, 20), match_count(base, 50)
     assert few is not None
     assert more is not None
     assert torch.equal(few.c.x0, more.c.x0[:, :20])
-    assert match_count(one, COUNTS[-1]) is None
-    still, moved = noise(one, 0.0), noise(one, 2.0)
+    assert match_count(base, COUNTS[-1]) is None
+    still, moved = noise(base, 0.0), noise(base, 2.0)
     assert still is not None
     assert moved is not None
     assert (moved.c.x0 - still.c.x0).std().item() == pytest.approx(2.0, rel=0.1)
@@ -119,13 +119,13 @@ def test_tables_are_of_pairs_that_all_estimators_have_and_say_who_has_fewer_seed
 
     rows = [row("b", "0", 1.0, 1), row("b", "1", 1.0, 2), row("a", "0", 1.0, 3), row("a", "1", 1.0, 3),
             row("a", "2", 1.0, 1), row("a", "0", 2.0, 3)]  # fmt: skip
-    found = stress_rows.comparable(rows, ["c", "a"])
-    assert [(r["method"], r["pair"], r["level"]) for r in found] == [
+    comparable = stress_rows.comparable(rows, ["c", "a"])
+    assert [(r["method"], r["pair"], r["level"]) for r in comparable] == [
         ("a", "0", 1.0), ("a", "1", 1.0), ("b", "0", 1.0), ("b", "1", 1.0),
     ]  # fmt: skip
-    assert [len(r["nsgd"]) for r in found] == [len(r["ms"]) for r in found] == [3, 3, 1, 1]
-    assert stress_table.seeds(found) == "3 seeds (b: 1)"
-    assert stress_table.seeds(found[:2]) == "3 seeds"
+    assert [len(r["nsgd"]) for r in comparable] == [len(r["ms"]) for r in comparable] == [3, 3, 1, 1]
+    assert stress_table.seeds(comparable) == "3 seeds (b: 1)"
+    assert stress_table.seeds(comparable[:2]) == "3 seeds"
 
 
 def test_an_interrupted_run_goes_on_and_its_tables_stand_in_the_page(

@@ -156,11 +156,11 @@ def test_a_data_set_that_broke_off_is_continued(
         SCRIPT["fetch_dataset"](asked)
     assert [path.name for path in (tmp_path / "TUM").iterdir()] == [".x_y.archive.part"]
     handler.limit = len(handler.content)
-    made = SCRIPT["fetch_dataset"](asked)
+    folders = SCRIPT["fetch_dataset"](asked)
     assert handler.asked == [None, "bytes=20000-"]
-    assert made == [tmp_path / "TUM/rgbd_dataset_x"]
-    assert (made[0] / "rgb.txt").read_bytes() == b"# list"
-    assert len((made[0] / "rgb/1.png").read_bytes()) == 50_000
+    assert folders == [tmp_path / "TUM/rgbd_dataset_x"]
+    assert (folders[0] / "rgb.txt").read_bytes() == b"# list"
+    assert len((folders[0] / "rgb/1.png").read_bytes()) == 50_000
     assert sorted(path.name for path in (tmp_path / "TUM").iterdir()) == [".x_y.complete", "rgbd_dataset_x"]
     assert SCRIPT["fetch_dataset"](asked) == []  # it is there
     assert len(handler.asked) == 2

@@ -43,12 +43,12 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     arrays = {"a": np.arange(6.0).reshape(2, 3), "b": np.array([True, False]), "empty": np.zeros((0, 2, 3), np.float32)}
     assert cache.read("some", "name") is None
     cache.write("some", "name", arrays)
-    found = cache.read("some", "name")
-    assert found is not None
-    assert found.keys() == arrays.keys()
+    cached = cache.read("some", "name")
+    assert cached is not None
+    assert cached.keys() == arrays.keys()
     for name, array in arrays.items():
-        assert found[name].dtype == array.dtype
-        np.testing.assert_array_equal(found[name], array)
+        assert cached[name].dtype == array.dtype
+        np.testing.assert_array_equal(cached[name], array)
     assert [path.name for path, _ in cache.files()] == ["name.npz"]
 
 
@@ -61,9 +61,9 @@ def test_a_truncated_file_counts_as_absent(tmp_path: Path, keep: float) -> None:
     with pytest.warns(UserWarning, match=r"name\.npz is damaged"):
         assert cache.read("some", "name") is None
     cache.write("some", "name", {"a": np.arange(3)})
-    found = cache.read("some", "name")
-    assert found is not None
-    assert len(found["a"]) == 3
+    cached = cache.read("some", "name")
+    assert cached is not None
+    assert len(cached["a"]) == 3
 
 
 def test_a_changed_byte_never_goes_unnoticed_and_never_crashes(tmp_path: Path) -> None:
@@ -76,9 +76,9 @@ def test_a_changed_byte_never_goes_unnoticed_and_never_crashes(tmp_path: Path) -
         path.write_bytes(sound[:i] + bytes([sound[i] ^ 0x55]) + sound[i + 1 :])
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            found = cache.read("some", "name")
+            cached = cache.read("some", "name")
         # Some bytes of a zip file mean nothing (time stamps, attributes, an entry's name).
-        assert found is None or "a" not in found or np.array_equal(found["a"], values)
+        assert cached is None or "a" not in cached or np.array_equal(cached["a"], values)
 
 
 def test_a_pickle_is_not_opened(tmp_path: Path) -> None:
@@ -143,9 +143,9 @@ def test_a_killed_writer_leaves_no_broken_file(tmp_path: Path) -> None:
     for name in names:  # without a warning
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            found = cache.read("some", name)
-        assert found is not None
-        assert (found["a"] == int(name)).all()
+            cached = cache.read("some", name)
+        assert cached is not None
+        assert (cached["a"] == int(name)).all()
 
 
 @pytest.mark.parametrize("limit", [0, 5_000_000])
@@ -157,9 +157,9 @@ def test_processes_share_a_cache(tmp_path: Path, limit: int) -> None:
     cache = ArrayCache(tmp_path)
     files = list(cache.files())
     for path, _ in files:
-        found = cache.read("some", path.stem)
-        assert found is not None
-        assert (found["a"] == int(path.stem)).all()
+        cached = cache.read("some", path.stem)
+        assert cached is not None
+        assert (cached["a"] == int(path.stem)).all()
     total = sum(status.st_size for _, status in files)
     assert len(files) == 50 if limit == 0 else total <= (1 + 2 * SLACK) * limit + 2 * 400_500
     assert not list(tmp_path.glob("some/*.tmp"))
@@ -173,8 +173,8 @@ def test_threads_share_a_cache(tmp_path: Path) -> None:
         try:
             for i in range(start, start + 60):
                 cache.write("some", f"{i % 40}", {"a": np.full(1000, i % 40)})
-                found = cache.read("some", f"{(i * 3) % 40}")
-                assert found is None or (found["a"] == (i * 3) % 40).all()
+                cached = cache.read("some", f"{(i * 3) % 40}")
+                assert cached is None or (cached["a"] == (i * 3) % 40).all()
         except BaseException as error:
             errors.append(error)
 

@@ -149,7 +149,7 @@ for y in x: import l
 else:
     while x: import m
 """
-    assert sorted(name for found in code._imports(source.encode()) for name in found.names) == list("abcdefghijklm")
+    assert sorted(name for entry in code._imports(source.encode()) for name in entry.names) == list("abcdefghijklm")
 
 
 def test_a_module_without_a_file_is_refused() -> None:

@@ -115,22 +115,26 @@ def test_every_float_survives(tmp_path: Path) -> None:
             n = len(self.descriptors)
             return Features(torch.zeros(n, 2, 3), torch.zeros(n), self.descriptors, torch.tensor([1, 1]))
 
-    whole = torch.arange(256.0)[:, None]
+    integral = torch.arange(256.0)[:, None]
     special = torch.tensor([[-0.0], [256.0], [-1.0], [0.5], [torch.nan], [torch.inf], [1e30], [3.0]])
-    for descriptors in (whole, special, special.double(), special.half(), whole[:0], whole.double()):
+    for descriptors in (integral, special, special.double(), special.half(), integral[:0], integral.double()):
         kept = CachedFeatures(Odd(descriptors), ArrayCache(tmp_path))
         for _ in range(2):
-            found = kept(picture()).descriptors
-            assert found.dtype == descriptors.dtype
-            assert found.numpy().tobytes() == descriptors.numpy().tobytes()
+            read = kept(picture()).descriptors
+            assert read.dtype == descriptors.dtype
+            assert read.numpy().tobytes() == descriptors.numpy().tobytes()
         assert kept.found == 1
 
 
 def test_extractors_with_the_same_detection_share_it(tmp_path: Path) -> None:
     cache, image = ArrayCache(tmp_path), picture()
-    one, other, coarse = TwoSteps(gain=0.5), TwoSteps(gain=2.0), TwoSteps(Detector(step=16))
-    assert isinstance(one, TwoStepExtractor)
-    for extractor, expected in ((one, ["detect", "describe"]), (other, ["describe"]), (coarse, ["detect", "describe"])):
+    half_gain, double_gain, coarse = TwoSteps(gain=0.5), TwoSteps(gain=2.0), TwoSteps(Detector(step=16))
+    assert isinstance(half_gain, TwoStepExtractor)
+    for extractor, expected in (
+        (half_gain, ["detect", "describe"]),
+        (double_gain, ["describe"]),
+        (coarse, ["detect", "describe"]),
+    ):
         truth = dataclasses.replace(extractor, log=[])(image)
         for _ in range(2):
             assert equal(CachedFeatures(extractor, cache)(image), truth)
@@ -357,12 +361,12 @@ def test_the_command_tells_what_is_there(tmp_path: Path) -> None:
     source = str(Path(__file__).resolve().parents[2])
     env = {**os.environ, "PYTHONPATH": source, "FMTORCH_CACHE": str(tmp_path), "COLUMNS": "200"}
     command = [sys.executable, "-W", "error", "-m", "fmtorch.storage"]
-    told = subprocess.run(command, env=env, capture_output=True, text=True, timeout=120, check=True).stdout
-    assert "2 files" in told
-    assert "scenes drawn" not in told
+    output = subprocess.run(command, env=env, capture_output=True, text=True, timeout=120, check=True).stdout
+    assert "2 files" in output
+    assert "scenes drawn" not in output
     (tmp_path / "rendered" / "orbit").mkdir(parents=True)
     (tmp_path / "rendered" / "orbit" / "00.jpg").write_bytes(bytes(1_500_000))
     again = subprocess.run(command, env=env, capture_output=True, text=True, timeout=120, check=True).stdout
     assert re.search(r"rendered: scenes drawn\s+│\s+1 │ 1\.5 MB", again)
-    assert "detection-" in told
-    assert "TwoSteps-" in told
+    assert "detection-" in output
+    assert "TwoSteps-" in output

@@ -150,12 +150,12 @@ KINDS = ["configuration", "warning", "focal_error0", "focal_error1", "focal_log_
 PLANES = ["H", "corner_error"]
 
 
-@pytest.mark.parametrize(("version", "lacks", "told"), [
+@pytest.mark.parametrize(("version", "lacks", "missing"), [
     (2, [*POSES, *KINDS, *PLANES], "the errors of poses and configurations"), (3, [*KINDS, *PLANES], "configurations"),
     (4, PLANES, "homographies"),
 ])  # fmt: skip
 def test_a_folder_of_fewer_columns_is_read_but_not_continued(
-    version: int, lacks: list[str], told: str, tmp_path: Path
+    version: int, lacks: list[str], missing: str, tmp_path: Path
 ) -> None:
     run = RunFolder.open(tmp_path, CONFIG)
     run.append([row("a")])
@@ -171,7 +171,7 @@ def test_a_folder_of_fewer_columns_is_read_but_not_continued(
     assert table.schema == PAIR_SCHEMA
     assert [table[name].to_pylist() for name in lacks] == [[None]] * len(lacks)
     assert RunFolder.load(tmp_path).done() == {pair_key("a")}
-    with pytest.raises(RunFolderError, match=rf"format {version}, which lacks {told};.*Choose another run_dir"):
+    with pytest.raises(RunFolderError, match=rf"format {version}, which lacks {missing};.*Choose another run_dir"):
         RunFolder.open(tmp_path, CONFIG)
 
 

@@ -50,8 +50,8 @@ def cheirality(cameras: Cameras, longest: F8x1, F: F8x2, matches: Weighted, tole
             back += where(behind & (side > 0.0), support, 0.0)
             mirrored += where(ahead & (side < 0.0), support, 0.0)
             both += where(behind & (side < 0.0), support, 0.0)
-        largest, whole = max(max(added(front), added(back)), max(added(mirrored), added(both))), added(total)
-        out[k] = largest / whole if whole > 0 else math.nan
+        largest, total_support = max(max(added(front), added(back)), max(added(mirrored), added(both))), added(total)
+        out[k] = largest / total_support if total_support > 0 else math.nan
 
 
 @inner

@@ -80,17 +80,17 @@ def fit_samples(points: F8x2, labels: B1x1, stream: I8x1, size: int, out: F8x2) 
             total += 1
     if total == 0:
         return 0
-    models, whole, sample = 0, matrix(4, total), matrix(4, size)
+    models, inlier_points, sample = 0, matrix(4, total), matrix(4, size)
     for i in range(total):
         for k in range(4):
-            whole[k, i] = points[k, inliers[i]]
-    models += weighted_eight_point(whole, np.ones(total), out[0])
+            inlier_points[k, i] = points[k, inliers[i]]
+    models += weighted_eight_point(inlier_points, np.ones(total), out[0])
     ones = np.ones(size)
     for s in range(len(out) - 1):
         for j in range(size):
             word = random_bits(state, (stream[2] + s) * size + j) >> np.uint64(31)
             drawn = np.int64(word * np.uint64(total) >> np.uint64(32))
             for k in range(4):
-                sample[k, j] = whole[k, drawn]
+                sample[k, j] = inlier_points[k, drawn]
         models += weighted_eight_point(sample, ones, out[models])
     return models

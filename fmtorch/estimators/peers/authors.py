@@ -178,9 +178,9 @@ def superansac_cpp(
         settings.min_iterations, settings.max_iterations = min(1000, iterations), iterations
         (h0, w0), (h1, w1) = pair.size0, pair.size1
         weights = pair.likelihood.tolist() if sampler in ("importance", "adaptive") else []
-        F, found, _, _ = library.estimateFundamentalMatrix(pair.joined, [w0, h0, w1, h1], weights, settings)
+        F, indices, _, _ = library.estimateFundamentalMatrix(pair.joined, [w0, h0, w1, h1], weights, settings)
         inliers = np.zeros(len(pair.x0), dtype=np.bool_)
-        inliers[found] = True
+        inliers[indices] = True
         return solution(F, inliers)
 
     return PairwiseEstimator("SupeRANSAC", solve, best_first=sampler == "prosac")

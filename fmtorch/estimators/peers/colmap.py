@@ -90,11 +90,11 @@ def colmap(
     def fundamental(pair: Pair) -> Solution:
         cameras = None if pair.calibrations is None else _cameras(pair)
         if two_view:
-            found = two_view_geometry(pair.x0, pair.x1, cameras or _cameras(pair), settings(pair))
+            geometry = two_view_geometry(pair.x0, pair.x1, cameras or _cameras(pair), settings(pair))
             if cameras is None:
-                return found.F, found.inliers
-            focals = np.array([np.nan if K is None else K[0, 0] for K in (found.K0, found.K1)])
-            return Posed(found.F, found.inliers, focals, found.R, found.t)
+                return geometry.F, geometry.inliers
+            focals = np.array([np.nan if K is None else K[0, 0] for K in (geometry.K0, geometry.K1)])
+            return Posed(geometry.F, geometry.inliers, focals, geometry.R, geometry.t)
         ransac = settings(pair).ransac
         if cameras is not None and pair.exact:
             F, inliers, R, t = essential_matrix(pair.x0, pair.x1, cameras, ransac)
@@ -102,17 +102,17 @@ def colmap(
         return fundamental_matrix(pair.x0, pair.x1, ransac)
 
     def homography(pair: Pair) -> Solution:
-        found = library.estimate_homography_matrix(pair.x0, pair.x1, settings(pair).ransac)
-        if found is None:
+        result = library.estimate_homography_matrix(pair.x0, pair.x1, settings(pair).ransac)
+        if result is None:
             return None, np.zeros(len(pair.x0), np.bool_)
-        H, inliers = np.asarray(found["H"], np.float64), np.asarray(found["inlier_mask"], np.bool_)
+        H, inliers = np.asarray(result["H"], np.float64), np.asarray(result["inlier_mask"], np.bool_)
         depth = pair.x0[inliers] @ H[2, :2] + H[2, 2]
         return (-H if np.count_nonzero(depth < 0) > np.count_nonzero(depth > 0) else H), inliers
 
     return PairwiseEstimator("COLMAP", fundamental if model == "fundamental" else homography, model=model)
 
 
-def two_view_options(threshold: float | int, seed: int) -> Any:
+def two_view_options(threshold: float, seed: int) -> Any:
     """`pycolmap.TwoViewGeometryOptions` at a threshold in pixels, with relative poses."""
     options = peer("pycolmap", "COLMAP", extra="colmap").TwoViewGeometryOptions(compute_relative_pose=True)
     options.ransac.max_error, options.ransac.random_seed = threshold, seed % MAX_SEED
@@ -124,18 +124,18 @@ def two_view_geometry(x0: Points, x1: Points, cameras: tuple[Camera, Camera], op
     library = peer("pycolmap", "COLMAP", extra="colmap")
     matches = np.repeat(np.arange(len(x0), dtype=np.uint32)[:, None], 2, 1)
     ends = [_pinhole(library, camera) for camera in cameras]
-    found = library.estimate_two_view_geometry(ends[0], x0, ends[1], x1, matches, options)
+    result = library.estimate_two_view_geometry(ends[0], x0, ends[1], x1, matches, options)
     inliers = np.zeros(len(x0), np.bool_)
-    inliers[np.asarray(found.inlier_matches, np.int64).reshape(-1, 2)[:, 0]] = True
-    configuration = library.TwoViewGeometryConfiguration(found.config).name
+    inliers[np.asarray(result.inlier_matches, np.int64).reshape(-1, 2)[:, 0]] = True
+    configuration = library.TwoViewGeometryConfiguration(result.config).name
     K0, K1 = (
         camera.K if camera.known else None if estimated is None else np.asarray(estimated.calibration_matrix())
-        for camera, estimated in zip(cameras, (found.camera1, found.camera2), strict=True)
+        for camera, estimated in zip(cameras, (result.camera1, result.camera2), strict=True)
     )
-    F = None if found.F is None else np.asarray(found.F, np.float64)
-    if K0 is None or K1 is None or found.cam2_from_cam1 is None:
+    F = None if result.F is None else np.asarray(result.F, np.float64)
+    if K0 is None or K1 is None or result.cam2_from_cam1 is None:
         return TwoView(configuration, F, None, None, K0, K1, inliers)
-    R, t = np.asarray(found.cam2_from_cam1.rotation.matrix()), np.asarray(found.cam2_from_cam1.translation)
+    R, t = np.asarray(result.cam2_from_cam1.rotation.matrix()), np.asarray(result.cam2_from_cam1.translation)
     if configuration != "UNCALIBRATED" and np.any(t):
         F = fundamental_of_pose(K0, K1, R, t)
     return TwoView(configuration, F, R, t, K0, K1, inliers)
@@ -146,22 +146,22 @@ def essential_matrix(
 ) -> tuple[Points | None, NDArray[np.bool_], Points | None, Points | None]:
     """F of COLMAP's essential matrix, px, its inliers (n,), R and t; None without. ransac: `pycolmap.RANSACOptions`."""
     library = peer("pycolmap", "COLMAP", extra="colmap")
-    found = library.estimate_essential_matrix(x0, x1, *(_pinhole(library, camera) for camera in cameras), ransac)
-    if found is None:
+    result = library.estimate_essential_matrix(x0, x1, *(_pinhole(library, camera) for camera in cameras), ransac)
+    if result is None:
         return None, np.zeros(len(x0), np.bool_), None, None
     K0, K1 = (camera.K for camera in cameras)
-    F = np.linalg.inv(K1).T @ np.asarray(found["E"]) @ np.linalg.inv(K0)
-    pose = found["cam2_from_cam1"]
+    F = np.linalg.inv(K1).T @ np.asarray(result["E"]) @ np.linalg.inv(K0)
+    pose = result["cam2_from_cam1"]
     R, t = np.asarray(pose.rotation.matrix()), np.asarray(pose.translation)
-    return F, np.asarray(found["inlier_mask"], np.bool_), R, t
+    return F, np.asarray(result["inlier_mask"], np.bool_), R, t
 
 
 def fundamental_matrix(x0: Points, x1: Points, ransac: Any) -> tuple[Points | None, NDArray[np.bool_]]:
     """COLMAP's fundamental matrix, px, and its inliers (n,); None without. ransac: `pycolmap.RANSACOptions`."""
-    found = peer("pycolmap", "COLMAP", extra="colmap").estimate_fundamental_matrix(x0, x1, ransac)
-    if found is None:
+    result = peer("pycolmap", "COLMAP", extra="colmap").estimate_fundamental_matrix(x0, x1, ransac)
+    if result is None:
         return None, np.zeros(len(x0), np.bool_)
-    return np.asarray(found["F"], np.float64), np.asarray(found["inlier_mask"], np.bool_)
+    return np.asarray(result["F"], np.float64), np.asarray(result["inlier_mask"], np.bool_)
 
 
 def _cameras(pair: Pair) -> tuple[Camera, Camera]:
@@ -179,6 +179,6 @@ def _pinhole(library: Any, camera: Camera) -> Any:
     K = camera.K
     h, w = camera.size or (int(2 * K[1, 2]) + 1, int(2 * K[0, 2]) + 1)
     params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-    made = library.Camera(camera_id=camera.number, model="PINHOLE", width=w, height=h, params=params)
-    made.has_prior_focal_length = camera.known
-    return made
+    pinhole = library.Camera(camera_id=camera.number, model="PINHOLE", width=w, height=h, params=params)
+    pinhole.has_prior_focal_length = camera.known
+    return pinhole

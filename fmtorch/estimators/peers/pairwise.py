@@ -137,8 +137,8 @@ class PairwiseEstimator:
             posed[i] = solved if isinstance(solved, Posed) else None
         ok = torch.tensor([not reason for reason in reasons], dtype=torch.bool)
         draws = torch.zeros(b, dtype=torch.int64)  # not reported by these libraries
-        found = Estimate(F, inliers, ok, tuple(reasons), draws, model=self.model, **_cameras_found(posed))
-        return judged(found.to(c.mask.device), c)
+        batch_estimate = Estimate(F, inliers, ok, tuple(reasons), draws, model=self.model, **_cameras_found(posed))
+        return judged(batch_estimate.to(c.mask.device), c)
 
 
 def _with_cameras(pair: Pair, batch: Batch, i: int) -> Pair:

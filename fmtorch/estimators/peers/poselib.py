@@ -105,8 +105,8 @@ def _relative_pose(library: Any, pair: Pair, options: dict[str, Any], refinement
 def _shared_focal(library: Any, pair: Pair, options: dict[str, Any], refinement: dict[str, Any]) -> Solution:
     """The fundamental matrix of the relative pose and the one focal length of two images of one size."""
     centre = _centre(pair.size0)
-    found, info = library.estimate_shared_focal_relative_pose(pair.x0, pair.x1, centre, options, refinement)
-    focal, pose = found.camera1.params[0], found.pose
+    image_pair, info = library.estimate_shared_focal_relative_pose(pair.x0, pair.x1, centre, options, refinement)
+    focal, pose = image_pair.camera1.params[0], image_pair.pose
     if not (np.isfinite(focal) and focal > 0):
         return None, np.zeros(len(pair.x0), dtype=np.bool_)
     to_ray = np.array([[1 / focal, 0, -centre[0] / focal], [0, 1 / focal, -centre[1] / focal], [0, 0, 1]])

@@ -61,10 +61,10 @@ class Job(NamedTuple):
 
 def matching(dataset: PairDataset, build: Callable[[], Pipeline], most: int, images: int) -> Matching:
     """The matching by a pipeline that `build` makes, with the features of so many images kept."""
-    made = build()
+    template = build()
     pipeline = Pipeline(
-        made.extractor, made.matcher, made.pruners, made.estimator,
-        device=made.device, memory=images, families=made.families,
+        template.extractor, template.matcher, template.pruners, template.estimator,
+        device=template.device, memory=images, families=template.families,
     )  # fmt: skip
     return Matching(dataset, pipeline, most)
 

@@ -75,11 +75,11 @@ class H5Pairs(PairDataset):
             digest.update(known.digest.encode())
             offset = WITHOUT_GEOMETRY[layout] if origin is None else origin
             if layout == "hloc":
-                files = [_one(folder, features, "features"), _one(folder, matches, "matches")]
+                files = [_file_of_kind(folder, features, "features"), _file_of_kind(folder, matches, "matches")]
                 self._pairs = list(hloc_pairs(known, files[0], files[1], offset))
             else:
                 _expect_unset(layout, features=features)
-                files = [_one(folder, matches, "matches") if matches else _only(folder)]
+                files = [_file_of_kind(folder, matches, "matches") if matches else _only(folder)]
                 self._pairs = list(predicted_pairs(known, files[0], offset))
         for path in files:
             h5.add_to_digest(digest, path)
@@ -120,7 +120,7 @@ def _expect_unset(layout: str, **options: Any) -> None:
         raise DataError(f"layout {layout} takes no {' or '.join(given)}")
 
 
-def _one(folder: Path, name: str | None, kind: str) -> Path:
+def _file_of_kind(folder: Path, name: str | None, kind: str) -> Path:
     """The file of this name in the folder, or the only one whose name speaks of its kind."""
     if name is not None:
         path = folder / name

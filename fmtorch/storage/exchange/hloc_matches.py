@@ -139,15 +139,15 @@ def write_geometry(group: Any, geometry: PairGeometry) -> None:
 
 def _below(file: Any, last: str) -> list[str]:
     """The paths of the groups that hold an array of that name, at any depth."""
-    found: list[str] = []
+    groups: list[str] = []
 
     def visit(name: str) -> None:
         head, _, end = name.rpartition("/")
         if end == last and head:
-            found.append(head)
+            groups.append(head)
 
     try:
         file.visit(visit)
     except (OSError, RuntimeError) as error:
         raise DataError(f"{file.filename}: its keys cannot be read ({str(error).splitlines()[0]})") from error
-    return found
+    return groups

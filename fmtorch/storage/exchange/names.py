@@ -26,8 +26,8 @@ def pair_keys(pair: ImagePair) -> Iterator[tuple[str, bool]]:
     ``a/b``, as hloc and glue-factory write it with hyphens for slashes within names, and ``a_b``.
     """
     for swapped in (False, True):
-        one, other = (pair.image1, pair.image0) if swapped else (pair.image0, pair.image1)
-        for a, b in zip(names_of(one), names_of(other), strict=False):
+        image, other = (pair.image1, pair.image0) if swapped else (pair.image0, pair.image1)
+        for a, b in zip(names_of(image), names_of(other), strict=False):
             for key in _keys(a, b):
                 yield key, swapped
 

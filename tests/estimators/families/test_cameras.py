@@ -89,10 +89,10 @@ def test_sizes_of_another_unit_have_no_half_pixel() -> None:
         size0=c.size0.double() * 1e-3,
         size1=c.size1.double() * 1e-3,  # type: ignore[union-attr]
     )
-    one, other = images_of(pair_of(c)), images_of(pair_of(scaled))
+    in_pixels, in_units = images_of(pair_of(c)), images_of(pair_of(scaled))
     pixels = pair_of(scaled).pixels_per_unit * 1e3 / pair_of(c).pixels_per_unit
     half = 0.5 / pair_of(c).pixels_per_unit
-    np.testing.assert_allclose(other.offset * pixels, one.offset - half, atol=1e-12)
+    np.testing.assert_allclose(in_units.offset * pixels, in_pixels.offset - half, atol=1e-12)
 
 
 def test_a_model_that_is_not_finite_leaves_the_others_alone() -> None:

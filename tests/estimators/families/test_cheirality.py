@@ -51,11 +51,11 @@ def test_as_by_triangulation(seed: int, tolerance: float) -> None:
     rays1 = np.c_[x1 / focal[1], -(lines[:, 0] * x1 / focal[1] + lines[:, 2]) / lines[:, 1], np.ones(n)]
     support = rng.integers(1, 1 << 10, n) / (1 << 10)  # of few bits: their sums are exact
     points = np.stack([*x0.T, *(rays1[:, :2] * focal[1]).T])
-    found = share(U, V, focal, points, support, tolerance)
+    computed = share(U, V, focal, points, support, tolerance)
     expected = reference.share_in_front(E, rays0, rays1, support, np.full(n, tolerance / focal[1]))
     # Supports are rounded to BITS, those of gains that rounding leaves a little below one.
-    assert found == pytest.approx(expected, abs=n * 2.0**-BITS / support.sum())
-    assert 0.25 <= found < 0.95  # neither all nor none, so that the comparison tells
+    assert computed == pytest.approx(expected, abs=n * 2.0**-BITS / support.sum())
+    assert 0.25 <= computed < 0.95  # neither all nor none, so that the comparison tells
 
 
 def test_support_is_the_gain_of_geman_and_mcclure() -> None:
@@ -71,10 +71,10 @@ def test_support_is_the_gain_of_geman_and_mcclure() -> None:
     cameras, out = Cameras(np.stack([U, V])[None].copy(), np.zeros((1, 2))), np.empty(1)
     loss, F = LOSSES["geman_mcclure"], (U @ np.diag([1, 1, 0]) @ V.T).reshape(1, 9)
     cheirality(cameras, ones, F, Weighted(points, weight, np.full(60, scale), loss, NO_TABLE), 0.0, out)
-    found = out[0]
+    computed = out[0]
     # The same, each match weighted by its gain, with a scale so small that all count fully.
     cheirality(cameras, ones, F, Weighted(points, weight * gain, np.full(60, 1e-12), loss, NO_TABLE), 0.0, out)
-    assert found == pytest.approx(out[0], abs=60 * 2.0**-BITS / (weight * gain).sum())
+    assert computed == pytest.approx(out[0], abs=60 * 2.0**-BITS / (weight * gain).sum())
 
 
 def test_without_support_there_is_no_share() -> None:

@@ -31,8 +31,8 @@ def test_its_cost_and_gradient(same: bool, known: str) -> None:
         def cost(at: np.ndarray, measured: reference.Measured = ((m0, s0), (m1, s1))) -> float:
             return reference.prior_cost(*at, same_size=same, measured=measured)
 
-        found = focal_cost(focal, focal_prior(same, False, (m0, m1), (s0, s1)), out)
-        assert found == pytest.approx(cost(focal), rel=1e-9, abs=1e-9)
+        computed = focal_cost(focal, focal_prior(same, False, (m0, m1), (s0, s1)), out)
+        assert computed == pytest.approx(cost(focal), rel=1e-9, abs=1e-9)
         for i, step in enumerate(h * np.eye(2)):
             # The well, 0.01 wide and 5 deep, has third derivatives of up to 1e8: h^2 of these.
             numeric = (cost(focal + step) - cost(focal - step)) / (2 * h)
@@ -91,7 +91,9 @@ def test_how_likely_one_camera_is() -> None:
     """By Bayes' rule, of two normal densities of the difference of what is measured."""
     s = np.array([0.05, 0.1])
     for difference in (0.0, 0.1, 0.5):
-        one, two = (math.exp(-(difference**2) / 2 / v) / math.sqrt(v) for v in (0.0125 + 0.01**2, 0.0125 + 0.5**2))
-        expected = 0.7 * one / (0.7 * one + 0.3 * two)
+        same, different = (
+            math.exp(-(difference**2) / 2 / v) / math.sqrt(v) for v in (0.0125 + 0.01**2, 0.0125 + 0.5**2)
+        )
+        expected = 0.7 * same / (0.7 * same + 0.3 * different)
         assert same_camera_share(difference, s) == pytest.approx(expected, rel=1e-12)
     assert same_camera_share(0.0, np.array([0.0, math.inf])) == 0.7

@@ -67,14 +67,14 @@ def test_hypotheses_pass_through_their_five_matches() -> None:
     pair, start = pair_of(photographs(1, noise=0.0, outliers=0.0).c), 7
     rng = np.random.default_rng(0)
     sample = np.stack([rng.permutation(pair.count)[:5] for _ in range(40)], 1)
-    made = FundamentalWithFocals().solve(pair, sample, start)
-    assert made.F.shape == (len(made.draw), 9)
-    assert len(made.F) > 40
-    assert (np.diff(made.draw) >= 0).all()
-    assert made.start == start
-    own = pair.points[:, made.sample[:, made.draw]]
+    hypotheses = FundamentalWithFocals().solve(pair, sample, start)
+    assert hypotheses.F.shape == (len(hypotheses.draw), 9)
+    assert len(hypotheses.F) > 40
+    assert (np.diff(hypotheses.draw) >= 0).all()
+    assert hypotheses.start == start
+    own = pair.points[:, hypotheses.sample[:, hypotheses.draw]]
     x0, x1 = (np.concatenate([x, np.ones((1, *x.shape[1:]))]) for x in (own[:2], own[2:]))
-    M = made.F.astype(np.float64).reshape(-1, 3, 3)
+    M = hypotheses.F.astype(np.float64).reshape(-1, 3, 3)
     assert np.abs(np.einsum("isk,kij,jsk->ks", x1, M, x0)).max() < 1e-5  # float32 models of points of about 1
 
 
@@ -83,8 +83,8 @@ def test_a_plane_does_not_deceive_where_cameras_are_plausible() -> None:
     errors = {samples: [] for samples in (0, 250)}  # type: dict[int, list[float]]
     for seed in range(8):
         pair = photographs(seed, (WIDE, WIDE), (0.9, 0.9), 150, 0.5, 0.4, relief=0.02)
-        for samples, found in errors.items():
-            found.append(error(presets.build("estimator", "fmtorch", focal={"samples": samples})(pair.c, 0).F, pair))
+        for samples, values in errors.items():
+            values.append(error(presets.build("estimator", "fmtorch", focal={"samples": samples})(pair.c, 0).F, pair))
     assert np.median(errors[250]) < 0.02
     assert np.median(errors[250]) < 0.5 * np.median(errors[0])
 

@@ -45,9 +45,9 @@ def matches(
     return Matches(x0, x1, right)
 
 
-def corner_error(found: torch.Tensor, truth: np.ndarray = TRUTH) -> float:
+def corner_error(estimated: torch.Tensor, truth: np.ndarray = TRUTH) -> float:
     """The mean distance of the corners in px."""
-    apart = reference.mapped(found.detach().numpy(), CORNERS) - reference.mapped(truth.ravel(), CORNERS)
+    apart = reference.mapped(estimated.detach().numpy(), CORNERS) - reference.mapped(truth.ravel(), CORNERS)
     return float(np.linalg.norm(apart, axis=1).mean())
 
 

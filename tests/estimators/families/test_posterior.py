@@ -61,7 +61,7 @@ def test_cost_and_derivatives(loss: str, sizes: Sizes) -> None:
     assert pair.prior is not None
     cameras = moved(start(truth, pair), np.random.default_rng(1).normal(0, 3e-4, 7))
     precision, scale = 40.0 / 0.3**2 * pair.pixels_per_unit**2, 0.7
-    found = evaluated(cameras, pair, loss, scale, precision)
+    computed = evaluated(cameras, pair, loss, scale, precision)
     x0, x1 = centred(pair).points[:2].T, centred(pair).points[2:].T
     s = scale * noise[0].numpy() / pair.pixels_per_unit
 
@@ -76,12 +76,12 @@ def test_cost_and_derivatives(loss: str, sizes: Sizes) -> None:
     def prior(cameras: Cameras) -> float:
         return reference.prior_cost(*cameras.focal[0].tolist(), same_size=sizes[0] == sizes[1])
 
-    assert found.cost[0] == pytest.approx(data(cameras) + prior(cameras), rel=1e-9)
+    assert computed.cost[0] == pytest.approx(data(cameras) + prior(cameras), rel=1e-9)
     # Differences of second order, of steps of 1e-6: relative 1e-8 or so by truncation, and by rounding of the cost.
     h, each = 1e-6, np.eye(7)
     ends = [(moved(cameras, -h * e), moved(cameras, h * e)) for e in each]
     gradient = [(data(b) + prior(b) - data(a) - prior(a)) / (2 * h) for a, b in ends]
-    np.testing.assert_allclose(found.gradient[0], gradient, rtol=1e-5, atol=1e-6 * np.abs(gradient).max())
+    np.testing.assert_allclose(computed.gradient[0], gradient, rtol=1e-5, atol=1e-6 * np.abs(gradient).max())
     if loss == "truncated":  # the Hessian of Gauss and Newton, of matches that are not cut off
         J = np.stack([(residuals(b) - residuals(a)) / (2 * h) for a, b in ends], 1)
         weight = np.where(np.abs(residuals(cameras)) < s, pair.weight, 0)
@@ -94,7 +94,7 @@ def test_cost_and_derivatives(loss: str, sizes: Sizes) -> None:
                 ]
                 hessian[i, j] += sum(corners) / (4 * k * k)
             size = np.sqrt(np.outer(np.diag(hessian), np.diag(hessian)))
-            assert (np.abs(found.hessian[0] - hessian) < 1e-6 * size).all()
+            assert (np.abs(computed.hessian[0] - hessian) < 1e-6 * size).all()
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -108,11 +108,11 @@ def test_the_cost_at_the_optimum_is_that_of_scipy(seed: int) -> None:
     F = SevenPoint().refine(to_units(truth, pair)[None], pair, Loss("truncated", LOSS_SCALE_PX), Steps(10, 1e-4))
     _, refined = FAMILY.refine(F, pair, 50)
     r = sampson(in_pixels(refined.models[0], pair), x0, x1)
-    found = (weight * reference.loss(r, LOSS_SCALE_PX)).sum() / (2 * 0.3**2) + refined.cost[0]
+    computed = (weight * reference.loss(r, LOSS_SCALE_PX)).sum() / (2 * 0.3**2) + refined.cost[0]
     # The loss has local minima, but on these pairs both end in the same one, where the cost is flat: an error of the
     # parameters enters squared, and SciPy stops within 1e-7 of the least cost.
-    assert found <= expected * (1 + 1e-9)
-    assert found == pytest.approx(expected, rel=1e-7)
+    assert computed <= expected * (1 + 1e-9)
+    assert computed == pytest.approx(expected, rel=1e-7)
 
 
 @pytest.mark.parametrize("name", ["000", "010", "020"])
@@ -127,14 +127,14 @@ def test_scipy_finds_nothing_better_nearby_on_real_pairs(name: str) -> None:
         )
     )  # fmt: skip
     _, refined = FAMILY.refine(to_units(data[f"{name}.F_gt"], pair)[None], pair, 50)
-    found = in_pixels(refined.models[0], pair)
-    parameters = reference.parameters_of(found, sizes[0], sizes[1])
+    refined_cameras = in_pixels(refined.models[0], pair)
+    parameters = reference.parameters_of(refined_cameras, sizes[0], sizes[1])
     same = sizes[0] == sizes[1]
     expected = reference.prior_cost(parameters[6], parameters[7], same)  # by way of F and Bougnoux
     assert refined.cost[0] == pytest.approx(expected, rel=1e-4)
-    cost = reference.cost(found, parameters[6:], x0, x1, np.ones(len(x0)), LOSS_SCALE_PX, same)
-    _, least = reference.optimum(parameters, x0, x1, np.ones(len(x0)), LOSS_SCALE_PX, sizes[0], sizes[1])
-    assert cost <= least * (1 + 1e-6)
+    cost = reference.cost(refined_cameras, parameters[6:], x0, x1, np.ones(len(x0)), LOSS_SCALE_PX, same)
+    _, min_cost = reference.optimum(parameters, x0, x1, np.ones(len(x0)), LOSS_SCALE_PX, sizes[0], sizes[1])
+    assert cost <= min_cost * (1 + 1e-6)
 
 
 def test_without_noise_a_model_stays_and_strange_focal_lengths_cost() -> None:
@@ -177,8 +177,8 @@ def test_a_fit_goes_on_after_a_rejected_step() -> None:
     begin.focal[0] += [0.1, -0.1]
     weighted = Weighted(matches.points, pair.weight, matches.s2, LOSSES["truncated"], NO_TABLE)
     before = evaluated(begin, pair, "truncated", px, precision)
-    one, out = begin.copy(), no_optimum(1)
-    minimise(one, weighted, images_of(pair), Limits(precision, 1, 0.05), out)
+    single_step, out = begin.copy(), no_optimum(1)
+    minimise(single_step, weighted, images_of(pair), Limits(precision, 1, 0.05), out)
     assert out.cost == before.cost
     fit = FAMILY.fit(begin, pair, px, Limits(precision, 30, 0.05))
     after = evaluated(fit.cameras, pair, "truncated", px, precision)
@@ -193,6 +193,6 @@ def test_models_that_are_not_finite_harm_no_other() -> None:
     _, alone = FAMILY.refine(good, pair, 12)
     _, among = FAMILY.refine(bad, pair, 12)
     assert isinstance(among, Refined)
-    for one, many in zip(alone, among, strict=True):
-        np.testing.assert_array_equal(many[2], one[0])
+    for single, many in zip(alone, among, strict=True):
+        np.testing.assert_array_equal(many[2], single[0])
     assert among.cost[:2].tolist() == [math.inf, math.inf]

@@ -92,13 +92,13 @@ def transfers(H: np.ndarray, pair: Pair) -> np.ndarray:
 def round_of(pair: Pair, count: int = 100) -> tuple[Hypotheses, Verified]:
     """The verified models of the first samples."""
     search = HypothesizeAndVerify(confidence=None).search
-    found = search.family.solve(pair, search.sampler.draw(pair, 0, count, 7), 0)
-    return found, Verified(found.F, *Preselection(Msac(1.0), None)(found.F, pair))
+    hypotheses = search.family.solve(pair, search.sampler.draw(pair, 0, count, 7), 0)
+    return hypotheses, Verified(hypotheses.F, *Preselection(Msac(1.0), None)(hypotheses.F, pair))
 
 
 @pytest.mark.parametrize("on_plane", [4, 5, 6, 7])
 def test_the_plane_of_a_sample_is_that_of_the_best_triplet(on_plane: int) -> None:
-    found = 0
+    planar = 0
     for index in range(10):
         pair, F, members = seven(index, on_plane)
         H = np.empty(9)
@@ -108,8 +108,8 @@ def test_the_plane_of_a_sample_is_that_of_the_best_triplet(on_plane: int) -> Non
             for t in Degensac.TRIPLETS
         ]
         apart = [transfers(plane, pair) for plane in planes]
-        least, most = (max(int((x <= 1 + e).sum()) for x in apart) for e in (-1e-6, 1e-6))
-        assert least <= count <= most
+        fewest, most = (max(int((x <= 1 + e).sum()) for x in apart) for e in (-1e-6, 1e-6))
+        assert fewest <= count <= most
         unit = reference.unit(H.reshape(3, 3))
         # Matches and model are exact to 1e-16; a triplet that is nearly collinear magnifies that.
         assert (
@@ -120,11 +120,11 @@ def test_the_plane_of_a_sample_is_that_of_the_best_triplet(on_plane: int) -> Non
             )
             < 1e-8
         )
-        found += count >= Degensac.ON_PLANE
+        planar += count >= Degensac.ON_PLANE
         if on_plane > Degensac.ON_PLANE:  # the only plane with so many
             assert (transfers(H, pair)[members] < 1).all()
     # Four on a plane: a fifth comes within 2 px by chance now and then.
-    assert found <= 3 if on_plane < Degensac.ON_PLANE else found == 10
+    assert planar <= 3 if on_plane < Degensac.ON_PLANE else planar == 10
 
 
 @pytest.mark.parametrize("name", ["plane 0", "plane 3", "general 1", "real 7", "real 13"])
@@ -166,8 +166,8 @@ def test_models_of_plane_and_parallax_are_those_of_their_draws(name: str) -> Non
         if i != j:
             expected.append(reference.plane_and_parallax(H, pair.points[:2, [i, j]].T, pair.points[2:, [i, j]].T))
     assert len(F) == len(expected) > 40
-    for found, model in zip(F, expected, strict=True):
-        np.testing.assert_allclose(reference.unit(found.astype(np.float64).reshape(3, 3)), model, atol=1e-6)  # float32
+    for fit, model in zip(F, expected, strict=True):
+        np.testing.assert_allclose(reference.unit(fit.astype(np.float64).reshape(3, 3)), model, atol=1e-6)  # float32
 
 
 @pytest.mark.parametrize("turn", [0, 1, 500])
@@ -177,14 +177,14 @@ def test_completed_models_are_the_best_of_plane_and_parallax(turn: int) -> None:
     pair.prior = pair.match_weight = pair.table[6]
     pair.table[6] = np.random.default_rng(0).uniform(0.1, 1, pair.count)
     H, inside, F = reference_plane(pair), np.empty(pair.count, np.bool_), np.empty((PARALLAX_DRAWS, 9), np.float32)
-    found, scores = part.completed(H.copy(), pair, turn)
+    completed, scores = part.completed(H.copy(), pair, turn)
     fit_plane(H, pair.points, limit(pair), FITS, inside)
     weight = np.where(inside, 0, quantised(pair.match_weight.tolist(), largest_weight(pair.bucket)))
     state = pair.mixed_seed(Stream.PARALLAX), pair.key, 2 * turn * PARALLAX_DRAWS
     F = F[: parallax(H, pair.points, np.cumsum(weight), np.array(state), F)]
     every = Msac(1.0)(F, np.arange(len(F)), pair)
     best = np.argsort(-every, kind="stable")[:KEPT]
-    np.testing.assert_array_equal(found, F[best])
+    np.testing.assert_array_equal(completed, F[best])
     np.testing.assert_array_equal(scores, every[best])
 
 
@@ -206,16 +206,16 @@ def test_a_better_degenerate_model_is_completed_and_others_are_left_alone() -> N
         hypotheses, models = round_of(pair)
         top = float(models.score.max())
         assert part(hypotheses, models, top, pair) is models  # which is not beaten
-        found = part(hypotheses, models, -np.inf, pair)
-        if found is models:
+        verified = part(hypotheses, models, -np.inf, pair)
+        if verified is models:
             continue
         completed += 1
-        added = len(found.F) - len(models.F)
+        added = len(verified.F) - len(models.F)
         assert 0 < added <= KEPT
-        np.testing.assert_array_equal(found.F[: len(models.F)], models.F)
-        np.testing.assert_array_equal(found.which, [*models.which, *range(len(models.F), len(found.F))])
-        np.testing.assert_array_equal(found.score[-added:], Msac(1.0)(found.F, found.which[-added:], pair))
-        assert (np.diff(found.score[-added:]) <= 0).all()
+        np.testing.assert_array_equal(verified.F[: len(models.F)], models.F)
+        np.testing.assert_array_equal(verified.which, [*models.which, *range(len(models.F), len(verified.F))])
+        np.testing.assert_array_equal(verified.score[-added:], Msac(1.0)(verified.F, verified.which[-added:], pair))
+        assert (np.diff(verified.score[-added:]) <= 0).all()
     assert completed >= 4
     nothing = Verified(np.empty((0, 9), np.float32), np.empty(0, np.int64), np.empty(0))
     assert part(hypotheses, nothing, -np.inf, pair) is nothing
@@ -230,10 +230,10 @@ def test_what_determines_no_plane(name: str, scale: float) -> None:
     samples = np.stack([rng.permutation(pair.count)[:7] for _ in F], 1)
     for m in range(len(F)):
         hypotheses = Hypotheses(F, np.arange(len(F)), samples, 0)
-        found = part(hypotheses, Verified(F, np.array([m]), np.array([1.0])), -np.inf, pair)
-        assert np.isfinite(found.F).all()
-        assert np.isfinite(found.score).all()
-        assert len(found.score) <= 1 + min(KEPT, PARALLAX_DRAWS)
+        verified = part(hypotheses, Verified(F, np.array([m]), np.array([1.0])), -np.inf, pair)
+        assert np.isfinite(verified.F).all()
+        assert np.isfinite(verified.score).all()
+        assert len(verified.score) <= 1 + min(KEPT, PARALLAX_DRAWS)
 
 
 def error(F: torch.Tensor, exact: np.ndarray) -> float:

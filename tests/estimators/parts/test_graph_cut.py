@@ -32,13 +32,13 @@ def test_fits_are_those_of_all_inliers_and_of_samples_of_them(name: str) -> None
     inliers, size = np.flatnonzero(labels), part.SAMPLE_SIZE
     assert len(inliers) >= 8
     for iteration in (0, 1):
-        found, expected, errors = part.fits(labels, pair, iteration), [inliers], []
+        fits, expected, errors = part.fits(labels, pair, iteration), [inliers], []
         for s in range(part.SAMPLES):
             draw = FIRST_DRAW + iteration * part.SAMPLES + s
             words = [number(pair.seed, pair.key, Stream.SAMPLING, draw, j, size) for j in range(size)]
             expected.append(inliers[[(word >> 31) * len(inliers) >> 32 for word in words]])
-        assert len(found) == len(expected)
-        for F, sample in zip(found, expected, strict=True):
+        assert len(fits) == len(expected)
+        for F, sample in zip(fits, expected, strict=True):
             x0, x1 = pair.points[:2, sample].T, pair.points[2:, sample].T
             s = np.linalg.svd(normalised_equations(x0, x1)[0], compute_uv=False)
             # Of the products of the equations: sums of up to 1000 terms, an eigenvector that is apart by s8^2 - s9^2;

@@ -26,11 +26,11 @@ def test_residuals_are_squared_sampson_distances_in_pixels(given: str) -> None:
     for scale in SCALES if given in FEW else (1.0,):
         pair = named(given, scale)
         for F in models(pair, 8)[1:]:
-            found = residuals_squared_px(F, pair)
+            squared = residuals_squared_px(F, pair)
             r = residuals(F, pair, 1.0, np.float64)  # per noise
             noise = np.ones(pair.count) if pair.noise is None else pair.noise
             low, high = r.low * noise, r.high * noise
-            assert ((low**2 * (1 - 1e-15) <= found) & (found <= high**2 * (1 + 1e-15))).all()
+            assert ((low**2 * (1 - 1e-15) <= squared) & (squared <= high**2 * (1 + 1e-15))).all()
 
 
 @pytest.mark.parametrize("count", [7, 8, 9, 20, 151])

@@ -107,11 +107,11 @@ def test_the_reference_cut_finds_the_least_energy() -> None:
         for coherence in (0.1, 0.7, 2.0):
             K = rng.random(n)
             edges = [(p, q) for q in range(n) for p in range(q) if rng.random() < 0.5]
-            least = reference.least_by_enumeration(K, edges, coherence)
+            min_energy = reference.least_by_enumeration(K, edges, coherence)
             labels = reference.least_cut(K, edges, coherence)
             # Each capacity is off by half a unit at most; a labelling meets n + edges of them, the best one too.
             tolerance = (n + len(edges)) * reference.CAPACITY_UNIT
-            assert reference.energy(labels, K, edges, coherence) <= least + tolerance
+            assert reference.energy(labels, K, edges, coherence) <= min_energy + tolerance
 
 
 @pytest.mark.parametrize("coherence", [0.125, 0.5, 1.0])  # exact, so that ties are ties
@@ -122,20 +122,20 @@ def test_labels_on_random_graphs(coherence: float) -> None:
         for density in (0.1, 0.4, 0.8):
             edges = [(p, q) for q in range(n) for p in range(q) if rng.random() < density]
             wanted = rng.integers(1, 1025, n) / 1024
-            points, K, found = (
+            points, K, labelled = (
                 rectified(2 * 1024 * (wanted ** (-1 / 1024) - 1)),
                 np.empty(n, np.float32),
                 np.empty(n, np.bool_),
             )
             gaussian(RECTIFIED, points, 1.0, K)
             np.testing.assert_array_equal(K, wanted)
-            label(RECTIFIED, points, 1.0, graph_of(n, edges), coherence, found)
+            label(RECTIFIED, points, 1.0, graph_of(n, edges), coherence, labelled)
             low, high = (reference.fixed_point(wanted, edges, coherence, start, SWEEPS) for start in (0, 1))
             cut = reference.least_cut(wanted, edges, coherence)
             assert (low <= cut).all()
             assert (cut <= high).all()
             energies = [reference.energy(labels, wanted, edges, coherence) for labels in (low, high)]
-            np.testing.assert_array_equal(found, low if energies[0] <= energies[1] else high)
+            np.testing.assert_array_equal(labelled, low if energies[0] <= energies[1] else high)
 
 
 @pytest.mark.parametrize(("epsilon", "coherence"), [(0.31, 0.1), (1.5, 0.1), (1.0, 0.5)])
@@ -144,15 +144,15 @@ def test_labels_are_almost_those_of_the_exact_cut_on_real_pairs(epsilon: float, 
     for name in REAL:
         pair, F = given(name)
         graph, scale = neighbor_graph(pair, RADIUS), (pair.pixels_per_unit / epsilon) ** 2
-        K, found = np.empty(pair.count, np.float32), np.empty(pair.count, np.bool_)
+        K, labels = np.empty(pair.count, np.float32), np.empty(pair.count, np.bool_)
         gaussian(F, pair.points, scale, K)
-        label(F, pair.points, scale, graph, coherence, found)
+        label(F, pair.points, scale, graph, coherence, labels)
         exact, edges = K.astype(np.float64), edges_of(graph)
         cut = reference.least_cut(exact, edges, coherence)
         assert 0 < cut.mean() < 1
-        least = reference.energy(cut, exact, edges, coherence)
-        same.append(np.mean(found == cut))
-        excess.append(reference.energy(found, exact, edges, coherence) / least - 1)
+        min_energy = reference.energy(cut, exact, edges, coherence)
+        same.append(np.mean(labels == cut))
+        excess.append(reference.energy(labels, exact, edges, coherence) / min_energy - 1)
     # Where the two bounds meet the labels are the cut's; what is asked here is that they meet nearly everywhere.
     assert np.mean(same) > 0.999
     assert min(same) > 0.995
@@ -162,8 +162,8 @@ def test_labels_are_almost_those_of_the_exact_cut_on_real_pairs(epsilon: float, 
 @pytest.mark.parametrize("name", FEW)
 def test_a_model_of_all_matches_has_all_labels_and_one_of_none_has_none(name: str) -> None:
     pair = named(name)
-    graph, found = neighbor_graph(pair, RADIUS), np.empty(pair.count, np.bool_)
-    label(models(pair, 2)[1], pair.points, 1e-30, graph, 0.1, found)
-    assert found.all()
-    label(np.array([0, 0, 0, 0, 0, 0, 0, 0, 1.0]), pair.points, 1.0, graph, 0.1, found)  # no point is on its line
-    assert not found.any()
+    graph, labels = neighbor_graph(pair, RADIUS), np.empty(pair.count, np.bool_)
+    label(models(pair, 2)[1], pair.points, 1e-30, graph, 0.1, labels)
+    assert labels.all()
+    label(np.array([0, 0, 0, 0, 0, 0, 0, 0, 1.0]), pair.points, 1.0, graph, 0.1, labels)  # no point is on its line
+    assert not labels.any()

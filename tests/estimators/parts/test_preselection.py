@@ -75,11 +75,11 @@ def test_the_best_of_a_round_and_the_first_of_equals(m: int, k: int) -> None:
 def test_the_models_that_pass_are_the_best_on_few_matches(given: str, score: Any) -> None:
     pair, options = named(given, seed=SEED), Preselect(matches=64, survivors=20)
     F = models(pair, 120).astype(np.float32)
-    which, found = Preselection(score, options)(F, pair)
+    which, scores = Preselection(score, options)(F, pair)
     draw = drawn_by_prior if score.prior_weighted and pair.prior is not None else shuffled_first
     first = getattr(score, "preselection", score)(F, np.arange(120), draw(pair, 64))
     np.testing.assert_array_equal(which, np.sort(np.argsort(-first, kind="stable")[:20]))
-    np.testing.assert_array_equal(found, score(F, np.arange(120), pair)[which])
+    np.testing.assert_array_equal(scores, score(F, np.arange(120), pair)[which])
 
 
 @pytest.mark.parametrize("given", ["scene 700", *FEW])
@@ -89,9 +89,9 @@ def test_all_models_are_scored_where_there_is_little_to_gain(given: str) -> None
     F = models(pair, 30).astype(np.float32)
     few = None if pair.bucket >= 2 * 64 else Preselect(64, 20)
     for options in (None, Preselect(64, 30), Preselect(512, 20), few):
-        which, found = Preselection(score, options)(F, pair)
+        which, scores = Preselection(score, options)(F, pair)
         np.testing.assert_array_equal(which, np.arange(30))
-        np.testing.assert_array_equal(found, score(F, np.arange(30), pair))
+        np.testing.assert_array_equal(scores, score(F, np.arange(30), pair))
 
 
 def test_a_pair_is_asked_once_for_its_few_matches() -> None:

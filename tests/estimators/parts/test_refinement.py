@@ -40,8 +40,8 @@ def test_matches_near_a_pool(name: str) -> None:
             assert surely <= set(index) <= perhaps
             assert index == shuffled(sorted(index), words, pair.count)
         for count in (1, 5):
-            some = Refinement(Refine("truncated", 1.5 * scale, matches=count)).near(pool_of(F), pair)
-            np.testing.assert_array_equal(some.table, near.table[:, :count])
+            fewer = Refinement(Refine("truncated", 1.5 * scale, matches=count)).near(pool_of(F), pair)
+            np.testing.assert_array_equal(fewer.table, near.table[:, :count])
 
 
 def test_all_matches_are_near_without_a_number_of_them() -> None:
@@ -57,22 +57,22 @@ def test_all_matches_are_near_without_a_number_of_them() -> None:
 def test_refined_models_have_lower_errors(name: str, kernel: str) -> None:
     pair, scale = named(name), 2.0
     pool = HypothesizeAndVerify(hypotheses=200, pool=4).search(pair)
-    found = Refinement(Refine(kernel, scale, iterations=20))(pool, pair, SevenPoint())
-    assert found.valid.all()
-    assert found.near is pair
+    refined = Refinement(Refine(kernel, scale, iterations=20))(pool, pair, SevenPoint())
+    assert refined.valid.all()
+    assert refined.near is pair
 
     def cost(F: np.ndarray, pair: Pair) -> float:
         r = residuals(F, pair, scale, np.float64).exact
         return float((pair.weight * reference.loss(r**2, 1.0, kernel) / pair.pixels_per_noise**2).sum())
 
-    before, after = ([cost(F, pair) for F in some] for some in (pool.models, found.F))
+    before, after = ([cost(F, pair) for F in models] for models in (pool.models, refined.F))
     assert all(a <= b * (1 + 1e-6) for a, b in zip(after, before, strict=True))  # first made rank 2, to float32
     assert any(a < b * (1 - 1e-3) for a, b in zip(after, before, strict=True))
 
 
 def test_local_optimisation_comes_first() -> None:
     pair, F = named("scene 40"), models(named("scene 40"), 3)[1:]
-    found = Refinement(None, lambda F, pair: F + 1)(pool_of(F), pair, SevenPoint())
-    np.testing.assert_array_equal(found.F, F.astype(np.float32).astype(np.float64) + 1)
+    refined = Refinement(None, lambda F, pair: F + 1)(pool_of(F), pair, SevenPoint())
+    np.testing.assert_array_equal(refined.F, F.astype(np.float32).astype(np.float64) + 1)
     plain = Refinement(None)(Pool.empty(3), pair, SevenPoint())
     assert plain.valid.tolist() == [False]

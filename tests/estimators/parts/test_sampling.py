@@ -40,56 +40,58 @@ def numbers(pair: Pair, draw: int, columns: int) -> list[int]:
 @pytest.mark.parametrize("size", [4, 5, 7, 8])
 @pytest.mark.parametrize("count", [8, 9, 20, 40, 150, 700])
 def test_samples_by_weight_are_those_of_the_definition(count: int, size: int, prior: str) -> None:
-    one = pair(count, prior)
+    matches = pair(count, prior)
     ones = [1] * count
-    weights = ones if one.prior is None else reference.quantised(one.prior.tolist(), largest_weight(one.bucket))
+    weights = (
+        ones if matches.prior is None else reference.quantised(matches.prior.tolist(), largest_weight(matches.bucket))
+    )
     for sampler, expected in ((PriorWeighted(), weights), (Uniform(), ones)):
-        assert sampler.weight(one).tolist() == expected
+        assert sampler.weight(matches).tolist() == expected
         assert sum(expected) <= 1 << 30
         for start, draws in ((0, 20), (700, 11)):
-            sample = sampler.draw(one, start, draws, size)
+            sample = sampler.draw(matches, start, draws, size)
             assert sample.dtype == np.int64
             assert sample.T.tolist() == [
-                reference.weighted_sample(expected, numbers(one, start + d, size)) for d in range(draws)
+                reference.weighted_sample(expected, numbers(matches, start + d, size)) for d in range(draws)
             ]
 
 
 @pytest.mark.parametrize("size", [4, 5, 7, 8])
 @pytest.mark.parametrize("count", [8, 9, 20, 40, 700])
 def test_samples_of_prosac_are_those_of_the_definition(count: int, size: int) -> None:
-    one, sampler = pair(count), Prosac()
+    matches, sampler = pair(count), Prosac()
     exact, grown = reference.prosac_growth(count, size, sampler.GROWTH)
     table = sampler.growth(count, size).tolist()
     for n in range(1, count):  # a whole number that rounding has put above itself is rounded up to the next
         excess = table[n] - table[n - 1] - (exact[n] - exact[n - 1])
         assert excess == 0 or (excess == 1 and grown[n].denominator == 1), n
-    assert one.quality is not None
-    best = np.argsort(one.quality, kind="stable")
+    assert matches.quality is not None
+    best = np.argsort(matches.quality, kind="stable")
     for start in (0, table[-1] // 2, max(table[-1] - 10, 0)):
         draws = min(20, table[-1] - start)
         expected = [
-            reference.prosac_sample(table, start + d + 1, numbers(one, start + d, size - 1)) for d in range(draws)
+            reference.prosac_sample(table, start + d + 1, numbers(matches, start + d, size - 1)) for d in range(draws)
         ]
-        np.testing.assert_array_equal(sampler.draw(one, start, draws, size).T, best[expected])
+        np.testing.assert_array_equal(sampler.draw(matches, start, draws, size).T, best[expected])
 
 
 def test_prosac_ranks_by_prior_where_there_is_no_quality() -> None:
-    one = pair_of(scene(1, 100).replace(quality=None))
-    assert one.prior is not None
-    rank = np.argsort(np.argsort(-one.prior, kind="stable"))
-    sample = rank[Prosac().draw(one, 0, 300, 7)]
+    matches = pair_of(scene(1, 100).replace(quality=None))
+    assert matches.prior is not None
+    rank = np.argsort(np.argsort(-matches.prior, kind="stable"))
+    sample = rank[Prosac().draw(matches, 0, 300, 7)]
     assert sorted(sample[:, 0].tolist()) == list(range(7))
     assert (np.diff(sample.max(0)) >= 0).all()
 
 
 def test_prosac_is_uniform_after_its_growth_and_where_nothing_is_ranked() -> None:
     """Without a rank the order of matches means nothing: the first half may be a part of the image."""
-    one = pair(20)
+    matches = pair(20)
     end = int(Prosac().growth(20, 7)[-1])
-    assert (Prosac().draw(one, end - 1, 1, 7) == np.argsort(one.quality)[-1]).any()
-    across = Prosac().draw(one, end - 30, 60, 7)
-    np.testing.assert_array_equal(across[:, :30], Prosac().draw(one, end - 30, 30, 7))
-    np.testing.assert_array_equal(across[:, 30:], Uniform().draw(one, end, 30, 7))
+    assert (Prosac().draw(matches, end - 1, 1, 7) == np.argsort(matches.quality)[-1]).any()
+    across = Prosac().draw(matches, end - 30, 60, 7)
+    np.testing.assert_array_equal(across[:, :30], Prosac().draw(matches, end - 30, 30, 7))
+    np.testing.assert_array_equal(across[:, 30:], Uniform().draw(matches, end, 30, 7))
     nothing = pair_of(scene(1, 100).replace(quality=None, prior=None))
     np.testing.assert_array_equal(Prosac().draw(nothing, 100, 300, 7), Uniform().draw(nothing, 100, 300, 7))
 
@@ -97,9 +99,9 @@ def test_prosac_is_uniform_after_its_growth_and_where_nothing_is_ranked() -> Non
 @pytest.mark.parametrize("key", [0, 1, -1, 2**63 - 1, -(2**63)])
 @pytest.mark.parametrize("seed", [0, -3, 2**62])
 def test_samples_of_any_key_and_seed(seed: int, key: int) -> None:
-    one = pair_of(scene(0, 30).replace(key=torch.tensor([key])), seed=seed)
-    expected = [reference.weighted_sample([1] * 30, numbers(one, d, 7)) for d in range(20)]
-    assert Uniform().draw(one, 0, 20, 7).T.tolist() == expected
+    matches = pair_of(scene(0, 30).replace(key=torch.tensor([key])), seed=seed)
+    expected = [reference.weighted_sample([1] * 30, numbers(matches, d, 7)) for d in range(20)]
+    assert Uniform().draw(matches, 0, 20, 7).T.tolist() == expected
 
 
 def test_samples_of_a_real_pair() -> None:
@@ -112,9 +114,9 @@ def test_samples_of_a_real_pair() -> None:
 @pytest.mark.parametrize("sampler", [Uniform(), PriorWeighted()])
 def test_samples_follow_the_prior(sampler: Any) -> None:
     """Chi-square of how often a match is the first, and the second of a sample, at 1e-4."""
-    one, draws = pair(30), 50_000
-    p = sampler.weight(one) / sampler.weight(one).sum()
-    sample = sampler.draw(one, 0, draws, 2)
+    matches, draws = pair(30), 50_000
+    p = sampler.weight(matches) / sampler.weight(matches).sum()
+    sample = sampler.draw(matches, 0, draws, 2)
     # Without replacement: the second is j with probability sum_i p_i p_j / (1 - p_i), i != j.
     second = [sum(p[i] * p[j] / (1 - p[i]) for i in range(30) if i != j) for j in range(30)]
     for drawn, expected in zip(sample, (p, np.array(second)), strict=True):

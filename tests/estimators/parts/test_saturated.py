@@ -34,12 +34,12 @@ def test_cells_are_those_of_the_grid_over_the_matches_of_weight(given: str, weig
         clear = np.abs(share - np.round(share)) > 1e-4  # of a border: shares have an error of some 2^-20
         clear |= (share < 1e-9) | (share > GRID - 1e-9)  # cut off
         cell = np.clip(share, 0, GRID - 1).astype(int)
-        found = cells_of(pair, weighted) - [[0], [GRID * GRID]]
+        cells = cells_of(pair, weighted) - [[0], [GRID * GRID]]
         for image in range(2):
             certain = clear[2 * image] & clear[2 * image + 1]
             assert given in FEW or certain.mean() > 0.99
             x, y = cell[2 * image, certain], cell[2 * image + 1, certain]
-            np.testing.assert_array_equal(found[image, certain], x + GRID * y)
+            np.testing.assert_array_equal(cells[image, certain], x + GRID * y)
 
 
 @pytest.mark.parametrize("weighted", [False, True])
@@ -53,9 +53,9 @@ def test_scores_are_those_of_the_definition(given: str, weighted: bool) -> None:
         for threshold in {1.5, 1.5 * scale}:
             for k, total in zip(which, SaturatedGains(threshold, weighted)(F, which, pair), strict=True):
                 r = residuals(F[k], pair, threshold)
-                least = [max(reference.geman_mcclure(x) - GAIN_ROUNDING, 0) for x in r.high]
+                lower = [max(reference.geman_mcclure(x) - GAIN_ROUNDING, 0) for x in r.high]
                 most = [reference.geman_mcclure(x) + GAIN_ROUNDING for x in r.low]
-                bounds = [reference.saturated(gains, weight, cells, bits) for gains in (least, most)]
+                bounds = [reference.saturated(gains, weight, cells, bits) for gains in (lower, most)]
                 assert bounds[0] <= total <= bounds[1]
 
 

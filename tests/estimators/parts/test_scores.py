@@ -33,9 +33,9 @@ def bounds(gain: Any, F: Any, pair: Pair, threshold: float, weighted: bool) -> t
     low, high = r.low, r.high
     if gain is reference.magsac:  # tabulated over r^2, each entry in the middle of its interval
         low, high = (np.sqrt(np.maximum(x**2 + d, 0)) for x, d in ((low, -0.5 / ENTRIES), (high, 0.5 / ENTRIES)))
-    least = [max(gain(x) - GAIN_ROUNDING, 0) for x in high]
+    lower = [max(gain(x) - GAIN_ROUNDING, 0) for x in high]
     most = [gain(x) + GAIN_ROUNDING for x in low]
-    return reference.summed(least, weight, bits), reference.summed(most, weight, bits)
+    return reference.summed(lower, weight, bits), reference.summed(most, weight, bits)
 
 
 @pytest.mark.parametrize("weighted", [False, True])
@@ -50,12 +50,12 @@ def test_scores_are_those_of_the_definitions(given: str, name: str, weighted: bo
             score = kind(threshold)
             score.prior_weighted = weighted
             which = np.array([5, 1, 2, 3, 4, 2])
-            found = score(F, which, pair)
-            for k, total in zip(which, found, strict=True):
-                least, most = bounds(gain, F[k], pair, threshold, weighted)
-                assert least <= total <= most
+            totals = score(F, which, pair)
+            for k, total in zip(which, totals, strict=True):
+                lower, most = bounds(gain, F[k], pair, threshold, weighted)
+                assert lower <= total <= most
                 if given not in FEW:  # the bounds are no idle ones: roundings, and a few matches on the threshold
-                    assert most - least <= 2.0**-9 * pair.count + 2
+                    assert most - lower <= 2.0**-9 * pair.count + 2
 
 
 class Biweight(SummedGains):
@@ -82,8 +82,8 @@ def test_a_gain_in_numpy(given: str, weighted: bool) -> None:
         compiled = Msac(1.5, weighted)(F, which, pair)
         np.testing.assert_array_equal(TruncatedSquares(1.5, weighted)(F, which, pair), compiled)
     for k, total in zip(which, Biweight(1.5, weighted)(F, which, pair), strict=True):
-        least, most = bounds(lambda r: reference.truncated_square(r) ** 2, F[k], pair, 1.5, weighted)
-        assert least <= total <= most
+        lower, most = bounds(lambda r: reference.truncated_square(r) ** 2, F[k], pair, 1.5, weighted)
+        assert lower <= total <= most
 
 
 @pytest.mark.parametrize("score", [*(kind(2.0) for kind, _ in SCORES.values()), Biweight(2.0)])
@@ -111,8 +111,8 @@ def test_the_reference_of_magsac_is_the_integral_over_sigma(r: float) -> None:
         # g(r | sigma) = 2 C(4) sigma^-4 exp(-r^2 / (2 sigma^2)) r^3; the density of r has three dimensions less, r^-3
         return float(integrate.quad(lambda s: np.exp(-(r**2) / (2 * s**2)) / s**4 * r**3, r / QUANTILE, 1.0)[0])
 
-    loss, whole = (integrate.quad(lambda r: weight(r) * r, 0, QUANTILE * end, epsabs=1e-10)[0] for end in (r, 1.0))
-    assert reference.magsac(r) == pytest.approx(1 - loss / whole, abs=1e-8)  # the tolerance of the quadrature
+    loss, total = (integrate.quad(lambda r: weight(r) * r, 0, QUANTILE * end, epsabs=1e-10)[0] for end in (r, 1.0))
+    assert reference.magsac(r) == pytest.approx(1 - loss / total, abs=1e-8)  # the tolerance of the quadrature
 
 
 @pytest.mark.parametrize(("count", "bits"), [(1, 10), (2**14, 10), (2**14 + 1, 9), (2**20, 4)])

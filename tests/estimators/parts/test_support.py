@@ -14,7 +14,7 @@ from tests.reference import support as reference
 EPS32 = 2.0**-23
 
 
-def told(x0: np.ndarray, x1: np.ndarray, inliers: np.ndarray | None = None, dtype: type = np.float64) -> str:
+def reason_of(x0: np.ndarray, x1: np.ndarray, inliers: np.ndarray | None = None, dtype: type = np.float64) -> str:
     """What is said of a pair of these matches."""
     points = [torch.from_numpy(x.astype(dtype).astype(np.float64))[None] for x in (x0, x1)]
     pair = pair_of(Correspondences(*points, torch.ones(1, len(x0), dtype=torch.bool)))
@@ -39,7 +39,7 @@ def test_points_of_a_line_are_told_from_points_near_one(scale: float, shift: flo
             (near, other, ""),
         ):
             expected = f"the inliers of the best model lie on one line in {images}" if images else ""
-            assert told(scale * x0, scale * x1, dtype=dtype) == expected
+            assert reason_of(scale * x0, scale * x1, dtype=dtype) == expected
 
 
 @pytest.mark.parametrize("count", [0, 6, 7])
@@ -50,11 +50,11 @@ def test_inliers_count_once_at_one_place_and_late_ones_are_seen(count: int) -> N
     for first in (0, 100, FIRST_LOOK - 3, 900):
         inliers = np.zeros(1000, np.bool_)
         inliers[first : first + count] = True
-        assert told(x[:, :2], x[:, 2:], inliers) == few
+        assert reason_of(x[:, :2], x[:, 2:], inliers) == few
         y = x.copy()
         y[first + count : first + count + 20] = x[first + max(count - 1, 0)]
         inliers[first + count : first + count + 20] = count > 0
-        assert told(y[:, :2], y[:, 2:], inliers) == few
+        assert reason_of(y[:, :2], y[:, 2:], inliers) == few
 
 
 @pytest.mark.parametrize("scale", SCALES)
@@ -63,10 +63,10 @@ def test_what_is_said_is_what_the_definition_says(name: str, scale: float) -> No
     pair, rng = named(name, scale), np.random.default_rng(0)
     for share in (0.01, 0.1, 0.5, 1.0):
         inliers = rng.random(pair.count) < share
-        found = degenerate_support(pair, inliers, 7, EPS32)
+        reason = degenerate_support(pair, inliers, 7, EPS32)
         inside = pair.points[:, inliers].T
         largest = np.abs(pair.centre).max() / pair.pixels_per_unit + 1
-        assert found == reference.degenerate_support(inside, 7, EPS32 * largest)
+        assert reason == reference.degenerate_support(inside, 7, EPS32 * largest)
 
 
 def test_lines_up_to_the_rounding_of_float32_coordinates() -> None:
@@ -76,4 +76,4 @@ def test_lines_up_to_the_rounding_of_float32_coordinates() -> None:
     other = rng.uniform(0, 500, (30, 2))
     for off, on_line in ((EPS32 / 16, True), (4 * EPS32, False)):  # of 600; the first point is as near as 300
         line = np.stack([along, 600 * off * rng.choice([-1, 1], 30)], 1)
-        assert ("line in image 0" in told(line, other)) == on_line
+        assert ("line in image 0" in reason_of(line, other)) == on_line

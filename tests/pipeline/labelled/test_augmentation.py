@@ -37,7 +37,7 @@ def test_the_truth_stays_true(epoch: int) -> None:
     assert singular[2] < 1e-9 * singular[0]
     assert torch.equal(c.lafs0[..., 2], c.x0)
     assert torch.equal(c.lafs1[..., 2], c.x1)
-    assert c.mask.all()  # no empty slot
+    assert c.mask.all()
     # Every match is one of before, with its label: the quality says which.
     old = {float(q): int(v) for q, v in zip(before.correspondences.quality[0], before.label[0], strict=True)}
     assert [old[float(q)] for q in c.quality[0]] == after.label[0].tolist()
@@ -45,12 +45,12 @@ def test_the_truth_stays_true(epoch: int) -> None:
 
 def test_the_same_draw_gives_the_same_matches_and_another_one_others() -> None:
     m = exact()
-    one = ALWAYS(m, seed=3, epoch=5)
-    assert same(one, ALWAYS(exact(), seed=3, epoch=5))
-    assert not same(one, ALWAYS(m, seed=3, epoch=6))
-    assert not same(one, ALWAYS(m, seed=4, epoch=5))
+    augmented = ALWAYS(m, seed=3, epoch=5)
+    assert same(augmented, ALWAYS(exact(), seed=3, epoch=5))
+    assert not same(augmented, ALWAYS(m, seed=3, epoch=6))
+    assert not same(augmented, ALWAYS(m, seed=4, epoch=5))
     other = m.replace(correspondences=m.correspondences.replace(key=m.correspondences.keys + 1))
-    assert not same(one, ALWAYS(other, seed=3, epoch=5))
+    assert not same(augmented, ALWAYS(other, seed=3, epoch=5))
 
 
 def test_every_change_happens_and_none_of_them_when_off() -> None:
@@ -129,10 +129,10 @@ def test_the_expected_length_is_the_length_but_for_crops() -> None:
     for epoch in range(20):
         for crop in (0.0, 1.0):
             a = dataclasses.replace(Augmentation(), crop=crop, matches=None)
-            found = a(m, seed=1, epoch=epoch).label.shape[1]
+            length = a(m, seed=1, epoch=epoch).label.shape[1]
             key = int(m.correspondences.keys[0])
             expected = a.expected(m.correspondences.quality[0], m.label[0], key=key, seed=1, epoch=epoch)
-            assert expected == pytest.approx(found, abs=1 if crop == 0 else 500)
+            assert expected == pytest.approx(length, abs=1 if crop == 0 else 500)
 
 
 def test_mistakes_are_named() -> None:

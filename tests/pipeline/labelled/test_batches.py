@@ -58,17 +58,17 @@ def test_every_pair_comes_once_an_epoch_in_other_batches_each_time() -> None:
 def test_batches_are_a_function_of_seed_and_epoch_and_go_on_where_they_stopped() -> None:
     batches = SimilarLengthBatches(Pairs(), 16, seed=2)
     batches.set_epoch(7)
-    whole = list(batches)
+    epoch = list(batches)
     again = SimilarLengthBatches(Pairs(), 16, seed=2)
     again.set_epoch(7, start=5)
     state = again.state_dict()
     fresh = SimilarLengthBatches(Pairs(), 16, seed=2)
     fresh.load_state_dict(state)
-    assert list(again) == list(fresh) == whole[5:]
-    assert len(fresh) == len(whole) - 5
+    assert list(again) == list(fresh) == epoch[5:]
+    assert len(fresh) == len(epoch) - 5
     other = SimilarLengthBatches(Pairs(), 16, seed=3)
     other.set_epoch(7)
-    assert list(other) != whole
+    assert list(other) != epoch
 
 
 @pytest.mark.parametrize("world_size", [2, 3, 4])

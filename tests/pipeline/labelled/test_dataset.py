@@ -102,7 +102,7 @@ def test_an_interrupted_computation_goes_on(
     rendered: RenderedPairs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(compute_module, "SHARD", 1)
-    whole = MatchedPairs(rendered, **SIFT, root=tmp_path / "whole", workers=1)
+    uninterrupted = MatchedPairs(rendered, **SIFT, root=tmp_path / "whole", workers=1)
     written: list[Path] = []
     original = compute_module.write_shard
 
@@ -115,17 +115,17 @@ def test_an_interrupted_computation_goes_on(
     monkeypatch.setattr(compute_module, "write_shard", interrupted)
     with pytest.raises(KeyboardInterrupt):
         MatchedPairs(rendered, **SIFT, root=tmp_path / "parts", workers=1)
-    folder = tmp_path / "parts" / whole.folder.name
+    folder = tmp_path / "parts" / uninterrupted.folder.name
     assert set(contents(folder)) == {path.name for path in written}
-    assert len(contents(whole.folder)) > 2
+    assert len(contents(uninterrupted.folder)) > 2
     first = set(written)
     monkeypatch.setattr(compute_module, "write_shard", lambda path, rows: (written.append(path), original(path, rows)))
     calls: list[tuple[int, int]] = []
     MatchedPairs(rendered, **SIFT, root=tmp_path / "parts", workers=1, progress=lambda *c: calls.append(c))
     assert calls[0] == (2, len(rendered))
-    assert len(written) == len(set(written)) == len(contents(whole.folder))
+    assert len(written) == len(set(written)) == len(contents(uninterrupted.folder))
     assert first < set(written)
-    assert contents(folder) == contents(whole.folder)
+    assert contents(folder) == contents(uninterrupted.folder)
 
 
 @pytest.mark.parametrize("damage", ["changed", "cut", "fewer pairs"])
@@ -167,10 +167,10 @@ def test_what_would_change_the_matches_has_a_folder_of_its_own(
 def test_the_best_matches_are_kept(rendered: RenderedPairs, matched: MatchedPairs, tmp_path: Path) -> None:
     few = MatchedPairs(rendered, **SIFT, root=tmp_path, most=40)
     for i in range(len(few)):
-        kept, whole = few[i].correspondences.quality[0], matched[i].correspondences.quality[0]
-        assert len(kept) == min(40, len(whole))
-        assert torch.equal(kept.sort().values, whole.sort().values[: len(kept)])
-        assert torch.equal(kept, whole[torch.isin(whole, kept)])  # in their order
+        kept, all_quality = few[i].correspondences.quality[0], matched[i].correspondences.quality[0]
+        assert len(kept) == min(40, len(all_quality))
+        assert torch.equal(kept.sort().values, all_quality.sort().values[: len(kept)])
+        assert torch.equal(kept, all_quality[torch.isin(all_quality, kept)])  # in their order
 
 
 def test_pairs_that_fail_are_left_out_and_told(rendered: RenderedPairs, tmp_path: Path) -> None:
@@ -237,9 +237,9 @@ def test_workers_of_a_loader_read_what_this_process_reads(matched: MatchedPairs,
     batches.set_epoch(2)
     options: dict[str, Any] = {"num_workers": 1, "multiprocessing_context": context}
     loader = DataLoader(pairs, batch_sampler=batches, collate_fn=collate_trimmed, **options)
-    found = list(loader)
-    assert len(found) == len(batches)
-    for draws, batch in zip(batches, found, strict=True):
+    loaded = list(loader)
+    assert len(loaded) == len(batches)
+    for draws, batch in zip(batches, loaded, strict=True):
         expected = collate_trimmed([pairs[draw] for draw in draws])
         assert torch.equal(batch.label, expected.label)
         assert torch.equal(batch.correspondences.x0, expected.correspondences.x0)
@@ -257,8 +257,8 @@ def test_epochs_and_draws(matched: MatchedPairs) -> None:
     assert matched.augmentation is None
     assert matched.lengths(0) == [about["matches"] for about in matched.pairs]
     assert len(pairs.lengths(0)) == len(pairs)
-    whole = collate([pairs[i] for i in range(len(pairs))])
-    assert len(whole) == len(pairs)
+    collated = collate([pairs[i] for i in range(len(pairs))])
+    assert len(collated) == len(pairs)
 
 
 def test_validation_scenes_are_the_last_of_each_family(matched: MatchedPairs) -> None:

@@ -54,9 +54,9 @@ class Wall:
     def depth(self, image: ImageSource, points: np.ndarray) -> np.ndarray:
         camera = self.cameras[int(image.identity[-1])]
         rays = np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(camera.K).T @ camera.R
-        found = WALL / rays[:, 1]
-        world = camera.centre + found[:, None] * rays
-        return np.where(self.cameras[0].project(world)[0][:, 0] < SKY, found, np.nan)
+        wall_depth = WALL / rays[:, 1]
+        world = camera.centre + wall_depth[:, None] * rays
+        return np.where(self.cameras[0].project(world)[0][:, 0] < SKY, wall_depth, np.nan)
 
     def partner(self, x0: np.ndarray) -> np.ndarray:
         """Where points of the wall's plane are in image 1."""
@@ -167,12 +167,12 @@ def test_rendered_labels_equal_the_scalar_reference(rendered: RenderedPairs) -> 
         rays = np.column_stack([x0, np.ones(80)]) @ np.linalg.inv(pair.K0).T
         there = (rays * np.nan_to_num(depth0, nan=1.0)[:, None] @ pair.R.T + pair.t) @ pair.K1.T
         x1 = there[:, :2] / there[:, 2:] + rng.normal(0, 1, (80, 2)) * rng.choice([0.3, 3, 30], (80, 1))
-        found = label(rendered, pair, x0, x1)
+        labels = label(rendered, pair, x0, x1)
         d0, d1 = depths(rendered, pair.image0, x0), depths(rendered, pair.image1, x1)
         for i in range(80):
             forward = reference.transfer_error(x0[i], d0[:, i], x1[i], pair.K0, pair.K1, pair.R, pair.t)
             backward = reference.transfer_error(x1[i], d1[:, i], x0[i], pair.K1, pair.K0, pair.R.T, -pair.R.T @ pair.t)
             line = reference.line_distance(pair.F, x0[i], x1[i])
-            assert found[i] == reference.label(forward, backward, line)
-        seen |= set(found.tolist())
+            assert labels[i] == reference.label(forward, backward, line)
+        seen |= set(labels.tolist())
     assert seen == {-1, 0, 1}

@@ -15,13 +15,13 @@ from fmtorch.pipeline.labelled.shards import SCHEMA, Shard, ShardError, write_sh
 
 def rows(n: int = 5) -> list[dict[str, Any]]:
     rng = np.random.default_rng(0)
-    made = []
+    drawn = []
     for i in range(n):
         count = int(rng.integers(1, 50))
         arrays = {
             "x0": (count, 2), "x1": (count, 2), "quality": (count,), "lafs0": (count, 2, 3), "lafs1": (count, 2, 3)
         }  # fmt: skip
-        made.append(
+        drawn.append(
             {
                 "key": int(rng.integers(-(2**62), 2**62)), "identity": f"set/scene/{i}", "family": "set", "scene": "s",
                 "reason": "", "matches": count, "inliers": 1, "outliers": count - 1,
@@ -31,11 +31,11 @@ def rows(n: int = 5) -> list[dict[str, Any]]:
                 **{name: rng.normal(size=shape).astype(np.float32).ravel() for name, shape in arrays.items()},
             }
         )  # fmt: skip
-    made.append({
+    drawn.append({
         "key": 7, "identity": "set/scene/failed", "family": "set", "scene": "s", "reason": "no keypoints in image 0",
         "matches": 0, "inliers": 0, "outliers": 0,
     })  # fmt: skip
-    return made
+    return drawn
 
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:
@@ -78,22 +78,22 @@ def test_the_same_rows_give_the_same_bytes(tmp_path: Path) -> None:
 def test_any_changed_byte_of_the_values_is_noticed(tmp_path: Path) -> None:
     path = tmp_path / "shard.arrow"
     write_shard(path, rows())
-    whole = path.read_bytes()
-    values = np.random.default_rng(0).choice(len(whole), 60, replace=False)
+    intact = path.read_bytes()
+    values = np.random.default_rng(0).choice(len(intact), 60, replace=False)
     noticed = 0
     for position in values:
-        changed = bytearray(whole)
+        changed = bytearray(intact)
         changed[position] ^= 0x10
         path.write_bytes(changed)
         try:
-            found = Shard(path, verify=True)
+            shard = Shard(path, verify=True)
         except ShardError:
             noticed += 1
         else:  # padding between buffers, or a number in the headers that no reader looks at
-            path.write_bytes(whole)
-            for row in range(len(found)):
+            path.write_bytes(intact)
+            for row in range(len(shard)):
                 for name, value in Shard(path).read(row).items():
-                    np.testing.assert_array_equal(found.read(row)[name], value)
+                    np.testing.assert_array_equal(shard.read(row)[name], value)
     assert noticed > 20
 
 
@@ -101,7 +101,7 @@ def test_any_changed_byte_of_the_values_is_noticed(tmp_path: Path) -> None:
 def test_what_is_no_such_file_is_refused(tmp_path: Path, content: str) -> None:
     path = tmp_path / "shard.arrow"
     write_shard(path, rows())
-    whole = path.read_bytes()
+    intact = path.read_bytes()
     if content == "missing":
         path.unlink()
     elif content == "other schema":
@@ -109,6 +109,6 @@ def test_what_is_no_such_file_is_refused(tmp_path: Path, content: str) -> None:
         with pa.ipc.new_file(str(path), batch.schema) as writer:
             writer.write_batch(batch)
     else:
-        path.write_bytes({"empty": b"", "truncated": whole[: len(whole) // 2], "pickle": pickle.dumps([1])}[content])
+        path.write_bytes({"empty": b"", "truncated": intact[: len(intact) // 2], "pickle": pickle.dumps([1])}[content])
     with pytest.raises(ShardError, match=r"shard\.arrow"):
         Shard(path)

@@ -42,8 +42,8 @@ def test_a_checkpoint_of_neural_guided_ransac_becomes_a_pruner(tmp_path: Path) -
     c = Correspondences(x0, x1, mask, quality=ratio.double(), size0=size0, size1=size1)
     p = LearnedPruner(LC(side=["ratio"]), file=tmp_path / "net.safetensors").probability(c)[0].double()
     expected = data["001.logprob_F_r1.00"].astype(np.float64)
-    found = (p / p.sum()).log().numpy()
-    np.testing.assert_allclose(found, expected, rtol=0, atol=4e-4)  # of both float32 against float64: 2e-4 each
+    computed = (p / p.sum()).log().numpy()
+    np.testing.assert_allclose(computed, expected, rtol=0, atol=4e-4)  # of both float32 against float64: 2e-4 each
 
 
 def test_what_is_no_such_checkpoint_is_told(tmp_path: Path) -> None:

@@ -78,12 +78,12 @@ def test_padding_is_zero_and_not_finite_matches_are_masked(coordinates: str) -> 
         "x0": torch.where(mask[..., None], c.x0, torch.nan), "quality": torch.where(mask, c.quality, torch.inf),
         "lafs0": torch.where(mask[..., None, None], c.lafs0, torch.nan),
     }  # fmt: skip
-    x, found = MatchInputs(coordinates, SIDE)(c.replace(mask=mask, **garbage))
+    x, input_mask = MatchInputs(coordinates, SIDE)(c.replace(mask=mask, **garbage))
     assert torch.equal(x[..., :15], expected)
     assert not x[..., 15:].any()
-    assert torch.equal(found, mask)
-    x, found = MatchInputs(coordinates, SIDE)(c.replace(**garbage))
-    assert torch.equal(found, mask)
+    assert torch.equal(input_mask, mask)
+    x, input_mask = MatchInputs(coordinates, SIDE)(c.replace(**garbage))
+    assert torch.equal(input_mask, mask)
     assert torch.isfinite(x).all()
 
 

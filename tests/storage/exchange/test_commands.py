@@ -134,20 +134,20 @@ def test_images_are_described_by_several_threads(
     torch.set_num_threads(2)
     match(images, tmp_path / "two", "export=h5")
     torch.set_num_threads(threads)
-    found = capsys.readouterr()
+    captured = capsys.readouterr()
     times = re.compile(r"\d+:\d\d:\d\d")  # of the progress bar
-    assert times.sub("", found.err) == times.sub("", expected.err)
-    assert "3 of 10 pairs show one scene" in found.out
+    assert times.sub("", captured.err) == times.sub("", expected.err)
+    assert "3 of 10 pairs show one scene" in captured.out
     for name in (FEATURES, MATCHES):
-        with h5py.File(tmp_path / "one" / name) as one, h5py.File(tmp_path / "two" / name) as two:
+        with h5py.File(tmp_path / "one" / name) as first, h5py.File(tmp_path / "two" / name) as second:
             compared = []
 
-            def compare(at: str, item: object, other: h5py.File = two, seen: list[str] = compared) -> None:
+            def compare(at: str, item: object, other: h5py.File = second, seen: list[str] = compared) -> None:
                 if isinstance(item, h5py.Dataset):
                     np.testing.assert_array_equal(item[:], other[at][:])
                     seen.append(at)
 
-            one.visititems(compare)
+            first.visititems(compare)
             assert len(compared) >= 4
 
 
@@ -167,16 +167,16 @@ def test_lists_of_pairs_that_are_none(text: str, said: str, images: Path, tmp_pa
 
 
 def test_lists_of_pairs(images: Path, tmp_path: Path) -> None:
-    found = images_below(images)
-    assert [path.relative_to(images).as_posix() for path in found] == ["a.png", "b.png", "more/c.png", "other.png"]
-    assert len(chosen_pairs(images, found, Path("exhaustive"))) == 6
+    paths = images_below(images)
+    assert [path.relative_to(images).as_posix() for path in paths] == ["a.png", "b.png", "more/c.png", "other.png"]
+    assert len(chosen_pairs(images, paths, Path("exhaustive"))) == 6
     (tmp_path / "pairs.txt").write_text("b.png a.png\n# again\na.png b.png\na.png other.png\n")
-    chosen = chosen_pairs(images, found, tmp_path / "pairs.txt")
+    chosen = chosen_pairs(images, paths, tmp_path / "pairs.txt")
     assert [(a.name, b.name) for a, b in chosen] == [("b.png", "a.png"), ("a.png", "other.png")]
     with pytest.raises(
         ValueError, match=r"list\.txt: no such file; it must be exhaustive, sequential:N, .*, or a file"
     ):
-        chosen_pairs(images, found, tmp_path / "list.txt")
+        chosen_pairs(images, paths, tmp_path / "list.txt")
 
 
 @pytest.mark.parametrize(

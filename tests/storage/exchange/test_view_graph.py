@@ -27,8 +27,8 @@ def test_of_a_journal(tmp_path: Path) -> None:
         image.write_text(image.name)
     journal = Journal(tmp_path / "export", tmp_path)
     matches, scores, inliers = np.zeros((3, 2), np.int32), np.ones(3, np.float32), np.array([True, True, False])
-    found = {"significance": 12.5, "configuration": "planar"}
-    given = ExportedPair("a.png", "b.png", matches, scores, inliers, np.eye(3), **found)
+    verdict = {"significance": 12.5, "configuration": "planar"}
+    given = ExportedPair("a.png", "b.png", matches, scores, inliers, np.eye(3), **verdict)
     journal.add_pair(*images[:2], given)
     journal.add_pair(images[0], images[2], ExportedPair(
         "a.png", "c.png", matches, scores, ~inliers, np.zeros((3, 3)), False, significance=-math.inf))  # fmt: skip
