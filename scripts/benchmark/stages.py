@@ -20,8 +20,9 @@ from rich.table import Table
 
 from fmtorch import presets
 from fmtorch.data import read_image
+from fmtorch.data.images import to_grey
 from fmtorch.data.rendered.photographs import photograph
-from fmtorch.features import LocalFeature
+from fmtorch.features import ImagePyramid, LocalFeature
 
 STAGES = ("detection", "shape", "orientation", "description")
 
@@ -68,7 +69,7 @@ def by_stage(feature: LocalFeature, image: np.ndarray) -> dict[str, float]:
         last = now
 
     lafs, _ = feature.detector.detect(image)
-    pyramid = feature._pyramid(image)
+    pyramid = ImagePyramid(to_grey(image))
     note("detection")
     for stage, step in (("shape", feature.shape), ("orientation", feature.orientation)):
         if step is not None:
