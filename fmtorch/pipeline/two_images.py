@@ -49,7 +49,7 @@ def match(
     image0: Path | str | Image,
     image1: Path | str | Image,
     *,
-    pipeline: str | Pipeline = "hesaffnet_fmtorch",
+    pipeline: str | Pipeline = "hesaffnet_fast_fmtorch",
     device: torch.device | str | None = None,
     longest_side: int = 1600,
     seed: int = 0,

@@ -304,13 +304,13 @@ def test_the_command(tmp_path: Path) -> None:
     done = run_python("-m", "fmtorch.match", "image0=a.png", "image1=b.webp", "truth=F.txt", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "RuntimeWarning" not in done.stderr
-    for text in ("hesaffnet_fmtorch", "one_to_one", "inliers", "seconds", "NSGD", "matches/a-b"):
+    for text in ("hesaffnet_fast_fmtorch", "one_to_one", "inliers", "seconds", "NSGD", "matches/a-b"):
         assert text in done.stdout
     folder = tmp_path / "matches" / "a-b"
     assert {path.name for path in folder.iterdir()} == {"result.json", "matches.png", "pruning.png", "epipolar.png"}
     assert {path.name for path in tmp_path.iterdir()} == {"a.png", "b.webp", "F.txt", "matches", "cache"}
     report = json.loads((folder / "result.json").read_text())
-    assert report["pipeline"] == "hesaffnet_fmtorch"
+    assert report["pipeline"] == "hesaffnet_fast_fmtorch"
     assert report["overrides"] == []
     assert report["size0"] == report["size1"] == [240, 320]
     assert report["reason"] == ""
