@@ -128,11 +128,11 @@ def homography_sampson(
     Returns:
         (..., N), at least 0.
     """
-    h = unit_largest(H).flatten(-2).movedim(-1, 0)[..., None]
+    h = unit_largest(H.to(torch.float64)).flatten(-2).movedim(-1, 0)[..., None]
     shape = np.broadcast_shapes(x0.shape, x1.shape)
     points = torch.cat([x0.expand(shape), x1.expand(shape)], -1).movedim(-1, 0)
-    squared = linearise_homography(h, points).squared
-    return squared * inverse_root(squared)
+    squared = linearise_homography(h, points.to(torch.float64)).squared  # of the fourth degree in the coordinates
+    return (squared * inverse_root(squared)).to(x0.dtype)
 
 
 def _distance(x: Tensor, y: Tensor) -> Tensor:

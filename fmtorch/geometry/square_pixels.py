@@ -94,7 +94,7 @@ def calibration_problems(
 def _problem(K: NDArray[np.float64], size: NDArray[np.float64] | None, name: str) -> str:
     if not np.isfinite(K).all():
         return f"{name} is not finite"
-    if K[2, 2] == 0 or K[0, 0] * K[1, 1] == 0:
+    if 0 in (K[0, 0], K[1, 1], K[2, 2]):
         return f"{name} is singular; its rows must be (fx, s, cx), (0, fy, cy), (0, 0, 1)"
     K = K / K[2, 2]
     if K[1, 0] != 0 or K[2, 0] != 0 or K[2, 1] != 0:
@@ -103,7 +103,7 @@ def _problem(K: NDArray[np.float64], size: NDArray[np.float64] | None, name: str
         return f"{name} has focal lengths {K[0, 0]:g}, {K[1, 1]:g}; they must be positive"
     if size is None or not (size > 0).all():
         return ""
-    (h, w), focal = size.tolist(), float(np.sqrt(K[0, 0] * K[1, 1]))
+    (h, w), focal = size.tolist(), float(np.sqrt(K[0, 0]) * np.sqrt(K[1, 1]))
     if not MIN_FOCAL * max(h, w) <= focal:
         return f"{name} has a focal length of {focal:g} for an image of {w:g} x {h:g} pixels; it must be in pixels"
     if not (-0.5 <= K[0, 2] <= w - 0.5 and -0.5 <= K[1, 2] <= h - 0.5):

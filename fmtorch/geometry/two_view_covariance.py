@@ -152,7 +152,7 @@ def _valid(*given: Tensor) -> tuple[Tensor, list[Tensor]]:
     R, t, focal, _, _, truncation, _ = given = tuple(a.to(torch.float64) for a in given)
     finite = [a.isfinite().flatten(1).all(1) for a in given if a is not truncation]
     valid = torch.stack([*finite, (t != 0).any(-1), (focal > 0).all(-1), truncation > 0]).all(0)
-    zeros, ones = torch.zeros_like(truncation[:1]), torch.ones_like(truncation[:1])
+    zeros, ones = truncation.new_zeros(1), truncation.new_ones(1)
     places = (torch.eye(3, dtype=R.dtype, device=R.device), t.new_tensor([0.0, 0, 1]), ones, zeros, zeros, ones, zeros)
     kept = (valid.reshape(-1, *[1] * (a.dim() - 1)) for a in given)
     return valid, [torch.where(keep, a, place) for keep, a, place in zip(kept, given, places, strict=True)]

@@ -50,6 +50,12 @@ def test_the_unit_of_normalised_points_does_not_matter(scale: float, central: bo
     torch.testing.assert_close((at - centre) / square_map.focal, torch.tensor([0.3, -0.2], dtype=torch.float64))
 
 
+def test_a_focal_length_beyond_all_measure_is_judged_without_overflow() -> None:
+    K = GOOD * torch.tensor([[1e200], [1e200], [1.0]], dtype=torch.float64)
+    (problem,) = calibration_problems(K, SIZE, "K1")
+    assert problem.startswith("K1 has the principal point (3.1e+202, 2.5e+202), outside the image of 640 x 480 pixels")
+
+
 def test_gradients_reach_the_calibration_and_are_those_of_a_constant_image() -> None:
     x = torch.tensor([[[100.0, 50.0], [600.0, 400.0]]], dtype=torch.float64)
     K = GOOD.clone().requires_grad_()
