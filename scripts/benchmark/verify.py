@@ -33,7 +33,7 @@ SCENES = (
     "Strecha/Herz-Jesus-P8", "PhotoTourism/sacre_coeur", "Strecha/fountain-P11", "Strecha_train/castle-P19",
     "TanksLike/fox",
 )  # fmt: skip
-METHODS = ("colmap:4", "colmap:1", "ours")
+METHODS = ("colmap:4", "colmap:1", "colmap:0.5", "ours")
 FIELDS = ("scene", "features", "cameras", "method", "seed", "mapper")  # what a row is of; no mapper: verification
 
 
