@@ -16,6 +16,7 @@ from rich.progress import Progress
 
 from fmtorch import data, presets
 from fmtorch.commands.main import job, run_command
+from fmtorch.core.executors import MIN_PAIRS_FOR_PROCESSES
 from fmtorch.core.shards import shard_of
 from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.data import ImagePair, PairDataset
@@ -34,8 +35,6 @@ from fmtorch.storage import RunFolder, identity_digest
 from fmtorch.storage.exchange.export import export_kinds, write_exports
 from fmtorch.storage.exchange.journal import Journal
 from fmtorch.storage.features import CachedFeatures
-
-MIN_PAIRS_FOR_PROCESSES = 1000  # of given matches: 10.0 s by one thread, 8.3 by two processes, start included
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,10 +135,8 @@ def _evaluated(
     journal: Journal | None,
 ) -> Iterator[int]:  # fmt: skip
     """Evaluates pairs into the folder and the journal; yields how many were done since."""
-    asked = execution_of(config, fields.workers, fields.processes)
-    several = (asked.workers or os.cpu_count() or 1) > 1
-    parallel = several and len(pairs) >= MIN_PAIRS_FOR_PROCESSES and pipeline.device.type == "cpu"
-    execution = asked.decided(parallel)
+    parallel = len(pairs) >= MIN_PAIRS_FOR_PROCESSES and pipeline.device.type == "cpu"
+    execution = execution_of(config, fields.workers, fields.processes).decided(parallel)
     if execution.shared and execution.workers is None and pipeline.device.type != "cpu":
         execution = dataclasses.replace(execution, workers=1)
     build = None if execution.shared else functools.partial(presets.build_pipeline, config, pipeline.device, None)

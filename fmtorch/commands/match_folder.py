@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-import os
 import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import BrokenExecutor
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from omegaconf import DictConfig
 
 from fmtorch import presets
-from fmtorch.core.executors import SHARED_BY, Team, WorkersLost
+from fmtorch.core.executors import MIN_PAIRS_FOR_PROCESSES, SHARED_BY, Team, WorkersLost
 from fmtorch.core.files import replacing
 from fmtorch.core.stages import ImageMatcher
 from fmtorch.core.terminal import console, errors, progress_bars
@@ -38,8 +37,6 @@ from fmtorch.storage.exchange.export import export_kinds, write_exports
 from fmtorch.storage.exchange.journal import Journal
 from fmtorch.storage.exchange.view_graph import ViewGraph, view_graph, write_view_graph
 from fmtorch.storage.features import CachedFeatures, cached
-
-MIN_PAIRS_FOR_PROCESSES = 1000  # 1,225 of SIFT: 27.0 s by one thread, 26.7 by two, 22.1 by two processes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,9 +110,8 @@ def match_folder(
 @contextlib.contextmanager
 def _team(config: DictConfig, fields: FolderFields, pipeline: Pipeline, pairs: int) -> Iterator[dict[str, Any]]:
     """Who does the work, as `FolderMatches` takes it. Raises WorkersLost where workers die or the scheduler is lost."""
-    asked = execution_of(config, fields.workers)
-    several = (asked.workers or os.cpu_count() or 1) > 1 and pipeline.device.type == "cpu"
-    execution = asked.decided(several and pairs >= MIN_PAIRS_FOR_PROCESSES)
+    parallel = pairs >= MIN_PAIRS_FOR_PROCESSES and pipeline.device.type == "cpu"
+    execution = execution_of(config, fields.workers).decided(parallel)
     if execution.shared:
         yield {"workers": execution.workers}
         return

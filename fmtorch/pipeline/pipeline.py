@@ -195,7 +195,8 @@ class Pipeline:
             own = [i for i, o in enumerate(outcomes) if (o.pair.family if o.pair.family in others else None) == family]
             if own:
                 family_outcomes = [outcomes[i] for i in own]
-                c = keypoints = collated(family_outcomes)
+                c = collated(family_outcomes)
+                keypoints = Correspondences(c.x0, c.x1, c.mask, quality=c.quality)
 
                 def images(i: int, family_outcomes: list[Outcome] = family_outcomes) -> PairImages:
                     return family_outcomes[i].images or self.images(family_outcomes[i].pair)

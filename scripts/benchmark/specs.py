@@ -43,8 +43,14 @@ def pipeline_of(words: str, *overrides: str) -> Pipeline:
 
 
 def features_of(name: str) -> str:
-    """What the name of a pipeline, with overrides or not, says of its features: ``hesaffnet`` of ``hesaffnet_gms``."""
-    return name.split()[0].rpartition("_")[0]
+    """What the name of a pipeline, with overrides or not, says of its features: ``hesaffnet`` of ``hesaffnet_gms``.
+
+    With its folder, as ``paper/sift`` of ``paper/sift_gms``; the whole name where it names none.
+    """
+    preset = name.split()[0]
+    own = preset.rpartition("/")[2]
+    known = [feature for feature in presets.available("features") if own.startswith(f"{feature}_")]
+    return preset.removesuffix(own) + max(known, key=len) if known else preset
 
 
 def identity(spec: str, extra: Mapping[str, Stage] = NONE) -> str:

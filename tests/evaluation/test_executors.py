@@ -85,6 +85,17 @@ def test_rows_of_threads_and_processes(kind: str, pairs: list[ImagePair], expect
     assert evaluated(pairs, Execution(kind, 2)) == expected
 
 
+@pytest.mark.parametrize(("workers", "many", "kind"), [
+    (1, True, "threads"), (2, True, "processes"), (2, False, "threads"), (None, True, "processes"),
+])  # fmt: skip
+def test_many_pairs_go_to_processes_unless_there_is_a_single_worker(
+    workers: int | None, many: bool, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    assert Execution("auto", workers).decided(many).kind == kind
+    assert Execution("processes", workers).decided(many).kind == "processes"  # as it was asked for
+
+
 def test_rows_of_an_executor_of_ones_own(pairs: list[ImagePair], expected: dict[int, PairRow]) -> None:
     own = Execution(workers=2, send_images=True, make=functools.partial(ThreadPoolExecutor, 2))
     assert evaluated(pairs, own) == expected

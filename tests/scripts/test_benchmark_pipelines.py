@@ -19,8 +19,13 @@ def benchmark(*arguments: str, cwd: Path) -> str:
 
 
 def test_names_of_features_that_begin_alike_are_apart() -> None:
-    names = ["hesaffnet_fmtorch", "hesaffnet_fast_fmtorch", "hesaffnet_gms estimator=lmeds_eight_point"]
-    assert [features_of(name) for name in names] == ["hesaffnet", "hesaffnet_fast", "hesaffnet"]
+    names = [
+        "hesaffnet_fmtorch", "hesaffnet_fast_fmtorch", "hesaffnet_gms estimator=lmeds_eight_point", "sift_lc_fmtorch",
+        "sift_code_lmeds", "paper/sift_gms", "given_fmtorch",
+    ]  # fmt: skip
+    assert [features_of(name) for name in names] == [
+        "hesaffnet", "hesaffnet_fast", "hesaffnet", "sift", "sift", "paper/sift", "given_fmtorch",
+    ]  # fmt: skip
 
 
 def test_an_interrupted_run_goes_on(tmp_path: Path) -> None:
