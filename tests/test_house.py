@@ -6,11 +6,11 @@ import ast
 from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[1] / "fmtorch"
-MAX_FILE, MAX_FUNCTION, MAX_ROOMS = 250, 60, 15  # lines, lines without the docstring, folders
+MAX_FILE, MAX_FUNCTION, MAX_ROOMS = 500, 60, 20  # lines, lines without the docstring, folders
 MAX_ARGUMENTS = 6  # of a kernel
 
 
-def test_fifteen_rooms_at_most() -> None:
+def test_twenty_rooms_at_most() -> None:
     assert len(list(PACKAGE.glob("*/__init__.py"))) <= MAX_ROOMS
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import functools
 import graphlib
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -76,17 +75,6 @@ def libraries(module: str) -> set[str]:
     return {name.partition(".")[0] for name in imported(module)}
 
 
-def kernels() -> Iterator[str]:
-    """The files that hold a function decorated as a kernel."""
-    for module in FILES:
-        for node in ast.walk(tree(module)):
-            if isinstance(node, ast.FunctionDef):
-                decorators = [d.func if isinstance(d, ast.Call) else d for d in node.decorator_list]
-                if any(isinstance(d, ast.Name) and d.id == "kernel" for d in decorators):
-                    yield module
-                    break
-
-
 def test_every_room_has_its_rule() -> None:
     assert set(MAY_IMPORT) == set(ROOMS)
 
@@ -111,21 +99,6 @@ def test_no_circle_between_files() -> None:
         list(graphlib.TopologicalSorter({module: within(module) - {module} for module in FILES}).static_order())
     except graphlib.CycleError as error:
         pytest.fail(" <- ".join(error.args[1]))
-
-
-def test_files_with_kernels_reach_no_torch() -> None:
-    """A process that compiles kernels then needs none, which saves it a second."""
-    reaching, holders = {}, list(kernels())
-    assert holders
-    for module in holders:
-        seen, todo = {module}, [module]
-        while todo:
-            name = todo.pop()
-            if libraries(name) & TORCH:
-                reaching[module] = name
-            todo += within(name) - seen
-            seen |= within(name)
-    assert reaching == {}
 
 
 def test_estimators_take_tensors_at_their_edges_alone() -> None:
