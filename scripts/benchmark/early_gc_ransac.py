@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.estimators.peers.pairwise import Pair, PairwiseEstimator, Solution
+from fmtorch.estimators import PairwiseEstimator
+from fmtorch.estimators.peers.pairwise import Pair, Solution
 
 Single = NDArray[np.float32]
 MINIMAL, LOCAL_SAMPLE, LOCAL_SAMPLES = 7, 49, 20  # matches of a sample, those of local optimisation, how many of these
@@ -48,8 +49,7 @@ class EarlyGCRansac:
             fit, _ = cv2.findFundamentalMat(pair.x0[inside], pair.x1[inside], cv2.FM_8POINT)
             return np.asarray(fit, np.float64), inside
         shift = np.array([[1, 0, ORIGIN], [0, 1, ORIGIN], [0, 0, 1]])
-        F = shift.T @ eight_point(points[inside]).astype(np.float64) @ shift
-        return F, inside
+        return shift.T @ eight_point(points[inside]).astype(np.float64) @ shift, inside
 
     def _search(self, points: Single, random: np.random.Generator) -> NDArray[np.bool_]:
         """The inliers of the best model."""

@@ -17,160 +17,281 @@ python -m scripts.benchmark posebench FILES --every 10 --methods E:fmtorch E:fmt
 from __future__ import annotations
 
 import argparse
+import csv
+import dataclasses
+import functools
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from rich.progress import track
 
-from fmtorch import metrics, presets
+import fmtorch
+from fmtorch import data, metrics, presets
 from fmtorch.data import DataError, ImagePair
 from fmtorch.evaluation.intervals import MIN_UNITS
-from fmtorch.evaluation.statistics import PERCENT, difference
-from scripts.benchmark import matched, sheet
-from scripts.benchmark import posebench_methods as methods_of
-from scripts.benchmark.kept import Kept, Row
-from scripts.benchmark.matched import console
-from scripts.benchmark.posebench_sets import THRESHOLDS, Figures, Set, read_published, sets_of
-from scripts.benchmark.sheet import MISSING, Sheet, put
+from fmtorch.evaluation.statistics import PERCENT, POSE_THRESHOLDS, difference
+from fmtorch.pipeline.pipeline import Outcome
+from fmtorch.presets.objects import merged
+from fmtorch.storage.exchange import h5
+from scripts.benchmark import pairs
+from scripts.benchmark.cameras import has_cameras
+from scripts.benchmark.methods import options
+from scripts.benchmark.runner import Item, Kept, Row, add_command, console, identity, judged, measure
+from scripts.benchmark.tables import Record, Sheet, Span, show, span
 
 METHODS = ("E:fmtorch", "E:poselib", "E:colmap", "F:fmtorch", "F:poselib", "F:colmap")
-MISSED = {"rotation": 180.0, "translation": 180.0}
+KINDS = ("E", "F")  # a relative pose of known cameras; a fundamental matrix, of whose four poses the best one counts
+MAX_ITERATIONS, MIN_ITERATIONS, CONFIDENCE = 1000, 100, 0.9999
+FOCAL_SAMPLES = 250  # of a round of our search with focal lengths
+IN_PIXELS = ("threshold", "inlier_threshold", "scale")  # options of our presets that are distances
+NOT_SCALED = "scaled"  # false: our preset keeps its own distances
+PUBLISHED = Path(__file__).with_name("posebench.csv")  # PoseLib 2.0.5; results/baseline.2_0_5.json there
+Figures = dict[str, dict[str, tuple[float, ...]]]  # method -> data set -> AUC in per cent
 
 
 def add_arguments(commands: Any) -> None:
-    parser = commands.add_parser("posebench", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = add_command(commands, "posebench", run, __doc__, seeds=1)
     parser.add_argument("files", nargs="?", type=Path, help="the folder `relative` of PoseBench's data, or one file")
-    matched.add_arguments(parser)
+    pairs.add_match_options(parser)
     parser.add_argument("--methods", nargs="+", default=METHODS, help="KIND:PRESET[:KEY=VALUE,...], KIND being E or F")
     parser.add_argument("--threshold", type=float, help="px, of sets that are not PoseBench's")
     parser.add_argument("--every", type=int, default=1, help="every so many-th pair of each set; the protocol has all")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--rows", type=Path, help="keep what each method makes of each pair here, one line each")
-    parser.add_argument("--markdown", type=Path, help="put the tables between the marks `posebench` of this file")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> None:
-    torch.set_num_threads(1)
     published = read_published()
-    arguments.methods = installed(arguments.methods)
-    rows: dict[str, list[Row]] = {}
+    methods = installed(arguments.methods)
     kept = Kept(arguments.rows)
-    for each in sets_of(arguments, published[0]):
-        set_rows = measured(each, arguments, kept)
-        if set_rows:
-            rows[each.name] = set_rows
+    rows: dict[str, list[Row]] = {}
+    for of in sets_of(arguments, published[0]):
+        items = of.items[:: arguments.every]
+        usable = [item for item in items if item.pair.problem is None]
+        own = measure([dataclasses.replace(each, matches=of.digest) for each in methods], usable, arguments.seeds, kept)
+        _say_what_is_missing(of.name, items, own)
+        if own:
+            rows[of.name] = [{**row, "scene": f"{of.name}/{row['scene']}"} for row in own]
     if not rows:
         raise SystemExit("no pair of pinhole cameras")
-    tables = sheets(rows, arguments.methods, published)
-    for table in tables:
-        console.print(table.terminal())
-    if arguments.markdown is not None:
-        put(arguments.markdown, tables, "posebench")
+    show([sheet(rows, [method.name for method in methods], published)], arguments.table)
 
 
-def installed(methods: Sequence[str]) -> list[str]:
+class Set(NamedTuple):
+    """Pairs with given matches. digest: of the matches."""
+
+    name: str
+    items: Sequence[Item]
+    digest: str
+
+
+def sets_of(arguments: argparse.Namespace, thresholds: Mapping[str, float]) -> Iterator[Set]:
+    """The sets that are asked for. Raises SystemExit where there are none, or one has no threshold."""
+    if arguments.files is None and not pairs.named(arguments):
+        raise SystemExit("name FILES, the folder `relative` of PoseBench's data, or --root DATA")
+    if arguments.files is not None:
+        yield from _files(arguments.files, thresholds, arguments.threshold)
+    if pairs.named(arguments):
+        if arguments.threshold is None:
+            raise SystemExit("--root: give the threshold in pixels, --threshold PX")
+        facts = {"threshold": arguments.threshold}
+        families: dict[str, list[Item]] = {}
+        for item in pairs.matched(arguments):
+            if has_cameras(item.pair):  # by their families, with points alone, as PoseBench has them
+                own = Item(item.pair, functools.partial(_points_of, item), facts)
+                families.setdefault(item.pair.family, []).append(own)
+        digest = pairs.matches_identity(arguments)
+        yield from (Set(name, items, digest) for name, items in families.items())
+
+
+def _points_of(item: Item) -> Outcome | None:
+    if item.outcome is None or item.outcome.correspondences is None:
+        return item.outcome
+    return dataclasses.replace(item.outcome, correspondences=pairs.points_alone(item.matches).correspondences)
+
+
+def _files(folder: Path, thresholds: Mapping[str, float], threshold: float | None) -> Iterator[Set]:
+    root = folder / "relative" if (folder / "relative").is_dir() else folder
+    try:
+        given = {path: thresholds.get(path.stem, threshold) for path in h5.files(root)}
+    except DataError as error:
+        raise SystemExit(f"{error}; give the folder `relative` of PoseBench's data") from error
+    for path, px in given.items():
+        if px is None and not path.stem.startswith("fisheye_"):
+            raise SystemExit(f"{path.name} is none of PoseBench's sets: give its threshold in pixels, --threshold PX")
+    for path, px in given.items():
+        if px is None:
+            console.print(f"{path.name}: left out, its cameras are no pinholes", style="dim", highlight=False)
+            continue
+        try:
+            dataset = data.load("h5", root=path, layout="posebench")
+        except DataError as error:
+            raise SystemExit(str(error)) from error
+        every = [dataset[i] for i in range(len(dataset))]
+        yield Set(path.stem, [Item(p, functools.partial(_given, p), {"threshold": px}) for p in every], dataset.digest)
+
+
+def _given(pair: ImagePair) -> Outcome:
+    assert pair.matches is not None
+    try:
+        c, counts = pair.matches()
+    except (ValueError, DataError) as error:
+        return Outcome(pair, reason=str(error))
+    return Outcome(pair, counts, c)
+
+
+@dataclasses.dataclass(frozen=True)
+class Protocol:
+    """An estimator by PoseBench's protocol.
+
+    kind: of `KINDS`. preset: of an estimator. changes: options that replace the protocol's. matches: their digest.
+    """
+
+    name: str
+    kind: str
+    preset: str
+    changes: dict[str, Any]
+    matches: str = ""
+
+    @classmethod
+    def of(cls, text: str) -> Protocol:
+        """``KIND:PRESET[:KEY=VALUE,...]``. Raises SystemExit for anything else."""
+        kind, _, rest = text.partition(":")
+        preset, _, settings = rest.partition(":")
+        if kind not in KINDS or preset not in presets.available("estimator"):
+            raise SystemExit(f"{text}: write KIND:PRESET[:KEY=VALUE,...], KIND being E or F, PRESET one of `fmtorch list`")
+        return cls(text, kind, preset, options(settings))
+
+    @functools.cached_property
+    def identity(self) -> str:
+        """Of its options at 1 px, code, and versions of peers."""
+        return identity([("estimator", self.preset, self.options(1.0))], self.name, self.matches)
+
+    def options(self, threshold: float) -> dict[str, Any]:
+        """The options of a data set whose threshold is so many pixels.
+
+        At most 1,000 samples, at least 100, confidence 0.9999. A peer gets the threshold. Our presets, whose distances
+        are of matches that are exact to about a pixel, get them times the threshold, unless ``scaled=false``.
+        """
+        changes = dict(self.changes)
+        scaled = changes.pop(NOT_SCALED, True)
+        preset = presets.load("estimator", self.preset)
+        if "hypotheses" in preset:  # one of ours
+            own = _distances(preset, threshold) if scaled else {}
+            own |= {"hypotheses": MAX_ITERATIONS, "confidence": CONFIDENCE}
+            if preset.get("focal"):
+                own["focal"] = {**own.get("focal", {}), "rounds": MAX_ITERATIONS // FOCAL_SAMPLES}
+        else:
+            known = {
+                "threshold": threshold, "iterations": MAX_ITERATIONS, "min_iterations": MIN_ITERATIONS,
+                "confidence": CONFIDENCE, "two_view": False,
+            }  # fmt: skip
+            own = {name: value for name, value in known.items() if name in preset}
+        return merged(own, changes)
+
+    def applies(self, item: Item) -> bool:
+        return True
+
+    def figures(self, item: Item, seed: int) -> Row:
+        """What it makes of a pair: signed angles in degrees, 180 where it has no pose, and milliseconds."""
+        matched, pair = item.outcome, item.pair
+        assert matched is not None
+        c = matched.correspondences
+        if c is None:
+            return {**judged(matched, seed, signed=True), "ms": 0.0}
+        given: dict[str, Any] = {
+            "mask": c.mask, "quality": c.quality, "size0": c.size0, "size1": c.size1, "key": pair.key, "seed": seed,
+            "estimator": self.preset, **self.options(item.facts["threshold"]),
+        }  # fmt: skip
+        start = time.process_time()
+        try:
+            if self.kind == "E":
+                estimate = fmtorch.find_essential(c.x0, c.x1, pair.K0, pair.K1, **given)  # type: ignore[arg-type]
+            else:
+                estimate = fmtorch.find_fundamental(c.x0, c.x1, **given)
+            outcome = dataclasses.replace(matched, estimate=estimate, reason=estimate.reason[0])
+        except ValueError as error:
+            outcome = Outcome(pair, reason=str(error))
+        ms = 1e3 * (time.process_time() - start)
+        return {**judged(outcome, seed, signed=True), "ms": ms}
+
+
+def _distances(preset: Mapping[str, Any], scale: float) -> dict[str, Any]:
+    """The distances within a preset, at any depth, times `scale`."""
+    levels = {key: _distances(value, scale) for key, value in preset.items() if isinstance(value, Mapping)}
+    own = {key: value * scale for key, value in preset.items() if key in IN_PIXELS and value is not None}
+    return {**{key: inside for key, inside in levels.items() if inside}, **own}
+
+
+def installed(words: Sequence[str]) -> list[Protocol]:
     """The methods whose packages are there; of those that are named, all must be. Raises SystemExit for another."""
     available = []
-    for text in methods:
+    for text in words:
+        method = Protocol.of(text)
         try:
-            presets.build("estimator", methods_of.read(text).preset)
-            available.append(text)
+            presets.build("estimator", method.preset)
+            available.append(method)
         except ImportError as error:
-            if methods is not METHODS:
+            if words is not METHODS:
                 raise SystemExit(f"{text}: {error}") from error
             console.print(f"{text} is left out: {error}", style="dim", highlight=False, markup=False)
     return available
 
 
-def measured(of: Set, arguments: argparse.Namespace, kept: Kept) -> list[Row]:
-    """The rows of a set's pairs by all methods."""
-    pairs = of.pairs[:: arguments.every]
-    usable = [pair for pair in pairs if pair.problem is None]
-    done = kept.by("pair", "seed", "threshold", "method", "identity", "matches")
-    made_with = {text: (text, methods_of.identity(text), of.digest) for text in arguments.methods}
-    rows: list[Row] = []
-    for pair in track(usable, of.name, console=console, transient=True):
-        new = []
-        for text in arguments.methods:
-            row = done.get((pair.identity, arguments.seed, of.threshold, *made_with[text]))
-            if row is None:
-                row = judged(methods_of.read(text), pair, of.threshold, arguments.seed)
-                row |= dict(zip(("method", "identity", "matches"), made_with[text], strict=True))
-                new.append(row)
-            rows.append({**row, "scene": f"{of.name}/{pair.scene}"})
-        kept.add(new)
-    _say_what_is_missing(of, pairs, rows)
-    return rows
-
-
-def judged(method: methods_of.Method, pair: ImagePair, threshold: float, seed: int) -> Row:
-    """What one method makes of a pair: angles in degrees, 180 where it has no pose, and milliseconds."""
-    row: Row = {"pair": pair.identity, "seed": seed, "threshold": threshold, "ms": 0.0, "reason": "", **MISSED}
-    assert pair.matches is not None
-    start = time.process_time()
-    try:
-        c = pair.matches().correspondences
-        start = time.process_time()
-        estimate = methods_of.estimated(method, pair, c, threshold, seed)
-    except (ValueError, DataError) as error:
-        return row | {"reason": str(error), "ms": 1e3 * (time.process_time() - start)}
-    row["ms"] = 1e3 * (time.process_time() - start)
-    if not bool(estimate.ok[0]):
-        return row | {"reason": estimate.reason[0]}
-    angles = methods_of.error(method, estimate, pair)
-    return row | {"rotation": float(angles.rotation), "translation": float(angles.translation)}
-
-
-def _say_what_is_missing(of: Set, pairs: Sequence[ImagePair], rows: list[Row]) -> None:
+def _say_what_is_missing(name: str, items: Sequence[Item], rows: Sequence[Row]) -> None:
     """Pairs that are left out, with the commonest reason, and those that a method has no pose for."""
-    reasons = Counter(pair.problem for pair in pairs if pair.problem is not None)
+    reasons = Counter(item.pair.problem for item in items if item.pair.problem is not None)
     if reasons:
         left, (reason, _) = sum(reasons.values()), reasons.most_common(1)[0]
-        console.print(f"{of.name}: {left} of {len(pairs)} pairs left out: {reason}", style="dim", highlight=False)
-    failed = Counter(row["method"] for row in rows if row["reason"])
-    for method, count in failed.items():
+        console.print(f"{name}: {left} of {len(items)} pairs left out: {reason}", style="dim", highlight=False)
+    for method, count in Counter(row["method"] for row in rows if row["reason"]).items():
         reason = next(row["reason"] for row in rows if row["method"] == method and row["reason"])
-        console.print(f"{of.name}, {method}: {count} misses, such as: {reason}", style="dim", highlight=False)
+        console.print(f"{name}, {method}: {count} misses, such as: {reason}", style="dim", highlight=False)
 
 
-def sheets(
-    rows: dict[str, list[Row]], methods: Sequence[str], published: tuple[dict[str, float], Figures]
-) -> tuple[Sheet, Sheet]:
-    """Means over the sets, and the figures of each set, with published ones, also of methods that were not run."""
+def read_published() -> tuple[dict[str, float], Figures]:
+    """The threshold of each of PoseBench's sets in pixels, and its published figures."""
+    thresholds: dict[str, float] = {}
+    figures: Figures = {}
+    with PUBLISHED.open(encoding="utf-8") as file:
+        for line in csv.DictReader(file):
+            thresholds[line["dataset"]] = float(line["threshold"])
+            values = tuple(float(line[f"auc{t}"]) for t in POSE_THRESHOLDS)
+            figures.setdefault(line["method"], {})[line["dataset"]] = values
+    return thresholds, figures
+
+
+def sheet(rows: dict[str, list[Row]], methods: Sequence[str], published: tuple[dict[str, float], Figures]) -> Sheet:
+    """Means over the sets, then each set, with published figures, also of methods that were not run."""
     thresholds, theirs = published
     own = {m: {name: [row for row in of if row["method"] == m] for name, of in rows.items()} for m in methods}
     known = [name for name in rows if name in thresholds]
     others = [method for method in theirs if method not in methods and known]
-    overall, each = [], []
+    records: list[Record] = []
     for method in (*methods, *others):
-        of_sets = own.get(method, {})
-        ours = mean([areas(of) for of in of_sets.values()]) if of_sets else None
-        said = mean([theirs[method][name] for name in rows]) if method in theirs and len(known) == len(rows) else None
-        ms = f"{np.median([row['ms'] for of in of_sets.values() for row in of]):.1f}" if of_sets else MISSING
-        overall.append([method, shown(ours), shown(said), lead(own, method), ms])
+        of_sets, said = own.get(method, {}), theirs.get(method, {})
+        line: Record = {"set": "mean of the sets", "method": method, "px": "", "pairs": sum(map(len, of_sets.values())) or ""}
+        line |= _areas("AUC", mean([areas(of) for of in of_sets.values()]))
+        line["first of its kind minus this, @5"] = lead(own, method)
+        line["ms"] = f"{np.median([row['ms'] for of in of_sets.values() for row in of]):.1f}" if of_sets else ""
+        records.append(line | _areas("published", mean([said[name] for name in rows]) if said and len(known) == len(rows) else ()))
     for name in rows:
-        px = f"{rows[name][0]['threshold']:g}"
         for method in (*methods, *(others if name in known else ())):
-            of = own.get(method, {}).get(name)
-            stated = shown(theirs.get(method, {}).get(name))
-            each.append([name, method, px, *([str(len(of)), shown(areas(of))] if of else [MISSING] * 2), stated])
-    count = sum(len(of) for of in own[methods[0]].values())
+            of = own.get(method, {}).get(name, [])
+            line = {"set": name, "method": method, "px": f"{rows[name][0]['threshold']:g}", "pairs": len(of) or ""}
+            records.append(line | _areas("AUC", areas(of)) | _areas("published", theirs.get(method, {}).get(name, ())))
     part = f", {len(known)} of PoseBench's {len(thresholds)}" if known else ""
-    title = f"PoseBench's protocol: means of {len(rows)} set{'s' * (len(rows) != 1)}{part}; {count:,} pairs"
-    heading = "AUC@5/10/20°, signed"
-    return (
-        Sheet(title, ["method", heading, "published", "first of its kind minus this, @5°", "ms, median"], overall),
-        Sheet("Each set", ["set", "method", "px", "pairs", heading, "published"], each),
-    )
+    count = sum(len(of) for of in own[methods[0]].values())
+    return Sheet("poses", f"PoseBench's protocol: {len(rows)} sets{part}; {count:,} pairs; AUC of signed angles, %", records)
 
 
-def lead(own: dict[str, dict[str, list[Row]]], method: str) -> str:
+def _areas(name: str, values: Sequence[float]) -> Record:
+    return {f"{name}@{t}": f"{value:.1f}" for t, value in zip(POSE_THRESHOLDS, values, strict=False)}
+
+
+def lead(own: dict[str, dict[str, list[Row]]], method: str) -> Span | str:
     """AUC@5 of the first method of a kind minus that of another, every set counting alike, with its 95 % interval."""
     first = next((name for name in own if name[0] == method[0]), method)
     if method == first or method not in own:
@@ -180,24 +301,24 @@ def lead(own: dict[str, dict[str, list[Row]]], method: str) -> str:
         scenes = [str(i) for i in range(len(scenes))]
     share = np.concatenate([np.full(len(of), len(scenes) / len(own[method]) / len(of)) for of in own[method].values()])
     a, b = (share * np.array([_below(row) for of in own[name].values() for row in of]) for name in (first, method))
-    return sheet.shown(difference(a, b, scenes, PERCENT), "+.1f")
+    return span(difference(a, b, scenes, PERCENT), "+.1f")
 
 
 def _below(row: Row) -> float:
     """The share of thresholds up to 5 degrees above the error."""
-    error: float = max(row["rotation"], row["translation"])
-    return max(0.0, 1 - error / THRESHOLDS[0])
+    return max(0.0, 1 - _worst(row) / POSE_THRESHOLDS[0])
 
 
-def areas(rows: list[Row]) -> tuple[float, ...]:
-    """AUC in per cent at each of the thresholds."""
-    worst = torch.tensor([max(row["rotation"], row["translation"]) for row in rows], dtype=torch.float64)
-    return tuple((100 * metrics.pose_auc(worst, THRESHOLDS)).tolist())
+def _worst(row: Row) -> float:
+    return float(max(row["rotation_error"], row["translation_error"]))
 
 
-def mean(figures: list[tuple[float, ...]]) -> tuple[float, ...]:
-    return tuple(np.mean(figures, 0).tolist())
+def areas(rows: Sequence[Row]) -> tuple[float, ...]:
+    """AUC in per cent at each of the thresholds; none of no rows."""
+    worst = torch.tensor([_worst(row) for row in rows], dtype=torch.float64)
+    return tuple((100 * metrics.pose_auc(worst, POSE_THRESHOLDS)).tolist()) if rows else ()
 
 
-def shown(figures: tuple[float, ...] | None) -> str:
-    return MISSING if figures is None else " / ".join(f"{value:.1f}" for value in figures)
+def mean(figures: Sequence[tuple[float, ...]]) -> tuple[float, ...]:
+    """Of several sets."""
+    return tuple(np.mean(figures, 0).tolist()) if figures else ()

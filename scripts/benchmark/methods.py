@@ -1,0 +1,188 @@
+"""Methods that are named in one word, PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...], or as a pipeline with overrides.
+
+A pruner may have options, too. Beside presets there are the estimators `truth`, the fit that starts from the true
+matrix and so what the matches allow, and `early_gc_ransac`; without an estimator, as in `@gms`, pruners alone are meant.
+Stages that are no presets take something away from an estimator or are another's: see `EXTRA`.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import torch
+
+from fmtorch import presets
+from fmtorch.core.stages import Estimator, Pruner
+from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.data import ImagePair
+from fmtorch.geometry import refine
+from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.presets.composition import compose
+from scripts.benchmark.early_gc_ransac import EarlyGCRansac
+from scripts.benchmark.runner import Method, identity
+
+TRUTH, EARLY, NGRANSAC = "truth", "early_gc_ransac", "ngransac"
+SHARED = frozenset(("ratio", "one_to_one"))  # pruners that nearly all pipelines have, whose time does not count
+NO_STAGES: Mapping[str, Pruner] = {}
+
+
+def read_specs(path: Path) -> list[str]:
+    """One method a line, without comments."""
+    return [text for line in path.read_text().splitlines() if (text := line.partition("#")[0].strip())]
+
+
+def options(text: str) -> dict[str, Any]:
+    """``KEY=VALUE,...``: numbers, true, false or null as in JSON; anything else is text.
+
+    ``PART.KEY=VALUE`` is the option KEY of a part, as on the command line.
+    """
+    changed: dict[str, Any] = {}
+    for key, value in (item.split("=") for item in text.split(",") if item):
+        *parts, last = key.split(".")
+        inside = changed
+        for part in parts:
+            inside = inside.setdefault(part, {})
+        inside[last] = _parsed(value)
+    return changed
+
+
+def _parsed(value: str) -> Any:
+    try:
+        return json.loads(value)
+    except json.JSONDecodeError:
+        return value
+
+
+def split(word: str) -> tuple[str, dict[str, Any]]:
+    """The preset of ``PRESET[:KEY=VALUE,...]`` and its changed options."""
+    name, _, rest = word.partition(":")
+    return name, options(rest)
+
+
+def build(group: str, word: str) -> Any:
+    """The part of ``PRESET[:KEY=VALUE,...]``, or one of `EXTRA`."""
+    name, changed = split(word)
+    if group == "pruner" and name in EXTRA:
+        return EXTRA[name]
+    if (group, name) == ("estimator", EARLY):
+        return EarlyGCRansac(**changed).estimator()
+    return presets.build(group, name, **changed)
+
+
+def stages_of(spec: str) -> list[str]:
+    """The words after ``@``."""
+    return [stage for stage in spec.partition("@")[2].split("+") if stage]
+
+
+def method(spec: str, matches: str = "", extra: Mapping[str, Pruner] = NO_STAGES) -> Method:
+    """The method of a spec on given matches. matches: what these depend on; extra: further stages by name."""
+    word, names = spec.partition("@")[0], stages_of(spec)
+    stages = {name: extra[name] if name in extra else build("pruner", name) for name in names}
+    name, changed = split(word)
+    own = [] if name in (TRUTH, EARLY) else [("estimator", name, changed)]
+    own += [("pruner", *split(stage)) for stage in names if stage not in {*extra, *EXTRA}]
+    others = [part for stage in names for part in (stage, stages[stage])]
+    if name == TRUTH:
+        solve = from_truth
+    else:
+        solve = functools.partial(_estimated, build("estimator", word))
+    return Method(spec, identity(own, word, matches, *others), lambda family: stages, solve)
+
+
+def call(spec: str) -> Callable[[Correspondences], Any]:
+    """A spec as a function of matches alone: pruners in order, then the estimator, if there is one, with seed 0."""
+    word = spec.partition("@")[0]
+    parts: list[Callable[[Correspondences], Any]] = [build("pruner", name) for name in stages_of(spec)]
+    parts += [functools.partial(build("estimator", word), seed=0)] if word else []
+    return lambda c: functools.reduce(lambda given, part: part(given), parts, c)
+
+
+def _estimated(estimator: Estimator, pair: ImagePair, c: Correspondences, seed: int) -> Estimate:
+    return estimator(c, seed)
+
+
+def from_truth(pair: ImagePair, c: Correspondences, seed: int) -> Estimate:
+    """The robust fit to the matches, weighted by their prior, that starts from the true matrix."""
+    F = torch.from_numpy(pair.F)[None]
+    for scale in (1.5, 0.7):  # px
+        F = refine(F, c.x0, c.x1, c.prior, c.mask, kernel="geman_mcclure", scale=scale, iterations=20)
+    ok = torch.isfinite(F).all(-1).all(-1)
+    reason = "" if bool(ok) else "no fit"
+    return Estimate(torch.where(ok[:, None, None], F, 0.0), c.mask & ok[:, None], ok, (reason,), torch.zeros(1, dtype=torch.int64))
+
+
+def pipeline_of(words: str, *overrides: str) -> Pipeline:
+    """The pipeline of ``PRESET[ NAME=VALUE...]``, such as ``sift_ratio estimator=msac``, with further overrides."""
+    name, *own = words.split()
+    pipeline: Pipeline = presets.pipeline(name, overrides=[*own, *overrides])
+    return pipeline
+
+
+def pipeline_method(name: str, words: str, *overrides: str) -> tuple[Method, Pipeline, str]:
+    """A pipeline as a method, what makes its matches, and the digest of that; words after ``+`` are further pruners.
+
+    Estimators that are no presets are named by ``estimator=truth`` and ``estimator=early_gc_ransac:KEY=VALUE,...``.
+    """
+    words, *more = (part.strip() for part in words.split(" + "))
+    preset, *own = words.split()
+    special = [word.removeprefix("estimator=") for word in own if word.startswith((f"estimator={TRUTH}", f"estimator={EARLY}"))]
+    changed = [word for word in own if word.removeprefix("estimator=") not in special] + list(overrides)
+    pipeline = pipeline_of(preset, *changed)
+    config = presets.stages(compose("match", (f"pipeline={preset}", *changed)))
+    front = identity([], config["features"], config["matcher"], pipeline.extractor)
+    added = {word: build("pruner", word) for word in more}
+    estimator = pipeline.estimator
+    solve: Any = functools.partial(_estimated, estimator)
+    if special:
+        solve = from_truth if special[0] == TRUTH else functools.partial(_estimated, build("estimator", special[0]))
+    made_with = [part for entry in config["pruner"] for part in entry.values()]
+    digest = identity(
+        [("pruner", *split(word)) for word in more], *made_with, config["estimator"], front, *special,
+        *pipeline.pruners.values(), str(pipeline.families), *added.values(),
+    )  # fmt: skip
+    made = Method(name, digest, lambda family: {**pipeline.pruners_of(family), **added}, solve, untimed=SHARED)
+    return made, pipeline, front
+
+
+def ngransac(file: Path | None) -> dict[str, Pruner]:
+    """The network of neural-guided RANSAC (Brachmann & Rother, ICCV 2019) as prior: its weights of samples."""
+    if file is None:
+        return {}
+    if not file.is_file():
+        raise SystemExit(f"--ngransac {file}: no such file; scripts/convert_ngransac.py makes it")
+    network = {"_target_": "fmtorch.pruning.networks.LC", "side": ["ratio"]}
+    return {NGRANSAC: presets.build("pruner", "lc", soft=True, network=network, file=str(file))}
+
+
+def sizeless(c: Correspondences) -> Correspondences:
+    """The matches of images whose sizes nobody tells."""
+    return c.replace(size0=None, size1=None)
+
+
+def ratioless(c: Correspondences) -> Correspondences:
+    """The matches without their distance ratios."""
+    return c.replace(quality=None)
+
+
+def opencv_gms(c: Correspondences) -> Correspondences:
+    """OpenCV's GMS of a batch of one, which opencv-contrib has."""
+    if not hasattr(cv2, "xfeatures2d"):
+        raise SystemExit("opencv_gms needs cv2.xfeatures2d: run the benchmark where opencv-contrib-python is installed")
+    assert c.size0 is not None
+    assert c.size1 is not None
+    sizes = [(int(size[0, 1]), int(size[0, 0])) for size in (c.size0, c.size1)]
+    keypoints = [[cv2.KeyPoint(float(x), float(y), 1.0) for x, y in points[0]] for points in (c.x0, c.x1)]
+    matches = [cv2.DMatch(i, i, 0.0) for i in range(c.mask.shape[1])]
+    kept = torch.zeros_like(c.mask)
+    kept_by_peer = cv2.xfeatures2d.matchGMS(*sizes, *keypoints, matches, False, False, 4.0)
+    kept[0, [match.queryIdx for match in kept_by_peer]] = True
+    return c.keep(kept)
+
+
+EXTRA: dict[str, Pruner] = {"sizeless": sizeless, "ratioless": ratioless, "opencv_gms": opencv_gms}
+"""Stages that are no presets: what an estimator is not given, and another library's pruner, for timing."""
