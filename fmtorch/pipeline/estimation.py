@@ -17,9 +17,9 @@ from fmtorch.compiling.together import compile_together
 from fmtorch.core.arguments import number
 from fmtorch.core.checks import expect_values
 from fmtorch.core.stages import Estimator, Pruner, model_of
-from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.geometry.verdict import judged
+from fmtorch.jobs.threads import one_thread
 from fmtorch.pipeline.known_cameras import KnownCameras
 from fmtorch.pipeline.units import expect_pixels
 

@@ -11,7 +11,6 @@ from torch import Tensor
 from fmtorch.compiling.batches import for_each_pair
 from fmtorch.core.records import ungraphed
 from fmtorch.core.stages import Estimator, Pruner
-from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.geometry.arithmetic import matmul3, sqrt
 from fmtorch.geometry.cameras import cross_matrix
@@ -20,6 +19,7 @@ from fmtorch.geometry.pose import pose_from_fundamental
 from fmtorch.geometry.pose_kernels import pose
 from fmtorch.geometry.square_pixels import calibration_problems, mapped, square_pixels
 from fmtorch.geometry.verdict import judged
+from fmtorch.jobs.threads import one_thread
 from fmtorch.pipeline.covariance import covariance_fields
 
 
