@@ -132,12 +132,8 @@ def rebuilt(r: Run, options: Options) -> Pipeline:
         raise ValueError(
             f"it has parts of your own ({', '.join(sorted(foreign))}), which a report loads with own_code=true"
         )
-    try:
-        composed = presets.composed(stages)
-    except ValueError as error:
-        raise ValueError(f"made by an earlier version, {error}") from error
-    cache = {"cache": options.cache, "cache_limit": options.cache_limit}
-    built: Pipeline = presets.build_pipeline(OmegaConf.create({**composed, **cache}), options.device, None)
+    config = {**presets.composed(stages), "cache": options.cache, "cache_limit": options.cache_limit}
+    built: Pipeline = presets.build_pipeline(OmegaConf.create(config), options.device, None)
     return built
 
 

@@ -49,20 +49,9 @@ def pipeline_stages(name: str) -> dict[str, Any] | None:
 
 
 def composed(stages: Mapping[str, Any]) -> dict[str, Any]:
-    """The config that `stages` was made of. Raises ValueError where several pruners stand in no order."""
+    """The config that `stages` was made of."""
     pruners = stages.get("pruner") or []
-    if isinstance(pruners, Mapping):  # of a version that did not keep the order
-        if len(pruners) > 1:
-            raise ValueError(f"the order of its pruners ({', '.join(pruners)}) is not known; evaluate it again")
-        pruners = [pruners]
-    return {**stages, "pruner": {name: _of_now(value) for entry in pruners for name, value in entry.items()}}
-
-
-def _of_now(pruner: Any) -> Any:
-    """A pruner's options with those renamed that earlier versions called otherwise."""
-    if not isinstance(pruner, Mapping) or "prune" not in pruner:
-        return pruner
-    return {**{key: value for key, value in pruner.items() if key != "prune"}, "soft": not pruner["prune"]}
+    return {**stages, "pruner": {name: value for entry in pruners for name, value in entry.items()}}
 
 
 def expect_stages(config: DictConfig) -> None:
