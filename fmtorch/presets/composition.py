@@ -49,8 +49,8 @@ def pipeline_stages(name: str) -> dict[str, Any] | None:
 
 def composed(stages: Mapping[str, Any]) -> dict[str, Any]:
     """The config that `stages` was made of."""
-    pruners = {name: value for entry in stages.get("pruner") or [] for name, value in entry.items()}
-    return {**stages, "pruner": pruners}
+    pruners = stages.get("pruner") or []
+    return {**stages, "pruner": {name: value for entry in pruners for name, value in entry.items()}}
 
 
 def expect_stages(config: DictConfig) -> None:
