@@ -21,6 +21,7 @@ from fmtorch.data.images import read_image
 from fmtorch.evaluation.view_graph_picture import view_graph_svg
 from fmtorch.features.vlad import descriptor_kind, image_vector
 from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES
+from fmtorch.pipeline.build import build_pipeline
 from fmtorch.pipeline.folder import MEMORY, FolderMatches, folder_workers
 from fmtorch.pipeline.folder_images import SIMILAR, chosen_pairs, count_of, images_below
 from fmtorch.pipeline.folder_output import default_output, open_folder
@@ -68,7 +69,7 @@ def match_folder(
     presets.expect_stages(config)
     stages = presets.stages(config)
     vector = functools.partial(image_vector, kind=descriptor_kind(stages["features"])) if similar else None
-    pipeline: Pipeline = presets.build_pipeline(config, presets.resolve_device(fields.device))
+    pipeline: Pipeline = build_pipeline(config, presets.resolve_device(fields.device))
     if isinstance(pipeline.matcher, ImageMatcher):
         raise ValueError("images: a folder is matched by keypoints of each image; this matcher takes pairs of images")
     output = fields.output or default_output(folder)
@@ -84,7 +85,7 @@ def match_folder(
     count = len(images) * similar if similar else len(pairs)
     many = count >= MIN_PAIRS_FOR_PROCESSES and pipeline.device.type == "cpu"
     execution = execution_of(config, fields.workers).decided(many)
-    build = None if execution.shared else functools.partial(presets.build_pipeline, config, pipeline.device)
+    build = None if execution.shared else functools.partial(build_pipeline, config, pipeline.device)
     with folder_workers(pipeline, execution) as workers, progress_bars() as progress:
         work = FolderMatches(
             pipeline, journal, fields.longest_side, fields.orient, fields.seed,

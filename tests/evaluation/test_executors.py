@@ -19,11 +19,11 @@ from typing import Any
 
 import pytest
 
-from fmtorch import presets
 from fmtorch.data.pairs import ImagePair
 from fmtorch.evaluation.run import evaluate_pairs
 from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.pool import WorkersLost
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.storage import PairRow
 from scripts.benchmark.scale_pairs import given_pairs
@@ -34,7 +34,7 @@ PATIENCE = 240.0  # seconds for a scheduler to answer, or workers to come
 
 
 def build() -> Pipeline:
-    built: Pipeline = presets.pipeline("given_fmtorch")
+    built: Pipeline = load_pipeline("given_fmtorch")
     return built
 
 

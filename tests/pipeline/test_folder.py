@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch import presets
 from fmtorch.data.pairs import ImageSource
 from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.pool import WorkerPool, WorkersLost
 from fmtorch.jobs.runner import DEATH
 from fmtorch.pipeline import folder
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.folder import FolderMatches, folder_workers
 from fmtorch.pipeline.photograph_cameras import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
@@ -52,7 +52,7 @@ def threads(count: int) -> Execution:
 
 def built() -> Pipeline:
     options = ["features.max_features=300", "estimator=lmeds", "estimator.hypotheses=30"]
-    return presets.pipeline("sift_ratio", overrides=options)
+    return load_pipeline("sift_ratio", overrides=options)
 
 
 @pytest.fixture
