@@ -10,13 +10,28 @@ import torch
 if not __package__:
     raise SystemExit("run it in the checkout's folder, as a module: python -m scripts.benchmark COMMAND ...")
 
-from scripts.benchmark import cameras, estimators, pipelines, planes, posebench, related, stress
+from scripts.benchmark import (
+    cameras,
+    estimators,
+    images,
+    pipelines,
+    planes,
+    posebench,
+    related,
+    scale,
+    scenes,
+    speed,
+    stress,
+    verify,
+)
+
+MODULES = (cameras, estimators, images, pipelines, planes, posebench, related, scale, scenes, speed, stress, verify)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m scripts.benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    for module in (cameras, estimators, pipelines, planes, posebench, related, stress):
+    for module in MODULES:
         module.add_arguments(commands)
     arguments = parser.parse_args()
     torch.set_num_threads(1)

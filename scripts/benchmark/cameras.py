@@ -1,17 +1,12 @@
-"""Pose, focal lengths and F by what is known of the cameras, beside PoseLib, COLMAP, OpenCV, kornia and SupeRANSAC.
+"""Pose, focal lengths and F by what is known of the cameras, beside PoseLib, COLMAP, OpenCV and kornia.
 
 A method is named as NAME:LEVEL[:KEY=VALUE,...]. Levels: known; rough (each focal length times a log-uniform factor of
 its own, 1/1.1 to 1.1, given with a deviation of 6 %); wrong (1.5 times too long, given as rough); one_sided (K0 alone);
 shared (one unknown focal length; of pairs of one camera alone); unknown. Peers take a calibration for exact. All
-methods get the same SIFT matches; P(inlier) and noise from the keypoints' frames are part of ours, and of its time. One
-thread; the methods take turns at each pair.
+methods get the same SIFT matches; P(inlier) and noise from the keypoints' frames are part of ours, and of its time.
 
-python -m scripts.benchmark cameras --root DATA/Strecha --root DATA/PhotoTourism --root DATA/KITTI --root DATA/TUM \\
-    --specs scripts/benchmark/cameras.txt --seeds 3 --rows rows.jsonl --table docs/tables/cameras.csv
-python -m scripts.benchmark cameras --root DATA/Strecha_train --root DATA/TanksLike --methods fmtorch:known
-
-The second command is of the scenes that thresholds are chosen on. --rows is appended to pair by pair: started again,
-the command measures what is missing.
+python -m scripts.benchmark cameras --root DATA/Strecha --root DATA/KITTI --specs scripts/benchmark/cameras.txt \\
+    --seeds 3 --rows rows.jsonl --table docs/tables/cameras.csv
 """
 
 from __future__ import annotations
@@ -19,8 +14,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
-import importlib
-import importlib.metadata
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -35,10 +28,10 @@ from fmtorch import presets
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data import ImagePair
 from fmtorch.estimators import PairwiseEstimator
-from fmtorch.pipeline.known_cameras import KnownCameras
+from fmtorch.two_view.known_cameras import KnownCameras
 from scripts.benchmark import pairs
 from scripts.benchmark.methods import build, options, read_specs
-from scripts.benchmark.runner import Item, Kept, Row, add_command, identity, judged, measure
+from scripts.benchmark.runner import Item, Kept, Measured, Row, add_command, identity, judged, measure
 from scripts.benchmark.tables import Record, Results, Sheet, show
 
 Array = NDArray[Any]
@@ -61,7 +54,7 @@ EXACT = ("known", "rough", "wrong")
 TAKES = {
     "fmtorch": tuple(LEVELS), "fmtorch_f": tuple(LEVELS), "poselib": (*EXACT, "shared"),
     "poselib_f": (*EXACT, "one_sided", "shared", "unknown"), "colmap": (*EXACT, "one_sided", "shared", "unknown"),
-    "colmap_f": EXACT, "opencv": EXACT, "kornia": EXACT, "superansac": EXACT,
+    "colmap_f": EXACT, "opencv": EXACT, "kornia": EXACT,
 }  # fmt: skip
 """The levels that each method takes; ``_f``: a fundamental matrix without cameras, of which the pose is taken."""
 
@@ -148,7 +141,7 @@ Solve = Callable[[Correspondences, Knowledge, int], Estimate]
 
 
 @dataclasses.dataclass(frozen=True)
-class CameraMethod:
+class CameraMethod(Measured):
     """An estimator that is given what a level tells of the cameras."""
 
     name: str
@@ -171,7 +164,6 @@ class CameraMethod:
         return cls(text, level, solve, identity(made_with, text, matches, Path(__file__).read_text()))
 
     def applies(self, item: Item) -> bool:
-        """Whether what the level takes for true holds."""
         return applies(self.level, item.pair)
 
     def figures(self, item: Item, seed: int) -> Row:
@@ -211,10 +203,9 @@ def _solver(name: str, level: str, changed: dict[str, Any]) -> tuple[Solve, list
         stages = [("estimator", kind, changed), *(("pruner", word, {}) for word in PRIOR)]
         return lambda c, given, seed: solve(functools.reduce(lambda x, stage: stage(x), prior, c), given, seed), stages
     if kind in ESSENTIAL:
-        importlib.metadata.version(PACKAGES[kind])  # that it is not installed is said at once
         solve = functools.partial(_with_cameras, ESSENTIAL[kind](**changed), exact=True)
         return functools.partial(_best_first, solve), []
-    usual = {"poselib": {"iterations": 5000, "prosac": True}, "colmap": {"two_view": not alone}}[kind]
+    usual: dict[str, Any] = {"iterations": 5000, "prosac": True} if kind == "poselib" else {"two_view": not alone}
     shared = {"shared_focal": True} if (name, level) == ("poselib", "shared") else {}
     changed = {**usual, **shared, **changed}
     try:
@@ -222,7 +213,9 @@ def _solver(name: str, level: str, changed: dict[str, Any]) -> tuple[Solve, list
     except ImportError as error:
         raise SystemExit(f"{name}: {error}") from error
     call = _decomposed if alone or shared else _with_cameras
-    return functools.partial(_best_first, functools.partial(call, estimator, exact=True)), [("estimator", kind, changed)]
+    return functools.partial(_best_first, functools.partial(call, estimator, exact=True)), [
+        ("estimator", kind, changed)
+    ]
 
 
 def _with_cameras(estimator: Any, c: Correspondences, given: Knowledge, seed: int, exact: bool) -> Estimate:
@@ -261,7 +254,7 @@ def _posed(estimate: Estimate, c: Correspondences, given: Knowledge) -> Estimate
             for x, K in ((c.x0, K0), (c.x1, K1))]  # fmt: skip
     normalised = [np.ascontiguousarray(each[:, :2]) for each in rays]
     far = 1e9  # baselines: OpenCV's own bound of 50 rejects short ones
-    _, R, t, _, _ = cv2.recoverPose(K1.T @ F @ K0, *normalised, np.eye(3), distanceThresh=far)
+    _, R, t, _, _ = cv2.recoverPose(K1.T @ F @ K0, normalised[0], normalised[1], np.eye(3), distanceThresh=far)
     pose = {"R": np.asarray(R), "t": np.asarray(t).ravel(), "focals": focals_of(K0, K1)}
     return estimate.replace(**{name: torch.from_numpy(np.asarray(v, np.float64))[None] for name, v in pose.items()})
 
@@ -286,7 +279,6 @@ def _squared_focal(G: Array) -> float:
         return float(-(row @ p) * (p @ G.T @ p) / (row @ D @ G.T @ p))
 
 
-PACKAGES = {"opencv": "opencv-python-headless", "kornia": "kornia", "superansac": "pysuperansac"}
 Essential = Callable[[Any, Array, Array], tuple[Any, Any]]  # a pair, K0 and K1 -> E and its inliers
 
 
@@ -324,24 +316,7 @@ def _kornia(threshold: float = 1.0, rounds: int = 10, prosac: bool = True) -> Pa
     return _essential("kornia", find)
 
 
-def _superansac(threshold: float = 1.5, iterations: int = 5000, sampler: str = "PROSAC", score: str = "MAGSAC") -> Any:
-    library = importlib.import_module("pysuperansac")
-
-    def find(pair: Any, K0: Array, K1: Array) -> tuple[Any, Any]:
-        settings = library.RANSACSettings()
-        settings.sampler, settings.scoring = getattr(library.SamplerType, sampler), getattr(library.ScoringType, score)
-        settings.inlier_threshold, settings.confidence = threshold, 0.9999
-        settings.min_iterations, settings.max_iterations = min(1000, iterations), iterations
-        sizes = [float(side) for size in (pair.size0, pair.size1) for side in size[::-1]]
-        E, indices, _, _ = library.estimateEssentialMatrix(pair.joined, K0, K1, sizes, config=settings)
-        return E, np.isin(np.arange(len(pair.x0)), indices)
-
-    return _essential("SupeRANSAC", find)
-
-
-ESSENTIAL: dict[str, Callable[..., PairwiseEstimator]] = {
-    "opencv": _opencv, "kornia": _kornia, "superansac": _superansac,
-}  # fmt: skip
+ESSENTIAL: dict[str, Callable[..., PairwiseEstimator]] = {"opencv": _opencv, "kornia": _kornia}
 
 
 def sheet(rows: Sequence[Row]) -> Sheet:
@@ -356,4 +331,6 @@ def sheet(rows: Sequence[Row]) -> Sheet:
         results = Results(sorted(own, key=lambda row: row["method"].split(":")[0] != "fmtorch"))
         lines = results.records(results.groups(results.all_pairs), columns, label="method", minus=["pose@5"])
         records += [{"known": level, "method": line.pop("method"), **line} for line in lines]
-    return Sheet("poses", "AUC of the larger pose error at 5, 10 and 20 degrees, recall and AUC@0.05 of F, in %", records)
+    return Sheet(
+        "poses", "AUC of the larger pose error at 5, 10 and 20 degrees, recall and AUC@0.05 of F, in %", records
+    )

@@ -11,7 +11,6 @@ python -m scripts.benchmark estimators --rendered full --specs scripts/benchmark
 
 --rows is appended to pair by pair: started again, the command goes on where it was interrupted, and measures what other
 seeds, pairs and estimators need. A row counts only for the code, options and learned files that it was made with.
-Estimators that were not measured in one run did not take turns, which their times may show.
 """
 
 from __future__ import annotations
@@ -48,7 +47,6 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument("--estimators", nargs="+", default=[], help="PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]")
     parser.add_argument("--specs", type=Path, help="a file with one estimator a line; # starts a comment")
     parser.add_argument("--ngransac", type=Path, help="NG-RANSAC's published weights (scripts/convert_ngransac.py)")
-    parser.add_argument("--baseline", type=Path, help="--rows of an earlier run, to compare recall and time with")
     parser = add_command(commands, "curves", run_curves, CURVES, seeds=1)
     pairs.add_match_options(parser)
     parser.add_argument("--specs", type=Path, default=FOLDER / "curves.txt", help="lines: CURVE | ESTIMATOR | VALUES")
@@ -63,9 +61,6 @@ def run(arguments: argparse.Namespace) -> None:
     rows = measured([spec for spec in specs if extra or NGRANSAC not in stages_of(spec)], arguments, extra)
     results = Results(rows)
     show([sheet(results)], arguments.table)
-    if arguments.baseline:
-        for line in compared(results, Results(Kept(arguments.baseline).rows)):
-            print(line)
 
 
 def measured(specs: Sequence[str], arguments: argparse.Namespace, extra: Mapping[str, Any] | None = None) -> list[Row]:
@@ -91,23 +86,10 @@ def sheet(results: Results) -> Sheet:
         results.groups(results.pairs()), (*merits, "ms", "time ratio"), label="estimator", minus=merits[1:]
     )
     seeds = min(results.seeds(name) for name in results.methods)
-    title = f"Recall at NSGD 0.05, at 0.01 and AUC@0.05 in %, mean of {seeds} seeds; lead: {results.methods[0]} minus this"
+    title = (
+        f"Recall at NSGD 0.05, at 0.01 and AUC@0.05 in %, mean of {seeds} seeds; lead: {results.methods[0]} minus this"
+    )
     return Sheet("recall", f"{title}; {results.described(results.pairs())}", records)
-
-
-def compared(now: Results, then: Results) -> list[str]:
-    """How recall and time of each estimator differ from an earlier run's, family by family."""
-    lines = []
-    for name in now.methods:
-        common = [pair for pair in now.pairs(name) if name in then.methods and pair in then.pairs(name)]
-        for family, own in now.groups(common).items():
-            get, before = now.get(name, own), then.get(name, own)
-            merits = {f: FIGURES[f].scale * float((FIGURES[f].of(get) - FIGURES[f].of(before)).mean())
-                      for f in ("R.05", "R.01", "AUC@0.05")}  # fmt: skip
-            merits["ms"] = float(np.median(get("ms")) - np.median(before("ms")))
-            changes = ", ".join(f"{figure} {change:+.2f}" for figure, change in merits.items())
-            lines.append(f"{family}, {name} against the baseline: {changes}")
-    return lines
 
 
 class Curve(NamedTuple):
@@ -154,7 +136,9 @@ def knee(curve: Curve, results: Results) -> str:
     """The cheapest estimator within KNEE_TOLERANCE of the best AUC@0.05, averaged over the families."""
     groups = results.groups(results.pairs())
     area = {spec: mean_area(results, spec) for spec in curve.specs}
-    cost = {spec: np.mean([results.get(spec, groups[f])("ms").mean() for f in results.families]) for spec in curve.specs}
+    cost = {
+        spec: np.mean([results.get(spec, groups[f])("ms").mean() for f in results.families]) for spec in curve.specs
+    }
     good = [spec for spec in curve.specs if area[spec] >= max(area.values()) - KNEE_TOLERANCE]
     return min(good, key=cost.__getitem__)
 

@@ -63,7 +63,9 @@ def draw(
             panel.grid(color=INK, alpha=0.25, linewidth=0.5)
             panel.spines[["top", "right"]].set_visible(False)
         axes[0].set_ylabel(ylabel)
-        handles = {label: handle for panel in axes for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)}
+        handles = {
+            label: handle for panel in axes for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)
+        }
         figure.legend(
             [handles[name] for name in names], names, loc="outside lower center", ncols=2, frameon=False, fontsize=8
         )

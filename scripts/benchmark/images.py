@@ -1,10 +1,4 @@
-"""Where the time of an image's features goes, beside kornia and OpenCV: processor milliseconds of calls that take turns.
-
-By stage, of the presets of --features; then our Hessian, patches, orientations and descriptions against kornia's and
-OpenCV's, on one thread, medians of the repeats.
-
-python -m scripts.benchmark features --image PHOTOGRAPH --size 1178 1766 --features hesaffnet hesaffnet_fast
-"""
+"""Where the time of images goes: processor milliseconds by stage, and pairs proposed by the likeness of images."""
 
 from __future__ import annotations
 
@@ -27,14 +21,14 @@ from fmtorch import presets
 from fmtorch.core.stages import pruned
 from fmtorch.data import ImagePair, read_image, to_grey
 from fmtorch.data.rendered.photographs import photograph
-from fmtorch.features import SIFT, DominantGradient, HessianDetector, ImagePyramid, LocalFeature, PatchSIFT
+from fmtorch.features import ImagePyramid, LocalFeature
 from fmtorch.features.vlad import codebook, descriptor_kind, load_codebook, local_descriptors, vlad
 from fmtorch.pipeline.pipeline import STAGES, Pipeline
 from fmtorch.pipeline.similar import similar_pairs
 from fmtorch.pipeline.two_images import describe
 from scripts.benchmark import pairs
 from scripts.benchmark.methods import pipeline_of
-from scripts.benchmark.runner import add_command, console, turns
+from scripts.benchmark.runner import add_command, console
 from scripts.benchmark.tables import Record, Sheet, show
 
 Image = NDArray[np.uint8]
@@ -42,21 +36,23 @@ Seconds = dict[str, float]
 Peer = Callable[[Image, Image, int], Seconds]
 PARTS = ("detection", "shape", "orientation", "description")
 RATIO = 0.8
-END_TO_END = """Whole pipelines by stage against the same stages written with OpenCV's and kornia's calls, one thread each.
+FEATURES = """Where the time of an image's features goes: processor milliseconds by stage, of presets that take turns.
 
-Ours and the peer take turns at each pair; medians of processor time are shown. The peer of `hesaffnet_gms` has kornia's
-Hessian detector, AffNet and HardNet (the same networks with random weights, which cost the same) for as many features
-as ours found, and no GMS, which neither library has; that of `sift_fmtorch` has USAC_MAGSAC.
+python -m scripts.benchmark features --image PHOTOGRAPH --size 1178 1766 --features hesaffnet hesaffnet_fast
+"""
+END_TO_END = """Whole pipelines by stage against the same stages written with OpenCV's and kornia's calls, in turn.
+
+The peer of `hesaffnet_gms` has kornia's Hessian detector, AffNet and HardNet (the same networks with random weights,
+which cost the same) for as many features as ours found, and no GMS, which neither library has.
 """
 SIMILAR = "How many of the pairs that can be matched `pairs=similar:N` proposes, all scenes mixed in one folder."
 
 
 def add_arguments(commands: Any) -> None:
-    parser = add_command(commands, "features", run_features, __doc__)
+    parser = add_command(commands, "features", run_features, FEATURES)
     parser.add_argument("--image", type=Path, help="default: a photograph of scikit-image")
     parser.add_argument("--size", type=int, nargs=2, default=(1024, 1536), help="the image is resized to (h, w)")
     parser.add_argument("--features", nargs="+", default=["hesaffnet", "hesaffnet_fast"], help="of conf/features")
-    parser.add_argument("--count", type=int, default=2048, help="features of the parts that are compared")
     parser.add_argument("--repeats", type=int, default=7)
     parser = add_command(commands, "end_to_end", run_end_to_end, END_TO_END)
     pairs.add_set_options(parser)
@@ -84,9 +80,8 @@ class Clock:
 
 def medians(seconds: list[Seconds]) -> Record:
     """Of each stage and of their sum, in milliseconds."""
-    every = [*seconds[0], "all"]
-    values = [[each.get(stage, sum(each.values())) for each in seconds] for stage in every]
-    return {f"{stage}, ms": f"{1e3 * np.median(v):.1f}" for stage, v in zip(every, values, strict=True)}
+    totals = [{**each, "all": sum(each.values())} for each in seconds]
+    return {f"{stage}, ms": f"{1e3 * np.median([each[stage] for each in totals]):.1f}" for stage in totals[0]}
 
 
 @torch.no_grad()
@@ -95,17 +90,9 @@ def run_features(arguments: argparse.Namespace) -> None:
     image = photograph("chelsea.png") if arguments.image is None else read_image(arguments.image)
     image = np.asarray(cv2.resize(image, (w, h), interpolation=cv2.INTER_CUBIC), np.uint8)
     features = {name: presets.build("features", name) for name in arguments.features}
-    by_name: dict[str, list[Seconds]] = {name: [] for name in features}
-    for _ in range(arguments.repeats + 1):
-        for name, feature in features.items():
-            by_name[name].append(by_stage(feature, image))
-    stages: list[Record] = [{"features": name, **medians(own[1:])} for name, own in by_name.items()]
-    parts: list[Record] = []
-    for part, calls in beside_peers(to_grey(image), arguments.count).items():
-        ms = turns(calls, arguments.repeats)
-        line: Record = {"part": part, **{f"{name}, ms": f"{np.median(values):.0f}" for name, values in ms.items()}}
-        parts.append(line | ({"kornia / ours": f"{np.median(ms['kornia'] / ms['ours']):.1f}"} if "kornia" in ms else {}))
-    show([Sheet("stages", f"{w} x {h}", stages), Sheet("time", f"{arguments.count} features", parts)], arguments.table)
+    turns = [{name: by_stage(each, image) for name, each in features.items()} for _ in range(arguments.repeats + 1)]
+    records: list[Record] = [{"features": name, **medians([turn[name] for turn in turns[1:]])} for name in features]
+    show([Sheet("stages", f"{w} x {h}", records)], arguments.table)
 
 
 def by_stage(feature: LocalFeature, image: Image) -> Seconds:
@@ -121,41 +108,6 @@ def by_stage(feature: LocalFeature, image: Image) -> Seconds:
     feature.describe(image, lafs)
     clock.stage("description")
     return clock.seconds
-
-
-def beside_peers(grey: Image, n: int) -> dict[str, dict[str, Callable[[], Any]]]:
-    """Parts of features with the same input, ours and others'."""
-    tensor = torch.from_numpy(grey)[None, None].float() / 255
-    lafs, pyramid = HessianDetector(n).detect(grey)[0], ImagePyramid(grey)
-    patches = pyramid.extract(lafs)
-    dog, opencv = SIFT(max_features=n), cv2.SIFT.create(n)
-    dog_lafs, keypoints = dog.detect(grey)[0], opencv.detect(grey)
-    blob = KF.ScaleSpaceDetector(n, resp_module=KF.BlobHessian())
-    orientation, description = KF.PatchDominantGradientOrientation(32), KF.SIFTDescriptor(32)
-    hesaffnet, peer = presets.build("features", "hesaffnet", max_features=n), kornia_hesaffnet(n)
-    return {
-        "detection": {
-            "ours": lambda: HessianDetector(n).detect(grey), "kornia": lambda: blob(tensor),
-            "OpenCV": lambda: dog.detect(grey),
-        },
-        "patches": {
-            "ours": lambda: ImagePyramid(grey).extract(lafs),
-            "kornia": lambda: KF.extract_patches_from_pyramid(tensor, lafs[None]),
-        },
-        "orientation": {"ours": lambda: DominantGradient()(pyramid, lafs), "kornia": lambda: orientation(patches)},
-        "SIFT description": {
-            "ours": lambda: PatchSIFT()(ImagePyramid(grey), dog_lafs), "kornia": lambda: description(patches),
-            "OpenCV": lambda: opencv.compute(grey, keypoints),
-        },
-        "HesAffNet": {"ours": lambda: hesaffnet(grey), "kornia": lambda: peer(tensor)},
-    }  # fmt: skip
-
-
-def kornia_hesaffnet(n: int) -> torch.nn.Module:
-    """kornia's Hessian, AffNet, dominant gradient and HardNet for n features, with random weights."""
-    shape = KF.LAFAffNetShapeEstimator(False, preserve_orientation=False)
-    detector = KF.ScaleSpaceDetector(n, resp_module=KF.BlobHessian(), aff_module=shape, ori_module=KF.LAFOrienter(32))
-    return KF.LocalFeature(detector, KF.LAFDescriptor(KF.HardNet(False))).eval()
 
 
 @torch.no_grad()
@@ -174,7 +126,7 @@ def run_end_to_end(arguments: argparse.Namespace) -> None:
         ratio = np.median([sum(b.values()) / sum(a.values()) for a, b in zip(ours[1:], theirs[1:], strict=True)])
         records.append({"pipeline": name, **medians(ours[1:]), "time / ours": "1.0"})
         records.append({"pipeline": title, **medians(theirs[1:]), "time / ours": f"{ratio:.1f}"})
-    show([Sheet("end_to_end", f"Medians a pair, {len(every)} pairs", records)], arguments.table)
+    show([Sheet("end_to_end", f"Medians of {len(every)} pairs", records)], arguments.table)
 
 
 def own_stages(pipeline: Pipeline, pair: ImagePair, image0: Image, image1: Image) -> tuple[Seconds, int]:
@@ -211,7 +163,10 @@ def opencv_stages(method: int, threshold: float, image0: Image, image1: Image, f
 
 def kornia_stages(image0: Image, image1: Image, features: int) -> Seconds:
     """kornia's HesAffNet and matcher with the ratio test, OpenCV's LMedS."""
-    hesaffnet = kornia_hesaffnet(features)
+    shape = KF.LAFAffNetShapeEstimator(False, preserve_orientation=False)
+    hessian = KF.BlobHessian()
+    detector = KF.ScaleSpaceDetector(features, resp_module=hessian, aff_module=shape, ori_module=KF.LAFOrienter(32))
+    hesaffnet = KF.LocalFeature(detector, KF.LAFDescriptor(KF.HardNet(False))).eval()
     clock = Clock(STAGES)
     extracted = [hesaffnet(torch.from_numpy(to_grey(image))[None, None].float() / 255) for image in (image0, image1)]
     clock.stage("features")
@@ -225,36 +180,34 @@ def kornia_stages(image0: Image, image1: Image, features: int) -> Seconds:
     return clock.seconds
 
 
+LMEDS, MAGSAC = (functools.partial(opencv_stages, *of) for of in ((cv2.FM_LMEDS, 1.0), (cv2.USAC_MAGSAC, 0.25)))
 PEERS: dict[str, tuple[str, Peer]] = {
-    "sift_ratio estimator=lmeds_eight_point": (
-        "OpenCV: SIFT, BFMatcher, FM_LMEDS", functools.partial(opencv_stages, cv2.FM_LMEDS, 1.0)
-    ),
-    "sift_fmtorch": (
-        "OpenCV: SIFT, BFMatcher, USAC_MAGSAC", functools.partial(opencv_stages, cv2.USAC_MAGSAC, 0.25)
-    ),
+    "sift_ratio estimator=lmeds_eight_point": ("OpenCV: SIFT, BFMatcher, FM_LMEDS", LMEDS),
+    "sift_fmtorch": ("OpenCV: SIFT, BFMatcher, USAC_MAGSAC", MAGSAC),
     "hesaffnet_gms": ("kornia: HesAffNet, match_snn; OpenCV: FM_LMEDS", kornia_stages),
-}  # fmt: skip
+}
 
 
 def run_similar(arguments: argparse.Namespace) -> None:
     images = {root: images_of(root) for root in sorted(arguments.root)}
     paths = [path for of_root in images.values() for path in of_root.values()]
     overlapping = {pair: scene for root in images for scene, pair in overlaps(root, images[root])}
-    pipeline: Pipeline = presets.pipeline(arguments.pipeline)
+    pipeline = pipeline_of(arguments.pipeline)
     kind = descriptor_kind((presets.pipeline_stages(arguments.pipeline) or {})["features"])
     book = codebook(kind) if arguments.codebook is None else load_codebook(arguments.codebook)
     described = [describe(pipeline, read_image(path), 1600).features.descriptors for path in paths]
     start = time.process_time()
     vectors = torch.stack([vlad(local_descriptors(descriptors, kind), book) for descriptors in described])
-    print(f"{len(paths)} images; {1e3 * (time.process_time() - start) / len(paths):.1f} s for a thousand once described")
-    total = Counter(overlapping.values())
+    print(
+        f"{len(paths)} images; {1e3 * (time.process_time() - start) / len(paths):.1f} s for a thousand once described"
+    )
+    proposed = {n: {frozenset(pair) for pair in similar_pairs(paths, vectors, n)} for n in arguments.count}
     records: list[Record] = []
-    for scene, count in [*total.items(), ("all", len(overlapping))]:
+    for scene, count in [*Counter(overlapping.values()).items(), ("all", len(overlapping))]:
         line: Record = {"scene": scene, "overlapping pairs": count}
-        for n in arguments.count:
-            proposed = {frozenset(pair) for pair in similar_pairs(paths, vectors, n)}
-            hits = sum(pair in proposed for pair, of in overlapping.items() if scene in (of, "all"))
-            line |= {f"similar:{n}, recall, %": f"{100 * hits / count:.0f}", f"similar:{n}, pairs": len(proposed)}
+        for n, chosen in proposed.items():
+            hits = sum(pair in chosen for pair, of in overlapping.items() if scene in (of, "all"))
+            line |= {f"similar:{n}, recall, %": f"{100 * hits / count:.0f}", f"similar:{n}, pairs": len(chosen)}
         records.append(line)
     show([Sheet("similar", f"Pairs proposed, of {len(paths) * (len(paths) - 1) // 2}", records)], arguments.table)
 

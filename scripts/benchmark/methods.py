@@ -1,8 +1,7 @@
 """Methods that are named in one word, PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...], or as a pipeline with overrides.
 
-A pruner may have options, too. Beside presets there are the estimators `truth`, the fit that starts from the true
-matrix and so what the matches allow, and `early_gc_ransac`; without an estimator, as in `@gms`, pruners alone are meant.
-Stages that are no presets take something away from an estimator or are another's: see `EXTRA`.
+Pruners may have options, too. The estimator `truth` is the fit that starts from the true matrix, and so what the
+matches allow; without an estimator, as in `@gms`, pruners alone are meant.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import cv2
 import torch
 
 from fmtorch import presets
@@ -21,12 +19,12 @@ from fmtorch.core.stages import Estimator, Pruner
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data import ImagePair
 from fmtorch.geometry import refine
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets.composition import compose
-from scripts.benchmark.early_gc_ransac import EarlyGCRansac
 from scripts.benchmark.runner import Method, identity
 
-TRUTH, EARLY, NGRANSAC = "truth", "early_gc_ransac", "ngransac"
+TRUTH, NGRANSAC = "truth", "ngransac"
 SHARED = frozenset(("ratio", "one_to_one"))  # pruners that nearly all pipelines have, whose time does not count
 NO_STAGES: Mapping[str, Pruner] = {}
 
@@ -65,13 +63,9 @@ def split(word: str) -> tuple[str, dict[str, Any]]:
 
 
 def build(group: str, word: str) -> Any:
-    """The part of ``PRESET[:KEY=VALUE,...]``, or one of `EXTRA`."""
+    """The part of ``PRESET[:KEY=VALUE,...]``, or one of `WITHHELD`."""
     name, changed = split(word)
-    if group == "pruner" and name in EXTRA:
-        return EXTRA[name]
-    if (group, name) == ("estimator", EARLY):
-        return EarlyGCRansac(**changed).estimator()
-    return presets.build(group, name, **changed)
+    return WITHHELD[name] if name in WITHHELD else presets.build(group, name, **changed)
 
 
 def stages_of(spec: str) -> list[str]:
@@ -83,14 +77,10 @@ def method(spec: str, matches: str = "", extra: Mapping[str, Pruner] = NO_STAGES
     """The method of a spec on given matches. matches: what these depend on; extra: further stages by name."""
     word, names = spec.partition("@")[0], stages_of(spec)
     stages = {name: extra[name] if name in extra else build("pruner", name) for name in names}
-    name, changed = split(word)
-    own = [] if name in (TRUTH, EARLY) else [("estimator", name, changed)]
-    own += [("pruner", *split(stage)) for stage in names if stage not in {*extra, *EXTRA}]
+    own = [] if word == TRUTH else [("estimator", *split(word))]
+    own += [("pruner", *split(stage)) for stage in names if stage not in {*extra, *WITHHELD}]
     others = [part for stage in names for part in (stage, stages[stage])]
-    if name == TRUTH:
-        solve = from_truth
-    else:
-        solve = functools.partial(_estimated, build("estimator", word))
+    solve = from_truth if word == TRUTH else functools.partial(_estimated, build("estimator", word))
     return Method(spec, identity(own, word, matches, *others), lambda family: stages, solve)
 
 
@@ -113,38 +103,29 @@ def from_truth(pair: ImagePair, c: Correspondences, seed: int) -> Estimate:
         F = refine(F, c.x0, c.x1, c.prior, c.mask, kernel="geman_mcclure", scale=scale, iterations=20)
     ok = torch.isfinite(F).all(-1).all(-1)
     reason = "" if bool(ok) else "no fit"
-    return Estimate(torch.where(ok[:, None, None], F, 0.0), c.mask & ok[:, None], ok, (reason,), torch.zeros(1, dtype=torch.int64))
+    return Estimate(
+        torch.where(ok[:, None, None], F, 0.0), c.mask & ok[:, None], ok, (reason,), torch.zeros(1, dtype=torch.int64)
+    )
 
 
 def pipeline_of(words: str, *overrides: str) -> Pipeline:
     """The pipeline of ``PRESET[ NAME=VALUE...]``, such as ``sift_ratio estimator=msac``, with further overrides."""
     name, *own = words.split()
-    pipeline: Pipeline = presets.pipeline(name, overrides=[*own, *overrides])
-    return pipeline
+    return load_pipeline(name, overrides=[*own, *overrides])
 
 
 def pipeline_method(name: str, words: str, *overrides: str) -> tuple[Method, Pipeline, str]:
-    """A pipeline as a method, what makes its matches, and the digest of that; words after ``+`` are further pruners.
-
-    Estimators that are no presets are named by ``estimator=truth`` and ``estimator=early_gc_ransac:KEY=VALUE,...``.
-    """
+    """A pipeline as a method, what makes its matches, and the digest of that; words after ``+`` are further pruners."""
     words, *more = (part.strip() for part in words.split(" + "))
-    preset, *own = words.split()
-    special = [word.removeprefix("estimator=") for word in own if word.startswith((f"estimator={TRUTH}", f"estimator={EARLY}"))]
-    changed = [word for word in own if word.removeprefix("estimator=") not in special] + list(overrides)
+    preset, *changed = [*words.split(), *overrides]
     pipeline = pipeline_of(preset, *changed)
     config = presets.stages(compose("match", (f"pipeline={preset}", *changed)))
     front = identity([], config["features"], config["matcher"], pipeline.extractor)
     added = {word: build("pruner", word) for word in more}
-    estimator = pipeline.estimator
-    solve: Any = functools.partial(_estimated, estimator)
-    if special:
-        solve = from_truth if special[0] == TRUTH else functools.partial(_estimated, build("estimator", special[0]))
-    made_with = [part for entry in config["pruner"] for part in entry.values()]
-    digest = identity(
-        [("pruner", *split(word)) for word in more], *made_with, config["estimator"], front, *special,
-        *pipeline.pruners.values(), str(pipeline.families), *added.values(),
-    )  # fmt: skip
+    configs = [config["estimator"], *(part for entry in config["pruner"] for part in entry.values())]
+    parts = [*pipeline.pruners.values(), *added.values()]
+    digest = identity([("pruner", *split(word)) for word in more], *configs, front, str(pipeline.families), *parts)
+    solve = functools.partial(_estimated, pipeline.estimator)
     made = Method(name, digest, lambda family: {**pipeline.pruners_of(family), **added}, solve, untimed=SHARED)
     return made, pipeline, front
 
@@ -169,20 +150,5 @@ def ratioless(c: Correspondences) -> Correspondences:
     return c.replace(quality=None)
 
 
-def opencv_gms(c: Correspondences) -> Correspondences:
-    """OpenCV's GMS of a batch of one, which opencv-contrib has."""
-    if not hasattr(cv2, "xfeatures2d"):
-        raise SystemExit("opencv_gms needs cv2.xfeatures2d: run the benchmark where opencv-contrib-python is installed")
-    assert c.size0 is not None
-    assert c.size1 is not None
-    sizes = [(int(size[0, 1]), int(size[0, 0])) for size in (c.size0, c.size1)]
-    keypoints = [[cv2.KeyPoint(float(x), float(y), 1.0) for x, y in points[0]] for points in (c.x0, c.x1)]
-    matches = [cv2.DMatch(i, i, 0.0) for i in range(c.mask.shape[1])]
-    kept = torch.zeros_like(c.mask)
-    kept_by_peer = cv2.xfeatures2d.matchGMS(*sizes, *keypoints, matches, False, False, 4.0)
-    kept[0, [match.queryIdx for match in kept_by_peer]] = True
-    return c.keep(kept)
-
-
-EXTRA: dict[str, Pruner] = {"sizeless": sizeless, "ratioless": ratioless, "opencv_gms": opencv_gms}
-"""Stages that are no presets: what an estimator is not given, and another library's pruner, for timing."""
+WITHHELD: dict[str, Pruner] = {"sizeless": sizeless, "ratioless": ratioless}
+"""Stages that are no presets: what an estimator is not given."""

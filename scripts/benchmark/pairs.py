@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import functools
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from unittest import mock
 
 import numpy as np
@@ -16,14 +17,14 @@ import torch
 from fmtorch import data, presets
 from fmtorch.core.types import Correspondences, Estimate, pair_key
 from fmtorch.data import ImagePair, ImageSource, PairDataset
-from fmtorch.data.baselines import WIDE
 from fmtorch.data.pairs import GivenMatches
 from fmtorch.data.rendered import RenderedPairs, generate, photographs
 from fmtorch.evaluation.run import select
+from fmtorch.geometry import fundamental_from_calibration
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.storage.features import cached
 from scripts.benchmark import methods
-from scripts.benchmark.runner import Item, identity
+from scripts.benchmark.runner import Item, Stages, identity
 
 SIZE = (768, 1024)  # (h, w) of synthetic pairs
 UNRELATED = "unrelated"  # what the names of families of pairs of different scenes begin with
@@ -72,7 +73,7 @@ def front_of(features: str, pruners: Iterable[str], cache: str = "off", memory: 
 
 def matches_identity(arguments: argparse.Namespace) -> str:
     """The digest of what the matches of `matched` depend on, but for the images."""
-    stages = [("features", arguments.features, {}), ("matcher", "nearest", {})]
+    stages: Stages = [("features", arguments.features, {}), ("matcher", "nearest", {})]
     stages += [("pruner", *methods.split(word)) for word in arguments.pruners]
     return identity(stages, *(presets.build(group, name, **changed) for group, name, changed in stages))
 
@@ -95,34 +96,21 @@ def no_estimator(c: Correspondences, seed: int = 0) -> Estimate:
     raise NotImplementedError("matches alone are asked for")
 
 
-def points_alone(c: Correspondences) -> GivenMatches:
-    """Matches as those give them who tell nothing but points and image sizes."""
-    plain = Correspondences(c.x0, c.x1, c.mask, size0=c.size0, size1=c.size1, key=c.key)
-    return GivenMatches(plain, (c.mask.shape[1],) * 2)
-
-
-def is_wide(family: str) -> bool:
-    """Whether a family has wide baselines."""
-    return family in WIDE
-
-
-def synthetic_pair(index: int, matches: int, spread: float = 0.5) -> Correspondences:
-    """Matches of a cloud of points seen by two cameras, with outliers, ratios and similarity frames.
+def synthetic_pair(index: int, matches: int, spread: float = 0.5) -> ImagePair:
+    """Two views of a cloud of points, with their matches: with outliers, ratios and similarity frames.
 
     Their number is log-normal about `matches`; 30 to 80 % of them are right, with a noise of 0.5 px.
     """
-    rng = np.random.default_rng(index)
+    f, (h, w), rng = 1.2 * SIZE[1], SIZE, np.random.default_rng(index)
     n = max(20, round(matches * np.exp(spread * rng.normal())))
-    h, w = SIZE
-    f = 1.2 * w
-    depth = rng.uniform(4, 12, n)
-    x0 = rng.uniform([0, 0], [w, h], (n, 2))
-    X = np.concatenate([(x0 - [w / 2, h / 2]) / f, np.ones((n, 1))], 1) * depth[:, None]
+    depth, x0 = rng.uniform(4, 12, n), rng.uniform([0, 0], [w, h], (n, 2))
     roll, yaw = rng.uniform(-0.3, 0.3, 2)
-    R = np.array([[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]])
-    turn = np.array([[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]])
-    moved = X @ R.T + [-8 * np.sin(yaw) + rng.uniform(-1, 1), rng.uniform(-0.3, 0.3), rng.uniform(-0.5, 0.5)]
-    x1 = f * (moved[:, :2] / moved[:, 2:]) @ turn.T + [w / 2, h / 2]
+    turn = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
+    R = turn @ np.array([[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]])
+    t = turn @ (rng.uniform([-1, -0.3, -0.5], [1, 0.3, 0.5]) - [8 * np.sin(yaw), 0, 0])
+    K = np.array([[f, 0, w / 2], [0, f, h / 2], [0, 0, 1]])
+    moved = np.c_[x0, np.ones(n)] @ np.linalg.inv(K).T * depth[:, None] @ R.T + t
+    x1 = (moved @ K.T)[:, :2] / moved[:, 2:]
     wrong = rng.random(n) > rng.uniform(0.3, 0.8)
     x1[wrong] = rng.uniform([0, 0], [w, h], (int(wrong.sum()), 2))
     x0, x1 = (x + rng.normal(0, 0.5, (n, 2)) for x in (x0, x1))
@@ -130,11 +118,22 @@ def synthetic_pair(index: int, matches: int, spread: float = 0.5) -> Corresponde
     angle = np.where(wrong, rng.uniform(-np.pi, np.pi, n), roll + rng.normal(0, 0.1, n))
     scale = np.where(wrong, np.exp(rng.normal(0, 0.7, n)), depth / moved[:, 2].clip(1) * np.exp(rng.normal(0, 0.1, n)))
     size = np.exp(rng.normal(1.5, 0.5, n))
-    return Correspondences(
+    image = ImageSource("none", Path("none.png"))  # not looked at
+    F = fundamental_from_calibration(*(torch.from_numpy(each) for each in (K, K, R, t))).numpy()
+    pair = ImagePair(f"synthetic/{index}", "synthetic", f"{index}", image, image, F, K, K, R, t)
+    c = Correspondences(
         _tensor(x0), _tensor(x1), torch.ones(1, n, dtype=torch.bool), quality=_tensor(ratio),
         lafs0=_tensor(_frames(x0, size, np.zeros(n))), lafs1=_tensor(_frames(x1, size * scale, angle)),
-        size0=torch.tensor([SIZE]), size1=torch.tensor([SIZE]), key=torch.tensor([index + 1]),
+        size0=torch.tensor([SIZE]), size1=torch.tensor([SIZE]), key=torch.tensor([pair.key]),
     )  # fmt: skip
+    return dataclasses.replace(pair, matches=functools.partial(GivenMatches, c, (n, n)))
+
+
+def synthetic_matches(index: int, matches: int, spread: float = 0.5) -> Correspondences:
+    """The matches of `synthetic_pair`, a batch of one."""
+    pair = synthetic_pair(index, matches, spread)
+    assert pair.matches is not None
+    return pair.matches().correspondences
 
 
 def _frames(x: np.ndarray, size: np.ndarray, angle: np.ndarray) -> np.ndarray:

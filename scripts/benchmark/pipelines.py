@@ -1,16 +1,12 @@
 """Pipelines on the same pairs: recall, inlier rates and counts by set, beside the paper's figures; paired differences.
 
-Each of these benchmarks is a page of settings, the file of its name in this folder: the pipelines with their names in the
-tables, as PRESET NAME=VALUE ..., what is shown of them, and which are compared. --pipelines takes some of them, by
-their names or patterns such as 'sift*', or others, as 'NAME = PRESET NAME=VALUE ...'; `+ STAGE` at the end of one adds
-a pruner. The time of pruners is that of all but `ratio` and `one_to_one`, on one thread.
+Each of these benchmarks is a page of settings, the YAML file of its name in this folder: pipelines with their names in
+the tables, as PRESET NAME=VALUE ..., what is shown of them, and which are compared. --pipelines takes some of them, by
+names or patterns such as 'sift*', or others, as 'NAME = PRESET NAME=VALUE ...'; `+ PRUNER` at the end of one adds one.
+The time of pruners is that of all but `ratio` and `one_to_one`, on one thread.
 
 python -m scripts.benchmark pipelines --root DATA/Strecha --root DATA/PhotoTourism --rows features.jsonl
 python -m scripts.benchmark pruning --rendered full --limit 50 --pipelines RATIO 'mine = sift_ratio pruner=[ratio,lpm]'
-python -m scripts.benchmark learned --rows rows.jsonl --table docs/tables/learned.csv
-
---rows is appended to pair by pair: started again, the command goes on where it was interrupted; without a set it shows
-what is there. A row counts only for the options, code and learned files that it was made with.
 """
 
 from __future__ import annotations
@@ -26,11 +22,12 @@ import yaml  # type: ignore[import-untyped]
 
 from fmtorch.data import ImagePair, read_image, to_grey
 from fmtorch.data.matchable import keypoints, matchable
+from fmtorch.evaluation.run import select
 from fmtorch.features import ASIFT
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from scripts.benchmark import pairs
 from scripts.benchmark.methods import pipeline_method
-from scripts.benchmark.runner import Item, Kept, Method, Row, add_command, measure
+from scripts.benchmark.runner import Item, Kept, Measured, Method, Row, add_command, measure
 from scripts.benchmark.tables import KIN, Published, Record, Results, Sheet, published, show
 
 FOLDER = Path(__file__).parent
@@ -52,13 +49,17 @@ def add_arguments(commands: Any) -> None:
         about = f"{settings['about']}\n\n{(__doc__ or '').partition(chr(10))[2]}"
         parser = add_command(commands, name, functools.partial(run, settings), about, seeds=settings.get("seeds", 1))
         pairs.add_set_options(parser)
-        parser.add_argument("--asift-limit", type=int, default=10, help="the same of pipelines with ASIFT, a minute a pair")
+        parser.add_argument(
+            "--asift-limit", type=int, default=10, help="the same of pipelines with ASIFT, a minute a pair"
+        )
         add_pipeline_options(parser)
 
 
 def add_pipeline_options(parser: argparse.ArgumentParser) -> None:
     """Which pipelines, with which options."""
-    parser.add_argument("--pipelines", nargs="*", default=["*"], help="names or patterns of the settings, or NAME = WORDS")
+    parser.add_argument(
+        "--pipelines", nargs="*", default=["*"], help="names or patterns of the settings, or NAME = WORDS"
+    )
     parser.add_argument("--overrides", nargs="*", default=[], help="of each pipeline, e.g. features.precision=int8")
     parser.add_argument("--label", default="", help="appended to the pipelines' names in the tables")
     parser.add_argument("--cache", default="null", help="folder of features; null: the user's; off: nowhere")
@@ -98,7 +99,7 @@ def measured(chosen: Mapping[str, str], every: Sequence[ImagePair], arguments: A
     for front, methods in by_front(chosen, arguments):
         own = every
         if isinstance(getattr(front.extractor, "extractor", front.extractor), ASIFT):
-            own = pairs.select(every, arguments.asift_limit)
+            own = select(every, arguments.asift_limit)
         rows += measure(methods, pairs.items(own, front), arguments.seeds, kept, methods[0].name)
     return rows
 
@@ -117,7 +118,7 @@ def by_front(chosen: Mapping[str, str], arguments: argparse.Namespace) -> Iterat
     yield from groups.values()
 
 
-class Rule:
+class Rule(Measured):
     """Whether the paper's rule would select a pair, as a method."""
 
     name, identity = RULE, ""
@@ -125,12 +126,9 @@ class Rule:
     def __init__(self) -> None:
         self._keypoints = functools.lru_cache(maxsize=64)(lambda path: keypoints(to_grey(read_image(path))))
 
-    def applies(self, item: Item) -> bool:
-        return True
-
     def figures(self, item: Item, seed: int) -> Row:
-        ends = (self._keypoints(image) for image in (item.pair.image0, item.pair.image1))
-        return {"selected": bool(matchable(*ends, item.pair.F))}
+        a, b = (self._keypoints(image) for image in (item.pair.image0, item.pair.image1))
+        return {"selected": bool(matchable(a, b, item.pair.F))}
 
 
 def judged_by_rule(every: Sequence[ImagePair], kept: Kept) -> list[Row]:
@@ -154,7 +152,10 @@ def figures_sheet(results: Results, settings: Mapping[str, Any], selected: set[s
                 apart = [pair for pair in own if (pair in selected) == inside]
                 record[f"%Recall, {head}"] = results.cell(record["pipeline"], apart, "R.05")
         if theirs := _papers(paper, settings, record["set"], record["pipeline"]):
-            record |= {"paper's set": KIN[record["set"]], **{f"paper: {c}": theirs[field] for c, field in PAPER.items()}}
+            record |= {
+                "paper's set": KIN[record["set"]],
+                **{f"paper: {c}": theirs[field] for c, field in PAPER.items()},
+            }
     title = f"{settings['about']}: {results.described(results.all_pairs)}"
     return Sheet("figures", title, records)
 
@@ -169,7 +170,9 @@ def _papers(paper: Published, settings: Mapping[str, Any], family: str, name: st
 def differences_sheet(results: Results, settings: Mapping[str, Any]) -> Sheet:
     """What one pipeline has more than another on the pairs that both have, of each set."""
     paper = published(FOLDER / settings["published"] if "published" in settings else None)
-    two = [(first, second) for first, second in settings.get("differences", []) if {first, second} <= set(results.methods)]
+    two = [
+        (first, second) for first, second in settings.get("differences", []) if {first, second} <= set(results.methods)
+    ]
     labelled = [(name, base) for name in results.methods for base in results.methods if name.startswith(f"{base} ")]
     records = []
     for group, every in results.groups(results.all_pairs).items():

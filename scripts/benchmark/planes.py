@@ -19,7 +19,6 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -32,12 +31,12 @@ from fmtorch.core.estimate import CONFIGURATIONS
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.estimators.peers import colmap
 from fmtorch.geometry import poses_from_homography
-from fmtorch.pipeline.configuration import classify
-from fmtorch.pipeline.known_cameras import KnownCameras
+from fmtorch.two_view.known_cameras import KnownCameras
+from fmtorch.two_view.pair_type import classify
 from scripts.benchmark import pairs
 from scripts.benchmark.methods import options
 from scripts.benchmark.photographs import Array, Plane, add_options, kinds, mapped, paths_of, points, views, warped
-from scripts.benchmark.runner import Item, Kept, Row, add_command, console, measure, milliseconds
+from scripts.benchmark.runner import Item, Kept, Measured, Row, add_command, console, measure, milliseconds
 from scripts.benchmark.tables import Record, Results, Sheet, show
 
 Solver = Callable[[Correspondences, int], Array | None]
@@ -87,7 +86,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 @dataclasses.dataclass(frozen=True)
-class Homography:
+class Homography(Measured):
     """An estimator of homographies."""
 
     name: str
@@ -104,9 +103,6 @@ class Homography:
             return cls(word, functools.partial(_poselib, float(setting)))
         return cls(word, functools.partial(_opencv, getattr(cv2, name.upper()), float(setting)))
 
-    def applies(self, item: Item) -> bool:
-        return True
-
     def figures(self, item: Item, seed: int) -> Row:
         """The mean error in pixels, infinite where there is no homography, and milliseconds."""
         assert isinstance(item, Plane)
@@ -121,7 +117,7 @@ class Homography:
 
 
 def _ours(changed: dict[str, Any], c: Correspondences, seed: int) -> Array | None:
-    given = {"mask": c.mask, "quality": c.quality, "prior": c.prior, "noise": c.noise, "key": c.key}
+    given: dict[str, Any] = {"mask": c.mask, "quality": c.quality, "prior": c.prior, "noise": c.noise, "key": c.key}
     estimate = find_homography(c.x0, c.x1, seed=seed, **given, **changed)
     return estimate.H[0].numpy() if bool(estimate.ok[0]) else None
 
@@ -199,7 +195,9 @@ def kinds_sheet(items: Sequence[Item], verdicts: dict[str, list[str]]) -> Sheet:
     for name, said in verdicts.items():
         groups: dict[tuple[str, str], list[str]] = {}
         for item, kind in zip(items, said, strict=True):
-            groups.setdefault((f"{item.pair.family}/{item.pair.scene}" if item.images else item.pair.family, item.facts["truth"]), []).append(kind)
+            groups.setdefault(
+                (f"{item.pair.family}/{item.pair.scene}" if item.images else item.pair.family, item.facts["truth"]), []
+            ).append(kind)
         for (group, truth), own in groups.items():
             line: Record = {"method": name, "pairs of": group, "truth": truth, "pairs": len(own)}
             line |= {kind: own.count(kind) for kind in CONFIGURATIONS}
@@ -218,7 +216,9 @@ def pose_sheet(items: Sequence[Item], said: Sequence[str]) -> Sheet:
     for (family, kind), errors in groups.items():
         line: Record = {"set": family, "kind": kind, "pairs": len(errors)}
         areas = 100 * metrics.pose_auc(torch.from_numpy(np.stack(errors, 1)))
-        for name, own in zip(("from F", "from H, the first pose", "from H, the better one"), areas.tolist(), strict=True):
+        for name, own in zip(
+            ("from F", "from H, the first pose", "from H, the better one"), areas.tolist(), strict=True
+        ):
             line |= {f"{name} @{t}": f"{area:.1f}" for t, area in zip((5, 10, 20), own, strict=True)}
         records.append(line)
     return Sheet("poses", "AUC of the pose error, in %", records)
@@ -230,7 +230,7 @@ def pose_errors(c: Correspondences, R: torch.Tensor, t: torch.Tensor) -> Array:
     assert c.K1 is not None
     estimate = presets.build("estimator", "fmtorch")(c, 0)
     from_F = metrics.fundamental_pose_error(estimate.F, c.K0, c.K1, c.x0, c.x1, R[None], t[None], estimate.inliers)
-    given = {"mask": c.mask, "quality": c.quality, "prior": c.prior, "noise": c.noise, "key": c.key}
+    given: dict[str, Any] = {"mask": c.mask, "quality": c.quality, "prior": c.prior, "noise": c.noise, "key": c.key}
     H = find_homography(c.x0, c.x1, **given)
     poses = poses_from_homography(H.F, c.K0, c.K1, c.x0.double(), c.x1.double(), H.inliers)
     seen = torch.where(poses.valid[..., None, None], poses.R, torch.nan)

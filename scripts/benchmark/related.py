@@ -59,7 +59,9 @@ def run(arguments: argparse.Namespace) -> None:
 def by_pipeline(rows: Sequence[Row]) -> Rows:
     """The rows of each pipeline, of equals the last."""
     newest = {(row["method"], row["pair"]): row for row in rows}
-    return {name: [row for row in newest.values() if row["method"] == name] for name in dict.fromkeys(m for m, _ in newest)}
+    return {
+        name: [row for row in newest.values() if row["method"] == name] for name in dict.fromkeys(m for m, _ in newest)
+    }
 
 
 def true(row: Row) -> bool:
@@ -107,7 +109,10 @@ def rates_sheet(rows: Rows) -> Sheet:
         for rule, accepts in RULES.items():
             line[f"{rule}: accepted, %"] = percent([accepts(r) for r in unrelated])
             line[f"{rule}: rejected, %"] = percent([not accepts(r) for r in right])
-        line |= {"area": f"{area(right, unrelated, significance):.5f}", "area by inliers": f"{area(right, unrelated, inliers):.5f}"}
+        line |= {
+            "area": f"{area(right, unrelated, significance):.5f}",
+            "area by inliers": f"{area(right, unrelated, inliers):.5f}",
+        }
         records.append(line)
     title = f"At level {RELATED:g}: unrelated pairs accepted and right ones (NSGD < {RIGHT}) rejected"
     return Sheet("rates", title, records)
@@ -168,7 +173,7 @@ def roc(rows: Sequence[Row], figure: Callable[[Row], float]) -> tuple[NDArray[np
 
 
 def draw(rows: Rows, path: Path) -> None:
-    """The ROC curves: a panel for each way to judge pairs, a line for each pipeline, a dot at the level of `related`."""
+    """The ROC curves: a panel for each way to judge pairs, a line for each pipeline, a dot at the verdict's level."""
     panels: dict[str, dict[str, figures.Line]] = {"by significance": {}, "by the number of inliers": {}}
     for name, own in ((name, own) for name, own in rows.items() if all(split(own))):
         for figure, lines in zip((significance, inliers), panels.values(), strict=True):

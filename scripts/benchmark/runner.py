@@ -9,16 +9,13 @@ import functools
 import gc
 import json
 import math
-import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import hydra.utils
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
@@ -35,45 +32,39 @@ from fmtorch.storage.code import code_digest
 from fmtorch.storage.configuration import learned, libraries
 
 Row = dict[str, Any]
-Stages = Sequence[tuple[str, str, Mapping[str, Any]]]  # group, preset and changed options of each
+Stages = list[tuple[str, str, dict[str, Any]]]  # group, preset and changed options of each
 console = Console(stderr=True)  # progress and remarks; the tables alone go to the standard output
 
 DIGITS = 16  # of an identity
 WHICH = ("pair", "sweep", "level", "threshold", "seed", "method", "identity")  # what rows are told apart by
 KEPT = (
     "ok", "reason", "nsgd", "inlier_rate", "inlier_rate_before", "corrs", "corrs_before", "features0", "features1",
-    "significance", "rotation_error", "translation_error", "focal_error0", "focal_error1",
+    "significance", "rotation_error", "translation_error",
 )  # fmt: skip
 NEAR = 2.0  # px from the true epipolar line: matches whose exactness is looked at
 PROC = Path("/proc/self")
+ROWS = "keeps what each method makes of each pair, one line each; shown where no data set is named"
 
 
 def add_command(
     commands: Any, name: str, run: Callable[[argparse.Namespace], None], about: str | None, seeds: int | None = None
 ) -> argparse.ArgumentParser:
-    """A command with `--rows`, `--table` and, where `seeds` says how many by default, `--seeds`."""
-    parser: argparse.ArgumentParser = commands.add_parser(
-        name, help=about, description=about, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    """A command with `--table` and, where `seeds` says how many by default, `--seeds` and `--rows`."""
+    raw = argparse.RawDescriptionHelpFormatter
+    parser: argparse.ArgumentParser = commands.add_parser(name, help=about, description=about, formatter_class=raw)
     if seeds is not None:
         parser.add_argument("--seeds", type=int, default=seeds, help="of the methods, from 0; figures are their means")
-        parser.add_argument(
-            "--rows", type=Path, help="keeps what each method makes of each pair, one line each; shown where no set is named"
-        )
+        parser.add_argument("--rows", type=Path, help=ROWS)
     parser.add_argument("--table", type=Path, help="write the table here as CSV; of several each to FILE_NAME.csv")
     parser.set_defaults(run=run)
     return parser
 
 
 class Kept:
-    """The rows of one benchmark, appended to a file of JSON lines as they are made.
+    """The rows of one benchmark, appended to a file of JSON lines as they are made; without a file in memory only.
 
-    Args:
-        path: the file, with the rows of earlier runs if there are some; a last line that was cut off by an
-            interruption is removed. None: rows are kept in memory only.
-
-    Raises:
-        SystemExit: where the folder does not exist or the file holds anything else.
+    A last line that was cut off by an interruption is removed. Raises SystemExit where the folder does not exist or the
+    file holds anything else.
     """
 
     def __init__(self, path: Path | None) -> None:
@@ -110,14 +101,10 @@ class Kept:
 
 
 def identity(stages: Stages, *others: Any) -> str:
-    """The digest of what defines the results of some stages.
+    """The digest of what defines the results of stages: options, code, versions of peers' packages, learned files.
 
-    Args:
-        stages: e.g. ``[("estimator", "usac", {"threshold": 1.0})]``.
-        others: configs with a `_target_`, plain values, and objects, of which only the learned files count.
-
-    Returns:
-        The digest of their options, their code, the versions of peers' packages, and the learned files.
+    stages: e.g. ``[("estimator", "usac", {"threshold": 1.0})]``. others: configs with a `_target_`, plain values, and
+    objects, of which only the learned files count.
     """
     configs: list[Any] = [merged(presets.load(group, name), options) for group, name, options in stages]
     configs += [other for other in others if isinstance(other, Mapping)]
@@ -156,30 +143,27 @@ class Item:
         return self.outcome.correspondences
 
 
-class Measured(Protocol):
-    """Anything that is measured: its name in tables, what its results depend on, and what it makes of a pair."""
+class Measured:
+    """Anything that is measured. name: in tables; identity: the digest of what its results depend on."""
 
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def identity(self) -> str: ...
+    name: str
+    identity: str
 
     def applies(self, item: Item) -> bool:
         """Whether the method takes such a pair."""
-        ...
+        return True
 
     def figures(self, item: Item, seed: int) -> Row:
         """What it makes of a pair, with the processor milliseconds of it as ``ms``."""
-        ...
+        raise NotImplementedError
 
 
 @dataclasses.dataclass(frozen=True)
-class Method:
+class Method(Measured):
     """Pruners, whose time counts, and an estimator.
 
-    stages: of a family's pairs, by name. untimed: the names of those whose time does not count. signed: whether the
-    sign of a translation counts. takes: whether it is measured on an item.
+    stages: of a family's pairs, by name. untimed: the names of those whose time does not count. takes: whether it is
+    measured on an item.
     """
 
     name: str
@@ -187,11 +171,9 @@ class Method:
     stages: Callable[[str], Mapping[str, Pruner]]
     estimator: Callable[[ImagePair, Correspondences, int], Estimate]
     untimed: frozenset[str] = frozenset()
-    signed: bool = False
     takes: Callable[[Item], bool] = lambda item: True
 
     def applies(self, item: Item) -> bool:
-        """As `takes` says."""
         return self.takes(item)
 
     def figures(self, item: Item, seed: int) -> Row:
@@ -209,9 +191,9 @@ class Method:
         start = time.process_time()
         estimate = self.estimator(matched.pair, c, seed)
         estimation = time.process_time() - start
-        known = c.replace(size0=matched.correspondences.size0, size1=matched.correspondences.size1)
-        outcome = dataclasses.replace(matched, correspondences=known, estimate=estimate, reason=estimate.reason[0])
-        return {**judged(outcome, seed, self.signed), "ms": 1e3 * (pruning + estimation), "ms_pruning": 1e3 * pruning}
+        sized = c.replace(size0=matched.correspondences.size0, size1=matched.correspondences.size1)
+        outcome = dataclasses.replace(matched, correspondences=sized, estimate=estimate, reason=estimate.reason[0])
+        return {**judged(outcome, seed), "ms": 1e3 * (pruning + estimation), "ms_pruning": 1e3 * pruning}
 
 
 def _images(item: Item) -> PairImages:
@@ -266,15 +248,6 @@ def measure(
     return rows
 
 
-def turns(calls: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, NDArray[np.float64]]:
-    """Processor milliseconds (repeats,) of calls that take turns."""
-    ms: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(repeats):
-        for name, call in calls.items():
-            ms[name].append(milliseconds(call))
-    return {name: np.array(values) for name, values in ms.items()}
-
-
 def milliseconds(call: Callable[[], Any]) -> float:
     """Of processor time."""
     start = time.process_time()
@@ -305,8 +278,3 @@ def _resident(field: str) -> int:
     """kB; of the process itself, whereas ru_maxrss is inherited."""
     lines = (PROC / "status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith(field))
-
-
-def say(text: str) -> None:
-    """A remark beside the tables."""
-    print(text, file=sys.stderr, flush=True)

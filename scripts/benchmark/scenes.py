@@ -1,4 +1,4 @@
-"""Scenes with true cameras, as COLMAP databases without two-view geometries, and as COLMAP models with these cameras."""
+"""Scenes with true cameras, as COLMAP databases without two-view geometries and as COLMAP models."""
 
 from __future__ import annotations
 
@@ -19,11 +19,9 @@ FEATURES = 4096
 ORIGIN = 0.5  # px: COLMAP's coordinates of the first pixel's centre
 FEATURE_KINDS = ("colmap", "ours")  # COLMAP's SIFT; our default pipeline
 CAMERA_KINDS = ("unknown", "known")
-KNOWN_MODELS = """COLMAP models of scenes whose cameras are known: SIFT matches of all pairs, triangulated with these cameras.
+KNOWN_MODELS = """COLMAP models of scenes in FM-Bench's layout: SIFT matches triangulated with the known cameras.
 
-python -m scripts.benchmark known_models --root DATA/Strecha --folder models
-
-A scene in FM-Bench's layout, with Camera.txt, becomes ``models/<scene>`` with sparse/ and images/, for dataset=colmap.
+A scene becomes ``models/<scene>`` with sparse/ and images/, for dataset=colmap.
 """
 Array = NDArray[np.float64]
 
@@ -125,18 +123,11 @@ def calibrate(path: Path, truth: Truth) -> None:
 
     with pycolmap.Database.open(path) as database:
         for image in database.read_all_images():
-            old = database.read_camera(image.camera_id)
-            known = pinhole(image.camera_id, truth.K[image.name], old.width, old.height)
-            known.has_prior_focal_length = True
+            K, camera = truth.K[image.name], database.read_camera(image.camera_id)
+            params: list[Any] = [K[0, 0], K[1, 1], K[0, 2] + ORIGIN, K[1, 2] + ORIGIN]
+            known = pycolmap.Camera(model="PINHOLE", width=camera.width, height=camera.height, params=params)
+            known.camera_id, known.has_prior_focal_length = image.camera_id, True
             database.update_camera(known)
-
-
-def pinhole(number: int, K: Array, width: int, height: int) -> Any:
-    """A camera of COLMAP's."""
-    import pycolmap
-
-    params: list[Any] = [K[0, 0], K[1, 1], K[0, 2] + ORIGIN, K[1, 2] + ORIGIN]
-    return pycolmap.Camera(camera_id=number, model="PINHOLE", width=width, height=height, params=params)
 
 
 def run_known_models(arguments: argparse.Namespace) -> None:

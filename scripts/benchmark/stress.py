@@ -2,11 +2,9 @@
 
 python -m scripts.benchmark stress --root DATA/Strecha --root DATA/PhotoTourism --root DATA/KITTI --root DATA/TUM \\
     --rendered full --rows stress.jsonl --table docs/tables/stress.csv --figures docs/benchmarks
-python -m scripts.benchmark stress --rows stress.jsonl
 
 --rows is appended to pair by pair: started again, the command goes on where it was interrupted, and measures what more
-seeds need. A row counts only for the code, options and learned files that it was made with. `sizeless` among an
-estimator's stages takes the image sizes away, and with them the prior on cameras.
+seeds need. `sizeless` among an estimator's stages takes the image sizes away, and with them the prior on cameras.
 """
 
 from __future__ import annotations
@@ -22,17 +20,20 @@ from typing import Any
 import numpy as np
 
 from fmtorch.data import ImagePair
+from fmtorch.data.baselines import WIDE
 from fmtorch.data.rendered.generate import FAMILIES
+from fmtorch.evaluation.run import select
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from scripts.benchmark import figures, pairs
 from scripts.benchmark.methods import method, read_specs
 from scripts.benchmark.runner import Item, Kept, Method, Row, add_command, measure
 from scripts.benchmark.stress_changes import (
-    CONDITIONS,
+    CONDITIONED,
     MIN_RIGHT,
     SWEEPS,
     Case,
     Change,
+    Level,
     case_of,
     on_plane,
     parallax,
@@ -40,11 +41,14 @@ from scripts.benchmark.stress_changes import (
 from scripts.benchmark.tables import FIGURES, Record, Results, Sheet, show
 
 SPECS = Path(__file__).with_name("stress.txt")
-CONDITIONED = "conditions"
 AXES = {"inlier ratio": "inlier ratio", "noise": "added noise [px]", "match count": "matches"}
 IMAGES = 256  # whose features are kept, some 5 MB each
 PLANE, TURN = 0.8, 0.02
-Level = float | str
+NATURAL: dict[Level, Callable[[Row], bool]] = {
+    "of these: one homography": lambda row: row["plane"] > PLANE and not row["parallax"] < TURN * row["side"],
+    "of these: rotation": lambda row: row["plane"] > PLANE and row["parallax"] < TURN * row["side"],
+}
+"""Unchanged pairs of which one homography explains nearly all right matches; the second, with next to no parallax."""
 
 
 def add_arguments(commands: Any) -> None:
@@ -52,7 +56,7 @@ def add_arguments(commands: Any) -> None:
     pairs.add_set_options(parser, limit=20)
     parser.add_argument("--rendered-limit", type=int, default=10, help="pairs of each rendered family at most")
     parser.add_argument("--specs", type=Path, default=SPECS, help="estimators; those in (...) for conditions only")
-    parser.add_argument("--only", nargs="*", default=[], choices=[*SWEEPS, CONDITIONED], help="all by default")
+    parser.add_argument("--only", nargs="*", default=list(SWEEPS), choices=list(SWEEPS), help="all by default")
     parser.add_argument("--figures", type=Path, help="draw stress_SWEEP.svg into this folder")
 
 
@@ -60,67 +64,53 @@ def run(arguments: argparse.Namespace) -> None:
     kept = Kept(arguments.rows)
     rows = kept.rows
     if pairs.named(arguments):
-        items = (changed_item(case, *change) for case in cases(arguments) for change in changes(arguments.only))
-        rows = measure(methods_of(read_specs(arguments.specs)), items, arguments.seeds, kept)
+        rows = measure(methods_of(read_specs(arguments.specs)), items_of(arguments), arguments.seeds, kept)
     if not rows:
         raise SystemExit("nothing to show: name sets with --root or --rendered, or a file of earlier --rows")
     show([accuracy_sheet(rows), time_sheet(rows)], arguments.table)
-    if arguments.figures:
-        for sweep in {row["sweep"] for row in rows} & AXES.keys():
-            draw(rows, sweep, arguments.figures / f"stress_{sweep.replace(' ', '_')}.svg")
+    for sweep in {row["sweep"] for row in rows} & AXES.keys() if arguments.figures else ():
+        draw(rows, sweep, arguments.figures / f"stress_{sweep.replace(' ', '_')}.svg")
 
 
 def methods_of(specs: Sequence[str]) -> list[Method]:
     """The estimators; those in brackets are measured under conditions alone."""
-    return [
-        dataclasses.replace(method(spec.strip("()")), takes=_under_conditions) if spec.startswith("(") else method(spec)
-        for spec in specs
-    ]
+    methods = [(method(spec.strip("()")), spec.startswith("(")) for spec in specs]
+    return [dataclasses.replace(each, takes=_under_conditions) if some else each for each, some in methods]
 
 
 def _under_conditions(item: Item) -> bool:
     return bool(item.facts["sweep"] == CONDITIONED)
 
 
-class LazyCase:
-    """A pair whose matches are made when something asks for them."""
-
-    def __init__(self, pair: ImagePair, front: Pipeline) -> None:
-        self.pair, self._front = pair, front
-
-    @functools.cached_property
-    def case(self) -> Case | None:
-        """None where there are too few right matches."""
-        c = self._front.match([self.pair])[0].correspondences
-        case = None if c is None else case_of(self.pair, c)
-        return None if case is None or int(case.right.sum()) < MIN_RIGHT else case
-
-
-def cases(arguments: argparse.Namespace) -> Iterator[LazyCase]:
-    """The pairs that are asked for, families in turn, with the SIFT matches that pass the ratio test."""
+def items_of(arguments: argparse.Namespace) -> Iterator[Item]:
+    """The pairs that are asked for, families in turn, with the SIFT matches that pass the ratio test, changed."""
     families: dict[str, list[ImagePair]] = {}
     for dataset in pairs.sets_of(arguments):
         limit = arguments.rendered_limit if dataset.name == "rendered" else arguments.limit
-        for pair in pairs.select([dataset[i] for i in range(len(dataset))], limit):
+        for pair in select([dataset[i] for i in range(len(dataset))], limit):
             families.setdefault(pair.family, []).append(pair)
     front = pairs.front_of("sift", [], memory=IMAGES)
     for turn in itertools.zip_longest(*families.values()):  # an interrupted run has some of each family
-        yield from (LazyCase(pair, front) for pair in turn if pair is not None)
+        for pair in (pair for pair in turn if pair is not None):
+            case = functools.cache(functools.partial(_case, front, pair))
+            for sweep in arguments.only:
+                yield from (item_of(pair, case, sweep, level, change) for level, change in SWEEPS[sweep].items())
 
 
-def changes(only: Sequence[str]) -> Iterator[tuple[str, Level, Change]]:
-    """Sweep, level and what is done to a case, of all that are asked for."""
-    for sweep, levels in {**SWEEPS, CONDITIONED: CONDITIONS}.items():
-        if not only or sweep in only:
-            yield from ((sweep, level, change) for level, change in levels.items())
+def _case(front: Pipeline, pair: ImagePair) -> Case | None:
+    """None where there are too few right matches."""
+    c = front.match([pair])[0].correspondences
+    case = None if c is None else case_of(pair, c)
+    return None if case is None or int(case.right.sum()) < MIN_RIGHT else case
 
 
-def changed_item(case: LazyCase, sweep: str, level: Level, change: Change) -> Item:
+def item_of(pair: ImagePair, case: Callable[[], Case | None], sweep: str, level: Level, change: Change) -> Item:
     """A pair after a change; of conditions with its share of right matches on a plane and its parallax."""
     facts: Row = {"sweep": sweep, "level": level}
 
     def make() -> Outcome | None:
-        changed = None if case.case is None else change(case.case)
+        base = case()
+        changed = None if base is None else change(base)
         if changed is None:
             return None
         facts.update(matches=len(changed.right), right=int(changed.right.sum()))
@@ -130,30 +120,23 @@ def changed_item(case: LazyCase, sweep: str, level: Level, change: Change) -> It
             facts["side"] = float(max(size.max() for size in changed.sizes()))
         return Outcome(changed.pair, (len(changed.right),) * 2, changed.c)
 
-    return Item(case.pair, make, facts)
-
-
-NATURAL: dict[str, Callable[[Row], bool]] = {
-    "of these: one homography": lambda row: row["plane"] > PLANE and not row["parallax"] < TURN * row["side"],
-    "of these: rotation": lambda row: row["plane"] > PLANE and row["parallax"] < TURN * row["side"],
-}
-"""Unchanged pairs of which one homography explains nearly all right matches; the second, with next to no parallax."""
-
-
-def group(family: str) -> str:
-    """Real pairs of wide or of short baselines, or rendered ones."""
-    return "rendered" if family in FAMILIES else "real, wide" if pairs.is_wide(family) else "real, short"
+    return Item(pair, make, facts)
 
 
 def by_level(rows: Sequence[Row]) -> Iterator[tuple[str, Level, Results]]:
-    """Each sweep's levels in order, with the rows of the pairs that all estimators have there."""
-    for sweep, levels in {**SWEEPS, CONDITIONED: {**CONDITIONS, **NATURAL}}.items():
-        own = [{**row, "method": label(row["method"]), "family": group(row["family"])} for row in rows if row["sweep"] == sweep]
-        for level in levels:
-            shown = "as they are" if level in NATURAL else level
-            there = [row for row in own if row["level"] == shown and NATURAL.get(str(level), bool)(row)]
-            if there:
-                yield sweep, level, Results(there)
+    """Each sweep's levels in order, with the rows there of real pairs, wide and short, and of rendered ones."""
+    named = [{**row, "method": label(row["method"]), "family": group(row["family"])} for row in rows]
+    for sweep, levels in SWEEPS.items():
+        for level in (*levels, *(NATURAL if sweep == CONDITIONED else ())):
+            shown, holds = ("as they are", NATURAL[level]) if level in NATURAL else (level, bool)
+            own = [row for row in named if (row["sweep"], row["level"]) == (sweep, shown) and holds(row)]
+            if own:
+                yield sweep, level, Results(own)
+
+
+def group(family: str) -> str:
+    """What a family's pairs are shown with."""
+    return "rendered" if family in FAMILIES else "real, wide" if family in WIDE else "real, short"
 
 
 def label(spec: str) -> str:
@@ -165,7 +148,7 @@ def label(spec: str) -> str:
 
 
 def accuracy_sheet(rows: Sequence[Row]) -> Sheet:
-    """Recall and AUC@0.05 of each set at each level, and the lead of the first estimator."""
+    """Recall and AUC@0.05 of each set at each level, of the pairs that all have, and the lead of the first."""
     records: list[Record] = []
     for sweep, level, results in by_level(rows):
         groups = {name: own for name, own in results.groups(results.pairs()).items() if name in results.families}
@@ -190,10 +173,10 @@ def draw(rows: Sequence[Row], sweep: str, path: Path) -> None:
     panels: dict[str, dict[str, figures.Line]] = {}
     area = FIGURES["AUC@0.05"]
     for _, level, results in (each for each in by_level(rows) if each[0] == sweep):
-        for set_name, own in results.groups(results.pairs()).items():
-            for name in results.methods if set_name in results.families else ():
-                line = panels.setdefault(set_name, {}).setdefault(name, figures.Line([], []))
+        for name, own in results.groups(results.pairs()).items():
+            for estimator in results.methods if name in results.families else ():
+                line = panels.setdefault(name, {}).setdefault(estimator, figures.Line([], []))
                 line.x.append(float(level))
-                line.y.append(area.scale * float(area.of(results.get(name, own)).mean()))
+                line.y.append(area.scale * float(area.of(results.get(estimator, own)).mean()))
     scale = "linear" if sweep == "noise" else "log"
-    figures.draw(path, panels, AXES[sweep], "AUC@0.05 [%]", xscale=scale, ticks=list(SWEEPS[sweep]))
+    figures.draw(path, panels, AXES[sweep], "AUC@0.05 [%]", xscale=scale, ticks=[float(x) for x in SWEEPS[sweep]])

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,16 +16,16 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch import find_homography
 from fmtorch.core.types import Correspondences
 from fmtorch.data import ImagePair
 from fmtorch.geometry import symmetric_max
 from fmtorch.pruning import one_to_one
 
-Array = NDArray[Any]
 RATIO = 0.8
 RIGHT_PX, WRONG_PX = 3.0, 10.0  # from the true epipolar lines in both images, and in one of them
 MIN_RIGHT = 15
-PLANE_PX, UNIT_PX = 3.0, 300.0  # of a plane's matches; in which homographies are computed
+PLANE_PX = 3.0
 INLIER_RATIOS = (0.05, 0.1, 0.2, 0.4, 0.7, 0.95)
 MAX_RIGHT = 150  # in the sweep of inlier ratios
 NOISES = (0.0, 0.5, 1.0, 2.0, 4.0)  # px
@@ -99,50 +98,14 @@ def parallax(case: Case) -> float:
     return float((x[:, :2] / x[:, 2:] - case.c.x1[0].double()).norm(dim=-1)[case.right].median())
 
 
-def on_plane(case: Case, samples: int = 500) -> Bool[Tensor, " n"]:
-    """The right matches within PLANE_PX of the homography that holds for most of them, (n,)."""
+def on_plane(case: Case) -> Bool[Tensor, " n"]:
+    """The right matches of the homography that holds for most of them, (n,)."""
     index = case.right.nonzero()[:, 0]
-    points = torch.cat([case.c.x0[0, index], case.c.x1[0, index]], -1).double().numpy()
-    drawn = case.rng("plane").random((samples, len(index))).argsort(-1)[:, :4]
-    near = transfer_squared(homographies(points[drawn]), points) < PLANE_PX**2
-    inside = near[near.sum(-1).argmax()]
-    for _ in range(3):
-        refined = transfer_squared(homographies(points[inside][None]), points)[0] < PLANE_PX**2
-        if refined.sum() < inside.sum():
-            break
-        inside = refined
+    ends = case.c.x0[0, index].double(), case.c.x1[0, index].double()
+    found = find_homography(*ends, inlier_threshold=PLANE_PX, key=case.pair.key)
     mask = torch.zeros_like(case.right)
-    mask[index[torch.from_numpy(inside)]] = True
+    mask[index] = found.inliers[0]
     return mask
-
-
-def homographies(points: Array) -> Array:
-    """Of least algebraic error, of k sets of n matches (k, n, 4): the normalised DLT (Hartley & Zisserman, 4.2)."""
-    centre = points.mean(1, keepdims=True)
-    h0, h1 = (np.insert(x, 2, 1.0, axis=-1) for x in np.split((points - centre) / UNIT_PX, 2, axis=-1))
-    zero = np.zeros_like(h0)
-    rows = [np.concatenate([zero, -h0, h1[..., 1:2] * h0], -1), np.concatenate([h0, zero, -h1[..., :1] * h0], -1)]
-    H = np.linalg.svd(np.concatenate(rows, 1))[2][:, -1].reshape(-1, 3, 3)
-    T0, T1 = (np.broadcast_to(np.eye(3), H.shape).copy() for _ in range(2))
-    T0[:, :2, 2], T1[:, :2, 2] = -centre[:, 0, :2], -centre[:, 0, 2:]
-    unit = np.diag([1 / UNIT_PX, 1 / UNIT_PX, 1])
-    result: Array = np.linalg.inv(unit @ T1) @ H @ (unit @ T0)
-    return result
-
-
-def transfer_squared(H: Array, points: Array) -> Array:
-    """The greater of the squared distances from H x0 to x1 and from H^-1 x1 to x0: (k, n), of points (n, 4)."""
-
-    def distance(H: Array, x: Array, y: Array) -> Array:
-        mapped = np.insert(x, 2, 1.0, axis=-1) @ H.transpose(0, 2, 1)
-        squared: Array = np.square(mapped[..., :2] / mapped[..., 2:] - y).sum(-1)
-        return squared
-
-    with np.errstate(all="ignore"):
-        there = distance(H, points[:, :2], points[:, 2:])
-        back = distance(np.linalg.pinv(H).astype(np.float64), points[:, 2:], points[:, :2])
-    greater: Array = np.maximum(there, back)
-    return greater
 
 
 def inlier_ratio(case: Case, ratio: float) -> Case | None:
@@ -209,16 +172,11 @@ def crops(case: Case) -> Case | None:
     return seen(case, *((at, np.floor(WINDOW * size), 1.0) for at, size in zip(corners, case.sizes(), strict=True)))
 
 
-def zoomed(case: Case) -> Case | None:
-    """Image 1 cropped at its centre to 1 / ZOOM of its sides, image 0 reduced by ZOOM: of one size if they were."""
+def zoomed(case: Case, reduced: bool) -> Case | None:
+    """Image 1 cropped at its centre to 1 / ZOOM of its sides; image 0 reduced as much, so that both have one size."""
     size0, size1 = case.sizes()
-    return seen(case, (np.zeros(2), np.floor(size0 / ZOOM), 1 / ZOOM), central(size1, np.floor(size1 / ZOOM)))
-
-
-def cropped_once(case: Case) -> Case | None:
-    """Image 1 cropped at its centre to 1 / ZOOM of its sides, image 0 as it is."""
-    size0, size1 = case.sizes()
-    return seen(case, (np.zeros(2), size0, 1.0), central(size1, np.floor(size1 / ZOOM)))
+    first = (np.zeros(2), np.floor(size0 / ZOOM), 1 / ZOOM) if reduced else (np.zeros(2), size0, 1.0)
+    return seen(case, first, central(size1, np.floor(size1 / ZOOM)))
 
 
 def focal_length(case: Case, f: float) -> Case | None:
@@ -273,18 +231,18 @@ def _joined(a: Correspondences, b: Correspondences) -> Correspondences:
 
 
 Change = Callable[[Case], Case | None]
-SWEEPS: dict[str, dict[float, Change]] = {
+Level = float | str
+CONDITIONED = "conditions"
+SWEEPS: dict[str, dict[Level, Change]] = {
     "inlier ratio": {ratio: functools.partial(inlier_ratio, ratio=ratio) for ratio in INLIER_RATIOS},
     "noise": {sigma: functools.partial(noise, sigma=sigma) for sigma in NOISES},
     "match count": {float(count): functools.partial(match_count, count=count) for count in COUNTS},
-}
-CONDITIONS: dict[str, Change] = {
-    "as they are": lambda case: case,
-    "one plane": plane,
-    "crops": crops,
-    "f 1 : 2.5, one size": zoomed,
-    "f 1 : 2.5, two sizes": cropped_once,
-    "f = 0.4": functools.partial(focal_length, f=0.4),
-    "f = 2": functools.partial(focal_length, f=2.0),
-    "f = 4": functools.partial(focal_length, f=4.0),
+    CONDITIONED: {
+        "as they are": lambda case: case,
+        "one plane": plane,
+        "crops": crops,
+        "f 1 : 2.5, one size": functools.partial(zoomed, reduced=True),
+        "f 1 : 2.5, two sizes": functools.partial(zoomed, reduced=False),
+        **{f"f = {f:g}": functools.partial(focal_length, f=f) for f in (0.4, 2.0, 4.0)},
+    },
 }

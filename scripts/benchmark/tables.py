@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fmtorch.data.baselines import WIDE
 from fmtorch.evaluation.bootstrap import Interval
 from fmtorch.evaluation.statistics import (
-    MERITS,
     PERCENT,
     POSE_THRESHOLDS,
     areas,
@@ -25,7 +25,6 @@ from fmtorch.evaluation.statistics import (
     scene_names,
 )
 from fmtorch.metrics.recall import FINE_THRESHOLD
-from scripts.benchmark.pairs import is_wide
 from scripts.benchmark.runner import Row
 
 BASELINES = ("wide baselines", "short baselines")
@@ -72,7 +71,10 @@ class Sheet:
         widths = [max(3, *(len(line[i]) for line in lines)) for i in range(len(self.columns))]
         rule = ["-" * width for width in widths]
         padded = [
-            [cell.ljust(w) if _is_text(column) else cell.rjust(w) for cell, w, column in zip(line, widths, zip(*lines[1:], strict=True), strict=True)]
+            [
+                cell.ljust(w) if _is_text(column) else cell.rjust(w)
+                for cell, w, column in zip(line, widths, zip(*lines[1:], strict=True), strict=True)
+            ]
             for line in (lines[0], rule, *lines[1:])
         ]
         return f"{self.title}\n\n" + "\n".join(f"| {' | '.join(line)} |" for line in padded)
@@ -145,8 +147,10 @@ FIGURES: dict[str, Figure] = {
     "kept, %": Figure(lambda get: _solved(get, get("corrs") / get("corrs_before").clip(1)), PERCENT, ".0f"),
     "keypoints": Figure(lambda get: (get("features0") + get("features1")).mean(0) / 2, form=".0f"),
     "distance, px": Figure(lambda get: _known(get("distance")), form=".3f"),
-    **{f"AUC@{px} px": Figure(lambda get, px=px: np.clip(1 - get("corner_error") / px, 0, 1).mean(0), PERCENT)  # type: ignore[misc]
-       for px in (1, 3, 5)},
+    **{
+        f"AUC@{px} px": Figure(lambda get, px=px: np.clip(1 - get("corner_error") / px, 0, 1).mean(0), PERCENT)  # type: ignore[misc]
+        for px in (1, 3, 5)
+    },
     "flipped, %": Figure(lambda get: _known(get("flipped")), PERCENT),
     **{f"focal within {p} %, %": Figure(lambda get, p=p: _known(get(f"focal_{p}")), PERCENT) for p in (5, 10)},  # type: ignore[misc]
     **{f"pose@{t}": Figure(lambda get, t=t: pose_areas(get, t), PERCENT) for t in POSE_THRESHOLDS},  # type: ignore[misc]
@@ -166,7 +170,7 @@ class Results:
             self._rows[method].setdefault(pair, []).append(row)
         self._places = {pair: (row["family"], row["scene"]) for (_, pair, _), row in by_place.items()}
         self.all_pairs = list(self._places)
-        self.families = sorted({family for family, _ in self._places.values()}, key=lambda f: (not is_wide(f), f))
+        self.families = sorted({family for family, _ in self._places.values()}, key=lambda f: (f not in WIDE, f))
 
     def of(self, method: str, pairs: Sequence[str]) -> list[list[Row]]:
         """The rows of some pairs, one list a pair; as many seeds as all of them have."""
@@ -196,8 +200,8 @@ class Results:
         """These pairs by family, then those of wide and of short baselines where there are both, and all of several."""
         by_family = {f: [pair for pair in pairs if self._places[pair][0] == f] for f in self.families}
         by_family = {family: own for family, own in by_family.items() if own}
-        wide = [pair for family, own in by_family.items() if is_wide(family) for pair in own]
-        short = [pair for family, own in by_family.items() if not is_wide(family) for pair in own]
+        wide = [pair for family, own in by_family.items() if family in WIDE for pair in own]
+        short = [pair for family, own in by_family.items() if family not in WIDE for pair in own]
         if wide and short:
             by_family |= dict(zip(BASELINES, (wide, short), strict=True))
         return by_family | ({"all": list(pairs)} if len(by_family) > 1 else {})
@@ -256,9 +260,9 @@ class Results:
                 line |= {name: self.cell(method, own, name, intervals) for name in columns if name != "time ratio"}
                 first = against or self.methods[0]
                 for name in minus:
-                    two = (method, first) if against else (first, method)
+                    a, b = (method, first) if against else (first, method)
                     head = f"{name} minus {against}" if against else f"lead {name}"
-                    line[head] = self.difference(*two, own, name) if first in self.methods else ""
+                    line[head] = self.difference(a, b, own, name) if first in self.methods else ""
                 if "time ratio" in columns:
                     line["time ratio"] = self.time_ratio(method, first, own)
                 lines.append(line)

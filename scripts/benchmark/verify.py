@@ -2,9 +2,8 @@
 
 Features and matches are those of COLMAP's SIFT, or of our default pipeline, made once for each scene in --work. Every
 method begins with the same database without geometries, on one thread, reading and writing included: `colmap:PX` is
-`pycolmap.geometric_verification` at that threshold, `ours` is `fmtorch.verify`. Known cameras are the true ones, with
-a prior focal length. Then the incremental and the global mapper, whose poses are compared with the true ones; images
-that are not registered count as wrong. Rows are kept in --work: an interrupted run goes on where it stopped.
+`pycolmap.geometric_verification` at that threshold, `ours` is `fmtorch.verify`. Known cameras are the true ones. Images
+that a mapper does not register count as wrong. Rows are kept in --work: an interrupted run goes on where it stopped.
 
 python -m scripts.benchmark verify --root DATA --work runs/verify --table docs/tables/verify.csv
 """
@@ -15,7 +14,7 @@ import argparse
 import itertools
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -127,12 +126,10 @@ def mapped(mapper: str, path: Path, scene: Scene, cameras: str, seed: int) -> Ro
     copy = output / "database.db"
     shutil.copy(path, copy)
     start = time.process_time()
-    if mapper == "global":
-        if cameras == "unknown":
-            pycolmap.calibrate_view_graph(copy, pycolmap.ViewGraphCalibrationOptions(random_seed=seed))
-        models = pycolmap.global_mapping(copy, scene.images, output, _global(cameras, seed))
-    else:
-        models = pycolmap.incremental_mapping(copy, scene.images, output, _incremental(cameras, seed))
+    if (mapper, cameras) == ("global", "unknown"):
+        pycolmap.calibrate_view_graph(copy, pycolmap.ViewGraphCalibrationOptions(random_seed=seed))
+    mapping = pycolmap.global_mapping if mapper == "global" else pycolmap.incremental_mapping
+    models = mapping(copy, scene.images, output, _options(mapper, cameras, seed))
     row: Row = {"seconds": time.process_time() - start, "registered": 0, "images": len(scene.truth.R)}
     poses: dict[str, Any] = {}
     if models:
@@ -146,27 +143,23 @@ def mapped(mapper: str, path: Path, scene: Scene, cameras: str, seed: int) -> Ro
     return row | accuracy(poses, scene.truth)
 
 
-def _incremental(cameras: str, seed: int) -> Any:
+def _options(mapper: str, cameras: str, seed: int) -> Any:
+    """Of COLMAP's mappers."""
     import pycolmap
 
-    options = pycolmap.IncrementalPipelineOptions(
-        min_model_size=MIN_MODEL, num_threads=1, random_seed=seed, extract_colors=False
-    )
+    if mapper == "global":
+        options: Any = pycolmap.GlobalPipelineOptions(min_model_size=MIN_MODEL, num_threads=1, random_seed=seed)
+        options.mapper.num_threads, options.mapper.random_seed = 1, seed
+        options.mapper.global_positioning.random_seed = options.mapper.rotation_averaging.random_seed = seed
+        if cameras == "known":
+            adjustment = options.mapper.bundle_adjustment
+            adjustment.refine_focal_length = adjustment.refine_extra_params = False
+        return options
+    options = pycolmap.IncrementalPipelineOptions(min_model_size=MIN_MODEL, num_threads=1, random_seed=seed)
+    options.extract_colors = False
     if cameras == "known":
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
-    return options
-
-
-def _global(cameras: str, seed: int) -> Any:
-    import pycolmap
-
-    options = pycolmap.GlobalPipelineOptions(min_model_size=MIN_MODEL, num_threads=1, random_seed=seed)
-    options.mapper.num_threads, options.mapper.random_seed = 1, seed
-    options.mapper.global_positioning.random_seed = options.mapper.rotation_averaging.random_seed = seed
-    if cameras == "known":
-        adjustment = options.mapper.bundle_adjustment
-        adjustment.refine_focal_length = adjustment.refine_extra_params = False
     return options
 
 
@@ -176,7 +169,7 @@ def accuracy(poses: dict[str, Any], truth: Truth) -> dict[str, float]:
         relative_error(poses[b] * poses[a].inverse(), truth, a, b) if a in poses and b in poses else 180.0
         for a, b in itertools.combinations(sorted(truth.R), 2)
     ]
-    figures = {}
+    figures: dict[str, float] = {}
     for name, values in (("auc", np.array(errors)), ("centre", centre_errors(poses, truth))):
         areas = pose_auc(torch.from_numpy(values), THRESHOLDS).tolist()
         figures |= {f"{name}{limit}": 100 * area for limit, area in zip(THRESHOLDS, areas, strict=True)}
@@ -216,70 +209,53 @@ def pair_poses(path: Path, truth: Truth) -> dict[str, int]:
         names = {image.image_id: image.name for image in database.read_all_images()}
         ends = [pycolmap.pair_id_to_image_pair(pair) for pair in database.read_two_view_geometries()[0]]
         poses = [database.read_two_view_geometry(*pair).cam2_from_cam1 for pair in ends]
-    posed = [(pose, *(names[i] for i in pair)) for pose, pair in zip(poses, ends, strict=True) if pose is not None]
+    posed = [(pose, names[a], names[b]) for pose, (a, b) in zip(poses, ends, strict=True) if pose is not None]
     errors = np.array([relative_error(pose, truth, a, b) for pose, a, b in posed])
     return {"poses": len(errors), "right": int((errors < RIGHT).sum()), "wrong": int((errors > WRONG).sum())}
 
 
-Figure = tuple[str, Callable[[Row], float], int]  # column, value of a row, digits
-
-
-def _field(name: str) -> Callable[[Row], float]:
-    return lambda row: float(row.get(name, np.nan))
-
-
-VERIFICATION: tuple[Figure, ...] = (
-    ("pairs", _field("pairs"), 0),
-    ("with a geometry", _field("verified"), 0),
-    ("ms a pair", lambda row: 1000 * row["seconds"] / row["pairs"], 1),
-    ("pairs a second", lambda row: row["pairs"] / row["seconds"], 0),
-    *((name, _field(name), 0) for name in ("poses", "right", "wrong")),
-)
-MODEL: tuple[Figure, ...] = (
-    ("registered", _field("registered"), 1),
-    ("points", _field("points"), 0),
-    ("track", _field("track"), 2),
-    ("error, px", _field("error"), 2),
-    *((f"AUC@{limit}", _field(f"auc{limit}"), 1) for limit in THRESHOLDS),
-    *((f"centres@{limit}", _field(f"centre{limit}"), 1) for limit in THRESHOLDS),
-    ("s", _field("seconds"), 1),
-)
+VERIFICATION = {"pairs": 0, "verified": 0, "ms a pair": 1, "pairs a second": 0, "poses": 0, "right": 0, "wrong": 0}
+MODEL = {"registered": 1, "points": 0, "track": 2, "error": 2}
+MODEL |= {f"{name}{limit}": 1 for name in ("auc", "centre") for limit in THRESHOLDS} | {"seconds": 1}
+"""Columns, which are fields of the rows, and their digits; error: px."""
 
 
 def sheets(rows: Sequence[Row]) -> list[Sheet]:
     """Means of the scenes; pairs and models of each scene and method, means of the seeds."""
-    kinds = {place: [row for row in rows if _place(row) == place] for place in dict.fromkeys(map(_place, rows))}
     each: dict[str, list[Record]] = {"means": [], "pairs": [], "models": []}
-    for (features, cameras, method), own in kinds.items():
-        about = {"features": features, "intrinsics": cameras, "verified by": method}
+    places = [tuple(row[name] for name in ("features", "cameras", "method")) for row in rows]
+    for place in dict.fromkeys(places):
+        own = [_with_speed(row) for row, at in zip(rows, places, strict=True) if at == place]
+        about: Record = dict(zip(("features", "intrinsics", "verified by"), place, strict=True))
         each["means"].append(about | _means(own))
         for mapper, scene in dict.fromkeys((row["mapper"], row["scene"]) for row in own):
             mine = [row for row in own if (row["mapper"], row["scene"]) == (mapper, scene)]
-            figures = {name: _mean([value(row) for row in mine], digits) for name, value, digits in MODEL if mapper}
-            figures = figures or {name: _mean([value(row) for row in mine], digits) for name, value, digits in VERIFICATION}
             line: Record = {**about, **({"mapper": mapper} if mapper else {}), "scene": scene, "seeds": len(mine)}
-            each["models" if mapper else "pairs"].append(line | figures)
+            columns = MODEL if mapper else VERIFICATION
+            line |= {name: _mean([row.get(name, np.nan) for row in mine], digits) for name, digits in columns.items()}
+            each["models" if mapper else "pairs"].append(line)
     return [Sheet(name, f"Verified databases: {name}", records) for name, records in each.items()]
 
 
-def _place(row: Row) -> tuple[str, str, str]:
-    return row["features"], row["cameras"], row["method"]
+def _with_speed(row: Row) -> Row:
+    if row["mapper"]:
+        return {**row, "registered, %": 100 * row["registered"] / row["images"]}
+    return {**row, "ms a pair": 1e3 * row["seconds"] / row["pairs"], "pairs a second": row["pairs"] / row["seconds"]}
 
 
 def _means(rows: Sequence[Row]) -> Record:
     """Means over the scenes: pairs a second, and of each mapper registered images and AUC of relative poses."""
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
 
-    def by_scene(mapper: str, value: Callable[[Row], float]) -> list[float]:
-        own = [[value(row) for row in rows if (row["scene"], row["mapper"]) == (s, mapper)] for s in scenes]
+    def by_scene(mapper: str, field: str) -> list[float]:
+        own = [[row[field] for row in rows if (row["scene"], row["mapper"]) == (s, mapper)] for s in scenes]
         return [float(np.mean(values)) for values in own if values]
 
-    pairs, seconds = (sum(by_scene("", _field(name))) for name in ("pairs", "seconds"))
-    line: Record = {"scenes": len(scenes), "pairs a second": f"{pairs / seconds:.0f}" if seconds else ""}
+    speed = sum(by_scene("", "pairs")) / max(sum(by_scene("", "seconds")), 1e-9)
+    line: Record = {"scenes": len(scenes), "pairs a second": f"{speed:.0f}"}
     for mapper in MAPPERS:
-        registered = by_scene(mapper, lambda row: 100 * row["registered"] / row["images"])
-        line[f"{mapper}: registered, %"] = _mean(registered, 1)
-        line |= {f"{mapper}: @{n}": _mean(by_scene(mapper, _field(f"auc{n}")), 1) for n in THRESHOLDS}
+        for field in ("registered, %", *(f"auc{n}" for n in THRESHOLDS)):
+            line[f"{mapper}: {field}"] = _mean(by_scene(mapper, field), 1)
     return line
 
 
