@@ -7,11 +7,11 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
+from scripts.benchmark.memory import OTHER_LIBRARIES
 
 from fmtorch import presets
-from fmtorch.compiling import switch
 from fmtorch.core.types import Correspondences, Estimate, collate
-from scripts.benchmark.memory import OTHER_LIBRARIES
+from fmtorch.jit import kernel as switch
 from tests.laws import (
     Result,
     Subject,

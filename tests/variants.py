@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from scripts.benchmark.matched import options
+
 from fmtorch import presets
 from fmtorch.presets.objects import instantiate, merged
-from scripts.benchmark.matched import options
 
 METHODS = ("lmeds", "usac_default", "usac_fast", "usac_accurate", "usac_prosac", "usac_magsac")
 OPTIONS = {

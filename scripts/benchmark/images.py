@@ -20,12 +20,12 @@ from rich.progress import track
 from fmtorch import presets
 from fmtorch.core.stages import pruned
 from fmtorch.data import ImagePair, read_image, to_grey
-from fmtorch.data.rendered.photographs import photograph
 from fmtorch.features import ImagePyramid, LocalFeature
 from fmtorch.features.vlad import codebook, descriptor_kind, load_codebook, local_descriptors, vlad
+from fmtorch.pipeline.folder import similar_pairs
 from fmtorch.pipeline.pipeline import STAGES, Pipeline
-from fmtorch.pipeline.similar import similar_pairs
 from fmtorch.pipeline.two_images import describe
+from fmtorch.scenes.textures import photograph
 from scripts.benchmark import pairs
 from scripts.benchmark.methods import pipeline_of
 from scripts.benchmark.runner import add_command, console

@@ -18,11 +18,11 @@ from fmtorch import data, presets
 from fmtorch.core.types import Correspondences, Estimate, pair_key
 from fmtorch.data import ImagePair, ImageSource, PairDataset
 from fmtorch.data.pairs import GivenMatches
-from fmtorch.data.rendered import RenderedPairs, generate, photographs
 from fmtorch.evaluation.run import select
 from fmtorch.geometry import fundamental_from_calibration
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
-from fmtorch.storage.features import cached
+from fmtorch.runs.feature_cache import cached
+from fmtorch.scenes import RenderedPairs, generate, textures
 from scripts.benchmark import methods
 from scripts.benchmark.runner import Item, Stages, identity
 
@@ -201,7 +201,7 @@ def photographs_shown(dataset: RenderedPairs) -> dict[str, frozenset[str]]:
     """The names of the photographs that each rendered scene is built with, whether they can be seen or not."""
     shown = {}
     for name, task in dataset._tasks.items():
-        with mock.patch.object(photographs, "photograph", wraps=photographs.photograph) as taken:
+        with mock.patch.object(textures, "photograph", wraps=textures.photograph) as taken:
             generate.build(task)
         shown[name] = frozenset(str(call.args[0]) for call in taken.call_args_list)
     return shown

@@ -21,7 +21,7 @@ from typing import Any
 import yaml  # type: ignore[import-untyped]
 
 from fmtorch.data import ImagePair, read_image, to_grey
-from fmtorch.data.matchable import keypoints, matchable
+from fmtorch.data.construction import keypoints, matchable
 from fmtorch.evaluation.run import select
 from fmtorch.features import ASIFT
 from fmtorch.pipeline.pipeline import Outcome, Pipeline

@@ -29,7 +29,7 @@ from rich.progress import track
 from fmtorch import find_homography, metrics, presets
 from fmtorch.core.estimate import CONFIGURATIONS
 from fmtorch.core.types import Correspondences, collate
-from fmtorch.estimators.peers import colmap
+from fmtorch.estimators.external import colmap
 from fmtorch.geometry import poses_from_homography
 from fmtorch.two_view.known_cameras import KnownCameras
 from fmtorch.two_view.pair_type import classify

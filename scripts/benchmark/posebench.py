@@ -28,11 +28,10 @@ import fmtorch
 from fmtorch import data, metrics, presets
 from fmtorch.core.types import Correspondences
 from fmtorch.data import DataError, ImagePair
-from fmtorch.evaluation.intervals import MIN_UNITS
-from fmtorch.evaluation.statistics import PERCENT, POSE_THRESHOLDS, difference
+from fmtorch.evaluation.statistics import MIN_UNITS, PERCENT, POSE_THRESHOLDS, difference
+from fmtorch.io import h5
 from fmtorch.pipeline.pipeline import Outcome
 from fmtorch.presets.objects import merged
-from fmtorch.storage.exchange import h5
 from scripts.benchmark import pairs
 from scripts.benchmark.cameras import has_cameras
 from scripts.benchmark.methods import options

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.core.types import RELATED
-from fmtorch.evaluation.intervals import share_interval
+from fmtorch.evaluation.statistics import share_interval
 from scripts.benchmark import figures, pairs
 from scripts.benchmark.pipelines import add_pipeline_options, chosen_pipelines, measured, settings_of
 from scripts.benchmark.runner import Kept, Row, add_command

@@ -27,9 +27,8 @@ from fmtorch.evaluation.rows import evaluate
 from fmtorch.geometry import sampson
 from fmtorch.pipeline.pipeline import Outcome
 from fmtorch.presets.objects import merged
-from fmtorch.storage import identity_digest
-from fmtorch.storage.code import code_digest
-from fmtorch.storage.configuration import learned, libraries
+from fmtorch.runs import identity_digest
+from fmtorch.runs.fingerprint import code_digest, learned, libraries
 
 Row = dict[str, Any]
 Stages = list[tuple[str, str, dict[str, Any]]]  # group, preset and changed options of each

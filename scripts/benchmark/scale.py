@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from fmtorch.data import ImagePair
-from fmtorch.data.rendered import RenderedPairs
 from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import summarize
 from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.pool import WorkerPool
 from fmtorch.jobs.runner import Factory, Local, TaskRunner
-from fmtorch.storage import PairRow, RunFolder
+from fmtorch.runs import PairRow, RunFolder
+from fmtorch.scenes import RenderedPairs
 from scripts.benchmark.methods import pipeline_of
 from scripts.benchmark.pairs import synthetic_pair
 from scripts.benchmark.runner import add_command

@@ -21,9 +21,9 @@ import numpy as np
 
 from fmtorch.data import ImagePair
 from fmtorch.data.baselines import WIDE
-from fmtorch.data.rendered.generate import FAMILIES
 from fmtorch.evaluation.run import select
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
+from fmtorch.scenes.generate import FAMILIES
 from scripts.benchmark import figures, pairs
 from scripts.benchmark.methods import method, read_specs
 from scripts.benchmark.runner import Item, Kept, Method, Row, add_command, measure

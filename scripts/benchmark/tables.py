@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.data.baselines import WIDE
-from fmtorch.evaluation.bootstrap import Interval
 from fmtorch.evaluation.statistics import (
     PERCENT,
     POSE_THRESHOLDS,
+    Interval,
     areas,
     described,
     difference,

@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 
 import fmtorch
-from fmtorch.estimators.peers import colmap
+from fmtorch.estimators.external import colmap
 from fmtorch.metrics import pose_auc, pose_error
 from scripts.benchmark.runner import Kept, Row, add_command
 from scripts.benchmark.scenes import CAMERA_KINDS, FEATURE_KINDS, Scene, Truth, database_of, read_scene, remove

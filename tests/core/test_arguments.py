@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scripts.benchmark.memory import OTHER_LIBRARIES
 
 import fmtorch
 from fmtorch import metrics
@@ -14,7 +15,6 @@ from fmtorch.core.types import Correspondences, Estimate, collate
 from fmtorch.data import ImageSource
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.pipeline.build import load_pipeline
-from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.commands.test_match import run_python
 from tests.laws import quick, scene, shown
 from tests.pipeline.test_pipeline import draw, pair, pipeline

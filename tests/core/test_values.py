@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from scripts.benchmark.memory import OTHER_LIBRARIES
 
 import fmtorch
 from fmtorch import metrics, presets
 from fmtorch.core.types import Correspondences, collate
-from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.laws import quick, scene
 from tests.variants import variants
 

@@ -6,11 +6,11 @@ import functools
 
 import pytest
 import torch
+from scripts.benchmark.memory import OTHER_LIBRARIES
 from torch import Tensor
 
 from fmtorch import presets
 from fmtorch.core.types import Correspondences, collate
-from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.laws import quick, scene, scenes
 
 

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scripts.benchmark.memory import OTHER_LIBRARIES
 
 import fmtorch
 from fmtorch import presets
-from fmtorch.compiling.kernel import Kernel
 from fmtorch.core.types import collate
 from fmtorch.estimators import Ransac
+from fmtorch.estimators.inliers import residuals_squared_px
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.inliers import residuals_squared_px
-from scripts.benchmark.memory import OTHER_LIBRARIES
+from fmtorch.jit.kernel import Kernel
 from tests.estimators.pairs import pair_of
 from tests.laws import quick, scene, scenes
 from tests.variants import built, variants

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from scripts.benchmark.scale_pairs import given_pairs
 
 from fmtorch.data.pairs import ImagePair
 from fmtorch.evaluation.run import evaluate_pairs
@@ -25,8 +26,7 @@ from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.pool import WorkersLost
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.storage import PairRow
-from scripts.benchmark.scale_pairs import given_pairs
+from fmtorch.runs import PairRow
 
 PAIRS = 96
 SLOW_SECONDS = 0.3  # of each batch of a slow pipeline, so that there is time to kill its workers

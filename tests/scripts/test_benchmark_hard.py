@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 from scripts.benchmark.hard import RULE, tables
+
 from tests.processes import run_command
 
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scripts.benchmark.kept import Kept, read
 
 from fmtorch.data import ImagePair, ImageSource
 from scripts.benchmark import estimators, kept, learned, specs
-from scripts.benchmark.kept import Kept, read
 from tests.laws import scene
 
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scripts.benchmark.known_models import triangulate
+from scripts.benchmark.verify_scenes import read_scene
 
 from fmtorch.data import load, read_image
 from fmtorch.data.overlap import overlap_of
 from fmtorch.data.scenes import ScenePairs
-from scripts.benchmark.known_models import triangulate
-from scripts.benchmark.verify_scenes import read_scene
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 from scripts.benchmark.specs import features_of
+
 from tests.pipeline.test_pipeline import draw
 from tests.processes import run_command
 

@@ -12,13 +12,13 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from scripts.benchmark.sheet import MISSING
 
 from fmtorch import data, presets
 from fmtorch.core.types import Correspondences
 from fmtorch.data import ImagePair
 from fmtorch.pipeline.build import load_pipeline
 from scripts.benchmark import __main__, posebench, posebench_methods
-from scripts.benchmark.sheet import MISSING
 from tests.conftest import shared_path
 from tests.reference import metrics as reference
 from tests.reference import solvers

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
+from scripts.benchmark.specs import build, informed, pruned_by, pruners_of
 
 from fmtorch.core.types import Correspondences
 from fmtorch.data import load, read_image, to_grey
-from fmtorch.data.matchable import keypoints, ratio_matches
+from fmtorch.data.construction import keypoints, ratio_matches
 from fmtorch.presets import build as preset
-from scripts.benchmark.specs import build, informed, pruned_by, pruners_of
 
 
 def test_a_pruner_that_looks_at_images_is_given_those_of_the_pair() -> None:

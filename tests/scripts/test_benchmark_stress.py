@@ -9,12 +9,12 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import torch
+from scripts.benchmark.stress_cases import RIGHT_PX, Case, on_plane, parallax
 
 from fmtorch.core.types import Correspondences
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.geometry import fundamental_from_calibration
 from scripts.benchmark import stress, stress_cases, stress_rows, stress_table
-from scripts.benchmark.stress_cases import RIGHT_PX, Case, on_plane, parallax
 from scripts.benchmark.stress_changes import CONDITIONS, COUNTS, INLIER_RATIOS, SWEEPS, ZOOM, match_count, noise, sizes
 
 FOCAL, SIZE = 900.0, (600, 800)  # px, (h, w)

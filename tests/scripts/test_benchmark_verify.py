@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
-
-from scripts.benchmark import verify
 from scripts.benchmark.kept import Kept
 from scripts.benchmark.verify_mappers import accuracy, centre_errors
 from scripts.benchmark.verify_scenes import Scene, Truth, calibrate
 from scripts.benchmark.verify_table import sheets
+
+from scripts.benchmark import verify
 from tests.pipeline import databases
 
 K = np.array([[700.0, 0, 310], [0, 701, 250], [0, 0, 1]])
