@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from scripts.benchmark.memory import OTHER_LIBRARIES
 
 from fmtorch import presets
 from fmtorch.core.types import Correspondences, Estimate, collate
@@ -26,7 +25,7 @@ from tests.laws import (
     small,
     with_padding,
 )
-from tests.variants import variants
+from tests.variants import OTHER_LIBRARIES, variants
 
 OWN = [n for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES)]
 PER_MATCH = ("inliers", "kept", "prior", "noise")

@@ -157,7 +157,7 @@ def figures_sheet(results: Results, settings: Mapping[str, Any], selected: set[s
                 **{f"paper: {c}": theirs[field] for c, field in PAPER.items()},
             }
     title = f"{settings['about']}: {results.described(results.all_pairs)}"
-    return Sheet("figures", title, records)
+    return Sheet("", title, records)
 
 
 def _papers(paper: Published, settings: Mapping[str, Any], family: str, name: str) -> dict[str, str]:

@@ -54,7 +54,7 @@ def span(found: Interval | None, form: str) -> Span | str:
 
 @dataclasses.dataclass(frozen=True)
 class Sheet:
-    """A table. name: of its CSV file, where a command writes several; title: above it in the terminal."""
+    """A table. name: what its file's name ends in, where a command writes several; title: above it in the terminal."""
 
     name: str
     title: str
@@ -104,7 +104,8 @@ def show(sheets: Sequence[Sheet], table: Path | None = None) -> None:
             continue
         print(sheet.markdown(), end="\n\n")
         if table is not None:
-            sheet.write(table if len(sheets) == 1 else table.with_name(f"{table.stem}_{sheet.name}{table.suffix}"))
+            alone = len(sheets) == 1 or not sheet.name
+            sheet.write(table if alone else table.with_name(f"{table.stem}_{sheet.name}{table.suffix}"))
 
 
 def _known(values: Values) -> Values:

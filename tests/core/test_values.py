@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from scripts.benchmark.memory import OTHER_LIBRARIES
 
 import fmtorch
 from fmtorch import metrics, presets
 from fmtorch.core.types import Correspondences, collate
 from tests.laws import quick, scene
-from tests.variants import variants
+from tests.variants import OTHER_LIBRARIES, variants
 
 OWN = [n for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES)]
 WRONG = [

@@ -6,12 +6,12 @@ import functools
 
 import pytest
 import torch
-from scripts.benchmark.memory import OTHER_LIBRARIES
 from torch import Tensor
 
 from fmtorch import presets
 from fmtorch.core.types import Correspondences, collate
 from tests.laws import quick, scene, scenes
+from tests.variants import OTHER_LIBRARIES
 
 
 @functools.cache

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from scripts.benchmark.memory import OTHER_LIBRARIES
 
 from fmtorch import find_essential, geometry, presets
 from fmtorch.core.types import Correspondences, collate
@@ -18,7 +17,7 @@ from fmtorch.estimators.external.pairwise import Pair, Solution
 from fmtorch.two_view.known_cameras import KnownCameras
 from tests.geometry.scenes import scene as matched_scene
 from tests.laws import PEERS, scene
-from tests.variants import built, variants
+from tests.variants import OTHER_LIBRARIES, built, variants
 
 NAMES = [n for n in variants("estimator") if n.startswith(OTHER_LIBRARIES)]
 

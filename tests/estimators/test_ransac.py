@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from scripts.benchmark.memory import OTHER_LIBRARIES
 
 import fmtorch
 from fmtorch import presets
@@ -20,7 +19,7 @@ from fmtorch.estimators.pair import Pair
 from fmtorch.jit.kernel import Kernel
 from tests.estimators.pairs import pair_of
 from tests.laws import quick, scene, scenes
-from tests.variants import built, variants
+from tests.variants import OTHER_LIBRARIES, built, variants
 
 OWN = [n for n in variants("estimator") if not n.startswith((*OTHER_LIBRARIES, "homography"))]
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from scripts.benchmark.memory import OTHER_LIBRARIES
 
 from fmtorch import find_fundamental
 from fmtorch.core.types import Correspondences, Estimate, collate
@@ -21,7 +20,7 @@ from fmtorch.estimators.models.homography import Homography
 from fmtorch.estimators.models.model import FitScale
 from fmtorch.presets.objects import merged
 from tests.laws import PEERS, few, quick, scene, small
-from tests.variants import built, loaded, variants
+from tests.variants import OTHER_LIBRARIES, built, loaded, variants
 
 EVERY = variants("estimator")
 OWN = [name for name in EVERY if not name.startswith(OTHER_LIBRARIES)]
