@@ -30,13 +30,13 @@ from fmtorch.presets import plain
 from fmtorch.training.correspondences import Tolerance
 from fmtorch.training.geodesc_loss import geodesc
 from fmtorch.training.match_set_training import MatchSetTraining
+from fmtorch.training.options import PlaneViews
 from fmtorch.training.patch_loop import PatchTraining, TrainingOptions
 from fmtorch.training.patch_losses import LOSSES
 from fmtorch.training.patch_metrics import middle, validation_pairs
 from fmtorch.training.patch_objectives import CovarianceObjective, DescriptorObjective, Objective, ShapeObjective
 from fmtorch.training.patch_store import PatchStore, build_store
 from fmtorch.training.photographs import Photograph, list_photographs, package_photographs, split
-from fmtorch.training.planes import PlaneViews
 from fmtorch.training.scenes import training_scenes
 from fmtorch.training.track_store import TrackStore, build_track_store
 from fmtorch.training.warps import ViewRange

@@ -10,18 +10,18 @@ from pathlib import Path
 
 import hydra.utils
 import pyarrow as pa
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich.progress import Progress
 
 from fmtorch import data, presets
-from fmtorch.commands.main import job, run_command
+from fmtorch.commands.config import chosen_pipeline, job, run_command
+from fmtorch.commands.options import EVAL, EvalOptions
 from fmtorch.core.executors import MIN_PAIRS_FOR_PROCESSES
 from fmtorch.core.shards import shard_of
 from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.data import ImagePair, PairDataset
 from fmtorch.evaluation.identity import run_identity
-from fmtorch.evaluation.pair_cameras import Cameras, built_with, cameras_of
+from fmtorch.evaluation.pair_cameras import built_with, cameras_of
 from fmtorch.evaluation.plots import plot_recall_curves
 from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import ALL, Group, summarize
@@ -30,37 +30,11 @@ from fmtorch.pipeline.exporting import exportable
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
 from fmtorch.presets.executors import execution_of
-from fmtorch.presets.fields import Cache, Count, Device, Gigabytes, Seed, path_fields, read_fields
+from fmtorch.presets.fields import read_fields
 from fmtorch.storage import RunFolder, identity_digest
 from fmtorch.storage.exchange.export import export_kinds, write_exports
 from fmtorch.storage.exchange.journal import Journal
 from fmtorch.storage.features import CachedFeatures
-
-
-@dataclasses.dataclass(frozen=True)
-class PoseFields:
-    """How poses are judged."""
-
-    signed: bool = False
-
-
-@dataclasses.dataclass(frozen=True)
-class Fields:
-    """What the command takes beside stages and the data set; ``conf/eval.yaml`` says what each is."""
-
-    limit: Count | None = None
-    seed: Seed = 0
-    cameras: Cameras | None = None
-    pose: PoseFields = PoseFields()
-    device: Device = "auto"
-    batch: Count = 16
-    workers: Count | None = None
-    processes: bool | None = None
-    shard: str | None = None
-    run_dir: Path | None = None
-    cache: Cache = None
-    cache_limit: Gigabytes | None = 20
-    export: str | list[str] | None = None
 
 
 def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -> Path:
@@ -70,7 +44,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
 
     Raises ValueError, before anything is computed or written, where an option is not what it may be.
     """
-    fields = read_fields(Fields, config)
+    fields = read_fields(EvalOptions, config)
     execution_of(config, fields.workers, fields.processes)
     shard = shard_of(fields.shard)
     device = presets.resolve_device(fields.device)
@@ -116,7 +90,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
 
 
 def _open_folder(
-    config: DictConfig, fields: Fields, pipeline_name: str, pipeline: Pipeline, dataset: PairDataset
+    config: DictConfig, fields: EvalOptions, pipeline_name: str, pipeline: Pipeline, dataset: PairDataset
 ) -> RunFolder:
     """The folder of the run with this identity, its `run_dir` if given, new or to be continued."""
     identity = run_identity(config, pipeline_name, pipeline, dataset.digest, fields.cameras, fields.pose.signed)
@@ -131,7 +105,7 @@ def _missing(pairs: Sequence[ImagePair], folder: RunFolder, journal: Journal | N
 
 
 def _evaluated(
-    config: DictConfig, fields: Fields, pipeline: Pipeline, pairs: Sequence[ImagePair], folder: RunFolder,
+    config: DictConfig, fields: EvalOptions, pipeline: Pipeline, pairs: Sequence[ImagePair], folder: RunFolder,
     journal: Journal | None,
 ) -> Iterator[int]:  # fmt: skip
     """Evaluates pairs into the folder and the journal; yields how many were done since."""
@@ -204,12 +178,9 @@ def _load(config: DictConfig, progress: Progress) -> PairDataset:
 @job
 def task(config: DictConfig) -> None:
     """What Hydra runs."""
-    hydra_config = HydraConfig.get()
-    changed = [o for o in hydra_config.overrides.task if o.lstrip("+~").startswith(presets.STAGES)]
-    run(config, str(hydra_config.runtime.choices["pipeline"]), changed)
+    run(config, *chosen_pipeline())
 
 
 def main() -> None:
     """The command."""
-    paths = [*path_fields(Fields), "dataset.root", "dataset.file", "dataset.truth", "dataset.images", "export"]
-    run_command("eval", task, paths=paths, interrupted="interrupted; the same command continues the run")
+    run_command(EVAL, task)

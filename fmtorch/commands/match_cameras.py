@@ -17,14 +17,6 @@ from fmtorch.pipeline.reduced_images import Image
 from fmtorch.pipeline.two_images import MatchResult
 
 
-@dataclasses.dataclass(frozen=True)
-class CameraFields:
-    """What the command takes of cameras; ``conf/match.yaml`` says what each is."""
-
-    cameras: Path | None = None
-    K: str | list[float | int] | None = None
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Photographs:
     """Two photographs, and what is known of their cameras as `fmtorch.match` takes it; notes: what is said of these."""

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import functools
 import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from omegaconf import DictConfig
 
 from fmtorch import presets
+from fmtorch.commands.options import MatchOptions
 from fmtorch.core.executors import MIN_PAIRS_FOR_PROCESSES, SHARED_BY, Team, WorkersLost
 from fmtorch.core.files import replacing
 from fmtorch.core.stages import ImageMatcher
@@ -31,7 +31,6 @@ from fmtorch.pipeline.photograph_cameras import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pipeline.similar import similar_pairs, vectors_of
 from fmtorch.presets.executors import execution_of
-from fmtorch.presets.fields import Count, Device, Seed
 from fmtorch.storage.code import fmtorch_version
 from fmtorch.storage.exchange.export import export_kinds, write_exports
 from fmtorch.storage.exchange.journal import Journal
@@ -39,24 +38,8 @@ from fmtorch.storage.exchange.view_graph import ViewGraph, view_graph, write_vie
 from fmtorch.storage.features import CachedFeatures, cached
 
 
-@dataclasses.dataclass(frozen=True)
-class FolderFields:
-    """What the command takes of a folder, and of a single pair too; ``conf/match.yaml`` says what each is."""
-
-    images: Path | None = None
-    pairs: Path | None = None
-    export: str | list[str] | None = None
-    camera: Literal["per_image", "shared"] = "per_image"
-    output: Path | None = None
-    orient: bool = True
-    longest_side: Count = 1600
-    workers: Count | None = None
-    seed: Seed = 0
-    device: Device = "auto"
-
-
 def match_folder(
-    config: DictConfig, fields: FolderFields, cameras: PhotographCameras, pipeline_name: str, overrides: Sequence[str]
+    config: DictConfig, fields: MatchOptions, cameras: PhotographCameras, pipeline_name: str, overrides: Sequence[str]
 ) -> Path:
     """Match the pairs of a folder of images, write what is to be exported and return the folder with it.
 
@@ -108,7 +91,7 @@ def match_folder(
 
 
 @contextlib.contextmanager
-def _team(config: DictConfig, fields: FolderFields, pipeline: Pipeline, pairs: int) -> Iterator[dict[str, Any]]:
+def _team(config: DictConfig, fields: MatchOptions, pipeline: Pipeline, pairs: int) -> Iterator[dict[str, Any]]:
     """Who does the work, as `FolderMatches` takes it. Raises WorkersLost where workers die or the scheduler is lost."""
     parallel = pairs >= MIN_PAIRS_FOR_PROCESSES and pipeline.device.type == "cpu"
     execution = execution_of(config, fields.workers).decided(parallel)

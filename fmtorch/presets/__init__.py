@@ -21,12 +21,11 @@ from fmtorch.presets.files import (
     own_modules,
     peer_packages,
     targets_of,
-    top_level_names,
 )
 from fmtorch.presets.objects import build, expect_buildable, instantiate, plain, resolve_device
 
 __all__ = [
     "STAGES", "available", "build", "build_pipeline", "closest", "composed", "expect_buildable", "expect_dataset",
     "expect_stages", "instantiate", "known_targets", "load", "own_modules", "peer_packages", "pipeline",
-    "pipeline_stages", "plain", "resolve_device", "stages", "targets_of", "top_level_names",
+    "pipeline_stages", "plain", "resolve_device", "stages", "targets_of",
 ]  # fmt: skip

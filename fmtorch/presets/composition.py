@@ -11,11 +11,13 @@ from typing import Any
 import hydra
 import hydra.utils
 import torch
+from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from fmtorch import data
+from fmtorch.core.resources import STAGES as STAGES
 from fmtorch.core.resources import conf_dir
 from fmtorch.presets import hydra_source
 from fmtorch.presets.files import available, unknown
@@ -24,10 +26,12 @@ from fmtorch.presets.objects import expect_buildable, instantiate, open_files, p
 from fmtorch.presets.pruners import build_pruners, expect_pruners, pruner_configs, with_explicit
 from fmtorch.storage.features import cached
 
-STAGES = ("features", "matcher", "pruner", "estimator")  # groups that a pipeline chooses from
 PIPELINE = "fmtorch.pipeline.pipeline.Pipeline"  # by name, as the stages: presets know nothing of what they build
 _composing = threading.Lock()  # Hydra composes through a global
 hydra_source.register()
+PIPELINES = "pipelines"  # the config that a pipeline alone is composed from
+_DEFAULTS = [*({group: name} for group, name in STAGES.items()), {"pipeline": "sift_ratio"}, "_self_"]
+ConfigStore.instance().store(PIPELINES, {"defaults": _DEFAULTS, "cache": None, "cache_limit": 20})
 
 
 def stages(config: DictConfig) -> dict[str, Any]:
@@ -45,7 +49,7 @@ def pipeline_stages(name: str) -> dict[str, Any] | None:
     """The `stages` of the project's own pipeline `name`, unchanged; None where it has, and had, no such pipeline."""
     now = FORMER["pipeline"].get(name, Now(name))
     known = now.name in available("pipeline")
-    return stages(compose("match", (f"pipeline={now.name}", *now.overrides))) if known else None
+    return stages(compose(PIPELINES, (f"pipeline={now.name}", *now.overrides))) if known else None
 
 
 def composed(stages: Mapping[str, Any]) -> dict[str, Any]:
@@ -128,7 +132,7 @@ def pipeline(
         raise ValueError(unknown("pipeline", name, config_dir))
     words = (f"pipeline={name}", "cache=off", *overrides)
     try:
-        config = compose("match", words) if config_dir is None else _composed("match", words, Path(config_dir))
+        config = compose(PIPELINES, words) if config_dir is None else _composed(PIPELINES, words, Path(config_dir))
     except HydraException as error:
         raise ValueError(f"pipeline={name} with {', '.join(overrides)}: {error}") from error
     return build_pipeline(config, device)

@@ -10,7 +10,8 @@ from typing import cast
 from omegaconf import DictConfig
 
 from fmtorch.core.executors import Execution
-from fmtorch.presets.fields import Count, read_fields
+from fmtorch.core.options import Count
+from fmtorch.presets.fields import read_fields
 from fmtorch.presets.objects import expect_buildable, instantiate, plain
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import hydra.utils
 import yaml  # type: ignore[import-untyped]
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from fmtorch.core.options import nearest
@@ -127,11 +127,3 @@ def own_modules(config: object) -> dict[str, str]:
     return {
         name: str(getattr(hydra.utils.get_object(name), "__module__", None) or name.rpartition(".")[0]) for name in own
     }
-
-
-def top_level_names(config_name: str) -> list[str]:
-    """What the command of this config takes by name: its fields and the groups it chooses from."""
-    fields = OmegaConf.load(conf_dir() / f"{config_name}.yaml")
-    assert isinstance(fields, DictConfig)
-    groups = [str(group) for entry in fields.get("defaults", []) if entry != "_self_" for group in entry]
-    return [name for name in (*map(str, fields), *groups) if name not in ("defaults", "hydra") and " " not in name]

@@ -27,38 +27,12 @@ from fmtorch.data.cameras import relative_pose
 from fmtorch.data.images import read_image
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.data.rendered.pinhole import Camera, calibration
+from fmtorch.training.options import PlaneViews
 from fmtorch.training.photographs import Photograph
 from fmtorch.training.warps import Matrix, change_camera, change_light, grey_of, warp
 
 VERSION = 1  # of the views: raised by every change that changes one
 _QUALITY = 92  # of the JPEG files; `change_camera` may have compressed the view before
-
-
-@dataclasses.dataclass(frozen=True)
-class PlaneViews:
-    """How views are drawn; ranges are uniform, of ratios in their logarithm.
-
-    views: of each photograph; every two of them are a pair. tilt: largest angle in degrees between the optical axis and
-    the plane's normal. roll: standard deviation in degrees of the rotation about the axis. part: of the photograph's
-    width that a view spans. scale: sides of a view, of the photograph's. focal: in widths of the view.
-    """
-
-    views: int = 5
-    tilt: float | int = 60.0
-    roll: float | int = 15.0
-    part: tuple[float | int, float | int] = (0.5, 1.0)
-    scale: tuple[float | int, float | int] = (0.7, 1.0)
-    focal: tuple[float | int, float | int] = (0.7, 1.8)
-
-    def __post_init__(self) -> None:
-        if self.views < 2:
-            raise ValueError(f"planes.views={self.views}; a pair needs 2")
-        if not 0 <= self.tilt < 80 or self.roll < 0:
-            raise ValueError(f"planes.tilt={self.tilt}, roll={self.roll}: 0 <= tilt < 80 degrees, roll not negative")
-        for name in ("part", "scale", "focal"):
-            low, high = getattr(self, name)
-            if not 0 < low <= high:
-                raise ValueError(f"planes.{name}={[low, high]}; it must be two positive numbers, the smaller first")
 
 
 class PlanePairs(Dataset[ImagePair]):

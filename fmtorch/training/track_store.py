@@ -17,9 +17,10 @@ from fmtorch.data.images import read_image
 from fmtorch.data.rendered.generate import Task
 from fmtorch.training.correspondences import Tolerance, cut_context, detect, in_order_of_points
 from fmtorch.training.match_sets import Tracks
+from fmtorch.training.options import PlaneViews
 from fmtorch.training.patch_store import PatchStore, count_by, write_store
 from fmtorch.training.photographs import Photograph
-from fmtorch.training.planes import PlaneViews, plane_homography, random_camera
+from fmtorch.training.planes import plane_homography, random_camera
 from fmtorch.training.scenes import View, linked, views_of_scene
 from fmtorch.training.track_geometry import rays_and_incidence
 from fmtorch.training.warps import change_camera, change_light, grey_of, warp

@@ -24,8 +24,8 @@ from fmtorch.evaluation.redraw import difference
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.summary import summarize
 from fmtorch.pipeline.pipeline import Outcome
-from fmtorch.presets.composition import compose
 from fmtorch.storage import PairRow, RunFolder, RunFolderError, to_table
+from tests.helpers import compose
 from tests.pipeline.test_pipeline import draw, pair
 from tests.processes import run_command
 

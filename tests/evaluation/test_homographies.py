@@ -16,9 +16,9 @@ from fmtorch.data import load
 from fmtorch.evaluation.planes import homography_figures
 from fmtorch.metrics import corner_error, pose_auc
 from fmtorch.pipeline.labelled import MatchedPairs
-from fmtorch.presets.composition import compose
 from fmtorch.storage import RunFolder
 from tests.data import planes
+from tests.helpers import compose
 
 
 def run(root: Path, folder: Path, *words: str, pipeline: str = "sift_ratio") -> Path:

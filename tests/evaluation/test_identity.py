@@ -15,9 +15,9 @@ from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.evaluation import identity as identity_module
 from fmtorch.evaluation.identity import run_identity
 from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.presets.composition import compose
 from fmtorch.storage import identity_digest
 from fmtorch.storage.configuration import libraries
+from tests.helpers import compose
 
 GROUPS = ("features", "matcher", "pruner", "estimator", "dataset")
 

@@ -13,9 +13,10 @@ from fmtorch import presets
 from fmtorch.commands.list import HEADINGS, listed
 from fmtorch.commands.report import named
 from fmtorch.core.resources import conf_dir
-from fmtorch.presets.composition import compose, composed
+from fmtorch.presets.composition import composed
 from fmtorch.presets.former import FORMER, moved
 from fmtorch.storage import RunFolder
+from tests.helpers import compose
 from tests.laws import scene
 from tests.processes import run_command
 

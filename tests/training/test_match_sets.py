@@ -18,9 +18,9 @@ from fmtorch.training.geodesc_loss import geodesc
 from fmtorch.training.match_set_training import MatchSetTraining
 from fmtorch.training.match_sets import Tracks, match_sets
 from fmtorch.training.model_card import model_card
+from fmtorch.training.options import PlaneViews
 from fmtorch.training.patch_loop import TrainingOptions
 from fmtorch.training.patch_metrics import validation_pairs
-from fmtorch.training.planes import PlaneViews
 from fmtorch.training.scenes import View
 from fmtorch.training.track_geometry import patch_similarity, rays_and_incidence
 from fmtorch.training.track_store import TrackStore, build_track_store, tracks_of_views, views_of_plane

@@ -13,8 +13,9 @@ from fmtorch.data import DepthDataset, ImagePair
 from fmtorch.data.images import ImageError
 from fmtorch.data.rendered.pinhole import Camera
 from fmtorch.pipeline.labelled import MatchedPairs, collate
+from fmtorch.training.options import PlaneViews
 from fmtorch.training.photographs import Photograph, package_photographs
-from fmtorch.training.planes import PlanePairs, PlaneViews, plane_depth, plane_homography, random_camera
+from fmtorch.training.planes import PlanePairs, plane_depth, plane_homography, random_camera
 from tests.pipeline.labelled.conftest import SIFT
 
 SIZE = (300, 400)

@@ -25,8 +25,9 @@ from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
 from fmtorch.presets.executors import execution_of
 from fmtorch.storage.features import cached
+from fmtorch.training.options import PlaneViews
 from fmtorch.training.photographs import Photograph, list_photographs
-from fmtorch.training.planes import PlanePairs, PlaneViews
+from fmtorch.training.planes import PlanePairs
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ import shlex
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
 from lightning import Trainer
@@ -18,11 +18,10 @@ from omegaconf import DictConfig
 from torch.utils.data import DataLoader, Sampler
 
 from fmtorch import presets
-from fmtorch.core.options import Within, expect_options
+from fmtorch.core.options import expect_options
 from fmtorch.core.terminal import console, progress_bars
 from fmtorch.core.version import __version__
 from fmtorch.pipeline.labelled import (
-    Augmentation,
     Draw,
     LabelledMatches,
     SimilarLengthBatches,
@@ -30,12 +29,12 @@ from fmtorch.pipeline.labelled import (
     collate_trimmed,
 )
 from fmtorch.presets import plain
-from fmtorch.presets.fields import Cache, Count, Gigabytes, Seed, read_fields
+from fmtorch.presets.fields import read_fields
 from fmtorch.storage.runs import identity_digest
-from fmtorch.training.planes import PlaneViews
+from fmtorch.training.options import TrainOptions
 from fmtorch.training.pruners.data import labelled_matches
 from fmtorch.training.pruners.loop import claim, train
-from fmtorch.training.pruners.module import Optimisation, PrunerTraining
+from fmtorch.training.pruners.module import PrunerTraining
 from fmtorch.training.pruners.objective import Objective
 from fmtorch.training.pruners.pictures import ValidationPictures
 from fmtorch.training.pruners.result import Result, write_result
@@ -44,71 +43,24 @@ from fmtorch.training.pruners.validation import Use, Validation
 PICTURES = 4  # validation pairs that are drawn into the log
 
 
-@dataclasses.dataclass(frozen=True)
-class ValidationFields:
-    """What ``validation`` of the command's config holds; ``conf/train.yaml`` says what each is."""
-
-    every: Count = 250
-    scenes: Count = 4
-    roots: list[str] = dataclasses.field(default_factory=list)
-    pairs: Count = 25
-    ratio: float = 0.8
-    uses: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    monitor: str = "log_loss"
-    patience: Count | None = None
-
-
-@dataclasses.dataclass(frozen=True)
-class Fields:
-    """What the command takes at the top level, beside what it chooses; ``conf/train.yaml`` says what each is."""
-
-    before: list[str] = dataclasses.field(default_factory=list)
-    limit: Count | None = None
-    seed: Seed = 0
-    output: Path | None = None
-    cache: Cache = None
-    cache_limit: Gigabytes | None = 20
-    workers: Count | None = None
-    loaders: Annotated[int, Within(0)] = 0
-    threads: Count | None = None
-    batch: Count = 32
-    checkpoint_every: Count = 100
-
-
-@dataclasses.dataclass(frozen=True)
-class PlanesFields:
-    """What ``planes`` of the command's config holds beside the options of `PlaneViews`."""
-
-    photographs: Path | None = None
-    seed: Seed = 0
-
-
-PARTS = {"optimisation": Optimisation, "objective": Objective, "augmentation": Augmentation, "trainer": Trainer}
-
-
 def run(config: DictConfig, name: str) -> Path:
     """Train what a composed config describes and return the folder of the result.
 
     Started again, it goes on from the last checkpoint; a finished training only writes its files anew.
     name: of the pruner's preset, e.g. ``lc``. Raises ValueError for options that cannot be.
     """
-    read_fields(Fields, config)
-    read_fields(ValidationFields, config.validation, "validation")
-    read_fields(PlanesFields, config.planes, "planes")
-    own = {field.name for field in dataclasses.fields(PlanesFields)}
-    expect_options(PlaneViews, {k: v for k, v in plain(config.planes).items() if k not in own}, "planes")
-    for group, part in PARTS.items():
-        expect_options(part, plain(config[group]), group)
+    options = read_fields(TrainOptions, config)
+    expect_options(Trainer, plain(config.trainer), "trainer")
     presets.expect_dataset(config.dataset)
     presets.expect_stages(config)
     network_config = network_of(config, name)
-    optimisation, objective = Optimisation(**plain(config.optimisation)), Objective(**plain(config.objective))
-    uses = {key: use_of(key, value) for key, value in plain(config.validation.uses).items()}
+    objective = Objective(**dataclasses.asdict(options.objective))
+    uses = {key: use_of(key, value) for key, value in options.validation.uses.items()}
     with progress_bars() as progress:
         matches = labelled_matches(config, progress)
     identity = {
         "network": network_config, "objective": dataclasses.asdict(objective), "batch": config.batch,
-        "optimisation": dataclasses.asdict(optimisation), "augmentation": plain(config.augmentation),
+        "optimisation": dataclasses.asdict(options.optimisation), "augmentation": plain(config.augmentation),
         "seed": config.seed, "matches": matches.digest, "version": __version__, "trainer": plain(config.trainer),
         "validation": {k: v for k, v in plain(config.validation).items() if k != "roots"},
     }  # fmt: skip
@@ -118,7 +70,7 @@ def run(config: DictConfig, name: str) -> Path:
     torch.manual_seed(config.seed)
     network = presets.instantiate(network_config, f"pruner={name}, network")
     validation = Validation([m for _, m in matches.validation], uses, [p.family for p, _ in matches.validation])
-    module = PrunerTraining(network, objective, optimisation, validation)
+    module = PrunerTraining(network, objective, options.optimisation, validation)
     first = int(os.environ.get("LOCAL_RANK", "0")) == 0  # of several processes the one that reports
     if first:
         about = f"{len(matches.training)} pairs to train on, {len(matches.validation)} to validate on"
@@ -131,10 +83,10 @@ def run(config: DictConfig, name: str) -> Path:
         ),
         folder,
         plain(config.trainer),
-        every=config.validation.every,
-        checkpoint_every=config.checkpoint_every,
-        patience=config.validation.patience,
-        monitor=config.validation.monitor,
+        every=options.validation.every,
+        checkpoint_every=options.checkpoint_every,
+        patience=options.validation.patience,
+        monitor=options.validation.monitor,
         callbacks=(ValidationPictures(shown),),
     )
     if first:
