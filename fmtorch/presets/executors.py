@@ -11,8 +11,9 @@ from omegaconf import DictConfig
 
 from fmtorch.core.executors import Execution
 from fmtorch.core.options import Count
+from fmtorch.presets.composition import plain
 from fmtorch.presets.fields import read_fields
-from fmtorch.presets.objects import expect_buildable, instantiate, plain
+from fmtorch.presets.objects import expect_buildable, instantiate
 
 
 @dataclasses.dataclass(frozen=True)
