@@ -15,11 +15,12 @@ from rich.progress import Progress
 from fmtorch import data, presets
 from fmtorch.commands.config import chosen_pipeline, job, run_command
 from fmtorch.commands.options import EVAL, EvalOptions
+from fmtorch.core.files import replacing
 from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.data import ImagePair, PairDataset
+from fmtorch.evaluation.curves import picture
 from fmtorch.evaluation.identity import run_identity
 from fmtorch.evaluation.pair_cameras import built_with, cameras_of
-from fmtorch.evaluation.plots import plot_recall_curves
 from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import ALL, Group, summarize
 from fmtorch.evaluation.summary_tables import further_tables, pose_table, summary_markdown, summary_table
@@ -131,7 +132,8 @@ def _summarize(table: pa.Table, folder: RunFolder, title: str, signed: bool) -> 
     summary = summarize(table, signed)
     all_rows = summary if len(run_table) == len(table) else summarize(run_table, signed)
     folder.write_summary(all_rows, summary_markdown(all_rows, title=title))
-    plot_recall_curves({title.partition(" ")[0]: run_table}, folder.path / "recall.png")
+    with replacing(folder.path / "recall.svg") as path:
+        path.write_text(picture(title.partition(" ")[0], run_table), encoding="utf-8")
     part = "" if len(run_table) == len(table) else f", {len(table)} of the {len(run_table)} pairs of the run"
     console.print(summary_table(summary, title=f"{title}{part}"))
     if (poses := pose_table(summary)) is not None:
@@ -139,7 +141,7 @@ def _summarize(table: pa.Table, folder: RunFolder, title: str, signed: bool) -> 
     for further in further_tables(summary):
         console.print(further)
     about = f"; of all {len(run_table)} pairs" if part else ""
-    console.print(f"{folder.path}: pairs/, summary.json, summary.md, recall.png{about}", style="dim")
+    console.print(f"{folder.path}: pairs/, summary.json, summary.md, recall.svg{about}", style="dim")
     return summary
 
 

@@ -105,7 +105,7 @@ def render(
         title=title, runs=runs, shared=shared, names=names,
         swatches={name: Markup(curves.swatch(i)) for i, name in enumerate(names)},
         sections=[_context(section, names) for section in sections],
-        style=Markup(_resource("report.css")), script=Markup(script),
+        style=Markup(curves.style_sheet() + _resource("report.css")), script=Markup(script),
         policy="default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-"
         + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() + "'",
     )  # fmt: skip

@@ -69,7 +69,7 @@ def test_the_summary_is_of_corner_errors(runs: Path) -> None:
     page = (runs / "runs/a/summary.md").read_text()
     assert "AUC@1 px" in page
     assert "%Recall" not in page
-    assert (runs / "runs/a/recall.png").stat().st_size > 0
+    assert (runs / "runs/a/recall.svg").stat().st_size > 0
 
 
 def test_the_report_compares_corner_errors(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
