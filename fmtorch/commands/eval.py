@@ -23,7 +23,7 @@ from fmtorch.evaluation.identity import run_identity
 from fmtorch.evaluation.pair_cameras import built_with, cameras_of
 from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import ALL, Group, summarize
-from fmtorch.evaluation.summary_tables import further_tables, pose_table, summary_markdown, summary_table
+from fmtorch.evaluation.tables import summary_markdown, terminal_tables
 from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES, shard_of
 from fmtorch.pipeline.build import build_pipeline
 from fmtorch.pipeline.exporting import exportable
@@ -135,11 +135,8 @@ def _summarize(table: pa.Table, folder: RunFolder, title: str, signed: bool) -> 
     with replacing(folder.path / "recall.svg") as path:
         path.write_text(picture(title.partition(" ")[0], run_table), encoding="utf-8")
     part = "" if len(run_table) == len(table) else f", {len(table)} of the {len(run_table)} pairs of the run"
-    console.print(summary_table(summary, title=f"{title}{part}"))
-    if (poses := pose_table(summary)) is not None:
-        console.print(poses)
-    for further in further_tables(summary):
-        console.print(further)
+    for each in terminal_tables(summary, f"{title}{part}"):
+        console.print(each)
     about = f"; of all {len(run_table)} pairs" if part else ""
     console.print(f"{folder.path}: pairs/, summary.json, summary.md, recall.svg{about}", style="dim")
     return summary

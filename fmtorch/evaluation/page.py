@@ -15,10 +15,8 @@ import pyarrow as pa
 
 from fmtorch.evaluation import curves, tables
 from fmtorch.evaluation.canvas import Image
-from fmtorch.evaluation.differences import differences
 from fmtorch.evaluation.statistics import THRESHOLD
 from fmtorch.evaluation.summary import summarize
-from fmtorch.evaluation.summary_tables import caption
 
 QUALITY, WIDTH = 80, 1280  # of JPEG pictures; px
 DISAGREEMENT = 0.1  # NSGD beyond which a result is as bad as any
@@ -164,15 +162,11 @@ def _context(section: Section, names: Sequence[str]) -> dict[str, Any]:
     pairs = {table.num_rows for table in section.runs.values()}
     facts = f"{len(section.runs)} runs" if len(section.runs) > 1 else "One run"
     counts = f"{min(pairs):,}" + (f" to {max(pairs):,}" if len(pairs) > 1 else "")
-    optional_tables = (
-        tables.merit(summaries), tables.families(summaries), tables.homographies(summaries), tables.poses(summaries),
-        tables.focals(summaries), tables.configurations(summaries), differences(section.runs),
-    )  # fmt: skip
     return {
         "heading": section.heading,
         "facts": f"{facts}, {counts} pair{'s' * (pairs != {1})}{' each' * (len(section.runs) > 1)}.",
-        "legend": caption(next(iter(summaries.values()))),
-        "tables": [*(table for table in optional_tables if table), tables.seconds(summaries)],
+        "legend": tables.caption(next(iter(summaries.values()))),
+        "tables": tables.report_tables(section.runs, summaries),
         "names": list(section.runs),
         "axis": axis.label,
         "curves": [

@@ -15,14 +15,6 @@ from fmtorch.metrics import corner_error, pose_auc, right_of_homography
 from fmtorch.pipeline.pipeline import Outcome
 
 THRESHOLDS = (1, 3, 5)  # px, as LightGlue (Lindenberger et al., ICCV 2023); SuperGlue and LoFTR: 3, 5, 10
-INLIERS = (
-    "%Inlier: right matches, within 3 px of the true homography, and #Corrs, after estimation, -m: before; means over "
-    "the pairs that did not fail."
-)
-CAPTION = (
-    "By the mean distance, in image 1, between the corners of image 0 as the true and the estimated homography map "
-    "them; failures are misses. AUC: area under the recall curve; corner error: median."
-)
 Values = NDArray[np.float64]
 
 
