@@ -13,9 +13,16 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fmtorch.core.estimate import CONFIGURATIONS
-from fmtorch.evaluation.intervals import share_interval
-from fmtorch.evaluation.planes import homography_figures
-from fmtorch.evaluation.statistics import MERITS, THRESHOLD, focal_figures, pose_figures, recalled, scene_names
+from fmtorch.evaluation.statistics import (
+    MERITS,
+    THRESHOLD,
+    focal_figures,
+    homography_figures,
+    pose_figures,
+    recalled,
+    scene_names,
+    share_interval,
+)
 from fmtorch.storage import PAIR_SCHEMA
 
 ALL = "all"

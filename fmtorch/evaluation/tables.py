@@ -13,16 +13,17 @@ from rich import box
 from rich.table import Table as TerminalTable
 
 from fmtorch.core.estimate import CONFIGURATIONS
-from fmtorch.evaluation.bootstrap import LEVEL, Interval
 from fmtorch.evaluation.curves import NSGD, axis_of
-from fmtorch.evaluation.intervals import MIN_UNITS
-from fmtorch.evaluation.planes import THRESHOLDS as CORNER_THRESHOLDS
 from fmtorch.evaluation.statistics import (
+    CORNER_THRESHOLDS,
     FINE_THRESHOLD,
     FOCAL_THRESHOLDS,
+    LEVEL,
+    MIN_UNITS,
     PERCENT,
     POSE_THRESHOLDS,
     THRESHOLD,
+    Interval,
     areas,
     difference,
     recalled,

@@ -18,9 +18,8 @@ from fmtorch.core.types import Correspondences
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.data.pairs import GivenMatches
 from fmtorch.evaluation import tables
-from fmtorch.evaluation.focals import focal_errors
 from fmtorch.evaluation.pair_cameras import WithPairCameras, built_with, cameras_of
-from fmtorch.evaluation.rows import evaluate
+from fmtorch.evaluation.rows import evaluate, focal_errors
 from fmtorch.evaluation.statistics import focal_figures
 from fmtorch.evaluation.summary import summarize
 from fmtorch.evaluation.tables import summary_markdown, terminal_tables

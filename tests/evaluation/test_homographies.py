@@ -13,7 +13,7 @@ import torch
 from fmtorch.commands import eval as eval_command
 from fmtorch.commands import report as report_command
 from fmtorch.data import load
-from fmtorch.evaluation.planes import homography_figures
+from fmtorch.evaluation.statistics import homography_figures
 from fmtorch.metrics import corner_error, pose_auc
 from fmtorch.pipeline.labelled import MatchedPairs
 from fmtorch.storage import RunFolder
