@@ -21,8 +21,8 @@ from omegaconf import DictConfig
 from omegaconf.errors import GrammarParseError, OmegaConfBaseException
 
 from fmtorch.commands.options import COMMANDS, Command
+from fmtorch.core.files import STAGES, conf_dir
 from fmtorch.core.options import nearest
-from fmtorch.core.resources import STAGES, conf_dir
 from fmtorch.core.terminal import MISTAKES, error_line, exits_with_message
 from fmtorch.presets import available
 from fmtorch.presets.fields import path_fields

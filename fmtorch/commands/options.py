@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from fmtorch.core.files import STAGES
 from fmtorch.core.options import Cache, Count, Device, Gigabytes, Seed, Within, defaults_of, option
-from fmtorch.core.resources import STAGES
 from fmtorch.training.options import TrainOptions
 
 CACHE = "folder of features computed before; null: features in $FMTORCH_CACHE or ~/.cache/fmtorch; off: none"

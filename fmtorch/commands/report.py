@@ -18,10 +18,9 @@ from fmtorch.core.files import expect_writable, replacing
 from fmtorch.core.terminal import console
 from fmtorch.evaluation.curves import axis_of
 from fmtorch.evaluation.gallery import Options, Run, gallery
-from fmtorch.evaluation.names import run_names, shared_settings
-from fmtorch.evaluation.page import Section, render
+from fmtorch.evaluation.page import Section, render, run_names, shared_settings
 from fmtorch.presets.fields import read_fields
-from fmtorch.storage import RunFolder, RunFolderError
+from fmtorch.runs import RunFolder, RunFolderError
 
 
 def run(config: DictConfig) -> Path:

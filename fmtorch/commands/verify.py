@@ -17,12 +17,11 @@ from fmtorch.commands.config import job, run_command
 from fmtorch.commands.options import VERIFY, VerifyOptions
 from fmtorch.core.terminal import console, errors, progress_bars, reporter
 from fmtorch.jobs.execution import shard_of
-from fmtorch.pipeline.verification import ONE_THREAD, How, verify_by
-from fmtorch.pipeline.verification_places import Places
-from fmtorch.pipeline.verification_run import Verification
 from fmtorch.presets import plain
 from fmtorch.presets.executors import execution_of
 from fmtorch.presets.fields import read_fields
+from fmtorch.verification.run import Verification
+from fmtorch.verification.verify import ONE_THREAD, How, Places, verify_by
 
 MAX_PROBLEMS = 20  # that are printed
 

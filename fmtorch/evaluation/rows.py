@@ -22,7 +22,7 @@ from fmtorch.data.pairs import ImagePair
 from fmtorch.metrics import closest_pose_error, corner_error, fundamental_pose_error, pose_error, right_of_homography
 from fmtorch.metrics.pose import PoseError
 from fmtorch.pipeline.pipeline import STAGES, Outcome
-from fmtorch.storage import PairRow
+from fmtorch.runs import PairRow
 
 LARGEST_ROTATION, LARGEST_TRANSLATION = 180.0, 90.0  # degrees: what a failed pair counts as, 180 with the sign of t
 Figures = dict[str, Any]  # fields of `PairRow`
@@ -201,7 +201,7 @@ class FocalErrors(NamedTuple):
 
 
 def focal_errors(outcome: Outcome) -> FocalErrors:
-    """The errors of one pair, by what its estimator was given (`fmtorch.pipeline.examination`)."""
+    """The errors of one pair, by what its estimator was given (`fmtorch.pipeline.pipeline`)."""
     c, estimate = outcome.correspondences, outcome.estimate
     if c is None or c.focal is None or estimate is None:
         return FocalErrors()

@@ -23,7 +23,7 @@ from fmtorch.evaluation.statistics import (
     scene_names,
     share_interval,
 )
-from fmtorch.storage import PAIR_SCHEMA
+from fmtorch.runs import PAIR_SCHEMA
 
 ALL = "all"
 STAGES = tuple(name.removeprefix("seconds_") for name in PAIR_SCHEMA.names if name.startswith("seconds_"))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from fmtorch.core.resources import STAGES
+    from fmtorch.core.files import STAGES
     from fmtorch.presets.composition import (
         composed,
         expect_dataset,

@@ -23,10 +23,9 @@ from fmtorch.evaluation.rows import evaluate, focal_errors
 from fmtorch.evaluation.statistics import focal_figures
 from fmtorch.evaluation.summary import summarize
 from fmtorch.evaluation.tables import summary_markdown, terminal_tables
-from fmtorch.pipeline.examination import examined
-from fmtorch.pipeline.pipeline import Outcome, Pipeline
-from fmtorch.storage import PairRow, to_table
-from fmtorch.storage.exchange.dataset import H5Pairs
+from fmtorch.io.dataset import H5Pairs
+from fmtorch.pipeline.pipeline import Outcome, Pipeline, examined
+from fmtorch.runs import PairRow, to_table
 from tests.geometry.kinds import K, batch, draw
 from tests.storage.exchange import writers
 

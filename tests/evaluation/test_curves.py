@@ -11,7 +11,7 @@ import pytest
 
 from fmtorch.core.types import pair_key
 from fmtorch.evaluation.curves import panels, picture, svg
-from fmtorch.storage import PairRow, to_table
+from fmtorch.runs import PairRow, to_table
 
 
 def table(*families: str, nsgd: float = 0.03) -> pa.Table:

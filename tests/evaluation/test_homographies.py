@@ -16,7 +16,7 @@ from fmtorch.data import load
 from fmtorch.evaluation.statistics import homography_figures
 from fmtorch.metrics import corner_error, pose_auc
 from fmtorch.pipeline.labelled import MatchedPairs
-from fmtorch.storage import RunFolder
+from fmtorch.runs import RunFolder
 from tests.data import planes
 from tests.helpers import compose
 

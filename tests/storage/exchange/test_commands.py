@@ -19,12 +19,11 @@ from omegaconf import DictConfig
 from fmtorch import data
 from fmtorch.commands import eval as eval_command
 from fmtorch.commands import match as match_command
+from fmtorch.io.export import DATABASE, FEATURES, MATCHES
 from fmtorch.pipeline import folder
-from fmtorch.pipeline.folder_images import chosen_pairs, images_below
-from fmtorch.pipeline.folder_output import open_folder
+from fmtorch.pipeline.folder import chosen_pairs, images_below, open_folder
 from fmtorch.pipeline.two_images import Described
-from fmtorch.storage import RunFolder
-from fmtorch.storage.exchange.export import DATABASE, FEATURES, MATCHES
+from fmtorch.runs import RunFolder
 from tests.helpers import compose
 from tests.pipeline.test_pipeline import draw
 
