@@ -44,12 +44,12 @@ def evaluate(outcomes: Sequence[Outcome], seed: int = 0, signed: bool = False) -
     return [rows[i] for i in range(len(outcomes))]
 
 
-def _joined(outcomes: Sequence[Outcome]) -> tuple[Correspondences, Estimate]:
-    """Correspondences and estimates of outcomes that have both, as batches on the CPU."""
+def _joined(outcomes: Sequence[Outcome]) -> tuple[Correspondences, Estimate, tuple[Tensor, Tensor]]:
+    """Correspondences and estimates of outcomes that have both, as batches on the CPU, and the sizes of images."""
     c = collate([o.correspondences.to("cpu") for o in outcomes if o.correspondences is not None])
     if c.size0 is None or c.size1 is None:
         raise ValueError("correspondences come without image sizes (size0, size1); the matcher must supply them")
-    return c, collate([o.estimate.to("cpu") for o in outcomes if o.estimate is not None])
+    return c, collate([o.estimate.to("cpu") for o in outcomes if o.estimate is not None]), (c.size0, c.size1)
 
 
 def _truth(outcomes: Sequence[Outcome], *names: str) -> list[Tensor]:
@@ -68,15 +68,15 @@ def _of_fundamental_matrices(outcomes: Sequence[Outcome], seed: int, signed: boo
     figures: list[Figures] = [{**undefined} for _ in outcomes]
     if solved := [i for i, o in enumerate(outcomes) if o.solved]:
         own = [outcomes[i] for i in solved]
-        (c, estimate), (F,) = _joined(own), _truth(own, "F")
+        (c, estimate, sizes), (F,) = _joined(own), _truth(own, "F")
         for name, distance in (("nsgd", metrics.nsgd), ("nsgd_released", metrics.nsgd_released)):
-            values = distance(F, estimate.F, c.size0, c.size1, seed=seed, key=c.keys).tolist()
+            values = distance(F, estimate.F, *sizes, seed=seed, key=c.keys).tolist()
             for i, value in zip(solved, values, strict=True):
                 figures[i][name] = value
     if matched := _matched(outcomes):
         own = [outcomes[i] for i in matched]
-        (c, estimate), (F,) = _joined(own), _truth(own, "F")
-        rates = metrics.inlier_rate(F, c.x0, c.x1, estimate.inliers, c.size0, c.size1, mask=c.mask)
+        (c, estimate, sizes), (F,) = _joined(own), _truth(own, "F")
+        rates = metrics.inlier_rate(F, c.x0, c.x1, estimate.inliers, *sizes, mask=c.mask)
         for i, before, after in zip(matched, rates.before.tolist(), rates.after.tolist(), strict=True):
             figures[i] |= {"inlier_rate_before": before, "inlier_rate": after if outcomes[i].solved else math.nan}
     poses = pose_errors(outcomes, signed)
@@ -89,8 +89,8 @@ def _of_homographies(outcomes: Sequence[Outcome]) -> list[Figures]:
     figures: list[Figures] = [{"nsgd": math.nan, "corner_error": math.inf, **rates} for _ in outcomes]
     if matched := _matched(outcomes):
         own = [outcomes[i] for i in matched]
-        (c, estimate), (H,) = _joined(own), _truth(own, "H")
-        errors = torch.where(estimate.ok, corner_error(estimate.F, H, cast(Tensor, c.size0)), torch.inf)
+        (c, estimate, (size0, _)), (H,) = _joined(own), _truth(own, "H")
+        errors = torch.where(estimate.ok, corner_error(estimate.F, H, size0), torch.inf)
         right, kept = right_of_homography(H, c.x0, c.x1, mask=c.mask), estimate.inliers & c.mask
         before = right.sum(-1).double() / c.mask.sum(-1)
         after = torch.where(estimate.ok, (right & kept).sum(-1).double() / kept.sum(-1), torch.nan)
@@ -103,14 +103,14 @@ def _row(outcome: Outcome, figures: Figures, planar: bool, seconds: float) -> Pa
     pair, c, estimate = outcome.pair, outcome.correspondences, outcome.estimate
     ok, configuration, focals = outcome.solved, outcome.configuration, focal_errors(outcome)
     matrix = estimate.F[0].flatten().tolist() if estimate is not None and ok else None
+    figures = figures | {f"seconds_{stage}": outcome.seconds.get(stage, math.nan) for stage in STAGES}
     return PairRow(
         pair=pair.identity, key=pair.key, family=pair.family, scene=pair.scene, ok=ok, reason=outcome.reason,
         corrs=int(estimate.inliers.sum()) if estimate is not None else 0,
         corrs_before=int(c.mask.sum()) if c is not None else 0,
         features0=outcome.features[0], features1=outcome.features[1],
         draws=int(estimate.draws[0]) if estimate is not None else 0,
-        **{f"seconds_{stage}": outcome.seconds.get(stage, math.nan) for stage in STAGES}, seconds_metrics=seconds,
-        F=None if planar else matrix, H=matrix if planar else None, **figures,
+        seconds_metrics=seconds, F=None if planar else matrix, H=matrix if planar else None, **figures,
         significance=float(cast(Tensor, estimate.significance)[0]) if estimate is not None and ok else None,
         related=bool(estimate.related[0]) if estimate is not None else False,
         configuration=None if configuration is None else configuration.names[0],
@@ -174,18 +174,18 @@ def _has_pose(outcome: Outcome) -> bool:
 
 
 def _of_pose(outcomes: Sequence[Outcome], up_to_sign: bool) -> PoseError:
-    (_, estimate), (R, t) = _joined(outcomes), _truth(outcomes, "R", "t")
+    (_, estimate, _), (R, t) = _joined(outcomes), _truth(outcomes, "R", "t")
     own = cast(Tensor, estimate.R).double(), cast(Tensor, estimate.t).double()
     return pose_error(*own, R, t, up_to_sign=up_to_sign)
 
 
 def _of_fundamental(outcomes: Sequence[Outcome]) -> PoseError:
-    (c, estimate), (K0, K1, R, t) = _joined(outcomes), _truth(outcomes, "K0", "K1", "R", "t")
+    (c, estimate, _), (K0, K1, R, t) = _joined(outcomes), _truth(outcomes, "K0", "K1", "R", "t")
     return fundamental_pose_error(estimate.F.double(), K0, K1, c.x0, c.x1, R, t, estimate.inliers & c.mask)
 
 
 def _closest(outcomes: Sequence[Outcome]) -> PoseError:
-    _, estimate = _joined(outcomes)
+    _, estimate, _ = _joined(outcomes)
     return closest_pose_error(estimate.F.double(), *_truth(outcomes, "K0", "K1", "R", "t"))
 
 
