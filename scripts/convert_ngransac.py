@@ -18,7 +18,7 @@ from torch import Tensor
 
 from fmtorch.core.terminal import console, exits_with_message
 from fmtorch.pruning.networks import LC
-from fmtorch.training.pruner_export import save_weights
+from fmtorch.training.export import save_weights
 
 _LAYERS = {"s0": "linear0", "s1": "norm0", "s2": "linear1", "s3": "norm1"}
 

@@ -9,9 +9,9 @@ python scripts/download.py weights=hardnet++ sha256=HEX           for a file who
 python scripts/download.py weights=hardnet++ sha256=any           accepts what comes, and prints its SHA-256
 
 L2-Net's authors publish MATLAB files only and no stable address of a port is known; a port that you have is converted
-by scripts/export_onnx.py architecture=l2net.
+by scripts.patch_networks.export architecture=l2net.
 
-Then: python scripts/export_onnx.py checkpoint=weights/AffNet.pth architecture=affnet licence=MIT
+Then: python -m scripts.patch_networks.export checkpoint=weights/AffNet.pth architecture=affnet licence=MIT
 """
 
 from __future__ import annotations
