@@ -13,14 +13,15 @@ import cv2
 import numpy as np
 import torch
 
-from fmtorch import presets
-from fmtorch.core.calls import Calls
-from fmtorch.core.executors import Execution, Team
 from fmtorch.core.files import replacing
-from fmtorch.core.recipes import Here, Recipe, Source
 from fmtorch.core.resources import cache_dir
 from fmtorch.core.types import Correspondences
 from fmtorch.data.pairs import DepthDataset, ImagePair, PairDataset
+from fmtorch.jobs.execution import Execution
+from fmtorch.jobs.pool import WorkerPool
+from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner
+from fmtorch.jobs.threads import use_one_thread
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.storage.configuration import configuration, environment
 from fmtorch.storage.features import CachedFeatures
@@ -97,8 +98,8 @@ class MatchedPairs(StoredMatches):
             )
         stages, execution = pipeline, execution or Execution("threads", workers)
         if isinstance(stages, str):
-            build = build or functools.partial(presets.pipeline, stages, overrides=tuple(overrides))
-            stages = presets.pipeline(stages, overrides=overrides)
+            build = build or functools.partial(load_pipeline, stages, overrides=tuple(overrides))
+            stages = load_pipeline(stages, overrides=overrides)
         elif overrides:
             raise ValueError("overrides change a pipeline that is given by name; this one is given as an object")
         if build is None and not execution.shared:
@@ -216,19 +217,20 @@ def compute_shards(
         build: makes it in other processes; pickled. jobs: files and their pairs. most: matches kept of a pair.
         execution: by which workers, each with one thread of the libraries.
     """
-    team = Team(execution, PRELOADED)
+    pool = WorkerPool(execution, PRELOADED)
     source: Source[Matching]
     if execution.shared:
-        source = Here(matching(dataset, stages, most, _IMAGES * team.size))
+        source = Local(matching(dataset, stages, most, _IMAGES * pool.size))
     else:
         assert build is not None
-        source = Recipe(functools.partial(_matching_in_process, dataset, build, most))
+        source = Factory(functools.partial(_matching_in_process, dataset, build, most))
+    runner = TaskRunner(pool, source, matched_rows, lambda job, rows: write_shard(job.path, rows))
     threads = torch.get_num_threads(), cv2.getNumThreads()
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
+    use_one_thread()
     try:
-        for job in Calls(team, source, matched_rows, lambda job, rows: write_shard(job.path, rows)).each(jobs):
-            yield len(job.pairs)
+        with pool:
+            for job in runner.each(jobs):
+                yield len(job.pairs)
     finally:  # interrupted: what is under way is finished and kept
         torch.set_num_threads(threads[0])
         cv2.setNumThreads(threads[1])
