@@ -11,7 +11,7 @@ from fmtorch.data import read_image
 from fmtorch.data.pairs import ImageSource
 from fmtorch.data.rendered import Plan
 from fmtorch.data.rendered import dataset as rendered_dataset
-from scripts import draw_gallery
+from scripts import draw
 from tests.conftest import own_cache
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "gallery.md"
@@ -24,11 +24,11 @@ def test_the_pictures_are_drawn(
 ) -> None:
     monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(tmp_path)))
     monkeypatch.setattr(rendered_dataset, "PLANS", {("small", "test"): SMALL})
-    draw_gallery.main(["--output", str(tmp_path / "gallery")])
+    draw.main(["gallery", "--output", str(tmp_path / "gallery")])
     shown = re.findall(r"\(gallery/(\w+\.jpg)\)", PAGE.read_text(encoding="utf-8"))
     assert sorted(shown) == sorted(path.name for path in (tmp_path / "gallery").iterdir())
     for name in shown:
         image = read_image(ImageSource(name, tmp_path / "gallery" / name))
-        assert image.shape[1] == draw_gallery.WIDTH
+        assert image.shape[1] == draw.GALLERY_WIDTH
         assert image.std() > 10
     assert "matches; NSGD" in capsys.readouterr().out
