@@ -28,15 +28,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.core.files import replacing
-from fmtorch.core.resources import models_dir
+from fmtorch.core.files import models_dir, replacing
 from fmtorch.core.terminal import console, exits_with_message
 from fmtorch.data import read_image
-from fmtorch.data.rendered.photographs import PICTURES, photograph
 from fmtorch.features import learn_projection, local_feature
 from fmtorch.features.vlad import Codebook, Kind, local_descriptors
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pruning.networks import LC
+from fmtorch.scenes.textures import PICTURES, photograph
 from fmtorch.training.export import save_weights
 from fmtorch.training.planes import list_photographs
 

@@ -16,9 +16,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fmtorch.core.random import bits, uniform
-from fmtorch.core.streams import Stream
 from fmtorch.geometry.epipolar import unit_frobenius
+from fmtorch.jit.random import Stream, bits, uniform
 from fmtorch.training.labelled import LabelledMatches
 
 MIN_INLIERS = 16  # no crop or ratio threshold that would leave fewer; twice what the eight-point algorithm needs

@@ -9,8 +9,7 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch.utils.data import DataLoader, Sampler
 
-from fmtorch.core.random import uniform
-from fmtorch.core.streams import Stream
+from fmtorch.jit.random import Stream, uniform
 from fmtorch.training.augmentation import subset_size
 from fmtorch.training.labelled import LabelledMatches, collate
 from fmtorch.training.stored_matches import Draw, StoredMatches

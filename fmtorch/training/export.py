@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from fmtorch.core.files import replacing
 from fmtorch.pruning.networks.files import INPUT, OUTPUT, LearnedFile, OnnxBackbone, stated_network
 from fmtorch.pruning.networks.layers import Slots
-from fmtorch.pruning.networks.prediction import Exportable
+from fmtorch.pruning.networks.learned import Exportable
 from fmtorch.training.validation import Evaluation, Validation, reliability
 
 ATOL = 1e-4  # of torch against ONNX

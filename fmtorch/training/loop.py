@@ -30,8 +30,8 @@ from fmtorch.core.files import replacing
 from fmtorch.core.terminal import progress_bars
 from fmtorch.data import ImagePair, read_image
 from fmtorch.evaluation.pictures import draw_matches
-from fmtorch.pruning.networks.prediction import predict
-from fmtorch.storage.runs import identity_digest
+from fmtorch.pruning.networks.learned import predict
+from fmtorch.runs.run_folder import identity_digest
 from fmtorch.training.labelled import LabelledMatches
 from fmtorch.training.objective import Objective
 from fmtorch.training.validation import Evaluation, Validation

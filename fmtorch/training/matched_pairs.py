@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 import torch
 
-from fmtorch.core.files import replacing
-from fmtorch.core.resources import cache_dir
+from fmtorch.core.files import cache_dir, replacing
 from fmtorch.core.types import Correspondences
 from fmtorch.data.pairs import DepthDataset, ImagePair, PairDataset
 from fmtorch.jobs.execution import Execution
@@ -23,9 +22,9 @@ from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner
 from fmtorch.jobs.threads import use_one_thread
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
-from fmtorch.storage.configuration import configuration, environment
-from fmtorch.storage.features import CachedFeatures
-from fmtorch.storage.runs import canonical, identity_digest
+from fmtorch.runs.feature_cache import CachedFeatures
+from fmtorch.runs.fingerprint import configuration, environment
+from fmtorch.runs.run_folder import canonical, identity_digest
 from fmtorch.training import labelled
 from fmtorch.training.augmentation import Augmentation
 from fmtorch.training.stored_matches import FORMAT, Shard, ShardError, StoredMatches, write_shard

@@ -14,15 +14,13 @@ import torch
 from jaxtyping import Bool, Float, Int, Int8, Real
 from torch import Tensor
 
-from fmtorch.core.random import uniform
-from fmtorch.core.streams import Stream
 from fmtorch.geometry.arithmetic import matmul3, stable_sum
 from fmtorch.geometry.eight_point import eight_point
 from fmtorch.geometry.epipolar import lines_through, residual_and_normals, unit_largest
+from fmtorch.jit.random import Stream, uniform
 from fmtorch.metrics import nsgd
-from fmtorch.metrics.draws import segment_in_image
-from fmtorch.metrics.nsgd import BORDER
-from fmtorch.pruning.networks.prediction import Prediction
+from fmtorch.metrics.nsgd import BORDER, segment_in_image
+from fmtorch.pruning.networks.learned import Prediction
 from fmtorch.training.labelled import LabelledMatches
 
 COORDINATES = ("size", "K")

@@ -25,15 +25,15 @@ from fmtorch.core.options import Within, expect_options
 from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.core.version import __version__
 from fmtorch.data import ImagePair, PairDataset
-from fmtorch.data.matchable import ENOUGH
-from fmtorch.data.subset import subset
+from fmtorch.data.construction import ENOUGH
+from fmtorch.data.pairs import subset
 from fmtorch.evaluation.run import select
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
 from fmtorch.presets.executors import execution_of
 from fmtorch.presets.fields import Cache, Count, Gigabytes, Seed, read_fields
-from fmtorch.storage.features import cached
-from fmtorch.storage.runs import identity_digest
+from fmtorch.runs.feature_cache import cached
+from fmtorch.runs.run_folder import identity_digest
 from fmtorch.training.augmentation import Augmentation, keep_ratio
 from fmtorch.training.batches import training_batches
 from fmtorch.training.export import Result, write_result

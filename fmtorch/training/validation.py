@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from fmtorch import metrics
 from fmtorch.core.stages import Estimator
 from fmtorch.metrics.recall import FINE_THRESHOLD
-from fmtorch.pruning.networks.prediction import predict
+from fmtorch.pruning.networks.learned import predict
 from fmtorch.training.labelled import LabelledMatches
 from fmtorch.training.objective import classification_loss
 

@@ -19,10 +19,9 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from fmtorch.core.resources import models_dir
+from fmtorch.core.files import models_dir
 from fmtorch.core.terminal import console, exits_with_message
-from fmtorch.features.networks import DESCRIPTORS, build, load_weights
-from fmtorch.features.networks.checkpoints import read_checkpoint
+from fmtorch.features.networks import DESCRIPTORS, build, load_weights, read_checkpoint
 from fmtorch.features.onnx_network import PatchNetwork, network_file
 from fmtorch.training.export import OWN_LICENCE, listed, markdown_table, sha256
 from fmtorch.training.onnx_export import export, lay_out, quantize

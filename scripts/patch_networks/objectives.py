@@ -16,9 +16,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from fmtorch.core import random
-from fmtorch.core.streams import Stream
-from fmtorch.features.orientation import PatchFunction
+from fmtorch.features.frames import PatchFunction
+from fmtorch.jit import random
+from fmtorch.jit.random import Stream
 
 DRAWS = 6  # random numbers in [0, 1) that an objective gets for each point
 SAME_PATCH = 0.008  # a negative nearer than this is the same patch twice, as in the authors' code for HardNet

@@ -16,11 +16,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fmtorch.data.rendered.generate import FAMILIES, Plan, Task, build, draw, seeds
-from fmtorch.data.rendered.pinhole import Camera
-from fmtorch.data.rendered.raycast import Geometry
 from fmtorch.features import SIFT, DominantGradient, HessianDetector, ImagePyramid
 from fmtorch.features.frames import FRAME_SIGMAS
+from fmtorch.scenes.camera import Camera
+from fmtorch.scenes.generate import FAMILIES, Plan, Task, build, draw, seeds
+from fmtorch.scenes.raycast import Geometry
 from fmtorch.training import planes
 from fmtorch.training.planes import Grey, Matrix, PlaneViews, warp
 

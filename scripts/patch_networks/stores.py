@@ -19,11 +19,11 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.core import random
-from fmtorch.core.streams import Stream
 from fmtorch.data.images import read_image
-from fmtorch.data.rendered.generate import Task
-from fmtorch.data.rendered.photographs import PICTURES, skimage_file
+from fmtorch.jit import random
+from fmtorch.jit.random import Stream
+from fmtorch.scenes.generate import Task
+from fmtorch.scenes.textures import PICTURES, skimage_file
 from fmtorch.training.planes import Photograph, PlaneViews
 from scripts.patch_networks import patches as patches_module
 from scripts.patch_networks.patches import CONTEXT_SIZE, Part, Tolerance, Warps

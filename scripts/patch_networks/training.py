@@ -18,10 +18,10 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor, from_numpy, nn
 
-from fmtorch.core import random
 from fmtorch.core.files import replacing
-from fmtorch.core.streams import Stream
-from fmtorch.features.networks.checkpoints import read_checkpoint
+from fmtorch.features.networks import read_checkpoint
+from fmtorch.jit import random
+from fmtorch.jit.random import Stream
 from scripts.patch_networks.objectives import DRAWS, DescriptorObjective, Objective
 from scripts.patch_networks.patches import patch_similarity
 from scripts.patch_networks.stores import PatchStore, Tracks

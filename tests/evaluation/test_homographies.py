@@ -13,10 +13,10 @@ import torch
 from fmtorch.commands import eval as eval_command
 from fmtorch.commands import report as report_command
 from fmtorch.data import load
-from fmtorch.evaluation.planes import homography_figures
+from fmtorch.evaluation.rows import homography_figures
 from fmtorch.metrics import corner_error, pose_auc
 from fmtorch.presets.composition import compose
-from fmtorch.storage import RunFolder
+from fmtorch.runs import RunFolder
 from fmtorch.training import MatchedPairs
 from tests.data import planes
 

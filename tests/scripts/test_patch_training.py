@@ -15,10 +15,10 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 from torch import Tensor, nn
 
-from fmtorch.core.resources import conf_dir
-from fmtorch.data.rendered.photographs import photograph
+from fmtorch.core.files import conf_dir
 from fmtorch.features.networks import AffNet, AffNetFast, GeoDesc, HardNet, build, load_weights
 from fmtorch.features.onnx_network import PatchNetwork
+from fmtorch.scenes.textures import photograph
 from fmtorch.training.export import sha256
 from fmtorch.training.planes import PlaneViews
 from scripts.patch_networks.evaluate import DEFAULTS, figures, times

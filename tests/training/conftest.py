@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from fmtorch.core.types import Correspondences, pair_key
-from fmtorch.data.rendered import Plan, RenderedPairs
-from fmtorch.data.rendered.pinhole import calibration
+from fmtorch.scenes import Plan, RenderedPairs
+from fmtorch.scenes.camera import calibration
 from fmtorch.training import LabelledMatches, MatchedPairs
 from tests.conftest import own_cache
 

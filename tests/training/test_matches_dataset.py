@@ -16,11 +16,11 @@ from torch.utils.data import DataLoader
 
 from fmtorch.data import load
 from fmtorch.data.pairs import ImagePair, ImageSource
-from fmtorch.data.rendered import RenderedPairs
-from fmtorch.data.rendered.generate import FAMILIES, PLANS, Task
 from fmtorch.geometry.epipolar import symmetric_max
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.scenes import RenderedPairs
+from fmtorch.scenes.generate import FAMILIES, PLANS, Task
 from fmtorch.training import (
     Augmentation,
     Draw,

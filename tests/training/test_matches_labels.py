@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from fmtorch.data.pairs import ImagePair, ImageSource
-from fmtorch.data.rendered import RenderedPairs
-from fmtorch.data.rendered.pinhole import calibration, fundamental, look_at, relative_pose
+from fmtorch.scenes import RenderedPairs
+from fmtorch.scenes.camera import calibration, fundamental, look_at, relative_pose
 from fmtorch.training.labelled import (
     EDGE_PX,
     by_line,

@@ -11,8 +11,8 @@ import torch
 
 from fmtorch.data import DepthDataset, ImagePair
 from fmtorch.data.images import ImageError
-from fmtorch.data.rendered.photographs import skimage_file
-from fmtorch.data.rendered.pinhole import Camera
+from fmtorch.scenes.camera import Camera
+from fmtorch.scenes.textures import skimage_file
 from fmtorch.training import MatchedPairs, collate
 from fmtorch.training.planes import (
     Photograph,
@@ -133,7 +133,7 @@ def between_views(planes: PlanePairs, pair: ImagePair) -> np.ndarray:
 def test_pairs_of_planes_train_the_classification_alone(planes: PlanePairs, tmp_path: Path) -> None:
     pytest.importorskip("lightning", reason="training needs the extra `train`")
     from fmtorch.pruning.networks import LC
-    from fmtorch.pruning.networks.prediction import predict
+    from fmtorch.pruning.networks.learned import predict
     from fmtorch.training.objective import Objective
 
     matched = MatchedPairs(planes, **SIFT, root=tmp_path, workers=1)

@@ -12,7 +12,7 @@ from fmtorch import presets
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry import eight_point
 from fmtorch.pruning.networks import LC
-from fmtorch.pruning.networks.prediction import Prediction, predict
+from fmtorch.pruning.networks.learned import Prediction, predict
 from fmtorch.training import LabelledMatches, collate
 from fmtorch.training.objective import Objective, classification_loss, fits, geometric_loss
 from fmtorch.training.validation import Use, Validation
