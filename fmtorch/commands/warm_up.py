@@ -8,8 +8,7 @@ import sys
 import time
 
 from fmtorch.compiling import cache, calls, switch
-from fmtorch.compiling.process import HOME
-from fmtorch.compiling.together import compile_together
+from fmtorch.compiling.together import HOME, compile_together
 from fmtorch.core.terminal import console, exits_with_message
 
 USAGE = """fmtorch warm-up: compile all kernels now

@@ -25,9 +25,6 @@ from fmtorch.compiling import calls
 from fmtorch.core.resources import cache_dir
 
 HERE = Path(__file__).resolve().parent
-_HOW = (  # the files that say how
-    "kernel.py", "fused.py", "inner.py", "calls.py", "version.py", "lanes.py", "lane_types.py", "lane_functions.py",
-)  # fmt: skip
 ABOUT = "about.json"  # in each folder; its time of change is when the folder was last used
 UNUSED_DAYS = 30  # after which a folder is removed
 _SETTINGS = ("BOUNDSCHECK", "CPU_FEATURES", "CPU_NAME", "DEBUGINFO_DEFAULT", "ENABLE_AVX", "LOOP_VECTORIZE", "OPT")
@@ -46,12 +43,12 @@ def versions() -> dict[str, str]:
     from llvmlite import binding
 
     settings = {name: str(getattr(numba.config, name, None)) for name in _SETTINGS}
-    features = binding.get_host_cpu_features().flatten()
+    own = b"".join(file.read_bytes() for file in sorted(HERE.glob("*.py")))
     return {
-        "compiling": _hex(b"".join((HERE / name).read_bytes() for name in _HOW)), "numba": numba.__version__,
-        "llvmlite": llvmlite.__version__, "python": platform.python_version(),
-        "machine": f"{platform.system()} {platform.machine()}", "processor": binding.get_host_cpu_name(),
-        "features": features, "settings": json.dumps(settings),
+        "compiling": _hex(own), "numba": numba.__version__, "llvmlite": llvmlite.__version__,
+        "python": platform.python_version(), "machine": f"{platform.system()} {platform.machine()}",
+        "processor": binding.get_host_cpu_name(), "features": binding.get_host_cpu_features().flatten(),
+        "settings": json.dumps(settings),
     }  # fmt: skip
 
 

@@ -5,18 +5,14 @@ A terminal shows which one it is and forgets the line when all is done; a log ge
 
 from __future__ import annotations
 
-import os
 import sys
 
-QUIET = "FMTORCH_COMPILES_QUIETLY"  # set for a process that helps another one, which speaks for both
 _CLEAR = "\r\x1b[K"
 _state = {"announced": False}
 
 
 def begun(name: str, where: str, count: str = "") -> None:
     """Say that a kernel is compiled, on the error stream. where: it is kept. count: which one of how many it is."""
-    if os.environ.get(QUIET):
-        return
     if sys.stderr.isatty():
         print(f"{_CLEAR}{count}compiling {name} {where}", end="", file=sys.stderr, flush=True)
     elif not _state["announced"]:
@@ -26,5 +22,5 @@ def begun(name: str, where: str, count: str = "") -> None:
 
 def ended() -> None:
     """Take the line back from a terminal."""
-    if not os.environ.get(QUIET) and sys.stderr.isatty():
+    if sys.stderr.isatty():
         print(_CLEAR, end="", file=sys.stderr, flush=True)

@@ -14,9 +14,8 @@ from fmtorch.core.resources import cache_dir
 from fmtorch.data.candidates import AllPairs
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.data.rendered.depth import depth_at
-from fmtorch.data.rendered.generate import FAMILIES, PLANS, Plan, Task, digest, read
+from fmtorch.data.rendered.generate import FAMILIES, PLANS, Plan, Progress, Task, digest, generate_all, read
 from fmtorch.data.rendered.pinhole import Camera, fundamental, relative_pose
-from fmtorch.data.rendered.workers import Progress, generate_all
 from fmtorch.data.scenes import Scene, ScenePairs, View
 
 

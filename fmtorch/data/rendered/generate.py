@@ -14,13 +14,14 @@ import json
 import os
 import shutil
 import uuid
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+from fmtorch.compiling.together import compile_together
 from fmtorch.data.matchable import Keypoints, keypoints, matchable
 from fmtorch.data.rendered import collection, driving, indoor, orbit
 from fmtorch.data.rendered.light import Stage, expose
@@ -30,11 +31,15 @@ from fmtorch.data.rendered.pinhole import Camera, fundamental
 from fmtorch.data.rendered.raycast import Geometry
 from fmtorch.data.rendered.raycast_kernels import cast_pieces
 from fmtorch.data.rendered.scene import Scene, Shot
+from fmtorch.jobs.execution import Execution, cores
+from fmtorch.jobs.pool import MAX_PROCESSES, WorkerPool
+from fmtorch.jobs.runner import Local, TaskRunner
 
 VERSION = 3  # of the generator: raised by every change that changes a picture or a pair
 FAMILIES = {"indoor": indoor.scene, "driving": driving.scene, "orbit": orbit.scene, "collection": collection.scene}
 SPLITS = ("test", "train")
 RECORD = Path(__file__).with_name("pairs.json")
+Progress = Callable[[int, int], None]
 
 KERNELS = (cast_pieces, shade, footprints, affine, group_by_texture)  # that drawing calls, slowest first
 
@@ -75,12 +80,6 @@ class Task:
     def name(self) -> str:
         """The scene's name and its folder's."""
         return f"{self.family}-{self.split}-{self.number:03d}"
-
-    @classmethod
-    def from_json(cls, text: str) -> Task:
-        """The inverse of ``json.dumps(dataclasses.asdict(task))``."""
-        fields: dict[str, Any] = json.loads(text)
-        return cls(**{**fields, "plan": Plan(**fields["plan"])})
 
 
 def digest(family: str, split: str, seed: int, plan: Plan) -> str:
@@ -125,6 +124,32 @@ def draw(scene: Scene, seed: np.random.SeedSequence) -> Iterator[Pixels]:
             stages[shot.light] = Stage(Geometry(surfaces), scene.lights[shot.light], scene.sky)
         cameras = shot.moments or [shot.camera]
         yield expose(stages[shot.light], cameras, shot.lens, np.random.default_rng(noise))
+
+
+def generate_all(
+    scenes: Sequence[tuple[Task, Path]], workers: int | None = None, progress: Progress | None = None
+) -> None:
+    """Draws every scene (task, folder) that is missing; `progress` gets (done, total) as scenes are completed.
+
+    workers: processes; by default one for each core that this process may use; 1 draws here. Interrupted, it completes
+    the scenes that are being drawn. Raises WorkersLost where workers die.
+    """
+    missing = [scene for scene in scenes if not (scene[1] / scene[0].name).is_dir()]
+    report = progress or (lambda done, total: None)
+    done = len(scenes) - len(missing)
+    report(done, len(scenes))
+    count = min(workers or min(cores(), MAX_PROCESSES), len(missing))
+    if count > 1:
+        compile_together(KERNELS)  # once, rather than in each of them
+    execution = Execution("processes" if count > 1 else "threads", max(count, 1))
+    with WorkerPool(execution, ("fmtorch.data.rendered.generate",), needs_main=False) as pool:
+        for _ in TaskRunner(pool, Local(None), _generated, lambda scene, path: None).each(missing):
+            done += 1
+            report(done, len(scenes))
+
+
+def _generated(_: None, scene: tuple[Task, Path]) -> Path:
+    return generate(*scene)
 
 
 def generate(task: Task, folder: Path) -> Path:
