@@ -47,6 +47,11 @@ class Planes(PlaneViews):
     photographs: Path | None = option(None, "folder of photographs; null: none")
     seed: Seed = option(0, "of the views")
 
+    @property
+    def limits(self) -> PlaneViews:
+        """How views are drawn, without the rest."""
+        return PlaneViews(**{field.name: getattr(self, field.name) for field in dataclasses.fields(PlaneViews)})
+
 
 @dataclasses.dataclass(frozen=True)
 class Optimisation:

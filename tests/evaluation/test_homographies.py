@@ -15,8 +15,8 @@ from fmtorch.commands import report as report_command
 from fmtorch.data import load
 from fmtorch.evaluation.statistics import homography_figures
 from fmtorch.metrics import corner_error, pose_auc
-from fmtorch.pipeline.labelled import MatchedPairs
 from fmtorch.runs import RunFolder
+from fmtorch.training import MatchedPairs
 from tests.data import planes
 from tests.helpers import compose
 

@@ -13,8 +13,8 @@ import torch
 pytest.importorskip("lightning", reason="training needs the extra `train`")
 
 
-from fmtorch.training.pruners.loop import TrainingFolderError
-from fmtorch.training.pruners.run import run
+from fmtorch.training.loop import TrainingFolderError
+from fmtorch.training.run import run
 from tests.conftest import own_cache
 from tests.helpers import compose
 from tests.pipeline.test_pipeline import draw
