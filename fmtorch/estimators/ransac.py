@@ -8,20 +8,21 @@ verb; `batch` leads from tensors to pairs and back.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.kernel import Kernel
 from fmtorch.compiling.together import compile_together
+from fmtorch.core.options import Within, expect_options
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.batch import NOT_SOLVED, Solution, estimated, with_sqrt_prior
 from fmtorch.estimators.families.family import Refining
 from fmtorch.estimators.families.focals import FundamentalWithFocals
 from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
 from fmtorch.estimators.gradients import Attached
-from fmtorch.estimators.options import Focal, Preselect, Refine, Select, at_least_one, group
+from fmtorch.estimators.options import Count, Focal, Preselect, Refine, Select, stage
 from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.parts.degensac import Degensac
 from fmtorch.estimators.parts.final_fits import FinalFit, Fit
@@ -38,6 +39,7 @@ from fmtorch.estimators.search import Search
 FOCAL_ROUND = 500  # samples of five matches at a time
 CALIBRATED_MATCHES = 6  # that a pair of calibrated cameras needs: five of them have up to ten solutions
 DEFAULT_PRESELECT = Preselect()
+Probability = Annotated[float, Within(0, 1, exclusive=True)]
 
 
 class Ransac:
@@ -87,12 +89,12 @@ class Ransac:
         sampler: str | Mapping[str, Any] | Sampler = "uniform",
         score: str | Mapping[str, Any] | Score = "msac",
         threshold: float | None = None,
-        hypotheses: int = 2000,
-        round: int = 500,
-        confidence: float | None = 0.9999,
+        hypotheses: Count = 2000,
+        round: Count = 500,
+        confidence: Probability | None = 0.9999,
         preselect: Preselect | Mapping[str, Any] | None = DEFAULT_PRESELECT,
         degeneracy: str | Mapping[str, Any] | None = None,
-        pool: int = 1,
+        pool: Count = 1,
         local_optimization: str | Mapping[str, Any] | LocalOptimization | None = None,
         refine: Refine | Mapping[str, Any] | None = None,
         select: Select | Mapping[str, Any] | None = None,
@@ -102,9 +104,7 @@ class Ransac:
         final: str | Mapping[str, Any] | FinalFit = "least_squares",
         refit_inliers: bool = True,
     ) -> None:
-        at_least_one(hypotheses=hypotheses, round=round, pool=pool)
-        if confidence is not None and not 0 < confidence < 1:
-            raise ValueError(f"confidence is {confidence}; it is a probability between 0 and 1, or null")
+        expect_options(Ransac, {name: value for name, value in locals().items() if name != "self"}, "")
         stops = confidence is not None
         threshold, inlier_px = thresholds(threshold, inlier_threshold, score, inliers, stops, local_optimization)
         self.family: Refining = part("solver", solver)
@@ -114,18 +114,18 @@ class Ransac:
         self.final: FinalFit = part("final", final)
         self.refit_inliers = refit_inliers
         stop = None if confidence is None else StoppingRule(confidence, inlier_px, self.sampler)
-        preselection = Preselection(self.score, group("preselect", preselect, Preselect))
+        preselection = Preselection(self.score, stage(preselect, Preselect))
         check = part("degeneracy", degeneracy, score=self.score)
         if check is not None and self.family.size != Degensac.SAMPLE:
             raise ValueError(f"degeneracy={degeneracy} needs solver=seven_point; solver is {solver!r}")
         self._expect_fundamental(degeneracy=check, local_optimization=local_optimization, focal=focal)
         self.search = Search(self.family, self.sampler, preselection, pool, hypotheses, round, stop, check)
         optimization = part("local_optimization", local_optimization, threshold=threshold, score=self.score)
-        refinement = Refinement(group("refine", refine, Refine), optimization)
-        choice = group("select", select, Select)
+        refinement = Refinement(stage(refine, Refine), optimization)
+        choice = stage(select, Select)
         self.refine = refinement
         self.select = _selector(self.score, choice, threshold, refinement)
-        self.focal = _focal_search(group("focal", focal, Focal), self.select, self.search, refinement, choice)
+        self.focal = _focal_search(stage(focal, Focal), self.select, self.search, refinement, choice)
 
     def _expect_fundamental(self, **options: object) -> None:
         """Raise ValueError for an option that is there and serves fundamental matrices alone."""
