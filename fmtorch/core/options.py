@@ -29,10 +29,9 @@ class Within:
 
     def __call__(self, value: Any) -> bool:
         """Whether a number is in bounds."""
-        if not isinstance(value, numbers.Real):
-            return False
-        inside = self.minimum <= value <= self.maximum
-        return inside and not (self.exclusive and value in (self.minimum, self.maximum))
+        number = float(value) if isinstance(value, numbers.Real) else math.nan
+        inside = self.minimum <= number <= self.maximum
+        return inside and not (self.exclusive and number in (self.minimum, self.maximum))
 
     def __str__(self) -> str:
         low, high = (str(bound) if isinstance(bound, int) else f"{bound:g}" for bound in (self.minimum, self.maximum))

@@ -15,10 +15,8 @@ from torch import Tensor
 
 from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.batches import as_array
-from fmtorch.core.checks import PER_MATCH, reason
-from fmtorch.core.rules import FOCAL, SIZE
 from fmtorch.core.threads import available, mapped
-from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.core.types import DEVIATION, FOCAL, PROBABILITY, SIZE, Correspondences, Estimate
 from fmtorch.estimators.calibration import EXACT, calibration_of
 from fmtorch.estimators.families.cameras import focal_precision, focals_near, focals_px
 from fmtorch.estimators.families.family import Estimated
@@ -202,7 +200,7 @@ class Batch(NamedTuple):
             return f"{count} matches; at least {minimal} are needed"
         focal = None if self.focal is None else self.focal[i]
         if not right or (focal is not None and not FOCAL.holds(focal).all()):
-            return _wrong_values(matches, slot, focal)
+            return _wrong_values(matches, slot)
         if not unit:
             return "all matches coincide"
         calibration = None if focal is None else calibration_of(focal, bool(self.shared[i]))
@@ -212,14 +210,15 @@ class Batch(NamedTuple):
         return pair, slot
 
 
-def _wrong_values(matches: PixelMatches, slot: Array, focal: Array | None) -> str:
+def _wrong_values(matches: PixelMatches, slot: Array) -> str:
     """Why a pair whose matches have such values cannot be estimated."""
-    values = {"prior": matches.prior, "noise": matches.noise}
-    right = {name: PER_MATCH[name].holds(v[slot]) for name, v in values.items() if len(v)}
-    right |= {"size0": SIZE.holds(matches.sizes[:2]), "size1": SIZE.holds(matches.sizes[2:])}
-    if focal is not None:
-        right["focal"] = FOCAL.holds(focal)
-    return reason({name: len(each) - int(np.count_nonzero(each)) for name, each in right.items()})
+    for name, value, rule in (("prior", matches.prior, PROBABILITY), ("noise", matches.noise, DEVIATION)):
+        if len(value) and (wrong := int(np.count_nonzero(~rule.holds(value[slot])))):
+            return f"{name} of {wrong} match{'' if wrong == 1 else 'es'} is wrong: {rule.text}"
+    for name, size in (("size0", matches.sizes[:2]), ("size1", matches.sizes[2:])):
+        if not SIZE.holds(size).all():
+            return f"{name} is wrong: {SIZE.text}"
+    return f"focal is wrong: {FOCAL.text}"
 
 
 def _row(values: Array | None, i: int) -> Array:

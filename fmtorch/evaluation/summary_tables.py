@@ -8,7 +8,7 @@ from typing import Any
 from rich import box
 from rich.table import Table
 
-from fmtorch.core.estimate import CONFIGURATIONS
+from fmtorch.core.types import CONFIGURATIONS
 from fmtorch.evaluation.bootstrap import LEVEL
 from fmtorch.evaluation.planes import CAPTION, INLIERS, THRESHOLDS
 from fmtorch.evaluation.statistics import FINE_THRESHOLD, FOCAL_THRESHOLDS, POSE_THRESHOLDS, THRESHOLD

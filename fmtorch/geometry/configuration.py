@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.compiling.batches import for_each_pair
-from fmtorch.core.estimate import CONFIGURATIONS
+from fmtorch.core.types import CONFIGURATIONS
 from fmtorch.geometry import configuration_kernels as compiled
 from fmtorch.geometry.arithmetic import logarithm
 from fmtorch.geometry.rotation_kernels import Cameras

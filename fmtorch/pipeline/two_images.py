@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.core.arguments import Arrays
 from fmtorch.core.stages import ImageMatcher, PairImages, pruned
 from fmtorch.core.threads import mapped, one_thread
 from fmtorch.core.types import Correspondences, Estimate
@@ -37,7 +36,7 @@ from fmtorch.pipeline.reduced_images import (
     to_original,
     undistorted_matches,
 )
-from fmtorch.two_view.arguments import Focal, camera_fields
+from fmtorch.two_view.arguments import Arrays, Focal, camera_fields
 from fmtorch.two_view.known_cameras import KnownCameras
 from fmtorch.two_view.pair_type import classify, compile_with, still_warning
 

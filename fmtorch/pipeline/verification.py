@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, cast, get_args
 
 from fmtorch import presets
-from fmtorch.core.arguments import number
+from fmtorch.core.checks import number
 from fmtorch.core.executors import Execution
 from fmtorch.core.shards import Shard, shard_of
 from fmtorch.core.stages import Estimator, model_of
