@@ -11,8 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fmtorch.compiling.arrays import Array
+from fmtorch.core.threads import mapped
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.estimators.batch import Solution, estimated
+from fmtorch.estimators.batch import Estimation, Solution
 from fmtorch.estimators.families.fundamental import SevenPoint
 from fmtorch.estimators.gradients import GraphedMatches, Solved
 from fmtorch.estimators.pair import Pair, squared
@@ -87,7 +88,15 @@ class IterativelyReweighted:
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
-        return estimated(c, seed, self.MIN_MATCHES, SevenPoint(), self.solve, self.attached)
+        estimation = Estimation(c, seed, SevenPoint(), self.MIN_MATCHES)
+
+        def estimate_part(part: Sequence[int]) -> None:
+            with np.errstate(all="ignore"):  # infinite or NaN beyond the range of a float
+                for row in estimation.rows(part):
+                    estimation.put(row, self.solve(row.pair))
+
+        mapped(estimate_part, estimation.parts)
+        return estimation.estimates(self.attached)
 
     def solve(self, pair: Pair) -> Solution:
         """The model of least cost of one pair."""

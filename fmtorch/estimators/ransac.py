@@ -7,7 +7,7 @@ verb; `batch` leads from tensors to pairs and back.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import numpy as np
@@ -16,8 +16,9 @@ from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.kernel import Kernel
 from fmtorch.compiling.together import compile_together
 from fmtorch.core.options import Within, expect_options
+from fmtorch.core.threads import mapped
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.estimators.batch import NOT_SOLVED, Solution, estimated, with_sqrt_prior
+from fmtorch.estimators.batch import NOT_SOLVED, Estimation, Solution, with_sqrt_prior
 from fmtorch.estimators.families.family import Refining
 from fmtorch.estimators.families.focals import FundamentalWithFocals
 from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
@@ -161,9 +162,19 @@ class Ransac:
         exact = None if self.focal is None else self.focal.options.exact_focals
         if exact is not None and exact.sqrt_prior:
             c = with_sqrt_prior(c)
-        size, attached = self.family.size, Attached(self.final, self.family)
         calibrated = None if self.focal is None else CALIBRATED_MATCHES
-        return estimated(c, seed, size, self.family, self.estimate, attached, calibrated)
+        estimation = Estimation(c, seed, self.family, self.family.size, calibrated)
+
+        def estimate_part(part: Sequence[int]) -> None:
+            with np.errstate(all="ignore"):  # infinite or NaN beyond the range of a float
+                for row in estimation.rows(part):
+                    estimation.put(row, self.estimate(row.pair))
+
+        if len(estimation.parts) > 1:
+            mapped(estimate_part, estimation.parts)
+        else:
+            estimate_part(estimation.parts[0])
+        return estimation.estimates(Attached(self.final, self.family))
 
     def estimate(self, pair: Pair) -> Solution:
         """Search to fit of one pair."""
