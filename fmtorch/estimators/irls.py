@@ -11,7 +11,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fmtorch.compiling.arrays import Array
-from fmtorch.core.threads import mapped
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.batch import Estimation, Solution
 from fmtorch.estimators.families.fundamental import SevenPoint
@@ -27,6 +26,7 @@ from fmtorch.geometry.rank2_manifold_kernels import SQUARINGS
 from fmtorch.geometry.refine_kernels import refine
 from fmtorch.geometry.robust_losses import named_kernel
 from fmtorch.geometry.sampson_objective_kernels import LOSSES, Weighted, loss_table
+from fmtorch.jobs.threads import mapped
 
 DECAY = 0.65  # of the kernel's scale, from one iteration to the next, down to the threshold
 FIRST_DAMPING = 1e-4  # of Levenberg-Marquardt

@@ -16,7 +16,6 @@ from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.kernel import Kernel
 from fmtorch.compiling.together import compile_together
 from fmtorch.core.options import Within, expect_options
-from fmtorch.core.threads import mapped
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.batch import NOT_SOLVED, Estimation, Solution, with_sqrt_prior
 from fmtorch.estimators.families.family import Refining
@@ -36,6 +35,7 @@ from fmtorch.estimators.parts.selection import BestOfSearch, BestScore, Selectio
 from fmtorch.estimators.precompiled import OF_HOMOGRAPHIES, WITH_FOCALS
 from fmtorch.estimators.registry import part, thresholds
 from fmtorch.estimators.search import Search
+from fmtorch.jobs.threads import mapped
 
 FOCAL_ROUND = 500  # samples of five matches at a time
 CALIBRATED_MATCHES = 6  # that a pair of calibrated cameras needs: five of them have up to ten solutions

@@ -15,10 +15,10 @@ from fmtorch.compiling import switch
 from fmtorch.compiling.together import compile_together
 from fmtorch.core.checks import number
 from fmtorch.core.stages import Estimator, Pruner, model_of
-from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.ransac import Ransac
 from fmtorch.geometry.verdict import judged
+from fmtorch.jobs.threads import one_thread
 from fmtorch.presets.files import load
 from fmtorch.presets.objects import construct, instantiate, merged
 from fmtorch.pruning.frame_consistency import FrameConsistency

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from fmtorch.compiling import switch
 from fmtorch.compiling.together import compile_together
-from fmtorch.core.threads import one_thread
 from fmtorch.core.types import CONFIGURATIONS, WARNINGS, Correspondences, Estimate
 from fmtorch.geometry.arithmetic import component_sum, sqrt
 from fmtorch.geometry.configuration import (
@@ -27,6 +26,7 @@ from fmtorch.geometry.configuration import (
 from fmtorch.geometry.configuration_kernels import weigh
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.homography_pose import PlanePoses, poses_from_homography
+from fmtorch.jobs.threads import one_thread
 from fmtorch.two_view.arguments import expect_values
 from fmtorch.two_view.estimation import estimated, estimator_of
 
