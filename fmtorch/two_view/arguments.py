@@ -18,7 +18,7 @@ from torch import Tensor
 
 from fmtorch.core.checks import as_tensor
 from fmtorch.core.types import Correspondences, collate
-from fmtorch.geometry.square_pixels import calibration_problems
+from fmtorch.geometry.cameras import calibration_problems
 
 Array = Tensor | NDArray[Any]
 Arrays = Array | Sequence[Any]
