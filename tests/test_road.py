@@ -17,7 +17,7 @@ from tests.laws import scene
 
 PACKAGE = Path(fmtorch.__file__).parent
 PAGE = (PACKAGE.parent / "docs" / "architecture.md").read_text(encoding="utf-8")
-MAX_FILES, MAX_MODULES = 6, 140
+MAX_FILES, MAX_MODULES = 6, 92
 ELSEWHERE = (
     "PIL", "cv2", "hydra", "kornia", "matplotlib", "omegaconf", "onnxruntime", "pyarrow", "scipy.sparse", "skimage"
 )  # fmt: skip
