@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rich import box
 from rich.table import Table as TerminalTable
 
-from fmtorch.core.estimate import CONFIGURATIONS
+from fmtorch.core.types import CONFIGURATIONS
 from fmtorch.evaluation.curves import NSGD, axis_of
 from fmtorch.evaluation.statistics import (
     CORNER_THRESHOLDS,
