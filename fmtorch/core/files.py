@@ -64,6 +64,10 @@ def sync(path: Path) -> None:
 
 
 _PACKAGE = Path(__file__).resolve().parents[1]
+STAGES: dict[str, str | list[str]] = {
+    "features": "sift", "matcher": "nearest", "pruner": ["ratio", "one_to_one"], "estimator": "ransac",
+}  # fmt: skip
+"""The groups of presets that a pipeline chooses from, with what stands where nothing is chosen."""
 
 
 def _folder(name: str) -> Path:

@@ -36,8 +36,8 @@ from fmtorch.runs.run_folder import canonical
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 EXHAUSTIVE, SEQUENTIAL, SIMILAR = "exhaustive", "sequential", "similar"
 CHOICES = f"{EXHAUSTIVE}, {SEQUENTIAL}:N, {SIMILAR}:N"
-# Pictures that fmtorch draws, by the file beside which it does; a set of pairs holds copies of photographs.
-_DRAWN = {"result.json": ("matches.png", "pruning.png", "epipolar.png"), "run.json": ("recall.png",)}
+# Pictures that fmtorch draws beside a result.json; a set of pairs holds copies of photographs.
+_DRAWN = ("matches.png", "pruning.png", "epipolar.png")
 _SET_OF_PAIRS = "pairs.json"
 
 Pair = tuple[Path, Path]
@@ -62,7 +62,7 @@ def _images(folder: Path) -> Iterator[Path]:
         folders[:] = [
             name for name in folders if not (name.startswith(".") or (inside / name / _SET_OF_PAIRS).is_file())
         ]
-        drawn = {name for file, names in _DRAWN.items() if file in files for name in names}
+        drawn = _DRAWN if "result.json" in files else ()
         for name in files:
             path = inside / name
             if path.suffix.lower() in SUFFIXES and name not in drawn and path.is_file():
