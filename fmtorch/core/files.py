@@ -1,4 +1,4 @@
-"""Files that are either whole or absent, whatever happens while they are written."""
+"""Files that are either whole or absent, and the folders of configuration, networks and caches."""
 
 from __future__ import annotations
 
@@ -61,9 +61,6 @@ def sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-# Where the configuration files and the learned files are, in a checkout and in an installed wheel
 
 
 _PACKAGE = Path(__file__).resolve().parents[1]
