@@ -29,7 +29,7 @@ from fmtorch.pipeline.exporting import keep_outcomes
 from fmtorch.pipeline.pipeline import Outcome, Pipeline, examined
 from fmtorch.runs import PairRow
 from fmtorch.runs.feature_cache import CachedFeatures
-from fmtorch.storage.exchange.collected import CollectedJournal
+from fmtorch.io.collected import CollectedJournal
 from fmtorch.two_view.pair_type import compile_with
 
 Build = Callable[[], Pipeline]
