@@ -72,13 +72,11 @@ def test_the_examples_of_a_page_run(page: str) -> None:
     assert failed == 0
 
 
-@pytest.mark.parametrize("module", [
-    "data", "geometry.eight_point", "geometry.epipolar", "geometry.homography", "geometry.homography_pose",
-    "geometry.homography_refine", "geometry.seven_point", "geometry.two_view_covariance", "metrics.nsgd",
-    "metrics.recall", "two_view.pair_type", "two_view.find",
-    "pipeline.two_images", "pipeline.verification",
-])  # fmt: skip
-def test_the_examples_of_docstrings_run(module: str) -> None:
-    failed, attempted = doctest.testmod(importlib.import_module(f"fmtorch.{module}"))
+EXAMPLES = [path for path in sorted((SOURCE / "fmtorch").rglob("*.py")) if ">>> " in path.read_text(encoding="utf-8")]
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=relative)
+def test_the_examples_of_docstrings_run(path: Path) -> None:
+    failed, attempted = doctest.testmod(importlib.import_module(relative(path.with_suffix("")).replace("/", ".")))
     assert attempted > 0
     assert failed == 0
