@@ -177,7 +177,6 @@ def _name(value: Any) -> str:
 
 
 HERE = Path(__file__).resolve().parent
-_HOW = ("kernel.py", "linking.py", "cache.py", "lanes.py", "lane_instructions.py")  # the files that say how
 ABOUT = "about.json"  # in each folder; its time of change is when the folder was last used
 UNUSED_DAYS = 30  # after which a folder is removed
 _SETTINGS = ("BOUNDSCHECK", "CPU_FEATURES", "CPU_NAME", "DEBUGINFO_DEFAULT", "ENABLE_AVX", "LOOP_VECTORIZE", "OPT")
@@ -196,12 +195,12 @@ def versions() -> dict[str, str]:
     from llvmlite import binding
 
     settings = {name: str(getattr(numba.config, name, None)) for name in _SETTINGS}
-    features = binding.get_host_cpu_features().flatten()
+    own = b"".join(file.read_bytes() for file in sorted(HERE.glob("*.py")))
     return {
-        "compiling": _hex(b"".join((HERE / name).read_bytes() for name in _HOW)), "numba": numba.__version__,
-        "llvmlite": llvmlite.__version__, "python": platform.python_version(),
-        "machine": f"{platform.system()} {platform.machine()}", "processor": binding.get_host_cpu_name(),
-        "features": features, "settings": json.dumps(settings),
+        "compiling": _hex(own), "numba": numba.__version__, "llvmlite": llvmlite.__version__,
+        "python": platform.python_version(), "machine": f"{platform.system()} {platform.machine()}",
+        "processor": binding.get_host_cpu_name(), "features": binding.get_host_cpu_features().flatten(),
+        "settings": json.dumps(settings),
     }  # fmt: skip
 
 

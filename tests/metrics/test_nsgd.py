@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -273,7 +274,7 @@ def test_neighbours_batch_and_tile_are_invisible(function: object, monkeypatch: 
     order = torch.tensor([8, 3, 5, 0])
     part = function(F_gt[order], F_est[order], *sizes[:, order], key=key[order], samples=50)
     assert torch.equal(part, together[order])
-    monkeypatch.setattr("fmtorch.metrics.nsgd.TILE", 16)
+    monkeypatch.setattr(sys.modules["fmtorch.metrics.nsgd"], "TILE", 16)
     assert torch.equal(function(F_gt, F_est, *sizes, key=key, samples=50), together)
 
 
