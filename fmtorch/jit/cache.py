@@ -263,7 +263,6 @@ class KernelFile:
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """The compiled function of the file; None where there is none, with a warning if it is damaged."""
-        target_context.refresh()
         if (loaded := self._loaded(signature, target_context)) is not None:
             return loaded
         if self._acquire() and (loaded := self._loaded(signature, target_context)) is not None:
@@ -284,6 +283,7 @@ class KernelFile:
                     with contextlib.suppress(OSError):  # a folder that can be read, but not written
                         os.utime(self.path)  # so that files in use are not the oldest
                     self.calls = linking.called(data)
+                    _open_runtime(target_context, data)
                     return _of(signature, CompileResult._rebuild(target_context, *pickle.loads(data)))
                 warnings.warn(f"{self.path} is damaged; it is compiled anew", stacklevel=2)
                 with contextlib.suppress(OSError):
@@ -299,7 +299,7 @@ class KernelFile:
         from numba.core.serialize import dumps
 
         try:
-            data = dumps(result._reduce())
+            data = dumps(_alone(result))
             self.calls = linking.called(data)
             if self.path is not None and not result._asdict()["library"].has_dynamic_globals:
                 _write(self.path, _signature(data) + data)
@@ -332,6 +332,29 @@ class KernelFile:
         """Remove the file."""
         if self.path is not None:
             self.path.unlink(missing_ok=True)
+
+
+def _open_runtime(target_context: Any, machine_code: bytes) -> None:
+    """Let machine code find what it needs of numba; all that compiling needs would take a third of a second more."""
+    from numba.core.runtime import rtsys
+
+    if b"_numba_hashsecret" in machine_code:  # of dictionaries and sets, the one name that the rest of numba adds
+        target_context.refresh()
+    rtsys.initialize(target_context)
+
+
+def _alone(result: Any) -> Any:
+    """What numba keeps of a compiled function, without code for others to link, and constants of functions without any.
+
+    A kernel is called by its address alone.
+    """
+    from llvmlite import binding
+
+    (library, kind, (code, _)), *rest, environments = result._reduce()
+    names = (result.fndesc.llvm_func_name, result.fndesc.llvm_cpython_wrapper_name)
+    defined = binding.parse_assembly("".join(f'define void @"{name}"() {{ ret void }}\n' for name in names))
+    used = tuple(environment for environment in environments if environment.consts)
+    return (library, kind, (code, defined.as_bitcode())), *rest, used
 
 
 def _write(path: Path, data: bytes) -> None:
