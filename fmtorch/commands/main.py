@@ -5,26 +5,31 @@ Help, and a mistake in the command's name, are answered here, before any library
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import sys
-import textwrap
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from fmtorch.commands.options import COMMANDS, Command
-from fmtorch.core.options import shown
 from fmtorch.core.version import __version__
 
-SUMMARIES = {name: command.summary for name, command in COMMANDS.items()} | {
+if TYPE_CHECKING:
+    from fmtorch.commands.options import Command
+
+SUMMARIES = {
+    "eval": "run a pipeline over a data set of image pairs and evaluate it",
     "list": "the presets there are, of all groups or of one: fmtorch list estimator",
+    "match": "the fundamental matrix of two photographs, with pictures: fmtorch match a.jpg b.jpg",
+    "pairs": "which pairs of images with known cameras can be matched, as a data set",
+    "report": "compare runs of eval on one HTML page",
+    "train": "train a learned pruner on labelled matches of a data set",
+    "verify": "two-view geometries of the matches in a COLMAP database, or hloc's files",
     "warm-up": "compile all kernels now, for images and containers",
 }
 HELP = f"""fmtorch {__version__}: two-view geometry
 
 usage: fmtorch COMMAND [NAME=VALUE ...]
 
-{chr(10).join(f"  {name:9}{what}" for name, what in sorted(SUMMARIES.items()))}
+{chr(10).join(f"  {name:9}{what}" for name, what in SUMMARIES.items())}
 
 `fmtorch COMMAND --help` lists what a command takes; `python -m fmtorch COMMAND` is the same command."""
 FOOTER = """Hydra's own: -m for sweeps (estimator=ransac,msac), --config-dir FOLDER for presets of your own, --cfg job
@@ -35,15 +40,17 @@ _COLUMN, _WIDTH = 27, 120  # where what is said of an option begins, and where i
 def main(words: Sequence[str] | None = None) -> None:
     """Run the command that the first word names, of the process's own command line if none are given."""
     name, *rest = (sys.argv[1:] if words is None else words) or ["--help"]
-    command = COMMANDS.get(name)
+    own_help = name in ("list", "warm-up")
     if name in ("--help", "-h", "help"):
         print(HELP)
-    elif name == "--version" or (command is not None and "--version" in rest):
+    elif name == "--version" or ("--version" in rest and not own_help):
         print(__version__)
     elif name not in SUMMARIES:
-        sys.exit(f"error: no command {name!r}; there are: {', '.join(sorted(SUMMARIES))}")
-    elif command is not None and {"--help", "-h"} & set(rest):
-        print(help_text(command))
+        sys.exit(f"error: no command {name!r}; there are: {', '.join(SUMMARIES)}")
+    elif {"--help", "-h"} & set(rest) and not own_help:
+        from fmtorch.commands.options import COMMANDS
+
+        print(help_text(COMMANDS[name]))
     else:
         sys.argv[1:] = rest
         if sys.path[0] != os.getcwd():  # where a user's own parts are found, as by `python -m`
@@ -74,8 +81,11 @@ def _command(name: str) -> Callable[[], None]:
 
 def help_text(command: Command) -> str:
     """The page of a command: what it does, its groups of presets and its options, each with its default."""
+    import dataclasses
+
     places = "".join(f" [{name.removesuffix('...').upper()}]" for name in command.positional)
-    about = f"{command.summary[0].upper()}{command.summary[1:]}.\n{command.about}"
+    summary = SUMMARIES[command.name]
+    about = f"{summary[0].upper()}{summary[1:]}.\n{command.about}"
     groups = [_line(name, value, command.group_help.get(name, "")) for name, value in command.groups.items()]
     options = [
         _line(field.name, command.defaults[field.name], str(field.metadata["about"]))
@@ -93,6 +103,10 @@ def help_text(command: Command) -> str:
 
 def _line(name: str, value: Any, about: str) -> str:
     """A name with its default and what is said of it; of an option with parts, their names."""
+    import textwrap
+
+    from fmtorch.core.options import shown
+
     if isinstance(value, dict):
         name, value, about = f"{name}.NAME", "", f"{about}; NAME: {', '.join(value)}"
     start = f"  {name}={shown(value) if value != '' else ''}"

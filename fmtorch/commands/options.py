@@ -183,8 +183,7 @@ class Command:
 
     Attributes:
         name: as in ``fmtorch NAME``.
-        summary: what it does, in a line.
-        about: what else its help begins with.
+        about: what its help says after its summary.
         options: the dataclass of its options, each an `option`.
         groups: groups of presets, with those that stand in each where the user names no other.
         group_help: what help says of a group.
@@ -195,7 +194,6 @@ class Command:
     """
 
     name: str
-    summary: str
     about: str
     options: type
     groups: Mapping[str, str | list[str]]
@@ -218,7 +216,6 @@ class Command:
 
 EVAL = Command(
     "eval",
-    "run a pipeline over a data set of image pairs and evaluate it",
     REPLACED,
     EvalOptions,
     {**STAGES, "dataset": "rendered", "executor": "auto", "pipeline": "sift_ratio"},
@@ -228,7 +225,6 @@ EVAL = Command(
 )
 MATCH = Command(
     "match",
-    "the fundamental matrix of two photographs, with pictures: fmtorch match a.jpg b.jpg",
     REPLACED,
     MatchOptions,
     {**STAGES, "executor": "auto", "pipeline": "hesaffnet_fast_fmtorch"},
@@ -237,7 +233,6 @@ MATCH = Command(
 )
 PAIRS = Command(
     "pairs",
-    "which pairs of images with known cameras can be matched, as a data set",
     """The set has the layout of FM-Bench, for dataset=fmbench. The rule is the paper's: more than 20 SIFT matches
 within 1 px of the true epipolar lines in both images; or, with overlap, how much of the scene both images show,
 whatever features find. Which pairs are looked at, the data set says (window, candidates); docs/guides/data.md.""",
@@ -248,7 +243,6 @@ whatever features find. Which pairs are looked at, the data set says (window, ca
 )
 REPORT = Command(
     "report",
-    "compare runs of eval on one HTML page",
     "It has tables, curves and pictures.",
     ReportOptions,
     {},
@@ -256,7 +250,6 @@ REPORT = Command(
 )
 TRAIN = Command(
     "train",
-    "train a learned pruner on labelled matches of a data set",
     """The data set has ground truth: fmtorch train pruner=lc.
 Groups are replaced by name (pruner=dfe, trainer=gpu), values by path (optimisation.steps=500).""",
     TrainOptions,
@@ -277,7 +270,6 @@ Groups are replaced by name (pruner=dfe, trainer=gpu), values by path (optimisat
 )  # fmt: skip
 VERIFY = Command(
     "verify",
-    "two-view geometries of the matches in a COLMAP database, or hloc's files",
     """docs/verify.md. The estimator is replaced by name (estimator=magsac), its values by path
 (estimator.inlier_threshold=1.0).""",
     VerifyOptions,
