@@ -17,8 +17,7 @@ from fmtorch import match
 from fmtorch.core.types import Correspondences
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.pipeline.pipeline import Outcome
-from fmtorch.training.photographs import Photograph
-from fmtorch.training.planes import PlanePairs, PlaneViews
+from fmtorch.training.planes import Photograph, PlanePairs, PlaneViews
 from scripts.benchmark.runner import Item
 
 Array = NDArray[Any]
