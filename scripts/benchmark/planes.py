@@ -27,8 +27,7 @@ import torch
 from rich.progress import track
 
 from fmtorch import find_homography, metrics, presets
-from fmtorch.core.estimate import CONFIGURATIONS
-from fmtorch.core.types import Correspondences, collate
+from fmtorch.core.types import CONFIGURATIONS, Correspondences, collate
 from fmtorch.estimators.external import colmap
 from fmtorch.geometry import poses_from_homography
 from fmtorch.two_view.known_cameras import KnownCameras
