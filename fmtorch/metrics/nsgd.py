@@ -20,14 +20,9 @@ import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
-from fmtorch.compiling.arrays import Array
-from fmtorch.compiling.batches import for_each_pair, kernels_serve
 from fmtorch.core.checks import checked
-from fmtorch.core.streams import Stream, mixed_seed
-from fmtorch.geometry.arithmetic import sqrt
-from fmtorch.geometry.epipolar import lines_through, residual_and_normals, unit_largest
-from fmtorch.metrics import nsgd_kernels as compiled
-from fmtorch.metrics.draws import Pairs, diagonal, expect_samples, segment_in_image, sum_of_draws
+from fmtorch.geometry.epipolar import unit_largest
+from fmtorch.metrics.draws import Chord, Draws, Pairs, diagonal, from_centre, lines, sum_of_draws
 
 BORDER = -0.5  # left and top edge of the first pixel
 NORMAL_FLOOR = 1e-12  # length of a normal, for F of unit size, that is as good as none: its line is at infinity
@@ -107,25 +102,22 @@ def nsgd(
 
 
 def draw_distances(
-    pairs: Pairs, uniforms: Float[Tensor, "b n 6"]
+    pairs: Pairs, draws: Draws
 ) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n"], Bool[Tensor, "b n"]]:
-    """Of each draw the mean distances in pixels in images 0 and 1 over its two halves, and whether it counts."""
-    first, second = uniforms[..., :3], uniforms[..., 3:]
-    a0, a1, hits_a = _half_draw(pairs.F_gt, pairs.F_est, pairs.size0, pairs.size1, first)
-    b0, b1, hits_b = _half_draw(pairs.F_est, pairs.F_gt, pairs.size0, pairs.size1, second)
-    return (a0 + b0) / 2, (a1 + b1) / 2, hits_a & hits_b
+    """Of each draw the mean distances in pixels in images 0 and 1 over its two halves, and whether it counts.
 
-
-def _half_draw(
-    F: Tensor, F_other: Tensor, size0: Tensor, size1: Tensor, uniforms: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Steps 1 and 2: a match (m, m') exact for F, and its distances from the lines of F_other in images 0 and 1."""
-    m = uniforms[..., :2] * size0.flip(-1)[:, None] + BORDER
-    start, end, hits = segment_in_image(lines_through(F, m), size1, BORDER)
-    m_prime = start + uniforms[..., 2:] * (end - start)
-    e, squared0, squared1 = residual_and_normals(F_other, m, m_prime)
-    floor = NORMAL_FLOOR**2
-    return e.abs() / sqrt(squared0 + floor), e.abs() / sqrt(squared1 + floor), hits
+    A half is steps 1 and 2: a match (m, m') exact for one matrix, and its distances from the lines of the other.
+    """
+    F = from_centre(torch.stack([pairs.F_gt, pairs.F_est]), pairs.size1, BORDER)
+    h, w = pairs.size0[..., None].unbind(-2)
+    x, y, z = F.unbind(-1)
+    of_shares = torch.stack([x * w, y * h, z + BORDER * (x + y)], -1)  # of shares of the sides of image 0
+    x1, y1 = (chord := Chord.of(*lines(of_shares, draws.x, draws.y), pairs.size1)).at(draws.share)
+    a1, b1, c1 = lines(of_shares.flip(0), draws.x, draws.y)
+    a0, b0 = lines(F.flip(0).mT[..., :2, :], x1, y1)
+    e = torch.addcmul(torch.addcmul(c1, a1, x1), b1, y1).abs()
+    d0, d1 = (e * (torch.addcmul(a * a, b, b) + NORMAL_FLOOR**2).rsqrt() for a, b in ((a0, b0), (a1, b1)))
+    return (d0[0] + d0[1]) / 2, (d1[0] + d1[1]) / 2, chord.hits.all(0)
 
 
 def _mean_distance(
@@ -145,38 +137,13 @@ def _mean_distance(
     scaled = [unit_largest(torch.where(valid[:, None, None], F, 0.0)) for F in (pairs.F_gt, pairs.F_est)]
     pairs = replace(pairs, F_gt=scaled[0], F_est=scaled[1])
 
-    def draw(tile: Pairs, uniforms: Tensor) -> tuple[Tensor, Tensor]:
-        d0, d1, accepted = draw_distances(tile, uniforms)
+    def draw(tile: Pairs, draws: Draws) -> tuple[Tensor, Tensor]:
+        d0, d1, accepted = draw_distances(tile, draws)
         unit0, unit1 = unit(diagonal(tile.size0)), unit(diagonal(tile.size1))
         return (d0 / unit0[:, None] + d1 / unit1[:, None]) / 2, accepted
 
-    if kernels_serve(pairs.F_gt, pairs.F_est, pairs.size0, pairs.size1):
-        total, count = compiled_sums(unit, pairs, samples, seed)
-    else:
-        total, count = sum_of_draws(pairs, draw, samples=samples, seed=seed)
+    total, count = sum_of_draws(pairs, draw, samples=samples, seed=seed)
     diagonal0, diagonal1 = diagonal(pairs.size0), diagonal(pairs.size1)
     worst = (diagonal0 / unit(diagonal0) + diagonal1 / unit(diagonal1)) / 2
     value = torch.where(count > 0, total / count.clamp(min=1), worst)
     return (torch.minimum(value, worst) if cap else value).reshape(shape).to(F_est.dtype)
-
-
-def compiled_sums(
-    unit: Callable[[Tensor], Tensor], pairs: Pairs, samples: int, seed: int, released: bool = False
-) -> tuple[Float[Tensor, " b"], Float[Tensor, " b"]]:
-    """Sum and number of the accepted draws of each pair, by the kernel. released: draws of `nsgd_released`."""
-    expect_samples(samples)
-    units = torch.stack([unit(diagonal(size)) for size in (pairs.size0, pairs.size1)], -1)
-    tensors = (pairs.F_gt, pairs.F_est, pairs.size0, pairs.size1, units, pairs.key[:, None])
-    constants = (released, mixed_seed(seed, Stream.METRIC), samples)
-    out = torch.empty(len(units), 2, dtype=torch.float64)
-    terms = for_each_pair(_into, tensors, *constants, out=out, kind=torch.float64)
-    return terms[:, 0], terms[:, 1]
-
-
-def _into(
-    F_gt: Array, F_est: Array, size0: Array, size1: Array, unit: Array, key: Array, released: bool, seed: int,
-    samples: int, out: Array,
-) -> None:  # fmt: skip
-    compiled.accepted_draws(
-        compiled.Comparison(F_gt, F_est, size0, size1, unit, released), int(key[0]), seed, samples, out
-    )

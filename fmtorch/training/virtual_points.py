@@ -10,8 +10,8 @@ from torch import Tensor
 
 from fmtorch.core.random import uniform
 from fmtorch.core.streams import Stream
-from fmtorch.geometry.epipolar import lines_through, unit_largest
-from fmtorch.metrics.draws import segment_in_image
+from fmtorch.geometry.epipolar import unit_largest
+from fmtorch.metrics.draws import Chord, from_centre, lines
 from fmtorch.metrics.nsgd import BORDER
 
 TRIES = 4  # draws made for each point wanted; those whose epipolar line misses image 1 are dropped
@@ -64,10 +64,10 @@ def virtual_points(
         height0, width0 = size0.to(torch.float64)[:, None].unbind(-1)
         key = torch.zeros(len(F), dtype=torch.int64, device=F.device) if key is None else key
         u, v, along = uniform(seed, key, Stream.TRAINING, 0, TRIES * count, 3).unbind(-1)
-        x0 = torch.stack([u * width0, v * height0], -1) + BORDER
-        start, end, hits = segment_in_image(lines_through(F, x0), size1.to(torch.float64), BORDER)
-        x1 = start + along[..., None] * (end - start)
-        order = torch.argsort((~hits).to(torch.uint8), dim=1, stable=True)[:, :count]
-        mask = hits.gather(1, order)
+        x0, size1 = torch.stack([u * width0, v * height0], -1) + BORDER, size1.to(torch.float64)
+        chord = Chord.of(*lines(from_centre(F, size1, BORDER), *x0.unbind(-1)), size1)
+        x1 = torch.stack(chord.at(along), -1) + (size1.flip(-1) / 2 + BORDER)[:, None]
+        order = torch.argsort((~chord.hits).to(torch.uint8), dim=1, stable=True)[:, :count]
+        mask = chord.hits.gather(1, order)
         x0, x1 = (torch.where(mask[..., None], x.gather(1, order[..., None].expand(-1, -1, 2)), 0.0) for x in (x0, x1))
     return VirtualPoints(x0, x1, mask)
