@@ -11,17 +11,11 @@ from torch import Tensor
 from fmtorch.geometry.arithmetic import component_sum, unit
 from fmtorch.geometry.rank2_manifold import RANK_TWO, constant
 
-GRADIENTS = ("implicit", "unrolled")
 CONTRACTION_GAP = 1e-6  # singular values of I - J below it, of an iteration that does not contract, are held off zero
 
 
-def gradient_wanted(gradient: str, *inputs: object) -> bool:
-    """Whether a graph is being recorded and one of the inputs is on it.
-
-    Raises ValueError for an unknown kind of gradient.
-    """
-    if gradient not in GRADIENTS:
-        raise ValueError(f"gradient is {gradient!r}; it must be one of: {', '.join(GRADIENTS)}")
+def gradient_wanted(*inputs: object) -> bool:
+    """Whether a graph is being recorded and one of the inputs is on it."""
     return torch.is_grad_enabled() and any(isinstance(x, Tensor) and x.requires_grad for x in inputs)
 
 

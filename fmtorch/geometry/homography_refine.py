@@ -65,7 +65,7 @@ def refine_homography(
         True
     """
     robust, schedule = named_kernel(kernel), Schedule(iterations, FIRST_DAMPING, 0.0)
-    wanted = gradient_wanted("implicit", x0, x1, weight)
+    wanted = gradient_wanted(x0, x1, weight)
     with torch.set_grad_enabled(wanted):
         matches = NormalizedMatches(x0, x1, weight, mask, H.detach(), scale, homographies=True)
         shared, s2 = (matches.points, matches.weight), matches.scale.square()[:, None]

@@ -32,7 +32,6 @@ def irls(
     kernel: str = "cauchy",
     scale: float | Tensor = 1.0,
     iterations: int = 5,
-    gradient: str = "implicit",
 ) -> Float[Tensor, "*models 3 3"]:
     """Fundamental matrices near F0 by the normalised 8-point algorithm with Sampson weights, repeated.
 
@@ -41,8 +40,12 @@ def irls(
     for estimating the fundamental matrix", section 4. A fixed point is close to, but not quite, the least of
     ``sum w rho(r^2)``, since g moves with F: `refine` finds that.
 
-    Differentiable in points and weights. Gradients are bounded where the matches leave F open, and zero for a model
-    that is kept as it was. Where nothing requires them no graph is built, and the values are the same in any case.
+    Differentiable in points and weights, not in F0: by the implicit function theorem, the gradient is that of the fixed
+    point F = fit(F, points, weights) (see `at_fixed_point`). It costs ten iterations and needs the memory of two. Each
+    iteration divides the distance from the fixed point by 1.2 to 30; before it the gradient is near that there: after 5
+    iterations with the Cauchy loss and 20 wrong matches among 120 it is off by 0.1 %. Gradients are bounded where the
+    matches leave F open, and zero for a model that is kept as it was. Where nothing requires them no graph is built,
+    and the values are the same in any case.
 
     Args:
         x0: points of image 0, pixels.
@@ -53,34 +56,28 @@ def irls(
         kernel: a name of `robust_losses.KERNELS`.
         scale: of the kernel, in pixels (a number, or one per set).
         iterations: reweighted fits.
-        gradient: "implicit", that of the fixed point F = fit(F, points, weights) by the implicit function theorem (see
-            `at_fixed_point`); it costs ten iterations, needs the memory of two, and there is none to F0. Or "unrolled"
-            through all iterations, exact for the matrix returned whatever their number, and also to F0. They agree at
-            convergence; each iteration divides the distance from there by 1.2 to 30. Before it the implicit one is the
-            nearer to the gradient of the fixed point: after 5 iterations with the Cauchy kernel and 20 wrong matches
-            among 120 it is off by 0.1 %, the unrolled one by 2 %.
 
     Returns:
         Matrices of rank 2 and unit norm in float64; a model that the weighted matches do not determine is kept as it
         was.
 
     Raises:
-        ValueError: for an unknown kernel or gradient.
+        ValueError: for an unknown kernel.
     """
     robust = named_kernel(kernel)
-    wanted = gradient_wanted(gradient, x0, x1, weight, scale, F0 if gradient == "unrolled" else None)
+    wanted = gradient_wanted(x0, x1, weight, scale)
     with torch.set_grad_enabled(wanted):
         matches = NormalizedMatches(x0, x1, weight, mask, F0, scale)
 
         def step(F: Tensor) -> Tensor:
             return reweighted(F, matches.points, matches.weight, robust, matches.scale)
 
-        F = matches.models
-        with torch.set_grad_enabled(wanted and gradient == "unrolled"):
+        F = matches.models.detach()
+        with torch.no_grad():
             for _ in range(iterations):
                 F = step(F)
-        if wanted and gradient == "implicit":
-            F = at_fixed_point(F.detach(), step)
+        if wanted:
+            F = at_fixed_point(F, step)
         return matches.to_pixels(F).reshape(F0.shape)
 
 

@@ -1,4 +1,4 @@
-"""Gradients of the least robust Sampson error: of the optimum itself, or through the steps that led there."""
+"""Gradients of the least robust Sampson error: those of the optimum."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fmtorch.geometry.arithmetic import as_rows, cofactors, component_sum, sqrt, stable_sum, unit
-from fmtorch.geometry.levenberg_marquardt_kernels import FIRST_DAMPING, MAX_DAMPING, MIN_DAMPING
-from fmtorch.geometry.rank2_manifold import RANK_TWO, constant, start
+from fmtorch.geometry.rank2_manifold import RANK_TWO, constant
 from fmtorch.geometry.residuals import homogeneous, linearise
 from fmtorch.geometry.robust_losses import Kernel
 
@@ -109,63 +108,3 @@ def _hessian(
         rows = [torch.autograd.grad(total[i].sum(), model, retain_graph=True)[0] for i in range(9)]
     H = torch.stack(rows).movedim((0, 1), (-2, -1))
     return (H + H.mT) / 2
-
-
-def through_steps(
-    F: Float[Tensor, "9 p k"],
-    F0: Float[Tensor, "9 p k"],
-    iterations: int,
-    points: Float[Tensor, "4 p n"],
-    weight: Float[Tensor, "p n"],
-    robust: Kernel,
-    scale: Float[Tensor, " p"],
-) -> Float[Tensor, "9 p k"]:
-    """F, to which so many steps led from F0, attached to the graph of F0, points and weights through each of them.
-
-    The steps are taken once more, in tensors. Damping and the choice of the steps that are accepted are constants.
-    Arguments as of `gradient_of_cost`. Returns the same values.
-    """
-    shared = (points, weight, robust, scale)
-    valid = torch.isfinite(F).all(0) & (F != 0).any(0)
-    current = start(torch.where(valid, F0, constant(F, RANK_TWO)))[0]
-    cost, damping = _cost(current, *shared), torch.full_like(F[0].detach(), FIRST_DAMPING)
-    for _ in range(iterations):
-        with torch.no_grad():
-            trial_cost = _cost(_step(current, *shared, damping), *shared)
-        accepted = valid & (trial_cost < cost)
-        moved = _step(current, *shared, torch.where(accepted, damping, 1))
-        current, cost = torch.where(accepted, moved, current), torch.where(accepted, trial_cost, cost)
-        damping = torch.where(accepted, damping / 10, damping * 10).clamp(MIN_DAMPING, MAX_DAMPING)
-    return F + torch.where(valid, current - current.detach(), 0)
-
-
-@torch.no_grad()
-def _cost(F: Tensor, points: Tensor, weight: Tensor, robust: Kernel, scale: Tensor) -> Float[Tensor, "p k"]:
-    """The robust costs of models of rank 2."""
-    r2 = linearise(F, homogeneous(points[:, None, :, None]), derivatives=False)[3][0]
-    return stable_sum(weight[:, None] * robust.loss(r2, scale.square()[:, None, None]))
-
-
-def _step(
-    F: Tensor, points: Tensor, weight: Tensor, robust: Kernel, scale: Tensor, damping: Tensor
-) -> Float[Tensor, "9 p k"]:
-    """The model after one damped step of Gauss and Newton on the manifold, attached to all inputs."""
-    J, e, inverse, r2 = linearise(F, homogeneous(points[:, None, :, None]))
-    J, e = J.flatten(0, 1)[:, 0], e[0]
-    influence = (weight[:, None] * robust.weight(r2, scale.square()[:, None, None]) * inverse)[0]
-    H = torch.einsum("apkn,bpkn->pkab", J * influence, J)
-    gradient = torch.einsum("apkn,pkn->pka", J * influence, e)
-    model = F.movedim(0, -1)
-    normal = unit(cofactors(as_rows(F)).flatten(0, 1)).movedim(0, -1)
-    curvature = H.diagonal(dim1=-2, dim2=-1).amax(-1)
-    curvature = torch.where(curvature > 0, curvature, 1.0)
-    blocked = model[..., :, None] * model[..., None, :] + torch.diag_embed(damping[..., None].expand_as(model))
-    Q = torch.cat([H + curvature[..., None, None] * blocked, normal[..., None]], -1)
-    last = torch.cat([normal, torch.zeros_like(normal[..., :1])], -1)
-    Q = torch.cat([Q, last[..., None, :]], -2)
-    right = torch.cat([-gradient, torch.zeros_like(gradient[..., :1])], -1)
-    step = torch.linalg.solve_ex(Q, right[..., None])[0][..., :9, 0]
-    G = F + step.movedim(-1, 0)
-    C, n = cofactors(as_rows(G)).flatten(0, 1), unit(cofactors(as_rows(F)).flatten(0, 1))
-    determinant = component_sum(C[:3] * G[:3])
-    return unit(G - determinant / component_sum(C * n) * n)

@@ -15,7 +15,7 @@ from fmtorch.geometry.arithmetic import component_sum
 from fmtorch.geometry.fixed_point import gradient_wanted
 from fmtorch.geometry.levenberg_marquardt_kernels import FIRST_DAMPING, Schedule
 from fmtorch.geometry.normalized_matches import NormalizedMatches, fitted_by
-from fmtorch.geometry.optimum import STEP_DAMPING, at_optimum, curvature_of_cost, gradient_of_cost, through_steps
+from fmtorch.geometry.optimum import STEP_DAMPING, at_optimum, curvature_of_cost, gradient_of_cost
 from fmtorch.geometry.rank2_manifold import RANK_TWO, RANK_TWO_EPIPOLE, constant, constrained_solve, retract, start
 from fmtorch.geometry.rank2_manifold_kernels import SQUARINGS
 from fmtorch.geometry.refine_kernels import refine as refine_pair
@@ -58,13 +58,15 @@ def refine(
     kernel: str = "truncated",
     scale: float | Tensor = 1.0,
     iterations: int = 10,
-    gradient: str = "implicit",
 ) -> Float[Tensor, "*models 3 3"]:
     """The fundamental matrix of least robust Sampson error near F: ``sum_i w_i rho(r_i^2)``.
 
-    Bartoli & Sturm (2004); Hartley & Zisserman (2004), 11.4.3. Differentiable in points and weights. Gradients are
-    bounded where the matches leave F open, and zero for a model that cannot be refined. Where nothing requires them no
-    graph is built, and the values are the same in any case.
+    Bartoli & Sturm (2004); Hartley & Zisserman (2004), 11.4.3. Differentiable in points and weights, not in F: by the
+    implicit function theorem with the exact Hessian, the gradient is that of the optimum. (`attached_step` takes Gauss
+    and Newton's Hessian: its gradient is off by 0.2 to 5 % at a noise of 1 px with a focal length of 1000 px, by 6 to
+    65 % at 10 px, and by 1 to 50 % where a robust kernel weighs wrong matches.) Gradients are bounded where the matches
+    leave F open, and zero for a model that cannot be refined. Where nothing requires them no graph is built, and the
+    values are the same in any case.
 
     Args:
         F: one matrix for each set of matches, or K of them, (*batch, K, 3, 3).
@@ -75,28 +77,20 @@ def refine(
         kernel: a name of `robust_losses.KERNELS`.
         scale: of the kernel, in pixels (a number, or one per set).
         iterations: Levenberg-Marquardt steps.
-        gradient: "implicit", that of the optimum by the implicit function theorem, with the exact Hessian; there is
-            none to F. Or "unrolled" through all accepted steps, also to F; their choice and the centre of the
-            coordinates, on which they depend before convergence, are constants. Both agree at convergence, and before
-            it the implicit one is the nearer to the optimum's. (`attached_step` takes Gauss and Newton's Hessian: its
-            gradient is off by 0.2 to 5 % at a noise of 1 px with a focal length of 1000 px, by 6 to 65 % at 10 px, and
-            by 1 to 50 % where a robust kernel weighs wrong matches.)
 
     Returns:
         Matrices of rank 2 and unit norm in float64; one that cannot be refined comes back as it was, scaled.
 
     Raises:
-        ValueError: for an unknown kernel or gradient.
+        ValueError: for an unknown kernel.
     """
     robust = named_kernel(kernel)
-    wanted = gradient_wanted(gradient, x0, x1, weight, F if gradient == "unrolled" else None)
+    wanted = gradient_wanted(x0, x1, weight)
     with torch.set_grad_enabled(wanted):
-        matches = NormalizedMatches(x0, x1, weight, mask, F, scale)
+        matches = NormalizedMatches(x0, x1, weight, mask, F.detach(), scale)
         shared = (matches.points, matches.weight)
         models, _ = refine_components(matches.models, *shared, kernel, matches.scale, iterations)
-        if wanted and gradient == "unrolled":
-            models = through_steps(models, matches.models, iterations, *shared, robust, matches.scale)
-        elif wanted:
+        if wanted:
             models = at_optimum(models, *shared, robust, matches.scale)
         return matches.to_pixels(models).reshape(F.shape)
 
