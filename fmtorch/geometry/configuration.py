@@ -90,9 +90,9 @@ def configuration_evidence(
     models = torch.stack([A.to(torch.float64) for A in (F, H, *cameras)], 1)
     models = torch.where(models.isfinite().flatten(2).all(2)[..., None, None], models, 0.0)
     sizes = (None if size is None else size.to(torch.float64) for size in (size0, size1))
-    given = [None if a is None else a.cpu() for a in (x0, x1, mask, prior, noise, models, *sizes, precision)]
+    given = (x0, x1, mask, prior, noise, models, *sizes, precision)
     out = torch.empty(len(F), compiled.COLUMNS, dtype=torch.float64)
-    rows = for_each_pair(_into, given, out=out, kind=torch.float64).to(F.device)
+    rows = for_each_pair(_into, given, out=out, kind=torch.float64)
     columns = [rows[:, k] for k in (compiled.LINE, compiled.PLANE, compiled.BOTH, compiled.TURN, compiled.COPY)]
     columns += [rows[:, k] for k in (compiled.NOISE, compiled.MATCHES, compiled.ON_PLANE, compiled.ON_LINE)]
     columns += [rows[:, compiled.ROTATION : compiled.SCALED].reshape(-1, 3, 3)]

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fmtorch.compiling.batches import kernels_serve
+from fmtorch.compiling import switch
 from fmtorch.core.threads import one_thread
 from fmtorch.geometry.arithmetic import sqrt, stable_sum
 from fmtorch.matching import eight_bit
@@ -119,7 +119,8 @@ def _match_one_pair(d0: Tensor, d1: Tensor, mask0: Tensor, mask1: Tensor, chunk:
 
 def _compiled(rows: Tensor, columns: Tensor) -> tuple[_Nearest, Tensor] | None:
     """`_two_nearest` by kernels, None where they do not serve."""
-    neighbors = eight_bit.two_nearest(rows, columns) if kernels_serve(rows, columns) else None
+    served = rows.device.type == "cpu" and switch.available()
+    neighbors = eight_bit.two_nearest(rows, columns) if served else None
     if neighbors is None:
         return None
     tensors = (torch.from_numpy(value) for value in (neighbors.nearest, neighbors.squared, neighbors.second_squared))

@@ -1,4 +1,4 @@
-"""`frame_consistency` for one pair, compiled: the same orders and the same sums, in float32."""
+"""`frame_consistency` for one pair, compiled; float32."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 
 from fmtorch.compiling.arrays import Array, B1x1, F4x1, F4x2, F4x3
 from fmtorch.compiling.kernel import inner, kernel
-from fmtorch.geometry.curves_kernels import curve_order
 from fmtorch.pruning.agreement import (
     CURVES32,
     MIN_SQUARE32,
@@ -20,6 +19,9 @@ from fmtorch.pruning.agreement import (
     SHARPNESS32,
     WINDOW,
     WORST_RATIO32,
+    add_products,
+    curve_orders,
+    put_in_order,
 )
 
 
@@ -60,25 +62,15 @@ def frame_agreement(matches: FramedMatches, out: F4x1) -> None:
             valid = valid and math.isfinite(rows[k, m])
         match[m] = i
         m += valid
-    order, along = np.empty(m, np.int64), np.empty((10, m), x0.dtype)
+    orders, along = np.empty((2 * len(CURVES32), m), np.int64), np.empty((10, m), x0.dtype)
+    curve_orders(rows, orders)
     agreement, votes = np.zeros(m, x0.dtype), np.zeros(m, x0.dtype)
     ahead, behind = np.empty((WINDOW, m), x0.dtype), np.empty((WINDOW, m), x0.dtype)
-    for image in range(2):
-        for curve in range(len(CURVES32)):
-            curve_order(
-                rows[2 * image, :m],
-                rows[2 * image + 1, :m],
-                CURVES32[curve, 0],
-                CURVES32[curve, 1],
-                CURVES32[curve, 2],
-                order,
-            )
-            for k in range(10):
-                for i in range(m):
-                    along[k, i] = rows[k, order[i]]
-            for k in range(1, WINDOW + 1):
-                _frames_agree(along, k, ahead[k - 1], behind[k - 1])
-            _add_votes(along[9], ahead, behind, order, agreement, votes)
+    for order in orders:
+        put_in_order(rows, order, along)
+        for k in range(1, WINDOW + 1):
+            _frames_agree(along, k, ahead[k - 1], behind[k - 1])
+        _add_votes(along[9], ahead, behind, order, agreement, votes)
     for i in range(m):
         out[match[i]] = agreement[i] / max(votes[i], MIN_VOTES32)
 
@@ -124,25 +116,3 @@ def _add_votes(vote: Array, ahead: Array, behind: Array, order: Array, agreement
     for i in range(m):
         agreement[order[i]] += total[i]
         votes[order[i]] += all_votes[i]
-
-
-@inner
-def add_products(agree: Array, vote: Array, count: int, total: Array, votes: Array) -> None:
-    """Adds so many agreeing votes to the totals, and the votes."""
-    for i in range(count):
-        total[i] += agree[i] * vote[i]
-    for i in range(count):
-        votes[i] += vote[i]
-
-
-@kernel
-def frame_prior(agreement: F4x1, quality: F4x1, mask: B1x1, numbers: F4x1, out: F4x1) -> None:
-    """P(inlier) of `FrameConsistency` from agreement and ratio (n,) -> out (n,); zero where masked or not finite.
-
-    numbers: odds, floor, slope.
-    """
-    odds, floor, slope = numbers[0], numbers[1], numbers[2]
-    for i in range(len(mask)):
-        w, divisor = agreement[i] + floor, ONE32 + slope * quality[i]
-        o = odds * w * w * w / (divisor * divisor)
-        out[i] = o / (ONE32 + o) if mask[i] and math.isfinite(quality[i]) else ONE32 - ONE32

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fmtorch.compiling.batches import for_each_pair, kernels_serve
-from fmtorch.core.records import ungraphed
+from fmtorch.compiling.batches import for_each_pair
 from fmtorch.core.types import Correspondences
-from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.pruning import gms_kernels as compiled
 from fmtorch.pruning.calibration import calibration_of
-from fmtorch.pruning.gms_table import GRIDS, Border, Moves, Surroundings, Table, give_back, moves_in_blocks, tabulated
+
+Border = Literal["opencv", "authors"]
+# Cells a side in image 1 at the scale ratios 1, 1/2, 1/sqrt(2), sqrt(2), 2, rounded down as the released code does.
+GRIDS = (20, 10, 14, 28, 40)
 
 
 def gms(
@@ -41,23 +42,12 @@ def gms(
 
     x0, x1 in pixels, size0, size1 as (h, w). Matches outside their images' grids are dropped. Masks equal those of
     OpenCV's matchGMS; border="authors" gives those of the authors' code, which drops points in the left and top half
-    cells of shifted grids. Time and memory are linear in the number of matches, besides a table of cell pairs whose
-    size is bounded.
+    cells of shifted grids. Time and memory are linear in the number of matches, besides a table of cell pairs. Computed
+    on the CPU.
     """
-    grids, turns = GRIDS if with_scale else GRIDS[:1], 8 if with_rotation else 1
-    if kernels_serve(x0.detach(), x1.detach()):
-        out = torch.empty(x0.shape[:2], dtype=torch.bool)
-        options = (np.array(grids), turns, threshold_factor, border == "authors")
-        tensors = _per_pair(x0, x1, size0, size1, mask)
-        return for_each_pair(compiled.gms, tensors, *options, out=out, kind=torch.float64, group=compiled.Matches)
-    kept = torch.zeros(x0.shape[:2], dtype=torch.bool, device=x0.device)
-    for moves, place in moves_in_blocks(x0, x1, size0, size1, mask, grids, border):
-        table = tabulated(moves)
-        bits = _standing(table, moves, turns, threshold_factor)
-        searched = len(grids) * turns > 1
-        kept.view(-1)[place] = _kept(bits, _winner(bits, moves, turns), moves, turns) if searched else bits[0] > 0
-        give_back(table)
-    return kept
+    tensors, options = _given(x0, x1, size0, size1, mask), _options(with_rotation, with_scale, threshold_factor, border)
+    out = torch.empty(x0.shape[:2], dtype=torch.bool)
+    return for_each_pair(compiled.gms, tensors, *options, out=out, kind=torch.float64, group=compiled.Matches)
 
 
 def gms_support(
@@ -80,83 +70,26 @@ def gms_support(
     the grids; 0 for a match that is alone, outside or masked. Rotation and scale are those of the hypothesis that keeps
     most matches of the pair in `gms`, whose arguments these are.
     """
-    grids, turns = GRIDS if with_scale else GRIDS[:1], 8 if with_rotation else 1
-    if kernels_serve(x0.detach(), x1.detach()):
-        out = torch.empty(x0.shape[:2], dtype=torch.float64)
-        options = (np.array(grids), turns, threshold_factor, border == "authors")
-        tensors = _per_pair(x0, x1, size0, size1, mask)
-        for_each_pair(compiled.gms_support, tensors, *options, out=out, kind=torch.float64, group=compiled.Matches)
-        return out.to(x0.dtype)
-    support = torch.zeros(x0.shape[:2], dtype=x0.dtype, device=x0.device)
-    for moves, place in moves_in_blocks(x0, x1, size0, size1, mask, grids, border):
-        table = tabulated(moves)
-        winner = torch.zeros(moves.pairs, dtype=torch.int64, device=x0.device)
-        if len(grids) * turns > 1:
-            winner = _winner(_standing(table, moves, turns, threshold_factor), moves, turns)
-        z = _own_support(table, moves, winner, turns)
-        give_back(table)
-        support.view(-1)[place] = (z / (z + compiled.HALF_SUPPORT)).to(support.dtype)
-    return support
+    tensors, options = _given(x0, x1, size0, size1, mask), _options(with_rotation, with_scale, threshold_factor, border)
+    out = torch.empty(x0.shape[:2], dtype=torch.float64)
+    for_each_pair(compiled.gms_support, tensors, *options, out=out, kind=torch.float64, group=compiled.Matches)
+    return out.to(x0)
 
 
-def _per_pair(x0: Tensor, x1: Tensor, size0: Tensor, size1: Tensor, mask: Tensor | None) -> tuple[Tensor, ...]:
+def _given(x0: Tensor, x1: Tensor, size0: Tensor, size1: Tensor, mask: Tensor | None) -> tuple[Tensor, ...]:
     """What the kernels are given of each pair."""
     mask = torch.ones_like(x0[..., 0], dtype=torch.bool) if mask is None else mask
     return x0, x1, size0.float(), size1.float(), mask
 
 
-def _standing(table: Table, moves: Moves, turns: int, factor: float) -> UInt8[Tensor, "s m"]:
-    """The rotations, as bits, under which a match follows an assignment that stands, for each grid of image 1."""
-    line, lines = moves.line.flatten().long(), moves.lines
-    occupied = table.filled.nonzero()[:, 0].int()
-    rows = []
-    for grid, (side, slot, end) in enumerate(zip(moves.grids, table.slot, moves.end, strict=True)):
-        # The cell of image 1 that most matches of a line go to: largest count, then lowest cell.
-        cells = side * side
-        counted = torch.int32 if len(end) * cells < 2**31 else torch.int64
-        merit = (cells - 1 - end).to(counted) + table.moves.index_select(0, slot).to(counted).mul_(cells).view(4, -1)
-        best = merit.new_zeros(lines + 1).scatter_reduce_(0, line, merit.flatten(), "amax")
-        assigned = (cells - 1 - best.index_select(0, occupied).remainder(cells)).int()
-        around = Surroundings(table, moves, grid, occupied, assigned)
-        stands = torch.zeros_like(assigned)
-        for turn in range(turns):
-            score, mean = around.turned(turn)
-            stands |= (score >= factor * sqrt(mean)).int() << turn
-        verdict = stands.new_zeros(lines + 1)  # best cell and, in the low byte, bit k: it stands under rotation k
-        verdict.index_copy_(0, occupied.long(), (assigned << 8) + stands)
-        differs = verdict.index_select(0, line).view(4, -1) ^ (end << 8)  # bits beyond the low byte: another cell
-        bits = differs.clamp_(max=256).to(torch.uint8)
-        rows.append(bits[0] | bits[1] | bits[2] | bits[3])
-    return torch.stack(rows)
-
-
-def _winner(bits: UInt8[Tensor, "s m"], moves: Moves, turns: int) -> Int[Tensor, " pairs"]:
-    """The hypothesis, grid * turns + turn, that keeps most matches of each pair, the first of equals."""
-    hypotheses = torch.stack([(row >> turn) & 1 for row in bits for turn in range(turns)], 1)  # (M, S * turns)
-    counts = torch.zeros(moves.pairs, hypotheses.shape[1], dtype=torch.int32, device=bits.device)
-    counts.index_add_(0, moves.pair, hypotheses.int())
-    return counts.argmax(1)
-
-
-def _kept(bits: UInt8[Tensor, "s m"], winner: Int[Tensor, " pairs"], moves: Moves, turns: int) -> Bool[Tensor, " m"]:
-    """What the winning hypothesis of its pair says of each match."""
-    chosen = winner[moves.pair]
-    row = bits.gather(0, torch.div(chosen, turns, rounding_mode="floor")[None])[0]
-    return ((row >> chosen.remainder(turns).to(torch.uint8)) & 1).bool()
-
-
-def _own_support(table: Table, moves: Moves, winner: Int[Tensor, " pairs"], turns: int) -> Float[Tensor, " m"]:
-    """``(score - 1) / sqrt(mean)`` of each match's own cells under its pair's hypothesis, mean over the four grids."""
-    chosen = winner[moves.pair]
-    total = torch.zeros(len(chosen), dtype=torch.float64, device=chosen.device)
-    for hypothesis in sorted(set(winner.tolist())):
-        grid, turn = divmod(hypothesis, turns)
-        members = (chosen == hypothesis).nonzero()[:, 0]
-        for line in moves.line:
-            here = members[line[members] < moves.lines]
-            score, mean = Surroundings(table, moves, grid, line[here], moves.end[grid, here]).turned(turn)
-            total.index_add_(0, here, (score - 1).clamp_min(0) / sqrt(mean.clamp_min(1)) / 4)
-    return total
+def _options(with_rotation: bool, with_scale: bool, threshold_factor: float, border: Border) -> tuple[Any, ...]:
+    """What they are given of all pairs: sides of the grids in image 1, rotations, factor, whose rule at the border."""
+    return (
+        np.array(GRIDS if with_scale else GRIDS[:1]),
+        8 if with_rotation else 1,
+        threshold_factor,
+        border == "authors",
+    )
 
 
 class GMS:
@@ -182,9 +115,6 @@ class GMS:
 
     def __call__(self, c: Correspondences) -> Correspondences:
         """The same matches, of which only those survive that move with their neighbours, or with a prior."""
-        return ungraphed(c, lambda: self._pruned(c))
-
-    def _pruned(self, c: Correspondences) -> Correspondences:
         return self.calibration(c, self.evidence(c)) if self.calibration else c.keep(gms(**self._arguments(c)))
 
     def evidence(self, c: Correspondences) -> Float[Tensor, "b n"]:

@@ -1,4 +1,4 @@
-"""`gms` for one pair, compiled: the same decisions."""
+"""`gms` for one pair, compiled."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ import numpy as np
 from fmtorch.compiling.arrays import Array, B1x1, F8x1, F8x2, I8x1
 from fmtorch.compiling.kernel import inner, kernel
 
-GRID = 20  # this and the ring as in `gms_table`
+GRID = 20  # cells a side in image 0
 CELLS = GRID * GRID
 HALF_SUPPORT = 1.5  # the score, in square roots of the mean, whose support is one half
+# The cells around a cell as (dx, dy), clockwise from the top left. A rotation by 45 degrees moves the ring on by one.
 RING = np.array(((-1, -1), (0, -1), (1, -1), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0)))
 
 

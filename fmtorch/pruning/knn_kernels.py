@@ -17,7 +17,7 @@ _LEAF = 8  # points a leaf, at most
 
 @inner
 def search(queries: Array, points: Array, neighbors: Array) -> None:
-    """`knn.nearest_points` of queries (n, 2) among points (m, 2) -> found (n, count); -1 for no more points.
+    """The points (m, 2) nearest to each query (n, 2), nearest first -> neighbors (n, count); -1 for no more points.
 
     Squared distances in float64, ties by index, exactly as an exhaustive search finds them.
     Node j of depth d holds the places from (j m) >> d on in an order of the points, its box and their lowest index.

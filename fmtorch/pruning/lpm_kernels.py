@@ -1,4 +1,4 @@
-"""`lpm` for one pair, compiled: the same costs."""
+"""`lpm` for one pair, compiled."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def _cost(points0: Array, points1: Array, members: Array, K: int, tau: float, co
     search(points1, points1[members], near1)
     for i in range(n):
         cost[i] = 0
-        for scale in range(3):  # as in the tensor form: neighbours 1..K+2, 2..K+1, 3..K
+        for scale in range(3):  # as released: neighbours 1..K+2, 2..K+1, 3..K; 0 is the match
             size = K + 2 - 2 * scale
             kept = 0
             for a in range(1 + scale, width - scale):

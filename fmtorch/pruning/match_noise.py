@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.compiling.batches import for_each_pair, kernels_serve
 from fmtorch.core.records import ungraphed
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry.arithmetic import sqrt
-from fmtorch.pruning import match_noise_kernels as compiled
 
 MIN_AREA = 1e-12  # square pixels: keeps the gradient of the scale finite
 MIN_PRIOR = 0.02  # matches less likely than that are not taken for noisier
@@ -68,12 +65,6 @@ class MatchNoise:
         lafs0, lafs1 = c.lafs0, c.lafs1
         if lafs0 is None or lafs1 is None:
             return c
-        if kernels_serve(lafs0, lafs1, c.quality, c.prior, floats=(torch.float32,)):
-            numbers = np.array((self.usual, self.radius, self.slope, MIN_AREA, MIN_PRIOR), np.float32)
-            tensors = (lafs0, lafs1, c.quality, c.prior, c.mask)
-            noise = torch.empty(c.mask.shape)
-            for_each_pair(compiled.match_noise, tensors, numbers, out=noise, group=compiled.FramedMatches)
-            return c.derived(noise=noise)
         return ungraphed(c, lambda: self._with_noise(c, lafs0, lafs1))
 
     def _with_noise(self, c: Correspondences, lafs0: Tensor, lafs1: Tensor) -> Correspondences:

@@ -1,4 +1,4 @@
-"""`position_consistency` for one pair, compiled: the same orders and the same sums, in float32."""
+"""`position_consistency` for one pair, compiled; float32."""
 
 from __future__ import annotations
 
@@ -9,39 +9,45 @@ import numpy as np
 
 from fmtorch.compiling.arrays import Array, B1x1, F4x1, F4x2
 from fmtorch.compiling.kernel import inner, kernel
-from fmtorch.geometry.curves_kernels import curve_order
 from fmtorch.pruning.agreement import (
     CURVES32,
-    EDGES32,
     FARTHEST32,
-    HALF_COSINE32,
-    HALF_SINE32,
-    IDENTITY,
-    MAPS32,
     MIN_SQUARE32,
     MIN_VOTE32,
     MIN_VOTES32,
     NOISE32,
     ONE32,
     SHARPNESS32,
-    TWO_TANGENT32,
     WINDOW,
     WORST_RATIO32,
+    add_products,
+    curve_orders,
+    put_in_order,
 )
-from fmtorch.pruning.frame_consistency_kernels import add_products
+
+TURNS = 16  # hypotheses of the turn that a pair's neighbours have in common
+SCALES = tuple(2.0 ** (k / 2) for k in range(-4, 5))  # hypotheses of their change of scale
+IDENTITY = SCALES.index(1.0) * TURNS  # the hypothesis scale * TURNS + turn that changes nothing
+EDGES32 = np.array([2.0 ** (k / 2) for k in range(-9, 11, 2)], np.float32)  # of squared scales, halfway between these
+_ANGLES = [2 * math.pi * k / TURNS for k in range(TURNS)]
+_SCALES32 = np.array(SCALES, np.float32)[:, None]
+_COSINES32, _SINES32 = (np.array([f(angle) for angle in _ANGLES], np.float32) for f in (math.cos, math.sin))
+MAPS32 = np.stack(np.broadcast_arrays(_SCALES32 * _COSINES32, _SCALES32 * _SINES32, _SCALES32), -1).copy()
+"""(scales, turns, 3), of each its cosine and sine, times the scale, and the scale."""
+HALF_COSINE32, HALF_SINE32 = np.float32(math.cos(math.pi / TURNS)), np.float32(math.sin(math.pi / TURNS))
+TWO_TANGENT32 = np.float32(math.tan(math.pi / 8))
 
 
 @kernel
 def position_agreement(x0: F4x2, x1: F4x2, quality: F4x1, mask: B1x1, out: F4x1) -> None:
-    """`position_consistency.position_agreement` of x0, x1 (n, 2), mask (n,) -> out (n,).
+    """`position_consistency.position_agreement` of x0, x1 (n, 2), mask (n,), and its a, b and s -> out (n + 3,).
 
     quality: (n,), empty where unknown.
     """
-    n = len(mask)
+    n, m = len(mask), 0
+    out[:] = 0
     rows, match = np.empty((5, n), x0.dtype), np.empty(n, np.int64)
-    m = 0
     for i in range(n):
-        out[i] = 0
         rows[0, m], rows[1, m], rows[2, m], rows[3, m] = x0[i, 0], x0[i, 1], x1[i, 0], x1[i, 1]
         rows[4, m] = max(WORST_RATIO32 - quality[i], MIN_VOTE32) if len(quality) else x0.dtype.type(1)
         valid = mask[i] and not (len(quality) and math.isnan(quality[i]))
@@ -52,44 +58,45 @@ def position_agreement(x0: F4x2, x1: F4x2, quality: F4x1, mask: B1x1, out: F4x1)
     if m == 0:
         return
     orders, along = np.empty((2 * len(CURVES32), m), np.int64), np.empty((5, m), x0.dtype)
-    for o in range(len(orders)):
-        image, curve = o // len(CURVES32), o % len(CURVES32)
-        curve_order(
-            rows[2 * image, :m], rows[2 * image + 1, :m], CURVES32[curve, 0], CURVES32[curve, 1], CURVES32[curve, 2],
-            orders[o],
-        )  # fmt: skip
+    curve_orders(rows, orders)
+    similarity = _similarity(rows, orders, along)
+    agreement, votes, agree = np.zeros(m, x0.dtype), np.zeros(m, x0.dtype), np.empty(m, x0.dtype)
+    for order in orders:
+        put_in_order(rows, order, along)
+        total, all_votes = np.zeros(m, x0.dtype), np.zeros(m, x0.dtype)
+        for k in range(1, min(WINDOW, m - 1) + 1):
+            _positions_agree(along, k, similarity, agree)
+            add_products(agree, along[4, k:], m - k, total, all_votes)
+            add_products(agree, along[4], m - k, total[k:], all_votes[k:])
+        for i in range(m):
+            agreement[order[i]] += total[i]
+            votes[order[i]] += all_votes[i]
+    for i in range(m):
+        out[match[i]] = agreement[i] / max(votes[i], MIN_VOTES32)
+    for k in range(3):
+        out[n + k] = similarity[k]
+
+
+@inner
+def _similarity(rows: Array, orders: Array, along: Array) -> Array:
+    """The map of small vectors (a x - b y, b x + a y) that most neighbours in either image have in common: a, b, s.
+
+    Every two consecutive matches along a curve vote for the turn and scale between them. Right matches vote alike in
+    both images' orders. Wrong ones vote for large scales in the order of image 0, where they are near each other in
+    image 0 alone, and for small ones in the other: the product of the two (smoothed) histograms is low there.
+    """
     scales, turns = MAPS32.shape[:2]
     bins = scales * turns
     merit = np.ones(bins, np.int64)
     for image in range(2):
-        _put_in_order(rows, orders[image * len(CURVES32)], along)
+        put_in_order(rows, orders[image * len(CURVES32)], along)
         _multiply_by_histogram(along, merit)
     best, best_merit = 0, np.int64(-1)
     for first in range(bins):  # of equals the identity wins, then what comes before it
         index = (IDENTITY - first) % bins
         if merit[index] > best_merit:
             best, best_merit = index, merit[index]
-    agreement, votes, agree = np.zeros(m, x0.dtype), np.zeros(m, x0.dtype), np.empty(m, x0.dtype)
-    for o in range(len(orders)):
-        _put_in_order(rows, orders[o], along)
-        total, all_votes = np.zeros(m, x0.dtype), np.zeros(m, x0.dtype)
-        for k in range(1, min(WINDOW, m - 1) + 1):
-            _positions_agree(along, k, MAPS32[best // turns, best % turns], agree)
-            add_products(agree, along[4, k:], m - k, total, all_votes)
-            add_products(agree, along[4], m - k, total[k:], all_votes[k:])
-        for i in range(m):
-            agreement[orders[o, i]] += total[i]
-            votes[orders[o, i]] += all_votes[i]
-    for i in range(m):
-        out[match[i]] = agreement[i] / max(votes[i], MIN_VOTES32)
-
-
-@inner
-def _put_in_order(rows: Array, order: Array, along: Array) -> None:
-    """Columns of rows (d, n) in the order (m,) -> along (d, m)."""
-    for k in range(len(rows)):
-        for i in range(len(order)):
-            along[k, i] = rows[k, order[i]]
+    return MAPS32[best // turns, best % turns]
 
 
 @inner
@@ -121,7 +128,7 @@ def _multiply_by_histogram(along: Array, merit: Array) -> None:
 
 @inner
 def _turn(x: Any, y: Any) -> int:
-    """Which of 16 sectors the direction (x, y) is in, as in `position_consistency`."""
+    """Which of 16 sectors, centred on multiples of 22.5 degrees, the direction (x, y) is in; by comparisons alone."""
     cosine, sine, tangent = HALF_COSINE32, HALF_SINE32, TWO_TANGENT32
     x, y = cosine * x - sine * y, sine * x + cosine * y
     sector = 0
