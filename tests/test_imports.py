@@ -11,17 +11,19 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "fmtorch"
 ROOMS = sorted(path.parent.name for path in PACKAGE.glob("*/__init__.py"))
-GROUND = "core compiling geometry"
+GROUND = "core jobs compiling geometry"
 MAY_IMPORT = {
     "core": "",
-    "compiling": "core",
-    "geometry": "core compiling",
+    "jobs": "core",
+    "compiling": "core jobs",
+    "geometry": "core jobs compiling",
     **dict.fromkeys(("metrics", "matching", "features", "pruning", "estimators"), GROUND),
-    "data": "core compiling",
+    "data": "core jobs compiling",
     "storage": GROUND + " data",
-    "presets": "core data storage",
-    "pipeline": GROUND + " data storage presets",
-    "evaluation": GROUND + " metrics data storage presets pipeline",
+    "presets": "core jobs data storage",
+    "two_view": GROUND + " estimators pruning presets",
+    "pipeline": GROUND + " data storage presets two_view",
+    "evaluation": GROUND + " metrics data storage presets two_view pipeline",
     "training": " ".join(room for room in ROOMS if room != "commands"),
     "commands": " ".join(ROOMS),
 }

@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 from fmtorch.compiling import calls
-from fmtorch.compiling.lock import FileLock
 from fmtorch.core.resources import cache_dir
 
 HERE = Path(__file__).resolve().parent
@@ -106,7 +105,7 @@ class KernelFile:
     def __init__(self, path: Path | None, missing: Callable[[str], None]) -> None:
         self.path, self.missing = path, missing
         self.calls: list[Any] = []
-        self._lock = None if path is None else FileLock(path)
+        self._lock: Any = None  # held while this process compiles; it ends with the process, however that ends
 
     @property
     def cache_path(self) -> str | None:
@@ -118,8 +117,7 @@ class KernelFile:
         target_context.refresh()
         if (loaded := self._loaded(signature, target_context)) is not None:
             return loaded
-        locked = self._lock is not None and self._lock.acquire()
-        if locked and (loaded := self._loaded(signature, target_context)) is not None:
+        if self._acquire() and (loaded := self._loaded(signature, target_context)) is not None:
             self._release()
             return loaded  # another process has just compiled it
         kept = "for this process" if self.path is None else f"for this machine, once (kept in {self.path.parent})"
@@ -159,10 +157,27 @@ class KernelFile:
         finally:
             self._release()
 
+    def _acquire(self) -> bool:
+        """Wait for a process that compiles the same; False where no file can be locked."""
+        import filelock  # only now: loading a kernel needs none
+
+        if self.path is None or self._lock is not None:  # held since a compilation that failed
+            return self._lock is not None
+        lock = filelock.FileLock(self.path.with_name(f"{self.path.name}.lock"), thread_local=False)
+        try:
+            lock.acquire()
+        except (OSError, NotImplementedError):  # a folder that can only be read, a file system without locks
+            return False
+        self._lock = lock
+        return True
+
     def _release(self) -> None:
         """Let other processes that wait for the file have it."""
         if self._lock is not None:
             self._lock.release()
+            with contextlib.suppress(OSError):
+                Path(self._lock.lock_file).unlink()
+            self._lock = None
 
     def flush(self) -> None:
         """Remove the file."""

@@ -114,9 +114,8 @@ def _pruner_words(mine: Any, values: Sequence[Any]) -> Iterator[str]:
 
 
 def _pruners(value: Any) -> dict[str, Any]:
-    """The pruners of a run by name: stored as a list of one-name mappings, or by earlier versions as one mapping."""
-    entries = value if isinstance(value, list) else [value or {}]
-    return {name: options for entry in entries for name, options in entry.items()}
+    """The pruners of a run by name, stored as a list of one-name mappings."""
+    return {name: options for entry in value or () for name, options in entry.items()}
 
 
 def _options(mine: Mapping[str, Any], values: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, str]]:

@@ -112,7 +112,7 @@ def focals(summaries: Summaries) -> Table | None:
 
 
 def configurations(summaries: Summaries) -> Table | None:
-    """How many pairs are in which configuration; None where nobody has looked, as in runs of earlier versions."""
+    """How many pairs are in which configuration; None where nobody has looked."""
     return _of_field(summaries, "configurations", "Configurations", CONFIGURATION_COLUMNS, CONFIGURATION_CAPTION)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fmtorch.core.files import replacing
-from fmtorch.core.shards import Shard
+from fmtorch.jobs.execution import Shard
 from fmtorch.storage.exchange.database import MatchDatabase, copy_database, remove_database
 from fmtorch.storage.exchange.geometry_parts import GeometryParts
 from fmtorch.storage.exchange.hloc_matches import HlocMatches

@@ -29,7 +29,7 @@ class ArrayCache:
 
     limit: bytes; when more are kept, the least recently used files go (each process may exceed it by `SLACK`). None: no
     bound. A file that is damaged, or holds other arrays than were written under its name, counts as absent, with a
-    warning, one of a version that kept no digest without; what cannot be written is not kept, with a warning.
+    warning; what cannot be written is not kept, with a warning.
     Raises ValueError where the folder is a file or the limit is not positive.
     """
 
@@ -57,10 +57,7 @@ class ArrayCache:
         try:
             with np.load(path, allow_pickle=False) as file:
                 arrays = {key: file[key] for key in file.files}
-            kept = arrays.pop(DIGEST, None)
-            if kept is None:
-                return None
-            if kept.tobytes() != self._digest(section, name, arrays):
+            if arrays.pop(DIGEST).tobytes() != self._digest(section, name, arrays):
                 raise ValueError("it is not what was written there")
             os.utime(path)  # used now
         except FileNotFoundError:

@@ -46,13 +46,6 @@ PAIR_SCHEMA = pa.schema(
         pa.field("corner_error", pa.float64()),
     ]
 )
-_POSES = ("rotation_error", "translation_error", "pose_reason")
-_KINDS = ("configuration", "warning", "focal_error0", "focal_error1", "focal_log_ratio0", "focal_log_ratio1")
-_PLANES = ("H", "corner_error")
-MISSING_COLUMNS = {
-    1: (*_POSES, *_KINDS, *_PLANES), 2: (*_POSES, *_KINDS, *_PLANES), 3: (*_KINDS, *_PLANES), 4: _PLANES,
-}  # fmt: skip
-"""Of the rows of run folders of these earlier formats."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,14 +24,9 @@ import pyarrow.parquet as pq
 
 from fmtorch.core.files import naming, replacing, sync, temporary_name
 from fmtorch.storage.parts import PartWriter, part_bytes, part_files
-from fmtorch.storage.rows import MISSING_COLUMNS, PAIR_SCHEMA, PairRow, to_table
+from fmtorch.storage.rows import PAIR_SCHEMA, PairRow, to_table
 
-FORMAT = 5  # of the folder; to be raised when the schema changes, or what the identity tells
-READABLE = (1, 2, 3, 4, FORMAT)  # formats that `load` reads
-_LACKS = {
-    1: "the order of the pruners, the errors of poses and configurations",
-    2: "the errors of poses and configurations", 3: "configurations", 4: "homographies",
-}  # fmt: skip
+FORMAT = 1  # of the folder; to be raised when the schema changes, or what the identity tells
 _LISTINGS = 20  # at most, until parts are those that were listed
 _SHOWN = 5  # differing fields shown in an error
 
@@ -60,7 +55,6 @@ class RunFolder:
 
     path: Path
     config: dict[str, Any]  # what defines the results, see `identity_digest`
-    format: int = FORMAT
 
     @classmethod
     def open(cls, path: Path | str, config: Mapping[str, Any]) -> RunFolder:
@@ -83,12 +77,6 @@ class RunFolder:
                 )
             _claim(path / "run.json", wanted)
         folder = cls.load(path)
-        if folder.format != FORMAT:
-            raise RunFolderError(
-                f"{path} holds a run of format {folder.format}, which lacks {_LACKS[folder.format]}; this version "
-                f"continues format {FORMAT} only, but `fmtorch.report` still reads it. "
-                "Choose another run_dir, or delete the folder"
-            )
         if folder.identity != identity_digest(wanted):
             raise RunFolderError(
                 f"{path} holds another run; what differs (there -> now): {_head(_differences(folder.config, wanted))}. "
@@ -99,10 +87,7 @@ class RunFolder:
 
     @classmethod
     def load(cls, path: Path | str) -> RunFolder:
-        """The existing run in `path`, whatever its identity and of any format in `READABLE`.
-
-        Raises RunFolderError where there is none.
-        """
+        """The existing run in `path`, whatever its identity. Raises RunFolderError where there is none."""
         file = Path(path) / "run.json"
         try:
             stored = json.loads(file.read_text(encoding="utf-8"))
@@ -112,17 +97,16 @@ class RunFolder:
             raise RunFolderError(f"{file} is not valid JSON ({error}); delete the folder and run again") from error
         if not isinstance(stored, dict) or not isinstance(stored.get("config"), dict):
             raise RunFolderError(f"{file} was not written by this program: it has no 'config'")
-        if stored.get("format") not in READABLE:
-            formats = " and ".join(map(str, READABLE))
+        if stored.get("format") != FORMAT:
             raise RunFolderError(
-                f"{file} has format {stored.get('format')}, this version reads {formats}; choose another run_dir"
+                f"{file} has format {stored.get('format')}, this version reads {FORMAT}; choose another run_dir"
             )
-        if stored["format"] > 1 and stored.get("identity") != identity_digest(stored["config"]):
+        if stored.get("identity") != identity_digest(stored["config"]):
             raise RunFolderError(
                 f"{file} was changed: its identity is not that of its config; put it back as it was, or delete the "
                 "folder and run again"
             )
-        return cls(Path(path), stored["config"], stored["format"])
+        return cls(Path(path), stored["config"])
 
     @property
     def identity(self) -> str:
@@ -179,17 +163,11 @@ class RunFolder:
         return parts
 
     def _part(self, file: Path, columns: list[str]) -> pa.Table:
-        missing = MISSING_COLUMNS.get(self.format, ())
-        earlier = pa.schema([field for field in PAIR_SCHEMA if field.name not in missing])
         try:
             with pq.ParquetFile(part_bytes(file)) as parquet:
-                older = self.format < FORMAT and parquet.schema_arrow.equals(earlier)
-                if not older and not parquet.schema_arrow.equals(PAIR_SCHEMA):
+                if not parquet.schema_arrow.equals(PAIR_SCHEMA):
                     raise pa.ArrowInvalid("its columns are not those of this version")
-                part = parquet.read(columns=[name for name in columns if not older or name not in missing])
-            for field in (PAIR_SCHEMA.field(name) for name in missing if older and name in columns):
-                part = part.append_column(field, pa.nulls(len(part), field.type))
-            return part
+                return parquet.read(columns=columns)
         except FileNotFoundError:
             raise
         except (pa.ArrowException, OSError) as error:

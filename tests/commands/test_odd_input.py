@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shlex
 from pathlib import Path
@@ -11,6 +10,7 @@ import cv2
 import pytest
 
 from fmtorch.core.resources import models_dir
+from fmtorch.storage import RunFolder
 from tests.commands.test_command_line import ended
 from tests.commands.test_match import stereo
 from tests.processes import run_command
@@ -99,10 +99,9 @@ def test_only_regular_files_are_read(monkeypatch: pytest.MonkeyPatch, photograph
 
 def test_the_report_is_refused_before_it_is_drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    (run / "pairs").mkdir(parents=True)
+    RunFolder.open(run, {})
     monkeypatch.setattr("fmtorch.commands.report.gallery", lambda *_: pytest.fail("the work was begun"))
     monkeypatch.setattr("fmtorch.commands.report.named", lambda _: [])
-    (run / "run.json").write_text(json.dumps({"format": 1, "config": {}}))
     end = ended(monkeypatch, tmp_path, "report", "runs=run", "output=run")
     assert end == "error: output=run is a folder; it must name a file"
 

@@ -18,11 +18,12 @@ from fmtorch.commands import report
 from fmtorch.core.types import Estimate
 from fmtorch.data import read_image
 from fmtorch.evaluation import tables
-from fmtorch.evaluation.gallery import Options, Run, rebuilt, shown_pair
+from fmtorch.evaluation.gallery import Options, rebuilt, shown_pair
 from fmtorch.evaluation.page import Section, differing_pairs, render
 from fmtorch.evaluation.redraw import difference
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.summary import summarize
+from fmtorch.pipeline.build import build_pipeline
 from fmtorch.pipeline.pipeline import Outcome
 from fmtorch.presets.composition import compose
 from fmtorch.storage import PairRow, RunFolder, RunFolderError, to_table
@@ -161,7 +162,7 @@ def test_a_pipeline_is_drawn_again_as_it_was_and_a_difference_is_said(order: lis
         f"pruner=[{','.join(order)}]",
     ]
     config = compose("match", ("pipeline=sift_ratio", "cache=off", *overrides))
-    rows = evaluate(presets.build_pipeline(config).run([first, second], seed=3), seed=3)
+    rows = evaluate(build_pipeline(config).run([first, second], seed=3), seed=3)
     F = np.array([0, 0, 1, 0, 0, 0, -1, 0, 0]) / np.sqrt(2)  # of a vertical motion; that of the images is horizontal
     rows[1] = dataclasses.replace(rows[1], F=F.tolist(), nsgd=0.0)
     identity = {"pipeline": "sift_ratio", "seed": 3, **presets.stages(config)}
@@ -194,23 +195,6 @@ def test_a_result_that_cannot_be_had_again_is_said(tmp_path: Path) -> None:
     assert "(no keypoints), unlike in its run" in difference(shown, images, solved, lost)
     assert "NSGD 0.0000, unlike in its run" in difference(shown, images, failed, solution)
     assert difference(shown, images, solved, solution) == difference(shown, images, failed, lost) == ""
-
-
-def test_an_older_run_is_drawn_where_its_pruners_have_one_order(tmp_path: Path) -> None:
-    config = compose("match", ("pipeline=sift_ratio", "cache=off"))
-    stages = presets.stages(config)
-    for names, drawn in (([], True), (["ratio"], True), (["ratio", "one_to_one"], False)):
-        pruner = {name: value for entry in stages["pruner"] for name, value in entry.items() if name in names}
-        old = {"pipeline": "sift_ratio", **stages, "pruner": pruner}
-        folder = RunFolder(tmp_path, old, 1)
-        r = Run("sift_ratio", folder, to_table([]))
-        if drawn:
-            assert list(rebuilt(r, SHOWN).pruners) == names
-        else:
-            with pytest.raises(
-                ValueError, match=r"made by an earlier version.*order of its pruners \(ratio, one_to_one\)"
-            ):
-                rebuilt(r, SHOWN)
 
 
 def test_the_command_on_two_runs(tmp_path: Path) -> None:

@@ -70,8 +70,6 @@ def test_orders_and_choices_of_pruners() -> None:
     assert names(config(pruner=alone), config(pruner=[]), config(pruner=ratio(0.9))) == [
         "ratio threshold=0.8", "no pruner", "ratio+one_to_one threshold=0.9",
     ]  # fmt: skip
-    old = {name: value for entry in alone for name, value in entry.items()}  # as earlier versions stored it
-    assert names(config(pruner=old), config(pruner=forward)) == ["ratio", "ratio+one_to_one"]
 
 
 def test_parts_of_ones_own_go_by_their_class() -> None:

@@ -8,11 +8,13 @@ import os
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from fmtorch.core.types import pair_key
 from fmtorch.storage import PAIR_SCHEMA, PairRow, RunFolder, RunFolderError, identity_digest, replacing, to_table
+from fmtorch.storage.parts import content_digest
 
 CONFIG = {
     "pipeline": {"name": "sift_ratio", "estimator": {"threshold": 0.5, "samples": 2000}, "stages": ["a", "b"]},
@@ -135,44 +137,18 @@ def test_a_broken_run_json_is_named(tmp_path: Path, content: str) -> None:
         RunFolder.open(tmp_path, CONFIG)
 
 
-def test_a_folder_of_the_first_format_is_read_but_not_continued(tmp_path: Path) -> None:
+def test_a_part_of_other_columns_is_named(tmp_path: Path) -> None:
     run = RunFolder.open(tmp_path, CONFIG)
     run.append([row("a")])
-    stored = json.loads((tmp_path / "run.json").read_text())
-    (tmp_path / "run.json").write_text(json.dumps({**stored, "format": 1}))
-    assert RunFolder.load(tmp_path).read().num_rows == 1
-    with pytest.raises(RunFolderError, match=r"format 1.*order of the pruners.*Choose another run_dir"):
-        RunFolder.open(tmp_path, CONFIG)
-
-
-POSES = ["rotation_error", "translation_error", "pose_reason"]
-KINDS = ["configuration", "warning", "focal_error0", "focal_error1", "focal_log_ratio0", "focal_log_ratio1"]
-PLANES = ["H", "corner_error"]
-
-
-@pytest.mark.parametrize(("version", "lacks", "missing"), [
-    (2, [*POSES, *KINDS, *PLANES], "the errors of poses and configurations"), (3, [*KINDS, *PLANES], "configurations"),
-    (4, PLANES, "homographies"),
-])  # fmt: skip
-def test_a_folder_of_fewer_columns_is_read_but_not_continued(
-    version: int, lacks: list[str], missing: str, tmp_path: Path
-) -> None:
-    run = RunFolder.open(tmp_path, CONFIG)
-    run.append([row("a")])
-    part = next((tmp_path / "pairs").iterdir())
-    old = pq.read_table(part).drop_columns(lacks)
-    pq.write_table(old, part.with_name("part-0.parquet"))
+    (part,) = (tmp_path / "pairs").iterdir()
+    sink = pa.BufferOutputStream()
+    pq.write_table(pq.read_table(part).drop_columns(["H", "corner_error"]), sink)
+    data = sink.getvalue().to_pybytes()
+    other = part.with_name(f"part-0-0-{content_digest(data)}.parquet")
+    other.write_bytes(data)
     part.unlink()
-    with pytest.raises(RunFolderError, match="columns are not those"):
+    with pytest.raises(RunFolderError, match=rf"{other.name} cannot be read \(its columns are not those"):
         run.read()
-    stored = json.loads((tmp_path / "run.json").read_text())
-    (tmp_path / "run.json").write_text(json.dumps({**stored, "format": version}))
-    table = RunFolder.load(tmp_path).read()
-    assert table.schema == PAIR_SCHEMA
-    assert [table[name].to_pylist() for name in lacks] == [[None]] * len(lacks)
-    assert RunFolder.load(tmp_path).done() == {pair_key("a")}
-    with pytest.raises(RunFolderError, match=rf"format {version}, which lacks {missing};.*Choose another run_dir"):
-        RunFolder.open(tmp_path, CONFIG)
 
 
 def test_the_order_of_a_list_of_names_is_part_of_the_identity(tmp_path: Path) -> None:

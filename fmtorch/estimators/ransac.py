@@ -1,0 +1,227 @@
+"""Hypothesise and verify: four verbs whose parts make RANSAC, MSAC, LMedS and their descendants.
+
+**search**: rounds of minimal samples, scores, the best models; **refine** these; **select** one; **fit** it. The engine
+is control flow on one pair: `registry` names the parts, which hold the arithmetic, `options` describes those of each
+verb; `batch` leads from tensors to pairs and back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from fmtorch.compiling.arrays import Array
+from fmtorch.compiling.kernel import Kernel
+from fmtorch.compiling.together import compile_together
+from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.estimators.batch import NOT_SOLVED, Solution, estimated, with_sqrt_prior
+from fmtorch.estimators.families.family import Refining
+from fmtorch.estimators.families.focals import FundamentalWithFocals
+from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
+from fmtorch.estimators.gradients import Attached
+from fmtorch.estimators.options import Focal, Preselect, Refine, Select, at_least_one, group
+from fmtorch.estimators.pair import Pair
+from fmtorch.estimators.parts.degensac import Degensac
+from fmtorch.estimators.parts.final_fits import FinalFit, Fit
+from fmtorch.estimators.parts.inliers import InlierRule, StoppingRule, residuals_squared_px
+from fmtorch.estimators.parts.preselection import Preselection
+from fmtorch.estimators.parts.refinement import LocalOptimization, Refinement
+from fmtorch.estimators.parts.sampling import Sampler
+from fmtorch.estimators.parts.scores import Score
+from fmtorch.estimators.parts.selection import BestOfSearch, BestScore, Selection, Selector
+from fmtorch.estimators.precompiled import OF_HOMOGRAPHIES, WITH_FOCALS
+from fmtorch.estimators.registry import part, thresholds
+from fmtorch.estimators.search import Search
+
+FOCAL_ROUND = 500  # samples of five matches at a time
+CALIBRATED_MATCHES = 6  # that a pair of calibrated cameras needs: five of them have up to ten solutions
+DEFAULT_PRESELECT = Preselect()
+
+
+class Ransac:
+    """A robust estimator of fundamental matrices, batched over pairs.
+
+    Parts are named as in `registry`; the options of a stage are those of the class of that name in `options`.
+
+    Args:
+        solver: minimal solver, `seven_point` or `eight_point`, and with it the family of models; `four_point` for
+            homographies.
+        sampler: draws the matches of a sample, `uniform`, `prosac` or `prior`.
+        score: by which models are compared.
+        threshold: Sampson distance in pixels up to which a match supports a model; None: 1.
+        hypotheses: minimal samples drawn at most.
+        round: samples between two looks at the stopping rule.
+        confidence: stop once an all-inlier sample was drawn with this probability; None: never before `hypotheses`.
+        preselect: `Preselect`, the models of a round compared on few matches first; None: all are scored on all.
+        degeneracy: `degensac` completes a best model whose sample lies on a plane by plane and parallax; None.
+        pool: the best models that are kept to the end.
+        local_optimization: of the pool, `graph_cut`; None.
+        refine: `Refine`, Levenberg-Marquardt from each model of the pool; None.
+        select: `Select`, by which score the estimate is selected from the refined pool; None: the search's own.
+        focal: `Focal`, the prior on focal lengths, where the image sizes are known: for whole photographs, not crops.
+            Models of five matches and drawn focal lengths are searched first, in rounds, until all good candidates are
+            one model or enough rounds confirm the best one, and the stopping rule is content. They suffice for a pair
+            whose images have one size, if that rule is content; other pairs are searched without assumptions, too, and
+            both kinds compared. Where a focal length is known, they suffice. Needs `select`.
+        inliers: `threshold`, `lmeds` (2.5 robust standard deviations) or `median` (the better half).
+        inlier_threshold: of the inliers reported and of the stopping rule, Sampson distance in pixels; None: the
+            threshold.
+        final: `least_squares` (8-point on the inliers, weighted by prior and noise where there is a prior),
+            `unweighted_least_squares` (all inliers alike), `gauss_newton` (one step), `adaptive` (refined at the pair's
+            own noise, with the prior on focal lengths unless the matches contradict it) or `none`.
+        refit_inliers: recompute the inliers after the final fit.
+
+    Raises:
+        ValueError: for an unknown part or option, and for one that would have no effect, such as a threshold where
+            neither score nor inliers have one.
+
+    Memory: for each thread some 300 bytes a match of one pair, and 1 MB of models.
+    """
+
+    def __init__(
+        self,
+        *,
+        solver: str | Mapping[str, Any] | Refining = "seven_point",
+        sampler: str | Mapping[str, Any] | Sampler = "uniform",
+        score: str | Mapping[str, Any] | Score = "msac",
+        threshold: float | None = None,
+        hypotheses: int = 2000,
+        round: int = 500,
+        confidence: float | None = 0.9999,
+        preselect: Preselect | Mapping[str, Any] | None = DEFAULT_PRESELECT,
+        degeneracy: str | Mapping[str, Any] | None = None,
+        pool: int = 1,
+        local_optimization: str | Mapping[str, Any] | LocalOptimization | None = None,
+        refine: Refine | Mapping[str, Any] | None = None,
+        select: Select | Mapping[str, Any] | None = None,
+        focal: Focal | Mapping[str, Any] | None = None,
+        inliers: str | Mapping[str, Any] | InlierRule = "threshold",
+        inlier_threshold: float | None = None,
+        final: str | Mapping[str, Any] | FinalFit = "least_squares",
+        refit_inliers: bool = True,
+    ) -> None:
+        at_least_one(hypotheses=hypotheses, round=round, pool=pool)
+        if confidence is not None and not 0 < confidence < 1:
+            raise ValueError(f"confidence is {confidence}; it is a probability between 0 and 1, or null")
+        stops = confidence is not None
+        threshold, inlier_px = thresholds(threshold, inlier_threshold, score, inliers, stops, local_optimization)
+        self.family: Refining = part("solver", solver)
+        self.sampler: Sampler = part("sampler", sampler)
+        self.score: Score = part("score", score, threshold=threshold)
+        self.inlier_rule: InlierRule = part("inliers", inliers, threshold=inlier_px)
+        self.final: FinalFit = part("final", final)
+        self.refit_inliers = refit_inliers
+        stop = None if confidence is None else StoppingRule(confidence, inlier_px, self.sampler)
+        preselection = Preselection(self.score, group("preselect", preselect, Preselect))
+        check = part("degeneracy", degeneracy, score=self.score)
+        if check is not None and self.family.size != Degensac.SAMPLE:
+            raise ValueError(f"degeneracy={degeneracy} needs solver=seven_point; solver is {solver!r}")
+        self._expect_fundamental(degeneracy=check, local_optimization=local_optimization, focal=focal)
+        self.search = Search(self.family, self.sampler, preselection, pool, hypotheses, round, stop, check)
+        optimization = part("local_optimization", local_optimization, threshold=threshold, score=self.score)
+        refinement = Refinement(group("refine", refine, Refine), optimization)
+        choice = group("select", select, Select)
+        self.refine = refinement
+        self.select = _selector(self.score, choice, threshold, refinement)
+        self.focal = _focal_search(group("focal", focal, Focal), self.select, self.search, refinement, choice)
+
+    def _expect_fundamental(self, **options: object) -> None:
+        """Raise ValueError for an option that is there and serves fundamental matrices alone."""
+        wrong = [name for name, value in options.items() if value is not None]
+        if wrong and self.family.model != "fundamental":
+            raise ValueError(f"{wrong[0]} is for fundamental matrices; the solver gives {self.family.model} matrices")
+
+    @property
+    def model(self) -> str:
+        """What its matrices are, `Estimate.model`."""
+        return self.family.model
+
+    @property
+    def kernels(self) -> tuple[Kernel[..., Any], ...]:
+        """Those worth compiling together, before the first pair."""
+        if self.focal is not None:
+            return WITH_FOCALS
+        return OF_HOMOGRAPHIES if self.family.model == "homography" else ()
+
+    @property
+    def gradients_reach(self) -> tuple[str, ...]:
+        """The fields of `Correspondences` that gradients of the estimate reach."""
+        return Attached(self.final, self.family).reached
+
+    @property
+    def uses_prior(self) -> bool:
+        """Whether a prior makes a difference to the search."""
+        return getattr(self.sampler, "uses_prior", False) or getattr(self.score, "prior_weighted", False)
+
+    def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
+        """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
+        compile_together(self.kernels)
+        exact = None if self.focal is None else self.focal.options.exact_focals
+        if exact is not None and exact.sqrt_prior:
+            c = with_sqrt_prior(c)
+        size, attached = self.family.size, Attached(self.final, self.family)
+        calibrated = None if self.focal is None else CALIBRATED_MATCHES
+        return estimated(c, seed, size, self.family, self.estimate, attached, calibrated)
+
+    def estimate(self, pair: Pair) -> Solution:
+        """Search to fit of one pair."""
+        selection, draws = self.selected(pair)
+        if not selection.valid:
+            return Solution(None, draws, reason=NOT_SOLVED)
+        inliers = self.inliers(selection.F, pair)
+        fit: Fit = self.final(selection, pair, inliers, self.family)
+        return Solution(fit, draws, self.inliers(fit.F, pair) if self.refit_inliers else inliers)
+
+    def selected(self, pair: Pair) -> tuple[Selection, int]:
+        """The selected model, and the samples drawn: among plausible cameras first where the image sizes are known."""
+        if self.focal is None or not pair.sizes_known:
+            pool = self.search(pair)
+            return self.select(self.refine(pool, pair, self.family), pair), pool.draws
+        plausible: PlausibleCandidates | None = None
+        draws = 0
+        if self.focal.search is not None:
+            candidates, settled, draws = self.focal(pair)
+            if settled:
+                return candidates.selection, draws
+            plausible = candidates.best_alone()
+        pool = self.search(pair)
+        selection = self.focal.select(self.refine(pool, pair, self.family), pair, plausible)
+        valid = selection.valid or (plausible is not None and plausible.valid)
+        return selection._replace(valid=valid), draws + pool.draws
+
+    def inliers(self, F: Array, pair: Pair) -> Array:
+        """The inliers (n,) of a model (9,)."""
+        inliers = self.inlier_rule(residuals_squared_px(F, pair), pair)
+        if not isinstance(inliers, np.ndarray) or inliers.shape != (pair.count,) or inliers.dtype != bool:
+            what = f"{inliers.dtype} {inliers.shape}" if isinstance(inliers, np.ndarray) else type(inliers).__name__
+            raise ValueError(
+                f"{type(self.inlier_rule).__name__} returns {what}; it must be an array of bool ({pair.count},): "
+                "whether each match is an inlier"
+            )
+        return inliers
+
+
+def _selector(score: Score, choice: Select | None, threshold: float, refinement: Refinement) -> Selector:
+    """What selects one model of the refined pool."""
+    if choice is not None:
+        return BestScore(part("score", choice.score, threshold=choice.scale))
+    changed = refinement.options is not None or refinement.local_optimization is not None
+    return BestScore(score) if changed else BestOfSearch()
+
+
+def _focal_search(
+    options: Focal | None, select: Selector, search: Search, refinement: Refinement, choice: Select | None
+) -> FocalSearch | None:
+    """The search among plausible cameras."""
+    if options is None:
+        return None
+    if choice is None or not isinstance(select, BestScore):
+        raise ValueError("focal needs select: the score by which models with the prior are compared")
+    family, own = FundamentalWithFocals(), None
+    if options.samples:
+        own = Search(family, search.sampler, search.preselection, options.pool, options.samples, FOCAL_ROUND)
+    exact = options.exact_focals
+    exact_gain = None if exact is None else part("score", choice.score, threshold=exact.scale)
+    return FocalSearch(options, family, select.score, refinement, own, search.stop, exact_gain)

@@ -1,0 +1,129 @@
+"""One estimator call as the public functions make it: preset, prior, cameras, verdict."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from fmtorch.compiling import switch
+from fmtorch.compiling.together import compile_together
+from fmtorch.core.arguments import number
+from fmtorch.core.checks import expect_values
+from fmtorch.core.stages import Estimator, Pruner, model_of
+from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.estimators.ransac import Ransac
+from fmtorch.geometry.verdict import judged
+from fmtorch.jobs.threads import one_thread
+from fmtorch.presets.files import load
+from fmtorch.presets.objects import construct, instantiate, merged
+from fmtorch.pruning.frame_consistency import FrameConsistency
+from fmtorch.pruning.position_consistency import PositionConsistency
+from fmtorch.two_view.arguments import expect_pixels
+from fmtorch.two_view.known_cameras import KnownCameras
+
+RANSAC = f"fmtorch.estimators.{Ransac.__name__}"  # the `_target_` of presets of this project's own engine
+
+
+def estimated(
+    c: Correspondences, model: str, name: str, config_dir: Path | str | None, seed: int, options: Mapping[str, Any],
+    covariance: bool = False, in_pixels: bool = True,
+) -> Estimate:  # fmt: skip
+    """The estimate of matches by a preset, with a prior of their consistency where it uses one and none is given.
+
+    model: what the preset must estimate. What is known of cameras counts where `focal` or `shared_focal` is given; then
+    the estimate may have a covariance. in_pixels: refuse points that obviously are not.
+    """
+    expect_values(c)
+    seed = int(number("seed", seed, integer=True))
+    estimator = estimator_of(name, config_dir, options)
+    _expect_gradients(c, estimator, name)
+    if (gives := model_of(estimator)) != model:
+        option = f" (here by model={model})" if "model" in load("estimator", name, config_dir) else ""
+        needed = f"find_{model} needs one that gives {model} matrices{option}"
+        raise ValueError(f"estimator={name} gives {gives} matrices; {needed}")
+    if in_pixels:
+        expect_pixels(c)
+    return estimated_by(estimator, c, seed, covariance)
+
+
+def estimated_by(estimator: Estimator, c: Correspondences, seed: int, covariance: bool = False) -> Estimate:
+    """The same of an estimator that is built, and of values that are known to be right."""
+    if not c.asks_for_cameras:
+        c = _with_prior(c, estimator)
+        return judged(estimator(c, seed), c)
+    return KnownCameras(estimator, functools.partial(_with_prior, estimator=estimator), covariance)(c, seed)
+
+
+def _expect_gradients(c: Correspondences, estimator: Estimator, name: str) -> None:
+    """Raise ValueError naming a field that requires a gradient which the estimator does not give."""
+    reached = getattr(estimator, "gradients_reach", None)
+    if reached is None or not (torch.is_grad_enabled() and c.requires_grad):
+        return
+    for field in ("x0", "x1", "prior", "noise"):
+        value = getattr(c, field)
+        if value is not None and value.requires_grad and field not in reached:
+            raise ValueError(
+                f"{field} requires a gradient, and the final fit of estimator={name} passes none to it: "
+                f"give {field}.detach(), or take another (estimator=fmtorch, or the option final=gauss_newton)"
+            )
+
+
+def _with_prior(c: Correspondences, estimator: Estimator) -> Correspondences:
+    """The matches with a prior of their consistency where the estimator uses one and none is given."""
+    if c.prior is None and getattr(estimator, "uses_prior", False):
+        framed = c.lafs0 is not None and c.lafs1 is not None and c.quality is not None
+        pruner = _consistency(framed)
+        if switch.available():
+            compile_together([*getattr(pruner, "kernels", ()), *getattr(estimator, "kernels", ())])
+        with one_thread(c.mask.device):
+            return pruner(c)
+    return c
+
+
+def estimator_of(name: str, config_dir: Path | str | None, options: Mapping[str, Any]) -> Estimator:
+    """The estimator of a preset, built but once where its options are plain values and its file is not a user's."""
+    plain = _plain(options)
+    if config_dir is None:
+        try:
+            return _kept(name, json.dumps(plain, sort_keys=True))
+        except TypeError:  # an option is an object of some kind
+            pass
+    return _built(name, config_dir, plain)
+
+
+@functools.lru_cache(maxsize=64)
+def _kept(name: str, options: str) -> Estimator:
+    return _built(name, None, json.loads(options))
+
+
+def _built(name: str, config_dir: Path | str | None, options: Mapping[str, Any]) -> Estimator:
+    config, where = merged(load("estimator", name, config_dir), options), f"estimator={name}"
+    if config.get("_target_") == RANSAC:
+        return construct(Ransac, config, where)
+    built: Estimator = instantiate(config, where)
+    return built
+
+
+def _plain(value: Any) -> Any:
+    """The value with numbers of NumPy as Python's, at any depth."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    return value
+
+
+@functools.cache
+def _consistency(framed: bool) -> Pruner:
+    """The prior of matches with frames and ratios, or of points alone, with the constants of its preset."""
+    if framed:
+        return construct(FrameConsistency, load("pruner", "frame_consistency"), "pruner=frame_consistency")
+    return construct(PositionConsistency, load("pruner", "position_consistency"), "pruner=position_consistency")

@@ -1,0 +1,228 @@
+"""The two-line replacements for `cv2.findFundamentalMat`, `cv2.findEssentialMat` and `cv2.findHomography`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from fmtorch.core.arguments import Arrays, correspondences
+from fmtorch.core.types import Estimate
+from fmtorch.two_view.arguments import Focal, camera_fields, expect_calibrations
+from fmtorch.two_view.estimation import estimated
+from fmtorch.two_view.pair_type import with_configuration
+
+
+def find_fundamental(
+    x0: Arrays,
+    x1: Arrays,
+    *,
+    estimator: str = "fmtorch",
+    mask: Arrays | None = None,
+    quality: Arrays | None = None,
+    prior: Arrays | None = None,
+    lafs0: Arrays | None = None,
+    lafs1: Arrays | None = None,
+    noise: Arrays | None = None,
+    size0: Arrays | None = None,
+    size1: Arrays | None = None,
+    K0: Arrays | None = None,
+    K1: Arrays | None = None,
+    focal: Focal = None,
+    covariance: bool = False,
+    configuration: bool = False,
+    key: Arrays | int | None = None,
+    seed: int = 0,
+    config_dir: Path | str | None = None,
+    **options: Any,
+) -> Estimate:
+    """Robustly estimate fundamental matrices from matched points, ``x1^T F x0 = 0``.
+
+    Args:
+        x0, x1: matched points in pixels, NumPy or torch, on any device: (N, 2) for one pair, (B, N, 2) for a padded
+            batch, or a list of (N, 2) for pairs of different lengths. Gradients reach them through the final fit.
+        estimator: a preset of conf/estimator.
+        mask: (B, N), True for real matches; all when not given. Like all that is told of matches it may come without
+            the leading B for one pair, and comes as a list where the points do.
+        quality: (B, N), the matcher's figure, smaller is better (a distance ratio).
+        prior: (B, N), P(inlier) in [0, 1]. Where an estimator uses a prior and none is given, it is derived from the
+            frames and the quality, if both are given, otherwise from the points and, if given, the quality.
+        lafs0, lafs1: (B, N, 2, 3) local affine frames.
+        noise: (B, N), each match's standard deviation relative to a usual one's (`fmtorch.pruning.MatchNoise` derives
+            it from frames).
+        size0, size1: image sizes (h, w), one for all pairs or (B, 2).
+        K0, K1: calibration matrices, px, (3, 3) for all pairs or (B, 3, 3), of both images or of one. Gradients reach
+            them.
+        focal: what else is known of the focal lengths, for square pixels and a central principal point where there is
+            no K, and with `size0` and `size1` there:
+
+            ================================  ======================================================================
+            None                              K0 and K1 are exact; without them usual focal lengths are likely
+            "unknown"                         the same estimate, with its cameras and pose
+            "shared"                          one unknown focal length for both images (in units of the longer side)
+            (f, s)                            f px for both images, up to a relative standard deviation s
+            ((f0, s0), (f1, s1))              the same for each image, None in place of what is unknown; (B, 2, 2)
+            s, (s0, s1) or (B, 2), with K     how well the focal lengths of K0 and K1 are known; with "unknown" and
+                                              "shared" K tells principal points and the shape of pixels alone
+            ================================  ======================================================================
+
+            A deviation of 0 is exact and an infinite one nothing; 0.05 suits EXIF. From 0.02 on measurements may be
+            wrong altogether. A mapping says nothing of cameras: it holds options of the preset's stage of that name.
+        covariance: whether the estimate has its covariance, which needs K0 and K1 or the image sizes. Where nothing is
+            said of the cameras these are as of ``focal="unknown"``.
+        configuration: whether it has the configuration of each pair: general, planar, rotation, identical, unrelated.
+        key: (B,) int64, selects each pair's random numbers.
+        seed: of the random numbers.
+        config_dir: a folder with presets of your own, ``<config_dir>/estimator/<name>.yaml``, which come first.
+        options: replace values of the preset (``threshold=0.5``).
+
+    Returns:
+        An `Estimate` of B pairs (of one pair for (N, 2) points, of none for an empty list), with F of unit Frobenius
+        norm, inliers, ok, reason, significance. A pair that cannot be solved is ``ok=False``, never an exception. An F
+        that is ok may be of images that show nothing in common: `related` tells. With K0, K1 or `focal` also focals,
+        E, R and t, NaN where they are not determined; `deviation_degrees` says how far these may be off and `warning`
+        what the configuration leaves open.
+
+    Raises:
+        ValueError: for points of another shape, points that are no pixels or outside images of these sizes, a prior
+            outside [0, 1], a noise or an image size that is not positive, the size of one image only, an unknown preset
+            or option, and an estimator of another model; for a K that is no calibration matrix of the image, of a
+            single pair (of a batch that pair is ``ok=False``).
+        TypeError: for what is no array of numbers.
+
+    Example:
+        >>> import torch, fmtorch
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> X = torch.rand(80, 3, generator=generator, dtype=torch.float64) + torch.tensor([0.0, 0.0, 2.0])
+        >>> x0, x1 = (500 * Y[:, :2] / Y[:, 2:] for Y in (X, X + torch.tensor([-0.5, 0.0, 0.2])))
+        >>> x1[:20] = x1[:20].flip(0)                            # twenty wrong matches
+        >>> estimate = fmtorch.find_fundamental(x0, x1)
+        >>> bool(estimate.ok[0]), int(estimate.inliers[0, 20:].sum())
+        (True, 60)
+    """
+    if covariance and K0 is None and K1 is None and focal is None:
+        focal = "unknown"
+    c = correspondences(
+        x0, x1, mask=mask, quality=quality, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, size0=size0,
+        size1=size1, key=key, **camera_fields(K0, K1, focal, size0 is not None),
+    )  # fmt: skip
+    expect_calibrations(c)
+    if isinstance(focal, Mapping):
+        options["focal"] = focal
+    estimate = estimated(c, "fundamental", estimator, config_dir, seed, options, covariance)
+    return with_configuration(estimate, c, seed) if configuration else estimate
+
+
+def find_essential(
+    x0: Arrays,
+    x1: Arrays,
+    K0: Arrays,
+    K1: Arrays,
+    *,
+    focal: Focal = None,
+    estimator: str = "fmtorch",
+    mask: Arrays | None = None,
+    quality: Arrays | None = None,
+    prior: Arrays | None = None,
+    lafs0: Arrays | None = None,
+    lafs1: Arrays | None = None,
+    noise: Arrays | None = None,
+    size0: Arrays | None = None,
+    size1: Arrays | None = None,
+    covariance: bool = False,
+    configuration: bool = False,
+    key: Arrays | int | None = None,
+    seed: int = 0,
+    config_dir: Path | str | None = None,
+    **options: Any,
+) -> Estimate:
+    """Robustly estimate the relative pose of two calibrated cameras: ``X1 = R X0 + t`` and ``E = [t]_x R``.
+
+    Args:
+        x0, x1: matched points in pixels, as of `find_fundamental`; or normalised ones, with K the identity, of which
+            thresholds count as pixels of a camera with a focal length of 1000 px.
+        K0, K1: calibration matrices in the unit of the points, (3, 3) for all pairs or (B, 3, 3). Pixels need not be
+            square nor principal points central; lenses must not distort.
+        focal: how well the focal lengths of K0 and K1 are known: None for exactly, or their relative standard
+            deviation, one number, (s0, s1) or (B, 2); 0.05 suits EXIF; "shared" or "unknown" where K tells principal
+            points and the shape of pixels alone. What is not exact is estimated.
+        size0, size1: image sizes (h, w), one for all pairs or (B, 2). Twice the principal point when not given.
+        estimator, mask, quality, prior, lafs0, lafs1, noise, covariance, configuration, key, seed, config_dir: as of
+            `find_fundamental`.
+        options: replace values of the preset (``inlier_threshold=1.0``).
+
+    Returns:
+        An `Estimate` with R (B, 3, 3), t (B, 3) of unit length with the inliers in front of both cameras, E (B, 3, 3),
+        focals (B, 2) and F. NaN where there is no pose. Gradients of all reach the points, prior, noise, K0 and K1.
+        Six matches are enough where K0 and K1 are exact, otherwise seven.
+
+    Raises:
+        ValueError: as `find_fundamental`; for a K0 or K1 of a single pair that is singular, not in pixels, or whose
+            principal point lies outside an image of known size. In a batch that pair is ``ok=False`` with a reason.
+        TypeError: for what is no array of numbers.
+
+    Example:
+        >>> import torch, fmtorch
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> X = torch.rand(80, 3, generator=generator, dtype=torch.float64) + torch.tensor([0.0, 0.0, 2.0])
+        >>> K = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=torch.float64)
+        >>> x0, x1 = (Y @ K.T for Y in (X, X + torch.tensor([-0.64, 0.48, 0.6])))
+        >>> x0, x1 = x0[:, :2] / x0[:, 2:], x1[:, :2] / x1[:, 2:]
+        >>> x1[:20] = x1[:20].flip(0)                            # twenty wrong matches
+        >>> estimate = fmtorch.find_essential(x0, x1, K, K)
+        >>> bool(estimate.ok[0]), [round(value, 3) for value in estimate.t[0].tolist()]
+        (True, [-0.64, 0.48, 0.6])
+    """
+    for name, K in (("K0", K0), ("K1", K1)):
+        if K is None:
+            raise ValueError(f"{name} is None; find_fundamental estimates pairs of which one camera or none is known")
+    return find_fundamental(
+        x0, x1, estimator=estimator, mask=mask, quality=quality, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise,
+        size0=size0, size1=size1, K0=K0, K1=K1, focal=focal, covariance=covariance, configuration=configuration,
+        key=key, seed=seed, config_dir=config_dir, **options,
+    )  # fmt: skip
+
+
+def find_homography(
+    x0: Arrays,
+    x1: Arrays,
+    *,
+    estimator: str = "homography",
+    mask: Arrays | None = None,
+    quality: Arrays | None = None,
+    prior: Arrays | None = None,
+    lafs0: Arrays | None = None,
+    lafs1: Arrays | None = None,
+    noise: Arrays | None = None,
+    key: Arrays | int | None = None,
+    seed: int = 0,
+    config_dir: Path | str | None = None,
+    **options: Any,
+) -> Estimate:
+    """Robustly estimate homographies from matched points, ``x1 ~ H x0``: of a plane, or of a camera that turns.
+
+    Args:
+        x0, x1: matched points in pixels, as of `find_fundamental`. Gradients reach them through the final fit.
+        estimator: a preset of conf/estimator whose solver is `four_point`.
+        mask, quality, prior, lafs0, lafs1, noise, key, seed, config_dir: as of `find_fundamental`.
+        options: replace values of the preset (``inlier_threshold=1.5``).
+
+    Returns:
+        An `Estimate` whose `H` (B, 3, 3) has unit Frobenius norm and maps points that are seen to positive third
+        coordinates; inliers, ok, reason. Its significance is NaN where `ok`: that is a test of fundamental matrices.
+
+    Raises:
+        ValueError, TypeError: as `find_fundamental`.
+
+    Example:
+        >>> import torch, fmtorch
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> x0 = 600 * torch.rand(60, 2, generator=generator, dtype=torch.float64)
+        >>> x1 = x0 @ torch.tensor([[0.9, 0.1], [-0.1, 0.9]], dtype=torch.float64) + 20
+        >>> x1[:20] = x1[:20].flip(0)                            # twenty wrong matches
+        >>> estimate = fmtorch.find_homography(x0, x1)
+        >>> bool(estimate.ok[0]), int(estimate.inliers[0, 20:].sum()), tuple(estimate.H.shape)
+        (True, 40, (1, 3, 3))
+    """
+    c = correspondences(x0, x1, mask=mask, quality=quality, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, key=key)
+    return estimated(c, "homography", estimator, config_dir, seed, options)

@@ -1,0 +1,210 @@
+"""Tasks of workers that share what they need or make it, and of which some die."""
+
+from __future__ import annotations
+
+import functools
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fmtorch.jobs import runner
+from fmtorch.jobs.execution import Execution
+from fmtorch.jobs.pool import WorkerPool, WorkersLost
+from fmtorch.jobs.runner import DEATH, MAX_DEATHS, Factory, Local, TaskRunner, in_order
+
+PROCESSES = Execution("processes", 2)
+
+
+def make_needs(folder: Path, size: int = 0) -> tuple[Path, bytes]:
+    """What workers need; each process that makes it leaves a file."""
+    (folder / f"made-{os.getpid()}-{time.monotonic_ns()}").touch()
+    return folder, bytes(size)
+
+
+def squares(needed: tuple[Path, bytes], numbers: list[int]) -> list[int]:
+    """The squares; a negative number ends the process, after it has left a file."""
+    folder = needed[0]
+    for number in numbers:
+        if number < 0:
+            (folder / f"died-{time.monotonic_ns()}").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+    return [number * number for number in numbers]
+
+
+def ends(folder: Path) -> Any:
+    """A factory that ends the process."""
+    os._exit(3)
+
+
+def parts(numbers: list[int]) -> list[list[int]]:
+    return [[number] for number in numbers]
+
+
+def calls(
+    make: Callable[[], Any], execution: Execution, jobs: list[list[int]], **options: Any
+) -> tuple[dict[int, int], dict[int, str], list[list[int]]]:
+    """The results by number, why some have none, and the jobs that were yielded."""
+    results, reasons = dict[int, int](), dict[int, str]()
+
+    def keep(job: list[int], result: list[int]) -> None:
+        results.update(zip(job, result, strict=True))
+
+    def give_up(job: list[int], reason: str) -> None:
+        reasons.update(dict.fromkeys(job, reason))
+
+    source: Any = Local(make()) if execution.shared else Factory(make)
+    options = {"give_up": give_up, "split": parts, **options}
+    with WorkerPool(execution) as pool:
+        yielded = list(TaskRunner(pool, source, squares, keep, **options).each(jobs))
+    return results, reasons, yielded
+
+
+@pytest.mark.parametrize("kind", ["threads", "processes"])
+def test_results_of_each_job(kind: str, tmp_path: Path) -> None:
+    jobs = [[i, i + 100] for i in range(20)]
+    results, reasons, yielded = calls(functools.partial(make_needs, tmp_path), Execution(kind, 2), jobs)
+    assert results == {i: i * i for job in jobs for i in job}
+    assert reasons == {}
+    assert sorted(yielded) == jobs
+    assert len(list(tmp_path.glob("made-*"))) <= (1 if kind == "threads" else 2)  # once in each process
+
+
+def test_a_long_factory_is_sent_to_workers_that_have_it_not(tmp_path: Path) -> None:
+    size = 20 * runner.SENT_ALONG
+    results, _, _ = calls(functools.partial(make_needs, tmp_path, size), PROCESSES, [[i] for i in range(30)])
+    assert results == {i: i * i for i in range(30)}
+    assert len(list(tmp_path.glob("made-*"))) <= 2
+
+
+def test_what_ends_its_workers_is_known_and_others_are_done(tmp_path: Path) -> None:
+    jobs = [[1, 2], [3, -4, 5], [6, 7], [8], [-9], [10]]
+    results, reasons, yielded = calls(functools.partial(make_needs, tmp_path), PROCESSES, jobs)
+    assert results == {i: i * i for i in (1, 2, 3, 5, 6, 7, 8, 10)}
+    assert reasons == {-4: DEATH, -9: DEATH}
+    assert sorted(i for job in yielded for i in job) == sorted(i for job in jobs for i in job)
+    assert len(list(tmp_path.glob("died-*"))) <= 2 * (MAX_DEATHS + 2)  # bounded: with its neighbours, its batch, alone
+
+
+def test_a_lone_job_that_ends_its_workers(tmp_path: Path) -> None:
+    assert calls(functools.partial(make_needs, tmp_path), PROCESSES, [[-1]])[:2] == ({}, {-1: DEATH})
+
+
+def test_workers_that_cannot_begin_are_no_pairs_fault(tmp_path: Path) -> None:
+    with pytest.raises(WorkersLost, match="the same command goes on"):
+        calls(functools.partial(ends, tmp_path), PROCESSES, [[1], [2], [3]])
+
+
+def test_without_a_reason_to_give_workers_that_die_are_an_error(tmp_path: Path) -> None:
+    with pytest.raises(WorkersLost, match="fewer workers"):
+        calls(functools.partial(make_needs, tmp_path), PROCESSES, [[1], [-2]], give_up=None)
+
+
+def fails(needed: object, job: int) -> int:
+    raise ValueError(f"job {job} is wrong")
+
+
+@pytest.mark.parametrize("kind", ["threads", "processes"])
+def test_what_a_call_raises_is_raised_here(kind: str, tmp_path: Path) -> None:
+    execution = Execution(kind, 2)
+    source: Any = Local(None) if execution.shared else Factory(functools.partial(make_needs, tmp_path))
+    with WorkerPool(execution) as pool, pytest.raises(ValueError, match=r"job \d is wrong"):
+        list(TaskRunner(pool, source, fails, lambda job, result: None).each([1, 2, 3]))
+
+
+def slow(event: threading.Event, job: int) -> int:
+    if job:
+        event.wait(60)
+    return job
+
+
+def test_interrupted_what_is_under_way_is_kept() -> None:
+    event, kept = threading.Event(), list[int]()
+    with WorkerPool(Execution("threads", 2)) as pool:
+        run = TaskRunner(pool, Local(event), slow, lambda job, result: kept.append(job)).each(range(100))
+        next(run)
+        threading.Timer(0.2, event.set).start()
+        run.close()
+    assert kept[0] == 0
+    assert 1 in kept
+    assert len(kept) < 10
+
+
+def late(value: None, job: int) -> int:
+    time.sleep(0.05 if job % 3 == 0 else 0)
+    return -job
+
+
+@pytest.mark.parametrize("kind", ["threads", "processes"])
+def test_results_in_the_order_of_the_jobs(kind: str) -> None:
+    with WorkerPool(Execution(kind, 2)) as pool:
+        assert list(in_order(pool, Local(None), late, range(20))) == [(i, -i) for i in range(20)]
+
+
+def test_a_job_that_needs_the_result_of_another_waits_for_it() -> None:
+    """Each number is ready when the one before it has ended; all at once are asked for."""
+    done: list[int] = []
+
+    def jobs() -> Iterator[int | None]:
+        for number in range(6):
+            while len(done) < number:
+                yield None
+            yield number
+
+    with WorkerPool(Execution("threads", 3)) as pool:
+        list(TaskRunner[int](pool, Local(None), late, lambda job, result: done.append(job)).each(jobs()))
+    assert done == list(range(6))
+
+
+SCRIPT = """
+from fmtorch.jobs.execution import Execution
+from fmtorch.jobs.pool import WorkerPool
+with WorkerPool(Execution("processes", 2), needs_main=False) as pool:
+    print(sorted(pool.executor.map(abs, range(-4, 0))))
+"""
+
+
+def test_a_script_without_a_guard_starts_processes_that_do_not_need_it(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=120)
+    assert (done.stdout, done.returncode) == ("[1, 2, 3, 4]\n", 0), done.stderr
+
+
+def test_another_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    factory = Factory(functools.partial(make_needs, tmp_path))
+    monkeypatch.setattr(runner, "__version__", "9.9")
+    with pytest.raises(ValueError, match=r"a worker has fmtorch 9\.9"):
+        factory.call(squares, with_factory=True)([1])
+
+
+class Own(ThreadPoolExecutor):
+    """Anybody's executor, which breaks off after some calls."""
+
+
+def test_an_executor_of_ones_own(tmp_path: Path) -> None:
+    execution = Execution(make=functools.partial(Own, 3))
+    results: list[int] = []
+    source = Factory(functools.partial(make_needs, tmp_path))
+    with WorkerPool(execution) as pool:
+        keep = lambda job, result: results.extend(result)  # noqa: E731
+        list(TaskRunner(pool, source, squares, keep).each([[i] for i in range(9)]))
+        assert pool.size == 3
+    assert sorted(results) == [i * i for i in range(9)]
+    with pytest.raises(ValueError, match=r"executor: dict is no concurrent\.futures\.Executor"):
+        WorkerPool(Execution(make=dict)).executor  # noqa: B018
+
+
+def test_what_an_execution_may_be() -> None:
+    with pytest.raises(ValueError, match="executor=mpi; it must be one of auto, threads, processes, dask"):
+        Execution("mpi")
+    with pytest.raises(ValueError, match="give executor=dask"):
+        Execution("threads", address="tcp://localhost:8786")
