@@ -102,7 +102,7 @@ def _load(config: DictConfig) -> ScenePairs:
     options = plain(config)
     own = "_target_" in options
     if options.get("name") == "rendered":
-        from fmtorch.data.rendered import RenderedPairs
+        from fmtorch.scenes import RenderedPairs
 
         with progress_bars() as progress:
             drawn = data.load(**options, progress=reporter(progress, "drawing scenes"))

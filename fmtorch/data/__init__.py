@@ -13,8 +13,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from fmtorch.core.options import expect_options
-from fmtorch.data.exif import ExifFocal, exif_focal
 from fmtorch.data.fmbench import FMBenchPairs
+from fmtorch.data.image_cameras import ExifFocal, exif_focal
 from fmtorch.data.images import ImageError, read_image, to_grey
 from fmtorch.data.pairs import DepthDataset, ImagePair, ImageSource, PairDataset
 from fmtorch.data.text_files import DataError
@@ -42,16 +42,16 @@ __all__ = [
 
 _CLASSES = {
     "fmbench": ("fmtorch.data.fmbench", "FMBenchPairs"),
-    "rendered": ("fmtorch.data.rendered", "RenderedPairs"),
-    "stereo": ("fmtorch.data.rendered", "StereoPair"),
+    "rendered": ("fmtorch.scenes", "RenderedPairs"),
+    "stereo": ("fmtorch.scenes", "StereoPair"),
     "tum": ("fmtorch.data.tum", "tum_pairs"),
     "kitti": ("fmtorch.data.kitti", "KittiPairs"),
     "colmap": ("fmtorch.data.colmap", "colmap_pairs"),
     "bundler": ("fmtorch.data.bundler", "BundlerPairs"),
-    "cameras": ("fmtorch.data.camera_files", "CameraFilePairs"),
+    "cameras": ("fmtorch.data.fmbench", "CameraFilePairs"),
     "pair_list": ("fmtorch.data.pair_list", "PairList"),
     "hpatches": ("fmtorch.data.hpatches", "HPatchesPairs"),
-    "h5": ("fmtorch.storage.exchange.dataset", "H5Pairs"),
+    "h5": ("fmtorch.io.dataset", "H5Pairs"),
 }
 NEEDS_ROOT = {
     "fmbench": "a set's folder with pairs_with_gt.txt, or a folder of such sets",

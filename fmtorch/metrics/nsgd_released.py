@@ -18,7 +18,7 @@ from torch import Tensor
 
 from fmtorch.core.checks import checked
 from fmtorch.geometry.arithmetic import sqrt
-from fmtorch.metrics.draws import Chord, Draws, Pairs, diagonal, from_centre, lines, sum_of_draws
+from fmtorch.metrics.nsgd import Chord, Draws, Pairs, diagonal, from_centre, lines, sum_of_draws
 
 BORDER = 0.5  # left and top edge of the first pixel where pixels count from 1
 NORMAL_OFFSET = 1e-10

@@ -19,7 +19,7 @@ from rich.progress import track
 
 from fmtorch.data import ImagePair, read_image, to_grey
 from fmtorch.data.baselines import WIDE
-from fmtorch.data.matchable import Keypoints, keypoints, matchable
+from fmtorch.data.construction import Keypoints, keypoints, matchable
 from fmtorch.evaluation.run import select
 from fmtorch.evaluation.statistics import PERCENT, areas, described, difference, interval, recalled
 from scripts.benchmark.kept import Kept, Row, read

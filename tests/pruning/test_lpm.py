@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from fmtorch.compiling.arrays import F8x2, I8x2
-from fmtorch.compiling.kernel import kernel
 from fmtorch.core.types import Correspondences
-from fmtorch.pruning import LPM, knn_kernels, lpm
+from fmtorch.jit.kernel import F8x2, I8x2, kernel
+from fmtorch.pruning import LPM, lpm
+from fmtorch.pruning import neighbors as knn_kernels
 from tests.conftest import oracle
 from tests.reference.lpm import lpm as reference
 from tests.reference.lpm import nearest

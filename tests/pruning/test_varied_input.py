@@ -11,8 +11,8 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences
 from fmtorch.pruning import frame_agreement, gms, lpm, lpm_cost, one_to_one, position_agreement
-from fmtorch.pruning.agreement import CURVES, MIN_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO
-from fmtorch.pruning.position_consistency_kernels import SCALES, TURNS
+from fmtorch.pruning.neighbors import CURVES, MIN_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO
+from fmtorch.pruning.position_consistency import SCALES, TURNS
 from tests.laws import degenerate, scene, scenes, small, with_padding
 from tests.reference import frame_consistency, position_consistency
 from tests.reference.gms import gms as gms_reference

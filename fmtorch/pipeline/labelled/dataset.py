@@ -9,8 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from fmtorch.core.files import replacing
-from fmtorch.core.resources import cache_dir
+from fmtorch.core.files import cache_dir, replacing
 from fmtorch.data.pairs import DepthDataset, PairDataset
 from fmtorch.jobs.execution import Execution
 from fmtorch.pipeline.build import load_pipeline
@@ -20,9 +19,9 @@ from fmtorch.pipeline.labelled.compute import Job, Progress, compute_shards, par
 from fmtorch.pipeline.labelled.shards import FORMAT, Shard, ShardError
 from fmtorch.pipeline.labelled.stored import StoredMatches
 from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.storage.configuration import configuration, environment
-from fmtorch.storage.features import CachedFeatures
-from fmtorch.storage.runs import canonical, identity_digest
+from fmtorch.runs.feature_cache import CachedFeatures
+from fmtorch.runs.fingerprint import configuration, environment
+from fmtorch.runs.run_folder import canonical, identity_digest
 
 MAX_MATCHES = 4000  # matches kept of a pair
 

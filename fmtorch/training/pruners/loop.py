@@ -20,7 +20,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from fmtorch.core.files import replacing
 from fmtorch.core.terminal import progress_bars
-from fmtorch.storage.runs import identity_digest
+from fmtorch.runs.run_folder import identity_digest
 from fmtorch.training.pruners.module import PrunerTraining
 
 CHECKPOINTS, BEST, LOGS = "checkpoints", "best.ckpt", "logs"

@@ -1,0 +1,390 @@
+"""Pairs of a COLMAP database as correspondences."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+import uuid
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, Protocol, cast, runtime_checkable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from fmtorch.core.files import replacing
+from fmtorch.core.stages import Estimator
+from fmtorch.core.types import Correspondences, collate, pair_key
+from fmtorch.io.colmap import DatabaseImage
+from fmtorch.io.match_store import Kind, PairGeometry
+from fmtorch.jobs.execution import Execution, Shard
+from fmtorch.jobs.pool import WorkerPool
+from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner
+from fmtorch.pipeline.two_images import pair_geometries
+from fmtorch.two_view.arguments import UNKNOWN
+from fmtorch.two_view.estimation import estimated_by
+from fmtorch.two_view.pair_type import classify
+
+Cameras = Literal["stored", "shared", "unknown"]
+"""What is taken for known: the cameras of the database, that both images have one focal length, or nothing."""
+
+
+class DatabasePair(NamedTuple):
+    """A pair of images with its matches, keypoints (n, 2) of both."""
+
+    image0: DatabaseImage
+    image1: DatabaseImage
+    matches: NDArray[np.int64]
+
+
+def as_correspondences(pair: DatabasePair, cameras: Cameras) -> Correspondences:
+    """The pair as a batch of one, with what is known of its cameras; of pinholes where these are those stored.
+
+    Without image sizes nothing is asked of cameras. Raises ValueError where a stored camera is none that there can be,
+    or where the size of one image alone is known.
+    """
+    images, stored = (pair.image0, pair.image1), cameras == "stored"
+    problem = next((image.problem for image in images if image.problem), "") if stored else ""
+    if problem:
+        raise ValueError(problem)
+    fields: dict[str, Any] = {}
+    for i, image in enumerate(images):
+        points = (image.pinhole if stored else image.points)[pair.matches[:, i]]
+        fields[f"x{i}"] = torch.from_numpy(points)[None]
+        if image.size is not None:
+            fields[f"size{i}"] = torch.tensor([image.size])
+        if stored and image.K is not None:
+            fields[f"K{i}"] = torch.from_numpy(image.K)[None]
+    mask = torch.isfinite(fields["x0"]).all(-1) & torch.isfinite(fields["x1"]).all(-1)
+    if any(image.size is not None for image in images):
+        focal = [(1.0, image.deviation) for image in images] if stored else [UNKNOWN, UNKNOWN]
+        fields["focal"] = torch.tensor([focal], dtype=torch.float64)
+        fields["shared_focal"] = torch.tensor([_shared(*images, cameras)])
+    elif cameras == "shared":
+        raise ValueError("cameras=shared needs the image sizes: size0 and size1, or K0 and K1")
+    key = torch.tensor([pair_key(f"{images[0].name} {images[1].name}")])
+    return Correspondences(mask=mask, key=key, **fields)
+
+
+def _shared(image0: DatabaseImage, image1: DatabaseImage, cameras: Cameras) -> bool:
+    """Whether both images are known to have one focal length, which is not known exactly."""
+    return cameras == "shared" or (
+        cameras == "stored" and image0.camera_id == image1.camera_id and image0.deviation > 0
+    )
+
+
+# Which pairs of a database an interrupted verification had finished, in a file beside it
+
+
+Ids = tuple[int, int]
+
+
+class VerificationLog:
+    """A text file: the settings, and a line of image numbers for each batch of pairs that is in the database.
+
+    done: pairs finished with these settings; a log of others is begun again.
+    """
+
+    def __init__(self, path: Path, settings: Mapping[str, Any]) -> None:
+        self.path, self.done = path, set[Ids]()
+        first, *lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else [""]
+        wanted = json.dumps(settings, sort_keys=True)
+        self.continued = first == wanted
+        if not self.continued:
+            with replacing(path) as temporary:
+                temporary.write_text(wanted + "\n", encoding="utf-8")
+            return
+        for line in lines:
+            self.done.update(_pairs(line))
+
+    def add(self, pairs: Iterable[Ids]) -> None:
+        """Note pairs as finished, once they are in the database."""
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write("\n" + json.dumps(list(pairs)))
+
+    def remove(self) -> None:
+        """Remove the file."""
+        self.path.unlink(missing_ok=True)
+
+
+def _pairs(line: str) -> list[Ids]:
+    """The pairs of a line; none of a line that was not written to its end."""
+    try:
+        return [(int(first), int(second)) for first, second in json.loads(line)] if line else []
+    except ValueError:
+        return []
+
+
+# Two-view geometries of the shards of one verification, a file a batch in one folder, until they are merged
+
+
+SETTINGS = "settings.json"
+_MATRICES = ("F", "E", "H", "R", "t")
+
+_GeometryIds = tuple[Any, Any]
+
+
+class GeometryParts:
+    """The folder, which any number of shards of the same settings may write to.
+
+    Raises ValueError where it holds geometries of other settings.
+    """
+
+    def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
+        self.folder = folder
+        wanted = json.dumps(settings, sort_keys=True)
+        folder.mkdir(exist_ok=True)
+        file = folder / SETTINGS
+        if not file.exists():
+            with replacing(file) as temporary:
+                temporary.write_text(wanted, encoding="utf-8")
+        if file.read_text(encoding="utf-8") != wanted:
+            raise ValueError(f"{folder} holds shards of other settings or matches; give the same, or delete the folder")
+        self.done: set[_GeometryIds] = {ids for part in self.read() for ids, _ in part}
+
+    def write(self, geometries: Iterable[tuple[_GeometryIds, PairGeometry]]) -> None:
+        """Keep geometries of pairs, all of them or none."""
+        arrays: dict[str, Any] = {}
+        pairs, kinds = [], []
+        for i, (ids, geometry) in enumerate(geometries):
+            pairs.append(ids)
+            kinds.append(geometry.kind)
+            values = {name: getattr(geometry, name) for name in ("inliers", *_MATRICES)}
+            arrays |= {f"{name}-{i}": value for name, value in values.items() if value is not None}
+        with replacing(self.folder / f"{uuid.uuid4().hex}.npz") as temporary, temporary.open("wb") as file:
+            np.savez(file, pairs=np.array(pairs), kinds=np.array(kinds), **arrays)
+        self.done.update(pairs)
+
+    def read(self) -> Iterator[list[tuple[_GeometryIds, PairGeometry]]]:
+        """The geometries, part by part."""
+        for path in sorted(self.folder.glob("*.npz")):
+            with np.load(path) as part:
+                yield [
+                    (_ids(ids), _geometry(part, i, str(kind)))
+                    for i, (ids, kind) in enumerate(zip(part["pairs"].tolist(), part["kinds"].tolist(), strict=True))
+                ]
+
+    def remove(self) -> None:
+        """Remove the folder."""
+        shutil.rmtree(self.folder)
+
+
+def _ids(ids: list[Any]) -> _GeometryIds:
+    first, second = ids
+    return first, second
+
+
+def _geometry(part: Any, i: int, kind: str) -> PairGeometry:
+    matrices = (part.get(f"{name}-{i}") for name in _MATRICES)
+    return PairGeometry(cast(Kind, kind), part[f"inliers-{i}"], *matrices)
+
+
+# Pairs of stored matches, estimated and written batch by batch
+
+
+BATCH = 64  # pairs that are read, and written, at a time
+PRELOADED = ("fmtorch.verification.run",)  # by the process that workers are forked of
+
+_PairIds = tuple[Any, Any]
+
+
+@runtime_checkable
+class MatchStore(Protocol):
+    """Matches of pairs of images, and a place for their geometries; see `MatchDatabase`."""
+
+    def pairs(self) -> list[_PairIds]:
+        """The pairs of images that have matches."""
+
+    def image(self, image_id: Any) -> DatabaseImage:
+        """An image with its keypoints."""
+
+    def matches(self, pair: _PairIds) -> NDArray[np.int64]:
+        """The matches of a pair, keypoints (n, 2) of its images."""
+
+    def has_geometry(self, pair: _PairIds) -> bool:
+        """Whether a pair has a geometry, of a failure too."""
+
+    def write(self, geometries: Iterable[tuple[_PairIds, PairGeometry]]) -> None:
+        """Write geometries, all of them or none."""
+
+    def name(self, image_id: Any) -> str:
+        """The name of an image."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Verification:
+    """What `verify` did with a database.
+
+    path: of the database with the geometries. pairs: that have matches. kept: of these, that had a geometry before or
+    were finished by an interrupted run. configurations: of the others, how many of each of COLMAP's kinds. problems:
+    why pairs could not be read, a line each; the next run tries them again. seconds: of the whole.
+    """
+
+    path: Path
+    pairs: int
+    kept: int
+    configurations: Mapping[str, int]
+    problems: tuple[str, ...]
+    seconds: float
+
+    @property
+    def verified(self) -> int:
+        """How many pairs were given a geometry: all but the degenerate ones."""
+        return sum(count for kind, count in self.configurations.items() if kind != "degenerate")
+
+
+class Estimation(NamedTuple):
+    """What estimates batches of pairs."""
+
+    estimator: Estimator
+    cameras: Cameras
+    seed: int
+
+
+class Batch(NamedTuple):
+    """Pairs that were read; the problems of those that could not be, or not be estimated."""
+
+    ids: list[_PairIds]
+    pairs: list[DatabasePair]
+    problems: list[tuple[_PairIds, str]]
+
+
+class Geometries(NamedTuple):
+    """The geometries of a batch's pairs; the problems of the others."""
+
+    ids: list[_PairIds]
+    geometries: list[PairGeometry]
+    problems: list[tuple[_PairIds, str]]
+
+
+def estimate_batch(how: Estimation, batch: Batch) -> Geometries:
+    """What a worker does."""
+    ids, pairs, given, problems = [], [], [], list[tuple[_PairIds, str]]()
+    for own, pair in zip(batch.ids, batch.pairs, strict=True):
+        try:
+            given.append(as_correspondences(pair, how.cameras))
+            ids.append(own)
+            pairs.append(pair)
+        except Exception as error:  # one pair does not end the work on the others
+            problems.append((own, _first_line(error)))
+    if not ids:
+        return Geometries([], [], problems)
+    results: dict[int, PairGeometry] = {}
+    for alike in _alike(given):
+        c = collate([given[i] for i in alike])
+        estimate = estimated_by(how.estimator, c, how.seed)
+        configuration = classify(c, estimate, focal_deviation=0, seed=how.seed)
+        of_these = pair_geometries([pairs[i].matches for i in alike], c, estimate, configuration)
+        results |= zip(alike, of_these, strict=True)
+    return Geometries(ids, [results[i] for i in range(len(ids))], problems)
+
+
+def _alike(given: Sequence[Correspondences]) -> list[list[int]]:
+    """Indices of pairs of which the same is known: in one batch a pair would lose what another lacks."""
+    groups: dict[tuple[bool, ...], list[int]] = {}
+    for i, c in enumerate(given):
+        known = tuple(getattr(c, field.name) is not None for field in dataclasses.fields(c))
+        groups.setdefault(known, []).append(i)
+    return list(groups.values())
+
+
+def divided(batch: Batch) -> list[Batch]:
+    """The pairs of a batch in batches of their own."""
+    return [Batch([ids], [pair], []) for ids, pair in zip(batch.ids, batch.pairs, strict=True)]
+
+
+class VerificationRun:
+    """The pairs of one store of matches.
+
+    log: of the pairs that count as done, else those with a geometry. shard, parts: only these pairs, and where their
+    geometries go instead; without a shard, whence they come. again: whether a shard does pairs that have a geometry.
+    """
+
+    def __init__(
+        self, database: MatchStore, log: VerificationLog | None = None, shard: Shard | None = None,
+        parts: GeometryParts | None = None, again: bool = False,
+    ) -> None:  # fmt: skip
+        self.database, self.log, self.again = database, log, again
+        self.parts = parts if shard is not None else None
+        self._merged = set[_PairIds]()
+        pairs = database.pairs()
+        self.pairs = pairs if shard is None else list(shard.of(pairs))
+        self.configurations: Counter[str] = Counter()
+        self.problems: list[str] = []
+        self.kept = 0
+        if parts is not None and shard is None:
+            self._merge(parts)
+
+    def each_batch(
+        self, make: Callable[[], Estimation], execution: Execution, report: Callable[[int, int], None] | None
+    ) -> None:
+        """Estimate and write the pairs that are not done, batch by batch; `make` is pickled for workers elsewhere."""
+        todo = [pair for pair in self.pairs if not self._done(pair)]
+        self.kept = len(self.pairs) - len(todo)
+        if report is not None and todo:
+            report(0, len(todo))
+        source: Source[Estimation] = Local(make()) if execution.shared else Factory(make)
+        batches = (self._read(todo[start : start + BATCH]) for start in range(0, len(todo), BATCH))
+        done = 0
+        with WorkerPool(execution, PRELOADED) as pool:
+            for batch in TaskRunner(pool, source, estimate_batch, self._keep, self._give_up, divided).each(batches):
+                done += len(batch.ids) + len(batch.problems)
+                if report is not None:
+                    report(done, len(todo))
+
+    def result(self, path: Path, seconds: float) -> Verification:
+        """The summary."""
+        counts = dict(self.configurations)
+        return Verification(path, len(self.pairs), self.kept, counts, tuple(self.problems), seconds)
+
+    def _done(self, pair: _PairIds) -> bool:
+        if pair in self._merged:
+            return True
+        if self.parts is not None:
+            return pair in self.parts.done or (not self.again and self.database.has_geometry(pair))
+        return self.database.has_geometry(pair) if self.log is None else pair in self.log.done
+
+    def _read(self, pairs: Sequence[_PairIds]) -> Batch:
+        batch = Batch([], [], [])
+        for pair in pairs:
+            try:
+                matches = self.database.matches(pair)
+                batch.pairs.append(DatabasePair(self.database.image(pair[0]), self.database.image(pair[1]), matches))
+                batch.ids.append(pair)
+            except Exception as error:  # one pair does not end the work on the others
+                batch.problems.append((pair, _first_line(error)))
+        return batch
+
+    def _keep(self, batch: Batch, result: Geometries) -> None:
+        self._note([*batch.problems, *result.problems])
+        self._write(result.ids, result.geometries)
+
+    def _write(self, ids: Sequence[_PairIds], results: Sequence[PairGeometry]) -> None:
+        if not ids:
+            return
+        store = self.database if self.parts is None else self.parts
+        store.write(zip(ids, results, strict=True))
+        if self.log is not None and self.parts is None:
+            self.log.add(ids)
+        self.configurations.update(result.kind for result in results)
+
+    def _merge(self, parts: GeometryParts) -> None:
+        """Write what shards found."""
+        for part in parts.read():
+            new = [(ids, geometry) for ids, geometry in part if not self._done(ids)]
+            self._write([ids for ids, _ in new], [geometry for _, geometry in new])
+            self._merged.update(ids for ids, _ in part)
+
+    def _give_up(self, batch: Batch, reason: str) -> None:
+        self._note([*batch.problems, *((ids, reason) for ids in batch.ids)])
+
+    def _note(self, problems: Iterable[tuple[_PairIds, str]]) -> None:
+        for pair, problem in problems:
+            self.problems.append(f"{', '.join(self.database.name(image) for image in pair)}: {problem}")
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [""])[0]
