@@ -133,14 +133,13 @@ def geometry() -> dict[str, torch.Tensor]:
         "sampson": lambda a, b, v: g.sampson(F0[:, 0], a, b),
         "calibration": lambda a, b, v: g.fundamental_from_calibration(K, K, K / 700, a[:, 0, :1].expand(5, 3) + 1),
         **{
-            f"{name} {kernel} {gradient}": lambda a, b, v, f=f, k=kernel, gradient=gradient: f(
-                *((F0, a, b) if f is g.refine else (a, b, F0)), v, mask, kernel=k, scale=3.0, gradient=gradient
+            f"{name} {loss}": lambda a, b, v, f=f, loss=loss: f(
+                *((F0, a, b) if f is g.refine else (a, b, F0)), v, mask, loss=loss, scale=3.0
             )
             for name, f in (("refine", g.refine), ("irls", g.irls))
-            for kernel in ("cauchy", "truncated", "magsac")
-            for gradient in ("implicit", "unrolled")
+            for loss in ("cauchy", "truncated", "magsac")
         },
-        "attached step": lambda a, b, v: g.attached_step(F0, a, b, v, mask, kernel="huber", scale=3.0),
+        "attached step": lambda a, b, v: g.attached_step(F0, a, b, v, mask, loss="huber", scale=3.0),
     }
     arrays = {}
     for name, call in calls.items():

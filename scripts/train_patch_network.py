@@ -30,7 +30,7 @@ from fmtorch.training.correspondences import Tolerance
 from fmtorch.training.geodesc_loss import geodesc
 from fmtorch.training.match_set_training import MatchSetTraining
 from fmtorch.training.patch_loop import PatchTraining, TrainingOptions
-from fmtorch.training.patch_losses import LOSSES
+from fmtorch.training.patch_losses import LOSS_CODES
 from fmtorch.training.patch_metrics import middle, validation_pairs
 from fmtorch.training.patch_objectives import CovarianceObjective, DescriptorObjective, Objective, ShapeObjective
 from fmtorch.training.patch_store import PatchStore, build_store
@@ -95,11 +95,11 @@ def objective_of(config: DictConfig, device: torch.device) -> Objective:
         return ShapeObjective(descriptor, **loss)
     if name == "affine_covariance":
         return CovarianceObjective(**loss, **taught)
-    if name not in LOSSES:
+    if name not in LOSS_CODES:
         raise ValueError(
-            f"training.loss.name={name}; there are: {', '.join(LOSSES)}, hard_negative_constant, affine_covariance"
+            f"training.loss.name={name}; there are: {', '.join(LOSS_CODES)}, hard_negative_constant, affine_covariance"
         )
-    return DescriptorObjective(functools.partial(LOSSES[name], **loss), **taught)
+    return DescriptorObjective(functools.partial(LOSS_CODES[name], **loss), **taught)
 
 
 def teacher_of(config: DictConfig) -> dict[str, Any]:

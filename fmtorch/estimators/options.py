@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-from fmtorch.geometry.levenberg_marquardt import LOSSES
+from fmtorch.geometry.levenberg_marquardt import LOSS_CODES
 
 Group = TypeVar("Group")
 
@@ -42,11 +42,11 @@ class Preselect:
 class Refine:
     """Levenberg-Marquardt of the robust Sampson error, from each model of the pool.
 
-    kernel: a name of `geometry.KERNELS`. scale: its scale, Sampson distance, px. iterations: steps. matches: at most so
+    loss: a name of `geometry.LOSSES`. scale: its scale, Sampson distance, px. iterations: steps. matches: at most so
     many are looked at, drawn by the pair's key from those within RADIUS scales of a model of the pool; None: all.
     """
 
-    kernel: str
+    loss: str
     scale: float = 1.0
     iterations: int = 5
     matches: int | None = None
@@ -54,8 +54,8 @@ class Refine:
     RADIUS = 4.0  # scales: a match farther from all models of the pool is not looked at again
 
     def __post_init__(self) -> None:
-        if self.kernel not in LOSSES:
-            raise ValueError(f"kernel is {self.kernel!r}; it must be one of: {', '.join(LOSSES)}")
+        if self.loss not in LOSS_CODES:
+            raise ValueError(f"loss is {self.loss!r}; it must be one of: {', '.join(LOSS_CODES)}")
         _positive(**{"refine.scale": self.scale})
         _at_least(0, **{"refine.iterations": self.iterations})
         if self.matches is not None:

@@ -16,7 +16,7 @@ from fmtorch.geometry.matrices import assign, nearest_rank2
 from fmtorch.geometry.normalize import NormalizedMatches, canonical, denormalize_fundamental, normalize_points
 from fmtorch.geometry.optimum import at_fixed_point, gradient_wanted
 from fmtorch.geometry.rank2_manifold import RANK_TWO, constant
-from fmtorch.geometry.robust_losses import Kernel, named_kernel
+from fmtorch.geometry.robust_losses import RobustLoss, named_loss
 from fmtorch.jit.kernel import F8x2, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, load, store
 
@@ -30,7 +30,7 @@ def irls(
     weight: Float[Tensor, "*batch n"] | None = None,
     mask: Bool[Tensor, "*batch n"] | None = None,
     *,
-    kernel: str = "cauchy",
+    loss: str = "cauchy",
     scale: float | Tensor = 1.0,
     iterations: int = 5,
 ) -> Float[Tensor, "*models 3 3"]:
@@ -54,8 +54,8 @@ def irls(
         F0: one matrix for each set of matches, or K of them, (*batch, K, 3, 3).
         weight: not negative, 1 by default.
         mask: False in slots to ignore; matches that are not finite are ignored too.
-        kernel: a name of `robust_losses.KERNELS`.
-        scale: of the kernel, in pixels (a number, or one per set).
+        loss: a name of `robust_losses.LOSSES`.
+        scale: of the loss, in pixels (a number, or one per set).
         iterations: reweighted fits.
 
     Returns:
@@ -63,9 +63,9 @@ def irls(
         was.
 
     Raises:
-        ValueError: for an unknown kernel.
+        ValueError: for an unknown loss.
     """
-    robust = named_kernel(kernel)
+    robust = named_loss(loss)
     wanted = gradient_wanted(x0, x1, weight, scale)
     with torch.set_grad_enabled(wanted):
         matches = NormalizedMatches(x0, x1, weight, mask, F0, scale)
@@ -148,13 +148,13 @@ def reweighted(
     F: Float[Tensor, "9 p k"],
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
-    robust: Kernel,
+    robust: RobustLoss,
     scale: Float[Tensor, " p"],
 ) -> Float[Tensor, "9 p k"]:
     """One iteration, component by component: the 8-point algorithm with the weights that the residuals under F give.
 
     F: k models for each of p pairs, entries row by row. points: x0, y0, x1, y1, of about unit scale; finite. weight: 0
-    in padded slots. scale: of the kernel, in the unit of the points. Models of rank 2; one that the weighted matches do
+    in padded slots. scale: of the loss, in the unit of the points. Models of rank 2; one that the weighted matches do
     not determine is kept as it was.
     """
     finite = torch.isfinite(F).all(0)

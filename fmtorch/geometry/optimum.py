@@ -11,7 +11,7 @@ from torch import Tensor
 from fmtorch.geometry.arithmetic import as_rows, cofactors, component_sum, sqrt, stable_sum, unit
 from fmtorch.geometry.epipolar import homogeneous, linearise
 from fmtorch.geometry.rank2_manifold import RANK_TWO, constant
-from fmtorch.geometry.robust_losses import Kernel
+from fmtorch.geometry.robust_losses import RobustLoss
 
 STEP_DAMPING = 1e-10  # of the attached step: bounds its gradient where the points leave a direction open
 
@@ -20,7 +20,7 @@ def gradient_of_cost(
     F: Float[Tensor, "9 p k"],
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
-    robust: Kernel,
+    robust: RobustLoss,
     scale: Float[Tensor, " p"],
 ) -> Float[Tensor, "9 p k"]:
     """Half the gradient of the cost with respect to F, ``sum_i w_i rho'(r_i^2) r_i dr_i``; attached to all inputs."""
@@ -33,7 +33,7 @@ def curvature_of_cost(
     F: Float[Tensor, "9 p k"],
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
-    robust: Kernel,
+    robust: RobustLoss,
     scale: Float[Tensor, " p"],
 ) -> Float[Tensor, "9 9 p k"]:
     """The Gauss-Newton matrix ``J^T W J`` with Newton's weights, those of the loss's curvature, not those of IRLS."""
@@ -47,7 +47,7 @@ def at_optimum(
     F: Float[Tensor, "9 p k"],
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
-    robust: Kernel,
+    robust: RobustLoss,
     scale: Float[Tensor, " p"],
 ) -> Float[Tensor, "9 p k"]:
     """F, optima of rank 2 and unit norm, attached to the graph of points and weights by the implicit function theorem.
@@ -99,7 +99,7 @@ def inverse_hessian(
 
 
 def _hessian(
-    F: Tensor, C: Tensor, size: Tensor, points: Tensor, weight: Tensor, robust: Kernel, scale: Tensor
+    F: Tensor, C: Tensor, size: Tensor, points: Tensor, weight: Tensor, robust: RobustLoss, scale: Tensor
 ) -> Float[Tensor, "p k 9 9"]:
     """Half the second derivative of the Lagrangian ``cost + 2 multiplier det F``; C are F's cofactors, size |C|^2."""
     with torch.enable_grad():

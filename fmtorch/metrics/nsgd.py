@@ -104,8 +104,8 @@ def sum_of_draws(pairs: Pairs, draw: Draw, *, samples: int, seed: int) -> tuple[
     """Sum of the first `samples` accepted draws of each pair, and how many there are among 10 x `samples` tries.
 
     `draw` maps pairs and their draws to values and accepted flags, both (b, draws). As many draws as samples are made
-    first, then, of pairs that need more, half as many, and each further time twice as many. Raises ValueError unless there
-    is at least one sample.
+    first, then, of pairs that need more, half as many, and each further time twice as many. Raises ValueError unless
+    there is at least one sample.
     """
     if samples < 1:
         raise ValueError(f"samples is {samples}; it must be at least 1")
@@ -119,11 +119,9 @@ def sum_of_draws(pairs: Pairs, draw: Draw, *, samples: int, seed: int) -> tuple[
             current = pairs.take(tile)
             value, accepted = draw(current, Draws.of(seed, current.key, start, draws))
             taken = accepted & (count[tile, None] + accepted.cumsum(-1) <= samples)
-            blocks = torch.nn.functional.pad(torch.where(taken, value, 0.0), (0, -draws % BLOCK)).unflatten(
-                1, (-1, BLOCK)
-            )
-            sums = torch.cat([total[tile, None], stable_sum(blocks)], 1)
-            total = total.index_put((tile,), component_sum(sums, 1))
+            value = torch.nn.functional.pad(torch.where(taken, value, 0.0), (0, -draws % BLOCK))
+            blocks = stable_sum(value.reshape(len(tile), value.shape[1] // BLOCK, BLOCK))
+            total = total.index_put((tile,), component_sum(torch.cat([total[tile, None], blocks], 1), 1))
             count = count.index_add(0, tile, taken.sum(-1))
         active = active[count[active] < samples]
         more = 2 * more if start else -(-first // (2 * BLOCK)) * BLOCK
@@ -159,8 +157,9 @@ class Chord(NamedTuple):
     hits: Tensor
 
     @classmethod
-    def of(cls, a: Tensor, b: Tensor, c: Tensor, size: Float[Tensor, "*#batch 2"]) -> Chord:
-        """Those of lines of any scale, sign and direction, in coordinates from the centre of the image."""
+    def of(cls, line: list[Tensor], size: Float[Tensor, "*#batch 2"]) -> Chord:
+        """Those of lines a, b, c of any scale, sign and direction, in coordinates from the centre of the image."""
+        a, b, c = line
         half_h, half_w = (size / 2)[..., None, :].unbind(-1)
         squared = torch.addcmul(a * a, b, b)
         # The sign makes t run from left to right, on a vertical line downwards.
@@ -273,7 +272,8 @@ def draw_distances(
     h, w = pairs.size0[..., None].unbind(-2)
     x, y, z = F.unbind(-1)
     of_shares = torch.stack([x * w, y * h, z + BORDER * (x + y)], -1)  # of shares of the sides of image 0
-    x1, y1 = (chord := Chord.of(*lines(of_shares, draws.x, draws.y), pairs.size1)).at(draws.share)
+    chord = Chord.of(lines(of_shares, draws.x, draws.y), pairs.size1)
+    x1, y1 = chord.at(draws.share)
     a1, b1, c1 = lines(of_shares.flip(0), draws.x, draws.y)
     a0, b0 = lines(F.flip(0).mT[..., :2, :], x1, y1)
     e = torch.addcmul(torch.addcmul(c1, a1, x1), b1, y1).abs()

@@ -56,7 +56,7 @@ def released_draw(pairs: Pairs, draws: Draws) -> tuple[Float[Tensor, "b n"], Boo
     h, w = size0[:, :, None].unbind(-1)
     x0, y0 = (draws.x * w).round(), (draws.y * h).round()
     a, b, c = lines(F, x0, y0)
-    chord = Chord.of(a, b, c, size1)
+    chord = Chord.of([a, b, c], size1)
     x1, _ = chord.at(draws.share)
     y1 = -(a * x1 + c) / b
     d1 = _distance(x1, y1, *lines(other, x0, y0)) / diagonal(size1)[..., None]

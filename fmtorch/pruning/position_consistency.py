@@ -114,7 +114,8 @@ def _similarity(rows: Array, orders: Array, along: Array) -> Array:
         index = (IDENTITY - first) % bins
         if merit[index] > best_merit:
             best, best_merit = index, merit[index]
-    return MAPS32[best // turns, best % turns]
+    similarity: Array = MAPS32[best // turns, best % turns]
+    return similarity
 
 
 @inner

@@ -70,4 +70,4 @@ def _correlation(x: Float[Tensor, "n d"]) -> Float[Tensor, ""]:
     return (r.square().sum() - r.diagonal().square().sum()) / (2 * x.shape[1])
 
 
-LOSSES = {"hardest_triplet": hardest_triplet, "relative_distance": relative_distance}
+LOSS_CODES = {"hardest_triplet": hardest_triplet, "relative_distance": relative_distance}

@@ -63,7 +63,7 @@ def virtual_points(
         key = torch.zeros(len(F), dtype=torch.int64, device=F.device) if key is None else key
         u, v, along = uniform(seed, key, Stream.TRAINING, 0, TRIES * count, 3).unbind(-1)
         x0, size1 = torch.stack([u * width0, v * height0], -1) + BORDER, size1.to(torch.float64)
-        chord = Chord.of(*lines(from_centre(F, size1, BORDER), *x0.unbind(-1)), size1)
+        chord = Chord.of(lines(from_centre(F, size1, BORDER), *x0.unbind(-1)), size1)
         x1 = torch.stack(chord.at(along), -1) + (size1.flip(-1) / 2 + BORDER)[:, None]
         order = torch.argsort((~chord.hits).to(torch.uint8), dim=1, stable=True)[:, :count]
         mask = chord.hits.gather(1, order)

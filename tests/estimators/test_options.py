@@ -21,9 +21,9 @@ MEDIAN = {"score": "median", "inliers": "lmeds", "confidence": None}
 
 def test_groups_are_made_of_mappings() -> None:
     assert group("preselect", {"survivors": 64}, Preselect) == Preselect(128, 64)
-    assert group("refine", {"kernel": "cauchy", "scale": 0.5}, Refine) == Refine("cauchy", 0.5)
+    assert group("refine", {"loss": "cauchy", "scale": 0.5}, Refine) == Refine("cauchy", 0.5)
     assert group("focal", None, Focal) is None
-    with pytest.raises(ValueError, match="refine is 'truncated'; it must be null or a mapping of: kernel, scale"):
+    with pytest.raises(ValueError, match="refine is 'truncated'; it must be null or a mapping of: loss, scale"):
         group("refine", "truncated", Refine)
     select = Select(scale=0.3)
     assert group("select", select, Select) is select
@@ -32,11 +32,11 @@ def test_groups_are_made_of_mappings() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"refine": {"kernel": "truncated", "threshold": 1}}, "refine: no option threshold; there are: kernel"),
-        ({"refine": {"scale": 1.0}}, "refine: kernel is missing"),
-        ({"refine": {"kernel": "l1"}}, "kernel is 'l1'"),
-        ({"refine": {"kernel": "cauchy", "scale": 0.0}}, "refine.scale is 0.0; it must be positive"),
-        ({"refine": {"kernel": "cauchy", "matches": 0}}, "refine.matches is 0; it must be at least 1"),
+        ({"refine": {"loss": "truncated", "threshold": 1}}, "refine: no option threshold; there are: loss"),
+        ({"refine": {"scale": 1.0}}, "refine: loss is missing"),
+        ({"refine": {"loss": "l1"}}, "loss is 'l1'"),
+        ({"refine": {"loss": "cauchy", "scale": 0.0}}, "refine.scale is 0.0; it must be positive"),
+        ({"refine": {"loss": "cauchy", "matches": 0}}, "refine.matches is 0; it must be at least 1"),
         ({"preselect": {"matches": 0}}, "preselect.matches is 0; it must be at least 1"),
         ({"select": {"scale": 0.0}}, "select.scale is 0.0; it must be positive"),
         ({"select": {}, "focal": {"samples": -1}}, "focal.samples is -1; it must be at least 0"),
