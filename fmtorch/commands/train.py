@@ -5,14 +5,15 @@ from __future__ import annotations
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from fmtorch.commands.main import job, run_command
+from fmtorch.commands.config import job, run_command
+from fmtorch.commands.options import TRAIN
 
 
 @job
 def task(config: DictConfig) -> None:
     """What Hydra runs."""
     try:
-        from fmtorch.training.pruners.run import run
+        from fmtorch.training.run import run
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] not in ("lightning", "tensorboard"):
             raise
@@ -22,4 +23,4 @@ def task(config: DictConfig) -> None:
 
 def main() -> None:
     """The command."""
-    run_command("train", task, interrupted="interrupted; the same command continues the training")
+    run_command(TRAIN, task)

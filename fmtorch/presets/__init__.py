@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
+    from fmtorch.core.files import STAGES
     from fmtorch.presets.composition import (
-        STAGES,
         composed,
         expect_dataset,
         expect_stages,
@@ -23,14 +23,13 @@ if TYPE_CHECKING:
         known_targets,
         load,
         targets_of,
-        top_level_names,
     )
     from fmtorch.presets.objects import build, expect_buildable, instantiate, own_modules, peer_packages, resolve_device
 
 __all__ = [
     "STAGES", "available", "build", "closest", "composed", "expect_buildable", "expect_dataset",
     "expect_stages", "instantiate", "known_targets", "load", "own_modules", "peer_packages",
-    "pipeline_stages", "plain", "resolve_device", "stages", "targets_of", "top_level_names",
+    "pipeline_stages", "plain", "resolve_device", "stages", "targets_of",
 ]  # fmt: skip
 
 lazy_exports(__name__)

@@ -20,7 +20,7 @@ _LEAF = 8  # points a leaf, at most
 
 @inner
 def search(queries: Array, points: Array, neighbors: Array) -> None:
-    """The points (m, 2) nearest to each query (n, 2), nearest first -> neighbors (n, count); -1 for no more points.
+    """The nearest points (m, 2) of queries (n, 2): indices, neighbors (n, count), nearest first; -1 past the last.
 
     Squared distances in float64, ties by index, exactly as an exhaustive search finds them.
     Node j of depth d holds the places from (j m) >> d on in an order of the points, its box and their lowest index.
