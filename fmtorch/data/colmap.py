@@ -11,9 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.data.candidates import MIN_SHARED, AllPairs, Candidates, sharing_points
-from fmtorch.data.colmap_binary import read_binary
-from fmtorch.data.colmap_model import Model
-from fmtorch.data.colmap_text import read_text
+from fmtorch.data.colmap_model import Model, read_model
 from fmtorch.data.depth_images import DepthImages, read_colmap
 from fmtorch.data.pairs import ImageSource
 from fmtorch.data.scenes import DepthScenePairs, Scene, ScenePairs, View, folders
@@ -97,18 +95,6 @@ def _depth_paths(images: Path, scene: Scene) -> dict[str, Path]:
 def _points(folder: Path) -> list[NDArray[np.int64]]:
     """The points that each image of a model sees."""
     return [image.points for image in read_model(folder).images]
-
-
-def read_model(folder: Path, points: bool = True) -> Model:
-    """The model in a folder, of binary files where these are there, else of text files.
-
-    points: read which points each image sees. Raises DataError, naming file and line or record, for damaged files.
-    """
-    if (folder / "cameras.bin").is_file():
-        return read_binary(folder, points)
-    if (folder / "cameras.txt").is_file():
-        return read_text(folder, points)
-    raise DataError(f"{folder}: neither cameras.bin nor cameras.txt; it must hold a COLMAP model")
 
 
 def scene_folders(

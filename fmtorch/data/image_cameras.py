@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fmtorch.data.colmap import read_model
-from fmtorch.data.colmap_text import read_cameras
+from fmtorch.data.colmap_model import read_cameras, read_model
 from fmtorch.data.lenses import Lens
 from fmtorch.data.text_files import DataError
 
