@@ -18,10 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.core.types import Estimate
-from fmtorch.pipeline.essential import find_essential
-from fmtorch.pipeline.fundamental import find_fundamental, find_homography
-from fmtorch.pipeline.opencv_arguments import calibrated, points_of
-from fmtorch.pipeline.units import MIN_PIXELS
+from fmtorch.two_view.arguments import MIN_PIXELS
+from fmtorch.two_view.find import find_essential, find_fundamental, find_homography
 
 Matrix = NDArray[np.float64]
 Mask = NDArray[np.uint8]
@@ -78,7 +76,9 @@ def findFundamentalMat(  # OpenCV's name, as all of this module
     if isinstance(maxIters, np.ndarray):
         maxIters, mask = None, maxIters
     name, options = _preset(method, ransacReprojThreshold, confidence, maxIters)
-    estimate = find_fundamental(points_of(points1, "points1"), points_of(points2, "points2"), estimator=name, **options)
+    estimate = find_fundamental(
+        _points_of(points1, "points1"), _points_of(points2, "points2"), estimator=name, **options
+    )
     return _result(estimate, estimate.F, mask)
 
 
@@ -102,7 +102,7 @@ def findHomography(
     Raises:
         ValueError: as `fmtorch.find_homography`. cv2.error: for fewer than four points.
     """
-    src, dst = points_of(srcPoints, "srcPoints"), points_of(dstPoints, "dstPoints")
+    src, dst = _points_of(srcPoints, "srcPoints"), _points_of(dstPoints, "dstPoints")
     if method == 0 or len(src) < MIN_H:
         return opencv.findHomography(src, dst, method)  # type: ignore[return-value]
     _, options = _preset(opencv.RANSAC if method == opencv.RHO else method, ransacReprojThreshold, confidence, maxIters)
@@ -131,7 +131,7 @@ def findEssentialMat(points1: Any, points2: Any, *arguments: Any, **named: Any) 
     Raises:
         ValueError, TypeError: for another form, and as `fmtorch.find_essential`.
     """
-    x1, x2, K1, K2, rest = calibrated(points_of(points1, "points1"), points_of(points2, "points2"), arguments, named)
+    x1, x2, K1, K2, rest = _calibrated(_points_of(points1, "points1"), _points_of(points2, "points2"), arguments, named)
     focal = float(np.abs([K1[0, 0], K1[1, 1], K2[0, 0], K2[1, 1]]).max())
     scale = UNIT_FOCAL / focal if focal < MIN_PIXELS else 1.0  # thresholds are in the unit of the points
     S = np.diag([scale, scale, 1])
@@ -158,8 +158,8 @@ def recoverPose(*arguments: Any, **named: Any) -> Any:
     E, inliers = findEssentialMat(*(given[name] for name in names[:6]), **kept)
     if E is None or inliers is None:
         raise ValueError("no essential matrix agrees with the points")
-    x1, x2, *_ = calibrated(
-        points_of(given["points1"], "points1"), points_of(given["points2"], "points2"),
+    x1, x2, *_ = _calibrated(
+        _points_of(given["points1"], "points1"), _points_of(given["points2"], "points2"),
         tuple(given[name] for name in names[2:6]), {},
     )  # fmt: skip
     y1, y2 = (
@@ -220,3 +220,46 @@ def _mask(estimate: Estimate, out: Mask | None) -> Mask:
 def __getattr__(name: str) -> Any:
     """All else is OpenCV's."""
     return getattr(opencv, name)
+
+
+def _calibrated(
+    x1: Matrix, x2: Matrix, arguments: tuple[Any, ...], named: dict[str, Any]
+) -> tuple[Matrix, Matrix, Matrix, Matrix, dict[str, Any]]:
+    """Points without distortion, the camera matrices, and the other arguments by name, of any form of OpenCV's."""
+    first = (
+        arguments[0] if arguments else next((named[n] for n in ("cameraMatrix", "cameraMatrix1") if n in named), 1.0)
+    )
+    two = "cameraMatrix2" in named or (len(arguments) > 3 and np.shape(arguments[2]) == (3, 3))
+    rest = ("method", "prob", "threshold", "maxIters", "mask")
+    if np.shape(first) != (3, 3):
+        names: tuple[str, ...] = ("focal", "pp", *rest)
+    elif two:
+        names = ("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2", *(n for n in rest if n != "maxIters"))
+    else:
+        names = ("cameraMatrix", *rest)
+    given = {**dict(zip(names, arguments, strict=False)), **named}
+    if len(arguments) > len(names) or given.keys() - set(names):
+        raise TypeError(f"findEssentialMat takes points1, points2, {', '.join(names)} in this form")
+    if np.shape(first) != (3, 3):
+        (cx, cy), f = given.get("pp", (0.0, 0.0)), float(given.get("focal", 1.0))
+        K = np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]])
+        return x1, x2, K, K, given
+    if not two:
+        K = np.asarray(given["cameraMatrix"], np.float64)
+        return x1, x2, K, K, given
+    Ks = [np.asarray(given[f"cameraMatrix{i}"], np.float64) for i in (1, 2)]
+    for i, x in enumerate((x1, x2), start=1):
+        bent = given.get(f"distCoeffs{i}")
+        if bent is not None and np.any(bent):
+            x[:] = opencv.undistortPoints(x[:, None], Ks[i - 1], np.asarray(bent, np.float64), P=Ks[i - 1])[:, 0]
+    return x1, x2, Ks[0], Ks[1], given
+
+
+def _points_of(points: Any, name: str) -> Matrix:
+    """Points (N, 2) of any form that OpenCV takes, a copy in float64. Raises ValueError for another."""
+    array = np.array(points, np.float64)
+    if array.ndim == 3 and 1 in array.shape[:2]:
+        array = array.reshape(-1, array.shape[2])
+    if array.ndim != 2 or array.shape[1] != 2:
+        raise ValueError(f"{name} has shape {array.shape}; it must be (N, 2), (N, 1, 2) or (1, N, 2)")
+    return array

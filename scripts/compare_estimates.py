@@ -23,7 +23,7 @@ import numpy as np
 import torch
 
 HERE = Path(__file__).resolve().parents[1]
-OWN = ("HypothesizeAndVerify", "IterativelyReweighted", "CoarseToFine")
+OWN = ("Ransac", "IterativelyReweighted", "CoarseToFine")
 QUICK_MATCHES, MATCHES = 400, 1000  # of a real pair, at most
 FIELDS = ("x0", "x1", "mask", "quality", "prior", "noise", "size0", "size1", "key", "lafs0", "lafs1")
 

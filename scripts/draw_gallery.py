@@ -20,6 +20,7 @@ from fmtorch import data, metrics, presets
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data import ImagePair
 from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_matches
+from fmtorch.pipeline.build import load_pipeline
 
 WIDTH, QUALITY = 1200, 80
 PIPELINE, PEER = "sift_fmtorch", ("opencv", {"method": "usac_magsac"})
@@ -51,7 +52,7 @@ class Gallery:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
-        self.pipeline = presets.pipeline(PIPELINE)
+        self.pipeline = load_pipeline(PIPELINE)
         self.peer = presets.build("estimator", PEER[0], **PEER[1])
 
     def save(self, name: str, picture: NDArray[np.uint8]) -> None:

@@ -16,11 +16,11 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from fmtorch import presets
 from fmtorch.core.files import replacing
 from fmtorch.core.resources import models_dir
 from fmtorch.features import learn_projection
 from fmtorch.features.vlad import Codebook, Kind, local_descriptors
+from fmtorch.pipeline.build import load_pipeline
 from scripts.learn_pca import SOURCES, images
 
 FEATURES: dict[str, tuple[str, Kind]] = {"rootsift_pca": ("sift", "sift"), "hardnet": ("hesaffnet", "hardnet")}
@@ -66,7 +66,7 @@ def main() -> None:
     for name in arguments.only:
         features, kind = FEATURES[name]
         options = [f"features={features}", f"features.max_features={PER_IMAGE}"]
-        extract = presets.pipeline("sift_ratio", overrides=options).extractor
+        extract = load_pipeline("sift_ratio", overrides=options).extractor
         selected = itertools.islice(images(arguments.photos, arguments.sources), 0, None, arguments.every)
         parts = [local_descriptors(extract(image).descriptors, kind) for image in selected]
         book = learned(parts, arguments.centers, arguments.dimensions)

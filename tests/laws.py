@@ -41,7 +41,7 @@ class Subject:
 
 def few(config: Mapping[str, Any], hypotheses: int = 200, round: int = 100) -> dict[str, Any]:
     """Options with which an estimator's preset does little in each of its stages."""
-    if config["_target_"] == "fmtorch.estimators.HypothesizeAndVerify":
+    if config["_target_"] == "fmtorch.estimators.Ransac":
         options = {"hypotheses": hypotheses, "round": round, "pool": min(config.get("pool", 1), 8)}
         if (config.get("refine") or {}).get("matches"):
             options["refine"] = {"matches": 64}  # fewer than a scene has

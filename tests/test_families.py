@@ -18,6 +18,7 @@ from fmtorch.core.resources import conf_dir
 from fmtorch.core.types import Correspondences
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.data.pairs import GivenMatches
+from fmtorch.pipeline.build import build_pipeline, load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets.composition import compose
 
@@ -54,7 +55,7 @@ def qualities(pipeline: Pipeline, pairs: list[ImagePair]) -> list[torch.Tensor]:
 
 def test_each_pair_of_a_batch_gets_the_options_of_its_family() -> None:
     options = ["pruner.ratio.threshold=0.5", f"+{RATIO}.wide.threshold=0.7", f"+{RATIO}.CPC.threshold=0.9"]
-    pipeline = presets.pipeline("paper/sift_ratio", overrides=options)
+    pipeline = load_pipeline("paper/sift_ratio", overrides=options)
     pairs = pairs_of_families("KITTI", "orbit", "CPC", "mine", "Strecha")
     limits = (0.5, 0.7, 0.9, 0.5, 0.7)
     for pair, kept, limit in zip(pairs, qualities(pipeline, pairs), limits, strict=True):
@@ -66,11 +67,11 @@ def test_each_pair_of_a_batch_gets_the_options_of_its_family() -> None:
 
 def test_gms_tries_scales_on_wide_baselines_alone() -> None:
     for name in ("sift_gms", "paper/hesaffnet_gms"):
-        pipeline = presets.pipeline(name, overrides=["+pruner.gms.families.mine.with_scale=true"])
+        pipeline = load_pipeline(name, overrides=["+pruner.gms.families.mine.with_scale=true"])
         scale = {family: pipeline.pruners_of(family)["gms"].with_scale for family in ("TUM", "CPC", "mine", "other")}  # type: ignore[attr-defined]
         assert scale == {"TUM": False, "CPC": True, "mine": True, "other": False}
         assert {pruner.threshold_factor for pruner in (pipeline.pruners_of(f)["gms"] for f in scale)} == {4.0}  # type: ignore[attr-defined]
-        usual = presets.pipeline(name, overrides=["pruner.gms.families=null"])
+        usual = load_pipeline(name, overrides=["pruner.gms.families=null"])
         assert not usual.pruners_of("CPC")["gms"].with_scale  # type: ignore[attr-defined]
 
 
@@ -95,7 +96,7 @@ def test_an_option_that_is_given_explicitly_holds_for_all_families(
     expected = dict(zip(("KITTI", "Strecha", "CPC"), scale, strict=True))
 
     def scales(config: DictConfig) -> dict[str, bool]:
-        pipeline = presets.build_pipeline(config)
+        pipeline = build_pipeline(config)
         return {family: pipeline.pruners_of(family)["gms"].with_scale for family in expected}  # type: ignore[attr-defined]
 
     assert scales(compose("match", words)) == expected
@@ -111,7 +112,7 @@ def test_those_of_a_pruner_that_others_replace_go_with_it() -> None:
     config = compose("match", ("pipeline=sift_gms", "pruner=[ratio]"))
     presets.expect_stages(config)
     assert [list(entry) for entry in presets.stages(config)["pruner"]] == [["ratio"]]
-    pipeline = presets.pipeline("sift_gms", overrides=["pruner=[lpm,ratio]"])
+    pipeline = load_pipeline("sift_gms", overrides=["pruner=[lpm,ratio]"])
     assert list(pipeline.pruners_of("CPC")) == ["lpm", "ratio"]
 
 

@@ -20,8 +20,9 @@ MAY_IMPORT = {
     "data": "core compiling",
     "storage": GROUND + " data",
     "presets": "core data storage",
-    "pipeline": GROUND + " data storage presets",
-    "evaluation": GROUND + " metrics data storage presets pipeline",
+    "two_view": GROUND + " estimators pruning presets",
+    "pipeline": GROUND + " data storage presets two_view",
+    "evaluation": GROUND + " metrics data storage presets two_view pipeline",
     "training": " ".join(room for room in ROOMS if room != "commands"),
     "commands": " ".join(ROOMS),
 }

@@ -8,7 +8,6 @@ import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import hydra.utils
 import pyarrow as pa
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
@@ -26,11 +25,13 @@ from fmtorch.evaluation.plots import plot_recall_curves
 from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import ALL, Group, summarize
 from fmtorch.evaluation.summary_tables import further_tables, pose_table, summary_markdown, summary_table
+from fmtorch.pipeline.build import build_pipeline
 from fmtorch.pipeline.exporting import exportable
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
 from fmtorch.presets.executors import execution_of
 from fmtorch.presets.fields import Cache, Count, Device, Gigabytes, Seed, path_fields, read_fields
+from fmtorch.presets.objects import target_of
 from fmtorch.storage import RunFolder, identity_digest
 from fmtorch.storage.exchange.export import export_kinds, write_exports
 from fmtorch.storage.exchange.journal import Journal
@@ -81,7 +82,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     if model != "fundamental" and (exports or fields.cameras is not None):
         raise ValueError(f"the data set has {model} matrices, which take no export= and no cameras=: leave them out")
     with progress_bars() as progress:
-        pipeline: Pipeline = presets.build_pipeline(config, device, model)
+        pipeline: Pipeline = build_pipeline(config, device, model)
         dataset = _load(config.dataset, progress)
         folder = _open_folder(config, fields, pipeline_name, pipeline, dataset)
         pairs = select([dataset[i] for i in range(len(dataset))], fields.limit)
@@ -139,7 +140,7 @@ def _evaluated(
     execution = execution_of(config, fields.workers, fields.processes).decided(parallel)
     if execution.shared and execution.workers is None and pipeline.device.type != "cpu":
         execution = dataclasses.replace(execution, workers=1)
-    build = None if execution.shared else functools.partial(presets.build_pipeline, config, pipeline.device, None)
+    build = None if execution.shared else functools.partial(build_pipeline, config, pipeline.device, None)
     cameras = None
     if fields.cameras is not None:
         cameras = cameras_of(pairs, fields.cameras)
@@ -188,7 +189,7 @@ def _model(config: DictConfig) -> str:
     options = plain(config)
     if "_target_" not in options:
         return data.model_of(str(options.get("name")))
-    model: str = getattr(hydra.utils.get_object(str(options["_target_"])), "model", "fundamental")
+    model: str = getattr(target_of(options, "dataset"), "model", "fundamental")
     return model
 
 

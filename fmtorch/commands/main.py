@@ -23,7 +23,6 @@ from fmtorch.core.terminal import MISTAKES, error_line, exits_with_message
 from fmtorch.core.version import __version__
 from fmtorch.presets import available, top_level_names
 from fmtorch.presets.files import groups
-from fmtorch.presets.former import moved
 from fmtorch.presets.pruners import with_explicit
 
 Task = Callable[[DictConfig], None]
@@ -123,7 +122,7 @@ def _missing(file: str, options: Sequence[str]) -> str:
     if group not in groups():
         group, _, name = file.rpartition("/")
     there_are = nearest(name, {*(options if "/" not in name else ()), *available(group)})
-    return moved(group, name, command=True) or f"no preset {name!r} in {group}; there are: {there_are or 'none'}"
+    return f"no preset {name!r} in {group}; there are: {there_are or 'none'}"
 
 
 def _line(text: str) -> str:

@@ -29,6 +29,7 @@ from fmtorch.core.types import RELATED
 from fmtorch.core.version import __version__
 from fmtorch.evaluation.pictures import draw_epipolar_lines, draw_matches
 from fmtorch.metrics import nsgd
+from fmtorch.pipeline.build import build_pipeline
 from fmtorch.pipeline.folder_images import EXHAUSTIVE
 from fmtorch.pipeline.photograph_cameras import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
@@ -70,7 +71,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     image0, image1 = given.images
     folder = fields.output or _default_output(paths)
     expect_writable(folder)
-    pipeline: Pipeline = presets.build_pipeline(config, presets.resolve_device(fields.device))
+    pipeline: Pipeline = build_pipeline(config, presets.resolve_device(fields.device))
     result = match(
         image0, image1, pipeline=pipeline, longest_side=fields.longest_side, seed=fields.seed, **given.knowledge
     )

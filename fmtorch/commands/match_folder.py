@@ -24,6 +24,7 @@ from fmtorch.core.terminal import console, errors, progress_bars
 from fmtorch.data.images import read_image
 from fmtorch.evaluation.view_graph_picture import view_graph_svg
 from fmtorch.features.vlad import descriptor_kind, image_vector
+from fmtorch.pipeline.build import build_pipeline
 from fmtorch.pipeline.folder import MEMORY, FolderMatches
 from fmtorch.pipeline.folder_images import SIMILAR, chosen_pairs, count_of, images_below
 from fmtorch.pipeline.folder_output import default_output, open_folder
@@ -71,7 +72,7 @@ def match_folder(
     presets.expect_stages(config)
     stages = presets.stages(config)
     vector = functools.partial(image_vector, kind=descriptor_kind(stages["features"])) if similar else None
-    pipeline: Pipeline = presets.build_pipeline(config, presets.resolve_device(fields.device))
+    pipeline: Pipeline = build_pipeline(config, presets.resolve_device(fields.device))
     if isinstance(pipeline.matcher, ImageMatcher):
         raise ValueError("images: a folder is matched by keypoints of each image; this matcher takes pairs of images")
     output = fields.output or default_output(folder)
@@ -119,7 +120,7 @@ def _team(config: DictConfig, fields: FolderFields, pipeline: Pipeline, pairs: i
     torch.multiprocessing.set_sharing_strategy(SHARED_BY)  # type: ignore[no-untyped-call]
     try:
         executor = team.executor  # which tells how many workers it has
-        build = functools.partial(presets.build_pipeline, config, pipeline.device)
+        build = functools.partial(build_pipeline, config, pipeline.device)
         yield {"executor": executor, "workers": team.size, "build": build, "send_images": execution.send_images}
     except BrokenExecutor as error:
         raise WorkersLost(

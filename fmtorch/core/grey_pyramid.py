@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,6 +30,8 @@ def grey_pyramid(image: NDArray[np.uint8]) -> GreyPyramid:
 
     Every other sample is taken of an image smoothed by a binomial filter; what is kept of each is smoothed slightly.
     """
+    import cv2  # not before an image is there: protocols of matches alone name this file
+
     images: list[Any] = [image]
     while len(images) < LEVELS and min(images[-1].shape) >= MIN_SIDE:
         images.append(cv2.pyrDown(images[-1]))

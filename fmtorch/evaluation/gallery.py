@@ -15,6 +15,7 @@ from fmtorch import data, presets
 from fmtorch.data import DataError, ImageError, ImagePair, PairDataset, read_image
 from fmtorch.evaluation.page import Picture, Shown, ShownPair, differing_pairs
 from fmtorch.evaluation.redraw import difference, drawn, from_stored
+from fmtorch.pipeline.build import build_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.storage import RunFolder
 from fmtorch.storage.exchange.dataset import WITHOUT_GEOMETRY
@@ -132,9 +133,8 @@ def rebuilt(r: Run, options: Options) -> Pipeline:
         raise ValueError(
             f"it has parts of your own ({', '.join(sorted(foreign))}), which a report loads with own_code=true"
         )
-    config = {**presets.composed(stages), "cache": options.cache, "cache_limit": options.cache_limit}
-    built: Pipeline = presets.build_pipeline(OmegaConf.create(config), options.device, None)
-    return built
+    cache = {"cache": options.cache, "cache_limit": options.cache_limit}
+    return build_pipeline(OmegaConf.create({**presets.composed(stages), **cache}), options.device, None)
 
 
 def shown_pair(pair: ImagePair, runs: Sequence[Run], pipelines: Mapping[str, Pipeline | None]) -> ShownPair:

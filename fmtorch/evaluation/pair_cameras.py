@@ -15,8 +15,8 @@ from fmtorch.core.stages import Estimator
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data.exif import exif_focal
 from fmtorch.data.pairs import ImagePair
-from fmtorch.pipeline.known_cameras import KnownCameras
 from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.two_view.known_cameras import KnownCameras
 
 Cameras = Literal["known", "shared", "exif", "unknown"]
 UNKNOWN, EXACT = (1.0, math.inf), (1.0, 0.0)  # px, relative deviation; K stands for the pixels of an exact one

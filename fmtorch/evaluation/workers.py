@@ -15,13 +15,13 @@ from pathlib import Path
 from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
 from fmtorch.evaluation.pair_cameras import PairCameras, WithPairCameras
 from fmtorch.evaluation.rows import evaluate
-from fmtorch.pipeline.configuration import compile_with
 from fmtorch.pipeline.examination import examined
 from fmtorch.pipeline.exporting import keep_outcomes
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.storage import PairRow
 from fmtorch.storage.exchange.collected import CollectedJournal
 from fmtorch.storage.features import CachedFeatures
+from fmtorch.two_view.pair_type import compile_with
 
 Build = Callable[[], Pipeline]
 

@@ -4,13 +4,18 @@ Their results are tensors; sizes may also be tuples (h, w).
 `fmtorch.metrics.torchmetrics` has thin classes over them that accumulate over batches and processes.
 """
 
-from fmtorch.metrics.homography import corner_error, right_of_homography
-from fmtorch.metrics.inlier_rate import InlierRate, ground_truth_inliers, inlier_rate
-from fmtorch.metrics.nsgd import nsgd, sgd
-from fmtorch.metrics.nsgd_released import nsgd_released
-from fmtorch.metrics.pose import PoseError, closest_pose_error, fundamental_pose_error, pose_error
-from fmtorch.metrics.pose_recall import pose_auc, pose_maa, pose_map
-from fmtorch.metrics.recall import mean_recall, recall, recall_curve
+from typing import TYPE_CHECKING
+
+from fmtorch.core.lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from fmtorch.metrics.homography import corner_error, right_of_homography
+    from fmtorch.metrics.inlier_rate import InlierRate, ground_truth_inliers, inlier_rate
+    from fmtorch.metrics.nsgd import nsgd, sgd
+    from fmtorch.metrics.nsgd_released import nsgd_released
+    from fmtorch.metrics.pose import PoseError, closest_pose_error, fundamental_pose_error, pose_error
+    from fmtorch.metrics.pose_recall import pose_auc, pose_maa, pose_map
+    from fmtorch.metrics.recall import mean_recall, recall, recall_curve
 
 __all__ = [
     "InlierRate",
@@ -32,3 +37,5 @@ __all__ = [
     "right_of_homography",
     "sgd",
 ]
+
+lazy_exports(__name__)

@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 
 from fmtorch.core.types import Correspondences, pair_key
-from fmtorch.pipeline.camera_arguments import UNKNOWN
 from fmtorch.storage.exchange.database_images import DatabaseImage
+from fmtorch.two_view.arguments import UNKNOWN
 
 Cameras = Literal["stored", "shared", "unknown"]
 """What is taken for known: the cameras of the database, that both images have one focal length, or nothing."""

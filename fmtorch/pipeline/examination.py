@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 from fmtorch.core.stages import model_of
 from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Correspondences, collate
-from fmtorch.pipeline.configuration import classify
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
+from fmtorch.two_view.pair_type import classify
 
 Knowledge = Callable[[Correspondences], Correspondences]
 

@@ -10,7 +10,7 @@ import torch
 from fmtorch.core.stages import PairImages
 from fmtorch.core.types import Correspondences, Estimate, collate
 from fmtorch.data.pairs import ImagePair
-from fmtorch.pipeline.configuration import Configuration
+from fmtorch.two_view.pair_type import Configuration
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

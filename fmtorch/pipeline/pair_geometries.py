@@ -12,8 +12,8 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.geometry.configuration import GENERAL, IDENTICAL, PLANAR, ROTATION
-from fmtorch.pipeline.configuration import FOCAL_DEVIATION, Configuration
 from fmtorch.storage.exchange.two_view import Kind, PairGeometry
+from fmtorch.two_view.pair_type import FOCAL_DEVIATION, Configuration
 
 KINDS: dict[int, Kind] = {PLANAR: "planar", ROTATION: "panoramic", IDENTICAL: "planar_or_panoramic"}
 MAX_CONFLICT = 3.0  # deviations, of an estimated focal length from that of a camera that counts as calibrated

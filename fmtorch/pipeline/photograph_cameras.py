@@ -11,8 +11,8 @@ from fmtorch.data.exif import exif_focal
 from fmtorch.data.image_cameras import ImageCameras
 from fmtorch.data.lenses import Lens
 from fmtorch.data.pairs import ImageSource
-from fmtorch.pipeline.camera_arguments import camera_fields
 from fmtorch.storage.configuration import file_digest
+from fmtorch.two_view.arguments import camera_fields
 
 WORDS = ("unknown", "shared", "exif")
 

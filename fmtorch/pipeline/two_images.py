@@ -19,12 +19,10 @@ from fmtorch.core.threads import mapped, one_thread
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data.lenses import Lens
 from fmtorch.geometry.verdict import judged
-from fmtorch.pipeline.camera_arguments import Focal, camera_fields
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.clock import Clock
-from fmtorch.pipeline.configuration import classify, compile_with, still_warning
 from fmtorch.pipeline.described import Described as Described
 from fmtorch.pipeline.described import describe as describe
-from fmtorch.pipeline.known_cameras import KnownCameras
 from fmtorch.pipeline.match_result import MatchResult as MatchResult
 from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.pipeline.pipeline import Pipeline
@@ -39,6 +37,9 @@ from fmtorch.pipeline.reduced_images import (
     to_original,
     undistorted_matches,
 )
+from fmtorch.two_view.arguments import Focal, camera_fields
+from fmtorch.two_view.known_cameras import KnownCameras
+from fmtorch.two_view.pair_type import classify, compile_with, still_warning
 
 NOTHING_KNOWN: Mapping[str, Tensor] = {}
 NO_CAMERAS: Mapping[str, None] = dict.fromkeys(("K0", "K1", "focal", "shared_focal"))  # of the reduced images
@@ -63,7 +64,7 @@ def match(
 
     Args:
         image0, image1: files, turned as their EXIF orientation says, or uint8 arrays, (H, W) or RGB (H, W, 3).
-        pipeline: a preset of conf/pipeline, or a `Pipeline` (``presets.pipeline("sift_gms", overrides=[...])``).
+        pipeline: a preset of conf/pipeline, or a `Pipeline` (``load_pipeline("sift_gms", overrides=[...])``).
         device: of a pipeline given by name; None: a GPU where there is one.
         longest_side: larger images are reduced to it for matching, and thresholds are in pixels of the reduced images;
             the results are always in pixels of the originals.
@@ -130,8 +131,7 @@ def relate(
 
 @functools.lru_cache(maxsize=8)
 def _pipeline(name: str, device: str) -> Pipeline:
-    built: Pipeline = presets.pipeline(name, device)
-    return built
+    return load_pipeline(name, device)
 
 
 def _matched(pipeline: Pipeline, described: Sequence[Described], clock: Clock) -> MatchResult:

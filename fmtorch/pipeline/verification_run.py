@@ -17,14 +17,14 @@ from fmtorch.core.recipes import Here, Recipe, Source
 from fmtorch.core.shards import Shard
 from fmtorch.core.stages import Estimator
 from fmtorch.core.types import Correspondences, collate
-from fmtorch.pipeline.configuration import classify
 from fmtorch.pipeline.database_pairs import Cameras, DatabasePair, as_correspondences
-from fmtorch.pipeline.estimation import estimated_by
 from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.storage.exchange.database_images import DatabaseImage
 from fmtorch.storage.exchange.geometry_parts import GeometryParts
 from fmtorch.storage.exchange.two_view import PairGeometry
 from fmtorch.storage.exchange.verification_log import VerificationLog
+from fmtorch.two_view.estimation import estimated_by
+from fmtorch.two_view.pair_type import classify
 
 BATCH = 64  # pairs that are read, and written, at a time
 PRELOADED = ("fmtorch.pipeline.verification_run",)  # by the process that workers are forked of

@@ -1,32 +1,36 @@
 """Presets: the flat YAML files of ``conf/<group>/<name>.yaml``, loaded by name and built into objects.
 
-With the commands this is the only user of Hydra and OmegaConf.
+`files` and `objects` need neither Hydra nor OmegaConf, which compose the configs of commands and pipelines.
 """
 
-from fmtorch.presets.composition import (
-    STAGES,
-    build_pipeline,
-    composed,
-    expect_dataset,
-    expect_stages,
-    pipeline,
-    pipeline_stages,
-    stages,
-)
-from fmtorch.presets.files import (
-    available,
-    closest,
-    known_targets,
-    load,
-    own_modules,
-    peer_packages,
-    targets_of,
-    top_level_names,
-)
-from fmtorch.presets.objects import build, expect_buildable, instantiate, plain, resolve_device
+from typing import TYPE_CHECKING
+
+from fmtorch.core.lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from fmtorch.presets.composition import (
+        STAGES,
+        composed,
+        expect_dataset,
+        expect_stages,
+        pipeline_stages,
+        plain,
+        stages,
+    )
+    from fmtorch.presets.files import (
+        available,
+        closest,
+        known_targets,
+        load,
+        targets_of,
+        top_level_names,
+    )
+    from fmtorch.presets.objects import build, expect_buildable, instantiate, own_modules, peer_packages, resolve_device
 
 __all__ = [
-    "STAGES", "available", "build", "build_pipeline", "closest", "composed", "expect_buildable", "expect_dataset",
-    "expect_stages", "instantiate", "known_targets", "load", "own_modules", "peer_packages", "pipeline",
+    "STAGES", "available", "build", "closest", "composed", "expect_buildable", "expect_dataset",
+    "expect_stages", "instantiate", "known_targets", "load", "own_modules", "peer_packages",
     "pipeline_stages", "plain", "resolve_device", "stages", "targets_of", "top_level_names",
 ]  # fmt: skip
+
+lazy_exports(__name__)

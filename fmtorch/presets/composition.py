@@ -9,23 +9,17 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-import hydra.utils
-import torch
 from hydra.core.global_hydra import GlobalHydra
-from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from fmtorch import data
 from fmtorch.core.resources import conf_dir
 from fmtorch.presets import hydra_source
-from fmtorch.presets.files import available, unknown
-from fmtorch.presets.former import FORMER, Now
-from fmtorch.presets.objects import expect_buildable, instantiate, open_files, plain
-from fmtorch.presets.pruners import build_pruners, expect_pruners, pruner_configs, with_explicit
-from fmtorch.storage.features import cached
+from fmtorch.presets.files import available
+from fmtorch.presets.objects import expect_buildable
+from fmtorch.presets.pruners import expect_pruners, pruner_configs, with_explicit
 
 STAGES = ("features", "matcher", "pruner", "estimator")  # groups that a pipeline chooses from
-PIPELINE = "fmtorch.pipeline.pipeline.Pipeline"  # by name, as the stages: presets know nothing of what they build
 _composing = threading.Lock()  # Hydra composes through a global
 hydra_source.register()
 
@@ -40,12 +34,17 @@ def stages(config: DictConfig) -> dict[str, Any]:
     return {**plain, "pruner": [{name: value} for name, value in pruner_configs(config).items()]}
 
 
+def plain(config: Any) -> dict[str, Any]:
+    """A part of a config as a dictionary without interpolations; empty for null."""
+    container = OmegaConf.to_container(config, resolve=True) if isinstance(config, DictConfig) else {}
+    assert isinstance(container, dict)
+    return {str(key): value for key, value in container.items()}
+
+
 @functools.cache
 def pipeline_stages(name: str) -> dict[str, Any] | None:
-    """The `stages` of the project's own pipeline `name`, unchanged; None where it has, and had, no such pipeline."""
-    now = FORMER["pipeline"].get(name, Now(name))
-    known = now.name in available("pipeline")
-    return stages(compose("match", (f"pipeline={now.name}", *now.overrides))) if known else None
+    """The `stages` of the project's own pipeline `name`, unchanged; None where it has no such pipeline."""
+    return stages(compose("match", (f"pipeline={name}",))) if name in available("pipeline") else None
 
 
 def composed(stages: Mapping[str, Any]) -> dict[str, Any]:
@@ -71,66 +70,20 @@ def expect_dataset(config: DictConfig) -> None:
         data.expect_loadable(**options)
 
 
-def build_pipeline(config: DictConfig, device: torch.device | str = "cpu", model: str | None = "fundamental") -> Any:
-    """The `Pipeline` that features (with cache), matcher, pruner and estimator of a composed config describe.
+def compose(config_name: str, overrides: Sequence[str], config_dir: Path | None = None) -> DictConfig:
+    """The config that a command composes from its arguments; a caller's own Hydra stays as it is.
 
-    model: what the estimator must give, "fundamental" or "homography"; None: either.
+    config_dir: a folder with a user's presets, which are read anew.
     """
-    extractor = cached(instantiate(config.features, "features"), config.cache, config.cache_limit)
-    pruners, for_families = build_pruners(config)
-    open_files([extractor, pruners, for_families], torch.device(device))  # a damaged one is no failure of each pair
-    return hydra.utils.get_object(PIPELINE)(
-        extractor,
-        instantiate(config.matcher, "matcher"),
-        pruners,
-        instantiate(config.estimator, "estimator"),
-        device=device,
-        families=for_families,
-        model=model,
-    )
-
-
-def pipeline(
-    name: str,
-    device: torch.device | str = "cpu",
-    overrides: Sequence[str] = (),
-    config_dir: Path | str | None = None,
-) -> Any:
-    """The `Pipeline` of ``conf/pipeline/<name>.yaml``, changed by `overrides` as on the command line.
-
-    E.g. ``pipeline("sift_gms", overrides=["estimator=lmeds", "pruner.gms.with_scale=true"])``. Unlike the commands it
-    keeps no features on disk unless asked to (``overrides=["cache=null"]``, or a folder).
-
-    Args:
-        name: a preset of conf/pipeline, or of `config_dir`.
-        device: where features are described and everything behind them is computed.
-        overrides: as words of a command.
-        config_dir: a folder with presets of your own, as the commands take it by `--config-dir`.
-
-    Raises:
-        ValueError: for an unknown pipeline, naming those there are, for an override that does not apply, and where
-            `config_dir` is no folder.
-    """
-    if config_dir is not None and not Path(config_dir).is_dir():
-        raise ValueError(f"config_dir={config_dir} is no folder")
-    if name not in available("pipeline", config_dir):
-        raise ValueError(unknown("pipeline", name, config_dir))
-    words = (f"pipeline={name}", "cache=off", *overrides)
-    try:
-        config = compose("match", words) if config_dir is None else _composed("match", words, Path(config_dir))
-    except HydraException as error:
-        raise ValueError(f"pipeline={name} with {', '.join(overrides)}: {error}") from error
-    return build_pipeline(config, device)
+    return _kept(config_name, tuple(overrides)) if config_dir is None else _composed(config_name, overrides, config_dir)
 
 
 @functools.lru_cache(maxsize=64)
-def compose(config_name: str, overrides: tuple[str, ...]) -> DictConfig:
-    """The config that a command composes from its arguments; a caller's own Hydra stays as it is."""
+def _kept(config_name: str, overrides: tuple[str, ...]) -> DictConfig:
     return _composed(config_name, overrides)
 
 
 def _composed(config_name: str, overrides: Sequence[str], config_dir: Path | None = None) -> DictConfig:
-    """The same, read anew, with a user's presets."""
     own = [] if config_dir is None else [f"hydra.searchpath=['file://{config_dir.resolve()}']"]
     with _composing:
         hydra_of_caller, GlobalHydra.instance().hydra = GlobalHydra.instance().hydra, None

@@ -10,8 +10,9 @@ from typing import cast
 from omegaconf import DictConfig
 
 from fmtorch.core.executors import Execution
+from fmtorch.presets.composition import plain
 from fmtorch.presets.fields import Count, read_fields
-from fmtorch.presets.objects import expect_buildable, instantiate, plain
+from fmtorch.presets.objects import expect_buildable, instantiate
 
 
 @dataclasses.dataclass(frozen=True)

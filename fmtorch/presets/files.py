@@ -9,14 +9,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import hydra.utils
 import yaml  # type: ignore[import-untyped]
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from fmtorch.core.options import nearest
 from fmtorch.core.resources import conf_dir
-from fmtorch.presets.former import moved
 
 
 def available(group: str, config_dir: Path | str | None = None) -> list[str]:
@@ -52,7 +48,7 @@ def load(group: str, name: str, config_dir: Path | str | None = None) -> dict[st
         path = folder / group / f"{name}.yaml"
         if path.is_file():
             with naming_file(path):
-                values = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
+                values = _read(path)
             if not isinstance(values, dict):
                 raise ValueError(f"{path}: a preset is a mapping with a `_target_`, the dotted name of what it builds")
             return {str(key): value for key, value in values.items()}
@@ -60,9 +56,44 @@ def load(group: str, name: str, config_dir: Path | str | None = None) -> dict[st
 
 
 def unknown(group: str, name: str, config_dir: Path | str | None = None) -> str:
-    """What is said of a preset that there is not: where it went, or which there are."""
-    there_are = nearest(name, available(group, config_dir))
-    return moved(group, name) or f"no preset {name!r} in conf/{group}; there are: {there_are}"
+    """What is said of a preset that there is not."""
+    return f"no preset {name!r} in conf/{group}; there are: {nearest(name, available(group, config_dir))}"
+
+
+def _read(path: Path) -> Any:
+    text = path.read_text(encoding="utf-8")
+    values = yaml.load(text, _Loader)
+    if "${" not in text:
+        return values
+    from omegaconf import OmegaConf  # for presets of a user's whose options refer to others or to the environment
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        return OmegaConf.to_container(OmegaConf.create(values), resolve=True)
+    except OmegaConfBaseException as error:
+        raise ValueError(f"{path}: {str(error).partition(chr(10))[0]}") from error
+
+
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    """YAML as OmegaConf reads it: 1e-3 is a number, a date is text, and a mapping has no key twice."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        """Raises ConstructorError where a key stands twice."""
+        keys = [key.value for key, _ in node.value]
+        for i, (key, _) in enumerate(node.value):
+            if key.value in keys[:i]:
+                raise yaml.constructor.ConstructorError(
+                    "while constructing a mapping", node.start_mark, f"found duplicate key {key.value}", key.start_mark
+                )
+        return super().construct_mapping(node, deep=deep)
+
+
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if not tag.endswith(":timestamp")]
+    for first, resolvers in _Loader.yaml_implicit_resolvers.items()
+}
+_EXPONENT = re.compile(r"[-+]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)[eE][-+]?\d+$")
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT, list("-+.0123456789"))
 
 
 @contextlib.contextmanager
@@ -74,8 +105,6 @@ def naming_file(path: Path | str) -> Iterator[None]:
         mark = error.problem_mark
         line = "" if mark is None else f"line {mark.line + 1}, column {mark.column + 1}: "
         raise ValueError(f"{path}: {line}{error.problem or error.context}; a preset is a mapping in YAML") from error
-    except OmegaConfBaseException as error:
-        raise ValueError(f"{path}: {str(error).partition(chr(10))[0]}") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: no text in UTF-8; a preset is a mapping in YAML") from error
 
@@ -115,23 +144,8 @@ def targets_of(config: object) -> frozenset[str]:
     return frozenset()
 
 
-def peer_packages(config: object) -> list[str]:
-    """The packages of other libraries whose versions decide what the targets within a config compute, sorted."""
-    packages = {getattr(hydra.utils.get_object(target), "peer_package", None) for target in targets_of(config)}
-    return sorted(package for package in packages if package)
-
-
-def own_modules(config: object) -> dict[str, str]:
-    """The modules that define the targets within a config that are none of this project's, by the targets' names."""
-    own = sorted(name for name in targets_of(config) if name.partition(".")[0] != "fmtorch")
-    return {
-        name: str(getattr(hydra.utils.get_object(name), "__module__", None) or name.rpartition(".")[0]) for name in own
-    }
-
-
 def top_level_names(config_name: str) -> list[str]:
     """What the command of this config takes by name: its fields and the groups it chooses from."""
-    fields = OmegaConf.load(conf_dir() / f"{config_name}.yaml")
-    assert isinstance(fields, DictConfig)
+    fields = _read(conf_dir() / f"{config_name}.yaml")
     groups = [str(group) for entry in fields.get("defaults", []) if entry != "_self_" for group in entry]
     return [name for name in (*map(str, fields), *groups) if name not in ("defaults", "hydra") and " " not in name]

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, TypeVar
 
-import hydra.utils
 import torch
-from omegaconf import DictConfig, OmegaConf
 
 from fmtorch.core.options import expect_options
-from fmtorch.presets.files import load
+from fmtorch.presets.files import load, targets_of
+
+T = TypeVar("T")
 
 
 def build(group: str, name: str, config_dir: Path | str | None = None, **options: Any) -> Any:
@@ -32,56 +34,84 @@ def merged(config: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, A
     return {**config, **changes}
 
 
-def plain(config: Any) -> dict[str, Any]:
-    """A part of a config as a dictionary without interpolations; empty for null."""
-    container = OmegaConf.to_container(config, resolve=True) if isinstance(config, DictConfig) else {}
-    assert isinstance(container, dict)
-    return {str(key): value for key, value in container.items()}
-
-
-def instantiate(config: Mapping[str, Any] | DictConfig, where: str, **extra: Any) -> Any:
+def instantiate(config: Mapping[str, Any], where: str, **extra: Any) -> Any:
     """The object of a config with a `_target_`; `where` names the config in errors, `extra` arguments are added.
 
     A value that is a mapping with a `_target_` of its own becomes an object first.
     Raises ValueError where `expect_buildable` does; what the target itself raises passes through.
     """
-    values = plain(config) if isinstance(config, DictConfig) else config
-    expect_buildable(values, where, extra)
-    return _instantiated(values, where, extra)
+    return construct(target_of(config, where), config, where, **extra)
+
+
+def construct(make: Callable[..., T], config: Mapping[str, Any], where: str, **extra: Any) -> T:
+    """The same with the target given: of the entries of a config but for its `_target_`."""
+    _expect_constructible(make, config, where, extra)
+    return _constructed(make, config, where, extra)
 
 
 def expect_buildable(config: Mapping[str, Any], where: str, given: Iterable[str] = ()) -> None:
     """Raises ValueError, naming the option, where a config, or one within it, does not fit its target's signature."""
-    if not isinstance(config, Mapping) or "_target_" not in config:
-        raise ValueError(f"{where}: a preset is a mapping with a `_target_`, the dotted name of what it builds")
+    _expect_constructible(target_of(config, where), config, where, given)
+
+
+def _expect_constructible(
+    make: Callable[..., Any], config: Mapping[str, Any], where: str, given: Iterable[str]
+) -> None:
     values = {str(key): value for key, value in config.items() if key != "_target_"}
-    expect_options(_target(config, where), values, where, given)
+    expect_options(make, values, where, given)
     for key, value in values.items():
         if _is_object(value):
             expect_buildable(value, f"{where}.{key}")
+
+
+def _constructed(make: Callable[..., T], config: Mapping[str, Any], where: str, extra: Mapping[str, Any]) -> T:
+    built = {
+        str(key): _constructed(target_of(value, place), value, place, {}) if _is_object(value) else value
+        for key, value, place in ((key, value, f"{where}.{key}") for key, value in config.items() if key != "_target_")
+    }
+    return make(**built, **extra)
 
 
 def _is_object(value: object) -> bool:
     return isinstance(value, Mapping) and "_target_" in value
 
 
-def _target(config: Mapping[str, Any], where: str) -> Callable[..., Any]:
+def target_of(config: Mapping[str, Any], where: str) -> Callable[..., Any]:
+    """What the `_target_` of a config names. Raises ValueError where there is none, or it cannot be imported."""
+    if not _is_object(config):
+        raise ValueError(f"{where}: a preset is a mapping with a `_target_`, the dotted name of what it builds")
     name = str(config["_target_"])
     try:
-        target: Callable[..., Any] = hydra.utils.get_object(name)
-    except (ImportError, ValueError) as error:
-        cause = " ".join(str(error.__cause__ or error).split())
-        raise ValueError(f"{where}: _target_={name} cannot be imported: {cause}") from error
+        target: Callable[..., Any] = _located(name)
+    except Exception as error:  # what a module of a user's raises while it is imported
+        raise ValueError(f"{where}: _target_={name} cannot be imported: {' '.join(str(error).split())}") from error
     return target
 
 
-def _instantiated(config: Mapping[str, Any], where: str, extra: Mapping[str, Any]) -> Any:
-    built = {
-        str(key): _instantiated(value, f"{where}.{key}", {}) if _is_object(value) else value
-        for key, value in config.items()
-        if key != "_target_"
-    }
-    return _target(config, where)(**built, **extra)
+def _located(name: str) -> Any:
+    """What a dotted name names; modules on the way to it are imported."""
+    parts = name.split(".")
+    value: Any = importlib.import_module(parts[0])
+    for i, part in enumerate(parts[1:], start=2):
+        try:
+            value = getattr(value, part)
+        except AttributeError:
+            if not isinstance(value, ModuleType):
+                raise
+            value = importlib.import_module(".".join(parts[:i]))
+    return value
+
+
+def peer_packages(config: object) -> list[str]:
+    """The packages of other libraries whose versions decide what the targets within a config compute, sorted."""
+    packages = {getattr(_located(target), "peer_package", None) for target in targets_of(config)}
+    return sorted(package for package in packages if package)
+
+
+def own_modules(config: object) -> dict[str, str]:
+    """The modules that define the targets within a config that are none of this project's, by the targets' names."""
+    own = sorted(name for name in targets_of(config) if name.partition(".")[0] != "fmtorch")
+    return {name: str(getattr(_located(name), "__module__", None) or name.rpartition(".")[0]) for name in own}
 
 
 def resolve_device(name: str) -> torch.device:

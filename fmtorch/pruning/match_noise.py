@@ -54,7 +54,7 @@ def _scale(lafs: Float[Tensor, "b n 2 3"]) -> Float[Tensor, "b n"]:
 class MatchNoise:
     """Supplies ``noise`` by `match_noise`; matches without frames are left as they are.
 
-    `HypothesizeAndVerify` divides each match's residual by it, in its scores (but not that of the median) and in its
+    `Ransac` divides each match's residual by it, in its scores (but not that of the median) and in its
     non-linear fits; the 8-point algorithm, the `irls_*` estimators and other libraries do not look at it. Inliers are
     reported by their distance in pixels all the same. usual, radius, slope: see `match_noise`.
     """

@@ -29,8 +29,8 @@ from fmtorch.core.types import Correspondences, collate
 from fmtorch.estimators.peers import colmap
 from fmtorch.evaluation.pair_cameras import EXACT
 from fmtorch.geometry import poses_from_homography
-from fmtorch.pipeline.configuration import classify
-from fmtorch.pipeline.known_cameras import KnownCameras
+from fmtorch.two_view.known_cameras import KnownCameras
+from fmtorch.two_view.pair_type import classify
 from scripts.benchmark import matched
 from scripts.benchmark.configuration_pairs import Case, photographs
 from scripts.benchmark.matched import console

@@ -24,6 +24,7 @@ from fmtorch import presets
 from fmtorch.core.types import Correspondences
 from fmtorch.data import ImagePair, read_image
 from fmtorch.evaluation.run import select
+from fmtorch.pipeline.build import load_pipeline
 from scripts.benchmark.matched import add_set_arguments, console, sets_of
 from scripts.benchmark.sheet import MISSING, Sheet, put
 
@@ -43,7 +44,7 @@ def run(arguments: argparse.Namespace) -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     pairs = select([dataset[i] for dataset in sets_of(arguments) for i in range(len(dataset))], arguments.limit)
-    front = presets.pipeline("paper/sift_ratio", overrides=["features=sift_vlfeat"])
+    front = load_pipeline("paper/sift_ratio", overrides=["features=sift_vlfeat"])
     matches = [o.correspondences for o in front.match(pairs) if o.correspondences is not None]
     with PAPER.open(encoding="utf-8") as file:
         published = list(csv.DictReader(file))

@@ -23,7 +23,7 @@ MAX_ITERATIONS, MIN_ITERATIONS, CONFIDENCE = 1000, 100, 0.9999
 KINDS = ("E", "F")
 FOCAL_SAMPLES = 250  # of a round of our search with focal lengths
 IN_PIXELS = ("threshold", "inlier_threshold", "scale")  # options of our presets that are distances
-ENGINE = "fmtorch.estimators.HypothesizeAndVerify"
+ENGINE = "fmtorch.estimators.Ransac"
 NOT_SCALED = "scaled"  # false: our preset keeps its own distances
 
 

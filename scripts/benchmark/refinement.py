@@ -29,6 +29,7 @@ from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.run import select
 from fmtorch.evaluation.statistics import MERITS, PERCENT, SHARES, difference
 from fmtorch.geometry import sampson
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from scripts.benchmark.matched import add_set_arguments, console, groups, scenes, sets_of
 from scripts.benchmark.sheet import Sheet, put, shown
@@ -65,7 +66,7 @@ def run(arguments: argparse.Namespace) -> None:
     pairs = select([dataset[i] for dataset in sets_of(arguments) for i in range(len(dataset))], arguments.limit)
     lines = []
     for name in arguments.pipelines:
-        pipeline = presets.pipeline(name, overrides=[f"cache={arguments.cache}"])
+        pipeline = load_pipeline(name, overrides=[f"cache={arguments.cache}"])
         kept, before, after, ms = stages(pipeline, pairs, name)
         distance = np.array([[exactness(o) for o in outcomes] for outcomes in (before, after)]).T
         for estimator in arguments.estimators:

@@ -22,11 +22,12 @@ import pyarrow.parquet as pq
 import torch
 from rich.progress import track
 
-from fmtorch import metrics, presets
+from fmtorch import metrics
 from fmtorch.core.files import replacing
 from fmtorch.core.stages import pruned
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.data import ImagePair
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
 from scripts.benchmark import related_figure, related_table
 from scripts.benchmark.estimators_table import replaced
@@ -102,7 +103,7 @@ def matches(
 
     A pair whose images have no features has an empty mask.
     """
-    front: Pipeline = presets.pipeline(f"{feature}_ratio", overrides=[f"cache={folder / 'features'}"])
+    front: Pipeline = load_pipeline(f"{feature}_ratio", overrides=[f"cache={folder / 'features'}"])
     assert tuple(front.pruners) == SHARED
     kept = folder / "matches" / feature
     kept.mkdir(parents=True, exist_ok=True)

@@ -19,7 +19,6 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from fmtorch import presets
 from fmtorch.core.calls import Calls
 from fmtorch.core.executors import Execution, Team
 from fmtorch.core.recipes import Here, Recipe
@@ -27,6 +26,7 @@ from fmtorch.data.pairs import ImagePair
 from fmtorch.data.rendered import RenderedPairs
 from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import summarize
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.storage import PairRow, RunFolder
 from scripts.benchmark.scale_pairs import given_pairs
 
@@ -95,7 +95,7 @@ def stage_table(folder: Path, count: int) -> tuple[list[str], float]:
         )
         pairs = select(source, None)[: count if given else max(count // 10, 1)]
         run = RunFolder.open(folder / pipeline, {"pipeline": pipeline})
-        built = presets.pipeline(pipeline)
+        built = load_pipeline(pipeline)
         evaluated(built, pairs[:2], [].extend)  # compiles and loads
         start = time.perf_counter()
         evaluated(built, pairs, run.append)

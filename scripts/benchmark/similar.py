@@ -15,6 +15,7 @@ from rich.console import Console
 from fmtorch import presets
 from fmtorch.data import read_image
 from fmtorch.features.vlad import Codebook, codebook, descriptor_kind, load_codebook, local_descriptors, vlad
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pipeline.similar import similar_pairs
 from fmtorch.pipeline.two_images import describe
@@ -65,7 +66,7 @@ def run(arguments: argparse.Namespace) -> None:
     console = Console()
     pairs = {pair: scene for root in arguments.root for scene, pair in overlapping(root)}
     images = [path for root in sorted(arguments.root) for path in images_of(root).values()]
-    pipeline: Pipeline = presets.pipeline(arguments.pipeline)
+    pipeline: Pipeline = load_pipeline(arguments.pipeline)
     options = (presets.pipeline_stages(arguments.pipeline) or {})["features"]
     book = None if arguments.codebook is None else load_codebook(arguments.codebook)
     vectors, seconds = vectors_of(images, pipeline, options, book)

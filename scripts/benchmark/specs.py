@@ -14,6 +14,7 @@ from fmtorch.core.stages import Estimator, Pruner, pruned
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data import ImagePair, ImageSource, read_image, to_grey
 from fmtorch.geometry import refine
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
 from scripts.benchmark import kept
 from scripts.benchmark.matched import pruner, split
@@ -38,7 +39,7 @@ def stages_of(spec: str) -> list[str]:
 def pipeline_of(words: str, *overrides: str) -> Pipeline:
     """The pipeline of ``PRESET[ NAME=VALUE...]``, such as ``sift_ratio estimator=msac``, with further overrides."""
     name, *own = words.split()
-    pipeline: Pipeline = presets.pipeline(name, overrides=[*own, *overrides])
+    pipeline: Pipeline = load_pipeline(name, overrides=[*own, *overrides])
     return pipeline
 
 

@@ -21,7 +21,6 @@ from fmtorch.commands.report import run_folders
 from fmtorch.data.baselines import WIDE
 from fmtorch.evaluation.statistics import MERITS, PERCENT, SHARES, described, difference, scene_names
 from fmtorch.evaluation.summary import ALL, summarize
-from fmtorch.presets.former import FORMER
 from fmtorch.storage import RunFolder
 from scripts.benchmark.matched import console
 from scripts.benchmark.pipelines_table import PAPER, REAL
@@ -68,8 +67,6 @@ def run(arguments: argparse.Namespace) -> None:
 def method_of(config: Mapping[str, Any]) -> str:
     """The pipeline of a run and, where it is not the pipeline's own, its estimator: ``code estimator=lmeds``."""
     name = str(config["pipeline"])
-    if (now := FORMER["pipeline"].get(name)) is not None:
-        return " ".join((now.name, *now.overrides))
     estimator, usual = config.get("estimator"), presets.pipeline_stages(name)
     close = presets.closest("estimator", estimator) if usual and estimator and estimator != usual["estimator"] else None
     return name if close is None else f"{name} estimator={close[0]}"

@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from fmtorch import MatchResult, match, presets
+from fmtorch import MatchResult, match
 from fmtorch.core.stages import FeatureExtractor
 from fmtorch.data import load
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.storage.cache import ArrayCache
 from fmtorch.storage.features import CachedFeatures
 from tests.commands.test_eval import OPTIONS, evaluate, rows
@@ -137,7 +138,7 @@ def test_two_photographs(root: Path, tmp_path: Path) -> None:
     images = [root / "scene" / "Images" / f"{i:08d}.png" for i in (0, 1)]
 
     def matched(*overrides: str, longest_side: int = 1600) -> tuple[MatchResult, FeatureExtractor]:
-        pipeline = presets.pipeline("sift_gms", overrides=overrides)
+        pipeline = load_pipeline("sift_gms", overrides=overrides)
         return match(*images, pipeline=pipeline, longest_side=longest_side), pipeline.extractor
 
     folder = f"cache={tmp_path / 'cache'}"
@@ -166,7 +167,7 @@ def test_real_pairs_are_the_same(tmp_path: Path) -> None:
     first_pairs = [pairs[0], pairs[1]]
     options = ["estimator=lmeds", "estimator.hypotheses=200"]
     outcomes = [
-        presets.pipeline("sift_ratio", overrides=[*options, f"cache={cache}"]).run(first_pairs)
+        load_pipeline("sift_ratio", overrides=[*options, f"cache={cache}"]).run(first_pairs)
         for cache in ("off", tmp_path, tmp_path)
     ]
     for off, cold, warm in zip(*outcomes, strict=True):

@@ -27,6 +27,7 @@ from fmtorch.core.types import RELATED
 from fmtorch.data import ImageError, read_image
 from fmtorch.geometry import homography_points, sampson
 from fmtorch.metrics import nsgd
+from fmtorch.pipeline.build import load_pipeline
 from tests.conftest import own_cache, shared_path
 from tests.matching import stand_in
 from tests.processes import run_command
@@ -49,7 +50,7 @@ def stereo(h: int = 480, w: int = 640, seed: int = 0) -> tuple[np.ndarray, np.nd
 
 @pytest.fixture(scope="module")
 def pipeline() -> fmtorch.pipeline.pipeline.Pipeline:
-    return presets.pipeline("sift_gms", overrides=["features.max_features=1500", "estimator.hypotheses=500"])
+    return load_pipeline("sift_gms", overrides=["features.max_features=1500", "estimator.hypotheses=500"])
 
 
 def distance(F: torch.Tensor, shape: tuple[int, ...]) -> float:
@@ -229,7 +230,7 @@ LMEDS = ("estimator=lmeds_eight_point",)
 def test_an_f_of_photographs_with_nothing_in_common() -> None:
     """Some F is found, and the verdict tells that it means nothing."""
     overrides = [*LMEDS, "features.max_features=1500", "pruner.ratio.threshold=0.95"]
-    lenient = presets.pipeline("sift_ratio", overrides=overrides)
+    lenient = load_pipeline("sift_ratio", overrides=overrides)
     images = stereo()[0], stereo(seed=1)[0]
     result = fmtorch.match(*images, pipeline=lenient)
     assert result.ok
@@ -266,14 +267,14 @@ def test_every_pipeline_composes_by_name(name: str, tmp_path: Path, monkeypatch:
     stand_in.install(tmp_path, monkeypatch)
     for module in ("features.kornia_features", "matching.lightglue"):  # without fetching others' weights
         monkeypatch.setattr(f"fmtorch.{module}.pretrained", lambda load, *_: torch.nn.Identity())
-    built = presets.pipeline(name)
+    built = load_pipeline(name)
     assert built.pruners or name in ("aliked_lightglue", "disk_lightglue", "given_fmtorch")
 
 
 def test_overrides_and_a_callers_own_hydra() -> None:
     with initialize_config_dir(str(conf_dir()), version_base=None):
         before = GlobalHydra.instance().hydra
-        built = presets.pipeline("paper/sift_gms", overrides=["pruner.gms.with_scale=true"])
+        built = load_pipeline("paper/sift_gms", overrides=["pruner.gms.with_scale=true"])
         assert GlobalHydra.instance().hydra is before
         assert compose("match").longest_side == 1600
     assert list(built.pruners) == ["ratio", "gms"]
@@ -281,7 +282,7 @@ def test_overrides_and_a_callers_own_hydra() -> None:
     assert built.pruners["gms"].threshold_factor == 4  # type: ignore[attr-defined]
     assert not GlobalHydra.instance().is_initialized()
     with pytest.raises(ValueError, match=r"pruner\.gms\.angle"):
-        presets.pipeline("sift_gms", overrides=["pruner.gms.angle=1"])
+        load_pipeline("sift_gms", overrides=["pruner.gms.angle=1"])
 
 
 def run_python(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:

@@ -13,13 +13,13 @@ import torch
 from PIL import ExifTags, Image
 
 import fmtorch
-from fmtorch import presets
 from fmtorch.commands.match_cameras import photographs, pose_line, pose_report
 from fmtorch.data import ImageError, ImagePair, load
 from fmtorch.data.lenses import Lens
 from fmtorch.data.undistort_points import undistorted_points
 from fmtorch.geometry import sampson
 from fmtorch.metrics import nsgd, pose_error
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
 from tests.conftest import shared_path
 from tests.processes import run_command
@@ -34,7 +34,7 @@ def pair() -> ImagePair:
 
 @pytest.fixture(scope="module")
 def pipeline() -> Pipeline:
-    return presets.pipeline("sift_fmtorch")
+    return load_pipeline("sift_fmtorch")
 
 
 def matched(pair: ImagePair, pipeline: Pipeline, **cameras: object) -> fmtorch.MatchResult:

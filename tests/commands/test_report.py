@@ -23,6 +23,7 @@ from fmtorch.evaluation.page import Section, differing_pairs, render
 from fmtorch.evaluation.redraw import difference
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.summary import summarize
+from fmtorch.pipeline.build import build_pipeline
 from fmtorch.pipeline.pipeline import Outcome
 from fmtorch.presets.composition import compose
 from fmtorch.storage import PairRow, RunFolder, RunFolderError, to_table
@@ -161,7 +162,7 @@ def test_a_pipeline_is_drawn_again_as_it_was_and_a_difference_is_said(order: lis
         f"pruner=[{','.join(order)}]",
     ]
     config = compose("match", ("pipeline=sift_ratio", "cache=off", *overrides))
-    rows = evaluate(presets.build_pipeline(config).run([first, second], seed=3), seed=3)
+    rows = evaluate(build_pipeline(config).run([first, second], seed=3), seed=3)
     F = np.array([0, 0, 1, 0, 0, 0, -1, 0, 0]) / np.sqrt(2)  # of a vertical motion; that of the images is horizontal
     rows[1] = dataclasses.replace(rows[1], F=F.tolist(), nsgd=0.0)
     identity = {"pipeline": "sift_ratio", "seed": 3, **presets.stages(config)}

@@ -9,10 +9,11 @@ import pytest
 import torch
 
 import fmtorch
-from fmtorch import metrics, presets
+from fmtorch import metrics
 from fmtorch.core.types import Correspondences, Estimate, collate
 from fmtorch.data import ImageSource
 from fmtorch.evaluation.rows import evaluate
+from fmtorch.pipeline.build import load_pipeline
 from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.commands.test_match import run_python
 from tests.laws import quick, scene, shown
@@ -122,7 +123,7 @@ def test_presets_of_ones_own(tmp_path: Path) -> None:
     for group in ("estimator", "pipeline"):
         (tmp_path / group).mkdir()
     file = tmp_path / "estimator" / "mine.yaml"
-    file.write_text("_target_: fmtorch.estimators.HypothesizeAndVerify\nthreshold: 0.5\nhypotheses: 100\n")
+    file.write_text("_target_: fmtorch.estimators.Ransac\nthreshold: 0.5\nhypotheses: 100\n")
     (tmp_path / "pipeline" / "my_pipeline.yaml").write_text(
         "# @package _global_\ndefaults:\n  - override /estimator: mine\n  - override /pruner: [one_to_one, ratio]\n"
     )
@@ -131,13 +132,13 @@ def test_presets_of_ones_own(tmp_path: Path) -> None:
     assert torch.equal(own.F, fmtorch.find_fundamental(x0, x1, threshold=0.5, final="least_squares", **FAST).F)
     file.write_text(file.read_text().replace("0.5", "2.5"))  # edited: read anew
     assert not torch.equal(own.F, fmtorch.find_fundamental(x0, x1, estimator="mine", config_dir=str(tmp_path)).F)
-    built = presets.pipeline("my_pipeline", config_dir=tmp_path)
+    built = load_pipeline("my_pipeline", config_dir=tmp_path)
     assert list(built.pruners) == ["one_to_one", "ratio"]
     assert built.estimator.search.hypotheses == 100  # type: ignore[attr-defined]
     with pytest.raises(ValueError, match=r"no preset 'their_pipeline' in conf/pipeline; there are: .*my_pipeline"):
-        presets.pipeline("their_pipeline", config_dir=tmp_path)
+        load_pipeline("their_pipeline", config_dir=tmp_path)
     with pytest.raises(ValueError, match=r"config_dir=.*nowhere is no folder"):
-        presets.pipeline("my_pipeline", config_dir=tmp_path / "nowhere")
+        load_pipeline("my_pipeline", config_dir=tmp_path / "nowhere")
     with pytest.raises(ValueError, match="no preset 'mine'"):
         fmtorch.find_fundamental(x0, x1, estimator="mine")
 

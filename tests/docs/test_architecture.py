@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import fmtorch
-from fmtorch.estimators import HypothesizeAndVerify
+from fmtorch.estimators import Ransac
 from tests.estimators.pairs import pair_of
 from tests.laws import scene
 
@@ -27,7 +27,7 @@ def test_the_way_of_a_seven_point_sample_is_five_files() -> None:
     paragraph = PAGE[PAGE.index("**The way of a seven-point sample**") :].split("\n\n")[0]
     files = re.findall(r"`([\w/]+\.py)`", paragraph)
     assert len(files) == 5
-    engine = HypothesizeAndVerify(hypotheses=50, round=50, refine={"kernel": "truncated"}, final="none")
+    engine = Ransac(hypotheses=50, round=50, refine={"kernel": "truncated"}, final="none")
     pair, called = pair_of(scene(1, 60)), set()
 
     def seen(frame: Any, event: str, argument: Any) -> None:

@@ -65,7 +65,7 @@ def test_the_examples_of_a_page_run(page: str) -> None:
 @pytest.mark.parametrize("module", [
     "data", "geometry.eight_point", "geometry.epipolar", "geometry.homography", "geometry.homography_pose",
     "geometry.homography_refine", "geometry.seven_point", "geometry.two_view_covariance", "metrics.nsgd",
-    "metrics.recall", "pipeline.configuration", "pipeline.essential", "pipeline.fundamental",
+    "metrics.recall", "two_view.pair_type", "two_view.find",
     "pipeline.two_images", "pipeline.verification",
 ])  # fmt: skip
 def test_the_examples_of_docstrings_run(module: str) -> None:

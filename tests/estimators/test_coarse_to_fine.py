@@ -7,11 +7,11 @@ import torch
 
 from fmtorch import presets
 from fmtorch.core.types import Correspondences, Estimate, collate
-from fmtorch.estimators import CoarseToFine, HypothesizeAndVerify
+from fmtorch.estimators import CoarseToFine, Ransac
 from tests.laws import scene
 
-COARSE = HypothesizeAndVerify(hypotheses=200, threshold=2.0)
-FINE = HypothesizeAndVerify(hypotheses=100, solver="eight_point", score="median", confidence=None, inliers="lmeds")
+COARSE = Ransac(hypotheses=200, threshold=2.0)
+FINE = Ransac(hypotheses=100, solver="eight_point", score="median", confidence=None, inliers="lmeds")
 
 
 def test_equals_the_two_by_hand() -> None:
@@ -53,7 +53,7 @@ def test_a_stage_s_options_are_replaced_by_name() -> None:
 
 @pytest.mark.parametrize("sampler", ["uniform", "prior"])
 def test_uses_the_prior_if_a_stage_does(sampler: str) -> None:
-    coarse = HypothesizeAndVerify(sampler=sampler)
+    coarse = Ransac(sampler=sampler)
     assert CoarseToFine(coarse=coarse, fine=FINE).uses_prior == (sampler == "prior")
 
 

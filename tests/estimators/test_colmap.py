@@ -12,6 +12,7 @@ import fmtorch
 from fmtorch import data, geometry, presets
 from fmtorch.core.types import Correspondences, Estimate, collate
 from fmtorch.data import ImagePair
+from fmtorch.pipeline.build import load_pipeline
 from tests.conftest import shared_path
 from tests.laws import scene
 
@@ -31,7 +32,7 @@ class Matched(NamedTuple):
 def matched(name: str, index: int = 0) -> Matched:
     """A real pair and its matches, which are also given as COLMAP takes them."""
     pair = data.load("fmbench", root=shared_path(f"data/{name}"))[index]
-    c = presets.pipeline("sift_ratio").match([pair])[0].correspondences
+    c = load_pipeline("sift_ratio").match([pair])[0].correspondences
     assert c is not None
     x0, x1 = (np.ascontiguousarray(x[0][c.mask[0]].double().numpy()) for x in (c.x0, c.x1))
     return Matched(pair, c, x0, x1)

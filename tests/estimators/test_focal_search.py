@@ -10,7 +10,7 @@ import torch
 
 from fmtorch import presets
 from fmtorch.core.types import Correspondences, collate
-from fmtorch.estimators import HypothesizeAndVerify, focal_search
+from fmtorch.estimators import Ransac, focal_search
 from fmtorch.estimators.families.cameras import Cameras, no_cameras
 from fmtorch.estimators.families.focals import FundamentalWithFocals, Refined
 from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
@@ -189,11 +189,11 @@ def test_models_that_are_not_there_are_not_selected() -> None:
 
 def test_rounds_go_on_where_the_search_is_not_settled() -> None:
     """An easy pair has one round, random matches have all, and the other search besides; in a batch as alone."""
-    estimator = HypothesizeAndVerify(**FOCAL, focal={"samples": 40, "rounds": 3, "pool": 4}, hypotheses=20)  # type: ignore[arg-type]
+    estimator = Ransac(**FOCAL, focal={"samples": 40, "rounds": 3, "pool": 4}, hypotheses=20)  # type: ignore[arg-type]
     pairs = [scene(1, 200, outliers=0.0), scene(2, 200, outliers=1.0)]
     assert estimator(collate(pairs), seed=1).draws.tolist() == [40, 3 * 40 + 20]
     assert [int(estimator(pair, seed=1).draws) for pair in pairs] == [40, 3 * 40 + 20]
-    patient = HypothesizeAndVerify(**FOCAL, focal={"samples": 40, "rounds": 3, "min_rounds": 2})  # type: ignore[arg-type]
+    patient = Ransac(**FOCAL, focal={"samples": 40, "rounds": 3, "min_rounds": 2})  # type: ignore[arg-type]
     assert int(patient(pairs[0], seed=1).draws) == 2 * 40
 
 
@@ -207,8 +207,8 @@ def test_images_of_two_sizes_are_searched_without_assumptions_too() -> None:
 def test_unknown_sizes_give_the_selection_without_prior() -> None:
     c = scenes().replace(size0=None, size1=None)
     options = {"hypotheses": 200, "pool": 8, "refine": {"kernel": "truncated"}, "select": {}, "final": "none"}
-    focal = HypothesizeAndVerify(focal={}, **options)(c)  # type: ignore[arg-type]
-    plain = HypothesizeAndVerify(**options)(c)  # type: ignore[arg-type]
+    focal = Ransac(focal={}, **options)(c)  # type: ignore[arg-type]
+    plain = Ransac(**options)(c)  # type: ignore[arg-type]
     assert torch.equal(focal.F, plain.F)
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from fmtorch.core.types import Correspondences, collate
-from fmtorch.estimators import HypothesizeAndVerify, IterativelyReweighted
+from fmtorch.estimators import IterativelyReweighted, Ransac
 from fmtorch.estimators.parts import final_fits
 from fmtorch.geometry import KERNELS
 from tests.estimators.families.photographs import TALL, WIDE, photographs
@@ -31,11 +31,11 @@ UNMOVED = {"unweighted_least_squares": ("prior", "noise"), **{f"irls {name}": ("
 """What a fit takes no account of."""
 
 
-def estimator(name: str) -> HypothesizeAndVerify | IterativelyReweighted:
+def estimator(name: str) -> Ransac | IterativelyReweighted:
     """One whose fits converge."""
     if name.startswith("irls "):
         return IterativelyReweighted(kernel=name.removeprefix("irls "), threshold=2.0, refine_iterations=60)
-    return HypothesizeAndVerify(**(SEARCH | FITS[name]))  # type: ignore[arg-type]
+    return Ransac(**(SEARCH | FITS[name]))  # type: ignore[arg-type]
 
 
 def inputs(seed: int, noise: float, same: bool = False) -> dict[str, Tensor]:

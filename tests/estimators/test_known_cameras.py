@@ -17,8 +17,8 @@ from fmtorch.data import ImagePair, load
 from fmtorch.estimators.parts import final_fits
 from fmtorch.geometry import fundamental_from_calibration, square_pixels
 from fmtorch.metrics import pose_error
-from fmtorch.pipeline.known_cameras import KnownCameras
 from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.two_view.known_cameras import KnownCameras
 from tests.conftest import shared_path
 from tests.laws import (
     Result,

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from fmtorch import find_fundamental, presets
-from fmtorch.estimators import HypothesizeAndVerify
+from fmtorch.estimators import Ransac
 from fmtorch.estimators.options import Focal, Preselect, Refine, Select, group
 from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.parts.scored_matches import scored_matches
@@ -55,7 +55,7 @@ def test_groups_are_made_of_mappings() -> None:
 )
 def test_bad_options_are_told(options: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        HypothesizeAndVerify(**options)  # type: ignore[arg-type]
+        Ransac(**options)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_bad_options_are_told(options: dict[str, object], message: str) -> None:
     ],
 )
 def test_thresholds_that_something_asks_for_are_taken(options: dict[str, object]) -> None:
-    HypothesizeAndVerify(**(MEDIAN | options))  # type: ignore[arg-type]
+    Ransac(**(MEDIAN | options))  # type: ignore[arg-type]
 
 
 def test_a_part_is_a_name_a_mapping_or_an_object() -> None:
@@ -123,7 +123,7 @@ class Nearest:
 def test_a_score_of_ones_own_in_a_preset_of_ones_own(tmp_path: Path) -> None:
     (tmp_path / "estimator").mkdir()
     (tmp_path / "estimator" / "nearest.yaml").write_text(
-        "_target_: fmtorch.estimators.HypothesizeAndVerify\n"
+        "_target_: fmtorch.estimators.Ransac\n"
         "score:\n  _target_: tests.estimators.test_options.Nearest\n  rank: 60\n"
         "hypotheses: 300\nconfidence: null\ninliers: threshold\nthreshold: 1.0\n"
     )

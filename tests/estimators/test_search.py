@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fmtorch.estimators import HypothesizeAndVerify
+from fmtorch.estimators import Ransac
 from fmtorch.estimators.families.family import Hypotheses
 from fmtorch.estimators.families.fundamental import EightPoint, SevenPoint
 from fmtorch.estimators.options import Preselect
@@ -158,5 +158,5 @@ def test_any_matches_are_searched(name: str, scale: float) -> None:
 
 def test_a_score_may_be_an_object() -> None:
     c = scene(3)
-    named_part, built = HypothesizeAndVerify(score="inlier_count"), HypothesizeAndVerify(score=InlierCount(1.0))
+    named_part, built = Ransac(score="inlier_count"), Ransac(score=InlierCount(1.0))
     np.testing.assert_array_equal(named_part(c).F, built(c).F)

@@ -19,10 +19,10 @@ from typing import Any
 
 import pytest
 
-from fmtorch import presets
 from fmtorch.core.executors import Execution, WorkersLost
 from fmtorch.data.pairs import ImagePair
 from fmtorch.evaluation.run import evaluate_pairs
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.storage import PairRow
 from scripts.benchmark.scale_pairs import given_pairs
@@ -33,7 +33,7 @@ PATIENCE = 240.0  # seconds for a scheduler to answer, or workers to come
 
 
 def build() -> Pipeline:
-    built: Pipeline = presets.pipeline("given_fmtorch")
+    built: Pipeline = load_pipeline("given_fmtorch")
     return built
 
 

@@ -14,6 +14,7 @@ from fmtorch.core.stages import Pruner
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.evaluation import identity as identity_module
 from fmtorch.evaluation.identity import run_identity
+from fmtorch.pipeline.build import build_pipeline, load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets.composition import compose
 from fmtorch.storage import identity_digest
@@ -55,7 +56,7 @@ class Described:
 def identity(*overrides: str, pipeline: Pipeline | None = None, **own: dict[str, object]) -> dict[str, object]:
     composed = compose("eval", ("pipeline=sift_ratio", "cache=off", *overrides))
     config = OmegaConf.create({**{name: composed[name] for name in composed}, **own})
-    return run_identity(config, "sift_ratio", pipeline or presets.build_pipeline(config), "abc")
+    return run_identity(config, "sift_ratio", pipeline or build_pipeline(config), "abc")
 
 
 def test_what_changes_speed_alone_is_no_part_of_it() -> None:
@@ -68,7 +69,7 @@ def test_what_changes_speed_alone_is_no_part_of_it() -> None:
 
 def test_signed_translations_are_part_of_it_and_folded_ones_change_no_earlier_identity() -> None:
     config = compose("eval", ("pipeline=sift_ratio", "cache=off"))
-    pipeline = presets.build_pipeline(config)
+    pipeline = build_pipeline(config)
     folded, signed = (run_identity(config, "sift_ratio", pipeline, "abc", signed=s) for s in (False, True))
     assert "pose" not in folded
     assert signed == {**folded, "pose": {"signed": True}}
@@ -122,7 +123,7 @@ def test_learned_files_of_every_stage_are_part_of_it(tmp_path: Path) -> None:
 def test_code_of_a_users_own_stage_is_part_of_it(group: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert identity()["code"] == {}
     own = {"_target_": f"{__name__}.Learned", "model": "x"}
-    parts = presets.pipeline("sift_ratio")
+    parts = load_pipeline("sift_ratio")
     changed = {group: {"mine": own} if group == "pruner" else own}
     first = identity(pipeline=parts, **changed)
     assert list(first["code"]) == [f"{__name__}.Learned"]  # type: ignore[call-overload]

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fmtorch import presets
 from fmtorch.core.executors import Execution, WorkersLost
 from fmtorch.core.types import Correspondences, Estimate, Features
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.evaluation.run import _shared_out, evaluate_pairs
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.storage import PairRow
 
@@ -34,7 +34,7 @@ def test_a_process_that_ends_is_told() -> None:
     pairs = [ImagePair(f"scene/0-{i}", "family", "scene", images[0], images[i], np.eye(3)) for i in (1, 2)]
     rows: list[PairRow] = []
     run = evaluate_pairs(
-        presets.pipeline("sift_ratio"), pairs, seed=0, batch=1, execution=Execution("processes", 2),
+        load_pipeline("sift_ratio"), pairs, seed=0, batch=1, execution=Execution("processes", 2),
         store=rows.extend, build=_ends,
     )  # fmt: skip
     with pytest.raises(WorkersLost, match="the same command goes on"):
@@ -121,7 +121,7 @@ def test_features_are_computed_while_the_first_pair_is_worked_on(tmp_path: Path)
     expected: list[PairRow] = []
     list(
         evaluate_pairs(
-            presets.pipeline("sift_ratio"),
+            load_pipeline("sift_ratio"),
             pairs,
             seed=0,
             batch=2,
@@ -129,7 +129,7 @@ def test_features_are_computed_while_the_first_pair_is_worked_on(tmp_path: Path)
             store=expected.extend,
         )
     )
-    pipeline, rows = presets.pipeline("sift_ratio"), list[PairRow]()
+    pipeline, rows = load_pipeline("sift_ratio"), list[PairRow]()
     watched = Watched(pipeline, len(images))
     counts = list(evaluate_pairs(pipeline, pairs, seed=0, batch=2, execution=TWO, store=rows.extend))
     assert watched.at_first_estimate == len(images)  # all of them, while the first pair waited

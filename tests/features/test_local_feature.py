@@ -21,6 +21,7 @@ from fmtorch.features import (
     local_feature,
 )
 from fmtorch.matching import NearestNeighborMatcher
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.storage.cache import ArrayCache
 from fmtorch.storage.features import CachedFeatures
 from tests.features.scenes import texture
@@ -137,7 +138,7 @@ def test_unknown_parts_and_options(options: dict[str, object], told: str) -> Non
 
 @pytest.mark.parametrize("name", [f"{s}{p}_ratio" for p in PIPELINES for s in ("", "paper/")])
 def test_pipelines_of_the_features_table(name: str) -> None:
-    pipeline = presets.pipeline(name)
+    pipeline = load_pipeline(name)
     paper = name.startswith("paper/")
     assert list(pipeline.pruners) == (["ratio"] if paper else ["ratio", "one_to_one"])
     assert pipeline.pruners["ratio"].threshold == 0.8  # type: ignore[attr-defined]
@@ -149,7 +150,7 @@ def test_pipelines_of_the_features_table(name: str) -> None:
     "name", [f"{s}{p}_gms" for p in ("rootsiftpca", "geodesc", "hardnet", "hesaffnet") for s in ("", "paper/")]
 )
 def test_pipelines_of_the_systems_table(name: str) -> None:
-    pipeline = presets.pipeline(name)
+    pipeline = load_pipeline(name)
     assert next(iter(pipeline.pruners)) == "ratio"
     assert list(pipeline.pruners)[-1] == "gms"
     assert type(pipeline.estimator.score).__name__ == "Median"  # type: ignore[attr-defined]

@@ -12,10 +12,10 @@ import pytest
 import torch
 
 import fmtorch
-from fmtorch import presets
 from fmtorch.data import read_image
 from fmtorch.matching.precision import MAX_RATIO, relative_noise
 from fmtorch.matching.vismatch import VisMatch
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
 from tests.data import lists
 from tests.matching import stand_in
@@ -112,7 +112,7 @@ def test_a_pair_does_not_depend_on_those_before_it(tmp_path: Path) -> None:
 
 
 def pipeline(name: str) -> Pipeline:
-    built: Pipeline = presets.pipeline("vismatch", overrides=[f"matcher.name={name}"])
+    built: Pipeline = load_pipeline("vismatch", overrides=[f"matcher.name={name}"])
     return built
 
 

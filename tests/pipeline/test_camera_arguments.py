@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import fmtorch
-from fmtorch.pipeline.camera_arguments import camera_fields
+from fmtorch.two_view.arguments import camera_fields
 from tests.reference import known_cameras as reference
 
 INF = float("inf")

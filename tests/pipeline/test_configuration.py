@@ -9,7 +9,7 @@ import fmtorch
 from fmtorch import presets
 from fmtorch.core.estimate import CONFIGURATIONS
 from fmtorch.core.types import Correspondences, Estimate, collate
-from fmtorch.pipeline.configuration import classify
+from fmtorch.two_view.pair_type import classify
 from tests.geometry.kinds import batch, draw
 
 

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch import presets
 from fmtorch.core.executors import Execution, Team
 from fmtorch.data.pairs import ImageSource
 from fmtorch.pipeline import folder
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.folder import FolderMatches
 from fmtorch.pipeline.photograph_cameras import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
@@ -44,7 +44,7 @@ class Recorded(Executor):
 
 def built() -> Pipeline:
     options = ["features.max_features=300", "estimator=lmeds", "estimator.hypotheses=30"]
-    return presets.pipeline("sift_ratio", overrides=options)
+    return load_pipeline("sift_ratio", overrides=options)
 
 
 @pytest.fixture

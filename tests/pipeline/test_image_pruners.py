@@ -17,6 +17,7 @@ from fmtorch.data import read_image
 from fmtorch.data.pairs import GivenMatches
 from fmtorch.geometry import sampson
 from fmtorch.pipeline import pipeline as module
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.exporting import keep_outcomes
 from fmtorch.pipeline.folder import FolderMatches
 from fmtorch.pipeline.pipeline import Pipeline
@@ -27,7 +28,7 @@ PRUNERS = "pruner=[ratio,one_to_one,frame_consistency,match_noise,refine_matches
 
 
 def built(cache: str = "off") -> Pipeline:
-    pipeline: Pipeline = presets.pipeline(
+    pipeline: Pipeline = load_pipeline(
         "sift_fmtorch", overrides=[PRUNERS, f"cache={cache}", "features.max_features=1500"]
     )
     return pipeline
@@ -56,7 +57,7 @@ def test_files_are_read_once_and_matches_are_refined(reads: collections.Counter[
         outcomes = pipeline.match(pairs)
         assert set(reads.values()) == {1}
         assert all(outcome.images is None for outcome in outcomes)
-    plain = presets.pipeline("sift_fmtorch", overrides=[f"cache={tmp_path}", "features.max_features=1500"])
+    plain = load_pipeline("sift_fmtorch", overrides=[f"cache={tmp_path}", "features.max_features=1500"])
     before = plain.match(pairs)
     gains = []
     for old, new in zip(before, outcomes, strict=True):
@@ -104,7 +105,7 @@ def test_refined_matches_are_exported_as_matches_of_keypoints(tmp_path: Path) ->
     ends = pair.image0.path, pair.image1.path
     journals = []
     for i, overrides in enumerate(([PRUNERS], [])):
-        pipeline = presets.pipeline("sift_fmtorch", overrides=[*overrides, "cache=off", "features.max_features=500"])
+        pipeline = load_pipeline("sift_fmtorch", overrides=[*overrides, "cache=off", "features.max_features=500"])
         run, folder = Journal(tmp_path / f"run{i}", ends[0].parent), Journal(tmp_path / f"folder{i}", ends[0].parent)
         keep_outcomes(run, pipeline, pipeline.run([pair]))
         for _ in FolderMatches(pipeline, folder, 4000, True, 0).each([ends]):

@@ -10,9 +10,9 @@ from fmtorch.core.types import Features
 from fmtorch.data import read_image
 from fmtorch.features.vlad import image_vector
 from fmtorch.pipeline import similar
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.similar import similar_pairs, vectors_of
 from fmtorch.pipeline.two_images import Described, describe
-from fmtorch.presets import pipeline
 from tests.conftest import shared_path
 
 
@@ -52,7 +52,7 @@ def test_scenes_are_told_apart() -> None:
     """Four images of each of three real scenes: none is most like an image of another scene."""
     folders = [shared_path(f"data/{name}/Images") for name in ("Strecha/fountain-P11", "KITTI/00", "TUM/fr1_rpy")]
     images = [path for folder in folders for path in sorted(folder.iterdir())[:4]]
-    sift = pipeline("sift_ratio", overrides=["features.max_features=1500"])
+    sift = load_pipeline("sift_ratio", overrides=["features.max_features=1500"])
     described = [describe(sift, read_image(image), 800) for image in images]
     vectors = vectors_of(described, lambda descriptors: image_vector(descriptors, "sift"))
     pairs = similar_pairs(images, vectors, 1)

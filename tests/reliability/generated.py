@@ -35,9 +35,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 import fmtorch
-from fmtorch import geometry, matching, metrics, presets, pruning
+from fmtorch import geometry, matching, metrics, pruning
 from fmtorch.core.annotations import arguments_of, arrays_of
 from fmtorch.core.types import Correspondences, Estimate, Features, collate
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.presets.objects import merged
 from tests.laws import PEERS, calibrated, few, quick_pruner
 from tests.reliability.arguments import KINDS, MISTAKES, NUMBERS, SEQUENCES, Scene, batches, scenes
@@ -369,7 +370,7 @@ PIPELINES = ("sift_gms", "sift_fmtorch")
 
 
 def _pipeline(name: str) -> Any:
-    return presets.pipeline(name, overrides=["cache=off", "features.max_features=200"])
+    return load_pipeline(name, overrides=["cache=off", "features.max_features=200"])
 
 
 def _stage(name: str) -> Draw:

@@ -12,7 +12,7 @@ from skimage import data as images
 
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry import homography_transfer
-from fmtorch.pipeline.configuration import classify
+from fmtorch.two_view.pair_type import classify
 from scripts.benchmark import configuration, configuration_pairs
 from scripts.benchmark.configuration import Ours, _pose_errors
 from scripts.benchmark.configuration_pairs import Case

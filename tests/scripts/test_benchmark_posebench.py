@@ -16,6 +16,7 @@ import pytest
 from fmtorch import data, presets
 from fmtorch.core.types import Correspondences
 from fmtorch.data import ImagePair
+from fmtorch.pipeline.build import load_pipeline
 from scripts.benchmark import __main__, posebench, posebench_methods
 from scripts.benchmark.sheet import MISSING
 from tests.conftest import shared_path
@@ -32,7 +33,7 @@ PROTOCOL = {"max_epipolar_error": THRESHOLD, "max_iterations": 1000, "min_iterat
 def real() -> list[tuple[ImagePair, Correspondences]]:
     """Some real pairs and their matches."""
     dataset = data.load("fmbench", root=shared_path("data/PhotoTourism"))
-    outcomes = presets.pipeline("sift_ratio").match([dataset[i] for i in range(PAIRS)])
+    outcomes = load_pipeline("sift_ratio").match([dataset[i] for i in range(PAIRS)])
     return [(o.pair, o.correspondences) for o in outcomes if o.correspondences is not None]
 
 

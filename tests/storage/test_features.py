@@ -23,6 +23,7 @@ from fmtorch import presets
 from fmtorch.core.stages import TimedExtractor, TwoStepExtractor
 from fmtorch.core.types import Features
 from fmtorch.features import RootSIFTPCA
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.storage import configuration as configuration_module
 from fmtorch.storage.cache import ArrayCache
 from fmtorch.storage.configuration import configuration, learned
@@ -225,8 +226,8 @@ def test_off_and_where(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert isinstance(own, CachedFeatures)
     assert (default.cache.folder, default.cache.limit) == (tmp_path / "home" / "features", 1_500_000_000)
     assert (own.cache.folder, own.cache.limit) == (tmp_path / "own", None)
-    assert presets.pipeline("sift_gms").extractor == sift  # a library call leaves nothing on disk
-    kept = presets.pipeline("sift_gms", overrides=[f"cache={tmp_path}/there", "cache_limit=1"]).extractor
+    assert load_pipeline("sift_gms").extractor == sift  # a library call leaves nothing on disk
+    kept = load_pipeline("sift_gms", overrides=[f"cache={tmp_path}/there", "cache_limit=1"]).extractor
     assert isinstance(kept, CachedFeatures)
     assert kept.cache.folder == tmp_path / "there"
 

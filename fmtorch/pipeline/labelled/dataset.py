@@ -13,6 +13,7 @@ from fmtorch.core.executors import Execution
 from fmtorch.core.files import replacing
 from fmtorch.core.resources import cache_dir
 from fmtorch.data.pairs import DepthDataset, PairDataset
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.labelled import labels
 from fmtorch.pipeline.labelled.augmentation import Augmentation
 from fmtorch.pipeline.labelled.compute import Job, Progress, compute_shards, partition
@@ -133,9 +134,7 @@ def _build(name: str, overrides: Sequence[str]) -> Callable[[], Pipeline]:
 
 def _pipeline(pipeline: Pipeline | str, overrides: Sequence[str]) -> Pipeline:
     if isinstance(pipeline, str):
-        from fmtorch import presets  # reads YAML files, which no other use of this package needs
-
-        built: Pipeline = presets.pipeline(pipeline, overrides=overrides)
+        built: Pipeline = load_pipeline(pipeline, overrides=overrides)
         return built
     if overrides:
         raise ValueError("overrides change a pipeline that is given by name; this one is given as an object")

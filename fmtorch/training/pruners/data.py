@@ -136,9 +136,9 @@ def _limited(dataset: PairDataset, indices: list[int], limit: int | None) -> lis
 
 def _front(config: DictConfig) -> Pipeline:
     """Features, matcher and the pruners before the trained one."""
-    extractor = cached(presets.instantiate(config.features, "features"), config.cache, config.cache_limit)
+    extractor = cached(presets.instantiate(plain(config.features), "features"), config.cache, config.cache_limit)
     before = {str(name): presets.build("pruner", str(name)) for name in config.before}
-    matcher: Any = presets.instantiate(config.matcher, "matcher")
+    matcher: Any = presets.instantiate(plain(config.matcher), "matcher")
     return Pipeline(extractor, matcher, before, _no_estimator)
 
 

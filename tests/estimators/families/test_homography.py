@@ -13,7 +13,7 @@ import torch
 import fmtorch
 from fmtorch import presets
 from fmtorch.core.arguments import correspondences
-from fmtorch.estimators import HypothesizeAndVerify
+from fmtorch.estimators import Ransac
 from tests.conftest import shared_path
 from tests.reference import homography_family as reference
 
@@ -288,9 +288,9 @@ def test_a_photographed_wall() -> None:
 @pytest.mark.parametrize("options", [{"degeneracy": "degensac"}, {"local_optimization": "graph_cut"}, {"focal": {}}])
 def test_parts_for_fundamental_matrices_are_refused(options: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=r"seven_point|is for fundamental matrices"):
-        HypothesizeAndVerify(solver="four_point", **options)
+        Ransac(solver="four_point", **options)
 
 
 def test_a_pipeline_needs_fundamental_matrices() -> None:
     with pytest.raises(ValueError, match="the estimator gives homography matrices; a pipeline needs fundamental"):
-        fmtorch.presets.pipeline("sift_gms", overrides=["estimator=homography"])
+        fmtorch.load_pipeline("sift_gms", overrides=["estimator=homography"])

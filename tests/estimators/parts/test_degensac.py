@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from fmtorch.core.streams import Stream
 from fmtorch.core.types import Correspondences, Estimate, collate
-from fmtorch.estimators import HypothesizeAndVerify
+from fmtorch.estimators import Ransac
 from fmtorch.estimators.families.family import Hypotheses
 from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.parts.degensac import (
@@ -91,7 +91,7 @@ def transfers(H: np.ndarray, pair: Pair) -> np.ndarray:
 
 def round_of(pair: Pair, count: int = 100) -> tuple[Hypotheses, Verified]:
     """The verified models of the first samples."""
-    search = HypothesizeAndVerify(confidence=None).search
+    search = Ransac(confidence=None).search
     hypotheses = search.family.solve(pair, search.sampler.draw(pair, 0, count, 7), 0)
     return hypotheses, Verified(hypotheses.F, *Preselection(Msac(1.0), None)(hypotheses.F, pair))
 
@@ -244,7 +244,7 @@ def error(F: torch.Tensor, exact: np.ndarray) -> float:
 
 
 def share_right(**options: object) -> float:
-    estimate = HypothesizeAndVerify(**{**OPTIONS, **options})(collate([scene(i)[0] for i in range(PAIRS)]))  # type: ignore[arg-type]
+    estimate = Ransac(**{**OPTIONS, **options})(collate([scene(i)[0] for i in range(PAIRS)]))  # type: ignore[arg-type]
     return float(np.mean([error(F, scene(i)[1]) < 2.0 for i, F in enumerate(estimate.F)]))
 
 
@@ -258,12 +258,12 @@ def test_a_scene_ruled_by_a_plane() -> None:
 def test_a_general_scene_is_left_alone() -> None:
     options = {**OPTIONS, "refine": None, "final": "none", "pool": 1, "score": "inlier_count"}
     scenes = collate([scene(i, 0.0)[0] for i in range(8)])
-    plain = HypothesizeAndVerify(**options)(scenes)  # type: ignore[arg-type]
-    assert torch.equal(HypothesizeAndVerify(**options, degeneracy="degensac")(scenes).F, plain.F)  # type: ignore[arg-type]
+    plain = Ransac(**options)(scenes)  # type: ignore[arg-type]
+    assert torch.equal(Ransac(**options, degeneracy="degensac")(scenes).F, plain.F)  # type: ignore[arg-type]
 
 
 def test_laws() -> None:
-    estimator = HypothesizeAndVerify(**OPTIONS, degeneracy="degensac")  # type: ignore[arg-type]
+    estimator = Ransac(**OPTIONS, degeneracy="degensac")  # type: ignore[arg-type]
     pairs = [scene(i)[0] for i in range(5)]
     degenerate = [
         pairs[0].replace(x1=pairs[0].x0 * 1.1 + 3),  # one plane, nothing off it
@@ -287,4 +287,4 @@ def test_laws() -> None:
 
 def test_degensac_needs_samples_of_seven() -> None:
     with pytest.raises(ValueError, match="degeneracy=degensac needs solver=seven_point; solver is 'eight_point'"):
-        HypothesizeAndVerify(solver="eight_point", degeneracy="degensac")
+        Ransac(solver="eight_point", degeneracy="degensac")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fmtorch.core.streams import Stream
-from fmtorch.estimators import HypothesizeAndVerify
+from fmtorch.estimators import Ransac
 from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.parts.graph_cut import FIRST_DRAW, GraphCut
 from fmtorch.estimators.parts.inliers import residuals_squared_px
@@ -22,7 +22,7 @@ NAMES = ("scene 40", "scene 300", *REAL)
 
 def searched(pair: Pair) -> np.ndarray:
     """The best models of a short search."""
-    return HypothesizeAndVerify(hypotheses=100, round=50, pool=4).search(pair).models
+    return Ransac(hypotheses=100, round=50, pool=4).search(pair).models
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -98,4 +98,4 @@ def test_models_without_inliers_are_kept() -> None:
 
 def test_unknown_local_optimization_is_told() -> None:
     with pytest.raises(ValueError, match="local_optimization is 'x'; it must be one of: graph_cut"):
-        HypothesizeAndVerify(local_optimization="x")
+        Ransac(local_optimization="x")

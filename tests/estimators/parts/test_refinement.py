@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fmtorch.core.streams import Stream
-from fmtorch.estimators import HypothesizeAndVerify
+from fmtorch.estimators import Ransac
 from fmtorch.estimators.families.fundamental import SevenPoint
 from fmtorch.estimators.options import Refine
 from fmtorch.estimators.pair import Pair
@@ -56,7 +56,7 @@ def test_all_matches_are_near_without_a_number_of_them() -> None:
 @pytest.mark.parametrize("name", ["scene 40", "scene 300", "real 7"])
 def test_refined_models_have_lower_errors(name: str, kernel: str) -> None:
     pair, scale = named(name), 2.0
-    pool = HypothesizeAndVerify(hypotheses=200, pool=4).search(pair)
+    pool = Ransac(hypotheses=200, pool=4).search(pair)
     refined = Refinement(Refine(kernel, scale, iterations=20))(pool, pair, SevenPoint())
     assert refined.valid.all()
     assert refined.near is pair

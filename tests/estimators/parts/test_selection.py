@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fmtorch.estimators import HypothesizeAndVerify
+from fmtorch.estimators import Ransac
 from fmtorch.estimators.parts.refinement import Candidates
 from fmtorch.estimators.parts.scores import Msac
 from fmtorch.estimators.parts.selection import BestOfSearch, BestScore, scores_of
@@ -31,4 +31,4 @@ def test_the_first_of_the_pool_or_the_best_score_of_what_is_valid() -> None:
 @pytest.mark.parametrize(("option", "value"), [("select", {"score": "best"}), ("refine", {"kernel": "l1"})])
 def test_unknown_parts_are_refused(option: str, value: dict[str, str]) -> None:
     with pytest.raises(ValueError, match=next(iter(value.values()))):
-        HypothesizeAndVerify(**{option: value})(scene(1, 100))  # type: ignore[arg-type]
+        Ransac(**{option: value})(scene(1, 100))  # type: ignore[arg-type]

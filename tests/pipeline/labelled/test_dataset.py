@@ -14,12 +14,12 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from fmtorch import presets
 from fmtorch.data import load
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.data.rendered import RenderedPairs
 from fmtorch.data.rendered.generate import FAMILIES, PLANS, Task
 from fmtorch.geometry.epipolar import symmetric_max
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.labelled import (
     Augmentation,
     Draw,
@@ -62,7 +62,7 @@ class Some:
 
 
 def test_items_are_the_pipelines_matches_with_labels(rendered: RenderedPairs, matched: MatchedPairs) -> None:
-    pipeline = presets.pipeline("sift_ratio", overrides=["pruner=[one_to_one]"])
+    pipeline = load_pipeline("sift_ratio", overrides=["pruner=[one_to_one]"])
     assert len(matched) == len(rendered) > 4
     assert not matched.failures
     by_identity = {pair.identity: pair for pair in rendered}
@@ -91,7 +91,7 @@ def test_computed_once_by_any_number_of_workers(rendered: RenderedPairs, matched
     assert two.folder.name == matched.folder.name
     assert calls[0] == (0, len(rendered))
     assert calls[-1] == (len(rendered), len(rendered))
-    pipeline = presets.pipeline("sift_ratio", overrides=["pruner=[one_to_one]", f"cache={tmp_path / 'features'}"])
+    pipeline = load_pipeline("sift_ratio", overrides=["pruner=[one_to_one]", f"cache={tmp_path / 'features'}"])
     calls.clear()
     again = MatchedPairs(rendered, pipeline, root=tmp_path, progress=lambda *c: calls.append(c))
     assert again.folder == two.folder  # neither a feature cache nor the estimator matters
@@ -191,7 +191,7 @@ def test_pairs_that_fail_are_left_out_and_told(rendered: RenderedPairs, tmp_path
         MatchedPairs(Some([good]), **SIFT, root=tmp_path, most=0)
     with pytest.raises(ValueError, match="no preset 'sift'"):
         MatchedPairs(Some([good]), "sift", root=tmp_path)
-    stages = presets.pipeline("sift_ratio")
+    stages = load_pipeline("sift_ratio")
     with pytest.raises(ValueError, match="overrides"):
         MatchedPairs(Some([good]), stages, overrides=["pruner=[]"], root=tmp_path)
     nameless = Pipeline(stages.extractor, lambda a, b: stages.matcher(a, b), {}, stages.estimator)

@@ -15,7 +15,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fmtorch import presets
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.folder import FolderMatches
 from fmtorch.pipeline.folder_images import chosen_pairs, images_below
 from fmtorch.storage.exchange.colmap import ORIGIN, write_database
@@ -265,7 +265,7 @@ def test_a_real_scene_is_reconstructed(tmp_path: Path) -> None:
     for path in sorted((source / "Images").iterdir())[2:8]:
         (images / path.name).symlink_to(path)
     options = ["features.max_features=2500", "estimator=lmeds", "estimator.hypotheses=300"]
-    pipeline = presets.pipeline("sift_ratio", overrides=options)
+    pipeline = load_pipeline("sift_ratio", overrides=options)
     kept = Journal(tmp_path / "export", images)
     pairs = chosen_pairs(images, images_below(images), None)
     work = FolderMatches(pipeline, kept, 1600, True, 0)

@@ -20,6 +20,7 @@ from fmtorch import data, presets
 from fmtorch.data import DataError, ImagePair
 from fmtorch.evaluation.gallery import Options, find_dataset
 from fmtorch.evaluation.rows import evaluate
+from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.pruning import ratio_test
 from fmtorch.storage.exchange.dataset import H5Pairs
@@ -338,7 +339,7 @@ def test_the_pipeline_of_given_matches_estimates_as_the_function_does(tmp_path: 
     pair = load("oanet", tmp_path)[0]
     assert pair.matches is not None
     c, _ = pair.matches()
-    (outcome,) = presets.pipeline("given_fmtorch").run([pair], seed=3)
+    (outcome,) = load_pipeline("given_fmtorch").run([pair], seed=3)
     alone = fmtorch.find_fundamental(
         c.x0, c.x1, mask=c.mask, quality=c.quality, size0=c.size0, size1=c.size1, key=pair.key, seed=3
     )

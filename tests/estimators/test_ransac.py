@@ -14,7 +14,7 @@ import fmtorch
 from fmtorch import presets
 from fmtorch.compiling.kernel import Kernel
 from fmtorch.core.types import collate
-from fmtorch.estimators import HypothesizeAndVerify
+from fmtorch.estimators import Ransac
 from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.parts.inliers import residuals_squared_px
 from scripts.benchmark.memory import OTHER_LIBRARIES
@@ -49,14 +49,14 @@ def test_recovers_the_geometry(name: str) -> None:
 
 def test_confidence_stops_early_and_null_never() -> None:
     easy = scene(0, 200, outliers=0.0, noise=0.1)
-    assert int(HypothesizeAndVerify(hypotheses=1000, round=100)(easy).draws) == 100
-    assert int(HypothesizeAndVerify(hypotheses=1000, round=100, confidence=None)(easy).draws) == 1000
+    assert int(Ransac(hypotheses=1000, round=100)(easy).draws) == 100
+    assert int(Ransac(hypotheses=1000, round=100, confidence=None)(easy).draws) == 1000
 
 
 def test_gradients_reach_the_points() -> None:
     c = scenes()
     x0, x1 = (x.double().requires_grad_() for x in (c.x0, c.x1))
-    estimate = HypothesizeAndVerify(hypotheses=200, refit_inliers=False)(c.replace(x0=x0, x1=x1))
+    estimate = Ransac(hypotheses=200, refit_inliers=False)(c.replace(x0=x0, x1=x1))
     estimate.F.square()[:, 0, 1].sum().backward()
     for x in (x0, x1):
         assert x.grad is not None
@@ -80,7 +80,7 @@ def test_who_asks_for_gradients_gets_the_same_estimate(name: str) -> None:
 def test_results_are_free_to_use_in_a_graph(stage: str) -> None:
     c = scenes()
     if stage == "estimator":
-        value = HypothesizeAndVerify(hypotheses=100)(c).F
+        value = Ransac(hypotheses=100)(c).F
     else:
         pruned = presets.build("pruner", stage)(c)
         value = pruned.mask.float() if stage == "gms" else pruned.prior
@@ -91,7 +91,7 @@ def test_results_are_free_to_use_in_a_graph(stage: str) -> None:
 
 
 def test_too_few_matches_have_a_reason() -> None:
-    estimate = HypothesizeAndVerify(solver="eight_point")(scene(0, 7))
+    estimate = Ransac(solver="eight_point")(scene(0, 7))
     assert estimate.reason == ("7 matches; at least 8 are needed",)
     assert not bool(estimate.ok)
 
@@ -107,7 +107,7 @@ def test_too_few_matches_have_a_reason() -> None:
 )
 def test_bad_options_are_told(options: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        HypothesizeAndVerify(**options)  # type: ignore[arg-type]
+        Ransac(**options)  # type: ignore[arg-type]
 
 
 def test_find_fundamental_takes_numpy_and_torch_single_and_batched() -> None:
@@ -134,11 +134,11 @@ def test_find_fundamental_names_what_is_wrong() -> None:
 
 def test_the_pool_is_refined_on_matches_near_one_of_its_models() -> None:
     pair = pair_of(scene(3, 400, outliers=0.5, noise=0.3))
-    pool = HypothesizeAndVerify(pool=4).search(pair)
+    pool = Ransac(pool=4).search(pair)
     r = np.sqrt(np.min([residuals_squared_px(F, pair) for F in pool.models], 0))
 
     def near(matches: int) -> Pair:
-        refining = HypothesizeAndVerify(pool=4, refine={"kernel": "truncated", "scale": 1.5, "matches": matches})
+        refining = Ransac(pool=4, refine={"kernel": "truncated", "scale": 1.5, "matches": matches})
         return refining.refine(pool, pair, refining.family).near
 
     few, every = near(150), near(1000)
@@ -165,7 +165,7 @@ WAY = (
 
 def test_the_way_of_a_sample_of_seven(monkeypatch: pytest.MonkeyPatch) -> None:
     """The files that a sample passes from draw to refinement, each where it comes first: see `docs/architecture.md`."""
-    estimator = HypothesizeAndVerify(hypotheses=100, round=100, pool=2, preselect=None, refine={"kernel": "truncated"})
+    estimator = Ransac(hypotheses=100, round=100, pool=2, preselect=None, refine={"kernel": "truncated"})
     estimator.refine(estimator.search(pair_of(scene(0, 60))), pair_of(scene(0, 60)), estimator.family)  # compiled
     pair, passed = pair_of(scene(0, 60)), dict[str, None]()
 

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from fmtorch import presets
 from fmtorch.compiling import switch
 from fmtorch.compiling.together import compile_together
 from fmtorch.core.arguments import number
@@ -19,9 +18,16 @@ from fmtorch.core.checks import expect_values
 from fmtorch.core.stages import Estimator, Pruner, model_of
 from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.estimators.ransac import Ransac
 from fmtorch.geometry.verdict import judged
-from fmtorch.pipeline.known_cameras import KnownCameras
-from fmtorch.pipeline.units import expect_pixels
+from fmtorch.presets.files import load
+from fmtorch.presets.objects import construct, instantiate, merged
+from fmtorch.pruning.frame_consistency import FrameConsistency
+from fmtorch.pruning.position_consistency import PositionConsistency
+from fmtorch.two_view.arguments import expect_pixels
+from fmtorch.two_view.known_cameras import KnownCameras
+
+RANSAC = f"fmtorch.estimators.{Ransac.__name__}"  # the `_target_` of presets of this project's own engine
 
 
 def estimated(
@@ -38,7 +44,7 @@ def estimated(
     estimator = estimator_of(name, config_dir, options)
     _expect_gradients(c, estimator, name)
     if (gives := model_of(estimator)) != model:
-        option = f" (here by model={model})" if "model" in presets.load("estimator", name, config_dir) else ""
+        option = f" (here by model={model})" if "model" in load("estimator", name, config_dir) else ""
         needed = f"find_{model} needs one that gives {model} matrices{option}"
         raise ValueError(f"estimator={name} gives {gives} matrices; {needed}")
     if in_pixels:
@@ -72,7 +78,7 @@ def _with_prior(c: Correspondences, estimator: Estimator) -> Correspondences:
     """The matches with a prior of their consistency where the estimator uses one and none is given."""
     if c.prior is None and getattr(estimator, "uses_prior", False):
         framed = c.lafs0 is not None and c.lafs1 is not None and c.quality is not None
-        pruner = _consistency("frame_consistency" if framed else "position_consistency")
+        pruner = _consistency(framed)
         if switch.available():
             compile_together([*getattr(pruner, "kernels", ()), *getattr(estimator, "kernels", ())])
         with one_thread(c.mask.device):
@@ -85,16 +91,22 @@ def estimator_of(name: str, config_dir: Path | str | None, options: Mapping[str,
     plain = _plain(options)
     if config_dir is None:
         try:
-            return _built(name, json.dumps(plain, sort_keys=True))
+            return _kept(name, json.dumps(plain, sort_keys=True))
         except TypeError:  # an option is an object of some kind
             pass
-    built: Estimator = presets.build("estimator", name, config_dir, **plain)
-    return built
+    return _built(name, config_dir, plain)
 
 
 @functools.lru_cache(maxsize=64)
-def _built(name: str, options: str) -> Estimator:
-    built: Estimator = presets.build("estimator", name, **json.loads(options))
+def _kept(name: str, options: str) -> Estimator:
+    return _built(name, None, json.loads(options))
+
+
+def _built(name: str, config_dir: Path | str | None, options: Mapping[str, Any]) -> Estimator:
+    config, where = merged(load("estimator", name, config_dir), options), f"estimator={name}"
+    if config.get("_target_") == RANSAC:
+        return construct(Ransac, config, where)
+    built: Estimator = instantiate(config, where)
     return built
 
 
@@ -109,7 +121,9 @@ def _plain(value: Any) -> Any:
     return value
 
 
-@functools.lru_cache(maxsize=2)
-def _consistency(name: str) -> Pruner:
-    built: Pruner = presets.build("pruner", name)
-    return built
+@functools.cache
+def _consistency(framed: bool) -> Pruner:
+    """The prior of matches with frames and ratios, or of points alone, with the constants of its preset."""
+    if framed:
+        return construct(FrameConsistency, load("pruner", "frame_consistency"), "pruner=frame_consistency")
+    return construct(PositionConsistency, load("pruner", "position_consistency"), "pruner=position_consistency")

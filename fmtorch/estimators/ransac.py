@@ -40,7 +40,7 @@ CALIBRATED_MATCHES = 6  # that a pair of calibrated cameras needs: five of them 
 DEFAULT_PRESELECT = Preselect()
 
 
-class HypothesizeAndVerify:
+class Ransac:
     """A robust estimator of fundamental matrices, batched over pairs.
 
     Parts are named as in `registry`; the options of a stage are those of the class of that name in `options`.

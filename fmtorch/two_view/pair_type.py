@@ -28,7 +28,7 @@ from fmtorch.geometry.configuration import (
 from fmtorch.geometry.configuration_kernels import weigh
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.homography_pose import PlanePoses, poses_from_homography
-from fmtorch.pipeline.estimation import estimated, estimator_of
+from fmtorch.two_view.estimation import estimated, estimator_of
 
 FOCAL_DEVIATION = 0.02
 """Of the focal lengths of a calibration, relative: what zoom and focus change between two days."""
@@ -112,7 +112,7 @@ def classify(
 
     Example:
         >>> import torch, fmtorch
-        >>> from fmtorch.pipeline.configuration import classify
+        >>> from fmtorch.two_view.pair_type import classify
         >>> x0 = 600 * torch.rand(100, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
         >>> H = torch.tensor([[0.9, 0.1, 20], [-0.1, 1.0, 5], [1e-4, 2e-4, 1]], dtype=torch.float64)
         >>> x1 = fmtorch.geometry.homography_points(H, x0)                       # one plane

@@ -1,0 +1,1 @@
+"""Matches of two images -> fundamental, essential and homography matrices: what users call."""
