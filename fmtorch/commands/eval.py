@@ -11,7 +11,6 @@ from pathlib import Path
 import pyarrow as pa
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-from rich.progress import Progress
 
 from fmtorch import data, presets
 from fmtorch.commands.main import job, run_command
@@ -31,7 +30,6 @@ from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
 from fmtorch.presets.executors import execution_of
 from fmtorch.presets.fields import Cache, Count, Device, Gigabytes, Seed, path_fields, read_fields
-from fmtorch.presets.objects import target_of
 from fmtorch.storage import RunFolder, identity_digest
 from fmtorch.storage.exchange.export import export_kinds, write_exports
 from fmtorch.storage.exchange.journal import Journal
@@ -76,14 +74,15 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     shard = shard_of(fields.shard)
     device = presets.resolve_device(fields.device)
     exports = export_kinds(fields.export)
-    presets.expect_dataset(config.dataset)
+    dataset_config = plain(config.dataset)
+    presets.expect_buildable(dataset_config, "dataset")
     presets.expect_stages(config)
-    model = _model(config.dataset)
+    model = getattr(presets.target_of(dataset_config, "dataset"), "model", "fundamental")
     if model != "fundamental" and (exports or fields.cameras is not None):
         raise ValueError(f"the data set has {model} matrices, which take no export= and no cameras=: leave them out")
     with progress_bars() as progress:
         pipeline: Pipeline = build_pipeline(config, device, model)
-        dataset = _load(config.dataset, progress)
+        dataset = data.build(dataset_config, reporter(progress, "drawing scenes"))
         folder = _open_folder(config, fields, pipeline_name, pipeline, dataset)
         pairs = select([dataset[i] for i in range(len(dataset))], fields.limit)
         journal = _journal(folder.path, pairs) if exports else None
@@ -182,24 +181,6 @@ def _to_export(journal: Journal, pair: ImagePair) -> bool:
     """Whether a pair's matches are not in the journal yet, and its images are there."""
     ends = pair.image0.path, pair.image1.path
     return exportable(pair) and all(path.is_file() for path in ends) and not journal.has_pair(*ends)
-
-
-def _model(config: DictConfig) -> str:
-    """What relates the pairs of a data set: fundamental, or homography."""
-    options = plain(config)
-    if "_target_" not in options:
-        return data.model_of(str(options.get("name")))
-    model: str = getattr(target_of(options, "dataset"), "model", "fundamental")
-    return model
-
-
-def _load(config: DictConfig, progress: Progress) -> PairDataset:
-    """The data set of a config; the embedded one is drawn on first use, which the progress bar shows."""
-    options = plain(config)
-    if "_target_" in options:  # somebody's own data set
-        dataset: PairDataset = presets.instantiate(options, "dataset")
-        return dataset
-    return data.load(**options, progress=reporter(progress, "drawing scenes"))
 
 
 @job

@@ -22,6 +22,7 @@ from fmtorch.core.options import Within
 from fmtorch.core.recipes import Here, Recipe, Source
 from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.data.construction import BLOCK, Construction, blocks
+from fmtorch.data.rendered import RenderedPairs
 from fmtorch.data.scenes import ScenePairs
 from fmtorch.presets import plain
 from fmtorch.presets.executors import execution_of
@@ -99,24 +100,18 @@ def _execution(config: DictConfig, fields: Fields, many: bool) -> Execution:
 
 def _load(config: DictConfig) -> ScenePairs:
     """The data set of a config, all of whose candidates are asked for."""
-    presets.expect_dataset(config)
     options = plain(config)
-    own = "_target_" in options
-    if options.get("name") == "rendered":
-        from fmtorch.data.rendered import RenderedPairs
-
-        with progress_bars() as progress:
-            drawn = data.load(**options, progress=reporter(progress, "drawing scenes"))
-        assert isinstance(drawn, RenderedPairs)
-        return drawn.scene_pairs()
-    if own or options["name"] in data.SCENE_SETS:
-        dataset = presets.instantiate(options, "dataset") if own else data.load(**options)
-        if isinstance(dataset, ScenePairs):
-            return dataset
-    raise ValueError(
-        f"dataset={options.get('name', options.get('_target_'))} has no candidates to judge; it must be one of "
-        f"{', '.join(data.SCENE_SETS)}, rendered, or a `ScenePairs` of your own"
-    )
+    presets.expect_buildable(options, "dataset")
+    with progress_bars() as progress:
+        dataset = data.build(options, reporter(progress, "drawing scenes"))
+    if isinstance(dataset, RenderedPairs):
+        return dataset.scene_pairs()
+    if not isinstance(dataset, ScenePairs):
+        raise ValueError(
+            f"dataset={dataset.name} has no candidates to judge; it must be one of tum, kitti, colmap, bundler, "
+            "cameras, rendered, or a `ScenePairs` of your own"
+        )
+    return dataset
 
 
 def _select(construction: Construction, execution: Execution, progress: Progress) -> tuple[list[int], int, list[str]]:

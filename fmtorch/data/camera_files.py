@@ -10,7 +10,7 @@ import numpy as np
 from fmtorch.data.candidates import WINDOW, AllPairs, Candidates, following
 from fmtorch.data.pairs import ImageSource
 from fmtorch.data.scenes import Scene, ScenePairs, View, folders
-from fmtorch.data.text_files import DataError, numbered, to_finite
+from fmtorch.data.text_files import DataError, given_root, numbered, to_finite
 
 CAMERAS, IMAGES, SUFFIXES = "Camera.txt", "Images", (".jpg", ".png")
 COLUMNS = "K (9 numbers, row by row), R (9), t (3)"
@@ -26,7 +26,7 @@ class CameraFilePairs(ScenePairs):
 
     def __init__(
         self,
-        root: str | Path,
+        root: str | Path | None = None,
         split: str = "test",
         sequences: Sequence[str] | None = None,
         fps: int | float | None = None,
@@ -38,7 +38,9 @@ class CameraFilePairs(ScenePairs):
             raise DataError(f"split {split!r}: cameras has only 'test'; choose scenes by root or sequences")
         if fps is not None and fps <= 0:
             raise DataError(f"fps={fps:g}; it must be positive, or null for images in no order")
-        home = Path(root).expanduser().absolute()
+        home = given_root(
+            root, "cameras", "a folder of scenes with Camera.txt and Images/ each, or one such scene"
+        ).absolute()
         if sequences is None and (home / CAMERAS).is_file():
             home, sequences = home.parent, [home.name]
         names = sequences or sorted(path.parent.name for path in home.glob(f"*/{CAMERAS}"))

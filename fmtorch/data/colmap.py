@@ -16,14 +16,14 @@ from fmtorch.data.depth_images import DepthImages, read_colmap
 from fmtorch.data.pairs import ImageSource
 from fmtorch.data.scenes import DepthScenePairs, Scene, ScenePairs, View, folders
 from fmtorch.data.splits import chosen
-from fmtorch.data.text_files import DataError
+from fmtorch.data.text_files import DataError, given_root
 
 _MODELS = ("sparse/0", "sparse", "dense/sparse", ".")  # below a scene's folder, in the order in which they are tried
 _FILES = ("cameras.bin", "cameras.txt")
 
 
 def colmap_pairs(
-    root: str | Path,
+    root: str | Path | None = None,
     split: str = "test",
     sequences: Sequence[str] | None = None,
     model: str | None = None,
@@ -98,10 +98,10 @@ def _points(folder: Path) -> list[NDArray[np.int64]]:
 
 
 def scene_folders(
-    root: str | Path, split: str, sequences: Sequence[str] | None, model: str | None
+    root: str | Path | None, split: str, sequences: Sequence[str] | None, model: str | None
 ) -> tuple[Path, list[Path]]:
     """The folder of scenes, and the scenes' folders: `root` itself where it is one."""
-    home = Path(root).expanduser().absolute()
+    home = given_root(root, "colmap", "a folder of scenes with a COLMAP model each, or one such scene").absolute()
     if sequences is None and any((home / place / file).is_file() for place in _places(model) for file in _FILES):
         return home.parent, [home]
     return home, folders(

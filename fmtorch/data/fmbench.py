@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fmtorch.data.camera_files import COLUMNS
 from fmtorch.data.cameras import Camera, relative_pose
 from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset
-from fmtorch.data.text_files import DataError, read_lines, read_numbers
+from fmtorch.data.text_files import DataError, given_root, read_lines, read_numbers
 
 _PAIRS, _SUBSETS, _CAMERAS = "pairs_with_gt.txt", "pairs_which_dataset.txt", "Camera.txt"
 _SUFFIXES = (".jpg", ".png")
@@ -42,7 +42,7 @@ class FMBenchPairs(PairDataset):
 
     def __init__(
         self,
-        root: str | Path,
+        root: str | Path | None = None,
         split: str = "test",
         subset: str | Sequence[str] | None = None,
         sets: Sequence[str] | None = None,
@@ -56,7 +56,9 @@ class FMBenchPairs(PairDataset):
         self._pairs: list[ImagePair] = []
         self._seen: Counter[str] = Counter()
         self._present: set[str] = set()
-        for folder in _set_folders(Path(root).expanduser(), sets):
+        for folder in _set_folders(
+            given_root(root, "fmbench", "a set's folder with pairs_with_gt.txt, or a folder of such sets"), sets
+        ):
             self._read_set(folder)
         for missing in sorted((self._subsets or set()) - self._present):
             raise DataError(f"{root}: no pairs of subset {missing!r}; it has {_listed(self._present) or 'no pairs'}")

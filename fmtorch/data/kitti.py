@@ -13,7 +13,7 @@ from fmtorch.data.candidates import WINDOW, following
 from fmtorch.data.pairs import ImageSource
 from fmtorch.data.scenes import Scene, ScenePairs, View, folders
 from fmtorch.data.splits import chosen
-from fmtorch.data.text_files import DataError, numbered, to_finite
+from fmtorch.data.text_files import DataError, given_root, numbered, to_finite
 
 _SUFFIXES = (".png", ".jpg")
 _LAYOUT = "the layout is sequences/NN/calib.txt, times.txt, image_0/ and poses/NN.txt"
@@ -34,7 +34,7 @@ class KittiPairs(ScenePairs):
 
     def __init__(
         self,
-        root: str | Path,
+        root: str | Path | None = None,
         split: str = "test",
         sequences: Sequence[str] | None = None,
         camera: int = 0,
@@ -42,7 +42,7 @@ class KittiPairs(ScenePairs):
         pairs: int | None = 1000,
         seed: int = 0,
     ) -> None:
-        home = Path(root).expanduser()
+        home = given_root(root, "kitti", "the folder with sequences/ and poses/ of KITTI odometry")
         there = sorted(f.name for f in (home / "sequences").iterdir()) if (home / "sequences").is_dir() else []
         sequence_folders = folders(
             home / "sequences", chosen("kitti", split, sequences, there), "a folder for each sequence"

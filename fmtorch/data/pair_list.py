@@ -17,7 +17,7 @@ from fmtorch.data.listed_pairs import ListedPair, text_pairs
 from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset
 from fmtorch.data.resampling import Resampling, Size, longer_side
 from fmtorch.data.scene_npz import camera_files, npz_pairs
-from fmtorch.data.text_files import DataError, numbered
+from fmtorch.data.text_files import DataError, given_root, numbered
 
 TEXT_SUFFIXES, NPZ = (".txt", ".csv", ".list", ""), ".npz"
 _FRAME = re.compile(r"(.+?)_frame\W")  # scene0711_00_frame-001680.jpg
@@ -44,14 +44,17 @@ class PairList(PairDataset):
 
     def __init__(
         self,
-        root: str | Path,
+        root: str | Path | None = None,
         file: str | Path | None = None,
         resize: int | Sequence[int] | None = None,
         origin: float | None = None,
     ) -> None:
         if file is None:
             raise DataError("pair_list needs file: dataset.file=FILE, the list of pairs, .txt or .npz")
-        home, path = Path(root).expanduser(), Path(file).expanduser()
+        home, path = (
+            given_root(root, "pair_list", "the folder of the images of dataset.file, the list"),
+            Path(file).expanduser(),
+        )
         if not home.is_dir():
             raise DataError(f"{home}: no such folder; dataset.root must be the folder of the images")
         if not path.is_file():

@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from fmtorch.presets.composition import (
         STAGES,
         composed,
-        expect_dataset,
         expect_stages,
         pipeline_stages,
         plain,
@@ -25,12 +24,20 @@ if TYPE_CHECKING:
         targets_of,
         top_level_names,
     )
-    from fmtorch.presets.objects import build, expect_buildable, instantiate, own_modules, peer_packages, resolve_device
+    from fmtorch.presets.objects import (
+        build,
+        expect_buildable,
+        instantiate,
+        own_modules,
+        peer_packages,
+        resolve_device,
+        target_of,
+    )
 
 __all__ = [
-    "STAGES", "available", "build", "closest", "composed", "expect_buildable", "expect_dataset",
-    "expect_stages", "instantiate", "known_targets", "load", "own_modules", "peer_packages",
-    "pipeline_stages", "plain", "resolve_device", "stages", "targets_of", "top_level_names",
+    "STAGES", "available", "build", "closest", "composed", "expect_buildable", "expect_stages", "instantiate",
+    "known_targets", "load", "own_modules", "peer_packages", "pipeline_stages", "plain", "resolve_device", "stages",
+    "target_of", "targets_of", "top_level_names",
 ]  # fmt: skip
 
 lazy_exports(__name__)

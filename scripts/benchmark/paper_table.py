@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from fmtorch.data.baselines import WIDE
 from fmtorch.evaluation.bootstrap import Interval
 from fmtorch.evaluation.statistics import PERCENT, described, difference, interval, recalled
+from fmtorch.presets.pruners import WIDE
 from scripts.benchmark.pipelines_table import REAL, Values, failed, nsgd_by_seed, solved_means
 from scripts.benchmark.pruning_table import KIN, Row, scenes_of
 from scripts.benchmark.sheet import MISSING, Published, Sheet, published, shown

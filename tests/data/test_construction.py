@@ -139,8 +139,11 @@ def test_a_finished_set_is_not_made_again_and_another_is_refused(
         (["output=null"], "output is missing; it names the folder of the set that is made"),
         (["count=0"], "count=0; it must be a whole number of at least 1 or null"),
         (["quality=101"], "quality=101; it must be a whole number from 1 to 100"),
-        (["dataset=stereo"], "dataset=stereo has no candidates to judge; it must be one of tum, kitti, colmap"),
-        (["dataset=fmbench"], "dataset=fmbench has no candidates to judge"),
+        (
+            ["dataset=stereo", "dataset.root=null"],
+            "dataset=stereo has no candidates to judge; it must be one of tum, kitti, colmap",
+        ),
+        (["dataset=fmbench", "dataset.root=null"], "fmbench needs root"),
         (["dataset=kitti"], "no such folder; it must hold a folder for each sequence"),
         (["dataset.fps=0"], "fps=0; it must be positive, or null for images in no order"),
         (["dataset.root=empty"], "no folder with Camera.txt, one line an image: K"),

@@ -183,7 +183,7 @@ def test_the_command_selects_by_overlap(tmp_path: Path, monkeypatch: pytest.Monk
 def test_the_command_selects_from_rendered_scenes(
     rendered: RenderedScenePairs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fmtorch.data.load", lambda **_: rendered.drawn)
+    monkeypatch.setattr("fmtorch.data.build", lambda *_: rendered.drawn)
     run(tmp_path, monkeypatch, "dataset=rendered", "overlap=[0.1,0.6]")
     monkeypatch.undo()
     overlaps = overlap_of(rendered)

@@ -16,6 +16,7 @@ from fmtorch import data, presets
 from fmtorch.core.terminal import reporter
 from fmtorch.data import ImagePair, PairDataset
 from fmtorch.data.matchable import ENOUGH
+from fmtorch.data.rendered import RenderedPairs
 from fmtorch.data.subset import subset
 from fmtorch.evaluation.run import select
 from fmtorch.pipeline.labelled import Augmentation, LabelledMatches, MatchedPairs, StoredMatches
@@ -93,12 +94,9 @@ def labelled_matches(config: DictConfig, progress: Progress) -> Matches:
 def _dataset(config: DictConfig, progress: Progress) -> PairDataset:
     """The data set to train on; of the embedded one always the training side."""
     options = plain(config.dataset)
-    if options.get("name") == "rendered":
+    if presets.target_of(options, "dataset") is RenderedPairs:
         options["split"] = "train"
-    if "_target_" in options:
-        dataset: PairDataset = presets.instantiate(options, "dataset")
-        return dataset
-    return data.load(**options, progress=reporter(progress, "drawing scenes"))
+    return data.build(options, reporter(progress, "drawing scenes"))
 
 
 def _views(config: DictConfig) -> PlaneViews:

@@ -99,7 +99,7 @@ def run(config: DictConfig, name: str) -> Path:
     expect_options(PlaneViews, {k: v for k, v in plain(config.planes).items() if k not in own}, "planes")
     for group, part in PARTS.items():
         expect_options(part, plain(config[group]), group)
-    presets.expect_dataset(config.dataset)
+    presets.expect_buildable(presets.plain(config.dataset), "dataset")
     presets.expect_stages(config)
     network_config = network_of(config, name)
     optimisation, objective = Optimisation(**plain(config.optimisation)), Objective(**plain(config.objective))
