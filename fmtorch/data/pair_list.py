@@ -49,12 +49,10 @@ class PairList(PairDataset):
         resize: int | Sequence[int] | None = None,
         origin: float | None = None,
     ) -> None:
+        home = given_root(root, "pair_list", "the folder of the images of dataset.file, the list")
         if file is None:
             raise DataError("pair_list needs file: dataset.file=FILE, the list of pairs, .txt or .npz")
-        home, path = (
-            given_root(root, "pair_list", "the folder of the images of dataset.file, the list"),
-            Path(file).expanduser(),
-        )
+        path = Path(file).expanduser()
         if not home.is_dir():
             raise DataError(f"{home}: no such folder; dataset.root must be the folder of the images")
         if not path.is_file():

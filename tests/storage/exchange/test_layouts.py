@@ -321,7 +321,7 @@ def test_says_which_extra_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(("layout", "roots"), [("hloc", ["Truth", "hloc"]), ("posebench", ["posebench"])])
 def test_a_report_finds_it(layout: str, roots: list[str], tmp_path: Path) -> None:
     dataset = load(layout, tmp_path)
-    stored = {"name": "h5", "layout": layout, "features": None, "matches": None, "origin": None}
+    stored = {**presets.load("dataset", "h5"), "layout": layout}
     options = Options(1, [tmp_path / root for root in roots])
     assert find_dataset({**stored, "digest": dataset.digest}, options).digest == dataset.digest
     with pytest.raises(DataError, match="has changed since the run"):
