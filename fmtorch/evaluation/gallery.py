@@ -99,17 +99,19 @@ def find_dataset(stored: Mapping[str, Any], options: Options) -> PairDataset:
 
 def _places(known: Mapping[str, Any], roots: Sequence[Path]) -> list[dict[str, Any]]:
     """The options that say where a data set, and what it needs beside itself, may lie."""
+    places: list[dict[str, Any]] = [{"root": root} for root in roots]
     target = presets.target_of(known, "dataset")
     if target is PairList:
-        return [{"root": r, "file": f} for r in roots if r.is_dir() for f in roots if f.is_file()] or [{}]
-    if target is H5Pairs:
+        places = [{"root": r, "file": f} for r in roots if r.is_dir() for f in roots if f.is_file()]
+    elif target is H5Pairs:
         other = "truth" if known.get("layout") in WITHOUT_GEOMETRY else "images"
-        places = [{"root": root, other: place} for root in roots for place in roots if place != root]
-        return places + [{"root": root} for root in roots] or [{}]
-    if target is RenderedPairs:  # which is drawn where it does not lie, and never among something else
+        places = [*({"root": root, other: place} for root in roots for place in roots if place != root), *places]
+    elif target is RenderedPairs:  # which is drawn where it does not lie, and never among something else
         drawn = f"*-{known.get('split', 'test')}-{known.get('size', 'small')}-*"
-        return [{"root": root} for root in roots if any(root.glob(drawn))] or [{}]
-    return [*({"root": root} for root in roots), {}]  # the last: its usual place
+        places = [place for place in places if any(place["root"].glob(drawn))]
+    else:
+        places.append({})  # its usual place
+    return places or [{}]
 
 
 def _same(dataset: PairDataset, stored: Mapping[str, Any]) -> PairDataset:
