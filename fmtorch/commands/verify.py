@@ -19,8 +19,7 @@ from fmtorch.commands.main import job, run_command
 from fmtorch.core.shards import shard_of
 from fmtorch.core.terminal import console, errors, progress_bars, reporter
 from fmtorch.pipeline.database_pairs import Cameras
-from fmtorch.pipeline.verification import ONE_THREAD, How, verify_by
-from fmtorch.pipeline.verification_places import Places
+from fmtorch.pipeline.verification import ONE_THREAD, VerifyOptions, VerifyPaths, verify_by
 from fmtorch.pipeline.verification_run import Verification
 from fmtorch.presets import plain
 from fmtorch.presets.executors import execution_of
@@ -51,11 +50,11 @@ def run(config: DictConfig, estimator: str) -> Verification:
     execution = execution_of(config).decided(False)
     if execution.shared and execution.workers is None:
         execution = ONE_THREAD
-    how = How(fields.cameras, fields.force, fields.seed, execution, shard_of(fields.shard))
+    options = VerifyOptions(fields.cameras, fields.force, fields.seed, execution, shard_of(fields.shard))
     with _begun_by_reports(estimator) as report:
-        places = Places(fields.database, fields.features_file, fields.matches, fields.output)
+        paths = VerifyPaths(fields.database, fields.features_file, fields.matches, fields.output)
         settings = {"estimator": plain(config.estimator)}
-        result = verify_by(make, settings, places, how, report)
+        result = verify_by(make, settings, paths, options, report)
     for problem in result.problems[:MAX_PROBLEMS]:
         errors.print(problem, style="bold", markup=False, highlight=False, soft_wrap=True)
     if len(result.problems) > MAX_PROBLEMS:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from fmtorch import presets
-from fmtorch.storage.runs import leaves
+from fmtorch.core.settings import leaves
 
 MAX_OPTIONS = 3  # that a name tells of a stage; of more the identity's first digits do
 _DIGITS = 6  # of an identity

@@ -9,8 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from fmtorch.core.files import replacing
-from fmtorch.storage.runs import canonical
+from fmtorch.core.settings import claim
 
 RECORD = "export.json"
 
@@ -31,21 +30,5 @@ def open_folder(output: Path, identity: Mapping[str, Any]) -> Path:
 
     Raises ValueError where the output holds results of another identity.
     """
-    output.mkdir(parents=True, exist_ok=True)
-    file = output / RECORD
-    wanted = json.loads(canonical(identity))
-    if file.exists():
-        try:
-            stored = json.loads(file.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise ValueError(f"{file} is not valid JSON ({error}); delete {output} and run again") from error
-        if stored != wanted:
-            differing = [key for key in {**stored, **wanted} if stored.get(key) != wanted.get(key)]
-            raise ValueError(
-                f"{output} holds matches of other settings ({', '.join(sorted(differing))} differ); "
-                "choose another output, or delete the folder"
-            )
-    else:
-        with replacing(file) as temporary:
-            temporary.write_text(json.dumps(wanted, indent=2) + "\n", encoding="utf-8")
+    claim(output / RECORD, identity, "matches", "choose another output, or delete the folder", alone=False)
     return output / "export"

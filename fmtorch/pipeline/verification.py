@@ -7,9 +7,9 @@ import dataclasses
 import functools
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, NamedTuple, cast, get_args
 
 from fmtorch import presets
 from fmtorch.core.arguments import number
@@ -18,11 +18,18 @@ from fmtorch.core.shards import Shard, shard_of
 from fmtorch.core.stages import Estimator, model_of
 from fmtorch.core.version import __version__
 from fmtorch.pipeline.database_pairs import Cameras
-from fmtorch.pipeline.verification_places import Places, log_of, opened, opened_files, parts_of
-from fmtorch.pipeline.verification_run import Estimation, Verification, VerificationRun
+from fmtorch.pipeline.verification_run import Estimation, MatchStore, Verification, VerificationRun
 from fmtorch.storage.exchange.colmap import imported
-from fmtorch.storage.exchange.database import MatchDatabase, copy_database, expect_database, move_database
+from fmtorch.storage.exchange.database import (
+    MatchDatabase,
+    copy_database,
+    expect_database,
+    move_database,
+    remove_database,
+)
 from fmtorch.storage.exchange.geometry_parts import GeometryParts
+from fmtorch.storage.exchange.hloc_matches import HlocMatches
+from fmtorch.storage.exchange.match_file import MatchFile, expect_suffix
 
 ONE_THREAD = Execution("threads", 1)  # that calls an estimator, which uses as many as torch may
 
@@ -50,9 +57,9 @@ def verify(
 ) -> Verification:
     """Estimate the two-view geometry of every pair with matches in a COLMAP database, as its mappers read it.
 
-    Configuration, inlier matches, F, E, H and relative pose are written, batch by batch in transactions: a run that is
-    killed leaves a database that can be read, and the same call continues it. Keypoints, matches, cameras, rigs and
-    frames stay as they are.
+    Configuration, inlier matches, F, E, H and relative pose are written, in one transaction. Until all pairs are done a
+    folder beside the database keeps them: a run that is killed leaves the database as it was, and the same call
+    continues it. Keypoints, matches, cameras, rigs and frames stay as they are.
 
     Args:
         path: the database, of COLMAP 3 or 4, with keypoints of 2, 4 or 6 columns and cameras of any model with a lens.
@@ -73,8 +80,7 @@ def verify(
         report: called with the pairs done and their number, at the start and after each batch.
         execution: by which workers, ``fmtorch.core.executors.Execution("processes", 4)`` say; None: threads of the
             estimator. All that is written this process writes.
-        shard: "2/8" for the second eighth of the pairs. Geometries go to a folder beside the database, whence a call
-            without `shard` merges them and estimates what is missing.
+        shard: "2/8" for the second eighth of the pairs. A call without it estimates what is missing and writes all.
         options: replace values of the preset (``inlier_threshold=1.0``).
 
     Returns:
@@ -99,13 +105,22 @@ def verify(
     """
     make = functools.partial(presets.build, "estimator", estimator, config_dir, **options)
     settings = {"estimator": estimator, "options": repr(sorted(options.items()))}
-    places = Places(*(None if place is None else Path(place) for place in (path, features, matches, output)))
-    how = How(cameras, force, seed, execution or ONE_THREAD, shard_of(shard))
-    return verify_by(make, settings, places, how, report)
+    paths = VerifyPaths(*(None if place is None else Path(place) for place in (path, features, matches, output)))
+    verify_options = VerifyOptions(cameras, force, seed, execution or ONE_THREAD, shard_of(shard))
+    return verify_by(make, settings, paths, verify_options, report)
+
+
+class VerifyPaths(NamedTuple):
+    """Where matches are, in a database, in hloc's two files or in one of matches alone, and where geometries go."""
+
+    database: Path | None
+    features: Path | None
+    matches: Path | None
+    output: Path | None
 
 
 @dataclasses.dataclass(frozen=True)
-class How:
+class VerifyOptions:
     """How pairs are verified: what is taken for known of cameras, what is replaced, by whom, and which pairs."""
 
     cameras: str = "stored"
@@ -116,55 +131,31 @@ class How:
 
 
 def verify_by(
-    make: Callable[[], Estimator], settings: Mapping[str, Any], places: Places, how: How,
+    make: Callable[[], Estimator], settings: Mapping[str, Any], paths: VerifyPaths, options: VerifyOptions,
     report: Callable[[int, int], None] | None,
 ) -> Verification:  # fmt: skip
     """The same by any estimator, which `make` builds; an interrupted run is continued by one of the same `settings`."""
     begin = time.perf_counter()
-    seed = int(number("seed", how.seed, integer=True))
-    if how.cameras not in get_args(Cameras):
-        raise ValueError(f"cameras is {how.cameras!r}; it must be one of {', '.join(get_args(Cameras))}")
+    seed = int(number("seed", options.seed, integer=True))
+    if options.cameras not in get_args(Cameras):
+        raise ValueError(f"cameras is {options.cameras!r}; it must be one of {', '.join(get_args(Cameras))}")
     estimator = make()
     if (gives := model_of(estimator)) != "fundamental":
         raise ValueError(f"estimator gives {gives} matrices; verify needs one that gives fundamental matrices")
-    settings = {**settings, "version": __version__, "cameras": how.cameras, "seed": seed, "force": how.force}
-    path, features, matches, output = places
-    known = cast(Cameras, how.cameras)
-    if how.execution.shared:
+    if options.execution.shared:
         make = functools.partial(_same, estimator)
-    if features is not None or matches is not None:
-        if path is not None or matches is None or output is None:
-            raise ValueError(HLOC_NEEDS if features is not None or path is not None else MATCHES_NEED)
-        known = "unknown" if features is not None and known == "stored" else known
-        with opened_files(features, matches, output, settings, how.force, how.shard) as store:
-            parts = parts_of(output, {**settings, "pairs": len(store.pairs())}, how.shard)
-            run = VerificationRun(store, None, how.shard, parts)
-            run.each_batch(functools.partial(_estimation, make, known, seed), how.execution, report)
-            if how.shard is None:
-                store.finish(output)
-        if how.shard is None:
-            log_of(output).unlink(missing_ok=True)
-        return _finished(run, parts, output, how.shard, begin)
-    estimation = functools.partial(_estimation, make, known, seed)
-    if path is None:
-        raise ValueError("database is missing; give the database of a COLMAP project: fmtorch verify database.db")
-    imported()
-    expect_database(path)
-    with contextlib.ExitStack() as stack:
-        if how.shard is None:
-            work, log = opened(path, output, settings, how.force)
-        else:  # many machines may read it, and SQLite writes to what it opens
-            work, log = Path(stack.enter_context(tempfile.TemporaryDirectory())) / path.name, None
-            copy_database(path, work)
-        database = stack.enter_context(MatchDatabase(work))
-        parts = parts_of(output or path, {**settings, **database.counts()}, how.shard)
-        run = VerificationRun(database, log if how.force else None, how.shard, parts, again=how.force)
-        run.each_batch(estimation, how.execution, report)
-    if output is not None and how.shard is None:
-        move_database(work, output)
-    if log is not None:
-        log.remove()
-    return _finished(run, parts, output or path, how.shard, begin)
+    known = "unknown" if paths.features is not None and options.cameras == "stored" else options.cameras
+    settings = {**settings, "version": __version__, "cameras": known, "seed": seed, "force": options.force}
+    whole = options.shard is None
+    with _opened(paths, options.force, whole) as (store, end):
+        parts = GeometryParts(end.with_name(f"{end.name}.parts"), {**settings, **store.identity()})
+        run = VerificationRun(store, parts, options.shard, options.force)
+        run.each_batch(functools.partial(_estimation, make, cast(Cameras, known), seed), options.execution, report)
+        if whole:
+            run.write()
+    if whole:
+        parts.remove()
+    return run.result(end if whole else parts.folder, time.perf_counter() - begin)
 
 
 def _same(estimator: Estimator) -> Estimator:
@@ -175,11 +166,56 @@ def _estimation(make: Callable[[], Estimator], cameras: Cameras, seed: int) -> E
     return Estimation(make(), cameras, seed)
 
 
-def _finished(
-    run: VerificationRun, parts: GeometryParts | None, path: Path, shard: Shard | None, begin: float
-) -> Verification:
-    """The summary; the folder of shards goes once it is merged."""
-    if parts is not None and shard is None:
-        parts.remove()
-    where = parts.folder if parts is not None and shard is not None else path
-    return run.result(where, time.perf_counter() - begin)
+@contextlib.contextmanager
+def _opened(paths: VerifyPaths, force: bool, whole: bool) -> Iterator[tuple[MatchStore, Path]]:
+    """The store of the matches, and the file that geometries are for; whole: they are written to it."""
+    database, features, matches, output = paths
+    if features is not None or matches is not None:
+        if database is not None or matches is None or output is None:
+            raise ValueError(HLOC_NEEDS if features is not None or database is not None else MATCHES_NEED)
+        _expect_files(features, matches, output, force)
+        with MatchFile(matches, output) if features is None else HlocMatches(features, matches, output) as files:
+            yield files, output
+        return
+    if database is None:
+        raise ValueError("database is missing; give the database of a COLMAP project: fmtorch verify database.db")
+    imported()
+    expect_database(database)
+    if output is not None:
+        if output.exists() and output.samefile(database):
+            raise ValueError(f"output={output} is the database itself; leave output out to write into it")
+        _expect_new(output, force)
+    with contextlib.ExitStack() as stack:
+        work = database
+        if not whole:  # many machines may read it, and SQLite writes to what it opens
+            work = Path(stack.enter_context(tempfile.TemporaryDirectory())) / database.name
+        elif output is not None:
+            work = output.with_name(f"{output.name}.partial")
+            remove_database(work)
+        if work != database:
+            copy_database(database, work)
+        with MatchDatabase(work) as store:
+            yield store, output or database
+        if whole and output is not None:
+            move_database(work, output)
+
+
+def _expect_files(features: Path | None, matches: Path, output: Path, force: bool) -> None:
+    """Raises FileNotFoundError or ValueError for files that are not there, of another kind, or one and the same."""
+    wanted = "give hloc's files: features=F.h5 matches=M.h5" if features else "give matches alone: matches=FILE.npz"
+    if features is None:
+        expect_suffix("matches", matches)
+        expect_suffix("output", output)
+    for path in (features, matches):
+        if path is not None and not path.exists():
+            raise FileNotFoundError(f"there is no file {path}; {wanted}")
+        if path is not None and output.exists() and output.samefile(path):
+            raise ValueError(f"output={output} is one of the files that are read; name another")
+    _expect_new(output, force)
+
+
+def _expect_new(output: Path, force: bool) -> None:
+    if output.exists() and not force:
+        raise ValueError(f"output={output} exists; name another file, or replace it with force=true")
+    if not output.parent.is_dir():
+        raise FileNotFoundError(f"there is no folder {output.parent}; output={output} cannot be written")

@@ -1,10 +1,10 @@
-"""Pairs of stored matches, estimated and written batch by batch."""
+"""Pairs of stored matches, estimated batch by batch; their geometries are kept until all are there."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -22,11 +22,10 @@ from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.storage.exchange.database_images import DatabaseImage
 from fmtorch.storage.exchange.geometry_parts import GeometryParts
 from fmtorch.storage.exchange.two_view import PairGeometry
-from fmtorch.storage.exchange.verification_log import VerificationLog
 from fmtorch.two_view.estimation import estimated_by
 from fmtorch.two_view.pair_type import classify
 
-BATCH = 64  # pairs that are read, and written, at a time
+BATCH = 64  # pairs that are read, and kept, at a time
 PRELOADED = ("fmtorch.pipeline.verification_run",)  # by the process that workers are forked of
 
 Ids = tuple[Any, Any]
@@ -35,6 +34,9 @@ Ids = tuple[Any, Any]
 @runtime_checkable
 class MatchStore(Protocol):
     """Matches of pairs of images, and a place for their geometries; see `MatchDatabase`."""
+
+    def identity(self) -> dict[str, Any]:
+        """By what the matches are known again, as plain values."""
 
     def pairs(self) -> list[Ids]:
         """The pairs of images that have matches."""
@@ -49,7 +51,7 @@ class MatchStore(Protocol):
         """Whether a pair has a geometry, of a failure too."""
 
     def write(self, geometries: Iterable[tuple[Ids, PairGeometry]]) -> None:
-        """Write geometries, all of them or none."""
+        """Write the geometries of all pairs, all of them or none."""
 
     def name(self, image_id: Any) -> str:
         """The name of an image."""
@@ -59,9 +61,10 @@ class MatchStore(Protocol):
 class Verification:
     """What `verify` did with a database.
 
-    path: of the database with the geometries. pairs: that have matches. kept: of these, that had a geometry before or
-    were finished by an interrupted run. configurations: of the others, how many of each of COLMAP's kinds. problems:
-    why pairs could not be read, a line each; the next run tries them again. seconds: of the whole.
+    path: of the database with the geometries; of a shard, the folder that keeps them. pairs: that have matches. kept:
+    of these, that had a geometry before, or were finished by an interrupted run or a shard. configurations: how many
+    of each of COLMAP's kinds were written. problems: why pairs could not be read, a line each; the next run tries them
+    again. seconds: of the whole.
     """
 
     path: Path
@@ -140,31 +143,25 @@ def divided(batch: Batch) -> list[Batch]:
 class VerificationRun:
     """The pairs of one store of matches.
 
-    log: of the pairs that count as done, else those with a geometry. shard, parts: only these pairs, and where their
-    geometries go instead; without a shard, whence they come. again: whether a shard does pairs that have a geometry.
+    parts: keeps their geometries. shard: only these pairs, which are kept there; None: all, and `write` moves what is
+    kept into the store. force: estimate pairs that have a geometry in the store, too.
     """
 
     def __init__(
-        self, database: MatchStore, log: VerificationLog | None = None, shard: Shard | None = None,
-        parts: GeometryParts | None = None, again: bool = False,
-    ) -> None:  # fmt: skip
-        self.database, self.log, self.again = database, log, again
-        self.parts = parts if shard is not None else None
-        self._merged = set[Ids]()
-        pairs = database.pairs()
+        self, store: MatchStore, parts: GeometryParts, shard: Shard | None = None, force: bool = False
+    ) -> None:
+        self.store, self.parts = store, parts
+        pairs = store.pairs()
         self.pairs = pairs if shard is None else list(shard.of(pairs))
+        self.todo = [p for p in self.pairs if p not in parts.done and (force or not store.has_geometry(p))]
         self.configurations: Counter[str] = Counter()
         self.problems: list[str] = []
-        self.kept = 0
-        if parts is not None and shard is None:
-            self._merge(parts)
 
     def each_batch(
         self, make: Callable[[], Estimation], execution: Execution, report: Callable[[int, int], None] | None
     ) -> None:
-        """Estimate and write the pairs that are not done, batch by batch; `make` is pickled for workers elsewhere."""
-        todo = [pair for pair in self.pairs if not self._done(pair)]
-        self.kept = len(self.pairs) - len(todo)
+        """Estimate and keep the pairs that are not done, batch by batch; `make` is pickled for workers elsewhere."""
+        todo = self.todo
         if report is not None and todo:
             report(0, len(todo))
         source: Source[Estimation] = Here(make()) if execution.shared else Recipe(make)
@@ -176,24 +173,27 @@ class VerificationRun:
             if report is not None:
                 report(done, len(todo))
 
+    def write(self) -> None:
+        """Write what is kept into the store."""
+        self.configurations.clear()
+        self.store.write(self._counted(self.parts.read()))
+
     def result(self, path: Path, seconds: float) -> Verification:
         """The summary."""
-        counts = dict(self.configurations)
-        return Verification(path, len(self.pairs), self.kept, counts, tuple(self.problems), seconds)
+        kept, counts = len(self.pairs) - len(self.todo), dict(self.configurations)
+        return Verification(path, len(self.pairs), kept, counts, tuple(self.problems), seconds)
 
-    def _done(self, pair: Ids) -> bool:
-        if pair in self._merged:
-            return True
-        if self.parts is not None:
-            return pair in self.parts.done or (not self.again and self.database.has_geometry(pair))
-        return self.database.has_geometry(pair) if self.log is None else pair in self.log.done
+    def _counted(self, geometries: Iterable[tuple[Ids, PairGeometry]]) -> Iterator[tuple[Ids, PairGeometry]]:
+        for ids, geometry in geometries:
+            self.configurations[geometry.kind] += 1
+            yield ids, geometry
 
     def _read(self, pairs: Sequence[Ids]) -> Batch:
         batch = Batch([], [], [])
         for pair in pairs:
             try:
-                matches = self.database.matches(pair)
-                batch.pairs.append(DatabasePair(self.database.image(pair[0]), self.database.image(pair[1]), matches))
+                matches = self.store.matches(pair)
+                batch.pairs.append(DatabasePair(self.store.image(pair[0]), self.store.image(pair[1]), matches))
                 batch.ids.append(pair)
             except Exception as error:  # one pair does not end the work on the others
                 batch.problems.append((pair, _first_line(error)))
@@ -201,30 +201,15 @@ class VerificationRun:
 
     def _keep(self, batch: Batch, result: Geometries) -> None:
         self._note([*batch.problems, *result.problems])
-        self._write(result.ids, result.geometries)
-
-    def _write(self, ids: Sequence[Ids], results: Sequence[PairGeometry]) -> None:
-        if not ids:
-            return
-        store = self.database if self.parts is None else self.parts
-        store.write(zip(ids, results, strict=True))
-        if self.log is not None and self.parts is None:
-            self.log.add(ids)
-        self.configurations.update(result.kind for result in results)
-
-    def _merge(self, parts: GeometryParts) -> None:
-        """Write what shards found."""
-        for part in parts.read():
-            new = [(ids, geometry) for ids, geometry in part if not self._done(ids)]
-            self._write([ids for ids, _ in new], [geometry for _, geometry in new])
-            self._merged.update(ids for ids, _ in part)
+        if result.ids:
+            self.parts.write(self._counted(zip(result.ids, result.geometries, strict=True)))
 
     def _give_up(self, batch: Batch, reason: str) -> None:
         self._note([*batch.problems, *((ids, reason) for ids in batch.ids)])
 
     def _note(self, problems: Iterable[tuple[Ids, str]]) -> None:
         for pair, problem in problems:
-            self.problems.append(f"{', '.join(self.database.name(image) for image in pair)}: {problem}")
+            self.problems.append(f"{', '.join(self.store.name(image) for image in pair)}: {problem}")
 
 
 def _first_line(error: Exception) -> str:

@@ -110,7 +110,7 @@ def test_the_command_makes_a_set_of_the_pairs_that_can_be_matched(
         assert pair.problem is None
     assert (tmp_path / "Made/a/names.txt").read_text().splitlines()[1] == "00000001 Set/a/00000001"
     assert not (tmp_path / "Made/work").exists()
-    assert json.loads((tmp_path / "Made/pairs.json").read_text())["summary"] == {
+    assert json.loads((tmp_path / "Made/summary.json").read_text()) == {
         "candidates": 20, "judged": 20, "kept": 4, "images": 6,
     }  # fmt: skip
 
@@ -120,7 +120,10 @@ def test_a_finished_set_is_not_made_again_and_another_is_refused(
 ) -> None:
     (tmp_path / "Made").mkdir()
     (tmp_path / "Made/notes.txt").write_text("mine")
-    with pytest.raises(SystemExit, match="error: output=Made holds something else; name a new folder"):
+    with pytest.raises(
+        SystemExit,
+        match=r"error: Made is not empty and has no pairs\.json, so it holds no pairs .*; name another folder",
+    ):
         run(tmp_path, monkeypatch, "count=1")
     (tmp_path / "Made/notes.txt").unlink()
     run(tmp_path, monkeypatch, "count=1")
@@ -129,7 +132,9 @@ def test_a_finished_set_is_not_made_again_and_another_is_refused(
     run(tmp_path, monkeypatch, "count=1")
     assert "Made is complete" in capsys.readouterr().out
     assert (tmp_path / "Made/pairs_with_gt.txt").stat().st_mtime_ns == before
-    with pytest.raises(SystemExit, match="output=Made holds pairs that differ in count 1 there, 2 now; name another"):
+    with pytest.raises(
+        SystemExit, match=r"Made holds pairs of other settings; what differs .*: count: 1 -> 2\. Name another"
+    ):
         run(tmp_path, monkeypatch, "count=2")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 from pathlib import Path
 
@@ -13,7 +12,7 @@ pytest.importorskip("lightning", reason="training needs the extra `train`")
 
 from fmtorch import presets
 from fmtorch.pruning.networks import LC
-from fmtorch.training.pruners.loop import BEST, CHECKPOINTS, TrainingFolderError, claim, latest_checkpoint, train
+from fmtorch.training.pruners.loop import BEST, CHECKPOINTS, latest_checkpoint, train
 from fmtorch.training.pruners.module import Optimisation, PrunerTraining
 from fmtorch.training.pruners.objective import Objective
 from fmtorch.training.pruners.validation import Use, Validation
@@ -113,15 +112,3 @@ def test_best_weights_are_kept(tmp_path: Path) -> None:
     trained(tmp_path)
     best = torch.load(tmp_path / CHECKPOINTS / BEST, weights_only=True)
     assert set(best["state_dict"]) == set(module().state_dict())
-
-
-def test_another_training_is_refused(tmp_path: Path) -> None:
-    claim(tmp_path / "a", {"seed": 0, "network": {"blocks": 2}})
-    claim(tmp_path / "a", {"seed": 0, "network": {"blocks": 2}})
-    with pytest.raises(TrainingFolderError, match="seed"):
-        claim(tmp_path / "a", {"seed": 1, "network": {"blocks": 2}})
-    (tmp_path / "b").mkdir()
-    (tmp_path / "b" / "notes.txt").write_text("mine")
-    with pytest.raises(TrainingFolderError, match="holds no training"):
-        claim(tmp_path / "b", {"seed": 0})
-    assert json.loads((tmp_path / "a" / "training.json").read_text())["seed"] == 0

@@ -15,7 +15,6 @@ pytest.importorskip("lightning", reason="training needs the extra `train`")
 from hydra import compose, initialize_config_dir
 
 from fmtorch.core.resources import conf_dir
-from fmtorch.training.pruners.loop import TrainingFolderError
 from fmtorch.training.pruners.run import run
 from tests.conftest import own_cache
 from tests.pipeline.test_pipeline import draw
@@ -117,7 +116,7 @@ def test_the_command_goes_on_and_refuses_another_training(
     assert (folder / "lc.onnx").is_file()
     trained(monkeypatch, tmp_path, *options)
     assert (folder / "lc.safetensors").read_bytes() == weights
-    with pytest.raises(TrainingFolderError, match=r"holds another training \(it differs in seed\)"):
+    with pytest.raises(ValueError, match=r"holds checkpoints of other settings; what differs .*: seed: "):
         trained(monkeypatch, tmp_path, *options, "seed=1")
 
 

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import functools
-import json
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from fmtorch.core.executors import Execution
-from fmtorch.core.files import replacing
 from fmtorch.core.resources import cache_dir
+from fmtorch.core.settings import claim
 from fmtorch.data.pairs import DepthDataset, PairDataset
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.labelled import labels
@@ -22,7 +21,7 @@ from fmtorch.pipeline.labelled.stored import StoredMatches
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.storage.configuration import configuration, environment
 from fmtorch.storage.features import CachedFeatures
-from fmtorch.storage.runs import canonical, identity_digest
+from fmtorch.storage.runs import identity_digest
 
 MAX_MATCHES = 4000  # matches kept of a pair
 
@@ -86,10 +85,7 @@ class MatchedPairs(StoredMatches):
         home = Path(root).expanduser() if root is not None else cache_dir() / "matched"
         identity = _identity(dataset, stages, most)
         folder = home / f"{dataset.name}-{identity_digest(identity)[:16]}"
-        folder.mkdir(parents=True, exist_ok=True)
-        if not (folder / "about.json").exists():
-            with replacing(folder / "about.json") as temporary:
-                temporary.write_text(json.dumps(json.loads(canonical(identity)), indent=2) + "\n", encoding="utf-8")
+        claim(folder / "about.json", identity, "matches", "delete the folder", alone=False)
         pairs = [dataset[i] for i in range(len(dataset))]
         shards = [[pairs[i] for i in members] for members in partition(pairs)]
         jobs = [Job(folder / f"shard-{number:05d}.arrow", members) for number, members in enumerate(shards)]

@@ -67,7 +67,7 @@ class MatchDatabase:
         pairs = [self._pycolmap.pair_id_to_image_pair(pair_id) for pair_id in ids]
         return sorted(pairs, key=lambda pair: (pair[0] // BLOCK, pair[1] // BLOCK, pair))
 
-    def counts(self) -> dict[str, int]:
+    def identity(self) -> dict[str, Any]:
         """How many keypoints and matches there are, by which a database is known again."""
         return {"keypoints": self._database.num_keypoints(), "matches": self._database.num_matches()}
 

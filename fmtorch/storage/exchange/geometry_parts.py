@@ -1,8 +1,7 @@
-"""Two-view geometries of the shards of one verification, a file a batch in one folder, until they are merged."""
+"""Two-view geometries of a verification that is under way: a file a batch in one folder, until all are there."""
 
 from __future__ import annotations
 
-import json
 import shutil
 import uuid
 from collections.abc import Iterable, Iterator, Mapping
@@ -12,6 +11,7 @@ from typing import Any, cast
 import numpy as np
 
 from fmtorch.core.files import replacing
+from fmtorch.core.settings import claim
 from fmtorch.storage.exchange.two_view import Kind, PairGeometry
 
 SETTINGS = "settings.json"
@@ -21,22 +21,18 @@ Ids = tuple[Any, Any]
 
 
 class GeometryParts:
-    """The folder, which any number of shards of the same settings may write to.
+    """The folder, which any number of processes and shards of the same settings may write to.
 
-    Raises ValueError where it holds geometries of other settings.
+    done: the pairs that it has. Raises ValueError where it holds geometries of other settings.
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
         self.folder = folder
-        wanted = json.dumps(settings, sort_keys=True)
-        folder.mkdir(exist_ok=True)
-        file = folder / SETTINGS
-        if not file.exists():
-            with replacing(file) as temporary:
-                temporary.write_text(wanted, encoding="utf-8")
-        if file.read_text(encoding="utf-8") != wanted:
-            raise ValueError(f"{folder} holds shards of other settings or matches; give the same, or delete the folder")
-        self.done: set[Ids] = {ids for part in self.read() for ids, _ in part}
+        claim(folder / SETTINGS, settings, "geometries", f"give the same, or delete {folder}")
+        self.done: set[Ids] = set()
+        for path in self._files():
+            with np.load(path) as part:
+                self.done.update(map(_ids, part["pairs"].tolist()))
 
     def write(self, geometries: Iterable[tuple[Ids, PairGeometry]]) -> None:
         """Keep geometries of pairs, all of them or none."""
@@ -51,18 +47,22 @@ class GeometryParts:
             np.savez(file, pairs=np.array(pairs), kinds=np.array(kinds), **arrays)
         self.done.update(pairs)
 
-    def read(self) -> Iterator[list[tuple[Ids, PairGeometry]]]:
-        """The geometries, part by part."""
-        for path in sorted(self.folder.glob("*.npz")):
+    def read(self) -> Iterator[tuple[Ids, PairGeometry]]:
+        """The geometries, each pair's once."""
+        seen: set[Ids] = set()
+        for path in self._files():
             with np.load(path) as part:
-                yield [
-                    (_ids(ids), _geometry(part, i, str(kind)))
-                    for i, (ids, kind) in enumerate(zip(part["pairs"].tolist(), part["kinds"].tolist(), strict=True))
-                ]
+                for i, (pair, kind) in enumerate(zip(part["pairs"].tolist(), part["kinds"].tolist(), strict=True)):
+                    if (ids := _ids(pair)) not in seen:
+                        seen.add(ids)
+                        yield ids, _geometry(part, i, str(kind))
 
     def remove(self) -> None:
         """Remove the folder."""
         shutil.rmtree(self.folder)
+
+    def _files(self) -> list[Path]:
+        return sorted(self.folder.glob("*.npz"))
 
 
 def _ids(ids: list[Any]) -> Ids:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import re
 import warnings
@@ -18,42 +17,11 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from rich.progress import Progress, TaskID
 from torch.utils.data import DataLoader, Dataset
 
-from fmtorch.core.files import replacing
 from fmtorch.core.terminal import progress_bars
-from fmtorch.storage.runs import identity_digest
 from fmtorch.training.pruners.module import PrunerTraining
 
 CHECKPOINTS, BEST, LOGS = "checkpoints", "best.ckpt", "logs"
 SMALLER_IS_BETTER = ("log_loss", "calibration_error")  # figures of validation; of the others larger is
-
-
-class TrainingFolderError(ValueError):
-    """A folder that holds another training; the message says what to do."""
-
-
-def claim(folder: Path, identity: Mapping[str, Any]) -> None:
-    """Make `folder` that of the training with this identity, or check that it already is.
-
-    Raises TrainingFolderError where it holds another training, or files that are none.
-    """
-    file = folder / "training.json"
-    wanted = json.loads(json.dumps(identity, sort_keys=True))
-    if file.is_file():
-        try:
-            stored = json.loads(file.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise TrainingFolderError(f"{file} is not valid JSON ({error}); delete {folder} to train anew") from error
-        if identity_digest(stored) != identity_digest(wanted):
-            changed = sorted(k for k in {*stored, *wanted} if stored.get(k) != wanted.get(k))
-            raise TrainingFolderError(
-                f"{folder} holds another training (it differs in {', '.join(changed)}); choose another output"
-            )
-        return
-    if folder.is_dir() and any(folder.iterdir()):
-        raise TrainingFolderError(f"{folder} is not empty and holds no training; choose another output")
-    folder.mkdir(parents=True, exist_ok=True)
-    with replacing(file) as temporary:
-        temporary.write_text(json.dumps(wanted, indent=2) + "\n", encoding="utf-8")
 
 
 def latest_checkpoint(folder: Path) -> tuple[Path | None, int]:

@@ -19,6 +19,7 @@ from torch.utils.data import DataLoader, Sampler
 
 from fmtorch import presets
 from fmtorch.core.options import Within, expect_options
+from fmtorch.core.settings import claim
 from fmtorch.core.terminal import console, progress_bars
 from fmtorch.core.version import __version__
 from fmtorch.pipeline.labelled import (
@@ -34,7 +35,7 @@ from fmtorch.presets.fields import Cache, Count, Gigabytes, Seed, read_fields
 from fmtorch.storage.runs import identity_digest
 from fmtorch.training.planes import PlaneViews
 from fmtorch.training.pruners.data import labelled_matches
-from fmtorch.training.pruners.loop import claim, train
+from fmtorch.training.pruners.loop import train
 from fmtorch.training.pruners.module import Optimisation, PrunerTraining
 from fmtorch.training.pruners.objective import Objective
 from fmtorch.training.pruners.pictures import ValidationPictures
@@ -113,7 +114,7 @@ def run(config: DictConfig, name: str) -> Path:
         "validation": {k: v for k, v in plain(config.validation).items() if k != "roots"},
     }  # fmt: skip
     folder = Path(config.output or f"runs/train/{name}-{identity_digest(identity)[:8]}")
-    claim(folder, identity)
+    claim(folder / "training.json", identity, "checkpoints", "choose another output")
     torch.set_num_threads(int(config.threads or os.cpu_count() or 1))
     torch.manual_seed(config.seed)
     network = presets.instantiate(network_config, f"pruner={name}, network")
