@@ -24,6 +24,7 @@ from fmtorch.storage.exchange.database import (
     MatchDatabase,
     copy_database,
     expect_database,
+    expect_writable,
     move_database,
     remove_database,
 )
@@ -192,7 +193,9 @@ def _opened(paths: VerifyPaths, force: bool, whole: bool) -> Iterator[tuple[Matc
         elif output is not None:
             work = output.with_name(f"{output.name}.partial")
             remove_database(work)
-        if work != database:
+        if work == database:
+            expect_writable(database)
+        else:
             copy_database(database, work)
         with MatchDatabase(work) as store:
             yield store, output or database

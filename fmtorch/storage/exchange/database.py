@@ -147,6 +147,16 @@ def expect_database(path: Path) -> None:
         )
 
 
+def expect_writable(path: Path) -> None:
+    """Raises OSError where a database cannot be written to, or another process does: before the work, not after."""
+    try:
+        with contextlib.closing(sqlite3.connect(path)) as connection:
+            connection.execute("BEGIN IMMEDIATE")
+            connection.rollback()
+    except sqlite3.OperationalError as error:
+        raise OSError(f"{path} cannot be written: {error}") from error
+
+
 def copy_database(path: Path, copy: Path) -> None:
     """Copy a database with what other processes have written last, and which may lie in a file beside it."""
     with _reading(path) as source, contextlib.closing(sqlite3.connect(copy)) as target:
