@@ -11,15 +11,16 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "fmtorch"
 ROOMS = sorted(path.parent.name for path in PACKAGE.glob("*/__init__.py"))
-GROUND = "core compiling geometry"
+GROUND = "core jobs compiling geometry"
 MAY_IMPORT = {
     "core": "",
-    "compiling": "core",
-    "geometry": "core compiling",
+    "jobs": "core",
+    "compiling": "core jobs",
+    "geometry": "core jobs compiling",
     **dict.fromkeys(("metrics", "matching", "features", "pruning", "estimators"), GROUND),
-    "data": "core compiling presets",
+    "data": "core jobs compiling presets",
     "storage": GROUND + " data",
-    "presets": "core",
+    "presets": "core jobs",
     "two_view": GROUND + " estimators pruning presets",
     "pipeline": GROUND + " data storage presets two_view",
     "evaluation": GROUND + " metrics data storage presets two_view pipeline",

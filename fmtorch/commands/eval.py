@@ -14,8 +14,6 @@ from omegaconf import DictConfig
 
 from fmtorch import data, presets
 from fmtorch.commands.main import job, run_command
-from fmtorch.core.executors import MIN_PAIRS_FOR_PROCESSES
-from fmtorch.core.shards import shard_of
 from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.data import ImagePair, PairDataset
 from fmtorch.evaluation.identity import run_identity
@@ -24,6 +22,7 @@ from fmtorch.evaluation.plots import plot_recall_curves
 from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import ALL, Group, summarize
 from fmtorch.evaluation.summary_tables import further_tables, pose_table, summary_markdown, summary_table
+from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES, shard_of
 from fmtorch.pipeline.build import build_pipeline
 from fmtorch.pipeline.exporting import exportable
 from fmtorch.pipeline.pipeline import Pipeline

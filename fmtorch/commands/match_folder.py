@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import shutil
-from collections.abc import Iterator, Sequence
-from concurrent.futures import BrokenExecutor
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from omegaconf import DictConfig
 
 from fmtorch import presets
-from fmtorch.core.executors import MIN_PAIRS_FOR_PROCESSES, SHARED_BY, Team, WorkersLost
 from fmtorch.core.files import replacing
 from fmtorch.core.stages import ImageMatcher
 from fmtorch.core.terminal import console, errors, progress_bars
 from fmtorch.data.images import read_image
 from fmtorch.evaluation.view_graph_picture import view_graph_svg
 from fmtorch.features.vlad import descriptor_kind, image_vector
+from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES
 from fmtorch.pipeline.build import build_pipeline
-from fmtorch.pipeline.folder import MEMORY, FolderMatches
+from fmtorch.pipeline.folder import MEMORY, FolderMatches, folder_workers
 from fmtorch.pipeline.folder_images import SIMILAR, chosen_pairs, count_of, images_below
 from fmtorch.pipeline.folder_output import default_output, open_folder
 from fmtorch.pipeline.photograph_cameras import PhotographCameras
@@ -86,10 +83,14 @@ def match_folder(
         pipeline.extractor = cached(pipeline.extractor, scratch)
     console.print(f"{' '.join([pipeline_name, *overrides])}: {folder}", style="italic", markup=False, highlight=False)
     count = len(images) * similar if similar else len(pairs)
-    with _team(config, fields, pipeline, count) as team, progress_bars() as progress:
+    many = count >= MIN_PAIRS_FOR_PROCESSES and pipeline.device.type == "cpu"
+    execution = execution_of(config, fields.workers).decided(many)
+    build = None if execution.shared else functools.partial(build_pipeline, config, pipeline.device)
+    with folder_workers(pipeline, execution) as workers, progress_bars() as progress:
         work = FolderMatches(
-            pipeline, journal, fields.longest_side, fields.orient, fields.seed, **team, cameras=cameras
-        )
+            pipeline, journal, fields.longest_side, fields.orient, fields.seed,
+            workers=workers, build=build, cameras=cameras,
+        )  # fmt: skip
         if similar and vector is not None:
             seen = progress.track(work.images(images), len(images), description="images")
             pairs = similar_pairs(images, vectors_of(seen, vector), similar)
@@ -106,33 +107,6 @@ def match_folder(
     if isinstance(pipeline.extractor, CachedFeatures) and pipeline.extractor.cache.folder != scratch:
         console.print(pipeline.extractor.report(), style="dim", markup=False, highlight=False)
     return output
-
-
-@contextlib.contextmanager
-def _team(config: DictConfig, fields: FolderFields, pipeline: Pipeline, pairs: int) -> Iterator[dict[str, Any]]:
-    """Who does the work, as `FolderMatches` takes it. Raises WorkersLost where workers die or the scheduler is lost."""
-    parallel = pairs >= MIN_PAIRS_FOR_PROCESSES and pipeline.device.type == "cpu"
-    execution = execution_of(config, fields.workers).decided(parallel)
-    if execution.shared:
-        yield {"workers": execution.workers}
-        return
-    team = Team(execution, ("fmtorch.pipeline.folder",))
-    torch.multiprocessing.set_sharing_strategy(SHARED_BY)  # type: ignore[no-untyped-call]
-    try:
-        executor = team.executor  # which tells how many workers it has
-        build = functools.partial(build_pipeline, config, pipeline.device)
-        yield {"executor": executor, "workers": team.size, "build": build, "send_images": execution.send_images}
-    except BrokenExecutor as error:
-        raise WorkersLost(
-            "a worker process died, perhaps for want of memory: the same command goes on from here; fewer workers, or "
-            "executor=threads, need less of it"
-        ) from error
-    except Exception as error:
-        if (lost := team.lost(error)) is not None:
-            raise lost from error
-        raise
-    finally:
-        team.close()
 
 
 def _expect_some(work: FolderMatches, pairs: int) -> None:

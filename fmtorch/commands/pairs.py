@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import itertools
@@ -16,14 +15,14 @@ from rich.progress import Progress
 
 from fmtorch import data, presets
 from fmtorch.commands.main import job, run_command
-from fmtorch.core.calls import Calls
-from fmtorch.core.executors import Execution, Team
 from fmtorch.core.options import Within
-from fmtorch.core.recipes import Here, Recipe, Source
 from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.data.construction import BLOCK, Construction, blocks
 from fmtorch.data.rendered import RenderedPairs
 from fmtorch.data.scenes import ScenePairs
+from fmtorch.jobs.execution import Execution
+from fmtorch.jobs.pool import WorkerPool
+from fmtorch.jobs.runner import Factory, Local, Source, in_order
 from fmtorch.presets import plain
 from fmtorch.presets.executors import execution_of
 from fmtorch.presets.fields import Count, Seed, path_fields, read_fields
@@ -140,26 +139,21 @@ def _each(
         for given in arguments:
             yield getattr(construction, method)(*given)
         return
-    results: dict[int, Any] = {}
     source: Source[Construction] = (
-        Here(construction) if execution.shared else Recipe(functools.partial(_same, construction))
+        Local(construction) if execution.shared else Factory(functools.partial(_same, construction))
     )
-    jobs = ((number, method, given) for number, given in enumerate(arguments))
-    calls = Calls(Team(execution, PRELOADED), source, _call, lambda job, result: results.update({job[0]: result}))
-    following = 0
-    with contextlib.closing(calls.each(jobs)) as done:
-        for _ in done:
-            while following in results:
-                yield results.pop(following)
-                following += 1
+    tasks = ((method, given) for given in arguments)
+    with WorkerPool(execution, PRELOADED) as pool:
+        for _, result in in_order(pool, source, _call, tasks):
+            yield result
 
 
 def _same(construction: Construction) -> Construction:
     return construction
 
 
-def _call(construction: Construction, job: tuple[int, str, tuple[object, ...]]) -> Any:
-    _, method, given = job
+def _call(construction: Construction, task: tuple[str, tuple[object, ...]]) -> Any:
+    method, given = task
     return getattr(construction, method)(*given)
 
 

@@ -16,8 +16,8 @@ from rich.table import Table
 
 from fmtorch import presets
 from fmtorch.commands.main import job, run_command
-from fmtorch.core.shards import shard_of
 from fmtorch.core.terminal import console, errors, progress_bars, reporter
+from fmtorch.jobs.execution import shard_of
 from fmtorch.pipeline.database_pairs import Cameras
 from fmtorch.pipeline.verification import ONE_THREAD, VerifyOptions, VerifyPaths, verify_by
 from fmtorch.pipeline.verification_run import Verification

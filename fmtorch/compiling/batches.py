@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.compiling import switch
-from fmtorch.core.threads import available, mapped
+from fmtorch.jobs.threads import available, mapped
 
 PAIRS_OF_A_THREAD = 8  # at least; a thread takes as long to begin as a kernel for a pair
 

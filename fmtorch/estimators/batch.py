@@ -17,7 +17,6 @@ from fmtorch.compiling.arrays import Array
 from fmtorch.compiling.batches import as_array
 from fmtorch.core.checks import PER_MATCH, reason
 from fmtorch.core.rules import FOCAL, SIZE
-from fmtorch.core.threads import available, mapped
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.calibration import EXACT, calibration_of
 from fmtorch.estimators.families.cameras import focal_precision, focals_near, focals_px
@@ -29,6 +28,7 @@ from fmtorch.estimators.parts.support import degenerate_support
 from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.geometry.residual_kernels import SAMPSON, Residual
 from fmtorch.geometry.significance import of_one_pair
+from fmtorch.jobs.threads import available, mapped
 
 PARTS_OF_A_THREAD = 4  # so that no thread is long alone at the end
 MIN_WORK = 500  # matches: a pair of fewer takes as long as one of these

@@ -9,9 +9,6 @@ from typing import Any
 
 import torch
 
-from fmtorch.core.calls import Calls
-from fmtorch.core.executors import Execution, Team
-from fmtorch.core.recipes import Here, Recipe, Source
 from fmtorch.core.stages import ImageMatcher
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.evaluation.pair_cameras import PairCameras
@@ -25,6 +22,9 @@ from fmtorch.evaluation.workers import (
     evaluate_batch,
     failed,
 )
+from fmtorch.jobs.execution import Execution
+from fmtorch.jobs.pool import WorkerPool
+from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.storage import PairRow
 from fmtorch.storage.exchange.collected import CollectedJournal
@@ -70,11 +70,9 @@ def evaluate_pairs(
     Rows and journal are written here. Results do not depend on `batch` or `execution`. Raises WorkersLost where workers
     die whatever they do, or a scheduler is gone.
     """
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    team = Team(execution, PRELOADED, most=max(1, len(pairs)))
-    batch = _shared_out(len(pairs), batch, team.size)
-    source: Source[Pipeline] = Here(pipeline) if execution.shared or build is None else Recipe(build)
+    pool = WorkerPool(execution, PRELOADED, limit=max(1, len(pairs)))
+    batch = _shared_out(len(pairs), batch, pool.size)
+    source: Source[Pipeline] = Local(pipeline) if execution.shared or build is None else Factory(build)
 
     def given(members: Sequence[ImagePair]) -> Batch:
         own = None if cameras is None or source.shared else {p.key: cameras[p.key] for p in members if p.key in cameras}
@@ -90,28 +88,31 @@ def evaluate_pairs(
             pipeline.extractor.computed += work.computed
             pipeline.extractor.found += work.from_cache
 
-    calls = Calls(team, source, evaluate_batch, keep, lambda done, reason: store(failed(done, reason)), divided)
+    runner = TaskRunner(pool, source, evaluate_batch, keep, lambda done, reason: store(failed(done, reason)), divided)
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
     try:
-        begun = 0
-        if source.shared and team.size > 1 and pairs and not isinstance(pipeline.matcher, ImageMatcher):
-            begun = 1  # alone: where its stages compile kernels, others would wait for them
-            _features_ahead(team, pipeline, pairs, calls.begin(given(pairs[:1])))
-        for done in calls.each(given(pairs[i : i + batch]) for i in range(begun, len(pairs), batch)):
-            yield len(done.pairs)
+        with pool:
+            begun = 0
+            if source.shared and pool.size > 1 and pairs and not isinstance(pipeline.matcher, ImageMatcher):
+                begun = 1  # alone: where its stages compile kernels, others would wait for them
+                _features_ahead(pool, pipeline, pairs, runner.begin(given(pairs[:1])))
+            for done in runner.each(given(pairs[i : i + batch]) for i in range(begun, len(pairs), batch)):
+                yield len(done.pairs)
     finally:
         torch.set_num_threads(before)
 
 
-def _features_ahead(team: Team, pipeline: Pipeline, pairs: Sequence[ImagePair], first: Future[Work]) -> None:
+def _features_ahead(pool: WorkerPool, pipeline: Pipeline, pairs: Sequence[ImagePair], first: Future[Work]) -> None:
     """While a worker is at the first pair, the others compute features of those that follow, as many as are kept."""
     computing: set[Future[None]] = set()
     for image in itertools.islice(_images_after_the_first(pairs), pipeline.memory):
-        while len(computing) >= team.size - 1 and not first.done():
+        while len(computing) >= pool.size - 1 and not first.done():
             wait(list[Future[Any]]([first, *computing]), return_when=FIRST_COMPLETED)
             computing = {future for future in computing if not future.done()}
         if first.done():
             return
-        computing.add(team.executor.submit(compute_features, pipeline, image))
+        computing.add(pool.executor.submit(compute_features, pipeline, image))
 
 
 def _images_after_the_first(pairs: Sequence[ImagePair]) -> Iterator[ImageSource]:

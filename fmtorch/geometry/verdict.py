@@ -7,9 +7,9 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.geometry.significance import significance
+from fmtorch.jobs.threads import one_thread
 
 
 def judged(estimate: Estimate, c: Correspondences) -> Estimate:

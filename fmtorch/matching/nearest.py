@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch.compiling.batches import kernels_serve
-from fmtorch.core.threads import one_thread
 from fmtorch.geometry.arithmetic import sqrt, stable_sum
+from fmtorch.jobs.threads import one_thread
 from fmtorch.matching import eight_bit
 
 _GROUP = 32  # columns whose minimum is taken together; a group is searched only where it can hold a neighbour

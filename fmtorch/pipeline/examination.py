@@ -6,8 +6,8 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 from fmtorch.core.stages import model_of
-from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Correspondences, collate
+from fmtorch.jobs.threads import one_thread
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.two_view.pair_type import classify
 

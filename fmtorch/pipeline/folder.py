@@ -1,20 +1,23 @@
-"""A folder of images: the work on its images and pairs, by any executor, that can be resumed."""
+"""A folder of images: the work on its images and pairs, by any workers, that can be resumed."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fmtorch.core.recipes import Here, Recipe, Source
-from fmtorch.core.threads import available, one_thread
+import torch
+
 from fmtorch.data.images import read_image
 from fmtorch.data.pairs import ImageSource
 from fmtorch.data.text_files import DataError
+from fmtorch.jobs.execution import Execution
+from fmtorch.jobs.pool import SHARED_BY, WorkerPool
+from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, in_order
+from fmtorch.jobs.threads import available, one_thread
 from fmtorch.pipeline.exporting import exported_image, exported_match
 from fmtorch.pipeline.folder_images import Pair, in_blocks
 from fmtorch.pipeline.photograph_cameras import PhotographCameras
@@ -23,14 +26,16 @@ from fmtorch.pipeline.two_images import Described, describe, relate
 from fmtorch.storage.exchange.journal import ExportedPair, Journal
 
 MEMORY = 64  # images whose features are kept for pairs to come
-AHEAD = 4  # pairs a worker that are begun before the first of them has ended
+AHEAD = 4  # pairs a worker whose images are described before the first of them is matched
 MAX_WORKERS = 8  # by default: each holds an image and its scale space
+PRELOADED = ("fmtorch.pipeline.folder",)  # by the process that workers are forked of
 
 
 class Photograph(NamedTuple):
-    """An image to describe, as `read_image` and `describe` take it."""
+    """An image to describe, as `read_image` and `describe` take it; in place of `image`, why there is none."""
 
-    image: ImageSource
+    path: Path
+    image: ImageSource | str
     longest_side: int
     orient: bool
 
@@ -38,199 +43,192 @@ class Photograph(NamedTuple):
 class DescribedPair(NamedTuple):
     """Two described images to match. names: of them, in the journal. known: `PhotographCameras.given`."""
 
+    pair: Pair
     ends: tuple[Described, Described]
     names: tuple[str, str]
     seed: int
     known: Mapping[str, Any]
 
 
-def described_image(pipeline: Pipeline, photograph: Photograph) -> Described:
-    """The features of an image file, by one thread."""
-    with one_thread(pipeline.device):
-        return describe(pipeline, read_image(photograph.image, orient=photograph.orient), photograph.longest_side)
+def described_or_matched(pipeline: Pipeline, task: Photograph | DescribedPair) -> Described | ExportedPair | str:
+    """What a worker does, by one thread: an image's features, what a journal keeps of a pair, or what went wrong."""
+    try:
+        with one_thread(pipeline.device):
+            if isinstance(task, DescribedPair):
+                result = relate(pipeline, *task.ends, task.seed, **task.known)
+                return exported_match(task.names, task.ends, result)
+            if isinstance(task.image, str):
+                return task.image
+            return describe(pipeline, read_image(task.image, orient=task.orient), task.longest_side)
+    except Exception as error:  # one image, or one pair, does not end the work on the others
+        return _in_a_line(error)
 
 
-def matched_pair(pipeline: Pipeline, pair: DescribedPair) -> ExportedPair:
-    """What a journal keeps of two images, by one thread."""
-    with one_thread(pipeline.device):
-        result = relate(pipeline, *pair.ends, pair.seed, **pair.known)
-    return exported_match(pair.names, pair.ends, result)
+def _in_a_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}".splitlines()[0]
 
 
-@dataclasses.dataclass(eq=False)
-class _Begun:
-    """A pair under way: its images' features, and what is found of it, once they are there."""
-
-    pair: Pair
-    ends: tuple[Future[Described], Future[Described]]
-    match: Future[ExportedPair] | None = None
-
-    @property
-    def described(self) -> bool:
-        return all(end.done() for end in self.ends)
-
-    @property
-    def failed(self) -> bool:
-        return any(end.done() and end.exception() is not None for end in self.ends)
-
-    @property
-    def under_way(self) -> list[Future[Any]]:
-        futures: list[Future[Any]] = [*self.ends] if self.match is None else [self.match]
-        return [future for future in futures if not future.done()]
-
-
-def _failed(error: Exception) -> Future[Any]:
-    future: Future[Any] = Future()
-    future.set_exception(error)
-    return future
+def folder_workers(pipeline: Pipeline, execution: Execution | None = None) -> WorkerPool:
+    """The workers for `FolderMatches`; of threads one a core, or one for a GPU, unless `execution` says how many."""
+    execution = execution or Execution()
+    if execution.shared:
+        usual = min(available(), MAX_WORKERS) if pipeline.device.type == "cpu" else 1
+        return WorkerPool(dataclasses.replace(execution, workers=execution.workers or usual))
+    torch.multiprocessing.set_sharing_strategy(SHARED_BY)  # type: ignore[no-untyped-call]
+    return WorkerPool(execution, PRELOADED)
 
 
 class FolderMatches:
     """Matches pairs of images into a journal, which this process alone writes; what that has already is taken.
 
-    executor: a `concurrent.futures.Executor` that does the work, not closed at the end; None: threads. workers: its
-    size; None: one a core, one for a GPU. build: makes the pipeline in other processes; None: threads share it.
-    send_images: as bytes, to workers that do not see the files. cameras: of the images.
+    workers: who does it, not closed at the end; None: those of `folder_workers`. build: makes the pipeline in other
+    processes; None: threads share it. cameras: of the images.
 
-    done, taken, related: pairs matched now, taken from the journal, and of either those that show one scene. troubles:
-    what went wrong with images or pairs, which are tried again the next time.
+    done, taken, related: pairs matched now, taken from the journal, and of either those that show one scene.
     """
 
     def __init__(
         self, pipeline: Pipeline, journal: Journal, longest_side: int, orient: bool, seed: int, *,
-        executor: Executor | None = None, workers: int | None = None, build: Callable[[], Pipeline] | None = None,
-        send_images: bool = False, cameras: PhotographCameras | None = None,
+        workers: WorkerPool | None = None, build: Callable[[], Pipeline] | None = None,
+        cameras: PhotographCameras | None = None,
     ) -> None:  # fmt: skip
         self.pipeline, self.journal, self.cameras = pipeline, journal, cameras or PhotographCameras()
         self.longest_side, self.orient, self.seed = longest_side, orient, seed
-        self.executor, self.send_images = executor, send_images
-        self.source: Source[Pipeline] = Here(pipeline) if build is None else Recipe(build)
-        usual = min(available(), MAX_WORKERS) if pipeline.device.type == "cpu" else 1
-        self.workers = usual if workers is None else workers
-        self.done = self.taken = self.related = 0
-        self.troubles: list[str] = []
-        self._described: OrderedDict[Path, Future[Described]] = OrderedDict()
-        self._kept: set[Path] = set()
+        self.workers = workers
+        self.source: Source[Pipeline] = Local(pipeline) if build is None else Factory(build)
+        self.done = self.taken = self.related = self._failed = 0
+        self._troubles: dict[tuple[Path, ...], str] = {}
+        self._described: OrderedDict[Path, Described | None] = OrderedDict()  # None: it cannot be
+
+    @property
+    def troubles(self) -> list[str]:
+        """What went wrong with images and pairs, in the order of their names; they are tried again the next time."""
+        return [trouble for _, trouble in sorted(self._troubles.items())]
 
     def images(self, images: Sequence[Path]) -> Iterator[Described | None]:
-        """The features of images, in their order; None of one that cannot be read, which is said once."""
-        with self._running() as executor:
-            ahead: deque[tuple[Path, Future[Described]]] = deque()
-            todo = iter(images)
-            while True:
-                for image in todo:
-                    ahead.append((image, self._image(executor, image)))
-                    if len(ahead) > AHEAD * self.workers:
-                        break
-                if not ahead:
-                    return
-                yield self._finished(*ahead.popleft())
+        """The features of images, in their order; None of one that cannot be read."""
+        with self._pool() as pool:
+            photographs = (self._photograph(image, pool) for image in images)
+            for photograph, result in in_order(pool, self.source, described_or_matched, photographs):
+                self._keep(photograph, result)
+                yield self._described[photograph.path]
+                self._forget(set())
 
     def each(self, pairs: Sequence[Pair]) -> Iterator[None]:
-        """Match the pairs, and yield after each; they are kept, and troubles told, in an order that is always the same.
+        """Match the pairs, keep what is found of each, and yield after it.
 
-        Raises BrokenExecutor where the executor's workers have died.
+        Raises WorkersLost where workers die whatever they do, or a scheduler is gone.
         """
-        todo = iter(in_blocks(pairs, MEMORY // 2))
-        begun: deque[_Begun] = deque()
-        with self._running() as executor:
-            try:
-                while True:
-                    for pair in todo:
-                        if self.journal.has_pair(*pair):
-                            self.taken += 1
-                            self.related += self.journal.pair(*pair).related
-                            yield
-                            continue
-                        begun.append(_Begun(pair, (self._image(executor, pair[0]), self._image(executor, pair[1]))))
-                        if len(begun) >= AHEAD * self.workers:
-                            break
-                    if not begun:
-                        return
-                    self._advance(executor, begun)
-                    if begun[0].failed or (begun[0].match is not None and begun[0].match.done()):
-                        self._keep(begun.popleft())
-                        yield
-            finally:
-                for each in begun:
-                    for future in each.under_way:
-                        future.cancel()
+        before = self._passed
+        with self._pool() as pool:
+            runner = TaskRunner(pool, self.source, described_or_matched, self._keep, self._keep)
+            for _ in runner.each(self._tasks(pairs, pool)):
+                while before < self._passed:
+                    before += 1
+                    yield
+        yield from [None] * (self._passed - before)
+
+    @property
+    def _passed(self) -> int:
+        return self.done + self.taken + self._failed
 
     @contextlib.contextmanager
-    def _running(self) -> Iterator[Executor]:
-        if self.executor is not None:
-            yield self.executor
+    def _pool(self) -> Iterator[WorkerPool]:
+        if self.workers is not None:
+            yield self.workers
             return
-        with ThreadPoolExecutor(self.workers) as threads:
-            try:
-                yield threads
-            finally:
-                threads.shutdown(wait=True, cancel_futures=True)
+        with folder_workers(self.pipeline) as pool:
+            yield pool
 
-    def _advance(self, executor: Executor, begun: deque[_Begun]) -> None:
-        """Wait until something has ended, and have pairs matched whose images are described."""
+    def _tasks(self, pairs: Sequence[Pair], pool: WorkerPool) -> Iterator[Photograph | DescribedPair | None]:
+        """Pairs as soon as their images are described, and before them these; None where others must end first."""
+        todo = iter(in_blocks(pairs, MEMORY // 2))
+        ahead = max(MEMORY // 2, AHEAD * pool.size)
+        begun, describing = list[Pair](), set[Path]()
         while True:
-            for each in begun:
-                if each.match is None and each.described and not each.failed:
-                    each.match = self._match(executor, each)
-            if begun[0].failed or not begun[0].under_way:
+            ready = next((pair for pair in begun if all(image in self._described for image in pair)), None)
+            if ready is not None:
+                begun.remove(ready)
+                if (task := self._described_pair(ready)) is not None:
+                    yield task
+            elif len(begun) < ahead and (pair := next(todo, None)) is not None:
+                if self.journal.has_pair(*pair):
+                    self.taken += 1
+                    self.related += self.journal.pair(*pair).related
+                    continue
+                begun.append(pair)
+                describing -= self._described.keys()
+                for image in pair:
+                    if image in self._described:
+                        self._described.move_to_end(image)
+                    elif image not in describing:
+                        describing.add(image)
+                        yield self._photograph(image, pool)
+                self._forget({image for pair in begun for image in pair})
+            elif begun:
+                yield None
+            else:
                 return
-            wait({future for each in begun for future in each.under_way}, return_when=FIRST_COMPLETED)
 
-    def _match(self, executor: Executor, begun: _Begun) -> Future[ExportedPair]:
-        names = self.journal.name(begun.pair[0]), self.journal.name(begun.pair[1])
-        ends = begun.ends[0].result(), begun.ends[1].result()
+    def _photograph(self, image: Path, pool: WorkerPool) -> Photograph:
         try:
-            known = self.cameras.given(begun.pair, [end.size for end in ends])
+            source: ImageSource | str = self.cameras.source(image)
+            if pool.execution.send_images:
+                source = dataclasses.replace(source, data=image.read_bytes())  # type: ignore[type-var]
+        except (DataError, OSError) as error:  # no camera, or no file
+            source = _in_a_line(error)
+        return Photograph(image, source, self.longest_side, self.orient)
+
+    def _described_pair(self, pair: Pair) -> DescribedPair | None:
+        """A pair to match; None where it cannot be."""
+        end0, end1 = (self._described[image] for image in pair)
+        if end0 is None or end1 is None:
+            self._failed += 1
+            return None
+        names = self.journal.name(pair[0]), self.journal.name(pair[1])
+        try:
+            known = self.cameras.given(pair, [end0.size, end1.size])
         except Exception as error:
-            return _failed(error)
-        pair = DescribedPair(ends, names, self.seed, known)
-        return executor.submit(self.source.call(matched_pair, True), pair)
+            self._fail(pair, _in_a_line(error))
+            return None
+        return DescribedPair(pair, (end0, end1), names, self.seed, known)
 
-    def _image(self, executor: Executor, image: Path) -> Future[Described]:
-        """An image's features, begun unless they are there."""
-        if image not in self._described:
+    def _keep(self, task: Photograph | DescribedPair, result: Any) -> None:
+        """Store an image or a pair, or tell what went wrong with it."""
+        if isinstance(task, Photograph):
+            self._described[task.path] = self._keep_image(task.path, result)
+            return
+        if not isinstance(result, str):
             try:
-                source = self.cameras.source(image)
-                if self.send_images:
-                    source = dataclasses.replace(source, data=image.read_bytes())
-                photograph = Photograph(source, self.longest_side, self.orient)
-                self._described[image] = executor.submit(self.source.call(described_image, True), photograph)
-            except (DataError, OSError) as error:  # no camera, or no file
-                self._described[image] = _failed(error)
-        self._described.move_to_end(image)
-        while len(self._described) > MEMORY:
-            self._described.popitem(last=False)
-        return self._described[image]
+                self.journal.add_pair(*task.pair, result)
+            except Exception as error:
+                result = _in_a_line(error)
+        if isinstance(result, str):
+            self._fail(task.pair, result)
+        else:
+            self.done += 1
+            self.related += result.related
 
-    def _finished(self, image: Path, future: Future[Described]) -> Described | None:
-        """An image's features, which the journal then has too; None where it cannot be read, which is said once."""
-        try:
-            described = future.result()
-            if image not in self._kept and not self.journal.has_image(image):
-                camera = self.cameras.of(image, described.size)
-                self.journal.add_image(image, exported_image(self.journal.name(image), described, camera))
-        except BrokenExecutor:
-            raise
-        except Exception as error:  # one image does not end the work on the others
-            if image not in self._kept:
-                self.troubles.append(f"{type(error).__name__}: {error}".splitlines()[0])
-            described = None
-        self._kept.add(image)
-        return described
+    def _keep_image(self, image: Path, described: Described | str) -> Described | None:
+        if not isinstance(described, str):
+            try:
+                if not self.journal.has_image(image):
+                    camera = self.cameras.of(image, described.size)
+                    self.journal.add_image(image, exported_image(self.journal.name(image), described, camera))
+                return described
+            except Exception as error:
+                described = _in_a_line(error)
+        self._troubles[image,] = described
+        return None
 
-    def _keep(self, begun: _Begun) -> None:
-        ends = [self._finished(image, end) for image, end in zip(begun.pair, begun.ends, strict=True)]
-        if begun.match is None or None in ends:
-            return
-        try:
-            pair = begun.match.result()
-            self.journal.add_pair(*begun.pair, pair)
-        except BrokenExecutor:
-            raise
-        except Exception as error:  # nor does one pair
-            names = f"{self.journal.name(begun.pair[0])}, {self.journal.name(begun.pair[1])}"
-            self.troubles.append(f"{names}: {type(error).__name__}: {error}".splitlines()[0])
-            return
-        self.done += 1
-        self.related += pair.related
+    def _fail(self, pair: Pair, reason: str) -> None:
+        self._failed += 1
+        self._troubles[pair] = f"{self.journal.name(pair[0])}, {self.journal.name(pair[1])}: {reason}"
+
+    def _forget(self, needed: set[Path]) -> None:
+        """Keep the features of the last images, and of those that are needed."""
+        for image in [*self._described]:
+            if len(self._described) <= MEMORY:
+                return
+            if image not in needed:
+                del self._described[image]

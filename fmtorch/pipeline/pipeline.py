@@ -24,11 +24,11 @@ from fmtorch.core.stages import (
     model_of,
     pruned,
 )
-from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Correspondences, Features
 from fmtorch.data.images import read_image, to_grey
 from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
 from fmtorch.geometry.verdict import judged
+from fmtorch.jobs.threads import one_thread
 from fmtorch.pipeline.clock import synchronise
 from fmtorch.pipeline.memo import Memo
 from fmtorch.pipeline.outcome import Outcome as Outcome

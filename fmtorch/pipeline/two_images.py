@@ -15,10 +15,10 @@ from torch import Tensor
 from fmtorch import presets
 from fmtorch.core.arguments import Arrays
 from fmtorch.core.stages import ImageMatcher, PairImages, pruned
-from fmtorch.core.threads import mapped, one_thread
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data.lenses import Lens
 from fmtorch.geometry.verdict import judged
+from fmtorch.jobs.threads import mapped, one_thread
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.clock import Clock
 from fmtorch.pipeline.described import Described as Described

@@ -13,10 +13,9 @@ from typing import Any, NamedTuple, cast, get_args
 
 from fmtorch import presets
 from fmtorch.core.arguments import number
-from fmtorch.core.executors import Execution
-from fmtorch.core.shards import Shard, shard_of
 from fmtorch.core.stages import Estimator, model_of
 from fmtorch.core.version import __version__
+from fmtorch.jobs.execution import Execution, Shard, shard_of
 from fmtorch.pipeline.database_pairs import Cameras
 from fmtorch.pipeline.verification_run import Estimation, MatchStore, Verification, VerificationRun
 from fmtorch.storage.exchange.colmap import imported
@@ -79,7 +78,7 @@ def verify(
         seed: of the random numbers.
         config_dir: a folder with presets of your own, as of `find_fundamental`.
         report: called with the pairs done and their number, at the start and after each batch.
-        execution: by which workers, ``fmtorch.core.executors.Execution("processes", 4)`` say; None: threads of the
+        execution: by which workers, ``fmtorch.jobs.execution.Execution("processes", 4)`` say; None: threads of the
             estimator. All that is written this process writes.
         shard: "2/8" for the second eighth of the pairs. A call without it estimates what is missing and writes all.
         options: replace values of the preset (``inlier_threshold=1.0``).

@@ -11,12 +11,11 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.core.calls import Calls
-from fmtorch.core.executors import Execution, Team
-from fmtorch.core.recipes import Here, Recipe, Source
-from fmtorch.core.shards import Shard
 from fmtorch.core.stages import Estimator
 from fmtorch.core.types import Correspondences, collate
+from fmtorch.jobs.execution import Execution, Shard
+from fmtorch.jobs.pool import WorkerPool
+from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner
 from fmtorch.pipeline.database_pairs import Cameras, DatabasePair, as_correspondences
 from fmtorch.pipeline.pair_geometries import pair_geometries
 from fmtorch.storage.exchange.database_images import DatabaseImage
@@ -164,14 +163,14 @@ class VerificationRun:
         todo = self.todo
         if report is not None and todo:
             report(0, len(todo))
-        source: Source[Estimation] = Here(make()) if execution.shared else Recipe(make)
-        team = Team(execution, PRELOADED)
+        source: Source[Estimation] = Local(make()) if execution.shared else Factory(make)
         batches = (self._read(todo[start : start + BATCH]) for start in range(0, len(todo), BATCH))
         done = 0
-        for batch in Calls(team, source, estimate_batch, self._keep, self._give_up, divided).each(batches):
-            done += len(batch.ids) + len(batch.problems)
-            if report is not None:
-                report(done, len(todo))
+        with WorkerPool(execution, PRELOADED) as pool:
+            for batch in TaskRunner(pool, source, estimate_batch, self._keep, self._give_up, divided).each(batches):
+                done += len(batch.ids) + len(batch.problems)
+                if report is not None:
+                    report(done, len(todo))
 
     def write(self) -> None:
         """Write what is kept into the store."""

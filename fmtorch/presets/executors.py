@@ -9,7 +9,7 @@ from typing import cast
 
 from omegaconf import DictConfig
 
-from fmtorch.core.executors import Execution
+from fmtorch.jobs.execution import Execution
 from fmtorch.presets.composition import plain
 from fmtorch.presets.fields import Count, read_fields
 from fmtorch.presets.objects import expect_buildable, instantiate

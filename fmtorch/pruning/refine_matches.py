@@ -13,9 +13,9 @@ from torch import Tensor
 from fmtorch.compiling.arrays import Array
 from fmtorch.core.grey_pyramid import GreyPyramid
 from fmtorch.core.stages import PairImages
-from fmtorch.core.threads import mapped
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry.arithmetic import sqrt
+from fmtorch.jobs.threads import mapped
 from fmtorch.pruning import refine_matches_kernels as compiled
 from fmtorch.pruning.neighbour_maps_kernels import neighbour_maps
 from fmtorch.pruning.window_kernels import Pyramid

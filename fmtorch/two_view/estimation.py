@@ -16,10 +16,10 @@ from fmtorch.compiling.together import compile_together
 from fmtorch.core.arguments import number
 from fmtorch.core.checks import expect_values
 from fmtorch.core.stages import Estimator, Pruner, model_of
-from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.ransac import Ransac
 from fmtorch.geometry.verdict import judged
+from fmtorch.jobs.threads import one_thread
 from fmtorch.presets.files import load
 from fmtorch.presets.objects import construct, instantiate, merged
 from fmtorch.pruning.frame_consistency import FrameConsistency

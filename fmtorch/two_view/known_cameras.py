@@ -11,7 +11,6 @@ from torch import Tensor
 from fmtorch.compiling.batches import for_each_pair
 from fmtorch.core.records import ungraphed
 from fmtorch.core.stages import Estimator, Pruner
-from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.geometry.arithmetic import cofactors, component_sum, determinant, matmul3, sqrt
 from fmtorch.geometry.cameras import cross_matrix
@@ -22,6 +21,7 @@ from fmtorch.geometry.pose_kernels import pose
 from fmtorch.geometry.square_pixels import calibration_problems, mapped, square_pixels
 from fmtorch.geometry.two_view_covariance import two_view_covariance
 from fmtorch.geometry.verdict import judged
+from fmtorch.jobs.threads import one_thread
 
 
 class KnownCameras:

@@ -12,7 +12,6 @@ from torch import Tensor
 from fmtorch.compiling import switch
 from fmtorch.compiling.together import compile_together
 from fmtorch.core.estimate import CONFIGURATIONS, WARNINGS
-from fmtorch.core.threads import one_thread
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.geometry.arithmetic import component_sum, sqrt
 from fmtorch.geometry.configuration import (
@@ -28,6 +27,7 @@ from fmtorch.geometry.configuration import (
 from fmtorch.geometry.configuration_kernels import weigh
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.homography_pose import PlanePoses, poses_from_homography
+from fmtorch.jobs.threads import one_thread
 from fmtorch.two_view.estimation import estimated, estimator_of
 
 FOCAL_DEVIATION = 0.02

@@ -19,13 +19,13 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from fmtorch.core.calls import Calls
-from fmtorch.core.executors import Execution, Team
-from fmtorch.core.recipes import Here, Recipe
 from fmtorch.data.pairs import ImagePair
 from fmtorch.data.rendered import RenderedPairs
 from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import summarize
+from fmtorch.jobs.execution import Execution
+from fmtorch.jobs.pool import WorkerPool
+from fmtorch.jobs.runner import Factory, Local, TaskRunner
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.storage import PairRow, RunFolder
 from scripts.benchmark.scale_pairs import given_pairs
@@ -152,13 +152,15 @@ def worker_table(executors: Sequence[str], workers: Sequence[int], batches: int)
 def _timed(executor: str, workers: int, seconds: float, count: int) -> float:
     """Seconds of so many calls from the first result on, when all workers have started."""
     execution = Execution(executor, workers)
-    source: Any = Here(seconds) if execution.shared else Recipe(functools.partial(_seconds, seconds))
+    source: Any = Local(seconds) if execution.shared else Factory(functools.partial(_seconds, seconds))
     warm = 4 * workers
     start = 0.0
-    for done, _ in enumerate(Calls(Team(execution), source, wait, lambda job, result: None).each(range(warm + count))):
-        if done == warm:
-            start = time.perf_counter()
-    return time.perf_counter() - start
+    with WorkerPool(execution) as pool:
+        runner = TaskRunner[int](pool, source, wait, lambda task, result: None)
+        for done, _ in enumerate(runner.each(range(warm + count))):
+            if done == warm:
+                start = time.perf_counter()
+        return time.perf_counter() - start
 
 
 def memory_table(rows: Sequence[int]) -> list[str]:
@@ -186,9 +188,10 @@ def run_memory(arguments: argparse.Namespace) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = RunFolder.open(Path(name) / "run", {"rows": arguments.rows})
         start = time.perf_counter()
-        calls = Calls(Team(Execution("threads", 2)), Here(None), rows_of, lambda job, rows: folder.append(rows))
-        for _ in calls.each(_batches(arguments.rows)):
-            pass
+        with WorkerPool(Execution("threads", 2)) as pool:
+            runner = TaskRunner[range](pool, Local(None), rows_of, lambda task, rows: folder.append(rows))
+            for _ in runner.each(_batches(arguments.rows)):
+                pass
         figures |= {"seconds": time.perf_counter() - start, "storing": _peak()}
         files = list((folder.path / "pairs").iterdir())
         figures |= {"parts": len(files), "bytes": sum(file.stat().st_size for file in files) / arguments.rows}

@@ -19,9 +19,10 @@ from typing import Any
 
 import pytest
 
-from fmtorch.core.executors import Execution, WorkersLost
 from fmtorch.data.pairs import ImagePair
 from fmtorch.evaluation.run import evaluate_pairs
+from fmtorch.jobs.execution import Execution
+from fmtorch.jobs.pool import WorkersLost
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.storage import PairRow
@@ -91,7 +92,7 @@ def test_rows_of_threads_and_processes(kind: str, pairs: list[ImagePair], expect
 def test_many_pairs_go_to_processes_unless_there_is_a_single_worker(
     workers: int | None, many: bool, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.setattr("fmtorch.jobs.execution.cores", lambda: 2)
     assert Execution("auto", workers).decided(many).kind == kind
     assert Execution("processes", workers).decided(many).kind == "processes"  # as it was asked for
 
@@ -212,7 +213,7 @@ def test_a_scheduler_that_is_lost(cluster: Cluster, pairs: list[ImagePair], expe
 
 def test_an_address_that_nobody_answers(pairs: list[ImagePair], monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed", reason="dask.distributed is not installed")
-    monkeypatch.setattr("fmtorch.core.cluster.SECONDS_TO_CONNECT", 1.0)
+    monkeypatch.setattr("fmtorch.jobs.pool.SECONDS_TO_CONNECT", 1.0)
     with pytest.raises(ValueError, match=r"executor\.address=tcp://127\.0\.0\.1:9: no scheduler answers"):
         evaluated(pairs, Execution("dask", address="tcp://127.0.0.1:9"))
 

@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fmtorch.core.executors import Execution, WorkersLost
 from fmtorch.core.types import Correspondences, Estimate, Features
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.evaluation.run import _shared_out, evaluate_pairs
+from fmtorch.jobs.execution import Execution
+from fmtorch.jobs.pool import WorkersLost
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.storage import PairRow
@@ -44,7 +45,7 @@ def test_a_process_that_ends_is_told() -> None:
 
 WORKER = """
 import multiprocessing, time
-from fmtorch.core.executors import end_with_parent
+from fmtorch.jobs.pool import end_with_parent
 def work():
     end_with_parent()
     print(multiprocessing.current_process().pid, flush=True)

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import itertools
+import os
+import signal
 import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -13,25 +15,27 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.core.executors import Execution, Team
 from fmtorch.data.pairs import ImageSource
+from fmtorch.jobs.execution import Execution
+from fmtorch.jobs.pool import WorkerPool, WorkersLost
+from fmtorch.jobs.runner import DEATH
 from fmtorch.pipeline import folder
 from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.folder import FolderMatches
+from fmtorch.pipeline.folder import FolderMatches, folder_workers
 from fmtorch.pipeline.photograph_cameras import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.storage.exchange.journal import Journal
 
 
 class Recorded(Executor):
-    """An executor of one's own, which does what is submitted at once and records the names of the functions."""
+    """An executor of one's own, which does what is submitted at once and records the kinds of tasks."""
 
     def __init__(self, error: Exception | None = None) -> None:
         self.calls: list[str] = []
         self.error = error
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        self.calls.append(fn.func.__name__)
+        self.calls.append(type(args[0]).__name__)
         future: Future[Any] = Future()
         try:
             if self.error is not None:
@@ -40,6 +44,10 @@ class Recorded(Executor):
         except Exception as error:
             future.set_exception(error)
         return future
+
+
+def threads(count: int) -> Execution:
+    return Execution("threads", count)
 
 
 def built() -> Pipeline:
@@ -78,11 +86,13 @@ def test_any_number_of_workers_and_any_executor_keep_the_same(
 ) -> None:
     pairs = list(itertools.combinations(images, 2))
     executor = Recorded()
-    for name, options in {"one": {"workers": 1}, "three": {"workers": 3}, "own": {"executor": executor}}.items():
-        matches = work(pipeline, images, tmp_path / name, **options)
-        assert len(list(matches.each(pairs))) == matches.done == len(pairs)
-        assert matches.troubles == []
-    assert Counter(executor.calls) == {"described_image": 6, "matched_pair": 15}
+    own = Execution(workers=1, make=lambda: executor)
+    for name, execution in {"one": threads(1), "three": threads(3), "own": own}.items():
+        with WorkerPool(execution) as workers:
+            matches = work(pipeline, images, tmp_path / name, workers=workers)
+            assert len(list(matches.each(pairs))) == matches.done == len(pairs)
+            assert matches.troubles == []
+    assert Counter(executor.calls) == {"Photograph": 6, "DescribedPair": 15}
     expected = kept(tmp_path / "one")
     assert len(expected) == 21
     for name in ("three", "own"):
@@ -97,13 +107,9 @@ def test_any_number_of_workers_and_any_executor_keep_the_same(
 def test_processes_keep_the_same(pipeline: Pipeline, images: list[Path], tmp_path: Path, send: bool) -> None:
     pairs = list(itertools.combinations(images[:4], 2))
     list(work(pipeline, images, tmp_path / "threads").each(pairs))
-    team = Team(Execution("processes", 2), ("fmtorch.pipeline.folder",))
-    try:
-        options = {"executor": team.executor, "workers": 2, "build": built, "send_images": send}
-        matches = work(pipeline, images, tmp_path / "processes", **options)
+    with folder_workers(pipeline, Execution("processes", 2, send_images=send)) as workers:
+        matches = work(pipeline, images, tmp_path / "processes", workers=workers, build=built)
         list(matches.each(pairs))
-    finally:
-        team.close()
     assert (matches.done, matches.troubles) == (6, [])
     expected, stored = kept(tmp_path / "threads"), kept(tmp_path / "processes")
     assert stored.keys() == expected.keys()
@@ -124,9 +130,10 @@ def test_no_image_is_described_twice(
         return plain(image, **options)
 
     monkeypatch.setattr(folder, "read_image", counted)
-    matches = work(pipeline, images, tmp_path / "out", workers=4)
-    assert [value is not None for value in matches.images(images)] == [True] * 6
-    list(matches.each(list(itertools.combinations(images, 2))))
+    with WorkerPool(threads(4)) as workers:
+        matches = work(pipeline, images, tmp_path / "out", workers=workers)
+        assert [value is not None for value in matches.images(images)] == [True] * 6
+        list(matches.each(list(itertools.combinations(images, 2))))
     assert sorted(described) == [path.name for path in images]
 
 
@@ -137,26 +144,67 @@ def test_an_image_or_a_pair_that_fails_harms_no_other(pipeline: Pipeline, images
         def given(self, paths: Sequence[Path], sizes: Sequence[tuple[int, int]]) -> dict[str, Any]:
             return {"cameras": {"focal": torch.ones(7)} if paths[1] == images[5] else {}}
 
-    matches = work(pipeline, images, tmp_path / "out", workers=2, cameras=Damaged())
-    list(matches.each(list(itertools.combinations(images, 2))))
+    matches = work(pipeline, images, tmp_path / "out", cameras=Damaged())
+    assert len(list(matches.each(list(itertools.combinations(images, 2))))) == 15
     assert (matches.done, matches.taken) == (6, 0)  # of four images
     assert sum("1.png" in trouble for trouble in matches.troubles) == 1
     assert sum("5.png" in trouble for trouble in matches.troubles) == 4
 
 
 def test_workers_that_died_end_the_work(pipeline: Pipeline, images: list[Path], tmp_path: Path) -> None:
-    matches = work(pipeline, images, tmp_path / "out", executor=Recorded(BrokenExecutor("killed")))
-    with pytest.raises(BrokenExecutor, match="killed"):
-        list(matches.each(list(itertools.combinations(images, 2))))
-    assert matches.done == 0
+    dying = Execution(make=lambda: Recorded(BrokenExecutor("killed")))
+    with WorkerPool(dying) as workers, pytest.raises(WorkersLost, match="the same command goes on from here"):
+        list(work(pipeline, images, tmp_path / "out", workers=workers).each(list(itertools.combinations(images, 2))))
+    assert kept(tmp_path / "out") == {}
+
+
+class Fatal:
+    """An extractor that ends its process at the darkest image."""
+
+    def __init__(self, extractor: Any) -> None:
+        self.extractor = extractor
+
+    def __call__(self, image: Any) -> Any:
+        if not image.any():
+            os.kill(os.getpid(), signal.SIGKILL)
+        return self.extractor(image)
+
+
+def fatal() -> Pipeline:
+    pipeline = built()
+    pipeline.extractor = Fatal(pipeline.extractor)
+    return pipeline
+
+
+def test_an_image_that_ends_its_workers_is_told_and_the_others_are_matched(
+    pipeline: Pipeline, images: list[Path], tmp_path: Path
+) -> None:
+    assert cv2.imwrite(str(images[1]), np.zeros((240, 320), np.uint8))
+    with folder_workers(pipeline, Execution("processes", 2)) as workers:
+        matches = work(pipeline, images[:4], tmp_path / "out", workers=workers, build=fatal)
+        assert len(list(matches.each(list(itertools.combinations(images[:4], 2))))) == 6
+    assert matches.done == 3
+    assert matches.troubles == [DEATH]
+
+
+def test_more_images_than_are_held_in_memory(
+    pipeline: Pipeline, images: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(folder, "MEMORY", 2)
+    monkeypatch.setattr(folder, "AHEAD", 1)
+    with WorkerPool(threads(2)) as workers:
+        matches = work(pipeline, images, tmp_path / "out", workers=workers)
+        held = [len(matches._described) for _ in matches.each(list(itertools.combinations(images, 2)))]
+    assert (matches.done, matches.troubles) == (15, [])
+    assert max(held) <= 2 * 2 + 1  # images of a pair a worker, and one that was described last
 
 
 def test_what_was_kept_before_an_end_is_taken(pipeline: Pipeline, images: list[Path], tmp_path: Path) -> None:
     pairs = list(itertools.combinations(images, 2))
-    first = work(pipeline, images, tmp_path / "out", workers=2)
+    first = work(pipeline, images, tmp_path / "out")
     for _ in itertools.islice(first.each(pairs), 4):
         pass
-    again = work(pipeline, images, tmp_path / "out", workers=2)
+    again = work(pipeline, images, tmp_path / "out")
     list(again.each(pairs))
     assert (again.taken, again.done) == (first.done, len(pairs) - first.done)
     assert again.related == len(pairs)

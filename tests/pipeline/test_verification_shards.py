@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import fmtorch
-from fmtorch.core.executors import Execution
+from fmtorch.jobs.execution import Execution
 from fmtorch.pipeline import verification_run
 from tests.pipeline import test_verification_hloc as hloc
 from tests.pipeline import test_verification_matches as alone

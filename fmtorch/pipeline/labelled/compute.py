@@ -11,11 +11,12 @@ import cv2
 import numpy as np
 import torch
 
-from fmtorch.core.calls import Calls
-from fmtorch.core.executors import Execution, Team
-from fmtorch.core.recipes import Here, Recipe, Source
 from fmtorch.core.types import Correspondences
 from fmtorch.data.pairs import ImagePair, PairDataset
+from fmtorch.jobs.execution import Execution
+from fmtorch.jobs.pool import WorkerPool
+from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner
+from fmtorch.jobs.threads import use_one_thread
 from fmtorch.pipeline.labelled.labels import label
 from fmtorch.pipeline.labelled.shards import write_shard
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
@@ -79,16 +80,17 @@ def compute_shards(
         where workers are no threads. jobs: files and their pairs. most: matches kept of a pair, the best by quality.
         execution: by which workers, each with one thread of the libraries.
     """
-    team = Team(execution, PRELOADED)
-    images = _IMAGES * team.size if execution.shared else _IMAGES
+    pool = WorkerPool(execution, PRELOADED)
+    images = _IMAGES * pool.size if execution.shared else _IMAGES
     make = functools.partial(matching, dataset, build, most, images)
-    source: Source[Matching] = Here(make()) if execution.shared else Recipe(make)
+    source: Source[Matching] = Local(make()) if execution.shared else Factory(make)
+    runner = TaskRunner(pool, source, matched_rows, lambda job, rows: write_shard(job.path, rows))
     threads = torch.get_num_threads(), cv2.getNumThreads()
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
+    use_one_thread()
     try:
-        for job in Calls(team, source, matched_rows, lambda job, rows: write_shard(job.path, rows)).each(jobs):
-            yield len(job.pairs)
+        with pool:
+            for job in runner.each(jobs):
+                yield len(job.pairs)
     finally:  # interrupted: what is under way is finished and kept
         torch.set_num_threads(threads[0])
         cv2.setNumThreads(threads[1])

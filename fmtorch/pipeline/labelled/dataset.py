@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from fmtorch.core.executors import Execution
 from fmtorch.core.resources import cache_dir
 from fmtorch.core.settings import claim
 from fmtorch.data.pairs import DepthDataset, PairDataset
+from fmtorch.jobs.execution import Execution
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.labelled import labels
 from fmtorch.pipeline.labelled.augmentation import Augmentation

@@ -1,23 +1,25 @@
-"""Calls by workers that share what they need or make it, and of which some die."""
+"""Tasks of workers that share what they need or make it, and of which some die."""
 
 from __future__ import annotations
 
 import functools
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from fmtorch.core import recipes
-from fmtorch.core.calls import DEATH, MAX_DEATHS, Calls
-from fmtorch.core.executors import Execution, Team, WorkersLost
-from fmtorch.core.recipes import Here, Recipe
+from fmtorch.jobs import runner
+from fmtorch.jobs.execution import Execution
+from fmtorch.jobs.pool import WorkerPool, WorkersLost
+from fmtorch.jobs.runner import DEATH, MAX_DEATHS, Factory, Local, TaskRunner, in_order
 
 PROCESSES = Execution("processes", 2)
 
@@ -39,7 +41,7 @@ def squares(needed: tuple[Path, bytes], numbers: list[int]) -> list[int]:
 
 
 def ends(folder: Path) -> Any:
-    """A recipe that ends the process."""
+    """A factory that ends the process."""
     os._exit(3)
 
 
@@ -59,10 +61,10 @@ def calls(
     def give_up(job: list[int], reason: str) -> None:
         reasons.update(dict.fromkeys(job, reason))
 
-    team = Team(execution)
-    source: Any = Here(make()) if execution.shared else Recipe(make)
+    source: Any = Local(make()) if execution.shared else Factory(make)
     options = {"give_up": give_up, "split": parts, **options}
-    yielded = list(Calls(team, source, squares, keep, **options).each(jobs))
+    with WorkerPool(execution) as pool:
+        yielded = list(TaskRunner(pool, source, squares, keep, **options).each(jobs))
     return results, reasons, yielded
 
 
@@ -76,8 +78,8 @@ def test_results_of_each_job(kind: str, tmp_path: Path) -> None:
     assert len(list(tmp_path.glob("made-*"))) <= (1 if kind == "threads" else 2)  # once in each process
 
 
-def test_a_long_recipe_is_sent_to_workers_that_have_it_not(tmp_path: Path) -> None:
-    size = 20 * recipes.SENT_ALONG
+def test_a_long_factory_is_sent_to_workers_that_have_it_not(tmp_path: Path) -> None:
+    size = 20 * runner.SENT_ALONG
     results, _, _ = calls(functools.partial(make_needs, tmp_path, size), PROCESSES, [[i] for i in range(30)])
     assert results == {i: i * i for i in range(30)}
     assert len(list(tmp_path.glob("made-*"))) <= 2
@@ -113,9 +115,9 @@ def fails(needed: object, job: int) -> int:
 @pytest.mark.parametrize("kind", ["threads", "processes"])
 def test_what_a_call_raises_is_raised_here(kind: str, tmp_path: Path) -> None:
     execution = Execution(kind, 2)
-    source: Any = Here(None) if execution.shared else Recipe(functools.partial(make_needs, tmp_path))
-    with pytest.raises(ValueError, match=r"job \d is wrong"):
-        list(Calls(Team(execution), source, fails, lambda job, result: None).each([1, 2, 3]))
+    source: Any = Local(None) if execution.shared else Factory(functools.partial(make_needs, tmp_path))
+    with WorkerPool(execution) as pool, pytest.raises(ValueError, match=r"job \d is wrong"):
+        list(TaskRunner(pool, source, fails, lambda job, result: None).each([1, 2, 3]))
 
 
 def slow(event: threading.Event, job: int) -> int:
@@ -126,20 +128,62 @@ def slow(event: threading.Event, job: int) -> int:
 
 def test_interrupted_what_is_under_way_is_kept() -> None:
     event, kept = threading.Event(), list[int]()
-    run = Calls(Team(Execution("threads", 2)), Here(event), slow, lambda job, result: kept.append(job)).each(range(100))
-    next(run)
-    threading.Timer(0.2, event.set).start()
-    run.close()
+    with WorkerPool(Execution("threads", 2)) as pool:
+        run = TaskRunner(pool, Local(event), slow, lambda job, result: kept.append(job)).each(range(100))
+        next(run)
+        threading.Timer(0.2, event.set).start()
+        run.close()
     assert kept[0] == 0
     assert 1 in kept
     assert len(kept) < 10
 
 
+def late(value: None, job: int) -> int:
+    time.sleep(0.05 if job % 3 == 0 else 0)
+    return -job
+
+
+@pytest.mark.parametrize("kind", ["threads", "processes"])
+def test_results_in_the_order_of_the_jobs(kind: str) -> None:
+    with WorkerPool(Execution(kind, 2)) as pool:
+        assert list(in_order(pool, Local(None), late, range(20))) == [(i, -i) for i in range(20)]
+
+
+def test_a_job_that_needs_the_result_of_another_waits_for_it() -> None:
+    """Each number is ready when the one before it has ended; all at once are asked for."""
+    done: list[int] = []
+
+    def jobs() -> Iterator[int | None]:
+        for number in range(6):
+            while len(done) < number:
+                yield None
+            yield number
+
+    with WorkerPool(Execution("threads", 3)) as pool:
+        list(TaskRunner[int](pool, Local(None), late, lambda job, result: done.append(job)).each(jobs()))
+    assert done == list(range(6))
+
+
+SCRIPT = """
+from fmtorch.jobs.execution import Execution
+from fmtorch.jobs.pool import WorkerPool
+with WorkerPool(Execution("processes", 2), needs_main=False) as pool:
+    print(sorted(pool.executor.map(abs, range(-4, 0))))
+"""
+
+
+def test_a_script_without_a_guard_starts_processes_that_do_not_need_it(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=120)
+    assert (done.stdout, done.returncode) == ("[1, 2, 3, 4]\n", 0), done.stderr
+
+
 def test_another_version_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recipe = Recipe(functools.partial(make_needs, tmp_path))
-    monkeypatch.setattr(recipes, "__version__", "9.9")
+    factory = Factory(functools.partial(make_needs, tmp_path))
+    monkeypatch.setattr(runner, "__version__", "9.9")
     with pytest.raises(ValueError, match=r"a worker has fmtorch 9\.9"):
-        recipe.call(squares, with_recipe=True)([1])
+        factory.call(squares, with_factory=True)([1])
 
 
 class Own(ThreadPoolExecutor):
@@ -148,14 +192,15 @@ class Own(ThreadPoolExecutor):
 
 def test_an_executor_of_ones_own(tmp_path: Path) -> None:
     execution = Execution(make=functools.partial(Own, 3))
-    team = Team(execution)
     results: list[int] = []
-    source = Recipe(functools.partial(make_needs, tmp_path))
-    list(Calls(team, source, squares, lambda job, result: results.extend(result)).each([[i] for i in range(9)]))
+    source = Factory(functools.partial(make_needs, tmp_path))
+    with WorkerPool(execution) as pool:
+        keep = lambda job, result: results.extend(result)  # noqa: E731
+        list(TaskRunner(pool, source, squares, keep).each([[i] for i in range(9)]))
+        assert pool.size == 3
     assert sorted(results) == [i * i for i in range(9)]
-    assert team.size == 3
     with pytest.raises(ValueError, match=r"executor: dict is no concurrent\.futures\.Executor"):
-        Team(Execution(make=dict)).executor  # noqa: B018
+        WorkerPool(Execution(make=dict)).executor  # noqa: B018
 
 
 def test_what_an_execution_may_be() -> None:

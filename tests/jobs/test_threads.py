@@ -11,12 +11,12 @@ import torch
 
 import fmtorch
 from fmtorch import presets
-from fmtorch.core.executors import Execution
-from fmtorch.core.threads import available, mapped, one_thread
 from fmtorch.core.types import collate
 from fmtorch.data import read_image
 from fmtorch.estimators import batch
 from fmtorch.evaluation.run import evaluate_pairs
+from fmtorch.jobs.execution import Execution
+from fmtorch.jobs.threads import available, mapped, one_thread
 from fmtorch.matching import nearest
 from fmtorch.pruning import position_consistency as consistency
 from tests.laws import degenerate, scene

@@ -1,4 +1,4 @@
-"""How many threads a stage computes with."""
+"""How many threads a stage, a worker or a loop over pairs computes with."""
 
 from __future__ import annotations
 
@@ -43,6 +43,14 @@ def _threads(count: int, held_by_pairs: int) -> Iterator[None]:
     finally:
         torch.set_num_threads(before)
         _held.reset(held)
+
+
+def use_one_thread() -> None:
+    """Have torch and OpenCV compute with one thread from now on: for workers, of which there is one a core."""
+    import cv2
+
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
 
 
 def available() -> int:
