@@ -9,9 +9,9 @@ if TYPE_CHECKING:
     from fmtorch.core.types import Correspondences, Estimate, Features
     from fmtorch.pipeline.pipeline import Pipeline
     from fmtorch.pipeline.two_images import MatchResult, match
-    from fmtorch.pipeline.verification import verify
-    from fmtorch.pipeline.verification_run import Verification
     from fmtorch.two_view.find import find_essential, find_fundamental, find_homography
+    from fmtorch.verification.run import Verification
+    from fmtorch.verification.verify import verify
 
 __all__ = [
     "Correspondences",

@@ -18,14 +18,11 @@ from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 from torch import Tensor
 
-from fmtorch.core.resources import models_dir
+from fmtorch.core.files import models_dir
 from fmtorch.core.terminal import console, exits_with_message
-from fmtorch.features.networks import DESCRIPTORS, build, load_weights
-from fmtorch.features.networks.checkpoints import read_checkpoint
+from fmtorch.features.networks import DESCRIPTORS, build, load_weights, read_checkpoint
 from fmtorch.features.onnx_network import PatchNetwork
-from fmtorch.features.patch_sift import EXTENT, sift_of_patches
-from fmtorch.features.rootsift_pca import load_projection, project
-from fmtorch.features.sift import root_sift
+from fmtorch.features.sift import EXTENT, load_projection, project, root_sift, sift_of_patches
 from fmtorch.training.patch_metrics import Describe, evaluate_descriptor, patch_quality, validation_pairs
 from fmtorch.training.patch_objectives import sample
 from fmtorch.training.patch_store import PatchStore

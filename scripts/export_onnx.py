@@ -18,10 +18,9 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from fmtorch.core.resources import models_dir
+from fmtorch.core.files import models_dir
 from fmtorch.core.terminal import console, exits_with_message
-from fmtorch.features.networks import DESCRIPTORS, build, load_weights
-from fmtorch.features.networks.checkpoints import read_checkpoint
+from fmtorch.features.networks import DESCRIPTORS, build, load_weights, read_checkpoint
 from fmtorch.features.onnx_network import PatchNetwork, network_file
 from fmtorch.training.model_card import model_card
 from fmtorch.training.onnx_export import export, quantize

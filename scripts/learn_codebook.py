@@ -16,8 +16,7 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from fmtorch.core.files import replacing
-from fmtorch.core.resources import models_dir
+from fmtorch.core.files import models_dir, replacing
 from fmtorch.features import learn_projection
 from fmtorch.features.vlad import Codebook, Kind, local_descriptors
 from fmtorch.pipeline.build import load_pipeline

@@ -17,11 +17,10 @@ import torch
 from numpy.typing import NDArray
 from rich.console import Console
 
-from fmtorch.core.files import replacing
-from fmtorch.core.resources import models_dir
+from fmtorch.core.files import models_dir, replacing
 from fmtorch.data import read_image
-from fmtorch.data.rendered.photographs import PICTURES, photograph
 from fmtorch.features import learn_projection, local_feature
+from fmtorch.scenes.textures import PICTURES, photograph
 
 # Repositories under BSD, MIT or Apache licences.
 SOURCES = (

@@ -21,10 +21,9 @@ from omegaconf import DictConfig
 from torch import nn
 
 from fmtorch import presets
-from fmtorch.core.resources import conf_dir
+from fmtorch.core.files import conf_dir
 from fmtorch.core.terminal import console, exits_with_message
-from fmtorch.features.networks import build, load_weights
-from fmtorch.features.networks.layers import PATCH_SIZE
+from fmtorch.features.networks import PATCH_SIZE, build, load_weights
 from fmtorch.features.onnx_network import PatchNetwork, network_file
 from fmtorch.presets import plain
 from fmtorch.training.correspondences import Tolerance

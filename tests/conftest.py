@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.compiling.cache import kernels_dir
+from fmtorch.jit.cache import kernels_dir
 
 torch.set_num_threads(1)
 
@@ -44,8 +44,9 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 def compile_all() -> None:
     """Compile every kernel of the package that this machine has not compiled yet."""
     import fmtorch  # not before the import hook of the type checker
-    from fmtorch.compiling import switch, together
-    from fmtorch.compiling.kernel import Kernel
+    from fmtorch.jit import kernel as switch
+    from fmtorch.jit import together
+    from fmtorch.jit.kernel import Kernel
 
     if not switch.available():
         return

@@ -76,7 +76,7 @@ def warm_up() -> None:
     figure = Figure()
     figure.subplots().set_title("fonts")
     figure.savefig(io.BytesIO())
-    from fmtorch.storage.code import code_digest, fmtorch_version
+    from fmtorch.runs.fingerprint import code_digest, fmtorch_version
 
     fmtorch_version()
     for name in ("fmtorch.features.sift", "fmtorch.estimators", "fmtorch.matching", "fmtorch.pruning"):

@@ -103,7 +103,7 @@ def test_kernels_and_what_calls_them_take_exact_operations() -> None:
     for name, tree in trees():
         if holds_kernels(tree) or (name.startswith("estimators/") and not (imports_torch(tree) or PEERS in name)):
             violations += [f"{name}:{line}: {what}" for line, what in inexact(tree) if (name, what) not in ALLOWED]
-    assert not violations, "see fmtorch/geometry/arithmetic_kernels.py"
+    assert not violations, "see fmtorch/geometry/arithmetic.py"
 
 
 def test_tensors_of_values_take_the_exact_root() -> None:

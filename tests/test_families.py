@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 
 from fmtorch import presets
 from fmtorch.commands.main import job
-from fmtorch.core.resources import conf_dir
+from fmtorch.core.files import conf_dir
 from fmtorch.core.types import Correspondences
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.data.pairs import GivenMatches

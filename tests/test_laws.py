@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from fmtorch import presets
-from fmtorch.compiling import switch
 from fmtorch.core.types import Correspondences, Estimate, collate
+from fmtorch.jit import kernel as switch
 from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.laws import (
     Result,

@@ -18,9 +18,9 @@ import pytest
 import torch
 
 from fmtorch import geometry
-from fmtorch.compiling import switch
-from fmtorch.estimators.families.focal_prior import normal_quantiles
-from fmtorch.geometry.magsac import LOSS_TABLE
+from fmtorch.estimators.models.focal_prior import normal_quantiles
+from fmtorch.geometry.robust_losses import LOSS_TABLE
+from fmtorch.jit import kernel
 from fmtorch.matching import nearest_neighbors
 from fmtorch.metrics import nsgd
 from tests.laws import degenerate, scene, scenes
@@ -106,7 +106,7 @@ def runs_haswell() -> bool:
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="for x86-64")
 def test_an_older_processor_computes_the_same_bits(tmp_path: Path) -> None:
-    if not (switch.available() and runs_haswell()):
+    if not (kernel.available() and runs_haswell()):
         pytest.skip("needs kernels, and a processor with AVX2 and FMA")
     given = inputs()
     torch.save(given, tmp_path / "given.pt")

@@ -22,6 +22,8 @@ from fmtorch.evaluation.plots import plot_recall_curves
 from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import ALL, Group, summarize
 from fmtorch.evaluation.summary_tables import further_tables, pose_table, summary_markdown, summary_table
+from fmtorch.io.export import export_kinds, write_exports
+from fmtorch.io.match_store import Journal
 from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES, shard_of
 from fmtorch.pipeline.build import build_pipeline
 from fmtorch.pipeline.exporting import exportable
@@ -29,10 +31,8 @@ from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
 from fmtorch.presets.executors import execution_of
 from fmtorch.presets.fields import Cache, Count, Device, Gigabytes, Seed, path_fields, read_fields
-from fmtorch.storage import RunFolder, identity_digest
-from fmtorch.storage.exchange.export import export_kinds, write_exports
-from fmtorch.storage.exchange.journal import Journal
-from fmtorch.storage.features import CachedFeatures
+from fmtorch.runs import RunFolder, identity_digest
+from fmtorch.runs.feature_cache import CachedFeatures
 
 
 @dataclasses.dataclass(frozen=True)

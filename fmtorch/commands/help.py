@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from fmtorch.core.resources import conf_dir
+from fmtorch.core.files import conf_dir
 
 FOOTER = """Hydra's own: -m for sweeps (estimator=ransac,msac), --config-dir FOLDER for presets of your own, --cfg job
 to print the config, --hydra-help for the rest."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import sys
 
+from fmtorch.core.files import conf_dir
 from fmtorch.core.options import nearest
-from fmtorch.core.resources import conf_dir
 from fmtorch.core.terminal import console, exits_with_message
 from fmtorch.presets.files import available, groups, summary
 

@@ -17,8 +17,8 @@ from omegaconf.errors import GrammarParseError, OmegaConfBaseException
 
 from fmtorch.commands.help import help_text
 from fmtorch.commands.overrides import hydra_arguments
+from fmtorch.core.files import conf_dir
 from fmtorch.core.options import nearest
-from fmtorch.core.resources import conf_dir
 from fmtorch.core.terminal import MISTAKES, error_line, exits_with_message
 from fmtorch.core.version import __version__
 from fmtorch.presets import available, top_level_names

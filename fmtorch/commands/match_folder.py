@@ -20,21 +20,29 @@ from fmtorch.core.terminal import console, errors, progress_bars
 from fmtorch.data.images import read_image
 from fmtorch.evaluation.view_graph_picture import view_graph_svg
 from fmtorch.features.vlad import descriptor_kind, image_vector
+from fmtorch.io.export import ViewGraph, export_kinds, view_graph, write_exports, write_view_graph
+from fmtorch.io.match_store import Journal
 from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES
 from fmtorch.pipeline.build import build_pipeline
-from fmtorch.pipeline.folder import MEMORY, FolderMatches, folder_workers
-from fmtorch.pipeline.folder_images import SIMILAR, chosen_pairs, count_of, images_below
-from fmtorch.pipeline.folder_output import default_output, open_folder
+from fmtorch.pipeline.folder import (
+    MEMORY,
+    SIMILAR,
+    FolderMatches,
+    chosen_pairs,
+    count_of,
+    default_output,
+    folder_workers,
+    images_below,
+    open_folder,
+    similar_pairs,
+    vectors_of,
+)
 from fmtorch.pipeline.photograph_cameras import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.pipeline.similar import similar_pairs, vectors_of
 from fmtorch.presets.executors import execution_of
 from fmtorch.presets.fields import Count, Device, Seed
-from fmtorch.storage.code import fmtorch_version
-from fmtorch.storage.exchange.export import export_kinds, write_exports
-from fmtorch.storage.exchange.journal import Journal
-from fmtorch.storage.exchange.view_graph import ViewGraph, view_graph, write_view_graph
-from fmtorch.storage.features import CachedFeatures, cached
+from fmtorch.runs.feature_cache import CachedFeatures, cached
+from fmtorch.runs.fingerprint import fmtorch_version
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,7 +18,6 @@ from fmtorch.commands.main import job, run_command
 from fmtorch.core.options import Within
 from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.data.construction import BLOCK, Construction, blocks
-from fmtorch.data.rendered import RenderedPairs
 from fmtorch.data.scenes import ScenePairs
 from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.pool import WorkerPool
@@ -26,6 +25,7 @@ from fmtorch.jobs.runner import Factory, Local, Source, in_order
 from fmtorch.presets import plain
 from fmtorch.presets.executors import execution_of
 from fmtorch.presets.fields import Count, Seed, path_fields, read_fields
+from fmtorch.scenes import RenderedPairs
 
 MIN_CANDIDATES_FOR_PROCESSES = 4 * BLOCK + 1  # below which processes are not worth their start
 PRELOADED = ("fmtorch.data.construction",)  # by the process that workers are forked of

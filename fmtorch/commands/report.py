@@ -20,10 +20,9 @@ from fmtorch.core.options import Within
 from fmtorch.core.terminal import console
 from fmtorch.evaluation.curves import axis_of
 from fmtorch.evaluation.gallery import Options, Run, gallery
-from fmtorch.evaluation.names import run_names, shared_settings
-from fmtorch.evaluation.page import Section, render
+from fmtorch.evaluation.page import Section, render, run_names, shared_settings
 from fmtorch.presets.fields import Cache, Device, Gigabytes, path_fields, read_fields
-from fmtorch.storage import RunFolder, RunFolderError
+from fmtorch.runs import RunFolder, RunFolderError
 
 
 @dataclasses.dataclass(frozen=True)

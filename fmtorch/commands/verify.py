@@ -18,12 +18,11 @@ from fmtorch import presets
 from fmtorch.commands.main import job, run_command
 from fmtorch.core.terminal import console, errors, progress_bars, reporter
 from fmtorch.jobs.execution import shard_of
-from fmtorch.pipeline.database_pairs import Cameras
-from fmtorch.pipeline.verification import ONE_THREAD, VerifyOptions, VerifyPaths, verify_by
-from fmtorch.pipeline.verification_run import Verification
 from fmtorch.presets import plain
 from fmtorch.presets.executors import execution_of
 from fmtorch.presets.fields import Seed, path_fields, read_fields
+from fmtorch.verification.run import Cameras, Verification
+from fmtorch.verification.verify import ONE_THREAD, VerifyOptions, VerifyPaths, verify_by
 
 MAX_PROBLEMS = 20  # that are printed
 

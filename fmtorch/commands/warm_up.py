@@ -7,10 +7,11 @@ import pkgutil
 import sys
 import time
 
-from fmtorch.compiling import cache, calls, switch
-from fmtorch.compiling.process import HOME
-from fmtorch.compiling.together import compile_together
 from fmtorch.core.terminal import console, exits_with_message
+from fmtorch.jit import cache, linking
+from fmtorch.jit import kernel as switch
+from fmtorch.jit.process import HOME
+from fmtorch.jit.together import compile_together
 
 USAGE = """fmtorch warm-up: compile all kernels now
 
@@ -19,7 +20,7 @@ usage: fmtorch warm-up
 The compiled kernels are kept in $FMTORCH_CACHE/kernels (~/.cache/fmtorch/kernels). A container may hold that folder: it
 serves machines with the processor, Python, numba and version of fmtorch that it was made with (about.json in it says
 which); any other compiles its own."""
-WITH_KERNELS = ("fmtorch.estimators.", "fmtorch.data.rendered.")  # beside files *_kernels
+WITH_KERNELS = ("fmtorch.estimators.", "fmtorch.scenes.")  # beside files *_kernels
 
 
 def warm_up() -> int:
@@ -34,7 +35,7 @@ def warm_up() -> int:
     for module in pkgutil.walk_packages([str(HOME / "fmtorch")], "fmtorch."):
         if module.name.endswith("_kernels") or module.name.startswith(WITH_KERNELS):
             importlib.import_module(module.name)
-    kernels = [kernel for (name, _), kernel in sorted(calls.KERNELS.items()) if name.startswith("fmtorch.")]
+    kernels = [kernel for (name, _), kernel in sorted(linking.KERNELS.items()) if name.startswith("fmtorch.")]
     compile_together(kernels)
     return len(kernels)
 

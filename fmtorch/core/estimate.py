@@ -43,7 +43,7 @@ class Estimate(Record):
 
     Where the covariance is asked for: covariance (B, 7, 7) of (rotation vector omega of ``exp([omega]x) R``, tau,
     log f0, log f1), radians and logarithms, where t moves to ``t + tangents tau``; tangents (B, 3, 2);
-    covariance_F (B, 9, 9), of F row by row. See `fmtorch.geometry.two_view_covariance`.
+    covariance_F (B, 9, 9), of F row by row. See `fmtorch.geometry.covariance`.
 
     Where the configuration is asked for: configuration_index (B,), into `CONFIGURATIONS`; homography (B, 3, 3), of the
     plane, the rotation or the copy, zero where there is none; other_R, other_t, the second pose that explains a plane,

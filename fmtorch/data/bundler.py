@@ -15,11 +15,19 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from fmtorch.data.cameras import nearest_rotation
-from fmtorch.data.candidates import MIN_SHARED, AllPairs, Candidates, sharing_points
 from fmtorch.data.lenses import Lens
 from fmtorch.data.pairs import ImageSource
-from fmtorch.data.scenes import Scene, ScenePairs, View, folders
-from fmtorch.data.splits import chosen
+from fmtorch.data.scenes import (
+    MIN_SHARED,
+    AllPairs,
+    Candidates,
+    Scene,
+    ScenePairs,
+    View,
+    chosen,
+    folders,
+    sharing_points,
+)
 from fmtorch.data.text_files import DataError, given_root, numbered, read_lines, to_finite, to_whole
 
 _FILES = ("gt_bundle.out", "bundle.out", "bundle/bundle.out")  # within a scene's folder, in the order they are tried

@@ -10,12 +10,22 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.data.candidates import MIN_SHARED, AllPairs, Candidates, sharing_points
 from fmtorch.data.colmap_model import Model, read_model
-from fmtorch.data.depth_images import DepthImages, read_colmap
 from fmtorch.data.pairs import ImageSource
-from fmtorch.data.scenes import DepthScenePairs, Scene, ScenePairs, View, folders
-from fmtorch.data.splits import chosen
+from fmtorch.data.scenes import (
+    MIN_SHARED,
+    AllPairs,
+    Candidates,
+    DepthImages,
+    DepthScenePairs,
+    Scene,
+    ScenePairs,
+    View,
+    chosen,
+    folders,
+    read_colmap,
+    sharing_points,
+)
 from fmtorch.data.text_files import DataError, given_root
 
 _MODELS = ("sparse/0", "sparse", "dense/sparse", ".")  # below a scene's folder, in the order in which they are tried
@@ -52,7 +62,7 @@ def colmap_pairs(
             in ``stereo/depth_maps`` beside the folder of the images; geometric ones, or else photometric.
 
     Images with lens distortion are undistorted when they are read, to a pinhole of the same focal lengths, principal
-    point and size (`fmtorch.data.undistort`). Principal points are lowered by COLMAP's half pixel. An image of another
+    point and size (`fmtorch.data.lenses`). Principal points are lowered by COLMAP's half pixel. An image of another
     size than its camera's is refused when it is read. Raises DataError for a missing or damaged model.
     """
     home, model_folders = scene_folders(root, split, sequences, model)

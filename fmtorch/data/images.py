@@ -1,4 +1,4 @@
-"""Images from disk, exactly as OpenCV decodes them, and never a half-decoded one."""
+"""Sizes of images from their headers alone."""
 
 from __future__ import annotations
 
@@ -14,8 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from fmtorch.data.lenses import undistorted
 from fmtorch.data.pairs import ImageSource
-from fmtorch.data.undistort import undistorted
+
+
+def stored_size(path: Path) -> tuple[int, int] | None:
+    """(h, w) of an image file, in pixels as stored; None where there is none, or no header that tells."""
+    try:
+        with Image.open(path) as image:
+            return image.height, image.width
+    except (OSError, ValueError, Image.DecompressionBombError):
+        return None
+
+
+# Images from disk, exactly as OpenCV decodes them, and never a half-decoded one
+
 
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _JPEG_MARKER = re.compile(rb"\xff+([^\x00\xff\xd0-\xd7])", re.DOTALL)

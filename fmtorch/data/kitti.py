@@ -9,10 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.data.cameras import Matrix, from_projection, nearest_rotation
-from fmtorch.data.candidates import WINDOW, following
 from fmtorch.data.pairs import ImageSource
-from fmtorch.data.scenes import Scene, ScenePairs, View, folders
-from fmtorch.data.splits import chosen
+from fmtorch.data.scenes import WINDOW, Scene, ScenePairs, View, chosen, folders, following
 from fmtorch.data.text_files import DataError, given_root, numbered, to_finite
 
 _SUFFIXES = (".png", ".jpg")

@@ -16,10 +16,9 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from fmtorch.data.candidates import Indices, incidence
 from fmtorch.data.images import read_image
 from fmtorch.data.pairs import DepthDataset, ImageSource
-from fmtorch.data.scenes import ScenePairs, View, image_pair
+from fmtorch.data.scenes import Indices, ScenePairs, View, image_pair, incidence
 
 STEP = 4  # px between the pixels of which depth is asked, along rows and columns
 TOLERANCE = 0.05  # by which depths may differ, relative to the one seen, for the same surface

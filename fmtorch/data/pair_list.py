@@ -1,4 +1,9 @@
-"""Lists of image pairs on which others evaluate, such as MegaDepth-1500 and ScanNet-1500, with a folder of images."""
+"""Text lists of image pairs with cameras: SuperGlue's ``*_with_gt.txt`` and glue-factory's ``pairs_calibrated.txt``.
+
+SuperGlue (Sarlin et al., CVPR 2020, match_pairs.py): the names of both images, by how many quarter turns each is turned
+counterclockwise, K0, K1 row by row, and the pose, a matrix (4, 4) that takes points of camera 0 to camera 1. K and pose
+are those of the images before they are turned. glue-factory: names, K0, K1, and either R and t or the matrix.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +11,205 @@ import dataclasses
 import hashlib
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from fmtorch.data.cameras import Camera, Matrix, fundamental, nearest_rotation
-from fmtorch.data.image_sizes import stored_size
-from fmtorch.data.listed_pairs import ListedPair, text_pairs
-from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset
-from fmtorch.data.resampling import Resampling, Size, longer_side
-from fmtorch.data.scene_npz import camera_files, npz_pairs
-from fmtorch.data.text_files import DataError, given_root, numbered
+from fmtorch.data.cameras import Camera, Matrix, fundamental, nearest_rotation, relative_pose
+from fmtorch.data.images import stored_size
+from fmtorch.data.npz_arrays import NpzArrays
+from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset, Resampling, Size, longer_side
+from fmtorch.data.text_files import DataError, given_root, numbered, read_numbers, to_numbers, to_whole
+
+SUPERGLUE, GLUE_FACTORY, GLUE_FACTORY_4X4 = 38, 32, 36  # columns of a line
+LAYOUTS = {
+    SUPERGLUE: "name0 name1 turns0 turns1 K0 (9) K1 (9) pose (4 x 4), as SuperGlue",
+    GLUE_FACTORY: "name0 name1 K0 (9) K1 (9) R (9) t (3), as glue-factory",
+    GLUE_FACTORY_4X4: "name0 name1 K0 (9) K1 (9) pose (4 x 4), as glue-factory",
+}
+CORNER = 0.5  # where glue-factory and COLMAP, whose cameras MegaDepth's are, put the centre of the first pixel
+_QUARTERS = 4  # of a full turn
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ListedPair:
+    """One pair of a list.
+
+    place: file and line, or record, with which messages begin. names: of the images, relative to their folder.
+    K0, K1: (3, 3), for images of `size` (h, w), None: of the files' own sizes. R, t: ``X1 = R X0 + t``.
+    quarter_turns: of both images, counterclockwise; K, R and t are those before the turn.
+    origin: coordinates of the first pixel's centre in the convention of K.
+    """
+
+    place: str
+    names: tuple[str, str]
+    K0: Matrix
+    K1: Matrix
+    R: Matrix
+    t: Matrix
+    quarter_turns: tuple[int, int] = (0, 0)
+    size: Size | None = None
+    origin: float = 0.0
+
+
+def text_pairs(path: Path) -> Iterator[ListedPair]:
+    """The pairs of a text file, a line each; empty lines and comments (``#``) are left out.
+
+    Raises DataError, naming the line, for a number of columns that is not one of `LAYOUTS`, and for an entry that is no
+    number. Numbers that are not finite pass: they are one pair's fault.
+    """
+    for number, line in numbered(path):
+        words = line.split()
+        if len(words) not in LAYOUTS:
+            forms = "; ".join(f"{count}: {form}" for count, form in LAYOUTS.items())
+            without = " without cameras" if len(words) <= SUPERGLUE - GLUE_FACTORY else ""
+            raise DataError(f"{path}, line {number}: {len(words)} columns{without}; it must have {forms}")
+        names, values, turns = (words[0], words[1]), words[2:], (0, 0)
+        if len(words) == SUPERGLUE:
+            turns = _turns(path, number, values[0]), _turns(path, number, values[1])
+            values = values[2:]
+        cameras = to_numbers(path, number, values, "K0, K1 and the pose", len(values))
+        R, t = _pose(cameras[18:])
+        place = f"{path}, line {number}"
+        origin = 0.0 if len(words) == SUPERGLUE else CORNER
+        K0, K1 = cameras[:9].reshape(3, 3), cameras[9:18].reshape(3, 3)
+        yield ListedPair(place, names, K0, K1, R, t, turns, origin=origin)
+
+
+def _turns(path: Path, number: int, word: str) -> int:
+    turns = to_whole(path, number, word, "the number of quarter turns")
+    if not 0 <= turns < _QUARTERS:
+        raise DataError(f"{path}, line {number}: {turns} quarter turns; it must be 0, 1, 2 or 3")
+    return turns
+
+
+def _pose(values: Matrix) -> tuple[Matrix, Matrix]:
+    """R and t of twelve numbers, R before t, or of sixteen, a matrix row by row."""
+    if len(values) == 12:
+        return values[:9].reshape(3, 3), values[9:]
+    matrix = values.reshape(4, 4)
+    return matrix[:3, :3], np.ascontiguousarray(matrix[:3, 3])
+
+
+# LoFTR's lists of image pairs (Sun et al., CVPR 2021): the ``.npz`` files of its MegaDepth-1500 and ScanNet-1500
+
+
+DEPTH_SIZE = (480, 640)  # (h, w) of ScanNet's depth images, whose K intrinsics.npz holds
+INTRINSICS = "intrinsics.npz"
+_COLOUR = "intrinsic/intrinsic_color.txt"  # of a scene's folder: a matrix (4, 4), for the colour images' own size
+
+
+def npz_pairs(path: Path, root: Path) -> Iterator[ListedPair]:
+    """The pairs of one file. root: the folder of the images, in which ScanNet's cameras may lie too.
+
+    Raises DataError for a file of another kind, and for arrays that do not fit.
+    """
+    arrays = NpzArrays(path)
+    if "pair_infos" in arrays:
+        yield from _megadepth(arrays)
+    elif "name" in arrays:
+        yield from _scannet(arrays, root)
+    else:
+        raise DataError(
+            f"{path}: neither pair_infos (MegaDepth) nor name (ScanNet) among its arrays, {', '.join(arrays.names)}"
+        )
+
+
+def camera_files(path: Path, root: Path) -> list[tuple[str, Path]]:
+    """The files that define the cameras of a list beside itself, by names that hold no place of theirs."""
+    arrays, beside = NpzArrays(path), path.parent / INTRINSICS
+    if "name" not in arrays or "pair_infos" in arrays:
+        return []
+    files = dict.fromkeys([] if beside.is_file() else [f"{scene}/{_COLOUR}" for scene, _, _ in _frames(arrays)])
+    if "rel_pose" not in arrays:
+        files |= dict.fromkeys(f"{scene}/pose/{frame}.txt" for scene, *frames in _frames(arrays) for frame in frames)
+    own = [(name, root / name) for name in files if (root / name).is_file()]
+    return [*([(INTRINSICS, beside)] if beside.is_file() else []), *own]
+
+
+def _megadepth(arrays: NpzArrays) -> Iterator[ListedPair]:
+    names, intrinsics, poses = arrays["image_paths"], arrays["intrinsics"], arrays["poses"]
+    counts = {len(names), len(intrinsics), len(poses)}
+    if len(counts) > 1:
+        raise DataError(f"{arrays.path}: image_paths, intrinsics and poses must have one entry an image each")
+    for record, info in enumerate(arrays["pair_infos"]):
+        place = f"{arrays.path}, pair {record}"
+        try:
+            i, j = (int(index) for index in info[0])
+        except (TypeError, ValueError, IndexError) as error:
+            raise DataError(f"{place}: {info!r:.60}; it must begin with the numbers of two images") from error
+        if not (min(i, j) >= 0 and max(i, j) < len(names)):
+            raise DataError(f"{place}: images {i} and {j}; there are {len(names)}")
+        (K0, T0), (K1, T1) = ((_matrix(intrinsics[k], 3), _matrix(poses[k], 4)) for k in (i, j))
+        R, t = relative_pose(Camera(K0, T0[:3, :3], T0[:3, 3]), Camera(K1, T1[:3, :3], T1[:3, 3]))
+        yield ListedPair(place, (str(names[i]), str(names[j])), K0, K1, R, t, origin=CORNER)
+
+
+def _matrix(value: Any, size: int) -> Matrix:
+    """A matrix (size, size) of an array of objects; NaN where there is none."""
+    try:
+        return np.asarray(value, np.float64).reshape(size, size)
+    except (TypeError, ValueError):
+        return np.full((size, size), np.nan)
+
+
+def _scannet(arrays: NpzArrays, root: Path) -> Iterator[ListedPair]:
+    frames = _frames(arrays)
+    motions = arrays.get("rel_pose")
+    if motions is not None and motions.shape not in ((len(frames), 12), (len(frames), 3, 4)):
+        raise DataError(f"{arrays.path}: 'rel_pose' is {motions.shape}; it must be ({len(frames)}, 12)")
+    beside = arrays.path.parent / INTRINSICS
+    intrinsics = NpzArrays(beside) if beside.is_file() else None
+    calibrations: dict[str, Matrix] = {}
+    for record, (scene, first, second) in enumerate(frames):
+        if scene not in calibrations:
+            calibrations[scene] = _calibration(intrinsics, root, scene)
+        K, place = calibrations[scene], f"{arrays.path}, pair {record}"
+        names = f"{scene}/color/{first}.jpg", f"{scene}/color/{second}.jpg"
+        if motions is None:
+            R, t = relative_pose(
+                *(_pose_of_scene(root / scene / "pose" / f"{frame}.txt", K) for frame in (first, second))
+            )
+        else:
+            motion = motions[record].reshape(3, 4).astype(np.float64)
+            R, t = motion[:, :3], motion[:, 3]
+        yield ListedPair(place, names, K, K, R, t, size=None if intrinsics is None else DEPTH_SIZE)
+
+
+def _frames(arrays: NpzArrays) -> list[tuple[str, int, int]]:
+    """Of each pair the name of its scene and the numbers of its frames."""
+    names = arrays["name"]
+    if names.ndim != 2 or names.shape[1] != 4 or names.dtype.kind not in "iu":
+        raise DataError(f"{arrays.path}: 'name' is {names.dtype} {names.shape}; it must hold four whole numbers a pair")
+    return [(f"scene{scene:04d}_{scan:02d}", first, second) for scene, scan, first, second in names.tolist()]
+
+
+def _calibration(intrinsics: NpzArrays | None, root: Path, scene: str) -> Matrix:
+    """K of a scene: of the file beside the list, or of the scene's own of the colour camera."""
+    if intrinsics is not None:
+        return _matrix(intrinsics[scene], 3)
+    path = root / scene / _COLOUR
+    if not path.is_file():
+        raise DataError(
+            f"{path}: no such file, nor {INTRINSICS} beside the list; one of them must hold the calibration"
+        )
+    return np.stack(read_numbers(path, "a matrix (4, 4)", 4))[:3, :3]
+
+
+def _pose_of_scene(path: Path, K: Matrix) -> Camera:
+    """The camera of a pose file, a matrix (4, 4) from camera to world; NaN where there is none, or no finite one."""
+    rows = read_numbers(path, "a matrix (4, 4), from camera to world", 4) if path.is_file() else []
+    to_world = np.stack(rows) if len(rows) == 4 else np.full((4, 4), np.nan)
+    if not np.isfinite(to_world).all():  # ScanNet has infinite poses
+        return Camera(K, np.full((3, 3), np.nan), np.full(3, np.nan))
+    R = to_world[:3, :3].T
+    return Camera(K, R, -R @ to_world[:3, 3])
+
+
+# Lists of image pairs on which others evaluate, such as MegaDepth-1500 and ScanNet-1500, with a folder of images
+
 
 TEXT_SUFFIXES, NPZ = (".txt", ".csv", ".list", ""), ".npz"
 _FRAME = re.compile(r"(.+?)_frame\W")  # scene0711_00_frame-001680.jpg
@@ -28,8 +220,8 @@ class PairList(PairDataset):
 
     Args:
         root: the folder of the images, to which the names of the list are relative.
-        file: a text list of SuperGlue's or glue-factory's columns (`fmtorch.data.listed_pairs`); an ``.npz`` of LoFTR's
-            (`fmtorch.data.scene_npz`); or a text file with the name of such an ``.npz`` in each line.
+        file: a text list of SuperGlue's or glue-factory's columns (`fmtorch.data.pair_list`); an ``.npz`` of LoFTR's
+            (`fmtorch.data.pair_list`); or a text file with the name of such an ``.npz`` in each line.
         resize: what images are resized to when read, px: one number for the longer side, [width, height] for both;
             None: not at all, but for lists of ScanNet whose K are of 640 x 480. K follows.
         origin: where the list's K puts the centre of the first pixel; None: 0.5 for glue-factory's lists and for

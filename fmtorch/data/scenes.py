@@ -1,22 +1,247 @@
-"""Scenes of images with known cameras, and the data set of pairs of them; what every native reader gives."""
+"""Which pairs of a scene's images are worth a look: of a video those a second apart, of a collection all, or those
+that see the same points of its reconstruction.
+"""
 
 from __future__ import annotations
 
 import bisect
 import dataclasses
+import functools
 import hashlib
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
+import cv2
 import numpy as np
+import scipy.sparse
 from numpy.typing import NDArray
 
 from fmtorch.data.cameras import Matrix, fundamental, relative_pose, share_centre
-from fmtorch.data.candidates import Candidates, drawn
-from fmtorch.data.depth_images import DepthImages
+from fmtorch.data.images import ImageError
 from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset
 from fmtorch.data.text_files import DataError
+
+Indices = NDArray[np.int64]
+
+WINDOW = 1.0  # s: a frame is paired with those of the following second (Bian et al., BMVC 2019, Section 3)
+MIN_SHARED = 1  # points of a reconstruction that two images must both see
+_ROUNDING = 1e-6  # s, of time stamps in text files
+_AT_ONCE = 512  # images whose shared points are counted together
+
+
+@runtime_checkable
+class Candidates(Protocol):
+    """Pairs (i, j), i < j, of a scene's images in a fixed order; not necessarily all in memory."""
+
+    def __len__(self) -> int: ...
+
+    def at(self, ranks: Indices) -> Indices:
+        """The pairs (n, 2) at these places (n,) of the order."""
+        ...
+
+
+class AllPairs:
+    """All pairs of n images, in the order (0, 1), (0, 2), ..., (1, 2), ..."""
+
+    def __init__(self, n: int) -> None:
+        self.n = n
+        self._starts = np.cumsum([0, *range(n - 1, 0, -1)])  # where the pairs that begin with image i begin
+
+    def __len__(self) -> int:
+        return self.n * (self.n - 1) // 2
+
+    def at(self, ranks: Indices) -> Indices:
+        """The pairs (n, 2) at these places (n,)."""
+        first = np.searchsorted(self._starts, ranks, side="right") - 1
+        return np.stack([first, first + 1 + ranks - self._starts[first]], -1)
+
+
+class ListedPairs:
+    """Pairs (n, 2) that are listed."""
+
+    def __init__(self, pairs: Indices) -> None:
+        self.pairs = pairs.reshape(-1, 2)
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def at(self, ranks: Indices) -> Indices:
+        """The pairs (n, 2) at these places (n,)."""
+        return self.pairs[ranks]
+
+
+def following(times: Sequence[float] | NDArray[np.float64], window: int | float = WINDOW) -> ListedPairs:
+    """Each frame with those at most `window` seconds later; times (n,) in seconds, ascending."""
+    t = np.asarray(times, dtype=np.float64)
+    ends = np.searchsorted(t, t + window + _ROUNDING, side="right")
+    counts = ends - np.arange(len(t)) - 1
+    first = np.repeat(np.arange(len(t)), counts)
+    within = np.arange(len(first)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return ListedPairs(np.stack([first, first + 1 + within], -1).astype(np.int64))
+
+
+def sharing_points(points: Sequence[NDArray[np.int64]], minimum: int = MIN_SHARED) -> ListedPairs:
+    """The pairs of images that both see at least `minimum` points; points: of each image the numbers it sees.
+
+    Memory is that of the pairs found; a reconstruction of n images with a mean track of m images has, in all, about
+    m / 2 such pairs for each point, most of them the same ones over and over.
+    """
+    sees = incidence(points)
+    blocks = []
+    for begin in range(0, len(points), _AT_ONCE):
+        shared = (sees[begin : begin + _AT_ONCE] @ sees.T).tocoo()
+        first, second = shared.row.astype(np.int64) + begin, shared.col.astype(np.int64)
+        kept = (shared.data >= minimum) & (first < second)
+        pairs = np.stack([first[kept], second[kept]], -1)
+        blocks.append(pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))])
+    return ListedPairs(np.concatenate([*blocks, np.zeros((0, 2), np.int64)]))
+
+
+def incidence(points: Sequence[Indices]) -> scipy.sparse.csr_array:
+    """Which image sees which point, (images, points) of ones; points: of each image the numbers it sees."""
+    seen = [np.unique(p) for p in points]
+    _, columns = np.unique(np.concatenate([*seen, np.zeros(0, np.int64)]), return_inverse=True)
+    return scipy.sparse.csr_array(
+        (np.ones(len(columns), np.int32), columns.astype(np.int64), np.cumsum([0, *map(len, seen)])),
+        shape=(len(seen), int(columns.max(initial=-1)) + 1),
+    )
+
+
+def drawn(total: int, count: int | None, seed: int) -> Sequence[int] | Indices:
+    """Places of `count` of `total` pairs, drawn at random by the seed and sorted; all where there are no more."""
+    if count is None or count >= total:
+        return range(total)
+    return np.sort(np.random.default_rng(seed).choice(total, count, replace=False))
+
+
+# Which sequences the paper trains and tests on (Bian et al., BMVC 2019, Section 4 and its supplement)
+
+
+SPLITS: dict[str, dict[str, tuple[str, ...]]] = {
+    "tum": {
+        "test": (
+            "rgbd_dataset_freiburg3_teddy",
+            "rgbd_dataset_freiburg3_large_cabinet",
+            "rgbd_dataset_freiburg3_long_office_household",
+        ),
+    },
+    "kitti": {
+        "test": ("06", "07", "08", "09", "10"),
+        "train": ("00", "01", "02", "03", "04", "05"),
+    },
+    "colmap": {
+        "test": ("Panther", "Playground", "Train", "Roman_Forum"),
+        "train": ("Family", "Francis", "Horse", "Lighthouse", "M60"),
+    },
+}  # fmt: skip
+"""By data set and split the names of sequences or scenes. Without `train` these are all others."""
+
+
+def chosen(name: str, split: str, sequences: Sequence[str] | None, there: Sequence[str]) -> list[str]:
+    """The sequences to read: those asked for, or those of the split.
+
+    there: the names of those on disk, among which a split of "all others" chooses. Raises DataError for an unknown
+    split, and where no sequence is left.
+    """
+    if split not in ("test", "train"):
+        raise DataError(f"split {split!r}; there are test and train")
+    if sequences is not None:
+        names = list(sequences)
+    elif split in SPLITS[name]:
+        names = list(SPLITS[name][split])
+    else:
+        names = sorted(set(there) - set(SPLITS[name]["test"]))
+    if not names:
+        raise DataError(f"{name}: no sequence in split {split!r}; dataset.sequences=[...] names some")
+    if len(set(names)) < len(names):
+        raise DataError(f"sequences={names}: one is named twice")
+    return names
+
+
+# Depth of each pixel of a photograph, measured or reconstructed, kept in a file beside it
+
+
+Values = NDArray[np.uint16] | NDArray[np.float32]
+_KEPT = 8  # depth images that are remembered, some MB each
+_COLMAP_HEADER = re.compile(rb"(\d{1,6})&(\d{1,6})&1&")
+
+
+class DepthImages:
+    """Depth images by the identity of the photographs, pixel by pixel on the photographs as they were taken.
+
+    paths: of the depth images. scale: their values per unit of length; 0 and less is no measurement. read: the values
+    (h, w) of a file. reduced: whether depth images may be smaller than their photographs, of the same proportions.
+    """
+
+    def __init__(
+        self, paths: Mapping[str, Path], scale: float, read: Callable[[Path], Values], reduced: bool = False
+    ) -> None:
+        self.paths, self.scale, self.read, self.reduced = dict(paths), scale, read, reduced
+
+    def at(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Depth (n,) along the optical axis at points (n, 2) of the undistorted image: that of the nearest pixel.
+
+        NaN outside, where nothing was measured, and everywhere in a photograph without a depth image. Raises ImageError
+        for a file that cannot be read or does not have the photograph's size.
+        """
+        if image.identity not in self.paths:
+            return np.full(len(points), np.nan)
+        path = self.paths[image.identity]
+        pixels = self.read(path)
+        h, w = pixels.shape
+        if image.size is not None and not self._fits((h, w), image.size):
+            raise ImageError(f"{path}: {(h, w)} px; its photograph has {image.size}")
+        there = points if image.lens is None else image.lens.distort(points)
+        if image.size is not None and image.size != (h, w):
+            there = (there + 0.5) * [w / image.size[1], h / image.size[0]] - 0.5
+        column, row = np.round(np.nan_to_num(there, nan=-1.0, posinf=-1.0, neginf=-1.0)).astype(np.int64).T
+        inside = (column >= 0) & (row >= 0) & (column < w) & (row < h)
+        value = np.where(inside, pixels[np.where(inside, row, 0), np.where(inside, column, 0)], 0).astype(np.float64)
+        return np.where(value > 0, value / self.scale, np.nan)
+
+    def _fits(self, size: tuple[int, int], photograph: tuple[int, int]) -> bool:
+        """Whether a depth image has the size of its photograph, or the same proportions to a pixel."""
+        (h, w), (height, width) = size, photograph
+        return size == photograph or (self.reduced and h <= height and abs(h * width / height - w) <= 1)
+
+
+@functools.lru_cache(maxsize=_KEPT)
+def read_grey(path: Path) -> NDArray[np.uint16]:
+    """A grey image with 16 bits (h, w). Raises ImageError for anything else."""
+    _expect_file(path)
+    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 2:
+        raise ImageError(f"{path}: it must be a depth image, grey with 16 bits")
+    return pixels  # type: ignore[return-value]
+
+
+@functools.lru_cache(maxsize=_KEPT)
+def read_colmap(path: Path) -> NDArray[np.float32]:
+    """A depth map of COLMAP's dense reconstruction (h, w): ``width&height&1&``, then float32, row by row.
+
+    Raises ImageError for anything else.
+    """
+    _expect_file(path)
+    content = path.read_bytes()
+    header = _COLMAP_HEADER.match(content)
+    if header is None:
+        raise ImageError(f"{path}: it must be a depth map of COLMAP, which begins with width&height&1&")
+    w, h = (int(number) for number in header.groups())
+    there = len(content) - header.end()
+    if there != 4 * w * h or not there:
+        raise ImageError(f"{path}: {there} bytes of depth; {w} x {h} px have {4 * w * h}: is it truncated?")
+    return np.frombuffer(content, np.dtype("<f4"), offset=header.end()).reshape(h, w)
+
+
+def _expect_file(path: Path) -> None:
+    if not path.is_file():
+        raise ImageError(f"{path}: no such file; it must be a depth image")
+
+
+# Scenes of images with known cameras, and the data set of pairs of them; what every native reader gives
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -9,12 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from fmtorch.data.candidates import WINDOW, following
-from fmtorch.data.depth_images import DepthImages, read_grey
 from fmtorch.data.lenses import Lens
 from fmtorch.data.pairs import ImageSource
-from fmtorch.data.scenes import DepthScenePairs, Scene, ScenePairs, View, folders
-from fmtorch.data.splits import chosen
+from fmtorch.data.scenes import (
+    WINDOW,
+    DepthImages,
+    DepthScenePairs,
+    Scene,
+    ScenePairs,
+    View,
+    chosen,
+    folders,
+    following,
+    read_grey,
+)
 from fmtorch.data.text_files import DataError, given_root, numbered, to_finite
 
 SIZE = (480, 640)  # h, w of all images

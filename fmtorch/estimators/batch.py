@@ -13,21 +13,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fmtorch.compiling.arrays import Array
-from fmtorch.compiling.batches import as_array
 from fmtorch.core.checks import PER_MATCH, reason
 from fmtorch.core.rules import FOCAL, SIZE
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.calibration import EXACT, calibration_of
-from fmtorch.estimators.families.cameras import focal_precision, focals_near, focals_px
-from fmtorch.estimators.families.family import Estimated
+from fmtorch.estimators.final_fits import Fit, scale_of
 from fmtorch.estimators.gradients import Attach, Solved, with_gradients
+from fmtorch.estimators.models.model import Estimated
+from fmtorch.estimators.models.posterior import focal_precision, focals_near, focals_px
 from fmtorch.estimators.pair import Pair, PixelMatches, bucket, normalize_pair
-from fmtorch.estimators.parts.final_fits import Fit, scale_of
-from fmtorch.estimators.parts.support import degenerate_support
+from fmtorch.estimators.preselection import degenerate_support
 from fmtorch.geometry.arithmetic import sqrt
-from fmtorch.geometry.residual_kernels import SAMPSON, Residual
+from fmtorch.geometry.epipolar import SAMPSON, Residual
 from fmtorch.geometry.significance import of_one_pair
+from fmtorch.jit.batches import as_array
+from fmtorch.jit.kernel import Array
 from fmtorch.jobs.threads import available, mapped
 
 PARTS_OF_A_THREAD = 4  # so that no thread is long alone at the end

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from fmtorch.compiling.arrays import Array
-from fmtorch.geometry.arithmetic_kernels import logarithm
+from fmtorch.geometry.arithmetic import logarithm_kernel
+from fmtorch.jit.kernel import Array
 
 EXACT = 0.02  # relative deviation below which a focal length counts as exactly known
 
@@ -30,7 +30,7 @@ class Calibration(NamedTuple):
     def logarithms(self, longest: tuple[float, float]) -> tuple[float, float]:
         """Of the focal lengths in units of the longer sides (px); 0 of unknown ones."""
         f0, f1 = (
-            float(logarithm(f / side)) if math.isfinite(s) else 0.0
+            float(logarithm_kernel(f / side)) if math.isfinite(s) else 0.0
             for f, s, side in zip(self.focals, self.deviations, longest, strict=True)
         )
         return f0, f1

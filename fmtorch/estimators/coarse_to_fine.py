@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fmtorch.core.stages import Estimator
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.geometry.verdict import judged
+from fmtorch.geometry.significance import judged
 
 
 class CoarseToFine:

@@ -8,16 +8,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fmtorch.compiling.arrays import Array, B1x1, F8x1, F8x2
-from fmtorch.compiling.kernel import kernel
-from fmtorch.estimators.families.cameras import Cameras
-from fmtorch.estimators.families.focals import FundamentalWithFocals
+from fmtorch.estimators.models.posterior import Cameras
+from fmtorch.estimators.models.with_focals import FundamentalWithFocals
 from fmtorch.estimators.options import Focal
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.refinement import Candidates, Refinement
-from fmtorch.estimators.parts.scores import Score
-from fmtorch.estimators.parts.selection import Selection, scores_of
+from fmtorch.estimators.refinement import Candidates, Refinement
+from fmtorch.estimators.scores import Score
 from fmtorch.estimators.search import Search, Stop
+from fmtorch.estimators.selection import Selection, scores_of
+from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, kernel
 
 # Share of the best gain without prior that gain minus prior cost must reach; chosen on castle-P19, fox, crops of them.
 MIN_GAIN_SHARE = 0.85

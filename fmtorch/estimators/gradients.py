@@ -13,21 +13,29 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.compiling.arrays import Array
-from fmtorch.compiling.lanes import LANES
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.estimators.families.cameras import Cameras, centred, images_of, translate
-from fmtorch.estimators.families.family import Refining
-from fmtorch.estimators.families.fundamental import response_of
-from fmtorch.estimators.families.posterior import Limits, minimise, no_optimum, tangents_of
+from fmtorch.estimators.final_fits import FinalFit, Fit
+from fmtorch.estimators.models.fundamental import response_of
+from fmtorch.estimators.models.model import Refining
+from fmtorch.estimators.models.posterior import (
+    Cameras,
+    Limits,
+    centred,
+    images_of,
+    minimise,
+    no_optimum,
+    tangents_of,
+    translate,
+)
 from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair
-from fmtorch.estimators.parts.final_fits import FinalFit, Fit
 from fmtorch.geometry import canonical, eight_point, unit_frobenius
+from fmtorch.geometry.cameras import PixelFrame
 from fmtorch.geometry.homography_refine import homography_at_optimum
+from fmtorch.geometry.levenberg_marquardt import LOSSES, NO_TABLE, Weighted
 from fmtorch.geometry.optimum import STEP_DAMPING, gradient_of_cost
-from fmtorch.geometry.pixel_frame import PixelFrame
 from fmtorch.geometry.robust_losses import KERNELS
-from fmtorch.geometry.sampson_objective_kernels import LOSSES, NO_TABLE, Weighted
+from fmtorch.jit.kernel import Array
+from fmtorch.jit.lanes import LANES
 
 
 class Solved(NamedTuple):

@@ -10,22 +10,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.compiling.arrays import Array
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.batch import Solution, estimated
-from fmtorch.estimators.families.fundamental import SevenPoint
+from fmtorch.estimators.final_fits import Fit
 from fmtorch.estimators.gradients import GraphedMatches, Solved
+from fmtorch.estimators.inliers import WithinThreshold, lower_median, residuals_squared, residuals_squared_px
+from fmtorch.estimators.models.fundamental import SevenPoint
 from fmtorch.estimators.pair import Pair, squared
-from fmtorch.estimators.parts.final_fits import Fit
-from fmtorch.estimators.parts.inliers import WithinThreshold, lower_median, residuals_squared, residuals_squared_px
 from fmtorch.geometry import attached_step
-from fmtorch.geometry.eight_point_kernels import weighted_eight_point
-from fmtorch.geometry.irls_kernels import reweighted
-from fmtorch.geometry.levenberg_marquardt_kernels import Schedule
-from fmtorch.geometry.rank2_manifold_kernels import SQUARINGS
-from fmtorch.geometry.refine_kernels import refine
+from fmtorch.geometry.eight_point import weighted_eight_point
+from fmtorch.geometry.irls import reweighted_kernel
+from fmtorch.geometry.levenberg_marquardt import LOSSES, Schedule, Weighted, loss_table
+from fmtorch.geometry.rank2_manifold import SQUARINGS
+from fmtorch.geometry.refine import refine_kernel
 from fmtorch.geometry.robust_losses import named_kernel
-from fmtorch.geometry.sampson_objective_kernels import LOSSES, Weighted, loss_table
+from fmtorch.jit.kernel import Array
 
 DECAY = 0.65  # of the kernel's scale, from one iteration to the next, down to the threshold
 FIRST_DAMPING = 1e-4  # of Levenberg-Marquardt
@@ -97,10 +96,10 @@ class IterativelyReweighted:
         scale = self.threshold / pair.pixels_per_unit
         widest = self.start_scale * 1.4826 * math.sqrt(max(_median(model, pair) for model in F))
         for i in range(self.iterations):
-            reweighted(F, self._weighted(pair, max(widest * DECAY**i, scale)))
+            reweighted_kernel(F, self._weighted(pair, max(widest * DECAY**i, scale)))
         refined, cost = np.empty_like(F), np.empty(len(F))
         schedule = Schedule(self.refine_iterations, FIRST_DAMPING, 0.0)
-        refine(F, SQUARINGS, self._weighted(pair, scale), schedule, refined, cost)
+        refine_kernel(F, SQUARINGS, self._weighted(pair, scale), schedule, refined, cost)
         best = int(np.argmin(np.where(np.isfinite(cost), cost, np.inf)))
         if not np.isfinite(cost[best]):
             return Solution(None, 0, reason=NOT_DETERMINED)

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-from fmtorch.geometry.sampson_objective_kernels import LOSSES
+from fmtorch.geometry.levenberg_marquardt import LOSSES
 
 Group = TypeVar("Group")
 

@@ -8,13 +8,10 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from fmtorch.compiling.arrays import Array, B1x1, F8x1, F8x2, I8x1
-from fmtorch.compiling.kernel import inner, kernel
-from fmtorch.compiling.random_kernels import stream_state, uniform
-from fmtorch.compiling.scratch import matrix
-from fmtorch.core.streams import Stream, mixed_seed
 from fmtorch.estimators.calibration import Calibration
-from fmtorch.geometry.residual_kernels import SAMPSON, Residual
+from fmtorch.geometry.epipolar import SAMPSON, Residual
+from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, I8x1, inner, kernel, matrix
+from fmtorch.jit.random import Stream, mixed_seed, stream_state, uniform_kernel
 
 T = TypeVar("T")
 MAX_COORDINATE_PX = 1e100  # a match beyond is none: numbers made of its coordinates would overflow
@@ -220,4 +217,4 @@ def uniforms(mixed_seed: int, key: int, start: int, out: F8x2) -> None:
     state, columns = stream_state(mixed_seed, key), out.shape[1]
     for i in range(len(out)):
         for j in range(columns):
-            out[i, j] = uniform(state, (start + i) * columns + j)
+            out[i, j] = uniform_kernel(state, (start + i) * columns + j)

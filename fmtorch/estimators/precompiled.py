@@ -4,33 +4,38 @@ from __future__ import annotations
 
 from typing import Any
 
-from fmtorch.compiling.kernel import Kernel
-from fmtorch.estimators import focal_search, pair, search
-from fmtorch.estimators.families import cameras, cheirality, focal_prior, focals, homography, posterior
-from fmtorch.estimators.parts import (
+from fmtorch.estimators import (
+    focal_search,
     inliers,
+    pair,
     preselection,
     refinement,
     sampling,
-    saturated,
-    scored_matches,
     scores,
-    support,
+    search,
 )
-from fmtorch.geometry import (
-    five_point_kernels,
-    four_point_kernels,
-    homography_objective_kernels,
-    refine_kernels,
-    sampson_objective_kernels,
-    seven_point_kernels,
-    significance_kernels,
+from fmtorch.estimators import (
+    preselection as support,
 )
+from fmtorch.estimators import (
+    scores as saturated,
+)
+from fmtorch.estimators import (
+    scores as scored_matches,
+)
+from fmtorch.estimators.models import focal_prior, homography, model, posterior, with_focals
+from fmtorch.estimators.models import posterior as cameras
+from fmtorch.geometry import five_point, homography_refine, levenberg_marquardt
+from fmtorch.geometry.homography import four_point
+from fmtorch.geometry.refine import refine_kernel
+from fmtorch.geometry.seven_point import seven_point_kernel
+from fmtorch.geometry.significance import counted_chances, most_significant
+from fmtorch.jit.kernel import Kernel
 
 WITH_FOCALS: tuple[Kernel[..., Any], ...] = (
-    five_point_kernels.five_point,  # solvers, samples and scores
-    seven_point_kernels.seven_point,
-    significance_kernels.counted_chances,
+    five_point.five_point,  # solvers, samples and scores
+    seven_point_kernel,
+    counted_chances,
     refinement.near,
     sampling.draw,
     focal_prior.draw_depths,
@@ -52,21 +57,21 @@ WITH_FOCALS: tuple[Kernel[..., Any], ...] = (
     focal_search.same_model,
     cameras.centre,  # cameras and fits
     cameras.translate,
-    focals.gain_without_prior,
-    focals.refine_with_prior,
-    cheirality.cheirality,
-    significance_kernels.most_significant,
+    with_focals.gain_without_prior,
+    with_focals.refine_with_prior,
+    model.cheirality,
+    most_significant,
     cameras.nearest_cameras,
-    sampson_objective_kernels.evaluate,  # called by `minimise` and `refine`
-    refine_kernels.refine,
+    levenberg_marquardt.evaluate,  # called by `minimise` and `refine`
+    refine_kernel,
     posterior.minimise,
 )
 """Of an estimator of fundamental matrices with the prior on focal lengths."""
 
 OF_HOMOGRAPHIES: tuple[Kernel[..., Any], ...] = (
-    homography_objective_kernels.refine_homographies,
-    homography_objective_kernels.evaluate_homographies,
-    four_point_kernels.four_point,
+    homography_refine.refine_homographies,
+    homography_refine.evaluate_homographies,
+    four_point,
     homography.homography_to_pixels,
     inliers.residuals_squared_homography,
     refinement.near_homography,

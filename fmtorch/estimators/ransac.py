@@ -12,28 +12,27 @@ from typing import Any
 
 import numpy as np
 
-from fmtorch.compiling.arrays import Array
-from fmtorch.compiling.kernel import Kernel
-from fmtorch.compiling.together import compile_together
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.batch import NOT_SOLVED, Solution, estimated, with_sqrt_prior
-from fmtorch.estimators.families.family import Refining
-from fmtorch.estimators.families.focals import FundamentalWithFocals
+from fmtorch.estimators.degensac import Degensac
+from fmtorch.estimators.final_fits import FinalFit, Fit
 from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
 from fmtorch.estimators.gradients import Attached
+from fmtorch.estimators.inliers import InlierRule, StoppingRule, residuals_squared_px
+from fmtorch.estimators.models.model import Refining
+from fmtorch.estimators.models.with_focals import FundamentalWithFocals
 from fmtorch.estimators.options import Focal, Preselect, Refine, Select, at_least_one, group
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.degensac import Degensac
-from fmtorch.estimators.parts.final_fits import FinalFit, Fit
-from fmtorch.estimators.parts.inliers import InlierRule, StoppingRule, residuals_squared_px
-from fmtorch.estimators.parts.preselection import Preselection
-from fmtorch.estimators.parts.refinement import LocalOptimization, Refinement
-from fmtorch.estimators.parts.sampling import Sampler
-from fmtorch.estimators.parts.scores import Score
-from fmtorch.estimators.parts.selection import BestOfSearch, BestScore, Selection, Selector
 from fmtorch.estimators.precompiled import OF_HOMOGRAPHIES, WITH_FOCALS
+from fmtorch.estimators.preselection import Preselection
+from fmtorch.estimators.refinement import LocalOptimization, Refinement
 from fmtorch.estimators.registry import part, thresholds
+from fmtorch.estimators.sampling import Sampler
+from fmtorch.estimators.scores import Score
 from fmtorch.estimators.search import Search
+from fmtorch.estimators.selection import BestOfSearch, BestScore, Selection, Selector
+from fmtorch.jit.kernel import Array, Kernel
+from fmtorch.jit.together import compile_together
 
 FOCAL_ROUND = 500  # samples of five matches at a time
 CALIBRATED_MATCHES = 6  # that a pair of calibrated cameras needs: five of them have up to ten solutions

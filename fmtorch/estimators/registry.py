@@ -10,16 +10,14 @@ import inspect
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from fmtorch.estimators.families.fundamental import EightPoint, SevenPoint
-from fmtorch.estimators.families.homography import Homography
-from fmtorch.estimators.parts.degensac import Degensac
-from fmtorch.estimators.parts.final_fits import Adaptive, GaussNewton, LeastSquares, NoFit, UnweightedLeastSquares
-from fmtorch.estimators.parts.graph_cut import GraphCut
-from fmtorch.estimators.parts.inliers import BetterHalf, RobustDeviations, WithinThreshold
-from fmtorch.estimators.parts.median import Median
-from fmtorch.estimators.parts.sampling import PriorWeighted, Prosac, Uniform
-from fmtorch.estimators.parts.saturated import SaturatedGains
-from fmtorch.estimators.parts.scores import InlierCount, Magsac, Msac
+from fmtorch.estimators.degensac import Degensac
+from fmtorch.estimators.final_fits import Adaptive, GaussNewton, LeastSquares, NoFit, UnweightedLeastSquares
+from fmtorch.estimators.graph_cut import GraphCut
+from fmtorch.estimators.inliers import BetterHalf, RobustDeviations, WithinThreshold
+from fmtorch.estimators.models.fundamental import EightPoint, SevenPoint
+from fmtorch.estimators.models.homography import Homography
+from fmtorch.estimators.sampling import PriorWeighted, Prosac, Uniform
+from fmtorch.estimators.scores import InlierCount, Magsac, Median, Msac, SaturatedGains
 
 DEFAULT_THRESHOLD_PX = 1.0
 

@@ -9,13 +9,12 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from fmtorch.compiling.arrays import Array, F4x2, F8x1, I8x1
-from fmtorch.compiling.kernel import kernel
-from fmtorch.estimators.families.family import Family, Hypotheses
+from fmtorch.estimators.models.model import Family, Hypotheses
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.preselection import Preselection
-from fmtorch.estimators.parts.sampling import Sampler, drawn
-from fmtorch.geometry.rank2_kernels import assign
+from fmtorch.estimators.preselection import Preselection
+from fmtorch.estimators.sampling import Sampler, drawn
+from fmtorch.geometry.matrices import assign
+from fmtorch.jit.kernel import Array, F4x2, F8x1, I8x1, kernel
 
 Stop = Callable[[Array, int, Pair, int], bool]
 """Whether the best model (9,), after so many draws of samples of this size, may be taken for the best there is."""

@@ -8,11 +8,20 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from fmtorch.evaluation.bootstrap import LEVEL, Interval
 from fmtorch.evaluation.curves import NSGD, axis_of
-from fmtorch.evaluation.intervals import MIN_UNITS, mean_difference, share_difference
-from fmtorch.evaluation.planes import THRESHOLDS as CORNER_THRESHOLDS
-from fmtorch.evaluation.statistics import FINE_THRESHOLD, PERCENT, THRESHOLD, areas, scene_names
+from fmtorch.evaluation.rows import THRESHOLDS as CORNER_THRESHOLDS
+from fmtorch.evaluation.statistics import (
+    FINE_THRESHOLD,
+    LEVEL,
+    MIN_UNITS,
+    PERCENT,
+    THRESHOLD,
+    Interval,
+    areas,
+    mean_difference,
+    scene_names,
+    share_difference,
+)
 from fmtorch.evaluation.tables import DASH, Bar, Cell, Table, common, shared_keys
 
 

@@ -13,12 +13,11 @@ from typing import Any
 from omegaconf import DictConfig
 
 from fmtorch import presets
-from fmtorch.compiling import switch
+from fmtorch.jit import kernel
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
-from fmtorch.storage.code import code_digest, fmtorch_version
-from fmtorch.storage.configuration import file_digest, learned, libraries
-from fmtorch.storage.features import CachedFeatures
+from fmtorch.runs.feature_cache import CachedFeatures
+from fmtorch.runs.fingerprint import code_digest, file_digest, fmtorch_version, learned, libraries
 
 PLACES = ("root", "file", "truth", "images")
 """Options of data sets that say where things lie; the digest says what they are."""
@@ -55,7 +54,7 @@ def run_identity(
     }
     return {
         "pipeline": pipeline_name, **stages, "seed": config.seed, "version": fmtorch_version(),
-        "libraries": libraries(presets.peer_packages(stages)), "kernels": switch.identity(),
+        "libraries": libraries(presets.peer_packages(stages)), "kernels": kernel.identity(),
         "learned": _learned(stages, pipeline),
         "code": _code({"stages": stages, "dataset": dataset}), "dataset": dataset,
         **({} if cameras is None else {"cameras": cameras}), **({"pose": {"signed": True}} if signed else {}),

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from fmtorch.core.stages import Estimator
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.data.exif import exif_focal
+from fmtorch.data.image_cameras import exif_focal
 from fmtorch.data.pairs import ImagePair
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.two_view.known_cameras import KnownCameras

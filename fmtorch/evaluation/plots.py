@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from fmtorch import metrics
 from fmtorch.evaluation.curves import NSGD, Axis, axis_of, by_family
 from fmtorch.evaluation.summary import ALL
-from fmtorch.storage import replacing
+from fmtorch.runs import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -1,24 +1,159 @@
-"""Recall, AUC@0.05, their differences and intervals: what every table of this project takes its figures from.
-
-A figure is the mean over pairs of what each pair adds to it. Shares of pairs, such as recall, have score intervals, all
-other means the bootstrap's (see `intervals`). Pairs of one scene succeed and fail together: the units are scenes, and
-pairs only where there are fewer than five scenes, which every table then says (`described`).
-"""
+"""Confidence intervals by resampling whole scenes, because the pairs of one scene are not independent."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.special import ndtri, stdtrit
 
 from fmtorch import metrics
-from fmtorch.evaluation.bootstrap import MIN_SCENES, Interval, bootstrap_mean
-from fmtorch.evaluation.intervals import mean_difference, share_difference, share_interval
 from fmtorch.metrics.recall import FINE_THRESHOLD as FINE_THRESHOLD
 from fmtorch.metrics.recall import THRESHOLD as THRESHOLD
+
+RESAMPLES = 2000
+LEVEL = 0.95
+MIN_SCENES = 5  # with fewer scenes their spread cannot be seen, and pairs are resampled
+_SEED = 0
+_BLOCK = 1 << 22  # numbers drawn at once: bounds the memory to some 100 MB
+
+
+@dataclasses.dataclass(frozen=True)
+class Interval:
+    """A mean with its percentile bootstrap interval. over: what was resampled, ``scene`` or ``pair``.
+
+    As text it is ``value [low, high]``, each number in the given format: ``f"{interval:+.1f}"``.
+    """
+
+    value: float
+    low: float
+    high: float
+    over: str
+
+    def __format__(self, form: str) -> str:
+        return f"{self.value:{form}} [{self.low:{form}}, {self.high:{form}}]"
+
+
+def bootstrap_mean(values: NDArray[np.float64], scenes: Sequence[str]) -> Interval:
+    """The mean over all pairs, with a 95 % percentile interval from 2,000 resamples of scenes (Efron 1979).
+
+    values: one per pair, (n,), n >= 1. scenes: the scene of each pair. With fewer than `MIN_SCENES` scenes the pairs
+    are resampled instead, which is too narrow where pairs of a scene succeed and fail together. The interval has no
+    width where all values are equal. The same input always gives the same interval.
+    """
+    _, cluster = np.unique(np.asarray(scenes), return_inverse=True)
+    over = "scene" if cluster.max() + 1 >= MIN_SCENES else "pair"
+    if over == "pair":
+        cluster = np.arange(len(values))
+    sums, sizes = np.bincount(cluster, values), np.bincount(cluster)
+    means = np.concatenate([sums[draw].sum(1) / sizes[draw].sum(1) for draw in _draws(len(sums))])
+    low, high = np.quantile(means, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return Interval(float(sums.sum() / len(values)), float(low), float(high), over)
+
+
+def paired_bootstrap(a: NDArray[np.float64], b: NDArray[np.float64], scenes: Sequence[str]) -> Interval:
+    """mean(a) - mean(b) of two methods on the same pairs, as `bootstrap_mean` of the differences.
+
+    a, b: (n,), e.g. 1.0 where NSGD is below the threshold. The methods differ at this level where the interval does
+    not hold 0.
+    """
+    if len(a) != len(b):
+        raise ValueError(f"paired_bootstrap compares the same pairs, but a has {len(a)} and b has {len(b)}")
+    return bootstrap_mean(a - b, scenes)
+
+
+def _draws(count: int) -> Iterator[NDArray[np.int64]]:
+    """`RESAMPLES` samples with replacement of `count` clusters, in blocks (r, count)."""
+    rng = np.random.default_rng(_SEED)
+    rows = max(1, min(RESAMPLES, _BLOCK // count))
+    for start in range(0, RESAMPLES, rows):
+        yield rng.integers(0, count, (min(rows, RESAMPLES - start), count))
+
+
+# Confidence intervals of shares of pairs: sound from three pairs on, and where all of them or none succeed
+
+
+MIN_UNITS = 10  # scenes, or pairs where those are resampled, below which a bootstrap of any other mean is not shown
+Successes = NDArray[np.bool_] | NDArray[np.float64]
+_Z = float(ndtri((1 + LEVEL) / 2))
+
+
+def effective_pairs(values: NDArray[np.float64], scenes: Sequence[str]) -> float:
+    """How many independent pairs tell as much of the mean as these, which come in scenes; at most n.
+
+    n divided by the design effect: the variance of the mean with whole scenes as units over that with pairs as units,
+    at least 1; and by the squared ratio of Student's quantiles, because few scenes tell their own spread badly. n with
+    fewer than `MIN_SCENES` scenes, whose spread cannot be seen, and where all values are equal.
+
+    Args:
+        values: one per pair, (n,), n >= 1.
+        scenes: the scene of each pair.
+    """
+    n = len(values)
+    _, cluster = np.unique(np.asarray(scenes), return_inverse=True)
+    m = int(cluster.max()) + 1
+    centred = values - values.mean()
+    alone = float((centred**2).sum()) * n / (n - 1) if n > 1 else 0.0
+    if m < MIN_SCENES or alone <= n * np.finfo(np.float64).eps:
+        return float(n)
+    together = float((np.bincount(cluster, centred) ** 2).sum()) * m / (m - 1)
+    quantiles = float(stdtrit(m - 1, (1 + LEVEL) / 2) / stdtrit(n - 1, (1 + LEVEL) / 2))
+    return n / (max(1.0, together / alone) * quantiles**2)
+
+
+def share_interval(successes: Successes, scenes: Sequence[str]) -> Interval:
+    """The share of pairs that succeed, with Wilson's 95 % score interval for the effective number of pairs.
+
+    Args:
+        successes: (n,), n >= 1; of several seeds the share of those with which a pair succeeds, in [0, 1].
+        scenes: the scene of each pair; `Interval.over` says whether scenes were many enough to be the units.
+    """
+    values = successes.astype(np.float64)
+    p, n = float(values.mean()), effective_pairs(values, scenes)
+    middle = (p + _Z**2 / (2 * n)) / (1 + _Z**2 / n)
+    half = _Z / (1 + _Z**2 / n) * math.sqrt(p * (1 - p) / n + _Z**2 / (4 * n**2))
+    # At the ends the bound is exact; rounding must not put it on the wrong side of the share.
+    return Interval(p, min(max(0.0, middle - half), p), max(min(1.0, middle + half), p), _unit(scenes))
+
+
+def share_difference(a: Successes, b: Successes, scenes: Sequence[str]) -> Interval:
+    """Share of a minus share of b, of the same pairs, with the adjusted Wald interval of Bonett and Price.
+
+    One pair more is counted on either side ("Adjusted Wald confidence interval for a difference of binomial proportions
+    based on paired data", Journal of Educational and Behavioral Statistics 2012), so that methods which agree on every
+    pair still have an interval of the width that so few pairs allow.
+
+    Args:
+        a, b: (n,), n >= 1, where either method succeeds; of several seeds as in `share_interval`.
+        scenes: the scene of each pair.
+    """
+    difference = a.astype(np.float64) - b.astype(np.float64)
+    n = effective_pairs(difference, scenes)
+    only_a, only_b = (float((sign * difference).clip(min=0.0).mean()) for sign in (1, -1))
+    p, q = (n * only_a + 1) / (n + 2), (n * only_b + 1) / (n + 2)
+    half = _Z * math.sqrt((p + q - (p - q) ** 2) / (n + 2))
+    value = float(difference.mean())
+    low, high = max(-1.0, p - q - half), min(1.0, p - q + half)
+    return Interval(value, min(low, value), max(high, value), _unit(scenes))
+
+
+def mean_difference(a: NDArray[np.float64], b: NDArray[np.float64], scenes: Sequence[str]) -> Interval | None:
+    """mean(a) - mean(b) of a figure that is no share, by `paired_bootstrap`; None of fewer than `MIN_UNITS` units."""
+    units = len(set(scenes)) if _unit(scenes) == "scene" else len(a)
+    return paired_bootstrap(a, b, scenes) if units >= MIN_UNITS else None
+
+
+def _unit(scenes: Sequence[str]) -> str:
+    return "scene" if len(set(scenes)) >= MIN_SCENES else "pair"
+
+
+# Recall, AUC@0.05, their differences and intervals: what every table of this project takes its figures from
+
 
 POSE_THRESHOLDS = (5, 10, 20)  # degrees
 FOCAL_THRESHOLDS = (5, 10)  # percent

@@ -13,10 +13,17 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fmtorch.core.estimate import CONFIGURATIONS
-from fmtorch.evaluation.intervals import share_interval
-from fmtorch.evaluation.planes import homography_figures
-from fmtorch.evaluation.statistics import MERITS, THRESHOLD, focal_figures, pose_figures, recalled, scene_names
-from fmtorch.storage import PAIR_SCHEMA
+from fmtorch.evaluation.rows import homography_figures
+from fmtorch.evaluation.statistics import (
+    MERITS,
+    THRESHOLD,
+    focal_figures,
+    pose_figures,
+    recalled,
+    scene_names,
+    share_interval,
+)
+from fmtorch.runs import PAIR_SCHEMA
 
 ALL = "all"
 STAGES = tuple(name.removeprefix("seconds_") for name in PAIR_SCHEMA.names if name.startswith("seconds_"))

@@ -9,9 +9,8 @@ from rich import box
 from rich.table import Table
 
 from fmtorch.core.estimate import CONFIGURATIONS
-from fmtorch.evaluation.bootstrap import LEVEL
-from fmtorch.evaluation.planes import CAPTION, INLIERS, THRESHOLDS
-from fmtorch.evaluation.statistics import FINE_THRESHOLD, FOCAL_THRESHOLDS, POSE_THRESHOLDS, THRESHOLD
+from fmtorch.evaluation.rows import CAPTION, INLIERS, THRESHOLDS
+from fmtorch.evaluation.statistics import FINE_THRESHOLD, FOCAL_THRESHOLDS, LEVEL, POSE_THRESHOLDS, THRESHOLD
 from fmtorch.evaluation.summary import ALL, STAGES, Group
 
 RECALL = "%Recall [interval]"  # the column that has an interval

@@ -10,9 +10,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from fmtorch.evaluation.bootstrap import LEVEL
-from fmtorch.evaluation.planes import CAPTION
-from fmtorch.evaluation.statistics import FINE_THRESHOLD, POSE_THRESHOLDS, THRESHOLD
+from fmtorch.evaluation.rows import CAPTION
+from fmtorch.evaluation.statistics import FINE_THRESHOLD, LEVEL, POSE_THRESHOLDS, THRESHOLD
 from fmtorch.evaluation.summary import ALL, STAGES
 from fmtorch.evaluation.summary_tables import (
     CONFIGURATION_CAPTION,

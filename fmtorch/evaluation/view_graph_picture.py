@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.storage.exchange.view_graph import Edge, ViewGraph
+from fmtorch.io.export import Edge, ViewGraph
 
 MAX_THUMBNAILS, MAX_LABELS, MAX_EDGES, MAX_SPECTRAL = 40, 80, 20_000, 1_500
 _SIZE, _THUMBNAIL, _QUALITY = 900, 72, 80  # of the picture and a thumbnail's longer side, in CSS pixels; of JPEG

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from fmtorch.core.onnx_network import pretrained
 from fmtorch.core.options import Within
-from fmtorch.core.pretrained import pretrained
 from fmtorch.core.types import Features
 from fmtorch.features.sift import strongest
 

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.core.onnx_session import NetworkFileError, onnx_session
-from fmtorch.core.resources import models_dir
+from fmtorch.core.files import models_dir
+from fmtorch.core.onnx_network import NetworkFileError, onnx_session
 
 PRECISIONS = ("fp32", "int8")
 PATCH_SHAPE = (1, 32, 32)

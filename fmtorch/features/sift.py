@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
+import zipfile
 from collections.abc import Sequence
-from typing import Annotated
+from pathlib import Path
+from types import ModuleType
+from typing import Annotated, Any
 
 import cv2
 import kornia
@@ -15,9 +19,11 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch.core.files import models_dir
 from fmtorch.core.options import Within
 from fmtorch.core.types import Features
 from fmtorch.features.frames import FRAME_SIGMAS
+from fmtorch.features.patches import PATCH, ImagePyramid
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,3 +135,238 @@ def as_grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     if image.ndim == 2:
         return np.ascontiguousarray(image)
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)  # type: ignore[return-value]
+
+
+# VLFeat's difference-of-Gaussians keypoints with SIFT descriptors, through pycolmap (extra `colmap`)
+
+
+ORIENTATIONS = 4  # of one location at most, as VLFeat
+SMALLEST = 16  # px, the shorter side: the smallest octave has 8, and VLFeat takes no smaller image
+
+
+@dataclasses.dataclass(frozen=True)
+class VLFeatSIFT:
+    """Detects DoG keypoints and describes them by SIFT as VLFeat does; an instance may be used by several threads.
+
+    The paper (Bian et al., BMVC 2019) took its keypoints and descriptors from there. VLFeat does not double the image
+    and, by default, has no threshold of contrast, so that it finds more keypoints than OpenCV, of larger scales.
+
+    max_features: the keypoints of the largest scales that are kept.
+    first_octave: -1 doubles the image first.
+    peak_threshold: least contrast |DoG|, for intensities in [0, 1]; 0 takes every extremum.
+    edge_threshold: largest ratio of principal curvatures.
+    root: RootSIFT instead.
+    """
+
+    max_features: Annotated[int, Within(1)] = 20000
+    first_octave: int = 0
+    peak_threshold: float = 0.0
+    edge_threshold: float = 10.0
+    root: bool = False
+
+    def __post_init__(self) -> None:
+        _library()
+
+    def __call__(self, image: NDArray[np.uint8]) -> Features:
+        """The features of a grey (H, W) or RGB (H, W, 3) uint8 image; none, with N = 0, where nothing is found.
+
+        lafs: half side `FRAME_SIGMAS` sigma. scores: sigma in pixels, as VLFeat tells no contrast. descriptors:
+        (N, 128) float32, whole numbers from 0 to 255 unless `root`. Raises ValueError for another type, shape or an
+        empty image.
+        """
+        grey = as_grey(image)
+        size = torch.tensor(grey.shape, dtype=torch.int64)
+        if min(grey.shape) < SMALLEST:
+            return Features(torch.zeros(0, 2, 3), torch.zeros(0), torch.zeros(0, 128), size)
+        keypoints, computed = self._extractor(grey.shape).extract_from_uint8_array(grey)
+        table = [(k.a11, k.a12, k.x, k.a21, k.a22, k.y) for k in keypoints]
+        frames = torch.tensor(table, dtype=torch.float32).reshape(-1, 2, 3)
+        sigma = frames[:, :, 0].norm(dim=1)
+        order = torch.argsort(-sigma, stable=True)[: self.max_features].sort().values
+        lafs = torch.cat([FRAME_SIGMAS * frames[..., :2], frames[..., 2:] - 0.5], -1)  # COLMAP's origin is the corner
+        descriptors = torch.from_numpy(np.array(computed.data, np.float32).reshape(-1, 128))[order]
+        return Features(lafs[order], sigma[order], root_sift(descriptors) if self.root else descriptors, size)
+
+    def _extractor(self, shape: tuple[int, ...]) -> Any:
+        pycolmap = _library()
+        options = pycolmap.FeatureExtractionOptions()
+        options.use_gpu, options.num_threads = False, 1
+        sift = options.sift
+        sift.first_octave, sift.num_octaves = self.first_octave, octaves(shape, self.first_octave)
+        sift.peak_threshold = max(self.peak_threshold, 1e-12)  # pycolmap refuses zero
+        sift.edge_threshold = self.edge_threshold
+        sift.max_num_orientations = ORIENTATIONS
+        sift.max_num_features = max(self.max_features, 1)
+        sift.normalization = pycolmap.Normalization.L2
+        return pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+
+
+def octaves(shape: tuple[int, ...], first: int) -> int:
+    """How many octaves VLFeat takes of an image (h, w): as many as leave 8 px of the shorter side."""
+    return max(int(math.log2(min(shape))) - first - 3, 1)
+
+
+def _library() -> ModuleType:
+    """pycolmap, which says nothing but warnings. Raises ImportError naming the extra where it is not installed."""
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise ImportError("features=sift_vlfeat needs pycolmap: pip install 'fmtorch[colmap]'") from error
+    pycolmap.logging.minloglevel = pycolmap.logging.WARNING.value
+    module: ModuleType = pycolmap
+    return module
+
+
+# SIFT of patches, plain, as RootSIFT, and pooled over domain sizes; batched (Lowe, IJCV 2004, section 6)
+
+
+CELLS, DIRECTIONS = 4, 8  # a grid of 4 x 4 histograms of 8 directions
+CELL_SIGMAS = 3.0  # side of a cell in keypoint sigmas: vl_sift's magnification
+EXTENT = CELL_SIGMAS * (CELLS + 1) / 2 / FRAME_SIGMAS  # half side of the patch in frames: votes reach half a cell on
+WINDOW = CELLS / 2  # cells, sigma of the Gaussian window; Lowe, section 6.1
+CLIP = 0.2  # largest entry of the normalised histogram; Lowe, section 6.1
+SMOOTHING = 1.0  # keypoint sigmas, the blur at which gradients are taken: that of the level of detection
+PATCH_BLUR = 0.75  # pixels, the blur that patches have from the pyramid
+FLAT = 1e-6  # gradients below are the rounding of float32 intensities
+CHUNK = 64  # patches worked on together: their histograms fit a core's cache
+
+
+@dataclasses.dataclass(frozen=True)
+class PatchSIFT:
+    """SIFT descriptors of frames; with several `sizes` the mean over them, DSP-SIFT (Dong and Soatto, CVPR 2015).
+
+    root: RootSIFT (Arandjelovic and Zisserman, CVPR 2012) of each. smallest, largest: the range of domain sizes, in
+    units of the frame. sizes: how many are sampled in it, evenly, both ends included.
+    """
+
+    root: bool = False
+    smallest: float = 1.0
+    largest: float = 1.0
+    sizes: int = 1
+
+    def __call__(self, pyramid: ImagePyramid, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n 128"]:
+        """Descriptors of unit length; zeros for a frame without gradient. In OpenCV's order."""
+        total = lafs.new_zeros(len(lafs), CELLS * CELLS * DIRECTIONS)
+        for size in torch.linspace(self.smallest, self.largest, self.sizes).tolist():
+            scaled = torch.cat([lafs[..., :2] * (EXTENT * size), lafs[..., 2:]], -1)
+            described = sift_of_patches(pyramid.extract(scaled))
+            total = total + (root_sift(described) if self.root else described)
+        return total if self.sizes == 1 else normalized(total)
+
+
+def sift_of_patches(patches: Float[Tensor, "n 1 32 32"]) -> Float[Tensor, "n 128"]:
+    """SIFT of patches that cover `EXTENT` frames: gradients of the blurred patch vote, weighted by a Gaussian window.
+
+    Each gradient votes for the two nearest directions and the four nearest cells; the histogram is normalised, clipped
+    and normalised again. Entry (4 y + x) 8 + d is cell (x, y), direction 45 d degrees counter-clockwise on the screen.
+    """
+    pooling, along, across = _matrices(patches.device)
+    parts = []
+    for part in torch.split(patches[:, 0], CHUNK):
+        gx = across @ part @ along.T
+        gy = along @ part @ across.T
+        squared = (gx * gx + gy * gy).flatten(1)
+        magnitude = torch.where(squared > FLAT * FLAT, squared, 0.0).sqrt()
+        position = (torch.atan2(-gy, gx) * (DIRECTIONS / (2 * math.pi))).flatten(1)
+        lower = position.floor()
+        upper_weight = (position - lower) * magnitude
+        lower_bin = lower.long() & (DIRECTIONS - 1)
+        votes = part.new_zeros(len(part), DIRECTIONS, PATCH * PATCH)
+        votes.scatter_(1, lower_bin[:, None], (magnitude - upper_weight)[:, None])
+        votes.scatter_(1, ((lower_bin + 1) & (DIRECTIONS - 1))[:, None], upper_weight[:, None])
+        parts.append((votes @ pooling).transpose(1, 2).flatten(1))
+    histogram = torch.cat(parts) if parts else patches.new_zeros(0, CELLS * CELLS * DIRECTIONS)
+    return normalized(normalized(histogram).clamp(max=CLIP))
+
+
+def normalized(x: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
+    """Rows of unit length; zero rows stay zero."""
+    norm = torch.linalg.vector_norm(x, dim=1, keepdim=True)
+    return x / torch.where(norm > 0, norm, 1.0)
+
+
+@functools.cache
+def _matrices(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Pooling (1024, 16) of the pixels' votes; blur with derivative, and blur, along an axis (32, 32)."""
+    sigma_pixels = PATCH / (2 * EXTENT * FRAME_SIGMAS)  # a keypoint sigma
+    x = torch.arange(PATCH, dtype=torch.float64)
+    cell = CELL_SIGMAS * sigma_pixels
+    centred = (x - (PATCH - 1) / 2) / cell
+    centres = torch.arange(CELLS, dtype=torch.float64) - (CELLS - 1) / 2
+    weight = (1 - (centred[:, None] - centres).abs()).clamp(min=0) * torch.exp(-0.5 * (centred / WINDOW) ** 2)[:, None]
+    pooling = torch.einsum("yi,xj->yxij", weight, weight).reshape(PATCH * PATCH, CELLS * CELLS)
+    sigma = math.sqrt(max((SMOOTHING * sigma_pixels) ** 2 - PATCH_BLUR**2, 1e-6))
+    blur = torch.exp(-0.5 * ((x[:, None] - x) / sigma) ** 2)
+    blur = torch.where(blur > 1e-8, blur, 0.0)  # denormal numbers would make the products ten times slower
+    blur = blur / blur.sum(1, keepdim=True)
+    derivative = torch.zeros(PATCH, PATCH, dtype=torch.float64)
+    inner = torch.arange(1, PATCH - 1)
+    derivative[inner, inner + 1], derivative[inner, inner - 1] = 0.5, -0.5
+    return pooling.float().to(device), (derivative @ blur).float().to(device), blur.float().to(device)
+
+
+# RootSIFT-PCA: RootSIFT projected on its principal components (Bursuc, Tolias and Jégou, ICMR 2015)
+
+
+DIMENSIONS = 80  # of the paper's RootSIFT-PCA
+
+
+@dataclasses.dataclass(frozen=True)
+class RootSIFTPCA:
+    """RootSIFT of frames, centred, projected to 80 dimensions, raised to a power, and normalised.
+
+    model: the learned file with `mean` (128,) and `basis` (128, 80); None: the one that comes with the package.
+    power: exponent of the entries' absolute values, which keep their signs; the authors' released code has 0.5.
+    """
+
+    model: Path | str | None = None
+    power: float = 0.5
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "model", Path(self.model) if self.model else models_dir() / "rootsift_pca.npz")
+
+    def __call__(self, pyramid: ImagePyramid, lafs: Float[Tensor, "n 2 3"]) -> Float[Tensor, "n d"]:
+        """Descriptors (N, 80) of unit length.
+
+        Raises FileNotFoundError where the learned file is absent, ValueError where it is not what it should be.
+        """
+        mean, basis = load_projection(Path(str(self.model)))
+        return project(PatchSIFT(root=True)(pyramid, lafs), mean.to(lafs.device), basis.to(lafs.device), self.power)
+
+
+def project(
+    descriptors: Float[Tensor, "n 128"], mean: Float[Tensor, 128], basis: Float[Tensor, "128 d"], power: float
+) -> Float[Tensor, "n d"]:
+    """Centred, projected, signed power of each entry, unit length."""
+    projected = (descriptors - mean) @ basis
+    return normalized(projected.sign() * projected.abs() ** power)
+
+
+def learn_projection(
+    descriptors: Float[Tensor, "n D"], dimensions: int = DIMENSIONS
+) -> tuple[Float[Tensor, " D"], Float[Tensor, "D d"]]:
+    """Mean and the `dimensions` principal axes of descriptors, largest variance first; the largest entry positive."""
+    x = descriptors.double()
+    mean = x.mean(0)
+    _, axes = torch.linalg.eigh((x - mean).T @ (x - mean) / len(x))
+    basis = axes.flip(1)[:, :dimensions]
+    sign = basis.gather(0, basis.abs().argmax(0, keepdim=True)).sign()
+    return mean.float(), (basis * sign).float()
+
+
+@functools.lru_cache(maxsize=8)
+def load_projection(path: Path) -> tuple[Float[Tensor, 128], Float[Tensor, "128 d"]]:
+    """Mean and basis of a learned file. Raises FileNotFoundError and ValueError that say how to make it."""
+    remedy = "make it with `python scripts/learn_pca.py`"
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; {remedy}")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            mean, basis = (torch.from_numpy(file[name].astype(np.float32)) for name in ("mean", "basis"))
+    except (KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path}: no file with `mean` and `basis` ({error}); {remedy}") from error
+    if mean.shape != (128,) or basis.dim() != 2 or len(basis) != 128:
+        raise ValueError(
+            f"{path}: mean {tuple(mean.shape)}, basis {tuple(basis.shape)} must be (128,), (128, D); {remedy}"
+        )
+    return mean, basis

@@ -16,10 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.core.resources import models_dir
-from fmtorch.features.patch_sift import normalized
-from fmtorch.features.rootsift_pca import load_projection, project
-from fmtorch.features.sift import root_sift
+from fmtorch.core.files import models_dir
+from fmtorch.features.sift import load_projection, normalized, project, root_sift
 
 Kind = Literal["sift", "rootsiftpca", "hardnet"]
 POWER = 0.5  # of RootSIFT-PCA's entries, as `features=rootsiftpca` has it

@@ -6,6 +6,7 @@ from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from fmtorch.geometry.cameras import cross_matrix, fundamental_from_calibration, fundamental_from_projections
+    from fmtorch.geometry.covariance import TwoViewCovariance, two_view_covariance
     from fmtorch.geometry.eight_point import eight_point
     from fmtorch.geometry.epipolar import (
         algebraic,
@@ -23,14 +24,13 @@ if TYPE_CHECKING:
     from fmtorch.geometry.homography_pose import PlanePoses, poses_from_homography, rotation_from_homography
     from fmtorch.geometry.homography_refine import refine_homography
     from fmtorch.geometry.irls import Fits, irls, reweighted_fits
+    from fmtorch.geometry.matrices import nearest_rank2
     from fmtorch.geometry.normalize import canonical, denormalize_fundamental, normalize_pair, normalize_points
     from fmtorch.geometry.pose import FourPoses, Pose, pose_from_fundamental, poses_from_fundamental
-    from fmtorch.geometry.rank2 import nearest_rank2
     from fmtorch.geometry.refine import attached_step, refine
     from fmtorch.geometry.robust_losses import KERNELS
     from fmtorch.geometry.seven_point import seven_point
     from fmtorch.geometry.significance import significance
-    from fmtorch.geometry.two_view_covariance import TwoViewCovariance, two_view_covariance
 
 __all__ = [
     "KERNELS", "Fits", "FourPoses", "PlanePoses", "Pose", "TwoViewCovariance", "algebraic", "attached_step",

@@ -10,6 +10,7 @@ or (9, *s) row by row, over which an operation on one entry runs over all matric
 
 from __future__ import annotations
 
+import math
 from typing import Any, cast
 
 import numpy as np
@@ -17,7 +18,50 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.geometry import arithmetic_kernels
+from fmtorch.jit.kernel import Array, inner
+
+# exp and log by arithmetic alone, compiled: the same operations, hence the same bits, as in the tensor form
+
+
+ROOT2, LOG2, LOG10 = math.sqrt(2), 0.6931471805599453, 2.302585092994046
+
+
+@inner
+def exponential(x: Any) -> Any:
+    """exp(x) for |x| up to about 5: Pade's approximant of order 4 at x / 32, and five squarings. Of tensors, too."""
+    y = x / 32
+    y2 = y * y
+    even, odd = 1680 + y2 * (180 + y2), y * (840 + 20 * y2)
+    value = (even + odd) / (even - odd)
+    for _ in range(5):
+        value = value * value
+    return value
+
+
+@inner
+def logarithm_kernel(x: float) -> Any:
+    """ln(x) of a positive number: the series of atanh at the mantissa."""
+    mantissa, exponent = math.frexp(x)
+    m = mantissa * ROOT2
+    return twice_atanh((m - 1) / (m + 1)) + (exponent - 0.5) * LOG2
+
+
+@inner
+def logarithm_1p_kernel(x: float) -> Any:
+    """ln(1 + x) for x > -1, to rounding also near 0."""
+    if -0.25 < x < 0.4:
+        return twice_atanh(x / (x + 2))
+    return logarithm_kernel(1 + x) if x < math.inf else x
+
+
+@inner
+def twice_atanh(z: Any) -> Any:
+    """ln((1 + z) / (1 - z)) for |z| up to (sqrt 2 - 1) / (sqrt 2 + 1), to rounding, by its series. Of tensors, too."""
+    z2 = z * z
+    series = z2 * (1 / 19) + 1 / 17
+    for k in range(15, 0, -2):
+        series = series * z2 + 1 / k
+    return 2 * z * series
 
 
 def stable_sum(x: Tensor, dim: int = -1) -> Tensor:
@@ -151,9 +195,9 @@ def _sqrt(x: Tensor) -> Tensor:
 def logarithm(x: Tensor) -> Tensor:
     """ln(x) of positive numbers, to rounding, by arithmetic alone: the series of atanh at the mantissa."""
     mantissa, exponent = torch.frexp(x)
-    m = mantissa * arithmetic_kernels.ROOT2
-    series = arithmetic_kernels.twice_atanh((m - 1) / (m + 1))
-    value: Tensor = series + (exponent.to(x.dtype) - 0.5) * arithmetic_kernels.LOG2
+    m = mantissa * ROOT2
+    series = twice_atanh((m - 1) / (m + 1))
+    value: Tensor = series + (exponent.to(x.dtype) - 0.5) * LOG2
     return value
 
 
@@ -162,5 +206,48 @@ def logarithm_1p(x: Tensor) -> Tensor:
     near = (x > -0.25) & (x < 0.4)
     z = torch.where(near, x, 0.0)
     far = torch.where(near | ~torch.isfinite(x), 0.0, x)
-    value = torch.where(near, arithmetic_kernels.twice_atanh(z / (z + 2)), logarithm(1 + far))
+    value = torch.where(near, twice_atanh(z / (z + 2)), logarithm(1 + far))
     return torch.where(x < torch.inf, value, x)
+
+
+# Order statistics and sorting, compiled
+
+
+@inner
+def smallest_but(values: Array, begin: int, end: int, k: int) -> Any:
+    """The k-th smallest, from 0, of values[begin:end], which are reordered (Hoare). No NaN."""
+    low, high = begin, end - 1
+    while low < high:
+        pivot, i, j = values[(low + high) >> 1], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while values[j] > pivot:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if begin + k <= j:
+            high = j
+        elif begin + k >= i:
+            low = i
+        else:
+            break
+    return values[begin + k]
+
+
+@inner
+def sort_by(key: Array, value: Array) -> None:
+    """Sorts keys, ascending, and values along with them, where two have the same key by value (Shell)."""
+    gap = 1
+    while gap < len(key) // 3:
+        gap = 3 * gap + 1
+    while gap > 0:
+        for i in range(gap, len(key)):
+            k, v, j = key[i], value[i], i
+            while j >= gap and (key[j - gap] > k or (key[j - gap] == k and value[j - gap] > v)):
+                key[j], value[j] = key[j - gap], value[j - gap]
+                j -= gap
+            key[j], value[j] = k, v
+        gap //= 3

@@ -8,9 +8,16 @@ the epipole its line is undefined: its normal is then zero, and distances and gr
 
 from __future__ import annotations
 
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from fmtorch.jit.kernel import Array, Inner, inner
+from fmtorch.jit.lanes import lanes, where
 
 
 def unit_frobenius(F: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
@@ -181,3 +188,124 @@ def unit_largest(matrix: Tensor) -> Tensor:
     """
     largest = matrix.detach().abs().amax((-2, -1), keepdim=True)
     return matrix / torch.where(largest == 0, 1.0, largest)
+
+
+# Sampson distances component by component, with derivatives for fits
+
+
+TINY = 1e-30  # squared slope of the epipolar constraint below which it is taken for this, in fits
+
+
+def homogeneous(points: Float[Tensor, " 4 *s"]) -> Float[Tensor, " 2 3 *s"]:
+    """x0, y0, x1, y1 as homogeneous points of the two images."""
+    return torch.cat([points.reshape(2, 2, *points.shape[1:]), torch.ones_like(points[:2])[:, None]], 1)
+
+
+def linearise(
+    F: Float[Tensor, "9 p k"], points: Float[Tensor, "2 3 m p 1 lanes"], derivatives: bool = True
+) -> tuple[Tensor, Float[Tensor, "m p k lanes"], Float[Tensor, "m p k lanes"], Float[Tensor, "m p k lanes"]]:
+    """The Sampson residual ``r = e / g`` and its Jacobian: g J (3, 3, m, p, k, lanes), then e, 1 / g^2, and r^2.
+
+    ``g dr = x1^T dF x0 - (e / g^2) ((F x0)^T D dF x0 + x1^T dF D F^T x1)`` with ``D = diag(1, 1, 0)``: the sum of two
+    products of a column and a row. points: homogeneous. Without derivatives the first is empty.
+    """
+    x0, x1 = points
+    rows = F.reshape(3, 3, 1, *F.shape[1:], 1)
+    line1 = torch.addcmul(torch.addcmul(rows[:, 2], rows[:, 0], x0[0]), rows[:, 1], x0[1])  # F x0
+    line0 = torch.addcmul(torch.addcmul(rows[2, :2], rows[0, :2], x1[0]), rows[1, :2], x1[1])  # F^T x1
+    slope1 = line1[:2]
+    e = torch.addcmul(torch.addcmul(line1[2], slope1[0], x1[0]), slope1[1], x1[1])
+    a, b = torch.addcmul(slope1 * slope1, line0, line0)
+    inverse = (a + b).clamp_min(TINY).reciprocal()
+    c = e * inverse
+    r2 = e * c
+    if not derivatives:
+        return e.new_empty(0), e, inverse, r2
+    across1 = torch.cat([torch.addcmul(x1[:2], c, slope1, value=-1), torch.ones_like(e)[None]])  # x1 - c D F x0
+    across0 = torch.cat([-c * line0, torch.zeros_like(e)[None]])  # -c D F^T x1
+    return torch.addcmul(across1[:, None] * x0, x1[:, None], across0), e, inverse, r2
+
+
+# Squared residuals of matches under a model, as scores take them of many models, and fits of one
+
+
+SINGLES = 16  # float32 numbers of a row
+load, fill = lanes(SINGLES)
+MATCH = 6  # rows of SINGLES matches: x0, y0, x1, y1, scale, weight
+INFINITE, ZERO = np.float32(math.inf), np.float32(0)
+TINY32, TINY_OF_KERNEL = np.finfo(np.float32).tiny, float(np.finfo(np.float64).tiny)
+
+
+class Residual(NamedTuple):
+    """Three inner functions of one residual. name: unique, part of the names of the kernels that are made of it.
+
+    of_row(f, rows, row): squared residuals of SINGLES matches, float32, times their scale. of_match(f, x0, y0, x1, y1):
+    the square of one, in the type of its arguments. within(f, x0, y0, x1, y1, limit): whether that is within a limit.
+    """
+
+    name: str
+    of_row: Inner[..., Any]
+    of_match: Inner[..., Any]
+    within: Inner[..., Any]
+
+
+@inner
+def _sampson(f: Array, x0: Any, y0: Any, x1: Any, y1: Any) -> tuple[Any, Any]:
+    """The epipolar error, and the square of its slope."""
+    a0, b0 = f[0] * x0 + f[1] * y0 + f[2], f[3] * x0 + f[4] * y0 + f[5]
+    e = f[6] * x0 + f[7] * y0 + f[8] + a0 * x1 + b0 * y1
+    a1, b1 = f[0] * x1 + f[3] * y1 + f[6], f[1] * x1 + f[4] * y1 + f[7]
+    return e, a0 * a0 + b0 * b0 + a1 * a1 + b1 * b1
+
+
+@inner
+def _sampson_of_row(f: Array, rows: Array, row: int) -> Any:
+    e, slope = _sampson(f, load(rows, row), load(rows, row + 1), load(rows, row + 2), load(rows, row + 3))
+    return e * e / where(slope > TINY32, slope, TINY32) * load(rows, row + 4)
+
+
+@inner
+def _sampson_of_match(f: Array, x0: Any, y0: Any, x1: Any, y1: Any) -> Any:
+    e, slope = _sampson(f, x0, y0, x1, y1)
+    return e * e / (slope if slope > TINY_OF_KERNEL else TINY_OF_KERNEL)
+
+
+@inner
+def _sampson_within(f: Array, x0: Any, y0: Any, x1: Any, y1: Any, limit: Any) -> Any:
+    e, slope = _sampson(f, x0, y0, x1, y1)
+    return e * e <= limit * slope
+
+
+SAMPSON = Residual("sampson", _sampson_of_row, _sampson_of_match, _sampson_within)
+"""The Sampson distance of a fundamental matrix (Hartley & Zisserman 2004, 11.4.3)."""
+
+
+@inner
+def _homography(h: Array, x: Any, y: Any, u: Any, v: Any) -> tuple[Any, Any, Any]:
+    """Of a match W, positive before the horizon, and numerator and denominator of its squared distance."""
+    w = h[6] * x + h[7] * y + h[8]
+    e, f = h[0] * x + h[1] * y + h[2] - u * w, h[3] * x + h[4] * y + h[5] - v * w
+    a, b, c, d = h[0] - u * h[6], h[1] - u * h[7], h[3] - v * h[6], h[4] - v * h[7]
+    p, q, area, w2 = c * e - a * f, d * e - b * f, a * d - b * c, w * w
+    return w, w2 * (e * e + f * f) + p * p + q * q, area * area + w2 * (a * a + b * b + c * c + d * d + w2)
+
+
+@inner
+def _homography_of_row(h: Array, rows: Array, row: int) -> Any:
+    w, r2, by = _homography(h, load(rows, row), load(rows, row + 1), load(rows, row + 2), load(rows, row + 3))
+    return where(w > ZERO, r2 / where(by > TINY32, by, TINY32) * load(rows, row + 4), INFINITE)
+
+
+@inner
+def _homography_of_match(h: Array, x: Any, y: Any, u: Any, v: Any) -> Any:
+    w, r2, by = _homography(h, x, y, u, v)
+    return r2 / by if w > 0 else w - w + math.inf
+
+
+@inner
+def _homography_within(h: Array, x: Any, y: Any, u: Any, v: Any, limit: Any) -> Any:
+    return _homography_of_match(h, x, y, u, v) <= limit
+
+
+HOMOGRAPHY = Residual("homography", _homography_of_row, _homography_of_match, _homography_within)
+"""The Sampson distance of a homography (4.2.6); infinite behind its horizon (`homography_objective_kernels`)."""

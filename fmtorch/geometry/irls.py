@@ -9,15 +9,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.geometry.eight_point import linear_fundamental
-from fmtorch.geometry.epipolar import sampson
-from fmtorch.geometry.fixed_point import at_fixed_point, gradient_wanted
-from fmtorch.geometry.normalize import canonical, denormalize_fundamental, normalize_points
-from fmtorch.geometry.normalized_matches import NormalizedMatches
-from fmtorch.geometry.rank2 import nearest_rank2
+from fmtorch.geometry.eight_point import linear_fundamental, weighted_eight_point
+from fmtorch.geometry.epipolar import homogeneous, linearise, sampson
+from fmtorch.geometry.levenberg_marquardt import MATCH, Weighted, in_rows, linearise_kernel, robust
+from fmtorch.geometry.matrices import assign, nearest_rank2
+from fmtorch.geometry.normalize import NormalizedMatches, canonical, denormalize_fundamental, normalize_points
+from fmtorch.geometry.optimum import at_fixed_point, gradient_wanted
 from fmtorch.geometry.rank2_manifold import RANK_TWO, constant
-from fmtorch.geometry.residuals import homogeneous, linearise
 from fmtorch.geometry.robust_losses import Kernel, named_kernel
+from fmtorch.jit.kernel import F8x2, kernel, matrix, vector
+from fmtorch.jit.lanes import LANES, load, store
 
 Weigh = Callable[[Tensor | None, Tensor | None], Tensor]
 
@@ -186,3 +187,21 @@ def weighted_fit(
     fitted = denormalize_fundamental(nearest_rank2(linear), T0, T1).flatten(2).movedim(-1, 0)
     determined = determined & valid[..., 0] & torch.isfinite(fitted).all(0) & (fitted != 0).any(0)
     return fitted, determined
+
+
+# `irls` for the matches of one pair, compiled; float64
+
+
+@kernel
+def reweighted_kernel(F: F8x2, weighted: Weighted) -> None:
+    """`irls.reweighted` of models (k, 9), in place."""
+    matches = in_rows(weighted.points, weighted.weight, weighted.s2)
+    J, work = matrix(10, LANES), matrix(3, LANES)
+    weights, fitted = matrix(len(matches) // MATCH, LANES), vector(9)
+    for k in range(len(F)):
+        for row in range(0, len(matches), MATCH):
+            inverse, r2 = linearise_kernel(F[k], matches, row, J)
+            _, slope = robust(r2, load(matches, row + 5), weighted.loss, weighted.table, work)
+            store(weights, row // MATCH, inverse * (load(matches, row + 4) * slope))
+        if weighted_eight_point(weighted.points, weights.ravel()[: len(weighted.weight)], fitted):
+            assign(F[k], fitted)

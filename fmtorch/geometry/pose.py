@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch.geometry.arithmetic import cofactors, component_sum, cross, product, sqrt
-from fmtorch.geometry.rank2 import complement, last_right_singular_vector
+from fmtorch.geometry.matrices import complement, complement_kernel, last_right_singular_vector
+from fmtorch.geometry.rank2_manifold import SQUARINGS, start_one
+from fmtorch.jit.kernel import Array, F8x1, F8x2, inner, kernel, matrix, vector
+from fmtorch.jit.lanes import fill, load
 
 
 class Pose(NamedTuple):
@@ -185,3 +189,140 @@ def _inverse(K: Tensor) -> tuple[Tensor, Tensor]:
     determinant = component_sum(K[0] * C[0])
     regular = determinant.detach() != 0
     return C.transpose(0, 1) / torch.where(regular, determinant, 1.0), regular
+
+
+# `pose` for one pair of cameras with square pixels, compiled; and the essential matrix nearest to a model
+
+
+WEIGHT_BITS = 20  # fractional, of weights, so that their sums are exact
+RANK_2 = 1e-10  # share of the squared norm that the product of the singular values must exceed
+
+
+@inner
+def nearest_axes(M: Array, e0: Array, e1: Array, U: Array, V: Array) -> Any:
+    """U and V (3, 3) of the essential matrix nearest to M (9,), whose epipoles are e0, e1; whether M has rank 2.
+
+    In the planes across the epipoles M is 2 x 2; its nearest orthogonal matrix gives both singular values 1.
+    """
+    p, q, a, b = vector(3), vector(3), vector(3), vector(3)
+    complement_kernel(e0, p, q)
+    complement_kernel(e1, a, b)
+    m00, m01, m10, m11 = 0.0, 0.0, 0.0, 0.0
+    for r in range(3):
+        Mp = M[3 * r] * p[0] + M[3 * r + 1] * p[1] + M[3 * r + 2] * p[2]
+        Mq = M[3 * r] * q[0] + M[3 * r + 1] * q[1] + M[3 * r + 2] * q[2]
+        m00, m01, m10, m11 = m00 + a[r] * Mp, m01 + a[r] * Mq, m10 + b[r] * Mp, m11 + b[r] * Mq
+    sign = 1.0 if m00 * m11 >= m01 * m10 else -1.0
+    cosine, sine = m00 + sign * m11, m10 - sign * m01
+    norm = math.sqrt(cosine * cosine + sine * sine)
+    cosine, sine = cosine / norm, sine / norm
+    for r in range(3):
+        U[r, 0], U[r, 1] = a[r] * cosine + b[r] * sine, sign * (b[r] * cosine - a[r] * sine)
+        V[r, 0], V[r, 1] = p[r], q[r]
+        U[r, 2], V[r, 2] = e1[r], e0[r]
+    return abs(m00 * m11 - m01 * m10) > RANK_2 * norm * norm
+
+
+@kernel(holds_gil=True)
+def pose(F: F8x2, cameras: F8x1, x0: F8x2, x1: F8x2, weight: F8x1, out: F8x1) -> None:
+    """The pose of a fundamental matrix (3, 3), of four the one with the most support in front -> out (13,).
+
+    cameras: (6,), focal length and principal point of both. x0, x1: (n, 2). weight: (n,), in [0, 1], by which matches
+    count. out: R row by row, t of unit length, and 1; all zero where there is no pose.
+    """
+    M, G, e0, e1, U, V, R = vector(9), vector(9), vector(3), vector(3), matrix(3, 3), matrix(3, 3), matrix(6, 3)
+    f0, u0, v0, f1, u1, v1 = cameras
+    for r in range(3):  # E = K1^T F K0
+        G[3 * r], G[3 * r + 1] = F[r, 0] * f0, F[r, 1] * f0
+        G[3 * r + 2] = F[r, 0] * u0 + F[r, 1] * v0 + F[r, 2]
+    for c in range(3):
+        M[c], M[3 + c] = G[c] * f1, G[3 + c] * f1
+        M[6 + c] = G[c] * u1 + G[3 + c] * v1 + G[6 + c]
+    start_one(M, SQUARINGS, G, e0, e1)
+    valid = nearest_axes(G, e0, e1, U, V)
+    handed = _determinant(U) * _determinant(V)
+    for r in range(3):
+        for c in range(3):
+            turned, straight = U[r, 1] * V[c, 0] - U[r, 0] * V[c, 1], U[r, 2] * V[c, 2] * handed
+            R[r, c], R[3 + r, c] = straight + turned, straight - turned
+    support = vector(4)
+    for i in range(4):
+        support[i] = 0.0
+    a, b = vector(3), vector(3)
+    a[2] = b[2] = 1.0
+    for i in range(len(weight)):
+        if weight[i] > 0:
+            a[0], a[1] = (x0[i, 0] - u0) / f0, (x0[i, 1] - v0) / f0
+            b[0], b[1] = (x1[i, 0] - u1) / f1, (x1[i, 1] - v1) / f1
+            _vote(R, U, a, b, math.floor(min(weight[i], 1.0) * 2.0**WEIGHT_BITS + 0.5), support)
+    best = 0
+    for i in range(1, 4):
+        best = i if support[i] > support[best] else best
+    for r in range(3):
+        out[9 + r] = U[r, 2] if best < 2 else -U[r, 2]
+        for c in range(3):
+            out[3 * r + c] = R[3 * (best % 2) + r, c]
+    finite = valid and support[best] > 0
+    for i in range(12):
+        finite = finite and math.isfinite(out[i])
+    for i in range(12):
+        out[i] = out[i] if finite else 0.0
+    out[12] = 1.0 if finite else 0.0
+
+
+@inner
+def _vote(R: Array, U: Array, a: Array, b: Array, weight: float, support: Array) -> None:
+    """Adds the weight of a match of rays a, b to the poses R[:3], R[3:], and these with -t, in front of which it lies.
+
+    Least squares on d1 b = d0 R a + t: the signs of the depths are those of n (b x t) and n (R a x t), n = R a x b.
+    """
+    for k in range(2):
+        p, q, r = 0.0, 0.0, 0.0
+        for i in range(3):
+            p += R[3 * k, i] * a[i]
+            q += R[3 * k + 1, i] * a[i]
+            r += R[3 * k + 2, i] * a[i]
+        nx, ny, nz = q * b[2] - r * b[1], r * b[0] - p * b[2], p * b[1] - q * b[0]
+        tx, ty, tz = U[0, 2], U[1, 2], U[2, 2]
+        depth0 = nx * (b[1] * tz - b[2] * ty) + ny * (b[2] * tx - b[0] * tz) + nz * (b[0] * ty - b[1] * tx)
+        depth1 = nx * (q * tz - r * ty) + ny * (r * tx - p * tz) + nz * (p * ty - q * tx)
+        if depth0 > 0 and depth1 > 0:
+            support[k] += weight
+        if depth0 < 0 and depth1 < 0:
+            support[2 + k] += weight
+
+
+@inner
+def _determinant(M: Array) -> Any:
+    """The sign of the determinant (3, 3) of orthogonal columns."""
+    a = M[0, 0] * (M[1, 1] * M[2, 2] - M[1, 2] * M[2, 1])
+    b = M[0, 1] * (M[1, 2] * M[2, 0] - M[1, 0] * M[2, 2]) + M[0, 2] * (M[1, 0] * M[2, 1] - M[1, 1] * M[2, 0])
+    return 1.0 if a + b > 0 else -1.0
+
+
+# The oriented epipolar constraint: what lies before both cameras is on one side of the epipolar geometry
+
+
+@inner
+def consistently_oriented(F: Array, X: Array, size: int) -> Any:
+    """Whether ``F x0`` and ``e1 x x1``, the same epipolar line, point the same way for all matches of a sample: a mask.
+
+    Chum, Werner & Matas, "Epipolar geometry estimation via RANSAC benefits from the oriented epipolar constraint"
+    (ICPR 2004). A model through a wrong match mostly fails, so a look at the sample alone tells most wrong models.
+    F: (9, LANES), of rank two. X: (4 size, LANES), x0, y0, x1, y1 of the matches that each model was made from.
+    """
+    f0, f1, f2, f3, f4, f5 = load(F, 0), load(F, 1), load(F, 2), load(F, 3), load(F, 4), load(F, 5)
+    f6, f7, f8 = load(F, 6), load(F, 7), load(F, 8)
+    # The epipole is across all columns: here two combinations, which no usual epipole makes parallel.
+    g0, g1, g2 = f0 + 0.618 * f2, f3 + 0.618 * f5, f6 + 0.618 * f8
+    h0, h1, h2 = f1 + 0.414 * f2, f4 + 0.414 * f5, f7 + 0.414 * f8
+    ex, ey, ez = g1 * h2 - g2 * h1, g2 * h0 - g0 * h2, g0 * h1 - g1 * h0
+    ahead = fill(0.0) == 0.0
+    behind = ahead
+    for j in range(size):
+        x0, y0, x1, y1 = load(X, 4 * j), load(X, 4 * j + 1), load(X, 4 * j + 2), load(X, 4 * j + 3)
+        a, b = f0 * x0 + f1 * y0 + f2, f3 * x0 + f4 * y0 + f5
+        agreement = a * (ey - ez * y1) + b * (ez * x1 - ex)
+        ahead &= agreement > 0.0
+        behind &= agreement < 0.0
+    return ahead | behind

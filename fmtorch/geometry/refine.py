@@ -7,19 +7,94 @@ is refined to the same bits in any batch.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.geometry.arithmetic import component_sum
-from fmtorch.geometry.fixed_point import gradient_wanted
-from fmtorch.geometry.levenberg_marquardt_kernels import FIRST_DAMPING, Schedule
-from fmtorch.geometry.normalized_matches import NormalizedMatches, fitted_by
-from fmtorch.geometry.optimum import STEP_DAMPING, at_optimum, curvature_of_cost, gradient_of_cost, through_steps
-from fmtorch.geometry.rank2_manifold import RANK_TWO, RANK_TWO_EPIPOLE, constant, constrained_solve, retract, start
-from fmtorch.geometry.rank2_manifold_kernels import SQUARINGS
-from fmtorch.geometry.refine_kernels import refine as refine_pair
+from fmtorch.geometry.levenberg_marquardt import (
+    FIRST_DAMPING,
+    Problem,
+    Schedule,
+    Weighted,
+    accepting,
+    evaluate,
+    levenberg_marquardt,
+)
+from fmtorch.geometry.matrices import assign, assign_rows
+from fmtorch.geometry.normalize import NormalizedMatches, fitted_by
+from fmtorch.geometry.optimum import (
+    STEP_DAMPING,
+    at_optimum,
+    curvature_of_cost,
+    gradient_of_cost,
+    gradient_wanted,
+    through_steps,
+)
+from fmtorch.geometry.rank2_manifold import (
+    RANK_TWO,
+    RANK_TWO_EPIPOLE,
+    SQUARINGS,
+    constant,
+    constrained_solve,
+    retract,
+    start,
+    start_one,
+    steps,
+)
 from fmtorch.geometry.robust_losses import named_kernel
+from fmtorch.jit.kernel import Array, F8x1, F8x2, inner, kernel, matrix, vector
+
+# Levenberg-Marquardt of the robust Sampson error on the manifold of rank 2 and unit norm, for the models of a pair
+
+
+class _State(NamedTuple):
+    """Models of rank 2 (k, 9), their epipoles (k, 3), and the normal equations (k, 10, 10) and costs (k,) there."""
+
+    F: Array
+    e0: Array
+    e1: Array
+    products: Array
+    cost: Array
+
+
+@kernel
+def refine_kernel(F: F8x2, squarings: int, matches: Weighted, schedule: Schedule, out: F8x2, cost: F8x1) -> None:
+    """Models (k, 9) made rank 2 and refined -> out (k, 9), cost (k,); what cannot be is not finite, nor its cost.
+
+    squarings: of `start_one`.
+    """
+    k = len(F)
+    state = _State(out, matrix(k, 3), matrix(k, 3), np.empty((k, 10, 10)), cost)
+    trial = _State(matrix(k, 9), matrix(k, 3), matrix(k, 3), np.empty((k, 10, 10)), vector(k))
+    problem = Problem(matches, schedule.tolerance)
+    for i in range(k):
+        start_one(F[i], squarings, state.F[i], state.e0[i], state.e1[i])
+    _minimise(problem, state, trial, np.full(k, schedule.damping), schedule.iterations, schedule.tolerance > 0)
+
+
+@inner
+def _evaluate(state: _State, problem: Problem, derivatives: bool) -> None:
+    evaluate(state.F, problem.matches, derivatives, state.products, state.cost)
+
+
+@inner
+def _step(state: _State, damping: Array, trial: _State) -> None:
+    steps(state.products, state.F, state.e0, state.e1, damping, trial.F, trial.e0, trial.e1)
+
+
+@inner
+def _take(state: _State, trial: _State, k: int) -> None:
+    assign(state.F[k], trial.F[k])
+    assign(state.e0[k], trial.e0[k])
+    assign(state.e1[k], trial.e1[k])
+    assign_rows(state.products[k], trial.products[k])
+
+
+_minimise = levenberg_marquardt(_evaluate, _step, accepting(_take))
 
 
 def refine_components(
@@ -43,7 +118,7 @@ def refine_components(
     schedule = Schedule(iterations, FIRST_DAMPING, tolerance)
     scale = scale if scale.dim() > 1 else scale[:, None]
     return fitted_by(
-        lambda models, matches, out, cost: refine_pair(models, SQUARINGS, matches, schedule, out, cost),
+        lambda models, matches, out, cost: refine_kernel(models, SQUARINGS, matches, schedule, out, cost),
         F, points, weight, scale.square(), kernel,
     )  # fmt: skip
 

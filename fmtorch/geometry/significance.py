@@ -9,17 +9,154 @@ are to be expected then, in all that a search could have tried.
 from __future__ import annotations
 
 import functools
+import math
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
-from fmtorch.compiling.arrays import Array
-from fmtorch.compiling.batches import for_each_pair
-from fmtorch.geometry import significance_kernels as compiled
-from fmtorch.geometry.arithmetic import logarithm
-from fmtorch.geometry.significance_kernels import SAMPLE
+from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.geometry.arithmetic import LOG10, logarithm, logarithm_kernel, smallest_but
+from fmtorch.jit.batches import for_each_pair
+from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, inner, kernel, matrix, vector
+from fmtorch.jobs.threads import one_thread
+
+# `significance` for the matches of one pair, in float64
+
+
+SAMPLE = 7  # matches that determine a model
+LOG_MODELS = 1.0986122886681098  # of 3, the models of a minimal sample at most
+CELLS = 64  # of a grid to the diagonal of an image: matches that join the same two cells are one
+LEAST_CHANCE = 2.0**-13  # that a point is near a line: some 0.05 px, beyond which no keypoint is exact
+MOST_CELLS = 1 << 15  # of a row or column: a match's four cells make one number of 60 bits
+FARTHEST = 1e100  # px; a match beyond is none: numbers made of its coordinates would overflow
+FREE = -1  # a place of no match: in a slot of the table that is not taken
+GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # spreads places over the table
+
+
+class Matches(NamedTuple):
+    """All matches of one pair, x0, x1 (n, 2), and which are real, mask (n,).
+
+    size0, size1: (h, w) of the images, empty where unknown. All in pixels.
+    """
+
+    x0: F8x2
+    x1: F8x2
+    mask: B1x1
+    size0: F8x1
+    size1: F8x1
+
+
+@kernel
+def counted_chances(F: F8x2, matches: Matches, out: F8x1) -> int:
+    """Of a model F (3, 3) the chances of the matches, the median one of each place, in no order -> out (m,); m.
+
+    Without a model m is 0.
+    """
+    x0, x1, mask, size0, size1 = matches
+    n = len(mask)
+    peak = 0.0
+    for i in range(9):
+        value = F[i // 3, i % 3]
+        if not math.isfinite(value):
+            return 0
+        peak = max(peak, abs(value))
+    if peak == 0:
+        return 0
+    point, count = matrix(4, n), 0
+    for i in range(n):
+        a, b, c, d = x0[i, 0], x0[i, 1], x1[i, 0], x1[i, 1]
+        if mask[i] and abs(a) < FARTHEST and abs(b) < FARTHEST and abs(c) < FARTHEST and abs(d) < FARTHEST:
+            point[0, count], point[1, count], point[2, count], point[3, count] = a, b, c, d
+            count += 1
+    if count <= SAMPLE:
+        return 0
+    chance, place = np.zeros(count), np.zeros(count, np.int64)
+    strip0 = _placed(point[0], point[1], size0, place)
+    strip1 = _placed(point[2], point[3], size1, place)
+    f0, f1, f2 = F[0, 0] / peak, F[0, 1] / peak, F[0, 2] / peak
+    f3, f4, f5 = F[1, 0] / peak, F[1, 1] / peak, F[1, 2] / peak
+    f6, f7, f8 = F[2, 0] / peak, F[2, 1] / peak, F[2, 2] / peak
+    for i in range(count):
+        u, v, x, y = point[0, i], point[1, i], point[2, i], point[3, i]
+        a1, b1, c1 = f0 * u + f1 * v + f2, f3 * u + f4 * v + f5, f6 * u + f7 * v + f8
+        a0, b0 = f0 * x + f3 * y + f6, f1 * x + f4 * y + f7
+        e = abs(a1 * x + b1 * y + c1)
+        chance[i] = max(_chance(e, a0 * a0 + b0 * b0, strip0), _chance(e, a1 * a1 + b1 * b1, strip1))
+    return _median_of_places(chance, place, out)
+
+
+@inner
+def _placed(x: Array, y: Array, size: Array, place: Array) -> Any:
+    """Appends the cells of points of an image to the numbers of their places; what turns a distance into a chance."""
+    left, top, right, bottom = math.inf, math.inf, -math.inf, -math.inf
+    for i in range(len(place)):
+        left, right, top, bottom = min(left, x[i]), max(right, x[i]), min(top, y[i]), max(bottom, y[i])
+    h, w = (size[0], size[1]) if len(size) else (bottom - top, right - left)
+    diagonal = math.sqrt(h * h + w * w)
+    side = diagonal / CELLS
+    for i in range(len(place)):
+        place[i] = (place[i] * MOST_CELLS + _cell((x[i] - left) / side)) * MOST_CELLS + _cell((y[i] - top) / side)
+    return 2 * diagonal / (h * w) if h * w > 0 else math.inf
+
+
+@inner
+def _cell(position: float) -> int:
+    """The number of a cell; of what is not a number the first, beyond the grid the last."""
+    if not position > 0:
+        return 0
+    return int(position) if position < MOST_CELLS else MOST_CELLS - 1
+
+
+@inner
+def _chance(e: float, squared: float, strip: float) -> float:
+    """The chance of a point as near to its line; certain where there is no line, or no image."""
+    chance = e * (1 / math.sqrt(squared)) * strip if squared != 0 else 0 * strip
+    chance = chance if chance < 1 else 1.0  # NaN, too
+    return chance if chance > LEAST_CHANCE else LEAST_CHANCE
+
+
+@inner
+def _median_of_places(chance: Array, place: Array, out: Array) -> int:
+    """The median chance of the matches of each place, the upper one of two -> out (m,); how many places there are."""
+    n, bits = len(place), 1
+    while (1 << bits) < 2 * n:
+        bits += 1
+    shift, last = np.uint64(64 - bits), (1 << bits) - 1
+    table, group, which = np.full(1 << bits, FREE), np.empty(1 << bits, np.int64), np.empty(n, np.int64)
+    begin, groups = np.zeros(n + 1, np.int64), 0
+    for i in range(n):
+        slot = np.int64((np.uint64(place[i]) * GOLDEN) >> shift)
+        while table[slot] != FREE and table[slot] != place[i]:
+            slot = (slot + 1) & last
+        if table[slot] == FREE:
+            table[slot], group[slot] = place[i], groups
+            groups += 1
+        which[i] = group[slot]
+        begin[which[i] + 1] += 1
+    for g in range(groups):
+        begin[g + 1] += begin[g]
+    grouped, free = vector(n), begin.copy()
+    for i in range(n):
+        grouped[free[which[i]]] = chance[i]
+        free[which[i]] += 1
+    for g in range(groups):
+        out[g] = smallest_but(grouped, begin[g], begin[g + 1], (begin[g + 1] - begin[g]) // 2)
+    return groups
+
+
+@kernel(holds_gil=True)
+def most_significant(chance: F8x1, factorial: F8x1) -> float:
+    """-log10 of the least number of false alarms over k, of ascending chances; factorial: log i!, for i to n."""
+    n, best = len(chance), -math.inf
+    for k in range(SAMPLE + 1, n + 1):
+        subsets = factorial[n] - factorial[k] - factorial[n - k]
+        samples = factorial[k] - factorial[k - SAMPLE] - factorial[SAMPLE]
+        tests = factorial[n - SAMPLE] - factorial[n - SAMPLE - 1] + subsets + samples + LOG_MODELS
+        best = max(best, -(tests + (k - SAMPLE) * logarithm_kernel(chance[k - 1])))
+    return best / LOG10
 
 
 @torch.no_grad()
@@ -65,9 +202,9 @@ def significance(
 def of_one_pair(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array) -> float:
     """`significance` of one pair by kernels; float64, sizes empty where unknown."""
     chance = np.empty(len(mask))
-    chance = chance[: compiled.counted_chances(F, compiled.Matches(x0, x1, mask, size0, size1), chance)]
+    chance = chance[: counted_chances(F, Matches(x0, x1, mask, size0, size1), chance)]
     chance.sort()
-    return compiled.most_significant(chance, _log_factorials(1 << max(len(mask), SAMPLE + 1).bit_length()))
+    return most_significant(chance, _log_factorials(1 << max(len(mask), SAMPLE + 1).bit_length()))
 
 
 def _into(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array, out: Array) -> None:
@@ -82,3 +219,26 @@ def _log_factorials(count: int) -> Array:
     """
     logarithms = logarithm(torch.arange(1, count, dtype=torch.float64))
     return np.concatenate([np.zeros(1), np.cumsum(logarithms.numpy())])
+
+
+# Whether two images show one scene: the significance of an estimate, the same for every estimator
+
+
+def judged(estimate: Estimate, c: Correspondences) -> Estimate:
+    """The estimate with its significance, where the estimator has not given one.
+
+    Args:
+        estimate: of anybody's estimator.
+        c: the matches that it was given, all of them: an estimate from a choice of them must not be judged by these.
+
+    Returns:
+        The same with `significance`, minus infinity where it is not ok.
+    """
+    given = cast(Tensor, estimate.significance)
+    unknown = given.isnan()
+    if estimate.model != "fundamental" or not bool(unknown.any()):
+        return estimate
+    with one_thread(c.mask.device):
+        computed = significance(estimate.F.detach(), c.x0.detach(), c.x1.detach(), c.mask, c.size0, c.size1)
+    computed = torch.where(estimate.ok, computed, -torch.inf)
+    return estimate.derived(significance=torch.where(unknown, computed, given))

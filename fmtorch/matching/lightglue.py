@@ -6,7 +6,7 @@ import kornia
 import torch
 from torch import Tensor, nn
 
-from fmtorch.core.pretrained import pretrained
+from fmtorch.core.onnx_network import pretrained
 from fmtorch.core.types import Correspondences, Features
 
 FEATURES = ("aliked", "disk")  # those that need no more than positions and descriptors, and that this project reads

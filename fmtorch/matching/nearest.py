@@ -6,17 +6,239 @@ elsewhere, and where those tell too few apart, all distances are computed. The r
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fmtorch.compiling.batches import kernels_serve
 from fmtorch.geometry.arithmetic import sqrt, stable_sum
+from fmtorch.jit.batches import kernels_serve
+from fmtorch.jit.kernel import Array, F8x1, I1x2, I4x1, I4x2, I8x1, inner, kernel
 from fmtorch.jobs.threads import one_thread
-from fmtorch.matching import eight_bit
+
+# Two nearest neighbours, compiled: products of 8-bit integers leave few candidates, whose distances are exact
+
+
+GROUP = 32  # columns that are passed over together where none can be a neighbour
+FAR = 1 << 30  # squared 8-bit distance of a column of padding; those of others are less
+_MAX_INT32 = 2**31 - 1
+
+
+class Descriptors(NamedTuple):
+    """Descriptors of an image, ``exact = center + step * rounded`` up to a distance of `error`.
+
+    exact: (n, d) integers, at most 2^25 in norm. squared_norms: (n,) of the rounded ones, FAR for padding.
+    """
+
+    exact: I4x2
+    squared_norms: I4x1
+    error: float
+    step: float
+
+
+class Nearest(NamedTuple):
+    """Neighbours and exact squared distances so far, (rows,) and (columns,); FAR-fetched ones are infinite.
+
+    limit: (columns + padding,) the largest 8-bit squared distance at which a row may be nearer than `reverse`.
+    """
+
+    nearest: I8x1
+    squared: F8x1
+    second_squared: F8x1
+    reverse: I8x1
+    reverse_squared: F8x1
+    limit: I4x1
+
+
+@kernel
+def round_to_8_bits(exact: I4x2, center: float, step: float, rounded: I1x2, squared_norms: I4x1) -> float:
+    """Rounds descriptors (n, d) to 8 bits, in units of `step` from `center`, and returns the largest error's norm."""
+    largest = 0.0
+    for i in range(len(exact)):
+        norm, error = 0, 0.0
+        for k in range(exact.shape[1]):
+            value = (exact[i, k] - center) / step
+            nearest = min(max(np.rint(value), -128.0), 127.0)
+            rounded[i, k] = np.int8(nearest)
+            norm += int(nearest) * int(nearest)
+            error += (value - nearest) * (value - nearest)
+        squared_norms[i] = norm
+        largest = max(largest, error)
+    return math.sqrt(largest) * step
+
+
+@kernel
+def update(products: I4x2, first: int, rows: Descriptors, columns: Descriptors, neighbors: Nearest) -> int:
+    """Takes products of rounded rows, from `first` on, with all rounded columns into what is found; overwrites them.
+
+    A distance D and the distance D8 of what was rounded differ by the errors at most (triangle inequality), so that
+    none beyond a bound on D8 needs to be computed. Returns how many were.
+    """
+    groups = products.shape[1] // GROUP
+    minima = np.empty(groups, np.int32)
+    error, step = rows.error + columns.error, rows.step
+    computed = 0
+    for i in range(len(products)):
+        row, squared = first + i, products[i]
+        norm, exact = rows.squared_norms[row], rows.exact[row]
+        for g in range(groups):
+            begin = g * GROUP
+            smallest, excess = np.int32(_MAX_INT32), np.int32(_MAX_INT32)
+            for j in range(begin, begin + GROUP):
+                value = np.int32(np.int32(norm + columns.squared_norms[j]) - np.int32(2 * squared[j]))
+                squared[j] = value
+                smallest = min(smallest, value)
+                excess = min(excess, np.int32(value - neighbors.limit[j]))
+            minima[g] = smallest
+            if excess <= 0:
+                for j in range(begin, begin + GROUP):
+                    if squared[j] <= neighbors.limit[j]:
+                        distance = _squared_distance(exact, columns.exact[j])
+                        computed += 1
+                        if distance < neighbors.reverse_squared[j]:
+                            neighbors.reverse[j], neighbors.reverse_squared[j] = row, distance
+                            neighbors.limit[j] = _below(distance, error, step)
+        computed += _search(row, squared, minima, rows, columns, neighbors)
+    return computed
+
+
+@inner
+def _search(
+    row: int, squared: Array, minima: Array, rows: Descriptors, columns: Descriptors, neighbors: Nearest
+) -> int:
+    """The two nearest columns of a row, by 8-bit squared distances and their minima in groups; what was computed."""
+    error, step = rows.error + columns.error, rows.step
+    limit = _reach(minima, error, step)
+    best, second, nearest, computed = math.inf, math.inf, -1, 0
+    for g in range(len(minima)):
+        if minima[g] > limit:
+            continue
+        for j in range(g * GROUP, (g + 1) * GROUP):
+            if squared[j] > limit:
+                continue
+            distance = _squared_distance(rows.exact[row], columns.exact[j])
+            computed += 1
+            if distance < best:
+                best, second, nearest = distance, best, j
+            elif distance < second:
+                second = distance
+            limit = min(limit, _below(second, error, step))
+    neighbors.nearest[row], neighbors.squared[row], neighbors.second_squared[row] = nearest, best, second
+    return computed
+
+
+@inner
+def _reach(minima: Array, error: float, step: float) -> int:
+    """The largest 8-bit squared distance that either of the two nearest columns can have, by the minima of groups."""
+    first, second = FAR - 1, FAR - 1
+    for value in minima:
+        if value < first:
+            first, second = value, first
+        elif value < second:
+            second = value
+    if error == 0:
+        return second
+    reach = (math.sqrt(second) + 2 * error / step) * (1 + 1e-9)
+    return min(int(reach * reach), FAR - 1)
+
+
+@inner
+def _below(squared: float, error: float, step: float) -> int:
+    """The largest 8-bit squared distance that a column can have whose exact one is less than this."""
+    if squared == math.inf:
+        return FAR - 1
+    if error == 0:
+        return int(squared / (step * step)) - 1
+    reach = (math.sqrt(squared) + error) / step * (1 + 1e-9)
+    return min(int(reach * reach), FAR - 1)
+
+
+@inner
+def _squared_distance(a: Array, b: Array) -> float:
+    """|a - b|^2, exact: in integers, which add in any order."""
+    total = np.int64(0)
+    for k in range(len(a)):
+        difference = np.int64(np.int32(a[k] - b[k]))
+        total += difference * difference
+    return float(total)
+
+
+# Two nearest neighbours on a CPU: products of 8-bit integers first, then exact distances of those that may be
+# nearest
+
+
+BLOCK = 128  # rows whose products with all columns exist at a time: 4 MB at 8,000 columns
+MAX_COMPUTED = 256  # exact distances a descriptor, beyond which rounding does not help: nearly equal ones
+MAX_LENGTH = 1 << 10  # of a descriptor: products stay below 2^24, exact in float32, and squared distances below FAR
+MAX_NORM = 2.0**25  # of a descriptor: differences fit 32 bits
+_RANGE = 255  # between the least and the largest 8-bit integer
+
+
+def two_nearest(rows: Tensor, columns: Tensor, block: int = BLOCK) -> Nearest | None:
+    """Of integer-valued descriptors (n0, d), (n1, d), at most 2^25 in norm; None where rounding tells too few apart."""
+    (n0, length), n1 = rows.shape, len(columns)
+    if not 1 <= length <= MAX_LENGTH:
+        return None
+    bounds = [value.item() for each in (rows, columns) for value in each.aminmax()]
+    low, high = min(bounds), max(bounds)
+    if not max(-low, high) <= MAX_NORM:  # squares that overflow leave no sound scale
+        return None
+    fits = high - low <= _RANGE
+    center, step = (low + 128, 1.0) if fits else ((low + high) / 2, (high - low) / _RANGE)
+    padded = -(-n1 // GROUP) * GROUP
+    rounded0, first = _rounded(rows, center, step, n0)
+    rounded1, second = _rounded(columns, center, step, padded)
+    neighbors = _no_neighbors(n0, n1, padded)
+    multiply = torch._int_mm if int8_products_are_exact() else _float_products
+    transposed = rounded1.T
+    if multiply is _float_products:
+        rounded0, transposed = rounded0.float(), transposed.float().contiguous()
+    computed, buffer = 0, torch.empty(min(block, n0), padded, dtype=torch.int32)
+    for start in range(0, n0, block):
+        products = buffer[: n0 - start]
+        multiply(rounded0[start : start + block], transposed, out=products)
+        computed += update(products.numpy(), start, first, second, neighbors)
+        if computed > MAX_COMPUTED * (n0 + n1):
+            return None
+    return neighbors
+
+
+@functools.cache
+def int8_products_are_exact() -> bool:
+    """Whether torch multiplies matrices of 8-bit integers exactly: it does not on processors without VNNI."""
+    generator = torch.Generator().manual_seed(0)
+    a, b = (torch.randint(-128, 128, (128, 256), generator=generator, dtype=torch.int8) for _ in range(2))
+    try:
+        return torch.equal(torch._int_mm(a, b.T), (a.float() @ b.T.float()).int())
+    except (AttributeError, RuntimeError, NotImplementedError):
+        return False
+
+
+def _float_products(a: Tensor, b: Tensor, out: Tensor) -> None:
+    """Products of integer-valued float32 matrices: exact, as sums below 2^24 are."""
+    out.copy_(a @ b)
+
+
+def _rounded(values: Tensor, center: float, step: float, padded: int) -> tuple[Tensor, Descriptors]:
+    """The descriptors in 8 bits, with rows of zeros up to so many, and what the kernel is to know of them."""
+    exact = values.int().numpy()
+    rounded = torch.zeros(padded, values.shape[1], dtype=torch.int8)
+    norms = np.full(padded, FAR, np.int32)
+    error = round_to_8_bits(exact, float(center), float(step), rounded.numpy(), norms)
+    return rounded, Descriptors(exact, norms, error * (1 + 1e-9), float(step))
+
+
+def _no_neighbors(n0: int, n1: int, padded: int) -> Nearest:
+    """Nothing found: any distance improves it, but that of padding."""
+    return Nearest(
+        np.full(n0, -1), np.full(n0, np.inf), np.full(n0, np.inf), np.full(n1, -1), np.full(n1, np.inf),
+        np.full(padded, FAR - 1, np.int32),
+    )  # fmt: skip
+
 
 _GROUP = 32  # columns whose minimum is taken together; a group is searched only where it can hold a neighbour
 _FLOAT32_NORM = 2.0**11  # integer vectors no longer than this have squared distances up to 2^24: exact in float32
@@ -119,7 +341,7 @@ def _match_one_pair(d0: Tensor, d1: Tensor, mask0: Tensor, mask1: Tensor, chunk:
 
 def _compiled(rows: Tensor, columns: Tensor) -> tuple[_Nearest, Tensor] | None:
     """`_two_nearest` by kernels, None where they do not serve."""
-    neighbors = eight_bit.two_nearest(rows, columns) if kernels_serve(rows, columns) else None
+    neighbors = two_nearest(rows, columns) if kernels_serve(rows, columns) else None
     if neighbors is None:
         return None
     tensors = (torch.from_numpy(value) for value in (neighbors.nearest, neighbors.squared, neighbors.second_squared))

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from fmtorch.core.options import Within, nearest
 from fmtorch.core.types import Correspondences, Features
-from fmtorch.matching.precision import RecordedSample, relative_noise
+from fmtorch.matching.matcher import RecordedSample, relative_noise
 
 CORNER = ("roma", "dkm")  # in the names of matchers whose first pixel's centre is at 0.5
 EDGE = 0.5  # px from the first pixel's centre to the edge of the image

@@ -13,8 +13,15 @@ if TYPE_CHECKING:
     from fmtorch.metrics.inlier_rate import InlierRate, ground_truth_inliers, inlier_rate
     from fmtorch.metrics.nsgd import nsgd, sgd
     from fmtorch.metrics.nsgd_released import nsgd_released
-    from fmtorch.metrics.pose import PoseError, closest_pose_error, fundamental_pose_error, pose_error
-    from fmtorch.metrics.pose_recall import pose_auc, pose_maa, pose_map
+    from fmtorch.metrics.pose import (
+        PoseError,
+        closest_pose_error,
+        fundamental_pose_error,
+        pose_auc,
+        pose_error,
+        pose_maa,
+        pose_map,
+    )
     from fmtorch.metrics.recall import mean_recall, recall, recall_curve
 
 __all__ = [

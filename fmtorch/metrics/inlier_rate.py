@@ -10,7 +10,7 @@ from torch import Tensor
 
 from fmtorch.core.checks import checked, expect_sizes
 from fmtorch.geometry.epipolar import epipolar_distances
-from fmtorch.metrics.draws import diagonal
+from fmtorch.metrics.nsgd import diagonal
 
 THRESHOLD = 0.003  # of the image diagonal (Bian et al., BMVC 2019)
 

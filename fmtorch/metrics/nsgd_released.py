@@ -16,12 +16,11 @@ import torch
 from jaxtyping import Float, Int, Real
 from torch import Tensor
 
-from fmtorch.compiling.batches import kernels_serve
 from fmtorch.core.checks import checked
 from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.geometry.epipolar import lines_through
-from fmtorch.metrics.draws import Pairs, diagonal, segment_in_image, sum_of_draws
-from fmtorch.metrics.nsgd import compiled_sums
+from fmtorch.jit.batches import kernels_serve
+from fmtorch.metrics.nsgd import Pairs, compiled_sums, diagonal, segment_in_image, sum_of_draws
 
 BORDER = 0.5  # left and top edge of the first pixel where pixels count from 1
 NORMAL_OFFSET = 1e-10

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int, Real
 from torch import Tensor
 
 from fmtorch.metrics.nsgd import nsgd
-from fmtorch.metrics.pose_recall import BIN, MAA_MAXIMUM, THRESHOLDS, pose_auc, pose_maa, pose_map
+from fmtorch.metrics.pose import BIN, MAA_MAXIMUM, THRESHOLDS, pose_auc, pose_maa, pose_map
 from fmtorch.metrics.recall import THRESHOLD, mean_recall, recall
 
 try:

@@ -14,7 +14,7 @@ from fmtorch.presets.composition import compose, plain
 from fmtorch.presets.files import available, unknown
 from fmtorch.presets.objects import instantiate, open_files
 from fmtorch.presets.pruners import build_pruners
-from fmtorch.storage.features import cached
+from fmtorch.runs.feature_cache import cached
 
 
 def build_pipeline(

@@ -14,12 +14,10 @@ from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.geometry.cameras import cross_matrix
 from fmtorch.geometry.pose import pose_from_fundamental
-from fmtorch.pipeline.pair_geometries import pair_geometries
+from fmtorch.io.match_store import ExportedImage, ExportedPair, Journal, PairGeometry, indices
 from fmtorch.pipeline.photograph_cameras import PhotographCamera
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
-from fmtorch.pipeline.two_images import Described, MatchResult
-from fmtorch.storage.exchange.journal import ExportedImage, ExportedPair, Journal, indices
-from fmtorch.storage.exchange.two_view import PairGeometry
+from fmtorch.pipeline.two_images import Described, MatchResult, pair_geometries
 from fmtorch.two_view.pair_type import Configuration
 
 EXACT = (1.0, 0.0)  # px, relative deviation; K stands for the pixels

@@ -1,29 +1,195 @@
-"""A folder of images: the work on its images and pairs, by any workers, that can be resumed."""
+"""The images of a folder, and the pairs of them that are asked for."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
+import itertools
+import json
+import os
+import re
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
+from fmtorch.core.settings import claim
 from fmtorch.data.images import read_image
 from fmtorch.data.pairs import ImageSource
 from fmtorch.data.text_files import DataError
+from fmtorch.io.match_store import ExportedPair, Journal
 from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.pool import SHARED_BY, WorkerPool
 from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, in_order
 from fmtorch.jobs.threads import available, one_thread
 from fmtorch.pipeline.exporting import exported_image, exported_match
-from fmtorch.pipeline.folder_images import Pair, in_blocks
 from fmtorch.pipeline.photograph_cameras import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pipeline.two_images import Described, describe, relate
-from fmtorch.storage.exchange.journal import ExportedPair, Journal
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
+EXHAUSTIVE, SEQUENTIAL, SIMILAR = "exhaustive", "sequential", "similar"
+CHOICES = f"{EXHAUSTIVE}, {SEQUENTIAL}:N, {SIMILAR}:N"
+# Pictures that fmtorch draws, by the file beside which it does; a set of pairs holds copies of photographs.
+_DRAWN = {"result.json": ("matches.png", "pruning.png", "epipolar.png"), "run.json": ("recall.png",)}
+_SET_OF_PAIRS = "pairs.json"
+
+Pair = tuple[Path, Path]
+
+
+def images_below(folder: Path) -> list[Path]:
+    """The images of a folder, at any depth, by name; none that fmtorch itself has written, nor in hidden folders.
+
+    Raises ValueError where there are fewer than two.
+    """
+    if not folder.is_dir():
+        raise ValueError(f"images={folder} is no folder")
+    images = sorted(_images(folder))
+    if len(images) < 2:
+        raise ValueError(f"images={folder} holds {len(images)} images ({', '.join(SUFFIXES)}); a pair needs two")
+    return images
+
+
+def _images(folder: Path) -> Iterator[Path]:
+    for parent, folders, files in os.walk(folder):
+        inside = Path(parent)
+        folders[:] = [
+            name for name in folders if not (name.startswith(".") or (inside / name / _SET_OF_PAIRS).is_file())
+        ]
+        drawn = {name for file, names in _DRAWN.items() if file in files for name in names}
+        for name in files:
+            path = inside / name
+            if path.suffix.lower() in SUFFIXES and name not in drawn and path.is_file():
+                yield path
+
+
+def count_of(pairs: Path | str | None, kind: str) -> int | None:
+    """The N of ``pairs=kind:N``; None where something else is asked for. Raises ValueError where N is no number."""
+    name, colon, number = str(pairs or "").partition(":")
+    if name != kind:
+        return None
+    if not colon or not number.isdecimal() or int(number) < 1:
+        raise ValueError(f"pairs={pairs}; it must be {kind}:N with a whole number N of at least 1, as {kind}:10")
+    return int(number)
+
+
+def chosen_pairs(folder: Path, images: Sequence[Path], pairs: Path | None) -> list[Pair]:
+    """All pairs of the images, neighbours in the order of their names, or those of a file.
+
+    pairs: ``exhaustive`` or None, ``sequential:N`` (each image with the N next ones), or a text file with the names of
+    two images a line, below the folder. There an empty line and one that begins with # is left out, and a pair that
+    stands there again. Raises ValueError for anything else, naming file and line for what is no pair.
+    """
+    if pairs is None or str(pairs) == EXHAUSTIVE:
+        return list(itertools.combinations(images, 2))
+    if count := count_of(pairs, SEQUENTIAL):
+        ordered = sorted(images, key=lambda path: natural_order(path.relative_to(folder).as_posix()))
+        return [(a, b) for i, a in enumerate(ordered) for b in ordered[i + 1 : i + 1 + count]]
+    if not pairs.is_file():
+        raise ValueError(f"pairs={pairs}: no such file; it must be {CHOICES}, or a file with two names a line")
+    return _listed_pairs(folder, images, pairs)
+
+
+def natural_order(name: str) -> list[tuple[int, int, str]]:
+    """A sort key by which numbers in names count as numbers: a2.jpg comes before a10.jpg."""
+    parts = re.split(r"(\d+)", name)
+    return [(0, int(part), part) if part.isdecimal() else (1, 0, part.casefold()) for part in parts if part]
+
+
+def _listed_pairs(folder: Path, images: Sequence[Path], pairs: Path) -> list[Pair]:
+    known = {path.relative_to(folder).as_posix(): path for path in images}
+    selected: dict[frozenset[Path], Pair] = {}
+    for number, line in enumerate(pairs.read_text(encoding="utf-8").splitlines(), start=1):
+        names = line.split()
+        if not names or names[0].startswith("#"):
+            continue
+        where = f"{pairs}, line {number}"
+        if len(names) != 2 or names[0] == names[1]:
+            raise ValueError(f"{where}: {line.strip()!r}; it must be the names of two images")
+        missing = [name for name in names if name not in known]
+        if missing:
+            raise ValueError(f"{where}: no image {missing[0]} in {folder}")
+        pair = known[names[0]], known[names[1]]
+        selected.setdefault(frozenset(pair), pair)
+    if not selected:
+        raise ValueError(f"{pairs} names no pair")
+    return list(selected.values())
+
+
+def in_blocks(pairs: Sequence[Pair], block: int) -> list[Pair]:
+    """The pairs in an order that needs few images at a time: `block` first ones meet one second image after another."""
+    number: dict[Path, int] = {}
+    for pair in pairs:
+        for image in pair:
+            number.setdefault(image, len(number))
+    return sorted(pairs, key=lambda pair: (number[pair[0]] // block, number[pair[1]], number[pair[0]]))
+
+
+# Where the matches of a folder go, and whose they are
+
+
+RECORD = "export.json"
+
+
+def default_output(folder: Path) -> Path:
+    """``matches/NAME``, with some digits behind where that holds the matches of another folder of this name."""
+    output = Path("matches") / folder.absolute().name
+    with contextlib.suppress(OSError, ValueError):
+        images = json.loads((output / RECORD).read_text(encoding="utf-8"))["images"]
+        if images != str(folder.absolute()):
+            digest = hashlib.blake2b(str(folder.absolute()).encode(), digest_size=4).hexdigest()
+            return output.with_name(f"{output.name}-{digest}")
+    return output
+
+
+def open_folder(output: Path, identity: Mapping[str, Any]) -> Path:
+    """The folder for what is found of pairs, in `output`; the identity is kept beside it.
+
+    Raises ValueError where the output holds results of another identity.
+    """
+    claim(output / RECORD, identity, "matches", "choose another output, or delete the folder", alone=False)
+    return output / "export"
+
+
+# Which images are worth matching: those whose VLAD vectors are most alike
+
+
+ROWS = 1024  # of the matrix of similarities that exist at a time
+
+
+def vectors_of(described: Iterable[Described | None], vector: Callable[[Tensor], Tensor]) -> Float[Tensor, "n d"]:
+    """A vector for each image by its local descriptors; zeros where there is no image."""
+    vectors = [None if each is None else vector(each.features.descriptors) for each in described]
+    length = max((len(each) for each in vectors if each is not None), default=1)
+    return torch.stack([torch.zeros(length) if each is None else each for each in vectors])
+
+
+def similar_pairs(images: Sequence[Path], vectors: Float[Tensor, "n d"], count: int) -> list[Pair]:
+    """Each image with its `count` most similar ones, by the inner products of the vectors; a pair once, in order.
+
+    Images without a vector, zeros, are in no pair. Of equally similar ones those of lower number come first.
+    """
+    described = (vectors != 0).any(1)
+    selected: set[tuple[int, int]] = set()
+    for start in range(0, len(vectors), ROWS):
+        similarity = vectors[start : start + ROWS] @ vectors.T
+        similarity[:, ~described] = -torch.inf
+        rows = torch.arange(len(similarity))
+        similarity[rows, rows + start] = -torch.inf
+        values, order = similarity.sort(dim=1, descending=True, stable=True)
+        for row, (best, neighbors) in enumerate(zip(values[:, :count], order[:, :count], strict=True), start=start):
+            if described[row]:
+                selected |= {(min(row, j), max(row, j)) for j in neighbors[best > -torch.inf].tolist()}
+    return [(images[i], images[j]) for i, j in sorted(selected)]
+
+
+# A folder of images: the work on its images and pairs, by any workers, that can be resumed
+
 
 MEMORY = 64  # images whose features are kept for pairs to come
 AHEAD = 4  # pairs a worker whose images are described before the first of them is matched

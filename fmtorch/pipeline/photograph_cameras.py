@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fmtorch.data.exif import exif_focal
-from fmtorch.data.image_cameras import ImageCameras
+from fmtorch.data.image_cameras import ImageCameras, exif_focal
 from fmtorch.data.lenses import Lens
 from fmtorch.data.pairs import ImageSource
-from fmtorch.storage.configuration import file_digest
+from fmtorch.runs.fingerprint import file_digest
 from fmtorch.two_view.arguments import camera_fields
 
 WORDS = ("unknown", "shared", "exif")

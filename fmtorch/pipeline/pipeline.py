@@ -1,11 +1,15 @@
-"""The four stages in a row: features, matching, pruning, estimation; batching, timing, failures as data."""
+"""Results kept for those who ask for the same again."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import threading
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from concurrent.futures import Future
+from typing import Generic, TypeVar
 
 import numpy as np
 import torch
@@ -24,15 +28,124 @@ from fmtorch.core.stages import (
     model_of,
     pruned,
 )
-from fmtorch.core.types import Correspondences, Features
+from fmtorch.core.types import Correspondences, Estimate, Features, collate
 from fmtorch.data.images import read_image, to_grey
 from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
-from fmtorch.geometry.verdict import judged
+from fmtorch.geometry.significance import judged
 from fmtorch.jobs.threads import one_thread
-from fmtorch.pipeline.clock import synchronise
-from fmtorch.pipeline.memo import Memo
-from fmtorch.pipeline.outcome import Outcome as Outcome
-from fmtorch.pipeline.outcome import collated, described, expect_finite
+from fmtorch.two_view.pair_type import Configuration, classify
+
+Key = TypeVar("Key")
+Value = TypeVar("Value")
+
+
+class Memo(Generic[Key, Value]):
+    """Keeps the most recently used results; threads that ask for the same one share one computation."""
+
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._futures: OrderedDict[Key, Future[Value]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: Key, compute: Callable[[], Value]) -> Value:
+        """The value of `key`, computed if it is not there; an exception is kept and raised again."""
+        with self._lock:
+            future = self._futures.get(key)
+            mine = future is None
+            if future is None:
+                future = self._futures[key] = Future()
+            self._futures.move_to_end(key)
+            while len(self._futures) > self._capacity:
+                self._futures.popitem(last=False)
+        if mine:
+            try:
+                future.set_result(compute())
+            except BaseException as error:
+                future.set_exception(error)
+        return future.result()
+
+
+# How long the steps of a pipeline take
+
+
+class Clock:
+    """The seconds between its calls."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._device, self._last = device, time.perf_counter()
+        self.seconds: dict[str, float] = {}
+
+    def __call__(self, step: str, seconds: float | None = None) -> None:
+        """The time since the last call was spent on `step`, which counts for `seconds` where they are given."""
+        synchronise(self._device)
+        now = time.perf_counter()
+        self.seconds[step] = now - self._last if seconds is None else seconds
+        self._last = now
+
+
+def synchronise(device: torch.device) -> None:
+    """Wait for what a GPU is still doing."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+# What a pipeline made of one pair, and of several as one batch
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Outcome:
+    """What a pipeline made of one pair.
+
+    correspondences, estimate: batches of one; None where the pair failed before that stage.
+    features: how many each image has. seconds: per stage; a batched stage is shared out evenly, and features count in
+    full for each pair that uses them, cached ones with the seconds they took when they were computed.
+    reason: why the pair failed, empty where it did not. configuration, not_examined: of this pair alone, or why there
+    is none, where it was asked for (`fmtorch.pipeline.pipeline`). images: for pruners that look at them. keypoints:
+    the correspondences as the matcher left them, where pruners that look at images may have moved their points.
+    """
+
+    pair: ImagePair
+    features: tuple[int, int] = (0, 0)
+    correspondences: Correspondences | None = None
+    estimate: Estimate | None = None
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+    reason: str = ""
+    configuration: Configuration | None = None
+    not_examined: str = ""
+    images: PairImages | None = None
+    keypoints: Correspondences | None = None
+
+    @property
+    def solved(self) -> bool:
+        """Whether there is an F."""
+        return self.estimate is not None and bool(self.estimate.ok[0])
+
+
+def expect_finite(estimate: Estimate) -> Estimate:
+    """The estimate, whose pairs are not ok where F is no matrix: anybody's estimator may have made it."""
+    valid = torch.isfinite(estimate.F).flatten(1).all(1) & (estimate.F != 0).flatten(1).any(1)
+    wrong = (estimate.ok & ~valid).tolist()
+    if not any(wrong):
+        return estimate
+    said = "estimation: F is zero or not finite, though the estimator calls it ok"
+    reason = tuple(said if bad else old for bad, old in zip(wrong, estimate.reason, strict=True))
+    keep = valid[:, None]
+    F, inliers = torch.where(keep[..., None], estimate.F, 0), estimate.inliers & keep
+    return estimate.replace(F=F, inliers=inliers, ok=estimate.ok & valid, reason=reason, significance=None)
+
+
+def collated(outcomes: Sequence[Outcome]) -> Correspondences:
+    """The matches of the outcomes that have some, as one batch."""
+    return collate([outcome.correspondences for outcome in outcomes if outcome.correspondences is not None])
+
+
+def described(stage: str, error: Exception) -> str:
+    """What a stage raised, as a reason of one line."""
+    return f"{stage}: {type(error).__name__}: {error}".splitlines()[0]
+
+
+# The four stages in a row: features, matching, pruning, estimation; batching, timing, failures as data
+
 
 STAGES = ("features", "matching", "pruning", "estimation")
 
@@ -226,3 +339,53 @@ def _alone(stage: str, function: Callable[[list[Outcome]], list[Outcome]], outco
         return function([outcome])[0]
     except Exception as error:
         return dataclasses.replace(outcome, correspondences=None, images=None, reason=described(stage, error))
+
+
+# Which configurations the pairs of a run are in, by the matches and what the estimator was given of the cameras
+
+
+Knowledge = Callable[[Correspondences], Correspondences]
+
+
+def examined(
+    pipeline: Pipeline, outcomes: Sequence[Outcome], seed: int = 0, knowledge: Knowledge | None = None
+) -> list[Outcome]:
+    """The outcomes of a run with their configurations; a pair that cannot be examined has none and harms no other.
+
+    knowledge: gives correspondences what the estimator was given of their cameras; None: nothing, and their K counts
+    for nothing here. Matches of the results have what it gives. Of homographies nothing is asked.
+    """
+    if model_of(pipeline.estimator) != "fundamental":
+        return list(outcomes)
+    matched = [i for i, o in enumerate(outcomes) if o.correspondences is not None and o.estimate is not None]
+    results = list(outcomes)
+    with one_thread(pipeline.device):
+        try:
+            own = _examined([outcomes[i] for i in matched], seed, knowledge) if matched else []
+        except Exception:  # whose fault it is shows pair by pair
+            own = [_pair_alone(outcomes[i], seed, knowledge) for i in matched]
+    for i, outcome in zip(matched, own, strict=True):
+        results[i] = outcome
+    return results
+
+
+def _examined(outcomes: Sequence[Outcome], seed: int, knowledge: Knowledge | None) -> list[Outcome]:
+    c = collate([o.correspondences for o in outcomes if o.correspondences is not None])
+    estimate = collate([o.estimate for o in outcomes if o.estimate is not None])
+    if knowledge is None:
+        configuration = classify(c.derived(K0=None, K1=None), estimate, seed=seed)
+    else:
+        c = knowledge(c)
+        configuration = classify(c, estimate, seed=seed)
+    return [
+        dataclasses.replace(outcome, correspondences=c[i], configuration=configuration.of_pair(i))
+        for i, outcome in enumerate(outcomes)
+    ]
+
+
+def _pair_alone(outcome: Outcome, seed: int, knowledge: Knowledge | None) -> Outcome:
+    try:
+        return _examined([outcome], seed, knowledge)[0]
+    except Exception as error:  # what it is in stays unknown, and the row says why
+        reason = f"not examined: {type(error).__name__}: {error}".splitlines()[0]
+        return dataclasses.replace(outcome, not_examined=reason)

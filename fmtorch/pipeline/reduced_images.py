@@ -15,11 +15,10 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences
 from fmtorch.data.images import read_image
-from fmtorch.data.lenses import Lens
-from fmtorch.data.undistort_points import undistorted_frames, undistorted_points
+from fmtorch.data.lenses import Lens, undistorted_frames, undistorted_points
+from fmtorch.geometry.cameras import calibration_problems
 from fmtorch.geometry.epipolar import unit_frobenius
-from fmtorch.geometry.square_pixels import calibration_problems
-from fmtorch.storage.exchange.two_view import PairGeometry
+from fmtorch.io.match_store import PairGeometry
 
 Image = NDArray[np.uint8]
 Array = NDArray[np.float64]

@@ -1,31 +1,34 @@
-"""Two photographs of any size through a pipeline: their matches and fundamental matrix in their own pixels."""
+"""Photographs described for matching: features of each as it was reduced, and what leads back to it."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch import presets
 from fmtorch.core.arguments import Arrays
+from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
+from fmtorch.core.no_features import NoFeatures
 from fmtorch.core.stages import ImageMatcher, PairImages, pruned
-from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.core.types import RELATED, Correspondences, Estimate, Features
+from fmtorch.data.images import to_grey
 from fmtorch.data.lenses import Lens
-from fmtorch.geometry.verdict import judged
+from fmtorch.geometry.pair_type import GENERAL, IDENTICAL, PLANAR, ROTATION
+from fmtorch.geometry.significance import judged
+from fmtorch.io.match_store import Kind, PairGeometry
 from fmtorch.jobs.threads import mapped, one_thread
 from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.clock import Clock
-from fmtorch.pipeline.described import Described as Described
-from fmtorch.pipeline.described import describe as describe
-from fmtorch.pipeline.match_result import MatchResult as MatchResult
-from fmtorch.pipeline.pair_geometries import pair_geometries
-from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.pipeline.pipeline import Clock, Pipeline
 from fmtorch.pipeline.reduced_images import (
     Image,
     evenly_reduced,
@@ -34,12 +37,181 @@ from fmtorch.pipeline.reduced_images import (
     geometry_to_original,
     given_image,
     reduced_cameras,
+    reduced_image,
     to_original,
     undistorted_matches,
 )
 from fmtorch.two_view.arguments import Focal, camera_fields
 from fmtorch.two_view.known_cameras import KnownCameras
-from fmtorch.two_view.pair_type import classify, compile_with, still_warning
+from fmtorch.two_view.pair_type import FOCAL_DEVIATION, Configuration, classify, compile_with, still_warning
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Described:
+    """A photograph's features in pixels of it as it was reduced, the scale of that in x and y, and its size (h, w).
+
+    seconds: that describing it takes or took. pyramid: its grey levels, for pruners that look at them. image: reduced,
+    for a matcher that takes the images themselves, and has no features.
+    """
+
+    features: Features
+    scale: Float[Tensor, " xy"]
+    size: tuple[int, int]
+    seconds: float
+    pyramid: GreyPyramid | None = None
+    image: Image | None = None
+
+    @property
+    def points(self) -> Float[Tensor, "n 2"]:
+        """The keypoints in pixels of the photograph."""
+        return to_original(self.features.keypoints, self.scale.to(self.features.keypoints))
+
+
+def describe(pipeline: Pipeline, image: Image, longest_side: int) -> Described:
+    """The features of a photograph, for `relate`; see `match`."""
+    reduced, scale = reduced_image(image, longest_side)
+    itself = isinstance(pipeline.matcher, ImageMatcher)
+    features, seconds = (NoFeatures()(reduced), 0.0) if itself else pipeline.extract(reduced)
+    pyramid = grey_pyramid(to_grey(reduced)) if pipeline.looks_at_images else None
+    return Described(features, scale, (image.shape[0], image.shape[1]), seconds, pyramid, reduced if itself else None)
+
+
+# What is found of two photographs
+
+
+FLAT = ("planar", "rotation", "identical")  # configurations of which a homography explains all matches
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MatchResult:
+    """The matches of two photographs and their fundamental matrix, ``x1^T F x0 = 0``, in pixels of the photographs.
+
+    keypoints0, keypoints1: all that were detected, (N0, 2) and (N1, 2).
+    putative: the matcher's matches, a batch of one. kept: which of them the pruners kept, (M,).
+    correspondences: the kept ones, a batch of one. inliers: which of those agree with F, (K,).
+    F: (3, 3) float64 of unit Frobenius norm; zero where there is none, and `reason` then says why.
+    significance: how far the support of F is beyond chance (`fmtorch.geometry.significance`); -inf where there is no F.
+    warning: why F, though found, means little; mostly empty. counts: matches after each step, in order. seconds: of
+    each step, cached features with those they took when they were computed.
+    R (3, 3), t (3,), focals (2,): X1 = R X0 + t with a t of unit length, and focal lengths in pixels of the
+    photographs, where cameras were asked for; NaN where not determined.
+    configuration: one of `CONFIGURATIONS`; empty where nothing could be matched. geometry: the two-view geometry for
+    COLMAP, whose inliers are indices of the kept matches, twice. undistorted: where a lens distorts, the kept matches
+    as pinholes would have them, which F and homography relate; points are otherwise those of the photographs.
+    """
+
+    keypoints0: Float[Tensor, "n0 2"]
+    keypoints1: Float[Tensor, "n1 2"]
+    putative: Correspondences
+    kept: Bool[Tensor, " m"]
+    correspondences: Correspondences
+    inliers: Bool[Tensor, " k"]
+    F: Float[Tensor, "3 3"]
+    reason: str = ""
+    warning: str = ""
+    counts: dict[str, int] = dataclasses.field(default_factory=dict)
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+    significance: float = -math.inf
+    R: Float[Tensor, "3 3"] | None = None
+    t: Float[Tensor, " 3"] | None = None
+    focals: Float[Tensor, " 2"] | None = None
+    configuration: str = ""
+    geometry: PairGeometry | None = None
+    undistorted: Correspondences | None = None
+
+    @property
+    def homography(self) -> Float[Tensor, "3 3"] | None:
+        """Of planes, rotations and copies: ``x1 ~ H x0`` in pixels of the photographs; else None."""
+        H = None if self.geometry is None or self.configuration not in FLAT else self.geometry.H
+        return None if H is None else torch.from_numpy(H)
+
+    @property
+    def related(self) -> bool:
+        """Whether the photographs are taken to show one scene: F was found, and its support is beyond chance."""
+        return self.ok and self.significance >= RELATED
+
+    @property
+    def ok(self) -> bool:
+        """Whether a fundamental matrix was found."""
+        return not self.reason
+
+
+# Estimates of pairs and their configurations as the two-view geometries of COLMAP's databases
+
+
+KINDS: dict[int, Kind] = {PLANAR: "planar", ROTATION: "panoramic", IDENTICAL: "planar_or_panoramic"}
+MAX_CONFLICT = 3.0  # deviations, of an estimated focal length from that of a camera that counts as calibrated
+
+
+def pair_geometries(
+    matches: Sequence[NDArray[np.integer[Any]]], c: Correspondences, estimate: Estimate, configuration: Configuration
+) -> list[PairGeometry]:
+    """The geometries of a batch of pairs.
+
+    Of general pairs F, its inliers, and E and the pose where there is one; of others the homography and its inliers,
+    and the pose where the cameras are known or only turn. A pair is calibrated where both focal lengths are known and
+    the matches agree; one whose support is not beyond chance is degenerate.
+
+    Args:
+        matches: keypoints of both images, (n, 2), of each pair.
+        c: the same matches, with what the estimator was given of their cameras.
+        estimate: their estimates.
+        configuration: of `classify`.
+    """
+    calibrated = _calibrated(c, estimate)
+    kind, homography = configuration.kind, configuration.homography
+    kinds = torch.where(kind != GENERAL, kind, torch.where(estimate.related, GENERAL, -1)).tolist()
+    results = []
+    for i, (index, what) in enumerate(zip(matches, kinds, strict=True)):
+        of_lines = what == GENERAL or (what == PLANAR and bool(calibrated[i]))
+        inliers = index[(estimate if of_lines else homography).inliers[i, : len(index)].cpu().numpy()]
+        H = _known(homography.F[i], homography.ok[i])
+        if what == GENERAL:
+            results.append(_with_lines("calibrated" if calibrated[i] else "uncalibrated", inliers, estimate, i, H))
+        elif of_lines:
+            results.append(_with_lines("planar", inliers, estimate, i, H))
+        elif what not in KINDS:
+            results.append(PairGeometry("degenerate", index[:0]))
+        elif what == ROTATION:
+            R = configuration.evidence.R[i].cpu().numpy()
+            results.append(PairGeometry("panoramic", inliers, H=H, R=R, t=np.zeros(3)))
+        else:
+            results.append(PairGeometry(KINDS[what], inliers, H=H))
+    return results
+
+
+def _calibrated(c: Correspondences, estimate: Estimate) -> Tensor:
+    """Whether both focal lengths of a pair are known, and the pose with them: (b,)."""
+    if c.focal is None or estimate.R is None:
+        return torch.zeros_like(estimate.ok)
+    known = c.focal[..., 1].isfinite().all(1)
+    return known & estimate.R.isfinite().flatten(1).all(1) & ~_conflicting(c, estimate)
+
+
+def _with_lines(kind: Kind, inliers: NDArray[np.integer[Any]], estimate: Estimate, i: int, H: Any) -> PairGeometry:
+    """A geometry with F, and the pose where there is one."""
+    E, R, t = (
+        None if value is None else _known(value[i], value[i].isfinite().all())
+        for value in (estimate.E, estimate.R, estimate.t)
+    )
+    return PairGeometry(kind, inliers, estimate.F[i].detach().cpu().double().numpy(), E, H, R, t)
+
+
+def _known(value: Tensor, known: Tensor) -> NDArray[np.float64] | None:
+    return value.detach().cpu().double().numpy() if known else None
+
+
+def _conflicting(c: Correspondences, estimate: Estimate) -> Tensor:
+    """Whether an estimated focal length contradicts the known one of K: (b,)."""
+    if c.K0 is None or c.K1 is None or c.focal is None or estimate.focals is None:
+        return torch.zeros_like(estimate.ok)
+    stored = torch.stack([torch.sqrt(K[:, 0, 0] * K[:, 1, 1]) for K in (c.K0, c.K1)], 1)
+    apart = (estimate.focals / stored).log().abs()
+    return (apart > MAX_CONFLICT * c.focal[..., 1].clamp_min(FOCAL_DEVIATION)).any(1)
+
+
+# Two photographs of any size through a pipeline: their matches and fundamental matrix in their own pixels
+
 
 NOTHING_KNOWN: Mapping[str, Tensor] = {}
 NO_CAMERAS: Mapping[str, None] = dict.fromkeys(("K0", "K1", "focal", "shared_focal"))  # of the reduced images

@@ -12,7 +12,7 @@ import hydra
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
-from fmtorch.core.resources import conf_dir
+from fmtorch.core.files import conf_dir
 from fmtorch.presets import hydra_source
 from fmtorch.presets.files import available
 from fmtorch.presets.objects import expect_buildable

@@ -11,8 +11,8 @@ from typing import Any
 
 import yaml  # type: ignore[import-untyped]
 
+from fmtorch.core.files import conf_dir
 from fmtorch.core.options import nearest
-from fmtorch.core.resources import conf_dir
 
 
 def available(group: str, config_dir: Path | str | None = None) -> list[str]:

@@ -9,22 +9,166 @@ eighth of the time, and the same area under the ROC curve (measured on castle-P1
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fmtorch.compiling.arrays import Array
-from fmtorch.compiling.batches import for_each_pair, kernels_serve
 from fmtorch.core.records import ungraphed
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry.arithmetic import component_sum, sqrt
-from fmtorch.geometry.curves import curve_orders
-from fmtorch.pruning import frame_consistency_kernels as compiled
-from fmtorch.pruning.agreement import CURVES, MIN_SQUARE, MIN_VOTE, NOISE, SHARPNESS, WINDOW, WORST_RATIO
+from fmtorch.geometry.curves import curve_order_kernel, curve_orders
+from fmtorch.jit.batches import for_each_pair, kernels_serve
+from fmtorch.jit.kernel import Array, B1x1, F4x1, F4x2, F4x3, inner, kernel
+from fmtorch.pruning.neighbors import (
+    CURVES,
+    CURVES32,
+    MIN_SQUARE,
+    MIN_SQUARE32,
+    MIN_VOTE,
+    MIN_VOTE32,
+    MIN_VOTES32,
+    NOISE,
+    NOISE32,
+    ONE32,
+    SHARPNESS,
+    SHARPNESS32,
+    WINDOW,
+    WORST_RATIO,
+    WORST_RATIO32,
+)
+
+# `frame_consistency` for one pair, compiled: the same orders and the same sums, in float32
+
+
+class FramedMatches(NamedTuple):
+    """The matches of one pair: points x0, x1 (n, 2), frames lafs0, lafs1 (n, 2, 3), pixels; which are real, mask (n,).
+
+    quality: (n,), empty where unknown.
+    """
+
+    x0: F4x2
+    x1: F4x2
+    lafs0: F4x3
+    lafs1: F4x3
+    quality: F4x1
+    mask: B1x1
+
+
+@kernel
+def frame_agreement_kernel(matches: FramedMatches, out: F4x1) -> None:
+    """`frame_consistency.frame_agreement` of n matches -> out (n,)."""
+    x0, x1, lafs0, lafs1, quality, mask = matches
+    n, zero = len(mask), x0.dtype.type(0)
+    rows, match = np.empty((10, n), x0.dtype), np.empty(n, np.int64)
+    m = 0
+    for i in range(n):
+        out[i] = zero
+        a, b, c, d = lafs0[i, 0, 0], lafs0[i, 0, 1], lafs0[i, 1, 0], lafs0[i, 1, 1]
+        determinant = a * d - b * c
+        rows[0, m], rows[1, m], rows[2, m], rows[3, m] = x0[i, 0], x0[i, 1], x1[i, 0], x1[i, 1]
+        rows[4, m] = (lafs1[i, 0, 0] * d + lafs1[i, 0, 1] * -c) / determinant
+        rows[5, m] = (lafs1[i, 0, 0] * -b + lafs1[i, 0, 1] * a) / determinant
+        rows[6, m] = (lafs1[i, 1, 0] * d + lafs1[i, 1, 1] * -c) / determinant
+        rows[7, m] = (lafs1[i, 1, 0] * -b + lafs1[i, 1, 1] * a) / determinant
+        rows[8, m] = math.sqrt(abs(rows[4, m] * rows[7, m] - rows[5, m] * rows[6, m]))
+        rows[9, m] = max(WORST_RATIO32 - quality[i], MIN_VOTE32) if len(quality) else x0.dtype.type(1)
+        valid = mask[i] and not (len(quality) and math.isnan(quality[i]))
+        for k in range(10):
+            valid = valid and math.isfinite(rows[k, m])
+        match[m] = i
+        m += valid
+    order, along = np.empty(m, np.int64), np.empty((10, m), x0.dtype)
+    agreement, votes = np.zeros(m, x0.dtype), np.zeros(m, x0.dtype)
+    ahead, behind = np.empty((WINDOW, m), x0.dtype), np.empty((WINDOW, m), x0.dtype)
+    for image in range(2):
+        for curve in range(len(CURVES32)):
+            curve_order_kernel(
+                rows[2 * image, :m],
+                rows[2 * image + 1, :m],
+                CURVES32[curve, 0],
+                CURVES32[curve, 1],
+                CURVES32[curve, 2],
+                order,
+            )
+            for k in range(10):
+                for i in range(m):
+                    along[k, i] = rows[k, order[i]]
+            for k in range(1, WINDOW + 1):
+                _frames_agree(along, k, ahead[k - 1], behind[k - 1])
+            _add_votes(along[9], ahead, behind, order, agreement, votes)
+    for i in range(m):
+        out[match[i]] = agreement[i] / max(votes[i], MIN_VOTES32)
+
+
+@inner
+def _frames_agree(along: Array, k: int, ahead: Array, behind: Array) -> None:
+    """For matches i and j = i + k: how well j agrees with i -> ahead[i], i with j -> behind[i]."""
+    noise, sharpness, tiny = NOISE32, SHARPNESS32, MIN_SQUARE32
+    X0, Y0, X1, Y1, A, B, C, D, S = (
+        along[0], along[1], along[2], along[3], along[4], along[5], along[6], along[7], along[8],
+    )  # fmt: skip
+    for i in range(along.shape[1] - k):
+        j = i + k
+        dx, dy, ux, uy = X0[j] - X0[i], Y0[j] - Y0[i], X1[j] - X1[i], Y1[j] - Y1[i]
+        p, q = A[i] * dx + B[i] * dy - ux, C[i] * dx + D[i] * dy - uy
+        r, s = A[j] * dx + B[j] * dy - ux, C[j] * dx + D[j] * dy - uy
+        own, other = p * p + q * q, r * r + s * s
+        error = own if own > other else other
+        length0, length1 = math.sqrt(dx * dx + dy * dy + tiny), math.sqrt(ux * ux + uy * uy + tiny)
+        length = length0 * S[i] + length1 + noise
+        t = ONE32 + error / (length * length) * sharpness
+        t = t * t
+        t = t * t
+        t = t * t
+        ahead[i] = ONE32 / t
+        length = length0 * S[j] + length1 + noise
+        t = ONE32 + error / (length * length) * sharpness
+        t = t * t
+        t = t * t
+        t = t * t
+        behind[i] = ONE32 / t
+
+
+@inner
+def _add_votes(vote: Array, ahead: Array, behind: Array, order: Array, agreement: Array, votes: Array) -> None:
+    """Adds the votes of the neighbours along a curve, from the farthest before to the farthest after."""
+    m = len(vote)
+    total, all_votes = np.zeros(m, vote.dtype), np.zeros(m, vote.dtype)
+    for k in range(min(WINDOW, m - 1), 0, -1):
+        add_products(behind[k - 1], vote, m - k, total[k:], all_votes[k:])
+    for k in range(1, min(WINDOW, m - 1) + 1):
+        add_products(ahead[k - 1], vote[k:], m - k, total, all_votes)
+    for i in range(m):
+        agreement[order[i]] += total[i]
+        votes[order[i]] += all_votes[i]
+
+
+@inner
+def add_products(agree: Array, vote: Array, count: int, total: Array, votes: Array) -> None:
+    """Adds so many agreeing votes to the totals, and the votes."""
+    for i in range(count):
+        total[i] += agree[i] * vote[i]
+    for i in range(count):
+        votes[i] += vote[i]
+
+
+@kernel
+def frame_prior(agreement: F4x1, quality: F4x1, mask: B1x1, numbers: F4x1, out: F4x1) -> None:
+    """P(inlier) of `FrameConsistency` from agreement and ratio (n,) -> out (n,); zero where masked or not finite.
+
+    numbers: odds, floor, slope.
+    """
+    odds, floor, slope = numbers[0], numbers[1], numbers[2]
+    for i in range(len(mask)):
+        w, divisor = agreement[i] + floor, ONE32 + slope * quality[i]
+        o = odds * w * w * w / (divisor * divisor)
+        out[i] = o / (ONE32 + o) if mask[i] and math.isfinite(quality[i]) else ONE32 - ONE32
+
 
 TILE = 1 << 12  # matches looked at together: what a processor's cache holds; changes no result
 GPU_TILE = 1 << 17
@@ -47,7 +191,7 @@ def frame_agreement(
     if kernels_serve(x0, x1, lafs0, lafs1, quality):
         tensors = (x0, x1, lafs0, lafs1, quality, mask)
         out = torch.empty(mask.shape, dtype=torch.float32)
-        return for_each_pair(compiled.frame_agreement, tensors, out=out, group=compiled.FramedMatches).to(x0.dtype)
+        return for_each_pair(frame_agreement_kernel, tensors, out=out, group=FramedMatches).to(x0.dtype)
     S = frame_map(lafs0, lafs1)
     vote = torch.ones_like(x0[..., 0]) if quality is None else (WORST_RATIO - quality).clamp_min(MIN_VOTE)
     scale = sqrt((S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]).abs())
@@ -120,7 +264,7 @@ class FrameConsistency:
     kernels: worth compiling together with those of an estimator.
     """
 
-    kernels: ClassVar = (compiled.frame_agreement, compiled.frame_prior)
+    kernels: ClassVar = (frame_agreement_kernel, frame_prior)
 
     def __init__(self, *, odds: float, floor: float, slope: float) -> None:
         self.odds, self.floor, self.slope = odds, floor, slope
@@ -134,14 +278,14 @@ class FrameConsistency:
         if kernels_serve(c.x0, c.x1, frames0, frames1, ratio):
             tensors = (c.x0, c.x1, frames0, frames1, ratio, c.mask)
             prior = torch.empty(c.mask.shape, dtype=torch.float32)
-            for_each_pair(self._of_one_pair, tensors, out=prior, group=compiled.FramedMatches)
+            for_each_pair(self._of_one_pair, tensors, out=prior, group=FramedMatches)
             return c.derived(prior=prior.to(c.x0.dtype))
         return ungraphed(c, lambda: self._with_prior(c, frames0, frames1, ratio))
 
-    def _of_one_pair(self, matches: compiled.FramedMatches, out: Array) -> None:
+    def _of_one_pair(self, matches: FramedMatches, out: Array) -> None:
         w = np.empty_like(out)
-        compiled.frame_agreement(matches, w)
-        compiled.frame_prior(w, matches.quality, matches.mask, self._numbers, out)
+        frame_agreement_kernel(matches, w)
+        frame_prior(w, matches.quality, matches.mask, self._numbers, out)
 
     def _with_prior(self, c: Correspondences, lafs0: Tensor, lafs1: Tensor, ratio: Tensor) -> Correspondences:
         w = frame_agreement(c.x0, c.x1, lafs0, lafs1, ratio, c.mask) + self.floor

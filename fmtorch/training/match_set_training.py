@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from fmtorch.core import random
-from fmtorch.core.streams import Stream
-from fmtorch.features.networks.checkpoints import read_checkpoint
+from fmtorch.features.networks import read_checkpoint
+from fmtorch.jit import random
+from fmtorch.jit.random import Stream
 from fmtorch.training.match_sets import MAX_SIMILARITY, MatchSets, match_sets
 from fmtorch.training.patch_loop import PatchTraining, TrainingOptions
 from fmtorch.training.patch_objectives import DescriptorObjective

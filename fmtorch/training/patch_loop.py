@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from fmtorch.core import random
-from fmtorch.core.streams import Stream
-from fmtorch.features.networks.checkpoints import read_checkpoint
+from fmtorch.features.networks import read_checkpoint
+from fmtorch.jit import random
+from fmtorch.jit.random import Stream
 from fmtorch.training.patch_objectives import DRAWS, Objective
 from fmtorch.training.patch_store import PatchStore
 

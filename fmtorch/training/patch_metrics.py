@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.core import random
-from fmtorch.core.streams import Stream
+from fmtorch.jit import random
+from fmtorch.jit.random import Stream
 from fmtorch.training.patch_losses import distances
 from fmtorch.training.patch_store import PatchStore
 

@@ -12,9 +12,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from fmtorch.core import random
-from fmtorch.core.streams import Stream
-from fmtorch.features.orientation import PatchFunction
+from fmtorch.features.frames import PatchFunction
+from fmtorch.jit import random
+from fmtorch.jit.random import Stream
 from fmtorch.training.patch_losses import hard_negative_constant
 from fmtorch.training.patch_metrics import evaluate_descriptor, middle, patch_quality
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch.data.images import read_image
-from fmtorch.data.rendered.generate import Task
+from fmtorch.scenes.generate import Task
 from fmtorch.training.correspondences import CONTEXT_SIZE, Tolerance, corresponding_patches
 from fmtorch.training.photographs import Photograph
 from fmtorch.training.scenes import draw_patches

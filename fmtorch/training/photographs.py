@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
-from fmtorch.data.rendered.photographs import PICTURES, skimage_file
+from fmtorch.scenes.textures import PICTURES, skimage_file
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".ppm", ".tif", ".tiff"}
 PACKAGE_SOURCE = "scikit-image"

@@ -21,12 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
-from fmtorch.core.files import replacing
-from fmtorch.core.resources import cache_dir
+from fmtorch.core.files import cache_dir, replacing
 from fmtorch.data.cameras import relative_pose
 from fmtorch.data.images import read_image
 from fmtorch.data.pairs import ImagePair, ImageSource
-from fmtorch.data.rendered.pinhole import Camera, calibration
+from fmtorch.scenes.camera import Camera, calibration
 from fmtorch.training.photographs import Photograph
 from fmtorch.training.warps import Matrix, change_camera, change_light, grey_of, warp
 

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from fmtorch.core.files import replacing
 from fmtorch.pruning.networks.files import INPUT, OUTPUT, LearnedFile, OnnxBackbone, stated_network
 from fmtorch.pruning.networks.layers import Slots
-from fmtorch.pruning.networks.prediction import Exportable
+from fmtorch.pruning.networks.learned import Exportable
 from fmtorch.training.onnx_origin import forget_origin
 
 ATOL = 1e-4  # of torch against ONNX, in log-odds

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.data.rendered.generate import FAMILIES, Plan, Task, build, draw, seeds
-from fmtorch.data.rendered.pinhole import Camera
-from fmtorch.data.rendered.raycast import Geometry
+from fmtorch.scenes.camera import Camera
+from fmtorch.scenes.generate import FAMILIES, Plan, Task, build, draw, seeds
+from fmtorch.scenes.raycast import Geometry
 from fmtorch.training.correspondences import (
     SAME_PLACE,
     Tolerance,

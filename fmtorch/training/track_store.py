@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.data.images import read_image
-from fmtorch.data.rendered.generate import Task
+from fmtorch.scenes.generate import Task
 from fmtorch.training.correspondences import Tolerance, cut_context, detect, in_order_of_points
 from fmtorch.training.match_sets import Tracks
 from fmtorch.training.patch_store import PatchStore, count_by, write_store

@@ -8,11 +8,9 @@ import torch
 from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
-from fmtorch.core.random import uniform
-from fmtorch.core.streams import Stream
 from fmtorch.geometry.epipolar import lines_through, unit_largest
-from fmtorch.metrics.draws import segment_in_image
-from fmtorch.metrics.nsgd import BORDER
+from fmtorch.jit.random import Stream, uniform
+from fmtorch.metrics.nsgd import BORDER, segment_in_image
 
 TRIES = 4  # draws made for each point wanted; those whose epipolar line misses image 1 are dropped
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from fmtorch.core.arguments import Arrays, as_tensor
 from fmtorch.core.types import Correspondences
-from fmtorch.geometry.square_pixels import calibration_problems
+from fmtorch.geometry.cameras import calibration_problems
 
 Focal = Literal["shared", "unknown"] | float | Arrays | Mapping[str, Any] | None
 FORMS = "None, 'unknown', 'shared', (px, deviation) or ((px, deviation), (px, deviation))"

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from fmtorch.compiling import switch
-from fmtorch.compiling.together import compile_together
 from fmtorch.core.arguments import number
 from fmtorch.core.checks import expect_values
 from fmtorch.core.stages import Estimator, Pruner, model_of
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.ransac import Ransac
-from fmtorch.geometry.verdict import judged
+from fmtorch.geometry.significance import judged
+from fmtorch.jit import kernel
+from fmtorch.jit.together import compile_together
 from fmtorch.jobs.threads import one_thread
 from fmtorch.presets.files import load
 from fmtorch.presets.objects import construct, instantiate, merged
@@ -79,7 +79,7 @@ def _with_prior(c: Correspondences, estimator: Estimator) -> Correspondences:
     if c.prior is None and getattr(estimator, "uses_prior", False):
         framed = c.lafs0 is not None and c.lafs1 is not None and c.quality is not None
         pruner = _consistency(framed)
-        if switch.available():
+        if kernel.available():
             compile_together([*getattr(pruner, "kernels", ()), *getattr(estimator, "kernels", ())])
         with one_thread(c.mask.device):
             return pruner(c)

@@ -8,19 +8,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.compiling.batches import for_each_pair
 from fmtorch.core.records import ungraphed
 from fmtorch.core.stages import Estimator, Pruner
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.geometry.arithmetic import cofactors, component_sum, determinant, matmul3, sqrt
-from fmtorch.geometry.cameras import cross_matrix
+from fmtorch.geometry.cameras import calibration_problems, cross_matrix, mapped, square_pixels
+from fmtorch.geometry.covariance import two_view_covariance
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.normalize import canonical
-from fmtorch.geometry.pose import pose_from_fundamental
-from fmtorch.geometry.pose_kernels import pose
-from fmtorch.geometry.square_pixels import calibration_problems, mapped, square_pixels
-from fmtorch.geometry.two_view_covariance import two_view_covariance
-from fmtorch.geometry.verdict import judged
+from fmtorch.geometry.pose import pose, pose_from_fundamental
+from fmtorch.geometry.significance import judged
+from fmtorch.jit.batches import for_each_pair
 from fmtorch.jobs.threads import one_thread
 
 

@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fmtorch.compiling import switch
-from fmtorch.compiling.together import compile_together
 from fmtorch.core.estimate import CONFIGURATIONS, WARNINGS
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.geometry.arithmetic import component_sum, sqrt
-from fmtorch.geometry.configuration import (
+from fmtorch.geometry.epipolar import inverse_root
+from fmtorch.geometry.homography_pose import PlanePoses, poses_from_homography
+from fmtorch.geometry.pair_type import (
     GENERAL,
     IDENTICAL,
     PLANAR,
@@ -23,10 +23,10 @@ from fmtorch.geometry.configuration import (
     Evidence,
     classified,
     configuration_evidence,
+    weigh,
 )
-from fmtorch.geometry.configuration_kernels import weigh
-from fmtorch.geometry.epipolar import inverse_root
-from fmtorch.geometry.homography_pose import PlanePoses, poses_from_homography
+from fmtorch.jit import kernel
+from fmtorch.jit.together import compile_together
 from fmtorch.jobs.threads import one_thread
 from fmtorch.two_view.estimation import estimated, estimator_of
 
@@ -77,7 +77,7 @@ class Configuration(NamedTuple):
 
 def compile_with(stages: Iterable[object]) -> None:
     """Have the kernels of these stages and of `classify` ready; two processes compile those that are new."""
-    if switch.available():
+    if kernel.available():
         stages = (estimator_of("homography", None, {}), *stages)
         compile_together([weigh, *(each for stage in stages for each in getattr(stage, "kernels", ()))])
 

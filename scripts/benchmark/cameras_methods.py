@@ -16,7 +16,7 @@ import numpy as np
 import fmtorch
 from fmtorch import presets
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.storage.code import code_digest
+from fmtorch.runs.fingerprint import code_digest
 from scripts.benchmark import cameras_peers, kept
 from scripts.benchmark.cameras_knowledge import LEVELS, NOTHING, Answer, Array, Knowledge, answer
 from scripts.benchmark.matched import options
@@ -66,7 +66,7 @@ def identity(text: str) -> str:
         return kept.identity(stages + [("pruner", name, {}) for name in PRUNERS], spec.name, spec.level, code)
     files = [Path(cameras_peers.__file__), Path(cameras_peers.__file__).with_name("cameras_knowledge.py")]
     code = hashlib.blake2b(b"".join(file.read_bytes() for file in files)).hexdigest()
-    code += code_digest("fmtorch.estimators.peers.colmap") if spec.name.startswith("colmap") else ""
+    code += code_digest("fmtorch.estimators.external.colmap") if spec.name.startswith("colmap") else ""
     return kept.identity([], text, cameras_peers.version(spec.name), code)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from fmtorch.estimators.peers import colmap
+from fmtorch.estimators.external import colmap
 from scripts.benchmark.cameras_knowledge import (
     NOTHING,
     USUAL,

@@ -26,7 +26,7 @@ from fmtorch import find_homography, metrics, presets
 from fmtorch.core.estimate import CONFIGURATIONS
 from fmtorch.core.files import replacing
 from fmtorch.core.types import Correspondences, collate
-from fmtorch.estimators.peers import colmap
+from fmtorch.estimators.external import colmap
 from fmtorch.evaluation.pair_cameras import EXACT
 from fmtorch.geometry import poses_from_homography
 from fmtorch.two_view.known_cameras import KnownCameras

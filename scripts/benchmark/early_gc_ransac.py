@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.estimators.peers.pairwise import Pair, PairwiseEstimator, Solution
+from fmtorch.estimators.external.pairwise import Pair, PairwiseEstimator, Solution
 
 Single = NDArray[np.float32]
 MINIMAL, LOCAL_SAMPLE, LOCAL_SAMPLES = 7, 49, 20  # matches of a sample, those of local optimisation, how many of these

@@ -19,9 +19,9 @@ from rich.console import Console
 from fmtorch.core.types import Features
 from fmtorch.data import read_image
 from fmtorch.data.images import to_grey
-from fmtorch.data.rendered.photographs import photograph
 from fmtorch.features import SIFT, DominantGradient, HessianDetector, ImagePyramid, PatchSIFT, local_feature
 from fmtorch.matching import NearestNeighborMatcher
+from fmtorch.scenes.textures import photograph
 from fmtorch.training.onnx_layout import lay_out
 
 OURS = "ours"

@@ -25,7 +25,7 @@ from fmtorch.evaluation.run import select
 from fmtorch.evaluation.statistics import PERCENT
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import build, load
-from fmtorch.storage import PairRow
+from fmtorch.runs import PairRow
 from scripts.benchmark.early_gc_ransac import EarlyGCRansac
 from scripts.benchmark.matched import add_set_arguments, console, sets_of
 from scripts.benchmark.paper_table import PAPER

@@ -18,7 +18,7 @@ import torch
 from rich.progress import track
 
 from fmtorch.data import ImagePair, read_image, to_grey
-from fmtorch.data.matchable import Keypoints, keypoints, matchable
+from fmtorch.data.construction import Keypoints, keypoints, matchable
 from fmtorch.evaluation.run import select
 from fmtorch.evaluation.statistics import PERCENT, areas, described, difference, interval, recalled
 from fmtorch.presets.pruners import WIDE

@@ -31,7 +31,7 @@ from rich.table import Table
 
 from fmtorch import find_homography, presets
 from fmtorch.core.types import Correspondences
-from fmtorch.evaluation.bootstrap import bootstrap_mean, paired_bootstrap
+from fmtorch.evaluation.statistics import bootstrap_mean, paired_bootstrap
 from scripts.benchmark.homography_pairs import Case, hard, mapped, points, views, warped
 from scripts.benchmark.matched import console
 

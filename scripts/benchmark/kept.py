@@ -11,9 +11,8 @@ import hydra.utils
 
 from fmtorch.presets import load, peer_packages, targets_of
 from fmtorch.presets.objects import merged
-from fmtorch.storage import identity_digest
-from fmtorch.storage.code import code_digest
-from fmtorch.storage.configuration import learned, libraries
+from fmtorch.runs import identity_digest
+from fmtorch.runs.fingerprint import code_digest, learned, libraries
 
 Row = dict[str, Any]
 Stages = list[tuple[str, str, Mapping[str, Any]]]  # group, preset and changed options of each

@@ -20,8 +20,8 @@ import numpy as np
 import torch
 
 from fmtorch import presets
-from fmtorch.compiling import switch
 from fmtorch.core.types import Correspondences
+from fmtorch.jit import kernel
 from scripts.benchmark.matched import pruner
 from scripts.benchmark.pruning_speed import correspondences
 
@@ -91,11 +91,11 @@ def time_stages(names: Sequence[str], c: Correspondences) -> None:
         stage = pruner(name)
 
         def run(form: str, stage: Any = stage) -> None:
-            os.environ[switch.SWITCH] = form
+            os.environ[kernel.SWITCH] = form
             stage(c)
 
         line(name, functools.partial(run, "on"), functools.partial(run, "off"))
-    os.environ[switch.SWITCH] = "on"
+    os.environ[kernel.SWITCH] = "on"
 
 
 if __name__ == "__main__":

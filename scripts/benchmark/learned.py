@@ -31,7 +31,7 @@ from fmtorch.data import ImagePair
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.run import select
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
-from fmtorch.storage.features import cached
+from fmtorch.runs.feature_cache import cached
 from scripts.benchmark import learned_table
 from scripts.benchmark.kept import Kept, Row, Stages, identity, read
 from scripts.benchmark.matched import add_set_arguments, options, pruner, sets_of

@@ -20,7 +20,7 @@ from fmtorch.data import ImagePair, PairDataset
 from fmtorch.evaluation.statistics import scene_names
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets.pruners import WIDE
-from fmtorch.storage.features import cached
+from fmtorch.runs.feature_cache import cached
 from scripts.benchmark import kept
 
 console = Console(width=None if sys.stdout.isatty() else 170)

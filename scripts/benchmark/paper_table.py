@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fmtorch.evaluation.bootstrap import Interval
-from fmtorch.evaluation.statistics import PERCENT, described, difference, interval, recalled
+from fmtorch.evaluation.statistics import PERCENT, Interval, described, difference, interval, recalled
 from fmtorch.presets.pruners import WIDE
 from scripts.benchmark.pipelines_table import REAL, Values, failed, nsgd_by_seed, solved_means
 from scripts.benchmark.pruning_table import KIN, Row, scenes_of

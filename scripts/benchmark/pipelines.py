@@ -24,9 +24,9 @@ from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.run import select
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.presets.pruners import WIDE
-from fmtorch.storage import identity_digest
-from fmtorch.storage.configuration import configuration
-from fmtorch.storage.features import CachedFeatures
+from fmtorch.runs import identity_digest
+from fmtorch.runs.feature_cache import CachedFeatures
+from fmtorch.runs.fingerprint import configuration
 from scripts.benchmark import pipelines_table
 from scripts.benchmark.kept import Kept, read
 from scripts.benchmark.matched import add_set_arguments, console, sets_of

@@ -29,8 +29,7 @@ from rich.progress import track
 
 from fmtorch import metrics, presets
 from fmtorch.data import DataError, ImagePair
-from fmtorch.evaluation.intervals import MIN_UNITS
-from fmtorch.evaluation.statistics import PERCENT, difference
+from fmtorch.evaluation.statistics import MIN_UNITS, PERCENT, difference
 from scripts.benchmark import matched, sheet
 from scripts.benchmark import posebench_methods as methods_of
 from scripts.benchmark.kept import Kept, Row

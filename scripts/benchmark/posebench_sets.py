@@ -14,7 +14,7 @@ from fmtorch import data
 from fmtorch.core.types import Correspondences
 from fmtorch.data import DataError, ImagePair
 from fmtorch.data.pairs import GivenMatches
-from fmtorch.storage.exchange import h5
+from fmtorch.io import h5
 from scripts.benchmark import matched
 from scripts.benchmark.matched import console
 

@@ -28,7 +28,7 @@ from fmtorch.data import ImagePair
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.run import select
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
-from fmtorch.storage.features import cached
+from fmtorch.runs.feature_cache import cached
 from scripts.benchmark import pruning_speed, pruning_table
 from scripts.benchmark.matched import add_set_arguments, pruner, sets_of
 from scripts.benchmark.sheet import put

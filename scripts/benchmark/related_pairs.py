@@ -11,9 +11,9 @@ import numpy as np
 
 from fmtorch.core.types import pair_key
 from fmtorch.data import ImagePair, ImageSource, PairDataset
-from fmtorch.data.rendered import photographs
-from fmtorch.data.rendered.dataset import RenderedPairs
-from fmtorch.data.rendered.generate import build
+from fmtorch.scenes import textures
+from fmtorch.scenes.dataset import RenderedPairs
+from fmtorch.scenes.generate import build
 
 UNRELATED = "unrelated"
 """What the names of families of pairs of different scenes begin with."""
@@ -78,7 +78,7 @@ def photographs_shown(dataset: RenderedPairs) -> dict[str, frozenset[str]]:
     """The names of the photographs that each rendered scene is built with, whether they can be seen or not."""
     shown = {}
     for name, task in dataset._tasks.items():
-        with mock.patch.object(photographs, "photograph", wraps=photographs.photograph) as taken:
+        with mock.patch.object(textures, "photograph", wraps=textures.photograph) as taken:
             build(task)
         shown[name] = frozenset(str(call.args[0]) for call in taken.call_args_list)
     return shown

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from fmtorch.core.types import RELATED
-from fmtorch.evaluation.intervals import share_interval
+from fmtorch.evaluation.statistics import share_interval
 
 Row = dict[str, Any]
 RIGHT = 0.05  # NSGD below which an estimate of a related pair is right

@@ -20,14 +20,14 @@ import torch
 from rich.console import Console
 
 from fmtorch.data.pairs import ImagePair
-from fmtorch.data.rendered import RenderedPairs
 from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import summarize
 from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.pool import WorkerPool
 from fmtorch.jobs.runner import Factory, Local, TaskRunner
 from fmtorch.pipeline.build import load_pipeline
-from fmtorch.storage import PairRow, RunFolder
+from fmtorch.runs import PairRow, RunFolder
+from fmtorch.scenes import RenderedPairs
 from scripts.benchmark.scale_pairs import given_pairs
 
 PIPELINES = {"given matches": "given_fmtorch", "SIFT": "sift_fmtorch", "HesAffNet": "hesaffnet_fmtorch"}

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 
 from fmtorch.data.pairs import ImagePair
-from fmtorch.storage.exchange.dataset import H5Pairs
+from fmtorch.io.dataset import H5Pairs
 
 
 def given_pairs(root: Path, pairs: int, matches: int = 60, seed: int = 0, outliers: float = 0.0) -> list[ImagePair]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rich.table import Table
 
-from fmtorch.evaluation.bootstrap import Interval
+from fmtorch.evaluation.statistics import Interval
 
 MISSING = "–"
 PUBLISHED = ("recall", "inlier", "inlier_m", "corrs", "corrs_m")  # columns of the paper's tables

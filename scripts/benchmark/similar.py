@@ -16,8 +16,8 @@ from fmtorch import presets
 from fmtorch.data import read_image
 from fmtorch.features.vlad import Codebook, codebook, descriptor_kind, load_codebook, local_descriptors, vlad
 from fmtorch.pipeline.build import load_pipeline
+from fmtorch.pipeline.folder import similar_pairs
 from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.pipeline.similar import similar_pairs
 from fmtorch.pipeline.two_images import describe
 
 Pair = frozenset[Path]

@@ -21,8 +21,8 @@ from rich.table import Table
 from fmtorch import presets
 from fmtorch.data import read_image
 from fmtorch.data.images import to_grey
-from fmtorch.data.rendered.photographs import photograph
 from fmtorch.features import ImagePyramid, LocalFeature
+from fmtorch.scenes.textures import photograph
 
 STAGES = ("detection", "shape", "orientation", "description")
 

@@ -21,7 +21,7 @@ from fmtorch.data import ImagePair
 from fmtorch.evaluation.run import select
 from fmtorch.geometry.epipolar import symmetric_max
 from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.pruning.one_to_one import one_to_one
+from fmtorch.pruning.filters import one_to_one
 from scripts.benchmark.matched import console, sets_of
 
 Array = NDArray[Any]

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from fmtorch.evaluation.statistics import PERCENT, areas
-from fmtorch.storage import replacing
+from fmtorch.runs import replacing
 from scripts.benchmark.stress_rows import GROUPS, Row, figures, group, label, levels, methods
 
 AXES = {"inlier ratio": "inlier ratio", "noise": "added noise [px]", "match count": "matches"}

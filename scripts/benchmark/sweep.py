@@ -21,7 +21,7 @@ from fmtorch.commands.report import run_folders
 from fmtorch.evaluation.statistics import MERITS, PERCENT, SHARES, described, difference, scene_names
 from fmtorch.evaluation.summary import ALL, summarize
 from fmtorch.presets.pruners import WIDE
-from fmtorch.storage import RunFolder
+from fmtorch.runs import RunFolder
 from scripts.benchmark.matched import console
 from scripts.benchmark.pipelines_table import PAPER, REAL
 from scripts.benchmark.pruning_table import KIN

@@ -21,7 +21,7 @@ from typing import Any
 import torch
 
 import fmtorch
-from fmtorch.estimators.peers import colmap
+from fmtorch.estimators.external import colmap
 from scripts.benchmark.kept import Kept, Row
 from scripts.benchmark.matched import console
 from scripts.benchmark.sheet import put

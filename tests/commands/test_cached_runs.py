@@ -13,8 +13,7 @@ from fmtorch import MatchResult, match
 from fmtorch.core.stages import FeatureExtractor
 from fmtorch.data import load
 from fmtorch.pipeline.build import load_pipeline
-from fmtorch.storage.cache import ArrayCache
-from fmtorch.storage.features import CachedFeatures
+from fmtorch.runs.feature_cache import ArrayCache, CachedFeatures
 from tests.commands.test_eval import OPTIONS, evaluate, rows
 from tests.commands.test_match import run_python
 from tests.conftest import shared_path

@@ -22,7 +22,7 @@ import fmtorch
 from fmtorch import presets
 from fmtorch.commands import match as match_command
 from fmtorch.core.estimate import WARNINGS
-from fmtorch.core.resources import conf_dir
+from fmtorch.core.files import conf_dir
 from fmtorch.core.types import RELATED
 from fmtorch.data import ImageError, read_image
 from fmtorch.geometry import homography_points, sampson

@@ -13,10 +13,9 @@ import torch
 from PIL import ExifTags, Image
 
 import fmtorch
-from fmtorch.commands.match_cameras import photographs, pose_line, pose_report
+from fmtorch.commands.match import photographs, pose_line, pose_report
 from fmtorch.data import ImageError, ImagePair, load
-from fmtorch.data.lenses import Lens
-from fmtorch.data.undistort_points import undistorted_points
+from fmtorch.data.lenses import Lens, undistorted_points
 from fmtorch.geometry import sampson
 from fmtorch.metrics import nsgd, pose_error
 from fmtorch.pipeline.build import load_pipeline

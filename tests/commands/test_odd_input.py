@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import pytest
 
-from fmtorch.core.resources import models_dir
-from fmtorch.storage import RunFolder
+from fmtorch.core.files import models_dir
+from fmtorch.runs import RunFolder
 from tests.commands.test_command_line import ended
 from tests.commands.test_match import stereo
 from tests.processes import run_command

@@ -18,15 +18,14 @@ from fmtorch.commands import report
 from fmtorch.core.types import Estimate
 from fmtorch.data import read_image
 from fmtorch.evaluation import tables
-from fmtorch.evaluation.gallery import Options, rebuilt, shown_pair
+from fmtorch.evaluation.gallery import Options, difference, rebuilt, shown_pair
 from fmtorch.evaluation.page import Section, differing_pairs, render
-from fmtorch.evaluation.redraw import difference
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.summary import summarize
 from fmtorch.pipeline.build import build_pipeline
 from fmtorch.pipeline.pipeline import Outcome
 from fmtorch.presets.composition import compose
-from fmtorch.storage import PairRow, RunFolder, RunFolderError, to_table
+from fmtorch.runs import PairRow, RunFolder, RunFolderError, to_table
 from tests.pipeline.test_pipeline import draw, pair
 from tests.processes import run_command
 

@@ -5,9 +5,8 @@ import pytest
 import torch
 from scipy import stats
 
-from fmtorch.core.random import bits, uniform
-from fmtorch.core.streams import Stream
 from fmtorch.core.types import pair_key
+from fmtorch.jit.random import Stream, bits, uniform
 from tests.reference import random as reference
 
 KEYS = torch.tensor([0, 1, -1, 2**63 - 1, -(2**63), pair_key("fountain-P11/3-7")])

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 import fmtorch
-from fmtorch.core import resources
+from fmtorch.core import files
 
 CHECKOUT = Path(fmtorch.__file__).resolve().parents[1]
 
@@ -15,43 +15,43 @@ def _installation(root: Path, monkeypatch: pytest.MonkeyPatch, *folders: str) ->
     package.mkdir(parents=True)
     for folder in folders:
         (root / "site-packages" / folder).mkdir(parents=True)
-    monkeypatch.setattr(resources, "_PACKAGE", package)
+    monkeypatch.setattr(files, "_PACKAGE", package)
     return package
 
 
 def test_in_this_checkout() -> None:
-    assert resources.models_dir() == CHECKOUT / "models"
-    assert resources.conf_dir() == CHECKOUT / "conf"
+    assert files.models_dir() == CHECKOUT / "models"
+    assert files.conf_dir() == CHECKOUT / "conf"
 
 
 def test_folders_do_not_depend_on_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = resources.models_dir()
+    before = files.models_dir()
     (tmp_path / "models").mkdir()
     monkeypatch.chdir(tmp_path)
-    assert resources.models_dir() == before
+    assert files.models_dir() == before
     assert before.is_absolute()
 
 
 def test_an_installed_wheel_uses_its_own_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     package = _installation(tmp_path, monkeypatch, "fmtorch/conf", "fmtorch/models", "conf", "models")
-    assert resources.conf_dir() == package / "conf"
-    assert resources.models_dir() == package / "models"
+    assert files.conf_dir() == package / "conf"
+    assert files.models_dir() == package / "models"
 
 
 def test_an_incomplete_installation_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     package = _installation(tmp_path, monkeypatch)
     with pytest.raises(FileNotFoundError, match=f"'conf' in {package}"):
-        resources.conf_dir()
+        files.conf_dir()
 
 
 def test_cache_dir(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", "/home/someone")
     monkeypatch.setenv("XDG_CACHE_HOME", "/scratch/cache")
     monkeypatch.setenv("FMTORCH_CACHE", "/data/fmtorch")
-    assert resources.cache_dir() == Path("/data/fmtorch")
+    assert files.cache_dir() == Path("/data/fmtorch")
     monkeypatch.setenv("FMTORCH_CACHE", "~/here")
-    assert resources.cache_dir() == Path("/home/someone/here")
+    assert files.cache_dir() == Path("/home/someone/here")
     monkeypatch.setenv("FMTORCH_CACHE", "")
-    assert resources.cache_dir() == Path("/scratch/cache/fmtorch")
+    assert files.cache_dir() == Path("/scratch/cache/fmtorch")
     monkeypatch.delenv("XDG_CACHE_HOME")
-    assert resources.cache_dir() == Path("/home/someone/.cache/fmtorch")
+    assert files.cache_dir() == Path("/home/someone/.cache/fmtorch")

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from fmtorch.data.candidates import AllPairs, ListedPairs, drawn, following, sharing_points
+from fmtorch.data.scenes import AllPairs, ListedPairs, drawn, following, sharing_points
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 7, 50])

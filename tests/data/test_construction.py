@@ -12,8 +12,8 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 
 from fmtorch.commands import pairs as command
+from fmtorch.data import construction as rule
 from fmtorch.data import load, read_image
-from fmtorch.data import matchable as rule
 from fmtorch.data.cameras import Camera, fundamental
 from fmtorch.data.construction import Construction, blocks
 from fmtorch.data.images import to_grey

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from fmtorch.data import DataError
-from fmtorch.data.object_arrays import NpzArrays
+from fmtorch.data.npz_arrays import NpzArrays
 
 
 def objects() -> np.ndarray:

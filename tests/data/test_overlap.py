@@ -15,7 +15,6 @@ from hydra.core.global_hydra import GlobalHydra
 
 from fmtorch.commands import pairs as command
 from fmtorch.data import load
-from fmtorch.data.candidates import incidence
 from fmtorch.data.construction import Construction
 from fmtorch.data.overlap import (
     STEP,
@@ -28,9 +27,9 @@ from fmtorch.data.overlap import (
     shared_points,
 )
 from fmtorch.data.pairs import ImageSource
-from fmtorch.data.rendered import Plan, RenderedPairs
-from fmtorch.data.rendered.dataset import RenderedScenePairs
-from fmtorch.data.scenes import ScenePairs
+from fmtorch.data.scenes import ScenePairs, incidence
+from fmtorch.scenes import Plan, RenderedPairs
+from fmtorch.scenes.dataset import RenderedScenePairs
 from tests.conftest import shared_path
 from tests.data.native import write_bundler, write_colmap, write_kitti
 from tests.reference import overlap as reference

@@ -14,13 +14,13 @@ import cv2
 import numpy as np
 import pytest
 
-from fmtorch.data.matchable import Keypoints, keypoints, matchable
-from fmtorch.data.rendered import Plan, RenderedPairs
-from fmtorch.data.rendered import generate as generation
-from fmtorch.data.rendered.generate import FAMILIES, PLANS, Task, build, generate, read, recorded_pairs, seeds
-from fmtorch.data.rendered.photographs import MATERIALS, PICTURES
-from fmtorch.data.rendered.pinhole import fundamental
-from fmtorch.data.rendered.scene import Scene
+from fmtorch.data.construction import Keypoints, keypoints, matchable
+from fmtorch.scenes import Plan, RenderedPairs
+from fmtorch.scenes import generate as generation
+from fmtorch.scenes.camera import fundamental
+from fmtorch.scenes.generate import FAMILIES, PLANS, Task, build, generate, read, recorded_pairs, seeds
+from fmtorch.scenes.scene import Scene
+from fmtorch.scenes.textures import MATERIALS, PICTURES
 
 TINY = Plan(scenes=1, shots=3, pairs=2, scale=0.25)
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from fmtorch.data import DepthDataset, load
-from fmtorch.data.rendered import Plan, RenderedPairs
-from fmtorch.data.rendered import depth as depth_module
-from fmtorch.data.rendered.depth import depth_at
-from fmtorch.data.rendered.generate import Task, build
-from fmtorch.data.rendered.light import Lens, Light
-from fmtorch.data.rendered.pinhole import Camera, calibration, look_at
-from fmtorch.data.rendered.scene import Scene, Shot
-from fmtorch.data.rendered.surfaces import Surfaces, vec
+from fmtorch.scenes import Plan, RenderedPairs
+from fmtorch.scenes import dataset as depth_module
+from fmtorch.scenes.camera import Camera, calibration, look_at
+from fmtorch.scenes.dataset import depth_at
+from fmtorch.scenes.generate import Task, build
+from fmtorch.scenes.light import Lens, Light
+from fmtorch.scenes.scene import Scene, Shot
+from fmtorch.scenes.surfaces import Surfaces, vec
 from tests.reference.labels import first_hit
 
 SIZE = (60, 80)

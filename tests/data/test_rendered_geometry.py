@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from fmtorch.data.rendered.generate import FAMILIES, Plan, Task, build
-from fmtorch.data.rendered.light import Light, Stage
-from fmtorch.data.rendered.mipmap import TO_LINEAR, Texture, to_srgb
-from fmtorch.data.rendered.pinhole import Camera, calibration, fundamental, look_at, relative_pose
-from fmtorch.data.rendered.raycast import Geometry
-from fmtorch.data.rendered.surfaces import Surfaces, vec
+from fmtorch.scenes.camera import Camera, calibration, fundamental, look_at, relative_pose
+from fmtorch.scenes.generate import FAMILIES, Plan, Task, build
+from fmtorch.scenes.light import Light, Stage
+from fmtorch.scenes.raycast import Geometry
+from fmtorch.scenes.surfaces import Surfaces, vec
+from fmtorch.scenes.textures import TO_LINEAR, Texture, to_srgb
 from tests.reference.rendering import colour
 
 SIZE = (120, 160)

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fmtorch.data.rendered import raycast
-from fmtorch.data.rendered.depth import depth_at
-from fmtorch.data.rendered.generate import FAMILIES, Plan, Task, build
-from fmtorch.data.rendered.light import Lens, Light, Stage, expose
-from fmtorch.data.rendered.pinhole import Camera, calibration, look_at
-from fmtorch.data.rendered.raycast import Geometry
-from fmtorch.data.rendered.surfaces import Surfaces, vec
+from fmtorch.scenes import raycast
+from fmtorch.scenes.camera import Camera, calibration, look_at
+from fmtorch.scenes.dataset import depth_at
+from fmtorch.scenes.generate import FAMILIES, Plan, Task, build
+from fmtorch.scenes.light import Lens, Light, Stage, expose
+from fmtorch.scenes.raycast import Geometry
+from fmtorch.scenes.surfaces import Surfaces, vec
 from tests.reference import rendering as reference
 
 SIZE = (90, 120)

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from fmtorch.data.rendered import StereoPair
-from fmtorch.data.rendered.photographs import skimage_file
+from fmtorch.scenes import StereoPair
+from fmtorch.scenes.textures import skimage_file
 
 
 def test_one_pair_with_the_protocol() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fmtorch.data import ImageSource, read_image
-from fmtorch.data.resampling import Resampling, longer_side, shorter_side
+from fmtorch.data.pairs import Resampling, longer_side, shorter_side
 
 SIZE = (6, 9)
 

@@ -8,7 +8,7 @@ import pytest
 
 from fmtorch import presets
 from fmtorch.data import DataError
-from fmtorch.data.splits import SPLITS, chosen
+from fmtorch.data.scenes import SPLITS, chosen
 
 THERE = ["06", "rgbd_dataset_freiburg1_xyz", "rgbd_dataset_freiburg3_teddy", "Horse", "Train"]
 

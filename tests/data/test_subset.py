@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from fmtorch.data import DepthDataset, PairDataset, load
-from fmtorch.data.rendered import Plan, RenderedPairs
-from fmtorch.data.subset import subset
+from fmtorch.data.pairs import subset
+from fmtorch.scenes import Plan, RenderedPairs
 from tests.conftest import shared_path
 
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.data.rendered import Plan
-from fmtorch.data.rendered import dataset as rendered_dataset
+from fmtorch.scenes import Plan
+from fmtorch.scenes import dataset as rendered_dataset
 from tests.conftest import own_cache
 
 NOTEBOOKS = Path(__file__).resolve().parents[2] / "docs" / "notebooks"

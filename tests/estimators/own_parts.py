@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from fmtorch.estimators import F4x2, Pair, SummedGains, kernel
-from fmtorch.estimators.parts.sampling import Uniform
+from fmtorch.estimators.sampling import Uniform
 
 Array = np.ndarray[Any, Any]
 

@@ -10,7 +10,7 @@ import torch
 from fmtorch.core.types import Correspondences
 from fmtorch.estimators.batch import Batch
 from fmtorch.estimators.pair import Pair
-from fmtorch.geometry.eight_point_kernels import weighted_eight_point
+from fmtorch.geometry.eight_point import weighted_eight_point
 from tests.conftest import oracle
 from tests.laws import scene, small
 

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fmtorch.compiling.arrays import Array
 from fmtorch.estimators.pair import Pair
+from fmtorch.jit.kernel import Array
 from tests.reference.ransac import sampson
 
 SUMS, ROW, LAST = 8, 3, 16

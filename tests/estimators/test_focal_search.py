@@ -11,14 +11,14 @@ import torch
 from fmtorch import presets
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.estimators import Ransac, focal_search
-from fmtorch.estimators.families.cameras import Cameras, no_cameras
-from fmtorch.estimators.families.focals import FundamentalWithFocals, Refined
 from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
+from fmtorch.estimators.models.posterior import Cameras, no_cameras
+from fmtorch.estimators.models.with_focals import FundamentalWithFocals, Refined
 from fmtorch.estimators.options import Focal
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.refinement import Candidates, Refinement
-from fmtorch.estimators.parts.saturated import SaturatedGains
-from tests.estimators.families.photographs import TALL, WIDE, photographs
+from fmtorch.estimators.refinement import Candidates, Refinement
+from fmtorch.estimators.scores import SaturatedGains
+from tests.estimators.models.photographs import TALL, WIDE, photographs
 from tests.estimators.pairs import pair_of, to_units
 from tests.laws import scene, scenes
 from tests.reference import focal as reference

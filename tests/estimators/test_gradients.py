@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from fmtorch.core.types import Correspondences, collate
-from fmtorch.estimators import IterativelyReweighted, Ransac
-from fmtorch.estimators.parts import final_fits
+from fmtorch.estimators import IterativelyReweighted, Ransac, final_fits
 from fmtorch.geometry import KERNELS
-from tests.estimators.families.photographs import TALL, WIDE, photographs
+from tests.estimators.models.photographs import TALL, WIDE, photographs
 from tests.laws import degenerate, scene
 
 VARIABLES = ("x0", "x1", "prior", "noise")

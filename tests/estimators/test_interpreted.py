@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from fmtorch import presets
-from fmtorch.compiling.switch import SWITCH
+from fmtorch.jit.kernel import SWITCH
 from tests.laws import few, scene
 
 PROGRAM = """

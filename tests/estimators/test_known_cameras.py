@@ -14,8 +14,9 @@ import fmtorch
 from fmtorch import presets
 from fmtorch.core.types import Correspondences, Estimate, collate
 from fmtorch.data import ImagePair, load
-from fmtorch.estimators.parts import final_fits
-from fmtorch.geometry import fundamental_from_calibration, square_pixels
+from fmtorch.estimators import final_fits
+from fmtorch.geometry import cameras as square_pixels
+from fmtorch.geometry import fundamental_from_calibration
 from fmtorch.metrics import pose_error
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.two_view.known_cameras import KnownCameras

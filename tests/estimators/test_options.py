@@ -12,9 +12,8 @@ from fmtorch import find_fundamental, presets
 from fmtorch.estimators import Ransac
 from fmtorch.estimators.options import Focal, Preselect, Refine, Select, group
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.scored_matches import scored_matches
-from fmtorch.estimators.parts.scores import InlierCount, Msac, squared_residuals_of
 from fmtorch.estimators.registry import PARTS, part
+from fmtorch.estimators.scores import InlierCount, Msac, scored_matches, squared_residuals_of
 from tests.laws import scene
 
 MEDIAN = {"score": "median", "inliers": "lmeds", "confidence": None}

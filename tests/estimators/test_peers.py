@@ -13,7 +13,7 @@ import torch
 from fmtorch import find_essential, geometry, presets
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.estimators import PairwiseEstimator
-from fmtorch.estimators.peers.pairwise import Pair, Solution
+from fmtorch.estimators.external.pairwise import Pair, Solution
 from fmtorch.two_view.known_cameras import KnownCameras
 from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.geometry.scenes import scene as matched_scene

@@ -12,11 +12,11 @@ import torch
 
 import fmtorch
 from fmtorch import presets
-from fmtorch.compiling.kernel import Kernel
 from fmtorch.core.types import collate
 from fmtorch.estimators import Ransac
+from fmtorch.estimators.inliers import residuals_squared_px
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.inliers import residuals_squared_px
+from fmtorch.jit.kernel import Kernel
 from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.estimators.pairs import pair_of
 from tests.laws import quick, scene, scenes

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from fmtorch.estimators import Ransac
-from fmtorch.estimators.families.family import Hypotheses
-from fmtorch.estimators.families.fundamental import EightPoint, SevenPoint
+from fmtorch.estimators.inliers import StoppingRule
+from fmtorch.estimators.models.fundamental import EightPoint, SevenPoint
+from fmtorch.estimators.models.model import Hypotheses
 from fmtorch.estimators.options import Preselect
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.inliers import StoppingRule
-from fmtorch.estimators.parts.preselection import Preselection
-from fmtorch.estimators.parts.sampling import PriorWeighted, Prosac, Sampler, Uniform
-from fmtorch.estimators.parts.scores import InlierCount, Msac
+from fmtorch.estimators.preselection import Preselection
+from fmtorch.estimators.sampling import PriorWeighted, Prosac, Sampler, Uniform
+from fmtorch.estimators.scores import InlierCount, Msac
 from fmtorch.estimators.search import Pool, Search, Verified, merge
 from tests.estimators.pairs import FEW, SCALES, named, pair_of
 from tests.laws import scene

@@ -12,12 +12,12 @@ import torch
 
 from fmtorch import find_fundamental
 from fmtorch.core.types import Correspondences, Estimate, collate
-from fmtorch.estimators.families import focals
-from fmtorch.estimators.families.family import FitScale
-from fmtorch.estimators.families.fundamental import Fundamental
-from fmtorch.estimators.families.homography import Homography
-from fmtorch.estimators.parts import degensac
-from fmtorch.estimators.parts.graph_cut import GraphCut
+from fmtorch.estimators import degensac
+from fmtorch.estimators.graph_cut import GraphCut
+from fmtorch.estimators.models import with_focals
+from fmtorch.estimators.models.fundamental import Fundamental
+from fmtorch.estimators.models.homography import Homography
+from fmtorch.estimators.models.model import FitScale
 from fmtorch.presets.objects import merged
 from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.laws import PEERS, few, quick, scene, small
@@ -26,8 +26,8 @@ from tests.variants import built, loaded, variants
 EVERY = variants("estimator")
 OWN = [name for name in EVERY if not name.startswith(OTHER_LIBRARIES)]
 PIXELS = [  # what is a distance in pixels and no option
-    (degensac, "PLANE_THRESHOLD_PX"), (focals, "INLIER_SIGMA_PX"), (focals, "LOSS_SCALE_PX"),
-    (focals, "PARALLEL_PX"), (GraphCut, "RADIUS_PX"), (Fundamental, "fit_scale"), (Homography, "fit_scale"),
+    (degensac, "PLANE_THRESHOLD_PX"), (with_focals, "INLIER_SIGMA_PX"), (with_focals, "LOSS_SCALE_PX"),
+    (with_focals, "PARALLEL_PX"), (GraphCut, "RADIUS_PX"), (Fundamental, "fit_scale"), (Homography, "fit_scale"),
 ]  # fmt: skip
 
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fmtorch.evaluation.bootstrap import MIN_SCENES, RESAMPLES, bootstrap_mean, paired_bootstrap
+from fmtorch.evaluation.statistics import MIN_SCENES, RESAMPLES, bootstrap_mean, paired_bootstrap
 from tests.reference.bootstrap import bootstrap_interval
 
 
@@ -63,7 +63,7 @@ def test_repeatable_and_blind_to_names_and_blocks(monkeypatch: pytest.MonkeyPatc
     result = bootstrap_mean(values, names)
     assert bootstrap_mean(values, names) == result
     assert bootstrap_mean(values, ["x" + name for name in names]) == result
-    monkeypatch.setattr("fmtorch.evaluation.bootstrap._BLOCK", 70)
+    monkeypatch.setattr("fmtorch.evaluation.statistics._BLOCK", 70)
     again = bootstrap_mean(values, names)
     assert again.low == pytest.approx(result.low, abs=quantile_error(values, 10, RESAMPLES))
 

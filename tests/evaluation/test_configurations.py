@@ -18,16 +18,14 @@ from fmtorch.core.types import Correspondences
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.data.pairs import GivenMatches
 from fmtorch.evaluation import tables
-from fmtorch.evaluation.focals import focal_errors
 from fmtorch.evaluation.pair_cameras import WithPairCameras, built_with, cameras_of
-from fmtorch.evaluation.rows import evaluate
+from fmtorch.evaluation.rows import evaluate, focal_errors
 from fmtorch.evaluation.statistics import focal_figures
 from fmtorch.evaluation.summary import summarize
 from fmtorch.evaluation.summary_tables import further_tables, summary_markdown
-from fmtorch.pipeline.examination import examined
-from fmtorch.pipeline.pipeline import Outcome, Pipeline
-from fmtorch.storage import PairRow, to_table
-from fmtorch.storage.exchange.dataset import H5Pairs
+from fmtorch.io.dataset import H5Pairs
+from fmtorch.pipeline.pipeline import Outcome, Pipeline, examined
+from fmtorch.runs import PairRow, to_table
 from tests.geometry.kinds import K, batch, draw
 from tests.storage.exchange import writers
 

@@ -25,7 +25,7 @@ from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.pool import WorkersLost
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.storage import PairRow
+from fmtorch.runs import PairRow
 from scripts.benchmark.scale_pairs import given_pairs
 
 PAIRS = 96

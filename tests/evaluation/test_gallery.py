@@ -18,7 +18,7 @@ from fmtorch.evaluation import gallery as module
 from fmtorch.evaluation.gallery import Options, Run, find_dataset, gallery
 from fmtorch.evaluation.page import Section, ShownPair, render
 from fmtorch.presets.composition import compose
-from fmtorch.storage import PairRow, RunFolder, to_table
+from fmtorch.runs import PairRow, RunFolder, to_table
 from tests.data import lists
 from tests.pipeline.test_pipeline import draw
 

@@ -13,11 +13,11 @@ import torch
 from fmtorch.commands import eval as eval_command
 from fmtorch.commands import report as report_command
 from fmtorch.data import load
-from fmtorch.evaluation.planes import homography_figures
+from fmtorch.evaluation.rows import homography_figures
 from fmtorch.metrics import corner_error, pose_auc
 from fmtorch.pipeline.labelled import MatchedPairs
 from fmtorch.presets.composition import compose
-from fmtorch.storage import RunFolder
+from fmtorch.runs import RunFolder
 from tests.data import planes
 
 

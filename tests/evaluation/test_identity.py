@@ -17,8 +17,8 @@ from fmtorch.evaluation.identity import run_identity
 from fmtorch.pipeline.build import build_pipeline, load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets.composition import compose
-from fmtorch.storage import identity_digest
-from fmtorch.storage.configuration import libraries
+from fmtorch.runs import identity_digest
+from fmtorch.runs.fingerprint import libraries
 
 GROUPS = ("features", "matcher", "pruner", "estimator", "dataset")
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fmtorch.evaluation.bootstrap import MIN_SCENES
-from fmtorch.evaluation.intervals import (
+from fmtorch.evaluation.statistics import (
+    MIN_SCENES,
     MIN_UNITS,
     effective_pairs,
     mean_difference,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from fmtorch import presets
-from fmtorch.evaluation.names import run_names, shared_settings
+from fmtorch.evaluation.page import run_names, shared_settings
 
 
 def config(pipeline: str = "sift_ratio", estimator: str = "ransac", **changes: Any) -> dict[str, Any]:

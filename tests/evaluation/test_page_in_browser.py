@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fmtorch.evaluation.page import Picture, Section, Shown, ShownPair, render
-from fmtorch.storage import PairRow, to_table
+from fmtorch.runs import PairRow, to_table
 from tests.evaluation.browser import Page, find_chromium
 
 CHROMIUM = find_chromium()

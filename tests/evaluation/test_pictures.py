@@ -7,9 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fmtorch.evaluation.canvas import BAD, GOOD, HEIGHT, WIDTH, Place
 from fmtorch.evaluation.pictures import (
+    BAD,
     COLOURS,
+    GOOD,
+    HEIGHT,
+    WIDTH,
+    Place,
     draw_epipolar_lines,
     draw_epipolar_lines_of_corners,
     draw_matches,

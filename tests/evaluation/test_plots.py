@@ -11,7 +11,7 @@ from matplotlib import image as mpimg
 
 from fmtorch.core.types import pair_key
 from fmtorch.evaluation import plots
-from fmtorch.storage import PairRow, to_table
+from fmtorch.runs import PairRow, to_table
 
 
 def table(*families: str, nsgd: float = 0.03) -> pa.Table:

@@ -9,9 +9,20 @@ import pytest
 import torch
 
 from fmtorch import metrics
-from fmtorch.evaluation.bootstrap import bootstrap_mean
-from fmtorch.evaluation.intervals import mean_difference, share_difference, share_interval
-from fmtorch.evaluation.statistics import MERITS, PERCENT, areas, described, difference, interval, recalled, scene_names
+from fmtorch.evaluation.statistics import (
+    MERITS,
+    PERCENT,
+    areas,
+    bootstrap_mean,
+    described,
+    difference,
+    interval,
+    mean_difference,
+    recalled,
+    scene_names,
+    share_difference,
+    share_interval,
+)
 from tests.reference import metrics as reference
 
 

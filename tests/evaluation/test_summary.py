@@ -14,7 +14,7 @@ from fmtorch import metrics
 from fmtorch.core.types import pair_key
 from fmtorch.evaluation.summary import summarize
 from fmtorch.evaluation.summary_tables import pose_table, summary_markdown, summary_table
-from fmtorch.storage import PairRow, to_table
+from fmtorch.runs import PairRow, to_table
 
 F = (0.0, -0.5, 0.1, 0.5, 0.0, -0.1, 0.2, 0.3, 0.59)
 

@@ -21,7 +21,7 @@ from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.pool import WorkersLost
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.storage import PairRow
+from fmtorch.runs import PairRow
 
 ONE, TWO = (Execution("threads", count) for count in (1, 2))
 

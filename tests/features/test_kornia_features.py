@@ -12,8 +12,7 @@ from torch import Tensor, nn
 
 from fmtorch import presets
 from fmtorch.features.kornia_features import ALIKED, DISK
-from fmtorch.storage.cache import ArrayCache
-from fmtorch.storage.features import CachedFeatures
+from fmtorch.runs.feature_cache import ArrayCache, CachedFeatures
 from tests.features.test_sift import same, texture
 
 SIZE = (90, 131)  # no multiple of 16

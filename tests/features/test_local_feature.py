@@ -22,8 +22,7 @@ from fmtorch.features import (
 )
 from fmtorch.matching import NearestNeighborMatcher
 from fmtorch.pipeline.build import load_pipeline
-from fmtorch.storage.cache import ArrayCache
-from fmtorch.storage.features import CachedFeatures
+from fmtorch.runs.feature_cache import ArrayCache, CachedFeatures
 from tests.features.scenes import texture
 
 WITHOUT_NETWORK = ("rootsift", "dspsift", "rootsiftpca")

@@ -11,8 +11,8 @@ import torch
 from onnx import TensorProto, helper
 from torch import Tensor
 
-from fmtorch.core.onnx_session import NetworkFileError
-from fmtorch.core.resources import models_dir
+from fmtorch.core.files import models_dir
+from fmtorch.core.onnx_network import NetworkFileError
 from fmtorch.features.networks import ARCHITECTURES, build, load_weights
 from fmtorch.features.onnx_network import PatchNetwork, network_file
 from fmtorch.training.onnx_export import export, quantize

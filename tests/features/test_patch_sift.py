@@ -14,7 +14,7 @@ from fmtorch.features import (
     root_sift,
     sift_of_patches,
 )
-from fmtorch.features.rootsift_pca import load_projection, project
+from fmtorch.features.sift import load_projection, project
 from tests.conftest import oracle
 from tests.features.scenes import random_frames, texture
 from tests.reference.local_features import sift

@@ -9,9 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from fmtorch.features.extrema import _exceeds_levels, _is_maximum, _samples
-from fmtorch.features.filters import STRIP, OpenCVFilters, TorchFilters
-from fmtorch.features.orientation import BINS, _histogram, _window
+from fmtorch.features.frames import BINS, _histogram, _window
+from fmtorch.features.hessian import STRIP, OpenCVFilters, TorchFilters, _exceeds_levels, _is_maximum, _samples
 from tests.features.scenes import texture
 
 THRESHOLD = 1e-3

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.estimators.families import focal_prior
-from fmtorch.geometry import arithmetic_kernels, significance_kernels
+from fmtorch.estimators.models import focal_prior
+from fmtorch.geometry import arithmetic
 from fmtorch.geometry.arithmetic import (
     SMALL,
     as_components,
@@ -25,6 +25,7 @@ from fmtorch.geometry.arithmetic import (
     stable_sum,
     unit,
 )
+from fmtorch.geometry.significance import LOG_MODELS
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 7, 8, 9, 100, 760, 1000])
@@ -79,10 +80,10 @@ def test_outer_sum():
 def test_exponential_and_logarithm() -> None:
     x = np.linspace(-3, 3, 601)
     # Eight squarings multiply the rounding error of one by 256.
-    assert np.abs(arithmetic_kernels.exponential(x) / np.exp(x) - 1).max() < 512 * 2**-52
+    assert np.abs(arithmetic.exponential(x) / np.exp(x) - 1).max() < 512 * 2**-52
     y = np.concatenate([np.logspace(-300, 300, 1001), np.linspace(0.4, 2.1, 1001)])
     expected = logarithm(torch.from_numpy(y)).tolist()
-    assert [arithmetic_kernels.logarithm(number) for number in y.tolist()] == expected
+    assert [arithmetic.logarithm_kernel(number) for number in y.tolist()] == expected
 
 
 def test_the_logarithm_is_alike_everywhere_and_far_from_one() -> None:
@@ -114,16 +115,16 @@ def test_the_logarithm_of_one_more_is_exact_near_zero_and_the_same_in_kernels() 
     expected = np.log1p(x.numpy())
     # Some ten roundings of parts of the value, and of 1 + x where that is small against x or 1.
     np.testing.assert_allclose(logarithm_1p(x).numpy(), expected, rtol=8 * 2**-52, atol=0)
-    assert logarithm_1p(x).tolist() == [arithmetic_kernels.logarithm_1p(number) for number in x.tolist()]
+    assert logarithm_1p(x).tolist() == [arithmetic.logarithm_1p_kernel(number) for number in x.tolist()]
     ends = torch.tensor([0.0, torch.inf, torch.nan], dtype=torch.float64)
     assert logarithm_1p(ends)[:2].tolist() == [0, torch.inf]
     assert torch.isnan(logarithm_1p(ends)[2])
-    assert [arithmetic_kernels.logarithm_1p(number) for number in (0.0, np.inf)] == [0, np.inf]
+    assert [arithmetic.logarithm_1p_kernel(number) for number in (0.0, np.inf)] == [0, np.inf]
 
 
 def test_constants_are_the_nearest_numbers() -> None:
     with decimal.localcontext(prec=40):
-        assert float(decimal.Decimal(2).ln()) == arithmetic_kernels.LOG2
-        assert float(decimal.Decimal(10).ln()) == arithmetic_kernels.LOG10
-        assert float(decimal.Decimal(3).ln()) == significance_kernels.LOG_MODELS
+        assert float(decimal.Decimal(2).ln()) == arithmetic.LOG2
+        assert float(decimal.Decimal(10).ln()) == arithmetic.LOG10
+        assert float(decimal.Decimal(3).ln()) == LOG_MODELS
         assert float(decimal.Decimal(focal_prior.USUAL_FOCAL).ln()) == focal_prior.LOG_USUAL

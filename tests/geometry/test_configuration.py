@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from fmtorch.core.estimate import CONFIGURATIONS
-from fmtorch.geometry.configuration import Evidence, classified, configuration_evidence
+from fmtorch.geometry.pair_type import Evidence, classified, configuration_evidence
 from tests.geometry.kinds import SIZE, K, batch, draw
 from tests.reference import configuration as reference
 from tests.reference.epipolar import sampson

@@ -5,15 +5,14 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from fmtorch.compiling.arrays import F8x1
-from fmtorch.compiling.kernel import kernel
-from fmtorch.geometry import cubic_kernels
+from fmtorch.geometry import polynomials
+from fmtorch.jit.kernel import F8x1, kernel
 
 
 def roots_of(*coefficients):
     """The real roots, by the kernel's function interpreted."""
     roots, valid = np.zeros(3), np.zeros(3, np.bool_)
-    cubic_kernels.cubic_roots(np.array(coefficients, dtype=np.float64), roots, valid)
+    polynomials.cubic_roots(np.array(coefficients, dtype=np.float64), roots, valid)
     return sorted(roots[valid].tolist())
 
 
@@ -80,7 +79,7 @@ def test_never_nan_and_every_root_is_one(coefficients):
 @kernel
 def cube_roots(x: F8x1, out: F8x1) -> None:
     for i in range(len(x)):
-        out[i] = cubic_kernels._cube_root(x[i])
+        out[i] = polynomials._cube_root(x[i])
 
 
 def test_cube_roots():
@@ -88,4 +87,4 @@ def test_cube_roots():
     out = np.empty(len(x))
     cube_roots(x, out)
     np.testing.assert_allclose(out * out * out, x, rtol=8 * np.finfo(float).eps)
-    assert [cubic_kernels._cube_root(number) for number in x[::100].tolist()] == out[::100].tolist()
+    assert [polynomials._cube_root(number) for number in x[::100].tolist()] == out[::100].tolist()

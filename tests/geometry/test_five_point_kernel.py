@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fmtorch.geometry.five_point_kernels import five_point
+from fmtorch.geometry.five_point import five_point
 from tests.reference import five_point as reference
 from tests.reference.solvers import consistently_oriented
 

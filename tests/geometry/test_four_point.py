@@ -7,8 +7,8 @@ import itertools
 import numpy as np
 import pytest
 
-from fmtorch.compiling.lanes import LANES
-from fmtorch.geometry.four_point_kernels import four_point
+from fmtorch.geometry.homography import four_point
+from fmtorch.jit.lanes import LANES
 from tests.reference import homography_family as reference
 
 ROUNDING32, ROUNDING64 = 2.0**-24, 2.0**-53

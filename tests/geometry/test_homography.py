@@ -4,9 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from fmtorch.compiling.arrays import B1x1, F8x1, F8x2, I8x1
-from fmtorch.compiling.kernel import kernel
-from fmtorch.geometry import homography_kernels
+from fmtorch.geometry.homography import (
+    least_squares_homography as compiled_least_squares_homography,
+)
+from fmtorch.geometry.homography import (
+    near_plane as compiled_near_plane,
+)
+from fmtorch.geometry.homography import (
+    plane_and_parallax as compiled_plane_and_parallax,
+)
+from fmtorch.geometry.homography import (
+    plane_homography as compiled_plane_homography,
+)
+from fmtorch.jit.kernel import B1x1, F8x1, F8x2, I8x1, kernel
 from tests.reference import homography as reference
 from tests.reference.solvers import skew
 
@@ -15,22 +25,22 @@ PROBLEMS = 12
 
 @kernel
 def least_squares_homography(points: F8x2, inside: B1x1, H: F8x1) -> bool:
-    return homography_kernels.least_squares_homography(points, inside, H)
+    return compiled_least_squares_homography(points, inside, H)
 
 
 @kernel
 def plane_homography(F: F8x1, e1: F8x1, points: F8x2, triplet: I8x1, H: F8x1) -> bool:
-    return homography_kernels.plane_homography(F, e1, points, triplet, H)
+    return compiled_plane_homography(F, e1, points, triplet, H)
 
 
 @kernel
 def plane_and_parallax(H: F8x1, points: F8x2, i: int, j: int, F: F8x1) -> bool:
-    return homography_kernels.plane_and_parallax(H, points, i, j, F)
+    return compiled_plane_and_parallax(H, points, i, j, F)
 
 
 @kernel
 def near_plane(H: F8x1, points: F8x2, limit: float, out: B1x1) -> int:
-    return homography_kernels.near_plane(H, points, limit, out)
+    return compiled_near_plane(H, points, limit, out)
 
 
 def planar(seed: int, n: int, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:

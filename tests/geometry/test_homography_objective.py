@@ -8,17 +8,18 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.geometry.homography_error import homography_curvature, homography_gradient, linearise_homography
-from fmtorch.geometry.homography_objective_kernels import (
+from fmtorch.geometry.epipolar import HOMOGRAPHY
+from fmtorch.geometry.homography_refine import (
     evaluate_homographies,
+    homography_curvature,
+    homography_gradient,
+    inverse_hessian_of_homography,
+    linearise_homography,
     refine_homographies,
     step_of_homography,
 )
-from fmtorch.geometry.homography_refine import inverse_hessian_of_homography
-from fmtorch.geometry.levenberg_marquardt_kernels import Schedule
-from fmtorch.geometry.residual_kernels import HOMOGRAPHY
+from fmtorch.geometry.levenberg_marquardt import LOSSES, NO_TABLE, Schedule, Weighted
 from fmtorch.geometry.robust_losses import KERNELS
-from fmtorch.geometry.sampson_objective_kernels import LOSSES, NO_TABLE, Weighted
 from tests.reference import homography_family as reference
 
 EPS = 2.0**-52

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from fmtorch.geometry.levenberg_marquardt_kernels import accepting, levenberg_marquardt
+from fmtorch.geometry.levenberg_marquardt import accepting, levenberg_marquardt
 
 
 class State(NamedTuple):

@@ -7,7 +7,7 @@ import hashlib
 import numpy as np
 from scipy.special import gamma, gammainc
 
-from fmtorch.geometry.magsac import ENTRIES, GAIN_TABLE, LOSS_TABLE, QUANTILE
+from fmtorch.geometry.robust_losses import ENTRIES, GAIN_TABLE, LOSS_TABLE, QUANTILE
 
 END = QUANTILE**2 / 2
 

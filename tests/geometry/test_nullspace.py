@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.linalg import null_space as scipy_null_space
 
-from fmtorch.compiling.lanes import LANES
-from fmtorch.geometry import nullspace_kernels
+from fmtorch.geometry import null_space as nullspace_kernels
+from fmtorch.jit.lanes import LANES
 
 EPS = np.finfo(np.float64).eps
 

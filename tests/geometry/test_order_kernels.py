@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fmtorch.geometry.order_kernels import smallest_but, sort_by
+from fmtorch.geometry.arithmetic import smallest_but, sort_by
 
 
 @pytest.mark.parametrize("m", [0, 1, 2, 3, 10, 200])

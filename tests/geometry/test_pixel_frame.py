@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from fmtorch.geometry.pixel_frame import PixelFrame
+from fmtorch.geometry.cameras import PixelFrame
 
 GENERATOR = torch.Generator().manual_seed(0)
 PIXELS = torch.rand(3, 50, 4, generator=GENERATOR, dtype=torch.float64) * torch.tensor([[[900.0]], [[30.0]], [[4e5]]])

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from fmtorch.geometry import pose_from_fundamental
-from fmtorch.geometry.pose_kernels import pose
+from fmtorch.geometry.pose import pose
 from tests.reference import known_cameras as reference
 from tests.reference import solvers
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from fmtorch.geometry.epipolar import homogeneous, linearise
 from fmtorch.geometry.rank2_manifold import start
 from fmtorch.geometry.refine import attached_step, refine, refine_components
-from fmtorch.geometry.residuals import homogeneous, linearise
 from fmtorch.geometry.robust_losses import KERNELS
 from tests.conftest import oracle
 from tests.geometry.scenes import unit_scene

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.geometry import irls_kernels
-from fmtorch.geometry.irls import reweighted
-from fmtorch.geometry.levenberg_marquardt_kernels import FIRST_DAMPING, Schedule
-from fmtorch.geometry.rank2_manifold_kernels import SQUARINGS
-from fmtorch.geometry.refine_kernels import refine
+from fmtorch.geometry.irls import reweighted, reweighted_kernel
+from fmtorch.geometry.levenberg_marquardt import FIRST_DAMPING, LOSSES, Schedule, Weighted, evaluate, loss_table
+from fmtorch.geometry.rank2_manifold import SQUARINGS
+from fmtorch.geometry.refine import refine_kernel
 from fmtorch.geometry.robust_losses import KERNELS
-from fmtorch.geometry.sampson_objective_kernels import LOSSES, Weighted, evaluate, loss_table
 from tests.estimators.pairs import apart
 from tests.reference import refine as reference
 
@@ -57,13 +55,13 @@ def test_one_reweighted_fit(loss: str, n: int) -> None:
     tensors = (torch.from_numpy(a) for a in (F.T[:, None].copy(), points[:, None], weight[None]))
     expected = reweighted(*tensors, KERNELS[loss], torch.tensor([SCALE], dtype=torch.float64))[:, 0].T.numpy()
     fitted, s2 = F.copy(), np.full(n, SCALE**2)
-    irls_kernels.reweighted(fitted, Weighted(points, weight, s2, LOSSES[loss], loss_table(loss)))
+    reweighted_kernel(fitted, Weighted(points, weight, s2, LOSSES[loss], loss_table(loss)))
     for fit, other in zip(fitted, expected, strict=True):
         # Rounding of the sums over the gap of their eigenvalues, 1e-8 of the largest.
         assert apart(fit, other) < 1e-8
     kept = F.copy()  # where the weights determine no model
     none = np.where(np.arange(n) < 6, weight, 0)
-    irls_kernels.reweighted(kept, Weighted(points, none, s2, LOSSES[loss], loss_table(loss)))
+    reweighted_kernel(kept, Weighted(points, none, s2, LOSSES[loss], loss_table(loss)))
     np.testing.assert_array_equal(kept, F)
 
 
@@ -73,7 +71,7 @@ def refined(
     """Models and costs by the kernel."""
     fitted, cost = np.empty_like(F), np.empty(len(F))
     weighted = Weighted(points, weight, s2, LOSSES[loss], loss_table(loss))
-    refine(F, SQUARINGS, weighted, Schedule(iterations, FIRST_DAMPING, tolerance), fitted, cost)
+    refine_kernel(F, SQUARINGS, weighted, Schedule(iterations, FIRST_DAMPING, tolerance), fitted, cost)
     return fitted, cost
 
 

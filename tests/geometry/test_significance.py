@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from fmtorch.compiling import switch
 from fmtorch.core.types import RELATED
 from fmtorch.geometry import significance
+from fmtorch.jit import kernel
 from tests.conftest import oracle
 from tests.geometry.scenes import scene
 from tests.laws import degenerate, small
@@ -23,7 +23,7 @@ SIZE = (800, 1000)
 @pytest.fixture(params=["on", "off"], autouse=True)
 def form(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """By kernels, and by tensors."""
-    monkeypatch.setenv(switch.SWITCH, request.param)
+    monkeypatch.setenv(kernel.SWITCH, request.param)
 
 
 def pair(n: int, seed: int = 0, outliers: float = 0.4) -> tuple[Tensor, Tensor, Tensor]:
@@ -151,7 +151,7 @@ def assert_same_in_both_forms(monkeypatch: pytest.MonkeyPatch, F: Tensor, *c: Te
     """Within rounding: sums of up to a hundred thousand logarithms of factorials, of which each form rounds one."""
     values = []
     for state in ("on", "off"):
-        monkeypatch.setenv(switch.SWITCH, state)
+        monkeypatch.setenv(kernel.SWITCH, state)
         values.append(significance(F, *c))
     torch.testing.assert_close(*values, rtol=1e-12, atol=1e-9)
 

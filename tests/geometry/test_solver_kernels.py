@@ -7,14 +7,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from fmtorch.geometry.eight_point_kernels import eight_point, weighted_eight_point
-from fmtorch.geometry.seven_point_kernels import seven_point
+from fmtorch.geometry.eight_point import eight_point_kernel, weighted_eight_point
+from fmtorch.geometry.seven_point import seven_point_kernel
 from tests.estimators.pairs import apart, normalized
 from tests.laws import degenerate, scene, small
 from tests.reference import solvers as reference
 
 Kernel = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], int]
-SOLVERS: dict[str, tuple[Kernel, int, int]] = {"seven": (seven_point, 7, 3), "eight": (eight_point, 8, 1)}
+SOLVERS: dict[str, tuple[Kernel, int, int]] = {"seven": (seven_point_kernel, 7, 3), "eight": (eight_point_kernel, 8, 1)}
 DRAWS = 203  # not whole lanes
 
 

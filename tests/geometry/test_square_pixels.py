@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.geometry.square_pixels import calibration_problems, mapped, square_pixels
+from fmtorch.geometry.cameras import calibration_problems, mapped, square_pixels
 from tests.reference import known_cameras as reference
 
 SIZE = torch.tensor([[480, 640]])

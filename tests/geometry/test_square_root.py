@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.compiling.arrays import F8x2
-from fmtorch.compiling.kernel import kernel
-from fmtorch.compiling.lanes import LANES, load, store
-from fmtorch.compiling.lanes import sqrt as sqrt_of_lanes
 from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.geometry.epipolar import inverse_root
+from fmtorch.jit.kernel import F8x2, kernel
+from fmtorch.jit.lanes import LANES, load, store
+from fmtorch.jit.lanes import sqrt as sqrt_of_lanes
 
 KINDS = {torch.float32: np.float32, torch.float64: np.float64}
 

@@ -11,7 +11,7 @@ from scipy.stats import binom, chi2
 from torch import Tensor
 
 from fmtorch.geometry import two_view_covariance
-from fmtorch.geometry.two_view_information import residual_slopes, tangents
+from fmtorch.geometry.covariance import residual_slopes, tangents
 from tests.geometry.scenes import scene
 from tests.reference import two_view as reference
 from tests.reference.two_view import Cameras

@@ -13,7 +13,7 @@ import fmtorch
 from fmtorch.core.stages import Estimator
 from fmtorch.core.types import RELATED, Correspondences, Estimate, collate
 from fmtorch.geometry import significance
-from fmtorch.geometry.verdict import judged
+from fmtorch.geometry.significance import judged
 from tests.laws import degenerate, quick, scene
 from tests.variants import variants
 

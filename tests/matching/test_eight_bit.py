@@ -4,8 +4,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from fmtorch.matching import eight_bit, nearest, nearest_neighbors
-from fmtorch.matching.nearest_kernels import GROUP
+from fmtorch.matching import nearest, nearest_neighbors
+from fmtorch.matching import nearest as eight_bit
+from fmtorch.matching.nearest import GROUP
 from tests.matching.test_nearest import assert_same, sift_like, unit
 
 

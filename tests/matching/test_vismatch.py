@@ -13,7 +13,7 @@ import torch
 
 import fmtorch
 from fmtorch.data import read_image
-from fmtorch.matching.precision import MAX_RATIO, relative_noise
+from fmtorch.matching.matcher import MAX_RATIO, relative_noise
 from fmtorch.matching.vismatch import VisMatch
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fmtorch.core.random import uniform
-from fmtorch.core.streams import Stream
 from fmtorch.geometry import cross_matrix, unit_frobenius
-from fmtorch.metrics import draws, nsgd, nsgd_released, sgd
+from fmtorch.jit.random import Stream, uniform
+from fmtorch.metrics import nsgd, nsgd_released, sgd
+from fmtorch.metrics import nsgd as draws
 from fmtorch.metrics.nsgd import draw_distances
 from tests.conftest import oracle
 from tests.reference import metrics as reference

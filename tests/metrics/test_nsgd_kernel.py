@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from fmtorch.compiling import switch
+from fmtorch.jit import kernel
 from fmtorch.metrics import nsgd, nsgd_released, sgd
 from tests.metrics.test_nsgd import HD, VGA, columns_shifted, random_pairs, rows_shifted
 
@@ -31,9 +31,9 @@ def test_both_forms_are_alike(samples: int, cap: bool, monkeypatch: pytest.Monke
     key = torch.arange(len(F_gt)) * 77 - 500
     for distance in (nsgd, sgd):
         for sizes in ((HD, HD), (VGA, HD)):
-            monkeypatch.setenv(switch.SWITCH, "on")
+            monkeypatch.setenv(kernel.SWITCH, "on")
             compiled = distance(F_gt, F_est, *sizes, samples=samples, seed=3, key=key, cap=cap)
-            monkeypatch.setenv(switch.SWITCH, "off")
+            monkeypatch.setenv(kernel.SWITCH, "off")
             tensors = distance(F_gt, F_est, *sizes, samples=samples, seed=3, key=key, cap=cap)
             # The same sums of the same terms, but torch's roots of float64 are not always correctly rounded. Distances
             # of 1e3 px are differences of terms of 1e3; those below are rounding of such.
@@ -45,9 +45,9 @@ def test_both_forms_of_the_released_figure_are_alike(samples: int, monkeypatch: 
     F_gt, F_est = matrices()
     key = torch.arange(len(F_gt)) * 77 - 500
     for sizes in ((HD, HD), (VGA, HD)):
-        monkeypatch.setenv(switch.SWITCH, "on")
+        monkeypatch.setenv(kernel.SWITCH, "on")
         compiled = nsgd_released(F_gt, F_est, *sizes, samples=samples, seed=3, key=key)
-        monkeypatch.setenv(switch.SWITCH, "off")
+        monkeypatch.setenv(kernel.SWITCH, "off")
         tensors = nsgd_released(F_gt, F_est, *sizes, samples=samples, seed=3, key=key)
         torch.testing.assert_close(compiled, tensors, rtol=1e-9, atol=1e-12)
 

@@ -16,6 +16,7 @@ import pytest
 import torch
 
 from fmtorch.data.pairs import ImageSource
+from fmtorch.io.match_store import Journal
 from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.pool import WorkerPool, WorkersLost
 from fmtorch.jobs.runner import DEATH
@@ -24,7 +25,6 @@ from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.folder import FolderMatches, folder_workers
 from fmtorch.pipeline.photograph_cameras import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.storage.exchange.journal import Journal
 
 
 class Recorded(Executor):

@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fmtorch.pipeline.folder_images import chosen_pairs, images_below, in_blocks, natural_order
-from fmtorch.pipeline.folder_output import default_output
+from fmtorch.pipeline.folder import chosen_pairs, default_output, images_below, in_blocks, natural_order
 
 
 def picture(path: Path) -> Path:

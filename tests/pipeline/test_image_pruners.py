@@ -16,12 +16,12 @@ from fmtorch.core.stages import ImagePruner
 from fmtorch.data import read_image
 from fmtorch.data.pairs import GivenMatches
 from fmtorch.geometry import sampson
+from fmtorch.io.match_store import Journal
 from fmtorch.pipeline import pipeline as module
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.exporting import keep_outcomes
 from fmtorch.pipeline.folder import FolderMatches
 from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.storage.exchange.journal import Journal
 from tests.conftest import shared_path
 
 PRUNERS = "pruner=[ratio,one_to_one,frame_consistency,match_noise,refine_matches]"

@@ -14,8 +14,7 @@ import torch
 from fmtorch import presets
 from fmtorch.core.types import Correspondences, Estimate, Features
 from fmtorch.data import ImagePair, ImageSource
-from fmtorch.pipeline.memo import Memo
-from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.pipeline.pipeline import Memo, Pipeline
 
 
 def draw(path: Path, seed: int, shift: int = 0) -> ImageSource:

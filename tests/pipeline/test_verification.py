@@ -17,9 +17,8 @@ import pytest
 import fmtorch
 from fmtorch.core.types import pair_key
 from fmtorch.data.lenses import MODELS
-from fmtorch.pipeline import verification_run
-from fmtorch.storage.exchange.database import MatchDatabase
-from fmtorch.storage.exchange.database_images import EXIF_DEVIATION, database_image
+from fmtorch.io.colmap import EXIF_DEVIATION, MatchDatabase, database_image
+from fmtorch.verification import run
 from tests.conftest import shared_path
 from tests.pipeline import databases
 from tests.pipeline.databases import SIZE, plain, read, scene, write
@@ -401,9 +400,9 @@ def test_keypoints_are_read_for_many_images_in_blocks(tmp_path: Path, monkeypatc
     write(path, scene(6))
     write(other, scene(6))
     fmtorch.verify(path)
-    monkeypatch.setattr(verification_run, "BATCH", 2)
-    monkeypatch.setattr("fmtorch.storage.exchange.database.BLOCK", 2)
-    monkeypatch.setattr("fmtorch.storage.exchange.database.MEMORY", 3)
+    monkeypatch.setattr(run, "BATCH", 2)
+    monkeypatch.setattr("fmtorch.io.colmap.BLOCK", 2)
+    monkeypatch.setattr("fmtorch.io.colmap.MEMORY", 3)
     with MatchDatabase(other) as database:
         pairs = database.pairs()
     assert pairs[5:12] == [(2, 3), (2, 4), (2, 5), (3, 4), (3, 5), (2, 6), (3, 6)]
@@ -411,7 +410,7 @@ def test_keypoints_are_read_for_many_images_in_blocks(tmp_path: Path, monkeypatc
     assert plain(read(other)) == plain(read(path))
 
 
-SLOWLY = "import time, fmtorch.pipeline.verification_run as v\nv.BATCH = 2\n"
+SLOWLY = "import time, fmtorch.verification.run as v\nv.BATCH = 2\n"
 
 
 @pytest.mark.parametrize("way", ["in place", "copy", "forced", "forced copy"])

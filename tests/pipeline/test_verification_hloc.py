@@ -17,7 +17,7 @@ from tests.processes import run_command, starter
 
 K = np.array([[600.0, 0, 319.5], [0, 600, 239.5], [0, 0, 1]])
 FILES = ("features=features.h5", "matches=matches.h5", "output=verified.h5")
-SLOWLY = "import fmtorch.pipeline.verification_run as v\nv.BATCH = 2\n"
+SLOWLY = "import fmtorch.verification.run as v\nv.BATCH = 2\n"
 
 
 def write(folder: Path, cameras: Scene) -> list[tuple[str, str]]:

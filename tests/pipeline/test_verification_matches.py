@@ -20,7 +20,7 @@ K = np.array([[600.0, 0, 319.5], [0, 600, 239.5], [0, 0, 1]])
 MATRICES = ("F", "E", "H", "R", "t")
 SIZES = {"size0": np.array(SIZE), "size1": np.array(SIZE)}
 CALIBRATIONS = {"K0": K, "K1": K}
-SLOWLY = "import fmtorch.pipeline.verification_run as v\nv.BATCH = 2\n"
+SLOWLY = "import fmtorch.verification.run as v\nv.BATCH = 2\n"
 
 
 def points(count: int = 2, kind: str = "general") -> list[tuple[np.ndarray, np.ndarray]]:

@@ -9,7 +9,7 @@ import pytest
 
 import fmtorch
 from fmtorch.jobs.execution import Execution
-from fmtorch.pipeline import verification_run
+from fmtorch.verification import run
 from tests.pipeline import test_verification_hloc as hloc
 from tests.pipeline import test_verification_matches as alone
 from tests.pipeline.databases import plain, read, scene, write
@@ -17,7 +17,7 @@ from tests.pipeline.databases import plain, read, scene, write
 
 @pytest.fixture(autouse=True)
 def _small_batches(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(verification_run, "BATCH", 2)
+    monkeypatch.setattr(run, "BATCH", 2)
 
 
 def test_processes_find_what_threads_find(tmp_path: Path) -> None:

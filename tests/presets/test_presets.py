@@ -9,7 +9,7 @@ import pytest
 import fmtorch
 from fmtorch import presets
 from fmtorch.commands.list import HEADINGS, listed
-from fmtorch.core.resources import conf_dir
+from fmtorch.core.files import conf_dir
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.presets.composition import compose
 from tests.laws import scene

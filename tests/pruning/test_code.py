@@ -10,8 +10,7 @@ from torch import Tensor
 from fmtorch import presets
 from fmtorch.core.types import Correspondences
 from fmtorch.pruning import CODE, LikelihoodField, SmoothMotion, code, coherence
-from fmtorch.pruning.code import huber_regression, match_domain
-from fmtorch.pruning.code.domain import evenly, predictive_gaussians, spread_centres
+from fmtorch.pruning.code import evenly, huber_regression, match_domain, predictive_gaussians, spread_centres
 from tests.reference import code as reference
 
 WIDTHS = {"position": 0.5, "displacement": 0.2, "rotation": 0.8, "scale": 0.5}

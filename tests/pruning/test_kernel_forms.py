@@ -10,11 +10,10 @@ import torch
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.compiling import switch
-from fmtorch.compiling.arrays import F8x2, I8x2
-from fmtorch.compiling.kernel import kernel
 from fmtorch.core.types import Correspondences
-from fmtorch.pruning import knn_kernels
+from fmtorch.jit import kernel as switch
+from fmtorch.jit.kernel import F8x2, I8x2, kernel
+from fmtorch.pruning import neighbors as knn_kernels
 from tests.laws import degenerate, scene, scenes, small, with_padding
 from tests.variants import built
 

@@ -12,13 +12,13 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from fmtorch.core.onnx_session import NetworkFileError
-from fmtorch.core.resources import models_dir
+from fmtorch.core.files import models_dir
+from fmtorch.core.onnx_network import NetworkFileError
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.pruning import LearnedPruner
 from fmtorch.pruning.networks import DFE, LC
 from fmtorch.pruning.networks.files import learned_file
-from fmtorch.storage.configuration import configuration, learned
+from fmtorch.runs.fingerprint import configuration, learned
 from fmtorch.training.pruner_export import export_onnx, save_weights
 from tests.laws import scene
 

@@ -13,9 +13,9 @@ from fmtorch import presets
 from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
 from fmtorch.core.stages import ImagePruner
 from fmtorch.core.types import Correspondences, collate
-from fmtorch.pruning import refine_matches_kernels as compiled
-from fmtorch.pruning.neighbour_maps_kernels import neighbour_maps
-from fmtorch.pruning.window_kernels import Pyramid
+from fmtorch.pruning import refine_matches as compiled
+from fmtorch.pruning.neighbors import neighbour_maps
+from fmtorch.pruning.windows import Pyramid
 from tests.reference import refine_matches as reference
 
 MAP = np.array([[1.1, -0.2], [0.15, 0.95]])

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from fmtorch.data.rendered.pinhole import Camera
-from fmtorch.data.rendered.surfaces import Surfaces
+from fmtorch.scenes.camera import Camera
+from fmtorch.scenes.surfaces import Surfaces
 
 
 def first_hit(surfaces: Surfaces, camera: Camera, x: float, y: float) -> tuple[int, np.ndarray]:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from fmtorch.data.rendered.light import SHADOW_MAP, Stage
-from fmtorch.data.rendered.mipmap import TO_LINEAR, Texture, bilinear
-from fmtorch.data.rendered.raycast import SEAM, Geometry, Hits
-from fmtorch.data.rendered.raycast_kernels import Bounds, Met, Pieces
+from fmtorch.scenes.light import SHADOW_MAP, Stage
+from fmtorch.scenes.raycast import SEAM, Bounds, Geometry, Hits, Met, Pieces
+from fmtorch.scenes.textures import TO_LINEAR, Texture, bilinear
 
 
 def cast(geometry: Geometry, pieces: Pieces, bounds: Bounds, met: Met) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fmtorch.storage import RunFolder
+from fmtorch.runs import RunFolder
 from tests.pipeline.test_pipeline import draw
 
 EVAL = ["features.max_features=400", "estimator=lmeds", "estimator.hypotheses=200", "batch=1", "workers=1"]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fmtorch.core.onnx_session import NetworkFileError, onnx_session
+from fmtorch.core.onnx_network import NetworkFileError, onnx_session
 
 
 def main(source: Path, folder: Path, count: int) -> None:

@@ -12,7 +12,7 @@ import torch
 
 from fmtorch.core.types import Correspondences
 from fmtorch.data import ImagePair, ImageSource
-from fmtorch.evaluation.bootstrap import paired_bootstrap
+from fmtorch.evaluation.statistics import paired_bootstrap
 from scripts.benchmark import cameras, cameras_knowledge, cameras_methods, cameras_peers, cameras_table, matched
 from scripts.benchmark.cameras_knowledge import Answer, applies, bougnoux, fundamental, knowledge
 from scripts.benchmark.specs import read_specs

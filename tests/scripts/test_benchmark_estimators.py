@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fmtorch.data import ImagePair, ImageSource
-from fmtorch.evaluation.bootstrap import paired_bootstrap
+from fmtorch.evaluation.statistics import paired_bootstrap
 from fmtorch.geometry import eight_point
 from scripts.benchmark import estimators, estimators_table, matched
 from tests.laws import scene

@@ -6,7 +6,7 @@ import pyarrow as pa
 import torch
 
 from fmtorch.core.types import Correspondences
-from fmtorch.evaluation.bootstrap import MIN_SCENES
+from fmtorch.evaluation.statistics import MIN_SCENES
 from scripts.benchmark import paper_table, sweep
 from scripts.benchmark.early_gc_ransac import EarlyGCRansac, eight_point, residuals, seven_point
 from tests.geometry.scenes import scene

@@ -45,9 +45,9 @@ def test_rendered_scenes_that_show_one_photograph_are_not_paired(monkeypatch: py
 
 
 def test_the_photographs_of_a_drawn_scene_are_known(tmp_path: Path) -> None:
-    from fmtorch.data.rendered import RenderedPairs
-    from fmtorch.data.rendered.generate import Plan
-    from fmtorch.data.rendered.photographs import PICTURES
+    from fmtorch.scenes import RenderedPairs
+    from fmtorch.scenes.generate import Plan
+    from fmtorch.scenes.textures import PICTURES
 
     plan = Plan(1, 2, 1, scale=0.2)
     dataset = RenderedPairs("train", families=["indoor"], root=tmp_path, plan=plan, workers=1)

@@ -7,7 +7,7 @@ import torch
 
 from fmtorch.core.types import Correspondences
 from fmtorch.data import load, read_image, to_grey
-from fmtorch.data.matchable import keypoints, ratio_matches
+from fmtorch.data.construction import keypoints, ratio_matches
 from fmtorch.presets import build as preset
 from scripts.benchmark.specs import build, informed, pruned_by, pruners_of
 

@@ -9,8 +9,8 @@ import pytest
 
 from fmtorch.data import read_image
 from fmtorch.data.pairs import ImageSource
-from fmtorch.data.rendered import Plan
-from fmtorch.data.rendered import dataset as rendered_dataset
+from fmtorch.scenes import Plan
+from fmtorch.scenes import dataset as rendered_dataset
 from scripts import draw_gallery
 from tests.conftest import own_cache
 

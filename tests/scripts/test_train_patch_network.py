@@ -9,7 +9,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from fmtorch.core.resources import conf_dir
+from fmtorch.core.files import conf_dir
 from fmtorch.features.networks import build
 from fmtorch.features.onnx_network import PatchNetwork
 from fmtorch.training.match_set_training import MatchSetTraining

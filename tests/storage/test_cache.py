@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fmtorch.storage import cache as module
-from fmtorch.storage.cache import ABANDONED, SLACK, ArrayCache
+from fmtorch.runs import feature_cache as module
+from fmtorch.runs.feature_cache import ABANDONED, SLACK, ArrayCache
 
 WRITER = """
 import sys
 from pathlib import Path
 import numpy as np
-from fmtorch.storage.cache import ArrayCache
+from fmtorch.runs.feature_cache import ArrayCache
 cache = ArrayCache(Path(sys.argv[1]), int(sys.argv[2]) or None)
 for i in range(int(sys.argv[3])):
     cache.write("some", f"{i % 50}", {"a": np.full(50_000, i % 50)})

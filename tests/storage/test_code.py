@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from fmtorch import __version__
-from fmtorch.storage import code
+from fmtorch.runs import fingerprint
 
 
 @pytest.fixture
@@ -22,15 +22,15 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     folder.mkdir(parents=True)
     (folder / "a.py").write_text("one")
     (folder.parent / "pyproject.toml").write_text("")
-    monkeypatch.setattr(code, "PACKAGE", folder)
-    code.fmtorch_version.cache_clear()
+    monkeypatch.setattr(fingerprint, "PACKAGE", folder)
+    fingerprint.fmtorch_version.cache_clear()
     yield folder
-    code.fmtorch_version.cache_clear()
+    fingerprint.fmtorch_version.cache_clear()
 
 
 def version() -> str:
-    code.fmtorch_version.cache_clear()
-    return code.fmtorch_version()
+    fingerprint.fmtorch_version.cache_clear()
+    return fingerprint.fmtorch_version()
 
 
 def git(folder: Path, *arguments: str) -> str:
@@ -47,7 +47,7 @@ def test_a_checkout_is_its_commit_and_what_was_changed_since(package: Path, monk
     git(checkout, "add", ".")
     git(checkout, "commit", "-qm", "first")
     commit = git(checkout, "rev-parse", "HEAD")
-    clean = f"{__version__}+g{commit[: code.DIGITS]}"
+    clean = f"{__version__}+g{commit[: fingerprint.DIGITS]}"
     assert version() == clean
     (checkout / "notes.md").write_text("decides nothing")
     monkeypatch.setenv("GIT_DIR", str(checkout / "elsewhere"))  # as within a hook of another repository
@@ -111,8 +111,8 @@ def test_a_module_is_all_that_it_imports_of_its_own(
     importlib.import_module(module)
 
     def of() -> str:
-        code.code_digest.cache_clear()
-        return code.code_digest(module)
+        fingerprint.code_digest.cache_clear()
+        return fingerprint.code_digest(module)
 
     before = of()
     assert of() == before
@@ -149,9 +149,11 @@ for y in x: import l
 else:
     while x: import m
 """
-    assert sorted(name for entry in code._imports(source.encode()) for name in entry.names) == list("abcdefghijklm")
+    assert sorted(name for entry in fingerprint._imports(source.encode()) for name in entry.names) == list(
+        "abcdefghijklm"
+    )
 
 
 def test_a_module_without_a_file_is_refused() -> None:
     with pytest.raises(TypeError, match="sys is in no file"):
-        code.code_digest("sys")
+        fingerprint.code_digest("sys")

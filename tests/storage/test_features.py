@@ -24,10 +24,9 @@ from fmtorch.core.stages import TimedExtractor, TwoStepExtractor
 from fmtorch.core.types import Features
 from fmtorch.features import RootSIFTPCA
 from fmtorch.pipeline.build import load_pipeline
-from fmtorch.storage import configuration as configuration_module
-from fmtorch.storage.cache import ArrayCache
-from fmtorch.storage.configuration import configuration, learned
-from fmtorch.storage.features import CachedFeatures, cached, image_digest
+from fmtorch.runs import fingerprint as configuration_module
+from fmtorch.runs.feature_cache import ArrayCache, CachedFeatures, cached, image_digest
+from fmtorch.runs.fingerprint import configuration, learned
 from tests.conftest import shared_path
 
 
@@ -361,7 +360,7 @@ def test_the_command_tells_what_is_there(tmp_path: Path) -> None:
     CachedFeatures(TwoSteps(), ArrayCache(tmp_path / "features"))(picture())
     source = str(Path(__file__).resolve().parents[2])
     env = {**os.environ, "PYTHONPATH": source, "FMTORCH_CACHE": str(tmp_path), "COLUMNS": "200"}
-    command = [sys.executable, "-W", "error", "-m", "fmtorch.storage"]
+    command = [sys.executable, "-W", "error", "-m", "fmtorch.runs"]
     output = subprocess.run(command, env=env, capture_output=True, text=True, timeout=120, check=True).stdout
     assert "2 files" in output
     assert "scenes drawn" not in output

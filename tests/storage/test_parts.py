@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from fmtorch.storage import PairRow, RunFolder
-from fmtorch.storage import parts as parts_module
-from fmtorch.storage.parts import MAX_LEVEL, MERGED, part_files
+from fmtorch.runs import PairRow, RunFolder
+from fmtorch.runs import run_folder as parts_module
+from fmtorch.runs.run_folder import MAX_LEVEL, MERGED, part_files
 
 IDENTITY = {"pipeline": "sift_ratio", "seed": 0}
 

@@ -13,8 +13,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from fmtorch.core.types import pair_key
-from fmtorch.storage import PAIR_SCHEMA, PairRow, RunFolder, RunFolderError, identity_digest, replacing, to_table
-from fmtorch.storage.parts import content_digest
+from fmtorch.runs import PAIR_SCHEMA, PairRow, RunFolder, RunFolderError, identity_digest, replacing, to_table
+from fmtorch.runs.run_folder import content_digest
 
 CONFIG = {
     "pipeline": {"name": "sift_ratio", "estimator": {"threshold": 0.5, "samples": 2000}, "stages": ["a", "b"]},

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.data.rendered.generate import Plan, Task
-from fmtorch.data.rendered.photographs import photograph
-from fmtorch.features.networks import GeoDesc
-from fmtorch.features.networks.checkpoints import read_checkpoint
+from fmtorch.features.networks import GeoDesc, read_checkpoint
+from fmtorch.scenes.generate import Plan, Task
+from fmtorch.scenes.textures import photograph
 from fmtorch.training.correspondences import Tolerance
 from fmtorch.training.geodesc_loss import geodesc
 from fmtorch.training.match_set_training import MatchSetTraining

@@ -11,7 +11,7 @@ import torch
 from onnx import numpy_helper
 from torch import Tensor
 
-from fmtorch.core.resources import models_dir
+from fmtorch.core.files import models_dir
 from fmtorch.features.networks import ARCHITECTURES, build
 from fmtorch.features.onnx_network import PatchNetwork
 from fmtorch.training.onnx_export import export, quantize

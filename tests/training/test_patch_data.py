@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from fmtorch.data.rendered.photographs import photograph
+from fmtorch.scenes.textures import photograph
 from fmtorch.training.correspondences import CONTEXT_SIZE, Tolerance, corresponding_patches, cut
 from fmtorch.training.keypoints import dog_keypoints, hessian_keypoints
 from fmtorch.training.patch_store import PatchStore, build_store

@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from fmtorch.data.rendered.photographs import photograph
 from fmtorch.features.networks import AffNet, AffNetFast, HardNet, build, load_weights
+from fmtorch.scenes.textures import photograph
 from fmtorch.training.correspondences import Tolerance, corresponding_patches
 from fmtorch.training.model_card import model_card, sha256
 from fmtorch.training.patch_loop import PatchTraining, TrainingOptions

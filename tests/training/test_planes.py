@@ -11,8 +11,8 @@ import torch
 
 from fmtorch.data import DepthDataset, ImagePair
 from fmtorch.data.images import ImageError
-from fmtorch.data.rendered.pinhole import Camera
 from fmtorch.pipeline.labelled import MatchedPairs, collate
+from fmtorch.scenes.camera import Camera
 from fmtorch.training.photographs import Photograph, package_photographs
 from fmtorch.training.planes import PlanePairs, PlaneViews, plane_depth, plane_homography, random_camera
 from tests.pipeline.labelled.conftest import SIFT
@@ -126,7 +126,7 @@ def between_views(planes: PlanePairs, pair: ImagePair) -> np.ndarray:
 def test_pairs_of_planes_train_the_classification_alone(planes: PlanePairs, tmp_path: Path) -> None:
     pytest.importorskip("lightning", reason="training needs the extra `train`")
     from fmtorch.pruning.networks import LC
-    from fmtorch.pruning.networks.prediction import predict
+    from fmtorch.pruning.networks.learned import predict
     from fmtorch.training.pruners.objective import Objective
 
     matched = MatchedPairs(planes, **SIFT, root=tmp_path, workers=1)

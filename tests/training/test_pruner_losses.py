@@ -13,10 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fmtorch.core.random import uniform
-from fmtorch.core.streams import Stream
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.geometry import eight_point, fundamental_from_calibration, irls, refine, reweighted_fits
+from fmtorch.jit.random import Stream, uniform
 from fmtorch.training import virtual_points as virtual
 from fmtorch.training.pruner_losses import LIMIT_E, LIMIT_F, classification_loss, geometric_loss, nsgd_loss
 from fmtorch.training.virtual_points import virtual_points

@@ -13,7 +13,7 @@ from fmtorch.core.types import Correspondences
 from fmtorch.geometry import eight_point
 from fmtorch.pipeline.labelled import LabelledMatches, collate
 from fmtorch.pruning.networks import LC
-from fmtorch.pruning.networks.prediction import Prediction, predict
+from fmtorch.pruning.networks.learned import Prediction, predict
 from fmtorch.training.pruner_losses import classification_loss, geometric_loss
 from fmtorch.training.pruners.objective import Objective, fits
 from fmtorch.training.pruners.validation import Use, Validation

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fmtorch.data.rendered.generate import Plan, Task
-from fmtorch.data.rendered.pinhole import Camera, calibration, fundamental, look_at
+from fmtorch.scenes.camera import Camera, calibration, fundamental, look_at
+from fmtorch.scenes.generate import Plan, Task
 from fmtorch.training.correspondences import Tolerance, near
 from fmtorch.training.patch_store import PatchStore, build_store
 from fmtorch.training.scenes import View, linked, patches_of_scene, training_scenes, transferred

@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fmtorch.core.random import bits, uniform
-from fmtorch.core.streams import Stream
+from fmtorch.jit.random import Stream, bits, uniform
 from fmtorch.pipeline.labelled import transforms
 from fmtorch.pipeline.labelled.record import LabelledMatches
 

@@ -9,8 +9,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import torch
 from torch.utils.data import Sampler
 
-from fmtorch.core.random import uniform
-from fmtorch.core.streams import Stream
+from fmtorch.jit.random import Stream, uniform
 from fmtorch.pipeline.labelled.augmentation import subset_size
 from fmtorch.pipeline.labelled.record import LabelledMatches, collate
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from fmtorch.core.resources import cache_dir
+from fmtorch.core.files import cache_dir
 from fmtorch.core.settings import claim
 from fmtorch.data.pairs import DepthDataset, PairDataset
 from fmtorch.jobs.execution import Execution
@@ -19,9 +19,9 @@ from fmtorch.pipeline.labelled.compute import Job, Progress, compute_shards, par
 from fmtorch.pipeline.labelled.shards import FORMAT, Shard, ShardError
 from fmtorch.pipeline.labelled.stored import StoredMatches
 from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.storage.configuration import configuration, environment
-from fmtorch.storage.features import CachedFeatures
-from fmtorch.storage.runs import identity_digest
+from fmtorch.runs.feature_cache import CachedFeatures
+from fmtorch.runs.fingerprint import configuration, environment
+from fmtorch.runs.run_folder import identity_digest
 
 MAX_MATCHES = 4000  # matches kept of a pair
 

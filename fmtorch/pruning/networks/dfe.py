@@ -12,7 +12,7 @@ from fmtorch.core.types import Correspondences
 from fmtorch.geometry.irls import reweighted_fits
 from fmtorch.pruning.networks.inputs import MatchInputs
 from fmtorch.pruning.networks.layers import ContextBatchNormReLU, Perceptron, Slots
-from fmtorch.pruning.networks.prediction import Backbone, Prediction
+from fmtorch.pruning.networks.learned import Backbone, Prediction
 
 RESIDUAL_UNIT = 1e-3  # of the image's longest side, or of the focal length: about a pixel
 LARGEST_RESIDUAL = 0.5  # of the same; as published

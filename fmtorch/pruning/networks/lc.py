@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from fmtorch.core.types import Correspondences
 from fmtorch.pruning.networks.inputs import MatchInputs
 from fmtorch.pruning.networks.layers import Perceptron, ResidualBlock, Slots
-from fmtorch.pruning.networks.prediction import Backbone, Prediction
+from fmtorch.pruning.networks.learned import Backbone, Prediction
 
 
 class PointCN(nn.Module):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from fmtorch.storage.exchange.journal import ExportedImage, ExportedPair, Journal
+from fmtorch.io.match_store import ExportedImage, ExportedPair, Journal
 
 
 @dataclasses.dataclass(frozen=True)

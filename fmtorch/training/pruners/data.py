@@ -15,9 +15,8 @@ from rich.progress import Progress
 from fmtorch import data, presets
 from fmtorch.core.terminal import reporter
 from fmtorch.data import ImagePair, PairDataset
-from fmtorch.data.matchable import ENOUGH
-from fmtorch.data.rendered import RenderedPairs
-from fmtorch.data.subset import subset
+from fmtorch.data.construction import ENOUGH
+from fmtorch.data.pairs import subset
 from fmtorch.evaluation.run import select
 from fmtorch.pipeline.labelled import Augmentation, LabelledMatches, MatchedPairs, StoredMatches
 from fmtorch.pipeline.labelled.stored import last_scenes
@@ -25,7 +24,8 @@ from fmtorch.pipeline.labelled.transforms import keep_ratio
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
 from fmtorch.presets.executors import execution_of
-from fmtorch.storage.features import cached
+from fmtorch.runs.feature_cache import cached
+from fmtorch.scenes import RenderedPairs
 from fmtorch.training.photographs import Photograph, list_photographs
 from fmtorch.training.planes import PlanePairs, PlaneViews
 

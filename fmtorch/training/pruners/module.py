@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from fmtorch.pipeline.labelled import LabelledMatches
-from fmtorch.pruning.networks.prediction import predict
+from fmtorch.pruning.networks.learned import predict
 from fmtorch.training.pruners.objective import Objective
 from fmtorch.training.pruners.validation import Evaluation, Validation
 

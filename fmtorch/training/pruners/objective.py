@@ -10,7 +10,7 @@ from torch import Tensor
 
 from fmtorch.geometry.eight_point import eight_point
 from fmtorch.pipeline.labelled import LabelledMatches
-from fmtorch.pruning.networks.prediction import Prediction
+from fmtorch.pruning.networks.learned import Prediction
 from fmtorch.training.pruner_losses import classification_loss, geometric_loss, nsgd_loss
 
 COORDINATES = ("size", "K")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fmtorch.data import ImagePair, read_image
 from fmtorch.evaluation.pictures import draw_matches
 from fmtorch.pipeline.labelled import LabelledMatches
-from fmtorch.pruning.networks.prediction import predict
+from fmtorch.pruning.networks.learned import predict
 from fmtorch.training.pruners.module import PrunerTraining
 
 HEIGHT = 480  # px

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from fmtorch.core.files import replacing
-from fmtorch.pruning.networks.prediction import Exportable
+from fmtorch.pruning.networks.learned import Exportable
 from fmtorch.training.model_card import OWN_LICENCE, sha256
 from fmtorch.training.pruner_export import export_onnx, save_weights
 from fmtorch.training.pruners.loop import BEST, CHECKPOINTS

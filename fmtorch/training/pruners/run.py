@@ -32,7 +32,7 @@ from fmtorch.pipeline.labelled import (
 )
 from fmtorch.presets import plain
 from fmtorch.presets.fields import Cache, Count, Gigabytes, Seed, read_fields
-from fmtorch.storage.runs import identity_digest
+from fmtorch.runs.run_folder import identity_digest
 from fmtorch.training.planes import PlaneViews
 from fmtorch.training.pruners.data import labelled_matches
 from fmtorch.training.pruners.loop import train

@@ -12,7 +12,7 @@ from fmtorch import metrics
 from fmtorch.core.stages import Estimator
 from fmtorch.metrics.recall import FINE_THRESHOLD
 from fmtorch.pipeline.labelled import LabelledMatches
-from fmtorch.pruning.networks.prediction import predict
+from fmtorch.pruning.networks.learned import predict
 from fmtorch.training.pruner_losses import classification_loss
 from fmtorch.training.reliability import reliability, temperature
 

@@ -9,12 +9,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from fmtorch.core.streams import Stream
 from fmtorch.core.types import Correspondences, Estimate, collate
 from fmtorch.estimators import Ransac
-from fmtorch.estimators.families.family import Hypotheses
-from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.degensac import (
+from fmtorch.estimators.degensac import (
     FITS,
     KEPT,
     PARALLAX_DRAWS,
@@ -24,10 +21,13 @@ from fmtorch.estimators.parts.degensac import (
     parallax,
     plane_of_sample,
 )
-from fmtorch.estimators.parts.preselection import Preselection
-from fmtorch.estimators.parts.sampling import largest_weight
-from fmtorch.estimators.parts.scores import Msac
+from fmtorch.estimators.models.model import Hypotheses
+from fmtorch.estimators.pair import Pair
+from fmtorch.estimators.preselection import Preselection
+from fmtorch.estimators.sampling import largest_weight
+from fmtorch.estimators.scores import Msac
 from fmtorch.estimators.search import Verified
+from fmtorch.jit.random import Stream
 from tests.estimators.pairs import FEW, SCALES, models, named, pair_of, to_units
 from tests.laws import assert_same
 from tests.reference import homography as reference

@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fmtorch.core.streams import Stream
 from fmtorch.estimators import Ransac
+from fmtorch.estimators.graph_cut import FIRST_DRAW, GraphCut, neighbor_graph
+from fmtorch.estimators.inliers import residuals_squared_px
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.graph_cut import FIRST_DRAW, GraphCut
-from fmtorch.estimators.parts.inliers import residuals_squared_px
-from fmtorch.estimators.parts.neighbours import neighbor_graph
-from fmtorch.estimators.parts.scores import Msac
-from fmtorch.estimators.parts.selection import scores_of
+from fmtorch.estimators.scores import Msac
+from fmtorch.estimators.selection import scores_of
+from fmtorch.jit.random import Stream
 from tests.estimators.pairs import FEW, REAL, SCALES, models, named
 from tests.reference.random import number
 from tests.reference.solvers import eight_point, normalised_equations, unit

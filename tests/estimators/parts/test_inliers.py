@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from fmtorch.estimators.parts.inliers import (
+from fmtorch.estimators.inliers import (
     BetterHalf,
     InlierRule,
     RobustDeviations,
@@ -15,7 +15,7 @@ from fmtorch.estimators.parts.inliers import (
     WithinThreshold,
     residuals_squared_px,
 )
-from fmtorch.estimators.parts.sampling import PriorWeighted, Prosac, Sampler, Uniform
+from fmtorch.estimators.sampling import PriorWeighted, Prosac, Sampler, Uniform
 from tests.estimators.pairs import FEW, SCALES, models, named
 from tests.estimators.residuals import residuals
 from tests.reference import ransac as reference

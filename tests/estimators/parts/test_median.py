@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fmtorch.estimators.parts.median import Median
+from fmtorch.estimators.scores import Median
 from tests.estimators.pairs import FEW, known, models, named, pair_of
 from tests.estimators.residuals import residuals
 from tests.reference.ransac import lower_median

@@ -7,10 +7,7 @@ import functools
 import numpy as np
 import pytest
 
-from fmtorch.compiling.arrays import F4x1, F8x1, F8x2
-from fmtorch.compiling.kernel import kernel
-from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.neighbours import (
+from fmtorch.estimators.graph_cut import (
     HALVINGS,
     MAX_NEIGHBOURS,
     SWEEPS,
@@ -21,6 +18,8 @@ from fmtorch.estimators.parts.neighbours import (
     label,
     neighbor_graph,
 )
+from fmtorch.estimators.pair import Pair
+from fmtorch.jit.kernel import F4x1, F8x1, F8x2, kernel
 from tests.conftest import oracle
 from tests.estimators.pairs import FEW, REAL, SCALES, models, named, to_units
 from tests.reference import graph_cut as reference

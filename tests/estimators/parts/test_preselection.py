@@ -7,19 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fmtorch.core.streams import Stream
 from fmtorch.estimators.options import Preselect
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.preselection import (
-    Preselection,
-    best,
-    draw_by_prior,
-    drawn_by_prior,
-    shuffle,
-    shuffled_first,
-)
-from fmtorch.estimators.parts.saturated import SaturatedGains
-from fmtorch.estimators.parts.scores import InlierCount, Magsac, Msac
+from fmtorch.estimators.preselection import Preselection, best, draw_by_prior, drawn_by_prior, shuffle, shuffled_first
+from fmtorch.estimators.scores import InlierCount, Magsac, Msac, SaturatedGains
+from fmtorch.jit.random import Stream
 from tests.estimators.pairs import FEW, models, named
 from tests.reference import sampling as reference
 from tests.reference.random import number

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fmtorch.core.streams import Stream
 from fmtorch.estimators import Ransac
-from fmtorch.estimators.families.fundamental import SevenPoint
+from fmtorch.estimators.models.fundamental import SevenPoint
 from fmtorch.estimators.options import Refine
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.refinement import Refinement
+from fmtorch.estimators.refinement import Refinement
 from fmtorch.estimators.search import Pool
+from fmtorch.jit.random import Stream
 from tests.estimators.pairs import FEW, SCALES, models, named
 from tests.estimators.residuals import residuals
 from tests.reference import refine as reference

@@ -9,10 +9,10 @@ import pytest
 import torch
 from scipy import stats
 
-from fmtorch.core.streams import Stream
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.sampling import PriorWeighted, Prosac, Sampler, Uniform, largest_weight
+from fmtorch.estimators.sampling import PriorWeighted, Prosac, Sampler, Uniform, largest_weight
+from fmtorch.jit.random import Stream
 from tests.estimators.pairs import known, named, pair_of
 from tests.laws import scene, with_padding
 from tests.reference import sampling as reference

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.saturated import GRID, SaturatedGains, saturated_cells
-from fmtorch.estimators.parts.scored_matches import fractional_bits
+from fmtorch.estimators.scores import GRID, SaturatedGains, fractional_bits, saturated_cells
 from tests.estimators.pairs import FEW, SCALES, known, models, named, pair_of
 from tests.estimators.residuals import residuals
 from tests.reference import ransac as reference

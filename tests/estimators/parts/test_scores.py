@@ -9,10 +9,9 @@ import pytest
 from scipy import integrate
 
 from fmtorch.estimators.pair import Pair
-from fmtorch.estimators.parts.scored_matches import fractional_bits
-from fmtorch.estimators.parts.scores import GemanMcClure, InlierCount, Magsac, Msac, Score, SummedGains
-from fmtorch.geometry.magsac import ENTRIES, QUANTILE
-from fmtorch.geometry.residual_kernels import HOMOGRAPHY, SAMPSON
+from fmtorch.estimators.scores import GemanMcClure, InlierCount, Magsac, Msac, Score, SummedGains, fractional_bits
+from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON
+from fmtorch.geometry.robust_losses import ENTRIES, QUANTILE
 from tests.estimators.pairs import FEW, REAL, SCALES, known, models, named, pair_of
 from tests.estimators.residuals import residuals
 from tests.reference import ransac as reference

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from fmtorch.estimators import Ransac
-from fmtorch.estimators.parts.refinement import Candidates
-from fmtorch.estimators.parts.scores import Msac
-from fmtorch.estimators.parts.selection import BestOfSearch, BestScore, scores_of
+from fmtorch.estimators.refinement import Candidates
+from fmtorch.estimators.scores import Msac
+from fmtorch.estimators.selection import BestOfSearch, BestScore, scores_of
 from tests.estimators.pairs import pair_of
 from tests.laws import scene
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from fmtorch.core.types import Correspondences
-from fmtorch.estimators.parts.support import FIRST_LOOK, degenerate_support
+from fmtorch.estimators.preselection import FIRST_LOOK, degenerate_support
 from tests.estimators.pairs import FEW, SCALES, named, pair_of
 from tests.reference import support as reference
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from fmtorch.core.types import Correspondences, pair_key
-from fmtorch.data.rendered import Plan, RenderedPairs
-from fmtorch.data.rendered.pinhole import calibration
 from fmtorch.pipeline.labelled import LabelledMatches, MatchedPairs
+from fmtorch.scenes import Plan, RenderedPairs
+from fmtorch.scenes.camera import calibration
 from tests.conftest import own_cache
 
 TINY = Plan(scenes=2, shots=4, pairs=4, scale=0.25)

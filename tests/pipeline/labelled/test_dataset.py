@@ -16,8 +16,6 @@ from torch.utils.data import DataLoader
 
 from fmtorch.data import load
 from fmtorch.data.pairs import ImagePair, ImageSource
-from fmtorch.data.rendered import RenderedPairs
-from fmtorch.data.rendered.generate import FAMILIES, PLANS, Task
 from fmtorch.geometry.epipolar import symmetric_max
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.labelled import (
@@ -35,6 +33,8 @@ from fmtorch.pipeline.labelled import labels as labels_module
 from fmtorch.pipeline.labelled.compute import SHARD, partition
 from fmtorch.pipeline.labelled.labels import label
 from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.scenes import RenderedPairs
+from fmtorch.scenes.generate import FAMILIES, PLANS, Task
 from tests.conftest import shared_path
 from tests.pipeline.labelled.conftest import SIFT
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from fmtorch.data.rendered import RenderedPairs
-from fmtorch.data.rendered import dataset as rendered_dataset
+from fmtorch.scenes import RenderedPairs
+from fmtorch.scenes import dataset as rendered_dataset
 from tests.pipeline.labelled.conftest import FAMILY, TINY
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "guides" / "training.md"

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 from fmtorch.data.pairs import ImagePair, ImageSource
-from fmtorch.data.rendered import RenderedPairs
-from fmtorch.data.rendered.pinhole import calibration, fundamental, look_at, relative_pose
 from fmtorch.pipeline.labelled.labels import (
     EDGE_PX,
     by_line,
@@ -20,6 +18,8 @@ from fmtorch.pipeline.labelled.labels import (
     line_distance,
     transfer_error,
 )
+from fmtorch.scenes import RenderedPairs
+from fmtorch.scenes.camera import calibration, fundamental, look_at, relative_pose
 from tests.reference import labels as reference
 
 SIZE = (240, 320)

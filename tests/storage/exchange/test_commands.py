@@ -20,13 +20,12 @@ from omegaconf import DictConfig
 from fmtorch import data
 from fmtorch.commands import eval as eval_command
 from fmtorch.commands import match as match_command
-from fmtorch.core.resources import conf_dir
+from fmtorch.core.files import conf_dir
+from fmtorch.io.export import DATABASE, FEATURES, MATCHES
 from fmtorch.pipeline import folder
-from fmtorch.pipeline.folder_images import chosen_pairs, images_below
-from fmtorch.pipeline.folder_output import open_folder
+from fmtorch.pipeline.folder import chosen_pairs, images_below, open_folder
 from fmtorch.pipeline.two_images import Described
-from fmtorch.storage import RunFolder
-from fmtorch.storage.exchange.export import DATABASE, FEATURES, MATCHES
+from fmtorch.runs import RunFolder
 from tests.pipeline.test_pipeline import draw
 
 OPTIONS = ("features.max_features=400", "estimator=lmeds", "estimator.hypotheses=100", "cache=off")

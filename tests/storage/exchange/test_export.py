@@ -15,12 +15,11 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
+from fmtorch.io.colmap import ORIGIN, write_database
+from fmtorch.io.export import DATABASE, export_kinds, write_exports
+from fmtorch.io.match_store import ExportedImage, ExportedPair, Journal, indices
 from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.folder import FolderMatches
-from fmtorch.pipeline.folder_images import chosen_pairs, images_below
-from fmtorch.storage.exchange.colmap import ORIGIN, write_database
-from fmtorch.storage.exchange.export import DATABASE, export_kinds, write_exports
-from fmtorch.storage.exchange.journal import ExportedImage, ExportedPair, Journal, indices
+from fmtorch.pipeline.folder import FolderMatches, chosen_pairs, images_below
 from tests.conftest import shared_path
 
 K = np.array([[1000.0, 0, 480], [0, 1000, 410], [0, 0, 1]])

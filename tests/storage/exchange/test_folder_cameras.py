@@ -19,11 +19,11 @@ from PIL import ExifTags, Image
 
 import fmtorch
 from fmtorch.commands import match as match_command
-from fmtorch.core.resources import conf_dir
+from fmtorch.core.files import conf_dir
 from fmtorch.data import load, read_image
 from fmtorch.data.lenses import Lens
+from fmtorch.io.export import DATABASE, MATCHES
 from fmtorch.metrics import pose_error
-from fmtorch.storage.exchange.export import DATABASE, MATCHES
 from tests.commands.test_match_cameras import BENT, photographed
 from tests.conftest import shared_path
 

@@ -20,10 +20,10 @@ from fmtorch import data, presets
 from fmtorch.data import DataError, ImagePair
 from fmtorch.evaluation.gallery import Options, find_dataset
 from fmtorch.evaluation.rows import evaluate
+from fmtorch.io.dataset import H5Pairs
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.pruning import ratio_test
-from fmtorch.storage.exchange.dataset import H5Pairs
 from tests.storage.exchange import writers
 
 NEEDS_TRUTH = ("hloc", "glue_factory", "vismatch")

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from fmtorch.evaluation.view_graph_picture import MAX_THUMBNAILS, spectral_order, view_graph_svg
-from fmtorch.storage.exchange.journal import ExportedPair, Journal
-from fmtorch.storage.exchange.view_graph import Edge, ViewGraph, view_graph, write_view_graph
+from fmtorch.io.export import Edge, ViewGraph, view_graph, write_view_graph
+from fmtorch.io.match_store import ExportedPair, Journal
 
 SVG = "{http://www.w3.org/2000/svg}"
 

@@ -1,0 +1,72 @@
+"""ONNX files opened for inference on a CPU."""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+
+
+class NetworkFileError(ValueError):
+    """A network file that is absent, unreadable or of another shape; the message names it and what makes it."""
+
+
+def onnx_session(path: Path | str, threads: int, hint: str) -> Any:
+    """An inference session of ONNX Runtime on CPU; one for each file and thread count serves the whole process.
+
+    Args:
+        path: the file.
+        threads: of one operator; operators run one after the other.
+        hint: what makes such a file, for the errors.
+
+    Returns:
+        An ``onnxruntime.InferenceSession``, which several threads may use. A file that changed is opened again.
+
+    Raises:
+        NetworkFileError: the file is absent or cannot be run.
+    """
+    path = Path(path).absolute()
+    if not path.is_file():
+        raise NetworkFileError(f"{path} does not exist: {hint}")
+    try:
+        return _opened(str(path), path.stat().st_mtime_ns, threads)
+    except Exception as error:  # the runtime has a dozen kinds, and where its message is no text, UnicodeDecodeError
+        raise NetworkFileError(f"{path} is no ONNX network that can be run ({error}): {hint}") from error
+
+
+@functools.lru_cache(maxsize=16)
+def _opened(path: str, modified: int, threads: int) -> Any:
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    options.log_severity_level = 3
+    return onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+
+
+# Networks that other libraries fetch
+
+
+Network = TypeVar("Network")
+
+
+def pretrained(load: Callable[[], Network], name: str, publisher: str, file: str) -> Network:
+    """The network that a library's own loader fetches once and keeps in torch's hub folder.
+
+    Raises ConnectionError, saying what to put where, where it cannot be fetched.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of each attempt; the last one's error says it all
+            network = load()
+    except (RuntimeError, OSError) as error:
+        cause = str(error.__cause__ or error).splitlines()[0]
+        raise ConnectionError(
+            f"the weights of {name} cannot be loaded ({cause}). They are not part of this project: run once with "
+            f"access to {publisher}, or copy its {file} to {Path(torch.hub.get_dir()) / 'checkpoints' / file}"
+        ) from error
+    return network

@@ -1,0 +1,112 @@
+"""Fundamental matrices without assumptions: samples of seven or eight matches, refined on the manifold of rank 2."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import ClassVar
+
+import numpy as np
+
+from fmtorch.estimators.models.model import FitScale, Hypotheses, Loss, Steps
+from fmtorch.estimators.pair import Pair, to_pixels
+from fmtorch.geometry.eight_point import eight_point_kernel, weighted_eight_point
+from fmtorch.geometry.epipolar import SAMPSON, Residual
+from fmtorch.geometry.levenberg_marquardt import LOSSES, NO_TABLE, Schedule, Weighted, loss_table
+from fmtorch.geometry.rank2_manifold import gauss_newton, response
+from fmtorch.geometry.refine import refine_kernel
+from fmtorch.geometry.seven_point import seven_point_kernel
+from fmtorch.jit.kernel import Array
+
+STEP_DAMPING = 1e-10  # of a Gauss-Newton step at an optimum: bounds it where the points leave a direction open
+SQUARINGS = 1  # by which models are made rank 2, whose last singular value is but rounding of float32
+
+
+class Matrices:
+    """What the families share whose models are matrices of a minimal sample, each by its kernels.
+
+    size, solutions: matches of a minimal sample, and its models at most. minimal: samples -> models. linear: weighted
+    matches -> the model of least squares. gauss_newton: a model -> the model after one step.
+    """
+
+    size: ClassVar[int]
+    solutions: ClassVar[int]
+    minimal: ClassVar[Callable[..., int]]
+    linear: ClassVar[Callable[..., bool]]
+    gauss_newton: ClassVar[Callable[..., None]]
+
+    def solve(self, pair: Pair, sample: Array, start: int) -> Hypotheses:
+        """As `Family.solve`."""
+        F = np.empty((sample.shape[1] * self.solutions, 9), np.float32)
+        draw = np.empty(len(F), np.int64)
+        count = self.minimal(pair.points, sample, F, draw)
+        return Hypotheses(F[:count], draw[:count], sample, start)
+
+    def weight(self, pair: Pair) -> Array:
+        """What each match (n,) counts in `refine`."""
+        weight: Array = pair.weight
+        return weight
+
+    def minimise(self, F: Array, matches: Weighted, schedule: Schedule, out: Array, cost: Array) -> None:
+        """Models (k, 9) of least robust error near F -> out (k, 9), and their costs (k,)."""
+        raise NotImplementedError
+
+    def refine(self, F: Array, pair: Pair, loss: Loss, steps: Steps) -> Array:
+        """As `Refining.refine`."""
+        s2 = np.square(loss.scale / pair.pixels_per_noise)
+        matches = Weighted(pair.points, self.weight(pair), s2, LOSSES[loss.name], loss_table(loss.name))
+        refined, cost = np.empty_like(F), np.empty(len(F))
+        self.minimise(F, matches, Schedule(steps.iterations, steps.damping, steps.tolerance or 0.0), refined, cost)
+        np.copyto(refined, F, where=~np.isfinite(cost)[:, None])
+        return refined
+
+    def least_squares(self, F: Array, pair: Pair, weight: Array) -> Array:
+        """As `Refining.least_squares`."""
+        fitted = np.empty(9)
+        return fitted if self.linear(pair.points, weight, fitted) else F
+
+    def step(self, F: Array, pair: Pair, weight: Array) -> Array:
+        """As `Refining.step`."""
+        moved = np.empty(9)
+        self.gauss_newton(F, squared_error(pair, weight), STEP_DAMPING, moved)
+        return moved if np.isfinite(moved).all() else F
+
+
+def squared_error(pair: Pair, weight: Array) -> Weighted:
+    """Weighted matches, whose errors are squared without bound."""
+    return Weighted(pair.points, weight, np.full(pair.count, np.inf), LOSSES["truncated"], NO_TABLE)
+
+
+class Fundamental(Matrices):
+    """Matrices of rank 2."""
+
+    model: ClassVar[str] = "fundamental"
+    residual: ClassVar[Residual] = SAMPSON
+    fit_scale: ClassVar[FitScale] = FitScale()
+    linear, gauss_newton = weighted_eight_point, gauss_newton
+
+    def to_pixels(self, F: Array, pair: Pair, out: Array) -> bool:
+        """As `Estimated.to_pixels`, the entry of largest magnitude positive."""
+        return to_pixels(F, pair.centre, pair.pixels_per_unit, out)
+
+    def minimise(self, F: Array, matches: Weighted, schedule: Schedule, out: Array, cost: Array) -> None:
+        """As `Matrices.minimise`."""
+        refine_kernel(F, SQUARINGS, matches, schedule, out, cost)
+
+
+class SevenPoint(Fundamental):
+    """Up to three models from seven matches."""
+
+    size, solutions, minimal = 7, 3, seven_point_kernel
+
+
+class EightPoint(Fundamental):
+    """One model from eight matches."""
+
+    size, solutions, minimal = 8, 1, eight_point_kernel
+
+
+def response_of(F: Array, pair: Pair, weight: Array) -> Array:
+    """How the optimum F (9,) moves with the gradient of its cost, (9, 9): minus the inverse Hessian."""
+    inverse = np.empty((9, 9))
+    response(F, squared_error(pair, weight), STEP_DAMPING, inverse)
+    return inverse if np.isfinite(inverse).all() else np.zeros((9, 9))

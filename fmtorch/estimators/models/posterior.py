@@ -1,0 +1,399 @@
+"""The posterior of two cameras given matches, and its maximum near models: refinement with the prior.
+
+axes: (k, 2, 3, 3), U and V of ``E = U diag(1, 1, 0) V^T``, rows first. focal: (k, 2), logarithms of focal lengths in
+units of the longer sides. Points are from the principal points.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fmtorch.estimators.calibration import EXACT
+from fmtorch.estimators.models.focal_prior import LOG_USUAL, FocalPrior, focal_cost, focal_prior, prior_slopes
+from fmtorch.estimators.pair import Pair
+from fmtorch.geometry.arithmetic import exponential, logarithm_kernel
+from fmtorch.geometry.levenberg_marquardt import Weighted, evaluate, levenberg_marquardt
+from fmtorch.geometry.matrices import assign, assign_rows
+from fmtorch.geometry.pose import nearest_axes
+from fmtorch.geometry.rank2_manifold import SQUARINGS, eliminate, start_one
+from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, F8x4, inner, kernel, matrix, vector
+from fmtorch.jit.lanes import LANES, fill, load, store
+
+# Two cameras of square pixels and central principal points: fundamental matrices by their parameters
+
+
+MIN_IMAGE_SIDE_PX = 16.0  # longer side of both images below which sizes are taken for those of another unit than pixels
+MIN_FOCAL, MAX_FOCAL = 0.25, 5.0  # focal lengths outside, in units of the longer side, are not believed at the start
+
+
+class Cameras(NamedTuple):
+    """The cameras of k candidates: axes (k, 2, 3, 3), U and V, rows first; focal (k, 2), logarithms."""
+
+    axes: F8x4
+    focal: F8x2
+
+    def of(self, k: int) -> Cameras:
+        """Those of one candidate."""
+        return Cameras(self.axes[k : k + 1], self.focal[k : k + 1])
+
+    def joined(self, other: Cameras) -> Cameras:
+        """The candidates of both."""
+        return Cameras(np.concatenate([self.axes, other.axes]), np.concatenate([self.focal, other.focal]))
+
+    def copy(self) -> Cameras:
+        """The same in memory of its own."""
+        return Cameras(self.axes.copy(), self.focal.copy())
+
+
+def no_cameras(k: int) -> Cameras:
+    """Room for the cameras of k candidates."""
+    return Cameras(np.empty((k, 2, 3, 3)), np.empty((k, 2)))
+
+
+class Images(NamedTuple):
+    """Two images in normalised units. offset: (4,), from the points to those from the principal points. longest: (2,),
+    the longer sides. prior: on the focal lengths."""
+
+    offset: F8x1
+    longest: F8x1
+    prior: FocalPrior
+
+
+def images_of(pair: Pair) -> Images:
+    """The images of a pair whose sizes are known, computed once."""
+    images: Images | None = pair.images.get("images")
+    if images is None:
+        images = pair.images["images"] = _images(pair)
+    return images
+
+
+def _images(pair: Pair) -> Images:
+    unit, (h0, w0, h1, w1) = pair.pixels_per_unit, pair.sizes.tolist()
+    sides = w0, h0, w1, h1
+    # Half a pixel, of images in pixels; of sizes in another unit nobody knows what it is, and it is small.
+    pixel = 0.0 if max(sides) < MIN_IMAGE_SIDE_PX else 1.0
+    offset = np.array([(x - (side - pixel) / 2) / unit for x, side in zip(pair.centre.tolist(), sides, strict=True)])
+    prior = focal_prior(pair.same_size)
+    if (known := pair.calibration) is not None:
+        measured = known.logarithms((max(h0, w0), max(h1, w1)))
+        prior = focal_prior(pair.same_size, known.shared, measured, known.deviations)
+    return Images(offset, np.array([max(h0, w0) / unit, max(h1, w1) / unit]), prior)
+
+
+def focals_px(cameras: Cameras, pair: Pair) -> Array:
+    """The focal lengths (2,) of the first candidate, px."""
+    f0, f1 = cameras.focal[0].tolist()
+    return np.array([exponential(f0), exponential(f1)]) * images_of(pair).longest * pair.pixels_per_unit
+
+
+def focals_near(F: Array, pair: Pair) -> Array:
+    """The focal lengths (2,) near a model (9,), px, by Bougnoux's formula; NaN of those that are measured."""
+    cameras, calibration = no_cameras(1), pair.calibration
+    nearest_cameras(F[None], images_of(pair), cameras)
+    focals = focals_px(cameras, pair)
+    return focals if calibration is None else np.where(np.isinf(calibration.deviations), focals, np.nan)
+
+
+def focal_precision(focals: Array, pair: Pair) -> Array:
+    """The second derivatives (2, 2) of the prior's cost by the logarithms of the focal lengths (2,), px.
+
+    Infinite on the diagonal where a focal length is exactly known; one parameter that both share has the first place.
+    """
+    images, work = images_of(pair), np.empty(5)
+    if pair.calibration is not None:
+        focals = np.where(np.isnan(focals), pair.calibration.focals, focals)
+    f0, f1 = (focals / (images.longest * pair.pixels_per_unit)).tolist()
+    logarithms = np.array([logarithm_kernel(f0), logarithm_kernel(f1)])
+    prior_slopes(logarithms, images.prior, work)
+    precision = np.array([[work[2], work[4]], [work[4], 0.0 if images.prior.shared else work[3]]])
+    if pair.calibration is not None:
+        exact = np.array(pair.calibration.deviations) < EXACT
+        np.fill_diagonal(precision, np.where(exact, np.inf, precision.diagonal()))
+    return precision
+
+
+class CentredMatches(NamedTuple):
+    """Points (4, n) from the principal points; s2 (n,), squared scales of a loss in the unit of the points; precision
+    (n,), one over these."""
+
+    points: Array
+    s2: Array
+    precision: Array
+
+
+def centred(pair: Pair, scale_px: float = 1.0) -> CentredMatches:
+    """The matches of a pair whose image sizes are known, computed once. scale_px: of the loss."""
+    return pair.cached(("centred", scale_px), lambda pair: _centred(pair, scale_px))
+
+
+def _centred(pair: Pair, scale_px: float) -> CentredMatches:
+    out = np.empty((6, pair.count))
+    centre(pair.table, images_of(pair).offset, scale_px, out)
+    return CentredMatches(out[:4], out[4], out[5])
+
+
+@kernel(holds_gil=True)
+def translate(F: F8x2, offset: F8x1, out: F8x2) -> None:
+    """Models (k, 9) for points from which the offset (4,) is taken -> out (k, 9)."""
+    for k in range(len(F)):
+        for r in range(3):
+            a, b = F[k, 3 * r], F[k, 3 * r + 1]
+            out[k, 3 * r], out[k, 3 * r + 1] = a, b
+            out[k, 3 * r + 2] = F[k, 3 * r + 2] + offset[0] * a + offset[1] * b
+        for c in range(3):
+            out[k, 6 + c] += offset[2] * out[k, c] + offset[3] * out[k, 3 + c]
+
+
+@kernel(holds_gil=True)
+def centre(table: F8x2, offset: F8x1, scale_px: float, out: F8x2) -> None:
+    """Points from the principal points, squared scales of a loss, and one over these -> out (6, n).
+
+    table: (9, n), of `Pair`. offset: (4,), what is added to points. scale_px: of the loss, of a usual match.
+    """
+    for i in range(table.shape[1]):
+        for r in range(4):
+            out[r, i] = table[r, i] + offset[r]
+        scale = table[5, i]
+        out[4, i], out[5, i] = (scale_px / scale) * (scale_px / scale), (scale / scale_px) * (scale / scale_px)
+
+
+@kernel(holds_gil=True)
+def nearest_cameras(F: F8x2, images: Images, cameras: Cameras) -> None:
+    """Cameras near models (k, 9): those of their focal lengths, or of usual or measured ones where these are
+    implausible; of exactly measured ones."""
+    axes, focal, longest, shifted = cameras.axes, cameras.focal, images.longest, np.empty(F.shape)
+    prior = images.prior
+    measured = prior.precision[0] > 0 or prior.precision[1] > 0
+    translate(F, -images.offset, shifted)
+    G, M, e0, e1 = vector(9), vector(9), vector(3), vector(3)
+    for k in range(len(shifted)):
+        start_one(shifted[k], SQUARINGS, G, e0, e1)
+        first = _squared_focal(G, 1, 3, e1) / (longest[0] * longest[0])
+        second = _squared_focal(G, 3, 1, e0) / (longest[1] * longest[1])
+        plausible0, plausible1 = MIN_FOCAL**2 < first < MAX_FOCAL**2, MIN_FOCAL**2 < second < MAX_FOCAL**2
+        if not measured:  # one implausible focal length speaks against the other
+            plausible0 = plausible0 and plausible1
+            plausible1 = plausible0
+        focal[k, 0] = logarithm_kernel(first) / 2 if plausible0 else LOG_USUAL
+        focal[k, 1] = logarithm_kernel(second) / 2 if plausible1 else LOG_USUAL
+        for i in range(2):
+            plausible = plausible0 if i == 0 else plausible1
+            if prior.precision[i] > 1 / EXACT**2 or (prior.precision[i] > 0 and not plausible):
+                focal[k, i] = prior.measured[i]
+        if prior.shared:
+            focal[k, 0] = (focal[k, 0] + focal[k, 1]) / 2
+            focal[k, 1] = focal[k, 0]
+        d0 = 1 / (exponential(focal[k, 0]) * longest[0])
+        d1 = 1 / (exponential(focal[k, 1]) * longest[1])
+        for r in range(3):
+            G[3 * r + 2] *= d0
+        for c in range(3):
+            G[6 + c] *= d1
+        start_one(G, 0, M, e0, e1)
+        nearest_axes(M, e0, e1, axes[k, 0], axes[k, 1])
+
+
+@inner
+def _squared_focal(F: Array, column: int, row: int, e: Array) -> Any:
+    """Bougnoux's formula (ICCV 1998) for the camera whose points F's columns belong to; steps exchanged, the other."""
+    r0 = -F[0] * e[1] + F[row] * e[0]
+    r1 = -F[column] * e[1] + F[row + column] * e[0]
+    r2 = -F[2 * column] * e[1] + F[row + 2 * column] * e[0]
+    return -(r2 * F[8]) / (r0 * F[2 * row] + r1 * F[2 * row + column])
+
+
+FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-9, 1e6
+
+
+class Limits(NamedTuple):
+    """precision: one over the variance of an inlier's distance. iterations: steps at most. tolerance: what a step must
+    lower the cost of a candidate by, if its fit is to go on; negative: none is ever done, and the derivatives are not
+    those at the end."""
+
+    precision: float
+    iterations: int
+    tolerance: float
+
+
+class Optimum(NamedTuple):
+    """Of k candidates, models F (k, 9), costs (k,), and their derivatives by five rotations and two logarithms,
+    gradient (k, 7), hessian (k, 7, 7)."""
+
+    F: F8x2
+    cost: F8x1
+    gradient: F8x2
+    hessian: F8x3
+
+
+class _State(NamedTuple):
+    """Of k candidates, cameras, models (k, 9), costs (k,), and their derivatives (k, 7), (k, 7, 7).
+
+    shared: whether the two focal lengths are one; the sixth parameter is then its logarithm and the seventh has none.
+    """
+
+    axes: Array
+    focal: Array
+    F: Array
+    cost: Array
+    gradient: Array
+    hessian: Array
+    shared: bool
+
+
+class _Data(NamedTuple):
+    """What `minimise` is given; tangents (k, 9, LANES), of which 7 count, and products (k, 10, 10) for the work."""
+
+    matches: Weighted
+    images: Images
+    limits: Limits
+    tangents: Array
+    products: Array
+
+
+def no_optimum(k: int) -> Optimum:
+    """Room for the optima of k candidates."""
+    return Optimum(np.empty((k, 9)), np.empty(k), np.empty((k, 7)), np.empty((k, 7, 7)))
+
+
+@kernel
+def minimise(cameras: Cameras, matches: Weighted, images: Images, limits: Limits, out: Optimum) -> None:
+    """Cameras of least negative logarithm of the posterior near these, in place; what it is there -> out."""
+    k, shared = len(out.cost), images.prior.shared
+    state = _State(cameras.axes, cameras.focal, out.F, out.cost, out.gradient, out.hessian, shared)
+    axes, hessian = np.empty((k, 2, 3, 3)), np.empty((k, 7, 7))
+    trial = _State(axes, matrix(k, 2), matrix(k, 9), vector(k), matrix(k, 7), hessian, shared)
+    data = _Data(matches, images, limits, np.zeros((k, 9, LANES)), np.empty((k, 10, 10)))
+    _minimise(data, state, trial, np.full(k, FIRST_DAMPING), limits.iterations, limits.tolerance >= 0)
+
+
+@kernel(holds_gil=True)
+def tangents_of(cameras: Cameras, longest: F8x1, F: F8x2, out: F8x3) -> None:
+    """Fundamental matrices -> F (k, 9), and their derivatives by five rotations and two logarithms -> (k, 9, LANES)."""
+    _models(cameras.axes, cameras.focal, longest, F, out)
+
+
+@inner
+def _evaluate(state: _State, data: _Data, derivatives: bool) -> None:
+    _models(state.axes, state.focal, data.images.longest, state.F, data.tangents)
+    if state.shared:
+        _tie(data.tangents)
+    evaluate(state.F, data.matches, derivatives, data.products, state.cost)
+    work = vector(5)
+    for k in range(len(state.cost)):
+        prior = focal_cost(state.focal[k], data.images.prior, work)
+        state.cost[k] = state.cost[k] * data.limits.precision / 2 + prior
+        if derivatives:
+            _derivatives(
+                data.products[k], data.tangents[k], work, data.limits.precision, state.gradient[k], state.hessian[k]
+            )
+
+
+@inner
+def _models(axes: Array, focal: Array, longest: Array, F: Array, tangents: Array) -> None:
+    """Fundamental matrices -> F (k, 9), and their derivatives by five rotations and two logarithms -> (k, 9, LANES)."""
+    for k in range(len(F)):
+        U, V, T = axes[k, 0], axes[k, 1], tangents[k]
+        d0, d1 = exponential(focal[k, 0]) * longest[0], exponential(focal[k, 1]) * longest[1]
+        for r in range(3):
+            for c in range(3):
+                by, q = (d0 if c == 2 else 1.0) * (d1 if r == 2 else 1.0), 3 * r + c
+                F[k, q] = (U[r, 0] * V[c, 0] + U[r, 1] * V[c, 1]) * by
+                T[q, 0], T[q, 1] = U[r, 2] * V[c, 1] * by, -U[r, 2] * V[c, 0] * by
+                T[q, 2] = (U[r, 1] * V[c, 0] - U[r, 0] * V[c, 1]) * by
+                T[q, 3], T[q, 4] = U[r, 1] * V[c, 2] * by, -U[r, 0] * V[c, 2] * by
+                T[q, 5], T[q, 6] = F[k, q] if c == 2 else 0.0, F[k, q] if r == 2 else 0.0
+
+
+@inner
+def _tie(tangents: Array) -> None:
+    """One logarithm for both images: derivatives (k, 9, LANES) by the first are those by it, by the second zero."""
+    for k in range(len(tangents)):
+        for q in range(9):
+            tangents[k, q, 5] += tangents[k, q, 6]
+            tangents[k, q, 6] = 0.0
+
+
+@inner
+def _derivatives(
+    products: Array, tangents: Array, prior: Array, precision: float, gradient: Array, hessian: Array
+) -> None:  # fmt: skip
+    """Of one candidate. products: (10, 10), of `evaluate`; tangents: (9, LANES); prior: (5,), of `focal_cost`."""
+    along, column = matrix(10, LANES), matrix(1, LANES)
+    for j in range(10):
+        total = fill(0.0)
+        for q in range(9):
+            total += load(tangents, q) * products[q, j]
+        store(along, j, total)
+    for i in range(7):
+        gradient[i] = along[9, i] * precision
+    for j in range(7):
+        total = fill(0.0)
+        for q in range(9):
+            total += load(tangents, q) * along[q, j]
+        store(column, 0, total * precision)
+        for i in range(7):
+            hessian[i, j] = column[0, i]
+    for i in range(2):
+        gradient[5 + i] += prior[i]
+        for j in range(2):
+            hessian[5 + i, 5 + j] += prior[2 + i] if i == j else prior[4]
+
+
+@inner
+def _step(state: _State, damping: Array, trial: _State) -> None:
+    Q = matrix(7, LANES)
+    for k in range(len(damping)):
+        damped_step(state.hessian[k], state.gradient[k], damping[k], Q)
+        _rotate(state.axes[k, 0], Q[0, 7] / 2, Q[1, 7] / 2, Q[2, 7] / 2, trial.axes[k, 0])
+        _rotate(state.axes[k, 1], Q[3, 7] / 2, Q[4, 7] / 2, 0.0, trial.axes[k, 1])
+        for i in range(2):
+            step = Q[5 if state.shared else 5 + i, 7]
+            trial.focal[k, i] = min(max(state.focal[k, i] + min(max(step, -1.0), 1.0), -3.0), 3.0)
+
+
+@inner
+def damped_step(hessian: Array, gradient: Array, damping: float, Q: Array) -> None:
+    """Solves ``(H + damping diag H) x = -gradient`` -> last column of Q (7, LANES)."""
+    for i in range(7):
+        for j in range(7):
+            Q[i, j] = hessian[i, j]
+        Q[i, i] += hessian[i, i] * damping
+        Q[i, 7] = -gradient[i]
+    eliminate(Q, 7)
+
+
+@inner
+def _rotate(A: Array, x: float, y: float, z: float, out: Array) -> None:
+    """``A R`` with the Cayley rotation of (x, y, z), half of its angles -> out (3, 3)."""
+    n = x * x + y * y + z * z
+    factor = 2 / (1 + n)
+    for r in range(3):
+        a, b, c = A[r, 0], A[r, 1], A[r, 2]
+        along = a * x + b * y + c * z
+        out[r, 0] = a + factor * (z * b - y * c + along * x - n * a)
+        out[r, 1] = b + factor * (x * c - z * a + along * y - n * b)
+        out[r, 2] = c + factor * (y * a - x * b + along * z - n * c)
+
+
+@inner
+def _accept(state: _State, trial: _State, damping: Array, done: Array, data: _Data) -> bool:
+    everything = True
+    for k in range(len(damping)):
+        better = trial.cost[k] < state.cost[k] and not done[k]
+        damping[k] = min(max(damping[k] / 10 if better else damping[k] * 10, MIN_DAMPING), MAX_DAMPING)
+        if better:
+            done[k] |= data.limits.tolerance >= 0 and state.cost[k] - trial.cost[k] <= data.limits.tolerance
+            state.cost[k] = trial.cost[k]
+            assign(state.focal[k], trial.focal[k])
+            assign(state.F[k], trial.F[k])
+            assign(state.gradient[k], trial.gradient[k])
+            assign_rows(state.axes[k, 0], trial.axes[k, 0])
+            assign_rows(state.axes[k, 1], trial.axes[k, 1])
+            assign_rows(state.hessian[k], trial.hessian[k])
+        everything = everything and done[k]
+    return everything
+
+
+_minimise = levenberg_marquardt(_evaluate, _step, _accept)

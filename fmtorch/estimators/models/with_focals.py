@@ -1,0 +1,148 @@
+"""Fundamental matrices of cameras with plausible focal lengths: samples of five matches and drawn focal lengths."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from fmtorch.estimators.models.focal_prior import FocalPrior, draw_depths, focal_cost
+from fmtorch.estimators.models.model import Hypotheses, cheirality
+from fmtorch.estimators.models.posterior import (
+    Cameras,
+    Images,
+    Limits,
+    Optimum,
+    centre,
+    centred,
+    damped_step,
+    images_of,
+    minimise,
+    nearest_cameras,
+    no_cameras,
+    no_optimum,
+    translate,
+)
+from fmtorch.estimators.pair import Pair, squared
+from fmtorch.geometry.five_point import five_point
+from fmtorch.geometry.levenberg_marquardt import LOSSES, NO_TABLE, Weighted
+from fmtorch.geometry.matrices import unit_kernel
+from fmtorch.jit.kernel import Array, F8x1, F8x2, kernel, matrix, vector
+from fmtorch.jit.lanes import LANES
+from fmtorch.jit.random import Stream
+
+SOLUTIONS = 10  # of five matches, at most
+INLIER_SIGMA_PX = 0.3  # standard deviation of an inlier's Sampson distance
+LOSS_SCALE_PX = 0.7  # Sampson distance at which an inlier's cost is half of what a squared one would be
+PARALLEL_PX = 4.0  # in image 1: rays that differ less do not tell on which side of the cameras they meet
+STEP_DAMPING = 1e-10  # of a Gauss-Newton step at an optimum: bounds it where the points leave a direction open
+TRUNCATED, GEMAN_MCCLURE = LOSSES["truncated"], LOSSES["geman_mcclure"]
+
+
+class Refined(NamedTuple):
+    """Of k candidates, models (k, 9), costs of the prior (k,), shares of the support in front of both cameras (k,)."""
+
+    models: F8x2
+    cost: F8x1
+    share: F8x1
+
+
+class FocalFit(NamedTuple):
+    """A model (9,), its cameras, and what the logarithm of the likelihood would gain without prior."""
+
+    F: Array
+    cameras: Cameras
+    gain: float
+
+
+class FundamentalWithFocals:
+    """Square pixels, central principal points, usual focal lengths, of images whose sizes are known."""
+
+    size: ClassVar[int] = 5
+
+    def solve(self, pair: Pair, sample: Array, start: int) -> Hypotheses:
+        """As `Family.solve`, with focal lengths drawn from their prior."""
+        count, images = sample.shape[1], images_of(pair)
+        depth, F = np.empty((2, count)), np.empty((SOLUTIONS * count, 9), np.float32)
+        draw = np.empty(len(F), np.int64)
+        draw_depths(images.prior, images.longest, pair.mixed_seed(Stream.FOCAL), pair.key, start, depth)
+        models = five_point(centred(pair).points, sample, depth, images.offset, F, draw)
+        return Hypotheses(F[:models], draw[:models], sample, start)
+
+    def refine(self, F: Array, pair: Pair, iterations: int) -> tuple[Cameras, Refined]:
+        """Models of least ``sum P rho(r) / (2 sigma^2) + cost(f0, f1)`` near F (k, 9), and their cameras.
+
+        r is the Sampson distance in pixels, sigma INLIER_SIGMA_PX, rho the loss of Geman & McClure at LOSS_SCALE_PX.
+        A model that is not finite comes back as something that is not, with a prior cost of infinity.
+        """
+        k, precision = len(F), squared(pair.pixels_per_unit / INLIER_SIGMA_PX)
+        cameras, refined = no_cameras(k), Refined(np.empty((k, 9)), np.empty(k), np.empty(k))
+        limits, parallel = Limits(precision, iterations, -1.0), PARALLEL_PX / pair.pixels_per_unit
+        refine_with_prior(F, Subset(pair.table, images_of(pair), parallel), limits, cameras, refined)
+        return cameras, refined
+
+    def fit(self, start: Cameras, pair: Pair, truncation: float, limits: Limits) -> FocalFit:
+        """The maximum a posteriori of the truncated Sampson error near one candidate; truncation: px."""
+        cameras, images, out, F, gain = start.copy(), images_of(pair), no_optimum(1), np.empty((1, 9)), np.empty(1)
+        minimise(cameras, _truncated(pair, truncation), images, limits, out)
+        translate(out.F, images.offset, F)
+        gain_without_prior(out.hessian[0], out.gradient[0], cameras.focal[0], images.prior, gain)
+        return FocalFit(F[0], cameras, float(gain[0]))
+
+
+def _truncated(pair: Pair, truncation: float) -> Weighted:
+    matches = centred(pair, truncation)
+    return Weighted(matches.points, pair.weight, matches.s2, TRUNCATED, NO_TABLE)
+
+
+class Subset(NamedTuple):
+    """Matches on which candidates are refined: table (9, n), of `Pair`; parallel: the tolerance of `cheirality`."""
+
+    table: F8x2
+    images: Images
+    parallel: float
+
+
+@kernel
+def refine_with_prior(F: F8x2, subset: Subset, limits: Limits, cameras: Cameras, out: Refined) -> None:
+    """`FundamentalWithFocals.refine` of models (k, 9) -> cameras, out."""
+    table, images, k = subset.table, subset.images, len(F)
+    centred_matches, optimum = (
+        matrix(6, table.shape[1]),
+        Optimum(matrix(k, 9), vector(k), matrix(k, 7), np.empty((k, 7, 7))),
+    )
+    centre(table, images.offset, LOSS_SCALE_PX, centred_matches)
+    points, s2, scale = centred_matches[:4], centred_matches[4], centred_matches[5]
+    nearest_cameras(F, images, cameras)
+    minimise(cameras, Weighted(points, table[4], s2, GEMAN_MCCLURE, matrix(2, 0)), images, limits, optimum)
+    translate(optimum.F, images.offset, out.models)
+    work = vector(5)
+    for i in range(k):
+        unit_kernel(out.models[i])
+        out.cost[i] = focal_cost(cameras.focal[i], images.prior, work)
+        finite = math.isfinite(optimum.cost[i])
+        for q in range(9):
+            finite = finite and math.isfinite(out.models[i, q])
+        if not finite:
+            out.cost[i] = math.inf
+    support = Weighted(points, table[6], scale, GEMAN_MCCLURE, matrix(2, 0))
+    cheirality(cameras, images.longest, optimum.F, support, subset.parallel, out.share)
+
+
+@kernel(holds_gil=True)
+def gain_without_prior(hessian: F8x2, gradient: F8x1, focal: F8x1, prior: FocalPrior, out: F8x1) -> None:
+    """What the logarithm of the likelihood would rise by at an optimum without prior -> out (1,)."""
+    Q, H, g, work, total = matrix(7, LANES), matrix(7, 7), vector(7), vector(5), 0.0
+    focal_cost(focal, prior, work)
+    for i in range(7):
+        g[i] = gradient[i] - (work[i - 5] if i >= 5 else 0.0)
+        for j in range(7):
+            own = 0.0
+            if i >= 5 and j >= 5:
+                own = work[i - 3] if i == j else work[4]
+            H[i, j] = hessian[i, j] - own
+    damped_step(H, g, STEP_DAMPING, Q)
+    for i in range(7):
+        total += g[i] * Q[i, 7]
+    out[0] = -total / 2

@@ -1,0 +1,105 @@
+"""The models of a pool made better before one of them is selected: on their inliers, and by Levenberg-Marquardt."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+
+from fmtorch.estimators.models.model import Loss, Refining, Steps
+from fmtorch.estimators.options import Refine
+from fmtorch.estimators.pair import Pair, squared
+from fmtorch.estimators.preselection import first_shuffled
+from fmtorch.estimators.search import Pool
+from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON, Residual
+from fmtorch.jit.kernel import Array, F4x2, I8x1, Kernel, kernel
+from fmtorch.jit.random import Stream
+
+FIRST_DAMPING = 1e-4  # of Levenberg-Marquardt
+
+
+@runtime_checkable
+class LocalOptimization(Protocol):
+    """Improves a small pool of models; none comes back with a lower score than it had."""
+
+    def __call__(self, F: Array, pair: Pair) -> Array:
+        """The improved models (k, 9), float64."""
+        ...
+
+
+class Candidates(NamedTuple):
+    """The models of a pool, refined: F (m, 9) float64; which are there (m,); the matches they were refined on."""
+
+    F: Array
+    valid: Array
+    near: Pair
+
+
+@dataclasses.dataclass(frozen=True)
+class Refinement:
+    """Local optimisation of each model on its inliers, then Levenberg-Marquardt on the matches near the pool.
+
+    options: of the latter; None: none. local_optimization: None: none.
+    """
+
+    options: Refine | None
+    local_optimization: LocalOptimization | None = None
+
+    def near(self, pool: Pool, pair: Pair) -> Pair:
+        """The pair with the matches on which the pool's models are refined: at most so many of those within reach.
+
+        Which of them, the pair's key decides.
+        """
+        if self.options is None or self.options.matches is None:
+            return pair
+        limit = np.float32(squared(self.options.RADIUS * self.options.scale / pair.pixels_per_unit))
+        index = np.empty(min(self.options.matches, pair.count), np.int64)
+        seed = pair.mixed_seed(Stream.REFINEMENT)
+        return pair.take(
+            index[: near_of(pair.residual)(pool.F[: pool.filled], pair.points32, limit, seed, pair.key, index)]
+        )
+
+    def __call__(self, pool: Pool, pair: Pair, family: Refining) -> Candidates:
+        """The pool with refined models."""
+        F, near = pool.models, self.near(pool, pair)
+        if self.local_optimization is not None:
+            F = self.local_optimization(F, pair)
+        if (options := self.options) is not None:
+            steps = Steps(options.iterations, FIRST_DAMPING)
+            F = family.refine(F, near, Loss(options.kernel, options.scale), steps)
+        return Candidates(F, pool.valid, near)
+
+
+@functools.cache
+def near_of(residual: Residual) -> Kernel[..., int]:
+    """The kernel that looks for matches near models, for a residual."""
+    within = residual.within
+
+    @kernel(name=f"near_{residual.name}")
+    def near(F: F4x2, points: F4x2, limit: np.float32, mixed_seed: int, key: int, out: I8x1) -> int:
+        """Points (4, n) within a squared residual of one of the models (k, 9), the first in a random order -> out.
+
+        How many they are. Nothing is near a model of zeros.
+        """
+        x0, y0, x1, y1 = points[0], points[1], points[2], points[3]
+        wanted = np.zeros(points.shape[1], np.bool_)
+        for k in range(len(F)):
+            f = (F[k, 0], F[k, 1], F[k, 2], F[k, 3], F[k, 4], F[k, 5], F[k, 6], F[k, 7], F[k, 8])
+            zero = True
+            for q in range(9):
+                zero = zero and F[k, q] == 0
+            for i in range(0 if zero else len(wanted)):
+                wanted[i] |= within(f, x0[i], y0[i], x1[i], y1[i], limit)
+        index, count = np.empty(len(wanted), np.int64), 0
+        for i in range(len(wanted)):
+            index[count] = i
+            count += wanted[i]
+        return first_shuffled(index[:count], mixed_seed, key, out)
+
+    return near
+
+
+near = near_of(SAMPSON)
+near_homography = near_of(HOMOGRAPHY)

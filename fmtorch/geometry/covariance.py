@@ -1,0 +1,334 @@
+"""Covariance of a two-view estimate: of its pose, its focal lengths and its fundamental matrix.
+
+The parameters of a pair are (omega, tau, log f0, log f1): R is ``exp([omega]x) R``, the direction of translation moves
+along two unit tangents, ``t + B tau``, so that both are in radians. The information of a fit that minimises the robust
+sum of w rho(r^2) with a loss truncated at T is J^T W J over the matches within T, J being the derivative of the Sampson
+distance (Hartley & Zisserman 2004, 11.4.3), with three corrections:
+
+1. A truncated fit does not use all that its inliers know: its variance is E[psi^2] / E[psi']^2 of that of one match
+   (Huber 1981, Robust Statistics, chapter 7). With c = T / s, A = P(|z| < c) and m = A - 2 c phi(c), which both
+   expectations are for the truncated square, the information is m / A of J^T W J.
+2. The noise s is estimated anew from the distances below 2.5 s, consistent at normal noise: the scale of a robust fit
+   is biased by its own limits and by the parameters that were fitted.
+3. The derivatives by t hold noise, as if it were parallax; its expected share of their squares is taken from the
+   information about the direction of translation. Without that a camera that only turns seems to have one, known to
+   some ten degrees. (The bias of matrices of moments: Kanatani 1996, Statistical Optimization for Geometric
+   Computation, chapter 9. The noise itself is not subtracted: where other parameters leave little, the difference of
+   two estimates says that nothing is known where errors are a few degrees.)
+
+Weights that are no inverse variances, such as P(inlier), count by ``sum w / sum w^2`` (Kish 1965). Independent noise
+is assumed; on real pairs neighbours err alike, and deviations come out too small.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from fmtorch.geometry.arithmetic import component_sum, sqrt, stable_sum
+from fmtorch.geometry.epipolar import inverse_root
+from fmtorch.geometry.matrices import complement
+
+# Information of matches about a two-view estimate, and their noise; see `two_view_covariance`
+
+
+PARAMETERS = 7
+WINDOW = 2.5  # noises within which distances are taken to be those of right matches
+WINDOW_SHARE = 0.911256360935392  # `kept_share` of WINDOW
+ITERATIONS = 8  # of the noise; each leaves a quarter of the error (by the slope of `kept_share` at WINDOW)
+MIN_NOISE_PX = 1e-3  # float32 coordinates of large images are no finer
+MIN_SPARE_MATCHES = 3  # beyond the parameters, from which on the noise is estimated
+TERMS, WIDEST = 64, 6.0  # of the series of `kept_share`, and from where on it is one to 1e-7
+
+
+def tangents(R: Tensor, t: Tensor, focal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """F (3, 3, b) between centred pixels, its derivatives by the parameters (3, 3, 7, b), and the basis (3, 2, b)."""
+    basis = torch.stack(complement(t), 1)
+    E = _cross(t, R)
+    axes = torch.eye(3, dtype=R.dtype, device=R.device)[..., None].expand(3, 3, R.shape[-1])
+    turned = [_cross(t, _cross(axes[k], R)) for k in range(3)]
+    shifted = [_cross(basis[:, k], R) for k in range(2)]
+    scale0, scale1 = (torch.stack([1 / f, 1 / f, torch.ones_like(f)]) for f in focal)
+    by0, by1 = (torch.stack([-1 / f, -1 / f, torch.zeros_like(f)]) for f in focal)
+    pixels = scale1[:, None] * scale0[None]
+    scaled = [A * pixels for A in (*turned, *shifted)]
+    slopes = torch.stack([*scaled, E * scale1[:, None] * by0[None], E * by1[:, None] * scale0[None]], 2)
+    return E * pixels, slopes, basis
+
+
+def _cross(t: Tensor, A: Tensor) -> Tensor:
+    """``[t]x A`` (3, 3, b)."""
+    crossed: Tensor = torch.linalg.cross(t[:, None].expand_as(A), A, dim=0)
+    return crossed
+
+
+def residual_slopes(F: Tensor, slopes: Tensor, a0: Tensor, a1: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Signed Sampson distances (b, n), their derivatives (7, b, n) by the parameters, and the noise in two of these.
+
+    With e = a1^T F a0 and q the sum of the squares of both lines' normals, r = e / sqrt(q), and ``dr = de / sqrt(q)``
+    at the points corrected to first order, where e is zero. Zero where a point is the epipole. The last are the
+    covariances (2, 2, b, n) of the derivatives by the direction of translation, in squared noises of a point: where the
+    images have no parallax these derivatives are nothing but noise, in the three directions that are not corrected.
+    """
+    ones = torch.ones_like(a0[:1])
+    line1 = component_sum(F[..., None] * torch.cat([a0, ones])[None], 1)
+    line0 = component_sum(F[..., None] * torch.cat([a1, ones])[:, None], 0)
+    root = inverse_root(component_sum(line1[:2] * line1[:2]) + component_sum(line0[:2] * line0[:2]))
+    r = component_sum(torch.cat([a1, ones]) * line1) * root
+    normal = torch.cat([line0[:2], line1[:2]]) * root
+    h0, h1 = torch.cat([a0 - r * normal[:2], ones]), torch.cat([a1 - r * normal[2:], ones])
+    by_entry = h1[:, None] * h0[None] * root
+    J = component_sum((by_entry[:, :, None] * slopes[..., None]).flatten(0, 1))
+    shifted = slopes[:, :, 3:5, :, None]
+    by_h0, by_h1 = component_sum(shifted * h1[:, None, None], 0), component_sum(shifted * h0[None, :, None], 1)
+    by_point = torch.cat([by_h0[:2], by_h1[:2]]) * root
+    corrected = component_sum(normal[:, None] * by_point)
+    noise = component_sum(by_point[:, :, None] * by_point[:, None]) - corrected[:, None] * corrected[None]
+    return r, J, noise
+
+
+def kept_share(c: Tensor) -> Tensor:
+    """m / A of limits c (b,): ``1 - 1 / S``, ``S = sum_k c^2k / (2 k + 1)!!``, by the series of the normal integral."""
+    square = c.clamp_max(WIDEST) * c.clamp_max(WIDEST)
+    ratios = square[..., None] / torch.arange(3.0, 2 * TERMS + 3, 2, dtype=c.dtype, device=c.device)
+    return 1 - 1 / (1 + component_sum(ratios.cumprod(-1), -1))
+
+
+def noise_of(r: Tensor, w: Tensor, T: Tensor, parameters: Tensor) -> Tensor:
+    """s (b,): ``s^2 = sum w r^2 / (share (sum w - p share sum w^2 / sum w))`` within WINDOW s, iterated from 0.6 T.
+
+    Within a window the share m / A of the variance is left; p parameters have taken theirs of that. At most T. Without
+    a limit it is started at the root mean square; of fewer matches than parameters it is not estimated.
+    """
+    # Of each match: its count, weight, squared weight, weighted square of the distance.
+    summands = torch.stack([(w > 0).to(r.dtype), w, w * w, w * r * r])
+    _, total, _, square = stable_sum(summands)
+    start = torch.where(T.isfinite(), 0.6 * T, sqrt(square / total.clamp_min(1e-300)))
+    s = start.clamp_min(MIN_NOISE_PX)
+    for _ in range(ITERATIONS):
+        count, total, squares, square = stable_sum(torch.where(r < WINDOW * s[:, None], summands, 0.0))
+        spare = WINDOW_SHARE * (total - parameters * WINDOW_SHARE * squares / total.clamp_min(1e-300))
+        enough = (count >= parameters + MIN_SPARE_MATCHES) & (spare > 0)
+        estimate = sqrt(square / torch.where(spare > 0, spare, 1.0)).clamp_min(MIN_NOISE_PX)
+        s = torch.where(enough, estimate.minimum(T), s)
+    return s
+
+
+def information_of(r: Tensor, J: Tensor, noise: Tensor, w: Tensor, T: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+    """Of the matches, (7, 7, b), and what of it noise alone gives about the direction of translation, (2, 2, b)."""
+    w = torch.where(r < T[:, None], w, 0.0)
+    squares = stable_sum(w * w)
+    factor = kept_share(T / s) * (stable_sum(w) / torch.where(squares > 0, squares, 1.0))
+    rows, columns = torch.triu_indices(PARAMETERS, PARAMETERS, device=r.device)
+    sums = stable_sum(J[rows] * J[columns] * w) * (factor / (s * s))
+    index = torch.zeros_like(rows).new_zeros(PARAMETERS, PARAMETERS)
+    index[rows, columns] = torch.arange(len(rows), device=r.device)
+    return sums[torch.maximum(index, index.mT)], stable_sum(noise * w) * factor
+
+
+DIFFUSE = (1.33, 1.33, 1.33, 1.21, 1.21, 2.3, 2.3)
+"""Deviations that no parameter exceeds: of a rotation and a direction drawn uniformly (radians, each axis), and a
+factor of ten in a focal length. They enter as independent information, which is nothing beside that of matches."""
+
+
+class TwoViewCovariance(NamedTuple):
+    """Covariances of B pairs.
+
+    covariance: of (omega, tau, log f0, log f1), radians and logarithms; rows of known focal lengths are zero.
+    tangent: the basis B of the plane across t. fundamental: covariance of F, row by row, at unit Frobenius norm, in
+    pixels. noise: s, px. valid: False where R, t, a focal length, the truncation or the prior is not finite or has no
+    meaning; such a pair is as one without matches.
+    """
+
+    covariance: Float[Tensor, "b 7 7"]
+    tangent: Float[Tensor, "b 3 2"]
+    fundamental: Float[Tensor, "b 9 9"]
+    noise: Float[Tensor, " b"]
+    valid: Bool[Tensor, " b"]
+
+    @property
+    def deviation_degrees(self) -> Float[Tensor, "b 2"]:
+        """Root mean squared angles of rotation and of the direction of translation, in degrees.
+
+        Where nothing is known of them they are some 132 and 98 degrees.
+        """
+        variances = self.covariance.diagonal(dim1=-2, dim2=-1)
+        turned, shifted = component_sum(variances[:, :3], -1), component_sum(variances[:, 3:5], -1)
+        return torch.rad2deg(sqrt(torch.stack([turned, shifted], -1)))
+
+
+def two_view_covariance(
+    x0: Float[Tensor, "b n 2"],
+    x1: Float[Tensor, "b n 2"],
+    R: Float[Tensor, "b 3 3"],
+    t: Float[Tensor, "b 3"],
+    focal: Float[Tensor, "b 2"],
+    principal0: Float[Tensor, "b 2"],
+    principal1: Float[Tensor, "b 2"],
+    truncation: Float[Tensor, " b"],
+    weight: Float[Tensor, "b n"] | None = None,
+    noise: Float[Tensor, "b n"] | None = None,
+    mask: Bool[Tensor, "b n"] | None = None,
+    focal_precision: Float[Tensor, "b 2 2"] | None = None,
+    shared_focal: Bool[Tensor, " b"] | None = None,
+) -> TwoViewCovariance:
+    """The covariance of pose, focal lengths and F at the optimum of a robust fit, in closed form.
+
+    Nothing is NaN: what the matches leave open has a deviation of up to `DIFFUSE`. A local covariance knows nothing of
+    another optimum: see `significance`. Float64.
+
+    Args:
+        x0: points of image 0, px.
+        x1: their matches in image 1.
+        R: rotation, ``X1 = R X0 + t``.
+        t: translation, of any length.
+        focal: focal lengths of both images, px.
+        principal0: principal point of image 0, px.
+        principal1: that of image 1.
+        truncation: Sampson distance of a match of usual noise from which on it does not count in the fit, px; infinite
+            for plain least squares.
+        weight: of each match in the fit, of any scale, P(inlier) where that is known; 1 by default.
+        noise: of each match, relative to a usual one's; 1 by default.
+        mask: True for a real match; all by default.
+        focal_precision: the Hessian, by (log f0, log f1), of the negative logarithm of the prior density that the fit
+            had, of which the positive part counts; infinite on the diagonal where a focal length is known exactly. Zero
+            by default.
+        shared_focal: where the two focal lengths are one parameter; nowhere by default.
+
+    Returns:
+        A `TwoViewCovariance`. The result has the same bits in any batch and with any padding.
+
+    Example:
+        >>> import torch
+        >>> from fmtorch.geometry import two_view_covariance
+        >>> X = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * 4 + torch.tensor([-2.0, -2.0, 4.0])
+        >>> x0, x1 = (600 * Y[:, :2] / Y[:, 2:] for Y in (X, X + torch.tensor([-1.0, 0, 0])))
+        >>> x1 = x1 + 0.5 * torch.randn(x1.shape, generator=torch.Generator().manual_seed(1))
+        >>> known = torch.diag(torch.full((2,), torch.inf))[None]
+        >>> result = two_view_covariance(
+        ...     x0[None], x1[None], torch.eye(3)[None], torch.tensor([[-1.0, 0, 0]]), torch.full((1, 2), 600.0),
+        ...     torch.zeros(1, 2), torch.zeros(1, 2), torch.tensor([1.0]), focal_precision=known,
+        ... )
+        >>> bool((result.deviation_degrees < 0.5).all()), round(float(result.noise[0]), 1)
+        (True, 0.4)
+    """
+    kind = torch.float64
+    open_prior = torch.zeros(len(R), 2, 2, dtype=kind, device=R.device)
+    Pi = open_prior if focal_precision is None else focal_precision.to(kind)
+    shared = torch.zeros_like(Pi[:, 0, 0], dtype=torch.bool) if shared_focal is None else shared_focal
+    known = Pi.diagonal(dim1=-2, dim2=-1) == torch.inf
+    Pi = torch.where(known[:, :, None] | known[:, None, :], 0.0, Pi)
+    valid, (R, t, f, p0, p1, T, Pi) = _valid(R, t, focal, principal0, principal1, truncation, Pi)
+    t = t * inverse_root(component_sum(t * t, -1))[:, None]
+    real = torch.ones_like(x0[..., 0], dtype=torch.bool) if mask is None else mask
+    w, n = (torch.ones_like(x0[..., 0]) if a is None else a for a in (weight, noise))
+    real = real & valid[:, None] & (x0.isfinite() & x1.isfinite()).all(-1) & (w > 0) & (n > 0) & (w + n).isfinite()
+    a0, a1 = (torch.where(real[..., None], x - p[:, None], 0.0).movedim(-1, 0) for x, p in ((x0, p0), (x1, p1)))
+    w, n = torch.where(real, w, 0.0).to(kind), torch.where(real, n, 1.0).to(kind)
+    F, slopes, basis = tangents(R.movedim(0, -1), t.movedim(0, -1), f.movedim(0, -1))
+    r, J, in_slopes = residual_slopes(F, slopes, a0, a1)
+    r, J = (r / n).abs(), J / n
+    used = _directions(known, shared)
+    s = noise_of(r.detach(), w, T, used.amax(0).sum(0))
+    information, from_noise = information_of(r, J, in_slopes, w, T, s)
+    by_direction = information[3, 3] + information[4, 4]
+    share = (from_noise[0, 0] + from_noise[1, 1]) / torch.where(by_direction > 0, by_direction, 1.0)
+    C = _without(_covariance(information, Pi.movedim(0, -1), used), share.clamp(0, 1))
+    V = _of_fundamental(C, F, slopes, p0.movedim(0, -1), p1.movedim(0, -1))
+    return TwoViewCovariance(C.movedim(-1, 0), basis.movedim(-1, 0), V.movedim(-1, 0), s, valid)
+
+
+def _valid(*given: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """Whether the pairs have cameras, and those, float64, in whose place others stand where they have none.
+
+    given: R, t, focal, principal0, principal1, truncation, focal_precision.
+    """
+    R, t, focal, _, _, truncation, _ = given = tuple(a.to(torch.float64) for a in given)
+    finite = [a.isfinite().flatten(1).all(1) for a in given if a is not truncation]
+    valid = torch.stack([*finite, (t != 0).any(-1), (focal > 0).all(-1), truncation > 0]).all(0)
+    zeros, ones = truncation.new_zeros(1), truncation.new_ones(1)
+    places = (torch.eye(3, dtype=R.dtype, device=R.device), t.new_tensor([0.0, 0, 1]), ones, zeros, zeros, ones, zeros)
+    kept = (valid.reshape(-1, *[1] * (a.dim() - 1)) for a in given)
+    return valid, [torch.where(keep, a, place) for keep, a, place in zip(kept, given, places, strict=True)]
+
+
+def _directions(known: Tensor, shared: Tensor) -> Tensor:
+    """How the parameters move (7, 7, b), by the columns: a known one never, shared ones together by the first's."""
+    b = len(known)
+    used = torch.eye(PARAMETERS, dtype=torch.float64, device=known.device)[..., None].repeat(1, 1, b)
+    any_known, together = known.any(-1), shared & ~known.any(-1)
+    used[5, 5] = (~(known[:, 0] | (shared & any_known))).to(used.dtype)
+    used[6, 6] = (~(known[:, 1] | shared)).to(used.dtype)
+    used[6, 5] = together.to(used.dtype)
+    return used
+
+
+def _covariance(information: Tensor, Pi: Tensor, used: Tensor) -> Tensor:
+    """The inverse (7, 7, b) of information, prior and `DIFFUSE` in the directions that are used; zero in others."""
+    total = information + torch.diag(information.new_tensor(DIFFUSE) ** -2)[..., None]
+    prior = torch.nn.functional.pad(_positive_part(Pi).movedim(-1, 0), (5, 0, 5, 0)).movedim(0, -1)
+    reduced = _product(used.transpose(0, 1), _product(total + prior, used))
+    idle = 1 - used.amax(0)
+    eye = torch.eye(PARAMETERS, dtype=total.dtype, device=total.device)[..., None]
+    M = torch.cat([reduced + eye * idle, eye.expand_as(reduced)], 1)
+    for k in range(PARAMETERS):  # Gauss and Jordan, of a positive definite matrix without pivots
+        M = M - (M[:, k] - eye[:, k])[:, None] * (M[k] / M[k, k])[None]
+    inverse = M[:, PARAMETERS:] * (1 - idle) * (1 - idle)[:, None]
+    C = _product(used, _product(inverse, used.transpose(0, 1)))
+    return (C + C.transpose(0, 1)) / 2
+
+
+def _without(C: Tensor, share: Tensor) -> Tensor:
+    """The covariance (7, 7, b) with a share (b,) of the information about the direction of translation taken away.
+
+    The other parameters keep their distribution given that direction, whose own covariance becomes larger. What
+    `DIFFUSE` knows of it stays.
+    """
+    S, eye = _inverse(C[3:5, 3:5]), torch.eye(2, dtype=C.dtype, device=C.device)[..., None]
+    diffuse_information = eye * DIFFUSE[3] ** -2
+    grown = _inverse(_positive_part(S * (1 - share) - diffuse_information) + diffuse_information)
+    by_direction = _product(C[:, 3:5], S)
+    C = C + _product(by_direction, _product(grown - C[3:5, 3:5], by_direction.transpose(0, 1)))
+    return (C + C.transpose(0, 1)) / 2
+
+
+def _inverse(A: Tensor) -> Tensor:
+    """Of symmetric matrices (2, 2, b)."""
+    adjugate = torch.stack([torch.stack([A[1, 1], -A[0, 1]]), torch.stack([-A[0, 1], A[0, 0]])])
+    return adjugate / (A[0, 0] * A[1, 1] - A[0, 1] * A[0, 1])
+
+
+def _positive_part(Pi: Tensor) -> Tensor:
+    """Symmetric matrices (2, 2, b) with their negative eigenvalues set to zero."""
+    a, b, c = Pi[0, 0], (Pi[0, 1] + Pi[1, 0]) / 2, Pi[1, 1]
+    mean, half = (a + c) / 2, (a - c) / 2
+    radius = sqrt(half * half + b * b)
+    high, low = (mean + radius).clamp_min(0), (mean - radius).clamp_min(0)
+    turn = torch.where(radius > 0, 1 / torch.where(radius > 0, radius, 1.0), 0.0)
+    middle, part = (high + low) / 2, (high - low) / 2 * turn
+    return torch.stack([torch.stack([middle + part * half, part * b]), torch.stack([part * b, middle - part * half])])
+
+
+def _of_fundamental(C: Tensor, F: Tensor, slopes: Tensor, p0: Tensor, p1: Tensor) -> Tensor:
+    """The covariance (9, 9, b) of F in pixels at unit norm, of that of the parameters."""
+    pixels = torch.stack([_uncentred(A, p0, p1) for A in (F, *slopes.unbind(2))])
+    entries = pixels.flatten(1, 2)
+    f = entries[0] * inverse_root(component_sum(entries[0] * entries[0]))
+    J = entries[1:] * inverse_root(component_sum(entries[0] * entries[0]))
+    J = J - component_sum(J * f, 1)[:, None] * f
+    V = _product(J.transpose(0, 1), _product(C, J))
+    return (V + V.transpose(0, 1)) / 2
+
+
+def _uncentred(A: Tensor, p0: Tensor, p1: Tensor) -> Tensor:
+    """``T1^T A T0`` (3, 3, b): a matrix between centred pixels as one between pixels."""
+    A = torch.stack([A[:, 0], A[:, 1], A[:, 2] - A[:, 0] * p0[0] - A[:, 1] * p0[1]], 1)
+    return torch.stack([A[0], A[1], A[2] - A[0] * p1[0] - A[1] * p1[1]])
+
+
+def _product(A: Tensor, B: Tensor) -> Tensor:
+    """``A B`` of component-first matrices of any size."""
+    return component_sum(A[:, :, None] * B[None], 1)

@@ -1,0 +1,233 @@
+"""Levenberg-Marquardt: the one loop of all non-linear fits, over the models of one pair.
+
+Damped Gauss-Newton steps; each model takes its own where that lowers its cost, and else tries a shorter one (Marquardt
+1963; Hartley & Zisserman 2004, appendix 6.2). The objective is a set of inner functions, so that a whole fit is one
+call, between whose steps nothing waits for Python.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fmtorch.geometry.arithmetic import logarithm_1p_kernel
+from fmtorch.geometry.robust_losses import LOSS_TABLE
+from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, inner, kernel, matrix
+from fmtorch.jit.lanes import LANES, added, fill, load, sqrt, store, where
+
+# `sampson_objective` for models on the matches of one pair, compiled; float64, LANES matches at a time
+
+
+TINY = 1e-30  # as in `residuals`
+HUBER, CAUCHY, GEMAN_MCCLURE, TRUNCATED, MAGSAC = 0, 1, 2, 3, 4  # losses
+LOSSES = {"huber": HUBER, "cauchy": CAUCHY, "geman_mcclure": GEMAN_MCCLURE, "truncated": TRUNCATED, "magsac": MAGSAC}
+NO_TABLE = np.empty((2, 0))
+MATCH = 6  # rows of LANES matches: x0, y0, x1, y1, their weights, squared scales
+
+
+def loss_table(loss: str) -> Array:
+    """What `Weighted.table` is for a loss of this name."""
+    return LOSS_TABLE if loss == "magsac" else NO_TABLE
+
+
+class Weighted(NamedTuple):
+    """Matches and a robust loss of their errors.
+
+    points: (4, n). weight: (n,), what each counts. s2: (n,), squared scales of the loss, a code. table: (2, t + 2), of
+    the loss MAGSAC, its weight at the ends of t intervals of r^2 / s^2 and beyond, and the weight's integral up to
+    there; of others it is not read.
+    """
+
+    points: F8x2
+    weight: F8x1
+    s2: F8x1
+    loss: int
+    table: F8x2
+
+
+@kernel
+def evaluate(F: F8x2, weighted: Weighted, derivatives: bool, products: F8x3, cost: F8x1) -> None:
+    """`SampsonObjective` of models (k, 9) -> products (k, 10, 10), if wanted; cost (k,)."""
+    matches, loss, table = in_rows(weighted.points, weighted.weight, weighted.s2), weighted.loss, weighted.table
+    sums, J, scaled, work = matrix(55, LANES), matrix(10, LANES), matrix(10, LANES), matrix(3, LANES)
+    for k in range(len(F)):
+        costs = fill(0.0)
+        for q in range(55 if derivatives else 0):
+            store(sums, q, costs)
+        for row in range(0, len(matches), MATCH):
+            inverse, r2 = linearise_kernel(F[k], matches, row, J)
+            share, slope = robust(r2, load(matches, row + 5), loss, table, work)
+            costs += share * load(matches, row + 4)
+            if derivatives:
+                add_products(J, inverse * (load(matches, row + 4) * slope), scaled, sums)
+        cost[k] = added(costs)
+        q = 0
+        for r in range(10 if derivatives else 0):
+            for c in range(r + 1):
+                total = added(load(sums, q))
+                products[k, r, c], products[k, c, r] = total, total
+                q += 1
+
+
+@inner
+def in_rows(points: Array, weight: Array, s2: Array) -> Array:
+    """Matches (n,), LANES in MATCH rows each; those that fill the last ones have no weight."""
+    n = len(weight)
+    count = (n + LANES - 1) // LANES
+    rows = np.zeros((MATCH * count, LANES))
+    for first in range(0, n, LANES):
+        row = first // LANES * MATCH
+        for i in range(LANES):
+            rows[row + 5, i] = 1.0
+        for i in range(min(LANES, n - first)):
+            for k in range(4):
+                rows[row + k, i] = points[k, first + i]
+            rows[row + 4, i], rows[row + 5, i] = weight[first + i], s2[first + i]
+    return rows
+
+
+@inner
+def linearise_kernel(f: Array, matches: Array, row: int, J: Array) -> tuple[Any, Any]:
+    """Jacobian and residual of LANES matches -> J (10, LANES); inverse squared slopes, squared Sampson distances."""
+    x0, y0, x1, y1 = load(matches, row), load(matches, row + 1), load(matches, row + 2), load(matches, row + 3)
+    a0, b0 = f[0] * x0 + f[1] * y0 + f[2], f[3] * x0 + f[4] * y0 + f[5]
+    a1, b1 = f[0] * x1 + f[3] * y1 + f[6], f[1] * x1 + f[4] * y1 + f[7]
+    e = f[6] * x0 + f[7] * y0 + f[8] + a0 * x1 + b0 * y1
+    slope = a0 * a0 + b0 * b0 + a1 * a1 + b1 * b1
+    inverse = 1.0 / where(slope > TINY, slope, TINY)
+    c = e * inverse
+    u, v, p, q = x1 - c * a0, y1 - c * b0, -c * a1, -c * b1
+    store(J, 0, u * x0 + x1 * p)
+    store(J, 1, u * y0 + x1 * q)
+    store(J, 2, u)
+    store(J, 3, v * x0 + y1 * p)
+    store(J, 4, v * y0 + y1 * q)
+    store(J, 5, v)
+    store(J, 6, x0 + p)
+    store(J, 7, y0 + q)
+    store(J, 8, fill(1.0))
+    store(J, 9, e)
+    return inverse, e * c
+
+
+@inner
+def robust(r2: Any, s2: Any, loss: int, table: Array, work: Array) -> tuple[Any, Any]:
+    """The losses of squared residuals, and their derivatives by these. work: (3, LANES)."""
+    if loss == TRUNCATED:
+        value, slope = where(r2 <= s2, r2, s2), where(r2 <= s2, fill(1.0), 0.0)
+    elif loss == GEMAN_MCCLURE:
+        share = s2 / (s2 + r2)
+        value, slope = r2 * share, share * share
+    elif loss == HUBER:
+        far = where(r2 > s2, r2, s2)
+        value, slope = where(r2 <= s2, r2, 2.0 * sqrt(s2 * far) - s2), sqrt(s2 / far)
+    elif loss == CAUCHY:
+        store(work, 0, r2 / s2)
+        for i in range(LANES):
+            work[0, i] = logarithm_1p_kernel(work[0, i])
+        value, slope = s2 * load(work, 0), s2 / (s2 + r2)
+    else:
+        store(work, 0, r2 / s2)
+        _tabulated(table, work)
+        value, slope = s2 * load(work, 1), load(work, 2)
+    # A residual that is not a number must not pass for a small loss.
+    return where(r2 == r2, value, math.nan), slope
+
+
+@inner
+def _tabulated(table: Array, work: Array) -> None:
+    """Integral and value of the table at r^2 / s^2, in row 0 of work (3, LANES) -> its rows 1 and 2."""
+    entries = table.shape[1] - 2
+    for i in range(LANES):
+        position = work[0, i] * entries
+        position = position if position < entries else float(entries)
+        interval = min(max(np.int64(position), 0), entries)
+        share, begin = position - interval, table[0, interval]
+        rise = table[0, interval + 1] - begin
+        work[1, i] = table[1, interval] + (begin + share * rise / 2) * share / entries
+        work[2, i] = begin + share * rise
+
+
+@inner
+def add_products(J: Array, factor: Any, weighted: Array, sums: Array) -> None:
+    """Adds the lower triangle of the weighted products of Jacobian and residual, row by row."""
+    for r in range(10):
+        store(weighted, r, load(J, r) * factor)
+    q = 0
+    for r in range(10):
+        of_row = load(J, r)
+        for c in range(r + 1):
+            store(sums, q, load(sums, q) + of_row * load(weighted, c))
+            q += 1
+
+
+FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-4, 1e-12, 1e6  # relative to the greatest curvature
+
+
+class Schedule(NamedTuple):
+    """iterations: steps at most. damping: of the first. tolerance: a model is done once a step has lowered its cost by
+    no more than this share of it; 0: none is ever done."""
+
+    iterations: int
+    damping: float
+    tolerance: float
+
+
+def levenberg_marquardt(
+    evaluate: Callable[..., None], step: Callable[..., None], accept: Callable[..., bool]
+) -> Callable[[Any, Any, Any, Array, int, bool], None]:
+    """The loop for an objective: loop(data, state, trial, damping, iterations, ends), in place.
+
+    evaluate(state, data, derivatives): the costs, and the derivatives if asked for, at the state's parameters.
+    step(state, damping, trial): those of a trial. accept(state, trial, damping, done, data): the trial for the models
+    that it improves; whether all are done.
+    """
+
+    @inner
+    def loop(data: Any, state: Any, trial: Any, damping: Array, iterations: int, ends: bool) -> None:
+        """The state holds the start, then that of least cost; no cost ever rises.
+
+        damping: (k,), the first of each model. ends: whether models are ever done; the state then keeps the
+        derivatives at the end.
+        """
+        done = np.zeros(len(damping), np.bool_)
+        evaluate(state, data, iterations > 0 or ends)
+        for i in range(iterations):
+            step(state, damping, trial)
+            evaluate(trial, data, i + 1 < iterations or ends)
+            if accept(state, trial, damping, done, data) and ends:
+                break
+
+    return loop
+
+
+class Problem(NamedTuple):
+    """The matches of a robust error, and the tolerance of the schedule: what `accepting` looks at."""
+
+    matches: Weighted
+    tolerance: float
+
+
+def accepting(take: Callable[[Any, Any, int], None]) -> Callable[..., bool]:
+    """The `accept` of an objective on a `Problem`: a step that is taken divides the damping by 10, another multiplies.
+
+    take(state, trial, k): gives the state model k of the trial; costs are copied here.
+    """
+
+    @inner
+    def accept(state: Any, trial: Any, damping: Array, done: Array, problem: Problem) -> bool:
+        everything = True
+        for k in range(len(damping)):
+            better = trial.cost[k] < state.cost[k] and not done[k]
+            damping[k] = min(max(damping[k] / 10 if better else damping[k] * 10, MIN_DAMPING), MAX_DAMPING)
+            if better:
+                done[k] |= problem.tolerance > 0 and state.cost[k] - trial.cost[k] <= problem.tolerance * state.cost[k]
+                state.cost[k] = trial.cost[k]
+                take(state, trial, k)
+            everything = everything and done[k]
+        return everything
+
+    return accept

@@ -1,0 +1,166 @@
+"""A journal's images and pairs as hloc's two files, and as a COLMAP database."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from fmtorch.core.files import replacing
+from fmtorch.io import colmap, h5
+from fmtorch.io.hloc import write_geometry
+from fmtorch.io.match_store import ExportedImage, ExportedPair, Journal
+from fmtorch.io.predictions import pair_key_of
+
+KINDS = ("h5", "colmap")
+FEATURES, MATCHES, DATABASE = "features.h5", "matches.h5", "database.db"
+
+
+def export_kinds(value: str | Sequence[str] | None) -> tuple[str, ...]:
+    """The kinds of a list, or of a text with commas. Raises ValueError naming those there are."""
+    words = [word.strip() for word in value.split(",")] if isinstance(value, str) else list(value or ())
+    unknown = [word for word in words if word not in KINDS]
+    if unknown:
+        raise ValueError(f"export={','.join(words)}: {unknown[0]!r} is none of {', '.join(KINDS)}")
+    if "h5" in words:
+        h5.imported()
+    if "colmap" in words:
+        colmap.imported()
+    return tuple(dict.fromkeys(words))
+
+
+def write_exports(
+    journal: Journal,
+    pairs: Sequence[tuple[Path, Path]],
+    kinds: Iterable[str],
+    folder: Path,
+    shared_camera: bool = False,
+) -> list[str]:
+    """Write the files for the images of these pairs into a folder, whole or not at all; their names.
+
+    shared_camera: in COLMAP's database, one camera for all images of one size whose calibration is unknown.
+    """
+    images = list(dict.fromkeys(image for pair in pairs for image in pair if journal.has_image(image)))
+    done = [pair for pair in pairs if journal.has_pair(*pair)]
+    written = []
+    for kind in kinds:
+        if kind == "h5":
+            write_hloc(folder, (journal.image(i) for i in images), journal, done)
+            written += [FEATURES, MATCHES]
+        else:
+            with replacing(folder / DATABASE) as temporary:
+                values = (journal.pair(*pair) for pair in done)
+                colmap.write_database(temporary, (journal.image(i) for i in images), values, shared_camera)
+            written.append(DATABASE)
+    return written
+
+
+def write_hloc(
+    folder: Path, images: Iterable[ExportedImage], journal: Journal, pairs: Iterable[tuple[Path, Path]]
+) -> None:
+    """hloc's features and matches, float32 and int32.
+
+    hloc itself writes float16 and int16, of which the second overflows beyond 32,767 keypoints. Each pair holds beside
+    ``matches0`` and ``matching_scores0``, which hloc knows, ``inliers0`` (bool), and F, `related` and, where its
+    geometry is known, `configuration`, E, H, R and t as attributes.
+    """
+    h5py = h5.imported()
+    counts: dict[str, int] = {}
+    with replacing(folder / FEATURES) as temporary, h5py.File(temporary, "w") as file:
+        for image in images:
+            counts[image.name] = len(image.points)
+            group = file.create_group(image.name)
+            group["keypoints"], group["scores"] = image.points, image.scores
+            group["image_size"] = np.array(image.size[::-1])
+    with replacing(folder / MATCHES) as temporary, h5py.File(temporary, "w") as file:
+        for pair in (journal.pair(*ends) for ends in pairs):
+            group = file.create_group(pair_key_of(pair.name0, pair.name1))
+            for name, values in _by_keypoint(pair, counts[pair.name0]):
+                group[name] = values
+            group.attrs["F"], group.attrs["related"] = pair.F, pair.related
+            if pair.geometry is not None:
+                write_geometry(group, pair.geometry)
+
+
+def _by_keypoint(pair: ExportedPair, count: int) -> Iterator[tuple[str, np.ndarray]]:
+    """The matches by keypoint of the first image, which keeps the best of several."""
+    order = np.argsort(pair.scores, kind="stable")  # the last one written wins
+    i, j = pair.matches[order].T
+    matches, scores, inliers = np.full(count, -1, np.int32), np.zeros(count, np.float32), np.zeros(count, bool)
+    matches[i], scores[i], inliers[i] = j, pair.scores[order], pair.inliers[order]
+    yield from (("matches0", matches), ("matching_scores0", scores), ("inliers0", inliers))
+
+
+# The view graph of a folder's images: which pairs were matched, and by how much they support one another
+
+
+GRAPH_JSON, GRAPH_CSV = "graph.json", "graph.csv"
+
+
+@dataclasses.dataclass(frozen=True)
+class Edge:
+    """A pair. matches: those given to the estimator. significance: None where there is no F, or it was not computed."""
+
+    image0: str
+    image1: str
+    matches: int
+    inliers: int
+    significance: float | None
+    related: bool
+    configuration: str
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewGraph:
+    """Names of images, in order, and the pairs that were matched; related ones connect their images."""
+
+    images: tuple[str, ...]
+    edges: tuple[Edge, ...]
+
+    def components(self) -> list[list[str]]:
+        """The images that related pairs connect, largest component first, each in the order of the images."""
+        parent = {name: name for name in self.images}
+
+        def root(name: str) -> str:
+            while parent[name] != name:
+                parent[name] = parent[parent[name]]
+                name = parent[name]
+            return name
+
+        for edge in self.edges:
+            if edge.related:
+                parent[root(edge.image1)] = root(edge.image0)
+        groups: dict[str, list[str]] = {}
+        for name in self.images:
+            groups.setdefault(root(name), []).append(name)
+        return sorted(groups.values(), key=len, reverse=True)
+
+
+def view_graph(journal: Journal, images: Sequence[Path], pairs: Sequence[tuple[Path, Path]]) -> ViewGraph:
+    """The graph of what a journal has of these pairs, and of all these images."""
+    edges = []
+    for ends in pairs:
+        if journal.has_pair(*ends):
+            pair = journal.pair(*ends)
+            significance = pair.significance if math.isfinite(pair.significance) else None
+            counts = len(pair.matches), int(pair.inliers.sum())
+            edges.append(Edge(pair.name0, pair.name1, *counts, significance, pair.related, pair.configuration))
+    return ViewGraph(tuple(journal.name(image) for image in images), tuple(edges))
+
+
+def write_view_graph(graph: ViewGraph, folder: Path) -> list[str]:
+    """Write the graph as JSON, with its connected components, and its pairs as CSV; the names of the files."""
+    pairs = [dataclasses.asdict(edge) for edge in graph.edges]
+    content = {"images": graph.images, "components": graph.components(), "pairs": pairs}
+    with replacing(folder / GRAPH_JSON) as path:
+        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    with replacing(folder / GRAPH_CSV) as path, path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, [field.name for field in dataclasses.fields(Edge)])
+        writer.writeheader()
+        writer.writerows(pairs)
+    return [GRAPH_JSON, GRAPH_CSV]

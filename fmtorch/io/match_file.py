@@ -1,0 +1,212 @@
+"""Matches alone: x0, x1 of one pair or of many in an npz or HDF5 file, and their geometries in another."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import zipfile
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from fmtorch.core.files import replacing
+from fmtorch.data.text_files import DataError
+from fmtorch.geometry.cameras import calibration_problems
+from fmtorch.io import h5
+from fmtorch.io.colmap import DatabaseImage
+from fmtorch.io.given import size_by_centre
+from fmtorch.io.match_store import PairGeometry
+
+NPZ = ".npz"
+SUFFIXES = (NPZ, *h5.SUFFIXES)
+MATRICES = ("F", "E", "H", "R", "t")
+MEMORY = 256  # images whose points are kept
+
+Ids = tuple[str, str]  # keys of the points of both images, which end in x0 and x1
+
+
+class ArrayFile(Protocol):
+    """Arrays by keys such as ``a/x0``."""
+
+    def keys(self) -> Iterable[str]:
+        """All of them."""
+
+    def read(self, key: str) -> NDArray[Any]:
+        """One array; raises DataError where it cannot be read."""
+
+
+class MatchFile:
+    """The pairs of one file; each has matches of its own. output: the file of geometries that is written.
+
+    A file holds ``x0, x1`` (n, 2), pixels with (0, 0) at the centre of the first one, and perhaps ``K0, K1`` (3, 3) and
+    ``size0, size1`` (h, w): of one pair, or of each pair below a name of its own (``a/x0``; in HDF5 a group).
+
+    Raises DataError where the file is of another kind or holds no such pair.
+    """
+
+    def __init__(self, path: Path, output: Path) -> None:
+        self._path, self._output, self._open = path, output, contextlib.ExitStack()
+        with contextlib.ExitStack() as stack:
+            self._file = stack.enter_context(_arrays(path))
+            self._keys = set(self._file.keys())
+            ends = [key.removesuffix("x0") for key in self._keys if key.rpartition("/")[2] == "x0"]
+            self._pairs = sorted(end for end in ends if f"{end}x1" in self._keys)
+            if not self._pairs:
+                raise DataError(
+                    f"{path} holds no x0 and x1; give matches x0, x1 (n, 2), alone or of each pair in a group, "
+                    "or hloc's features=F.h5 as well"
+                )
+            self._open = stack.pop_all()
+        self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
+
+    def __enter__(self) -> MatchFile:
+        """The file itself, closed on leaving."""
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Close the file."""
+        self._open.close()
+
+    def pairs(self) -> list[Ids]:
+        """Both images of each pair."""
+        return [(f"{pair}x0", f"{pair}x1") for pair in self._pairs]
+
+    def identity(self) -> dict[str, Any]:
+        """What the file holds."""
+        return {"files": h5.digest_of(self._path)}
+
+    def has_geometry(self, pair: Ids) -> bool:
+        """Whether a pair has a geometry: none has."""
+        return False
+
+    def matches(self, pair: Ids) -> NDArray[np.int64]:
+        """Point i with point i. Raises DataError where x0 and x1 have different lengths."""
+        counts = [len(self.image(side).points) for side in pair]
+        if counts[0] != counts[1]:
+            raise DataError(f"x0 has {counts[0]} points and x1 has {counts[1]}; they must have as many")
+        return np.repeat(np.arange(counts[0])[:, None], 2, 1)
+
+    def write(self, geometries: Iterable[tuple[Ids, PairGeometry]]) -> None:
+        """Write the file: which matches are inliers, configuration and matrices."""
+        with replacing(self._output) as temporary:
+            entries = (self._entries(*pair) for pair in geometries)
+            (_write_npz if self._output.suffix == NPZ else _write_h5)(temporary, entries)
+
+    def _entries(self, ids: Ids, geometry: PairGeometry) -> dict[str, NDArray[Any]]:
+        """What is written of a pair, by keys."""
+        pair = ids[0].removesuffix("x0")
+        inliers = np.zeros(len(self.image(ids[0]).points), bool)
+        inliers[geometry.inliers[:, 0]] = True
+        values = ((name, getattr(geometry, name)) for name in MATRICES)
+        matrices = {f"{pair}{name}": value for name, value in values if value is not None}
+        return {f"{pair}inliers": inliers, f"{pair}configuration": np.array(geometry.kind), **matrices}
+
+    def name(self, image_id: str) -> str:
+        """The key of the points."""
+        return image_id
+
+    def _image(self, image_id: str) -> DatabaseImage:
+        pair, i = image_id[:-2], int(image_id[-1])
+        points = self._numbers(image_id, (None, 2)).astype(np.float32)
+        K, size = (
+            self._numbers(f"{pair}{key}", shape) if f"{pair}{key}" in self._keys else None
+            for key, shape in ((f"K{i}", (3, 3)), (f"size{i}", (2,)))
+        )
+        if K is not None and (problem := calibration_problems(torch.from_numpy(K)[None], None, f"K{i}")[0]):
+            raise DataError(problem)
+        known = size_by_centre(K) if size is None and K is not None else None
+        if size is not None:
+            if not (np.isfinite(size).all() and (size >= 1).all()):
+                raise DataError(f"size{i} is {size.tolist()}; it must be the height and width of the image")
+            known = int(size[0]), int(size[1])
+        deviation = np.inf if K is None else 0.0
+        return DatabaseImage(image_id, i, known, K, deviation, points, points)
+
+    def _numbers(self, key: str, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
+        values = self._file.read(key)
+        if values.dtype.kind not in "fiu":
+            raise DataError(f"{key} is of {values.dtype}; it must hold real numbers")
+        fits = values.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, values.shape, strict=True))
+        if not fits:
+            wanted = ", ".join("n" if n is None else str(n) for n in shape)
+            raise DataError(f"{key} has shape {values.shape}; it must be ({wanted})")
+        return values.astype(np.float64)
+
+
+def expect_suffix(name: str, path: Path) -> None:
+    """Raise ValueError where a file of matches ends otherwise than in .npz, .h5 or .hdf5."""
+    if path.suffix not in SUFFIXES:
+        raise ValueError(f"{name}={path} must end in {', '.join(SUFFIXES)}")
+
+
+@contextlib.contextmanager
+def _arrays(path: Path) -> Iterator[ArrayFile]:
+    if path.suffix != NPZ:
+        with h5.opened(path) as file:
+            yield _H5(file)
+        return
+    try:
+        npz = np.load(path)
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise DataError(f"{path}: is not a valid npz file; write it by numpy.savez") from error
+    if not isinstance(npz, np.lib.npyio.NpzFile):
+        raise DataError(f"{path}: is a single array; write x0 and x1 by numpy.savez")
+    with npz:
+        yield _Npz(npz)
+
+
+class _Npz:
+    def __init__(self, file: Any) -> None:
+        self._file = file
+
+    def keys(self) -> list[str]:
+        return list(self._file.files)
+
+    def read(self, key: str) -> NDArray[Any]:
+        try:
+            return np.asarray(self._file[key])
+        except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+            raise DataError(f"{key} cannot be read ({str(error).partition(chr(10))[0]})") from error
+
+
+class _H5:
+    def __init__(self, file: Any) -> None:
+        self._file = file
+
+    def keys(self) -> list[str]:
+        names: list[str] = []
+        try:
+            self._file.visit(names.append)
+        except (OSError, RuntimeError) as error:
+            raise DataError(f"{self._file.filename}: its keys cannot be read") from error
+        return names
+
+    def read(self, key: str) -> NDArray[Any]:
+        return h5.array(self._file, key)
+
+
+def _write_npz(path: Path, pairs: Iterable[Mapping[str, NDArray[Any]]]) -> None:
+    """As `numpy.savez` writes it, with one pair in memory."""
+    with zipfile.ZipFile(path, "w") as archive:
+        for entries in pairs:
+            for key, value in entries.items():
+                with archive.open(f"{key}.npy", "w", force_zip64=True) as file:
+                    np.lib.format.write_array(file, np.asarray(value), allow_pickle=False)
+
+
+def _write_h5(path: Path, pairs: Iterable[Mapping[str, NDArray[Any]]]) -> None:
+    """`inliers` as a data set of each pair's group, the others as its attributes."""
+    h5py = h5.imported()
+    with h5py.File(path, "w") as file:
+        for entries in pairs:
+            for key, value in entries.items():
+                pair, _, name = key.rpartition("/")
+                group = file.require_group(pair or "/")
+                if name == "inliers":
+                    group[name] = value
+                else:
+                    group.attrs[name] = str(value) if name == "configuration" else value

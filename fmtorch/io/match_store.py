@@ -1,0 +1,210 @@
+"""What is to be exported, image by image and pair by pair, as files that are whole or absent: work can be resumed.
+
+::
+
+    images/<digest>.npz   keypoints, scores, size, camera of an image; the digest is of its name and its file's bytes
+    pairs/<digest>.npz    indices of matched keypoints, their scores, F, its inliers and significance, and the two-view
+                          geometry for COLMAP; the digest is of the two images' digests
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import math
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fmtorch.core.files import replacing
+from fmtorch.data.lenses import Lens
+
+# The geometry of a pair as COLMAP's databases hold it
+
+
+ORIGIN = 0.5  # px: COLMAP's coordinates of the first pixel's centre
+
+Kind = Literal["calibrated", "uncalibrated", "planar", "panoramic", "planar_or_panoramic", "degenerate"]
+"""COLMAP's configurations: of a general pair by whether both focal lengths are known, of others by what they show."""
+Matrix = NDArray[np.float64] | None
+
+
+class PairGeometry(NamedTuple):
+    """The geometry of one pair, in pixels with (0, 0) at the centre of the first one.
+
+    inliers: keypoints of both images, (n, 2). F, E, H: (3, 3), None where the pair has none; ``x1^T F x0 = 0``,
+    ``x1 ~ H x0``. R, t: X1 = R X0 + t.
+    """
+
+    kind: Kind
+    inliers: NDArray[np.integer[Any]]
+    F: Matrix = None
+    E: Matrix = None
+    H: Matrix = None
+    R: Matrix = None
+    t: Matrix = None
+
+
+def two_view_geometry(pycolmap: Any, pair: PairGeometry) -> Any:
+    """The `pycolmap.TwoViewGeometry` of a pair: F and H in COLMAP's pixels."""
+    geometry = pycolmap.TwoViewGeometry()
+    geometry.config = pycolmap.TwoViewGeometryConfiguration.__members__[pair.kind.upper()]
+    geometry.inlier_matches = np.ascontiguousarray(pair.inliers, np.uint32)
+    back = np.array([[1.0, 0, -ORIGIN], [0, 1, -ORIGIN], [0, 0, 1]])
+    if pair.F is not None:
+        geometry.F = back.T @ pair.F @ back
+    if pair.E is not None:
+        geometry.E = pair.E / np.linalg.norm(pair.E)
+    if pair.H is not None:
+        geometry.H = np.linalg.inv(back) @ pair.H @ back
+    if pair.R is not None and pair.t is not None:
+        geometry.cam2_from_cam1 = pycolmap.Rigid3d(pycolmap.Rotation3d(pair.R), pair.t)
+    return geometry
+
+
+Array = NDArray[np.float64]
+_PAIR = ("matches", "scores", "inliers", "F", "related", "significance", "configuration")
+_GEOMETRY = ("F", "E", "H", "R", "t")  # matrices of a geometry, of those that there are
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ExportedImage:
+    """An image: points (n, 2) in pixels, (0, 0) at the first pixel's centre; scores (n,); size (h, w).
+
+    K: of an image without distortion; lens: of one with it; focal: of EXIF, px; of all three one at most.
+    """
+
+    name: str
+    points: NDArray[np.float32]
+    scores: NDArray[np.float32]
+    size: tuple[int, int]
+    K: Array | None = None
+    lens: Lens | None = None
+    focal: float | None = None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ExportedPair:
+    """The matches given to the estimator, (m, 2) indices of points; scores (m,) in [0, 1]; inliers (m,) of F (3, 3).
+
+    F is zero where there is none. related: whether its support is beyond chance. significance: how far, -inf without F
+    and NaN where it was not computed. configuration: of the cameras and the scene; empty where it is not known, and
+    geometry, for COLMAP, None.
+    """
+
+    name0: str
+    name1: str
+    matches: NDArray[np.int32]
+    scores: NDArray[np.float32]
+    inliers: NDArray[np.bool_]
+    F: Array
+    related: bool = True
+    geometry: PairGeometry | None = None
+    significance: float = math.nan
+    configuration: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Journal:
+    """The folder of what was computed; names of images are paths below `root`. Any number of processes may add."""
+
+    folder: Path
+    root: Path
+
+    def name(self, image: Path) -> str:
+        """Under what name an image is exported."""
+        return image.absolute().relative_to(self.root.absolute()).as_posix()
+
+    def has_image(self, image: Path) -> bool:
+        return self._image(image).exists()
+
+    def has_pair(self, image0: Path, image1: Path) -> bool:
+        return self._pair(image0, image1).exists()
+
+    def add_image(self, image: Path, value: ExportedImage) -> None:
+        arrays: dict[str, NDArray[Any]] = {"points": value.points, "scores": value.scores, "size": np.array(value.size)}
+        if value.K is not None:
+            arrays["K"] = value.K
+        if value.focal is not None:
+            arrays["focal"] = np.array(value.focal)
+        if (lens := value.lens) is not None:
+            arrays["lens_model"] = np.array(lens.model)
+            arrays["lens"] = np.array([lens.fx, lens.fy, lens.cx, lens.cy, *lens.coefficients])
+        _write(self._image(image), arrays)
+
+    def add_pair(self, image0: Path, image1: Path, value: ExportedPair) -> None:
+        arrays: dict[str, NDArray[Any]] = {name: np.asarray(getattr(value, name)) for name in _PAIR}
+        if (geometry := value.geometry) is not None:
+            arrays |= {"kind": np.array(geometry.kind), "geometry_inliers": np.asarray(geometry.inliers)}
+            matrices = {f"geometry_{name}": getattr(geometry, name) for name in _GEOMETRY}
+            arrays |= {name: matrix for name, matrix in matrices.items() if matrix is not None}
+        _write(self._pair(image0, image1), arrays)
+
+    def image(self, image: Path) -> ExportedImage:
+        with np.load(self._image(image)) as stored:
+            h, w = stored["size"].tolist()
+            K, lens, focal = stored.get("K"), None, stored.get("focal")
+            if "lens" in stored:
+                fx, fy, cx, cy, *coefficients = stored["lens"].tolist()
+                lens = Lens(fx, fy, cx, cy, str(stored["lens_model"]), tuple(coefficients))
+            points, scores, given = stored["points"], stored["scores"], None if focal is None else float(focal)
+            return ExportedImage(self.name(image), points, scores, (h, w), K, lens, given)
+
+    def pair(self, image0: Path, image1: Path) -> ExportedPair:
+        with np.load(self._pair(image0, image1)) as stored:
+            values = {name: stored[name] for name in _PAIR}
+            geometry = None
+            if "kind" in stored:
+                matrices = [stored.get(f"geometry_{name}") for name in _GEOMETRY]
+                geometry = PairGeometry(cast(Kind, str(stored["kind"])), stored["geometry_inliers"], *matrices)
+        values |= {name: values[name].item() for name in ("related", "significance", "configuration")}
+        return ExportedPair(self.name(image0), self.name(image1), geometry=geometry, **values)
+
+    def _image(self, image: Path) -> Path:
+        return self.folder / "images" / f"{self._digest(image)}.npz"
+
+    def _pair(self, image0: Path, image1: Path) -> Path:
+        both = f"{self._digest(image0)} {self._digest(image1)}"
+        return self.folder / "pairs" / f"{hashlib.blake2b(both.encode(), digest_size=16).hexdigest()}.npz"
+
+    def _digest(self, image: Path) -> str:
+        status = image.stat()
+        return _digest(self.name(image), image.absolute(), status.st_size, status.st_mtime_ns)
+
+
+def indices(points: NDArray[np.float32], x: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Which of the points, (n, 2), each of x, (m, 2), is: the first at that location.
+
+    Raises ValueError where x holds a point that is none of them: a matcher that moves points cannot be exported so.
+    """
+    keys, wanted = _keys(points), _keys(x)
+    order = np.argsort(keys, kind="stable")
+    place = np.searchsorted(keys, wanted, sorter=order)
+    index = order[np.minimum(place, len(order) - 1)] if len(order) else np.zeros(len(wanted), np.int64)
+    absent = np.ones(len(wanted), bool) if not len(order) else keys[index] != wanted
+    if absent.any():
+        point = tuple(x[absent.argmax()].tolist())
+        raise ValueError(f"the match at {point} is at no keypoint; such matches cannot be exported")
+    return index.astype(np.int32)
+
+
+def _keys(points: NDArray[np.float32]) -> NDArray[np.int64]:
+    """The bits of both coordinates of each point, (n,); 0 and -0 are one."""
+    return np.ascontiguousarray(points + np.float32(0), np.float32).view(np.int64)[:, 0]
+
+
+@functools.lru_cache(maxsize=100_000)
+def _digest(name: str, path: Path, size: int, changed: int) -> str:
+    digest = hashlib.blake2b(f"{name}\0".encode(), digest_size=16)
+    with path.open("rb") as file:
+        digest.update(hashlib.file_digest(file, "blake2b").digest())
+    return digest.hexdigest()
+
+
+def _write(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]

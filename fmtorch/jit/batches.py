@@ -1,0 +1,74 @@
+"""The door from batched tensors to kernels, which see the arrays of one pair."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from fmtorch.jit import kernel
+from fmtorch.jobs.threads import available, mapped
+
+PAIRS_OF_A_THREAD = 8  # at least; a thread takes as long to begin as a kernel for a pair
+
+
+def kernels_serve(*tensors: Tensor | None, floats: Sequence[torch.dtype] = (torch.float32, torch.float64)) -> bool:
+    """Whether kernels stand for a tensor function of these: all on the CPU, no gradient to keep, these float types."""
+    given = [t for t in tensors if t is not None]
+    return (
+        all(t.device.type == "cpu" and (t.dtype in floats or not t.is_floating_point()) for t in given)
+        and not (torch.is_grad_enabled() and any(t.requires_grad for t in given))
+        and kernel.available()
+    )
+
+
+def for_each_pair(
+    function: Callable[..., None],
+    tensors: Sequence[Tensor | None],
+    *constants: Any,
+    out: Tensor,
+    kind: torch.dtype = torch.float32,
+    group: Callable[..., Any] | None = None,
+) -> Tensor:
+    """`out` (B, ...) after function(row of each tensor, constants, row of out) for each of B pairs.
+
+    Rows are C-contiguous arrays, floating ones of type `kind`; of what is not known (None) an empty one. group: the
+    NamedTuple in which the function takes the rows. Pairs are shared out among threads.
+    """
+    results = out.numpy()
+    arrays = [_array(t, kind, len(results)) for t in tensors]
+
+    def run_pairs(pairs: range) -> None:
+        for pair in pairs:
+            rows = [array[pair] for array in arrays]
+            function(*(rows if group is None else [group(*rows)]), *constants, results[pair])
+
+    parts = max(1, min(available(), len(results) // PAIRS_OF_A_THREAD))
+    mapped(run_pairs, [range(first, len(results), parts) for first in range(parts)])
+    return out
+
+
+def _array(tensor: Tensor | None, kind: torch.dtype, pairs: int) -> NDArray[Any]:
+    if tensor is None:
+        return np.empty((pairs, 0), _numpy(kind))
+    if tensor.is_floating_point() and tensor.dtype != kind:
+        tensor = tensor.to(kind)
+    array: NDArray[Any] = as_array(tensor.contiguous())
+    return array
+
+
+@functools.cache
+def _numpy(kind: torch.dtype) -> Any:
+    """NumPy's name of a type of torch's."""
+    return torch.empty(0, dtype=kind).numpy().dtype
+
+
+def as_array(tensor: Tensor) -> NDArray[Any]:
+    """A tensor on the CPU as an array, a view, on no graph."""
+    array: NDArray[Any] = (tensor.detach() if tensor.requires_grad else tensor).numpy()
+    return array

@@ -1,0 +1,387 @@
+"""Types of a kernel's arguments, by which it is compiled: ``F8x2`` is an array of float64 with two axes in C order."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import gc
+import inspect
+import os
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from typing import (
+    Annotated,
+    Any,
+    Generic,
+    ParamSpec,
+    TypeAlias,
+    TypeVar,
+    get_args,
+    get_origin,
+    get_type_hints,
+    overload,
+)
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fmtorch.jit import cache, linking
+from fmtorch.jit.cache import named_by_version, version
+from fmtorch.jit.linking import inner_compiler
+
+Array: TypeAlias = NDArray[Any]
+F8x1: TypeAlias = Annotated[NDArray[np.float64], "f8[::1]"]
+F8x2: TypeAlias = Annotated[NDArray[np.float64], "f8[:, ::1]"]
+F8x3: TypeAlias = Annotated[NDArray[np.float64], "f8[:, :, ::1]"]
+F8x4: TypeAlias = Annotated[NDArray[np.float64], "f8[:, :, :, ::1]"]
+F4x1: TypeAlias = Annotated[NDArray[np.float32], "f4[::1]"]
+F4x2: TypeAlias = Annotated[NDArray[np.float32], "f4[:, ::1]"]
+F4x3: TypeAlias = Annotated[NDArray[np.float32], "f4[:, :, ::1]"]
+I1x2: TypeAlias = Annotated[NDArray[np.int8], "i1[:, ::1]"]
+I8x1: TypeAlias = Annotated[NDArray[np.int64], "i8[::1]"]
+I8x2: TypeAlias = Annotated[NDArray[np.int64], "i8[:, ::1]"]
+I4x1: TypeAlias = Annotated[NDArray[np.int32], "i4[::1]"]
+I4x2: TypeAlias = Annotated[NDArray[np.int32], "i4[:, ::1]"]
+U1x1: TypeAlias = Annotated[NDArray[np.uint8], "u1[::1]"]
+B1x1: TypeAlias = Annotated[NDArray[np.bool_], "b1[::1]"]
+B1x2: TypeAlias = Annotated[NDArray[np.bool_], "b1[:, ::1]"]
+
+
+# The signature of a kernel, from its annotations: arrays of `arrays`, int, float, bool, and groups of these
+
+
+NUMBERS = {int: "int64", float: "float64", bool: "boolean", np.float32: "float32"}  # numba's names
+
+
+def signature_of(function: Callable[..., Any]) -> tuple[Any, ...]:
+    """The types of a function's arguments, as numba compiles for them.
+
+    A group is a NamedTuple of such types. Raises TypeError, naming the argument, for a type that is none of these.
+    """
+    hints = get_type_hints(function, include_extras=True)
+    names = function.__code__.co_varnames[: function.__code__.co_argcount]
+    return tuple(_type(hints.get(name), f"{function.__qualname__}: {name}") for name in names)
+
+
+def described(kinds: Iterable[Any]) -> str:
+    """Types of arguments in words: of groups also where the class is and how its members are called."""
+    return ", ".join(f"{_group(kind)}({described(kind)})" if hasattr(kind, "fields") else str(kind) for kind in kinds)
+
+
+def _group(kind: Any) -> str:
+    of = kind.instance_class
+    return f"{of.__module__}.{of.__qualname__} {' '.join(kind.fields)}"
+
+
+def _type(hint: Any, what: str) -> Any:
+    from numba import types
+    from numba.core import sigutils
+
+    if hint in NUMBERS:
+        return getattr(types, NUMBERS[hint])
+    if get_origin(hint) is Annotated:
+        ((array,), _) = sigutils.normalize_signature(f"({get_args(hint)[1]},)")
+        return array
+    if hasattr(hint, "_fields"):
+        fields = get_type_hints(hint, include_extras=True)
+        members = [_type(fields[name], f"{what}.{name}") for name in hint._fields]
+        return types.BaseTuple.from_types(members, hint)  # where all are alike, a type of its own
+    raise TypeError(f"{what} is annotated {hint}; it must be a type of `compiling.arrays`, a number or a NamedTuple")
+
+
+# `FMTORCH_KERNELS=off`: estimators run their kernels interpreted by Python, all else takes its tensor form
+
+
+SWITCH = "FMTORCH_KERNELS"
+
+
+def off() -> bool:
+    """Whether kernels are switched off. Raises ValueError if $FMTORCH_KERNELS is neither on nor off."""
+    switch = os.environ.get(SWITCH, "")
+    if switch not in ("", "on", "off"):
+        raise ValueError(f"{SWITCH}={switch}; it must be on or off")
+    return switch == "off"
+
+
+def available() -> bool:
+    """Whether kernels stand for tensor forms: not switched off, and numba is there; a warning says once that it is not.
+
+    Raises ValueError if $FMTORCH_KERNELS is neither on nor off.
+    """
+    return not off() and numba_version() is not None
+
+
+@functools.cache
+def numba_version() -> str | None:
+    """The version of numba, None, with a warning, where it cannot be imported."""
+    try:
+        import numba
+    except (ImportError, OSError) as error:
+        reason = str(error).partition("\n")[0]
+        warnings.warn(f"without numba ({reason}) the slower tensor and NumPy forms are used", stacklevel=3)
+        return None
+    return str(numba.__version__)
+
+
+def identity() -> str:
+    """What a run says of its kernels: ``numba 0.68.1``, or ``off``."""
+    return f"numba {numba_version()}" if available() else "off"
+
+
+# What is said while kernels are compiled: one line, however many there are
+
+
+QUIET = "FMTORCH_COMPILES_QUIETLY"  # set for a process that helps another one, which speaks for both
+_CLEAR = "\r\x1b[K"
+_state = {"announced": False}
+
+
+def begun(name: str, where: str, count: str = "") -> None:
+    """Say that a kernel is compiled, on the error stream. where: it is kept. count: which one of how many it is."""
+    if os.environ.get(QUIET):
+        return
+    if sys.stderr.isatty():
+        print(f"{_CLEAR}{count}compiling {name} {where}", end="", file=sys.stderr, flush=True)
+    elif not _state["announced"]:
+        print(f"{count}compiling {name} and what else is missing {where}", file=sys.stderr, flush=True)
+    _state["announced"] = True
+
+
+def ended() -> None:
+    """Take the line back from a terminal."""
+    if not os.environ.get(QUIET) and sys.stderr.isatty():
+        print(_CLEAR, end="", file=sys.stderr, flush=True)
+
+
+# Functions that numba compiles for this machine when they are first called, kept in a cache folder of their own
+
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+OPTIONS = {"nogil": True, "error_model": "numpy", "fastmath": False, "no_cfunc_wrapper": True}
+_lock = threading.RLock()  # numba compiles one function at a time; a kernel may compile those that it calls
+
+
+class Kernel(Generic[P, R]):
+    """A function of NumPy arrays and numbers, compiled for one signature when it is first called.
+
+    The signature is that of its annotations. Arrays of another dtype, number of axes or memory order are refused with a
+    TypeError, never converted, and so are numbers in a group; other numbers are converted. Kernels and inner functions
+    may call it, too. It holds no Python lock while it runs, unless it is made with holds_gil=True. With
+    FMTORCH_KERNELS=off, for a debugger, the plain function runs, a thousand times slower. Raises ImportError where
+    numba cannot be imported.
+    """
+
+    __slots__ = ("__call__", "__dict__")  # so that to call a kernel is to call what is compiled, with nothing between
+    __call__: Callable[P, R]
+
+    def __init__(self, function: Callable[P, R], holds_gil: bool = False, always_compiled: bool = False) -> None:
+        self.function: Callable[P, R] = inspect.unwrap(
+            function
+        )  # without the checks that tests wrap around every function
+        functools.update_wrapper(self, self.function)
+        self.holds_gil, self.always_compiled = holds_gil, always_compiled
+        self._compiled: Callable[P, R] | None = None
+        self.calls: list[Kernel[..., Any]] = []  # those that it calls, once it is compiled
+        linking.register(self)
+        self.__call__ = self._first_call
+
+    @functools.cached_property
+    def signature(self) -> Any:
+        """The types of its arguments."""
+        return signature_of(self.function)
+
+    @functools.cached_property
+    def version(self) -> str:
+        """What it is made of, in hexadecimal digits (`fmtorch.jit.cache`)."""
+        return version(self.function, described(self.signature), f"holds_gil={self.holds_gil}")
+
+    def described(self) -> tuple[str, None]:
+        """Its name and types, all that a kernel that calls it depends on."""
+        module, name = self.function.__module__, self.function.__qualname__
+        return f"kernel {module}.{name}({described(self.signature)}) -> {linking.returned(self.function)}", None
+
+    def _first_call(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        if off() and not self.always_compiled:
+            with np.errstate(all="ignore"):  # as compiled: numbers wrap round, and may become infinite or NaN
+                return self.function(*args, **kwargs)
+        return self.compiled()(*args, **kwargs)
+
+    def compiled(self) -> Callable[P, R]:
+        """The compiled function, ready to be called: of this process, of the cache folder, or compiled now.
+
+        Raises ImportError where numba cannot be imported.
+        """
+        with _lock:
+            if not self.ready:
+                function = self.compiled_alone()
+                for each in self.calls:
+                    each.compiled()
+                self.__call__ = function
+        return self.__call__
+
+    def compiled_alone(self, count: str = "") -> Callable[P, R]:
+        """The compiled function, not to be called before those that it calls are compiled, too.
+
+        A message tells where it is compiled now; count: what the message begins with. Raises ImportError where numba
+        cannot be imported.
+        """
+        with _lock:
+            if self._compiled is None:
+                self._compiled, self.calls = _compiled(self, count)
+        return self._compiled
+
+    @property
+    def ready(self) -> bool:
+        """Whether this process has compiled it and those that it calls."""
+        return self._compiled is not None and self.__call__ is self._compiled
+
+    @property
+    def kept(self) -> bool:
+        """Whether the cache folder holds it. Raises ImportError where numba cannot be imported."""
+        path = cache.path(self.function, self.version)
+        return path is not None and path.is_file()
+
+    @functools.cached_property
+    def _numba_type_(self) -> Any:  # asked by numba where a kernel calls this one
+        return linking.callable_type(self.function, self.signature)
+
+    def __reduce__(self) -> str:
+        return str(self.__qualname__)  # type: ignore[attr-defined]  # the name to import it by
+
+
+class Inner(Generic[P, R]):
+    """A function for kernels to call, compiled into each of them for the types that it is called with.
+
+    Called from Python it is the plain function, slow and easy to test.
+    """
+
+    def __init__(self, function: Callable[P, R], inline: bool) -> None:
+        self.function: Callable[P, R] = inspect.unwrap(function)
+        self.inline = inline
+        functools.update_wrapper(self, self.function)
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        """The function's value."""
+        return self.function(*args, **kwargs)
+
+    @functools.cached_property
+    def _dispatcher(self) -> Any:
+        import numba
+
+        how: dict[str, Any] = {"inline": "always"} if self.inline else {}
+        if (compiler := inner_compiler()) is not None:
+            how["pipeline_class"] = compiler
+        function = named_by_version(self.function, version(self.function))
+        return numba.njit(**OPTIONS, no_cpython_wrapper=True, **how)(function)
+
+    @property
+    def _numba_type_(self) -> Any:
+        return _type_of(self._dispatcher)
+
+    def described(self) -> tuple[str, Callable[..., Any] | None]:
+        """How it is compiled, and its function, which is compiled into those that call it."""
+        return f"inner, inline={self.inline}", self.function
+
+    def __reduce__(self) -> str:
+        return str(self.__qualname__)  # type: ignore[attr-defined]  # the name to import it by
+
+
+@overload
+def kernel(function: Callable[P, R]) -> Kernel[P, R]: ...
+@overload
+def kernel(
+    *, holds_gil: bool = False, always_compiled: bool = False, name: str = ""
+) -> Callable[[Callable[P, R]], Kernel[P, R]]: ...
+def kernel(
+    function: Callable[P, R] | None = None, *, holds_gil: bool = False, always_compiled: bool = False, name: str = ""
+) -> Any:
+    """Makes a function a `Kernel` of the types of its annotations.
+
+    Arrays must be writable. holds_gil: of some microseconds, for which it keeps Python's lock: a thread that waits for
+    it would wake too late to use them. always_compiled: also with FMTORCH_KERNELS=off, since Python would take hours.
+    name: of one that a function makes for some other function, unique in its file.
+    """
+    if function is not None:
+        return Kernel(function)
+
+    def named(function: Callable[P, R]) -> Kernel[P, R]:
+        if name:
+            function = inspect.unwrap(function)
+            function.__name__ = function.__qualname__ = name
+        return Kernel(function, holds_gil, always_compiled)
+
+    return named
+
+
+@overload
+def inner(function: Callable[P, R]) -> Inner[P, R]: ...
+@overload
+def inner(*, inline: bool) -> Callable[[Callable[P, R]], Inner[P, R]]: ...
+def inner(function: Callable[P, R] | None = None, *, inline: bool = False) -> Any:
+    """Makes a function an `Inner` one. inline: numba, too, inlines it; LLVM does so anyway where it is small."""
+    return Inner(function, inline) if function is not None else lambda f: Inner(f, inline)
+
+
+def _compiled(uncompiled: Kernel[P, R], count: str) -> tuple[Callable[P, R], list[Kernel[..., Any]]]:
+    """The compiled function of a kernel, whose address its cell holds from now on, and the kernels that it calls."""
+    import numba
+
+    function = uncompiled.function
+    how = OPTIONS | {"nogil": not uncompiled.holds_gil}
+    dispatcher: Any = numba.njit(**how)(named_by_version(function, uncompiled.version))
+    if not hasattr(dispatcher, "compile"):
+        return function, []  # NUMBA_DISABLE_JIT=1
+
+    announced: list[str] = []
+
+    def announce(where: str) -> None:
+        begun(function.__name__, where, count)
+        announced.append(where)
+
+    file = dispatcher._cache = cache.KernelFile(cache.path(function, uncompiled.version), announce)
+    with _no_garbage_collection():
+        dispatcher.compile(uncompiled.signature)
+    if announced:
+        ended()
+    dispatcher.disable_compile()
+    (result,) = dispatcher.overloads.values()
+    linking.publish(function, result)
+    compiled: Callable[P, R] = dispatcher
+    return compiled, file.calls
+
+
+@contextlib.contextmanager
+def _no_garbage_collection() -> Iterator[None]:
+    """Within it Python does not look for circles of objects: numba makes millions, nearly all of which stay."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+def _type_of(dispatcher: Any) -> Any:
+    import numba
+
+    return numba.types.Dispatcher(dispatcher)
+
+
+# Scratch arrays of kernels: numba compiles `np.empty` anew for each literal shape, an inner function but once
+
+
+@inner
+def vector(n: int) -> Array:
+    """(n,) float64, not initialised."""
+    return np.empty(n)
+
+
+@inner
+def matrix(rows: int, columns: int) -> Array:
+    """(rows, columns) float64, not initialised."""
+    return np.empty((rows, columns))

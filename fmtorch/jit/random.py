@@ -1,0 +1,110 @@
+"""What random numbers are for, and the seed of each purpose: without tensors."""
+
+from __future__ import annotations
+
+import enum
+import functools
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from fmtorch.jit.kernel import inner
+
+
+class Stream(enum.IntEnum):
+    """What a random number is for; streams of the same pair are independent."""
+
+    SAMPLING = 1
+    PRESELECTION = 2
+    METRIC = 3
+    TRAINING = 4
+    PLANE = 5
+    PARALLAX = 6
+    REFINEMENT = 7
+    FOCAL = 8
+    AUGMENTATION = 9
+    BATCHES = 10
+
+
+def wrap(value: int) -> int:
+    """An unsigned 64-bit constant as the int64 with the same bits."""
+    return value - (1 << 64) if value >= 1 << 63 else value
+
+
+@functools.lru_cache(maxsize=64)
+def mixed_seed(seed: int, stream: Stream) -> int:
+    """The seed and the stream, mixed by splitmix64, as an int64."""
+    x = ((seed * 2 + 1) * 0x9E3779B97F4A7C15 + int(stream)) % (1 << 64)
+    x = (x ^ (x >> 30)) * 0xBF58476D1CE4E5B9 % (1 << 64)
+    x = (x ^ (x >> 27)) * 0x94D049BB133111EB % (1 << 64)
+    return wrap(x ^ (x >> 31))
+
+
+# Random numbers as a stateless function of (seed, pair key, stream, draw): the same in any batch and on any device
+
+
+_GAMMA, _MIX1, _MIX2 = (wrap(c) for c in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
+
+
+def _shift_right(x: Tensor, n: int) -> Tensor:
+    """Logical right shift of int64."""
+    return (x >> n) & ((1 << (64 - n)) - 1)
+
+
+def _mix(x: Int[Tensor, "*shape"]) -> Int[Tensor, "*shape"]:
+    """The finaliser of splitmix64 (Steele, Lea, Flood, OOPSLA 2014): a bijection of 64-bit words."""
+    x = (x ^ _shift_right(x, 30)) * _MIX1
+    x = (x ^ _shift_right(x, 27)) * _MIX2
+    return x ^ _shift_right(x, 31)
+
+
+def bits(
+    seed: int, key: Int[Tensor, " b"], stream: Stream, start: int, count: int, columns: int
+) -> Int[Tensor, "b count columns"]:
+    """Random 63-bit non-negative integers for the draws start .. start + count - 1, `columns` numbers a draw."""
+    device = key.device
+    counter = torch.arange(start * columns, (start + count) * columns, device=device, dtype=torch.int64)
+    state = _mix(key ^ mixed_seed(seed, stream))[:, None] + (counter * _GAMMA)[None]
+    return _shift_right(_mix(state), 1).reshape(len(key), count, columns)
+
+
+def uniform(
+    seed: int, key: Int[Tensor, " b"], stream: Stream, start: int, count: int, columns: int
+) -> Float[Tensor, "b count columns"]:
+    """Random numbers in [0, 1), float64, with 53 random bits; arguments as `bits`."""
+    return _shift_right(bits(seed, key, stream, start, count, columns), 10).to(torch.float64) * 2.0**-53
+
+
+# `random`, compiled: the same integer arithmetic, hence the same numbers
+
+
+Word = Any  # np.uint64
+
+
+@inner
+def mix(x: Word) -> Word:
+    """The finaliser of splitmix64 of a word, uint64."""
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return x ^ (x >> np.uint64(31))
+
+
+@inner
+def stream_state(mixed_seed: int, key: int) -> Word:
+    """What the numbers of a pair's stream are made of, uint64; mixed_seed: of the seed and the stream, int64."""
+    return mix(np.uint64(np.int64(key)) ^ np.uint64(np.int64(mixed_seed)))
+
+
+@inner
+def random_bits(state: Word, counter: int) -> Word:
+    """Number `counter` (draw * columns + column) of a stream: 63 random bits, uint64."""
+    return mix(state + np.uint64(counter) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(1)
+
+
+@inner
+def uniform_kernel(state: Word, counter: int) -> Any:
+    """Number `counter` of a stream in [0, 1), with 53 random bits."""
+    return np.float64(random_bits(state, counter) >> np.uint64(10)) * 2.0**-53

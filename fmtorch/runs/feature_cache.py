@@ -1,0 +1,272 @@
+"""Arrays kept on disk by name, one NumPy file each, in a folder of bounded size that several processes may share."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import os
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from fmtorch.core.files import cache_dir, replacing
+from fmtorch.core.stages import FeatureExtractor, TwoStepExtractor
+from fmtorch.core.types import Features
+from fmtorch.runs.fingerprint import configuration, environment
+from fmtorch.runs.run_folder import identity_digest
+
+Arrays = dict[str, NDArray[Any]]
+DIGEST = "digest"  # the array that holds the digest of the others
+SLACK = 0.05  # share of the bound that is freed at once, so that the folder is not listed for every file
+ABANDONED = 3600.0  # seconds after which a temporary file is a dead writer's
+
+
+class ArrayCache:
+    """Files ``<folder>/<section>/<name>.npz``, each whole or absent. Safe with several threads and processes.
+
+    limit: bytes; when more are kept, the least recently used files go (each process may exceed it by `SLACK`). None: no
+    bound. A file that is damaged, or holds other arrays than were written under its name, counts as absent, with a
+    warning; what cannot be written is not kept, with a warning.
+    Raises ValueError where the folder is a file or the limit is not positive.
+    """
+
+    def __init__(self, folder: Path, limit: int | None = None) -> None:
+        if folder.exists() and not folder.is_dir():
+            raise ValueError(f"cache={folder} is a file; it must name a folder, or be off")
+        if limit is not None and limit <= 0:
+            raise ValueError(f"the cache's limit is {limit} bytes; it must be positive, or null for none")
+        self.folder, self.limit = folder, limit
+        self._lock = threading.Lock()
+        self._unseen: float = np.inf  # bytes written since the folder was last listed
+
+    def describe(self, section: str, about: Mapping[str, Any]) -> None:
+        """Say, for a human reader, what a section's files are."""
+        file = self.folder / section / "about.json"
+        if not file.exists():
+            with self._excused(file):
+                file.parent.mkdir(parents=True, exist_ok=True)
+                with replacing(file) as temporary:
+                    temporary.write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+
+    def read(self, section: str, name: str) -> Arrays | None:
+        """The arrays of that name, or None. Executes nothing that is in the file (no pickle), checks its checksums."""
+        path = self._path(section, name)
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                arrays = {key: file[key] for key in file.files}
+            if arrays.pop(DIGEST).tobytes() != self._digest(section, name, arrays):
+                raise ValueError("it is not what was written there")
+            os.utime(path)  # used now
+        except FileNotFoundError:
+            return None
+        except Exception as error:  # a damaged file may make the reader raise nearly anything
+            warnings.warn(f"{path} is damaged ({error}); it is computed anew", stacklevel=2)
+            return None
+        return arrays
+
+    def write(self, section: str, name: str, arrays: Arrays) -> None:
+        """Keep arrays of numbers under that name, in place of what is there."""
+        path = self._path(section, name)
+        with self._excused(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with replacing(path) as temporary, temporary.open("wb") as file:
+                digest = np.frombuffer(self._digest(section, name, arrays), np.uint8)
+                np.savez(file, **arrays, **{DIGEST: digest})  # type: ignore[arg-type]
+            self._grown(sum(array.nbytes for array in arrays.values()))
+
+    def files(self) -> Iterator[tuple[Path, os.stat_result]]:
+        """The files that are kept."""
+        yield from _listed(self.folder.glob("*/*.npz"))
+
+    def trim(self) -> None:
+        """Remove the least recently used files beyond the limit, and what dead writers left."""
+        for path, status in _listed(self.folder.glob("*/*.tmp")):
+            if time.time() - status.st_mtime > ABANDONED:
+                path.unlink(missing_ok=True)
+        if self.limit is None:
+            return
+        kept = sorted(self.files(), key=lambda entry: entry[1].st_mtime_ns)
+        excess = sum(status.st_size for _, status in kept) - self.limit
+        if excess > 0:
+            excess += int(SLACK * self.limit)
+        for path, status in kept:
+            if excess <= 0:
+                break
+            path.unlink(missing_ok=True)
+            excess -= status.st_size
+
+    @staticmethod
+    def _digest(section: str, name: str, arrays: Arrays) -> bytes:
+        """Of the file's place and all that it holds."""
+        digest = hashlib.blake2b(f"{section}/{name}".encode(), digest_size=16)
+        for key, array in sorted(arrays.items()):
+            digest.update(repr((key, array.dtype.str, array.shape)).encode())
+            digest.update(np.ascontiguousarray(array).data)
+        return digest.digest()
+
+    def _path(self, section: str, name: str) -> Path:
+        return self.folder / section / f"{name}.npz"
+
+    def _grown(self, size: int) -> None:
+        with self._lock:
+            self._unseen += size
+            if self._unseen >= SLACK * (self.limit or np.inf):
+                self.trim()
+                self._unseen = 0
+
+    @contextlib.contextmanager
+    def _excused(self, path: Path) -> Iterator[None]:
+        """A full disk or a folder that may not be written costs the cache, not the run."""
+        try:
+            yield
+        except OSError as error:
+            warnings.warn(f"nothing is kept in {path.parent}: {error.strerror or error}", stacklevel=3)
+
+
+def _listed(paths: Iterator[Path]) -> Iterator[tuple[Path, os.stat_result]]:
+    """Those that are still there, with what is known of them."""
+    for path in paths:
+        with contextlib.suppress(FileNotFoundError):
+            yield path, path.stat()
+
+
+# The feature cache: what an extractor finds in an image is kept under the image's and the extractor's digests
+
+
+OFF = ("off", "none", "")
+
+
+class CachedFeatures:
+    """An extractor that keeps what another one finds, bit-equal, and computes only what it does not have.
+
+    A `TwoStepExtractor` is kept in two files, frames under the digest of its `detection` alone; any other in one.
+    Results are on the CPU. `timed` gives the seconds that the computation took when it was done, here or in another
+    run. found, computed: images so far that needed no computation, and that needed some. For any number of threads.
+
+    Raises TypeError where the extractor does not say what defines it, OSError where a file of it cannot be read (see
+    `configuration`).
+    """
+
+    def __init__(self, extractor: FeatureExtractor, cache: ArrayCache) -> None:
+        self.extractor, self.cache = extractor, cache
+        name = type(extractor).__name__
+        self._extraction = self._section(name, extractor)
+        self._detection = ""
+        if isinstance(extractor, TwoStepExtractor):
+            self._detection = self._section("detection", extractor.detection)
+        self._lock = threading.Lock()
+        self.found = self.computed = 0
+
+    def __call__(self, image: NDArray[np.uint8]) -> Features:
+        """The features of an image, from the cache where they are there."""
+        return self.timed(image)[0]
+
+    def timed(self, image: NDArray[np.uint8]) -> tuple[Features, float]:
+        """The features, and the seconds that computing them took when it was done."""
+        digest = image_digest(image)
+        extractor = self.extractor
+        if isinstance(extractor, TwoStepExtractor):
+            frames = self._kept(self._detection, digest, lambda: _named(("lafs", "scores"), extractor.detect(image)))
+            lafs = frames.tensors["lafs"]
+            described = self._kept(self._extraction, digest, lambda: {"descriptors": extractor.describe(image, lafs)})
+            steps = [frames, described]
+            size = {"image_size": torch.tensor(image.shape[:2], dtype=torch.int64)}
+        else:
+            steps, size = [self._kept(self._extraction, digest, lambda: _fields(extractor(image)))], {}
+        with self._lock:
+            computed = any(step.computed for step in steps)
+            self.computed, self.found = self.computed + computed, self.found + (not computed)
+        tensors = {name: value for step in steps for name, value in step.tensors.items()}
+        return Features(**tensors, **size), sum(step.seconds for step in steps)
+
+    def report(self) -> str:
+        """One line: what was computed and found so far, and the size of the cache."""
+        sizes = [status.st_size for _, status in self.cache.files()]
+        return (
+            f"features of {self.computed} images computed, of {self.found} taken from the cache; "
+            f"{self.cache.folder}: {len(sizes)} files, {sum(sizes) / 1e6:.1f} MB"
+        )
+
+    def _section(self, name: str, part: object) -> str:
+        identity = {"configuration": configuration(part), "environment": environment()}
+        section = f"{name}-{identity_digest(identity)[:16]}"
+        self.cache.describe(section, identity)
+        return section
+
+    def _kept(self, section: str, digest: str, compute: Callable[[], Mapping[str, Tensor]]) -> _Step:
+        """One step's result, from the cache or computed and kept."""
+        arrays = self.cache.read(section, digest)
+        if arrays is not None:
+            seconds = float(arrays.pop("seconds"))
+            return _Step({name: _unpacked(array) for name, array in arrays.items()}, seconds, computed=False)
+        start = time.perf_counter()
+        tensors = {name: value.detach().cpu() for name, value in compute().items()}
+        seconds = time.perf_counter() - start
+        arrays = {name: _packed(value) for name, value in tensors.items()}
+        self.cache.write(section, digest, {**arrays, "seconds": np.array(seconds)})
+        return _Step(tensors, seconds, computed=True)
+
+
+def cached(
+    extractor: FeatureExtractor, cache: str | Path | bool | None, limit: int | float | None = None
+) -> FeatureExtractor:
+    """The extractor with a cache in the folder `cache`; None: the user's cache folder; "off" or False: as it is.
+
+    limit: GB, see `ArrayCache`. An extractor that does not say what defines it, or whose files cannot be read, stays as
+    it is, with a warning.
+    """
+    if cache is False or str(cache) in OFF or not getattr(extractor, "keep", True):
+        return extractor
+    folder = cache_dir() / "features" if cache is None else Path(str(cache)).expanduser()
+    try:
+        return CachedFeatures(extractor, ArrayCache(folder, None if limit is None else int(limit * 1e9)))
+    except (TypeError, OSError) as error:  # of a learned file that is not there the extractor speaks better
+        warnings.warn(f"features are not cached: {error}", stacklevel=2)
+        return extractor
+
+
+def image_digest(image: NDArray[np.uint8]) -> str:
+    """The hex digest (SHA-256) of an image's shape and pixels."""
+    digest = hashlib.sha256(repr((image.dtype.str, image.shape)).encode())
+    digest.update(np.ascontiguousarray(image).data)
+    return digest.hexdigest()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Step:
+    tensors: dict[str, Tensor]
+    seconds: float
+    computed: bool
+
+
+def _named(names: tuple[str, ...], tensors: tuple[Tensor, ...]) -> dict[str, Tensor]:
+    return dict(zip(names, tensors, strict=True))
+
+
+def _fields(features: Features) -> dict[str, Tensor]:
+    return {field.name: getattr(features, field.name) for field in dataclasses.fields(features)}
+
+
+def _packed(value: Tensor) -> NDArray[Any]:
+    """The array of a tensor; bytes where every element is a whole number from 0 to 255, as SIFT's are."""
+    array = value.numpy()
+    if array.dtype == np.float32:
+        with np.errstate(invalid="ignore"):
+            small = array.astype(np.uint8)
+        if np.array_equal(small.astype(np.float32).view(np.uint32), array.view(np.uint32)):  # to the sign of zero
+            return small
+    return array
+
+
+def _unpacked(array: NDArray[Any]) -> Tensor:
+    return torch.from_numpy(array.astype(np.float32) if array.dtype == np.uint8 else array)

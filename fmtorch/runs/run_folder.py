@@ -1,0 +1,385 @@
+"""The result of one image pair, as one row of a table."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import json
+import math
+import time
+import uuid
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from fmtorch.core.files import replacing
+from fmtorch.core.settings import canonical, create, differences, head
+
+PAIR_SCHEMA = pa.schema(
+    [
+        pa.field("pair", pa.string(), nullable=False),
+        pa.field("key", pa.int64(), nullable=False),
+        pa.field("family", pa.string(), nullable=False),
+        pa.field("scene", pa.string(), nullable=False),
+        pa.field("ok", pa.bool_(), nullable=False),
+        pa.field("reason", pa.string(), nullable=False),
+        pa.field("nsgd", pa.float64(), nullable=False),
+        pa.field("nsgd_released", pa.float64()),
+        pa.field("inlier_rate", pa.float64()),
+        pa.field("inlier_rate_before", pa.float64()),
+        pa.field("corrs", pa.int64(), nullable=False),
+        pa.field("corrs_before", pa.int64(), nullable=False),
+        pa.field("features0", pa.int64(), nullable=False),
+        pa.field("features1", pa.int64(), nullable=False),
+        pa.field("draws", pa.int64(), nullable=False),
+        pa.field("seconds_features", pa.float64()),
+        pa.field("seconds_matching", pa.float64()),
+        pa.field("seconds_pruning", pa.float64()),
+        pa.field("seconds_estimation", pa.float64()),
+        pa.field("seconds_metrics", pa.float64()),
+        pa.field("F", pa.list_(pa.float64(), 9)),
+        pa.field("significance", pa.float64()),
+        pa.field("related", pa.bool_(), nullable=False),
+        pa.field("rotation_error", pa.float64()),
+        pa.field("translation_error", pa.float64()),
+        pa.field("pose_reason", pa.string()),
+        pa.field("configuration", pa.string()),
+        pa.field("warning", pa.string()),
+        pa.field("focal_error0", pa.float64()),
+        pa.field("focal_error1", pa.float64()),
+        pa.field("focal_log_ratio0", pa.float64()),
+        pa.field("focal_log_ratio1", pa.float64()),
+        pa.field("H", pa.list_(pa.float64(), 9)),
+        pa.field("corner_error", pa.float64()),
+    ]
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class PairRow:
+    """The result of one image pair. What could not be computed is None or NaN, and null in the table.
+
+    A pair of a known homography has a corner error, infinite where it failed, and H in place of F; its NSGD is NaN.
+
+    Raises ValueError for a row that contradicts itself: a failed pair has a reason, NSGD 1 and no F; a sound one has no
+    reason and nine finite elements of F or H; NSGD is in [0, 1]; there are both angles of a pose error or neither.
+    """
+
+    pair: str  # the pair's identity within its data set
+    key: int  # the pair's stable 64-bit key, `pair_key(pair)`
+    family: str  # what results are grouped by
+    scene: str  # the cluster for the bootstrap
+    ok: bool  # whether there is an estimate
+    reason: str = ""  # why not
+    nsgd: float = 1.0  # share of the image diagonal, in [0, 1]; 1 where the pair failed
+    nsgd_released: float | None = None  # the same as the published evaluator computes it
+    inlier_rate: float | None = None  # share of the estimator's inliers that obey the true F, in [0, 1]
+    inlier_rate_before: float | None = None  # share of the matches given to the estimator that do
+    corrs: int = 0  # the estimator's inliers
+    corrs_before: int = 0  # the matches given to the estimator
+    features0: int = 0  # features of image 0
+    features1: int = 0  # features of image 1
+    draws: int = 0  # minimal samples drawn
+    seconds_features: float | None = None  # seconds of wall-clock time spent on this pair, stage by stage;
+    seconds_matching: float | None = None  # a batch's time is shared equally among its pairs
+    seconds_pruning: float | None = None
+    seconds_estimation: float | None = None
+    seconds_metrics: float | None = None
+    F: Sequence[float] | None = None  # row by row, x1^T F x0 = 0 in pixels, unit Frobenius norm
+    significance: float | None = None  # how far the support of F is beyond chance
+    related: bool = False  # whether the images are therefore taken to show one scene; recall does not ask
+    rotation_error: float | None = None  # degrees, in [0, 180]; 180 where the pair failed; None without a true pose
+    translation_error: float | None = None  # of directions up to sign, in [0, 90], 90 where it failed; signed: to 180
+    pose_reason: str | None = None  # why there is no pose error, or no pose; None where there is
+    configuration: str | None = None  # of `CONFIGURATIONS`; None where there are no matches to tell it by
+    warning: str | None = None  # what the configuration leaves open, empty where nothing
+    focal_error0: float | None = None  # |f - f_true| / f_true of image 0 where f is estimated; infinite where it is
+    focal_error1: float | None = None  # not determined; None where it is given exactly, or the true one is unknown
+    focal_log_ratio0: float | None = None  # log(f / f_true); None where it is not determined, too
+    focal_log_ratio1: float | None = None
+    H: Sequence[float] | None = None  # row by row, x1 ~ H x0 in pixels, unit Frobenius norm
+    corner_error: float | None = None  # px in image 1, of the corners of image 0; infinite where the pair failed
+
+    def __post_init__(self) -> None:
+        if self.corner_error is not None:
+            _expect_homography(self)
+            return
+        if not 0.0 <= self.nsgd <= 1.0:
+            raise ValueError(f"pair {self.pair!r}: nsgd is {self.nsgd}; it must be in [0, 1]")
+        angles = [a for a in (self.rotation_error, self.translation_error) if a is not None and not math.isnan(a)]
+        if len(angles) == 1 or not all(0.0 <= a <= 180.0 for a in angles):
+            raise ValueError(
+                f"pair {self.pair!r}: rotation_error is {self.rotation_error} and translation_error is "
+                f"{self.translation_error}; both must be angles in [0, 180] degrees, or neither known"
+            )
+        if self.related and not self.ok:
+            raise ValueError(f"pair {self.pair!r} failed, but is called related")
+        if self.ok:
+            if self.reason:
+                raise ValueError(f"pair {self.pair!r} is ok but has a reason of failure: {self.reason!r}")
+            if self.F is None or len(self.F) != 9 or not all(map(math.isfinite, self.F)):
+                raise ValueError(f"pair {self.pair!r} is ok: F must be nine finite numbers, but is {self.F}")
+        elif not self.reason or self.nsgd != 1.0 or self.F is not None:
+            raise ValueError(
+                f"pair {self.pair!r} failed: it needs a reason, nsgd 1 and no F, "
+                f"but has reason={self.reason!r}, nsgd={self.nsgd}, F={self.F}"
+            )
+
+
+def _expect_homography(row: PairRow) -> None:
+    """Raises ValueError for a row of a pair of a known homography that contradicts itself."""
+    error, H = row.corner_error, row.H
+    if error is None or not error >= 0.0 or not math.isnan(row.nsgd) or row.F is not None:
+        raise ValueError(
+            f"pair {row.pair!r} has a homography: it needs a corner error of at least 0, NSGD NaN and no F, but has "
+            f"corner_error={error}, nsgd={row.nsgd}, F={row.F}"
+        )
+    has_homography = H is not None and len(H) == 9 and all(map(math.isfinite, H))
+    if row.ok != has_homography or row.ok == bool(row.reason) or (not row.ok and math.isfinite(error)):
+        raise ValueError(
+            f"pair {row.pair!r} has a homography: it needs nine finite numbers of H and no reason, or a reason, no H "
+            f"and an infinite corner error, but has H={H}, reason={row.reason!r}, corner_error={error}"
+        )
+
+
+def to_table(rows: Sequence[PairRow]) -> pa.Table:
+    """The rows as a table of `PAIR_SCHEMA`; NaN becomes null."""
+    columns = {name: [_plain(getattr(row, name)) for row in rows] for name in PAIR_SCHEMA.names}
+    columns["nsgd"] = [row.nsgd for row in rows]  # NaN where there is no F
+    return pa.table(columns, schema=PAIR_SCHEMA)
+
+
+def _plain(value: object) -> object:
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+# The parts of a run's table: files that are whole or absent, merged as they grow in number
+
+
+MERGED = 16  # parts of one level that become one of the next
+MAX_LEVEL = 3  # 16^3 batches to a part at most: merging needs the memory of one
+
+
+class PartWriter:
+    """Adds parts to a folder, and merges those that it has added itself: any number of writers may do so at once.
+
+    Names sort by the time at which the first rows of a part were written; they end with a digest of the bytes.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._own: list[list[Path]] = [[] for _ in range(MAX_LEVEL)]  # by level, in the order of time
+
+    def add(self, table: pa.Table) -> None:
+        """Write rows as a new part; where parts have become many, some of them as one."""
+        self._kept(self._write(table, f"{time.time_ns():020d}"), 0)
+
+    def _kept(self, path: Path, level: int) -> None:
+        if level == MAX_LEVEL:
+            return
+        parts = self._own[level]
+        parts.append(path)
+        if len(parts) == MERGED:
+            if (merged := self._merge(parts)) is not None:
+                self._kept(merged, level + 1)
+            parts.clear()
+
+    def _merge(self, parts: Sequence[Path]) -> Path | None:
+        """One part in place of several; killed in between, rows are there twice, which readers drop.
+
+        None where one of them is damaged, for a reader to name, or the disk is full: they stay as they are.
+        """
+        try:
+            merged = self._write(pa.concat_tables([read_part(path) for path in parts]), parts[0].name.split("-")[1])
+        except (pa.ArrowException, OSError):
+            return None
+        for path in parts:
+            path.unlink(missing_ok=True)
+        return merged
+
+    def _write(self, table: pa.Table, begun: str) -> Path:
+        sink = pa.BufferOutputStream()
+        pq.write_table(table, sink)
+        data = sink.getvalue().to_pybytes()
+        # The second word keeps simultaneous writers apart.
+        path = self.folder / f"part-{begun}-{uuid.uuid4().hex[:8]}-{content_digest(data)}.parquet"
+        with replacing(path) as temporary:
+            temporary.write_bytes(data)
+        return path
+
+
+def part_files(folder: Path) -> list[Path]:
+    """The parts in the order that their first rows were written."""
+    return sorted(folder.glob("part-*.parquet"))
+
+
+def part_bytes(path: Path) -> pa.BufferReader:
+    """The bytes of a part. Raises ArrowInvalid where they are not those that were written."""
+    data = path.read_bytes()
+    if path.stem.split("-")[3:] != [content_digest(data)]:
+        raise pa.ArrowInvalid("it is not what was written there")
+    return pa.BufferReader(data)
+
+
+def read_part(path: Path) -> pa.Table:
+    """The rows of a part. Raises ArrowException or OSError where it cannot be read."""
+    with pq.ParquetFile(part_bytes(path)) as parquet:
+        return parquet.read()
+
+
+def content_digest(data: bytes) -> str:
+    """Hex digest (blake2b, 64 bits) of a part, which its name ends with."""
+    return hashlib.blake2b(data, digest_size=8).hexdigest()
+
+
+# The run folder: one evaluation's identity, its pairs' results as they come, its summary
+
+
+FORMAT = 1  # of the folder; to be raised when the schema changes, or what the identity tells
+_LISTINGS = 20  # at most, until parts are those that were listed
+
+
+class RunFolderError(ValueError):
+    """A run folder that cannot be used as asked; the message says what to do."""
+
+
+def identity_digest(config: Mapping[str, Any]) -> str:
+    """The hex digest (blake2b, 128 bits) of what defines a run's results.
+
+    config: plain dicts, lists, strings, numbers, booleans and None: the pipeline's configuration, the data set's name
+    and digest, the seed, the digests of learned files, the version. Raises TypeError for anything else.
+    """
+    return hashlib.blake2b(canonical(config).encode(), digest_size=16).hexdigest()
+
+
+@dataclasses.dataclass(frozen=True)
+class RunFolder:
+    """An evaluation on disk; made by `open` (to write) or `load` (to read)."""
+
+    path: Path
+    config: dict[str, Any]  # what defines the results, see `identity_digest`
+
+    @classmethod
+    def open(cls, path: Path | str, config: Mapping[str, Any]) -> RunFolder:
+        """Start a run in `path`, or continue it there when the folder holds a run of the same identity.
+
+        Several processes may open the same folder at once. Raises RunFolderError, touching nothing, where the folder
+        holds a run of another identity or files that are no run.
+        """
+        path = Path(path)
+        wanted: dict[str, Any] = json.loads(canonical(config))
+        if path.exists() and not path.is_dir():
+            raise RunFolderError(f"{path} is a file; run_dir must name a folder")
+        path.mkdir(parents=True, exist_ok=True)
+        foreign = sorted(entry.name for entry in path.iterdir() if entry.suffix != ".tmp")
+        if not (path / "run.json").exists():
+            if foreign:
+                raise RunFolderError(
+                    f"{path} is not empty and has no run.json, so it is no run folder (it holds {head(foreign)}); "
+                    "choose another run_dir"
+                )
+            stored = {"format": FORMAT, "identity": identity_digest(wanted), "config": wanted}
+            create(path / "run.json", json.dumps(stored, indent=2) + "\n")
+        folder = cls.load(path)
+        if folder.identity != identity_digest(wanted):
+            raise RunFolderError(
+                f"{path} holds another run; what differs (there -> now): {differences(folder.config, wanted)}. "
+                "Choose another run_dir, or delete the folder"
+            )
+        (path / "pairs").mkdir(exist_ok=True)
+        return folder
+
+    @classmethod
+    def load(cls, path: Path | str) -> RunFolder:
+        """The existing run in `path`, whatever its identity. Raises RunFolderError where there is none."""
+        file = Path(path) / "run.json"
+        try:
+            stored = json.loads(file.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise RunFolderError(f"{path} is no run folder: it has no run.json") from None
+        except ValueError as error:
+            raise RunFolderError(f"{file} is not valid JSON ({error}); delete the folder and run again") from error
+        if not isinstance(stored, dict) or not isinstance(stored.get("config"), dict):
+            raise RunFolderError(f"{file} was not written by this program: it has no 'config'")
+        if stored.get("format") != FORMAT:
+            raise RunFolderError(
+                f"{file} has format {stored.get('format')}, this version reads {FORMAT}; choose another run_dir"
+            )
+        if stored.get("identity") != identity_digest(stored["config"]):
+            raise RunFolderError(
+                f"{file} was changed: its identity is not that of its config; put it back as it was, or delete the "
+                "folder and run again"
+            )
+        return cls(Path(path), stored["config"])
+
+    @property
+    def identity(self) -> str:
+        """The digest of what defines the results."""
+        return identity_digest(self.config)
+
+    def append(self, rows: Sequence[PairRow]) -> None:
+        """Add results, as a new part that is either whole or absent; parts are merged. Safe with several processes."""
+        if not rows:
+            return
+        self._writer.add(to_table(rows))
+
+    def done(self) -> set[int]:
+        """The keys of the pairs that have a result."""
+        return {int(key) for part in self._parts(["key"]) for key in part["key"].to_numpy()}
+
+    def read(self, keys: Collection[int] | None = None, without: Collection[str] = ()) -> pa.Table:
+        """The results, a row of `PAIR_SCHEMA` per pair, without some columns: all, or those of the given keys.
+
+        Of several rows of one pair the first written counts. Raises RunFolderError naming a part that cannot be read.
+        """
+        names = [name for name in PAIR_SCHEMA.names if name not in without]
+        table = pa.concat_tables([PAIR_SCHEMA.empty_table().select(names), *self._parts(names)])
+        stored_keys = table["key"].to_numpy()
+        _, first = np.unique(stored_keys, return_index=True)
+        if keys is not None:
+            first = first[np.isin(stored_keys[first], np.fromiter(keys, np.int64, len(keys)))]
+        return table.take(np.sort(first))
+
+    def write_summary(self, summary: Mapping[str, Any], markdown: str) -> None:
+        """Write ``summary.json`` and ``summary.md``. Raises ValueError for NaN, which JSON does not have."""
+        text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
+        for name, content in (("summary.json", text), ("summary.md", markdown)):
+            with replacing(self.path / name) as temporary:
+                temporary.write_text(content, encoding="utf-8")
+
+    @functools.cached_property
+    def _writer(self) -> PartWriter:
+        return PartWriter(self.path / "pairs")
+
+    def _parts(self, columns: list[str]) -> list[pa.Table]:
+        """The parts in the order they were written; of a part's columns only those asked for."""
+        parts: list[pa.Table] | None = None
+        for _ in range(_LISTINGS):  # another process may merge parts while they are read
+            files = part_files(self.path / "pairs")
+            try:
+                parts = [self._part(file, columns) for file in files]
+            except FileNotFoundError:
+                continue
+            if part_files(self.path / "pairs") == files:
+                return parts
+        if parts is None:
+            raise RunFolderError(f"{self.path}: its parts cannot be read while others merge them; try again")
+        return parts
+
+    def _part(self, file: Path, columns: list[str]) -> pa.Table:
+        try:
+            with pq.ParquetFile(part_bytes(file)) as parquet:
+                if not parquet.schema_arrow.equals(PAIR_SCHEMA):
+                    raise pa.ArrowInvalid("its columns are not those of this version")
+                return parquet.read(columns=columns)
+        except FileNotFoundError:
+            raise
+        except (pa.ArrowException, OSError) as error:
+            raise RunFolderError(
+                f"{file} cannot be read ({error}); delete it and start the run again, which computes its pairs anew"
+            ) from error

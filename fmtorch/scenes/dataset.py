@@ -1,0 +1,234 @@
+"""How far away the points of a rendered photograph are: the scene is built anew and its rays are cast."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import threading
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from torch.utils.data import Dataset
+
+from fmtorch.core.files import cache_dir
+from fmtorch.data.pairs import ImagePair, ImageSource
+from fmtorch.data.scenes import AllPairs, Scene, ScenePairs, View
+from fmtorch.scenes.camera import Camera, calibration, fundamental, relative_pose
+from fmtorch.scenes.generate import FAMILIES, PLANS, Plan, Progress, Task, build, digest, generate_all, read
+from fmtorch.scenes.raycast import Geometry, Matrix
+from fmtorch.scenes.textures import skimage_file
+
+_SCENES = 2  # that each thread keeps, some 100 MB each: pairs of one scene follow one another
+_PHOTOGRAPHS = 48  # whose visible pieces each thread keeps, some 2 MB each
+
+
+def depth_at(task: Task, number: int, points: Matrix) -> Matrix:
+    """Depth (n,) in metres along the axis of photograph `number` of a scene, at points (n, 2) in pixels.
+
+    The depth of the plane that the nearest pixel's ray meets first, at the point itself. NaN where that ray meets
+    nothing, and outside the photograph. What moves is where it was when this photograph was taken: each shot is cast
+    against the surfaces of its own light. Of a long exposure it is the depth from the camera of the ground truth.
+    """
+    piece, inverse = _recent.visible(task, number)
+    h, w = piece.shape
+    column, row = np.round(np.nan_to_num(points, nan=-1.0)).astype(np.int64).T
+    inside = (column >= 0) & (row >= 0) & (column < w) & (row < h)
+    met = np.where(inside, piece[np.where(inside, row, 0), np.where(inside, column, 0)], -1)
+    form = inverse[met]
+    inverse_depth = form[:, 0] * points[:, 0] + form[:, 1] * points[:, 1] + form[:, 2]
+    known = (met >= 0) & (inverse_depth > 0)
+    return np.where(known, 1 / np.where(known, inverse_depth, 1.0), np.nan)
+
+
+class _Recent(threading.local):
+    """The scenes and photographs that a thread has asked for last; they go with the thread."""
+
+    def __init__(self) -> None:
+        self.scene = functools.lru_cache(maxsize=_SCENES)(build)
+        self.visible = functools.lru_cache(maxsize=_PHOTOGRAPHS)(self._visible)
+
+    def _visible(self, task: Task, number: int) -> tuple[NDArray[np.int32], Matrix]:
+        """Per pixel (h, w) the piece that is met (-1: none), and of each piece (n, 3) the form of its 1 / depth."""
+        scene = self.scene(task)
+        shot = scene.shots[number]
+        hits = Geometry(scene.surfaces[shot.light]).look(shot.camera)
+        return hits.piece, hits.inverse[:, 2].copy()
+
+
+_recent = _Recent()
+
+
+# `RenderedPairs`: the embedded data set, drawn on first use from known cameras
+
+
+class RenderedPairs(Dataset[ImagePair]):
+    """Image pairs of textured 3-D scenes with exact ground truth, in four families after the paper's four sets.
+
+    split: "test" or "train"; they share no scene and no texture. size: "small" (about 20 pairs a family) or "full".
+    families: some of "indoor", "driving", "orbit", "collection"; all four by default. seed: another seed, other scenes.
+    root: the folder that keeps what was drawn, by default ``rendered`` in the cache folder.
+    progress: called with (scenes done, scenes in all). workers: processes that draw, by default one a core.
+    plan: replaces the amounts of `size`, for tests.
+
+    A pair is kept if more than 20 SIFT matches (ratio 0.8) lie within 1 px of the true epipolar lines in both images,
+    which is the paper's rule. Raises ValueError for an unknown split, size or family.
+    """
+
+    name = "rendered"
+
+    def __init__(
+        self,
+        split: str = "test",
+        size: str = "small",
+        families: Sequence[str] | None = None,
+        seed: int = 0,
+        root: str | Path | None = None,
+        *,
+        progress: Progress | None = None,
+        workers: int | None = None,
+        plan: Plan | None = None,
+    ) -> None:
+        if (size, split) not in PLANS:
+            raise ValueError(f"no split {split!r} in size {size!r}; there are test and train, in small and full")
+        chosen = list(FAMILIES) if families is None else list(families)
+        unknown = [family for family in chosen if family not in FAMILIES]
+        if unknown or not chosen:
+            raise ValueError(f"unknown families {unknown}; there are {', '.join(FAMILIES)}")
+        plan = plan or PLANS[size, split]
+        home = Path(root) if root is not None else cache_dir() / "rendered"
+        digests = {family: digest(family, split, seed, plan) for family in chosen}
+        self.digest = hashlib.sha256(" ".join(digests.values()).encode()).hexdigest()
+        folders = {family: home / f"{family}-{split}-{size}-{digests[family][:16]}" for family in chosen}
+        # Scenes of all families in turn, so that the first pictures of each are there early; the last of `FAMILIES`,
+        # which takes longest, comes first, so that no worker is long alone at the end.
+        tasks = [Task(family, split, n, seed, plan) for n in range(plan.scenes) for family in reversed(chosen)]
+        for folder in folders.values():
+            folder.mkdir(parents=True, exist_ok=True)
+        generate_all([(task, folders[task.family]) for task in tasks], workers, progress)
+        self._pairs: list[tuple[Task, int, int]] = []
+        self._views: dict[str, list[tuple[Path, Camera]]] = {}
+        self._tasks = {task.name: task for task in tasks}
+        for task in sorted(tasks, key=lambda task: chosen.index(task.family)):
+            self._views[task.name], pairs = read(folders[task.family] / task.name)
+            self._pairs += [(task, i, j) for i, j in pairs]
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def __getitem__(self, index: int) -> ImagePair:
+        task, i, j = self._pairs[index]
+        (path0, camera0), (path1, camera1) = self._views[task.name][i], self._views[task.name][j]
+        R, t = relative_pose(camera0, camera1)
+        return ImagePair(
+            identity=f"{self.name}/{task.name}/{i}-{j}",
+            family=task.family,
+            scene=task.name,
+            image0=ImageSource(f"{task.name}/{i}", path0),
+            image1=ImageSource(f"{task.name}/{j}", path1),
+            F=fundamental(camera0, camera1),
+            K0=camera0.K,
+            K1=camera1.K,
+            R=R,
+            t=t,
+        )
+
+    def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Depth (n,) in metres along the optical axis at points (n, 2) of an image; NaN for the sky and outside.
+
+        The scene is built anew and its rays are cast, as when it was drawn; the last few images are remembered.
+        Raises KeyError for an image of another data set.
+        """
+        scene, _, number = image.identity.rpartition("/")
+        return depth_at(self._tasks[scene], int(number), points)
+
+    def scene_pairs(self) -> RenderedScenePairs:
+        """All pairs of the photographs of each scene, as candidates to select from."""
+        scenes = []
+        for name, views in self._views.items():
+            drawn = [
+                View(ImageSource(f"{name}/{i}", path, camera.size), camera.K, camera.R, camera.t, f"{name}/{path.name}")
+                for i, (path, camera) in enumerate(views)
+            ]
+            scenes.append(Scene(name, self._tasks[name].family, drawn, AllPairs(len(drawn))))
+        return RenderedScenePairs(self, scenes)
+
+    def __iter__(self) -> Iterator[ImagePair]:
+        return (self[index] for index in range(len(self)))
+
+
+class RenderedScenePairs(ScenePairs):
+    """All pairs of the photographs of rendered scenes; drawn: these scenes as a data set, which knows the depth."""
+
+    def __init__(self, drawn: RenderedPairs, scenes: Sequence[Scene]) -> None:
+        super().__init__("rendered", scenes, (), (drawn.digest,))
+        self.drawn = drawn
+
+    def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """As `RenderedPairs.depth`."""
+        return self.drawn.depth(image, points)
+
+
+# A real pair with measured disparity, the Middlebury motorcycle that the scikit-image package carries
+
+
+_FILES = ("motorcycle_left.png", "motorcycle_right.png", "motorcycle_disp.npz")
+# Calibration of the pictures as shipped (a quarter of the published resolution); see skimage.data.stereo_motorcycle.
+_FOCAL, _CENTRE, _SHIFT, _BASELINE, _SIZE = 994.978, (311.193, 254.877), 31.086, 0.193001, (500, 741)
+
+
+class StereoPair(Dataset[ImagePair]):
+    """One rectified pair with dense ground truth: a point (x, y) on the left is (x - disparity, y) on the right.
+
+    The three files lie inside scikit-image's wheel, so that nothing is downloaded; FileNotFoundError names the one
+    that is absent. root: another folder that holds them.
+    Source: Scharstein et al., High-resolution stereo datasets with subpixel-accurate ground truth, GCPR 2014.
+    """
+
+    name = "stereo"
+
+    def __init__(self, root: str | Path | None = None) -> None:
+        self._paths = [skimage_file(name) if root is None else Path(root) / name for name in _FILES]
+        for path in self._paths:
+            if not path.is_file():
+                raise FileNotFoundError(f"{path} is absent; the stereo pair needs {', '.join(_FILES)}")
+        self.digest = hashlib.sha256(b"".join(path.read_bytes() for path in self._paths)).hexdigest()
+        x, y = _CENTRE
+        left = Camera(calibration(_FOCAL, _SIZE, (x, y)), np.eye(3), np.zeros(3), _SIZE)
+        right = Camera(calibration(_FOCAL, _SIZE, (x + _SHIFT, y)), np.eye(3), np.array([-_BASELINE, 0.0, 0.0]), _SIZE)
+        R, t = relative_pose(left, right)
+        self._pair = ImagePair(
+            identity=f"{self.name}/motorcycle/left-right",
+            family=self.name,
+            scene="motorcycle",
+            image0=ImageSource("motorcycle/left", self._paths[0]),
+            image1=ImageSource("motorcycle/right", self._paths[1]),
+            F=fundamental(left, right),
+            K0=left.K,
+            K1=right.K,
+            R=R,
+            t=t,
+        )
+
+    def __len__(self) -> int:
+        return 1
+
+    def __getitem__(self, index: int) -> ImagePair:
+        if index not in (0, -1):
+            raise IndexError(f"pair {index} of a data set of one pair")
+        return self._pair
+
+    def __iter__(self) -> Iterator[ImagePair]:
+        yield self._pair
+
+    def matches(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Points (n, 2) on the left and where they are on the right, for every pixel with a measured disparity."""
+        with np.load(self._paths[2]) as file:
+            disparity = file["arr_0"].astype(np.float64)
+        known = np.isfinite(disparity)
+        y, x = np.nonzero(known)
+        left = np.stack([x, y], -1).astype(np.float64)
+        right = left - np.stack([disparity[known], np.zeros(len(left))], -1)
+        inside = (right[:, 0] >= 0) & (right[:, 0] <= disparity.shape[1] - 1)
+        return left[inside], right[inside]

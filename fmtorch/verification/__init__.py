@@ -1,0 +1,1 @@
+"""Two-view geometries of matches that others made."""

@@ -1,0 +1,334 @@
+"""Pairs of a COLMAP database as correspondences."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import uuid
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, Protocol, cast, runtime_checkable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from fmtorch.core.files import replacing
+from fmtorch.core.settings import claim
+from fmtorch.core.stages import Estimator
+from fmtorch.core.types import Correspondences, collate, pair_key
+from fmtorch.io.colmap import DatabaseImage
+from fmtorch.io.match_store import Kind, PairGeometry
+from fmtorch.jobs.execution import Execution, Shard
+from fmtorch.jobs.pool import WorkerPool
+from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner
+from fmtorch.pipeline.two_images import pair_geometries
+from fmtorch.two_view.arguments import UNKNOWN
+from fmtorch.two_view.estimation import estimated_by
+from fmtorch.two_view.pair_type import classify
+
+Cameras = Literal["stored", "shared", "unknown"]
+"""What is taken for known: the cameras of the database, that both images have one focal length, or nothing."""
+
+
+class DatabasePair(NamedTuple):
+    """A pair of images with its matches, keypoints (n, 2) of both."""
+
+    image0: DatabaseImage
+    image1: DatabaseImage
+    matches: NDArray[np.int64]
+
+
+def as_correspondences(pair: DatabasePair, cameras: Cameras) -> Correspondences:
+    """The pair as a batch of one, with what is known of its cameras; of pinholes where these are those stored.
+
+    Without image sizes nothing is asked of cameras. Raises ValueError where a stored camera is none that there can be,
+    or where the size of one image alone is known.
+    """
+    images, stored = (pair.image0, pair.image1), cameras == "stored"
+    problem = next((image.problem for image in images if image.problem), "") if stored else ""
+    if problem:
+        raise ValueError(problem)
+    fields: dict[str, Any] = {}
+    for i, image in enumerate(images):
+        points = (image.pinhole if stored else image.points)[pair.matches[:, i]]
+        fields[f"x{i}"] = torch.from_numpy(points)[None]
+        if image.size is not None:
+            fields[f"size{i}"] = torch.tensor([image.size])
+        if stored and image.K is not None:
+            fields[f"K{i}"] = torch.from_numpy(image.K)[None]
+    mask = torch.isfinite(fields["x0"]).all(-1) & torch.isfinite(fields["x1"]).all(-1)
+    if any(image.size is not None for image in images):
+        focal = [(1.0, image.deviation) for image in images] if stored else [UNKNOWN, UNKNOWN]
+        fields["focal"] = torch.tensor([focal], dtype=torch.float64)
+        fields["shared_focal"] = torch.tensor([_shared(*images, cameras)])
+    elif cameras == "shared":
+        raise ValueError("cameras=shared needs the image sizes: size0 and size1, or K0 and K1")
+    key = torch.tensor([pair_key(f"{images[0].name} {images[1].name}")])
+    return Correspondences(mask=mask, key=key, **fields)
+
+
+def _shared(image0: DatabaseImage, image1: DatabaseImage, cameras: Cameras) -> bool:
+    """Whether both images are known to have one focal length, which is not known exactly."""
+    return cameras == "shared" or (
+        cameras == "stored" and image0.camera_id == image1.camera_id and image0.deviation > 0
+    )
+
+
+# Two-view geometries of a verification that is under way: a file a batch in one folder, until all are there
+
+
+SETTINGS = "settings.json"
+_MATRICES = ("F", "E", "H", "R", "t")
+
+_GeometryIds = tuple[Any, Any]
+
+
+class GeometryParts:
+    """The folder, which any number of processes and shards of the same settings may write to.
+
+    done: the pairs that it has. Raises ValueError where it holds geometries of other settings.
+    """
+
+    def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
+        self.folder = folder
+        claim(folder / SETTINGS, settings, "geometries", f"give the same, or delete {folder}")
+        self.done: set[_GeometryIds] = set()
+        for path in self._files():
+            with np.load(path) as part:
+                self.done.update(map(_ids, part["pairs"].tolist()))
+
+    def write(self, geometries: Iterable[tuple[_GeometryIds, PairGeometry]]) -> None:
+        """Keep geometries of pairs, all of them or none."""
+        arrays: dict[str, Any] = {}
+        pairs, kinds = [], []
+        for i, (ids, geometry) in enumerate(geometries):
+            pairs.append(ids)
+            kinds.append(geometry.kind)
+            values = {name: getattr(geometry, name) for name in ("inliers", *_MATRICES)}
+            arrays |= {f"{name}-{i}": value for name, value in values.items() if value is not None}
+        with replacing(self.folder / f"{uuid.uuid4().hex}.npz") as temporary, temporary.open("wb") as file:
+            np.savez(file, pairs=np.array(pairs), kinds=np.array(kinds), **arrays)
+        self.done.update(pairs)
+
+    def read(self) -> Iterator[tuple[_GeometryIds, PairGeometry]]:
+        """The geometries, each pair's once."""
+        seen: set[_GeometryIds] = set()
+        for path in self._files():
+            with np.load(path) as part:
+                for i, (pair, kind) in enumerate(zip(part["pairs"].tolist(), part["kinds"].tolist(), strict=True)):
+                    if (ids := _ids(pair)) not in seen:
+                        seen.add(ids)
+                        yield ids, _geometry(part, i, str(kind))
+
+    def remove(self) -> None:
+        """Remove the folder."""
+        shutil.rmtree(self.folder)
+
+    def _files(self) -> list[Path]:
+        return sorted(self.folder.glob("*.npz"))
+
+
+def _ids(ids: list[Any]) -> _GeometryIds:
+    first, second = ids
+    return first, second
+
+
+def _geometry(part: Any, i: int, kind: str) -> PairGeometry:
+    matrices = (part.get(f"{name}-{i}") for name in _MATRICES)
+    return PairGeometry(cast(Kind, kind), part[f"inliers-{i}"], *matrices)
+
+
+# Pairs of stored matches, estimated batch by batch; their geometries are kept until all are there
+
+
+BATCH = 64  # pairs that are read, and kept, at a time
+PRELOADED = ("fmtorch.verification.run",)  # by the process that workers are forked of
+
+_PairIds = tuple[Any, Any]
+
+
+@runtime_checkable
+class MatchStore(Protocol):
+    """Matches of pairs of images, and a place for their geometries; see `MatchDatabase`."""
+
+    def identity(self) -> dict[str, Any]:
+        """By what the matches are known again, as plain values."""
+
+    def pairs(self) -> list[_PairIds]:
+        """The pairs of images that have matches."""
+
+    def image(self, image_id: Any) -> DatabaseImage:
+        """An image with its keypoints."""
+
+    def matches(self, pair: _PairIds) -> NDArray[np.int64]:
+        """The matches of a pair, keypoints (n, 2) of its images."""
+
+    def has_geometry(self, pair: _PairIds) -> bool:
+        """Whether a pair has a geometry, of a failure too."""
+
+    def write(self, geometries: Iterable[tuple[_PairIds, PairGeometry]]) -> None:
+        """Write the geometries of all pairs, all of them or none."""
+
+    def name(self, image_id: Any) -> str:
+        """The name of an image."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Verification:
+    """What `verify` did with a database.
+
+    path: of the database with the geometries; of a shard, the folder that keeps them. pairs: that have matches. kept:
+    of these, that had a geometry before, or were finished by an interrupted run or a shard. configurations: how many
+    of each of COLMAP's kinds were written. problems: why pairs could not be read, a line each; the next run tries them
+    again. seconds: of the whole.
+    """
+
+    path: Path
+    pairs: int
+    kept: int
+    configurations: Mapping[str, int]
+    problems: tuple[str, ...]
+    seconds: float
+
+    @property
+    def verified(self) -> int:
+        """How many pairs were given a geometry: all but the degenerate ones."""
+        return sum(count for kind, count in self.configurations.items() if kind != "degenerate")
+
+
+class Estimation(NamedTuple):
+    """What estimates batches of pairs."""
+
+    estimator: Estimator
+    cameras: Cameras
+    seed: int
+
+
+class Batch(NamedTuple):
+    """Pairs that were read; the problems of those that could not be, or not be estimated."""
+
+    ids: list[_PairIds]
+    pairs: list[DatabasePair]
+    problems: list[tuple[_PairIds, str]]
+
+
+class Geometries(NamedTuple):
+    """The geometries of a batch's pairs; the problems of the others."""
+
+    ids: list[_PairIds]
+    geometries: list[PairGeometry]
+    problems: list[tuple[_PairIds, str]]
+
+
+def estimate_batch(how: Estimation, batch: Batch) -> Geometries:
+    """What a worker does."""
+    ids, pairs, given, problems = [], [], [], list[tuple[_PairIds, str]]()
+    for own, pair in zip(batch.ids, batch.pairs, strict=True):
+        try:
+            given.append(as_correspondences(pair, how.cameras))
+            ids.append(own)
+            pairs.append(pair)
+        except Exception as error:  # one pair does not end the work on the others
+            problems.append((own, _first_line(error)))
+    if not ids:
+        return Geometries([], [], problems)
+    results: dict[int, PairGeometry] = {}
+    for alike in _alike(given):
+        c = collate([given[i] for i in alike])
+        estimate = estimated_by(how.estimator, c, how.seed)
+        configuration = classify(c, estimate, focal_deviation=0, seed=how.seed)
+        of_these = pair_geometries([pairs[i].matches for i in alike], c, estimate, configuration)
+        results |= zip(alike, of_these, strict=True)
+    return Geometries(ids, [results[i] for i in range(len(ids))], problems)
+
+
+def _alike(given: Sequence[Correspondences]) -> list[list[int]]:
+    """Indices of pairs of which the same is known: in one batch a pair would lose what another lacks."""
+    groups: dict[tuple[bool, ...], list[int]] = {}
+    for i, c in enumerate(given):
+        known = tuple(getattr(c, field.name) is not None for field in dataclasses.fields(c))
+        groups.setdefault(known, []).append(i)
+    return list(groups.values())
+
+
+def divided(batch: Batch) -> list[Batch]:
+    """The pairs of a batch in batches of their own."""
+    return [Batch([ids], [pair], []) for ids, pair in zip(batch.ids, batch.pairs, strict=True)]
+
+
+class VerificationRun:
+    """The pairs of one store of matches.
+
+    parts: keeps their geometries. shard: only these pairs, which are kept there; None: all, and `write` moves what is
+    kept into the store. force: estimate pairs that have a geometry in the store, too.
+    """
+
+    def __init__(
+        self, store: MatchStore, parts: GeometryParts, shard: Shard | None = None, force: bool = False
+    ) -> None:
+        self.store, self.parts = store, parts
+        pairs = store.pairs()
+        self.pairs = pairs if shard is None else list(shard.of(pairs))
+        self.todo = [p for p in self.pairs if p not in parts.done and (force or not store.has_geometry(p))]
+        self.configurations: Counter[str] = Counter()
+        self.problems: list[str] = []
+
+    def each_batch(
+        self, make: Callable[[], Estimation], execution: Execution, report: Callable[[int, int], None] | None
+    ) -> None:
+        """Estimate and keep the pairs that are not done, batch by batch; `make` is pickled for workers elsewhere."""
+        todo = self.todo
+        if report is not None and todo:
+            report(0, len(todo))
+        source: Source[Estimation] = Local(make()) if execution.shared else Factory(make)
+        batches = (self._read(todo[start : start + BATCH]) for start in range(0, len(todo), BATCH))
+        done = 0
+        with WorkerPool(execution, PRELOADED) as pool:
+            for batch in TaskRunner(pool, source, estimate_batch, self._keep, self._give_up, divided).each(batches):
+                done += len(batch.ids) + len(batch.problems)
+                if report is not None:
+                    report(done, len(todo))
+
+    def write(self) -> None:
+        """Write what is kept into the store."""
+        self.configurations.clear()
+        self.store.write(self._counted(self.parts.read()))
+
+    def result(self, path: Path, seconds: float) -> Verification:
+        """The summary."""
+        kept, counts = len(self.pairs) - len(self.todo), dict(self.configurations)
+        return Verification(path, len(self.pairs), kept, counts, tuple(self.problems), seconds)
+
+    def _counted(self, geometries: Iterable[tuple[_PairIds, PairGeometry]]) -> Iterator[tuple[_PairIds, PairGeometry]]:
+        for ids, geometry in geometries:
+            self.configurations[geometry.kind] += 1
+            yield ids, geometry
+
+    def _read(self, pairs: Sequence[_PairIds]) -> Batch:
+        batch = Batch([], [], [])
+        for pair in pairs:
+            try:
+                matches = self.store.matches(pair)
+                batch.pairs.append(DatabasePair(self.store.image(pair[0]), self.store.image(pair[1]), matches))
+                batch.ids.append(pair)
+            except Exception as error:  # one pair does not end the work on the others
+                batch.problems.append((pair, _first_line(error)))
+        return batch
+
+    def _keep(self, batch: Batch, result: Geometries) -> None:
+        self._note([*batch.problems, *result.problems])
+        if result.ids:
+            self.parts.write(self._counted(zip(result.ids, result.geometries, strict=True)))
+
+    def _give_up(self, batch: Batch, reason: str) -> None:
+        self._note([*batch.problems, *((ids, reason) for ids in batch.ids)])
+
+    def _note(self, problems: Iterable[tuple[_PairIds, str]]) -> None:
+        for pair, problem in problems:
+            self.problems.append(f"{', '.join(self.store.name(image) for image in pair)}: {problem}")
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [""])[0]

@@ -1,0 +1,458 @@
+"""Compiled functions: made when first called, kept by version, refused where they do not fit, dispensable."""
+
+from __future__ import annotations
+
+import copy
+import importlib.util
+import os
+import pickle
+import subprocess
+import sys
+import threading
+import time
+import types
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fmtorch.jit import cache as files
+from fmtorch.jit import kernel as messages
+from fmtorch.jit import kernel as switch
+from fmtorch.jit import process, together
+from fmtorch.jit.kernel import Inner, Kernel, inner, kernel
+from fmtorch.jit.lanes import fused
+from tests.processes import run_command
+
+SOURCE = """
+import numpy as np
+from fmtorch.jit.kernel import F4x1, F4x2
+from fmtorch.jit.kernel import inner, kernel
+
+@inner
+def square(x):
+    return x * x
+
+@kernel
+def scaled_squares(x: F4x1, scale: float, out: F4x1) -> None:
+    for i in range(len(x)):
+        out[i] = np.float32(square(x[i]) * scale)
+
+@kernel
+def rows(x: F4x2, out: F4x2):
+    for i in range(len(x)):
+        scaled_squares(x[i], 2.0, out[i])
+"""
+WAITING = """
+import numpy as np
+from fmtorch.jit.kernel import I8x1
+from fmtorch.jit.kernel import kernel
+
+@kernel(holds_gil={holds_gil})
+def answered(flags: I8x1, rounds: int):
+    flags[0] = 1
+    for _ in range(rounds):
+        if flags[1]:
+            return True
+        np.empty(1)  # as far as the compiler knows, this may change the flags
+    return False
+"""
+REPOSITORY = Path(__file__).resolve().parents[2]
+numba = pytest.importorskip("numba", reason="numba is not installed")
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    monkeypatch.setenv("FMTORCH_CACHE", str(tmp_path / "cache"))
+    monkeypatch.delenv(switch.SWITCH, raising=False)
+    monkeypatch.setitem(messages._state, "announced", False)
+    files.folder.cache_clear()
+    yield tmp_path / "cache" / "kernels"
+    files.folder.cache_clear()
+
+
+@pytest.fixture
+def module(tmp_path: Path) -> types.ModuleType:
+    return load(tmp_path)
+
+
+def load(folder: Path, source: str = SOURCE) -> types.ModuleType:
+    """A module of kernels, as in a process that has called none of them."""
+    path = folder / "some_kernels.py"
+    path.write_text(source)
+    spec = importlib.util.spec_from_file_location("some_kernels", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["some_kernels"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def result(module: types.ModuleType) -> list[list[float]]:
+    x = np.array([[1, 2], [3, 4]], np.float32)
+    out = np.zeros_like(x)
+    module.rows(x, out)
+    return out.tolist()
+
+
+EXPECTED = [[2, 8], [18, 32]]
+
+
+def test_a_kernel_calls_kernels_and_inner_functions(module: types.ModuleType) -> None:
+    assert result(module) == EXPECTED
+    assert module.square(3) == 9  # an inner function is also a plain one
+
+
+RETURNING = """
+from fmtorch.jit.kernel import kernel
+
+@kernel
+def half(x: float){annotation}:
+    return x / 2
+
+@kernel
+def quarter(x: float, sure: bool) -> float:
+    return half(half(x)) if sure else x
+"""
+
+
+def test_kernels_compiled_in_any_order_and_loaded_call_one_another(tmp_path: Path, cache: Path) -> None:
+    module = load(tmp_path, RETURNING.format(annotation=" -> float"))
+    module.quarter.compiled_alone()
+    assert not module.quarter.ready
+    assert not module.half.kept
+    assert module.quarter(8.0, True) == 2
+    assert module.half.kept
+    (folder,) = cache.iterdir()
+    for path in folder.glob("*half-*.bin"):
+        path.unlink()
+    again = load(tmp_path, RETURNING.format(annotation=" -> float"))
+    assert again.quarter(8.0, True) == 2
+    assert again.half.kept
+
+
+@pytest.mark.parametrize("annotation", ["", " -> int", " -> None", " -> tuple"])
+def test_what_a_kernel_returns_to_kernels_must_be_annotated(tmp_path: Path, annotation: str) -> None:
+    module = load(tmp_path, RETURNING.format(annotation=annotation))
+    with pytest.raises((TypeError, numba.core.errors.TypingError), match=r"half|none"):
+        module.quarter(8.0, True)
+
+
+def test_what_does_not_fit_the_signature_is_refused(module: types.ModuleType) -> None:
+    x = np.ones((2, 2), np.float32)
+    module.scaled_squares(x[0], 2, x[1])  # an integer for a float will do
+    for wrong in (x.astype(np.float64), np.asfortranarray(x), x[0], x[:, ::2]):
+        with pytest.raises(TypeError):
+            module.rows(wrong, x)
+    assert len(module.scaled_squares.compiled().signatures) == 1
+
+
+def test_a_signature_of_one_argument(tmp_path: Path) -> None:
+    source = """
+from fmtorch.jit.kernel import F8x2
+from fmtorch.jit.kernel import kernel
+
+@kernel
+def first(x: F8x2):
+    return x[0, 0]
+"""
+    assert load(tmp_path, source).first(np.full((1, 1), 2.0)) == 2
+
+
+def test_what_was_compiled_is_kept_and_told_once(
+    tmp_path: Path, cache: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert result(load(tmp_path)) == EXPECTED
+    messages = capsys.readouterr().err
+    assert [line.split(" for ")[0] for line in messages.splitlines()] == ["compiling rows and what else is missing"]
+    files = {path: path.stat().st_ino for path in cache.rglob("*.bin")}
+    assert len(files) == 2
+    assert result(load(tmp_path)) == EXPECTED
+    assert capsys.readouterr().err == ""
+    assert {path: path.stat().st_ino for path in cache.rglob("*.bin")} == files
+
+
+def test_a_log_gets_one_line_and_a_terminal_a_passing_one(
+    module: types.ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for each in (module.rows, module.scaled_squares):
+        each.compiled()
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    messages.begun("rows", "for this machine", "3 of 40: ")
+    messages.ended()
+    assert capsys.readouterr().err == "\r\x1b[K3 of 40: compiling rows for this machine\r\x1b[K"
+    monkeypatch.setenv(messages.QUIET, "1")
+    messages.begun("rows", "for this machine")
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("importable", [True, False])
+def test_two_processes_compile_together(
+    module: types.ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cache: Path, importable: bool
+) -> None:
+    """What the other process cannot compile is compiled here."""
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path) if importable else "")
+    monkeypatch.setattr(process, "cores", lambda: 2)
+    both = [module.rows, module.scaled_squares]
+    assert not any(each.ready or each.kept for each in both)
+    together.compile_together(both)
+    assert all(each.ready and each.kept for each in both)
+    assert len(list(cache.rglob("*.bin"))) == 2
+    assert result(module) == EXPECTED
+    monkeypatch.setattr(together, "_helper", None)  # is not asked again
+    together.compile_together(both)
+
+
+def test_the_other_process_compiles_what_it_is_told(module: types.ModuleType, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "fmtorch.jit.process", "fmtorch.jit.together"]
+    path = os.pathsep.join([str(REPOSITORY), str(tmp_path)])
+    done = subprocess.run(
+        command, input="some_kernels rows 1 of 1: \n", capture_output=True, text=True, check=True,
+        env={**os.environ, "PYTHONPATH": path},
+    )  # fmt: skip
+    assert done.stdout.split() == ["ready", "rows"]
+    assert "1 of 1: compiling rows" in done.stderr
+    assert module.rows.kept
+
+
+def test_the_folder_depends_on_what_decides_the_machine_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = files.folder()
+    monkeypatch.setattr(numba, "__version__", "9.9.9")
+    files.folder.cache_clear()
+    assert files.folder() != before
+
+
+def test_fused_arithmetic_rounds_once_compiled_and_not(tmp_path: Path) -> None:
+    source = """
+from fmtorch.jit.kernel import F4x1
+from fmtorch.jit.lanes import fused
+from fmtorch.jit.kernel import kernel
+
+@kernel
+def all_fused(a: F4x1, b: F4x1, c: F4x1, out: F4x1):
+    for i in range(len(a)):
+        out[i] = fused(a[i], b[i], c[i])
+"""
+    a, b, c = np.random.default_rng(0).normal(0, 1, (3, 2000)).astype(np.float32)
+    out = np.empty_like(a)
+    load(tmp_path, source).all_fused(a, b, c, out)
+    np.testing.assert_array_equal(out, [fused(*values) for values in zip(a, b, c, strict=True)])
+    assert (out != a + b * c).any()
+
+
+def test_an_edited_kernel_outside_the_package_is_compiled_anew(tmp_path: Path) -> None:
+    assert result(load(tmp_path)) == EXPECTED
+    assert result(load(tmp_path, SOURCE.replace("x * x", "x * x * x"))) == [[2, 16], [54, 128]]
+
+
+def test_kernels_that_a_function_makes_have_names_of_their_own() -> None:
+    def multiplier(by: float, **options: str) -> Kernel[..., float]:
+        @kernel(**options)
+        def scaled(x: float) -> float:
+            return x * by
+
+        return scaled
+
+    assert multiplier(2.0, name="doubled")(1.0) == 2
+    assert multiplier(3.0, name="tripled")(1.0) == 3
+    with pytest.raises(ValueError, match=r"two kernels are called .*doubled: make each with a name="):
+        multiplier(4.0, name="doubled")
+
+
+def test_a_damaged_file_is_compiled_anew(tmp_path: Path, cache: Path) -> None:
+    result(load(tmp_path))
+    for path in cache.rglob("*.bin"):
+        path.write_bytes(path.read_bytes()[:-7])
+    with pytest.warns(UserWarning, match="is damaged"):
+        assert result(load(tmp_path)) == EXPECTED
+    assert result(load(tmp_path)) == EXPECTED
+
+
+def test_without_a_writable_cache_kernels_are_compiled_and_say_so(
+    module: types.ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("FMTORCH_CACHE", str(tmp_path / "file"))
+    with pytest.warns(UserWarning, match="compiled kernels are not kept"):
+        assert result(module) == EXPECTED
+    assert "compiling rows and what else is missing for this process" in capsys.readouterr().err
+
+
+def test_a_cache_that_can_only_be_read_is_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    result(load(tmp_path))
+    capsys.readouterr()
+    files.folder.cache_clear()
+
+    def refused(*args: object, **options: object) -> int:
+        raise PermissionError("read-only file system")
+
+    monkeypatch.setattr(Path, "write_text", refused)
+    monkeypatch.setattr(Path, "write_bytes", refused)
+    assert files.folder() is not None
+    monkeypatch.undo()
+    monkeypatch.setenv("FMTORCH_CACHE", str(tmp_path / "cache"))
+    assert result(load(tmp_path)) == EXPECTED
+    assert capsys.readouterr().err == ""
+
+
+def test_a_full_disk_costs_the_file_and_not_the_result(
+    module: types.ModuleType, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*args: object) -> int:
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", refused)
+    with pytest.warns(UserWarning, match="no space left"):
+        assert result(module) == EXPECTED
+    assert not list(cache.rglob("*.bin*"))
+
+
+def test_folders_long_unused_are_removed(cache: Path) -> None:
+    for name, days in (("old", 31), ("recent", 29)):
+        (cache / name).mkdir(parents=True)
+        (cache / name / files.ABOUT).write_text("{}")
+        then = time.time() - days * 24 * 3600
+        os.utime(cache / name / files.ABOUT, (then, then))
+    (cache / "of somebody else").mkdir()
+    now = files.folder()
+    assert now is not None
+    assert {path.name for path in cache.iterdir()} == {"recent", "of somebody else", now.name}
+
+
+def test_threads_compile_it_once_and_run_at_the_same_time(
+    module: types.ModuleType, capsys: pytest.CaptureFixture[str]
+) -> None:
+    results: list[list[list[float]]] = []
+    threads = [threading.Thread(target=lambda: results.append(result(module))) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert results == [EXPECTED] * 4
+    assert capsys.readouterr().err.count("compiling rows") == 1
+
+
+@pytest.mark.parametrize("holds_gil", [False, True])
+def test_a_kernel_may_keep_the_lock_that_others_leave_to_other_threads(tmp_path: Path, holds_gil: bool) -> None:
+    flags = np.zeros(2, np.int64)  # the kernel runs; a thread has seen that
+    answered = load(tmp_path, WAITING.format(holds_gil=holds_gil)).answered
+    answered(flags, 0)
+    flags[:] = 0
+
+    def answer() -> None:
+        while not flags[0]:
+            time.sleep(1e-4)
+        flags[1] = 1
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    assert answered(flags, 10**5 if holds_gil else 10**9) == (not holds_gil)
+    thread.join()
+
+
+def test_several_processes_compile_each_kernel_once(tmp_path: Path, cache: Path) -> None:
+    (tmp_path / "some_kernels.py").write_text(SOURCE)
+    code = (
+        "import numpy as np, some_kernels as k\n"
+        "from fmtorch.jit.cache import KernelFile\n"
+        "compiled, plain = [], KernelFile.save_overload\n"
+        "KernelFile.save_overload = lambda *arguments: (compiled.append(1), plain(*arguments))\n"
+        "x = np.ones((1, 3), 'f4'); k.rows(x, x); print(len(compiled), x.tolist())"
+    )
+    path = os.pathsep.join([str(REPOSITORY), str(tmp_path)])
+    environment = {**os.environ, "PYTHONPATH": path}
+    processes = [
+        subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
+        for _ in range(3)
+    ]
+    outputs = [process.communicate(timeout=300)[0].strip().partition(" ") for process in processes]
+    assert [values for _, _, values in outputs] == ["[[2.0, 2.0, 2.0]]"] * 3
+    assert sum(int(compiled) for compiled, _, _ in outputs) == 2  # rows, and scaled_squares, which it calls
+    assert not list(cache.rglob("*.lock"))
+
+
+def test_several_processes_share_the_folder(tmp_path: Path, cache: Path) -> None:
+    (tmp_path / "some_kernels.py").write_text(SOURCE)
+    code = "import numpy as np, some_kernels as k; x = np.ones((1, 3), 'f4'); k.rows(x, x); print(x.tolist())"
+    path = os.pathsep.join([str(REPOSITORY), str(tmp_path)])
+    env = {**os.environ, "PYTHONPATH": path}
+    processes = [
+        subprocess.Popen([sys.executable, "-c", code], env=env, stdout=subprocess.PIPE, text=True) for _ in range(2)
+    ]
+    assert [process.communicate(timeout=300)[0].strip() for process in processes] == ["[[2.0, 2.0, 2.0]]"] * 2
+    assert len(list(cache.rglob("*.bin"))) == 2
+    assert not list(cache.rglob("*.tmp"))
+
+
+def test_numba_is_not_imported_before_a_kernel_is_called() -> None:
+    code = "import sys, fmtorch.jit.kernel, fmtorch; sys.exit('numba' in sys.modules or 'llvmlite' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": str(REPOSITORY)}, check=True)
+
+
+def test_without_numba_a_warning_tells_it_once(
+    monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
+) -> None:
+    monkeypatch.setitem(sys.modules, "numba", None)
+    switch.numba_version.cache_clear()
+    try:
+        assert not switch.available()
+        assert not switch.available()
+        assert switch.identity() == "off"
+        assert [str(w.message)[:13] for w in recwarn] == ["without numba"]
+    finally:
+        switch.numba_version.cache_clear()
+
+
+def test_kernels_can_be_switched_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert switch.available()
+    assert switch.identity() == f"numba {numba.__version__}"
+    monkeypatch.setenv(switch.SWITCH, "off")
+    assert not switch.available()
+    assert switch.identity() == "off"
+    monkeypatch.setenv(switch.SWITCH, "no")
+    with pytest.raises(ValueError, match="FMTORCH_KERNELS=no; it must be on or off"):
+        switch.available()
+
+
+def test_they_are_pickled_and_copied_by_name(module: types.ModuleType) -> None:
+    for function in (module.rows, module.square):
+        assert pickle.loads(pickle.dumps(function)) is function
+        assert copy.deepcopy(function) is function
+
+
+def test_decorators_take_checked_functions() -> None:
+    """The tests' import hook wraps every function of the package; what is compiled is what was written."""
+
+    def written(x: float) -> float:
+        return x
+
+    def checked(x: float) -> float:
+        return written(x)
+
+    checked.__wrapped__ = written  # type: ignore[attr-defined]
+    for decorator in (kernel, kernel(holds_gil=True)):
+        assert isinstance(decorator(checked), Kernel)
+        assert decorator(checked).function is written
+    assert isinstance(inner(inline=True)(checked), Inner)
+    assert inner(checked).function is written
+
+
+def test_the_storage_command_lists_and_clears_them(module: types.ModuleType, cache: Path, tmp_path: Path) -> None:
+    result(module)
+    (tmp_path / "here").mkdir()
+
+    def listing(*options: str) -> str:
+        environment = {"FMTORCH_CACHE": str(cache.parent)}
+        done = run_command("storage", *options, cwd=tmp_path / "here", environment=environment)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    version = next(cache.iterdir()).name
+    assert f"{version}, used {time.strftime('%Y-%m-%d')} │     2 │" in listing()
+    assert version not in listing("--clear-kernels")
+    assert not cache.exists()

@@ -1,0 +1,110 @@
+"""Values of lanes: a kernel compiled does what the same function does to arrays, to the bit."""
+
+import numpy as np
+import pytest
+
+from fmtorch.geometry.five_point import five_point
+from fmtorch.jit import kernel as switch
+from fmtorch.jit.kernel import B1x2, F4x2, F8x1, F8x2, kernel
+from fmtorch.jit.lanes import LANES, absolute, added, any_lane, copysign, fill, lanes, load, sqrt, store, where
+
+pytestmark = pytest.mark.skipif(not switch.available(), reason="kernels are switched off, or numba is not installed")
+SINGLES = 16
+load_singles, fill_singles = lanes(SINGLES)
+
+
+@kernel
+def in_doubles(values: F8x2, out: F8x2, masks: B1x2, sums: F8x1):
+    """Every operator and function of lanes, of float64."""
+    x, y, z = load(values, 0), load(values, 1), load(values, 2)
+    total = fill(0.0)
+    for row in range(len(values)):
+        total += load(values, row) * load(values, row)
+    store(out, 0, x + 2 * y - z / 3.0)
+    store(out, 1, sqrt(total))
+    store(out, 2, where((x < y) & ~(z >= 0.1) | (x != x), copysign(x, z), -absolute(y)))
+    store(out, 3, 1.0 / x)
+    store(out, 4, where(x == y, 5.0, z))
+    total -= x
+    total *= y
+    total /= z
+    store(out, 5, total)
+    store(masks, 0, (x <= y) ^ (x > z))
+    mask = load(masks, 0)
+    mask &= y > z
+    mask |= x >= z
+    store(masks, 1, mask)
+    sums[0], sums[1], sums[2], sums[3] = added(y), added(x), any_lane(y != y), any_lane(x != x)
+
+
+@kernel
+def in_singles(values: F4x2, out: F4x2, sums: F8x1):
+    """Of float32, which stay so beside a number of float32."""
+    x, y = load_singles(values, 0), load_singles(values, 1)
+    store(out, 0, np.float32(0.1) * x + y / (x + np.float32(3)))
+    store(out, 1, where(x > y, fill_singles(np.float32(2)), sqrt(absolute(y))))
+    sums[0] = added(x * y)
+
+
+def _rows(count, dtype):
+    values = np.random.default_rng(0).normal(size=(3, count)).astype(dtype)
+    values[0, :5] = [np.nan, np.inf, -np.inf, -0.0, values[1, 4]]
+    return values
+
+
+@pytest.mark.filterwarnings("ignore:divide by zero|invalid value:RuntimeWarning")
+def test_compiled_operators_do_to_each_lane_what_they_do_to_arrays() -> None:
+    values, results = _rows(LANES, np.float64), []
+    for each in (in_doubles, in_doubles.function):
+        out, masks, sums = np.zeros((6, LANES)), np.zeros((2, LANES), np.bool_), np.zeros(4)
+        each(values, out, masks, sums)
+        results.append((out, masks, sums))
+    for compiled, plain in zip(*results, strict=True):
+        np.testing.assert_array_equal(compiled, plain)
+    assert results[0][1].any()
+    assert not results[0][1].all()
+
+
+def test_float32_stays_float32() -> None:
+    values, results = _rows(SINGLES, np.float32), []
+    values[0, :5] = [1, 2, 3, 4, 5]
+    for each in (in_singles, in_singles.function):
+        out, sums = np.zeros((2, SINGLES), np.float32), np.zeros(1)
+        each(values, out, sums)
+        results.append((out, sums))
+    for compiled, plain in zip(*results, strict=True):
+        np.testing.assert_array_equal(compiled, plain)
+
+
+def test_lanes_of_different_kinds_do_not_mix() -> None:
+    import numba
+
+    @kernel
+    def mixed(a: F8x2, b: F4x2):
+        store(a, 0, load(a, 0) + load_singles(b, 0))
+
+    with pytest.raises(numba.TypingError, match="lanes"):
+        mixed(np.zeros((1, LANES)), np.zeros((1, SINGLES), np.float32))
+
+
+def test_an_operator_leaves_other_names_of_a_value_as_they_were() -> None:
+    total = start = fill(1.0)
+    total += 1.0
+    total *= 3.0
+    assert start.tolist() == [1.0] * LANES
+    assert total.tolist() == [6.0] * LANES
+
+
+@pytest.mark.filterwarnings("ignore:divide by zero|invalid value|overflow:RuntimeWarning")
+def test_a_solver_called_without_numba_finds_the_same_models() -> None:
+    generator = np.random.default_rng(0)
+    points = np.tile(generator.normal(size=(2, 30)), (2, 1)) + 0.1 * generator.normal(size=(4, 30))
+    sample = np.stack([generator.permutation(30)[:5] for _ in range(LANES + 3)], 1)
+    depth, results = np.full((2, LANES + 3), 1.2), []
+    for each in (five_point, five_point.function):
+        F, draw = np.zeros((10 * sample.shape[1], 9), np.float32), np.zeros(10 * sample.shape[1], np.int64)
+        count = each(points, sample, depth, np.zeros(4), F, draw)
+        results.append((count, F, draw))
+    assert results[0][0] > LANES
+    for compiled, plain in zip(*results, strict=True):
+        np.testing.assert_array_equal(compiled, plain)
