@@ -11,25 +11,28 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "fmtorch"
 ROOMS = sorted(path.parent.name for path in PACKAGE.glob("*/__init__.py"))
-GROUND = "core jobs compiling geometry"
+GROUND = "core jobs jit geometry"
 MAY_IMPORT = {
     "core": "",
     "jobs": "core",
-    "compiling": "core jobs",
-    "geometry": "core jobs compiling",
+    "jit": "core jobs",
+    "geometry": "core jobs jit",
     **dict.fromkeys(("metrics", "matching", "features", "pruning", "estimators"), GROUND),
-    "data": "core jobs compiling presets",
-    "storage": GROUND + " data",
+    "data": "core jobs presets",
+    "scenes": "core jobs jit data",
+    "io": GROUND + " data",
+    "runs": "core jobs jit data",
     "presets": "core jobs",
     "two_view": GROUND + " estimators pruning presets",
-    "pipeline": GROUND + " data storage presets two_view",
-    "evaluation": GROUND + " metrics data storage presets two_view pipeline",
+    "pipeline": GROUND + " data io runs presets two_view",
+    "verification": GROUND + " data io runs presets two_view pipeline",
+    "evaluation": GROUND + " metrics data io runs presets two_view pipeline",
     "training": " ".join(room for room in ROOMS if room != "commands"),
     "commands": " ".join(ROOMS),
 }
 TORCH = {"torch", "torchvision", "torchmetrics", "kornia", "lightning"}  # the last four import the first
 NUMBA = {"numba", "llvmlite"}
-TENSORS_OF_ESTIMATORS = ("batch.py", "gradients.py", "irls.py", "coarse_to_fine.py", "peers/")
+TENSORS_OF_ESTIMATORS = ("batch.py", "gradients.py", "irls.py", "coarse_to_fine.py", "external/")
 
 
 def module_name(path: Path) -> str:
@@ -92,8 +95,8 @@ def test_rooms_import_what_they_may() -> None:
     assert sorted(astray) == []
 
 
-def test_numba_is_imported_by_compiling_alone() -> None:
-    assert [m for m in FILES if libraries(m) & NUMBA and room(m) != "compiling"] == []
+def test_numba_is_imported_by_jit_alone() -> None:
+    assert [m for m in FILES if libraries(m) & NUMBA and room(m) != "jit"] == []
 
 
 def test_no_circle_between_files() -> None:

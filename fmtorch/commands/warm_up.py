@@ -20,7 +20,7 @@ usage: fmtorch warm-up
 The compiled kernels are kept in $FMTORCH_CACHE/kernels (~/.cache/fmtorch/kernels). A container may hold that folder: it
 serves machines with the processor, Python, numba and version of fmtorch that it was made with (about.json in it says
 which); any other compiles its own."""
-WITH_KERNELS = ("fmtorch.estimators.", "fmtorch.scenes.")  # beside files *_kernels
+WITH_KERNELS = ("estimators", "geometry", "matching", "metrics", "pruning", "scenes")  # rooms
 
 
 def warm_up() -> int:
@@ -33,7 +33,7 @@ def warm_up() -> int:
     if cache.folder() is None:
         raise ValueError(f"{cache.kernels_dir()} cannot be written; set FMTORCH_CACHE to a folder that can")
     for module in pkgutil.walk_packages([str(HOME / "fmtorch")], "fmtorch."):
-        if module.name.endswith("_kernels") or module.name.startswith(WITH_KERNELS):
+        if module.name.split(".")[1] in WITH_KERNELS:
             importlib.import_module(module.name)
     kernels = [kernel for (name, _), kernel in sorted(linking.KERNELS.items()) if name.startswith("fmtorch.")]
     compile_together(kernels)

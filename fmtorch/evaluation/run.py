@@ -21,6 +21,7 @@ from fmtorch.core.stages import ImageMatcher
 from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
 from fmtorch.evaluation.pair_cameras import PairCameras, WithPairCameras
 from fmtorch.evaluation.rows import evaluate
+from fmtorch.io.collected import CollectedJournal
 from fmtorch.io.match_store import Journal
 from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.pool import WorkerPool
@@ -29,7 +30,6 @@ from fmtorch.pipeline.exporting import keep_outcomes
 from fmtorch.pipeline.pipeline import Outcome, Pipeline, examined
 from fmtorch.runs import PairRow
 from fmtorch.runs.feature_cache import CachedFeatures
-from fmtorch.storage.exchange.collected import CollectedJournal
 from fmtorch.two_view.pair_type import compile_with
 
 Build = Callable[[], Pipeline]

@@ -177,9 +177,7 @@ def _name(value: Any) -> str:
 
 
 HERE = Path(__file__).resolve().parent
-_HOW = (  # the files that say how
-    "kernel.py", "fused.py", "inner.py", "calls.py", "version.py", "lanes.py", "lane_types.py", "lane_functions.py",
-)  # fmt: skip
+_HOW = ("kernel.py", "linking.py", "cache.py", "lanes.py", "lane_instructions.py")  # the files that say how
 ABOUT = "about.json"  # in each folder; its time of change is when the folder was last used
 UNUSED_DAYS = 30  # after which a folder is removed
 _SETTINGS = ("BOUNDSCHECK", "CPU_FEATURES", "CPU_NAME", "DEBUGINFO_DEFAULT", "ENABLE_AVX", "LOOP_VECTORIZE", "OPT")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -14,8 +15,7 @@ from torch import Tensor
 from fmtorch.geometry import cross_matrix, unit_frobenius
 from fmtorch.jit.random import Stream, uniform
 from fmtorch.metrics import nsgd, nsgd_released, sgd
-from fmtorch.metrics import nsgd as draws
-from fmtorch.metrics.nsgd import draw_distances
+from fmtorch.metrics.nsgd import COLUMNS, Pairs, draw_distances
 from tests.conftest import oracle
 from tests.reference import metrics as reference
 
@@ -138,7 +138,7 @@ def test_matches_scalar_reference(sizes: tuple[Tensor, Tensor], spread: float) -
     samples, pairs = 24, 12
     F_gt, F_est = random_pairs(0, pairs, spread=spread)
     key = torch.arange(pairs)
-    uniforms = uniform(3, key, Stream.METRIC, 0, 10 * samples, draws.COLUMNS).numpy()
+    uniforms = uniform(3, key, Stream.METRIC, 0, 10 * samples, COLUMNS).numpy()
     options = {"samples": samples, "seed": 3, "key": key}
     loss, pixels = (f(F_gt, F_est, *sizes, **options, cap=False) for f in (nsgd, sgd))
     released = nsgd_released(F_gt, F_est, *sizes, **options)
@@ -156,7 +156,7 @@ def test_matches_scalar_reference_on_the_published_cases() -> None:
     samples = 8
     arrays = [file[k] for k in ("F_gt", "F_est", "size1", "size2")]
     key = torch.arange(len(file["names"]))
-    uniforms = uniform(0, key, Stream.METRIC, 0, 10 * samples, draws.COLUMNS).numpy()
+    uniforms = uniform(0, key, Stream.METRIC, 0, 10 * samples, COLUMNS).numpy()
     tensors = [torch.from_numpy(a) for a in arrays]
     value = nsgd(*tensors, samples=samples, key=key, cap=False)
     released = nsgd_released(*tensors, samples=samples, key=key)
@@ -236,9 +236,9 @@ def test_exchanging_the_matrices_exchanges_the_halves(seed: int) -> None:
     F_gt, F_est = random_pairs(seed, 2)
     sizes = [size.double().expand(2, 2) for size in (VGA, HD)]
     key = torch.arange(2)
-    u = uniform(seed, key, Stream.METRIC, 0, 40, draws.COLUMNS)
-    forward = draw_distances(draws.Pairs(F_gt, F_est, *sizes, key), u)
-    backward = draw_distances(draws.Pairs(F_est, F_gt, *sizes, key), u.roll(3, -1))
+    u = uniform(seed, key, Stream.METRIC, 0, 40, COLUMNS)
+    forward = draw_distances(Pairs(F_gt, F_est, *sizes, key), u)
+    backward = draw_distances(Pairs(F_est, F_gt, *sizes, key), u.roll(3, -1))
     for a, b in zip(forward, backward, strict=True):
         assert torch.equal(a, b)
 
@@ -274,7 +274,7 @@ def test_neighbours_batch_and_tile_are_invisible(function: object, monkeypatch: 
     order = torch.tensor([8, 3, 5, 0])
     part = function(F_gt[order], F_est[order], *sizes[:, order], key=key[order], samples=50)
     assert torch.equal(part, together[order])
-    monkeypatch.setattr(draws, "TILE", 16)
+    monkeypatch.setattr(sys.modules["fmtorch.metrics.nsgd"], "TILE", 16)
     assert torch.equal(function(F_gt, F_est, *sizes, key=key, samples=50), together)
 
 
