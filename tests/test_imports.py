@@ -26,7 +26,7 @@ MAY_IMPORT = {
     "two_view": GROUND + " estimators pruning presets",
     "pipeline": GROUND + " data io runs presets two_view",
     "verification": GROUND + " data io runs presets two_view pipeline",
-    "evaluation": GROUND + " metrics data io runs presets two_view pipeline",
+    "evaluation": GROUND + " metrics data scenes io runs presets two_view pipeline",
     "training": " ".join(room for room in ROOMS if room != "commands"),
     "commands": " ".join(ROOMS),
 }
