@@ -21,14 +21,12 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from fmtorch import data, presets
-from fmtorch.core.types import Correspondences
+from fmtorch import Correspondences, Pipeline, data, presets
 from fmtorch.geometry import sampson
-from fmtorch.pipeline.pipeline import Pipeline
 
 STAGES = ("ratio_prior", "gms", "lpm", "position_consistency", "frame_consistency", "code")
 NEWTON_STEPS = 30
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 console = Console(width=None if sys.stdout.isatty() else 140)
 
 
@@ -37,7 +35,7 @@ class Pair(NamedTuple):
 
     scene: str
     c: Correspondences
-    right: NDArray[np.bool_]
+    right: Array
 
 
 def main() -> None:
@@ -47,9 +45,7 @@ def main() -> None:
     parser.add_argument("--stages", nargs="*", default=list(STAGES))
     parser.add_argument("--ratio", type=float, default=0.9, help="matches below this distance ratio take part")
     parser.add_argument("--threshold", type=float, default=2.0, help="px, Sampson distance of an inlier")
-    parser.add_argument(
-        "--least", dest="min_matches", type=int, default=20, help="pairs with fewer matches are left out"
-    )
+    parser.add_argument("--least", type=int, default=20, help="pairs with fewer matches are left out")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     pairs = matched(arguments)
@@ -67,34 +63,42 @@ def matched(arguments: argparse.Namespace) -> list[Pair]:
         sets.append(data.load("rendered", "train", size=arguments.rendered))
     pruners = {"ratio": presets.build("pruner", "ratio", threshold=arguments.ratio)}
     pruners["one_to_one"] = presets.build("pruner", "one_to_one")
-    front = Pipeline(
-        presets.build("features", "sift"), presets.build("matcher", "nearest"), pruners, lambda c, seed=0: None
-    )
+    stages = presets.build("features", "sift"), presets.build("matcher", "nearest"), pruners
+    front = Pipeline(*stages, lambda c, seed=0: None)
     pairs = []
     for pair in track(sorted((p for s in sets for p in s), key=lambda p: p.identity), "matching", console=console):
         c = front.match([pair])[0].correspondences
-        if c is None or int(c.count()) < arguments.min_matches:
-            continue
-        distance = sampson(torch.from_numpy(pair.F)[None], c.x0.double(), c.x1.double())[0]
-        scene = pair.scene if pair.family in families else pair.family  # a rendered scene has but a few pairs
-        pairs.append(Pair(scene, c, (distance < arguments.threshold).numpy()))
+        if c is not None and int(c.count()) >= arguments.least:
+            distance = sampson(torch.from_numpy(pair.F)[None], c.x0.double(), c.x1.double())[0]
+            scene = pair.scene if pair.family in families else pair.family  # a rendered scene has but a few pairs
+            pairs.append(Pair(scene, c, (distance < arguments.threshold).numpy()))
     return pairs
 
 
 def report(name: str, stage: Any, pairs: list[Pair]) -> None:
     """Print the stage's figures for each scene, and the constants where it has a `calibration`."""
-    table = Table(title=name, title_justify="left")
     scenes = list(dict.fromkeys(pair.scene for pair in pairs))
     members = [[i for i, pair in enumerate(pairs) if pair.scene == scene] for scene in scenes]
-    columns = {"scene": scenes, "pairs": [str(len(inside)) for inside in members]}
-    columns["AUC of preset"], columns["its log loss"] = of_preset(stage, pairs, members)
+    priors = [np.clip(stage(pair.c).prior[0].double().numpy(), 1e-6, 1 - 1e-6) for pair in pairs]
+    areas = [auc(p, pair.right) for p, pair in zip(priors, pairs, strict=True)]
+    losses = [loss(np.log(p / (1 - p)), pair.right) for p, pair in zip(priors, pairs, strict=True)]
+    columns = {
+        "scene": scenes, "pairs": [str(len(inside)) for inside in members],
+        "AUC of preset": [f"{np.nanmean([areas[i] for i in inside]):.3f}" for inside in members],
+        "its log loss": [f"{np.mean([losses[i] for i in inside]):.3f}" for inside in members],
+    }  # fmt: skip
     constants = {}
-    if hasattr(stage, "evidence"):
-        for kind in ("with_ratio", "alone"):
-            X = [features(stage, pair, kind) for pair in pairs]
-            if X[0].shape[1] > 1:
-                constants[kind], fitted, left_out = of_fit(X, pairs, members)
-                columns |= {f"{kind}: fitted": fitted, "left out" if kind == "alone" else "scene left out": left_out}
+    for kind in ("with_ratio", "alone") if hasattr(stage, "evidence") else ():
+        X = [features(stage, pair, kind) for pair in pairs]
+        if X[0].shape[1] > 1:
+            constants[kind] = fit(X, pairs)
+            fitted = [(constants[kind], inside) for inside in members]
+            others = [[i for i in range(len(pairs)) if i not in inside] or inside for inside in members]
+            elsewhere = [fit([X[i] for i in kept], [pairs[i] for i in kept]) for kept in others]
+            cases = fitted, list(zip(elsewhere, members, strict=True))
+            for title, case in zip((f"{kind}: fitted", f"{kind}: scene left out"), cases, strict=True):
+                columns[title] = [f"{np.mean([loss(X[i] @ w, pairs[i].right) for i in at]):.3f}" for w, at in case]
+    table = Table(title=name, title_justify="left")
     for column in columns:
         table.add_column(column, justify="left" if column == "scene" else "right")
     for row in zip(*columns.values(), strict=True):
@@ -105,34 +109,12 @@ def report(name: str, stage: Any, pairs: list[Pair]) -> None:
         console.print(f"  {kind}: {{{', '.join(f'{key}: {value:.3f}' for key, value in named.items())}}}")
 
 
-def of_preset(stage: Any, pairs: list[Pair], members: list[list[int]]) -> tuple[list[str], list[str]]:
-    """Area under the ROC curve and log loss of the prior as the preset gives it, for each scene."""
-    priors = [np.clip(stage(pair.c).prior[0].double().numpy(), 1e-6, 1 - 1e-6) for pair in pairs]
-    log_odds = [np.log(p / (1 - p)) for p in priors]
-    areas = [np.nanmean([auc(priors[i], pairs[i].right) for i in inside]) for inside in members]
-    losses = [np.mean([loss(log_odds[i], pairs[i].right) for i in inside]) for inside in members]
-    return [f"{v:.3f}" for v in areas], [f"{v:.3f}" for v in losses]
-
-
-def of_fit(X: list[Array], pairs: list[Pair], members: list[list[int]]) -> tuple[Array, list[str], list[str]]:
-    """The constants fitted to all pairs, their log loss on each scene, and that of those fitted to the other scenes."""
-    constants, fitted, left_out = fit(X, pairs), [], []
-    for inside in members:
-        others = [i for i in range(len(pairs)) if i not in inside] or inside
-        elsewhere = fit([X[i] for i in others], [pairs[i] for i in others])
-        for w, losses in ((constants, fitted), (elsewhere, left_out)):
-            losses.append(f"{np.mean([loss(X[i] @ w, pairs[i].right) for i in inside]):.3f}")
-    return constants, fitted, left_out
-
-
 def features(stage: Any, pair: Pair, kind: str) -> Array:
     """Columns: one, the evidence (which `ratio_prior` does not have: it is zero) and, unless alone, the ratio."""
     c = pair.c if kind == "with_ratio" else pair.c.replace(quality=None)
     evidence = stage.evidence(c)[0].double().numpy()
-    columns = [np.ones_like(evidence), evidence] if evidence.any() or kind == "with_ratio" else [np.ones_like(evidence)]
-    if c.quality is not None:
-        columns.append(c.quality[0].double().numpy())
-    return np.stack(columns, 1)
+    columns = [np.ones_like(evidence), *([evidence] if evidence.any() or kind == "with_ratio" else [])]
+    return np.stack([*columns, *([c.quality[0].double().numpy()] if c.quality is not None else [])], 1)
 
 
 def fit(columns: list[Array], pairs: list[Pair]) -> Array:
@@ -149,12 +131,12 @@ def fit(columns: list[Array], pairs: list[Pair]) -> Array:
     return np.asarray(w)
 
 
-def loss(z: Array, right: NDArray[np.bool_]) -> float:
+def loss(z: Array, right: Array) -> float:
     """Mean negative log likelihood, in nats, of log-odds z."""
     return float(np.mean(np.logaddexp(0, z) - right * z))
 
 
-def auc(score: Array, right: NDArray[np.bool_]) -> float:
+def auc(score: Array, right: Array) -> float:
     """Area under the ROC curve, ties counted half; NaN where all matches are right or all wrong."""
     _, rank, count = np.unique(score, return_inverse=True, return_counts=True)
     middle = np.cumsum(count) - (count - 1) / 2

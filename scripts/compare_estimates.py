@@ -4,14 +4,17 @@
 
 BEFORE and AFTER are checkouts, or files written with --save; AFTER is this checkout by default. Every estimator preset
 of the project runs on the same pairs in a process of each checkout: synthetic scenes with and without prior, noise,
-image sizes; pairs that are degenerate; and, with --matches, real ones. Compared are F, inliers, ok, reasons, draws,
-the models before the final fit, and gradients, besides public functions of `fmtorch.geometry`.
+image sizes; pairs that are degenerate; and, with --matches, real ones. Compared are F, inliers, ok, reasons, samples,
+the models before the final fit, and gradients, besides public functions of `fmtorch.geometry`. Only public names are
+used, and of those that were renamed (`FORMER`) each checkout is asked by its own.
 Exit status 1 where anything differs.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import inspect
 import os
 import subprocess
 import sys
@@ -23,9 +26,28 @@ import numpy as np
 import torch
 
 HERE = Path(__file__).resolve().parents[1]
-OWN = ("Ransac", "IterativelyReweighted", "CoarseToFine")
+OWN = ("Ransac", "HypothesizeAndVerify", "IterativelyReweighted", "CoarseToFine")
 QUICK_MATCHES, MATCHES = 400, 1000  # of a real pair, at most
-FIELDS = ("x0", "x1", "mask", "quality", "prior", "noise", "size0", "size1", "key", "lafs0", "lafs1")
+FIELDS = ("x0", "x1", "mask", "ratio", "prior", "noise", "size0", "size1", "key", "lafs0", "lafs1")
+FORMER = {"ratio": "quality", "samples": "draws", "loss": "kernel", "model_matrix": "F"}
+
+
+def name_in(names: Any, name: str) -> str:
+    """A name, or the former one where a checkout knows only that."""
+    return FORMER[name] if name in FORMER and name not in names else name
+
+
+def value_of(record: Any, name: str) -> Any:
+    """A member of a record by its name or its former one."""
+    return getattr(record, name_in(dir(record), name))
+
+
+def correspondences(values: dict[str, Any]) -> Any:
+    """The record of these fields."""
+    from fmtorch import Correspondences
+
+    known = {field.name for field in dataclasses.fields(Correspondences)}
+    return Correspondences(**{name_in(known, name): value for name, value in values.items()})
 
 
 def inputs(quick: bool, matches: Path | None) -> dict[str, dict[str, torch.Tensor]]:
@@ -51,7 +73,7 @@ def inputs(quick: bool, matches: Path | None) -> dict[str, dict[str, torch.Tenso
         batches |= {
             "hard": hard,
             "two sizes, noise, no prior": scenes.replace(size1=other, noise=noise(scenes), prior=None),
-            "no quality": scenes.replace(quality=None),
+            "no ratio": scenes.replace(**{name_in(dir(scenes), "ratio"): None}),
         }
     kinds = [*degenerate().values(), *small().values()]
     batches["degenerate"] = collate(kinds[::4] if quick else kinds)
@@ -60,27 +82,28 @@ def inputs(quick: bool, matches: Path | None) -> dict[str, dict[str, torch.Tenso
         names = range(0, len(arrays["names"]), 8 if quick else 1)
         batches |= {f"real {i}": real(arrays, i, QUICK_MATCHES if quick else MATCHES) for i in names}
     return {
-        name: {f: v.clone() for f in FIELDS if isinstance(v := getattr(c, f), torch.Tensor)}
+        name: {f: v.clone() for f in FIELDS if isinstance(v := value_of(c, f), torch.Tensor)}
         for name, c in batches.items()
     }
 
 
 def real(arrays: Any, i: int, most: int) -> Any:
-    from fmtorch import Correspondences, presets
+    from fmtorch import presets
 
     x0, x1 = (torch.from_numpy(arrays[f"{i:03d}.{x}"][:most].astype(np.float32))[None] for x in ("X1", "X2"))
     size0, size1 = (torch.from_numpy(arrays[f"{i:03d}.{s}"].astype(np.int64))[None] for s in ("size1", "size2"))
-    quality = torch.from_numpy(np.random.default_rng(i).uniform(0.3, 0.95, x0.shape[:2]).astype(np.float32))
-    c = Correspondences(x0, x1, torch.ones(x0.shape[:2], dtype=torch.bool), quality, size0=size0, size1=size1)
-    return presets.build("pruner", "position_consistency")(c.replace(key=torch.tensor([i + 1])))
+    ratio = torch.from_numpy(np.random.default_rng(i).uniform(0.3, 0.95, x0.shape[:2]).astype(np.float32))
+    mask, key = torch.ones(x0.shape[:2], dtype=torch.bool), torch.tensor([i + 1])
+    fields = {"x0": x0, "x1": x1, "mask": mask, "ratio": ratio, "size0": size0, "size1": size1, "key": key}
+    return presets.build("pruner", "position_consistency")(correspondences(fields))
 
 
 def dump(pairs: Path, out: Path, presets_: list[str], quick: bool) -> None:
     """What this process's fmtorch computes of the pairs."""
-    from fmtorch import Correspondences, presets
+    from fmtorch import presets
 
     torch.set_num_threads(1)
-    batches = {name: Correspondences(**fields) for name, fields in torch.load(pairs).items()}
+    batches = {name: correspondences(fields) for name, fields in torch.load(pairs).items()}
     own = [n for n in presets.available("estimator") if str(presets.load("estimator", n)["_target_"]).endswith(OWN)]
     arrays: dict[str, torch.Tensor] = geometry()
     for name in presets_ or own:
@@ -95,13 +118,13 @@ def dump(pairs: Path, out: Path, presets_: list[str], quick: bool) -> None:
                 arrays |= gradients(f"{name} | {label} |", estimator, c)
                 if unfitted is not None:
                     plain = presets.build("estimator", name, **unfitted)(c, 0)
-                    arrays[f"{name} | {label} | before the final fit"] = plain.F
+                    arrays[f"{name} | {label} | before the final fit"] = value_of(plain, "model_matrix")
     torch.save(arrays, out)
 
 
 def fields_of(what: str, estimate: Any) -> dict[str, torch.Tensor]:
     reasons = torch.frombuffer(bytearray("\n".join(estimate.reason).encode() + b"\n"), dtype=torch.uint8).clone()
-    values = {f: getattr(estimate, f) for f in ("F", "inliers", "ok", "draws")}
+    values = {f: value_of(estimate, f) for f in ("model_matrix", "inliers", "ok", "samples")}
     return {f"{what} {f}": v for f, v in {**values, "reasons": reasons}.items()}
 
 
@@ -109,11 +132,12 @@ def gradients(what: str, estimator: Any, c: Any) -> dict[str, torch.Tensor]:
     asked = {f: getattr(c, f).double().requires_grad_() for f in ("x0", "x1", "prior", "noise")}
     estimate = estimator(c.replace(**asked), 1)
     weights = torch.linspace(-1, 1, 9, dtype=torch.float64).reshape(3, 3)
-    if not estimate.F.requires_grad:
-        return {f"{what} F with gradients": estimate.F}
-    grads = torch.autograd.grad((estimate.F * weights).sum(), list(asked.values()), allow_unused=True)
+    F = value_of(estimate, "model_matrix")
+    if not F.requires_grad:
+        return {f"{what} F with gradients": F}
+    grads = torch.autograd.grad((F * weights).sum(), list(asked.values()), allow_unused=True)
     named = {f"{what} gradient to {f}": g for f, g in zip(asked, grads, strict=True) if g is not None}
-    return {f"{what} F with gradients": estimate.F.detach(), **named}
+    return {f"{what} F with gradients": F.detach(), **named}
 
 
 def geometry() -> dict[str, torch.Tensor]:
@@ -126,6 +150,10 @@ def geometry() -> dict[str, torch.Tensor]:
     F0 = torch.randn(5, 2, 3, 3, generator=rng, dtype=torch.float64) * torch.tensor([1e-3, 1e-3, 1.0])
     K = torch.tensor([[700.0, 0, 300], [0, 720, 310], [0, 0, 1]], dtype=torch.float64).expand(5, 3, 3)
     mask = w > 0.1
+
+    def loss(function: Any, kind: str) -> dict[str, str]:
+        return {name_in(inspect.signature(function).parameters, "loss"): kind}
+
     calls = {
         "seven_point": lambda a, b, v: g.seven_point(a[:, :7], b[:, :7])[0],
         "eight_point": lambda a, b, v: g.eight_point(a, b, v, mask)[0],
@@ -133,14 +161,15 @@ def geometry() -> dict[str, torch.Tensor]:
         "sampson": lambda a, b, v: g.sampson(F0[:, 0], a, b),
         "calibration": lambda a, b, v: g.fundamental_from_calibration(K, K, K / 700, a[:, 0, :1].expand(5, 3) + 1),
         **{
-            f"{name} {kernel} {gradient}": lambda a, b, v, f=f, k=kernel, gradient=gradient: f(
-                *((F0, a, b) if f is g.refine else (a, b, F0)), v, mask, kernel=k, scale=3.0, gradient=gradient
+            f"{name} {kind}": lambda a, b, v, f=f, kind=kind: f(
+                *((F0, a, b) if f is g.refine else (a, b, F0)), v, mask, **loss(f, kind), scale=3.0
             )
             for name, f in (("refine", g.refine), ("irls", g.irls))
-            for kernel in ("cauchy", "truncated", "magsac")
-            for gradient in ("implicit", "unrolled")
+            for kind in ("cauchy", "truncated", "magsac")
         },
-        "attached step": lambda a, b, v: g.attached_step(F0, a, b, v, mask, kernel="huber", scale=3.0),
+        "attached step": lambda a, b, v: g.attached_step(
+            F0, a, b, v, mask, **loss(g.attached_step, "huber"), scale=3.0
+        ),
     }
     arrays = {}
     for name, call in calls.items():

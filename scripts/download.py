@@ -9,14 +9,13 @@ python scripts/download.py weights=hardnet++ sha256=HEX           for a file who
 python scripts/download.py weights=hardnet++ sha256=any           accepts what comes, and prints its SHA-256
 
 L2-Net's authors publish MATLAB files only and no stable address of a port is known; a port that you have is converted
-by scripts/export_onnx.py architecture=l2net.
+by scripts.patch_networks.export architecture=l2net.
 
-Then: python scripts/export_onnx.py checkpoint=weights/AffNet.pth architecture=affnet licence=MIT
+Then: python -m scripts.patch_networks.export checkpoint=weights/AffNet.pth architecture=affnet licence=MIT
 """
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import http.client
 import os
@@ -27,6 +26,7 @@ import urllib.error
 import urllib.request
 import zlib
 from pathlib import Path
+from typing import NamedTuple
 
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
@@ -40,13 +40,11 @@ AFFNET = "https://raw.githubusercontent.com/ducha-aiki/affnet/da7cf51ba09cb92e3c
 HARDNET = "https://github.com/DagnyT/hardnet/raw/master/pretrained"
 
 
-@dataclasses.dataclass(frozen=True)
-class Weights:
-    """A published file: where it is, for which architecture, under which licence; sha256 is None where not known."""
+class Weights(NamedTuple):
+    """A published file: where it is, for which architecture; sha256 is None where not known. All are under MIT."""
 
     url: str
     architecture: str
-    licence: str
     sha256: str | None = None
 
     @property
@@ -56,28 +54,27 @@ class Weights:
 
 TABLE = {
     "affnet": Weights(
-        f"{AFFNET}/pretrained/AffNet.pth", "affnet", "MIT",
-        "65c8bb2cf71e913818522d09dcc4262bcbcef5d756baa86a41f28526c2d61160",
+        f"{AFFNET}/pretrained/AffNet.pth", "affnet", "65c8bb2cf71e913818522d09dcc4262bcbcef5d756baa86a41f28526c2d61160"
     ),
     "orinet": Weights(
-        f"{AFFNET}/pretrained/OriNet.pth", "orinet", "MIT",
-        "030e7964ae3e136d00431c7e11c6b67df40ad299f02ac384fee0f1c3fd1dcb30",
+        f"{AFFNET}/pretrained/OriNet.pth", "orinet", "030e7964ae3e136d00431c7e11c6b67df40ad299f02ac384fee0f1c3fd1dcb30"
     ),
     "affnet_jit": Weights(
-        f"{AFFNET}/convertJIT/AffNetJIT.pt", "affnet", "MIT",
+        f"{AFFNET}/convertJIT/AffNetJIT.pt",
+        "affnet",
         "ab06ef8747ed1871415d34dc65308314f3b56521b3c6ff6a03005c996e9c32c7",
     ),
     "orinet_jit": Weights(
-        f"{AFFNET}/convertJIT/OriNetJIT.pt", "orinet", "MIT",
+        f"{AFFNET}/convertJIT/OriNetJIT.pt",
+        "orinet",
         "984077b99385bf25083cafeff30be7a0f7fa2334d73015fbbea42b92b888a75a",
     ),
-    "hardnet++": Weights(f"{HARDNET}/pretrained_all_datasets/HardNet++.pth", "hardnet", "MIT"),
-    "hardnet_liberty": Weights(f"{HARDNET}/train_liberty_with_aug/checkpoint_liberty_with_aug.pth", "hardnet", "MIT"),
-}  # fmt: skip
+    "hardnet++": Weights(f"{HARDNET}/pretrained_all_datasets/HardNet++.pth", "hardnet"),
+    "hardnet_liberty": Weights(f"{HARDNET}/train_liberty_with_aug/checkpoint_liberty_with_aug.pth", "hardnet"),
+}
 
 
-@dataclasses.dataclass(frozen=True)
-class Source:
+class Source(NamedTuple):
     """A published data set: `url` of an archive by its file's name, the files that the paper tests on, its terms.
 
     by_hand: what to do where there is no address to fetch from.
@@ -236,7 +233,7 @@ def fetch(config: DictConfig) -> Path:
     path = Path(config.folder or "weights") / entry.file
     digest = download(config.url or entry.url, path, None if expected == "any" else expected, config.timeout)
     state = "not verified" if expected == "any" else "verified"
-    console.print(f"{path}  SHA-256 {digest} ({state})  licence: {entry.licence}  architecture={entry.architecture}")
+    console.print(f"{path}  SHA-256 {digest} ({state})  licence: MIT  architecture={entry.architecture}")
     return path
 
 
@@ -249,7 +246,7 @@ def main() -> None:
         elif config.weights is None:
             table = Table("weights", "architecture", "licence", "SHA-256", "URL")
             for name, entry in TABLE.items():
-                table.add_row(name, entry.architecture, entry.licence, entry.sha256 or "not known", entry.url)
+                table.add_row(name, entry.architecture, "MIT", entry.sha256 or "not known", entry.url)
             console.print(table)
             sets = Table("dataset", "files", "licence", "citation")
             for name, source in DATASETS.items():

@@ -2,7 +2,7 @@
 
     python scripts/record_rendered_pairs.py ~/.cache/fmtorch/rendered/indoor-test-small-*
 
-adds folders of `rendered` to fmtorch/data/rendered/pairs.json and drops those of other versions.
+adds folders of `rendered` to fmtorch/scenes/pairs.json and drops those of other versions.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from fmtorch.commands.main import job, run_command
 def task(config: DictConfig) -> None:
     """What Hydra runs."""
     try:
-        from fmtorch.training.pruners.run import run
+        from fmtorch.training.run import run
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] not in ("lightning", "tensorboard"):
             raise

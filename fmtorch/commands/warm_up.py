@@ -10,8 +10,7 @@ import time
 from fmtorch.core.terminal import console, exits_with_message
 from fmtorch.jit import cache, linking
 from fmtorch.jit import kernel as switch
-from fmtorch.jit.process import HOME
-from fmtorch.jit.together import compile_together
+from fmtorch.jit.together import HOME, compile_together
 
 USAGE = """fmtorch warm-up: compile all kernels now
 

@@ -7,6 +7,7 @@ import difflib
 import enum
 import inspect
 import math
+import numbers
 import os
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -20,20 +21,25 @@ MAX_NAMES = 12  # that a message lists
 
 @dataclasses.dataclass(frozen=True)
 class Within:
-    """Bounds of a number, for ``Annotated[int, Within(1)]``; both may be reached."""
+    """Bounds of a number, for ``Annotated[int, Within(1)]``; both may be reached unless they are exclusive."""
 
     minimum: int | float = -math.inf
     maximum: int | float = math.inf
+    exclusive: bool = False
 
     def __call__(self, value: Any) -> bool:
         """Whether a number is in bounds."""
-        return isinstance(value, int | float) and self.minimum <= value <= self.maximum
+        number = float(value) if isinstance(value, numbers.Real) else math.nan
+        inside = self.minimum <= number <= self.maximum
+        return inside and not (self.exclusive and number in (self.minimum, self.maximum))
 
     def __str__(self) -> str:
         low, high = (str(bound) if isinstance(bound, int) else f"{bound:g}" for bound in (self.minimum, self.maximum))
         if self.maximum == math.inf:
-            return f"of at least {low}"
-        return f"of at most {high}" if self.minimum == -math.inf else f"from {low} to {high}"
+            return f"above {low}" if self.exclusive else f"of at least {low}"
+        if self.minimum == -math.inf:
+            return f"below {high}" if self.exclusive else f"of at most {high}"
+        return f"between {low} and {high}" if self.exclusive else f"from {low} to {high}"
 
 
 def expect_options(
@@ -64,6 +70,8 @@ def expect_options(
         annotation = annotations.get(str(key), Any)
         place = f"{where}: {key}" if "=" in where else f"{where}.{key}" if where else str(key)
         nested = dataclass_in(annotation)
+        if nested is not None and isinstance(value, nested):
+            value = vars(value)
         if isinstance(value, Mapping) and "_target_" not in value and nested is not None:
             expect_options(nested, value, place)
         elif not fits(value, annotation):
@@ -136,6 +144,8 @@ def expected(annotation: Any) -> str:
         return f"a list of {', '.join(map(expected, args))}"
     if issubclass(list, kind) or issubclass(kind, list | tuple):
         return "a list" + (f", each {expected(args[0])}" if args else "")
+    if dataclasses.is_dataclass(kind):
+        return f"a mapping of: {', '.join(field.name for field in dataclasses.fields(kind))}"
     return f"a {kind.__name__}: a mapping with a `_target_`"
 
 

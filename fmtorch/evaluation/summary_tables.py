@@ -8,7 +8,7 @@ from typing import Any
 from rich import box
 from rich.table import Table
 
-from fmtorch.core.estimate import CONFIGURATIONS
+from fmtorch.core.types import CONFIGURATIONS
 from fmtorch.evaluation.rows import CAPTION, INLIERS, THRESHOLDS
 from fmtorch.evaluation.statistics import FINE_THRESHOLD, FOCAL_THRESHOLDS, LEVEL, POSE_THRESHOLDS, THRESHOLD
 from fmtorch.evaluation.summary import ALL, STAGES, Group

@@ -16,10 +16,10 @@ from fmtorch.core.onnx_network import NetworkFileError, onnx_session
 
 PRECISIONS = ("fp32", "int8")
 PATCH_SHAPE = (1, 32, 32)
-HINT = "python scripts/export_onnx.py makes it from a checkpoint, scripts/download.py fetches authors' checkpoints"
+HINT = "scripts.patch_networks.export makes it from a checkpoint, scripts/download.py fetches authors' checkpoints"
 HINT_INT8 = (
-    "python scripts/export_onnx.py precision=int8 makes it from a checkpoint, checkpoint=FILE, and patches that "
-    "calibrate it, calibration=FOLDER (scripts/train_patch_network.py leaves both)"
+    "scripts.patch_networks.export precision=int8 makes it from a checkpoint, checkpoint=FILE, and patches that "
+    "calibrate it, calibration=FOLDER (scripts.patch_networks.train leaves both)"
 )
 
 

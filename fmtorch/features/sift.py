@@ -357,7 +357,7 @@ def learn_projection(
 @functools.lru_cache(maxsize=8)
 def load_projection(path: Path) -> tuple[Float[Tensor, 128], Float[Tensor, "128 d"]]:
     """Mean and basis of a learned file. Raises FileNotFoundError and ValueError that say how to make it."""
-    remedy = "make it with `python scripts/learn_pca.py`"
+    remedy = "make it with `python scripts/make_models.py pca`"
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; {remedy}")
     try:

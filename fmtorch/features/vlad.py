@@ -58,7 +58,7 @@ def codebook(kind: Kind) -> Codebook:
 
 def load_codebook(path: Path) -> Codebook:
     """The codebook of a learned file. Raises FileNotFoundError and ValueError that say how to make it."""
-    remedy = "make it with `python scripts/learn_codebook.py`"
+    remedy = "make it with `python scripts/make_models.py codebooks`"
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; {remedy}")
     try:

@@ -177,7 +177,6 @@ def _name(value: Any) -> str:
 
 
 HERE = Path(__file__).resolve().parent
-_HOW = ("kernel.py", "linking.py", "cache.py", "lanes.py", "lane_instructions.py")  # the files that say how
 ABOUT = "about.json"  # in each folder; its time of change is when the folder was last used
 UNUSED_DAYS = 30  # after which a folder is removed
 _SETTINGS = ("BOUNDSCHECK", "CPU_FEATURES", "CPU_NAME", "DEBUGINFO_DEFAULT", "ENABLE_AVX", "LOOP_VECTORIZE", "OPT")
@@ -196,12 +195,12 @@ def versions() -> dict[str, str]:
     from llvmlite import binding
 
     settings = {name: str(getattr(numba.config, name, None)) for name in _SETTINGS}
-    features = binding.get_host_cpu_features().flatten()
+    own = b"".join(file.read_bytes() for file in sorted(HERE.glob("*.py")))
     return {
-        "compiling": _hex(b"".join((HERE / name).read_bytes() for name in _HOW)), "numba": numba.__version__,
-        "llvmlite": llvmlite.__version__, "python": platform.python_version(),
-        "machine": f"{platform.system()} {platform.machine()}", "processor": binding.get_host_cpu_name(),
-        "features": features, "settings": json.dumps(settings),
+        "compiling": _hex(own), "numba": numba.__version__, "llvmlite": llvmlite.__version__,
+        "python": platform.python_version(), "machine": f"{platform.system()} {platform.machine()}",
+        "processor": binding.get_host_cpu_name(), "features": binding.get_host_cpu_features().flatten(),
+        "settings": json.dumps(settings),
     }  # fmt: skip
 
 
@@ -264,7 +263,6 @@ class KernelFile:
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """The compiled function of the file; None where there is none, with a warning if it is damaged."""
-        target_context.refresh()
         if (loaded := self._loaded(signature, target_context)) is not None:
             return loaded
         if self._acquire() and (loaded := self._loaded(signature, target_context)) is not None:
@@ -285,6 +283,7 @@ class KernelFile:
                     with contextlib.suppress(OSError):  # a folder that can be read, but not written
                         os.utime(self.path)  # so that files in use are not the oldest
                     self.calls = linking.called(data)
+                    _open_runtime(target_context, data)
                     return _of(signature, CompileResult._rebuild(target_context, *pickle.loads(data)))
                 warnings.warn(f"{self.path} is damaged; it is compiled anew", stacklevel=2)
                 with contextlib.suppress(OSError):
@@ -300,7 +299,7 @@ class KernelFile:
         from numba.core.serialize import dumps
 
         try:
-            data = dumps(result._reduce())
+            data = dumps(_alone(result))
             self.calls = linking.called(data)
             if self.path is not None and not result._asdict()["library"].has_dynamic_globals:
                 _write(self.path, _signature(data) + data)
@@ -333,6 +332,29 @@ class KernelFile:
         """Remove the file."""
         if self.path is not None:
             self.path.unlink(missing_ok=True)
+
+
+def _open_runtime(target_context: Any, machine_code: bytes) -> None:
+    """Let machine code find what it needs of numba; all that compiling needs would take a third of a second more."""
+    from numba.core.runtime import rtsys
+
+    if b"_numba_hashsecret" in machine_code:  # of dictionaries and sets, the one name that the rest of numba adds
+        target_context.refresh()
+    rtsys.initialize(target_context)
+
+
+def _alone(result: Any) -> Any:
+    """What numba keeps of a compiled function, without code for others to link, and constants of functions without any.
+
+    A kernel is called by its address alone.
+    """
+    from llvmlite import binding
+
+    (library, kind, (code, _)), *rest, environments = result._reduce()
+    names = (result.fndesc.llvm_func_name, result.fndesc.llvm_cpython_wrapper_name)
+    defined = binding.parse_assembly("".join(f'define void @"{name}"() {{ ret void }}\n' for name in names))
+    used = tuple(environment for environment in environments if environment.consts)
+    return (library, kind, (code, defined.as_bitcode())), *rest, used
 
 
 def _write(path: Path, data: bytes) -> None:

@@ -133,15 +133,12 @@ def identity() -> str:
 # What is said while kernels are compiled: one line, however many there are
 
 
-QUIET = "FMTORCH_COMPILES_QUIETLY"  # set for a process that helps another one, which speaks for both
 _CLEAR = "\r\x1b[K"
 _state = {"announced": False}
 
 
 def begun(name: str, where: str, count: str = "") -> None:
     """Say that a kernel is compiled, on the error stream. where: it is kept. count: which one of how many it is."""
-    if os.environ.get(QUIET):
-        return
     if sys.stderr.isatty():
         print(f"{_CLEAR}{count}compiling {name} {where}", end="", file=sys.stderr, flush=True)
     elif not _state["announced"]:
@@ -151,7 +148,7 @@ def begun(name: str, where: str, count: str = "") -> None:
 
 def ended() -> None:
     """Take the line back from a terminal."""
-    if not os.environ.get(QUIET) and sys.stderr.isatty():
+    if sys.stderr.isatty():
         print(_CLEAR, end="", file=sys.stderr, flush=True)
 
 

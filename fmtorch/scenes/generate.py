@@ -12,11 +12,7 @@ import hashlib
 import itertools
 import json
 import os
-import queue
 import shutil
-import subprocess
-import sys
-import threading
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -26,8 +22,10 @@ import cv2
 import numpy as np
 
 from fmtorch.data.construction import Keypoints, keypoints, matchable
-from fmtorch.jit import process
 from fmtorch.jit.together import compile_together
+from fmtorch.jobs.execution import Execution, cores
+from fmtorch.jobs.pool import MAX_PROCESSES, WorkerPool
+from fmtorch.jobs.runner import Local, TaskRunner
 from fmtorch.scenes import collection, driving, indoor, orbit
 from fmtorch.scenes.camera import Camera, fundamental
 from fmtorch.scenes.light import Stage, affine, expose, footprints, group_by_texture, shade
@@ -39,6 +37,7 @@ VERSION = 3  # of the generator: raised by every change that changes a picture o
 FAMILIES = {"indoor": indoor.scene, "driving": driving.scene, "orbit": orbit.scene, "collection": collection.scene}
 SPLITS = ("test", "train")
 RECORD = Path(__file__).with_name("pairs.json")
+Progress = Callable[[int, int], None]
 
 KERNELS = (cast_pieces, shade, footprints, affine, group_by_texture)  # that drawing calls, slowest first
 
@@ -79,12 +78,6 @@ class Task:
     def name(self) -> str:
         """The scene's name and its folder's."""
         return f"{self.family}-{self.split}-{self.number:03d}"
-
-    @classmethod
-    def from_json(cls, text: str) -> Task:
-        """The inverse of ``json.dumps(dataclasses.asdict(task))``."""
-        fields: dict[str, Any] = json.loads(text)
-        return cls(**{**fields, "plan": Plan(**fields["plan"])})
 
 
 def digest(family: str, split: str, seed: int, plan: Plan) -> str:
@@ -129,6 +122,32 @@ def draw(scene: Scene, seed: np.random.SeedSequence) -> Iterator[Pixels]:
             stages[shot.light] = Stage(Geometry(surfaces), scene.lights[shot.light], scene.sky)
         cameras = shot.moments or [shot.camera]
         yield expose(stages[shot.light], cameras, shot.lens, np.random.default_rng(noise))
+
+
+def generate_all(
+    scenes: Sequence[tuple[Task, Path]], workers: int | None = None, progress: Progress | None = None
+) -> None:
+    """Draws every scene (task, folder) that is missing; `progress` gets (done, total) as scenes are completed.
+
+    workers: processes; by default one for each core that this process may use; 1 draws here. Interrupted, it completes
+    the scenes that are being drawn. Raises WorkersLost where workers die.
+    """
+    missing = [scene for scene in scenes if not (scene[1] / scene[0].name).is_dir()]
+    report = progress or (lambda done, total: None)
+    done = len(scenes) - len(missing)
+    report(done, len(scenes))
+    count = min(workers or min(cores(), MAX_PROCESSES), len(missing))
+    if count > 1:
+        compile_together(KERNELS)  # once, rather than in each of them
+    execution = Execution("processes" if count > 1 else "threads", max(count, 1))
+    with WorkerPool(execution, ("fmtorch.scenes.generate",), needs_main=False) as pool:
+        for _ in TaskRunner(pool, Local(None), _generated, lambda scene, path: None).each(missing):
+            done += 1
+            report(done, len(scenes))
+
+
+def _generated(_: None, scene: tuple[Task, Path]) -> Path:
+    return generate(*scene)
 
 
 def generate(task: Task, folder: Path) -> Path:
@@ -212,89 +231,3 @@ def read(folder: Path) -> tuple[list[tuple[Path, Camera]], list[tuple[int, int]]
         K, R, t = (np.array(c[k], dtype=np.float64) for k in ("K", "R", "t"))
         views.append((folder / c["image"], Camera(K, R, t, (c["size"][0], c["size"][1]))))
     return views, [(i, j) for i, j in record["pairs"]]
-
-
-# Several scenes at a time, each worker a process of its own that draws one scene after another
-
-
-Progress = Callable[[int, int], None]
-_MOST = 8  # workers; each takes some 0.5 GB
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-
-
-def generate_all(
-    jobs: Sequence[tuple[Task, Path]], workers: int | None = None, progress: Progress | None = None
-) -> None:
-    """Draws every scene (task, folder) that is missing; `progress` gets (done, total) as scenes are completed.
-
-    workers: processes; by default one for each core that this process may use; 1 draws here.
-    Raises RuntimeError if a worker fails.
-    """
-    total = len(jobs)
-    missing = [job for job in jobs if not (job[1] / job[0].name).is_dir()]
-    done = total - len(missing)
-    report = progress or (lambda done, total: None)
-    report(done, total)
-    count = min(workers or min(process.cores(), _MOST), len(missing))
-    if count <= 1:
-        for task, folder in missing:
-            generate(task, folder)
-            done += 1
-            report(done, total)
-        return
-    waiting: queue.SimpleQueue[tuple[Task, Path]] = queue.SimpleQueue()
-    for job in missing:
-        waiting.put(job)
-    finished: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-    processes = [process.start("fmtorch.scenes.generate", **_ONE_THREAD) for _ in range(count)]
-    threads = [threading.Thread(target=_feed, args=(p, waiting, finished), daemon=True) for p in processes]
-    try:
-        compile_together(KERNELS)  # once, while the workers start, rather than in each of them
-        for thread in threads:
-            thread.start()
-        for _ in missing:
-            problem = finished.get()
-            if problem is not None:
-                raise RuntimeError(f"a worker that drew scenes failed: {problem}")
-            done += 1
-            report(done, total)
-    finally:
-        for worker in processes:
-            if done < total:
-                worker.terminate()
-            assert worker.stdin is not None
-            worker.stdin.close()
-            worker.wait()
-
-
-def _feed(
-    process: subprocess.Popen[str],
-    waiting: queue.SimpleQueue[tuple[Task, Path]],
-    finished: queue.SimpleQueue[str | None],
-) -> None:
-    assert process.stdin is not None
-    assert process.stdout is not None
-    while True:
-        try:
-            task, folder = waiting.get_nowait()
-        except queue.Empty:
-            return
-        try:
-            process.stdin.write(json.dumps({"folder": str(folder), "task": dataclasses.asdict(task)}) + "\n")
-            process.stdin.flush()
-            answer = process.stdout.readline().strip()
-        except (OSError, ValueError) as error:
-            answer = str(error)
-        problem = None if answer == task.name else f"{task.name}: {answer or 'the process ended (see its messages)'}"
-        finished.put(problem)
-        if problem is not None:
-            return
-
-
-def main() -> None:
-    """Draw the scenes that standard input names, one JSON object a line, and tell of each when it is complete."""
-    for line in sys.stdin:
-        job = json.loads(line)
-        task = Task.from_json(json.dumps(job["task"]))
-        generate(task, Path(job["folder"]))
-        print(task.name, flush=True)

@@ -1,23 +1,40 @@
-"""Patch networks as ONNX files, in float32 or quantised to int8, checked against torch."""
+"""Patch networks as ONNX files, in float32 or quantised to int8, laid out for ONNX Runtime's CPU kernels.
+
+The layout is another, the network the same, in less time:
+
+- A convolution that sees its whole input at once is a matrix product of one row a patch. As one product of all patches
+  it reads its weights once, not once a patch: a fifth of HardNet's time in fp32.
+- In int8 a convolution is a matrix product of one row a pixel, and each row costs some time of its own, however short
+  it is. Where there are few channels, one row gives the outputs of several pixels beside one another: its kernel is as
+  much wider, with zeros in the columns that a pixel does not see, and steps over them all.
+
+int8 networks keep their outputs to the last bit where the processor sums products of bytes exactly (VNNI; older ones
+saturate), those in fp32 up to the order of a sum.
+"""
 
 from __future__ import annotations
 
 import copy
 import tempfile
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import onnx
 import torch
 from jaxtyping import Float
+from numpy.typing import NDArray
+from onnx import helper, numpy_helper
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from fmtorch.features.onnx_network import PatchNetwork
-from fmtorch.training.onnx_layout import lay_out
-from fmtorch.training.onnx_origin import forget_origin
+from fmtorch.core.files import replacing
+from fmtorch.features.onnx_network import PATCH_SHAPE, PatchNetwork
+from fmtorch.training.export import expect_equal, forget_origin, onnx_model
 
-ATOL = 1e-4  # of torch against ONNX
-OPSET = 18
+OUTPUTS = 64  # of a row, channels times pixels, where there are fewer channels than `FEW_CHANNELS`
+OUTPUTS_OF_GREY = 128  # where the input has one channel, and a pixel's row is 9 numbers
+FEW_CHANNELS = 32
 
 
 def fused(network: nn.Module) -> nn.Module:
@@ -35,27 +52,12 @@ def fused(network: nn.Module) -> nn.Module:
 
 def export(network: nn.Module, path: Path) -> None:
     """Write a network as ONNX, input (N, 1, 32, 32) with N free; ArithmeticError where ONNX Runtime disagrees."""
-    small = fused(network)
     example = torch.rand(4, 1, 32, 32, generator=torch.Generator().manual_seed(0))
+    model = onnx_model(fused(network), example, "patches", "out", free_axis=0)
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(path.name + ".tmp")
-    program = torch.onnx.export(
-        small, (example,), dynamo=True, opset_version=OPSET, input_names=["patches"], output_names=["out"],
-        dynamic_shapes={"patches": {0: torch.export.Dim("n", min=1)}}, verbose=False,
-    )  # fmt: skip
-    assert program is not None
-    program.save(str(unfinished))
-    _without_origin(unfinished)
-    check(network, unfinished, example)
-    unfinished.replace(path)
-
-
-@torch.no_grad()
-def check(network: nn.Module, path: Path, patches: Float[Tensor, "n 1 32 32"]) -> None:
-    """ArithmeticError where the file's output is further than `ATOL` from the network's."""
-    apart = float((PatchNetwork(path)(patches) - network.eval()(patches)).abs().max())
-    if not apart <= ATOL:
-        raise ArithmeticError(f"{path}: ONNX Runtime differs from torch by {apart:.1e}, more than {ATOL:.0e}")
+    with replacing(path) as unfinished, torch.no_grad():
+        onnx.save(model, unfinished)
+        expect_equal(path, PatchNetwork(unfinished)(example), network.eval()(example))
 
 
 def quantize(source: Path, path: Path, patches: Float[Tensor, "n 1 32 32"]) -> None:
@@ -81,21 +83,152 @@ def quantize(source: Path, path: Path, patches: Float[Tensor, "n 1 32 32"]) -> N
             return None if part is None else {"patches": part.numpy()}
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory() as folder:
-        prepared, unfinished = Path(folder) / "prepared.onnx", path.with_name(path.name + ".tmp")
+    with tempfile.TemporaryDirectory() as folder, replacing(path) as unfinished:
+        prepared = Path(folder) / "prepared.onnx"
         quant_pre_process(str(source), str(prepared), skip_symbolic_shape=True)
         quantize_static(
             str(prepared), str(unfinished), Reader(), quant_format=QuantFormat.QDQ, per_channel=True,
             activation_type=QuantType.QUInt8, weight_type=QuantType.QInt8, op_types_to_quantize=["Conv", "Relu"],
             calibrate_method=CalibrationMethod.MinMax,
         )  # fmt: skip
-    _without_origin(unfinished)
-    lay_out(unfinished)
-    unfinished.replace(path)
+        model = onnx.load(unfinished)
+        forget_origin(model)
+        onnx.save(model, unfinished)
+        lay_out(unfinished)
 
 
-def _without_origin(path: Path) -> None:
-    """Write a file anew without the exporter's notes of source lines."""
-    model = onnx.load(path)
-    forget_origin(model)
-    onnx.save(model, path)
+def lay_out(path: Path) -> None:
+    """Write a file's network anew in another layout (`laid_out`)."""
+    onnx.save(laid_out(onnx.load(path), PATCH_SHAPE[-1]), path)
+
+
+def laid_out(model: onnx.ModelProto, side: int) -> onnx.ModelProto:
+    """The network in another layout.
+
+    Args:
+        model: a chain of convolutions, in fp32 or as ``onnxruntime.quantization`` quantises it (QDQ); not changed.
+        side: height and width of its input.
+    """
+    changed = onnx.ModelProto()
+    changed.CopyFrom(model)
+    graph = _Graph(changed.graph)
+    for node in [node for node in changed.graph.node if node.op_type == "Conv"]:
+        channels, inputs, _, width = graph.weights(node).shape
+        seen, side = side, graph.output_side(node, side)
+        if side == 1 and width == seen:
+            graph.make_product(node)
+        elif graph.quantised(node):
+            graph.widen(node, side, _pixels(inputs, channels, side))
+    del changed.graph.value_info[:]  # shapes within, which were of the layout before
+    onnx.checker.check_model(changed)
+    return changed
+
+
+def _pixels(inputs: int, channels: int, side: int) -> int:
+    """How many pixels a row should have: a power of two that divides the side, as few as give the outputs wanted."""
+    if inputs > 1 and channels >= FEW_CHANNELS:
+        return 1
+    wanted, pixels = OUTPUTS_OF_GREY if inputs == 1 else OUTPUTS, 1
+    while pixels * channels < wanted and side % (2 * pixels) == 0:
+        pixels *= 2
+    return pixels
+
+
+class _Graph:
+    """The nodes of a chain of convolutions, by what they read and write."""
+
+    def __init__(self, graph: Any) -> None:
+        self.graph = graph
+        self.constants = {tensor.name: tensor for tensor in graph.initializer}
+        self.writer = {name: node for node in graph.node for name in node.output}
+
+    def quantised(self, convolution: Any) -> bool:
+        return convolution.input[1] not in self.constants
+
+    def weights(self, convolution: Any) -> NDArray[Any]:
+        """The weights of a convolution as they are kept, (outputs, inputs, height, width)."""
+        name = convolution.input[1]
+        return numpy_helper.to_array(
+            self.constants[self.writer[name].input[0] if self.quantised(convolution) else name]
+        )
+
+    def output_side(self, convolution: Any, side: int) -> int:
+        """Width of a convolution's output."""
+        ways = _attributes(convolution)
+        around = ways["pads"].ints[1] + ways["pads"].ints[3]
+        return int(side + around - self.weights(convolution).shape[3]) // int(ways["strides"].ints[1]) + 1
+
+    def widen(self, convolution: Any, side: int, pixels: int) -> None:
+        """Have each row of a convolution give several pixels beside one another. side: of the convolution's output."""
+        if pixels == 1:
+            return
+        ways, weights = _attributes(convolution), self.weights(convolution)
+        step = int(ways["strides"].ints[1])
+        channels, inputs, height, width = weights.shape
+        wide = np.zeros((pixels, channels, inputs, height, (pixels - 1) * step + width), weights.dtype)
+        for pixel, kernel in enumerate(wide):
+            kernel[..., pixel * step : pixel * step + width] = weights
+        quantised = self.writer[convolution.input[1]]
+        self._put(quantised.input[0], wide.reshape(-1, *wide.shape[2:]))
+        for name in (*quantised.input[1:], *self.writer[convolution.input[2]].input):
+            self._put(name, np.tile(numpy_helper.to_array(self.constants[name]), pixels))
+        ways["strides"].ints[1], ways["kernel_shape"].ints[1] = pixels * step, wide.shape[-1]
+        self._split_rows(self._reader(convolution.output[0]).output[0], side, channels)
+
+    def make_product(self, convolution: Any) -> None:
+        """Write a convolution that sees its whole input at once as a matrix product of all patches."""
+        weights, written = self.weights(convolution), convolution.output[0]
+        flat = weights.reshape(len(weights), -1)
+        if self.quantised(convolution):
+            quantised, before = self.writer[convolution.input[1]], self.writer[convolution.input[0]]
+            self._put(quantised.input[0], flat.T)  # (inputs, outputs): what ONNX Runtime has an int8 product for
+            quantised.attribute[0].i = 1  # the axis of the outputs
+            self._flatten(before, before.input[0])
+            written, ways = self._reader(written).output[0], []
+        else:
+            self._put(convolution.input[1], flat)
+            self._flatten(convolution, convolution.input[0])
+            ways = [helper.make_attribute("transB", 1)]
+        convolution.op_type = "Gemm"
+        del convolution.attribute[:]
+        convolution.attribute.extend(ways)
+        self._reshape_for_reader(written, [0, len(weights), 1, 1])
+
+    def _flatten(self, reader: Any, name: str) -> None:
+        """Have a node read (n, inputs) for (n, channels, height, width)."""
+        shape = self._constant(f"{name}_shape", [0, -1])
+        self._insert_before(reader, "Reshape", [name, shape], f"{name}_flat")
+        reader.input[0] = f"{name}_flat"
+
+    def _split_rows(self, name: str, side: int, channels: int) -> None:
+        """(n, pixels * channels, side, side / pixels) -> (n, channels, side, side), for whoever reads it."""
+        reader = self._reader(name)
+        shape = self._constant(f"{name}_shape", [0, side, side, channels])
+        self._insert_before(reader, "Transpose", [name], f"{name}_rows", perm=[0, 2, 3, 1])
+        self._insert_before(reader, "Reshape", [f"{name}_rows", shape], f"{name}_pixels")
+        self._insert_before(reader, "Transpose", [f"{name}_pixels"], f"{name}_channels", perm=[0, 3, 1, 2])
+        reader.input[0] = f"{name}_channels"
+
+    def _reshape_for_reader(self, name: str, shape: list[int]) -> None:
+        reader = self._reader(name)
+        self._insert_before(reader, "Reshape", [name, self._constant(f"{name}_shape", shape)], f"{name}_whole")
+        reader.input[0] = f"{name}_whole"
+
+    def _reader(self, name: str) -> Any:
+        (reader,) = [node for node in self.graph.node if name in node.input]
+        return reader
+
+    def _insert_before(self, node: Any, operator: str, inputs: list[str], output: str, **attributes: Any) -> None:
+        inserted = helper.make_node(operator, inputs, [output], f"{output}_{operator}", **attributes)
+        self.graph.node.insert(list(self.graph.node).index(node), inserted)
+
+    def _constant(self, name: str, values: list[int]) -> str:
+        self.graph.initializer.append(numpy_helper.from_array(np.array(values, np.int64), name))
+        return name
+
+    def _put(self, name: str, values: NDArray[Any]) -> None:
+        self.constants[name].CopyFrom(numpy_helper.from_array(np.ascontiguousarray(values), name))
+
+
+def _attributes(node: Any) -> dict[str, Any]:
+    return {attribute.name: attribute for attribute in node.attribute}

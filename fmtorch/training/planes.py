@@ -26,11 +26,56 @@ from fmtorch.data.cameras import relative_pose
 from fmtorch.data.images import read_image
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.scenes.camera import Camera, calibration
-from fmtorch.training.photographs import Photograph
-from fmtorch.training.warps import Matrix, change_camera, change_light, grey_of, warp
+
+SUFFIXES = {".jpg", ".jpeg", ".png", ".ppm", ".tif", ".tiff"}
 
 VERSION = 1  # of the views: raised by every change that changes one
 _QUALITY = 92  # of the JPEG files; `change_camera` may have compressed the view before
+
+Grey = NDArray[np.uint8]
+Matrix = NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True)
+class Photograph:
+    """A file and the source it comes from; photographs of one source never serve both training and validation."""
+
+    path: Path
+    source: str
+
+
+def list_photographs(
+    folder: Path | str, sources: Sequence[str] | None = None, excluded: Sequence[str] = ()
+) -> list[Photograph]:
+    """The photographs of a folder, in a fixed order.
+
+    The source is the fourth column of ``sources.txt`` (file width height source path) where the folder has one, with
+    the path appended after a colon for `excluded`; else the subfolder, or for files at the top the file itself.
+    sources: only these; None: all. excluded: parts of "source:path" that are left out.
+    Raises FileNotFoundError where the folder is absent, ValueError where nothing is left.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder} is no folder of photographs")
+    table = folder / "sources.txt"
+    if table.is_file():
+        rows = [line.split(maxsplit=4) for line in table.read_text().splitlines() if line and not line.startswith("#")]
+        photographs = [(folder / row[0], row[3], f"{row[3]}:{row[4]}") for row in rows]
+    else:
+        files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
+        names = [path.relative_to(folder) for path in files]
+        photographs = [
+            (path, str(name.parent if len(name.parts) > 1 else name), str(name))
+            for path, name in zip(files, names, strict=True)
+        ]
+    kept = [
+        Photograph(path, source)
+        for path, source, full in photographs
+        if (sources is None or source in sources) and not any(part in full for part in excluded)
+    ]
+    if not kept:
+        raise ValueError(f"{folder}: none of its {len(photographs)} photographs is left by sources and excluded")
+    return kept
 
 
 @dataclasses.dataclass(frozen=True)
@@ -194,6 +239,69 @@ def plane_depth(camera: Camera, points: Matrix) -> Matrix:
     depth = -camera.centre[2] / (rays @ camera.R)[:, 2]
     inside = (points >= -0.5).all(1) & (points < np.array([w, h]) - 0.5).all(1)
     return np.where(inside & (depth > 0), depth, np.nan)
+
+
+def warp(image: Grey, H: Matrix, size: tuple[int, int]) -> Grey:
+    """The view of an image under a homography, drawn finer and then reduced by areas where it shrinks the image."""
+    h, w = size
+    centre = np.array([[(image.shape[1] - 1) / 2, (image.shape[0] - 1) / 2]])
+    smallest = float(np.linalg.svd(local_affine(H, centre)[0], compute_uv=False)[-1])
+    fine = int(np.clip(math.ceil(1 / smallest - 0.25), 1, 4))
+    up = np.array([[fine, 0, (fine - 1) / 2], [0, fine, (fine - 1) / 2], [0, 0, 1.0]])
+    view = cv2.warpPerspective(
+        image, up @ H, (w * fine, h * fine), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
+    )
+    return view if fine == 1 else cv2.resize(view, (w, h), interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
+
+
+def local_affine(H: Matrix, points: Matrix) -> Matrix:
+    """The derivative (n, 2, 2) of a homography at points (n, 2)."""
+    mapped = np.c_[points, np.ones(len(points))] @ H.T
+    out = mapped[:, :2] / mapped[:, 2:]
+    return (H[None, :2, :2] - out[:, :, None] * H[None, None, 2, :2]) / mapped[:, 2, None, None]  # type: ignore[no-any-return]
+
+
+def grey_of(rng: np.random.Generator, image: NDArray[np.uint8]) -> Grey:
+    """A grey image of an RGB one with random weights of the channels, as under light of another colour."""
+    if image.ndim == 2:
+        return image
+    weights = rng.dirichlet([3.0, 5.0, 2.0])
+    return np.clip(image @ weights, 0, 255).astype(np.uint8)
+
+
+def change_light(rng: np.random.Generator, image: Grey) -> Grey:
+    """Gamma, contrast, brightness and soft shadows, at random."""
+    x = image.astype(np.float32) / 255
+    x = x ** np.float32(math.exp(rng.uniform(-0.5, 0.5)))
+    if rng.random() < 0.6:
+        coarse = rng.normal(0, rng.uniform(0.1, 0.4), (int(rng.integers(2, 6)), int(rng.integers(2, 6))))
+        field = cv2.resize(coarse.astype(np.float32), image.shape[::-1], interpolation=cv2.INTER_CUBIC)
+        x = x * np.exp(field)
+    low, high = float(x.min()), float(x.max())
+    bottom, top = rng.uniform(-0.1, 0.2), rng.uniform(0.65, 1.15)
+    x = bottom + (x - low) / max(high - low, 1e-6) * (top - bottom)
+    return (np.clip(x, 0, 1) * 255).round().astype(np.uint8)
+
+
+def change_camera(rng: np.random.Generator, image: Grey) -> Grey:
+    """Blur of focus or of motion, noise and JPEG compression, at random."""
+    choice = rng.random()
+    if choice < 0.4:
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), rng.uniform(0.3, 1.6)), np.uint8)
+    elif choice < 0.55:
+        length, angle = int(rng.integers(3, 9)), rng.uniform(0, 180)
+        line = np.zeros((length, length), np.float32)
+        line[length // 2] = 1
+        turn = cv2.getRotationMatrix2D(((length - 1) / 2, (length - 1) / 2), angle, 1.0)
+        kernel = np.asarray(cv2.warpAffine(line, turn, (length, length)), np.float32)
+        image = np.asarray(cv2.filter2D(image, -1, kernel / max(float(kernel.sum()), 1e-6)), np.uint8)
+    if rng.random() < 0.6:
+        noise = rng.normal(0, rng.uniform(1, 9), image.shape)
+        image = np.clip(image + noise, 0, 255).round().astype(np.uint8)
+    if rng.random() < 0.6:
+        _, coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(25, 95))])
+        image = np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), np.uint8)
+    return image
 
 
 def _log_uniform(rng: np.random.Generator, limits: tuple[float | int, float | int]) -> float:

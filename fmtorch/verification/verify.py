@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast, get_args
 
 from fmtorch import presets
-from fmtorch.core.arguments import number
+from fmtorch.core.checks import number
 from fmtorch.core.stages import Estimator, model_of
 from fmtorch.core.version import __version__
 from fmtorch.io.colmap import (

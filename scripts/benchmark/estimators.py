@@ -47,7 +47,7 @@ def add_arguments(commands: Any) -> None:
     matched.add_arguments(parser)
     parser.add_argument("--estimators", nargs="+", default=[], help="PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...]")
     parser.add_argument("--specs", type=Path, help="a file with one estimator a line; # starts a comment")
-    parser.add_argument("--ngransac", type=Path, help="NG-RANSAC's published weights (scripts/convert_ngransac.py)")
+    parser.add_argument("--ngransac", type=Path, help="NG-RANSAC's published weights (scripts/make_models.py ngransac)")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--rows", type=Path, help="keep what each estimator makes of each pair here, one line each")
     parser.add_argument("--json", type=Path, help="write the figures here")

@@ -22,7 +22,7 @@ from fmtorch.data.images import to_grey
 from fmtorch.features import SIFT, DominantGradient, HessianDetector, ImagePyramid, PatchSIFT, local_feature
 from fmtorch.matching import NearestNeighborMatcher
 from fmtorch.scenes.textures import photograph
-from fmtorch.training.onnx_layout import lay_out
+from fmtorch.training.onnx_export import lay_out
 
 OURS = "ours"
 

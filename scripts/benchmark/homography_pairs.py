@@ -13,8 +13,7 @@ from rich.progress import track
 
 from fmtorch import match
 from fmtorch.core.types import Correspondences
-from fmtorch.training.photographs import Photograph
-from fmtorch.training.planes import PlanePairs, PlaneViews
+from fmtorch.training.planes import Photograph, PlanePairs, PlaneViews
 from scripts.benchmark.matched import console
 
 Array = NDArray[Any]

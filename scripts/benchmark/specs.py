@@ -106,7 +106,7 @@ def pruned_by(pruners: Sequence[Stage], pair: ImagePair, c: Correspondences) -> 
 def ngransac(file: Path) -> Stage:
     """The network of neural-guided RANSAC (Brachmann & Rother, ICCV 2019) as prior: its weights of samples."""
     if not file.is_file():
-        raise SystemExit(f"--ngransac {file}: no such file; scripts/convert_ngransac.py makes it")
+        raise SystemExit(f"--ngransac {file}: no such file; scripts/make_models.py ngransac makes it")
     network = {"_target_": "fmtorch.pruning.networks.LC", "side": ["ratio"]}
     stage: Stage = presets.build("pruner", "lc", soft=True, network=network, file=str(file))
     return stage

@@ -118,7 +118,7 @@ def test_cached_features_take_no_seconds_and_changed_stages_are_named(photograph
 def test_a_training_says_how_its_file_is_used(words: tuple[str, ...]) -> None:
     """As a prior, with the presets that the training had."""
     pytest.importorskip("lightning")
-    from fmtorch.training.pruners.run import use_line
+    from fmtorch.training.run import use_line
 
     said = use_line("mine", Path("runs/a b.onnx"), ["pruner=mine", *words])
     assert shlex.split(said) == [

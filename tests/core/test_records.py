@@ -12,7 +12,7 @@ from torch import Tensor
 
 from fmtorch.core.records import Record, expect_fields, slotted
 from fmtorch.core.types import Correspondences, Estimate, Features
-from fmtorch.pipeline.labelled.record import LabelledMatches
+from fmtorch.training.labelled import LabelledMatches
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

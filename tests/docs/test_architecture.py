@@ -16,7 +16,7 @@ from tests.laws import scene
 
 PACKAGE = Path(fmtorch.__file__).parent
 PAGE = (PACKAGE.parent / "docs" / "architecture.md").read_text(encoding="utf-8")
-PASSED_ON = {"parts/preselection.py", "parts/refinement.py", "parts/selection.py"}  # models to scores and family
+PASSED_ON = {"preselection.py", "refinement.py", "selection.py"}  # models to scores and family
 
 
 def short(path: str | Path) -> str:

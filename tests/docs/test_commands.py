@@ -42,7 +42,7 @@ ELSEWHERE = {
     r"python3? -m venv|pip install": "a fresh environment: continuous integration runs these",
     r"python -m pytest|ruff check|sphinx-build": "what continuous integration does",
     r"scripts/download": "tests/test_download.py runs it against a server of its own",
-    r"convert_ngransac": "needs the authors' weights; tests/pruning/networks/test_files.py runs it on others",
+    r"make_models.py ngransac": "needs the authors' weights; tests/pruning/networks/test_files.py runs it on others",
     r"benchmark homography": "needs a folder of photographs; tests/estimators/models/test_homography.py warps one",
     r"benchmark configuration": "needs photographs; tests/scripts/test_benchmark_configuration.py runs it on some",
     r"\bdask (scheduler|worker)\b": "tests/evaluation/test_executors.py runs a cluster",

@@ -13,8 +13,7 @@ import torch
 from rich.console import Console
 
 from fmtorch import presets
-from fmtorch.core.estimate import CONFIGURATIONS, WARNINGS
-from fmtorch.core.types import Correspondences
+from fmtorch.core.types import CONFIGURATIONS, WARNINGS, Correspondences
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.data.pairs import GivenMatches
 from fmtorch.evaluation import tables

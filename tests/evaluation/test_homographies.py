@@ -15,9 +15,9 @@ from fmtorch.commands import report as report_command
 from fmtorch.data import load
 from fmtorch.evaluation.rows import homography_figures
 from fmtorch.metrics import corner_error, pose_auc
-from fmtorch.pipeline.labelled import MatchedPairs
 from fmtorch.presets.composition import compose
 from fmtorch.runs import RunFolder
+from fmtorch.training import MatchedPairs
 from tests.data import planes
 
 

@@ -158,9 +158,9 @@ def test_pipelines_of_the_systems_table(name: str) -> None:
 def test_networks_are_read_when_first_used(tmp_path: Path) -> None:
     missing = tmp_path / "mine.onnx"
     extract = local_feature("hessian", {"name": "hardnet", "network": str(missing)}, shape=None)
-    with pytest.raises(ValueError, match=r"mine\.onnx.*export_onnx"):
+    with pytest.raises(ValueError, match=r"mine\.onnx.*patch_networks.export"):
         extract(texture(4))
-    with pytest.raises(ValueError, match=r"mine\.onnx.*export_onnx"):
+    with pytest.raises(ValueError, match=r"mine\.onnx.*patch_networks.export"):
         CachedFeatures(extract, ArrayCache(tmp_path))
 
 

@@ -91,7 +91,7 @@ def test_other_shapes_of_patches_are_refused(hardnet: Path) -> None:
 
 
 def test_an_absent_file_is_named_with_what_makes_it(tmp_path: Path) -> None:
-    with pytest.raises(NetworkFileError, match=r"absent\.onnx does not exist: python scripts/export_onnx\.py"):
+    with pytest.raises(NetworkFileError, match=r"absent\.onnx does not exist: scripts\.patch_networks\.export"):
         PatchNetwork(tmp_path / "absent.onnx")(torch.zeros(1, 1, 32, 32))
     for use in (lambda n: n(torch.zeros(1, 1, 32, 32)), lambda n: n.identity):
         with pytest.raises(

@@ -111,11 +111,11 @@ def test_a_projection_that_is_absent_or_broken(tmp_path: object) -> None:
 
     folder = Path(str(tmp_path))
     pyramid, lafs = ImagePyramid(texture(5)), random_frames(5, 2, 160, 200)
-    with pytest.raises(FileNotFoundError, match=r"absent\.npz.*learn_pca"):
+    with pytest.raises(FileNotFoundError, match=r"absent\.npz.*make_models"):
         RootSIFTPCA(model=folder / "absent.npz")(pyramid, lafs)
     (folder / "text.npz").write_text("no projection")
     np.savez(folder / "shape.npz", mean=np.zeros(5), basis=np.zeros((128, 80)))
     np.savez(folder / "names.npz", average=np.zeros(128))
     for name in ("text", "shape", "names"):
-        with pytest.raises(ValueError, match=rf"{name}\.npz.*learn_pca"):
+        with pytest.raises(ValueError, match=rf"{name}\.npz.*make_models"):
             RootSIFTPCA(model=folder / f"{name}.npz")(pyramid, lafs)

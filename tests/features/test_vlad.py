@@ -19,7 +19,7 @@ from fmtorch.features.vlad import (
     local_descriptors,
     vlad,
 )
-from scripts.learn_codebook import k_means, learned
+from scripts.make_models import k_means, learned
 from tests.reference import vlad as reference
 
 
@@ -97,7 +97,9 @@ def test_the_shipped_codebooks_are_those_of_the_card(name: str, kind: str) -> No
 
 
 def test_files_that_are_no_codebook_are_told(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"no such file; make it with `python scripts/learn_codebook\.py`"):
+    with pytest.raises(
+        FileNotFoundError, match=r"no such file; make it with `python scripts/make_models\.py codebooks`"
+    ):
         load_codebook(tmp_path / "none.npz")
     (tmp_path / "text.npz").write_text("text")
     with pytest.raises(ValueError, match=r"text\.npz: no file with mean, basis, centers"):

@@ -20,7 +20,7 @@ import pytest
 from fmtorch.jit import cache as files
 from fmtorch.jit import kernel as messages
 from fmtorch.jit import kernel as switch
-from fmtorch.jit import process, together
+from fmtorch.jit import together
 from fmtorch.jit.kernel import Inner, Kernel, inner, kernel
 from fmtorch.jit.lanes import fused
 from tests.processes import run_command
@@ -184,9 +184,6 @@ def test_a_log_gets_one_line_and_a_terminal_a_passing_one(
     messages.begun("rows", "for this machine", "3 of 40: ")
     messages.ended()
     assert capsys.readouterr().err == "\r\x1b[K3 of 40: compiling rows for this machine\r\x1b[K"
-    monkeypatch.setenv(messages.QUIET, "1")
-    messages.begun("rows", "for this machine")
-    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("importable", [True, False])
@@ -195,27 +192,34 @@ def test_two_processes_compile_together(
 ) -> None:
     """What the other process cannot compile is compiled here."""
     monkeypatch.setenv("PYTHONPATH", str(tmp_path) if importable else "")
-    monkeypatch.setattr(process, "cores", lambda: 2)
+    monkeypatch.setattr(together, "cores", lambda: 2)
     both = [module.rows, module.scaled_squares]
     assert not any(each.ready or each.kept for each in both)
     together.compile_together(both)
     assert all(each.ready and each.kept for each in both)
     assert len(list(cache.rglob("*.bin"))) == 2
     assert result(module) == EXPECTED
-    monkeypatch.setattr(together, "_helper", None)  # is not asked again
+    monkeypatch.setattr(together, "_helped", None)  # is not asked again
     together.compile_together(both)
 
 
 def test_the_other_process_compiles_what_it_is_told(module: types.ModuleType, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "fmtorch.jit.process", "fmtorch.jit.together"]
+    command = [sys.executable, "-m", "fmtorch.jit.together", "some_kernels:rows"]
     path = os.pathsep.join([str(REPOSITORY), str(tmp_path)])
-    done = subprocess.run(
-        command, input="some_kernels rows 1 of 1: \n", capture_output=True, text=True, check=True,
-        env={**os.environ, "PYTHONPATH": path},
-    )  # fmt: skip
-    assert done.stdout.split() == ["ready", "rows"]
-    assert "1 of 1: compiling rows" in done.stderr
+    helper = subprocess.Popen(command, stdin=subprocess.PIPE, env={**os.environ, "PYTHONPATH": path})
+    assert helper.wait(300) == 0
     assert module.rows.kept
+    assert not module.scaled_squares.kept
+
+
+def test_the_other_process_ends_with_the_one_that_asked(tmp_path: Path) -> None:
+    (tmp_path / "endless.py").write_text("import time\ntime.sleep(300)\n")
+    command = [sys.executable, "-m", "fmtorch.jit.together", "endless:rows"]
+    path = os.pathsep.join([str(REPOSITORY), str(tmp_path)])
+    helper = subprocess.Popen(command, stdin=subprocess.PIPE, env={**os.environ, "PYTHONPATH": path})
+    assert helper.stdin is not None
+    helper.stdin.close()
+    assert helper.wait(60) == 1
 
 
 def test_the_folder_depends_on_what_decides_the_machine_code(monkeypatch: pytest.MonkeyPatch) -> None:

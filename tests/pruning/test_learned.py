@@ -19,7 +19,7 @@ from fmtorch.pruning import LearnedPruner
 from fmtorch.pruning.networks import DFE, LC
 from fmtorch.pruning.networks.files import learned_file
 from fmtorch.runs.fingerprint import configuration, learned
-from fmtorch.training.pruner_export import export_onnx, save_weights
+from fmtorch.training.export import export_onnx, save_weights
 from tests.laws import scene
 
 K = torch.tensor([[[800.0, 0, 480], [0, 800, 320], [0, 0, 1]]])

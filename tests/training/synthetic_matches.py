@@ -9,7 +9,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry import fundamental_from_projections
-from fmtorch.pipeline.labelled import LabelledMatches, collate
+from fmtorch.training import LabelledMatches, collate
 
 SIZE = 480, 640
 FOCAL = 600.0

@@ -14,8 +14,7 @@ from torch import Tensor
 from fmtorch.core.files import models_dir
 from fmtorch.features.networks import ARCHITECTURES, build
 from fmtorch.features.onnx_network import PatchNetwork
-from fmtorch.training.onnx_export import export, quantize
-from fmtorch.training.onnx_layout import laid_out
+from fmtorch.training.onnx_export import export, laid_out, quantize
 from tests.features.test_networks import randomized
 
 SHIPPED = [

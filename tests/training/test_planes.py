@@ -11,11 +11,18 @@ import torch
 
 from fmtorch.data import DepthDataset, ImagePair
 from fmtorch.data.images import ImageError
-from fmtorch.pipeline.labelled import MatchedPairs, collate
 from fmtorch.scenes.camera import Camera
-from fmtorch.training.photographs import Photograph, package_photographs
-from fmtorch.training.planes import PlanePairs, PlaneViews, plane_depth, plane_homography, random_camera
-from tests.pipeline.labelled.conftest import SIFT
+from fmtorch.scenes.textures import skimage_file
+from fmtorch.training import MatchedPairs, collate
+from fmtorch.training.planes import (
+    Photograph,
+    PlanePairs,
+    PlaneViews,
+    plane_depth,
+    plane_homography,
+    random_camera,
+)
+from tests.training.conftest import SIFT
 
 SIZE = (300, 400)
 
@@ -32,7 +39,7 @@ def on_plane(x: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def photographs() -> list[Photograph]:
-    return [p for p in package_photographs() if p.path.name in ("chelsea.png", "rocket.jpg")]
+    return [Photograph(skimage_file(name), "scikit-image") for name in ("chelsea.png", "rocket.jpg")]
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +134,7 @@ def test_pairs_of_planes_train_the_classification_alone(planes: PlanePairs, tmp_
     pytest.importorskip("lightning", reason="training needs the extra `train`")
     from fmtorch.pruning.networks import LC
     from fmtorch.pruning.networks.learned import predict
-    from fmtorch.training.pruners.objective import Objective
+    from fmtorch.training.objective import Objective
 
     matched = MatchedPairs(planes, **SIFT, root=tmp_path, workers=1)
     batch = collate([matched[i] for i in range(3)])

@@ -12,10 +12,16 @@ pytest.importorskip("lightning", reason="training needs the extra `train`")
 
 from fmtorch import presets
 from fmtorch.pruning.networks import LC
-from fmtorch.training.pruners.loop import BEST, CHECKPOINTS, latest_checkpoint, train
-from fmtorch.training.pruners.module import Optimisation, PrunerTraining
-from fmtorch.training.pruners.objective import Objective
-from fmtorch.training.pruners.validation import Use, Validation
+from fmtorch.training.loop import (
+    BEST,
+    CHECKPOINTS,
+    Optimisation,
+    PrunerTraining,
+    latest_checkpoint,
+    train,
+)
+from fmtorch.training.objective import Objective
+from fmtorch.training.validation import Use, Validation
 from tests.processes import run_command
 from tests.training.synthetic_matches import batches, labelled_pair
 

@@ -16,9 +16,8 @@ from torch import Tensor
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.geometry import eight_point, fundamental_from_calibration, irls, refine, reweighted_fits
 from fmtorch.jit.random import Stream, uniform
-from fmtorch.training import virtual_points as virtual
-from fmtorch.training.pruner_losses import LIMIT_E, LIMIT_F, classification_loss, geometric_loss, nsgd_loss
-from fmtorch.training.virtual_points import virtual_points
+from fmtorch.training import objective as virtual
+from fmtorch.training.objective import LIMIT_E, LIMIT_F, classification_loss, geometric_loss, nsgd_loss, virtual_points
 from tests import laws
 from tests.metrics.test_nsgd import random_pairs, rows_shifted
 from tests.reference import metrics as metric_reference

@@ -11,12 +11,11 @@ pytest.importorskip("lightning", reason="training needs the extra `train`")
 from fmtorch import presets
 from fmtorch.core.types import Correspondences
 from fmtorch.geometry import eight_point
-from fmtorch.pipeline.labelled import LabelledMatches, collate
 from fmtorch.pruning.networks import LC
 from fmtorch.pruning.networks.learned import Prediction, predict
-from fmtorch.training.pruner_losses import classification_loss, geometric_loss
-from fmtorch.training.pruners.objective import Objective, fits
-from fmtorch.training.pruners.validation import Use, Validation
+from fmtorch.training import LabelledMatches, collate
+from fmtorch.training.objective import Objective, classification_loss, fits, geometric_loss
+from fmtorch.training.validation import Use, Validation
 from tests.training.synthetic_matches import labelled_pair
 
 

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fmtorch.training.reliability import MAX_TEMPERATURE, reliability, temperature
+from fmtorch.training.validation import MAX_TEMPERATURE, reliability, temperature
 from tests.reference import pruner_losses as reference
 from tests.training.test_pruner_losses import generator, labels
 

@@ -15,7 +15,7 @@ pytest.importorskip("lightning", reason="training needs the extra `train`")
 from hydra import compose, initialize_config_dir
 
 from fmtorch.core.files import conf_dir
-from fmtorch.training.pruners.run import run
+from fmtorch.training.run import run
 from tests.conftest import own_cache
 from tests.pipeline.test_pipeline import draw
 from tests.processes import run_command

@@ -120,7 +120,7 @@ class OnnxBackbone:
 def _checked(network: nn.Module, path: Path, metadata: Mapping[str, str]) -> LearnedFile:
     """What a file's metadata says. Raises NetworkFileError where it states another network, or none."""
     if METADATA not in metadata:
-        raise NetworkFileError(f"{path} does not state its network: fmtorch.training.pruner_export makes such files")
+        raise NetworkFileError(f"{path} does not state its network: fmtorch.training.export makes such files")
     try:
         content = json.loads(metadata[METADATA])
         stated = LearnedFile(content["network"], float(content["temperature"]), content["notes"])

@@ -13,16 +13,16 @@ import torch
 from fmtorch.core.types import Correspondences
 from fmtorch.pruning import LearnedPruner
 from fmtorch.pruning.networks import LC
-from scripts.convert_ngransac import ngransac_state
+from scripts.make_models import ngransac_state
 from tests.conftest import oracle, shared_path
 
-SCRIPT = Path(__file__).resolve().parents[3] / "scripts" / "convert_ngransac.py"
+SCRIPT = Path(__file__).resolve().parents[3] / "scripts" / "make_models.py"
 
 
 def convert(checkpoint: Path, out: Path) -> None:
     """Run the script. Raises SystemExit where that fails."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", [str(SCRIPT), str(checkpoint), str(out)])
+        patch.setattr(sys, "argv", [str(SCRIPT), "ngransac", str(checkpoint), str(out)])
         runpy.run_path(str(SCRIPT), run_name="__main__")
 
 

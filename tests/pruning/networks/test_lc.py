@@ -6,7 +6,7 @@ import torch
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.pruning.networks import DFE, LC
 from fmtorch.pruning.networks.layers import Slots
-from scripts.convert_ngransac import ngransac_state
+from scripts.make_models import ngransac_state
 from tests.conftest import oracle
 from tests.laws import scene
 

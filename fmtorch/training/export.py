@@ -1,0 +1,251 @@
+"""What a training leaves: a learned pruner as safetensors and ONNX, and a card that says where it comes from.
+
+Both files state the network that they belong to. The card says how good it is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import dataclasses
+import hashlib
+import importlib.util
+import json
+import logging
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from fmtorch.core.files import replacing
+from fmtorch.pruning.networks.files import INPUT, OUTPUT, LearnedFile, OnnxBackbone, stated_network
+from fmtorch.pruning.networks.layers import Slots
+from fmtorch.pruning.networks.learned import Exportable
+from fmtorch.training.validation import Evaluation, Validation, reliability
+
+ATOL = 1e-4  # of torch against ONNX
+OPSET = 18
+EXAMPLE_MATCHES = 300
+OWN_LICENCE = "Apache-2.0, as this project"
+
+
+def sha256(path: Path) -> str:
+    """Of a file, in hexadecimal."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def save_weights(
+    network: nn.Module, path: Path, *, temperature: float = 1.0, notes: Mapping[str, str] | None = None
+) -> None:
+    """Write a network's weights as safetensors, whole or not at all.
+
+    Args:
+        network: any module; one with an attribute `options` states them in the file.
+        path: to write to; its folder is made.
+        temperature: by which log-odds are divided at inference.
+        notes: what else the file is to say.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    state = {key: value.detach().cpu().contiguous() for key, value in network.state_dict().items()}
+    with replacing(path) as unfinished:
+        save_file(state, unfinished, metadata=_metadata(network, temperature, notes))
+
+
+def export_onnx(
+    network: nn.Module, path: Path, *, temperature: float = 1.0, notes: Mapping[str, str] | None = None
+) -> None:
+    """Write a network's backbone as ONNX: float `matches` (1, channels, N), N free, to `outputs` (1, K, N).
+
+    Needs the extra `export`. Arguments as of `save_weights`.
+    Raises ValueError for a network that is not `Exportable`, ArithmeticError where ONNX Runtime disagrees with torch.
+    """
+    if not isinstance(network, Exportable):
+        raise ValueError(f"{type(network).__name__} has no `backbone`, `input_channels`, `options` and `predict`: "
+                         "it cannot be exported to ONNX, and runs with torch alone")  # fmt: skip
+    outside = [key for key in network.state_dict() if not key.startswith("backbone.")]
+    if outside:
+        raise ValueError(f"{', '.join(outside)}: parameters outside the backbone would not be in the ONNX file")
+    import onnx
+
+    alone = _OnePair(copy.deepcopy(network.backbone)).eval().cpu().float()
+    generator = torch.Generator().manual_seed(0)
+    example = torch.rand(1, network.input_channels, EXAMPLE_MATCHES, generator=generator)
+    model = onnx_model(alone, example, INPUT, OUTPUT, free_axis=2)
+    onnx.helper.set_model_props(model, _metadata(network, temperature, notes))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as unfinished, torch.no_grad():
+        onnx.save(model, unfinished)
+        x = torch.rand(1, network.input_channels, 3 * EXAMPLE_MATCHES)
+        exported = OnnxBackbone(network, unfinished, "")(x, Slots(torch.tensor([float(x.shape[2])]), None))
+        expect_equal(unfinished, exported, alone(x))
+
+
+def onnx_model(network: nn.Module, example: Tensor, name: str, output: str, *, free_axis: int) -> Any:
+    """A module of one input as an ONNX model, one axis of the input of any length, without notes of source lines."""
+    with _quiet():
+        program = torch.onnx.export(
+            network, (example,), dynamo=True, opset_version=OPSET, input_names=[name], output_names=[output],
+            dynamic_shapes=({free_axis: torch.export.Dim("n", min=1)},), verbose=False,
+        )  # fmt: skip
+    assert program is not None
+    model = program.model_proto
+    forget_origin(model)
+    return model
+
+
+def expect_equal(path: Path, exported: Tensor, expected: Tensor) -> None:
+    """Raises ArithmeticError where what a file's network gives is further than `ATOL` from torch's."""
+    apart = float((exported - expected).abs().max())
+    if not apart <= ATOL:
+        raise ArithmeticError(f"{path}: ONNX Runtime differs from torch by {apart:.1e}, more than {ATOL:.0e}")
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without the exporter's messages on operators that are not installed and on its own deprecated calls."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)
+            yield
+    finally:
+        logger.setLevel(level)
+
+
+class _OnePair(nn.Module):
+    """A backbone as a function of one pair's input alone."""
+
+    def __init__(self, backbone: nn.Module) -> None:
+        super().__init__()
+        self.backbone = backbone
+
+    def forward(self, x: Float[Tensor, "1 channels n"]) -> Float[Tensor, "1 outputs n"]:
+        matches = torch.ones_like(x[:, 0]).sum(1)
+        return self.backbone(x, Slots(matches, None))  # type: ignore[no-any-return]
+
+
+def _metadata(network: nn.Module, temperature: float, notes: Mapping[str, str] | None) -> dict[str, str]:
+    return LearnedFile(stated_network(network), float(temperature), dict(notes or {})).metadata()
+
+
+def forget_origin(model: Any) -> None:
+    """Clear the notes and properties of a model's graph, of its nodes and values, and of the graphs within them."""
+    _forget(model.graph)
+    for function in model.functions:
+        _forget_nodes(function.node)
+
+
+def _forget(graph: Any) -> None:
+    for part in (graph, *graph.value_info, *graph.input, *graph.output, *graph.initializer):
+        part.ClearField("metadata_props")
+        part.ClearField("doc_string")
+    _forget_nodes(graph.node)
+
+
+def _forget_nodes(nodes: Any) -> None:
+    for node in nodes:
+        node.ClearField("metadata_props")
+        node.ClearField("doc_string")
+        for attribute in node.attribute:
+            for inner in (*attribute.graphs, *([attribute.g] if attribute.HasField("g") else [])):
+                _forget(inner)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Result:
+    """A finished training: files, figures and the temperature of its log-odds."""
+
+    files: tuple[Path, ...]
+    evaluation: Evaluation
+    temperature: float
+
+
+def write_result(
+    folder: Path, name: str, network: nn.Module, validation: Validation, facts: Mapping[str, Any]
+) -> Result:
+    """Evaluate the best weights of a training and write them into its folder.
+
+    The files are `name` with .safetensors, .md and, where the network can be exported and the extra `export` is
+    installed, .onnx.
+
+    Args:
+        folder: of the training.
+        name: of the files.
+        network: with its best weights.
+        validation: what it is evaluated by.
+        facts: what the card says of the training: `data`, `seconds`, `steps`, `best_step`, `processor`, the identity.
+    """
+    network = network.to("cpu").eval()
+    evaluation = validation(network)
+    temperature = evaluation.temperature()
+    files = [folder / f"{name}.safetensors"]
+    save_weights(network, files[0], temperature=temperature)
+    if isinstance(network, Exportable) and importlib.util.find_spec("onnxscript") is not None:
+        files.append(folder / f"{name}.onnx")
+        export_onnx(network, files[-1], temperature=temperature)
+    card = folder / f"{name}.md"
+    with replacing(card) as temporary:
+        temporary.write_text(model_card(files, facts, evaluation, temperature), encoding="utf-8")
+    with replacing(folder / "validation.json") as temporary:
+        temporary.write_text(json.dumps({**evaluation.figures, "temperature": temperature}, indent=2) + "\n")
+    return Result((*files, card), evaluation, temperature)
+
+
+def model_card(files: Sequence[Path], facts: Mapping[str, Any], evaluation: Evaluation, temperature: float) -> str:
+    """Markdown: what was trained on what, for how long, and how good it is on the validation pairs."""
+    network, optimisation, figures = facts["network"], facts["optimisation"], evaluation.figures
+    options = listed({key: value for key, value in network.items() if key != "_target_"})
+    rows = {
+        "network": str(network["_target_"]).rpartition(".")[2] + (f" ({options})" if options else ""),
+        **{f"SHA-256 of {path.name}": f"`{sha256(path)}`" for path in files},
+        "bytes": ", ".join(str(path.stat().st_size) for path in files),
+        "licence": OWN_LICENCE,
+        "origin": "trained by this project from random weights, fmtorch.train",
+        "trained on": facts["data"]["training"],
+        "validated on": facts["data"]["validation"],
+        "augmentation": listed(facts["augmentation"]),
+        "loss": listed(facts["objective"]),
+        "run": f"{facts['steps']} steps of {facts['batch']} pairs, Adam, learning rate {optimisation['learning_rate']} "
+        f"falling to zero over the last {100 * optimisation['decay']:.0f} %, seed {facts['seed']}, "
+        f"{facts['seconds'] / 60:.0f} minutes on {facts['processor']}; weights of step {facts['best_step']}",
+        "temperature": f"{temperature:.3f}, fitted on validation",
+    }
+    lines = [f"# {files[0].stem}", "", "| | |", "| --- | --- |", *(f"| {k} | {v} |" for k, v in rows.items()), ""]
+    uses = sorted({key.split("/")[0] for key in figures if key.endswith("/AUC@0.05")})
+    families = sorted({key.split("/")[2] for key in figures if key.count("/") == 2})
+    keys = {"R.05": "recall@0.05", "R.01": "recall@0.01", "AUC@0.05": "AUC@0.05"}
+    percent = {use: [f"{100 * figures[f'{use}/{key}']:.1f}" for key in keys.values()] for use in uses}
+    lines += ["On the validation pairs (recall in %):", "", *markdown_table("use", keys, percent)]
+    if families:
+        percent = {use: [f"{100 * figures[f'{use}/AUC@0.05/{family}']:.1f}" for family in families] for use in uses}
+        lines += ["", "AUC@0.05 by family:", "", *markdown_table("use", families, percent)]
+    table = reliability(torch.sigmoid(evaluation.logit / temperature), evaluation.label)
+    lines += [
+        "", f"Log loss {figures['log_loss']:.3f} nats a match; with P >= 0.5, precision "
+        f"{100 * figures['match_precision']:.1f} % and recall {100 * figures['match_recall']:.1f} % of the matches. "
+        f"Reliability (expected calibration error {100 * table.error:.1f} %):", "",
+        *markdown_table("P(inlier)", [f"{p:.2f}" for p in table.predicted.tolist()], {
+            "share of inliers": [f"{p:.2f}" for p in table.observed.tolist()],
+            "matches": [str(n) for n in table.matches.tolist()],
+        }),
+    ]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+def markdown_table(corner: str, columns: Iterable[str], rows: Mapping[str, Sequence[str]]) -> list[str]:
+    """The lines of a Markdown table of figures, a column of names first."""
+    names = list(columns)
+    head = [f"| {corner}".rstrip() + " | " + " | ".join(names) + " |", "| --- |" + " ---: |" * len(names)]
+    return [*head, *(f"| {name} | " + " | ".join(values) + " |" for name, values in rows.items())]
+
+
+def listed(options: Mapping[str, Any]) -> str:
+    """Options in a cell of a card's table."""
+    return ", ".join(f"{key} {value}" for key, value in options.items())

@@ -1,0 +1,271 @@
+"""`MatchedPairs`: a data set of image pairs seen through a pipeline's first stages, with labels, kept on disk."""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+
+from fmtorch.core.files import cache_dir
+from fmtorch.core.settings import claim
+from fmtorch.core.types import Correspondences
+from fmtorch.data.pairs import DepthDataset, ImagePair, PairDataset
+from fmtorch.jobs.execution import Execution
+from fmtorch.jobs.pool import WorkerPool
+from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner
+from fmtorch.jobs.threads import use_one_thread
+from fmtorch.pipeline.build import load_pipeline
+from fmtorch.pipeline.pipeline import Outcome, Pipeline
+from fmtorch.runs.feature_cache import CachedFeatures
+from fmtorch.runs.fingerprint import configuration, environment
+from fmtorch.runs.run_folder import identity_digest
+from fmtorch.training import labelled
+from fmtorch.training.augmentation import Augmentation
+from fmtorch.training.stored_matches import FORMAT, Shard, ShardError, StoredMatches, write_shard
+
+MAX_MATCHES = 4000  # matches kept of a pair
+Progress = Callable[[int, int], None]  # called with (pairs done, pairs in all)
+SHARD = 32  # pairs in a file, all of one scene: what an interruption can cost; a change is one of FORMAT
+PRELOADED = (__name__,)  # by the process that workers are forked of
+_IMAGES = 64  # whose features each worker may need again
+_STORED = {
+    **dict.fromkeys(("x0", "x1", "quality", "prior", "noise", "lafs0", "lafs1"), torch.float32), "mutual": torch.uint8,
+    **dict.fromkeys(("K0", "K1"), torch.float64), **dict.fromkeys(("size0", "size1"), torch.int64),
+}  # fmt: skip
+
+
+class MatchedPairs(StoredMatches):
+    """Labelled matches of the pairs of any data set with ground truth; for torch's DataLoader with `collate`.
+
+    Matches are computed once, by `workers` threads, and kept on disk; an interrupted computation goes on where it
+    stopped, a damaged file is computed anew. The folder's name holds a digest of all that defines them: data set,
+    stages before estimation, label rules, libraries. Pairs come ordered by family, scene and images. A pipeline without
+    a ratio test leaves the threshold to the `augmentation`. Several processes may compute the same folder at once: each
+    does all that is missing when it starts, and they agree.
+
+    Args:
+        dataset: image pairs with ground truth; labels are by depth where it is a `DepthDataset`.
+        pipeline: a `Pipeline`, or the name of one of conf/pipeline. Its estimator is not used.
+        overrides: changes of a named pipeline, as on the command line, e.g. ``["pruner=[one_to_one]"]``.
+        root: the folder of such folders, by default ``matched`` in the cache folder.
+        workers: threads, by default one a core. progress: called with (pairs done, pairs in all).
+        most: matches kept of a pair, the best by quality.
+        augmentation, seed: as of `StoredMatches`.
+        execution: other workers than these threads. build: makes the pipeline in other processes, where it is given as
+            an object; pickled, as is the data set.
+
+    Raises ValueError for an unknown pipeline, for one whose stages do not say what defines their results, for an empty
+    data set, for `most` below 1, and where every pair fails.
+
+    Example:
+        >>> from fmtorch.data import load
+        >>> from fmtorch.training import Augmentation, MatchedPairs
+        >>> rendered = load("rendered", split="train", size="full")  # doctest: +SKIP
+        >>> matches = MatchedPairs(
+        ...     rendered, "sift_ratio", overrides=["pruner=[one_to_one]"], augmentation=Augmentation()
+        ... )  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        dataset: PairDataset,
+        pipeline: Pipeline | str,
+        *,
+        overrides: Sequence[str] = (),
+        root: str | Path | None = None,
+        workers: int | None = None,
+        progress: Progress | None = None,
+        most: int = MAX_MATCHES,
+        augmentation: Augmentation | None = None,
+        seed: int = 0,
+        execution: Execution | None = None,
+        build: Callable[[], Pipeline] | None = None,
+    ) -> None:
+        if most < 1:
+            raise ValueError(f"most is {most}; at least 1 match of a pair must be kept")
+        if not len(dataset):
+            raise ValueError(f"the data set {dataset.name} has no pairs")
+        if (model := getattr(dataset, "model", "fundamental")) != "fundamental":
+            raise ValueError(
+                f"the data set {dataset.name} has {model} matrices; matches are labelled by fundamental ones"
+            )
+        stages, execution = pipeline, execution or Execution("threads", workers)
+        if isinstance(stages, str):
+            build = build or functools.partial(load_pipeline, stages, overrides=tuple(overrides))
+            stages = load_pipeline(stages, overrides=overrides)
+        elif overrides:
+            raise ValueError("overrides change a pipeline that is given by name; this one is given as an object")
+        if build is None and not execution.shared:
+            raise ValueError("other processes need to make the pipeline: give its name, or `build`")
+        home = Path(root).expanduser() if root is not None else cache_dir() / "matched"
+        identity = _identity(dataset, stages, most)
+        folder = home / f"{dataset.name}-{identity_digest(identity)[:16]}"
+        claim(folder / "about.json", identity, "matches", "delete the folder", alone=False)
+        pairs = [dataset[i] for i in range(len(dataset))]
+        shards = [[pairs[i] for i in members] for members in partition(pairs)]
+        jobs = [Job(folder / f"shard-{number:05d}.arrow", members) for number, members in enumerate(shards)]
+        missing = [job for job in jobs if not _sound(job.path, len(job.pairs))]
+        done, total = len(pairs) - sum(len(job.pairs) for job in missing), len(pairs)
+        report = progress or (lambda done, total: None)
+        report(done, total)
+        for count in compute_shards(dataset, stages, build, missing, most=most, execution=execution):
+            done += count
+            report(done, total)
+        super().__init__(folder, augmentation=augmentation, seed=seed)
+
+
+def _identity(dataset: PairDataset, stages: Pipeline, most: int) -> dict[str, Any]:
+    """What defines the matches and their labels, as plain values."""
+    extractor = stages.extractor
+    if isinstance(extractor, CachedFeatures):
+        extractor = extractor.extractor
+    try:
+        parts = configuration(
+            [extractor, stages.matcher, stages.pruners, *([stages.families] if stages.families else [])]
+        )
+    except TypeError as error:
+        raise ValueError(f"the matches of this pipeline cannot be kept: {error}") from error
+    rules = [labelled.INLIER_PX, labelled.OUTLIER_PX, labelled.EDGE_PX]
+    return {
+        "format": FORMAT, "dataset": [dataset.name, dataset.digest], "most": most,
+        "labels": [labelled.VERSION, "depth" if isinstance(dataset, DepthDataset) else "lines", *rules],
+        "stages": parts, "environment": environment(),
+    }  # fmt: skip
+
+
+def _sound(path: Path, pairs: int) -> bool:
+    """Whether a file is there and whole, with so many pairs; of a damaged one a warning tells."""
+    if not path.exists():
+        return False
+    try:
+        shard = Shard(path, verify=True)
+        if len(shard) != pairs:
+            raise ShardError(f"{path} has {len(shard)} pairs instead of {pairs}")
+    except ShardError as error:
+        warnings.warn(f"{error}; it is computed anew", stacklevel=3)
+        return False
+    return True
+
+
+def partition(pairs: Sequence[ImagePair]) -> list[list[int]]:
+    """Indices of the pairs of each shard: at most `SHARD` of one scene, those that share images together."""
+    names = [(p.family, p.scene, p.image0.identity, p.image1.identity) for p in pairs]
+    order = sorted(range(len(pairs)), key=lambda i: (names[i], i))
+    shards: list[list[int]] = []
+    for i in order:
+        if not shards or len(shards[-1]) == SHARD or names[shards[-1][-1]][:2] != names[i][:2]:
+            shards.append([])
+        shards[-1].append(i)
+    return shards
+
+
+class Matching(NamedTuple):
+    """What pairs are matched and labelled by.
+
+    dataset: where they are from. pipeline: its stages before estimation are run. most: matches kept of a pair, the best
+    by quality.
+    """
+
+    dataset: PairDataset
+    pipeline: Pipeline
+    most: int
+
+
+class Job(NamedTuple):
+    """A shard to compute: its file and its pairs."""
+
+    path: Path
+    pairs: list[ImagePair]
+
+
+def matching(dataset: PairDataset, stages: Pipeline, most: int, images: int) -> Matching:
+    """The matching by a pipeline's stages, with the features of so many images kept."""
+    pipeline = Pipeline(
+        stages.extractor, stages.matcher, stages.pruners, stages.estimator,
+        device=stages.device, memory=images, families=stages.families,
+    )  # fmt: skip
+    return Matching(dataset, pipeline, most)
+
+
+def _matching_in_process(dataset: PairDataset, build: Callable[[], Pipeline], most: int) -> Matching:
+    return matching(dataset, build(), most, _IMAGES)
+
+
+def compute_shards(
+    dataset: PairDataset,
+    stages: Pipeline,
+    build: Callable[[], Pipeline] | None,
+    jobs: Sequence[Job],
+    *,
+    most: int,
+    execution: Execution,
+) -> Iterator[int]:
+    """Write each job's shard; yields the number of its pairs when it is written.
+
+    Args:
+        dataset: where the pairs are from. stages: the pipeline whose stages before estimation are run by threads.
+        build: makes it in other processes; pickled. jobs: files and their pairs. most: matches kept of a pair.
+        execution: by which workers, each with one thread of the libraries.
+    """
+    pool = WorkerPool(execution, PRELOADED)
+    source: Source[Matching]
+    if execution.shared:
+        source = Local(matching(dataset, stages, most, _IMAGES * pool.size))
+    else:
+        assert build is not None
+        source = Factory(functools.partial(_matching_in_process, dataset, build, most))
+    runner = TaskRunner(pool, source, matched_rows, lambda job, rows: write_shard(job.path, rows))
+    threads = torch.get_num_threads(), cv2.getNumThreads()
+    use_one_thread()
+    try:
+        with pool:
+            for job in runner.each(jobs):
+                yield len(job.pairs)
+    finally:  # interrupted: what is under way is finished and kept
+        torch.set_num_threads(threads[0])
+        cv2.setNumThreads(threads[1])
+
+
+def matched_rows(how: Matching, job: Job) -> list[dict[str, Any]]:
+    """The rows of a shard."""
+    return [_row(how.dataset, how.pipeline.match([pair])[0], how.most) for pair in job.pairs]
+
+
+def _row(dataset: PairDataset, outcome: Outcome, most: int) -> dict[str, Any]:
+    """A pair as a row of a shard; a pair that fails has a reason and no matches."""
+    pair, c = outcome.pair, outcome.correspondences
+    row: dict[str, Any] = {
+        "key": pair.key, "identity": pair.identity, "family": pair.family, "scene": pair.scene,
+        "reason": outcome.reason, "matches": 0, "inliers": 0, "outliers": 0,
+    }  # fmt: skip
+    if c is None:
+        return row
+    c = _best(c.detach().to("cpu").compact(), most)
+    if not len(c.x0[0]):
+        return {**row, "reason": "no matches are left"}
+    x0, x1 = (x[0].to(torch.float64).numpy() for x in (c.x0.to(torch.float32), c.x1.to(torch.float32)))
+    labels = labelled.label(dataset, pair, x0, x1)
+    norm = np.linalg.norm(pair.F) or 1.0  # zero where the pair determines none
+    row |= {
+        "matches": len(labels), "inliers": int((labels == 1).sum()), "outliers": int((labels == 0).sum()),
+        "label": labels, "F": (pair.F / norm).ravel(),
+    }  # fmt: skip
+    tensors = ((name, getattr(c, name), kind) for name, kind in _STORED.items())
+    return row | {name: x.to(kind).reshape(-1).numpy() for name, x, kind in tensors if x is not None}
+
+
+def _best(c: Correspondences, most: int) -> Correspondences:
+    """The `most` matches of the lowest quality of a single pair, in their order (the first ones without a quality)."""
+    n = c.x0.shape[1]
+    if n <= most:
+        return c
+    rank = torch.arange(n) if c.quality is None else torch.argsort(c.quality[0], stable=True)
+    kept = torch.zeros_like(c.mask)
+    kept[0, rank[:most]] = True
+    return c.keep(kept).compact()

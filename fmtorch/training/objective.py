@@ -1,0 +1,335 @@
+"""What a pruner is trained for: a loss of its classification of matches, and losses of the geometry fitted with them.
+
+Each loss is a mean over the pairs that it can judge. A pair that it cannot judge (no labelled match, a fit that failed,
+no true geometry) adds zero to loss and gradient; where that holds for all pairs, the loss is zero and still attached to
+the graph. So no training step needs to be skipped.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int, Int8, Real
+from torch import Tensor
+
+from fmtorch.geometry.arithmetic import matmul3, stable_sum
+from fmtorch.geometry.eight_point import eight_point
+from fmtorch.geometry.epipolar import lines_through, residual_and_normals, unit_largest
+from fmtorch.jit.random import Stream, uniform
+from fmtorch.metrics import nsgd
+from fmtorch.metrics.nsgd import BORDER, segment_in_image
+from fmtorch.pruning.networks.learned import Prediction
+from fmtorch.training.labelled import LabelledMatches
+
+COORDINATES = ("size", "K")
+LIMIT_E = 0.1  # squared focal lengths; clamp of the geometric loss of Zhang et al. (OANet, ICCV 2019), their code
+LIMIT_F = 0.03  # squared half longer sides of the image; the same code's clamp for fundamental matrices
+NORMAL_FLOOR = 1e-6  # length of an epipolar line's normal, for F of unit size in normalised coordinates, taken for none
+TRIES = 4  # draws made for each point wanted; those whose epipolar line misses image 1 are dropped
+
+
+@dataclasses.dataclass(frozen=True)
+class Objective:
+    """The loss of a batch, as a sum of terms that a config weighs; every stage of the network is supervised.
+
+    Attributes:
+        classification: weight of the cross-entropy of P(inlier) (Yi et al., CVPR 2018, eq. 7, without class balance).
+        geometric: weight of the symmetric epipolar distance of virtual points of the true geometry to the weighted
+            8-point fit (Ranftl & Koltun, ECCV 2018; clamped as by Zhang et al., ICCV 2019).
+        nsgd: weight of NSGD between that fit and the truth, in image diagonals.
+        nsgd_limit: of a pair's NSGD, beyond which it has no gradient.
+        coordinates: the unit of the geometric loss, "size" (half the longest side) or "K" (focal lengths).
+        classification_steps: steps of classification alone, before the other two terms come in.
+        points: virtual points of a pair.
+    """
+
+    classification: float = 1.0
+    geometric: float = 0.5
+    nsgd: float = 0.0
+    nsgd_limit: float | None = 0.2
+    coordinates: str = "size"
+    classification_steps: int = 500
+    points: int = 100
+
+    def __post_init__(self) -> None:
+        if self.coordinates not in COORDINATES:
+            raise ValueError(f"objective.coordinates={self.coordinates}; it must be one of: {', '.join(COORDINATES)}")
+        if min(self.classification, self.geometric, self.nsgd, self.classification_steps) < 0 or self.points < 1:
+            raise ValueError("objective: weights and classification_steps must not be negative, points at least 1")
+        if not max(self.classification, self.geometric, self.nsgd) > 0:
+            raise ValueError("objective: at least one of classification, geometric and nsgd must have a weight")
+
+    def __call__(self, prediction: Prediction, batch: LabelledMatches, step: int) -> dict[str, Float[Tensor, ""]]:
+        """The terms of the loss, unweighted, and their weighted sum `loss`.
+
+        Args:
+            prediction: of the network, for the batch's correspondences.
+            batch: labelled matches; pairs without labels, or whose fit is not determined, add nothing.
+            step: optimisation steps done so far.
+
+        Returns:
+            A scalar for each term that counts at this step, and `loss`. Gradients are finite for every batch.
+        """
+        terms = {}
+        if self.classification:
+            terms["classification"] = classification_loss(prediction.logit, batch.label)
+        if step >= self.classification_steps and (self.geometric or self.nsgd):
+            F, valid = fits(prediction, batch)
+            c = batch.correspondences
+            if c.size0 is None or c.size1 is None:
+                raise ValueError("the geometric losses need image sizes (size0, size1) of every pair")
+            if self.geometric:
+                calibrated = self.coordinates == "K"
+                if calibrated and (c.K0 is None or c.K1 is None):
+                    raise ValueError("objective.coordinates=K needs calibration matrices; the data set has none")
+                terms["geometric"] = geometric_loss(
+                    F, batch.F, c.size0, c.size1, K0=c.K0 if calibrated else None, K1=c.K1 if calibrated else None,
+                    valid=valid, points=self.points, seed=step, key=c.keys,
+                )  # fmt: skip
+            if self.nsgd:
+                terms["nsgd"] = nsgd_loss(
+                    F, batch.F, c.size0, c.size1, valid=valid, limit=self.nsgd_limit, samples=self.points, seed=step,
+                    key=c.keys,
+                )  # fmt: skip
+        weights = {"classification": self.classification, "geometric": self.geometric, "nsgd": self.nsgd}
+        total = 0 * prediction.logit.sum()
+        for name, value in terms.items():
+            total = total + weights[name] * value.to(total.dtype)
+        return {**terms, "loss": total}
+
+
+def fits(
+    prediction: Prediction, batch: LabelledMatches
+) -> tuple[Float[Tensor, "stages b 3 3"], Bool[Tensor, "stages b"]]:
+    """The fundamental matrices of each stage in pixels, and which are valid: the network's own, or weighted 8-point."""
+    c = batch.correspondences
+    if prediction.F is not None:
+        F = prediction.F
+        return F, torch.isfinite(F.detach()).flatten(-2).all(-1) & (F.detach() != 0).flatten(-2).any(-1)
+    x0, x1 = (x.to(torch.float64).expand(len(prediction.weight), *x.shape) for x in (c.x0, c.x1))
+    return eight_point(x0, x1, prediction.weight.to(torch.float64), c.mask.expand(prediction.weight.shape))
+
+
+def classification_loss(
+    logit: Float[Tensor, "*stages b n"], label: Int8[Tensor, "b n"], *, balanced: bool = False
+) -> Float[Tensor, ""]:
+    """Cross-entropy of labelled matches: the mean over the matches of each pair, then over pairs, then over stages.
+
+    Without class balance its optimum is the calibrated log-odds that a match is an inlier. With it (Yi et al., CVPR
+    2018) both classes of a pair count equally and the log-odds of its share of inliers are taken off the logit
+    first, so that the optimum is the same: the logit stays the log-odds under the pair's own mixture of classes.
+
+    Args:
+        logit: log-odds that a match is an inlier, of one or more stages.
+        label: 1 inlier, 0 outlier, -1 ignored, also in masked slots.
+        balanced: whether both classes of a pair count equally.
+
+    Returns:
+        The loss in nats. Its gradient with respect to a logit is at most 1; a pair with one class only is judged by it.
+    """
+    labelled = label >= 0
+    logit = torch.where(labelled, logit.to(torch.promote_types(logit.dtype, torch.float32)), 0.0)
+    target = (label > 0).to(logit.dtype)
+    weight = labelled.to(logit.dtype)
+    if balanced:
+        # One more of each class, in weights and log-odds alike, keeps the optimum and serves pairs of one class.
+        inliers = stable_sum(target)[:, None] + 1
+        outliers = stable_sum(weight - target)[:, None] + 1
+        logit = torch.where(labelled, logit - (inliers / outliers).log(), 0.0)
+        weight = weight * torch.where(label > 0, 1 / inliers, 1 / outliers)
+    total = stable_sum(weight)
+    weight = weight / torch.where(total > 0, total, 1.0)[:, None]
+    entropy = torch.nn.functional.softplus(logit) - target * logit
+    return _mean_over_pairs(stable_sum(weight * entropy), total > 0)
+
+
+def geometric_loss(
+    F_est: Float[Tensor, "*stages b 3 3"],
+    F_true: Float[Tensor, "b 3 3"],
+    size0: Real[Tensor, "b 2"],
+    size1: Real[Tensor, "b 2"],
+    *,
+    K0: Float[Tensor, "b 3 3"] | None = None,
+    K1: Float[Tensor, "b 3 3"] | None = None,
+    valid: Bool[Tensor, "*stages b"] | None = None,
+    limit: float | None = None,
+    points: int = 256,
+    seed: int = 0,
+    key: Int[Tensor, " b"] | None = None,
+) -> Float[Tensor, ""]:
+    """Squared symmetric epipolar distance of virtual points of the true geometry, clamped, in normalised coordinates.
+
+    The sum of the two squared point-to-line distances (Hartley & Zisserman, eq. 11.10) of `virtual_points`, at most
+    `limit`; the mean over the points of each pair, then over pairs, then over stages (Ranftl & Koltun, ECCV
+    2018, section 3.3; squared and with these limits as in the code of Zhang et al., OANet, ICCV 2019). Beyond the
+    limit a point has no gradient.
+
+    Args:
+        F_est: estimates in pixels, of any scale, of one or more stages.
+        F_true: true fundamental matrices in pixels, of any scale.
+        size0: image sizes as (h, w), pixels.
+        size1: likewise, of image 1.
+        K0: calibration of image 0. With both, distances are in focal lengths; without, in half longer sides of the
+            images.
+        K1: calibration of image 1.
+        valid: False for estimates to leave out; those that are zero or not finite are left out anyway.
+        limit: clamp, in squared units of the normalised coordinates; by default LIMIT_E with calibration, else LIMIT_F.
+        points: virtual points for each pair.
+        seed: of the virtual points.
+        key: the pairs' keys, which select their virtual points.
+
+    Returns:
+        The loss, between 0 and the limit.
+
+    Raises:
+        ValueError: only one of K0 and K1 is given, or points is less than 1.
+    """
+    if (K0 is None) != (K1 is None):
+        raise ValueError("only one of K0 and K1 is given; the loss needs both, or neither")
+    limit = (LIMIT_F if K0 is None else LIMIT_E) if limit is None else limit
+    A0, A1 = (_by_size(s) if K is None else K.to(torch.float64) for K, s in ((K0, size0), (K1, size1)))
+    x0, x1, mask = virtual_points(F_true, size0, size1, count=points, seed=seed, key=key)
+    calibrated = (A0.isfinite() & A1.isfinite()).all(-1).all(-1) & _diagonal(A0) & _diagonal(A1)
+    A0, A1 = (torch.where(calibrated[:, None, None], A, torch.eye(3, dtype=A.dtype, device=A.device)) for A in (A0, A1))
+    mask = mask & calibrated[:, None]
+    valid = _valid_models(F_est, valid)
+    F = unit_largest(torch.where(valid[..., None, None], F_est.to(torch.float64), 0.0))
+    F = unit_largest(matmul3(matmul3(A1.mT, F), A0))
+    e, squared0, squared1 = residual_and_normals(F, _normalised(x0, A0), _normalised(x1, A1))
+    floor = NORMAL_FLOOR**2
+    squared = e * e * (1 / (squared0 + floor) + 1 / (squared1 + floor))
+    count = mask.sum(-1)
+    mean = stable_sum(torch.where(mask, squared.clamp(max=limit), 0.0)) / count.clamp(min=1)
+    return _mean_over_pairs(mean, valid & (count > 0)).to(F_est.dtype)
+
+
+def nsgd_loss(
+    F_est: Float[Tensor, "*stages b 3 3"],
+    F_true: Float[Tensor, "b 3 3"],
+    size0: Real[Tensor, "b 2"],
+    size1: Real[Tensor, "b 2"],
+    *,
+    valid: Bool[Tensor, "*stages b"] | None = None,
+    limit: float | None = None,
+    samples: int = 100,
+    seed: int = 0,
+    key: Int[Tensor, " b"] | None = None,
+) -> Float[Tensor, ""]:
+    """The benchmark's own figure as a loss: NSGD without its cap (`fmtorch.metrics.nsgd`), mean over pairs and stages.
+
+    A pair none of whose draws is accepted, since the lines of one matrix miss the image, counts 1 and has no gradient:
+    train with another loss beside this one.
+
+    Args:
+        F_est: estimates in pixels, of any scale, of one or more stages.
+        F_true: true fundamental matrices in pixels, of any scale.
+        size0: image sizes as (h, w), pixels.
+        size1: likewise, of image 1.
+        valid: False for estimates to leave out; those that are zero or not finite are left out anyway.
+        limit: clamp of a pair's figure, in image diagonals, beyond which it has no gradient; None: no clamp.
+        samples: accepted draws for each pair.
+        seed: of the draws.
+        key: the pairs' keys, which select their draws.
+
+    Returns:
+        The loss in image diagonals.
+
+    Raises:
+        ValueError: samples is less than 1.
+    """
+    valid = _valid_models(F_est, valid)
+    F = torch.where(valid[..., None, None], F_est.to(torch.float64), 0.0)
+    value = nsgd(F_true.to(torch.float64), F, size0, size1, samples=samples, seed=seed, key=key, cap=False)
+    value = value if limit is None else value.clamp(max=limit)
+    return _mean_over_pairs(value, valid & _valid_models(F_true)).to(F_est.dtype)
+
+
+class VirtualPoints(NamedTuple):
+    """Exact correspondences in pixels; slots where `mask` is False hold (0, 0)."""
+
+    x0: Float[Tensor, "b n 2"]
+    x1: Float[Tensor, "b n 2"]
+    mask: Bool[Tensor, "b n"]
+
+
+def virtual_points(
+    F: Float[Tensor, "b 3 3"],
+    size0: Real[Tensor, "b 2"],
+    size1: Real[Tensor, "b 2"],
+    *,
+    count: int = 256,
+    seed: int = 0,
+    key: Int[Tensor, " b"] | None = None,
+) -> VirtualPoints:
+    """Points of image 0 and, on their epipolar lines, points of image 1, each inside its image; without gradients.
+
+    A point is drawn uniformly in image 0, its partner uniformly on the part of its line inside image 1, as NSGD draws
+    them (see `fmtorch.metrics.nsgd`). Published losses move a regular grid onto the geometry instead (Ranftl & Koltun,
+    ECCV 2018, section 3.3; Zhang et al., OANet, ICCV 2019), which puts some of the points outside the images.
+
+    Args:
+        F: true fundamental matrices in pixels, of any scale.
+        size0: image sizes as (h, w), pixels.
+        size1: likewise, of image 1.
+        count: points for each pair.
+        seed: of the draws, a function of (seed, key).
+        key: the pairs' keys; 0 for all where None.
+
+    Returns:
+        `count` slots for each pair. There are fewer points where fewer than one in TRIES lines meets image 1, and none
+        where F is zero or not finite.
+
+    Raises:
+        ValueError: count is less than 1.
+    """
+    if count < 1:
+        raise ValueError(f"count is {count}; it must be at least 1")
+    with torch.no_grad():
+        F = F.to(torch.float64)
+        valid = F.isfinite().all(-1).all(-1)
+        F = unit_largest(torch.where(valid[:, None, None], F, 0.0))
+        height0, width0 = size0.to(torch.float64)[:, None].unbind(-1)
+        key = torch.zeros(len(F), dtype=torch.int64, device=F.device) if key is None else key
+        u, v, along = uniform(seed, key, Stream.TRAINING, 0, TRIES * count, 3).unbind(-1)
+        x0 = torch.stack([u * width0, v * height0], -1) + BORDER
+        start, end, hits = segment_in_image(lines_through(F, x0), size1.to(torch.float64), BORDER)
+        x1 = start + along[..., None] * (end - start)
+        order = torch.argsort((~hits).to(torch.uint8), dim=1, stable=True)[:, :count]
+        mask = hits.gather(1, order)
+        x0, x1 = (torch.where(mask[..., None], x.gather(1, order[..., None].expand(-1, -1, 2)), 0.0) for x in (x0, x1))
+    return VirtualPoints(x0, x1, mask)
+
+
+def _mean_over_pairs(value: Float[Tensor, "*stages b"], counted: Bool[Tensor, "*#stages b"]) -> Float[Tensor, ""]:
+    """The mean over the pairs that count, of each stage, then over stages; 0 for a stage where none counts."""
+    counted = counted.expand(value.shape)
+    count = counted.sum(-1).clamp(min=1)
+    return (stable_sum(torch.where(counted, value, 0.0)) / count).mean()
+
+
+def _valid_models(F: Float[Tensor, "*stages b 3 3"], valid: Tensor | None = None) -> Bool[Tensor, "*stages b"]:
+    """Which matrices are finite, not zero, and not said to be invalid."""
+    finite = F.detach().isfinite().all(-1).all(-1) & (F.detach() != 0).any(-1).any(-1)
+    return finite if valid is None else finite & valid
+
+
+def _by_size(size: Real[Tensor, "b 2"]) -> Float[Tensor, "b 3 3"]:
+    """From coordinates about the image's centre, in half longer sides, to pixels."""
+    h, w = size.to(torch.float64).unbind(-1)
+    half = torch.maximum(h, w) / 2
+    zero, ones = torch.zeros_like(h), torch.ones_like(h)
+    rows = [half, zero, (w - 1) / 2, zero, half, (h - 1) / 2, zero, zero, ones]
+    return torch.stack(rows, -1).reshape(-1, 3, 3)
+
+
+def _diagonal(A: Float[Tensor, "b 3 3"]) -> Bool[Tensor, " b"]:
+    """Whether upper triangular matrices are regular."""
+    return (A.diagonal(dim1=-2, dim2=-1) != 0).all(-1)
+
+
+def _normalised(x: Float[Tensor, "b n 2"], A: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b n 2"]:
+    """The points A^-1 x, of an upper triangular A with last row (0, 0, 1)."""
+    y = (x[..., 1] - A[:, 1, 2, None]) / A[:, 1, 1, None]
+    return torch.stack([(x[..., 0] - A[:, 0, 2, None] - A[:, 0, 1, None] * y) / A[:, 0, 0, None], y], -1)

@@ -1,0 +1,300 @@
+"""Labelled matches on disk: Arrow files with a row for each pair, and the torch Dataset that reads them.
+
+A file is read through a memory map, whole or recognised as damaged.
+"""
+
+from __future__ import annotations
+
+import copy
+import warnings
+import zlib
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import torch
+from numpy.typing import NDArray
+from torch.utils.data import Dataset
+
+from fmtorch.core.files import replacing
+from fmtorch.core.types import Correspondences
+from fmtorch.training.augmentation import Augmentation
+from fmtorch.training.labelled import LabelledMatches
+
+PATTERN = "shard-*.arrow"
+FORMAT = 1  # of the files; raised when the schema changes
+
+_PER_MATCH = {
+    **dict.fromkeys(("x0", "x1"), ("float32", (-1, 2))), "label": ("int8", (-1,)),
+    **dict.fromkeys(("quality", "prior", "noise"), ("float32", (-1,))), "mutual": ("uint8", (-1,)),
+    **dict.fromkeys(("lafs0", "lafs1"), ("float32", (-1, 2, 3))),
+}  # fmt: skip
+_PER_PAIR = {
+    **dict.fromkeys(("F", "K0", "K1"), ("float64", (3, 3))), **dict.fromkeys(("size0", "size1"), ("int64", (2,))),
+}  # fmt: skip
+_SHAPES = {name: shape for name, (_, shape) in (_PER_PAIR | _PER_MATCH).items()}
+_TEXTS = ("identity", "family", "scene", "reason")
+SCHEMA = pa.schema(
+    [
+        pa.field("key", pa.int64()),
+        *(pa.field(name, pa.string()) for name in _TEXTS),
+        pa.field("matches", pa.int64()),
+        pa.field("inliers", pa.int64()),
+        pa.field("outliers", pa.int64()),
+        *(pa.field(name, pa.list_(pa.from_numpy_dtype(kind))) for name, (kind, _) in _PER_PAIR.items()),
+        *(pa.field(name, pa.list_(pa.from_numpy_dtype(kind))) for name, (kind, _) in _PER_MATCH.items()),
+    ]
+)
+INDEX = ("key", *_TEXTS, "matches", "inliers", "outliers")  # what is known of a pair without its matches
+
+Row = Mapping[str, Any]
+
+
+class ShardError(ValueError):
+    """A file of matches that is missing, damaged or of another version; the message names it."""
+
+
+def write_shard(path: Path, rows: Sequence[Row]) -> None:
+    """Write rows of `SCHEMA`: texts, integers, flat arrays, None for what a pair does not have. Whole or absent."""
+    columns = [pa.array([row.get(field.name) for row in rows], field.type) for field in SCHEMA]
+    batch = pa.record_batch(columns, schema=SCHEMA)
+    about = {"format": str(FORMAT), "checksum": str(_checksum(batch))}
+    batch = batch.replace_schema_metadata(about)
+    with (
+        replacing(path) as temporary,
+        pa.OSFile(str(temporary), "wb") as sink,
+        pa.ipc.new_file(sink, batch.schema) as writer,
+    ):
+        writer.write_batch(batch)
+
+
+class Shard:
+    """A file of matches, mapped into memory: reading a pair touches the bytes of that pair only.
+
+    verify: check every byte against the checksum, at about 1 GB/s.
+    Raises ShardError for a file that is missing, damaged or of another version.
+    """
+
+    def __init__(self, path: Path, *, verify: bool = False) -> None:
+        self.path = path
+        try:
+            self._file = pa.memory_map(str(path))
+            reader = pa.ipc.open_file(self._file)
+            about = reader.schema.metadata or {}
+            if about.get(b"format") != str(FORMAT).encode() or not reader.schema.equals(SCHEMA):
+                raise ShardError(f"{path} is not of format {FORMAT} of this version")
+            self.batch = reader.get_batch(0)
+            if verify:
+                self.batch.validate(full=True)
+                if about.get(b"checksum") != str(_checksum(self.batch)).encode():
+                    raise ShardError(f"{path} is damaged: its checksum is wrong")
+        except (pa.ArrowException, OSError, ValueError) as error:
+            raise error if isinstance(error, ShardError) else ShardError(f"{path} cannot be read: {error}") from error
+
+    def __len__(self) -> int:
+        """Number of pairs."""
+        return int(self.batch.num_rows)
+
+    def index(self) -> dict[str, list[Any]]:
+        """What is known of each pair without its matches: the columns of `INDEX`."""
+        return {name: self.batch.column(name).to_pylist() for name in INDEX}
+
+    def read(self, row: int, names: Sequence[str] = (*_PER_PAIR, *_PER_MATCH)) -> dict[str, NDArray[Any]]:
+        """A pair's arrays, views of the file: points (n, 2), frames (n, 2, 3), F (3, 3), ...; absent ones left out."""
+        columns = ((name, self._list(name, row)) for name in names)
+        return {name: values.reshape(_SHAPES[name]) for name, values in columns if values is not None}
+
+    def _list(self, name: str, row: int) -> NDArray[Any] | None:
+        column = self.batch.column(name)
+        if not column[row].is_valid:
+            return None
+        start, end = (column.offsets[i].as_py() for i in (row, row + 1))
+        values: NDArray[Any] = column.values.slice(start, end - start).to_numpy(zero_copy_only=True)
+        return values
+
+
+def _checksum(batch: pa.RecordBatch) -> int:
+    """CRC-32 over the values of all columns."""
+    total = 0
+    for name, column in zip(batch.schema.names, batch.columns, strict=True):
+        total = zlib.crc32(name.encode(), total)
+        if pa.types.is_list(column.type):
+            total = zlib.crc32(np.asarray(column.is_valid()).tobytes(), total)
+            total = zlib.crc32(column.offsets.to_numpy().tobytes(), total)
+            values = column.values.to_numpy(zero_copy_only=True)
+            total = zlib.crc32(values.data if len(values) else b"", total)
+        else:
+            total = zlib.crc32(repr(column.to_pylist()).encode(), total)
+    return total
+
+
+class Draw(NamedTuple):
+    """An item of a batch: which pair, in which epoch, and at most how many of its matches."""
+
+    pair: int
+    epoch: int = 0
+    matches: int | None = None
+
+
+class StoredMatches(Dataset[LabelledMatches]):
+    """The labelled matches in a folder that `MatchedPairs` has filled; each item is a batch of one pair.
+
+    Files are mapped into memory and opened by each process for itself, so the data set can be handed to the workers of
+    a DataLoader, forked or spawned. Pairs that failed are left out, with a warning; `failures` holds their identities
+    and reasons. `pairs` says of each item what its key, identity, family and scene are, and how many matches, inliers
+    and outliers it has on disk.
+
+    Args:
+        folder: holds ``shard-*.arrow``.
+        augmentation: random changes of each item, selected by `seed`, the pair's key and the epoch (`set_epoch`, or an
+            index that is a `Draw`).
+
+    Raises ValueError where the folder has no such files or every pair failed, ShardError for a damaged file.
+    """
+
+    def __init__(self, folder: str | Path, *, augmentation: Augmentation | None = None, seed: int = 0) -> None:
+        self.folder = Path(folder)
+        self.augmentation, self.seed, self.epoch = augmentation, seed, 0
+        self._paths = sorted(self.folder.glob(PATTERN))
+        self._open: dict[int, Shard] = {}
+        if not self._paths:
+            raise ValueError(f"{folder} holds no labelled matches ({PATTERN}); MatchedPairs computes them")
+        self.pairs: list[dict[str, Any]] = []
+        self.failures: list[tuple[str, str]] = []
+        self._rows: list[tuple[int, int]] = []
+        for number in range(len(self._paths)):
+            index = self._shard(number).index()
+            for row in range(len(self._shard(number))):
+                about = {name: column[row] for name, column in index.items()}
+                if about["reason"]:
+                    self.failures.append((about["identity"], about["reason"]))
+                else:
+                    self._rows.append((number, row))
+                    self.pairs.append(about)
+        self._tell_failures()
+
+    def __len__(self) -> int:
+        """Number of pairs that have matches."""
+        return len(self._rows)
+
+    def __getitem__(self, index: int | Draw) -> LabelledMatches:
+        """The matches of a pair, augmented where that is asked for; of a `Draw`, at most so many of them."""
+        draw = index if isinstance(index, Draw) else Draw(int(index), self.epoch)
+        matches = self.stored(draw.pair)
+        if self.augmentation is None and draw.matches is None:
+            return matches
+        change = self.augmentation or Augmentation.none()
+        return change(matches, seed=self.seed, epoch=draw.epoch, count=draw.matches)
+
+    def stored(self, index: int) -> LabelledMatches:
+        """The matches of a pair as they are on disk."""
+        number, row = self._rows[index]
+        tensors = {name: torch.from_numpy(array.copy())[None] for name, array in self._shard(number).read(row).items()}
+        label, F = tensors.pop("label"), tensors.pop("F")
+        if "mutual" in tensors:
+            tensors["mutual"] = tensors["mutual"].to(torch.bool)
+        key = torch.tensor([self.pairs[index]["key"]], dtype=torch.int64)
+        mask = torch.ones_like(label, dtype=torch.bool)
+        return LabelledMatches(Correspondences(mask=mask, key=key, **tensors), label, F)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the random numbers of items that are asked for by a plain index."""
+        self.epoch = epoch
+
+    def lengths(self, epoch: int) -> list[float]:
+        """About how many matches each pair has in an epoch, before it is cut to a random number of them."""
+        if self.augmentation is None:
+            return [float(about["matches"]) for about in self.pairs]
+        return [
+            self.augmentation.expected(quality, label, key=about["key"], seed=self.seed, epoch=epoch)
+            for about, (quality, label) in zip(self.pairs, map(self._figures, self._rows), strict=True)
+        ]
+
+    def select(self, indices: Iterable[int]) -> StoredMatches:
+        """The same data set with these pairs only."""
+        chosen = list(indices)
+        other = copy.copy(self)
+        other._rows = [self._rows[i] for i in chosen]
+        other.pairs = [self.pairs[i] for i in chosen]
+        return other
+
+    def joined(self, other: StoredMatches) -> StoredMatches:
+        """The pairs of both data sets, this one's first, with this one's random changes and folder."""
+        both = copy.copy(self)
+        both._paths, both._open = [*self._paths, *other._paths], {}
+        both._rows = [*self._rows, *((number + len(self._paths), row) for number, row in other._rows)]
+        both.pairs, both.failures = [*self.pairs, *other.pairs], [*self.failures, *other.failures]
+        return both
+
+    def augmented(self, augmentation: Augmentation | None, seed: int = 0) -> StoredMatches:
+        """The same data set with other random changes."""
+        other = copy.copy(self)
+        other.augmentation, other.seed = augmentation, seed
+        return other
+
+    def _figures(self, where: tuple[int, int]) -> tuple[torch.Tensor | None, torch.Tensor]:
+        number, row = where
+        arrays = self._shard(number).read(row, ("quality", "label"))
+        quality = torch.from_numpy(arrays["quality"].copy()) if "quality" in arrays else None
+        return quality, torch.from_numpy(arrays["label"].copy())
+
+    def _shard(self, number: int) -> Shard:
+        if number not in self._open:
+            self._open[number] = Shard(self._paths[number])
+        return self._open[number]
+
+    def _tell_failures(self) -> None:
+        if not self.failures:
+            return
+        identity, reason = self.failures[0]
+        total = len(self.failures) + len(self)
+        message = (
+            f"{len(self.failures)} of {total} pairs have no matches and are left out, the first is {identity}: {reason}"
+        )
+        if not len(self):
+            raise ValueError(message)
+        warnings.warn(message, stacklevel=3)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_open": {}}
+
+
+def split_scenes(matches: StoredMatches, last: int = 4) -> tuple[StoredMatches, StoredMatches]:
+    """Pairs for training, and those of the last scenes of each family, by name, for validation.
+
+    The splits of a data set share neither scene nor pair. The rendered training scenes share a few photographs, which
+    hang on walls of both parts.
+
+    Args:
+        matches: of several scenes a family. last: scenes of each family for validation.
+
+    Raises ValueError for a family that has no more scenes than that.
+    """
+    scenes: dict[str, set[str]] = {}
+    for about in matches.pairs:
+        scenes.setdefault(about["family"], set()).add(about["scene"])
+    for family, names in scenes.items():
+        if len(names) <= last:
+            raise ValueError(
+                f"family {family} has {len(names)} scenes; with {last} for validation none is left to train"
+            )
+    held = last_scenes(((about["family"], about["scene"]) for about in matches.pairs), last)
+    inside = [(about["family"], about["scene"]) in held for about in matches.pairs]
+    return (
+        matches.select(i for i, held_out in enumerate(inside) if not held_out),
+        matches.select(i for i, held_out in enumerate(inside) if held_out),
+    )
+
+
+def last_scenes(scenes: Iterable[tuple[str, str]], last: int) -> set[tuple[str, str]]:
+    """Of scenes (family, name), each given any number of times, the last of each family by name; never its first."""
+    names: dict[str, set[str]] = {}
+    for family, name in scenes:
+        names.setdefault(family, set()).add(name)
+    return {
+        (family, name)
+        for family, of_family in names.items()
+        for name in sorted(of_family)[max(1, len(of_family) - last) :]
+    }

@@ -1,0 +1,169 @@
+"""Makes learned files of models/: from photographs, or from weights that others published.
+
+python scripts/make_models.py pca --photos FOLDER
+    models/rootsift_pca.npz: the mean and the 80 principal axes of RootSIFT descriptors at DoG keypoints (Bursuc, Tolias
+    and Jégou, ICMR 2015, section 4, there on patches of Brown et al.)
+python scripts/make_models.py codebooks --photos FOLDER
+    models/vlad_rootsift_pca.npz and models/vlad_hardnet.npz, VLAD's codebooks: mean and principal axes of local
+    descriptors, and centres of the projected ones by k-means
+python scripts/make_models.py ngransac weights_ucn_r1.00.net runs/ngransac.safetensors
+    a learned file of `LC` from a checkpoint of neural-guided RANSAC (Brachmann & Rother, ICCV 2019; BSD 3-clause): the
+    authors' .net, or an .npz of the same parameters; nothing in it is executed. Then: python -m fmtorch.eval
+    pipeline=sift_lc 'pruner.lc.file=runs/ngransac.safetensors' 'pruner.lc.network.side=[ratio]'
+
+Photographs: scikit-image's of the train split and, with --photos, a folder whose sources.txt names each file's source;
+only those of --sources are read.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import itertools
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from fmtorch.core.files import models_dir, replacing
+from fmtorch.core.terminal import console, exits_with_message
+from fmtorch.data import read_image
+from fmtorch.features import learn_projection, local_feature
+from fmtorch.features.vlad import Codebook, Kind, local_descriptors
+from fmtorch.pipeline.build import load_pipeline
+from fmtorch.pruning.networks import LC
+from fmtorch.scenes.textures import PICTURES, photograph
+from fmtorch.training.export import save_weights
+from fmtorch.training.planes import list_photographs
+
+# Repositories under BSD, MIT or Apache licences.
+SOURCES = (
+    "danini/magsac", "mapillary/OpenSfM", "3DOM-FBK/deep-image-matching", "vbalnt/tfeat", "ducha-aiki/affnet",
+    "cvg/LightGlue",
+)  # fmt: skip
+PER_IMAGE = 1500  # descriptors, so that no image weighs more than another
+FEATURES: dict[str, tuple[str, Kind]] = {"rootsift_pca": ("sift", "sift"), "hardnet": ("hesaffnet", "hardnet")}
+CENTERS, DIMENSIONS = 64, 64
+ITERATIONS = 50
+NGRANSAC_LAYERS = {"s0": "linear0", "s1": "norm0", "s2": "linear1", "s3": "norm1"}
+
+
+def images(arguments: argparse.Namespace) -> Iterator[NDArray[np.uint8]]:
+    """The photographs to learn from."""
+    for name in PICTURES["train"]:
+        yield photograph(name)
+    if arguments.photos is not None:
+        for listed in list_photographs(arguments.photos, arguments.sources):
+            yield read_image(listed.path)
+
+
+def write(file: Path, arrays: Mapping[str, Tensor], parts: list[Tensor]) -> None:
+    with replacing(file) as path, open(path, "wb") as stream:
+        np.savez(stream, **{name: value.numpy() for name, value in arrays.items()})  # type: ignore[arg-type]
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    console.print(f"{sum(map(len, parts))} descriptors of {len(parts)} images; {file}: sha256 {digest}")
+
+
+def pca(arguments: argparse.Namespace) -> None:
+    extract = local_feature("dog", "rootsift", max_features=PER_IMAGE)
+    parts = [extract(image).descriptors for image in images(arguments)]
+    descriptors = torch.cat(parts)
+    mean, basis = learn_projection(descriptors[descriptors.any(1)])
+    write(arguments.output / "rootsift_pca.npz", {"mean": mean, "basis": basis}, parts)
+
+
+def codebooks(arguments: argparse.Namespace) -> None:
+    for name in arguments.only:
+        features, kind = FEATURES[name]
+        options = [f"features={features}", f"features.max_features={PER_IMAGE}"]
+        extract = load_pipeline("sift_ratio", overrides=options).extractor
+        selected = itertools.islice(images(arguments), 0, None, arguments.every)
+        parts = [local_descriptors(extract(image).descriptors, kind) for image in selected]
+        book = learned(parts, arguments.centers, arguments.dimensions)
+        write(arguments.output / f"vlad_{name}.npz", book._asdict(), parts)
+
+
+def learned(parts: list[Tensor], centers: int, dimensions: int) -> Codebook:
+    """The codebook of these local descriptors."""
+    descriptors = torch.cat(parts)
+    mean, basis = learn_projection(descriptors, dimensions)
+    return Codebook(mean, basis, k_means((descriptors - mean) @ basis, centers))
+
+
+def k_means(x: Tensor, count: int, seed: int = 0) -> Tensor:
+    """Centres (count, d) of x (n, d) by Lloyd's iterations from k-means++ (Arthur and Vassilvitskii, 2007)."""
+    generator = torch.Generator().manual_seed(seed)
+    centers = x[torch.randint(len(x), (1,), generator=generator)]
+    nearest = (x - centers[0]).square().sum(1)
+    while len(centers) < count:
+        centers = torch.cat([centers, x[torch.multinomial(nearest, 1, generator=generator)]])
+        nearest = torch.minimum(nearest, (x - centers[-1]).square().sum(1))
+    for _ in range(ITERATIONS):
+        assigned = torch.cdist(x, centers).argmin(1)
+        counts = torch.bincount(assigned, minlength=count)
+        sums = torch.zeros_like(centers).index_add_(0, assigned, x)
+        centers = torch.where(counts[:, None] > 0, sums / counts.clamp(min=1)[:, None], centers)
+    return centers
+
+
+def ngransac(arguments: argparse.Namespace) -> None:
+    if arguments.checkpoint.suffix == ".npz":
+        with np.load(arguments.checkpoint) as file:
+            weights = {key: torch.from_numpy(file[key]) for key in file.files}
+    else:
+        weights = torch.load(arguments.checkpoint, map_location="cpu", weights_only=True)
+    network = LC(side=["ratio"])
+    network.load_state_dict(ngransac_state(weights))
+    save_weights(network, arguments.out, notes={"origin": "vislearn/ngransac, BSD 3-clause"})
+    console.print(f"{arguments.out}: LC with side=[ratio]; log-odds are not calibrated", markup=False)
+
+
+def ngransac_state(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The state of `LC` from that of the network of Brachmann & Rother, "Neural-guided RANSAC", ICCV 2019.
+
+    Their network is LC with 12 blocks, coordinates="size" and side=["ratio"]. Its layers are p_in, 0s0 to 11s3 and
+    p_out; the biases of s0 and s2, which context normalisation takes away, are left out.
+    Raises ValueError for a name that is none of these.
+    """
+    state = {}
+    for key, value in weights.items():
+        layer, _, kind = key.rpartition(".")
+        block, position = layer[:-2], layer[-2:]
+        if layer not in ("p_in", "p_out") and not (block.isdecimal() and position in NGRANSAC_LAYERS):
+            raise ValueError(f"{key} is no parameter of a network of neural-guided RANSAC")
+        if kind == "num_batches_tracked" or (kind == "bias" and position in ("s0", "s2")):
+            continue
+        name = f"blocks.{block}.{NGRANSAC_LAYERS[position]}" if position in NGRANSAC_LAYERS else layer
+        state[f"backbone.{name}.{kind}"] = value.flatten(1) if value.dim() == 4 else value
+    return state
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    for function in (pca, codebooks, ngransac):
+        command = commands.add_parser(function.__name__)
+        command.set_defaults(function=function)
+        if function is ngransac:
+            command.add_argument("checkpoint", type=Path)
+            command.add_argument("out", type=Path, help="a file .safetensors")
+            continue
+        command.add_argument("--photos", type=Path)
+        command.add_argument("--sources", nargs="+", default=SOURCES, help="as in the fourth column of sources.txt")
+        command.add_argument("--output", type=Path, default=models_dir())
+        if function is codebooks:
+            command.add_argument("--only", choices=[*FEATURES], nargs="+", default=[*FEATURES])
+            command.add_argument("--every", type=int, default=1, help="of the photographs, every so many-th")
+            command.add_argument("--centers", type=int, default=CENTERS)
+            command.add_argument("--dimensions", type=int, default=DIMENSIONS)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)  # many small steps: threads would wait for one another
+    with exits_with_message():
+        arguments.function(arguments)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,177 @@
+"""Makes an ONNX file, and its model card, from a checkpoint of a patch network.
+
+python -m scripts.patch_networks.export checkpoint=runs/patch_networks/hardnet.pt           -> models/hardnet.onnx, .md
+python -m scripts.patch_networks.export checkpoint=HardNet++.pth architecture=hardnet name=hardnetpp
+python -m scripts.patch_networks.export checkpoint=... precision=int8 calibration=runs/patch_networks/patches/train
+
+checkpoint: of scripts.patch_networks.train, kornia's and the authors' .pth, or TorchScript. Needs the extra `export`.
+precision=int8 quantises weights per channel and activations by what `calibration` patches show.
+validation=FOLDER of patches adds the ONNX file's own figures to the card.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from fmtorch.core.files import models_dir
+from fmtorch.core.terminal import console, exits_with_message
+from fmtorch.features.networks import DESCRIPTORS, build, load_weights, read_checkpoint
+from fmtorch.features.onnx_network import PatchNetwork, network_file
+from fmtorch.training.export import OWN_LICENCE, listed, markdown_table, sha256
+from fmtorch.training.onnx_export import export, lay_out, quantize
+from scripts.patch_networks.objectives import evaluate_descriptor, middle
+from scripts.patch_networks.stores import PatchStore, validation_pairs
+
+DEFAULTS = {
+    "checkpoint": "???", "architecture": None, "name": None, "precision": "fp32", "folder": None,
+    "calibration": None, "calibration_patches": 2048, "validation": None, "pairs": 5000, "seed": 0, "threads": 1,
+    "licence": None,
+}  # fmt: skip
+HARDNET = "HardNet (Mishchuk, Mishkin, Radenovic, Matas, NIPS 2017)"
+AFFNET = "AffNet (Mishkin, Radenovic, Matas, ECCV 2018)"
+TITLES = {
+    "hardnet": HARDNET,
+    "l2net": "L2-Net (Tian, Fan, Wu, CVPR 2017)",
+    "geodesc": "GeoDesc (Luo, Shen, Zhou, Zhu, Zhang, Yao, Fang, Quan, ECCV 2018)",
+    "affnet": AFFNET,
+    "hardnet_fast": f"{HARDNET} in a smaller layout",
+    "affnet_fast": f"{AFFNET} in a smaller layout",
+    "orinet": "OriNet (Mishkin, Radenovic, Matas, ECCV 2018)",
+}
+RATIO = "residual_tilt"
+FIGURES = {
+    "fpr95": "FPR at 95 % recall (%)",
+    "map": "mAP (%)",
+    "accuracy": "nearest is right (%)",
+    RATIO: "ratio of axes left after rectification (median; 1 is best)",
+}
+OTHER_LOSS = {
+    ("affnet", "affine_covariance"): "The loss is this project's own, not AffNet's: a patch that was stretched in two "
+    "known ways should be rectified alike (scripts.patch_networks.objectives.CovarianceObjective). The published hard "
+    "negative-constant loss, with a HardNet that is itself robust to tilt, ended after 20 minutes in one shape for all "
+    "patches; it is the option training.loss.name=hard_negative_constant.",
+    ("affnet_fast", "affine_covariance"): "The loss is that of affnet.md, plus the departure from its shapes.",
+    ("l2net", "hardest_triplet"): "The loss is HardNet's: L2-Net's own, the option "
+    "training.loss.name=relative_distance, learns far more slowly in so short a run.",
+    ("geodesc", "geodesc"): "The method is GeoDesc's; the authors' weights are not. In place of their reconstructions, "
+    "photographs seen as planes and rendered scenes give matches with known angles. A batch has fewer pairs of "
+    "photographs than theirs (12), the optimiser is Adam instead of SGD, and the two patches of a match are not turned "
+    "at random by up to 90 degrees each, which the authors' later code limits to 5 (lzx551402/tfmatch).",
+}  # what a card says of an architecture and loss: how its training differs from that of its paper
+
+
+def model_card(
+    path: Path,
+    architecture: str,
+    precision: str,
+    checkpoint: Mapping[str, Any],
+    figures: Mapping[str, float] | None = None,
+    licence: str | None = None,
+) -> str:
+    """Markdown for the ONNX file at `path`, from what its checkpoint says beside the weights.
+
+    figures: of the ONNX file itself on the validation patches. licence: of weights that this project did not train.
+    """
+    trained = "options" in checkpoint
+    rows = {
+        "SHA-256": f"`{sha256(path)}`",
+        "bytes": path.stat().st_size,
+        "licence": licence or (OWN_LICENCE if trained else "as the checkpoint it was converted from"),
+        **(_training(checkpoint) if trained else {"origin": "converted"}),
+    }
+    title = f"{TITLES[architecture]}, {precision}: float32 grey patches (N, 1, 32, 32) to (N, D)."
+    lines = [f"# {path.name}", "", title, "", "| | |", "| --- | --- |", *(f"| {k} | {v} |" for k, v in rows.items())]
+    other_loss = OTHER_LOSS.get((architecture, checkpoint.get("loss", {}).get("name")))
+    lines += ["", other_loss] if other_loss else []
+    measured = {**checkpoint.get("validation", {}), **({"this file": figures} if figures is not None else {})}
+    return "\n".join([*lines, "", *_quality(measured, checkpoint)]).rstrip() + "\n"
+
+
+def _training(checkpoint: Mapping[str, Any]) -> dict[str, str]:
+    """Rows of the card: what a network was trained on, and how."""
+    o, data, losses = checkpoint["options"], checkpoint["data"], checkpoint["losses"][-100:]
+    licences = checkpoint.get("licences", {}) | {"scikit-image": "photographs inside the package, BSD-3-Clause"}
+    photographs = (
+        f"{count} of {source}" + f" ({licences[source]})" * (source in licences)
+        for source, count in data["photographs"].items()
+    )
+    scenes = ", ".join(f"{count} of {family}" for family, count in data.get("scenes", {}).items())
+    rows = {
+        "origin": "trained by this project from random weights, scripts.patch_networks.train",
+        "photographs": "; ".join(photographs),
+        "patches": f"{data['patches']} of {data['points']} points, found independently by DoG and Hessian in "
+        f"{data['views']} random views of each photograph ({listed(data['limits'])}) with changes of light, blur, "
+        f"noise and JPEG{f', and in as many photographs of each rendered scene ({scenes})' if scenes else ''}",
+        "loss": listed({k: Path(v).name if k == "descriptor" else v for k, v in checkpoint["loss"].items()}),
+    }
+    if teacher := checkpoint.get("teacher"):
+        name = f"{Path(teacher['network']).name} ({teacher['precision']})"
+        rows["teacher"] = f"{name}, whose outputs for the same patches are imitated with weight {teacher['weight']}"
+    if "match_sets" in checkpoint:
+        rows["match sets"] = listed(checkpoint["match_sets"])
+    rows["run"] = (
+        f"{checkpoint['step']} steps of {o['batch']} points, {checkpoint['seconds'] / 60:.0f} minutes, "
+        f"{o['optimizer']}, learning rate {o['learning_rate']} falling linearly to zero, seed {o['seed']}, "
+        f"{'bfloat16 autocast' if o['bf16'] else 'float32'}"
+    )
+    return {**rows, f"loss of the last {len(losses)} steps": f"{sum(losses) / len(losses):.4f}"}
+
+
+def _quality(rows: Mapping[str, Mapping[str, float]], checkpoint: Mapping[str, Any]) -> list[str]:
+    """A table of the figures on held-out patches; figures of circular shapes get a row of their own."""
+    table: dict[str, Mapping[str, float]] = {}
+    for name, row in rows.items():
+        table[name] = row
+        if circle := {k.removeprefix("circle_"): v for k, v in row.items() if k.startswith("circle_")}:
+            table["circles instead of shapes"] = circle
+    if not table:
+        return []
+    held_out = ", ".join(checkpoint.get("validation_data", {}).get("photographs", {}))
+    title = f"Measured on patches of held-out sources ({held_out}):" if held_out else "Measured on held-out patches:"
+    columns = [key for key in FIGURES if all(key in row for row in table.values())]
+    cells = {name: [f"{row[k] * (1 if k == RATIO else 100):.2f}" for k in columns] for name, row in table.items()}
+    return [title, "", *markdown_table("", [FIGURES[key] for key in columns], cells)]
+
+
+def main() -> None:
+    """The command."""
+    with exits_with_message():
+        config = OmegaConf.merge(OmegaConf.create(DEFAULTS), OmegaConf.from_cli())
+        assert isinstance(config, DictConfig)
+        torch.set_num_threads(config.threads)
+        content = read_checkpoint(config.checkpoint)
+        architecture = config.architecture or content.get("architecture")
+        if architecture is None:
+            raise ValueError(f"{config.checkpoint} does not say what it is: give architecture=")
+        network = build(str(architecture)).eval()
+        load_weights(network, config.checkpoint)
+        folder = models_dir() if config.folder is None else Path(config.folder)
+        path = folder / network_file(config.name or architecture, config.precision).name
+        if config.precision == "fp32":
+            export(network, path)
+            lay_out(path)
+        elif config.calibration is None:
+            raise ValueError("precision=int8 needs calibration=FOLDER of patches, e.g. <out>/patches/train")
+        else:
+            store = PatchStore.open(config.calibration)
+            with tempfile.TemporaryDirectory() as temporary:
+                export(network, Path(temporary) / "fp32.onnx")
+                patches = middle(validation_pairs(store, config.calibration_patches, config.seed)[0])
+                quantize(Path(temporary) / "fp32.onnx", path, patches)
+        figures = None
+        if config.validation is not None and architecture in DESCRIPTORS:
+            pairs = validation_pairs(PatchStore.open(config.validation), config.pairs)
+            figures = evaluate_descriptor(PatchNetwork(path), pairs)
+        card = path.with_suffix(".md")
+        card.write_text(model_card(path, str(architecture), config.precision, content, figures, config.licence))
+        console.print(f"{path} ({path.stat().st_size} bytes), {card}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,462 @@
+"""Losses, figures, objectives, match sets, the loop and the command of patch networks."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+from torch import Tensor, nn
+
+from fmtorch.core.files import conf_dir
+from fmtorch.features.networks import AffNet, AffNetFast, GeoDesc, HardNet, build, load_weights
+from fmtorch.features.onnx_network import PatchNetwork
+from fmtorch.scenes.textures import photograph
+from fmtorch.training.export import sha256
+from fmtorch.training.planes import PlaneViews
+from scripts.patch_networks.evaluate import DEFAULTS, figures, times
+from scripts.patch_networks.export import model_card
+from scripts.patch_networks.objectives import (
+    DRAWS,
+    CovarianceObjective,
+    DescriptorObjective,
+    ShapeObjective,
+    fpr_at_recall,
+    geodesc,
+    geometric,
+    hard_negative_constant,
+    hardest_triplet,
+    middle,
+    patch_quality,
+    relative_distance,
+    sample,
+    shape_matrix,
+    structured,
+)
+from scripts.patch_networks.patches import Tolerance, patch_similarity, tracks_of_views, views_of_plane
+from scripts.patch_networks.stores import PatchStore, Tracks, build_store, package_photographs, validation_pairs
+from scripts.patch_networks.train import cutting_of, objective_of, training_of
+from scripts.patch_networks.training import MatchSetTraining, PatchTraining, TrainingOptions, match_sets
+from tests.reference import geodesc as geodesc_reference
+from tests.reference import patch_losses as reference
+
+
+def unit(n: int, d: int, seed: int, noise: float = 0.3) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    a = torch.randn(n, d, generator=generator, dtype=torch.float64)
+    b = a + noise * torch.randn(n, d, generator=generator, dtype=torch.float64)
+    return nn.functional.normalize(a, dim=1), nn.functional.normalize(b, dim=1)
+
+
+def sets_of(sets: int, n: int, d: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Unit descriptors of match sets, alike within noise, and random S_patch."""
+    a, b = unit(sets * n, d, seed, noise=1.0)
+    similarity = torch.rand(sets, n, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return a.reshape(sets, n, d), b.reshape(sets, n, d), similarity
+
+
+@pytest.fixture(scope="module")
+def store() -> PatchStore:
+    """Patches of a photograph as a plane, with their geometry."""
+    planes = PlaneViews(views=4, tilt=15.0, scale=(0.5, 0.6))
+    views = views_of_plane(photograph("chelsea.png"), np.random.default_rng(0), planes, points=150)
+    patches, point, columns = tracks_of_views(views, Tolerance())
+    first = np.r_[0, np.cumsum(np.bincount(point))]
+    about = {"photographs": {"scikit-image": 1}, "points": len(first) - 1, "patches": len(patches), "views": 4}
+    return PatchStore(patches, first, {**about, "limits": {}}, Tracks(first, **columns))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_losses_are_their_definitions(seed: int) -> None:
+    a, b = unit(12, 4, seed)
+    b[3] = a[7]  # the same patch twice is no negative
+    for squared in (False, True):
+        expected = reference.hardest_triplet(a.tolist(), b.tolist(), 1.0, squared)
+        assert float(hardest_triplet(a, b, squared=squared)) == pytest.approx(expected, abs=1e-9)
+    a, b = unit(10, 5, seed)
+    expected = reference.relative_distance(a.tolist(), b.tolist(), 0.7)
+    assert float(relative_distance(a, b, compactness=0.7)) == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_negative_of_the_shape_loss_is_a_constant() -> None:
+    a, b = unit(8, 4, 0, noise=1.0)
+    a.requires_grad_()
+    loss = hard_negative_constant(a, b)
+    assert float(loss.detach()) == pytest.approx(float(hardest_triplet(a, b).detach()))
+    active = ((1 + (a - b).norm(dim=1)) > 0).double()
+    (gradient,) = torch.autograd.grad(loss, a)
+    direction = (a - b) / (a - b).norm(dim=1, keepdim=True) * active[:, None] / 8
+    tangent = direction - a * (direction * a).sum(1, keepdim=True)
+    mine = gradient - a * (gradient * a).sum(1, keepdim=True)  # the loss knows unit vectors only
+    torch.testing.assert_close(mine, tangent.detach(), atol=1e-6, rtol=0)
+
+
+def geodesc_of_one_set(a: Tensor, b: Tensor) -> Tensor:
+    return geodesc(a[None], b[None], torch.full((1, len(a)), 0.5))
+
+
+@pytest.mark.parametrize("loss", [hardest_triplet, hard_negative_constant, relative_distance, geodesc_of_one_set])
+def test_coincident_descriptors_have_finite_gradients(loss: Callable[[Tensor, Tensor], Tensor]) -> None:
+    a = nn.functional.normalize(torch.ones(4, 3), dim=1).requires_grad_()
+    loss(a, a).backward()
+    assert a.grad is not None
+    assert torch.isfinite(a.grad).all()
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_loss_of_match_sets_is_its_definition(seed: int) -> None:
+    a, b, similarity = sets_of(3, 9, 4, seed)
+    sets = list(zip(a.tolist(), b.tolist(), similarity.tolist(), strict=True))
+    first = sum(geodesc_reference.structured(x, y, 0.3) for x, y, _ in sets) / 3
+    second = sum(geodesc_reference.geometric(x, y, s) for x, y, s in sets) / 3
+    assert min(first, second) > 0.02
+    assert float(structured(a, b, ratio=0.3)) == pytest.approx(first, abs=1e-12)
+    assert float(geometric(a, b, similarity)) == pytest.approx(second, abs=1e-12)
+    assert float(geodesc(a, b, similarity, ratio=0.3, geometric_weight=0.2)) == pytest.approx(first + 0.2 * second)
+    alone = [float(geodesc(a[i : i + 1], b[i : i + 1], similarity[i : i + 1])) for i in range(3)]
+    assert float(geodesc(a, b, similarity)) == pytest.approx(sum(alone) / 3)  # sets do not see each other
+    a, b, similarity = sets_of(2, 5, 3, seed)
+    assert torch.autograd.gradcheck(lambda x, y: geodesc(x, y, similarity), (a.requires_grad_(), b.requires_grad_()))
+
+
+def test_the_margins_of_match_sets_are_those_of_the_paper() -> None:
+    zero, one = torch.tensor([[0.0, 1]]), torch.tensor([[1.0, 0]])  # of cosine 0: the loss is the margin
+    margins = [float(geometric(zero, one, torch.tensor([s]))) for s in (1.0, 0.5, 0.4999, 0.2, 0.1999, 0.0)]
+    assert margins == pytest.approx([0.7, 0.7, 0.5, 0.5, 0.2, 0.2])
+    # Two matches of similarity s whose patches are else of similarity c: no loss while c <= (1 - ratio) s.
+    for c, s, expected in ((0.54, 0.9, 0.0), (0.64, 0.9, 0.2), (0.34, 0.4, 0.2)):
+        found = structured(torch.eye(2), torch.tensor([[s, c], [c, s]]).mT, ratio=0.4)
+        assert float(found) == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_figures_are_their_definitions(seed: int) -> None:
+    a, b = unit(40, 3, seed, noise=0.5)
+    found = patch_quality(a, b)
+    positive = [reference.distance(x, y) for x, y in zip(a.tolist(), b.tolist(), strict=True)]
+    negative = [reference.distance(x, y) for x, y in zip(a.tolist(), b.roll(1, 0).tolist(), strict=True)]
+    assert found["fpr95"] == pytest.approx(reference.fpr_at_recall(positive, negative, 0.95))
+    assert found["map"] == pytest.approx(reference.mean_average_precision(a.tolist(), b.tolist()))
+    assert found["map"] >= found["accuracy"]
+    # By hand: 95 % of 20 are 19.
+    assert fpr_at_recall(torch.arange(1, 21.0), torch.tensor([0.5, 19.0, 19.5, 30.0])) == 0.5
+    assert patch_quality(*(torch.eye(5),) * 2) == {"fpr95": 0.0, "map": 1.0, "accuracy": 1.0}
+
+
+OPTIONS: dict[str, Any] = {"batch": 24, "steps": 30, "bf16": False, "checkpoint_steps": 1000, "seed": 3}
+
+
+def training(store: PatchStore, **options: Any) -> PatchTraining:
+    torch.manual_seed(0)
+    made = TrainingOptions(**{**OPTIONS, **options})
+    description = {"architecture": "hardnet", "loss": {"name": "hardest_triplet"}}
+    return PatchTraining(HardNet(dropout=0.3), DescriptorObjective(hardest_triplet), store, made, description)
+
+
+def set_training(store: PatchStore, batch: int = 32) -> MatchSetTraining:
+    torch.manual_seed(0)
+    options = TrainingOptions(batch=batch, steps=20, learning_rate=3e-4, bf16=False, checkpoint_steps=1000)
+    description = {"architecture": "geodesc", "loss": {"name": "geodesc"}, "match_sets": {"matches": 16}}
+    return MatchSetTraining(GeoDesc(), geodesc, store, options, description, matches=16, max_similarity=1.0)
+
+
+def test_the_loss_falls(store: PatchStore) -> None:
+    run = training(store)
+    run.run()
+    assert run.step == 30
+    assert sum(run.losses[-5:]) < 0.9 * sum(run.losses[:5])
+    assert run.optimizer.param_groups[0]["lr"] == pytest.approx(3e-3 / 30)  # linearly to zero
+
+
+@pytest.mark.parametrize("make", [training, set_training])
+def test_a_resumed_run_is_the_uninterrupted_run(
+    make: Callable[[PatchStore], PatchTraining], store: PatchStore, tmp_path: Path
+) -> None:
+    whole, first, second = make(store), make(store), make(store)
+    whole.run(until=6)
+    first.run(until=3, checkpoint=tmp_path / "run.pt")
+    second.resume(tmp_path / "run.pt")
+    assert second.step == 3
+    torch.manual_seed(99)  # what else draws random numbers does not matter
+    second.run(until=6)
+    assert second.losses == whole.losses
+    for name, value in whole.network.state_dict().items():
+        assert torch.equal(value, second.network.state_dict()[name]), name
+    assert [p.name for p in tmp_path.iterdir()] == ["run.pt"]
+    second.description["match_sets"] = {"matches": 8}
+    with pytest.raises(ValueError, match="was trained with other match_sets"):
+        second.resume(tmp_path / "run.pt")
+
+
+def test_a_checkpoint_of_other_options_is_refused(store: PatchStore, tmp_path: Path) -> None:
+    training(store).save(tmp_path / "run.pt")
+    with pytest.raises(ValueError, match="trained with other batch, seed"):
+        training(store, batch=16, seed=4, steps=60).resume(tmp_path / "run.pt")
+    with pytest.raises(ValueError, match="batch=100000 is more than"):
+        training(store, batch=100000)
+    with pytest.raises(ValueError, match="optimizer=lion; there are: adam, sgd"):
+        training(store, optimizer="lion")
+    with pytest.raises(ValueError, match=r"batch=40 must be a multiple of match_sets\.matches=16"):
+        set_training(store, batch=40)
+    with pytest.raises(ValueError, match="batch=3200 is more than 16 matches of the"):
+        set_training(store, batch=3200)
+
+
+def test_minutes_end_a_run_and_divergence_does(store: PatchStore) -> None:
+    run = training(store, minutes=1e-9, optimizer="sgd")
+    run.run()
+    assert run.step == 1
+    run.objective = DescriptorObjective(lambda a, b: (a - b).sum() / 0.0)
+    run.seconds = 0.0
+    with pytest.raises(FloatingPointError, match="lower the learning rate"):
+        run.run()
+
+
+def test_a_checkpoint_gives_the_network_its_card_and_its_figures(store: PatchStore, tmp_path: Path) -> None:
+    run = training(store)
+    run.run(until=2)
+    row = {"fpr95": 0.0123, "map": 0.91, "accuracy": 0.89}
+    run.save(tmp_path / "hardnet.pt", validation={"untrained": row, "trained": row})
+    network = build("hardnet").eval()
+    content = load_weights(network, tmp_path / "hardnet.pt")
+    x = middle(validation_pairs(store, 10)[0])
+    torch.testing.assert_close(network(x), run.network.eval()(x))
+    (tmp_path / "hardnet.onnx").write_bytes(b"as if")
+    card = model_card(tmp_path / "hardnet.onnx", "hardnet", "fp32", content, row)
+    digest = sha256(tmp_path / "hardnet.onnx")
+    for part in (digest, "2 steps of 24 points", "1 of scikit-image", "| trained | 1.23 | 91.00", "| this file | 1.23"):
+        assert part in card
+    other = model_card(tmp_path / "hardnet.onnx", "affnet", "int8", {**content, "loss": {"name": "affine_covariance"}})
+    assert "own, not AffNet's" in other
+    assert "own, not" not in card
+    config = DictConfig({**DEFAULTS, "networks": [str(tmp_path / "hardnet.pt")], "pairs": 20, "repeats": 1})
+    assert all(seconds > 0 for (repeat,) in times(config).values() for seconds in repeat)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PatchStore, "open", lambda folder: store)
+        found = figures(config)
+    assert {"SIFT", "RootSIFT-PCA", "geodesc, untrained", "hardnet.pt"} <= found.keys()
+    assert found["SIFT"]["map"] > 0.5
+
+
+def test_a_teacher_adds_the_distance_to_its_descriptors(store: PatchStore) -> None:
+    torch.manual_seed(0)
+    network, teacher = HardNet(dropout=0.0).eval(), HardNet().eval().requires_grad_(False)
+    pairs, draws = validation_pairs(store, 12), torch.full((12, DRAWS), 0.9)  # neither mirrored nor turned
+    plain = DescriptorObjective(hardest_triplet).loss(network, pairs, draws)
+    itself = DescriptorObjective(hardest_triplet, network, weight=2.0).loss(network, pairs, draws)
+    torch.testing.assert_close(itself, plain)
+    taught = DescriptorObjective(hardest_triplet, teacher, weight=2.0).loss(network, pairs, draws)
+    patches = middle(pairs).flatten(0, 1)
+    apart = (network(patches) - teacher(patches)).square().sum(1).mean()
+    torch.testing.assert_close(taught, plain + 2 * apart)
+
+
+def test_a_teacher_adds_the_departure_from_its_shapes(store: PatchStore) -> None:
+    torch.manual_seed(0)
+    network, draws = AffNetFast(dropout=0.0).eval(), torch.rand(12, DRAWS)
+    pairs = validation_pairs(store, 12)
+    plain = CovarianceObjective().loss(network, pairs, draws)
+    itself = CovarianceObjective(teacher=network, weight=2.0).loss(network, pairs, draws)
+    torch.testing.assert_close(itself, plain, atol=1e-6, rtol=0)
+
+    def stretching(patches: Tensor) -> Tensor:
+        """The network's shapes, stretched by 1.2 in x and by 1 / 1.2 in y."""
+        x = network(patches)
+        return torch.stack([1.2 * (1 + x[:, 0]) - 1, x[:, 1] / 1.2, (1 + x[:, 2]) / 1.2 - 1], 1)
+
+    taught = CovarianceObjective(teacher=stretching, weight=2.0).loss(network, pairs, draws)
+    # (S A)^-1 A with S the stretch: at least S's own singular values are left
+    assert float((taught - plain).detach()) > 2 * math.log((1.44 + 1 / 1.44) / 2) - 1e-5
+
+
+def test_sampling_through_the_identity_is_the_middle_and_a_turn_is_a_turn(store: PatchStore) -> None:
+    patches = validation_pairs(store, 20)[0]
+    seen, turned = (
+        sample(patches, torch.tensor(matrix).expand(len(patches), 2, 2))
+        for matrix in ([[1.0, 0], [0, 1]], [[0.0, -1], [1, 0]])  # the patch's x axis shows what was y
+    )
+    torch.testing.assert_close(seen, middle(patches), atol=1e-5, rtol=0)
+    torch.testing.assert_close(turned, middle(patches).rot90(1, (2, 3)), atol=1e-4, rtol=0)
+
+
+def test_shapes_have_determinant_one_and_zero_is_a_circle() -> None:
+    x = torch.rand(50, 3, generator=torch.Generator().manual_seed(0)) * 1.6 - 0.8
+    matrix = shape_matrix(x)
+    torch.testing.assert_close(torch.linalg.det(matrix), torch.ones(50), atol=1e-5, rtol=0)
+    assert (matrix[:, 0, 1] == 0).all()
+    torch.testing.assert_close(shape_matrix(torch.zeros(1, 3))[0], torch.eye(2))
+
+
+def test_a_shape_that_undoes_the_stretch_lowers_the_loss(store: PatchStore) -> None:
+    objective, n, stretch = ShapeObjective(HardNet().eval(), tilt=2.0), 40, 2**0.5
+    pairs = validation_pairs(store, n)[:1].expand(2, -1, -1, -1, -1)  # the same patch twice, stretched apart
+    draws = torch.zeros(n, DRAWS)
+    draws[:, 1] = 1.0  # the first is stretched twofold along x, the second not at all
+    shapes = torch.tensor([[1 / stretch - 1, 0, stretch - 1]]).repeat(n, 1)
+    known = lambda answer: lambda patches: answer  # noqa: E731
+    undone = objective.loss(known(torch.cat([shapes, torch.zeros(n, 3)])), pairs, draws).detach()
+    circles = objective.loss(known(torch.zeros(2 * n, 3)), pairs, draws).detach()
+    with torch.no_grad():
+        a, b = objective.described(None, pairs, draws)
+    assert float((a - b).norm(dim=1).mean()) > 0.1
+    assert float(undone) < float(circles) - 0.05
+
+
+def test_shape_training_moves_the_network_and_not_the_descriptor(store: PatchStore) -> None:
+    descriptor = HardNet().eval().requires_grad_(False)
+    before = {k: v.clone() for k, v in descriptor.state_dict().items()}
+    torch.manual_seed(0)
+    network = AffNet()
+    start = {k: v.clone() for k, v in network.state_dict().items()}
+    run = PatchTraining(network, ShapeObjective(descriptor), store, TrainingOptions(batch=16, steps=3, bf16=False))
+    run.run()
+    assert all(torch.equal(v, before[k]) for k, v in descriptor.state_dict().items())
+    assert all(not torch.equal(v, start[k]) for k, v in network.named_parameters())
+    assert set(run.objective.evaluate(network.eval(), validation_pairs(store, 30))) >= {"map", "circle_map"}
+
+
+class SecondMoment(nn.Module):
+    """Shapes from the second moments of a white disc that was stretched: covariant by construction."""
+
+    def forward(self, patches: Tensor) -> Tensor:
+        u = (torch.arange(32) + 0.5) / 16 - 1
+        grid = torch.stack(torch.meshgrid(u, u, indexing="xy"), -1).flatten(0, 1)
+        weight = patches.flatten(1)
+        moment = torch.einsum("np,pi,pj->nij", weight / weight.sum(1, keepdim=True), grid, grid)
+        A = torch.linalg.cholesky(moment)  # lower triangular, A A^T is the moment
+        A = A / torch.linalg.det(A).sqrt()[:, None, None]
+        return torch.stack([A[:, 0, 0] - 1, A[:, 1, 0], A[:, 1, 1] - 1], -1)
+
+
+class Circle(nn.Module):
+    def forward(self, patches: Tensor) -> Tensor:
+        return torch.zeros(len(patches), 3)
+
+
+def test_covariant_shapes_have_no_loss_and_constant_ones_do() -> None:
+    u = (torch.arange(64) + 0.5) / 16 - 2
+    disc = (u[:, None] ** 2 + u[None] ** 2 < 0.35**2).float()
+    pairs = disc.expand(2, 30, 1, 64, 64)
+    draws = torch.rand(30, DRAWS, generator=torch.Generator().manual_seed(0))
+    objective = CovarianceObjective(tilt=1.8)
+    covariant, constant = (float(objective.loss(f, pairs, draws)) for f in (SecondMoment(), Circle()))
+    assert covariant < constant / 5
+    found = objective.evaluate(SecondMoment(), pairs)
+    assert found["residual_tilt"] < 1.1 < found["circle_residual_tilt"]
+    draws = torch.zeros(1, DRAWS)
+    draws[0, 1] = 1.0  # T1 stretches 1.8 times, T2 not at all
+    loss = float(objective.loss(Circle(), pairs[:, :1], draws))
+    assert loss == pytest.approx(np.log((1.8 + 1 / 1.8) / 2), abs=1e-5)
+
+
+def random_tracks(seed: int) -> tuple[Tracks, dict[tuple[int, int], float]]:
+    """Points in up to five views, and S_patch of every two patches of a point."""
+    rng = np.random.default_rng(seed)
+    first, views, names = [0], [], []
+    for point in range(60):
+        shown = rng.permutation(5)[: rng.integers(2, 6)]
+        views += shown.tolist()
+        names += [1000 * int(v) + point for v in shown]
+        first.append(len(views))
+    rays = rng.normal(size=(len(views), 3)) * 0.2 + [0, 0, 1]
+    rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
+    incidence = rng.uniform(0, 40, len(views)).astype(np.float32)
+    incidence[rng.random(len(views)) < 0.1] = np.nan
+    similarity = {}
+    for begin, end in itertools.pairwise(first):
+        for i, j in itertools.combinations(range(begin, end), 2):
+            if np.isfinite(incidence[[i, j]]).all():
+                value = patch_similarity(rays[[i]], rays[[j]], incidence[[i]], incidence[[j]])[0]
+                similarity[names[i], names[j]] = float(value)
+    return Tracks(np.array(first), np.array(views), rays, incidence), similarity
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_match_sets_are_their_definition(seed: int) -> None:
+    tracks, similarity = random_tracks(seed)
+    names = 1000 * tracks.view + np.repeat(np.arange(60), np.diff(tracks.first))
+    everything = match_sets(tracks, 2, 1.0)
+    assert len(everything) == 10
+    limit = float(np.median(everything.image_similarity))
+    sets, expected = match_sets(tracks, 15, limit), geodesc_reference.match_sets(similarity, 15, limit)
+    assert 0 < len(sets) < len(everything)
+    assert len(sets) == len(expected)
+    for i, (a, b) in enumerate(itertools.pairwise(sets.first)):
+        patches = names[sets.patches[:, a:b]]
+        members, image = expected[patches[0, 0] // 1000, patches[1, 0] // 1000]
+        assert sorted(zip(*patches.tolist(), strict=True)) == members
+        assert sets.image_similarity[i] == pytest.approx(image)
+        assert sets.similarity[a:b].mean() == pytest.approx(image)
+    with pytest.raises(ValueError, match=r"shares 500 points .* at most 0\.85: lower match_sets\.matches"):
+        match_sets(tracks, 500)
+
+
+def test_draws_are_different_matches_of_their_sets() -> None:
+    sets = match_sets(random_tracks(0)[0], 15, 1.0)
+    chosen, numbers = [3, 0], torch.rand(2, 12, generator=torch.Generator().manual_seed(0))
+    patches, similarity = sets.draw(chosen, 12, numbers)
+    assert patches.shape == (2, 2, 12)
+    for row, i in enumerate(chosen):
+        members = sets.patches[:, sets.first[i] : sets.first[i + 1]].T.tolist()
+        drawn = patches[:, row].T.tolist()
+        assert all(pair in members for pair in drawn)
+        assert len({tuple(pair) for pair in drawn}) == 12
+        values = sets.similarity[sets.first[i] : sets.first[i + 1]]
+        assert similarity[row].tolist() == [values[members.index(pair)] for pair in drawn]
+
+
+def test_training_on_match_sets_lowers_the_loss(store: PatchStore) -> None:
+    run = set_training(store)
+    before = run.objective.evaluate(run.network.eval(), validation_pairs(store, 100))
+    run.run()
+    assert sum(run.losses[-4:]) < 0.7 * sum(run.losses[:4])
+    assert run.objective.evaluate(run.network.eval(), validation_pairs(store, 100))["map"] > before["map"]
+
+
+def config(*overrides: str) -> DictConfig:
+    with initialize_config_dir(str(conf_dir()), version_base=None):
+        return compose("train_patch_network", overrides=["training=geodesc", "images=.", *overrides])
+
+
+@pytest.mark.parametrize(("name", "teacher"), [("hardnet_fast", "hardnet.int8.onnx"), ("affnet_fast", "affnet.onnx")])
+def test_fast_networks_have_teachers(name: str, teacher: str) -> None:
+    objective = objective_of(config(f"training={name}"), torch.device("cpu"))
+    assert isinstance(objective, DescriptorObjective | CovarianceObjective)
+    assert isinstance(objective.teacher, PatchNetwork)
+    assert objective.teacher.path.name == teacher
+    with_none = objective_of(config(f"training={name}", "~training.teacher"), torch.device("cpu"))
+    assert with_none.teacher is None  # type: ignore[attr-defined]
+
+
+def test_photographs_become_tracks_and_a_step_of_training(tmp_path: Path) -> None:
+    """The preset has the values of the paper."""
+    training = config().training
+    assert training.match_sets == {"matches": 64, "max_similarity": 0.85}
+    assert training.loss == {"name": "geodesc", "ratio": 0.4, "geometric_weight": 0.2}
+    small = [
+        "training.tracks.points=80", "training.tracks.planes.views=3", "training.tracks.planes.tilt=10",
+        "patches.longest_side=300", "training.options.batch=16", "training.match_sets.matches=8",
+        "training.match_sets.max_similarity=1.0",
+    ]  # fmt: skip
+    made = config(*small)
+    store = build_store(tmp_path / "tracks", package_photographs()[:2], cutting_of(made, True), seed=0)
+    assert store.description["views"] == 3
+    network, cpu = build("geodesc"), torch.device("cpu")
+    run = training_of(made, network, store, {"architecture": "geodesc"}, cpu)
+    assert isinstance(run, MatchSetTraining)
+    assert run.description["match_sets"] == {"matches": 8, "max_similarity": 1.0}
+    run.run(until=1)
+    assert len(run.losses) == 1
+    with pytest.raises(ValueError, match=r"training\.match_sets needs training\.loss\.name=geodesc"):
+        training_of(config(*small, "training.loss.name=hardest_triplet"), network, store, {}, cpu)
+    plain = PatchStore(store.patches, store.first, store.description)
+    with pytest.raises(ValueError, match=r"training\.match_sets needs .* training\.tracks"):
+        training_of(made, network, plain, {}, cpu)
+    assert cutting_of(made, False).views.views == 12

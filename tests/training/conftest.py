@@ -1,0 +1,78 @@
+"""Small data for labelled matches: rendered scenes at a quarter of their size, and pairs with exact geometry."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from fmtorch.core.types import Correspondences, pair_key
+from fmtorch.scenes import Plan, RenderedPairs
+from fmtorch.scenes.camera import calibration
+from fmtorch.training import LabelledMatches, MatchedPairs
+from tests.conftest import own_cache
+
+TINY = Plan(scenes=2, shots=4, pairs=4, scale=0.25)
+FAMILY = "indoor"  # the quickest to draw
+SIFT = {"pipeline": "sift_ratio", "overrides": ["pruner=[one_to_one]"]}
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cache folder, as $FMTORCH_CACHE names one, in which the scenes of `rendered` are."""
+    return own_cache(tmp_path_factory.mktemp("cache"))
+
+
+@pytest.fixture(scope="session")
+def rendered(cache: Path) -> RenderedPairs:
+    """Pairs of two training scenes."""
+    return RenderedPairs("train", families=[FAMILY], root=cache / "rendered", plan=TINY, workers=1)
+
+
+@pytest.fixture(scope="session")
+def matched(rendered: RenderedPairs, tmp_path_factory: pytest.TempPathFactory) -> MatchedPairs:
+    """Their matches."""
+    return MatchedPairs(rendered, **SIFT, root=tmp_path_factory.mktemp("matched"), workers=1)
+
+
+def exact(seed: int = 0, n: int = 200, share: float = 0.5, pairs: int = 1) -> LabelledMatches:
+    """Matches of which `share` are true to machine precision (float64), in images of different cameras."""
+    rng = np.random.default_rng(seed)
+    rows = [_exact_pair(rng, n, share) for _ in range(pairs)]
+    stacked = {name: torch.from_numpy(np.stack([row[name] for row in rows])) for name in rows[0]}
+    label, F = stacked.pop("label"), stacked.pop("F")
+    key = torch.tensor([pair_key(f"{seed}/{i}") for i in range(pairs)])
+    mask = torch.ones(pairs, n, dtype=torch.bool)
+    return LabelledMatches(Correspondences(mask=mask, key=key, **stacked), label, F)
+
+
+def _exact_pair(rng: np.random.Generator, n: int, share: float) -> dict[str, np.ndarray]:
+    sizes = [(480, 640), (300, 500)]
+    K0, K1 = (
+        calibration(rng.uniform(300, 900), s, (s[1] * rng.uniform(0.4, 0.6), s[0] * rng.uniform(0.4, 0.6)))
+        for s in sizes
+    )
+    K0[1, 1] *= 1.1  # pixels that are not square
+    angle = rng.normal(0, 0.2, 3)
+    skew = np.array([[0, -angle[2], angle[1]], [angle[2], 0, -angle[0]], [-angle[1], angle[0], 0]])
+    R, _ = np.linalg.qr(np.eye(3) + skew)
+    R *= np.sign(np.diag(R))
+    t = rng.normal(size=3)
+    x0 = rng.uniform(0, [639, 479], (n, 2))
+    depth = rng.uniform(5, 20, (n, 1))
+    X = np.column_stack([x0, np.ones(n)]) @ np.linalg.inv(K0).T * depth
+    projected = (X @ R.T + t) @ K1.T
+    x1 = projected[:, :2] / projected[:, 2:]
+    label = (rng.random(n) < share).astype(np.int8)
+    label[rng.random(n) < 0.05] = -1
+    x1 = np.where(label[:, None] == 0, rng.uniform(0, [499, 299], (n, 2)), x1)
+    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    F = np.linalg.inv(K1).T @ cross @ R @ np.linalg.inv(K0)
+    frames = [np.concatenate([rng.normal(0, 3, (n, 2, 2)), x[..., None]], -1) for x in (x0, x1)]
+    return {
+        "x0": x0, "x1": x1, "quality": rng.uniform(0.3, 1, n), "mutual": rng.random(n) < 0.5,
+        "lafs0": frames[0], "lafs1": frames[1], "size0": np.array(sizes[0]), "size1": np.array(sizes[1]),
+        "K0": K0, "K1": K1, "label": label, "F": F / np.linalg.norm(F),
+    }  # fmt: skip

@@ -1,0 +1,140 @@
+"""Batches: every pair once an epoch, similar lengths, little padding, the same after a restart, shared out to ranks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import torch
+
+from fmtorch.training import (
+    Augmentation,
+    Draw,
+    LabelledMatches,
+    SimilarLengthBatches,
+    collate,
+    collate_trimmed,
+)
+from fmtorch.training.batches import MAX_PADDING, longest
+from tests.training.conftest import exact
+
+
+class Pairs:
+    """Pairs of which only the lengths are known, as various as those of the rendered scenes."""
+
+    def __init__(self, n: int = 300) -> None:
+        self.counts = np.random.default_rng(0).lognormal(6, 0.8, n).astype(int) + 20
+
+    def __len__(self) -> int:
+        return len(self.counts)
+
+    def lengths(self, epoch: int) -> Sequence[float]:
+        return self.counts.tolist()
+
+
+def padding(m: LabelledMatches) -> float:
+    return 1 - float(m.correspondences.mask.double().mean())
+
+
+def test_every_pair_comes_once_an_epoch_in_other_batches_each_time() -> None:
+    batches = SimilarLengthBatches(Pairs(), 32, seed=1)
+    epochs = []
+    for epoch in range(2):
+        batches.set_epoch(epoch)
+        drawn = list(batches)
+        assert len(drawn) == len(batches) == 10
+        assert sorted(d.pair for batch in drawn for d in batch) == list(range(300))
+        assert {d.epoch for batch in drawn for d in batch} == {epoch}
+        assert all(len({d.matches for d in batch}) == 1 for batch in drawn)
+        assert sorted(map(len, drawn)) == [12, *[32] * 9]
+        epochs.append([frozenset(d.pair for d in batch) for batch in drawn])
+    assert not set(epochs[0]) & set(epochs[1])
+    sizes = [batch[0].matches for batch in drawn]
+    assert len(set(sizes)) > 5
+    assert all(50 <= size <= 4000 for size in sizes)
+
+
+def test_batches_are_a_function_of_seed_and_epoch_and_go_on_where_they_stopped() -> None:
+    batches = SimilarLengthBatches(Pairs(), 16, seed=2)
+    batches.set_epoch(7)
+    epoch = list(batches)
+    again = SimilarLengthBatches(Pairs(), 16, seed=2)
+    again.set_epoch(7, start=5)
+    state = again.state_dict()
+    fresh = SimilarLengthBatches(Pairs(), 16, seed=2)
+    fresh.load_state_dict(state)
+    assert list(again) == list(fresh) == epoch[5:]
+    assert len(fresh) == len(epoch) - 5
+    other = SimilarLengthBatches(Pairs(), 16, seed=3)
+    other.set_epoch(7)
+    assert list(other) != epoch
+
+
+@pytest.mark.parametrize("world_size", [2, 3, 4])
+def test_ranks_share_the_epoch_out_and_have_as_many_batches(world_size: int) -> None:
+    ranks = [list(SimilarLengthBatches(Pairs(), 32, rank=r, world_size=world_size)) for r in range(world_size)]
+    assert len({len(drawn) for drawn in ranks}) == 1
+    single = list(SimilarLengthBatches(Pairs(), 32))
+    shared = [batch for drawn in zip(*ranks, strict=True) for batch in drawn]
+    assert shared[: len(single)] == single
+    assert shared[len(single) :] == single[: len(shared) - len(single)]
+    sampler = SimilarLengthBatches(Pairs(), 32, rank=world_size - 1, world_size=world_size)
+    assert len(sampler) == len(ranks[-1])
+
+
+@pytest.mark.parametrize("matches", [None, (50, 4000)])
+def test_padding_stays_below_a_fifth_and_few_matches_are_cut_for_it(matches: tuple[int, int] | None) -> None:
+    pairs = Pairs()
+    kept = cut = 0
+    for batch in SimilarLengthBatches(pairs, 32, matches=matches):
+        counts = torch.tensor([min(int(pairs.counts[d.pair]), d.matches or 10**6) for d in batch])
+        n = longest(counts, MAX_PADDING)
+        filled = int(counts.clamp(max=n).sum())
+        assert 1 - filled / (len(batch) * n) <= MAX_PADDING
+        kept, cut = kept + filled, cut + int(counts.sum()) - filled
+    assert cut < 0.1 * (kept + cut)
+
+
+def test_longest_is_the_largest_that_keeps_the_bound() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        counts = torch.from_numpy(rng.integers(1, 200, rng.integers(1, 10)))
+        n = longest(counts, 0.2)
+        allowed = [
+            k for k in range(1, int(counts.max()) + 1) if int(counts.clamp(max=k).sum()) >= 0.8 * len(counts) * k
+        ]
+        assert n == max(allowed)
+    assert longest(torch.tensor([5, 5]), 0.2) == 5
+    assert longest(torch.zeros(0, dtype=torch.int64), 0.2) == 1
+
+
+def test_trimmed_collation_keeps_real_matches_and_the_bound() -> None:
+    items = [exact(seed, n=n) for seed, n in enumerate((20, 150, 160, 170, 400))]
+    assert padding(collate(items)) > 0.5
+    batch = collate_trimmed(items)
+    assert padding(batch) <= MAX_PADDING
+    for i, item in enumerate(items):
+        mine = batch[i].compact()
+        n = mine.label.shape[1]
+        assert torch.equal(mine.label, item.label[:, :n])
+        assert torch.equal(mine.correspondences.x0, item.correspondences.x0[:, :n])
+    assert padding(collate_trimmed(items, padding=0.0)) == 0
+    with pytest.raises(ValueError, match="at least one"):
+        collate_trimmed([])
+
+
+def test_trimming_cuts_a_random_subset_of_what_an_augmentation_gives() -> None:
+    m = exact(n=400)
+    first = Augmentation.none()(m, seed=0).first(100).correspondences
+    ranks = torch.searchsorted(m.correspondences.x0[0, :, 0].sort().values, first.x0[0, :, 0].contiguous()).double()
+    # The mean rank of 100 of 400 without replacement: standard error 400 / sqrt(12 * 100) * sqrt(3 / 4).
+    assert abs(float(ranks.mean()) - 199.5) < 4 * 400 / np.sqrt(1200) * np.sqrt(0.75)
+
+
+def test_mistakes_are_named() -> None:
+    with pytest.raises(ValueError, match="batch is 0"):
+        SimilarLengthBatches(Pairs(), 0)
+    with pytest.raises(ValueError, match="rank is 2 of 2"):
+        SimilarLengthBatches(Pairs(), rank=2, world_size=2)
+    assert Draw(3) == (3, 0, None)

@@ -1,0 +1,283 @@
+"""`MatchedPairs`: computed once, resumed, never stale, never damaged, readable from any process."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import pickle
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from fmtorch.data import load
+from fmtorch.data.pairs import ImagePair, ImageSource
+from fmtorch.geometry.epipolar import symmetric_max
+from fmtorch.pipeline.build import load_pipeline
+from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.scenes import RenderedPairs
+from fmtorch.scenes.generate import FAMILIES, PLANS, Task
+from fmtorch.training import (
+    Augmentation,
+    Draw,
+    MatchedPairs,
+    SimilarLengthBatches,
+    StoredMatches,
+    collate,
+    collate_trimmed,
+    split_scenes,
+)
+from fmtorch.training import labelled as labels_module
+from fmtorch.training import matched_pairs as compute_module
+from fmtorch.training.labelled import label
+from fmtorch.training.matched_pairs import SHARD, partition
+from tests.conftest import shared_path
+from tests.training.conftest import SIFT
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in folder.glob("shard-*")}
+
+
+class Some:
+    """Some pairs of a data set, changed in part; without depth."""
+
+    name, digest = "some", "1"
+
+    def __init__(self, pairs: list[ImagePair]) -> None:
+        self.pairs = pairs
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def __getitem__(self, index: int) -> ImagePair:
+        return self.pairs[index]
+
+    def __iter__(self) -> Iterator[ImagePair]:
+        return iter(self.pairs)
+
+
+def test_items_are_the_pipelines_matches_with_labels(rendered: RenderedPairs, matched: MatchedPairs) -> None:
+    pipeline = load_pipeline("sift_ratio", overrides=["pruner=[one_to_one]"])
+    assert len(matched) == len(rendered) > 4
+    assert not matched.failures
+    by_identity = {pair.identity: pair for pair in rendered}
+    for index in range(0, len(matched), 2):
+        pair = by_identity[matched.pairs[index]["identity"]]
+        expected = pipeline.match([pair])[0].correspondences
+        item = matched[index]
+        c = item.correspondences
+        for name in ("x0", "x1", "quality", "mutual", "lafs0", "lafs1", "size0", "size1", "K0", "K1", "key", "mask"):
+            assert torch.equal(getattr(c, name), getattr(expected, name)), name
+            assert getattr(c, name).dtype == getattr(expected, name).dtype
+        np.testing.assert_allclose(item.F[0].numpy(), pair.F, atol=1e-15)
+        x0, x1 = (x[0].double().numpy() for x in (c.x0, c.x1))
+        assert item.label[0].tolist() == label(rendered, pair, x0, x1).tolist()
+        about = matched.pairs[index]
+        assert about["inliers"] == int(item.inlier.sum())
+        assert about["inliers"] + about["outliers"] == int(item.labelled.sum())
+        assert about["scene"] == pair.scene
+    assert sum(about["inliers"] for about in matched.pairs) > 100
+
+
+def test_computed_once_by_any_number_of_workers(rendered: RenderedPairs, matched: MatchedPairs, tmp_path: Path) -> None:
+    calls: list[tuple[int, int]] = []
+    two = MatchedPairs(rendered, **SIFT, root=tmp_path, workers=2, progress=lambda *c: calls.append(c))
+    assert contents(two.folder) == contents(matched.folder)
+    assert two.folder.name == matched.folder.name
+    assert calls[0] == (0, len(rendered))
+    assert calls[-1] == (len(rendered), len(rendered))
+    pipeline = load_pipeline("sift_ratio", overrides=["pruner=[one_to_one]", f"cache={tmp_path / 'features'}"])
+    calls.clear()
+    again = MatchedPairs(rendered, pipeline, root=tmp_path, progress=lambda *c: calls.append(c))
+    assert again.folder == two.folder  # neither a feature cache nor the estimator matters
+    assert calls == [(len(rendered), len(rendered))]
+
+
+def test_an_interrupted_computation_goes_on(
+    rendered: RenderedPairs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compute_module, "SHARD", 1)
+    uninterrupted = MatchedPairs(rendered, **SIFT, root=tmp_path / "whole", workers=1)
+    written: list[Path] = []
+    original = compute_module.write_shard
+
+    def interrupted(path: Path, rows: Any) -> None:
+        if len(written) == 2:
+            raise KeyboardInterrupt
+        written.append(path)
+        original(path, rows)
+
+    monkeypatch.setattr(compute_module, "write_shard", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        MatchedPairs(rendered, **SIFT, root=tmp_path / "parts", workers=1)
+    folder = tmp_path / "parts" / uninterrupted.folder.name
+    assert set(contents(folder)) == {path.name for path in written}
+    assert len(contents(uninterrupted.folder)) > 2
+    first = set(written)
+    monkeypatch.setattr(compute_module, "write_shard", lambda path, rows: (written.append(path), original(path, rows)))
+    calls: list[tuple[int, int]] = []
+    MatchedPairs(rendered, **SIFT, root=tmp_path / "parts", workers=1, progress=lambda *c: calls.append(c))
+    assert calls[0] == (2, len(rendered))
+    assert len(written) == len(set(written)) == len(contents(uninterrupted.folder))
+    assert first < set(written)
+    assert contents(folder) == contents(uninterrupted.folder)
+
+
+@pytest.mark.parametrize("damage", ["changed", "cut", "fewer pairs"])
+def test_a_damaged_file_is_computed_anew(
+    rendered: RenderedPairs, matched: MatchedPairs, tmp_path: Path, damage: str
+) -> None:
+    folder = tmp_path / matched.folder.name
+    folder.mkdir()
+    for file in matched.folder.iterdir():
+        (folder / file.name).write_bytes(file.read_bytes())
+    victim = folder / "shard-00001.arrow"
+    data = bytearray(victim.read_bytes())
+    if damage == "changed":
+        data[len(data) // 2] ^= 1
+    victim.write_bytes(data[:-100] if damage == "cut" else data)
+    if damage == "fewer pairs":
+        compute_module.write_shard(victim, [])
+    with pytest.warns(UserWarning, match=r"shard-00001\.arrow.* computed anew"):
+        MatchedPairs(rendered, **SIFT, root=tmp_path, workers=1)
+    assert contents(folder) == contents(matched.folder)
+
+
+def test_what_would_change_the_matches_has_a_folder_of_its_own(
+    rendered: RenderedPairs, matched: MatchedPairs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pairs = Some([rendered[0]])
+    names = {MatchedPairs(pairs, **SIFT, root=tmp_path).folder.name}
+    names.add(MatchedPairs(pairs, **SIFT, root=tmp_path, most=50).folder.name)
+    names.add(MatchedPairs(pairs, "sift_ratio", root=tmp_path).folder.name)
+    names.add(MatchedPairs(pairs, "sift_ratio", overrides=["features.max_features=200"], root=tmp_path).folder.name)
+    monkeypatch.setattr(labels_module, "VERSION", 99)
+    names.add(MatchedPairs(pairs, **SIFT, root=tmp_path).folder.name)
+    pairs.digest = "2"
+    names.add(MatchedPairs(pairs, **SIFT, root=tmp_path).folder.name)
+    assert len(names) == 6
+    assert all((tmp_path / name / "about.json").is_file() for name in names)
+
+
+def test_the_best_matches_are_kept(rendered: RenderedPairs, matched: MatchedPairs, tmp_path: Path) -> None:
+    few = MatchedPairs(rendered, **SIFT, root=tmp_path, most=40)
+    for i in range(len(few)):
+        kept, all_quality = few[i].correspondences.quality[0], matched[i].correspondences.quality[0]
+        assert len(kept) == min(40, len(all_quality))
+        assert torch.equal(kept.sort().values, all_quality.sort().values[: len(kept)])
+        assert torch.equal(kept, all_quality[torch.isin(all_quality, kept)])  # in their order
+
+
+def test_pairs_that_fail_are_left_out_and_told(rendered: RenderedPairs, tmp_path: Path) -> None:
+    good = rendered[0]
+    gone = dataclasses.replace(good, identity="gone", image1=ImageSource("gone", tmp_path / "gone.png"))
+    unusable = dataclasses.replace(good, identity="unusable", problem="line 3: F is zero")
+    with pytest.warns(UserWarning, match="2 of 3 pairs have no matches"):
+        matches = MatchedPairs(Some([gone, good, unusable]), **SIFT, root=tmp_path)
+    assert len(matches) == 1
+    assert [about["identity"] for about in matches.pairs] == [good.identity]
+    assert dict(matches.failures)["unusable"] == "line 3: F is zero"
+    assert "gone.png" in dict(matches.failures)["gone"]
+    with pytest.raises(ValueError, match="1 of 1 pairs have no matches"):
+        MatchedPairs(Some([unusable]), **SIFT, root=tmp_path / "b")
+    with pytest.raises(ValueError, match="no pairs"):
+        MatchedPairs(Some([]), **SIFT, root=tmp_path / "c")
+    with pytest.raises(ValueError, match="most is 0"):
+        MatchedPairs(Some([good]), **SIFT, root=tmp_path, most=0)
+    with pytest.raises(ValueError, match="no preset 'sift'"):
+        MatchedPairs(Some([good]), "sift", root=tmp_path)
+    stages = load_pipeline("sift_ratio")
+    with pytest.raises(ValueError, match="overrides"):
+        MatchedPairs(Some([good]), stages, overrides=["pruner=[]"], root=tmp_path)
+    nameless = Pipeline(stages.extractor, lambda a, b: stages.matcher(a, b), {}, stages.estimator)
+    with pytest.raises(ValueError, match="cannot be kept"):
+        MatchedPairs(Some([good]), nameless, root=tmp_path)
+
+
+def test_a_folder_in_the_benchmarks_layout_is_labelled_by_epipolar_lines(tmp_path: Path) -> None:
+    pairs = load("fmbench", root=shared_path("data/Strecha"))
+    matches = MatchedPairs(Some([pairs[0], pairs[1]]), **SIFT, root=tmp_path)
+    for item in (matches[0], matches[1]):
+        c = item.correspondences
+        distance = symmetric_max(item.F, c.x0.double(), c.x1.double())
+        expected = torch.where(distance <= 3, 1, torch.where(distance > 6, 0, -1)).to(torch.int8)
+        clear = ((distance - 3).abs() > 1e-6) & ((distance - 6).abs() > 1e-6)  # rounding decides on the thresholds
+        assert torch.equal(item.label[clear], expected[clear])
+        assert set(item.label[0].tolist()) == {-1, 0, 1}
+
+
+def test_a_shard_holds_pairs_of_one_scene(rendered: RenderedPairs) -> None:
+    pairs = [dataclasses.replace(rendered[0], identity=f"{i}", scene=f"{i % 3}") for i in range(3 * SHARD + 10)]
+    shards = partition(pairs)
+    assert sorted(i for shard in shards for i in shard) == list(range(len(pairs)))
+    assert max(map(len, shards)) <= SHARD
+    assert all(len({pairs[i].scene for i in shard}) == 1 for shard in shards)
+    assert len(shards) == 6
+
+
+def test_a_folder_is_read_without_its_data_set(matched: MatchedPairs, tmp_path: Path) -> None:
+    alone = StoredMatches(matched.folder)
+    assert alone.pairs == matched.pairs
+    assert torch.equal(alone[3].label, matched[3].label)
+    with pytest.raises(ValueError, match="no labelled matches"):
+        StoredMatches(tmp_path)
+
+
+@pytest.mark.parametrize("context", ["fork", "spawn"])
+def test_workers_of_a_loader_read_what_this_process_reads(matched: MatchedPairs, context: str) -> None:
+    pairs = StoredMatches(matched.folder, augmentation=Augmentation(), seed=5)
+    assert torch.equal(pairs[0].label, pairs[0].label)  # files are open when the workers start
+    assert len(pickle.dumps(pairs)) < 1000 * len(pairs) + 5000
+    batches = SimilarLengthBatches(pairs, 3, seed=1)
+    batches.set_epoch(2)
+    options: dict[str, Any] = {"num_workers": 1, "multiprocessing_context": context}
+    loader = DataLoader(pairs, batch_sampler=batches, collate_fn=collate_trimmed, **options)
+    loaded = list(loader)
+    assert len(loaded) == len(batches)
+    for draws, batch in zip(batches, loaded, strict=True):
+        expected = collate_trimmed([pairs[draw] for draw in draws])
+        assert torch.equal(batch.label, expected.label)
+        assert torch.equal(batch.correspondences.x0, expected.correspondences.x0)
+        assert torch.equal(batch.F, expected.F)
+
+
+def test_epochs_and_draws(matched: MatchedPairs) -> None:
+    pairs = matched.augmented(Augmentation(), seed=3)
+    first = pairs[0]
+    pairs.set_epoch(1)
+    assert not torch.equal(first.correspondences.x0, pairs[0].correspondences.x0)
+    assert torch.equal(first.correspondences.x0, pairs[Draw(0, epoch=0)].correspondences.x0)
+    assert pairs[Draw(0, 0, 20)].label.shape[1] == 20
+    assert matched[Draw(0, 0, 20)].label.shape[1] == 20  # cut, though not augmented
+    assert matched.augmentation is None
+    assert matched.lengths(0) == [about["matches"] for about in matched.pairs]
+    assert len(pairs.lengths(0)) == len(pairs)
+    collated = collate([pairs[i] for i in range(len(pairs))])
+    assert len(collated) == len(pairs)
+
+
+def test_validation_scenes_are_the_last_of_each_family(matched: MatchedPairs) -> None:
+    training, validation = split_scenes(matched, last=1)
+    assert len(training) + len(validation) == len(matched)
+    assert {about["scene"] for about in validation.pairs} == {"indoor-train-001"}
+    assert {about["scene"] for about in training.pairs} == {"indoor-train-000"}
+    where = [about["identity"] for about in matched.pairs].index(validation.pairs[0]["identity"])
+    assert torch.equal(validation[0].label, matched[where].label)
+    with pytest.raises(ValueError, match="2 scenes"):
+        split_scenes(matched)
+
+
+def test_training_has_no_scene_of_the_test_split(matched: MatchedPairs) -> None:
+    """What the scenes are made of is compared in tests/data/test_rendered.py."""
+    plans = {plan for (_, split), plan in PLANS.items() if split == "test"}
+    test = {Task(family, "test", n, 0, plan).name for plan in plans for family in FAMILIES for n in range(plan.scenes)}
+    training = {about["scene"] for about in matched.pairs}
+    assert test
+    assert training
+    assert not training & test
+    assert all(f"rendered/{about['scene']}/" in about["identity"] for about in matched.pairs)
