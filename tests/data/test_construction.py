@@ -183,10 +183,8 @@ def test_a_draw_is_the_same_however_it_is_interrupted(
     broken.begin()
     for number, ranks in list(blocks(broken.order()))[:9]:
         broken.judge(number, ranks)
-    asked = list[object]()
-    monkeypatch.setattr(
-        "fmtorch.data.construction.matchable", lambda *given: asked.append(given) or rule.matchable(*given)
-    )
+    asked, matchable = list[object](), rule.matchable
+    monkeypatch.setattr(rule, "matchable", lambda *given: asked.append(given) or matchable(*given))
     run(tmp_path, monkeypatch, "count=3", "seed=5", "workers=1")
     last = uninterrupted.order().tolist().index(passed[2])
     judged = [dataset.candidate(rank) for rank in uninterrupted.order()[9 : last + 1].tolist()]  # type: ignore[attr-defined]
