@@ -9,19 +9,20 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pyarrow as pa
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from fmtorch import data, presets
-from fmtorch.commands.main import job, run_command
+from fmtorch.commands.config import chosen_pipeline, job, run_command
+from fmtorch.commands.options import EVAL, EvalOptions
+from fmtorch.core.files import replacing
 from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.data import ImagePair, PairDataset
+from fmtorch.evaluation.curves import picture
 from fmtorch.evaluation.identity import run_identity
-from fmtorch.evaluation.pair_cameras import Cameras, built_with, cameras_of
-from fmtorch.evaluation.plots import plot_recall_curves
+from fmtorch.evaluation.pair_cameras import built_with, cameras_of
 from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import ALL, Group, summarize
-from fmtorch.evaluation.summary_tables import further_tables, pose_table, summary_markdown, summary_table
+from fmtorch.evaluation.tables import summary_markdown, terminal_tables
 from fmtorch.io.export import export_kinds, write_exports
 from fmtorch.io.match_store import Journal
 from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES, shard_of
@@ -30,35 +31,9 @@ from fmtorch.pipeline.exporting import exportable
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
 from fmtorch.presets.executors import execution_of
-from fmtorch.presets.fields import Cache, Count, Device, Gigabytes, Seed, path_fields, read_fields
+from fmtorch.presets.fields import read_fields
 from fmtorch.runs import RunFolder, identity_digest
 from fmtorch.runs.feature_cache import CachedFeatures
-
-
-@dataclasses.dataclass(frozen=True)
-class PoseFields:
-    """How poses are judged."""
-
-    signed: bool = False
-
-
-@dataclasses.dataclass(frozen=True)
-class Fields:
-    """What the command takes beside stages and the data set; ``conf/eval.yaml`` says what each is."""
-
-    limit: Count | None = None
-    seed: Seed = 0
-    cameras: Cameras | None = None
-    pose: PoseFields = PoseFields()
-    device: Device = "auto"
-    batch: Count = 16
-    workers: Count | None = None
-    processes: bool | None = None
-    shard: str | None = None
-    run_dir: Path | None = None
-    cache: Cache = None
-    cache_limit: Gigabytes | None = 20
-    export: str | list[str] | None = None
 
 
 def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -> Path:
@@ -68,7 +43,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
 
     Raises ValueError, before anything is computed or written, where an option is not what it may be.
     """
-    fields = read_fields(Fields, config)
+    fields = read_fields(EvalOptions, config)
     execution_of(config, fields.workers, fields.processes)
     shard = shard_of(fields.shard)
     device = presets.resolve_device(fields.device)
@@ -115,7 +90,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
 
 
 def _open_folder(
-    config: DictConfig, fields: Fields, pipeline_name: str, pipeline: Pipeline, dataset: PairDataset
+    config: DictConfig, fields: EvalOptions, pipeline_name: str, pipeline: Pipeline, dataset: PairDataset
 ) -> RunFolder:
     """The folder of the run with this identity, its `run_dir` if given, new or to be continued."""
     identity = run_identity(config, pipeline_name, pipeline, dataset.digest, fields.cameras, fields.pose.signed)
@@ -130,7 +105,7 @@ def _missing(pairs: Sequence[ImagePair], folder: RunFolder, journal: Journal | N
 
 
 def _evaluated(
-    config: DictConfig, fields: Fields, pipeline: Pipeline, pairs: Sequence[ImagePair], folder: RunFolder,
+    config: DictConfig, fields: EvalOptions, pipeline: Pipeline, pairs: Sequence[ImagePair], folder: RunFolder,
     journal: Journal | None,
 ) -> Iterator[int]:  # fmt: skip
     """Evaluates pairs into the folder and the journal; yields how many were done since."""
@@ -156,15 +131,13 @@ def _summarize(table: pa.Table, folder: RunFolder, title: str, signed: bool) -> 
     summary = summarize(table, signed)
     all_rows = summary if len(run_table) == len(table) else summarize(run_table, signed)
     folder.write_summary(all_rows, summary_markdown(all_rows, title=title))
-    plot_recall_curves({title.partition(" ")[0]: run_table}, folder.path / "recall.png")
+    with replacing(folder.path / "recall.svg") as path:
+        path.write_text(picture(title.partition(" ")[0], run_table), encoding="utf-8")
     part = "" if len(run_table) == len(table) else f", {len(table)} of the {len(run_table)} pairs of the run"
-    console.print(summary_table(summary, title=f"{title}{part}"))
-    if (poses := pose_table(summary)) is not None:
-        console.print(poses)
-    for further in further_tables(summary):
-        console.print(further)
+    for each in terminal_tables(summary, f"{title}{part}"):
+        console.print(each)
     about = f"; of all {len(run_table)} pairs" if part else ""
-    console.print(f"{folder.path}: pairs/, summary.json, summary.md, recall.png{about}", style="dim")
+    console.print(f"{folder.path}: pairs/, summary.json, summary.md, recall.svg{about}", style="dim")
     return summary
 
 
@@ -185,12 +158,9 @@ def _to_export(journal: Journal, pair: ImagePair) -> bool:
 @job
 def task(config: DictConfig) -> None:
     """What Hydra runs."""
-    hydra_config = HydraConfig.get()
-    changed = [o for o in hydra_config.overrides.task if o.lstrip("+~").startswith(presets.STAGES)]
-    run(config, str(hydra_config.runtime.choices["pipeline"]), changed)
+    run(config, *chosen_pipeline())
 
 
 def main() -> None:
     """The command."""
-    paths = [*path_fields(Fields), "dataset.root", "dataset.file", "dataset.truth", "dataset.images", "export"]
-    run_command("eval", task, paths=paths, interrupted="interrupted; the same command continues the run")
+    run_command(EVAL, task)

@@ -1,4 +1,8 @@
-"""What a compiled function was made of, as one digest: equal versions are equal machine code on the same machine.
+"""The folder of compiled kernels: one file each, in a folder for this version of numba and this processor.
+
+numba's own cache does not notice when a function that a kernel calls is edited in another module, and cannot be read
+where it cannot be written. Here the names of folder and file hold digests of all that decides the machine code, so that
+a file is never stale, and it is written in one step, so that several processes may share it.
 
 A version is taken from live functions, not from files: bytecode, constants, defaults, and every value that the bytecode
 takes from its module or its closure. An inner function among them is compiled into the one that calls it, so its own
@@ -173,9 +177,6 @@ def _name(value: Any) -> str:
     return f"{getattr(value, '__module__', None) or ''}.{name}"
 
 
-# The folder of compiled kernels: one file each, in a folder for this version of numba and this processor
-
-
 HERE = Path(__file__).resolve().parent
 ABOUT = "about.json"  # in each folder; its time of change is when the folder was last used
 UNUSED_DAYS = 30  # after which a folder is removed
@@ -256,11 +257,6 @@ class KernelFile:
         self.calls: list[Any] = []
         self._lock: Any = None  # held while this process compiles; it ends with the process, however that ends
 
-    @property
-    def cache_path(self) -> str | None:
-        """The folder, for numba's statistics."""
-        return None if self.path is None else str(self.path.parent)
-
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """The compiled function of the file; None where there is none, with a warning if it is damaged."""
         if (loaded := self._loaded(signature, target_context)) is not None:
@@ -327,11 +323,6 @@ class KernelFile:
             with contextlib.suppress(OSError):
                 Path(self._lock.lock_file).unlink()
             self._lock = None
-
-    def flush(self) -> None:
-        """Remove the file."""
-        if self.path is not None:
-            self.path.unlink(missing_ok=True)
 
 
 def _open_runtime(target_context: Any, machine_code: bytes) -> None:

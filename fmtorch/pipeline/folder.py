@@ -1,4 +1,4 @@
-"""The images of a folder, and the pairs of them that are asked for."""
+"""A folder of images: its pairs, the work on them by any workers, which can be resumed, and where results go."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ from fmtorch.pipeline.two_images import Described, describe, relate
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 EXHAUSTIVE, SEQUENTIAL, SIMILAR = "exhaustive", "sequential", "similar"
 CHOICES = f"{EXHAUSTIVE}, {SEQUENTIAL}:N, {SIMILAR}:N"
-# Pictures that fmtorch draws, by the file beside which it does; a set of pairs holds copies of photographs.
-_DRAWN = {"result.json": ("matches.png", "pruning.png", "epipolar.png"), "run.json": ("recall.png",)}
+# Pictures that fmtorch draws beside a result.json; a set of pairs holds copies of photographs.
+_DRAWN = ("matches.png", "pruning.png", "epipolar.png")
 _SET_OF_PAIRS = "pairs.json"
 
 Pair = tuple[Path, Path]
@@ -61,7 +61,7 @@ def _images(folder: Path) -> Iterator[Path]:
         folders[:] = [
             name for name in folders if not (name.startswith(".") or (inside / name / _SET_OF_PAIRS).is_file())
         ]
-        drawn = {name for file, names in _DRAWN.items() if file in files for name in names}
+        drawn = _DRAWN if "result.json" in files else ()
         for name in files:
             path = inside / name
             if path.suffix.lower() in SUFFIXES and name not in drawn and path.is_file():
@@ -130,9 +130,6 @@ def in_blocks(pairs: Sequence[Pair], block: int) -> list[Pair]:
     return sorted(pairs, key=lambda pair: (number[pair[0]] // block, number[pair[1]], number[pair[0]]))
 
 
-# Where the matches of a folder go, and whose they are
-
-
 RECORD = "export.json"
 
 
@@ -154,9 +151,6 @@ def open_folder(output: Path, identity: Mapping[str, Any]) -> Path:
     """
     claim(output / RECORD, identity, "matches", "choose another output, or delete the folder", alone=False)
     return output / "export"
-
-
-# Which images are worth matching: those whose VLAD vectors are most alike
 
 
 ROWS = 1024  # of the matrix of similarities that exist at a time
@@ -186,9 +180,6 @@ def similar_pairs(images: Sequence[Path], vectors: Float[Tensor, "n d"], count: 
             if described[row]:
                 selected |= {(min(row, j), max(row, j)) for j in neighbors[best > -torch.inf].tolist()}
     return [(images[i], images[j]) for i, j in sorted(selected)]
-
-
-# A folder of images: the work on its images and pairs, by any workers, that can be resumed
 
 
 MEMORY = 64  # images whose features are kept for pairs to come

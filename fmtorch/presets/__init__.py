@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
+    from fmtorch.core.files import STAGES
     from fmtorch.presets.composition import (
-        STAGES,
         composed,
         expect_stages,
         pipeline_stages,
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
         known_targets,
         load,
         targets_of,
-        top_level_names,
     )
     from fmtorch.presets.objects import (
         build,
@@ -37,7 +36,7 @@ if TYPE_CHECKING:
 __all__ = [
     "STAGES", "available", "build", "closest", "composed", "expect_buildable", "expect_stages", "instantiate",
     "known_targets", "load", "own_modules", "peer_packages", "pipeline_stages", "plain", "resolve_device", "stages",
-    "target_of", "targets_of", "top_level_names",
+    "target_of", "targets_of",
 ]  # fmt: skip
 
 lazy_exports(__name__)

@@ -6,7 +6,6 @@ What is already done is taken up again, whatever ended the last attempt.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import logging
 import re
 import time
@@ -31,39 +30,12 @@ from fmtorch.evaluation.pictures import draw_matches
 from fmtorch.pruning.networks.learned import predict
 from fmtorch.training.labelled import LabelledMatches
 from fmtorch.training.objective import Objective
+from fmtorch.training.options import Optimisation as Optimisation
 from fmtorch.training.validation import Evaluation, Validation
 
 CHECKPOINTS, BEST, LOGS = "checkpoints", "best.ckpt", "logs"
 SMALLER_IS_BETTER = ("log_loss", "calibration_error")  # figures of validation; of the others larger is
 PICTURE_HEIGHT = 480  # px
-
-
-@dataclasses.dataclass(frozen=True)
-class Optimisation:
-    """Adam (Kingma & Ba, ICLR 2015) at a constant rate that falls linearly to zero over the last part of the steps.
-
-    Attributes:
-        learning_rate: 1e-3 in Yi et al. 2018's code; the 1e-4 of one later paper trains far more slowly.
-        weight_decay: L2 penalty of the parameters.
-        steps: in all. decay: share of them, at the end, over which the rate falls.
-    """
-
-    learning_rate: float = 1e-3
-    weight_decay: float = 0.0
-    steps: int = 2500
-    decay: float = 0.5
-
-    def __post_init__(self) -> None:
-        if not self.learning_rate > 0 or self.weight_decay < 0 or self.steps < 1 or not 0 <= self.decay <= 1:
-            raise ValueError(
-                f"optimisation={dataclasses.asdict(self)}: learning_rate and steps must be positive, weight_decay "
-                "not negative, decay between 0 and 1"
-            )
-
-    def factor(self, step: int) -> float:
-        """What the learning rate is multiplied by at a step."""
-        left = (self.steps - step) / max(self.decay * self.steps, 1)
-        return min(1.0, max(left, 0.0))
 
 
 class PrunerTraining(lightning.LightningModule):

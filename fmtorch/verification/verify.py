@@ -104,8 +104,8 @@ def verify(
     make = functools.partial(presets.build, "estimator", estimator, config_dir, **options)
     settings = {"estimator": estimator, "options": repr(sorted(options.items()))}
     paths = VerifyPaths(*(None if place is None else Path(place) for place in (path, features, matches, output)))
-    verify_options = VerifyOptions(cameras, force, seed, execution or ONE_THREAD, shard_of(shard))
-    return verify_by(make, settings, paths, verify_options, report)
+    mode = VerifyMode(cameras, force, seed, execution or ONE_THREAD, shard_of(shard))
+    return verify_by(make, settings, paths, mode, report)
 
 
 class VerifyPaths(NamedTuple):
@@ -118,7 +118,7 @@ class VerifyPaths(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class VerifyOptions:
+class VerifyMode:
     """How pairs are verified: what is taken for known of cameras, what is replaced, by whom, and which pairs."""
 
     cameras: str = "stored"
@@ -129,26 +129,26 @@ class VerifyOptions:
 
 
 def verify_by(
-    make: Callable[[], Estimator], settings: Mapping[str, Any], paths: VerifyPaths, options: VerifyOptions,
+    make: Callable[[], Estimator], settings: Mapping[str, Any], paths: VerifyPaths, mode: VerifyMode,
     report: Callable[[int, int], None] | None,
 ) -> Verification:  # fmt: skip
     """The same by any estimator, which `make` builds; an interrupted run is continued by one of the same `settings`."""
     begin = time.perf_counter()
-    seed = int(number("seed", options.seed, integer=True))
-    if options.cameras not in get_args(Cameras):
-        raise ValueError(f"cameras is {options.cameras!r}; it must be one of {', '.join(get_args(Cameras))}")
+    seed = int(number("seed", mode.seed, integer=True))
+    if mode.cameras not in get_args(Cameras):
+        raise ValueError(f"cameras is {mode.cameras!r}; it must be one of {', '.join(get_args(Cameras))}")
     estimator = make()
     if (gives := model_of(estimator)) != "fundamental":
         raise ValueError(f"estimator gives {gives} matrices; verify needs one that gives fundamental matrices")
-    if options.execution.shared:
+    if mode.execution.shared:
         make = functools.partial(_same, estimator)
-    known = "unknown" if paths.features is not None and options.cameras == "stored" else options.cameras
-    settings = {**settings, "version": __version__, "cameras": known, "seed": seed, "force": options.force}
-    whole = options.shard is None
-    with _opened(paths, options.force, whole) as (store, end):
+    known = "unknown" if paths.features is not None and mode.cameras == "stored" else mode.cameras
+    settings = {**settings, "version": __version__, "cameras": known, "seed": seed, "force": mode.force}
+    whole = mode.shard is None
+    with _opened(paths, mode.force, whole) as (store, end):
         parts = GeometryParts(end.with_name(f"{end.name}.parts"), {**settings, **store.identity()})
-        run = VerificationRun(store, parts, options.shard, options.force)
-        run.each_batch(functools.partial(_estimation, make, cast(Cameras, known), seed), options.execution, report)
+        run = VerificationRun(store, parts, mode.shard, mode.force)
+        run.each_batch(functools.partial(_estimation, make, cast(Cameras, known), seed), mode.execution, report)
         if whole:
             run.write()
     if whole:

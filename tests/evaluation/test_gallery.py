@@ -17,9 +17,9 @@ from fmtorch.data import DataError
 from fmtorch.evaluation import gallery as module
 from fmtorch.evaluation.gallery import Options, Run, find_dataset, gallery
 from fmtorch.evaluation.page import Section, ShownPair, render
-from fmtorch.presets.composition import compose
 from fmtorch.runs import PairRow, RunFolder, to_table
 from tests.data import lists
+from tests.helpers import compose
 from tests.pipeline.test_pipeline import draw
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "guides" / "reports.md"

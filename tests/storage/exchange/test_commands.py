@@ -14,26 +14,24 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from fmtorch import data
 from fmtorch.commands import eval as eval_command
 from fmtorch.commands import match as match_command
-from fmtorch.core.files import conf_dir
 from fmtorch.io.export import DATABASE, FEATURES, MATCHES
 from fmtorch.pipeline import folder
 from fmtorch.pipeline.folder import chosen_pairs, images_below, open_folder
 from fmtorch.pipeline.two_images import Described
 from fmtorch.runs import RunFolder
+from tests.helpers import compose
 from tests.pipeline.test_pipeline import draw
 
 OPTIONS = ("features.max_features=400", "estimator=lmeds", "estimator.hypotheses=100", "cache=off")
 
 
 def config(command: str, *words: str) -> DictConfig:
-    with initialize_config_dir(str(conf_dir()), version_base=None):
-        return compose(command, ["pipeline=sift_ratio", *OPTIONS, *words])
+    return compose(command, ("pipeline=sift_ratio", *OPTIONS, *words))
 
 
 @pytest.fixture
