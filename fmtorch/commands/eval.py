@@ -24,7 +24,7 @@ from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import ALL, Group, summarize
 from fmtorch.evaluation.tables import summary_markdown, terminal_tables
 from fmtorch.io.export import export_kinds, write_exports
-from fmtorch.io.match_store import Journal
+from fmtorch.io.match_store import MatchStore
 from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES, shard_of
 from fmtorch.pipeline.build import build_pipeline
 from fmtorch.pipeline.exporting import exportable
@@ -98,7 +98,7 @@ def _open_folder(
     return RunFolder.open(fields.run_dir or Path(f"runs/{dataset.name}/{name}"), identity)
 
 
-def _missing(pairs: Sequence[ImagePair], folder: RunFolder, journal: Journal | None) -> list[ImagePair]:
+def _missing(pairs: Sequence[ImagePair], folder: RunFolder, journal: MatchStore | None) -> list[ImagePair]:
     """The pairs that have no row yet, or whose matches are to be exported and not in the journal."""
     done = folder.done()
     return [p for p in pairs if p.key not in done or (journal is not None and _to_export(journal, p))]
@@ -106,7 +106,7 @@ def _missing(pairs: Sequence[ImagePair], folder: RunFolder, journal: Journal | N
 
 def _evaluated(
     config: DictConfig, fields: EvalOptions, pipeline: Pipeline, pairs: Sequence[ImagePair], folder: RunFolder,
-    journal: Journal | None,
+    journal: MatchStore | None,
 ) -> Iterator[int]:  # fmt: skip
     """Evaluates pairs into the folder and the journal; yields how many were done since."""
     parallel = len(pairs) >= MIN_PAIRS_FOR_PROCESSES and pipeline.device.type == "cpu"
@@ -141,15 +141,15 @@ def _summarize(table: pa.Table, folder: RunFolder, title: str, signed: bool) -> 
     return summary
 
 
-def _journal(folder: Path, pairs: Sequence[ImagePair]) -> Journal:
+def _journal(folder: Path, pairs: Sequence[ImagePair]) -> MatchStore:
     """Where what is to be exported is kept. Raises ValueError where no pair has images to name."""
     parents = {str(image.path.absolute().parent) for p in pairs if exportable(p) for image in (p.image0, p.image1)}
     if not parents:
         raise ValueError("export: no pair has images in which a pipeline finds keypoints, as they are stored")
-    return Journal(folder / "export", Path(os.path.commonpath(sorted(parents))))
+    return MatchStore(folder / "export", Path(os.path.commonpath(sorted(parents))))
 
 
-def _to_export(journal: Journal, pair: ImagePair) -> bool:
+def _to_export(journal: MatchStore, pair: ImagePair) -> bool:
     """Whether a pair's matches are not in the journal yet, and its images are there."""
     ends = pair.image0.path, pair.image1.path
     return exportable(pair) and all(path.is_file() for path in ends) and not journal.has_pair(*ends)

@@ -22,7 +22,7 @@ from fmtorch.core.settings import claim
 from fmtorch.data.images import read_image
 from fmtorch.data.pairs import ImageSource
 from fmtorch.data.text_files import DataError
-from fmtorch.io.match_store import ExportedPair, Journal
+from fmtorch.io.match_store import MatchStore, StoredPair
 from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.pool import SHARED_BY, WorkerPool
 from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, in_order
@@ -207,7 +207,7 @@ class DescribedPair(NamedTuple):
     known: Mapping[str, Any]
 
 
-def described_or_matched(pipeline: Pipeline, task: Photograph | DescribedPair) -> Described | ExportedPair | str:
+def described_or_matched(pipeline: Pipeline, task: Photograph | DescribedPair) -> Described | StoredPair | str:
     """What a worker does, by one thread: an image's features, what a journal keeps of a pair, or what went wrong."""
     try:
         with one_thread(pipeline.device):
@@ -245,7 +245,7 @@ class FolderMatches:
     """
 
     def __init__(
-        self, pipeline: Pipeline, journal: Journal, longest_side: int, orient: bool, seed: int, *,
+        self, pipeline: Pipeline, journal: MatchStore, longest_side: int, orient: bool, seed: int, *,
         workers: WorkerPool | None = None, build: Callable[[], Pipeline] | None = None,
         cameras: PhotographCameras | None = None,
     ) -> None:  # fmt: skip

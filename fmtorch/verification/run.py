@@ -150,7 +150,7 @@ _PairIds = tuple[Any, Any]
 
 
 @runtime_checkable
-class MatchStore(Protocol):
+class PairStore(Protocol):
     """Matches of pairs of images, and a place for their geometries; see `MatchDatabase`."""
 
     def identity(self) -> dict[str, Any]:
@@ -265,9 +265,7 @@ class VerificationRun:
     kept into the store. force: estimate pairs that have a geometry in the store, too.
     """
 
-    def __init__(
-        self, store: MatchStore, parts: GeometryParts, shard: Shard | None = None, force: bool = False
-    ) -> None:
+    def __init__(self, store: PairStore, parts: GeometryParts, shard: Shard | None = None, force: bool = False) -> None:
         self.store, self.parts = store, parts
         pairs = store.pairs()
         self.pairs = pairs if shard is None else list(shard.of(pairs))

@@ -27,7 +27,7 @@ from fmtorch.io.colmap import (
 from fmtorch.io.hloc import HlocMatches
 from fmtorch.io.match_file import MatchFile, expect_suffix
 from fmtorch.jobs.execution import Execution, Shard, shard_of
-from fmtorch.verification.run import Cameras, Estimation, GeometryParts, MatchStore, Verification, VerificationRun
+from fmtorch.verification.run import Cameras, Estimation, GeometryParts, PairStore, Verification, VerificationRun
 
 ONE_THREAD = Execution("threads", 1)  # that calls an estimator, which uses as many as torch may
 
@@ -165,7 +165,7 @@ def _estimation(make: Callable[[], Estimator], cameras: Cameras, seed: int) -> E
 
 
 @contextlib.contextmanager
-def _opened(paths: VerifyPaths, force: bool, whole: bool) -> Iterator[tuple[MatchStore, Path]]:
+def _opened(paths: VerifyPaths, force: bool, whole: bool) -> Iterator[tuple[PairStore, Path]]:
     """The store of the matches, and the file that geometries are for; whole: they are written to it."""
     database, features, matches, output = paths
     if features is not None or matches is not None:
