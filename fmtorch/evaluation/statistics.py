@@ -292,7 +292,7 @@ def share_difference(a: Values | NDArray[np.bool_], b: Values | NDArray[np.bool_
     """Share of a minus share of b, of the same pairs, with the adjusted Wald interval of Bonett and Price.
 
     One pair more is counted on either side ("Adjusted Wald confidence interval for a difference of binomial proportions
-    based on paired data", MatchStore of Educational and Behavioral Statistics 2012), so that methods which agree on every
+    based on paired data", Journal of Educational and Behavioral Statistics 2012), so that methods which agree on every
     pair still have an interval of the width that so few pairs allow.
 
     Args:
