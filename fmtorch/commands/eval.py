@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pyarrow as pa
 from omegaconf import DictConfig
-from rich.progress import Progress
 
 from fmtorch import data, presets
 from fmtorch.commands.config import chosen_pipeline, job, run_command
@@ -25,7 +24,7 @@ from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import ALL, Group, summarize
 from fmtorch.evaluation.tables import summary_markdown, terminal_tables
 from fmtorch.io.export import export_kinds, write_exports
-from fmtorch.io.match_store import Journal
+from fmtorch.io.match_store import MatchStore
 from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES, shard_of
 from fmtorch.pipeline.build import build_pipeline
 from fmtorch.pipeline.exporting import exportable
@@ -33,7 +32,6 @@ from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
 from fmtorch.presets.executors import execution_of
 from fmtorch.presets.fields import read_fields
-from fmtorch.presets.objects import target_of
 from fmtorch.runs import RunFolder, identity_digest
 from fmtorch.runs.feature_cache import CachedFeatures
 
@@ -50,14 +48,15 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
     shard = shard_of(fields.shard)
     device = presets.resolve_device(fields.device)
     exports = export_kinds(fields.export)
-    presets.expect_dataset(config.dataset)
+    dataset_config = plain(config.dataset)
+    presets.expect_buildable(dataset_config, "dataset")
     presets.expect_stages(config)
-    model = _model(config.dataset)
+    model = getattr(presets.target_of(dataset_config, "dataset"), "model", "fundamental")
     if model != "fundamental" and (exports or fields.cameras is not None):
         raise ValueError(f"the data set has {model} matrices, which take no export= and no cameras=: leave them out")
     with progress_bars() as progress:
         pipeline: Pipeline = build_pipeline(config, device, model)
-        dataset = _load(config.dataset, progress)
+        dataset = data.build(dataset_config, reporter(progress, "drawing scenes"))
         folder = _open_folder(config, fields, pipeline_name, pipeline, dataset)
         pairs = select([dataset[i] for i in range(len(dataset))], fields.limit)
         journal = _journal(folder.path, pairs) if exports else None
@@ -99,7 +98,7 @@ def _open_folder(
     return RunFolder.open(fields.run_dir or Path(f"runs/{dataset.name}/{name}"), identity)
 
 
-def _missing(pairs: Sequence[ImagePair], folder: RunFolder, journal: Journal | None) -> list[ImagePair]:
+def _missing(pairs: Sequence[ImagePair], folder: RunFolder, journal: MatchStore | None) -> list[ImagePair]:
     """The pairs that have no row yet, or whose matches are to be exported and not in the journal."""
     done = folder.done()
     return [p for p in pairs if p.key not in done or (journal is not None and _to_export(journal, p))]
@@ -107,7 +106,7 @@ def _missing(pairs: Sequence[ImagePair], folder: RunFolder, journal: Journal | N
 
 def _evaluated(
     config: DictConfig, fields: EvalOptions, pipeline: Pipeline, pairs: Sequence[ImagePair], folder: RunFolder,
-    journal: Journal | None,
+    journal: MatchStore | None,
 ) -> Iterator[int]:  # fmt: skip
     """Evaluates pairs into the folder and the journal; yields how many were done since."""
     parallel = len(pairs) >= MIN_PAIRS_FOR_PROCESSES and pipeline.device.type == "cpu"
@@ -142,36 +141,18 @@ def _summarize(table: pa.Table, folder: RunFolder, title: str, signed: bool) -> 
     return summary
 
 
-def _journal(folder: Path, pairs: Sequence[ImagePair]) -> Journal:
+def _journal(folder: Path, pairs: Sequence[ImagePair]) -> MatchStore:
     """Where what is to be exported is kept. Raises ValueError where no pair has images to name."""
     parents = {str(image.path.absolute().parent) for p in pairs if exportable(p) for image in (p.image0, p.image1)}
     if not parents:
         raise ValueError("export: no pair has images in which a pipeline finds keypoints, as they are stored")
-    return Journal(folder / "export", Path(os.path.commonpath(sorted(parents))))
+    return MatchStore(folder / "export", Path(os.path.commonpath(sorted(parents))))
 
 
-def _to_export(journal: Journal, pair: ImagePair) -> bool:
+def _to_export(journal: MatchStore, pair: ImagePair) -> bool:
     """Whether a pair's matches are not in the journal yet, and its images are there."""
     ends = pair.image0.path, pair.image1.path
     return exportable(pair) and all(path.is_file() for path in ends) and not journal.has_pair(*ends)
-
-
-def _model(config: DictConfig) -> str:
-    """What relates the pairs of a data set: fundamental, or homography."""
-    options = plain(config)
-    if "_target_" not in options:
-        return data.model_of(str(options.get("name")))
-    model: str = getattr(target_of(options, "dataset"), "model", "fundamental")
-    return model
-
-
-def _load(config: DictConfig, progress: Progress) -> PairDataset:
-    """The data set of a config; the embedded one is drawn on first use, which the progress bar shows."""
-    options = plain(config)
-    if "_target_" in options:  # somebody's own data set
-        dataset: PairDataset = presets.instantiate(options, "dataset")
-        return dataset
-    return data.load(**options, progress=reporter(progress, "drawing scenes"))
 
 
 @job

@@ -20,7 +20,7 @@ from fmtorch.data.images import read_image
 from fmtorch.evaluation.view_graph_picture import view_graph_svg
 from fmtorch.features.vlad import descriptor_kind, image_vector
 from fmtorch.io.export import ViewGraph, export_kinds, view_graph, write_exports, write_view_graph
-from fmtorch.io.match_store import Journal
+from fmtorch.io.match_store import MatchStore
 from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES
 from fmtorch.pipeline.build import build_pipeline
 from fmtorch.pipeline.folder import (
@@ -67,7 +67,7 @@ def match_folder(
         "version": fmtorch_version(), "images": str(folder.absolute()), **stages, "seed": fields.seed,
         "orient": fields.orient, "longest_side": fields.longest_side, **cameras.identity,
     }  # fmt: skip
-    journal = Journal(open_folder(output, identity), folder)
+    journal = MatchStore(open_folder(output, identity), folder)
     scratch = journal.folder / "features"
     if len(images) > MEMORY and not isinstance(pipeline.extractor, CachedFeatures):  # none is computed twice
         pipeline.extractor = cached(pipeline.extractor, scratch)

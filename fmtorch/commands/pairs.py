@@ -25,6 +25,7 @@ from fmtorch.jobs.runner import Factory, Local, Source, in_order
 from fmtorch.presets import plain
 from fmtorch.presets.executors import execution_of
 from fmtorch.presets.fields import read_fields
+from fmtorch.scenes import RenderedPairs
 
 MIN_CANDIDATES_FOR_PROCESSES = 4 * BLOCK + 1  # below which processes are not worth their start
 PRELOADED = ("fmtorch.data.construction",)  # by the process that workers are forked of
@@ -75,24 +76,18 @@ def _execution(config: DictConfig, fields: PairsOptions, many: bool) -> Executio
 
 def _load(config: DictConfig) -> ScenePairs:
     """The data set of a config, all of whose candidates are asked for."""
-    presets.expect_dataset(config)
     options = plain(config)
-    own = "_target_" in options
-    if options.get("name") == "rendered":
-        from fmtorch.scenes import RenderedPairs
-
-        with progress_bars() as progress:
-            drawn = data.load(**options, progress=reporter(progress, "drawing scenes"))
-        assert isinstance(drawn, RenderedPairs)
-        return drawn.scene_pairs()
-    if own or options["name"] in data.SCENE_SETS:
-        dataset = presets.instantiate(options, "dataset") if own else data.load(**options)
-        if isinstance(dataset, ScenePairs):
-            return dataset
-    raise ValueError(
-        f"dataset={options.get('name', options.get('_target_'))} has no candidates to judge; it must be one of "
-        f"{', '.join(data.SCENE_SETS)}, rendered, or a `ScenePairs` of your own"
-    )
+    presets.expect_buildable(options, "dataset")
+    with progress_bars() as progress:
+        dataset = data.build(options, reporter(progress, "drawing scenes"))
+    if isinstance(dataset, RenderedPairs):
+        return dataset.scene_pairs()
+    if not isinstance(dataset, ScenePairs):
+        raise ValueError(
+            f"dataset={dataset.name} has no candidates to judge; it must be one of tum, kitti, colmap, bundler, "
+            "cameras, rendered, or a `ScenePairs` of your own"
+        )
+    return dataset
 
 
 def _select(construction: Construction, execution: Execution, progress: Progress) -> tuple[list[int], int, list[str]]:

@@ -21,7 +21,7 @@ from fmtorch.presets import plain
 from fmtorch.presets.executors import execution_of
 from fmtorch.presets.fields import read_fields
 from fmtorch.verification.run import Verification
-from fmtorch.verification.verify import ONE_THREAD, How, Places, verify_by
+from fmtorch.verification.verify import ONE_THREAD, VerifyMode, VerifyPaths, verify_by
 
 MAX_PROBLEMS = 20  # that are printed
 
@@ -34,11 +34,11 @@ def run(config: DictConfig, estimator: str) -> Verification:
     execution = execution_of(config).decided(False)
     if execution.shared and execution.workers is None:
         execution = ONE_THREAD
-    how = How(fields.cameras, fields.force, fields.seed, execution, shard_of(fields.shard))
+    mode = VerifyMode(fields.cameras, fields.force, fields.seed, execution, shard_of(fields.shard))
     with _begun_by_reports(estimator) as report:
-        places = Places(fields.database, fields.features_file, fields.matches, fields.output)
+        paths = VerifyPaths(fields.database, fields.features_file, fields.matches, fields.output)
         settings = {"estimator": plain(config.estimator)}
-        result = verify_by(make, settings, places, how, report)
+        result = verify_by(make, settings, paths, mode, report)
     for problem in result.problems[:MAX_PROBLEMS]:
         errors.print(problem, style="bold", markup=False, highlight=False, soft_wrap=True)
     if len(result.problems) > MAX_PROBLEMS:

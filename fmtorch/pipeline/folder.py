@@ -18,11 +18,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.core.files import replacing
+from fmtorch.core.settings import claim
 from fmtorch.data.images import read_image
 from fmtorch.data.pairs import ImageSource
 from fmtorch.data.text_files import DataError
-from fmtorch.io.match_store import ExportedPair, Journal
+from fmtorch.io.match_store import MatchStore, StoredPair
 from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.pool import SHARED_BY, WorkerPool
 from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, in_order
@@ -31,7 +31,6 @@ from fmtorch.pipeline.exporting import exported_image, exported_match
 from fmtorch.pipeline.photograph_cameras import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pipeline.two_images import Described, describe, relate
-from fmtorch.runs.run_folder import canonical
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 EXHAUSTIVE, SEQUENTIAL, SIMILAR = "exhaustive", "sequential", "similar"
@@ -150,23 +149,7 @@ def open_folder(output: Path, identity: Mapping[str, Any]) -> Path:
 
     Raises ValueError where the output holds results of another identity.
     """
-    output.mkdir(parents=True, exist_ok=True)
-    file = output / RECORD
-    wanted = json.loads(canonical(identity))
-    if file.exists():
-        try:
-            stored = json.loads(file.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise ValueError(f"{file} is not valid JSON ({error}); delete {output} and run again") from error
-        if stored != wanted:
-            differing = [key for key in {**stored, **wanted} if stored.get(key) != wanted.get(key)]
-            raise ValueError(
-                f"{output} holds matches of other settings ({', '.join(sorted(differing))} differ); "
-                "choose another output, or delete the folder"
-            )
-    else:
-        with replacing(file) as temporary:
-            temporary.write_text(json.dumps(wanted, indent=2) + "\n", encoding="utf-8")
+    claim(output / RECORD, identity, "matches", "choose another output, or delete the folder", alone=False)
     return output / "export"
 
 
@@ -224,7 +207,7 @@ class DescribedPair(NamedTuple):
     known: Mapping[str, Any]
 
 
-def described_or_matched(pipeline: Pipeline, task: Photograph | DescribedPair) -> Described | ExportedPair | str:
+def described_or_matched(pipeline: Pipeline, task: Photograph | DescribedPair) -> Described | StoredPair | str:
     """What a worker does, by one thread: an image's features, what a journal keeps of a pair, or what went wrong."""
     try:
         with one_thread(pipeline.device):
@@ -262,7 +245,7 @@ class FolderMatches:
     """
 
     def __init__(
-        self, pipeline: Pipeline, journal: Journal, longest_side: int, orient: bool, seed: int, *,
+        self, pipeline: Pipeline, journal: MatchStore, longest_side: int, orient: bool, seed: int, *,
         workers: WorkerPool | None = None, build: Callable[[], Pipeline] | None = None,
         cameras: PhotographCameras | None = None,
     ) -> None:  # fmt: skip

@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from fmtorch.core.files import STAGES
     from fmtorch.presets.composition import (
         composed,
-        expect_dataset,
         expect_stages,
         pipeline_stages,
         plain,
@@ -24,12 +23,20 @@ if TYPE_CHECKING:
         load,
         targets_of,
     )
-    from fmtorch.presets.objects import build, expect_buildable, instantiate, own_modules, peer_packages, resolve_device
+    from fmtorch.presets.objects import (
+        build,
+        expect_buildable,
+        instantiate,
+        own_modules,
+        peer_packages,
+        resolve_device,
+        target_of,
+    )
 
 __all__ = [
-    "STAGES", "available", "build", "closest", "composed", "expect_buildable", "expect_dataset",
-    "expect_stages", "instantiate", "known_targets", "load", "own_modules", "peer_packages",
-    "pipeline_stages", "plain", "resolve_device", "stages", "targets_of",
+    "STAGES", "available", "build", "closest", "composed", "expect_buildable", "expect_stages", "instantiate",
+    "known_targets", "load", "own_modules", "peer_packages", "pipeline_stages", "plain", "resolve_device", "stages",
+    "target_of", "targets_of",
 ]  # fmt: skip
 
 lazy_exports(__name__)

@@ -13,7 +13,6 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
-from fmtorch import data
 from fmtorch.core.files import STAGES, conf_dir
 from fmtorch.presets import hydra_source
 from fmtorch.presets.files import available
@@ -62,15 +61,6 @@ def expect_stages(config: DictConfig) -> None:
         if group != "pruner" and group in config:  # a training has no estimator
             expect_buildable(plain(config[group]), group)
     expect_pruners(config)
-
-
-def expect_dataset(config: DictConfig) -> None:
-    """Raises ValueError, naming the option, where a data set cannot be loaded with the options of its config."""
-    options = plain(config)
-    if "_target_" in options:
-        expect_buildable(options, "dataset")
-    else:
-        data.expect_loadable(**options)
 
 
 def compose(config_name: str, overrides: Sequence[str], config_dir: Path | None = None) -> DictConfig:

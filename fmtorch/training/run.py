@@ -22,6 +22,7 @@ from rich.progress import Progress
 
 from fmtorch import data, presets
 from fmtorch.core.options import expect_options
+from fmtorch.core.settings import claim
 from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.core.version import __version__
 from fmtorch.data import ImagePair, PairDataset
@@ -34,11 +35,12 @@ from fmtorch.presets.executors import execution_of
 from fmtorch.presets.fields import read_fields
 from fmtorch.runs.feature_cache import cached
 from fmtorch.runs.run_folder import identity_digest
+from fmtorch.scenes import RenderedPairs
 from fmtorch.training.augmentation import Augmentation, keep_ratio
 from fmtorch.training.batches import training_batches
 from fmtorch.training.export import Result, write_result
 from fmtorch.training.labelled import LabelledMatches
-from fmtorch.training.loop import PrunerTraining, ValidationPictures, claim, load_best, train
+from fmtorch.training.loop import PrunerTraining, ValidationPictures, load_best, train
 from fmtorch.training.matched_pairs import MatchedPairs
 from fmtorch.training.objective import Objective
 from fmtorch.training.options import TrainOptions
@@ -57,7 +59,7 @@ def run(config: DictConfig, name: str) -> Path:
     """
     options = read_fields(TrainOptions, config)
     expect_options(Trainer, plain(config.trainer), "trainer")
-    presets.expect_dataset(config.dataset)
+    presets.expect_buildable(plain(config.dataset), "dataset")
     presets.expect_stages(config)
     network_config = network_of(config, name)
     objective = Objective(**dataclasses.asdict(options.objective))
@@ -71,7 +73,7 @@ def run(config: DictConfig, name: str) -> Path:
         "validation": {k: v for k, v in plain(config.validation).items() if k != "roots"},
     }  # fmt: skip
     folder = Path(config.output or f"runs/train/{name}-{identity_digest(identity)[:8]}")
-    claim(folder, identity)
+    claim(folder / "training.json", identity, "checkpoints", "choose another output")
     torch.set_num_threads(int(config.threads or os.cpu_count() or 1))
     torch.manual_seed(config.seed)
     network = presets.instantiate(network_config, f"pruner={name}, network")
@@ -211,12 +213,9 @@ def labelled_matches(config: DictConfig, options: TrainOptions, progress: Progre
 def _dataset(config: DictConfig, progress: Progress) -> PairDataset:
     """The data set to train on; of the embedded one always the training side."""
     options = plain(config.dataset)
-    if options.get("name") == "rendered":
+    if presets.target_of(options, "dataset") is RenderedPairs:
         options["split"] = "train"
-    if "_target_" in options:
-        dataset: PairDataset = presets.instantiate(options, "dataset")
-        return dataset
-    return data.load(**options, progress=reporter(progress, "drawing scenes"))
+    return data.build(options, reporter(progress, "drawing scenes"))
 
 
 def _split(dataset: PairDataset, last: int) -> tuple[list[int], list[int]]:

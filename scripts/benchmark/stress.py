@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 from fmtorch.data import ImagePair
-from fmtorch.data.baselines import WIDE
 from fmtorch.evaluation.run import select
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
+from fmtorch.presets.pruners import WIDE
 from fmtorch.scenes.generate import FAMILIES
 from scripts.benchmark import figures, pairs
 from scripts.benchmark.methods import method, read_specs

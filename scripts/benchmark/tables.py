@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.data.baselines import WIDE
 from fmtorch.evaluation.statistics import (
     PERCENT,
     POSE_THRESHOLDS,
@@ -25,6 +24,7 @@ from fmtorch.evaluation.statistics import (
     scene_names,
 )
 from fmtorch.metrics.recall import FINE_THRESHOLD
+from fmtorch.presets.pruners import WIDE
 from scripts.benchmark.runner import Row
 
 BASELINES = ("wide baselines", "short baselines")

@@ -92,7 +92,8 @@ def options() -> set[str]:
     """The groups and keys of the YAML files in conf/, and the fields by which commands declare options."""
     texts = [path.read_text("utf-8") for path in (SOURCE / "conf").rglob("*.yaml")]
     keys = {key for text in texts for key in re.findall(r"(\w+):(?:\s|$)", text)}
-    return keys | {path.stem for path in (SOURCE / "conf").rglob("*")}
+    declared = [bound(ast.parse(path.read_bytes())) for path in CODE if path.name == "options.py"]
+    return keys.union(*declared) | {path.stem for path in (SOURCE / "conf").rglob("*")}
 
 
 def resolves(name: str) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 from pathlib import Path
 
@@ -18,8 +17,6 @@ from fmtorch.training.loop import (
     CHECKPOINTS,
     Optimisation,
     PrunerTraining,
-    TrainingFolderError,
-    claim,
     latest_checkpoint,
     train,
 )
@@ -121,15 +118,3 @@ def test_best_weights_are_kept(tmp_path: Path) -> None:
     trained(tmp_path)
     best = torch.load(tmp_path / CHECKPOINTS / BEST, weights_only=True)
     assert set(best["state_dict"]) == set(module().state_dict())
-
-
-def test_another_training_is_refused(tmp_path: Path) -> None:
-    claim(tmp_path / "a", {"seed": 0, "network": {"blocks": 2}})
-    claim(tmp_path / "a", {"seed": 0, "network": {"blocks": 2}})
-    with pytest.raises(TrainingFolderError, match="seed"):
-        claim(tmp_path / "a", {"seed": 1, "network": {"blocks": 2}})
-    (tmp_path / "b").mkdir()
-    (tmp_path / "b" / "notes.txt").write_text("mine")
-    with pytest.raises(TrainingFolderError, match="holds no training"):
-        claim(tmp_path / "b", {"seed": 0})
-    assert json.loads((tmp_path / "a" / "training.json").read_text())["seed"] == 0

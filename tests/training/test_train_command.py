@@ -13,7 +13,6 @@ import torch
 pytest.importorskip("lightning", reason="training needs the extra `train`")
 
 
-from fmtorch.training.loop import TrainingFolderError
 from fmtorch.training.run import run
 from tests.conftest import own_cache
 from tests.helpers import compose
@@ -114,7 +113,7 @@ def test_the_command_goes_on_and_refuses_another_training(
     assert (folder / "lc.onnx").is_file()
     trained(monkeypatch, tmp_path, *options)
     assert (folder / "lc.safetensors").read_bytes() == weights
-    with pytest.raises(TrainingFolderError, match=r"holds another training \(it differs in seed\)"):
+    with pytest.raises(ValueError, match=r"holds checkpoints of other settings; what differs .*: seed: "):
         trained(monkeypatch, tmp_path, *options, "seed=1")
 
 

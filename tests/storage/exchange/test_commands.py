@@ -86,7 +86,7 @@ def test_a_folder_of_images(images: Path, tmp_path: Path, capsys: pytest.Capture
     assert re.search(r"[23] of 6 pairs taken from an earlier run", said)
     assert "6 of 6 pairs show one scene" in said
 
-    with pytest.raises(ValueError, match=r"holds matches of other settings \(seed differ\); choose another output"):
+    with pytest.raises(ValueError, match=r"holds matches of other settings; .*: seed: 0 -> 3\. Choose another output"):
         match(images, tmp_path / "out", "seed=3")
 
 

@@ -97,7 +97,7 @@ def test_a_calibration_of_all_gives_what_verify_gives(tmp_path: Path) -> None:
     ours, theirs = (set(map(tuple, g.inlier_matches.tolist())) for g in (geometry, again))
     assert len(ours & theirs) > 0.9 * len(ours | theirs)
 
-    with pytest.raises(ValueError, match=r"holds matches of other settings \(cameras differ\)"):
+    with pytest.raises(ValueError, match=r"holds matches of other settings; .*: cameras"):
         scene.match(tmp_path / "out", "cameras=unknown")
 
 
