@@ -19,9 +19,9 @@ from fmtorch.core.stages import Estimator, Pruner
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data import ImagePair
 from fmtorch.geometry import refine
-from fmtorch.pipeline.build import load_pipeline
+from fmtorch.pipeline.build import build_pipeline, load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.presets.composition import compose
+from fmtorch.presets.composition import PIPELINES, compose
 from scripts.benchmark.runner import Method, identity
 
 TRUTH, NGRANSAC = "truth", "ngransac"
@@ -118,8 +118,8 @@ def pipeline_method(name: str, words: str, *overrides: str) -> tuple[Method, Pip
     """A pipeline as a method, what makes its matches, and the digest of that; words after ``+`` are further pruners."""
     words, *more = (part.strip() for part in words.split(" + "))
     preset, *changed = [*words.split(), *overrides]
-    pipeline = pipeline_of(preset, *changed)
-    config = presets.stages(compose("match", (f"pipeline={preset}", *changed)))
+    composed = compose(PIPELINES, (f"pipeline={preset}", "cache=off", *changed))
+    pipeline, config = build_pipeline(composed), presets.stages(composed)
     front = identity([], config["features"], config["matcher"], pipeline.extractor)
     added = {word: build("pruner", word) for word in more}
     configs = [config["estimator"], *(part for entry in config["pruner"] for part in entry.values())]
