@@ -83,7 +83,7 @@ def run(arguments: argparse.Namespace) -> None:
     cv2.setNumThreads(1)
     pairs = select([dataset[i] for dataset in sets_of(arguments) for i in range(len(dataset))], arguments.limit)
     front = pipeline_of(METHOD, "features=sift_vlfeat", f"cache={arguments.cache}")
-    matched = [front.match([pair])[0] for pair in track(pairs, "matching", console=console, transient=True)]
+    matched = [front.correspondences([pair])[0] for pair in track(pairs, "matching", console=console, transient=True)]
     rows: dict[str, list[PairRow]] = {}
     for name, estimator in variants().items():
         estimation = Pipeline(front.extractor, front.matcher, {}, estimator)

@@ -179,7 +179,7 @@ def rows_of(
     front: Pipeline, pair: ImagePair, built: Chains, estimators: dict[str, Any], features: str
 ) -> Iterator[Row]:
     """A row for each method and estimator."""
-    matched = front.match([pair])[0]
+    matched = front.correspondences([pair])[0]
     for use, methods in built.items():
         for name, pruners in methods.items():
             outcome, seconds = timed(matched, pruners, front)

@@ -107,7 +107,7 @@ def load(arguments: argparse.Namespace) -> list[Item]:
         presets.build("matcher", "nearest"), pruners, _no_estimator,
     )  # fmt: skip
     with ThreadPoolExecutor(torch.get_num_threads()) as workers:
-        matched = workers.map(lambda pair: front.match([pair])[0], pairs)
+        matched = workers.map(lambda pair: front.correspondences([pair])[0], pairs)
         outcomes = list(track(matched, "matching", total=len(pairs), console=console))
     items = [(o.pair, o.correspondences) for o in outcomes if o.correspondences is not None]
     typical = np.median([int(c.count()) for _, c in items])

@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> None:
     cv2.setNumThreads(1)
     pairs = select([dataset[i] for dataset in sets_of(arguments) for i in range(len(dataset))], arguments.limit)
     front = load_pipeline("paper/sift_ratio", overrides=["features=sift_vlfeat"])
-    matches = [o.correspondences for o in front.match(pairs) if o.correspondences is not None]
+    matches = [o.correspondences for o in front.correspondences(pairs) if o.correspondences is not None]
     with PAPER.open(encoding="utf-8") as file:
         published = list(csv.DictReader(file))
     lines = []

@@ -126,7 +126,7 @@ def rows_of(
     All have the pruners of the shortest of them, whose matches are shared.
     """
     front = min(pipelines.values(), key=lambda p: len(p.pruners))
-    matched = front.match(batch)
+    matched = front.correspondences(batch)
     for name, pipeline in pipelines.items():
         outcomes: list[Outcome] = []
         for outcome in matched:

@@ -106,7 +106,7 @@ def measure(arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def rows(front: Pipeline, pair: ImagePair, methods: dict[str, list[Any]]) -> Iterator[dict[str, Any]]:
-    matched = front.match([pair])[0]
+    matched = front.correspondences([pair])[0]
     for name, pruners in methods.items():
         row = evaluate(front.estimate([pruned_by(matched, pruners, front)]))[0]
         kept = ("pair", "family", "scene", "ok", "nsgd", "inlier_rate", "inlier_rate_before", "corrs", "corrs_before")

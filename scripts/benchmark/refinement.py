@@ -88,7 +88,7 @@ def stages(
     stage = presets.build("pruner", STAGE)
     before, after, ms = [], [], []
     for pair in track(pairs, name, console=console, transient=True):
-        outcome = pipeline.match([pair])[0]
+        outcome = pipeline.correspondences([pair])[0]
         c = outcome.correspondences
         if c is None or not int(c.count()):
             continue

@@ -110,7 +110,7 @@ def matches(
     for name, batch in track(list(batches(pairs)), feature, console=console):
         path = kept / f"{name}.pt"
         if not path.exists():
-            matched = [outcome.correspondences or _nothing(outcome.pair) for outcome in front.match(batch)]
+            matched = [outcome.correspondences or _nothing(outcome.pair) for outcome in front.correspondences(batch)]
             fields = {name: getattr(collate([_slim(c) for c in matched]), name) for name in FIELDS}
             with replacing(path) as temporary:
                 torch.save(fields, temporary)

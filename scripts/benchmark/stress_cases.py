@@ -78,7 +78,7 @@ def load(arguments: argparse.Namespace) -> Iterator[Case]:
     sift, nearest = presets.build("features", "sift"), presets.build("matcher", "nearest")
     front = Pipeline(sift, nearest, {}, _no_estimator, memory=IMAGES)
     for pair in track(pairs, "pairs", console=console):
-        matches = front.match([pair])[0].correspondences
+        matches = front.correspondences([pair])[0].correspondences
         if matches is not None:
             case = case_of(pair, matches)
             if int(case.right.sum()) >= MIN_RIGHT:

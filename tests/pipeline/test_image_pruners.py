@@ -54,11 +54,11 @@ def test_files_are_read_once_and_matches_are_refined(reads: collections.Counter[
     for _ in range(2):  # the second run finds its features in the cache
         reads.clear()
         pipeline = built(str(tmp_path))
-        outcomes = pipeline.match(pairs)
+        outcomes = pipeline.correspondences(pairs)
         assert set(reads.values()) == {1}
         assert all(outcome.images is None for outcome in outcomes)
     plain = load_pipeline("sift_fmtorch", overrides=[f"cache={tmp_path}", "features.max_features=1500"])
-    before = plain.match(pairs)
+    before = plain.correspondences(pairs)
     gains = []
     for old, new in zip(before, outcomes, strict=True):
         F = torch.from_numpy(new.pair.F)[None]
@@ -74,7 +74,7 @@ def test_files_are_read_once_and_matches_are_refined(reads: collections.Counter[
     given = dataclasses.replace(pairs[0], matches=lambda: GivenMatches(c, (1500, 1500)))
     reads.clear()
     fresh = Pipeline(pipeline.extractor, pipeline.matcher, {"refine": refiner()}, pipeline.estimator)
-    refined = fresh.match([given])[0].correspondences
+    refined = fresh.correspondences([given])[0].correspondences
     expected = outcomes[0].correspondences
     assert reads == {pairs[0].image0.path: 1, pairs[0].image1.path: 1}
     assert refined is not None

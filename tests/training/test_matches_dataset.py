@@ -68,7 +68,7 @@ def test_items_are_the_pipelines_matches_with_labels(rendered: RenderedPairs, ma
     by_identity = {pair.identity: pair for pair in rendered}
     for index in range(0, len(matched), 2):
         pair = by_identity[matched.pairs[index]["identity"]]
-        expected = pipeline.match([pair])[0].correspondences
+        expected = pipeline.correspondences([pair])[0].correspondences
         item = matched[index]
         c = item.correspondences
         for name in ("x0", "x1", "quality", "mutual", "lafs0", "lafs1", "size0", "size1", "K0", "K1", "key", "mask"):
