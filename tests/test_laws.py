@@ -10,7 +10,6 @@ import torch
 
 from fmtorch import presets
 from fmtorch.core.types import Correspondences, Estimate, collate
-from fmtorch.jit import kernel as switch
 from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.laws import (
     Result,
@@ -31,10 +30,6 @@ from tests.variants import variants
 OWN = [n for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES)]
 PER_MATCH = ("inliers", "kept", "prior", "noise")
 NOISY = ("fmtorch", "fmtorch_fast", "gc_ransac", "msac")  # are also told the noise of matches
-COMPILED = (  # pruners of two forms: a kernel, and tensors
-    "frame_consistency", "gms", "gms:soft=true", "lpm", "lpm:soft=true", "match_noise", "one_to_one",
-    "position_consistency",
-)  # fmt: skip
 
 
 def _results(e: Estimate) -> Result:
@@ -47,18 +42,15 @@ def _estimator(name: str) -> Subject:
     return Subject(f"estimator={name}", lambda c: _results(estimator(c, seed=5)))
 
 
-def _pruner(name: str, kernel: bool = True) -> Subject:
+def _pruner(name: str) -> Subject:
     pruner = quick_pruner(name)
 
     def run(c: Correspondences) -> Result:
-        with pytest.MonkeyPatch.context() as environment:
-            if not kernel:
-                environment.setenv(switch.SWITCH, "off")
-            pruned = pruner(calibrated(c))
+        pruned = pruner(calibrated(c))
         fields = {name: getattr(pruned, name) for name in ("prior", "noise")}
         return {"kept": pruned.mask, **{name: value for name, value in fields.items() if value is not None}}
 
-    return Subject(f"pruner={name}" + ("" if kernel else " without kernels"), run)
+    return Subject(f"pruner={name}", run)
 
 
 def _noisy(name: str) -> Subject:
@@ -69,8 +61,7 @@ def _noisy(name: str) -> Subject:
 def _subjects() -> list[Subject]:
     """Every preset of these groups: a new file in conf/ joins by being there."""
     estimators = [_estimator(n) for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES[1:])]
-    pruners = [*(_pruner(n) for n in variants("pruner")), *(_pruner(n, kernel=False) for n in COMPILED)]
-    return [*estimators, *pruners, *(_noisy(n) for n in NOISY)]
+    return [*estimators, *(_pruner(n) for n in variants("pruner")), *(_noisy(n) for n in NOISY)]
 
 
 def _row(result: Result, c: Correspondences, i: int) -> Result:

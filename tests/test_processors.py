@@ -27,7 +27,7 @@ from tests.laws import degenerate, scene, scenes
 from tests.variants import built
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-ESTIMATORS = ("fmtorch", "irls:kernel=cauchy", "irls", "msac", "usac")
+ESTIMATORS = ("fmtorch", "irls:loss=cauchy", "irls", "msac", "usac")
 PRUNERS = (
     "frame_consistency", "gms", "gms:soft=true", "lpm", "lpm:soft=true", "match_noise", "one_to_one",
     "position_consistency", "ratio_prior",

@@ -1,4 +1,4 @@
-"""Presets, and other methods that an option makes of them, by one word each: ``irls``, ``irls:kernel=huber``."""
+"""Presets, and other methods that an option makes of them, by one word each: ``irls``, ``irls:loss=huber``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ METHODS = ("lmeds", "usac_default", "usac_fast", "usac_accurate", "usac_prosac",
 OPTIONS = {
     "estimator": {
         "colmap": ["two_view=false"],
-        "irls": [f"kernel={kernel}" for kernel in ("cauchy", "geman_mcclure", "huber", "truncated")],
+        "irls": [f"loss={loss}" for loss in ("cauchy", "geman_mcclure", "huber", "truncated")],
         "opencv": [f"method={method}" for method in METHODS],
         "poselib": ["shared_focal=true"],
     },

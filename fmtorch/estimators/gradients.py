@@ -31,9 +31,9 @@ from fmtorch.estimators.pair import MAX_NOISE, MIN_NOISE, Pair
 from fmtorch.geometry import canonical, eight_point, unit_frobenius
 from fmtorch.geometry.cameras import PixelFrame
 from fmtorch.geometry.homography_refine import homography_at_optimum
-from fmtorch.geometry.levenberg_marquardt import LOSSES, NO_TABLE, Weighted
+from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, NO_TABLE, Weighted
 from fmtorch.geometry.optimum import STEP_DAMPING, gradient_of_cost
-from fmtorch.geometry.robust_losses import KERNELS
+from fmtorch.geometry.robust_losses import LOSSES
 from fmtorch.jit.kernel import Array
 from fmtorch.jit.lanes import LANES
 
@@ -125,7 +125,7 @@ class Attached:
         if self.family.model == "homography":
             return _homographies_at_optimum(solved, at, matches, weight)
         unbounded = torch.full_like(at[:, 0], torch.inf)
-        gradient = gradient_of_cost(at.T[..., None], matches.points, weight, KERNELS["truncated"], unbounded)[..., 0].T
+        gradient = gradient_of_cost(at.T[..., None], matches.points, weight, LOSSES["truncated"], unbounded)[..., 0].T
         response = torch.from_numpy(np.stack([_response(s) for s in solved])).to(device)
         return (response * (gradient - gradient.detach())[:, None]).sum(-1)
 
@@ -134,10 +134,10 @@ def _homographies_at_optimum(
     solved: list[Solved], at: Float[Tensor, "p 9"], matches: GraphedMatches, weight: Float[Tensor, "p n"]
 ) -> Float[Tensor, "p 9"]:
     """As `Attach`, of homographies, by the loss of their fits."""
-    robust, s2 = KERNELS["truncated"], torch.full_like(at[:, :1], torch.inf)
+    robust, s2 = LOSSES["truncated"], torch.full_like(at[:, :1], torch.inf)
     scales = [s.fit.s2 for s in solved if s.fit.s2 is not None]  # of all fits, or of none
     if scales:
-        robust, s2 = KERNELS["cauchy"], torch.where(matches.mask, _padded(scales, matches.mask), 1)
+        robust, s2 = LOSSES["cauchy"], torch.where(matches.mask, _padded(scales, matches.mask), 1)
     model = torch.nn.functional.normalize(at, dim=1).T[..., None]
     attached = homography_at_optimum(model, matches.points, weight, robust, s2)[..., 0].T
     return attached - attached.detach()
@@ -206,7 +206,7 @@ def camera_response(cameras: Cameras, pair: Pair, weight: Array, precision: floa
     weight: (n,), of the matches that count. precision: one over the variance of an inlier's distance.
     """
     images, optimum, tangents = images_of(pair), no_optimum(1), np.zeros((1, 9, LANES))
-    matches = Weighted(centred(pair).points, weight, np.full(pair.count, np.inf), LOSSES["truncated"], NO_TABLE)
+    matches = Weighted(centred(pair).points, weight, np.full(pair.count, np.inf), LOSS_CODES["truncated"], NO_TABLE)
     minimise(cameras.copy(), matches, images, Limits(precision, 0, 0.0), optimum)
     tangents_of(cameras, images.longest, optimum.F, tangents)
     moves, hessian, by_focal = np.empty((7, 9)), optimum.hessian[0], np.eye(7, 2, -5)

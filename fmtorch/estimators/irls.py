@@ -20,14 +20,14 @@ from fmtorch.estimators.pair import Pair, squared
 from fmtorch.geometry import attached_step
 from fmtorch.geometry.eight_point import weighted_eight_point
 from fmtorch.geometry.irls import reweighted_kernel
-from fmtorch.geometry.levenberg_marquardt import LOSSES, Schedule, Weighted, loss_table
+from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, Schedule, Weighted, loss_table
 from fmtorch.geometry.rank2_manifold import SQUARINGS
 from fmtorch.geometry.refine import refine_kernel
-from fmtorch.geometry.robust_losses import named_kernel
+from fmtorch.geometry.robust_losses import named_loss
 from fmtorch.jit.kernel import Array
 from fmtorch.jobs.threads import mapped
 
-DECAY = 0.65  # of the kernel's scale, from one iteration to the next, down to the threshold
+DECAY = 0.65  # of the loss's scale, from one iteration to the next, down to the threshold
 FIRST_DAMPING = 1e-4  # of Levenberg-Marquardt
 NOT_DETERMINED = "the matches do not determine a model"
 
@@ -36,25 +36,25 @@ class IterativelyReweighted:
     """The least ``sum_i w_i rho(r_i^2)``, r the Sampson distance, from the weighted 8-point algorithm on all matches.
 
     w is the prior P(inlier); where there is none, the rank by quality (1 for the best match, falling to 0); where there
-    is neither, 1. Each power of w in `starts` gives a first model. From there the scale of the kernel shrinks from the
+    is neither, 1. Each power of w in `starts` gives a first model. From there the scale of the loss shrinks from the
     residuals' own to the threshold, one reweighted fit at each scale (graduated non-convexity, Blake & Zisserman 1987,
-    with the 8-point weights of Torr & Murray 1997), so that a redescending kernel is not caught in the nearest minimum.
+    with the 8-point weights of Torr & Murray 1997), so that a redescending loss is not caught in the nearest minimum.
     Of the refined models the one of least cost is the estimate.
 
     Gradients reach the points and the prior through one attached Gauss-Newton step: those of the optimum.
 
     Args:
-        kernel: a name of `geometry.KERNELS`.
-        threshold: its scale, Sampson distance, px; a number, or one of each kernel by its name.
+        loss: a name of `geometry.LOSSES`.
+        threshold: its scale, Sampson distance, px; a number, or one of each loss by its name.
         starts: powers of w, integers, at least 0.
         iterations: reweighted fits.
-        start_scale: the kernel's first scale, in robust standard deviations of the residuals under a first model, the
+        start_scale: the loss's first scale, in robust standard deviations of the residuals under a first model, the
             widest of them.
         refine_iterations: Levenberg-Marquardt steps of the end.
         inlier_threshold: of the inliers reported, Sampson distance, px; null: the threshold.
 
     Raises:
-        ValueError: for a threshold that is not positive, for no starts or a negative one, for an unknown kernel, and
+        ValueError: for a threshold that is not positive, for no starts or a negative one, for an unknown loss, and
             for one without a threshold.
     """
 
@@ -64,7 +64,7 @@ class IterativelyReweighted:
     def __init__(
         self,
         *,
-        kernel: str,
+        loss: str,
         threshold: float | Mapping[str, float],
         starts: Sequence[int] = (0, 1, 2, 4, 8, 16),
         iterations: int = 12,
@@ -72,16 +72,16 @@ class IterativelyReweighted:
         refine_iterations: int = 30,
         inlier_threshold: float | None = None,
     ) -> None:
-        named_kernel(kernel)
+        named_loss(loss)
         if isinstance(threshold, Mapping):
-            if kernel not in threshold:
-                raise ValueError(f"threshold has no entry for kernel={kernel}; there are: {', '.join(threshold)}")
-            threshold = threshold[kernel]
+            if loss not in threshold:
+                raise ValueError(f"threshold has no entry for loss={loss}; there are: {', '.join(threshold)}")
+            threshold = threshold[loss]
         if not threshold > 0:
             raise ValueError(f"threshold is {threshold}; it must be positive")
         if not starts or min(starts) < 0:
             raise ValueError(f"starts is {starts}; it must be a list of integers, each at least 0")
-        self.kernel, self.threshold, self.starts = kernel, threshold, sorted(set(starts))
+        self.loss, self.threshold, self.starts = loss, threshold, sorted(set(starts))
         self.iterations, self.start_scale, self.refine_iterations = iterations, start_scale, refine_iterations
         self.inlier_rule = WithinThreshold(threshold if inlier_threshold is None else inlier_threshold)
 
@@ -124,13 +124,13 @@ class IterativelyReweighted:
             weight = torch.zeros_like(matches.weight)
             for row, each in zip(weight, solved, strict=True):
                 row[: each.pair.count] = torch.from_numpy(_weight(each.pair)).to(row)
-        step = attached_step(F, matches.points0, matches.points1, weight, kernel=self.kernel, scale=scale).flatten(1)
+        step = attached_step(F, matches.points0, matches.points1, weight, loss=self.loss, scale=scale).flatten(1)
         return step - step.detach()
 
     def _weighted(self, pair: Pair, scale: float) -> Weighted:
         """The matches with the loss at a scale, in the unit of the points."""
-        s2, loss = np.full(pair.count, squared(scale)), LOSSES[self.kernel]
-        return Weighted(pair.points, pair.cached("irls weight", _weight), s2, loss, loss_table(self.kernel))
+        s2, code = np.full(pair.count, squared(scale)), LOSS_CODES[self.loss]
+        return Weighted(pair.points, pair.cached("irls weight", _weight), s2, code, loss_table(self.loss))
 
     def _first(self, pair: Pair) -> Array:
         """The 8-point algorithm with each power of the weights, where these determine a model, (k, 9)."""

@@ -34,11 +34,11 @@ class Preselect:
 class Refine:
     """Levenberg-Marquardt of the robust Sampson error, from each model of the pool.
 
-    kernel: a name of `geometry.KERNELS`. scale: its scale, Sampson distance, px. iterations: steps. matches: at most so
+    loss: a name of `geometry.LOSSES`. scale: its scale, Sampson distance, px. iterations: steps. matches: at most so
     many are looked at, drawn by the pair's key from those within RADIUS scales of a model of the pool; None: all.
     """
 
-    kernel: Literal["huber", "cauchy", "geman_mcclure", "truncated", "magsac"]
+    loss: Literal["huber", "cauchy", "geman_mcclure", "truncated", "magsac"]
     scale: Pixels = 1.0
     iterations: NonNegative = 5
     matches: Count | None = None

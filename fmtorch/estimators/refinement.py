@@ -68,7 +68,7 @@ class Refinement:
             F = self.local_optimization(F, pair)
         if (options := self.options) is not None:
             steps = Steps(options.iterations, FIRST_DAMPING)
-            F = family.refine(F, near, Loss(options.kernel, options.scale), steps)
+            F = family.refine(F, near, Loss(options.loss, options.scale), steps)
         return Candidates(F, pool.valid, near)
 
 

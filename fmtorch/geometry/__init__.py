@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     from fmtorch.geometry.normalize import canonical, denormalize_fundamental, normalize_pair, normalize_points
     from fmtorch.geometry.pose import FourPoses, Pose, pose_from_fundamental, poses_from_fundamental
     from fmtorch.geometry.refine import attached_step, refine
-    from fmtorch.geometry.robust_losses import KERNELS
+    from fmtorch.geometry.robust_losses import LOSSES
     from fmtorch.geometry.seven_point import seven_point
     from fmtorch.geometry.significance import significance
 
 __all__ = [
-    "KERNELS", "Fits", "FourPoses", "PlanePoses", "Pose", "TwoViewCovariance", "algebraic", "attached_step",
+    "LOSSES", "Fits", "FourPoses", "PlanePoses", "Pose", "TwoViewCovariance", "algebraic", "attached_step",
     "canonical", "cross_matrix", "denormalize_fundamental", "eight_point", "epipolar_distances", "epipolar_lines",
     "fundamental_from_calibration", "fundamental_from_projections", "homography", "homography_points",
     "homography_sampson", "homography_transfer", "irls", "nearest_rank2", "normalize_pair", "normalize_points",

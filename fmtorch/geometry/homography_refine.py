@@ -30,7 +30,7 @@ from fmtorch.geometry.matrices import assign, assign_rows, unit_kernel
 from fmtorch.geometry.normalize import NormalizedMatches, fitted_by
 from fmtorch.geometry.optimum import gradient_wanted, inverse_hessian
 from fmtorch.geometry.rank2_manifold import eliminate
-from fmtorch.geometry.robust_losses import Kernel, named_kernel
+from fmtorch.geometry.robust_losses import RobustLoss, named_loss
 from fmtorch.jit.kernel import Array, F8x1, F8x2, F8x3, inner, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, added, fill, load, store, where
 
@@ -84,7 +84,7 @@ def homography_gradient(
     H: Float[Tensor, "9 p k"],
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
-    robust: Kernel,
+    robust: RobustLoss,
     s2: Float[Tensor, "p slots"],
 ) -> Float[Tensor, "9 p k"]:
     """Half the gradient of ``sum_i w_i rho(r_i^2)`` by the entries of H, ``G^T l``, attached to all inputs.
@@ -107,7 +107,7 @@ def homography_curvature(
     H: Float[Tensor, "9 p k"],
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
-    robust: Kernel,
+    robust: RobustLoss,
     s2: Float[Tensor, "p slots"],
 ) -> Float[Tensor, "p k 9 9"]:
     """The Gauss-Newton matrix ``G^T (J J^T)^-1 G`` with the curvature of the loss; arguments as of the gradient."""
@@ -329,7 +329,7 @@ def refine_homography(
     weight: Float[Tensor, "*batch n"] | None = None,
     mask: Bool[Tensor, "*batch n"] | None = None,
     *,
-    kernel: str = "truncated",
+    loss: str = "truncated",
     scale: float | Tensor = 1.0,
     iterations: int = 10,
 ) -> Float[Tensor, "*models 3 3"]:
@@ -346,8 +346,8 @@ def refine_homography(
         x1: their matches in image 1.
         weight: not negative, 1 by default.
         mask: False in slots to ignore, whatever they hold; a match that is not finite is ignored too.
-        kernel: a name of `robust_losses.KERNELS`.
-        scale: of the kernel, in pixels (a number, or one per set).
+        loss: a name of `robust_losses.LOSSES`.
+        scale: of the loss, in pixels (a number, or one per set).
         iterations: Levenberg-Marquardt steps.
 
     Returns:
@@ -355,7 +355,7 @@ def refine_homography(
         cannot be refined comes back as it was, scaled.
 
     Raises:
-        ValueError: for an unknown kernel.
+        ValueError: for an unknown loss.
 
     Example:
         >>> import torch
@@ -366,14 +366,14 @@ def refine_homography(
         >>> bool(((refined / refined[2, 2] - H).abs() < 1e-6).all())
         True
     """
-    robust, schedule = named_kernel(kernel), Schedule(iterations, FIRST_DAMPING, 0.0)
-    wanted = gradient_wanted("implicit", x0, x1, weight)
+    robust, schedule = named_loss(loss), Schedule(iterations, FIRST_DAMPING, 0.0)
+    wanted = gradient_wanted(x0, x1, weight)
     with torch.set_grad_enabled(wanted):
         matches = NormalizedMatches(x0, x1, weight, mask, H.detach(), scale, homographies=True)
         shared, s2 = (matches.points, matches.weight), matches.scale.square()[:, None]
         models, _ = fitted_by(
             lambda models, data, out, cost: refine_homographies(models, data, schedule, out, cost),
-            _seen_from_the_front(matches), *shared, s2, kernel,
+            _seen_from_the_front(matches), *shared, s2, loss,
         )  # fmt: skip
         if wanted:
             models = homography_at_optimum(models, *shared, robust, s2)
@@ -384,7 +384,7 @@ def homography_at_optimum(
     H: Float[Tensor, "9 p k"],
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
-    robust: Kernel,
+    robust: RobustLoss,
     s2: Float[Tensor, "p slots"],
 ) -> Float[Tensor, "9 p k"]:
     """H, optima of unit norm on no graph, attached to the graph of points and weights by the implicit function theorem.
@@ -404,7 +404,7 @@ def inverse_hessian_of_homography(
     H: Float[Tensor, "9 p k"],
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
-    robust: Kernel,
+    robust: RobustLoss,
     s2: Float[Tensor, "p slots"],
 ) -> Float[Tensor, "9 9 p k"]:
     """That of half the cost at optima of unit norm, across these; arguments as of `homography_at_optimum`."""
@@ -413,7 +413,7 @@ def inverse_hessian_of_homography(
     return inverse_hessian(exact, gauss_newton, H.movedim(0, -1)[..., None])
 
 
-def _hessian(H: Tensor, points: Tensor, weight: Tensor, robust: Kernel, s2: Tensor) -> Float[Tensor, "p k 9 9"]:
+def _hessian(H: Tensor, points: Tensor, weight: Tensor, robust: RobustLoss, s2: Tensor) -> Float[Tensor, "p k 9 9"]:
     """Half the second derivative of the cost."""
     with torch.enable_grad():
         model = H.detach().clone().requires_grad_()

@@ -16,7 +16,7 @@ from fmtorch.geometry.matrices import assign, nearest_rank2
 from fmtorch.geometry.normalize import NormalizedMatches, canonical, denormalize_fundamental, normalize_points
 from fmtorch.geometry.optimum import at_fixed_point, gradient_wanted
 from fmtorch.geometry.rank2_manifold import RANK_TWO, constant
-from fmtorch.geometry.robust_losses import Kernel, named_kernel
+from fmtorch.geometry.robust_losses import RobustLoss, named_loss
 from fmtorch.jit.kernel import F8x2, kernel, matrix, vector
 from fmtorch.jit.lanes import LANES, load, store
 
@@ -30,10 +30,9 @@ def irls(
     weight: Float[Tensor, "*batch n"] | None = None,
     mask: Bool[Tensor, "*batch n"] | None = None,
     *,
-    kernel: str = "cauchy",
+    loss: str = "cauchy",
     scale: float | Tensor = 1.0,
     iterations: int = 5,
-    gradient: str = "implicit",
 ) -> Float[Tensor, "*models 3 3"]:
     """Fundamental matrices near F0 by the normalised 8-point algorithm with Sampson weights, repeated.
 
@@ -42,8 +41,12 @@ def irls(
     for estimating the fundamental matrix", section 4. A fixed point is close to, but not quite, the least of
     ``sum w rho(r^2)``, since g moves with F: `refine` finds that.
 
-    Differentiable in points and weights. Gradients are bounded where the matches leave F open, and zero for a model
-    that is kept as it was. Where nothing requires them no graph is built, and the values are the same in any case.
+    Differentiable in points and weights, not in F0: by the implicit function theorem, the gradient is that of the fixed
+    point F = fit(F, points, weights) (see `at_fixed_point`). It costs ten iterations and needs the memory of two. Each
+    iteration divides the distance from the fixed point by 1.2 to 30; before it the gradient is near that there: after 5
+    iterations with the Cauchy loss and 20 wrong matches among 120 it is off by 0.1 %. Gradients are bounded where the
+    matches leave F open, and zero for a model that is kept as it was. Where nothing requires them no graph is built,
+    and the values are the same in any case.
 
     Args:
         x0: points of image 0, pixels.
@@ -51,37 +54,31 @@ def irls(
         F0: one matrix for each set of matches, or K of them, (*batch, K, 3, 3).
         weight: not negative, 1 by default.
         mask: False in slots to ignore; matches that are not finite are ignored too.
-        kernel: a name of `robust_losses.KERNELS`.
-        scale: of the kernel, in pixels (a number, or one per set).
+        loss: a name of `robust_losses.LOSSES`.
+        scale: of the loss, in pixels (a number, or one per set).
         iterations: reweighted fits.
-        gradient: "implicit", that of the fixed point F = fit(F, points, weights) by the implicit function theorem (see
-            `at_fixed_point`); it costs ten iterations, needs the memory of two, and there is none to F0. Or "unrolled"
-            through all iterations, exact for the matrix returned whatever their number, and also to F0. They agree at
-            convergence; each iteration divides the distance from there by 1.2 to 30. Before it the implicit one is the
-            nearer to the gradient of the fixed point: after 5 iterations with the Cauchy kernel and 20 wrong matches
-            among 120 it is off by 0.1 %, the unrolled one by 2 %.
 
     Returns:
         Matrices of rank 2 and unit norm in float64; a model that the weighted matches do not determine is kept as it
         was.
 
     Raises:
-        ValueError: for an unknown kernel or gradient.
+        ValueError: for an unknown loss.
     """
-    robust = named_kernel(kernel)
-    wanted = gradient_wanted(gradient, x0, x1, weight, scale, F0 if gradient == "unrolled" else None)
+    robust = named_loss(loss)
+    wanted = gradient_wanted(x0, x1, weight, scale)
     with torch.set_grad_enabled(wanted):
         matches = NormalizedMatches(x0, x1, weight, mask, F0, scale)
 
         def step(F: Tensor) -> Tensor:
             return reweighted(F, matches.points, matches.weight, robust, matches.scale)
 
-        F = matches.models
-        with torch.set_grad_enabled(wanted and gradient == "unrolled"):
+        F = matches.models.detach()
+        with torch.no_grad():
             for _ in range(iterations):
                 F = step(F)
-        if wanted and gradient == "implicit":
-            F = at_fixed_point(F.detach(), step)
+        if wanted:
+            F = at_fixed_point(F, step)
         return matches.to_pixels(F).reshape(F0.shape)
 
 
@@ -151,13 +148,13 @@ def reweighted(
     F: Float[Tensor, "9 p k"],
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
-    robust: Kernel,
+    robust: RobustLoss,
     scale: Float[Tensor, " p"],
 ) -> Float[Tensor, "9 p k"]:
     """One iteration, component by component: the 8-point algorithm with the weights that the residuals under F give.
 
     F: k models for each of p pairs, entries row by row. points: x0, y0, x1, y1, of about unit scale; finite. weight: 0
-    in padded slots. scale: of the kernel, in the unit of the points. Models of rank 2; one that the weighted matches do
+    in padded slots. scale: of the loss, in the unit of the points. Models of rank 2; one that the weighted matches do
     not determine is kept as it was.
     """
     finite = torch.isfinite(F).all(0)

@@ -23,7 +23,13 @@ from fmtorch.jit.lanes import LANES, added, fill, load, sqrt, store, where
 
 TINY = 1e-30  # as in `residuals`
 HUBER, CAUCHY, GEMAN_MCCLURE, TRUNCATED, MAGSAC = 0, 1, 2, 3, 4  # losses
-LOSSES = {"huber": HUBER, "cauchy": CAUCHY, "geman_mcclure": GEMAN_MCCLURE, "truncated": TRUNCATED, "magsac": MAGSAC}
+LOSS_CODES = {
+    "huber": HUBER,
+    "cauchy": CAUCHY,
+    "geman_mcclure": GEMAN_MCCLURE,
+    "truncated": TRUNCATED,
+    "magsac": MAGSAC,
+}
 NO_TABLE = np.empty((2, 0))
 MATCH = 6  # rows of LANES matches: x0, y0, x1, y1, their weights, squared scales
 

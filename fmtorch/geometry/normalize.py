@@ -13,7 +13,7 @@ from torch import Tensor
 from fmtorch.geometry.arithmetic import as_components, as_matrices, component_sum, matmul3, sqrt, stable_sum, unit
 from fmtorch.geometry.cameras import PixelFrame
 from fmtorch.geometry.epipolar import unit_frobenius
-from fmtorch.geometry.levenberg_marquardt import LOSSES, Weighted, loss_table
+from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, Weighted, loss_table
 from fmtorch.jit.kernel import Array
 
 
@@ -146,7 +146,7 @@ def _similarity(centroid: Tensor, scale: Tensor) -> Tensor:
 class NormalizedMatches:
     """Matches of P pairs, those that count first, centred, of about unit scale, and K models for each pair.
 
-    points: (4, P, N), rows x0, y0, x1, y1, zero in padded slots. weight: (P, N), likewise. scale: of the kernel in the
+    points: (4, P, N), rows x0, y0, x1, y1, zero in padded slots. weight: (P, N), likewise. scale: of the loss in the
     unit of the points, (P,). models: (9, P, K), entries row by row, of about unit scale. counts: which of the caller's
     matches count. Everything is float64 and attached to the caller's graph; the frame is constant. homographies: the
     models F are homographies, not fundamental matrices.
@@ -214,7 +214,7 @@ def fitted_by(
     scales = s2.detach().expand_as(weight).cpu().contiguous().numpy()
     out, cost = np.empty_like(start), np.empty(start.shape[:2])
     for p, given in enumerate(start):
-        matches = Weighted(columns[p], weights[p], scales[p], LOSSES[loss], loss_table(loss))
+        matches = Weighted(columns[p], weights[p], scales[p], LOSS_CODES[loss], loss_table(loss))
         fit(given, matches, out[p], cost[p])
     known = np.isfinite(cost)
     fitted = torch.from_numpy(np.where(known[..., None], out, start)).to(models.device)

@@ -1,4 +1,4 @@
-"""Gradients of the least robust Sampson error: of the optimum itself, or through the steps that led there."""
+"""Gradients of the least robust Sampson error: those of the optimum."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from torch import Tensor
 
 from fmtorch.geometry.arithmetic import as_rows, cofactors, component_sum, sqrt, stable_sum, unit
 from fmtorch.geometry.epipolar import homogeneous, linearise
-from fmtorch.geometry.levenberg_marquardt import FIRST_DAMPING, MAX_DAMPING, MIN_DAMPING
-from fmtorch.geometry.rank2_manifold import RANK_TWO, constant, start
-from fmtorch.geometry.robust_losses import Kernel
+from fmtorch.geometry.rank2_manifold import RANK_TWO, constant
+from fmtorch.geometry.robust_losses import RobustLoss
 
 STEP_DAMPING = 1e-10  # of the attached step: bounds its gradient where the points leave a direction open
 
@@ -21,7 +20,7 @@ def gradient_of_cost(
     F: Float[Tensor, "9 p k"],
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
-    robust: Kernel,
+    robust: RobustLoss,
     scale: Float[Tensor, " p"],
 ) -> Float[Tensor, "9 p k"]:
     """Half the gradient of the cost with respect to F, ``sum_i w_i rho'(r_i^2) r_i dr_i``; attached to all inputs."""
@@ -34,7 +33,7 @@ def curvature_of_cost(
     F: Float[Tensor, "9 p k"],
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
-    robust: Kernel,
+    robust: RobustLoss,
     scale: Float[Tensor, " p"],
 ) -> Float[Tensor, "9 9 p k"]:
     """The Gauss-Newton matrix ``J^T W J`` with Newton's weights, those of the loss's curvature, not those of IRLS."""
@@ -48,7 +47,7 @@ def at_optimum(
     F: Float[Tensor, "9 p k"],
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
-    robust: Kernel,
+    robust: RobustLoss,
     scale: Float[Tensor, " p"],
 ) -> Float[Tensor, "9 p k"]:
     """F, optima of rank 2 and unit norm, attached to the graph of points and weights by the implicit function theorem.
@@ -100,7 +99,7 @@ def inverse_hessian(
 
 
 def _hessian(
-    F: Tensor, C: Tensor, size: Tensor, points: Tensor, weight: Tensor, robust: Kernel, scale: Tensor
+    F: Tensor, C: Tensor, size: Tensor, points: Tensor, weight: Tensor, robust: RobustLoss, scale: Tensor
 ) -> Float[Tensor, "p k 9 9"]:
     """Half the second derivative of the Lagrangian ``cost + 2 multiplier det F``; C are F's cofactors, size |C|^2."""
     with torch.enable_grad():
@@ -113,80 +112,14 @@ def _hessian(
     return (H + H.mT) / 2
 
 
-def through_steps(
-    F: Float[Tensor, "9 p k"],
-    F0: Float[Tensor, "9 p k"],
-    iterations: int,
-    points: Float[Tensor, "4 p n"],
-    weight: Float[Tensor, "p n"],
-    robust: Kernel,
-    scale: Float[Tensor, " p"],
-) -> Float[Tensor, "9 p k"]:
-    """F, to which so many steps led from F0, attached to the graph of F0, points and weights through each of them.
-
-    The steps are taken once more, in tensors. Damping and the choice of the steps that are accepted are constants.
-    Arguments as of `gradient_of_cost`. Returns the same values.
-    """
-    shared = (points, weight, robust, scale)
-    valid = torch.isfinite(F).all(0) & (F != 0).any(0)
-    current = start(torch.where(valid, F0, constant(F, RANK_TWO)))[0]
-    cost, damping = _cost(current, *shared), torch.full_like(F[0].detach(), FIRST_DAMPING)
-    for _ in range(iterations):
-        with torch.no_grad():
-            trial_cost = _cost(_step(current, *shared, damping), *shared)
-        accepted = valid & (trial_cost < cost)
-        moved = _step(current, *shared, torch.where(accepted, damping, 1))
-        current, cost = torch.where(accepted, moved, current), torch.where(accepted, trial_cost, cost)
-        damping = torch.where(accepted, damping / 10, damping * 10).clamp(MIN_DAMPING, MAX_DAMPING)
-    return F + torch.where(valid, current - current.detach(), 0)
-
-
-@torch.no_grad()
-def _cost(F: Tensor, points: Tensor, weight: Tensor, robust: Kernel, scale: Tensor) -> Float[Tensor, "p k"]:
-    """The robust costs of models of rank 2."""
-    r2 = linearise(F, homogeneous(points[:, None, :, None]), derivatives=False)[3][0]
-    return stable_sum(weight[:, None] * robust.loss(r2, scale.square()[:, None, None]))
-
-
-def _step(
-    F: Tensor, points: Tensor, weight: Tensor, robust: Kernel, scale: Tensor, damping: Tensor
-) -> Float[Tensor, "9 p k"]:
-    """The model after one damped step of Gauss and Newton on the manifold, attached to all inputs."""
-    J, e, inverse, r2 = linearise(F, homogeneous(points[:, None, :, None]))
-    J, e = J.flatten(0, 1)[:, 0], e[0]
-    influence = (weight[:, None] * robust.weight(r2, scale.square()[:, None, None]) * inverse)[0]
-    H = torch.einsum("apkn,bpkn->pkab", J * influence, J)
-    gradient = torch.einsum("apkn,pkn->pka", J * influence, e)
-    model = F.movedim(0, -1)
-    normal = unit(cofactors(as_rows(F)).flatten(0, 1)).movedim(0, -1)
-    curvature = H.diagonal(dim1=-2, dim2=-1).amax(-1)
-    curvature = torch.where(curvature > 0, curvature, 1.0)
-    blocked = model[..., :, None] * model[..., None, :] + torch.diag_embed(damping[..., None].expand_as(model))
-    Q = torch.cat([H + curvature[..., None, None] * blocked, normal[..., None]], -1)
-    last = torch.cat([normal, torch.zeros_like(normal[..., :1])], -1)
-    Q = torch.cat([Q, last[..., None, :]], -2)
-    right = torch.cat([-gradient, torch.zeros_like(gradient[..., :1])], -1)
-    step = torch.linalg.solve_ex(Q, right[..., None])[0][..., :9, 0]
-    G = F + step.movedim(-1, 0)
-    C, n = cofactors(as_rows(G)).flatten(0, 1), unit(cofactors(as_rows(F)).flatten(0, 1))
-    determinant = component_sum(C[:3] * G[:3])
-    return unit(G - determinant / component_sum(C * n) * n)
-
-
 # Gradients of the fixed point of an iteration over fundamental matrices, by the implicit function theorem
 
 
-GRADIENTS = ("implicit", "unrolled")
 CONTRACTION_GAP = 1e-6  # singular values of I - J below it, of an iteration that does not contract, are held off zero
 
 
-def gradient_wanted(gradient: str, *inputs: object) -> bool:
-    """Whether a graph is being recorded and one of the inputs is on it.
-
-    Raises ValueError for an unknown kind of gradient.
-    """
-    if gradient not in GRADIENTS:
-        raise ValueError(f"gradient is {gradient!r}; it must be one of: {', '.join(GRADIENTS)}")
+def gradient_wanted(*inputs: object) -> bool:
+    """Whether a graph is being recorded and one of the inputs is on it."""
     return torch.is_grad_enabled() and any(isinstance(x, Tensor) and x.requires_grad for x in inputs)
 
 

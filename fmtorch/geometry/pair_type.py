@@ -327,9 +327,9 @@ def configuration_evidence(
     models = torch.stack([A.to(torch.float64) for A in (F, H, *cameras)], 1)
     models = torch.where(models.isfinite().flatten(2).all(2)[..., None, None], models, 0.0)
     sizes = (None if size is None else size.to(torch.float64) for size in (size0, size1))
-    given = [None if a is None else a.cpu() for a in (x0, x1, mask, prior, noise, models, *sizes, precision)]
+    given = (x0, x1, mask, prior, noise, models, *sizes, precision)
     out = torch.empty(len(F), COLUMNS, dtype=torch.float64)
-    rows = for_each_pair(_into, given, out=out, kind=torch.float64).to(F.device)
+    rows = for_each_pair(_into, given, out=out, kind=torch.float64)
     columns = [rows[:, k] for k in (LINE, PLANE, BOTH, TURN, COPY)]
     columns += [rows[:, k] for k in (NOISE, MATCHES, ON_PLANE, ON_LINE)]
     columns += [rows[:, ROTATION_OF_KERNEL:SCALED].reshape(-1, 3, 3)]

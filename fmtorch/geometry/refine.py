@@ -26,14 +26,7 @@ from fmtorch.geometry.levenberg_marquardt import (
 )
 from fmtorch.geometry.matrices import assign, assign_rows
 from fmtorch.geometry.normalize import NormalizedMatches, fitted_by
-from fmtorch.geometry.optimum import (
-    STEP_DAMPING,
-    at_optimum,
-    curvature_of_cost,
-    gradient_of_cost,
-    gradient_wanted,
-    through_steps,
-)
+from fmtorch.geometry.optimum import STEP_DAMPING, at_optimum, curvature_of_cost, gradient_of_cost, gradient_wanted
 from fmtorch.geometry.rank2_manifold import (
     RANK_TWO,
     RANK_TWO_EPIPOLE,
@@ -45,7 +38,7 @@ from fmtorch.geometry.rank2_manifold import (
     start_one,
     steps,
 )
-from fmtorch.geometry.robust_losses import named_kernel
+from fmtorch.geometry.robust_losses import named_loss
 from fmtorch.jit.kernel import Array, F8x1, F8x2, inner, kernel, matrix, vector
 
 # Levenberg-Marquardt of the robust Sampson error on the manifold of rank 2 and unit norm, for the models of a pair
@@ -101,7 +94,7 @@ def refine_components(
     F: Float[Tensor, "9 p k"],
     points: Float[Tensor, "4 p n"],
     weight: Float[Tensor, "p n"],
-    kernel: str,
+    loss: str,
     scale: Float[Tensor, " p"] | Float[Tensor, "p slots"],
     iterations: int,
     tolerance: float = 0.0,
@@ -109,7 +102,7 @@ def refine_components(
     """Refined models and their costs ``sum_i w_i rho(r_i^2)``, component by component, without gradients.
 
     F: k models for each of p pairs, entries row by row; made rank 2 first where they are not. points: x0, y0, x1, y1,
-    of about unit scale; finite. weight: 0 in padded slots. scale: of the kernel, in the unit of the points,
+    of about unit scale; finite. weight: 0 in padded slots. scale: of the loss, in the unit of the points,
     one for all matches of a pair, (p,) or (p, 1), or one for each (p, n).
     iterations: at most. tolerance: a model is done once a step has lowered its cost by no more than this share of it.
     The cost of a model never rises above that of its (rank-2) start; a model that cannot be improved is kept, one that
@@ -119,7 +112,7 @@ def refine_components(
     scale = scale if scale.dim() > 1 else scale[:, None]
     return fitted_by(
         lambda models, matches, out, cost: refine_kernel(models, SQUARINGS, matches, schedule, out, cost),
-        F, points, weight, scale.square(), kernel,
+        F, points, weight, scale.square(), loss,
     )  # fmt: skip
 
 
@@ -130,16 +123,18 @@ def refine(
     weight: Float[Tensor, "*batch n"] | None = None,
     mask: Bool[Tensor, "*batch n"] | None = None,
     *,
-    kernel: str = "truncated",
+    loss: str = "truncated",
     scale: float | Tensor = 1.0,
     iterations: int = 10,
-    gradient: str = "implicit",
 ) -> Float[Tensor, "*models 3 3"]:
     """The fundamental matrix of least robust Sampson error near F: ``sum_i w_i rho(r_i^2)``.
 
-    Bartoli & Sturm (2004); Hartley & Zisserman (2004), 11.4.3. Differentiable in points and weights. Gradients are
-    bounded where the matches leave F open, and zero for a model that cannot be refined. Where nothing requires them no
-    graph is built, and the values are the same in any case.
+    Bartoli & Sturm (2004); Hartley & Zisserman (2004), 11.4.3. Differentiable in points and weights, not in F: by the
+    implicit function theorem with the exact Hessian, the gradient is that of the optimum. (`attached_step` takes Gauss
+    and Newton's Hessian: its gradient is off by 0.2 to 5 % at a noise of 1 px with a focal length of 1000 px, by 6 to
+    65 % at 10 px, and by 1 to 50 % where a robust loss weighs wrong matches.) Gradients are bounded where the matches
+    leave F open, and zero for a model that cannot be refined. Where nothing requires them no graph is built, and the
+    values are the same in any case.
 
     Args:
         F: one matrix for each set of matches, or K of them, (*batch, K, 3, 3).
@@ -147,31 +142,23 @@ def refine(
         x1: their matches in image 1.
         weight: not negative, 1 by default.
         mask: False in slots to ignore, whatever they hold; a match that is not finite is ignored too.
-        kernel: a name of `robust_losses.KERNELS`.
-        scale: of the kernel, in pixels (a number, or one per set).
+        loss: a name of `robust_losses.LOSSES`.
+        scale: of the loss, in pixels (a number, or one per set).
         iterations: Levenberg-Marquardt steps.
-        gradient: "implicit", that of the optimum by the implicit function theorem, with the exact Hessian; there is
-            none to F. Or "unrolled" through all accepted steps, also to F; their choice and the centre of the
-            coordinates, on which they depend before convergence, are constants. Both agree at convergence, and before
-            it the implicit one is the nearer to the optimum's. (`attached_step` takes Gauss and Newton's Hessian: its
-            gradient is off by 0.2 to 5 % at a noise of 1 px with a focal length of 1000 px, by 6 to 65 % at 10 px, and
-            by 1 to 50 % where a robust kernel weighs wrong matches.)
 
     Returns:
         Matrices of rank 2 and unit norm in float64; one that cannot be refined comes back as it was, scaled.
 
     Raises:
-        ValueError: for an unknown kernel or gradient.
+        ValueError: for an unknown loss.
     """
-    robust = named_kernel(kernel)
-    wanted = gradient_wanted(gradient, x0, x1, weight, F if gradient == "unrolled" else None)
+    robust = named_loss(loss)
+    wanted = gradient_wanted(x0, x1, weight)
     with torch.set_grad_enabled(wanted):
-        matches = NormalizedMatches(x0, x1, weight, mask, F, scale)
+        matches = NormalizedMatches(x0, x1, weight, mask, F.detach(), scale)
         shared = (matches.points, matches.weight)
-        models, _ = refine_components(matches.models, *shared, kernel, matches.scale, iterations)
-        if wanted and gradient == "unrolled":
-            models = through_steps(models, matches.models, iterations, *shared, robust, matches.scale)
-        elif wanted:
+        models, _ = refine_components(matches.models, *shared, loss, matches.scale, iterations)
+        if wanted:
             models = at_optimum(models, *shared, robust, matches.scale)
         return matches.to_pixels(models).reshape(F.shape)
 
@@ -183,30 +170,30 @@ def attached_step(
     weight: Float[Tensor, "*batch n"] | None = None,
     mask: Bool[Tensor, "*batch n"] | None = None,
     *,
-    kernel: str = "truncated",
+    loss: str = "truncated",
     scale: float | Tensor = 1.0,
 ) -> Float[Tensor, "*models 3 3"]:
     """One Gauss-Newton step from a refined F, whose gradients are those of the optimum.
 
     The gradient of the cost is attached to the graph of points and weights, the normal matrix is not. This is the
-    implicit function theorem with the Hessian in the Gauss-Newton approximation, which has the curvature of the kernel
+    implicit function theorem with the Hessian in the Gauss-Newton approximation, which has the curvature of the loss
     but not that of the residuals: it is exact where the residuals that count vanish.
 
     Args:
         F: the optimum, as `refine` returns it; it gets no gradient.
-        x0, x1, weight, mask, kernel, scale: those with which `refine` found it.
+        x0, x1, weight, mask, loss, scale: those with which `refine` found it.
 
     Returns:
         F after the step. Where the points leave a direction undetermined, the step and its gradients in that direction
         are damped; where F or the step is not finite, F comes back with gradients of zero.
 
     Raises:
-        ValueError: there is no such kernel.
+        ValueError: there is no such loss.
     """
     matches = NormalizedMatches(x0, x1, weight, mask, F.detach(), scale)
     with torch.no_grad():
         model, e0, e1 = start(matches.models)
-        robust = named_kernel(kernel)
+        robust = named_loss(loss)
         H = curvature_of_cost(model, matches.points, matches.weight, robust, matches.scale)
         identity = torch.eye(9, dtype=H.dtype, device=H.device)[:, :, None, None].expand_as(H)
         inverse = constrained_solve(H, model, e0, e1, torch.full_like(H[0, 0], STEP_DAMPING), identity)

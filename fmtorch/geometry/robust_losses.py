@@ -1,4 +1,4 @@
-"""Robust losses (kernels): functions of a squared residual that grow more slowly than the residual itself.
+"""Robust losses: functions of a squared residual that grow more slowly than the residual itself.
 
 Each is scaled so that ``loss ~ r^2`` for small residuals; ``weight = d loss / d r^2`` is then 1 at zero, and minimising
 ``sum weight * r^2`` with the weights held fixed, again and again, minimises the sum of losses (IRLS).
@@ -75,7 +75,7 @@ GAIN_TABLE = _gain_table()
 _WEIGHT, _INTEGRAL = torch.from_numpy(LOSS_TABLE).unbind(0)
 
 
-class Kernel(NamedTuple):
+class RobustLoss(NamedTuple):
     """A robust loss, its derivative with respect to r^2, and its curvature, all functions of (r2, s2).
 
     curvature: half the second derivative with respect to r, ``rho' + 2 r^2 rho''``, and 0 where that is negative.
@@ -171,17 +171,17 @@ def _look_up(r2: Tensor, s2: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return interval, position - interval, weight, torch.take(table, interval + 1) - weight
 
 
-KERNELS: dict[str, Kernel] = {
-    "huber": Kernel(huber_loss, huber_weight, huber_curvature),
-    "cauchy": Kernel(cauchy_loss, cauchy_weight, cauchy_curvature),
-    "geman_mcclure": Kernel(geman_mcclure_loss, geman_mcclure_weight, geman_mcclure_curvature),
-    "truncated": Kernel(truncated_loss, truncated_weight, truncated_weight),
-    "magsac": Kernel(tabulated_loss, tabulated_weight, tabulated_curvature),
+LOSSES: dict[str, RobustLoss] = {
+    "huber": RobustLoss(huber_loss, huber_weight, huber_curvature),
+    "cauchy": RobustLoss(cauchy_loss, cauchy_weight, cauchy_curvature),
+    "geman_mcclure": RobustLoss(geman_mcclure_loss, geman_mcclure_weight, geman_mcclure_curvature),
+    "truncated": RobustLoss(truncated_loss, truncated_weight, truncated_weight),
+    "magsac": RobustLoss(tabulated_loss, tabulated_weight, tabulated_curvature),
 }
 
 
-def named_kernel(name: str) -> Kernel:
-    """The kernel of that name; a ValueError that lists the names where there is none."""
-    if name not in KERNELS:
-        raise ValueError(f"kernel is {name!r}; it must be one of: {', '.join(KERNELS)}")
-    return KERNELS[name]
+def named_loss(name: str) -> RobustLoss:
+    """The loss of that name; a ValueError that lists the names where there is none."""
+    if name not in LOSSES:
+        raise ValueError(f"loss is {name!r}; it must be one of: {', '.join(LOSSES)}")
+    return LOSSES[name]

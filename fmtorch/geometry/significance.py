@@ -193,10 +193,9 @@ def significance(
     if x0.shape[1] <= SAMPLE:
         return torch.full((len(F),), -torch.inf, dtype=torch.float64, device=F.device)
     mask = torch.ones(x0.shape[:2], dtype=torch.bool, device=x0.device) if mask is None else mask
-    tensors = [None if t is None else t.cpu() for t in (F, x0, x1, mask, size0, size1)]
-    tensors[4:] = [None if size is None else size.to(torch.float64) for size in tensors[4:]]
+    sizes = (None if size is None else size.to(torch.float64) for size in (size0, size1))
     out = torch.empty(len(F), 1, dtype=torch.float64)
-    return for_each_pair(_into, tensors, out=out, kind=torch.float64)[:, 0].to(F.device)
+    return for_each_pair(_into, (F, x0, x1, mask, *sizes), out=out, kind=torch.float64)[:, 0]
 
 
 def of_one_pair(F: Array, x0: Array, x1: Array, mask: Array, size0: Array, size1: Array) -> float:

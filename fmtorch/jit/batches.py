@@ -11,20 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.jit import kernel
 from fmtorch.jobs.threads import available, mapped
 
 PAIRS_OF_A_THREAD = 8  # at least; a thread takes as long to begin as a kernel for a pair
-
-
-def kernels_serve(*tensors: Tensor | None, floats: Sequence[torch.dtype] = (torch.float32, torch.float64)) -> bool:
-    """Whether kernels stand for a tensor function of these: all on the CPU, no gradient to keep, these float types."""
-    given = [t for t in tensors if t is not None]
-    return (
-        all(t.device.type == "cpu" and (t.dtype in floats or not t.is_floating_point()) for t in given)
-        and not (torch.is_grad_enabled() and any(t.requires_grad for t in given))
-        and kernel.available()
-    )
 
 
 def for_each_pair(
@@ -38,7 +27,8 @@ def for_each_pair(
     """`out` (B, ...) after function(row of each tensor, constants, row of out) for each of B pairs.
 
     Rows are C-contiguous arrays, floating ones of type `kind`; of what is not known (None) an empty one. group: the
-    NamedTuple in which the function takes the rows. Pairs are shared out among threads.
+    NamedTuple in which the function takes the rows. Pairs are shared out among threads. What is on another device is
+    copied to the CPU, and `out`, which is there, comes back on the device of the first tensor; it is on no graph.
     """
     results = out.numpy()
     arrays = [_array(t, kind, len(results)) for t in tensors]
@@ -50,7 +40,7 @@ def for_each_pair(
 
     parts = max(1, min(available(), len(results) // PAIRS_OF_A_THREAD))
     mapped(run_pairs, [range(first, len(results), parts) for first in range(parts)])
-    return out
+    return out.to(next(t.device for t in tensors if t is not None))
 
 
 def _array(tensor: Tensor | None, kind: torch.dtype, pairs: int) -> NDArray[Any]:
@@ -58,7 +48,7 @@ def _array(tensor: Tensor | None, kind: torch.dtype, pairs: int) -> NDArray[Any]
         return np.empty((pairs, 0), _numpy(kind))
     if tensor.is_floating_point() and tensor.dtype != kind:
         tensor = tensor.to(kind)
-    array: NDArray[Any] = as_array(tensor.contiguous())
+    array: NDArray[Any] = as_array(tensor.cpu().contiguous())
     return array
 
 

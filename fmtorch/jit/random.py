@@ -52,14 +52,14 @@ _GAMMA, _MIX1, _MIX2 = (wrap(c) for c in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9
 
 def _shift_right(x: Tensor, n: int) -> Tensor:
     """Logical right shift of int64."""
-    return (x >> n) & ((1 << (64 - n)) - 1)
+    return (x >> n).bitwise_and_((1 << (64 - n)) - 1)
 
 
 def _mix(x: Int[Tensor, "*shape"]) -> Int[Tensor, "*shape"]:
     """The finaliser of splitmix64 (Steele, Lea, Flood, OOPSLA 2014): a bijection of 64-bit words."""
-    x = (x ^ _shift_right(x, 30)) * _MIX1
-    x = (x ^ _shift_right(x, 27)) * _MIX2
-    return x ^ _shift_right(x, 31)
+    x = _shift_right(x, 30).bitwise_xor_(x).mul_(_MIX1)
+    x = _shift_right(x, 27).bitwise_xor_(x).mul_(_MIX2)
+    return _shift_right(x, 31).bitwise_xor_(x)
 
 
 def bits(
@@ -76,7 +76,7 @@ def uniform(
     seed: int, key: Int[Tensor, " b"], stream: Stream, start: int, count: int, columns: int
 ) -> Float[Tensor, "b count columns"]:
     """Random numbers in [0, 1), float64, with 53 random bits; arguments as `bits`."""
-    return _shift_right(bits(seed, key, stream, start, count, columns), 10).to(torch.float64) * 2.0**-53
+    return (bits(seed, key, stream, start, count, columns) >> 10).to(torch.float64).mul_(2.0**-53)
 
 
 Word = Any  # np.uint64

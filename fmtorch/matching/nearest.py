@@ -16,8 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch.geometry.arithmetic import sqrt, stable_sum
-from fmtorch.jit.batches import kernels_serve
-from fmtorch.jit.kernel import Array, F8x1, I1x2, I4x1, I4x2, I8x1, inner, kernel
+from fmtorch.jit.kernel import Array, F8x1, I1x2, I4x1, I4x2, I8x1, available, inner, kernel
 from fmtorch.jobs.threads import one_thread
 
 # Two nearest neighbours, compiled: products of 8-bit integers leave few candidates, whose distances are exact
@@ -341,7 +340,8 @@ def _match_one_pair(d0: Tensor, d1: Tensor, mask0: Tensor, mask1: Tensor, chunk:
 
 def _compiled(rows: Tensor, columns: Tensor) -> tuple[_Nearest, Tensor] | None:
     """`_two_nearest` by kernels, None where they do not serve."""
-    neighbors = two_nearest(rows, columns) if kernels_serve(rows, columns) else None
+    served = rows.device.type == "cpu" and available()
+    neighbors = two_nearest(rows, columns) if served else None
     if neighbors is None:
         return None
     tensors = (torch.from_numpy(value) for value in (neighbors.nearest, neighbors.squared, neighbors.second_squared))

@@ -13,14 +13,12 @@ What differs from `nsgd` (github.com/JiawangBian/FM-Bench, ComputeNormlizedSGD.m
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float, Int, Real
+from jaxtyping import Bool, Float, Int, Real
 from torch import Tensor
 
 from fmtorch.core.checks import checked
 from fmtorch.geometry.arithmetic import sqrt
-from fmtorch.geometry.epipolar import lines_through
-from fmtorch.jit.batches import kernels_serve
-from fmtorch.metrics.nsgd import Pairs, compiled_sums, diagonal, segment_in_image, sum_of_draws
+from fmtorch.metrics.nsgd import Chord, Draws, Pairs, diagonal, from_centre, lines, sum_of_draws
 
 BORDER = 0.5  # left and top edge of the first pixel where pixels count from 1
 NORMAL_OFFSET = 1e-10
@@ -44,35 +42,28 @@ def nsgd_released(
     the evaluator never measures those and counts them as misses. Not differentiable; `nsgd` is.
     """
     pairs, shape = Pairs.flatten(F_gt, F_est, size0, size1, key)
-    if kernels_serve(pairs.F_gt, pairs.F_est, pairs.size0, pairs.size1):
-        total, _ = compiled_sums(torch.clone, pairs, samples, seed, released=True)
-    else:
-        total, _ = sum_of_draws(pairs, released_draw, samples=samples, seed=seed)
+    total, _ = sum_of_draws(pairs, released_draw, samples=samples, seed=seed)
     value = (total / samples).clamp(max=1.0)
     failed = ~pairs.F_est.isfinite().all(-1).all(-1) | (pairs.F_est == 0).all(-1).all(-1)
     return torch.where(failed | value.isnan(), 1.0, value).reshape(shape).to(F_est.dtype)
 
 
-def released_draw(pairs: Pairs, uniforms: Float[Tensor, "b n 6"]) -> tuple[Tensor, Tensor]:
+def released_draw(pairs: Pairs, draws: Draws) -> tuple[Float[Tensor, "b n"], Bool[Tensor, "b n"]]:
     """The value of each draw in image diagonals (NaN or infinite on vertical lines), and whether it counts."""
-    first, second = uniforms[..., :3], uniforms[..., 3:]
-    a, hits_a = _half_draw(pairs.F_gt, pairs.F_est, pairs.size0, pairs.size1, first)
-    b, hits_b = _half_draw(pairs.F_est, pairs.F_gt, pairs.size1, pairs.size0, second)
-    return (a + b) / 2, hits_a & hits_b
+    size0 = torch.stack([pairs.size0, pairs.size1])
+    size1, both = size0.flip(0), torch.stack([pairs.F_gt, pairs.F_est])
+    F, other = from_centre(both, size1, BORDER), from_centre(both.flip(0), size1, BORDER)
+    h, w = size0[:, :, None].unbind(-1)
+    x0, y0 = (draws.x * w).round(), (draws.y * h).round()
+    a, b, c = lines(F, x0, y0)
+    chord = Chord.of([a, b, c], size1)
+    x1, _ = chord.at(draws.share)
+    y1 = -(a * x1 + c) / b
+    d1 = _distance(x1, y1, *lines(other, x0, y0)) / diagonal(size1)[..., None]
+    d0 = _distance(x0, y0, *lines(other.mT, x1, y1)) / diagonal(size0)[..., None]
+    mean = (d0 + d1) / 2
+    return (mean[0] + mean[1]) / 2, chord.hits.all(0)
 
 
-def _half_draw(F: Tensor, F_other: Tensor, size0: Tensor, size1: Tensor, uniforms: Tensor) -> tuple[Tensor, Tensor]:
-    """A match on F and the mean of its distances from the lines of F_other, in the diagonals of the images."""
-    m = (uniforms[..., :2] * size0.flip(-1)[:, None]).round()
-    a, b, c = lines_through(F, m)
-    start, end, hits = segment_in_image([a, b, c], size1, BORDER)
-    x = start[..., 0] + uniforms[..., 2] * (end - start)[..., 0]
-    m_prime = torch.stack([x, -(a * x + c) / b], -1)
-    d1 = _distance(m_prime, lines_through(F_other, m)) / diagonal(size1)[:, None]
-    d0 = _distance(m, lines_through(F_other.mT, m_prime)) / diagonal(size0)[:, None]
-    return (d0 + d1) / 2, hits
-
-
-def _distance(x: Tensor, line: list[Tensor]) -> Tensor:
-    a, b, c = line
-    return (a * x[..., 0] + b * x[..., 1] + c).abs() / (sqrt(a * a + b * b) + NORMAL_OFFSET)
+def _distance(x: Tensor, y: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    return (a * x + b * y + c).abs() / (sqrt(torch.addcmul(a * a, b, b)) + NORMAL_OFFSET)

@@ -5,33 +5,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from fmtorch.core.types import Correspondences
-from fmtorch.jit.batches import for_each_pair, kernels_serve
-from fmtorch.jit.kernel import B1x1, F4x1, kernel
-
-# `calibration` for one pair, compiled: the same bits
-
-
-@kernel
-def calibrated(evidence: F4x1, quality: F4x1, mask: B1x1, numbers: F4x1, out: F4x1) -> None:
-    """P(inlier) of `Calibration` from evidence and ratio (n,) -> out (n,); zero where masked.
-
-    quality: empty where unknown. numbers: constant, weights of evidence and ratio, largest log-odds, and 2^-10.
-    """
-    for i in range(len(mask)):
-        z = numbers[0] + numbers[1] * evidence[i]
-        if len(quality):
-            z += numbers[2] * (np.float32(1) if np.isnan(quality[i]) else quality[i])
-        o = 1.0 + np.float64(min(max(z, -numbers[3]), numbers[3])) * numbers[4]
-        for _ in range(10):
-            o *= o
-        out[i] = o / (o + 1.0) if mask[i] else 0.0
-
 
 _SQUARINGS = 10
 _LARGEST = 12.0  # log-odds beyond which P(inlier) is as good as 0 or 1; the logistic function here is 6e-6 off 1 there
@@ -61,20 +39,14 @@ class Calibration:
     alone: Mapping[str, float] | None = None
 
     def __call__(self, c: Correspondences, evidence: Float[Tensor, "b n"]) -> Correspondences:
-        """The same matches with ``prior``, zero where masked. A ratio that is NaN counts as 1."""
+        """The same matches with ``prior``, zero where masked. A ratio that is NaN counts as 1. Log-odds are float32."""
         fitted = self.alone if c.quality is None else self.with_ratio
         if fitted is None:
             return c
-        if kernels_serve(c.x0, evidence, c.quality):
-            numbers = (fitted["constant"], fitted["evidence"], fitted.get("ratio", 0.0), _LARGEST, 2.0**-_SQUARINGS)
-            out = torch.empty(c.mask.shape, dtype=torch.float32)
-            tensors = (evidence, c.quality, c.mask)
-            prior = for_each_pair(calibrated, tensors, np.array(numbers, np.float32), out=out)
-            return c.derived(prior=prior.to(c.x0.dtype))
-        log_odds = fitted["constant"] + fitted["evidence"] * torch.where(c.mask, evidence.to(c.x0.dtype), 0)
+        log_odds = fitted["constant"] + fitted["evidence"] * torch.where(c.mask, evidence.float(), 0)
         if c.quality is not None:
-            log_odds = log_odds + fitted["ratio"] * torch.where(c.mask, c.quality, 0).nan_to_num(nan=1.0)
-        return c.derived(prior=torch.where(c.mask, logistic(log_odds), 0))
+            log_odds = log_odds + fitted["ratio"] * torch.where(c.mask, c.quality.float(), 0).nan_to_num(nan=1.0)
+        return c.derived(prior=torch.where(c.mask, logistic(log_odds), 0).to(c.x0.dtype))
 
 
 def calibration_of(

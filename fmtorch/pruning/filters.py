@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Annotated
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fmtorch.core.options import Within
 from fmtorch.core.types import Correspondences
-from fmtorch.jit.batches import for_each_pair, kernels_serve
-from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, inner, kernel, vector
-from fmtorch.jit.random import mix
 
 
 def ratio_test(
@@ -71,66 +66,6 @@ class MutualCheck:
         return c.keep(c.mutual)
 
 
-# Keeping the matches that are likely to be right
-
-
-@dataclasses.dataclass(frozen=True)
-class Likely:
-    """Keeps the matches whose ``prior``, P(inlier), is at least `min_probability`.
-
-    It makes a filter of any stage that supplies a prior. Raises ValueError for correspondences without a prior.
-    """
-
-    min_probability: float = 0.5
-
-    def __call__(self, correspondences: Correspondences) -> Correspondences:
-        """The same matches, of which only likely ones survive; a prior that is NaN fails."""
-        if correspondences.prior is None:
-            raise ValueError("`likely` needs `prior`: put a stage that supplies it before, e.g. frame_consistency")
-        return correspondences.keep(correspondences.prior >= self.min_probability)
-
-
-# `one_to_one` for one pair, compiled: the same matches, in linear time by a hash table of locations
-
-
-@kernel
-def one_to_one_kernel(x0: F8x2, x1: F8x2, quality: F8x1, mask: B1x1, out: B1x1) -> None:
-    """`one_to_one` of x0, x1 (n, 2), quality, mask (n,) -> out (n,)."""
-    n = len(mask)
-    valid, rank = np.empty(n, np.bool_), vector(n)
-    for i in range(n):
-        finite = math.isfinite(x0[i, 0]) and math.isfinite(x0[i, 1])
-        valid[i] = mask[i] and finite and math.isfinite(x1[i, 0]) and math.isfinite(x1[i, 1])
-        rank[i] = math.inf if math.isnan(quality[i]) else quality[i]
-        out[i] = valid[i]
-    _drop_all_but_the_best(x0, rank, valid, out)
-    _drop_all_but_the_best(x1, rank, valid, out)
-
-
-@inner
-def _drop_all_but_the_best(x: Array, rank: Array, valid: Array, out: Array) -> None:
-    """Sets out[i] to False where another valid match at the same location has a lower (rank, index)."""
-    n = len(valid)
-    size = 4
-    while size < 2 * n:
-        size *= 2
-    place, best = np.empty(n, np.int64), np.full(size, -1, np.int64)
-    at = x + 0.0  # -0 becomes 0
-    bits = at.view(np.uint64)
-    for i in range(n):
-        if not valid[i]:
-            continue
-        slot = np.int64(mix(bits[i, 0] + np.uint64(0x9E3779B97F4A7C15) * mix(bits[i, 1])) & np.uint64(size - 1))
-        while best[slot] >= 0 and (at[best[slot], 0] != at[i, 0] or at[best[slot], 1] != at[i, 1]):
-            slot = (slot + 1) & (size - 1)
-        place[i] = slot
-        if best[slot] < 0 or rank[i] < rank[best[slot]]:
-            best[slot] = i
-    for i in range(n):
-        if valid[i] and best[place[i]] != i:
-            out[i] = False
-
-
 # One match per keypoint location in each image
 
 
@@ -144,23 +79,18 @@ def one_to_one(
 
     The best has the lowest `quality` (NaN is worst), ties by lowest index. Locations are the same when the coordinates
     are exactly equal, as those of one keypoint with several orientations are. The rule is symmetric in the images and
-    independent of the order of the matches, ties apart. Matches with a non-finite coordinate are dropped.
-    O(N log N), on a CPU O(N).
+    independent of the order of the matches, ties apart. Matches with a non-finite coordinate are dropped. O(N log N).
     """
-    if kernels_serve(x0.detach(), x1.detach(), quality.detach()):
-        tensors = (x0, x1, quality, torch.ones_like(x0[..., 0], dtype=torch.bool) if mask is None else mask)
-        out = torch.empty(x0.shape[:2], dtype=torch.bool)
-        return for_each_pair(one_to_one_kernel, tensors, out=out, kind=torch.float64)
     finite = torch.isfinite(x0).all(-1) & torch.isfinite(x1).all(-1)
     mask = finite if mask is None else finite & mask
     rank = torch.where(mask & ~quality.isnan(), quality, torch.inf)
-    return mask & _best_at_location(x0, rank, mask) & _best_at_location(x1, rank, mask)
-
-
-def _best_at_location(x: Tensor, rank: Tensor, mask: Tensor) -> Tensor:
-    """True for the first match of every location, in the lexicographic order of (x, y, rank, index)."""
-    x = torch.where(mask[..., None], x, torch.inf)
     order = torch.argsort(rank, dim=-1, stable=True)
+    return mask & _first_at_location(x0, order, mask) & _first_at_location(x1, order, mask)
+
+
+def _first_at_location(x: Tensor, order: Tensor, mask: Tensor) -> Tensor:
+    """True for the match of every location that comes first in an order."""
+    x = torch.where(mask[..., None], x, torch.inf)
     for column in (x[..., 1], x[..., 0]):
         order = order.gather(-1, torch.argsort(column.gather(-1, order), dim=-1, stable=True))
     location = x.gather(1, order[..., None].expand(-1, -1, 2))
@@ -179,3 +109,22 @@ class OneToOne:
         if c.quality is None:
             raise ValueError("one-to-one needs `quality`: the figure by which the best match of a location is chosen")
         return c.keep(one_to_one(c.x0, c.x1, c.quality, c.mask))
+
+
+# Keeping the matches that are likely to be right
+
+
+@dataclasses.dataclass(frozen=True)
+class Likely:
+    """Keeps the matches whose ``prior``, P(inlier), is at least `min_probability`.
+
+    It makes a filter of any stage that supplies a prior. Raises ValueError for correspondences without a prior.
+    """
+
+    min_probability: float = 0.5
+
+    def __call__(self, correspondences: Correspondences) -> Correspondences:
+        """The same matches, of which only likely ones survive; a prior that is NaN fails."""
+        if correspondences.prior is None:
+            raise ValueError("`likely` needs `prior`: put a stage that supplies it before, e.g. frame_consistency")
+        return correspondences.keep(correspondences.prior >= self.min_probability)

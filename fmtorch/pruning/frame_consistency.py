@@ -10,7 +10,6 @@ eighth of the time, and the same area under the ROC curve (measured on castle-P1
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -20,29 +19,27 @@ from torch import Tensor
 
 from fmtorch.core.records import ungraphed
 from fmtorch.core.types import Correspondences
-from fmtorch.geometry.arithmetic import component_sum, sqrt
-from fmtorch.geometry.curves import curve_order_kernel, curve_orders
-from fmtorch.jit.batches import for_each_pair, kernels_serve
+from fmtorch.geometry.optimum import gradient_wanted
+from fmtorch.jit.batches import for_each_pair
 from fmtorch.jit.kernel import Array, B1x1, F4x1, F4x2, F4x3, inner, kernel
 from fmtorch.pruning.neighbors import (
-    CURVES,
     CURVES32,
-    MIN_SQUARE,
     MIN_SQUARE32,
-    MIN_VOTE,
     MIN_VOTE32,
     MIN_VOTES32,
-    NOISE,
     NOISE32,
     ONE32,
-    SHARPNESS,
     SHARPNESS32,
     WINDOW,
-    WORST_RATIO,
     WORST_RATIO32,
+    add_products,
+    curve_orders,
+    put_in_order,
+    votes_of,
+    with_gradient,
 )
 
-# `frame_consistency` for one pair, compiled: the same orders and the same sums, in float32
+# `frame_consistency` for one pair, compiled; float32
 
 
 class FramedMatches(NamedTuple):
@@ -82,25 +79,15 @@ def frame_agreement_kernel(matches: FramedMatches, out: F4x1) -> None:
             valid = valid and math.isfinite(rows[k, m])
         match[m] = i
         m += valid
-    order, along = np.empty(m, np.int64), np.empty((10, m), x0.dtype)
+    orders, along = np.empty((2 * len(CURVES32), m), np.int64), np.empty((10, m), x0.dtype)
+    curve_orders(rows, orders)
     agreement, votes = np.zeros(m, x0.dtype), np.zeros(m, x0.dtype)
     ahead, behind = np.empty((WINDOW, m), x0.dtype), np.empty((WINDOW, m), x0.dtype)
-    for image in range(2):
-        for curve in range(len(CURVES32)):
-            curve_order_kernel(
-                rows[2 * image, :m],
-                rows[2 * image + 1, :m],
-                CURVES32[curve, 0],
-                CURVES32[curve, 1],
-                CURVES32[curve, 2],
-                order,
-            )
-            for k in range(10):
-                for i in range(m):
-                    along[k, i] = rows[k, order[i]]
-            for k in range(1, WINDOW + 1):
-                _frames_agree(along, k, ahead[k - 1], behind[k - 1])
-            _add_votes(along[9], ahead, behind, order, agreement, votes)
+    for order in orders:
+        put_in_order(rows, order, along)
+        for k in range(1, WINDOW + 1):
+            _frames_agree(along, k, ahead[k - 1], behind[k - 1])
+        _add_votes(along[9], ahead, behind, order, agreement, votes)
     for i in range(m):
         out[match[i]] = agreement[i] / max(votes[i], MIN_VOTES32)
 
@@ -148,32 +135,6 @@ def _add_votes(vote: Array, ahead: Array, behind: Array, order: Array, agreement
         votes[order[i]] += all_votes[i]
 
 
-@inner
-def add_products(agree: Array, vote: Array, count: int, total: Array, votes: Array) -> None:
-    """Adds so many agreeing votes to the totals, and the votes."""
-    for i in range(count):
-        total[i] += agree[i] * vote[i]
-    for i in range(count):
-        votes[i] += vote[i]
-
-
-@kernel
-def frame_prior(agreement: F4x1, quality: F4x1, mask: B1x1, numbers: F4x1, out: F4x1) -> None:
-    """P(inlier) of `FrameConsistency` from agreement and ratio (n,) -> out (n,); zero where masked or not finite.
-
-    numbers: odds, floor, slope.
-    """
-    odds, floor, slope = numbers[0], numbers[1], numbers[2]
-    for i in range(len(mask)):
-        w, divisor = agreement[i] + floor, ONE32 + slope * quality[i]
-        o = odds * w * w * w / (divisor * divisor)
-        out[i] = o / (ONE32 + o) if mask[i] and math.isfinite(quality[i]) else ONE32 - ONE32
-
-
-TILE = 1 << 12  # matches looked at together: what a processor's cache holds; changes no result
-GPU_TILE = 1 << 17
-
-
 def frame_agreement(
     x0: Float[Tensor, "b n 2"],
     x1: Float[Tensor, "b n 2"],
@@ -186,41 +147,14 @@ def frame_agreement(
 
     For neighbours i, j with frame maps S: ``e = max(|S_i dx0 - dx1|, |S_j dx0 - dx1|) / (s_i |dx0| + |dx1| + NOISE)``
     with s the scale change of S; the agreement is the mean of ``(1 + (e / TOLERANCE)^2 / 8)^-8`` over the neighbours in
-    both images, weighted by votes. On a CPU and without gradients it is computed in float32, by a kernel.
+    both images, weighted by votes. Computed in float32, on the CPU; differentiable in all but the mask.
     """
-    if kernels_serve(x0, x1, lafs0, lafs1, quality):
-        tensors = (x0, x1, lafs0, lafs1, quality, mask)
-        out = torch.empty(mask.shape, dtype=torch.float32)
-        return for_each_pair(frame_agreement_kernel, tensors, out=out, group=FramedMatches).to(x0.dtype)
-    S = frame_map(lafs0, lafs1)
-    vote = torch.ones_like(x0[..., 0]) if quality is None else (WORST_RATIO - quality).clamp_min(MIN_VOTE)
-    scale = sqrt((S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]).abs())
-    rows = torch.stack([*x0.unbind(-1), *x1.unbind(-1), *S.flatten(2).unbind(-1), scale, vote])
-    mask = mask & torch.isfinite(rows).all(0)
-    rows = torch.where(mask, rows, 0)
-    return tiled(_agreement, rows, mask)
-
-
-def tiled(function: Callable[[Tensor, Tensor], Tensor], rows: Tensor, mask: Bool[Tensor, "b n"]) -> Tensor:
-    """function(rows (d, b, n), mask) over so many pairs at once that TILE matches bound its memory."""
-    if not mask.numel():
-        return rows.new_zeros(mask.shape)
-    pairs = max(1, (GPU_TILE if mask.is_cuda else TILE) // max(mask.shape[1], 1))
-    if len(mask) <= pairs:
-        return function(rows, mask)
-    tiles = zip(torch.split(rows, pairs, 1), torch.split(mask, pairs), strict=True)
-    return torch.cat([function(*tile) for tile in tiles])
-
-
-def _agreement(rows: Float[Tensor, "10 b n"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b n"]:
-    """The agreement of matches x0, y0, x1, y1, S, scale, vote along all curves in both images at once."""
-    orders = curve_orders(rows[0:2].detach(), rows[2:4].detach(), mask, CURVES)
-    orders = orders[..., : max(int(mask.sum(1).max()), 1)]  # masked slots stand last
-    along = rows[:, None].expand(-1, len(orders), -1, -1).gather(3, orders.expand(len(rows), -1, -1, -1))
-    sums = _along_curve(along.flatten(1, 2)).reshape(2, *orders.shape)
-    in_slots = sums.new_zeros(*sums.shape[:3], mask.shape[1]).scatter(3, orders.expand(2, -1, -1, -1), sums)
-    agreement, votes = component_sum(in_slots, 1)
-    return torch.where(mask, agreement / votes.clamp_min(torch.finfo(votes.dtype).tiny), 0)
+    tensors, out = (x0, x1, lafs0, lafs1, quality, mask), torch.empty(mask.shape, dtype=torch.float32)
+    agreement = for_each_pair(frame_agreement_kernel, tensors, out=out, group=FramedMatches).to(x0.dtype)
+    if not gradient_wanted(x0, x1, lafs0, lafs1, quality):
+        return agreement
+    maps, usable = usable_frame_maps(lafs0, lafs1, mask)
+    return with_gradient(agreement, x0, x1, maps, votes_of(quality, x0[..., 0]), usable)
 
 
 def frame_map(lafs0: Float[Tensor, "b n 2 3"], lafs1: Float[Tensor, "b n 2 3"]) -> Float[Tensor, "b n 2 2"]:
@@ -233,26 +167,15 @@ def frame_map(lafs0: Float[Tensor, "b n 2 3"], lafs1: Float[Tensor, "b n 2 3"]) 
     return product / determinant[..., None, None]
 
 
-def _along_curve(rows: Float[Tensor, "10 b n"]) -> Float[Tensor, "2 b n"]:
-    """Sums of agreeing votes and of all votes over the neighbours of each match along the curve."""
-    padded = torch.nn.functional.pad(rows, (WINDOW, WINDOW))
-    near = padded.unfold(2, rows.shape[2], 1)  # (10, b, 17, n), no copy: each match itself is in the middle
-    rows = rows[:, :, None]
-    dx, dy, ux, uy = near[:4] - rows[:4]
-    error = torch.maximum(_prediction_error(rows[4:8], dx, dy, ux, uy), _prediction_error(near[4:8], dx, dy, ux, uy))
-    length = (
-        sqrt(dx.square() + dy.square() + MIN_SQUARE) * rows[8] + sqrt(ux.square() + uy.square() + MIN_SQUARE) + NOISE
-    )
-    # exp(-z) in arithmetic alone, whose last bits, unlike exp's, do not depend on where in memory a number stands
-    agree = (1 + error / length.square() * SHARPNESS).square().square().square().reciprocal()
-    votes = torch.stack([agree * near[9], near[9]])
-    votes[:, :, WINDOW] = 0
-    return component_sum(votes, 2)
-
-
-def _prediction_error(S: Tensor, dx: Tensor, dy: Tensor, ux: Tensor, uy: Tensor) -> Tensor:
-    """``|S dx0 - dx1|^2``."""
-    return (S[0] * dx + S[1] * dy - ux).square() + (S[2] * dx + S[3] * dy - uy).square()
+def usable_frame_maps(
+    lafs0: Float[Tensor, "b n 2 3"], lafs1: Float[Tensor, "b n 2 3"], mask: Bool[Tensor, "b n"]
+) -> tuple[Float[Tensor, "b n 2 2"], Bool[Tensor, "b n"]]:
+    """`frame_map`, and of which matches: the identity where masked, and for frames not finite or without area."""
+    for lafs in (lafs0, lafs1):
+        (a, b), (c, d) = (row.unbind(-1) for row in lafs[..., :2].unbind(-2))
+        mask = mask & torch.isfinite(lafs).flatten(2).all(2) & (a * d - b * c != 0)
+    unit = torch.eye(2, 3, dtype=lafs0.dtype, device=lafs0.device)
+    return frame_map(*(torch.where(mask[..., None, None], lafs, unit) for lafs in (lafs0, lafs1))), mask
 
 
 class FrameConsistency:
@@ -264,32 +187,21 @@ class FrameConsistency:
     kernels: worth compiling together with those of an estimator.
     """
 
-    kernels: ClassVar = (frame_agreement_kernel, frame_prior)
+    kernels: ClassVar = (frame_agreement_kernel,)
 
     def __init__(self, *, odds: float, floor: float, slope: float) -> None:
         self.odds, self.floor, self.slope = odds, floor, slope
-        self._numbers = np.array((odds, floor, slope), np.float32)
 
     def __call__(self, c: Correspondences) -> Correspondences:
         """The same matches with a prior; zero for one whose ratio is not finite."""
         if c.lafs0 is None or c.lafs1 is None or c.quality is None:
             return c
-        frames0, frames1, ratio = c.lafs0, c.lafs1, c.quality
-        if kernels_serve(c.x0, c.x1, frames0, frames1, ratio):
-            tensors = (c.x0, c.x1, frames0, frames1, ratio, c.mask)
-            prior = torch.empty(c.mask.shape, dtype=torch.float32)
-            for_each_pair(self._of_one_pair, tensors, out=prior, group=FramedMatches)
-            return c.derived(prior=prior.to(c.x0.dtype))
-        return ungraphed(c, lambda: self._with_prior(c, frames0, frames1, ratio))
-
-    def _of_one_pair(self, matches: FramedMatches, out: Array) -> None:
-        w = np.empty_like(out)
-        frame_agreement_kernel(matches, w)
-        frame_prior(w, matches.quality, matches.mask, self._numbers, out)
+        lafs0, lafs1, ratio = c.lafs0, c.lafs1, c.quality
+        return ungraphed(c, lambda: self._with_prior(c, lafs0, lafs1, ratio))
 
     def _with_prior(self, c: Correspondences, lafs0: Tensor, lafs1: Tensor, ratio: Tensor) -> Correspondences:
-        w = frame_agreement(c.x0, c.x1, lafs0, lafs1, ratio, c.mask) + self.floor
+        w = frame_agreement(c.x0, c.x1, lafs0, lafs1, ratio, c.mask).float() + self.floor
         known = c.mask & torch.isfinite(ratio)
-        quality = torch.where(known, ratio, 1)
+        quality = torch.where(known, ratio, 1).float()
         odds = self.odds * w * w * w / (1 + self.slope * quality).square()
-        return c.derived(prior=torch.where(known, odds / (1 + odds), 0))
+        return c.derived(prior=torch.where(known, odds / (1 + odds), 0).to(c.x0.dtype))

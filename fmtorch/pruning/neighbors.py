@@ -6,9 +6,14 @@ import math
 from typing import Any
 
 import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
-from fmtorch.geometry.arithmetic import smallest_but
-from fmtorch.jit.kernel import Array, F8x2, F8x3, inner, kernel, matrix, vector
+from fmtorch.geometry.arithmetic import component_sum, smallest_but, sqrt
+from fmtorch.geometry.curves import curve_order
+from fmtorch.jit.batches import for_each_pair
+from fmtorch.jit.kernel import Array, B1x1, F4x2, F8x2, F8x3, I8x2, inner, kernel, matrix, vector
 
 _LEAF = 8  # points a leaf, at most
 
@@ -200,7 +205,7 @@ def neighbour_maps(x0: F8x2, x1: F8x2, out: F8x3) -> None:
                 )
 
 
-# When two neighbouring matches agree: the numbers of `frame_consistency` and `position_consistency`
+# When two neighbouring matches agree: what `frame_consistency` and `position_consistency` have in common
 
 
 WINDOW = 8  # neighbours before and after each match along each curve
@@ -217,16 +222,96 @@ SHARPNESS32, NOISE32, FARTHEST32 = np.float32(SHARPNESS), np.float32(NOISE), np.
 WORST_RATIO32, MIN_VOTE32 = np.float32(WORST_RATIO), np.float32(MIN_VOTE)
 MIN_SQUARE32, MIN_VOTES32, ONE32 = np.float32(MIN_SQUARE), np.float32(MIN_VOTES), np.float32(1)
 
-TURNS = 16  # hypotheses of the turn that a pair's neighbours have in common
-SCALES = tuple(2.0 ** (k / 2) for k in range(-4, 5))  # hypotheses of their change of scale
-IDENTITY = SCALES.index(1.0) * TURNS  # the hypothesis scale * TURNS + turn that changes nothing
-EDGES = tuple(2.0 ** (k / 2) for k in range(-9, 11, 2))  # of squared scales, halfway between the hypotheses
-ANGLES = tuple(2 * math.pi * k / TURNS for k in range(TURNS))
-HALF_SECTOR, TWO_SECTORS = math.pi / TURNS, math.pi / 8
 
-EDGES32, _SCALES32 = np.array(EDGES, np.float32), np.array(SCALES, np.float32)[:, None]
-_COSINES32, _SINES32 = (np.array([f(angle) for angle in ANGLES], np.float32) for f in (math.cos, math.sin))
-MAPS32 = np.stack(np.broadcast_arrays(_SCALES32 * _COSINES32, _SCALES32 * _SINES32, _SCALES32), -1).copy()
-"""(scales, turns, 3), of each its cosine and sine, times the scale, and the scale."""
-HALF_COSINE32, HALF_SINE32 = np.float32(math.cos(HALF_SECTOR)), np.float32(math.sin(HALF_SECTOR))
-TWO_TANGENT32 = np.float32(math.tan(TWO_SECTORS))
+@inner
+def curve_orders(rows: Array, orders: Array) -> None:
+    """The order of matches (x0, y0, x1, y1, ...) along each curve, first of image 0, then of image 1 -> (c, m)."""
+    m = orders.shape[1]
+    for o in range(len(orders)):
+        image, curve = o // len(CURVES32), o % len(CURVES32)
+        curve_order(
+            rows[2 * image, :m], rows[2 * image + 1, :m], CURVES32[curve, 0], CURVES32[curve, 1], CURVES32[curve, 2],
+            orders[o],
+        )  # fmt: skip
+
+
+@inner
+def put_in_order(rows: Array, order: Array, along: Array) -> None:
+    """Columns of rows (d, n) in the order (m,) -> along (d, m)."""
+    for k in range(len(rows)):
+        for i in range(len(order)):
+            along[k, i] = rows[k, order[i]]
+
+
+@inner
+def add_products(agree: Array, vote: Array, count: int, total: Array, votes: Array) -> None:
+    """Adds so many agreeing votes to the totals, and the votes."""
+    for i in range(count):
+        total[i] += agree[i] * vote[i]
+    for i in range(count):
+        votes[i] += vote[i]
+
+
+@kernel
+def slots_along_curves(x0: F4x2, x1: F4x2, mask: B1x1, out: I8x2) -> None:
+    """The slots of the matches in the mask along each curve, those of the others last -> out (c, n)."""
+    n, m, last = len(mask), 0, len(mask)
+    rows, slot = np.empty((4, n), x0.dtype), np.empty(n, np.int64)
+    for i in range(n):
+        if mask[i]:
+            rows[0, m], rows[1, m], rows[2, m], rows[3, m], slot[m] = x0[i, 0], x0[i, 1], x1[i, 0], x1[i, 1], i
+            m += 1
+        else:
+            last -= 1
+            for o in range(len(out)):
+                out[o, last] = i
+    orders = np.empty((len(out), m), np.int64)
+    curve_orders(rows, orders)
+    for o in range(len(out)):
+        for k in range(m):
+            out[o, k] = slot[orders[o, k]]
+
+
+def votes_of(quality: Float[Tensor, "b n"] | None, like: Float[Tensor, "b n"]) -> Float[Tensor, "b n"]:
+    """What the vote of each match counts."""
+    return torch.ones_like(like) if quality is None else (WORST_RATIO - quality).clamp_min(MIN_VOTE)
+
+
+def with_gradient(
+    agreement: Float[Tensor, "b n"],
+    x0: Float[Tensor, "b n 2"],
+    x1: Float[Tensor, "b n 2"],
+    maps: Float[Tensor, "b n 2 2"],
+    vote: Float[Tensor, "b n"],
+    mask: Bool[Tensor, "b n"],
+) -> Float[Tensor, "b n"]:
+    """The agreement, attached to the graph of points, maps from image 0 to 1 and votes; the curves are constants."""
+    S = maps.flatten(2).unbind(-1)
+    scale = sqrt((S[0] * S[3] - S[1] * S[2]).abs())
+    rows = torch.stack([*x0.unbind(-1), *x1.unbind(-1), *S, scale, vote])
+    mask = mask & (rows.abs() < FARTHEST).all(0)
+    rows = torch.where(mask, rows, 0)
+    out = torch.empty(len(mask), 2 * len(CURVES), mask.shape[1], dtype=torch.int64)
+    orders = for_each_pair(slots_along_curves, (x0, x1, mask), out=out).movedim(1, 0)
+    defined = _agreement(rows, orders)
+    return agreement + torch.where(mask & torch.isfinite(defined), defined - defined.detach(), 0)
+
+
+def _agreement(rows: Float[Tensor, "10 b n"], orders: Int[Tensor, "c b n"]) -> Float[Tensor, "b n"]:
+    """The agreement of matches x0, y0, x1, y1, map, scale, vote along all curves; those of no vote do not count."""
+    along = rows[:, None].expand(-1, len(orders), -1, -1).gather(3, orders.expand(len(rows), -1, -1, -1))
+    near = torch.nn.functional.pad(along, (WINDOW, WINDOW)).unfold(3, along.shape[3], 1)  # (10, c, b, 17, n), no copy
+    rows = along[:, :, :, None]
+    dx, dy, ux, uy = near[:4] - rows[:4]
+    own, other = (
+        (S[0] * dx + S[1] * dy - ux).square() + (S[2] * dx + S[3] * dy - uy).square() for S in (rows[4:8], near[4:8])
+    )
+    length0, length1 = (sqrt(x.square() + y.square() + MIN_SQUARE) for x, y in ((dx, dy), (ux, uy)))
+    length = length0 * rows[8] + length1 + NOISE
+    agree = (1 + torch.maximum(own, other) / length.square() * SHARPNESS) ** -8
+    votes = torch.stack([agree * near[9], near[9].expand_as(agree)])
+    votes = component_sum(torch.cat([votes[..., :WINDOW, :], votes[..., WINDOW + 1 :, :]], -2), -2)  # others' alone
+    in_slots = torch.zeros_like(votes).scatter(3, orders.expand(2, -1, -1, -1), votes)
+    agreement, total = component_sum(in_slots, 1)
+    share: Tensor = agreement / total.clamp_min(torch.finfo(total.dtype).tiny)
+    return share

@@ -15,10 +15,10 @@ from torch import Tensor
 
 from fmtorch.geometry.arithmetic import matmul3, stable_sum
 from fmtorch.geometry.eight_point import eight_point
-from fmtorch.geometry.epipolar import lines_through, residual_and_normals, unit_largest
+from fmtorch.geometry.epipolar import residual_and_normals, unit_largest
 from fmtorch.jit.random import Stream, uniform
 from fmtorch.metrics import nsgd
-from fmtorch.metrics.nsgd import BORDER, segment_in_image
+from fmtorch.metrics.nsgd import BORDER, Chord, from_centre, lines
 from fmtorch.pruning.networks.learned import Prediction
 from fmtorch.training.labelled import LabelledMatches
 from fmtorch.training.options import ObjectiveWeights
@@ -264,11 +264,11 @@ def virtual_points(
         height0, width0 = size0.to(torch.float64)[:, None].unbind(-1)
         key = torch.zeros(len(F), dtype=torch.int64, device=F.device) if key is None else key
         u, v, along = uniform(seed, key, Stream.TRAINING, 0, TRIES * count, 3).unbind(-1)
-        x0 = torch.stack([u * width0, v * height0], -1) + BORDER
-        start, end, hits = segment_in_image(lines_through(F, x0), size1.to(torch.float64), BORDER)
-        x1 = start + along[..., None] * (end - start)
-        order = torch.argsort((~hits).to(torch.uint8), dim=1, stable=True)[:, :count]
-        mask = hits.gather(1, order)
+        x0, size1 = torch.stack([u * width0, v * height0], -1) + BORDER, size1.to(torch.float64)
+        chord = Chord.of(lines(from_centre(F, size1, BORDER), *x0.unbind(-1)), size1)
+        x1 = torch.stack(chord.at(along), -1) + (size1.flip(-1) / 2 + BORDER)[:, None]
+        order = torch.argsort((~chord.hits).to(torch.uint8), dim=1, stable=True)[:, :count]
+        mask = chord.hits.gather(1, order)
         x0, x1 = (torch.where(mask[..., None], x.gather(1, order[..., None].expand(-1, -1, 2)), 0.0) for x in (x0, x1))
     return VirtualPoints(x0, x1, mask)
 

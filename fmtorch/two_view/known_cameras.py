@@ -163,9 +163,8 @@ def _pose(estimate: Estimate, square: Correspondences, focals: Tensor, known: Te
     prior = torch.ones_like(square.x0[..., 0]) if square.prior is None else square.prior.nan_to_num(0)
     weight = torch.where(estimate.inliers & known[:, None], prior, 0).detach()
     cameras = torch.cat([K[:, [0, 0, 1], [0, 2, 2]] for K in (K0, K1)], 1)
-    given = [value.detach().to("cpu") for value in (F, cameras, square.x0, square.x1, weight)]
     out = torch.empty(len(F), 13, dtype=torch.float64)
-    out = for_each_pair(pose, given, out=out, kind=torch.float64).to(F.device)
+    out = for_each_pair(pose, (F, cameras, square.x0, square.x1, weight), out=out, kind=torch.float64)
     R, t, valid = out[:, :9].reshape(-1, 3, 3), out[:, 9:12], (out[:, 12] == 1) & known
     if torch.is_grad_enabled() and (F.requires_grad or focals.requires_grad):
         graphed = pose_from_fundamental(F, K0, K1, square.x0.detach(), square.x1.detach(), estimate.inliers, weight)

@@ -125,6 +125,6 @@ def from_truth(pair: ImagePair, c: Correspondences) -> Estimate:
     """The robust fit to the matches, weighted by their prior, that starts from the true matrix."""
     F = torch.from_numpy(pair.F)[None]
     for scale in (1.5, 0.7):  # px
-        F = refine(F, c.x0, c.x1, c.prior, c.mask, kernel="geman_mcclure", scale=scale, iterations=20)
+        F = refine(F, c.x0, c.x1, c.prior, c.mask, loss="geman_mcclure", scale=scale, iterations=20)
     ok = torch.isfinite(F).all(-1).all(-1)
     return Estimate(F, c.mask, ok, ("",), torch.zeros(1, dtype=torch.int64))

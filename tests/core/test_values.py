@@ -48,7 +48,7 @@ def test_wrong_values_are_named_to_who_gives_them(name: str, value: float, messa
 
 
 @pytest.mark.parametrize(("name", "value", "message"), WRONG)
-@pytest.mark.parametrize("estimator", ["msac", "irls:kernel=truncated", "cf_ransac", "opencv"])
+@pytest.mark.parametrize("estimator", ["msac", "irls:loss=truncated", "cf_ransac", "opencv"])
 def test_wrong_values_of_one_pair_are_its_reason(estimator: str, name: str, value: float, message: str) -> None:
     built = quick(estimator) if estimator in OWN else presets.build("estimator", estimator)
     estimate = built(with_wrong(name, value), 0)

@@ -206,7 +206,7 @@ def test_images_of_two_sizes_are_searched_without_assumptions_too() -> None:
 
 def test_unknown_sizes_give_the_selection_without_prior() -> None:
     c = scenes().replace(size0=None, size1=None)
-    options = {"hypotheses": 200, "pool": 8, "refine": {"kernel": "truncated"}, "select": {}, "final": "none"}
+    options = {"hypotheses": 200, "pool": 8, "refine": {"loss": "truncated"}, "select": {}, "final": "none"}
     focal = Ransac(focal={}, **options)(c)  # type: ignore[arg-type]
     plain = Ransac(**options)(c)  # type: ignore[arg-type]
     assert torch.equal(focal.F, plain.F)

@@ -11,13 +11,13 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.estimators import IterativelyReweighted, Ransac, final_fits
-from fmtorch.geometry import KERNELS
+from fmtorch.geometry import LOSSES
 from tests.estimators.models.photographs import TALL, WIDE, photographs
 from tests.laws import degenerate, scene
 
 VARIABLES = ("x0", "x1", "prior", "noise")
 SEARCH = {"hypotheses": 200, "round": 200, "confidence": None, "refit_inliers": False, "inlier_threshold": 3.0}
-REFINED = {"refine": {"kernel": "truncated"}, "select": {"scale": 1.0}, "pool": 4}
+REFINED = {"refine": {"loss": "truncated"}, "select": {"scale": 1.0}, "pool": 4}
 CAMERAS = "adaptive, with cameras"
 FITS: Mapping[str, Mapping[str, object]] = {
     "least_squares": {"final": "least_squares"},
@@ -26,14 +26,14 @@ FITS: Mapping[str, Mapping[str, object]] = {
     "adaptive": {"final": "adaptive", **REFINED},
     CAMERAS: {"final": "adaptive", **REFINED, "focal": {"samples": 100, "pool": 8}},
 }
-UNMOVED = {"unweighted_least_squares": ("prior", "noise"), **{f"irls {name}": ("noise",) for name in KERNELS}}
+UNMOVED = {"unweighted_least_squares": ("prior", "noise"), **{f"irls {name}": ("noise",) for name in LOSSES}}
 """What a fit takes no account of."""
 
 
 def estimator(name: str) -> Ransac | IterativelyReweighted:
     """One whose fits converge."""
     if name.startswith("irls "):
-        return IterativelyReweighted(kernel=name.removeprefix("irls "), threshold=2.0, refine_iterations=60)
+        return IterativelyReweighted(loss=name.removeprefix("irls "), threshold=2.0, refine_iterations=60)
     return Ransac(**(SEARCH | FITS[name]))  # type: ignore[arg-type]
 
 
@@ -57,7 +57,7 @@ def converging(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("converging")
 @pytest.mark.parametrize("same", [False, True])
-@pytest.mark.parametrize("name", [*FITS, *(f"irls {kernel}" for kernel in KERNELS)])
+@pytest.mark.parametrize("name", [*FITS, *(f"irls {loss}" for loss in LOSSES)])
 def test_they_are_the_differences_of_estimates(name: str, same: bool) -> None:
     """Where residuals are small against the image: Gauss and Newton's Hessian leaves out their curvature."""
     given, built = inputs(7, 1e-3, same), estimator(name)

@@ -1,4 +1,4 @@
-"""FMTORCH_KERNELS=off: estimators run as plain Python, for debugging, and find the same."""
+"""FMTORCH_KERNELS=off: estimators and pruners run as plain Python, for debugging, and find the same."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from fmtorch import presets
 from fmtorch.jit.kernel import SWITCH
 from tests.laws import few, scene
+from tests.variants import built
 
 PROGRAM = """
 import sys
@@ -22,12 +23,15 @@ np.savez(sys.argv[1], **estimates())
 
 
 def estimates() -> dict[str, np.ndarray]:
-    """F and inliers of a pair of few matches."""
+    """F and inliers of a pair of few matches, and what pruners make of these."""
     c, arrays = scene(1, 40), {}
     for name in ("msac", "fmtorch"):
         estimate = presets.build("estimator", name, **few(presets.load("estimator", name), 40, 40))(c)
         assert bool(estimate.ok[0])
         arrays |= {f"{name}.F": estimate.F[0].numpy(), f"{name}.inliers": estimate.inliers[0].numpy()}
+    for name in ("frame_consistency", "position_consistency", "gms", "gms:soft=true", "lpm", "lpm:soft=true"):
+        pruned = built("pruner", name)(c)
+        arrays |= {f"{name}.mask": pruned.mask.numpy(), f"{name}.prior": pruned.prior.numpy()}
     return arrays
 
 

@@ -10,24 +10,24 @@ from fmtorch import presets
 from fmtorch.core.types import collate
 from fmtorch.estimators import IterativelyReweighted
 from fmtorch.estimators.irls import _weight
-from fmtorch.geometry import KERNELS
+from fmtorch.geometry import LOSSES
 from fmtorch.geometry.refine import refine
 from tests.estimators.pairs import pair_of
 from tests.laws import scene
 from tests.reference import refine as reference
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_presets_name_their_kernel(kernel: str) -> None:
-    estimator = presets.build("estimator", "irls", kernel=kernel)
+@pytest.mark.parametrize("loss", LOSSES)
+def test_presets_name_their_loss(loss: str) -> None:
+    estimator = presets.build("estimator", "irls", loss=loss)
     assert isinstance(estimator, IterativelyReweighted)
-    assert estimator.kernel == kernel
+    assert estimator.loss == loss
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_is_a_minimum_of_the_weighted_loss(kernel: str) -> None:
+@pytest.mark.parametrize("loss", LOSSES)
+def test_is_a_minimum_of_the_weighted_loss(loss: str) -> None:
     c = collate([scene(i, 150, outliers=0.05) for i in range(3)])
-    estimate = IterativelyReweighted(kernel=kernel, threshold=2.0, refine_iterations=60)(c)
+    estimate = IterativelyReweighted(loss=loss, threshold=2.0, refine_iterations=60)(c)
     assert bool(estimate.ok.all())
     assert bool((estimate.draws == 0).all())
     prior = c.prior
@@ -35,18 +35,18 @@ def test_is_a_minimum_of_the_weighted_loss(kernel: str) -> None:
 
     def cost(F: torch.Tensor, i: int) -> float:
         r2 = reference.sampson(F.numpy(), c.x0[i].double().numpy(), c.x1[i].double().numpy()) ** 2
-        return float((prior[i].double().numpy() * reference.loss(r2, 4.0, kernel)).sum())
+        return float((prior[i].double().numpy() * reference.loss(r2, 4.0, loss)).sum())
 
-    further = refine(estimate.F, c.x0, c.x1, prior, c.mask, kernel=kernel, scale=2.0, iterations=50)
+    further = refine(estimate.F, c.x0, c.x1, prior, c.mask, loss=loss, scale=2.0, iterations=50)
     for i in range(3):
         assert cost(estimate.F[i], i) <= cost(further[i], i) * (1 + 1e-9)
 
 
-def test_an_annealed_kernel_is_not_caught_where_a_narrow_one_is() -> None:
+def test_an_annealed_loss_is_not_caught_where_a_narrow_one_is() -> None:
     pairs = collate([scene(i, 150, outliers=0.3) for i in range(40)]).replace(prior=None, quality=None)
     near = []
     for options in ({}, {"start_scale": 1e-9}):
-        estimate = IterativelyReweighted(kernel="truncated", threshold=1.0, **options)(pairs)
+        estimate = IterativelyReweighted(loss="truncated", threshold=1.0, **options)(pairs)
         near.append(estimate.inliers.sum(1).to(torch.float64).mean())
     assert near[0] > 1.3 * near[1]
 
@@ -54,7 +54,7 @@ def test_an_annealed_kernel_is_not_caught_where_a_narrow_one_is() -> None:
 def test_the_prior_and_the_quality_decide_where_there_are_more_outliers_than_inliers() -> None:
     pairs = collate([scene(i, 150, outliers=0.65) for i in range(16)])
     inliers = {
-        name: int(IterativelyReweighted(kernel="geman_mcclure", threshold=1.0)(c).inliers.sum())
+        name: int(IterativelyReweighted(loss="geman_mcclure", threshold=1.0)(c).inliers.sum())
         for name, c in {
             "prior": pairs,
             "quality": pairs.replace(prior=None),
@@ -81,15 +81,15 @@ def test_weights_of_matches(known: str) -> None:
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"kernel": "tukey"}, "kernel is 'tukey'"), ({"threshold": 0.0}, "must be positive"),
+    [({"loss": "tukey"}, "loss is 'tukey'"), ({"threshold": 0.0}, "must be positive"),
      ({"starts": []}, "list of integers"), ({"starts": [1, -1]}, "list of integers")],
 )  # fmt: skip
 def test_bad_options_are_told(options: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        IterativelyReweighted(**{"kernel": "huber", "threshold": 1.0, **options})  # type: ignore[arg-type]
+        IterativelyReweighted(**{"loss": "huber", "threshold": 1.0, **options})  # type: ignore[arg-type]
 
 
 def test_too_few_matches_have_a_reason() -> None:
-    estimate = IterativelyReweighted(kernel="huber", threshold=1.0)(scene(0, 7))
+    estimate = IterativelyReweighted(loss="huber", threshold=1.0)(scene(0, 7))
     assert estimate.reason == ("7 matches; at least 8 are needed",)
     assert np.all(estimate.F.numpy() == 0)

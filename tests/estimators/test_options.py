@@ -15,7 +15,7 @@ from fmtorch.estimators.options import Focal, Preselect, Refine, Select, stage
 from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.registry import PARTS, part
 from fmtorch.estimators.scores import InlierCount, Msac, scored_matches, squared_residuals_of
-from fmtorch.geometry.levenberg_marquardt import LOSSES
+from fmtorch.geometry.levenberg_marquardt import LOSS_CODES
 from tests.laws import scene
 
 MEDIAN = {"score": "median", "inliers": "lmeds", "confidence": None}
@@ -23,29 +23,29 @@ MEDIAN = {"score": "median", "inliers": "lmeds", "confidence": None}
 
 def test_groups_are_made_of_mappings() -> None:
     assert stage({"survivors": 64}, Preselect) == Preselect(128, 64)
-    assert stage({"kernel": "cauchy", "scale": 0.5}, Refine) == Refine("cauchy", 0.5)
+    assert stage({"loss": "cauchy", "scale": 0.5}, Refine) == Refine("cauchy", 0.5)
     assert stage(None, Focal) is None
     select = Select(scale=0.3)
     assert stage(select, Select) is select
-    with pytest.raises(ValueError, match="estimator=ransac: refine=truncated; it must be a mapping of: kernel, scale"):
+    with pytest.raises(ValueError, match="estimator=ransac: refine=truncated; it must be a mapping of: loss, scale"):
         presets.build("estimator", "ransac", refine="truncated")
 
 
 def test_losses_that_refine_names_are_those_there_are() -> None:
-    assert typing.get_args(typing.get_type_hints(Refine)["kernel"]) == tuple(LOSSES)
+    assert typing.get_args(typing.get_type_hints(Refine)["loss"]) == tuple(LOSS_CODES)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"refine": {"kernel": "truncated", "threshold": 1}}, "refine: no option threshold; there are: "),
-        ({"refine": {"scale": 1.0}}, "refine: kernel is missing"),
+        ({"refine": {"loss": "truncated", "threshold": 1}}, "refine: no option threshold; there are: "),
+        ({"refine": {"scale": 1.0}}, "refine: loss is missing"),
         (
-            {"refine": {"kernel": "l1"}},
-            "refine.kernel=l1; it must be one of: huber, cauchy, geman_mcclure",
+            {"refine": {"loss": "l1"}},
+            "refine.loss=l1; it must be one of: huber, cauchy, geman_mcclure",
         ),
-        ({"refine": {"kernel": "cauchy", "scale": 0.0}}, "refine.scale=0.0; it must be a number above 0"),
-        ({"refine": {"kernel": "cauchy", "matches": 0}}, "refine.matches=0; it must be a whole number of at least 1"),
+        ({"refine": {"loss": "cauchy", "scale": 0.0}}, "refine.scale=0.0; it must be a number above 0"),
+        ({"refine": {"loss": "cauchy", "matches": 0}}, "refine.matches=0; it must be a whole number of at least 1"),
         ({"preselect": {"matches": 0}}, "preselect.matches=0; it must be a whole number of at least 1"),
         ({"preselect": Preselect(survivors=0)}, "preselect.survivors=0; it must be a whole number of at least 1"),
         ({"select": {"scale": 0.0}}, "select.scale=0.0; it must be a number above 0"),

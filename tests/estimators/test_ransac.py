@@ -37,7 +37,7 @@ def _true_inlier_error(F: torch.Tensor, index: int, count: int) -> float:
 @pytest.mark.parametrize("name", OWN)
 def test_recovers_the_geometry(name: str) -> None:
     # M-estimators without samples break down earlier, Huber's, whose loss is unbounded, at once.
-    outliers = 0.02 if name == "irls:kernel=huber" else 0.1 if name.startswith("irls") else 0.3
+    outliers = 0.02 if name == "irls:loss=huber" else 0.1 if name.startswith("irls") else 0.3
     pairs = [scene(i, 300, outliers=outliers, noise=0.2) for i in range(4)]
     estimate = built("estimator", name)(collate(pairs))
     assert bool(estimate.ok.all()), estimate.reason
@@ -138,7 +138,7 @@ def test_the_pool_is_refined_on_matches_near_one_of_its_models() -> None:
     r = np.sqrt(np.min([residuals_squared_px(F, pair) for F in pool.models], 0))
 
     def near(matches: int) -> Pair:
-        refining = Ransac(pool=4, refine={"kernel": "truncated", "scale": 1.5, "matches": matches})
+        refining = Ransac(pool=4, refine={"loss": "truncated", "scale": 1.5, "matches": matches})
         return refining.refine(pool, pair, refining.family).near
 
     few, every = near(150), near(1000)
@@ -165,7 +165,7 @@ WAY = (
 
 def test_the_way_of_a_sample_of_seven(monkeypatch: pytest.MonkeyPatch) -> None:
     """The files that a sample passes from draw to refinement, each where it comes first: see `docs/architecture.md`."""
-    estimator = Ransac(hypotheses=100, round=100, pool=2, preselect=None, refine={"kernel": "truncated"})
+    estimator = Ransac(hypotheses=100, round=100, pool=2, preselect=None, refine={"loss": "truncated"})
     estimator.refine(estimator.search(pair_of(scene(0, 60))), pair_of(scene(0, 60)), estimator.family)  # compiled
     pair, passed = pair_of(scene(0, 60)), dict[str, None]()
 

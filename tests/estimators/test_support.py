@@ -85,9 +85,9 @@ def scaled(config: Mapping[str, Any], scale: float) -> dict[str, Any]:
     levels = {key: scaled(value, scale) for key, value in config.items() if isinstance(value, Mapping)}
     pixels = ("threshold", "inlier_threshold", "scale")
     own = {k: v * scale for k, v in config.items() if k in pixels and isinstance(v, float)}
-    of_kernels = config.get("threshold")
-    if isinstance(of_kernels, Mapping):
-        own["threshold"] = {kernel: value * scale for kernel, value in of_kernels.items()}
+    of_losses = config.get("threshold")
+    if isinstance(of_losses, Mapping):
+        own["threshold"] = {loss: value * scale for loss, value in of_losses.items()}
     return {**levels, **own}
 
 
@@ -112,7 +112,7 @@ def test_coordinates_sizes_and_thresholds_scaled_together_give_the_same_inliers(
     inliers = {}
     # Outliers carry Huber's loss away so far that its 30 steps do not end at an optimum; where they do depends on the
     # unit of the points, which is the next power of two.
-    scales = (2.0**-30, 2.0**-10, 2.0**10, 2.0**30) if name == "irls:kernel=huber" else (1e-9, 1e-3, 1e3, 1e9)
+    scales = (2.0**-30, 2.0**-10, 2.0**10, 2.0**30) if name == "irls:loss=huber" else (1e-9, 1e-3, 1e3, 1e9)
     for scale in (1.0, *scales):
         for (owner, constant), value in pixels.items():
             monkeypatch.setattr(owner, constant, in_pixels(value, scale))

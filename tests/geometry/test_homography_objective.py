@@ -18,8 +18,8 @@ from fmtorch.geometry.homography_refine import (
     refine_homographies,
     step_of_homography,
 )
-from fmtorch.geometry.levenberg_marquardt import LOSSES, NO_TABLE, Schedule, Weighted
-from fmtorch.geometry.robust_losses import KERNELS
+from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, NO_TABLE, Schedule, Weighted
+from fmtorch.geometry.robust_losses import LOSSES
 from tests.reference import homography_family as reference
 
 EPS = 2.0**-52
@@ -35,11 +35,11 @@ class Problem(NamedTuple):
     s2: np.ndarray
 
     def weighted(self, loss: str) -> Weighted:
-        return Weighted(self.points, self.weight, self.s2, LOSSES[loss], NO_TABLE)
+        return Weighted(self.points, self.weight, self.s2, LOSS_CODES[loss], NO_TABLE)
 
     def unbounded(self) -> Weighted:
         """Without a robust loss."""
-        return Weighted(self.points, self.weight, np.full_like(self.s2, np.inf), LOSSES["truncated"], NO_TABLE)
+        return Weighted(self.points, self.weight, np.full_like(self.s2, np.inf), LOSS_CODES["truncated"], NO_TABLE)
 
 
 def problem(seed: int, n: int = 30, noise: float = 0.02) -> Problem:
@@ -176,7 +176,7 @@ def test_step_at_an_optimum_and_inverse_hessian() -> None:
         np.testing.assert_allclose(moved, out[0], atol=1e-7)  # sqrt(EPS) as above, times the condition
         points, weight = torch.from_numpy(p.points[:, None].copy()), torch.from_numpy(p.weight[None])
         at, unbounded = torch.from_numpy(out.T[..., None].copy()), torch.full((1, 1), torch.inf, dtype=torch.float64)
-        inverse = inverse_hessian_of_homography(at, points, weight, KERNELS["truncated"], unbounded)[..., 0, 0].numpy()
+        inverse = inverse_hessian_of_homography(at, points, weight, LOSSES["truncated"], unbounded)[..., 0, 0].numpy()
         step = 1e-5
         columns = [evaluated(out[0] + sign * step * e, p.unbounded())[0][9, :9] for e in np.eye(9) for sign in (1, -1)]
         A = np.subtract(columns[::2], columns[1::2]).T / (2 * step)  # off by the third derivative times step^2
@@ -192,16 +192,16 @@ def test_gradient_in_tensors_and_its_graph(loss: str) -> None:
         torch.from_numpy(a) for a in (p.h[:, None, None], p.points[:, None].copy(), p.weight[None], p.s2[None])
     )
     expected, _ = evaluated(p.h, p.weighted(loss))
-    computed = homography_gradient(h, points, weight, KERNELS[loss], s2)
+    computed = homography_gradient(h, points, weight, LOSSES[loss], s2)
     np.testing.assert_allclose(computed[:, 0, 0].numpy(), expected[9, :9], atol=1e-11 * np.abs(expected).max())
     points.requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: homography_gradient(h, x, weight, KERNELS[loss], s2), points)
+    assert torch.autograd.gradcheck(lambda x: homography_gradient(h, x, weight, LOSSES[loss], s2), points)
 
 
 def test_gauss_newton_matrix_in_tensors() -> None:
     p = problem(4)
     h, points, weight = (torch.from_numpy(a) for a in (p.h[:, None, None], p.points[:, None].copy(), p.weight[None]))
     unbounded = torch.full((1, 1), torch.inf, dtype=torch.float64)
-    computed = homography_curvature(h, points, weight, KERNELS["truncated"], unbounded)[0, 0].numpy()
+    computed = homography_curvature(h, points, weight, LOSSES["truncated"], unbounded)[0, 0].numpy()
     expected = reference.gauss_newton(p.h, p.points, p.weight)
     np.testing.assert_allclose(computed, expected, atol=1e-11 * np.abs(expected).max())

@@ -147,8 +147,8 @@ def test_gradients() -> None:
     assert bool(torch.isfinite(gradient).all())
 
 
-@pytest.mark.parametrize("kernel", ["truncated", "cauchy", "geman_mcclure", "huber", "magsac"])
-def test_gradients_of_refined_homographies_are_those_of_the_optimum(kernel: str) -> None:
+@pytest.mark.parametrize("loss", ["truncated", "cauchy", "geman_mcclure", "huber", "magsac"])
+def test_gradients_of_refined_homographies_are_those_of_the_optimum(loss: str) -> None:
     """By differences of optima, each found anew."""
     x0, x1, truth = pairs((2,), 25, noise=0.003)  # 1.2 px
     x1[:, 0] += 30  # a wrong match
@@ -158,7 +158,7 @@ def test_gradients_of_refined_homographies_are_those_of_the_optimum(kernel: str)
     corners = torch.tensor([[0.0, 0.0], [800.0, 0.0], [800.0, 800.0], [0.0, 800.0]], dtype=torch.float64)
 
     def seen(a: torch.Tensor, b: torch.Tensor, w: torch.Tensor) -> torch.Tensor:
-        H = refine_homography(truth, a, b, w, kernel=kernel, scale=scale, iterations=60)
+        H = refine_homography(truth, a, b, w, loss=loss, scale=scale, iterations=60)
         return homography_points(H, corners).sum((-2, -1))
 
     value = seen(*inputs)
@@ -180,18 +180,18 @@ def test_gradients_of_refined_homographies_are_those_of_the_optimum(kernel: str)
 def test_refined_homographies() -> None:
     x0, x1, truth = pairs((2,), 40, noise=0.003)
     many = torch.stack([truth, -3 * truth, torch.zeros_like(truth), torch.full_like(truth, torch.nan)], 1)
-    refined = refine_homography(many, x0, x1, kernel="cauchy", scale=3.0, iterations=20)
+    refined = refine_homography(many, x0, x1, loss="cauchy", scale=3.0, iterations=20)
     assert refined.shape == many.shape
-    assert torch.equal(refined[:, 0], refine_homography(truth, x0, x1, kernel="cauchy", scale=3.0, iterations=20))
+    assert torch.equal(refined[:, 0], refine_homography(truth, x0, x1, loss="cauchy", scale=3.0, iterations=20))
     torch.testing.assert_close(refined[:, 0], refined[:, 1], rtol=0, atol=1e-9)
     assert not bool(torch.isfinite(refined[:, 2:]).all(-1).any())
     costs = [(1 + homography_sampson(H, x0, x1).square() / 9).log().sum(-1) for H in (truth, refined[:, 0])]
     assert bool((costs[1] < costs[0]).all())
     x0.requires_grad_()
-    attached = refine_homography(many, x0, x1, kernel="cauchy", scale=3.0, iterations=20)
+    attached = refine_homography(many, x0, x1, loss="cauchy", scale=3.0, iterations=20)
     assert torch.equal(attached.detach().nan_to_num(7), refined.nan_to_num(7))
     attached[:, :2].sum().backward()
     assert x0.grad is not None
     assert bool(torch.isfinite(x0.grad).all())
     with pytest.raises(ValueError, match="welsch"):
-        refine_homography(truth, x0, x1, kernel="welsch")
+        refine_homography(truth, x0, x1, loss="welsch")

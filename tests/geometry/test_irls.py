@@ -7,7 +7,7 @@ from torch import Tensor
 
 from fmtorch.geometry.irls import irls
 from fmtorch.geometry.refine import refine
-from fmtorch.geometry.robust_losses import KERNELS
+from fmtorch.geometry.robust_losses import LOSSES
 from tests.conftest import oracle
 from tests.geometry.scenes import unit_scene
 from tests.geometry.test_refine import distance
@@ -19,13 +19,13 @@ def pair(seed: int, noise: float, outliers: int = 0) -> tuple[Tensor, Tensor, Te
     return F, x0, x1
 
 
-def cost(F: Tensor, x0: Tensor, x1: Tensor, kernel: str, scale: float) -> float:
+def cost(F: Tensor, x0: Tensor, x1: Tensor, loss: str, scale: float) -> float:
     r2 = reference.sampson(F.numpy(), x0.numpy(), x1.numpy()) ** 2
-    return float(reference.loss(r2, scale**2, kernel).sum())
+    return float(reference.loss(r2, scale**2, loss).sum())
 
 
 def eight_point_once(F: np.ndarray, x0: np.ndarray, x1: np.ndarray, scale: float) -> np.ndarray:
-    """One reweighted fit with the Cauchy kernel, from the definition."""
+    """One reweighted fit with the Cauchy loss, from the definition."""
     h0, h1 = np.c_[x0, np.ones(len(x0))], np.c_[x1, np.ones(len(x1))]
     line1, line0 = h0 @ F.T, h1 @ F
     g2 = (line1[:, :2] ** 2).sum(1) + (line0[:, :2] ** 2).sum(1)
@@ -48,7 +48,7 @@ def eight_point_once(F: np.ndarray, x0: np.ndarray, x1: np.ndarray, scale: float
 @pytest.mark.parametrize("seed", range(4))
 def test_two_iterations_equal_the_definition(seed: int) -> None:
     F, x0, x1 = pair(seed, 2e-3, 20)
-    fitted = irls(x0, x1, F, kernel="cauchy", scale=0.01, iterations=2)
+    fitted = irls(x0, x1, F, loss="cauchy", scale=0.01, iterations=2)
     expected = F.numpy()
     for _ in range(2):
         expected = eight_point_once(expected, x0.numpy(), x1.numpy(), 0.01)
@@ -56,11 +56,11 @@ def test_two_iterations_equal_the_definition(seed: int) -> None:
     assert distance(fitted.flatten(), torch.from_numpy(expected.flatten())) < 1e-9
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_exact_matches_keep_the_exact_matrix(kernel: str) -> None:
+@pytest.mark.parametrize("loss", LOSSES)
+def test_exact_matches_keep_the_exact_matrix(loss: str) -> None:
     F, x0, x1 = pair(5, 0.0)
     near = F + 1e-3 * torch.from_numpy(np.random.default_rng(0).normal(size=(3, 3)))
-    fitted = irls(x0, x1, near, kernel=kernel, scale=1.0)
+    fitted = irls(x0, x1, near, loss=loss, scale=1.0)
     assert distance(fitted.flatten(), F.flatten()) < 1e-9  # as above
     assert float(torch.linalg.svdvals(fitted)[2]) < 1e-15
     assert float(fitted.norm()) == pytest.approx(1, abs=1e-15)
@@ -70,8 +70,8 @@ def test_comes_close_to_the_optimum_on_real_pairs() -> None:
     data = oracle("robust.npz")
     for name in ("000", "001"):
         x0, x1, F = (torch.from_numpy(data[f"{name}.{key}"]) for key in ("X1", "X2", "F_gt"))
-        fitted = irls(x0, x1, F, kernel="cauchy", scale=1.0, iterations=10)
-        best = refine(F, x0, x1, kernel="cauchy", scale=1.0, iterations=30)
+        fitted = irls(x0, x1, F, loss="cauchy", scale=1.0, iterations=10)
+        best = refine(F, x0, x1, loss="cauchy", scale=1.0, iterations=30)
         start, end, optimum = (cost(m, x0, x1, "cauchy", 1.0) for m in (F, fitted, best))
         assert optimum <= end < start
 
@@ -107,5 +107,5 @@ def test_hopeless_problems_keep_their_model() -> None:
 
 def test_unknown_kernel() -> None:
     F, x0, x1 = pair(1, 0.0)
-    with pytest.raises(ValueError, match="kernel"):
-        irls(x0, x1, F, kernel="none")
+    with pytest.raises(ValueError, match="loss"):
+        irls(x0, x1, F, loss="none")

@@ -1,4 +1,4 @@
-"""Gradients of iteratively reweighted least squares: finite differences, both kinds, degenerate scenes, the laws."""
+"""Gradients of iteratively reweighted least squares: finite differences, degenerate scenes, the laws."""
 
 from __future__ import annotations
 
@@ -11,23 +11,22 @@ from torch import Tensor
 
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.geometry import eight_point, irls, reweighted_fits
-from fmtorch.geometry.robust_losses import KERNELS
+from fmtorch.geometry.robust_losses import LOSSES
 from tests import laws
 from tests.geometry.scenes import unit_scene
 
 SCALE = 0.02
-GRADIENTS = ("implicit", "unrolled")
 
 
-def tolerances(kernel: str) -> dict[str, float | bool]:
+def tolerances(loss: str) -> dict[str, float | bool]:
     """Of `gradcheck`, along random directions. Central differences round 1e-15 times the condition 1e3 over the step.
 
-    The tabulated kernel is linear between its entries, 1 / 1000 apart, whose slopes differ by as much.
+    The tabulated loss is linear between its entries, 1 / 1000 apart, whose slopes differ by as much.
     """
     return {
         "eps": 1e-6,
         "atol": 1e-5,
-        "rtol": 1e-3 if kernel == "magsac" else 1e-5,
+        "rtol": 1e-3 if loss == "magsac" else 1e-5,
         "fast_mode": True,
         "check_undefined_grad": False,
     }
@@ -41,53 +40,28 @@ def inputs(seed: int, n: int = 24, noise: float = 3e-3, outliers: int = 3) -> tu
     return x0, x1, near, torch.from_numpy(rng.uniform(0.2, 1, n))
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_unrolled_gradients_are_those_of_the_function(kernel: str) -> None:
-    """To points, first model and weights, one of them zero, whatever the number of iterations."""
-    values = inputs(1)
-    values[3][5] = 0.0
-    for iterations in (1, 3):
-
-        def function(x0: Tensor, x1: Tensor, F0: Tensor, w: Tensor, iterations: int = iterations) -> Tensor:
-            options = {"kernel": kernel, "scale": SCALE, "iterations": iterations}
-            # Negative weights are not allowed, so finite differences at zero need some room.
-            return irls(x0, x1, F0, w + 1e-5, gradient="unrolled", **options)
-
-        attached = [v.clone().requires_grad_() for v in values]
-        assert torch.autograd.gradcheck(function, attached, **tolerances(kernel))
-
-
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_implicit_gradients_are_those_of_the_fixed_point(kernel: str) -> None:
-    """Finite differences of the converged iteration, and the gradients through all of it."""
+@pytest.mark.parametrize("loss", LOSSES)
+def test_gradients_are_those_of_the_fixed_point(loss: str) -> None:
+    """Finite differences of the converged iteration."""
     x0, x1, F0, weight = inputs(2, outliers=1)
-    converged = irls(x0, x1, F0, weight, kernel=kernel, scale=SCALE, iterations=60)
+    converged = irls(x0, x1, F0, weight, loss=loss, scale=SCALE, iterations=60)
 
-    def function(x0: Tensor, x1: Tensor, w: Tensor, gradient: str, iterations: int = 15) -> Tensor:
-        return irls(x0, x1, converged, w, kernel=kernel, scale=SCALE, iterations=iterations, gradient=gradient)
+    def function(x0: Tensor, x1: Tensor, w: Tensor) -> Tensor:
+        return irls(x0, x1, converged, w, loss=loss, scale=SCALE, iterations=15)
 
     attached = [v.clone().requires_grad_() for v in (x0, x1, weight)]
-    implicit = functools.partial(function, gradient="implicit")
-    assert torch.autograd.gradcheck(implicit, attached, **tolerances(kernel))
-    direction = torch.from_numpy(np.random.default_rng(0).normal(size=(3, 3)))
-    both = [torch.autograd.grad((function(*attached, kind, 40) * direction).sum(), attached) for kind in GRADIENTS]
-    for by_implicit, by_unrolled in zip(*both, strict=True):
-        # The eigenvector's gradient knows gaps of some 1e-3 of the trace to rounding: 1e-13, times the sum over fits.
-        torch.testing.assert_close(by_implicit, by_unrolled, rtol=1e-8, atol=1e-8 * float(by_unrolled.abs().max()))
+    assert torch.autograd.gradcheck(function, attached, **tolerances(loss))
 
 
 def test_models_of_a_pool_have_their_own_gradients() -> None:
     x0, x1, F0, weight = inputs(3)
     pool = torch.stack([F0, F0 + 0.01, -F0])
-    for gradient in GRADIENTS:
-        w = weight.clone().requires_grad_()
-        fitted = irls(x0, x1, pool, w, scale=SCALE, gradient=gradient)
-        for i in range(3):
-            alone = irls(x0, x1, pool[i], w, scale=SCALE, gradient=gradient)
-            pooled, own = (
-                torch.autograd.grad(F.square()[0].sum(), w, retain_graph=True)[0] for F in (fitted[i], alone)
-            )
-            torch.testing.assert_close(pooled, own, rtol=1e-10, atol=1e-12)
+    w = weight.clone().requires_grad_()
+    fitted = irls(x0, x1, pool, w, scale=SCALE)
+    for i in range(3):
+        alone = irls(x0, x1, pool[i], w, scale=SCALE)
+        pooled, own = (torch.autograd.grad(F.square()[0].sum(), w, retain_graph=True)[0] for F in (fitted[i], alone))
+        torch.testing.assert_close(pooled, own, rtol=1e-10, atol=1e-12)
 
 
 def test_nothing_is_recorded_without_need() -> None:
@@ -98,13 +72,10 @@ def test_nothing_is_recorded_without_need() -> None:
     with torch.no_grad():
         assert not irls(*attached[:2], F0, attached[2], scale=SCALE).requires_grad
     first = F0.clone().requires_grad_()
-    assert not irls(x0, x1, first, weight, scale=SCALE, gradient="implicit").requires_grad
-    for gradient in GRADIENTS:
-        fitted = irls(*attached[:2], first, attached[2], scale=SCALE, gradient=gradient)
-        assert fitted.requires_grad
-        assert torch.equal(fitted, plain)
-    with pytest.raises(ValueError, match="gradient is 'none'"):
-        irls(x0, x1, F0, gradient="none")
+    assert not irls(x0, x1, first, weight, scale=SCALE).requires_grad
+    fitted = irls(*attached[:2], first, attached[2], scale=SCALE)
+    assert fitted.requires_grad
+    assert torch.equal(fitted, plain)
 
 
 def degenerate() -> dict[str, Correspondences]:
@@ -133,9 +104,8 @@ def first_model() -> Tensor:
     return eight_point(clean.x0.double(), clean.x1.double())[0][0]
 
 
-@pytest.mark.parametrize("gradient", GRADIENTS)
 @pytest.mark.parametrize("kind", degenerate())
-def test_gradients_are_finite_and_do_not_touch_neighbours(kind: str, gradient: str) -> None:
+def test_gradients_are_finite_and_do_not_touch_neighbours(kind: str) -> None:
     """A good pair beside a degenerate one has the bits it has alone, and the gradients up to rounding."""
     good, bad = laws.scene(1), degenerate()[kind]
     size = {"very small": 1e-9, "very large": 1e9}.get(kind, 1.0)
@@ -146,19 +116,15 @@ def test_gradients_are_finite_and_do_not_touch_neighbours(kind: str, gradient: s
 
     def fitted(c: Correspondences, F0: Tensor) -> tuple[Tensor, list[Tensor]]:
         assert c.prior is not None
-        attached = [v.double().clone().requires_grad_() for v in (c.x0, c.x1, c.prior, F0)]
-        x0, x1, weight, first = attached
+        x0, x1, weight = attached = [v.double().clone().requires_grad_() for v in (c.x0, c.x1, c.prior)]
         scale = torch.tensor([2.0, 2.0 * size, 2.0], dtype=torch.float64)[: len(F0)]
-        F = irls(x0, x1, first, weight, c.mask, scale=scale, gradient=gradient)
-        gradients = torch.autograd.grad(F.sum(), attached, allow_unused=gradient == "implicit")
-        return F.detach(), [g for g in gradients if g is not None]
+        F = irls(x0, x1, F0, weight, c.mask, scale=scale)
+        return F.detach(), list(torch.autograd.grad(F.sum(), attached))
 
     F, gradients = fitted(c, F0)
     assert bool(F.isfinite().all())
-    assert len(gradients) == (3 if gradient == "implicit" else 4)
     for g in gradients:
         assert bool(g.isfinite().all())
-    for g in gradients[:3]:
         assert bool((g[~c.mask] == 0).all())
     alone, its_gradients = fitted(pairs[0], F0[:1])
     assert torch.equal(F[0], alone[0])
@@ -167,24 +133,18 @@ def test_gradients_are_finite_and_do_not_touch_neighbours(kind: str, gradient: s
         torch.testing.assert_close(g[0, :n], own[0], rtol=1e-8, atol=1e-10 * float(own.abs().max()))
 
 
-@pytest.mark.parametrize("gradient", GRADIENTS)
-def test_what_is_no_model_has_no_gradient(gradient: str) -> None:
+def test_what_is_no_model_has_no_gradient() -> None:
     x0, x1, F0, weight = inputs(3)
-    pool = torch.stack([F0, F0 * torch.nan]).requires_grad_()
+    pool = torch.stack([F0, F0 * torch.nan])
     attached = [v.clone().requires_grad_() for v in (x0, x1, weight)]
-    fitted = irls(*attached[:2], pool, attached[2], scale=SCALE, gradient=gradient)
-    alone = irls(*attached[:2], F0, attached[2], scale=SCALE, gradient=gradient)
+    fitted = irls(*attached[:2], pool, attached[2], scale=SCALE)
+    alone = irls(*attached[:2], F0, attached[2], scale=SCALE)
     sums = [torch.autograd.grad(f.sum(), attached, retain_graph=True) for f in (fitted, alone)]
     for g, own in zip(*sums, strict=True):
         torch.testing.assert_close(g, own, rtol=1e-8, atol=1e-8 * float(own.abs().max()))
-    if gradient == "unrolled":
-        (to_pool,) = torch.autograd.grad(fitted.sum(), pool)
-        assert bool((to_pool[1:] == 0).all())
-        assert bool(to_pool.isfinite().all())
 
 
-@pytest.mark.parametrize("gradient", GRADIENTS)
-def test_padding_is_invisible_to_gradients(gradient: str) -> None:
+def test_padding_is_invisible_to_gradients() -> None:
     x0, x1, F0, weight = inputs(4)
     where = torch.arange(24) * 2 + 7
     padded = [torch.full((61, *v.shape[1:]), torch.nan, dtype=torch.float64) for v in (x0, x1, weight)]
@@ -195,7 +155,7 @@ def test_padding_is_invisible_to_gradients(gradient: str) -> None:
     results = []
     for a, b, w, m in ((x0, x1, weight, None), (*padded, mask)):
         attached = [v.clone().requires_grad_() for v in (a, b, w)]
-        F = irls(*attached[:2], F0, attached[2], m, scale=SCALE, gradient=gradient)
+        F = irls(*attached[:2], F0, attached[2], m, scale=SCALE)
         results.append((F.detach(), torch.autograd.grad(F[0].sum(), attached)))
     assert torch.equal(results[0][0], results[1][0])
     for short, long in zip(results[0][1], results[1][1], strict=True):

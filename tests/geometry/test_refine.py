@@ -10,7 +10,7 @@ from torch import Tensor
 from fmtorch.geometry.epipolar import homogeneous, linearise
 from fmtorch.geometry.rank2_manifold import start
 from fmtorch.geometry.refine import attached_step, refine, refine_components
-from fmtorch.geometry.robust_losses import KERNELS
+from fmtorch.geometry.robust_losses import LOSSES
 from tests.conftest import oracle
 from tests.geometry.scenes import unit_scene
 from tests.reference import refine as reference
@@ -87,21 +87,19 @@ def test_least_squares_optimum_equals_scipy(seed: int) -> None:
             assert distance(fitted[:, 0, i], torch.from_numpy(expected.flatten())) < 1e-4
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("loss", LOSSES)
 @pytest.mark.parametrize("seed", range(2))
-def test_robust_optimum_equals_scipy(kernel: str, seed: int) -> None:
+def test_robust_optimum_equals_scipy(loss: str, seed: int) -> None:
     F, x0, x1 = unit_scene(seed, 120, noise=2e-3, outliers=30)
     scale = 0.01
     F0 = models(F, 1, 1e-3, seed)
     ones = torch.ones(1, 120, dtype=torch.float64)
-    fitted, cost = refine_components(
-        F0, components(x0, x1), ones, kernel, torch.tensor([scale], dtype=torch.float64), 60
-    )
+    fitted, cost = refine_components(F0, components(x0, x1), ones, loss, torch.tensor([scale], dtype=torch.float64), 60)
     # From our optimum SciPy, which knows another parametrisation and numerical gradients, cannot get lower.
-    _, min_cost = reference.optimum(fitted[:, 0, 0].reshape(3, 3).numpy(), x0, x1, np.ones(120), kernel, scale)
-    # The tabulated kernel is linear between its entries, whose integral is off by up to 1e-7.
-    assert cost.item() == pytest.approx(min_cost, rel=1e-6 if kernel == "magsac" else 1e-8)
-    if kernel in ("geman_mcclure", "truncated"):  # bounded losses; the others let a quarter of outliers move F far
+    _, min_cost = reference.optimum(fitted[:, 0, 0].reshape(3, 3).numpy(), x0, x1, np.ones(120), loss, scale)
+    # The tabulated loss is linear between its entries, whose integral is off by up to 1e-7.
+    assert cost.item() == pytest.approx(min_cost, rel=1e-6 if loss == "magsac" else 1e-8)
+    if loss in ("geman_mcclure", "truncated"):  # bounded losses; the others let a quarter of outliers move F far
         assert distance(fitted[:, 0, 0], torch.from_numpy(F.flatten())) < 0.05
 
 
@@ -134,13 +132,13 @@ def test_exact_matches_give_the_exact_matrix(seed: int) -> None:
     assert bool((distance(fitted, torch.from_numpy(F.reshape(9, 1, 1))) < 1e-11).all())
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_cost_never_rises(kernel: str) -> None:
+@pytest.mark.parametrize("loss", LOSSES)
+def test_cost_never_rises(loss: str) -> None:
     F, x0, x1 = unit_scene(7, 90, noise=5e-3, outliers=40)
     F0 = torch.cat([models(F, 10, 0.05), models(F, 10, 1.0)], 2)
     weight = torch.from_numpy(np.random.default_rng(0).uniform(0, 1, (1, 90)))
     scale = torch.tensor([0.02], dtype=torch.float64)
-    costs = [refine_components(F0, components(x0, x1), weight, kernel, scale, i)[1] for i in range(8)]
+    costs = [refine_components(F0, components(x0, x1), weight, loss, scale, i)[1] for i in range(8)]
     for before, after in itertools.pairwise(costs):
         assert bool((after <= before).all())
     assert bool((costs[-1] < costs[0])[:, :10].any())
@@ -184,8 +182,8 @@ def test_masked_slots_and_neighbours_are_invisible() -> None:
     assert torch.equal(pool[2], -expected)
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_hopeless_problems_keep_their_model(kernel: str) -> None:
+@pytest.mark.parametrize("loss", LOSSES)
+def test_hopeless_problems_keep_their_model(loss: str) -> None:
     F, x0, x1 = unit_scene(1, 60, noise=1e-3)
     points = components(x0, x1).repeat(1, 5, 1)
     points[:, 1] = 0.0  # all matches coincide
@@ -198,14 +196,14 @@ def test_hopeless_problems_keep_their_model(kernel: str) -> None:
     F0[:, :, 2] = 0
     F0[:, :, 3] = torch.tensor([1.0, 2, 3, 2, 4, 6, 3, 6, 9], dtype=torch.float64)[:, None]  # rank 1
     scale = torch.full((5,), 0.01, dtype=torch.float64)
-    fitted, cost = refine_components(F0, points, weight, kernel, scale, 6)
+    fitted, cost = refine_components(F0, points, weight, loss, scale, 6)
     assert bool(torch.isfinite(fitted[:, :, 0]).all())
     assert bool(torch.isfinite(cost[:, 0]).all())
     assert bool(torch.isnan(fitted[:, :, 1]).all())
     assert bool(torch.isinf(cost[:, 1:3]).all())
     assert bool((fitted[:, :, 2] == 0).all())
     assert not bool(torch.isnan(cost).any())
-    alone, _ = refine_components(F0[:, :1, :1], points[:, :1], weight[:1], kernel, scale[:1], 6)
+    alone, _ = refine_components(F0[:, :1, :1], points[:, :1], weight[:1], loss, scale[:1], 6)
     assert torch.equal(alone[:, 0, 0], fitted[:, 0, 0])
 
 
@@ -213,18 +211,18 @@ def test_empty_and_unknown() -> None:
     F = torch.eye(3, dtype=torch.float64)
     none = torch.zeros(0, 2, dtype=torch.float64)
     assert refine(F, none, none).shape == (3, 3)
-    with pytest.raises(ValueError, match="kernel"):
-        refine(F, none, none, kernel="none")
+    with pytest.raises(ValueError, match="loss"):
+        refine(F, none, none, loss="none")
 
 
-@pytest.mark.parametrize(("kernel", "outliers"), [*((name, 0) for name in KERNELS), ("truncated", 6)])
-def test_attached_step_has_the_gradient_of_the_optimum(kernel: str, outliers: int) -> None:
+@pytest.mark.parametrize(("loss", "outliers"), [*((name, 0) for name in LOSSES), ("truncated", 6)])
+def test_attached_step_has_the_gradient_of_the_optimum(loss: str, outliers: int) -> None:
     F, a, b = unit_scene(2, 30, noise=1e-4, outliers=outliers)
     x0, x1 = torch.from_numpy(a), torch.from_numpy(b)
     rng = np.random.default_rng(0)
     weight = torch.from_numpy(rng.uniform(0.2, 1, 30))
     direction = torch.from_numpy(rng.normal(size=(3, 3)))
-    arguments = {"kernel": kernel, "scale": 0.02}
+    arguments = {"loss": loss, "scale": 0.02}
 
     def optimum(x0: Tensor, x1: Tensor, weight: Tensor) -> Tensor:
         return refine(torch.from_numpy(F), x0, x1, weight, iterations=30, **arguments)

@@ -8,18 +8,18 @@ from torch import Tensor
 
 from fmtorch.core.types import collate
 from fmtorch.geometry import eight_point, irls, reweighted_fits, sampson
-from fmtorch.geometry.robust_losses import KERNELS, named_kernel
+from fmtorch.geometry.robust_losses import LOSSES, named_loss
 from tests import laws
 from tests.geometry.test_irls_gradients import SCALE, degenerate, inputs
 from tests.geometry.test_refine import distance
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_weights_of_a_kernel_make_it_irls(kernel: str) -> None:
+@pytest.mark.parametrize("loss", LOSSES)
+def test_weights_of_a_loss_make_it_irls(loss: str) -> None:
     """The same step serves both: `irls` is the iteration whose weights are w rho'(r^2) / g^2."""
     x0, x1, F0, weight = (torch.stack(v) for v in zip(*(inputs(s) for s in range(3)), strict=True))
     F0 = F0 / F0.flatten(1).norm(dim=1)[:, None, None]
-    robust = named_kernel(kernel)
+    robust = named_loss(loss)
 
     def weigh(F: Tensor | None, residual: Tensor | None) -> Tensor:
         assert F is not None
@@ -33,7 +33,7 @@ def test_weights_of_a_kernel_make_it_irls(kernel: str) -> None:
     assert bool(fits.valid.all())
     assert fits.F.shape == (3, 3, 3, 3)
     for i in range(3):
-        expected = irls(x0, x1, F0, weight, kernel=kernel, scale=SCALE, iterations=i + 1)
+        expected = irls(x0, x1, F0, weight, loss=loss, scale=SCALE, iterations=i + 1)
         # Rounding of 1e-16 times the condition of the normal equations, 1e6.
         assert float(distance(fits.F[i].flatten(1).T, expected.flatten(1).T).max()) < 1e-9
 

@@ -18,7 +18,7 @@ from tests.laws import degenerate, quick, scene
 from tests.variants import variants
 
 ESTIMATORS = [n for n in variants("estimator") if "_cpp" not in n and n != "homography"]
-NOT_ROBUST = ("irls:kernel=huber", "irls:kernel=cauchy")  # against three wrong matches in ten
+NOT_ROBUST = ("irls:loss=huber", "irls:loss=cauchy")  # against three wrong matches in ten
 
 
 @functools.cache

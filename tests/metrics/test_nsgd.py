@@ -15,7 +15,7 @@ from torch import Tensor
 from fmtorch.geometry import cross_matrix, unit_frobenius
 from fmtorch.jit.random import Stream, uniform
 from fmtorch.metrics import nsgd, nsgd_released, sgd
-from fmtorch.metrics.nsgd import COLUMNS, Pairs, draw_distances
+from fmtorch.metrics.nsgd import COLUMNS, Draws, Pairs, draw_distances
 from tests.conftest import oracle
 from tests.reference import metrics as reference
 
@@ -236,9 +236,10 @@ def test_exchanging_the_matrices_exchanges_the_halves(seed: int) -> None:
     F_gt, F_est = random_pairs(seed, 2)
     sizes = [size.double().expand(2, 2) for size in (VGA, HD)]
     key = torch.arange(2)
-    u = uniform(seed, key, Stream.METRIC, 0, 40, COLUMNS)
-    forward = draw_distances(Pairs(F_gt, F_est, *sizes, key), u)
-    backward = draw_distances(Pairs(F_est, F_gt, *sizes, key), u.roll(3, -1))
+    both = Draws.of(seed, key, 0, 40)
+    forward = draw_distances(Pairs(F_gt, F_est, *sizes, key), both)
+    exchanged = Draws(*(numbers.flip(0) for numbers in both))
+    backward = draw_distances(Pairs(F_est, F_gt, *sizes, key), exchanged)
     for a, b in zip(forward, backward, strict=True):
         assert torch.equal(a, b)
 
@@ -274,7 +275,7 @@ def test_neighbours_batch_and_tile_are_invisible(function: object, monkeypatch: 
     order = torch.tensor([8, 3, 5, 0])
     part = function(F_gt[order], F_est[order], *sizes[:, order], key=key[order], samples=50)
     assert torch.equal(part, together[order])
-    monkeypatch.setattr(sys.modules["fmtorch.metrics.nsgd"], "TILE", 16)
+    monkeypatch.setattr(sys.modules["fmtorch.metrics.nsgd"], "TILE", 100)
     assert torch.equal(function(F_gt, F_est, *sizes, key=key, samples=50), together)
 
 

@@ -12,6 +12,7 @@ from fmtorch.core.types import Correspondences
 from fmtorch.pruning import frame_agreement
 from fmtorch.pruning.neighbors import CURVES, MIN_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO
 from tests.laws import scene
+from tests.pruning.gradients import expect_gradients
 from tests.reference import frame_consistency as reference
 
 
@@ -67,12 +68,33 @@ def test_a_wrong_match_disagrees_and_is_told_from_the_right_ones() -> None:
     assert float(w[torch.arange(len(w)) != 7].min()) > 0.8
 
 
-def test_gradients_are_finite() -> None:
+def test_gradients_are_those_of_the_definition() -> None:
+    c = scene(2, 30)
+    fields = {name: getattr(c, name).double().requires_grad_() for name in ("x0", "x1", "lafs0", "lafs1", "quality")}
+    weight = torch.linspace(-1, 1, 30, dtype=torch.float64)
+
+    def defined(x0: np.ndarray, x1: np.ndarray, lafs0: np.ndarray, lafs1: np.ndarray, quality: np.ndarray) -> float:
+        S, vote = lafs1[0, :, :, :2] @ np.linalg.inv(lafs0[0, :, :, :2]), np.maximum(WORST_RATIO - quality[0], MIN_VOTE)
+        agreement = reference.agreement(x0[0], x1[0], S, vote, CURVES, WINDOW, TOLERANCE, NOISE)
+        return float(weight.numpy() @ agreement)
+
+    (frame_agreement(**fields, mask=c.mask)[0] * weight).sum().backward()
+    expect_gradients(fields, defined)
+
+
+def test_gradients_are_finite_beside_padding_and_what_is_no_frame() -> None:
     c = scene(2, 50)
-    x0, x1 = c.x0.clone().requires_grad_(), c.x1.clone().requires_grad_()
-    prior = presets.build("pruner", "frame_consistency")(c.replace(x0=x0, x1=x1)).prior
+    assert c.lafs0 is not None
+    lafs = c.lafs0.clone()
+    lafs[:, 3], lafs[:, 4] = float("nan"), 0.0
+    mask = c.mask.clone()
+    mask[:, 5:9] = False
+    fields = {"x0": c.x0.clone(), "x1": c.x1.clone(), "lafs0": lafs}
+    prior = presets.build("pruner", "frame_consistency")(
+        c.replace(mask=mask, **{name: value.requires_grad_() for name, value in fields.items()})
+    ).prior
     prior.sum().backward()
-    for x in (x0, x1):
+    for x in fields.values():
         assert x.grad is not None
         assert bool(torch.isfinite(x.grad).all())
         assert bool((x.grad != 0).any())

@@ -9,11 +9,23 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from fmtorch.core.types import Correspondences
+from fmtorch.jit.kernel import F8x2, I8x2, kernel
 from fmtorch.pruning import LPM, lpm
-from fmtorch.pruning.lpm import nearest_points
+from fmtorch.pruning import neighbors as knn_kernels
 from tests.conftest import oracle
 from tests.reference.lpm import lpm as reference
 from tests.reference.lpm import nearest
+
+
+@kernel
+def search(queries: F8x2, points: F8x2, neighbors: I8x2) -> None:
+    knn_kernels.search(queries, points, neighbors)
+
+
+def nearest_points(queries: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:
+    neighbors = np.empty((len(queries), count), np.int64)
+    search(queries, points, neighbors)
+    return neighbors
 
 
 def moving(seed: int, n: int, outliers: float = 0.4) -> tuple[Tensor, Tensor]:
@@ -36,8 +48,7 @@ def test_nearest_points_equal_the_definition(seed: int, n: int, m: int, count: i
     queries, points = rng.uniform(0, 6, (n, 2)), rng.uniform(0, 6, (m, 2))
     if coarse:  # ties everywhere
         queries, points = queries.round(), points.round()
-    queries_, points_ = torch.from_numpy(queries), torch.from_numpy(points)
-    neighbors = nearest_points(queries_, points_, count)
+    neighbors = nearest_points(queries, points, count)
     for query, row in zip(queries, neighbors.tolist(), strict=True):
         expected = nearest(query, points, list(range(m)), count)
         assert row == expected + [-1] * (count - len(expected))
@@ -55,7 +66,7 @@ def test_nearest_points_of_many(kind: str) -> None:
         "one place": np.full((n, 2), 7.0),
     }[kind]
     queries = np.concatenate([points[:400], rng.uniform(-200, 1200, (100, 2))])
-    neighbors = nearest_points(torch.from_numpy(queries), torch.from_numpy(points), 9).numpy()
+    neighbors = nearest_points(queries, points, 9)
     expected = cKDTree(points).query(queries, 9)[0]
     distances = np.linalg.norm(points[neighbors] - queries[:, None], axis=-1)
     np.testing.assert_allclose(distances, expected, rtol=1e-14, atol=1e-14)  # a few roundings of float64
@@ -73,7 +84,7 @@ def test_masks_equal_the_original() -> None:
         x0, x1 = torch.from_numpy(case["X"]), torch.from_numpy(case["Y"])
         mask = lpm(x0[None], x1[None], thresholds=(lambda1, lambda2), neighbors=(int(K1), int(K2)), taus=(tau1, tau2))
         np.testing.assert_array_equal(mask[0], case["mask"], str(name))
-        for x, key in ((x0, "nX1"), (x1, "nY1")):
+        for x, key in ((case["X"], "nX1"), (case["Y"], "nY1")):
             np.testing.assert_array_equal(nearest_points(x, x, int(K1) + 3), case[key], str(name))
 
 

@@ -12,8 +12,10 @@ import fmtorch
 from fmtorch import presets
 from fmtorch.core.types import Correspondences, collate
 from fmtorch.pruning import position_agreement
-from fmtorch.pruning.neighbors import CURVES, MIN_VOTE, NOISE, SCALES, TOLERANCE, TURNS, WINDOW, WORST_RATIO
+from fmtorch.pruning.neighbors import CURVES, MIN_VOTE, NOISE, TOLERANCE, WINDOW, WORST_RATIO
+from fmtorch.pruning.position_consistency import SCALES, TURNS
 from tests.laws import scene
+from tests.pruning.gradients import expect_gradients
 from tests.reference import position_consistency as reference
 
 
@@ -58,6 +60,22 @@ def test_pairs_of_a_batch_have_their_own_turns() -> None:
     together = agree(collate(pairs))
     for i, pair in enumerate(pairs):
         assert torch.equal(together[i, : 60 + i], agree(pair)[0])
+
+
+def test_gradients_are_those_of_the_definition() -> None:
+    c = scene(2, 30)
+    assert c.quality is not None
+    fields = {name: getattr(c, name).double().requires_grad_() for name in ("x0", "x1", "quality")}
+    weight = torch.linspace(-1, 1, 30, dtype=torch.float64)
+
+    def defined(x0: np.ndarray, x1: np.ndarray, quality: np.ndarray) -> float:
+        S = reference.similarity(x0[0], x1[0], CURVES, TURNS, SCALES)
+        vote = np.maximum(WORST_RATIO - quality[0], MIN_VOTE)
+        agreement = reference.agreement(x0[0], x1[0], S, vote, CURVES, WINDOW, TOLERANCE, NOISE)
+        return float(weight.numpy() @ agreement)
+
+    (position_agreement(**fields, mask=c.mask)[0] * weight).sum().backward()
+    expect_gradients(fields, defined)
 
 
 def test_gradients_are_finite() -> None:

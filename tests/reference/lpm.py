@@ -10,7 +10,9 @@ import numpy as np
 
 def nearest(query: np.ndarray, points: np.ndarray, members: list[int], count: int) -> list[int]:
     """The `count` members nearest to the query, ties by index; fewer where there are fewer."""
-    return sorted(members, key=lambda j: (float(((points[j] - query) ** 2).sum()), j))[:count]
+    among = np.array(members, dtype=int)
+    nearest_first: list[int] = among[np.lexsort((among, ((points[among] - query) ** 2).sum(1)))].tolist()
+    return nearest_first[:count]
 
 
 def cost(i: int, x: np.ndarray, y: np.ndarray, members: list[int], K: int, tau: float) -> float:

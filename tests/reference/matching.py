@@ -34,6 +34,6 @@ def one_to_one(x0: np.ndarray, x1: np.ndarray, quality: np.ndarray) -> np.ndarra
     """A match is kept unless another at its location in either image is better: lower quality, then lower index."""
     kept = []
     for i in range(len(x0)):
-        rivals = [j for j in range(len(x0)) if (x0[i] == x0[j]).all() or (x1[i] == x1[j]).all()]
+        rivals = np.flatnonzero((x0 == x0[i]).all(1) | (x1 == x1[i]).all(1))
         kept.append(all((quality[i], i) <= (quality[j], j) for j in rivals))
     return np.array(kept, bool)

@@ -29,8 +29,9 @@ def similarity(p0: np.ndarray, p1: np.ndarray, curves: Sequence[Any], turns: int
         smooth[1:] += votes[:-1]
         smooth[:-1] += votes[1:]
         product *= smooth
-    level, turn = np.unravel_index(product.argmax(), product.shape)
-    return scales[level] * np.exp(2j * np.pi * turn / turns) if product.any() else 1 + 0j
+    bins, identity = product.size, len(scales) // 2 * turns
+    best = max(range(bins), key=lambda i: (product.flat[i], -((identity - i) % bins)))  # the identity, of equals
+    return scales[best // turns] * np.exp(2j * np.pi * (best % turns) / turns)
 
 
 def agreement(

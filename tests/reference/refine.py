@@ -8,7 +8,7 @@ from scipy.optimize import least_squares, minimize
 from scipy.spatial.transform import Rotation
 from scipy.special import gamma, gammainc, gammaincc
 
-from fmtorch.geometry.robust_losses import KERNELS
+from fmtorch.geometry.robust_losses import LOSSES
 
 
 def sampson(F: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:
@@ -19,15 +19,15 @@ def sampson(F: np.ndarray, x0: np.ndarray, x1: np.ndarray) -> np.ndarray:
     return (h1 * line1).sum(1) / np.sqrt((line1[:, :2] ** 2).sum(1) + (line0[:, :2] ** 2).sum(1))
 
 
-def loss(r2: np.ndarray, s2: float, kernel: str) -> np.ndarray:
+def loss(r2: np.ndarray, s2: float, name: str) -> np.ndarray:
     """The robust losses, point by point."""
-    if kernel == "huber":
+    if name == "huber":
         return np.array([v if v <= s2 else 2 * np.sqrt(s2 * v) - s2 for v in r2])
-    if kernel == "cauchy":
+    if name == "cauchy":
         return np.array([s2 * np.log(1 + v / s2) for v in r2])
-    if kernel == "geman_mcclure":
+    if name == "geman_mcclure":
         return np.array([v * s2 / (v + s2) for v in r2])
-    if kernel == "magsac":
+    if name == "magsac":
         return magsac_loss(r2, s2)
     return np.array([min(v, s2) for v in r2])
 
@@ -47,7 +47,7 @@ def magsac_loss(r2: np.ndarray, s2: float) -> np.ndarray:
 
 
 def optimum(
-    F: np.ndarray, x0: np.ndarray, x1: np.ndarray, weight: np.ndarray, kernel: str = "truncated", scale: float = np.inf
+    F: np.ndarray, x0: np.ndarray, x1: np.ndarray, weight: np.ndarray, name: str = "truncated", scale: float = np.inf
 ) -> tuple[np.ndarray, float]:
     """The local minimum near F of ``sum w rho(r^2)``, and its cost; points of about unit scale."""
     U, s, Vt = np.linalg.svd(F)
@@ -59,7 +59,7 @@ def optimum(
         return left @ np.diag([np.cos(angle), np.sin(angle), 0]) @ right.T
 
     def cost(theta: np.ndarray) -> float:
-        return float((weight * loss(sampson(matrix(theta), x0, x1) ** 2, scale**2, kernel)).sum())
+        return float((weight * loss(sampson(matrix(theta), x0, x1) ** 2, scale**2, name)).sum())
 
     theta = np.zeros(7)
     if np.isinf(scale):
@@ -74,7 +74,7 @@ def optimum(
 
 
 def normal_equations(
-    f: np.ndarray, points: np.ndarray, weight: np.ndarray, s2: np.ndarray, kernel: str
+    f: np.ndarray, points: np.ndarray, weight: np.ndarray, s2: np.ndarray, name: str
 ) -> tuple[np.ndarray, float]:
     """``[J r]^T W [J r]`` (10, 10) of a model (9,), by the derivative of the residual, and the cost; points (4, n)."""
     x0, x1 = points[:2].T, points[2:].T
@@ -90,18 +90,18 @@ def normal_equations(
         rows.append(np.append(slope.ravel(), e[match] / np.sqrt(g2[match])))
     A = np.array(rows)
     r2 = e**2 / g2
-    robust, R2, S2 = KERNELS[kernel], torch.from_numpy(r2), torch.from_numpy(s2)
+    robust, R2, S2 = LOSSES[name], torch.from_numpy(r2), torch.from_numpy(s2)
     return A.T @ (A * (weight * robust.weight(R2, S2).numpy())[:, None]), float(weight @ robust.loss(R2, S2).numpy())
 
 
 def levenberg_marquardt(
-    f: np.ndarray, points: np.ndarray, weight: np.ndarray, s2: np.ndarray, kernel: str, iterations: int, damping: float,
+    f: np.ndarray, points: np.ndarray, weight: np.ndarray, s2: np.ndarray, name: str, iterations: int, damping: float,
     tolerance: float,
 ) -> tuple[np.ndarray, float]:  # fmt: skip
     """The model (9,) and its cost after damped steps across F and ``e1 e0^T``, each made rank 2 along the second."""
     U, s, Vt = np.linalg.svd(f.reshape(3, 3))
     F = U @ np.diag([s[0], s[1], 0]) @ Vt / np.hypot(s[0], s[1])
-    products, cost = normal_equations(F.ravel(), points, weight, s2, kernel)
+    products, cost = normal_equations(F.ravel(), points, weight, s2, name)
     for _ in range(iterations):
         U, _, Vt = np.linalg.svd(F)
         normal = np.outer(U[:, 2], Vt[2])
@@ -111,7 +111,7 @@ def levenberg_marquardt(
         cofactors = np.stack([np.cross(G[1], G[2]), np.cross(G[2], G[0]), np.cross(G[0], G[1])])
         G = G - np.linalg.det(G) / (cofactors * normal).sum() * normal
         G /= np.linalg.norm(G)
-        trial, trial_cost = normal_equations(G.ravel(), points, weight, s2, kernel)
+        trial, trial_cost = normal_equations(G.ravel(), points, weight, s2, name)
         better, gain = trial_cost < cost, cost - trial_cost
         damping = min(max(damping / 10 if better else damping * 10, 1e-12), 1e6)
         if better:

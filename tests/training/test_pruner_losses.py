@@ -241,7 +241,7 @@ def irls_fit(c: Correspondences, weight: Tensor) -> tuple[Tensor, Tensor]:
 
 def refined_fit(c: Correspondences, weight: Tensor) -> tuple[Tensor, Tensor]:
     F, valid = eight_point(c.x0, c.x1, weight.detach(), c.mask)
-    return refine(F, c.x0, c.x1, weight, c.mask, kernel="cauchy", scale=2.0), valid
+    return refine(F, c.x0, c.x1, weight, c.mask, loss="cauchy", scale=2.0), valid
 
 
 @pytest.mark.parametrize("fit", [eight_point_fit, iterated_fits, irls_fit, refined_fit])

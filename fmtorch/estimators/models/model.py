@@ -61,7 +61,7 @@ class FitScale(NamedTuple):
 
 
 class Loss(NamedTuple):
-    """A robust loss of the Sampson distance. name: of `geometry.KERNELS`. scale: px, of a match of usual noise."""
+    """A robust loss of the Sampson distance. name: of `geometry.LOSSES`. scale: px, of a match of usual noise."""
 
     name: str
     scale: float

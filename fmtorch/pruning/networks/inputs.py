@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fmtorch.core.types import Correspondences
-from fmtorch.pruning.frame_consistency import frame_agreement, frame_map
+from fmtorch.pruning.frame_consistency import frame_agreement, usable_frame_maps
 
 COORDINATES = ("size", "K")
 MIN_AREA_RATIO = 1e-12  # of two frames; keeps the gradient of the logarithm finite
@@ -119,14 +119,7 @@ def _mutual(c: Correspondences) -> list[Tensor]:
 
 def _frame_map(c: Correspondences) -> Float[Tensor, "b n 2 2"] | None:
     """The linear part of the map from frame 0 to frame 1; the identity's in masked slots and for unusable frames."""
-    if c.lafs0 is None or c.lafs1 is None:
-        return None
-    mask = c.mask
-    for lafs in (c.lafs0, c.lafs1):
-        (a, b), (d, e) = (row.unbind(-1) for row in lafs[..., :2].unbind(-2))
-        mask = mask & torch.isfinite(lafs).flatten(2).all(2) & (a * e - b * d != 0)
-    unit = torch.eye(2, 3, dtype=c.lafs0.dtype, device=c.lafs0.device)
-    return frame_map(*(torch.where(mask[..., None, None], lafs, unit) for lafs in (c.lafs0, c.lafs1)))
+    return None if c.lafs0 is None or c.lafs1 is None else usable_frame_maps(c.lafs0, c.lafs1, c.mask)[0]
 
 
 def _scale(c: Correspondences) -> list[Tensor]:

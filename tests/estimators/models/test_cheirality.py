@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from fmtorch.estimators.models.model import BITS, cheirality
 from fmtorch.estimators.models.posterior import Cameras
-from fmtorch.geometry.levenberg_marquardt import LOSSES, NO_TABLE, Weighted
+from fmtorch.geometry.levenberg_marquardt import LOSS_CODES, NO_TABLE, Weighted
 from tests.reference import cheirality as reference
 
 
@@ -32,7 +32,7 @@ def share(
     K0, K1 = (np.diag([1 / f, 1 / f, 1]) for f in focal)
     F, out = (K1 @ U @ np.diag([1, 1, 0]) @ V.T @ K0).reshape(1, 9), np.empty(1)
     cameras = Cameras(np.stack([U, V])[None].copy(), np.log(focal)[None])
-    matches = Weighted(points, support, np.full(len(support), 1e4), LOSSES["geman_mcclure"], NO_TABLE)
+    matches = Weighted(points, support, np.full(len(support), 1e4), LOSS_CODES["geman_mcclure"], NO_TABLE)
     cheirality(cameras, np.ones(2), F, matches, tolerance, out)
     return float(out[0])
 
@@ -69,7 +69,7 @@ def test_support_is_the_gain_of_geman_and_mcclure() -> None:
     scale = 30.0
     gain = np.maximum(1 / (1 + r2 * scale) - 1 / 26, 0) / (1 - 1 / 26)
     cameras, out = Cameras(np.stack([U, V])[None].copy(), np.zeros((1, 2))), np.empty(1)
-    loss, F = LOSSES["geman_mcclure"], (U @ np.diag([1, 1, 0]) @ V.T).reshape(1, 9)
+    loss, F = LOSS_CODES["geman_mcclure"], (U @ np.diag([1, 1, 0]) @ V.T).reshape(1, 9)
     cheirality(cameras, ones, F, Weighted(points, weight, np.full(60, scale), loss, NO_TABLE), 0.0, out)
     computed = out[0]
     # The same, each match weighted by its gain, with a scale so small that all count fully.

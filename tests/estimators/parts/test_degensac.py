@@ -37,7 +37,7 @@ from tests.reference.sampling import quantised
 PAIRS = 64
 COUNT = 200
 OPTIONS = {
-    "threshold": 1.0, "hypotheses": 200, "round": 100, "confidence": None, "pool": 4, "refine": {"kernel": "truncated"},
+    "threshold": 1.0, "hypotheses": 200, "round": 100, "confidence": None, "pool": 4, "refine": {"loss": "truncated"},
 }  # fmt: skip
 K = np.array([[900, 0, 480], [0, 900, 320], [0, 0, 1.0]])
 

@@ -52,18 +52,18 @@ def test_all_matches_are_near_without_a_number_of_them() -> None:
     assert nothing.count == 0
 
 
-@pytest.mark.parametrize("kernel", ["truncated", "geman_mcclure", "cauchy", "huber", "magsac"])
+@pytest.mark.parametrize("loss", ["truncated", "geman_mcclure", "cauchy", "huber", "magsac"])
 @pytest.mark.parametrize("name", ["scene 40", "scene 300", "real 7"])
-def test_refined_models_have_lower_errors(name: str, kernel: str) -> None:
+def test_refined_models_have_lower_errors(name: str, loss: str) -> None:
     pair, scale = named(name), 2.0
     pool = Ransac(hypotheses=200, pool=4).search(pair)
-    refined = Refinement(Refine(kernel, scale, iterations=20))(pool, pair, SevenPoint())
+    refined = Refinement(Refine(loss, scale, iterations=20))(pool, pair, SevenPoint())
     assert refined.valid.all()
     assert refined.near is pair
 
     def cost(F: np.ndarray, pair: Pair) -> float:
         r = residuals(F, pair, scale, np.float64).exact
-        return float((pair.weight * reference.loss(r**2, 1.0, kernel) / pair.pixels_per_noise**2).sum())
+        return float((pair.weight * reference.loss(r**2, 1.0, loss) / pair.pixels_per_noise**2).sum())
 
     before, after = ([cost(F, pair) for F in models] for models in (pool.models, refined.F))
     assert all(a <= b * (1 + 1e-6) for a, b in zip(after, before, strict=True))  # first made rank 2, to float32

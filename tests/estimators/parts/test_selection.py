@@ -28,7 +28,7 @@ def test_the_first_of_the_pool_or_the_best_score_of_what_is_valid() -> None:
     assert not BestScore(Msac(50.0))(Candidates(F, np.zeros(6, np.bool_), pair), pair).valid
 
 
-@pytest.mark.parametrize(("option", "value"), [("select", {"score": "best"}), ("refine", {"kernel": "l1"})])
+@pytest.mark.parametrize(("option", "value"), [("select", {"score": "best"}), ("refine", {"loss": "l1"})])
 def test_unknown_parts_are_refused(option: str, value: dict[str, str]) -> None:
     with pytest.raises(ValueError, match=next(iter(value.values()))):
         Ransac(**{option: value})(scene(1, 100))  # type: ignore[arg-type]
