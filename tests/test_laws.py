@@ -10,7 +10,6 @@ import torch
 
 from fmtorch import presets
 from fmtorch.core.types import Correspondences, Estimate, collate
-from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.laws import (
     Result,
     Subject,
@@ -25,7 +24,7 @@ from tests.laws import (
     small,
     with_padding,
 )
-from tests.variants import variants
+from tests.variants import OTHER_LIBRARIES, variants
 
 OWN = [n for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES)]
 PER_MATCH = ("inliers", "kept", "prior", "noise")

@@ -4,51 +4,38 @@ from __future__ import annotations
 
 import argparse
 
+import cv2
+import torch
+
 if not __package__:
     raise SystemExit("run it in the checkout's folder, as a module: python -m scripts.benchmark COMMAND ...")
 
 from scripts.benchmark import (
     cameras,
-    configuration,
-    curves,
-    end_to_end,
     estimators,
-    features,
-    gc_ransac,
-    hard,
-    homography,
-    known_models,
-    learned,
-    matching,
-    memory,
-    paper,
-    paper_times,
+    images,
     pipelines,
+    planes,
     posebench,
-    pruning,
-    refinement,
     related,
     scale,
-    similar,
+    scenes,
     speed,
-    stages,
     stress,
-    sweep,
-    thresholds,
     verify,
 )
+
+MODULES = (cameras, estimators, images, pipelines, planes, posebench, related, scale, scenes, speed, stress, verify)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m scripts.benchmark", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    for module in (
-        cameras, configuration, curves, end_to_end, estimators, features, gc_ransac, hard, homography, known_models,
-        learned, matching, memory, paper, paper_times, pipelines, posebench, pruning, refinement, related, scale,
-        similar, speed, stages, stress, sweep, thresholds, verify,
-    ):  # fmt: skip
+    for module in MODULES:
         module.add_arguments(commands)
     arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
     arguments.run(arguments)
 
 

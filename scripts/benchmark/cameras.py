@@ -1,81 +1,85 @@
-"""Pose, focal lengths and F by what is known of the cameras, beside PoseLib, COLMAP, OpenCV, kornia and SupeRANSAC.
+"""Pose, focal lengths and F by what is known of the cameras, beside PoseLib, COLMAP, OpenCV and kornia.
 
 A method is named as NAME:LEVEL[:KEY=VALUE,...]. Levels: known; rough (each focal length times a log-uniform factor of
 its own, 1/1.1 to 1.1, given with a deviation of 6 %); wrong (1.5 times too long, given as rough); one_sided (K0 alone);
 shared (one unknown focal length; of pairs of one camera alone); unknown. Peers take a calibration for exact. All
-methods get the same SIFT matches; P(inlier) and noise from the keypoints' frames are part of ours, and of its time. One
-thread; the methods take turns at each pair.
+methods get the same SIFT matches; P(inlier) and noise from the keypoints' frames are part of ours, and of its time.
 
-python -m scripts.benchmark cameras --root DATA/Strecha --root DATA/PhotoTourism --root DATA/KITTI --root DATA/TUM \\
-    --specs scripts/benchmark/cameras.txt --seeds 3 --rows rows.jsonl --update docs/appendix/cameras.md
-python -m scripts.benchmark cameras --root DATA/Strecha_train --root DATA/TanksLike --methods fmtorch:known
-
-The second command is of the scenes that thresholds are chosen on. --rows is appended to pair by pair: started again,
-the command measures what is missing.
+python -m scripts.benchmark cameras --root DATA/Strecha --root DATA/KITTI --specs scripts/benchmark/cameras.txt \\
+    --seeds 3 --rows rows.jsonl --table docs/tables/cameras.csv
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import platform
+import dataclasses
+import functools
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
-from rich.progress import track
+from numpy.typing import NDArray
 
-from fmtorch import metrics
+from fmtorch import presets
+from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data import ImagePair
-from scripts.benchmark import cameras_table, matched
-from scripts.benchmark.cameras_knowledge import Answer, Knowledge, applies, knowledge
-from scripts.benchmark.cameras_methods import Solver, build, identity, read
-from scripts.benchmark.kept import Kept, Row
-from scripts.benchmark.matched import Item, console
-from scripts.benchmark.specs import read_specs
+from fmtorch.estimators import PairwiseEstimator
+from fmtorch.two_view.known_cameras import KnownCameras
+from scripts.benchmark import pairs
+from scripts.benchmark.methods import build, options, read_specs
+from scripts.benchmark.runner import Item, Kept, Measured, Row, add_command, identity, judged, measure
+from scripts.benchmark.tables import Record, Results, Sheet, show
 
-Measured = dict[str, list[Row]]  # the rows of each method
-FAILED = {"rotation": 180.0, "translation": 90.0, "flipped": False, "posed": False}
+Array = NDArray[Any]
+LEVELS = {
+    "known": "both calibrations are known",
+    "rough": "focal lengths are known to 10 %",
+    "wrong": "focal lengths are 1.5 times too long",
+    "one_sided": "the calibration of image 0 is known",
+    "shared": "one unknown focal length",
+    "unknown": "nothing is known",
+}
+ROUGH = 1.1  # largest factor of a roughly known focal length; log-uniform, of each camera its own
+DEVIATION = 0.06  # relative, of such a factor: log(1.1) / sqrt(3), rounded up
+WRONG = 1.5  # factor of a wrong focal length
+USUAL = 1.2  # focal length in units of the longer side where F has no real one: COLMAP's default
+ONE_CAMERA = 1e-3  # relative difference up to which two focal lengths are one
+FOCAL_ERRORS = (0.05, 0.1)  # relative
+PRIOR = ("frame_consistency", "match_noise")  # P(inlier) and noise of each match, before our own estimator
+EXACT = ("known", "rough", "wrong")
+TAKES = {
+    "fmtorch": tuple(LEVELS), "fmtorch_f": tuple(LEVELS), "poselib": (*EXACT, "shared"),
+    "poselib_f": (*EXACT, "one_sided", "shared", "unknown"), "colmap": (*EXACT, "one_sided", "shared", "unknown"),
+    "colmap_f": EXACT, "opencv": EXACT, "kornia": EXACT,
+}  # fmt: skip
+"""The levels that each method takes; ``_f``: a fundamental matrix without cameras, of which the pose is taken."""
 
 
 def add_arguments(commands: Any) -> None:
-    parser = commands.add_parser("cameras", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    matched.add_arguments(parser)
+    parser = add_command(commands, "cameras", run, __doc__, seeds=1)
+    pairs.add_match_options(parser)
     parser.add_argument("--methods", nargs="+", default=[], help="NAME:LEVEL[:KEY=VALUE,...]")
     parser.add_argument("--specs", type=Path, help="a file with one method a line; # starts a comment")
-    parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--rows", type=Path, help="keep what each method makes of each pair here, one line each")
-    parser.add_argument("--json", type=Path, help="write the figures here")
-    parser.add_argument("--update", type=Path, help="write the tables into this Markdown file, between its markers")
-    parser.add_argument("--marker", default="cameras", help="the tables go between <!-- NAME --> and <!-- end NAME -->")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> None:
     kept = Kept(arguments.rows)
-    methods = [*arguments.methods, *(read_specs(arguments.specs) if arguments.specs else [])]
-    if not methods:
-        raise SystemExit("name at least one method: --methods or --specs")
-    solvers = {text: build(text) for text in methods}
-    items = [(pair, c) for pair, c in matched.load(arguments) if has_cameras(pair)]
-    if not items:
-        raise SystemExit("no pair has cameras; a --root must hold Camera.txt files")
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-    rows = measure(solvers, items, arguments.seeds, kept, matched.identity(arguments))
-    pairs = [pair for pair, _ in items]
-    figures = cameras_table.figures(rows, pairs)
-    for sheet in cameras_table.sheets(figures, pairs, arguments.seeds):
-        console.print(sheet.terminal())
-    if arguments.json:
-        machine = {"processor": platform.processor() or platform.machine(), "torch": torch.__version__}
-        content = {"machine": machine, "pairs": len(pairs), "seeds": arguments.seeds, "figures": figures}
-        arguments.json.write_text(json.dumps(content, indent=1) + "\n")
-    if arguments.update:
-        cameras_table.write(arguments.update, arguments.marker, figures, pairs, arguments.seeds)
+    rows = kept.rows
+    if pairs.named(arguments):
+        words = [*arguments.methods, *(read_specs(arguments.specs) if arguments.specs else [])]
+        if not words:
+            raise SystemExit("name at least one method: --methods or --specs")
+        matches = pairs.matches_identity(arguments)
+        methods = [CameraMethod.of(word, matches) for word in words]
+        items = [item for item in pairs.matched(arguments) if has_cameras(item.pair)]
+        if not items:
+            raise SystemExit("no pair has cameras; a --root must hold Camera.txt files")
+        rows = measure(methods, items, arguments.seeds, kept)
+    show([sheet(rows)], arguments.table)
 
 
 def has_cameras(pair: ImagePair) -> bool:
@@ -83,81 +87,250 @@ def has_cameras(pair: ImagePair) -> bool:
     return all(value is not None for value in (pair.K0, pair.K1, pair.R, pair.t))
 
 
-def measure(solvers: dict[str, Solver], items: list[Item], seeds: int, kept: Kept, matches: str = "") -> Measured:
-    """The rows of each method, one for each pair and seed that its level applies to, by seed and pair.
+class Knowledge(NamedTuple):
+    """What a method is given of two cameras.
 
-    Args:
-        solvers: the methods by their names.
-        items: pairs whose cameras are known, with their matches.
-        seeds: how many, from 0.
-        kept: takes the rows; those that it has are not measured again.
-        matches: the digest of what the matches were made with.
+    K: (3, 3) of each image, None where unknown. deviation: relative standard deviation of their focal lengths, 0 where
+    exact. one_camera: whether both images are of one camera. sizes: (2, 2) as (h, w).
     """
-    done = kept.by("pair", "seed", "method", "identity", "matches")
-    made_with = {text: (text, identity(text), matches) for text in solvers}
-    rows: Measured = {text: [] for text in solvers}
-    started = set[str]()
-    turns = [(seed, item) for seed in range(seeds) for item in items]
-    for seed, (pair, c) in track(turns, "estimating", console=console, transient=True):
-        new = []
-        for text, solve in solvers.items():
-            if not applies(read(text).level, pair):
-                continue
-            row = done.get((pair.identity, seed, *made_with[text]))
-            if row is None:
-                given = knowledge(read(text).level, pair, _sizes((pair, c)), seed)
-                if text not in started:
-                    solve(c, given, seed)  # not counted: lazy initialisation
-                    started.add(text)
-                row = judge(solve, (pair, c), given, seed)
-                row |= dict(zip(("method", "identity", "matches"), made_with[text], strict=True))
-                new.append(row)
-            rows[text].append(row)
-        kept.add(new)
-    return rows
+
+    K: tuple[Array | None, Array | None]
+    deviation: float
+    one_camera: bool
+    sizes: Array
+
+    def calibrations(self, focals: Array) -> tuple[Array, Array]:
+        """Those that are given, and of square pixels with these focal lengths (2,) in pixels in place of others.
+
+        Principal points are those that are given or the centres of the images.
+        """
+        centres = [(size[::-1] - 1) / 2 for size in self.sizes]
+        K0, K1 = (
+            np.array([[f, 0, x], [0, f, y], [0, 0, 1]]) if K is None else K
+            for K, f, (x, y) in zip(self.K, focals, centres, strict=True)
+        )
+        return K0, K1
 
 
-def judge(solve: Solver, item: Item, given: Knowledge, seed: int) -> Row:
-    """What one call makes of a pair: angles in degrees, NSGD, relative errors of focal lengths, milliseconds.
+def focals_of(K0: Array | None, K1: Array | None) -> Array:
+    """The focal lengths (2,) in pixels, geometric means of those along x and y; NaN where unknown."""
+    return np.array([np.nan if K is None else np.sqrt(K[0, 0] * K[1, 1]) for K in (K0, K1)])
 
-    A pair without a pose has the largest angles and is not `posed`. `flipped`: the translation points backwards, which
-    its angle, folded to 90 degrees, does not tell. Focal lengths that are given exactly have no error; those of a
-    method that keeps what it is given are these.
-    """
-    pair, c = item
-    start = time.process_time()
-    result = solve(c, given, seed)
-    ms = 1e3 * (time.process_time() - start)
-    row: Row = {"pair": pair.identity, "seed": seed, "ms": ms, "nsgd": 1.0, **FAILED, **_pose(result, pair)}
-    if result.F is not None and np.isfinite(result.F).all() and np.any(result.F):
-        F = torch.from_numpy(result.F / np.linalg.norm(result.F))[None]
+
+def applies(level: str, pair: ImagePair) -> bool:
+    """Whether what a level takes for true holds: `shared` is of pairs of one camera."""
+    f0, f1 = focals_of(pair.K0, pair.K1)
+    return level != "shared" or bool(abs(np.log(f0 / f1)) < ONE_CAMERA)
+
+
+def knowledge(level: str, pair: ImagePair, sizes: Array, seed: int) -> Knowledge:
+    """What a level tells of a pair's cameras. sizes: (2, 2) as (h, w). seed: of roughly known focal lengths."""
+    factors, deviation = np.ones(2), 0.0
+    if level == "rough":
+        rng = np.random.default_rng([pair.key % 2**64, seed])
+        factors, deviation = np.exp(rng.uniform(-np.log(ROUGH), np.log(ROUGH), 2)), DEVIATION
+    elif level == "wrong":
+        factors, deviation = np.full(2, WRONG), DEVIATION
+    told = {"one_sided": 1, "shared": 0, "unknown": 0}.get(level, 2)
+    K = [k @ np.diag([f, f, 1.0]) for k, f in zip((pair.K0, pair.K1), factors, strict=True) if k is not None]
+    given = (K[0] if told > 0 else None, K[1] if told > 1 else None)
+    return Knowledge(given, deviation, level == "shared", sizes)
+
+
+Solve = Callable[[Correspondences, Knowledge, int], Estimate]
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraMethod(Measured):
+    """An estimator that is given what a level tells of the cameras."""
+
+    name: str
+    level: str
+    solve: Solve
+    identity: str
+
+    @classmethod
+    def of(cls, text: str, matches: str = "") -> CameraMethod:
+        """The method of ``NAME:LEVEL[:KEY=VALUE,...]``. Raises SystemExit for anything else."""
+        name, _, rest = text.partition(":")
+        level, _, settings = rest.partition(":")
+        if level not in LEVELS:
+            raise SystemExit(f"{text}: write NAME:LEVEL[:KEY=VALUE,...] with a level of {', '.join(LEVELS)}")
+        if name not in TAKES:
+            raise SystemExit(f"{text}: no method {name!r}; there are {', '.join(TAKES)}")
+        if level not in TAKES[name]:
+            raise SystemExit(f"{text}: {name} has no estimator for {level!r}; it has: {', '.join(TAKES[name])}")
+        solve, made_with = _solver(name, level, options(settings))
+        return cls(text, level, solve, identity(made_with, text, matches, Path(__file__).read_text()))
+
+    def applies(self, item: Item) -> bool:
+        return applies(self.level, item.pair)
+
+    def figures(self, item: Item, seed: int) -> Row:
+        """The figures of F and pose, whether t points backwards, and the errors of focal lengths not given exactly."""
+        c, pair = item.matches, item.pair
         assert c.size0 is not None
         assert c.size1 is not None
-        row["nsgd"] = float(metrics.nsgd(torch.from_numpy(pair.F)[None], F, c.size0, c.size1, key=c.keys))
-    exact = [K is not None and not given.deviation for K in (given.K0, given.K1)]
-    if not all(exact):
-        focals = given.focals if result.focals is None else result.focals
-        errors = np.abs(focals / knowledge("known", pair, _sizes(item), seed).focals - 1)
-        wrong = np.where(np.isfinite(errors), errors, 1.0)  # a pair without focal lengths misses them
-        row["focals"] = [float(error) for error, known in zip(wrong, exact, strict=True) if not known]
-    return row
+        given = knowledge(self.level, pair, np.stack([c.size0[0].numpy(), c.size1[0].numpy()]), seed)
+        start = time.process_time()
+        estimate = self.solve(c, given, seed)
+        ms = 1e3 * (time.process_time() - start)
+        assert item.outcome is not None
+        inliers = estimate.inliers if estimate.inliers.shape == c.mask.shape else c.mask
+        outcome = dataclasses.replace(
+            item.outcome, estimate=estimate.replace(inliers=inliers), reason=estimate.reason[0]
+        )
+        row = {**judged(outcome, seed), "ms": ms}
+        if estimate.t is not None and pair.t is not None and bool(estimate.ok[0]) and bool(estimate.t.isfinite().all()):
+            row["flipped"] = bool(estimate.t[0].double().numpy() @ pair.t < 0)
+        asked = [K is None or given.deviation > 0 for K in given.K]
+        if any(asked):
+            found = focals_of(*given.K)
+            if bool(estimate.ok[0]) and estimate.focals is not None:
+                found = np.where(estimate.focals[0].isfinite(), estimate.focals[0].double().numpy(), np.inf)
+            errors = np.abs(found / focals_of(pair.K0, pair.K1) - 1)[asked]
+            row |= {f"focal_{round(100 * bound)}": float((errors <= bound).mean()) for bound in FOCAL_ERRORS}
+        return row
 
 
-def _pose(result: Answer, pair: ImagePair) -> dict[str, Any]:
-    """The angles of an answer's pose, nothing where it has none."""
-    if result.R is None or result.t is None or not (np.isfinite(result.R).all() and np.isfinite(result.t).all()):
-        return {}
-    R, t, R_true, t_true = (torch.from_numpy(np.array(v, np.float64)) for v in (result.R, result.t, pair.R, pair.t))
-    folded = metrics.pose_error(R, t, R_true, t_true)
-    return {
-        "rotation": float(folded.rotation), "translation": float(folded.translation),
-        "flipped": bool(t @ t_true < 0), "posed": True,
-    }  # fmt: skip
+def _solver(name: str, level: str, changed: dict[str, Any]) -> tuple[Solve, list[tuple[str, str, dict[str, Any]]]]:
+    """What a method computes, and the presets that it is made of."""
+    kind, _, alone = name.partition("_")
+    if kind == "fmtorch":
+        prior = [build("pruner", word) for word in PRIOR]
+        own = _with_cameras if not alone else _decomposed
+        solve = functools.partial(own, presets.build("estimator", kind, **changed), exact=False)
+        stages = [("estimator", kind, changed), *(("pruner", word, {}) for word in PRIOR)]
+        return lambda c, given, seed: solve(functools.reduce(lambda x, stage: stage(x), prior, c), given, seed), stages
+    if kind in ESSENTIAL:
+        solve = functools.partial(_with_cameras, ESSENTIAL[kind](**changed), exact=True)
+        return functools.partial(_best_first, solve), []
+    usual: dict[str, Any] = {"iterations": 5000, "prosac": True} if kind == "poselib" else {"two_view": not alone}
+    shared = {"shared_focal": True} if (name, level) == ("poselib", "shared") else {}
+    changed = {**usual, **shared, **changed}
+    try:
+        estimator = presets.build("estimator", kind, **changed)
+    except ImportError as error:
+        raise SystemExit(f"{name}: {error}") from error
+    call = _decomposed if alone or shared else _with_cameras
+    return functools.partial(_best_first, functools.partial(call, estimator, exact=True)), [
+        ("estimator", kind, changed)
+    ]
 
 
-def _sizes(item: Item) -> Any:
-    """The sizes of both images (2, 2), as (h, w)."""
-    _, c = item
-    assert c.size0 is not None
-    assert c.size1 is not None
-    return np.stack([c.size0[0].numpy(), c.size1[0].numpy()])
+def _with_cameras(estimator: Any, c: Correspondences, given: Knowledge, seed: int, exact: bool) -> Estimate:
+    """By an estimator that takes cameras. exact: it is another library's, which takes what is given for exact."""
+    K0, K1 = (None if K is None else torch.from_numpy(np.asarray(K))[None] for K in given.K)
+    deviations = [np.inf if K is None else 0.0 if exact else given.deviation for K in given.K]
+    focal = torch.tensor([[[1.0, deviation] for deviation in deviations]], dtype=torch.float64)
+    fields = {"K0": K0, "K1": K1, "focal": focal, "shared_focal": torch.tensor([given.one_camera])}
+    estimate: Estimate = KnownCameras(estimator)(c.replace(**fields), seed).detach()
+    lacks_pose = estimate.t is None or not bool(estimate.t.isfinite().all())
+    return _posed(estimate, c, given) if exact and lacks_pose else estimate
+
+
+def _best_first(solve: Solve, c: Correspondences, given: Knowledge, seed: int) -> Estimate:
+    """By another library, which gets the matches in ascending order of their ratios."""
+    assert c.quality is not None
+    order = c.quality[0].argsort(stable=True)
+    slots = {name: getattr(c, name)[:, order] for name in c.per_slot if getattr(c, name) is not None}
+    estimate = solve(c.replace(**slots), given, seed)
+    return estimate.replace(inliers=estimate.inliers[:, order.argsort()])
+
+
+def _decomposed(estimator: Any, c: Correspondences, given: Knowledge, seed: int, exact: bool) -> Estimate:
+    """F by an estimator that is told nothing of the cameras, and its pose."""
+    return _posed(estimator(c.replace(K0=None, K1=None), seed).detach(), c, given)
+
+
+def _posed(estimate: Estimate, c: Correspondences, given: Knowledge) -> Estimate:
+    """The estimate with the pose of F, by the given calibrations or else focal lengths by `bougnoux`."""
+    inliers = estimate.inliers[0].numpy()
+    if not bool(estimate.ok[0]) or not inliers.any():
+        return estimate
+    F = estimate.F[0].double().numpy()
+    K0, K1 = given.calibrations(bougnoux(F, given))
+    rays = [np.c_[x[0].double().numpy(), np.ones(len(inliers))][inliers] @ np.linalg.inv(K).T
+            for x, K in ((c.x0, K0), (c.x1, K1))]  # fmt: skip
+    normalised = [np.ascontiguousarray(each[:, :2]) for each in rays]
+    far = 1e9  # baselines: OpenCV's own bound of 50 rejects short ones
+    _, R, t, _, _ = cv2.recoverPose(K1.T @ F @ K0, normalised[0], normalised[1], np.eye(3), distanceThresh=far)
+    pose = {"R": np.asarray(R), "t": np.asarray(t).ravel(), "focals": focals_of(K0, K1)}
+    return estimate.replace(**{name: torch.from_numpy(np.asarray(v, np.float64))[None] for name, v in pose.items()})
+
+
+def bougnoux(F: Array, given: Knowledge) -> Array:
+    """Focal lengths (2,) in pixels by Bougnoux's formula (ICCV 1998); usual ones for both where one is not real."""
+    centre0, centre1 = Knowledge((None, None), 0.0, False, given.sizes).calibrations(np.ones(2))
+    for centre, K in ((centre0, given.K[0]), (centre1, given.K[1])):
+        centre[:2, 2] = centre[:2, 2] if K is None else K[:2, 2]
+    G = centre1.T @ F @ centre0
+    squares = np.array([_squared_focal(G), _squared_focal(G.T)])
+    usual = USUAL * given.sizes.max(1)
+    return np.asarray(np.sqrt(squares) if np.isfinite(squares).all() and (squares > 0).all() else usual)
+
+
+def _squared_focal(G: Array) -> float:
+    """The squared focal length of the camera whose points G's columns belong to."""
+    p, D = np.array([0, 0, 1.0]), np.diag([1.0, 1, 0])
+    e = np.linalg.svd(G.T)[2][2]
+    row = np.cross(p, e) @ D @ G  # p^T [e]x D G
+    with np.errstate(all="ignore"):
+        return float(-(row @ p) * (p @ G.T @ p) / (row @ D @ G.T @ p))
+
+
+Essential = Callable[[Any, Array, Array], tuple[Any, Any]]  # a pair, K0 and K1 -> E and its inliers
+
+
+def _essential(name: str, find: Essential) -> PairwiseEstimator:
+    """An estimator of fundamental matrices by a library's essential matrices, of matches that come best first."""
+
+    def solve(pair: Any) -> tuple[Array | None, Array]:
+        K0, K1 = pair.exact
+        E, mask = find(pair, K0, K1)
+        if E is None or mask is None or np.shape(E) != (3, 3):
+            return None, np.zeros(len(pair.x0), np.bool_)
+        return np.linalg.inv(K1).T @ np.asarray(E, np.float64) @ np.linalg.inv(K0), np.asarray(mask).ravel() > 0
+
+    return PairwiseEstimator(name, solve, best_first=True)
+
+
+def _opencv(method: str = "USAC_MAGSAC", threshold: float = 1.0, confidence: float = 0.999) -> PairwiseEstimator:
+    def find(pair: Any, K0: Array, K1: Array) -> tuple[Any, Any]:
+        cv2.setRNGSeed(pair.seed)
+        return cv2.findEssentialMat(pair.x0, pair.x1, K0, None, K1, None, getattr(cv2, method), confidence, threshold)
+
+    return _essential("OpenCV", find)
+
+
+def _kornia(threshold: float = 1.0, rounds: int = 10, prosac: bool = True) -> PairwiseEstimator:
+    from kornia.geometry import RANSAC
+
+    def find(pair: Any, K0: Array, K1: Array) -> tuple[Any, Any]:
+        unit = float(np.mean([K0[0, 0], K1[0, 0]]))  # px
+        ransac = RANSAC("essential", inl_th=threshold / unit, max_iter=rounds, prosac_sampling=prosac, seed=pair.seed)
+        rays = [np.c_[x, np.ones(len(x))] @ np.linalg.inv(K).T for x, K in ((pair.x0, K0), (pair.x1, K1))]
+        E, mask = ransac(*(torch.from_numpy(np.ascontiguousarray(each[:, :2])) for each in rays))
+        return E.double().numpy(), mask.numpy()
+
+    return _essential("kornia", find)
+
+
+ESSENTIAL: dict[str, Callable[..., PairwiseEstimator]] = {"opencv": _opencv, "kornia": _kornia}
+
+
+def sheet(rows: Sequence[Row]) -> Sheet:
+    """Each level's methods on each set, and what our own method of the level, or else the first of it, has more."""
+    records: list[Record] = []
+    columns = [
+        "pose@5", "pose@10", "pose@20", "R.01", "AUC@0.05", "flipped, %", *(f"focal within {p} %, %" for p in (5, 10)),
+        "ms", "time ratio",
+    ]  # fmt: skip
+    for level in LEVELS:
+        own = [row for row in rows if row["method"].split(":")[1] == level]
+        results = Results(sorted(own, key=lambda row: row["method"].split(":")[0] != "fmtorch"))
+        lines = results.records(results.groups(results.all_pairs), columns, label="method", minus=["pose@5"])
+        records += [{"known": level, "method": line.pop("method"), **line} for line in lines]
+    return Sheet(
+        "poses", "AUC of the larger pose error at 5, 10 and 20 degrees, recall and AUC@0.05 of F, in %", records
+    )

@@ -1,140 +1,190 @@
-"""Pipelines of different features: recall, inlier rates and counts, beside the paper's figures.
+"""Pipelines on the same pairs: recall, inlier rates and counts by set, beside the paper's figures; paired differences.
 
-python -m scripts.benchmark pipelines --root DATA/Strecha --root DATA/PhotoTourism --json features.jsonl
-python -m scripts.benchmark pipelines --rendered full --limit 40 --json features.jsonl
-python -m scripts.benchmark pipelines --from features.jsonl --markdown docs/appendix/features.md
+Each of these benchmarks is a page of settings, the YAML file of its name in this folder: pipelines with their names in
+the tables, as PRESET NAME=VALUE ..., what is shown of them, and which are compared. --pipelines takes some of them, by
+names or patterns such as 'sift*', or others, as 'NAME = PRESET NAME=VALUE ...'; `+ PRUNER` at the end of one adds one.
+The time of pruners is that of all but `ratio` and `one_to_one`, on one thread.
 
---json is appended to batch by batch: started again, the command goes on where it was interrupted. A row counts only
-for the learned files and options that it was made with.
+python -m scripts.benchmark pipelines --root DATA/Strecha --root DATA/PhotoTourism --rows features.jsonl
+python -m scripts.benchmark pruning --rendered full --limit 50 --pipelines RATIO 'mine = sift_ratio pruner=[ratio,lpm]'
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+import fnmatch
+import functools
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
-from rich.progress import track
+import yaml  # type: ignore[import-untyped]
 
-from fmtorch import presets
-from fmtorch.data import ImagePair
-from fmtorch.evaluation.rows import evaluate
+from fmtorch.data import ImagePair, read_image, to_grey
+from fmtorch.data.construction import keypoints, matchable
 from fmtorch.evaluation.run import select
+from fmtorch.features import ASIFT
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
-from fmtorch.presets.pruners import WIDE
-from fmtorch.runs import identity_digest
-from fmtorch.runs.feature_cache import CachedFeatures
-from fmtorch.runs.fingerprint import configuration
-from scripts.benchmark import pipelines_table
-from scripts.benchmark.kept import Kept, read
-from scripts.benchmark.matched import add_set_arguments, console, sets_of
-from scripts.benchmark.pruning import pruned_by
-from scripts.benchmark.sheet import put
-from scripts.benchmark.specs import features_of, pipeline_of
+from scripts.benchmark import pairs
+from scripts.benchmark.methods import pipeline_method
+from scripts.benchmark.runner import Item, Kept, Measured, Method, Row, add_command, measure
+from scripts.benchmark.tables import KIN, Published, Record, Results, Sheet, published, show
 
-FEATURES = ("sift", "dspsift", "rootsiftpca", "l2net", "geodesc", "hardnet", "hesaffnet")
-SYSTEMS = ("rootsiftpca", "hardnet", "hesaffnet")
-PIPELINES = [*(f"{name}_ratio" for name in FEATURES), *(f"{name}_gms" for name in SYSTEMS)]
-BATCH = 8  # pairs that are kept together
-FIGURES = ("nsgd", "inlier_rate", "inlier_rate_before", "corrs", "corrs_before", "ok")
+FOLDER = Path(__file__).parent
+BENCHMARKS = ("pipelines", "hard", "paper", "pruning", "learned", "refinement", "gc_ransac")
+RULE = "the paper's rule"
+PAPER = {"%Recall": "recall", "%Inlier": "inlier", "%Inlier-m": "inlier_m", "#Corrs": "corrs", "#Corrs-m": "corrs_m"}
+"""Columns of the paper's tables, by what they are called here and there."""
+
+
+def settings_of(name: str) -> dict[str, Any]:
+    """The page of settings of a benchmark."""
+    settings: dict[str, Any] = yaml.safe_load((FOLDER / f"{name}.yaml").read_text(encoding="utf-8"))
+    return settings
 
 
 def add_arguments(commands: Any) -> None:
-    parser = commands.add_parser("pipelines", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add_set_arguments(parser, "pairs of each family at most, chosen by hash")
+    for name in BENCHMARKS:
+        settings = settings_of(name)
+        about = f"{settings['about']}\n\n{(__doc__ or '').partition(chr(10))[2]}"
+        parser = add_command(commands, name, functools.partial(run, settings), about, seeds=settings.get("seeds", 1))
+        pairs.add_set_options(parser)
+        parser.add_argument(
+            "--asift-limit", type=int, default=10, help="the same of pipelines with ASIFT, a minute a pair"
+        )
+        add_pipeline_options(parser)
+
+
+def add_pipeline_options(parser: argparse.ArgumentParser) -> None:
+    """Which pipelines, with which options."""
     parser.add_argument(
-        "--pipelines", nargs="*", default=PIPELINES, help="PRESET of conf/pipeline, or 'PRESET NAME=VALUE ...'"
+        "--pipelines", nargs="*", default=["*"], help="names or patterns of the settings, or NAME = WORDS"
     )
     parser.add_argument("--overrides", nargs="*", default=[], help="of each pipeline, e.g. features.precision=int8")
     parser.add_argument("--label", default="", help="appended to the pipelines' names in the tables")
-    add_measure_arguments(parser, seeds=5)
-    parser.set_defaults(run=run)
+    parser.add_argument("--cache", default="null", help="folder of features; null: the user's; off: nowhere")
 
 
-def add_measure_arguments(parser: argparse.ArgumentParser, seeds: int) -> None:
-    """The options of `measure` and of what is done with its rows."""
-    parser.add_argument("--seeds", type=int, default=seeds, help="of the estimators; recall is their mean")
-    parser.add_argument("--cache", default="null", help="folder of features; null: the user's")
-    parser.add_argument("--json", type=Path, help="keep the figures of every pair here, one line each")
-    parser.add_argument("--from", nargs="*", type=Path, default=[], dest="earlier", help="only show earlier --json")
-    parser.add_argument("--markdown", type=Path, help="put the tables between the marks of this file")
+def run(settings: Mapping[str, Any], arguments: argparse.Namespace) -> None:
+    kept = Kept(arguments.rows)
+    rows = kept.rows
+    if pairs.named(arguments):
+        every = pairs.pairs_of(arguments)
+        chosen = chosen_pipelines(settings["methods"], arguments.pipelines)
+        rows = judged_by_rule(every, kept) if settings.get("rule") else []
+        rows += measured(chosen, every, arguments, kept)
+    if not rows:
+        raise SystemExit("nothing to show: name sets with --root or --rendered, or a file of earlier --rows")
+    selected = {row["pair"] for row in rows if row["method"] == RULE and row["selected"]}
+    results = Results(row for row in rows if row["method"] != RULE)
+    sheets = [figures_sheet(results, settings, selected), differences_sheet(results, settings)]
+    show([sheet for sheet in sheets if sheet.records], arguments.table)
 
 
-def run(arguments: argparse.Namespace) -> None:
-    torch.set_num_threads(1)
-    rows = [row for path in arguments.earlier for row in read(path)]
-    if arguments.root or arguments.rendered:
-        rows += measure(arguments)
-    rows = list({(row["pair"], row["method"]): row for row in rows}.values())  # the last of equals
-    tables = pipelines_table.tables(rows)
-    for table in tables:
-        console.print(table.terminal())
-    if arguments.markdown:
-        put(arguments.markdown, tables)
+def chosen_pipelines(known: Mapping[str, str], wanted: Sequence[str]) -> dict[str, str]:
+    """The pipelines that are asked for, by name. Raises SystemExit for one that is none."""
+    chosen: dict[str, str] = {}
+    for word in wanted:
+        name, equals, words = (part.strip() for part in word.partition(" = "))
+        names = fnmatch.filter(known, name)
+        if not equals and not names and "*" in name:
+            raise SystemExit(f"--pipelines {word!r}: there are {', '.join(known)}")
+        chosen |= {name: words} if equals else {n: known[n] for n in names} if names else {name: name}
+    return chosen
 
 
-def measure(arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """A row for each pipeline and pair, those of an earlier run included."""
-    every = [dataset[i] for dataset in sets_of(arguments) for i in range(len(dataset))]
-    pairs = select(every, arguments.limit)
-    kept = Kept(arguments.json)
-    known = list(kept.rows)
-    rows = []
-    for wide in (True, False):
-        same_width = [pair for pair in pairs if (pair.family in WIDE) == wide]
-        for group in by_features(arguments) if same_width else []:
-            pipelines = {name: pipeline for name, (pipeline, _) in group.items()}
-            identity = {name: digest for name, (_, digest) in group.items()}
-            own = [row for row in known if identity.get(row["method"]) == row["identity"]]
-            rows += own
-            done = set.intersection(*({row["pair"] for row in own if row["method"] == name} for name in group))
-            todo = [pair for pair in same_width if pair.identity not in done]
-            batches = [todo[i : i + BATCH] for i in range(0, len(todo), BATCH)]
-            for batch in track(batches, next(iter(pipelines)), console=console):
-                new = list(rows_of(pipelines, batch, arguments.seeds, identity))
-                rows += new
-                kept.add(new)
+def measured(chosen: Mapping[str, str], every: Sequence[ImagePair], arguments: Any, kept: Kept) -> list[Row]:
+    """The rows of pipelines on pairs; those with the same features share their matches and take turns."""
+    rows: list[Row] = []
+    for front, methods in by_front(chosen, arguments):
+        own = every
+        if isinstance(getattr(front.extractor, "extractor", front.extractor), ASIFT):
+            own = select(every, arguments.asift_limit)
+        rows += measure(methods, pairs.items(own, front), arguments.seeds, kept, methods[0].name)
     return rows
 
 
-def by_features(arguments: argparse.Namespace) -> Iterator[dict[str, tuple[Pipeline, str]]]:
-    """The pipelines in groups that share features and matches, by the names that the tables show.
-
-    With each the digest of its options and learned files.
-    """
-    groups: dict[str, dict[str, tuple[Pipeline, str]]] = {}
-    for name in arguments.pipelines:
-        preset, *own = name.split()
-        overrides = [*own, *arguments.overrides]
-        pipeline = pipeline_of(preset, f"cache={arguments.cache}", *overrides)
-        extractor = pipeline.extractor
-        features = extractor.extractor if isinstance(extractor, CachedFeatures) else extractor
-        made_with = {"features": configuration(features), "stages": presets.pipeline_stages(preset),
-                     "overrides": overrides, "seeds": arguments.seeds}  # fmt: skip
-        label = name + arguments.label
-        groups.setdefault(features_of(name), {})[label] = pipeline, identity_digest(made_with)[:16]
+def by_front(chosen: Mapping[str, str], arguments: argparse.Namespace) -> Iterator[tuple[Pipeline, list[Method]]]:
+    """What makes matches, and the methods that start from these."""
+    groups: dict[str, tuple[Pipeline, list[Method]]] = {}
+    for name, words in chosen.items():
+        made, pipeline, front = pipeline_method(
+            name + arguments.label, words, f"cache={arguments.cache}", *arguments.overrides
+        )
+        if front not in groups:
+            shared = Pipeline(pipeline.extractor, pipeline.matcher, {}, pairs.no_estimator, model=None)
+            groups[front] = shared, []
+        groups[front][1].append(made)
     yield from groups.values()
 
 
-def rows_of(
-    pipelines: dict[str, Pipeline], batch: Sequence[ImagePair], seeds: int, identity: dict[str, str]
-) -> Iterator[dict[str, Any]]:
-    """A row for each pipeline and pair, with a list over seeds for each figure.
+class Rule(Measured):
+    """Whether the paper's rule would select a pair, as a method."""
 
-    All have the pruners of the shortest of them, whose matches are shared.
-    """
-    front = min(pipelines.values(), key=lambda p: len(p.pruners))
-    matched = front.correspondences(batch)
-    for name, pipeline in pipelines.items():
-        outcomes: list[Outcome] = []
-        for outcome in matched:
-            stages = pipeline.pruners_of(outcome.pair.family)
-            own = [stage for key, stage in stages.items() if key not in front.pruners]
-            outcomes.append(pruned_by(outcome, own, pipeline))
-        runs = [evaluate(pipeline.estimate(outcomes, seed), seed) for seed in range(seeds)]
-        for same in zip(*runs, strict=True):
-            row = {field: getattr(same[0], field) for field in ("pair", "family", "scene", "features0", "features1")}
-            figures = {field: [getattr(r, field) for r in same] for field in FIGURES}
-            yield {"method": name, "identity": identity[name], **row, **figures}
+    name, identity = RULE, ""
+
+    def __init__(self) -> None:
+        self._keypoints = functools.lru_cache(maxsize=64)(lambda path: keypoints(to_grey(read_image(path))))
+
+    def figures(self, item: Item, seed: int) -> Row:
+        a, b = (self._keypoints(image) for image in (item.pair.image0, item.pair.image1))
+        return {"selected": bool(matchable(a, b, item.pair.F))}
+
+
+def judged_by_rule(every: Sequence[ImagePair], kept: Kept) -> list[Row]:
+    """A row for each pair that says whether the paper's rule selects it."""
+    return measure([Rule()], [Item(pair, functools.partial(Outcome, pair)) for pair in every], 1, kept, RULE)
+
+
+def figures_sheet(results: Results, settings: Mapping[str, Any], selected: set[str]) -> Sheet:
+    """Each set's figures, beside the paper's; recall apart for pairs that the paper's rule selects and leaves out."""
+    paper = published(FOLDER / settings["published"] if "published" in settings else None)
+    groups = results.groups(results.all_pairs)
+    groups.pop("all", None)
+    records = results.records(
+        groups, settings["columns"], label="pipeline", intervals=True,
+        minus=settings.get("minus", ()), against=settings.get("against"),
+    )  # fmt: skip
+    for record in records:
+        own = [pair for pair in groups[record["set"]] if pair in results.pairs(record["pipeline"])]
+        if settings.get("rule"):
+            for head, inside in (("selected", True), ("left out", False)):
+                apart = [pair for pair in own if (pair in selected) == inside]
+                record[f"%Recall, {head}"] = results.cell(record["pipeline"], apart, "R.05")
+        if theirs := _papers(paper, settings, record["set"], record["pipeline"]):
+            record |= {
+                "paper's set": KIN[record["set"]],
+                **{f"paper: {c}": theirs[field] for c, field in PAPER.items()},
+            }
+    title = f"{settings['about']}: {results.described(results.all_pairs)}"
+    return Sheet("", title, records)
+
+
+def _papers(paper: Published, settings: Mapping[str, Any], family: str, name: str) -> dict[str, str]:
+    """The paper's figures of a pipeline, by its name or words, on its set of the same kind of motion."""
+    words = settings["methods"].get(name, name).replace(" features=sift_vlfeat", "")
+    kin = KIN.get(family, "")
+    return paper.get((kin, name)) or paper.get((kin, words)) or {}
+
+
+def differences_sheet(results: Results, settings: Mapping[str, Any]) -> Sheet:
+    """What one pipeline has more than another on the pairs that both have, of each set."""
+    paper = published(FOLDER / settings["published"] if "published" in settings else None)
+    two = [
+        (first, second) for first, second in settings.get("differences", []) if {first, second} <= set(results.methods)
+    ]
+    labelled = [(name, base) for name in results.methods for base in results.methods if name.startswith(f"{base} ")]
+    records = []
+    for group, every in results.groups(results.all_pairs).items():
+        for first, second in [*two, *(pair for pair in labelled if pair not in two)]:
+            common = [pair for pair in results.pairs(first, second) if pair in set(every)]
+            if not common:
+                continue
+            line: Record = {"set": group, "pairs": len(common), "pipeline": first, "minus": second}
+            for name in settings.get("compared", ("%Recall", "AUC@0.05")):
+                line[name] = results.difference(first, second, common, name)
+            theirs = [_papers(paper, settings, group, name) for name in (first, second)]
+            if all(theirs):
+                line["paper: %Recall"] = f"{float(theirs[0]['recall']) - float(theirs[1]['recall']):+.1f}"
+            records.append(line)
+    return Sheet("differences", "Paired differences, in points", records)

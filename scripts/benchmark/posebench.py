@@ -2,201 +2,281 @@
 
 FILES is the folder `relative` of its data, or one file of it; --root judges pairs in FM-Bench's layout in the same way,
 by SIFT matches and --threshold. Of each pair the error is the larger of the angles of rotation and of translation,
-whose sign counts; of a fundamental matrix the best of its four poses is taken. AUC at 5, 10 and 20 degrees, and means
-over the sets; intervals of differences are over scenes, or over pairs of fewer than ten. Each set has its threshold;
-at most 1,000 samples, at least 100. Sets of other names need --threshold; pairs whose cameras have distortion
-(fisheye_*) are left out and counted.
+whose sign counts; of a fundamental matrix the best of its four poses is taken. Each set has its threshold; samples are
+100 to 1,000. Sets of other names need --threshold; pairs whose cameras have distortion are left out.
 
 python -m scripts.benchmark posebench FILES
-python -m scripts.benchmark posebench --root DATA/Strecha --root DATA/KITTI --threshold 1
 python -m scripts.benchmark posebench FILES --every 10 --methods E:fmtorch E:fmtorch:scaled=false E:poselib E:colmap
-
---rows is appended to pair by pair: started again, the command measures what is missing.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
+import dataclasses
+import functools
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from rich.progress import track
 
-from fmtorch import metrics, presets
+import fmtorch
+from fmtorch import data, metrics, presets
+from fmtorch.core.types import Correspondences
 from fmtorch.data import DataError, ImagePair
-from fmtorch.evaluation.statistics import MIN_UNITS, PERCENT, difference
-from scripts.benchmark import matched, sheet
-from scripts.benchmark import posebench_methods as methods_of
-from scripts.benchmark.kept import Kept, Row
-from scripts.benchmark.matched import console
-from scripts.benchmark.posebench_sets import THRESHOLDS, Figures, Set, read_published, sets_of
-from scripts.benchmark.sheet import MISSING, Sheet, put
+from fmtorch.evaluation.statistics import MIN_UNITS, PERCENT, POSE_THRESHOLDS, difference
+from fmtorch.io import h5
+from fmtorch.pipeline.pipeline import Outcome
+from fmtorch.presets.objects import merged
+from scripts.benchmark import pairs
+from scripts.benchmark.cameras import has_cameras
+from scripts.benchmark.methods import options
+from scripts.benchmark.runner import Item, Kept, Measured, Row, add_command, console, identity, judged, measure
+from scripts.benchmark.tables import FIGURES, Record, Results, Sheet, Span, show, span
 
 METHODS = ("E:fmtorch", "E:poselib", "E:colmap", "F:fmtorch", "F:poselib", "F:colmap")
-MISSED = {"rotation": 180.0, "translation": 180.0}
+KINDS = ("E", "F")  # a relative pose of known cameras; a fundamental matrix, of whose four poses the best one counts
+MAX_ITERATIONS, MIN_ITERATIONS, CONFIDENCE = 1000, 100, 0.9999
+FOCAL_SAMPLES = 250  # of a round of our search with focal lengths
+IN_PIXELS = ("threshold", "inlier_threshold", "scale")  # options of our presets that are distances
+PUBLISHED = Path(__file__).with_name("posebench.csv")  # PoseLib 2.0.5; results/baseline.2_0_5.json there
+Published = dict[str, dict[str, dict[str, float]]]  # method -> data set -> column -> per cent
 
 
 def add_arguments(commands: Any) -> None:
-    parser = commands.add_parser("posebench", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = add_command(commands, "posebench", run, __doc__, seeds=1)
     parser.add_argument("files", nargs="?", type=Path, help="the folder `relative` of PoseBench's data, or one file")
-    matched.add_arguments(parser)
+    pairs.add_match_options(parser)
     parser.add_argument("--methods", nargs="+", default=METHODS, help="KIND:PRESET[:KEY=VALUE,...], KIND being E or F")
     parser.add_argument("--threshold", type=float, help="px, of sets that are not PoseBench's")
     parser.add_argument("--every", type=int, default=1, help="every so many-th pair of each set; the protocol has all")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--rows", type=Path, help="keep what each method makes of each pair here, one line each")
-    parser.add_argument("--markdown", type=Path, help="put the tables between the marks `posebench` of this file")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> None:
-    torch.set_num_threads(1)
-    published = read_published()
-    arguments.methods = installed(arguments.methods)
-    rows: dict[str, list[Row]] = {}
+    thresholds, published = read_published()
+    methods = installed(arguments.methods)
     kept = Kept(arguments.rows)
-    for each in sets_of(arguments, published[0]):
-        set_rows = measured(each, arguments, kept)
-        if set_rows:
-            rows[each.name] = set_rows
+    rows: list[Row] = []
+    for name, items, digest in sets_of(arguments, thresholds):
+        chosen = items[:: arguments.every]
+        usable = [item for item in chosen if item.pair.problem is None]
+        own = measure([dataclasses.replace(each, matches=digest) for each in methods], usable, arguments.seeds, kept)
+        say_what_is_missing(name, chosen, own)
+        rows += [{**row, "family": name} for row in own]
     if not rows:
         raise SystemExit("no pair of pinhole cameras")
-    tables = sheets(rows, arguments.methods, published)
-    for table in tables:
-        console.print(table.terminal())
-    if arguments.markdown is not None:
-        put(arguments.markdown, tables, "posebench")
+    show([sheet(rows, thresholds, published)], arguments.table)
 
 
-def installed(methods: Sequence[str]) -> list[str]:
+def sets_of(arguments: argparse.Namespace, thresholds: Mapping[str, float]) -> Iterator[tuple[str, list[Item], str]]:
+    """Name, pairs and digest of the sets that are asked for. SystemExit where there are none, or for no threshold."""
+    if arguments.files is None and not pairs.named(arguments):
+        raise SystemExit("name FILES, the folder `relative` of PoseBench's data, or --root DATA")
+    if arguments.files is not None:
+        yield from _files(arguments.files, thresholds, arguments.threshold)
+    if pairs.named(arguments):
+        if arguments.threshold is None:
+            raise SystemExit("--root: give the threshold in pixels, --threshold PX")
+        families: dict[str, list[Item]] = {}
+        for item in pairs.matched(arguments):
+            if has_cameras(item.pair):  # by their families, with points alone, as PoseBench has them
+                own = Item(item.pair, functools.partial(_points_of, item), {"threshold": arguments.threshold})
+                families.setdefault(item.pair.family, []).append(own)
+        digest = pairs.matches_identity(arguments)
+        yield from ((name, items, digest) for name, items in families.items())
+
+
+def _points_of(item: Item) -> Outcome | None:
+    if item.outcome is None or item.outcome.correspondences is None:
+        return item.outcome
+    c = item.matches
+    plain = Correspondences(c.x0, c.x1, c.mask, size0=c.size0, size1=c.size1, key=c.key)
+    return dataclasses.replace(item.outcome, correspondences=plain)
+
+
+def _files(
+    folder: Path, thresholds: Mapping[str, float], threshold: float | None
+) -> Iterator[tuple[str, list[Item], str]]:
+    root = folder / "relative" if (folder / "relative").is_dir() else folder
+    try:
+        given = {path: thresholds.get(path.stem, threshold) for path in h5.files(root)}
+        for path, px in given.items():
+            if px is None and not path.stem.startswith("fisheye_"):
+                raise SystemExit(f"{path.name} is none of PoseBench's sets: give its threshold in pixels, --threshold")
+            if px is not None:
+                dataset = data.load("h5", root=path, layout="posebench")
+                items = [Item(p, functools.partial(_given, p), {"threshold": px}) for p in dataset]
+                yield path.stem, items, dataset.digest
+    except DataError as error:
+        raise SystemExit(f"{error}; give the folder `relative` of PoseBench's data") from error
+
+
+def _given(pair: ImagePair) -> Outcome:
+    assert pair.matches is not None
+    try:
+        c, counts = pair.matches()
+    except (ValueError, DataError) as error:
+        return Outcome(pair, reason=str(error))
+    return Outcome(pair, counts, c)
+
+
+@dataclasses.dataclass(frozen=True)
+class Protocol(Measured):
+    """An estimator by PoseBench's protocol. changes: options that replace the protocol's; matches: their digest."""
+
+    name: str
+    kind: str
+    preset: str
+    changes: dict[str, Any]
+    matches: str = ""
+
+    @classmethod
+    def of(cls, text: str) -> Protocol:
+        """``KIND:PRESET[:KEY=VALUE,...]``. Raises SystemExit for anything else."""
+        kind, _, rest = text.partition(":")
+        preset, _, settings = rest.partition(":")
+        if kind not in KINDS or preset not in presets.available("estimator"):
+            raise SystemExit(f"{text}: write KIND:PRESET[:KEY=VALUE,...], KIND being E or F, PRESET of `fmtorch list`")
+        return cls(text, kind, preset, options(settings))
+
+    @functools.cached_property
+    def identity(self) -> str:  # type: ignore[override]
+        """Of its options at 1 px, code, and versions of peers."""
+        return identity([("estimator", self.preset, self.options(1.0))], self.name, self.matches)
+
+    def options(self, threshold: float) -> dict[str, Any]:
+        """The options of a data set whose threshold is so many pixels.
+
+        At most 1,000 samples, at least 100, confidence 0.9999. A peer gets the threshold. Our presets, whose distances
+        are of matches that are exact to about a pixel, get them times the threshold, unless ``scaled=false``.
+        """
+        changes = dict(self.changes)
+        scaled = changes.pop("scaled", True)
+        preset = presets.load("estimator", self.preset)
+        if "hypotheses" in preset:  # one of ours
+            own = _distances(preset, threshold) if scaled else {}
+            own |= {"hypotheses": MAX_ITERATIONS, "confidence": CONFIDENCE}
+            if preset.get("focal"):
+                own["focal"] = {**own.get("focal", {}), "rounds": MAX_ITERATIONS // FOCAL_SAMPLES}
+        else:
+            known = {"threshold": threshold, "iterations": MAX_ITERATIONS, "min_iterations": MIN_ITERATIONS}
+            known |= {"confidence": CONFIDENCE, "two_view": False}
+            own = {name: value for name, value in known.items() if name in preset}
+        return merged(own, changes)
+
+    def figures(self, item: Item, seed: int) -> Row:
+        """What it makes of a pair: signed angles in degrees, 180 where it has no pose, and milliseconds."""
+        matched, pair = item.outcome, item.pair
+        assert matched is not None
+        c = matched.correspondences
+        start = time.process_time()
+        if c is not None:
+            given: dict[str, Any] = {"mask": c.mask, "size0": c.size0, "size1": c.size1, "key": pair.key, "seed": seed}
+            given |= {"estimator": self.preset, **self.options(item.facts["threshold"])}
+            try:
+                if self.kind == "E":
+                    estimate = fmtorch.find_essential(c.x0, c.x1, pair.K0, pair.K1, **given)  # type: ignore[arg-type]
+                else:
+                    estimate = fmtorch.find_fundamental(c.x0, c.x1, **given)
+                matched = dataclasses.replace(matched, estimate=estimate, reason=estimate.reason[0])
+            except ValueError as error:
+                matched = Outcome(pair, reason=str(error))
+        ms = 1e3 * (time.process_time() - start)
+        return {**judged(matched, seed, signed=True), "ms": ms}
+
+
+def _distances(preset: Mapping[str, Any], scale: float) -> dict[str, Any]:
+    """The distances within a preset, at any depth, times `scale`."""
+    levels = {key: _distances(value, scale) for key, value in preset.items() if isinstance(value, Mapping)}
+    own = {key: value * scale for key, value in preset.items() if key in IN_PIXELS and value is not None}
+    return {**{key: inside for key, inside in levels.items() if inside}, **own}
+
+
+def installed(words: Sequence[str]) -> list[Protocol]:
     """The methods whose packages are there; of those that are named, all must be. Raises SystemExit for another."""
     available = []
-    for text in methods:
+    for method in map(Protocol.of, words):
         try:
-            presets.build("estimator", methods_of.read(text).preset)
-            available.append(text)
+            presets.build("estimator", method.preset)
+            available.append(method)
         except ImportError as error:
-            if methods is not METHODS:
-                raise SystemExit(f"{text}: {error}") from error
-            console.print(f"{text} is left out: {error}", style="dim", highlight=False, markup=False)
+            if words is not METHODS:
+                raise SystemExit(f"{method.name}: {error}") from error
+            console.print(f"{method.name} is left out: {error}", highlight=False, markup=False)
     return available
 
 
-def measured(of: Set, arguments: argparse.Namespace, kept: Kept) -> list[Row]:
-    """The rows of a set's pairs by all methods."""
-    pairs = of.pairs[:: arguments.every]
-    usable = [pair for pair in pairs if pair.problem is None]
-    done = kept.by("pair", "seed", "threshold", "method", "identity", "matches")
-    made_with = {text: (text, methods_of.identity(text), of.digest) for text in arguments.methods}
-    rows: list[Row] = []
-    for pair in track(usable, of.name, console=console, transient=True):
-        new = []
-        for text in arguments.methods:
-            row = done.get((pair.identity, arguments.seed, of.threshold, *made_with[text]))
-            if row is None:
-                row = judged(methods_of.read(text), pair, of.threshold, arguments.seed)
-                row |= dict(zip(("method", "identity", "matches"), made_with[text], strict=True))
-                new.append(row)
-            rows.append({**row, "scene": f"{of.name}/{pair.scene}"})
-        kept.add(new)
-    _say_what_is_missing(of, pairs, rows)
-    return rows
-
-
-def judged(method: methods_of.Method, pair: ImagePair, threshold: float, seed: int) -> Row:
-    """What one method makes of a pair: angles in degrees, 180 where it has no pose, and milliseconds."""
-    row: Row = {"pair": pair.identity, "seed": seed, "threshold": threshold, "ms": 0.0, "reason": "", **MISSED}
-    assert pair.matches is not None
-    start = time.process_time()
-    try:
-        c = pair.matches().correspondences
-        start = time.process_time()
-        estimate = methods_of.estimated(method, pair, c, threshold, seed)
-    except (ValueError, DataError) as error:
-        return row | {"reason": str(error), "ms": 1e3 * (time.process_time() - start)}
-    row["ms"] = 1e3 * (time.process_time() - start)
-    if not bool(estimate.ok[0]):
-        return row | {"reason": estimate.reason[0]}
-    angles = methods_of.error(method, estimate, pair)
-    return row | {"rotation": float(angles.rotation), "translation": float(angles.translation)}
-
-
-def _say_what_is_missing(of: Set, pairs: Sequence[ImagePair], rows: list[Row]) -> None:
-    """Pairs that are left out, with the commonest reason, and those that a method has no pose for."""
-    reasons = Counter(pair.problem for pair in pairs if pair.problem is not None)
-    if reasons:
-        left, (reason, _) = sum(reasons.values()), reasons.most_common(1)[0]
-        console.print(f"{of.name}: {left} of {len(pairs)} pairs left out: {reason}", style="dim", highlight=False)
-    failed = Counter(row["method"] for row in rows if row["reason"])
-    for method, count in failed.items():
+def say_what_is_missing(name: str, items: Sequence[Item], rows: Sequence[Row]) -> None:
+    """Pairs that are left out, with a reason, and how many a method has no pose for."""
+    problems = [item.pair.problem for item in items if item.pair.problem is not None]
+    if problems:
+        console.print(f"{name}: {len(problems)} of {len(items)} pairs left out: {problems[0]}", highlight=False)
+    for method, count in Counter(row["method"] for row in rows if row["reason"]).items():
         reason = next(row["reason"] for row in rows if row["method"] == method and row["reason"])
-        console.print(f"{of.name}, {method}: {count} misses, such as: {reason}", style="dim", highlight=False)
+        console.print(f"{name}, {method}: {count} misses, such as: {reason}", highlight=False)
 
 
-def sheets(
-    rows: dict[str, list[Row]], methods: Sequence[str], published: tuple[dict[str, float], Figures]
-) -> tuple[Sheet, Sheet]:
-    """Means over the sets, and the figures of each set, with published ones, also of methods that were not run."""
-    thresholds, theirs = published
-    own = {m: {name: [row for row in of if row["method"] == m] for name, of in rows.items()} for m in methods}
-    known = [name for name in rows if name in thresholds]
-    others = [method for method in theirs if method not in methods and known]
-    overall, each = [], []
-    for method in (*methods, *others):
-        of_sets = own.get(method, {})
-        ours = mean([areas(of) for of in of_sets.values()]) if of_sets else None
-        said = mean([theirs[method][name] for name in rows]) if method in theirs and len(known) == len(rows) else None
-        ms = f"{np.median([row['ms'] for of in of_sets.values() for row in of]):.1f}" if of_sets else MISSING
-        overall.append([method, shown(ours), shown(said), lead(own, method), ms])
-    for name in rows:
-        px = f"{rows[name][0]['threshold']:g}"
-        for method in (*methods, *(others if name in known else ())):
-            of = own.get(method, {}).get(name)
-            stated = shown(theirs.get(method, {}).get(name))
-            each.append([name, method, px, *([str(len(of)), shown(areas(of))] if of else [MISSING] * 2), stated])
-    count = sum(len(of) for of in own[methods[0]].values())
-    part = f", {len(known)} of PoseBench's {len(thresholds)}" if known else ""
-    title = f"PoseBench's protocol: means of {len(rows)} set{'s' * (len(rows) != 1)}{part}; {count:,} pairs"
-    heading = "AUC@5/10/20°, signed"
-    return (
-        Sheet(title, ["method", heading, "published", "first of its kind minus this, @5°", "ms, median"], overall),
-        Sheet("Each set", ["set", "method", "px", "pairs", heading, "published"], each),
-    )
+def read_published() -> tuple[dict[str, float], Published]:
+    """The threshold of each of PoseBench's sets in pixels, and its published figures."""
+    thresholds: dict[str, float] = {}
+    figures: Published = {}
+    with PUBLISHED.open(encoding="utf-8") as file:
+        for line in csv.DictReader(file):
+            thresholds[line["dataset"]] = float(line["threshold"])
+            areas = {f"published: AUC@{t}": float(line[f"auc{t}"]) for t in POSE_THRESHOLDS}
+            figures.setdefault(line["method"], {})[line["dataset"]] = areas
+    return thresholds, figures
 
 
-def lead(own: dict[str, dict[str, list[Row]]], method: str) -> str:
-    """AUC@5 of the first method of a kind minus that of another, every set counting alike, with its 95 % interval."""
-    first = next((name for name in own if name[0] == method[0]), method)
-    if method == first or method not in own:
-        return ""
-    scenes = [row["scene"] for of in own[method].values() for row in of]
-    if len(set(scenes)) < MIN_UNITS:
-        scenes = [str(i) for i in range(len(scenes))]
-    share = np.concatenate([np.full(len(of), len(scenes) / len(own[method]) / len(of)) for of in own[method].values()])
-    a, b = (share * np.array([_below(row) for of in own[name].values() for row in of]) for name in (first, method))
-    return sheet.shown(difference(a, b, scenes, PERCENT), "+.1f")
+def sheet(rows: Sequence[Row], thresholds: Mapping[str, float], published: Published) -> Sheet:
+    """Means over the sets, then each set, with published figures, also of methods that were not run."""
+    results = Results(rows)
+    sets = {name: own for name, own in results.groups(results.all_pairs).items() if name in results.families}
+    theirs = {m: {name: of[name] for name in sets if name in of} for m, of in published.items()}
+    methods = [*results.methods, *(m for m, of in theirs.items() if of and m not in results.methods)]
+    each: dict[tuple[str, str], Record] = {}
+    for name, own in sets.items():
+        for m in methods:
+            measured = areas(results, m, own) if m in results.methods else {}
+            each[name, m] = {**measured, **theirs.get(m, {}).get(name, {})}
+    records: list[Record] = []
+    for m in methods:
+        of_sets = [each[name, m] for name in sets]
+        heads = [head for head in of_sets[0] if all(head in of for of in of_sets)]
+        line: Record = {"set": "mean of the sets", "method": m}
+        line |= {head: f"{np.mean([of[head] for of in of_sets]):.1f}" for head in heads}
+        line["first of its kind minus this: AUC@5"] = lead(results, sets, m)
+        line["ms"] = results.cell(m, results.pairs(m), "ms") if m in results.methods else ""
+        records.append(line)
+    for (name, m), cells in each.items():
+        count = len([pair for pair in sets[name] if pair in results.pairs(m)]) if m in results.methods else ""
+        line = {"set": name, "method": m, "px": f"{thresholds.get(name, rows[0]['threshold']):g}", "pairs": count}
+        records.append(line | {head: f"{value:.1f}" for head, value in cells.items()})
+    title = f"PoseBench's protocol: {len(sets)} sets, {len(set(sets) & set(thresholds))} of its {len(thresholds)}"
+    return Sheet("poses", f"{title}; {len(results.all_pairs):,} pairs; signed angles, in %", records)
 
 
-def _below(row: Row) -> float:
-    """The share of thresholds up to 5 degrees above the error."""
-    error: float = max(row["rotation"], row["translation"])
-    return max(0.0, 1 - error / THRESHOLDS[0])
-
-
-def areas(rows: list[Row]) -> tuple[float, ...]:
+def areas(results: Results, method: str, own: Sequence[str]) -> dict[str, float]:
     """AUC in per cent at each of the thresholds."""
-    worst = torch.tensor([max(row["rotation"], row["translation"]) for row in rows], dtype=torch.float64)
-    return tuple((100 * metrics.pose_auc(worst, THRESHOLDS)).tolist())
+    get = results.get(method, own)
+    worst = torch.from_numpy(np.maximum(get("rotation_error"), get("translation_error")))
+    of_seeds = metrics.pose_auc(worst, POSE_THRESHOLDS).mean(0).tolist()
+    return {f"AUC@{t}": PERCENT * value for t, value in zip(POSE_THRESHOLDS, of_seeds, strict=True)}
 
 
-def mean(figures: list[tuple[float, ...]]) -> tuple[float, ...]:
-    return tuple(np.mean(figures, 0).tolist())
-
-
-def shown(figures: tuple[float, ...] | None) -> str:
-    return MISSING if figures is None else " / ".join(f"{value:.1f}" for value in figures)
+def lead(results: Results, sets: Mapping[str, Sequence[str]], method: str) -> Span | str:
+    """AUC@5 of the first method of a kind minus that of another, every set counting alike, with its 95 % interval."""
+    first = next((name for name in results.methods if name[0] == method[0]), method)
+    if method == first or method not in results.methods:
+        return ""
+    every = [pair for own in sets.values() for pair in own]
+    scenes = results.scenes(every)
+    if len(set(scenes)) < MIN_UNITS:
+        scenes = every
+    share = np.concatenate([np.full(len(own), len(every) / len(sets) / len(own)) for own in sets.values()])
+    a, b = (share * FIGURES["pose@5"].of(results.get(name, every)) for name in (first, method))
+    return span(difference(a, b, scenes, PERCENT), "+.1f")

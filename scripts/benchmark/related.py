@@ -1,166 +1,187 @@
 """The verdict on pairs of one scene and of different scenes: shares accepted and rejected, and ROC.
 
-python -m scripts.benchmark related --root DATA/Strecha --root DATA/PhotoTourism --root DATA/KITTI --root DATA/TUM \
-    --folder related/test --update docs/appendix/related.md
-python -m scripts.benchmark related --folder related/test --update docs/appendix/related.md \
-    --figure docs/appendix/related.svg
+python -m scripts.benchmark related --root DATA/Strecha --root DATA/PhotoTourism --root DATA/KITTI --root DATA/TUM \\
+    --rows related.jsonl --table docs/tables/related.csv --figure docs/concepts/related.svg
+python -m scripts.benchmark related --rows related.jsonl
 
-The second line shows what the folder holds. It keeps features, matches and rows: started again, the command goes on
-where it was interrupted. Take another folder for other code or other options.
+The second line shows what the file holds: rows are kept pair by pair, and the command goes on where it was interrupted.
 """
 
 from __future__ import annotations
 
 import argparse
-import hashlib
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-import pyarrow.parquet as pq
-import torch
-from rich.progress import track
+import numpy as np
+from numpy.typing import NDArray
 
-from fmtorch import metrics
-from fmtorch.core.files import replacing
-from fmtorch.core.stages import pruned
-from fmtorch.core.types import Correspondences, collate
-from fmtorch.data import ImagePair
-from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.pipeline import Pipeline
-from scripts.benchmark import related_figure, related_table
-from scripts.benchmark.estimators_table import replaced
-from scripts.benchmark.matched import add_set_arguments, console, sets_of
-from scripts.benchmark.related_pairs import UNRELATED, in_order, unrelated_pairs
-from scripts.benchmark.specs import features_of, pipeline_of
+from fmtorch.core.types import RELATED
+from fmtorch.evaluation.statistics import share_interval
+from scripts.benchmark import figures, pairs
+from scripts.benchmark.pipelines import add_pipeline_options, chosen_pipelines, measured, settings_of
+from scripts.benchmark.runner import Kept, Row, add_command
+from scripts.benchmark.tables import Record, Sheet, Span, show
 
-PIPELINES = [
-    "sift_fmtorch", "sift_gms", "sift_ratio estimator=lmeds_eight_point", "hardnet_fmtorch", "hesaffnet_fmtorch",
-    "hesaffnet_gms",
-]  # fmt: skip
-SHARED = ("ratio", "one_to_one")  # pruners that come first in all of them: matches are kept behind these
-BATCH = 32  # pairs that are kept together
-FIELDS = ("x0", "x1", "mask", "quality", "lafs0", "lafs1", "size0", "size1", "key")
+RIGHT = 0.05  # NSGD below which an estimate of a related pair is right
+LEVELS = (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 5.0, 8.0)
+Rows = dict[str, list[Row]]  # by pipeline
 
 
 def add_arguments(commands: Any) -> None:
-    parser = commands.add_parser("related", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add_set_arguments(parser, "related pairs of each family at most, chosen by hash; others are of their photographs")
-    parser.add_argument(
-        "--pipelines", nargs="*", default=PIPELINES, help="PRESET of conf/pipeline, or 'PRESET NAME=VALUE ...'"
-    )
+    parser = add_command(commands, "related", run, __doc__, seeds=1)
+    pairs.add_set_options(parser)
     parser.add_argument("--unrelated", type=int, default=300, help="pairs of each two scenes at most, chosen by hash")
-    parser.add_argument("--folder", type=Path, default=Path("related"), help="keeps features, matches and rows")
-    parser.add_argument("--update", type=Path, help="put the tables between the marks of this file")
+    add_pipeline_options(parser)
     parser.add_argument("--figure", type=Path, help="draw the ROC curves here, as SVG")
-    parser.add_argument("--marker", default="related", help="which marks: <!-- MARKER --> and <!-- end MARKER -->")
-    parser.set_defaults(run=run)
+    parser.set_defaults(asift_limit=None)
 
 
 def run(arguments: argparse.Namespace) -> None:
-    torch.set_num_threads(1)
-    if arguments.root or arguments.rendered:
-        pairs = chosen_pairs(arguments)
-        unrelated = sum(pair.family.startswith(UNRELATED) for pair in pairs)
-        console.print(f"{len(pairs) - unrelated} related pairs, {unrelated} unrelated ones")
-        for feature in dict.fromkeys(map(features_of, arguments.pipelines)):
-            names = [name for name in arguments.pipelines if features_of(name) == feature]
-            for name, batch, c in matches(feature, pairs, arguments.folder):
-                for pipeline in names:
-                    judge(pipeline, name, batch, c, arguments.folder)
-    rows = read(arguments.folder, arguments.pipelines)
-    text = related_table.text(rows)
-    console.print(text, markup=False)
-    if arguments.update and not replaced(arguments.update, arguments.marker, text):
-        raise SystemExit(f"{arguments.update} has no lines <!-- {arguments.marker} --> and <!-- end ... -->")
+    kept = Kept(arguments.rows)
+    rows = kept.rows
+    if pairs.named(arguments):
+        related = [pair for pair in pairs.pairs_of(arguments) if pair.problem is None]
+        unrelated = pairs.unrelated_pairs(related, pairs.sets_of(arguments), arguments.unrelated)
+        every = sorted([*related, *unrelated], key=lambda p: (p.family, p.scene, p.image0.identity, p.image1.identity))
+        chosen = chosen_pipelines(settings_of("related")["methods"], arguments.pipelines)
+        rows = measured(chosen, every, arguments, kept)
+    if not rows:
+        raise SystemExit("nothing to show: name sets with --root or --rendered, or a file of earlier --rows")
+    by_method = by_pipeline(rows)
+    show([rates_sheet(by_method), levels_sheet(by_method), sets_sheet(by_method)], arguments.table)
     if arguments.figure:
-        related_figure.draw(rows, arguments.figure)
+        draw(by_method, arguments.figure)
 
 
-def chosen_pairs(arguments: argparse.Namespace) -> list[ImagePair]:
-    """The related pairs of the data sets, and unrelated ones across their scenes."""
-    datasets = sets_of(arguments)
-    related: dict[str, list[ImagePair]] = {}
-    for pair in sorted((d[i] for d in datasets for i in range(len(d))), key=lambda pair: pair.key):
-        if pair.problem is None:
-            related.setdefault(pair.family, []).append(pair)
-    chosen = [pair for family in related.values() for pair in family[: arguments.limit]]
-    return in_order([*chosen, *unrelated_pairs(chosen, datasets, arguments.unrelated)])
+def by_pipeline(rows: Sequence[Row]) -> Rows:
+    """The rows of each pipeline, of equals the last."""
+    newest = {(row["method"], row["pair"]): row for row in rows}
+    return {
+        name: [row for row in newest.values() if row["method"] == name] for name in dict.fromkeys(m for m, _ in newest)
+    }
 
 
-def batches(pairs: Sequence[ImagePair]) -> Iterator[tuple[str, list[ImagePair]]]:
-    """The pairs in batches, each with a name that tells which pairs these are."""
-    for start in range(0, len(pairs), BATCH):
-        batch = list(pairs[start : start + BATCH])
-        yield hashlib.blake2b("\n".join(p.identity for p in batch).encode(), digest_size=8).hexdigest(), batch
+def true(row: Row) -> bool:
+    """Whether the photographs are of one scene."""
+    return not row["family"].startswith(pairs.UNRELATED)
 
 
-def matches(
-    feature: str, pairs: Sequence[ImagePair], folder: Path
-) -> Iterator[tuple[str, list[ImagePair], Correspondences]]:
-    """Each batch of pairs with its name and its matches after `SHARED`, computed where the folder does not have them.
-
-    A pair whose images have no features has an empty mask.
-    """
-    front: Pipeline = load_pipeline(f"{feature}_ratio", overrides=[f"cache={folder / 'features'}"])
-    assert tuple(front.pruners) == SHARED
-    kept = folder / "matches" / feature
-    kept.mkdir(parents=True, exist_ok=True)
-    for name, batch in track(list(batches(pairs)), feature, console=console):
-        path = kept / f"{name}.pt"
-        if not path.exists():
-            matched = [outcome.correspondences or _nothing(outcome.pair) for outcome in front.correspondences(batch)]
-            fields = {name: getattr(collate([_slim(c) for c in matched]), name) for name in FIELDS}
-            with replacing(path) as temporary:
-                torch.save(fields, temporary)
-        yield name, batch, Correspondences(**torch.load(path))
+def significance(row: Row) -> float:
+    """How far the support of a pair's F is beyond chance; least where there is no F."""
+    return -math.inf if row["significance"] is None else float(row["significance"])
 
 
-def _slim(c: Correspondences) -> Correspondences:
-    return Correspondences(**{name: getattr(c, name) for name in FIELDS}).compact()
+def inliers(row: Row) -> float:
+    """The number of inliers of a pair, 0 where there is no F."""
+    return float(row["corrs"] * row["ok"])
 
 
-def _nothing(pair: ImagePair) -> Correspondences:
-    points, frames = torch.zeros(1, 0, 2), torch.zeros(1, 0, 2, 3)
-    size = torch.ones(1, 2, dtype=torch.int64)
-    return Correspondences(
-        points, points, torch.zeros(1, 0, dtype=torch.bool), quality=points[..., 0], lafs0=frames, lafs1=frames,
-        size0=size, size1=size, key=torch.tensor([pair.key]),
-    )  # fmt: skip
+def called_related(row: Row) -> bool:
+    """The verdict."""
+    return significance(row) >= RELATED
 
 
-def judge(name: str, batch: str, pairs: Sequence[ImagePair], c: Correspondences, folder: Path) -> None:
-    """Write a row for each pair of a batch, unless it is there: what a pipeline makes of it from its matches on."""
-    path = folder / "rows" / name / f"{batch}.parquet"
-    if path.exists():
-        return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    pipeline = pipeline_of(name)
-    for pruner in [stage for key, stage in pipeline.pruners.items() if key not in SHARED]:
-        c = pruned(pruner, c, lambda i: pipeline.images(pairs[i])).compact()
-    estimate = pipeline.estimator(c, 0).detach()
-    significance = estimate.significance
-    assert significance is not None
-    assert c.size0 is not None
-    assert c.size1 is not None
-    F = torch.stack([torch.from_numpy(pair.F) for pair in pairs])
-    true = F.flatten(1).any(1)
-    error = torch.where(true & estimate.ok, metrics.nsgd(F, estimate.F, c.size0, c.size1, key=c.keys), 1.0)
-    columns = {
-        "pair": [pair.identity for pair in pairs], "family": [pair.family for pair in pairs],
-        "scene": [pair.scene for pair in pairs], "true": true.tolist(), "ok": estimate.ok.tolist(),
-        "nsgd": error.tolist(), "significance": significance.tolist(),
-        "inliers": estimate.inliers.sum(1).tolist(), "matches": c.count().tolist(),
-    }  # fmt: skip
-    with replacing(path) as temporary:
-        pq.write_table(pa.table(columns), temporary)
+RULES: dict[str, Callable[[Row], bool]] = {
+    "COLMAP's rule": lambda row: inliers(row) >= max(15, 0.25 * row["corrs_before"]),
+    "15 inliers": lambda row: inliers(row) >= 15,
+    "20 inliers": lambda row: inliers(row) >= 20,
+}
+"""What others accept a pair by. COLMAP's default: 15 inliers that are a quarter of the matches."""
 
 
-def read(folder: Path, pipelines: Sequence[str]) -> dict[str, list[related_table.Row]]:
-    """The rows of each pipeline that has some, one a pair."""
-    rows: dict[str, list[related_table.Row]] = {}
-    for name in pipelines:
-        for path in sorted((folder / "rows" / name).glob("*.parquet")):
-            rows.setdefault(name, []).extend(pq.read_table(path).to_pylist())
-    return {name: list({row["pair"]: row for row in own}.values()) for name, own in rows.items()}
+def split(rows: Sequence[Row]) -> tuple[list[Row], list[Row]]:
+    """The unrelated pairs, and the related ones whose estimate is right."""
+    return [r for r in rows if not true(r)], [r for r in rows if true(r) and r["nsgd"] < RIGHT]
+
+
+def rates_sheet(rows: Rows) -> Sheet:
+    """Each rule: the share of unrelated pairs that it accepts, and of right estimates that it rejects."""
+    records: list[Record] = []
+    for name, own in rows.items():
+        unrelated, right = split(own)
+        line: Record = {"pipeline": name, "unrelated pairs": len(unrelated), "right pairs": len(right)}
+        line["unrelated pairs with an F, %"] = percent([bool(r["ok"]) for r in unrelated])
+        line["accepted, %"] = share(unrelated, called_related)
+        line["rejected, %"] = share(right, lambda row: not called_related(row))
+        for rule, accepts in RULES.items():
+            line[f"{rule}: accepted, %"] = percent([accepts(r) for r in unrelated])
+            line[f"{rule}: rejected, %"] = percent([not accepts(r) for r in right])
+        line |= {
+            "area": f"{area(right, unrelated, significance):.5f}",
+            "area by inliers": f"{area(right, unrelated, inliers):.5f}",
+        }
+        records.append(line)
+    title = f"At level {RELATED:g}: unrelated pairs accepted and right ones (NSGD < {RIGHT}) rejected"
+    return Sheet("rates", title, records)
+
+
+def levels_sheet(rows: Rows) -> Sheet:
+    """Points of the ROC curve: unrelated pairs accepted and right ones rejected at several levels."""
+    records: list[Record] = []
+    for name, own in rows.items():
+        unrelated, right = split(own)
+        for level in LEVELS:
+            accepted = percent([significance(r) >= level for r in unrelated])
+            rejected = percent([significance(r) < level for r in right])
+            records.append({"pipeline": name, "level": f"{level:g}", "accepted, %": accepted, "rejected, %": rejected})
+    return Sheet("levels", "Points of the ROC curves", records)
+
+
+def sets_sheet(rows: Rows) -> Sheet:
+    """By set: pairs called related, of those whose estimate is right and of others."""
+    records: list[Record] = []
+    for family in sorted({row["family"] for own in rows.values() for row in own}):
+        for name, own in rows.items():
+            members = [row for row in own if row["family"] == family]
+            line: Record = {"set": family, "pipeline": name}
+            for head, right in (("right", True), ("other", False)):
+                called = [called_related(row) for row in members if (true(row) and row["nsgd"] < RIGHT) == right]
+                line |= {f"{head} pairs": len(called), f"{head} pairs called related": sum(called)}
+            records.append(line)
+    return Sheet("sets", "Pairs called related", records)
+
+
+def share(rows: Sequence[Row], holds: Callable[[Row], bool]) -> Span | str:
+    """The share of pairs for which something holds, in %, with its interval."""
+    if not rows:
+        return ""
+    i = share_interval(np.array([holds(row) for row in rows]), [f"{row['family']}/{row['scene']}" for row in rows])
+    return Span(*(f"{100 * value:.2f}" for value in (i.value, i.low, i.high)))
+
+
+def percent(values: Sequence[bool]) -> str:
+    """A share in %."""
+    return f"{100 * np.mean(values):.2f}" if values else ""
+
+
+def area(right: Sequence[Row], unrelated: Sequence[Row], figure: Callable[[Row], float]) -> float:
+    """The chance that a right pair has more of a figure than an unrelated one; ties count half."""
+    a, b = np.array([figure(row) for row in right]), np.sort([figure(row) for row in unrelated])
+    if len(a) == 0 or len(b) == 0:
+        return math.nan
+    return float((np.searchsorted(b, a, "left") + np.searchsorted(b, a, "right")).mean() / (2 * len(b)))
+
+
+def roc(rows: Sequence[Row], figure: Callable[[Row], float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Shares of unrelated pairs accepted and of right ones rejected at every level of a figure, from the lowest on."""
+    unrelated, right = (np.array([figure(row) for row in part], dtype=np.float64) for part in split(rows))
+    levels = np.append(np.unique(np.concatenate([unrelated, right])), np.inf)
+    return (unrelated >= levels[:, None]).mean(1), (right < levels[:, None]).mean(1)
+
+
+def draw(rows: Rows, path: Path) -> None:
+    """The ROC curves: a panel for each way to judge pairs, a line for each pipeline, a dot at the verdict's level."""
+    panels: dict[str, dict[str, figures.Line]] = {"by significance": {}, "by the number of inliers": {}}
+    for name, own in ((name, own) for name, own in rows.items() if all(split(own))):
+        for figure, lines in zip((significance, inliers), panels.values(), strict=True):
+            accepted, rejected = (100 * shares for shares in roc(own, figure))
+            perfect = " (along the axes)" if ((accepted == 0) & (rejected == 0)).any() else ""
+            dot = None
+            if figure is significance:
+                levels = np.append(np.unique([figure(row) for part in split(own) for row in part]), np.inf)
+                dot = int(np.searchsorted(levels, RELATED))
+            lines[name + perfect] = figures.Line(accepted.tolist(), rejected.tolist(), dot)
+    figures.draw(path, panels, "unrelated pairs accepted, %", "right pairs rejected, %", shares=True)

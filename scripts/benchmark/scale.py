@@ -1,118 +1,86 @@
-"""What evaluation costs at any size: stages, workers, bytes and memory; written into docs/scale.md with --write."""
+"""What evaluation costs at any size: stages, workers, bytes and memory."""
 
 from __future__ import annotations
 
 import argparse
 import functools
-import json
-import os
-import platform
+import multiprocessing
 import resource
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
-from rich.console import Console
-
-from fmtorch.data.pairs import ImagePair
+from fmtorch.data import ImagePair
 from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import summarize
 from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.pool import WorkerPool
 from fmtorch.jobs.runner import Factory, Local, TaskRunner
-from fmtorch.pipeline.build import load_pipeline
 from fmtorch.runs import PairRow, RunFolder
 from fmtorch.scenes import RenderedPairs
-from scripts.benchmark.scale_pairs import given_pairs
+from scripts.benchmark.methods import pipeline_of
+from scripts.benchmark.pairs import synthetic_pair
+from scripts.benchmark.runner import add_command
+from scripts.benchmark.tables import Record, Sheet, show
 
 PIPELINES = {"given matches": "given_fmtorch", "SIFT": "sift_fmtorch", "HesAffNet": "hesaffnet_fmtorch"}
 STAGES = ("features", "matching", "pruning", "estimation", "metrics")
 MATCHES = 500  # of a pair of given matches
 WAIT = 0.04  # seconds of a stage that only waits
 BATCH = 64  # rows that are stored at a time where memory is measured
-PAGE, MARK = Path("docs/scale.md"), "<!-- python -m scripts.benchmark scale --write -->"
 
 
 def add_arguments(commands: Any) -> None:
-    parser = commands.add_parser("scale", help=__doc__)
+    parser = add_command(commands, "scale", run, __doc__)
     parser.add_argument("--pairs", type=int, default=1000, help="of given matches; of the others a tenth")
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2, 4, 8])
     parser.add_argument("--executors", nargs="+", default=["threads", "processes", "dask"])
     parser.add_argument("--batches", type=int, default=1000, help="that a scheduler is given to do nothing in")
     parser.add_argument("--rows", type=int, nargs="+", default=[10_000, 1_000_000], help="at which memory is measured")
-    parser.add_argument("--parts", nargs="+", default=["workers", "memory", "stages"], help="of the page")
-    parser.add_argument("--write", action="store_true", help=f"replace the tables of {PAGE}")
-    parser.set_defaults(run=run)
-    memory = commands.add_parser("scale-memory", help="the memory of a process that stores and sums up so many rows")
-    memory.add_argument("rows", type=int)
-    memory.set_defaults(run=run_memory)
+    parser.add_argument("--parts", nargs="+", default=["workers", "memory", "stages"], help="of the tables")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    torch.set_num_threads(1)
-    with tempfile.TemporaryDirectory() as folder:
-        sections = [_about()]
-        if "workers" in arguments.parts:
-            sections += worker_table(arguments.executors, arguments.workers, arguments.batches)
-        if "memory" in arguments.parts:
-            sections += memory_table(arguments.rows)
-        if "stages" in arguments.parts:
-            stages, size = stage_table(Path(folder), arguments.pairs)
-            sections += [*stages, *cost_table(stages, size)]
-    text = "\n".join(sections)
-    if arguments.write:
-        head = PAGE.read_text(encoding="utf-8").partition(MARK)[0]
-        PAGE.write_text(f"{head}{MARK}\n\n{text}\n", encoding="utf-8")
-    Console().print(text, markup=False, highlight=False, soft_wrap=True)
+    sheets = []
+    if "workers" in arguments.parts:
+        sheets.append(worker_sheet(arguments.executors, arguments.workers, arguments.batches))
+    if "memory" in arguments.parts:
+        sheets.append(memory_sheet(arguments.rows))
+    if "stages" in arguments.parts:
+        with tempfile.TemporaryDirectory() as folder:
+            sheets += stage_sheets(Path(folder), arguments.pairs)
+    show(sheets, arguments.table)
 
 
-def _about() -> str:
-    load = os.getloadavg()[0]
-    return (
-        f"{time.strftime('%Y-%m-%d')}, {platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}, load "
-        f"{load:.1f} at the start (times mean little where that is above 1).\n"
-    )
-
-
-def stage_table(folder: Path, count: int) -> tuple[list[str], float]:
-    """Milliseconds of each stage, by one worker, and the bytes of a row on disk."""
-    lines = [
-        "## Stages, by one worker", "", _row("pipeline", "pairs", *(f"{stage}, ms" for stage in STAGES), "rest, ms",
-        "pairs a second and core"), "|---|" + "---:|" * (len(STAGES) + 3),
-    ]  # fmt: skip
-    size = 0.0
+def stage_sheets(folder: Path, count: int) -> list[Sheet]:
+    """Milliseconds of each stage by one worker, and what a million and a billion pairs cost at that speed."""
+    stages: list[Record] = []
+    costs: list[Record] = []
+    size = 0.0  # bytes of a row
     for name, pipeline in PIPELINES.items():
         given = name == "given matches"
-        source = (
-            given_pairs(folder / "given", count, MATCHES, outliers=0.5)
-            if given
-            else list(RenderedPairs("test", size="small"))
-        )
-        pairs = select(source, None)[: count if given else max(count // 10, 1)]
-        run = RunFolder.open(folder / pipeline, {"pipeline": pipeline})
-        built = load_pipeline(pipeline)
-        evaluated(built, pairs[:2], [].extend)  # compiles and loads
+        source = [synthetic_pair(i, MATCHES) for i in range(count)] if given else list(
+            RenderedPairs("test", size="small")
+        )  # fmt: skip
+        every = select(source, None)[: count if given else max(count // 10, 1)]
+        stored, built = RunFolder.open(folder / pipeline, {"pipeline": pipeline}), pipeline_of(pipeline)
+        evaluated(built, every[:2], [].extend)  # compiles and loads
         start = time.perf_counter()
-        evaluated(built, pairs, run.append)
+        evaluated(built, every, stored.append)
         wall = time.perf_counter() - start
-        table = run.read()
-        own = [1e3 * sum(v or 0.0 for v in table[f"seconds_{stage}"].to_pylist()) / len(pairs) for stage in STAGES]
-        rest = max(1e3 * wall / len(pairs) - sum(own), 0.0)
-        cells = " | ".join(f"{value:.1f}" for value in (*own, rest))
-        lines.append(f"| {name} | {len(pairs)} | {cells} | {len(pairs) / wall:.1f} |")
-        if given:
-            size = sum(path.stat().st_size for path in (run.path / "pairs").iterdir()) / len(pairs)
-    lines += ["", "Features count in full for each pair that shows an image, which is computed once.", ""]
-    return lines, size
-
-
-def _row(*cells: str) -> str:
-    return f"| {' | '.join(cells)} |"
+        rows = stored.read()
+        ms = {s: 1e3 * sum(v or 0.0 for v in rows[f"seconds_{s}"].to_pylist()) / len(every) for s in STAGES}
+        ms["rest"] = max(1e3 * wall / len(every) - sum(ms.values()), 0.0)
+        speed, hours = len(every) / wall, 1e6 * wall / len(every) / 3600
+        size = size or sum(path.stat().st_size for path in (stored.path / "pairs").iterdir()) / len(every)
+        stages.append({"pipeline": name, "pairs": len(every), **{f"{s}, ms": f"{v:.1f}" for s, v in ms.items()},
+                       "pairs a second and core": f"{speed:.1f}"})  # fmt: skip
+        costs.append({"pipeline": name, "core hours of 10^6 pairs": f"{hours:.0f}", "of 10^9": f"{1e3 * hours:.0f}",
+                      "rows of 10^6, GB": f"{size / 1e3:.2f}", "of 10^9, TB": f"{size / 1e3:.2f}"})  # fmt: skip
+    return [Sheet("stages", "Stages, by one worker", stages), Sheet("extrapolated", "Extrapolated", costs)]
 
 
 def evaluated(pipeline: Any, pairs: Sequence[ImagePair], store: Any) -> None:
@@ -120,33 +88,17 @@ def evaluated(pipeline: Any, pairs: Sequence[ImagePair], store: Any) -> None:
         pass
 
 
-def wait(seconds: float, job: int) -> int:
-    """A stage that only waits."""
-    time.sleep(seconds)
-    return job
-
-
-def _seconds(seconds: float) -> float:
-    return seconds
-
-
-def worker_table(executors: Sequence[str], workers: Sequence[int], batches: int) -> list[str]:
-    """Efficiency of waiting, and calls a second of doing nothing."""
-    lines = [
-        "## Workers", "",
-        f"Efficiency: of batches that only wait {1e3 * WAIT:.0f} ms, the time of one worker without any executor by "
-        "the number of workers, divided by the time taken. Batches a second: of such as do nothing, the limit.", "",
-        f"| executor | {' | '.join(f'{n} workers' for n in workers)} | batches a second |",
-        "|---|" + "---:|" * (len(workers) + 1),
-    ]  # fmt: skip
+def worker_sheet(executors: Sequence[str], workers: Sequence[int], batches: int) -> Sheet:
+    """Efficiency of waiting, the time of one worker by their number over that taken; calls a second of nothing."""
+    records: list[Record] = []
     for executor in executors:
-        cells = []
+        line: Record = {"executor": executor}
         for count in workers:
             number = 50 * count
-            cells.append(f"{100 * WAIT * number / count / _timed(executor, count, WAIT, number):.0f} %")
-        limit = batches / _timed(executor, workers[-1], 0.0, batches)
-        lines.append(f"| {executor} | {' | '.join(cells)} | {limit:.0f} |")
-    return [*lines, ""]
+            efficiency = 100 * WAIT * number / count / _timed(executor, count, WAIT, number)
+            line[f"{count} worker{'s' * (count > 1)}: efficiency, %"] = f"{efficiency:.0f}"
+        records.append(line | {"batches a second": f"{batches / _timed(executor, workers[-1], 0.0, batches):.0f}"})
+    return Sheet("workers", f"Batches that only wait {1e3 * WAIT:.0f} ms, and such as do nothing", records)
 
 
 def _timed(executor: str, workers: int, seconds: float, count: int) -> float:
@@ -163,47 +115,44 @@ def _timed(executor: str, workers: int, seconds: float, count: int) -> float:
         return time.perf_counter() - start
 
 
-def memory_table(rows: Sequence[int]) -> list[str]:
-    """Peak memory of a caller that stores, lists and sums up rows."""
-    lines = [
-        "## Memory of the caller", "", _row("rows", "imports, MB", "storing, MB", "finding what is done, MB",
-        "summary, MB", "storing, s", "parts", "bytes a row on disk"), "|---:|" + "---:|" * 7,
-    ]  # fmt: skip
+def wait(seconds: float, job: int) -> int:
+    """A stage that only waits."""
+    time.sleep(seconds)
+    return job
+
+
+def _seconds(seconds: float) -> float:
+    return seconds
+
+
+def memory_sheet(rows: Sequence[int]) -> Sheet:
+    """Peak memory of a caller that stores, lists and sums up rows, each time in a process of its own."""
+    records: list[Record] = []
     for count in rows:
-        command = [sys.executable, "-m", "scripts.benchmark", "scale-memory", str(count)]
-        figures = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
-        lines.append(
-            f"| {count:,} | {figures['imports']:.0f} | {figures['storing']:.0f} | {figures['done']:.0f} | "
-            f"{figures['summary']:.0f} | {figures['seconds']:.0f} | {figures['parts']} | {figures['bytes']:.0f} |"
-        )
-    said = (
-        "Each column is the peak up to then. Rows are stored as they come; the list of pairs is the data set's own, "
-        "some 2 kB a pair, and is not counted."
-    )
-    return [*lines, "", said, ""]
+        with multiprocessing.get_context("spawn").Pool(1) as pool:
+            records.append({"rows": count, **{k: f"{v:.0f}" for k, v in pool.apply(stored, (count,)).items()}})
+    return Sheet("memory", "Memory of the caller, each column the peak up to then", records)
 
 
-def run_memory(arguments: argparse.Namespace) -> None:
-    figures: dict[str, float] = {"imports": _peak()}
+def stored(count: int) -> dict[str, float]:
+    """Peaks after imports, storing, finding what is done and the summary; seconds, parts and bytes of storing."""
+    figures: dict[str, float] = {"imports, MB": _peak()}
     with tempfile.TemporaryDirectory() as name:
-        folder = RunFolder.open(Path(name) / "run", {"rows": arguments.rows})
+        folder = RunFolder.open(Path(name) / "run", {"rows": count})
         start = time.perf_counter()
         with WorkerPool(Execution("threads", 2)) as pool:
             runner = TaskRunner[range](pool, Local(None), rows_of, lambda task, rows: folder.append(rows))
-            for _ in runner.each(_batches(arguments.rows)):
+            for _ in runner.each(range(i, min(i + BATCH, count)) for i in range(0, count, BATCH)):
                 pass
-        figures |= {"seconds": time.perf_counter() - start, "storing": _peak()}
+        seconds = time.perf_counter() - start
+        figures["storing, MB"] = _peak()
         files = list((folder.path / "pairs").iterdir())
-        figures |= {"parts": len(files), "bytes": sum(file.stat().st_size for file in files) / arguments.rows}
-        assert len(folder.done()) == arguments.rows
-        figures["done"] = _peak()
+        assert len(folder.done()) == count
+        figures["finding what is done, MB"] = _peak()
         summarize(folder.read(without=("pair", "F")))
-        figures["summary"] = _peak()
-    print(json.dumps(figures))
-
-
-def _batches(rows: int) -> Iterator[range]:
-    return (range(i, min(i + BATCH, rows)) for i in range(0, rows, BATCH))
+        size = sum(file.stat().st_size for file in files) / count
+        figures |= {"summary, MB": _peak(), "storing, s": seconds, "parts": len(files), "bytes a row on disk": size}
+    return figures
 
 
 def rows_of(nothing: None, numbers: range) -> list[PairRow]:
@@ -222,19 +171,3 @@ def rows_of(nothing: None, numbers: range) -> list[PairRow]:
 def _peak() -> float:
     """MB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
-
-
-def cost_table(stages: Sequence[str], size: float) -> list[str]:
-    """What a million and a billion pairs cost, from the speeds of one core."""
-    columns = ("pipeline", "core hours of 10^6 pairs", "of 10^9", "rows of 10^6, GB", "of 10^9, TB")
-    lines = ["## Extrapolated", "", _row(*columns), "|---|---:|---:|---:|---:|"]
-    for line in stages:
-        cells = [cell.strip() for cell in line.strip("|").split("|")]
-        if cells[0] in PIPELINES:
-            hours = 1e6 / float(cells[-1]) / 3600
-            lines.append(f"| {cells[0]} | {hours:,.0f} | {1e3 * hours:,.0f} | {size / 1e3:.2f} | {size / 1e3:.2f} |")
-    said = (
-        "With the features of every image computed anew as often as in the pairs measured here. A billion pairs are "
-        "for shards: a thousand commands of a million pairs each (`shard=i/1000`)."
-    )
-    return [*lines, "", said, ""]

@@ -1,151 +1,182 @@
 """Where estimators fail: sweeps of inlier ratio, noise and number of matches, and conditions that hurt.
 
 python -m scripts.benchmark stress --root DATA/Strecha --root DATA/PhotoTourism --root DATA/KITTI --root DATA/TUM \\
-    --rendered full --json stress.jsonl --update docs/appendix/stress.md
-python -m scripts.benchmark stress --from stress.jsonl --update docs/appendix/stress.md
+    --rendered full --rows stress.jsonl --table docs/tables/stress.csv --figures docs/benchmarks
 
---json is appended to pair by pair: started again, the command goes on where it was interrupted, and measures what more
-seeds need. A row counts only for the code, options and learned files that it was made with. `sizeless` among an
-estimator's stages takes the image sizes away, and with them the prior on cameras.
+--rows is appended to pair by pair: started again, the command goes on where it was interrupted, and measures what more
+seeds need. `sizeless` among an estimator's stages takes the image sizes away, and with them the prior on cameras.
 """
 
 from __future__ import annotations
 
 import argparse
-import time
-from collections.abc import Iterator, Mapping
+import dataclasses
+import functools
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
-import torch
+import numpy as np
 
-from fmtorch import metrics
-from fmtorch.core.types import Correspondences
-from scripts.benchmark import stress_cases, stress_rows, stress_table
-from scripts.benchmark.kept import Kept, Row, read
-from scripts.benchmark.specs import Method, identity, informed, read_specs
-from scripts.benchmark.stress_cases import Case, on_plane, parallax
-from scripts.benchmark.stress_changes import CONDITIONS, SWEEPS, Change, sizes
+from fmtorch.data import ImagePair
+from fmtorch.evaluation.run import select
+from fmtorch.pipeline.pipeline import Outcome, Pipeline
+from fmtorch.presets.pruners import WIDE
+from fmtorch.scenes.generate import FAMILIES
+from scripts.benchmark import figures, pairs
+from scripts.benchmark.methods import method, read_specs
+from scripts.benchmark.runner import Item, Kept, Method, Row, add_command, measure
+from scripts.benchmark.stress_changes import (
+    CONDITIONED,
+    MIN_RIGHT,
+    SWEEPS,
+    Case,
+    Change,
+    Level,
+    case_of,
+    on_plane,
+    parallax,
+)
+from scripts.benchmark.tables import FIGURES, Record, Results, Sheet, show
 
 SPECS = Path(__file__).with_name("stress.txt")
-CONDITIONED = "conditions"
+AXES = {"inlier ratio": "inlier ratio", "noise": "added noise [px]", "match count": "matches"}
+IMAGES = 256  # whose features are kept, some 5 MB each
+PLANE, TURN = 0.8, 0.02
+NATURAL: dict[Level, Callable[[Row], bool]] = {
+    "of these: one homography": lambda row: row["plane"] > PLANE and not row["parallax"] < TURN * row["side"],
+    "of these: rotation": lambda row: row["plane"] > PLANE and row["parallax"] < TURN * row["side"],
+}
+"""Unchanged pairs of which one homography explains nearly all right matches; the second, with next to no parallax."""
 
 
 def add_arguments(commands: Any) -> None:
-    parser = commands.add_parser("stress", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    stress_cases.add_arguments(parser)
-    parser.add_argument(
-        "--specs", type=Path, default=SPECS, help="estimators, one a line; (...) holds for conditions only"
-    )
-    parser.add_argument("--only", nargs="*", default=[], help=f"of {', '.join([*SWEEPS, CONDITIONED])}; all by default")
-    parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--json", type=Path, help="keep the figures of every pair here, one line each")
-    parser.add_argument("--from", nargs="*", type=Path, default=[], dest="earlier", help="only show earlier --json")
-    parser.add_argument("--update", type=Path, help="write the tables into this Markdown file, figures beside it")
-    parser.set_defaults(run=run)
+    parser = add_command(commands, "stress", run, __doc__, seeds=1)
+    pairs.add_set_options(parser, limit=20)
+    parser.add_argument("--rendered-limit", type=int, default=10, help="pairs of each rendered family at most")
+    parser.add_argument("--specs", type=Path, default=SPECS, help="estimators; those in (...) for conditions only")
+    parser.add_argument("--only", nargs="*", default=list(SWEEPS), choices=list(SWEEPS), help="all by default")
+    parser.add_argument("--figures", type=Path, help="draw stress_SWEEP.svg into this folder")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-    unknown = set(arguments.only) - {*SWEEPS, CONDITIONED}
-    if unknown:
-        raise SystemExit(f"--only {unknown.pop()!r}: it must be one of: {', '.join([*SWEEPS, CONDITIONED])}")
-    rows = [row for path in arguments.earlier for row in read(path)]
-    if arguments.root or arguments.rendered:
-        rows += measure(stress_cases.load(arguments), arguments)
+    kept = Kept(arguments.rows)
+    rows = kept.rows
+    if pairs.named(arguments):
+        rows = measure(methods_of(read_specs(arguments.specs)), items_of(arguments), arguments.seeds, kept)
     if not rows:
-        raise SystemExit("nothing to show: name sets with --root or --rendered, or earlier figures with --from")
-    rows = stress_rows.comparable(rows, [spec.strip("()") for spec in read_specs(arguments.specs)])
-    stress_table.show(rows)
-    if arguments.update:
-        stress_table.write(arguments.update, rows)
+        raise SystemExit("nothing to show: name sets with --root or --rendered, or a file of earlier --rows")
+    show([accuracy_sheet(rows), time_sheet(rows)], arguments.table)
+    for sweep in {row["sweep"] for row in rows} & AXES.keys() if arguments.figures else ():
+        draw(rows, sweep, arguments.figures / f"stress_{sweep.replace(' ', '_')}.svg")
 
 
-def measure(cases: Iterator[Case], arguments: argparse.Namespace) -> list[Row]:
-    """A row for each case, change and estimator; those of an interrupted run are not measured again."""
-    kept = Kept(arguments.json)
-    always, under_conditions = methods(arguments.specs)
-    every = {**always, **under_conditions}
-    made_with = {name: identity(name, STAGES) for name in every}
-    known = kept.by("pair", "sweep", "level", "method", "identity")
-    rows = {key: row for key, row in known.items() if made_with.get(row["method"]) == row["identity"]}
-    for case in cases:
-        for sweep, level, change in changes(arguments.only):
-            chosen_methods = every if sweep == CONDITIONED else always
-            place = {name: (case.pair.identity, sweep, level, name, made_with[name]) for name in chosen_methods}
-            before = {name: rows[key] for name, key in place.items() if key in rows}
-            todo = {
-                n: m for n, m in chosen_methods.items() if n not in before or len(before[n]["nsgd"]) < arguments.seeds
-            }
-            changed = change(case) if todo else None
-            if changed is None:
-                continue
-            facts: Row = {"sweep": sweep, "level": level}
-            if sweep == CONDITIONED:
-                plane = float(on_plane(changed).sum() / changed.right.sum())
-                side = max(max(image.tolist()) for image in sizes(changed))
-                facts |= {"plane": round(plane, 3), "parallax": round(parallax(changed), 2), "side": side}
-            measured = rows_of(changed, todo, arguments.seeds, before)
-            new = [row | facts | {"identity": made_with[row["method"]]} for row in measured]
-            rows |= {place[row["method"]]: row for row in new}
-            kept.add(new)
-    complete = [row for row in rows.values() if len(row["nsgd"]) >= arguments.seeds]
-    return [row | {name: row[name][: arguments.seeds] for name in ("nsgd", "ms")} for row in complete]
+def methods_of(specs: Sequence[str]) -> list[Method]:
+    """The estimators; those in brackets are measured under conditions alone."""
+    methods = [(method(spec.strip("()")), spec.startswith("(")) for spec in specs]
+    return [dataclasses.replace(each, takes=_under_conditions) if some else each for each, some in methods]
 
 
-def changes(only: list[str]) -> Iterator[tuple[str, float | str, Change]]:
-    """Sweep, level and what is done to a case, of all that are asked for."""
+def _under_conditions(item: Item) -> bool:
+    return bool(item.facts["sweep"] == CONDITIONED)
+
+
+def items_of(arguments: argparse.Namespace) -> Iterator[Item]:
+    """The pairs that are asked for, families in turn, with the SIFT matches that pass the ratio test, changed."""
+    families: dict[str, list[ImagePair]] = {}
+    for dataset in pairs.sets_of(arguments):
+        limit = arguments.rendered_limit if dataset.name == "rendered" else arguments.limit
+        for pair in select([dataset[i] for i in range(len(dataset))], limit):
+            families.setdefault(pair.family, []).append(pair)
+    front = pairs.front_of("sift", [], memory=IMAGES)
+    for turn in itertools.zip_longest(*families.values()):  # an interrupted run has some of each family
+        for pair in (pair for pair in turn if pair is not None):
+            case = functools.cache(functools.partial(_case, front, pair))
+            for sweep in arguments.only:
+                yield from (item_of(pair, case, sweep, level, change) for level, change in SWEEPS[sweep].items())
+
+
+def _case(front: Pipeline, pair: ImagePair) -> Case | None:
+    """None where there are too few right matches."""
+    c = front.correspondences([pair])[0].correspondences
+    case = None if c is None else case_of(pair, c)
+    return None if case is None or int(case.right.sum()) < MIN_RIGHT else case
+
+
+def item_of(pair: ImagePair, case: Callable[[], Case | None], sweep: str, level: Level, change: Change) -> Item:
+    """A pair after a change; of conditions with its share of right matches on a plane and its parallax."""
+    facts: Row = {"sweep": sweep, "level": level}
+
+    def make() -> Outcome | None:
+        base = case()
+        changed = None if base is None else change(base)
+        if changed is None:
+            return None
+        facts.update(matches=len(changed.right), right=int(changed.right.sum()))
+        if sweep == CONDITIONED:
+            facts["plane"] = round(float(on_plane(changed).sum() / changed.right.sum()), 3)
+            facts["parallax"] = round(parallax(changed), 2)
+            facts["side"] = float(max(size.max() for size in changed.sizes()))
+        return Outcome(changed.pair, (len(changed.right),) * 2, changed.c)
+
+    return Item(pair, make, facts)
+
+
+def by_level(rows: Sequence[Row]) -> Iterator[tuple[str, Level, Results]]:
+    """Each sweep's levels in order, with the rows there of real pairs, wide and short, and of rendered ones."""
+    named = [{**row, "method": label(row["method"]), "family": group(row["family"])} for row in rows]
     for sweep, levels in SWEEPS.items():
-        if not only or sweep in only:
-            yield from ((sweep, level, change) for level, change in levels.items())
-    if not only or CONDITIONED in only:
-        yield from ((CONDITIONED, name, change) for name, change in CONDITIONS.items())
+        for level in (*levels, *(NATURAL if sweep == CONDITIONED else ())):
+            shown, holds = ("as they are", NATURAL[level]) if level in NATURAL else (level, bool)
+            own = [row for row in named if (row["sweep"], row["level"]) == (sweep, shown) and holds(row)]
+            if own:
+                yield sweep, level, Results(own)
 
 
-def rows_of(
-    case: Case, chosen_methods: Mapping[str, Method], seeds: int, before: Mapping[str, Row] | None = None
-) -> Iterator[Row]:
-    """A row for each estimator, with NSGD and processor milliseconds of each seed; they take turns.
-
-    before: rows with fewer seeds, whose figures are taken over.
-    """
-    c, pair = case.c, case.pair
-    F = torch.from_numpy(pair.F)[None]
-    assert c.size0 is not None
-    assert c.size1 is not None
-    earlier = {name: (before or {}).get(name, {"nsgd": [], "ms": []}) for name in chosen_methods}
-    figures = {name: (list(row["nsgd"]), list(row["ms"])) for name, row in earlier.items()}
-    for seed in range(seeds):
-        for name, method in chosen_methods.items():
-            if seed < len(figures[name][0]):
-                continue
-            start = time.process_time()
-            estimate = method(pair, c, seed)
-            milliseconds = 1e3 * (time.process_time() - start)
-            nsgd = float(metrics.nsgd(F, estimate.F, c.size0, c.size1, key=c.keys)) if bool(estimate.ok[0]) else 1.0
-            figures[name][0].append(round(nsgd, 6))
-            figures[name][1].append(round(milliseconds, 2))
-    facts: Row = {"pair": pair.identity, "family": pair.family, "scene": pair.scene}
-    facts |= {"matches": len(case.right), "right": int(case.right.sum())}
-    for name, (nsgds, ms) in figures.items():
-        yield {**facts, "method": name, "nsgd": nsgds, "ms": ms}
+def group(family: str) -> str:
+    """What a family's pairs are shown with."""
+    return "rendered" if family in FAMILIES else "real, wide" if family in WIDE else "real, short"
 
 
-def methods(path: Path) -> tuple[dict[str, Method], dict[str, Method]]:
-    """The estimators of a file, by their lines: those of every sweep, and those in brackets, of conditions alone."""
-    specs = read_specs(path)
-    bracketed = [spec.strip("()") for spec in specs if spec.startswith("(")]
-    return (
-        {spec: informed(spec, STAGES) for spec in specs if not spec.startswith("(")},
-        {spec: informed(spec, STAGES) for spec in bracketed},
-    )
+def label(spec: str) -> str:
+    """An estimator's name in tables: without its stages and the options that all of its kind have."""
+    front, _, stages = spec.partition("@")
+    name, _, rest = front.partition(":")
+    options = [option for option in rest.split(",") if option and not option.startswith(("threshold=", "prosac="))]
+    return ", ".join([name, *options, *(["no sizes"] if "sizeless" in stages else [])])
 
 
-def sizeless(c: Correspondences) -> Correspondences:
-    """The matches of images whose sizes nobody tells."""
-    return c.replace(size0=None, size1=None)
+def accuracy_sheet(rows: Sequence[Row]) -> Sheet:
+    """Recall and AUC@0.05 of each set at each level, of the pairs that all have, and the lead of the first."""
+    records: list[Record] = []
+    for sweep, level, results in by_level(rows):
+        groups = {name: own for name, own in results.groups(results.pairs()).items() if name in results.families}
+        lines = results.records(groups, ("R.05", "R.01", "AUC@0.05"), label="estimator", minus=["AUC@0.05"])
+        records += [{"test": sweep, "set": line.pop("set"), "level": level, **line} for line in lines]
+    return Sheet("accuracy", "Recall at NSGD 0.05, at 0.01 and AUC@0.05 in %; lead: the first minus this", records)
 
 
-STAGES = {"sizeless": sizeless}
+def time_sheet(rows: Sequence[Row]) -> Sheet:
+    """The median number of matches at each level, and median processor milliseconds a pair."""
+    records: list[Record] = []
+    for sweep, level, results in by_level(rows):
+        for name in results.methods:
+            matches = np.median(results.get(name, results.pairs())("matches"))
+            ms = results.cell(name, results.pairs(), "ms")
+            records.append({"test": sweep, "level": level, "estimator": name, "matches": f"{matches:.0f}", "ms": ms})
+    return Sheet("times", "Median number of matches, median processor milliseconds a pair", records)
+
+
+def draw(rows: Sequence[Row], sweep: str, path: Path) -> None:
+    """AUC@0.05 against the level, a panel for each set."""
+    panels: dict[str, dict[str, figures.Line]] = {}
+    area = FIGURES["AUC@0.05"]
+    for _, level, results in (each for each in by_level(rows) if each[0] == sweep):
+        for name, own in results.groups(results.pairs()).items():
+            for estimator in results.methods if name in results.families else ():
+                line = panels.setdefault(name, {}).setdefault(estimator, figures.Line([], []))
+                line.x.append(float(level))
+                line.y.append(area.scale * float(area.of(results.get(estimator, own)).mean()))
+    scale = "linear" if sweep == "noise" else "log"
+    figures.draw(path, panels, AXES[sweep], "AUC@0.05 [%]", xscale=scale, ticks=[float(x) for x in SWEEPS[sweep]])

@@ -1,7 +1,7 @@
 """What the stress test does to a pair's matches: sweeps of one quantity, and conditions that hurt.
 
-Each change takes a `Case` and gives another, or None where too few right matches would be left.
-Images are not drawn again: the matches of the whole photographs are thinned out, moved or seen through a window.
+Each change takes a `Case` and gives another, or None where too few right matches would be left. Images are not drawn
+again: the matches of the whole photographs are thinned out, moved or seen through a window.
 """
 
 from __future__ import annotations
@@ -12,14 +12,20 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fmtorch import find_homography
 from fmtorch.core.types import Correspondences
-from scripts.benchmark.stress_cases import MIN_RIGHT, Case, on_plane, taken
+from fmtorch.data import ImagePair
+from fmtorch.geometry import symmetric_max
+from fmtorch.pruning import one_to_one
 
-Change = Callable[[Case], Case | None]
-
+RATIO = 0.8
+RIGHT_PX, WRONG_PX = 3.0, 10.0  # from the true epipolar lines in both images, and in one of them
+MIN_RIGHT = 15
+PLANE_PX = 3.0
 INLIER_RATIOS = (0.05, 0.1, 0.2, 0.4, 0.7, 0.95)
 MAX_RIGHT = 150  # in the sweep of inlier ratios
 NOISES = (0.0, 0.5, 1.0, 2.0, 4.0)  # px
@@ -28,6 +34,78 @@ COUNTS = (20, 50, 100, 300, 1000, 4000)
 OFF_PLANE = 0.1  # share of right matches that are left off the plane
 WINDOW = 0.6  # of width and height
 ZOOM = 2.5
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A pair with its matches, the right and the wrong told by its true F.
+
+    c: a batch of one, no slot masked. right: (n,), True within RIGHT_PX of the true epipolar lines in both images.
+    wrong: (n,), True beyond WRONG_PX in one of them. spare: wrong nearest neighbours that the ratio test took away.
+    """
+
+    pair: ImagePair
+    c: Correspondences
+    right: Bool[Tensor, " n"]
+    wrong: Bool[Tensor, " n"]
+    spare: Correspondences
+
+    def subset(self, index: Tensor) -> Case:
+        """Some of the matches: a mask or indices."""
+        return dataclasses.replace(self, c=taken(self.c, index), right=self.right[index], wrong=self.wrong[index])
+
+    def rng(self, *names: float | str) -> np.random.Generator:
+        """Random numbers that depend on the pair and on what they are for."""
+        words = [byte for name in names for byte in str(name).encode()]
+        return np.random.default_rng([self.pair.key % 2**63, *words])
+
+    def sizes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The images' (h, w)."""
+        assert self.c.size0 is not None
+        assert self.c.size1 is not None
+        return self.c.size0[0].double().numpy(), self.c.size1[0].double().numpy()
+
+
+def case_of(pair: ImagePair, c: Correspondences) -> Case:
+    """A case of all nearest neighbours of a pair, a batch of one."""
+    assert c.quality is not None
+    passed = c.mask & (c.quality < RATIO)
+    kept = one_to_one(c.x0, c.x1, c.quality, passed)
+    spare = one_to_one(c.x0, c.x1, c.quality, c.mask & ~passed)
+    distance = distances(pair.F, c)
+    matches, apart = taken(c, kept[0]), distance[kept[0]]
+    return Case(pair, matches, apart < RIGHT_PX, apart > WRONG_PX, taken(c, spare[0] & (distance > WRONG_PX)))
+
+
+def taken(c: Correspondences, index: Tensor) -> Correspondences:
+    """Some matches of a batch of one: a mask or indices."""
+    slots = {name: getattr(c, name) for name in c.per_slot if getattr(c, name) is not None}
+    return c.replace(**{name: value[:, index] for name, value in slots.items()})
+
+
+def distances(F: NDArray[np.float64], c: Correspondences) -> Float[Tensor, " n"]:
+    """The greater distance of each match to its true epipolar lines, in pixels."""
+    return symmetric_max(torch.from_numpy(F)[None], c.x0.double(), c.x1.double())[0]
+
+
+def parallax(case: Case) -> float:
+    """Median distance in image 1 of right matches from where rotation alone has them, in pixels; NaN: unknown."""
+    pair = case.pair
+    if pair.K0 is None or pair.K1 is None or pair.R is None:
+        return float("nan")
+    turn = torch.from_numpy(pair.K1 @ pair.R @ np.linalg.inv(pair.K0))
+    x = torch.cat([case.c.x0[0].double(), torch.ones(len(case.right), 1, dtype=torch.float64)], -1) @ turn.T
+    return float((x[:, :2] / x[:, 2:] - case.c.x1[0].double()).norm(dim=-1)[case.right].median())
+
+
+def on_plane(case: Case) -> Bool[Tensor, " n"]:
+    """The right matches of the homography that holds for most of them, (n,)."""
+    index = case.right.nonzero()[:, 0]
+    ends = case.c.x0[0, index].double(), case.c.x1[0, index].double()
+    found = find_homography(*ends, inlier_threshold=PLANE_PX, key=case.pair.key)
+    mask = torch.zeros_like(case.right)
+    mask[index] = found.inliers[0]
+    return mask
 
 
 def inlier_ratio(case: Case, ratio: float) -> Case | None:
@@ -50,8 +128,9 @@ def inlier_ratio(case: Case, ratio: float) -> Case | None:
     drawn = case.c.quality[:, torch.from_numpy(rng.choice(wrong, len(added)))]
     more = taken(case.spare, torch.from_numpy(added)).replace(quality=drawn)
     away = torch.zeros(len(added), dtype=torch.bool)
+    joined = _joined(kept.c, more)
     return dataclasses.replace(
-        kept, c=_joined(kept.c, more), right=torch.cat([kept.right, away]), wrong=torch.cat([kept.wrong, ~away])
+        kept, c=joined, right=torch.cat([kept.right, away]), wrong=torch.cat([kept.wrong, ~away])
     )
 
 
@@ -69,10 +148,6 @@ def match_count(case: Case, count: float) -> Case | None:
     return case.subset(torch.from_numpy(order[: int(count)])) if len(order) >= count else None
 
 
-def unchanged(case: Case) -> Case | None:
-    return case
-
-
 def plane(case: Case) -> Case | None:
     """Right matches off the dominant plane thinned out until they are a tenth of all right ones."""
     inside = on_plane(case)
@@ -86,28 +161,22 @@ def plane(case: Case) -> Case | None:
     return case.subset(keep)
 
 
+Window = tuple[NDArray[np.float64], NDArray[np.float64], float]
+"""Of one image: upper left corner (x, y) and new size (h, w), in pixels, and the scale of the new image."""
+
+
 def crops(case: Case) -> Case | None:
     """Both images cropped to windows of 0.6 of width and height, anywhere."""
     rng = case.rng("crop")
-    corners = []
-    for size in sizes(case):
-        h, w = size
-        corners.append(np.floor(rng.random(2) * (1 - WINDOW) * [w, h]))
-    return seen(
-        case, *((corner, np.floor(WINDOW * size), 1.0) for corner, size in zip(corners, sizes(case), strict=True))
-    )
+    corners = [np.floor(rng.random(2) * (1 - WINDOW) * size[::-1]) for size in case.sizes()]
+    return seen(case, *((at, np.floor(WINDOW * size), 1.0) for at, size in zip(corners, case.sizes(), strict=True)))
 
 
-def zoomed(case: Case) -> Case | None:
-    """Image 1 cropped at its centre to 1 / ZOOM of its sides, image 0 reduced by ZOOM: of one size if they were."""
-    size0, size1 = sizes(case)
-    return seen(case, (np.zeros(2), np.floor(size0 / ZOOM), 1 / ZOOM), central(size1, np.floor(size1 / ZOOM)))
-
-
-def cropped_once(case: Case) -> Case | None:
-    """Image 1 cropped at its centre to 1 / ZOOM of its sides, image 0 as it is."""
-    size0, size1 = sizes(case)
-    return seen(case, (np.zeros(2), size0, 1.0), central(size1, np.floor(size1 / ZOOM)))
+def zoomed(case: Case, reduced: bool) -> Case | None:
+    """Image 1 cropped at its centre to 1 / ZOOM of its sides; image 0 reduced as much, so that both have one size."""
+    size0, size1 = case.sizes()
+    first = (np.zeros(2), np.floor(size0 / ZOOM), 1 / ZOOM) if reduced else (np.zeros(2), size0, 1.0)
+    return seen(case, first, central(size1, np.floor(size1 / ZOOM)))
 
 
 def focal_length(case: Case, f: float) -> Case | None:
@@ -116,37 +185,10 @@ def focal_length(case: Case, f: float) -> Case | None:
     if pair.K0 is None or pair.K1 is None:
         return None
     windows = []
-    for size, K in zip(sizes(case), (pair.K0, pair.K1), strict=True):
+    for size, K in zip(case.sizes(), (pair.K0, pair.K1), strict=True):
         now = float(np.sqrt(K[0, 0] * K[1, 1])) / float(size.max())
         windows.append(central(size, np.floor(size * now / f)))
     return seen(case, *windows)
-
-
-SWEEPS: dict[str, dict[float, Change]] = {
-    "inlier ratio": {ratio: functools.partial(inlier_ratio, ratio=ratio) for ratio in INLIER_RATIOS},
-    "noise": {sigma: functools.partial(noise, sigma=sigma) for sigma in NOISES},
-    "match count": {float(count): functools.partial(match_count, count=count) for count in COUNTS},
-}
-CONDITIONS: dict[str, Change] = {
-    "as they are": unchanged,
-    "one plane": plane,
-    "crops": crops,
-    "f 1 : 2.5, one size": zoomed,
-    "f 1 : 2.5, two sizes": cropped_once,
-    "f = 0.4": functools.partial(focal_length, f=0.4),
-    "f = 2": functools.partial(focal_length, f=2.0),
-    "f = 4": functools.partial(focal_length, f=4.0),
-}
-
-Window = tuple[NDArray[np.float64], NDArray[np.float64], float]
-"""Of one image: upper left corner (x, y) and new size (h, w), in pixels, and the scale of the new image."""
-
-
-def sizes(case: Case) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The images' (h, w)."""
-    assert case.c.size0 is not None
-    assert case.c.size1 is not None
-    return case.c.size0[0].double().numpy(), case.c.size1[0].double().numpy()
 
 
 def central(size: NDArray[np.float64], new: NDArray[np.float64]) -> Window:
@@ -169,7 +211,7 @@ def seen(case: Case, window0: Window, window1: Window) -> Case | None:
     c = _placed(case.c, moved[0], moved[1], window0[2], window1[2])
     shapes = [torch.from_numpy(window[1].astype(np.int64))[None] for window in (window0, window1)]
     pair = dataclasses.replace(case.pair, F=inverse[1].T @ case.pair.F @ inverse[0], K0=None, K1=None)
-    windowed = dataclasses.replace(case, pair=pair, c=c.replace(size0=shapes[0], size1=shapes[1]))
+    windowed = dataclasses.replace(case, pair=pair, c=c.replace(size0=shapes[0], size1=shapes[1], K0=None, K1=None))
     return windowed.subset(inside)
 
 
@@ -186,3 +228,21 @@ def _joined(a: Correspondences, b: Correspondences) -> Correspondences:
     """The matches of two batches of one."""
     slots = [name for name in a.per_slot if getattr(a, name) is not None]
     return a.replace(**{name: torch.cat([getattr(a, name), getattr(b, name)], 1) for name in slots})
+
+
+Change = Callable[[Case], Case | None]
+Level = float | str
+CONDITIONED = "conditions"
+SWEEPS: dict[str, dict[Level, Change]] = {
+    "inlier ratio": {ratio: functools.partial(inlier_ratio, ratio=ratio) for ratio in INLIER_RATIOS},
+    "noise": {sigma: functools.partial(noise, sigma=sigma) for sigma in NOISES},
+    "match count": {float(count): functools.partial(match_count, count=count) for count in COUNTS},
+    CONDITIONED: {
+        "as they are": lambda case: case,
+        "one plane": plane,
+        "crops": crops,
+        "f 1 : 2.5, one size": functools.partial(zoomed, reduced=True),
+        "f 1 : 2.5, two sizes": functools.partial(zoomed, reduced=False),
+        **{f"f = {f:g}": functools.partial(focal_length, f=f) for f in (0.4, 2.0, 4.0)},
+    },
+}

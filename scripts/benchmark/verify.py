@@ -2,11 +2,10 @@
 
 Features and matches are those of COLMAP's SIFT, or of our default pipeline, made once for each scene in --work. Every
 method begins with the same database without geometries, on one thread, reading and writing included: `colmap:PX` is
-`pycolmap.geometric_verification` at that threshold, `ours` is `fmtorch.verify`. Known cameras are the true ones, with
-a prior focal length. Then the incremental and the global mapper, whose poses are compared with the true ones; images
-that are not registered count as wrong. Rows are kept in --work: an interrupted run goes on where it stopped.
+`pycolmap.geometric_verification` at that threshold, `ours` is `fmtorch.verify`. Known cameras are the true ones. Images
+that a mapper does not register count as wrong. Rows are kept in --work: an interrupted run goes on where it stopped.
 
-python -m scripts.benchmark verify --root DATA --work runs/verify --markdown docs/appendix/verify.md
+python -m scripts.benchmark verify --root DATA --work runs/verify --table docs/tables/verify.csv
 """
 
 from __future__ import annotations
@@ -15,30 +14,36 @@ import argparse
 import itertools
 import shutil
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 import fmtorch
 from fmtorch.estimators.external import colmap
-from scripts.benchmark.kept import Kept, Row
-from scripts.benchmark.matched import console
-from scripts.benchmark.sheet import put
-from scripts.benchmark.verify_mappers import MAPPERS, mapped, pair_poses
-from scripts.benchmark.verify_scenes import CAMERA_KINDS, FEATURE_KINDS, Scene, database_of, read_scene
-from scripts.benchmark.verify_table import sheets
+from fmtorch.metrics import pose_auc, pose_error
+from scripts.benchmark.runner import Kept, Row, add_command
+from scripts.benchmark.scenes import CAMERA_KINDS, FEATURE_KINDS, Scene, Truth, database_of, read_scene, remove
+from scripts.benchmark.tables import Record, Sheet, show
 
 SCENES = (
     "Strecha/Herz-Jesus-P8", "PhotoTourism/sacre_coeur", "Strecha/fountain-P11", "Strecha_train/castle-P19",
     "TanksLike/fox",
 )  # fmt: skip
 METHODS = ("colmap:4", "colmap:1", "colmap:0.5", "ours")
+MAPPERS = ("incremental", "global")
 FIELDS = ("scene", "features", "cameras", "method", "seed", "mapper")  # what a row is of; no mapper: verification
+THRESHOLDS = (1, 5, 10)  # degrees; of camera centres per cent of the scene's size
+RIGHT, WRONG = 5, 10  # degrees, of the pose of a pair
+MIN_MODEL = 3  # images
+Array = NDArray[np.float64]
 
 
 def add_arguments(commands: Any) -> None:
-    parser = commands.add_parser("verify", help=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = add_command(commands, "verify", run, __doc__)
     parser.add_argument("--root", type=Path, required=True, help="a folder of data sets in FM-Bench's layout")
     parser.add_argument("--scenes", nargs="+", default=SCENES, help="folders below it")
     parser.add_argument("--work", type=Path, required=True, help="a folder for databases and rows")
@@ -47,12 +52,9 @@ def add_arguments(commands: Any) -> None:
     parser.add_argument("--cameras", nargs="+", default=CAMERA_KINDS, choices=CAMERA_KINDS)
     parser.add_argument("--mappers", nargs="*", default=MAPPERS, choices=MAPPERS)
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--markdown", type=Path, help="put the tables between the marks of this file")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> None:
-    torch.set_num_threads(1)
     arguments.work.mkdir(parents=True, exist_ok=True)
     kept = Kept(arguments.work / "rows.jsonl")
     for name in arguments.scenes:
@@ -63,14 +65,10 @@ def run(arguments: argparse.Namespace) -> None:
             database = database_of(scene, features, cameras, arguments.work)
             for seed, method in itertools.product(range(arguments.seeds), arguments.methods):
                 measure(scene, database, (scene.name, features, cameras, method, seed), arguments.mappers, kept)
-    tables = sheets(kept.rows, arguments.methods)
-    for table in tables:
-        console.print(table.terminal())
-    if arguments.markdown is not None:
-        put(arguments.markdown, tables)
+    show(sheets(kept.rows), arguments.table)
 
 
-def measure(scene: Scene, database: Path, key: tuple[Any, ...], mappers: list[str], kept: Kept) -> None:
+def measure(scene: Scene, database: Path, key: tuple[Any, ...], mappers: Sequence[str], kept: Kept) -> None:
     """One verification, and what the mappers make of it, as far as there are no rows yet."""
     done = kept.by(*FIELDS)
     missing = [mapper for mapper in ("", *mappers) if (*key, mapper) not in done]
@@ -80,23 +78,11 @@ def measure(scene: Scene, database: Path, key: tuple[Any, ...], mappers: list[st
     path = database.with_name(f"{database.stem}-{method.replace(':', '-')}-{seed}.db")
     remove(path)
     shutil.copy(database, path)
-    row = verified_by(method, path, seed)
-    if "" in missing:
-        kept.add([_row(key, "", row | pair_poses(path, scene.truth))])
+    verified = verified_by(method, path, seed)
     for mapper in missing:
-        if mapper:
-            kept.add([_row(key, mapper, mapped(mapper, path, scene, cameras, seed))])
+        figures = mapped(mapper, path, scene, cameras, seed) if mapper else verified | pair_poses(path, scene.truth)
+        kept.add([dict(zip(FIELDS, (*key, mapper), strict=True)) | figures])
     remove(path)
-
-
-def _row(key: tuple[Any, ...], mapper: str, figures: Row) -> Row:
-    return dict(zip(FIELDS, (*key, mapper), strict=True)) | figures
-
-
-def remove(path: Path) -> None:
-    """Remove a database with what lies beside it."""
-    for old in path.parent.glob(f"{path.name}*"):
-        old.unlink()
 
 
 def verified_by(method: str, path: Path, seed: int) -> Row:
@@ -105,29 +91,174 @@ def verified_by(method: str, path: Path, seed: int) -> Row:
 
     kind, _, threshold = method.partition(":")
     if kind == "ours":
-        _load_kernels(path)
+        if path.parent not in _warm:  # what a process loads and compiles is no part of a pair's time
+            copy = path.with_suffix(".warm")
+            fmtorch.verify(path, output=copy, force=True)
+            remove(copy)
+            _warm.add(path.parent)
         start = time.process_time()
         fmtorch.verify(path, seed=seed)
-        seconds = time.process_time() - start
     else:
         options = colmap.two_view_options(float(threshold), seed)
         verifier = pycolmap.GeometricVerifierOptions(num_threads=1)
         start = time.process_time()
         pycolmap.geometric_verification(path, verifier_options=verifier, two_view_geometry_options=options)
-        seconds = time.process_time() - start
+    seconds = time.process_time() - start
     with pycolmap.Database.open(path) as database:
         pairs, verified = len(database.read_num_matches()[0]), len(database.read_two_view_geometry_num_inliers()[0])
     return {"pairs": pairs, "verified": verified, "seconds": seconds}
 
 
-def _load_kernels(path: Path) -> None:
-    """One untimed verification a process: what it loads and compiles is no part of a pair's time."""
-    if path.parent in _warm:
-        return
-    copy = path.with_suffix(".warm")
-    fmtorch.verify(path, output=copy, force=True)
-    remove(copy)
-    _warm.add(path.parent)
-
-
 _warm: set[Path] = set()
+
+
+def mapped(mapper: str, path: Path, scene: Scene, cameras: str, seed: int) -> Row:
+    """The largest model of a mapper on one thread, with its processor seconds.
+
+    Known intrinsics are held fixed. Unknown ones are calibrated from the view graph before the global mapper, as
+    COLMAP asks for; that changes the database, so it works on a copy.
+    """
+    import pycolmap
+
+    output = path.with_suffix(f".{mapper}")
+    shutil.rmtree(output, ignore_errors=True)
+    output.mkdir()
+    copy = output / "database.db"
+    shutil.copy(path, copy)
+    start = time.process_time()
+    if (mapper, cameras) == ("global", "unknown"):
+        pycolmap.calibrate_view_graph(copy, pycolmap.ViewGraphCalibrationOptions(random_seed=seed))
+    mapping = pycolmap.global_mapping if mapper == "global" else pycolmap.incremental_mapping
+    models = mapping(copy, scene.images, output, _options(mapper, cameras, seed))
+    row: Row = {"seconds": time.process_time() - start, "registered": 0, "images": len(scene.truth.R)}
+    poses: dict[str, Any] = {}
+    if models:
+        model = max(models.values(), key=lambda each: each.num_reg_images())
+        row |= {
+            "registered": model.num_reg_images(), "points": model.num_points3D(),
+            "track": model.compute_mean_track_length(), "error": model.compute_mean_reprojection_error(),
+        }  # fmt: skip
+        poses = {image.name: image.cam_from_world() for image in model.images.values() if image.has_pose}
+    shutil.rmtree(output)
+    return row | accuracy(poses, scene.truth)
+
+
+def _options(mapper: str, cameras: str, seed: int) -> Any:
+    """Of COLMAP's mappers."""
+    import pycolmap
+
+    if mapper == "global":
+        options: Any = pycolmap.GlobalPipelineOptions(min_model_size=MIN_MODEL, num_threads=1, random_seed=seed)
+        options.mapper.num_threads, options.mapper.random_seed = 1, seed
+        options.mapper.global_positioning.random_seed = options.mapper.rotation_averaging.random_seed = seed
+        if cameras == "known":
+            adjustment = options.mapper.bundle_adjustment
+            adjustment.refine_focal_length = adjustment.refine_extra_params = False
+        return options
+    options = pycolmap.IncrementalPipelineOptions(min_model_size=MIN_MODEL, num_threads=1, random_seed=seed)
+    options.extract_colors = False
+    if cameras == "known":
+        options.ba_refine_focal_length = options.ba_refine_extra_params = False
+        options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    return options
+
+
+def accuracy(poses: dict[str, Any], truth: Truth) -> dict[str, float]:
+    """AUC, per cent, of the errors of all relative poses and of all camera centres; no pose is a wrong one."""
+    errors = [
+        relative_error(poses[b] * poses[a].inverse(), truth, a, b) if a in poses and b in poses else 180.0
+        for a, b in itertools.combinations(sorted(truth.R), 2)
+    ]
+    figures: dict[str, float] = {}
+    for name, values in (("auc", np.array(errors)), ("centre", centre_errors(poses, truth))):
+        areas = pose_auc(torch.from_numpy(values), THRESHOLDS).tolist()
+        figures |= {f"{name}{limit}": 100 * area for limit, area in zip(THRESHOLDS, areas, strict=True)}
+    return figures
+
+
+def relative_error(relative: Any, truth: Truth, a: str, b: str) -> float:
+    """The larger of the errors of rotation and direction of translation, in degrees."""
+    R = truth.R[b] @ truth.R[a].T
+    t = truth.t[b] - R @ truth.t[a]
+    given = [torch.tensor(np.array(value)) for value in (relative.rotation.matrix(), relative.translation, R, t)]
+    return float(max(pose_error(*given, up_to_sign=False)))
+
+
+def centre_errors(poses: dict[str, Any], truth: Truth) -> Array:
+    """Distances from the true centres after the best similarity (Umeyama 1991), per cent of the centres' RMS spread."""
+    names = sorted(truth.R)
+    true = np.array([-truth.R[name].T @ truth.t[name] for name in names])
+    size, errors = np.sqrt(((true - true.mean(0)) ** 2).sum(1).mean()), np.full(len(names), np.inf)
+    here = [i for i, name in enumerate(names) if name in poses]
+    if len(here) < MIN_MODEL:
+        return errors
+    centres = np.array([poses[names[i]].inverse().translation for i in here])
+    P, Q = centres - centres.mean(0), true[here] - true[here].mean(0)
+    U, D, Vt = np.linalg.svd(Q.T @ P)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    scale = (D * signs).sum() / (P**2).sum()
+    errors[here] = np.linalg.norm(scale * P @ (U * signs @ Vt).T - Q, axis=1) / size * 100
+    return errors
+
+
+def pair_poses(path: Path, truth: Truth) -> dict[str, int]:
+    """How many pairs have a relative pose, and how many of them are right within 5 degrees, or off by more than 10."""
+    import pycolmap
+
+    with pycolmap.Database.open(path) as database:
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        ends = [pycolmap.pair_id_to_image_pair(pair) for pair in database.read_two_view_geometries()[0]]
+        poses = [database.read_two_view_geometry(*pair).cam2_from_cam1 for pair in ends]
+    posed = [(pose, names[a], names[b]) for pose, (a, b) in zip(poses, ends, strict=True) if pose is not None]
+    errors = np.array([relative_error(pose, truth, a, b) for pose, a, b in posed])
+    return {"poses": len(errors), "right": int((errors < RIGHT).sum()), "wrong": int((errors > WRONG).sum())}
+
+
+VERIFICATION = {"pairs": 0, "verified": 0, "ms a pair": 1, "pairs a second": 0, "poses": 0, "right": 0, "wrong": 0}
+MODEL = {"registered": 1, "points": 0, "track": 2, "error": 2}
+MODEL |= {f"{name}{limit}": 1 for name in ("auc", "centre") for limit in THRESHOLDS} | {"seconds": 1}
+"""Columns, which are fields of the rows, and their digits; error: px."""
+
+
+def sheets(rows: Sequence[Row]) -> list[Sheet]:
+    """Means of the scenes; pairs and models of each scene and method, means of the seeds."""
+    each: dict[str, list[Record]] = {"means": [], "pairs": [], "models": []}
+    places = [tuple(row[name] for name in ("features", "cameras", "method")) for row in rows]
+    for place in dict.fromkeys(places):
+        own = [_with_speed(row) for row, at in zip(rows, places, strict=True) if at == place]
+        about: Record = dict(zip(("features", "intrinsics", "verified by"), place, strict=True))
+        each["means"].append(about | _means(own))
+        for mapper, scene in dict.fromkeys((row["mapper"], row["scene"]) for row in own):
+            mine = [row for row in own if (row["mapper"], row["scene"]) == (mapper, scene)]
+            line: Record = {**about, **({"mapper": mapper} if mapper else {}), "scene": scene, "seeds": len(mine)}
+            columns = MODEL if mapper else VERIFICATION
+            line |= {name: _mean([row.get(name, np.nan) for row in mine], digits) for name, digits in columns.items()}
+            each["models" if mapper else "pairs"].append(line)
+    return [Sheet(name, f"Verified databases: {name}", records) for name, records in each.items()]
+
+
+def _with_speed(row: Row) -> Row:
+    if row["mapper"]:
+        return {**row, "registered, %": 100 * row["registered"] / row["images"]}
+    return {**row, "ms a pair": 1e3 * row["seconds"] / row["pairs"], "pairs a second": row["pairs"] / row["seconds"]}
+
+
+def _means(rows: Sequence[Row]) -> Record:
+    """Means over the scenes: pairs a second, and of each mapper registered images and AUC of relative poses."""
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+
+    def by_scene(mapper: str, field: str) -> list[float]:
+        own = [[row[field] for row in rows if (row["scene"], row["mapper"]) == (s, mapper)] for s in scenes]
+        return [float(np.mean(values)) for values in own if values]
+
+    speed = sum(by_scene("", "pairs")) / max(sum(by_scene("", "seconds")), 1e-9)
+    line: Record = {"scenes": len(scenes), "pairs a second": f"{speed:.0f}"}
+    for mapper in MAPPERS:
+        for field in ("registered, %", *(f"auc{n}" for n in THRESHOLDS)):
+            line[f"{mapper}: {field}"] = _mean(by_scene(mapper, field), 1)
+    return line
+
+
+def _mean(values: Sequence[float], digits: int) -> str:
+    known = [value for value in values if not np.isnan(value)]
+    return f"{np.mean(known):.{digits}f}" if known else ""

@@ -14,11 +14,10 @@ from fmtorch.core.types import Correspondences, Estimate, collate
 from fmtorch.data import ImageSource
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.pipeline.build import load_pipeline
-from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.commands.test_match import run_python
 from tests.laws import quick, scene, shown
 from tests.pipeline.test_pipeline import draw, pair, pipeline
-from tests.variants import built, keywords, variants
+from tests.variants import OTHER_LIBRARIES, built, keywords, variants
 
 EVERY = [n for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES[1:])]
 PAIRS = [scene(i, count) for i, count in enumerate((60, 90, 40))]

@@ -9,9 +9,8 @@ import torch
 import fmtorch
 from fmtorch import metrics, presets
 from fmtorch.core.types import Correspondences, collate
-from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.laws import quick, scene
-from tests.variants import variants
+from tests.variants import OTHER_LIBRARIES, variants
 
 OWN = [n for n in variants("estimator") if not n.startswith(OTHER_LIBRARIES)]
 WRONG = [

@@ -43,23 +43,23 @@ ELSEWHERE = {
     r"python -m pytest|ruff check|^\.ci/": "what continuous integration does",
     r"scripts/download": "tests/test_download.py runs it against a server of its own",
     r"benchmark homography": "needs a folder of photographs; tests/estimators/models/test_homography.py warps one",
-    r"benchmark configuration": "needs photographs; tests/scripts/test_benchmark_configuration.py runs it on some",
+    r"benchmark configuration": "needs photographs; tests/scripts/test_benchmark_planes.py runs it on some",
     r"\bdask (scheduler|worker)\b": "tests/evaluation/test_executors.py runs a cluster",
     r"--config-dir my_conf (pruner|pipeline)=": "tests/training/test_train_command.py runs these files and commands",
     r"dataset=(tum|kitti|colmap|bundler|fmbench dataset\.root=KITTI)": "tests/data runs these on data of their layout",
     r"pipeline=vismatch|(dataset=|runs/)pair_list": "tests/matching/test_vismatch.py runs a stand-in on lists of pairs",
     r"dataset=hpatches": "tests/evaluation/test_homographies.py runs these on sequences of its own",
-    r"'overlap=|HARD/": "tests/data/test_overlap.py, tests/scripts/test_benchmark_hard.py run these",
-    r"benchmark known_models": "needs the images of a scene; tests/scripts/test_benchmark_known_models.py has some",
+    r"'overlap=|HARD/": "tests/data/test_overlap.py, tests/scripts/test_benchmark_pipelines.py run these",
+    r"benchmark known_models": "needs the images of a scene; tests/scripts/test_benchmark_verify.py has some",
     r"--config-dir my_conf features=": "tests/docs/test_own_parts.py runs this page",
 }
 """Commands that are not run here, and why."""
 
 SLOW = (
     r"fmtorch train",
-    r"benchmark (memory|features)",
+    r"benchmark (memory|features|scale)",
     r"-m pipeline=",
-    r"benchmark (paper|gc_ransac|sweep)",
+    r"benchmark (paper|gc_ransac|learned|refinement)",
 )
 
 PEERS = {"poselib": "poselib", "degensac_cpp": "pydegensac",
@@ -88,38 +88,23 @@ APPENDED = {
     "fmtorch report": ["pictures=1", "root=DATA/Strecha"],
     "estimators": ["--limit", "1", "--seeds", "1"],
     "cameras": ["--limit", "1", "--seeds", "1"],
-    "curves": ["--limit", "1", "--specs", "curves.txt"],
-    "thresholds": ["--limit", "1", "--seeds", "1", "--values", "0.5", "0.75"],
+    "curves": ["--limit", "1", "--curves", "samples | msac:hypotheses={} | 50 100"],
     "pipelines": ["--limit", "1", "--seeds", "1", "--cache", "kept"],
     "paper": ["--limit", "1", "--seeds", "1", "--cache", "kept"],
-    "paper_times": ["--limit", "1"],
-    "gc_ransac": ["--limit", "1", "--cache", "kept"],
-    "sweep": [],
+    "gc_ransac": ["--limit", "1", "--cache", "kept", "--pipelines", "paper/*"],
     "pruning": ["--limit", "1", "--asift-limit", "0", "--cache", "kept"],
-    "refinement": [
-        "--limit",
-        "1",
-        "--seeds",
-        "1",
-        "--cache",
-        "kept",
-        "--pipelines",
-        "sift_fmtorch",
-        "--estimators",
-        "fmtorch",
-    ],
+    "refinement": ["--limit", "1", "--seeds", "1", "--cache", "kept", "--pipelines", "sift_fmtorch, fmtorch*"],
     "posebench": ["--threshold", "1", "--methods", "E:fmtorch", "F:fmtorch"],
-    "related": ["--limit", "1", "--unrelated", "1"],
-    "learned": ["--limit", "1", "--cache", "kept", "--methods", "ratio", "LC, F", "DFE"],
+    "related": ["--limit", "1", "--unrelated", "1", "--cache", "kept", "--pipelines", "sift_gms"],
+    "learned": ["--limit", "1", "--cache", "kept", "--pipelines", "*LC, F", "RANSAC - ratio"],
     "similar": ["--root", "DATA/Strecha"],
     "stress": ["--limit", "1", "--only", "noise"],
     "verify": ["--root", "DATA", "--scenes", "Strecha/a", "--features", "colmap", "--seeds", "1", "--mappers"],
     "speed": ["--pairs", "2", "--batch", "2", "--repeats", "1", "--matches", "200"],
     "memory": ["--pairs", "1", "--matches", "200", "--estimators", "ransac"],
     "end_to_end": ["--limit", "1", "--pipelines", "sift_ratio estimator=lmeds_eight_point"],
-    "stages": ["--size", "120", "160", "--repeats", "1"],
-    "features": ["--features", "100", "--repeats", "1", "--size", "120", "160"],
-    "matching": ["--features", "200", "--repeats", "1"],
+    "features": ["--repeats", "1", "--size", "120", "160", "--features", "hesaffnet_fast"],
+    "scale": ["--parts", "memory", "--rows", "100"],
 }
 """Options that come last and win."""
 
@@ -145,7 +130,6 @@ def smaller(command: str) -> list[str]:
         (r"(dataset\.layout=(\w+) dataset\.root=)FILES", r"\1FILES/\2"),
         (r"benchmark posebench FILES", "benchmark posebench FILES/posebench"),
         (r" root=DIR", ""),
-        (r" d\.json", ""),
         (r"runs=\[runs/a,runs/b\]|runs/a runs/b", "runs=[runs/fmbench]"),
         (r" 'root=\[\S*\]'", ""),
         (r"^(python -m )?fmtorch[. ](\w+)", r"python -m fmtorch \2"),
@@ -158,7 +142,7 @@ def smaller(command: str) -> list[str]:
     added = APPENDED[name]
     if "dataset=h5" in words:
         added = ["limit=1", "workers=1"]
-    if "--from" in words:  # shows what is there
+    if "--rows" in words and "--root" not in words and "--rendered" not in command:  # shows what is there
         added = []
     elif name == "pipelines" and "--overrides" not in words:
         added = [*added, "--overrides", *TINY]
@@ -183,7 +167,6 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for specs in (SOURCE / "scripts" / "benchmark").glob("*.txt"):
         lines = [line for line in specs.read_text().splitlines() if _installed(line.split(" ")[0])]
         (folder / "scripts" / "benchmark" / specs.name).write_text("\n".join(lines))
-    (folder / "curves.txt").write_text("samples | msac:hypotheses={} | 50 100\n")
     pair = data.load("stereo")[0]
     images = [_half(read_image(source)) for source in (pair.image0, pair.image1)]
     halved = np.diag([2.0, 2.0, 1.0])
@@ -283,7 +266,7 @@ def run_all(page_commands: list[str], workplace: Path, monkeypatch: pytest.Monke
     monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(workplace)))
     for command in page_commands:
         print(command)
-        if ("report" in command or "sweep runs" in command) and not (workplace / "runs").exists():
+        if "report" in command and not (workplace / "runs").exists():
             run(smaller("fmtorch eval pipeline=sift_ratio"), workplace)
         run(smaller(command), workplace)
 

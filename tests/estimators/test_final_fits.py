@@ -10,8 +10,8 @@ from torch import Tensor
 
 from fmtorch import presets
 from fmtorch.core.types import Correspondences, collate
-from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.laws import quick, scene, scenes
+from tests.variants import OTHER_LIBRARIES
 
 
 @functools.cache

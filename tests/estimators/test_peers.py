@@ -15,10 +15,9 @@ from fmtorch.core.types import Correspondences, collate
 from fmtorch.estimators import PairwiseEstimator
 from fmtorch.estimators.external.pairwise import Pair, Solution
 from fmtorch.two_view.known_cameras import KnownCameras
-from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.geometry.scenes import scene as matched_scene
 from tests.laws import PEERS, scene
-from tests.variants import built, variants
+from tests.variants import OTHER_LIBRARIES, built, variants
 
 NAMES = [n for n in variants("estimator") if n.startswith(OTHER_LIBRARIES)]
 

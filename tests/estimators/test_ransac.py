@@ -17,10 +17,9 @@ from fmtorch.estimators import Ransac
 from fmtorch.estimators.inliers import residuals_squared_px
 from fmtorch.estimators.pair import Pair
 from fmtorch.jit.kernel import Kernel
-from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.estimators.pairs import pair_of
 from tests.laws import quick, scene, scenes
-from tests.variants import built, variants
+from tests.variants import OTHER_LIBRARIES, built, variants
 
 OWN = [n for n in variants("estimator") if not n.startswith((*OTHER_LIBRARIES, "homography"))]
 

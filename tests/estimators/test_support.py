@@ -19,9 +19,8 @@ from fmtorch.estimators.models.fundamental import Fundamental
 from fmtorch.estimators.models.homography import Homography
 from fmtorch.estimators.models.model import FitScale
 from fmtorch.presets.objects import merged
-from scripts.benchmark.memory import OTHER_LIBRARIES
 from tests.laws import PEERS, few, quick, scene, small
-from tests.variants import built, loaded, variants
+from tests.variants import OTHER_LIBRARIES, built, loaded, variants
 
 EVERY = variants("estimator")
 OWN = [name for name in EVERY if not name.startswith(OTHER_LIBRARIES)]

@@ -26,7 +26,7 @@ from fmtorch.jobs.pool import WorkersLost
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.runs import PairRow
-from scripts.benchmark.scale_pairs import given_pairs
+from scripts.benchmark.pairs import synthetic_pair
 
 PAIRS = 96
 SLOW_SECONDS = 0.3  # of each batch of a slow pipeline, so that there is time to kill its workers
@@ -58,8 +58,8 @@ def build_slow() -> Pipeline:
 
 
 @pytest.fixture(scope="module")
-def pairs(tmp_path_factory: pytest.TempPathFactory) -> list[ImagePair]:
-    return given_pairs(tmp_path_factory.mktemp("given") / "scene", PAIRS)
+def pairs() -> list[ImagePair]:
+    return [synthetic_pair(i, 150, 0) for i in range(PAIRS)]
 
 
 @pytest.fixture(scope="module")

@@ -1,62 +1,100 @@
-"""`scripts/benchmark pipelines`: rows are kept, an interrupted run goes on, tables go into a Markdown file."""
+"""Benchmarks that are pages of settings: commands that resume, tables beside the paper's, pairs that its rule takes."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-from scripts.benchmark.specs import features_of
-from tests.pipeline.test_pipeline import draw
-from tests.processes import run_command
+import pytest
 
-SOURCE = Path(__file__).resolve().parents[2]
-
-
-def benchmark(*arguments: str, cwd: Path) -> str:
-    result = run_command("scripts.benchmark", "pipelines", *arguments, cwd=cwd)
-    assert result.returncode == 0, result.stderr
-    return result.stdout
-
-
-def test_names_of_features_that_begin_alike_are_apart() -> None:
-    names = [
-        "hesaffnet_fmtorch", "hesaffnet_fast_fmtorch", "hesaffnet_gms estimator=lmeds_eight_point", "sift_lc_fmtorch",
-        "sift_code_lmeds", "paper/sift_gms", "given_fmtorch",
-    ]  # fmt: skip
-    assert [features_of(name) for name in names] == [
-        "hesaffnet", "hesaffnet_fast", "hesaffnet", "sift", "sift", "paper/sift", "given_fmtorch",
-    ]  # fmt: skip
+from fmtorch import presets
+from scripts.benchmark.methods import pipeline_of
+from scripts.benchmark.pipelines import (
+    BENCHMARKS,
+    RULE,
+    chosen_pipelines,
+    differences_sheet,
+    figures_sheet,
+    settings_of,
+)
+from scripts.benchmark.runner import Row
+from scripts.benchmark.tables import FIGURES, MEDIANS, Results, published
+from tests.scripts.samples import drawn_set, read, row, run
 
 
-def test_an_interrupted_run_goes_on(tmp_path: Path) -> None:
-    images = tmp_path / "Set" / "scene" / "Images"
-    images.mkdir(parents=True)
-    for i in range(4):
-        draw(images / f"{i:08d}.png", seed=0, shift=9 * i)
-    lines = [f"{i} {j} 0 0 0 0 0 -1 0 1 0" for i, j in ((0, 1), (0, 2), (1, 3))]
-    (tmp_path / "Set" / "pairs_with_gt.txt").write_text("\n".join(lines) + "\n")
-    (tmp_path / "Set" / "pairs_which_dataset.txt").write_text("scene/\n" * len(lines))
-    options = ["--pipelines", "sift_ratio", "rootsiftpca_ratio", "rootsiftpca_gms", "--seeds", "2"]
-    arguments = ["--root", str(tmp_path / "Set"), *options, "--json", str(tmp_path / "rows.jsonl")]
-    benchmark(*arguments, cwd=tmp_path)
-    text = (tmp_path / "rows.jsonl").read_text()
-    rows = [json.loads(line) for line in text.splitlines()]
-    assert len(rows) == 9
-    assert all(len(row["nsgd"]) == 2 and all(row["ok"]) for row in rows)
+@pytest.mark.parametrize("name", [*BENCHMARKS, "related"])
+def test_settings_name_pipelines_columns_and_figures_there_are(name: str) -> None:
+    settings = settings_of(name)
+    assert {*settings.get("columns", ()), *settings.get("compared", ())} <= {*FIGURES, *MEDIANS, "failed"}
+    others = {word for two in settings.get("differences", ()) for word in two} - set(settings["methods"])
+    assert {word.split()[0] for word in others} <= set(presets.available("pipeline"))
+    if "published" in settings:
+        assert published(Path("scripts/benchmark") / settings["published"])
+    for words in list(settings["methods"].values())[::4]:  # composing takes a while
+        assert pipeline_of(words.partition(" + ")[0], "cache=off").pruners
 
-    cut = text[: text.index("\n") + 40]  # a whole line, and one that the interruption cut off
-    (tmp_path / "rows.jsonl").write_text(cut)
-    benchmark(*arguments, cwd=tmp_path)
-    again = (tmp_path / "rows.jsonl").read_text().splitlines()
-    assert len(again) == 9
-    resumed = {(row["method"], row["pair"]): row for row in map(json.loads, again)}
-    assert resumed == {(row["method"], row["pair"]): row for row in rows}
 
-    table = tmp_path / "table.md"
-    table.write_text("before\n<!-- figures -->\n<!-- end of figures -->\nafter\n")
-    benchmark("--from", str(tmp_path / "rows.jsonl"), "--markdown", str(table), cwd=tmp_path)
-    written = table.read_text()
-    assert "### Set: 3 pairs of 1 scene, intervals over pairs" in written
-    assert "| `rootsiftpca_gms` | " in written
-    assert written.startswith("before")
-    assert written.endswith("after\n")
+def test_an_interrupted_run_goes_on_and_its_tables_are_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows, table = tmp_path / "rows.jsonl", tmp_path / "own.csv"
+    mine = "mine = sift_ratio pruner=[ratio] + lpm"
+    arguments = ["--root", drawn_set(tmp_path / "Set", images=3), "--seeds", 2, "--cache", "off", "--rows", rows,
+                 "--pipelines", "RATIO", "GMS*", mine, "--overrides", "features.max_features=300"]  # fmt: skip
+    run(capsys, monkeypatch, "pruning", *arguments)
+    first = read(rows)
+    assert [len([r for r in first if r["method"] == m]) for m in ("RATIO", "GMS", "GMS, scale", "mine")] == [4] * 4
+    assert all(r["ok"] and r["features0"] > 50 for r in first if r["method"] == "RATIO")
+    assert all((r["ms_pruning"] == 0) == (r["method"] == "RATIO") for r in first)
+    rows.write_text("\n".join(rows.read_text().splitlines()[:5]) + '\n{"cut')
+    run(capsys, monkeypatch, "pruning", *arguments)
+    again = {(r["method"], r["pair"], r["seed"]): r["nsgd"] for r in read(rows)}
+    assert again == {(r["method"], r["pair"], r["seed"]): r["nsgd"] for r in first}
+    printed = run(capsys, monkeypatch, "pruning", "--rows", rows, "--table", table)
+    assert "R.05 minus RATIO" in printed
+    assert len(table.read_text().splitlines()) == 5
+    with pytest.raises(SystemExit, match="nothing to show: name sets with --root"):
+        run(capsys, monkeypatch, "pruning", "--rows", tmp_path / "none.jsonl")
+
+
+def test_pipelines_are_taken_by_name_pattern_or_words() -> None:
+    known = {"a": "sift_ratio", "a b": "sift_gms", "c": "sift_lpm"}
+    assert chosen_pipelines(known, ["a*"]) == {"a": "sift_ratio", "a b": "sift_gms"}
+    assert chosen_pipelines(known, ["c", "x = sift_ratio estimator=msac", "sift_lc"]) == {
+        "c": "sift_lpm", "x": "sift_ratio estimator=msac", "sift_lc": "sift_lc",
+    }  # fmt: skip
+    with pytest.raises(SystemExit, match=r"'d\*': there are a, a b, c"):
+        chosen_pipelines(known, ["d*"])
+
+
+def counted(method: str, pair: str, nsgd: float, **others: object) -> Row:
+    counts = {"inlier_rate": 0.75, "inlier_rate_before": 0.5, "corrs": 30, "corrs_before": 40}
+    return row(method, pair, nsgd, **counts, features0=100, features1=300, **others)
+
+
+def test_figures_stand_beside_the_papers() -> None:
+    settings = settings_of("paper")
+    rows = [counted("RANSAC", f"{family}/s{i % 6}/{i}", 0.2) for family in ("TUM", "orbit") for i in range(12)]
+    rows += [counted("LMedS", f"TUM/s{i % 6}/{i}", 0.01 if i % 4 else 0.2) for i in range(12)]
+    results = Results(rows)
+    lines = {(line["set"], line["pipeline"]): line for line in figures_sheet(results, settings, set()).records}
+    lmeds = lines["TUM", "LMedS"]
+    assert lmeds["%Recall"].value == "75.0"
+    assert (lmeds["paper: %Recall"], lmeds["paper's set"], lmeds["keypoints"].value) == ("69.2", "TUM", "200")
+    assert (lmeds["kept, %"].value, lines["orbit", "RANSAC"]["paper's set"]) == ("75", "T&T")
+    (line,) = (each for each in differences_sheet(results, settings).records if each["set"] == "TUM")
+    assert (line["pipeline"], line["minus"], line["%Recall"].value) == ("LMedS", "RANSAC", "+75.0")
+    assert line["paper: %Recall"] == "+11.8"  # 69.2 - 57.4
+
+
+def test_recall_is_given_apart_for_pairs_that_the_rule_leaves_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solved = {"sift_ratio": (0.01, 0.3), "sift_fmtorch": (0.01, 0.01)}  # pairs that it selects, and others
+    results = Results(counted(m, f"orbit/s/{i}", solved[m][i % 2]) for m in solved for i in range(4))
+    ratio, own = figures_sheet(results, settings_of("hard"), {"orbit/s/0", "orbit/s/2"}).records
+    assert [ratio[f"%Recall, {part}"] for part in ("selected", "left out")] == ["100.0", "0.0"]
+    assert [own[f"%Recall, {part}"] for part in ("selected", "left out")] == ["100.0", "100.0"]
+    rows = tmp_path / "rows.jsonl"
+    run(capsys, monkeypatch, "hard", "--root", drawn_set(tmp_path / "Set"), "--pipelines", "sift_ratio", "--seeds", 1,
+        "--cache", "off", "--rows", rows)  # fmt: skip
+    assert [(r["method"], r.get("selected")) for r in read(rows)] == [(RULE, True), ("sift_ratio", None)]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
-import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -16,12 +14,14 @@ import pytest
 from fmtorch import data, presets
 from fmtorch.core.types import Correspondences
 from fmtorch.data import ImagePair
-from fmtorch.pipeline.build import load_pipeline
-from scripts.benchmark import __main__, posebench, posebench_methods
-from scripts.benchmark.sheet import MISSING
+from scripts.benchmark import posebench
+from scripts.benchmark.methods import pipeline_of
+from scripts.benchmark.posebench import Protocol
+from scripts.benchmark.tables import Results
 from tests.conftest import shared_path
 from tests.reference import metrics as reference
 from tests.reference import solvers
+from tests.scripts.samples import read, row, run
 from tests.storage.exchange.writers import posebench_group
 
 SET, THRESHOLD = "imc_london_bridge", 0.75
@@ -33,7 +33,7 @@ PROTOCOL = {"max_epipolar_error": THRESHOLD, "max_iterations": 1000, "min_iterat
 def real() -> list[tuple[ImagePair, Correspondences]]:
     """Some real pairs and their matches."""
     dataset = data.load("fmbench", root=shared_path("data/PhotoTourism"))
-    outcomes = load_pipeline("sift_ratio").correspondences([dataset[i] for i in range(PAIRS)])
+    outcomes = pipeline_of("sift_ratio").correspondences([dataset[i] for i in range(PAIRS)])
     return [(o.pair, o.correspondences) for o in outcomes if o.correspondences is not None]
 
 
@@ -53,19 +53,10 @@ def sample(folder: Path, name: str = SET, sized: bool = True) -> Path:
     return folder
 
 
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: object) -> str:
-    monkeypatch.setattr(sys, "argv", ["benchmark", "posebench", *map(str, arguments)])
-    __main__.main()
-    return capsys.readouterr().out
-
-
 def direct(method: str) -> list[float]:
     """The larger angle of each pair: the libraries called as PoseBench calls them, judged by its definitions."""
     errors = []
-    for i, (pair, c) in enumerate(real()):
-        if i == PAIRS - 1:
-            errors.append(180.0)  # three matches
-            continue
+    for pair, c in real()[:-1]:
         x, motion = matched(c), (pair.R, pair.t)
         cameras = [
             {"model": "PINHOLE", "width": int(s[0, 1]), "height": int(s[0, 0]),
@@ -78,7 +69,7 @@ def direct(method: str) -> list[float]:
         else:
             angles = reference.rotation_angle(R, pair.R), reference.signed_direction_angle(t, pair.t)
         errors.append(max(angles))
-    return errors
+    return [*errors, 180.0]  # three matches
 
 
 def _poselib_e(x: Any, cameras: Any) -> Any:
@@ -119,16 +110,17 @@ def test_peers_have_the_figures_of_posebenchs_own_protocol(
 ) -> None:
     expected = direct(method)
     rows = tmp_path / "rows.jsonl"
-    printed = run(capsys, monkeypatch, sample(tmp_path / "relative"), "--methods", method, "--rows", rows)
-    stored = [json.loads(line) for line in rows.read_text().splitlines()]
+    folder = sample(tmp_path / "relative")
+    printed = run(capsys, monkeypatch, "posebench", folder, "--methods", method, "--rows", rows)
+    errors = [max(each["rotation_error"], each["translation_error"]) for each in read(rows)]
     # arccos at a cosine near 1 is exact to the root of its rounding; pixels with a central principal point, to 1e-7
-    assert [max(row["rotation"], row["translation"]) for row in stored] == pytest.approx(expected, abs=1e-3)
+    assert errors == pytest.approx(expected, abs=1e-3)
     areas = [100 * area for area in reference.pose_auc(expected, (5.0, 10.0, 20.0))]
-    assert posebench.areas(stored) == pytest.approx(areas, abs=0.02)
-    assert " / ".join(f"{value:.1f}" for value in posebench.areas(stored)) in printed
-    published = {"E:poselib": "56.6 / 70.7 / 81.1", "F:colmap": "33.0 / 45.1 / 55.7"}  # of the whole set
+    results = Results(read(rows))
+    assert list(posebench.areas(results, method, results.all_pairs).values()) == pytest.approx(areas, abs=0.02)
+    published = {"E:poselib": "56.6", "F:colmap": "33.0"}  # of the whole set
     assert published.get(method, "") in printed
-    assert [row["reason"] != "" for row in stored] == [False] * (PAIRS - 1) + [True]
+    assert [each["reason"] != "" for each in read(rows)] == [False] * (PAIRS - 1) + [True]
 
 
 def test_our_estimators_run_by_the_protocol_and_a_run_goes_on_where_it_stopped(
@@ -136,47 +128,38 @@ def test_our_estimators_run_by_the_protocol_and_a_run_goes_on_where_it_stopped(
 ) -> None:
     rows, methods = tmp_path / "rows.jsonl", ["E:fmtorch", "F:fmtorch", "E:fmtorch:scaled=false"]
     arguments = [sample(tmp_path / "relative").parent, "--methods", *methods, "--rows", rows]
-    printed = run(capsys, monkeypatch, *arguments, "--every", 3)
-    printed = " ".join(printed.split())
-    assert "means of 1 set, 1 of PoseBench's 20; 2 pairs" in printed
-    assert "E:colmap │ – │ 45.0 / 61.4 / 75.4" in printed  # published, not run
-    first = rows.read_text().splitlines()
+    printed = run(capsys, monkeypatch, "posebench", *arguments, "--every", 3)
+    assert "1 sets, 1 of its 20; 2 pairs" in printed
+    assert [line.split("|")[2].strip() for line in printed.splitlines() if "E:colmap" in line] == ["E:colmap"] * 2
+    first = read(rows)
     assert len(first) == 2 * len(methods)
-    page = tmp_path / "page.md"
-    page.write_text("a\n<!-- posebench -->\n<!-- end of posebench -->\nz\n")
-    run(capsys, monkeypatch, *arguments, "--markdown", page)
-    lines = rows.read_text().splitlines()
-    assert len(lines) == PAIRS * len(methods)
-    assert lines[: len(first)] == first
-    posed = [row for row in map(json.loads, lines) if not row["reason"]]
-    assert len(posed) >= (PAIRS - 1) * len(methods) - 1
-    assert np.median([max(row["rotation"], row["translation"]) for row in posed]) < 5
-    text = page.read_text()
-    assert text.startswith("a\n")
-    assert text.endswith("z\n")
-    assert re.search(rf"\| {SET} \| E:fmtorch \| 0\.75 \| {PAIRS} \| \d", text)
+    run(capsys, monkeypatch, "posebench", *arguments)
+    assert read(rows)[: len(first)] == first
+    posed = [each for each in read(rows) if not each["reason"]]
+    assert PAIRS * len(methods) >= len(posed) >= (PAIRS - 1) * len(methods) - 1
+    assert np.median([max(each["rotation_error"], each["translation_error"]) for each in posed]) < 5
 
 
 def test_the_protocol_gives_each_estimator_its_options() -> None:
-    read, protocol = posebench_methods.read, posebench_methods.protocol
-    assert protocol(read("F:poselib"), 2.5) == {
+    def protocol(text: str, px: float) -> dict[str, Any]:
+        return Protocol.of(text).options(px)
+
+    assert protocol("F:poselib", 2.5) == {
         "threshold": 2.5, "iterations": 1000, "min_iterations": 100, "confidence": 0.9999,
     }  # fmt: skip
-    assert protocol(read("E:colmap:two_view=true"), 1.5)["two_view"] is True
-    assert protocol(read("E:colmap"), 1.5)["two_view"] is False
-    preset = presets.load("estimator", "fmtorch")
-    own = protocol(read("E:fmtorch"), 2.0)
+    assert [protocol(f"E:colmap{o}", 1.5)["two_view"] for o in ("", ":two_view=true")] == [False, True]
+    preset, own = presets.load("estimator", "fmtorch"), protocol("E:fmtorch", 2.0)
     assert own["threshold"] == 2 * preset["threshold"]
     assert own["select"]["scale"] == 2 * preset["select"]["scale"]
     assert own["focal"]["exact"]["scale"] == 2 * preset["focal"]["exact"]["scale"]
     assert (own["hypotheses"], own["focal"]["rounds"] * preset["focal"]["samples"]) == (1000, 1000)
-    kept = protocol(read("E:fmtorch:scaled=false,focal.rounds=12"), 2.0)
+    kept = protocol("E:fmtorch:scaled=false,focal.rounds=12", 2.0)
     assert "threshold" not in kept
     assert kept["focal"] == {"rounds": 12}
     presets.build("estimator", "fmtorch", **own)
     for wrong in ("fmtorch", "H:fmtorch", "E:nobody"):
         with pytest.raises(SystemExit, match="write KIND:PRESET"):
-            read(wrong)
+            Protocol.of(wrong)
 
 
 def test_the_published_figures_are_those_of_the_twenty_pinhole_sets() -> None:
@@ -185,10 +168,11 @@ def test_the_published_figures_are_those_of_the_twenty_pinhole_sets() -> None:
     assert {name.partition("_")[0]: px for name, px in thresholds.items() if "scannet" not in name} == {
         "megadepth1500": 1.0, "imc": 0.75,
     }  # fmt: skip
-    means = {method: posebench.shown(posebench.mean(list(sets.values()))) for method, sets in figures.items()}
+    means = {m: [round(float(np.mean([each[h] for each in of.values()])), 1) for h in next(iter(of.values()))]
+             for m, of in figures.items()}  # fmt: skip
     assert means == {
-        "E:poselib": "49.1 / 63.5 / 74.7", "E:colmap": "42.3 / 58.6 / 71.7", "F:poselib": "34.0 / 47.9 / 60.5",
-        "F:colmap": "29.4 / 43.1 / 56.5",
+        "E:poselib": [49.1, 63.5, 74.7], "E:colmap": [42.3, 58.6, 71.7], "F:poselib": [34.0, 47.9, 60.5],
+        "F:colmap": [29.4, 43.1, 56.5],
     }  # fmt: skip
     assert all(set(sets) == set(thresholds) for sets in figures.values())
 
@@ -197,65 +181,47 @@ def test_what_is_not_posebenchs_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     own = sample(tmp_path / "own", "mine")
+    lmeds = ["--methods", "F:opencv:method=lmeds"]
     with pytest.raises(SystemExit, match=r"mine\.h5 is none of PoseBench's sets: give its threshold in pixels"):
-        run(capsys, monkeypatch, own)
-    printed = run(capsys, monkeypatch, own, "--threshold", 1, "--methods", "F:opencv:method=lmeds")
-    assert MISSING in printed
+        run(capsys, monkeypatch, "posebench", own)
+    assert "published" not in run(capsys, monkeypatch, "posebench", own, "--threshold", 1, *lmeds).splitlines()[2]
     with pytest.raises(SystemExit, match=r"holds no file \.h5 or \.hdf5; give the folder `relative`"):
-        run(capsys, monkeypatch, tmp_path)
+        run(capsys, monkeypatch, "posebench", tmp_path)
+    with h5py.File(own / "mine.h5", "r+") as file:
+        del file["001/camera1/model"]
+        file["001/camera1/model"] = np.array(["OPENCV_FISHEYE"], dtype=h5py.string_dtype())
+    assert f" {PAIRS - 1} pairs" in run(capsys, monkeypatch, "posebench", own, "--threshold", 1, *lmeds)
     (tmp_path / "fisheye").mkdir()
     (own / "mine.h5").rename(tmp_path / "fisheye" / "fisheye_church.h5")
     with pytest.raises(SystemExit, match="no pair of pinhole cameras"):
-        run(capsys, monkeypatch, tmp_path / "fisheye")
+        run(capsys, monkeypatch, "posebench", tmp_path / "fisheye")
+    root = shared_path("data/PhotoTourism")
+    with pytest.raises(SystemExit, match="--root: give the threshold in pixels"):
+        run(capsys, monkeypatch, "posebench", "--root", root)
+    with pytest.raises(SystemExit, match="name FILES, the folder `relative`"):
+        run(capsys, monkeypatch, "posebench")
+    printed = run(capsys, monkeypatch, "posebench", "--root", root, "--limit", 2, "--threshold", THRESHOLD, *lmeds)
+    assert "0 of its 20; 2 pairs" in printed
 
 
 def test_a_lead_is_the_difference_of_the_means_of_sets() -> None:
-    def rows(errors: list[float]) -> list[dict[str, Any]]:
-        return [{"rotation": e, "translation": 0.0, "scene": f"s/{i}"} for i, e in enumerate(errors)]
+    errors = {"E:a": ([0.0, 0.0] * 9, [5.0, 2.5, 180.0, 0.0] * 9), "E:b": ([5.0, 0.0] * 9, [180.0] * 36)}
+    results = Results(
+        row(method, f"{name}/s{i}/{i}", rotation_error=error, translation_error=0.0)
+        for method, sets in errors.items() for name, of in zip(("one", "two"), sets, strict=True)
+        for i, error in enumerate(of)
+    )  # fmt: skip
+    sets = {name: own for name, own in results.groups(results.all_pairs).items() if name in ("one", "two")}
+    assert posebench.lead(results, sets, "E:a") == posebench.lead(results, sets, "F:c") == ""
+    expected = 100 * ((1 + 1.5 / 4) / 2 - (0.5 + 0) / 2)
+    assert posebench.lead(results, sets, "E:b").value == f"{expected:+.1f}"
 
-    own = {
-        "E:a": {"one": rows([0.0, 0.0] * 9), "two": rows([5.0, 2.5, 180.0, 0.0] * 9)},
-        "E:b": {"one": rows([5.0, 0.0] * 9), "two": rows([180.0] * 36)}, "F:c": {},
-    }  # fmt: skip
-    assert posebench.lead(own, "E:a") == posebench.lead(own, "F:c") == ""
-    assert posebench.lead(own, "E:b").startswith(f"{100 * ((1 + 1.5 / 4) / 2 - (0.5 + 0) / 2):+.1f} [")
 
-
-def test_a_library_that_is_missing_is_left_out_or_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_library_that_is_missing_is_left_out_or_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    folder = sample(tmp_path / "relative")
     with pytest.raises(SystemExit, match=r"E:colmap: COLMAP .pycolmap. is not installed: pip install 'fmtorch\[co"):
-        run(capsys, monkeypatch, folder, "--methods", "E:colmap")
-    printed = " ".join(run(capsys, monkeypatch, folder, "--every", PAIRS).split())
-    assert "F:colmap is left out: COLMAP (pycolmap) is not installed: pip install 'fmtorch[colmap]'" in printed
-    assert "F:fmtorch" in printed
-
-
-def test_pairs_of_other_sets_are_judged_alike(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    root = shared_path("data/PhotoTourism")
-    arguments = ["--root", root, "--limit", 2, "--threshold", THRESHOLD, "--methods", "F:opencv:method=lmeds"]
-    printed = run(capsys, monkeypatch, *arguments)
-    assert "means of 1 set; 2 pairs" in " ".join(printed.split())
-    with pytest.raises(SystemExit, match="--root: give the threshold in pixels"):
-        run(capsys, monkeypatch, "--root", root)
-    with pytest.raises(SystemExit, match="name FILES, the folder `relative`"):
-        run(capsys, monkeypatch)
-
-
-def test_pairs_with_distortion_are_left_out_and_said(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = sample(tmp_path / "relative")
-    with h5py.File(folder / f"{SET}.h5", "r+") as file:
-        del file["001/camera1/model"]
-        file["001/camera1/model"] = np.array(["OPENCV_FISHEYE"], dtype=h5py.string_dtype())
-    printed = " ".join(run(capsys, monkeypatch, folder, "--methods", "F:opencv:method=lmeds").split())
-    assert f"1 of {PAIRS} pairs left out" in printed
-    assert f"means of 1 set, 1 of PoseBench's 20; {PAIRS - 1} pairs" in printed
+        posebench.installed(["E:colmap"])
+    assert "E:colmap" not in [each.name for each in posebench.installed(posebench.METHODS)]
 
 
 def test_cameras_without_sizes_have_the_same_poses(
@@ -266,6 +232,6 @@ def test_cameras_without_sizes_have_the_same_poses(
     for sized in (True, False):
         rows = tmp_path / f"{sized}.jsonl"
         folder = sample(tmp_path / str(sized), sized=sized)
-        run(capsys, monkeypatch, folder, "--methods", "E:fmtorch", "--rows", rows)
-        errors.append([json.loads(line)["rotation"] for line in rows.read_text().splitlines()])
+        run(capsys, monkeypatch, "posebench", folder, "--methods", "E:fmtorch", "--rows", rows)
+        errors.append([each["rotation_error"] for each in read(rows)])
     assert errors[0] == pytest.approx(errors[1], abs=1e-3)

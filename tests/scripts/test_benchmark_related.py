@@ -1,8 +1,7 @@
-"""`python -m scripts.benchmark related`: unrelated pairs, rows that are kept, tables."""
+"""`python -m scripts.benchmark related`: unrelated pairs, tables, ROC curves, and the command."""
 
 from __future__ import annotations
 
-import argparse
 import math
 from pathlib import Path
 from xml.etree import ElementTree
@@ -12,118 +11,88 @@ import pytest
 
 from fmtorch.core.types import RELATED
 from fmtorch.data import ImagePair, ImageSource
-from scripts.benchmark import related, related_figure, related_pairs, related_table
-from tests.pipeline.test_pipeline import draw
+from fmtorch.scenes.dataset import RenderedPairs
+from fmtorch.scenes.generate import Plan
+from fmtorch.scenes.textures import PICTURES
+from scripts.benchmark import pairs, related
+from scripts.benchmark.runner import Row
+from tests.scripts.samples import drawn_set, read, run
+from tests.scripts.samples import row as plain_row
 
 
-def pair(scene: str, i: int, j: int, family: str = "family") -> ImagePair:
+def pair(scene: str, i: int, j: int) -> ImagePair:
     images = [ImageSource(f"{scene}/{k}", Path(f"{scene}{k}.png")) for k in (i, j)]
-    return ImagePair(f"{family}/{scene}/{i}-{j}", family, scene, *images, np.eye(3))
+    return ImagePair(f"family/{scene}/{i}-{j}", "family", scene, *images, np.eye(3))
+
+
+def row(true: bool, nsgd: float, significance: float, inliers: int) -> Row:
+    of = "f" if true else pairs.UNRELATED
+    return plain_row("sift", f"{of}/s/{id(object())}", nsgd, significance=significance, corrs=inliers, corrs_before=50)
 
 
 def test_unrelated_pairs_cross_scenes_and_are_chosen_once() -> None:
-    related_ones = [pair(scene, i, i + 1) for scene in ("a", "b", "c") for i in range(4)]
-    unrelated = related_pairs.unrelated_pairs(related_ones, [], 100)
-    assert len(unrelated) == len({p.identity for p in unrelated}) == 3 * 5 * 5
-    places = [{p.image0.identity[0], p.image1.identity[0]} for p in unrelated]
-    assert all(len(place) == 2 for place in places)
-    assert len({frozenset((p.image0.identity, p.image1.identity)) for p in unrelated}) == 75
-    subset = related_pairs.unrelated_pairs(related_ones, [], 7)
-    assert {p.identity for p in subset} < {p.identity for p in unrelated}
-    assert len(subset) == 3 * 7
-    assert all(p.family.startswith(related_pairs.UNRELATED) and not p.F.any() for p in unrelated)
+    ours = [pair(scene, i, i + 1) for scene in ("a", "b", "c") for i in range(4)]
+    every = pairs.unrelated_pairs(ours, [], 100)
+    assert len(every) == len({frozenset((p.image0.identity, p.image1.identity)) for p in every}) == 3 * 5 * 5
+    assert all(p.image0.identity[0] != p.image1.identity[0] for p in every)
+    some = pairs.unrelated_pairs(ours, [], 7)
+    assert {p.identity for p in some} < {p.identity for p in every}
+    assert len(some) == 3 * 7
+    assert all(p.family.startswith(pairs.UNRELATED) and not p.F.any() for p in every)
 
 
-def test_rendered_scenes_that_show_one_photograph_are_not_paired(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rendered_scenes_that_show_one_photograph_are_not_paired(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset = RenderedPairs("train", families=["indoor"], root=tmp_path, plan=Plan(1, 2, 1, scale=0.2), workers=1)
+    (shown,) = pairs.photographs_shown(dataset).values()
+    assert shown
+    assert shown <= set(PICTURES["train"])
     shows = {"a": frozenset({"moon"}), "b": frozenset({"moon", "text"}), "c": frozenset({"text"}), "d": frozenset()}
-    monkeypatch.setattr(related_pairs, "photographs_shown", lambda dataset: shows)
-    monkeypatch.setattr(related_pairs, "RenderedPairs", list)
-    pairs = [pair(scene, 0, 1) for scene in "abcd"] + [pair("real", 0, 1)]
-    unrelated = related_pairs.unrelated_pairs(pairs, [[]], 100)
+    monkeypatch.setattr(pairs, "photographs_shown", lambda dataset: shows)
+    monkeypatch.setattr(pairs, "RenderedPairs", list)
+    unrelated = pairs.unrelated_pairs([*(pair(scene, 0, 1) for scene in "abcd"), pair("real", 0, 1)], [[]], 100)
     crossed = {p.scene.replace("family/", "") for p in unrelated}
     assert crossed == {"a | c", "a | d", "b | d", "c | d"}  # neither a | b, b | c, nor a drawn and a real one
 
 
-def test_the_photographs_of_a_drawn_scene_are_known(tmp_path: Path) -> None:
-    from fmtorch.scenes import RenderedPairs
-    from fmtorch.scenes.generate import Plan
-    from fmtorch.scenes.textures import PICTURES
-
-    plan = Plan(1, 2, 1, scale=0.2)
-    dataset = RenderedPairs("train", families=["indoor"], root=tmp_path, plan=plan, workers=1)
-    (shown,) = related_pairs.photographs_shown(dataset).values()
-    assert shown
-    assert shown <= set(PICTURES["train"])
-
-
-def row(true: bool, nsgd: float, significance: float, inliers: int, matches: int = 50) -> related_table.Row:
-    return {
-        "pair": "p", "family": "f" if true else related_pairs.UNRELATED, "scene": "s", "true": true, "ok": True,
-        "nsgd": nsgd, "significance": significance, "inliers": inliers, "matches": matches,
-    }  # fmt: skip
-
-
 def test_area_counts_ties_half() -> None:
     right, unrelated = [row(True, 0, s, 9) for s in (1.0, 2.0)], [row(False, 1, s, 9) for s in (0.0, 1.0, -math.inf)]
-    assert related_table.area(right, unrelated, lambda r: r["significance"]) == pytest.approx(5.5 / 6)
-    assert related_table.area(right, unrelated, lambda r: r["inliers"]) == 0.5
+    assert related.area(right, unrelated, related.significance) == pytest.approx(5.5 / 6)
+    assert related.area(right, unrelated, related.inliers) == 0.5
 
 
 def test_tables_tell_what_each_rule_does() -> None:
-    rows = [row(False, 1, -3.0, 12), row(False, 1, RELATED, 16), row(True, 0.01, 9.0, 14), row(True, 0.9, 0.0, 14)]
-    text = related_table.text({"sift": rows})
-    assert "| `sift` | 2 | 1 |" in text
-    assert "50.00 / 0.00 | 50.00 / 0.00 | 0.00 / 0.00 |" in text  # at three of the levels
-    assert "1 of 1; 0 of 1" in text  # of the family
-    assert "0 of 0; 1 of 2" in text  # of unrelated pairs
+    of_scenes = [row(False, 1, -3.0, 12), row(False, 1, RELATED, 16)]
+    rows = {"sift": [*of_scenes, row(True, 0.01, 9.0, 14), row(True, 0.9, 0, 14)]}
+    (line,) = related.rates_sheet(rows).records
+    assert (line["unrelated pairs"], line["right pairs"], line["accepted, %"].value) == (2, 1, "50.00")
+    rates = [line[f"{rule}: {kind}, %"] for rule in related.RULES for kind in ("accepted", "rejected")]
+    assert rates == ["50.00", "100.00", "50.00", "100.00", "0.00", "100.00"]
+    levels = {each["level"]: each for each in related.levels_sheet(rows).records}
+    assert (levels["-2"]["accepted, %"], levels["-2"]["rejected, %"]) == ("50.00", "0.00")
+    own, other = ([v for k, v in line.items() if "pairs" in k] for line in related.sets_sheet(rows).records)
+    assert (own, other) == ([1, 1, 1, 0], [0, 0, 2, 1])
 
 
-def test_roc_goes_from_all_to_none_and_is_drawn_the_same_every_time(tmp_path: Path) -> None:
+def test_roc_goes_from_all_to_none(tmp_path: Path) -> None:
     rows = [row(False, 1, s, 9) for s in (-math.inf, 0.0, 1.0)] + [row(True, 0, s, 9) for s in (1.0, 2.0)]
-    accepted, rejected = related_figure.roc([*rows, row(True, 0.9, 3.0, 9)], related_table.significance)
+    accepted, rejected = related.roc([*rows, row(True, 0.9, 3.0, 9)], related.significance)
     assert accepted.tolist() == pytest.approx([1, 2 / 3, 1 / 3, 0, 0])  # at -inf, 0, 1, 2 and above all
     assert rejected.tolist() == [0, 0, 0, 0.5, 1]
-    for name in ("a.svg", "b.svg"):
-        related_figure.draw({"sift_a": rows, "sift_b": rows[:1] + rows[4:], "none": rows[:3]}, tmp_path / name)
-    drawn = (tmp_path / "a.svg").read_text()
-    assert drawn == (tmp_path / "b.svg").read_text()
-    texts = [element.text.strip() for element in ElementTree.fromstring(drawn).iter("{http://www.w3.org/2000/svg}text")]
-    assert {"sift_a", "sift_b (along the axes)", "unrelated pairs accepted, %", "right pairs rejected, %"} <= set(texts)
+    related.draw({"sift_a": rows, "sift_b": rows[:1] + rows[4:], "none": rows[:3]}, tmp_path / "a.svg")
+    texts = {element.text for element in ElementTree.parse(tmp_path / "a.svg").iter() if element.text}
+    assert {"sift_a", "sift_b (along the axes)", "unrelated pairs accepted, %"} <= texts
 
 
-LMEDS = "sift_ratio estimator=lmeds_eight_point"
-
-
-def test_an_interrupted_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for seed, scene in enumerate(("a", "b")):
-        images = tmp_path / "Set" / scene / "Images"
-        images.mkdir(parents=True)
-        for i in range(2):
-            draw(images / f"{i:08d}.png", seed=seed, shift=9 * i)
-    (tmp_path / "Set" / "pairs_with_gt.txt").write_text("0 1 0 0 0 0 0 -1 0 1 0\n" * 2)
-    (tmp_path / "Set" / "pairs_which_dataset.txt").write_text("a/\nb/\n")
-    page = tmp_path / "page.md"
-    page.write_text("<!-- related -->\n<!-- end related -->\n")
-    arguments = argparse.Namespace(
-        root=[str(tmp_path / "Set")], rendered=None, split="test", limit=None, pipelines=[LMEDS, "sift_gms"],
-        unrelated=3, folder=tmp_path / "kept", update=page, marker="related",
-        figure=tmp_path / "roc.svg",
-    )  # fmt: skip
-    monkeypatch.setattr(related, "BATCH", 2)
-    related.run(arguments)
-    rows = related.read(arguments.folder, arguments.pipelines)
-    assert {name: len(method_rows) for name, method_rows in rows.items()} == {LMEDS: 5, "sift_gms": 5}
-    assert [r["true"] for r in sorted(rows[LMEDS], key=lambda r: r["pair"])].count(True) == 2
-    assert all(r["significance"] > RELATED for r in rows[LMEDS] if r["true"])
-    assert not any(r["significance"] >= RELATED for r in rows[LMEDS] if not r["true"])
-    text = page.read_text()
-    assert "sift_gms" in text
-    assert LMEDS in arguments.figure.read_text()
-
-    next((tmp_path / "kept" / "rows" / "sift_gms").iterdir()).unlink()
-    monkeypatch.setattr(related.Pipeline, "match", lambda *_: pytest.fail("matches are kept"))
-    related.run(arguments)
-    assert related.read(arguments.folder, arguments.pipelines) == rows
-    assert page.read_text() == text
-    with pytest.raises(SystemExit, match="has no lines"):
-        related.run(argparse.Namespace(**{**vars(arguments), "marker": "other"}))
+def test_the_command_tells_pairs_apart(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows, pipelines = tmp_path / "rows.jsonl", ["sift_gms", "sift_ratio*"]
+    run(capsys, monkeypatch, "related", "--root", drawn_set(tmp_path / "Set", "ab"), "--unrelated", 3, "--pipelines",
+        *pipelines, "--cache", "off", "--rows", rows, "--figure", tmp_path / "roc.svg")  # fmt: skip
+    own = read(rows)
+    assert len(own) == 2 * (2 + 3)
+    assert all(related.called_related(r) == related.true(r) for r in own)
+    assert "sift_gms" in run(capsys, monkeypatch, "related", "--rows", rows)
+    assert "estimator=lmeds_eight_point" in (tmp_path / "roc.svg").read_text()

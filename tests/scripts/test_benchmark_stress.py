@@ -1,8 +1,7 @@
-"""The stress test: what each change does to matches and to F, rows that are kept, tables and figures."""
+"""The stress test: what each change does to matches and to F, and the command."""
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -11,23 +10,24 @@ import pytest
 import torch
 
 from fmtorch.core.types import Correspondences
-from fmtorch.data import ImagePair, ImageSource
+from fmtorch.data import ImagePair
 from fmtorch.geometry import fundamental_from_calibration
-from scripts.benchmark import stress, stress_cases, stress_rows, stress_table
-from scripts.benchmark.stress_cases import RIGHT_PX, Case, on_plane, parallax
-from scripts.benchmark.stress_changes import CONDITIONS, COUNTS, INLIER_RATIOS, SWEEPS, ZOOM, match_count, noise, sizes
+from scripts.benchmark import stress, stress_changes
+from scripts.benchmark.stress_changes import CONDITIONED, COUNTS, INLIER_RATIOS, RIGHT_PX, SWEEPS, ZOOM, Case
+from tests.scripts.samples import drawn_set, pair, read, row, run
 
 FOCAL, SIZE = 900.0, (600, 800)  # px, (h, w)
+CONDITIONS = SWEEPS[CONDITIONED]
 
 
-def nearest(pair: ImagePair, rng: np.random.Generator, right: int, flat: int, wrong: int) -> Correspondences:
+def nearest(of: ImagePair, rng: np.random.Generator, right: int, flat: int, wrong: int) -> Correspondences:
     """Nearest neighbours of a pair: right ones, some on a plane, then twice as many wrong ones."""
     h, w = SIZE
     n = right + flat
     depth = np.concatenate([rng.uniform(6, 9, right), np.full(flat, 7.0)])
     x0 = rng.uniform([60, 60], [w - 60, h - 60], (n, 2))
-    X = np.concatenate([x0, np.ones((n, 1))], 1) @ np.linalg.inv(pair.K0).T * depth[:, None]
-    x1 = (X @ pair.R.T + pair.t) @ pair.K1.T
+    X = np.concatenate([x0, np.ones((n, 1))], 1) @ np.linalg.inv(of.K0).T * depth[:, None]
+    x1 = (X @ of.R.T + of.t) @ of.K1.T
     x1 = x1[:, :2] / x1[:, 2:] + rng.normal(0, 0.2, (n, 2))
     x = [np.concatenate([x, rng.uniform([0, 0], [w, h], (2 * wrong, 2))]) for x in (x0, x1)]
     ratio = np.concatenate([rng.uniform(0.3, 0.7, n), np.full(wrong, 0.75), np.full(wrong, 0.95)])
@@ -40,14 +40,12 @@ def nearest(pair: ImagePair, rng: np.random.Generator, right: int, flat: int, wr
     )  # fmt: skip
 
 
-def case(index: int = 0, turn: float = 0.1, t: tuple[float, float, float] = (-1.0, 0.1, 0.05)) -> Case:
-    rng = np.random.default_rng(index)
+def case(turn: float = 0.1, t: tuple[float, float, float] = (-1.0, 0.1, 0.05)) -> Case:
     K = np.array([[FOCAL, 0, (SIZE[1] - 1) / 2], [0, FOCAL, (SIZE[0] - 1) / 2], [0, 0, 1]])
     R = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
     F = fundamental_from_calibration(*(torch.from_numpy(np.asarray(a, np.float64)) for a in (K, K, R, t))).numpy()
-    image = ImageSource("none", Path("none.png"))
-    pair = ImagePair(f"orbit/a/{index}", "orbit", "a", image, image, F, K, K, R, np.array(t))
-    return stress_cases.case_of(pair, nearest(pair, rng, right=150, flat=60, wrong=600))
+    of = pair("orbit/a/0", F, K0=K, K1=K, R=R, t=np.array(t))
+    return stress_changes.case_of(of, nearest(of, np.random.default_rng(0), right=150, flat=60, wrong=600))
 
 
 def test_right_and_wrong_are_told_by_the_true_matrix() -> None:
@@ -56,30 +54,29 @@ def test_right_and_wrong_are_told_by_the_true_matrix() -> None:
     assert base.right[210:].float().mean() < 0.05
     assert not (base.right & base.wrong).any()
     assert (base.spare.quality > 0.8).all()
-    assert on_plane(base)[150:210].float().mean() > 0.95
-    assert on_plane(base)[:150].float().mean() < 0.5
-    assert parallax(base) > 50
-    assert parallax(case(t=(-1e-4, 0.0, 0.0))) < 1
+    flat = stress_changes.on_plane(base)
+    assert flat[150:210].float().mean() > 0.95
+    assert flat[:150].float().mean() < 0.5
+    assert stress_changes.parallax(base) > 50
+    assert stress_changes.parallax(case(t=(-1e-4, 0.0, 0.0))) < 1
 
 
 @pytest.mark.parametrize("name", CONDITIONS)
 def test_right_matches_stay_right_under_every_condition(name: str) -> None:
-    base = case()
-    changed = CONDITIONS[name](base)
+    changed = CONDITIONS[name](case())
     assert changed is not None
     assert changed.c.lafs0 is not None
-    assert stress_cases.distances(changed.pair.F, changed.c)[changed.right].max() < RIGHT_PX
+    assert stress_changes.distances(changed.pair.F, changed.c)[changed.right].max() < RIGHT_PX
     assert torch.equal(changed.c.lafs0[..., 2], changed.c.x0)
-    size0, size1 = sizes(changed)
+    size0, size1 = changed.sizes()
     for x, size in ((changed.c.x0, size0), (changed.c.x1, size1)):
         if name not in ("as they are", "one plane"):  # wrong matches were made anywhere
             assert (x[0].double().numpy() > -0.5).all()
             assert (x[0].double().numpy() < size[::-1] - 0.5).all()
-    focal = {"f = 0.4": 0.4, "f = 2": 2.0, "f = 4": 4.0}
-    if name in focal:
-        assert max(size0) == pytest.approx(FOCAL / focal[name], abs=1)
+    if name.startswith("f = "):
+        assert max(size0) == pytest.approx(FOCAL / float(name.removeprefix("f = ")), abs=1)
     if name == "one plane":
-        assert on_plane(changed)[changed.right].float().mean() >= 0.89
+        assert stress_changes.on_plane(changed)[changed.right].float().mean() >= 0.89
     if name.startswith("f 1"):
         assert (tuple(size0) == tuple(size1)) == name.endswith("one size")
         assert max(size1) == pytest.approx(SIZE[1] / ZOOM, abs=1)
@@ -95,68 +92,43 @@ def test_sweeps_vary_one_quantity() -> None:
         assert changed.right.float().mean().item() == pytest.approx(ratio, rel=0.03)
         assert changed.wrong.sum() == len(changed.right) - rights[-1]
     assert len(set(rights)) == 1
-    few, more = match_count(base, 20), match_count(base, 50)
+    few, more = (stress_changes.match_count(base, count) for count in (20, 50))
     assert few is not None
     assert more is not None
     assert torch.equal(few.c.x0, more.c.x0[:, :20])
-    assert match_count(base, COUNTS[-1]) is None
-    still, moved = noise(base, 0.0), noise(base, 2.0)
+    assert stress_changes.match_count(base, COUNTS[-1]) is None
+    still, moved = (stress_changes.noise(base, sigma) for sigma in (0.0, 2.0))
     assert still is not None
     assert moved is not None
     assert (moved.c.x0 - still.c.x0).std().item() == pytest.approx(2.0, rel=0.1)
 
 
-def test_tables_are_of_pairs_that_all_estimators_have_and_say_who_has_fewer_seeds() -> None:
-    def row(method: str, pair: str, level: float, seeds: int) -> stress.Row:
-        return {
-            "sweep": "noise",
-            "level": level,
-            "pair": pair,
-            "method": method,
-            "nsgd": [0.1] * seeds,
-            "ms": [1.0] * seeds,
-        }
-
-    rows = [row("b", "0", 1.0, 1), row("b", "1", 1.0, 2), row("a", "0", 1.0, 3), row("a", "1", 1.0, 3),
-            row("a", "2", 1.0, 1), row("a", "0", 2.0, 3)]  # fmt: skip
-    comparable = stress_rows.comparable(rows, ["c", "a"])
-    assert [(r["method"], r["pair"], r["level"]) for r in comparable] == [
-        ("a", "0", 1.0), ("a", "1", 1.0), ("b", "0", 1.0), ("b", "1", 1.0),
+def test_tables_are_of_pairs_that_all_estimators_have_and_tell_planes_from_rotations() -> None:
+    facts = {"sweep": CONDITIONED, "level": "as they are", "side": 800.0, "matches": 9}
+    kinds = {"a": (0.9, 99.0), "b": (0.9, 1.0), "c": (0.1, 1.0)}
+    rows = [row(m, f"Strecha/{name}/0", plane=plane, parallax=moved, **facts)
+            for m in ("x:threshold=1@gms", "y@sizeless") for name, (plane, moved) in kinds.items()
+            if (m, name) != ("y@sizeless", "c")]  # fmt: skip
+    lines = stress.accuracy_sheet(rows).records
+    assert [(line["level"], line["estimator"], line["pairs"]) for line in lines] == [
+        (level, estimator, count) for level, count in (("as they are", 2), *((name, 1) for name in stress.NATURAL))
+        for estimator in ("x", "y, no sizes")
     ]  # fmt: skip
-    assert [len(r["nsgd"]) for r in comparable] == [len(r["ms"]) for r in comparable] == [3, 3, 1, 1]
-    assert stress_table.seeds(comparable) == "3 seeds (b: 1)"
-    assert stress_table.seeds(comparable[:2]) == "3 seeds"
+    assert {line["set"] for line in lines} == {"real, wide"}
+    assert stress.time_sheet(rows).records[0]["matches"] == "9"
 
 
-def test_an_interrupted_run_goes_on_and_its_tables_stand_in_the_page(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_the_command_goes_on_and_draws(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    specs = tmp_path / "specs.txt"
+    specs, rows = tmp_path / "specs.txt", tmp_path / "rows.jsonl"
     specs.write_text("opencv:method=lmeds\n(opencv:method=lmeds@ratio_prior+sizeless)\n")
-    page = tmp_path / "page.md"
-    names = [f"stress {sweep}" for sweep in ("noise", "conditions")]
-    page.write_text("".join(f"<!-- {name} -->\n<!-- end {name} -->\n" for name in names))
-    arguments = argparse.Namespace(
-        root=["none"], rendered=None, earlier=[], specs=specs, only=["noise", "conditions"], seeds=1,
-        json=tmp_path / "rows.jsonl", update=page,
-    )  # fmt: skip
-    monkeypatch.setattr(stress, "SWEEPS", {"noise": {sigma: SWEEPS["noise"][sigma] for sigma in (0.0, 4.0)}})
-    monkeypatch.setattr(stress, "CONDITIONS", {name: CONDITIONS[name] for name in ("as they are", "f = 0.4")})
-    cases = [case(0), case(1)]
-    monkeypatch.setattr(stress_cases, "load", lambda _: iter(cases[:1]))
-    stress.run(arguments)
-    first = stress.read(arguments.json)
-    monkeypatch.setattr(stress_cases, "load", lambda _: iter(cases))
-    stress.run(arguments)
-    rows = stress.read(arguments.json)
-    assert rows[: len(first)] == first
-    assert len(rows) == 2 * len(first)
-    text = page.read_text()
-    assert "| opencv, method=lmeds |" in text
-    assert "opencv, method=lmeds, no sizes" in text
-    assert "as they are (2)" in text
+    arguments = ["--root", drawn_set(tmp_path / "Set"), "--specs", specs, "--rows", rows, "--only"]
+    run(capsys, monkeypatch, "stress", *arguments, "noise")
+    first = read(rows)
+    assert len(first) == len(SWEEPS["noise"])
+    printed = run(capsys, monkeypatch, "stress", *arguments, "noise", CONDITIONED, "--figures", tmp_path)
+    assert read(rows)[: len(first)] == first
+    assert {r["level"] for r in read(rows) if "sizeless" in r["method"]} >= {"as they are", "crops"}
+    assert "opencv, method=lmeds, no sizes" in printed
     ElementTree.parse(tmp_path / "stress_noise.svg")
-    assert "stress_noise.svg" in text
-    assert set(stress_rows.levels(rows)) >= {"as they are", "f = 0.4"}
-    with pytest.raises(SystemExit, match="must be one of"):
-        stress.run(argparse.Namespace(**{**vars(arguments), "only": ["colour"]}))

@@ -1,22 +1,26 @@
-"""What the benchmark of verified databases measures, and that it goes on where it stopped."""
+"""What the benchmark of verified databases measures, that it goes on, and models of known cameras."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
 
+from fmtorch.data import load, read_image
+from fmtorch.data.overlap import overlap_of
+from fmtorch.data.scenes import ScenePairs
 from scripts.benchmark import verify
-from scripts.benchmark.kept import Kept
-from scripts.benchmark.verify_mappers import accuracy, centre_errors
-from scripts.benchmark.verify_scenes import Scene, Truth, calibrate
-from scripts.benchmark.verify_table import sheets
+from scripts.benchmark.runner import Kept
+from scripts.benchmark.scenes import Scene, Truth, calibrate, read_scene, triangulate
+from scripts.benchmark.verify import accuracy, centre_errors, sheets
 from tests.pipeline import databases
 
 K = np.array([[700.0, 0, 310], [0, 701, 250], [0, 0, 1]])
+AREAS = [f"{name}{limit}" for name in ("auc", "centre") for limit in (1, 5, 10)]
 
 
 def scene(count: int = 5) -> tuple[Scene, dict[str, Any]]:
@@ -33,22 +37,18 @@ def scene(count: int = 5) -> tuple[Scene, dict[str, Any]]:
     return Scene("walk", Path(), truth, True), poses
 
 
-def test_true_poses_have_no_error_in_any_frame() -> None:
+def test_true_poses_have_no_error_in_any_frame_and_an_image_without_a_pose_counts_as_wrong() -> None:
+    """Without one, four of the ten pairs, and one of the five centres."""
     walk, poses = scene()
-    figures = accuracy(poses, walk)
-    assert set(figures) == {f"{name}{limit}" for name in ("auc", "centre") for limit in (1, 5, 10)}
+    figures = accuracy(poses, walk.truth)
+    assert set(figures) == set(AREAS)
     assert min(figures.values()) > 99.99
     assert centre_errors(poses, walk.truth).max() < 1e-6
-
-
-def test_an_image_without_a_pose_counts_as_wrong() -> None:
-    """Four of the ten pairs, and one of the five centres."""
-    walk, poses = scene()
     del poses["002.jpg"]
-    figures = accuracy(poses, walk)
+    figures = accuracy(poses, walk.truth)
     assert figures["auc10"] == pytest.approx(60, abs=0.01)
     assert figures["centre10"] == pytest.approx(80, abs=0.01)
-    assert accuracy({}, walk)["centre10"] == 0
+    assert accuracy({}, walk.truth)["centre10"] == 0
 
 
 def test_known_cameras_are_the_true_ones(tmp_path: Path) -> None:
@@ -85,11 +85,30 @@ def test_an_interrupted_run_measures_what_is_missing(tmp_path: Path, monkeypatch
     assert [row["mapper"] for row in kept.rows] == ["", "incremental", "global"]
     assert (kept.rows[0]["pairs"], kept.rows[0]["verified"], kept.rows[0]["poses"]) == (3, 3, 3)
     assert [path.name for path in tmp_path.glob("*.db*")] == ["walk.db"]
-    summary, pairs, incremental, _ = sheets(kept.rows, ["colmap:4", "ours"])
-    assert summary.rows[0][:3] == ["COLMAP's SIFT", "known", "`fmtorch verify`"]
-    assert summary.rows[0][3] == "1"
-    assert pairs.rows[0][:5] == ["walk", "`fmtorch verify`", "1", "3", "3"]
-    assert incremental.rows[0][3] == "3.0"
+    means, pairs, models = ([list(line.values()) for line in sheet.records] for sheet in sheets(kept.rows))
+    assert means[0][:4] == ["colmap", "known", "ours", 1]
+    assert means[0][5:9] == ["100.0", "50.0", "50.0", "50.0"]
+    assert pairs[0][3:7] == ["walk", 1, "3", "3"]
+    assert [line[3:7] for line in models] == [[m, "walk", 1, "3.0"] for m in ("incremental", "global")]
 
 
-AREAS = [f"{name}{limit}" for name in ("auc", "centre") for limit in (1, 5, 10)]
+@pytest.mark.slow
+def test_a_scene_is_triangulated_with_its_own_cameras(tmp_path: Path) -> None:
+    """The stereo pair, which has no point that three images see."""
+    pair = load("stereo")[0]
+    assert pair.K0 is not None
+    assert pair.K1 is not None
+    assert pair.R is not None
+    assert pair.t is not None
+    images = tmp_path / "scene/Images"
+    images.mkdir(parents=True)
+    for i, source in enumerate((pair.image0, pair.image1)):
+        cv2.imwrite(str(images / f"{i:08d}.png"), read_image(source)[..., ::-1])
+    identity = np.concatenate([pair.K0.ravel(), np.eye(3).ravel(), np.zeros(3)])
+    second = np.concatenate([pair.K1.ravel(), pair.R.ravel(), pair.t])
+    np.savetxt(tmp_path / "scene/Camera.txt", [identity, second])
+    assert triangulate(read_scene(tmp_path / "scene"), tmp_path / "models/scene") == (0, 0)
+    dataset = load("colmap", root=tmp_path / "models/scene", pairs=None)
+    assert isinstance(dataset, ScenePairs)
+    assert min(np.abs(dataset[0].F - pair.F).max(), np.abs(dataset[0].F + pair.F).max()) < 1e-9
+    assert overlap_of(dataset).of((0, 0, 1)) == 0

@@ -1,0 +1,154 @@
+"""Methods that are named in one word, PRESET[:KEY=VALUE,...][@PRUNER+PRUNER...], or as a pipeline with overrides.
+
+Pruners may have options, too. The estimator `truth` is the fit that starts from the true matrix, and so what the
+matches allow; without an estimator, as in `@gms`, pruners alone are meant.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from fmtorch import presets
+from fmtorch.core.stages import Estimator, Pruner
+from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.data import ImagePair
+from fmtorch.geometry import refine
+from fmtorch.pipeline.build import load_pipeline
+from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.presets.composition import compose
+from scripts.benchmark.runner import Method, identity
+
+TRUTH, NGRANSAC = "truth", "ngransac"
+SHARED = frozenset(("ratio", "one_to_one"))  # pruners that nearly all pipelines have, whose time does not count
+NO_STAGES: Mapping[str, Pruner] = {}
+
+
+def read_specs(path: Path) -> list[str]:
+    """One method a line, without comments."""
+    return [text for line in path.read_text().splitlines() if (text := line.partition("#")[0].strip())]
+
+
+def options(text: str) -> dict[str, Any]:
+    """``KEY=VALUE,...``: numbers, true, false or null as in JSON; anything else is text.
+
+    ``PART.KEY=VALUE`` is the option KEY of a part, as on the command line.
+    """
+    changed: dict[str, Any] = {}
+    for key, value in (item.split("=") for item in text.split(",") if item):
+        *parts, last = key.split(".")
+        inside = changed
+        for part in parts:
+            inside = inside.setdefault(part, {})
+        inside[last] = _parsed(value)
+    return changed
+
+
+def _parsed(value: str) -> Any:
+    try:
+        return json.loads(value)
+    except json.JSONDecodeError:
+        return value
+
+
+def split(word: str) -> tuple[str, dict[str, Any]]:
+    """The preset of ``PRESET[:KEY=VALUE,...]`` and its changed options."""
+    name, _, rest = word.partition(":")
+    return name, options(rest)
+
+
+def build(group: str, word: str) -> Any:
+    """The part of ``PRESET[:KEY=VALUE,...]``, or one of `WITHHELD`."""
+    name, changed = split(word)
+    return WITHHELD[name] if name in WITHHELD else presets.build(group, name, **changed)
+
+
+def stages_of(spec: str) -> list[str]:
+    """The words after ``@``."""
+    return [stage for stage in spec.partition("@")[2].split("+") if stage]
+
+
+def method(spec: str, matches: str = "", extra: Mapping[str, Pruner] = NO_STAGES) -> Method:
+    """The method of a spec on given matches. matches: what these depend on; extra: further stages by name."""
+    word, names = spec.partition("@")[0], stages_of(spec)
+    stages = {name: extra[name] if name in extra else build("pruner", name) for name in names}
+    own = [] if word == TRUTH else [("estimator", *split(word))]
+    own += [("pruner", *split(stage)) for stage in names if stage not in {*extra, *WITHHELD}]
+    others = [part for stage in names for part in (stage, stages[stage])]
+    solve = from_truth if word == TRUTH else functools.partial(_estimated, build("estimator", word))
+    return Method(spec, identity(own, word, matches, *others), lambda family: stages, solve)
+
+
+def call(spec: str) -> Callable[[Correspondences], Any]:
+    """A spec as a function of matches alone: pruners in order, then the estimator, if there is one, with seed 0."""
+    word = spec.partition("@")[0]
+    parts: list[Callable[[Correspondences], Any]] = [build("pruner", name) for name in stages_of(spec)]
+    parts += [functools.partial(build("estimator", word), seed=0)] if word else []
+    return lambda c: functools.reduce(lambda given, part: part(given), parts, c)
+
+
+def _estimated(estimator: Estimator, pair: ImagePair, c: Correspondences, seed: int) -> Estimate:
+    return estimator(c, seed)
+
+
+def from_truth(pair: ImagePair, c: Correspondences, seed: int) -> Estimate:
+    """The robust fit to the matches, weighted by their prior, that starts from the true matrix."""
+    F = torch.from_numpy(pair.F)[None]
+    for scale in (1.5, 0.7):  # px
+        F = refine(F, c.x0, c.x1, c.prior, c.mask, loss="geman_mcclure", scale=scale, iterations=20)
+    ok = torch.isfinite(F).all(-1).all(-1)
+    reason = "" if bool(ok) else "no fit"
+    return Estimate(
+        torch.where(ok[:, None, None], F, 0.0), c.mask & ok[:, None], ok, (reason,), torch.zeros(1, dtype=torch.int64)
+    )
+
+
+def pipeline_of(words: str, *overrides: str) -> Pipeline:
+    """The pipeline of ``PRESET[ NAME=VALUE...]``, such as ``sift_ratio estimator=msac``, with further overrides."""
+    name, *own = words.split()
+    return load_pipeline(name, overrides=[*own, *overrides])
+
+
+def pipeline_method(name: str, words: str, *overrides: str) -> tuple[Method, Pipeline, str]:
+    """A pipeline as a method, what makes its matches, and the digest of that; words after ``+`` are further pruners."""
+    words, *more = (part.strip() for part in words.split(" + "))
+    preset, *changed = [*words.split(), *overrides]
+    pipeline = pipeline_of(preset, *changed)
+    config = presets.stages(compose("match", (f"pipeline={preset}", *changed)))
+    front = identity([], config["features"], config["matcher"], pipeline.extractor)
+    added = {word: build("pruner", word) for word in more}
+    configs = [config["estimator"], *(part for entry in config["pruner"] for part in entry.values())]
+    parts = [*pipeline.pruners.values(), *added.values()]
+    digest = identity([("pruner", *split(word)) for word in more], *configs, front, str(pipeline.families), *parts)
+    solve = functools.partial(_estimated, pipeline.estimator)
+    made = Method(name, digest, lambda family: {**pipeline.pruners_of(family), **added}, solve, untimed=SHARED)
+    return made, pipeline, front
+
+
+def ngransac(file: Path | None) -> dict[str, Pruner]:
+    """The network of neural-guided RANSAC (Brachmann & Rother, ICCV 2019) as prior: its weights of samples."""
+    if file is None:
+        return {}
+    if not file.is_file():
+        raise SystemExit(f"--ngransac {file}: no such file; scripts/make_models.py ngransac makes it")
+    network = {"_target_": "fmtorch.pruning.networks.LC", "side": ["ratio"]}
+    return {NGRANSAC: presets.build("pruner", "lc", soft=True, network=network, file=str(file))}
+
+
+def sizeless(c: Correspondences) -> Correspondences:
+    """The matches of images whose sizes nobody tells."""
+    return c.replace(size0=None, size1=None)
+
+
+def ratioless(c: Correspondences) -> Correspondences:
+    """The matches without their distance ratios."""
+    return c.replace(quality=None)
+
+
+WITHHELD: dict[str, Pruner] = {"sizeless": sizeless, "ratioless": ratioless}
+"""Stages that are no presets: what an estimator is not given."""

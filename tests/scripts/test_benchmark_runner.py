@@ -1,0 +1,152 @@
+"""What benchmarks share: rows that are kept and resumed, what they depend on, methods in one word, memory."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from fmtorch.core.types import Correspondences
+from fmtorch.data import load, read_image, to_grey
+from fmtorch.data.construction import keypoints, ratio_matches
+from fmtorch.geometry import eight_point
+from fmtorch.pipeline.pipeline import Outcome
+from fmtorch.presets import build as preset
+from scripts.benchmark import methods, pairs, runner
+from scripts.benchmark.runner import Item, Kept, Measured, Row, measure
+from tests.laws import scene
+from tests.scripts.samples import item, pair, read
+
+
+@dataclasses.dataclass
+class Counted(Measured):
+    """A method that is interrupted from its call of some number on."""
+
+    name: str
+    identity: str = "made with"
+    end: int = 1000
+    calls: int = 0
+
+    def figures(self, item: Item, seed: int) -> Row:
+        self.calls += 1
+        if self.calls > self.end:
+            raise KeyboardInterrupt
+        return {"nsgd": seed + 0.5}
+
+
+def items(count: int) -> list[Item]:
+    return [item(pair(f"orbit/s/{i}"), scene(i, 60)) for i in range(count)]
+
+
+def test_a_line_that_was_cut_off_goes_and_other_files_stay_as_they_are(tmp_path: Path) -> None:
+    path = tmp_path / "rows.jsonl"
+    Kept(path).add([{"pair": "a", "seed": 0}, {"pair": "b", "seed": 0}])
+    path.write_bytes(path.read_bytes() + b'{"pair": "\xc3')
+    again = Kept(path)
+    again.add([{"pair": "b", "seed": 0, "new": True}])
+    assert read(path) == again.rows == [{"pair": "a", "seed": 0}, {"pair": "b", "seed": 0}, again.rows[-1]]
+    assert again.by("pair", "seed")["b", 0] == {"pair": "b", "seed": 0, "new": True}
+    figures = tmp_path / "figures.json"
+    figures.write_text('{\n"machine": 1,\n')
+    with pytest.raises(SystemExit, match=r"figures\.json, line 1: no row"):
+        Kept(figures)
+    assert figures.read_text() == '{\n"machine": 1,\n'
+    with pytest.raises(SystemExit, match=r"none/rows\.jsonl: there is no folder"):
+        Kept(tmp_path / "none" / "rows.jsonl")
+
+
+def test_an_interrupted_run_goes_on_and_measures_what_others_need(tmp_path: Path) -> None:
+    path = tmp_path / "rows.jsonl"
+    with pytest.raises(KeyboardInterrupt):
+        measure([Counted("a", end=4), Counted("b")], items(3), 2, Kept(path))
+    assert len(read(path)) == 6  # of the first pair both seeds, of the second one; the first call was not counted
+    a, b = Counted("a"), Counted("b")
+    rows = measure([a, b], items(3), 2, Kept(path))
+    assert (a.calls, b.calls) == (4, 4)  # three that were missing, after one that is not counted
+    assert rows == measure([Counted("a", end=0), Counted("b", end=0)], items(3), 2, Kept(path))
+    assert len(rows) == len(read(path)) == 12
+    for other, count, seeds in ((Counted("c"), 3, 1), (Counted("a", "otherwise"), 3, 1), (a, 4, 2), (a, 3, 3)):
+        before = other.calls
+        measure([other], items(count), seeds, Kept(path))
+        assert other.calls > before
+    elsewhere = Item(pair("orbit/s/0"), lambda: None)  # a pair of which nothing can be measured has no row
+    assert measure([Counted("d", end=0)], [elsewhere], 1, Kept(None)) == []
+
+
+def test_what_a_row_was_made_with_is_options_code_and_learned_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    def identities() -> list[str]:
+        words = ["usac", "usac:threshold=0.7", "usac@ratio_prior", "poselib", "truth", "truth@lc:soft=true"]
+        own = dict.fromkeys(words)
+        monkeypatch.setattr(methods.presets, "build", lambda group, name, **changed: preset(group, name, **changed)
+                            if name != "poselib" else None)  # fmt: skip
+        return [methods.method(word).identity for word in own]
+
+    monkeypatch.setattr(runner, "libraries", lambda others: dict.fromkeys(others, "1"))  # PoseLib may be absent
+    before = identities()
+    assert len(set(before)) == len(before)
+    assert identities() == before
+    with monkeypatch.context() as patch:
+        patch.setattr(runner, "code_digest", lambda module: module)
+        assert not set(before[:4]) & set(identities()[:4])
+    monkeypatch.setattr(runner, "libraries", lambda others: dict.fromkeys(others, "2"))
+    assert identities()[3] != before[3]
+
+
+def test_options_are_numbers_switches_or_words_and_those_of_a_part_are_nested() -> None:
+    assert methods.options("a=0.5,b=true,c=null,d=focal") == {"a": 0.5, "b": True, "c": None, "d": "focal"}
+    assert methods.options("a.b=1,c=x,a.d=2") == {"a": {"b": 1, "d": 2}, "c": "x"}
+    assert methods.options("") == {}
+
+
+def test_truth_is_the_fit_that_starts_from_the_true_matrix() -> None:
+    exact = scene(0, 200, outliers=0, noise=0)
+    (F,), _ = eight_point(exact.x0.double(), exact.x1.double())
+    noisy = scene(0, 200, outliers=0.5, noise=0.3)
+    both = [item(pair("orbit/0/0", F.numpy()), noisy), item(pair("orbit/0/1", F.flip(0).numpy()), noisy)]
+    for spec in ("truth", "truth@position_consistency"):
+        near, far = (row["nsgd"] for row in measure([methods.method(spec)], both, 1, Kept(None)))
+        assert 1e-6 < near < 0.01, spec  # the matches' noise moves it
+        assert far > 0.05, spec  # and does not bring it home from elsewhere
+
+
+def test_what_is_withheld_does_not_reach_the_estimator(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[Correspondences] = []
+    ransac = preset("estimator", "ransac", hypotheses=20)
+    monkeypatch.setattr(methods, "_estimated", lambda estimator, pair, c, seed: seen.append(c) or ransac(c, seed))
+    given = item(pair("orbit/0/0"), scene(0, 60))
+    specs = ["ransac", "ransac@sizeless", "ransac@ratioless+sizeless"]
+    rows = measure([methods.method(spec) for spec in specs], [given], 1, Kept(None))
+    assert [(c.quality is None, c.size0 is None) for c in seen[1::2]] == [(False, False), (False, True), (True, True)]
+    assert len({row["nsgd"] for row in rows}) == 1  # judged with the sizes all the same
+
+
+def test_a_pruner_that_looks_at_images_is_given_those_of_the_pair() -> None:
+    stereo = load("stereo")[0]
+    grey = [to_grey(read_image(image)) for image in (stereo.image0, stereo.image1)]
+    x0, x1 = (torch.from_numpy(x)[None, :200].float() for x in ratio_matches(*map(keypoints, grey)))
+    sizes = [torch.tensor([image.shape]) for image in grey]
+    c = Correspondences(x0, x1, torch.ones(x0.shape[:2], dtype=torch.bool), size0=sizes[0], size1=sizes[1])
+    front = pairs.front_of("sift", [])
+    refined, plain = methods.method("lmeds@refine_matches"), methods.method("lmeds")
+    outcome = Outcome(stereo, (200, 200), c)
+    given = Item(stereo, lambda: outcome, images=lambda: front.images(stereo))
+    distances = [measure([each], [given], 1, Kept(None))[0]["distance"] for each in (refined, plain)]
+    assert distances[0] < distances[1]
+    with pytest.raises(ValueError, match="there are no images"):
+        refined.figures(Item(stereo, lambda: outcome), 0)
+
+
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").is_file(), reason="peaks are told by Linux alone")
+def test_what_a_call_claims_and_frees_is_measured_whatever_was_claimed_before() -> None:
+    np.ones(200 << 17)  # 200 MiB, freed again
+    assert 45 < runner.peak_growth(lambda: np.ones(50 << 17)) < 60
+    assert runner.peak_growth(lambda: None) < 5
+
+
+def test_elsewhere_peaks_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runner, "PROC", tmp_path / "none")
+    with pytest.raises(SystemExit, match="on Linux alone"):
+        runner.peak_growth(lambda: None)
