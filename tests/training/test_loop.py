@@ -2,34 +2,43 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
+from torch.utils.data import DataLoader
 
 pytest.importorskip("lightning", reason="training needs the extra `train`")
 
 from fmtorch import presets
 from fmtorch.pruning.networks import LC
-from fmtorch.training.loop import (
-    BEST,
-    CHECKPOINTS,
-    Optimisation,
-    PrunerTraining,
-    TrainingFolderError,
-    claim,
-    latest_checkpoint,
-    train,
-)
-from fmtorch.training.objective import Objective
-from fmtorch.training.validation import Use, Validation
+from fmtorch.training import LabelledMatches, Objective, Use, Validation, collate, loop
+from fmtorch.training.loop import Optimisation, PrunerTraining, TrainingFolderError, claim, latest_checkpoint
 from tests.processes import run_command
-from tests.training.synthetic_matches import batches, labelled_pair
+from tests.training.conftest import labelled_pair
 
 STEPS = 12
-CPU = {"accelerator": "cpu", "devices": 1, "gradient_clip_val": 1.0}
+PAIRS = [labelled_pair(i) for i in range(24)]
+
+
+class Steps:
+    """The pairs of each step, four for each process."""
+
+    def __init__(self, *where: int) -> None:
+        self.start, self.rank, self.processes = where
+
+    def __iter__(self) -> Iterator[list[int]]:
+        firsts = (4 * (self.processes * step + self.rank) for step in itertools.count(self.start))
+        return ([(first + i) % len(PAIRS) for i in range(4)] for first in firsts)
+
+
+def batches(*where: int) -> DataLoader[LabelledMatches]:
+    """Training batches of a process from a step on."""
+    return DataLoader(PAIRS, batch_sampler=Steps(*where), collate_fn=collate)  # type: ignore[arg-type]
 
 
 def module() -> PrunerTraining:
@@ -40,13 +49,23 @@ def module() -> PrunerTraining:
     return PrunerTraining(network, Objective(classification_steps=4), Optimisation(steps=STEPS), validation)
 
 
+def train(made: PrunerTraining, folder: Path, every: int, checkpoint_every: int, monitor: str) -> int:
+    cpu = {"accelerator": "cpu", "devices": 1, "gradient_clip_val": 1.0}
+    often = {"every": every, "checkpoint_every": checkpoint_every}
+    return loop.train(made, batches, folder, cpu, **often, patience=None, monitor=monitor)[0]
+
+
 def trained(folder: Path, seen: list[int] | None = None) -> PrunerTraining:
     """The trained module; `seen` gets the steps that were made."""
     made = module()
     made.on_train_batch_start = lambda *_: None if seen is None else seen.append(made.global_step)
-    steps, _ = train(made, batches, folder, CPU, every=5, checkpoint_every=3, patience=None, monitor="hard/AUC@0.05")
-    assert steps == STEPS
+    assert train(made, folder, every=5, checkpoint_every=3, monitor="hard/AUC@0.05") == STEPS
     return made
+
+
+def expect_equal(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> None:
+    for name, value in a.items():
+        assert torch.equal(value, b[name]), name
 
 
 def test_killed_and_started_again_it_ends_with_the_same_weights(tmp_path: Path) -> None:
@@ -57,7 +76,7 @@ import os, signal
 from pathlib import Path
 import torch
 torch.set_num_threads({torch.get_num_threads()})
-from tests.training import test_pruner_loop as t
+from tests.training import test_loop as t
 step = t.PrunerTraining.training_step
 def dies(self, batch, index):
     if self.global_step == 7:
@@ -74,53 +93,39 @@ t.trained(Path({str(tmp_path / "parts")!r}))
     seen: list[int] = []
     parts = trained(tmp_path / "parts", seen)
     assert seen == list(range(6, STEPS))
-    for name, value in whole.state_dict().items():
-        assert torch.equal(value, parts.state_dict()[name]), name
+    expect_equal(whole.state_dict(), parts.state_dict())
+    # The best weights are kept, and a damaged checkpoint is passed over.
+    loop.load_best(tmp_path / "parts", parts)
+    (tmp_path / "parts" / loop.CHECKPOINTS / "step=99.ckpt").write_bytes(b"not a checkpoint")
+    with pytest.warns(UserWarning, match="step=99"):
+        assert latest_checkpoint(tmp_path / "parts")[1] == STEPS
 
 
 class Ended(Exception):
     """What a kill would do."""
 
 
-@pytest.mark.parametrize("last", [1, 2, 3])  # validations after 4, 8 and 12 steps
-def test_ended_before_a_validation_it_is_made_again(tmp_path: Path, last: int) -> None:
+def test_ended_before_a_validation_it_is_made_again(tmp_path: Path) -> None:
     """Checkpoints are at the steps of validation; the best weights are those of an undisturbed training."""
 
-    def run(folder: Path, ends_at: int | None) -> None:
-        made, count = module(), 0
+    def best(folder: Path, ends_at: int | None) -> tuple[int, dict[str, torch.Tensor]]:
+        made, count = module(), itertools.count(1)
 
         def starts() -> None:
-            nonlocal count
-            count += 1
-            if count == ends_at:
+            if next(count) == ends_at:
                 raise Ended
 
         made.on_validation_start = starts  # type: ignore[method-assign]
-        train(made, batches, folder, CPU, every=4, checkpoint_every=4, patience=None, monitor="log_loss")
+        train(made, folder, every=4, checkpoint_every=4, monitor="log_loss")
+        return loop.load_best(folder, made), made.state_dict()
 
-    run(tmp_path / "whole", None)
-    with pytest.raises(Ended):
-        run(tmp_path / "parts", last)
-    run(tmp_path / "parts", None)
-    whole, parts = (torch.load(tmp_path / name / CHECKPOINTS / BEST, weights_only=True) for name in ("whole", "parts"))
-    assert whole["global_step"] == parts["global_step"]
-    for name, value in whole["state_dict"].items():
-        assert torch.equal(value, parts["state_dict"][name]), name
-
-
-def test_damaged_checkpoint_is_passed_over(tmp_path: Path) -> None:
-    trained(tmp_path)
-    (tmp_path / CHECKPOINTS / "step=99.ckpt").write_bytes(b"not a checkpoint")
-    with pytest.warns(UserWarning, match="step=99"):
-        path, step = latest_checkpoint(tmp_path)
-    assert step == STEPS
-    assert path is not None
-
-
-def test_best_weights_are_kept(tmp_path: Path) -> None:
-    trained(tmp_path)
-    best = torch.load(tmp_path / CHECKPOINTS / BEST, weights_only=True)
-    assert set(best["state_dict"]) == set(module().state_dict())
+    whole = best(tmp_path / "whole", None)
+    for last in (1, 2, 3):  # validations after 4, 8 and 12 steps
+        with pytest.raises(Ended):
+            best(tmp_path / f"{last}", last)
+        parts = best(tmp_path / f"{last}", None)
+        assert whole[0] == parts[0]
+        expect_equal(whole[1], parts[1])
 
 
 def test_another_training_is_refused(tmp_path: Path) -> None:
