@@ -1,8 +1,8 @@
-"""`python -m fmtorch.eval` runs the command of `fmtorch.commands.eval`."""
+"""`python -m fmtorch.eval` is `fmtorch eval`."""
 
-from fmtorch.commands.eval import main, run
+import sys
 
-__all__ = ["main", "run"]
+from fmtorch.commands.main import main
 
 if __name__ == "__main__":
-    main()
+    main(["eval", *sys.argv[1:]])

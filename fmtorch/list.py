@@ -1,8 +1,8 @@
-"""`python -m fmtorch.list` runs the command of `fmtorch.commands.list`."""
+"""`python -m fmtorch.list` is `fmtorch list`."""
 
-from fmtorch.commands.list import main
+import sys
 
-__all__ = ["main"]
+from fmtorch.commands.main import main
 
 if __name__ == "__main__":
-    main()
+    main(["list", *sys.argv[1:]])

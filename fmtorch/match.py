@@ -1,8 +1,8 @@
-"""`python -m fmtorch.match` runs the command of `fmtorch.commands.match`."""
+"""`python -m fmtorch.match` is `fmtorch match`."""
 
-from fmtorch.commands.match import main, run
+import sys
 
-__all__ = ["main", "run"]
+from fmtorch.commands.main import main
 
 if __name__ == "__main__":
-    main()
+    main(["match", *sys.argv[1:]])

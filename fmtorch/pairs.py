@@ -1,8 +1,8 @@
-"""`python -m fmtorch.pairs` runs the command of `fmtorch.commands.pairs`."""
+"""`python -m fmtorch.pairs` is `fmtorch pairs`."""
 
-from fmtorch.commands.pairs import main, run
+import sys
 
-__all__ = ["main", "run"]
+from fmtorch.commands.main import main
 
 if __name__ == "__main__":
-    main()
+    main(["pairs", *sys.argv[1:]])

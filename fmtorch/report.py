@@ -1,8 +1,8 @@
-"""`python -m fmtorch.report` runs the command of `fmtorch.commands.report`."""
+"""`python -m fmtorch.report` is `fmtorch report`."""
 
-from fmtorch.commands.report import main, run
+import sys
 
-__all__ = ["main", "run"]
+from fmtorch.commands.main import main
 
 if __name__ == "__main__":
-    main()
+    main(["report", *sys.argv[1:]])

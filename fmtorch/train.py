@@ -1,8 +1,8 @@
-"""`python -m fmtorch.train` runs the command of `fmtorch.commands.train`."""
+"""`python -m fmtorch.train` is `fmtorch train`."""
 
-from fmtorch.commands.train import main
+import sys
 
-__all__ = ["main"]
+from fmtorch.commands.main import main
 
 if __name__ == "__main__":
-    main()
+    main(["train", *sys.argv[1:]])

@@ -1,8 +1,8 @@
-"""`python -m fmtorch.verify` runs the command of `fmtorch.commands.verify`."""
+"""`python -m fmtorch.verify` is `fmtorch verify`."""
 
-from fmtorch.commands.verify import main, run
+import sys
 
-__all__ = ["main", "run"]
+from fmtorch.commands.main import main
 
 if __name__ == "__main__":
-    main()
+    main(["verify", *sys.argv[1:]])

@@ -1,8 +1,8 @@
-"""`python -m fmtorch.warm_up` runs the command of `fmtorch.commands.warm_up`."""
+"""`python -m fmtorch.warm_up` is `fmtorch warm-up`."""
 
-from fmtorch.commands.warm_up import main
+import sys
 
-__all__ = ["main"]
+from fmtorch.commands.main import main
 
 if __name__ == "__main__":
-    main()
+    main(["warm-up", *sys.argv[1:]])

@@ -1,17 +1,21 @@
-"""Writes docs/reference/presets.md and docs/reference/command_line.md from the comments in conf/.
+"""Writes docs/reference/presets.md from the comments in conf/ and command_line.md from the commands' declarations.
 
 python scripts/draw_reference.py
 """
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 from fmtorch.commands.list import HEADINGS
+from fmtorch.commands.main import SUMMARIES
+from fmtorch.commands.options import COMMANDS
+from fmtorch.core.options import shown
 from fmtorch.presets.files import available, summary
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -28,7 +32,7 @@ GROUPS = {
     "trainer": "Where `fmtorch train` runs, `trainer=NAME`.",
     "photographs": "Which photographs `fmtorch train` takes as planes, `photographs=NAME`.",
 }
-COMMANDS = {
+USAGES = {
     "match": "fmtorch match A.jpg B.jpg [NAME=VALUE ...]",
     "eval": "fmtorch eval [NAME=VALUE ...]",
     "report": "fmtorch report [RUN ...] [NAME=VALUE ...]",
@@ -45,17 +49,11 @@ on the command line, `estimator.threshold=0.5`, or in Python,
 """
 COMMANDS_HEAD = """# Command line
 
-`fmtorch COMMAND` is the same as `python -m fmtorch.COMMAND`. Options are `NAME=VALUE`; groups, such as
+`fmtorch COMMAND` is the same as `python -m fmtorch COMMAND`. Options are `NAME=VALUE`; groups, such as
 `estimator=lmeds`, take a [preset](presets.md), and their values are set by path, `estimator.threshold=0.5`. `-m` runs a
 sweep over values that are separated by commas; `--config-dir FOLDER` adds presets of your own. A value of `null` is
 none. This page is written by `python scripts/draw_reference.py`.
 """
-
-
-class Option(NamedTuple):
-    name: str  # dotted
-    default: str
-    comment: str
 
 
 def text(comment: str) -> str:
@@ -65,34 +63,18 @@ def text(comment: str) -> str:
     return "".join(plain).replace("|", "\\|")
 
 
-def default(option: Option) -> str:
-    if option.default == "???":
-        return "to be given"
-    return f"`{option.default}`" if option.default else ""
-
-
 def sentence(words: str) -> str:
     return text(words[0].upper() + words[1:]) + "."
 
 
-def options(path: Path) -> Iterator[Option]:
-    """The options of a command's configuration, nested ones by dotted names; a comment goes on in lines of its own."""
-    parents: list[tuple[int, str]] = []
-    current: Option | None = None
-    for line in path.read_text(encoding="utf-8").splitlines():
-        entry = re.match(r"^( *)(\w+):(?: +([^#]*?))?(?: *#(.*))?$", line)
-        if entry is None:
-            more = re.match(r"^ +#(.*)$", line)
-            if current is not None and more is not None:
-                current = current._replace(comment=f"{current.comment} {more[1].strip()}")
-            continue
-        if current is not None:
-            yield current
-        indent, name, default, comment = len(entry[1]), entry[2], (entry[3] or "").strip(), (entry[4] or "").strip()
-        parents = [*((at, key) for at, key in parents if at < indent), (indent, name)]
-        current = Option(".".join(key for _, key in parents), default, comment)
-    if current is not None:
-        yield current
+def rows(options: Any, prefix: str = "") -> Iterator[str]:
+    """A line for each option of a dataclass of options, those of nested ones by dotted names."""
+    for field in dataclasses.fields(options):
+        value, name = getattr(options, field.name), f"{prefix}{field.name}"
+        if dataclasses.is_dataclass(value):
+            yield from rows(value, f"{name}.")
+        else:
+            yield f"| `{name}` | `{shown(value)}` | {text(str(field.metadata['about']))} |"
 
 
 def presets_page() -> str:
@@ -110,15 +92,10 @@ def presets_page() -> str:
 
 def commands_page() -> str:
     parts = [COMMANDS_HEAD]
-    for command, usage in COMMANDS.items():
-        path = CONF / f"{command}.yaml"
-        rows = [
-            f"| `{o.name}` | {default(o)} | {text(o.comment)} |"
-            for o in options(path)
-            if not o.name.startswith(("defaults", "hydra")) and (o.default or o.comment)
-        ]
-        head = [f"## {command}\n", f"```text\n{usage}\n```\n", f"{sentence(summary(path).partition(': ')[2])}\n"]
-        parts.append("\n".join([*head, "| option | default | what it is |", "| --- | --- | --- |", *rows]) + "\n")
+    for name, usage in USAGES.items():
+        head = f"## {name}\n\n```text\n{usage}\n```\n\n{sentence(SUMMARIES[name])}\n"
+        table = ["| option | default | what it is |", "| --- | --- | --- |", *rows(COMMANDS[name].options())]
+        parts.append("\n".join([head, *table]) + "\n")
     return "\n".join(parts)
 
 

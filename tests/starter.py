@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import io
 import json
 import os
 import runpy
@@ -20,7 +19,7 @@ import traceback
 from typing import Any
 
 LIBRARIES = (
-    "torch", "kornia", "cv2", "hydra", "omegaconf", "pyarrow.parquet", "pyarrow.compute", "matplotlib.figure",
+    "torch", "kornia", "cv2", "hydra", "omegaconf", "pyarrow.parquet", "pyarrow.compute",
     "skimage.io", "rich.progress", "scipy.spatial", "numba", "onnxruntime", "lightning", "lightning.pytorch.loggers",
     "torch.utils.tensorboard", "antlr4", "jinja2", "h5py",
     "fmtorch.commands.eval", "fmtorch.commands.match", "fmtorch.commands.pairs", "fmtorch.commands.report",
@@ -63,7 +62,7 @@ def run(job: dict[str, Any]) -> None:
 
 
 def warm_up() -> None:
-    """Load what numba needs before its first kernel and matplotlib before its first figure; read the package's code.
+    """Load what numba needs before its first kernel; read the package's code.
 
     Without threads, which a fork would lose.
     """
@@ -71,11 +70,6 @@ def warm_up() -> None:
         from numba.core.registry import cpu_target
 
         cpu_target.target_context.refresh()
-    from matplotlib.figure import Figure
-
-    figure = Figure()
-    figure.subplots().set_title("fonts")
-    figure.savefig(io.BytesIO())
     from fmtorch.runs.fingerprint import code_digest, fmtorch_version
 
     fmtorch_version()

@@ -13,14 +13,14 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from fmtorch import presets
-from fmtorch.commands.main import job
+from fmtorch.commands.config import job
 from fmtorch.core.files import conf_dir
 from fmtorch.core.types import Correspondences
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.data.pairs import GivenMatches
 from fmtorch.pipeline.build import build_pipeline, load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.presets.composition import compose
+from tests.helpers import compose
 
 RATIO = "pruner.ratio.families"
 

@@ -9,58 +9,31 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pyarrow as pa
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-from rich.progress import Progress
 
 from fmtorch import data, presets
-from fmtorch.commands.main import job, run_command
+from fmtorch.commands.config import chosen_pipeline, job, run_command
+from fmtorch.commands.options import EVAL, EvalOptions
+from fmtorch.core.files import replacing
 from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.data import ImagePair, PairDataset
+from fmtorch.evaluation.curves import picture
 from fmtorch.evaluation.identity import run_identity
-from fmtorch.evaluation.pair_cameras import Cameras, built_with, cameras_of
-from fmtorch.evaluation.plots import plot_recall_curves
+from fmtorch.evaluation.pair_cameras import built_with, cameras_of
 from fmtorch.evaluation.run import evaluate_pairs, select
 from fmtorch.evaluation.summary import ALL, Group, summarize
-from fmtorch.evaluation.summary_tables import further_tables, pose_table, summary_markdown, summary_table
+from fmtorch.evaluation.tables import summary_markdown, terminal_tables
 from fmtorch.io.export import export_kinds, write_exports
-from fmtorch.io.match_store import Journal
+from fmtorch.io.match_store import MatchStore
 from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES, shard_of
 from fmtorch.pipeline.build import build_pipeline
 from fmtorch.pipeline.exporting import exportable
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
 from fmtorch.presets.executors import execution_of
-from fmtorch.presets.fields import Cache, Count, Device, Gigabytes, Seed, path_fields, read_fields
-from fmtorch.presets.objects import target_of
+from fmtorch.presets.fields import read_fields
 from fmtorch.runs import RunFolder, identity_digest
 from fmtorch.runs.feature_cache import CachedFeatures
-
-
-@dataclasses.dataclass(frozen=True)
-class PoseFields:
-    """How poses are judged."""
-
-    signed: bool = False
-
-
-@dataclasses.dataclass(frozen=True)
-class Fields:
-    """What the command takes beside stages and the data set; ``conf/eval.yaml`` says what each is."""
-
-    limit: Count | None = None
-    seed: Seed = 0
-    cameras: Cameras | None = None
-    pose: PoseFields = PoseFields()
-    device: Device = "auto"
-    batch: Count = 16
-    workers: Count | None = None
-    processes: bool | None = None
-    shard: str | None = None
-    run_dir: Path | None = None
-    cache: Cache = None
-    cache_limit: Gigabytes | None = 20
-    export: str | list[str] | None = None
 
 
 def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -> Path:
@@ -70,19 +43,20 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
 
     Raises ValueError, before anything is computed or written, where an option is not what it may be.
     """
-    fields = read_fields(Fields, config)
+    fields = read_fields(EvalOptions, config)
     execution_of(config, fields.workers, fields.processes)
     shard = shard_of(fields.shard)
     device = presets.resolve_device(fields.device)
     exports = export_kinds(fields.export)
-    presets.expect_dataset(config.dataset)
+    dataset_config = plain(config.dataset)
+    presets.expect_buildable(dataset_config, "dataset")
     presets.expect_stages(config)
-    model = _model(config.dataset)
+    model = getattr(presets.target_of(dataset_config, "dataset"), "model", "fundamental")
     if model != "fundamental" and (exports or fields.cameras is not None):
         raise ValueError(f"the data set has {model} matrices, which take no export= and no cameras=: leave them out")
     with progress_bars() as progress:
         pipeline: Pipeline = build_pipeline(config, device, model)
-        dataset = _load(config.dataset, progress)
+        dataset = data.build(dataset_config, reporter(progress, "drawing scenes"))
         folder = _open_folder(config, fields, pipeline_name, pipeline, dataset)
         pairs = select([dataset[i] for i in range(len(dataset))], fields.limit)
         journal = _journal(folder.path, pairs) if exports else None
@@ -116,7 +90,7 @@ def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -
 
 
 def _open_folder(
-    config: DictConfig, fields: Fields, pipeline_name: str, pipeline: Pipeline, dataset: PairDataset
+    config: DictConfig, fields: EvalOptions, pipeline_name: str, pipeline: Pipeline, dataset: PairDataset
 ) -> RunFolder:
     """The folder of the run with this identity, its `run_dir` if given, new or to be continued."""
     identity = run_identity(config, pipeline_name, pipeline, dataset.digest, fields.cameras, fields.pose.signed)
@@ -124,15 +98,15 @@ def _open_folder(
     return RunFolder.open(fields.run_dir or Path(f"runs/{dataset.name}/{name}"), identity)
 
 
-def _missing(pairs: Sequence[ImagePair], folder: RunFolder, journal: Journal | None) -> list[ImagePair]:
+def _missing(pairs: Sequence[ImagePair], folder: RunFolder, journal: MatchStore | None) -> list[ImagePair]:
     """The pairs that have no row yet, or whose matches are to be exported and not in the journal."""
     done = folder.done()
     return [p for p in pairs if p.key not in done or (journal is not None and _to_export(journal, p))]
 
 
 def _evaluated(
-    config: DictConfig, fields: Fields, pipeline: Pipeline, pairs: Sequence[ImagePair], folder: RunFolder,
-    journal: Journal | None,
+    config: DictConfig, fields: EvalOptions, pipeline: Pipeline, pairs: Sequence[ImagePair], folder: RunFolder,
+    journal: MatchStore | None,
 ) -> Iterator[int]:  # fmt: skip
     """Evaluates pairs into the folder and the journal; yields how many were done since."""
     parallel = len(pairs) >= MIN_PAIRS_FOR_PROCESSES and pipeline.device.type == "cpu"
@@ -157,59 +131,36 @@ def _summarize(table: pa.Table, folder: RunFolder, title: str, signed: bool) -> 
     summary = summarize(table, signed)
     all_rows = summary if len(run_table) == len(table) else summarize(run_table, signed)
     folder.write_summary(all_rows, summary_markdown(all_rows, title=title))
-    plot_recall_curves({title.partition(" ")[0]: run_table}, folder.path / "recall.png")
+    with replacing(folder.path / "recall.svg") as path:
+        path.write_text(picture(title.partition(" ")[0], run_table), encoding="utf-8")
     part = "" if len(run_table) == len(table) else f", {len(table)} of the {len(run_table)} pairs of the run"
-    console.print(summary_table(summary, title=f"{title}{part}"))
-    if (poses := pose_table(summary)) is not None:
-        console.print(poses)
-    for further in further_tables(summary):
-        console.print(further)
+    for each in terminal_tables(summary, f"{title}{part}"):
+        console.print(each)
     about = f"; of all {len(run_table)} pairs" if part else ""
-    console.print(f"{folder.path}: pairs/, summary.json, summary.md, recall.png{about}", style="dim")
+    console.print(f"{folder.path}: pairs/, summary.json, summary.md, recall.svg{about}", style="dim")
     return summary
 
 
-def _journal(folder: Path, pairs: Sequence[ImagePair]) -> Journal:
+def _journal(folder: Path, pairs: Sequence[ImagePair]) -> MatchStore:
     """Where what is to be exported is kept. Raises ValueError where no pair has images to name."""
     parents = {str(image.path.absolute().parent) for p in pairs if exportable(p) for image in (p.image0, p.image1)}
     if not parents:
         raise ValueError("export: no pair has images in which a pipeline finds keypoints, as they are stored")
-    return Journal(folder / "export", Path(os.path.commonpath(sorted(parents))))
+    return MatchStore(folder / "export", Path(os.path.commonpath(sorted(parents))))
 
 
-def _to_export(journal: Journal, pair: ImagePair) -> bool:
+def _to_export(journal: MatchStore, pair: ImagePair) -> bool:
     """Whether a pair's matches are not in the journal yet, and its images are there."""
     ends = pair.image0.path, pair.image1.path
     return exportable(pair) and all(path.is_file() for path in ends) and not journal.has_pair(*ends)
 
 
-def _model(config: DictConfig) -> str:
-    """What relates the pairs of a data set: fundamental, or homography."""
-    options = plain(config)
-    if "_target_" not in options:
-        return data.model_of(str(options.get("name")))
-    model: str = getattr(target_of(options, "dataset"), "model", "fundamental")
-    return model
-
-
-def _load(config: DictConfig, progress: Progress) -> PairDataset:
-    """The data set of a config; the embedded one is drawn on first use, which the progress bar shows."""
-    options = plain(config)
-    if "_target_" in options:  # somebody's own data set
-        dataset: PairDataset = presets.instantiate(options, "dataset")
-        return dataset
-    return data.load(**options, progress=reporter(progress, "drawing scenes"))
-
-
 @job
 def task(config: DictConfig) -> None:
     """What Hydra runs."""
-    hydra_config = HydraConfig.get()
-    changed = [o for o in hydra_config.overrides.task if o.lstrip("+~").startswith(presets.STAGES)]
-    run(config, str(hydra_config.runtime.choices["pipeline"]), changed)
+    run(config, *chosen_pipeline())
 
 
 def main() -> None:
     """The command."""
-    paths = [*path_fields(Fields), "dataset.root", "dataset.file", "dataset.truth", "dataset.images", "export"]
-    run_command("eval", task, paths=paths, interrupted="interrupted; the same command continues the run")
+    run_command(EVAL, task)

@@ -1,129 +1,115 @@
-"""How every command runs: Hydra composes its config, and a user's mistake ends it with one line and status 1."""
+"""The commands by one name: ``fmtorch eval pipeline=sift_ratio``, also ``python -m fmtorch eval ...``.
+
+Help, and a mistake in the command's name, are answered here, before any library is imported.
+"""
 
 from __future__ import annotations
 
-import functools
-import re
+import os
 import sys
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
-import hydra
-from hydra.core.hydra_config import HydraConfig
-from hydra.core.utils import env_override
-from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
-from hydra.types import RunMode
-from omegaconf import DictConfig
-from omegaconf.errors import GrammarParseError, OmegaConfBaseException
-
-from fmtorch.commands.help import help_text
-from fmtorch.commands.overrides import hydra_arguments
-from fmtorch.core.files import conf_dir
-from fmtorch.core.options import nearest
-from fmtorch.core.terminal import MISTAKES, error_line, exits_with_message
 from fmtorch.core.version import __version__
-from fmtorch.presets import available, top_level_names
-from fmtorch.presets.files import groups
-from fmtorch.presets.pruners import with_explicit
 
-Task = Callable[[DictConfig], None]
-SUBMITTED = "jobs run in other processes; what each prints: .submitit/JOB/JOB_0_log.out below hydra.sweep.dir (runs)"
+if TYPE_CHECKING:
+    from fmtorch.commands.options import Command
 
+SUMMARIES = {
+    "eval": "run a pipeline over a data set of image pairs and evaluate it",
+    "list": "the presets there are, of all groups or of one: fmtorch list estimator",
+    "match": "the fundamental matrix of two photographs, with pictures: fmtorch match a.jpg b.jpg",
+    "pairs": "which pairs of images with known cameras can be matched, as a data set",
+    "report": "compare runs of eval on one HTML page",
+    "train": "train a learned pruner on labelled matches of a data set",
+    "verify": "two-view geometries of the matches in a COLMAP database, or hloc's files",
+    "warm-up": "compile all kernels now, for images and containers",
+}
+HELP = f"""fmtorch {__version__}: two-view geometry
 
-class Mistake(ValueError):
-    """A user's mistake in one job of a sweep, error_line by its message: it can be sent between processes."""
+usage: fmtorch COMMAND [NAME=VALUE ...]
 
+{chr(10).join(f"  {name:9}{what}" for name, what in SUMMARIES.items())}
 
-def job(task: Task) -> Task:
-    """The task, ending a single run with one line for a user's mistake; a sweep goes on with its other jobs first."""
-
-    @functools.wraps(task)
-    def wrapped(config: DictConfig) -> None:
-        try:
-            _expect_known(HydraConfig.get().overrides.task)
-            task(with_explicit(config, HydraConfig.get().overrides.task))
-        except MISTAKES as error:
-            if HydraConfig.get().mode == RunMode.MULTIRUN:
-                raise Mistake(error_line(error)) from None
-            sys.exit(f"error: {error_line(error)}")
-
-    return wrapped
+`fmtorch COMMAND --help` lists what a command takes; `python -m fmtorch COMMAND` is the same command."""
+FOOTER = """Hydra's own: -m for sweeps (estimator=ransac,msac), --config-dir FOLDER for presets of your own, --cfg job
+to print the config, --hydra-help for the rest."""
+_COLUMN, _WIDTH = 27, 120  # where what is said of an option begins, and where its lines end
 
 
-def run_command(
-    name: str,
-    task: Task,
-    *,
-    paths: Sequence[str] = (),
-    positional: Sequence[str] = (),
-    interrupted: str = "interrupted",
-) -> None:
-    """Run a `job` on the config that ``conf/<name>.yaml`` and the command line compose.
-
-    Args:
-        name: of the command and of its config.
-        task: a `job` that its module holds under its own name, so that launchers can send it to other processes.
-        paths, positional: fields that hold paths, and those that need no name, see `hydra_arguments`.
-        interrupted: what is said where the user stops it.
-    """
-    if {"--version"} & set(sys.argv[1:]):
+def main(words: Sequence[str] | None = None) -> None:
+    """Run the command that the first word names, of the process's own command line if none are given."""
+    name, *rest = (sys.argv[1:] if words is None else words) or ["--help"]
+    own_help = name in ("list", "warm-up")
+    if name in ("--help", "-h", "help"):
+        print(HELP)
+    elif name == "--version" or ("--version" in rest and not own_help):
         print(__version__)
-        return
-    if {"--help", "-h"} & set(sys.argv[1:]):
-        print(help_text(name, tuple(positional)))
-        return
-    with exits_with_message(interrupted):
-        sys.argv[1:] = hydra_arguments(sys.argv[1:], paths, positional)
-        if any(word.startswith("hydra/launcher=submitit") for word in sys.argv):
-            print(SUBMITTED, flush=True)
-        try:
-            with env_override({"HYDRA_FULL_ERROR": "1"}):  # Hydra then leaves errors to us
-                hydra.main(version_base=None, config_path=str(conf_dir()), config_name=name)(task)()
-        except (HydraException, OmegaConfBaseException) as error:
-            sys.exit(f"error: {explained(error, name)}")
+    elif name not in SUMMARIES:
+        sys.exit(f"error: no command {name!r}; there are: {', '.join(SUMMARIES)}")
+    elif {"--help", "-h"} & set(rest) and not own_help:
+        from fmtorch.commands.options import COMMANDS
+
+        print(help_text(COMMANDS[name]))
+    else:
+        sys.argv[1:] = rest
+        if sys.path[0] != os.getcwd():  # where a user's own parts are found, as by `python -m`
+            sys.path.insert(0, os.getcwd())
+        _command(name)()
 
 
-def _expect_known(overrides: Sequence[str]) -> None:
-    """Raise ValueError for a field that is added (`+limti=2`) and that no command takes."""
-    job_config = HydraConfig.get()
-    known = [*top_level_names(str(job_config.job.config_name)), *map(str, job_config.runtime.choices)]
-    for word in overrides:
-        name = word.lstrip("+").partition("=")[0]
-        if word.startswith("+") and re.fullmatch(r"\w+", name) and name not in known:
-            raise ValueError(f"no option {name}; there are: {nearest(name, known[: -len(job_config.runtime.choices)])}")
+def _command(name: str) -> Callable[[], None]:
+    """What runs a command; with it come the libraries that it needs."""
+    if name == "eval":
+        from fmtorch.commands.eval import main
+    elif name == "list":
+        from fmtorch.commands.list import main
+    elif name == "match":
+        from fmtorch.commands.match import main
+    elif name == "pairs":
+        from fmtorch.commands.pairs import main
+    elif name == "report":
+        from fmtorch.commands.report import main
+    elif name == "train":
+        from fmtorch.commands.train import main
+    elif name == "verify":
+        from fmtorch.commands.verify import main
+    else:
+        from fmtorch.commands.warm_up import main
+    return main
 
 
-def explained(error: HydraException | OmegaConfBaseException, command: str) -> str:
-    """One line for an error of Hydra's composition of the config of a command."""
-    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
-        return _missing(str(error.missing_cfg_file), error.options or ())
-    if isinstance(error, OverrideParseException):
-        return f"{error.override} cannot be read; a value with special characters stands in quotes: \"NAME='VALUE'\""
-    cause = error
-    while isinstance(cause.__cause__, HydraException | OmegaConfBaseException):
-        cause = cause.__cause__
-    parent = getattr(cause, "parent_node", None)
-    if isinstance(cause, GrammarParseError):
-        return f"{cause.full_key}: {_line(str(cause.msg))}"
-    if isinstance(cause, OmegaConfBaseException) and cause.full_key:
-        names = [str(key) for key in parent] if isinstance(parent, DictConfig) else []
-        if parent is not None and cause.key is not None and str(cause.key) not in names:
-            names = [name for name in names if name != "hydra"]
-            return f"no option {cause.full_key}; there are: {nearest(str(cause.key), names) or 'none'}"
-        return f"{cause.full_key}: {_line(str(cause.msg or cause))}"
-    unknown = re.search(r"[Cc]ould not override '([^']+)'", str(error))
-    if isinstance(error, ConfigCompositionException) and unknown:
-        return f"no option {unknown[1]}; there are: {nearest(unknown[1], top_level_names(command))}"
-    return _line(str(error))
+def help_text(command: Command) -> str:
+    """The page of a command: what it does, its groups of presets and its options, each with its default."""
+    import dataclasses
+
+    places = "".join(f" [{name.removesuffix('...').upper()}]" for name in command.positional)
+    summary = SUMMARIES[command.name]
+    about = f"{summary[0].upper()}{summary[1:]}.\n{command.about}"
+    groups = [_line(name, value, command.group_help.get(name, "")) for name, value in command.groups.items()]
+    options = [
+        _line(field.name, command.defaults[field.name], str(field.metadata["about"]))
+        for field in dataclasses.fields(command.options)
+    ]
+    parts = [
+        f"usage: fmtorch {command.name}{places} [NAME=VALUE ...]",
+        about,
+        "\n".join(["groups of presets:", *groups]) if groups else "",
+        "\n".join(["options:", *options]),
+        FOOTER,
+    ]
+    return "\n\n".join(filter(None, parts))
 
 
-def _missing(file: str, options: Sequence[str]) -> str:
-    """One line for a preset that there is not; options: those that Hydra found in its folder."""
-    group, _, name = file.partition("/")
-    if group not in groups():
-        group, _, name = file.rpartition("/")
-    there_are = nearest(name, {*(options if "/" not in name else ()), *available(group)})
-    return f"no preset {name!r} in {group}; there are: {there_are or 'none'}"
+def _line(name: str, value: Any, about: str) -> str:
+    """A name with its default and what is said of it; of an option with parts, their names."""
+    import textwrap
 
+    from fmtorch.core.options import shown
 
-def _line(text: str) -> str:
-    return " ".join(text.split())
+    if isinstance(value, dict):
+        name, value, about = f"{name}.NAME", "", f"{about}; NAME: {', '.join(value)}"
+    start = f"  {name}={shown(value) if value != '' else ''}"
+    lines = textwrap.wrap(about, _WIDTH - _COLUMN, break_on_hyphens=False) or [""]
+    indented = f"\n{' ' * _COLUMN}".join(lines)
+    return f"{start:{_COLUMN - 1}} {indented}".rstrip()

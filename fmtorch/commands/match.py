@@ -14,14 +14,14 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from hydra.core.hydra_config import HydraConfig
 from numpy.typing import NDArray
 from omegaconf import DictConfig
 from rich.table import Table
 
 from fmtorch import presets
-from fmtorch.commands.main import job, run_command
-from fmtorch.commands.match_folder import FolderFields, match_folder
+from fmtorch.commands.config import chosen_pipeline, job, run_command
+from fmtorch.commands.match_folder import match_folder
+from fmtorch.commands.options import MATCH, MatchOptions
 from fmtorch.core.files import expect_writable, replacing
 from fmtorch.core.terminal import console, errors
 from fmtorch.core.types import RELATED
@@ -36,16 +36,8 @@ from fmtorch.pipeline.photograph_cameras import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pipeline.reduced_images import Image
 from fmtorch.pipeline.two_images import MatchResult, match
-from fmtorch.presets.fields import Cache, Gigabytes, path_fields, read_fields
+from fmtorch.presets.fields import read_fields
 from fmtorch.runs.feature_cache import CachedFeatures
-
-
-@dataclasses.dataclass(frozen=True)
-class CameraFields:
-    """What the command takes of cameras; ``conf/match.yaml`` says what each is."""
-
-    cameras: Path | None = None
-    K: str | list[float | int] | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -117,23 +109,12 @@ def pose_line(result: MatchResult) -> str:
 MAX_RANK3 = 0.01  # third singular value of a true F over the second one: its numbers may be rounded
 
 
-@dataclasses.dataclass(frozen=True)
-class Fields(CameraFields, FolderFields):
-    """What the command takes beside stages; ``conf/match.yaml`` says what each is."""
-
-    image0: Path | None = None
-    image1: Path | None = None
-    truth: Path | None = None
-    cache: Cache = None
-    cache_limit: Gigabytes | None = 20
-
-
 def run(config: DictConfig, pipeline_name: str, overrides: Sequence[str] = ()) -> Path:
     """Match the two photographs of a composed config and return the folder with the results.
 
     overrides: what the command line changed of the pipeline of that name; said beside it.
     """
-    fields = read_fields(Fields, config)
+    fields = read_fields(MatchOptions, config)
     if fields.images is not None:
         if fields.image0 is not None or fields.image1 is not None or fields.truth is not None:
             raise ValueError("images takes a folder; image0, image1 and truth are of a single pair")
@@ -300,11 +281,9 @@ def _table(result: MatchResult, cached: bool) -> Table:
 @job
 def task(config: DictConfig) -> None:
     """What Hydra runs."""
-    hydra_config = HydraConfig.get()
-    changed = [o for o in hydra_config.overrides.task if o.lstrip("+~").startswith(presets.STAGES)]
-    run(config, str(hydra_config.runtime.choices["pipeline"]), changed)
+    run(config, *chosen_pipeline())
 
 
 def main() -> None:
     """The command."""
-    run_command("match", task, paths=[*path_fields(Fields), "export", "K"], positional=("image0", "image1"))
+    run_command(MATCH, task)

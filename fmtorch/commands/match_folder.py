@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from omegaconf import DictConfig
 
 from fmtorch import presets
+from fmtorch.commands.options import MatchOptions
 from fmtorch.core.files import replacing
 from fmtorch.core.stages import ImageMatcher
 from fmtorch.core.terminal import console, errors, progress_bars
@@ -21,7 +20,7 @@ from fmtorch.data.images import read_image
 from fmtorch.evaluation.view_graph_picture import view_graph_svg
 from fmtorch.features.vlad import descriptor_kind, image_vector
 from fmtorch.io.export import ViewGraph, export_kinds, view_graph, write_exports, write_view_graph
-from fmtorch.io.match_store import Journal
+from fmtorch.io.match_store import MatchStore
 from fmtorch.jobs.execution import MIN_PAIRS_FOR_PROCESSES
 from fmtorch.pipeline.build import build_pipeline
 from fmtorch.pipeline.folder import (
@@ -40,29 +39,12 @@ from fmtorch.pipeline.folder import (
 from fmtorch.pipeline.photograph_cameras import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets.executors import execution_of
-from fmtorch.presets.fields import Count, Device, Seed
 from fmtorch.runs.feature_cache import CachedFeatures, cached
 from fmtorch.runs.fingerprint import fmtorch_version
 
 
-@dataclasses.dataclass(frozen=True)
-class FolderFields:
-    """What the command takes of a folder, and of a single pair too; ``conf/match.yaml`` says what each is."""
-
-    images: Path | None = None
-    pairs: Path | None = None
-    export: str | list[str] | None = None
-    camera: Literal["per_image", "shared"] = "per_image"
-    output: Path | None = None
-    orient: bool = True
-    longest_side: Count = 1600
-    workers: Count | None = None
-    seed: Seed = 0
-    device: Device = "auto"
-
-
 def match_folder(
-    config: DictConfig, fields: FolderFields, cameras: PhotographCameras, pipeline_name: str, overrides: Sequence[str]
+    config: DictConfig, fields: MatchOptions, cameras: PhotographCameras, pipeline_name: str, overrides: Sequence[str]
 ) -> Path:
     """Match the pairs of a folder of images, write what is to be exported and return the folder with it.
 
@@ -85,7 +67,7 @@ def match_folder(
         "version": fmtorch_version(), "images": str(folder.absolute()), **stages, "seed": fields.seed,
         "orient": fields.orient, "longest_side": fields.longest_side, **cameras.identity,
     }  # fmt: skip
-    journal = Journal(open_folder(output, identity), folder)
+    journal = MatchStore(open_folder(output, identity), folder)
     scratch = journal.folder / "features"
     if len(images) > MEMORY and not isinstance(pipeline.extractor, CachedFeatures):  # none is computed twice
         pipeline.extractor = cached(pipeline.extractor, scratch)

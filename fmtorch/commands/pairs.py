@@ -8,14 +8,14 @@ import itertools
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 from omegaconf import DictConfig
 from rich.progress import Progress
 
 from fmtorch import data, presets
-from fmtorch.commands.main import job, run_command
-from fmtorch.core.options import Within
+from fmtorch.commands.config import job, run_command
+from fmtorch.commands.options import PAIRS, PairsOptions
 from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.data.construction import BLOCK, Construction, blocks
 from fmtorch.data.scenes import ScenePairs
@@ -24,33 +24,11 @@ from fmtorch.jobs.pool import WorkerPool
 from fmtorch.jobs.runner import Factory, Local, Source, in_order
 from fmtorch.presets import plain
 from fmtorch.presets.executors import execution_of
-from fmtorch.presets.fields import Count, Seed, path_fields, read_fields
+from fmtorch.presets.fields import read_fields
+from fmtorch.scenes import RenderedPairs
 
 MIN_CANDIDATES_FOR_PROCESSES = 4 * BLOCK + 1  # below which processes are not worth their start
 PRELOADED = ("fmtorch.data.construction",)  # by the process that workers are forked of
-
-
-class LeastAndGreatest:
-    """A rule for lists: two shares, of which the first is not the greater."""
-
-    def __call__(self, value: Any) -> bool:
-        """Whether it is such a list."""
-        return len(value) == 2 and 0 <= value[0] <= value[1] <= 1
-
-    def __str__(self) -> str:
-        return "from 0 to 1: least and greatest share, as [0.1,0.4],"
-
-
-@dataclasses.dataclass(frozen=True)
-class Fields:
-    """What the command takes beside the data set; ``conf/pairs.yaml`` says what each is."""
-
-    output: Path | None = None
-    count: Count | None = 1000
-    seed: Seed = 0
-    workers: Count | None = None
-    quality: Annotated[int, Within(1, 100)] = 95
-    overlap: Annotated[list[int | float], LeastAndGreatest()] | None = None
 
 
 def run(config: DictConfig) -> Path:
@@ -58,7 +36,7 @@ def run(config: DictConfig) -> Path:
 
     Raises ValueError, before anything is computed or written, where an option is not what it may be.
     """
-    fields = read_fields(Fields, config)
+    fields = read_fields(PairsOptions, config)
     if fields.output is None:
         raise ValueError("output is missing; it names the folder of the set that is made: output=KITTI")
     dataset = _load(config.dataset)
@@ -89,7 +67,7 @@ def run(config: DictConfig) -> Path:
     return construction.folder
 
 
-def _execution(config: DictConfig, fields: Fields, many: bool) -> Execution:
+def _execution(config: DictConfig, fields: PairsOptions, many: bool) -> Execution:
     """By whom candidates are judged: with nothing said, by processes where there are many, else here."""
     asked = execution_of(config, fields.workers)
     execution = asked.decided(many if asked.workers is None else asked.workers > 1)
@@ -98,24 +76,18 @@ def _execution(config: DictConfig, fields: Fields, many: bool) -> Execution:
 
 def _load(config: DictConfig) -> ScenePairs:
     """The data set of a config, all of whose candidates are asked for."""
-    presets.expect_dataset(config)
     options = plain(config)
-    own = "_target_" in options
-    if options.get("name") == "rendered":
-        from fmtorch.scenes import RenderedPairs
-
-        with progress_bars() as progress:
-            drawn = data.load(**options, progress=reporter(progress, "drawing scenes"))
-        assert isinstance(drawn, RenderedPairs)
-        return drawn.scene_pairs()
-    if own or options["name"] in data.SCENE_SETS:
-        dataset = presets.instantiate(options, "dataset") if own else data.load(**options)
-        if isinstance(dataset, ScenePairs):
-            return dataset
-    raise ValueError(
-        f"dataset={options.get('name', options.get('_target_'))} has no candidates to judge; it must be one of "
-        f"{', '.join(data.SCENE_SETS)}, rendered, or a `ScenePairs` of your own"
-    )
+    presets.expect_buildable(options, "dataset")
+    with progress_bars() as progress:
+        dataset = data.build(options, reporter(progress, "drawing scenes"))
+    if isinstance(dataset, RenderedPairs):
+        return dataset.scene_pairs()
+    if not isinstance(dataset, ScenePairs):
+        raise ValueError(
+            f"dataset={dataset.name} has no candidates to judge; it must be one of tum, kitti, colmap, bundler, "
+            "cameras, rendered, or a `ScenePairs` of your own"
+        )
+    return dataset
 
 
 def _select(construction: Construction, execution: Execution, progress: Progress) -> tuple[list[int], int, list[str]]:
@@ -189,5 +161,4 @@ def task(config: DictConfig) -> None:
 
 def main() -> None:
     """The command."""
-    paths = [*path_fields(Fields), "dataset.root"]
-    run_command("pairs", task, paths=paths, interrupted="interrupted; the same command goes on from there")
+    run_command(PAIRS, task)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import pyarrow as pa
@@ -14,36 +12,20 @@ from omegaconf import DictConfig
 from rich.progress import track
 
 from fmtorch import presets
-from fmtorch.commands.main import job, run_command
+from fmtorch.commands.config import job, run_command
+from fmtorch.commands.options import REPORT, ReportOptions
 from fmtorch.core.files import expect_writable, replacing
-from fmtorch.core.options import Within
 from fmtorch.core.terminal import console
 from fmtorch.evaluation.curves import axis_of
 from fmtorch.evaluation.gallery import Options, Run, gallery
 from fmtorch.evaluation.page import Section, render, run_names, shared_settings
-from fmtorch.presets.fields import Cache, Device, Gigabytes, path_fields, read_fields
+from fmtorch.presets.fields import read_fields
 from fmtorch.runs import RunFolder, RunFolderError
-
-
-@dataclasses.dataclass(frozen=True)
-class Fields:
-    """What the command takes; ``conf/report.yaml`` says what each is."""
-
-    runs: str | list[str]
-    output: Path
-    title: str = "Fundamental matrices"
-    pictures: Annotated[int, Within(0)] = 6
-    order: str | None = None
-    root: str | list[str] | None = None
-    own_code: bool = False
-    device: Device = "auto"
-    cache: Cache = None
-    cache_limit: Gigabytes | None = 20
 
 
 def run(config: DictConfig) -> Path:
     """Write the page of a composed config and return its path. Raises ValueError where there is no run."""
-    fields = read_fields(Fields, config)
+    fields = read_fields(ReportOptions, config)
     paths = [Path(path) for path in ([fields.runs] if isinstance(fields.runs, str) else fields.runs)]
     runs = named([RunFolder.load(path) for path in run_folders(paths)])
     if _order(fields.order, paths) == "recall":
@@ -147,10 +129,10 @@ def _dataset(folder: RunFolder) -> str:
 
 
 def _heading(runs: Sequence[Run]) -> str:
-    options = runs[0].folder.config.get("dataset") or {}
-    words = [
-        str(value) for key, value in options.items() if key not in ("digest", "_target_") and isinstance(value, str)
-    ]
+    options = {key: value for key, value in (runs[0].folder.config.get("dataset") or {}).items() if key != "digest"}
+    preset = presets.closest("dataset", options)
+    words = [] if preset is None else [preset[0]]
+    words += [value for key, value in options.items() if key != "_target_" and isinstance(value, str)]
     families = dict.fromkeys(name for r in runs for name in r.table["family"].to_pylist())
     return ": ".join(dict.fromkeys(", ".join(part) for part in (words, families) if part))
 
@@ -163,4 +145,4 @@ def task(config: DictConfig) -> None:
 
 def main() -> None:
     """The command."""
-    run_command("report", task, paths=path_fields(Fields), positional=("runs...",))
+    run_command(REPORT, task)

@@ -5,7 +5,8 @@ from __future__ import annotations
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from fmtorch.commands.main import job, run_command
+from fmtorch.commands.config import job, run_command
+from fmtorch.commands.options import TRAIN
 
 
 @job
@@ -22,4 +23,4 @@ def task(config: DictConfig) -> None:
 
 def main() -> None:
     """The command."""
-    run_command("train", task, interrupted="interrupted; the same command continues the training")
+    run_command(TRAIN, task)

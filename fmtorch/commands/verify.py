@@ -3,57 +3,42 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import functools
 import re
 import sys
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich.table import Table
 
 from fmtorch import presets
-from fmtorch.commands.main import job, run_command
+from fmtorch.commands.config import job, run_command
+from fmtorch.commands.options import VERIFY, VerifyOptions
 from fmtorch.core.terminal import console, errors, progress_bars, reporter
 from fmtorch.jobs.execution import shard_of
 from fmtorch.presets import plain
 from fmtorch.presets.executors import execution_of
-from fmtorch.presets.fields import Seed, path_fields, read_fields
-from fmtorch.verification.run import Cameras, Verification
-from fmtorch.verification.verify import ONE_THREAD, How, Places, verify_by
+from fmtorch.presets.fields import read_fields
+from fmtorch.verification.run import Verification
+from fmtorch.verification.verify import ONE_THREAD, VerifyMode, VerifyPaths, verify_by
 
 MAX_PROBLEMS = 20  # that are printed
 
 
-@dataclasses.dataclass(frozen=True)
-class Fields:
-    """What the command takes beside the estimator; ``conf/verify.yaml`` says what each is."""
-
-    database: Path | None = None
-    features_file: Path | None = None
-    matches: Path | None = None
-    output: Path | None = None
-    cameras: Cameras = "stored"
-    force: bool = False
-    seed: Seed = 0
-    shard: str | None = None
-
-
 def run(config: DictConfig, estimator: str) -> Verification:
     """Verify the database of a composed config, by a preset whose options are those of the config."""
-    fields = read_fields(Fields, config)
+    fields = read_fields(VerifyOptions, config)
     presets.expect_buildable(plain(config.estimator), "estimator")
     make = functools.partial(presets.instantiate, plain(config.estimator), "estimator")
     execution = execution_of(config).decided(False)
     if execution.shared and execution.workers is None:
         execution = ONE_THREAD
-    how = How(fields.cameras, fields.force, fields.seed, execution, shard_of(fields.shard))
+    mode = VerifyMode(fields.cameras, fields.force, fields.seed, execution, shard_of(fields.shard))
     with _begun_by_reports(estimator) as report:
-        places = Places(fields.database, fields.features_file, fields.matches, fields.output)
+        paths = VerifyPaths(fields.database, fields.features_file, fields.matches, fields.output)
         settings = {"estimator": plain(config.estimator)}
-        result = verify_by(make, settings, places, how, report)
+        result = verify_by(make, settings, paths, mode, report)
     for problem in result.problems[:MAX_PROBLEMS]:
         errors.print(problem, style="bold", markup=False, highlight=False, soft_wrap=True)
     if len(result.problems) > MAX_PROBLEMS:
@@ -104,5 +89,4 @@ def task(config: DictConfig) -> None:
 def main() -> None:
     """The command."""
     sys.argv[1:] = [re.sub("^features=", "features_file=", word) for word in sys.argv[1:]]  # no preset of conf/features
-    said = "interrupted; the same command continues"
-    run_command("verify", task, paths=path_fields(Fields), positional=("database",), interrupted=said)
+    run_command(VERIFY, task)

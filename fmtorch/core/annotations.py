@@ -6,10 +6,7 @@
 from __future__ import annotations
 
 import inspect
-import sys
-import types
 import typing
-from collections import ChainMap
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -17,11 +14,10 @@ import torch
 from jaxtyping import AbstractArray
 from torch import Tensor
 
+from fmtorch.core.options import UNIONS
+
 FLOATING, WHOLE, REAL, BOOLEAN = "floating-point numbers", "whole numbers", "real numbers", "booleans"
 NUMBERS = {"Float": FLOATING, "Int": WHOLE, "Int8": WHOLE, "Real": REAL, "Bool": BOOLEAN}
-UNIONS = (typing.Union, types.UnionType)
-UNRESOLVED = (NameError, AttributeError, TypeError, SyntaxError)
-"""What an annotation raises that means something to type checkers alone: it names what is imported for these only."""
 
 
 class Rule(NamedTuple):
@@ -91,23 +87,6 @@ def arrays_of(kind: type) -> dict[str, Expected]:
     hints = typing.get_type_hints(kind, include_extras=True)
     fields = {name: expectation(hint) for name, hint in hints.items()}
     return {name: expected for name, expected in fields.items() if expected.kind == "array"}
-
-
-def resolved(target: Callable[..., Any]) -> dict[str, Any]:
-    """The annotations of the parameters of anybody's class or function; without those for type checkers alone.
-
-    Those of a dataclass's fields may stand in a base of it, in whose module they mean something.
-    """
-    function = inspect.unwrap(target.__init__ if isinstance(target, type) else target)  # type: ignore[misc]
-    names = getattr(function, "__globals__", {})
-    bases = [vars(sys.modules[base.__module__]) for base in target.__mro__] if isinstance(target, type) else []
-    hints = {}
-    for name, annotation in getattr(function, "__annotations__", {}).items():
-        try:
-            hints[name] = eval(annotation, names, ChainMap(*bases)) if isinstance(annotation, str) else annotation
-        except UNRESOLVED:
-            continue
-    return hints
 
 
 def numbers_of(dtype: torch.dtype) -> str:

@@ -7,19 +7,17 @@ from __future__ import annotations
 
 import functools
 import inspect
-import sys
+import math
+import operator
 from collections.abc import Callable, Mapping
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int
 from torch import Tensor
 
 from fmtorch.core.annotations import WHOLE, Expected, arguments_of, numbers_of
-from fmtorch.core.arguments import as_tensor, number
-from fmtorch.core.rules import FOCAL, SIZE
-from fmtorch.core.types import Correspondences
+from fmtorch.core.types import SIZE
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -61,18 +59,47 @@ def checked(function: Callable[P, R], *, common_type: bool = False) -> Callable[
     return door
 
 
-def check_exported(package: str) -> None:
-    """Make the functions that a package exports, those of its `__all__`, `checked` with one type for all tensors.
+def as_tensor(value: Any, name: str) -> Tensor:
+    """A tensor of numbers, of an array without copying. Raises TypeError, naming the argument, for anything else."""
+    if isinstance(value, Tensor):
+        return value
+    if isinstance(value, list | tuple) and value and all(isinstance(entry, Tensor) for entry in value):
+        return torch.stack(list(value))
+    try:
+        array = np.asarray(value)
+    except ValueError as error:
+        raise TypeError(
+            f"{name} is a {type(value).__name__} of uneven rows; it must be an array or a tensor"
+        ) from error
+    if array.dtype.kind not in "biuf":
+        raise TypeError(
+            f"{name} is a {type(value).__name__} of {array.dtype}; it must be an array or tensor of numbers"
+        )
+    if array.dtype.kind == "f" and array.dtype.itemsize > 8:
+        array = array.astype(np.float64)
+    if array.dtype.kind == "u" and array.dtype.itemsize > 1:
+        array = array.astype(np.int64)
+    array = np.ascontiguousarray(array, array.dtype.newbyteorder("="))
+    return torch.from_numpy(array if array.flags.writeable else array.copy())
 
-    The package's own modules import each other's functions unchecked, from where they are defined.
-    """
-    module = sys.modules[package]
-    for name in module.__all__:
-        function = getattr(module, name)
-        if inspect.isfunction(function):
-            door = checked(function, common_type=True)
-            door.__module__ = package  # where pickle finds it
-            setattr(module, name, door)
+
+def number(name: str, value: Any, integer: bool) -> Any:
+    """A number, not NaN; what has one element may be one. Raises TypeError or ValueError naming the argument."""
+    if isinstance(value, bool | np.bool_ | str | bytes | complex | np.complexfloating):
+        raise TypeError(f"{name} is {value!r}; it must be a {'whole ' if integer else ''}number")
+    if isinstance(value, int | float):
+        plain: Any = value
+    else:
+        try:
+            plain = operator.index(value) if integer else float(value)
+        except (TypeError, ValueError, RuntimeError, OverflowError):
+            said = "whole number" if integer else "number"
+            raise TypeError(f"{name} is a {type(value).__name__}; it must be a {said}") from None
+    if integer and not isinstance(plain, int):
+        raise TypeError(f"{name} is {value!r}; it must be a whole number")
+    if math.isnan(plain):
+        raise ValueError(f"{name} is nan; it must be a number")
+    return value if isinstance(value, int | float) else plain
 
 
 def _checked_value(name: str, value: Any, want: Expected, device: torch.device) -> Any:
@@ -181,46 +208,6 @@ def _readable(shape: tuple[str, ...]) -> str:
     """``(..., N, 2)`` of jaxtyping's ``*#batch n 2``."""
     tokens = ["..." if token.startswith("*") else token.lstrip("#").upper() for token in shape]
     return f"({', '.join(tokens)}{',' if len(tokens) == 1 else ''})"
-
-
-PER_MATCH = {name: rule for name in Correspondences.per_slot if (rule := Correspondences.declared[name].bounds)}
-RULES = {**PER_MATCH, "size0": SIZE, "size1": SIZE, "focal": FOCAL}
-"""The rules for values, in a tensor or an array. NaN is never right."""
-
-
-def wrong_values(c: Correspondences, mask: Bool[Tensor, "b n"]) -> dict[str, Int[Tensor, " b"]]:
-    """How many values of each argument are wrong, in each pair; in slots other than `mask` nothing is."""
-    wrong = {}
-    for name, rule in RULES.items():
-        if (value := getattr(c, name)) is not None:
-            broken = ~rule.holds(value.detach())
-            wrong[name] = (mask & broken if name in PER_MATCH else broken).sum(1)
-    return wrong
-
-
-def reason(wrong: dict[str, int]) -> str:
-    """What is said of a pair with so many wrong values of each argument; empty where there is none."""
-    for name, count in wrong.items():
-        if count:
-            matches = f" of {count} match{'' if count == 1 else 'es'}" if name in PER_MATCH else ""
-            return f"{name}{matches} is wrong: {RULES[name].text}"
-    return ""
-
-
-def expect_values(c: Correspondences) -> None:
-    """Raises ValueError naming the first wrong value of the real matches of a batch; a GPU is asked but once."""
-    wrong = wrong_values(c, c.mask)
-    if not wrong or not bool(torch.stack(list(wrong.values())).any()):
-        return
-    for name, rule in PER_MATCH.items():
-        if name in wrong and bool(wrong[name].any()):
-            pair, match = (c.mask & ~rule.holds(getattr(c, name))).nonzero()[0].tolist()
-            value = getattr(c, name)[pair, match].item()
-            raise ValueError(f"{name} of match {match} of pair {pair} is {value}; {rule.text}")
-    expect_sizes(size0=c.size0, size1=c.size1)
-    if c.focal is not None and not bool(FOCAL.holds(c.focal).all()):
-        pair, image = (~FOCAL.holds(c.focal)).nonzero()[0].tolist()
-        raise ValueError(f"focal of image {image} of pair {pair} is {c.focal[pair, image].tolist()}; {FOCAL.text}")
 
 
 def expect_sizes(**sizes: Tensor | None) -> None:

@@ -1,4 +1,4 @@
-"""Files that are either whole or absent, whatever happens while they are written."""
+"""Files that are either whole or absent, and the folders of configuration, networks and caches."""
 
 from __future__ import annotations
 
@@ -63,10 +63,11 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
-# Where the configuration files and the learned files are, in a checkout and in an installed wheel
-
-
 _PACKAGE = Path(__file__).resolve().parents[1]
+STAGES: dict[str, str | list[str]] = {
+    "features": "sift", "matcher": "nearest", "pruner": ["ratio", "one_to_one"], "estimator": "ransac",
+}  # fmt: skip
+"""The groups of presets that a pipeline chooses from, with what stands where nothing is chosen."""
 
 
 def _folder(name: str) -> Path:

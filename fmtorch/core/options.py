@@ -1,4 +1,7 @@
-"""Options that a user sets, checked against the signature of what takes them before anything is built."""
+"""Options that a user sets: declared as fields of a dataclass, and checked against the signature of what takes them.
+
+Nothing here imports more than Python's own library, so that a command's ``--help`` waits for nothing.
+"""
 
 from __future__ import annotations
 
@@ -7,33 +10,83 @@ import difflib
 import enum
 import inspect
 import math
+import numbers
 import os
+import re
+import sys
+import types
 import typing
+from collections import ChainMap
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, cast
 
-from fmtorch.core.annotations import UNIONS, resolved
-
+T = TypeVar("T")
 PLAIN = (bool, int, float, str, type(None), list, tuple, Mapping)  # what a YAML file or a command line can say
 MAX_NAMES = 12  # that a message lists
+UNIONS = (typing.Union, types.UnionType)
+UNRESOLVED = (NameError, AttributeError, TypeError, SyntaxError)
+"""What an annotation raises that means something to type checkers alone: it names what is imported for these only."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Within:
-    """Bounds of a number, for ``Annotated[int, Within(1)]``; both may be reached."""
+    """Bounds of a number, for ``Annotated[int, Within(1)]``; both may be reached unless they are exclusive."""
 
     minimum: int | float = -math.inf
     maximum: int | float = math.inf
+    exclusive: bool = False
 
     def __call__(self, value: Any) -> bool:
         """Whether a number is in bounds."""
-        return isinstance(value, int | float) and self.minimum <= value <= self.maximum
+        number = float(value) if isinstance(value, numbers.Real) else math.nan
+        inside = self.minimum <= number <= self.maximum
+        return inside and not (self.exclusive and number in (self.minimum, self.maximum))
 
     def __str__(self) -> str:
         low, high = (str(bound) if isinstance(bound, int) else f"{bound:g}" for bound in (self.minimum, self.maximum))
         if self.maximum == math.inf:
-            return f"of at least {low}"
-        return f"of at most {high}" if self.minimum == -math.inf else f"from {low} to {high}"
+            return f"above {low}" if self.exclusive else f"of at least {low}"
+        if self.minimum == -math.inf:
+            return f"below {high}" if self.exclusive else f"of at most {high}"
+        return f"between {low} and {high}" if self.exclusive else f"from {low} to {high}"
+
+
+class DeviceName:
+    """A rule for texts: what `torch.device` takes, and ``auto``."""
+
+    def __call__(self, value: str) -> bool:
+        """Whether it is the name of a device."""
+        return re.fullmatch(r"auto|cpu|mps|(cuda|xpu)(:\d+)?", value) is not None
+
+    def __str__(self) -> str:
+        return "that names a device: auto, cpu, cuda, cuda:1 or mps"
+
+
+Count = Annotated[int, Within(1)]
+Seed = Annotated[int, Within(-(2**63), 2**63 - 1)]
+Device = Annotated[str, DeviceName()]
+Cache = Path | bool | None  # false is off
+Gigabytes = Annotated[int | float, Within(0)]
+
+
+def option(default: T, about: str) -> T:
+    """A field of a dataclass of options, with its default and what ``--help`` says of it."""
+    metadata = {"about": about}
+    if isinstance(default, list | dict):
+        return cast(T, dataclasses.field(default_factory=lambda: default.copy(), metadata=metadata))
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def defaults_of(options: type) -> dict[str, Any]:
+    """The default of each field of a dataclass of options as a config has it: those of a nested one as a mapping."""
+    return {field.name: _plain(getattr(options(), field.name)) for field in dataclasses.fields(options)}
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    return list(value) if isinstance(value, tuple) else str(value) if isinstance(value, Path) else value
 
 
 def expect_options(
@@ -64,6 +117,8 @@ def expect_options(
         annotation = annotations.get(str(key), Any)
         place = f"{where}: {key}" if "=" in where else f"{where}.{key}" if where else str(key)
         nested = dataclass_in(annotation)
+        if nested is not None and isinstance(value, nested):
+            value = vars(value)
         if isinstance(value, Mapping) and "_target_" not in value and nested is not None:
             expect_options(nested, value, place)
         elif not fits(value, annotation):
@@ -136,6 +191,8 @@ def expected(annotation: Any) -> str:
         return f"a list of {', '.join(map(expected, args))}"
     if issubclass(list, kind) or issubclass(kind, list | tuple):
         return "a list" + (f", each {expected(args[0])}" if args else "")
+    if dataclasses.is_dataclass(kind):
+        return f"a mapping of: {', '.join(field.name for field in dataclasses.fields(kind))}"
     return f"a {kind.__name__}: a mapping with a `_target_`"
 
 
@@ -160,3 +217,20 @@ def dataclass_in(annotation: Any) -> type | None:
     options = typing.get_args(annotation) if typing.get_origin(annotation) in UNIONS else ()
     kinds = [kind for kind in (annotation, *options) if isinstance(kind, type) and dataclasses.is_dataclass(kind)]
     return kinds[0] if len(kinds) == 1 else None
+
+
+def resolved(target: Callable[..., Any]) -> dict[str, Any]:
+    """The annotations of the parameters of anybody's class or function; without those for type checkers alone.
+
+    Those of a dataclass's fields may stand in a base of it, in whose module they mean something.
+    """
+    function = inspect.unwrap(target.__init__ if isinstance(target, type) else target)  # type: ignore[misc]
+    names = getattr(function, "__globals__", {})
+    bases = [vars(sys.modules[base.__module__]) for base in target.__mro__] if isinstance(target, type) else []
+    hints = {}
+    for name, annotation in getattr(function, "__annotations__", {}).items():
+        try:
+            hints[name] = eval(annotation, names, ChainMap(*bases)) if isinstance(annotation, str) else annotation
+        except UNRESOLVED:
+            continue
+    return hints

@@ -32,7 +32,7 @@ class TwoStepExtractor(FeatureExtractor, Protocol):
 
     @property
     def detection(self) -> object:
-        """What defines the frames and scores: parts, options, files, see `storage.configuration.configuration`."""
+        """What defines the frames and scores: parts, options, files (`fingerprint.configuration`)."""
         ...
 
     def detect(self, image: NDArray[np.uint8]) -> tuple[Float[Tensor, "n 2 3"], Float[Tensor, " n"]]:

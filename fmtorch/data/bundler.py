@@ -28,7 +28,7 @@ from fmtorch.data.scenes import (
     folders,
     sharing_points,
 )
-from fmtorch.data.text_files import DataError, numbered, read_lines, to_finite, to_whole
+from fmtorch.data.text_files import DataError, given_root, numbered, read_lines, to_finite, to_whole
 
 _FILES = ("gt_bundle.out", "bundle.out", "bundle/bundle.out")  # within a scene's folder, in the order they are tried
 _LIST = "list.txt"
@@ -50,7 +50,7 @@ class BundlerPairs(ScenePairs):
 
     def __init__(
         self,
-        root: str | Path,
+        root: str | Path | None = None,
         split: str = "test",
         sequences: Sequence[str] | None = None,
         candidates: Literal["all", "points"] = "all",
@@ -59,7 +59,9 @@ class BundlerPairs(ScenePairs):
         seed: int = 0,
         family: str | None = None,
     ) -> None:
-        home = Path(root).expanduser().absolute()
+        home = given_root(
+            root, "bundler", "a folder of scenes with list.txt and a Bundler file each, or one such scene"
+        ).absolute()
         if sequences is None and (home / _LIST).is_file():
             home, sequences = home.parent, [home.name]
         scene_folders = folders(home, chosen("colmap", split, sequences, ()), f"a folder for each scene, with {_LIST}")

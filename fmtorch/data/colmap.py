@@ -10,9 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.data.colmap_binary import read_binary
-from fmtorch.data.colmap_model import Model
-from fmtorch.data.colmap_text import read_text
+from fmtorch.data.colmap_model import Model, read_model
 from fmtorch.data.pairs import ImageSource
 from fmtorch.data.scenes import (
     MIN_SHARED,
@@ -28,14 +26,14 @@ from fmtorch.data.scenes import (
     read_colmap,
     sharing_points,
 )
-from fmtorch.data.text_files import DataError
+from fmtorch.data.text_files import DataError, given_root
 
 _MODELS = ("sparse/0", "sparse", "dense/sparse", ".")  # below a scene's folder, in the order in which they are tried
 _FILES = ("cameras.bin", "cameras.txt")
 
 
 def colmap_pairs(
-    root: str | Path,
+    root: str | Path | None = None,
     split: str = "test",
     sequences: Sequence[str] | None = None,
     model: str | None = None,
@@ -109,23 +107,11 @@ def _points(folder: Path) -> list[NDArray[np.int64]]:
     return [image.points for image in read_model(folder).images]
 
 
-def read_model(folder: Path, points: bool = True) -> Model:
-    """The model in a folder, of binary files where these are there, else of text files.
-
-    points: read which points each image sees. Raises DataError, naming file and line or record, for damaged files.
-    """
-    if (folder / "cameras.bin").is_file():
-        return read_binary(folder, points)
-    if (folder / "cameras.txt").is_file():
-        return read_text(folder, points)
-    raise DataError(f"{folder}: neither cameras.bin nor cameras.txt; it must hold a COLMAP model")
-
-
 def scene_folders(
-    root: str | Path, split: str, sequences: Sequence[str] | None, model: str | None
+    root: str | Path | None, split: str, sequences: Sequence[str] | None, model: str | None
 ) -> tuple[Path, list[Path]]:
     """The folder of scenes, and the scenes' folders: `root` itself where it is one."""
-    home = Path(root).expanduser().absolute()
+    home = given_root(root, "colmap", "a folder of scenes with a COLMAP model each, or one such scene").absolute()
     if sequences is None and any((home / place / file).is_file() for place in _places(model) for file in _FILES):
         return home.parent, [home]
     return home, folders(

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmtorch.core.files import replacing
+from fmtorch.core.settings import claim
 from fmtorch.data.fmbench import CAMERAS, IMAGES, SUFFIXES
 from fmtorch.data.images import ImageError, read_image, to_grey
 from fmtorch.data.overlap import DepthOverlap, PointOverlap, overlap_of
@@ -140,19 +141,8 @@ class Construction:
 
     def begin(self) -> None:
         """Make the folder, or go on with it. Raises ValueError where it holds another set, or anything else."""
-        record, identity = self.folder / "pairs.json", self.identity
-        if record.is_file():
-            there = json.loads(record.read_text(encoding="utf-8"))["identity"]
-            differing = [key for key, value in identity.items() if there.get(key) != value]
-            if differing:
-                said = ", ".join(f"{key} {there.get(key)} there, {identity[key]} now" for key in differing)
-                raise ValueError(f"output={self.folder} holds pairs that differ in {said}; name another folder")
-        elif self.folder.is_dir() and any(self.folder.iterdir()):
-            raise ValueError(f"output={self.folder} holds something else; name a new folder")
-        else:
-            self.work.mkdir(parents=True)
-            with replacing(record) as path:
-                path.write_text(json.dumps({"identity": identity}, indent=1) + "\n", encoding="utf-8")
+        claim(self.folder / "pairs.json", self.identity, "pairs", "name another folder as output")
+        self.work.mkdir(exist_ok=True)
 
     def order(self) -> Sequence[int] | NDArray[np.int64]:
         """The candidates in the order in which they are judged."""
@@ -219,9 +209,8 @@ class Construction:
             scene = self.dataset.scenes[number]
             pairs.append(f"{i} {j} {_numbers(image_pair(scene, i, j).F)}\n")
             subsets.append(f"{scene.name}/\n")
-        record = {"identity": self.identity, "summary": dict(summary)}
         for name, text in (
-            ("pairs.json", json.dumps(record, indent=1) + "\n"),
+            ("summary.json", json.dumps(dict(summary), indent=1) + "\n"),
             ("pairs_which_dataset.txt", "".join(subsets)),
             ("pairs_with_gt.txt", "".join(pairs)),
         ):

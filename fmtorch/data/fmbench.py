@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fmtorch.data.cameras import Camera, relative_pose
 from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset
 from fmtorch.data.scenes import WINDOW, AllPairs, Candidates, Scene, ScenePairs, View, folders, following
-from fmtorch.data.text_files import DataError, numbered, read_lines, read_numbers, to_finite
+from fmtorch.data.text_files import DataError, given_root, numbered, read_lines, read_numbers, to_finite
 
 CAMERAS, IMAGES, SUFFIXES = "Camera.txt", "Images", (".jpg", ".png")
 COLUMNS = "K (9 numbers, row by row), R (9), t (3)"
@@ -31,7 +31,7 @@ class CameraFilePairs(ScenePairs):
 
     def __init__(
         self,
-        root: str | Path,
+        root: str | Path | None = None,
         split: str = "test",
         sequences: Sequence[str] | None = None,
         fps: int | float | None = None,
@@ -43,7 +43,9 @@ class CameraFilePairs(ScenePairs):
             raise DataError(f"split {split!r}: cameras has only 'test'; choose scenes by root or sequences")
         if fps is not None and fps <= 0:
             raise DataError(f"fps={fps:g}; it must be positive, or null for images in no order")
-        home = Path(root).expanduser().absolute()
+        home = given_root(
+            root, "cameras", "a folder of scenes with Camera.txt and Images/ each, or one such scene"
+        ).absolute()
         if sequences is None and (home / CAMERAS).is_file():
             home, sequences = home.parent, [home.name]
         names = sequences or sorted(path.parent.name for path in home.glob(f"*/{CAMERAS}"))
@@ -100,7 +102,7 @@ class FMBenchPairs(PairDataset):
 
     def __init__(
         self,
-        root: str | Path,
+        root: str | Path | None = None,
         split: str = "test",
         subset: str | Sequence[str] | None = None,
         sets: Sequence[str] | None = None,
@@ -114,7 +116,9 @@ class FMBenchPairs(PairDataset):
         self._pairs: list[ImagePair] = []
         self._seen: Counter[str] = Counter()
         self._present: set[str] = set()
-        for folder in _set_folders(Path(root).expanduser(), sets):
+        for folder in _set_folders(
+            given_root(root, "fmbench", "a set's folder with pairs_with_gt.txt, or a folder of such sets"), sets
+        ):
             self._read_set(folder)
         for missing in sorted((self._subsets or set()) - self._present):
             raise DataError(f"{root}: no pairs of subset {missing!r}; it has {_listed(self._present) or 'no pairs'}")

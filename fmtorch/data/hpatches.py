@@ -14,7 +14,7 @@ from fmtorch.core.options import Within
 from fmtorch.data.cameras import Matrix
 from fmtorch.data.images import stored_size
 from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset, Resampling, shorter_side
-from fmtorch.data.text_files import DataError, read_numbers
+from fmtorch.data.text_files import DataError, given_root, read_numbers
 
 FAMILIES = {"i": "illumination", "v": "viewpoint"}  # by the first letter of a sequence's name
 LARGE = (
@@ -43,12 +43,12 @@ class HPatchesPairs(PairDataset):
 
     def __init__(
         self,
-        root: str | Path,
+        root: str | Path | None = None,
         sequences: Sequence[str] | None = None,
         large: bool = False,
         short_side: Annotated[int, Within(1)] | None = 480,
     ) -> None:
-        home = Path(root).expanduser()
+        home = given_root(root, "hpatches", "the folder of the sequences, i_* and v_*")
         there = sorted(folder.name for kind in FAMILIES for folder in home.glob(f"{kind}_*") if folder.is_dir())
         if not there:
             raise DataError(

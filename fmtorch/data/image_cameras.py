@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import ExifTags, Image
 
-from fmtorch.data.colmap import read_model
-from fmtorch.data.colmap_text import read_cameras
+from fmtorch.data.colmap_model import read_cameras, read_model
 from fmtorch.data.lenses import Lens
 from fmtorch.data.text_files import DataError
 

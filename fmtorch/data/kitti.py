@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fmtorch.data.cameras import Matrix, from_projection, nearest_rotation
 from fmtorch.data.pairs import ImageSource
 from fmtorch.data.scenes import WINDOW, Scene, ScenePairs, View, chosen, folders, following
-from fmtorch.data.text_files import DataError, numbered, to_finite
+from fmtorch.data.text_files import DataError, given_root, numbered, to_finite
 
 _SUFFIXES = (".png", ".jpg")
 _LAYOUT = "the layout is sequences/NN/calib.txt, times.txt, image_0/ and poses/NN.txt"
@@ -32,7 +32,7 @@ class KittiPairs(ScenePairs):
 
     def __init__(
         self,
-        root: str | Path,
+        root: str | Path | None = None,
         split: str = "test",
         sequences: Sequence[str] | None = None,
         camera: int = 0,
@@ -40,7 +40,7 @@ class KittiPairs(ScenePairs):
         pairs: int | None = 1000,
         seed: int = 0,
     ) -> None:
-        home = Path(root).expanduser()
+        home = given_root(root, "kitti", "the folder with sequences/ and poses/ of KITTI odometry")
         there = sorted(f.name for f in (home / "sequences").iterdir()) if (home / "sequences").is_dir() else []
         sequence_folders = folders(
             home / "sequences", chosen("kitti", split, sequences, there), "a folder for each sequence"

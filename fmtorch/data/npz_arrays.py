@@ -1,7 +1,8 @@
 """Arrays of ``.npz`` files, also those that NumPy stored as pickled objects, read without running what a pickle names.
 
-A pickle is a program that calls what it names. Here every name that it may use stands for a class of this module that
-holds data, and any other name is refused: nothing of the file is ever called.
+A pickle is a program that calls what it names. Here the six names that arrays need stand for what follows, which holds
+data; any other name is refused, and nothing of NumPy's is called: with NumPy's own `dtype` and `_reconstruct` a file
+may describe an array of objects by the bytes of its pointers, and so have any code run.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import pickle
 import re
 import zipfile
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,38 +66,12 @@ class NpzArrays:
             version = np.lib.format.read_magic(stream)
             header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
             shape, fortran, dtype = header[version](stream)
-            if dtype.hasobject:
-                value = _plain(_Reader(stream, encoding="latin1").load())
-                if not isinstance(value, np.ndarray) or value.dtype.kind != "O" or value.shape != shape:
-                    raise ValueError("the pickle holds another array than the header says")
-                return value
-            flat = np.frombuffer(stream.read(), dtype)
-            return flat.reshape(shape, order=_order(fortran))
-
-
-class _Array:
-    """An array as a pickle describes it."""
-
-    shape: tuple[int, ...] = ()
-    dtype: _DType | None = None
-    fortran = False
-    content: Any = b""
-
-    def __setstate__(self, state: Any) -> None:
-        _, self.shape, self.dtype, self.fortran, self.content = state
-
-    def value(self) -> NDArray[Any]:
-        """The array itself."""
-        if self.dtype is None:
-            raise ValueError("an array without a dtype")
-        dtype, order = self.dtype.value(), _order(self.fortran)
-        if dtype.kind != "O":
-            content = self.content.encode("latin1") if isinstance(self.content, str) else self.content
-            return np.frombuffer(content, dtype).reshape(self.shape, order=order)
-        flat = np.empty(len(self.content), object)
-        for i, element in enumerate(self.content):
-            flat[i] = _plain(element)
-        return flat.reshape(self.shape, order=order)
+            if not dtype.hasobject:
+                return np.frombuffer(stream.read(), dtype).reshape(shape, order="F" if fortran else "C")
+            value = _plain(_Reader(stream, encoding="latin1").load())
+            if not isinstance(value, np.ndarray) or value.dtype.kind != "O" or value.shape != shape:
+                raise ValueError("the pickle holds another array than the header says")
+            return value
 
 
 class _DType:
@@ -115,48 +90,67 @@ class _DType:
         return np.dtype(object) if self.code[0] == "O" else np.dtype(f"{self.order}{self.code}")
 
 
+class _Array:
+    """An array as a pickle describes it."""
+
+    def __init__(self, *_: object) -> None:
+        self.__setstate__((1, (0,), _DType("u1"), False, b""))
+
+    def __setstate__(self, state: Any) -> None:
+        _, self.shape, self.dtype, self.fortran, self.content = state
+
+    @classmethod
+    def of_buffer(cls, content: bytes | bytearray, dtype: _DType, shape: tuple[int, ...], order: str) -> _Array:
+        """As ``numpy._core.numeric._frombuffer``."""
+        array = cls()
+        array.__setstate__((1, shape, dtype, order == "F", bytes(content)))
+        return array
+
+    def value(self) -> NDArray[Any]:
+        """The array itself."""
+        dtype = self.dtype.value()
+        if dtype.kind == "O":
+            flat = np.empty(len(self.content), object)
+            for i, element in enumerate(self.content):
+                flat[i] = _plain(element)
+        else:
+            flat = np.frombuffer(_bytes(self.content), dtype)
+        return flat.reshape(self.shape, order="F" if self.fortran else "C")
+
+
 class _ForeignError(pickle.UnpicklingError):
     """A name that a pickle uses and arrays do not need."""
 
 
 class _Reader(pickle.Unpickler):
-    """An unpickler for which the names of NumPy stand for the classes above, and no other name for anything."""
+    """An unpickler for which six names stand for the above and below, and no other name for anything."""
 
     def find_class(self, module: str, name: str) -> Any:
         """What a name of the pickle stands for. Raises _ForeignError for any that arrays do not need."""
-        stands_for = {
-            "multiarray._reconstruct": _empty, "multiarray.scalar": _scalar, "numeric._frombuffer": _from_buffer,
-            "numpy.ndarray": _Array, "numpy.dtype": _DType, "_codecs.encode": _encoded,
-        }  # fmt: skip
-        known = stands_for.get(f"{_CORE.sub('', module)}.{name}")
+        known = _NAMES.get(f"{_CORE.sub('', module)}.{name}")
         if known is None:
             raise _ForeignError(f"{module}.{name}")
         return known
 
 
-def _order(fortran: bool) -> Literal["F", "C"]:
-    return "F" if fortran else "C"
-
-
-def _empty(*_: object) -> _Array:
-    return _Array()
-
-
 def _scalar(dtype: _DType, content: bytes | str) -> Any:
-    raw = content.encode("latin1") if isinstance(content, str) else content
-    return np.frombuffer(raw, dtype.value())[0].item()
-
-
-def _from_buffer(content: bytes | bytearray, dtype: _DType, shape: tuple[int, ...], order: str) -> _Array:
-    array = _Array()
-    array.shape, array.dtype, array.fortran, array.content = shape, dtype, order == "F", bytes(content)
-    return array
+    return np.frombuffer(_bytes(content), dtype.value())[0].item()
 
 
 def _encoded(text: str, encoding: str) -> bytes:
     if encoding not in ("latin1", "latin-1"):
         raise _ForeignError(f"_codecs.encode to {encoding}")
-    return text.encode("latin1")
+    return _bytes(text)
+
+
+def _bytes(content: bytes | str) -> bytes:
+    return content.encode("latin1") if isinstance(content, str) else content
+
+
+_NAMES = {
+    "multiarray._reconstruct": _Array, "multiarray.scalar": _scalar, "numeric._frombuffer": _Array.of_buffer,
+    "numpy.ndarray": _Array, "numpy.dtype": _DType, "_codecs.encode": _encoded,
+}  # fmt: skip
 
 
 def _plain(value: Any) -> Any:

@@ -21,7 +21,7 @@ from fmtorch.data.cameras import Camera, Matrix, fundamental, nearest_rotation, 
 from fmtorch.data.images import stored_size
 from fmtorch.data.npz_arrays import NpzArrays
 from fmtorch.data.pairs import ImagePair, ImageSource, PairDataset, Resampling, Size, longer_side
-from fmtorch.data.text_files import DataError, numbered, read_numbers, to_numbers, to_whole
+from fmtorch.data.text_files import DataError, given_root, numbered, read_numbers, to_numbers, to_whole
 
 SUPERGLUE, GLUE_FACTORY, GLUE_FACTORY_4X4 = 38, 32, 36  # columns of a line
 LAYOUTS = {
@@ -236,14 +236,15 @@ class PairList(PairDataset):
 
     def __init__(
         self,
-        root: str | Path,
+        root: str | Path | None = None,
         file: str | Path | None = None,
         resize: int | Sequence[int] | None = None,
         origin: float | None = None,
     ) -> None:
+        home = given_root(root, "pair_list", "the folder of the images of dataset.file, the list")
         if file is None:
             raise DataError("pair_list needs file: dataset.file=FILE, the list of pairs, .txt or .npz")
-        home, path = Path(root).expanduser(), Path(file).expanduser()
+        path = Path(file).expanduser()
         if not home.is_dir():
             raise DataError(f"{home}: no such folder; dataset.root must be the folder of the images")
         if not path.is_file():

@@ -13,6 +13,13 @@ class DataError(ValueError):
     """A data set that cannot be used as a whole; the message names file, line and what would be right."""
 
 
+def given_root(root: str | Path | None, name: str, what: str) -> Path:
+    """Where a data set lies. Raises DataError, with its name and what is wanted, where nobody says."""
+    if root is None:
+        raise DataError(f"{name} needs root: {what}")
+    return Path(root).expanduser()
+
+
 def read_lines(path: Path, hint: str = "") -> list[str]:
     """The lines of a text file without the empty ones at its end.
 

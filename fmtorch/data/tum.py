@@ -23,7 +23,7 @@ from fmtorch.data.scenes import (
     following,
     read_grey,
 )
-from fmtorch.data.text_files import DataError, numbered, to_finite
+from fmtorch.data.text_files import DataError, given_root, numbered, to_finite
 
 SIZE = (480, 640)  # h, w of all images
 CALIBRATIONS = {
@@ -41,7 +41,7 @@ _POSE = "timestamp tx ty tz qx qy qz qw"
 
 
 def tum_pairs(
-    root: str | Path,
+    root: str | Path | None = None,
     split: str = "test",
     sequences: Sequence[str] | None = None,
     camera: str | None = None,
@@ -65,7 +65,7 @@ def tum_pairs(
     than `TOLERANCE` from either are left out. Raises DataError, naming file and line, for files that are missing,
     damaged or out of order.
     """
-    home = Path(root).expanduser()
+    home = given_root(root, "tum", "the folder of the sequences' folders of TUM RGB-D")
     there = sorted(f.parent.name for f in home.glob("*/groundtruth.txt") if (f.parent / "rgb.txt").is_file())
     sequence_folders = folders(home, chosen("tum", split, sequences, there), "a folder for each sequence")
     scenes = [_scene(folder, _lens(folder, camera), window) for folder in sequence_folders]

@@ -6,29 +6,26 @@ changes no result. What stands beside a pair in the batch is never looked at.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from fmtorch.core.checks import PER_MATCH, reason
-from fmtorch.core.rules import FOCAL, SIZE
-from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.estimators.calibration import EXACT, calibration_of
+from fmtorch.core.types import DEVIATION, FOCAL, PROBABILITY, SIZE, Correspondences, Estimate
 from fmtorch.estimators.final_fits import Fit, scale_of
 from fmtorch.estimators.gradients import Attach, Solved, with_gradients
 from fmtorch.estimators.models.model import Estimated
 from fmtorch.estimators.models.posterior import focal_precision, focals_near, focals_px
-from fmtorch.estimators.pair import Pair, PixelMatches, bucket, normalize_pair
+from fmtorch.estimators.pair import EXACT, Pair, PixelMatches, bucket, calibration_of, normalize_pair
 from fmtorch.estimators.preselection import degenerate_support
 from fmtorch.geometry.arithmetic import sqrt
 from fmtorch.geometry.epipolar import SAMPSON, Residual
 from fmtorch.geometry.significance import of_one_pair
 from fmtorch.jit.batches import as_array
 from fmtorch.jit.kernel import Array
-from fmtorch.jobs.threads import available, mapped
+from fmtorch.jobs.threads import available
 
 PARTS_OF_A_THREAD = 4  # so that no thread is long alone at the end
 MIN_WORK = 500  # matches: a pair of fewer takes as long as one of these
@@ -59,64 +56,82 @@ class CameraRows(NamedTuple):
         self.focal_precision[i] = focal_precision(self.focals[i], pair)
 
 
-def estimated(
-    c: Correspondences, seed: int, minimal: int, family: Estimated, solve: Callable[[Pair], Solution], attach: Attach,
-    calibrated: int | None = None,
-) -> Estimate:  # fmt: skip
-    """Estimate the models of a batch of pairs; a pair that cannot be solved is `ok=False` with a reason.
+class Row(NamedTuple):
+    """A pair of a batch that can be tried: its place there, and its matches as they came.
 
-    minimal: matches below which a pair is not tried, and inliers below which a model is none. family: of the models.
-    calibrated: the same as minimal for a pair whose focal lengths are exactly known; None: no difference.
+    slot: (n,), where the pair's matches are among these. needed: inliers below which a model is none.
     """
-    host = c if c.mask.device.type == "cpu" else c.detach().to("cpu")
-    b, n = c.mask.shape
-    batch = Batch.of(host)
-    rounding = relative_rounding(c)
-    F, inliers, ok = np.zeros((b, 3, 3)), np.zeros((b, n), np.bool_), np.zeros(b, np.bool_)
-    draws, significance, reasons = np.zeros(b, np.int64), np.full(b, -np.inf), [""] * b
-    asked = family.model == "fundamental" and c.asks_for_cameras
-    cameras = CameraRows(np.full((b, 2), np.nan), np.full(b, np.nan), np.full((b, 2, 2), np.nan))
-    keep = torch.is_grad_enabled() and c.requires_grad
-    solved: dict[int, Solved] = {}
 
-    def estimate(i: int) -> str:
-        """Why there is no estimate of a pair; empty where there is one."""
-        matches = batch.pair(i)
-        needed = calibrated if calibrated is not None and batch.calibrated(i) else minimal
-        normalized = batch.normalized(matches, i, seed, needed, family.residual)
-        if isinstance(normalized, str):
-            return normalized
-        pair, slot = normalized
-        solution = solve(pair)
-        draws[i] = solution.draws
+    place: int
+    matches: PixelMatches
+    pair: Pair
+    slot: Array
+    needed: int
+
+
+class Estimation:
+    """The estimation of a batch of pairs on the host: the pairs, and the estimates that become of them.
+
+    family: of the models. minimal: matches below which a pair is not tried, and inliers below which a model is none.
+    calibrated: the same of a pair whose focal lengths are exactly known; None: no difference.
+    """
+
+    def __init__(
+        self, c: Correspondences, seed: int, family: Estimated, minimal: int, calibrated: int | None = None
+    ) -> None:
+        host = c if c.mask.device.type == "cpu" else c.detach().to("cpu")
+        b, n = c.mask.shape
+        self.c, self.seed, self.family, self.batch = c, seed, family, Batch.of(host)
+        self.minimal, self.calibrated = minimal, minimal if calibrated is None else calibrated
+        self.parts = [part.tolist() for part in shared_out(host)] if b > 1 and available() > 1 else [range(b)]
+        """The rows, shared out among threads."""
+        self.F, self.inliers, self.ok = np.zeros((b, 3, 3)), np.zeros((b, n), np.bool_), np.zeros(b, np.bool_)
+        self.draws, self.significance, self.reasons = np.zeros(b, np.int64), np.full(b, -np.inf), [""] * b
+        self.cameras = CameraRows(np.full((b, 2), np.nan), np.full(b, np.nan), np.full((b, 2, 2), np.nan))
+        self.asked_for_cameras = family.model == "fundamental" and c.asks_for_cameras
+        self.graphed = torch.is_grad_enabled() and c.requires_grad
+        self.solved: dict[int, Solved] = {}
+
+    def rows(self, part: Sequence[int]) -> Iterator[Row]:
+        """Those of a part that can be tried; the others have their reason."""
+        for i in part:
+            matches = self.batch.pair(i)
+            needed = self.calibrated if self.batch.calibrated(i) else self.minimal
+            normalized = self.batch.normalized(matches, i, self.seed, needed, self.family.residual)
+            if isinstance(normalized, str):
+                self.reasons[i] = normalized
+            else:
+                yield Row(i, matches, *normalized, needed)
+
+    def put(self, row: Row, solution: Solution) -> None:
+        """The solution of a pair as its estimate, or the reason why there is none."""
+        i, pair = row.place, row.pair
+        self.draws[i] = solution.draws
         if solution.fit is None or solution.inliers is None:
-            return solution.reason
-        if degenerate := degenerate_support(pair, solution.inliers, needed, rounding):
-            return degenerate
-        if not family.to_pixels(solution.fit.F, pair, F[i]):
-            F[i] = 0
-            return NOT_FINITE
-        inliers[i, slot] = solution.inliers
-        significance[i] = _significance(F[i], matches) if family.model == "fundamental" else np.nan
-        ok[i] = True
-        if asked and pair.sizes_known:
-            cameras.fill(i, solution.fit, pair)
-        if keep:
-            solved[i] = Solved(pair, slot, solution.fit)
-        return ""
+            self.reasons[i] = solution.reason
+        elif degenerate := degenerate_support(pair, solution.inliers, row.needed, relative_rounding(self.c)):
+            self.reasons[i] = degenerate
+        elif not self.family.to_pixels(solution.fit.F, pair, self.F[i]):
+            self.F[i], self.reasons[i] = 0, NOT_FINITE
+        else:
+            self.ok[i] = True
+            self.inliers[i, row.slot] = solution.inliers
+            fundamental = self.family.model == "fundamental"
+            self.significance[i] = _significance(self.F[i], row.matches) if fundamental else np.nan
+            if self.asked_for_cameras and pair.sizes_known:
+                self.cameras.fill(i, solution.fit, pair)
+            if self.graphed:
+                self.solved[i] = Solved(pair, row.slot, solution.fit)
 
-    def estimate_all(rows: Sequence[int]) -> None:
-        with np.errstate(all="ignore"):  # infinite or NaN beyond the range of a float
-            for i in rows:
-                reasons[i] = estimate(i)
-
-    mapped(estimate_all, [part.tolist() for part in shared_out(host)] if b > 1 and available() > 1 else [range(b)])
-    fields = {"F": F, "inliers": inliers, "ok": ok, "draws": draws, "significance": significance}
-    if asked:
-        fields |= cameras._asdict()
-    tensors = {name: torch.from_numpy(value).to(c.mask.device) for name, value in fields.items()}
-    estimates = Estimate.unchecked(reason=tuple(reasons), model=family.model, **tensors)
-    return with_gradients(estimates, c, solved, attach) if keep else estimates
+    def estimates(self, attach: Attach) -> Estimate:
+        """What has become of the pairs."""
+        arrays = {"F": self.F, "inliers": self.inliers, "ok": self.ok, "draws": self.draws}
+        arrays["significance"] = self.significance
+        if self.asked_for_cameras:
+            arrays |= self.cameras._asdict()
+        fields = {name: torch.from_numpy(value).to(self.c.mask.device) for name, value in arrays.items()}
+        estimates = Estimate.unchecked(reason=tuple(self.reasons), model=self.family.model, **fields)
+        return with_gradients(estimates, self.c, self.solved, attach) if self.graphed else estimates
 
 
 def _significance(F: Array, matches: PixelMatches) -> float:
@@ -202,7 +217,7 @@ class Batch(NamedTuple):
             return f"{count} matches; at least {minimal} are needed"
         focal = None if self.focal is None else self.focal[i]
         if not right or (focal is not None and not FOCAL.holds(focal).all()):
-            return _wrong_values(matches, slot, focal)
+            return _wrong_values(matches, slot)
         if not unit:
             return "all matches coincide"
         calibration = None if focal is None else calibration_of(focal, bool(self.shared[i]))
@@ -212,14 +227,15 @@ class Batch(NamedTuple):
         return pair, slot
 
 
-def _wrong_values(matches: PixelMatches, slot: Array, focal: Array | None) -> str:
+def _wrong_values(matches: PixelMatches, slot: Array) -> str:
     """Why a pair whose matches have such values cannot be estimated."""
-    values = {"prior": matches.prior, "noise": matches.noise}
-    right = {name: PER_MATCH[name].holds(v[slot]) for name, v in values.items() if len(v)}
-    right |= {"size0": SIZE.holds(matches.sizes[:2]), "size1": SIZE.holds(matches.sizes[2:])}
-    if focal is not None:
-        right["focal"] = FOCAL.holds(focal)
-    return reason({name: len(each) - int(np.count_nonzero(each)) for name, each in right.items()})
+    for name, value, rule in (("prior", matches.prior, PROBABILITY), ("noise", matches.noise, DEVIATION)):
+        if len(value) and (wrong := int(np.count_nonzero(~rule.holds(value[slot])))):
+            return f"{name} of {wrong} match{'' if wrong == 1 else 'es'} is wrong: {rule.text}"
+    for name, size in (("size0", matches.sizes[:2]), ("size1", matches.sizes[2:])):
+        if not SIZE.holds(size).all():
+            return f"{name} is wrong: {SIZE.text}"
+    return f"focal is wrong: {FOCAL.text}"
 
 
 def _row(values: Array | None, i: int) -> Array:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.estimators.batch import Solution, estimated
+from fmtorch.estimators.batch import Estimation, Solution
 from fmtorch.estimators.final_fits import Fit
 from fmtorch.estimators.gradients import GraphedMatches, Solved
 from fmtorch.estimators.inliers import WithinThreshold, lower_median, residuals_squared, residuals_squared_px
@@ -25,6 +25,7 @@ from fmtorch.geometry.rank2_manifold import SQUARINGS
 from fmtorch.geometry.refine import refine_kernel
 from fmtorch.geometry.robust_losses import named_kernel
 from fmtorch.jit.kernel import Array
+from fmtorch.jobs.threads import mapped
 
 DECAY = 0.65  # of the kernel's scale, from one iteration to the next, down to the threshold
 FIRST_DAMPING = 1e-4  # of Levenberg-Marquardt
@@ -86,7 +87,15 @@ class IterativelyReweighted:
 
     def __call__(self, c: Correspondences, seed: int = 0) -> Estimate:
         """Estimate the fundamental matrices of a batch of pairs; a pair that cannot be solved is `ok=False`."""
-        return estimated(c, seed, self.MIN_MATCHES, SevenPoint(), self.solve, self.attached)
+        estimation = Estimation(c, seed, SevenPoint(), self.MIN_MATCHES)
+
+        def estimate_part(part: Sequence[int]) -> None:
+            with np.errstate(all="ignore"):  # infinite or NaN beyond the range of a float
+                for row in estimation.rows(part):
+                    estimation.put(row, self.solve(row.pair))
+
+        mapped(estimate_part, estimation.parts)
+        return estimation.estimates(self.attached)
 
     def solve(self, pair: Pair) -> Solution:
         """The model of least cost of one pair."""

@@ -1,26 +1,21 @@
-"""Options of the engine's stages, as configs write them: a mapping for each stage, null to leave the stage out."""
+"""Options of the engine's stages, as configs write them: a mapping for each stage, null to leave the stage out.
+
+The annotations say what each may be; `fmtorch.core.options.expect_options` checks them.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
-from fmtorch.geometry.levenberg_marquardt import LOSSES
+from fmtorch.core.options import Within
 
-Group = TypeVar("Group")
+Stage = TypeVar("Stage")
 
-
-def _at_least(minimum: int, **values: int) -> None:
-    for name, value in values.items():
-        if not value >= minimum:
-            raise ValueError(f"{name} is {value}; it must be at least {minimum}")
-
-
-def _positive(**values: float) -> None:
-    for name, value in values.items():
-        if not value > 0:
-            raise ValueError(f"{name} is {value}; it must be positive")
+Count = Annotated[int, Within(1)]
+NonNegative = Annotated[int, Within(0)]
+Pixels = Annotated[float, Within(0, exclusive=True)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,11 +26,8 @@ class Preselect:
     survivors: models that are scored on all matches.
     """
 
-    matches: int = 128
-    survivors: int = 256
-
-    def __post_init__(self) -> None:
-        _at_least(1, **{"preselect.matches": self.matches, "preselect.survivors": self.survivors})
+    matches: Count = 128
+    survivors: Count = 256
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,20 +38,12 @@ class Refine:
     many are looked at, drawn by the pair's key from those within RADIUS scales of a model of the pool; None: all.
     """
 
-    kernel: str
-    scale: float = 1.0
-    iterations: int = 5
-    matches: int | None = None
+    kernel: Literal["huber", "cauchy", "geman_mcclure", "truncated", "magsac"]
+    scale: Pixels = 1.0
+    iterations: NonNegative = 5
+    matches: Count | None = None
 
     RADIUS = 4.0  # scales: a match farther from all models of the pool is not looked at again
-
-    def __post_init__(self) -> None:
-        if self.kernel not in LOSSES:
-            raise ValueError(f"kernel is {self.kernel!r}; it must be one of: {', '.join(LOSSES)}")
-        _positive(**{"refine.scale": self.scale})
-        _at_least(0, **{"refine.iterations": self.iterations})
-        if self.matches is not None:
-            _at_least(1, **{"refine.matches": self.matches})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,10 +54,7 @@ class Select:
     """
 
     score: Any = "saturated"
-    scale: float = 1.0
-
-    def __post_init__(self) -> None:
-        _positive(**{"select.scale": self.scale})
+    scale: Pixels = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,11 +65,8 @@ class ExactFocals:
     stands for it throughout.
     """
 
-    scale: float
+    scale: Pixels
     sqrt_prior: bool = False
-
-    def __post_init__(self) -> None:
-        _positive(**{"focal.exact.scale": self.scale})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,53 +81,25 @@ class Focal:
     `ExactFocals`; None: nothing is different.
     """
 
-    samples: int = 250
-    rounds: int = 1
-    min_rounds: int = 1
-    confirmations: int = 1
-    pool: int = 12
-    candidates: int = 12
-    iterations: int = 12
+    samples: NonNegative = 250
+    rounds: Count = 1
+    min_rounds: Count = 1
+    confirmations: Count = 1
+    pool: Count = 12
+    candidates: Count = 12
+    iterations: NonNegative = 12
     exact: ExactFocals | Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
-        group("focal.exact", self.exact, ExactFocals)
         if self.min_rounds > self.rounds:
             raise ValueError(f"focal.min_rounds is {self.min_rounds}; it must be at most focal.rounds, {self.rounds}")
-        _at_least(0, **{"focal.samples": self.samples, "focal.iterations": self.iterations})
-        _at_least(
-            1,
-            **{
-                "focal.min_rounds": self.min_rounds,
-                "focal.confirmations": self.confirmations,
-                "focal.rounds": self.rounds,
-                "focal.pool": self.pool,
-                "focal.candidates": self.candidates,
-            },
-        )
 
     @property
     def exact_focals(self) -> ExactFocals | None:
         """The options of `exact`."""
-        return group("focal.exact", self.exact, ExactFocals)
+        return stage(self.exact, ExactFocals)
 
 
-def at_least_one(**values: int) -> None:
-    """Raise ValueError for a number below one."""
-    _at_least(1, **values)
-
-
-def group(name: str, value: object, kind: type[Group]) -> Group | None:
-    """The options of a stage from a mapping, or as they are; ValueError for an unknown one, naming those there are."""
-    if value is None or isinstance(value, kind):
-        return value
-    known = {field.name: field for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    if not isinstance(value, Mapping):
-        raise ValueError(f"{name} is {value!r}; it must be null or a mapping of: {', '.join(known)}")
-    unknown = [key for key in value if key not in known]
-    if unknown:
-        raise ValueError(f"{name}: no option {', '.join(map(str, unknown))}; there are: {', '.join(known)}")
-    missing = [key for key, f in known.items() if f.default is dataclasses.MISSING and key not in value]
-    if missing:
-        raise ValueError(f"{name}: {', '.join(missing)} is missing; the options are: {', '.join(known)}")
-    return kind(**value)
+def stage(options: Stage | Mapping[str, Any] | None, kind: type[Stage]) -> Stage | None:
+    """The options of a stage, from a mapping or as they are."""
+    return kind(**options) if isinstance(options, Mapping) else options

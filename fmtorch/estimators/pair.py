@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from fmtorch.estimators.calibration import Calibration
+from fmtorch.geometry.arithmetic import logarithm_kernel
 from fmtorch.geometry.epipolar import SAMPSON, Residual
 from fmtorch.jit.kernel import Array, B1x1, F8x1, F8x2, I8x1, inner, kernel, matrix
 from fmtorch.jit.random import Stream, mixed_seed, stream_state, uniform_kernel
@@ -17,6 +17,40 @@ T = TypeVar("T")
 MAX_COORDINATE_PX = 1e100  # a match beyond is none: numbers made of its coordinates would overflow
 MIN_NOISE, MAX_NOISE = 0.1, 10.0  # of a match, relative to a usual one; what is beyond is taken for these
 SMALLEST_BUCKET = 128
+EXACT = 0.02  # relative deviation below which a focal length counts as exactly known
+
+
+class Calibration(NamedTuple):
+    """Measured focal lengths of two images of square pixels and central principal points.
+
+    focals: px. deviations: relative standard deviations, 0 of a calibration, infinite where a focal length is unknown.
+    shared: whether both are one, in units of the longer sides of the images.
+    """
+
+    focals: tuple[float, float]
+    deviations: tuple[float, float]
+    shared: bool
+
+    @property
+    def exact(self) -> bool:
+        """Whether both are exactly known."""
+        return max(self.deviations) < EXACT
+
+    def logarithms(self, longest: tuple[float, float]) -> tuple[float, float]:
+        """Of the focal lengths in units of the longer sides (px); 0 of unknown ones."""
+        f0, f1 = (
+            float(logarithm_kernel(f / side)) if math.isfinite(s) else 0.0
+            for f, s, side in zip(self.focals, self.deviations, longest, strict=True)
+        )
+        return f0, f1
+
+
+def calibration_of(focal: Array, shared: bool) -> Calibration | None:
+    """The calibration of a pair from a row of `Correspondences.focal` (2, 2); None where nothing is known."""
+    (f0, s0), (f1, s1) = focal.tolist()
+    if not shared and math.isinf(s0) and math.isinf(s1):
+        return None
+    return Calibration((f0, f1), (s0, s1), shared)
 
 
 class Pair:

@@ -7,13 +7,14 @@ verb; `batch` leads from tensors to pairs and back.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
 
 import numpy as np
 
+from fmtorch.core.options import Within, expect_options
 from fmtorch.core.types import Correspondences, Estimate
-from fmtorch.estimators.batch import NOT_SOLVED, Solution, estimated, with_sqrt_prior
+from fmtorch.estimators.batch import NOT_SOLVED, Estimation, Solution, with_sqrt_prior
 from fmtorch.estimators.degensac import Degensac
 from fmtorch.estimators.final_fits import FinalFit, Fit
 from fmtorch.estimators.focal_search import FocalSearch, PlausibleCandidates
@@ -21,7 +22,7 @@ from fmtorch.estimators.gradients import Attached
 from fmtorch.estimators.inliers import InlierRule, StoppingRule, residuals_squared_px
 from fmtorch.estimators.models.model import Refining
 from fmtorch.estimators.models.with_focals import FundamentalWithFocals
-from fmtorch.estimators.options import Focal, Preselect, Refine, Select, at_least_one, group
+from fmtorch.estimators.options import Count, Focal, Preselect, Refine, Select, stage
 from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.precompiled import OF_HOMOGRAPHIES, WITH_FOCALS
 from fmtorch.estimators.preselection import Preselection
@@ -33,10 +34,12 @@ from fmtorch.estimators.search import Search
 from fmtorch.estimators.selection import BestOfSearch, BestScore, Selection, Selector
 from fmtorch.jit.kernel import Array, Kernel
 from fmtorch.jit.together import compile_together
+from fmtorch.jobs.threads import mapped
 
 FOCAL_ROUND = 500  # samples of five matches at a time
 CALIBRATED_MATCHES = 6  # that a pair of calibrated cameras needs: five of them have up to ten solutions
 DEFAULT_PRESELECT = Preselect()
+Probability = Annotated[float, Within(0, 1, exclusive=True)]
 
 
 class Ransac:
@@ -86,12 +89,12 @@ class Ransac:
         sampler: str | Mapping[str, Any] | Sampler = "uniform",
         score: str | Mapping[str, Any] | Score = "msac",
         threshold: float | None = None,
-        hypotheses: int = 2000,
-        round: int = 500,
-        confidence: float | None = 0.9999,
+        hypotheses: Count = 2000,
+        round: Count = 500,
+        confidence: Probability | None = 0.9999,
         preselect: Preselect | Mapping[str, Any] | None = DEFAULT_PRESELECT,
         degeneracy: str | Mapping[str, Any] | None = None,
-        pool: int = 1,
+        pool: Count = 1,
         local_optimization: str | Mapping[str, Any] | LocalOptimization | None = None,
         refine: Refine | Mapping[str, Any] | None = None,
         select: Select | Mapping[str, Any] | None = None,
@@ -101,9 +104,7 @@ class Ransac:
         final: str | Mapping[str, Any] | FinalFit = "least_squares",
         refit_inliers: bool = True,
     ) -> None:
-        at_least_one(hypotheses=hypotheses, round=round, pool=pool)
-        if confidence is not None and not 0 < confidence < 1:
-            raise ValueError(f"confidence is {confidence}; it is a probability between 0 and 1, or null")
+        expect_options(Ransac, {name: value for name, value in locals().items() if name != "self"}, "")
         stops = confidence is not None
         threshold, inlier_px = thresholds(threshold, inlier_threshold, score, inliers, stops, local_optimization)
         self.family: Refining = part("solver", solver)
@@ -113,18 +114,18 @@ class Ransac:
         self.final: FinalFit = part("final", final)
         self.refit_inliers = refit_inliers
         stop = None if confidence is None else StoppingRule(confidence, inlier_px, self.sampler)
-        preselection = Preselection(self.score, group("preselect", preselect, Preselect))
+        preselection = Preselection(self.score, stage(preselect, Preselect))
         check = part("degeneracy", degeneracy, score=self.score)
         if check is not None and self.family.size != Degensac.SAMPLE:
             raise ValueError(f"degeneracy={degeneracy} needs solver=seven_point; solver is {solver!r}")
         self._expect_fundamental(degeneracy=check, local_optimization=local_optimization, focal=focal)
         self.search = Search(self.family, self.sampler, preselection, pool, hypotheses, round, stop, check)
         optimization = part("local_optimization", local_optimization, threshold=threshold, score=self.score)
-        refinement = Refinement(group("refine", refine, Refine), optimization)
-        choice = group("select", select, Select)
+        refinement = Refinement(stage(refine, Refine), optimization)
+        choice = stage(select, Select)
         self.refine = refinement
         self.select = _selector(self.score, choice, threshold, refinement)
-        self.focal = _focal_search(group("focal", focal, Focal), self.select, self.search, refinement, choice)
+        self.focal = _focal_search(stage(focal, Focal), self.select, self.search, refinement, choice)
 
     def _expect_fundamental(self, **options: object) -> None:
         """Raise ValueError for an option that is there and serves fundamental matrices alone."""
@@ -160,9 +161,19 @@ class Ransac:
         exact = None if self.focal is None else self.focal.options.exact_focals
         if exact is not None and exact.sqrt_prior:
             c = with_sqrt_prior(c)
-        size, attached = self.family.size, Attached(self.final, self.family)
         calibrated = None if self.focal is None else CALIBRATED_MATCHES
-        return estimated(c, seed, size, self.family, self.estimate, attached, calibrated)
+        estimation = Estimation(c, seed, self.family, self.family.size, calibrated)
+
+        def estimate_part(part: Sequence[int]) -> None:
+            with np.errstate(all="ignore"):  # infinite or NaN beyond the range of a float
+                for row in estimation.rows(part):
+                    estimation.put(row, self.estimate(row.pair))
+
+        if len(estimation.parts) > 1:
+            mapped(estimate_part, estimation.parts)
+        else:
+            estimate_part(estimation.parts[0])
+        return estimation.estimates(Attached(self.final, self.family))
 
     def estimate(self, pair: Pair) -> Solution:
         """Search to fit of one pair."""

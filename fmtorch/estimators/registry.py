@@ -10,6 +10,7 @@ import inspect
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from fmtorch.core.options import expect_options
 from fmtorch.estimators.degensac import Degensac
 from fmtorch.estimators.final_fits import Adaptive, GaussNewton, LeastSquares, NoFit, UnweightedLeastSquares
 from fmtorch.estimators.graph_cut import GraphCut
@@ -64,11 +65,9 @@ def part(role: str, spec: Any, **context: Any) -> Any:
     if name not in PARTS[role]:
         raise ValueError(f"{role} is {name!r}; it must be one of: {', '.join(PARTS[role])}")
     make = PARTS[role][name]
-    known = inspect.signature(make).parameters
-    unknown = [key for key in options if key not in known]
-    if unknown:
-        raise ValueError(f"{role}={name}: no option {', '.join(unknown)}; there are: {', '.join(known) or 'none'}")
-    return make(**({key: value for key, value in context.items() if key in known} | options))
+    told = {key: value for key, value in context.items() if key in inspect.signature(make).parameters}
+    expect_options(make, options, f"{role}={name}", told)
+    return make(**(told | options))
 
 
 def thresholds(

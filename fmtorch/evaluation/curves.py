@@ -1,10 +1,12 @@
-"""Recall curves as SVG inside a page: its style sheet colours them, so that they follow light and dark."""
+"""Recall curves as SVG, within a page or a picture of their own: a style sheet colours them, for light and dark."""
 
 from __future__ import annotations
 
 import dataclasses
 import html
+import re
 from collections.abc import Mapping, Sequence
+from importlib import resources
 
 import numpy as np
 import pyarrow as pa
@@ -19,6 +21,7 @@ COLOURS, DASHES = 7, ("", "7 4", "2 3", "9 3 2 3")  # the style sheet has classe
 _WIDTH, _HEIGHT = 340, 250  # of a panel, in units that are CSS pixels at its usual size
 _LEFT, _RIGHT, _TOP, _BOTTOM = 36, 12, 10, 38  # margins
 _STEPS = 400  # of the threshold
+_LINE, _LEGEND = 20, 220  # of a picture: height of a line of its legend, width of this
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,11 +83,38 @@ def swatch(number: int) -> str:
     return f'<svg class="swatch {colour}" viewBox="0 0 26 8" aria-hidden="true">{line}</svg>'
 
 
+def style_sheet() -> str:
+    """The colours and lines of curves."""
+    return resources.files("fmtorch.evaluation").joinpath("curves.css").read_text(encoding="utf-8")
+
+
+def picture(name: str, table: pa.Table) -> str:
+    """The curves of one run as an SVG file: of each family, and of all of several, with the recall at the mark."""
+    axis = axis_of({name: table})
+    curves = {title: errors[name] for title, errors in panels({name: table}).items()}
+    rows = [f'<text x="{_WIDTH + 6}" y="{_TOP}">recall [%] at {axis.mark:g}</text>']
+    for i, (title, errors) in enumerate(curves.items()):
+        (colour, dash), y = style(i), _TOP + _LINE * (i + 1)
+        rows.append(f'<path class="curve {colour}" stroke-dasharray="{dash}" d="M{_WIDTH + 6},{y - 4}h26"/>')
+        recall = f"{100 * axis.below(errors, axis.mark):.1f}"
+        rows.append(f'<text x="{_WIDTH + 38}" y="{y}">{recall} {html.escape(title)}</text>')
+    height = max(_HEIGHT, _TOP + _LINE * len(curves)) + _LINE
+    colours, _, rules = style_sheet().partition("@media")
+    light = dict(re.findall(r"(--\w+): (#\w+)", colours))  # by their values: not every viewer knows variables
+    rules = re.sub(r"var\((--\w+)\)", lambda match: light[match[1]], rules[rules.index(".c0") :])
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" class="plot" viewBox="0 0 {_WIDTH + _LEGEND} {height}" '
+        f'font-family="sans-serif"><style>{rules}</style><rect width="100%" height="100%" fill="white"/>'
+        f'<text x="{_LEFT}" y="{_LINE - 4}" font-weight="bold">{html.escape(name)}</text>'
+        f'<g transform="translate(0 {_LINE})">{svg(name, curves, list(curves), axis)}{"".join(rows)}</g></svg>\n'
+    )
+
+
 def svg(title: str, curves: Mapping[str, NDArray[np.float64]], order: Sequence[str], axis: Axis = NSGD) -> str:
     """A panel. order: the names of all runs of the page, whose places decide the styles; the first is drawn on top."""
     parts = [
-        f'<svg class="plot" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="recall by {axis.label}, '
-        f'{html.escape(title)}">'
+        f'<svg class="plot" viewBox="0 0 {_WIDTH} {_HEIGHT}" width="{_WIDTH}" height="{_HEIGHT}" role="img" '
+        f'aria-label="recall by {axis.label}, {html.escape(title)}">'
     ]
     for percent in range(0, 101, 20):
         y = _y(percent / 100)

@@ -14,13 +14,15 @@ from omegaconf import OmegaConf
 
 from fmtorch import data, presets
 from fmtorch.data import DataError, ImageError, ImagePair, PairDataset, read_image
+from fmtorch.data.pair_list import PairList
 from fmtorch.evaluation.page import Picture, Shown, ShownPair, differing_pairs
 from fmtorch.evaluation.pictures import Image, draw_epipolar_lines, draw_epipolar_lines_of_corners, draw_matches
-from fmtorch.io.dataset import WITHOUT_GEOMETRY
+from fmtorch.io.dataset import WITHOUT_GEOMETRY, H5Pairs
 from fmtorch.metrics import corner_error, nsgd
 from fmtorch.pipeline.build import build_pipeline
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.runs import RunFolder
+from fmtorch.scenes import RenderedPairs
 
 # A pair of a run seen again: its pictures, and where its pipeline now gives another result than the run stored
 
@@ -170,17 +172,14 @@ def find_dataset(stored: Mapping[str, Any], options: Options) -> PairDataset:
     for in the roots in the layout of `fmbench`. Raises DataError where it is another or nowhere to be found.
     """
     known = {key: value for key, value in stored.items() if key != "digest"}
-    own = "_target_" in known
-    if own and not options.own_code:
+    if "_target_" not in known:
+        known = presets.load("dataset", "fmbench")
+    if known["_target_"] not in presets.known_targets() and not options.own_code:
         raise DataError("the data set is one of your own, which a report loads with own_code=true")
-    known = known if own or "name" in known else {"name": "fmbench"}
     reasons = []
     for place in _places(known, options.roots):
         try:
-            if own:
-                given = {name: value for name, value in place.items() if value is not None}
-                return _same(presets.instantiate({**known, **given}, "dataset"), stored)
-            return _same(data.load(**{**known, **place}), stored)
+            return _same(data.build({**known, **place}), stored)
         except _NOT_BUILT as error:
             reasons.append(str(error))
     raise DataError("; ".join(dict.fromkeys(reasons)))
@@ -188,21 +187,19 @@ def find_dataset(stored: Mapping[str, Any], options: Options) -> PairDataset:
 
 def _places(known: Mapping[str, Any], roots: Sequence[Path]) -> list[dict[str, Any]]:
     """The options that say where a data set, and what it needs beside itself, may lie."""
-    if known.get("name") == "pair_list":
-        return [{"root": r, "file": f} for r in roots if r.is_dir() for f in roots if f.is_file()] or [{"root": None}]
-    if known.get("name") != "h5":
-        return [{"root": root} for root in _roots(known, roots)]
-    other = "truth" if known.get("layout") in WITHOUT_GEOMETRY else "images"
-    places = [{"root": root, other: place} for root in roots for place in roots if place != root]
-    return places + [{"root": root} for root in roots] or [{"root": None}]
-
-
-def _roots(known: Mapping[str, Any], roots: Sequence[Path]) -> list[Path | None]:
-    """Where a data set may lie; None: its usual place."""
-    if known.get("name") == "rendered":  # which is drawn where it does not lie, and never among something else
+    places: list[dict[str, Any]] = [{"root": root} for root in roots]
+    target = presets.target_of(known, "dataset")
+    if target is PairList:
+        places = [{"root": r, "file": f} for r in roots if r.is_dir() for f in roots if f.is_file()]
+    elif target is H5Pairs:
+        other = "truth" if known.get("layout") in WITHOUT_GEOMETRY else "images"
+        places = [*({"root": root, other: place} for root in roots for place in roots if place != root), *places]
+    elif target is RenderedPairs:  # which is drawn where it does not lie, and never among something else
         drawn = f"*-{known.get('split', 'test')}-{known.get('size', 'small')}-*"
-        return [root for root in roots if any(root.glob(drawn))] or [None]
-    return list(roots) or [None] if known.get("name") in data.NEEDS_ROOT else [None, *roots]
+        places = [place for place in places if any(place["root"].glob(drawn))]
+    else:
+        places.append({})  # its usual place
+    return places or [{}]
 
 
 def _same(dataset: PairDataset, stored: Mapping[str, Any]) -> PairDataset:

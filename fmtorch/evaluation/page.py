@@ -11,19 +11,15 @@ from importlib import resources
 from typing import Any
 
 import cv2
-import jinja2
 import numpy as np
 import pyarrow as pa
-from markupsafe import Markup
 
 from fmtorch import presets
+from fmtorch.core.settings import leaves
 from fmtorch.evaluation import curves, tables
-from fmtorch.evaluation.differences import differences
 from fmtorch.evaluation.pictures import Image
 from fmtorch.evaluation.statistics import THRESHOLD
 from fmtorch.evaluation.summary import summarize
-from fmtorch.evaluation.summary_tables import caption
-from fmtorch.runs.run_folder import leaves
 
 QUALITY, WIDTH = 80, 1280  # of JPEG pictures; px
 DISAGREEMENT = 0.1  # NSGD beyond which a result is as bad as any
@@ -36,6 +32,16 @@ class Picture:
     image: Image
     alt: str
     caption: str
+
+    def encoded(self) -> tuple[str, int, int]:
+        """A JPEG as a URL of its data, and its width and height, which keep its place until it is shown."""
+        image = self.image
+        if image.shape[1] > WIDTH:
+            height = round(image.shape[0] * WIDTH / image.shape[1])
+            image = np.asarray(cv2.resize(image, (WIDTH, height), interpolation=cv2.INTER_AREA), np.uint8)
+        jpeg = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
+        height, width = image.shape[:2]
+        return f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode('ascii')}", width, height
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,13 +108,20 @@ def render(
 
     runs: name, data set, identity, version, seed and folder of each run. shared: settings that all have in common.
     """
+    try:
+        import jinja2
+    except ImportError as error:
+        raise ImportError("a report needs jinja2: pip install 'fmtorch[report]'") from error
     names = list(dict.fromkeys([*(row[0] for row in runs), *(name for s in sections for name in s.runs)]))
     script = _resource("report.js")
-    return _template().render(
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.from_string(_resource("report.html.j2")).render(
         title=title, runs=runs, shared=shared, names=names,
-        swatches={name: Markup(curves.swatch(i)) for i, name in enumerate(names)},
+        swatches={name: curves.swatch(i) for i, name in enumerate(names)},
         sections=[_context(section, names) for section in sections],
-        style=Markup(_resource("report.css")), script=Markup(script),
+        style=curves.style_sheet() + _resource("report.css"), script=script,
         policy="default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-"
         + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() + "'",
     )  # fmt: skip
@@ -142,13 +155,6 @@ def differing_pairs(runs: Mapping[str, pa.Table], count: int) -> list[str]:
     return [names[rows[i]] for i in chosen]
 
 
-def _template() -> jinja2.Template:
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    return environment.from_string(_resource("report.html.j2"))
-
-
 def _resource(name: str) -> str:
     return resources.files("fmtorch.evaluation").joinpath(name).read_text(encoding="utf-8")
 
@@ -159,52 +165,19 @@ def _context(section: Section, names: Sequence[str]) -> dict[str, Any]:
     pairs = {table.num_rows for table in section.runs.values()}
     facts = f"{len(section.runs)} runs" if len(section.runs) > 1 else "One run"
     counts = f"{min(pairs):,}" + (f" to {max(pairs):,}" if len(pairs) > 1 else "")
-    optional_tables = (
-        tables.merit(summaries), tables.families(summaries), tables.homographies(summaries), tables.poses(summaries),
-        tables.focals(summaries), tables.configurations(summaries), differences(section.runs),
-    )  # fmt: skip
     return {
         "heading": section.heading,
         "facts": f"{facts}, {counts} pair{'s' * (pairs != {1})}{' each' * (len(section.runs) > 1)}.",
-        "legend": caption(next(iter(summaries.values()))),
-        "tables": [*(table for table in optional_tables if table), tables.seconds(summaries)],
+        "legend": tables.caption(next(iter(summaries.values()))),
+        "tables": tables.report_tables(section.runs, summaries),
         "names": list(section.runs),
         "axis": axis.label,
         "curves": [
-            (title, Markup(curves.svg(title, panel, names, axis)))
-            for title, panel in curves.panels(section.runs).items()
+            (title, curves.svg(title, panel, names, axis)) for title, panel in curves.panels(section.runs).items()
         ],
-        "pairs": [_pair(pair) for pair in section.pairs],
+        "pairs": section.pairs,
         "notes": section.notes,
     }
-
-
-def _pair(pair: ShownPair) -> dict[str, Any]:
-    return {
-        "name": pair.name,
-        "notes": pair.notes,
-        "runs": [
-            {
-                "name": shown.run,
-                "result": shown.result,
-                "good": shown.good,
-                "pictures": [_encoded(picture) for picture in shown.pictures],
-            }
-            for shown in pair.runs
-        ],
-    }
-
-
-def _encoded(picture: Picture) -> dict[str, Any]:
-    """A picture as a JPEG within the page, and its size, which keeps its place until it is shown."""
-    image = picture.image
-    if image.shape[1] > WIDTH:
-        height = round(image.shape[0] * WIDTH / image.shape[1])
-        image = np.asarray(cv2.resize(image, (WIDTH, height), interpolation=cv2.INTER_AREA), np.uint8)
-    encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
-    source = f"data:image/jpeg;base64,{base64.b64encode(encoded.tobytes()).decode('ascii')}"
-    height, width = image.shape[:2]
-    return {"source": source, "alt": picture.alt, "caption": picture.caption, "width": width, "height": height}
 
 
 # Short names of runs: what differs between them and nothing else

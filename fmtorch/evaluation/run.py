@@ -21,8 +21,8 @@ from fmtorch.core.stages import ImageMatcher
 from fmtorch.data.pairs import GivenMatches, ImagePair, ImageSource
 from fmtorch.evaluation.pair_cameras import PairCameras, WithPairCameras
 from fmtorch.evaluation.rows import evaluate
-from fmtorch.io.collected import CollectedJournal
-from fmtorch.io.match_store import Journal
+from fmtorch.io.collected import CollectedMatches
+from fmtorch.io.match_store import MatchStore
 from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.pool import WorkerPool
 from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner
@@ -46,7 +46,7 @@ class Batch:
     pairs: list[ImagePair]
     seed: int
     cameras: Mapping[int, PairCameras] | None = None
-    journal: CollectedJournal | None = None
+    journal: CollectedMatches | None = None
     counted: bool = False
     signed: bool = False
 
@@ -61,7 +61,7 @@ class Work:
     rows: list[PairRow]
     computed: int = 0
     from_cache: int = 0
-    journal: CollectedJournal | None = None
+    journal: CollectedMatches | None = None
 
 
 def evaluate_batch(pipeline: Pipeline, batch: Batch) -> Work:
@@ -167,7 +167,7 @@ def evaluate_pairs(
     store: Callable[[list[PairRow]], None],
     build: Build | None = None,
     cameras: Mapping[int, PairCameras] | None = None,
-    journal: Journal | None = None,
+    journal: MatchStore | None = None,
     signed: bool = False,
 ) -> Iterator[int]:
     """Run and evaluate the pairs, hand each batch's rows to `store`, and yield how many pairs it held.
@@ -185,7 +185,7 @@ def evaluate_pairs(
     def given(members: Sequence[ImagePair]) -> Batch:
         own = None if cameras is None or source.shared else {p.key: cameras[p.key] for p in members if p.key in cameras}
         sent = batch_contents(list(members)) if execution.send_images and not source.shared else list(members)
-        kept = None if journal is None else CollectedJournal.of(journal)
+        kept = None if journal is None else CollectedMatches.of(journal)
         return Batch(sent, seed, own, kept, not source.shared, signed)
 
     def keep(done: Batch, work: Work) -> None:

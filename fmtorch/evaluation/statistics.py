@@ -1,4 +1,13 @@
-"""Confidence intervals by resampling whole scenes, because the pairs of one scene are not independent."""
+"""Recall, AUC@0.05, their differences and intervals: what every table of this project takes its figures from.
+
+A figure is the mean over pairs of what each pair adds to it. Pairs of one scene succeed and fail together: the units
+of intervals are scenes, and pairs only where there are fewer than five scenes, which every table then says
+(`described`). Means have the bootstrap's percentile intervals. Where every pair succeeds these have no width: of three
+right pairs they say [100, 100]. Shares of pairs, such as recall, therefore have the score interval, the usual
+recommendation for a proportion (Brown, Cai and DasGupta, "Interval Estimation for a Binomial Proportion", Statistical
+Science 2001), of the effective number of pairs (Korn and Graubard, "Confidence intervals for proportions with small
+expected number of positive counts estimated from survey data", Survey Methodology 1998).
+"""
 
 from __future__ import annotations
 
@@ -16,11 +25,18 @@ from fmtorch import metrics
 from fmtorch.metrics.recall import FINE_THRESHOLD as FINE_THRESHOLD
 from fmtorch.metrics.recall import THRESHOLD as THRESHOLD
 
-RESAMPLES = 2000
+POSE_THRESHOLDS = (5, 10, 20)  # degrees
+FOCAL_THRESHOLDS = (5, 10)  # percent
+CORNER_THRESHOLDS = (1, 3, 5)  # px, as LightGlue (Lindenberger et al., ICCV 2023); SuperGlue and LoFTR: 3, 5, 10
+PERCENT = 100.0
 LEVEL = 0.95
-MIN_SCENES = 5  # with fewer scenes their spread cannot be seen, and pairs are resampled
+RESAMPLES = 2000
+MIN_SCENES = 5  # with fewer scenes their spread cannot be seen, and pairs are the units
+MIN_UNITS = 10  # below which a bootstrap of a difference is not shown
 _SEED = 0
 _BLOCK = 1 << 22  # numbers drawn at once: bounds the memory to some 100 MB
+_Z = float(ndtri((1 + LEVEL) / 2))
+Values = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,130 +51,12 @@ class Interval:
     high: float
     over: str
 
+    def scaled(self, scale: float) -> Interval:
+        """The same in another unit."""
+        return Interval(scale * self.value, scale * self.low, scale * self.high, self.over)
+
     def __format__(self, form: str) -> str:
         return f"{self.value:{form}} [{self.low:{form}}, {self.high:{form}}]"
-
-
-def bootstrap_mean(values: NDArray[np.float64], scenes: Sequence[str]) -> Interval:
-    """The mean over all pairs, with a 95 % percentile interval from 2,000 resamples of scenes (Efron 1979).
-
-    values: one per pair, (n,), n >= 1. scenes: the scene of each pair. With fewer than `MIN_SCENES` scenes the pairs
-    are resampled instead, which is too narrow where pairs of a scene succeed and fail together. The interval has no
-    width where all values are equal. The same input always gives the same interval.
-    """
-    _, cluster = np.unique(np.asarray(scenes), return_inverse=True)
-    over = "scene" if cluster.max() + 1 >= MIN_SCENES else "pair"
-    if over == "pair":
-        cluster = np.arange(len(values))
-    sums, sizes = np.bincount(cluster, values), np.bincount(cluster)
-    means = np.concatenate([sums[draw].sum(1) / sizes[draw].sum(1) for draw in _draws(len(sums))])
-    low, high = np.quantile(means, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-    return Interval(float(sums.sum() / len(values)), float(low), float(high), over)
-
-
-def paired_bootstrap(a: NDArray[np.float64], b: NDArray[np.float64], scenes: Sequence[str]) -> Interval:
-    """mean(a) - mean(b) of two methods on the same pairs, as `bootstrap_mean` of the differences.
-
-    a, b: (n,), e.g. 1.0 where NSGD is below the threshold. The methods differ at this level where the interval does
-    not hold 0.
-    """
-    if len(a) != len(b):
-        raise ValueError(f"paired_bootstrap compares the same pairs, but a has {len(a)} and b has {len(b)}")
-    return bootstrap_mean(a - b, scenes)
-
-
-def _draws(count: int) -> Iterator[NDArray[np.int64]]:
-    """`RESAMPLES` samples with replacement of `count` clusters, in blocks (r, count)."""
-    rng = np.random.default_rng(_SEED)
-    rows = max(1, min(RESAMPLES, _BLOCK // count))
-    for start in range(0, RESAMPLES, rows):
-        yield rng.integers(0, count, (min(rows, RESAMPLES - start), count))
-
-
-# Confidence intervals of shares of pairs: sound from three pairs on, and where all of them or none succeed
-
-
-MIN_UNITS = 10  # scenes, or pairs where those are resampled, below which a bootstrap of any other mean is not shown
-Successes = NDArray[np.bool_] | NDArray[np.float64]
-_Z = float(ndtri((1 + LEVEL) / 2))
-
-
-def effective_pairs(values: NDArray[np.float64], scenes: Sequence[str]) -> float:
-    """How many independent pairs tell as much of the mean as these, which come in scenes; at most n.
-
-    n divided by the design effect: the variance of the mean with whole scenes as units over that with pairs as units,
-    at least 1; and by the squared ratio of Student's quantiles, because few scenes tell their own spread badly. n with
-    fewer than `MIN_SCENES` scenes, whose spread cannot be seen, and where all values are equal.
-
-    Args:
-        values: one per pair, (n,), n >= 1.
-        scenes: the scene of each pair.
-    """
-    n = len(values)
-    _, cluster = np.unique(np.asarray(scenes), return_inverse=True)
-    m = int(cluster.max()) + 1
-    centred = values - values.mean()
-    alone = float((centred**2).sum()) * n / (n - 1) if n > 1 else 0.0
-    if m < MIN_SCENES or alone <= n * np.finfo(np.float64).eps:
-        return float(n)
-    together = float((np.bincount(cluster, centred) ** 2).sum()) * m / (m - 1)
-    quantiles = float(stdtrit(m - 1, (1 + LEVEL) / 2) / stdtrit(n - 1, (1 + LEVEL) / 2))
-    return n / (max(1.0, together / alone) * quantiles**2)
-
-
-def share_interval(successes: Successes, scenes: Sequence[str]) -> Interval:
-    """The share of pairs that succeed, with Wilson's 95 % score interval for the effective number of pairs.
-
-    Args:
-        successes: (n,), n >= 1; of several seeds the share of those with which a pair succeeds, in [0, 1].
-        scenes: the scene of each pair; `Interval.over` says whether scenes were many enough to be the units.
-    """
-    values = successes.astype(np.float64)
-    p, n = float(values.mean()), effective_pairs(values, scenes)
-    middle = (p + _Z**2 / (2 * n)) / (1 + _Z**2 / n)
-    half = _Z / (1 + _Z**2 / n) * math.sqrt(p * (1 - p) / n + _Z**2 / (4 * n**2))
-    # At the ends the bound is exact; rounding must not put it on the wrong side of the share.
-    return Interval(p, min(max(0.0, middle - half), p), max(min(1.0, middle + half), p), _unit(scenes))
-
-
-def share_difference(a: Successes, b: Successes, scenes: Sequence[str]) -> Interval:
-    """Share of a minus share of b, of the same pairs, with the adjusted Wald interval of Bonett and Price.
-
-    One pair more is counted on either side ("Adjusted Wald confidence interval for a difference of binomial proportions
-    based on paired data", Journal of Educational and Behavioral Statistics 2012), so that methods which agree on every
-    pair still have an interval of the width that so few pairs allow.
-
-    Args:
-        a, b: (n,), n >= 1, where either method succeeds; of several seeds as in `share_interval`.
-        scenes: the scene of each pair.
-    """
-    difference = a.astype(np.float64) - b.astype(np.float64)
-    n = effective_pairs(difference, scenes)
-    only_a, only_b = (float((sign * difference).clip(min=0.0).mean()) for sign in (1, -1))
-    p, q = (n * only_a + 1) / (n + 2), (n * only_b + 1) / (n + 2)
-    half = _Z * math.sqrt((p + q - (p - q) ** 2) / (n + 2))
-    value = float(difference.mean())
-    low, high = max(-1.0, p - q - half), min(1.0, p - q + half)
-    return Interval(value, min(low, value), max(high, value), _unit(scenes))
-
-
-def mean_difference(a: NDArray[np.float64], b: NDArray[np.float64], scenes: Sequence[str]) -> Interval | None:
-    """mean(a) - mean(b) of a figure that is no share, by `paired_bootstrap`; None of fewer than `MIN_UNITS` units."""
-    units = len(set(scenes)) if _unit(scenes) == "scene" else len(a)
-    return paired_bootstrap(a, b, scenes) if units >= MIN_UNITS else None
-
-
-def _unit(scenes: Sequence[str]) -> str:
-    return "scene" if len(set(scenes)) >= MIN_SCENES else "pair"
-
-
-# Recall, AUC@0.05, their differences and intervals: what every table of this project takes its figures from
-
-
-POSE_THRESHOLDS = (5, 10, 20)  # degrees
-FOCAL_THRESHOLDS = (5, 10)  # percent
-PERCENT = 100.0
-Values = NDArray[np.float64]
 
 
 def recalled(nsgd: Values, threshold: float = THRESHOLD) -> Values:
@@ -187,6 +85,11 @@ MERITS: dict[str, Callable[[Values], Values]] = {
 
 SHARES = ("recall_05", "recall_01")
 """Those of them that are shares of pairs."""
+
+
+def _per_pair(values: torch.Tensor) -> Values:
+    array: Values = values.double().numpy()
+    return array.mean(0) if array.ndim > 1 else array
 
 
 def pose_figures(rotation: Values, translation: Values, signed: bool = False) -> dict[str, float | int] | None:
@@ -238,30 +141,64 @@ def focal_figures(errors: Values, log_ratios: Values, ok: NDArray[np.bool_]) -> 
     }
 
 
+def homography_figures(errors: Values) -> dict[str, float | int | None] | None:
+    """Accuracy of homographies over the pairs whose true one is known; None where there is none.
+
+    errors: corner errors in pixels, (n,), infinite where a pair failed, NaN where no homography is known.
+
+    - pairs: how many are known.
+    - auc_1px, auc_3px, auc_5px: area under the recall curve of the corner error (`fmtorch.metrics.pose_auc`).
+    - corner_error: the median, None where that is infinite.
+    """
+    known = errors[~np.isnan(errors)]
+    if not len(known):
+        return None
+    areas = metrics.pose_auc(torch.from_numpy(known), CORNER_THRESHOLDS).tolist()
+    median = float(np.median(known))
+    return {
+        "pairs": len(known), **{f"auc_{t}px": area for t, area in zip(CORNER_THRESHOLDS, areas, strict=True)},
+        "corner_error": median if math.isfinite(median) else None,
+    }  # fmt: skip
+
+
 def interval(values: Values, scenes: Sequence[str], scale: float = 1.0, share: bool = False) -> Interval | None:
     """Mean of the values that are not NaN, times `scale`, with its 95 % interval; None where all are NaN.
 
     values, scenes: one per pair, (n,). share: the values are successes, see `share_interval`.
     """
-    known = ~np.isnan(values)
-    if not known.any():
+    known, places = _known(scenes, values)
+    if not len(places):
         return None
-    of = share_interval if share else bootstrap_mean
-    return _scaled(of(values[known], _known_scenes(scenes, known)), scale)
+    return (share_interval if share else bootstrap_mean)(values[known], places).scaled(scale)
 
 
 def difference(a: Values, b: Values, scenes: Sequence[str], scale: float = 1.0, share: bool = False) -> Interval | None:
     """mean(a) - mean(b) of two methods on the same pairs, times `scale`, with its 95 % interval.
 
-    Of the pairs for which both are not NaN; None where there are none, or too few for the figure (`mean_difference`).
-    a, b, scenes: one per pair, (n,). share: the values are successes, see `share_difference`.
+    Of the pairs for which both are not NaN; None where there are none, or, for a figure that is no share, fewer than
+    `MIN_UNITS` units. The methods differ at this level where the interval does not hold 0.
+
+    Args:
+        a, b: one per pair, (n,).
+        scenes: the scene of each pair.
+        scale: of the result.
+        share: the values are successes, see `share_difference`.
     """
-    known = ~(np.isnan(a) | np.isnan(b))
-    if not known.any():
+    if len(a) != len(b):
+        raise ValueError(f"a difference is of the same pairs, but a has {len(a)} and b has {len(b)}")
+    known, places = _known(scenes, a, b)
+    if not len(places):
         return None
-    of = share_difference if share else mean_difference
-    unscaled = of(a[known], b[known], _known_scenes(scenes, known))
-    return None if unscaled is None else _scaled(unscaled, scale)
+    if share:
+        return share_difference(a[known], b[known], places).scaled(scale)
+    units = len(set(places)) if unit(places) == "scene" else len(places)
+    return bootstrap_mean((a - b)[known], places).scaled(scale) if units >= MIN_UNITS else None
+
+
+def _known(scenes: Sequence[str], *values: Values) -> tuple[NDArray[np.bool_], list[str]]:
+    """Where no value is NaN, and the scenes of these pairs."""
+    known: NDArray[np.bool_] = ~np.any([np.isnan(each) for each in values], axis=0)
+    return known, [scene for scene, is_known in zip(scenes, known, strict=True) if is_known]
 
 
 def scene_names(families: Sequence[str], scenes: Sequence[str]) -> list[str]:
@@ -281,14 +218,92 @@ def unit(scenes: Sequence[str]) -> str:
     return "scene" if len(set(scenes)) >= MIN_SCENES else "pair"
 
 
-def _per_pair(values: torch.Tensor) -> Values:
-    array: Values = values.double().numpy()
-    return array.mean(0) if array.ndim > 1 else array
+def _clusters(scenes: Sequence[str]) -> NDArray[np.int64]:
+    """The number of each pair's unit."""
+    if unit(scenes) == "pair":
+        return np.arange(len(scenes))
+    numbers: NDArray[np.int64] = np.unique(np.asarray(scenes), return_inverse=True)[1]
+    return numbers
 
 
-def _scaled(i: Interval, scale: float) -> Interval:
-    return Interval(scale * i.value, scale * i.low, scale * i.high, i.over)
+def bootstrap_mean(values: Values, scenes: Sequence[str]) -> Interval:
+    """The mean over all pairs, with a 95 % percentile interval from 2,000 resamples of scenes (Efron 1979).
+
+    With fewer than `MIN_SCENES` scenes the pairs are resampled instead, which is too narrow where pairs of a scene
+    succeed and fail together. The interval has no width where all values are equal. The same input always gives the
+    same interval.
+
+    Args:
+        values: one per pair, (n,), n >= 1.
+        scenes: the scene of each pair.
+    """
+    cluster = _clusters(scenes)
+    sums, sizes = np.bincount(cluster, values), np.bincount(cluster)
+    means = np.concatenate([sums[draw].sum(1) / sizes[draw].sum(1) for draw in _draws(len(sums))])
+    low, high = np.quantile(means, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return Interval(float(sums.sum() / len(values)), float(low), float(high), unit(scenes))
 
 
-def _known_scenes(scenes: Sequence[str], known: NDArray[np.bool_]) -> list[str]:
-    return [scene for scene, is_known in zip(scenes, known, strict=True) if is_known]
+def _draws(count: int) -> Iterator[NDArray[np.int64]]:
+    """`RESAMPLES` samples with replacement of `count` clusters, in blocks (r, count)."""
+    rng = np.random.default_rng(_SEED)
+    rows = max(1, min(RESAMPLES, _BLOCK // count))
+    for start in range(0, RESAMPLES, rows):
+        yield rng.integers(0, count, (min(rows, RESAMPLES - start), count))
+
+
+def effective_pairs(values: NDArray[np.float64], scenes: Sequence[str]) -> float:
+    """How many independent pairs tell as much of the mean as these, which come in scenes; at most n.
+
+    n divided by the design effect: the variance of the mean with whole scenes as units over that with pairs as units,
+    at least 1; and by the squared ratio of Student's quantiles, because few scenes tell their own spread badly. n with
+    fewer than `MIN_SCENES` scenes, whose spread cannot be seen, and where all values are equal.
+
+    Args:
+        values: one per pair, (n,), n >= 1.
+        scenes: the scene of each pair.
+    """
+    n, m = len(values), len(set(scenes))
+    centred = values - values.mean()
+    alone = float((centred**2).sum()) * n / (n - 1) if n > 1 else 0.0
+    if m < MIN_SCENES or alone <= n * np.finfo(np.float64).eps:
+        return float(n)
+    together = float((np.bincount(_clusters(scenes), centred) ** 2).sum()) * m / (m - 1)
+    quantiles = float(stdtrit(m - 1, (1 + LEVEL) / 2) / stdtrit(n - 1, (1 + LEVEL) / 2))
+    return n / (max(1.0, together / alone) * quantiles**2)
+
+
+def share_interval(successes: Values | NDArray[np.bool_], scenes: Sequence[str]) -> Interval:
+    """The share of pairs that succeed, with Wilson's 95 % score interval for the effective number of pairs.
+
+    Args:
+        successes: (n,), n >= 1; of several seeds the share of those with which a pair succeeds, in [0, 1].
+        scenes: the scene of each pair; `Interval.over` says whether scenes were many enough to be the units.
+    """
+    values = successes.astype(np.float64)
+    p, n = float(values.mean()), effective_pairs(values, scenes)
+    middle = (p + _Z**2 / (2 * n)) / (1 + _Z**2 / n)
+    half = _Z / (1 + _Z**2 / n) * math.sqrt(p * (1 - p) / n + _Z**2 / (4 * n**2))
+    # At the ends the bound is exact; rounding must not put it on the wrong side of the share.
+    return Interval(p, min(max(0.0, middle - half), p), max(min(1.0, middle + half), p), unit(scenes))
+
+
+def share_difference(a: Values | NDArray[np.bool_], b: Values | NDArray[np.bool_], scenes: Sequence[str]) -> Interval:
+    """Share of a minus share of b, of the same pairs, with the adjusted Wald interval of Bonett and Price.
+
+    One pair more is counted on either side ("Adjusted Wald confidence interval for a difference of binomial proportions
+    based on paired data", Journal of Educational and Behavioral Statistics 2012), so that methods which agree on every
+    pair still have an interval of the width that so few pairs allow.
+
+    Args:
+        a, b: (n,), n >= 1, where either method succeeds; of several seeds as in `share_interval`.
+        scenes: the scene of each pair.
+    """
+    difference = a.astype(np.float64) - b.astype(np.float64)
+    n = effective_pairs(difference, scenes)
+    only_a, only_b = (float((sign * difference).clip(min=0.0).mean()) for sign in (1, -1))
+    p, q = (n * only_a + 1) / (n + 2), (n * only_b + 1) / (n + 2)
+    half = _Z * math.sqrt((p + q - (p - q) ** 2) / (n + 2))
+    value = float(difference.mean())
+    low, high = max(-1.0, p - q - half), min(1.0, p - q + half)
+    return Interval(value, min(low, value), max(high, value), unit(scenes))

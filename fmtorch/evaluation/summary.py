@@ -12,12 +12,12 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from fmtorch.core.estimate import CONFIGURATIONS
-from fmtorch.evaluation.rows import homography_figures
+from fmtorch.core.types import CONFIGURATIONS
 from fmtorch.evaluation.statistics import (
     MERITS,
     THRESHOLD,
     focal_figures,
+    homography_figures,
     pose_figures,
     recalled,
     scene_names,

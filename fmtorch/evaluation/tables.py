@@ -1,34 +1,259 @@
-"""The tables of a report, as cells: figures of merit, families, paired differences, seconds."""
+"""Summaries as tables: of one run on a terminal and in Markdown, of several runs as cells of a report."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
+from rich import box
+from rich.table import Table as TerminalTable
 
-from fmtorch.evaluation.rows import CAPTION
-from fmtorch.evaluation.statistics import FINE_THRESHOLD, LEVEL, POSE_THRESHOLDS, THRESHOLD
-from fmtorch.evaluation.summary import ALL, STAGES
-from fmtorch.evaluation.summary_tables import (
-    CONFIGURATION_CAPTION,
-    CONFIGURATION_COLUMNS,
-    FOCAL_CAPTION,
-    FOCAL_COLUMNS,
-    HOMOGRAPHY_COLUMNS,
-    MARKDOWN_COLUMNS,
-    RECALL,
-    Columns,
-    known_columns,
-    pose_caption,
-    pose_columns,
+from fmtorch.core.types import CONFIGURATIONS
+from fmtorch.evaluation.curves import NSGD, axis_of
+from fmtorch.evaluation.statistics import (
+    CORNER_THRESHOLDS,
+    FINE_THRESHOLD,
+    FOCAL_THRESHOLDS,
+    LEVEL,
+    MIN_UNITS,
+    PERCENT,
+    POSE_THRESHOLDS,
+    THRESHOLD,
+    Interval,
+    areas,
+    difference,
+    recalled,
+    scene_names,
+)
+from fmtorch.evaluation.summary import ALL, STAGES, Group
+
+Columns = Mapping[str, Callable[[Group], str]]  # what stands below a heading, of the figures of a row
+Summaries = Mapping[str, Mapping[str, Group]]  # of `summarize`, by the runs' names
+DASH = "–"
+RECALL = "%Recall [interval]"  # the column that has an interval
+_OF_RECALL = ("%Recall", RECALL, f"at {FINE_THRESHOLD}", "AUC@0.05", "%Recall (released NSGD)")
+
+
+def _text(value: float | int | None, form: str) -> str:
+    return DASH if value is None else form.format(value)
+
+
+def _number(field: str, form: str = "{}") -> Callable[[Group], str]:
+    return lambda group: _text(group[field], form)
+
+
+def _percent(field: str, form: str = "{:.1f}") -> Callable[[Group], str]:
+    return lambda group: _text(None if group[field] is None else 100 * group[field], form)
+
+
+def _recall(group: Group) -> str:
+    if group["recall"] is None:
+        return DASH
+    low, high = group["recall_interval"]
+    return f"{100 * group['recall']:.1f} [{100 * low:.0f}, {100 * high:.0f}]"
+
+
+def _corrs(group: Group) -> str:
+    return f"{_text(group['corrs'], '{:.0f}')} ({_text(group['corrs_before'], '{:.0f}')})"
+
+
+def _failures(group: Group) -> str:
+    return f"{group['failures']} ({_text(group['failure_share'], '{:.1%}')})" if group["failures"] else "0"
+
+
+TERMINAL_COLUMNS: Columns = {
+    "Pairs": _number("pairs"),
+    "%Recall": _recall,
+    "AUC@0.05": _percent("auc_05"),
+    "%Inlier (-m)": lambda group: f"{_percent('inlier_rate')(group)} ({_percent('inlier_rate_before')(group)})",
+    "#Corrs (-m)": _corrs,
+    "Failed": _number("failures"),
+}
+COLUMNS: Columns = {
+    "Pairs": _number("pairs"),
+    "Scenes": _number("scenes"),
+    RECALL: _recall,
+    f"at {FINE_THRESHOLD}": _percent("recall_fine"),
+    "AUC@0.05": _percent("auc_05"),
+    "%Recall (released NSGD)": _percent("recall_released"),
+    "%Inlier": _percent("inlier_rate"),
+    "with failures 0": _percent("inlier_rate_failures_0"),
+    "%Inlier-m": _percent("inlier_rate_before"),
+    "#Corrs (-m)": _corrs,
+    "Failures": _failures,
+}
+INLIERS = (
+    "%Inlier: right matches, within 3 px of the true homography, and #Corrs, after estimation, -m: before; means over "
+    "the pairs that did not fail."
 )
 
-DASH = "–"
-Summaries = Mapping[str, Mapping[str, Any]]  # of `summarize`, by the runs' names
+
+def known_columns(columns: Columns, groups: Mapping[str, Group]) -> Columns:
+    """The columns without those of recall where no group has any: homographies have none."""
+    if any(group["recall"] is not None or not group["pairs"] for group in groups.values()):
+        return columns
+    return {heading: column for heading, column in columns.items() if heading not in _OF_RECALL}
+
+
+def caption(summary: Mapping[str, Group]) -> str:
+    """What the columns mean, and what the intervals take for independent."""
+    groups = _groups(summary)
+    overs = dict.fromkeys(group["interval_over"] for group in groups.values() if group["interval_over"])
+    where = {over: [name for name, g in groups.items() if g["interval_over"] == over] for over in overs}
+    over = "; ".join(f"{o}s" + (f" ({', '.join(names)})" if len(where) > 1 else "") for o, names in where.items())
+    if any(group["homography"] is not None for group in groups.values()):
+        return INLIERS
+    return (
+        f"%Recall: NSGD < {THRESHOLD}, failures are misses; [{LEVEL:.0%} Wilson interval; independent units: "
+        f"{over or 'pairs'}]. AUC@0.05: area under the recall curve to NSGD {THRESHOLD}. "
+        "%Inlier, #Corrs: after estimation, -m: before; means over the pairs that did not fail."
+    )
+
+
+def _groups(summary: Mapping[str, Group]) -> dict[str, Group]:
+    """The groups to show: ``all`` last, and not where it repeats the only family."""
+    return {name: group for name, group in summary.items() if name != ALL or len(summary) != 2}
+
+
+class Part(NamedTuple):
+    """A table of what some groups have beside their recall. ranked: the fields of columns whose largest is the best."""
+
+    heading: str
+    note: str
+    columns: Columns
+    rows: Mapping[str, Group]
+    ranked: Mapping[str, str] = {}
+
+
+POSE = {
+    False: "Of the pairs with known cameras, by the larger of the angles of rotation and of translation, which is "
+    "folded: its sign does not count. Failures count as 180° and 90°. AUC: area under the recall curve; mAA(10°): mean "
+    "of recall at 1°, ..., 10°; R error, t error: medians.",
+    True: "Of the pairs with known cameras, by the larger of the angles of rotation and of translation, whose sign "
+    "counts (pose.signed=true); of an F without cameras, of the best of its four poses, as PoseBench. Failures count "
+    "as 180°. AUC: area under the recall curve; mAA(10°): mean of recall at 1°, ..., 10°; R error, t error: medians.",
+}
+"""What is said of poses, by whether the sign of a translation counts."""
+BINNED = " mAP: mean of recall at 5°, 10°, ..., as in papers before 2020."
+HOMOGRAPHY = (
+    "By the mean distance, in image 1, between the corners of image 0 as the true and the estimated homography map "
+    "them; failures are misses. AUC: area under the recall curve; corner error: median."
+)
+HOMOGRAPHY_COLUMNS: Columns = {
+    "Pairs": _number("pairs"),
+    **{f"AUC@{t} px": _percent(f"auc_{t}px") for t in CORNER_THRESHOLDS},
+    "corner error": _number("corner_error", "{:.2f} px"),
+}
+FOCALS = (
+    "Of the estimated focal lengths of known cameras: median relative error, median ratio, and shares within an error; "
+    "those of failed pairs, and those that are not determined, are misses."
+)
+FOCAL_COLUMNS: Columns = {
+    "Images": _number("images"),
+    "error": _percent("error", "{:.1f} %"),
+    "f / true f": _number("ratio", "{:.3f}"),
+    **{f"%within {p} %": _percent(f"within_{p}") for p in FOCAL_THRESHOLDS},
+}
+KINDS = (
+    "Number of pairs by what their matches show. Those of one plane, of a camera that only turns, or of one photograph "
+    "twice do not determine F: recall of such pairs is luck."
+)
+
+
+def parts(groups: Mapping[str, Group], binned: bool = True) -> list[Part]:
+    """Poses, homographies, focal lengths and configurations, of the groups that have some. binned: with mAP."""
+
+    def known(field: str) -> dict[str, Group]:
+        return {name: group[field] for name, group in groups.items() if group[field] is not None}
+
+    tables = [
+        _poses(known("pose"), binned),
+        Part("Homography", HOMOGRAPHY, HOMOGRAPHY_COLUMNS, known("homography")),
+        Part("Focal lengths", FOCALS, FOCAL_COLUMNS, known("focals")),
+        Part("Configurations", KINDS, {name: _number(name) for name in CONFIGURATIONS}, known("configurations")),
+    ]
+    return [table for table in tables if table.rows]
+
+
+def _poses(rows: Mapping[str, Group], binned: bool) -> Part:
+    """Its last heading says whether translations are folded or signed, where all are alike; else the note, by rows."""
+    by_sign = {signed: [name for name, row in rows.items() if row["signed"] == signed] for signed in (False, True)}
+    said = [(signed, names) for signed, names in by_sign.items() if names]
+    suffix = "" if len(said) != 1 else ", signed" if said[0][0] else ", folded"
+    note = " ".join(POSE[signed] if len(said) == 1 else f"{', '.join(names)}: {POSE[signed]}" for signed, names in said)
+    areas = {f"AUC@{t}°": f"auc_{t}" for t in POSE_THRESHOLDS} | {"mAA(10°)": "maa_10"}
+    columns: Columns = {
+        "Pairs": _number("pairs"),
+        **{heading: _percent(field) for heading, field in areas.items()},
+        **{f"mAP@{t}°": _percent(f"map_{t}") for t in POSE_THRESHOLDS if binned},
+        "R error": _number("rotation", "{:.2f}°"),
+        f"t error{suffix}": _number("translation", "{:.2f}°"),
+    }
+    return Part("Relative pose", note + BINNED * binned, columns, rows, areas)
+
+
+def _parts_of_run(summary: Mapping[str, Group], binned: bool) -> list[Part]:
+    """Configurations only where a pair is not general."""
+    kinds = [group["configurations"] or {} for group in summary.values()]
+    general = not any(count for counts in kinds for kind, count in counts.items() if kind != "general")
+    return [part for part in parts(_groups(summary), binned) if part.heading != "Configurations" or not general]
+
+
+def terminal_tables(summary: Mapping[str, Group], title: str) -> list[TerminalTable]:
+    """The main figures of a run, for a terminal of 80 columns."""
+    columns = known_columns(TERMINAL_COLUMNS, summary)
+    first = Part(title, caption(summary), columns, _groups(summary))
+    return [_on_terminal(part) for part in (first, *_parts_of_run(summary, binned=False))]
+
+
+def _on_terminal(part: Part) -> TerminalTable:
+    table = TerminalTable(
+        title=part.heading, title_style="bold", caption=part.note, caption_justify="left", caption_style="dim",
+        box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True,
+    )  # fmt: skip
+    table.add_column("", overflow="fold")
+    for heading in part.columns:
+        table.add_column(heading, justify="right", no_wrap=True, overflow="fold")
+    for name, group in part.rows.items():
+        table.add_row(name, *_cells(part, group), style="bold" if name == ALL else "")
+    return table
+
+
+def summary_markdown(summary: Mapping[str, Group], title: str) -> str:
+    """All figures of a run as a Markdown page."""
+    groups = _groups(summary)
+    seconds = {stage: _number(stage, "{:.3f}") for stage in (*STAGES, "total")}
+    first = Part("", caption(summary), known_columns(COLUMNS, summary), groups)
+    last = Part("seconds (median per pair)", "", seconds, {name: group["seconds"] for name, group in groups.items()})
+    failures = [
+        f"- {name}: {_escape(reason)} ({count})"
+        for name, group in groups.items()
+        if name != ALL or len(summary) == 1
+        for reason, count in group["reasons"].items()
+    ]
+    if failures:
+        failures = ["Commonest reasons of failure, with the number of pairs:", "\n".join(failures)]
+    tables = [text for part in (first, *_parts_of_run(summary, binned=True), last) for text in _in_markdown(part)]
+    return "\n\n".join([f"# {title}", *tables, *failures]) + "\n"
+
+
+def _in_markdown(part: Part) -> list[str]:
+    rows = [[part.heading, *part.columns], ["---", *["---:"] * len(part.columns)]]
+    rows += [[name, *_cells(part, group)] for name, group in part.rows.items()]
+    table = "\n".join("| " + " | ".join(_escape(cell) for cell in row) + " |" for row in rows)
+    return [table, part.note] if part.note else [table]
+
+
+def _cells(part: Part, group: Group) -> list[str]:
+    return [column(group) for column in part.columns.values()]
+
+
+def _escape(text: str) -> str:
+    return " ".join(text.replace("|", "\\|").split())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,78 +282,47 @@ class Table:
 
     heading: str
     head: Sequence[str]
-    rows: Mapping[str, Sequence[Cell]]
+    rows: Mapping[str, list[Cell]]
     note: str = ""
     stages: bool = False  # whether the headings are keys to the parts of stacked bars
 
 
-def merit(summaries: Summaries) -> Table:
-    """All figures over all pairs, a row a run."""
-    counts = ("Pairs", "Scenes")  # which stand last: recall is what is looked for
-    known = known_columns(MARKDOWN_COLUMNS, {name: summary[ALL] for name, summary in summaries.items()})
-    columns = {heading: column for heading, column in known.items() if heading and heading not in counts}
-    columns |= {heading: MARKDOWN_COLUMNS[heading] for heading in counts}
+def report_tables(runs: Mapping[str, pa.Table], summaries: Summaries) -> list[Table]:
+    """The tables of runs on one data set, a row a run."""
+    overall = {name: summary[ALL] for name, summary in summaries.items()}
+    compared = (_families(summaries), *(_of_runs(part, summaries) for part in parts(overall)), _differences(runs))
+    return [_merit(overall), *(table for table in compared if table), _seconds(overall)]
+
+
+def _merit(overall: Mapping[str, Group]) -> Table:
+    """All figures over all pairs; counts stand last, since recall is what is looked for."""
+    known = known_columns(COLUMNS, overall)
+    counts = ("Pairs", "Scenes")
+    columns = {h: c for h, c in known.items() if h not in counts} | {h: COLUMNS[h] for h in counts}
     ranked = {RECALL: "recall", f"at {FINE_THRESHOLD}": "recall_fine", "AUC@0.05": "auc_05"}
-    best = {heading: _best({n: s[ALL][field] for n, s in summaries.items()}) for heading, field in ranked.items()}
+    table = _of_runs(Part("Figures of merit", "", columns, overall, ranked), overall)
+    if RECALL not in columns:
+        return table
+    place = list(columns).index(RECALL)
+    for name, cells in table.rows.items():
+        cells[place] = dataclasses.replace(cells[place], bar=_share(overall[name]))
+    return table
+
+
+def _of_runs(part: Part, names: Iterable[str]) -> Table:
+    """Dashes stand where a run has none of it."""
+    best = {h: _best({name: row[field] for name, row in part.rows.items()}) for h, field in part.ranked.items()}
     rows = {
         name: [
-            Cell(
-                column(summary[ALL]), name in best.get(heading, ()), _share(summary[ALL]) if heading == RECALL else None
-            )
-            for heading, column in columns.items()
+            Cell(column(part.rows[name]), name in best.get(heading, ())) if name in part.rows else Cell(DASH)
+            for heading, column in part.columns.items()
         ]
-        for name, summary in summaries.items()
+        for name in names
     }
-    return Table("Figures of merit", ["run", *columns], rows)
+    return Table(part.heading, ["run", *part.columns], rows, part.note)
 
 
-def poses(summaries: Summaries) -> Table | None:
-    """Accuracy of relative poses over all pairs with known cameras; None where there are none."""
-    known = {name: summary[ALL]["pose"] for name, summary in summaries.items() if summary[ALL]["pose"] is not None}
-    if not known:
-        return None
-    columns = {heading: column for heading, column in pose_columns(list(known.items())).items() if heading}
-    ranked = {f"AUC@{t}°": f"auc_{t}" for t in POSE_THRESHOLDS} | {"mAA(10°)": "maa_10"}
-    best = {heading: _best({n: figures[field] for n, figures in known.items()}) for heading, field in ranked.items()}
-    rows = {
-        name: [
-            Cell(column(known[name]), name in best.get(heading, ())) if name in known else Cell(DASH)
-            for heading, column in columns.items()
-        ]
-        for name in summaries
-    }
-    return Table("Relative pose", ["run", *columns], rows, pose_caption(list(known.items()), binned=True))
-
-
-def homographies(summaries: Summaries) -> Table | None:
-    """Accuracy of homographies over all pairs; None where none is known."""
-    return _of_field(summaries, "homography", "Homography", HOMOGRAPHY_COLUMNS, CAPTION)
-
-
-def focals(summaries: Summaries) -> Table | None:
-    """Accuracy of estimated focal lengths over all pairs; None where none were estimated."""
-    return _of_field(summaries, "focals", "Focal lengths", FOCAL_COLUMNS, FOCAL_CAPTION)
-
-
-def configurations(summaries: Summaries) -> Table | None:
-    """How many pairs are in which configuration; None where nobody has looked."""
-    return _of_field(summaries, "configurations", "Configurations", CONFIGURATION_COLUMNS, CONFIGURATION_CAPTION)
-
-
-def _of_field(summaries: Summaries, field: str, heading: str, columns: Columns, note: str) -> Table | None:
-    """The figures of a field over all pairs, a row a run."""
-    known = {name: summary[ALL][field] for name, summary in summaries.items() if summary[ALL][field] is not None}
-    if not known:
-        return None
-    shown = {name: column for name, column in columns.items() if name}
-    rows = {
-        name: [Cell(column(known[name])) if name in known else Cell(DASH) for column in shown.values()]
-        for name in summaries
-    }
-    return Table(heading, ["run", *shown], rows, note)
-
-
-def families(summaries: Summaries) -> Table | None:
+def _families(summaries: Summaries) -> Table | None:
     """Recall with its interval, and AUC@0.05, by family; None where there is but one."""
     names = list(dict.fromkeys(family for summary in summaries.values() for family in summary if family != ALL))
     if len(names) < 2 or any(group["recall"] is None for summary in summaries.values() for group in summary.values()):
@@ -147,25 +341,79 @@ def families(summaries: Summaries) -> Table | None:
     return Table(f"By family: %Recall at {THRESHOLD} / AUC@0.05", ["run", *names], rows, note)
 
 
-def seconds(summaries: Summaries) -> Table:
+def _differences(runs: Mapping[str, pa.Table]) -> Table | None:
+    """The first run minus each other one, on the pairs that the two share; None of a single run."""
+    if len(runs) < 2:
+        return None
+    axis = axis_of(runs)
+    first, *others = runs
+    keys, families, scenes = (runs[first][name].to_pylist() for name in ("key", "family", "scene"))
+    scene = dict(zip(keys, scene_names(families, scenes), strict=True))
+    counts, compared = [], []
+    for other in others:
+        two = {first: runs[first], other: runs[other]}
+        a, b = common(two, axis.column)
+        counts.append(len(a))
+        compared.append(_ahead(a, b, [scene[key] for key in shared_keys(two)], axis is NSGD))
+    ends = [abs(end) for cells in compared for _, i in cells if i for end in (i.low, i.high)]
+    widest = max(ends, default=1.0) or 1.0
+    rows = {
+        name: [Cell(f"{count:,}"), *(Cell(text, bar=_around_zero(i, widest)) for text, i in cells)]
+        for name, count, cells in zip(others, counts, compared, strict=True)
+    }
+    figures = [f"recall at {THRESHOLD}", f"at {FINE_THRESHOLD}", "AUC@0.05"]
+    head = ["run", "shared pairs", *(figures if axis is NSGD else [f"AUC@{t} px" for t in CORNER_THRESHOLDS])]
+    note = (
+        f"In points; positive where {first} is ahead of the row's run. In brackets the paired {LEVEL:.0%} interval "
+        f"(Bonett and Price's for recall, a bootstrap for AUC@0.05 from {MIN_UNITS} scenes or pairs on): a difference "
+        "whose interval holds 0 may be chance."
+    )
+    return Table(f"{first} minus each other run, pair by pair", head, rows, note)
+
+
+def _ahead(
+    a: NDArray[np.float64], b: NDArray[np.float64], scenes: Sequence[str], of_nsgd: bool
+) -> list[tuple[str, Interval | None]]:
+    """Differences of recall at both thresholds and of AUC@0.05, or of areas below corner errors, of the same pairs."""
+    if of_nsgd:
+        values = [(recalled(a, t), recalled(b, t), True) for t in (THRESHOLD, FINE_THRESHOLD)]
+        values.append((areas(a), areas(b), False))
+    else:
+        values = [(_area(a, t), _area(b, t), False) for t in CORNER_THRESHOLDS]
+    cells: list[tuple[str, Interval | None]] = []
+    for own, other, share in values:
+        interval = difference(own, other, scenes, PERCENT, share=share) if len(a) else None
+        few = f"{PERCENT * float((own - other).mean()):+.1f} (n too small)" if len(a) else DASH
+        cells.append((few if interval is None else f"{interval:+.1f}", interval))
+    return cells
+
+
+def _area(errors: NDArray[np.float64], threshold: float) -> NDArray[np.float64]:
+    """The share of thresholds up to one that are above a pair's corner error; NaN is a miss."""
+    area: NDArray[np.float64] = np.clip(1 - np.nan_to_num(errors, nan=np.inf) / threshold, 0, 1)
+    return area
+
+
+def _around_zero(i: Interval | None, widest: float) -> Bar | None:
+    if i is None:
+        return None
+    low, value, high = (50 + 50 * end / widest for end in (i.low, i.value, i.high))
+    return Bar(low, value, high, zero=50.0)
+
+
+def _seconds(overall: Mapping[str, Group]) -> Table:
     """Median seconds a pair of each stage, and the commonest failures."""
-    stages = [*STAGES, "total"]
-    totals = {name: summary[ALL]["seconds"]["total"] or 0.0 for name, summary in summaries.items()}
-    slowest = max(totals.values(), default=0.0)
-    rows = {}
-    for name, summary in summaries.items():
-        known = summary[ALL]["seconds"]
-        cells = [Cell(DASH if known[stage] is None else f"{known[stage]:.3f}") for stage in stages]
-        stage_total = sum(known[stage] or 0.0 for stage in STAGES)
-        width = 100 * totals[name] / slowest / stage_total if slowest and stage_total else 0.0
-        rows[name] = [*cells[:-1], dataclasses.replace(cells[-1], shares=[width * (known[s] or 0.0) for s in STAGES])]
-    failed = [
-        f"{name}: {reason} ({count})"
-        for name, summary in summaries.items()
-        for reason, count in summary[ALL]["reasons"].items()
-    ]
-    note = ("Pairs that failed: " + "; ".join(failed) + ".") if failed else ""
-    return Table("Seconds a pair, median", ["run", *stages], rows, note, stages=True)
+    columns = {stage: _number(stage, "{:.3f}") for stage in (*STAGES, "total")}
+    known = {name: group["seconds"] for name, group in overall.items()}
+    table = _of_runs(Part("Seconds a pair, median", "", columns, known), overall)
+    slowest = max((seconds["total"] or 0.0 for seconds in known.values()), default=0.0)
+    for name, seconds in known.items():
+        stages = [seconds[stage] or 0.0 for stage in STAGES]
+        width = 100 * (seconds["total"] or 0.0) / slowest / sum(stages) if slowest and sum(stages) else 0.0
+        table.rows[name][-1] = dataclasses.replace(table.rows[name][-1], shares=[width * each for each in stages])
+    failed = [f"{name}: {reason} ({n})" for name, group in overall.items() for reason, n in group["reasons"].items()]
+    note = f"Pairs that failed: {'; '.join(failed)}." if failed else ""
+    return dataclasses.replace(table, note=note, stages=True)
 
 
 def shared_keys(runs: Mapping[str, pa.Table]) -> list[int]:
@@ -185,7 +433,8 @@ def common(runs: Mapping[str, pa.Table], column: str) -> list[NDArray[np.float64
     return columns
 
 
-def _share(group: Mapping[str, Any]) -> Bar | None:
+def _share(group: Group) -> Bar | None:
+    """The interval of recall."""
     if group["recall"] is None:
         return None
     low, high = group["recall_interval"]

@@ -151,7 +151,7 @@ SHIFT, RANK_TOLERANCE, SQUARINGS = 1e-14, 1e-12, 14  # as in `eigenvector`
 def eight_point_kernel(points: F8x2, sample: I8x2, F: F4x2, draw: I8x1) -> int:
     """Consistently oriented models of samples (8, s) of points (4, n) -> F (s, 9), draw (s,); how many there are.
 
-    As `minimal.eight_point_components`, in the order of the samples. Buffers are rows of LANES numbers, one a sample.
+    The models stand in the order of the samples. Buffers are rows of LANES numbers, one per sample.
     """
     X, N, A, B = matrix(32, LANES), matrix(32, LANES), matrix(72, LANES), matrix(9, LANES)
     work, there = matrix(8, LANES), np.empty((1, LANES), np.bool_)

@@ -50,7 +50,7 @@ class Weighted(NamedTuple):
 
 @kernel
 def evaluate(F: F8x2, weighted: Weighted, derivatives: bool, products: F8x3, cost: F8x1) -> None:
-    """`SampsonObjective` of models (k, 9) -> products (k, 10, 10), if wanted; cost (k,)."""
+    """Robust weighted cost (k,) of models (k, 9) by Sampson distances; with derivatives also products (k, 10, 10)."""
     matches, loss, table = in_rows(weighted.points, weighted.weight, weighted.s2), weighted.loss, weighted.table
     sums, J, scaled, work = matrix(55, LANES), matrix(10, LANES), matrix(10, LANES), matrix(3, LANES)
     for k in range(len(F)):

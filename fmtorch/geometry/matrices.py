@@ -192,7 +192,7 @@ def complement_kernel(v: Array, p: Array, q: Array) -> None:
 
 @inner
 def nearest_rank2_kernel(F: Array) -> None:
-    """Makes F the nearest matrix of rank two, F - F v v^T, in place, as `rank2.rank2_components`."""
+    """Makes F the nearest matrix of rank two, F - F v v^T, in place, as `rank2_components`."""
     v = vector(3)
     last_right_singular_vector_kernel(F, v)
     for r in range(3):
@@ -203,7 +203,7 @@ def nearest_rank2_kernel(F: Array) -> None:
 
 @inner
 def last_right_singular_vector_kernel(F: Array, v: Array) -> None:
-    """The unit right singular vector of the smallest singular value -> v, as `rank2.last_right_singular_vector`."""
+    """The unit right singular vector of the smallest singular value -> v, as `last_right_singular_vector`."""
     G, C, K = vector(9), vector(9), vector(9)
     for i in range(9):
         G[i] = F[i]

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int, Real
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.core.estimate import CONFIGURATIONS
+from fmtorch.core.types import CONFIGURATIONS
 from fmtorch.geometry.arithmetic import logarithm, logarithm_kernel
 from fmtorch.geometry.epipolar import HOMOGRAPHY, SAMPSON
 from fmtorch.geometry.rotation import Cameras, fit_rotation

@@ -166,7 +166,7 @@ def steps(
 ) -> None:  # fmt: skip
     """Damped Gauss-Newton steps of models (k, 9), epipoles (k, 3) -> G (k, 9), g0, g1 (k, 3), again of rank 2.
 
-    products: (k, 10, 10), of `sampson_objective_kernels.evaluate`. damping: (k,).
+    products: (k, 10, 10), of `levenberg_marquardt.evaluate`. damping: (k,).
     """
     Q, C = np.zeros((20, LANES)), vector(9)
     for k in range(len(F)):

@@ -5,19 +5,19 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from fmtorch.io.match_store import ExportedImage, ExportedPair, Journal
+from fmtorch.io.match_store import MatchStore, StoredImage, StoredPair
 
 
 @dataclasses.dataclass(frozen=True)
-class CollectedJournal(Journal):
+class CollectedMatches(MatchStore):
     """Images and pairs by their paths, which are below `start` where they are relative; nothing is read or written."""
 
     start: Path = dataclasses.field(default_factory=Path.cwd)
-    images: dict[Path, ExportedImage] = dataclasses.field(default_factory=dict)
-    pairs: dict[tuple[Path, Path], ExportedPair] = dataclasses.field(default_factory=dict)
+    images: dict[Path, StoredImage] = dataclasses.field(default_factory=dict)
+    pairs: dict[tuple[Path, Path], StoredPair] = dataclasses.field(default_factory=dict)
 
     @classmethod
-    def of(cls, journal: Journal) -> CollectedJournal:
+    def of(cls, journal: MatchStore) -> CollectedMatches:
         """An empty one for the images of a journal."""
         return cls(journal.folder, journal.root.absolute())
 
@@ -33,23 +33,23 @@ class CollectedJournal(Journal):
         """Whether a pair has been added."""
         return (image0, image1) in self.pairs
 
-    def add_image(self, image: Path, value: ExportedImage) -> None:
+    def add_image(self, image: Path, value: StoredImage) -> None:
         """Add an image."""
         self.images[image] = value
 
-    def image(self, image: Path) -> ExportedImage:
+    def image(self, image: Path) -> StoredImage:
         """An image that was added."""
         return self.images[image]
 
-    def add_pair(self, image0: Path, image1: Path, value: ExportedPair) -> None:
+    def add_pair(self, image0: Path, image1: Path, value: StoredPair) -> None:
         """Add a pair."""
         self.pairs[image0, image1] = value
 
-    def pair(self, image0: Path, image1: Path) -> ExportedPair:
+    def pair(self, image0: Path, image1: Path) -> StoredPair:
         """A pair that was added."""
         return self.pairs[image0, image1]
 
-    def write(self, journal: Journal) -> None:
+    def write(self, journal: MatchStore) -> None:
         """Add all of it to a journal that does not have it; a pair after its images."""
         for image, value in self.images.items():
             if not journal.has_image(image):

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from fmtorch.core.files import replacing
 from fmtorch.data.lenses import MODELS, Lens
 from fmtorch.geometry.cameras import calibration_problems
-from fmtorch.io.match_store import ORIGIN, ExportedImage, ExportedPair, PairGeometry, two_view_geometry
+from fmtorch.io.match_store import ORIGIN, PairGeometry, StoredImage, StoredPair, two_view_geometry
 
 FOCAL_LENGTH = 1.2  # of the longer side, where it is unknown: COLMAP's own default
 
@@ -37,7 +37,7 @@ def imported() -> ModuleType:
 
 
 def write_database(
-    path: Path, images: Iterable[ExportedImage], pairs: Iterable[ExportedPair], shared_camera: bool = False
+    path: Path, images: Iterable[StoredImage], pairs: Iterable[StoredPair], shared_camera: bool = False
 ) -> None:
     """Write a database: keypoints, the matches given to the estimator, and the geometry of each pair with its inliers.
 
@@ -71,7 +71,7 @@ def write_database(
                 database.write_two_view_geometry(*ends, two_view_geometry(pycolmap, geometry))
 
 
-def _camera(pycolmap: Any, database: Any, cameras: dict[object, int], image: ExportedImage, shared: bool) -> int:
+def _camera(pycolmap: Any, database: Any, cameras: dict[object, int], image: StoredImage, shared: bool) -> int:
     """The image's camera, with a rig of its own."""
     model, parameters, prior = _parameters(image)
     key: object = image.name
@@ -88,7 +88,7 @@ def _camera(pycolmap: Any, database: Any, cameras: dict[object, int], image: Exp
     return cameras[key]
 
 
-def _parameters(image: ExportedImage) -> tuple[str, list[float], bool]:
+def _parameters(image: StoredImage) -> tuple[str, list[float], bool]:
     """The model of an image's camera, its parameters, and whether its focal length is known."""
     h, w = image.size
     if (lens := image.lens) is not None:
@@ -101,7 +101,7 @@ def _parameters(image: ExportedImage) -> tuple[str, list[float], bool]:
 
 
 def _geometry(
-    pair: ExportedPair, matches: NDArray[np.int32], known: dict[str, NDArray[np.float64] | None]
+    pair: StoredPair, matches: NDArray[np.int32], known: dict[str, NDArray[np.float64] | None]
 ) -> PairGeometry:
     """The geometry of a pair, whose inliers are among the matches (m, 2)."""
     written = set(map(tuple, matches.tolist()))
@@ -118,7 +118,7 @@ def _geometry(
     return PairGeometry("calibrated", inliers, pair.F, K1.T @ pair.F @ K0)
 
 
-def _one_to_one(pair: ExportedPair) -> NDArray[np.bool_]:
+def _one_to_one(pair: StoredPair) -> NDArray[np.bool_]:
     """Matches that share no keypoint with a better one: COLMAP's tracks allow one each; inliers come first."""
     keep = np.zeros(len(pair.matches), bool)
     taken0: set[int] = set()
@@ -253,7 +253,7 @@ class MatchDatabase:
         pairs = [self._pycolmap.pair_id_to_image_pair(pair_id) for pair_id in ids]
         return sorted(pairs, key=lambda pair: (pair[0] // BLOCK, pair[1] // BLOCK, pair))
 
-    def counts(self) -> dict[str, int]:
+    def identity(self) -> dict[str, Any]:
         """How many keypoints and matches there are, by which a database is known again."""
         return {"keypoints": self._database.num_keypoints(), "matches": self._database.num_matches()}
 
@@ -331,6 +331,16 @@ def expect_database(path: Path) -> None:
             f"{path} was written by a newer COLMAP (schema {version}; this pycolmap {imported().__version__} "
             f"reads up to {newest}); pip install --upgrade pycolmap"
         )
+
+
+def expect_writable(path: Path) -> None:
+    """Raises OSError where a database cannot be written to, or another process does: before the work, not after."""
+    try:
+        with contextlib.closing(sqlite3.connect(path)) as connection:
+            connection.execute("BEGIN IMMEDIATE")
+            connection.rollback()
+    except sqlite3.OperationalError as error:
+        raise OSError(f"{path} cannot be written: {error}") from error
 
 
 def copy_database(path: Path, copy: Path) -> None:

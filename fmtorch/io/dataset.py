@@ -9,7 +9,7 @@ from typing import Any
 
 from fmtorch.data.fmbench import FMBenchPairs
 from fmtorch.data.pairs import ImagePair, PairDataset
-from fmtorch.data.text_files import DataError
+from fmtorch.data.text_files import DataError, given_root
 from fmtorch.io import h5
 from fmtorch.io.predictions import hloc_pairs, predicted_pairs
 from fmtorch.io.relative_poses import oanet_pairs, posebench_pairs, tutorial_files, tutorial_pairs
@@ -42,8 +42,8 @@ class H5Pairs(PairDataset):
 
     def __init__(
         self,
-        root: str | Path,
-        layout: str,
+        root: str | Path | None = None,
+        layout: str = "hloc",
         truth: str | Path | None = None,
         images: str | Path | None = None,
         features: str | None = None,
@@ -52,7 +52,7 @@ class H5Pairs(PairDataset):
     ) -> None:
         if layout not in LAYOUTS:
             raise DataError(f"no layout {layout!r}; it must be one of {', '.join(LAYOUTS)}")
-        folder = Path(root).expanduser()
+        folder = given_root(root, "h5", "the file, or the folder of the files, that hold the matches")
         if not folder.exists():
             raise DataError(f"{folder}: no such file or folder")
         folder = folder.resolve()

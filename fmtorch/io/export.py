@@ -14,7 +14,7 @@ import numpy as np
 from fmtorch.core.files import replacing
 from fmtorch.io import colmap, h5
 from fmtorch.io.hloc import write_geometry
-from fmtorch.io.match_store import ExportedImage, ExportedPair, Journal
+from fmtorch.io.match_store import MatchStore, StoredImage, StoredPair
 from fmtorch.io.predictions import pair_key_of
 
 KINDS = ("h5", "colmap")
@@ -35,7 +35,7 @@ def export_kinds(value: str | Sequence[str] | None) -> tuple[str, ...]:
 
 
 def write_exports(
-    journal: Journal,
+    journal: MatchStore,
     pairs: Sequence[tuple[Path, Path]],
     kinds: Iterable[str],
     folder: Path,
@@ -61,7 +61,7 @@ def write_exports(
 
 
 def write_hloc(
-    folder: Path, images: Iterable[ExportedImage], journal: Journal, pairs: Iterable[tuple[Path, Path]]
+    folder: Path, images: Iterable[StoredImage], journal: MatchStore, pairs: Iterable[tuple[Path, Path]]
 ) -> None:
     """hloc's features and matches, float32 and int32.
 
@@ -87,7 +87,7 @@ def write_hloc(
                 write_geometry(group, pair.geometry)
 
 
-def _by_keypoint(pair: ExportedPair, count: int) -> Iterator[tuple[str, np.ndarray]]:
+def _by_keypoint(pair: StoredPair, count: int) -> Iterator[tuple[str, np.ndarray]]:
     """The matches by keypoint of the first image, which keeps the best of several."""
     order = np.argsort(pair.scores, kind="stable")  # the last one written wins
     i, j = pair.matches[order].T
@@ -141,7 +141,7 @@ class ViewGraph:
         return sorted(groups.values(), key=len, reverse=True)
 
 
-def view_graph(journal: Journal, images: Sequence[Path], pairs: Sequence[tuple[Path, Path]]) -> ViewGraph:
+def view_graph(journal: MatchStore, images: Sequence[Path], pairs: Sequence[tuple[Path, Path]]) -> ViewGraph:
     """The graph of what a journal has of these pairs, and of all these images."""
     edges = []
     for ends in pairs:

@@ -126,6 +126,14 @@ def text(file: Any, key: str) -> str:
     return value.decode() if isinstance(value, bytes) else str(value)
 
 
+def digest_of(*paths: Path) -> str:
+    """The hex digest of files, see `add_to_digest`."""
+    digest = hashlib.blake2b(digest_size=16)
+    for path in paths:
+        add_to_digest(digest, path)
+    return digest.hexdigest()
+
+
 def add_to_digest(digest: Any, path: Path) -> None:
     """Add a file's name, size and bytes; of a file beyond a gigabyte, blocks that are spread over it."""
     size = path.stat().st_size

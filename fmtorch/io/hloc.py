@@ -1,11 +1,9 @@
-"""hloc's files of features and matches: read pair by pair, and written again with the matches that were verified."""
+"""hloc's files of features and matches: read pair by pair, and written anew with the matches that were verified."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
-import shutil
-import uuid
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -25,13 +23,14 @@ Names = tuple[str, str]
 
 
 class HlocMatches:
-    """The pairs of two files. What is found of them is kept in a folder, a file a batch, until `finish`.
+    """The pairs of two files; output: the file of matches that is written.
 
     Raises DataError where one of the files is no HDF5 file, or holds no keypoints or no matches.
     """
 
-    def __init__(self, features: Path, matches: Path, parts: Path) -> None:
-        self._parts, self._open = parts, contextlib.ExitStack()
+    def __init__(self, features: Path, matches: Path, output: Path) -> None:
+        self._output, self._open = output, contextlib.ExitStack()
+        self.files = (features, matches)
         with contextlib.ExitStack() as stack:
             self._features, self._matches = (stack.enter_context(h5.opened(path)) for path in (features, matches))
             images = _below(self._features, "keypoints")
@@ -42,8 +41,6 @@ class HlocMatches:
             if not self._keys:
                 raise DataError(f"{matches} holds no matches0; give hloc's file of matches")
             self._open = stack.pop_all()
-        parts.mkdir(exist_ok=True)
-        self._done = {pair for part in sorted(parts.glob("*.h5")) for pair in self._pairs_of(part)}
         self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
 
     def __enter__(self) -> HlocMatches:
@@ -58,9 +55,13 @@ class HlocMatches:
         """The pairs of the file of matches, by the names of their images."""
         return sorted(self._keys)
 
+    def identity(self) -> dict[str, Any]:
+        """What the files hold."""
+        return {"files": h5.digest_of(*self.files)}
+
     def has_geometry(self, pair: Names) -> bool:
-        """Whether an interrupted run had a pair."""
-        return pair in self._done
+        """Whether a pair has a geometry: none has."""
+        return False
 
     def matches(self, pair: Names) -> NDArray[np.int64]:
         """The matches of a pair, keypoints (n, 2). Raises DataError where there are no such keypoints."""
@@ -74,9 +75,9 @@ class HlocMatches:
         return np.stack([first, second[first]], -1)
 
     def write(self, geometries: Iterable[tuple[Names, PairGeometry]]) -> None:
-        """Keep geometries of pairs: `matches0` of inliers alone, their scores, and the matrices as attributes."""
+        """Write the file: `matches0` of inliers alone, their scores, and the matrices as attributes."""
         h5py = h5.imported()
-        with replacing(self._parts / f"{uuid.uuid4().hex}.h5") as temporary, h5py.File(temporary, "w") as file:
+        with replacing(self._output) as temporary, h5py.File(temporary, "w") as file:
             for pair, geometry in geometries:
                 group = file.create_group(self._keys[pair])
                 second = np.full(len(self._second(pair)), NO_MATCH, np.int32)
@@ -91,25 +92,10 @@ class HlocMatches:
         """The name itself."""
         return image_id
 
-    def finish(self, output: Path) -> None:
-        """Write one file of all pairs and remove the folder."""
-        h5py = h5.imported()
-        with replacing(output) as temporary, h5py.File(temporary, "w") as file:
-            for part in sorted(self._parts.glob("*.h5")):
-                with h5.opened(part) as source:
-                    for key in _below(source, "matches0"):
-                        if key not in file:
-                            source.copy(source[key], file, name=key)
-        shutil.rmtree(self._parts)
-
     def _named(self, key: str) -> Names:
         """The names of a pair's images; of an image without features that in the key."""
         first, _, second = key.rpartition("/")
         return self._stored.get(first, first), self._stored.get(second, second)
-
-    def _pairs_of(self, part: Path) -> list[Names]:
-        with h5.opened(part) as file:
-            return [self._named(key) for key in _below(file, "matches0")]
 
     def _second(self, pair: Names) -> NDArray[np.int64]:
         values = h5.array(self._matches, f"{self._keys[pair]}/matches0", None)

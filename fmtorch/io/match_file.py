@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import shutil
-import uuid
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -28,8 +26,7 @@ SUFFIXES = (NPZ, *h5.SUFFIXES)
 MATRICES = ("F", "E", "H", "R", "t")
 MEMORY = 256  # images whose points are kept
 
-Side = tuple[str, int]  # pair, and 0 or 1 of its images
-Ids = tuple[Side, Side]
+Ids = tuple[str, str]  # keys of the points of both images, which end in x0 and x1
 
 
 class ArrayFile(Protocol):
@@ -43,8 +40,7 @@ class ArrayFile(Protocol):
 
 
 class MatchFile:
-    """The pairs of one file; each has matches of its own. Geometries are kept in a folder, a file a batch, until
-    `finish`.
+    """The pairs of one file; each has matches of its own. output: the file of geometries that is written.
 
     A file holds ``x0, x1`` (n, 2), pixels with (0, 0) at the centre of the first one, and perhaps ``K0, K1`` (3, 3) and
     ``size0, size1`` (h, w): of one pair, or of each pair below a name of its own (``a/x0``; in HDF5 a group).
@@ -52,8 +48,8 @@ class MatchFile:
     Raises DataError where the file is of another kind or holds no such pair.
     """
 
-    def __init__(self, path: Path, parts: Path) -> None:
-        self._path, self._parts, self._open = path, parts, contextlib.ExitStack()
+    def __init__(self, path: Path, output: Path) -> None:
+        self._path, self._output, self._open = path, output, contextlib.ExitStack()
         with contextlib.ExitStack() as stack:
             self._file = stack.enter_context(_arrays(path))
             self._keys = set(self._file.keys())
@@ -65,8 +61,6 @@ class MatchFile:
                     "or hloc's features=F.h5 as well"
                 )
             self._open = stack.pop_all()
-        parts.mkdir(exist_ok=True)
-        self._done = {pair for part in self._stored() for pair in _pairs_of(part)}
         self.image = functools.lru_cache(maxsize=MEMORY)(self._image)
 
     def __enter__(self) -> MatchFile:
@@ -79,11 +73,15 @@ class MatchFile:
 
     def pairs(self) -> list[Ids]:
         """Both images of each pair."""
-        return [((pair, 0), (pair, 1)) for pair in self._pairs]
+        return [(f"{pair}x0", f"{pair}x1") for pair in self._pairs]
+
+    def identity(self) -> dict[str, Any]:
+        """What the file holds."""
+        return {"files": h5.digest_of(self._path)}
 
     def has_geometry(self, pair: Ids) -> bool:
-        """Whether an interrupted run had a pair."""
-        return pair[0][0] in self._done
+        """Whether a pair has a geometry: none has."""
+        return False
 
     def matches(self, pair: Ids) -> NDArray[np.int64]:
         """Point i with point i. Raises DataError where x0 and x1 have different lengths."""
@@ -93,34 +91,27 @@ class MatchFile:
         return np.repeat(np.arange(counts[0])[:, None], 2, 1)
 
     def write(self, geometries: Iterable[tuple[Ids, PairGeometry]]) -> None:
-        """Keep geometries of pairs: which matches are inliers, configuration and matrices."""
-        entries: dict[str, NDArray[Any]] = {}
-        for ((pair, _), _), geometry in geometries:
-            inliers = np.zeros(len(self.image((pair, 0)).points), bool)
-            inliers[geometry.inliers[:, 0]] = True
-            entries |= {f"{pair}inliers": inliers, f"{pair}configuration": np.array(geometry.kind)}
-            values = ((name, getattr(geometry, name)) for name in MATRICES)
-            entries |= {f"{pair}{name}": value for name, value in values if value is not None}
-        with replacing(self._parts / f"{uuid.uuid4().hex}{NPZ}") as temporary:
-            _write_npz(temporary, [entries])
+        """Write the file: which matches are inliers, configuration and matrices."""
+        with replacing(self._output) as temporary:
+            entries = (self._entries(*pair) for pair in geometries)
+            (_write_npz if self._output.suffix == NPZ else _write_h5)(temporary, entries)
 
-    def name(self, image_id: Side) -> str:
+    def _entries(self, ids: Ids, geometry: PairGeometry) -> dict[str, NDArray[Any]]:
+        """What is written of a pair, by keys."""
+        pair = ids[0].removesuffix("x0")
+        inliers = np.zeros(len(self.image(ids[0]).points), bool)
+        inliers[geometry.inliers[:, 0]] = True
+        values = ((name, getattr(geometry, name)) for name in MATRICES)
+        matrices = {f"{pair}{name}": value for name, value in values if value is not None}
+        return {f"{pair}inliers": inliers, f"{pair}configuration": np.array(geometry.kind), **matrices}
+
+    def name(self, image_id: str) -> str:
         """The key of the points."""
-        return f"{image_id[0]}x{image_id[1]}"
+        return image_id
 
-    def finish(self, output: Path) -> None:
-        """Write one file of all pairs and remove the folder."""
-        with replacing(output) as temporary:
-            parts = (_read_npz(part) for part in self._stored())
-            (_write_npz if output.suffix == NPZ else _write_h5)(temporary, parts)
-        shutil.rmtree(self._parts)
-
-    def _stored(self) -> list[Path]:
-        return sorted(self._parts.glob(f"*{NPZ}"))
-
-    def _image(self, image_id: Side) -> DatabaseImage:
-        pair, i = image_id
-        points = self._numbers(f"{pair}x{i}", (None, 2)).astype(np.float32)
+    def _image(self, image_id: str) -> DatabaseImage:
+        pair, i = image_id[:-2], int(image_id[-1])
+        points = self._numbers(image_id, (None, 2)).astype(np.float32)
         K, size = (
             self._numbers(f"{pair}{key}", shape) if f"{pair}{key}" in self._keys else None
             for key, shape in ((f"K{i}", (3, 3)), (f"size{i}", (2,)))
@@ -133,7 +124,7 @@ class MatchFile:
                 raise DataError(f"size{i} is {size.tolist()}; it must be the height and width of the image")
             known = int(size[0]), int(size[1])
         deviation = np.inf if K is None else 0.0
-        return DatabaseImage(self.name(image_id), i, known, K, deviation, points, points)
+        return DatabaseImage(image_id, i, known, K, deviation, points, points)
 
     def _numbers(self, key: str, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
         values = self._file.read(key)
@@ -198,31 +189,21 @@ class _H5:
         return h5.array(self._file, key)
 
 
-def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
-    with np.load(path) as npz:
-        return dict(npz)
-
-
-def _pairs_of(part: Path) -> list[str]:
-    with np.load(part) as npz:
-        return [key.removesuffix("configuration") for key in npz.files if key.rpartition("/")[2] == "configuration"]
-
-
-def _write_npz(path: Path, batches: Iterable[Mapping[str, NDArray[Any]]]) -> None:
-    """As `numpy.savez` writes it, with one batch in memory."""
+def _write_npz(path: Path, pairs: Iterable[Mapping[str, NDArray[Any]]]) -> None:
+    """As `numpy.savez` writes it, with one pair in memory."""
     with zipfile.ZipFile(path, "w") as archive:
-        for batch in batches:
-            for key, value in batch.items():
+        for entries in pairs:
+            for key, value in entries.items():
                 with archive.open(f"{key}.npy", "w", force_zip64=True) as file:
                     np.lib.format.write_array(file, np.asarray(value), allow_pickle=False)
 
 
-def _write_h5(path: Path, batches: Iterable[Mapping[str, NDArray[Any]]]) -> None:
+def _write_h5(path: Path, pairs: Iterable[Mapping[str, NDArray[Any]]]) -> None:
     """`inliers` as a data set of each pair's group, the others as its attributes."""
     h5py = h5.imported()
     with h5py.File(path, "w") as file:
-        for batch in batches:
-            for key, value in batch.items():
+        for entries in pairs:
+            for key, value in entries.items():
                 pair, _, name = key.rpartition("/")
                 group = file.require_group(pair or "/")
                 if name == "inliers":

@@ -71,7 +71,7 @@ _GEOMETRY = ("F", "E", "H", "R", "t")  # matrices of a geometry, of those that t
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class ExportedImage:
+class StoredImage:
     """An image: points (n, 2) in pixels, (0, 0) at the first pixel's centre; scores (n,); size (h, w).
 
     K: of an image without distortion; lens: of one with it; focal: of EXIF, px; of all three one at most.
@@ -87,7 +87,7 @@ class ExportedImage:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class ExportedPair:
+class StoredPair:
     """The matches given to the estimator, (m, 2) indices of points; scores (m,) in [0, 1]; inliers (m,) of F (3, 3).
 
     F is zero where there is none. related: whether its support is beyond chance. significance: how far, -inf without F
@@ -108,7 +108,7 @@ class ExportedPair:
 
 
 @dataclasses.dataclass(frozen=True)
-class Journal:
+class MatchStore:
     """The folder of what was computed; names of images are paths below `root`. Any number of processes may add."""
 
     folder: Path
@@ -124,7 +124,7 @@ class Journal:
     def has_pair(self, image0: Path, image1: Path) -> bool:
         return self._pair(image0, image1).exists()
 
-    def add_image(self, image: Path, value: ExportedImage) -> None:
+    def add_image(self, image: Path, value: StoredImage) -> None:
         arrays: dict[str, NDArray[Any]] = {"points": value.points, "scores": value.scores, "size": np.array(value.size)}
         if value.K is not None:
             arrays["K"] = value.K
@@ -135,7 +135,7 @@ class Journal:
             arrays["lens"] = np.array([lens.fx, lens.fy, lens.cx, lens.cy, *lens.coefficients])
         _write(self._image(image), arrays)
 
-    def add_pair(self, image0: Path, image1: Path, value: ExportedPair) -> None:
+    def add_pair(self, image0: Path, image1: Path, value: StoredPair) -> None:
         arrays: dict[str, NDArray[Any]] = {name: np.asarray(getattr(value, name)) for name in _PAIR}
         if (geometry := value.geometry) is not None:
             arrays |= {"kind": np.array(geometry.kind), "geometry_inliers": np.asarray(geometry.inliers)}
@@ -143,7 +143,7 @@ class Journal:
             arrays |= {name: matrix for name, matrix in matrices.items() if matrix is not None}
         _write(self._pair(image0, image1), arrays)
 
-    def image(self, image: Path) -> ExportedImage:
+    def image(self, image: Path) -> StoredImage:
         with np.load(self._image(image)) as stored:
             h, w = stored["size"].tolist()
             K, lens, focal = stored.get("K"), None, stored.get("focal")
@@ -151,9 +151,9 @@ class Journal:
                 fx, fy, cx, cy, *coefficients = stored["lens"].tolist()
                 lens = Lens(fx, fy, cx, cy, str(stored["lens_model"]), tuple(coefficients))
             points, scores, given = stored["points"], stored["scores"], None if focal is None else float(focal)
-            return ExportedImage(self.name(image), points, scores, (h, w), K, lens, given)
+            return StoredImage(self.name(image), points, scores, (h, w), K, lens, given)
 
-    def pair(self, image0: Path, image1: Path) -> ExportedPair:
+    def pair(self, image0: Path, image1: Path) -> StoredPair:
         with np.load(self._pair(image0, image1)) as stored:
             values = {name: stored[name] for name in _PAIR}
             geometry = None
@@ -161,7 +161,7 @@ class Journal:
                 matrices = [stored.get(f"geometry_{name}") for name in _GEOMETRY]
                 geometry = PairGeometry(cast(Kind, str(stored["kind"])), stored["geometry_inliers"], *matrices)
         values |= {name: values[name].item() for name in ("related", "significance", "configuration")}
-        return ExportedPair(self.name(image0), self.name(image1), geometry=geometry, **values)
+        return StoredPair(self.name(image0), self.name(image1), geometry=geometry, **values)
 
     def _image(self, image: Path) -> Path:
         return self.folder / "images" / f"{self._digest(image)}.npz"

@@ -1,4 +1,8 @@
-"""What a compiled function was made of, as one digest: equal versions are equal machine code on the same machine.
+"""The folder of compiled kernels: one file each, in a folder for this version of numba and this processor.
+
+numba's own cache does not notice when a function that a kernel calls is edited in another module, and cannot be read
+where it cannot be written. Here the names of folder and file hold digests of all that decides the machine code, so that
+a file is never stale, and it is written in one step, so that several processes may share it.
 
 A version is taken from live functions, not from files: bytecode, constants, defaults, and every value that the bytecode
 takes from its module or its closure. An inner function among them is compiled into the one that calls it, so its own
@@ -173,9 +177,6 @@ def _name(value: Any) -> str:
     return f"{getattr(value, '__module__', None) or ''}.{name}"
 
 
-# The folder of compiled kernels: one file each, in a folder for this version of numba and this processor
-
-
 HERE = Path(__file__).resolve().parent
 ABOUT = "about.json"  # in each folder; its time of change is when the folder was last used
 UNUSED_DAYS = 30  # after which a folder is removed
@@ -256,14 +257,8 @@ class KernelFile:
         self.calls: list[Any] = []
         self._lock: Any = None  # held while this process compiles; it ends with the process, however that ends
 
-    @property
-    def cache_path(self) -> str | None:
-        """The folder, for numba's statistics."""
-        return None if self.path is None else str(self.path.parent)
-
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """The compiled function of the file; None where there is none, with a warning if it is damaged."""
-        target_context.refresh()
         if (loaded := self._loaded(signature, target_context)) is not None:
             return loaded
         if self._acquire() and (loaded := self._loaded(signature, target_context)) is not None:
@@ -284,6 +279,7 @@ class KernelFile:
                     with contextlib.suppress(OSError):  # a folder that can be read, but not written
                         os.utime(self.path)  # so that files in use are not the oldest
                     self.calls = linking.called(data)
+                    _open_runtime(target_context, data)
                     return _of(signature, CompileResult._rebuild(target_context, *pickle.loads(data)))
                 warnings.warn(f"{self.path} is damaged; it is compiled anew", stacklevel=2)
                 with contextlib.suppress(OSError):
@@ -299,7 +295,7 @@ class KernelFile:
         from numba.core.serialize import dumps
 
         try:
-            data = dumps(result._reduce())
+            data = dumps(_alone(result))
             self.calls = linking.called(data)
             if self.path is not None and not result._asdict()["library"].has_dynamic_globals:
                 _write(self.path, _signature(data) + data)
@@ -328,10 +324,28 @@ class KernelFile:
                 Path(self._lock.lock_file).unlink()
             self._lock = None
 
-    def flush(self) -> None:
-        """Remove the file."""
-        if self.path is not None:
-            self.path.unlink(missing_ok=True)
+
+def _open_runtime(target_context: Any, machine_code: bytes) -> None:
+    """Let machine code find what it needs of numba; all that compiling needs would take a third of a second more."""
+    from numba.core.runtime import rtsys
+
+    if b"_numba_hashsecret" in machine_code:  # of dictionaries and sets, the one name that the rest of numba adds
+        target_context.refresh()
+    rtsys.initialize(target_context)
+
+
+def _alone(result: Any) -> Any:
+    """What numba keeps of a compiled function, without code for others to link, and constants of functions without any.
+
+    A kernel is called by its address alone.
+    """
+    from llvmlite import binding
+
+    (library, kind, (code, _)), *rest, environments = result._reduce()
+    names = (result.fndesc.llvm_func_name, result.fndesc.llvm_cpython_wrapper_name)
+    defined = binding.parse_assembly("".join(f'define void @"{name}"() {{ ret void }}\n' for name in names))
+    used = tuple(environment for environment in environments if environment.consts)
+    return (library, kind, (code, defined.as_bitcode())), *rest, used
 
 
 def _write(path: Path, data: bytes) -> None:

@@ -1,4 +1,15 @@
-"""Types of a kernel's arguments, by which it is compiled: ``F8x2`` is an array of float64 with two axes in C order."""
+"""Functions that numba compiles for this machine when they are first called, kept in a cache folder of their own.
+
+A kernel loops over NumPy arrays where a tensor form would take many small operations::
+
+    @kernel
+    def row_sums(x: F4x2, scale: float, out: F4x1) -> None: ...
+
+It is compiled for the types of its annotations: ``F4x2`` is an array of float32 with two axes in C order. Kernels stand
+beside the class that calls them; what they are made of versions the file that keeps them (`fmtorch.jit.cache`). Nothing
+is imported from numba before the first call. With ``FMTORCH_KERNELS=off`` estimators run their kernels interpreted by
+Python, all else takes its tensor form.
+"""
 
 from __future__ import annotations
 
@@ -48,17 +59,15 @@ U1x1: TypeAlias = Annotated[NDArray[np.uint8], "u1[::1]"]
 B1x1: TypeAlias = Annotated[NDArray[np.bool_], "b1[::1]"]
 B1x2: TypeAlias = Annotated[NDArray[np.bool_], "b1[:, ::1]"]
 
-
-# The signature of a kernel, from its annotations: arrays of `arrays`, int, float, bool, and groups of these
-
-
 NUMBERS = {int: "int64", float: "float64", bool: "boolean", np.float32: "float32"}  # numba's names
 
 
 def signature_of(function: Callable[..., Any]) -> tuple[Any, ...]:
-    """The types of a function's arguments, as numba compiles for them.
+    """The types of a function's arguments, as numba compiles for them, from its annotations.
 
-    A group is a NamedTuple of such types. Raises TypeError, naming the argument, for a type that is none of these.
+    They are array types of this file, numbers, bool, and groups: NamedTuples of such types.
+
+    Raises TypeError, naming the argument, for a type that is none of these.
     """
     hints = get_type_hints(function, include_extras=True)
     names = function.__code__.co_varnames[: function.__code__.co_argcount]
@@ -88,10 +97,9 @@ def _type(hint: Any, what: str) -> Any:
         fields = get_type_hints(hint, include_extras=True)
         members = [_type(fields[name], f"{what}.{name}") for name in hint._fields]
         return types.BaseTuple.from_types(members, hint)  # where all are alike, a type of its own
-    raise TypeError(f"{what} is annotated {hint}; it must be a type of `compiling.arrays`, a number or a NamedTuple")
-
-
-# `FMTORCH_KERNELS=off`: estimators run their kernels interpreted by Python, all else takes its tensor form
+    raise TypeError(
+        f"{what} is annotated {hint}; it must be an array type of `fmtorch.jit.kernel`, a number or a NamedTuple"
+    )
 
 
 SWITCH = "FMTORCH_KERNELS"
@@ -130,15 +138,15 @@ def identity() -> str:
     return f"numba {numba_version()}" if available() else "off"
 
 
-# What is said while kernels are compiled: one line, however many there are
-
-
 _CLEAR = "\r\x1b[K"
 _state = {"announced": False}
 
 
 def begun(name: str, where: str, count: str = "") -> None:
-    """Say that a kernel is compiled, on the error stream. where: it is kept. count: which one of how many it is."""
+    """Say that a kernel is compiled, on the error stream: a terminal shows which one, a log gets the first line alone.
+
+    where: it is kept. count: which one of how many it is.
+    """
     if sys.stderr.isatty():
         print(f"{_CLEAR}{count}compiling {name} {where}", end="", file=sys.stderr, flush=True)
     elif not _state["announced"]:
@@ -150,9 +158,6 @@ def ended() -> None:
     """Take the line back from a terminal."""
     if sys.stderr.isatty():
         print(_CLEAR, end="", file=sys.stderr, flush=True)
-
-
-# Functions that numba compiles for this machine when they are first called, kept in a cache folder of their own
 
 
 P = ParamSpec("P")
@@ -176,9 +181,7 @@ class Kernel(Generic[P, R]):
     __call__: Callable[P, R]
 
     def __init__(self, function: Callable[P, R], holds_gil: bool = False, always_compiled: bool = False) -> None:
-        self.function: Callable[P, R] = inspect.unwrap(
-            function
-        )  # without the checks that tests wrap around every function
+        self.function: Callable[P, R] = inspect.unwrap(function)  # without the checks that tests wrap around functions
         functools.update_wrapper(self, self.function)
         self.holds_gil, self.always_compiled = holds_gil, always_compiled
         self._compiled: Callable[P, R] | None = None
@@ -270,14 +273,14 @@ class Inner(Generic[P, R]):
         import numba
 
         how: dict[str, Any] = {"inline": "always"} if self.inline else {}
-        if (compiler := inner_compiler()) is not None:
-            how["pipeline_class"] = compiler
         function = named_by_version(self.function, version(self.function))
-        return numba.njit(**OPTIONS, no_cpython_wrapper=True, **how)(function)
+        return numba.njit(**OPTIONS, no_cpython_wrapper=True, pipeline_class=inner_compiler(), **how)(function)
 
     @property
     def _numba_type_(self) -> Any:
-        return _type_of(self._dispatcher)
+        import numba
+
+        return numba.types.Dispatcher(self._dispatcher)
 
     def described(self) -> tuple[str, Callable[..., Any] | None]:
         """How it is compiled, and its function, which is compiled into those that call it."""
@@ -363,18 +366,9 @@ def _no_garbage_collection() -> Iterator[None]:
             gc.enable()
 
 
-def _type_of(dispatcher: Any) -> Any:
-    import numba
-
-    return numba.types.Dispatcher(dispatcher)
-
-
-# Scratch arrays of kernels: numba compiles `np.empty` anew for each literal shape, an inner function but once
-
-
 @inner
 def vector(n: int) -> Array:
-    """(n,) float64, not initialised."""
+    """(n,) float64, not initialised: numba compiles `np.empty` anew for each literal shape, this but once."""
     return np.empty(n)
 
 

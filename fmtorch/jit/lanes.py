@@ -36,14 +36,14 @@ class Value(np.ndarray):
 
 
 class LaneFunction(Inner[..., Any]):
-    """A function of lanes: in Python that of arrays, in kernels the intrinsic of this name in `lane_functions`."""
+    """A function of lanes: in Python that of arrays, in kernels the intrinsic of this name in `lane_instructions`."""
 
     def __init__(self, function: Callable[..., Any], *parameters: int) -> None:
         super().__init__(function, inline=False)
         self.parameters = parameters
 
     def described(self) -> tuple[str, None]:
-        """Its name and parameters: the files of lanes count into the version of every kernel."""
+        """Its name and parameters: this folder counts into the version of every kernel."""
         return f"lanes {self.function.__name__}{self.parameters}", None
 
     @functools.cached_property
@@ -121,14 +121,11 @@ def added(value: Any) -> Any:
     return value[0]
 
 
-# A product and a sum rounded once, in kernels and in Python
-
-
 class _Fused(Inner[[Any, Any, Any], Any]):
     """`fused`, compiled into one instruction where the processor has it."""
 
     def described(self) -> tuple[str, None]:
-        """Its name: this file counts into the version of every kernel."""
+        """Its name: this folder counts into the version of every kernel."""
         return "fused", None
 
     @functools.cached_property

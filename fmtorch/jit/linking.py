@@ -118,19 +118,16 @@ def returned(function: Callable[..., Any]) -> str:
     return annotation if isinstance(annotation, str) else getattr(annotation, "__name__", str(annotation))
 
 
-# Libraries of inner functions, which are linked into kernels: neither optimised nor made machine code on their own
-
-
 @functools.cache
 def inner_compiler() -> Any:
-    """The compiler of inner functions, for numba's `pipeline_class`; None where numba's own names have changed."""
-    try:
-        from numba.core.codegen import JITCodeLibrary
-        from numba.core.compiler import Compiler
-    except ImportError:
-        return None
-    if not all(hasattr(JITCodeLibrary, name) for name in ("_optimize_final_module", "_finalize_final_module")):
-        return None
+    """The compiler of inner functions, for numba's `pipeline_class`: neither optimised nor machine code on their own.
+
+    numba compiles each function that another calls as if it were called from Python, too. A kernel is optimised as a
+    whole after all of its inner functions have been linked in, so that this would be half of compiling's time for
+    nothing. The names used here are numba's own.
+    """
+    from numba.core.codegen import JITCodeLibrary
+    from numba.core.compiler import Compiler
 
     class Codegen:
         """The code generator of a library whose functions have no environment in memory."""

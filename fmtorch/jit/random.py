@@ -1,4 +1,8 @@
-"""What random numbers are for, and the seed of each purpose: without tensors."""
+"""Random numbers as a stateless function of (seed, pair key, stream, draw): the same in any batch, on any device.
+
+Tensors have `bits` and `uniform`, kernels `random_bits` and `uniform_kernel`: the same integer arithmetic, hence the
+same numbers.
+"""
 
 from __future__ import annotations
 
@@ -43,9 +47,6 @@ def mixed_seed(seed: int, stream: Stream) -> int:
     return wrap(x ^ (x >> 31))
 
 
-# Random numbers as a stateless function of (seed, pair key, stream, draw): the same in any batch and on any device
-
-
 _GAMMA, _MIX1, _MIX2 = (wrap(c) for c in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
 
 
@@ -76,9 +77,6 @@ def uniform(
 ) -> Float[Tensor, "b count columns"]:
     """Random numbers in [0, 1), float64, with 53 random bits; arguments as `bits`."""
     return _shift_right(bits(seed, key, stream, start, count, columns), 10).to(torch.float64) * 2.0**-53
-
-
-# `random`, compiled: the same integer arithmetic, hence the same numbers
 
 
 Word = Any  # np.uint64

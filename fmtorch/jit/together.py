@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from fmtorch.jit import cache, linking
-from fmtorch.jit import kernel as switch
-from fmtorch.jit.kernel import Kernel
+from fmtorch.jit.kernel import Kernel, off
 from fmtorch.jobs.execution import cores
 
 HOME = Path(__file__).resolve().parents[2]
@@ -30,7 +29,7 @@ def compile_together(kernels: Sequence[Kernel[..., Any]]) -> None:
     An inner function is compiled in each process that needs it: kernels that share many should stand side by side, the
     slowest at both ends. Raises ImportError where numba cannot be imported.
     """
-    if switch.off() or all(each.ready for each in kernels):
+    if off() or all(each.ready for each in kernels):
         return
     with _lock:
         absent = [each for each in kernels if not (each.ready or each.kept)]

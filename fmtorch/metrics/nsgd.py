@@ -54,7 +54,7 @@ class Comparison(NamedTuple):
 
 @kernel
 def accepted_draws(pair: Comparison, key: int, mixed_seed: int, samples: int, out: F8x1) -> None:
-    """`draws.sum_of_draws` of a pair: the sum of its accepted draws, and their number -> out (2,).
+    """`sum_of_draws` of a pair: the sum of its accepted draws, and their number -> out (2,).
 
     mixed_seed: of the seed and the stream. samples: how many draws to accept.
     """
@@ -130,7 +130,7 @@ def _half_draw_kernel(F: Array, other: Array, size0: Array, size1: Array, u: Arr
 def _segment_in_image(
     a: float, b: float, c: float, size: Array, border: float
 ) -> tuple[float, float, float, float, bool]:
-    """`draws.segment_in_image` of a line: x and y of its end points, and whether there are any."""
+    """`segment_in_image` of a line: x and y of its end points, and whether there are any."""
     half_h, half_w = size[0] / 2, size[1] / 2
     centre_x, centre_y = half_w + border, half_h + border
     squared = a * a + b * b

@@ -10,7 +10,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 
 from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.presets.composition import compose, plain
+from fmtorch.presets.composition import PIPELINES, compose, plain
 from fmtorch.presets.files import available, unknown
 from fmtorch.presets.objects import instantiate, open_files
 from fmtorch.presets.pruners import build_pruners
@@ -65,7 +65,7 @@ def load_pipeline(
         raise ValueError(unknown("pipeline", name, config_dir))
     words = (f"pipeline={name}", "cache=off", *overrides)
     try:
-        config = compose("match", words, None if config_dir is None else Path(config_dir))
+        config = compose(PIPELINES, words, None if config_dir is None else Path(config_dir))
     except HydraException as error:
         raise ValueError(f"pipeline={name} with {', '.join(overrides)}: {error}") from error
     return build_pipeline(config, device)

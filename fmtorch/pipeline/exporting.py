@@ -14,7 +14,7 @@ from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.geometry.cameras import cross_matrix
 from fmtorch.geometry.pose import pose_from_fundamental
-from fmtorch.io.match_store import ExportedImage, ExportedPair, Journal, PairGeometry, indices
+from fmtorch.io.match_store import MatchStore, PairGeometry, StoredImage, StoredPair, indices
 from fmtorch.pipeline.photograph_cameras import PhotographCamera
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.pipeline.two_images import Described, MatchResult, pair_geometries
@@ -23,7 +23,7 @@ from fmtorch.two_view.pair_type import Configuration
 EXACT = (1.0, 0.0)  # px, relative deviation; K stands for the pixels
 
 
-def keep_outcomes(journal: Journal, pipeline: Pipeline, outcomes: Sequence[Outcome]) -> None:
+def keep_outcomes(journal: MatchStore, pipeline: Pipeline, outcomes: Sequence[Outcome]) -> None:
     """Add the outcomes' images and pairs to a journal; pairs that cannot be used, and what it has, are left out."""
     for outcome in outcomes:
         pair, c, estimate = outcome.pair, outcome.correspondences, outcome.estimate
@@ -68,17 +68,17 @@ def exportable(pair: ImagePair) -> bool:
     return pair.problem is None and pair.matches is None and not resampled
 
 
-def exported_image(name: str, described: Described, camera: PhotographCamera | None = None) -> ExportedImage:
+def exported_image(name: str, described: Described, camera: PhotographCamera | None = None) -> StoredImage:
     """A photograph's keypoints, with what is known of its camera, as a journal keeps them."""
     scores = described.features.scores.detach().cpu().float().numpy()
     lens = None if camera is None else camera.lens
     focal = None if camera is None or camera.focal is None else camera.focal[0]
     bends = lens is not None and lens.bends
     K = None if lens is None or bends else lens.K
-    return ExportedImage(name, _points(described), scores, described.size, K, lens if bends else None, focal)
+    return StoredImage(name, _points(described), scores, described.size, K, lens if bends else None, focal)
 
 
-def exported_match(names: tuple[str, str], described: tuple[Described, Described], result: MatchResult) -> ExportedPair:
+def exported_match(names: tuple[str, str], described: tuple[Described, Described], result: MatchResult) -> StoredPair:
     """What was found of two photographs, as a journal keeps it."""
     points = _points(described[0]), _points(described[1])
     keypoints = result.putative.derived(mask=result.kept[None]).compact()
@@ -94,19 +94,19 @@ def _points(described: Described) -> NDArray[np.float32]:
     return described.points.detach().cpu().float().numpy()
 
 
-def _keep_image(journal: Journal, pipeline: Pipeline, image: ImageSource, K: NDArray[np.float64] | None) -> None:
+def _keep_image(journal: MatchStore, pipeline: Pipeline, image: ImageSource, K: NDArray[np.float64] | None) -> None:
     if journal.has_image(image.path):
         return
     features, _ = pipeline.features(image)
     h, w = (int(n) for n in features.image_size)
     points, scores = (value.detach().cpu().float().numpy() for value in (features.keypoints, features.scores))
-    journal.add_image(image.path, ExportedImage(journal.name(image.path), points, scores, (h, w), K))
+    journal.add_image(image.path, StoredImage(journal.name(image.path), points, scores, (h, w), K))
 
 
 def _pair(
     names: tuple[str, str], points: tuple[NDArray[np.float32], NDArray[np.float32]],
     c: Correspondences, F: Tensor, inliers: Tensor, related: bool,
-) -> ExportedPair:  # fmt: skip
+) -> StoredPair:  # fmt: skip
     """The surviving matches of one pair, as the matcher left them, as indices of the images' points.
 
     Scores are one less the matcher's figure, a ratio, and 1 where there is none. Raises ValueError for matches that are
@@ -119,7 +119,7 @@ def _pair(
     ]
     quality = torch.zeros(len(mask)) if c.quality is None else c.quality[0].detach().cpu().float()
     scores = (1 - quality[mask]).nan_to_num(0.0).clamp(0.0, 1.0)
-    return ExportedPair(
+    return StoredPair(
         *names, np.stack(index, -1).astype(np.int32), scores.numpy(), inliers.cpu()[mask].numpy(),
         F.detach().cpu().double().numpy(), related,
     )  # fmt: skip

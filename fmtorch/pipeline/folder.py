@@ -1,4 +1,4 @@
-"""The images of a folder, and the pairs of them that are asked for."""
+"""A folder of images: its pairs, the work on them by any workers, which can be resumed, and where results go."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fmtorch.core.files import replacing
+from fmtorch.core.settings import claim
 from fmtorch.data.images import read_image
 from fmtorch.data.pairs import ImageSource
 from fmtorch.data.text_files import DataError
-from fmtorch.io.match_store import ExportedPair, Journal
+from fmtorch.io.match_store import MatchStore, StoredPair
 from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.pool import SHARED_BY, WorkerPool
 from fmtorch.jobs.runner import Factory, Local, Source, TaskRunner, in_order
@@ -31,13 +31,12 @@ from fmtorch.pipeline.exporting import exported_image, exported_match
 from fmtorch.pipeline.photograph_cameras import PhotographCameras
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.pipeline.two_images import Described, describe, relate
-from fmtorch.runs.run_folder import canonical
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 EXHAUSTIVE, SEQUENTIAL, SIMILAR = "exhaustive", "sequential", "similar"
 CHOICES = f"{EXHAUSTIVE}, {SEQUENTIAL}:N, {SIMILAR}:N"
-# Pictures that fmtorch draws, by the file beside which it does; a set of pairs holds copies of photographs.
-_DRAWN = {"result.json": ("matches.png", "pruning.png", "epipolar.png"), "run.json": ("recall.png",)}
+# Pictures that fmtorch draws beside a result.json; a set of pairs holds copies of photographs.
+_DRAWN = ("matches.png", "pruning.png", "epipolar.png")
 _SET_OF_PAIRS = "pairs.json"
 
 Pair = tuple[Path, Path]
@@ -62,7 +61,7 @@ def _images(folder: Path) -> Iterator[Path]:
         folders[:] = [
             name for name in folders if not (name.startswith(".") or (inside / name / _SET_OF_PAIRS).is_file())
         ]
-        drawn = {name for file, names in _DRAWN.items() if file in files for name in names}
+        drawn = _DRAWN if "result.json" in files else ()
         for name in files:
             path = inside / name
             if path.suffix.lower() in SUFFIXES and name not in drawn and path.is_file():
@@ -131,9 +130,6 @@ def in_blocks(pairs: Sequence[Pair], block: int) -> list[Pair]:
     return sorted(pairs, key=lambda pair: (number[pair[0]] // block, number[pair[1]], number[pair[0]]))
 
 
-# Where the matches of a folder go, and whose they are
-
-
 RECORD = "export.json"
 
 
@@ -153,27 +149,8 @@ def open_folder(output: Path, identity: Mapping[str, Any]) -> Path:
 
     Raises ValueError where the output holds results of another identity.
     """
-    output.mkdir(parents=True, exist_ok=True)
-    file = output / RECORD
-    wanted = json.loads(canonical(identity))
-    if file.exists():
-        try:
-            stored = json.loads(file.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise ValueError(f"{file} is not valid JSON ({error}); delete {output} and run again") from error
-        if stored != wanted:
-            differing = [key for key in {**stored, **wanted} if stored.get(key) != wanted.get(key)]
-            raise ValueError(
-                f"{output} holds matches of other settings ({', '.join(sorted(differing))} differ); "
-                "choose another output, or delete the folder"
-            )
-    else:
-        with replacing(file) as temporary:
-            temporary.write_text(json.dumps(wanted, indent=2) + "\n", encoding="utf-8")
+    claim(output / RECORD, identity, "matches", "choose another output, or delete the folder", alone=False)
     return output / "export"
-
-
-# Which images are worth matching: those whose VLAD vectors are most alike
 
 
 ROWS = 1024  # of the matrix of similarities that exist at a time
@@ -205,9 +182,6 @@ def similar_pairs(images: Sequence[Path], vectors: Float[Tensor, "n d"], count: 
     return [(images[i], images[j]) for i, j in sorted(selected)]
 
 
-# A folder of images: the work on its images and pairs, by any workers, that can be resumed
-
-
 MEMORY = 64  # images whose features are kept for pairs to come
 AHEAD = 4  # pairs a worker whose images are described before the first of them is matched
 MAX_WORKERS = 8  # by default: each holds an image and its scale space
@@ -233,7 +207,7 @@ class DescribedPair(NamedTuple):
     known: Mapping[str, Any]
 
 
-def described_or_matched(pipeline: Pipeline, task: Photograph | DescribedPair) -> Described | ExportedPair | str:
+def described_or_matched(pipeline: Pipeline, task: Photograph | DescribedPair) -> Described | StoredPair | str:
     """What a worker does, by one thread: an image's features, what a journal keeps of a pair, or what went wrong."""
     try:
         with one_thread(pipeline.device):
@@ -271,7 +245,7 @@ class FolderMatches:
     """
 
     def __init__(
-        self, pipeline: Pipeline, journal: Journal, longest_side: int, orient: bool, seed: int, *,
+        self, pipeline: Pipeline, journal: MatchStore, longest_side: int, orient: bool, seed: int, *,
         workers: WorkerPool | None = None, build: Callable[[], Pipeline] | None = None,
         cameras: PhotographCameras | None = None,
     ) -> None:  # fmt: skip

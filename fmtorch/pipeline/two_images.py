@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fmtorch import presets
-from fmtorch.core.arguments import Arrays
 from fmtorch.core.grey_pyramid import GreyPyramid, grey_pyramid
 from fmtorch.core.no_features import NoFeatures
 from fmtorch.core.stages import ImageMatcher, PairImages, pruned
@@ -41,7 +40,7 @@ from fmtorch.pipeline.reduced_images import (
     to_original,
     undistorted_matches,
 )
-from fmtorch.two_view.arguments import Focal, camera_fields
+from fmtorch.two_view.arguments import Arrays, Focal, camera_fields
 from fmtorch.two_view.known_cameras import KnownCameras
 from fmtorch.two_view.pair_type import FOCAL_DEVIATION, Configuration, classify, compile_with, still_warning
 

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 from fmtorch.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
+    from fmtorch.core.files import STAGES
     from fmtorch.presets.composition import (
-        STAGES,
         composed,
-        expect_dataset,
         expect_stages,
         pipeline_stages,
         plain,
@@ -23,14 +22,21 @@ if TYPE_CHECKING:
         known_targets,
         load,
         targets_of,
-        top_level_names,
     )
-    from fmtorch.presets.objects import build, expect_buildable, instantiate, own_modules, peer_packages, resolve_device
+    from fmtorch.presets.objects import (
+        build,
+        expect_buildable,
+        instantiate,
+        own_modules,
+        peer_packages,
+        resolve_device,
+        target_of,
+    )
 
 __all__ = [
-    "STAGES", "available", "build", "closest", "composed", "expect_buildable", "expect_dataset",
-    "expect_stages", "instantiate", "known_targets", "load", "own_modules", "peer_packages",
-    "pipeline_stages", "plain", "resolve_device", "stages", "targets_of", "top_level_names",
+    "STAGES", "available", "build", "closest", "composed", "expect_buildable", "expect_stages", "instantiate",
+    "known_targets", "load", "own_modules", "peer_packages", "pipeline_stages", "plain", "resolve_device", "stages",
+    "target_of", "targets_of",
 ]  # fmt: skip
 
 lazy_exports(__name__)

@@ -9,19 +9,21 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
-from fmtorch import data
-from fmtorch.core.files import conf_dir
+from fmtorch.core.files import STAGES, conf_dir
 from fmtorch.presets import hydra_source
 from fmtorch.presets.files import available
 from fmtorch.presets.objects import expect_buildable
 from fmtorch.presets.pruners import expect_pruners, pruner_configs, with_explicit
 
-STAGES = ("features", "matcher", "pruner", "estimator")  # groups that a pipeline chooses from
 _composing = threading.Lock()  # Hydra composes through a global
 hydra_source.register()
+PIPELINES = "pipelines"  # the config that a pipeline alone is composed from
+_DEFAULTS = [*({group: name} for group, name in STAGES.items()), {"pipeline": "sift_ratio"}, "_self_"]
+ConfigStore.instance().store(PIPELINES, {"defaults": _DEFAULTS, "cache": None, "cache_limit": 20})
 
 
 def stages(config: DictConfig) -> dict[str, Any]:
@@ -44,7 +46,7 @@ def plain(config: Any) -> dict[str, Any]:
 @functools.cache
 def pipeline_stages(name: str) -> dict[str, Any] | None:
     """The `stages` of the project's own pipeline `name`, unchanged; None where it has no such pipeline."""
-    return stages(compose("match", (f"pipeline={name}",))) if name in available("pipeline") else None
+    return stages(compose(PIPELINES, (f"pipeline={name}",))) if name in available("pipeline") else None
 
 
 def composed(stages: Mapping[str, Any]) -> dict[str, Any]:
@@ -59,15 +61,6 @@ def expect_stages(config: DictConfig) -> None:
         if group != "pruner" and group in config:  # a training has no estimator
             expect_buildable(plain(config[group]), group)
     expect_pruners(config)
-
-
-def expect_dataset(config: DictConfig) -> None:
-    """Raises ValueError, naming the option, where a data set cannot be loaded with the options of its config."""
-    options = plain(config)
-    if "_target_" in options:
-        expect_buildable(options, "dataset")
-    else:
-        data.expect_loadable(**options)
 
 
 def compose(config_name: str, overrides: Sequence[str], config_dir: Path | None = None) -> DictConfig:

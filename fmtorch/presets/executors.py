@@ -9,9 +9,10 @@ from typing import cast
 
 from omegaconf import DictConfig
 
+from fmtorch.core.options import Count
 from fmtorch.jobs.execution import Execution
 from fmtorch.presets.composition import plain
-from fmtorch.presets.fields import Count, read_fields
+from fmtorch.presets.fields import read_fields
 from fmtorch.presets.objects import expect_buildable, instantiate
 
 

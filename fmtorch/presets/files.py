@@ -142,10 +142,3 @@ def targets_of(config: object) -> frozenset[str]:
     if isinstance(config, list):
         return frozenset().union(*(targets_of(value) for value in config))
     return frozenset()
-
-
-def top_level_names(config_name: str) -> list[str]:
-    """What the command of this config takes by name: its fields and the groups it chooses from."""
-    fields = _read(conf_dir() / f"{config_name}.yaml")
-    groups = [str(group) for entry in fields.get("defaults", []) if entry != "_self_" for group in entry]
-    return [name for name in (*map(str, fields), *groups) if name not in ("defaults", "hydra") and " " not in name]

@@ -9,12 +9,17 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from fmtorch.core.stages import Pruner
-from fmtorch.data.baselines import WIDE
 from fmtorch.presets.objects import expect_buildable, instantiate
 
 FAMILIES = "families"  # among a pruner's options: family -> options that its pairs get instead
 OF_PIPELINES = frozenset({FAMILIES, "soft"})  # options that pipelines' presets set, of pruners that may be replaced
 WIDE_FAMILIES = "wide"  # stands there for every family of wide baselines
+WIDE = (
+    "Tanks_and_Temples", "CPC",  # of FM-Bench
+    "Strecha", "Strecha_train", "PhotoTourism", "TanksLike",  # further photographs of unordered scenes
+    "orbit", "collection",  # rendered
+)  # fmt: skip
+"""Families of wide baselines by name. The others are taken for videos, whose baselines are short."""
 
 
 def pruner_configs(config: DictConfig) -> dict[str, Any]:

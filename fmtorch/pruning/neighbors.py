@@ -15,7 +15,7 @@ _LEAF = 8  # points a leaf, at most
 
 @inner
 def search(queries: Array, points: Array, neighbors: Array) -> None:
-    """`knn.nearest_points` of queries (n, 2) among points (m, 2) -> found (n, count); -1 for no more points.
+    """The nearest points (m, 2) of queries (n, 2): indices, neighbors (n, count), nearest first; -1 past the last.
 
     Squared distances in float64, ties by index, exactly as an exhaustive search finds them.
     Node j of depth d holds the places from (j m) >> d on in an order of the points, its box and their lowest index.

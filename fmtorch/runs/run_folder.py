@@ -7,10 +7,9 @@ import functools
 import hashlib
 import json
 import math
-import os
 import time
 import uuid
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fmtorch.core.files import naming, replacing, sync, temporary_name
+from fmtorch.core.files import replacing
+from fmtorch.core.settings import canonical, create, differences, head
 
 PAIR_SCHEMA = pa.schema(
     [
@@ -242,16 +242,10 @@ def content_digest(data: bytes) -> str:
 
 FORMAT = 1  # of the folder; to be raised when the schema changes, or what the identity tells
 _LISTINGS = 20  # at most, until parts are those that were listed
-_SHOWN = 5  # differing fields shown in an error
 
 
 class RunFolderError(ValueError):
     """A run folder that cannot be used as asked; the message says what to do."""
-
-
-def canonical(config: Mapping[str, Any]) -> str:
-    """The one JSON text of a configuration: sorted keys, no spaces, floats by `repr`."""
-    return json.dumps(config, sort_keys=True, separators=(",", ":"))
 
 
 def identity_digest(config: Mapping[str, Any]) -> str:
@@ -286,14 +280,15 @@ class RunFolder:
         if not (path / "run.json").exists():
             if foreign:
                 raise RunFolderError(
-                    f"{path} is not empty and has no run.json, so it is no run folder (it holds {_head(foreign)}); "
+                    f"{path} is not empty and has no run.json, so it is no run folder (it holds {head(foreign)}); "
                     "choose another run_dir"
                 )
-            _claim(path / "run.json", wanted)
+            stored = {"format": FORMAT, "identity": identity_digest(wanted), "config": wanted}
+            create(path / "run.json", json.dumps(stored, indent=2) + "\n")
         folder = cls.load(path)
         if folder.identity != identity_digest(wanted):
             raise RunFolderError(
-                f"{path} holds another run; what differs (there -> now): {_head(_differences(folder.config, wanted))}. "
+                f"{path} holds another run; what differs (there -> now): {differences(folder.config, wanted)}. "
                 "Choose another run_dir, or delete the folder"
             )
         (path / "pairs").mkdir(exist_ok=True)
@@ -388,55 +383,3 @@ class RunFolder:
             raise RunFolderError(
                 f"{file} cannot be read ({error}); delete it and start the run again, which computes its pairs anew"
             ) from error
-
-
-def _claim(file: Path, config: dict[str, Any]) -> None:
-    """Write run.json unless another process has just done so: of several, the first one wins.
-
-    Where the file system has no hard links the last one wins, which is the same unless their identities differ.
-    """
-    temporary = temporary_name(file)
-    stored = {"format": FORMAT, "identity": identity_digest(config), "config": config}
-    try:
-        with naming(file, temporary):
-            temporary.write_text(json.dumps(stored, indent=2) + "\n", encoding="utf-8")
-            sync(temporary)
-        try:
-            os.link(temporary, file)  # unlike a rename it fails where the name is taken
-        except FileExistsError:
-            return
-        except OSError:
-            os.replace(temporary, file)
-        sync(file.parent)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def _differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    """``a.b: 1 -> 2`` for each field that differs."""
-    before, after = dict(leaves(old)), dict(leaves(new))
-    names = [*before, *(name for name in after if name not in before)]
-    pairs = [(name, before.get(name, "(absent)"), after.get(name, "(absent)")) for name in names]
-    return [f"{name}: {was} -> {now}" for name, was, now in pairs if was != now]
-
-
-def leaves(value: Any, name: str = "") -> Iterator[tuple[str, str]]:
-    """Dotted names and JSON texts of all that a nested configuration holds.
-
-    A list of mappings of one name each, such as a pipeline's pruners, is that order of names, and what is below each.
-    """
-    if isinstance(value, list) and value and all(isinstance(entry, dict) and len(entry) == 1 for entry in value):
-        names = [key for entry in value for key in entry]
-        yield name, f"[{', '.join(names)}]"
-        value = {key: below for entry in value for key, below in entry.items()}
-    if isinstance(value, dict) and value:
-        for key, entry in value.items():
-            yield from leaves(entry, f"{name}.{key}" if name else key)
-    else:
-        yield name, json.dumps(value, sort_keys=True)
-
-
-def _head(items: Sequence[str]) -> str:
-    """The first few items, and how many more there are."""
-    more = len(items) - _SHOWN
-    return "; ".join(items[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")

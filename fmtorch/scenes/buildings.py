@@ -1,4 +1,7 @@
-"""Things that stand about: trees, lamp posts, cars, people, rocks, statues, columns, shelves."""
+"""Things that stand about (trees, lamp posts, cars, people, rocks, statues, columns) and house fronts in relief.
+
+A front is one painted picture; windows are set back from it, sills, cornices and signs set off.
+"""
 
 from __future__ import annotations
 
@@ -76,8 +79,7 @@ def car(surfaces: Surfaces, rng: Rng, foot: Vector, ahead: Vector) -> None:
     length, width = rng.uniform(3.9, 4.7), rng.uniform(1.7, 1.85)
     rear = foot - ahead * (length / 2) + left * (width / 2)
     paint = [end, metal, end, metal, metal]
-    body = [end, metal, end, metal, metal]
-    surfaces.box(rear + vec(0, 0, 0.3), -left * width, ahead * length, 0.52, body)
+    surfaces.box(rear + vec(0, 0, 0.3), -left * width, ahead * length, 0.52, paint)
     cabin = rear + ahead * (0.18 * length) - left * 0.08 + vec(0, 0, 0.82)
     surfaces.box(cabin, -left * (width - 0.16), ahead * (0.55 * length), 0.6, paint, ((0, 0, 1, 0.5),) * 5)
     for shift, along in ((0.01, -ahead), (-width - 0.01, ahead)):
@@ -130,9 +132,6 @@ def ashlar(surfaces: Surfaces, rng: Rng, rows: int = 6, cols: int = 8, h: int = 
     """A texture of large dressed stones."""
     tint = colour(rng, (0.05, 0.13), (0.1, 0.4), (0.5, 0.85))
     return surfaces.texture(to_pixels(masonry(rng, h, w, rows, cols, tint, joint=0.03)))
-
-
-# House fronts in relief: one painted picture for each, windows set back, sills, cornices and signs set off
 
 
 @dataclasses.dataclass(frozen=True)

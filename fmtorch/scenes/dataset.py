@@ -1,4 +1,4 @@
-"""How far away the points of a rendered photograph are: the scene is built anew and its rays are cast."""
+"""The embedded data sets: `RenderedPairs`, drawn on first use from known cameras, and `StereoPair`, a real pair."""
 
 from __future__ import annotations
 
@@ -168,9 +168,6 @@ class RenderedScenePairs(ScenePairs):
     def depth(self, image: ImageSource, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """As `RenderedPairs.depth`."""
         return self.drawn.depth(image, points)
-
-
-# A real pair with measured disparity, the Middlebury motorcycle that the scikit-image package carries
 
 
 _FILES = ("motorcycle_left.png", "motorcycle_right.png", "motorcycle_disp.npz")

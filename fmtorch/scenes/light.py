@@ -1,4 +1,4 @@
-"""How surfaces look, compiled: footprints of pixels on textures, filtered colours, light."""
+"""How surfaces look: filtered texture, sun with shadows, sky light, and what a real camera adds."""
 
 from __future__ import annotations
 
@@ -193,9 +193,6 @@ def shade(index: I4x1, seen: Seen, footprint: Footprints, picture: Picture, ligh
             coarse = to_linear[_code(atlas, corner2 + place, beside, below, right2, lower2)]
             colour = fine + (coarse - fine) * part
             out[p, channel] = colour * (sun * light[0, channel] + sky * light[1, channel])
-
-
-# How surfaces look: filtered texture, sun with shadows, sky light, and what a real camera adds
 
 
 # Four rays a pixel, one on each row and column of a 4 x 4 grid (rotated grid); their mean is the pixel centre.

@@ -1,4 +1,7 @@
-"""Procedural materials: masonry, plaster, wood, ground, cloth, leaves, sky; float32 RGB in [0, 1], sRGB."""
+"""Procedural pictures, float32 RGB in [0, 1], sRGB: materials (masonry, wood, ground, leaves, sky), and painted things.
+
+Painted are windows, doors, signs, posters, books, cars and people.
+"""
 
 from __future__ import annotations
 
@@ -197,9 +200,6 @@ def heights(rng: Rng, m: int, n: int, coarsest: int = 8) -> NDArray[np.float64]:
     field = fractal(rng, m, n, coarsest, 1, 0.45).astype(np.float64)
     field -= field.min()
     return field / max(float(field.max()), 1e-9)
-
-
-# Painted things: windows, doors, signs, posters, books, cars, people
 
 
 _FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_COMPLEX, cv2.FONT_HERSHEY_TRIPLEX)

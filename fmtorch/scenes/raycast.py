@@ -1,4 +1,9 @@
-"""The inner loop of the ray-caster, compiled: every piece against the pixels of its bounding box, row by row."""
+"""Which surface each pixel's ray meets first: exact ray-plane intersection, batched over pixels, with a depth buffer.
+
+A piece ``X = O + s U + t V`` is seen by a camera P through the homography ``G = P [U V O; 0 0 1]``. Hence the ray of
+pixel x meets its plane at ``(s, t, 1) = z G^-1 (x, y, 1)``: three linear forms and one division for each pixel, and the
+depth z is the reciprocal of the third form. Each piece is intersected with the rays of its bounding box only.
+"""
 
 from __future__ import annotations
 
@@ -143,9 +148,6 @@ def _open_holes(
             c, d = np.float32(opacity[corner + stride]), np.float32(opacity[corner + stride + 1])
             above, below = fused(a, at_x - left, b - a), fused(c, at_x - left, d - c)
             hit[x] = np.rint(fused(above, at_y - top, below - above)) >= _OPAQUE_FROM
-
-
-# Which surface each pixel's ray meets first: exact ray-plane intersection, batched over pixels, with a depth buffer
 
 
 Matrix = NDArray[np.float64]

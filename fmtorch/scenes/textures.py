@@ -1,4 +1,4 @@
-"""Textures prefiltered for minification: all levels of the pyramid in one picture, looked up trilinearly."""
+"""Textures prefiltered for minification, and the photographs inside the scikit-image package that some of them show."""
 
 from __future__ import annotations
 
@@ -82,9 +82,6 @@ def bilinear(picture: Pixels, x: Floats, y: Floats) -> Pixels:
     table = maps.reshape(2, rows, _ROW)
     out = cv2.remap(picture, table[0], table[1], cv2.INTER_LINEAR)
     return out.reshape(rows * _ROW, -1)[:n].astype(np.uint8, copy=False)
-
-
-# The photographs inside the scikit-image package, shared out between the splits; read from disk, never downloaded
 
 
 # No photograph serves two splits; the motorcycle stays with `StereoPair`.

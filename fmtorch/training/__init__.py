@@ -3,13 +3,18 @@
 The loop needs the extra `train`: `fmtorch.training.loop`, run by `python -m fmtorch.train`.
 """
 
-from fmtorch.training.augmentation import Augmentation
-from fmtorch.training.batches import SimilarLengthBatches, collate_trimmed
-from fmtorch.training.labelled import LabelledMatches, collate
-from fmtorch.training.matched_pairs import MatchedPairs
-from fmtorch.training.objective import Objective, classification_loss, geometric_loss, nsgd_loss, virtual_points
-from fmtorch.training.stored_matches import Draw, StoredMatches, split_scenes
-from fmtorch.training.validation import Use, Validation, reliability, temperature
+from typing import TYPE_CHECKING
+
+from fmtorch.core.lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from fmtorch.training.augmentation import Augmentation
+    from fmtorch.training.batches import SimilarLengthBatches, collate_trimmed
+    from fmtorch.training.labelled import LabelledMatches, collate
+    from fmtorch.training.matched_pairs import MatchedPairs
+    from fmtorch.training.objective import Objective, classification_loss, geometric_loss, nsgd_loss, virtual_points
+    from fmtorch.training.stored_matches import Draw, StoredMatches, split_scenes
+    from fmtorch.training.validation import Use, Validation, reliability, temperature
 
 __all__ = [
     "Augmentation",
@@ -31,3 +36,5 @@ __all__ = [
     "temperature",
     "virtual_points",
 ]
+
+lazy_exports(__name__)

@@ -8,7 +8,6 @@ the matcher's figures stay as they are. Matches that fall away are masked; `Labe
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -19,6 +18,7 @@ from torch import Tensor
 from fmtorch.geometry.epipolar import unit_frobenius
 from fmtorch.jit.random import Stream, bits, uniform
 from fmtorch.training.labelled import LabelledMatches
+from fmtorch.training.options import AugmentationOptions, Range
 
 MIN_INLIERS = 16  # no crop or ratio threshold that would leave fewer; twice what the eight-point algorithm needs
 MIN_MATCHES = 50  # no thinning of outliers below so many matches
@@ -26,52 +26,13 @@ _COLUMNS = 32  # random numbers of a pair in an epoch; the last three are keys o
 _PER_IMAGE = 7
 _ROUNDING = 1e-6  # pixels that a rotated side may exceed a whole number by
 
-Real = float | int
-Range = Sequence[Real]  # the least and the most
 
-
-@dataclasses.dataclass(frozen=True)
-class Augmentation:
-    """Random changes of a pair's labelled matches, after which the truth is still true (see the module).
+class Augmentation(AugmentationOptions):
+    """Random changes of a pair's labelled matches, after which the truth is still true.
 
     The same (seed, key, epoch) gives the same matches, so a training that is resumed sees what it would have seen.
     Matches come out in random order, so the first ones of them are a random subset. None turns a change off.
-
-    swap: probability that the images change places.
-    quarter_turn, turn: probability, for each image, of a turn by 90, 180 or 270 degrees, or else by any angle.
-    angle: largest such angle either way, degrees.
-    crop: probability, for each image, of a crop whose sides are `crop_side` of the image's.
-    ratio: threshold on the distance ratio.
-    thin: probability that inliers or outliers are thinned to a share of inliers in `inlier_share`.
-    noise: standard deviation of the error added to both coordinates of both points, pixels.
-    matches: size of a random subset, uniform in its logarithm.
     """
-
-    swap: Real = 0.5
-    quarter_turn: Real = 0.2
-    turn: Real = 0.2
-    angle: Real = 45.0
-    crop: Real = 0.3
-    crop_side: Range = (0.6, 1.0)
-    ratio: Range | None = (0.8, 1.0)
-    thin: Real = 0.5
-    inlier_share: Range = (0.05, 0.95)
-    noise: Range | None = (0.0, 0.5)
-    matches: Sequence[int] | None = (50, 4000)
-
-    def __post_init__(self) -> None:
-        for name in ("swap", "quarter_turn", "turn", "crop", "thin"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; it is a probability, from 0 to 1")
-        if self.quarter_turn + self.turn > 1:
-            raise ValueError("quarter_turn and turn exclude each other: together they are at most 1")
-        for name, low, high in (
-            ("crop_side", 0.0, 1.0), ("ratio", 0.0, 1.0), ("inlier_share", 0.0, 1.0), ("noise", 0.0, math.inf),
-            ("matches", 1, math.inf),
-        ):  # fmt: skip
-            range_ = getattr(self, name)
-            if range_ is not None and not low <= range_[0] <= range_[1] <= high:
-                raise ValueError(f"{name} is {tuple(range_)}; it must be a range (least, most) within {low} and {high}")
 
     @classmethod
     def none(cls) -> Augmentation:

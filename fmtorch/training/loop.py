@@ -6,8 +6,6 @@ What is already done is taken up again, whatever ended the last attempt.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
-import json
 import logging
 import re
 import time
@@ -26,47 +24,18 @@ from rich.progress import Progress, TaskID
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
-from fmtorch.core.files import replacing
 from fmtorch.core.terminal import progress_bars
 from fmtorch.data import ImagePair, read_image
 from fmtorch.evaluation.pictures import draw_matches
 from fmtorch.pruning.networks.learned import predict
-from fmtorch.runs.run_folder import identity_digest
 from fmtorch.training.labelled import LabelledMatches
 from fmtorch.training.objective import Objective
+from fmtorch.training.options import Optimisation as Optimisation
 from fmtorch.training.validation import Evaluation, Validation
 
 CHECKPOINTS, BEST, LOGS = "checkpoints", "best.ckpt", "logs"
 SMALLER_IS_BETTER = ("log_loss", "calibration_error")  # figures of validation; of the others larger is
 PICTURE_HEIGHT = 480  # px
-
-
-@dataclasses.dataclass(frozen=True)
-class Optimisation:
-    """Adam (Kingma & Ba, ICLR 2015) at a constant rate that falls linearly to zero over the last part of the steps.
-
-    Attributes:
-        learning_rate: 1e-3 in Yi et al. 2018's code; the 1e-4 of one later paper trains far more slowly.
-        weight_decay: L2 penalty of the parameters.
-        steps: in all. decay: share of them, at the end, over which the rate falls.
-    """
-
-    learning_rate: float = 1e-3
-    weight_decay: float = 0.0
-    steps: int = 2500
-    decay: float = 0.5
-
-    def __post_init__(self) -> None:
-        if not self.learning_rate > 0 or self.weight_decay < 0 or self.steps < 1 or not 0 <= self.decay <= 1:
-            raise ValueError(
-                f"optimisation={dataclasses.asdict(self)}: learning_rate and steps must be positive, weight_decay "
-                "not negative, decay between 0 and 1"
-            )
-
-    def factor(self, step: int) -> float:
-        """What the learning rate is multiplied by at a step."""
-        left = (self.steps - step) / max(self.decay * self.steps, 1)
-        return min(1.0, max(left, 0.0))
 
 
 class PrunerTraining(lightning.LightningModule):
@@ -127,35 +96,6 @@ class PrunerTraining(lightning.LightningModule):
         adam = torch.optim.Adam(self.network.parameters(), lr=o.learning_rate, weight_decay=o.weight_decay)
         schedule = torch.optim.lr_scheduler.LambdaLR(adam, lambda step: o.factor(step))
         return {"optimizer": adam, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
-
-
-class TrainingFolderError(ValueError):
-    """A folder that holds another training; the message says what to do."""
-
-
-def claim(folder: Path, identity: Mapping[str, Any]) -> None:
-    """Make `folder` that of the training with this identity, or check that it already is.
-
-    Raises TrainingFolderError where it holds another training, or files that are none.
-    """
-    file = folder / "training.json"
-    wanted = json.loads(json.dumps(identity, sort_keys=True))
-    if file.is_file():
-        try:
-            stored = json.loads(file.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise TrainingFolderError(f"{file} is not valid JSON ({error}); delete {folder} to train anew") from error
-        if identity_digest(stored) != identity_digest(wanted):
-            changed = sorted(k for k in {*stored, *wanted} if stored.get(k) != wanted.get(k))
-            raise TrainingFolderError(
-                f"{folder} holds another training (it differs in {', '.join(changed)}); choose another output"
-            )
-        return
-    if folder.is_dir() and any(folder.iterdir()):
-        raise TrainingFolderError(f"{folder} is not empty and holds no training; choose another output")
-    folder.mkdir(parents=True, exist_ok=True)
-    with replacing(file) as temporary:
-        temporary.write_text(json.dumps(wanted, indent=2) + "\n", encoding="utf-8")
 
 
 def latest_checkpoint(folder: Path) -> tuple[Path | None, int]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -13,7 +12,8 @@ import cv2
 import numpy as np
 import torch
 
-from fmtorch.core.files import cache_dir, replacing
+from fmtorch.core.files import cache_dir
+from fmtorch.core.settings import claim
 from fmtorch.core.types import Correspondences
 from fmtorch.data.pairs import DepthDataset, ImagePair, PairDataset
 from fmtorch.jobs.execution import Execution
@@ -24,7 +24,7 @@ from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
 from fmtorch.runs.feature_cache import CachedFeatures
 from fmtorch.runs.fingerprint import configuration, environment
-from fmtorch.runs.run_folder import canonical, identity_digest
+from fmtorch.runs.run_folder import identity_digest
 from fmtorch.training import labelled
 from fmtorch.training.augmentation import Augmentation
 from fmtorch.training.stored_matches import FORMAT, Shard, ShardError, StoredMatches, write_shard
@@ -106,10 +106,7 @@ class MatchedPairs(StoredMatches):
         home = Path(root).expanduser() if root is not None else cache_dir() / "matched"
         identity = _identity(dataset, stages, most)
         folder = home / f"{dataset.name}-{identity_digest(identity)[:16]}"
-        folder.mkdir(parents=True, exist_ok=True)
-        if not (folder / "about.json").exists():
-            with replacing(folder / "about.json") as temporary:
-                temporary.write_text(json.dumps(json.loads(canonical(identity)), indent=2) + "\n", encoding="utf-8")
+        claim(folder / "about.json", identity, "matches", "delete the folder", alone=False)
         pairs = [dataset[i] for i in range(len(dataset))]
         shards = [[pairs[i] for i in members] for members in partition(pairs)]
         jobs = [Job(folder / f"shard-{number:05d}.arrow", members) for number, members in enumerate(shards)]

@@ -7,7 +7,6 @@ the graph. So no training step needs to be skipped.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import NamedTuple
 
 import torch
@@ -22,44 +21,16 @@ from fmtorch.metrics import nsgd
 from fmtorch.metrics.nsgd import BORDER, segment_in_image
 from fmtorch.pruning.networks.learned import Prediction
 from fmtorch.training.labelled import LabelledMatches
+from fmtorch.training.options import ObjectiveWeights
 
-COORDINATES = ("size", "K")
 LIMIT_E = 0.1  # squared focal lengths; clamp of the geometric loss of Zhang et al. (OANet, ICCV 2019), their code
 LIMIT_F = 0.03  # squared half longer sides of the image; the same code's clamp for fundamental matrices
 NORMAL_FLOOR = 1e-6  # length of an epipolar line's normal, for F of unit size in normalised coordinates, taken for none
 TRIES = 4  # draws made for each point wanted; those whose epipolar line misses image 1 are dropped
 
 
-@dataclasses.dataclass(frozen=True)
-class Objective:
-    """The loss of a batch, as a sum of terms that a config weighs; every stage of the network is supervised.
-
-    Attributes:
-        classification: weight of the cross-entropy of P(inlier) (Yi et al., CVPR 2018, eq. 7, without class balance).
-        geometric: weight of the symmetric epipolar distance of virtual points of the true geometry to the weighted
-            8-point fit (Ranftl & Koltun, ECCV 2018; clamped as by Zhang et al., ICCV 2019).
-        nsgd: weight of NSGD between that fit and the truth, in image diagonals.
-        nsgd_limit: of a pair's NSGD, beyond which it has no gradient.
-        coordinates: the unit of the geometric loss, "size" (half the longest side) or "K" (focal lengths).
-        classification_steps: steps of classification alone, before the other two terms come in.
-        points: virtual points of a pair.
-    """
-
-    classification: float = 1.0
-    geometric: float = 0.5
-    nsgd: float = 0.0
-    nsgd_limit: float | None = 0.2
-    coordinates: str = "size"
-    classification_steps: int = 500
-    points: int = 100
-
-    def __post_init__(self) -> None:
-        if self.coordinates not in COORDINATES:
-            raise ValueError(f"objective.coordinates={self.coordinates}; it must be one of: {', '.join(COORDINATES)}")
-        if min(self.classification, self.geometric, self.nsgd, self.classification_steps) < 0 or self.points < 1:
-            raise ValueError("objective: weights and classification_steps must not be negative, points at least 1")
-        if not max(self.classification, self.geometric, self.nsgd) > 0:
-            raise ValueError("objective: at least one of classification, geometric and nsgd must have a weight")
+class Objective(ObjectiveWeights):
+    """The loss of a batch, as a sum of terms that a config weighs; every stage of the network is supervised."""
 
     def __call__(self, prediction: Prediction, batch: LabelledMatches, step: int) -> dict[str, Float[Tensor, ""]]:
         """The terms of the loss, unweighted, and their weighted sum `loss`.

@@ -26,6 +26,7 @@ from fmtorch.data.cameras import relative_pose
 from fmtorch.data.images import read_image
 from fmtorch.data.pairs import ImagePair, ImageSource
 from fmtorch.scenes.camera import Camera, calibration
+from fmtorch.training.options import PlaneViews as PlaneViews
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".ppm", ".tif", ".tiff"}
 
@@ -76,33 +77,6 @@ def list_photographs(
     if not kept:
         raise ValueError(f"{folder}: none of its {len(photographs)} photographs is left by sources and excluded")
     return kept
-
-
-@dataclasses.dataclass(frozen=True)
-class PlaneViews:
-    """How views are drawn; ranges are uniform, of ratios in their logarithm.
-
-    views: of each photograph; every two of them are a pair. tilt: largest angle in degrees between the optical axis and
-    the plane's normal. roll: standard deviation in degrees of the rotation about the axis. part: of the photograph's
-    width that a view spans. scale: sides of a view, of the photograph's. focal: in widths of the view.
-    """
-
-    views: int = 5
-    tilt: float | int = 60.0
-    roll: float | int = 15.0
-    part: tuple[float | int, float | int] = (0.5, 1.0)
-    scale: tuple[float | int, float | int] = (0.7, 1.0)
-    focal: tuple[float | int, float | int] = (0.7, 1.8)
-
-    def __post_init__(self) -> None:
-        if self.views < 2:
-            raise ValueError(f"planes.views={self.views}; a pair needs 2")
-        if not 0 <= self.tilt < 80 or self.roll < 0:
-            raise ValueError(f"planes.tilt={self.tilt}, roll={self.roll}: 0 <= tilt < 80 degrees, roll not negative")
-        for name in ("part", "scale", "focal"):
-            low, high = getattr(self, name)
-            if not 0 < low <= high:
-                raise ValueError(f"planes.{name}={[low, high]}; it must be two positive numbers, the smaller first")
 
 
 class PlanePairs(Dataset[ImagePair]):

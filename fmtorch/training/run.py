@@ -13,7 +13,7 @@ import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
 from lightning import Trainer
@@ -21,7 +21,8 @@ from omegaconf import DictConfig
 from rich.progress import Progress
 
 from fmtorch import data, presets
-from fmtorch.core.options import Within, expect_options
+from fmtorch.core.options import expect_options
+from fmtorch.core.settings import claim
 from fmtorch.core.terminal import console, progress_bars, reporter
 from fmtorch.core.version import __version__
 from fmtorch.data import ImagePair, PairDataset
@@ -31,63 +32,23 @@ from fmtorch.evaluation.run import select
 from fmtorch.pipeline.pipeline import Pipeline
 from fmtorch.presets import plain
 from fmtorch.presets.executors import execution_of
-from fmtorch.presets.fields import Cache, Count, Gigabytes, Seed, read_fields
+from fmtorch.presets.fields import read_fields
 from fmtorch.runs.feature_cache import cached
 from fmtorch.runs.run_folder import identity_digest
+from fmtorch.scenes import RenderedPairs
 from fmtorch.training.augmentation import Augmentation, keep_ratio
 from fmtorch.training.batches import training_batches
 from fmtorch.training.export import Result, write_result
 from fmtorch.training.labelled import LabelledMatches
-from fmtorch.training.loop import Optimisation, PrunerTraining, ValidationPictures, claim, load_best, train
+from fmtorch.training.loop import PrunerTraining, ValidationPictures, load_best, train
 from fmtorch.training.matched_pairs import MatchedPairs
 from fmtorch.training.objective import Objective
-from fmtorch.training.planes import Photograph, PlanePairs, PlaneViews, list_photographs
+from fmtorch.training.options import TrainOptions
+from fmtorch.training.planes import Photograph, PlanePairs, list_photographs
 from fmtorch.training.stored_matches import StoredMatches, last_scenes
 from fmtorch.training.validation import Use, Validation
 
 PICTURES = 4  # validation pairs that are drawn into the log
-
-
-@dataclasses.dataclass(frozen=True)
-class ValidationFields:
-    """What ``validation`` of the command's config holds; ``conf/train.yaml`` says what each is."""
-
-    every: Count = 250
-    scenes: Count = 4
-    roots: list[str] = dataclasses.field(default_factory=list)
-    pairs: Count = 25
-    ratio: float = 0.8
-    uses: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    monitor: str = "log_loss"
-    patience: Count | None = None
-
-
-@dataclasses.dataclass(frozen=True)
-class Fields:
-    """What the command takes at the top level, beside what it chooses; ``conf/train.yaml`` says what each is."""
-
-    before: list[str] = dataclasses.field(default_factory=list)
-    limit: Count | None = None
-    seed: Seed = 0
-    output: Path | None = None
-    cache: Cache = None
-    cache_limit: Gigabytes | None = 20
-    workers: Count | None = None
-    loaders: Annotated[int, Within(0)] = 0
-    threads: Count | None = None
-    batch: Count = 32
-    checkpoint_every: Count = 100
-
-
-@dataclasses.dataclass(frozen=True)
-class PlanesFields:
-    """What ``planes`` of the command's config holds beside the options of `PlaneViews`."""
-
-    photographs: Path | None = None
-    seed: Seed = 0
-
-
-PARTS = {"optimisation": Optimisation, "objective": Objective, "augmentation": Augmentation, "trainer": Trainer}
 
 
 def run(config: DictConfig, name: str) -> Path:
@@ -96,33 +57,28 @@ def run(config: DictConfig, name: str) -> Path:
     Started again, it goes on from the last checkpoint; a finished training only writes its files anew.
     name: of the pruner's preset, e.g. ``lc``. Raises ValueError for options that cannot be.
     """
-    read_fields(Fields, config)
-    read_fields(ValidationFields, config.validation, "validation")
-    read_fields(PlanesFields, config.planes, "planes")
-    own = {field.name for field in dataclasses.fields(PlanesFields)}
-    expect_options(PlaneViews, {k: v for k, v in plain(config.planes).items() if k not in own}, "planes")
-    for group, part in PARTS.items():
-        expect_options(part, plain(config[group]), group)
-    presets.expect_dataset(config.dataset)
+    options = read_fields(TrainOptions, config)
+    expect_options(Trainer, plain(config.trainer), "trainer")
+    presets.expect_buildable(plain(config.dataset), "dataset")
     presets.expect_stages(config)
     network_config = network_of(config, name)
-    optimisation, objective = Optimisation(**plain(config.optimisation)), Objective(**plain(config.objective))
-    uses = {key: use_of(key, value) for key, value in plain(config.validation.uses).items()}
+    objective = Objective(**dataclasses.asdict(options.objective))
+    uses = {key: use_of(key, value) for key, value in options.validation.uses.items()}
     with progress_bars() as progress:
-        matches = labelled_matches(config, progress)
+        matches = labelled_matches(config, options, progress)
     identity = {
         "network": network_config, "objective": dataclasses.asdict(objective), "batch": config.batch,
-        "optimisation": dataclasses.asdict(optimisation), "augmentation": plain(config.augmentation),
+        "optimisation": dataclasses.asdict(options.optimisation), "augmentation": plain(config.augmentation),
         "seed": config.seed, "matches": matches.digest, "version": __version__, "trainer": plain(config.trainer),
         "validation": {k: v for k, v in plain(config.validation).items() if k != "roots"},
     }  # fmt: skip
     folder = Path(config.output or f"runs/train/{name}-{identity_digest(identity)[:8]}")
-    claim(folder, identity)
+    claim(folder / "training.json", identity, "checkpoints", "choose another output")
     torch.set_num_threads(int(config.threads or os.cpu_count() or 1))
     torch.manual_seed(config.seed)
     network = presets.instantiate(network_config, f"pruner={name}, network")
     validation = Validation([m for _, m in matches.validation], uses, [p.family for p, _ in matches.validation])
-    module = PrunerTraining(network, objective, optimisation, validation)
+    module = PrunerTraining(network, objective, options.optimisation, validation)
     first = int(os.environ.get("LOCAL_RANK", "0")) == 0  # of several processes the one that reports
     if first:
         about = f"{len(matches.training)} pairs to train on, {len(matches.validation)} to validate on"
@@ -135,10 +91,10 @@ def run(config: DictConfig, name: str) -> Path:
         ),
         folder,
         plain(config.trainer),
-        every=config.validation.every,
-        checkpoint_every=config.checkpoint_every,
-        patience=config.validation.patience,
-        monitor=config.validation.monitor,
+        every=options.validation.every,
+        checkpoint_every=options.checkpoint_every,
+        patience=options.validation.patience,
+        monitor=options.validation.monitor,
         callbacks=(ValidationPictures(shown),),
     )
     if first:
@@ -197,20 +153,19 @@ class Matches:
     description: dict[str, str]
 
 
-def labelled_matches(config: DictConfig, progress: Progress) -> Matches:
+def labelled_matches(config: DictConfig, options: TrainOptions, progress: Progress) -> Matches:
     """The matches of the config's data set, split by scenes, and of its further validation sets.
 
     Raises ValueError where there is nothing to train on or to validate on.
     """
-    photographs, given, planned = list[Photograph](), config.photographs, _ranges(plain(config.planes))
-    if planned.pop("photographs") is not None:
-        photographs = list_photographs(config.planes.photographs, given.sources, given.excluded)
-    seed, views = planned.pop("seed"), PlaneViews(**planned)
+    photographs, given, validated = list[Photograph](), config.photographs, options.validation
+    if options.planes.photographs is not None:
+        photographs = list_photographs(options.planes.photographs, given.sources, given.excluded)
     dataset = _dataset(config, progress)
-    chosen, held_out = _split(dataset, config.validation.scenes)
+    chosen, held_out = _split(dataset, validated.scenes)
     chosen = _limited(dataset, chosen, config.limit)
     if not chosen:
-        raise ValueError(f"no pairs to train on: {config.validation.scenes} scenes of each family are for validation")
+        raise ValueError(f"no pairs to train on: {validated.scenes} scenes of each family are for validation")
     front = _front(config)
 
     def matched(source: PairDataset, indices: Sequence[int], what: str) -> StoredMatches:
@@ -223,16 +178,16 @@ def labelled_matches(config: DictConfig, progress: Progress) -> Matches:
     training = matched(dataset, chosen, "to train on")
     digests, validation = [training.folder.name], list[tuple[ImagePair, LabelledMatches]]()
     sets = [(dataset, held_out, "to validate on")]
-    for root in config.validation.roots:
+    for root in validated.roots:
         real = data.load("fmbench", root=root)
         sets.append((real, list(range(len(real))), f"of {root}"))
     for source, indices, what in sets:
-        if selected := _limited(source, indices, config.validation.pairs):
+        if selected := _limited(source, indices, validated.pairs):
             stored = matched(source, selected, what)
             digests.append(stored.folder.name)
             pairs = {source[i].key: source[i] for i in selected}
             for i, about in enumerate(stored.pairs):
-                matches = keep_ratio(stored.stored(i), config.validation.ratio).compact()
+                matches = keep_ratio(stored.stored(i), validated.ratio).compact()
                 validation.append((pairs[about["key"]], matches))
     if not validation:
         raise ValueError("no pairs to validate on: give validation.scenes or validation.roots")
@@ -240,30 +195,27 @@ def labelled_matches(config: DictConfig, progress: Progress) -> Matches:
     description = {
         "training": f"{len(training)} pairs of {_scenes(training)} scenes of {dataset.name}",
         "validation": ", ".join(f"{count} pairs of {family}" for family, count in families.items())
-        + f" (of {dataset.name} the last {config.validation.scenes} scenes of each family, which share photographs "
+        + f" (of {dataset.name} the last {validated.scenes} scenes of each family, which share photographs "
         "with the training scenes)",
     }
     if photographs:
         workers, report = config.workers or os.cpu_count() or 1, reporter(progress, "views of photographs")
-        drawn = PlanePairs(photographs, views, seed, workers=workers, progress=report)
+        drawn = PlanePairs(photographs, options.planes.limits, options.planes.seed, workers=workers, progress=report)
         planes = matched(drawn, range(len(drawn)), "of photographs")
         planes = planes.select(i for i, about in enumerate(planes.pairs) if about["inliers"] > ENOUGH)
         digests.append(planes.folder.name)
         description["training"] += f" and {len(planes)} pairs of {_scenes(planes)} photographs seen as planes"
         training = training.joined(planes)
-    augmented = training.augmented(Augmentation(**_ranges(plain(config.augmentation))), config.seed)
+    augmented = training.augmented(Augmentation(**dataclasses.asdict(options.augmentation)), config.seed)
     return Matches(augmented, validation, hashlib.sha256(" ".join(digests).encode()).hexdigest(), description)
 
 
 def _dataset(config: DictConfig, progress: Progress) -> PairDataset:
     """The data set to train on; of the embedded one always the training side."""
     options = plain(config.dataset)
-    if options.get("name") == "rendered":
+    if presets.target_of(options, "dataset") is RenderedPairs:
         options["split"] = "train"
-    if "_target_" in options:
-        dataset: PairDataset = presets.instantiate(options, "dataset")
-        return dataset
-    return data.load(**options, progress=reporter(progress, "drawing scenes"))
+    return data.build(options, reporter(progress, "drawing scenes"))
 
 
 def _split(dataset: PairDataset, last: int) -> tuple[list[int], list[int]]:
@@ -296,7 +248,3 @@ def _no_estimator(c: Any, seed: int = 0) -> Any:
 
 def _scenes(matches: StoredMatches) -> int:
     return len({about["scene"] for about in matches.pairs})
-
-
-def _ranges(options: dict[str, Any]) -> dict[str, Any]:
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in options.items()}

@@ -1,29 +1,187 @@
-"""What users say of cameras, as fields of `Correspondences`."""
+"""The door: what users say of two views, checked once, as `Correspondences` that need no second look.
+
+NumPy or torch, one pair or a batch, pairs of different lengths as lists.
+"""
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Mapping
-from typing import Any, Literal
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, cast
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 from torch import Tensor
 
-from fmtorch.core.arguments import Arrays, as_tensor
-from fmtorch.core.types import Correspondences
+from fmtorch.core.checks import as_tensor
+from fmtorch.core.types import Correspondences, collate
 from fmtorch.geometry.cameras import calibration_problems
 
+Array = Tensor | NDArray[Any]
+Arrays = Array | Sequence[Any]
+"""One array, or a list of them: of pairs of different lengths."""
 Focal = Literal["shared", "unknown"] | float | Arrays | Mapping[str, Any] | None
+
+PER_MATCH = {name: len(Correspondences.declared[name].shape) - 1 for name in Correspondences.per_slot}
+"""The dimensions of what has an entry for each match, of one pair."""
 FORMS = "None, 'unknown', 'shared', (px, deviation) or ((px, deviation), (px, deviation))"
 FORMS_WITH_K = "None, 'unknown', 'shared', or the relative deviations of the focal lengths of K: one, two, or (B, 2)"
 UNKNOWN = (1.0, math.inf)  # px, relative deviation
 MIN_PIXELS = 10.0  # a photograph's points reach farther from its first pixel
 MIN_MATCHES = 8  # fewer say nothing of their unit
-MAX_OUTSIDE = (
-    0.5  # share of points outside an image of the given size, such as points undistorted far beyond its border
-)
-SWAPPED = 0.05  # share outside from which on a size is taken for (w, h), if all points are inside then
+MAX_OUTSIDE = 0.5  # fraction of points outside an image of the given size: some are undistorted far beyond its border
+SWAPPED = 0.05  # fraction outside from which on a size is taken for (w, h), if all points are inside then
+
+
+def correspondences(
+    x0: Arrays,
+    x1: Arrays,
+    *,
+    K0: Arrays | None = None,
+    K1: Arrays | None = None,
+    focal: Focal = None,
+    **fields: Arrays | int | None,
+) -> Correspondences:
+    """The batch that points and what is known of them and of the cameras describe.
+
+    Args:
+        x0, x1: (N, 2) of one pair, (B, N, 2) of a padded batch, or a list of (N, 2) of different N, in pixels. Whole
+            numbers become float64; x0 decides the device.
+        K0, K1, focal: as of `fmtorch.find_fundamental`.
+        fields: of `Correspondences`, or None. Per-match fields come in the form of the points. A size is one for all
+            pairs, (2,), or one each, (B, 2), and so is a key.
+
+    Raises:
+        TypeError: for what is no array of numbers.
+        ValueError: for wrong shapes, values that cannot be, a calibration that is none, and points of no pixels.
+    """
+    cameras = camera_fields(K0, K1, focal, fields.get("size0") is not None)
+    c = _batch(x0, x1, {**fields, **cameras})
+    _expect_calibrations(c)
+    expect_values(c)
+    _expect_pixels(c)
+    return c
+
+
+def _batch(x0: Arrays, x1: Arrays, fields: Mapping[str, Any]) -> Correspondences:
+    """Points and what is known of them as tensors of a batch."""
+    ragged = [name for name, value in (("x0", x0), ("x1", x1)) if _is_list_of_pairs(value)]
+    if len(ragged) == 1:
+        raise ValueError(f"{ragged[0]} is a list of pairs and the other is not; both must be, or neither")
+    if ragged:
+        return _of_list(cast(Sequence[Any], x0), cast(Sequence[Any], x1), fields)
+    points0, points1 = _points(x0, "x0"), _points(x1, "x1")
+    if points0.shape != points1.shape:
+        raise ValueError(f"x0 has shape {tuple(points0.shape)} but x1 {tuple(points1.shape)}; they must be equal")
+    if points0.dim() == 3 and points0.shape[1] == 1 and len(points0) > 1 and fields.get("mask") is None:
+        raise ValueError(
+            f"x0 and x1 have shape {tuple(points0.shape)}, as OpenCV stores {len(points0)} points; give x0[:, 0] and "
+            f"x1[:, 0] for one pair (with a mask they are {len(points0)} pairs of one match)"
+        )
+    single = points0.dim() == 2
+    points0, points1 = (points[None] if single else points for points in (points0, points1.to(points0.device)))
+    kind = torch.promote_types(points0.dtype, points1.dtype)
+    known = {name: _field(name, value, single, points0) for name, value in fields.items() if value is not None}
+    mask = known.pop("mask", None)
+    mask = torch.ones_like(points0[..., 0], dtype=torch.bool) if mask is None else mask.to(torch.bool)
+    return Correspondences(points0.to(kind), points1.to(kind), mask, **known)
+
+
+def _is_list_of_pairs(value: object) -> bool:
+    """Whether the elements are pairs' points, and not single points; of an empty list there are none of either."""
+    return isinstance(value, list | tuple) and (not value or getattr(value[0], "ndim", _depth(value[0])) >= 2)
+
+
+def _depth(value: object) -> int:
+    """How deeply lists are nested."""
+    if not isinstance(value, list | tuple):
+        return 0
+    return 1 + (_depth(value[0]) if value else 0)
+
+
+def _points(value: object, name: str) -> Tensor:
+    points = as_tensor(value, name)
+    if points.dim() not in (2, 3) or points.shape[-1] != 2:
+        raise ValueError(f"{name} has shape {tuple(points.shape)}; it must be (N, 2) or (B, N, 2)")
+    return points if points.is_floating_point() else points.to(torch.float64)
+
+
+def _field(name: str, value: object, single: bool, points: Tensor) -> Tensor:
+    """A field of a batch: with the leading dimension where one pair's came without, sizes and keys for each pair."""
+    tensor = as_tensor(value, name).to(points.device)
+    if name == "key" and tensor.is_floating_point():
+        raise ValueError(f"key is of {tensor.dtype}; it must be whole numbers (`pair_key` makes them)")
+    tensor = tensor.to(torch.int64) if name == "key" else tensor
+    if name in PER_MATCH:
+        return tensor[None] if single and tensor.dim() == PER_MATCH[name] else tensor
+    shape = tuple(map(int, Correspondences.declared[name].shape[1:]))
+    if tuple(tensor.shape) in (shape, (1, *shape)):
+        return tensor.expand(len(points), *shape)
+    if tuple(tensor.shape) != (len(points), *shape):
+        single_shape = f"{shape} for all pairs" if shape else "one number for all pairs"
+        raise ValueError(
+            f"{name} has shape {tuple(tensor.shape)}; it must be {single_shape}, or {(len(points), *shape)}"
+        )
+    return tensor
+
+
+def _of_list(x0: Sequence[Any], x1: Sequence[Any], fields: Mapping[str, Any]) -> Correspondences:
+    """A padded batch of pairs of different lengths."""
+    count = len(x0)
+    for name, value in {"x1": x1, **{name: fields[name] for name in PER_MATCH if fields.get(name) is not None}}.items():
+        listed = isinstance(value, list | tuple | Tensor | np.ndarray) and getattr(value, "ndim", 1) > 0
+        if not listed or len(cast(Any, value)) != count:
+            raise ValueError(f"{name} must be a list of {count} arrays, one for each pair of x0")
+    if not count:
+        return _batch(torch.zeros(0, 0, 2), torch.zeros(0, 0, 2), {})
+    batch_fields = {
+        name: _field(name, value, False, torch.zeros(count, 0, 2))
+        for name, value in fields.items()
+        if value is not None and name not in PER_MATCH
+    }
+    pairs = []
+    for i in range(count):
+        own = {name: fields[name][i] for name in PER_MATCH if fields.get(name) is not None}
+        pairs.append(_one_of_list(i, x0[i], x1[i], {**own, **{name: value[i] for name, value in batch_fields.items()}}))
+    device, kind = pairs[0].x0.device, functools.reduce(torch.promote_types, (pair.x0.dtype for pair in pairs))
+    return collate(
+        [pair.to(device).replace(x0=pair.x0.to(device, kind), x1=pair.x1.to(device, kind)) for pair in pairs]
+    )
+
+
+def _one_of_list(i: int, x0: Any, x1: Any, fields: Mapping[str, Any]) -> Correspondences:
+    try:
+        points0, points1 = as_tensor(x0, "x0"), as_tensor(x1, "x1")
+        if points0.dim() != 2 or points1.dim() != 2:
+            raise ValueError(
+                f"x0 and x1 have shapes {tuple(points0.shape)} and {tuple(points1.shape)}; both must be (N, 2)"
+            )
+        return _batch(points0, points1, fields)
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"pair {i}: {error}") from error
+
+
+def expect_values(c: Correspondences) -> None:
+    """Raises ValueError naming the first wrong value of the real matches of a batch; a GPU is asked but once."""
+    rules = {name: field.bounds for name, field in c.declared.items() if field.bounds}
+    wrong = {
+        name: ~rule.holds(value.detach()) & (c.mask if name in PER_MATCH else True)
+        for name, rule in rules.items()
+        if (value := getattr(c, name)) is not None
+    }
+    if not wrong or not bool(torch.stack([each.any() for each in wrong.values()]).any()):
+        return
+    name = next(name for name, each in wrong.items() if bool(each.any()))
+    pair, place = wrong[name].nonzero()[0].tolist()
+    value, text = getattr(c, name)[pair], rules[name].text
+    if name in PER_MATCH:
+        raise ValueError(f"{name} of match {place} of pair {pair} is {value[place].item()}; {text}")
+    if name == "focal":
+        raise ValueError(f"focal of image {place} of pair {pair} is {value[place].tolist()}; {text}")
+    raise ValueError(f"{name} is {tuple(value.tolist())}; {text}")
 
 
 def camera_fields(K0: Arrays | None, K1: Arrays | None, focal: Focal, sizes_known: bool) -> dict[str, Any]:
@@ -42,7 +200,7 @@ def camera_fields(K0: Arrays | None, K1: Arrays | None, focal: Focal, sizes_know
     return fields | {"focal": _deviations(focal, K0 is not None, K1 is not None) if fields else _measured(focal)}
 
 
-def expect_calibrations(c: Correspondences) -> None:
+def _expect_calibrations(c: Correspondences) -> None:
     """Raise ValueError naming K0 or K1 where it is no calibration matrix of the image, of a single pair."""
     if len(c) != 1:
         return
@@ -89,7 +247,7 @@ def _floating(value: Any, name: str) -> Tensor:
     return tensor if tensor.is_floating_point() else tensor.to(torch.float64)
 
 
-def expect_pixels(c: Correspondences) -> None:
+def _expect_pixels(c: Correspondences) -> None:
     """Raise ValueError where the points of all pairs are obviously not in pixels, or contradict the image sizes.
 
     Of a batch in which some pairs are sound none is refused: no pair can take its batch down. Points of an image with a

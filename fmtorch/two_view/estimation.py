@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from fmtorch.core.arguments import number
-from fmtorch.core.checks import expect_values
+from fmtorch.core.checks import number
 from fmtorch.core.stages import Estimator, Pruner, model_of
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.estimators.ransac import Ransac
@@ -24,7 +23,6 @@ from fmtorch.presets.files import load
 from fmtorch.presets.objects import construct, instantiate, merged
 from fmtorch.pruning.frame_consistency import FrameConsistency
 from fmtorch.pruning.position_consistency import PositionConsistency
-from fmtorch.two_view.arguments import expect_pixels
 from fmtorch.two_view.known_cameras import KnownCameras
 
 RANSAC = f"fmtorch.estimators.{Ransac.__name__}"  # the `_target_` of presets of this project's own engine
@@ -32,14 +30,13 @@ RANSAC = f"fmtorch.estimators.{Ransac.__name__}"  # the `_target_` of presets of
 
 def estimated(
     c: Correspondences, model: str, name: str, config_dir: Path | str | None, seed: int, options: Mapping[str, Any],
-    covariance: bool = False, in_pixels: bool = True,
+    covariance: bool = False,
 ) -> Estimate:  # fmt: skip
     """The estimate of matches by a preset, with a prior of their consistency where it uses one and none is given.
 
     model: what the preset must estimate. What is known of cameras counts where `focal` or `shared_focal` is given; then
-    the estimate may have a covariance. in_pixels: refuse points that obviously are not.
+    the estimate may have a covariance.
     """
-    expect_values(c)
     seed = int(number("seed", seed, integer=True))
     estimator = estimator_of(name, config_dir, options)
     _expect_gradients(c, estimator, name)
@@ -47,8 +44,6 @@ def estimated(
         option = f" (here by model={model})" if "model" in load("estimator", name, config_dir) else ""
         needed = f"find_{model} needs one that gives {model} matrices{option}"
         raise ValueError(f"estimator={name} gives {gives} matrices; {needed}")
-    if in_pixels:
-        expect_pixels(c)
     return estimated_by(estimator, c, seed, covariance)
 
 

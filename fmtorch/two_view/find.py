@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from fmtorch.core.arguments import Arrays, correspondences
 from fmtorch.core.types import Estimate
-from fmtorch.two_view.arguments import Focal, camera_fields, expect_calibrations
+from fmtorch.two_view.arguments import Arrays, Focal, correspondences
 from fmtorch.two_view.estimation import estimated
 from fmtorch.two_view.pair_type import with_configuration
 
@@ -104,9 +103,8 @@ def find_fundamental(
         focal = "unknown"
     c = correspondences(
         x0, x1, mask=mask, quality=quality, prior=prior, lafs0=lafs0, lafs1=lafs1, noise=noise, size0=size0,
-        size1=size1, key=key, **camera_fields(K0, K1, focal, size0 is not None),
+        size1=size1, K0=K0, K1=K1, focal=focal, key=key,
     )  # fmt: skip
-    expect_calibrations(c)
     if isinstance(focal, Mapping):
         options["focal"] = focal
     estimate = estimated(c, "fundamental", estimator, config_dir, seed, options, covariance)

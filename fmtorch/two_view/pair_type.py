@@ -9,8 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fmtorch.core.estimate import CONFIGURATIONS, WARNINGS
-from fmtorch.core.types import Correspondences, Estimate
+from fmtorch.core.types import CONFIGURATIONS, WARNINGS, Correspondences, Estimate
 from fmtorch.geometry.arithmetic import component_sum, sqrt
 from fmtorch.geometry.epipolar import inverse_root
 from fmtorch.geometry.homography_pose import PlanePoses, poses_from_homography
@@ -28,6 +27,7 @@ from fmtorch.geometry.pair_type import (
 from fmtorch.jit import kernel
 from fmtorch.jit.together import compile_together
 from fmtorch.jobs.threads import one_thread
+from fmtorch.two_view.arguments import expect_values
 from fmtorch.two_view.estimation import estimated, estimator_of
 
 FOCAL_DEVIATION = 0.02
@@ -41,7 +41,7 @@ OTHER_CAMERA = 0.5  # deviation of the logarithm of the ratio of both focal leng
 class Configuration(NamedTuple):
     """Configurations of B pairs.
 
-    kind: indices into `fmtorch.core.estimate.CONFIGURATIONS`. evidence: for the kinds. homography: of the plane, or of
+    kind: indices into `fmtorch.core.types.CONFIGURATIONS`. evidence: for the kinds. homography: of the plane, or of
     the rotation.
     """
 
@@ -127,9 +127,10 @@ def classify(
         raise ValueError(f"estimate is of {len(estimate)} pairs and c of {len(c)}; they must be of the same pairs")
     if not focal_deviation >= 0:
         raise ValueError(f"focal_deviation is {focal_deviation}; it must not be negative")
+    expect_values(c)
     compile_with(())
     matches = c.detach().derived(K0=None, K1=None, focal=None, shared_focal=None)
-    H = estimated(matches, "homography", "homography", None, seed, options, in_pixels=False)
+    H = estimated(matches, "homography", "homography", None, seed, options)
     K0, K1, precision = _cameras(c, focal_deviation)
     with one_thread(c.mask.device):
         evidence = configuration_evidence(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import shutil
 import uuid
 from collections import Counter
@@ -16,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from fmtorch.core.files import replacing
+from fmtorch.core.settings import claim
 from fmtorch.core.stages import Estimator
 from fmtorch.core.types import Correspondences, collate, pair_key
 from fmtorch.io.colmap import DatabaseImage
@@ -76,49 +76,7 @@ def _shared(image0: DatabaseImage, image1: DatabaseImage, cameras: Cameras) -> b
     )
 
 
-# Which pairs of a database an interrupted verification had finished, in a file beside it
-
-
-Ids = tuple[int, int]
-
-
-class VerificationLog:
-    """A text file: the settings, and a line of image numbers for each batch of pairs that is in the database.
-
-    done: pairs finished with these settings; a log of others is begun again.
-    """
-
-    def __init__(self, path: Path, settings: Mapping[str, Any]) -> None:
-        self.path, self.done = path, set[Ids]()
-        first, *lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else [""]
-        wanted = json.dumps(settings, sort_keys=True)
-        self.continued = first == wanted
-        if not self.continued:
-            with replacing(path) as temporary:
-                temporary.write_text(wanted + "\n", encoding="utf-8")
-            return
-        for line in lines:
-            self.done.update(_pairs(line))
-
-    def add(self, pairs: Iterable[Ids]) -> None:
-        """Note pairs as finished, once they are in the database."""
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write("\n" + json.dumps(list(pairs)))
-
-    def remove(self) -> None:
-        """Remove the file."""
-        self.path.unlink(missing_ok=True)
-
-
-def _pairs(line: str) -> list[Ids]:
-    """The pairs of a line; none of a line that was not written to its end."""
-    try:
-        return [(int(first), int(second)) for first, second in json.loads(line)] if line else []
-    except ValueError:
-        return []
-
-
-# Two-view geometries of the shards of one verification, a file a batch in one folder, until they are merged
+# Two-view geometries of a verification that is under way: a file a batch in one folder, until all are there
 
 
 SETTINGS = "settings.json"
@@ -128,22 +86,18 @@ _GeometryIds = tuple[Any, Any]
 
 
 class GeometryParts:
-    """The folder, which any number of shards of the same settings may write to.
+    """The folder, which any number of processes and shards of the same settings may write to.
 
-    Raises ValueError where it holds geometries of other settings.
+    done: the pairs that it has. Raises ValueError where it holds geometries of other settings.
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
         self.folder = folder
-        wanted = json.dumps(settings, sort_keys=True)
-        folder.mkdir(exist_ok=True)
-        file = folder / SETTINGS
-        if not file.exists():
-            with replacing(file) as temporary:
-                temporary.write_text(wanted, encoding="utf-8")
-        if file.read_text(encoding="utf-8") != wanted:
-            raise ValueError(f"{folder} holds shards of other settings or matches; give the same, or delete the folder")
-        self.done: set[_GeometryIds] = {ids for part in self.read() for ids, _ in part}
+        claim(folder / SETTINGS, settings, "geometries", f"give the same, or delete {folder}")
+        self.done: set[_GeometryIds] = set()
+        for path in self._files():
+            with np.load(path) as part:
+                self.done.update(map(_ids, part["pairs"].tolist()))
 
     def write(self, geometries: Iterable[tuple[_GeometryIds, PairGeometry]]) -> None:
         """Keep geometries of pairs, all of them or none."""
@@ -158,18 +112,22 @@ class GeometryParts:
             np.savez(file, pairs=np.array(pairs), kinds=np.array(kinds), **arrays)
         self.done.update(pairs)
 
-    def read(self) -> Iterator[list[tuple[_GeometryIds, PairGeometry]]]:
-        """The geometries, part by part."""
-        for path in sorted(self.folder.glob("*.npz")):
+    def read(self) -> Iterator[tuple[_GeometryIds, PairGeometry]]:
+        """The geometries, each pair's once."""
+        seen: set[_GeometryIds] = set()
+        for path in self._files():
             with np.load(path) as part:
-                yield [
-                    (_ids(ids), _geometry(part, i, str(kind)))
-                    for i, (ids, kind) in enumerate(zip(part["pairs"].tolist(), part["kinds"].tolist(), strict=True))
-                ]
+                for i, (pair, kind) in enumerate(zip(part["pairs"].tolist(), part["kinds"].tolist(), strict=True)):
+                    if (ids := _ids(pair)) not in seen:
+                        seen.add(ids)
+                        yield ids, _geometry(part, i, str(kind))
 
     def remove(self) -> None:
         """Remove the folder."""
         shutil.rmtree(self.folder)
+
+    def _files(self) -> list[Path]:
+        return sorted(self.folder.glob("*.npz"))
 
 
 def _ids(ids: list[Any]) -> _GeometryIds:
@@ -182,18 +140,21 @@ def _geometry(part: Any, i: int, kind: str) -> PairGeometry:
     return PairGeometry(cast(Kind, kind), part[f"inliers-{i}"], *matrices)
 
 
-# Pairs of stored matches, estimated and written batch by batch
+# Pairs of stored matches, estimated batch by batch; their geometries are kept until all are there
 
 
-BATCH = 64  # pairs that are read, and written, at a time
+BATCH = 64  # pairs that are read, and kept, at a time
 PRELOADED = ("fmtorch.verification.run",)  # by the process that workers are forked of
 
 _PairIds = tuple[Any, Any]
 
 
 @runtime_checkable
-class MatchStore(Protocol):
+class PairStore(Protocol):
     """Matches of pairs of images, and a place for their geometries; see `MatchDatabase`."""
+
+    def identity(self) -> dict[str, Any]:
+        """By what the matches are known again, as plain values."""
 
     def pairs(self) -> list[_PairIds]:
         """The pairs of images that have matches."""
@@ -208,7 +169,7 @@ class MatchStore(Protocol):
         """Whether a pair has a geometry, of a failure too."""
 
     def write(self, geometries: Iterable[tuple[_PairIds, PairGeometry]]) -> None:
-        """Write geometries, all of them or none."""
+        """Write the geometries of all pairs, all of them or none."""
 
     def name(self, image_id: Any) -> str:
         """The name of an image."""
@@ -218,9 +179,10 @@ class MatchStore(Protocol):
 class Verification:
     """What `verify` did with a database.
 
-    path: of the database with the geometries. pairs: that have matches. kept: of these, that had a geometry before or
-    were finished by an interrupted run. configurations: of the others, how many of each of COLMAP's kinds. problems:
-    why pairs could not be read, a line each; the next run tries them again. seconds: of the whole.
+    path: of the database with the geometries; of a shard, the folder that keeps them. pairs: that have matches. kept:
+    of these, that had a geometry before, or were finished by an interrupted run or a shard. configurations: how many
+    of each of COLMAP's kinds were written. problems: why pairs could not be read, a line each; the next run tries them
+    again. seconds: of the whole.
     """
 
     path: Path
@@ -299,31 +261,23 @@ def divided(batch: Batch) -> list[Batch]:
 class VerificationRun:
     """The pairs of one store of matches.
 
-    log: of the pairs that count as done, else those with a geometry. shard, parts: only these pairs, and where their
-    geometries go instead; without a shard, whence they come. again: whether a shard does pairs that have a geometry.
+    parts: keeps their geometries. shard: only these pairs, which are kept there; None: all, and `write` moves what is
+    kept into the store. force: estimate pairs that have a geometry in the store, too.
     """
 
-    def __init__(
-        self, database: MatchStore, log: VerificationLog | None = None, shard: Shard | None = None,
-        parts: GeometryParts | None = None, again: bool = False,
-    ) -> None:  # fmt: skip
-        self.database, self.log, self.again = database, log, again
-        self.parts = parts if shard is not None else None
-        self._merged = set[_PairIds]()
-        pairs = database.pairs()
+    def __init__(self, store: PairStore, parts: GeometryParts, shard: Shard | None = None, force: bool = False) -> None:
+        self.store, self.parts = store, parts
+        pairs = store.pairs()
         self.pairs = pairs if shard is None else list(shard.of(pairs))
+        self.todo = [p for p in self.pairs if p not in parts.done and (force or not store.has_geometry(p))]
         self.configurations: Counter[str] = Counter()
         self.problems: list[str] = []
-        self.kept = 0
-        if parts is not None and shard is None:
-            self._merge(parts)
 
     def each_batch(
         self, make: Callable[[], Estimation], execution: Execution, report: Callable[[int, int], None] | None
     ) -> None:
-        """Estimate and write the pairs that are not done, batch by batch; `make` is pickled for workers elsewhere."""
-        todo = [pair for pair in self.pairs if not self._done(pair)]
-        self.kept = len(self.pairs) - len(todo)
+        """Estimate and keep the pairs that are not done, batch by batch; `make` is pickled for workers elsewhere."""
+        todo = self.todo
         if report is not None and todo:
             report(0, len(todo))
         source: Source[Estimation] = Local(make()) if execution.shared else Factory(make)
@@ -335,24 +289,27 @@ class VerificationRun:
                 if report is not None:
                     report(done, len(todo))
 
+    def write(self) -> None:
+        """Write what is kept into the store."""
+        self.configurations.clear()
+        self.store.write(self._counted(self.parts.read()))
+
     def result(self, path: Path, seconds: float) -> Verification:
         """The summary."""
-        counts = dict(self.configurations)
-        return Verification(path, len(self.pairs), self.kept, counts, tuple(self.problems), seconds)
+        kept, counts = len(self.pairs) - len(self.todo), dict(self.configurations)
+        return Verification(path, len(self.pairs), kept, counts, tuple(self.problems), seconds)
 
-    def _done(self, pair: _PairIds) -> bool:
-        if pair in self._merged:
-            return True
-        if self.parts is not None:
-            return pair in self.parts.done or (not self.again and self.database.has_geometry(pair))
-        return self.database.has_geometry(pair) if self.log is None else pair in self.log.done
+    def _counted(self, geometries: Iterable[tuple[_PairIds, PairGeometry]]) -> Iterator[tuple[_PairIds, PairGeometry]]:
+        for ids, geometry in geometries:
+            self.configurations[geometry.kind] += 1
+            yield ids, geometry
 
     def _read(self, pairs: Sequence[_PairIds]) -> Batch:
         batch = Batch([], [], [])
         for pair in pairs:
             try:
-                matches = self.database.matches(pair)
-                batch.pairs.append(DatabasePair(self.database.image(pair[0]), self.database.image(pair[1]), matches))
+                matches = self.store.matches(pair)
+                batch.pairs.append(DatabasePair(self.store.image(pair[0]), self.store.image(pair[1]), matches))
                 batch.ids.append(pair)
             except Exception as error:  # one pair does not end the work on the others
                 batch.problems.append((pair, _first_line(error)))
@@ -360,30 +317,15 @@ class VerificationRun:
 
     def _keep(self, batch: Batch, result: Geometries) -> None:
         self._note([*batch.problems, *result.problems])
-        self._write(result.ids, result.geometries)
-
-    def _write(self, ids: Sequence[_PairIds], results: Sequence[PairGeometry]) -> None:
-        if not ids:
-            return
-        store = self.database if self.parts is None else self.parts
-        store.write(zip(ids, results, strict=True))
-        if self.log is not None and self.parts is None:
-            self.log.add(ids)
-        self.configurations.update(result.kind for result in results)
-
-    def _merge(self, parts: GeometryParts) -> None:
-        """Write what shards found."""
-        for part in parts.read():
-            new = [(ids, geometry) for ids, geometry in part if not self._done(ids)]
-            self._write([ids for ids, _ in new], [geometry for _, geometry in new])
-            self._merged.update(ids for ids, _ in part)
+        if result.ids:
+            self.parts.write(self._counted(zip(result.ids, result.geometries, strict=True)))
 
     def _give_up(self, batch: Batch, reason: str) -> None:
         self._note([*batch.problems, *((ids, reason) for ids in batch.ids)])
 
     def _note(self, problems: Iterable[tuple[_PairIds, str]]) -> None:
         for pair, problem in problems:
-            self.problems.append(f"{', '.join(self.database.name(image) for image in pair)}: {problem}")
+            self.problems.append(f"{', '.join(self.store.name(image) for image in pair)}: {problem}")
 
 
 def _first_line(error: Exception) -> str:

@@ -23,9 +23,8 @@ from rich.progress import track
 from rich.table import Table
 
 from fmtorch import find_homography, metrics, presets
-from fmtorch.core.estimate import CONFIGURATIONS
 from fmtorch.core.files import replacing
-from fmtorch.core.types import Correspondences, collate
+from fmtorch.core.types import CONFIGURATIONS, Correspondences, collate
 from fmtorch.estimators.external import colmap
 from fmtorch.evaluation.pair_cameras import EXACT
 from fmtorch.geometry import poses_from_homography

@@ -18,10 +18,10 @@ import torch
 from rich.progress import track
 
 from fmtorch.data import ImagePair, read_image, to_grey
-from fmtorch.data.baselines import WIDE
 from fmtorch.data.construction import Keypoints, keypoints, matchable
 from fmtorch.evaluation.run import select
 from fmtorch.evaluation.statistics import PERCENT, areas, described, difference, interval, recalled
+from fmtorch.presets.pruners import WIDE
 from scripts.benchmark.kept import Kept, Row, read
 from scripts.benchmark.matched import add_set_arguments, console, sets_of
 from scripts.benchmark.pipelines import add_measure_arguments, measure

@@ -31,7 +31,7 @@ from rich.table import Table
 
 from fmtorch import find_homography, presets
 from fmtorch.core.types import Correspondences
-from fmtorch.evaluation.statistics import bootstrap_mean, paired_bootstrap
+from fmtorch.evaluation.statistics import bootstrap_mean
 from scripts.benchmark.homography_pairs import Case, hard, mapped, points, views, warped
 from scripts.benchmark.matched import console
 
@@ -150,7 +150,7 @@ def report(kind: str, results: dict[str, tuple[Array, Array]], cases: list[Case]
     areas = {m: [np.clip(1 - errors / t, 0, 1).mean(0) * 100 for t in THRESHOLDS] for m, (errors, _) in results.items()}
     first = next(iter(areas.values()))
     for method, of_thresholds in areas.items():
-        lead = paired_bootstrap(first[0], of_thresholds[0], names)
+        lead = bootstrap_mean(first[0] - of_thresholds[0], names)
         figures = [f"{bootstrap_mean(a, names).value:.1f}" for a in of_thresholds]
         table.add_row(method, *figures, f"{lead:+.1f}", f"{np.median(results[method][1]):.2f}")
     console.print(table)

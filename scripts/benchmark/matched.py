@@ -17,9 +17,9 @@ from rich.progress import track
 from fmtorch import data, presets
 from fmtorch.core.types import Correspondences, Estimate
 from fmtorch.data import ImagePair, PairDataset
-from fmtorch.data.baselines import WIDE
 from fmtorch.evaluation.statistics import scene_names
 from fmtorch.pipeline.pipeline import Pipeline
+from fmtorch.presets.pruners import WIDE
 from fmtorch.runs.feature_cache import cached
 from scripts.benchmark import kept
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fmtorch.data.baselines import WIDE
 from fmtorch.evaluation.statistics import PERCENT, Interval, described, difference, interval, recalled
+from fmtorch.presets.pruners import WIDE
 from scripts.benchmark.pipelines_table import REAL, Values, failed, nsgd_by_seed, solved_means
 from scripts.benchmark.pruning_table import KIN, Row, scenes_of
 from scripts.benchmark.sheet import MISSING, Published, Sheet, published, shown

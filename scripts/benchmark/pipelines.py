@@ -20,10 +20,10 @@ from rich.progress import track
 
 from fmtorch import presets
 from fmtorch.data import ImagePair
-from fmtorch.data.baselines import WIDE
 from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.run import select
 from fmtorch.pipeline.pipeline import Outcome, Pipeline
+from fmtorch.presets.pruners import WIDE
 from fmtorch.runs import identity_digest
 from fmtorch.runs.feature_cache import CachedFeatures
 from fmtorch.runs.fingerprint import configuration

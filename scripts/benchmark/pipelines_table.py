@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.data.baselines import WIDE
 from fmtorch.evaluation.statistics import PERCENT, areas, described, difference, interval, recalled
+from fmtorch.presets.pruners import WIDE
 from scripts.benchmark.pruning_table import KIN, Row, scenes_of
 from scripts.benchmark.sheet import Published, Sheet, compared, published, shown
 

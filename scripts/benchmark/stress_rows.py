@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fmtorch.data.baselines import WIDE
 from fmtorch.evaluation.statistics import scene_names
+from fmtorch.presets.pruners import WIDE
 from fmtorch.scenes.generate import FAMILIES
 from scripts.benchmark.stress_changes import CONDITIONS
 

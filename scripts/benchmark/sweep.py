@@ -18,9 +18,9 @@ import pyarrow as pa
 
 from fmtorch import presets
 from fmtorch.commands.report import run_folders
-from fmtorch.data.baselines import WIDE
 from fmtorch.evaluation.statistics import MERITS, PERCENT, SHARES, described, difference, scene_names
 from fmtorch.evaluation.summary import ALL, summarize
+from fmtorch.presets.pruners import WIDE
 from fmtorch.runs import RunFolder
 from scripts.benchmark.matched import console
 from scripts.benchmark.pipelines_table import PAPER, REAL

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import os
-import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -13,9 +12,11 @@ import pytest
 
 import fmtorch.__main__
 from fmtorch.commands import list as list_presets
+from fmtorch.commands import main as commands
 from fmtorch.commands import warm_up
-from fmtorch.commands.overrides import hydra_arguments
-from fmtorch.presets import available, top_level_names
+from fmtorch.commands.config import hydra_arguments
+from fmtorch.commands.options import COMMANDS
+from fmtorch.presets import available
 from tests.conftest import own_cache
 from tests.pipeline.test_pipeline import draw
 
@@ -37,22 +38,21 @@ def test_help_lists_the_commands_without_torch() -> None:
         "with contextlib.redirect_stdout(io.StringIO()) as told: main()\n"
         "names = ('eval', 'list', 'match', 'pairs', 'report', 'train', 'verify', 'warm-up')\n"
         "assert all(f'  {name} ' in told.getvalue() for name in names)\n"
-        "assert not {'torch', 'hydra', 'numpy'} & set(sys.modules)"
+        "with contextlib.redirect_stdout(io.StringIO()) as told: main(['eval', '--help'])\n"
+        "assert '  limit=null ' in told.getvalue()\n"
+        "assert not {'torch', 'hydra', 'numpy', 'cv2', 'pyarrow', 'rich', 'yaml'} & set(sys.modules)"
     )
 
 
 def test_a_subcommand_runs_as_its_module_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Parts of a user's own are found in the working folder, wherever the script lies."""
     called = []
-    monkeypatch.setattr(
-        runpy, "run_module", lambda *args, **options: called.append((args, options, sys.argv, sys.path[0]))
-    )
+    monkeypatch.setattr("fmtorch.commands.eval.main", lambda: called.append((sys.argv, sys.path[0])))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", ["/usr/bin", *sys.path])
     monkeypatch.setattr(sys, "argv", ["/usr/bin/fmtorch", "eval", "-m", "seed=1,2"])
     fmtorch.__main__.main()
-    options = {"run_name": "__main__", "alter_sys": True}
-    assert called == [(("fmtorch.eval",), options, ["/usr/bin/fmtorch", "-m", "seed=1,2"], str(tmp_path))]
+    assert called == [(["/usr/bin/fmtorch", "-m", "seed=1,2"], str(tmp_path))]
     monkeypatch.setattr(sys, "argv", ["fmtorch", "evaluate"])
     there = "eval, list, match, pairs, report, train, verify, warm-up"
     with pytest.raises(SystemExit, match=f"error: no command 'evaluate'; there are: {there}"):
@@ -61,9 +61,8 @@ def test_a_subcommand_runs_as_its_module_does(tmp_path: Path, monkeypatch: pytes
 
 def test_match_is_the_function_and_its_command_can_be_imported() -> None:
     python(
-        "from fmtorch.match import main, run\n"  # the submodule before the function
-        "import inspect, sys, fmtorch, fmtorch.commands.match as command, fmtorch.match as imported\n"
-        "assert run is command.run and main is command.main\n"
+        "import fmtorch.match\n"  # the submodule before the function
+        "import inspect, sys, fmtorch, fmtorch.match as imported\n"
         "assert inspect.isfunction(fmtorch.match) and imported is fmtorch.match\n"
         "from fmtorch import match\n"
         "assert match is fmtorch.match\n"
@@ -247,19 +246,15 @@ def test_a_sweep_runs_in_processes_of_a_launcher(
 
 
 @pytest.mark.parametrize("command", ["eval", "match", "pairs", "report", "train", "verify"])
-def test_help_is_ours_and_fits_a_page(
-    command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_help_is_ours_and_fits_a_page(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     """A command's own options with a line each come first; Hydra's page is at --hydra-help."""
-    monkeypatch.setattr(sys, "argv", [command, "--help"])
-    importlib.import_module(f"fmtorch.commands.{command}").main()
+    commands.main([command, "--help"])
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith(f"usage: fmtorch {command}")
     assert len(lines) < 60
-    fields = [name for name in top_level_names(command) if name != "hydra"]
-    assert all(any(line.startswith(f"  {name}=") for line in lines) for name in fields)
-    monkeypatch.setattr(sys, "argv", [command, "--version"])
-    importlib.import_module(f"fmtorch.commands.{command}").main()
+    told = {line.split("=")[0].strip().removesuffix(".NAME") for line in lines if "=" in line}
+    assert told >= set(COMMANDS[command].names)
+    commands.main([command, "--version"])
     assert capsys.readouterr().out.strip() == fmtorch.__version__
 
 

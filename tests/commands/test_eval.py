@@ -68,7 +68,7 @@ def test_a_run_from_start_to_end(root: Path, tmp_path: Path) -> None:
     assert summary["all"]["pairs"] == 5
     assert summary["all"]["failures"] == 2
     assert "%Recall" in second.stdout
-    assert (run_dir / "recall.png").read_bytes().startswith(b"\x89PNG")
+    assert (run_dir / "recall.svg").read_text().startswith("<svg")
     assert not (tmp_path / "outputs").exists()  # Hydra leaves nothing of its own
 
     # The folder's summary is of all its rows, also where a command asks for fewer.

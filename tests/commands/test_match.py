@@ -21,9 +21,8 @@ from PIL import Image
 import fmtorch
 from fmtorch import presets
 from fmtorch.commands import match as match_command
-from fmtorch.core.estimate import WARNINGS
 from fmtorch.core.files import conf_dir
-from fmtorch.core.types import RELATED
+from fmtorch.core.types import RELATED, WARNINGS
 from fmtorch.data import ImageError, read_image
 from fmtorch.geometry import homography_points, sampson
 from fmtorch.metrics import nsgd

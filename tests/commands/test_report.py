@@ -24,8 +24,8 @@ from fmtorch.evaluation.rows import evaluate
 from fmtorch.evaluation.summary import summarize
 from fmtorch.pipeline.build import build_pipeline
 from fmtorch.pipeline.pipeline import Outcome
-from fmtorch.presets.composition import compose
 from fmtorch.runs import PairRow, RunFolder, RunFolderError, to_table
+from tests.helpers import compose
 from tests.pipeline.test_pipeline import draw, pair
 from tests.processes import run_command
 
@@ -64,8 +64,8 @@ def test_figures_and_differences_are_those_of_the_rows() -> None:
 def test_poses_are_shown_where_a_run_has_them() -> None:
     posed = [dataclasses.replace(r, rotation_error=2.0, translation_error=4.0) for r in results([0.01] * 4)]
     runs = {"with": to_table(posed), "without": to_table(results([0.01] * 4))}
-    table = tables.poses({name: summarize(rows) for name, rows in runs.items()})
-    assert table is not None
+    summaries = {name: summarize(rows) for name, rows in runs.items()}
+    table = next(each for each in tables.report_tables(runs, summaries) if each.heading == "Relative pose")
     figures = dict(zip(table.head[1:], (cell.text for cell in table.rows["with"]), strict=True))
     # To 4 degrees a triangle up to the first of the four pairs, then 6 at 1.
     assert figures["AUC@10°"] == "65.0"
@@ -81,13 +81,12 @@ def test_signed_translations_are_said_and_told_apart_from_folded_ones() -> None:
     folded = [dataclasses.replace(r, rotation_error=2.0, translation_error=10.0) for r in results([0.01] * 4)]
     runs = {"a": to_table(posed), "b": to_table(folded)}
     summaries = {name: summarize(rows, name == "a") for name, rows in runs.items()}
-    alone, both = tables.poses({"a": summaries["a"]}), tables.poses(summaries)
-    assert alone is not None
-    assert both is not None
-    assert alone.head[-1] == "t error, signed"
+    overall = {name: summary["all"] for name, summary in summaries.items()}
+    (alone,), (both,) = tables.parts({"a": overall["a"]}), tables.parts(overall)
+    assert list(alone.columns)[-1] == "t error, signed"
     assert "whose sign counts" in alone.note
     assert "folded" not in alone.note
-    assert both.head[-1] == "t error"
+    assert list(both.columns)[-1] == "t error"
     assert "b: Of the pairs" in both.note
     assert "a: Of the pairs" in both.note
     page = render("Poses", [Section("set", runs, signed=["a"])], [])

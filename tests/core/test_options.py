@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol, TypedDict, TypeVar
 
+import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
@@ -51,6 +52,7 @@ OBJECT = {"_target_": "any.Thing"}
         (Path | str | None, ["a", None], [3]),
         (Literal["x", 2], ["x", 2], ["y", 3, None]),
         (Annotated[int, Within(1, 5)], [1, 5], [0, 6, 2.0, "x"]),
+        (Annotated[float, Within(0, 1, exclusive=True)], [0.5, np.float32(0.5)], [0, 1, -1, 2.0, np.float32(0)]),
         (Annotated[float, Within(maximum=1)] | None, [None, -2, 1], [1.5, "x"]),
         (list[int], [[], [1, 2]], [[1.5], 1, "12", {}]),
         (Sequence[str], [["a"], ("a",)], ["abc", [1], None]),
@@ -93,7 +95,7 @@ class Wide:
         (Wide, {"threshold": 1, "level": 2}, "here: no option level; there are: levels, "),
         (Wide, {"threshold": 1, "first": {"matches": "all"}}, "here.first.matches=all; it must be a whole number"),
         (Wide, {"threshold": 1, "first": {"match": 3}}, "here.first: no option match; there are: matches, scale"),
-        (Wide, {"threshold": 1, "first": 3}, "here.first=3; it must be a Part"),
+        (Wide, {"threshold": 1, "first": 3}, "here.first=3; it must be a mapping of: matches, scale"),
         (takes, {"needed": 1, "part": {"scale": [1]}}, r"here.part.scale=\[1\]; it must be a number or null"),
         (any_more, {"a": None, "b": 1}, "here.a=null; it must be a whole number"),
     ],

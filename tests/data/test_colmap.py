@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from fmtorch.data import DataError, DepthDataset, ImageError, load, read_image
-from fmtorch.data.colmap import read_model
+from fmtorch.data.colmap_model import read_model
 from fmtorch.data.lenses import Lens
 from tests.conftest import shared_path
 from tests.data.native import SIZE, to_binary, write_colmap, write_image

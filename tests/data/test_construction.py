@@ -110,7 +110,7 @@ def test_the_command_makes_a_set_of_the_pairs_that_can_be_matched(
         assert pair.problem is None
     assert (tmp_path / "Made/a/names.txt").read_text().splitlines()[1] == "00000001 Set/a/00000001"
     assert not (tmp_path / "Made/work").exists()
-    assert json.loads((tmp_path / "Made/pairs.json").read_text())["summary"] == {
+    assert json.loads((tmp_path / "Made/summary.json").read_text()) == {
         "candidates": 20, "judged": 20, "kept": 4, "images": 6,
     }  # fmt: skip
 
@@ -120,7 +120,10 @@ def test_a_finished_set_is_not_made_again_and_another_is_refused(
 ) -> None:
     (tmp_path / "Made").mkdir()
     (tmp_path / "Made/notes.txt").write_text("mine")
-    with pytest.raises(SystemExit, match="error: output=Made holds something else; name a new folder"):
+    with pytest.raises(
+        SystemExit,
+        match=r"error: Made is not empty and has no pairs\.json, .*; name another folder",
+    ):
         run(tmp_path, monkeypatch, "count=1")
     (tmp_path / "Made/notes.txt").unlink()
     run(tmp_path, monkeypatch, "count=1")
@@ -129,7 +132,7 @@ def test_a_finished_set_is_not_made_again_and_another_is_refused(
     run(tmp_path, monkeypatch, "count=1")
     assert "Made is complete" in capsys.readouterr().out
     assert (tmp_path / "Made/pairs_with_gt.txt").stat().st_mtime_ns == before
-    with pytest.raises(SystemExit, match="output=Made holds pairs that differ in count 1 there, 2 now; name another"):
+    with pytest.raises(SystemExit, match=r"Made holds pairs of other settings; .*: count: 1 -> 2\. Name another"):
         run(tmp_path, monkeypatch, "count=2")
 
 
@@ -139,8 +142,11 @@ def test_a_finished_set_is_not_made_again_and_another_is_refused(
         (["output=null"], "output is missing; it names the folder of the set that is made"),
         (["count=0"], "count=0; it must be a whole number of at least 1 or null"),
         (["quality=101"], "quality=101; it must be a whole number from 1 to 100"),
-        (["dataset=stereo"], "dataset=stereo has no candidates to judge; it must be one of tum, kitti, colmap"),
-        (["dataset=fmbench"], "dataset=fmbench has no candidates to judge"),
+        (
+            ["dataset=stereo", "dataset.root=null"],
+            "dataset=stereo has no candidates to judge; it must be one of tum, kitti, colmap",
+        ),
+        (["dataset=fmbench", "dataset.root=null"], "fmbench needs root"),
         (["dataset=kitti"], "no such folder; it must hold a folder for each sequence"),
         (["dataset.fps=0"], "fps=0; it must be positive, or null for images in no order"),
         (["dataset.root=empty"], "no folder with Camera.txt, one line an image: K"),
@@ -177,10 +183,8 @@ def test_a_draw_is_the_same_however_it_is_interrupted(
     broken.begin()
     for number, ranks in list(blocks(broken.order()))[:9]:
         broken.judge(number, ranks)
-    asked = list[object]()
-    monkeypatch.setattr(
-        "fmtorch.data.construction.matchable", lambda *given: asked.append(given) or rule.matchable(*given)
-    )
+    asked, matchable = list[object](), rule.matchable
+    monkeypatch.setattr(rule, "matchable", lambda *given: asked.append(given) or matchable(*given))
     run(tmp_path, monkeypatch, "count=3", "seed=5", "workers=1")
     last = uninterrupted.order().tolist().index(passed[2])
     judged = [dataset.candidate(rank) for rank in uninterrupted.order()[9 : last + 1].tolist()]  # type: ignore[attr-defined]

@@ -131,7 +131,7 @@ def test_cameras_must_fit(tmp_path: Path) -> None:
 
 
 def test_load_names_what_there_is() -> None:
-    with pytest.raises(DataError, match="no data set 'kity'; there are fmbench"):
+    with pytest.raises(ValueError, match="no preset 'kity' in conf/dataset; there are: kitti, "):
         load("kity")
     with pytest.raises(DataError, match="fmbench needs root"):
         load("fmbench")

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from fmtorch.data import DataError, load, model_of, read_image
-from fmtorch.data.hpatches import LARGE
+from fmtorch.data import DataError, load, read_image
+from fmtorch.data.hpatches import LARGE, HPatchesPairs
 from tests.data import planes
 
 
@@ -20,8 +20,7 @@ def test_pairs_are_image_1_with_the_others(tmp_path: Path) -> None:
         ("illumination", "i_light"), ("viewpoint", "v_view"),
     ]  # fmt: skip
     assert len(dataset) == 10
-    assert model_of("hpatches") == "homography"
-    assert model_of("tum") == "fundamental"
+    assert HPatchesPairs.model == "homography"
     for k, pair in enumerate(list(dataset)[5:], start=2):
         H = planes.view(k) / np.linalg.norm(planes.view(k))
         assert pair.H is not None

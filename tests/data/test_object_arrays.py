@@ -80,6 +80,29 @@ def test_a_pickle_that_runs_code_is_refused(tmp_path: Path) -> None:
     assert ran.exists()  # the file does run code where it is trusted
 
 
+class _Pointers:
+    """An array of objects given by the bytes of their addresses, of a dtype whose flags deny that it holds objects."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        reconstruct, arguments, _ = np.zeros(1).__reduce__()  # type: ignore[misc]
+        return reconstruct, arguments, (1, (1,), _Objects(), False, b"A" * 8)
+
+
+class _Objects:
+    def __reduce__(self) -> tuple[Any, ...]:
+        return np.dtype, ("O8", False, True), (3, "|", None, None, None, -1, -1, 0)
+
+
+def test_addresses_of_objects_are_refused(tmp_path: Path) -> None:
+    """NumPy's own functions, all of them names that arrays need, take the bytes for addresses: the process crashes."""
+    path = tmp_path / "a.npz"
+    with zipfile.ZipFile(path, "w") as file, file.open("x.npy", "w") as stream:
+        np.lib.format.write_array_header_1_0(stream, {"descr": "|O", "fortran_order": False, "shape": (1,)})
+        pickle.dump(_Pointers(), stream)
+    with pytest.raises(DataError, match=r"a\.npz: 'x' cannot be read"):
+        NpzArrays(path)["x"]
+
+
 @pytest.mark.parametrize("damage", [slice(0, 60), slice(0, -40)])
 def test_damaged_files_say_so(tmp_path: Path, damage: slice) -> None:
     path = tmp_path / "a.npz"

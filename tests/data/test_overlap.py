@@ -171,9 +171,9 @@ def test_the_command_selects_by_overlap(tmp_path: Path, monkeypatch: pytest.Monk
     run(tmp_path, monkeypatch, *words, "overlap=[0.7,0.9]")
     selected = load("fmbench", root=tmp_path / "Made")
     assert [pair.identity for pair in selected] == ["Made/a/0-2", "Made/a/1-2"]
-    rule = json.loads((tmp_path / "Made/pairs.json").read_text())["identity"]["rule"]
+    rule = json.loads((tmp_path / "Made/pairs.json").read_text())["rule"]
     assert rule == {"overlap": [0.7, 0.9], "by": "points"}
-    with pytest.raises(SystemExit, match=r"holds pairs that differ in rule .*name another folder"):
+    with pytest.raises(SystemExit, match=r"holds pairs of other settings; .*: rule\.overlap: .*Name another folder"):
         run(tmp_path, monkeypatch, *words, "overlap=[0.6,0.9]")
     run(tmp_path, monkeypatch, *words, "overlap=[0.6,0.6]", "output=Other")
     assert [pair.identity for pair in load("fmbench", root=tmp_path / "Other")] == ["Other/a/0-1"]
@@ -182,7 +182,7 @@ def test_the_command_selects_by_overlap(tmp_path: Path, monkeypatch: pytest.Monk
 def test_the_command_selects_from_rendered_scenes(
     rendered: RenderedScenePairs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fmtorch.data.load", lambda **_: rendered.drawn)
+    monkeypatch.setattr("fmtorch.data.build", lambda *_: rendered.drawn)
     run(tmp_path, monkeypatch, "dataset=rendered", "overlap=[0.1,0.6]")
     monkeypatch.undo()
     overlaps = overlap_of(rendered)

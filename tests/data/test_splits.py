@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
+
 import pytest
 
-from fmtorch import data, presets
+from fmtorch import presets
 from fmtorch.data import DataError
 from fmtorch.data.scenes import SPLITS, chosen
 
@@ -34,12 +36,9 @@ def test_what_no_split_holds_is_told() -> None:
         chosen("kitti", "test", [], [])
 
 
-@pytest.mark.parametrize("name", data.SCENE_SETS)
+@pytest.mark.parametrize("name", presets.available("dataset"))
 def test_the_preset_has_every_option_with_the_readers_default(name: str) -> None:
-    import inspect
-
     preset = presets.load("dataset", name)
-    module, reader = data._CLASSES[name]
-    parameters = inspect.signature(getattr(__import__(module, fromlist=[reader]), reader)).parameters
-    defaults = {key: p.default for key, p in parameters.items() if key != "root"}
-    assert {key: value for key, value in preset.items() if key not in ("name", "root")} == defaults
+    parameters = inspect.signature(presets.target_of(preset, "dataset")).parameters
+    defaults = {key: p.default for key, p in parameters.items() if p.kind is not p.KEYWORD_ONLY}
+    assert {key: value for key, value in preset.items() if key != "_target_"} == defaults

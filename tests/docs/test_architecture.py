@@ -1,52 +1,23 @@
-"""docs/architecture.md tells the way of a seven-point sample as it is."""
+"""docs/architecture.md tells the rules of the rooms as they are; tests/test_road.py holds its road of a pair."""
 
 from __future__ import annotations
 
 import re
-import sys
 from pathlib import Path
-from typing import Any
 
-import numpy as np
+from tests.test_imports import GROUND, MAY_IMPORT
 
-import fmtorch
-from fmtorch.estimators import Ransac
-from tests.estimators.pairs import pair_of
-from tests.laws import scene
-
-PACKAGE = Path(fmtorch.__file__).parent
-PAGE = (PACKAGE.parent / "docs" / "architecture.md").read_text(encoding="utf-8")
-PASSED_ON = {"parts/preselection.py", "parts/refinement.py", "parts/selection.py"}  # models to scores and family
+SOURCE = Path(__file__).resolve().parents[2]
+PAGE = (SOURCE / "docs" / "architecture.md").read_text(encoding="utf-8")
 
 
-def short(path: str | Path) -> str:
-    return Path(path).resolve().relative_to(PACKAGE).as_posix().removeprefix("estimators/")
-
-
-def test_the_way_of_a_seven_point_sample_is_five_files() -> None:
-    paragraph = PAGE[PAGE.index("**The way of a seven-point sample**") :].split("\n\n")[0]
-    files = re.findall(r"`([\w/]+\.py)`", paragraph)
-    assert len(files) == 5
-    engine = Ransac(hypotheses=50, round=50, refine={"kernel": "truncated"}, final="none")
-    pair, called = pair_of(scene(1, 60)), set()
-
-    def seen(frame: Any, event: str, argument: Any) -> None:
-        """The files of the functions that hold models or samples of a round."""
-        local = frame.f_code.co_varnames[: frame.f_code.co_argcount]
-        where = Path(frame.f_code.co_filename)
-        if event == "call" and where.is_relative_to(PACKAGE / "estimators"):
-            arrays = [frame.f_locals[name] for name in local if isinstance(frame.f_locals.get(name), np.ndarray)]
-            if any(array.ndim == 2 and (array.shape[1] == 9 or array.shape[0] == 7) for array in arrays):
-                called.add(short(where))
-
-    sys.setprofile(seen)
-    try:
-        assert engine.estimate(pair).fit is not None
-    finally:
-        sys.setprofile(None)
-    kernel = type(engine.family).minimal
-    solver, drawn, search = (
-        short(sys.modules[each.__module__].__file__ or "")
-        for each in (getattr(kernel, "function", kernel), type(engine.sampler), type(engine.search))
-    )
-    assert called - PASSED_ON | {solver, drawn, search} == set(files)
+def test_what_a_room_may_import() -> None:
+    rules = dict(re.findall(r"^\| `(\w+)/` \|.*\| ([^|]*) \|$", PAGE, re.MULTILINE))
+    everything = {"all": MAY_IMPORT.keys(), "all but `commands`": MAY_IMPORT.keys() - {"commands"}}
+    read = {
+        room: everything.get(
+            rule, set(re.findall(r"`(\w+)`", rule)) | set(GROUND.split() if "*ground*" in rule else ())
+        )
+        for room, rule in rules.items()
+    }
+    assert read == {room: set(allowed.split()) for room, allowed in MAY_IMPORT.items()}

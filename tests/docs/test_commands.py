@@ -40,13 +40,11 @@ SETS = ("Strecha", "PhotoTourism", "KITTI", "TUM", "Strecha_train", "TanksLike")
 
 ELSEWHERE = {
     r"python3? -m venv|pip install": "a fresh environment: continuous integration runs these",
-    r"python -m pytest|ruff check|sphinx-build": "what continuous integration does",
+    r"python -m pytest|ruff check|^\.ci/": "what continuous integration does",
     r"scripts/download": "tests/test_download.py runs it against a server of its own",
-    r"make_models.py ngransac": "needs the authors' weights; tests/pruning/networks/test_files.py runs it on others",
     r"benchmark homography": "needs a folder of photographs; tests/estimators/models/test_homography.py warps one",
     r"benchmark configuration": "needs photographs; tests/scripts/test_benchmark_configuration.py runs it on some",
     r"\bdask (scheduler|worker)\b": "tests/evaluation/test_executors.py runs a cluster",
-    r"--contrib-python": "needs a Python with opencv-contrib",
     r"--config-dir my_conf (pruner|pipeline)=": "tests/training/test_train_command.py runs these files and commands",
     r"dataset=(tum|kitti|colmap|bundler|fmbench dataset\.root=KITTI)": "tests/data runs these on data of their layout",
     r"pipeline=vismatch|(dataset=|runs/)pair_list": "tests/matching/test_vismatch.py runs a stand-in on lists of pairs",
@@ -58,12 +56,9 @@ ELSEWHERE = {
 """Commands that are not run here, and why."""
 
 SLOW = (
-    r"fmtorch\.train",
+    r"fmtorch train",
     r"benchmark (memory|features)",
     r"-m pipeline=",
-    r"--marker rendered",
-    r"--label",
-    r"benchmark related .*(hardnet|hesaffnet)",
     r"benchmark (paper|gc_ransac|sweep)",
 )
 
@@ -79,18 +74,18 @@ TRAINED = [
     "validation.scenes=1", "validation.pairs=1", "checkpoint_every=2", "workers=1", *TINY,
 ]  # fmt: skip
 APPENDED = {
-    "fmtorch.match": ["pipeline=sift_gms", *TINY],
-    "fmtorch.eval": [*DATASET, *TINY, "workers=1"],
-    "fmtorch.train": [
+    "fmtorch match": ["pipeline=sift_gms", *TINY],
+    "fmtorch eval": [*DATASET, *TINY, "workers=1"],
+    "fmtorch train": [
         "dataset=fmbench",
         "dataset.root=DATA",
         "dataset.sets=[Strecha_train,TanksLike]",
         *TRAINED,
         *TINY,
     ],
-    "fmtorch.pairs": ["dataset.root=DATA/Strecha", "workers=1"],
-    "fmtorch.verify": ["estimator.focal.rounds=3"],
-    "fmtorch.report": ["pictures=1", "root=DATA/Strecha"],
+    "fmtorch pairs": ["dataset.root=DATA/Strecha", "workers=1"],
+    "fmtorch verify": ["estimator.focal.rounds=3"],
+    "fmtorch report": ["pictures=1", "root=DATA/Strecha"],
     "estimators": ["--limit", "1", "--seeds", "1"],
     "cameras": ["--limit", "1", "--seeds", "1"],
     "curves": ["--limit", "1", "--specs", "curves.txt"],
@@ -144,7 +139,6 @@ def smaller(command: str) -> list[str]:
     for pattern, replacement in (
         (r"--rendered \w+", "--root DATA/Strecha"),
         (r"--root DATA/\w+ (?=.*--root)", ""),
-        (r" --ngransac \S+", ""),
         (r" dataset\.size=\w+", ""),
         (r" '?dataset\.sets=\[\S*\]'?", ""),
         (r"FOLDER", "kept"),
@@ -154,11 +148,11 @@ def smaller(command: str) -> list[str]:
         (r" d\.json", ""),
         (r"runs=\[runs/a,runs/b\]|runs/a runs/b", "runs=[runs/fmbench]"),
         (r" 'root=\[\S*\]'", ""),
-        (r"^fmtorch (\w+)", r"python -m fmtorch.\1"),
+        (r"^(python -m )?fmtorch[. ](\w+)", r"python -m fmtorch \2"),
     ):
         text = re.sub(pattern, replacement, text)
     words = shlex.split(text)
-    name = words[3] if words[2] == "scripts.benchmark" else words[2]
+    name = words[3] if words[2] == "scripts.benchmark" else " ".join(words[2:4])
     if name not in APPENDED:
         raise AssertionError(f"no rule for {command!r}: say in APPENDED how to run it small, or in ELSEWHERE why not")
     added = APPENDED[name]
@@ -259,8 +253,8 @@ def as_a_command(words: list[str], folder: Path) -> Iterator[None]:
 def run(words: list[str], folder: Path) -> None:
     """`python -m MODULE ...`: within this process, which saves its start, where the module can be run twice in one."""
     assert words[:2] == ["python", "-m"], words
-    if words[2] == "fmtorch.report":  # defines classes of its own, which the tests' type checker would mistake
-        ended = run_command("report", *words[3:], cwd=folder)
+    if words[2:4] == ["fmtorch", "report"]:  # defines classes of its own, which the tests' type checker would mistake
+        ended = run_command("report", *words[4:], cwd=folder)
         assert ended.returncode == 0, ended.stderr
         return
     with as_a_command(words[2:], folder):
@@ -290,7 +284,7 @@ def run_all(page_commands: list[str], workplace: Path, monkeypatch: pytest.Monke
     for command in page_commands:
         print(command)
         if ("report" in command or "sweep runs" in command) and not (workplace / "runs").exists():
-            run(smaller("python -m fmtorch.eval pipeline=sift_ratio"), workplace)
+            run(smaller("fmtorch eval pipeline=sift_ratio"), workplace)
         run(smaller(command), workplace)
 
 

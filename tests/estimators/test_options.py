@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import typing
 from pathlib import Path
 
 import numpy as np
@@ -10,43 +11,60 @@ import torch
 
 from fmtorch import find_fundamental, presets
 from fmtorch.estimators import Ransac
-from fmtorch.estimators.options import Focal, Preselect, Refine, Select, group
+from fmtorch.estimators.options import Focal, Preselect, Refine, Select, stage
 from fmtorch.estimators.pair import Pair
 from fmtorch.estimators.registry import PARTS, part
 from fmtorch.estimators.scores import InlierCount, Msac, scored_matches, squared_residuals_of
+from fmtorch.geometry.levenberg_marquardt import LOSSES
 from tests.laws import scene
 
 MEDIAN = {"score": "median", "inliers": "lmeds", "confidence": None}
 
 
 def test_groups_are_made_of_mappings() -> None:
-    assert group("preselect", {"survivors": 64}, Preselect) == Preselect(128, 64)
-    assert group("refine", {"kernel": "cauchy", "scale": 0.5}, Refine) == Refine("cauchy", 0.5)
-    assert group("focal", None, Focal) is None
-    with pytest.raises(ValueError, match="refine is 'truncated'; it must be null or a mapping of: kernel, scale"):
-        group("refine", "truncated", Refine)
+    assert stage({"survivors": 64}, Preselect) == Preselect(128, 64)
+    assert stage({"kernel": "cauchy", "scale": 0.5}, Refine) == Refine("cauchy", 0.5)
+    assert stage(None, Focal) is None
     select = Select(scale=0.3)
-    assert group("select", select, Select) is select
+    assert stage(select, Select) is select
+    with pytest.raises(ValueError, match="estimator=ransac: refine=truncated; it must be a mapping of: kernel, scale"):
+        presets.build("estimator", "ransac", refine="truncated")
+
+
+def test_losses_that_refine_names_are_those_there_are() -> None:
+    assert typing.get_args(typing.get_type_hints(Refine)["kernel"]) == tuple(LOSSES)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"refine": {"kernel": "truncated", "threshold": 1}}, "refine: no option threshold; there are: kernel"),
+        ({"refine": {"kernel": "truncated", "threshold": 1}}, "refine: no option threshold; there are: "),
         ({"refine": {"scale": 1.0}}, "refine: kernel is missing"),
-        ({"refine": {"kernel": "l1"}}, "kernel is 'l1'"),
-        ({"refine": {"kernel": "cauchy", "scale": 0.0}}, "refine.scale is 0.0; it must be positive"),
-        ({"refine": {"kernel": "cauchy", "matches": 0}}, "refine.matches is 0; it must be at least 1"),
-        ({"preselect": {"matches": 0}}, "preselect.matches is 0; it must be at least 1"),
-        ({"select": {"scale": 0.0}}, "select.scale is 0.0; it must be positive"),
-        ({"select": {}, "focal": {"samples": -1}}, "focal.samples is -1; it must be at least 0"),
+        (
+            {"refine": {"kernel": "l1"}},
+            "refine.kernel=l1; it must be one of: huber, cauchy, geman_mcclure",
+        ),
+        ({"refine": {"kernel": "cauchy", "scale": 0.0}}, "refine.scale=0.0; it must be a number above 0"),
+        ({"refine": {"kernel": "cauchy", "matches": 0}}, "refine.matches=0; it must be a whole number of at least 1"),
+        ({"preselect": {"matches": 0}}, "preselect.matches=0; it must be a whole number of at least 1"),
+        ({"preselect": Preselect(survivors=0)}, "preselect.survivors=0; it must be a whole number of at least 1"),
+        ({"select": {"scale": 0.0}}, "select.scale=0.0; it must be a number above 0"),
+        ({"select": {}, "focal": {"samples": -1}}, "focal.samples=-1; it must be a whole number of at least 0"),
         ({"select": {}, "focal": {"min_rounds": 2}}, "focal.min_rounds is 2; it must be at most focal.rounds, 1"),
-        ({"select": {}, "focal": {"confirmations": 0}}, "focal.confirmations is 0; it must be at least 1"),
+        (
+            {"select": {}, "focal": {"confirmations": 0}},
+            "focal.confirmations=0; it must be a whole number",
+        ),
         ({"focal": {}}, "focal needs select"),
         ({"score": "prior_saturated"}, "score is 'prior_saturated'; it must be one of: inlier_count, msac, saturated"),
-        ({"score": {"name": "msac", "weighted": True}}, "score=msac: no option weighted; there are: threshold, prior"),
+        (
+            {"score": {"name": "msac", "weighted": True}},
+            "score=msac: no option weighted; there are: prior_weighted",
+        ),
         ({"score": {"prior_weighted": True}}, "score is None; it must be one of"),
-        ({"pool": 0}, "pool is 0; it must be at least 1"),
+        ({"pool": 0}, "pool=0; it must be a whole number of at least 1"),
+        ({"confidence": 1.0}, "confidence=1.0; it must be a number between 0 and 1 or null"),
+        ({"select": {}, "focal": {"exact": {"scale": -1}}}, "focal.exact.scale=-1; it must be a number above 0"),
         (MEDIAN | {"threshold": 2.0}, "threshold=2.0 has no effect: score=median takes none"),
         (MEDIAN | {"inlier_threshold": 2.0}, "inlier_threshold=2.0 has no effect: inliers=lmeds takes none"),
         ({"local_optimization": "x"}, "local_optimization is 'x'; it must be one of: graph_cut"),

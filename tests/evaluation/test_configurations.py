@@ -13,8 +13,7 @@ import torch
 from rich.console import Console
 
 from fmtorch import presets
-from fmtorch.core.estimate import CONFIGURATIONS, WARNINGS
-from fmtorch.core.types import Correspondences
+from fmtorch.core.types import CONFIGURATIONS, WARNINGS, Correspondences
 from fmtorch.data import ImagePair, ImageSource
 from fmtorch.data.pairs import GivenMatches
 from fmtorch.evaluation import tables
@@ -22,7 +21,7 @@ from fmtorch.evaluation.pair_cameras import WithPairCameras, built_with, cameras
 from fmtorch.evaluation.rows import evaluate, focal_errors
 from fmtorch.evaluation.statistics import focal_figures
 from fmtorch.evaluation.summary import summarize
-from fmtorch.evaluation.summary_tables import further_tables, summary_markdown
+from fmtorch.evaluation.tables import summary_markdown, terminal_tables
 from fmtorch.io.dataset import H5Pairs
 from fmtorch.pipeline.pipeline import Outcome, Pipeline, examined
 from fmtorch.runs import PairRow, to_table
@@ -149,7 +148,7 @@ def test_summaries_and_reports_show_them() -> None:
     assert summary["all"]["configurations"] == {**dict.fromkeys(CONFIGURATIONS, 0), "general": 1, "planar": 1}
     assert summary["all"]["focals"]["images"] == 4
     console = Console(width=80, record=True)
-    for each in further_tables(summary):
+    for each in terminal_tables(summary, "t")[1:]:
         console.print(each)
     shown = console.export_text()
     assert "Focal lengths" in shown
@@ -157,15 +156,13 @@ def test_summaries_and_reports_show_them() -> None:
     page = summary_markdown(summary, "run")
     assert "| family | 1 | 1 | 0 | 0 | 0 |" in page
     assert "folded" in page
-    of_report = tables.configurations({"run": summary})
-    assert of_report is not None
-    assert [cell.text for cell in of_report.rows["run"]] == ["1", "1", "0", "0", "0"]
-    focals = tables.focals({"run": summary})
-    assert focals is not None
-    assert focals.rows["run"][0].text == "4"
+    of_report = {each.heading: each for each in tables.report_tables({"run": table}, {"run": summary})}
+    assert [cell.text for cell in of_report["Configurations"].rows["run"]] == ["1", "1", "0", "0", "0"]
+    assert of_report["Focal lengths"].rows["run"][0].text == "4"
     nobody = to_table([dataclasses.replace(row, configuration=None) for row in rows(pairs[:1], None)])
-    assert tables.configurations({"run": summarize(nobody)}) is None
-    assert further_tables(summarize(to_table(rows(pairs[:1], None)))) == []  # all general: nothing to say
+    assert "Configurations" not in {part.heading for part in tables.parts(summarize(nobody))}
+    alone = terminal_tables(summarize(to_table(rows(pairs[:1], None))), "t")
+    assert [each.title for each in alone] == ["t", "Relative pose"]  # all general: nothing to say
 
 
 @pytest.mark.parametrize("layout", writers.WRITERS)

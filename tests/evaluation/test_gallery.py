@@ -17,9 +17,9 @@ from fmtorch.data import DataError
 from fmtorch.evaluation import gallery as module
 from fmtorch.evaluation.gallery import Options, Run, find_dataset, gallery
 from fmtorch.evaluation.page import Section, ShownPair, render
-from fmtorch.presets.composition import compose
 from fmtorch.runs import PairRow, RunFolder, to_table
 from tests.data import lists
+from tests.helpers import compose
 from tests.pipeline.test_pipeline import draw
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "guides" / "reports.md"
@@ -98,7 +98,7 @@ def test_own_methods_keep_their_pictures_and_run_only_where_that_is_asked_for(
     root = distribution(tmp_path)
     stages = presets.stages(compose("match", ("pipeline=sift_ratio", "cache=off")))
     stages["estimator"] = {"_target_": "own_estimator_of_a_test.Mine", "threshold": 1}
-    config = {"pipeline": "sift_ratio", **stages, "seed": 0, "dataset": {"name": "fmbench", "split": "test"}}
+    config = {"pipeline": "sift_ratio", **stages, "seed": 0, "dataset": presets.load("dataset", "fmbench")}
     mine = run("mine", config, rows(root))
     shown, notes = gallery([mine], Options(1, [root], cache="off"))
     assert "own_estimator_of_a_test" not in sys.modules
@@ -114,18 +114,18 @@ def test_each_data_set_is_found_in_its_own_root(tmp_path: Path) -> None:
     roots = [distribution(tmp_path / "a", "A", 2), distribution(tmp_path / "b", "B", 3)]
     for root in roots:
         dataset = data.load("fmbench", root=root)
-        stored = {"name": "fmbench", "split": "test", "digest": dataset.digest}
+        stored = {**presets.load("dataset", "fmbench"), "digest": dataset.digest}
         assert find_dataset(stored, Options(1, roots)).digest == dataset.digest
         assert find_dataset(stored, Options(1, [tmp_path / "nowhere", *roots])).digest == dataset.digest
     with pytest.raises(DataError, match="has changed since the run, or another one lies in root"):
-        find_dataset({"name": "fmbench", "digest": "other"}, Options(1, roots))
+        find_dataset({**presets.load("dataset", "fmbench"), "digest": "other"}, Options(1, roots))
     with pytest.raises(DataError, match="fmbench needs root"):
-        find_dataset({"name": "fmbench", "digest": "other"}, Options(1))
+        find_dataset({**presets.load("dataset", "fmbench"), "digest": "other"}, Options(1))
     with pytest.raises(DataError, match="one of your own, which a report loads with own_code=true"):
         find_dataset({"_target_": "pathlib.Path.touch"}, Options(1, roots))
     # A root of another data set does not hide one that needs none.
-    assert len(find_dataset({"name": "stereo"}, Options(1, roots))) == 1
-    assert module._roots({"name": "rendered"}, roots) == [None]
+    assert len(find_dataset(presets.load("dataset", "stereo"), Options(1, roots))) == 1
+    assert module._places(presets.load("dataset", "rendered"), roots) == [{}]
 
 
 def test_many_runs_are_drawn_in_part_and_the_page_says_so(tmp_path: Path) -> None:
@@ -150,7 +150,7 @@ def test_no_pictures_are_explained(tmp_path: Path) -> None:
 
 def test_the_list_of_pairs_lies_beside_the_folder_of_its_images(tmp_path: Path) -> None:
     file = lists.write(tmp_path / "list.txt", [lists.superglue(1, 5)])
-    stored = {"name": "pair_list", "resize": 200, "origin": None}
+    stored = {**presets.load("dataset", "pair_list"), "resize": 200}
     stored["digest"] = data.load("pair_list", root=lists.images(), file=file, resize=200).digest
     pairs = find_dataset(stored, Options(1, [lists.images(), file]))
     assert pairs[0].image0.path == lists.images() / lists.name(1)

@@ -13,12 +13,12 @@ import torch
 from fmtorch.commands import eval as eval_command
 from fmtorch.commands import report as report_command
 from fmtorch.data import load
-from fmtorch.evaluation.rows import homography_figures
+from fmtorch.evaluation.statistics import homography_figures
 from fmtorch.metrics import corner_error, pose_auc
-from fmtorch.presets.composition import compose
 from fmtorch.runs import RunFolder
 from fmtorch.training import MatchedPairs
 from tests.data import planes
+from tests.helpers import compose
 
 
 def run(root: Path, folder: Path, *words: str, pipeline: str = "sift_ratio") -> Path:
@@ -69,7 +69,7 @@ def test_the_summary_is_of_corner_errors(runs: Path) -> None:
     page = (runs / "runs/a/summary.md").read_text()
     assert "AUC@1 px" in page
     assert "%Recall" not in page
-    assert (runs / "runs/a/recall.png").stat().st_size > 0
+    assert (runs / "runs/a/recall.svg").stat().st_size > 0
 
 
 def test_the_report_compares_corner_errors(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:

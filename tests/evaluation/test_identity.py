@@ -16,9 +16,9 @@ from fmtorch.evaluation import identity as identity_module
 from fmtorch.evaluation.identity import run_identity
 from fmtorch.pipeline.build import build_pipeline, load_pipeline
 from fmtorch.pipeline.pipeline import Pipeline
-from fmtorch.presets.composition import compose
 from fmtorch.runs import identity_digest
 from fmtorch.runs.fingerprint import libraries
+from tests.helpers import compose
 
 GROUPS = ("features", "matcher", "pruner", "estimator", "dataset")
 

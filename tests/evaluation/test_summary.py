@@ -13,7 +13,7 @@ from rich.console import Console
 from fmtorch import metrics
 from fmtorch.core.types import pair_key
 from fmtorch.evaluation.summary import summarize
-from fmtorch.evaluation.summary_tables import pose_table, summary_markdown, summary_table
+from fmtorch.evaluation.tables import summary_markdown, terminal_tables
 from fmtorch.runs import PairRow, to_table
 
 F = (0.0, -0.5, 0.1, 0.5, 0.0, -0.1, 0.2, 0.3, 0.59)
@@ -111,7 +111,7 @@ def test_nothing_breaks_on_few_or_failed_pairs(rows: list[PairRow]) -> None:
 def _render(summary: dict[str, dict[str, Any]], width: int) -> str:
     console = Console(width=width, record=True, file=None, color_system=None)
     with console.capture() as capture:
-        console.print(summary_table(summary, title="sift_ratio on rendered"))
+        console.print(terminal_tables(summary, "sift_ratio on rendered")[0])
     return capture.get()
 
 
@@ -160,12 +160,12 @@ def test_poses_known_answer() -> None:
 
 def test_poses_are_shown_where_cameras_are_known() -> None:
     without = summarize(known())
-    assert pose_table(without) is None
+    assert len(terminal_tables(without, "t")) == 1
     assert "Relative pose" not in summary_markdown(without, title="t")
     with_poses = summarize(to_table([posed("a", 0.5, 2.0), posed("b", 4.5, 1.0, family="orbit")]))
     console = Console(width=80, color_system=None)
     with console.capture() as capture:
-        console.print(pose_table(with_poses))
+        console.print(terminal_tables(with_poses, "t")[1])
     lines = capture.get().splitlines()
     assert max(map(len, lines)) <= 80
     assert "…" not in capture.get()

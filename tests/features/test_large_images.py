@@ -36,7 +36,7 @@ print(peak() - before)
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="peak memory is read from /proc")
 @pytest.mark.parametrize(("name", "bound"), [("sift", 4.0e9), pytest.param("hesaffnet", 2.5e9, marks=pytest.mark.slow)])
 def test_8k_images_within_the_stated_memory(name: str, bound: float) -> None:
-    """docs/appendix/features.md states the bounds: SIFT sees at most 16 million pixels, the Hessian all 67 million."""
+    """As docs/benchmarks/features.md states: SIFT sees at most 16 million pixels, the Hessian all 67 million."""
     result = subprocess.run([sys.executable, "-c", GROWTH, name], capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
     assert int(result.stdout) < bound, f"{int(result.stdout) / 1e9:.2f} GB"

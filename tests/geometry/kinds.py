@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from fmtorch.core.estimate import CONFIGURATIONS
+from fmtorch.core.types import CONFIGURATIONS
 
 K = np.array([[768.0, 0, 319.5], [0, 768, 239.5], [0, 0, 1]])
 SIZE = (480, 640)

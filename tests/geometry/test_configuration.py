@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from fmtorch.core.estimate import CONFIGURATIONS
+from fmtorch.core.types import CONFIGURATIONS
 from fmtorch.geometry.pair_type import Evidence, classified, configuration_evidence
 from tests.geometry.kinds import SIZE, K, batch, draw
 from tests.reference import configuration as reference

@@ -50,11 +50,8 @@ def fresh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     linking.inner_compiler.cache_clear()
 
 
-@pytest.mark.parametrize("private", [True, False])
-def test_one_is_compiled_into_a_kernel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, private: bool) -> None:
+def test_one_is_compiled_into_a_kernel(tmp_path: Path) -> None:
     """Recursion, exceptions and scratch arrays; from the folder, too."""
-    if not private:
-        monkeypatch.delattr(numba.core.codegen, "JITCodeLibrary")
     for _ in range(2):
         module, out = load(tmp_path, SOURCE), np.zeros(10)
         assert module.sums(10, out) == 89

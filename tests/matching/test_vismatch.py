@@ -156,7 +156,7 @@ def test_what_cannot_be_loaded_is_one_line(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_the_command_evaluates_it(tmp_path: Path) -> None:
     from fmtorch.commands.eval import run
-    from fmtorch.presets.composition import compose
+    from tests.helpers import compose
 
     file = lists.write(tmp_path / "list.txt", [lists.superglue(1, 5), lists.superglue(0, 2)])
     words = (
@@ -173,7 +173,7 @@ def test_the_command_evaluates_it(tmp_path: Path) -> None:
 
 def test_a_folder_is_refused(tmp_path: Path) -> None:
     from fmtorch.commands.match import run
-    from fmtorch.presets.composition import compose
+    from tests.helpers import compose
 
     for i in (0, 1):
         draw(tmp_path / f"{i}.png", i)

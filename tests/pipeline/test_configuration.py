@@ -7,8 +7,7 @@ import torch
 
 import fmtorch
 from fmtorch import presets
-from fmtorch.core.estimate import CONFIGURATIONS
-from fmtorch.core.types import Correspondences, Estimate, collate
+from fmtorch.core.types import CONFIGURATIONS, Correspondences, Estimate, collate
 from fmtorch.two_view.pair_type import classify
 from tests.geometry.kinds import batch, draw
 

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import fmtorch
-from fmtorch.core.estimate import CONFIGURATIONS, WARNINGS
-from fmtorch.core.types import Estimate
+from fmtorch.core.types import CONFIGURATIONS, WARNINGS, Estimate
 from tests.geometry.kinds import batch, draw
 from tests.reference import known_cameras as reference
 

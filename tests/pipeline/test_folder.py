@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from fmtorch.data.pairs import ImageSource
-from fmtorch.io.match_store import Journal
+from fmtorch.io.match_store import MatchStore
 from fmtorch.jobs.execution import Execution
 from fmtorch.jobs.pool import WorkerPool, WorkersLost
 from fmtorch.jobs.runner import DEATH
@@ -73,7 +73,7 @@ def images(tmp_path: Path) -> list[Path]:
 
 
 def work(pipeline: Pipeline, images: list[Path], output: Path, **options: Any) -> FolderMatches:
-    return FolderMatches(pipeline, Journal(output, images[0].parent), 1600, True, 0, **options)
+    return FolderMatches(pipeline, MatchStore(output, images[0].parent), 1600, True, 0, **options)
 
 
 def kept(output: Path) -> dict[str, dict[str, Any]]:

@@ -30,8 +30,6 @@ def test_nothing_that_fmtorch_has_written_is_a_photograph(tmp_path: Path) -> Non
         picture(tmp_path / name)  # output=.
     for folder in ("matches/a-b", "."):
         text(tmp_path / folder / "result.json")
-    picture(tmp_path / "runs/tum/sift-1234/recall.png")
-    text(tmp_path / "runs/tum/sift-1234/run.json")
     picture(tmp_path / "set/scene/Images/00000000.jpg")  # an undistorted copy
     text(tmp_path / "set/pairs.json")
     picture(tmp_path / ".thumbnails/a.jpg")

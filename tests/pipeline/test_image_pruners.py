@@ -16,7 +16,7 @@ from fmtorch.core.stages import ImagePruner
 from fmtorch.data import read_image
 from fmtorch.data.pairs import GivenMatches
 from fmtorch.geometry import sampson
-from fmtorch.io.match_store import Journal
+from fmtorch.io.match_store import MatchStore
 from fmtorch.pipeline import pipeline as module
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.exporting import keep_outcomes
@@ -106,7 +106,10 @@ def test_refined_matches_are_exported_as_matches_of_keypoints(tmp_path: Path) ->
     journals = []
     for i, overrides in enumerate(([PRUNERS], [])):
         pipeline = load_pipeline("sift_fmtorch", overrides=[*overrides, "cache=off", "features.max_features=500"])
-        run, folder = Journal(tmp_path / f"run{i}", ends[0].parent), Journal(tmp_path / f"folder{i}", ends[0].parent)
+        run, folder = (
+            MatchStore(tmp_path / f"run{i}", ends[0].parent),
+            MatchStore(tmp_path / f"folder{i}", ends[0].parent),
+        )
         keep_outcomes(run, pipeline, pipeline.run([pair]))
         for _ in FolderMatches(pipeline, folder, 4000, True, 0).each([ends]):
             pass

@@ -123,12 +123,12 @@ def test_what_are_no_files_to_verify(words: list[str], said: str, tmp_path: Path
 def test_a_killed_verification_of_files_continues(tmp_path: Path) -> None:
     write(tmp_path, scene(7))
     command = starter().start(tmp_path, "verify", *FILES, before=SLOWLY)
-    parts = tmp_path / "verified.h5.partial"
-    assert command.kill_when(lambda: len(list(parts.glob("*.h5"))) > 2), command.said()
+    parts = tmp_path / "verified.h5.parts"
+    assert command.kill_when(lambda: len(list(parts.glob("*.npz"))) > 2), command.said()
     assert not (tmp_path / "verified.h5").exists()
     command = starter().run(tmp_path, "verify", *FILES, before=SLOWLY)
     assert command.wait() == 0, command.said()
     assert re.search(r"had a geometry\W+\d+", command.said())
     fmtorch.verify(features=tmp_path / "features.h5", matches=tmp_path / "matches.h5", output=tmp_path / "truth.h5")
     assert contents(tmp_path / "verified.h5") == contents(tmp_path / "truth.h5")
-    assert not [name for name in os.listdir(tmp_path) if name.endswith((".partial", ".verification", ".tmp"))]
+    assert not [name for name in os.listdir(tmp_path) if name.endswith((".parts", ".tmp"))]

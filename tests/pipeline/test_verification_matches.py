@@ -173,7 +173,7 @@ def test_a_killed_verification_of_matches_continues(ending: str, tmp_path: Path)
     save(tmp_path / f"matches{ending}", arrays)
     words = [f"matches=matches{ending}", f"output=verified{ending}"]
     command = starter().start(tmp_path, "verify", *words, before=SLOWLY)
-    parts = tmp_path / f"verified{ending}.partial"
+    parts = tmp_path / f"verified{ending}.parts"
     assert command.kill_when(lambda: len(list(parts.glob("*.npz"))) > 2), command.said()
     assert not (tmp_path / f"verified{ending}").exists()
     command = starter().run(tmp_path, "verify", *words, before=SLOWLY)
@@ -181,4 +181,4 @@ def test_a_killed_verification_of_matches_continues(ending: str, tmp_path: Path)
     assert re.search(r"had a geometry\W+\d+", command.said())
     fmtorch.verify(matches=tmp_path / f"matches{ending}", output=tmp_path / f"truth{ending}")
     assert load(tmp_path / f"verified{ending}") == load(tmp_path / f"truth{ending}")
-    assert not [name for name in os.listdir(tmp_path) if name.endswith((".partial", ".verification", ".tmp"))]
+    assert not [name for name in os.listdir(tmp_path) if name.endswith((".parts", ".tmp"))]

@@ -11,6 +11,7 @@ import fmtorch
 from fmtorch.jobs.execution import Execution
 from fmtorch.verification import run
 from tests.pipeline import test_verification_hloc as hloc
+from tests.pipeline import test_verification_matches as alone
 from tests.pipeline.databases import plain, read, scene, write
 
 
@@ -55,10 +56,30 @@ def test_shards_of_other_settings_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
     write(path, scene(3))
     fmtorch.verify(path, shard="1/2")
-    with pytest.raises(ValueError, match="holds shards of other settings"):
+    with pytest.raises(
+        ValueError,
+        match=r"holds geometries of other settings; .*: seed: 0 -> 1\. Give the same, or",
+    ):
         fmtorch.verify(path, shard="2/2", seed=1)
     with pytest.raises(ValueError, match=r"shard=3/2; it must be i/n"):
         fmtorch.verify(path, shard="3/2")
+
+
+def test_shards_of_matches_alone(tmp_path: Path) -> None:
+    pairs = enumerate(alone.points(4))
+    arrays = {f"{i}/{key}": x for i, pair in pairs for key, x in zip(("x0", "x1"), pair, strict=True)}
+    path = alone.save(tmp_path / "matches.npz", arrays)
+    unsharded = fmtorch.verify(matches=path, output=tmp_path / "whole.npz")
+    for shard in ("1/2", "2/2"):
+        fmtorch.verify(matches=path, output=tmp_path / "merged.npz", shard=shard)
+    merged = fmtorch.verify(matches=path, output=tmp_path / "merged.npz")
+    assert (merged.pairs, merged.kept) == (6, 6)
+    assert alone.load(merged.path) == alone.load(unsharded.path)
+    alone.save(path, {**arrays, "5/x0": arrays["5/x0"] + 1})
+    fmtorch.verify(matches=path, output=tmp_path / "new.npz", shard="1/2")
+    alone.save(path, arrays)
+    with pytest.raises(ValueError, match=r"holds geometries of other settings; what differs .*: files: "):
+        fmtorch.verify(matches=path, output=tmp_path / "new.npz", shard="2/2")
 
 
 def test_shards_of_hlocs_files(tmp_path: Path) -> None:

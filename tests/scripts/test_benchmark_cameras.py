@@ -12,7 +12,7 @@ import torch
 
 from fmtorch.core.types import Correspondences
 from fmtorch.data import ImagePair, ImageSource
-from fmtorch.evaluation.statistics import paired_bootstrap
+from fmtorch.evaluation.statistics import bootstrap_mean
 from scripts.benchmark import cameras, cameras_knowledge, cameras_methods, cameras_peers, cameras_table, matched
 from scripts.benchmark.cameras_knowledge import Answer, applies, bougnoux, fundamental, knowledge
 from scripts.benchmark.specs import read_specs
@@ -229,7 +229,7 @@ def test_leads_are_differences_of_areas_under_step_curves() -> None:
     }  # fmt: skip
     figures = cameras_table.figures(rows, pairs)["opencv:known"]["orbit"]
     share = np.clip(1 - errors / 5, 0, 1).mean(1)
-    expected = paired_bootstrap(100 * share[1], 100 * share[0], [f"orbit/{pair.scene}" for pair in pairs])
+    expected = bootstrap_mean(100 * share[1] - 100 * share[0], [f"orbit/{pair.scene}" for pair in pairs])
     assert figures["pose_5"] == pytest.approx(100 * share[0].mean())
     assert figures["ahead_pose_5"] == pytest.approx([expected.value, expected.low, expected.high], abs=1e-9)
     assert (figures["flipped"], figures["focal_5"], figures["focal_10"]) == (25, 0, 50)

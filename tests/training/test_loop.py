@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +16,7 @@ pytest.importorskip("lightning", reason="training needs the extra `train`")
 from fmtorch import presets
 from fmtorch.pruning.networks import LC
 from fmtorch.training import LabelledMatches, Objective, Use, Validation, collate, loop
-from fmtorch.training.loop import Optimisation, PrunerTraining, TrainingFolderError, claim, latest_checkpoint
+from fmtorch.training.loop import Optimisation, PrunerTraining, latest_checkpoint
 from tests.processes import run_command
 from tests.training.conftest import labelled_pair
 
@@ -126,15 +125,3 @@ def test_ended_before_a_validation_it_is_made_again(tmp_path: Path) -> None:
         parts = best(tmp_path / f"{last}", None)
         assert whole[0] == parts[0]
         expect_equal(whole[1], parts[1])
-
-
-def test_another_training_is_refused(tmp_path: Path) -> None:
-    claim(tmp_path / "a", {"seed": 0, "network": {"blocks": 2}})
-    claim(tmp_path / "a", {"seed": 0, "network": {"blocks": 2}})
-    with pytest.raises(TrainingFolderError, match="seed"):
-        claim(tmp_path / "a", {"seed": 1, "network": {"blocks": 2}})
-    (tmp_path / "b").mkdir()
-    (tmp_path / "b" / "notes.txt").write_text("mine")
-    with pytest.raises(TrainingFolderError, match="holds no training"):
-        claim(tmp_path / "b", {"seed": 0})
-    assert json.loads((tmp_path / "a" / "training.json").read_text())["seed"] == 0

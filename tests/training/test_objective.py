@@ -9,7 +9,6 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from fmtorch.pruning.networks.learned import Prediction, predict
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -19,6 +18,7 @@ from fmtorch.core.types import Correspondences
 from fmtorch.geometry import eight_point, fundamental_from_calibration, irls, refine, reweighted_fits
 from fmtorch.jit.random import Stream, uniform
 from fmtorch.pruning.networks import LC
+from fmtorch.pruning.networks.learned import Prediction, predict
 from fmtorch.training import (
     LabelledMatches,
     Objective,

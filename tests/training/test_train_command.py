@@ -12,12 +12,10 @@ import torch
 
 pytest.importorskip("lightning", reason="training needs the extra `train`")
 
-from hydra import compose, initialize_config_dir
 
-from fmtorch.core.files import conf_dir
-from fmtorch.training.loop import TrainingFolderError
 from fmtorch.training.run import run
 from tests.conftest import own_cache
+from tests.helpers import compose
 from tests.pipeline.test_pipeline import draw
 from tests.processes import run_command
 
@@ -102,9 +100,7 @@ def trained(monkeypatch: pytest.MonkeyPatch, folder: Path, *overrides: str) -> P
     """The command without a process of its own."""
     monkeypatch.chdir(folder)
     monkeypatch.setenv("FMTORCH_CACHE", str(own_cache(folder)))
-    with initialize_config_dir(str(conf_dir()), version_base=None):
-        config = compose("train", list(overrides))
-    return run(config, "lc")
+    return run(compose("train", overrides), "lc")
 
 
 def test_the_command_goes_on_and_refuses_another_training(
@@ -117,7 +113,7 @@ def test_the_command_goes_on_and_refuses_another_training(
     assert (folder / "lc.onnx").is_file()
     trained(monkeypatch, tmp_path, *options)
     assert (folder / "lc.safetensors").read_bytes() == weights
-    with pytest.raises(TrainingFolderError, match=r"holds another training \(it differs in seed\)"):
+    with pytest.raises(ValueError, match=r"holds checkpoints of other settings; what differs .*: seed: "):
         trained(monkeypatch, tmp_path, *options, "seed=1")
 
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fmtorch.estimators.calibration import EXACT
+from fmtorch.estimators.pair import EXACT
 from fmtorch.geometry.arithmetic import exponential
 from fmtorch.jit.kernel import Array, F8x1, F8x2, inner, kernel
 from fmtorch.jit.random import random_bits, stream_state

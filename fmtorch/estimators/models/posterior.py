@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fmtorch.estimators.calibration import EXACT
 from fmtorch.estimators.models.focal_prior import LOG_USUAL, FocalPrior, focal_cost, focal_prior, prior_slopes
-from fmtorch.estimators.pair import Pair
+from fmtorch.estimators.pair import EXACT, Pair
 from fmtorch.geometry.arithmetic import exponential, logarithm_kernel
 from fmtorch.geometry.levenberg_marquardt import Weighted, evaluate, levenberg_marquardt
 from fmtorch.geometry.matrices import assign, assign_rows

@@ -12,8 +12,8 @@ import torch
 
 import fmtorch
 from fmtorch import presets
-from fmtorch.core.arguments import correspondences
 from fmtorch.estimators import Ransac
+from fmtorch.two_view.arguments import correspondences
 from tests.conftest import shared_path
 from tests.reference import homography_family as reference
 

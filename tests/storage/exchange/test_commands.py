@@ -14,26 +14,24 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
 from fmtorch import data
 from fmtorch.commands import eval as eval_command
 from fmtorch.commands import match as match_command
-from fmtorch.core.files import conf_dir
 from fmtorch.io.export import DATABASE, FEATURES, MATCHES
 from fmtorch.pipeline import folder
 from fmtorch.pipeline.folder import chosen_pairs, images_below, open_folder
 from fmtorch.pipeline.two_images import Described
 from fmtorch.runs import RunFolder
+from tests.helpers import compose
 from tests.pipeline.test_pipeline import draw
 
 OPTIONS = ("features.max_features=400", "estimator=lmeds", "estimator.hypotheses=100", "cache=off")
 
 
 def config(command: str, *words: str) -> DictConfig:
-    with initialize_config_dir(str(conf_dir()), version_base=None):
-        return compose(command, ["pipeline=sift_ratio", *OPTIONS, *words])
+    return compose(command, ("pipeline=sift_ratio", *OPTIONS, *words))
 
 
 @pytest.fixture
@@ -88,7 +86,7 @@ def test_a_folder_of_images(images: Path, tmp_path: Path, capsys: pytest.Capture
     assert re.search(r"[23] of 6 pairs taken from an earlier run", said)
     assert "6 of 6 pairs show one scene" in said
 
-    with pytest.raises(ValueError, match=r"holds matches of other settings \(seed differ\); choose another output"):
+    with pytest.raises(ValueError, match=r"holds matches of other settings; .*: seed: 0 -> 3\. Choose another output"):
         match(images, tmp_path / "out", "seed=3")
 
 

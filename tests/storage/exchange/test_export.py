@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from fmtorch.io.colmap import ORIGIN, write_database
 from fmtorch.io.export import DATABASE, export_kinds, write_exports
-from fmtorch.io.match_store import ExportedImage, ExportedPair, Journal, indices
+from fmtorch.io.match_store import MatchStore, StoredImage, StoredPair, indices
 from fmtorch.pipeline.build import load_pipeline
 from fmtorch.pipeline.folder import FolderMatches, chosen_pairs, images_below
 from tests.conftest import shared_path
@@ -41,7 +41,7 @@ class Circle:
             lonely = rng.uniform(0, 800, (i, 2))  # so that the same point has another index in each image
             points = np.concatenate([lonely, x]).astype(np.float32)
             scores = np.ones(len(points), np.float32)
-            self.images.append(ExportedImage(f"{i}.png", points, scores, SIZE, K if known else None))
+            self.images.append(StoredImage(f"{i}.png", points, scores, SIZE, K if known else None))
         for i in range(IMAGES):
             for j in range(i + 1, IMAGES):
                 partner = np.arange(POINTS)
@@ -49,7 +49,7 @@ class Circle:
                 right = partner == np.arange(POINTS)
                 matches = np.stack([np.arange(POINTS) + i, partner + j], 1).astype(np.int32)
                 scores = rng.uniform(0.1, 1, POINTS).astype(np.float32)
-                self.pairs.append(ExportedPair(f"{i}.png", f"{j}.png", matches, scores, right, self.F(i, j)))
+                self.pairs.append(StoredPair(f"{i}.png", f"{j}.png", matches, scores, right, self.F(i, j)))
 
     def F(self, i: int, j: int) -> np.ndarray:
         R = self.R[j] @ self.R[i].T
@@ -138,11 +138,11 @@ def test_pycolmap_reads_verifies_and_reconstructs(known: bool, tmp_path: Path) -
 
 
 def test_matches_that_share_a_keypoint_are_sorted_out_for_tracks(tmp_path: Path) -> None:
-    image = [ExportedImage(f"{i}.png", np.eye(4, 2, dtype=np.float32), np.ones(4, np.float32), SIZE) for i in (0, 1)]
+    image = [StoredImage(f"{i}.png", np.eye(4, 2, dtype=np.float32), np.ones(4, np.float32), SIZE) for i in (0, 1)]
     matches = np.array([[0, 0], [0, 1], [1, 1], [2, 2]], np.int32)
     scores = np.array([0.2, 0.9, 0.5, 0.5], np.float32)
     inliers = np.array([True, False, False, True])
-    pair = ExportedPair("0.png", "1.png", matches, scores, inliers, np.eye(3))
+    pair = StoredPair("0.png", "1.png", matches, scores, inliers, np.eye(3))
     write_database(tmp_path / DATABASE, image, [pair])
     with pycolmap.Database.open(tmp_path / DATABASE) as file:
         assert sorted(file.read_matches(1, 2).tolist()) == [[0, 0], [1, 1], [2, 2]]  # an inlier before a better score
@@ -176,12 +176,12 @@ def test_keypoints_are_found_as_a_dictionary_finds_them() -> None:
     assert indices(points, x).tolist() == [place[tuple(point)] for point in x.tolist()]
 
 
-def journal(folder: Path, circle: Circle) -> tuple[Journal, list[tuple[Path, Path]]]:
+def journal(folder: Path, circle: Circle) -> tuple[MatchStore, list[tuple[Path, Path]]]:
     (folder / "images").mkdir(parents=True)
     paths = [folder / "images" / image.name for image in circle.images]
     for i, path in enumerate(paths):
         cv2.imwrite(str(path), np.full((8, 10), i, np.uint8))
-    kept = Journal(folder / "export", folder / "images")
+    kept = MatchStore(folder / "export", folder / "images")
     for path, image in zip(paths, circle.images, strict=True):
         kept.add_image(path, image)
     ends = []
@@ -232,9 +232,9 @@ def test_hloc_files(tmp_path: Path) -> None:
 def test_indices_beyond_16_bits(tmp_path: Path) -> None:
     points = np.random.default_rng(0).uniform(0, 800, (40_000, 2)).astype(np.float32)
     circle = Circle()
-    circle.images = [ExportedImage(f"{i}.png", points, points[:, 0], SIZE) for i in (0, 1)]
+    circle.images = [StoredImage(f"{i}.png", points, points[:, 0], SIZE) for i in (0, 1)]
     matches = np.array([[39_999, 39_998]], np.int32)
-    circle.pairs = [ExportedPair("0.png", "1.png", matches, np.ones(1, np.float32), np.ones(1, bool), np.eye(3))]
+    circle.pairs = [StoredPair("0.png", "1.png", matches, np.ones(1, np.float32), np.ones(1, bool), np.eye(3))]
     kept, ends = journal(tmp_path, circle)
     write_exports(kept, ends, ("h5",), tmp_path)
     with h5py.File(tmp_path / "matches.h5") as file:
@@ -265,7 +265,7 @@ def test_a_real_scene_is_reconstructed(tmp_path: Path) -> None:
         (images / path.name).symlink_to(path)
     options = ["features.max_features=2500", "estimator=lmeds", "estimator.hypotheses=300"]
     pipeline = load_pipeline("sift_ratio", overrides=options)
-    kept = Journal(tmp_path / "export", images)
+    kept = MatchStore(tmp_path / "export", images)
     pairs = chosen_pairs(images, images_below(images), None)
     work = FolderMatches(pipeline, kept, 1600, True, 0)
     assert len(list(work.each(pairs))) == len(pairs)

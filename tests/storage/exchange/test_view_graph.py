@@ -12,7 +12,7 @@ import pytest
 
 from fmtorch.evaluation.view_graph_picture import MAX_THUMBNAILS, spectral_order, view_graph_svg
 from fmtorch.io.export import Edge, ViewGraph, view_graph, write_view_graph
-from fmtorch.io.match_store import ExportedPair, Journal
+from fmtorch.io.match_store import MatchStore, StoredPair
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -25,12 +25,12 @@ def test_of_a_journal(tmp_path: Path) -> None:
     images = [tmp_path / name for name in ("a.png", "b.png", "c.png")]
     for image in images:
         image.write_text(image.name)
-    journal = Journal(tmp_path / "export", tmp_path)
+    journal = MatchStore(tmp_path / "export", tmp_path)
     matches, scores, inliers = np.zeros((3, 2), np.int32), np.ones(3, np.float32), np.array([True, True, False])
     verdict = {"significance": 12.5, "configuration": "planar"}
-    given = ExportedPair("a.png", "b.png", matches, scores, inliers, np.eye(3), **verdict)
+    given = StoredPair("a.png", "b.png", matches, scores, inliers, np.eye(3), **verdict)
     journal.add_pair(*images[:2], given)
-    journal.add_pair(images[0], images[2], ExportedPair(
+    journal.add_pair(images[0], images[2], StoredPair(
         "a.png", "c.png", matches, scores, ~inliers, np.zeros((3, 3)), False, significance=-math.inf))  # fmt: skip
     pairs = [(images[0], images[1]), (images[0], images[2]), (images[1], images[2])]
     graph = view_graph(journal, images, pairs)

@@ -1,0 +1,226 @@
+"""How a command runs: Hydra composes its config, and a user's mistake ends it with one line and status 1."""
+
+from __future__ import annotations
+
+import functools
+import re
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import hydra
+from hydra._internal.utils import get_args_parser
+from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Quote, QuotedString
+from hydra.core.utils import env_override
+from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
+from hydra.types import RunMode
+from omegaconf import DictConfig
+from omegaconf.errors import GrammarParseError, OmegaConfBaseException
+
+from fmtorch.commands.options import COMMANDS, Command
+from fmtorch.core.files import STAGES, conf_dir
+from fmtorch.core.options import nearest
+from fmtorch.core.terminal import MISTAKES, error_line, exits_with_message
+from fmtorch.presets import available
+from fmtorch.presets.fields import path_fields
+from fmtorch.presets.files import groups
+from fmtorch.presets.pruners import with_explicit
+
+Task = Callable[[DictConfig], None]
+SUBMITTED = "jobs run in other processes; what each prints: .submitit/JOB/JOB_0_log.out below hydra.sweep.dir (runs)"
+OVERRIDE = re.compile(r"(?P<key>(?:\+\+|\+)?[A-Za-z_][\w./@:-]*)=(?P<value>.*)", re.DOTALL)
+LITERAL = re.compile(r"null|true|false|\?\?\?|'.*'|\".*\"", re.IGNORECASE | re.DOTALL)  # what a path field may hold
+
+
+class Mistake(ValueError):
+    """A user's mistake in one job of a sweep, error_line by its message: it can be sent between processes."""
+
+
+def _register(command: Command) -> None:
+    """Have Hydra know the config of a command by its name."""
+    quiet = [{f"override hydra/{part}_logging": "none"} for part in ("hydra", "job")]
+    own = {"output_subdir": None, "run": {"dir": "."}, "sweep": {"dir": command.sweeps, "subdir": "."}}
+    defaults = [*({group: name} for group, name in command.groups.items()), "_self_", *quiet]
+    ConfigStore.instance().store(command.name, {"defaults": defaults, **command.defaults, "hydra": own})
+
+
+for each in COMMANDS.values():
+    _register(each)
+
+
+def job(task: Task) -> Task:
+    """The task, ending a single run with one line for a user's mistake; a sweep goes on with its other jobs first."""
+
+    @functools.wraps(task)
+    def wrapped(config: DictConfig) -> None:
+        try:
+            _expect_known(HydraConfig.get().overrides.task)
+            task(with_explicit(config, HydraConfig.get().overrides.task))
+        except MISTAKES as error:
+            if HydraConfig.get().mode == RunMode.MULTIRUN:
+                raise Mistake(error_line(error)) from None
+            sys.exit(f"error: {error_line(error)}")
+
+    return wrapped
+
+
+def chosen_pipeline() -> tuple[str, list[str]]:
+    """The name of the pipeline's preset that runs, and what the command line changes of its stages."""
+    config = HydraConfig.get()
+    changed = [word for word in config.overrides.task if word.lstrip("+~").startswith(tuple(STAGES))]
+    return str(config.runtime.choices["pipeline"]), changed
+
+
+def run_command(command: Command, task: Task) -> None:
+    """Run a `job` on the config that a command's declaration and the command line compose.
+
+    task: a `job` that its module holds under its own name, so that launchers can send it to other processes.
+    """
+    with exits_with_message(command.interrupted):
+        paths = [*path_fields(command.options), *command.texts]
+        sys.argv[1:] = hydra_arguments(sys.argv[1:], paths, command.positional)
+        if any(word.startswith("hydra/launcher=submitit") for word in sys.argv):
+            print(SUBMITTED, flush=True)
+        try:
+            with env_override({"HYDRA_FULL_ERROR": "1"}):  # Hydra then leaves errors to us
+                hydra.main(version_base=None, config_path=str(conf_dir()), config_name=command.name)(task)()
+        except (HydraException, OmegaConfBaseException) as error:
+            sys.exit(f"error: {explained(error, command.name)}")
+
+
+def _expect_known(overrides: Sequence[str]) -> None:
+    """Raise ValueError for a field that is added (`+limti=2`) and that no command takes."""
+    job_config = HydraConfig.get()
+    names = COMMANDS[str(job_config.job.config_name)].names
+    known = {*names, *map(str, job_config.runtime.choices)}
+    for word in overrides:
+        name = word.lstrip("+").partition("=")[0]
+        if word.startswith("+") and re.fullmatch(r"\w+", name) and name not in known:
+            raise ValueError(f"no option {name}; there are: {nearest(name, names)}")
+
+
+def explained(error: HydraException | OmegaConfBaseException, command: str) -> str:
+    """One line for an error of Hydra's composition of the config of a command."""
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
+        return _missing(str(error.missing_cfg_file), error.options or ())
+    if isinstance(error, OverrideParseException):
+        return f"{error.override} cannot be read; a value with special characters stands in quotes: \"NAME='VALUE'\""
+    cause = error
+    while isinstance(cause.__cause__, HydraException | OmegaConfBaseException):
+        cause = cause.__cause__
+    parent = getattr(cause, "parent_node", None)
+    if isinstance(cause, GrammarParseError):
+        return f"{cause.full_key}: {_line(str(cause.msg))}"
+    if isinstance(cause, OmegaConfBaseException) and cause.full_key:
+        names = [str(key) for key in parent] if isinstance(parent, DictConfig) else []
+        if parent is not None and cause.key is not None and str(cause.key) not in names:
+            names = [name for name in names if name != "hydra"]
+            return f"no option {cause.full_key}; there are: {nearest(str(cause.key), names) or 'none'}"
+        return f"{cause.full_key}: {_line(str(cause.msg or cause))}"
+    unknown = re.search(r"[Cc]ould not override '([^']+)'", str(error))
+    if isinstance(error, ConfigCompositionException) and unknown:
+        return f"no option {unknown[1]}; there are: {nearest(unknown[1], COMMANDS[command].names)}"
+    return _line(str(error))
+
+
+def _missing(file: str, options: Sequence[str]) -> str:
+    """One line for a preset that there is not; options: those that Hydra found in its folder."""
+    group, _, name = file.partition("/")
+    if group not in groups():
+        group, _, name = file.rpartition("/")
+    there_are = nearest(name, {*(options if "/" not in name else ()), *available(group)})
+    return f"no preset {name!r} in {group}; there are: {there_are or 'none'}"
+
+
+def _line(text: str) -> str:
+    return " ".join(text.split())
+
+
+def hydra_arguments(words: Sequence[str], paths: Sequence[str], positional: Sequence[str]) -> list[str]:
+    """The arguments for Hydra: its own flags first, then ``name=value``.
+
+    Args:
+        words: the command line.
+        paths: fields that hold a path. It may hold spaces, brackets, commas and ``=`` without further quotes.
+        positional: fields that may be given by place alone; the last one takes a list if its name ends in ``...``.
+
+    Raises:
+        ValueError: for more positional arguments than there are.
+    """
+    flags, overrides = _split(words)
+    multirun = any(flag in ("-m", "--multirun") for flag in flags)
+    placed = [word for word in overrides if _is_positional(word)]
+    named = [_quoted(word, paths, multirun) for word in overrides if not _is_positional(word)]
+    return [*flags, *_named(placed, positional), *named]
+
+
+def _split(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The flags with their values, and all others."""
+    takes_value = {name for action in get_args_parser()._actions if action.nargs != 0 for name in action.option_strings}
+    flags: list[str] = []
+    others: list[str] = []
+    rest = list(words)
+    while rest:
+        word = rest.pop(0)
+        if word == "--":
+            return flags, others + rest
+        if not word.startswith("-"):
+            others.append(word)
+            continue
+        flags.append(word)
+        if word in takes_value and rest and not (word in ("-i", "--info") and "=" in rest[0]):
+            flags.append(rest.pop(0))
+    return flags, others
+
+
+def _is_positional(word: str) -> bool:
+    return not word.startswith("~") and (OVERRIDE.fullmatch(word) is None or _exists(word))
+
+
+def _named(placed: list[str], positional: Sequence[str]) -> Iterator[str]:
+    """Positional arguments with the names of their fields."""
+    if not placed:
+        return
+    names = ", ".join(name.removesuffix("...") for name in positional)
+    if not positional:
+        raise ValueError(f"{placed[0]} is not of the form NAME=VALUE")
+    if positional[-1].endswith("..."):
+        yield f"{names}=[{','.join(map(_text, placed))}]"
+        return
+    if len(placed) > len(positional):
+        raise ValueError(f"{' '.join(placed[len(positional) :])}: only {names} may stand without NAME=")
+    yield from (f"{name}={_text(value)}" for name, value in zip(positional, placed, strict=False))
+
+
+def _quoted(word: str, paths: Sequence[str], multirun: bool) -> str:
+    """The override with its value in quotes where that is a path, which Hydra would take apart."""
+    match = OVERRIDE.fullmatch(word)
+    if match is None:
+        return word
+    key, value = match["key"], match["value"]
+    swept = multirun and ("," in value or "(" in value) and _parses(word)
+    is_path = key.lstrip("+") in paths and LITERAL.fullmatch(value) is None and not swept
+    is_file = _exists(value) and (set(value) & set(",[]{}()") or not _parses(word))
+    return f"{key}={_text(value)}" if is_path or is_file else word
+
+
+def _exists(value: str) -> bool:
+    try:
+        return bool(value) and Path(value).exists()
+    except OSError:  # too long for a name
+        return False
+
+
+def _parses(word: str) -> bool:
+    try:
+        OverridesParser.create().parse_override(word)
+    except HydraException:
+        return False
+    return True
+
+
+def _text(value: str) -> str:
+    return QuotedString(text=value, quote=Quote.single).with_quotes()
