@@ -19,7 +19,7 @@ from fmtorch.geometry import sampson
 from fmtorch.io.match_store import MatchStore
 from fmtorch.pipeline import pipeline as module
 from fmtorch.pipeline.build import load_pipeline
-from fmtorch.pipeline.exporting import keep_outcomes
+from fmtorch.pipeline.exporting import match_records
 from fmtorch.pipeline.folder import FolderMatches
 from fmtorch.pipeline.pipeline import Pipeline
 from tests.conftest import shared_path
@@ -110,7 +110,7 @@ def test_refined_matches_are_exported_as_matches_of_keypoints(tmp_path: Path) ->
             MatchStore(tmp_path / f"run{i}", ends[0].parent),
             MatchStore(tmp_path / f"folder{i}", ends[0].parent),
         )
-        keep_outcomes(run, pipeline, pipeline.run([pair]))
+        run.add(match_records(pipeline, pipeline.run([pair])))
         for _ in FolderMatches(pipeline, folder, 4000, True, 0).each([ends]):
             pass
         journals += [run, folder]
